@@ -1,0 +1,242 @@
+"""From a data set to training batches: splits and folds, scales, context and targets.
+
+Section 3.2 and 4.3 of the paper: 80/10/10 inside each of 10 folds; k observations, k uniform in
+1 … obs_max, at random phases of a random trajectory.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from affordlib.types import Observations
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+@dataclass(frozen=True)
+class Split:
+    """Interaction numbers for training, validation and test."""
+
+    train: np.ndarray
+    validation: np.ndarray
+    test: np.ndarray
+
+
+def split_interactions(n: int, seed: int = 0, fold: int = 0, n_folds: int = 10) -> Split:
+    """Shuffle interactions 0 … n-1 into `n_folds` blocks: one tests, the next validates.
+
+    Each interaction has an object of its own, so this splits by object.
+    """
+    if not 3 <= n_folds <= n:
+        raise ValueError(
+            f"n_folds must lie in [3, {n}] (the number of interactions), got {n_folds}"
+        )
+    if not 0 <= fold < n_folds:
+        raise ValueError(f"fold must lie in [0, {n_folds - 1}], got {fold}")
+    blocks = np.array_split(np.random.default_rng(seed).permutation(n), n_folds)
+    test, validation = fold, (fold + 1) % n_folds
+    train = np.concatenate([b for k, b in enumerate(blocks) if k not in (test, validation)])
+    return Split(np.sort(train), np.sort(blocks[validation]), np.sort(blocks[test]))
+
+
+@dataclass(frozen=True)
+class Normaliser:
+    """Scales that bring channels near unit size; x and y share one, and zero stays zero."""
+
+    action_scale: tuple[float, ...]
+    effect_scale: tuple[float, ...]
+    image_mean: tuple[float, ...]
+    image_std: tuple[float, ...]
+
+    @classmethod
+    def fit(cls, arrays: TrainingArrays) -> Normaliser:
+        """Scales of training data: root mean square of the channels, mean and std of the image."""
+        image = arrays.image.double()
+        return cls(
+            _scales(arrays.action, arrays.action_channels),
+            _scales(arrays.effect, arrays.effect_channels),
+            tuple(image.mean(dim=(0, 2, 3)).tolist()),
+            tuple(image.std(dim=(0, 2, 3)).clamp_min(1e-6).tolist()),
+        )
+
+
+def _scales(values: torch.Tensor, channels: tuple[str, ...]) -> tuple[float, ...]:
+    rms = values.double().square().mean(dim=(0, 1)).sqrt().clamp_min(1e-6)
+    plane = [k for k, name in enumerate(channels) if name in ("x", "y")]
+    rms[plane] = rms[plane].square().mean().sqrt()
+    return tuple(rms.tolist())
+
+
+@dataclass(frozen=True)
+class TrainingArrays:
+    """Interactions as tensors: image (N, 2, 48, 48), phase (S,), action and effect (N, S, C)."""
+
+    image: torch.Tensor
+    phase: torch.Tensor
+    action: torch.Tensor
+    effect: torch.Tensor
+    action_channels: tuple[str, ...]
+    effect_channels: tuple[str, ...]
+
+    @classmethod
+    def from_dataset(
+        cls,
+        data: xr.Dataset,
+        interactions: np.ndarray | None = None,
+        action_channels: tuple[str, ...] = ("x", "y"),
+        effect_channels: tuple[str, ...] = ("x", "y"),
+    ) -> TrainingArrays:
+        """The chosen interactions (default: all) and channels; simulator faults are left out."""
+        chosen = np.arange(data.sizes["interaction"]) if interactions is None else interactions
+        chosen = chosen[~data["fault"].values[chosen]]
+        part = data.isel(interaction=chosen)
+
+        def channels(kind: str, names: tuple[str, ...]) -> torch.Tensor:
+            known = data.attrs[f"{kind}_channels"].split()
+            unknown = [name for name in names if name not in known]
+            if unknown:
+                raise ValueError(f"{kind}_channels {unknown} are not stored; choose from {known}")
+            values = part[kind].values[..., [known.index(name) for name in names]]
+            return torch.from_numpy(np.ascontiguousarray(values))
+
+        return cls(
+            torch.from_numpy(part["image"].values),
+            torch.from_numpy(part["phase"].values).float(),
+            channels("action", action_channels),
+            channels("effect", effect_channels),
+            tuple(action_channels),
+            tuple(effect_channels),
+        )
+
+    def __len__(self) -> int:
+        return len(self.image)
+
+    def select(self, rows: torch.Tensor) -> TrainingArrays:
+        """The interactions with the given row numbers."""
+        return replace(
+            self, image=self.image[rows], action=self.action[rows], effect=self.effect[rows]
+        )
+
+    def turned(self, quarters: int, mirror: bool = False) -> TrainingArrays:
+        """The same interactions on a table mirrored in y, then turned by quarter turns.
+
+        Exact: no pixel is interpolated. Physics on a level table does not mind.
+        """
+        image = torch.flip(self.image, (-2,)) if mirror else self.image
+        return replace(
+            self,
+            image=torch.rot90(image, quarters, (-2, -1)),
+            action=_turn(self.action, self.action_channels, quarters, mirror),
+            effect=_turn(self.effect, self.effect_channels, quarters, mirror),
+        )
+
+
+def _turn(
+    values: torch.Tensor, channels: tuple[str, ...], quarters: int, mirror: bool
+) -> torch.Tensor:
+    turned = values.clone()
+    x, y = channels.index("x"), channels.index("y")
+    if mirror:
+        for name in ("y", "yaw"):
+            if name in channels:
+                turned[..., channels.index(name)] *= -1
+    for _ in range(quarters % 4):
+        turned[..., x], turned[..., y] = -turned[..., y].clone(), turned[..., x].clone()
+    return turned
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Images, observations and the targets (B, T, C) at t_target (B, T) they should predict."""
+
+    image: torch.Tensor
+    observations: Observations
+    t_target: torch.Tensor
+    action: torch.Tensor
+    effect: torch.Tensor
+
+
+def observe(
+    arrays: TrainingArrays,
+    action_at: torch.Tensor,
+    action_mask: torch.Tensor,
+    effect_at: torch.Tensor,
+    effect_mask: torch.Tensor,
+    weight: torch.Tensor,
+) -> Observations:
+    """Observations of whole arrays at sample numbers (N, n) and (N, m)."""
+    rows = torch.arange(len(arrays))[:, None]
+    return Observations(
+        arrays.action[rows, action_at],
+        arrays.phase[action_at],
+        action_mask,
+        arrays.effect[rows, effect_at],
+        arrays.phase[effect_at],
+        effect_mask,
+        weight,
+    )
+
+
+def observe_action(arrays: TrainingArrays, samples: tuple[int, ...] = (0, -1)) -> Observations:
+    """Only the commanded action, at the given samples (default: t = 0 and t = 1), w₁ = 1."""
+    n = len(arrays)
+    last = len(arrays.phase)
+    at = torch.tensor([s % last for s in samples]).expand(n, -1)
+    seen = torch.ones(n, len(samples), dtype=torch.bool)
+    none = torch.zeros(n, 1, dtype=torch.bool)
+    return observe(arrays, at, seen, torch.zeros(n, 1, dtype=torch.long), none, torch.ones(n))
+
+
+def sample_batch(
+    arrays: TrainingArrays,
+    rows: torch.Tensor,
+    n_targets: int,
+    obs_max: int,
+    generator: torch.Generator,
+) -> Batch:
+    """Draw context and targets for the interactions in `rows`.
+
+    A share of the contexts is what will be asked later: the action at t = 0 (and 1), the effect
+    at t = 1. t = 1 is always a target.
+    """
+    part = arrays.select(rows)
+    b, last = len(rows), len(arrays.phase) - 1
+
+    def uniform(*shape: int) -> torch.Tensor:
+        return torch.rand(*shape, generator=generator)
+
+    def samples(*shape: int) -> torch.Tensor:
+        return torch.randint(0, last + 1, shape, generator=generator)
+
+    def counts() -> torch.Tensor:
+        few = torch.randint(1, min(2, obs_max) + 1, (b, 1), generator=generator)
+        many = torch.randint(1, obs_max + 1, (b, 1), generator=generator)
+        return torch.where(uniform(b, 1) < 0.5, few, many)
+
+    action_at, effect_at = samples(b, obs_max), samples(b, obs_max)
+    asked = uniform(b) < 0.5
+    action_at[asked, 0] = 0
+    action_at[asked, min(1, obs_max - 1)] = last if obs_max > 1 else 0
+    effect_at[uniform(b) < 0.5, 0] = last
+
+    slot = torch.arange(obs_max)
+    kind = uniform(b, 1)
+    action_mask = (slot < counts()) & ((kind < 0.5) | (kind > 0.75))
+    effect_mask = (slot < counts()) & (kind >= 0.5)
+    blend = torch.where(kind > 0.75, uniform(b, 1), (kind < 0.5).float()).squeeze(1)
+
+    target_at = samples(b, n_targets)
+    target_at[:, 0] = last
+    index = torch.arange(b)[:, None]
+    return Batch(
+        part.image,
+        observe(part, action_at, action_mask, effect_at, effect_mask, blend),
+        part.phase[target_at],
+        part.action[index, target_at],
+        part.effect[index, target_at],
+    )

@@ -1,0 +1,97 @@
+"""Checkpoints: weights as safetensors, everything else as JSON beside them; never pickle."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+
+from affordlib.interactions.batches import Normaliser
+from affordlib.models.cnp import AffordanceCNP, CNPConfig
+from affordlib.paths import repo_root
+
+FORMAT = "affordlib checkpoint 1"
+SUFFIX = ".safetensors"
+_KINDS = {"cnp": (AffordanceCNP, CNPConfig)}
+
+
+def save_checkpoint(model: AffordanceCNP, path: str | Path, about: dict[str, Any]) -> Path:
+    """Write `path` (ending in .safetensors) and the JSON beside it; returns the path.
+
+    about: what the reader of the checkpoint should know, such as the data set and the interactions
+    that the model was trained on; plain JSON values.
+    """
+    path = Path(path)
+    if path.suffix != SUFFIX:
+        raise ValueError(f"path must end in {SUFFIX!r}, got {str(path)!r}")
+    description = {
+        "format": FORMAT,
+        "model": "cnp",
+        "config": asdict(model.config) | {"sigma_floor": model.sigma_floor},
+        "normaliser": asdict(model.normaliser),
+        "about": about,
+    }
+    text = json.dumps(description, indent=1, allow_nan=False)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
+        weights, sidecar = Path(folder) / "weights", Path(folder) / "json"
+        tensors = {name: value.contiguous() for name, value in model.state_dict().items()}
+        save_file(tensors, weights)
+        sidecar.write_text(text + "\n")
+        os.replace(sidecar, path.with_suffix(".json"))
+        os.replace(weights, path)
+    return path
+
+
+def resolve_checkpoint(name_or_path: str | Path) -> Path:
+    """The weights' file of a shipped checkpoint's name, or of a path; raises when there is none."""
+    path = Path(name_or_path)
+    folder = repo_root() / "data" / "checkpoints"
+    if path.suffix != SUFFIX:
+        path = folder / f"{name_or_path}{SUFFIX}"
+    for file in (path, path.with_suffix(".json")):
+        if not file.is_file():
+            shipped = sorted(p.stem for p in folder.glob(f"*{SUFFIX}"))
+            raise FileNotFoundError(
+                f"checkpoint {str(name_or_path)!r}: there is no file {file}; give one of the "
+                f"shipped names {shipped} or the path of a {SUFFIX} file with its .json beside it"
+            )
+    return path
+
+
+def load_checkpoint(name_or_path: str | Path) -> tuple[AffordanceCNP, dict[str, Any]]:
+    """A model, ready to predict, and what its checkpoint says about it.
+
+    Raises FileNotFoundError, or ValueError when the files are damaged or of another model.
+    """
+    path = resolve_checkpoint(name_or_path)
+    remedy = "give another checkpoint, or train it again with notebook 03"
+    try:
+        description = json.loads(path.with_suffix(".json").read_text())
+        if description["format"] != FORMAT:
+            raise ValueError(f"its format is {description['format']!r}, not {FORMAT!r}")
+        kind, config_class = _KINDS[description["model"]]
+        model = kind(
+            config_class(**description["config"]),
+            Normaliser(**{k: tuple(v) for k, v in description["normaliser"].items()}),
+        )
+        about = description["about"]
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"checkpoint {path.with_suffix('.json')} does not describe a model of this package "
+            f"({error}); {remedy}"
+        ) from error
+    try:
+        model.load_state_dict(load_file(path))
+    except (RuntimeError, SafetensorError, OSError) as error:
+        raise ValueError(
+            f"checkpoint {path} does not hold the weights of the model that "
+            f"{path.with_suffix('.json').name} describes; {remedy}"
+        ) from error
+    return model.eval(), about

@@ -1,0 +1,67 @@
+"""What every model offers and planners see: encode an object once, predict many queries at once."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
+
+import numpy as np
+import torch
+
+from affordlib.types import ACTION_CHANNELS, Observations, Prediction
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from affordlib.primitives import Push
+
+
+@runtime_checkable
+class EffectModel(Protocol):
+    """A model of what actions do; everything in and out is in metres, radians and phase.
+
+    Both methods are differentiable in their inputs.
+    """
+
+    action_channels: tuple[str, ...]
+    effect_channels: tuple[str, ...]
+
+    def encode(self, image: torch.Tensor) -> torch.Tensor:
+        """Features (B, F) of images (B, 2, 48, 48)."""
+        ...
+
+    def predict(
+        self, features: torch.Tensor, observations: Observations, t_target: torch.Tensor
+    ) -> Prediction:
+        """Mean and σ (B, T, C) at t_target (B, T) for B queries; features (B, F) or (1, F)."""
+        ...
+
+
+def observe_pushes(model: EffectModel, pushes: Sequence[Push]) -> Observations:
+    """The commanded action of each push at t = 0 and t = 1, and no effect: B = len(pushes)."""
+    ends = np.array([0.0, 1.0])
+    columns = [ACTION_CHANNELS.index(name) for name in model.action_channels]
+    action = np.stack([push.path(ends)[:, columns] for push in pushes])
+    b = len(pushes)
+    return Observations(
+        torch.as_tensor(action, dtype=torch.float32),
+        torch.tensor([0.0, 1.0]).expand(b, 2),
+        torch.ones(b, 2, dtype=torch.bool),
+        torch.zeros(b, 1, len(model.effect_channels)),
+        torch.zeros(b, 1),
+        torch.zeros(b, 1, dtype=torch.bool),
+        torch.ones(b),
+    )
+
+
+def observe_final_effect(model: EffectModel, effect: torch.Tensor) -> Observations:
+    """The effect (B, C_e) at t = 1 and no action (w₁ = 0), differentiable in the effect."""
+    b = len(effect)
+    return Observations(
+        torch.zeros(b, 1, len(model.action_channels)),
+        torch.zeros(b, 1),
+        torch.zeros(b, 1, dtype=torch.bool),
+        effect[:, None],
+        torch.ones(b, 1),
+        torch.ones(b, 1, dtype=torch.bool),
+        torch.zeros(b),
+    )

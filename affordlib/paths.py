@@ -1,0 +1,53 @@
+"""Where things lie: the repository, its shipped data, and the folders that runs write to."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+
+def repo_root() -> Path:
+    """Return the checkout that the package belongs to.
+
+    Raises FileNotFoundError if the package was installed apart from its checkout.
+    """
+    root = Path(__file__).resolve().parents[1]
+    if not (root / "pyproject.toml").is_file():
+        raise FileNotFoundError(
+            f"affordlib is installed in {root}, apart from its notebooks and data; run "
+            "`make setup` in the checkout, which installs it in place"
+        )
+    return root
+
+
+def data_path(name: str) -> Path:
+    """Return the path of a file or folder shipped in `data/`.
+
+    Raises FileNotFoundError, naming what is there, if it is missing.
+    """
+    folder = repo_root() / "data"
+    path = folder / name
+    if not path.exists():
+        there = ", ".join(sorted(p.name for p in folder.glob("*"))) or "nothing"
+        raise FileNotFoundError(
+            f"name: {name!r} is not in {folder} (there: {there}); "
+            "restore it with `git checkout data`, or make it anew with `make data`"
+        )
+    return path
+
+
+def resolve_out_dir(out_dir: str | os.PathLike[str]) -> Path:
+    """Return the folder for results, made if missing; a relative one starts at the repository.
+
+    Raises NotADirectoryError if something else has that name.
+    """
+    if not isinstance(out_dir, str | os.PathLike) or not os.fspath(out_dir):
+        raise ValueError(f"out_dir must name a folder, such as 'runs/lab', got {out_dir!r}")
+    path = repo_root() / os.path.expanduser(out_dir)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError):
+        raise NotADirectoryError(
+            f"out_dir must be a folder, but {path} is, or lies under, a file; choose another"
+        ) from None
+    return path

@@ -1,0 +1,71 @@
+"""The three settings of Table 3, and what all planners share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from affordlib.types import IMAGE_CHANNELS, IMAGE_PIXELS, TABLE_X_M, TABLE_Y_M
+
+if TYPE_CHECKING:
+    from affordlib.models.protocol import EffectModel
+
+PATH_SAMPLES = 25
+"""Points of the predicted path that a step carries, as in Section 4.3."""
+
+
+@dataclass(frozen=True)
+class PlanMode:
+    """How many actions a plan may have, and whether they may stop before the end."""
+
+    max_steps: int
+    partial: bool
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.max_steps <= 10:
+            raise ValueError(f"max_steps must lie in [1, 10], got {self.max_steps!r}")
+
+
+MODES: dict[str, PlanMode] = {
+    "single_full": PlanMode(1, partial=False),
+    "single_partial": PlanMode(1, partial=True),
+    "multi_partial": PlanMode(3, partial=True),
+}
+
+
+def mode_named(mode: str | PlanMode) -> PlanMode:
+    """The mode of a name in `MODES`, or the mode itself; raises naming the known ones."""
+    if isinstance(mode, PlanMode):
+        return mode
+    if mode not in MODES:
+        raise ValueError(f"mode {mode!r} is unknown; choose one of {sorted(MODES)}")
+    return MODES[mode]
+
+
+def encode_image(model: EffectModel, image: np.ndarray) -> torch.Tensor:
+    """Features (1, F) of one depth image (2, 48, 48), checked."""
+    image = np.asarray(image, dtype=np.float32)
+    if image.shape != (len(IMAGE_CHANNELS), IMAGE_PIXELS, IMAGE_PIXELS):
+        raise ValueError(
+            f"image must have the shape (2, {IMAGE_PIXELS}, {IMAGE_PIXELS}) that "
+            f"Tabletop.look() gives, got {image.shape}"
+        )
+    if not np.isfinite(image).all():
+        raise ValueError("image holds numbers that are not finite; look again")
+    with torch.no_grad():
+        return model.encode(torch.from_numpy(image)[None])
+
+
+def plane(model: EffectModel) -> list[int]:
+    """Where x and y are among the model's effect channels."""
+    return [model.effect_channels.index(name) for name in ("x", "y")]
+
+
+def is_on_table(xy_m: np.ndarray) -> np.ndarray:
+    """Which of the points (n, 2) lie on the table."""
+    x, y = xy_m[:, 0], xy_m[:, 1]
+    on_x = (TABLE_X_M[0] <= x) & (x <= TABLE_X_M[1])
+    return on_x & (TABLE_Y_M[0] <= y) & (y <= TABLE_Y_M[1])

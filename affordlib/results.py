@@ -1,0 +1,324 @@
+"""Results are data: the tables that a notebook writes, and the tables drawn from them.
+
+A notebook writes `<out_dir>/<notebook>.json`, which is
+`{"notebook", "parameters", "versions", "tables": {name: [flat rows]}}`. Columns carry their units
+(`mean_m`, `plan_ms_median`, `tp_percent`). No table is typed: a page in Markdown holds
+
+    <!-- table: data/results/06_planning.json#planning columns=planner,mode,mean_m -->
+    <!-- /table -->
+
+and `python -m affordlib.results README.md` fills it; `--check` fails if that would change it.
+Any other option, such as `mode=multi_partial`, keeps the rows that have that value.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.metadata
+import json
+import math
+import os
+import platform
+import re
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+import affordlib
+from affordlib.paths import repo_root, resolve_out_dir
+
+# unit in the column's name: (unit shown, factor, digits); lengths are stored in metres
+UNITS = {
+    "m": ("mm", 1000.0, 2),
+    "mm": ("mm", 1.0, 2),
+    "percent": ("%", 1.0, 1),
+    "ms": ("ms", 1.0, 1),
+    "s": ("s", 1.0, 2),
+    "rad": ("°", 180 / math.pi, 1),
+    "deg": ("°", 1.0, 1),
+}
+STATISTICS = ("mean", "median", "sem", "std", "min", "max", "p5", "p95")
+BLOCK = re.compile(
+    r"(?P<open>^<!-- table: (?P<what>.*?) -->\n)(?P<body>.*?)(?P<close>^<!-- /table -->$)",
+    re.DOTALL | re.MULTILINE,
+)
+
+
+def versions() -> dict[str, str]:
+    """Return the versions that decide a number: Python, the package, the libraries, the machine."""
+    return {
+        "python": platform.python_version(),
+        "affordlib": affordlib.__version__,
+        **{name: importlib.metadata.version(name) for name in ("torch", "pybullet", "numpy")},
+        "platform": platform.platform(),
+    }
+
+
+def write_results(
+    out_dir: str | os.PathLike[str],
+    notebook: str,
+    parameters: Mapping[str, Any],
+    tables: Mapping[str, Any],
+) -> Path:
+    """Write a notebook's numbers to `<out_dir>/<notebook>.json`, whole or not at all.
+
+    `tables` maps a name to rows, each a flat mapping from column to number, text, truth or None.
+    A relative `out_dir` starts at the repository. Returns the path. Raises TypeError or ValueError,
+    before anything is written, for what is not plain, finite data.
+    """
+    if not re.fullmatch(r"\w[\w.-]*", notebook) or notebook.endswith((".json", ".ipynb")):
+        raise ValueError(
+            f"notebook must be a plain name such as '06_planning', got {notebook!r}; "
+            "leave out folder and ending"
+        )
+    for argument, value in (("parameters", parameters), ("tables", tables)):
+        if not isinstance(value, Mapping):
+            raise TypeError(f"{argument} must be a dict, got {type(value).__name__}: {value!r:.60}")
+    parameters = _parameter(parameters, "parameters")
+    tables = {name: _rows(rows, name) for name, rows in tables.items()}
+    path = resolve_out_dir(out_dir) / f"{notebook}.json"
+    write_text_atomically(path, _document(notebook, parameters, tables))
+    return path
+
+
+def read_results(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Read and check what `write_results` wrote; a relative path starts at the repository.
+
+    Raises FileNotFoundError if it is missing and ValueError if it is not such a file.
+    """
+    path = repo_root() / path
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"path: there are no results at {path}; run the notebook that writes them"
+        )
+    remedy = "; delete it and run its notebook again"
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
+    except ValueError as error:
+        raise ValueError(f"path: {path} is not valid JSON ({error}){remedy}") from None
+    keys = {"notebook": str, "parameters": dict, "versions": dict, "tables": dict}
+    for key, kind in keys.items():
+        if not isinstance(document, dict) or not isinstance(document.get(key), kind):
+            raise ValueError(f"path: {path} has no {key!r} of type {kind.__name__}{remedy}")
+    try:
+        for name, rows in document["tables"].items():
+            _rows(rows, name)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"path: {path} holds bad tables: {error}{remedy}") from None
+    return document
+
+
+def write_text_atomically(path: Path, text: str) -> None:
+    """Replace a file by `text` in one step: a reader, or a crash, meets the old or the new."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def results_table(
+    rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = None
+) -> pd.DataFrame:
+    """Return rows as a table to look at: text cells, lengths in mm, angles in degrees, few digits.
+
+    `columns` chooses and orders. To compute, use the rows.
+    """
+    names = _columns(rows, columns)
+    cells = [[cell(name, row.get(name)) for name in names] for row in rows]
+    return pd.DataFrame(cells, columns=[heading(n) for n in names], index=[""] * len(cells))
+
+
+def markdown_table(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = None) -> str:
+    """Return rows as a Markdown table with the headings and digits of `results_table`."""
+    names = _columns(rows, columns)
+    lines = [
+        [heading(name) for name in names],
+        ["---:" if _is_numeric(rows, name) else "---" for name in names],
+        *([cell(name, row.get(name)).replace("|", "\\|") for name in names] for row in rows),
+    ]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+
+
+def heading(column: str) -> str:
+    """Return the heading of a column: `plan_ms_median` becomes `plan median, ms`."""
+    words, unit = _split_unit(column)
+    return " ".join(words) + (f", {UNITS[unit][0]}" if unit else "")
+
+
+def cell(column: str, value: object) -> str:
+    """Return a value as shown under its column, in the unit and with the digits of the heading."""
+    value = value.item() if isinstance(value, np.generic) else value
+    if value is None:
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    _, unit = _split_unit(column)
+    if unit and isinstance(value, int | float):
+        _, factor, digits = UNITS[unit]
+        return f"{round(value * factor, digits) + 0.0:.{digits}f}"
+    if isinstance(value, float):
+        return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
+    return str(value)
+
+
+def fill_tables(text: str) -> str:
+    """Return a Markdown page with each of its table blocks drawn anew from its results file."""
+
+    def fill(block: re.Match[str]) -> str:
+        source, *options = block["what"].split()
+        path, _, name = source.partition("#")
+        tables = read_results(path)["tables"]
+        if name not in tables:
+            raise ValueError(f"table: {path} has no table {name!r}, only {', '.join(tables)}")
+        rows, columns = tables[name], None
+        for option in options:
+            key, _, value = option.partition("=")
+            if key == "columns":
+                columns = value.split(",")
+            else:
+                _columns(rows, [key])
+                rows = [row for row in rows if str(row.get(key)) == value]
+                if not rows:
+                    raise ValueError(f"table: no row of {source} has {option}")
+        body = markdown_table(rows, columns)
+        return f"{block['open']}{body}{block['close']}"
+
+    filled, count = BLOCK.subn(fill, text)
+    if count != text.count("<!-- table:") or count != text.count("<!-- /table -->"):
+        raise ValueError("table: a block is not closed; each ends with the line <!-- /table -->")
+    return filled
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Fill the tables of Markdown pages, or with `--check` say which pages are out of date."""
+    parser = argparse.ArgumentParser(prog="python -m affordlib.results", description=main.__doc__)
+    parser.add_argument("pages", nargs="+", type=Path)
+    parser.add_argument("--check", action="store_true", help="change nothing, fail if one would")
+    options = parser.parse_args(argv)
+    stale = []
+    for page in options.pages:
+        try:
+            text = page.read_text(encoding="utf-8")
+            filled = fill_tables(text)
+        except (OSError, ValueError) as error:
+            print(f"{page}: {error}", file=sys.stderr)
+            return 2
+        if filled != text:
+            stale.append(page)
+            if not options.check:
+                write_text_atomically(page, filled)
+    if stale and options.check:
+        pages = " ".join(map(str, stale))
+        print(f"tables out of date; run: python -m affordlib.results {pages}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _document(notebook: str, parameters: Any, tables: dict[str, list[dict[str, Any]]]) -> str:
+    """Return the JSON text, one line a row, so that a changed number is one changed line."""
+
+    def dump(value: object) -> str:
+        return json.dumps(value, allow_nan=False, ensure_ascii=False)
+
+    def block(name: str, rows: list[dict[str, Any]]) -> str:
+        return f"  {dump(name)}: [" + ",".join(f"\n   {dump(row)}" for row in rows) + "]"
+
+    blocks = ",\n".join(block(name, rows) for name, rows in tables.items())
+    return (
+        f'{{\n "notebook": {dump(notebook)},\n "parameters": {dump(parameters)},\n'
+        f' "versions": {dump(versions())},\n "tables": {{\n{blocks}\n }}\n}}\n'
+    )
+
+
+def _refuse_constant(name: str) -> None:
+    raise ValueError(f"it holds {name}")
+
+
+def _plain(value: object, where: str) -> Any:
+    """Return a number, text, truth or None as JSON knows it; NumPy's scalars are converted."""
+    if isinstance(value, np.generic) or (isinstance(value, np.ndarray) and value.ndim == 0):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ValueError(f"{where} is {value}; write None for a number that does not exist")
+    if value is None or isinstance(value, str | bool | int | float):
+        return value
+    raise TypeError(
+        f"{where} must be a number, text, True, False or None, got {type(value).__name__} "
+        f"{value!r:.60}; convert it, or spread it over columns"
+    )
+
+
+def _parameter(value: object, where: str) -> Any:
+    if isinstance(value, Mapping):
+        return {_name(k, where): _parameter(v, f"{where}[{k!r}]") for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_parameter(v, f"{where}[{i}]") for i, v in enumerate(value)]
+    return _plain(value, where)
+
+
+def _rows(rows: object, table: object) -> list[dict[str, Any]]:
+    where = f"tables[{_name(table, 'tables')!r}]"
+    if isinstance(rows, str | Mapping) or not isinstance(rows, Iterable):
+        raise TypeError(f"{where} must be a list of rows, got {type(rows).__name__}")
+    plain = []
+    for i, row in enumerate(rows):
+        if not isinstance(row, Mapping):
+            raise TypeError(
+                f"{where}[{i}] must map columns to values, got {type(row).__name__}; "
+                "make each row a dict"
+            )
+        plain.append(
+            {_name(k, f"{where}[{i}]"): _plain(v, f"{where}[{i}][{k!r}]") for k, v in row.items()}
+        )
+    return plain
+
+
+def _name(key: object, where: str) -> str:
+    if not isinstance(key, str) or not key:
+        raise TypeError(f"{where} has the key {key!r}; names must be non-empty text, use str()")
+    return key
+
+
+def _split_unit(column: str) -> tuple[list[str], str | None]:
+    """Return the words of a column without its unit, and the unit.
+
+    The unit is the last word, or the last before a statistic (`plan_ms_median`).
+    """
+    words = column.split("_")
+    for at in range(len(words) - 1, 0, -1):
+        if words[at] in UNITS:
+            return words[:at] + words[at + 1 :], words[at]
+        if words[at] not in STATISTICS:
+            break
+    return words, None
+
+
+def _columns(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None) -> list[str]:
+    there = list(dict.fromkeys(name for row in rows for name in row))
+    if columns is None:
+        return there
+    for name in columns:
+        if name not in there:
+            raise ValueError(f"columns: {name!r} is not in the table; it has {', '.join(there)}")
+    return list(columns)
+
+
+def _is_numeric(rows: Sequence[Mapping[str, Any]], column: str) -> bool:
+    values = [row.get(column) for row in rows if row.get(column) is not None]
+    return bool(values) and all(
+        isinstance(v, int | float | np.number) and not isinstance(v, bool) for v in values
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,54 @@
+"""Small animations of the robot at work: frames while the world runs, a GIF by Pillow."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from IPython.display import Image as NotebookImage
+from PIL import Image
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from affordlib.world import Tabletop
+
+
+class Film:
+    """Takes a picture every `every` simulation steps (1/240 s); give it to `world.film`."""
+
+    def __init__(self, every: int = 30, width: int = 320, height: int = 240) -> None:
+        self.every, self.width, self.height = every, width, height
+        self.frames: list[np.ndarray] = []
+        self._steps = 0
+
+    def __call__(self, world: Tabletop) -> None:
+        if self._steps % self.every == 0:
+            self.frames.append(world.picture(self.width, self.height))
+        self._steps += 1
+
+    def gif(self, frame_ms: int = 60) -> bytes:
+        """The frames as an animated GIF that loops and rests on its last frame."""
+        if not self.frames:
+            raise RuntimeError("the film is empty; set world.film = film before the robot moves")
+        pictures = [Image.fromarray(frame) for frame in self.frames]
+        # One palette for all frames, or colours flicker.
+        palette = pictures[len(pictures) // 2].quantize(128, dither=Image.Dither.NONE)
+        indexed = [p.quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures]
+        buffer = io.BytesIO()
+        durations = [frame_ms] * (len(indexed) - 1) + [1500]
+        indexed[0].save(
+            buffer, "GIF", save_all=True, append_images=indexed[1:], duration=durations, loop=0
+        )
+        return buffer.getvalue()
+
+
+def show_animation(film: Film, path: str | Path | None = None) -> NotebookImage:
+    """The film as a picture a notebook displays; saved to `path` as well, if given."""
+    data = film.gif()
+    if path is not None:
+        path = Path(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data)
+    return NotebookImage(data, format="gif")

@@ -1,0 +1,148 @@
+"""Figures of one look: fixed, colour-blind-safe colours for goal, prediction and truth.
+
+Every function draws into the `ax` that it is given and returns it. Positions are in centimetres.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from affordlib.types import CROP_WIDTH_M, TABLE_X_M, TABLE_Y_M
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from affordlib.types import Outcome, Plan
+    from affordlib.world import Cuboid, UprightCylinder
+
+GOAL, PREDICTION, TRUTH, NEUTRAL = "#0072B2", "#D55E00", "#009E73", "#777777"
+
+plt.rcParams.update(
+    {
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.grid": True,
+        "axes.titlesize": 11,
+        "axes.titlelocation": "left",
+        "figure.constrained_layout.use": True,
+        "figure.dpi": 90,
+        "font.size": 10,
+        "grid.alpha": 0.3,
+        "legend.frameon": False,
+        "savefig.dpi": 120,
+    }
+)
+
+
+def save_figure(figure: Figure, folder: Path, name: str) -> Path:
+    """Save a figure as `figures/<name>.png` in a results folder and return its path."""
+    path = Path(folder) / "figures" / f"{name}.png"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path)
+    return path
+
+
+def plot_table(ax: Axes, around_m: Sequence[float] = (0.0, 0.0), half_width_m: float = 0.3) -> Axes:
+    """An empty top-down view of the table around a point."""
+    ax.set_aspect("equal")
+    ax.set_xlim(100 * (around_m[0] - half_width_m), 100 * (around_m[0] + half_width_m))
+    ax.set_ylim(100 * (around_m[1] - half_width_m), 100 * (around_m[1] + half_width_m))
+    corners = 100 * np.array([[x, y] for x, y in _corners()])
+    ax.plot(*corners.T, color=NEUTRAL, lw=1)
+    ax.set_xlabel("x [cm]")
+    ax.set_ylabel("y [cm]")
+    return ax
+
+
+def _corners() -> list[tuple[float, float]]:
+    (x0, x1), (y0, y1) = TABLE_X_M, TABLE_Y_M
+    return [(x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0)]
+
+
+def plot_footprint(
+    ax: Axes,
+    thing: Cuboid | UprightCylinder,
+    xy_m: Sequence[float],
+    yaw_rad: float = 0.0,
+    color: str = NEUTRAL,
+    label: str | None = None,
+    filled: bool = True,
+) -> Axes:
+    """The outline of an object's base at a pose."""
+    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+    outline = 100 * (thing.footprint_m @ np.array([[c, s], [-s, c]]) + np.asarray(xy_m))
+    ax.fill(*outline.T, facecolor=color if filled else "none", alpha=0.25 if filled else 1, lw=0)
+    ax.plot(*np.vstack([outline, outline[:1]]).T, color=color, lw=1.5, label=label)
+    return ax
+
+
+def plot_plan(ax: Axes, plan: Plan) -> Axes:
+    """A plan as predicted: the object's path, where each step stops, and the goal."""
+    circle = plt.Circle(
+        100 * np.array(plan.goal.xy_m), 100 * plan.goal.tolerance_m, color=GOAL, fill=False, lw=1
+    )
+    ax.add_patch(circle)
+    ax.plot(*(100 * np.array(plan.goal.xy_m)), "*", color=GOAL, ms=13, label="goal", zorder=5)
+    start = np.array(plan.start_xy_m)
+    for k, step in enumerate(plan.steps):
+        direction = np.array(
+            [math.cos(step.primitive.direction_rad), math.sin(step.primitive.direction_rad)]
+        )
+        tail = 100 * (start - 0.075 * direction)
+        ax.annotate(
+            "",
+            100 * (start - 0.035 * direction),
+            tail,
+            arrowprops={"arrowstyle": "-|>", "color": NEUTRAL, "lw": 1.5},
+        )
+        text = f"{k + 1}: {100 * step.stop_phase:.0f} %"
+        ax.annotate(
+            text,
+            tail,
+            color=NEUTRAL,
+            ha="center",
+            va="center",
+            fontsize=8,
+            xytext=(-10 * direction[0], -10 * direction[1]),
+            textcoords="offset points",
+        )
+        ax.plot(
+            *(100 * step.predicted_path_xy_m.T),
+            color=PREDICTION,
+            lw=2,
+            label="prediction" if k == 0 else None,
+        )
+        ax.plot(*(100 * np.array(step.predicted_end_xy_m)), "o", color=PREDICTION, ms=5)
+        start = np.array(step.predicted_end_xy_m)
+    return ax
+
+
+def plot_outcome(ax: Axes, outcome: Outcome) -> Axes:
+    """What carrying out a plan gave: the object's real path, over the plan."""
+    plot_plan(ax, outcome.plan)
+    for k, path in enumerate(outcome.object_paths_xy_m):
+        ax.plot(*(100 * path.T), color=TRUTH, lw=2, ls="--", label="truth" if k == 0 else None)
+    ax.plot(*(100 * np.array(outcome.end_pose[:2])), "s", color=TRUTH, ms=6)
+    ax.set_title(f"{outcome.plan.planner}: {1000 * outcome.distance_m:.1f} mm from the goal")
+    return ax
+
+
+def plot_depth(ax: Axes, image: np.ndarray, title: str = "") -> Axes:
+    """The depth channel of an image (2, 48, 48), as height above the table in centimetres."""
+    half = 50 * CROP_WIDTH_M
+    height_cm = 100 * (image[0].max() - image[0])
+    drawn = ax.imshow(height_cm, extent=(-half, half, -half, half), cmap="cividis", vmin=0, vmax=8)
+    ax.grid(False)
+    ax.set_title(title)
+    ax.set_xlabel("x [cm]")
+    ax.set_ylabel("y [cm]")
+    ax.figure.colorbar(drawn, ax=ax, label="height [cm]", shrink=0.8)
+    return ax

@@ -1,0 +1,195 @@
+"""The narrow waist: the few frozen dataclasses that pass between the parts of the package.
+
+Phase t in [0, 1] is the normalised time of a full primitive, everywhere. Positions are metres,
+angles radians. Actions and effects are relative to where the object stood at the start
+(Section 3.1 of the paper, D_d = {a_t, e_t, o, t}); their axes are the table's.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import torch
+
+    from affordlib.primitives import Push
+
+ACTION_CHANNELS = ("x", "y", "z", "yaw", "gripper")
+EFFECT_CHANNELS = ("x", "y", "z", "yaw", "tilt")
+IMAGE_CHANNELS = ("depth", "mask")
+IMAGE_PIXELS = 48
+CROP_WIDTH_M = 0.16
+
+TABLE_X_M = (-0.5, 0.5)
+TABLE_Y_M = (-0.6, 0.6)
+
+
+def check_finite(name: str, value: float) -> float:
+    """Return `value` as a float, or raise naming the argument that is not a finite number."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not math.isfinite(number):
+        raise ValueError(f"{name} must be a finite number, got {value!r}")
+    return number
+
+
+def check_within(name: str, value: float, low: float, high: float, unit: str = "") -> float:
+    """Return `value` as a float, or raise naming the argument outside [low, high]."""
+    number = check_finite(name, value)
+    if not low <= number <= high:
+        raise ValueError(f"{name} must lie in [{low:g}, {high:g}] {unit}, got {number:g}".strip())
+    return number
+
+
+def check_on_table(name: str, xy_m: Sequence[float]) -> tuple[float, float]:
+    """Return (x, y) [m] in the frame of the table, or raise when it is not a point on it."""
+    pair = np.asarray(xy_m, dtype=float)
+    if pair.shape != (2,) or not np.isfinite(pair).all():
+        raise ValueError(f"{name} must be two finite numbers (x, y) in metres, got {xy_m!r}")
+    x, y = float(pair[0]), float(pair[1])
+    if not (TABLE_X_M[0] <= x <= TABLE_X_M[1] and TABLE_Y_M[0] <= y <= TABLE_Y_M[1]):
+        raise ValueError(
+            f"{name} = ({x:g}, {y:g}) m lies off the table; choose x in "
+            f"[{TABLE_X_M[0]:g}, {TABLE_X_M[1]:g}] and y in [{TABLE_Y_M[0]:g}, {TABLE_Y_M[1]:g}]"
+        )
+    return x, y
+
+
+@dataclass(frozen=True)
+class Interaction:
+    """What happened when a primitive was executed on one object.
+
+    phase: (n,); action: (n, 5) commanded, channels `ACTION_CHANNELS`; effect: (n, 5), channels
+    `EFFECT_CHANNELS` (metres and radians; gripper is 1 open, 0 closed); rest_effect: (5,) where
+    the object rests after the gripper has retreated; image: (2, 48, 48), depth [m] and mask;
+    start_pose: (x, y, yaw) of the object in the frame of the table.
+    """
+
+    primitive: Push
+    stop_phase: float
+    phase: np.ndarray
+    action: np.ndarray
+    effect: np.ndarray
+    rest_effect: np.ndarray
+    image: np.ndarray
+    start_pose: tuple[float, float, float]
+    tracking_error_m: float
+
+
+@dataclass(frozen=True)
+class Observations:
+    """What a model is conditioned on: action and effect at any times, in metres and radians.
+
+    action: (B, n, C_a) at action_t: (B, n), those with action_mask: (B, n) counting; likewise
+    effect: (B, m, C_e). weight: (B,), the blend w₁ of the action in equation (2), w₂ = 1 - w₁;
+    it is 1 where only actions, 0 where only effects are observed.
+    """
+
+    action: torch.Tensor
+    action_t: torch.Tensor
+    action_mask: torch.Tensor
+    effect: torch.Tensor
+    effect_t: torch.Tensor
+    effect_mask: torch.Tensor
+    weight: torch.Tensor
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Mean and σ of action and effect at the targets: (B, T, C) each, in metres and radians."""
+
+    action_mean: torch.Tensor
+    action_std: torch.Tensor
+    effect_mean: torch.Tensor
+    effect_std: torch.Tensor
+
+
+@dataclass(frozen=True)
+class Goal:
+    """Where the object shall be: a position (x, y) [m] on the table and a tolerance [m]."""
+
+    xy_m: tuple[float, float]
+    tolerance_m: float = 0.02
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "xy_m", check_on_table("goal xy_m", self.xy_m))
+        check_within("goal tolerance_m", self.tolerance_m, 0.0, 0.5, "m")
+
+    def distance_m(self, xy_m: Sequence[float]) -> float:
+        """Distance [m] between the goal and a point (x, y) [m] of the table."""
+        return float(np.hypot(xy_m[0] - self.xy_m[0], xy_m[1] - self.xy_m[1]))
+
+
+@dataclass(frozen=True)
+class Step:
+    """One (partial) action of a plan and where the model expects the object to end.
+
+    primitive: the action; stop_phase: the phase at which it stops; predicted_end_xy_m: (x, y)
+    in the frame of the table; predicted_path_xy_m: (n, 2), the object's way there;
+    path_xy_m: (m, 2) or None, a decoded end-effector path relative to the object, executed
+    instead of the primitive's own where a planner gives one; std_m: the model's σ of the end.
+    """
+
+    primitive: Push
+    stop_phase: float
+    predicted_end_xy_m: tuple[float, float]
+    predicted_path_xy_m: np.ndarray
+    path_xy_m: np.ndarray | None = None
+    std_m: float = math.nan
+
+    def __post_init__(self) -> None:
+        check_within("stop_phase", self.stop_phase, 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A chain of steps from a start (x, y) [m] towards a goal, and what finding it cost.
+
+    evaluations counts expanded nodes (A*) or gradient iterations; plan_s is wall time.
+    """
+
+    goal: Goal
+    start_xy_m: tuple[float, float]
+    steps: tuple[Step, ...]
+    planner: str
+    reaches_goal: bool
+    evaluations: int
+    plan_s: float
+
+    @property
+    def predicted_end_xy_m(self) -> tuple[float, float]:
+        """Where the model expects the object after the last step."""
+        return self.steps[-1].predicted_end_xy_m if self.steps else self.start_xy_m
+
+    @property
+    def predicted_distance_m(self) -> float:
+        """Distance [m] that the model expects to remain."""
+        return self.goal.distance_m(self.predicted_end_xy_m)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What carrying out a plan gave.
+
+    distance_m: between the goal and the object at rest, gripper retreated; object_paths_xy_m: one
+    (n, 2) path of the object per executed step, in the frame of the table; end_pose: (x, y, yaw);
+    tilt_rad: how far the object's upright axis ended from vertical.
+    """
+
+    plan: Plan
+    distance_m: float
+    end_pose: tuple[float, float, float]
+    tilt_rad: float
+    object_paths_xy_m: tuple[np.ndarray, ...] = field(default=())
+
+    def with_goal(self, goal: Goal) -> Outcome:
+        """The same outcome, measured against another goal."""
+        return replace(self, distance_m=goal.distance_m(self.end_pose[:2]))

@@ -1,0 +1,16 @@
+"""All that touches PyBullet: the tabletop, its objects, the arm and the camera."""
+
+import affordlib.world._quiet_pybullet  # noqa: F401  (must come first)
+from affordlib.world.objects import FAMILIES, Cuboid, UprightCylinder, family_named
+from affordlib.world.robot import UnreachableError
+from affordlib.world.scene import Tabletop, WorldConfig
+
+__all__ = [
+    "FAMILIES",
+    "Cuboid",
+    "Tabletop",
+    "UnreachableError",
+    "UprightCylinder",
+    "WorldConfig",
+    "family_named",
+]
