@@ -24,8 +24,8 @@ PUSH_TIP_HEIGHT_M = 0.01
 
 def min_jerk(t: np.ndarray | float) -> np.ndarray:
     """Share of the path covered at phase t under minimum-jerk timing: 10t³ - 15t⁴ + 6t⁵."""
-    t = np.clip(np.asarray(t, dtype=float), 0.0, 1.0)
-    return t**3 * (10.0 - 15.0 * t + 6.0 * t**2)
+    t = np.clip(t, 0.0, 1.0)
+    return np.asarray(t**3 * (10.0 - 15.0 * t + 6.0 * t**2))
 
 
 def wrap_angle(angle_rad: float) -> float:

@@ -54,7 +54,7 @@ def versions() -> dict[str, str]:
         "python": platform.python_version(),
         "affordlib": affordlib.__version__,
         **{name: importlib.metadata.version(name) for name in ("torch", "pybullet", "numpy")},
-        "platform": platform.platform(),
+        "platform": f"{platform.system()} {platform.machine()}",
     }
 
 
@@ -231,7 +231,7 @@ def _document(notebook: str, parameters: Any, tables: dict[str, list[dict[str, A
         return json.dumps(value, allow_nan=False, ensure_ascii=False)
 
     def block(name: str, rows: list[dict[str, Any]]) -> str:
-        return f"  {dump(name)}: [" + ",".join(f"\n   {dump(row)}" for row in rows) + "]"
+        return f"  {dump(name)}: [\n" + ",\n".join(f"   {dump(row)}" for row in rows) + "\n  ]"
 
     blocks = ",\n".join(block(name, rows) for name, rows in tables.items())
     return (

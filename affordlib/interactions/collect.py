@@ -43,9 +43,8 @@ _UNITS = {
 }
 
 
-def collect_chunk(recipe: Recipe, start: int) -> dict[str, np.ndarray]:
-    """Interactions start … start + CHUNK - 1 of a recipe (as far as it goes), as arrays by name."""
-    indices = range(start, min(start + CHUNK, recipe.n_interactions))
+def collect_chunk(recipe: Recipe, indices: range) -> dict[str, np.ndarray]:
+    """The interactions of a recipe with the given numbers, as arrays by name."""
     families = list(FAMILIES)
     rows: dict[str, list] = {}
     with Tabletop(recipe.world) as world:
@@ -72,9 +71,9 @@ def collect_chunk(recipe: Recipe, start: int) -> dict[str, np.ndarray]:
     return {"phase": seen.phase, "index": np.array(indices), **arrays}
 
 
-def _write_chunk(recipe: Recipe, start: int, path: str) -> None:
+def _write_chunk(recipe: Recipe, indices: range, path: str) -> None:
     """Collect one chunk into a file that appears whole or not at all; the task of a worker."""
-    arrays = collect_chunk(recipe, start)
+    arrays = collect_chunk(recipe, indices)
     folder = Path(path).parent
     handle, temporary = tempfile.mkstemp(dir=folder, prefix=".chunk")
     try:
@@ -185,19 +184,21 @@ def collect(
     folder = path.parent / f".{path.name}.{fingerprint}.chunks"
     folder.mkdir(parents=True, exist_ok=True)
     with _exclusive(folder / "lock"):
-        starts = range(0, recipe.n_interactions, CHUNK)
-        files = {start: folder.resolve() / f"{start:08d}.npz" for start in starts}
-        missing = [start for start in starts if _read_chunk(files[start]) is None]
+        everything = range(recipe.n_interactions)
+        chunks = [everything[k : k + CHUNK] for k in everything[::CHUNK]]
+        files = {chunk: folder.resolve() / f"{chunk.start:08d}.npz" for chunk in chunks}
+        missing = [chunk for chunk in chunks if _read_chunk(files[chunk]) is None]
         bar = tqdm(
-            total=recipe.n_interactions, desc=path.name, unit=" interactions", disable=not progress
+            total=recipe.n_interactions,
+            desc=path.name,
+            unit=" interactions",
+            disable=not progress,
+            initial=sum(len(chunk) for chunk in chunks if chunk not in missing),
         )
         with bar:
-            bar.update(
-                sum(min(CHUNK, recipe.n_interactions - s) for s in starts if s not in missing)
-            )
-            for start in _done(recipe, missing, files, client):
-                bar.update(min(CHUNK, recipe.n_interactions - start))
-        write_interactions((_as_dataset(_read_chunk(files[s]), recipe) for s in starts), path)
+            for chunk in _done(recipe, missing, files, client):
+                bar.update(len(chunk))
+        write_interactions((_as_dataset(_read_chunk(files[c]), recipe) for c in chunks), path)
         for file in files.values():
             file.unlink()
         (folder / "lock").unlink()
@@ -206,19 +207,19 @@ def collect(
 
 
 def _done(
-    recipe: Recipe, missing: list[int], files: dict[int, Path], client: Client | None
-) -> Iterator[int]:
-    """Yield the start of each chunk as it is finished, here or by the client's workers."""
+    recipe: Recipe, missing: list[range], files: dict[range, Path], client: Client | None
+) -> Iterator[range]:
+    """Yield each missing chunk's numbers as it is finished, here or by the client's workers."""
     if client is None:
-        for start in missing:
-            _write_chunk(recipe, start, str(files[start]))
-            yield start
+        for chunk in missing:
+            _write_chunk(recipe, chunk, str(files[chunk]))
+            yield chunk
         return
     from dask.distributed import as_completed
 
     futures = {
-        client.submit(_write_chunk, recipe, start, str(files[start]), pure=False, retries=2): start
-        for start in missing
+        client.submit(_write_chunk, recipe, chunk, str(files[chunk]), pure=False, retries=2): chunk
+        for chunk in missing
     }
     for future in as_completed(futures):
         future.result()

@@ -43,6 +43,7 @@ def save_checkpoint(model: AffordanceCNP, path: str | Path, about: dict[str, Any
         weights, sidecar = Path(folder) / "weights", Path(folder) / "json"
         tensors = {name: value.contiguous() for name, value in model.state_dict().items()}
         save_file(tensors, weights)
+        weights.chmod(0o644)
         sidecar.write_text(text + "\n")
         os.replace(sidecar, path.with_suffix(".json"))
         os.replace(weights, path)
@@ -65,6 +66,10 @@ def resolve_checkpoint(name_or_path: str | Path) -> Path:
     return path
 
 
+def _with_tuples(fields: dict[str, Any]) -> dict[str, Any]:
+    return {name: tuple(v) if isinstance(v, list) else v for name, v in fields.items()}
+
+
 def load_checkpoint(name_or_path: str | Path) -> tuple[AffordanceCNP, dict[str, Any]]:
     """A model, ready to predict, and what its checkpoint says about it.
 
@@ -78,8 +83,8 @@ def load_checkpoint(name_or_path: str | Path) -> tuple[AffordanceCNP, dict[str, 
             raise ValueError(f"its format is {description['format']!r}, not {FORMAT!r}")
         kind, config_class = _KINDS[description["model"]]
         model = kind(
-            config_class(**description["config"]),
-            Normaliser(**{k: tuple(v) for k, v in description["normaliser"].items()}),
+            config_class(**_with_tuples(description["config"])),
+            Normaliser(**_with_tuples(description["normaliser"])),
         )
         about = description["about"]
     except (KeyError, TypeError, ValueError) as error:

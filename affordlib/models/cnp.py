@@ -18,7 +18,8 @@ from itertools import pairwise
 
 import torch
 import torch.nn.functional as F
-from torch import nn
+from jaxtyping import Float
+from torch import Tensor, nn
 
 from affordlib.interactions.batches import Normaliser
 from affordlib.types import Observations, Prediction
@@ -98,13 +99,13 @@ class AffordanceCNP(nn.Module):
             self.register_buffer(name, values, persistent=False)
         self.apply(_initialise)
 
-    def encode(self, image: torch.Tensor) -> torch.Tensor:
+    def encode(self, image: Float[Tensor, "b 2 48 48"]) -> Float[Tensor, "b 16"]:
         """f(γ_o): features (B, 16) of depth and mask (B, 2, 48, 48)."""
         mean, std = (v[:, None, None] for v in (self.image_mean, self.image_std))
         scaled = (image - mean) / std
         return self.image_encoder(scaled.contiguous(memory_format=torch.channels_last))
 
-    def represent(self, observations: Observations) -> torch.Tensor:
+    def represent(self, observations: Observations) -> Float[Tensor, "b 128"]:
         """r: (B, 128), equations (2) and (3), the means taken over what is observed."""
         o = observations
         h_a = self.action_encoder(_with_time(o.action / self.action_scale, o.action_t))
@@ -113,8 +114,11 @@ class AffordanceCNP(nn.Module):
         return w_1 * _mean(h_a, o.action_mask) + (1 - w_1) * _mean(h_e, o.effect_mask)
 
     def decode(
-        self, r: torch.Tensor, features: torch.Tensor, t_target: torch.Tensor
-    ) -> tuple[torch.Tensor, ...]:
+        self,
+        r: Float[Tensor, "b 128"],
+        features: Float[Tensor, "#b 16"],
+        t_target: Float[Tensor, "b t"],
+    ) -> tuple[Float[Tensor, "b t _"], ...]:
         """(μ_a, σ_a, μ_e, σ_e), each (B, T, C) and standardised, of r (B, 128) at t_target (B, T).
 
         The merge layer has no activation, so it folds exactly into each decoder's first layer, and
@@ -133,14 +137,12 @@ class AffordanceCNP(nn.Module):
         return tuple(outputs)
 
     def forward(
-        self, image: torch.Tensor, observations: Observations, t_target: torch.Tensor
-    ) -> tuple[torch.Tensor, ...]:
+        self, image: Tensor, observations: Observations, t_target: Tensor
+    ) -> tuple[Tensor, ...]:
         """(μ_a, σ_a, μ_e, σ_e) in standardised units; what the loss is computed on."""
         return self.decode(self.represent(observations), self.encode(image), t_target)
 
-    def predict(
-        self, features: torch.Tensor, observations: Observations, t_target: torch.Tensor
-    ) -> Prediction:
+    def predict(self, features: Tensor, observations: Observations, t_target: Tensor) -> Prediction:
         """Mean and σ (B, T, C) at t_target (B, T); features (B, 16), or (1, 16) for all."""
         mu_a, sigma_a, mu_e, sigma_e = self.decode(self.represent(observations), features, t_target)
         a, e = self.action_scale, self.effect_scale
@@ -148,12 +150,12 @@ class AffordanceCNP(nn.Module):
 
     def loss(
         self,
-        image: torch.Tensor,
+        image: Tensor,
         observations: Observations,
-        t_target: torch.Tensor,
-        action: torch.Tensor,
-        effect: torch.Tensor,
-    ) -> torch.Tensor:
+        t_target: Tensor,
+        action: Tensor,
+        effect: Tensor,
+    ) -> Tensor:
         """Negative log-likelihood (Section 3.2) of the targets (B, T, C), per value."""
         mu_a, sigma_a, mu_e, sigma_e = self(image, observations, t_target)
         nll_a = _nll(action / self.action_scale, mu_a, sigma_a)
@@ -161,17 +163,17 @@ class AffordanceCNP(nn.Module):
         return (nll_a.mean() + nll_e.mean()) / 2
 
 
-def _with_time(values: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
+def _with_time(values: Tensor, t: Tensor) -> Tensor:
     return torch.cat([values, t[..., None]], dim=-1)
 
 
-def _mean(h: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+def _mean(h: Tensor, mask: Tensor) -> Tensor:
     """Mean over the observed: (B, n, H), (B, n) → (B, H); zero where nothing is observed."""
     seen = mask[..., None].to(h.dtype)
     return (h * seen).sum(dim=1) / seen.sum(dim=1).clamp_min(1)
 
 
-def _nll(y: torch.Tensor, mean: torch.Tensor, std: torch.Tensor) -> torch.Tensor:
+def _nll(y: Tensor, mean: Tensor, std: Tensor) -> Tensor:
     return 0.5 * ((y - mean) / std) ** 2 + std.log() + 0.5 * math.log(2 * math.pi)
 
 

@@ -1,7 +1,7 @@
 """The paper's continuous planner (Section 3.4, Algorithm 1), its two slips mended.
 
     direction ← random point on the circle of radius 0.2 m
-    repeat    loss ← mean square of (target - predicted effect at t = 1), given e_1 = direction, w₂ = 1
+    repeat    loss ← mean square of (target - predicted effect at t = 1 | e_1 = direction)
               direction ← direction - gradient step              until it no longer changes
     query the whole action and effect trajectory; stop at the phase of least distance to the target
 

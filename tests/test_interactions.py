@@ -1,0 +1,216 @@
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import torch
+
+from affordlib.interactions import (
+    CorruptedDataError,
+    Normaliser,
+    TrainingArrays,
+    collect,
+    open_interactions,
+    split_interactions,
+    store,
+)
+from affordlib.interactions.batches import observe_action, sample_batch
+from affordlib.interactions.collect import collect as collect_set
+from affordlib.interactions.recipes import RECIPES, Recipe, interact
+from affordlib.interactions.store import dataset_sha256
+
+SMALL = Recipe(n_interactions=6, seed=11)
+
+
+@pytest.fixture
+def small_chunks(monkeypatch):
+    monkeypatch.setattr(store, "CHUNK", 2)
+    monkeypatch.setattr(collect, "CHUNK", 2)
+
+
+@pytest.fixture(scope="module")
+def small_set(tmp_path_factory):
+    return collect_set(SMALL, tmp_path_factory.mktemp("set") / "small.zarr.zip", progress=False)
+
+
+def test_the_shipped_set_is_what_its_recipe_says(pushes, world):
+    assert Recipe.from_json(pushes.attrs["recipe"]) == RECIPES["push"]
+    assert pushes.sizes["interaction"] == 500
+    assert pushes.sizes["sample"] == 301
+    assert not pushes["fault"].any()
+    for index in (0, 123):
+        thing, seen = interact(RECIPES["push"], index, world)
+        stored = pushes.isel(interaction=index)
+        # Bits are promised on one machine; elsewhere processors round differently.
+        gap = np.abs(stored["effect"].values[:, :2] - seen.effect[:, :2]).max()
+        assert gap < 0.001
+        assert stored["size"].values[2] == pytest.approx(thing.height_m, rel=1e-6)
+
+
+def test_collected_by_any_number_of_workers_it_is_the_same(small_set, small_chunks, tmp_path):
+    one = dataset_sha256(open_interactions(small_set))
+    two_path = collect_set(SMALL, tmp_path / "two.zarr.zip", workers=2, progress=False)
+    assert dataset_sha256(open_interactions(two_path)) == one
+    other = collect_set(Recipe(n_interactions=6, seed=12), tmp_path / "b.zarr.zip", progress=False)
+    assert dataset_sha256(open_interactions(other)) != one
+
+
+_COLLECT = (
+    "import sys; from affordlib.interactions import store, collect as c; store.CHUNK = c.CHUNK = 2;"
+    "from affordlib.interactions.recipes import Recipe;"
+    "c.collect(Recipe(n_interactions=6, seed=11), sys.argv[1], progress=False)"
+)
+
+
+def test_killed_and_run_again_it_is_the_same(small_set, small_chunks, tmp_path):
+    path = tmp_path / "killed.zarr.zip"
+    process = subprocess.Popen([sys.executable, "-c", _COLLECT, str(path)])
+    deadline = time.monotonic() + 60
+    while not list(tmp_path.glob(".killed*/0*.npz")) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    with pytest.raises(RuntimeError, match="another process is collecting"):
+        collect_set(SMALL, path, progress=False)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    assert not path.exists()
+    assert len(list(tmp_path.glob(".killed*/0*.npz"))) >= 1
+    collect_set(SMALL, path, progress=False)
+    assert dataset_sha256(open_interactions(path)) == dataset_sha256(open_interactions(small_set))
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["killed.zarr.zip"]
+
+
+def test_a_damaged_file_is_never_read(small_set, tmp_path):
+    whole = small_set.read_bytes()
+    expected = dataset_sha256(open_interactions(small_set))
+    rng = np.random.default_rng(0)
+    caught = 0
+    for position in rng.integers(0, len(whole), 40):
+        damaged = bytearray(whole)
+        damaged[position] ^= 1 << int(rng.integers(8))
+        path = tmp_path / "damaged.zarr.zip"
+        path.write_bytes(damaged)
+        try:
+            read = open_interactions(path)
+        except CorruptedDataError:
+            caught += 1
+        else:
+            # A flip in the zip's padding or times harms nothing.
+            assert dataset_sha256(read) == expected
+    assert caught >= 30
+
+
+def test_a_missing_chunk_is_an_error_and_not_zeros(small_set, tmp_path):
+    import zipfile
+
+    path = tmp_path / "holed.zarr.zip"
+    with zipfile.ZipFile(small_set) as source, zipfile.ZipFile(path, "w") as target:
+        for name in source.namelist():
+            if name != "effect/c/0/0/0":
+                target.writestr(name, source.read(name))
+        assert "effect/c/0/0/0" in source.namelist()
+    with pytest.raises(CorruptedDataError, match="effect differ"):
+        open_interactions(path)
+
+
+def test_a_missing_set_names_the_shipped_ones(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"'pull'.*\['push', 'push_test'\]"):
+        open_interactions("pull")
+    (tmp_path / "x.zarr.zip").write_text("not a zip")
+    with pytest.raises(CorruptedDataError, match=r"x\.zarr\.zip cannot be read"):
+        open_interactions(tmp_path / "x.zarr.zip")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"primitive": "kick"}, "primitive 'kick'"),
+        ({"families": ("cone",)}, "family 'cone'"),
+        ({"families": ()}, "families must name"),
+        ({"n_interactions": 0}, "n_interactions .* 0"),
+        ({"seed": -1}, "seed .* -1"),
+        ({"seed": 1.5}, r"seed .* 1\.5"),
+    ],
+)
+def test_a_bad_recipe_is_named(arguments, words):
+    with pytest.raises(ValueError, match=words):
+        Recipe(**arguments)
+
+
+def test_a_failed_write_leaves_nothing(tmp_path, small_set, monkeypatch):
+    def full_disk(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(store, "_zip_folder", full_disk)
+    parts = [open_interactions(small_set)]
+    with pytest.raises(OSError, match="No space left"):
+        store.write_interactions(parts, tmp_path / "x.zarr.zip")
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(ValueError, match=r"path must end in '\.zarr\.zip'"):
+        collect_set(SMALL, tmp_path / "x.zarr")
+
+
+def test_splits_and_folds():
+    folds = [split_interactions(500, seed=3, fold=k) for k in range(10)]
+    assert sorted(np.concatenate([f.test for f in folds])) == list(range(500))
+    for split in folds:
+        parts = [split.train, split.validation, split.test]
+        assert [len(p) for p in parts] == [400, 50, 50]
+        assert len(np.unique(np.concatenate(parts))) == 500
+    assert not np.array_equal(folds[0].test, split_interactions(500, seed=4).test)
+    with pytest.raises(ValueError, match="fold must lie in"):
+        split_interactions(500, fold=10)
+
+
+def test_quarter_turns_turn_image_action_and_effect_alike(pushes):
+    arrays = TrainingArrays.from_dataset(pushes, np.arange(20))
+    turned = arrays
+    for _ in range(4):
+        turned = turned.turned(1)
+    assert torch.equal(turned.image, arrays.image)
+    assert torch.equal(turned.effect, arrays.effect)
+    once = arrays.turned(1, mirror=True)
+    start = arrays.action[:, 0] * torch.tensor([1.0, -1.0])
+    assert torch.allclose(once.action[:, 0], torch.stack([-start[:, 1], start[:, 0]], dim=1))
+    # The object's elongation, seen in the mask, turns with the push.
+    pixel = torch.arange(48) - 23.5
+    for rows, columns in ((pixel, pixel),):
+        mask = arrays.image[:, 1]
+        slant = torch.einsum("nrc,r,c->n", mask, -rows, columns)
+        seen = torch.einsum("nrc,r,c->n", once.image[:, 1], -rows, columns)
+        # Mirroring and a quarter turn each change the sign of the product x·y.
+        assert torch.allclose(seen, slant, atol=1.0)
+
+
+def test_normaliser_keeps_zero_and_gives_unit_size(pushes):
+    arrays = TrainingArrays.from_dataset(pushes)
+    normaliser = Normaliser.fit(arrays)
+    assert normaliser.effect_scale[0] == normaliser.effect_scale[1]
+    scaled = arrays.effect / torch.tensor(normaliser.effect_scale)
+    assert scaled.square().mean().sqrt() == pytest.approx(1.0, abs=1e-4)
+
+
+def test_batches_hold_what_the_trajectories_hold(pushes):
+    arrays = TrainingArrays.from_dataset(pushes, np.arange(8))
+    batch = sample_batch(arrays, torch.arange(8), 5, 10, torch.Generator().manual_seed(0))
+    at = (batch.t_target * 300).round().long()
+    assert torch.equal(batch.effect, arrays.effect[torch.arange(8)[:, None], at])
+    assert (batch.t_target[:, 0] == 1).all()
+    seen = batch.observations
+    nothing = ~(seen.action_mask.any(1) | seen.effect_mask.any(1))
+    assert not nothing.any()
+    assert (seen.weight[~seen.effect_mask.any(1)] == 1).all()
+    assert (seen.weight[~seen.action_mask.any(1)] == 0).all()
+    ends = observe_action(arrays)
+    assert ends.action_t.unique().tolist() == [0.0, 1.0]
+    with pytest.raises(ValueError, match="'spin'"):
+        TrainingArrays.from_dataset(pushes, effect_channels=("x", "spin"))
+
+
+def test_shipped_files_record_their_units(pushes):
+    assert pushes["effect"].attrs["units"] == "m, rad"
+    assert "pybullet=" in pushes.attrs["versions"]
+    assert len(json.loads(pushes.attrs["manifest_sha256"])) >= 12

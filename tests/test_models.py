@@ -1,0 +1,273 @@
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from affordlib.evaluation import mean_length_errors_m, refuse_seen
+from affordlib.interactions import Normaliser, TrainingArrays, split_interactions
+from affordlib.interactions.batches import observe, observe_action
+from affordlib.models import (
+    AffordanceCNP,
+    CNPConfig,
+    EffectModel,
+    TrainingConfig,
+    load_checkpoint,
+    observe_pushes,
+    save_checkpoint,
+    train,
+)
+from affordlib.models.training import final_errors_m
+from affordlib.primitives import Push
+from affordlib.types import Observations
+
+N = 7
+
+
+def some_observations(seed: int = 0, n: int = N, m: int = N) -> Observations:
+    g = torch.Generator().manual_seed(seed)
+
+    def rand(*shape: int) -> torch.Tensor:
+        return torch.rand(*shape, generator=g)
+
+    everything = torch.ones(2, n, dtype=torch.bool)
+    return Observations(
+        0.2 * rand(2, n, 2), rand(2, n), everything,
+        0.1 * rand(2, m, 2), rand(2, m), torch.ones(2, m, dtype=torch.bool), rand(2),
+    )  # fmt: skip
+
+
+def linear_sizes(module: nn.Module) -> list[tuple[int, int]]:
+    layers = [layer for layer in module.modules() if isinstance(layer, nn.Linear)]
+    return [(layer.in_features, layer.out_features) for layer in layers]
+
+
+def test_layer_table_of_the_appendix(untrained):
+    encoder = [(3, 32), (32, 64), (64, 64), (64, 128), (128, 128), (128, 256), (256, 128)]
+    decoder = [(1024, 512), (512, 256), (256, 128), (128, 32), (32, 4)]
+    assert linear_sizes(untrained.action_encoder) == encoder
+    assert linear_sizes(untrained.effect_encoder) == encoder
+    assert isinstance(untrained.action_encoder[-1], nn.LeakyReLU)
+    assert isinstance(untrained.effect_encoder[-1], nn.Linear)
+    assert linear_sizes(untrained.merge) == [(128 + 16 + 1, 1024)]
+    assert linear_sizes(untrained.action_decoder) == decoder
+    assert linear_sizes(untrained.effect_decoder) == decoder
+    assert sum(p.numel() for p in untrained.parameters()) == 2_009_912
+
+    shapes, x = [], torch.zeros(1, 2, 48, 48)
+    for layer in untrained.image_encoder:
+        x = layer(x)
+        if isinstance(layer, nn.MaxPool2d):
+            shapes.append(tuple(x.shape[1:]))
+    assert shapes == [(32, 24, 24), (64, 12, 12), (64, 6, 6), (128, 3, 3), (128, 1, 1)]
+    assert x.shape == (1, 16)
+
+
+def test_it_is_an_effect_model(untrained):
+    assert isinstance(untrained, EffectModel)
+
+
+def test_order_of_observations_does_not_matter(untrained):
+    seen = some_observations()
+    order = torch.randperm(N, generator=torch.Generator().manual_seed(1))
+    shuffled = Observations(
+        seen.action[:, order], seen.action_t[:, order], seen.action_mask,
+        seen.effect, seen.effect_t, seen.effect_mask, seen.weight,
+    )  # fmt: skip
+    torch.testing.assert_close(untrained.represent(seen), untrained.represent(shuffled))
+
+
+def test_representation_is_equations_2_and_3(untrained):
+    """Observed at the same times, r is the mean of r_i = w₁ h_a(a_i) + w₂ h_e(e_i)."""
+    seen = some_observations()
+    expected = []
+    for b in range(2):
+        r_i = []
+        for i in range(N):
+            a = torch.cat([seen.action[b, i] / 0.1, seen.action_t[b, i : i + 1]])
+            e = torch.cat([seen.effect[b, i] / 0.03, seen.effect_t[b, i : i + 1]])
+            w_1 = seen.weight[b]
+            h_a, h_e = untrained.action_encoder(a), untrained.effect_encoder(e)
+            r_i.append(w_1 * h_a + (1 - w_1) * h_e)
+        expected.append(torch.stack(r_i).mean(dim=0))
+    torch.testing.assert_close(untrained.represent(seen), torch.stack(expected))
+
+
+def test_masked_observations_count_for_nothing(untrained):
+    seen = some_observations()
+    mask = torch.arange(N) < 3
+    hidden = Observations(
+        torch.where(mask[:, None], seen.action, 1e3), seen.action_t, mask.expand(2, -1),
+        seen.effect, seen.effect_t, seen.effect_mask, seen.weight,
+    )  # fmt: skip
+    short = Observations(
+        seen.action[:, :3], seen.action_t[:, :3], seen.action_mask[:, :3],
+        seen.effect, seen.effect_t, seen.effect_mask, seen.weight,
+    )  # fmt: skip
+    torch.testing.assert_close(untrained.represent(hidden), untrained.represent(short))
+
+
+def test_folded_decoding_equals_the_layers_one_by_one(untrained):
+    r, features = torch.randn(2, 128), torch.randn(2, 16)
+    t = torch.rand(2, 5)
+    known = torch.cat([r, features], dim=1)[:, None].expand(-1, 5, -1)
+    merged = untrained.merge(torch.cat([known, t[..., None]], dim=-1))
+    mu_a, sigma_a, mu_e, sigma_e = untrained.decode(r, features, t)
+    for decoder, mean, std in (
+        (untrained.action_decoder, mu_a, sigma_a),
+        (untrained.effect_decoder, mu_e, sigma_e),
+    ):
+        literal_mean, raw = decoder(merged).chunk(2, dim=-1)
+        torch.testing.assert_close(mean, literal_mean, rtol=1e-4, atol=1e-4)
+        expected = untrained.sigma_floor + nn.functional.softplus(raw)
+        torch.testing.assert_close(std, expected, rtol=1e-4, atol=1e-4)
+
+
+def test_loss_is_the_gaussian_log_likelihood(untrained):
+    seen, t = some_observations(), torch.rand(2, 5)
+    image, action, effect = torch.rand(2, 2, 48, 48), torch.rand(2, 5, 2), torch.rand(2, 5, 2)
+    mu_a, sigma_a, mu_e, sigma_e = untrained(image, seen, t)
+    a = torch.distributions.Normal(mu_a, sigma_a).log_prob(action / 0.1).mean()
+    e = torch.distributions.Normal(mu_e, sigma_e).log_prob(effect / 0.03).mean()
+    torch.testing.assert_close(untrained.loss(image, seen, t, action, effect), -(a + e) / 2)
+
+
+def test_gradient_with_respect_to_the_observed_effect(untrained):
+    """The gradient planner descends it; compare with finite differences, in double precision."""
+    model = untrained.double()
+    features = model.encode(torch.rand(1, 2, 48, 48, dtype=torch.float64))
+
+    def predicted(effect: torch.Tensor) -> torch.Tensor:
+        none = torch.zeros(1, 1, dtype=torch.bool)
+        one = torch.ones(1, 1, dtype=torch.float64)
+        seen = Observations(
+            torch.zeros(1, 1, 2, dtype=torch.float64), 0 * one, none,
+            effect[:, None], one, ~none, torch.zeros(1, dtype=torch.float64),
+        )  # fmt: skip
+        return model.predict(features, seen, one).effect_mean
+
+    effect = torch.tensor([[0.05, -0.08]], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(predicted, (effect,), eps=1e-7, atol=1e-6)
+
+
+def test_a_minute_of_training_beats_the_mean_length(pushes):
+    """The check that an eighth of the shipped training already learns what an image tells."""
+    split = split_interactions(500)
+    training = TrainingArrays.from_dataset(pushes, split.train)
+    validation = TrainingArrays.from_dataset(pushes, split.validation)
+    torch.manual_seed(0)
+    model = AffordanceCNP(CNPConfig(), Normaliser.fit(training))
+    config = TrainingConfig(steps=600, n_targets=8, batch_size=48, validate_every=200)
+    history = train(model, training, validation, config, progress=False)
+    assert history[-1].loss < history[0].loss
+    errors = final_errors_m(model, validation)
+    # Early stopping keeps the best weights, not the last.
+    assert errors.mean() == pytest.approx(min(h.validation_error_m for h in history), rel=1e-4)
+    assert errors.mean() < mean_length_errors_m(training, validation).mean()
+
+
+def test_training_is_repeatable(pushes):
+    arrays = TrainingArrays.from_dataset(pushes, np.arange(40))
+    weights = []
+    for _ in range(2):
+        torch.manual_seed(1)
+        model = AffordanceCNP(CNPConfig(), Normaliser.fit(arrays))
+        train(model, arrays, arrays, TrainingConfig(steps=3, batch_size=8), progress=False)
+        weights.append(model.merge.weight.detach().clone())
+    assert torch.equal(*weights)
+
+
+def test_the_shipped_model_on_the_held_out_pushes(trained, test_pushes, pushes):
+    """At most 7 mm, and clearly better than a direction and a mean length."""
+    test = TrainingArrays.from_dataset(test_pushes)
+    training = TrainingArrays.from_dataset(pushes, split_interactions(500).train)
+    errors = final_errors_m(trained, test)
+    assert len(errors) == 1000
+    assert errors.mean() < 0.006
+    assert errors.mean() < 0.75 * mean_length_errors_m(training, test).mean()
+    # Conditioned on the effect instead, it finds the action that gives it.
+    n = len(test)
+    one, none = torch.ones(n, 1, dtype=torch.bool), torch.zeros(n, 1, dtype=torch.bool)
+    at_end = torch.full((n, 1), 300)
+    seen = observe(test, at_end, none, at_end, one, torch.zeros(n))
+    action = trained.predict(trained.encode(test.image), seen, torch.zeros(n, 1)).action_mean
+    turned = torch.atan2(action[:, 0, 1], action[:, 0, 0]) - torch.atan2(
+        test.action[:, 0, 1], test.action[:, 0, 0]
+    )
+    degrees = torch.rad2deg(torch.atan2(turned.sin(), turned.cos())).abs()
+    assert degrees.median() < 8
+
+
+def test_encoding_once_equals_encoding_each_time(trained, test_pushes):
+    one = TrainingArrays.from_dataset(test_pushes, np.arange(1))
+    pushed = [Push(theta) for theta in np.linspace(0, 6, 8)]
+    seen, t = observe_pushes(trained, pushed), torch.ones(8, 1)
+    once = trained.predict(trained.encode(one.image), seen, t)
+    each = trained.predict(trained.encode(one.image.expand(8, -1, -1, -1)), seen, t)
+    torch.testing.assert_close(once.effect_mean, each.effect_mean, rtol=1e-4, atol=1e-6)
+    # What observe_pushes commands is what the data set stores.
+    recorded = observe_action(one)
+    again = observe_pushes(trained, [Push(float(test_pushes["theta"][0]))])
+    torch.testing.assert_close(recorded.action, again.action, atol=1e-6, rtol=0)
+
+
+def test_checkpoint_round_trip(untrained, tmp_path):
+    path = save_checkpoint(untrained, tmp_path / "m.safetensors", {"note": "none"})
+    again, about = load_checkpoint(path)
+    assert about == {"note": "none"}
+    assert again.normaliser == untrained.normaliser
+    for name, value in untrained.state_dict().items():
+        assert torch.equal(again.state_dict()[name], value)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["m.json", "m.safetensors"]
+
+
+def test_a_bad_checkpoint_is_named(untrained, tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"'nobody'.*'push_cnp'"):
+        load_checkpoint("nobody")
+    path = save_checkpoint(untrained, tmp_path / "m.safetensors", {})
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(ValueError, match=r"m\.safetensors does not hold the weights"):
+        load_checkpoint(path)
+    three = CNPConfig(effect_channels=("x", "y", "yaw"))
+    other = AffordanceCNP(three, Normaliser((1, 1), (1, 1, 1), (0, 0), (1, 1)))
+    save_checkpoint(other, tmp_path / "other.safetensors", {})
+    path.write_bytes((tmp_path / "other.safetensors").read_bytes())
+    with pytest.raises(ValueError, match="does not hold the weights of the model"):
+        load_checkpoint(path)
+    path.with_suffix(".json").write_text(json.dumps({"format": "something else"}))
+    with pytest.raises(ValueError, match="does not describe a model of this package"):
+        load_checkpoint(path)
+
+
+def test_a_failed_save_leaves_nothing(untrained, tmp_path):
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        save_checkpoint(untrained, tmp_path / "m.safetensors", {"loss": math.nan})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_model_is_not_judged_on_what_it_saw(pushes, test_pushes):
+    _, about = load_checkpoint("push_cnp")
+    split = split_interactions(500)
+    refuse_seen(about, pushes, split.test)
+    refuse_seen(about, test_pushes, np.arange(1000))
+    for part in (split.train, split.validation):
+        with pytest.raises(ValueError, match="was trained or tuned on"):
+            refuse_seen(about, pushes, part)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: TrainingConfig(steps=0), "steps .* 0"),
+        (lambda: TrainingConfig(learning_rate=math.nan), "learning_rate .* nan"),
+        (lambda: TrainingConfig(max_minutes=-1), "max_minutes .* -1"),
+        (lambda: CNPConfig(sigma_floor=0.0), "sigma_floor .* 0.0"),
+        (lambda: CNPConfig(action_channels=()), "action_channels must name"),
+    ],
+)
+def test_bad_settings_are_named(make, words):
+    with pytest.raises(ValueError, match=words):
+        make()

@@ -1,0 +1,196 @@
+"""Every notebook: as it is committed, and run once with the values of the smoke profile."""
+
+import ast
+import os
+import re
+import subprocess
+import sys
+
+import nbformat
+import papermill
+import pytest
+from IPython.core.inputtransformer2 import TransformerManager
+
+from affordlib.profiles import default_parameters, notebook_paths
+from affordlib.results import read_results
+from affordlib.workbook import Layout, cleaned, make_jobs
+
+LAYOUT = Layout.of_repository()
+PATHS = notebook_paths(LAYOUT.notebooks)
+PROFILES = ("smoke", "reader", "full")
+BROKEN = LAYOUT.notebooks.parent / "tests" / "broken.ipynb"
+# A folder of some machine: a slash that begins a word, and a name that systems use at the root.
+ABSOLUTE = re.compile(
+    r"(?<![\w.~/:-])/(?:home|root|tmp|work|usr|var|opt|mnt|media|Users|private)/\w|\b[A-Z]:\\\w"
+)
+
+each_notebook = pytest.mark.parametrize("name", list(PATHS))
+
+
+def read(name):
+    return nbformat.read(PATHS[name], as_version=4)
+
+
+def code_of(notebook):
+    return [cell for cell in notebook.cells if cell.cell_type == "code"]
+
+
+def test_the_book_is_there():
+    assert next(iter(PATHS), None) == "00_start_here"
+
+
+# As committed
+
+
+@each_notebook
+def test_title(name):
+    first = read(name).cells[0]
+    assert first.cell_type == "markdown"
+    assert re.match(rf"# {name[:2]} \S", first.source), f"{name} must begin '# {name[:2]} Title'"
+
+
+@each_notebook
+def test_parameters(name):
+    defaults = default_parameters(read(name), name)
+    assert defaults["seed"] == 0
+    assert defaults["out_dir"] == "runs/lab"
+
+
+@each_notebook
+def test_every_parameter_is_used(name):
+    notebook = read(name)
+    cells = code_of(notebook)
+    at = next(i for i, c in enumerate(cells) if "parameters" in c.metadata.get("tags", []))
+    used = set()
+    for cell in cells[at + 1 :]:
+        for node in ast.walk(ast.parse(TransformerManager().transform_cell(cell.source))):
+            if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load):
+                used.add(node.id)
+    assert not default_parameters(notebook, name).keys() - used
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_every_value_of_a_profile_is_a_parameter_of_its_type(profile):
+    if PATHS:
+        make_jobs(LAYOUT, profile, [], {"seed": 0, "out_dir": "runs/x"})
+
+
+@each_notebook
+def test_executed_in_order_without_errors(name):
+    cells = code_of(read(name))
+    assert [cell.execution_count for cell in cells] == list(range(1, len(cells) + 1))
+    outputs = [output for cell in cells for output in cell.outputs]
+    assert outputs, "run `make notebooks`"
+    assert [o for o in outputs if o.output_type == "error" or o.get("name") == "stderr"] == []
+
+
+@each_notebook
+def test_small_and_clean(name):
+    text = PATHS[name].read_text(encoding="utf-8")
+    assert len(text.encode()) < 1_500_000
+    assert text == cleaned(read(name)), "metadata is not clean; run `make notebooks`"
+
+
+@each_notebook
+def test_cells_are_short_and_never_empty(name):
+    for number, cell in enumerate(read(name).cells, 1):
+        assert cell.source.strip(), f"cell {number} of {name} is empty"
+        if cell.cell_type == "code":
+            lines = cell.source.count("\n") + 1
+            assert lines <= 30, f"cell {number} of {name} has {lines} lines"
+
+
+@each_notebook
+def test_nothing_depends_on_the_machine(name):
+    for number, cell in enumerate(read(name).cells, 1):
+        outputs = [
+            output.get("text", "")
+            + "".join(str(v) for k, v in output.get("data", {}).items() if k.startswith("text/"))
+            for output in cell.get("outputs", [])
+        ]
+        found = ABSOLUTE.search("\n".join([cell.source, *outputs]))
+        assert not found, f"cell {number} of {name} holds the absolute path {found.group()!r}"
+        if cell.cell_type == "code":
+            bad = re.search(r"\bsys\.path\b|\bos\.chdir\b|^\s*[!%]\s*(pip|cd)\b", cell.source, re.M)
+            assert not bad, f"cell {number} of {name} has {bad.group()!r}"
+            assert "filterwarnings" not in cell.source
+
+
+@each_notebook
+def test_links_lead_somewhere(name):
+    text = "\n".join(cell.source for cell in read(name).cells if cell.cell_type == "markdown")
+    for link in re.findall(r"\]\(([^)\s#]+)", text):
+        if "://" not in link and not link.startswith("attachment:"):
+            assert (PATHS[name].parent / link).exists(), f"{name} links to {link}"
+
+
+@pytest.mark.parametrize(
+    ("text", "is_absolute"),
+    [
+        ("open('/home/ann/x')", True),
+        ("/tmp/a", True),
+        (r"C:\data", True),
+        ("runs/lab/tmp/x", False),
+        ("https://example.org/home/x", False),
+        ("1/2, a/b, </div>", False),
+        ("~/home/x", False),
+    ],
+)
+def test_absolute_paths_are_recognised(text, is_absolute):
+    assert bool(ABSOLUTE.search(text)) == is_absolute
+
+
+# As run
+
+
+def prepare(path, parameters, folder):
+    """Put a copy with these parameters into a folder, ready to run."""
+    copy = folder / path.name
+    papermill.execute_notebook(
+        path, copy, parameters, prepare_only=True, kernel_name="python3", language="python"
+    )
+    return copy
+
+
+def run_with_nbval(copy):
+    """Run a prepared notebook in a pytest of its own: asserts, and outputs marked to be checked."""
+    command = [sys.executable, "-m", "pytest", "--nbval-lax", "--nbval-current-env"]
+    command += ["--nbval-cell-timeout=600", "-p", "no:cacheprovider", "--rootdir", copy.parent]
+    environment = {k: v for k, v in os.environ.items() if k not in ("PYTEST_ADDOPTS", "MPLBACKEND")}
+    return subprocess.run(
+        [*map(str, command), str(copy)], env=environment, capture_output=True, text=True
+    )
+
+
+@pytest.fixture(scope="module")
+def smoke(tmp_path_factory):
+    """The folder of one run, shared: later notebooks may read what earlier ones wrote."""
+    folder = tmp_path_factory.mktemp("smoke")
+    return folder, {
+        job.name: job for job in make_jobs(LAYOUT, "smoke", [], {"seed": 0, "out_dir": str(folder)})
+    }
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+@each_notebook
+def test_run(name, smoke):
+    folder, jobs = smoke
+    copy = prepare(PATHS[name], jobs[name].overrides, folder)
+    done = run_with_nbval(copy)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert f"{len(code_of(nbformat.read(copy, as_version=4)))} passed" in done.stdout
+    document = read_results(folder / f"{name}.json")
+    assert document["notebook"] == name
+    asked = jobs[name].parameters
+    assert {k: v for k, v in document["parameters"].items() if k in asked}.items() <= asked.items()
+
+
+def test_the_same_route_fails_on_a_broken_notebook(tmp_path):
+    copy = prepare(BROKEN, {"seed": 1, "out_dir": str(tmp_path)}, tmp_path)
+    done = run_with_nbval(copy)
+    assert done.returncode == 1, done.stdout + done.stderr
+    # A wrong output and a false assert fail; the parameters, given and injected, pass.
+    assert "2 failed, 2 passed" in done.stdout
+    assert "assert total == 3" in done.stdout
+    assert "mismatch 'stdout'" in done.stdout

@@ -1,0 +1,249 @@
+"""What a notebook writes comes back the same, whole or not at all, and tables are drawn from it."""
+
+import errno
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from affordlib import paths, results
+from affordlib.results import fill_tables, markdown_table, read_results, write_results
+
+ROWS = [
+    {"planner": "astar", "n": 30, "mean_m": 0.00441, "plan_ms_median": 12.345, "tp_percent": 80.0},
+    {"planner": "gradient", "n": 30, "mean_m": None, "plan_ms_median": 1.0, "tp_percent": 99.96},
+]
+
+
+def test_round_trip_converts_numpy_scalars(tmp_path):
+    row = {
+        "n": np.int64(3),
+        "mean_m": np.float32(0.5),
+        "ok": np.bool_(True),
+        "name": "a|b",
+        "x": None,
+    }
+    path = write_results(tmp_path, "06_planning", {"modes": ("full", "partial")}, {"t": [row]})
+    document = read_results(path)
+    assert path == tmp_path / "06_planning.json"
+    assert document["notebook"] == "06_planning"
+    assert document["parameters"] == {"modes": ["full", "partial"]}
+    assert document["tables"] == {
+        "t": [{"n": 3, "mean_m": 0.5, "ok": True, "name": "a|b", "x": None}]
+    }
+    assert document["tables"]["t"][0]["ok"] is True
+    assert set(document["versions"]) == {
+        "python", "affordlib", "torch", "pybullet", "numpy", "platform",
+    }  # fmt: skip
+
+
+def test_empty_tables_are_valid(tmp_path):
+    assert read_results(write_results(tmp_path, "a", {}, {}))["tables"] == {}
+    assert read_results(write_results(tmp_path, "a", {}, {"t": []}))["tables"] == {"t": []}
+
+
+@pytest.mark.parametrize(
+    ("tables", "error", "named"),
+    [
+        (
+            {"t": [{"mean_m": math.nan}]},
+            ValueError,
+            r"tables\['t'\]\[0\]\['mean_m'\] is nan; .*None",
+        ),
+        ({"t": [{"a": 1.0}, {"a": np.float64("-inf")}]}, ValueError, r"\[1\]\['a'\] is -inf"),
+        ({"t": [{"path": [1, 2]}]}, TypeError, r"\['path'\] must be a number.*list \[1, 2\]"),
+        ({"t": [{"a": np.zeros(2)}]}, TypeError, r"\['a'\] must be a number.*ndarray"),
+        ({"t": [{3: 1}]}, TypeError, r"tables\['t'\]\[0\] has the key 3"),
+        ({"t": {"a": 1}}, TypeError, r"tables\['t'\] must be a list of rows, got dict"),
+        ({"t": [[1]]}, TypeError, r"tables\['t'\]\[0\] must map columns"),
+    ],
+)
+def test_bad_tables_are_refused_before_anything_is_written(tmp_path, tables, error, named):
+    with pytest.raises(error, match=named):
+        write_results(tmp_path, "06_planning", {}, tables)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["", "a/b", "../a", ".a", "06_planning.json", "06_planning.ipynb"])
+def test_bad_notebook_names_are_refused(tmp_path, name):
+    with pytest.raises(ValueError, match="notebook must be a plain name"):
+        write_results(tmp_path, name, {}, {})
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("step", ["fsync", "replace"])
+def test_a_full_disk_leaves_the_old_file(tmp_path, monkeypatch, step):
+    path = write_results(tmp_path, "a", {}, {"t": [{"n": 1}]})
+    before = path.read_bytes()
+
+    def fail(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, step, fail)
+    with pytest.raises(OSError, match="No space left"):
+        write_results(tmp_path, "a", {}, {"t": [{"n": 2}]})
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_kill_never_leaves_half_a_file(tmp_path):
+    code = (
+        "import itertools, sys\n"
+        "from affordlib.results import write_results\n"
+        "rows = [{'n': i, 'text': 'x' * 200} for i in range(2000)]\n"
+        "for i in itertools.count():\n"
+        "    write_results(sys.argv[1], 'a', {'i': i}, {'t': rows})\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)])
+    try:
+        while not (tmp_path / "a.json").exists():
+            assert process.poll() is None
+            time.sleep(0.01)
+        time.sleep(0.3)
+    finally:
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    document = read_results(tmp_path / "a.json")
+    assert [row["n"] for row in document["tables"]["t"]] == list(range(2000))
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ('{"notebook": "a", "parameters": {}, "vers', "is not valid JSON"),
+        (
+            '{"notebook": "a", "parameters": {}, "versions": {}, "tables": {"t": [{"a": NaN}]}}',
+            "NaN",
+        ),
+        ('{"notebook": "a", "parameters": {}, "versions": {}}', "has no 'tables'"),
+        ("[]", "has no 'notebook'"),
+        (
+            '{"notebook": "a", "parameters": {}, "versions": {}, "tables": {"t": [{"a": [1]}]}}',
+            "holds bad tables",
+        ),
+    ],
+)
+def test_damaged_results_are_refused_with_a_remedy(tmp_path, text, reason):
+    (tmp_path / "a.json").write_text(text)
+    with pytest.raises(ValueError, match=rf"a\.json.*{reason}.*delete it and run"):
+        read_results(tmp_path / "a.json")
+
+
+def test_missing_results_are_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"no results at .*b\.json; run the notebook"):
+        read_results(tmp_path / "b.json")
+
+
+def test_relative_folders_start_at_the_repository(tmp_path, monkeypatch):
+    root = tmp_path / "checkout"
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.setattr(paths, "repo_root", lambda: root)
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert paths.resolve_out_dir("runs/lab") == root / "runs" / "lab"
+    assert (root / "runs" / "lab").is_dir()
+    assert paths.resolve_out_dir(tmp_path / "x") == tmp_path / "x"
+    (root / "file").write_text("")
+    for bad in ("file", "file/under"):
+        with pytest.raises(NotADirectoryError, match="out_dir must be a folder"):
+            paths.resolve_out_dir(bad)
+    with pytest.raises(ValueError, match="out_dir must name a folder"):
+        paths.resolve_out_dir("")
+    (root / "data").mkdir()
+    (root / "data" / "push.zarr.zip").write_text("")
+    assert paths.data_path("push.zarr.zip") == root / "data" / "push.zarr.zip"
+    with pytest.raises(FileNotFoundError, match=r"'pull' is not in .*push\.zarr\.zip.*make data"):
+        paths.data_path("pull")
+
+
+def test_repo_root_is_the_checkout():
+    assert (paths.repo_root() / "tests" / "test_results.py").samefile(__file__)
+
+
+MARKDOWN = """\
+| planner | n | mean, mm | plan median, ms | tp, % |
+| --- | ---: | ---: | ---: | ---: |
+| astar | 30 | 4.41 | 12.3 | 80.0 |
+| gradient | 30 | – | 1.0 | 100.0 |
+"""
+
+
+def test_markdown_table_shows_units_and_few_digits():
+    assert markdown_table(ROWS) == MARKDOWN
+    assert (
+        markdown_table(ROWS[:1], ["n", "planner"])
+        == "| n | planner |\n| ---: | --- |\n| 30 | astar |\n"
+    )
+    with pytest.raises(ValueError, match="'speed' is not in the table; it has planner, n"):
+        markdown_table(ROWS, ["speed"])
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "head", "shown"),
+    [
+        ("p95_m", 0.0123456, "p95, mm", "12.35"),
+        ("theta_rad", math.pi / 2, "theta, °", "90.0"),
+        ("error_mm", -0.001, "error, mm", "0.00"),
+        ("loss", 0.123456, "loss", "0.123"),
+        ("loss", 12345.6, "loss", "12346"),
+        ("closed_loop", False, "closed loop", "no"),
+        ("samples", np.int64(300), "samples", "300"),
+        ("mean_m", np.float32(0.5), "mean, mm", "500.00"),
+        ("m", 3, "m", "3"),
+    ],
+)
+def test_units_come_from_the_name(column, value, head, shown):
+    assert results.heading(column) == head
+    assert results.cell(column, value) == shown
+
+
+def test_results_table_holds_the_same_cells_as_the_markdown():
+    table = results.results_table(ROWS, ["planner", "mean_m"])
+    assert list(table.columns) == ["planner", "mean, mm"]
+    assert table.to_numpy().tolist() == [["astar", "4.41"], ["gradient", "–"]]
+
+
+def test_pages_are_filled_and_checked(tmp_path, capsys):
+    source = write_results(tmp_path, "06_planning", {}, {"planning": ROWS})
+    page = tmp_path / "page.md"
+    opened = f"<!-- table: {source}#planning -->\n"
+    page.write_text(f"# Title\n\n{opened}stale\n<!-- /table -->\n\nend\n")
+    assert results.main(["--check", str(page)]) == 1
+    assert "python -m affordlib.results" in capsys.readouterr().err
+    assert "stale" in page.read_text()
+    assert results.main([str(page)]) == 0
+    assert page.read_text() == f"# Title\n\n{opened}{MARKDOWN}<!-- /table -->\n\nend\n"
+    assert results.main(["--check", str(page)]) == 0
+
+
+def test_blocks_choose_rows_and_columns(tmp_path):
+    source = write_results(tmp_path, "06_planning", {}, {"planning": ROWS})
+    block = "<!-- table: {}#planning {} -->\n<!-- /table -->\n"
+    filled = fill_tables(block.format(source, "planner=gradient columns=n,planner"))
+    assert "| 30 | gradient |\n<!-- /table -->" in filled
+    assert "astar" not in filled
+    for option, reason in [("planner=rrt", "no row"), ("columns=x", "'x'"), ("mode=a", "'mode'")]:
+        with pytest.raises(ValueError, match=reason):
+            fill_tables(block.format(source, option))
+    with pytest.raises(ValueError, match="not closed"):
+        fill_tables(f"<!-- table: {source}#planning -->\n")
+
+
+def test_the_tables_of_the_readme_are_those_of_their_files():
+    readme = paths.repo_root() / "README.md"
+    if not readme.exists():
+        pytest.skip("there is no README.md yet")
+    assert results.BLOCK.search(readme.read_text(encoding="utf-8")), "README.md has no table"
+    assert results.main(["--check", str(readme)]) == 0
+
+
+def test_shipped_results_are_valid_and_carry_no_path():
+    for path in sorted((paths.repo_root() / "data" / "results").glob("*.json")):
+        assert read_results(path)["notebook"] == path.stem
+        for value in json.loads(path.read_text())["parameters"].values():
+            assert not (isinstance(value, str) and os.path.isabs(value))

@@ -1,0 +1,173 @@
+import hashlib
+import math
+import subprocess
+import sys
+
+import numpy as np
+import pybullet
+import pytest
+
+from affordlib.interactions.recipes import Recipe, interact
+from affordlib.primitives import Push, min_jerk, primitive_named
+from affordlib.types import CROP_WIDTH_M, IMAGE_PIXELS, Goal
+from affordlib.world import (
+    Cuboid,
+    Tabletop,
+    UnreachableError,
+    UprightCylinder,
+    WorldConfig,
+    family_named,
+    robot,
+)
+
+THINGS = (Cuboid(0.05, 0.07, 0.06), UprightCylinder(0.06, 0.05))
+
+
+def test_push_path_is_the_papers():
+    push = Push(theta=0.7)
+    path = push.path(np.linspace(0, 1, 301))
+    start, end = path[0, :2], path[-1, :2]
+    np.testing.assert_allclose(start, 0.2 * np.array([math.cos(0.7), math.sin(0.7)]), atol=1e-12)
+    np.testing.assert_allclose(end, -0.05 * np.array([math.cos(0.7), math.sin(0.7)]), atol=1e-12)
+    speed = np.hypot(*np.diff(path[:, :2], axis=0).T)
+    assert speed.argmax() in (149, 150)
+    assert min_jerk(0.5) == pytest.approx(0.5)
+    assert Push.towards(0.4).direction_rad == pytest.approx(0.4)
+
+
+def test_inverse_kinematics_agrees_with_the_description():
+    client = pybullet.connect(pybullet.DIRECT)
+    arm = robot.load_robot(client)
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        xyz = rng.uniform([-0.4, -0.5, 0.01], [0.4, 0.5, 0.2])
+        yaw = rng.uniform(-math.pi, math.pi)
+        joints = robot.inverse_kinematics(xyz, yaw, np.array(robot.HOME))
+        for joint, angle in enumerate(joints):
+            pybullet.resetJointState(arm, joint, angle, physicsClientId=client)
+        state = pybullet.getLinkState(arm, 6, computeForwardKinematics=True, physicsClientId=client)
+        axes = np.array(pybullet.getMatrixFromQuaternion(state[5])).reshape(3, 3)
+        tip = np.array(state[4]) + robot.TOOL_LENGTH_M * axes[:, 2]
+        np.testing.assert_allclose(tip, xyz, atol=1e-6)
+        np.testing.assert_allclose(axes[:2, 0], [math.cos(yaw), math.sin(yaw)], atol=1e-6)
+    pybullet.disconnect(client)
+
+
+@pytest.mark.parametrize("thing", THINGS)
+def test_a_push_ends_beyond_the_gripper(world, thing):
+    """The gripper stops 5 cm past the centre, so the object ends at 5 cm plus half its extent."""
+    world.place(thing, (0.0, 0.0), 0.0)
+    seen = world.interact(Push.towards(0.0))
+    half, finger = np.ptp(thing.footprint_m[:, 0]) / 2, 0.01
+    if isinstance(thing, UprightCylinder):  # it sinks in between the fingers, 3 cm apart
+        half = math.sqrt(half**2 - 0.015**2)
+    assert seen.effect[-1, 0] == pytest.approx(0.05 + finger + half, abs=0.003)
+    assert abs(seen.effect[-1, 1]) < 0.004
+    assert seen.tracking_error_m < 5e-4
+    assert np.abs(seen.effect[: 301 // 2, :2]).max() < 1e-4  # nothing moves before contact
+    assert seen.phase.shape == (301,)
+    assert seen.action.shape == seen.effect.shape == (301, 5)
+
+
+def test_a_stopped_push_rests_where_the_full_push_was(world):
+    gaps = []
+    for k, stop in enumerate((0.65, 0.75, 0.85, 0.95)):
+        push = Push(1.0 + k)
+        world.place(THINGS[k % 2], (0.0, 0.0), 0.3)
+        full = world.interact(push)
+        world.place(THINGS[k % 2], (0.0, 0.0), 0.3)
+        part = world.interact(push, stop)
+        then = [np.interp(stop, full.phase, full.effect[:, c]) for c in range(2)]
+        gaps.append(np.hypot(*(part.rest_effect[:2] - then)))
+    assert np.median(gaps) < 0.0005
+    assert max(gaps) < 0.0015
+
+
+def test_approach_changes_nothing_that_matters(world):
+    world.place(THINGS[0], (0.05, -0.1), 0.4)
+    put = world.interact(Push(2.0))
+    world.place(THINGS[0], (0.05, -0.1), 0.4)
+    moved = world.interact(Push(2.0), approach=True)
+    np.testing.assert_allclose(moved.rest_effect[:2], put.rest_effect[:2], atol=5e-4)
+    end = np.array(world.object_pose()[:2])
+    np.testing.assert_allclose(end, np.array([0.05, -0.1]) + moved.rest_effect[:2], atol=1e-5)
+
+
+@pytest.mark.parametrize("thing", THINGS)
+@pytest.mark.parametrize("xy", [(0.0, 0.0), (0.21, -0.33)])
+def test_camera_measures_the_object(world, thing, xy):
+    world.place(thing, xy, 0.5)
+    depth, mask = world.look()
+    pixel = CROP_WIDTH_M / IMAGE_PIXELS
+    x, y = thing.footprint_m.T
+    true_area = 0.5 * abs(np.dot(x, np.roll(y, 1)) - np.dot(y, np.roll(x, 1)))
+    assert mask.sum() * pixel**2 == pytest.approx(true_area, rel=0.04)
+    # The renderer draws a cylinder 0.9 mm larger than it is.
+    seen_height = np.median(depth.max() - depth[mask > 0])
+    assert seen_height == pytest.approx(thing.height_m, abs=1e-3)
+    rows, columns = np.nonzero(mask)
+    centre = np.array([columns.mean() - 23.5, 23.5 - rows.mean()]) * pixel
+    assert np.hypot(*centre) < 0.0005
+
+
+def test_a_quarter_turn_of_the_table_is_a_quarter_turn_of_the_image(world):
+    world.place(THINGS[0], (0.0, 0.0), 0.35)
+    image = world.look()
+    world.place(THINGS[0], (0.0, 0.0), 0.35 + math.pi / 2)
+    assert (np.rot90(image[1]) != world.look()[1]).mean() < 0.005
+
+
+_HASH = (
+    "import hashlib; from affordlib.interactions.recipes import *; "
+    "w = Tabletop(); s = [interact(Recipe(seed=5), i, w)[1] for i in (3, 1)]; "
+    "print(hashlib.sha256(b''.join(x.effect.tobytes() + x.image.tobytes() for x in s)).hexdigest())"
+)
+
+
+def test_the_same_bits_in_a_second_process_and_another_order(world):
+    seen = {i: interact(Recipe(seed=5), i, world)[1] for i in (0, 1, 2, 3)}
+    parts = [seen[i].effect.tobytes() + seen[i].image.tobytes() for i in (3, 1)]
+    here = hashlib.sha256(b"".join(parts)).hexdigest()
+    there = subprocess.run(
+        [sys.executable, "-c", _HASH], capture_output=True, text=True, check=True
+    )
+    assert there.stdout.strip() == here
+    assert seen[0].effect.tobytes() != seen[1].effect.tobytes()
+
+
+def test_unreachable_raises_and_moves_nothing(world):
+    world.place(THINGS[0], (0.45, 0.5), 0.0)
+    before = world.object_state()
+    with pytest.raises(UnreachableError, match="cannot reach"):
+        world.interact(Push(math.pi / 4), approach=True)
+    assert world.object_state() == before
+
+
+@pytest.mark.parametrize(
+    ("act", "words"),
+    [
+        (lambda w: Push(math.nan), "theta .* nan"),
+        (lambda w: Push("left"), "theta .* 'left'"),
+        (lambda w: Push(0.0, length=-0.1), r"length .* -0\.1"),
+        (lambda w: Push(0.0, radius=1.0), "radius .* 1"),
+        (lambda w: primitive_named("kick"), "'kick' is unknown; choose one of .'push'"),
+        (lambda w: family_named("cone"), "'cone' is unknown"),
+        (lambda w: Cuboid(0.05, math.inf, 0.05), "cuboid width .* inf"),
+        (lambda w: UprightCylinder(0.05, 5.0), "cylinder height .* 5"),
+        (lambda w: Goal((0.9, 0.0)), r"goal xy_m = \(0\.9, 0\) m lies off the table; choose x in"),
+        (lambda w: Goal((0.1, math.nan)), "goal xy_m must be two finite numbers"),
+        (lambda w: Goal((0.1, 0.1), tolerance_m=-1), "goal tolerance_m .* -1"),
+        (lambda w: w.place(THINGS[0], (0.0, 2.0)), "xy_m = .* off the table"),
+        (lambda w: w.interact(Push(0.0), 1.5), "stop_phase .* 1.5"),
+        (lambda w: WorldConfig(table_friction=-1), "table_friction .* -1"),
+    ],
+)
+def test_bad_input_is_named(world, act, words):
+    world.place(THINGS[0])
+    with pytest.raises(ValueError, match=words):
+        act(world)
+
+
+def test_an_empty_table_says_so():
+    with Tabletop() as empty, pytest.raises(RuntimeError, match=r"call place\(\.\.\.\) first"):
+        empty.interact(Push(0.0))
