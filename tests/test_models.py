@@ -111,8 +111,8 @@ def test_masked_observations_count_for_nothing(untrained):
 
 def test_folded_decoding_equals_the_layers_one_by_one(untrained):
     r, features = torch.randn(2, 128), torch.randn(2, 16)
-    t = torch.rand(2, 5)
-    known = torch.cat([r, features], dim=1)[:, None].expand(-1, 5, -1)
+    t = torch.rand(2, 60)
+    known = torch.cat([r, features], dim=1)[:, None].expand(-1, 60, -1)
     merged = untrained.merge(torch.cat([known, t[..., None]], dim=-1))
     mu_a, sigma_a, mu_e, sigma_e = untrained.decode(r, features, t)
     for decoder, mean, std in (

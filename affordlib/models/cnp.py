@@ -29,6 +29,7 @@ DECODER_WIDTHS = (512, 256, 128, 32)
 CONVOLUTION_WIDTHS = (32, 64, 64, 128, 128)
 MERGE_WIDTH = 1024
 IMAGE_FEATURES = 16
+FOLD_FROM_TARGETS = 100
 
 
 @dataclass(frozen=True)
@@ -122,16 +123,22 @@ class AffordanceCNP(nn.Module):
         """(μ_a, σ_a, μ_e, σ_e), each (B, T, C) and standardised, of r (B, 128) at t_target (B, T).
 
         The merge layer has no activation, so it folds exactly into each decoder's first layer, and
-        of the sum only the column of t differs between the targets of one query.
+        of the sum only the column of t differs between the targets of one query. Folding pays from
+        some tens of targets on.
         """
         known = torch.cat([r, features.expand(len(r), -1)], dim=1)
+        folds = t_target.numel() >= FOLD_FROM_TARGETS
         outputs = []
         for decoder in (self.action_decoder, self.effect_decoder):
             first = decoder[0]
-            weight = first.weight @ self.merge.weight
-            bias = first.weight @ self.merge.bias + first.bias
-            base = F.linear(known, weight[:, :-1], bias)
-            hidden = base[:, None] + t_target[..., None] * weight[:, -1]
+            if folds:
+                weight = first.weight @ self.merge.weight
+                bias = first.weight @ self.merge.bias + first.bias
+                base = F.linear(known, weight[:, :-1], bias)
+                hidden = base[:, None] + t_target[..., None] * weight[:, -1]
+            else:
+                known_at_t = known[:, None].expand(-1, t_target.shape[1], -1)
+                hidden = first(self.merge(_with_time(known_at_t, t_target)))
             mean, raw = decoder[1:](hidden).chunk(2, dim=-1)
             outputs += [mean, self.sigma_floor + F.softplus(raw)]
         return tuple(outputs)

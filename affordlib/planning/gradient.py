@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from affordlib.models.protocol import observe_final_effect
+from affordlib.models.protocol import observe_final_effect, observe_pushes
 from affordlib.planning.modes import PATH_SAMPLES, PlanMode, encode_image, mode_named, plane
 from affordlib.primitives import Push
 from affordlib.types import Goal, Plan, Step, check_on_table
@@ -34,6 +34,7 @@ LEARNING_RATE_M = 0.005
 CONVERGED_M = 1e-5
 MAX_ITERATIONS = 400
 SUCCESS_M = 0.002
+NEARER_M = 0.0005
 
 
 def descend(
@@ -41,34 +42,52 @@ def descend(
     features: torch.Tensor,
     target_xy_m: np.ndarray,
     generator: np.random.Generator,
-    trace: list[tuple[np.ndarray, float]] | None = None,
+    starts: int = 1,
+    direction_only: bool = False,
+    trace: list[tuple[np.ndarray, np.ndarray]] | None = None,
 ) -> tuple[torch.Tensor, int]:
     """The effect input (1, C_e) whose predicted effect at t = 1 is nearest to the target (2,).
 
-    Descends the gradient of the mean square error with Adam, on the input alone. trace, if given,
-    receives each iteration's input (2,) [m] and loss [m²].
+    Descends the gradient of the mean square error with Adam, on the input alone, from some random
+    starts side by side, and keeps the best. direction_only keeps the input on the circle of
+    effects that full pushes have. trace, if given, receives each iteration's inputs (starts, 2)
+    [m] and losses (starts,) [m²]. Also returns the number of iterations.
     """
-    angle = generator.uniform(0, 2 * math.pi)
     columns = plane(model)
-    effect = torch.zeros(1, len(model.effect_channels))
-    effect[0, columns] = START_RADIUS_M * torch.tensor([math.cos(angle), math.sin(angle)])
-    effect.requires_grad_()
+    radius = _effect_radius_m(model, features) if direction_only else START_RADIUS_M
+    angle = torch.as_tensor(generator.uniform(0, 2 * math.pi, size=starts), dtype=torch.float32)
+    circle = radius * torch.stack([angle.cos(), angle.sin()], dim=1)
+    sought = (angle if direction_only else circle).requires_grad_()
+    optimiser = torch.optim.Adam([sought], lr=LEARNING_RATE_M / (radius if direction_only else 1))
     target = torch.as_tensor(target_xy_m, dtype=torch.float32)
-    optimiser = torch.optim.Adam([effect], lr=LEARNING_RATE_M)
-    at_end = torch.ones(1, 1)
+    at_end = torch.ones(starts, 1)
+    before = circle.detach()
     iterations = 0
     while iterations < MAX_ITERATIONS:
         iterations += 1
+        xy = radius * torch.stack([sought.cos(), sought.sin()], dim=1) if direction_only else sought
+        effect = torch.zeros(starts, len(model.effect_channels))
+        effect[:, columns] = xy
         prediction = model.predict(features, observe_final_effect(model, effect), at_end)
-        loss = (prediction.effect_mean[0, 0, columns] - target).square().mean()
-        (effect.grad,) = torch.autograd.grad(loss, [effect])
-        before = effect.detach().clone()
+        losses = (prediction.effect_mean[:, 0, columns] - target).square().mean(dim=-1)
         if trace is not None:
-            trace.append((before[0, columns].numpy().copy(), float(loss.detach())))
-        optimiser.step()
-        if float((effect.detach() - before).norm()) < CONVERGED_M:
+            trace.append((xy.detach().numpy().copy(), losses.detach().numpy().copy()))
+        change = float((xy.detach() - before).norm(dim=-1).max())
+        if iterations > 1 and change < CONVERGED_M:
             break
-    return effect.detach(), iterations
+        before = xy.detach().clone()
+        (sought.grad,) = torch.autograd.grad(losses.sum(), [sought])
+        optimiser.step()
+    best = int(losses.detach().argmin())
+    return effect.detach()[best : best + 1], iterations
+
+
+@torch.no_grad()
+def _effect_radius_m(model: EffectModel, features: torch.Tensor) -> float:
+    """Mean length [m] of the effects of full pushes of this object."""
+    pushes = [Push(theta) for theta in np.arange(12) * (math.pi / 6)]
+    prediction = model.predict(features, observe_pushes(model, pushes), torch.ones(12, 1))
+    return float(prediction.effect_mean[:, 0, plane(model)].norm(dim=-1).mean())
 
 
 def plan_gradient(
@@ -78,19 +97,25 @@ def plan_gradient(
     goal: Goal,
     mode: str | PlanMode = "multi_partial",
     samples: int = 100,
+    starts: int = 1,
+    direction_only: bool = False,
     seed: int = 0,
     snap: bool = False,
 ) -> Plan:
     """Plan from the object's position [m] and depth image (2, 48, 48) to a goal, by gradient.
 
-    samples: number of phases at which the trajectory is queried; it bounds how finely an action
-    can be cut. snap: execute Push(theta) instead of the decoded action trajectory.
+    samples: phases at which the trajectory is queried; they bound how finely an action can be cut.
+    starts: random starts of the descent; the paper has one, lost where it lies opposite the goal.
+    direction_only: ours; search on the circle of effects that pushes have, not in the whole plane,
+    where the network can be made to promise anything.
+    snap: execute Push(theta) instead of the decoded action trajectory.
     """
     began = time.perf_counter()
     mode = mode_named(mode)
     start = check_on_table("start_xy_m", start_xy_m)
-    if isinstance(samples, bool) or not isinstance(samples, int) or samples < 2:
-        raise ValueError(f"samples must be a whole number of at least 2, got {samples!r}")
+    for name, value, least in (("samples", samples, 2), ("starts", starts, 1)):
+        if isinstance(value, bool) or not isinstance(value, int) or value < least:
+            raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}")
     columns = plane(model)
     a_columns = [model.action_channels.index(name) for name in ("x", "y")]
     features = encode_image(model, image)
@@ -100,7 +125,7 @@ def plan_gradient(
     iterations = 0
     t = torch.linspace(0, 1, samples)
     while len(steps) < mode.max_steps and np.hypot(*(target - xy)) > SUCCESS_M:
-        effect, n = descend(model, features, target - xy, generator)
+        effect, n = descend(model, features, target - xy, generator, starts, direction_only)
         iterations += n
         with torch.no_grad():
             prediction = model.predict(features, observe_final_effect(model, effect), t[None])
@@ -109,7 +134,10 @@ def plan_gradient(
         std = prediction.effect_std[0, :, columns].norm(dim=-1).numpy()
         stop = samples - 1
         if mode.partial:
-            stop = int(np.argmin(np.hypot(*(xy + path - target).T)))
+            distance = np.hypot(*(xy + path - target).T)
+            stop = int(np.argmin(distance))
+            if SUCCESS_M < distance[stop] and distance[-1] - distance[stop] < NEARER_M:
+                stop = samples - 1  # the path only trembles at its end: the goal lies beyond it
         if stop == 0:
             break
         # A model's path need not begin exactly at rest; what counts is how far it carries.
@@ -132,5 +160,5 @@ def plan_gradient(
         if stop < samples - 1:
             break
     reached = bool(np.hypot(*(target - xy)) <= goal.tolerance_m)
-    name = "gradient_snapped" if snap else "gradient"
+    name = "gradient" + "_direction" * direction_only + "_snapped" * snap
     return Plan(goal, start, tuple(steps), name, reached, iterations, time.perf_counter() - began)

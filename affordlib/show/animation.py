@@ -11,6 +11,7 @@ from PIL import Image
 
 if TYPE_CHECKING:
     import numpy as np
+    from matplotlib.figure import Figure
 
     from affordlib.world import Tabletop
 
@@ -28,11 +29,17 @@ class Film:
             self.frames.append(world.picture(self.width, self.height))
         self._steps += 1
 
-    def gif(self, frame_ms: int = 60) -> bytes:
-        """The frames as an animated GIF that loops and rests on its last frame."""
+    def gif(self, frame_ms: int = 60, beside: Figure | None = None) -> bytes:
+        """The frames as an animated GIF that loops and rests on its last frame.
+
+        beside: a figure shown to the left of every frame.
+        """
         if not self.frames:
             raise RuntimeError("the film is empty; set world.film = film before the robot moves")
         pictures = [Image.fromarray(frame) for frame in self.frames]
+        if beside is not None:
+            left = _drawn(beside, pictures[0].height)
+            pictures = [_joined(left, picture) for picture in pictures]
         # One palette for all frames, or colours flicker.
         palette = pictures[len(pictures) // 2].quantize(128, dither=Image.Dither.NONE)
         indexed = [p.quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures]
@@ -44,9 +51,28 @@ class Film:
         return buffer.getvalue()
 
 
-def show_animation(film: Film, path: str | Path | None = None) -> NotebookImage:
-    """The film as a picture a notebook displays; saved to `path` as well, if given."""
-    data = film.gif()
+def _drawn(figure: Figure, height: int) -> Image.Image:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=2 * height / figure.get_figheight())
+    picture = Image.open(buffer).convert("RGB")
+    return picture.resize((picture.width // 2, picture.height // 2), Image.Resampling.LANCZOS)
+
+
+def _joined(left: Image.Image, right: Image.Image) -> Image.Image:
+    both = Image.new("RGB", (left.width + right.width, right.height), "white")
+    both.paste(left, (0, 0))
+    both.paste(right, (left.width, 0))
+    return both
+
+
+def show_animation(
+    film: Film, path: str | Path | None = None, beside: Figure | None = None
+) -> NotebookImage:
+    """The film as a picture a notebook displays; saved to `path` as well, if given.
+
+    beside: a figure shown to the left of every frame.
+    """
+    data = film.gif(beside=beside)
     if path is not None:
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,0 +1,100 @@
+# Everything runs with the Python of .venv, whatever else is active or registered.
+# Options are given on the command line (make workbook PROFILE=smoke), never by the environment.
+
+PYTHON  = python3.11
+PROFILE = reader
+SEED    = 0
+OUT     =
+ONLY    =
+ARGS    =
+FORCE   =
+
+PY     := .venv/bin/python
+STAMP  := .venv/.installed
+INPUTS := requirements.txt constraints.txt pyproject.toml
+
+SHELL         := /bin/bash
+.SHELLFLAGS   := -eu -o pipefail -c
+.DEFAULT_GOAL := help
+MAKEFLAGS     += --no-print-directory
+.SUFFIXES:
+
+export PROFILE SEED OUT ONLY ARGS
+unexport PYTHONPATH PYTHONHOME PYTHONSTARTUP VIRTUAL_ENV MPLBACKEND
+unexport PIP_USER PIP_TARGET PIP_PREFIX PIP_REQUIREMENT PIP_CONSTRAINT
+unexport PYTEST_ADDOPTS JUPYTER_PATH JUPYTER_TOKEN
+
+.PHONY: help setup workbook lab test test-fast lint format bench data notebooks tables \
+        constraints clean
+
+help: ## List the targets
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+setup: $(STAMP) ## Make .venv and install everything into it (PYTHON=python3.11)
+	@echo "The environment is ready: .venv"
+
+# The stamp is written last and holds the folder. Without it (never finished) or with another
+# folder in it (moved) the environment is made anew; otherwise pip brings it up to date.
+ifneq ($(shell cat $(STAMP) 2>/dev/null),$(CURDIR))
+.PHONY: $(STAMP)
+endif
+
+$(STAMP): $(INPUTS)
+	@[[ "$$("$(PYTHON)" -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null)" == 3.11 ]] \
+	  || { echo "This workbook needs Python 3.11, and '$(PYTHON)' is $$("$(PYTHON)" -V 2>/dev/null || echo 'not there')." \
+	            "Install it, or name it: make setup PYTHON=/path/to/python3.11" >&2; exit 1; }
+	@if [[ "$$(cat $@ 2>/dev/null)" != "$(CURDIR)" ]]; then \
+	   echo "Making .venv (a few minutes, once)"; "$(PYTHON)" -m venv --clear .venv; \
+	 else \
+	   echo "Bringing .venv up to date"; rm $@; \
+	 fi
+	@$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -r requirements.txt
+	@$(PY) -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	@printf '%s' "$(CURDIR)" > $@
+
+workbook: $(STAMP) ## Run all notebooks into runs/ (PROFILE=smoke|reader|full SEED= OUT= ONLY= ARGS=)
+	@set -f; $(PY) -m affordlib.workbook --profile "$${PROFILE:-reader}" --seed "$${SEED:-0}" \
+	  --out "$$OUT" --only "$$ONLY" $(if $(FORCE),--force) -- $$ARGS
+
+lab: $(STAMP) ## Open the book in JupyterLab, on this machine only
+	@root=; [[ $$(id -u) == 0 ]] && root=--allow-root; \
+	  JUPYTER_PREFER_ENV_PATH=1 $(PY) -m jupyterlab --ip=127.0.0.1 $$root \
+	  --ServerApp.root_dir="$(CURDIR)" --LabApp.default_url=/lab/tree/notebooks/00_start_here.ipynb
+
+test: $(STAMP) ## Run all tests, notebooks included
+	@$(PY) -m pytest
+
+test-fast: $(STAMP) ## Run the tests that take seconds, without the notebooks
+	@$(PY) -m pytest -m "not slow"
+
+lint: $(STAMP) ## Check style and formatting
+	@$(PY) -m ruff check
+	@$(PY) -m ruff format --check
+
+format: $(STAMP) ## Format the code, notebooks included
+	@$(PY) -m ruff check --fix
+	@$(PY) -m ruff format
+
+bench: $(STAMP) ## Run the benchmarks
+	@shopt -s nullglob; for file in benchmarks/bench_*.py; do \
+	   echo "== $$file"; $(PY) "$$file" || exit 1; \
+	 done
+
+data: $(STAMP) ## Make the shipped data sets and checkpoints anew
+	@$(PY) -m affordlib.interactions.make_data
+
+notebooks: $(STAMP) ## Execute the committed notebooks in place and clean them (ONLY= FORCE=1)
+	@$(PY) -m affordlib.workbook --in-place --only "$$ONLY" $(if $(FORCE),--force)
+
+tables: $(STAMP) ## Draw the tables of README.md from data/results
+	@$(PY) -m affordlib.results README.md
+
+constraints: $(STAMP) ## Write constraints.txt from what is installed
+	@{ sed -n '/^#/p;/^[^#]/q' constraints.txt; \
+	   $(PY) -m pip freeze --all --exclude pip --exclude affordlib -r requirements.txt \
+	     | sed -e '1,/^## The following/d' -e 's/+[^ ]*$$//'; } > constraints.txt.tmp
+	@mv constraints.txt.tmp constraints.txt
+
+clean: ## Remove runs/, caches and build leftovers; .venv stays
+	@rm -rf runs build dist *.egg-info .pytest_cache .ruff_cache notebooks/.ipynb_checkpoints
+	@find affordlib tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +
