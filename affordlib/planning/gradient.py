@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
 START_RADIUS_M = 0.2
 LEARNING_RATE_M = 0.005
-CONVERGED_M = 1e-5
-MAX_ITERATIONS = 400
+CONVERGED_M = 1e-4
+MAX_ITERATIONS = 300
 SUCCESS_M = 0.002
 NEARER_M = 0.0005
 
@@ -136,7 +136,7 @@ def plan_gradient(
         if mode.partial:
             distance = np.hypot(*(xy + path - target).T)
             stop = int(np.argmin(distance))
-            if SUCCESS_M < distance[stop] and distance[-1] - distance[stop] < NEARER_M:
+            if distance[stop] > SUCCESS_M and distance[-1] - distance[stop] < NEARER_M:
                 stop = samples - 1  # the path only trembles at its end: the goal lies beyond it
         if stop == 0:
             break

@@ -4,6 +4,7 @@ from affordlib.show.animation import Film, show_animation
 from affordlib.show.goal_picker import GoalPicker
 from affordlib.show.plots import (
     GOAL,
+    NEUTRAL,
     PREDICTION,
     TRUTH,
     plot_depth,
@@ -16,6 +17,7 @@ from affordlib.show.plots import (
 
 __all__ = [
     "GOAL",
+    "NEUTRAL",
     "PREDICTION",
     "TRUTH",
     "Film",

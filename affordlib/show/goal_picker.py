@@ -5,6 +5,7 @@ A view on plain objects: everything it does can be done with `plan_*` and `carry
 
 from __future__ import annotations
 
+import base64
 import html
 import io
 from typing import TYPE_CHECKING
@@ -109,4 +110,4 @@ class GoalPicker(widgets.VBox):
     def _repr_mimebundle_(self, **kwargs: object) -> dict[str, object]:
         # A box of widgets saves only text; the picture stays in the notebook without a kernel.
         bundle = super()._repr_mimebundle_(**kwargs)
-        return {**bundle, "image/png": self._picture.value}
+        return {**bundle, "image/png": base64.b64encode(self._picture.value).decode()}

@@ -211,10 +211,24 @@ class Tabletop:
         """Carry out a step of a plan, with approach: its decoded path if it has one."""
         if step.path_xy_m is None:
             return self.interact(step.primitive, step.stop_phase, approach=True)
-        phase = np.linspace(0.0, 1.0, len(step.path_xy_m)) * step.stop_phase
-        action = step.primitive.path(phase)
-        action[:, :2] = step.path_xy_m
-        heading = step.path_xy_m[-1] - step.path_xy_m[0]
+        return self.follow_path(step.path_xy_m, step.primitive, step.stop_phase)
+
+    def follow_path(
+        self, path_xy_m: np.ndarray, primitive: Push | None = None, stop_phase: float = 1.0
+    ) -> Interaction:
+        """Move the gripper along a path (n, 2) [m] relative to the object, and record.
+
+        Height and timing are those of the primitive (default: a push), up to stop_phase; the
+        fingers face where the path leads.
+        """
+        path = np.asarray(path_xy_m, dtype=float)
+        if path.ndim != 2 or path.shape[1] != 2 or len(path) < 2 or not np.isfinite(path).all():
+            raise ValueError(f"path_xy_m must be finite points (n, 2), n ≥ 2, got {path.shape}")
+        primitive = primitive or Push(0.0)
+        phase = np.linspace(0.0, 1.0, len(path)) * check_within("stop_phase", stop_phase, 0.0, 1.0)
+        action = primitive.path(phase)
+        action[:, :2] = path
+        heading = path[-1] - path[0]
         if np.hypot(*heading) > 1e-6:
             action[:, 3] = math.atan2(heading[1], heading[0])
-        return motion.execute(self, step.primitive, action, phase, approach=True)
+        return motion.execute(self, primitive, action, phase, approach=True)
