@@ -24,7 +24,7 @@ unexport PYTHONPATH PYTHONHOME PYTHONSTARTUP VIRTUAL_ENV MPLBACKEND
 unexport PIP_USER PIP_TARGET PIP_PREFIX PIP_REQUIREMENT PIP_CONSTRAINT
 unexport PYTEST_ADDOPTS JUPYTER_PATH JUPYTER_TOKEN
 
-.PHONY: help setup workbook lab test test-fast lint format bench data notebooks tables \
+.PHONY: help setup workbook lab test test-fast lint format bench data checkpoints notebooks tables \
         constraints clean
 
 help: ## List the targets
@@ -80,8 +80,11 @@ bench: $(STAMP) ## Run the benchmarks
 	   echo "== $$file"; $(PY) "$$file" || exit 1; \
 	 done
 
-data: $(STAMP) ## Make the shipped data sets and checkpoints anew
+data: $(STAMP) ## Collect the shipped data sets again and compare
 	@$(PY) -m affordlib.interactions.make_data
+
+checkpoints: $(STAMP) ## Train the shipped models again
+	@$(PY) -m affordlib.models.make_checkpoints
 
 notebooks: $(STAMP) ## Execute the committed notebooks in place and clean them (ONLY= FORCE=1)
 	@$(PY) -m affordlib.workbook --in-place --only "$$ONLY" $(if $(FORCE),--force)

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 START_RADIUS_M = 0.2
 LEARNING_RATE_M = 0.005
 CONVERGED_M = 1e-4
+STILL_ITERATIONS = 10
 MAX_ITERATIONS = 300
 SUCCESS_M = 0.002
 NEARER_M = 0.0005
@@ -62,7 +63,7 @@ def descend(
     target = torch.as_tensor(target_xy_m, dtype=torch.float32)
     at_end = torch.ones(starts, 1)
     before = circle.detach()
-    iterations = 0
+    iterations = still = 0
     while iterations < MAX_ITERATIONS:
         iterations += 1
         xy = radius * torch.stack([sought.cos(), sought.sin()], dim=1) if direction_only else sought
@@ -73,7 +74,8 @@ def descend(
         if trace is not None:
             trace.append((xy.detach().numpy().copy(), losses.detach().numpy().copy()))
         change = float((xy.detach() - before).norm(dim=-1).max())
-        if iterations > 1 and change < CONVERGED_M:
+        still = still + 1 if change < CONVERGED_M else 0
+        if still == STILL_ITERATIONS:
             break
         before = xy.detach().clone()
         (sought.grad,) = torch.autograd.grad(losses.sum(), [sought])

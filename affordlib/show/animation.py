@@ -40,8 +40,12 @@ class Film:
         if beside is not None:
             left = _drawn(beside, pictures[0].height)
             pictures = [_joined(left, picture) for picture in pictures]
-        # One palette for all frames, or colours flicker.
-        palette = pictures[len(pictures) // 2].quantize(128, dither=Image.Dither.NONE)
+        # One palette for all frames, drawn from a few of them, or colours flicker.
+        few = [pictures[round(k * (len(pictures) - 1) / 3)] for k in range(4)]
+        sheet = Image.new("RGB", (few[0].width, len(few) * few[0].height))
+        for k, picture in enumerate(few):
+            sheet.paste(picture, (0, k * picture.height))
+        palette = sheet.quantize(255, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
         indexed = [p.quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures]
         buffer = io.BytesIO()
         durations = [frame_ms] * (len(indexed) - 1) + [1500]

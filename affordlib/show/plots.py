@@ -103,15 +103,14 @@ def plot_plan(ax: Axes, plan: Plan) -> Axes:
             tail,
             arrowprops={"arrowstyle": "-|>", "color": NEUTRAL, "lw": 1.5},
         )
-        text = f"{k + 1}: {100 * step.stop_phase:.0f} %"
         ax.annotate(
-            text,
-            tail,
+            f"{k + 1}: {100 * step.stop_phase:.0f} %",
+            100 * (start - 0.055 * direction),
             color=NEUTRAL,
-            ha="center",
+            ha="left" if direction[1] >= 0 else "right",
             va="center",
             fontsize=8,
-            xytext=(-10 * direction[0], -10 * direction[1]),
+            xytext=(9 * direction[1], -9 * direction[0]),
             textcoords="offset points",
         )
         ax.plot(

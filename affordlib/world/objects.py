@@ -130,13 +130,20 @@ def create_body(client: int, thing: Cuboid | UprightCylinder, mass_kg: float, rg
 
 
 def create_footprint(
-    client: int, thing: Cuboid | UprightCylinder, xy_m: tuple, yaw_rad: float, rgba: tuple
+    client: int,
+    thing: Cuboid | UprightCylinder,
+    xy_m: tuple,
+    yaw_rad: float,
+    rgba: tuple,
+    scale: float = 1.0,
 ) -> int:
     """Create the object's base as a sheet on the table that is only seen; return its id."""
-    flat = replace(thing, height=0.005)
+    # Larger sheets lie lower, so that one on another shows as a frame around it.
+    flat = replace(thing, height=0.01)
+    scaled = {name: scale * size for name, size in asdict(flat).items() if name != "height"}
     return pybullet.createMultiBody(
-        baseVisualShapeIndex=_visual_shape(client, flat, rgba),
-        basePosition=(*xy_m, 0.0),
+        baseVisualShapeIndex=_visual_shape(client, replace(flat, **scaled), rgba),
+        basePosition=(*xy_m, 0.001 / scale - 0.004),
         baseOrientation=pybullet.getQuaternionFromEuler((0, 0, yaw_rad)),
         physicsClientId=client,
     )

@@ -186,11 +186,12 @@ class Tabletop:
         xy_m: tuple[float, float],
         rgb: tuple[float, float, float],
         yaw_rad: float = 0.0,
+        scale: float = 1.0,
     ) -> None:
         """Show the object's footprint at (x, y) [m] on the table, in a colour; only seen."""
         self._require_object()
         x, y = check_on_table("xy_m", xy_m)
-        create_footprint(self.client, self.thing, (x, y), yaw_rad, (*rgb, 1.0))
+        create_footprint(self.client, self.thing, (x, y), yaw_rad, (*rgb, 1.0), scale)
 
     def interact(
         self, primitive: Push, stop_phase: float = 1.0, *, approach: bool = False

@@ -1,0 +1,63 @@
+"""Imports point one way, and the promises of the layout hold."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import affordlib
+
+ROOT = Path(affordlib.__file__).parent
+MODULES = sorted(p.relative_to(ROOT.parent) for p in ROOT.rglob("*.py"))
+
+FORBIDDEN = {
+    "types": {"world", "interactions", "models", "planning", "evaluation", "show"},
+    "primitives": {"world", "interactions", "models", "planning", "evaluation", "show"},
+    "world": {"interactions", "models", "planning", "evaluation", "show"},
+    "interactions": {"models", "planning", "evaluation", "show"},
+    "models": {"world", "planning", "evaluation", "show"},
+    "planning": {"world", "evaluation", "show"},
+    "evaluation": {"show"},
+}
+NO_WORLD = {"interactions/__init__.py", "interactions/batches.py", "interactions/store.py"}
+
+
+def imported(path: Path) -> set[str]:
+    """First-level parts of affordlib that a module imports when it runs."""
+    tree = ast.parse((ROOT.parent / path).read_text())
+    typing_only = {
+        id(node)
+        for block in ast.walk(tree)
+        if isinstance(block, ast.If) and ast.unparse(block.test) == "TYPE_CHECKING"
+        for node in ast.walk(block)
+    }
+    names = set()
+    for node in ast.walk(tree):
+        if id(node) in typing_only:
+            continue
+        if isinstance(node, ast.ImportFrom) and node.module:
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+        elif isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+    return {n.split(".")[1] for n in names if n.startswith("affordlib.")}
+
+
+@pytest.mark.parametrize("path", MODULES, ids=str)
+def test_imports_point_one_way(path):
+    part = path.with_suffix("").parts[1] if len(path.parts) > 1 else ""
+    assert not imported(path) & FORBIDDEN.get(part, set())
+    if path.relative_to("affordlib").as_posix() in NO_WORLD:
+        assert "world" not in imported(path)
+
+
+@pytest.mark.parametrize("path", MODULES, ids=str)
+def test_modules_are_short_and_well_named(path):
+    text = (ROOT.parent / path).read_text()
+    assert text.count("\n") <= 400
+    assert path.stem not in {"utils", "helpers", "misc", "common"}
+    assert ast.get_docstring(ast.parse(text))
+
+
+def test_only_the_world_and_its_users_know_pybullet():
+    users = [p for p in MODULES if "import pybullet" in (ROOT.parent / p).read_text()]
+    assert {p.parts[1] for p in users} == {"world"}
