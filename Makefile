@@ -41,7 +41,7 @@ endif
 
 $(STAMP): $(INPUTS)
 	@[[ "$$("$(PYTHON)" -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null)" == 3.11 ]] \
-	  || { echo "This workbook needs Python 3.11, and '$(PYTHON)' is $$("$(PYTHON)" -V 2>/dev/null || echo 'not there')." \
+	  || { echo "This workbook needs Python 3.11, and '$(PYTHON)' is $$("$(PYTHON)" -c 'import sys; print("Python " + sys.version.split()[0])' 2>/dev/null || echo 'not there')." \
 	            "Install it, or name it: make setup PYTHON=/path/to/python3.11" >&2; exit 1; }
 	@if [[ "$$(cat $@ 2>/dev/null)" != "$(CURDIR)" ]]; then \
 	   echo "Making .venv (a few minutes, once)"; "$(PYTHON)" -m venv --clear .venv; \
