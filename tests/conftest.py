@@ -40,5 +40,5 @@ def cuboid_image(world):
 
 
 @pytest.fixture(scope="session")
-def test_pushes():
+def held_out_pushes():
     return open_interactions("push_test")

@@ -179,9 +179,9 @@ def test_training_is_repeatable(pushes):
     assert torch.equal(*weights)
 
 
-def test_the_shipped_model_on_the_held_out_pushes(trained, test_pushes, pushes):
+def test_the_shipped_model_on_the_held_out_pushes(trained, held_out_pushes, pushes):
     """At most 7 mm, and clearly better than a direction and a mean length."""
-    test = TrainingArrays.from_dataset(test_pushes)
+    test = TrainingArrays.from_dataset(held_out_pushes)
     training = TrainingArrays.from_dataset(pushes, split_interactions(500).train)
     errors = final_errors_m(trained, test)
     assert len(errors) == 1000
@@ -200,8 +200,8 @@ def test_the_shipped_model_on_the_held_out_pushes(trained, test_pushes, pushes):
     assert degrees.median() < 8
 
 
-def test_encoding_once_equals_encoding_each_time(trained, test_pushes):
-    one = TrainingArrays.from_dataset(test_pushes, np.arange(1))
+def test_encoding_once_equals_encoding_each_time(trained, held_out_pushes):
+    one = TrainingArrays.from_dataset(held_out_pushes, np.arange(1))
     pushed = [Push(theta) for theta in np.linspace(0, 6, 8)]
     seen, t = observe_pushes(trained, pushed), torch.ones(8, 1)
     once = trained.predict(trained.encode(one.image), seen, t)
@@ -209,7 +209,7 @@ def test_encoding_once_equals_encoding_each_time(trained, test_pushes):
     torch.testing.assert_close(once.effect_mean, each.effect_mean, rtol=1e-4, atol=1e-6)
     # What observe_pushes commands is what the data set stores.
     recorded = observe_action(one)
-    again = observe_pushes(trained, [Push(float(test_pushes["theta"][0]))])
+    again = observe_pushes(trained, [Push(float(held_out_pushes["theta"][0]))])
     torch.testing.assert_close(recorded.action, again.action, atol=1e-6, rtol=0)
 
 
@@ -248,11 +248,11 @@ def test_a_failed_save_leaves_nothing(untrained, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_model_is_not_judged_on_what_it_saw(pushes, test_pushes):
+def test_a_model_is_not_judged_on_what_it_saw(pushes, held_out_pushes):
     _, about = load_checkpoint("push_cnp")
     split = split_interactions(500)
     refuse_seen(about, pushes, split.test)
-    refuse_seen(about, test_pushes, np.arange(1000))
+    refuse_seen(about, held_out_pushes, np.arange(1000))
     for part in (split.train, split.validation):
         with pytest.raises(ValueError, match="was trained or tuned on"):
             refuse_seen(about, pushes, part)
