@@ -175,14 +175,22 @@ def test_quarter_turns_turn_image_action_and_effect_alike(pushes):
     once = arrays.turned(1, mirror=True)
     start = arrays.action[:, 0] * torch.tensor([1.0, -1.0])
     assert torch.allclose(once.action[:, 0], torch.stack([-start[:, 1], start[:, 0]], dim=1))
-    # The object's elongation, seen in the mask, turns with the push.
-    pixel = torch.arange(48) - 23.5
-    for rows, columns in ((pixel, pixel),):
-        mask = arrays.image[:, 1]
-        slant = torch.einsum("nrc,r,c->n", mask, -rows, columns)
-        seen = torch.einsum("nrc,r,c->n", once.image[:, 1], -rows, columns)
-        # Mirroring and a quarter turn each change the sign of the product x·y.
-        assert torch.allclose(seen, slant, atol=1.0)
+
+
+@pytest.mark.parametrize(("quarters", "mirror"), [(1, False), (2, False), (1, True), (3, True)])
+def test_what_lies_in_the_image_turns_as_the_effect_does(pushes, quarters, mirror):
+    """A mark drawn where the object will end is, turned, still where the object will end."""
+    arrays = TrainingArrays.from_dataset(pushes, np.arange(4))
+    arrays.image.zero_()
+    arrays.effect[:, -1] = torch.tensor([0.05, 0.02])
+    pixel_m = 0.16 / 48
+    row, column = round(23.5 - 0.02 / pixel_m), round(23.5 + 0.05 / pixel_m)
+    arrays.image[:, 1, row, column] = 1
+    turned = arrays.turned(quarters, mirror)
+    _, row, column = turned.image[:, 1].nonzero().T
+    seen = torch.stack([column - 23.5, 23.5 - row], dim=1) * pixel_m
+    torch.testing.assert_close(seen, turned.effect[:, -1], atol=pixel_m, rtol=0)
+    assert not torch.allclose(turned.effect[:, -1], arrays.effect[:, -1])
 
 
 def test_normaliser_keeps_zero_and_gives_unit_size(pushes):

@@ -71,8 +71,8 @@ def test_every_parameter_is_used(name):
 
 @pytest.mark.parametrize("profile", PROFILES)
 def test_every_value_of_a_profile_is_a_parameter_of_its_type(profile):
-    if PATHS:
-        make_jobs(LAYOUT, profile, [], {"seed": 0, "out_dir": "runs/x"})
+    jobs = make_jobs(LAYOUT, profile, [], {"seed": 0, "out_dir": "runs/x"})
+    assert [job.name for job in jobs] == list(PATHS)
 
 
 @each_notebook
