@@ -1,25 +1,32 @@
 """What an action is, as a path in phase; no physics here (Section 3.3 and Figure 2 of the paper).
 
-A primitive gives the commanded end-effector path over the phase t in [0, 1], relative to where
-the object stood at the start. The world makes the arm follow it; models are conditioned on it.
+A primitive is a chain of legs between keyframes, each covered with minimum-jerk timing. It gives
+the commanded end-effector path over the phase t in [0, 1], relative to where the object stood at
+the start. The world makes the arm follow it; models are conditioned on it.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
 from affordlib.types import check_finite, check_within
 
-PUSH_DURATION_S = 3.75
-"""25 recorded samples, one every 3 steps of 50 ms (Section 4.2)."""
+DURATION_S = 3.75
+"""Of every primitive: 25 recorded samples, one every 3 steps of 50 ms (Section 4.2)."""
 
 PUSH_GAP_M = 0.03
 """Distance between the fingers while pushing: they cradle the object's near face."""
 
-PUSH_TIP_HEIGHT_M = 0.01
+TIP_HEIGHT_M = 0.01
+HOVER_M = 0.16
+"""Height of the finger tips before they are lowered over an object."""
+
+BLADE_HEIGHT_M = 0.0015
 
 
 def min_jerk(t: np.ndarray | float) -> np.ndarray:
@@ -34,7 +41,75 @@ def wrap_angle(angle_rad: float) -> float:
 
 
 @dataclass(frozen=True)
-class Push:
+class Leg:
+    """A stretch of a primitive: seconds, and poses (6,) at its start and end.
+
+    Poses are x, y, z [m], yaw [rad], gripper (1 open, 0 closed) and pitch [rad, nose down].
+    A guarded leg stops when the robot feels the object.
+    """
+
+    seconds: float
+    start: np.ndarray
+    end: np.ndarray
+    guarded: bool = False
+
+    def at(self, share: np.ndarray) -> np.ndarray:
+        """Poses (n, 6) where the shares (n,) of the leg are covered."""
+        return self.start + np.asarray(share)[:, None] * (self.end - self.start)
+
+
+@dataclass(frozen=True)
+class Primitive:
+    """An action with its parameters; `legs` says how the gripper moves.
+
+    opening_m is the gap between the fingers where the gripper channel is 1, force_N what each
+    finger can press with, `holds` whether the object stays in the hand at the end.
+    """
+
+    name: ClassVar[str]
+    opening_m: ClassVar[float]
+    force_N: ClassVar[float]
+    holds: ClassVar[bool] = False
+    tool: ClassVar[str] = "gripper"
+
+    @cached_property
+    def legs(self) -> tuple[Leg, ...]:
+        raise NotImplementedError
+
+    @cached_property
+    def leg_phases(self) -> np.ndarray:
+        """Phases at which the legs begin, and 1: (m + 1,)."""
+        seconds = np.cumsum([0.0, *(leg.seconds for leg in self.legs)])
+        return seconds / seconds[-1]
+
+    def path(self, phase: np.ndarray | float) -> np.ndarray:
+        """The commanded action a_t: (n, 5) at the phases (n,), channels `ACTION_CHANNELS`."""
+        phase = np.clip(np.atleast_1d(np.asarray(phase, dtype=float)), 0.0, 1.0)
+        action = np.empty((len(phase), 5))
+        for leg, start, end in zip(
+            self.legs, self.leg_phases[:-1], self.leg_phases[1:], strict=True
+        ):
+            inside = (phase >= start) & (phase <= end)
+            share = min_jerk((phase[inside] - start) / (end - start))
+            action[inside] = leg.at(share)[:, :5]
+        return action
+
+    def succeeded(self, effect: np.ndarray) -> bool:
+        """Whether a final effect (5,) is what the primitive is for: here, moved by over 1 cm."""
+        return bool(np.hypot(effect[0], effect[1]) > 0.01)
+
+
+def _legs(*stops: tuple[float, tuple[float, ...]], guarded: int = -1) -> tuple[Leg, ...]:
+    """Legs through poses (x, y, z, yaw, gripper), each given with the seconds that lead to it."""
+    poses = [np.array([*pose, 0.0]) for _, pose in stops]
+    return tuple(
+        Leg(seconds, poses[k], poses[k + 1], guarded == k)
+        for k, (seconds, _) in enumerate(stops[1:])
+    )
+
+
+@dataclass(frozen=True)
+class Push(Primitive):
     """A straight push through the object's centre (Section 3.3).
 
     The gripper starts on a circle around the object at the angle theta [rad], travels through
@@ -47,7 +122,8 @@ class Push:
     radius: float = 0.2
 
     name = "push"
-    duration_s = PUSH_DURATION_S
+    opening_m = PUSH_GAP_M
+    force_N = 200.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "theta", check_finite("theta", self.theta) % (2 * math.pi))
@@ -64,23 +140,211 @@ class Push:
         """The direction in which the gripper travels, in [-π, π)."""
         return wrap_angle(self.theta + math.pi)
 
-    def path(self, phase: np.ndarray | float) -> np.ndarray:
-        """The commanded action a_t: (n, 5) at the phases (n,), channels `ACTION_CHANNELS`."""
-        phase = np.atleast_1d(np.asarray(phase, dtype=float))
-        along = (self.radius + self.length) * min_jerk(phase) - self.radius
-        action = np.empty((len(phase), 5))
-        action[:, 0] = along * math.cos(self.direction_rad)
-        action[:, 1] = along * math.sin(self.direction_rad)
-        action[:, 2] = PUSH_TIP_HEIGHT_M
-        action[:, 3] = self.direction_rad
-        action[:, 4] = 1.0
-        return action
+    @cached_property
+    def legs(self) -> tuple[Leg, ...]:
+        yaw = self.direction_rad
+        x, y = math.cos(yaw), math.sin(yaw)
+        start = (-self.radius * x, -self.radius * y, TIP_HEIGHT_M, yaw, 1.0)
+        end = (self.length * x, self.length * y, TIP_HEIGHT_M, yaw, 1.0)
+        return _legs((0.0, start), (DURATION_S, end))
 
 
-PRIMITIVES: dict[str, type[Push]] = {Push.name: Push}
+@dataclass(frozen=True)
+class Drag(Primitive):
+    """The paper's push for objects that roll: cage the object, take it along, let it go.
+
+    The open gripper is lowered over the object's centre, closed, moved by `length` [m] towards
+    theta [rad], and opened. grip_yaw [rad]: of the gripper, whose fingers close across this
+    direction; None means along the axis that the robot sees.
+    """
+
+    theta: float
+    length: float = 0.05
+    grip_yaw: float | None = None
+
+    name = "drag"
+    opening_m = 0.14
+    force_N = 10.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "theta", check_finite("theta", self.theta) % (2 * math.pi))
+        check_within("length", self.length, 0.0, 0.15, "m")
+        if self.grip_yaw is not None:
+            object.__setattr__(
+                self, "grip_yaw", wrap_angle(check_finite("grip_yaw", self.grip_yaw))
+            )
+
+    @classmethod
+    def towards(cls, direction_rad: float, **kwargs: float) -> Drag:
+        """The drag that takes an object towards the given direction [rad]."""
+        return cls(direction_rad, **kwargs)
+
+    @property
+    def direction_rad(self) -> float:
+        """The direction in which the object is taken, in [-π, π)."""
+        return wrap_angle(self.theta)
+
+    @cached_property
+    def legs(self) -> tuple[Leg, ...]:
+        end = (self.length * math.cos(self.theta), self.length * math.sin(self.theta))
+        yaw = self.grip_yaw or 0.0
+        return _legs(
+            (0.0, (0.0, 0.0, HOVER_M, yaw, 1.0)),
+            (1.0, (0.0, 0.0, TIP_HEIGHT_M, yaw, 1.0)),
+            (0.75, (0.0, 0.0, TIP_HEIGHT_M, yaw, 0.0)),
+            (1.25, (*end, TIP_HEIGHT_M, yaw, 0.0)),
+            (0.75, (*end, TIP_HEIGHT_M, yaw, 1.0)),
+        )
 
 
-def primitive_named(name: str) -> type[Push]:
+@dataclass(frozen=True)
+class Grasp(Primitive):
+    """Lower the open gripper until it feels the object, close it, lift; it has no parameters.
+
+    seen_height [m] is the object's: the tips aim at 30 mm below its top. None means as the robot
+    sees it.
+    """
+
+    seen_height: float | None = None
+
+    name = "grasp"
+    opening_m = 0.105
+    force_N = 10.0
+    holds = True
+    lift_m: ClassVar[float] = 0.25
+    success_m: ClassVar[float] = 0.1
+
+    def __post_init__(self) -> None:
+        if self.seen_height is not None:
+            check_within("seen_height", self.seen_height, 0.0, 0.2, "m")
+
+    @cached_property
+    def legs(self) -> tuple[Leg, ...]:
+        low = max((self.seen_height or 0.06) - 0.03, TIP_HEIGHT_M)
+        return _legs(
+            (0.0, (0.0, 0.0, HOVER_M, 0.0, 1.0)),
+            (1.0, (0.0, 0.0, low, 0.0, 1.0)),
+            (0.75, (0.0, 0.0, low, 0.0, 0.0)),
+            (2.0, (0.0, 0.0, low + self.lift_m, 0.0, 0.0)),
+            guarded=0,
+        )
+
+    def succeeded(self, effect: np.ndarray) -> bool:
+        """Whether the object is more than 0.1 m up (Section 4.3)."""
+        return bool(effect[2] > self.success_m)
+
+
+@dataclass(frozen=True)
+class Rotate(Primitive):
+    """Lower the open gripper over the object, close it, turn, open; it has no parameters.
+
+    The sweep is fixed: a smaller angle is a rotation stopped at an earlier phase.
+    """
+
+    name = "rotate"
+    opening_m = 0.14
+    force_N = 10.0
+    sweep_rad: ClassVar[float] = math.radians(60)
+
+    @cached_property
+    def legs(self) -> tuple[Leg, ...]:
+        return _legs(
+            (0.0, (0.0, 0.0, HOVER_M, 0.0, 1.0)),
+            (1.0, (0.0, 0.0, TIP_HEIGHT_M, 0.0, 1.0)),
+            (0.75, (0.0, 0.0, TIP_HEIGHT_M, 0.0, 0.0)),
+            (1.25, (0.0, 0.0, TIP_HEIGHT_M, self.sweep_rad, 0.0)),
+            (0.75, (0.0, 0.0, TIP_HEIGHT_M, self.sweep_rad, 1.0)),
+        )
+
+    def succeeded(self, effect: np.ndarray) -> bool:
+        """Whether the object has turned by more than half the sweep."""
+        return bool(effect[3] > self.sweep_rad / 2)
+
+
+@dataclass(frozen=True)
+class _Arc(Leg):
+    """The lifting leg: the blade turns by an angle φ about an edge `radius_m` ahead of it."""
+
+    radius_m: float = 0.16
+    angle_rad: float = 0.0
+    pitch_share: float = 0.8
+
+    def at(self, share: np.ndarray) -> np.ndarray:
+        poses = np.repeat(self.start[None], len(share), axis=0)
+        angle = np.asarray(share) * self.angle_rad
+        ahead = self.radius_m * (1 - np.cos(angle))
+        poses[:, 0] += ahead * math.cos(self.start[3])
+        poses[:, 1] += ahead * math.sin(self.start[3])
+        poses[:, 2] += self.radius_m * np.sin(angle)
+        poses[:, 5] = self.pitch_share * angle
+        return poses
+
+
+@dataclass(frozen=True)
+class LeverUp(Primitive):
+    """Slide a blade under an object's edge and lever it up (Section 4.1).
+
+    contact_x, contact_y [m]: a point on the edge, relative to the object's centre; theta [rad]:
+    the direction in which the blade goes under it; reach [m]: from the contact to the far edge on
+    which the object will turn. The tip follows r(1 - cos φ), r sin φ up to φ = 65°.
+    """
+
+    contact_x: float
+    contact_y: float
+    theta: float
+    reach: float
+
+    name = "lever_up"
+    opening_m = 0.012
+    force_N = 200.0
+    holds = True
+    tool = "screwdriver"
+    angle_rad: ClassVar[float] = math.radians(65)
+    insertion_m: ClassVar[float] = 0.012
+    run_up_m: ClassVar[float] = 0.03
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "theta", check_finite("theta", self.theta) % (2 * math.pi))
+        check_within("contact_x", self.contact_x, -0.2, 0.2, "m")
+        check_within("contact_y", self.contact_y, -0.2, 0.2, "m")
+        check_within("reach", self.reach, 0.05, 0.4, "m")
+
+    @classmethod
+    def at_edge(
+        cls, outline_m: np.ndarray, edge: int, share: float = 0.5, turn_rad: float = 0.0
+    ) -> LeverUp:
+        """The lever-up from a point on an edge of an outline (n, 2) [m], counter-clockwise.
+
+        share: how far along the edge; turn_rad: how far its direction is off the inward normal.
+        """
+        start, end = outline_m[edge % len(outline_m)], outline_m[(edge + 1) % len(outline_m)]
+        contact = start + check_within("share", share, 0.0, 1.0) * (end - start)
+        theta = math.atan2(*(end - start)[::-1]) + math.pi / 2 + turn_rad
+        direction = np.array([math.cos(theta), math.sin(theta)])
+        reach = float(((outline_m - contact) @ direction).max())
+        return cls(float(contact[0]), float(contact[1]), theta, reach)
+
+    @cached_property
+    def legs(self) -> tuple[Leg, ...]:
+        direction = np.array([math.cos(self.theta), math.sin(self.theta)])
+        contact = np.array([self.contact_x, self.contact_y])
+        outside = contact - self.run_up_m * direction
+        under = contact + self.insertion_m * direction
+        poses = [np.array([*xy, BLADE_HEIGHT_M, self.theta, 0.0, 0.0]) for xy in (outside, under)]
+        arc = _Arc(2.75, poses[1], poses[1], radius_m=self.reach, angle_rad=self.angle_rad)
+        return Leg(1.0, *poses), arc
+
+    def succeeded(self, effect: np.ndarray) -> bool:
+        """Whether the object has been tilted by more than half the lever's angle."""
+        return bool(effect[4] > self.angle_rad / 2)
+
+
+PRIMITIVES: dict[str, type[Primitive]] = {
+    primitive.name: primitive for primitive in (Push, Drag, Grasp, Rotate, LeverUp)
+}
+
+
+def primitive_named(name: str) -> type[Primitive]:
     """The class of the primitive called `name`; raises naming the known ones."""
     if name not in PRIMITIVES:
         raise ValueError(f"primitive {name!r} is unknown; choose one of {sorted(PRIMITIVES)}")

@@ -18,16 +18,22 @@ if TYPE_CHECKING:
 
     import torch
 
-    from affordlib.primitives import Push
+    from affordlib.primitives import Primitive
 
 ACTION_CHANNELS = ("x", "y", "z", "yaw", "gripper")
 EFFECT_CHANNELS = ("x", "y", "z", "yaw", "tilt")
 IMAGE_CHANNELS = ("depth", "mask")
 IMAGE_PIXELS = 48
 CROP_WIDTH_M = 0.16
+LEVER_IMAGE_PIXELS = 128
+LEVER_CROP_WIDTH_M = 0.56
+"""Of a lever-up: around the contact point, turned so that the lever's direction is to the right."""
 
-TABLE_X_M = (-0.5, 0.5)
-TABLE_Y_M = (-0.6, 0.6)
+FAULT_LIMIT_M = 0.002
+"""An episode off its path, or with bodies inside each other, by more than this is not believed."""
+
+TABLE_X_M = (-0.5, 0.7)
+TABLE_Y_M = (-0.7, 0.7)
 
 
 def check_finite(name: str, value: float) -> float:
@@ -69,11 +75,18 @@ class Interaction:
 
     phase: (n,); action: (n, 5) commanded, channels `ACTION_CHANNELS`; effect: (n, 5), channels
     `EFFECT_CHANNELS` (metres and radians; gripper is 1 open, 0 closed); rest_effect: (5,) where
-    the object rests after the gripper has retreated; image: (2, 48, 48), depth [m] and mask;
-    start_pose: (x, y, yaw) of the object in the frame of the table.
+    the object rests after the gripper has retreated; image: (2, 48, 48), depth [m] and mask, of a
+    lever-up (2, 128, 128) from the contact point in the lever's direction;
+    start_pose: (x, y, yaw) of the object in the frame of the table; believed_xy_m: where the robot
+    took it to be, and placed its action; tool: (26, 5) measured x, y, z [m], yaw [rad] of the tool
+    and gap of the fingers [m], every 3 steps of 50 ms as in the paper.
+
+    Of the execution: how far the tool was off its path and how deep bodies sank into each other,
+    at most [m]; whether the object left the table, fell over, and can roll as it lies now; whether
+    the arm could reach at all (if not, nothing happened).
     """
 
-    primitive: Push
+    primitive: Primitive
     stop_phase: float
     phase: np.ndarray
     action: np.ndarray
@@ -81,7 +94,29 @@ class Interaction:
     rest_effect: np.ndarray
     image: np.ndarray
     start_pose: tuple[float, float, float]
+    believed_xy_m: tuple[float, float]
+    tool: np.ndarray
     tracking_error_m: float
+    penetration_m: float
+    left_table: bool
+    fell: bool
+    rolls: bool
+    reached: bool = True
+
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """Why the episode must not be believed; empty when nothing is wrong with it."""
+        reasons = {
+            "off_path": self.tracking_error_m > FAULT_LIMIT_M,
+            "penetration": self.penetration_m > FAULT_LIMIT_M,
+            "left_table": self.left_table,
+        }
+        return tuple(name for name, so in reasons.items() if so)
+
+    @property
+    def success(self) -> bool:
+        """Whether the primitive did what it is for."""
+        return self.primitive.succeeded(self.effect[-1])
 
 
 @dataclass(frozen=True)
@@ -138,7 +173,7 @@ class Step:
     instead of the primitive's own where a planner gives one; std_m: the model's σ of the end.
     """
 
-    primitive: Push
+    primitive: Primitive
     stop_phase: float
     predicted_end_xy_m: tuple[float, float]
     predicted_path_xy_m: np.ndarray

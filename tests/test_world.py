@@ -63,7 +63,7 @@ def test_a_push_ends_beyond_the_gripper(world, thing):
         half = math.sqrt(half**2 - 0.015**2)
     assert seen.effect[-1, 0] == pytest.approx(0.05 + finger + half, abs=0.003)
     assert abs(seen.effect[-1, 1]) < 0.004
-    assert seen.tracking_error_m < 5e-4
+    assert seen.tracking_error_m < 1e-3
     assert np.abs(seen.effect[: 301 // 2, :2]).max() < 1e-4  # nothing moves before contact
     assert seen.phase.shape == (301,)
     assert seen.action.shape == seen.effect.shape == (301, 5)
@@ -150,7 +150,7 @@ def test_unreachable_raises_and_moves_nothing(world):
         (lambda w: Push("left"), "theta .* 'left'"),
         (lambda w: Push(0.0, length=-0.1), r"length .* -0\.1"),
         (lambda w: Push(0.0, radius=1.0), "radius .* 1"),
-        (lambda w: primitive_named("kick"), "'kick' is unknown; choose one of .'push'"),
+        (lambda w: primitive_named("kick"), "'kick' is unknown; choose one of .'drag', 'grasp'"),
         (lambda w: family_named("cone"), "'cone' is unknown"),
         (lambda w: Cuboid(0.05, math.inf, 0.05), "cuboid width .* inf"),
         (lambda w: UprightCylinder(0.05, 5.0), "cylinder height .* 5"),

@@ -9,35 +9,101 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from affordlib.primitives import primitive_named
+from affordlib.primitives import Drag, LeverUp, Primitive, Push, primitive_named
+from affordlib.types import TABLE_X_M, TABLE_Y_M, check_within
 from affordlib.world import Tabletop, WorldConfig, family_named
 
 if TYPE_CHECKING:
     from affordlib.types import Interaction
-    from affordlib.world.objects import Cuboid, UprightCylinder
+    from affordlib.world import Thing
+
+_TABLE_MARGIN_M = 0.08
+
+
+@dataclass(frozen=True)
+class Variation:
+    """What differs from episode to episode in a world that is no clean room.
+
+    Frictions, density and how much higher the gripper moves are drawn uniformly from ranges;
+    com_offset: the centre of mass lies off the centre by up to this share of the half extents;
+    bias_sd_m: of where the robot believes the object to be, beside the camera's own error.
+    """
+
+    table_friction: tuple[float, float] = (0.35, 0.65)
+    object_friction: tuple[float, float] = (0.35, 0.65)
+    finger_friction: tuple[float, float] = (0.6, 1.2)
+    density_kg_m3: tuple[float, float] = (300.0, 1200.0)
+    tip_offset_m: tuple[float, float] = (-0.003, 0.01)
+    com_offset: float = 0.15
+    bias_sd_m: float = 0.001
+    camera: str = "kinect"
+
+    def __post_init__(self) -> None:
+        for name in _RANGES:
+            low, high = (float(v) for v in getattr(self, name))
+            if not low <= high:
+                raise ValueError(f"{name} must be a range (low, high), got {(low, high)}")
+            object.__setattr__(self, name, (low, high))
+        check_within("com_offset", self.com_offset, 0.0, 0.5)
+        check_within("bias_sd_m", self.bias_sd_m, 0.0, 0.02, "m")
+
+    def draw(self, thing: Thing, rng: np.random.Generator) -> WorldConfig:
+        """One world: what an episode with this thing is like."""
+        drawn = {name: float(rng.uniform(*getattr(self, name))) for name in _RANGES}
+        half = np.array([*np.ptp(thing.footprint_m, axis=0), thing.height_m]) / 2
+        offset = self.com_offset * half * rng.uniform(-1, 1, size=3)
+        return WorldConfig(
+            **drawn,
+            com_offset_m=tuple(float(v) for v in offset),
+            camera=self.camera,
+            bias_m=tuple(float(v) for v in rng.normal(0, self.bias_sd_m, size=2)),
+            noise_seed=int(rng.integers(2**31)),
+        )
+
+
+_RANGES = ("table_friction", "object_friction", "finger_friction", "density_kg_m3", "tip_offset_m")
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """What is collected: a primitive on objects of some families, in a world, from a seed."""
+    """What is collected: primitives on objects of some families, in a world, from a seed.
 
-    primitive: str = "push"
+    Of several primitives one is drawn that suits the object: a push for what does not roll, a drag
+    for what does. size_range_m and height_range_m: of the objects (heights default to the sizes).
+    anywhere: objects lie all over the table, within reach or not, instead of at its centre.
+    partial: the action is broken off at a random phase. variation: worlds drawn episode by episode.
+    """
+
+    primitives: tuple[str, ...] = ("push",)
     n_interactions: int = 500
     seed: int = 0
     families: tuple[str, ...] = ("cuboid", "upright_cylinder")
+    size_range_m: tuple[float, float] = (0.04, 0.08)
+    height_range_m: tuple[float, float] | None = None
+    anywhere: bool = False
+    partial: bool = False
     world: WorldConfig = field(default_factory=WorldConfig)
+    variation: Variation | None = None
 
     def __post_init__(self) -> None:
-        primitive_named(self.primitive)
-        if not self.families:
-            raise ValueError("families must name at least one object family, got none")
-        for name in self.families:
-            family_named(name)
+        for name, check in (("primitives", primitive_named), ("families", family_named)):
+            values = tuple(getattr(self, name))
+            if not values or isinstance(getattr(self, name), str):
+                raise ValueError(f"{name} must be a sequence of at least one name, got {values!r}")
+            for value in values:
+                check(value)
+            object.__setattr__(self, name, values)
+        for name in ("size_range_m", "height_range_m"):
+            if getattr(self, name) is None:
+                continue
+            low, high = (check_within(name, v, 0.005, 0.3, "m") for v in getattr(self, name))
+            if low > high:
+                raise ValueError(f"{name} must be a range (low, high), got {(low, high)}")
+            object.__setattr__(self, name, (low, high))
         for name, low in (("n_interactions", 1), ("seed", 0)):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < low:
                 raise ValueError(f"{name} must be a whole number of at least {low}, got {value!r}")
-        object.__setattr__(self, "families", tuple(self.families))
 
     def to_json(self) -> str:
         """The recipe as JSON with sorted keys."""
@@ -48,31 +114,123 @@ class Recipe:
         """The recipe that `to_json` wrote."""
         fields = json.loads(text)
         fields["world"] = WorldConfig(**fields["world"])
-        fields["families"] = tuple(fields["families"])
+        if fields["variation"] is not None:
+            fields["variation"] = Variation(**fields["variation"])
         return cls(**fields)
 
 
+_ROLLABLE = ("lying_cylinder", "sphere")
+_STANDING = ("cuboid", "upright_cylinder")
+_PUSH = Recipe()
+_DRAG = Recipe(primitives=("drag",), families=_ROLLABLE, seed=1)
+_MIXED = Recipe(primitives=("push", "drag"), families=_STANDING + _ROLLABLE, seed=2)
+
 RECIPES: dict[str, Recipe] = {
-    "push": Recipe(),
-    "push_test": replace(Recipe(), n_interactions=1000, seed=1_000_003),
+    "push": _PUSH,
+    "drag": _DRAG,
+    "mixed": _MIXED,
+    "grasp": Recipe(
+        primitives=("grasp",),
+        n_interactions=100,
+        seed=3,
+        families=_STANDING + _ROLLABLE,
+        size_range_m=(0.03, 0.12),
+        world=WorldConfig(object_friction=0.25),
+    ),
+    "rotate": Recipe(
+        primitives=("rotate",), n_interactions=100, seed=4, families=(*_STANDING, "prism")
+    ),
+    "lever_up": Recipe(
+        primitives=("lever_up",),
+        n_interactions=1800,
+        seed=5,
+        families=("prism",),
+        size_range_m=(0.15, 0.24),
+        height_range_m=(0.03, 0.06),
+        world=WorldConfig(table_friction=1.0, object_friction=0.8, finger_friction=1.2),
+    ),
+    "push_test": replace(_PUSH, n_interactions=1000, seed=1_000_003),
+    "partial": replace(_MIXED, n_interactions=300, seed=1_000_004, partial=True),
+    "push_varied": replace(_PUSH, seed=6, families=(*_STANDING, "prism"), variation=Variation()),
+    "reach": Recipe(
+        primitives=("push", "drag", "grasp", "rotate"),
+        n_interactions=1000,
+        seed=7,
+        families=(*_STANDING, *_ROLLABLE, "prism"),
+        anywhere=True,
+    ),
 }
-"""The shipped data sets: the paper's 500 pushes, and a fixed test set no model trains on."""
+"""The paper's sets; a fixed test set no model trains on; partial executions, for testing only; a
+world that is no clean room; and objects all over the table, within reach or not."""
+
+SHIPPED = tuple(RECIPES)
+
+RECIPES |= {
+    f"{name}_x10": replace(recipe, n_interactions=10 * recipe.n_interactions, seed=recipe.seed + 10)
+    for name, recipe in RECIPES.items()
+    if name in ("push", "drag", "mixed", "grasp", "rotate", "lever_up")
+}
 
 
-def draw_scene(
-    recipe: Recipe, index: int
-) -> tuple[Cuboid | UprightCylinder, float, np.random.Generator]:
+def _generator(recipe: Recipe, index: int, *part: int) -> np.random.Generator:
+    return np.random.default_rng(np.random.SeedSequence(recipe.seed, spawn_key=(index, *part)))
+
+
+def draw_scene(recipe: Recipe, index: int) -> tuple[Thing, float, np.random.Generator]:
     """Object and yaw [rad] of interaction `index`, and the generator to draw its action from."""
-    rng = np.random.default_rng(np.random.SeedSequence(recipe.seed, spawn_key=(index,)))
+    rng = _generator(recipe, index)
     family = family_named(recipe.families[rng.integers(len(recipe.families))])
-    return family.sample(rng), float(rng.uniform(-math.pi, math.pi)), rng
+    thing = family.sample(rng, recipe.size_range_m, recipe.height_range_m)
+    return thing, float(rng.uniform(-math.pi, math.pi)), rng
+
+
+def draw_place(recipe: Recipe, index: int) -> tuple[float, float]:
+    """Where on the table the object of interaction `index` lies, (x, y) [m]."""
+    if not recipe.anywhere:
+        return 0.0, 0.0
+    low = np.array([TABLE_X_M[0], TABLE_Y_M[0]]) + _TABLE_MARGIN_M
+    high = np.array([TABLE_X_M[1], TABLE_Y_M[1]]) - _TABLE_MARGIN_M
+    x, y = _generator(recipe, index, 1).uniform(low, high)
+    return float(x), float(y)
+
+
+def draw_stop(recipe: Recipe, index: int) -> float:
+    """The phase at which interaction `index` is broken off; 1 if it is not."""
+    return float(_generator(recipe, index, 2).uniform(0.05, 1.0)) if recipe.partial else 1.0
+
+
+def draw_world(recipe: Recipe, index: int, thing: Thing) -> WorldConfig:
+    """The world in which interaction `index` takes place."""
+    if recipe.variation is None:
+        return recipe.world
+    return recipe.variation.draw(thing, _generator(recipe, index, 3))
+
+
+def _draw_action(recipe: Recipe, thing: Thing, yaw: float, rng: np.random.Generator) -> Primitive:
+    """A primitive that suits the thing, with parameters drawn at random."""
+    unsuited = "push" if thing.rollable else "drag"
+    names = [name for name in recipe.primitives if name != unsuited] or list(recipe.primitives)
+    kind = primitive_named(names[rng.integers(len(names))] if len(names) > 1 else names[0])
+    if issubclass(kind, Push | Drag):
+        return kind(float(rng.uniform(0, 2 * math.pi)))
+    if not issubclass(kind, LeverUp):
+        return kind()
+    c, s = math.cos(yaw), math.sin(yaw)
+    outline = thing.footprint_m @ np.array([[c, s], [-s, c]])
+    edge = int(rng.integers(len(outline)))
+    return kind.at_edge(outline, edge, rng.uniform(0.35, 0.65), rng.uniform(-0.1, 0.1))
 
 
 def interact(
-    recipe: Recipe, index: int, world: Tabletop
-) -> tuple[Cuboid | UprightCylinder, Interaction]:
-    """Carry out interaction `index` of a recipe: the same bits in every process and order."""
+    recipe: Recipe, index: int, world: Tabletop, stop_phase: float | None = None
+) -> tuple[Thing, Interaction]:
+    """Carry out interaction `index` of a recipe: the same bits in every process and order.
+
+    stop_phase: where to break it off, if not where the recipe says.
+    """
     thing, yaw, rng = draw_scene(recipe, index)
-    world.place(thing, (0.0, 0.0), yaw)
-    action = primitive_named(recipe.primitive)(float(rng.uniform(0, 2 * math.pi)))
-    return thing, world.interact(action)
+    action = _draw_action(recipe, thing, yaw, rng)
+    config = draw_world(recipe, index, thing)
+    world.place(thing, draw_place(recipe, index), yaw, tool=action.tool, config=config)
+    stop = draw_stop(recipe, index) if stop_phase is None else stop_phase
+    return thing, world.attempt(action, stop)

@@ -1,14 +1,27 @@
 """All that touches PyBullet: the tabletop, its objects, the arm and the camera."""
 
 import affordlib.world._quiet_pybullet  # noqa: F401  (must come first)
-from affordlib.world.objects import FAMILIES, Cuboid, UprightCylinder, family_named
+from affordlib.world.objects import (
+    FAMILIES,
+    Cuboid,
+    LyingCylinder,
+    Prism,
+    Sphere,
+    Thing,
+    UprightCylinder,
+    family_named,
+)
 from affordlib.world.robot import UnreachableError
 from affordlib.world.scene import Tabletop, WorldConfig
 
 __all__ = [
     "FAMILIES",
     "Cuboid",
+    "LyingCylinder",
+    "Prism",
+    "Sphere",
     "Tabletop",
+    "Thing",
     "UnreachableError",
     "UprightCylinder",
     "WorldConfig",

@@ -1,32 +1,57 @@
 """What the robot sees: a top-down depth image of the object, and pictures for people.
 
-The depth camera hangs vertically above the object and is rectified: its rays are parallel, so the
+The ideal camera hangs vertically above the object and is rectified: its rays are parallel, so the
 crop does not depend on where on the table the object stands. Depth is the distance [m] from the
-camera's plane; the mask is read from the depth (what stands above the table), not told.
+camera's plane; the mask is read from the depth (what stands above the table), not told. The Kinect
+has a perspective, noise, and must find the object itself.
 """
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pybullet
 
-from affordlib.types import CROP_WIDTH_M, IMAGE_PIXELS
+from affordlib.types import CROP_WIDTH_M, IMAGE_PIXELS, TABLE_X_M, TABLE_Y_M
+from affordlib.world.perception import CAMERA_HEIGHT_M, centre_m, largest_blob
 
-CAMERA_HEIGHT_M = 1.0
 _NEAR_M, _FAR_M = 0.5, 1.1
 _MASK_HEIGHT_M = 0.004
 
+KINECT_HEIGHT_M = 1.3
+_KINECT_XY_M = (sum(TABLE_X_M) / 2, sum(TABLE_Y_M) / 2)
+KINECT_FOCAL_PX = 575.0
+KINECT_BASELINE_M = 0.075
+_KINECT_MASK_HEIGHT_M = 0.012
 
-def _orthographic(half_width_m: float) -> np.ndarray:
+
+def _orthographic(half_width_m: float, pixels: int) -> np.ndarray:
     """The 4x4 projection of parallel rays, shifted by half a pixel.
 
     TinyRenderer samples pixels at their corners; the shift makes it their centres.
     """
     depth_range = _FAR_M - _NEAR_M
     projection = np.diag([1 / half_width_m, 1 / half_width_m, -2 / depth_range, 1.0])
-    projection[:2, 3] = -1 / IMAGE_PIXELS
+    projection[:2, 3] = -1 / pixels
     projection[2, 3] = -(_FAR_M + _NEAR_M) / depth_range
     return projection
+
+
+def _depth_buffer(client: int, view: tuple, projection: np.ndarray, shape: tuple) -> np.ndarray:
+    """The renderer's depth buffer as (rows, columns)."""
+    rows, columns = shape
+    _, _, _, buffer, _ = pybullet.getCameraImage(
+        columns,
+        rows,
+        view,
+        projection.T.ravel().tolist(),
+        renderer=pybullet.ER_TINY_RENDERER,
+        flags=pybullet.ER_NO_SEGMENTATION_MASK,
+        shadow=0,
+        physicsClientId=client,
+    )
+    return np.asarray(buffer, dtype=np.float64).reshape(rows, columns)
 
 
 def _distance_m(buffer: np.ndarray, projection: np.ndarray) -> np.ndarray:
@@ -39,28 +64,100 @@ def _distance_m(buffer: np.ndarray, projection: np.ndarray) -> np.ndarray:
     return far * near / (far - buffer * (far - near))
 
 
-def depth_crop(client: int, xy_m: tuple[float, float]) -> np.ndarray:
-    """Depth [m] and mask (2, 48, 48) of the 0.16 m square around (x, y), as float32.
+def depth_crop(
+    client: int,
+    xy_m: tuple[float, float],
+    pixels: int = IMAGE_PIXELS,
+    width_m: float = CROP_WIDTH_M,
+    turn_rad: float = 0.0,
+) -> np.ndarray:
+    """Depth [m] and mask (2, n, n) of the square around (x, y), as float32.
 
-    Rows run along -y and columns along +x of the table, as a map is read.
+    Columns run along the direction turn_rad of the table, rows a quarter turn to its right: by
+    default as a map is read.
     """
     x, y = xy_m
-    view = pybullet.computeViewMatrix((x, y, CAMERA_HEIGHT_M), (x, y, 0), (0, 1, 0))
-    projection = _orthographic(CROP_WIDTH_M / 2)
-    _, _, _, buffer, _ = pybullet.getCameraImage(
-        IMAGE_PIXELS,
-        IMAGE_PIXELS,
-        view,
-        projection.T.ravel().tolist(),
-        renderer=pybullet.ER_TINY_RENDERER,
-        flags=pybullet.ER_NO_SEGMENTATION_MASK,
-        shadow=0,
-        physicsClientId=client,
-    )
-    buffer = np.asarray(buffer, dtype=np.float64).reshape(IMAGE_PIXELS, IMAGE_PIXELS)
-    depth = _distance_m(buffer, projection)
+    up = (-math.sin(turn_rad), math.cos(turn_rad), 0)
+    view = pybullet.computeViewMatrix((x, y, CAMERA_HEIGHT_M), (x, y, 0), up)
+    projection = _orthographic(width_m / 2, pixels)
+    depth = _distance_m(_depth_buffer(client, view, projection, (pixels, pixels)), projection)
     mask = depth < CAMERA_HEIGHT_M - _MASK_HEIGHT_M
     return np.stack([depth, mask]).astype(np.float32)
+
+
+def _kinect_points(
+    client: int,
+    centre_m: tuple[float, float],
+    width_m: tuple[float, float],
+    step: int,
+    noise: np.random.Generator,
+) -> np.ndarray:
+    """Points (n, 3) [m] that a Kinect above the table's centre measures around a place.
+
+    Of its image only the window is rendered, every `step`-th pixel. Depth has noise that grows
+    with distance, is rounded to steps of disparity, and edges are frayed by about a pixel.
+    """
+    pitch = step / KINECT_FOCAL_PX
+    columns, rows = (math.ceil(w / KINECT_HEIGHT_M / pitch) for w in width_m)
+    stand = np.array(_KINECT_XY_M)
+    tangent = (np.array(centre_m) - stand) / KINECT_HEIGHT_M
+    half = np.array([columns, rows]) * pitch / 2
+    near, far = 0.8, 1.4
+    projection = np.zeros((4, 4))
+    projection[0, 0], projection[1, 1] = 1 / half
+    # Half a pixel's shift, as above, turned into one of the tangent.
+    projection[:2, 2] = tangent / half + 1 / np.array([columns, rows])
+    projection[2, 2:] = -(far + near) / (far - near), -2 * far * near / (far - near)
+    projection[3, 2] = -1
+    view = pybullet.computeViewMatrix((*stand, KINECT_HEIGHT_M), (*stand, 0), (0, 1, 0))
+    distance = _distance_m(_depth_buffer(client, view, projection, (rows, columns)), projection)
+
+    jitter = noise.normal(0, 0.8 / step, size=(2, rows, columns)) + np.indices((rows, columns))
+    row, column = np.rint(jitter).astype(int)
+    distance = distance[row.clip(0, rows - 1), column.clip(0, columns - 1)]
+    distance = distance + noise.normal(size=distance.shape) * (
+        0.0012 + 0.0019 * (distance - 0.4) ** 2
+    )
+    focal = KINECT_FOCAL_PX * KINECT_BASELINE_M
+    distance = focal / (np.rint(8 * focal / distance) / 8)
+    x = stand[0] + (tangent[0] - half[0] + pitch * (np.arange(columns) + 0.5))[None] * distance
+    y = stand[1] + (tangent[1] + half[1] - pitch * (np.arange(rows) + 0.5))[:, None] * distance
+    return np.stack([x, y, KINECT_HEIGHT_M - distance], axis=-1).reshape(-1, 3)
+
+
+def _height_map(points: np.ndarray, centre_m: tuple[float, float]) -> np.ndarray:
+    """Mean height [m] of the points in each pixel of a crop, seen from above; gaps are table."""
+    pixel = CROP_WIDTH_M / IMAGE_PIXELS
+    at = np.floor((points[:, :2] - np.array(centre_m)) / pixel + IMAGE_PIXELS / 2).astype(int)
+    inside = ((at >= 0) & (at < IMAGE_PIXELS)).all(axis=1)
+    cell = (IMAGE_PIXELS - 1 - at[inside, 1]) * IMAGE_PIXELS + at[inside, 0]
+    count = np.bincount(cell, minlength=IMAGE_PIXELS**2)
+    total = np.bincount(cell, weights=points[inside, 2], minlength=IMAGE_PIXELS**2)
+    return (total / np.maximum(count, 1)).reshape(IMAGE_PIXELS, IMAGE_PIXELS)
+
+
+def kinect_view(client: int, noise: np.random.Generator) -> tuple[tuple[float, float], np.ndarray]:
+    """Where a Kinect above the table sees the object, (x, y) [m], and a crop (2, 48, 48) of it.
+
+    The perspective image is turned into points and seen from straight above, so the crop does not
+    depend on where the object lies. Raises RuntimeError when nothing stands on the table.
+    """
+    table = (TABLE_X_M[1] - TABLE_X_M[0], TABLE_Y_M[1] - TABLE_Y_M[0])
+    coarse = _kinect_points(client, _KINECT_XY_M, table, 4, noise)
+    high = coarse[coarse[:, 2] > _KINECT_MASK_HEIGHT_M]
+    if not len(high):
+        raise RuntimeError("the camera sees no object on the table; call place(...) first")
+    xy = tuple(np.median(high[:, :2], axis=0))
+    for _ in range(2):
+        points = _kinect_points(client, xy, (1.5 * CROP_WIDTH_M, 1.5 * CROP_WIDTH_M), 1, noise)
+        height = _height_map(points, xy)
+        mask = largest_blob(height > _KINECT_MASK_HEIGHT_M)
+        if mask.any():
+            dx, dy = centre_m(mask)
+            xy = (float(xy[0] + dx), float(xy[1] + dy))
+    height = _height_map(points, xy)
+    mask = largest_blob(height > _KINECT_MASK_HEIGHT_M)
+    return xy, np.stack([CAMERA_HEIGHT_M - height, mask]).astype(np.float32)
 
 
 def picture(client: int, width: int = 320, height: int = 240) -> np.ndarray:

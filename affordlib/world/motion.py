@@ -1,20 +1,20 @@
 """How the arm follows a commanded path, fast: joints planned ahead, motors set once a step.
 
 Inverse kinematics runs at 20 Hz with a spline in between (the error is a few µm), so that
-a push costs little more than the physics itself.
+an interaction costs little more than the physics itself.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pybullet
 from scipy.interpolate import CubicSpline
 
-from affordlib.primitives import PUSH_GAP_M, Push, min_jerk
-from affordlib.types import Interaction
+from affordlib.primitives import Primitive, min_jerk
 from affordlib.world import robot
 
 if TYPE_CHECKING:
@@ -26,14 +26,14 @@ if TYPE_CHECKING:
 
 STEPS_PER_WAYPOINT = 12
 RECORD_EVERY = 3
-SETTLE_STEPS = 120
 HOVER_HEIGHT_M = 0.16
-RETREAT_M = 0.02
-FINGER_FORCE_N = 200.0
+GUARD_FORCE_N = 30.0
 ARM_FORCES_N_M = (330.0, 330.0, 150.0, 54.0, 54.0, 54.0)
 _STEP_S = 1 / 240
-_GAINS = [0.3] * 8
-_FORCES = [*ARM_FORCES_N_M, FINGER_FORCE_N, FINGER_FORCE_N]
+_WAYPOINT_S = STEPS_PER_WAYPOINT * _STEP_S
+_ARM_GAINS = [0.3] * 6
+_STILL_FINGERS, _MOVING_FINGERS = [0.3] * 2, [0.02] * 2
+"""Light fingers pulled hard to a far target would leap where a contact is lost for a step."""
 
 
 def poses(states: np.ndarray) -> np.ndarray:
@@ -55,149 +55,222 @@ def put_arm(world: Tabletop, joints: np.ndarray, gap_m: float) -> None:
     """Place the arm (without motion) at joint angles (6,) with the fingers a gap [m] apart."""
     for joint, angle in zip(world.joints, (*joints, gap_m / 2, gap_m / 2), strict=True):
         pybullet.resetJointState(world.robot, joint, angle, 0.0, physicsClientId=world.client)
-    world.arm = np.array(joints, dtype=float)
+    world.arm, world.gap_m = np.array(joints, dtype=float), gap_m
 
 
-def _drive(world: Tabletop, waypoints: np.ndarray) -> np.ndarray:
-    """Move through joint waypoints (n, 6), 50 ms apart; states (m, 7) of the object on the way.
+@dataclass(frozen=True)
+class Stretch:
+    """Waypoints 50 ms apart: poses (n, 6) as in `Leg`, phases (n,) at which they are passed.
 
-    The states are recorded before the first step and after every `RECORD_EVERY` steps.
+    n_steps: how many simulation steps of it are taken before the arm is stopped dead (default:
+    all). A guarded stretch freezes when the robot presses on the object.
     """
-    n_steps = (len(waypoints) - 1) * STEPS_PER_WAYPOINT
-    grid = np.arange(n_steps + 1) / STEPS_PER_WAYPOINT
-    targets = np.empty((n_steps + 1, 8))
-    spline = CubicSpline(np.arange(len(waypoints)), waypoints, bc_type="clamped")
-    targets[:, :6] = spline(grid)
-    targets[:, 6:] = PUSH_GAP_M / 2
-    velocities = (np.diff(targets, axis=0) / _STEP_S).tolist()
-    targets = targets[1:].tolist()
 
-    client, body, arm, joints = world.client, world.body, world.robot, world.joints
-    film = world.film
-    states = []
-    for step in range(n_steps):
-        if step % RECORD_EVERY == 0:
-            states.append(pybullet.getBasePositionAndOrientation(body, client))
-        pybullet.setJointMotorControlArray(
-            arm,
-            joints,
-            pybullet.POSITION_CONTROL,
-            targetPositions=targets[step],
-            targetVelocities=velocities[step],
-            forces=_FORCES,
-            positionGains=_GAINS,
-            physicsClientId=client,
+    poses: np.ndarray
+    phase: np.ndarray
+    guarded: bool = False
+    n_steps: int | None = None
+
+
+def stretches(primitive: Primitive, stop_phase: float, smooth: bool = True) -> list[Stretch]:
+    """The way of a primitive up to a phase, leg by leg.
+
+    smooth: the leg that is broken off keeps its path and gets a minimum-jerk stop of its own;
+    otherwise it is followed at full speed and cut off.
+    """
+    way = []
+    for leg, begin, end in zip(
+        primitive.legs, primitive.leg_phases[:-1], primitive.leg_phases[1:], strict=True
+    ):
+        if way and begin >= stop_phase - 1e-9:
+            break
+        local = min(1.0, (stop_phase - begin) / (end - begin))
+        covered = float(min_jerk(local)) if smooth else 1.0
+        n = max(2, math.ceil(leg.seconds * covered / _WAYPOINT_S - 1e-9))
+        share = covered * min_jerk(np.linspace(0, 1, n + 1))
+        at_phase = np.linspace(0, 1, n + 1)
+        if covered < 1.0:
+            fine = np.linspace(0, local, 301)
+            at_phase = np.interp(share, min_jerk(fine), fine)
+        steps = None
+        if not smooth and local < 1.0:
+            steps = RECORD_EVERY * round(local * leg.seconds / _STEP_S / RECORD_EVERY)
+        phase = begin + at_phase * (end - begin)
+        way.append(Stretch(leg.at(share), phase, leg.guarded, steps))
+    return way
+
+
+def stretch_along(action: np.ndarray, phase: np.ndarray, seconds: float) -> Stretch:
+    """A given path, action (n, 5) at phases (n,), followed along its length with a smooth stop."""
+    n = max(2, math.ceil(seconds / _WAYPOINT_S - 1e-9))
+    # Along its length, a minimum-jerk path is the same path whatever its speed.
+    length = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(action[:, :2], axis=0).T))])
+    if length[-1] < 1e-9:
+        return Stretch(np.repeat([[*action[0], 0.0]], n + 1, axis=0), np.zeros(n + 1))
+    wanted = min_jerk(np.linspace(0, 1, n + 1)) * length[-1]
+    columns = [np.interp(wanted, length, action[:, c]) for c in range(5)]
+    return Stretch(np.column_stack([*columns, np.zeros(n + 1)]), np.interp(wanted, length, phase))
+
+
+def mirror_fingers(world: Tabletop) -> int:
+    """Tie the two fingers by a gear, so that a held object stays in the middle; returns its id.
+
+    Driven by two motors alone, a held object is in neutral balance and wanders.
+    """
+    left, right = world.joints[-2:]
+    gear = pybullet.createConstraint(
+        world.robot,
+        left,
+        world.robot,
+        right,
+        jointType=pybullet.JOINT_GEAR,
+        jointAxis=(0, 1, 0),
+        parentFramePosition=(0, 0, 0),
+        childFramePosition=(0, 0, 0),
+        physicsClientId=world.client,
+    )
+    pybullet.changeConstraint(
+        gear, gearRatio=-1, maxForce=300, erp=0.5, physicsClientId=world.client
+    )
+    return gear
+
+
+class Drive:
+    """Moves the arm along waypoints and writes down what it sees on the way.
+
+    states: (n, 7) of the object every `RECORD_EVERY` steps; tool: (m, 5) measured x, y, z, yaw
+    and finger gap every waypoint; how far the tool was off its path, and how deep bodies sank
+    into each other, at most [m].
+    """
+
+    def __init__(self, world: Tabletop, finger_force_N: float, closes: bool) -> None:
+        self.world = world
+        self.gains = _ARM_GAINS + (_MOVING_FINGERS if closes else _STILL_FINGERS)
+        self.forces = [*ARM_FORCES_N_M, finger_force_N, finger_force_N]
+        self.states: list[tuple] = []
+        self.tool: list[np.ndarray] = []
+        self.off_path_m = 0.0
+        self.penetration_m = 0.0
+
+    def _sense(self, pose_W: np.ndarray | None) -> None:
+        """Measure the tool against where it should be, and the contacts of the object."""
+        world = self.world
+        measured = tool_pose(world)
+        self.tool.append(measured)
+        if pose_W is not None:
+            self.off_path_m = max(self.off_path_m, math.dist(measured[:3], pose_W[:3]))
+        for contact in pybullet.getContactPoints(world.body, physicsClientId=world.client):
+            self.penetration_m = max(self.penetration_m, -contact[8])
+
+    def _pressed(self) -> bool:
+        contacts = pybullet.getContactPoints(
+            self.world.robot, self.world.body, physicsClientId=self.world.client
         )
-        pybullet.stepSimulation(client)
-        if film is not None:
-            film(world)
-    states.append(pybullet.getBasePositionAndOrientation(body, client))
-    world.arm = waypoints[-1]
-    return np.array([(*position, *quaternion) for position, quaternion in states])
+        return sum(contact[9] for contact in contacts) > GUARD_FORCE_N
+
+    def along(
+        self,
+        joints: np.ndarray,
+        gaps_m: np.ndarray,
+        poses_W: np.ndarray | None = None,
+        guarded: bool = False,
+        n_steps: int | None = None,
+    ) -> float:
+        """Move through joint waypoints (n, 6) with finger gaps (n,); returns the share gone.
+
+        poses_W: (n, 3+) where the tool should be at the waypoints, if that is to be recorded.
+        """
+        world = self.world
+        client, body, arm, indices = world.client, world.body, world.robot, world.joints
+        whole = (len(joints) - 1) * STEPS_PER_WAYPOINT
+        grid = np.arange(whole + 1) / STEPS_PER_WAYPOINT
+        targets = np.empty((whole + 1, 8))
+        targets[:, :6] = joints[0]
+        if np.ptp(joints, axis=0).any():
+            targets[:, :6] = CubicSpline(np.arange(len(joints)), joints, bc_type="clamped")(grid)
+        targets[:, 6:] = (np.interp(grid, np.arange(len(gaps_m)), gaps_m) / 2)[:, None]
+        velocities = (np.diff(targets, axis=0) / _STEP_S).tolist()
+        commands = targets[1:].tolist()
+        n_steps = whole if n_steps is None else n_steps
+        record, film = poses_W is not None, world.film
+        now, frozen_at = (targets[0].tolist(), [0.0] * 8), None
+        for step in range(n_steps):
+            if record and step % RECORD_EVERY == 0:
+                self.states.append(pybullet.getBasePositionAndOrientation(body, client))
+                if step % STEPS_PER_WAYPOINT == 0:
+                    here = None if frozen_at else poses_W[step // STEPS_PER_WAYPOINT]
+                    self._sense(here)
+            if frozen_at is None:
+                now = commands[step], velocities[step]
+                if guarded and self._pressed():
+                    frozen_at, now = step, (commands[step], [0.0] * 8)
+            pybullet.setJointMotorControlArray(
+                arm,
+                indices,
+                pybullet.POSITION_CONTROL,
+                targetPositions=now[0],
+                targetVelocities=now[1],
+                forces=self.forces,
+                positionGains=self.gains,
+                physicsClientId=client,
+            )
+            pybullet.stepSimulation(client)
+            if film is not None:
+                film(world)
+        world.arm, world.gap_m = np.array(now[0][:6]), 2 * now[0][6]
+        if n_steps < whole:
+            self.hold()
+        return 1.0 if frozen_at is None else frozen_at / whole
+
+    def hold(self) -> None:
+        """Command the arm to stand still where it was last sent."""
+        world = self.world
+        pybullet.setJointMotorControlArray(
+            world.robot,
+            world.joints,
+            pybullet.POSITION_CONTROL,
+            targetPositions=[*world.arm, world.gap_m / 2, world.gap_m / 2],
+            forces=self.forces,
+            positionGains=self.gains,
+            physicsClientId=world.client,
+        )
+
+    def wait(self, n_steps: int) -> None:
+        """Let the simulation run with the arm held where it is."""
+        for _ in range(n_steps):
+            pybullet.stepSimulation(self.world.client)
+            if self.world.film is not None:
+                self.world.film(self.world)
+
+    def finish(self) -> None:
+        """Write down the last state."""
+        self.states.append(
+            pybullet.getBasePositionAndOrientation(self.world.body, self.world.client)
+        )
+        self._sense(None)
 
 
-def _wait(world: Tabletop, n_steps: int) -> None:
-    """Let the simulation run with the arm held where it is."""
-    for _ in range(n_steps):
-        pybullet.stepSimulation(world.client)
-        if world.film is not None:
-            world.film(world)
-
-
-def _tool_W(world: Tabletop) -> np.ndarray:
-    """Measured position (3,) of the point between the finger tips [m]."""
+def tool_pose(world: Tabletop) -> np.ndarray:
+    """Measured x, y, z [m] of the tool's point, its yaw [rad] and the gap of the fingers [m]."""
     palm = world.joints[5] + 1
     state = pybullet.getLinkState(
         world.robot, palm, computeForwardKinematics=1, physicsClientId=world.client
     )
-    z_axis = np.array(pybullet.getMatrixFromQuaternion(state[5])).reshape(3, 3)[:, 2]
-    return np.array(state[4]) + robot.TOOL_LENGTH_M * z_axis
+    axes = np.array(pybullet.getMatrixFromQuaternion(state[5])).reshape(3, 3)
+    along, below = robot.TOOL_OFFSETS_M[world.tool]
+    tip = np.array(state[4]) + along * axes[:, 0] + below * axes[:, 2]
+    fingers = pybullet.getJointStates(world.robot, world.joints[-2:], physicsClientId=world.client)
+    return np.array([*tip, math.atan2(axes[1, 0], axes[0, 0]), fingers[0][0] + fingers[1][0]])
 
 
-def _joint_move(start: np.ndarray, end: np.ndarray, seconds: float) -> np.ndarray:
+def joint_move(start: np.ndarray, end: np.ndarray, seconds: float) -> np.ndarray:
     """Joint waypoints (n, 6) of a smooth move between two postures."""
-    n = max(2, math.ceil(seconds / (STEPS_PER_WAYPOINT * _STEP_S)))
+    n = max(2, math.ceil(seconds / _WAYPOINT_S))
     return start + min_jerk(np.linspace(0, 1, n + 1))[:, None] * (end - start)
 
 
-def _line(start_W: np.ndarray, end_W: np.ndarray, yaw: float, near: np.ndarray, seconds: float):
-    """Joint waypoints (n, 6) of a smooth straight line of the tool."""
-    n = max(2, math.ceil(seconds / (STEPS_PER_WAYPOINT * _STEP_S)))
+def line(start_W: np.ndarray, end_W: np.ndarray, near: np.ndarray, seconds: float, tool: str):
+    """Joint waypoints (n, 6) of a smooth straight line between two poses (x, y, z, yaw, pitch)."""
+    n = max(2, math.ceil(seconds / _WAYPOINT_S))
     share = min_jerk(np.linspace(0, 1, n + 1))[:, None]
-    return robot.joint_path(start_W + share * (end_W - start_W), np.full(n + 1, yaw), near)
-
-
-def _retime(action: np.ndarray, phase: np.ndarray, duration_s: float) -> tuple[np.ndarray, ...]:
-    """Waypoint phases and tool positions of a path with a smooth start and stop of its own.
-
-    action: (n, 5) at phases (n,); a full path already is minimum-jerk in phase and is kept.
-    A prefix is followed along its own length, at the peak speed of the full primitive.
-    """
-    seconds = duration_s * float(min_jerk(phase[-1]))
-    n = max(2, math.ceil(seconds / (STEPS_PER_WAYPOINT * _STEP_S) - 1e-9))
-    share = min_jerk(np.linspace(0, 1, n + 1))
-    # Along its length, a minimum-jerk path is the same path whatever its speed.
-    length = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(action[:, :2], axis=0).T))])
-    if length[-1] < 1e-9:
-        return np.zeros(n + 1), np.repeat(action[:1, :3], n + 1, axis=0)
-    wanted = share * length[-1]
-    at_phase = np.interp(wanted, length, phase)
-    xyz = np.column_stack([np.interp(wanted, length, action[:, c]) for c in range(3)])
-    return at_phase, xyz
-
-
-def execute(
-    world: Tabletop, primitive: Push, action: np.ndarray, phase: np.ndarray, approach: bool
-) -> Interaction:
-    """Follow a commanded path (n, 5) over the object with the fingers `PUSH_GAP_M` apart.
-
-    All joints are planned before anything moves, so an unreachable path raises and moves nothing.
-    """
-    start_state = np.array(world.object_state())
-    start_pose = (*start_state[:2], 0.0)
-    image = world.look()
-    at_phase, xyz = _retime(action, phase, primitive.duration_s)
-    xyz_W = xyz + np.array(start_pose)
-    home, up = np.array(robot.HOME), np.array([0, 0, HOVER_HEIGHT_M])
-    # The gripper is symmetric: of its two equal yaws, take the one with less turning of the wrist.
-    yaws = (float(action[0, 3]), float(action[0, 3]) + math.pi)
-    yaw, over_start = min(
-        ((yaw, robot.inverse_kinematics(xyz_W[0] + up, yaw, home)) for yaw in yaws),
-        key=lambda option: abs(option[1][5] - home[5]),
-    )
-    path = robot.joint_path(xyz_W, np.full(len(xyz_W), yaw), over_start)
-    back = xyz_W[0] - xyz_W[-1]
-    distance = np.linalg.norm(back)
-    clear = xyz_W[-1] + back * (RETREAT_M / max(distance, RETREAT_M))
-    retreat = _line(xyz_W[-1], clear, yaw, path[-1], 0.25)
-    lift = _line(clear, clear + up, yaw, retreat[-1], 0.5) if approach else retreat[-1:]
-    descent = _line(xyz_W[0] + up, xyz_W[0], yaw, over_start, 1.0) if approach else path[:1]
-
-    if approach:
-        _drive(world, _joint_move(world.arm, over_start, 1.0))
-        _drive(world, descent)
-    else:
-        put_arm(world, path[0], PUSH_GAP_M)
-    states = _drive(world, path)
-    tracking_error = float(np.linalg.norm(_tool_W(world) - xyz_W[-1]))
-    _drive(world, np.concatenate([retreat, lift[1:]]))
-    if approach:
-        _drive(world, _joint_move(world.arm, home, 1.0))
-    _wait(world, SETTLE_STEPS)
-
-    recorded = poses(np.vstack([states, [world.object_state()]]))
-    relative = recorded - np.array([*recorded[0, :4], 0.0])
-    waypoint = np.arange(len(states)) * RECORD_EVERY / STEPS_PER_WAYPOINT
-    at_sample = np.interp(waypoint, np.arange(len(at_phase)), at_phase)
-    effect = np.column_stack([np.interp(phase, at_sample, relative[:-1, c]) for c in range(5)])
-    return Interaction(
-        primitive=primitive,
-        stop_phase=float(phase[-1]),
-        phase=phase,
-        action=action,
-        effect=effect,
-        rest_effect=relative[-1],
-        image=image,
-        start_pose=(float(start_state[0]), float(start_state[1]), float(recorded[0, 3])),
-        tracking_error_m=tracking_error,
-    )
+    return robot.joint_path(start_W + share * (end_W - start_W), near, tool)

@@ -1,43 +1,107 @@
 """The things on the table: one class per family, so that a new one is a few lines.
 
-A family is a frozen dataclass with its dimensions, `sample(rng)` to draw one, `height_m`,
-`volume_m3` and `shape()`, the arguments PyBullet builds it from.
+A family is a frozen dataclass with its dimensions. The frame of a body has its origin in the
+centre and z upwards as the thing is placed; the x axis of a lying cylinder is its own axis.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, replace
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
 import numpy as np
 import pybullet
+from scipy.spatial import ConvexHull
 
-from affordlib.types import check_within
+from affordlib.types import check_finite, check_within
 
 DENSITY_KG_M3 = 600.0
 SIZE_RANGE_M = (0.04, 0.08)
-LARGEST_M = 0.12
+LARGEST_M = 0.3
+N_EDGES = (3, 8)
+CHAMFER_M = (0.006, 0.004)
+"""Width and height of the chamfer around a prism's base, where a blade can get hold."""
+
+_UPRIGHT = math.cos(math.radians(45))
 
 
 @dataclass(frozen=True)
-class Cuboid:
+class Thing(ABC):
+    """Something on the table; all its fields are lengths [m]."""
+
+    family: ClassVar[str]
+    rollable: ClassVar[bool] = False
+    """Whether it can roll as it is placed."""
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            name = f"{self.family} {field.name}"
+            check_within(name, getattr(self, field.name), 0.005, LARGEST_M, "m")
+
+    @classmethod
+    def sample(
+        cls,
+        rng: np.random.Generator,
+        size_range_m: tuple[float, float] = SIZE_RANGE_M,
+        height_range_m: tuple[float, float] | None = None,
+    ) -> Thing:
+        """A thing with dimensions drawn uniformly from a range, heights from their own if given."""
+        sizes = rng.uniform(*size_range_m, size=len(fields(cls)))
+        if height_range_m is not None:
+            low, high = size_range_m
+            share = (sizes[-1] - low) / max(high - low, 1e-9)
+            sizes[-1] = height_range_m[0] + share * (height_range_m[1] - height_range_m[0])
+        return cls(*(float(size) for size in sizes))
+
+    @property
+    @abstractmethod
+    def height_m(self) -> float: ...
+
+    @property
+    @abstractmethod
+    def volume_m3(self) -> float: ...
+
+    @property
+    @abstractmethod
+    def footprint_m(self) -> np.ndarray:
+        """Corners (n, 2) of the outline seen from above, around the centre, before turning."""
+
+    @abstractmethod
+    def shape(self) -> dict[str, Any]:
+        """The arguments from which PyBullet builds it, visually and for contacts."""
+
+    def fallen(self, upward: np.ndarray) -> bool:
+        """Whether it lies differently than it was placed.
+
+        upward: (3,) the vertical components of the body's x, y and z axes.
+        """
+        return bool(upward[2] < _UPRIGHT)
+
+    def rolls(self, upward: np.ndarray) -> bool:
+        """Whether it can roll as it lies now."""
+        return self.rollable
+
+
+def _circle(diameter: float) -> np.ndarray:
+    angle = np.linspace(0, 2 * math.pi, 36, endpoint=False)
+    return diameter / 2 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+def _rectangle(length: float, width: float) -> np.ndarray:
+    return np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * np.array([length / 2, width / 2])
+
+
+@dataclass(frozen=True)
+class Cuboid(Thing):
     """A box with edges `length`, `width` and `height` [m], standing on its base."""
 
     length: float
     width: float
     height: float
 
-    family: ClassVar[str] = "cuboid"
-
-    def __post_init__(self) -> None:
-        for name, value in asdict(self).items():
-            check_within(f"cuboid {name}", value, 0.005, LARGEST_M, "m")
-
-    @classmethod
-    def sample(cls, rng: np.random.Generator) -> Cuboid:
-        """A cuboid with edges drawn uniformly from `SIZE_RANGE_M`."""
-        return cls(*(float(v) for v in rng.uniform(*SIZE_RANGE_M, size=3)))
+    family = "cuboid"
 
     @property
     def height_m(self) -> float:
@@ -49,9 +113,7 @@ class Cuboid:
 
     @property
     def footprint_m(self) -> np.ndarray:
-        """Corners (4, 2) of the base around the centre, before turning by the yaw."""
-        a, b = self.length / 2, self.width / 2
-        return np.array([[a, b], [-a, b], [-a, -b], [a, -b]])
+        return _rectangle(self.length, self.width)
 
     def shape(self) -> dict[str, Any]:
         half = [self.length / 2, self.width / 2, self.height / 2]
@@ -59,22 +121,13 @@ class Cuboid:
 
 
 @dataclass(frozen=True)
-class UprightCylinder:
+class UprightCylinder(Thing):
     """A cylinder of the given `diameter` and `height` [m], standing on its round base."""
 
     diameter: float
     height: float
 
-    family: ClassVar[str] = "upright_cylinder"
-
-    def __post_init__(self) -> None:
-        for name, value in asdict(self).items():
-            check_within(f"cylinder {name}", value, 0.005, LARGEST_M, "m")
-
-    @classmethod
-    def sample(cls, rng: np.random.Generator) -> UprightCylinder:
-        """A cylinder with diameter and height drawn uniformly from `SIZE_RANGE_M`."""
-        return cls(*(float(v) for v in rng.uniform(*SIZE_RANGE_M, size=2)))
+    family = "upright_cylinder"
 
     @property
     def height_m(self) -> float:
@@ -86,64 +139,236 @@ class UprightCylinder:
 
     @property
     def footprint_m(self) -> np.ndarray:
-        """Points (36, 2) around the base."""
-        angle = np.linspace(0, 2 * math.pi, 36, endpoint=False)
-        return self.diameter / 2 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        return _circle(self.diameter)
 
     def shape(self) -> dict[str, Any]:
+        radius = self.diameter / 2
+        return {"shapeType": pybullet.GEOM_CYLINDER, "radius": radius, "height": self.height}
+
+    def rolls(self, upward: np.ndarray) -> bool:
+        return self.fallen(upward) and bool(upward[2] > -_UPRIGHT)
+
+
+@dataclass(frozen=True)
+class LyingCylinder(Thing):
+    """A cylinder of the given `length` and `diameter` [m], lying on its side."""
+
+    length: float
+    diameter: float
+
+    family = "lying_cylinder"
+    rollable = True
+
+    @property
+    def height_m(self) -> float:
+        return self.diameter
+
+    @property
+    def volume_m3(self) -> float:
+        return math.pi * self.diameter**2 / 4 * self.length
+
+    @property
+    def footprint_m(self) -> np.ndarray:
+        return _rectangle(self.length, self.diameter)
+
+    def shape(self) -> dict[str, Any]:
+        radius = self.diameter / 2
+        frame = pybullet.getQuaternionFromEuler((0, math.pi / 2, 0))
         return {
             "shapeType": pybullet.GEOM_CYLINDER,
-            "radius": self.diameter / 2,
-            "height": self.height,
+            "radius": radius,
+            "height": self.length,
+            "frame": frame,
         }
 
+    def fallen(self, upward: np.ndarray) -> bool:
+        return bool(abs(upward[0]) > _UPRIGHT)
 
-FAMILIES: dict[str, type[Cuboid] | type[UprightCylinder]] = {
-    family.family: family for family in (Cuboid, UprightCylinder)
+    def rolls(self, upward: np.ndarray) -> bool:
+        return not self.fallen(upward)
+
+
+@dataclass(frozen=True)
+class Sphere(Thing):
+    """A ball of the given `diameter` [m]."""
+
+    diameter: float
+
+    family = "sphere"
+    rollable = True
+
+    @property
+    def height_m(self) -> float:
+        return self.diameter
+
+    @property
+    def volume_m3(self) -> float:
+        return math.pi * self.diameter**3 / 6
+
+    @property
+    def footprint_m(self) -> np.ndarray:
+        return _circle(self.diameter)
+
+    def shape(self) -> dict[str, Any]:
+        return {"shapeType": pybullet.GEOM_SPHERE, "radius": self.diameter / 2}
+
+    def fallen(self, upward: np.ndarray) -> bool:
+        return False
+
+
+@dataclass(frozen=True)
+class Prism(Thing):
+    """An extruded convex polygon: `corners` (x, y) [m] counter-clockwise, and a `height` [m].
+
+    Its centroid becomes the origin; the base is chamfered all around.
+    """
+
+    corners: tuple[tuple[float, float], ...]
+    height: float
+
+    family = "prism"
+
+    def __post_init__(self) -> None:
+        check_within("prism height", self.height, 0.005, LARGEST_M, "m")
+        corners = np.array(
+            [[check_finite("prism corners", v) for v in corner] for corner in self.corners]
+        )
+        if corners.shape != (len(corners), 2) or not N_EDGES[0] <= len(corners) <= N_EDGES[1]:
+            raise ValueError(f"prism corners must be 3 to 8 points (x, y), got {corners.shape}")
+        following = np.roll(corners, -1, axis=0)
+        edges = following - corners
+        turns = _cross(edges, np.roll(edges, -1, axis=0))
+        if (turns <= 0).any() or np.abs(corners).max() > LARGEST_M:
+            raise ValueError(
+                "prism corners must go counter-clockwise around a convex polygon of at most "
+                f"{LARGEST_M:g} m, got {self.corners!r}"
+            )
+        doubled = _cross(corners, following)
+        centroid = ((corners + following) * doubled[:, None]).sum(axis=0) / (3 * doubled.sum())
+        centred = tuple((float(x), float(y)) for x, y in corners - centroid)
+        object.__setattr__(self, "corners", centred)
+
+    @classmethod
+    def sample(
+        cls,
+        rng: np.random.Generator,
+        size_range_m: tuple[float, float] = SIZE_RANGE_M,
+        height_range_m: tuple[float, float] | None = None,
+    ) -> Prism:
+        """A polygon of 3 to 8 edges whose corners lie on a circle as wide as the drawn size."""
+        n = int(rng.integers(N_EDGES[0], N_EDGES[1] + 1))
+        angle = (np.arange(n) + rng.uniform(-0.3, 0.3, size=n)) * 2 * math.pi / n
+        radius = rng.uniform(*size_range_m) / 2
+        corners = radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        height = rng.uniform(*(height_range_m or size_range_m))
+        return cls(tuple((float(x), float(y)) for x, y in corners), float(height))
+
+    @property
+    def height_m(self) -> float:
+        return self.height
+
+    @property
+    def volume_m3(self) -> float:
+        return float(ConvexHull(self._vertices()).volume)
+
+    @property
+    def footprint_m(self) -> np.ndarray:
+        return np.array(self.corners)
+
+    def _vertices(self) -> np.ndarray:
+        """Corners (3n, 3) of the solid: of its top, of the chamfer's upper rim, of its base."""
+        outline = self.footprint_m
+        width, rise = np.minimum(CHAMFER_M, self.height / 3)
+        inradius = -ConvexHull(outline).equations[:, 2].max()
+        base = outline * (1 - min(width / inradius, 0.5))
+        half = self.height / 2
+        return np.vstack(
+            [
+                np.column_stack([points, np.full(len(points), z)])
+                for points, z in ((outline, half), (outline, rise - half), (base, -half))
+            ]
+        )
+
+    def shape(self) -> dict[str, Any]:
+        return {"shapeType": pybullet.GEOM_MESH, "vertices": self._vertices().tolist()}
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+
+
+FAMILIES: dict[str, type[Thing]] = {
+    family.family: family for family in (Cuboid, UprightCylinder, LyingCylinder, Sphere, Prism)
 }
 
 
-def family_named(name: str) -> type[Cuboid] | type[UprightCylinder]:
+def family_named(name: str) -> type[Thing]:
     """The class of the object family called `name`; raises naming the known ones."""
     if name not in FAMILIES:
         raise ValueError(f"object family {name!r} is unknown; choose one of {sorted(FAMILIES)}")
     return FAMILIES[name]
 
 
-def _visual_shape(client: int, thing: Cuboid | UprightCylinder, rgba: tuple) -> int:
+def _mesh(vertices: np.ndarray) -> dict[str, Any]:
+    """The convex hull of vertices (n, 3) as triangles with flat faces, for the renderer."""
+    hull = ConvexHull(vertices)
+    triangles = vertices[hull.simplices]
+    normals = hull.equations[:, :3]
+    facing = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    inward = (facing * normals).sum(axis=1) < 0
+    triangles[inward] = triangles[inward, ::-1]
+    return {
+        "shapeType": pybullet.GEOM_MESH,
+        "vertices": triangles.reshape(-1, 3).tolist(),
+        "indices": list(range(3 * len(triangles))),
+        "normals": np.repeat(normals, 3, axis=0).tolist(),
+    }
+
+
+def create_body(
+    client: int,
+    thing: Thing,
+    mass_kg: float,
+    rgba: tuple,
+    com_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> int:
+    """Create the object in a PyBullet client, at the origin, and return its body id.
+
+    com_offset_m: where its centre of mass lies in its frame.
+    """
     shape = thing.shape()
-    if "height" in shape:
-        shape["length"] = shape.pop("height")
-    return pybullet.createVisualShape(**shape, rgbaColor=rgba, physicsClientId=client)
-
-
-def create_body(client: int, thing: Cuboid | UprightCylinder, mass_kg: float, rgba: tuple) -> int:
-    """Create the object in a PyBullet client, at the origin, and return its body id."""
+    frame = shape.pop("frame", (0, 0, 0, 1))
+    visual = dict(shape)
+    if "vertices" in visual:
+        visual = _mesh(np.array(shape["vertices"]))
+    if "height" in visual:
+        visual["length"] = visual.pop("height")
     return pybullet.createMultiBody(
         baseMass=mass_kg,
         baseCollisionShapeIndex=pybullet.createCollisionShape(
-            **thing.shape(), physicsClientId=client
+            **shape, collisionFrameOrientation=frame, physicsClientId=client
         ),
-        baseVisualShapeIndex=_visual_shape(client, thing, rgba),
+        baseVisualShapeIndex=pybullet.createVisualShape(
+            **visual, visualFrameOrientation=frame, rgbaColor=rgba, physicsClientId=client
+        ),
+        baseInertialFramePosition=com_offset_m,
         physicsClientId=client,
     )
 
 
 def create_footprint(
-    client: int,
-    thing: Cuboid | UprightCylinder,
-    xy_m: tuple,
-    yaw_rad: float,
-    rgba: tuple,
-    scale: float = 1.0,
+    client: int, thing: Thing, xy_m: tuple, yaw_rad: float, rgba: tuple, scale: float = 1.0
 ) -> int:
-    """Create the object's base as a sheet on the table that is only seen; return its id."""
+    """Create the object's outline as a sheet on the table that is only seen; return its id."""
+    outline = scale * thing.footprint_m
     # Larger sheets lie lower, so that one on another shows as a frame around it.
-    flat = replace(thing, height=0.01)
-    scaled = {name: scale * size for name, size in asdict(flat).items() if name != "height"}
+    low, high = (np.full((len(outline), 1), z) for z in (-0.005, 0.001 / scale))
+    sheet = np.vstack([np.hstack([outline, low]), np.hstack([outline, high])])
     return pybullet.createMultiBody(
-        baseVisualShapeIndex=_visual_shape(client, replace(flat, **scaled), rgba),
-        basePosition=(*xy_m, 0.001 / scale - 0.004),
+        baseVisualShapeIndex=pybullet.createVisualShape(
+            **_mesh(sheet), rgbaColor=rgba, physicsClientId=client
+        ),
+        basePosition=(*xy_m, 0.0),
         baseOrientation=pybullet.getQuaternionFromEuler((0, 0, yaw_rad)),
         physicsClientId=client,
     )

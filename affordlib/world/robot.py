@@ -2,12 +2,14 @@
 
 The arm's description and meshes come from the package `example-robot-data`; the gripper, two box
 fingers on prismatic joints, is merged into the same description, because a gripper held by a
-constraint slips. Frames: W the table's centre, B the arm's base, T the tool (between the finger
-tips, z down, y along the opening).
+constraint slips. For levering it holds a screwdriver: a shaft straight down and, at its end, a flat
+blade along x. Frames: W the table's centre, B the arm's base, T the tool (between the finger tips
+or at the blade's tip; unpitched, z points down and y along the opening).
 """
 
 from __future__ import annotations
 
+import math
 import tempfile
 import xml.etree.ElementTree as ET
 from functools import cache
@@ -21,12 +23,17 @@ from ur_analytic_ik import ur10
 BASE_X_M = -0.7
 TOOL_LENGTH_M = 0.20
 FINGER_TRAVEL_M = 0.07
+SHAFT_LENGTH_M = 0.26
+BLADE_LENGTH_M = 0.05
+BLADE_THICKNESS_M = 0.002
+TOOL_OFFSETS_M = {"gripper": (0.0, TOOL_LENGTH_M), "screwdriver": (BLADE_LENGTH_M, SHAFT_LENGTH_M)}
+"""How far the tool's point lies from the flange along the tool's x and z axes."""
 ARM_JOINTS = tuple(range(6))
 HOME = (0.0, -1.9, 1.6, -1.27, -np.pi / 2, 0.0)
 """Joint angles [rad] of the arm parked above its base, out of the camera's view of the table."""
 
 _ARM_RGBA = {"shoulder_link": "0.30 0.45 0.60 1", "wrist_1_link": "0.30 0.45 0.60 1"}
-_GREY, _DARK = "0.72 0.74 0.77 1", "0.25 0.27 0.30 1"
+_GREY, _DARK, _RED = "0.72 0.74 0.77 1", "0.25 0.27 0.30 1", "0.75 0.25 0.15 1"
 
 
 class UnreachableError(ValueError):
@@ -72,8 +79,8 @@ def _joint(name: str, kind: str, parent: str, child: str, xyz: str, rpy: str) ->
 
 
 @cache
-def robot_description() -> str:
-    """The URDF text of arm and gripper, with meshes as absolute paths.
+def robot_description(tool: str = "gripper") -> str:
+    """The URDF text of arm, gripper and, if it is the tool, screwdriver; meshes as absolute paths.
 
     The detailed visual meshes are replaced by the collision ones (they load ten times faster) and
     the mass-less frames are dropped (PyBullet would give each a mass of 1 kg).
@@ -107,55 +114,97 @@ def robot_description() -> str:
             joint, "limit", lower="0", upper=str(FINGER_TRAVEL_M), effort="200", velocity="0.5"
         )
         root.append(joint)
+    if tool == "screwdriver":
+        middle = (0.1 + SHAFT_LENGTH_M) / 2
+        shaft = f"0.01 0.01 {SHAFT_LENGTH_M - 0.1}", f"0 0 {middle}"
+        blade = f"{BLADE_LENGTH_M} 0.012 {BLADE_THICKNESS_M}", f"{BLADE_LENGTH_M / 2} 0 0"
+        root.append(_box_link("shaft", *shaft, 0.05, _RED))
+        root.append(_joint("shaft_joint", "fixed", "palm", "shaft", "0 0 0", "0 0 0"))
+        root.append(_box_link("blade", *blade, 0.02, _RED))
+        root.append(
+            _joint("blade_joint", "fixed", "shaft", "blade", f"0 0 {SHAFT_LENGTH_M}", "0 0 0")
+        )
     return ET.tostring(root, encoding="unicode")
 
 
-def load_robot(client: int) -> int:
-    """Load arm and gripper into a PyBullet client and return the body id."""
+def load_robot(client: int, tool: str = "gripper") -> int:
+    """Load the arm with a tool into a PyBullet client and return the body id."""
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "ur10_gripper.urdf"
-        path.write_text(robot_description())
+        path = Path(folder) / "ur10.urdf"
+        path.write_text(robot_description(tool))
         return pybullet.loadURDF(
             str(path), basePosition=(BASE_X_M, 0, 0), useFixedBase=True, physicsClientId=client
         )
 
 
+def _link_names(client: int, robot: int) -> list[str]:
+    count = pybullet.getNumJoints(robot, physicsClientId=client)
+    return [
+        pybullet.getJointInfo(robot, j, physicsClientId=client)[12].decode() for j in range(count)
+    ]
+
+
 def finger_joints(client: int, robot: int) -> tuple[int, int]:
     """Indices of the two prismatic finger joints."""
-    count = pybullet.getNumJoints(robot, physicsClientId=client)
-    names = [
-        pybullet.getJointInfo(robot, j, physicsClientId=client)[1].decode() for j in range(count)
-    ]
-    return names.index("left_finger_joint"), names.index("right_finger_joint")
+    names = _link_names(client, robot)
+    return names.index("left_finger"), names.index("right_finger")
 
 
-def _flange_pose(xyz_W: np.ndarray, yaw_rad: float) -> np.ndarray:
+def touching_links(client: int, robot: int) -> list[int]:
+    """Indices of the links made to touch objects: the fingers and, if held, the blade."""
+    names = _link_names(client, robot)
+    return [k for k, name in enumerate(names) if name in ("left_finger", "right_finger", "blade")]
+
+
+def _flange_pose(
+    xyz_W: np.ndarray, yaw_rad: float, pitch_rad: float, offsets_m: tuple[float, float]
+) -> np.ndarray:
+    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+    cp, sp = math.cos(pitch_rad), math.sin(pitch_rad)
+    x_axis = np.array([c * cp, s * cp, -sp])
+    z_axis = np.array([-c * sp, -s * sp, -cp])
+    x, y, z = xyz_W - offsets_m[0] * x_axis - offsets_m[1] * z_axis
     # The analytic solver's base is turned by 180° about z against the URDF's.
-    c, s = -np.cos(yaw_rad), -np.sin(yaw_rad)
-    pose = np.array(
+    return np.array(
         [
-            [c, s, 0.0, -(xyz_W[0] - BASE_X_M)],
-            [s, -c, 0.0, -xyz_W[1]],
-            [0.0, 0.0, -1.0, xyz_W[2] + TOOL_LENGTH_M],
+            [-x_axis[0], -s, -z_axis[0], BASE_X_M - x],
+            [-x_axis[1], c, -z_axis[1], -y],
+            [x_axis[2], 0.0, z_axis[2], z],
             [0.0, 0.0, 0.0, 1.0],
         ]
     )
-    return pose
 
 
-def inverse_kinematics(xyz_W: np.ndarray, yaw_rad: float, near: np.ndarray) -> np.ndarray:
-    """Joint angles (6,) [rad] that put the tool, pointing down, at a pose.
+def inverse_kinematics(
+    xyz_W: np.ndarray,
+    yaw_rad: float,
+    near: np.ndarray,
+    pitch_rad: float = 0.0,
+    tool: str = "gripper",
+) -> np.ndarray:
+    """Joint angles (6,) [rad] that put the tool at a pose.
 
-    xyz_W: finger tips in the frame of the table [m]; yaw_rad: direction of the tool's x axis;
-    near: joint angles (6,) whose turn (of 2π) is kept. Of the solver's postures only the one with
-    elbow up and wrist forward is taken, so that a path never flips.
+    xyz_W: the tool's point in the frame of the table [m]; yaw_rad: direction of its x axis;
+    pitch_rad: how far that axis dips below the horizontal; near: joint angles (6,) whose turn (of
+    2π) is kept. Of the solver's postures one with the elbow up is taken, wrist forward where the
+    tool hangs straight, and otherwise the nearest, so that a path never flips.
     Raises UnreachableError when the arm cannot get there.
     """
-    for solution in ur10.inverse_kinematics(_flange_pose(xyz_W, yaw_rad)):
-        joints = np.asarray(solution)
+    best, least = None, 1.0
+    hanging = pitch_rad == 0.0
+    flange = _flange_pose(xyz_W, yaw_rad, pitch_rad, TOOL_OFFSETS_M[tool])
+    for joints in ur10.inverse_kinematics(flange):
+        if hanging and abs(math.remainder(joints[4] + math.pi / 2, 2 * math.pi)) >= 0.1:
+            continue
         joints = near + (joints - near + np.pi) % (2 * np.pi) - np.pi
-        if abs(joints[4] + np.pi / 2) < 0.1 and joints[2] > 0 and -np.pi < joints[1] < 0.3:
+        if joints[2] <= 0 or not -np.pi < joints[1] < 0.3:
+            continue
+        if hanging:
             return joints
+        if (jump := np.abs(joints - near).max()) < least:
+            best, least = joints, jump
+    if best is not None:
+        return best
     x, y, z = (round(float(v), 3) for v in xyz_W)
     raise UnreachableError(
         f"the arm cannot reach tool position ({x}, {y}, {z}) m; choose a place nearer to its "
@@ -163,12 +212,16 @@ def inverse_kinematics(xyz_W: np.ndarray, yaw_rad: float, near: np.ndarray) -> n
     )
 
 
-def joint_path(xyz_W: np.ndarray, yaw_rad: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Joint angles (n, 6) along tool positions (n, 3) and yaws (n,), without a jump.
+def joint_path(poses_W: np.ndarray, near: np.ndarray, tool: str = "gripper") -> np.ndarray:
+    """Joint angles (n, 6) along poses (n, 5) of the tool, x, y, z, yaw and pitch, without a jump.
 
     Raises UnreachableError when a pose is out of reach.
     """
-    joints = np.empty((len(xyz_W), 6))
-    for i, (xyz, yaw) in enumerate(zip(xyz_W, yaw_rad, strict=True)):
-        joints[i] = near = inverse_kinematics(xyz, yaw, near)
+    joints = np.empty((len(poses_W), 6))
+    last = None
+    for i, pose in enumerate(poses_W.tolist()):
+        if pose != last:
+            x, y, z, yaw, pitch = last = pose
+            near = inverse_kinematics(np.array([x, y, z]), yaw, near, pitch, tool)
+        joints[i] = near
     return joints

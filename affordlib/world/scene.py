@@ -12,9 +12,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pybullet
+from scipy.spatial.transform import Rotation
 
-from affordlib.primitives import PUSH_GAP_M, Push
+from affordlib.primitives import DURATION_S, PUSH_GAP_M, LeverUp, Primitive, Push, min_jerk
 from affordlib.types import (
+    LEVER_CROP_WIDTH_M,
+    LEVER_IMAGE_PIXELS,
     TABLE_X_M,
     TABLE_Y_M,
     Interaction,
@@ -23,31 +26,54 @@ from affordlib.types import (
     check_within,
 )
 from affordlib.world import camera, motion, robot
+from affordlib.world.execution import execute, refused
 from affordlib.world.objects import DENSITY_KG_M3, create_body, create_footprint
+from affordlib.world.perception import Percept, aim
 
 if TYPE_CHECKING:
     from affordlib.types import Step
     from affordlib.world.motion import Film
-    from affordlib.world.objects import Cuboid, UprightCylinder
+    from affordlib.world.objects import Thing
 
 STEP_S = 1 / 240
 N_SAMPLES = 301
-"""Recorded samples over the phase: one every 3 simulation steps of a full push."""
+"""Recorded samples over the phase: one every 3 simulation steps of a full primitive."""
+
+CAMERAS = ("ideal", "kinect")
 
 
 @dataclass(frozen=True)
 class WorldConfig:
-    """Friction coefficients (Bullet multiplies the two bodies') and the object's density."""
+    """Friction coefficients (Bullet multiplies the two bodies'), the object's inside, the senses.
+
+    com_offset_m: where the centre of mass lies in the object's frame; tip_offset_m: how much
+    higher than commanded the gripper moves. camera: "ideal" tells the robot where the object is
+    and shows it without noise, "kinect" leaves it to measure; bias_m is added to where it believes
+    the object to be, and noise_seed draws the noise of the images.
+    """
 
     table_friction: float = 0.5
     object_friction: float = 0.5
     finger_friction: float = 0.9
     density_kg_m3: float = DENSITY_KG_M3
+    com_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    tip_offset_m: float = 0.0
+    camera: str = "ideal"
+    bias_m: tuple[float, float] = (0.0, 0.0)
+    noise_seed: int = 0
 
     def __post_init__(self) -> None:
         for name in ("table_friction", "object_friction", "finger_friction"):
             check_within(name, getattr(self, name), 0.01, 2.0)
         check_within("density_kg_m3", self.density_kg_m3, 50.0, 10_000.0, "kg/m³")
+        check_within("tip_offset_m", self.tip_offset_m, -0.008, 0.1, "m")
+        for name, size in (("com_offset_m", 3), ("bias_m", 2)):
+            values = tuple(check_within(name, v, -0.1, 0.1, "m") for v in getattr(self, name))
+            if len(values) != size:
+                raise ValueError(f"{name} must be {size} numbers [m], got {values!r}")
+            object.__setattr__(self, name, values)
+        if self.camera not in CAMERAS:
+            raise ValueError(f"camera must be one of {CAMERAS}, got {self.camera!r}")
 
 
 class Tabletop:
@@ -56,8 +82,9 @@ class Tabletop:
     def __init__(self, config: WorldConfig | None = None) -> None:
         self.config = config or WorldConfig()
         self.client = pybullet.connect(pybullet.DIRECT)
-        self.thing: Cuboid | UprightCylinder | None = None
+        self.thing: Thing | None = None
         self.film: Film | None = None
+        self.tool = ""
         self.reset()
 
     def __enter__(self) -> Tabletop:
@@ -72,8 +99,21 @@ class Tabletop:
             pybullet.disconnect(self.client)
             self.client = -1
 
-    def reset(self) -> None:
-        """Clear the table and park the arm: the same world, bit for bit, every time."""
+    def reset(self, tool: str = "gripper") -> None:
+        """Clear the table and park the arm with a tool: the same world, bit for bit, every time."""
+        client = self.client
+        if tool != self.tool:
+            self._build(tool)
+        else:
+            self._clear()
+        self.thing, self.body = None, -1
+        self.noise = np.random.default_rng(self.config.noise_seed)
+        self._set_friction(self.table, -1, self.config.table_friction)
+        for link in robot.touching_links(client, self.robot):
+            self._set_friction(self.robot, link, self.config.finger_friction)
+        motion.put_arm(self, np.array(robot.HOME), PUSH_GAP_M)
+
+    def _build(self, tool: str) -> None:
         client = self.client
         pybullet.resetSimulation(physicsClientId=client)
         pybullet.setGravity(0, 0, -9.81, physicsClientId=client)
@@ -84,39 +124,38 @@ class Tabletop:
             deterministicOverlappingPairs=1,
             physicsClientId=client,
         )
-        self.thing, self.body = None, -1
-        self._add_table()
-        self.robot = robot.load_robot(client)
-        self.joints = (*robot.ARM_JOINTS, *robot.finger_joints(client, self.robot))
-        for finger in self.joints[-2:]:
-            pybullet.changeDynamics(
-                self.robot,
-                finger,
-                lateralFriction=self.config.finger_friction,
-                spinningFriction=1e-3,
-                rollingFriction=1e-3,
-                restitution=0.0,
-                physicsClientId=client,
-            )
-        motion.put_arm(self, np.array(robot.HOME), PUSH_GAP_M)
-
-    def _add_table(self) -> None:
         half = [(TABLE_X_M[1] - TABLE_X_M[0]) / 2, (TABLE_Y_M[1] - TABLE_Y_M[0]) / 2, 0.05]
-        shape = {"shapeType": pybullet.GEOM_BOX, "halfExtents": half}
+        shape = {"shapeType": pybullet.GEOM_BOX, "halfExtents": half, "physicsClientId": client}
         self.table = pybullet.createMultiBody(
-            baseCollisionShapeIndex=pybullet.createCollisionShape(
-                **shape, physicsClientId=self.client
-            ),
+            baseCollisionShapeIndex=pybullet.createCollisionShape(**shape),
             baseVisualShapeIndex=pybullet.createVisualShape(
-                **shape, rgbaColor=(0.93, 0.90, 0.85, 1), physicsClientId=self.client
+                **shape, rgbaColor=(0.93, 0.90, 0.85, 1)
             ),
             basePosition=(sum(TABLE_X_M) / 2, sum(TABLE_Y_M) / 2, -0.05),
-            physicsClientId=self.client,
+            physicsClientId=client,
         )
+        self.tool, self.robot = tool, robot.load_robot(client, tool)
+        self.joints = (*robot.ARM_JOINTS, *robot.finger_joints(client, self.robot))
+        self._fresh = pybullet.saveState(physicsClientId=client)
+
+    def _clear(self) -> None:
+        """Back to table and arm alone: exactly as when built, without loading them again."""
+        client = self.client
+        for k in reversed(range(pybullet.getNumConstraints(physicsClientId=client))):
+            pybullet.removeConstraint(
+                pybullet.getConstraintUniqueId(k, physicsClientId=client), physicsClientId=client
+            )
+        bodies = range(pybullet.getNumBodies(physicsClientId=client))
+        for body in [pybullet.getBodyUniqueId(k, physicsClientId=client) for k in bodies]:
+            if body not in (self.table, self.robot):
+                pybullet.removeBody(body, physicsClientId=client)
+        pybullet.restoreState(stateId=self._fresh, physicsClientId=client)
+
+    def _set_friction(self, body: int, link: int, lateral: float) -> None:
         pybullet.changeDynamics(
-            self.table,
-            -1,
-            lateralFriction=self.config.table_friction,
+            body,
+            link,
+            lateralFriction=lateral,
             spinningFriction=1e-3,
             rollingFriction=1e-3,
             restitution=0.0,
@@ -125,30 +164,39 @@ class Tabletop:
 
     def place(
         self,
-        thing: Cuboid | UprightCylinder,
+        thing: Thing,
         xy_m: tuple[float, float] = (0.0, 0.0),
         yaw_rad: float = 0.0,
+        *,
+        tool: str = "gripper",
+        config: WorldConfig | None = None,
     ) -> None:
-        """Clear the table, park the arm and stand an object at (x, y) [m], turned by a yaw."""
+        """Clear the table, park the arm and stand an object at (x, y) [m], turned by a yaw.
+
+        tool: "gripper" or "screwdriver"; config: from now on (default: as it is).
+        """
         x, y = check_on_table("xy_m", xy_m)
         yaw = check_finite("yaw_rad", yaw_rad)
-        self.reset()
+        if tool not in robot.TOOL_OFFSETS_M:
+            raise ValueError(f"tool must be one of {sorted(robot.TOOL_OFFSETS_M)}, got {tool!r}")
+        self.config = config or self.config
+        self.reset(tool)
         mass = self.config.density_kg_m3 * thing.volume_m3
-        self.thing, self.body = thing, create_body(self.client, thing, mass, (0.0, 0.62, 0.45, 1))
+        com = self.config.com_offset_m
+        self.thing = thing
+        self.body = create_body(self.client, thing, mass, (0.0, 0.62, 0.45, 1), com)
+        self._set_friction(self.body, -1, self.config.object_friction)
         pybullet.changeDynamics(
-            self.body,
-            -1,
-            lateralFriction=self.config.object_friction,
-            spinningFriction=1e-3,
-            rollingFriction=1e-3,
-            restitution=0.0,
-            linearDamping=0.0,
-            angularDamping=0.0,
-            physicsClientId=self.client,
+            self.body, -1, linearDamping=0.0, angularDamping=0.0, physicsClientId=self.client
         )
+        c, s = math.cos(yaw), math.sin(yaw)
         pybullet.resetBasePositionAndOrientation(
             self.body,
-            (x, y, thing.height_m / 2),
+            (
+                x + c * com[0] - s * com[1],
+                y + s * com[0] + c * com[1],
+                thing.height_m / 2 + com[2],
+            ),
             pybullet.getQuaternionFromEuler((0, 0, yaw)),
             physicsClientId=self.client,
         )
@@ -157,11 +205,19 @@ class Tabletop:
         if self.thing is None:
             raise RuntimeError("there is no object on the table; call place(...) first")
 
+    def centred(self, states: np.ndarray) -> np.ndarray:
+        """States (n, 7) of the object's centre, given those of its centre of mass."""
+        offset = np.array(self.config.com_offset_m)
+        if not offset.any():
+            return states
+        shift = Rotation.from_quat(states[:, 3:]).apply(offset)
+        return np.column_stack([states[:, :3] - shift, states[:, 3:]])
+
     def object_state(self) -> tuple[float, ...]:
         """Position (x, y, z) [m] and quaternion (x, y, z, w) of the object, seven numbers."""
         self._require_object()
         position, quaternion = pybullet.getBasePositionAndOrientation(self.body, self.client)
-        return (*position, *quaternion)
+        return tuple(self.centred(np.array([[*position, *quaternion]]))[0])
 
     def object_pose(self) -> tuple[float, float, float]:
         """The object's (x, y) [m] and yaw [rad] in the frame of the table."""
@@ -172,10 +228,47 @@ class Tabletop:
         """Angle between the object's own upright axis and the vertical [rad]."""
         return float(motion.poses(np.array([self.object_state()]))[0, 4])
 
+    def _upward(self) -> np.ndarray:
+        return Rotation.from_quat(self.object_state()[3:]).as_matrix()[2]
+
+    def object_fell(self) -> bool:
+        """Whether the object lies differently than it was placed."""
+        return self.thing.fallen(self._upward())
+
+    def object_rolls(self) -> bool:
+        """Whether the object can roll as it lies now: a cylinder on its side, not upright."""
+        return self.thing.rolls(self._upward())
+
+    @staticmethod
+    def on_table(xyz_m: tuple[float, float, float]) -> bool:
+        """Whether a point (x, y, z) [m] is above the table."""
+        x, y, z = xyz_m
+        return z > 0 and TABLE_X_M[0] <= x <= TABLE_X_M[1] and TABLE_Y_M[0] <= y <= TABLE_Y_M[1]
+
+    def perceive(self) -> Percept:
+        """Where the robot believes the object to be, and its image; the arm is parked."""
+        self._require_object()
+        x, y, _ = self.object_pose()
+        image = None
+        if self.config.camera == "kinect":
+            (x, y), image = camera.kinect_view(self.client, self.noise)
+        x, y = x + self.config.bias_m[0], y + self.config.bias_m[1]
+        if image is None:
+            image = camera.depth_crop(self.client, (x, y))
+        return Percept((x, y), image)
+
     def look(self) -> np.ndarray:
         """Depth [m] and mask (2, 48, 48) of the table around the object, the arm parked."""
-        self._require_object()
-        return camera.depth_crop(self.client, self.object_pose()[:2])
+        return self.perceive().image
+
+    def look_from(self, xy_m: tuple[float, float], turn_rad: float) -> np.ndarray:
+        """Depth [m] and mask (2, 128, 128) around a point, the direction turn_rad to the right.
+
+        xy_m: relative to the object, along the table's axes.
+        """
+        x, y, _ = self.object_pose()
+        at = (x + xy_m[0], y + xy_m[1])
+        return camera.depth_crop(self.client, at, LEVER_IMAGE_PIXELS, LEVER_CROP_WIDTH_M, turn_rad)
 
     def picture(self, width: int = 320, height: int = 240) -> np.ndarray:
         """A colour picture (height, width, 3), uint8, of the robot at work, for people."""
@@ -194,19 +287,49 @@ class Tabletop:
         create_footprint(self.client, self.thing, (x, y), yaw_rad, (*rgb, 1.0), scale)
 
     def interact(
-        self, primitive: Push, stop_phase: float = 1.0, *, approach: bool = False
+        self,
+        primitive: Primitive,
+        stop_phase: float = 1.0,
+        *,
+        approach: bool = False,
+        smooth: bool = True,
     ) -> Interaction:
         """Execute a primitive on the object up to a phase, and record what happens.
 
         approach=False puts the arm at the start of the path (collecting experience);
         approach=True moves it there through the air and back home (carrying out a plan).
         The effect is recorded at `N_SAMPLES` phases in [0, stop_phase]. A partial action is the
-        prefix of the path, re-timed to its own smooth stop.
+        prefix of the path, re-timed to its own smooth stop, or with smooth=False cut off.
         Raises UnreachableError when the arm cannot follow the path.
         """
         check_within("stop_phase", stop_phase, 0.0, 1.0)
+        if primitive.tool != self.tool:
+            raise ValueError(
+                f"primitive {primitive.name!r} needs the tool {primitive.tool!r}, and the arm "
+                f"holds the {self.tool}; call place(..., tool={primitive.tool!r})"
+            )
+        seen = self._percept_for(primitive)
+        primitive = aim(primitive, seen.image)
         phase = np.linspace(0.0, 1.0, N_SAMPLES) * stop_phase
-        return motion.execute(self, primitive, primitive.path(phase), phase, approach)
+        way = motion.stretches(primitive, stop_phase, smooth)
+        return execute(self, primitive, way, phase, primitive.path(phase), seen, approach)
+
+    def attempt(self, primitive: Primitive, stop_phase: float = 1.0) -> Interaction:
+        """As `interact`; where the arm cannot reach, an interaction in which nothing happened."""
+        try:
+            return self.interact(primitive, stop_phase)
+        except robot.UnreachableError:
+            seen = self._percept_for(primitive)
+            phase = np.linspace(0.0, 1.0, N_SAMPLES) * stop_phase
+            return refused(self, aim(primitive, seen.image), phase, seen)
+
+    def _percept_for(self, primitive: Primitive) -> Percept:
+        """What the robot sees before it acts; a lever-up looks from the contact point."""
+        if not isinstance(primitive, LeverUp):
+            return self.perceive()
+        self._require_object()
+        contact = (primitive.contact_x, primitive.contact_y)
+        return Percept(self.object_pose()[:2], self.look_from(contact, primitive.theta))
 
     def follow(self, step: Step) -> Interaction:
         """Carry out a step of a plan, with approach: its decoded path if it has one."""
@@ -232,4 +355,6 @@ class Tabletop:
         heading = path[-1] - path[0]
         if np.hypot(*heading) > 1e-6:
             action[:, 3] = math.atan2(heading[1], heading[0])
-        return motion.execute(self, primitive, action, phase, approach=True)
+        seconds = DURATION_S * float(min_jerk(phase[-1]))
+        way = [motion.stretch_along(action, phase, seconds)]
+        return execute(self, primitive, way, phase, action, self.perceive(), approach=True)

@@ -1,0 +1,207 @@
+"""Carrying out one primitive on the object, from the first look to the object at rest.
+
+Everything is planned before anything moves, so a way that is out of reach raises and moves nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from affordlib.primitives import TIP_HEIGHT_M, Primitive
+from affordlib.types import Interaction
+from affordlib.world import robot
+from affordlib.world.motion import (
+    HOVER_HEIGHT_M,
+    RECORD_EVERY,
+    STEPS_PER_WAYPOINT,
+    Drive,
+    Stretch,
+    joint_move,
+    line,
+    mirror_fingers,
+    poses,
+    put_arm,
+)
+
+if TYPE_CHECKING:
+    from affordlib.world.scene import Percept, Tabletop
+
+SETTLE_STEPS = 120
+RETREAT_M = 0.02
+RECORDED_SAMPLES = 26
+"""One every 3 steps of 50 ms of a full primitive, as in the paper: t = 0 and 25 more."""
+
+_UP = np.array([0.0, 0.0, 1.0, 0.0, 0.0])
+
+
+def execute(
+    world: Tabletop,
+    primitive: Primitive,
+    way: list[Stretch],
+    phase: np.ndarray,
+    action: np.ndarray,
+    seen: Percept,
+    approach: bool,
+) -> Interaction:
+    """Follow a way of stretches; phase (n,) and action (n, 5) are what shall be recorded."""
+    start = poses(np.array([world.object_state()]))[0]
+    offset = np.array([*seen.xy_m, world.config.tip_offset_m, 0.0, 0.0])
+    home, tool = np.array(robot.HOME), primitive.tool
+    # A gripper is symmetric: of its two equal yaws, take the one that turns the wrist less.
+    turns = (0.0, math.pi) if tool == "gripper" else (0.0,)
+    options = [[_in_table_frame(s, offset, turn) for s in way] for turn in turns]
+    up = max(HOVER_HEIGHT_M + TIP_HEIGHT_M - way[0].poses[0, 2], 0.0) * _UP
+    stretch_W, over_start = min(
+        ((option, robot.joint_path(option[0][:1] + up, home, tool)[0]) for option in options),
+        key=lambda option: abs(option[1][5] - home[5]),
+    )
+    gaps = [primitive.opening_m * s.poses[:, 4] for s in way]
+    paths, near = [], over_start
+    for one in stretch_W:
+        paths.append(robot.joint_path(one, near, tool))
+        near = paths[-1][-1]
+    retreat, lift = _way_out(primitive, way, stretch_W, paths, tool, approach)
+
+    closes = any(np.ptp(gap) > 0 for gap in gaps)
+    drive = Drive(world, primitive.force_N, closes)
+    if closes:
+        mirror_fingers(world)
+    if approach:
+        drive.along(joint_move(world.arm, over_start, 1.0), np.linspace(world.gap_m, gaps[0][0], 2))
+        down = line(stretch_W[0][0] + up, stretch_W[0][0], over_start, 1.0, tool)
+        drive.along(down, gaps[0][[0, 0]])
+    else:
+        put_arm(world, paths[0][0], gaps[0][0])
+
+    floor = -math.inf
+    for stretch, one, path, gap in zip(way, stretch_W, paths, gaps, strict=True):
+        if one[:, 2].min() < floor:
+            one = one.copy()
+            one[:, 2] = np.maximum(one[:, 2], floor)
+            path = robot.joint_path(one, world.arm, tool)
+        gone = drive.along(path, gap, one, stretch.guarded, stretch.n_steps)
+        if stretch.guarded and gone < 1.0:
+            floor = float(np.interp(gone, np.linspace(0, 1, len(one)), one[:, 2]))
+    drive.finish()
+
+    if not primitive.holds:
+        release = (
+            np.array([world.gap_m, primitive.opening_m]) if closes else world.gap_m * np.ones(2)
+        )
+        if release[1] > release[0]:
+            drive.along(np.repeat(world.arm[None], 13, axis=0), np.linspace(*release, 13))
+        drive.along(np.concatenate([retreat, lift[1:]]), release[[1, 1]])
+        if approach:
+            drive.along(joint_move(world.arm, home, 1.0), release[[1, 1]])
+    drive.wait(SETTLE_STEPS)
+    return _record(world, primitive, way, phase, action, seen, start, drive, offset)
+
+
+def refused(world: Tabletop, primitive: Primitive, phase: np.ndarray, seen: Percept) -> Interaction:
+    """The interaction that was out of the arm's reach: commanded, but nothing moved."""
+    x, y, yaw = world.object_pose()
+    return Interaction(
+        primitive=primitive,
+        stop_phase=float(phase[-1]),
+        phase=phase,
+        action=primitive.path(phase),
+        effect=np.zeros((len(phase), 5)),
+        rest_effect=np.zeros(5),
+        image=seen.image,
+        start_pose=(x, y, yaw),
+        believed_xy_m=seen.xy_m,
+        tool=np.zeros((RECORDED_SAMPLES, 5)),
+        tracking_error_m=0.0,
+        penetration_m=0.0,
+        left_table=False,
+        fell=False,
+        rolls=world.object_rolls(),
+        reached=False,
+    )
+
+
+def _in_table_frame(stretch: Stretch, offset: np.ndarray, turn: float) -> np.ndarray:
+    """Poses (n, 5), x, y, z, yaw and pitch, of a stretch given relative to the object."""
+    return stretch.poses[:, [0, 1, 2, 3, 5]] + offset + np.array([0, 0, 0, turn, 0])
+
+
+def _way_out(
+    primitive: Primitive,
+    way: list[Stretch],
+    stretch_W: list[np.ndarray],
+    paths: list[np.ndarray],
+    tool: str,
+    approach: bool,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Joint waypoints that free the object: back along the way, then up (up only if it cages)."""
+    end = stretch_W[-1][-1]
+    back = np.zeros(5)
+    caged = primitive.path(0.0)[0, 2] > TIP_HEIGHT_M or primitive.holds
+    if not caged:
+        back[:3] = stretch_W[0][0, :3] - end[:3]
+        back *= RETREAT_M / max(np.linalg.norm(back), RETREAT_M)
+    retreat = paths[-1][-1:]
+    if not caged:
+        retreat = line(end, end + back, retreat[-1], 0.25, tool)
+    if primitive.holds or not (caged or approach):
+        return retreat, retreat[-1:]
+    rise = HOVER_HEIGHT_M if not caged else max(HOVER_HEIGHT_M - end[2], 0.0)
+    return retreat, line(end + back, end + back + rise * _UP, retreat[-1], 0.5, tool)
+
+
+def _record(
+    world: Tabletop,
+    primitive: Primitive,
+    way: list[Stretch],
+    phase: np.ndarray,
+    action: np.ndarray,
+    seen: Percept,
+    start: np.ndarray,
+    drive: Drive,
+    offset: np.ndarray,
+) -> Interaction:
+    """What was seen on the way, brought to the phases (n,) that are recorded."""
+    recorded = poses(world.centred(np.array([(*p, *q) for p, q in drive.states])))
+    rest = poses(np.array([world.object_state()]))[0]
+    rest[3] = recorded[-1, 3] + (rest[3] - recorded[-1, 3] + math.pi) % (2 * math.pi) - math.pi
+    origin = np.array([*start[:3], recorded[0, 3], 0.0])
+    at_sample, at_waypoint = _phases_of_records(way)
+    effect = recorded - origin
+    tool = np.array(drive.tool) - np.array([*offset[:3], 0.0, 0.0])
+    tool[:, 3] = np.unwrap(tool[:, 3])
+    seldom = np.linspace(0, phase[-1], RECORDED_SAMPLES)
+    x, y, z = world.object_state()[:3]
+    return Interaction(
+        primitive=primitive,
+        stop_phase=float(phase[-1]),
+        phase=phase,
+        action=action,
+        effect=np.column_stack([np.interp(phase, at_sample, effect[:, c]) for c in range(5)]),
+        rest_effect=rest - origin,
+        image=seen.image,
+        start_pose=(float(start[0]), float(start[1]), float(recorded[0, 3])),
+        tracking_error_m=drive.off_path_m,
+        believed_xy_m=seen.xy_m,
+        tool=np.column_stack([np.interp(seldom, at_waypoint, tool[:, c]) for c in range(5)]),
+        penetration_m=drive.penetration_m,
+        left_table=not world.on_table((x, y, z)),
+        fell=world.object_fell(),
+        rolls=world.object_rolls(),
+    )
+
+
+def _phases_of_records(way: list[Stretch]) -> tuple[np.ndarray, np.ndarray]:
+    """Phases of the states and of the tool poses that a drive has written down, in order."""
+    per = STEPS_PER_WAYPOINT // RECORD_EVERY
+    at_sample, at_waypoint = [], []
+    for stretch in way:
+        n_waypoints = len(stretch.phase) - 1
+        records = n_waypoints * per if stretch.n_steps is None else stretch.n_steps // RECORD_EVERY
+        samples = np.interp(np.arange(records) / per, np.arange(n_waypoints + 1), stretch.phase)
+        at_sample.append(samples)
+        at_waypoint.append(samples[::per])
+        end = np.interp(records / per, np.arange(n_waypoints + 1), stretch.phase)
+    return np.concatenate([*at_sample, [end]]), np.concatenate([*at_waypoint, [end]])

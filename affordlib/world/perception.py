@@ -1,0 +1,108 @@
+"""What the robot can tell about an object from its depth image alone.
+
+Images are (2, 48, 48): depth [m] from a plane 1 m above the table, and the mask of the object.
+Rows run along -y and columns along +x of the table, as a map is read.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import ndimage
+
+from affordlib.primitives import Drag, Grasp, Primitive
+from affordlib.types import CROP_WIDTH_M
+
+CAMERA_HEIGHT_M = 1.0
+_ROUND = 0.8
+"""Curvature times radius above which a top counts as round: 1 for a sphere, 0 for a box."""
+_FALL_M = 0.01
+
+
+@dataclass(frozen=True)
+class Percept:
+    """Where the robot believes the object to be, (x, y) [m], and its image (2, 48, 48)."""
+
+    xy_m: tuple[float, float]
+    image: np.ndarray
+
+
+def heights_m(image: np.ndarray) -> np.ndarray:
+    """Height [m] above the table, zero outside the mask; (48, 48)."""
+    return np.where(image[1] > 0, CAMERA_HEIGHT_M - image[0], 0.0)
+
+
+def object_height_m(image: np.ndarray) -> float:
+    """Height of the object [m]: of all but the highest 2 % of its pixels."""
+    inside = heights_m(image)[image[1] > 0]
+    return float(np.quantile(inside, 0.98)) if inside.size else 0.0
+
+
+def _curvature(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Principal curvatures (2,) [1/m] of the top, weakest first, and their directions (2, 2).
+
+    Of a paraboloid fitted to the heights away from the rim, which noise hardly moves.
+    """
+    mask = image[1] > 0
+    for rim in (3, 2, 1):
+        inside = ndimage.binary_erosion(mask, iterations=rim)
+        if inside.sum() >= 20:
+            break
+    else:
+        return np.zeros(2), np.eye(2)
+    rows, columns = np.nonzero(inside)
+    pixel = CROP_WIDTH_M / len(inside)
+    x, y = pixel * (columns - columns.mean()), pixel * (rows.mean() - rows)
+    terms = np.column_stack([np.ones_like(x), x, y, x * x / 2, x * y, y * y / 2])
+    _, _, _, xx, xy, yy = np.linalg.lstsq(terms, heights_m(image)[inside], rcond=None)[0]
+    values, vectors = np.linalg.eigh([[xx, xy], [xy, yy]])
+    order = np.argsort(np.abs(values))
+    return values[order], vectors[:, order].T
+
+
+def looks_rollable(image: np.ndarray) -> bool:
+    """Whether the top is curved like that of something round which lies on the table."""
+    radius = min(object_height_m(image), CROP_WIDTH_M * math.sqrt((image[1] > 0).mean())) / 2
+    return bool(-_curvature(image)[0][1] * radius > _ROUND)
+
+
+def long_axis_rad(image: np.ndarray) -> float:
+    """Direction [rad], in [-π/2, π/2), along which the top bends least: a lying cylinder's axis."""
+    x, y = _curvature(image)[1][0]
+    return (math.atan2(y, x) + math.pi / 2) % math.pi - math.pi / 2
+
+
+def looks_fallen(before: np.ndarray, after: np.ndarray) -> bool:
+    """Whether an object lies differently than before: other height or other kind of top."""
+    change = abs(object_height_m(after) - object_height_m(before))
+    return bool(change > _FALL_M or looks_rollable(before) != looks_rollable(after))
+
+
+def largest_blob(mask: np.ndarray) -> np.ndarray:
+    """The largest connected part of a mask, its holes filled."""
+    labels, n = ndimage.label(mask)
+    if n == 0:
+        return np.zeros_like(mask, dtype=bool)
+    sizes = ndimage.sum_labels(mask, labels, np.arange(1, n + 1))
+    return ndimage.binary_fill_holes(labels == 1 + int(np.argmax(sizes)))
+
+
+def centre_m(mask: np.ndarray) -> tuple[float, float]:
+    """Centroid (x, y) [m] of a mask (n, n), `CROP_WIDTH_M` wide, relative to the image's middle."""
+    rows, columns = np.nonzero(mask)
+    middle, pixel = (len(mask) - 1) / 2, CROP_WIDTH_M / len(mask)
+    return float((columns.mean() - middle) * pixel), float((middle - rows.mean()) * pixel)
+
+
+def aim(primitive: Primitive, image: np.ndarray) -> Primitive:
+    """The primitive as it suits the object in the image; what was given is kept.
+
+    A drag closes its fingers across the axis, a grasp goes by the height.
+    """
+    if isinstance(primitive, Drag) and primitive.grip_yaw is None:
+        return replace(primitive, grip_yaw=long_axis_rad(image))
+    if isinstance(primitive, Grasp) and primitive.seen_height is None:
+        return replace(primitive, seen_height=object_height_m(image))
+    return primitive
