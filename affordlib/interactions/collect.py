@@ -194,5 +194,5 @@ def _by_workers(
         if chunks:
             client.cancel(list(chunks))
     # A chunk may only have shared its workers with the one that kills them: each goes alone now.
-    for number in killed:
+    for number in sorted(killed):
         yield from _by_workers(client, task, [number], alone=True)

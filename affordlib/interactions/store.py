@@ -27,8 +27,8 @@ from affordlib.interactions.chunks import (
     Layout,
     as_json,
     empty_set,
-    read_chunk,
     is_record,
+    read_chunk,
     record_name,
     sha256,
 )
