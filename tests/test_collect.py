@@ -240,13 +240,10 @@ collect.collect(Recipe(n_interactions=6, seed=11), sys.argv[1], progress=False)
     [
         ("write", "effect/c", 0, 0),  # in the first chunk
         ("write", "effect/c.1", 0, 1),  # before the second
-        pytest.param(
-            "write", "done", 0, 3, marks=pytest.mark.slow
-        ),  # the manifest is there, its hash is not
         ("writestr", "", 9, 3),  # while packing
-        pytest.param(
-            "rmtree", ".chunks", 0, 3, marks=pytest.mark.slow
-        ),  # packed and not yet tidied up
+        # The manifest is there and its hash is not; packed and not yet tidied up.
+        pytest.param("write", "done", 0, 3, marks=pytest.mark.slow),
+        pytest.param("rmtree", ".chunks", 0, 3, marks=pytest.mark.slow),
     ],
 )
 def test_killed_and_run_again_it_is_the_same_file(
@@ -477,6 +474,43 @@ def test_a_cluster_leaves_the_same_file(both, undisturbed, tmp_path, monkeypatch
     assert Path(path).read_bytes() == undisturbed(LONGER).read_bytes()
     assert most == 4
     assert [p.name for p in tmp_path.iterdir()] == ["relative.zarr.zip"]
+
+
+@pytest.mark.parametrize("suffix", [".zarr", ".zarr.zip"])
+def test_a_cluster_writes_where_all_can(both, undisturbed, tmp_path, monkeypatch, suffix):
+    monkeypatch.setattr(locks, "SETTLE_S", 0.1)
+
+    folder = str(tmp_path)
+
+    def register():
+        """Make known a file system that all processes see and that is not local to affordlib."""
+        import fsspec
+        from fsspec.implementations.dirfs import DirFileSystem
+        from fsspec.implementations.local import LocalFileSystem
+
+        class Shared(DirFileSystem):
+            protocol, cachable = "shared", False
+
+            def __init__(self, **_):
+                super().__init__(folder, LocalFileSystem())
+
+        fsspec.register_implementation("shared", Shared, clobber=True)
+
+    register()
+    both.run(register)
+    url = f"shared://set{suffix}"
+    assert not Place.of(url).is_local
+    assert collect_set(SMALL, url, both, progress=False) == url
+    assert dataset_sha256(open_interactions(url)) == stored_sha256(undisturbed(SMALL))
+    assert [p.name for p in tmp_path.iterdir()] == [f"set{suffix}"]
+    if suffix == ".zarr.zip":
+        whole = undisturbed(SMALL).read_bytes()
+        assert (tmp_path / "set.zarr.zip").read_bytes() == whole
+        (tmp_path / "set.zarr.zip").write_bytes(whole[:1000])
+    else:
+        (tmp_path / "set.zarr" / "size" / "c.1.0").unlink()
+    with pytest.raises(CorruptedDataError, match=r"size/c\.1\.0 is missing|directory is damaged"):
+        open_interactions(url)
 
 
 def kill_a_worker(client):

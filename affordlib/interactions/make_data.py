@@ -10,7 +10,8 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
+from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
@@ -19,6 +20,9 @@ from affordlib.interactions.collect import collect
 from affordlib.interactions.recipes import RECIPES
 from affordlib.interactions.store import SUFFIX, dataset_sha256, open_interactions
 from affordlib.paths import repo_root
+
+if TYPE_CHECKING:
+    from dask.distributed import Client
 
 TOLERANCE_M = 0.001
 """Median distance between the final positions of two collections that still are the same set.
@@ -75,7 +79,7 @@ def main(argv: list[str] | None = None) -> int:
     return 0 if agree else 1
 
 
-def _client(address: str | None):
+def _client(address: str | None) -> AbstractContextManager[Client | None]:
     if address is None:
         return nullcontext()
     from dask.distributed import Client
