@@ -1,155 +1,78 @@
 """Collecting experience: seeded, resumable, in this process or on a Dask cluster.
 
-One task makes one whole chunk and leaves it as a file of its own; a rerun makes only the missing
-ones. The finished set is the same bits whoever collected it, in whatever order.
+One task makes one whole chunk and writes its files itself; a rerun makes only what is missing.
+The finished set is the same bits whoever collected it, in whatever order.
 """
 
 from __future__ import annotations
 
 import hashlib
-import os
-import tempfile
-from contextlib import contextmanager
-from importlib import metadata
+import threading
+from contextlib import closing
+from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-import xarray as xr
 from tqdm.auto import tqdm
 
-from affordlib.interactions.recipes import Recipe, interact
-from affordlib.interactions.store import CHUNK, SUFFIX, array_sha256, write_interactions
-from affordlib.types import ACTION_CHANNELS, EFFECT_CHANNELS, IMAGE_CHANNELS
-from affordlib.world import FAMILIES, Tabletop
+from affordlib.interactions.chunks import (
+    CHUNK,
+    Layout,
+    create,
+    metadata_files,
+    read_chunk,
+    write_chunk,
+)
+from affordlib.interactions.locks import exclusive
+from affordlib.interactions.places import Place
+from affordlib.interactions.recipes import Recipe
+from affordlib.interactions.records import collect_chunk, describe
+from affordlib.interactions.store import FOLDER_SUFFIX, SUFFIX, finish, pack
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
 
     from dask.distributed import Client
 
-TRACKING_LIMIT_M = 0.002
+WINDOW = 4
+"""Tasks that each worker is given ahead; the driver knows of no more futures than these."""
 
-_UNITS = {
-    "image": "m (depth), 1 (mask)",
-    "action": "m, rad; gripper 1 open, 0 closed",
-    "effect": "m, rad",
-    "rest_effect": "m, rad",
-    "size": "m",
-    "mass": "kg",
-    "theta": "rad",
-    "start_pose": "m, m, rad",
-    "tracking_error": "m",
-}
+_RETRIES = 2
+_ONE_WORLD = threading.Lock()
 
 
-def collect_chunk(recipe: Recipe, indices: range) -> dict[str, np.ndarray]:
-    """The interactions of a recipe with the given numbers, as arrays by name."""
-    families = list(FAMILIES)
-    rows: dict[str, list] = {}
-    with Tabletop(recipe.world) as world:
-        for index in indices:
-            thing, seen = interact(recipe, index, world)
-            extent = np.ptp(thing.footprint_m, axis=0)
-            on_table = world.object_state()[2] > 0
-            row = {
-                "image": seen.image,
-                "action": seen.action.astype(np.float32),
-                "effect": seen.effect.astype(np.float32),
-                "rest_effect": seen.rest_effect.astype(np.float32),
-                "family": np.int8(families.index(thing.family)),
-                "size": np.array([*extent, thing.height_m], dtype=np.float32),
-                "mass": np.float32(recipe.world.density_kg_m3 * thing.volume_m3),
-                "theta": np.float64(seen.primitive.theta),
-                "start_pose": np.array(seen.start_pose),
-                "tracking_error": np.float32(seen.tracking_error_m),
-                "fault": np.bool_(seen.tracking_error_m > TRACKING_LIMIT_M or not on_table),
-            }
-            for name, value in row.items():
-                rows.setdefault(name, []).append(value)
-    arrays = {name: np.stack(values) for name, values in rows.items()}
-    return {"phase": seen.phase, "index": np.array(indices), **arrays}
+@dataclass(frozen=True)
+class _Task:
+    """Makes the chunk of a number where it is missing; what a worker is sent."""
 
+    recipe: Recipe
+    layout: Layout
+    place: Place
 
-def _write_chunk(recipe: Recipe, indices: range, path: str) -> None:
-    """Collect one chunk into a file that appears whole or not at all; the task of a worker."""
-    arrays = collect_chunk(recipe, indices)
-    folder = Path(path).parent
-    handle, temporary = tempfile.mkstemp(dir=folder, prefix=".chunk")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            np.savez(file, **arrays, sha256=_chunk_sha256(arrays))
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
-
-
-def _chunk_sha256(arrays: dict[str, np.ndarray]) -> str:
-    text = "".join(name + array_sha256(arrays[name]) for name in sorted(arrays))
-    return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _read_chunk(path: Path) -> dict[str, np.ndarray] | None:
-    """A finished chunk's arrays, or None when the file is missing or damaged."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-        return arrays if str(arrays.pop("sha256")) == _chunk_sha256(arrays) else None
-    except (OSError, ValueError, KeyError, EOFError):
-        return None
-
-
-def _as_dataset(arrays: dict[str, np.ndarray], recipe: Recipe) -> xr.Dataset:
-    dims = {
-        "image": ("interaction", "image_channel", "row", "column"),
-        "action": ("interaction", "sample", "action_channel"),
-        "effect": ("interaction", "sample", "effect_channel"),
-        "rest_effect": ("interaction", "effect_channel"),
-        "size": ("interaction", "size_axis"),
-        "start_pose": ("interaction", "pose_channel"),
-    }
-    variables = {
-        name: (
-            dims.get(name, ("interaction",)),
-            array,
-            {"units": _UNITS[name]} if name in _UNITS else {},
-        )
-        for name, array in arrays.items()
-        if name not in ("phase", "index")
-    }
-    data = xr.Dataset(variables, coords={"interaction": arrays["index"]})
-    data["phase"] = ("sample", arrays["phase"], {"long_name": "normalised time of the primitive"})
-    data["family"].attrs["flag_meanings"] = " ".join(FAMILIES)
-    data["fault"].attrs["long_name"] = "the simulator failed: exclude"
-    packages = ("affordlib", "numpy", "pybullet", "example-robot-data", "ur-analytic-ik")
-    data.attrs = {
-        "recipe": recipe.to_json(),
-        "image_channels": " ".join(IMAGE_CHANNELS),
-        "action_channels": " ".join(ACTION_CHANNELS),
-        "effect_channels": " ".join(EFFECT_CHANNELS),
-        "frame": "origin where the object stood at the start, axes of the table",
-        "versions": " ".join(f"{name}={metadata.version(name)}" for name in packages),
-    }
-    return data
-
-
-@contextmanager
-def _exclusive(path: Path) -> Iterator[None]:
-    """Hold a file lock that the system frees even after a kill; refuse a second collector."""
-    import fcntl
-
-    with open(path, "w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
+    def __call__(self, number: int) -> bool:
+        """Whether the chunk had to be made."""
+        if read_chunk(self.place, self.layout, number) is not None:
+            return False
+        here = describe(self.recipe, self.layout.chunk)
+        if here != self.layout:
             raise RuntimeError(
-                f"another process is collecting into {path.parent}; wait for it or choose another "
-                "path"
-            ) from error
-        yield
+                f"this worker would make another set than the collector described: it has "
+                f"{here.attrs}, not {self.layout.attrs}; give both the same packages"
+            )
+        with _ONE_WORLD:  # threads of one worker take turns: the simulator gains nothing by them
+            arrays = collect_chunk(self.recipe, self.layout.rows(number))
+        write_chunk(self.place, self.layout, number, arrays)
+        return True
+
+    def failure(self, number: int, error: Exception) -> RuntimeError:
+        """The error that says which interactions could not be made, and why."""
+        rows = self.layout.rows(number)
+        return RuntimeError(
+            f"interactions {rows.start} to {rows.stop - 1} could not be collected: "
+            f"{type(error).__name__}: {error}; finished chunks are kept, collect again into the "
+            "same path when the cause is mended"
+        )
 
 
 def collect(
@@ -158,69 +81,118 @@ def collect(
     client: Client | None = None,
     workers: int = 1,
     progress: bool = True,
-) -> Path:
-    """Collect a recipe into one file at `path` (ending in .zarr.zip) and return it.
+) -> str | Path:
+    """Collect a recipe into `path` and return it.
 
-    client: a Dask client to collect with; None means `workers` processes of this machine, or this
-    process alone for 1. Interrupted, a rerun goes on with what is missing.
+    path: a file ending in .zarr.zip, or a folder ending in .zarr; local, or an fsspec URL that
+    all workers reach. client: a Dask client to collect with; None means `workers` processes of
+    this machine, or this process alone for 1. Interrupted, a rerun goes on with what is missing.
+    Raises ValueError for a path or `workers` that cannot be, RuntimeError while another process
+    collects into the path, and when a chunk cannot be made.
     """
-    path = Path(path)
-    if not path.name.endswith(SUFFIX):
-        raise ValueError(f"path must end in {SUFFIX!r}, got {str(path)!r}")
+    if not str(path).endswith((SUFFIX, FOLDER_SUFFIX)):
+        raise ValueError(f"path must end in {SUFFIX!r} or {FOLDER_SUFFIX!r}, got {str(path)!r}")
     if isinstance(workers, bool) or not isinstance(workers, int) or workers < 1:
         raise ValueError(f"workers must be a whole number of at least 1, got {workers!r}")
+    place = Place.of(path)
+    if place.is_private and (client is not None or workers > 1):
+        raise ValueError(
+            f"path {str(path)!r} lies in the memory of one process, which other workers do not "
+            "see; collect with workers=1 and no client, or give a path that they share"
+        )
     if client is None and workers > 1:
         from dask.distributed import Client, LocalCluster
 
         with (
             LocalCluster(
-                n_workers=workers, threads_per_worker=1, dashboard_address=None
+                n_workers=workers, threads_per_worker=1, dashboard_address=":0"
             ) as cluster,
             Client(cluster) as local,
         ):
             return collect(recipe, path, local, progress=progress)
 
-    fingerprint = hashlib.sha256(recipe.to_json().encode()).hexdigest()[:8]
-    folder = path.parent / f".{path.name}.{fingerprint}.chunks"
-    folder.mkdir(parents=True, exist_ok=True)
-    with _exclusive(folder / "lock"):
-        everything = range(recipe.n_interactions)
-        chunks = [everything[k : k + CHUNK] for k in everything[::CHUNK]]
-        files = {chunk: folder.resolve() / f"{chunk.start:08d}.npz" for chunk in chunks}
-        missing = [chunk for chunk in chunks if _read_chunk(files[chunk]) is None]
-        bar = tqdm(
-            total=recipe.n_interactions,
-            desc=path.name,
-            unit=" interactions",
-            disable=not progress,
-            initial=sum(len(chunk) for chunk in chunks if chunk not in missing),
-        )
-        with bar:
-            for chunk in _done(recipe, missing, files, client):
-                bar.update(len(chunk))
-        write_interactions((_as_dataset(_read_chunk(files[c]), recipe) for c in chunks), path)
-        for file in files.values():
-            file.unlink()
-        (folder / "lock").unlink()
-    folder.rmdir()
+    layout = describe(recipe, CHUNK)
+    with exclusive(place) as still_ours:
+        work = _working_place(place, layout)
+        create(work, layout)
+        task = _Task(recipe, layout, work)
+        numbers = range(layout.n_chunks)
+        results = _here(task, numbers) if client is None else _by_workers(client, task, numbers)
+        with (
+            closing(results),
+            tqdm(
+                total=recipe.n_interactions,
+                desc=place.name,
+                unit=" interactions",
+                disable=not progress,
+            ) as bar,
+        ):
+            for number, made in results:
+                still_ours()
+                count = len(layout.rows(number))
+                if progress and not made:
+                    bar.initial += count  # what was there says nothing about the rate
+                bar.update(count)
+        finish(work, layout)
+        if work != place:
+            still_ours()
+            pack(work, place)
+            work.delete_all()
     return path
 
 
-def _done(
-    recipe: Recipe, missing: list[range], files: dict[range, Path], client: Client | None
-) -> Iterator[range]:
-    """Yield each missing chunk's numbers as it is finished, here or by the client's workers."""
-    if client is None:
-        for chunk in missing:
-            _write_chunk(recipe, chunk, str(files[chunk]))
-            yield chunk
-        return
-    from dask.distributed import as_completed
+def _working_place(place: Place, layout: Layout) -> Place:
+    """Where chunks grow: beside a zip a hidden folder, which only the very same set finds again."""
+    if not place.name.endswith(SUFFIX):
+        return place
+    digest = hashlib.sha256()
+    for name, content in sorted(metadata_files(layout).items()):
+        digest.update(name.encode() + content)
+    return place.sibling(f".{place.name}.{digest.hexdigest()[:8]}.chunks")
 
-    futures = {
-        client.submit(_write_chunk, recipe, chunk, str(files[chunk]), pure=False, retries=2): chunk
-        for chunk in missing
-    }
-    for future in as_completed(futures):
-        future.result()
-        yield futures[future]
+
+def _here(task: _Task, numbers: Iterable[int]) -> Iterator[tuple[int, bool]]:
+    """Yield each chunk's number, and whether it was made, after making it in this process."""
+    for number in numbers:
+        try:
+            made = task(number)
+        except Exception as error:
+            raise task.failure(number, error) from error
+        yield number, made
+
+
+def _by_workers(
+    client: Client, task: _Task, numbers: Iterable[int], alone: bool = False
+) -> Iterator[tuple[int, bool]]:
+    """Yield each chunk's number, and whether it was made, as the client's workers finish it."""
+    from dask.distributed import KilledWorker, as_completed
+
+    waiting, running, killed = iter(numbers), as_completed(), []
+    chunks = {}
+    try:
+        while True:
+            room = WINDOW * max(1, len(client.nthreads())) - len(chunks)
+            for number in islice(waiting, max(0, room)):
+                future = client.submit(task, number, pure=False, retries=_RETRIES)
+                chunks[future] = number
+                running.add(future)
+            if not chunks:
+                break
+            future = next(running)
+            number = chunks.pop(future)
+            try:
+                made = future.result()
+            except KilledWorker as error:
+                if alone:
+                    raise task.failure(number, error) from error
+                killed.append(number)
+                continue
+            except Exception as error:
+                raise task.failure(number, error) from error
+            yield number, made
+    finally:
+        if chunks:
+            client.cancel(list(chunks))
+    # A chunk may only have shared its workers with the one that kills them: each goes alone now.
+    for number in sorted(killed):
+        yield from _by_workers(client, task, [number], alone=True)

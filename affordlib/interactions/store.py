@@ -1,7 +1,9 @@
-"""Data sets of interactions: xarray on Zarr v3, one zip file each, checked when opened.
+"""Data sets of interactions: Zarr v3, a folder or one zip file, checked whole when opened.
 
-A reader meets one call, `open_interactions("push")`. Chunks carry checksums, and the file's own
-list of hashes makes a missing or changed array an error: nothing is ever read as fill values.
+A reader meets one call, `open_interactions("push")`. While a set grows, whoever makes a chunk
+writes its files and then, last, a record of their hashes in `tasks/`. A finished set has a
+`manifest.json` with the hash of every file, and a file `done` with the manifest's: nothing is ever
+read as fill values.
 """
 
 from __future__ import annotations
@@ -9,7 +11,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import shutil
 import tempfile
 import zipfile
 from pathlib import Path
@@ -17,129 +18,189 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
-import zarr
-from zarr.codecs import BloscCodec, Crc32cCodec
-from zarr.storage import LocalStore, ZipStore
+from zarr.buffer.cpu import Buffer
+from zarr.storage import MemoryStore
 
+from affordlib.interactions.chunks import (
+    AXIS,
+    DONE,
+    Layout,
+    as_json,
+    empty_set,
+    is_record,
+    read_chunk,
+    record_name,
+    sha256,
+)
+from affordlib.interactions.places import Place
 from affordlib.paths import repo_root
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-CHUNK = 50
-"""Interactions in one stored chunk, and in one task of collecting."""
-
 SUFFIX = ".zarr.zip"
-_CODECS = [BloscCodec(cname="zstd", clevel=7, shuffle="shuffle"), Crc32cCodec()]
+FOLDER_SUFFIX = ".zarr"
+MANIFEST = "manifest.json"
 
 
 class CorruptedDataError(ValueError):
-    """A data set's file is damaged: what was read is not what was written."""
+    """A data set is damaged or unfinished: what was read is not what was written."""
+
+
+def _array_digest(dtype: np.dtype, shape: tuple[int, ...]) -> hashlib._Hash:
+    return hashlib.sha256(f"{dtype.str}{shape}".encode())
 
 
 def array_sha256(array: np.ndarray) -> str:
     """Hash of an array's type, shape and bytes."""
-    array = np.ascontiguousarray(array)
-    digest = hashlib.sha256(f"{array.dtype.str}{array.shape}".encode())
-    digest.update(array.tobytes())
+    digest = _array_digest(array.dtype, array.shape)
+    digest.update(np.ascontiguousarray(array))
     return digest.hexdigest()
 
 
-def manifest(data: xr.Dataset) -> dict[str, str]:
-    """Hash of every variable of a data set, by name."""
-    return {str(name): array_sha256(data[name].values) for name in sorted(data.variables)}
+def _set_sha256(arrays: dict[str, str]) -> str:
+    return sha256(json.dumps(arrays, sort_keys=True).encode())
 
 
 def dataset_sha256(data: xr.Dataset) -> str:
     """One hash for all arrays of a data set; it depends neither on workers nor on the file."""
-    return hashlib.sha256(json.dumps(manifest(data), sort_keys=True).encode()).hexdigest()
+    return _set_sha256({str(name): array_sha256(data[name].values) for name in data.variables})
 
 
-def _zip_folder(folder: Path, path: Path) -> None:
-    """Zip a folder with sorted names and fixed times, so equal contents give equal bytes."""
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
-        for file in sorted(p for p in folder.rglob("*") if p.is_file()):
-            entry = zipfile.ZipInfo(file.relative_to(folder).as_posix(), (1980, 1, 1, 0, 0, 0))
-            archive.writestr(entry, file.read_bytes())
+def finish(place: Place, layout: Layout) -> None:
+    """Hash a set whose chunks are all there, chunk by chunk, and mark it as done."""
+    contents, arrays = empty_set(layout)
+    files = {name: sha256(content.to_bytes()) for name, content in contents.items()}
+    digests = {n: _array_digest(array.dtype, array.shape) for n, array in arrays.items()}
+    for number in range(layout.n_chunks):
+        chunk = read_chunk(place, layout, number)
+        if chunk is None:
+            raise CorruptedDataError(
+                f"{place.url}: the files of {record_name(number)} were changed or deleted after "
+                "they were written; collect again into the same path"
+            )
+        files |= {name: sha256(content) for name, content in chunk.items()}
+        contents.update({name: Buffer.from_bytes(content) for name, content in chunk.items()})
+        rows = slice(layout.rows(number).start, layout.rows(number).stop)
+        for name in layout.files(number).values():
+            part = arrays[name][rows if AXIS in layout.variables[name].dims else ...]
+            digests[name].update(np.ascontiguousarray(part))
+        for name in chunk:
+            del contents[name]
+    hashes = {name: digest.hexdigest() for name, digest in digests.items()}
+    manifest = as_json({"arrays": hashes, "files": files})
+    place.delete_partials()
+    place.write(MANIFEST, manifest)
+    place.write(DONE, sha256(manifest).encode())
 
 
-def write_interactions(parts: Iterable[xr.Dataset], path: str | Path) -> Path:
-    """Write a data set given in order as parts of `CHUNK` interactions; returns the file's path.
+def pack(folder: Place, target: Place) -> None:
+    """Zip a finished set; equal sets give equal bytes, whole under the target's name or not.
 
-    The file appears whole under its name, or not at all.
+    Only what the manifest names is packed, in sorted order and with fixed times.
     """
-    path = Path(path)
-    if not path.name.endswith(SUFFIX):
-        raise ValueError(f"path must end in {SUFFIX!r}, got {str(path)!r}")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    work = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
-    try:
-        store = LocalStore(work / "zarr")
-        for k, part in enumerate(parts):
-            if k == 0:
-                encoding = {
-                    name: {
-                        "compressors": _CODECS,
-                        "chunks": tuple(
-                            CHUNK if dim == "interaction" else n
-                            for dim, n in part[name].sizes.items()
-                        ),
-                    }
-                    for name in part.variables
-                }
-                part.to_zarr(store, mode="w", zarr_format=3, consolidated=False, encoding=encoding)
-            else:
-                part.to_zarr(store, append_dim="interaction", zarr_format=3, consolidated=False)
-        with xr.open_zarr(store, consolidated=False, zarr_format=3) as written:
-            hashes = manifest(written)
-        zarr.open_group(store, mode="r+").attrs["manifest_sha256"] = json.dumps(hashes)
-        _zip_folder(work / "zarr", work / "zip")
-        with open(work / "zip", "rb") as file:
+    names = [*json.loads(folder.read([MANIFEST])[MANIFEST])["files"], MANIFEST, DONE]
+    with tempfile.TemporaryDirectory(dir=folder.root if target.is_local else None) as work:
+        packed = Path(work, "zip")
+        with open(packed, "wb") as file:
+            with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+                for name in sorted(names):
+                    entry = zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))
+                    archive.writestr(entry, folder.read([name])[name])
+            file.flush()
             os.fsync(file.fileno())
-        os.replace(work / "zip", path)
+        if target.is_local:
+            os.replace(packed, target.root)
+            _sync_folder(Path(target.root).parent)
+        else:
+            target.fs.put_file(str(packed), target.root)
+
+
+def _sync_folder(folder: Path) -> None:
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
     finally:
-        shutil.rmtree(work, ignore_errors=True)
-    return path
+        os.close(handle)
 
 
-def resolve_interactions(name_or_path: str | Path) -> Path:
-    """The file of a shipped data set's name, or of a path; raises when there is none."""
-    path = Path(name_or_path)
-    if not str(name_or_path).endswith(SUFFIX):
-        path = repo_root() / "data" / f"{name_or_path}{SUFFIX}"
-    if not path.is_file():
+def _resolve(name_or_path: str | Path) -> Place:
+    """The place of a shipped data set's name, of a path or of a URL; raises when it is empty."""
+    path = os.fspath(name_or_path)
+    if not path.rstrip("/").endswith((SUFFIX, FOLDER_SUFFIX)):
+        path = str(repo_root() / "data" / f"{path}{SUFFIX}")
+    place = Place.of(path)
+    if not place.fs.exists(place.root):
         shipped = sorted(
             p.name.removesuffix(SUFFIX) for p in (repo_root() / "data").glob(f"*{SUFFIX}")
         )
         raise FileNotFoundError(
-            f"interactions {str(name_or_path)!r}: there is no file {path}; give one of the shipped "
-            f"names {shipped} or the path of a {SUFFIX} file, or make them again with `make data`"
+            f"interactions {str(name_or_path)!r}: there is no file {place.url}; give one of the "
+            f"shipped names {shipped} or the path of a {SUFFIX} file or {FOLDER_SUFFIX} folder, "
+            "or make them again with `make data`"
         )
-    return path
+    return place
+
+
+_REMEDY = "fetch it again, or collect it again (the shipped sets with `make data`)"
+
+
+def _read(place: Place, names: Iterable[str]) -> dict[str, bytes]:
+    """Those files of a set, a folder or a zip, that exist."""
+    if not place.name.endswith(SUFFIX):
+        return place.read(names)
+    found, name = {}, "its directory"
+    try:
+        with place.fs.open(place.root, "rb") as file, zipfile.ZipFile(file) as archive:
+            there = set(archive.namelist())
+            for name in there.intersection(names):
+                found[name] = archive.read(name)
+    except Exception as error:
+        raise CorruptedDataError(
+            f"{place.url} cannot be read: {name} is damaged ({error}); {_REMEDY}"
+        ) from error
+    return found
+
+
+def _read_manifest(place: Place) -> dict[str, dict[str, str]]:
+    found = _read(place, (DONE, MANIFEST))
+    if DONE not in found:
+        raise CorruptedDataError(
+            f"{place.url} is not finished: it has no file {DONE!r}; collect again into the same "
+            f"path to finish it, or {_REMEDY}"
+        )
+    if MANIFEST not in found:
+        raise CorruptedDataError(f"{place.url}: {MANIFEST} is missing; {_REMEDY}")
+    if found[DONE] != sha256(found[MANIFEST]).encode():
+        raise CorruptedDataError(
+            f"{place.url}: {MANIFEST} is not the one whose hash {DONE!r} holds, one of the two was "
+            f"changed; {_REMEDY}"
+        )
+    return json.loads(found[MANIFEST])
+
+
+def stored_sha256(name_or_path: str | Path) -> str:
+    """The `dataset_sha256` of a stored set, told by its manifest without reading the arrays."""
+    return _set_sha256(_read_manifest(_resolve(name_or_path))["arrays"])
 
 
 def open_interactions(name_or_path: str | Path) -> xr.Dataset:
-    """Read a data set, whole and checked, given a shipped name (`"push"`) or a path.
+    """Read a data set, whole and checked, given a shipped name (`"push"`), a path or a URL.
 
     Dimensions: interaction, sample, action_channel, effect_channel, image_channel, row, column.
     Raises FileNotFoundError, or CorruptedDataError naming what is damaged.
     """
-    path = resolve_interactions(name_or_path)
-    remedy = "fetch the file again, or make it again with `make data`"
-    try:
-        with ZipStore(path, mode="r") as store:
-            data = xr.open_zarr(store, consolidated=False, zarr_format=3).load()
-            data.close()
-    except Exception as error:
-        raise CorruptedDataError(f"{path} cannot be read ({error}); {remedy}") from error
-    try:
-        expected = json.loads(data.attrs["manifest_sha256"])
-    except (KeyError, ValueError) as error:
-        raise CorruptedDataError(f"{path} has lost its list of hashes; {remedy}") from error
-    found = manifest(data)
-    wrong = sorted(n for n in expected.keys() | found.keys() if expected.get(n) != found.get(n))
-    if wrong:
-        raise CorruptedDataError(
-            f"{path}: {', '.join(wrong)} differ from what was stored; {remedy}"
-        )
-    return data
+    place = _resolve(name_or_path)
+    hashes = _read_manifest(place)["files"]
+    files = _read(place, hashes)
+    missing = sorted(hashes.keys() - files.keys())
+    changed = sorted(name for name in files if sha256(files[name]) != hashes[name])
+    for names, what in ((missing, "missing"), (changed, "not what was stored")):
+        if names:
+            more = f" (and {len(names) - 1} others)" if len(names) > 1 else ""
+            raise CorruptedDataError(f"{place.url}: {names[0]}{more} is {what}; {_REMEDY}")
+    store = MemoryStore(
+        {name: Buffer.from_bytes(files[name]) for name in files if not is_record(name)}
+    )
+    with xr.open_zarr(store, consolidated=False, zarr_format=3) as data:
+        return data[sorted(data.data_vars)].load()

@@ -1,0 +1,634 @@
+"""Collecting at scale: the same bits whatever is killed, cut off or shared."""
+
+import errno
+import itertools
+import json
+import math
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+import tracemalloc
+import zipfile
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+import zarr
+
+import affordlib
+from affordlib.interactions import CorruptedDataError, collect, locks, make_data
+from affordlib.interactions.chunks import Layout, Variable
+from affordlib.interactions.collect import collect as collect_set
+from affordlib.interactions.locks import exclusive
+from affordlib.interactions.places import Place
+from affordlib.interactions.recipes import Recipe
+from affordlib.interactions.records import collect_chunk
+from affordlib.interactions.store import dataset_sha256, open_interactions, stored_sha256
+
+SMALL = Recipe(n_interactions=6, seed=11)
+LONGER = Recipe(n_interactions=12, seed=5)
+ROOT = Path(affordlib.__file__).parents[1]
+
+
+@pytest.fixture(autouse=True)
+def small_chunks(monkeypatch):
+    monkeypatch.setattr(collect, "CHUNK", 2)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory):
+    """A function from a recipe to its zip, collected in this process without any disturbance."""
+    made = {}
+
+    def make(recipe):
+        if recipe not in made:
+            path = tmp_path_factory.mktemp("undisturbed") / "set.zarr.zip"
+            made[recipe] = collect_set(recipe, path, progress=False)
+        return made[recipe]
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def arrays():
+    """What the interactions left, before anything is stored."""
+    return collect_chunk(SMALL, range(6))
+
+
+@pytest.fixture
+def folder_set(undisturbed, tmp_path):
+    with zipfile.ZipFile(undisturbed(SMALL)) as archive:
+        archive.extractall(tmp_path / "set.zarr")
+    return tmp_path / "set.zarr"
+
+
+def files_of(folder):
+    return {p.relative_to(folder).as_posix(): p for p in folder.rglob("*") if p.is_file()}
+
+
+# The store
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["a.zarr.zip", "a.zarr", "file://{}/a.zarr", "memory://{}/a.zarr", "memory://m.zarr.zip"],
+)
+def test_wherever_it_lies_it_holds_what_the_interactions_left(tmp_path, monkeypatch, arrays, path):
+    monkeypatch.setattr(locks, "SETTLE_S", 0.01)
+    monkeypatch.chdir(tmp_path)
+    path = collect_set(SMALL, path.format(tmp_path), progress=False)
+    read = open_interactions(path)
+    assert sorted(read.variables) == sorted(arrays)
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(read[name].values, array)
+        assert read[name].dtype == array.dtype
+    straight = xr.Dataset({n: ([f"{n}{k}" for k in range(a.ndim)], a) for n, a in arrays.items()})
+    assert dataset_sha256(read) == dataset_sha256(straight) == stored_sha256(path)
+    if "memory" not in str(path):
+        assert [p.name for p in tmp_path.iterdir()] == [Path(path).name]
+
+
+def test_each_file_is_written_by_one_task_with_the_promised_codecs(folder_set, arrays):
+    records = [json.loads(p.read_text()) for p in sorted((folder_set / "tasks").iterdir())]
+    assert [r["interactions"] for r in records] == [[0, 2], [2, 4], [4, 6]]
+    written = list(itertools.chain.from_iterable(r["sha256"] for r in records))
+    assert len(set(written)) == len(written)
+    there = {name for name in files_of(folder_set) if "/c" in name}
+    assert set(written) == there
+    manifest = json.loads((folder_set / "manifest.json").read_text())
+    assert manifest["files"].keys() == files_of(folder_set).keys() - {"manifest.json", "done"}
+    image = zarr.open_group(folder_set, mode="r")["image"]
+    blosc, crc = image.compressors
+    assert (blosc.cname.value, blosc.clevel, blosc.shuffle.value) == ("zstd", 7, "shuffle")
+    assert type(crc).__name__ == "Crc32cCodec"
+    np.testing.assert_array_equal(image[2:4], arrays["image"][2:4])
+
+
+def test_whatever_is_damaged_is_named(folder_set):
+    rng = np.random.default_rng(0)
+    for name, file in files_of(folder_set).items():
+        whole = file.read_bytes()
+        damaged = bytearray(whole)
+        damaged[rng.integers(len(whole))] ^= 1 << int(rng.integers(8))
+        file.write_bytes(damaged)
+        with pytest.raises(CorruptedDataError, match=f"{name}.*again"):
+            open_interactions(folder_set)
+        file.unlink()
+        with pytest.raises(CorruptedDataError, match=f"{name}.*again"):
+            open_interactions(folder_set)
+        file.write_bytes(whole)
+    metadata = folder_set / "zarr.json"
+    metadata.write_text(metadata.read_text().replace("depth mask", "mask depth"))
+    with pytest.raises(CorruptedDataError, match=r"zarr\.json is not what was stored"):
+        open_interactions(folder_set)
+
+
+def test_a_mended_set_is_the_same_again(folder_set, monkeypatch):
+    before = {name: file.read_bytes() for name, file in files_of(folder_set).items()}
+    files_of(folder_set)["effect/c.1.0.0"].unlink()
+    files_of(folder_set)["tasks/00000002.json"].write_text("{}")
+    with files_of(folder_set)["image/c.0.0.0.0"].open("r+b") as file:
+        file.truncate(100)
+    made = []
+    monkeypatch.setattr(
+        collect, "collect_chunk", lambda r, i: made.append(i.start) or collect_chunk(r, i)
+    )
+    collect_set(SMALL, folder_set, progress=False)
+    assert made == [0, 2, 4]
+    assert {name: file.read_bytes() for name, file in files_of(folder_set).items()} == before
+    collect_set(SMALL, folder_set, progress=False)
+    assert made == [0, 2, 4]
+
+
+def test_a_folder_of_another_recipe_is_left_alone(folder_set):
+    before = {name: file.read_bytes() for name, file in files_of(folder_set).items()}
+    with pytest.raises(ValueError, match=r"set\.zarr holds a set of another recipe"):
+        collect_set(Recipe(n_interactions=6, seed=12), folder_set, progress=False)
+    assert {name: file.read_bytes() for name, file in files_of(folder_set).items()} == before
+
+
+@pytest.mark.parametrize("spoil", [{"x": np.zeros(2)}, {"x": np.zeros((3, 2), "f4")}, {}])
+def test_a_chunk_that_is_not_what_was_described_is_refused(tmp_path, cheap, spoil, monkeypatch):
+    monkeypatch.setattr(collect, "collect_chunk", lambda *_: spoil)
+    with pytest.raises(RuntimeError, match=r"interactions 0 to 1 .*'x'"):
+        collect_set(SMALL, tmp_path / "x.zarr", progress=False)
+
+
+def test_paths_and_workers_that_cannot_be_are_named(tmp_path):
+    with pytest.raises(ValueError, match=r"path must end in .*'\.zarr', got .*x\.zip"):
+        collect_set(SMALL, tmp_path / "x.zip")
+    with pytest.raises(ValueError, match=r"workers must be a whole number .* 0"):
+        collect_set(SMALL, tmp_path / "x.zarr", workers=0)
+    with pytest.raises(ValueError, match=r"memory of one process.*workers=1"):
+        collect_set(SMALL, "memory://x.zarr", workers=2)
+    with pytest.raises(ValueError, match=r"memory of one process.*workers=1"):
+        collect_set(SMALL, "memory://x.zarr", client=object())
+    with pytest.raises(FileNotFoundError, match=r"there is no file .*x\.zarr; .*'push'"):
+        open_interactions(tmp_path / "x.zarr")
+
+
+# Memory
+
+
+@pytest.fixture
+def cheap(monkeypatch):
+    """Interactions of 20 kB that cost nothing."""
+
+    def layout(recipe, chunk):
+        sizes = {"interaction": recipe.n_interactions, "value": 5000}
+        return Layout({"x": Variable(("interaction", "value"), "float32")}, sizes, {}, chunk)
+
+    def arrays(recipe, indices):
+        values = [np.random.default_rng(i).random(5000, dtype=np.float32) for i in indices]
+        return {"x": np.stack(values)}
+
+    monkeypatch.setattr(collect, "describe", layout)
+    monkeypatch.setattr(collect, "collect_chunk", arrays)
+
+
+def test_memory_does_not_grow_with_the_set(tmp_path, cheap, monkeypatch):
+    monkeypatch.setattr(collect, "CHUNK", 50)
+
+    def peak(n):
+        tracemalloc.start()
+        collect_set(Recipe(n_interactions=n), tmp_path / f"{n}.zarr.zip", progress=False)
+        found = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return found
+
+    peak(50)  # what is imported and cached once
+    few, many = peak(200), peak(2000)
+    # The whole of 2,000 would be 40 MB; names and hashes of the files are all that grows.
+    assert few > 1_000_000
+    assert many < few + 200_000
+    assert (tmp_path / "2000.zarr.zip").stat().st_size > 30_000_000
+
+
+# Kills in one process
+
+_DRIVER = """
+import os, signal, sys
+from affordlib.interactions import collect, places, store
+from affordlib.interactions.recipes import Recipe
+
+collect.CHUNK = 2
+part, name, count = sys.argv[2], sys.argv[3], int(sys.argv[4])
+owner = {"write": places.Place, "writestr": store.zipfile.ZipFile, "rmtree": places.shutil}[part]
+whole = getattr(owner, part)
+
+def deadly(*arguments, **options):
+    global count
+    count -= name in str(arguments[0] if part == "rmtree" else arguments[1])
+    if count < 0:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return whole(*arguments, **options)
+
+setattr(owner, part, deadly)
+collect.collect(Recipe(n_interactions=6, seed=11), sys.argv[1], progress=False)
+"""
+
+
+@pytest.mark.parametrize(
+    ("part", "name", "count", "chunks_done"),
+    [
+        ("write", "effect/c", 0, 0),  # in the first chunk
+        ("write", "effect/c.1", 0, 1),  # before the second
+        ("writestr", "", 9, 3),  # while packing
+        # The manifest is there and its hash is not; packed and not yet tidied up.
+        pytest.param("write", "done", 0, 3, marks=pytest.mark.slow),
+        pytest.param("rmtree", ".chunks", 0, 3, marks=pytest.mark.slow),
+    ],
+)
+def test_killed_and_run_again_it_is_the_same_file(
+    undisturbed, tmp_path, part, name, count, chunks_done
+):
+    path = tmp_path / "killed.zarr.zip"
+    arguments = [sys.executable, "-c", _DRIVER, str(path), part, name, str(count)]
+    ended = subprocess.run(arguments, cwd=ROOT, capture_output=True, text=True)
+    assert ended.returncode == -signal.SIGKILL, ended.stderr
+    (work,) = tmp_path.glob(".killed*.chunks")
+    assert len(list(work.glob("tasks/*.json"))) == chunks_done
+    if part == "rmtree":
+        assert path.read_bytes() == undisturbed(SMALL).read_bytes()
+    else:
+        assert not path.exists()
+    collect_set(SMALL, path, progress=False)
+    assert path.read_bytes() == undisturbed(SMALL).read_bytes()
+    assert [p.name for p in tmp_path.iterdir()] == ["killed.zarr.zip"]
+
+
+@pytest.mark.parametrize("suffix", [".zarr", ".zarr.zip"])
+def test_a_full_disk_leaves_nothing_that_is_read(undisturbed, tmp_path, monkeypatch, suffix):
+    path = tmp_path / f"full{suffix}"
+    room = 0
+
+    def write(self, content):
+        nonlocal room
+        room -= 1
+        with open(self, "wb") as file:
+            file.write(content if room >= 0 else content[: len(content) // 2])
+        if room < 0:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_bytes", write)
+        for files in (3, 14, 10, 16, 13, 1, 14):  # from the metadata to the last file, `done`
+            room = files
+            with pytest.raises((OSError, RuntimeError), match="No space left"):
+                collect_set(SMALL, path, progress=False)
+            with pytest.raises((FileNotFoundError, CorruptedDataError), match="no file"):
+                open_interactions(path)
+    with monkeypatch.context() as patch:
+        patch.setattr(zipfile.ZipFile, "writestr", write_nothing)
+        if suffix == ".zarr.zip":
+            with pytest.raises(OSError, match="No space left"):
+                collect_set(SMALL, path, progress=False)
+            assert not path.exists()
+    collect_set(SMALL, path, progress=False)
+    expected = open_interactions(undisturbed(SMALL))
+    assert dataset_sha256(open_interactions(path)) == dataset_sha256(expected)
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+    assert not list(tmp_path.rglob("*.partial"))
+
+
+def write_nothing(*_):
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+# Locks
+
+
+@pytest.mark.parametrize("name", ["x.zarr", "x.zarr.zip"])
+def test_a_second_collector_is_refused(tmp_path, cheap, name):
+    with (
+        exclusive(Place.of(tmp_path / name)),
+        pytest.raises(RuntimeError, match=rf"another process is collecting into .*{name}"),
+    ):
+        collect_set(SMALL, tmp_path / name, progress=False)
+    collect_set(SMALL, tmp_path / name, progress=False)
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+
+
+@pytest.fixture
+def lease(monkeypatch):
+    monkeypatch.setattr(locks, "LEASE_S", 0.5)
+    monkeypatch.setattr(locks, "RENEW_S", 0.05)
+    monkeypatch.setattr(locks, "SETTLE_S", 0.1)
+    return lambda place: place.sibling(f".{place.name}.lock")
+
+
+def test_a_lease_that_moves_is_respected_and_then_given_back(lease, cheap):
+    place = Place.of("memory://lease/a.zarr")
+    with exclusive(place) as still_ours:
+        time.sleep(1)  # longer than the lease lasts without renewal
+        with pytest.raises(RuntimeError, match=r"collecting into memory://lease/a\.zarr"):
+            collect_set(SMALL, place.url, progress=False)
+        still_ours()
+    assert not lease(place).read(["lease"])
+    collect_set(SMALL, place.url, progress=False)
+    assert open_interactions(place.url).sizes["interaction"] == 6
+
+
+def test_a_lease_whose_owner_was_killed_is_taken_over(lease, cheap):
+    place = Place.of("memory://lease/b.zarr")
+    lease(place).make_folders(["lease"])
+    lease(place).write("lease", b'{"owner": "a dead one", "count": 7}')
+    began = time.monotonic()
+    with exclusive(place):
+        assert time.monotonic() - began > 0.5
+        assert b"dead" not in lease(place).read(["lease"])["lease"]
+    assert not lease(place).read(["lease"])
+
+
+def test_a_collector_that_lost_its_lease_stops(lease, cheap, monkeypatch):
+    place = Place.of("memory://lease/c.zarr")
+
+    def slow(recipe, indices):
+        time.sleep(0.1)
+        lease(place).write("lease", b'{"owner": "another", "count": 1}')
+        time.sleep(0.2)
+        return {"x": np.zeros((2, 5000), np.float32)}
+
+    monkeypatch.setattr(collect, "collect_chunk", slow)
+    with pytest.raises(RuntimeError, match=r"the lock on .*c\.zarr was lost"):
+        collect_set(SMALL, place.url, progress=False)
+    assert b"another" in lease(place).read(["lease"])["lease"]
+    with pytest.raises(CorruptedDataError, match="not finished"):
+        open_interactions(place.url)
+
+
+def test_of_many_that_come_at_once_one_holds_the_lease(lease):
+    place, outcomes, barrier = Place.of("memory://lease/d.zarr"), [], threading.Barrier(6)
+
+    def take():
+        barrier.wait()
+        try:
+            with exclusive(place):
+                time.sleep(1)
+                outcomes.append("held")
+        except RuntimeError:
+            outcomes.append("refused")
+
+    threads = [threading.Thread(target=take) for _ in range(6)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(outcomes) == ["held"] + ["refused"] * 5
+
+
+# Dask
+
+
+@pytest.fixture(scope="module")
+def client(tmp_path_factory):
+    """A client of a scheduler and two workers that the `dask` command has started."""
+    from dask.distributed import Client
+
+    folder = tmp_path_factory.mktemp("dask")
+    file = folder / "scheduler.json"
+    worker = ["worker", "--scheduler-file", str(file), "--nthreads", "1", "--no-dashboard"]
+    worker += ["--local-directory", str(folder)]
+    host = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard"]
+    commands = [["scheduler", *host, "--scheduler-file", str(file)], worker, worker]
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-m", "dask", *command],
+            cwd=ROOT,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        for command in commands
+    ]
+    try:
+        with Client(scheduler_file=str(file), timeout=60) as client:
+            client.wait_for_workers(2, timeout=60)
+            yield client
+    finally:
+        for process in processes:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+
+@pytest.fixture
+def both(client):
+    """The client while both workers are there."""
+    client.wait_for_workers(2, timeout=60)
+    yield client
+    client.wait_for_workers(2, timeout=60)
+
+
+@contextmanager
+def poisoned(client, how):
+    """Make all workers, also those started later, fail in the chunk that begins with 6."""
+    from dask.distributed import WorkerPlugin
+
+    class Poison(WorkerPlugin):
+        name = "poison"
+
+        def setup(self, worker):
+            from affordlib.interactions import collect, records
+
+            def deadly(recipe, indices):
+                if indices.start == 6:
+                    os._exit(9) if how == "kill" else math.sqrt(-1)
+                return records.collect_chunk(recipe, indices)
+
+            collect.collect_chunk = deadly
+
+        def teardown(self, worker):
+            from affordlib.interactions import collect, records
+
+            collect.collect_chunk = records.collect_chunk
+
+    client.register_plugin(Poison())
+    try:
+        yield
+    finally:
+        client.wait_for_workers(2, timeout=60)
+        client.unregister_worker_plugin("poison")
+
+
+def test_a_cluster_leaves_the_same_file(both, undisturbed, tmp_path, monkeypatch):
+    assert set(both.run(lambda: __import__("affordlib").__file__).values()) == {affordlib.__file__}
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(collect, "WINDOW", 2)
+    submit, most = both.submit, 0
+
+    def counting(*arguments, **options):
+        nonlocal most
+        future = submit(*arguments, **options)
+        most = max(most, sum(f.status == "pending" for f in both.futures.values()))
+        return future
+
+    monkeypatch.setattr(both, "submit", counting)
+    path = collect_set(LONGER, "relative.zarr.zip", both, progress=False)
+    assert Path(path).read_bytes() == undisturbed(LONGER).read_bytes()
+    assert most == 4
+    assert [p.name for p in tmp_path.iterdir()] == ["relative.zarr.zip"]
+
+
+@pytest.mark.parametrize("suffix", [".zarr", ".zarr.zip"])
+def test_a_cluster_writes_where_all_can(both, undisturbed, tmp_path, monkeypatch, suffix):
+    monkeypatch.setattr(locks, "SETTLE_S", 0.1)
+
+    folder = str(tmp_path)
+
+    def register():
+        """Make known a file system that all processes see and that is not local to affordlib."""
+        import fsspec
+        from fsspec.implementations.dirfs import DirFileSystem
+        from fsspec.implementations.local import LocalFileSystem
+
+        class Shared(DirFileSystem):
+            protocol, cachable = "shared", False
+
+            def __init__(self, **_):
+                super().__init__(folder, LocalFileSystem())
+
+        fsspec.register_implementation("shared", Shared, clobber=True)
+
+    register()
+    both.run(register)
+    url = f"shared://set{suffix}"
+    assert not Place.of(url).is_local
+    assert collect_set(SMALL, url, both, progress=False) == url
+    assert dataset_sha256(open_interactions(url)) == stored_sha256(undisturbed(SMALL))
+    assert [p.name for p in tmp_path.iterdir()] == [f"set{suffix}"]
+    if suffix == ".zarr.zip":
+        whole = undisturbed(SMALL).read_bytes()
+        assert (tmp_path / "set.zarr.zip").read_bytes() == whole
+        (tmp_path / "set.zarr.zip").write_bytes(whole[:1000])
+    else:
+        (tmp_path / "set.zarr" / "size" / "c.1.0").unlink()
+    with pytest.raises(CorruptedDataError, match=r"size/c\.1\.0 is missing|directory is damaged"):
+        open_interactions(url)
+
+
+def kill_a_worker(client):
+    pids = list(client.run(os.getpid).values())
+    os.kill(random.choice(pids), signal.SIGKILL)
+
+
+def test_a_killed_worker_is_no_loss(both, undisturbed, tmp_path):
+    path, killed = tmp_path / "set.zarr.zip", []
+
+    def kill():
+        while not list(tmp_path.glob(".set*.chunks/tasks/*.json")):
+            time.sleep(0.005)
+        kill_a_worker(both)
+        killed.append(len(list(tmp_path.glob(".set*.chunks/tasks/*.json"))))
+
+    thread = threading.Thread(target=kill)
+    thread.start()
+    collect_set(LONGER, path, both, progress=False)
+    thread.join()
+    assert killed[0] < 6
+    assert path.read_bytes() == undisturbed(LONGER).read_bytes()
+
+
+def test_a_chunk_that_cannot_be_made_is_named(both, undisturbed, tmp_path):
+    path = tmp_path / "set.zarr.zip"
+    reason = r"interactions 6 to 7 could not be collected: ValueError: math domain error"
+    with poisoned(both, "raise"), pytest.raises(RuntimeError, match=reason):
+        collect_set(LONGER, path, both, progress=False)
+    assert not path.exists()
+    assert list(tmp_path.glob(".set*.chunks/tasks/*.json"))
+    collect_set(LONGER, path, both, progress=False)
+    assert path.read_bytes() == undisturbed(LONGER).read_bytes()
+
+
+def test_a_chunk_that_kills_its_workers_is_named(both, tmp_path):
+    def allow(failures, dask_scheduler):
+        dask_scheduler.allowed_failures, before = failures, dask_scheduler.allowed_failures
+        return before
+
+    path = tmp_path / "set.zarr"
+    usual = both.run_on_scheduler(allow, 0)
+    try:
+        with (
+            poisoned(both, "kill"),
+            pytest.raises(RuntimeError, match=r"interactions 6 to 7 .*KilledWorker"),
+        ):
+            collect_set(LONGER, path, both, progress=False)
+    finally:
+        both.run_on_scheduler(allow, usual)
+    with pytest.raises(CorruptedDataError, match="not finished"):
+        open_interactions(path)
+    made = {p.stem for p in (path / "tasks").iterdir()}
+    assert made >= {f"{k:08d}" for k in range(3)}  # though they died with its workers
+    assert f"{3:08d}" not in made
+
+
+# Making the shipped sets again
+
+
+def test_make_data_says_how_far_apart_two_sets_are(undisturbed):
+    old = open_interactions(undisturbed(SMALL))
+    assert make_data.compare(old, old) == (True, "the same, bit for bit")
+    for gap_m, agree in ((0.0009, True), (0.0011, False)):
+        new = old.copy(deep=True)
+        new["rest_effect"][:, 1] += gap_m
+        same, sentence = make_data.compare(old, new)
+        assert same is agree
+        assert f"{gap_m * 1000:.3f} mm in the median (tolerance 1 mm)" in sentence
+    one = old.copy(deep=True)
+    one["rest_effect"][0, 0] += 0.05  # one object that tipped over the other way
+    assert make_data.compare(old, one)[0]
+    assert not make_data.compare(old, old.isel(interaction=slice(3)))[0]
+
+
+def test_make_data_ends_with_status_1_when_the_sets_differ(
+    undisturbed, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr(make_data, "RECIPES", {"push": SMALL, "turned": LONGER})
+    arguments = ["--only", "push", "--to", str(tmp_path), "--workers", "1"]
+    shutil.copy(undisturbed(SMALL), tmp_path / "former.zarr.zip")
+    former = {"push": tmp_path / "former.zarr.zip"}
+    monkeypatch.setattr(
+        make_data, "open_interactions", lambda name: open_interactions(former.get(name, name))
+    )
+    assert make_data.main(arguments) == 0
+    assert "push: the same, bit for bit" in capsys.readouterr().out
+    former["push"] = undisturbed(LONGER)
+    assert make_data.main(arguments) == 1
+    assert "not the same: 6 interactions, formerly 12" in capsys.readouterr().out
+
+
+# Any moment
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(10))
+def test_a_driver_killed_at_any_moment_is_no_loss(undisturbed, tmp_path, seed):
+    path = tmp_path / "set.zarr.zip"
+    arguments = [sys.executable, "-c", _DRIVER, str(path), "write", "no such name", "1"]
+    process = subprocess.Popen(arguments, cwd=ROOT)
+    deadline = time.monotonic() + 60
+    while not list(tmp_path.glob(".set*.chunks")) and time.monotonic() < deadline:
+        time.sleep(0.002)
+    time.sleep(random.Random(seed).uniform(0, 1))
+    process.kill()
+    process.wait()
+    collect_set(SMALL, path, progress=False)
+    assert path.read_bytes() == undisturbed(SMALL).read_bytes()
+    assert [p.name for p in tmp_path.iterdir()] == ["set.zarr.zip"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(10))
+def test_workers_killed_at_any_moment_are_no_loss(both, undisturbed, tmp_path, seed):
+    path = tmp_path / "set.zarr.zip"
+    timer = threading.Timer(random.Random(seed).uniform(0, 1.5), kill_a_worker, [both])
+    timer.start()
+    collect_set(LONGER, path, both, progress=False)
+    timer.join()
+    assert path.read_bytes() == undisturbed(LONGER).read_bytes()
