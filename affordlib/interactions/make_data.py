@@ -17,7 +17,7 @@ import numpy as np
 import xarray as xr
 
 from affordlib.interactions.collect import collect
-from affordlib.interactions.recipes import RECIPES
+from affordlib.interactions.recipes import RECIPES, SHIPPED
 from affordlib.interactions.store import SUFFIX, dataset_sha256, open_interactions
 from affordlib.paths import repo_root
 
@@ -49,12 +49,12 @@ def compare(old: xr.Dataset, new: xr.Dataset) -> tuple[bool, str]:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Collect what `--only` names (default: all) into `--to` (default: data/).
+    """Collect what `--only` names (default: what is shipped) into `--to` (default: data/).
 
     Returns 1 if a set and its predecessor differ by more than the tolerance, otherwise 0.
     """
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", nargs="*", choices=sorted(RECIPES), default=sorted(RECIPES))
+    parser.add_argument("--only", nargs="*", choices=sorted(RECIPES), default=list(SHIPPED))
     parser.add_argument("--to", default=str(repo_root() / "data"), help="a folder or fsspec URL")
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes here")

@@ -2,54 +2,127 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from importlib import metadata
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from affordlib.interactions.chunks import AXIS, CHUNK, Layout, Variable
-from affordlib.interactions.recipes import Recipe, interact
-from affordlib.types import ACTION_CHANNELS, EFFECT_CHANNELS, IMAGE_CHANNELS, IMAGE_PIXELS
+from affordlib.interactions.recipes import Recipe, draw_world, interact
+from affordlib.primitives import PRIMITIVES, LeverUp, primitive_named
+from affordlib.types import (
+    ACTION_CHANNELS,
+    EFFECT_CHANNELS,
+    IMAGE_CHANNELS,
+    IMAGE_PIXELS,
+    LEVER_IMAGE_PIXELS,
+)
 from affordlib.world import FAMILIES, Tabletop
+from affordlib.world.execution import RECORDED_SAMPLES
 from affordlib.world.scene import N_SAMPLES
 
-TRACKING_LIMIT_M = 0.002
+if TYPE_CHECKING:
+    from affordlib.types import Interaction
+    from affordlib.world import Thing, WorldConfig
 
 _SIZES = {
     "sample": N_SAMPLES,
+    "recorded_sample": RECORDED_SAMPLES,
     "action_channel": len(ACTION_CHANNELS),
     "effect_channel": len(EFFECT_CHANNELS),
     "image_channel": len(IMAGE_CHANNELS),
-    "row": IMAGE_PIXELS,
-    "column": IMAGE_PIXELS,
     "size_axis": 3,
     "pose_channel": 3,
+    "xy": 2,
+    "xyz": 3,
+    "tool_channel": 5,
+    "surface": 3,
 }
 
+
+def _per_interaction(dtype: str, *dims: str, **attrs: str) -> Variable:
+    return Variable((AXIS, *dims), dtype, attrs)
+
+
 _VARIABLES = {
-    "interaction": Variable((AXIS,), "int64"),
-    "phase": Variable(("sample",), "float64", {"long_name": "normalised time of the primitive"}),
-    "image": Variable(
-        (AXIS, "image_channel", "row", "column"), "float32", {"units": "m (depth), 1 (mask)"}
+    "interaction": _per_interaction("int64"),
+    "phase": Variable(
+        ("sample",),
+        "float64",
+        {
+            "long_name": "normalised time of the primitive; of a partial one, times stop_phase",
+            "every_150_ms": f"every {(N_SAMPLES - 1) // (RECORDED_SAMPLES - 1)}th sample",
+        },
     ),
-    "action": Variable(
-        (AXIS, "sample", "action_channel"),
+    "image": _per_interaction("float32", "image_channel", "row", "column", units="m (depth), 1"),
+    "action": _per_interaction(
+        "float32", "sample", "action_channel", units="m, rad; gripper 1 open, 0 closed"
+    ),
+    "effect": _per_interaction("float32", "sample", "effect_channel", units="m, rad"),
+    "rest_effect": _per_interaction("float32", "effect_channel", units="m, rad"),
+    "tool": _per_interaction(
         "float32",
-        {"units": "m, rad; gripper 1 open, 0 closed"},
+        "recorded_sample",
+        "tool_channel",
+        units="m, rad, m",
+        long_name="measured x, y, z, yaw and finger gap, every 150 ms of a full execution",
     ),
-    "effect": Variable((AXIS, "sample", "effect_channel"), "float32", {"units": "m, rad"}),
-    "rest_effect": Variable((AXIS, "effect_channel"), "float32", {"units": "m, rad"}),
-    "family": Variable((AXIS,), "int8", {"flag_meanings": " ".join(FAMILIES)}),
-    "size": Variable((AXIS, "size_axis"), "float32", {"units": "m"}),
-    "mass": Variable((AXIS,), "float32", {"units": "kg"}),
-    "theta": Variable((AXIS,), "float64", {"units": "rad"}),
-    "start_pose": Variable((AXIS, "pose_channel"), "float64", {"units": "m, m, rad"}),
-    "tracking_error": Variable((AXIS,), "float32", {"units": "m"}),
-    "fault": Variable((AXIS,), "bool", {"long_name": "the simulator failed: exclude"}),
+    "primitive": _per_interaction("int8", flag_meanings=" ".join(PRIMITIVES)),
+    "stop_phase": _per_interaction("float64"),
+    "family": _per_interaction("int8", flag_meanings=" ".join(FAMILIES)),
+    "size": _per_interaction("float32", "size_axis", units="m"),
+    "mass": _per_interaction("float32", units="kg"),
+    "com_offset": _per_interaction("float32", "xyz", units="m"),
+    "friction": _per_interaction("float32", "surface", long_name="of table, object, fingers"),
+    "start_pose": _per_interaction("float64", "pose_channel", units="m, m, rad"),
+    "believed_xy": _per_interaction(
+        "float64", "xy", units="m", long_name="where the robot took the object to be"
+    ),
+    "rollable": _per_interaction("bool", long_name="can roll as it was placed"),
+    "rolls": _per_interaction("bool", long_name="can roll as it lies at the end"),
+    "fell": _per_interaction("bool", long_name="lies differently than it was placed"),
+    "reached": _per_interaction("bool", long_name="the arm could do it; if not, nothing happened"),
+    "success": _per_interaction("bool", long_name="the primitive did what it is for"),
+    "tracking_error": _per_interaction("float32", units="m"),
+    "penetration": _per_interaction("float32", units="m"),
+    "left_table": _per_interaction("bool"),
+    "fault": _per_interaction("bool", long_name="not to be believed: exclude"),
 }
+
+_FULL_EFFECT = _per_interaction(
+    "float32",
+    "effect_channel",
+    units="m, rad",
+    long_name="the state of the full execution at stop_phase",
+)
+
+
+def _parameters(recipe: Recipe) -> list[str]:
+    """Names of the parameters of a recipe's primitives, in a fixed order."""
+    kinds = [primitive_named(name) for name in recipe.primitives]
+    return sorted({field.name for kind in kinds for field in fields(kind)})
+
+
+def _variables(recipe: Recipe) -> dict[str, Variable]:
+    variables = _VARIABLES | {
+        name: _per_interaction("float64", units="m or rad", long_name="parameter of the primitive")
+        for name in _parameters(recipe)
+    }
+    if recipe.partial:
+        variables["full_effect"] = _FULL_EFFECT
+    return variables
 
 
 def describe(recipe: Recipe, chunk: int = CHUNK) -> Layout:
     """The layout of a recipe's data set: all that is known of it before it is collected."""
+    lever = [name == LeverUp.name for name in recipe.primitives]
+    if any(lever) and not all(lever):
+        raise ValueError(
+            f"primitives {recipe.primitives} have images of different sizes; collect lever_up "
+            "in a set of its own"
+        )
+    pixels = LEVER_IMAGE_PIXELS if all(lever) else IMAGE_PIXELS
     packages = ("affordlib", "numpy", "pybullet", "example-robot-data", "ur-analytic-ik")
     attrs = {
         "recipe": recipe.to_json(),
@@ -59,7 +132,8 @@ def describe(recipe: Recipe, chunk: int = CHUNK) -> Layout:
         "frame": "origin where the object stood at the start, axes of the table",
         "versions": " ".join(f"{name}={metadata.version(name)}" for name in packages),
     }
-    return Layout(_VARIABLES, {AXIS: recipe.n_interactions, **_SIZES}, attrs, chunk)
+    sizes = {AXIS: recipe.n_interactions, **_SIZES, "row": pixels, "column": pixels}
+    return Layout(_variables(recipe), sizes, attrs, chunk)
 
 
 def collect_chunk(recipe: Recipe, indices: range) -> dict[str, np.ndarray]:
@@ -67,28 +141,52 @@ def collect_chunk(recipe: Recipe, indices: range) -> dict[str, np.ndarray]:
 
     The first axis is the interaction, for all that have it in `describe`.
     """
-    families = list(FAMILIES)
-    rows: dict[str, list] = {}
+    variables = _variables(recipe)
+    rows: dict[str, list] = {name: [] for name in variables if name != "phase"}
     with Tabletop(recipe.world) as world:
         for index in indices:
             thing, seen = interact(recipe, index, world)
-            extent = np.ptp(thing.footprint_m, axis=0)
-            on_table = world.object_state()[2] > 0
-            row = {
-                "interaction": np.int64(index),
-                "image": seen.image,
-                "action": seen.action.astype(np.float32),
-                "effect": seen.effect.astype(np.float32),
-                "rest_effect": seen.rest_effect.astype(np.float32),
-                "family": np.int8(families.index(thing.family)),
-                "size": np.array([*extent, thing.height_m], dtype=np.float32),
-                "mass": np.float32(recipe.world.density_kg_m3 * thing.volume_m3),
-                "theta": np.float64(seen.primitive.theta),
-                "start_pose": np.array(seen.start_pose),
-                "tracking_error": np.float32(seen.tracking_error_m),
-                "fault": np.bool_(seen.tracking_error_m > TRACKING_LIMIT_M or not on_table),
-            }
-            for name, value in row.items():
-                rows.setdefault(name, []).append(value)
-    arrays = {name: np.stack(values) for name, values in rows.items()}
-    return {"phase": seen.phase, **arrays}
+            row = _row(thing, seen, draw_world(recipe, index, thing))
+            if recipe.partial:
+                _, full = interact(recipe, index, world, stop_phase=1.0)
+                row["full_effect"] = np.array(
+                    [np.interp(seen.stop_phase, full.phase, e) for e in full.effect.T]
+                )
+            for name in rows:
+                value = index if name == "interaction" else row[name]
+                rows[name].append(np.asarray(value, dtype=variables[name].dtype))
+    return {"phase": np.linspace(0, 1, N_SAMPLES)} | {n: np.stack(v) for n, v in rows.items()}
+
+
+def _row(thing: Thing, seen: Interaction, config: WorldConfig) -> dict[str, object]:
+    parameters = {name: np.nan for kind in PRIMITIVES.values() for name in _fields(kind)}
+    parameters |= {name: getattr(seen.primitive, name) for name in _fields(type(seen.primitive))}
+    return parameters | {
+        "image": seen.image,
+        "action": seen.action,
+        "effect": seen.effect,
+        "rest_effect": seen.rest_effect,
+        "tool": seen.tool,
+        "primitive": list(PRIMITIVES).index(seen.primitive.name),
+        "stop_phase": seen.stop_phase,
+        "family": list(FAMILIES).index(thing.family),
+        "size": [*np.ptp(thing.footprint_m, axis=0), thing.height_m],
+        "mass": config.density_kg_m3 * thing.volume_m3,
+        "com_offset": config.com_offset_m,
+        "friction": (config.table_friction, config.object_friction, config.finger_friction),
+        "start_pose": seen.start_pose,
+        "believed_xy": seen.believed_xy_m,
+        "rollable": thing.rollable,
+        "rolls": seen.rolls,
+        "fell": seen.fell,
+        "reached": seen.reached,
+        "success": seen.success,
+        "tracking_error": seen.tracking_error_m,
+        "penetration": seen.penetration_m,
+        "left_table": seen.left_table,
+        "fault": bool(seen.faults),
+    }
+
+
+def _fields(kind: type) -> list[str]:
+    return [field.name for field in fields(kind)]

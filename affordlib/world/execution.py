@@ -137,13 +137,16 @@ def _way_out(
     approach: bool,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Joint waypoints that free the object: back along the way, then up (up only if it cages)."""
-    end = stretch_W[-1][-1]
+    stop = (len(paths[-1]) - 1) if way[-1].n_steps is None else way[-1].n_steps / STEPS_PER_WAYPOINT
+    at = np.arange(len(paths[-1]))
+    end = np.array([np.interp(stop, at, column) for column in stretch_W[-1].T])
+    near = np.array([np.interp(stop, at, column) for column in paths[-1].T])
     back = np.zeros(5)
     caged = primitive.path(0.0)[0, 2] > TIP_HEIGHT_M or primitive.holds
     if not caged:
         back[:3] = stretch_W[0][0, :3] - end[:3]
         back *= RETREAT_M / max(np.linalg.norm(back), RETREAT_M)
-    retreat = paths[-1][-1:]
+    retreat = near[None]
     if not caged:
         retreat = line(end, end + back, retreat[-1], 0.25, tool)
     if primitive.holds or not (caged or approach):
