@@ -53,8 +53,16 @@ def poses(states: np.ndarray) -> np.ndarray:
 
 def put_arm(world: Tabletop, joints: np.ndarray, gap_m: float) -> None:
     """Place the arm (without motion) at joint angles (6,) with the fingers a gap [m] apart."""
-    for joint, angle in zip(world.joints, (*joints, gap_m / 2, gap_m / 2), strict=True):
+    angles = [*joints, gap_m / 2, gap_m / 2]
+    for joint, angle in zip(world.joints, angles, strict=True):
         pybullet.resetJointState(world.robot, joint, angle, 0.0, physicsClientId=world.client)
+    pybullet.setJointMotorControlArray(
+        world.robot,
+        world.joints,
+        pybullet.POSITION_CONTROL,
+        targetPositions=angles,
+        physicsClientId=world.client,
+    )
     world.arm, world.gap_m = np.array(joints, dtype=float), gap_m
 
 

@@ -24,6 +24,9 @@ N_EDGES = (3, 8)
 CHAMFER_M = (0.006, 0.004)
 """Width and height of the chamfer around a prism's base, where a blade can get hold."""
 
+_HULL_MARGIN_M = 0.001
+"""PyBullet feels a convex hull this far outside its corners."""
+
 _UPRIGHT = math.cos(math.radians(45))
 
 
@@ -70,7 +73,11 @@ class Thing(ABC):
 
     @abstractmethod
     def shape(self) -> dict[str, Any]:
-        """The arguments from which PyBullet builds it, visually and for contacts."""
+        """The arguments from which PyBullet builds it.
+
+        `frame` turns the shape into the body's frame; `seen` are the corners that are drawn, where
+        they are not those that are felt.
+        """
 
     def fallen(self, upward: np.ndarray) -> bool:
         """Whether it lies differently than it was placed.
@@ -275,22 +282,33 @@ class Prism(Thing):
     def footprint_m(self) -> np.ndarray:
         return np.array(self.corners)
 
-    def _vertices(self) -> np.ndarray:
-        """Corners (3n, 3) of the solid: of its top, of the chamfer's upper rim, of its base."""
-        outline = self.footprint_m
+    def _vertices(self, inset_m: float = 0.0) -> np.ndarray:
+        """Corners (3n, 3) of the solid: of its top, of the chamfer's upper rim, of its base.
+
+        inset_m: how far its faces lie inside, nearly.
+        """
+        inradius = -ConvexHull(self.footprint_m).equations[:, 2].max()
         width, rise = np.minimum(CHAMFER_M, self.height / 3)
-        inradius = -ConvexHull(outline).equations[:, 2].max()
-        base = outline * (1 - min(width / inradius, 0.5))
         half = self.height / 2
+        outline = self.footprint_m * (1 - inset_m / inradius)
+        base = self.footprint_m * (1 - inset_m / inradius - min(width / inradius, 0.5))
         return np.vstack(
             [
                 np.column_stack([points, np.full(len(points), z)])
-                for points, z in ((outline, half), (outline, rise - half), (base, -half))
+                for points, z in (
+                    (outline, half - inset_m),
+                    (outline, rise - half),
+                    (base, inset_m - half),
+                )
             ]
         )
 
     def shape(self) -> dict[str, Any]:
-        return {"shapeType": pybullet.GEOM_MESH, "vertices": self._vertices().tolist()}
+        return {
+            "shapeType": pybullet.GEOM_MESH,
+            "vertices": self._vertices(_HULL_MARGIN_M).tolist(),
+            "seen": self._vertices(),
+        }
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -337,10 +355,8 @@ def create_body(
     com_offset_m: where its centre of mass lies in its frame.
     """
     shape = thing.shape()
-    frame = shape.pop("frame", (0, 0, 0, 1))
-    visual = dict(shape)
-    if "vertices" in visual:
-        visual = _mesh(np.array(shape["vertices"]))
+    frame, seen = shape.pop("frame", (0, 0, 0, 1)), shape.pop("seen", None)
+    visual = dict(shape) if seen is None else _mesh(seen)
     if "height" in visual:
         visual["length"] = visual.pop("height")
     return pybullet.createMultiBody(

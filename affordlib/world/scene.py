@@ -157,7 +157,7 @@ class Tabletop:
             link,
             lateralFriction=lateral,
             spinningFriction=1e-3,
-            rollingFriction=1e-3,
+            rollingFriction=1e-4,
             restitution=0.0,
             physicsClientId=self.client,
         )

@@ -1,0 +1,107 @@
+"""What the robot tells from a depth image, against what the world knows."""
+
+import math
+
+import numpy as np
+import pytest
+
+from affordlib.primitives import Drag, Grasp, Push
+from affordlib.world import (
+    FAMILIES,
+    Cuboid,
+    LyingCylinder,
+    Sphere,
+    UprightCylinder,
+    WorldConfig,
+)
+from affordlib.world.perception import (
+    aim,
+    long_axis_rad,
+    looks_fallen,
+    looks_rollable,
+    object_height_m,
+)
+
+CLEAN = WorldConfig()
+
+
+def _seen(world, thing, yaw=0.3, xy=(0.0, 0.0), **config):
+    world.place(thing, xy, yaw, config=WorldConfig(**config))
+    percept = world.perceive()
+    world.place(thing, xy, yaw, config=CLEAN)
+    return percept
+
+
+@pytest.mark.parametrize("family", FAMILIES.values(), ids=lambda f: f.family)
+def test_round_tops_look_rollable(world, family):
+    rng = np.random.default_rng(7)
+    for _ in range(10):
+        thing = family.sample(rng)
+        image = _seen(world, thing, rng.uniform(-3, 3)).image
+        assert looks_rollable(image) == thing.rollable
+        assert object_height_m(image) == pytest.approx(thing.height_m, abs=0.003)
+
+
+def test_the_axis_of_a_lying_cylinder_is_seen(world):
+    rng = np.random.default_rng(8)
+    for _ in range(10):
+        yaw = rng.uniform(-math.pi, math.pi)
+        image = _seen(world, LyingCylinder.sample(rng), yaw).image
+        off = (long_axis_rad(image) - yaw + math.pi / 2) % math.pi - math.pi / 2
+        assert abs(math.degrees(off)) < 2
+
+
+def test_a_fallen_cylinder_is_known_to_roll(world):
+    """Pushed above its centre, a slender cylinder topples."""
+    high = WorldConfig(tip_offset_m=0.06, table_friction=1.0)
+    world.place(UprightCylinder(0.034, 0.11), config=high)
+    before = world.look()
+    assert not world.object_rolls()
+    assert not looks_rollable(before)
+    seen = world.interact(Push.towards(0.0))
+    assert seen.fell
+    assert seen.rolls
+    assert world.object_fell()
+    assert world.object_rolls()
+    after = world.look()
+    assert looks_fallen(before, after)
+    assert looks_rollable(after)
+    assert not looks_fallen(before, before)
+
+
+def test_actions_suit_what_is_seen(world):
+    image = _seen(world, LyingCylinder(0.07, 0.05), 0.6).image
+    assert aim(Drag(1.0), image).grip_yaw == pytest.approx(0.6, abs=0.03)
+    assert aim(Drag(1.0, grip_yaw=0.1), image).grip_yaw == pytest.approx(0.1)
+    assert aim(Grasp(), image).seen_height == pytest.approx(0.05, abs=0.002)
+    assert aim(Push(1.0), image) == Push(1.0)
+
+
+@pytest.mark.parametrize(
+    "thing", [Cuboid(0.06, 0.05, 0.05), Sphere(0.06), LyingCylinder(0.07, 0.05)]
+)
+def test_a_kinect_finds_the_object_anywhere(world, thing):
+    rng = np.random.default_rng(9)
+    errors = []
+    for k in range(12):
+        xy = rng.uniform([-0.3, -0.5], [0.5, 0.5])
+        percept = _seen(world, thing, 0.4, tuple(xy), camera="kinect", noise_seed=k)
+        errors.append(math.dist(percept.xy_m, xy))
+        height = 1.0 - percept.image[0][percept.image[1] > 0]
+        assert np.quantile(height, 0.9) == pytest.approx(thing.height_m, abs=0.012)
+    assert 0.0001 < np.median(errors) < 0.003
+    assert max(errors) < 0.008
+
+
+def test_the_noise_of_an_image_is_drawn_from_its_seed(world):
+    box = Cuboid(0.06, 0.05, 0.05)
+    images = [_seen(world, box, camera="kinect", noise_seed=seed).image for seed in (1, 1, 2)]
+    np.testing.assert_array_equal(images[0], images[1])
+    assert (images[0] != images[2]).any()
+
+
+def test_a_missing_object_and_a_bad_camera_are_named(world):
+    with pytest.raises(ValueError, match=r"camera must be one of .* got 'sonar'"):
+        WorldConfig(camera="sonar")
+    with pytest.raises(ValueError, match=r"bias_m must lie in \[-0\.1, 0\.1\] m, got 1"):
+        WorldConfig(bias_m=(1.0, 0.0))

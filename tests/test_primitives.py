@@ -1,0 +1,308 @@
+"""Drag, grasp, rotate and lever-up, the arm's reach, and a world that varies."""
+
+import hashlib
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from affordlib.interactions.recipes import RECIPES, Recipe, Variation, interact
+from affordlib.primitives import PRIMITIVES, Drag, Grasp, LeverUp, Push, Rotate, min_jerk
+from affordlib.world import (
+    FAMILIES,
+    Cuboid,
+    LyingCylinder,
+    Prism,
+    Sphere,
+    Tabletop,
+    UnreachableError,
+    UprightCylinder,
+    WorldConfig,
+    robot,
+)
+from affordlib.world.objects import CHAMFER_M
+
+CLEAN = WorldConfig()
+LEVERING = RECIPES["lever_up"].world
+EXAMPLES = (Push(0.3), Drag(0.3), Grasp(0.05), Rotate(), LeverUp(-0.08, 0.0, 0.0, 0.16))
+
+
+@pytest.mark.parametrize("primitive", EXAMPLES, ids=lambda p: p.name)
+def test_a_path_is_smooth_and_passes_its_keyframes(primitive):
+    phase = np.linspace(0, 1, 3751)
+    path = primitive.path(phase)
+    assert np.abs(np.diff(path[:, :3], axis=0)).max() * 1000 < 0.75  # m/s
+    for leg, begin in zip(primitive.legs, primitive.leg_phases, strict=False):
+        np.testing.assert_allclose(primitive.path(begin)[0], leg.start[:5], atol=1e-9)
+    assert sum(leg.seconds for leg in primitive.legs) == pytest.approx(3.75)
+
+
+def test_a_drag_path_is_caged_before_it_moves():
+    drag = Drag.towards(0.5, length=0.04)
+    closed = drag.leg_phases[2]
+    before, after = drag.path(closed)[0], drag.path(drag.leg_phases[3])[0]
+    np.testing.assert_allclose(before[[0, 1, 4]], 0.0, atol=1e-12)
+    np.testing.assert_allclose(after[:2], 0.04 * np.array([math.cos(0.5), math.sin(0.5)]))
+    assert drag.path(1.0)[0, 4] == 1.0
+
+
+def test_the_lever_turns_about_the_far_edge():
+    """The blade's tip keeps its distance from the far edge, where the object turns."""
+    lever = LeverUp(-0.08, 0.0, 0.0, 0.16)
+    path = lever.path(np.linspace(lever.leg_phases[1], 1, 50))
+    edge = np.array([path[0, 0] + 0.16, 0, path[0, 2]])
+    np.testing.assert_allclose(np.linalg.norm(path[:, :3] - edge, axis=1), 0.16, atol=1e-9)
+    raised = math.asin((path[-1, 2] - path[0, 2]) / 0.16)
+    assert math.degrees(raised) == pytest.approx(65)
+
+
+@pytest.mark.parametrize("family", FAMILIES.values(), ids=lambda f: f.family)
+def test_things_rest_where_they_are_placed(world, family):
+    import pybullet
+
+    for seed in range(4):
+        thing = family.sample(np.random.default_rng(seed))
+        world.place(thing, (0.1, -0.2), 0.7, config=CLEAN)
+        before = np.array(world.object_state())
+        for _ in range(120):
+            pybullet.stepSimulation(world.client)
+        np.testing.assert_allclose(world.object_state()[:3], before[:3], atol=4e-4)
+        assert not world.object_fell()
+        assert world.object_rolls() == thing.rollable == (family in (LyingCylinder, Sphere))
+
+
+def test_a_prism_is_an_extruded_polygon_about_its_centroid():
+    square = Prism(((0.0, 0.0), (0.06, 0.0), (0.06, 0.06), (0.0, 0.06)), 0.05)
+    np.testing.assert_allclose(square.footprint_m.mean(axis=0), 0.0, atol=1e-12)
+    width, rise = CHAMFER_M
+    inner = 0.06 - 2 * width
+    chamfer = rise * (0.06**2 - (0.06**2 + inner**2 + 0.06 * inner) / 3)  # a frustum is missing
+    assert square.volume_m3 == pytest.approx(0.06**2 * 0.05 - chamfer)
+    edges = {len(Prism.sample(np.random.default_rng(k)).corners) for k in range(60)}
+    assert edges == {3, 4, 5, 6, 7, 8}
+
+
+@pytest.mark.parametrize("index", range(8))
+def test_a_dragged_object_stays_where_it_is_let_go(world, index):
+    _, seen = interact(RECIPES["drag"], index, world)
+    let_go = [np.interp(0.8, seen.phase, effect) for effect in seen.effect.T]
+    wanted = 0.05 * np.array([math.cos(seen.primitive.theta), math.sin(seen.primitive.theta)])
+    assert math.dist(seen.rest_effect[:2], let_go[:2]) < 0.001
+    assert math.dist(seen.rest_effect[:2], wanted) < 0.001
+    assert seen.success
+
+
+@pytest.mark.slow
+def test_a_hundred_dragged_objects_stay(world):
+    moved = []
+    for index in range(100):
+        _, seen = interact(replace(RECIPES["drag"], seed=99), index, world)
+        let_go = [np.interp(0.8, seen.phase, effect) for effect in seen.effect.T]
+        moved.append(math.dist(seen.rest_effect[:2], let_go[:2]))
+    assert sum(np.array(moved) < 0.001) >= 99
+
+
+def test_a_pushed_ball_rolls_away_and_a_dragged_one_does_not(world):
+    world.place(Sphere(0.06), config=CLEAN)
+    pushed = world.interact(Push.towards(0.0))
+    world.place(Sphere(0.06))
+    dragged = world.interact(Drag.towards(0.0))
+    assert pushed.rest_effect[0] > 0.15
+    assert dragged.rest_effect[0] == pytest.approx(0.05, abs=0.001)
+
+
+def test_grasps_lift_what_fits_and_leave_what_does_not(world):
+    world.place(Cuboid(0.05, 0.05, 0.06), config=CLEAN)
+    small = world.interact(Grasp())
+    world.place(Cuboid(0.118, 0.118, 0.06))
+    large = world.interact(Grasp())
+    assert small.success
+    assert small.rest_effect[2] == pytest.approx(Grasp.lift_m, abs=0.01)
+    assert not large.success
+    assert not large.faults
+    # The fingers felt its top and went no further.
+    assert large.tool[:14, 2].min() > 0.06 - 0.003
+
+
+def test_a_partial_grasp_ends_holding(world):
+    grasp = Grasp(0.06)
+    world.place(Cuboid(0.05, 0.05, 0.06), config=CLEAN)
+    part = world.interact(grasp, 0.75)
+    raised = grasp.path(0.75)[0, 2] - grasp.path(0.4)[0, 2]
+    assert part.rest_effect[2] == pytest.approx(raised, abs=0.003)
+
+
+def test_a_rotation_turns_by_its_sweep(world):
+    world.place(Cuboid(0.06, 0.05, 0.05), config=CLEAN)
+    seen = world.interact(Rotate())
+    assert seen.rest_effect[3] == pytest.approx(Rotate.sweep_rad, abs=0.02)
+    assert math.hypot(*seen.rest_effect[:2]) < 0.004
+    world.place(Cuboid(0.06, 0.05, 0.05))
+    half_way = world.interact(Rotate(), float(np.mean(Rotate().leg_phases[2:4])))
+    assert half_way.rest_effect[3] == pytest.approx(Rotate.sweep_rad / 2, abs=0.02)
+
+
+def test_levering_moves_a_polygon_by_about_ten_centimetres(world):
+    moved = []
+    for index in range(12):
+        _, seen = interact(RECIPES["lever_up"], index, world)
+        if seen.success:
+            moved.append(np.linalg.norm(seen.effect[-1, :3]))
+    assert len(moved) >= 8
+    assert 0.07 < np.mean(moved) < 0.12
+
+
+def test_the_image_of_a_lever_up_turns_with_its_direction(world):
+    prism = Prism.sample(np.random.default_rng(4), (0.18, 0.2), (0.04, 0.05))
+    images = []
+    for yaw in (0.0, 0.9):
+        c, s = math.cos(yaw), math.sin(yaw)
+        lever = LeverUp.at_edge(prism.footprint_m @ np.array([[c, s], [-s, c]]), 1)
+        world.place(prism, (0.0, 0.0), yaw, tool="screwdriver", config=LEVERING)
+        images.append(world.interact(lever, 0.0).image)
+        assert images[-1].shape == (2, 128, 128)
+    assert (images[0][1] != images[1][1]).mean() < 0.01
+    # The contact is in the middle: the object begins there and lies to the right.
+    row = images[0][1, 63:65].max(axis=0)
+    assert row[66:80].all()
+    assert not row[:62].any()
+
+
+def test_the_arm_says_which_tool_it_needs(world):
+    world.place(Cuboid(0.05, 0.05, 0.05), config=CLEAN)
+    with pytest.raises(ValueError, match=r"'lever_up' needs the tool 'screwdriver'.*place\("):
+        world.interact(LeverUp(-0.03, 0.0, 0.0, 0.06))
+    with pytest.raises(ValueError, match=r"tool must be one of .* got 'hammer'"):
+        world.place(Cuboid(0.05, 0.05, 0.05), tool="hammer")
+
+
+@pytest.mark.parametrize("name", ["push", "drag", "rotate", "grasp"])
+@pytest.mark.parametrize("smooth", [True, False])
+def test_stopped_anywhere_it_rests_where_the_full_one_was(world, name, smooth):
+    gaps = []
+    for index, stop in enumerate((0.6, 0.7, 0.8, 0.9)):
+        _, full = interact(RECIPES[name], index, world)
+        then = np.array([np.interp(stop, full.phase, effect) for effect in full.effect.T])
+        recipe = RECIPES[name]
+        interact(recipe, index, world, stop_phase=0.0)
+        thing, start = world.thing, full.start_pose
+        world.place(thing, start[:2], start[2], config=recipe.world)
+        part = world.interact(full.primitive, stop, smooth=smooth)
+        gaps.append(math.dist(part.rest_effect[:3], then[:3]))
+    assert np.median(gaps) < 0.001
+    assert max(gaps) < 0.003
+
+
+def test_what_the_arm_cannot_reach_is_recorded_and_moves_nothing(world):
+    """Kinematics is the oracle: reached exactly where every pose of the path has a posture."""
+    recipe = replace(RECIPES["reach"], seed=21)
+    found = []
+    for index in range(60):
+        _, seen = interact(recipe, index, world, stop_phase=0.0)
+        world.place(world.thing, seen.start_pose[:2], seen.start_pose[2])
+        seen = world.attempt(seen.primitive)
+        offset = np.array([*seen.start_pose[:2], 0, 0, 0])
+        path = seen.primitive.path(np.linspace(0, 1, 40)) + offset
+        found.append(seen.reached)
+        if seen.reached:
+            assert all(_has_posture(pose) for pose in path)
+        else:
+            assert not seen.effect.any()
+            with pytest.raises(UnreachableError):
+                world.interact(seen.primitive)
+    assert 1 <= found.count(False) <= 30
+
+
+def _has_posture(pose):
+    try:
+        robot.inverse_kinematics(pose[:3], pose[3], np.array(robot.HOME))
+    except UnreachableError:
+        return False
+    return True
+
+
+def test_a_push_over_the_edge_is_flagged(world):
+    world.place(Cuboid(0.06, 0.06, 0.06), (0.1, 0.66), config=CLEAN)
+    seen = world.interact(Push.towards(math.pi / 2))
+    assert seen.left_table
+    assert seen.faults == ("left_table",)
+
+
+def test_mass_off_the_centre_turns_a_push_and_not_the_frame(world):
+    turned = []
+    for offset in (0.0, 0.036):
+        config = WorldConfig(com_offset_m=(0.0, offset, 0.0))
+        world.place(Cuboid(0.06, 0.08, 0.05), (0.05, 0.1), 0.0, config=config)
+        np.testing.assert_allclose(world.object_pose(), (0.05, 0.1, 0.0), atol=1e-9)
+        seen = world.interact(Push.towards(0.0))
+        np.testing.assert_allclose(seen.effect[0, :4], 0.0, atol=1e-6)
+        turned.append(seen.effect[-1, 3])
+    assert abs(turned[1]) > abs(turned[0]) + 0.01
+    world.place(Cuboid(0.06, 0.06, 0.05), config=CLEAN)
+
+
+def test_a_biased_robot_places_its_action_beside(world):
+    world.place(UprightCylinder(0.06, 0.05), (0.0, 0.0), config=WorldConfig(bias_m=(0.0, 0.004)))
+    seen = world.interact(Push.towards(0.0))
+    assert seen.believed_xy_m == pytest.approx((0.0, 0.004))
+    assert seen.tool[-1, 1] == pytest.approx(0.0, abs=1e-3)  # relative to the believed centre
+    assert 0.002 < seen.rest_effect[1] < 0.006
+    world.place(UprightCylinder(0.06, 0.05), config=CLEAN)
+
+
+def test_worlds_vary_within_their_ranges():
+    recipe = RECIPES["push_varied"]
+    rng = np.random.default_rng(0)
+    worlds = [recipe.variation.draw(Cuboid(0.05, 0.06, 0.07), rng) for _ in range(200)]
+    for name in ("table_friction", "finger_friction", "density_kg_m3", "tip_offset_m"):
+        low, high = getattr(recipe.variation, name)
+        values = np.array([getattr(w, name) for w in worlds])
+        assert low <= values.min() < low + 0.1 * (high - low)
+        assert high - 0.1 * (high - low) < values.max() <= high
+    offsets = np.array([w.com_offset_m for w in worlds])
+    assert (np.abs(offsets) <= 0.15 * np.array([0.05, 0.06, 0.07]) / 2).all()
+    assert Recipe.from_json(recipe.to_json()) == recipe
+    with pytest.raises(ValueError, match="density_kg_m3 must be a range"):
+        Variation(density_kg_m3=(2.0, 1.0))
+
+
+_MIXED = ("push", "drag", "grasp", "rotate", "lever_up", "push_varied", "reach")
+
+
+def _fingerprint(seen):
+    return hashlib.sha256(
+        seen.effect.tobytes() + seen.image.tobytes() + seen.tool.tobytes()
+    ).hexdigest()
+
+
+def test_no_episode_knows_of_the_one_before(world):
+    jobs = [(name, index) for index in range(2) for name in _MIXED]
+    first = {}
+    for name, index in jobs:
+        with Tabletop() as fresh:
+            first[name, index] = _fingerprint(interact(RECIPES[name], index, fresh)[1])
+    for name, index in reversed(jobs):
+        assert _fingerprint(interact(RECIPES[name], index, world)[1]) == first[name, index]
+
+
+@pytest.mark.slow
+def test_a_thousand_episodes_leave_no_trace(world):
+    def resident_mb():
+        with open("/proc/self/statm") as file:
+            return int(file.read().split()[1]) * 4096 / 1e6
+
+    first = {}
+    for k in range(1050):
+        if k == 50:
+            before = resident_mb()
+        name = _MIXED[k % len(_MIXED)]
+        index = (k // len(_MIXED)) % 60
+        mark = _fingerprint(interact(RECIPES[name], index, world)[1])
+        assert first.setdefault((name, index), mark) == mark
+    assert resident_mb() - before < 20
+
+
+def test_every_primitive_is_named_and_timed():
+    assert list(PRIMITIVES) == ["push", "drag", "grasp", "rotate", "lever_up"]
+    assert min_jerk(np.array([0.0, 0.5, 1.0])).tolist() == [0.0, 0.5, 1.0]
