@@ -11,33 +11,15 @@ import time
 import numpy as np
 import pybullet
 
-from affordlib.interactions.recipes import RECIPES, interact
+from affordlib.interactions.cost import measure_cost
+from affordlib.interactions.recipes import RECIPES
 from affordlib.primitives import PRIMITIVES, Push
 from affordlib.world import Cuboid, Tabletop, robot
+from affordlib.world.clock import SteppingClock
 
 EPISODES = 24
 NAIVE_EPISODES = 6
 LIMIT = 1.25
-
-
-class Clock:
-    """Counts the seconds inside stepSimulation while it is installed."""
-
-    def __init__(self):
-        self.step, self.seconds, self.steps = pybullet.stepSimulation, 0.0, 0
-
-    def __call__(self, client):
-        began = time.perf_counter()
-        self.step(client)
-        self.seconds += time.perf_counter() - began
-        self.steps += 1
-
-    def __enter__(self):
-        pybullet.stepSimulation = self
-        return self
-
-    def __exit__(self, *_):
-        pybullet.stepSimulation = self.step
 
 
 def naive_push(world):
@@ -45,7 +27,7 @@ def naive_push(world):
     world.place(Cuboid(0.06, 0.06, 0.06))
     world.interact(Push(0.0), 0.3)  # puts the arm at the start of the path
     down = pybullet.getQuaternionFromEuler((np.pi, 0, 0))
-    clock, began = Clock(), time.perf_counter()
+    clock, began = SteppingClock(), time.perf_counter()
     for x, y, z, *_ in Push(0.0).path(np.linspace(0, 1, 900)):
         joints = pybullet.calculateInverseKinematics(
             world.robot, 6, (x, y, z + robot.TOOL_LENGTH_M), down, physicsClientId=world.client
@@ -63,33 +45,18 @@ def naive_push(world):
     return (time.perf_counter() - began) / clock.seconds
 
 
-def measure(world, name):
-    """Seconds of whole interactions and of their bare physics, episode by episode."""
-    recipe = RECIPES[name]
-    whole, bare = [], []
-    interact(recipe, 0, world)
-    for index in range(EPISODES):
-        began = time.perf_counter()
-        _, once = interact(recipe, index, world)
-        whole.append(time.perf_counter() - began)
-        with Clock() as clock:
-            _, again = interact(recipe, index, world)
-        bare.append(clock.seconds)
-        assert once.effect.tobytes() == again.effect.tobytes()
-    return np.array(whole), np.array(bare), clock.steps
-
-
 def main():
     print(f"{EPISODES} interactions per primitive; ratio: median (5 to 95 %), at most {LIMIT}")
     print(f"{'primitive':10} {'per second':>10} {'whole ms':>9} {'bare ms':>8} {'steps':>6}  ratio")
+    for name in PRIMITIVES:
+        cost = measure_cost(RECIPES[name], EPISODES)
+        low, middle, high = np.quantile(cost.ratios, [0.05, 0.5, 0.95])
+        print(
+            f"{name:10} {1 / cost.whole_s.mean():10.1f} {1000 * np.median(cost.whole_s):9.1f} "
+            f"{1000 * np.median(cost.bare_s):8.1f} {cost.steps:6}  "
+            f"{middle:.3f} ({low:.3f} to {high:.3f})"
+        )
     with Tabletop() as world:
-        for name in PRIMITIVES:
-            whole, bare, steps = measure(world, name)
-            low, middle, high = np.quantile(whole / bare, [0.05, 0.5, 0.95])
-            print(
-                f"{name:10} {1 / np.mean(whole):10.1f} {1000 * np.median(whole):9.1f} "
-                f"{1000 * np.median(bare):8.1f} {steps:6}  {middle:.3f} ({low:.3f} to {high:.3f})"
-            )
         naive = [naive_push(world) for _ in range(NAIVE_EPISODES)]
     print(f"naive push: {np.median(naive):.3f} times its bare physics ({NAIVE_EPISODES} episodes)")
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from affordlib.types import Outcome, Plan
-    from affordlib.world import Cuboid, UprightCylinder
+    from affordlib.world import Thing
 
 GOAL, PREDICTION, TRUTH, NEUTRAL = "#0072B2", "#D55E00", "#009E73", "#777777"
 
@@ -69,7 +69,7 @@ def _corners() -> list[tuple[float, float]]:
 
 def plot_footprint(
     ax: Axes,
-    thing: Cuboid | UprightCylinder,
+    thing: Thing,
     xy_m: Sequence[float],
     yaw_rad: float = 0.0,
     color: str = NEUTRAL,
@@ -134,11 +134,14 @@ def plot_outcome(ax: Axes, outcome: Outcome) -> Axes:
     return ax
 
 
-def plot_depth(ax: Axes, image: np.ndarray, title: str = "") -> Axes:
-    """The depth channel of an image (2, 48, 48), as height above the table in centimetres."""
-    half = 50 * CROP_WIDTH_M
+def plot_depth(ax: Axes, image: np.ndarray, title: str = "", width_m: float = CROP_WIDTH_M) -> Axes:
+    """The depth channel of an image (2, n, n), as height above the table in centimetres."""
+    half = 50 * width_m
     height_cm = 100 * (image[0].max() - image[0])
-    drawn = ax.imshow(height_cm, extent=(-half, half, -half, half), cmap="cividis", vmin=0, vmax=8)
+    top = max(8.0, float(height_cm.max()))
+    drawn = ax.imshow(
+        height_cm, extent=(-half, half, -half, half), cmap="cividis", vmin=0, vmax=top
+    )
     ax.grid(False)
     ax.set_title(title)
     ax.set_xlabel("x [cm]")
