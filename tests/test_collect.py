@@ -136,10 +136,15 @@ def test_a_mended_set_is_the_same_again(folder_set, monkeypatch):
     files_of(folder_set)["tasks/00000002.json"].write_text("{}")
     with files_of(folder_set)["image/c.0.0.0.0"].open("r+b") as file:
         file.truncate(100)
+    (folder_set / "effect" / ".killed.partial").write_text("what a killed worker left")
     made = []
-    monkeypatch.setattr(
-        collect, "collect_chunk", lambda r, i: made.append(i.start) or collect_chunk(r, i)
-    )
+
+    def counted(recipe, indices):
+        assert not (folder_set / "done").exists()
+        made.append(indices.start)
+        return collect_chunk(recipe, indices)
+
+    monkeypatch.setattr(collect, "collect_chunk", counted)
     collect_set(SMALL, folder_set, progress=False)
     assert made == [0, 2, 4]
     assert {name: file.read_bytes() for name, file in files_of(folder_set).items()} == before
@@ -364,11 +369,12 @@ def test_a_collector_that_lost_its_lease_stops(lease, cheap, monkeypatch):
         open_interactions(place.url)
 
 
-def test_of_many_that_come_at_once_one_holds_the_lease(lease):
+def test_of_many_that_come_at_once_one_holds_the_lease(lease, monkeypatch):
     place, outcomes, barrier = Place.of("memory://lease/d.zarr"), [], threading.Barrier(6)
+    # All have seen that there is no lease before the first one writes its own.
+    monkeypatch.setattr(Place, "make_folders", lambda *_: barrier.wait())
 
     def take():
-        barrier.wait()
         try:
             with exclusive(place):
                 time.sleep(1)
@@ -427,8 +433,11 @@ def both(client):
 
 
 @contextmanager
-def poisoned(client, how):
-    """Make all workers, also those started later, fail in the chunk that begins with 6."""
+def poisoned(client, log, how):
+    """Make all workers, also those started later, fail in the chunk that begins with 6.
+
+    log: a file that gets a letter for each time that they do.
+    """
     from dask.distributed import WorkerPlugin
 
     class Poison(WorkerPlugin):
@@ -439,6 +448,8 @@ def poisoned(client, how):
 
             def deadly(recipe, indices):
                 if indices.start == 6:
+                    with open(log, "a") as file:
+                        file.write("x")
                     os._exit(9) if how == "kill" else math.sqrt(-1)
                 return records.collect_chunk(recipe, indices)
 
@@ -536,10 +547,11 @@ def test_a_killed_worker_is_no_loss(both, undisturbed, tmp_path):
 
 
 def test_a_chunk_that_cannot_be_made_is_named(both, undisturbed, tmp_path):
-    path = tmp_path / "set.zarr.zip"
+    path, log = tmp_path / "set.zarr.zip", tmp_path / "log"
     reason = r"interactions 6 to 7 could not be collected: ValueError: math domain error"
-    with poisoned(both, "raise"), pytest.raises(RuntimeError, match=reason):
+    with poisoned(both, log, "raise"), pytest.raises(RuntimeError, match=reason):
         collect_set(LONGER, path, both, progress=False)
+    assert len(log.read_text()) == 3  # it may have been the disk or the network
     assert not path.exists()
     assert list(tmp_path.glob(".set*.chunks/tasks/*.json"))
     collect_set(LONGER, path, both, progress=False)
@@ -551,16 +563,17 @@ def test_a_chunk_that_kills_its_workers_is_named(both, tmp_path):
         dask_scheduler.allowed_failures, before = failures, dask_scheduler.allowed_failures
         return before
 
-    path = tmp_path / "set.zarr"
+    path, log = tmp_path / "set.zarr", tmp_path / "log"
     usual = both.run_on_scheduler(allow, 0)
     try:
         with (
-            poisoned(both, "kill"),
+            poisoned(both, log, "kill"),
             pytest.raises(RuntimeError, match=r"interactions 6 to 7 .*KilledWorker"),
         ):
             collect_set(LONGER, path, both, progress=False)
     finally:
         both.run_on_scheduler(allow, usual)
+    assert len(log.read_text()) == 2  # among others, and alone
     with pytest.raises(CorruptedDataError, match="not finished"):
         open_interactions(path)
     made = {p.stem for p in (path / "tasks").iterdir()}
@@ -603,6 +616,14 @@ def test_make_data_ends_with_status_1_when_the_sets_differ(
     assert "not the same: 6 interactions, formerly 12" in capsys.readouterr().out
 
 
+def test_make_data_collects_with_a_scheduler(both, undisturbed, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(make_data, "RECIPES", {"push": SMALL})
+    address = ["--scheduler", both.scheduler.address]
+    assert make_data.main(["--only", "push", "--to", str(tmp_path), *address]) == 1
+    assert "not the same: 6 interactions, formerly 500" in capsys.readouterr().out
+    assert (tmp_path / "push.zarr.zip").read_bytes() == undisturbed(SMALL).read_bytes()
+
+
 # Any moment
 
 
@@ -615,7 +636,7 @@ def test_a_driver_killed_at_any_moment_is_no_loss(undisturbed, tmp_path, seed):
     deadline = time.monotonic() + 60
     while not list(tmp_path.glob(".set*.chunks")) and time.monotonic() < deadline:
         time.sleep(0.002)
-    time.sleep(random.Random(seed).uniform(0, 1))
+    time.sleep(random.Random(seed).uniform(0, 0.7))
     process.kill()
     process.wait()
     collect_set(SMALL, path, progress=False)
@@ -627,7 +648,7 @@ def test_a_driver_killed_at_any_moment_is_no_loss(undisturbed, tmp_path, seed):
 @pytest.mark.parametrize("seed", range(10))
 def test_workers_killed_at_any_moment_are_no_loss(both, undisturbed, tmp_path, seed):
     path = tmp_path / "set.zarr.zip"
-    timer = threading.Timer(random.Random(seed).uniform(0, 1.5), kill_a_worker, [both])
+    timer = threading.Timer(random.Random(seed).uniform(0, 0.6), kill_a_worker, [both])
     timer.start()
     collect_set(LONGER, path, both, progress=False)
     timer.join()
