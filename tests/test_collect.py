@@ -224,7 +224,7 @@ from affordlib.interactions import collect, places, store
 from affordlib.interactions.recipes import Recipe
 
 collect.CHUNK = 2
-part, name, count = sys.argv[2], sys.argv[3], int(sys.argv[4])
+part, name, count, workers = sys.argv[2], sys.argv[3], int(sys.argv[4]), int(sys.argv[5])
 owner = {"write": places.Place, "writestr": store.zipfile.ZipFile, "rmtree": places.shutil}[part]
 whole = getattr(owner, part)
 
@@ -236,7 +236,9 @@ def deadly(*arguments, **options):
     return whole(*arguments, **options)
 
 setattr(owner, part, deadly)
-collect.collect(Recipe(n_interactions=6, seed=11), sys.argv[1], progress=False)
+recipe = Recipe(n_interactions=6, seed=11)
+if __name__ == "__main__":
+    collect.collect(recipe, sys.argv[1], workers=workers, progress=False)
 """
 
 
@@ -255,7 +257,7 @@ def test_killed_and_run_again_it_is_the_same_file(
     undisturbed, tmp_path, part, name, count, chunks_done
 ):
     path = tmp_path / "killed.zarr.zip"
-    arguments = [sys.executable, "-c", _DRIVER, str(path), part, name, str(count)]
+    arguments = [sys.executable, "-c", _DRIVER, str(path), part, name, str(count), "1"]
     ended = subprocess.run(arguments, cwd=ROOT, capture_output=True, text=True)
     assert ended.returncode == -signal.SIGKILL, ended.stderr
     (work,) = tmp_path.glob(".killed*.chunks")
@@ -631,8 +633,12 @@ def test_make_data_collects_with_a_scheduler(both, undisturbed, tmp_path, monkey
 @pytest.mark.parametrize("seed", range(10))
 def test_a_driver_killed_at_any_moment_is_no_loss(undisturbed, tmp_path, seed):
     path = tmp_path / "set.zarr.zip"
-    arguments = [sys.executable, "-c", _DRIVER, str(path), "write", "no such name", "1"]
-    process = subprocess.Popen(arguments, cwd=ROOT)
+    never, workers = ["write", "no such name", "1"], str(1 + seed % 2)
+    process = subprocess.Popen(
+        [sys.executable, "-c", _DRIVER, str(path), *never, workers],
+        cwd=ROOT,
+        stderr=subprocess.DEVNULL,
+    )
     deadline = time.monotonic() + 60
     while not list(tmp_path.glob(".set*.chunks")) and time.monotonic() < deadline:
         time.sleep(0.002)
