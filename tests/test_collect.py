@@ -15,6 +15,7 @@ import time
 import tracemalloc
 import zipfile
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -163,6 +164,14 @@ def test_a_folder_of_another_recipe_is_left_alone(folder_set):
 def test_a_chunk_that_is_not_what_was_described_is_refused(tmp_path, cheap, spoil, monkeypatch):
     monkeypatch.setattr(collect, "collect_chunk", lambda *_: spoil)
     with pytest.raises(RuntimeError, match=r"interactions 0 to 1 .*'x'"):
+        collect_set(SMALL, tmp_path / "x.zarr", progress=False)
+
+
+def test_a_worker_with_other_packages_is_refused(tmp_path, monkeypatch):
+    numpys = iter(("2.4.6", "1.0"))
+    layouts = (replace(describe(SMALL, 2), attrs={"versions": f"numpy={n}"}) for n in numpys)
+    monkeypatch.setattr(collect, "describe", lambda *_: next(layouts))
+    with pytest.raises(RuntimeError, match=r"another set .*numpy=1\.0.*, not .*numpy=2\.4\.6"):
         collect_set(SMALL, tmp_path / "x.zarr", progress=False)
 
 
