@@ -19,7 +19,10 @@ FORBIDDEN = {
     "planning": {"world", "evaluation", "show"},
     "evaluation": {"show"},
 }
-NO_WORLD = {"interactions/__init__.py", "interactions/batches.py", "interactions/store.py"}
+NO_WORLD = {
+    f"interactions/{name}.py"
+    for name in ("__init__", "batches", "chunks", "locks", "places", "store")
+}
 
 
 def imported(path: Path) -> set[str]:

@@ -15,6 +15,7 @@ import time
 import tracemalloc
 import zipfile
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -136,10 +137,15 @@ def test_a_mended_set_is_the_same_again(folder_set, monkeypatch):
     files_of(folder_set)["tasks/00000002.json"].write_text("{}")
     with files_of(folder_set)["image/c.0.0.0.0"].open("r+b") as file:
         file.truncate(100)
+    (folder_set / "effect" / ".killed.partial").write_text("what a killed worker left")
     made = []
-    monkeypatch.setattr(
-        collect, "collect_chunk", lambda r, i: made.append(i.start) or collect_chunk(r, i)
-    )
+
+    def counted(recipe, indices):
+        assert not (folder_set / "done").exists()
+        made.append(indices.start)
+        return collect_chunk(recipe, indices)
+
+    monkeypatch.setattr(collect, "collect_chunk", counted)
     collect_set(SMALL, folder_set, progress=False)
     assert made == [0, 2, 4]
     assert {name: file.read_bytes() for name, file in files_of(folder_set).items()} == before
@@ -158,6 +164,14 @@ def test_a_folder_of_another_recipe_is_left_alone(folder_set):
 def test_a_chunk_that_is_not_what_was_described_is_refused(tmp_path, cheap, spoil, monkeypatch):
     monkeypatch.setattr(collect, "collect_chunk", lambda *_: spoil)
     with pytest.raises(RuntimeError, match=r"interactions 0 to 1 .*'x'"):
+        collect_set(SMALL, tmp_path / "x.zarr", progress=False)
+
+
+def test_a_worker_with_other_packages_is_refused(tmp_path, monkeypatch):
+    numpys = iter(("2.4.6", "1.0"))
+    layouts = (replace(describe(SMALL, 2), attrs={"versions": f"numpy={n}"}) for n in numpys)
+    monkeypatch.setattr(collect, "describe", lambda *_: next(layouts))
+    with pytest.raises(RuntimeError, match=r"another set .*numpy=1\.0.*, not .*numpy=2\.4\.6"):
         collect_set(SMALL, tmp_path / "x.zarr", progress=False)
 
 
@@ -219,7 +233,7 @@ from affordlib.interactions import collect, places, store
 from affordlib.interactions.recipes import Recipe
 
 collect.CHUNK = 2
-part, name, count = sys.argv[2], sys.argv[3], int(sys.argv[4])
+part, name, count, workers = sys.argv[2], sys.argv[3], int(sys.argv[4]), int(sys.argv[5])
 owner = {"write": places.Place, "writestr": store.zipfile.ZipFile, "rmtree": places.shutil}[part]
 whole = getattr(owner, part)
 
@@ -231,7 +245,9 @@ def deadly(*arguments, **options):
     return whole(*arguments, **options)
 
 setattr(owner, part, deadly)
-collect.collect(Recipe(n_interactions=6, seed=11), sys.argv[1], progress=False)
+recipe = Recipe(n_interactions=6, seed=11)
+if __name__ == "__main__":
+    collect.collect(recipe, sys.argv[1], workers=workers, progress=False)
 """
 
 
@@ -250,7 +266,7 @@ def test_killed_and_run_again_it_is_the_same_file(
     undisturbed, tmp_path, part, name, count, chunks_done
 ):
     path = tmp_path / "killed.zarr.zip"
-    arguments = [sys.executable, "-c", _DRIVER, str(path), part, name, str(count)]
+    arguments = [sys.executable, "-c", _DRIVER, str(path), part, name, str(count), "1"]
     ended = subprocess.run(arguments, cwd=ROOT, capture_output=True, text=True)
     assert ended.returncode == -signal.SIGKILL, ended.stderr
     (work,) = tmp_path.glob(".killed*.chunks")
@@ -364,11 +380,12 @@ def test_a_collector_that_lost_its_lease_stops(lease, cheap, monkeypatch):
         open_interactions(place.url)
 
 
-def test_of_many_that_come_at_once_one_holds_the_lease(lease):
+def test_of_many_that_come_at_once_one_holds_the_lease(lease, monkeypatch):
     place, outcomes, barrier = Place.of("memory://lease/d.zarr"), [], threading.Barrier(6)
+    # All have seen that there is no lease before the first one writes its own.
+    monkeypatch.setattr(Place, "make_folders", lambda *_: barrier.wait())
 
     def take():
-        barrier.wait()
         try:
             with exclusive(place):
                 time.sleep(1)
@@ -427,8 +444,11 @@ def both(client):
 
 
 @contextmanager
-def poisoned(client, how):
-    """Make all workers, also those started later, fail in the chunk that begins with 6."""
+def poisoned(client, log, how):
+    """Make all workers, also those started later, fail in the chunk that begins with 6.
+
+    log: a file that gets a letter for each time that they do.
+    """
     from dask.distributed import WorkerPlugin
 
     class Poison(WorkerPlugin):
@@ -439,6 +459,8 @@ def poisoned(client, how):
 
             def deadly(recipe, indices):
                 if indices.start == 6:
+                    with open(log, "a") as file:
+                        file.write("x")
                     os._exit(9) if how == "kill" else math.sqrt(-1)
                 return records.collect_chunk(recipe, indices)
 
@@ -536,10 +558,11 @@ def test_a_killed_worker_is_no_loss(both, undisturbed, tmp_path):
 
 
 def test_a_chunk_that_cannot_be_made_is_named(both, undisturbed, tmp_path):
-    path = tmp_path / "set.zarr.zip"
+    path, log = tmp_path / "set.zarr.zip", tmp_path / "log"
     reason = r"interactions 6 to 7 could not be collected: ValueError: math domain error"
-    with poisoned(both, "raise"), pytest.raises(RuntimeError, match=reason):
+    with poisoned(both, log, "raise"), pytest.raises(RuntimeError, match=reason):
         collect_set(LONGER, path, both, progress=False)
+    assert len(log.read_text()) == 3  # it may have been the disk or the network
     assert not path.exists()
     assert list(tmp_path.glob(".set*.chunks/tasks/*.json"))
     collect_set(LONGER, path, both, progress=False)
@@ -551,16 +574,17 @@ def test_a_chunk_that_kills_its_workers_is_named(both, tmp_path):
         dask_scheduler.allowed_failures, before = failures, dask_scheduler.allowed_failures
         return before
 
-    path = tmp_path / "set.zarr"
+    path, log = tmp_path / "set.zarr", tmp_path / "log"
     usual = both.run_on_scheduler(allow, 0)
     try:
         with (
-            poisoned(both, "kill"),
+            poisoned(both, log, "kill"),
             pytest.raises(RuntimeError, match=r"interactions 6 to 7 .*KilledWorker"),
         ):
             collect_set(LONGER, path, both, progress=False)
     finally:
         both.run_on_scheduler(allow, usual)
+    assert len(log.read_text()) == 2  # among others, and alone
     with pytest.raises(CorruptedDataError, match="not finished"):
         open_interactions(path)
     made = {p.stem for p in (path / "tasks").iterdir()}
@@ -603,6 +627,14 @@ def test_make_data_ends_with_status_1_when_the_sets_differ(
     assert "not the same: 6 interactions, formerly 12" in capsys.readouterr().out
 
 
+def test_make_data_collects_with_a_scheduler(both, undisturbed, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(make_data, "RECIPES", {"push": SMALL})
+    address = ["--scheduler", both.scheduler.address]
+    assert make_data.main(["--only", "push", "--to", str(tmp_path), *address]) == 1
+    assert "not the same: 6 interactions, formerly 500" in capsys.readouterr().out
+    assert (tmp_path / "push.zarr.zip").read_bytes() == undisturbed(SMALL).read_bytes()
+
+
 # Any moment
 
 
@@ -610,12 +642,16 @@ def test_make_data_ends_with_status_1_when_the_sets_differ(
 @pytest.mark.parametrize("seed", range(10))
 def test_a_driver_killed_at_any_moment_is_no_loss(undisturbed, tmp_path, seed):
     path = tmp_path / "set.zarr.zip"
-    arguments = [sys.executable, "-c", _DRIVER, str(path), "write", "no such name", "1"]
-    process = subprocess.Popen(arguments, cwd=ROOT)
+    never, workers = ["write", "no such name", "1"], str(1 + seed % 2)
+    process = subprocess.Popen(
+        [sys.executable, "-c", _DRIVER, str(path), *never, workers],
+        cwd=ROOT,
+        stderr=subprocess.DEVNULL,
+    )
     deadline = time.monotonic() + 60
     while not list(tmp_path.glob(".set*.chunks")) and time.monotonic() < deadline:
         time.sleep(0.002)
-    time.sleep(random.Random(seed).uniform(0, 1))
+    time.sleep(random.Random(seed).uniform(0, 0.7))
     process.kill()
     process.wait()
     collect_set(SMALL, path, progress=False)
@@ -627,7 +663,7 @@ def test_a_driver_killed_at_any_moment_is_no_loss(undisturbed, tmp_path, seed):
 @pytest.mark.parametrize("seed", range(10))
 def test_workers_killed_at_any_moment_are_no_loss(both, undisturbed, tmp_path, seed):
     path = tmp_path / "set.zarr.zip"
-    timer = threading.Timer(random.Random(seed).uniform(0, 1.5), kill_a_worker, [both])
+    timer = threading.Timer(random.Random(seed).uniform(0, 0.6), kill_a_worker, [both])
     timer.start()
     collect_set(LONGER, path, both, progress=False)
     timer.join()

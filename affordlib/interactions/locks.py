@@ -121,8 +121,8 @@ class _Lease:
                     self.lost = True
                     return
                 self._renew()
-            except OSError:
-                continue  # `check` tells when this has lasted too long
+            except Exception:
+                continue  # whatever the network raises: `check` tells when it has lasted too long
 
     def check(self) -> None:
         """Raise RuntimeError if another may have taken the lease over."""

@@ -51,10 +51,15 @@ def _array_digest(dtype: np.dtype, shape: tuple[int, ...]) -> hashlib._Hash:
     return hashlib.sha256(f"{dtype.str}{shape}".encode())
 
 
+def _bytes(array: np.ndarray) -> np.ndarray:
+    """An array's bytes (n,), for any type of its values."""
+    return np.ascontiguousarray(array).reshape(-1).view(np.uint8)
+
+
 def array_sha256(array: np.ndarray) -> str:
     """Hash of an array's type, shape and bytes."""
     digest = _array_digest(array.dtype, array.shape)
-    digest.update(np.ascontiguousarray(array))
+    digest.update(_bytes(array))
     return digest.hexdigest()
 
 
@@ -84,7 +89,7 @@ def finish(place: Place, layout: Layout) -> None:
         rows = slice(layout.rows(number).start, layout.rows(number).stop)
         for name in layout.files(number).values():
             part = arrays[name][rows if AXIS in layout.variables[name].dims else ...]
-            digests[name].update(np.ascontiguousarray(part))
+            digests[name].update(_bytes(part))
         for name in chunk:
             del contents[name]
     hashes = {name: digest.hexdigest() for name, digest in digests.items()}
