@@ -26,6 +26,9 @@ if TYPE_CHECKING:
     from affordlib.types import Interaction
     from affordlib.world import Thing, WorldConfig
 
+GRAIN = 2.0**-20
+"""About 1 µm or 1 µrad: what is smaller in a float32 is not kept."""
+
 _SIZES = {
     "sample": N_SAMPLES,
     "recorded_sample": RECORDED_SAMPLES,
@@ -75,6 +78,9 @@ _VARIABLES = {
     "mass": _per_interaction("float32", units="kg"),
     "com_offset": _per_interaction("float32", "xyz", units="m"),
     "friction": _per_interaction("float32", "surface", long_name="of table, object, fingers"),
+    "tip_offset": _per_interaction(
+        "float32", units="m", long_name="how much higher than commanded the tool moved"
+    ),
     "start_pose": _per_interaction("float64", "pose_channel", units="m, m, rad"),
     "believed_xy": _per_interaction(
         "float64", "xy", units="m", long_name="where the robot took the object to be"
@@ -154,8 +160,15 @@ def collect_chunk(recipe: Recipe, indices: range) -> dict[str, np.ndarray]:
                 )
             for name in rows:
                 value = index if name == "interaction" else row[name]
-                rows[name].append(np.asarray(value, dtype=variables[name].dtype))
+                rows[name].append(_grained(value, variables[name].dtype))
     return {"phase": np.linspace(0, 1, N_SAMPLES)} | {n: np.stack(v) for n, v in rows.items()}
+
+
+def _grained(value: object, dtype: str) -> np.ndarray:
+    """A value as it is stored: float32 rounded to `GRAIN`, so that noise takes no space."""
+    if dtype != "float32":
+        return np.asarray(value, dtype=dtype)
+    return (np.round(np.asarray(value, dtype=np.float64) / GRAIN) * GRAIN).astype(dtype)
 
 
 def _row(thing: Thing, seen: Interaction, config: WorldConfig) -> dict[str, object]:
@@ -174,6 +187,7 @@ def _row(thing: Thing, seen: Interaction, config: WorldConfig) -> dict[str, obje
         "mass": config.density_kg_m3 * thing.volume_m3,
         "com_offset": config.com_offset_m,
         "friction": (config.table_friction, config.object_friction, config.finger_friction),
+        "tip_offset": config.tip_offset_m,
         "start_pose": seen.start_pose,
         "believed_xy": seen.believed_xy_m,
         "rollable": thing.rollable,
