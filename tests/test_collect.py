@@ -30,7 +30,7 @@ from affordlib.interactions.collect import collect as collect_set
 from affordlib.interactions.locks import exclusive
 from affordlib.interactions.places import Place
 from affordlib.interactions.recipes import Recipe
-from affordlib.interactions.records import collect_chunk
+from affordlib.interactions.records import collect_chunk, describe
 from affordlib.interactions.store import dataset_sha256, open_interactions, stored_sha256
 
 SMALL = Recipe(n_interactions=6, seed=11)
