@@ -89,8 +89,8 @@ checkpoints: $(STAMP) ## Train the shipped models again
 notebooks: $(STAMP) ## Execute the committed notebooks in place and clean them (ONLY= FORCE=1)
 	@$(PY) -m affordlib.workbook --in-place --only "$$ONLY" $(if $(FORCE),--force)
 
-tables: $(STAMP) ## Draw the tables of README.md from data/results
-	@$(PY) -m affordlib.results README.md
+tables: $(STAMP) ## Draw the tables of the README and the data card from data/results
+	@$(PY) -m affordlib.results README.md data/README.md
 
 constraints: $(STAMP) ## Write constraints.txt from what is installed
 	@{ sed -n '/^#/p;/^[^#]/q' constraints.txt; \

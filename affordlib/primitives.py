@@ -315,14 +315,21 @@ class LeverUp(Primitive):
     ) -> LeverUp:
         """The lever-up from a point on an edge of an outline (n, 2) [m], counter-clockwise.
 
-        share: how far along the edge; turn_rad: how far its direction is off the inward normal.
+        The outline is around the centroid. Lifted there, the object turns about the edge that
+        needs the least force, weight · distance to the centroid / distance to the contact; the
+        blade goes towards it, at right angles but for turn_rad. share: how far along the edge.
         """
-        start, end = outline_m[edge % len(outline_m)], outline_m[(edge + 1) % len(outline_m)]
-        contact = start + check_within("share", share, 0.0, 1.0) * (end - start)
-        theta = math.atan2(*(end - start)[::-1]) + math.pi / 2 + turn_rad
-        direction = np.array([math.cos(theta), math.sin(theta)])
-        reach = float(((outline_m - contact) @ direction).max())
-        return cls(float(contact[0]), float(contact[1]), theta, reach)
+        following = np.roll(outline_m, -1, axis=0)
+        along = following - outline_m
+        outward = np.column_stack([along[:, 1], -along[:, 0]])
+        outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+        contact = outline_m[edge] + check_within("share", share, 0.0, 1.0) * along[edge]
+        to_centre = (outline_m * outward).sum(axis=1)
+        to_contact = to_centre - outward @ contact
+        force = np.where(to_contact > 0.05, to_centre / np.maximum(to_contact, 0.05), np.inf)
+        pivot = int(np.argmin(force))
+        theta = math.atan2(*outward[pivot][::-1]) + turn_rad
+        return cls(float(contact[0]), float(contact[1]), theta, float(to_contact[pivot]))
 
     @cached_property
     def legs(self) -> tuple[Leg, ...]:

@@ -234,10 +234,11 @@ def test_blocks_choose_rows_and_columns(tmp_path):
         fill_tables(f"<!-- table: {source}#planning -->\n")
 
 
-def test_the_tables_of_the_readme_are_those_of_their_files():
-    readme = paths.repo_root() / "README.md"
-    assert results.BLOCK.search(readme.read_text(encoding="utf-8")), "README.md has no table"
-    assert results.main(["--check", str(readme)]) == 0
+@pytest.mark.parametrize("page", ["README.md", "data/README.md"])
+def test_the_tables_of_the_pages_are_those_of_their_files(page):
+    path = paths.repo_root() / page
+    assert results.BLOCK.search(path.read_text(encoding="utf-8")), f"{page} has no table"
+    assert results.main(["--check", str(path)]) == 0
 
 
 def test_shipped_results_are_valid_and_carry_no_path():

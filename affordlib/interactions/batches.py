@@ -91,9 +91,12 @@ class TrainingArrays:
         action_channels: tuple[str, ...] = ("x", "y"),
         effect_channels: tuple[str, ...] = ("x", "y"),
     ) -> TrainingArrays:
-        """The chosen interactions (default: all) and channels; simulator faults are left out."""
+        """The chosen interactions (default: all) and channels.
+
+        Left out are faults of the simulator and actions that were out of reach.
+        """
         chosen = np.arange(data.sizes["interaction"]) if interactions is None else interactions
-        chosen = chosen[~data["fault"].values[chosen]]
+        chosen = chosen[(data["reached"].values & ~data["fault"].values)[chosen]]
         part = data.isel(interaction=chosen)
 
         def channels(kind: str, names: tuple[str, ...]) -> torch.Tensor:

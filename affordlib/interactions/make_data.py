@@ -24,10 +24,11 @@ from affordlib.paths import repo_root
 if TYPE_CHECKING:
     from dask.distributed import Client
 
-TOLERANCE_M = 0.001
+TOLERANCE_M = 0.00005
 """Median distance between the final positions of two collections that still are the same set.
 
-It is far below what a model predicts (centimetres) and above what rounding does to most pushes.
+With NumPy's vector instructions turned off, as on another processor, 150 pushes ended 0.0005 mm
+from where they had in the median, and 0.05 mm at most.
 """
 
 
