@@ -13,6 +13,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from affordlib.types import CROP_WIDTH_M, TABLE_X_M, TABLE_Y_M
+from affordlib.world.perception import CAMERA_HEIGHT_M
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -137,7 +138,7 @@ def plot_outcome(ax: Axes, outcome: Outcome) -> Axes:
 def plot_depth(ax: Axes, image: np.ndarray, title: str = "", width_m: float = CROP_WIDTH_M) -> Axes:
     """The depth channel of an image (2, n, n), as height above the table in centimetres."""
     half = 50 * width_m
-    height_cm = 100 * (image[0].max() - image[0])
+    height_cm = 100 * (CAMERA_HEIGHT_M - image[0])
     top = max(8.0, float(height_cm.max()))
     drawn = ax.imshow(
         height_cm, extent=(-half, half, -half, half), cmap="cividis", vmin=0, vmax=top
