@@ -316,8 +316,9 @@ class LeverUp(Primitive):
         """The lever-up from a point on an edge of an outline (n, 2) [m], counter-clockwise.
 
         The outline is around the centroid. Lifted there, the object turns about the edge that
-        needs the least force, weight · distance to the centroid / distance to the contact; the
-        blade goes towards it, at right angles but for turn_rad. share: how far along the edge.
+        needs the least force, weight · distance to the centroid / distance to the contact. The
+        blade goes midway between that edge's normal and its own edge's, but for turn_rad; share:
+        how far along the edge.
         """
         following = np.roll(outline_m, -1, axis=0)
         along = following - outline_m
@@ -326,10 +327,16 @@ class LeverUp(Primitive):
         contact = outline_m[edge] + check_within("share", share, 0.0, 1.0) * along[edge]
         to_centre = (outline_m * outward).sum(axis=1)
         to_contact = to_centre - outward @ contact
-        force = np.where(to_contact > 0.05, to_centre / np.maximum(to_contact, 0.05), np.inf)
-        pivot = int(np.argmin(force))
-        theta = math.atan2(*outward[pivot][::-1]) + turn_rad
-        return cls(float(contact[0]), float(contact[1]), theta, float(to_contact[pivot]))
+        far = to_contact > to_contact.max() / 3
+        pivot = int(np.argmin(np.where(far, to_centre / np.where(far, to_contact, 1.0), np.inf)))
+        middle = outward[pivot] - outward[edge]
+        theta = math.atan2(middle[1], middle[0]) + turn_rad
+        return cls(float(contact[0]), float(contact[1]), theta, max(0.05, float(to_contact[pivot])))
+
+    def obliqueness_rad(self, outline_m: np.ndarray, edge: int) -> float:
+        """How far the blade's direction is off the inward normal of the edge it goes under."""
+        along = outline_m[(edge + 1) % len(outline_m)] - outline_m[edge]
+        return abs(wrap_angle(self.theta - math.atan2(along[0], -along[1])))
 
     @cached_property
     def legs(self) -> tuple[Leg, ...]:

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from affordlib.world import Thing
 
 _TABLE_MARGIN_M = 0.08
+_LEVER_DRAWS = 20
+_OBLIQUE_RAD = 0.18
 
 
 @dataclass(frozen=True)
@@ -217,8 +219,16 @@ def _draw_action(recipe: Recipe, thing: Thing, yaw: float, rng: np.random.Genera
         return kind()
     c, s = math.cos(yaw), math.sin(yaw)
     outline = thing.footprint_m @ np.array([[c, s], [-s, c]])
-    edge = int(rng.integers(len(outline)))
-    return kind.at_edge(outline, edge, rng.uniform(0.35, 0.65), rng.uniform(-0.1, 0.1))
+    levers = []
+    for _ in range(_LEVER_DRAWS):
+        edge = int(rng.integers(len(outline)))
+        lever = kind.at_edge(outline, edge, rng.uniform(0.2, 0.8))
+        levers.append((lever.obliqueness_rad(outline, edge), lever))
+        if levers[-1][0] < _OBLIQUE_RAD:
+            break
+    # A blade that goes far askew under its edge slips; of the draws, the straightest is taken.
+    _, lever = min(levers, key=lambda drawn: drawn[0])
+    return replace(lever, theta=lever.theta + rng.uniform(-0.1, 0.1))
 
 
 def interact(

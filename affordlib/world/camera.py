@@ -153,7 +153,8 @@ def kinect_view(client: int, noise: np.random.Generator) -> tuple[tuple[float, f
         height = _height_map(points, xy)
         mask = largest_blob(height > _KINECT_MASK_HEIGHT_M)
         if mask.any():
-            dx, dy = centre_m(mask)
+            # Of the walls the camera sees only those that face it: the upper half tells the centre.
+            dx, dy = centre_m(mask & (height > np.quantile(height[mask], 0.9) / 2))
             xy = (float(xy[0] + dx), float(xy[1] + dy))
     height = _height_map(points, xy)
     mask = largest_blob(height > _KINECT_MASK_HEIGHT_M)

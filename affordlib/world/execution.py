@@ -97,7 +97,10 @@ def execute(
         if approach:
             drive.along(joint_move(world.arm, home, 1.0), release[[1, 1]])
     drive.wait(SETTLE_STEPS)
-    return _record(world, primitive, way, phase, action, seen, start, drive, offset)
+    interaction = _record(world, primitive, way, phase, action, seen, start, drive, offset)
+    if not (approach or primitive.holds):
+        put_arm(world, home, world.gap_m)
+    return interaction
 
 
 def refused(world: Tabletop, primitive: Primitive, phase: np.ndarray, seen: Percept) -> Interaction:

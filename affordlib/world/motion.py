@@ -198,7 +198,8 @@ class Drive:
             targets[:, :6] = CubicSpline(np.arange(len(joints)), joints, bc_type="clamped")(grid)
         targets[:, 6:] = (np.interp(grid, np.arange(len(gaps_m)), gaps_m) / 2)[:, None]
         velocities = (np.diff(targets, axis=0) / _STEP_S).tolist()
-        commands = targets[1:].tolist()
+        # With the velocity fed forward, the target of the next step would put the arm ahead.
+        commands = targets[:-1].tolist()
         n_steps = whole if n_steps is None else n_steps
         record, film = poses_W is not None, world.film
         now, frozen_at = (targets[0].tolist(), [0.0] * 8), None
