@@ -89,9 +89,12 @@ class Recipe:
 
     def __post_init__(self) -> None:
         for name, check in (("primitives", primitive_named), ("families", family_named)):
-            values = tuple(getattr(self, name))
-            if not values or isinstance(getattr(self, name), str):
-                raise ValueError(f"{name} must be a sequence of at least one name, got {values!r}")
+            values = getattr(self, name)
+            if isinstance(values, str):
+                raise ValueError(f"{name} must be a sequence of names: write ({values!r},)")
+            values = tuple(values)
+            if not values:
+                raise ValueError(f"{name} must be a sequence of at least one name, got none")
             for value in values:
                 check(value)
             object.__setattr__(self, name, values)

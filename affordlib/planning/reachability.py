@@ -1,0 +1,85 @@
+"""Where the arm can act: learned from what it could and could not do (Section 3.4 of the paper).
+
+A small network answers for a primitive, a place on the table and a direction. It is trained on
+recorded interactions alone; no kinematics is told.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import nn
+
+from affordlib.primitives import PRIMITIVES, primitive_named
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+_HIDDEN, _STEPS, _RATE = 64, 1500, 1e-2
+
+
+class Reachability(nn.Module):
+    """The probability that the arm can carry out a primitive at a place."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.Linear(4 + len(PRIMITIVES), _HIDDEN),
+            nn.Tanh(),
+            nn.Linear(_HIDDEN, _HIDDEN),
+            nn.Tanh(),
+            nn.Linear(_HIDDEN, 1),
+        )
+
+    @torch.no_grad()
+    def probability(
+        self, primitive: str, xy_m: np.ndarray, direction_rad: np.ndarray | float | None = None
+    ) -> np.ndarray:
+        """Probability (n,) that `primitive` is in reach of objects at xy_m: (n, 2).
+
+        direction_rad: (n,) or one number, in which a push or drag moves; None for the others.
+        """
+        primitive_named(primitive)
+        xy_m = np.atleast_2d(np.asarray(xy_m, dtype=float))
+        number = list(PRIMITIVES).index(primitive)
+        turn = np.nan if direction_rad is None else direction_rad
+        turn = np.broadcast_to(np.asarray(turn, dtype=float), len(xy_m))
+        features = _features(np.full(len(xy_m), number), xy_m, turn)
+        return torch.sigmoid(self.layers(features)).squeeze(-1).numpy()
+
+
+def _features(number: np.ndarray, xy_m: np.ndarray, direction_rad: np.ndarray) -> torch.Tensor:
+    """(n, 4 + primitives): place, direction (zero where there is none), which primitive."""
+    ahead = np.column_stack([np.cos(direction_rad), np.sin(direction_rad)])
+    ahead[np.isnan(direction_rad)] = 0.0
+    kind = np.eye(len(PRIMITIVES))[number]
+    return torch.from_numpy(np.hstack([2 * xy_m, ahead, kind])).float()
+
+
+def learn_reachability(data: xr.Dataset, seed: int = 0) -> Reachability:
+    """Train on a set of interactions with objects all over the table; seconds on one core.
+
+    The arm stands on the table's x axis, so every interaction is seen mirrored as well.
+    """
+    number = data["primitive"].values
+    xy_m = data["believed_xy"].values
+    push = list(PRIMITIVES).index("push")
+    direction = data["theta"].values + np.where(number == push, np.pi, 0.0)
+    reached = torch.from_numpy(data["reached"].values).float()
+    inputs = torch.cat(
+        [_features(number, xy_m, direction), _features(number, xy_m * [1, -1], -direction)]
+    )
+    torch.manual_seed(seed)
+    model = Reachability()
+    optimiser = torch.optim.AdamW(model.parameters(), _RATE)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, _RATE, _STEPS)
+    for _ in range(_STEPS):
+        logits = model.layers(inputs).squeeze(-1)
+        loss = nn.functional.binary_cross_entropy_with_logits(logits, reached.repeat(2))
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        schedule.step()
+    return model.eval()

@@ -1,0 +1,62 @@
+"""Learned reachability against the arm's kinematics, which it was never told."""
+
+import math
+
+import numpy as np
+import pytest
+
+from affordlib.interactions import open_interactions
+from affordlib.planning.reachability import learn_reachability
+from affordlib.primitives import Drag, Grasp, Push, Rotate
+from affordlib.world import UnreachableError, robot
+
+KINDS = {
+    "push": lambda angle: Push.towards(angle),
+    "drag": lambda angle: Drag.towards(angle),
+    "grasp": lambda angle: Grasp(),
+    "rotate": lambda angle: Rotate(),
+}
+
+
+@pytest.fixture(scope="module")
+def learned():
+    return learn_reachability(open_interactions("reach"))
+
+
+def _kinematics_allow(primitive, xy):
+    """Whether every pose of the path has a posture, for one of the gripper's two equal yaws."""
+    path = primitive.path(np.linspace(0, 1, 76)) + np.array([*xy, 0, 0, 0])
+    for turn in (0.0, math.pi):
+        poses = np.column_stack([path[:, :3], path[:, 3] + turn, np.zeros(len(path))])
+        try:
+            robot.joint_path(poses, np.array(robot.HOME))
+        except UnreachableError:
+            continue
+        return True
+    return False
+
+
+def test_it_agrees_with_kinematics_on_places_it_has_not_seen(learned):
+    rng = np.random.default_rng(5)
+    right = {True: [], False: []}
+    for name, make in KINDS.items():
+        for _ in range(250):
+            xy, angle = rng.uniform([-0.42, -0.62], [0.62, 0.62]), rng.uniform(-math.pi, math.pi)
+            truth = _kinematics_allow(make(angle), xy)
+            direction = angle if name in ("push", "drag") else None
+            said = learned.probability(name, xy, direction)[0] > 0.5
+            right[truth].append(said == truth)
+    assert np.mean(right[True] + right[False]) >= 0.97
+    assert 1 - np.mean(right[False]) < 0.15  # false 'reachable'
+    assert len(right[False]) > 60
+
+
+def test_it_answers_for_many_places_at_once(learned):
+    places = np.array([[0.0, 0.0], [0.0, 0.3], [0.65, 0.65]])
+    many = learned.probability("push", places, 0.5)
+    single = [learned.probability("push", place, 0.5)[0] for place in places]
+    np.testing.assert_allclose(many, single, atol=1e-6)
+    assert many[0] > 0.95
+    assert many[2] < 0.2
+    with pytest.raises(ValueError, match="primitive 'kick'"):
+        learned.probability("kick", places)
