@@ -17,7 +17,13 @@ from typing import TYPE_CHECKING, Any
 import torch
 from tqdm.auto import tqdm
 
-from affordlib.interactions.batches import Batch, TrainingArrays, observe_action, sample_batch
+from affordlib.interactions.batches import (
+    Batch,
+    TrainingArrays,
+    observe_action,
+    plane_of,
+    sample_batch,
+)
 from affordlib.types import Observations, check_within
 
 if TYPE_CHECKING:
@@ -99,14 +105,17 @@ def device_named(name: str) -> torch.device:
 
 @torch.no_grad()
 def final_errors_m(model: EffectNetwork, arrays: TrainingArrays) -> torch.Tensor:
-    """Distance (N,) [m] between predicted and true (x, y) at t = 1, given image and action."""
+    """Distance (N,) [m] between predicted and true (x, y) at t = 1, given image and action.
+
+    Where x and y are not predicted, that of what is (z [m], yaw [rad]).
+    """
     was_training = model.training
     model.eval()
     device = model.action_scale.device
     seen, t_target = _to(observe_action(arrays), device), torch.ones(len(arrays), 1, device=device)
     prediction = model.predict(model.encode(arrays.image.to(device)), seen, t_target)
     model.train(was_training)
-    plane = [arrays.effect_channels.index(name) for name in ("x", "y")]
+    plane = plane_of(arrays.effect_channels) or list(range(len(arrays.effect_channels)))
     return (prediction.effect_mean[:, 0, plane].cpu() - arrays.effect[:, -1, plane]).norm(dim=-1)
 
 
