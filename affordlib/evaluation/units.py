@@ -15,7 +15,7 @@ import hashlib
 import json
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import lru_cache
 from itertools import product
 from pathlib import Path
@@ -59,6 +59,8 @@ if TYPE_CHECKING:
     from affordlib.models.training import TrainingConfig
 
 FORMAT = 1
+"""Counts the changes of code that change a unit's numbers without changing its configuration."""
+
 N_FOLDS = 10
 FEW_STEPS = 800
 """Of training on the sets of 100 interactions."""
@@ -155,10 +157,17 @@ def configuration_sha256(unit: Unit) -> str:
     }
     if configs := learner(unit):
         network, training = configs
-        told |= {"network": asdict(network), "training": asdict(training)}
-        for name in ("max_minutes", "device"):
-            del told["training"][name]
+        told |= {"network": type(network).__name__, **_chosen(network)}
+        told |= {f"training_{name}": value for name, value in _chosen(training).items()}
     return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+
+
+def _chosen(config: NetworkConfig | TrainingConfig) -> dict[str, Any]:
+    """What differs from the defaults: an option that is added later, and off, changes no hash."""
+    chosen = {f.name: getattr(config, f.name) for f in fields(config)}
+    defaults = {f.name: f.default for f in fields(config)}
+    apart = ("max_minutes", "device")
+    return {k: v for k, v in chosen.items() if v != defaults[k] and k not in apart}
 
 
 def data_sha256(unit: Unit) -> dict[str, str]:
