@@ -244,10 +244,12 @@ def test_all_weighs_classes_equally_and_seeds_are_no_further_objects():
     assert spread.mean_sem("all") == (1.5, pytest.approx(math.hypot(1, 2) / 2))
 
 
-def test_auc_counts_pairs_in_order():
-    truth = np.array([True, False, True, False])
-    assert auc(np.array([0.9, 0.1, 0.4, 0.4]), truth) == (3 + 0.5) / 4
-    assert auc(np.array([0.9]), np.array([True])) is None
+def test_auc_counts_pairs_in_order_within_folds():
+    truth, one = np.array([True, False, True, False]), np.zeros(4)
+    score = np.array([0.9, 0.1, 0.4, 0.4])
+    assert auc(score, truth, one) == (3 + 0.5) / 4
+    assert auc(score, truth, np.array([0, 0, 1, 1])) == (1 + 0.5) / 2
+    assert auc(score, truth, np.arange(4)) is None
 
 
 def test_true_and_false_shares_are_of_the_true_classes():

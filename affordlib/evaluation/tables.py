@@ -49,13 +49,16 @@ def wilson(k: int, n: int, z: float = 1.959964) -> tuple[float, float]:
     return max(0.0, centre - half), min(1.0, centre + half)
 
 
-def auc(score: np.ndarray, truth: np.ndarray) -> float | None:
-    """The share of (success, failure) pairs that the score puts in order; None without pairs."""
-    yes, no = score[truth], score[~truth]
-    if not len(yes) or not len(no):
+def auc(score: np.ndarray, truth: np.ndarray, fold: np.ndarray) -> float | None:
+    """The share of (success, failure) pairs that the score puts in order; None without pairs.
+
+    Pairs are of one fold each: models of different folds are not on one scale.
+    """
+    pairs = truth[:, None] & ~truth & (fold[:, None] == fold)
+    if not pairs.any():
         return None
-    above = (yes[:, None] > no).mean() + (yes[:, None] == no).mean() / 2
-    return float(above)
+    order = (score[:, None] > score) + (score[:, None] == score) / 2
+    return float(order[pairs].mean())
 
 
 def read_parts(folder: str | Path = PARTS) -> list[tuple[Unit, Part]]:
@@ -166,6 +169,7 @@ def grasp_rows(parts: list[tuple[Unit, Part]]) -> list[dict[str, Any]]:
         height = np.concatenate([t["truth"]["z"] for t in told])
         rolls = np.concatenate([t["rollable"] for t in told])
         score = np.concatenate([success_probability(t) for t in told])
+        fold = np.repeat(np.arange(len(told)), [len(t["rollable"]) for t in told])
         error = None
         if "mean" in told[0]:
             error = np.concatenate([final_error(t) for t in told])
@@ -177,7 +181,9 @@ def grasp_rows(parts: list[tuple[Unit, Part]]) -> list[dict[str, Any]]:
             row["error_mean_m"] = None if error is None else float(error[chosen].mean())
             row["error_median_m"] = None if error is None else float(np.median(error[chosen]))
             brier = float(np.square(score[chosen] - truth).mean())
-            rows.append(row | counts | {"auc": auc(score[chosen], truth), "brier": brier})
+            rows.append(
+                row | counts | {"auc": auc(score[chosen], truth, fold[chosen]), "brier": brier}
+            )
     return rows
 
 
