@@ -180,9 +180,10 @@ def grasp_rows(parts: list[tuple[Unit, Part]]) -> list[dict[str, Any]]:
             row = about | {"rollable": rollable, "n": int(chosen.sum())}
             row["error_mean_m"] = None if error is None else float(error[chosen].mean())
             row["error_median_m"] = None if error is None else float(np.median(error[chosen]))
+            order = auc(score[chosen], truth, fold[chosen])
             brier = float(np.square(score[chosen] - truth).mean())
             rows.append(
-                row | counts | {"auc": auc(score[chosen], truth, fold[chosen]), "brier": brier}
+                row | counts | {"auc": order, "brier": brier}
             )
     return rows
 
