@@ -83,8 +83,8 @@ bench: $(STAMP) ## Run the benchmarks
 data: $(STAMP) ## Collect the shipped data sets again and compare
 	@$(PY) -m affordlib.interactions.make_data
 
-checkpoints: $(STAMP) ## Train the shipped models again
-	@$(PY) -m affordlib.models.make_checkpoints
+checkpoints: $(STAMP) ## Train the shipped models again (ONLY="push_film")
+	@$(PY) -m affordlib.models.make_checkpoints $(if $(ONLY),--only $(ONLY))
 
 notebooks: $(STAMP) ## Execute the committed notebooks in place and clean them (ONLY= FORCE=1)
 	@$(PY) -m affordlib.workbook --in-place --only "$$ONLY" $(if $(FORCE),--force)

@@ -6,6 +6,7 @@ Section 3.2 and 4.3 of the paper: 80/10/10 inside each of 10 folds; k observatio
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -44,25 +45,59 @@ def split_interactions(n: int, seed: int = 0, fold: int = 0, n_folds: int = 10) 
     return Split(np.sort(train), np.sort(blocks[validation]), np.sort(blocks[test]))
 
 
+Range = tuple[float, float]
+
+
 @dataclass(frozen=True)
 class Normaliser:
-    """Scales that bring channels near unit size; x and y share one, and zero stays zero."""
+    """What models take from training data: scales, and ranges outside which they know nothing.
+
+    Scales bring channels near unit size; x and y share one, and zero stays zero. Ranges (None: not
+    known) are of the distance [m] of the action from the object's centre at t = 0 and at t = 1,
+    and of the share of the image that the object covers; whether objects reach the image's edge.
+    """
 
     action_scale: tuple[float, ...]
     effect_scale: tuple[float, ...]
     image_mean: tuple[float, ...]
     image_std: tuple[float, ...]
+    start_radius_m: Range | None = None
+    end_radius_m: Range | None = None
+    mask_share: Range | None = None
+    at_edge: bool = True
 
     @classmethod
     def fit(cls, arrays: TrainingArrays) -> Normaliser:
         """Scales of training data: root mean square of the channels, mean and std of the image."""
         image = arrays.image.double()
+        radius_m = [None, None]
+        if plane := plane_of(arrays.action_channels):
+            radius_m = [_range(arrays.action[:, k][:, plane].norm(dim=-1)) for k in (0, -1)]
+        mask = arrays.image[:, 1]
         return cls(
             _scales(arrays.action, arrays.action_channels),
             _scales(arrays.effect, arrays.effect_channels),
             tuple(image.mean(dim=(0, 2, 3)).tolist()),
             tuple(image.std(dim=(0, 2, 3)).clamp_min(1e-6).tolist()),
+            *radius_m,
+            _range(mask.mean(dim=(1, 2))),
+            bool(touches_edge(mask).any()),
         )
+
+
+def plane_of(channels: tuple[str, ...]) -> list[int]:
+    """Where x and y are among the channels; empty if they are not both there."""
+    return [channels.index(name) for name in "xy"] if {"x", "y"} <= {*channels} else []
+
+
+def touches_edge(mask: torch.Tensor) -> torch.Tensor:
+    """Which of the masks (N, n, n) reach the edge of their image: (N,)."""
+    rim = torch.cat([mask[:, (0, -1)].flatten(1), mask[:, :, (0, -1)].flatten(1)], dim=1)
+    return (rim > 0.5).any(dim=1)
+
+
+def _range(values: torch.Tensor) -> Range:
+    return float(values.min()), float(values.max())
 
 
 def _scales(values: torch.Tensor, channels: tuple[str, ...]) -> tuple[float, ...]:
@@ -130,27 +165,41 @@ class TrainingArrays:
 
         Exact: no pixel is interpolated. Physics on a level table does not mind.
         """
-        image = torch.flip(self.image, (-2,)) if mirror else self.image
+        heading = torch.tensor([(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)][quarters % 4])
+        image, action, effect = self.image, self.action, self.effect
+        if mirror:
+            image = torch.flip(image, (-2,))
+            action = _mirror(action, self.action_channels)
+            effect = _mirror(effect, self.effect_channels)
         return replace(
             self,
             image=torch.rot90(image, quarters, (-2, -1)),
-            action=_turn(self.action, self.action_channels, quarters, mirror),
-            effect=_turn(self.effect, self.effect_channels, quarters, mirror),
+            action=turn(action, self.action_channels, heading, absolute_yaw=True),
+            effect=turn(effect, self.effect_channels, heading, absolute_yaw=False),
         )
 
 
-def _turn(
-    values: torch.Tensor, channels: tuple[str, ...], quarters: int, mirror: bool
+def _mirror(values: torch.Tensor, channels: tuple[str, ...]) -> torch.Tensor:
+    return values * torch.tensor([-1.0 if name in ("y", "yaw") else 1.0 for name in channels])
+
+
+def turn(
+    values: torch.Tensor, channels: tuple[str, ...], heading: torch.Tensor, absolute_yaw: bool
 ) -> torch.Tensor:
-    turned = values.clone()
-    x, y = channels.index("x"), channels.index("y")
-    if mirror:
-        for name in ("y", "yaw"):
-            if name in channels:
-                turned[..., channels.index(name)] *= -1
-    for _ in range(quarters % 4):
-        turned[..., x], turned[..., y] = -turned[..., y].clone(), turned[..., x].clone()
-    return turned
+    """Values (..., C) turned by the angles whose (cos, sin) are `heading` (..., 2).
+
+    A yaw that is an orientation turns along; one that is a change, as an effect's, stays.
+    """
+    cos, sin = heading.unbind(-1)
+    columns = list(values.unbind(-1))
+    if plane := plane_of(channels):
+        x, y = (columns[k] for k in plane)
+        columns[plane[0]], columns[plane[1]] = cos * x - sin * y, sin * x + cos * y
+    if absolute_yaw and "yaw" in channels:
+        k = channels.index("yaw")
+        yaw = columns[k] + torch.atan2(sin, cos)
+        columns[k] = torch.remainder(yaw + math.pi, 2 * math.pi) - math.pi
+    return torch.stack(columns, dim=-1)
 
 
 @dataclass(frozen=True)

@@ -1,17 +1,32 @@
 """Models that relate an object's image, an action and its effect."""
 
-from affordlib.models.checkpoint import load_checkpoint, save_checkpoint
+from affordlib.models.attention import AttentionConfig, AttentiveCNP
+from affordlib.models.calibration import calibration_rows, coverage, fit_temperature
+from affordlib.models.checkpoint import build, load_checkpoint, save_checkpoint
 from affordlib.models.cnp import AffordanceCNP, CNPConfig
+from affordlib.models.film import FiLMConfig, FiLMNetwork
+from affordlib.models.network import EffectNetwork, NetworkConfig
 from affordlib.models.protocol import EffectModel, observe_pushes
-from affordlib.models.training import TrainingConfig, train
+from affordlib.models.training import TrainingConfig, train, train_literal
 
 __all__ = [
     "AffordanceCNP",
+    "AttentionConfig",
+    "AttentiveCNP",
     "CNPConfig",
     "EffectModel",
+    "EffectNetwork",
+    "FiLMConfig",
+    "FiLMNetwork",
+    "NetworkConfig",
     "TrainingConfig",
+    "build",
+    "calibration_rows",
+    "coverage",
+    "fit_temperature",
     "load_checkpoint",
     "observe_pushes",
     "save_checkpoint",
     "train",
+    "train_literal",
 ]

@@ -13,15 +13,31 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 from affordlib.interactions.batches import Normaliser
+from affordlib.models.attention import AttentionConfig, AttentiveCNP
 from affordlib.models.cnp import AffordanceCNP, CNPConfig
+from affordlib.models.film import FiLMConfig, FiLMNetwork
+from affordlib.models.network import EffectNetwork, NetworkConfig
 from affordlib.paths import repo_root
 
 FORMAT = "affordlib checkpoint 1"
 SUFFIX = ".safetensors"
-_KINDS = {"cnp": (AffordanceCNP, CNPConfig)}
+NETWORKS: dict[str, tuple[type[EffectNetwork], type[NetworkConfig]]] = {
+    "cnp": (AffordanceCNP, CNPConfig),
+    "film": (FiLMNetwork, FiLMConfig),
+    "attention": (AttentiveCNP, AttentionConfig),
+}
 
 
-def save_checkpoint(model: AffordanceCNP, path: str | Path, about: dict[str, Any]) -> Path:
+def build(config: NetworkConfig, normaliser: Normaliser) -> EffectNetwork:
+    """An untrained network of the architecture that the configuration belongs to."""
+    for network, config_class in NETWORKS.values():
+        if type(config) is config_class:
+            return network(config, normaliser)
+    known = [config_class.__name__ for _, config_class in NETWORKS.values()]
+    raise TypeError(f"config must be one of {known}, got {config!r}")
+
+
+def save_checkpoint(model: EffectNetwork, path: str | Path, about: dict[str, Any]) -> Path:
     """Write `path` (ending in .safetensors) and the JSON beside it; returns the path.
 
     about: what the reader of the checkpoint should know, such as the data set and the interactions
@@ -32,8 +48,9 @@ def save_checkpoint(model: AffordanceCNP, path: str | Path, about: dict[str, Any
         raise ValueError(f"path must end in {SUFFIX!r}, got {str(path)!r}")
     description = {
         "format": FORMAT,
-        "model": "cnp",
-        "config": asdict(model.config) | {"sigma_floor": model.sigma_floor},
+        "model": next(name for name, (kind, _) in NETWORKS.items() if kind is type(model)),
+        "config": asdict(model.config)
+        | {"sigma_floor": model.sigma_floor, "temperature": model.temperature},
         "normaliser": asdict(model.normaliser),
         "about": about,
     }
@@ -70,7 +87,7 @@ def _with_tuples(fields: dict[str, Any]) -> dict[str, Any]:
     return {name: tuple(v) if isinstance(v, list) else v for name, v in fields.items()}
 
 
-def load_checkpoint(name_or_path: str | Path) -> tuple[AffordanceCNP, dict[str, Any]]:
+def load_checkpoint(name_or_path: str | Path) -> tuple[EffectNetwork, dict[str, Any]]:
     """A model, ready to predict, and what its checkpoint says about it.
 
     Raises FileNotFoundError, or ValueError when the files are damaged or of another model.
@@ -81,7 +98,7 @@ def load_checkpoint(name_or_path: str | Path) -> tuple[AffordanceCNP, dict[str, 
         description = json.loads(path.with_suffix(".json").read_text())
         if description["format"] != FORMAT:
             raise ValueError(f"its format is {description['format']!r}, not {FORMAT!r}")
-        kind, config_class = _KINDS[description["model"]]
+        kind, config_class = NETWORKS[description["model"]]
         model = kind(
             config_class(**_with_tuples(description["config"])),
             Normaliser(**_with_tuples(description["normaliser"])),

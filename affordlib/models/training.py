@@ -1,33 +1,47 @@
 """Training: one plain loop over batches of trajectories, with early stopping (Section 3.2).
 
 The paper draws one trajectory and one target an iteration; here many trajectories, each with many
-targets, share a step, which is the same expectation a few hundred times faster.
+targets, share a step, which is the same expectation a few hundred times faster. `train_literal` is
+the paper's loop, for comparison.
 """
 
 from __future__ import annotations
 
-import copy
 import math
+import os
 import time
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import asdict, astuple, dataclass, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import torch
 from tqdm.auto import tqdm
 
-from affordlib.interactions.batches import TrainingArrays, observe_action, sample_batch
-from affordlib.types import check_within
+from affordlib.interactions.batches import (
+    Batch,
+    TrainingArrays,
+    observe_action,
+    plane_of,
+    sample_batch,
+)
+from affordlib.types import Observations, check_within
 
 if TYPE_CHECKING:
-    from affordlib.models.cnp import AffordanceCNP
+    from affordlib.models.network import EffectNetwork
+
+
+_AUTO = "cuda" if torch.cuda.is_available() else "cpu"
 
 
 @dataclass(frozen=True)
 class TrainingConfig:
     """How to train: steps and sizes; the σ floor falls from the model's to `final_sigma_floor`.
 
-    augment turns and mirrors each batch at random by quarter turns. patience counts validations
-    (one every `validate_every` steps) without improvement. max_minutes bounds wall time.
+    The floor stays for the first `hold_floor` of the steps. augment turns and mirrors: each batch
+    holds all eight images of the square in equal shares. ema: decay of the running mean of the
+    weights, which is what is validated and kept; 0 for none. patience counts validations (one every
+    `validate_every` steps) without improvement. max_minutes bounds wall time. device: as of torch,
+    or "auto" for a GPU where there is one.
     """
 
     steps: int = 3000
@@ -36,10 +50,13 @@ class TrainingConfig:
     obs_max: int = 10
     learning_rate: float = 1e-3
     final_sigma_floor: float = 0.02
+    hold_floor: float = 0.0
     augment: bool = True
+    ema: float = 0.0
     validate_every: int = 100
     patience: int = 10
     max_minutes: float = math.inf
+    device: str = "auto"
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -49,8 +66,23 @@ class TrainingConfig:
                 raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}")
         check_within("learning_rate", self.learning_rate, 1e-7, 1.0)
         check_within("final_sigma_floor", self.final_sigma_floor, 1e-6, 10.0)
+        check_within("hold_floor", self.hold_floor, 0.0, 1.0)
+        check_within("ema", self.ema, 0.0, 0.99999)
+        device_named(self.device)
         if not self.max_minutes > 0:
             raise ValueError(f"max_minutes must be positive, got {self.max_minutes!r}")
+
+    def rate(self, step: int) -> float:
+        """The learning rate at a step: it rises for a tenth of them, then falls as a cosine."""
+        share = (step - 0.5) / self.steps
+        rising = share / 0.1
+        falling = (1 + math.cos(math.pi * (share - 0.1) / 0.9)) / 2
+        return self.learning_rate * (rising if share < 0.1 else falling)
+
+    def sigma_floor(self, step: int, first: float) -> float:
+        """The floor at a step, falling geometrically from `first`."""
+        share = max(0.0, step / self.steps - self.hold_floor) / (1 - min(self.hold_floor, 0.99))
+        return first * (self.final_sigma_floor / first) ** min(1.0, share)
 
 
 @dataclass(frozen=True)
@@ -63,77 +95,233 @@ class TrainingRecord:
     validation_error_m: float
 
 
+def device_named(name: str) -> torch.device:
+    """The torch device of a name; "auto" is a GPU where there is one, or else the processor."""
+    try:
+        return torch.device(_AUTO if name == "auto" else name)
+    except RuntimeError:
+        raise ValueError(f'device must be "auto" or as "cpu" or "cuda", got {name!r}') from None
+
+
 @torch.no_grad()
-def final_errors_m(model: AffordanceCNP, arrays: TrainingArrays) -> torch.Tensor:
-    """Distance (N,) [m] between predicted and true (x, y) at t = 1, given image and action."""
+def final_errors_m(model: EffectNetwork, arrays: TrainingArrays) -> torch.Tensor:
+    """Distance (N,) [m] between predicted and true (x, y) at t = 1, given image and action.
+
+    Where x and y are not predicted, that of what is (z [m], yaw [rad]).
+    """
     was_training = model.training
     model.eval()
-    t_target = torch.ones(len(arrays), 1)
-    prediction = model.predict(model.encode(arrays.image), observe_action(arrays), t_target)
+    device = model.action_scale.device
+    seen, t_target = _to(observe_action(arrays), device), torch.ones(len(arrays), 1, device=device)
+    prediction = model.predict(model.encode(arrays.image.to(device)), seen, t_target)
     model.train(was_training)
-    plane = [arrays.effect_channels.index(name) for name in ("x", "y")]
-    return (prediction.effect_mean[:, 0, plane] - arrays.effect[:, -1, plane]).norm(dim=-1)
+    plane = plane_of(arrays.effect_channels) or list(range(len(arrays.effect_channels)))
+    return (prediction.effect_mean[:, 0, plane].cpu() - arrays.effect[:, -1, plane]).norm(dim=-1)
+
+
+def _to(batch: Any, device: torch.device) -> Any:
+    """The same batch or observations on a device."""
+    moved = {}
+    for field in fields(batch):
+        value = getattr(batch, field.name)
+        moved[field.name] = value.to(device) if torch.is_tensor(value) else _to(value, device)
+    return replace(batch, **moved)
+
+
+def _augmented(arrays: TrainingArrays) -> TrainingArrays:
+    """The interactions turned and mirrored in all eight ways, in turn."""
+    eighths = torch.arange(len(arrays)).tensor_split(8)
+    parts = [
+        arrays.select(rows).turned(k // 2, mirror=k % 2 == 1) for k, rows in enumerate(eighths)
+    ]
+    return replace(
+        arrays,
+        **{
+            name: torch.cat([getattr(part, name) for part in parts])
+            for name in ("image", "action", "effect")
+        },
+    )
+
+
+class _Run:
+    """What a training is made of, between two steps; saved and loaded as one."""
+
+    def __init__(self, model: EffectNetwork, config: TrainingConfig, about: dict[str, Any]) -> None:
+        self.model, self.config = model, config
+        self.about = about | asdict(replace(config, max_minutes=math.inf, device="cpu"))
+        self.generator = torch.Generator().manual_seed(config.seed)
+        self.optimiser = torch.optim.Adam(model.parameters(), lr=config.learning_rate, fused=True)
+        self.mean = {k: v.clone() for k, v in model.state_dict().items()}
+        self.best, self.best_state, self.best_floor = math.inf, self.mean, model.sigma_floor
+        self.step, self.waited, self.seconds = 0, 0, 0.0
+        self.history: list[TrainingRecord] = []
+
+    _PLAIN = ("mean", "best", "best_state", "best_floor", "step", "waited", "seconds", "about")
+
+    def save(self, path: Path) -> None:
+        state = {name: getattr(self, name) for name in self._PLAIN} | {
+            "model": self.model.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+            "generator": self.generator.get_state(),
+            "history": [astuple(record) for record in self.history],
+        }
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = path.with_name(f".{path.name}.partial")
+        torch.save(state, partial)
+        os.replace(partial, path)
+
+    def load(self, path: Path) -> None:
+        state = torch.load(path, weights_only=True, map_location=self.model.action_scale.device)
+        if state["about"] != self.about:
+            differ = [k for k in self.about if state["about"].get(k) != self.about[k]]
+            raise ValueError(
+                f"checkpoint {path} is of a training with other {', '.join(differ)}; delete it, or "
+                "train as it was begun"
+            )
+        for name in self._PLAIN:
+            setattr(self, name, state[name])
+        self.model.load_state_dict(state["model"])
+        self.optimiser.load_state_dict(state["optimiser"])
+        self.generator.set_state(state["generator"].cpu())
+        self.history = [TrainingRecord(*record) for record in state["history"]]
 
 
 def train(
-    model: AffordanceCNP,
+    model: EffectNetwork,
     training: TrainingArrays,
     validation: TrainingArrays,
     config: TrainingConfig | None = None,
     progress: bool = True,
+    checkpoint: str | Path | None = None,
 ) -> list[TrainingRecord]:
     """Train a model in place and return its history; it ends with the best validated weights.
 
     Early stopping watches the mean final position error on the validation interactions.
+    checkpoint: a file, written at every validation, from which the same call continues; on one
+    machine's processor to the same bits as without the break.
     """
     config = config or TrainingConfig()
     for name, arrays in (("training", training), ("validation", validation)):
         if len(arrays) == 0:
             raise ValueError(f"{name} holds no interactions")
-    torch.manual_seed(config.seed)
-    generator = torch.Generator().manual_seed(config.seed)
-    optimiser = torch.optim.Adam(model.parameters(), lr=config.learning_rate, fused=True)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(
-        optimiser, config.learning_rate, total_steps=config.steps, pct_start=0.1
-    )
+    device = device_named(config.device)
+    model.to(device).train()
     first_floor = model.config.sigma_floor
-    history: list[TrainingRecord] = []
-    best, best_state, waited = math.inf, copy.deepcopy(model.state_dict()), 0
-    start = time.perf_counter()
-    model.train()
-    with tqdm(total=config.steps, desc="training", unit=" steps", disable=not progress) as bar:
-        for step in range(1, config.steps + 1):
-            done = step / config.steps
-            model.sigma_floor = first_floor * (config.final_sigma_floor / first_floor) ** done
-            rows = torch.randint(0, len(training), (config.batch_size,), generator=generator)
+    about = {
+        "model": repr(model.config),
+        "data": [len(training), float(training.effect.double().sum()), len(validation)],
+    }
+    run = _Run(model, config, about)
+    if checkpoint is not None and Path(checkpoint).is_file():
+        run.load(Path(checkpoint))
+    start = time.perf_counter() - run.seconds
+    with tqdm(
+        total=config.steps, initial=run.step, desc="training", unit=" steps", disable=not progress
+    ) as bar:
+        while run.step < config.steps and run.waited < config.patience:
+            run.step += 1
+            model.sigma_floor = config.sigma_floor(run.step, first_floor)
+            for group in run.optimiser.param_groups:
+                group["lr"] = config.rate(run.step)
+            rows = torch.randint(0, len(training), (config.batch_size,), generator=run.generator)
             arrays = training.select(rows)
-            if config.augment:
-                quarters, mirror = torch.randint(0, 4, (2,), generator=generator).tolist()
-                arrays = arrays.turned(quarters, mirror % 2 == 1)
             batch = sample_batch(
-                arrays, torch.arange(len(rows)), config.n_targets, config.obs_max, generator
+                _augmented(arrays) if config.augment else arrays,
+                torch.arange(len(rows)),
+                config.n_targets,
+                config.obs_max,
+                run.generator,
             )
-            loss = model.loss(
-                batch.image, batch.observations, batch.t_target, batch.action, batch.effect
-            )
-            optimiser.zero_grad(set_to_none=True)
-            loss.backward()
-            torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
-            optimiser.step()
-            schedule.step()
+            loss = _step(model, run.optimiser, _to(batch, device))
+            if config.ema:
+                decay = min(config.ema, run.step / (run.step + 10))
+                for name, value in model.state_dict().items():
+                    run.mean[name].lerp_(value, 1 - decay)
             bar.update()
-            if step % config.validate_every and step != config.steps:
+            if run.step % config.validate_every and run.step != config.steps:
                 continue
-            seconds = time.perf_counter() - start
+            state = {k: v.clone() for k, v in model.state_dict().items()}
+            candidate = {k: v.clone() for k, v in run.mean.items()} if config.ema else state
+            model.load_state_dict(candidate)
             error = float(final_errors_m(model, validation).mean())
-            history.append(TrainingRecord(step, seconds, float(loss.detach()), error))
-            bar.set_postfix_str(f"validation {error * 1000:.2f} mm")
-            if error < best:
-                best, best_state, waited = error, copy.deepcopy(model.state_dict()), 0
-            else:
-                waited += 1
-            if waited >= config.patience or seconds > 60 * config.max_minutes:
+            model.load_state_dict(state)
+            run.seconds = time.perf_counter() - start
+            run.history.append(TrainingRecord(run.step, run.seconds, float(loss), error))
+            bar.set_postfix_str(f"loss {float(loss):.2f}, validation {error * 1000:.2f} mm")
+            run.waited += 1
+            if error < run.best:
+                run.best, run.best_state, run.waited = error, candidate, 0
+                run.best_floor = model.sigma_floor
+            if checkpoint is not None:
+                run.save(Path(checkpoint))
+            if run.seconds > 60 * config.max_minutes:
                 break
-    model.load_state_dict(best_state)
-    model.eval()
-    return history
+    model.load_state_dict(run.best_state)
+    model.sigma_floor = run.best_floor
+    model.cpu().eval()
+    return run.history
+
+
+def _step(model: EffectNetwork, optimiser: torch.optim.Optimizer, batch: Batch) -> torch.Tensor:
+    loss = batch_loss(model, batch)
+    optimiser.zero_grad(set_to_none=True)
+    loss.backward()
+    torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+    optimiser.step()
+    return loss.detach()
+
+
+def batch_loss(model: EffectNetwork, batch: Batch) -> torch.Tensor:
+    """Mean negative log-likelihood of a batch's targets."""
+    return model.loss(batch.image, batch.observations, batch.t_target, batch.action, batch.effect)
+
+
+def literal_draw(arrays: TrainingArrays, obs_max: int, generator: torch.Generator) -> Batch:
+    """The paper's draw: one trajectory, k observations, k uniform in 1 … obs_max, one target.
+
+    Action and effect are observed at the same times; w₁ is 1, 0 or uniform between, one in three.
+    """
+
+    def draw(high: int, n: int = 1) -> torch.Tensor:
+        return torch.randint(high, (n,), generator=generator)
+
+    row, last = int(draw(len(arrays))), len(arrays.phase)
+    at, target = draw(last, 1 + int(draw(obs_max))), draw(last)
+    kind, weight = int(draw(3)), torch.rand(1, generator=generator)
+    seen = torch.ones(1, len(at), dtype=torch.bool)
+    observations = Observations(
+        arrays.action[row, at][None], arrays.phase[at][None], seen,
+        arrays.effect[row, at][None], arrays.phase[at][None], seen,
+        weight if kind == 2 else torch.tensor([float(kind)]),
+    )  # fmt: skip
+    return Batch(
+        arrays.image[row][None],
+        observations,
+        arrays.phase[target][None],
+        arrays.action[row, target][None],
+        arrays.effect[row, target][None],
+    )
+
+
+def train_literal(
+    model: EffectNetwork,
+    training: TrainingArrays,
+    iterations: int,
+    obs_max: int = 10,
+    learning_rate: float = 1e-4,
+    seed: int = 0,
+) -> list[float]:
+    """The paper's loop (Section 3.2): one trajectory and one target an iteration, Adam.
+
+    Trains in place and returns the losses. A million iterations, as in the paper, take hours.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    optimiser = torch.optim.Adam(model.parameters(), lr=learning_rate)
+    losses = []
+    for _ in range(iterations):
+        loss = batch_loss(model, literal_draw(training, obs_max, generator))
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        losses.append(loss.item())
+    return losses

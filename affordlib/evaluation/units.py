@@ -1,0 +1,357 @@
+"""Cross-validation in units that can be interrupted: (model, data set, size, fold, seed).
+
+A unit trains one model on the training part of a fold, stops it early on the validation part, and
+asks it about the test part: the image and the commanded action at t = 0 and t = 1, no effect. Its
+answers are written, whole or not at all, to `data/results/parts/` with the hashes of its
+configuration and of its data; a part that is there is not made again. `tables.py` makes the tables.
+
+    python -m affordlib.evaluation.units --models film,paper --sets push --folds 3
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from functools import lru_cache
+from itertools import product
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from tqdm.auto import tqdm
+
+from affordlib.evaluation.answers import (
+    baseline_answers,
+    believable,
+    logistic_answers,
+    network_answers,
+    rounded,
+    summary,
+)
+from affordlib.evaluation.baselines import BASELINES
+from affordlib.evaluation.inverse import along_effect, executed_record, inverse_record
+from affordlib.interactions import (
+    Normaliser,
+    TrainingArrays,
+    open_interactions,
+    split_interactions,
+)
+from affordlib.interactions.store import stored_sha256
+from affordlib.models.calibration import fit_temperature
+from affordlib.models.checkpoint import build
+from affordlib.models.cnp import CNPConfig
+from affordlib.models.film import FiLMConfig
+from affordlib.models.make_checkpoints import SHIPPED
+from affordlib.models.training import train
+from affordlib.paths import repo_root, resolve_out_dir
+from affordlib.results import write_text_atomically
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from dask.distributed import Client
+
+    from affordlib.models.network import EffectNetwork, NetworkConfig
+    from affordlib.models.training import TrainingConfig
+
+FORMAT = 1
+"""Counts the changes of code that change a unit's numbers without changing its configuration."""
+
+N_FOLDS = 10
+FEW_STEPS = 800
+"""Of training on the sets of 100 interactions."""
+
+PARTS = "data/results/parts"
+NETWORKS = ("paper", "film", "paper_push_frame", "film_table_frame")
+MODELS = (*NETWORKS, *BASELINES, "logistic")
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is asked of a data set: channels, which of its objects' symmetries hold, a test set.
+
+    best_effects: what FiLM and the baselines foresee, where the paper's network foresees less;
+    also: a set that tests beside the folds; symmetries: (quarter turns, mirrored) under which the
+    primitive stays itself, None where the training turns and mirrors by itself, as for pushes.
+    """
+
+    action_channels: tuple[str, ...]
+    effect_channels: tuple[str, ...]
+    symmetries: tuple[tuple[int, bool], ...] | None = None
+    also: str | None = None
+    best_effects: tuple[str, ...] = ()
+
+    @property
+    def all_effects(self) -> tuple[str, ...]:
+        return self.best_effects or self.effect_channels
+
+
+TASKS: dict[str, Task] = {
+    "push": Task(("x", "y"), ("x", "y"), also="push_test", best_effects=("x", "y", "yaw")),
+    "drag": Task(("x", "y"), ("x", "y")),
+    "grasp": Task(("z", "gripper"), ("z",), ((0, False), (0, True), (2, False), (2, True))),
+    "rotate": Task(("yaw", "gripper"), ("yaw",), ((0, False), (2, False))),
+}
+
+
+@dataclass(frozen=True)
+class Unit:
+    """One training and one test; n counts the interactions of which ten folds are made."""
+
+    model: str
+    data: str
+    n: int | str = "all"
+    fold: int = 0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, known in (("model", MODELS), ("data", tuple(TASKS))):
+            if getattr(self, name) not in known:
+                raise ValueError(f"{name} must be one of {known}, got {getattr(self, name)!r}")
+        if self.n != "all" and (not isinstance(self.n, int) or self.n < N_FOLDS):
+            raise ValueError(f'n must be "all" or at least {N_FOLDS}, got {self.n!r}')
+        if self.fold not in range(N_FOLDS):
+            raise ValueError(f"fold must lie in [0, {N_FOLDS - 1}], got {self.fold!r}")
+        if self.model == "logistic" and self.data != "grasp":
+            raise ValueError(f"model 'logistic' tells the success of grasps, not {self.data!r}")
+        if self.data not in ("push", "drag") and self.model.endswith("_frame"):
+            raise ValueError(f"data {self.data!r} has no direction, so model {self.model!r} no use")
+
+    @property
+    def file(self) -> str:
+        """The name of its part."""
+        return f"{self.data}-{self.model}-{self.n}-fold{self.fold}-seed{self.seed}.json"
+
+
+def learner(unit: Unit) -> tuple[NetworkConfig, TrainingConfig] | None:
+    """The network of a unit and its training; None for a baseline.
+
+    Both are those of the shipped checkpoints; the sets of 100 grasps and rotations get fewer steps.
+    """
+    if unit.model not in NETWORKS:
+        return None
+    task, film = TASKS[unit.data], unit.model.startswith("film")
+    shipped = SHIPPED["push_film" if film else "push_cnp"]
+    push_frame = unit.model in ("film", "paper_push_frame") and task.symmetries is None
+    network = (FiLMConfig if film else CNPConfig)(
+        action_channels=task.action_channels,
+        effect_channels=task.all_effects if film else task.effect_channels,
+        frame="push" if push_frame else "table",
+    )
+    training = replace(shipped.training, seed=unit.seed)
+    if task.symmetries is not None:
+        training = replace(training, augment=False, steps=FEW_STEPS)
+    return network, training
+
+
+def configuration_sha256(unit: Unit) -> str:
+    """Hash of all that decides a unit's numbers beside its data."""
+    told: dict[str, Any] = {
+        "format": FORMAT,
+        "unit": asdict(unit),
+        "task": asdict(TASKS[unit.data]),
+    }
+    if configs := learner(unit):
+        network, training = configs
+        told |= {"network": type(network).__name__, **_chosen(network)}
+        told |= {f"training_{name}": value for name, value in _chosen(training).items()}
+    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+
+
+def _chosen(config: NetworkConfig | TrainingConfig) -> dict[str, Any]:
+    """What differs from the defaults: an option that is added later, and off, changes no hash."""
+    chosen = {f.name: getattr(config, f.name) for f in fields(config)}
+    defaults = {f.name: f.default for f in fields(config)}
+    apart = ("max_minutes", "device")
+    return {k: v for k, v in chosen.items() if v != defaults[k] and k not in apart}
+
+
+def data_sha256(unit: Unit) -> dict[str, str]:
+    """Hashes of the sets that a unit reads."""
+    names = [unit.data, TASKS[unit.data].also]
+    return {name: stored_sha256(name) for name in names if name}
+
+
+def hashes(unit: Unit) -> dict[str, Any]:
+    """What a part must hold to be this unit's."""
+    return {"configuration_sha256": configuration_sha256(unit), "data_sha256": data_sha256(unit)}
+
+
+def read_part(unit: Unit, folder: Path) -> dict[str, Any] | None:
+    """A unit's part; None when there is none, ValueError when it is another configuration's."""
+    path = folder / unit.file
+    if not path.is_file():
+        return None
+    part = json.loads(path.read_text())
+    for name, expected in hashes(unit).items():
+        if part.get(name) != expected:
+            raise ValueError(
+                f"part {unit.file} has another {name} than its unit has now; delete it and run "
+                "the unit again"
+            )
+    return part
+
+
+@lru_cache(maxsize=4)
+def _open(name: str) -> xr.Dataset:
+    return open_interactions(name)
+
+
+def run_unit(unit: Unit, folder: Path, progress: bool = False) -> bool:
+    """Train and ask one unit, and write its part; whether that had to be done.
+
+    Broken off while it trains, it goes on from its last validation. A stale part is replaced.
+    """
+    try:
+        if read_part(unit, folder) is not None:
+            return False
+    except ValueError:
+        pass  # of an earlier configuration or data: made again
+    data, task = _open(unit.data), TASKS[unit.data]
+    n = data.sizes["interaction"] if unit.n == "all" else int(unit.n)
+    if n > data.sizes["interaction"]:
+        raise ValueError(f"n = {n}, but {unit.data!r} has {data.sizes['interaction']} interactions")
+    split = split_interactions(n, unit.seed, unit.fold, N_FOLDS)
+    tests = {"fold": (data, split.test)}
+    if task.also:
+        other = _open(task.also)
+        tests["fixed"] = (other, np.arange(other.sizes["interaction"]))
+    part: dict[str, Any] = {"unit": asdict(unit), "n": n} | hashes(unit)
+    configs = learner(unit)
+    if configs is None:
+        told = {name: _guess(unit, data, split.train, *test) for name, test in tests.items()}
+        if (unit.model, unit.data) == ("constant", "push"):
+            kept = believable(data, split.test)
+            part["inverse"] = executed_record(data, kept, along_effect(data, kept))
+    else:
+        halfway = folder / f".{unit.file}.{part['configuration_sha256'][:8]}.pt"
+        model, part["training"] = _fit(unit, *configs, data, split, halfway, progress)
+        told = {name: network_answers(model, *test) for name, test in tests.items()}
+        if unit.data == "push":
+            part["inverse"] = inverse_record(model, data, split.test)
+    part["fold_test"] = told["fold"]
+    if "fixed" in told:
+        part["fixed_test"] = summary(told["fixed"])
+    write_text_atomically(folder / unit.file, json.dumps(rounded(part), allow_nan=False) + "\n")
+    if configs:
+        halfway.unlink(missing_ok=True)
+    return True
+
+
+def _guess(
+    unit: Unit, data: xr.Dataset, train_on: np.ndarray, other: xr.Dataset, asked: np.ndarray
+) -> dict[str, Any]:
+    if unit.model == "logistic":
+        return logistic_answers(data, train_on, other, asked)
+    task = TASKS[unit.data]
+    channels = task.action_channels, task.all_effects
+    return baseline_answers(BASELINES[unit.model], channels, data, train_on, other, asked)
+
+
+def _fit(
+    unit: Unit,
+    network: NetworkConfig,
+    config: TrainingConfig,
+    data: xr.Dataset,
+    split: Any,
+    halfway: Path,
+    progress: bool,
+) -> tuple[EffectNetwork, dict[str, Any]]:
+    channels = network.action_channels, network.effect_channels
+    training = TrainingArrays.from_dataset(data, split.train, *channels)
+    validation = TrainingArrays.from_dataset(data, split.validation, *channels)
+    symmetries = TASKS[unit.data].symmetries
+    if symmetries:
+        training = _all_of([training.turned(*symmetry) for symmetry in symmetries])
+    torch.manual_seed(config.seed)
+    model = build(network, Normaliser.fit(training))
+    history = train(model, training, validation, config, progress, halfway)
+    fit_temperature(model, validation)
+    best = min(record.validation_error_m for record in history)
+    return model, {
+        "steps": history[-1].step,
+        "seconds": history[-1].seconds,
+        "validation_error": best,
+        "temperature": model.temperature,
+    }
+
+
+def _all_of(parts: list[TrainingArrays]) -> TrainingArrays:
+    tensors = ("image", "action", "effect")
+    together = {name: torch.cat([getattr(p, name) for p in parts]) for name in tensors}
+    # Actions turned along with their objects are what these primitives command anyway.
+    return replace(parts[0], **(together | {"action": parts[0].action.repeat(len(parts), 1, 1)}))
+
+
+def run_units(
+    units: Sequence[Unit],
+    out_dir: str | Path = PARTS,
+    client: Client | None = None,
+    progress: bool = True,
+) -> int:
+    """Run what is missing of some units, in order, or on a Dask client's workers; how many ran.
+
+    Workers write their parts themselves, so `out_dir` must be a folder that they share.
+    """
+    folder = resolve_out_dir(out_dir)
+    ran = 0
+    with tqdm(total=len(units), desc="units", unit=" units", disable=not progress) as bar:
+        for unit, made in _here(units, folder) if client is None else _away(units, folder, client):
+            ran += made
+            bar.set_postfix_str(unit.file.removesuffix(".json"))
+            bar.update()
+    return ran
+
+
+def _here(units: Sequence[Unit], folder: Path) -> Iterator[tuple[Unit, bool]]:
+    for unit in units:
+        yield unit, run_unit(unit, folder)
+
+
+def _away(units: Sequence[Unit], folder: Path, client: Client) -> Iterator[tuple[Unit, bool]]:
+    from dask.distributed import as_completed
+
+    futures = {client.submit(run_unit, unit, folder, pure=False): unit for unit in units}
+    try:
+        for future in as_completed(list(futures)):
+            yield futures[future], future.result()
+    finally:
+        client.cancel(list(futures))
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Train and test models in folds; finished parts are kept, interrupted ones go on."""
+    parser = argparse.ArgumentParser(
+        prog="python -m affordlib.evaluation.units", description=main.__doc__
+    )
+    parser.add_argument("--models", default="film,paper", help=f"of {','.join(MODELS)}")
+    parser.add_argument("--sets", default="push", help=f"of {','.join(TASKS)}")
+    parser.add_argument("--n", default="all", help="interactions of the set that are used")
+    parser.add_argument("--folds", type=int, default=N_FOLDS, help="the first of the ten")
+    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--out", default=PARTS)
+    parser.add_argument("--scheduler", help="address of a Dask scheduler")
+    parser.add_argument("--workers", type=int, default=1, help="processes of this machine")
+    options = parser.parse_args(argv)
+    n = options.n if options.n == "all" else int(options.n)
+    seeds, folds = range(options.seeds), range(options.folds)
+    chosen = product(options.sets.split(","), seeds, folds, options.models.split(","))
+    units = [Unit(model, data, n, fold, seed) for data, seed, fold, model in chosen]
+    if options.scheduler or options.workers > 1:
+        from dask.distributed import Client, LocalCluster
+
+        cluster = options.scheduler or LocalCluster(options.workers, threads_per_worker=1)
+        with Client(cluster) as client:
+            ran = run_units(units, options.out, client)
+    else:
+        ran = run_units(units, options.out)
+    print(f"{ran} of {len(units)} units run, the others were there; {repo_root() / options.out}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,117 @@
+"""A conditional neural process with cross-attention: what the paper names as future work.
+
+Each observation is a token, each cell of the image's last feature map another. A target asks with
+its phase and attends to them, in a few blocks; instead of the mean of equation (3), each target
+weighs what is observed for itself. The blend w₁ of equation (2) enters as log w₁ and log w₂, added
+to the attention's logits. Source: Kim et al., Attentive neural processes, ICLR 2019.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from affordlib.models.film import convolutions, dense, split_outputs, waves
+from affordlib.models.network import EffectNetwork, NetworkConfig, with_time
+from affordlib.types import IMAGE_PIXELS, Observations
+
+if TYPE_CHECKING:
+    from affordlib.interactions.batches import Normaliser
+
+
+@dataclass(frozen=True)
+class AttentionConfig(NetworkConfig):
+    """Sizes of the network; width must be a multiple of heads. See `FiLMConfig`."""
+
+    frame: str = "push"
+    width: int = 128
+    blocks: int = 3
+    heads: int = 4
+    convolutions: tuple[int, ...] = (16, 32, 64, 64)
+    waves: int = 4
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.heads < 1 or self.width % self.heads:
+            raise ValueError(f"width must be a multiple of heads, got {self.width}, {self.heads}")
+
+
+class CrossAttention(nn.Module):
+    """x + attention of x to the tokens, then x + a small network of it, normalised before each."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.norm, self.token_norm = nn.LayerNorm(width), nn.LayerNorm(width)
+        self.query, self.key_value = nn.Linear(width, width), nn.Linear(width, 2 * width)
+        self.project = nn.Linear(width, width)
+        self.mlp = nn.Sequential(nn.LayerNorm(width), *dense(width, 2 * width, width))
+
+    def forward(
+        self,
+        x: Float[Tensor, "b t w"],
+        tokens: Float[Tensor, "b k w"],
+        bias: Float[Tensor, "b k"],
+    ) -> Float[Tensor, "b t w"]:
+        def by_head(values: Tensor) -> Tensor:
+            return values.unflatten(-1, (self.heads, -1)).transpose(1, 2)
+
+        key, value = self.key_value(self.token_norm(tokens)).chunk(2, dim=-1)
+        query = by_head(self.query(self.norm(x)))
+        logits = bias[:, None, None].expand(-1, -1, x.shape[1], -1)
+        seen = F.scaled_dot_product_attention(query, by_head(key), by_head(value), logits)
+        x = x + self.project(seen.transpose(1, 2).flatten(2))
+        return x + self.mlp(x)
+
+
+class AttentiveCNP(EffectNetwork):
+    """Relates object image, action and effect; satisfies `EffectModel`."""
+
+    def __init__(self, config: AttentionConfig, normaliser: Normaliser) -> None:
+        super().__init__(config, normaliser)
+        c, w = config, config.width
+        n_a, n_e = len(c.action_channels), len(c.effect_channels)
+        self.side = math.ceil(IMAGE_PIXELS / 2 ** len(c.convolutions))
+        self.image_encoder = convolutions(c.convolutions)
+        self.place = nn.Parameter(0.02 * torch.randn(self.side**2, w))
+        self.image_token = nn.Linear(c.convolutions[-1], w)
+        self.image_summary = nn.Linear(c.convolutions[-1] * self.side**2, w)
+        self.action_token = nn.Sequential(*dense(n_a + 1, w, w, w))
+        self.effect_token = nn.Sequential(*dense(n_e + 1, w, w, w))
+        self.ask = nn.Linear(2 * c.waves + 1, w)
+        self.blocks = nn.ModuleList(CrossAttention(w, c.heads) for _ in range(c.blocks))
+        self.last = nn.Sequential(nn.LayerNorm(w), *dense(w, w, 2 * (n_a + n_e)))
+
+    def features(self, scaled_image: Float[Tensor, "b 2 48 48"]) -> Float[Tensor, "b f"]:
+        """The last feature map, flattened."""
+        return self.image_encoder(scaled_image).flatten(1)
+
+    def outputs(
+        self, features: Tensor, observations: Observations, t_target: Tensor
+    ) -> tuple[Tensor, ...]:
+        """(μ_a, σ_a, μ_e, σ_e), each (B, T, C) and standardised."""
+        o = observations
+        b = len(o.weight)
+        cells = features.unflatten(1, (-1, self.side**2)).transpose(1, 2)
+        image = (self.image_token(cells) + self.place).expand(b, -1, -1)
+        tokens = torch.cat(
+            [
+                image,
+                self.action_token(with_time(o.action / self.action_scale, o.action_t)),
+                self.effect_token(with_time(o.effect / self.effect_scale, o.effect_t)),
+            ],
+            dim=1,
+        )
+        w_1 = o.weight[:, None]
+        share = torch.cat([w_1 * o.action_mask, (1 - w_1) * o.effect_mask], dim=1)
+        bias = F.pad(share.log(), (image.shape[1], 0))
+        x = self.ask(waves(t_target, self.config.waves)) + self.image_summary(features)[:, None]
+        for block in self.blocks:
+            x = block(x, tokens, bias)
+        return split_outputs(self.last(x), self.config, self.sigma_floor)

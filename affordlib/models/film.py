@@ -1,0 +1,150 @@
+"""Our improved network: a small CNN whose features modulate residual blocks (FiLM).
+
+    r      = w₁ mean h_a(a_i) + w₂ mean h_e(e_i)             as in the paper, equations (2) and (3)
+    x_0    = W {r, f(γ_o), φ(t_target)}
+    x_k+1  = x_k + W₂ ς(γ_k ∘ W₁ n(x_k) + β_k),  (γ_k - 1, β_k) = V_k f(γ_o)
+    g(x_K) = (μ_a, σ_a, μ_e, σ_e)
+
+f: image encoder, ς: SiLU, n: layer normalisation, φ: t with its first sines and cosines. Source:
+Perez et al., FiLM: visual reasoning with a general conditioning layer, AAAI 2018.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from affordlib.models.network import EffectNetwork, NetworkConfig, masked_mean, with_time
+from affordlib.types import IMAGE_PIXELS, Observations
+
+if TYPE_CHECKING:
+    from affordlib.interactions.batches import Normaliser
+
+
+@dataclass(frozen=True)
+class FiLMConfig(NetworkConfig):
+    """Sizes of the network, by default in the frame of the push.
+
+    width: of the residual blocks; image_features: of f(γ_o); convolutions: channels, each halving
+    the image; waves: how many sines and cosines of the phase the blocks see.
+    """
+
+    frame: str = "push"
+    width: int = 128
+    blocks: int = 3
+    image_features: int = 64
+    convolutions: tuple[int, ...] = (16, 32, 64, 64)
+    waves: int = 4
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("width", "blocks", "image_features", "waves"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+                raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}")
+        if not 1 <= len(self.convolutions) <= 4:
+            raise ValueError(f"convolutions must name 1 to 4 widths, got {self.convolutions!r}")
+
+
+class FiLMBlock(nn.Module):
+    """x + W₂ ς(γ ∘ W₁ n(x) + β), γ and β linear in the condition."""
+
+    def __init__(self, width: int, condition: int) -> None:
+        super().__init__()
+        self.norm = nn.LayerNorm(width)
+        self.first, self.second = nn.Linear(width, width), nn.Linear(width, width)
+        self.modulation = nn.Linear(condition, 2 * width)
+        nn.init.zeros_(self.second.weight)
+        nn.init.zeros_(self.second.bias)
+
+    def forward(
+        self, x: Float[Tensor, "b t w"], condition: Float[Tensor, "#b c"]
+    ) -> Float[Tensor, "b t w"]:
+        gain, shift = self.modulation(condition)[:, None].chunk(2, dim=-1)
+        return x + self.second(F.silu((1 + gain) * self.first(self.norm(x)) + shift))
+
+
+def convolutions(widths: tuple[int, ...]) -> nn.Sequential:
+    """(B, 2, n, n) → (B, widths[-1], n / 2^k, n / 2^k), k convolutions, each halving the image."""
+    layers: list[nn.Module] = []
+    for n_in, n_out in pairwise((2, *widths)):
+        layers += [nn.Conv2d(n_in, n_out, 3, stride=2, padding=1), nn.SiLU()]
+    return nn.Sequential(*layers)
+
+
+def waves(t: Float[Tensor, "b t"], n: int) -> Float[Tensor, "b t w"]:
+    """t with n sines and cosines of π k t: (B, T, 2n + 1)."""
+    angle = t[..., None] * (math.pi * torch.arange(1, n + 1, device=t.device))
+    return torch.cat([t[..., None], angle.sin(), angle.cos()], dim=-1)
+
+
+class FiLMNetwork(EffectNetwork):
+    """Relates object image, action and effect; satisfies `EffectModel`."""
+
+    def __init__(self, config: FiLMConfig, normaliser: Normaliser) -> None:
+        super().__init__(config, normaliser)
+        c, w = config, config.width
+        n_a, n_e = len(c.action_channels), len(c.effect_channels)
+        side = math.ceil(IMAGE_PIXELS / 2 ** len(c.convolutions))
+        self.image_encoder = nn.Sequential(
+            convolutions(c.convolutions),
+            nn.Flatten(),
+            *dense(c.convolutions[-1] * side**2, 2 * c.image_features, c.image_features),
+        )
+        self.action_encoder = nn.Sequential(*dense(n_a + 1, w, w, w))
+        self.effect_encoder = nn.Sequential(*dense(n_e + 1, w, w, w))
+        self.merge = nn.Linear(w + c.image_features + 2 * c.waves + 1, w)
+        self.blocks = nn.ModuleList(FiLMBlock(w, c.image_features) for _ in range(c.blocks))
+        self.head = nn.Sequential(nn.LayerNorm(w), nn.Linear(w, w), nn.SiLU())
+        self.last = nn.Linear(w, 2 * (n_a + n_e))
+
+    def features(self, scaled_image: Float[Tensor, "b 2 48 48"]) -> Float[Tensor, "b f"]:
+        """f(γ_o): (B, F) of standardised depth and mask."""
+        return self.image_encoder(scaled_image)
+
+    def represent(self, observations: Observations) -> Float[Tensor, "b w"]:
+        """r: (B, W), equations (2) and (3), the means taken over what is observed."""
+        o = observations
+        h_a = self.action_encoder(with_time(o.action / self.action_scale, o.action_t))
+        h_e = self.effect_encoder(with_time(o.effect / self.effect_scale, o.effect_t))
+        w_1 = o.weight[:, None]
+        return w_1 * masked_mean(h_a, o.action_mask) + (1 - w_1) * masked_mean(h_e, o.effect_mask)
+
+    def outputs(
+        self, features: Tensor, observations: Observations, t_target: Tensor
+    ) -> tuple[Tensor, ...]:
+        """(μ_a, σ_a, μ_e, σ_e), each (B, T, C) and standardised."""
+        r = self.represent(observations)
+        known = torch.cat([r, features.expand(len(r), -1)], dim=1)
+        # Only the phase differs between the targets of a query, so the rest is merged once.
+        split = known.shape[1]
+        base = F.linear(known, self.merge.weight[:, :split], self.merge.bias)
+        phase = waves(t_target, self.config.waves)
+        x = base[:, None] + F.linear(phase, self.merge.weight[:, split:])
+        for block in self.blocks:
+            x = block(x, features)
+        return split_outputs(self.last(self.head(x)), self.config, self.sigma_floor)
+
+
+def split_outputs(
+    y: Float[Tensor, "b t _"], config: NetworkConfig, sigma_floor: float
+) -> tuple[Tensor, ...]:
+    """(μ_a, σ_a, μ_e, σ_e) of a last layer's values (B, T, 2 C_a + 2 C_e)."""
+    n_a, n_e = len(config.action_channels), len(config.effect_channels)
+    mu_a, raw_a, mu_e, raw_e = y.split([n_a, n_a, n_e, n_e], dim=-1)
+    return mu_a, sigma_floor + F.softplus(raw_a), mu_e, sigma_floor + F.softplus(raw_e)
+
+
+def dense(*widths: int) -> list[nn.Module]:
+    """Linear layers of the given widths, SiLU between them."""
+    layers: list[nn.Module] = []
+    for n_in, n_out in pairwise(widths):
+        layers += [nn.Linear(n_in, n_out), nn.SiLU()]
+    return layers[:-1]

@@ -1,0 +1,222 @@
+"""What all networks share: scales, ranges, frame and loss; subclasses are the architectures."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from affordlib.interactions.batches import Normaliser, plane_of, touches_edge, turn
+from affordlib.models.frame import (
+    FRAMES,
+    heading,
+    inverse,
+    turn_image,
+    turn_observations,
+    turn_prediction,
+)
+from affordlib.types import Observations, Prediction
+
+RADIUS_TOLERANCE_M = 0.02
+_END_PHASE = 1e-3
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """Channels and frame of a network.
+
+    frame: "table", or "push" to turn everything into the direction of the push, see `frame.py`.
+    sigma_floor is in standardised units. temperature multiplies σ of effects, see `calibration.py`.
+    """
+
+    action_channels: tuple[str, ...] = ("x", "y")
+    effect_channels: tuple[str, ...] = ("x", "y")
+    sigma_floor: float = 0.1
+    frame: str = "table"
+    temperature: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.frame not in FRAMES:
+            raise ValueError(f"frame must be one of {FRAMES}, got {self.frame!r}")
+        for name in ("action_channels", "effect_channels"):
+            channels = tuple(getattr(self, name))
+            if not channels:
+                raise ValueError(f"{name} must name at least one channel, got none")
+            if self.frame == "push" and not plane_of(channels):
+                raise ValueError(f'{name} must name x and y for frame="push", got {channels}')
+            object.__setattr__(self, name, channels)
+        for name, high in (("sigma_floor", 10.0), ("temperature", 1000.0)):
+            if not 0 < getattr(self, name) < high:
+                raise ValueError(f"{name} must lie in (0, {high:g}), got {getattr(self, name)!r}")
+
+
+class EffectNetwork(nn.Module):
+    """A network that satisfies `EffectModel`.
+
+    Inputs and outputs are in metres and radians, in the frame of the table; scaling by the
+    normaliser and turning into the network's frame happen inside. In the frame of the push the
+    features of an image are the image itself, since it is turned by what is observed.
+    """
+
+    def __init__(self, config: NetworkConfig, normaliser: Normaliser) -> None:
+        super().__init__()
+        self.config, self.normaliser = config, normaliser
+        self.action_channels = config.action_channels
+        self.effect_channels = config.effect_channels
+        self.sigma_floor, self.temperature = config.sigma_floor, config.temperature
+        for kind in ("action", "effect"):
+            width = len(getattr(config, f"{kind}_channels"))
+            if len(getattr(normaliser, f"{kind}_scale")) != width:
+                raise ValueError(
+                    f"normaliser {kind}_scale must have {width} channels as the config does"
+                )
+        for name in ("action_scale", "effect_scale", "image_mean", "image_std"):
+            values = torch.tensor(getattr(normaliser, name), dtype=torch.float32)
+            self.register_buffer(name, values, persistent=False)
+
+    @abstractmethod
+    def features(self, scaled_image: Float[Tensor, "b 2 n n"]) -> Float[Tensor, "b f"]:
+        """What the network reads from a standardised image."""
+
+    @abstractmethod
+    def outputs(
+        self,
+        features: Float[Tensor, "#b f"],
+        observations: Observations,
+        t_target: Float[Tensor, "b t"],
+    ) -> tuple[Float[Tensor, "b t _"], ...]:
+        """(μ_a, σ_a, μ_e, σ_e), each (B, T, C), standardised, in the network's frame."""
+
+    @property
+    def _channels(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        return self.action_channels, self.effect_channels
+
+    def _look(self, image: Tensor) -> Tensor:
+        mean, std = (v[:, None, None] for v in (self.image_mean, self.image_std))
+        scaled = (image - mean) / std
+        return self.features(scaled.contiguous(memory_format=torch.channels_last))
+
+    def _enter(self, image: Tensor, o: Observations) -> tuple[Tensor, Observations, Tensor]:
+        """Features and observations in the frame of the push, and its headings (B, 2)."""
+        towards = heading(o, *self._channels)
+        back = inverse(towards)
+        turned = turn_observations(o, back, *self._channels)
+        return self._look(turn_image(image, back)), turned, towards
+
+    def encode(self, image: Float[Tensor, "b 2 n n"]) -> Float[Tensor, "b f"]:
+        """Features (B, F) of depth and mask (B, 2, 48, 48).
+
+        Raises ValueError where the object is unlike those the network was trained on.
+        """
+        self._check_image(image)
+        return image.flatten(1) if self.config.frame == "push" else self._look(image)
+
+    def predict(self, features: Tensor, observations: Observations, t_target: Tensor) -> Prediction:
+        """Mean and σ (B, T, C) at t_target (B, T); features (B, F), or (1, F) for all.
+
+        Raises ValueError for actions that start or end elsewhere than those trained on.
+        """
+        self._check_action(observations)
+        push = self.config.frame == "push"
+        if push:
+            pixels = math.isqrt(features.shape[1] // 2)
+            image = features.reshape(-1, 2, pixels, pixels)
+            features, observations, towards = self._enter(image, observations)
+        mu_a, sigma_a, mu_e, sigma_e = self.outputs(features, observations, t_target)
+        a, e = self.action_scale, self.effect_scale
+        prediction = Prediction(mu_a * a, sigma_a * a, mu_e * e, sigma_e * e * self.temperature)
+        return turn_prediction(prediction, towards, *self._channels) if push else prediction
+
+    def forward(
+        self, image: Tensor, observations: Observations, t_target: Tensor
+    ) -> tuple[Tensor, ...]:
+        """(μ_a, σ_a, μ_e, σ_e) in standardised units, in the network's frame."""
+        if self.config.frame == "push":
+            features, observations, _ = self._enter(image, observations)
+            return self.outputs(features, observations, t_target)
+        return self.outputs(self._look(image), observations, t_target)
+
+    def loss(
+        self,
+        image: Tensor,
+        observations: Observations,
+        t_target: Tensor,
+        action: Tensor,
+        effect: Tensor,
+    ) -> Tensor:
+        """Negative log-likelihood (Section 3.2) of the targets (B, T, C), per value.
+
+        The likelihood is of the standardised values, in the network's frame.
+        """
+        mu_a, sigma_a, mu_e, sigma_e = self(image, observations, t_target)
+        if self.config.frame == "push":
+            back = inverse(heading(observations, *self._channels))[:, None]
+            action = turn(action, self.action_channels, back, absolute_yaw=True)
+            effect = turn(effect, self.effect_channels, back, absolute_yaw=False)
+        nll_a = gaussian_nll(action / self.action_scale, mu_a, sigma_a)
+        nll_e = gaussian_nll(effect / self.effect_scale, mu_e, sigma_e)
+        return (nll_a.mean() + nll_e.mean()) / 2
+
+    def _check_image(self, image: Tensor) -> None:
+        n, mask = self.normaliser, image[:, 1]
+        if n.mask_share is None:
+            return
+        low, high = n.mask_share
+        share, at_edge = mask.mean(dim=(1, 2)), touches_edge(mask)
+        strange = ~((share > low / 2) & (share < 1.5 * high))
+        if strange.any():
+            raise ValueError(
+                f"image {int(strange.nonzero()[0])}: the object covers "
+                f"{float(share[strange][0]):.1%} of it, those trained on {low:.1%} to {high:.1%}; "
+                "train on such objects first"
+            )
+        if not n.at_edge and at_edge.any():
+            raise ValueError(
+                f"image {int(at_edge.nonzero()[0])}: the object reaches its edge, none trained on "
+                "does; centre the crop on the object, or train on such objects first"
+            )
+
+    def _check_action(self, o: Observations) -> None:
+        n, plane = self.normaliser, plane_of(self.action_channels)
+        if n.start_radius_m is None or not plane:
+            return
+        radius = o.action.detach()[..., plane].norm(dim=-1)
+        for name, (low, high), at_end in (
+            ("starts", n.start_radius_m, o.action_t < _END_PHASE),
+            ("ends", n.end_radius_m, o.action_t > 1 - _END_PHASE),
+        ):
+            far = (radius < low - RADIUS_TOLERANCE_M) | (radius > high + RADIUS_TOLERANCE_M)
+            strange = far & at_end & o.action_mask
+            if strange.any():
+                raise ValueError(
+                    f"an observed action {name} {float(radius[strange][0]):.3f} m from the "
+                    f"object's centre, those trained on {low:.3f} to {high:.3f} m; train on such "
+                    "actions first"
+                )
+
+
+def with_time(values: Tensor, t: Tensor) -> Tensor:
+    """Values (..., C) and their phases (...): (..., C + 1)."""
+    return torch.cat([values, t[..., None]], dim=-1)
+
+
+def masked_mean(h: Float[Tensor, "b n c"], mask: Bool[Tensor, "b n"]) -> Float[Tensor, "b c"]:
+    """Mean (B, H) over the observed of (B, n, H); zero where nothing is observed."""
+    seen = mask[..., None].to(h.dtype)
+    return (h * seen).sum(dim=1) / seen.sum(dim=1).clamp_min(1)
+
+
+def gaussian_nll(y: Tensor, mean: Tensor, std: Tensor) -> Tensor:
+    """-log N(y; mean, std²), elementwise."""
+    return 0.5 * ((y - mean) / std) ** 2 + std.log() + 0.5 * math.log(2 * math.pi)
+
+
+def he_initialise(module: nn.Module) -> None:
+    """He's initialisation for leaky layers; PyTorch's default never learns a push's direction."""
+    if isinstance(module, nn.Linear | nn.Conv2d):
+        nn.init.kaiming_normal_(module.weight, a=0.01, nonlinearity="leaky_relu")
+        nn.init.zeros_(module.bias)

@@ -1,0 +1,387 @@
+"""What holds for every network and both frames: equivariance, gradients, ranges, training."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from affordlib.interactions import Normaliser, TrainingArrays, split_interactions
+from affordlib.interactions.batches import observe_action, sample_batch
+from affordlib.models import (
+    AttentionConfig,
+    CNPConfig,
+    EffectModel,
+    FiLMConfig,
+    TrainingConfig,
+    build,
+    calibration_rows,
+    coverage,
+    fit_temperature,
+    load_checkpoint,
+    observe_pushes,
+    save_checkpoint,
+    train,
+    train_literal,
+)
+from affordlib.models.frame import heading, inverse, turn_image
+from affordlib.models.protocol import observe_final_effect
+from affordlib.models.training import batch_loss, final_errors_m, literal_draw
+from affordlib.primitives import Drag, Push
+from affordlib.types import Observations
+from affordlib.world import Cuboid
+
+YAW = {"action_channels": ("x", "y", "yaw"), "effect_channels": ("x", "y", "yaw")}
+SMALL = {"width": 32, "blocks": 2, "convolutions": (4, 8, 8, 8)}
+CONFIGS = {
+    "cnp, table": CNPConfig(**YAW),
+    "cnp, push": CNPConfig(**YAW, frame="push"),
+    "film, table": FiLMConfig(**YAW, **SMALL, frame="table"),
+    "film, push": FiLMConfig(**YAW, **SMALL),
+    "attention, push": AttentionConfig(**YAW, **SMALL),
+}
+IN_PUSH_FRAME = [name for name in CONFIGS if name.endswith("push")]
+
+
+@pytest.fixture(scope="module")
+def some(pushes):
+    """Forty pushes with the yaw of action and effect."""
+    return TrainingArrays.from_dataset(pushes, np.arange(40), *YAW.values())
+
+
+@pytest.fixture(params=CONFIGS)
+def network(request, some):
+    return made(request.param, some)
+
+
+def made(name, arrays):
+    torch.manual_seed(0)
+    network = build(CONFIGS[name], Normaliser.fit(arrays)).eval()
+    with torch.no_grad():  # blocks begin at zero; let them speak
+        for parameter in network.parameters():
+            parameter.add_(0.02 * torch.randn_like(parameter))
+    return network
+
+
+def asked(arrays, seed=0, n_targets=5):
+    """A batch of all kinds of contexts for all interactions."""
+    generator = torch.Generator().manual_seed(seed)
+    return sample_batch(arrays, torch.arange(len(arrays)), n_targets, 4, generator)
+
+
+def answers(network, image, observations, t_target):
+    told = network.predict(network.encode(image), observations, t_target)
+    return [getattr(told, f.name) for f in dataclasses.fields(told)]
+
+
+@torch.no_grad()
+def test_shapes_and_order(network, some):
+    assert isinstance(network, EffectModel)
+    batch = asked(some)
+    told = answers(network, batch.image, batch.observations, batch.t_target)
+    assert [tuple(v.shape) for v in told] == [(40, 5, 3)] * 4
+    assert all(bool((v > 0).all()) for v in (told[1], told[3]))
+    seen = batch.observations
+    order = torch.randperm(4, generator=torch.Generator().manual_seed(1))
+    shuffled = dataclasses.replace(
+        seen,
+        **{
+            f"{kind}{part}": getattr(seen, f"{kind}{part}")[:, order]
+            for kind in ("action", "effect")
+            for part in ("", "_t", "_mask")
+        },
+    )
+    for a, b in zip(told, answers(network, batch.image, shuffled, batch.t_target), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5)
+
+
+@torch.no_grad()
+def test_what_is_masked_counts_for_nothing(network, some):
+    batch = asked(some)
+    seen = batch.observations
+    hidden = dataclasses.replace(
+        seen,
+        action=torch.where(seen.action_mask[..., None], seen.action, 7.0),
+        effect=torch.where(seen.effect_mask[..., None], seen.effect, -7.0),
+    )
+    told, again = (answers(network, batch.image, o, batch.t_target) for o in (seen, hidden))
+    for a, b in zip(told, again, strict=True):
+        torch.testing.assert_close(a, b)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("name", IN_PUSH_FRAME)
+@pytest.mark.parametrize("quarters", [1, 2, 3])
+def test_a_quarter_turn_of_the_table_turns_the_answer(name, quarters, some):
+    network = made(name, some)
+    turned = some.turned(quarters)
+    a, b = asked(some), asked(turned)
+    # What was predicted is turned like data are: by the data's own turning.
+    mean_a, std_a, mean_e, std_e = answers(network, a.image, a.observations, a.t_target)
+    t_mean_a, t_std_a, t_mean_e, t_std_e = answers(network, b.image, b.observations, b.t_target)
+    told = dataclasses.replace(some, action=mean_a, effect=mean_e).turned(quarters)
+    # Where nothing tells a direction, as an effect before contact, the frame is the table's.
+    o = a.observations
+    seen_e = o.effect_mask & (o.effect[..., :2].norm(dim=-1) > 1e-3)
+    tells = o.action_mask.any(1) | (seen_e & (o.weight < 1)[:, None]).any(1)
+    tells &= heading(o, *YAW.values())[:, 1] != 0
+    assert tells.sum() > 20
+    for mine, theirs in ((told.effect, t_mean_e), (told.action[..., :2], t_mean_a[..., :2])):
+        torch.testing.assert_close(mine[tells], theirs[tells], rtol=0, atol=2e-5)
+    by = (told.action[..., 2] - t_mean_a[..., 2])[tells]
+    assert torch.remainder(by + math.pi, 2 * math.pi).sub(math.pi).abs().max() < 1e-4
+    for mine, theirs in ((std_a, t_std_a), (std_e, t_std_e)):
+        swapped = mine[..., [1, 0, 2]] if quarters % 2 else mine
+        torch.testing.assert_close(swapped[tells], theirs[tells], rtol=1e-3, atol=2e-5)
+
+
+@torch.no_grad()
+def test_any_turn_of_a_real_object_turns_the_answer_of_the_trained_model(world):
+    model, _ = load_checkpoint("push_film")
+    plane = slice(0, 2)
+    straight, errors = None, []
+    for degrees in (0, 11, 33, 45, 62, 78):
+        turn_rad = math.radians(degrees)
+        world.place(Cuboid(0.07, 0.05, 0.06), (0.0, 0.0), 0.3 + turn_rad)
+        image = torch.from_numpy(np.array(world.look()))[None]
+        pushed = [Push(theta + turn_rad) for theta in np.linspace(0, 6, 24)]
+        effect = model.predict(
+            model.encode(image), observe_pushes(model, pushed), torch.ones(24, 1)
+        ).effect_mean[:, 0, plane]
+        c, s = math.cos(turn_rad), math.sin(turn_rad)
+        effect = effect @ torch.tensor([[c, -s], [s, c]])
+        straight = effect if straight is None else straight
+        errors.append((effect - straight).norm(dim=-1))
+    assert torch.cat(errors[1:]).mean() < 0.0003
+
+
+def test_the_heading_is_the_push(some):
+    def towards(arrays, samples):
+        return heading(observe_action(arrays, samples), *YAW.values())
+
+    travel = some.action[:, -1, :2] - some.action[:, 0, :2]
+    expected = travel / travel.norm(dim=-1, keepdim=True)
+    for samples in ((0, -1), (0,), (-1, 0), (10, 20)):
+        torch.testing.assert_close(towards(some, samples), expected, atol=1e-4, rtol=0)
+    model = made("film, push", some)
+    end = torch.tensor([[0.03, -0.04, 0.1], [0.0, 0.0, 0.0]])
+    inverse_question = heading(observe_final_effect(model, end), *YAW.values())
+    torch.testing.assert_close(inverse_question, torch.tensor([[0.6, -0.8], [1.0, 0.0]]))
+
+
+def test_turning_an_image_keeps_the_object(some):
+    angle = 2 * math.pi * torch.rand(40, generator=torch.Generator().manual_seed(0))
+    towards = torch.stack([angle.cos(), angle.sin()], dim=1)
+    turned = turn_image(some.image, towards)
+    for channel, full in ((1, some.image[:, 1]), (0, 1 - some.image[:, 0])):
+        now = turned[:, 1] if channel == 1 else 1 - turned[:, 0]
+        kept = now.sum(dim=(1, 2)) / full.sum(dim=(1, 2))
+        assert (kept - 1).abs().max() < 0.01
+    again = turn_image(turned, inverse(towards))
+    assert (again - some.image)[:, 1].abs().mean() < 0.02
+    quarter = torch.tensor([[0.0, 1.0]]).expand(40, 2)
+    exact = torch.rot90(some.image, 1, (-2, -1))
+    torch.testing.assert_close(turn_image(some.image, quarter), exact, atol=1e-5, rtol=0)
+
+
+def test_turned_data_are_those_of_the_turned_push(some):
+    """Yaw turns along where it is an orientation, and mirrors where it is a change."""
+    turned = some.turned(1, mirror=True)
+    push = math.pi / 2 - torch.atan2(some.action[:, 0, 1], some.action[:, 0, 0])
+    for k in range(5):
+        expected = Push(float(push[k])).path(np.array([0.0, 1.0]))[:, [0, 1, 3]]
+        now = turned.action[k, [0, -1]].numpy()
+        np.testing.assert_allclose(now[:, :2], expected[:, :2], atol=1e-5)
+        assert np.abs(np.exp(1j * now[:, 2]) - np.exp(1j * expected[:, 2])).max() < 1e-5
+    torch.testing.assert_close(turned.effect[..., 2], -some.effect[..., 2])
+
+
+@pytest.mark.parametrize("name", IN_PUSH_FRAME)
+def test_gradients_in_effect_and_action(name, some):
+    """Planners descend them; compare with finite differences, in double precision."""
+    network = made(name, some).double()
+    features = network.encode(some.image[:1].double())
+    one = torch.ones(1, 1, dtype=torch.float64)
+    yes, no = torch.ones(1, 1, dtype=torch.bool), torch.zeros(1, 1, dtype=torch.bool)
+
+    def of_effect(effect):
+        seen = Observations(
+            torch.zeros(1, 1, 3).double(), 0 * one, no, effect[:, None], one, yes, 0 * one[0]
+        )
+        return network.predict(features, seen, one).effect_mean
+
+    def of_direction(angle):
+        start = torch.stack([angle.cos(), angle.sin(), angle + math.pi], dim=-1) * one.new_tensor(
+            [0.2, 0.2, 1.0]
+        )
+        seen = Observations(
+            start[:, None], 0 * one, yes, torch.zeros(1, 1, 3).double(), one, no, one[0]
+        )
+        return network.predict(features, seen, one).effect_mean
+
+    effect = torch.tensor([[0.05, -0.08, 0.1]], dtype=torch.float64, requires_grad=True)
+    angle = torch.tensor([0.7], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(of_effect, (effect,), eps=1e-7, atol=1e-5)
+    assert torch.autograd.gradcheck(of_direction, (angle,), eps=1e-7, atol=1e-5)
+
+
+def test_strange_inputs_are_refused(some):
+    network = made("film, push", some)
+    features = network.encode(some.image[:1])
+    with pytest.raises(ValueError, match=r"starts 0\.260 m .* trained on 0\.200 to 0\.200 m"):
+        network.predict(features, observe_pushes(network, [Push(0, radius=0.26)]), torch.ones(1, 1))
+    with pytest.raises(ValueError, match=r"starts 0\.000 m"):
+        network.predict(features, observe_pushes(network, [Drag(0)]), torch.ones(1, 1))
+    with pytest.raises(ValueError, match=r"ends 0\.120 m"):
+        network.predict(features, observe_pushes(network, [Push(0, length=0.12)]), torch.ones(1, 1))
+    empty = some.image[:2].clone()
+    empty[1, 1] = 0
+    with pytest.raises(ValueError, match=r"image 1: the object covers 0\.0% of it"):
+        network.encode(empty)
+    with pytest.raises(ValueError, match="image 0: the object reaches its edge"):
+        network.encode(torch.roll(some.image[:1], 16, dims=-1))
+
+
+def test_the_literal_loop_and_the_batch_agree(network, some):
+    """On the same draw: the mean over single targets has the loss and gradients of the batch."""
+    batch = asked(some.select(torch.arange(6)), n_targets=3)
+    batch_loss(network, batch).backward()
+    together = [p.grad.clone() for p in network.parameters() if p.grad is not None]
+    network.zero_grad()
+    o, losses = batch.observations, []
+    slot = torch.arange(4)
+    for b in range(6):
+        a, e = (m | ~m.any() & (slot == 0) for m in (o.action_mask[b], o.effect_mask[b]))
+        single = Observations(
+            o.action[b, a][None], o.action_t[b, a][None], o.action_mask[b, a][None],
+            o.effect[b, e][None], o.effect_t[b, e][None], o.effect_mask[b, e][None], o.weight[[b]],
+        )  # fmt: skip
+        for j in range(3):
+            one = dataclasses.replace(
+                batch,
+                image=batch.image[[b]],
+                observations=single,
+                t_target=batch.t_target[[b], j : j + 1],
+                action=batch.action[[b], j : j + 1],
+                effect=batch.effect[[b], j : j + 1],
+            )
+            loss = batch_loss(network, one) / 18
+            loss.backward()
+            losses.append(loss.detach())
+    apart = [p.grad for p in network.parameters() if p.grad is not None]
+    torch.testing.assert_close(sum(losses), batch_loss(network, batch).detach(), rtol=1e-5, atol=0)
+    for a, b in zip(together, apart, strict=True):
+        assert (a - b).norm() <= 1e-4 * a.norm() + 1e-5
+
+
+def test_the_literal_loop_learns(some):
+    network = made("film, push", some)
+    losses = train_literal(network, some, 150, learning_rate=1e-3)
+    assert np.mean(losses[-30:]) < np.mean(losses[:30]) - 0.3
+    generator = torch.Generator().manual_seed(0)
+    counts = [literal_draw(some, 10, generator).observations.action_t.shape[1] for _ in range(200)]
+    assert set(counts) == set(range(1, 11))
+
+
+class Stopped(Exception):
+    pass
+
+
+def test_training_resumes_to_the_same_bits(some, tmp_path, monkeypatch):
+    config = TrainingConfig(steps=9, batch_size=16, validate_every=2, ema=0.9, hold_floor=0.3)
+    whole = made("film, push", some)
+    history = train(whole, some, some, config, progress=False)
+
+    broken, calls = made("film, push", some), []
+
+    def stop(model, batch):
+        calls.append(0)
+        if len(calls) == 6:
+            raise Stopped
+        return batch_loss(model, batch)
+
+    file = tmp_path / "run" / "training.pt"
+    with monkeypatch.context() as patch:
+        patch.setattr("affordlib.models.training.batch_loss", stop)
+        with pytest.raises(Stopped):
+            train(broken, some, some, config, progress=False, checkpoint=file)
+    again = made("film, push", some)
+    resumed = train(again, some, some, config, progress=False, checkpoint=file)
+    assert [(h.step, h.loss, h.validation_error_m) for h in resumed] == [
+        (h.step, h.loss, h.validation_error_m) for h in history
+    ]
+    for a, b in zip(whole.parameters(), again.parameters(), strict=True):
+        assert torch.equal(a, b)
+    assert again.sigma_floor == whole.sigma_floor
+    other, fresh = dataclasses.replace(config, steps=10), made("film, push", some)
+    with pytest.raises(ValueError, match=r"training\.pt is of a training with other steps"):
+        train(fresh, some, some, other, progress=False, checkpoint=file)
+
+
+def test_checkpoints_of_every_network(network, some, tmp_path):
+    network.sigma_floor, network.temperature = 0.03, 1.7
+    again, _ = load_checkpoint(save_checkpoint(network, tmp_path / "m.safetensors", {}))
+    assert type(again) is type(network)
+    assert again.config == dataclasses.replace(network.config, sigma_floor=0.03, temperature=1.7)
+    assert again.normaliser == network.normaliser
+    batch = asked(some)
+    told, repeated = (
+        answers(n, batch.image, batch.observations, batch.t_target) for n in (network, again)
+    )
+    assert all(torch.equal(a, b) for a, b in zip(told, repeated, strict=True))
+
+
+def test_coverage_and_temperature(some):
+    generator = torch.Generator().manual_seed(0)
+    z = torch.randn(100_000, generator=generator)
+    zero, one = torch.zeros_like(z), torch.ones_like(z)
+    for level in (0.5, 0.9):
+        assert coverage(z, zero, one, level) == pytest.approx(level, abs=0.005)
+        assert coverage(z, zero, one / 2, level) < level - 0.1
+    network = made("film, push", some)
+    rows = calibration_rows(network, some, model="film")
+    temperature = fit_temperature(network, some)
+    assert network.temperature == temperature
+    tempered = calibration_rows(network, some, model="film")
+    assert {"coverage_50", "coverage_90", "nll", "model"} <= rows[0].keys()
+    assert len(rows) == 9
+    best = sum(row["nll"] for row in tempered)
+    assert best < sum(row["nll"] for row in rows)
+    for factor in (0.9, 1.1):  # it is the likeliest one
+        network.temperature = factor * temperature
+        assert best < sum(row["nll"] for row in calibration_rows(network, some))
+    with pytest.raises(ValueError, match=r"level .* 1\.5"):
+        coverage(z, zero, one, 1.5)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: FiLMConfig(frame="object"), r"frame .* 'object'"),
+        (lambda: FiLMConfig(effect_channels=("z",)), "effect_channels must name x and y"),
+        (lambda: FiLMConfig(blocks=0), "blocks .* 0"),
+        (lambda: CNPConfig(temperature=0.0), r"temperature .* 0\.0"),
+        (lambda: AttentionConfig(width=30), "width must be a multiple of heads, got 30"),
+        (lambda: TrainingConfig(ema=1.0), "ema .* 1"),
+        (lambda: TrainingConfig(device="abacus"), "device .* 'abacus'"),
+    ],
+)
+def test_bad_settings_are_named(make, words):
+    with pytest.raises(ValueError, match=words):
+        make()
+
+
+@pytest.mark.slow
+def test_the_shipped_film_on_the_held_out_pushes(pushes, held_out_pushes):
+    """Under a millimetre; cuboids under 1.5 mm and 3°; nine in ten inside the 90 % interval."""
+    model, about = load_checkpoint("push_film")
+    split = split_interactions(500)
+    assert about["seen_interactions"] == sorted([*split.train, *split.validation])
+    test = TrainingArrays.from_dataset(
+        held_out_pushes, None, *(model.action_channels, model.effect_channels)
+    )
+    errors = final_errors_m(model, test)
+    box = torch.from_numpy(held_out_pushes["family"].values == 0)
+    assert (errors[box].mean() + errors[~box].mean()) / 2 < 0.001
+    assert errors[box].mean() < 0.0015
