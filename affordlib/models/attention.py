@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from affordlib.models.film import convolutions, dense, split_outputs, waves
-from affordlib.models.network import EffectNetwork, NetworkConfig, with_time
+from affordlib.models.network import EffectNetwork, NetworkConfig, he_initialise, with_time
 from affordlib.types import IMAGE_PIXELS, Observations
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ class AttentiveCNP(EffectNetwork):
         c, w = config, config.width
         n_a, n_e = len(c.action_channels), len(c.effect_channels)
         self.side = math.ceil(IMAGE_PIXELS / 2 ** len(c.convolutions))
-        self.image_encoder = convolutions(c.convolutions)
+        self.image_encoder = convolutions(c.convolutions).apply(he_initialise)
         self.place = nn.Parameter(0.02 * torch.randn(self.side**2, w))
         self.image_token = nn.Linear(c.convolutions[-1], w)
         self.image_summary = nn.Linear(c.convolutions[-1] * self.side**2, w)

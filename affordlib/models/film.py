@@ -21,7 +21,13 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from affordlib.models.network import EffectNetwork, NetworkConfig, masked_mean, with_time
+from affordlib.models.network import (
+    EffectNetwork,
+    NetworkConfig,
+    he_initialise,
+    masked_mean,
+    with_time,
+)
 from affordlib.types import IMAGE_PIXELS, Observations
 
 if TYPE_CHECKING:
@@ -98,6 +104,7 @@ class FiLMNetwork(EffectNetwork):
             nn.Flatten(),
             *dense(c.convolutions[-1] * side**2, 2 * c.image_features, c.image_features),
         )
+        self.image_encoder.apply(he_initialise)
         self.action_encoder = nn.Sequential(*dense(n_a + 1, w, w, w))
         self.effect_encoder = nn.Sequential(*dense(n_e + 1, w, w, w))
         self.merge = nn.Linear(w + c.image_features + 2 * c.waves + 1, w)

@@ -43,6 +43,7 @@ class TrainingConfig:
     n_targets: int = 16
     obs_max: int = 10
     learning_rate: float = 1e-3
+    weight_decay: float = 0.0
     final_sigma_floor: float = 0.02
     hold_floor: float = 0.0
     augment: bool = True
@@ -59,6 +60,7 @@ class TrainingConfig:
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}")
         check_within("learning_rate", self.learning_rate, 1e-7, 1.0)
+        check_within("weight_decay", self.weight_decay, 0.0, 10.0)
         check_within("final_sigma_floor", self.final_sigma_floor, 1e-6, 10.0)
         check_within("hold_floor", self.hold_floor, 0.0, 1.0)
         check_within("ema", self.ema, 0.0, 0.99999)
@@ -141,7 +143,9 @@ class _Run:
         self.model, self.config = model, config
         self.about = about | asdict(replace(config, max_minutes=math.inf, device="cpu"))
         self.generator = torch.Generator().manual_seed(config.seed)
-        self.optimiser = torch.optim.Adam(model.parameters(), lr=config.learning_rate, fused=True)
+        self.optimiser = torch.optim.AdamW(
+            model.parameters(), config.learning_rate, weight_decay=config.weight_decay, fused=True
+        )
         self.mean = {k: v.clone() for k, v in model.state_dict().items()}
         self.best, self.best_state, self.best_floor = math.inf, self.mean, model.sigma_floor
         self.step, self.waited, self.seconds = 0, 0, 0.0
