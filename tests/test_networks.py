@@ -38,7 +38,7 @@ CONFIGS = {
     "cnp, table": CNPConfig(**YAW),
     "cnp, push": CNPConfig(**YAW, frame="push"),
     "film, table": FiLMConfig(**YAW, **SMALL, frame="table"),
-    "film, push": FiLMConfig(**YAW, **SMALL),
+    "film, push": FiLMConfig(**YAW, **SMALL, heading_noise_rad=0.1),
     "attention, push": AttentionConfig(**YAW, **SMALL),
 }
 IN_PUSH_FRAME = [name for name in CONFIGS if name.endswith("push")]
@@ -295,11 +295,11 @@ def test_training_resumes_to_the_same_bits(some, tmp_path, monkeypatch):
 
     broken, calls = made("film, push", some), []
 
-    def stop(model, batch):
+    def stop(model, batch, beta):
         calls.append(0)
         if len(calls) == 6:
             raise Stopped
-        return batch_loss(model, batch)
+        return batch_loss(model, batch, beta)
 
     file = tmp_path / "run" / "training.pt"
     with monkeypatch.context() as patch:

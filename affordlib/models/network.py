@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import torch
@@ -19,7 +19,7 @@ from affordlib.models.frame import (
     turn_observations,
     turn_prediction,
 )
-from affordlib.types import Observations, Prediction
+from affordlib.types import Observations, Prediction, check_within
 
 RADIUS_TOLERANCE_M = 0.02
 _END_PHASE = 1e-3
@@ -30,13 +30,16 @@ class NetworkConfig:
     """Channels and frame of a network.
 
     frame: "table", or "push" to turn everything into the direction of the push, see `frame.py`.
-    sigma_floor is in standardised units. temperature multiplies σ of effects, see `calibration.py`.
+    heading_noise_rad: in training the frame is off the push by a normal angle of this σ, so that
+    images are seen at more angles; any frame is as true. sigma_floor is in standardised units.
+    temperature multiplies σ of effects, see `calibration.py`.
     """
 
     action_channels: tuple[str, ...] = ("x", "y")
     effect_channels: tuple[str, ...] = ("x", "y")
     sigma_floor: float = 0.1
     frame: str = "table"
+    heading_noise_rad: float = 0.0
     temperature: float = 1.0
 
     def __post_init__(self) -> None:
@@ -49,12 +52,13 @@ class NetworkConfig:
             if self.frame == "push" and not plane_of(channels):
                 raise ValueError(f'{name} must name x and y for frame="push", got {channels}')
             object.__setattr__(self, name, channels)
+        check_within("heading_noise_rad", self.heading_noise_rad, 0.0, math.pi, "rad")
         for name, high in (("sigma_floor", 10.0), ("temperature", 1000.0)):
             if not 0 < getattr(self, name) < high:
                 raise ValueError(f"{name} must lie in (0, {high:g}), got {getattr(self, name)!r}")
 
 
-class EffectNetwork(nn.Module):
+class EffectNetwork(nn.Module, ABC):
     """A network that satisfies `EffectModel`.
 
     Inputs and outputs are in metres and radians, in the frame of the table; scaling by the
@@ -100,12 +104,15 @@ class EffectNetwork(nn.Module):
         scaled = (image - mean) / std
         return self.features(scaled.contiguous(memory_format=torch.channels_last))
 
-    def _enter(self, image: Tensor, o: Observations) -> tuple[Tensor, Observations, Tensor]:
-        """Features and observations in the frame of the push, and its headings (B, 2)."""
-        towards = heading(o, *self._channels)
+    def _heading(self, o: Observations) -> Tensor:
+        return heading(o, *self._channels)
+
+    def _enter(
+        self, image: Tensor, o: Observations, towards: Tensor
+    ) -> tuple[Tensor, Observations]:
+        """Features and observations in the frame of the headings (B, 2)."""
         back = inverse(towards)
-        turned = turn_observations(o, back, *self._channels)
-        return self._look(turn_image(image, back)), turned, towards
+        return self._look(turn_image(image, back)), turn_observations(o, back, *self._channels)
 
     def encode(self, image: Float[Tensor, "b 2 n n"]) -> Float[Tensor, "b f"]:
         """Features (B, F) of depth and mask (B, 2, 48, 48).
@@ -125,18 +132,27 @@ class EffectNetwork(nn.Module):
         if push:
             pixels = math.isqrt(features.shape[1] // 2)
             image = features.reshape(-1, 2, pixels, pixels)
-            features, observations, towards = self._enter(image, observations)
+            towards = self._heading(observations)
+            features, observations = self._enter(image, observations, towards)
         mu_a, sigma_a, mu_e, sigma_e = self.outputs(features, observations, t_target)
         a, e = self.action_scale, self.effect_scale
         prediction = Prediction(mu_a * a, sigma_a * a, mu_e * e, sigma_e * e * self.temperature)
         return turn_prediction(prediction, towards, *self._channels) if push else prediction
 
     def forward(
-        self, image: Tensor, observations: Observations, t_target: Tensor
+        self,
+        image: Tensor,
+        observations: Observations,
+        t_target: Tensor,
+        towards: Tensor | None = None,
     ) -> tuple[Tensor, ...]:
-        """(μ_a, σ_a, μ_e, σ_e) in standardised units, in the network's frame."""
+        """(μ_a, σ_a, μ_e, σ_e) in standardised units, in the network's frame.
+
+        towards: headings (B, 2) of the frame, if not those that the observations tell.
+        """
         if self.config.frame == "push":
-            features, observations, _ = self._enter(image, observations)
+            towards = self._heading(observations) if towards is None else towards
+            features, observations = self._enter(image, observations, towards)
             return self.outputs(features, observations, t_target)
         return self.outputs(self._look(image), observations, t_target)
 
@@ -147,18 +163,30 @@ class EffectNetwork(nn.Module):
         t_target: Tensor,
         action: Tensor,
         effect: Tensor,
+        beta: float = 0.0,
     ) -> Tensor:
         """Negative log-likelihood (Section 3.2) of the targets (B, T, C), per value.
 
-        The likelihood is of the standardised values, in the network's frame.
+        The likelihood is of the standardised values, in the network's frame. beta weighs each value
+        by σ^(2 beta), so that what is hard to predict is not given up for a large σ: with 0 it is
+        the likelihood, with 1 means learn as from the squared error (Seitzer et al., On the
+        pitfalls of heteroscedastic uncertainty estimation, ICLR 2022).
         """
-        mu_a, sigma_a, mu_e, sigma_e = self(image, observations, t_target)
+        towards = None
         if self.config.frame == "push":
-            back = inverse(heading(observations, *self._channels))[:, None]
+            towards = self._heading(observations)
+            if self.training and self.config.heading_noise_rad:
+                noise = self.config.heading_noise_rad * torch.randn(len(towards), 1).to(towards)
+                towards = turn(towards, ("x", "y"), torch.cat([noise.cos(), noise.sin()], 1), False)
+            back = inverse(towards)[:, None]
             action = turn(action, self.action_channels, back, absolute_yaw=True)
             effect = turn(effect, self.effect_channels, back, absolute_yaw=False)
+        mu_a, sigma_a, mu_e, sigma_e = self(image, observations, t_target, towards)
         nll_a = gaussian_nll(action / self.action_scale, mu_a, sigma_a)
         nll_e = gaussian_nll(effect / self.effect_scale, mu_e, sigma_e)
+        if beta:
+            nll_a = nll_a * sigma_a.detach() ** (2 * beta)
+            nll_e = nll_e * sigma_e.detach() ** (2 * beta)
         return (nll_a.mean() + nll_e.mean()) / 2
 
     def _check_image(self, image: Tensor) -> None:

@@ -31,11 +31,11 @@ _AUTO = "cuda" if torch.cuda.is_available() else "cpu"
 class TrainingConfig:
     """How to train: steps and sizes; the σ floor falls from the model's to `final_sigma_floor`.
 
-    The floor stays for the first `hold_floor` of the steps. augment turns and mirrors: each batch
-    holds all eight images of the square in equal shares. ema: decay of the running mean of the
-    weights, which is what is validated and kept; 0 for none. patience counts validations (one every
-    `validate_every` steps) without improvement. max_minutes bounds wall time. device: as of torch,
-    or "auto" for a GPU where there is one.
+    beta: see `EffectNetwork.loss`. The floor stays for the first `hold_floor` of the steps. augment
+    turns and mirrors: each batch holds all eight images of the square in equal shares. ema: decay
+    of the running mean of the weights, which is what is validated and kept; 0 for none. patience
+    counts validations (one every `validate_every` steps) without improvement. max_minutes bounds
+    wall time. device: as of torch, or "auto" for a GPU where there is one.
     """
 
     steps: int = 3000
@@ -44,6 +44,7 @@ class TrainingConfig:
     obs_max: int = 10
     learning_rate: float = 1e-3
     weight_decay: float = 0.0
+    beta: float = 0.0
     final_sigma_floor: float = 0.02
     hold_floor: float = 0.0
     augment: bool = True
@@ -61,6 +62,7 @@ class TrainingConfig:
                 raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}")
         check_within("learning_rate", self.learning_rate, 1e-7, 1.0)
         check_within("weight_decay", self.weight_decay, 0.0, 10.0)
+        check_within("beta", self.beta, 0.0, 1.0)
         check_within("final_sigma_floor", self.final_sigma_floor, 1e-6, 10.0)
         check_within("hold_floor", self.hold_floor, 0.0, 1.0)
         check_within("ema", self.ema, 0.0, 0.99999)
@@ -142,6 +144,7 @@ class _Run:
     def __init__(self, model: EffectNetwork, config: TrainingConfig, about: dict[str, Any]) -> None:
         self.model, self.config = model, config
         self.about = about | asdict(replace(config, max_minutes=math.inf, device="cpu"))
+        torch.manual_seed(config.seed)
         self.generator = torch.Generator().manual_seed(config.seed)
         self.optimiser = torch.optim.AdamW(
             model.parameters(), config.learning_rate, weight_decay=config.weight_decay, fused=True
@@ -158,6 +161,7 @@ class _Run:
             "model": self.model.state_dict(),
             "optimiser": self.optimiser.state_dict(),
             "generator": self.generator.get_state(),
+            "global_generator": torch.get_rng_state(),
             "history": [astuple(record) for record in self.history],
         }
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -178,6 +182,7 @@ class _Run:
         self.model.load_state_dict(state["model"])
         self.optimiser.load_state_dict(state["optimiser"])
         self.generator.set_state(state["generator"].cpu())
+        torch.set_rng_state(state["global_generator"].cpu())
         self.history = [TrainingRecord(*record) for record in state["history"]]
 
 
@@ -227,7 +232,7 @@ def train(
                 config.obs_max,
                 run.generator,
             )
-            loss = _step(model, run.optimiser, _to(batch, device))
+            loss = _step(model, run.optimiser, _to(batch, device), config.beta)
             if config.ema:
                 decay = min(config.ema, run.step / (run.step + 10))
                 for name, value in model.state_dict().items():
@@ -257,8 +262,10 @@ def train(
     return run.history
 
 
-def _step(model: EffectNetwork, optimiser: torch.optim.Optimizer, batch: Batch) -> torch.Tensor:
-    loss = batch_loss(model, batch)
+def _step(
+    model: EffectNetwork, optimiser: torch.optim.Optimizer, batch: Batch, beta: float
+) -> torch.Tensor:
+    loss = batch_loss(model, batch, beta)
     optimiser.zero_grad(set_to_none=True)
     loss.backward()
     torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
@@ -266,9 +273,10 @@ def _step(model: EffectNetwork, optimiser: torch.optim.Optimizer, batch: Batch) 
     return loss.detach()
 
 
-def batch_loss(model: EffectNetwork, batch: Batch) -> torch.Tensor:
-    """Mean negative log-likelihood of a batch's targets."""
-    return model.loss(batch.image, batch.observations, batch.t_target, batch.action, batch.effect)
+def batch_loss(model: EffectNetwork, batch: Batch, beta: float = 0.0) -> torch.Tensor:
+    """Mean negative log-likelihood of a batch's targets; for beta see `EffectNetwork.loss`."""
+    b = batch
+    return model.loss(b.image, b.observations, b.t_target, b.action, b.effect, beta)
 
 
 def literal_draw(arrays: TrainingArrays, obs_max: int, generator: torch.Generator) -> Batch:
