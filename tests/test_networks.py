@@ -38,7 +38,7 @@ CONFIGS = {
     "cnp, table": CNPConfig(**YAW),
     "cnp, push": CNPConfig(**YAW, frame="push"),
     "film, table": FiLMConfig(**YAW, **SMALL, frame="table"),
-    "film, push": FiLMConfig(**YAW, **SMALL, heading_noise_rad=0.1),
+    "film, push": FiLMConfig(**YAW, **SMALL),
     "attention, push": AttentionConfig(**YAW, **SMALL),
 }
 IN_PUSH_FRAME = [name for name in CONFIGS if name.endswith("push")]

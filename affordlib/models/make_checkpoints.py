@@ -40,8 +40,9 @@ class Shipped:
 
 
 _FILM_TRAINING = TrainingConfig(
-    steps=5000, patience=20, final_sigma_floor=0.005, hold_floor=0.5, ema=0.998
-)
+    steps=4000, n_targets=8, patience=99, beta=0.5, weight_decay=0.1, final_sigma_floor=0.005,
+    ema=0.99,
+)  # fmt: skip
 SHIPPED: dict[str, Shipped] = {
     "push_cnp": Shipped("push", CNPConfig(), TrainingConfig(steps=5000, patience=20)),
     "push_film": Shipped("push", FiLMConfig(effect_channels=("x", "y", "yaw")), _FILM_TRAINING),

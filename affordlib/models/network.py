@@ -19,7 +19,7 @@ from affordlib.models.frame import (
     turn_observations,
     turn_prediction,
 )
-from affordlib.types import Observations, Prediction, check_within
+from affordlib.types import Observations, Prediction
 
 RADIUS_TOLERANCE_M = 0.02
 _END_PHASE = 1e-3
@@ -30,16 +30,13 @@ class NetworkConfig:
     """Channels and frame of a network.
 
     frame: "table", or "push" to turn everything into the direction of the push, see `frame.py`.
-    heading_noise_rad: in training the frame is off the push by a normal angle of this σ, so that
-    images are seen at more angles; any frame is as true. sigma_floor is in standardised units.
-    temperature multiplies σ of effects, see `calibration.py`.
+    sigma_floor is in standardised units. temperature multiplies σ of effects, see `calibration.py`.
     """
 
     action_channels: tuple[str, ...] = ("x", "y")
     effect_channels: tuple[str, ...] = ("x", "y")
     sigma_floor: float = 0.1
     frame: str = "table"
-    heading_noise_rad: float = 0.0
     temperature: float = 1.0
 
     def __post_init__(self) -> None:
@@ -52,7 +49,6 @@ class NetworkConfig:
             if self.frame == "push" and not plane_of(channels):
                 raise ValueError(f'{name} must name x and y for frame="push", got {channels}')
             object.__setattr__(self, name, channels)
-        check_within("heading_noise_rad", self.heading_noise_rad, 0.0, math.pi, "rad")
         for name, high in (("sigma_floor", 10.0), ("temperature", 1000.0)):
             if not 0 < getattr(self, name) < high:
                 raise ValueError(f"{name} must lie in (0, {high:g}), got {getattr(self, name)!r}")
@@ -104,15 +100,12 @@ class EffectNetwork(nn.Module, ABC):
         scaled = (image - mean) / std
         return self.features(scaled.contiguous(memory_format=torch.channels_last))
 
-    def _heading(self, o: Observations) -> Tensor:
-        return heading(o, *self._channels)
-
-    def _enter(
-        self, image: Tensor, o: Observations, towards: Tensor
-    ) -> tuple[Tensor, Observations]:
-        """Features and observations in the frame of the headings (B, 2)."""
+    def _enter(self, image: Tensor, o: Observations) -> tuple[Tensor, Observations, Tensor]:
+        """Features and observations in the frame of the push, and its headings (B, 2)."""
+        towards = heading(o, *self._channels)
         back = inverse(towards)
-        return self._look(turn_image(image, back)), turn_observations(o, back, *self._channels)
+        turned = turn_observations(o, back, *self._channels)
+        return self._look(turn_image(image, back)), turned, towards
 
     def encode(self, image: Float[Tensor, "b 2 n n"]) -> Float[Tensor, "b f"]:
         """Features (B, F) of depth and mask (B, 2, 48, 48).
@@ -132,8 +125,7 @@ class EffectNetwork(nn.Module, ABC):
         if push:
             pixels = math.isqrt(features.shape[1] // 2)
             image = features.reshape(-1, 2, pixels, pixels)
-            towards = self._heading(observations)
-            features, observations = self._enter(image, observations, towards)
+            features, observations, towards = self._enter(image, observations)
         mu_a, sigma_a, mu_e, sigma_e = self.outputs(features, observations, t_target)
         a, e = self.action_scale, self.effect_scale
         prediction = Prediction(mu_a * a, sigma_a * a, mu_e * e, sigma_e * e * self.temperature)
@@ -144,15 +136,10 @@ class EffectNetwork(nn.Module, ABC):
         image: Tensor,
         observations: Observations,
         t_target: Tensor,
-        towards: Tensor | None = None,
     ) -> tuple[Tensor, ...]:
-        """(μ_a, σ_a, μ_e, σ_e) in standardised units, in the network's frame.
-
-        towards: headings (B, 2) of the frame, if not those that the observations tell.
-        """
+        """(μ_a, σ_a, μ_e, σ_e) in standardised units, in the network's frame."""
         if self.config.frame == "push":
-            towards = self._heading(observations) if towards is None else towards
-            features, observations = self._enter(image, observations, towards)
+            features, observations, _ = self._enter(image, observations)
             return self.outputs(features, observations, t_target)
         return self.outputs(self._look(image), observations, t_target)
 
@@ -172,16 +159,11 @@ class EffectNetwork(nn.Module, ABC):
         the likelihood, with 1 means learn as from the squared error (Seitzer et al., On the
         pitfalls of heteroscedastic uncertainty estimation, ICLR 2022).
         """
-        towards = None
+        mu_a, sigma_a, mu_e, sigma_e = self(image, observations, t_target)
         if self.config.frame == "push":
-            towards = self._heading(observations)
-            if self.training and self.config.heading_noise_rad:
-                noise = self.config.heading_noise_rad * torch.randn(len(towards), 1).to(towards)
-                towards = turn(towards, ("x", "y"), torch.cat([noise.cos(), noise.sin()], 1), False)
-            back = inverse(towards)[:, None]
+            back = inverse(heading(observations, *self._channels))[:, None]
             action = turn(action, self.action_channels, back, absolute_yaw=True)
             effect = turn(effect, self.effect_channels, back, absolute_yaw=False)
-        mu_a, sigma_a, mu_e, sigma_e = self(image, observations, t_target, towards)
         nll_a = gaussian_nll(action / self.action_scale, mu_a, sigma_a)
         nll_e = gaussian_nll(effect / self.effect_scale, mu_e, sigma_e)
         if beta:

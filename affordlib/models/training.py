@@ -144,7 +144,6 @@ class _Run:
     def __init__(self, model: EffectNetwork, config: TrainingConfig, about: dict[str, Any]) -> None:
         self.model, self.config = model, config
         self.about = about | asdict(replace(config, max_minutes=math.inf, device="cpu"))
-        torch.manual_seed(config.seed)
         self.generator = torch.Generator().manual_seed(config.seed)
         self.optimiser = torch.optim.AdamW(
             model.parameters(), config.learning_rate, weight_decay=config.weight_decay, fused=True
@@ -161,7 +160,6 @@ class _Run:
             "model": self.model.state_dict(),
             "optimiser": self.optimiser.state_dict(),
             "generator": self.generator.get_state(),
-            "global_generator": torch.get_rng_state(),
             "history": [astuple(record) for record in self.history],
         }
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -182,7 +180,6 @@ class _Run:
         self.model.load_state_dict(state["model"])
         self.optimiser.load_state_dict(state["optimiser"])
         self.generator.set_state(state["generator"].cpu())
-        torch.set_rng_state(state["global_generator"].cpu())
         self.history = [TrainingRecord(*record) for record in state["history"]]
 
 
