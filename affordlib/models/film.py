@@ -5,8 +5,9 @@
     x_k+1  = x_k + W₂ ς(γ_k ∘ W₁ n(x_k) + β_k),  (γ_k - 1, β_k) = V_k f(γ_o)
     g(x_K) = (μ_a, σ_a, μ_e, σ_e)
 
-f: image encoder, of convolutions and of the image's circular harmonics; ς: SiLU, n: layer normalisation, φ: t with its first sines and cosines. Source:
-Perez et al., FiLM: visual reasoning with a general conditioning layer, AAAI 2018.
+f: image encoder, of convolutions and of the image's circular harmonics; ς: SiLU; n: layer
+normalisation; φ: t with its first sines and cosines. Source: Perez et al., FiLM: visual reasoning
+with a general conditioning layer, AAAI 2018.
 """
 
 from __future__ import annotations

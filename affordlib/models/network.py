@@ -30,14 +30,15 @@ class NetworkConfig:
     """Channels and frame of a network.
 
     frame: "table", or "push" to turn everything into the direction of the push, see `frame.py`.
-    sigma_floor is in standardised units. temperature multiplies σ of effects, see `calibration.py`.
+    sigma_floor is in standardised units. temperature multiplies σ of each effect channel
+    (none given: by 1), see `calibration.py`.
     """
 
     action_channels: tuple[str, ...] = ("x", "y")
     effect_channels: tuple[str, ...] = ("x", "y")
     sigma_floor: float = 0.1
     frame: str = "table"
-    temperature: float = 1.0
+    temperature: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         if self.frame not in FRAMES:
@@ -49,9 +50,15 @@ class NetworkConfig:
             if self.frame == "push" and not plane_of(channels):
                 raise ValueError(f'{name} must name x and y for frame="push", got {channels}')
             object.__setattr__(self, name, channels)
-        for name, high in (("sigma_floor", 10.0), ("temperature", 1000.0)):
-            if not 0 < getattr(self, name) < high:
-                raise ValueError(f"{name} must lie in (0, {high:g}), got {getattr(self, name)!r}")
+        if not 0 < self.sigma_floor < 10:
+            raise ValueError(f"sigma_floor must lie in (0, 10), got {self.sigma_floor!r}")
+        temperature = tuple(self.temperature) or (1.0,) * len(self.effect_channels)
+        if len(temperature) != len(self.effect_channels) or not min(temperature) > 0:
+            raise ValueError(
+                f"temperature must hold {len(self.effect_channels)} positive numbers, one per "
+                f"effect channel, got {self.temperature!r}"
+            )
+        object.__setattr__(self, "temperature", temperature)
 
 
 class EffectNetwork(nn.Module, ABC):
@@ -128,7 +135,9 @@ class EffectNetwork(nn.Module, ABC):
             features, observations, towards = self._enter(image, observations)
         mu_a, sigma_a, mu_e, sigma_e = self.outputs(features, observations, t_target)
         a, e = self.action_scale, self.effect_scale
-        prediction = Prediction(mu_a * a, sigma_a * a, mu_e * e, sigma_e * e * self.temperature)
+        prediction = Prediction(
+            mu_a * a, sigma_a * a, mu_e * e, sigma_e * e * e.new_tensor(self.temperature)
+        )
         return turn_prediction(prediction, towards, *self._channels) if push else prediction
 
     def forward(
