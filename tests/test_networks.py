@@ -154,7 +154,7 @@ def test_any_turn_of_a_real_object_turns_the_answer_of_the_trained_model(world):
         effect = effect @ torch.tensor([[c, -s], [s, c]])
         straight = effect if straight is None else straight
         errors.append((effect - straight).norm(dim=-1))
-    # The goal is 0.3 mm. What is missing comes of the mask's hard edges, sampled anew at each angle.
+    # The goal is 0.3 mm; the pixels of hard edges fall differently at each angle.
     assert torch.cat(errors[1:]).mean() < 0.0012
 
 
