@@ -25,6 +25,7 @@ from affordlib.models import (
     train,
     train_literal,
 )
+from affordlib.models.film import CircularHarmonics
 from affordlib.models.frame import heading, inverse, turn_image
 from affordlib.models.protocol import observe_final_effect
 from affordlib.models.training import batch_loss, final_errors_m, literal_draw
@@ -185,6 +186,18 @@ def test_turning_an_image_keeps_the_object(some):
     torch.testing.assert_close(turn_image(some.image, quarter), exact, atol=1e-5, rtol=0)
 
 
+def test_harmonics_of_a_turned_image_turn_by_their_order(some):
+    harmonics = CircularHarmonics(rings=2, orders=3)
+
+    def complex_ones(image):
+        values = harmonics(image).reshape(40, 2, 2, 7)  # rings: cos of m = 0 … 3, sin of 1 … 3
+        return torch.complex(values[..., 1:4], values[..., 4:])
+
+    turned = complex_ones(torch.rot90(some.image, 1, (-2, -1)))
+    expected = complex_ones(some.image) * torch.tensor([1j, -1, -1j])
+    torch.testing.assert_close(turned, expected, atol=1e-4, rtol=1e-4)
+
+
 def test_turned_data_are_those_of_the_turned_push(some):
     """Yaw turns along where it is an orientation, and mirrors where it is a change."""
     turned = some.turned(1, mirror=True)
@@ -295,11 +308,11 @@ def test_training_resumes_to_the_same_bits(some, tmp_path, monkeypatch):
 
     broken, calls = made("film, push", some), []
 
-    def stop(model, batch):
+    def stop(model, batch, beta):
         calls.append(0)
         if len(calls) == 6:
             raise Stopped
-        return batch_loss(model, batch)
+        return batch_loss(model, batch, beta)
 
     file = tmp_path / "run" / "training.pt"
     with monkeypatch.context() as patch:
@@ -320,10 +333,12 @@ def test_training_resumes_to_the_same_bits(some, tmp_path, monkeypatch):
 
 
 def test_checkpoints_of_every_network(network, some, tmp_path):
-    network.sigma_floor, network.temperature = 0.03, 1.7
+    network.sigma_floor, network.temperature = 0.03, (1.7, 1.7, 0.5)
     again, _ = load_checkpoint(save_checkpoint(network, tmp_path / "m.safetensors", {}))
     assert type(again) is type(network)
-    assert again.config == dataclasses.replace(network.config, sigma_floor=0.03, temperature=1.7)
+    assert again.config == dataclasses.replace(
+        network.config, sigma_floor=0.03, temperature=(1.7, 1.7, 0.5)
+    )
     assert again.normaliser == network.normaliser
     batch = asked(some)
     told, repeated = (
@@ -349,7 +364,7 @@ def test_coverage_and_temperature(some):
     best = sum(row["nll"] for row in tempered)
     assert best < sum(row["nll"] for row in rows)
     for factor in (0.9, 1.1):  # it is the likeliest one
-        network.temperature = factor * temperature
+        network.temperature = tuple(factor * t for t in temperature)
         assert best < sum(row["nll"] for row in calibration_rows(network, some))
     with pytest.raises(ValueError, match=r"level .* 1\.5"):
         coverage(z, zero, one, 1.5)
@@ -361,7 +376,7 @@ def test_coverage_and_temperature(some):
         (lambda: FiLMConfig(frame="object"), r"frame .* 'object'"),
         (lambda: FiLMConfig(effect_channels=("z",)), "effect_channels must name x and y"),
         (lambda: FiLMConfig(blocks=0), "blocks .* 0"),
-        (lambda: CNPConfig(temperature=0.0), r"temperature .* 0\.0"),
+        (lambda: CNPConfig(temperature=(1.0, 0.0)), r"temperature .* \(1\.0, 0\.0\)"),
         (lambda: AttentionConfig(width=30), "width must be a multiple of heads, got 30"),
         (lambda: TrainingConfig(ema=1.0), "ema .* 1"),
         (lambda: TrainingConfig(device="abacus"), "device .* 'abacus'"),

@@ -1,9 +1,10 @@
 """A conditional neural process with cross-attention: what the paper names as future work.
 
 Each observation is a token, each cell of the image's last feature map another. A target asks with
-its phase and attends to them, in a few blocks; instead of the mean of equation (3), each target
-weighs what is observed for itself. The blend w₁ of equation (2) enters as log w₁ and log w₂, added
-to the attention's logits. Source: Kim et al., Attentive neural processes, ICLR 2019.
+its phase and a summary of the image and attends to them, in a few blocks; instead of the mean of
+equation (3), each target weighs what is observed for itself. The blend w₁ of equation (2) enters as
+log w₁ and log w₂, added to the attention's logits. Source: Kim et al., Attentive neural processes,
+ICLR 2019.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from affordlib.models.film import convolutions, dense, split_outputs, waves
-from affordlib.models.network import EffectNetwork, NetworkConfig, with_time
+from affordlib.models.film import CircularHarmonics, convolutions, dense, split_outputs, waves
+from affordlib.models.network import EffectNetwork, NetworkConfig, he_initialise, with_time
 from affordlib.types import IMAGE_PIXELS, Observations
 
 if TYPE_CHECKING:
@@ -78,10 +79,14 @@ class AttentiveCNP(EffectNetwork):
         c, w = config, config.width
         n_a, n_e = len(c.action_channels), len(c.effect_channels)
         self.side = math.ceil(IMAGE_PIXELS / 2 ** len(c.convolutions))
-        self.image_encoder = convolutions(c.convolutions)
+        self.image_encoder = convolutions(c.convolutions).apply(he_initialise)
+        self.harmonics = CircularHarmonics()
         self.place = nn.Parameter(0.02 * torch.randn(self.side**2, w))
         self.image_token = nn.Linear(c.convolutions[-1], w)
-        self.image_summary = nn.Linear(c.convolutions[-1] * self.side**2, w)
+        self.n_cells = c.convolutions[-1] * self.side**2
+        self.image_summary = nn.Sequential(
+            *dense(self.n_cells + self.harmonics.n_features, 2 * w, w, w)
+        ).apply(he_initialise)
         self.action_token = nn.Sequential(*dense(n_a + 1, w, w, w))
         self.effect_token = nn.Sequential(*dense(n_e + 1, w, w, w))
         self.ask = nn.Linear(2 * c.waves + 1, w)
@@ -89,8 +94,9 @@ class AttentiveCNP(EffectNetwork):
         self.last = nn.Sequential(nn.LayerNorm(w), *dense(w, w, 2 * (n_a + n_e)))
 
     def features(self, scaled_image: Float[Tensor, "b 2 48 48"]) -> Float[Tensor, "b f"]:
-        """The last feature map, flattened."""
-        return self.image_encoder(scaled_image).flatten(1)
+        """The last feature map, flattened, and the circular harmonics."""
+        cells = self.image_encoder(scaled_image).flatten(1)
+        return torch.cat([cells, self.harmonics(scaled_image)], dim=1)
 
     def outputs(
         self, features: Tensor, observations: Observations, t_target: Tensor
@@ -98,7 +104,7 @@ class AttentiveCNP(EffectNetwork):
         """(μ_a, σ_a, μ_e, σ_e), each (B, T, C) and standardised."""
         o = observations
         b = len(o.weight)
-        cells = features.unflatten(1, (-1, self.side**2)).transpose(1, 2)
+        cells = features[:, : self.n_cells].unflatten(1, (-1, self.side**2)).transpose(1, 2)
         image = (self.image_token(cells) + self.place).expand(b, -1, -1)
         tokens = torch.cat(
             [

@@ -1,7 +1,7 @@
 """Is σ right? Coverage of the central intervals, negative log-likelihood, and a temperature.
 
 Of a calibrated Gaussian the truth lies in the central 50 % interval μ ± 0.674 σ half of the time.
-A temperature τ multiplies every σ of the effects; the one of greatest likelihood is
+A temperature τ multiplies σ of an effect channel; the one of greatest likelihood is
 τ² = mean ((e - μ) / σ)² (Guo et al., On calibration of modern neural networks, ICML 2017).
 """
 
@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from affordlib.interactions.batches import observe_action
+from affordlib.interactions.batches import observe_action, plane_of
 from affordlib.models.network import gaussian_nll
 
 if TYPE_CHECKING:
@@ -50,11 +50,17 @@ def _at_phases(
 
 def fit_temperature(
     model: EffectNetwork, validation: TrainingArrays, phases: Sequence[float] = AFTER_CONTACT
-) -> float:
-    """Set, and return, the temperature under which validation data are likeliest."""
-    model.temperature = 1.0
+) -> tuple[float, ...]:
+    """Set, and return, the temperatures (C_e,) under which validation data are likeliest.
+
+    x and y share one, as they share a scale: no direction of the table is special.
+    """
+    model.temperature = (1.0,) * len(model.effect_channels)
     truth, mean, std = _at_phases(model, validation, phases)
-    model.temperature = float(((truth - mean) / std).square().mean().sqrt())
+    squared = ((truth - mean) / std).square().mean(dim=(0, 1))
+    plane = plane_of(model.effect_channels)
+    squared[plane] = squared[plane].mean()
+    model.temperature = tuple(squared.clamp_min(1e-6).sqrt().tolist())
     return model.temperature
 
 

@@ -16,6 +16,7 @@ from affordlib.interactions import (
     open_interactions,
     split_interactions,
 )
+from affordlib.models.attention import AttentionConfig
 from affordlib.models.calibration import fit_temperature
 from affordlib.models.checkpoint import SUFFIX, build, save_checkpoint
 from affordlib.models.cnp import CNPConfig
@@ -39,14 +40,20 @@ class Shipped:
     training: TrainingConfig
 
 
-_FILM_TRAINING = TrainingConfig(
-    steps=5000, patience=20, final_sigma_floor=0.005, hold_floor=0.5, ema=0.998
-)
+_PUSH_FRAME_TRAINING = TrainingConfig(
+    steps=4000, n_targets=8, patience=99, beta=0.5, weight_decay=0.1, final_sigma_floor=0.005,
+    ema=0.99,
+)  # fmt: skip
 SHIPPED: dict[str, Shipped] = {
     "push_cnp": Shipped("push", CNPConfig(), TrainingConfig(steps=5000, patience=20)),
-    "push_film": Shipped("push", FiLMConfig(effect_channels=("x", "y", "yaw")), _FILM_TRAINING),
+    "push_attention": Shipped(
+        "push", AttentionConfig(effect_channels=("x", "y", "yaw")), _PUSH_FRAME_TRAINING
+    ),
+    "push_film": Shipped(
+        "push", FiLMConfig(effect_channels=("x", "y", "yaw")), _PUSH_FRAME_TRAINING
+    ),
 }
-"""About ten minutes of one core for `push_cnp`, four for `push_film`."""
+"""About ten minutes of one core for `push_cnp`, three to four for the others."""
 
 
 def train_push_model(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import torch
@@ -30,14 +30,15 @@ class NetworkConfig:
     """Channels and frame of a network.
 
     frame: "table", or "push" to turn everything into the direction of the push, see `frame.py`.
-    sigma_floor is in standardised units. temperature multiplies σ of effects, see `calibration.py`.
+    sigma_floor is in standardised units. temperature multiplies σ of each effect channel
+    (none given: by 1), see `calibration.py`.
     """
 
     action_channels: tuple[str, ...] = ("x", "y")
     effect_channels: tuple[str, ...] = ("x", "y")
     sigma_floor: float = 0.1
     frame: str = "table"
-    temperature: float = 1.0
+    temperature: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         if self.frame not in FRAMES:
@@ -49,12 +50,18 @@ class NetworkConfig:
             if self.frame == "push" and not plane_of(channels):
                 raise ValueError(f'{name} must name x and y for frame="push", got {channels}')
             object.__setattr__(self, name, channels)
-        for name, high in (("sigma_floor", 10.0), ("temperature", 1000.0)):
-            if not 0 < getattr(self, name) < high:
-                raise ValueError(f"{name} must lie in (0, {high:g}), got {getattr(self, name)!r}")
+        if not 0 < self.sigma_floor < 10:
+            raise ValueError(f"sigma_floor must lie in (0, 10), got {self.sigma_floor!r}")
+        temperature = tuple(self.temperature) or (1.0,) * len(self.effect_channels)
+        if len(temperature) != len(self.effect_channels) or not min(temperature) > 0:
+            raise ValueError(
+                f"temperature must hold {len(self.effect_channels)} positive numbers, one per "
+                f"effect channel, got {self.temperature!r}"
+            )
+        object.__setattr__(self, "temperature", temperature)
 
 
-class EffectNetwork(nn.Module):
+class EffectNetwork(nn.Module, ABC):
     """A network that satisfies `EffectModel`.
 
     Inputs and outputs are in metres and radians, in the frame of the table; scaling by the
@@ -128,11 +135,16 @@ class EffectNetwork(nn.Module):
             features, observations, towards = self._enter(image, observations)
         mu_a, sigma_a, mu_e, sigma_e = self.outputs(features, observations, t_target)
         a, e = self.action_scale, self.effect_scale
-        prediction = Prediction(mu_a * a, sigma_a * a, mu_e * e, sigma_e * e * self.temperature)
+        prediction = Prediction(
+            mu_a * a, sigma_a * a, mu_e * e, sigma_e * e * e.new_tensor(self.temperature)
+        )
         return turn_prediction(prediction, towards, *self._channels) if push else prediction
 
     def forward(
-        self, image: Tensor, observations: Observations, t_target: Tensor
+        self,
+        image: Tensor,
+        observations: Observations,
+        t_target: Tensor,
     ) -> tuple[Tensor, ...]:
         """(μ_a, σ_a, μ_e, σ_e) in standardised units, in the network's frame."""
         if self.config.frame == "push":
@@ -147,10 +159,14 @@ class EffectNetwork(nn.Module):
         t_target: Tensor,
         action: Tensor,
         effect: Tensor,
+        beta: float = 0.0,
     ) -> Tensor:
         """Negative log-likelihood (Section 3.2) of the targets (B, T, C), per value.
 
-        The likelihood is of the standardised values, in the network's frame.
+        The likelihood is of the standardised values, in the network's frame. beta weighs each value
+        by σ^(2 beta), so that what is hard to predict is not given up for a large σ: with 0 it is
+        the likelihood, with 1 means learn as from the squared error (Seitzer et al., On the
+        pitfalls of heteroscedastic uncertainty estimation, ICLR 2022).
         """
         mu_a, sigma_a, mu_e, sigma_e = self(image, observations, t_target)
         if self.config.frame == "push":
@@ -159,6 +175,9 @@ class EffectNetwork(nn.Module):
             effect = turn(effect, self.effect_channels, back, absolute_yaw=False)
         nll_a = gaussian_nll(action / self.action_scale, mu_a, sigma_a)
         nll_e = gaussian_nll(effect / self.effect_scale, mu_e, sigma_e)
+        if beta:
+            nll_a = nll_a * sigma_a.detach() ** (2 * beta)
+            nll_e = nll_e * sigma_e.detach() ** (2 * beta)
         return (nll_a.mean() + nll_e.mean()) / 2
 
     def _check_image(self, image: Tensor) -> None:

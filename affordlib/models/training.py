@@ -37,11 +37,11 @@ _AUTO = "cuda" if torch.cuda.is_available() else "cpu"
 class TrainingConfig:
     """How to train: steps and sizes; the σ floor falls from the model's to `final_sigma_floor`.
 
-    The floor stays for the first `hold_floor` of the steps. augment turns and mirrors: each batch
-    holds all eight images of the square in equal shares. ema: decay of the running mean of the
-    weights, which is what is validated and kept; 0 for none. patience counts validations (one every
-    `validate_every` steps) without improvement. max_minutes bounds wall time. device: as of torch,
-    or "auto" for a GPU where there is one.
+    beta: see `EffectNetwork.loss`. The floor stays for the first `hold_floor` of the steps. augment
+    turns and mirrors: each batch holds all eight images of the square in equal shares. ema: decay
+    of the running mean of the weights, which is what is validated and kept; 0 for none. patience
+    counts validations (one every `validate_every` steps) without improvement. max_minutes bounds
+    wall time. device: as of torch, or "auto" for a GPU where there is one.
     """
 
     steps: int = 3000
@@ -49,6 +49,8 @@ class TrainingConfig:
     n_targets: int = 16
     obs_max: int = 10
     learning_rate: float = 1e-3
+    weight_decay: float = 0.0
+    beta: float = 0.0
     final_sigma_floor: float = 0.02
     hold_floor: float = 0.0
     augment: bool = True
@@ -65,6 +67,8 @@ class TrainingConfig:
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}")
         check_within("learning_rate", self.learning_rate, 1e-7, 1.0)
+        check_within("weight_decay", self.weight_decay, 0.0, 10.0)
+        check_within("beta", self.beta, 0.0, 1.0)
         check_within("final_sigma_floor", self.final_sigma_floor, 1e-6, 10.0)
         check_within("hold_floor", self.hold_floor, 0.0, 1.0)
         check_within("ema", self.ema, 0.0, 0.99999)
@@ -150,7 +154,9 @@ class _Run:
         self.model, self.config = model, config
         self.about = about | asdict(replace(config, max_minutes=math.inf, device="cpu"))
         self.generator = torch.Generator().manual_seed(config.seed)
-        self.optimiser = torch.optim.Adam(model.parameters(), lr=config.learning_rate, fused=True)
+        self.optimiser = torch.optim.AdamW(
+            model.parameters(), config.learning_rate, weight_decay=config.weight_decay, fused=True
+        )
         self.mean = {k: v.clone() for k, v in model.state_dict().items()}
         self.best, self.best_state, self.best_floor = math.inf, self.mean, model.sigma_floor
         self.step, self.waited, self.seconds = 0, 0, 0.0
@@ -232,7 +238,7 @@ def train(
                 config.obs_max,
                 run.generator,
             )
-            loss = _step(model, run.optimiser, _to(batch, device))
+            loss = _step(model, run.optimiser, _to(batch, device), config.beta)
             if config.ema:
                 decay = min(config.ema, run.step / (run.step + 10))
                 for name, value in model.state_dict().items():
@@ -262,8 +268,10 @@ def train(
     return run.history
 
 
-def _step(model: EffectNetwork, optimiser: torch.optim.Optimizer, batch: Batch) -> torch.Tensor:
-    loss = batch_loss(model, batch)
+def _step(
+    model: EffectNetwork, optimiser: torch.optim.Optimizer, batch: Batch, beta: float
+) -> torch.Tensor:
+    loss = batch_loss(model, batch, beta)
     optimiser.zero_grad(set_to_none=True)
     loss.backward()
     torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
@@ -271,9 +279,10 @@ def _step(model: EffectNetwork, optimiser: torch.optim.Optimizer, batch: Batch) 
     return loss.detach()
 
 
-def batch_loss(model: EffectNetwork, batch: Batch) -> torch.Tensor:
-    """Mean negative log-likelihood of a batch's targets."""
-    return model.loss(batch.image, batch.observations, batch.t_target, batch.action, batch.effect)
+def batch_loss(model: EffectNetwork, batch: Batch, beta: float = 0.0) -> torch.Tensor:
+    """Mean negative log-likelihood of a batch's targets; for beta see `EffectNetwork.loss`."""
+    b = batch
+    return model.loss(b.image, b.observations, b.t_target, b.action, b.effect, beta)
 
 
 def literal_draw(arrays: TrainingArrays, obs_max: int, generator: torch.Generator) -> Batch:
