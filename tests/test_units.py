@@ -135,6 +135,18 @@ def test_the_hash_is_of_what_decides_the_numbers(monkeypatch):
     assert configuration_sha256(unit) != first
 
 
+def test_one_training_is_not_counted_twice(tmp_path):
+    run_units([FEW[0], replace(FEW[0], n=100)], tmp_path, progress=False)
+    with pytest.raises(ValueError, match="are the same; delete one"):
+        tables.read_parts(tmp_path)
+
+
+def test_sets_ten_times_as_large_are_asked_the_same():
+    small, large = Unit("film", "push"), Unit("film", "push_x10")
+    assert units.learner(small) == units.learner(large)
+    assert configuration_sha256(small) != configuration_sha256(large)
+
+
 def test_a_dask_client_makes_the_same_parts(tmp_path):
     from dask.distributed import Client
 

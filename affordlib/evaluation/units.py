@@ -97,6 +97,14 @@ TASKS: dict[str, Task] = {
     "rotate": Task(("yaw", "gripper"), ("yaw",), ((0, False), (2, False))),
 }
 
+TEN_TIMES = "_x10"
+SETS = (*TASKS, *(f"{name}{TEN_TIMES}" for name in TASKS))
+
+
+def task_of(data: str) -> Task:
+    """What is asked of a set, or of the one that is ten times as large."""
+    return TASKS[data.removesuffix(TEN_TIMES)]
+
 
 @dataclass(frozen=True)
 class Unit:
@@ -109,16 +117,16 @@ class Unit:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name, known in (("model", MODELS), ("data", tuple(TASKS))):
+        for name, known in (("model", MODELS), ("data", SETS)):
             if getattr(self, name) not in known:
                 raise ValueError(f"{name} must be one of {known}, got {getattr(self, name)!r}")
         if self.n != "all" and (not isinstance(self.n, int) or self.n < N_FOLDS):
             raise ValueError(f'n must be "all" or at least {N_FOLDS}, got {self.n!r}')
         if self.fold not in range(N_FOLDS):
             raise ValueError(f"fold must lie in [0, {N_FOLDS - 1}], got {self.fold!r}")
-        if self.model == "logistic" and self.data != "grasp":
+        if self.model == "logistic" and not self.data.startswith("grasp"):
             raise ValueError(f"model 'logistic' tells the success of grasps, not {self.data!r}")
-        if self.data not in ("push", "drag") and self.model.endswith("_frame"):
+        if task_of(self.data).symmetries is not None and self.model.endswith("_frame"):
             raise ValueError(f"data {self.data!r} has no direction, so model {self.model!r} no use")
 
     @property
@@ -134,7 +142,7 @@ def learner(unit: Unit) -> tuple[NetworkConfig, TrainingConfig] | None:
     """
     if unit.model not in NETWORKS:
         return None
-    task, film = TASKS[unit.data], unit.model.startswith("film")
+    task, film = task_of(unit.data), unit.model.startswith("film")
     shipped = SHIPPED["push_film" if film else "push_cnp"]
     push_frame = unit.model in ("film", "paper_push_frame") and task.symmetries is None
     network = (FiLMConfig if film else CNPConfig)(
@@ -144,7 +152,8 @@ def learner(unit: Unit) -> tuple[NetworkConfig, TrainingConfig] | None:
     )
     training = replace(shipped.training, seed=unit.seed)
     if task.symmetries is not None:
-        training = replace(training, augment=False, steps=FEW_STEPS)
+        few = not unit.data.endswith(TEN_TIMES)
+        training = replace(training, augment=False, steps=FEW_STEPS if few else training.steps)
     return network, training
 
 
@@ -153,7 +162,7 @@ def configuration_sha256(unit: Unit) -> str:
     told: dict[str, Any] = {
         "format": FORMAT,
         "unit": asdict(unit),
-        "task": asdict(TASKS[unit.data]),
+        "task": asdict(task_of(unit.data)),
     }
     if configs := learner(unit):
         network, training = configs
@@ -166,13 +175,13 @@ def _chosen(config: NetworkConfig | TrainingConfig) -> dict[str, Any]:
     """What differs from the defaults: an option that is added later, and off, changes no hash."""
     chosen = {f.name: getattr(config, f.name) for f in fields(config)}
     defaults = {f.name: f.default for f in fields(config)}
-    apart = ("max_minutes", "device")
+    apart = ("max_minutes", "device", "temperature")  # of the machine; fitted anyway
     return {k: v for k, v in chosen.items() if v != defaults[k] and k not in apart}
 
 
 def data_sha256(unit: Unit) -> dict[str, str]:
     """Hashes of the sets that a unit reads."""
-    names = [unit.data, TASKS[unit.data].also]
+    names = [unit.data, task_of(unit.data).also]
     return {name: stored_sha256(name) for name in names if name}
 
 
@@ -211,7 +220,7 @@ def run_unit(unit: Unit, folder: Path, progress: bool = False) -> bool:
             return False
     except ValueError:
         pass  # of an earlier configuration or data: made again
-    data, task = _open(unit.data), TASKS[unit.data]
+    data, task = _open(unit.data), task_of(unit.data)
     n = data.sizes["interaction"] if unit.n == "all" else int(unit.n)
     if n > data.sizes["interaction"]:
         raise ValueError(f"n = {n}, but {unit.data!r} has {data.sizes['interaction']} interactions")
@@ -224,14 +233,14 @@ def run_unit(unit: Unit, folder: Path, progress: bool = False) -> bool:
     configs = learner(unit)
     if configs is None:
         told = {name: _guess(unit, data, split.train, *test) for name, test in tests.items()}
-        if (unit.model, unit.data) == ("constant", "push"):
+        if unit.model == "constant" and task.also:
             kept = believable(data, split.test)
             part["inverse"] = executed_record(data, kept, along_effect(data, kept))
     else:
         halfway = folder / f".{unit.file}.{part['configuration_sha256'][:8]}.pt"
         model, part["training"] = _fit(unit, *configs, data, split, halfway, progress)
         told = {name: network_answers(model, *test) for name, test in tests.items()}
-        if unit.data == "push":
+        if task.also:
             part["inverse"] = inverse_record(model, data, split.test)
     part["fold_test"] = told["fold"]
     if "fixed" in told:
@@ -247,7 +256,7 @@ def _guess(
 ) -> dict[str, Any]:
     if unit.model == "logistic":
         return logistic_answers(data, train_on, other, asked)
-    task = TASKS[unit.data]
+    task = task_of(unit.data)
     channels = task.action_channels, task.all_effects
     return baseline_answers(BASELINES[unit.model], channels, data, train_on, other, asked)
 
@@ -264,7 +273,7 @@ def _fit(
     channels = network.action_channels, network.effect_channels
     training = TrainingArrays.from_dataset(data, split.train, *channels)
     validation = TrainingArrays.from_dataset(data, split.validation, *channels)
-    symmetries = TASKS[unit.data].symmetries
+    symmetries = task_of(unit.data).symmetries
     if symmetries:
         training = _all_of([training.turned(*symmetry) for symmetry in symmetries])
     torch.manual_seed(config.seed)
@@ -329,7 +338,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         prog="python -m affordlib.evaluation.units", description=main.__doc__
     )
     parser.add_argument("--models", default="film,paper", help=f"of {','.join(MODELS)}")
-    parser.add_argument("--sets", default="push", help=f"of {','.join(TASKS)}")
+    parser.add_argument("--sets", default="push", help=f"of {','.join(SETS)}")
     parser.add_argument("--n", default="all", help="interactions of the set that are used")
     parser.add_argument("--folds", type=int, default=N_FOLDS, help="the first of the ten")
     parser.add_argument("--seeds", type=int, default=1)
