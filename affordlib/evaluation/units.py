@@ -43,11 +43,11 @@ from affordlib.interactions import (
 )
 from affordlib.interactions.store import stored_sha256
 from affordlib.models.calibration import fit_temperature
-from affordlib.models.checkpoint import build
+from affordlib.models.checkpoint import build, load_checkpoint
 from affordlib.models.cnp import CNPConfig
 from affordlib.models.film import FiLMConfig
-from affordlib.models.make_checkpoints import SHIPPED
-from affordlib.models.training import train
+from affordlib.models.make_checkpoints import SHIPPED, about_training
+from affordlib.models.training import TrainingConfig, train
 from affordlib.paths import repo_root, resolve_out_dir
 from affordlib.results import write_text_atomically
 
@@ -55,8 +55,8 @@ if TYPE_CHECKING:
     import xarray as xr
     from dask.distributed import Client
 
+    from affordlib.interactions import Split
     from affordlib.models.network import EffectNetwork, NetworkConfig
-    from affordlib.models.training import TrainingConfig
 
 FORMAT = 1
 """Counts the changes of code that change a unit's numbers without changing its configuration."""
@@ -266,7 +266,7 @@ def _fit(
     network: NetworkConfig,
     config: TrainingConfig,
     data: xr.Dataset,
-    split: Any,
+    split: Split,
     halfway: Path,
     progress: bool,
 ) -> tuple[EffectNetwork, dict[str, Any]]:
@@ -276,8 +276,11 @@ def _fit(
     symmetries = task_of(unit.data).symmetries
     if symmetries:
         training = _all_of([training.turned(*symmetry) for symmetry in symmetries])
+    normaliser = Normaliser.fit(training)
+    if (found := _shipped(network, config, normaliser, data, split)) is not None:
+        return found
     torch.manual_seed(config.seed)
-    model = build(network, Normaliser.fit(training))
+    model = build(network, normaliser)
     history = train(model, training, validation, config, progress, halfway)
     fit_temperature(model, validation)
     best = min(record.validation_error_m for record in history)
@@ -287,6 +290,34 @@ def _fit(
         "validation_error": best,
         "temperature": model.temperature,
     }
+
+
+def _shipped(
+    network: NetworkConfig,
+    config: TrainingConfig,
+    normaliser: Normaliser,
+    data: xr.Dataset,
+    split: Split,
+) -> tuple[EffectNetwork, dict[str, Any]] | None:
+    """The shipped checkpoint that this very training gave, if there is one.
+
+    Settings, interactions seen, and all scales of their data must be the same.
+    """
+    for name, shipped in SHIPPED.items():
+        if (shipped.network, shipped.training) != (network, config):
+            continue
+        try:
+            model, about = load_checkpoint(name)
+        except (FileNotFoundError, ValueError):
+            continue
+        expected = about_training(data, np.concatenate([split.train, split.validation]), config)
+        # Options that are younger than a checkpoint were off when it was trained.
+        settings = vars(TrainingConfig()) | about["training"] | {"device": config.device}
+        del settings["max_minutes"]
+        same = expected == about | {"training": settings} and model.normaliser == normaliser
+        if same:
+            return model, {"checkpoint": name, "temperature": list(model.temperature)}
+    return None
 
 
 def _all_of(parts: list[TrainingArrays]) -> TrainingArrays:
