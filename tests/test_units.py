@@ -14,7 +14,12 @@ from affordlib.evaluation.baselines import constant, gaussian_process, logistic,
 from affordlib.evaluation.inverse import along_effect, executed_record
 from affordlib.evaluation.tables import Errors, auc, confusion_columns, grasp_rows, wilson
 from affordlib.evaluation.units import Unit, configuration_sha256, read_part, run_unit, run_units
-from affordlib.interactions import TrainingArrays, open_interactions
+from affordlib.interactions import (
+    Normaliser,
+    TrainingArrays,
+    open_interactions,
+    split_interactions,
+)
 from affordlib.paths import repo_root
 from affordlib.results import read_results
 
@@ -133,6 +138,33 @@ def test_the_hash_is_of_what_decides_the_numbers(monkeypatch):
     assert hash_with(device="cpu", max_minutes=3.0) == first
     monkeypatch.setattr(units, "FORMAT", units.FORMAT + 1)
     assert configuration_sha256(unit) != first
+
+
+def test_one_training_is_not_counted_twice(tmp_path):
+    run_units([FEW[0], replace(FEW[0], n=100)], tmp_path, progress=False)
+    with pytest.raises(ValueError, match="are the same; delete one"):
+        tables.read_parts(tmp_path)
+
+
+def test_sets_ten_times_as_large_are_asked_the_same():
+    small, large = Unit("film", "push"), Unit("film", "push_x10")
+    assert units.learner(small) == units.learner(large)
+    assert configuration_sha256(small) != configuration_sha256(large)
+
+
+def test_the_shipped_checkpoint_stands_for_its_own_training_only(pushes):
+    def found(fold, **change):
+        network, training = units.learner(Unit("paper", "push", fold=fold))
+        split = split_interactions(pushes.sizes["interaction"], 0, fold)
+        normaliser = Normaliser.fit(TrainingArrays.from_dataset(pushes, split.train))
+        normaliser = replace(normaliser, **change)
+        return units._shipped(network, training, normaliser, pushes, split)
+
+    model, told = found(0)
+    assert told["checkpoint"] == "push_cnp"
+    assert model.effect_channels == ("x", "y")
+    assert found(1) is None
+    assert found(0, effect_scale=(0.03, 0.03)) is None  # of other data
 
 
 def test_a_dask_client_makes_the_same_parts(tmp_path):

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from affordlib.evaluation.answers import calibration, final_error, yaw_error
-from affordlib.evaluation.units import MODELS, NETWORKS, PARTS, Unit, read_part
+from affordlib.evaluation.units import MODELS, NETWORKS, PARTS, TEN_TIMES, Unit, read_part
 from affordlib.paths import resolve_out_dir
 from affordlib.primitives import Grasp
 from affordlib.results import write_results
@@ -67,14 +67,20 @@ def read_parts(folder: str | Path = PARTS) -> list[tuple[Unit, Part]]:
     units = [Unit(**json.loads(path.read_text())["unit"]) for path in folder.glob("*.json")]
     units.sort(key=lambda u: (u.data, MODELS.index(u.model), str(u.n), u.seed, u.fold))
     parts = [(unit, read_part(unit, folder)) for unit in units]
-    return [(unit, part) for unit, part in parts if part is not None]
+    kept = [(unit, part) for unit, part in parts if part is not None]
+    seen: dict[tuple, Unit] = {}
+    for unit, part in kept:
+        key = (unit.model, unit.data, part["n"], unit.fold, unit.seed)
+        if (other := seen.setdefault(key, unit)) != unit:
+            raise ValueError(f"parts {other.file} and {unit.file} are the same; delete one")
+    return kept
 
 
 def _by_model(parts: Iterable[tuple[Unit, Part]], data: str) -> Iterable[tuple[dict, list[Part]]]:
     """The parts of a set, grouped, with the columns that say which they are."""
     groups: dict[tuple[str, int], list[tuple[Unit, Part]]] = defaultdict(list)
     for unit, part in parts:
-        if unit.data == data:
+        if unit.data.removesuffix(TEN_TIMES) == data:
             groups[unit.model, part["n"]].append((unit, part))
     for (model, n), group in groups.items():
         folds, seeds = ({getattr(u, name) for u, _ in group} for name in ("fold", "seed"))
@@ -182,9 +188,7 @@ def grasp_rows(parts: list[tuple[Unit, Part]]) -> list[dict[str, Any]]:
             row["error_median_m"] = None if error is None else float(np.median(error[chosen]))
             order = auc(score[chosen], truth, fold[chosen])
             brier = float(np.square(score[chosen] - truth).mean())
-            rows.append(
-                row | counts | {"auc": order, "brier": brier}
-            )
+            rows.append(row | counts | {"auc": order, "brier": brier})
     return rows
 
 

@@ -43,11 +43,11 @@ from affordlib.interactions import (
 )
 from affordlib.interactions.store import stored_sha256
 from affordlib.models.calibration import fit_temperature
-from affordlib.models.checkpoint import build
+from affordlib.models.checkpoint import build, load_checkpoint
 from affordlib.models.cnp import CNPConfig
 from affordlib.models.film import FiLMConfig
-from affordlib.models.make_checkpoints import SHIPPED
-from affordlib.models.training import train
+from affordlib.models.make_checkpoints import SHIPPED, about_training
+from affordlib.models.training import TrainingConfig, train
 from affordlib.paths import repo_root, resolve_out_dir
 from affordlib.results import write_text_atomically
 
@@ -55,8 +55,8 @@ if TYPE_CHECKING:
     import xarray as xr
     from dask.distributed import Client
 
+    from affordlib.interactions import Split
     from affordlib.models.network import EffectNetwork, NetworkConfig
-    from affordlib.models.training import TrainingConfig
 
 FORMAT = 1
 """Counts the changes of code that change a unit's numbers without changing its configuration."""
@@ -97,6 +97,14 @@ TASKS: dict[str, Task] = {
     "rotate": Task(("yaw", "gripper"), ("yaw",), ((0, False), (2, False))),
 }
 
+TEN_TIMES = "_x10"
+SETS = (*TASKS, *(f"{name}{TEN_TIMES}" for name in TASKS))
+
+
+def task_of(data: str) -> Task:
+    """What is asked of a set, or of the one that is ten times as large."""
+    return TASKS[data.removesuffix(TEN_TIMES)]
+
 
 @dataclass(frozen=True)
 class Unit:
@@ -109,16 +117,16 @@ class Unit:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name, known in (("model", MODELS), ("data", tuple(TASKS))):
+        for name, known in (("model", MODELS), ("data", SETS)):
             if getattr(self, name) not in known:
                 raise ValueError(f"{name} must be one of {known}, got {getattr(self, name)!r}")
         if self.n != "all" and (not isinstance(self.n, int) or self.n < N_FOLDS):
             raise ValueError(f'n must be "all" or at least {N_FOLDS}, got {self.n!r}')
         if self.fold not in range(N_FOLDS):
             raise ValueError(f"fold must lie in [0, {N_FOLDS - 1}], got {self.fold!r}")
-        if self.model == "logistic" and self.data != "grasp":
+        if self.model == "logistic" and not self.data.startswith("grasp"):
             raise ValueError(f"model 'logistic' tells the success of grasps, not {self.data!r}")
-        if self.data not in ("push", "drag") and self.model.endswith("_frame"):
+        if task_of(self.data).symmetries is not None and self.model.endswith("_frame"):
             raise ValueError(f"data {self.data!r} has no direction, so model {self.model!r} no use")
 
     @property
@@ -134,7 +142,7 @@ def learner(unit: Unit) -> tuple[NetworkConfig, TrainingConfig] | None:
     """
     if unit.model not in NETWORKS:
         return None
-    task, film = TASKS[unit.data], unit.model.startswith("film")
+    task, film = task_of(unit.data), unit.model.startswith("film")
     shipped = SHIPPED["push_film" if film else "push_cnp"]
     push_frame = unit.model in ("film", "paper_push_frame") and task.symmetries is None
     network = (FiLMConfig if film else CNPConfig)(
@@ -144,7 +152,8 @@ def learner(unit: Unit) -> tuple[NetworkConfig, TrainingConfig] | None:
     )
     training = replace(shipped.training, seed=unit.seed)
     if task.symmetries is not None:
-        training = replace(training, augment=False, steps=FEW_STEPS)
+        few = not unit.data.endswith(TEN_TIMES)
+        training = replace(training, augment=False, steps=FEW_STEPS if few else training.steps)
     return network, training
 
 
@@ -153,7 +162,7 @@ def configuration_sha256(unit: Unit) -> str:
     told: dict[str, Any] = {
         "format": FORMAT,
         "unit": asdict(unit),
-        "task": asdict(TASKS[unit.data]),
+        "task": asdict(task_of(unit.data)),
     }
     if configs := learner(unit):
         network, training = configs
@@ -166,13 +175,13 @@ def _chosen(config: NetworkConfig | TrainingConfig) -> dict[str, Any]:
     """What differs from the defaults: an option that is added later, and off, changes no hash."""
     chosen = {f.name: getattr(config, f.name) for f in fields(config)}
     defaults = {f.name: f.default for f in fields(config)}
-    apart = ("max_minutes", "device")
+    apart = ("max_minutes", "device", "temperature")  # of the machine; fitted anyway
     return {k: v for k, v in chosen.items() if v != defaults[k] and k not in apart}
 
 
 def data_sha256(unit: Unit) -> dict[str, str]:
     """Hashes of the sets that a unit reads."""
-    names = [unit.data, TASKS[unit.data].also]
+    names = [unit.data, task_of(unit.data).also]
     return {name: stored_sha256(name) for name in names if name}
 
 
@@ -211,7 +220,7 @@ def run_unit(unit: Unit, folder: Path, progress: bool = False) -> bool:
             return False
     except ValueError:
         pass  # of an earlier configuration or data: made again
-    data, task = _open(unit.data), TASKS[unit.data]
+    data, task = _open(unit.data), task_of(unit.data)
     n = data.sizes["interaction"] if unit.n == "all" else int(unit.n)
     if n > data.sizes["interaction"]:
         raise ValueError(f"n = {n}, but {unit.data!r} has {data.sizes['interaction']} interactions")
@@ -224,14 +233,14 @@ def run_unit(unit: Unit, folder: Path, progress: bool = False) -> bool:
     configs = learner(unit)
     if configs is None:
         told = {name: _guess(unit, data, split.train, *test) for name, test in tests.items()}
-        if (unit.model, unit.data) == ("constant", "push"):
+        if unit.model == "constant" and task.also:
             kept = believable(data, split.test)
             part["inverse"] = executed_record(data, kept, along_effect(data, kept))
     else:
         halfway = folder / f".{unit.file}.{part['configuration_sha256'][:8]}.pt"
         model, part["training"] = _fit(unit, *configs, data, split, halfway, progress)
         told = {name: network_answers(model, *test) for name, test in tests.items()}
-        if unit.data == "push":
+        if task.also:
             part["inverse"] = inverse_record(model, data, split.test)
     part["fold_test"] = told["fold"]
     if "fixed" in told:
@@ -247,7 +256,7 @@ def _guess(
 ) -> dict[str, Any]:
     if unit.model == "logistic":
         return logistic_answers(data, train_on, other, asked)
-    task = TASKS[unit.data]
+    task = task_of(unit.data)
     channels = task.action_channels, task.all_effects
     return baseline_answers(BASELINES[unit.model], channels, data, train_on, other, asked)
 
@@ -257,18 +266,21 @@ def _fit(
     network: NetworkConfig,
     config: TrainingConfig,
     data: xr.Dataset,
-    split: Any,
+    split: Split,
     halfway: Path,
     progress: bool,
 ) -> tuple[EffectNetwork, dict[str, Any]]:
     channels = network.action_channels, network.effect_channels
     training = TrainingArrays.from_dataset(data, split.train, *channels)
     validation = TrainingArrays.from_dataset(data, split.validation, *channels)
-    symmetries = TASKS[unit.data].symmetries
+    symmetries = task_of(unit.data).symmetries
     if symmetries:
         training = _all_of([training.turned(*symmetry) for symmetry in symmetries])
+    normaliser = Normaliser.fit(training)
+    if (found := _shipped(network, config, normaliser, data, split)) is not None:
+        return found
     torch.manual_seed(config.seed)
-    model = build(network, Normaliser.fit(training))
+    model = build(network, normaliser)
     history = train(model, training, validation, config, progress, halfway)
     fit_temperature(model, validation)
     best = min(record.validation_error_m for record in history)
@@ -278,6 +290,34 @@ def _fit(
         "validation_error": best,
         "temperature": model.temperature,
     }
+
+
+def _shipped(
+    network: NetworkConfig,
+    config: TrainingConfig,
+    normaliser: Normaliser,
+    data: xr.Dataset,
+    split: Split,
+) -> tuple[EffectNetwork, dict[str, Any]] | None:
+    """The shipped checkpoint that this very training gave, if there is one.
+
+    Settings, interactions seen, and all scales of their data must be the same.
+    """
+    for name, shipped in SHIPPED.items():
+        if (shipped.network, shipped.training) != (network, config):
+            continue
+        try:
+            model, about = load_checkpoint(name)
+        except (FileNotFoundError, ValueError):
+            continue
+        expected = about_training(data, np.concatenate([split.train, split.validation]), config)
+        # Options that are younger than a checkpoint were off when it was trained.
+        settings = vars(TrainingConfig()) | about["training"] | {"device": config.device}
+        del settings["max_minutes"]
+        same = expected == about | {"training": settings} and model.normaliser == normaliser
+        if same:
+            return model, {"checkpoint": name, "temperature": list(model.temperature)}
+    return None
 
 
 def _all_of(parts: list[TrainingArrays]) -> TrainingArrays:
@@ -329,7 +369,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         prog="python -m affordlib.evaluation.units", description=main.__doc__
     )
     parser.add_argument("--models", default="film,paper", help=f"of {','.join(MODELS)}")
-    parser.add_argument("--sets", default="push", help=f"of {','.join(TASKS)}")
+    parser.add_argument("--sets", default="push", help=f"of {','.join(SETS)}")
     parser.add_argument("--n", default="all", help="interactions of the set that are used")
     parser.add_argument("--folds", type=int, default=N_FOLDS, help="the first of the ten")
     parser.add_argument("--seeds", type=int, default=1)
