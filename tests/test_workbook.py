@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 
 import nbformat
 import psutil
@@ -259,7 +260,9 @@ def test_a_killed_run_counts_as_nothing_and_is_taken_up_again(book, capsys, how)
     )
     book.add("01_first")
     book.add("02_second", wait)
-    process = subprocess.Popen(book.command(), stderr=subprocess.PIPE, text=True)
+    # A job in the background ignores SIGINT, and its children would, too.
+    heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    process = subprocess.Popen(book.command(), stderr=subprocess.PIPE, text=True, preexec_fn=heed)
     try:
         deadline = time.monotonic() + 60
         while not (root / "pid").exists() or not (root / "pid").read_text():
