@@ -8,6 +8,9 @@ OUT     =
 ONLY    =
 ARGS    =
 FORCE   =
+DRY_RUN =
+SEEDS   = 0 1 2
+WORKERS = 1
 
 PY     := .venv/bin/python
 STAMP  := .venv/.installed
@@ -19,12 +22,12 @@ SHELL         := /bin/bash
 MAKEFLAGS     += --no-print-directory
 .SUFFIXES:
 
-export PROFILE SEED OUT ONLY ARGS
+export PROFILE SEED SEEDS WORKERS OUT ONLY ARGS
 unexport PYTHONPATH PYTHONHOME PYTHONSTARTUP VIRTUAL_ENV MPLBACKEND
 unexport PIP_USER PIP_TARGET PIP_PREFIX PIP_REQUIREMENT PIP_CONSTRAINT
 unexport PYTEST_ADDOPTS JUPYTER_PATH JUPYTER_TOKEN
 
-.PHONY: help setup workbook lab test test-fast lint format bench data checkpoints notebooks tables \
+.PHONY: help setup workbook seeds lab test test-fast test-slow lint format bench data checkpoints notebooks html tables \
         constraints clean
 
 help: ## List the targets
@@ -52,9 +55,13 @@ $(STAMP): $(INPUTS)
 	@$(PY) -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
 	@printf '%s' "$(CURDIR)" > $@
 
-workbook: $(STAMP) ## Run all notebooks into runs/ (PROFILE=smoke|reader|full SEED= OUT= ONLY= ARGS=)
+workbook: $(STAMP) ## Run all notebooks into runs/ (PROFILE=smoke|reader|full SEED= OUT= ONLY= ARGS= DRY_RUN=1)
 	@set -f; $(PY) -m affordlib.workbook --profile "$${PROFILE:-reader}" --seed "$${SEED:-0}" \
-	  --out "$$OUT" --only "$$ONLY" $(if $(FORCE),--force) -- $$ARGS
+	  --out "$$OUT" --only "$$ONLY" $(if $(FORCE),--force) $(if $(DRY_RUN),--dry-run) -- $$ARGS
+
+seeds: $(STAMP) ## Run them for several seeds, and a page over seeds (SEEDS="0 1 2" WORKERS=1 …)
+	@set -f; $(PY) -m affordlib.seeds $$SEEDS --workers "$$WORKERS" \
+	  --profile "$${PROFILE:-reader}" --out "$$OUT" --only "$$ONLY" --settings $$ARGS
 
 lab: $(STAMP) ## Open the book in JupyterLab, on this machine only
 	@root=; [[ $$(id -u) == 0 ]] && root=--allow-root; \
@@ -66,6 +73,10 @@ test: $(STAMP) ## Run all tests, notebooks included
 
 test-fast: $(STAMP) ## Run the tests that take seconds, without the notebooks
 	@$(PY) -m pytest -m "not slow"
+
+test-slow: $(STAMP) ## Run every notebook and solution as the reader does; the log is runs/test-slow.log
+	@mkdir -p runs; { $(PY) -m affordlib.workbook --profile reader --out test-slow --force; \
+	  $(PY) -m pytest tests/test_exercises.py tests/test_browser.py; } 2>&1 | tee runs/test-slow.log
 
 lint: $(STAMP) ## Check style and formatting
 	@$(PY) -m ruff check
@@ -88,6 +99,9 @@ checkpoints: $(STAMP) ## Train the shipped models again (ONLY="push_film")
 
 notebooks: $(STAMP) ## Execute the committed notebooks in place and clean them (ONLY= FORCE=1)
 	@$(PY) -m affordlib.workbook --in-place --only "$$ONLY" $(if $(FORCE),--force)
+
+html: $(STAMP) ## Write the book as web pages that need no network, into runs/html
+	@$(PY) -m affordlib.book
 
 tables: $(STAMP) ## Draw the tables of the README and the data card from data/results
 	@$(PY) -m affordlib.results README.md data/README.md

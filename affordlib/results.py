@@ -35,6 +35,7 @@ from affordlib.paths import repo_root, resolve_out_dir
 UNITS = {
     "m": ("mm", 1000.0, 2),
     "mm": ("mm", 1.0, 2),
+    "cm": ("cm", 1.0, 3),
     "percent": ("%", 1.0, 1),
     "ms": ("ms", 1.0, 1),
     "s": ("s", 1.0, 2),

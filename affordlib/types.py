@@ -149,14 +149,24 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Goal:
-    """Where the object shall be: a position (x, y) [m] on the table and a tolerance [m]."""
+    """Where the object shall be: a position (x, y) [m] on the table and a tolerance [m].
+
+    turn_rad: how far it shall be turned from how it stands, None if that does not matter;
+    height_m: how far it shall be lifted above where it stands, None to leave it on the table.
+    """
 
     xy_m: tuple[float, float]
     tolerance_m: float = 0.02
+    turn_rad: float | None = None
+    height_m: float | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "xy_m", check_on_table("goal xy_m", self.xy_m))
         check_within("goal tolerance_m", self.tolerance_m, 0.0, 0.5, "m")
+        if self.turn_rad is not None:
+            check_within("goal turn_rad", self.turn_rad, -math.pi, math.pi, "rad")
+        if self.height_m is not None:
+            check_within("goal height_m", self.height_m, 0.0, 0.5, "m")
 
     def distance_m(self, xy_m: Sequence[float]) -> float:
         """Distance [m] between the goal and a point (x, y) [m] of the table."""
@@ -170,7 +180,9 @@ class Step:
     primitive: the action; stop_phase: the phase at which it stops; predicted_end_xy_m: (x, y)
     in the frame of the table; predicted_path_xy_m: (n, 2), the object's way there;
     path_xy_m: (m, 2) or None, a decoded end-effector path relative to the object, executed
-    instead of the primitive's own where a planner gives one; std_m: the model's σ of the end.
+    instead of the primitive's own where a planner gives one; std_m: the model's σ of the end;
+    predicted_turn_rad: how far it expects the object to have turned since the plan's start;
+    predicted_height_m: how far it expects it to be lifted.
     """
 
     primitive: Primitive
@@ -179,6 +191,8 @@ class Step:
     predicted_path_xy_m: np.ndarray
     path_xy_m: np.ndarray | None = None
     std_m: float = math.nan
+    predicted_turn_rad: float = 0.0
+    predicted_height_m: float = 0.0
 
     def __post_init__(self) -> None:
         check_within("stop_phase", self.stop_phase, 0.0, 1.0)

@@ -38,7 +38,8 @@ from jupyter_client.kernelspec import KernelSpec
 from jupyter_client.manager import AsyncKernelManager
 from nbclient.exceptions import DeadKernelError
 
-from affordlib.paths import repo_root
+from affordlib import durations
+from affordlib.paths import digest_of, repo_root
 from affordlib.profiles import (
     WorkbookError,
     choose,
@@ -169,18 +170,6 @@ def environment_of(layout: Layout) -> dict[str, str]:
     }
 
 
-def digest_of(folder: Path) -> str:
-    """Return a digest of the names and contents of all files of a folder, caches left out."""
-    digest = hashlib.sha256()
-    for path in sorted(folder.rglob("*")):
-        parts = path.relative_to(folder).parts
-        if path.is_file() and not any(p.startswith((".", "__pycache__")) for p in parts):
-            with path.open("rb") as file:
-                content = hashlib.file_digest(file, "sha256").hexdigest()
-            digest.update(f"{'/'.join(parts)}\n{path.stat().st_size}\n{content}\n".encode())
-    return digest.hexdigest()
-
-
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
     """Hold a run's folder; the lock dies with its process, so a kill leaves none behind."""
@@ -208,8 +197,16 @@ def shown(path: Path) -> str:
 class Batch:
     """A run of the book into one folder; `in_place` also puts the cleaned copies back."""
 
-    def __init__(self, layout: Layout, folder: Path, jobs: Sequence[Job], in_place: bool = False):
+    def __init__(
+        self,
+        layout: Layout,
+        folder: Path,
+        jobs: Sequence[Job],
+        in_place: bool = False,
+        profile: str | None = None,
+    ):
         self.layout, self.folder, self.jobs, self.in_place = layout, folder, jobs, in_place
+        self.minutes = durations.expected_minutes(layout.notebooks, profile, folder)
 
     def copy(self, job: Job) -> Path:
         """The executed copy of a notebook."""
@@ -234,25 +231,31 @@ class Batch:
         """Execute what is not complete, in order; raises WorkbookError at the first failure."""
         environment = environment_of(self.layout)
         before: dict[str, str | None] = {}
+        asked = []
         for number, job in enumerate(self.jobs, 1):
             mark = fingerprint(job, environment, before)
             complete = self.is_complete(job, mark)
             if only and job.name not in only:
                 before[job.name] = mark if complete else None
-                continue
+            else:
+                before[job.name] = mark
+                asked.append((number, job, mark, complete and not force))
+        waiting = [job.name for _, job, _, done in asked if not done]
+        if about := durations.minutes_in_words(waiting, self.minutes):
+            print(f"to run: {len(waiting)} of {len(asked)} notebooks, {about}", flush=True)
+        for number, job, mark, done in asked:
             print(f"[{number}/{len(self.jobs)}] {job.name}: ", end="", flush=True)
-            if complete and not force:
+            if done:
                 print("skipped: complete", flush=True)
             elif dry:
-                print(f"would run with {job.parameters}", flush=True)
+                about = durations.minutes_in_words([job.name], self.minutes) or "length unknown"
+                print(f"would run ({about}) with {job.parameters}", flush=True)
             else:
-                start = time.monotonic()
-                self.execute(job, mark)
-                print(f"{time.monotonic() - start:.1f} s", flush=True)
-            before[job.name] = mark
+                print(f"{self.execute(job, mark):.1f} s", flush=True)
 
-    def execute(self, job: Job, mark: str) -> None:
-        """Execute one notebook, check what it wrote, and record that it is complete."""
+    def execute(self, job: Job, mark: str) -> float:
+        """Execute one notebook, check what it wrote, record it as complete; return the seconds."""
+        start = time.monotonic()
         copy, record = self.copy(job), self.record(job)
         record.parent.mkdir(parents=True, exist_ok=True)
         for stale in (record, job.results):
@@ -283,7 +286,9 @@ class Batch:
             ) from None
         if self.in_place:
             write_text_atomically(job.path, cleaned(read_notebook(copy)))
-        write_text_atomically(record, json.dumps({"fingerprint": mark}) + "\n")
+        seconds = round(time.monotonic() - start, 1)
+        write_text_atomically(record, json.dumps({"fingerprint": mark, "seconds": seconds}) + "\n")
+        return seconds
 
 
 def explained(job: Job, copy: Path, error: Exception) -> str:
@@ -374,7 +379,8 @@ def main(argv: Sequence[str] | None = None, layout: Layout | None = None) -> int
             for name in re.split(r"[\s,]+", options.only)
             if name
         ]
-        batch = Batch(layout, folder, jobs, options.in_place)
+        profile = None if options.in_place else options.profile
+        batch = Batch(layout, folder, jobs, options.in_place, profile)
         if options.dry_run:
             batch.run(only, options.force, dry=True)
         else:

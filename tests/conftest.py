@@ -34,6 +34,11 @@ def trained():
 
 
 @pytest.fixture(scope="session")
+def film():
+    return load_checkpoint("push_film")[0]
+
+
+@pytest.fixture(scope="session")
 def cuboid_image(world):
     world.place(Cuboid(0.06, 0.05, 0.05), (0.0, 0.0), 0.3)
     return np.array(world.look())

@@ -12,6 +12,7 @@ MODULES = sorted(p.relative_to(ROOT.parent) for p in ROOT.rglob("*.py"))
 
 FORBIDDEN = {
     "types": {"world", "interactions", "models", "planning", "evaluation", "show"},
+    "perception": {"world", "interactions", "models", "planning", "evaluation", "show"},
     "primitives": {"world", "interactions", "models", "planning", "evaluation", "show"},
     "world": {"interactions", "models", "planning", "evaluation", "show"},
     "interactions": {"models", "planning", "evaluation", "show"},

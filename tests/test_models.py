@@ -15,7 +15,7 @@ from affordlib.models import (
     EffectModel,
     TrainingConfig,
     load_checkpoint,
-    observe_pushes,
+    observe_actions,
     save_checkpoint,
     train,
 )
@@ -203,13 +203,13 @@ def test_the_shipped_model_on_the_held_out_pushes(trained, held_out_pushes, push
 def test_encoding_once_equals_encoding_each_time(trained, held_out_pushes):
     one = TrainingArrays.from_dataset(held_out_pushes, np.arange(1))
     pushed = [Push(theta) for theta in np.linspace(0, 6, 8)]
-    seen, t = observe_pushes(trained, pushed), torch.ones(8, 1)
+    seen, t = observe_actions(trained, pushed), torch.ones(8, 1)
     once = trained.predict(trained.encode(one.image), seen, t)
     each = trained.predict(trained.encode(one.image.expand(8, -1, -1, -1)), seen, t)
     torch.testing.assert_close(once.effect_mean, each.effect_mean, rtol=1e-4, atol=1e-6)
-    # What observe_pushes commands is what the data set stores.
+    # What observe_actions commands is what the data set stores.
     recorded = observe_action(one)
-    again = observe_pushes(trained, [Push(float(held_out_pushes["theta"][0]))])
+    again = observe_actions(trained, [Push(float(held_out_pushes["theta"][0]))])
     torch.testing.assert_close(recorded.action, again.action, atol=1e-6, rtol=0)
 
 

@@ -20,7 +20,7 @@ from affordlib.models import (
     coverage,
     fit_temperature,
     load_checkpoint,
-    observe_pushes,
+    observe_actions,
     save_checkpoint,
     train,
     train_literal,
@@ -34,7 +34,7 @@ from affordlib.types import Observations
 from affordlib.world import Cuboid
 
 YAW = {"action_channels": ("x", "y", "yaw"), "effect_channels": ("x", "y", "yaw")}
-SMALL = {"width": 32, "blocks": 2, "convolutions": (4, 8, 8, 8)}
+SMALL = {"width": 32, "blocks": 2, "rings": 3, "orders": 4}
 CONFIGS = {
     "cnp, table": CNPConfig(**YAW),
     "cnp, push": CNPConfig(**YAW, frame="push"),
@@ -138,8 +138,9 @@ def test_a_quarter_turn_of_the_table_turns_the_answer(name, quarters, some):
 
 
 @torch.no_grad()
-def test_any_turn_of_a_real_object_turns_the_answer_of_the_trained_model(world):
-    model, _ = load_checkpoint("push_film")
+@pytest.mark.parametrize("name", ["push_film", "push_film_x10"])
+def test_any_turn_of_a_real_object_turns_the_answer_of_the_trained_model(name, world):
+    model, _ = load_checkpoint(name)
     plane = slice(0, 2)
     straight, errors = None, []
     for degrees in (0, 11, 33, 45, 62, 78):
@@ -148,14 +149,14 @@ def test_any_turn_of_a_real_object_turns_the_answer_of_the_trained_model(world):
         image = torch.from_numpy(np.array(world.look()))[None]
         pushed = [Push(theta + turn_rad) for theta in np.linspace(0, 6, 24)]
         effect = model.predict(
-            model.encode(image), observe_pushes(model, pushed), torch.ones(24, 1)
+            model.encode(image), observe_actions(model, pushed), torch.ones(24, 1)
         ).effect_mean[:, 0, plane]
         c, s = math.cos(turn_rad), math.sin(turn_rad)
         effect = effect @ torch.tensor([[c, -s], [s, c]])
         straight = effect if straight is None else straight
         errors.append((effect - straight).norm(dim=-1))
-    # The goal is 0.3 mm; the pixels of hard edges fall differently at each angle.
-    assert torch.cat(errors[1:]).mean() < 0.0012
+    # Exact at quarter turns; between them the pixels of an edge fall differently at each angle.
+    assert torch.cat(errors[1:]).mean() < 0.0003
 
 
 def test_the_heading_is_the_push(some):
@@ -187,16 +188,19 @@ def test_turning_an_image_keeps_the_object(some):
     torch.testing.assert_close(turn_image(some.image, quarter), exact, atol=1e-5, rtol=0)
 
 
-def test_harmonics_of_a_turned_image_turn_by_their_order(some):
-    harmonics = CircularHarmonics(rings=2, orders=3)
-
-    def complex_ones(image):
-        values = harmonics(image).reshape(40, 2, 2, 7)  # rings: cos of m = 0 … 3, sin of 1 … 3
-        return torch.complex(values[..., 1:4], values[..., 4:])
-
-    turned = complex_ones(torch.rot90(some.image, 1, (-2, -1)))
-    expected = complex_ones(some.image) * torch.tensor([1j, -1, -1j])
-    torch.testing.assert_close(turned, expected, atol=1e-4, rtol=1e-4)
+def test_harmonics_turn_as_their_image_does(some):
+    harmonics = CircularHarmonics(rings=3, orders=4)
+    known = harmonics(some.image)
+    angle = math.tau * torch.rand(40, generator=torch.Generator().manual_seed(0))
+    for turn, exact in ((torch.full((40,), math.pi / 2), True), (angle, False)):
+        towards = torch.stack([turn.cos(), turn.sin()], dim=-1)
+        turned = torch.rot90(some.image, 1, (-2, -1)) if exact else turn_image(some.image, towards)
+        off = harmonics.turned(known, towards) - harmonics(turned)
+        # An interpolated image is not quite the turned one; the harmonics themselves are.
+        assert off.abs().max() < (1e-4 if exact else 0.03 * known.abs().max())
+        assert (harmonics(turned) - known).abs().max() > 0.2 * known.abs().max()
+    back = harmonics.turned(harmonics.turned(known, towards), inverse(towards))
+    torch.testing.assert_close(back, known, atol=1e-5, rtol=1e-4)
 
 
 def test_turned_data_are_those_of_the_turned_push(some):
@@ -244,11 +248,15 @@ def test_strange_inputs_are_refused(some):
     network = made("film, push", some)
     features = network.encode(some.image[:1])
     with pytest.raises(ValueError, match=r"starts 0\.260 m .* trained on 0\.200 to 0\.200 m"):
-        network.predict(features, observe_pushes(network, [Push(0, radius=0.26)]), torch.ones(1, 1))
+        network.predict(
+            features, observe_actions(network, [Push(0, radius=0.26)]), torch.ones(1, 1)
+        )
     with pytest.raises(ValueError, match=r"starts 0\.000 m"):
-        network.predict(features, observe_pushes(network, [Drag(0)]), torch.ones(1, 1))
+        network.predict(features, observe_actions(network, [Drag(0)]), torch.ones(1, 1))
     with pytest.raises(ValueError, match=r"ends 0\.120 m"):
-        network.predict(features, observe_pushes(network, [Push(0, length=0.12)]), torch.ones(1, 1))
+        network.predict(
+            features, observe_actions(network, [Push(0, length=0.12)]), torch.ones(1, 1)
+        )
     empty = some.image[:2].clone()
     empty[1, 1] = 0
     with pytest.raises(ValueError, match=r"image 1: the object covers 0\.0% of it"):
@@ -389,15 +397,27 @@ def test_bad_settings_are_named(make, words):
 
 
 @pytest.mark.slow
-def test_the_shipped_film_on_the_held_out_pushes(pushes, held_out_pushes):
-    """The goals of 1.0 mm, and 1.5 mm and 3° of cuboids, are nearly but not yet reached."""
-    model, about = load_checkpoint("push_film")
-    split = split_interactions(500)
+@pytest.mark.parametrize(
+    ("name", "n", "all_mm", "cuboid_mm", "p95_mm", "yaw_deg"),
+    [("push_film", 500, 1.0, 1.5, 4.0, 3.0), ("push_film_x10", 5000, 0.5, 0.8, 2.5, 1.5)],
+)
+def test_the_shipped_films_reach_their_goals(
+    name, n, all_mm, cuboid_mm, p95_mm, yaw_deg, held_out_pushes
+):
+    model, about = load_checkpoint(name)
+    split = split_interactions(n)
     assert about["seen_interactions"] == sorted([*split.train, *split.validation])
     test = TrainingArrays.from_dataset(
         held_out_pushes, None, *(model.action_channels, model.effect_channels)
     )
-    errors = final_errors_m(model, test)
+    errors = 1000 * final_errors_m(model, test)
     box = torch.from_numpy(held_out_pushes["family"].values == 0)
-    assert (errors[box].mean() + errors[~box].mean()) / 2 < 0.0012
-    assert errors[box].mean() < 0.0019
+    assert (errors[box].mean() + errors[~box].mean()) / 2 < all_mm
+    assert errors[box].mean() < cuboid_mm
+    assert errors.quantile(0.95) < p95_mm
+    with torch.no_grad():
+        told = model.predict(
+            model.encode(test.image), observe_action(test), torch.ones(len(test), 1)
+        )
+    off = (told.effect_mean[:, 0, 2] - test.effect[:, -1, 2])[box].abs().mean()
+    assert math.degrees(off) < yaw_deg

@@ -5,6 +5,13 @@ import math
 import numpy as np
 import pytest
 
+from affordlib.perception import (
+    aim,
+    long_axis_rad,
+    looks_fallen,
+    looks_rollable,
+    object_height_m,
+)
 from affordlib.primitives import Drag, Grasp, Push
 from affordlib.world import (
     FAMILIES,
@@ -13,13 +20,6 @@ from affordlib.world import (
     Sphere,
     UprightCylinder,
     WorldConfig,
-)
-from affordlib.world.perception import (
-    aim,
-    long_axis_rad,
-    looks_fallen,
-    looks_rollable,
-    object_height_m,
 )
 
 CLEAN = WorldConfig()

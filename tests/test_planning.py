@@ -1,15 +1,30 @@
 import itertools
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
-from affordlib.evaluation import constructed_tasks, measure, planning_rows, uniform_tasks
+from affordlib.evaluation.goals import (
+    ROLLABLE,
+    STANDING,
+    constructed_tasks,
+    frozen_tasks,
+    uniform_tasks,
+)
+from affordlib.evaluation.planning import measure, outcome_record, planning_rows
 from affordlib.models import EffectModel
-from affordlib.planning import carry_out, plan_astar, plan_gradient
-from affordlib.planning.astar import Branches, predict_branches, search
-from affordlib.primitives import Push
+from affordlib.planning import (
+    carry_out,
+    map_effects,
+    plan_astar,
+    plan_continuous,
+    plan_gradient,
+)
+from affordlib.planning.astar import Branches, BranchTable, search
+from affordlib.planning.steps import roll_out
+from affordlib.primitives import Drag, Push
 from affordlib.types import Goal, Observations, Prediction
 from affordlib.world import Cuboid
 
@@ -49,47 +64,161 @@ def test_the_known_dynamics_is_an_effect_model():
     assert isinstance(MODEL, EffectModel)
 
 
-def random_branches(seed: int, n: int = 6) -> Branches:
-    rng = np.random.default_rng(seed)
-    effects = rng.uniform(-0.09, 0.09, size=(n, 2))
-    path = np.repeat(effects[:, None], 25, axis=1)
-    return Branches(np.zeros(n), np.ones(n), effects, np.zeros(n), path)
+class RandomTable:
+    """A few branches that also turn the object, and then lead elsewhere."""
+
+    def __init__(self, seed: int, n: int = 6) -> None:
+        rng = np.random.default_rng(seed)
+        self.n, self.xy, self.turn = n, rng.uniform(-0.09, 0.09, (n, 2)), rng.uniform(-1, 1, n)
+        self.effects = SimpleNamespace(reach_m=np.hypot(*self.xy.T).max())
+
+    def at(self, turned: float) -> Branches:
+        c, s = math.cos(turned), math.sin(turned)
+        xy = self.xy @ np.array([[c, s], [-s, c]])
+        # The number of a branch stands in for its direction.
+        return Branches(np.arange(self.n), np.ones(self.n), xy, self.turn)
+
+    def follow(self, chain) -> tuple[np.ndarray, float]:
+        xy, turned, length = np.zeros(2), 0.0, 0.0
+        for k in chain:
+            here = self.at(turned)
+            xy, turned = xy + here.effect_xy_m[k], turned + here.turn_rad[k]
+            length += math.hypot(*here.effect_xy_m[k])
+        return xy, length
 
 
 @pytest.mark.parametrize("seed", range(40))
 def test_astar_finds_what_exhaustive_search_finds(seed):
-    branches = random_branches(seed)
+    table = RandomTable(seed)
     rng = np.random.default_rng(1000 + seed)
     goal = Goal(tuple(rng.uniform(-0.2, 0.2, 2)), tolerance_m=0.02)
-    lengths = np.hypot(*branches.effect_xy_m.T)
     best, nearest = math.inf, goal.distance_m((0, 0))
     if nearest <= goal.tolerance_m:
         best = 0.0
     for depth in (1, 2, 3):
         for chain in itertools.product(range(6), repeat=depth):
-            end = branches.effect_xy_m[list(chain)].sum(axis=0)
+            end, length = table.follow(chain)
             nearest = min(nearest, goal.distance_m(end))
             if goal.distance_m(end) <= goal.tolerance_m:
-                best = min(best, lengths[list(chain)].sum())
-    chain, reached, _ = search(branches, (0.0, 0.0), goal, max_steps=3)
+                best = min(best, length)
+    chain, reached, _ = search(table, (0.0, 0.0), goal, max_steps=3)
     assert reached == math.isfinite(best)
-    end = branches.effect_xy_m[chain].sum(axis=0) if chain else np.zeros(2)
+    end, length = table.follow([int(k) for k, _ in chain])
     if reached:
         assert goal.distance_m(end) <= goal.tolerance_m
-        assert lengths[chain].sum() == pytest.approx(best, abs=1e-9)
+        assert length == pytest.approx(best, abs=1e-9)
     else:
         assert goal.distance_m(end) == pytest.approx(nearest, abs=1e-9)
 
 
 def test_branches_are_the_papers_180():
-    branches = predict_branches(MODEL, IMAGE)
+    branches = BranchTable(map_effects(MODEL, IMAGE)).at(0.0)
     # Those that stop before contact do nothing and are pruned: 36 x {80, 100 %} remain.
-    assert len(branches.theta) == 72
+    assert len(branches.direction) == 72
     assert set(np.round(branches.stop_phase, 3)) == {0.8, 1.0}
     full = branches.stop_phase == 1.0
-    direction = branches.theta[full] + math.pi
+    direction = branches.direction[full]
     expected = REACH_M * np.stack([np.cos(direction), np.sin(direction)], axis=1)
-    np.testing.assert_allclose(branches.effect_xy_m[full], expected, atol=1e-6)
+    np.testing.assert_allclose(branches.effect_xy_m[full], expected, atol=1e-4)
+
+
+def test_astar_expands_nothing_out_of_reach():
+    def only_left(xy_m, direction_rad):
+        return xy_m[:, 0] < 0.05
+
+    goal = Goal((0.18, 0.06))
+    barred = plan_astar(MODEL, IMAGE, (0.0, 0.0), goal, reachable=only_left)
+    assert plan_astar(MODEL, IMAGE, (0.0, 0.0), goal).reaches_goal
+    assert not barred.reaches_goal
+    starts = [(0.0, 0.0), *(step.predicted_end_xy_m for step in barred.steps[:-1])]
+    assert all(x < 0.05 for x, _ in starts)
+
+
+@pytest.mark.parametrize("kind", [Push, Drag])
+def test_an_effect_map_says_what_the_model_says(world, film, kind):
+    world.place(Cuboid(0.07, 0.05, 0.05), (0.0, 0.0), 0.4)
+    model = film if kind is Push else MODEL
+    effects = map_effects(model, world.look(), kind)
+    rng = np.random.default_rng(0)
+    direction = torch.from_numpy(rng.uniform(-7, 7, 40))
+    phase = torch.from_numpy(rng.uniform(0.3, 1, 40))
+    told, std = effects(direction, phase)
+    asked = effects.ask_model(direction, phase)
+    assert (told - asked)[:, :2].norm(dim=-1).median() < 2e-4
+    assert (std > 0).all()
+    # It is smooth: its slopes are those of finite differences.
+    direction.requires_grad_(), phase.requires_grad_()
+    slopes = torch.autograd.grad(effects(direction, phase)[0][:, 0].sum(), [direction, phase])
+    for slope, (du, dv) in zip(slopes, [(1e-6, 0), (0, -1e-6)], strict=True):
+        with torch.no_grad():
+            there = effects(direction + du, phase + dv)[0][:, 0]
+            here = effects(direction, phase)[0][:, 0]
+        torch.testing.assert_close((there - here) / (du + dv), slope, atol=1e-5, rtol=1e-4)
+
+
+def test_a_chain_turns_with_the_object(world, film):
+    """Rolling out two pushes at once is asking for the second of the turned object."""
+    world.place(Cuboid(0.07, 0.05, 0.05), (0.0, 0.0), 0.4)
+    effects = map_effects(film, world.look())
+    direction, phase = torch.tensor([[0.3, 1.2]]).double(), torch.tensor([[1.0, 0.9]]).double()
+    positions, turns, variance = roll_out(effects, direction, phase)
+    first, _ = effects(direction[:, 0], phase[:, 0])
+    second, _ = effects(direction[:, 1] - first[:, 2], phase[:, 1])
+    c, s = math.cos(1.2), math.sin(1.2)
+    moved = second[0, :2].numpy() @ np.array([[c, s], [-s, c]])
+    np.testing.assert_allclose(positions[0, 1] - positions[0, 0], moved, atol=1e-12)
+    assert float(turns[0, 1]) == pytest.approx(float(first[0, 2] + second[0, 2]))
+    assert float(variance[0]) > float(roll_out(effects, direction[:, :1], phase[:, :1])[2][0])
+
+
+@pytest.mark.parametrize("goal_xy", [(0.05, 0.02), (-0.03, 0.06), (0.13, -0.11), (0.2, 0.05)])
+def test_the_continuous_planner_ends_at_the_goal(goal_xy):
+    plan = plan_continuous(MODEL, IMAGE, (0.0, 0.0), Goal(goal_xy))
+    assert len(plan.steps) >= math.ceil(math.hypot(*goal_xy) / REACH_M)
+    assert plan.predicted_distance_m < 5e-5
+    xy = np.zeros(2)
+    for step in plan.steps:
+        np.testing.assert_allclose(step.predicted_path_xy_m[0], xy, atol=5e-4)
+        xy = np.array(step.predicted_end_xy_m)
+        direction, share = step.primitive.direction_rad, (step.stop_phase - 0.6) / 0.4
+        assert share > 0
+    assert REACH_M * share * math.cos(direction) == pytest.approx(
+        xy[0] - (plan.steps[-2].predicted_end_xy_m[0] if len(plan.steps) > 1 else 0), abs=1e-3
+    )
+    assert plan_continuous(MODEL, IMAGE, goal_xy, Goal(goal_xy)).steps == ()
+    full = plan_continuous(MODEL, IMAGE, (0, 0), Goal(goal_xy), "single_full")
+    assert [s.stop_phase for s in full.steps] == [1.0]
+
+
+def test_of_two_plans_the_surer_is_taken():
+    class SureUpwards(KnownDynamics):
+        """σ is small for pushes along y, and ten times as large along x."""
+
+        def predict(self, features, observations, t_target):
+            told = super().predict(features, observations, t_target)
+            along = told.effect_mean / told.effect_mean.norm(dim=-1, keepdim=True).clamp_min(1e-9)
+            std = 0.001 + 0.02 * along[..., :1].square().expand_as(told.effect_std)
+            return Prediction(told.action_mean, std, told.effect_mean, std)
+
+    plan = plan_continuous(SureUpwards(), IMAGE, (0, 0), Goal((0.0, 0.12)))
+    assert plan.predicted_distance_m < 1e-4
+    assert all(abs(math.sin(s.primitive.direction_rad)) > 0.95 for s in plan.steps)
+    assert plan.steps[-1].std_m < 0.004
+
+
+def test_the_continuous_planner_keeps_to_where_the_arm_reaches():
+    def only_left(xy_m, direction_rad):
+        return xy_m[:, 0] < 0.05
+
+    plan = plan_continuous(MODEL, IMAGE, (0, 0), Goal((0.2, 0.0)), reachable=only_left)
+    assert not plan.reaches_goal
+    starts = [(0.0, 0.0), *(s.predicted_end_xy_m for s in plan.steps[:-1])]
+    assert all(x < 0.05 for x, _ in starts)
+    nowhere = plan_continuous(
+        MODEL, IMAGE, (0, 0), Goal((0.2, 0.0)), reachable=lambda xy, d: np.zeros(len(xy), bool)
+    )
+    assert nowhere.steps == ()
+    assert not nowhere.reaches_goal
 
 
 def test_astar_plans():
@@ -100,7 +229,7 @@ def test_astar_plans():
     assert plan.predicted_distance_m <= goal.tolerance_m
     xy = np.zeros(2)
     for step in plan.steps:
-        np.testing.assert_allclose(step.predicted_path_xy_m[0], xy, atol=1e-6)
+        np.testing.assert_allclose(step.predicted_path_xy_m[0], xy, atol=1e-4)
         xy = step.predicted_path_xy_m[-1]
         np.testing.assert_allclose(xy, step.predicted_end_xy_m, atol=1e-9)
     assert plan_astar(MODEL, IMAGE, (0, 0), Goal((0.01, 0.0))).steps == ()
@@ -188,13 +317,39 @@ def test_the_shipped_model_reaches_goals(world, trained):
         return plan_astar(trained, image, start, goal, mode)
 
     outcomes = measure(world, tasks, astar)
-    rows = planning_rows(tasks, outcomes, planner="astar", model="paper")
+    records = [outcome_record(t, o) for t, o in zip(tasks, outcomes, strict=True)]
+    rows = planning_rows(records, planner="astar", model="paper")
     assert [r["n"] for r in rows if r["object_class"] == "all"] == [6, 6]
     assert all(r["mean_m"] < 0.03 for r in rows if r["object_class"] == "all")
-    assert {r["object_class"] for r in rows} == {"all", "cuboid", "upright_cylinder"}
+    assert {r["object_class"] for r in rows} == {"all", "standing", "cuboid", "upright_cylinder"}
     for task in tasks:
         assert math.hypot(*task.goal.xy_m) > 0.02
     assert constructed_tasks(world, "single_partial", 2, seed=7) == tasks[:2]
+
+
+def test_the_continuous_planner_comes_within_millimetres(world, film):
+    """A floor again; open loop, and nearer still with corrections."""
+    tasks = [t for t in frozen_tasks() if t.goals == "constructed" and t.mode == "multi_partial"]
+    tasks = [t for t in tasks if not t.thing.rollable][:6]
+
+    def continuous(image, start, goal, mode):
+        return plan_continuous(film, image, start, goal, mode)
+
+    open_loop = [o.distance_m for o in measure(world, tasks, continuous)]
+    closed = [o.distance_m for o in measure(world, tasks, continuous, corrections=2)]
+    assert np.mean(open_loop) < 0.006
+    assert np.mean(closed) < min(0.002, np.mean(open_loop))
+
+
+def test_the_frozen_goals_are_those_that_are_drawn(world):
+    frozen = frozen_tasks()
+    assert len(frozen) == 460
+    drawn = constructed_tasks(world, "single_partial", 4, 0, STANDING + ROLLABLE)
+    for task, again in zip([t for t in frozen if t.mode == "single_partial"], drawn, strict=False):
+        assert task.thing == again.thing
+        assert task.goal.distance_m(again.goal.xy_m) < 0.002
+    for task in frozen:
+        assert math.hypot(*task.goal.xy_m) > 0.02
 
 
 @pytest.mark.parametrize(

@@ -148,8 +148,27 @@ def test_one_training_is_not_counted_twice(tmp_path):
 
 def test_sets_ten_times_as_large_are_asked_the_same():
     small, large = Unit("film", "push"), Unit("film", "push_x10")
-    assert units.learner(small) == units.learner(large)
+    (network, short), (same, long) = units.learner(small), units.learner(large)
+    assert network == same
+    assert replace(long, steps=short.steps) == short
+    assert long.steps > short.steps
     assert configuration_sha256(small) != configuration_sha256(large)
+
+
+@pytest.mark.parametrize(
+    ("data", "name"),
+    [
+        ("push", "push_film"),
+        ("push_x10", "push_film_x10"),
+        ("drag", "drag_film"),
+        ("grasp_x10", "grasp_film"),
+        ("rotate_x10", "rotate_film"),
+    ],
+)
+def test_shipped_networks_are_those_of_the_tables(data, name):
+    shipped = units.SHIPPED[name]
+    assert units.learner(Unit("film", data)) == (shipped.network, shipped.training)
+    assert (units.task_of(data).symmetries or ()) == shipped.symmetries
 
 
 def test_the_shipped_checkpoint_stands_for_its_own_training_only(pushes):

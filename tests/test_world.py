@@ -101,20 +101,22 @@ def test_camera_measures_the_object(world, thing, xy):
     pixel = CROP_WIDTH_M / IMAGE_PIXELS
     x, y = thing.footprint_m.T
     true_area = 0.5 * abs(np.dot(x, np.roll(y, 1)) - np.dot(y, np.roll(x, 1)))
-    assert mask.sum() * pixel**2 == pytest.approx(true_area, rel=0.04)
     # The renderer draws a cylinder 0.9 mm larger than it is.
-    seen_height = np.median(depth.max() - depth[mask > 0])
+    assert mask.sum() * pixel**2 == pytest.approx(true_area, rel=0.06)
+    seen_height = np.median(depth.max() - depth[mask > 0.5])
     assert seen_height == pytest.approx(thing.height_m, abs=1e-3)
-    rows, columns = np.nonzero(mask)
-    centre = np.array([columns.mean() - 23.5, 23.5 - rows.mean()]) * pixel
-    assert np.hypot(*centre) < 0.0005
+    at = np.arange(IMAGE_PIXELS) - 23.5
+    centre = np.array([mask.sum(axis=0) @ at, -(mask.sum(axis=1) @ at)]) / mask.sum() * pixel
+    assert np.hypot(*centre) < 0.0002
+    # The rim is not jagged: pixels there are covered in part.
+    assert ((mask > 0) & (mask < 1)).sum() > 20
 
 
 def test_a_quarter_turn_of_the_table_is_a_quarter_turn_of_the_image(world):
     world.place(THINGS[0], (0.0, 0.0), 0.35)
     image = world.look()
     world.place(THINGS[0], (0.0, 0.0), 0.35 + math.pi / 2)
-    assert (np.rot90(image[1]) != world.look()[1]).mean() < 0.005
+    assert np.abs(np.rot90(image[1]) - world.look()[1]).mean() < 0.002
 
 
 _HASH = (
@@ -171,3 +173,18 @@ def test_bad_input_is_named(world, act, words):
 def test_an_empty_table_says_so():
     with Tabletop() as empty, pytest.raises(RuntimeError, match=r"call place\(\.\.\.\) first"):
         empty.interact(Push(0.0))
+
+
+def test_a_shoved_object_moves_turns_and_rests(world):
+    thing = Cuboid(0.06, 0.04, 0.07)
+    world.place(thing, (0.05, 0.02), 0.3, config=WorldConfig(com_offset_m=(0.01, 0.0, 0.0)))
+    z = world.object_state()[2]
+    world.shove(0.1, -0.05, 0.5)
+    np.testing.assert_allclose(world.object_pose(), (0.15, -0.03, 0.8), atol=5e-4)
+    assert abs(world.object_state()[2] - z) < 5e-4
+    with pytest.raises(ValueError, match="off the table"):
+        world.shove(0.0, 5.0)
+    with pytest.raises(ValueError, match="dyaw_rad must be a finite number"):
+        world.shove(0.0, 0.0, np.nan)
+    np.testing.assert_allclose(world.object_pose(), (0.15, -0.03, 0.8), atol=5e-4)
+    world.place(thing, config=WorldConfig())

@@ -5,21 +5,5 @@ from affordlib.evaluation.effect_prediction import (
     mean_length_errors_m,
     refuse_seen,
 )
-from affordlib.evaluation.planning import (
-    PlanningTask,
-    constructed_tasks,
-    measure,
-    planning_rows,
-    uniform_tasks,
-)
 
-__all__ = [
-    "PlanningTask",
-    "constructed_tasks",
-    "error_row",
-    "mean_length_errors_m",
-    "measure",
-    "planning_rows",
-    "refuse_seen",
-    "uniform_tasks",
-]
+__all__ = ["error_row", "mean_length_errors_m", "refuse_seen"]

@@ -1,145 +1,284 @@
 """Table 3: plan to goals, carry the plans out, measure the distance that remains.
 
-Goals are drawn before planning, by seed, on objects no model has seen, more than 2 cm from the
-start and off the 10° grid of A*. Two families: *constructed* goals are where an executed full or
-partial push really ended; *uniform* ones are drawn evenly over the area in reach.
+Each planner is a variant: a planner, the models it sees, and how often it may correct itself. Its
+outcomes on the frozen goals are written, whole or not at all, as a part; the table is assembled
+from the parts that are there.
+
+    python -m affordlib.evaluation.planning --variants continuous astar
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+import argparse
+import hashlib
+import json
+import sys
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from tqdm.auto import tqdm
 
 from affordlib.evaluation.effect_prediction import error_row
-from affordlib.planning import MODES, carry_out
-from affordlib.primitives import Push
-from affordlib.types import Goal, Outcome, Plan
-from affordlib.world import Cuboid, Tabletop, UnreachableError, UprightCylinder, family_named
+from affordlib.evaluation.goals import FROZEN, ROLLABLE, STANDING, PlanningTask, frozen_tasks
+from affordlib.evaluation.planners import VARIANTS
+from affordlib.paths import repo_root
+from affordlib.planning import PlanMode, carry_out
+from affordlib.results import write_results, write_text_atomically
+from affordlib.types import Outcome, Plan
+from affordlib.world import Tabletop, UnreachableError
 
-MIN_DISTANCE_M = 0.02
-EARLIEST_STOP = 0.55
-"""Before this phase hardly any push has touched its object."""
+if TYPE_CHECKING:
+    from affordlib.types import Goal
 
-UNIFORM_REACH_M = {"single_full": 0.09, "single_partial": 0.09, "multi_partial": 0.25}
-OBJECT_CLASSES = ("cuboid", "upright_cylinder")
+PARTS = "data/results/parts/planning"
+NAME = "planning"
+GROUPS = {"all": STANDING + ROLLABLE, "standing": STANDING, "rollable": ROLLABLE} | {
+    name: (name,) for name in STANDING + ROLLABLE
+}
 
-Planner = Callable[[np.ndarray, tuple[float, float], Goal, str], Plan]
+Planner = Callable[[np.ndarray, tuple[float, float], "Goal", str], Plan]
 """A planner as (image, start_xy_m, goal, mode) → Plan."""
 
 
-@dataclass(frozen=True)
-class PlanningTask:
-    """An object at the table's centre, turned by a yaw [rad], and where it should go."""
-
-    thing: Cuboid | UprightCylinder
-    yaw_rad: float
-    goal: Goal
-    mode: str
-    goals: str
-
-
-def _objects(mode: str, goals: str, seed: int, index: int) -> tuple:
-    if mode not in MODES:
-        raise ValueError(f"mode {mode!r} is unknown; choose one of {sorted(MODES)}")
-    key = (list(MODES).index(mode), ("constructed", "uniform").index(goals), index)
-    rng = np.random.default_rng(np.random.SeedSequence(2_000_003 + seed, spawn_key=key))
-    thing = family_named(OBJECT_CLASSES[index % len(OBJECT_CLASSES)]).sample(rng)
-    return thing, float(rng.uniform(-math.pi, math.pi)), rng
-
-
-def _off_grid(rng: np.random.Generator, around: float, spread: float) -> float:
-    """An angle within `spread` of `around`, at least 1° off the 10° grid."""
-    while True:
-        angle = around + rng.uniform(-spread, spread)
-        off = math.degrees(angle) % 10
-        if 1 <= off <= 9:
-            return angle
-
-
-def constructed_tasks(world: Tabletop, mode: str, n: int, seed: int = 0) -> list[PlanningTask]:
-    """Tasks whose goal is where random pushes of the mode's kind really took the object."""
-    tasks = []
-    for index in range(n):
-        thing, yaw, rng = _objects(mode, "constructed", seed, index)
-        while True:
-            direction = rng.uniform(-math.pi, math.pi)
-            world.place(thing, (0.0, 0.0), yaw)
-            for _ in range(rng.integers(2, MODES[mode].max_steps + 1) if mode[0] == "m" else 1):
-                stop = rng.uniform(EARLIEST_STOP, 1.0) if MODES[mode].partial else 1.0
-                world.interact(Push(_off_grid(rng, direction, math.pi / 4)), stop, approach=True)
-            x, y, _ = world.object_pose()
-            if math.hypot(x, y) > MIN_DISTANCE_M and world.object_tilt_rad() < 0.1:
-                break
-        tasks.append(PlanningTask(thing, yaw, Goal((x, y)), mode, "constructed"))
-    return tasks
-
-
-def uniform_tasks(mode: str, n: int, seed: int = 0) -> list[PlanningTask]:
-    """Tasks whose goal is drawn evenly from the ring between 2 cm and the mode's reach."""
-    tasks = []
-    for index in range(n):
-        thing, yaw, rng = _objects(mode, "uniform", seed, index)
-        r = math.sqrt(rng.uniform(MIN_DISTANCE_M**2, UNIFORM_REACH_M[mode] ** 2))
-        angle = _off_grid(rng, 0.0, math.pi)
-        goal = Goal((r * math.cos(angle), r * math.sin(angle)))
-        tasks.append(PlanningTask(thing, yaw, goal, mode, "uniform"))
-    return tasks
-
-
-def attempt(world: Tabletop, task: PlanningTask, planner: Planner) -> Outcome:
-    """Plan and carry out one task.
+def attempt(world: Tabletop, task: PlanningTask, planner: Planner, corrections: int = 0) -> Outcome:
+    """Plan and carry out one task, correcting the end by up to so many single actions.
 
     A plan that the arm cannot follow counts with the distance at which it left the object.
     """
     world.place(task.thing, (0.0, 0.0), task.yaw_rad)
-    start = world.object_pose()[:2]
-    plan = planner(world.look(), start, task.goal, task.mode)
+    seen = world.perceive()
+    plan = planner(seen.image, seen.xy_m, task.goal, task.mode)
+    once = PlanMode(1, partial=True)
     try:
-        return carry_out(world, plan)
+        return carry_out(world, plan, corrections, lambda *query: planner(*query, once))
     except UnreachableError:
         pose = world.object_pose()
         return Outcome(plan, task.goal.distance_m(pose[:2]), pose, world.object_tilt_rad())
 
 
 def measure(
-    world: Tabletop, tasks: list[PlanningTask], planner: Planner, progress: str = ""
+    world: Tabletop,
+    tasks: list[PlanningTask],
+    planner: Planner,
+    progress: str = "",
+    corrections: int = 0,
 ) -> list[Outcome]:
     """Outcomes of all tasks with one planner, in order."""
     bar = tqdm(tasks, desc=progress, unit=" goals", disable=not progress, leave=False)
-    return [attempt(world, task, planner) for task in bar]
+    return [attempt(world, task, planner, corrections) for task in bar]
 
 
-def planning_rows(
-    tasks: list[PlanningTask], outcomes: list[Outcome], **columns: Any
-) -> list[dict[str, Any]]:
-    """Rows of the table `planning`: one per mode and object class, and one for all classes.
+def outcome_record(task: PlanningTask, outcome: Outcome) -> dict[str, Any]:
+    """What the table needs of one outcome."""
+    plan = outcome.plan
+    return {
+        "goals": task.goals,
+        "mode": task.mode,
+        "object_class": task.thing.family,
+        "distance_m": outcome.distance_m,
+        "predicted_m": plan.predicted_distance_m,
+        "surprise_m": float(np.hypot(*np.subtract(plan.predicted_end_xy_m, outcome.end_pose[:2]))),
+        "std_m": plan.steps[-1].std_m if plan.steps else 0.0,
+        "steps": len(plan.steps),
+        "actions": len(outcome.object_paths_xy_m),
+        "plan_s": plan.plan_s,
+    }
+
+
+def planning_rows(records: list[dict[str, Any]], **columns: Any) -> list[dict[str, Any]]:
+    """Rows of the table `planning`: per family of goals and mode, all objects and each class.
 
     columns: `planner`, `model`, `world`, `samples`, `closed_loop`, as they describe the outcomes.
+    predicted: how far from the goal the planner expected the end; surprise: how far from there the
+    object really ended, open loop.
     """
     rows = []
-    pairs = list(zip(tasks, outcomes, strict=True))
-    for goals in dict.fromkeys(task.goals for task in tasks):
-        for mode in dict.fromkeys(task.mode for task in tasks if task.goals == goals):
-            for object_class in ("all", *OBJECT_CLASSES):
+    for goals in dict.fromkeys(r["goals"] for r in records):
+        for mode in dict.fromkeys(r["mode"] for r in records if r["goals"] == goals):
+            for group, classes in GROUPS.items():
                 chosen = [
-                    o
-                    for t, o in pairs
-                    if (t.goals, t.mode) == (goals, mode)
-                    and object_class in ("all", t.thing.family)
+                    r
+                    for r in records
+                    if (r["goals"], r["mode"]) == (goals, mode) and r["object_class"] in classes
                 ]
                 if not chosen:
                     continue
-                about = {"goals": goals, "object_class": object_class, "mode": mode}
-                row = error_row(np.array([o.distance_m for o in chosen]), **columns, **about)
-                row["plan_ms_median"] = float(np.median([1000 * o.plan.plan_s for o in chosen]))
-                row["predicted_mean_m"] = float(
-                    np.mean([o.plan.predicted_distance_m for o in chosen])
-                )
-                row["steps_mean"] = float(np.mean([len(o.plan.steps) for o in chosen]))
+
+                def column(name: str, chosen: list = chosen) -> np.ndarray:
+                    return np.array([r[name] for r in chosen], dtype=float)
+
+                about = {"goals": goals, "object_class": group, "mode": mode}
+                row = error_row(column("distance_m"), **columns, **about)
+                row["plan_ms_median"] = 1000 * float(np.median(column("plan_s")))
+                row["predicted_mean_m"] = float(column("predicted_m").mean())
+                row["surprise_mean_m"] = float(column("surprise_m").mean())
+                row["std_mean_m"] = float(column("std_m").mean())
+                row["steps_mean"] = float(column("steps").mean())
+                row["actions_mean"] = float(column("actions").mean())
                 rows.append(row)
     return rows
+
+
+def run_variant(name: str, tasks: list[PlanningTask], progress: bool = True) -> dict[str, Any]:
+    """The records of a variant on the tasks that it can be asked."""
+    variant = VARIANTS[name]
+    planner = variant.make()
+    asked = [t for t in tasks if t.thing.family in variant.classes and t.goals in variant.goals]
+    with Tabletop() as world:
+        planner_here = partial(planner, world) if variant.sees_world else planner
+        outcomes = measure(world, asked, planner_here, name * progress, variant.corrections)
+    records = [outcome_record(t, o) for t, o in zip(asked, outcomes, strict=True)]
+    return {"variant": name, "about": variant.about(), "records": records}
+
+
+def tasks_sha256(path: str | Path = FROZEN) -> str:
+    """Hash of the frozen goals."""
+    return hashlib.sha256((repo_root() / path).read_bytes()).hexdigest()
+
+
+def _part(name: str) -> Path:
+    return repo_root() / PARTS / f"{name}.json"
+
+
+def _is_done(name: str, goals_sha256: str) -> bool:
+    """Whether there is a part of this variant, as it is now, on these goals."""
+    path = _part(name)
+    if not path.is_file():
+        return False
+    part = json.loads(path.read_text())
+    return (part["goals_sha256"], part["about"]) == (goals_sha256, VARIANTS[name].about())
+
+
+def assemble() -> Path:
+    """Write `data/results/planning.json` from all parts; returns its path."""
+    rows, parts = [], {}
+    for name, variant in VARIANTS.items():
+        if not _part(name).is_file():
+            continue
+        part = json.loads(_part(name).read_text())
+        parts[name] = part["records"]
+        rows += planning_rows(part["records"], variant=name, **variant.columns())
+    if not rows:
+        raise FileNotFoundError(f"there are no parts in {PARTS}; run some variants first")
+    tables = {"planning": rows, "summary": summary_rows(rows), "paired": paired_rows(parts)}
+    tables["error_decomposition"] = decomposition_rows(rows)
+    return write_results("data/results", NAME, {"goals_sha256": tasks_sha256()}, tables)
+
+
+def summary_rows(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """One row per variant on constructed goals: mean, standard error and median of each mode."""
+    summary: dict[tuple[str, str], dict[str, Any]] = {}
+    for row in rows:
+        group = row["object_class"]
+        if row["goals"] != "constructed" or group not in ("all", "standing", "rollable"):
+            continue
+        names = ("variant", "model", "samples", "closed_loop", "object_class")
+        told = summary.setdefault((row["variant"], group), {name: row[name] for name in names})
+        for statistic in ("mean", "sem", "median"):
+            told[f"{row['mode']}_{statistic}_m"] = row[f"{statistic}_m"]
+        told[f"{row['mode']}_plan_ms"] = row["plan_ms_median"]
+    return list(summary.values())
+
+
+def decomposition_rows(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Where the open-loop error on constructed goals comes from, by variant, mode and group.
+
+    search: what the planner itself expected to remain; model: how far from what it expected the
+    object ended; execution: what remains with the simulator as the model.
+    """
+    open_loop = [r for r in rows if r["goals"] == "constructed" and not r["closed_loop"]]
+
+    def place(row: dict[str, Any]) -> tuple[str, str]:
+        return row["mode"], row["object_class"]
+
+    oracle = {place(r): r["mean_m"] for r in open_loop if r["variant"] == "oracle"}
+    return [
+        {
+            **{key: row[key] for key in ("variant", "mode", "object_class", "n")},
+            "search_mean_m": row["predicted_mean_m"],
+            "model_mean_m": row["surprise_mean_m"],
+            "execution_mean_m": oracle.get(place(row)),
+            "total_mean_m": row["mean_m"],
+        }
+        for row in open_loop
+        if row["object_class"] in ("all", "standing", "rollable")
+    ]
+
+
+def paired_rows(
+    parts: dict[str, list[dict[str, Any]]], than: str = "continuous", n_draws: int = 2000
+) -> list[dict[str, Any]]:
+    """By how much each variant ends farther from the same goals than `than`: mean [m], interval.
+
+    The interval holds 95 % of the means of goals drawn again with replacement.
+    """
+    rows: list[dict[str, Any]] = []
+    if than not in parts:
+        return rows
+    rng = np.random.default_rng(0)
+    for name, records in parts.items():
+        if name == than:
+            continue
+        classes = {r["object_class"] for r in records}
+        for goals in dict.fromkeys(r["goals"] for r in records):
+            for mode in dict.fromkeys(r["mode"] for r in records):
+                these, others = (
+                    [
+                        r
+                        for r in some
+                        if (r["goals"], r["mode"]) == (goals, mode) and r["object_class"] in classes
+                    ]
+                    for some in (records, parts[than])
+                )
+                pairs = zip(these, others, strict=True)
+                gain = np.array([r["distance_m"] - o["distance_m"] for r, o in pairs])
+                draws = rng.choice(gain, (n_draws, len(gain))).mean(axis=1)
+                low, high = np.quantile(draws, [0.025, 0.975])
+                rows.append(
+                    {
+                        "variant": name,
+                        "than": than,
+                        "goals": goals,
+                        "mode": mode,
+                        "n": len(gain),
+                        "difference_mean_m": float(gain.mean()),
+                        "low_m": float(low),
+                        "high_m": float(high),
+                    }
+                )
+    return rows
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Measure planners on the frozen goals and make the table from all that were measured."""
+    parser = argparse.ArgumentParser(
+        prog="python -m affordlib.evaluation.planning", description=main.__doc__
+    )
+    parser.add_argument("--variants", nargs="*", choices=list(VARIANTS), default=list(VARIANTS))
+    options = parser.parse_args(argv)
+    torch.set_num_threads(1)
+    tasks, goals = frozen_tasks(), tasks_sha256()
+    for name in options.variants:
+        if _is_done(name, goals):
+            print(f"{name}: there already")
+            continue
+        part = run_variant(name, tasks) | {"goals_sha256": goals}
+        _part(name).parent.mkdir(parents=True, exist_ok=True)
+        write_text_atomically(_part(name), json.dumps(part, indent=0) + "\n")
+        for row in planning_rows(part["records"]):
+            if row["object_class"] == "all":
+                print(
+                    f"{name}: {row['goals']} {row['mode']} {1000 * row['mean_m']:.2f} mm, "
+                    f"median {1000 * row['median_m']:.2f} (n = {row['n']})",
+                    flush=True,
+                )
+    print(assemble())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -23,6 +23,8 @@ from typing import Any
 import numpy as np
 
 from affordlib.evaluation.answers import calibration, final_error, yaw_error
+from affordlib.evaluation.studies import FOLDER as STUDIES_FOLDER
+from affordlib.evaluation.studies import STUDIES, read_study
 from affordlib.evaluation.units import MODELS, NETWORKS, PARTS, TEN_TIMES, Unit, read_part
 from affordlib.paths import resolve_out_dir
 from affordlib.primitives import Grasp
@@ -275,8 +277,15 @@ def baseline_rows(tables: dict[str, list[dict[str, Any]]]) -> list[dict[str, Any
     return rows
 
 
-def assemble(folder: str | Path = PARTS, out_dir: str | Path = "data/results") -> Path:
-    """Write `effect_prediction.json` from all parts of a folder; returns its path."""
+def assemble(
+    folder: str | Path = PARTS,
+    out_dir: str | Path = "data/results",
+    studies: str | Path = STUDIES_FOLDER,
+) -> Path:
+    """Write `effect_prediction.json` from all parts and studies of two folders; returns its path.
+
+    A study that was not made has no table; one of other data or settings raises ValueError.
+    """
     parts = read_parts(folder)
     if not parts:
         raise FileNotFoundError(f"folder: there are no parts in {folder}; run units first")
@@ -290,9 +299,33 @@ def assemble(folder: str | Path = PARTS, out_dir: str | Path = "data/results") -
         "calibration": calibration_table(parts),
     }
     tables["baselines"] = baseline_rows(tables)
+    tables["frames"] = frame_rows(parts)
+    made = {name: read_study(name, studies) for name in STUDIES}
+    tables |= {name: rows for name, rows in made.items() if rows is not None}
     trained = sum(unit.model in NETWORKS for unit, _ in parts)
     parameters = {"units": len(parts), "trained": trained, "data_sha256": _data(parts)}
     return write_results(out_dir, NAME, parameters, tables)
+
+
+FRAMES = {
+    "paper": ("paper", "table"),
+    "paper_push_frame": ("paper", "push"),
+    "film_table_frame": ("film", "table"),
+    "film": ("film", "push"),
+}
+
+
+def frame_rows(parts: list[tuple[Unit, Part]]) -> list[dict[str, Any]]:
+    """Two networks in two frames, from the same folds of the same pushes, on the fixed test set."""
+    both = [(u, p) for u, p in parts if u.model in FRAMES and u.data == "push" and u.n == "all"]
+    folds = [{(u.fold, u.seed) for u, _ in both if u.model == model} for model in FRAMES]
+    shared = set.intersection(*folds)
+    rows = error_rows([(u, p) for u, p in both if (u.fold, u.seed) in shared], "push", "fixed_test")
+    told = []
+    for row in rows:
+        network, frame = FRAMES[row["model"]]
+        told.append({"network": network, "frame": frame} | row)
+    return told
 
 
 def _data(parts: list[tuple[Unit, Part]]) -> dict[str, str]:
@@ -306,8 +339,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--parts", default=PARTS)
     parser.add_argument("--out", default="data/results")
+    parser.add_argument("--studies", default=STUDIES_FOLDER)
     options = parser.parse_args(argv)
-    print(assemble(options.parts, options.out))
+    print(assemble(options.parts, options.out, options.studies))
     return 0
 
 

@@ -11,19 +11,15 @@ configuration and of its data; a part that is there is not made again. `tables.p
 from __future__ import annotations
 
 import argparse
-import hashlib
 import json
 import sys
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, fields, replace
-from functools import lru_cache
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
-from tqdm.auto import tqdm
 
 from affordlib.evaluation.answers import (
     baseline_answers,
@@ -35,20 +31,22 @@ from affordlib.evaluation.answers import (
 )
 from affordlib.evaluation.baselines import BASELINES
 from affordlib.evaluation.inverse import along_effect, executed_record, inverse_record
-from affordlib.interactions import (
-    Normaliser,
-    TrainingArrays,
-    open_interactions,
-    split_interactions,
-)
+from affordlib.evaluation.parts import checked_part, chosen_options, open_once, run_parts, sha256_of
+from affordlib.interactions import Normaliser, TrainingArrays, split_interactions
+from affordlib.interactions.batches import Symmetry, symmetric_copies
 from affordlib.interactions.store import stored_sha256
-from affordlib.models.calibration import fit_temperature
-from affordlib.models.checkpoint import build, load_checkpoint
+from affordlib.models.checkpoint import load_checkpoint
 from affordlib.models.cnp import CNPConfig
 from affordlib.models.film import FiLMConfig
-from affordlib.models.make_checkpoints import SHIPPED, about_training
-from affordlib.models.training import TrainingConfig, train
-from affordlib.paths import repo_root, resolve_out_dir
+from affordlib.models.make_checkpoints import (
+    GRASP_SYMMETRIES,
+    HALF_TURNS,
+    SHIPPED,
+    about_training,
+    train_model,
+)
+from affordlib.models.training import TrainingConfig
+from affordlib.paths import repo_root
 from affordlib.results import write_text_atomically
 
 if TYPE_CHECKING:
@@ -58,7 +56,7 @@ if TYPE_CHECKING:
     from affordlib.interactions import Split
     from affordlib.models.network import EffectNetwork, NetworkConfig
 
-FORMAT = 1
+FORMAT = 2
 """Counts the changes of code that change a unit's numbers without changing its configuration."""
 
 N_FOLDS = 10
@@ -81,7 +79,7 @@ class Task:
 
     action_channels: tuple[str, ...]
     effect_channels: tuple[str, ...]
-    symmetries: tuple[tuple[int, bool], ...] | None = None
+    symmetries: tuple[Symmetry, ...] | None = None
     also: str | None = None
     best_effects: tuple[str, ...] = ()
 
@@ -93,11 +91,14 @@ class Task:
 TASKS: dict[str, Task] = {
     "push": Task(("x", "y"), ("x", "y"), also="push_test", best_effects=("x", "y", "yaw")),
     "drag": Task(("x", "y"), ("x", "y")),
-    "grasp": Task(("z", "gripper"), ("z",), ((0, False), (0, True), (2, False), (2, True))),
-    "rotate": Task(("yaw", "gripper"), ("yaw",), ((0, False), (2, False))),
+    "grasp": Task(("z", "gripper"), ("z",), GRASP_SYMMETRIES),
+    "rotate": Task(("yaw", "gripper"), ("yaw",), HALF_TURNS),
 }
 
 TEN_TIMES = "_x10"
+OF_SET = {s.data: name for name, s in SHIPPED.items() if isinstance(s.network, FiLMConfig)}
+"""The shipped FiLM networks by the sets they learn from."""
+
 SETS = (*TASKS, *(f"{name}{TEN_TIMES}" for name in TASKS))
 
 
@@ -138,12 +139,15 @@ class Unit:
 def learner(unit: Unit) -> tuple[NetworkConfig, TrainingConfig] | None:
     """The network of a unit and its training; None for a baseline.
 
-    Both are those of the shipped checkpoints; the sets of 100 grasps and rotations get fewer steps.
+    Both are those of the shipped checkpoints, of FiLM of the one that learns from this very set, if
+    there is one; the sets of 100 grasps and rotations get fewer steps.
     """
     if unit.model not in NETWORKS:
         return None
     task, film = task_of(unit.data), unit.model.startswith("film")
     shipped = SHIPPED["push_film" if film else "push_cnp"]
+    if film and unit.n == "all":
+        shipped = SHIPPED.get(OF_SET.get(unit.data, ""), shipped)
     push_frame = unit.model in ("film", "paper_push_frame") and task.symmetries is None
     network = (FiLMConfig if film else CNPConfig)(
         action_channels=task.action_channels,
@@ -166,17 +170,9 @@ def configuration_sha256(unit: Unit) -> str:
     }
     if configs := learner(unit):
         network, training = configs
-        told |= {"network": type(network).__name__, **_chosen(network)}
-        told |= {f"training_{name}": value for name, value in _chosen(training).items()}
-    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
-
-
-def _chosen(config: NetworkConfig | TrainingConfig) -> dict[str, Any]:
-    """What differs from the defaults: an option that is added later, and off, changes no hash."""
-    chosen = {f.name: getattr(config, f.name) for f in fields(config)}
-    defaults = {f.name: f.default for f in fields(config)}
-    apart = ("max_minutes", "device", "temperature")  # of the machine; fitted anyway
-    return {k: v for k, v in chosen.items() if v != defaults[k] and k not in apart}
+        told |= {"network": type(network).__name__, **chosen_options(network)}
+        told |= {f"training_{name}": value for name, value in chosen_options(training).items()}
+    return sha256_of(told)
 
 
 def data_sha256(unit: Unit) -> dict[str, str]:
@@ -192,22 +188,7 @@ def hashes(unit: Unit) -> dict[str, Any]:
 
 def read_part(unit: Unit, folder: Path) -> dict[str, Any] | None:
     """A unit's part; None when there is none, ValueError when it is another configuration's."""
-    path = folder / unit.file
-    if not path.is_file():
-        return None
-    part = json.loads(path.read_text())
-    for name, expected in hashes(unit).items():
-        if part.get(name) != expected:
-            raise ValueError(
-                f"part {unit.file} has another {name} than its unit has now; delete it and run "
-                "the unit again"
-            )
-    return part
-
-
-@lru_cache(maxsize=4)
-def _open(name: str) -> xr.Dataset:
-    return open_interactions(name)
+    return checked_part(unit, folder, hashes(unit))
 
 
 def run_unit(unit: Unit, folder: Path, progress: bool = False) -> bool:
@@ -220,14 +201,14 @@ def run_unit(unit: Unit, folder: Path, progress: bool = False) -> bool:
             return False
     except ValueError:
         pass  # of an earlier configuration or data: made again
-    data, task = _open(unit.data), task_of(unit.data)
+    data, task = open_once(unit.data), task_of(unit.data)
     n = data.sizes["interaction"] if unit.n == "all" else int(unit.n)
     if n > data.sizes["interaction"]:
         raise ValueError(f"n = {n}, but {unit.data!r} has {data.sizes['interaction']} interactions")
     split = split_interactions(n, unit.seed, unit.fold, N_FOLDS)
     tests = {"fold": (data, split.test)}
     if task.also:
-        other = _open(task.also)
+        other = open_once(task.also)
         tests["fixed"] = (other, np.arange(other.sizes["interaction"]))
     part: dict[str, Any] = {"unit": asdict(unit), "n": n} | hashes(unit)
     configs = learner(unit)
@@ -272,17 +253,13 @@ def _fit(
 ) -> tuple[EffectNetwork, dict[str, Any]]:
     channels = network.action_channels, network.effect_channels
     training = TrainingArrays.from_dataset(data, split.train, *channels)
-    validation = TrainingArrays.from_dataset(data, split.validation, *channels)
-    symmetries = task_of(unit.data).symmetries
+    symmetries = task_of(unit.data).symmetries or ()
     if symmetries:
-        training = _all_of([training.turned(*symmetry) for symmetry in symmetries])
+        training = symmetric_copies(training, symmetries)
     normaliser = Normaliser.fit(training)
     if (found := _shipped(network, config, normaliser, data, split)) is not None:
         return found
-    torch.manual_seed(config.seed)
-    model = build(network, normaliser)
-    history = train(model, training, validation, config, progress, halfway)
-    fit_temperature(model, validation)
+    model, history = train_model(data, split, config, network, progress, symmetries, halfway)
     best = min(record.validation_error_m for record in history)
     return model, {
         "steps": history[-1].step,
@@ -320,13 +297,6 @@ def _shipped(
     return None
 
 
-def _all_of(parts: list[TrainingArrays]) -> TrainingArrays:
-    tensors = ("image", "action", "effect")
-    together = {name: torch.cat([getattr(p, name) for p in parts]) for name in tensors}
-    # Actions turned along with their objects are what these primitives command anyway.
-    return replace(parts[0], **(together | {"action": parts[0].action.repeat(len(parts), 1, 1)}))
-
-
 def run_units(
     units: Sequence[Unit],
     out_dir: str | Path = PARTS,
@@ -337,30 +307,7 @@ def run_units(
 
     Workers write their parts themselves, so `out_dir` must be a folder that they share.
     """
-    folder = resolve_out_dir(out_dir)
-    ran = 0
-    with tqdm(total=len(units), desc="units", unit=" units", disable=not progress) as bar:
-        for unit, made in _here(units, folder) if client is None else _away(units, folder, client):
-            ran += made
-            bar.set_postfix_str(unit.file.removesuffix(".json"))
-            bar.update()
-    return ran
-
-
-def _here(units: Sequence[Unit], folder: Path) -> Iterator[tuple[Unit, bool]]:
-    for unit in units:
-        yield unit, run_unit(unit, folder)
-
-
-def _away(units: Sequence[Unit], folder: Path, client: Client) -> Iterator[tuple[Unit, bool]]:
-    from dask.distributed import as_completed
-
-    futures = {client.submit(run_unit, unit, folder, pure=False): unit for unit in units}
-    try:
-        for future in as_completed(list(futures)):
-            yield futures[future], future.result()
-    finally:
-        client.cancel(list(futures))
+    return run_parts(units, run_unit, out_dir, client, progress)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -91,9 +91,9 @@ def plane_of(channels: tuple[str, ...]) -> list[int]:
 
 
 def touches_edge(mask: torch.Tensor) -> torch.Tensor:
-    """Which of the masks (N, n, n) reach the edge of their image: (N,)."""
+    """Which of the masks (N, n, n) reach the edge of their image, not just by a corner: (N,)."""
     rim = torch.cat([mask[:, (0, -1)].flatten(1), mask[:, :, (0, -1)].flatten(1)], dim=1)
-    return (rim > 0.5).any(dim=1)
+    return (rim > 0.5).sum(dim=1) > 2
 
 
 def _range(values: torch.Tensor) -> Range:
@@ -160,6 +160,20 @@ class TrainingArrays:
             self, image=self.image[rows], action=self.action[rows], effect=self.effect[rows]
         )
 
+    def joined(self, *others: TrainingArrays) -> TrainingArrays:
+        """These interactions and those of others, in order; phases and channels must be the same.
+
+        Raises ValueError where they are not.
+        """
+        for other in others:
+            for name in ("action_channels", "effect_channels"):
+                mine, theirs = getattr(self, name), getattr(other, name)
+                if mine != theirs:
+                    raise ValueError(f"{name} must be the same, got {mine} and {theirs}")
+        parts = (self, *others)
+        names = ("image", "action", "effect")
+        return replace(self, **{n: torch.cat([getattr(p, n) for p in parts]) for n in names})
+
     def turned(self, quarters: int, mirror: bool = False) -> TrainingArrays:
         """The same interactions on a table mirrored in y, then turned by quarter turns.
 
@@ -177,6 +191,19 @@ class TrainingArrays:
             action=turn(action, self.action_channels, heading, absolute_yaw=True),
             effect=turn(effect, self.effect_channels, heading, absolute_yaw=False),
         )
+
+
+Symmetry = tuple[int, bool]
+"""A number of quarter turns, and whether the table is mirrored before."""
+
+
+def symmetric_copies(arrays: TrainingArrays, symmetries: tuple[Symmetry, ...]) -> TrainingArrays:
+    """Interactions of a primitive without a direction, and what they would be under symmetries.
+
+    Image and effect are turned and mirrored; the commanded action stays, as it does in the world.
+    """
+    parts = [replace(arrays.turned(*s), action=arrays.action) for s in symmetries]
+    return parts[0].joined(*parts[1:])
 
 
 def _mirror(values: torch.Tensor, channels: tuple[str, ...]) -> torch.Tensor:
@@ -288,6 +315,27 @@ def sample_batch(
     return Batch(
         part.image,
         observe(part, action_at, action_mask, effect_at, effect_mask, blend),
+        part.phase[target_at],
+        part.action[index, target_at],
+        part.effect[index, target_at],
+    )
+
+
+def draw_forward(
+    arrays: TrainingArrays,
+    rows: torch.Tensor,
+    n_targets: int,
+    obs_max: int,
+    generator: torch.Generator,
+) -> Batch:
+    """Only the forward question: the action at t = 0 and 1 is observed; obs_max is not used."""
+    part, last = arrays.select(rows), len(arrays.phase) - 1
+    target_at = torch.randint(0, last + 1, (len(rows), n_targets), generator=generator)
+    target_at[:, 0] = last
+    index = torch.arange(len(rows))[:, None]
+    return Batch(
+        part.image,
+        observe_action(part),
         part.phase[target_at],
         part.action[index, target_at],
         part.effect[index, target_at],

@@ -71,9 +71,7 @@ _VARIABLES = {
         units="m, rad, m",
         long_name="measured x, y, z, yaw and finger gap, every 150 ms of a full execution",
     ),
-    "primitive": _per_interaction("int8", flag_meanings=" ".join(PRIMITIVES)),
     "stop_phase": _per_interaction("float64"),
-    "family": _per_interaction("int8", flag_meanings=" ".join(FAMILIES)),
     "size": _per_interaction("float32", "size_axis", units="m"),
     "mass": _per_interaction("float32", units="kg"),
     "com_offset": _per_interaction("float32", "xyz", units="m"),
@@ -111,7 +109,13 @@ def _parameters(recipe: Recipe) -> list[str]:
 
 
 def _variables(recipe: Recipe) -> dict[str, Variable]:
+    # Read when a set is made: a reader may have added families and primitives.
+    kinds = {"primitive": PRIMITIVES, "family": FAMILIES}
     variables = _VARIABLES | {
+        name: _per_interaction("int8", flag_meanings=" ".join(known))
+        for name, known in kinds.items()
+    }
+    variables |= {
         name: _per_interaction("float64", units="m or rad", long_name="parameter of the primitive")
         for name in _parameters(recipe)
     }

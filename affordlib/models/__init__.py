@@ -6,7 +6,7 @@ from affordlib.models.checkpoint import build, load_checkpoint, save_checkpoint
 from affordlib.models.cnp import AffordanceCNP, CNPConfig
 from affordlib.models.film import FiLMConfig, FiLMNetwork
 from affordlib.models.network import EffectNetwork, NetworkConfig
-from affordlib.models.protocol import EffectModel, observe_pushes
+from affordlib.models.protocol import EffectModel, observe_actions
 from affordlib.models.training import TrainingConfig, train, train_literal
 
 __all__ = [
@@ -25,7 +25,7 @@ __all__ = [
     "coverage",
     "fit_temperature",
     "load_checkpoint",
-    "observe_pushes",
+    "observe_actions",
     "save_checkpoint",
     "train",
     "train_literal",

@@ -1,6 +1,6 @@
 """A conditional neural process with cross-attention: what the paper names as future work.
 
-Each observation is a token, each cell of the image's last feature map another. A target asks with
+Each observation is a token, each ring of the image's circular harmonics another. A target asks with
 its phase and a summary of the image and attends to them, in a few blocks; instead of the mean of
 equation (3), each target weighs what is observed for itself. The blend w₁ of equation (2) enters as
 log w₁ and log w₂, added to the attention's logits. Source: Kim et al., Attentive neural processes,
@@ -9,7 +9,6 @@ ICLR 2019.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -18,9 +17,9 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from affordlib.models.film import CircularHarmonics, convolutions, dense, split_outputs, waves
+from affordlib.models.film import CircularHarmonics, dense, split_outputs, waves
 from affordlib.models.network import EffectNetwork, NetworkConfig, he_initialise, with_time
-from affordlib.types import IMAGE_PIXELS, Observations
+from affordlib.types import Observations
 
 if TYPE_CHECKING:
     from affordlib.interactions.batches import Normaliser
@@ -34,7 +33,8 @@ class AttentionConfig(NetworkConfig):
     width: int = 128
     blocks: int = 3
     heads: int = 4
-    convolutions: tuple[int, ...] = (16, 32, 64, 64)
+    rings: int = 7
+    orders: int = 8
     waves: int = 4
 
     def __post_init__(self) -> None:
@@ -78,15 +78,11 @@ class AttentiveCNP(EffectNetwork):
         super().__init__(config, normaliser)
         c, w = config, config.width
         n_a, n_e = len(c.action_channels), len(c.effect_channels)
-        self.side = math.ceil(IMAGE_PIXELS / 2 ** len(c.convolutions))
-        self.image_encoder = convolutions(c.convolutions).apply(he_initialise)
-        self.harmonics = CircularHarmonics()
-        self.place = nn.Parameter(0.02 * torch.randn(self.side**2, w))
-        self.image_token = nn.Linear(c.convolutions[-1], w)
-        self.n_cells = c.convolutions[-1] * self.side**2
-        self.image_summary = nn.Sequential(
-            *dense(self.n_cells + self.harmonics.n_features, 2 * w, w, w)
-        ).apply(he_initialise)
+        self.harmonics = CircularHarmonics(c.rings, c.orders)
+        n = self.harmonics.n_features
+        self.place = nn.Parameter(0.02 * torch.randn(c.rings, w))
+        self.image_token = nn.Linear(n // c.rings, w)
+        self.image_summary = nn.Sequential(*dense(n, 2 * w, w, w)).apply(he_initialise)
         self.action_token = nn.Sequential(*dense(n_a + 1, w, w, w))
         self.effect_token = nn.Sequential(*dense(n_e + 1, w, w, w))
         self.ask = nn.Linear(2 * c.waves + 1, w)
@@ -94,9 +90,18 @@ class AttentiveCNP(EffectNetwork):
         self.last = nn.Sequential(nn.LayerNorm(w), *dense(w, w, 2 * (n_a + n_e)))
 
     def features(self, scaled_image: Float[Tensor, "b 2 48 48"]) -> Float[Tensor, "b f"]:
-        """The last feature map, flattened, and the circular harmonics."""
-        cells = self.image_encoder(scaled_image).flatten(1)
-        return torch.cat([cells, self.harmonics(scaled_image)], dim=1)
+        """The circular harmonics of standardised depth and mask."""
+        return self.harmonics(scaled_image)
+
+    def look(self, image: Float[Tensor, "b 2 48 48"]) -> Float[Tensor, "b f"]:
+        """The circular harmonics (B, F) of images."""
+        return self.harmonics(self._scaled(image))
+
+    def turned_features(
+        self, seen: Float[Tensor, "#b f"], heading: Float[Tensor, "b 2"]
+    ) -> Float[Tensor, "b f"]:
+        """The harmonics of turned images, given those of the images as they lie."""
+        return self.harmonics.turned(seen, heading)
 
     def outputs(
         self, features: Tensor, observations: Observations, t_target: Tensor
@@ -104,8 +109,8 @@ class AttentiveCNP(EffectNetwork):
         """(μ_a, σ_a, μ_e, σ_e), each (B, T, C) and standardised."""
         o = observations
         b = len(o.weight)
-        cells = features[:, : self.n_cells].unflatten(1, (-1, self.side**2)).transpose(1, 2)
-        image = (self.image_token(cells) + self.place).expand(b, -1, -1)
+        rings = features.reshape(-1, *self.harmonics.layout).movedim(3, 1).flatten(2)
+        image = (self.image_token(rings) + self.place).expand(b, -1, -1)
         tokens = torch.cat(
             [
                 image,

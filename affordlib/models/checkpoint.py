@@ -13,9 +13,11 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 from affordlib.interactions.batches import Normaliser
+from affordlib.models.anchored import AnchoredConfig, AnchoredNetwork
 from affordlib.models.attention import AttentionConfig, AttentiveCNP
 from affordlib.models.cnp import AffordanceCNP, CNPConfig
 from affordlib.models.film import FiLMConfig, FiLMNetwork
+from affordlib.models.lstm import LSTMConfig, LSTMNetwork
 from affordlib.models.network import EffectNetwork, NetworkConfig
 from affordlib.paths import repo_root
 
@@ -25,6 +27,8 @@ NETWORKS: dict[str, tuple[type[EffectNetwork], type[NetworkConfig]]] = {
     "cnp": (AffordanceCNP, CNPConfig),
     "film": (FiLMNetwork, FiLMConfig),
     "attention": (AttentiveCNP, AttentionConfig),
+    "anchored": (AnchoredNetwork, AnchoredConfig),
+    "lstm": (LSTMNetwork, LSTMConfig),
 }
 
 

@@ -1,13 +1,13 @@
-"""Our improved network: a small CNN whose features modulate residual blocks (FiLM).
+"""Our improved network: what the image tells modulates residual blocks (FiLM).
 
     r      = w₁ mean h_a(a_i) + w₂ mean h_e(e_i)             as in the paper, equations (2) and (3)
     x_0    = W {r, f(γ_o), φ(t_target)}
     x_k+1  = x_k + W₂ ς(γ_k ∘ W₁ n(x_k) + β_k),  (γ_k - 1, β_k) = V_k f(γ_o)
     g(x_K) = (μ_a, σ_a, μ_e, σ_e)
 
-f: image encoder, of convolutions and of the image's circular harmonics; ς: SiLU; n: layer
-normalisation; φ: t with its first sines and cosines. Source: Perez et al., FiLM: visual reasoning
-with a general conditioning layer, AAAI 2018.
+f: a small network on the image's circular harmonics, which turn exactly into the frame of the push;
+ς: SiLU; n: layer normalisation; φ: t with its first sines and cosines. Source: Perez et al., FiLM:
+visual reasoning with a general conditioning layer, AAAI 2018.
 """
 
 from __future__ import annotations
@@ -39,25 +39,24 @@ if TYPE_CHECKING:
 class FiLMConfig(NetworkConfig):
     """Sizes of the network, by default in the frame of the push.
 
-    width: of the residual blocks; image_features: of f(γ_o); convolutions: channels, each halving
-    the image; waves: how many sines and cosines of the phase the blocks see.
+    width: of the residual blocks; image_features: of f(γ_o); rings, orders: of the harmonics of the
+    image; waves: how many sines and cosines of the phase the blocks see.
     """
 
     frame: str = "push"
     width: int = 128
     blocks: int = 3
     image_features: int = 64
-    convolutions: tuple[int, ...] = (16, 32, 64, 64)
+    rings: int = 7
+    orders: int = 8
     waves: int = 4
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("width", "blocks", "image_features", "waves"):
+        for name in ("width", "blocks", "image_features", "rings", "orders", "waves"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}")
-        if not 1 <= len(self.convolutions) <= 4:
-            raise ValueError(f"convolutions must name 1 to 4 widths, got {self.convolutions!r}")
 
 
 class FiLMBlock(nn.Module):
@@ -78,14 +77,6 @@ class FiLMBlock(nn.Module):
         return x + self.second(F.silu((1 + gain) * self.first(self.norm(x)) + shift))
 
 
-def convolutions(widths: tuple[int, ...]) -> nn.Sequential:
-    """(B, 2, n, n) → (B, widths[-1], n / 2^k, n / 2^k), k convolutions, each halving the image."""
-    layers: list[nn.Module] = []
-    for n_in, n_out in pairwise((2, *widths)):
-        layers += [nn.Conv2d(n_in, n_out, 3, stride=2, padding=1), nn.SiLU()]
-    return nn.Sequential(*layers)
-
-
 def waves(t: Float[Tensor, "b t"], n: int) -> Float[Tensor, "b t w"]:
     """t with n sines and cosines of π k t: (B, T, 2n + 1)."""
     angle = t[..., None] * (math.pi * torch.arange(1, n + 1, device=t.device))
@@ -96,8 +87,10 @@ class CircularHarmonics(nn.Module):
     """Products of an image with rings around its centre times cos mφ or sin mφ, m = 0 … orders.
 
     Sums over many pixels, they tell an outline's size, shape and angle far below a pixel, which
-    400 images do not teach convolutions. After Teague, Image analysis via the general theory of
-    moments, JOSA 1980, with rings for the radial polynomials.
+    400 images do not teach convolutions. When the image turns by α, the pair of order m turns by
+    mα: no pixel is interpolated. After Teague, Image analysis via the general theory of moments,
+    JOSA 1980, with rings for the radial polynomials, and Freeman and Adelson, The design and use of
+    steerable filters, PAMI 1991.
     """
 
     def __init__(self, rings: int = 7, orders: int = 8, reach: float = 0.8) -> None:
@@ -105,35 +98,35 @@ class CircularHarmonics(nn.Module):
         u = (torch.arange(IMAGE_PIXELS) + 0.5) / (IMAGE_PIXELS / 2) - 1
         x, y = u[None].expand(len(u), -1), -u[:, None].expand(-1, len(u))
         r, phi = torch.hypot(x, y), torch.atan2(y, x)
-        templates = []
-        for centre in torch.linspace(0.1, reach, rings):
-            ring = torch.exp(-(((r - centre) * rings / reach) ** 2))
-            templates += [ring * (m * phi).cos() for m in range(orders + 1)]
-            templates += [ring * (m * phi).sin() for m in range(1, orders + 1)]
-        stacked = torch.stack(templates).flatten(1)
-        # Unit length, and a gain that brings the sums over an object near unit size.
-        stacked = 0.3 * stacked / stacked.norm(dim=1, keepdim=True)
-        self.register_buffer("templates", stacked, persistent=False)
-        self.n_features = 2 * len(stacked)
+        centre = torch.linspace(0.1, reach, rings)[:, None, None, None]
+        m = torch.arange(orders + 1)[:, None, None]
+        ring = torch.exp(-(((r - centre) * rings / reach) ** 2)) * (r < 1)
+        cosines, sines = ring * (m * phi).cos(), ring * (m * phi).sin()
+        # On a grid of pixels they do not quite sum to zero; a bare table would seem to have angles.
+        leak = cosines.sum(dim=(2, 3), keepdim=True) / ring.sum(dim=(2, 3), keepdim=True)
+        cosines = cosines - torch.where(m > 0, leak, 0.0) * ring
+        # Unit length (both of a pair by the same), and a gain that brings the sums near unit size.
+        gain = 0.3 / cosines.flatten(2).norm(dim=2)[..., None, None]
+        templates = torch.stack([gain * cosines, gain * sines]).flatten(0, 2).flatten(1)
+        self.register_buffer("templates", templates, persistent=False)
+        self.layout = (2, 2, rings, orders + 1)
+        self.n_features = math.prod(self.layout)
 
     def forward(self, image: Float[Tensor, "b 2 n n"]) -> Float[Tensor, "b f"]:
-        return (image.flatten(2) @ self.templates.T).flatten(1)
+        """(B, F), by image channel, cosine or sine, ring and order."""
+        return (image.reshape(2 * len(image), -1) @ self.templates.T).reshape(len(image), -1)
 
-
-class ImageEncoder(nn.Module):
-    """f: (B, 2, 48, 48) → (B, F), a small network on convolutions and circular harmonics."""
-
-    def __init__(self, widths: tuple[int, ...], n_features: int) -> None:
-        super().__init__()
-        side = math.ceil(IMAGE_PIXELS / 2 ** len(widths))
-        self.convolutions, self.harmonics = convolutions(widths), CircularHarmonics()
-        n_in = widths[-1] * side**2 + self.harmonics.n_features
-        self.mlp = nn.Sequential(*dense(n_in, 4 * n_features, 2 * n_features, n_features))
-        self.apply(he_initialise)
-
-    def forward(self, image: Float[Tensor, "b 2 48 48"]) -> Float[Tensor, "b f"]:
-        local = self.convolutions(image).flatten(1)
-        return self.mlp(torch.cat([local, self.harmonics(image)], dim=1))
+    def turned(
+        self, values: Float[Tensor, "#b f"], heading: Float[Tensor, "b 2"]
+    ) -> Float[Tensor, "b f"]:
+        """The harmonics of the images turned by headings (cos α, sin α)."""
+        cosines, sines = values.reshape(-1, *self.layout).unbind(dim=2)
+        step = torch.complex(*heading.unbind(dim=-1))
+        powers = [torch.ones_like(step)]
+        for _ in range(self.layout[-1] - 1):
+            powers.append(powers[-1] * step)
+        turned = torch.complex(cosines, sines) * torch.stack(powers, dim=-1)[:, None, None]
+        return torch.stack([turned.real, turned.imag], dim=2).flatten(1)
 
 
 class FiLMNetwork(EffectNetwork):
@@ -143,7 +136,10 @@ class FiLMNetwork(EffectNetwork):
         super().__init__(config, normaliser)
         c, w = config, config.width
         n_a, n_e = len(c.action_channels), len(c.effect_channels)
-        self.image_encoder = ImageEncoder(c.convolutions, c.image_features)
+        self.harmonics = CircularHarmonics(c.rings, c.orders)
+        n = c.image_features
+        self.image_encoder = nn.Sequential(*dense(self.harmonics.n_features, 4 * n, 2 * n, n))
+        self.image_encoder.apply(he_initialise)
         self.action_encoder = nn.Sequential(*dense(n_a + 1, w, w, w))
         self.effect_encoder = nn.Sequential(*dense(n_e + 1, w, w, w))
         self.merge = nn.Linear(w + c.image_features + 2 * c.waves + 1, w)
@@ -153,7 +149,17 @@ class FiLMNetwork(EffectNetwork):
 
     def features(self, scaled_image: Float[Tensor, "b 2 48 48"]) -> Float[Tensor, "b f"]:
         """f(γ_o): (B, F) of standardised depth and mask."""
-        return self.image_encoder(scaled_image)
+        return self.image_encoder(self.harmonics(scaled_image))
+
+    def look(self, image: Float[Tensor, "b 2 48 48"]) -> Float[Tensor, "b f"]:
+        """The circular harmonics (B, F) of images."""
+        return self.harmonics(self._scaled(image))
+
+    def turned_features(
+        self, seen: Float[Tensor, "#b f"], heading: Float[Tensor, "b 2"]
+    ) -> Float[Tensor, "b f"]:
+        """f(γ_o) of turned images, given the harmonics of the images as they lie."""
+        return self.image_encoder(self.harmonics.turned(seen, heading))
 
     def represent(self, observations: Observations) -> Float[Tensor, "b w"]:
         """r: (B, W), equations (2) and (3), the means taken over what is observed."""

@@ -65,8 +65,8 @@ class EffectNetwork(nn.Module, ABC):
     """A network that satisfies `EffectModel`.
 
     Inputs and outputs are in metres and radians, in the frame of the table; scaling by the
-    normaliser and turning into the network's frame happen inside. In the frame of the push the
-    features of an image are the image itself, since it is turned by what is observed.
+    normaliser and turning into the network's frame happen inside. In the frame of the push an
+    encoded image is what can be read of it before the direction is known.
     """
 
     def __init__(self, config: NetworkConfig, normaliser: Normaliser) -> None:
@@ -102,17 +102,32 @@ class EffectNetwork(nn.Module, ABC):
     def _channels(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
         return self.action_channels, self.effect_channels
 
-    def _look(self, image: Tensor) -> Tensor:
+    def _scaled(self, image: Tensor) -> Tensor:
         mean, std = (v[:, None, None] for v in (self.image_mean, self.image_std))
-        scaled = (image - mean) / std
-        return self.features(scaled.contiguous(memory_format=torch.channels_last))
+        return (image - mean) / std
 
-    def _enter(self, image: Tensor, o: Observations) -> tuple[Tensor, Observations, Tensor]:
+    def look(self, image: Float[Tensor, "b 2 n n"]) -> Float[Tensor, "b f"]:
+        """What is read of an image before the direction is known: here, the image itself."""
+        return image.flatten(1)
+
+    def turned_features(
+        self, seen: Float[Tensor, "#b f"], heading: Float[Tensor, "b 2"]
+    ) -> Float[Tensor, "b f"]:
+        """The features of what `look` has seen, turned by the headings: here, the image turned."""
+        pixels = math.isqrt(seen.shape[1] // 2)
+        image = turn_image(seen.reshape(-1, 2, pixels, pixels), heading)
+        return self.features(self._scaled(image))
+
+    def _see(self, image: Tensor) -> Tensor:
+        push = self.config.frame == "push"
+        return self.look(image) if push else self.features(self._scaled(image))
+
+    def _enter(self, seen: Tensor, o: Observations) -> tuple[Tensor, Observations, Tensor]:
         """Features and observations in the frame of the push, and its headings (B, 2)."""
         towards = heading(o, *self._channels)
         back = inverse(towards)
         turned = turn_observations(o, back, *self._channels)
-        return self._look(turn_image(image, back)), turned, towards
+        return self.turned_features(seen, back), turned, towards
 
     def encode(self, image: Float[Tensor, "b 2 n n"]) -> Float[Tensor, "b f"]:
         """Features (B, F) of depth and mask (B, 2, 48, 48).
@@ -120,7 +135,7 @@ class EffectNetwork(nn.Module, ABC):
         Raises ValueError where the object is unlike those the network was trained on.
         """
         self._check_image(image)
-        return image.flatten(1) if self.config.frame == "push" else self._look(image)
+        return self._see(image)
 
     def predict(self, features: Tensor, observations: Observations, t_target: Tensor) -> Prediction:
         """Mean and σ (B, T, C) at t_target (B, T); features (B, F), or (1, F) for all.
@@ -130,9 +145,7 @@ class EffectNetwork(nn.Module, ABC):
         self._check_action(observations)
         push = self.config.frame == "push"
         if push:
-            pixels = math.isqrt(features.shape[1] // 2)
-            image = features.reshape(-1, 2, pixels, pixels)
-            features, observations, towards = self._enter(image, observations)
+            features, observations, towards = self._enter(features, observations)
         mu_a, sigma_a, mu_e, sigma_e = self.outputs(features, observations, t_target)
         a, e = self.action_scale, self.effect_scale
         prediction = Prediction(
@@ -147,10 +160,10 @@ class EffectNetwork(nn.Module, ABC):
         t_target: Tensor,
     ) -> tuple[Tensor, ...]:
         """(μ_a, σ_a, μ_e, σ_e) in standardised units, in the network's frame."""
+        features = self._see(image)
         if self.config.frame == "push":
-            features, observations, _ = self._enter(image, observations)
-            return self.outputs(features, observations, t_target)
-        return self.outputs(self._look(image), observations, t_target)
+            features, observations, _ = self._enter(features, observations)
+        return self.outputs(features, observations, t_target)
 
     def loss(
         self,

@@ -12,7 +12,7 @@ from affordlib.types import ACTION_CHANNELS, Observations, Prediction
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from affordlib.primitives import Push
+    from affordlib.primitives import Primitive
 
 
 @runtime_checkable
@@ -36,12 +36,12 @@ class EffectModel(Protocol):
         ...
 
 
-def observe_pushes(model: EffectModel, pushes: Sequence[Push]) -> Observations:
-    """The commanded action of each push at t = 0 and t = 1, and no effect: B = len(pushes)."""
+def observe_actions(model: EffectModel, actions: Sequence[Primitive]) -> Observations:
+    """Each commanded action at t = 0 and t = 1, and no effect: B = len(actions)."""
     ends = np.array([0.0, 1.0])
     columns = [ACTION_CHANNELS.index(name) for name in model.action_channels]
-    action = np.stack([push.path(ends)[:, columns] for push in pushes])
-    b = len(pushes)
+    action = np.stack([one.path(ends)[:, columns] for one in actions])
+    b = len(actions)
     return Observations(
         torch.as_tensor(action, dtype=torch.float32),
         torch.tensor([0.0, 1.0]).expand(b, 2),

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import os
 import time
+from collections.abc import Callable
 from dataclasses import asdict, astuple, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
     from affordlib.models.network import EffectNetwork
 
 
+Draw = Callable[[TrainingArrays, torch.Tensor, int, int, torch.Generator], Batch]
+Score = Callable[["EffectNetwork", TrainingArrays], torch.Tensor]
 _AUTO = "cuda" if torch.cuda.is_available() else "cpu"
 
 
@@ -138,13 +141,7 @@ def _augmented(arrays: TrainingArrays) -> TrainingArrays:
     parts = [
         arrays.select(rows).turned(k // 2, mirror=k % 2 == 1) for k, rows in enumerate(eighths)
     ]
-    return replace(
-        arrays,
-        **{
-            name: torch.cat([getattr(part, name) for part in parts])
-            for name in ("image", "action", "effect")
-        },
-    )
+    return parts[0].joined(*parts[1:])
 
 
 class _Run:
@@ -199,10 +196,13 @@ def train(
     config: TrainingConfig | None = None,
     progress: bool = True,
     checkpoint: str | Path | None = None,
+    draw: Draw = sample_batch,
+    score: Score = final_errors_m,
 ) -> list[TrainingRecord]:
     """Train a model in place and return its history; it ends with the best validated weights.
 
-    Early stopping watches the mean final position error on the validation interactions.
+    draw: makes a batch of context and targets, as `sample_batch`. Early stopping watches the mean
+    of score, by default of the final position errors, on the validation interactions.
     checkpoint: a file, written at every validation, from which the same call continues; on one
     machine's processor to the same bits as without the break.
     """
@@ -231,7 +231,7 @@ def train(
                 group["lr"] = config.rate(run.step)
             rows = torch.randint(0, len(training), (config.batch_size,), generator=run.generator)
             arrays = training.select(rows)
-            batch = sample_batch(
+            batch = draw(
                 _augmented(arrays) if config.augment else arrays,
                 torch.arange(len(rows)),
                 config.n_targets,
@@ -249,7 +249,7 @@ def train(
             state = {k: v.clone() for k, v in model.state_dict().items()}
             candidate = {k: v.clone() for k, v in run.mean.items()} if config.ema else state
             model.load_state_dict(candidate)
-            error = float(final_errors_m(model, validation).mean())
+            error = float(score(model, validation).mean())
             model.load_state_dict(state)
             run.seconds = time.perf_counter() - start
             run.history.append(TrainingRecord(run.step, run.seconds, float(loss), error))

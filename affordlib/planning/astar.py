@@ -1,14 +1,16 @@
-"""A* over (partial) pushes (Section 3.4): 36 directions x 20, 40, 60, 80, 100 % of the phase.
+"""A* over (partial) actions (Section 3.4): 36 directions x 20, 40, 60, 80, 100 % of the phase.
 
 An edge costs the distance that the object travels; the heuristic is the Euclidean distance to the
 goal's disc, max(0, d - tolerance), which never overestimates. The search ends at the first node
-within the tolerance (2 cm in the paper).
+within the tolerance (2 cm in the paper). A push turns the object as well, so its effects are looked
+up relative to the yaw that the model foresees; they are kept by degrees and used again.
 """
 
 from __future__ import annotations
 
 import heapq
 import itertools
+import math
 import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
@@ -16,66 +18,68 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from affordlib.models.protocol import observe_pushes
-from affordlib.planning.modes import (
-    PATH_SAMPLES,
-    PlanMode,
-    encode_image,
-    is_on_table,
-    mode_named,
-    plane,
-)
+from affordlib.planning.effect_map import EffectMap, map_effects
+from affordlib.planning.modes import PlanMode, is_on_table, mode_named
+from affordlib.planning.steps import make_steps
 from affordlib.primitives import Push
-from affordlib.types import Goal, Plan, Step, check_on_table
+from affordlib.types import Goal, Plan, check_on_table
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from affordlib.models.protocol import EffectModel
+    from affordlib.planning.repertoire import Reachable
+    from affordlib.primitives import Drag
 
 N_DIRECTIONS = 36
 STOP_PHASES = (0.2, 0.4, 0.6, 0.8, 1.0)
 PRUNE_BELOW_M = 0.001
+YAW_STEP_RAD = math.radians(1)
 _SAME_PLACE_M = 1e-4
 
 
 @dataclass(frozen=True)
 class Branches:
-    """Every action of the search and its predicted effect, the same at every node.
+    """Every action of the search, and what it does to the object standing as it does.
 
-    theta, stop_phase: (n,); effect_xy_m: (n, 2); std_m: (n,); path_xy_m: (n, PATH_SAMPLES, 2).
+    direction, stop_phase: (n,); effect_xy_m: (n, 2) along the table's axes; turn_rad: (n,).
     """
 
-    theta: np.ndarray
+    direction: np.ndarray
     stop_phase: np.ndarray
     effect_xy_m: np.ndarray
-    std_m: np.ndarray
-    path_xy_m: np.ndarray
+    turn_rad: np.ndarray
 
 
-@torch.no_grad()
-def predict_branches(
-    model: EffectModel,
-    image: np.ndarray,
-    n_directions: int = N_DIRECTIONS,
-    stop_phases: Sequence[float] = STOP_PHASES,
-) -> Branches:
-    """Predict all branches in one call, the image encoded once; those that do nothing are left out.
+class BranchTable:
+    """The branches of an object by how far it has turned since its image was taken."""
 
-    Effects are relative to the object, so one table serves every node of the search.
-    """
-    thetas = np.arange(n_directions) * (2 * np.pi / n_directions)
-    features = encode_image(model, image)
-    shares = torch.linspace(0, 1, PATH_SAMPLES)
-    t_target = (torch.tensor(stop_phases, dtype=torch.float32)[:, None] * shares).reshape(1, -1)
-    observations = observe_pushes(model, [Push(theta) for theta in thetas])
-    prediction = model.predict(features, observations, t_target.expand(n_directions, -1))
-    shape = (n_directions * len(stop_phases), PATH_SAMPLES, 2)
-    path = prediction.effect_mean[..., plane(model)].reshape(shape).numpy().astype(float)
-    std = prediction.effect_std[..., plane(model)].reshape(shape)[:, -1].norm(dim=-1).numpy()
-    theta, stop = np.repeat(thetas, len(stop_phases)), np.tile(stop_phases, n_directions)
-    moves = np.hypot(*path[:, -1].T) >= PRUNE_BELOW_M
-    return Branches(theta[moves], stop[moves], path[moves, -1], std[moves], path[moves])
+    def __init__(
+        self,
+        effects: EffectMap,
+        n_directions: int = N_DIRECTIONS,
+        stop_phases: Sequence[float] = STOP_PHASES,
+    ) -> None:
+        angles = np.arange(n_directions) * (2 * np.pi / n_directions)
+        self.effects = effects
+        self._direction = np.repeat(angles, len(stop_phases))
+        self._phase = np.tile(np.asarray(stop_phases, dtype=float), n_directions)
+        self._kept: dict[int, Branches] = {}
+
+    def at(self, turned_rad: float) -> Branches:
+        """The branches of the object turned by an angle; those that do nothing are left out."""
+        key = round(turned_rad / YAW_STEP_RAD)
+        if key not in self._kept:
+            relative = torch.from_numpy(self._direction - key * YAW_STEP_RAD)
+            with torch.no_grad():
+                told = self.effects(relative, torch.from_numpy(self._phase))[0].numpy()
+            c, s = np.cos(self._direction), np.sin(self._direction)
+            ahead, left, turn = told.T
+            xy = np.column_stack([c * ahead - s * left, s * ahead + c * left])
+            moves = np.hypot(ahead, left) >= PRUNE_BELOW_M
+            columns = (self._direction, self._phase, xy, turn)
+            self._kept[key] = Branches(*(column[moves] for column in columns))
+        return self._kept[key]
 
 
 @dataclass(order=True)
@@ -85,34 +89,39 @@ class _Node:
     order: int
     g: float = field(compare=False)
     xy: np.ndarray = field(compare=False)
+    turned: float = field(compare=False)
     parent: _Node | None = field(compare=False)
-    branch: int = field(compare=False)
+    action: tuple[float, float] = field(compare=False)
 
 
 def search(
-    branches: Branches,
+    table: BranchTable,
     start_xy_m: Sequence[float],
     goal: Goal,
     max_steps: int,
+    reachable: Reachable | None = None,
     max_expansions: int = 20_000,
-) -> tuple[list[int], bool, int]:
-    """The branches of the cheapest chain into the goal's disc, whether it gets there, expansions.
+    trace: list[tuple[np.ndarray, np.ndarray]] | None = None,
+) -> tuple[list[tuple[float, float]], bool, int]:
+    """The cheapest chain of (direction, phase) into the goal's disc, whether it gets there, and
+    how many nodes were expanded.
 
-    Where no chain does, the one that ends nearest. Ties go to fewer actions.
+    Where no chain does, the one that ends nearest. Ties go to fewer actions. Positions that are
+    off the table or out of reach are not expanded. trace, if given, receives each expanded
+    position (2,) with those of its children (n, 2).
     """
     goal_xy = np.asarray(goal.xy_m)
-    lengths = np.hypot(*branches.effect_xy_m.T)
-    reach = lengths.max(initial=0.0)
+    reach = table.effects.reach_m
 
     def heuristic(xy: np.ndarray) -> np.ndarray:
         return np.maximum(0.0, np.hypot(*(xy - goal_xy).T) - goal.tolerance_m)
 
     start = np.asarray(start_xy_m, dtype=float)
     counter = itertools.count()
-    root = _Node(float(heuristic(start)), 0, next(counter), 0.0, start, None, -1)
+    root = _Node(float(heuristic(start)), 0, next(counter), 0.0, start, 0.0, None, (0.0, 0.0))
     frontier, nearest, expansions = [root], root, 0
     nearest_m = goal.distance_m(start)
-    cheapest: dict[tuple[int, int, int], float] = {}
+    cheapest: dict[tuple[int, int, int, int], float] = {}
     reached = False
     while frontier and expansions < max_expansions:
         node = heapq.heappop(frontier)
@@ -125,23 +134,41 @@ def search(
         if node.depth == max_steps:
             continue
         expansions += 1
+        branches = table.at(node.turned)
         children = node.xy + branches.effect_xy_m
+        turned = node.turned + branches.turn_rad
         depth = node.depth + 1
-        h, g = heuristic(children), node.g + lengths
+        h = heuristic(children)
+        g = node.g + np.hypot(*branches.effect_xy_m.T)
         hopeful = is_on_table(children) & (h <= (max_steps - depth) * reach + nearest_m)
         if max_steps == depth:
             hopeful &= h < max(nearest_m - goal.tolerance_m, 1e-12)
+        if reachable is not None and hopeful.any():
+            here = np.broadcast_to(node.xy, children.shape)
+            hopeful[hopeful] = reachable(here[hopeful], branches.direction[hopeful])
+        if trace is not None:
+            trace.append((node.xy, children[hopeful]))
         places = np.round(children / _SAME_PLACE_M).astype(int)
+        turns = np.round(turned / YAW_STEP_RAD).astype(int)
         for k in np.flatnonzero(hopeful):
-            key = (int(places[k, 0]), int(places[k, 1]), depth)
+            key = (int(places[k, 0]), int(places[k, 1]), int(turns[k]), depth)
             if g[k] < cheapest.get(key, np.inf):
                 cheapest[key] = g[k]
-                order = next(counter)
-                child = _Node(float(g[k] + h[k]), depth, order, float(g[k]), children[k], node, k)
+                action = float(branches.direction[k]), float(branches.stop_phase[k])
+                child = _Node(
+                    float(g[k] + h[k]),
+                    depth,
+                    next(counter),
+                    float(g[k]),
+                    children[k],
+                    float(turned[k]),
+                    node,
+                    action,
+                )
                 heapq.heappush(frontier, child)
     chain = []
     while nearest.parent is not None:
-        chain.append(nearest.branch)
+        chain.append(nearest.action)
         nearest = nearest.parent
     return chain[::-1], reached, expansions
 
@@ -152,28 +179,23 @@ def plan_astar(
     start_xy_m: Sequence[float],
     goal: Goal,
     mode: str | PlanMode = "multi_partial",
+    kind: type[Push] | type[Drag] = Push,
+    effects: EffectMap | None = None,
+    reachable: Reachable | None = None,
     n_directions: int = N_DIRECTIONS,
     stop_phases: Sequence[float] = STOP_PHASES,
 ) -> Plan:
-    """Plan from the object's position [m] and depth image (2, 48, 48) to a goal, by A*."""
+    """Plan from the object's position [m] and depth image (2, 48, 48) to a goal, by A*.
+
+    kind: push or drag; effects: the object's map, if it was made before; reachable: a function of
+    positions (n, 2) and directions (n,) that says where the arm can act.
+    """
     began = time.perf_counter()
     mode = mode_named(mode)
     start = check_on_table("start_xy_m", start_xy_m)
-    phases = tuple(stop_phases) if mode.partial else (1.0,)
-    branches = predict_branches(model, image, n_directions, phases)
-    chain, reached, expansions = search(branches, start, goal, mode.max_steps)
-    steps, xy = [], np.asarray(start)
-    for k in chain:
-        path = xy + branches.path_xy_m[k]
-        xy = xy + branches.effect_xy_m[k]
-        steps.append(
-            Step(
-                Push(branches.theta[k]),
-                float(branches.stop_phase[k]),
-                (float(xy[0]), float(xy[1])),
-                path,
-                std_m=float(branches.std_m[k]),
-            )
-        )
+    effects = effects or map_effects(model, image, kind)
+    table = BranchTable(effects, n_directions, tuple(stop_phases) if mode.partial else (1.0,))
+    chain, reached, expansions = search(table, start, goal, mode.max_steps, reachable)
+    steps = make_steps(effects, start, torch.tensor(chain, dtype=torch.float64).reshape(-1, 2))
     seconds = time.perf_counter() - began
-    return Plan(goal, start, tuple(steps), "astar", reached, expansions, seconds)
+    return Plan(goal, start, steps, "astar", reached, expansions, seconds)

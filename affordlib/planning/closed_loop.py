@@ -1,26 +1,123 @@
-"""Carrying plans out in the world; the only part of planning that knows PyBullet."""
+"""Carrying plans out in the world; the only part of planning that knows PyBullet.
+
+`carry_out` trusts a plan. `pursue` looks after every action (Section 3.4 of the paper): is the
+object where it should be, has the goal changed, has the object fallen? If so a new image, a new
+plan. It ends in one of four ways, and says so.
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from affordlib.types import Outcome, Plan
+import numpy as np
+
+from affordlib.planning.chase import Chase, Pursuit, action_limit, follow
+from affordlib.planning.continuous import plan_continuous
+from affordlib.planning.modes import PlanMode, is_on_table
+from affordlib.planning.moves import Demands
+from affordlib.primitives import Drag
+from affordlib.types import Goal, Outcome, Plan, check_within
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from affordlib.planning.disturbances import Disturbance
+    from affordlib.planning.repertoire import Repertoire
     from affordlib.world import Tabletop
 
+__all__ = ["Pursuit", "action_limit", "carry_out", "pursue"]
 
-def carry_out(world: Tabletop, plan: Plan) -> Outcome:
+Replan = Callable[[np.ndarray, tuple[float, float], Goal], Plan]
+"""A planner as (image, start_xy_m, goal) → Plan."""
+
+ENOUGH_M = 0.0003
+"""What a corrective action leaves anyway; nearer to the goal than this, none is tried."""
+
+ROLLS_ON_M = 0.002
+"""A drag corrects no less: let go, one lying cylinder in ten that is wider than long rolls on."""
+
+TOLERANCE_M = 0.002
+TURN_TOLERANCE_RAD = math.radians(2)
+HEIGHT_TOLERANCE_M = 0.003
+
+
+def carry_out(
+    world: Tabletop,
+    plan: Plan,
+    corrections: int = 0,
+    replan: Replan | None = None,
+    enough_m: float = ENOUGH_M,
+) -> Outcome:
     """Execute a plan's steps, as planned, and measure where the object rests.
 
-    Open loop: the plan is never revised. Each action is carried out relative to where the object
+    Open loop: the plan is not revised. Each action is carried out relative to where the object
     then stands, as actions are defined. The distance is taken after the gripper has retreated and
     the object has rested 0.5 s. Raises UnreachableError when the arm cannot follow a step.
+
+    corrections: after the last step, so many single actions at most, each the first of a plan that
+    `replan` makes anew from what is then seen, and each only if the object seems farther than
+    enough_m [m] from the goal, the plan expects to bring it nearer, and the arm can do it.
     """
-    paths = []
-    for step in plan.steps:
-        seen = world.follow(step)
-        paths.append(seen.effect[:, :2] + seen.start_pose[:2])
+    if corrections and replan is None:
+        raise ValueError(f"corrections = {corrections} need a planner; give replan as well")
+    paths = [follow(world, step) for step in plan.steps]
+    for _ in range(corrections):
+        seen = world.perceive()
+        off = plan.goal.distance_m(seen.xy_m)
+        if off <= enough_m or not is_on_table(np.array([seen.xy_m]))[0] or not seen.image[1].any():
+            break
+        # A planner content within the goal's tolerance would have nothing to correct.
+        exactly = replace(plan.goal, tolerance_m=min(plan.goal.tolerance_m, enough_m))
+        steps = replan(seen.image, seen.xy_m, exactly).steps[:1]
+        if not steps or plan.goal.distance_m(steps[0].predicted_end_xy_m) >= off:
+            break
+        if isinstance(steps[0].primitive, Drag) and off <= ROLLS_ON_M:
+            break
+        if not world.can_reach(steps[0].primitive, steps[0].stop_phase):
+            break
+        paths.append(follow(world, steps[0]))
     pose = world.object_pose()
     distance = plan.goal.distance_m(pose[:2])
     return Outcome(plan, distance, pose, world.object_tilt_rad(), tuple(paths))
+
+
+def pursue(
+    world: Tabletop,
+    goal: Goal,
+    repertoire: Repertoire,
+    planner: Callable[..., Plan] = plan_continuous,
+    tolerance_m: float = TOLERANCE_M,
+    turn_tolerance_rad: float = TURN_TOLERANCE_RAD,
+    height_tolerance_m: float = HEIGHT_TOLERANCE_M,
+    max_actions: int | None = None,
+    disturbances: Sequence[Disturbance] = (),
+    horizon: int = 3,
+    on_action: Callable[[Plan, int], Goal | None] | None = None,
+) -> Pursuit:
+    """Bring the object to a goal, whatever happens on the way: position, orientation, height.
+
+    planner: called as plan_astar and plan_continuous are; horizon: the longest chain it is asked
+    for. max_actions: default `action_limit` of the distance, renewed when the goal moves or
+    somebody displaces the object (that at most three times). disturbances: what shall happen.
+    on_action: called with the plan and the number of actions taken, after each; it may return a
+    new goal. Never moves where the arm's kinematics says no.
+    """
+    for name, value in (("tolerance_m", tolerance_m), ("height_tolerance_m", height_tolerance_m)):
+        check_within(name, value, 1e-5, 0.1, "m")
+    check_within("turn_tolerance_rad", turn_tolerance_rad, 1e-4, math.pi, "rad")
+    if max_actions is not None and (isinstance(max_actions, bool) or max_actions < 0):
+        raise ValueError(f"max_actions must be a whole number from 0 on, got {max_actions!r}")
+    demands = Demands(
+        planner,
+        PlanMode(horizon, partial=True),
+        tolerance_m,
+        turn_tolerance_rad,
+        height_tolerance_m,
+        max_actions,
+        on_action,
+    )
+    chase = Chase(world, goal, repertoire, demands, disturbances)
+    return chase.run()

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from affordlib.models.protocol import observe_final_effect, observe_pushes
+from affordlib.models.protocol import observe_actions, observe_final_effect
 from affordlib.planning.modes import PATH_SAMPLES, PlanMode, encode_image, mode_named, plane
 from affordlib.primitives import Push
 from affordlib.types import Goal, Plan, Step, check_on_table
@@ -88,7 +88,7 @@ def descend(
 def _effect_radius_m(model: EffectModel, features: torch.Tensor) -> float:
     """Mean length [m] of the effects of full pushes of this object."""
     pushes = [Push(theta) for theta in np.arange(12) * (math.pi / 6)]
-    prediction = model.predict(features, observe_pushes(model, pushes), torch.ones(12, 1))
+    prediction = model.predict(features, observe_actions(model, pushes), torch.ones(12, 1))
     return float(prediction.effect_mean[:, 0, plane(model)].norm(dim=-1).mean())
 
 

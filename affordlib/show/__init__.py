@@ -1,7 +1,11 @@
-"""Pictures for people: figures, animations and the goal picker."""
+"""Pictures for people: figures, animations, and widgets to try things by hand."""
 
 from affordlib.show.animation import Film, show_animation
+from affordlib.show.conditioning_explorer import ConditioningExplorer
+from affordlib.show.executors import closed_loop, open_loop
 from affordlib.show.goal_picker import GoalPicker
+from affordlib.show.lever import outline_in_lever_frame, plot_levered
+from affordlib.show.phase_slider import PhaseSlider
 from affordlib.show.plots import (
     GOAL,
     NEUTRAL,
@@ -11,6 +15,7 @@ from affordlib.show.plots import (
     plot_footprint,
     plot_outcome,
     plot_plan,
+    plot_pursuit,
     plot_table,
     save_figure,
 )
@@ -20,12 +25,19 @@ __all__ = [
     "NEUTRAL",
     "PREDICTION",
     "TRUTH",
+    "ConditioningExplorer",
     "Film",
     "GoalPicker",
+    "PhaseSlider",
+    "closed_loop",
+    "open_loop",
+    "outline_in_lever_frame",
     "plot_depth",
     "plot_footprint",
+    "plot_levered",
     "plot_outcome",
     "plot_plan",
+    "plot_pursuit",
     "plot_table",
     "save_figure",
     "show_animation",

@@ -6,18 +6,21 @@ import io
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 from IPython.display import Image as NotebookImage
 from PIL import Image
 
 if TYPE_CHECKING:
-    import numpy as np
     from matplotlib.figure import Figure
 
     from affordlib.world import Tabletop
 
 
 class Film:
-    """Takes a picture every `every` simulation steps (1/240 s); give it to `world.film`."""
+    """Takes a picture every `every` simulation steps (1/240 s); give it to `world.film`.
+
+    Figures can be added as frames as well, with `add`.
+    """
 
     def __init__(self, every: int = 30, width: int = 320, height: int = 240) -> None:
         self.every, self.width, self.height = every, width, height
@@ -28,6 +31,10 @@ class Film:
         if self._steps % self.every == 0:
             self.frames.append(world.picture(self.width, self.height))
         self._steps += 1
+
+    def add(self, figure: Figure) -> None:
+        """Add a picture of a figure, as high as the film is."""
+        self.frames.append(np.asarray(_drawn(figure, self.height)))
 
     def gif(self, frame_ms: int = 60, beside: Figure | None = None) -> bytes:
         """The frames as an animated GIF that loops and rests on its last frame.

@@ -1,6 +1,7 @@
-"""Pick a goal with sliders, see the plan redrawn, run it in the world.
+"""Pick a goal by hand, see the plan redrawn, run it in the world, disturb it.
 
-A view on plain objects: everything it does can be done with `plan_*` and `carry_out`.
+A view on plain objects: everything it does can be done with a planner, `carry_out` and
+`Tabletop.shove`.
 """
 
 from __future__ import annotations
@@ -8,71 +9,339 @@ from __future__ import annotations
 import base64
 import html
 import io
-from typing import TYPE_CHECKING
+import itertools
+import threading
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import ipywidgets as widgets
+import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from affordlib.paths import resolve_out_dir
+from affordlib.plan_files import load_plan, save_plan
 from affordlib.planning import carry_out
+from affordlib.show.executors import Stopped, open_loop
 from affordlib.show.plots import plot_footprint, plot_outcome, plot_plan, plot_table
+from affordlib.show.sentences import outcome_in_words, plan_in_words
+from affordlib.show.table_view import TableView, make_scene, rounded
 from affordlib.types import Goal
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from affordlib.show.executors import Executor, Planner
     from affordlib.types import Outcome, Plan
     from affordlib.world import Tabletop
+    from affordlib.world.motion import Film
+
+HALF_WIDTH_M, LIMIT_M = 0.36, 0.35
+FILM_EVERY = 12
+"""Simulation steps (1/240 s) between two poses of the film."""
 
 
 class GoalPicker(widgets.VBox):
-    """Sliders for a goal, a choice of planners, the plan as a picture, and a button to run it.
+    """The table from above, where a goal is picked by mouse, keyboard or sliders.
 
-    planners: name → function (image, start_xy_m, goal) → Plan. `plan` and `outcome` hold what is
-    shown; `pick(x_m, y_m)` and `run()` do what the sliders and the button do.
+    planners: name → function (image, start_xy_m, goal) → Plan. executors: name → function (world,
+    plan, planner, tell) → Outcome that carries a plan out, or plans again with the planner that
+    made it. It calls tell() after every action, which shows the reader what happened, lets a
+    waiting disturbance happen, returns the goal as it is by then, and raises `Stopped`, to be let
+    through, once Stop was pressed. The default is `open_loop` alone.
+    goal_xy_m: [m], in whole millimetres. seed: of the disturbances. folder: where plans are saved,
+    relative to the repository.
+
+    `plan` and `outcome` hold what is shown; `pick`, `run`, `stop`, `shove_object`, `move_goal`,
+    `start_over`, `save` and `load` do what mouse and buttons do. *Run* works in the background, at
+    a pace that can be watched; leave the world alone until it is done. `run()` returns when done.
     """
 
     def __init__(
         self,
         world: Tabletop,
-        planners: dict[str, Callable[..., Plan]],
+        planners: dict[str, Planner],
         goal_xy_m: tuple[float, float] = (0.12, 0.10),
-        reach_m: float = 0.25,
+        *,
+        executors: dict[str, Executor] | None = None,
+        seed: int = 0,
+        seconds_per_action: float = 1.2,
+        folder: str = "runs/lab",
     ) -> None:
         self.world, self.planners = world, planners
+        self.executors = executors or {"open loop": open_loop}
+        self.seconds_per_action, self.folder = seconds_per_action, folder
         self.plan: Plan | None = None
         self.outcome: Outcome | None = None
-        limits = {"min": -reach_m * 100, "max": reach_m * 100, "step": 0.5, "readout_format": ".1f"}
-        self._x = widgets.FloatSlider(value=100 * goal_xy_m[0], description="x [cm]", **limits)
-        self._y = widgets.FloatSlider(value=100 * goal_xy_m[1], description="y [cm]", **limits)
-        self._planner = widgets.Dropdown(options=list(planners), description="planner")
-        self._run = widgets.Button(description="Run", button_style="primary", icon="play")
-        self._picture = widgets.Image(format="png", layout={"width": "460px"})
-        self._words = widgets.HTML()
-        for control in (self._x, self._y, self._planner):
-            control.observe(lambda _: self._safely(self._replan), names="value")
-        self._run.on_click(lambda _: self._safely(self.run))
-        controls = widgets.VBox([self._x, self._y, self._planner, self._run, self._words])
-        super().__init__([widgets.HBox([self._picture, controls])])
-        self._replan()
+        self._rng = np.random.default_rng(seed)
+        self._pose = self._first_pose = world.object_pose()
+        self._goal = Goal(_whole_mm(*goal_xy_m))
+        self._running = self._setting = False
+        self._stop = threading.Event()
+        self._waiting: list[Callable[[], None]] = []
+        self._poses: list[tuple[float, ...]] = []  # of the film since the last action
+        self._walked: list[np.ndarray] = []  # the object's paths since the plan was made
+        super().__init__(self._build())
+        self.add_class("affordlib-picker")
+        self._safely(self._replan)
+
+    # What mouse and buttons do
 
     def pick(self, x_m: float, y_m: float) -> None:
-        """Set the goal [m] and redraw the plan, as moving the sliders does."""
-        goal = Goal((x_m, y_m))
-        with self.hold_trait_notifications():
-            self._x.value, self._y.value = 100 * goal.xy_m[0], 100 * goal.xy_m[1]
+        """Set the goal [m], to the nearest millimetre, and make the plan anew."""
+        self._set_goal(Goal(_whole_mm(x_m, y_m), self._goal.tolerance_m))
         self._replan()
 
     def run(self) -> None:
-        """Carry the plan out in the world and show what came of it; the next plan starts there."""
-        self._run.disabled = True
+        """Carry the plan out and show what came of it; the next plan starts from there."""
+        self._refuse_while_running()
+        self._set_running(True)
+        self._run(seconds_per_action=0.0)
+
+    def stop(self) -> None:
+        """Let the action that is under way end, and carry out nothing more."""
+        self._stop.set()
+
+    def shove_object(self) -> None:
+        """Disturb: shove the object 2 to 4 cm to some side; while running, after this action."""
+        self._disturb(self._shove)
+
+    def move_goal(self) -> None:
+        """Disturb: move the goal 4 to 8 cm to some side; while running, after this action."""
+        self._disturb(self._move_goal)
+
+    def start_over(self) -> None:
+        """Put the object back where it stood when the picker was made."""
+        self._refuse_while_running()
+        x, y, yaw = self._first_pose
+        self.world.place(self.world.thing, (x, y), yaw)
+        self._make_plan()
+
+    def save(self, name: str = "plan.json") -> None:
+        """Save the plan and its goal as JSON in the picker's folder."""
+        if self.plan is None:
+            raise RuntimeError("there is no plan to save; pick a goal that can be planned for")
+        path = save_plan(resolve_out_dir(self.folder) / name, self.plan)
+        self._say(f"Saved the plan and its goal as {html.escape(f'{self.folder}/{path.name}')}.")
+
+    def load(self, name: str = "plan.json") -> None:
+        """Show a saved plan with its goal, to be run as it is."""
+        self._refuse_while_running()
+        plan = load_plan(resolve_out_dir(self.folder) / name)
+        self._set_goal(plan.goal)
+        self._pose, self.plan, self.outcome = self.world.object_pose(), plan, None
+        self._walked.clear()
+        away_m = np.hypot(*np.subtract(plan.start_xy_m, self._pose[:2]))
+        note = f" The object is {1000 * away_m:.0f} mm from where this plan starts."
+        self._say(f"Loaded. {plan_in_words(plan)}{note if away_m > 0.002 else ''}")
+        self._show()
+
+    # Planning
+
+    def _replan(self) -> None:
+        if self._running:  # the executor is told of the new goal after this action
+            self._show()
+        else:
+            self._make_plan()
+
+    def _make_plan(self) -> None:
+        planner, plan = self.planners[self._planner.value], None
+        self._pose = self.world.object_pose()
         try:
-            self.outcome = carry_out(self.world, self.plan)
+            plan = planner(self.world.look(), self._pose[:2], self._goal)
+            self._say(plan_in_words(plan))
         finally:
-            self._run.disabled = False
-        self._draw(self.outcome)
-        distance_mm = 1000 * self.outcome.distance_m
-        self._say(f"The object rests <b>{distance_mm:.1f} mm</b> from the goal.")
+            self.plan, self.outcome = plan, None
+            self._walked.clear()
+            self._show()
+
+    def _set_goal(self, goal: Goal) -> None:
+        """Set the goal everywhere; the sliders are told, and what they echo is not listened to."""
+        self._setting = True
+        try:
+            self._goal = goal
+            self._x.value, self._y.value = (round(100 * v, 1) for v in goal.xy_m)
+        finally:
+            self._setting = False
+
+    # Carrying out
+
+    def _refuse_while_running(self) -> None:
+        if self._running:
+            raise RuntimeError("the robot is still at work; press Stop or wait")
+
+    def _run(self, seconds_per_action: float) -> None:
+        planner, before, done = self.planners[self._planner.value], self.world.film, 0
+
+        def tell() -> Goal:
+            nonlocal done
+            done += 1
+            self._progress.value = done
+            self._play(seconds_per_action)
+            while self._waiting and not self._stop.is_set():
+                self._waiting.pop(0)()
+            if self._stop.is_set():
+                raise Stopped
+            return self._goal
+
+        try:
+            if self.plan is None or self.outcome is not None:
+                self._make_plan()
+            self._progress.value, self._progress.max = 0, max(1, len(self.plan.steps))
+            self.world.film = self._recorder(before)
+            try:
+                execute = self.executors[self._executor.value]
+                outcome, how = execute(self.world, self.plan, planner, tell), "Done,"
+            except Stopped:
+                outcome, how = carry_out(self.world, replace(self.plan, steps=())), "Stopped after"
+            self.outcome = outcome.with_goal(self._goal)
+            self._say(outcome_in_words(self.outcome, self._goal, how, done))
+        finally:
+            self.world.film = before
+            self._set_running(False)
+            self._play(0.0)
+            self._pose = self.world.object_pose()
+            self._show()
+
+    def _recorder(self, before: Film | None) -> Film:
+        """A film for the world that writes down the object's poses, beside the world's own."""
+        steps = itertools.count()
+
+        def record(world: Tabletop) -> None:
+            if before is not None:
+                before(world)
+            if next(steps) % FILM_EVERY == 0:
+                self._poses.append(world.object_pose())
+
+        return record
+
+    def _play(self, seconds: float) -> None:
+        """Play what was filmed since the last time; a film of an object at rest is skipped."""
+        poses = np.array(self._poses)
+        self._poses.clear()
+        if len(poses) < 2:
+            return
+        moving = np.abs(np.diff(poses, axis=0)).max(axis=1) > 1e-4
+        if moving.any():
+            first, last = np.flatnonzero(moving)[[0, -1]]
+            poses = poses[first : last + 2]
+            self._view.film = {"poses": rounded(poses), "seconds": seconds}
+            self._stop.wait(seconds)
+            self._walked.append(poses[:, :2])
+            self._pose = tuple(poses[-1])
+
+    def _set_running(self, running: bool) -> None:
+        self._running = running
+        self._stop.clear()
+        for control in (self._run_button, self._over, self._planner, self._executor, self._load):
+            control.disabled = running
+        self._stop_button.disabled = not running
+
+    # Disturbing
+
+    def _disturb(self, disturbance: Callable[[], None]) -> None:
+        if self._running:
+            self._waiting.append(disturbance)
+        else:
+            disturbance()
+            self._make_plan()
+
+    def _shove(self) -> None:
+        x, y, _ = self.world.object_pose()
+        dx, dy = self._drawn((x, y), 0.02, 0.04)
+        self.world.shove(dx, dy, float(self._rng.uniform(-0.5, 0.5)))
+        self._pose = self.world.object_pose()
+        self._poses.clear()
+        self._show()
+        self._say(f"The object was shoved by {1000 * np.hypot(dx, dy):.0f} mm.")
+
+    def _move_goal(self) -> None:
+        x, y = self._goal.xy_m
+        dx, dy = self._drawn((x, y), 0.04, 0.08)
+        self._set_goal(Goal(_whole_mm(x + dx, y + dy), self._goal.tolerance_m))
+        self._show()
+        self._say(f"The goal was moved by {1000 * np.hypot(dx, dy):.0f} mm.")
+
+    def _drawn(self, xy_m: tuple[float, float], least_m: float, most_m: float) -> np.ndarray:
+        """A random displacement (2,) [m] that stays in sight; from outside, one towards it."""
+        for _ in range(100):
+            angle, far = self._rng.uniform(0, 2 * np.pi), self._rng.uniform(least_m, most_m)
+            way = far * np.array([np.cos(angle), np.sin(angle)])
+            if np.abs(np.add(xy_m, way)).max() < LIMIT_M:
+                return way
+        return -far * np.array(xy_m) / np.hypot(*xy_m)
+
+    # The widget
+
+    def _build(self) -> list[widgets.Widget]:
+        limits = {"min": -100 * LIMIT_M, "max": 100 * LIMIT_M, "step": 0.1, "readout_format": ".1f"}
+        x_cm, y_cm = (round(100 * v, 1) for v in self._goal.xy_m)
+        self._view = TableView(layout={"width": "480px", "max_width": "100%"})
+        self._x = widgets.FloatSlider(value=x_cm, description="x [cm]", **limits)
+        self._y = widgets.FloatSlider(value=y_cm, description="y [cm]", **limits)
+        self._planner = widgets.Dropdown(options=list(self.planners), description="planner")
+        self._executor = widgets.Dropdown(options=list(self.executors), description="carry out")
+        self._run_button = _button("Run", "play", "Carry the plan out", button_style="primary")
+        self._stop_button = _button("Stop", "stop", "Stop after this action", disabled=True)
+        self._progress = widgets.IntProgress(max=1, layout={"width": "9em"})
+        self._shove_button = _button("Shove it", "hand-o-right", "Disturb: shove the object")
+        self._goal_button = _button("Move goal", "random", "Disturb: move the goal")
+        self._over = _button("Start over", "undo", "Put the object back")
+        self._name = widgets.Text("plan.json", description="file", layout={"width": "14em"})
+        self._save, self._load = _button("Save", "save"), _button("Load", "folder-open")
+        self._words = widgets.HTML()
+
+        for slider in (self._x, self._y):
+            slider.observe(self._slid, names="value")
+        self._planner.observe(lambda _: self._safely(self._replan), names="value")
+        self._view.observe(self._asked, names="asked")
+        self._view.on_msg(self._pressed)
+        for button, action in {
+            self._run_button: self._run_in_background,
+            self._stop_button: self.stop,
+            self._shove_button: self.shove_object,
+            self._goal_button: self.move_goal,
+            self._over: self.start_over,
+            self._save: lambda: self.save(self._name.value),
+            self._load: lambda: self.load(self._name.value),
+        }.items():
+            button.on_click(lambda _, action=action: self._safely(action))
+        controls = [
+            [self._planner],
+            [self._executor],
+            [self._x],
+            [self._y],
+            [self._run_button, self._stop_button, self._progress],
+            [widgets.Label("disturb"), self._shove_button, self._goal_button],
+            [self._over],
+            [self._name, self._save, self._load],
+            [self._words],
+        ]
+        beside = widgets.VBox([widgets.HBox(row) for row in controls])
+        layout = {"flex_flow": "row wrap", "grid_gap": "12px"}
+        return [widgets.HBox([self._view, beside], layout=layout)]
+
+    def _asked(self, change: dict[str, Any]) -> None:
+        x, y, _ = change["new"]
+        self._safely(lambda: self.pick(x, y))
+
+    def _slid(self, _: object) -> None:
+        if not self._setting:
+            self._safely(lambda: self.pick(self._x.value / 100, self._y.value / 100))
+
+    def _pressed(self, _: object, content: dict[str, Any], __: object) -> None:
+        presses = {"run": self._run_in_background, "stop": self.stop}
+        if content.get("press") in presses:
+            self._safely(presses[content["press"]])
+
+    def _run_in_background(self) -> None:
+        """So that Stop, a disturbance and a new goal are heard while the robot is at work."""
+        self._refuse_while_running()
+        self._set_running(True)
+        self._work = threading.Thread(
+            target=lambda: self._safely(lambda: self._run(self.seconds_per_action)), daemon=True
+        )
+        self._work.start()
 
     def _safely(self, action: Callable[[], None]) -> None:
         try:
@@ -80,34 +349,51 @@ class GoalPicker(widgets.VBox):
         except Exception as error:
             self._say(f"<b>{type(error).__name__}</b>: {html.escape(str(error))}")
 
-    def _replan(self) -> None:
-        goal = Goal((self._x.value / 100, self._y.value / 100))
-        start = self.world.object_pose()[:2]
-        self.plan = self.planners[self._planner.value](self.world.look(), start, goal)
-        self._draw(self.plan)
-        steps = ", ".join(f"push to {100 * s.stop_phase:.0f} %" for s in self.plan.steps) or "stay"
-        self._say(
-            f"Plan: {steps}. Expected distance {1000 * self.plan.predicted_distance_m:.1f} mm, "
-            f"found in {1000 * self.plan.plan_s:.0f} ms."
+    def _say(self, text: str) -> None:
+        style = "width: 27em; max-width: 100%; line-height: 1.4; white-space: normal"
+        self._words.value = f"<div role='status' aria-live='polite' style='{style}'>{text}</div>"
+
+    def _show(self) -> None:
+        self._view.scene = make_scene(
+            self.world.thing,
+            self._pose,
+            self._goal,
+            self.plan.steps if self.plan else (),
+            self.plan.start_xy_m if self.plan else self._pose[:2],
+            self._walked,
+            HALF_WIDTH_M,
+            LIMIT_M,
+            answered=self._view.asked[2],
+            running=self._running,
         )
 
-    def _say(self, text: str) -> None:
-        self._words.value = f"<div style='max-width: 22em; line-height: 1.4'>{text}</div>"
-
-    def _draw(self, shown: Plan | Outcome) -> None:
+    def picture(self) -> bytes:
+        """What is shown, as a PNG."""
         # A figure of its own, outside pyplot: no window, nothing to close.
         figure = Figure(figsize=(5, 5), layout="constrained")
         FigureCanvasAgg(figure)
-        ax = plot_table(figure.add_subplot(), half_width_m=0.32)
-        x, y, yaw = self.world.object_pose()
-        plot_footprint(ax, self.world.thing, (x, y), yaw)
-        (plot_plan if shown is self.plan else plot_outcome)(ax, shown)
+        ax = plot_table(figure.add_subplot(), half_width_m=HALF_WIDTH_M)
+        if self.outcome is not None:
+            plot_outcome(ax, self.outcome)
+        elif self.plan is not None:
+            plot_plan(ax, self.plan)
+        plot_footprint(ax, self.world.thing, self._pose[:2], self._pose[2], label="object")
         ax.legend(loc="upper left")
         buffer = io.BytesIO()
         figure.savefig(buffer, format="png", dpi=90)
-        self._picture.value = buffer.getvalue()
+        return buffer.getvalue()
 
     def _repr_mimebundle_(self, **kwargs: object) -> dict[str, object]:
         # A box of widgets saves only text; the picture stays in the notebook without a kernel.
-        bundle = super()._repr_mimebundle_(**kwargs)
-        return {**bundle, "image/png": base64.b64encode(self._picture.value).decode()}
+        bundle = super()._repr_mimebundle_(**kwargs) | {"text/plain": "GoalPicker"}
+        return {**bundle, "image/png": base64.b64encode(self.picture()).decode()}
+
+
+def _whole_mm(x_m: float, y_m: float) -> tuple[float, float]:
+    return round(x_m, 3), round(y_m, 3)
+
+
+def _button(name: str, icon: str, tooltip: str = "", **kwargs: Any) -> widgets.Button:
+    return widgets.Button(
+        description=name, icon=icon, tooltip=tooltip or name, layout={"width": "auto"}, **kwargs
+    )

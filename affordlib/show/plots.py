@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 import matplotlib.pyplot as plt
 import numpy as np
 
+from affordlib.perception import CAMERA_HEIGHT_M
 from affordlib.types import CROP_WIDTH_M, TABLE_X_M, TABLE_Y_M
-from affordlib.world.perception import CAMERA_HEIGHT_M
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from affordlib.planning import Pursuit
     from affordlib.types import Outcome, Plan
     from affordlib.world import Thing
 
@@ -133,6 +134,40 @@ def plot_outcome(ax: Axes, outcome: Outcome) -> Axes:
     ax.plot(*(100 * np.array(outcome.end_pose[:2])), "s", color=TRUTH, ms=6)
     ax.set_title(f"{outcome.plan.planner}: {1000 * outcome.distance_m:.1f} mm from the goal")
     return ax
+
+
+def plot_pursuit(ax: Axes, pursuit: Pursuit, thing: Thing | None = None) -> Axes:
+    """A pursuit from above: where each action took the object, and where it was moved by others.
+
+    Dots are where the object was expected after each action; dotted lines what nobody planned.
+    thing: drawn as it stands in the end, if given.
+    """
+    first = pursuit.plans[0].goal if pursuit.plans else pursuit.goal
+    if first.xy_m != pursuit.goal.xy_m:
+        ax.plot(*(100 * np.array(first.xy_m)), "*", color=GOAL, ms=11, mfc="none", zorder=5)
+    ax.plot(*(100 * np.array(pursuit.goal.xy_m)), "*", color=GOAL, ms=13, label="goal", zorder=5)
+    at = np.array(pursuit.seen_xy_m[0])
+    ax.plot(*(100 * at), "o", color=NEUTRAL, ms=5)
+    for k, (step, path) in enumerate(zip(pursuit.steps, pursuit.object_paths_xy_m, strict=True)):
+        if np.hypot(*(path[0] - at)) > 0.003:
+            label = "moved by others" if "moved by others" not in _labels(ax) else None
+            ax.plot(*(100 * np.array([at, path[0]]).T), ":", color="black", lw=1.2, label=label)
+        ax.plot(*(100 * path.T), color=TRUTH, lw=2, label="truth" if k == 0 else None)
+        end = 100 * np.array(step.predicted_end_xy_m)
+        ax.plot(*end, "o", color=PREDICTION, ms=5, label="prediction" if k == 0 else None)
+        middle = 100 * path[len(path) // 2 :].mean(axis=0)
+        ax.annotate(step.primitive.name, middle, (5, 4), textcoords="offset points", fontsize=7)
+        at = path[-1]
+    if thing is not None:
+        plot_footprint(ax, thing, pursuit.end_pose[:2], pursuit.end_pose[2], TRUTH)
+    ax.set_title(
+        f"{pursuit.ending}: {1000 * pursuit.distance_m:.1f} mm, {len(pursuit.steps)} actions"
+    )
+    return ax
+
+
+def _labels(ax: Axes) -> list[str]:
+    return ax.get_legend_handles_labels()[1]
 
 
 def plot_depth(ax: Axes, image: np.ndarray, title: str = "", width_m: float = CROP_WIDTH_M) -> Axes:

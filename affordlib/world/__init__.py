@@ -11,11 +11,13 @@ from affordlib.world.objects import (
     UprightCylinder,
     family_named,
 )
-from affordlib.world.robot import UnreachableError
+from affordlib.world.robot import BASE_X_M, REACH_M, UnreachableError
 from affordlib.world.scene import Tabletop, WorldConfig
 
 __all__ = [
+    "BASE_X_M",
     "FAMILIES",
+    "REACH_M",
     "Cuboid",
     "LyingCylinder",
     "Prism",

@@ -13,11 +13,15 @@ import math
 import numpy as np
 import pybullet
 
+from affordlib.perception import CAMERA_HEIGHT_M, centre_m, largest_blob
 from affordlib.types import CROP_WIDTH_M, IMAGE_PIXELS, TABLE_X_M, TABLE_Y_M
-from affordlib.world.perception import CAMERA_HEIGHT_M, centre_m, largest_blob
 
 _NEAR_M, _FAR_M = 0.5, 1.1
 _MASK_HEIGHT_M = 0.004
+
+RAYS_PER_SIDE = 3
+"""Of a pixel of the ideal camera. With one ray, 500 pushes teach FiLM to 1.09 mm, with 4 rays to
+0.87 mm, with 16 to 0.83 mm."""
 
 KINECT_HEIGHT_M = 1.3
 _KINECT_XY_M = (sum(TABLE_X_M) / 2, sum(TABLE_Y_M) / 2)
@@ -70,19 +74,23 @@ def depth_crop(
     pixels: int = IMAGE_PIXELS,
     width_m: float = CROP_WIDTH_M,
     turn_rad: float = 0.0,
+    samples: int = RAYS_PER_SIDE,
 ) -> np.ndarray:
     """Depth [m] and mask (2, n, n) of the square around (x, y), as float32.
 
     Columns run along the direction turn_rad of the table, rows a quarter turn to its right: by
-    default as a map is read.
+    default as a map is read. A pixel is the mean of samples x samples rays, so at the object's rim
+    the mask is the share that it covers.
     """
     x, y = xy_m
     up = (-math.sin(turn_rad), math.cos(turn_rad), 0)
     view = pybullet.computeViewMatrix((x, y, CAMERA_HEIGHT_M), (x, y, 0), up)
-    projection = _orthographic(width_m / 2, pixels)
-    depth = _distance_m(_depth_buffer(client, view, projection, (pixels, pixels)), projection)
-    mask = depth < CAMERA_HEIGHT_M - _MASK_HEIGHT_M
-    return np.stack([depth, mask]).astype(np.float32)
+    fine = pixels * samples
+    projection = _orthographic(width_m / 2, fine)
+    depth = _distance_m(_depth_buffer(client, view, projection, (fine, fine)), projection)
+    rays = np.stack([depth, depth < CAMERA_HEIGHT_M - _MASK_HEIGHT_M])
+    blocks = rays.reshape(2, pixels, samples, pixels, samples)
+    return blocks.mean(axis=(2, 4)).astype(np.float32)
 
 
 def _kinect_points(

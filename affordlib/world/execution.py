@@ -6,6 +6,7 @@ Everything is planned before anything moves, so a way that is out of reach raise
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -37,18 +38,31 @@ RECORDED_SAMPLES = 26
 _UP = np.array([0.0, 0.0, 1.0, 0.0, 0.0])
 
 
-def execute(
-    world: Tabletop,
-    primitive: Primitive,
-    way: list[Stretch],
-    phase: np.ndarray,
-    action: np.ndarray,
-    seen: Percept,
-    approach: bool,
-) -> Interaction:
-    """Follow a way of stretches; phase (n,) and action (n, 5) are what shall be recorded."""
-    start = poses(np.array([world.object_state()]))[0]
-    offset = np.array([*seen.xy_m, world.config.tip_offset_m, 0.0, 0.0])
+@dataclass(frozen=True)
+class Motion:
+    """All joint waypoints of an action, found before anything moves.
+
+    over_start: (6,) above the start; down: (n, 6) from there to it; poses_W: (n, 5) of the tool at
+    the waypoints `paths` (n, 6), and gaps of the fingers (n,) there, of each stretch; retreat,
+    lift: (n, 6), the way out.
+    """
+
+    over_start: np.ndarray
+    down: np.ndarray
+    poses_W: list[np.ndarray]
+    paths: list[np.ndarray]
+    gaps: list[np.ndarray]
+    retreat: np.ndarray
+    lift: np.ndarray
+
+
+def plan_motion(
+    primitive: Primitive, way: list[Stretch], offset: np.ndarray, approach: bool
+) -> Motion:
+    """The arm's motion along a way, given relative to a place: offset (5,) of its poses.
+
+    Raises UnreachableError where any of it is out of reach.
+    """
     home, tool = np.array(robot.HOME), primitive.tool
     # A gripper is symmetric: of its two equal yaws, take the one that turns the wrist less.
     turns = (0.0, math.pi) if tool == "gripper" else (0.0,)
@@ -64,20 +78,46 @@ def execute(
         paths.append(robot.joint_path(one, near, tool))
         near = paths[-1][-1]
     retreat, lift = _way_out(primitive, way, stretch_W, paths, tool, approach)
+    down = over_start[None]
+    if approach:
+        down = line(stretch_W[0][0] + up, stretch_W[0][0], over_start, 1.0, tool)
+    return Motion(over_start, down, stretch_W, paths, gaps, retreat, lift)
+
+
+def place_offset(world: Tabletop, xy_m: tuple[float, float]) -> np.ndarray:
+    """What is added to the poses (5,) of an action that is placed at (x, y) [m]."""
+    return np.array([*xy_m, world.config.tip_offset_m, 0.0, 0.0])
+
+
+def execute(
+    world: Tabletop,
+    primitive: Primitive,
+    way: list[Stretch],
+    phase: np.ndarray,
+    action: np.ndarray,
+    seen: Percept,
+    approach: bool,
+) -> Interaction:
+    """Follow a way of stretches; phase (n,) and action (n, 5) are what shall be recorded."""
+    start = poses(np.array([world.object_state()]))[0]
+    offset = place_offset(world, seen.xy_m)
+    home, tool = np.array(robot.HOME), primitive.tool
+    motion = plan_motion(primitive, way, offset, approach)
+    gaps = motion.gaps
 
     closes = any(np.ptp(gap) > 0 for gap in gaps)
     drive = Drive(world, primitive.force_N, closes)
     if closes:
         mirror_fingers(world)
     if approach:
-        drive.along(joint_move(world.arm, over_start, 1.0), np.linspace(world.gap_m, gaps[0][0], 2))
-        down = line(stretch_W[0][0] + up, stretch_W[0][0], over_start, 1.0, tool)
-        drive.along(down, gaps[0][[0, 0]])
+        over = joint_move(world.arm, motion.over_start, 1.0)
+        drive.along(over, np.linspace(world.gap_m, gaps[0][0], 2))
+        drive.along(motion.down, gaps[0][[0, 0]])
     else:
-        put_arm(world, paths[0][0], gaps[0][0])
+        put_arm(world, motion.paths[0][0], gaps[0][0])
 
     floor = -math.inf
-    for stretch, one, path, gap in zip(way, stretch_W, paths, gaps, strict=True):
+    for stretch, one, path, gap in zip(way, motion.poses_W, motion.paths, gaps, strict=True):
         if one[:, 2].min() < floor:
             one = one.copy()
             one[:, 2] = np.maximum(one[:, 2], floor)
@@ -93,7 +133,7 @@ def execute(
         )
         if release[1] > release[0]:
             drive.along(np.repeat(world.arm[None], 13, axis=0), np.linspace(*release, 13))
-        drive.along(np.concatenate([retreat, lift[1:]]), release[[1, 1]])
+        drive.along(np.concatenate([motion.retreat, motion.lift[1:]]), release[[1, 1]])
         if approach:
             drive.along(joint_move(world.arm, home, 1.0), release[[1, 1]])
     drive.wait(SETTLE_STEPS)

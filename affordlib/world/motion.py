@@ -29,8 +29,8 @@ RECORD_EVERY = 3
 HOVER_HEIGHT_M = 0.16
 GUARD_FORCE_N = 30.0
 ARM_FORCES_N_M = (330.0, 330.0, 150.0, 54.0, 54.0, 54.0)
-_STEP_S = 1 / 240
-_WAYPOINT_S = STEPS_PER_WAYPOINT * _STEP_S
+STEP_S = 1 / 240
+_WAYPOINT_S = STEPS_PER_WAYPOINT * STEP_S
 _ARM_GAINS = [0.3] * 6
 _STILL_FINGERS, _MOVING_FINGERS = [0.3] * 2, [0.02] * 2
 """Light fingers pulled hard to a far target would leap where a contact is lost for a step."""
@@ -102,7 +102,7 @@ def stretches(primitive: Primitive, stop_phase: float, smooth: bool = True) -> l
             at_phase = np.interp(share, min_jerk(fine), fine)
         steps = None
         if not smooth and local < 1.0:
-            steps = RECORD_EVERY * round(local * leg.seconds / _STEP_S / RECORD_EVERY)
+            steps = RECORD_EVERY * round(local * leg.seconds / STEP_S / RECORD_EVERY)
         phase = begin + at_phase * (end - begin)
         way.append(Stretch(leg.at(share), phase, leg.guarded, steps))
     return way
@@ -197,7 +197,7 @@ class Drive:
         if np.ptp(joints, axis=0).any():
             targets[:, :6] = CubicSpline(np.arange(len(joints)), joints, bc_type="clamped")(grid)
         targets[:, 6:] = (np.interp(grid, np.arange(len(gaps_m)), gaps_m) / 2)[:, None]
-        velocities = (np.diff(targets, axis=0) / _STEP_S).tolist()
+        velocities = (np.diff(targets, axis=0) / STEP_S).tolist()
         # With the velocity fed forward, the target of the next step would put the arm ahead.
         commands = targets[:-1].tolist()
         n_steps = whole if n_steps is None else n_steps

@@ -28,6 +28,9 @@ BLADE_LENGTH_M = 0.05
 BLADE_THICKNESS_M = 0.002
 TOOL_OFFSETS_M = {"gripper": (0.0, TOOL_LENGTH_M), "screwdriver": (BLADE_LENGTH_M, SHAFT_LENGTH_M)}
 """How far the tool's point lies from the flange along the tool's x and z axes."""
+REACH_M = (0.17, 1.26)
+"""How near to its base and how far from it a hanging tool gets, up to hovering height; the wrist
+turns freely, so neither yaw nor azimuth matters."""
 ARM_JOINTS = tuple(range(6))
 HOME = (0.0, -1.9, 1.6, -1.27, -np.pi / 2, 0.0)
 """Joint angles [rad] of the arm parked above its base, out of the camera's view of the table."""

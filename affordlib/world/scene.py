@@ -14,7 +14,8 @@ import numpy as np
 import pybullet
 from scipy.spatial.transform import Rotation
 
-from affordlib.primitives import DURATION_S, PUSH_GAP_M, LeverUp, Primitive, Push, min_jerk
+from affordlib.perception import Percept, aim
+from affordlib.primitives import DURATION_S, PUSH_GAP_M, Grasp, LeverUp, Primitive, Push, min_jerk
 from affordlib.types import (
     LEVER_CROP_WIDTH_M,
     LEVER_IMAGE_PIXELS,
@@ -26,16 +27,17 @@ from affordlib.types import (
     check_within,
 )
 from affordlib.world import camera, motion, robot
-from affordlib.world.execution import execute, refused
+from affordlib.world.execution import execute, place_offset, plan_motion, refused
+from affordlib.world.interventions import Interventions
 from affordlib.world.objects import DENSITY_KG_M3, create_body, create_footprint
-from affordlib.world.perception import Percept, aim
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from affordlib.types import Step
     from affordlib.world.motion import Film
     from affordlib.world.objects import Thing
 
-STEP_S = 1 / 240
 N_SAMPLES = 301
 """Recorded samples over the phase: one every 3 simulation steps of a full primitive."""
 
@@ -76,7 +78,7 @@ class WorldConfig:
             raise ValueError(f"camera must be one of {CAMERAS}, got {self.camera!r}")
 
 
-class Tabletop:
+class Tabletop(Interventions):
     """A table, an arm and at most one object, in a PyBullet client of its own."""
 
     def __init__(self, config: WorldConfig | None = None) -> None:
@@ -118,7 +120,7 @@ class Tabletop:
         pybullet.resetSimulation(physicsClientId=client)
         pybullet.setGravity(0, 0, -9.81, physicsClientId=client)
         pybullet.setPhysicsEngineParameter(
-            fixedTimeStep=STEP_S,
+            fixedTimeStep=motion.STEP_S,
             numSolverIterations=50,
             restitutionVelocityThreshold=0.0,
             deterministicOverlappingPairs=1,
@@ -268,7 +270,9 @@ class Tabletop:
         """
         x, y, _ = self.object_pose()
         at = (x + xy_m[0], y + xy_m[1])
-        return camera.depth_crop(self.client, at, LEVER_IMAGE_PIXELS, LEVER_CROP_WIDTH_M, turn_rad)
+        return camera.depth_crop(
+            self.client, at, LEVER_IMAGE_PIXELS, LEVER_CROP_WIDTH_M, turn_rad, samples=1
+        )
 
     def picture(self, width: int = 320, height: int = 240) -> np.ndarray:
         """A colour picture (height, width, 3), uint8, of the robot at work, for people."""
@@ -313,6 +317,31 @@ class Tabletop:
         phase = np.linspace(0.0, 1.0, N_SAMPLES) * stop_phase
         way = motion.stretches(primitive, stop_phase, smooth)
         return execute(self, primitive, way, phase, primitive.path(phase), seen, approach)
+
+    def can_reach(
+        self, primitive: Primitive, stop_phase: float = 1.0, at_xy_m: Sequence[float] | None = None
+    ) -> bool:
+        """Whether the arm can carry out an action, with approach and way out; nothing moves.
+
+        at_xy_m: where the object is (default: where it is seen). The answer is that of the
+        kinematics by which `interact` plans.
+        """
+        check_within("stop_phase", stop_phase, 0.0, 1.0)
+        xy = self.perceive().xy_m if at_xy_m is None else at_xy_m
+        way = motion.stretches(primitive, stop_phase)
+        try:
+            plan_motion(primitive, way, place_offset(self, xy), approach=True)
+        except robot.UnreachableError:
+            return False
+        return True
+
+    def park(self) -> None:
+        """Open the fingers, which lets go what they hold, and take the arm home."""
+        wide = np.linspace(self.gap_m, max(self.gap_m, Grasp.opening_m), 13)
+        drive = motion.Drive(self, Grasp.force_N, closes=True)
+        drive.along(np.repeat(self.arm[None], 13, axis=0), wide)
+        drive.along(motion.joint_move(self.arm, np.array(robot.HOME), 1.0), wide[[-1, -1]])
+        self.settle()
 
     def attempt(self, primitive: Primitive, stop_phase: float = 1.0) -> Interaction:
         """As `interact`; where the arm cannot reach, an interaction in which nothing happened."""

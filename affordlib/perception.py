@@ -1,7 +1,8 @@
 """What the robot can tell about an object from its depth image alone.
 
-Images are (2, 48, 48): depth [m] from a plane 1 m above the table, and the mask of the object.
-Rows run along -y and columns along +x of the table, as a map is read.
+Images are (2, 48, 48): depth [m] from a plane 1 m above the table, and the mask of the object
+(at its rim the share of a pixel that it covers). Rows run along -y and columns along +x of the
+table, as a map is read.
 """
 
 from __future__ import annotations
@@ -31,12 +32,12 @@ class Percept:
 
 def heights_m(image: np.ndarray) -> np.ndarray:
     """Height [m] above the table, zero outside the mask; (48, 48)."""
-    return np.where(image[1] > 0, CAMERA_HEIGHT_M - image[0], 0.0)
+    return np.where(image[1] > 0.5, CAMERA_HEIGHT_M - image[0], 0.0)
 
 
 def object_height_m(image: np.ndarray) -> float:
     """Height of the object [m]: of all but the highest 2 % of its pixels."""
-    inside = heights_m(image)[image[1] > 0]
+    inside = heights_m(image)[image[1] > 0.5]
     return float(np.quantile(inside, 0.98)) if inside.size else 0.0
 
 
@@ -45,7 +46,7 @@ def _curvature(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     Of a paraboloid fitted to the heights away from the rim, which noise hardly moves.
     """
-    mask = image[1] > 0
+    mask = image[1] > 0.5
     for rim in (3, 2, 1):
         inside = ndimage.binary_erosion(mask, iterations=rim)
         if inside.sum() >= 20:
@@ -64,7 +65,7 @@ def _curvature(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def looks_rollable(image: np.ndarray) -> bool:
     """Whether the top is curved like that of something round which lies on the table."""
-    radius = min(object_height_m(image), CROP_WIDTH_M * math.sqrt((image[1] > 0).mean())) / 2
+    radius = min(object_height_m(image), CROP_WIDTH_M * math.sqrt((image[1] > 0.5).mean())) / 2
     return bool(-_curvature(image)[0][1] * radius > _ROUND)
 
 

@@ -1,0 +1,134 @@
+"""Our network with one thing left out at a time: what was it worth?"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from affordlib.interactions import (
+    Normaliser,
+    TrainingArrays,
+    open_interactions,
+    split_interactions,
+)
+from affordlib.interactions.batches import Batch, observe, sample_batch
+from affordlib.models.checkpoint import build
+from affordlib.models.film import FiLMNetwork
+from affordlib.models.make_checkpoints import SHIPPED
+from affordlib.models.training import final_errors_m, literal_draw, train
+
+
+def random_contexts(
+    arrays: TrainingArrays, rows: torch.Tensor, n_targets: int, obs_max: int, g: torch.Generator
+) -> Batch:
+    """As `sample_batch`, but no context is one that will be asked: all phases are random."""
+    batch = sample_batch(arrays, rows, n_targets, obs_max, g)
+    o, n = batch.observations, len(arrays.phase)
+    action_at, effect_at = (torch.randint(n, m.shape, generator=g) for m in (o.action_mask,) * 2)
+    seen = observe(
+        arrays.select(rows), action_at, o.action_mask, effect_at, o.effect_mask, o.weight
+    )
+    return replace(batch, observations=seen)
+
+
+def half_blend(arrays: TrainingArrays, rows: torch.Tensor, *sizes: Any) -> Batch:
+    """As `sample_batch`, but w₁ = ½ wherever both are observed."""
+    batch = sample_batch(arrays, rows, *sizes)
+    o = batch.observations
+    both = (o.weight > 0) & (o.weight < 1)
+    return replace(batch, observations=replace(o, weight=torch.where(both, 0.5, o.weight)))
+
+
+def actions_only(arrays: TrainingArrays, rows: torch.Tensor, *sizes: Any) -> Batch:
+    """As `sample_batch`, but only actions are observed: effects are never asked about actions."""
+    batch = sample_batch(arrays, rows, *sizes)
+    o = batch.observations
+    first = torch.arange(o.action_mask.shape[1]) == 0
+    seen = replace(
+        o,
+        action_mask=o.action_mask | ~o.action_mask.any(dim=1, keepdim=True) & first,
+        effect_mask=torch.zeros_like(o.effect_mask),
+        weight=torch.ones_like(o.weight),
+    )
+    return replace(batch, observations=seen)
+
+
+def one_at_a_time(
+    arrays: TrainingArrays, rows: torch.Tensor, n_targets: int, obs_max: int, g: torch.Generator
+) -> Batch:
+    """The paper's draw: one trajectory, one target."""
+    return literal_draw(arrays.select(rows[:1]), obs_max, g)
+
+
+def _plain_start(model: FiLMNetwork) -> None:
+    """PyTorch's default initialisation instead of He's."""
+    for module in model.image_encoder:
+        if isinstance(module, torch.nn.Linear):
+            module.reset_parameters()
+
+
+def _no_modulation(model: FiLMNetwork) -> None:
+    """Blocks that the image does not modulate; it still enters by the merge layer."""
+    for block in model.blocks:
+        for parameter in block.modulation.parameters():
+            torch.nn.init.zeros_(parameter)
+            parameter.requires_grad_(False)
+
+
+def _raw(normaliser: Normaliser) -> Normaliser:
+    """Metres and radians as they are, images too."""
+    return replace(
+        normaliser,
+        action_scale=(1.0,) * len(normaliser.action_scale),
+        effect_scale=(1.0,) * len(normaliser.effect_scale),
+        image_mean=(0.0, 0.0),
+        image_std=(1.0, 1.0),
+    )
+
+
+CHANGES: dict[str, dict[str, Any]] = {
+    "nothing": {},
+    "no image": {"image": False},
+    "metres, not standardised": {"scales": _raw},
+    "table frame": {"network": {"frame": "table"}},
+    "no turned and mirrored copies": {"training": {"augment": False}},
+    "no FiLM: image joined only": {"start": _no_modulation},
+    "PyTorch's initialisation": {"start": _plain_start},
+    "one trajectory, one target a step": {"draw": one_at_a_time},
+    "random contexts only": {"draw": random_contexts},
+    "w₁ = ½": {"draw": half_blend},
+    "actions only": {"draw": actions_only},
+}
+"""What is left out or changed, by name."""
+
+
+def ablated(change: str, steps: int, seed: int = 0) -> np.ndarray:
+    """Final errors (N,) [m] on `push_test` after a training on fold 0 of `push` with a change."""
+    how = {"image": True, "network": {}, "training": {}, "draw": sample_batch} | CHANGES[change]
+    shipped = SHIPPED["push_film"]
+    config = replace(shipped.training, steps=steps, seed=seed, **how["training"])
+    network = replace(shipped.network, **how["network"])
+    channels = network.action_channels, network.effect_channels
+    data, test_data = open_interactions("push"), open_interactions("push_test")
+    split = split_interactions(data.sizes["interaction"])
+    parts = (data, split.train), (data, split.validation), (test_data, None)
+    training, validation, test = (
+        TrainingArrays.from_dataset(d, rows, *channels) for d, rows in parts
+    )
+    normaliser = Normaliser.fit(training)
+    if not how["image"]:
+        blank = training.image.mean(dim=0, keepdim=True)
+        training, validation, test = (
+            replace(a, image=blank.expand(len(a), -1, -1, -1)) for a in (training, validation, test)
+        )
+        normaliser = replace(normaliser, mask_share=None)
+    scales: Callable[[Normaliser], Normaliser] = how.get("scales", lambda same: same)
+    torch.manual_seed(seed)
+    model = build(network, scales(normaliser))
+    how.get("start", lambda _: None)(model)
+    train(model, training, validation, config, progress=False, draw=how["draw"])
+    return final_errors_m(model, test).numpy()

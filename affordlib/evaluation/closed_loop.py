@@ -1,0 +1,384 @@
+"""Closing the loop, in figures: height, orientation, disturbances, reachability of random goals.
+
+    python -m affordlib.evaluation.closed_loop --tables height,orientation
+
+Trial i of a table is a function of the seed and i: object, start, goal and disturbances are drawn
+before anything plans, on objects that no model has seen. A trial's record is kept as soon as it is
+made, so a run that is killed goes on. Whether a goal is feasible is judged by the kinematic oracle
+(position) and by grasping in full (height), never by the planner under test.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import math
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from tqdm.auto import tqdm
+
+from affordlib.evaluation.effect_prediction import error_row
+from affordlib.evaluation.feasibility import half_width_m, is_feasible, on_the_rim
+from affordlib.paths import repo_root
+from affordlib.planning import Repertoire, draw_disturbances, pursue
+from affordlib.planning.disturbances import KINDS
+from affordlib.planning.repertoire import CHECKPOINTS
+from affordlib.primitives import Drag, Grasp, Push
+from affordlib.results import write_results, write_text_atomically
+from affordlib.types import TABLE_X_M, TABLE_Y_M, Goal
+from affordlib.world import Tabletop, family_named
+
+if TYPE_CHECKING:
+    from dask.distributed import Client
+
+    from affordlib.planning import Disturbance, Pursuit
+    from affordlib.world import Thing
+
+FORMAT = 1
+"""Counts the changes of code that change a trial's record."""
+
+N_TRIALS = {"height": 50, "orientation": 50, "disturbances": 200, "reachability": 1000}
+CLASSES = ("cuboid", "upright_cylinder", "lying_cylinder", "sphere")
+WITHIN_M, WITHIN_HEIGHT_M, WITHIN_TURN_RAD = 0.005, 0.005, math.radians(3)
+POSE_TOLERANCE_M = 0.004
+"""Of the position where an orientation or a height is asked as well: gripping shifts objects."""
+
+EDGE_M = 0.05
+PARTS = "data/results/parts/closed_loop"
+
+
+@dataclass(frozen=True)
+class Trial:
+    """An object at a place, turned by a yaw [rad], where it should go, and what will go wrong."""
+
+    thing: Thing
+    start_xy_m: tuple[float, float]
+    yaw_rad: float
+    goal: Goal
+    disturbances: tuple[Disturbance, ...] = ()
+
+
+def draw_trial(table: str, index: int, seed: int = 0) -> Trial:
+    """Trial number `index` of a table."""
+    if table not in N_TRIALS:
+        raise ValueError(f"table must be one of {sorted(N_TRIALS)}, got {table!r}")
+    key = (100 + list(N_TRIALS).index(table), index)
+    rng = np.random.default_rng(np.random.SeedSequence(2_000_003 + seed, spawn_key=key))
+    thing = family_named(CLASSES[index % len(CLASSES)]).sample(rng)
+    yaw = float(rng.uniform(-math.pi, math.pi))
+    if table == "reachability":
+        low, high = (np.array([TABLE_X_M[k], TABLE_Y_M[k]]) for k in (0, 1))
+        end = rng.uniform(low + EDGE_M, high - EDGE_M).tolist()
+        return Trial(thing, (0.0, 0.0), yaw, Goal(tuple(end)))
+    farthest = 0.25 if table == "disturbances" else 0.12
+    r, angle = math.sqrt(rng.uniform(0.02**2, farthest**2)), rng.uniform(-math.pi, math.pi)
+    xy = (r * math.cos(angle), r * math.sin(angle))
+    if table == "height":
+        return Trial(thing, (0.0, 0.0), yaw, Goal(xy, height_m=float(rng.uniform(0.02, 0.2))))
+    if table == "orientation":
+        turn = float(rng.uniform(-math.pi, math.pi))
+        return Trial(thing, (0.0, 0.0), yaw, Goal(xy, turn_rad=turn))
+    n_actions = max(1, math.ceil(r / 0.09))
+    kinds = [kind for kind in KINDS if kind != "topple" or not thing.rollable]
+    script = draw_disturbances(int(rng.integers(2**32)), 1, n_actions, kinds)
+    return Trial(thing, (0.0, 0.0), yaw, Goal(xy), script)
+
+
+def run_trial(table: str, index: int, world: Tabletop, repertoire: Repertoire, seed: int) -> dict:
+    """The record of a trial: what was asked, how it ended, whether it could be done."""
+    trial = draw_trial(table, index, seed)
+    record: dict[str, Any] = {"index": index, "object_class": trial.thing.family}
+    world.place(trial.thing, trial.start_xy_m, trial.yaw_rad)
+    exact = {} if table in ("disturbances", "reachability") else {"tolerance_m": POSE_TOLERANCE_M}
+    went = pursue(world, trial.goal, repertoire, disturbances=trial.disturbances, **exact)
+    record |= _told(went)
+    if table == "height":
+        record["feasible"] = _can_be_lifted(world, trial, went)
+    elif table == "orientation":
+        record["feasible"] = True
+    elif table == "disturbances":
+        record["feasible"] = _stays_feasible(world, trial, went)
+        record["kind"] = trial.disturbances[0].kind
+        record["in_action"] = trial.disturbances[0].at_s is not None
+        record["happened"] = len(went.happened)
+        world.place(trial.thing, trial.start_xy_m, trial.yaw_rad)
+        undisturbed = pursue(world, trial.goal, repertoire)
+        record["undisturbed"] = _told(undisturbed)
+    else:
+        asked = _how_moved(trial), half_width_m(trial.thing.footprint_m)
+        record["feasible"] = is_feasible(*asked, trial.start_xy_m, trial.goal.xy_m)
+        record["on_the_rim"] = on_the_rim(*asked, trial.start_xy_m, trial.goal.xy_m)
+        record["moved"] = bool(went.steps)
+    return record
+
+
+def _told(went: Pursuit) -> dict[str, Any]:
+    return {
+        "ending": went.ending,
+        "words": went.words,
+        "distance_m": went.distance_m,
+        "actions": len(went.steps),
+        "plans": len(went.plans),
+        "vetoes": went.vetoes,
+        "turn_error_rad": went.turn_error_rad,
+        "height_error_m": went.height_error_m,
+    }
+
+
+def _how_moved(trial: Trial) -> type[Push] | type[Drag]:
+    return Drag if trial.thing.rollable else Push
+
+
+def _can_be_lifted(world: Tabletop, trial: Trial, went: Pursuit) -> bool:
+    """Whether the object was lifted as high, or a whole grasp of it at the goal does so."""
+    if went.reached:
+        return True
+    world.place(trial.thing, went.goal.xy_m, went.end_pose[2])
+    seen = world.attempt(Grasp())
+    return bool(seen.effect[:, 2].max() >= trial.goal.height_m - WITHIN_HEIGHT_M)
+
+
+def _stays_feasible(world: Tabletop, trial: Trial, went: Pursuit) -> bool:
+    """Whether the kinematics allows a way from the start, and from wherever the object was seen."""
+    half = half_width_m(trial.thing.footprint_m)
+    if went.ending == "lost" and any(d.kind != "goal" for d in went.happened):
+        return False
+    start, goal = trial.start_xy_m, went.goal.xy_m
+    if not is_feasible(_how_moved(trial), half, start, trial.goal.xy_m):
+        return False
+    kind = Drag if world.object_rolls() else Push
+    return all(is_feasible(kind, half, xy, goal) for xy in went.seen_xy_m[-1:])
+
+
+# Tables
+
+
+def _share(chosen: Sequence[dict], good: Callable[[dict], bool]) -> float | None:
+    return 100 * float(np.mean([good(r) for r in chosen])) if chosen else None
+
+
+def _groups(records: Sequence[dict], *by: str) -> Iterator[tuple[dict[str, Any], list[dict]]]:
+    """All records, and those of each value of some columns."""
+    yield dict.fromkeys(by, "all"), list(records)
+    for name in by:
+        for value in dict.fromkeys(r[name] for r in records):
+            about = dict.fromkeys(by, "all") | {name: value}
+            yield about, [r for r in records if r[name] == value]
+
+
+def _endings(chosen: Sequence[dict]) -> dict[str, int]:
+    names = ("reached", "unreachable", "gave_up", "lost")
+    return {name: sum(r["ending"] == name for r in chosen) for name in names}
+
+
+def pose_rows(records: Sequence[dict], column: str, within: float, unit: str) -> list[dict]:
+    """Rows of `height` or `orientation`: how many feasible goals are hit, and how far off."""
+    rows = []
+    for about, chosen in _groups(records, "object_class"):
+        feasible = [r for r in chosen if r["feasible"]]
+        reached = [r for r in feasible if r["ending"] == "reached"]
+        if not reached:
+            continue
+        spread = error_row(np.array([abs(r[column]) for r in reached]))
+        rows.append(
+            {
+                **about,
+                "n": len(chosen),
+                "feasible": len(feasible),
+                **_endings(chosen),
+                "within_percent": _share(feasible, lambda r: abs(r[column]) <= within),
+                **{
+                    f"off_{unit}_{name}": spread[f"{name}_m"]
+                    for name in ("mean", "sem", "median", "p95")
+                },
+                "distance_m_mean": float(np.mean([r["distance_m"] for r in reached])),
+                "actions_mean": float(np.mean([r["actions"] for r in reached])),
+            }
+        )
+    return rows
+
+
+def disturbance_rows(records: Sequence[dict]) -> list[dict]:
+    """Rows of `disturbances`: endings, and the error with and without what went wrong, paired."""
+    rows = []
+    for about, chosen in _groups(records, "kind", "object_class"):
+        feasible = [r for r in chosen if r["feasible"]]
+        both = [r for r in feasible if r["ending"] == r["undisturbed"]["ending"] == "reached"]
+        if not both:
+            continue
+        with_, without = (
+            np.array([r["distance_m"] for r in rs])
+            for rs in (both, [r["undisturbed"] for r in both])
+        )
+        apart = with_ - without
+        rows.append(
+            {
+                **about,
+                "n": len(chosen),
+                "feasible": len(feasible),
+                **_endings(chosen),
+                "within_percent": _share(feasible, lambda r: r["distance_m"] <= WITHIN_M),
+                "disturbed_mean_m": float(with_.mean()),
+                "undisturbed_mean_m": float(without.mean()),
+                "apart_mean_m": float(apart.mean()),
+                "apart_sem_m": float(apart.std(ddof=1) / math.sqrt(len(apart)))
+                if len(apart) > 1
+                else 0.0,
+                "actions_mean": float(np.mean([r["actions"] for r in feasible])),
+                "undisturbed_actions_mean": float(
+                    np.mean([r["undisturbed"]["actions"] for r in feasible])
+                ),
+            }
+        )
+    return rows
+
+
+def judged_right(record: dict) -> bool:
+    """A plan that was carried out, or 'unreachable' where the oracle agrees."""
+    if record["feasible"]:
+        return record["ending"] == "reached"
+    return record["ending"] == "unreachable"
+
+
+def reachability_rows(records: Sequence[dict]) -> list[dict]:
+    """Rows of `reachability`: both rates, goals on the rim apart."""
+    rows = []
+    for where, of_where in (
+        ("all", records),
+        ("off the rim", [r for r in records if not r["on_the_rim"]]),
+        ("on the rim", [r for r in records if r["on_the_rim"]]),
+    ):
+        for about, chosen in _groups(of_where, "object_class"):
+            if not chosen or (where != "all" and about["object_class"] != "all"):
+                continue
+            yes = [r for r in chosen if r["feasible"]]
+            no = [r for r in chosen if not r["feasible"]]
+            rows.append(
+                {
+                    "goals": where,
+                    **about,
+                    "n": len(chosen),
+                    "feasible": len(yes),
+                    **_endings(chosen),
+                    "right_percent": _share(chosen, judged_right),
+                    "feasible_reached_percent": _share(yes, judged_right),
+                    "infeasible_refused_percent": _share(no, judged_right),
+                    "moved_for_nothing_percent": _share(no, lambda r: r["moved"]),
+                    "vetoes_mean": float(np.mean([r["vetoes"] for r in chosen])),
+                    "actions_mean": float(np.mean([r["actions"] for r in yes])) if yes else 0.0,
+                }
+            )
+    return rows
+
+
+ROWS: dict[str, Callable[[Sequence[dict]], list[dict]]] = {
+    "height": lambda records: pose_rows(records, "height_error_m", WITHIN_HEIGHT_M, "m"),
+    "orientation": lambda records: pose_rows(records, "turn_error_rad", WITHIN_TURN_RAD, "rad"),
+    "disturbances": disturbance_rows,
+    "reachability": reachability_rows,
+}
+
+
+# Running
+
+
+def settings_sha256(seed: int) -> str:
+    """Hash of what decides a record beside its index: the seed, the models, the code's format."""
+    told = hashlib.sha256(f"{FORMAT} {seed}".encode())
+    for name in CHECKPOINTS.values():
+        path = repo_root() / "data" / "checkpoints" / f"{name}.safetensors"
+        told.update(path.read_bytes())
+    return told.hexdigest()
+
+
+def read_records(path: Path, sha256: str) -> dict[int, dict]:
+    """Records of a part by index; none where there are none of these settings."""
+    if not path.is_file():
+        return {}
+    head, *lines = path.read_text().splitlines()
+    if json.loads(head) != {"settings_sha256": sha256}:
+        return {}
+    return {r["index"]: r for r in map(json.loads, lines)}
+
+
+def _part(table: str, seed: int) -> Path:
+    return repo_root() / PARTS / f"{table}_{seed}.jsonl"
+
+
+def _write_records(path: Path, sha256: str, records: dict[int, dict]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lines = [json.dumps(records[k], allow_nan=False) for k in sorted(records)]
+    write_text_atomically(path, "\n".join([json.dumps({"settings_sha256": sha256}), *lines, ""]))
+
+
+_here: dict[str, Any] = {}
+
+
+def _records_of(table: str, indices: Sequence[int], seed: int) -> list[dict]:
+    """Some trials in one process, which keeps its world and its models."""
+    if not _here:
+        _here.update(world=Tabletop(), repertoire=Repertoire.load())
+    return [run_trial(table, i, _here["world"], _here["repertoire"], seed) for i in indices]
+
+
+def run_table(
+    table: str, n: int, seed: int = 0, client: Client | None = None, progress: bool = True
+) -> list[dict]:
+    """The records of a table's first n trials, those that are there not made again.
+
+    client: a Dask client that shares the folder; None means this process.
+    """
+    path, sha256 = _part(table, seed), settings_sha256(seed)
+    records = read_records(path, sha256)
+    missing = [i for i in range(n) if i not in records]
+    batches = [missing[k : k + 5] for k in range(0, len(missing), 5)]
+    if client is None:
+        done = (_records_of(table, batch, seed) for batch in batches)
+    else:
+        from dask.distributed import as_completed
+
+        futures = [client.submit(_records_of, table, b, seed, pure=False) for b in batches]
+        done = (future.result() for future in as_completed(futures))
+    for some in tqdm(done, desc=table, total=len(batches), disable=not progress):
+        records |= {r["index"]: r for r in some}
+        _write_records(path, sha256, records)
+    return [records[i] for i in range(n)]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the trials of the closed loop that are missing, and write the tables."""
+    parser = argparse.ArgumentParser(
+        prog="python -m affordlib.evaluation.closed_loop", description=main.__doc__
+    )
+    parser.add_argument("--tables", default=",".join(N_TRIALS), help="names, with commas")
+    parser.add_argument("--n", type=int, help="trials of each table (default: all)")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", default="data/results")
+    parser.add_argument("--scheduler", help="address of a Dask scheduler that shares the folder")
+    options = parser.parse_args(argv)
+    client = None
+    if options.scheduler:
+        from dask.distributed import Client
+
+        client = Client(options.scheduler)
+    for table in options.tables.split(","):
+        n = min(options.n or N_TRIALS[table], N_TRIALS[table])
+        run_table(table, n, options.seed, client)
+    # Also those of earlier runs.
+    tables = {}
+    for table, rows in ROWS.items():
+        if records := read_records(_part(table, options.seed), settings_sha256(options.seed)):
+            tables[table] = rows([records[i] for i in sorted(records)])
+    path = write_results(options.out, "closed_loop", {"seed": options.seed}, tables)
+    print(f"{path.name} written")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

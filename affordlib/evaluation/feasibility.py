@@ -1,0 +1,117 @@
+"""The kinematic oracle: can the arm bring an object from one place to another at all?
+
+It knows the arm's kinematics and the object, and asks no model and no planner. An action is
+possible if the tool gets to all of it; a place can be reached if a chain of possible actions leads
+there. Turning the wrist costs nothing, so all that counts is how far the tool is from the base.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from affordlib.planning.routes import RouteMap, find_route
+from affordlib.primitives import HOVER_M, TIP_HEIGHT_M, Drag, Push
+from affordlib.world import UnreachableError, robot
+from affordlib.world.execution import RETREAT_M
+from affordlib.world.motion import HOVER_HEIGHT_M
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+BAND_M = 0.01
+"""How near to the rim of what can be reached a goal is not judged, but reported apart."""
+
+
+@lru_cache
+def tool_reach_m(height_m: float) -> tuple[float, float]:
+    """How near to the base and how far from it the hanging tool gets at a height."""
+
+    def there(radius: float) -> bool:
+        at = np.array([robot.BASE_X_M + radius, 0.0, height_m])
+        try:
+            robot.inverse_kinematics(at, 0.0, np.array(robot.HOME))
+        except UnreachableError:
+            return False
+        return True
+
+    def rim(inside: float, outside: float) -> float:
+        while abs(outside - inside) > 1e-6:
+            middle = (inside + outside) / 2
+            inside, outside = (middle, outside) if there(middle) else (inside, middle)
+        return inside
+
+    return rim(0.6, 0.0), rim(0.6, 2.0)
+
+
+def possible(
+    kind: type[Push] | type[Drag], half_m: float, slack_m: float = 0.0
+) -> Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
+    """Which actions the arm can do, of positions (n, 2), directions (n,) and lengths (n,) [m].
+
+    half_m: of the object, behind whose centre the fingers of a push stop; slack_m: by how much
+    the arm is taken to reach farther than it does.
+    """
+    low, up = tool_reach_m(TIP_HEIGHT_M), tool_reach_m(HOVER_HEIGHT_M + TIP_HEIGHT_M)
+    caging = tool_reach_m(HOVER_M)
+
+    def judge(xy_m: np.ndarray, direction_rad: np.ndarray, length_m: np.ndarray) -> np.ndarray:
+        ahead = np.column_stack([np.cos(direction_rad), np.sin(direction_rad)])
+
+        def within(along_m: np.ndarray | float, reach: tuple[float, float]) -> np.ndarray:
+            at = xy_m + np.broadcast_to(along_m, len(xy_m))[:, None] * ahead
+            radius = np.hypot(at[:, 0] - robot.BASE_X_M, at[:, 1])
+            return (reach[0] - slack_m <= radius) & (radius <= reach[1] + slack_m)
+
+        if kind is Drag:
+            return within(0.0, caging) & within(length_m, caging)
+        end = length_m - half_m
+        ok = within(-Push(0.0).radius, up) & within(end, low) & within(end - RETREAT_M, up)
+        # On its way it may come too near to the base.
+        for share in (0.25, 0.5, 0.75):
+            ok &= within(-Push(0.0).radius * (1 - share) + share * end, low)
+        return ok
+
+    return judge
+
+
+@lru_cache(maxsize=64)
+def _routes(kind: type[Push] | type[Drag], half_mm: int, slack_m: float) -> RouteMap:
+    half = half_mm / 1000
+    reach = Drag(0.0).length if kind is Drag else Push(0.0).length + half
+    return RouteMap.of(reach, possible(kind, half, slack_m))
+
+
+def is_feasible(
+    kind: type[Push] | type[Drag],
+    half_m: float,
+    start_xy_m: Sequence[float],
+    goal_xy_m: Sequence[float],
+    slack_m: float = 0.0,
+) -> bool:
+    """Whether a chain of pushes or drags, all within the arm's reach, leads to the goal."""
+    half_mm = 5 * round(200 * half_m)
+    routes = _routes(kind, half_mm, slack_m)
+    judge = possible(kind, half_mm / 1000, slack_m)
+    return find_route(routes, start_xy_m, goal_xy_m, judge) is not None
+
+
+def on_the_rim(
+    kind: type[Push] | type[Drag],
+    half_m: float,
+    start_xy_m: Sequence[float],
+    goal_xy_m: Sequence[float],
+) -> bool:
+    """Whether a centimetre of reach more or less would change the answer."""
+    answers = [is_feasible(kind, half_m, start_xy_m, goal_xy_m, s) for s in (-BAND_M, BAND_M)]
+    return answers[0] != answers[1]
+
+
+def half_width_m(footprint_m: np.ndarray) -> float:
+    """Half the mean width of an outline (n, 2)."""
+    x, y = footprint_m.T
+    area = 0.5 * abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1)))
+    return math.sqrt(area / math.pi)

@@ -1,0 +1,168 @@
+"""Where objects shall be brought: goals drawn by seed, before anything plans (Table 3).
+
+Objects are ones that no model has seen; goals are more than 2 cm from the start and off the 10°
+grid of A*. Two families: *constructed* goals are where executed full or partial actions really
+ended, so they can be reached; *uniform* ones are drawn evenly over the area in reach.
+
+The goals of the tables are frozen in `data/goals/planning.json`; made once, by
+
+    python -m affordlib.evaluation.goals
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from affordlib.paths import repo_root
+from affordlib.planning import MODES
+from affordlib.primitives import Drag, Push
+from affordlib.results import write_text_atomically
+from affordlib.types import Goal
+from affordlib.world import Tabletop, Thing, family_named
+
+FROZEN = "data/goals/planning.json"
+FAMILIES = ("constructed", "uniform")
+N_GOALS = {"single_full": 50, "single_partial": 100, "multi_partial": 80}
+"""As in Table 3 of the paper."""
+
+MIN_DISTANCE_M = 0.02
+EARLIEST_STOP = 0.55
+"""Before this phase hardly any action has moved its object."""
+
+STANDING = ("cuboid", "upright_cylinder")
+ROLLABLE = ("lying_cylinder", "sphere")
+REACH_M = {Push: 0.07, Drag: 0.05}
+"""How far one full action takes an object, at least."""
+
+
+@dataclass(frozen=True)
+class PlanningTask:
+    """An object at the table's centre, turned by a yaw [rad], and where it should go."""
+
+    thing: Thing
+    yaw_rad: float
+    goal: Goal
+    mode: str
+    goals: str
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values, from which `from_json` makes the same task."""
+        return {
+            "object_class": self.thing.family,
+            "size_m": list(astuple(self.thing)),
+            "yaw_rad": self.yaw_rad,
+            "goal_xy_m": list(self.goal.xy_m),
+            "mode": self.mode,
+            "goals": self.goals,
+        }
+
+    @classmethod
+    def from_json(cls, plain: dict[str, Any]) -> PlanningTask:
+        """The task that `to_json` wrote."""
+        thing = family_named(plain["object_class"])(*plain["size_m"])
+        goal = Goal(tuple(plain["goal_xy_m"]))
+        return cls(thing, plain["yaw_rad"], goal, plain["mode"], plain["goals"])
+
+
+def _objects(mode: str, goals: str, seed: int, index: int, classes: Sequence[str]) -> tuple:
+    if mode not in MODES:
+        raise ValueError(f"mode {mode!r} is unknown; choose one of {sorted(MODES)}")
+    key = (list(MODES).index(mode), FAMILIES.index(goals), index)
+    rng = np.random.default_rng(np.random.SeedSequence(2_000_003 + seed, spawn_key=key))
+    thing = family_named(classes[index % len(classes)]).sample(rng)
+    return thing, float(rng.uniform(-math.pi, math.pi)), rng
+
+
+def _off_grid(rng: np.random.Generator, around: float, spread: float) -> float:
+    """An angle within `spread` of `around`, at least 1° off the 10° grid."""
+    while True:
+        angle = around + rng.uniform(-spread, spread)
+        off = math.degrees(angle) % 10
+        if 1 <= off <= 9:
+            return angle
+
+
+def constructed_tasks(
+    world: Tabletop, mode: str, n: int, seed: int = 0, classes: Sequence[str] = STANDING
+) -> list[PlanningTask]:
+    """Tasks whose goal is where random actions of the mode's kind really took the object."""
+    tasks = []
+    for index in range(n):
+        thing, yaw, rng = _objects(mode, "constructed", seed, index, classes)
+        kind = Drag if thing.rollable else Push
+        while True:
+            direction = rng.uniform(-math.pi, math.pi)
+            world.place(thing, (0.0, 0.0), yaw)
+            believed = True
+            for _ in range(rng.integers(2, MODES[mode].max_steps + 1) if mode[0] == "m" else 1):
+                stop = rng.uniform(EARLIEST_STOP, 1.0) if MODES[mode].partial else 1.0
+                action = kind.towards(_off_grid(rng, direction, math.pi / 4))
+                seen = world.interact(action, stop, approach=True)
+                believed &= not seen.faults and not seen.fell
+            x, y, _ = world.object_pose()
+            if math.hypot(x, y) > MIN_DISTANCE_M and believed:
+                break
+        tasks.append(PlanningTask(thing, yaw, Goal((x, y)), mode, "constructed"))
+    return tasks
+
+
+def uniform_tasks(
+    mode: str, n: int, seed: int = 0, classes: Sequence[str] = STANDING
+) -> list[PlanningTask]:
+    """Tasks whose goal is drawn evenly from the ring between 2 cm and the mode's reach."""
+    tasks = []
+    for index in range(n):
+        thing, yaw, rng = _objects(mode, "uniform", seed, index, classes)
+        reach = MODES[mode].max_steps * REACH_M[Drag if thing.rollable else Push]
+        r = math.sqrt(rng.uniform(MIN_DISTANCE_M**2, reach**2))
+        angle = _off_grid(rng, 0.0, math.pi)
+        goal = Goal((r * math.cos(angle), r * math.sin(angle)))
+        tasks.append(PlanningTask(thing, yaw, goal, mode, "uniform"))
+    return tasks
+
+
+def frozen_tasks(path: str | Path = FROZEN) -> list[PlanningTask]:
+    """The tasks of the tables; a relative path starts at the repository."""
+    path = repo_root() / path
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"path: there are no goals at {path}; run python -m affordlib.evaluation.goals"
+        )
+    return [PlanningTask.from_json(plain) for plain in json.loads(path.read_text())["tasks"]]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Draw the goals of Table 3 and freeze them in a file, which is never written over."""
+    parser = argparse.ArgumentParser(
+        prog="python -m affordlib.evaluation.goals", description=main.__doc__
+    )
+    parser.add_argument("--to", default=FROZEN)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args(argv)
+    path = repo_root() / options.to
+    if path.exists():
+        print(f"--to: {path} is there already; goals are frozen before measuring", file=sys.stderr)
+        return 1
+    tasks, classes = [], STANDING + ROLLABLE
+    with Tabletop() as world:
+        for mode, n in N_GOALS.items():
+            tasks += constructed_tasks(world, mode, n, options.seed, classes)
+            tasks += uniform_tasks(mode, n, options.seed, classes)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rows = ",\n".join(json.dumps(task.to_json()) for task in tasks)
+    write_text_atomically(path, f'{{"seed": {options.seed}, "tasks": [\n{rows}\n]}}\n')
+    print(f"{len(tasks)} goals frozen in {path}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

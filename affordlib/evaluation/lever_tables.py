@@ -1,0 +1,204 @@
+"""`data/results/lever_up.json` from the parts that `lever_up.py` wrote (Table 1 of the paper).
+
+    python -m affordlib.evaluation.lever_tables
+
+An object's errors are meaned over its windows; means, standard errors and intervals are over
+objects. A part whose hash is not its unit's is refused.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from collections.abc import Iterable, Sequence
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from affordlib.evaluation.lever_up import BASELINES, MODELS, NAME, PARTS, LeverUnit, hashes
+from affordlib.evaluation.parts import checked_part
+from affordlib.interactions.lever import POSE_CHANNELS
+from affordlib.models.lever import PROTOCOLS
+from affordlib.paths import resolve_out_dir
+from affordlib.results import write_results
+
+OURS, RIVAL = "anchored", "lstm_tuned"
+RESTS_M = 0.005
+"""A window in which the object moves by less, from the last observed step to the last foreseen."""
+
+
+def read_parts(folder: str | Path = PARTS) -> list[tuple[LeverUnit, dict[str, Any]]]:
+    """All parts with their units, in the order of models and folds; stale ones raise."""
+    folder = resolve_out_dir(folder)
+    units = [LeverUnit(**json.loads(path.read_text())["unit"]) for path in folder.glob("*.json")]
+    units.sort(key=lambda u: (MODELS.index(u.model), u.trained_for, u.no_edges or 0, u.fold))
+    return [(unit, checked_part(unit, folder, hashes(unit))) for unit in units]
+
+
+Group = list[tuple[LeverUnit, dict[str, Any]]]
+
+
+def _groups(parts: Group, no_edges: bool = False) -> Iterable[tuple[dict[str, Any], str, Group]]:
+    """The parts of a model and protocol, and the columns that say which they are."""
+    for protocol, model in product(PROTOCOLS, MODELS):
+        group = [
+            (unit, part)
+            for unit, part in parts
+            if unit.model == model
+            and protocol in unit.protocols
+            and (unit.no_edges is not None) == no_edges
+        ]
+        if group:
+            epochs = [u.epochs for u, _ in group if u.epochs]
+            about = {"model": model, "protocol": protocol}
+            about["folds"] = len({unit.fold for unit, _ in group})
+            yield about | {"epochs": min(epochs) if epochs else None}, protocol, group
+
+
+def _pooled(group: Group, protocol: str) -> np.ndarray:
+    """Errors (N, W, T) [cm] of all folds together."""
+    return np.concatenate([part["tests"][protocol]["error_cm"] for _, part in group])
+
+
+def _told(errors_cm: np.ndarray) -> dict[str, float]:
+    """Mean, standard error, median, 95th percentile of errors (N,) [cm], one an object."""
+    sem = errors_cm.std(ddof=1) / math.sqrt(len(errors_cm)) if len(errors_cm) > 1 else 0.0
+    return {
+        "n": len(errors_cm),
+        "mean_cm": float(errors_cm.mean()),
+        "sem_cm": float(sem),
+        "median_cm": float(np.median(errors_cm)),
+        "p95_cm": float(np.quantile(errors_cm, 0.95)),
+    }
+
+
+def error_rows(parts: Group, no_edges: bool = False) -> list[dict[str, Any]]:
+    """Table 1: an object's errors are meaned over its windows."""
+    rows = []
+    for about, protocol, group in _groups(parts, no_edges):
+        if no_edges:
+            about = about | {"edges": ", ".join(str(u.no_edges) for u, _ in group)}
+        errors = _pooled(group, protocol).mean(axis=1)
+        rows += [about | {"steps": k + 1} | _told(errors[:, k]) for k in range(errors.shape[1])]
+    return rows
+
+
+def motion_rows(parts: Group) -> list[dict[str, Any]]:
+    """Windows in which the object moves on and those in which it rests, apart."""
+    rows = []
+    for about, protocol, group in _groups(parts):
+        if protocol != "window":
+            continue
+        errors = _pooled(group, protocol)
+        moves = np.concatenate([part["window_moves_cm"] for _, part in group])
+        for kind, which in (("moving", moves >= 100 * RESTS_M), ("resting", moves < 100 * RESTS_M)):
+            chosen = errors[which]
+            for k in range(chosen.shape[1] if len(chosen) else 0):
+                told = {"n_windows": len(chosen), "mean_cm": float(chosen[:, k].mean())}
+                rows.append(about | {"windows": kind, "steps": k + 1} | told)
+    return rows
+
+
+def paired_rows(parts: Group, draws: int = 2000) -> list[dict[str, Any]]:
+    """Ours minus the well-tuned LSTM, object by object, with bootstrapped 95 % intervals."""
+    rng, rows = np.random.default_rng(0), []
+    for protocol in PROTOCOLS:
+        found = {
+            model: {
+                (unit.fold, number): np.mean(error, axis=0)
+                for unit, part in parts
+                if unit.model == model and protocol in unit.protocols and unit.no_edges is None
+                for number, error in zip(
+                    part["interaction"], part["tests"][protocol]["error_cm"], strict=True
+                )
+            }
+            for model in (OURS, RIVAL)
+        }
+        both = sorted(found[OURS].keys() & found[RIVAL].keys())
+        if not both:
+            continue
+        gap = np.array([found[OURS][key] - found[RIVAL][key] for key in both])
+        means = gap[rng.integers(0, len(gap), (draws, len(gap)))].mean(axis=1)
+        low, high = np.quantile(means, [0.025, 0.975], axis=0)
+        every = 1 if protocol == "window" else 5
+        for k in range(every - 1, gap.shape[1], every):
+            row = {"protocol": protocol, "steps": k + 1, "n": len(gap)}
+            row |= {"difference_cm": float(gap[:, k].mean()), "low_cm": float(low[k])}
+            row |= {
+                "high_cm": float(high[k]),
+                "ours_better_percent": float(100 * (gap[:, k] < 0).mean()),
+            }
+            rows.append(row)
+    return rows
+
+
+def coverage_rows(parts: Group) -> list[dict[str, Any]]:
+    """How often the truth lies in the central 50 and 90 % intervals, by channel."""
+    rows = []
+    for about, protocol, group in _groups(parts):
+        told = [part["tests"][protocol]["coverage"] for _, part in group]
+        if about["model"] == "lstm_published" or None in told:
+            continue
+        for channel in POSE_CHANNELS:
+            half, most = np.mean([t[channel] for t in told], axis=0)
+            row = {"channel": channel, "coverage_50": float(half), "coverage_90": float(most)}
+            rows.append(about | row)
+    return rows
+
+
+def step_rows(parts: Group) -> list[dict[str, Any]]:
+    """How far the object moves in each step of 150 ms."""
+    group = [(u, p) for u, p in parts if u.model == BASELINES[0] and u.no_edges is None]
+    moves = np.concatenate([part["step_moves_cm"] for _, part in group])
+    return [
+        {"step": k + 1, "mean_cm": float(move.mean()), "p95_cm": float(np.quantile(move, 0.95))}
+        for k, move in enumerate(moves.T)
+    ]
+
+
+def assemble(folder: str | Path = PARTS, out_dir: str | Path = "data/results") -> Path:
+    """Write `lever_up.json` from all parts of a folder; returns its path."""
+    parts = read_parts(folder)
+    if not any(unit.model == BASELINES[0] for unit, _ in parts):
+        raise FileNotFoundError(f"folder: no part of the baselines in {folder}; run them first")
+    tables = {
+        "lever_up": error_rows(parts),
+        "motion": motion_rows(parts),
+        "unseen_edges": error_rows(parts, no_edges=True),
+        "paired": paired_rows(parts),
+        "coverage": coverage_rows(parts),
+        "steps": step_rows(parts),
+        "training": [
+            {
+                "model": u.model,
+                "trained_for": u.trained_for,
+                "fold": u.fold,
+                "edges_left_out": u.no_edges,
+            }
+            | {k: part["training"].get(k) for k in ("steps", "epochs", "seconds", "checkpoint")}
+            for u, part in parts
+            if "training" in part
+        ],
+    }
+    parameters = {"units": len(parts), "step_ms": 150, "data_sha256": parts[0][1]["data_sha256"]}
+    return write_results(out_dir, NAME, parameters, tables)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Make the tables of lever-ups from the parts that units wrote."""
+    parser = argparse.ArgumentParser(
+        prog="python -m affordlib.evaluation.lever_tables", description=main.__doc__
+    )
+    parser.add_argument("--parts", default=PARTS)
+    parser.add_argument("--out", default="data/results")
+    options = parser.parse_args(argv)
+    print(assemble(options.parts, options.out))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,70 @@
+"""The simulator itself as the model: what a planner could do if it foresaw everything."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from affordlib.planning.effect_map import EffectMap, map_effects
+from affordlib.types import Observations, Prediction
+
+if TYPE_CHECKING:
+    from affordlib.primitives import Drag, Push
+    from affordlib.world import Tabletop, Thing
+
+_STD_M = 1e-5
+
+
+@dataclass
+class SimulatorModel:
+    """An `EffectModel` that carries the action out in a world of its own.
+
+    It knows the object, its pose and the physics; a model only sees an image.
+    """
+
+    world: Tabletop
+    thing: Thing
+    yaw_rad: float
+    kind: type[Push] | type[Drag]
+
+    action_channels = ("x", "y")
+    effect_channels = ("x", "y", "yaw")
+
+    def encode(self, image: torch.Tensor) -> torch.Tensor:
+        """Nothing is read from the image."""
+        return torch.zeros(len(image), 1)
+
+    def predict(
+        self, features: torch.Tensor, observations: Observations, t_target: torch.Tensor
+    ) -> Prediction:
+        """As of any model; the action must be observed at t = 0 and t = 1."""
+        travel = observations.action[:, -1] - observations.action[:, 0]
+        effects = []
+        for (x, y), t in zip(travel.tolist(), t_target.numpy(), strict=True):
+            self.world.place(self.thing, (0.0, 0.0), self.yaw_rad)
+            action = self.kind.towards(math.atan2(y, x))
+            if len(t) == 1:
+                # A part of an action is re-timed to its own stop: it is carried out as such.
+                effects.append(
+                    self.world.interact(action, float(t[0])).rest_effect[None, [0, 1, 3]]
+                )
+                continue
+            seen = self.world.interact(action)
+            columns = [np.interp(t, seen.phase, seen.effect[:, c]) for c in (0, 1, 3)]
+            effects.append(np.column_stack(columns))
+        mean = torch.from_numpy(np.stack(effects)).float()
+        action = observations.action[:, -1:].expand(-1, mean.shape[1], -1)
+        std = torch.full_like(mean, _STD_M)
+        return Prediction(action, torch.full_like(action, _STD_M), mean, std)
+
+
+def oracle_effects(
+    imagined: Tabletop, world: Tabletop, image: np.ndarray, kind: type[Push] | type[Drag]
+) -> EffectMap:
+    """The effect map of the object that stands in a world, from actions in an imagined one."""
+    model = SimulatorModel(imagined, world.thing, world.object_pose()[2], kind)
+    return map_effects(model, image, kind)

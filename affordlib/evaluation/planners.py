@@ -1,0 +1,184 @@
+"""The planners of Table 3, by name: which planner, on which models, how often it may correct."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
+from typing import TYPE_CHECKING, Any
+
+from affordlib.evaluation.goals import FAMILIES, ROLLABLE, STANDING
+from affordlib.evaluation.oracle import oracle_effects
+from affordlib.models.checkpoint import load_checkpoint
+from affordlib.paths import repo_root
+from affordlib.planning import Repertoire, plan_astar, plan_continuous, plan_gradient
+from affordlib.planning.modes import PlanMode, mode_named
+from affordlib.primitives import Drag, Push
+from affordlib.world import Tabletop
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from affordlib.types import Goal, Plan
+
+FORMAT = 2
+"""Counts the changes of planners that change their numbers."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A planner and its settings.
+
+    push, drag: names of checkpoints; None where it has none for such objects. samples: stop phases
+    of A*, or phases at which the gradient planner queries. full_only: no partial actions. goals:
+    the families of goals that it is asked for.
+    """
+
+    planner: Callable[..., Plan]
+    name: str
+    model: str
+    push: str | None
+    drag: str | None = None
+    samples: int | None = None
+    corrections: int = 0
+    full_only: bool = False
+    goals: tuple[str, ...] = FAMILIES
+    settings: tuple[tuple[str, Any], ...] = ()
+
+    @property
+    def sees_world(self) -> bool:
+        """Whether it plans with the simulator itself."""
+        return self.model == "simulator"
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """The families of objects that it can be asked about."""
+        every = self.sees_world or (self.push and self.drag)
+        return STANDING + ROLLABLE if every else STANDING
+
+    def columns(self) -> dict[str, Any]:
+        """What a row of the table says of it."""
+        return {
+            "planner": self.name,
+            "model": self.model,
+            "world": "clean",
+            "samples": self.samples,
+            "closed_loop": self.corrections > 0,
+        }
+
+    def about(self) -> dict[str, Any]:
+        """All that decides its numbers, checkpoints by their hashes."""
+        files = {name: _sha256(name) for name in (self.push, self.drag) if name}
+        settings = {k: list(v) if isinstance(v, tuple) else v for k, v in self.settings}
+        more = {"corrections": self.corrections, "full_only": self.full_only}
+        more |= {"settings": settings, "checkpoints": files, "format": FORMAT}
+        return self.columns() | more
+
+    def make(self) -> Callable[..., Plan]:
+        """The planner as (image, start_xy_m, goal, mode) → Plan.
+
+        One that plans with the simulator takes the world before all others.
+        """
+        if self.sees_world:
+            return partial(_plan_with_simulator, self, Tabletop())
+        names = {"push": self.push, "drag": self.drag}
+        models = {kind: load_checkpoint(name)[0] for kind, name in names.items() if name}
+        return partial(_plan_with_models, self, Repertoire(models))
+
+    def mode(self, name: str | PlanMode) -> PlanMode:
+        """The mode, without partial actions if it has none."""
+        mode = mode_named(name)
+        return PlanMode(mode.max_steps, partial=False) if self.full_only else mode
+
+
+@lru_cache
+def _sha256(checkpoint: str) -> str:
+    path = repo_root() / "data" / "checkpoints" / f"{checkpoint}.safetensors"
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+
+
+def _plan_with_models(
+    variant: Variant,
+    repertoire: Repertoire,
+    image: np.ndarray,
+    start_xy_m: tuple[float, float],
+    goal: Goal,
+    mode: str | PlanMode,
+) -> Plan:
+    settings = dict(variant.settings)
+    goal = replace(goal, tolerance_m=settings.pop("tolerance_m", goal.tolerance_m))
+    kind = Push
+    if variant.drag:
+        kind = repertoire.kind_for(image)
+        settings["kind"] = kind
+    model = repertoire.model(kind)
+    return variant.planner(model, image, start_xy_m, goal, variant.mode(mode), **settings)
+
+
+def _plan_with_simulator(
+    variant: Variant,
+    imagined: Tabletop,
+    world: Tabletop,
+    image: np.ndarray,
+    start_xy_m: tuple[float, float],
+    goal: Goal,
+    mode: str | PlanMode,
+) -> Plan:
+    kind = Drag if world.object_rolls() else Push
+    effects = oracle_effects(imagined, world, image, kind)
+    return variant.planner(
+        effects.model, image, start_xy_m, goal, variant.mode(mode), kind=kind, effects=effects
+    )
+
+
+_FILM = {"model": "film_5000", "push": "push_film_x10", "drag": "drag_film"}
+_PAPER = {"model": "paper", "push": "push_cnp"}
+_FINE = (
+    ("n_directions", 72),
+    ("stop_phases", tuple(round(0.5 + 0.05 * k, 2) for k in range(1, 11))),
+    ("tolerance_m", 0.005),
+)
+_RING = (("starts", 4), ("direction_only", True))
+
+
+def _continuous(**columns: Any) -> Variant:
+    return Variant(plan_continuous, **{"name": "continuous"} | columns)
+
+
+def _astar(**columns: Any) -> Variant:
+    return Variant(plan_astar, **{"name": "astar", "samples": 5} | columns)
+
+
+def _gradient(
+    samples: int, name: str = "gradient", settings: tuple = (), **columns: Any
+) -> Variant:
+    settings = (("samples", samples), *settings)
+    return Variant(plan_gradient, name, **_PAPER, samples=samples, settings=settings, **columns)
+
+
+_CONSTRUCTED = {"goals": ("constructed",)}
+VARIANTS: dict[str, Variant] = {
+    "continuous": _continuous(**_FILM),
+    "continuous_corrected": _continuous(**_FILM, corrections=2),
+    "astar": _astar(**_FILM),
+    "astar_fine": _astar(**_FILM | {"name": "astar_fine", "samples": 10}, settings=_FINE),
+    "astar_corrected": _astar(**_FILM, corrections=2),
+    "astar_paper": _astar(**_PAPER),
+    "gradient_25": _gradient(25, **_CONSTRUCTED),
+    "gradient_100": _gradient(100),
+    "gradient_300": _gradient(300, **_CONSTRUCTED),
+    "gradient_snapped": _gradient(
+        100, "gradient_snapped", settings=(("snap", True),), **_CONSTRUCTED
+    ),
+    "gradient_direction": _gradient(100, "gradient_direction", settings=_RING),
+    "gradient_corrected": _gradient(
+        100, "gradient_direction", settings=_RING, corrections=2, **_CONSTRUCTED
+    ),
+    "continuous_paper": _continuous(**_PAPER),
+    "continuous_500": _continuous(**_FILM | {"model": "film_500", "push": "push_film"}),
+    "continuous_full": _continuous(**_FILM | {"name": "continuous_full"}, full_only=True),
+    "oracle": _continuous(name="oracle_privileged", model="simulator", push=None, **_CONSTRUCTED),
+}
+"""The first three of the paper's planners on our best model; the paper's on its own network; what
+each idea is worth; and the simulator itself in the place of a model."""

@@ -1,0 +1,316 @@
+"""Studies beside the cross-validation: what each part of a network is worth, and what it knows.
+
+    ablation      our network, one thing left out at a time, on pushes
+    latent        how far r from an action and r from its effect are the same, and what w₁ does
+    rollability   whether an object rolls, read from its image alone
+    mixed         one network for pushes and drags: which of them is meant, by the decoded action
+    varied        a world that is no clean room: error, and whether σ knows of it
+
+    python -m affordlib.evaluation.studies --only latent rollability
+
+Each is written, whole or not at all, to `data/results/studies/` with the hashes of its data and
+settings; `tables.py` puts them beside the tables of the units.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import math
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from affordlib.evaluation.ablation import CHANGES, ablated
+from affordlib.evaluation.answers import rounded
+from affordlib.interactions import TrainingArrays, open_interactions, split_interactions
+from affordlib.interactions.batches import observe
+from affordlib.interactions.store import stored_sha256
+from affordlib.models.calibration import calibration_rows
+from affordlib.models.checkpoint import load_checkpoint, resolve_checkpoint
+from affordlib.models.film import FiLMConfig
+from affordlib.models.frame import heading, inverse, turn_observations
+from affordlib.models.make_checkpoints import SHIPPED, train_model
+from affordlib.models.protocol import observe_final_effect
+from affordlib.models.rollability import learn_rollability
+from affordlib.models.training import final_errors_m
+from affordlib.paths import resolve_out_dir
+from affordlib.perception import looks_rollable
+from affordlib.results import write_text_atomically
+from affordlib.types import Observations
+
+FOLDER = "data/results/studies"
+Rows = list[dict[str, Any]]
+
+ABLATION_STEPS = 500
+ABLATION_SEEDS = 1
+TRAINING = replace(SHIPPED["push_film"].training, steps=1500)
+"""Of `mixed` and `varied`; longer for a network that is shipped."""
+
+WEIGHTS = (0.25, 0.5, 0.75)
+HALF_WAY_M = 0.1
+"""A decoded action that starts farther from the object than this is a push, else a drag."""
+
+
+def ablation() -> Rows:
+    """Errors on `push_test` of short trainings, each without one thing; means over seeds."""
+    test_data = open_interactions("push_test")
+    box = test_data["family"].values == 0
+    rows = []
+    for change in CHANGES:
+        errors = [ablated(change, ABLATION_STEPS, seed) for seed in range(ABLATION_SEEDS)]
+        mean = np.mean(errors, axis=0)
+        each = [(e[box].mean() + e[~box].mean()) / 2 for e in errors]
+        rows.append(
+            {
+                "change": change,
+                "steps": ABLATION_STEPS,
+                "seeds": ABLATION_SEEDS,
+                "n": len(mean),
+                "final_error_mean_m": float(np.mean(each)),
+                "final_error_min_m": float(np.min(each)),
+                "final_error_max_m": float(np.max(each)),
+                "cuboid_mean_m": float(mean[box].mean()),
+                "final_error_p95_m": float(np.quantile(np.concatenate(errors), 0.95)),
+            }
+        )
+    return rows
+
+
+def cka(a: torch.Tensor, b: torch.Tensor) -> float | None:
+    """Linear centred kernel alignment of codes (N, D) and (N, E), 1 for equal up to a turn.
+
+    None where codes are all the same, as those of actions in the frame of the push. Kornblith et
+    al., Similarity of neural network representations revisited, ICML 2019.
+    """
+    if min(v.std(dim=0).norm() / v.mean(dim=0).norm() for v in (a, b)) < 1e-3:
+        return None
+    a, b = (v - v.mean(dim=0) for v in (a.double(), b.double()))
+    return float((a.T @ b).square().sum() / ((a.T @ a).norm() * (b.T @ b).norm()))
+
+
+def _seen_by(arrays: TrainingArrays, action: bool, effect: bool, weight: float) -> Observations:
+    """The action at t = 0 and 1, the effect at t = 0.8 and 1, or both, blended by w₁."""
+    n, last = len(arrays), len(arrays.phase) - 1
+    at = [torch.tensor(v).expand(n, -1) for v in ([0, last], [round(0.8 * last), last])]
+    seen = [torch.full((n, 2), v) for v in (action, effect)]
+    return observe(arrays, at[0], seen[0], at[1], seen[1], torch.full((n,), weight))
+
+
+@torch.no_grad()
+def latent() -> Rows:
+    """Alignment of the codes r of `push_test`, and the errors of what is decoded from them."""
+    data = open_interactions("push_test")
+    rows = []
+    for name in ("push_cnp", "push_film"):
+        model, _ = load_checkpoint(name)
+        channels = model.action_channels, model.effect_channels
+        arrays = TrainingArrays.from_dataset(data, None, *channels)
+
+        def code(observed: Observations, model: Any = model, channels: Any = channels) -> Any:
+            if model.config.frame == "push":
+                back = inverse(heading(observed, *channels))
+                observed = turn_observations(observed, back, *channels)
+            return model.represent(observed)
+
+        r_a, r_e = code(_seen_by(arrays, True, False, 1.0)), code(_seen_by(arrays, False, True, 0))
+        other = r_e.roll(1, dims=0)
+        features, t_target = model.encode(arrays.image), torch.tensor([[0.0, 1.0]])
+        for action, effect, weights in (
+            (True, False, (1.0,)),
+            (False, True, (0.0,)),
+            (True, True, WEIGHTS),
+        ):
+            for weight in weights:
+                observed = _seen_by(arrays, action, effect, weight)
+                told = model.predict(features, observed, t_target.expand(len(arrays), -1))
+                start = (told.action_mean[:, 0, :2] - arrays.action[:, 0, :2]).norm(dim=-1)
+                end = (told.effect_mean[:, 1, :2] - arrays.effect[:, -1, :2]).norm(dim=-1)
+                r = code(observed)
+                rows.append(
+                    {
+                        "model": name,
+                        "observed": "both" if action and effect else "action" * action or "effect",
+                        "w_1": weight,
+                        "n": len(arrays),
+                        "cosine_to_action": float(torch.cosine_similarity(r, r_a).mean()),
+                        "cosine_to_effect": float(torch.cosine_similarity(r, r_e).mean()),
+                        "cosine_to_other": float(torch.cosine_similarity(r, other).mean()),
+                        "cka_action_effect": cka(r_a, r_e),
+                        "action_start_mean_m": float(start.mean()),
+                        "final_error_mean_m": float(end.mean()),
+                    }
+                )
+    return rows
+
+
+def rollability() -> Rows:
+    """Shares of objects read rightly: learned from 400 images of `mixed`, and by curvature."""
+    mixed = open_interactions("mixed")
+    split = split_interactions(mixed.sizes["interaction"])
+    model = learn_rollability(mixed, split.train)
+    rows = []
+    for name in ("mixed", "partial", "push_test", "drag", "reach"):
+        data = open_interactions(name)
+        chosen = split.test if name == "mixed" else np.arange(data.sizes["interaction"])
+        images, rolls = data["image"].values[chosen], data["rollable"].values[chosen]
+        with torch.no_grad():
+            learned = model(torch.from_numpy(images)).numpy() > 0.5
+        rule = np.array([looks_rollable(image) for image in images])
+        names = np.array(data["family"].attrs["flag_meanings"].split())
+        family = names[data["family"].values[chosen]]
+        for kind in ("all", *np.unique(family)):
+            of = (family == kind) | (kind == "all")
+            rows.append(
+                {
+                    "test": name,
+                    "object_class": str(kind),
+                    "n": int(of.sum()),
+                    "learned_percent": 100 * float((learned == rolls)[of].mean()),
+                    "curvature_percent": 100 * float((rule == rolls)[of].mean()),
+                }
+            )
+    return rows
+
+
+def mixed() -> Rows:
+    """The paper's single model of pushes and drags: the wanted effect alone, the behaviour read.
+
+    Objects of `partial` are to be moved in some direction by what drags do in the median, and by
+    what pushes do; the model was trained on neither these objects nor a switch.
+    """
+    data, other = open_interactions("mixed"), open_interactions("partial")
+    split = split_interactions(data.sizes["interaction"])
+    model, _ = train_model(data, split, TRAINING, FiLMConfig(), progress=False)
+    arrays = TrainingArrays.from_dataset(data, split.train)
+    rolls = _kept(data, split.train)["rollable"].values
+    length = arrays.effect[:, -1].norm(dim=-1)
+    usual_m = [float(length[torch.from_numpy(rolls == kind)].median()) for kind in (True, False)]
+    test = TrainingArrays.from_dataset(data, split.test)
+    errors = final_errors_m(model, test).numpy()
+    forward = _kept(data, split.test)["rollable"].values
+    asked = TrainingArrays.from_dataset(other)
+    rolls = _kept(other, np.arange(other.sizes["interaction"]))["rollable"].values
+    rows = []
+    for wanted_m in usual_m:
+        wanted = wanted_m * _unit(len(asked))
+        with torch.no_grad():
+            told = model.predict(
+                model.encode(asked.image),
+                observe_final_effect(model, wanted),
+                torch.zeros(len(asked), 1),
+            )
+        radius = told.action_mean[:, 0].norm(dim=-1).numpy()
+        for kind in (False, True):
+            rows.append(
+                {
+                    "rollable": kind,
+                    "n": int((rolls == kind).sum()),
+                    "wanted_mean_m": wanted_m,
+                    "behaviour_right_percent": 100
+                    * float(((radius > HALF_WAY_M) != kind)[rolls == kind].mean()),
+                    "start_radius_median_m": float(np.median(radius[rolls == kind])),
+                    "n_forward": int((forward == kind).sum()),
+                    "final_error_mean_m": float(errors[forward == kind].mean()),
+                }
+            )
+    return rows
+
+
+def _kept(data: Any, interactions: np.ndarray) -> Any:
+    """What `TrainingArrays.from_dataset` keeps of some interactions."""
+    good = (data["reached"].values & ~data["fault"].values)[interactions]
+    return data.isel(interaction=interactions[good])
+
+
+def _unit(n: int) -> torch.Tensor:
+    angle = math.tau * torch.rand(n, generator=torch.Generator().manual_seed(0))
+    return torch.stack([angle.cos(), angle.sin()], dim=-1)
+
+
+def varied(folds: int = 1) -> Rows:
+    """Errors and calibration in the varied, noisy world, folds together."""
+    data = open_interactions("push_varied")
+    network = SHIPPED["push_film"].network
+    errors, judged = [], []
+    for fold in range(folds):
+        split = split_interactions(data.sizes["interaction"], 0, fold)
+        model, _ = train_model(data, split, TRAINING, network, progress=False)
+        channels = model.action_channels, model.effect_channels
+        test = TrainingArrays.from_dataset(data, split.test, *channels)
+        errors.append(final_errors_m(model, test).numpy())
+        judged.append(calibration_rows(model, test))
+    error = np.concatenate(errors)
+    rows = []
+    for same in zip(*judged, strict=True):
+        row = {"folds": folds, "n": len(error), "final_error_mean_m": float(error.mean())}
+        row["final_error_median_m"] = float(np.median(error))
+        row |= {key: same[0][key] for key in ("phase", "channel")}
+        for key in ("coverage_50", "coverage_90", "std_mean", "nll"):
+            row[key] = float(np.average([r[key] for r in same], weights=[r["n"] for r in same]))
+        rows.append(row)
+    return rows
+
+
+STUDIES: dict[str, tuple[Callable[[], Rows], tuple[str, ...], tuple[str, ...]]] = {
+    "ablation": (ablation, ("push", "push_test"), ()),
+    "latent": (latent, ("push_test",), ("push_cnp", "push_film")),
+    "rollability": (rollability, ("mixed", "partial", "push_test", "drag", "reach"), ()),
+    "mixed": (mixed, ("mixed", "partial"), ()),
+    "varied": (varied, ("push_varied",), ()),
+}
+"""By name: the study, the data sets and the checkpoints that it reads."""
+
+
+def hashes(name: str) -> dict[str, Any]:
+    """What a written study must hold to be that of today's data, checkpoints and settings."""
+    _, sets, checkpoints = STUDIES[name]
+    training = replace(TRAINING, device="cpu")
+    settings = repr((training, SHIPPED["push_film"].network, ABLATION_STEPS, ABLATION_SEEDS))
+    files = {c: resolve_checkpoint(c).read_bytes() for c in checkpoints}
+    return {
+        "settings_sha256": hashlib.sha256(settings.encode()).hexdigest(),
+        "data_sha256": {s: stored_sha256(s) for s in sets},
+        "checkpoints_sha256": {c: hashlib.sha256(b).hexdigest() for c, b in files.items()},
+    }
+
+
+def read_study(name: str, folder: str | Path = FOLDER) -> Rows | None:
+    """The rows of a study; None when there are none, ValueError when they are of other data."""
+    path = resolve_out_dir(folder) / f"{name}.json"
+    if not path.is_file():
+        return None
+    told = json.loads(path.read_text())
+    for key, expected in hashes(name).items():
+        if told.get(key) != expected:
+            raise ValueError(
+                f"study {path.name} has another {key} than it would have now; run "
+                f"`python -m affordlib.evaluation.studies --only {name}` again"
+            )
+    return told["rows"]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Make studies anew and write them."""
+    parser = argparse.ArgumentParser(
+        prog="python -m affordlib.evaluation.studies", description=main.__doc__
+    )
+    parser.add_argument("--only", nargs="+", choices=sorted(STUDIES), default=list(STUDIES))
+    parser.add_argument("--out", default=FOLDER)
+    options = parser.parse_args(argv)
+    for name in options.only:
+        told = hashes(name) | {"rows": rounded(STUDIES[name][0]())}
+        path = resolve_out_dir(options.out) / f"{name}.json"
+        write_text_atomically(path, json.dumps(told, indent=1, allow_nan=False) + "\n")
+        print(path)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,181 @@
+"""Lever-ups: what models are asked in Section 4.1 and Table 1, and how they are trained for it.
+
+    window      15 poses observed, anywhere in the trajectory; the next 1 to 5 steps foreseen
+    first_step  the first pose observed; all later steps foreseen
+    image_only  no pose observed
+
+All see the image and the commanded action at t = 0 and t = 1. A pose is the change since the start,
+so the first one is zero for all and first_step tells a model no more than image_only does; a
+network trained for the one is trained for the other. A conditional network is trained once, for
+all protocols together; a recurrent one for each by itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from affordlib.interactions import Normaliser
+from affordlib.interactions.batches import Batch, symmetric_copies
+from affordlib.interactions.lever import (
+    ACTION_CHANNELS,
+    AHEAD,
+    MIRRORED,
+    POSE_CHANNELS,
+    SEEN,
+    draw_beginnings,
+    draw_windows,
+    lever_arrays,
+    n_windows,
+    poses_seen,
+)
+from affordlib.models.anchored import AnchoredConfig
+from affordlib.models.checkpoint import build
+from affordlib.models.cnp import CNPConfig
+from affordlib.models.lstm import LSTMConfig
+from affordlib.models.training import TrainingConfig, TrainingRecord, train
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    import xarray as xr
+
+    from affordlib.interactions import Split
+    from affordlib.interactions.batches import TrainingArrays
+    from affordlib.models.network import EffectNetwork, NetworkConfig
+    from affordlib.types import Prediction
+
+PROTOCOLS = ("window", "first_step", "image_only")
+TRAINED_FOR = ("all", "window", "first_step")
+"""`first_step` stands for `image_only` as well, see above."""
+
+_CHANNELS = {"action_channels": ACTION_CHANNELS, "effect_channels": POSE_CHANNELS}
+TRAINING = TrainingConfig(
+    steps=1000, n_targets=AHEAD, obs_max=SEEN, patience=99, beta=0.5, weight_decay=0.1,
+    final_sigma_floor=0.005, ema=0.99, augment=False, validate_every=125,
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class LeverModel:
+    """A network, how it is trained, and which part of the image it sees (see `lever_arrays`)."""
+
+    network: NetworkConfig
+    training: TrainingConfig = TRAINING
+    view: str = "near"
+
+
+_IMAGE = {"rings": 10, "orders": 12}
+LEVER_MODELS: dict[str, LeverModel] = {
+    "anchored": LeverModel(AnchoredConfig(**_CHANNELS, **_IMAGE)),
+    "paper": LeverModel(CNPConfig(**_CHANNELS), replace(TRAINING, steps=300), "wide"),
+    "lstm_tuned": LeverModel(LSTMConfig(**_CHANNELS, **_IMAGE)),
+}
+"""Ours, the paper's (its image shrunk to the 48×48 of the appendix), and the recurrent one.
+
+A step of the paper's network costs several times as much as one of ours, so it gets fewer."""
+
+
+@torch.no_grad()
+def foresee(
+    model: EffectNetwork,
+    arrays: TrainingArrays,
+    protocol: str,
+    start: int = 0,
+    features: Tensor | None = None,
+) -> tuple[Prediction, Float[Tensor, "n t c"]]:
+    """Prediction and truth of the steps that a protocol asks for; start: of the window.
+
+    features: of the images, where they are encoded already.
+    """
+    if protocol not in PROTOCOLS:
+        raise ValueError(f"protocol must be one of {PROTOCOLS}, got {protocol!r}")
+    n, last = len(arrays), len(arrays.phase)
+    n_seen = {"window": SEEN, "first_step": 1, "image_only": 0}[protocol]
+    first = start + SEEN if protocol == "window" else 1
+    steps = torch.arange(first, first + AHEAD if protocol == "window" else last)
+    seen = poses_seen(arrays, torch.full((n,), start), n_seen)
+    t_target = arrays.phase[steps].expand(n, -1)
+    features = model.encode(arrays.image) if features is None else features
+    told = model.predict(features, seen, t_target)
+    return told, arrays.effect[:, steps]
+
+
+def errors_m(told: Prediction, truth: Tensor) -> Float[Tensor, "n t"]:
+    """Distances [m] between predicted and true positions."""
+    return (told.effect_mean - truth)[..., :3].norm(dim=-1)
+
+
+@torch.no_grad()
+def window_errors_m(model: EffectNetwork, arrays: TrainingArrays) -> Float[Tensor, "n w t"]:
+    """Errors [m] of all windows of all trajectories, 1 to 5 steps ahead."""
+    features = model.encode(arrays.image)
+    found = [foresee(model, arrays, "window", s, features) for s in range(n_windows(arrays))]
+    return torch.stack([errors_m(*told) for told in found], dim=1)
+
+
+def beginning_errors_m(
+    model: EffectNetwork, arrays: TrainingArrays, protocol: str = "image_only"
+) -> Float[Tensor, "n t"]:
+    """Errors [m] at all steps after the first."""
+    return errors_m(*foresee(model, arrays, protocol))
+
+
+def _all_errors_m(model: EffectNetwork, arrays: TrainingArrays) -> Tensor:
+    """Window and beginning weighed about equally: beginnings err about three times as far."""
+    window, beginning = window_errors_m(model, arrays), beginning_errors_m(model, arrays)
+    return window.mean(dim=(1, 2)) + beginning.mean(dim=1) / 3
+
+
+def _draw_all(
+    arrays: TrainingArrays, rows: Tensor, n_targets: int, obs_max: int, generator: torch.Generator
+) -> Batch:
+    draw = (draw_windows, draw_beginnings)[int(torch.randint(0, 2, (1,), generator=generator))]
+    return draw(arrays, rows, n_targets, obs_max, generator)
+
+
+_DRAWS = {"all": _draw_all, "window": draw_windows, "first_step": draw_beginnings}
+_SCORES = {"all": _all_errors_m, "window": window_errors_m, "first_step": beginning_errors_m}
+
+
+def train_lever_model(
+    lever: LeverModel,
+    data: xr.Dataset,
+    split: Split,
+    trained_for: str = "all",
+    progress: bool = True,
+    checkpoint: Path | None = None,
+) -> tuple[EffectNetwork, list[TrainingRecord]]:
+    """A network trained on a split's training part and its mirror image.
+
+    Its validation part chooses the weights, by the errors of what it is trained for.
+    """
+    if trained_for not in TRAINED_FOR:
+        raise ValueError(f"trained_for must be one of {TRAINED_FOR}, got {trained_for!r}")
+    training = symmetric_copies(lever_arrays(data, split.train, lever.view), MIRRORED)
+    validation = lever_arrays(data, split.validation, lever.view)
+    return fit_lever_model(lever, training, validation, trained_for, progress, checkpoint)
+
+
+def fit_lever_model(
+    lever: LeverModel,
+    training: TrainingArrays,
+    validation: TrainingArrays,
+    trained_for: str = "all",
+    progress: bool = True,
+    checkpoint: Path | None = None,
+) -> tuple[EffectNetwork, list[TrainingRecord]]:
+    """As `train_lever_model`, of arrays: of another world's lever-ups, for one."""
+    torch.manual_seed(lever.training.seed)
+    model = build(lever.network, Normaliser.fit(training))
+    if hasattr(model, "fit_course"):
+        model.fit_course(training.effect)
+    history = train(
+        model, training, validation, lever.training, progress, checkpoint,
+        draw=_DRAWS[trained_for], score=_SCORES[trained_for],
+    )  # fmt: skip
+    return model, history

@@ -1,0 +1,190 @@
+"""Recurrent networks: what happens next, step by step, each prediction the next step's input.
+
+    x_k = {d_k, d_k - d_{k-1}, t_k, observed?, f(γ_o), h_a}      d = e - m, m the mean course
+    (h_k+1, c_k+1) = LSTM(x_k, h_k, c_k)
+    d_k+1 = d_k + (d_k - d_{k-1}) + g(h_k+1)                     observed where it is, else foreseen
+
+`LSTMNetwork` is the well-tuned one, of about a million parameters: it predicts the change of the
+increment, in standardised units, and is trained through its own rollouts. The one of the older
+study (Seker, Tekden and Ugur, Deep effect trajectory prediction in robot manipulation, Robotics and
+Autonomous Systems, 2019) is in `lstm_published.py`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from affordlib.interactions.batches import Normaliser
+from affordlib.models.anchored import MeanCourse
+from affordlib.models.film import CircularHarmonics, dense, waves
+from affordlib.models.network import (
+    EffectNetwork,
+    NetworkConfig,
+    he_initialise,
+    masked_mean,
+    with_time,
+)
+from affordlib.types import Observations
+
+
+@dataclass(frozen=True)
+class LSTMConfig(NetworkConfig):
+    """Sizes of the network; steps: into how many it divides the phase. See `FiLMConfig`."""
+
+    steps: int = 25
+    width: int = 192
+    image_features: int = 64
+    rings: int = 7
+    orders: int = 8
+    waves: int = 4
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("steps", "width", "image_features", "rings", "orders", "waves"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+                raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}")
+
+
+@dataclass(frozen=True)
+class Known:
+    """Observed effects on a grid of steps: d (B, K, C), where (B, K), the first step (B,)."""
+
+    d: Tensor
+    where: Tensor
+    first: Tensor
+
+
+def on_grid(off: Tensor, t: Tensor, seen: Tensor, steps: int) -> Known:
+    """Observations (B, m, C) at phases t (B, m) put on a grid of steps + 1 phases.
+
+    Where nothing is observed, the effect at t = 0 is known to be zero.
+    """
+    b, n = len(off), steps + 1
+    # What is not observed goes to a column of its own, which is cut off.
+    at = torch.where(seen, (t * steps).round().long(), n)
+    d = off.new_zeros(b, n + 1, off.shape[-1])
+    d = d.scatter(1, at[..., None].expand(-1, -1, off.shape[-1]), off)[:, :n]
+    where = torch.zeros(b, n + 1, dtype=torch.bool, device=off.device)
+    where = where.scatter(1, at, torch.ones_like(seen))[:, :n]
+    where[:, 0] |= ~where.any(dim=1)
+    return Known(d, where, where.to(torch.uint8).argmax(dim=1))
+
+
+class LSTMNetwork(EffectNetwork):
+    """Rolls a course out step by step from what is observed; satisfies `EffectModel`.
+
+    Between two steps it is linear, so that any phase can be asked for, with gradients.
+    """
+
+    def __init__(self, config: LSTMConfig, normaliser: Normaliser) -> None:
+        super().__init__(config, normaliser)
+        c, w = config, config.width
+        n_a, n_e = len(c.action_channels), len(c.effect_channels)
+        self.course = MeanCourse(c.steps, n_e)
+        self.harmonics, n = CircularHarmonics(c.rings, c.orders), c.image_features
+        self.image_encoder = nn.Sequential(*dense(self.harmonics.n_features, 4 * n, 2 * n, n))
+        self.image_encoder.apply(he_initialise)
+        self.action_encoder = nn.Sequential(*dense(n_a + 1, w, w, c.image_features))
+        static = 2 * c.image_features
+        self.begin = nn.Linear(static, 2 * w)
+        self.cell = nn.LSTMCell(2 * n_e + 2 * c.waves + 2 + static, w)
+        self.last = nn.Sequential(nn.LayerNorm(w), *dense(w, w, 2 * n_e))
+        nn.init.zeros_(self.last[-1].weight)
+        nn.init.zeros_(self.last[-1].bias)
+        # The commanded action is told, not foreseen; this completes it at other phases.
+        self.action_decoder = nn.Sequential(*dense(static + 2 * c.waves + 1, w, w, 2 * n_a))
+
+    def fit_course(self, effect: Float[Tensor, "n s c"]) -> None:
+        """Learn m(t) from training effects [m, rad]; before training."""
+        self.course.fit(effect, self.effect_scale)
+
+    def features(self, scaled_image: Float[Tensor, "b 2 48 48"]) -> Float[Tensor, "b f"]:
+        """f(γ_o): (B, F) of standardised depth and mask."""
+        return self.image_encoder(self.harmonics(scaled_image))
+
+    def look(self, image: Float[Tensor, "b 2 48 48"]) -> Float[Tensor, "b f"]:
+        """The circular harmonics (B, F) of images."""
+        return self.harmonics(self._scaled(image))
+
+    def turned_features(
+        self, seen: Float[Tensor, "#b f"], heading: Float[Tensor, "b 2"]
+    ) -> Float[Tensor, "b f"]:
+        """f(γ_o) of turned images, given the harmonics of the images as they lie."""
+        return self.image_encoder(self.harmonics.turned(seen, heading))
+
+    def outputs(
+        self, features: Tensor, observations: Observations, t_target: Tensor
+    ) -> tuple[Tensor, ...]:
+        """(μ_a, σ_a, μ_e, σ_e), each (B, T, C) and standardised."""
+        o, b = observations, len(observations.weight)
+        code = masked_mean(
+            self.action_encoder(with_time(o.action / self.action_scale, o.action_t)), o.action_mask
+        )
+        static = torch.cat([features.expand(b, -1), code], dim=1)
+        off = o.effect / self.effect_scale - self.course(o.effect_t)
+        known = on_grid(off, o.effect_t, o.effect_mask, self.config.steps)
+        at = (t_target * self.config.steps - known.first[:, None]).clamp_min(0)
+        path, raw = self.roll(known, static, max(1, int(at.detach().max().ceil())))
+        mu_e = self.course(t_target) + _between(path, at)
+        sigma_e = self.sigma_floor + F.softplus(_between(raw, at))
+        times = waves(t_target, self.config.waves)
+        told = torch.cat([static[:, None].expand(-1, times.shape[1], -1), times], dim=-1)
+        mu_a, raw_a = self.action_decoder(told).chunk(2, dim=-1)
+        return mu_a, self.sigma_floor + F.softplus(raw_a), mu_e, sigma_e
+
+    def roll(self, known: Known, static: Tensor, n: int) -> tuple[Tensor, Tensor]:
+        """Courses d and raw σ (B, n + 1, C) of n steps from the first observed one on.
+
+        The gates' share of what stays is computed once; a step that all have observed is not
+        foreseen.
+        """
+        rows, last = torch.arange(len(static), device=static.device), self.config.steps
+        h, c = self.begin(static).tanh().chunk(2, dim=-1)
+        moving = self.cell.input_size - static.shape[1]
+        w_in, w_h = self.cell.weight_ih, self.cell.weight_hh
+        fixed = F.linear(static, w_in[:, moving:], self.cell.bias_ih + self.cell.bias_hh)
+        weight = torch.cat([w_in[:, :moving], w_h], dim=1).T
+        phases = torch.linspace(0, 1, last + 1, device=static.device)[None]
+        times = waves(phases, self.config.waves)[0]
+        foreseen = previous = known.d[rows, known.first]
+        certain = torch.full_like(foreseen, _CERTAIN)
+        path, sigmas = [foreseen], [certain]
+        for j in range(n):
+            k = (known.first + j).clamp_max(last)
+            told = known.where[rows, k][:, None]
+            d = torch.where(told, known.d[rows, k], foreseen)
+            change = d - previous
+            x = torch.cat([d, change, times[k], told.to(d.dtype), h], dim=1)
+            i, f, g, o = torch.addmm(fixed, x, weight).chunk(4, dim=1)
+            c = f.sigmoid() * c + i.sigmoid() * g.tanh()
+            h = o.sigmoid() * c.tanh()
+            after = (k + 1).clamp_max(last)
+            if bool(known.where[rows, after].all()):
+                foreseen, raw = known.d[rows, after], certain
+            else:
+                bend, raw = self.last(h).chunk(2, dim=-1)
+                foreseen = d + change + bend
+            previous = d
+            path.append(foreseen)
+            sigmas.append(raw)
+        return torch.stack(path, dim=1), torch.stack(sigmas, dim=1)
+
+
+_CERTAIN = -6.0
+
+
+def _between(values: Float[Tensor, "b n c"], at: Float[Tensor, "b t"]) -> Float[Tensor, "b t c"]:
+    """Values at places between steps, linearly."""
+    below = at.detach().floor().long().clamp(0, values.shape[1] - 2)
+    share = (at - below)[..., None]
+
+    def pick(index: Tensor) -> Tensor:
+        return values.gather(1, index[..., None].expand(-1, -1, values.shape[-1]))
+
+    return (1 - share) * pick(below) + share * pick(below + 1)

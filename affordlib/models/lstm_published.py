@@ -1,0 +1,181 @@
+"""The older study's network for lever-ups, as published (Seker, Tekden and Ugur, 2019; Table 1).
+
+Four convolutions 3×3 (32, 64, 128, 256), each with ReLU and 2×2 max-pooling, a dense layer of 4096
+with dropout 0.5; these features are repeated over a window of 15 poses and concatenated with them;
+LSTM(256); a dense layer per step gives the next pose. 72 million parameters. Mean squared error,
+Adam at 5e-4, batches of 32, 100 epochs of one random window per trajectory, the learning rate times
+0.8 when the validation loss rests.
+
+Ours to add, for equal context with the other models: phase and commanded action of each step beside
+its pose, and poses scaled to unit size. Foreseen poses are its next inputs.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from affordlib.interactions import Normaliser
+from affordlib.interactions.lever import SEEN
+from affordlib.models.lever import beginning_errors_m, window_errors_m
+from affordlib.models.lstm import Known, on_grid
+from affordlib.models.network import EffectNetwork, NetworkConfig, with_time
+from affordlib.types import LEVER_IMAGE_PIXELS, Observations
+
+if TYPE_CHECKING:
+    from affordlib.interactions.batches import TrainingArrays
+
+CONVOLUTION_WIDTHS = (32, 64, 128, 256)
+DENSE, HIDDEN = 4096, 256
+BATCH, LEARNING_RATE, DECAY, EPOCHS = 32, 5e-4, 0.8, 100
+
+
+@dataclass(frozen=True)
+class PublishedConfig(NetworkConfig):
+    """Channels, and the number of steps that the phase has."""
+
+    steps: int = 25
+    patience: int = 5
+
+
+class PublishedLSTM(EffectNetwork):
+    """CNN and LSTM, step by step; σ is not foreseen and is the floor."""
+
+    def __init__(self, config: PublishedConfig, normaliser: Normaliser) -> None:
+        super().__init__(config, normaliser)
+        n_a, n_e = len(config.action_channels), len(config.effect_channels)
+        layers: list[nn.Module] = []
+        for n_in, n_out in pairwise((2, *CONVOLUTION_WIDTHS)):
+            layers += [nn.Conv2d(n_in, n_out, 3, padding="same"), nn.ReLU(), nn.MaxPool2d(2)]
+        side = LEVER_IMAGE_PIXELS // 2 ** len(CONVOLUTION_WIDTHS)
+        flat = CONVOLUTION_WIDTHS[-1] * side**2
+        self.cnn = nn.Sequential(
+            *layers, nn.Flatten(), nn.Linear(flat, DENSE), nn.ReLU(), nn.Dropout(0.5)
+        )
+        self.lstm = nn.LSTM(DENSE + n_e + 2 * n_a + 1, HIDDEN, batch_first=True)
+        self.next_pose = nn.Linear(HIDDEN, n_e)
+
+    def features(self, scaled_image: Float[Tensor, "b 2 128 128"]) -> Float[Tensor, "b f"]:
+        """4096 numbers of standardised depth and mask."""
+        return self.cnn(scaled_image)
+
+    def outputs(
+        self, features: Tensor, observations: Observations, t_target: Tensor
+    ) -> tuple[Tensor, ...]:
+        """(μ_a, σ_a, μ_e, σ_e) at steps of the phase, each (B, T, C) and standardised.
+
+        The action is not foreseen: μ_a is zero.
+        """
+        o = observations
+        known = on_grid(o.effect / self.effect_scale, o.effect_t, o.effect_mask, self.config.steps)
+        at = (t_target * self.config.steps).round().long() - known.first[:, None]
+        path = self.roll(features.expand(len(o.weight), -1), known, o, int(at.max()))
+        index = at.clamp_min(0)[..., None].expand(-1, -1, path.shape[-1])
+        mu_e = path.gather(1, index)
+        mu_a = mu_e.new_zeros(*t_target.shape, len(self.action_channels))
+        return mu_a, mu_a + self.sigma_floor, mu_e, torch.full_like(mu_e, self.sigma_floor)
+
+    def roll(self, features: Tensor, known: Known, o: Observations, n: int) -> Tensor:
+        """Poses (B, n + 1, C) from the first observed step on: those that are foreseen."""
+        rows = torch.arange(len(features), device=features.device)
+        action = (o.action / self.action_scale).flatten(1)[:, None]
+        n_told = int(known.where.sum(dim=1).min())
+        k = (known.first[:, None] + torch.arange(n_told)).clamp_max(self.config.steps)
+        told = known.d[rows[:, None], k]
+        out, state = self.lstm(self._inputs(features, told, k, action))
+        path = [told[:, :1], self.next_pose(out)]
+        for j in range(n_told, n):
+            k = (known.first[:, None] + j).clamp_max(self.config.steps)
+            out, state = self.lstm(self._inputs(features, path[-1][:, -1:], k, action), state)
+            path.append(self.next_pose(out))
+        return torch.cat(path, dim=1)
+
+    def _inputs(self, features: Tensor, pose: Tensor, k: Tensor, action: Tensor) -> Tensor:
+        steps = pose.shape[1]
+        told = torch.cat([pose, action.expand(-1, steps, -1)], dim=-1)
+        told = with_time(told, k / self.config.steps)
+        return torch.cat([features[:, None].expand(-1, steps, -1), told], dim=-1)
+
+    def next_step_loss(self, arrays: TrainingArrays, start: Tensor, n: int) -> Tensor:
+        """Mean squared error of the next pose at each of n observed steps from `start` (N,) on."""
+        rows = torch.arange(len(arrays))[:, None]
+        k = start[:, None] + torch.arange(n)
+        pose = arrays.effect / self.effect_scale
+        ends = arrays.action[:, [0, -1]] / self.action_scale
+        features = self._see(arrays.image)
+        out, _ = self.lstm(self._inputs(features, pose[rows, k], k, ends.flatten(1)[:, None]))
+        return F.mse_loss(self.next_pose(out), pose[rows, k + 1])
+
+
+def train_published(
+    model: PublishedLSTM,
+    training: TrainingArrays,
+    validation: TrainingArrays,
+    trained_for: str = "window",
+    epochs: int = EPOCHS,
+    seed: int = 0,
+    max_minutes: float = math.inf,
+    checkpoint: Path | None = None,
+) -> dict[str, float]:
+    """Train in place, to the weights of the best validation error; what it took.
+
+    An epoch is one window of each trajectory ("first_step": the whole trajectory). checkpoint: a
+    file, written after every epoch (0.9 GB), from which the same call goes on. max_minutes bounds
+    the processor time of training; the epochs done are told.
+    """
+    optimiser = torch.optim.Adam(model.parameters(), LEARNING_RATE, fused=True)
+    plateau = torch.optim.lr_scheduler.ReduceLROnPlateau(
+        optimiser, factor=DECAY, patience=model.config.patience
+    )
+    generator = torch.Generator().manual_seed(seed)
+    n = SEEN if trained_for == "window" else len(training.phase) - 1
+    score = window_errors_m if trained_for == "window" else beginning_errors_m
+    best, best_state, epoch, seconds = math.inf, model.state_dict(), 0, 0.0
+    if checkpoint is not None and checkpoint.is_file():
+        state = torch.load(checkpoint, weights_only=True)
+        model.load_state_dict(state["model"])
+        optimiser.load_state_dict(state["optimiser"])
+        plateau.load_state_dict(state["plateau"])
+        generator.set_state(state["generator"])
+        torch.set_rng_state(state["torch"])
+        best, best_state = state["best"], state["best_state"]
+        epoch, seconds = state["epoch"], state["seconds"]
+    while epoch < epochs and seconds < 60 * max_minutes:
+        began = time.process_time()
+        model.train()
+        for rows in torch.randperm(len(training), generator=generator).split(BATCH):
+            latest = len(training.phase) - 1 - n
+            start = torch.randint(0, latest + 1, (len(rows),), generator=generator)
+            loss = model.next_step_loss(training.select(rows), start, n)
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+        model.eval()
+        error = float(score(model, validation).mean())
+        plateau.step(error)
+        epoch, seconds = epoch + 1, seconds + time.process_time() - began
+        if error < best:
+            best, best_state = error, {k: v.clone() for k, v in model.state_dict().items()}
+        if checkpoint is not None:
+            state = {
+                "model": model.state_dict(), "optimiser": optimiser.state_dict(),
+                "plateau": plateau.state_dict(), "generator": generator.get_state(),
+                "torch": torch.get_rng_state(), "best": best, "best_state": best_state,
+                "epoch": epoch, "seconds": seconds,
+            }  # fmt: skip
+            partial = checkpoint.with_name(f".{checkpoint.name}.partial")
+            torch.save(state, partial)
+            os.replace(partial, checkpoint)
+    model.load_state_dict(best_state)
+    model.eval()
+    return {"epochs": epoch, "seconds": seconds, "validation_error": best}

@@ -1,0 +1,263 @@
+"""A pursuit while it lasts: look, judge whether the plan holds, plan anew, act, look again."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from affordlib.perception import looks_fallen
+from affordlib.planning.disturbances import Script
+from affordlib.planning.modes import is_on_table
+from affordlib.planning.moves import Ended, MovePlanner
+from affordlib.planning.poses import plan_lift, plan_turn
+from affordlib.primitives import Grasp, Rotate, wrap_angle
+from affordlib.types import Goal, Plan
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from affordlib.perception import Percept
+    from affordlib.planning.disturbances import Disturbance
+    from affordlib.planning.moves import Demands
+    from affordlib.planning.repertoire import Repertoire
+    from affordlib.types import Step
+    from affordlib.world import Tabletop
+
+SURPRISE_M = 0.002
+"""An object that is farther than this from where the plan has it makes the plan worthless."""
+
+DISPLACED_M = 0.03
+"""An object that is farther than this from where it should be was moved by somebody else."""
+
+RENEWALS = 3
+MOVE_M = 0.05
+SPARE_ACTIONS = 3
+MAX_LIFTS = 2
+ENDINGS = ("reached", "unreachable", "gave_up", "lost")
+
+
+@dataclass(frozen=True)
+class Pursuit:
+    """What pursuing a goal came to.
+
+    ending: one of `ENDINGS`, and in words; goal: as it was in the end; distance_m: between it and
+    the object's true position; turn_error_rad, height_error_m: likewise, None where the goal does
+    not ask; steps: the actions taken; object_paths_xy_m: one (n, 2) path of the object for each;
+    plans: all that were made; seen_xy_m: where the object was seen before every decision;
+    happened: the disturbances that came to pass; vetoes: planned actions that the arm's kinematics
+    refused before any motion.
+    """
+
+    goal: Goal
+    ending: str
+    words: str
+    distance_m: float
+    steps: tuple[Step, ...]
+    object_paths_xy_m: tuple[np.ndarray, ...]
+    plans: tuple[Plan, ...]
+    seen_xy_m: tuple[tuple[float, float], ...]
+    end_pose: tuple[float, float, float]
+    happened: tuple[Disturbance, ...] = ()
+    vetoes: int = 0
+    turn_error_rad: float | None = None
+    height_error_m: float | None = None
+
+    @property
+    def reached(self) -> bool:
+        """Whether the object was seen where, and as, the goal wants it."""
+        return self.ending == "reached"
+
+
+def action_limit(distance_m: float) -> int:
+    """How many actions a distance is worth: one for every 5 cm, rounded up, and 3 more."""
+    return math.ceil(distance_m / MOVE_M - 1e-9) + SPARE_ACTIONS
+
+
+def follow(world: Tabletop, step: Step) -> np.ndarray:
+    """Carry out a step; the object's path (n, 2) in the frame of the table."""
+    seen = world.follow(step)
+    return seen.effect[:, :2] + seen.start_pose[:2]
+
+
+class Chase:
+    """The state of a pursuit."""
+
+    def __init__(
+        self,
+        world: Tabletop,
+        goal: Goal,
+        repertoire: Repertoire,
+        demands: Demands,
+        disturbances: Sequence[Disturbance],
+    ) -> None:
+        self.world, self.repertoire, self.demands = world, repertoire, demands
+        self.script = Script(goal, disturbances)
+        self.steps: list[Step] = []
+        self.paths: list[np.ndarray] = []
+        self.moves = MovePlanner(world, repertoire, demands)
+        self.places: list[tuple[float, float]] = []
+        self.queue: list[Step] = []
+        self.seen: Percept | None = None
+        self.renewals = RENEWALS
+        self.planned_for: Goal | None = None
+        self.expected: tuple[float, float] | None = None
+        self.yaw_rad = world.object_pose()[2]
+        self.limit = self._limit_from(world.perceive().xy_m)
+        self.z_m = world.object_state()[2]
+
+    @property
+    def goal(self) -> Goal:
+        return self.script.goal
+
+    def run(self) -> Pursuit:
+        """Position, orientation, height, again until all hold or one cannot be had."""
+        try:
+            self._run()
+        except Ended as end:
+            return self._ended(*end.args)
+        raise AssertionError("a pursuit ends by saying how")
+
+    def _run(self) -> None:
+        turns = lifts = 0
+        while True:
+            self._look()
+            if self.goal.distance_m(self.seen.xy_m) > self.demands.tolerance_m:
+                self._act(self._next_move(), "position")
+                continue
+            off = self._turn_left()
+            if off is not None and abs(off) > self.demands.turn_tolerance_rad:
+                # Behind it lies what takes a whole round, in sweeps of 60°.
+                if turns == 0:
+                    self.limit += (
+                        math.ceil((off % (2 * math.pi)) / Rotate.sweep_rad) + SPARE_ACTIONS
+                    )
+                turns += 1
+                self._act(self._turn(off), "orientation")
+                continue
+            if self.goal.height_m is None:
+                raise Ended("reached", self._where())
+            if lifts == MAX_LIFTS:
+                self._give_up("height")
+            lifts += 1
+            self.limit += 1
+            self._act(self._lift(), "height")
+            if abs(self._height_left()) <= self.demands.height_tolerance_m:
+                raise Ended("reached", self._where())
+            self.world.park()
+
+    def _look(self) -> None:
+        """Let happen what happens between actions; look, and judge whether the plan still holds."""
+        self.script.before(self.world, len(self.steps))
+        before, self.seen = self.seen, self.world.perceive()
+        self.places.append(self.seen.xy_m)
+        if not (self.seen.image[1].any() and is_on_table(np.array([self.seen.xy_m]))[0]):
+            raise Ended("lost", f"the object is no longer on the table, after {self._count()}")
+        off = math.inf if self.expected is None else math.dist(self.expected, self.seen.xy_m)
+        moved = self.planned_for is not None and self.planned_for != self.goal
+        if moved or (self.expected is not None and off > DISPLACED_M and self.renewals > 0):
+            self.renewals -= not moved
+            self.limit = max(self.limit, len(self.steps) + self._limit_from(self.seen.xy_m))
+        fell = before is not None and looks_fallen(before.image, self.seen.image)
+        if off > SURPRISE_M or moved or fell:
+            self.queue = []
+
+    def _limit_from(self, xy_m: Sequence[float]) -> int:
+        if self.demands.max_actions is not None:
+            return self.demands.max_actions
+        return action_limit(self.goal.distance_m(xy_m))
+
+    def _act(self, step: Step, part: str) -> None:
+        """Carry out a step that the arm has agreed to."""
+        if len(self.steps) >= self.limit:
+            self._give_up(part)
+        self.planned_for, self.expected = self.goal, step.predicted_end_xy_m
+        with self.script.during(self.world, len(self.steps)):
+            self.paths.append(follow(self.world, step))
+        self.steps.append(step)
+        if self.demands.on_action is not None:
+            plan = (
+                self.moves.plans[-1]
+                if self.moves.plans
+                else Plan(self.goal, self.seen.xy_m, (step,), part, False, 0, 0.0)
+            )
+            self.script.goal = self.demands.on_action(plan, len(self.steps)) or self.goal
+
+    def _next_move(self) -> Step:
+        if len(self.steps) >= self.limit:
+            self._give_up("position")
+        if not self.queue:
+            self.queue = self.moves.steps(self.seen, self.goal, self._count())
+        return self.queue.pop(0)
+
+    def _turn_left(self) -> float | None:
+        if self.goal.turn_rad is None:
+            return None
+        turned = self.world.object_pose()[2] - self.yaw_rad
+        return wrap_angle(self.goal.turn_rad - turned)
+
+    def _height_left(self) -> float:
+        return self.goal.height_m - (self.world.object_state()[2] - self.z_m)
+
+    def _turn(self, off_rad: float) -> Step:
+        model = self.repertoire.model(Rotate)
+        step = plan_turn(model, self.seen.image, self.seen.xy_m, off_rad)
+        wanted = f"the orientation: {math.degrees(off_rad):.0f}° more"
+        if step is None:
+            raise Ended("unreachable", f"{wanted}, and no rotation is foreseen to turn the object")
+        return self._agreed(step, wanted)
+
+    def _lift(self) -> Step:
+        self.z_m = self.world.object_state()[2]
+        model, height = self.repertoire.model(Grasp), self.goal.height_m
+        step = plan_lift(model, self.seen.image, self.seen.xy_m, height)
+        wanted = f"the height: {100 * height:.1f} cm"
+        if step is None:
+            raise Ended("unreachable", f"{wanted}, and no grasp is foreseen to lift it so high")
+        return self._agreed(step, wanted)
+
+    def _agreed(self, step: Step, wanted: str) -> Step:
+        if not self.world.can_reach(step.primitive, step.stop_phase, self.seen.xy_m):
+            self.moves.vetoes += 1
+            x, y = self.seen.xy_m
+            raise Ended(
+                "unreachable",
+                f"{wanted}: the arm cannot {step.primitive.name} at ({x:.3f}, {y:.3f}) m",
+            )
+        return step
+
+    def _count(self) -> str:
+        n = len(self.steps)
+        return f"{n} action{'s' * (n != 1)}"
+
+    def _where(self) -> str:
+        parts = [f"{1000 * self.goal.distance_m(self.world.object_pose()[:2]):.1f} mm"]
+        if self.goal.turn_rad is not None:
+            parts.append(f"{math.degrees(abs(self._turn_left())):.1f}°")
+        if self.goal.height_m is not None:
+            parts.append(f"{1000 * abs(self._height_left()):.1f} mm in height")
+        return f"{', '.join(parts)} from the goal after {self._count()}"
+
+    def _give_up(self, part: str) -> None:
+        raise Ended("gave_up", f"{self._where()}: the {part} is not what it should be")
+
+    def _ended(self, ending: str, words: str) -> Pursuit:
+        """The pursuit as it ended, measured against the truth."""
+        pose = self.world.object_pose()
+        return Pursuit(
+            goal=self.goal,
+            ending=ending,
+            words=words,
+            distance_m=self.goal.distance_m(pose[:2]),
+            steps=tuple(self.steps),
+            object_paths_xy_m=tuple(self.paths),
+            plans=tuple(self.moves.plans),
+            seen_xy_m=tuple(self.places),
+            end_pose=pose,
+            happened=tuple(self.script.happened),
+            vetoes=self.moves.vetoes,
+            turn_error_rad=self._turn_left(),
+            height_error_m=None if self.goal.height_m is None else self._height_left(),
+        )

@@ -1,0 +1,174 @@
+"""A seeded script of what goes wrong: the object shoved, knocked or toppled, the goal moved.
+
+Between actions, or in the middle of one, by the world's callback at every simulation step.
+"""
+
+from __future__ import annotations
+
+import math
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from affordlib.types import (
+    TABLE_X_M,
+    TABLE_Y_M,
+    Goal,
+    check_finite,
+    check_on_table,
+    check_within,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from affordlib.world import Tabletop
+
+KINDS = ("shove", "knock", "topple", "goal")
+STEPS_PER_S = 240
+TIPPING_S = 1.0
+EDGE_M = 0.15
+"""Of the table, where nothing is shoved to and no goal is put."""
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """One thing that happens: before an action, or at_s seconds after it began to move.
+
+    kind: "shove" displaces the object by (x, y) [m] and turns it [rad], only between actions;
+    "knock" changes its velocity by (x, y) [m/s] and turn [rad/s]; "topple" tips it over towards
+    (x, y); "goal" displaces the goal by (x, y) [m]. action: counted from 0; what should happen in
+    the middle of an action that has ended by then happens at its end.
+    """
+
+    kind: str
+    action: int
+    x: float
+    y: float
+    turn: float = 0.0
+    at_s: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise ValueError(f"kind must be one of {KINDS}, got {self.kind!r}")
+        if isinstance(self.action, bool) or not isinstance(self.action, int) or self.action < 0:
+            raise ValueError(f"action must be a whole number from 0 on, got {self.action!r}")
+        for name in ("x", "y", "turn"):
+            check_finite(name, getattr(self, name))
+        if self.at_s is not None:
+            check_within("at_s", self.at_s, 0.0, 60.0, "s")
+            if self.kind == "shove":
+                raise ValueError("a shove happens between actions; give no at_s, or take a knock")
+
+    def strike(self, world: Tabletop, goal: Goal) -> Goal:
+        """Let it happen, and return the goal as it is then."""
+        if self.kind == "goal":
+            return replace(goal, xy_m=_inside(goal.xy_m[0] + self.x, goal.xy_m[1] + self.y))
+        if self.kind == "shove":
+            x, y, _ = world.object_pose()
+            to = _inside(x + self.x, y + self.y)
+            world.shove(to[0] - x, to[1] - y, self.turn)
+        elif self.kind == "knock":
+            world.knock(self.x, self.y, self.turn)
+        elif not world.object_rolls():
+            world.topple(math.atan2(self.y, self.x))
+        return goal
+
+
+def _inside(x: float, y: float) -> tuple[float, float]:
+    """The nearest place that is not at the table's edge."""
+    return check_on_table(
+        "disturbed place",
+        (
+            min(max(x, TABLE_X_M[0] + EDGE_M), TABLE_X_M[1] - EDGE_M),
+            min(max(y, TABLE_Y_M[0] + EDGE_M), TABLE_Y_M[1] - EDGE_M),
+        ),
+    )
+
+
+class Script:
+    """Disturbances, each of which happens once, and the goal as it has become.
+
+    happened: those that have, in order.
+    """
+
+    def __init__(self, goal: Goal, disturbances: Sequence[Disturbance] = ()) -> None:
+        self.goal = goal
+        self.happened: list[Disturbance] = []
+        self._waiting = list(disturbances)
+
+    def _strike(self, world: Tabletop, one: Disturbance) -> None:
+        self._waiting.remove(one)
+        self.happened.append(one)
+        self.goal = one.strike(world, self.goal)
+
+    def before(self, world: Tabletop, action: int) -> None:
+        """Let happen what comes before an action, and let the object come to rest."""
+        due = [one for one in self._waiting if one.action <= action and one.at_s is None]
+        for one in due:
+            self._strike(world, one)
+            if one.kind in ("knock", "topple"):
+                world.settle(TIPPING_S)
+
+    @contextmanager
+    def during(self, world: Tabletop, action: int) -> Iterator[None]:
+        """While entered, what comes in the middle of an action happens when it is due."""
+        film, steps = world.film, 0
+        due = [one for one in self._waiting if one.action <= action and one.at_s is not None]
+
+        def watch(world: Tabletop) -> None:
+            nonlocal steps
+            steps += 1
+            for one in [d for d in due if steps >= STEPS_PER_S * d.at_s]:
+                due.remove(one)
+                self._strike(world, one)
+            if film is not None:
+                film(world)
+
+        world.film = watch if due else film
+        try:
+            yield
+        finally:
+            world.film = film
+        for one in due:
+            self._strike(world, one)
+            if one.kind != "goal":
+                world.settle(TIPPING_S)
+
+
+def draw_disturbances(
+    seed: int | Sequence[int],
+    n: int = 1,
+    n_actions: int = 2,
+    kinds: Sequence[str] = KINDS,
+    strength: float = 1.0,
+) -> tuple[Disturbance, ...]:
+    """A script of n disturbances, a function of the seed alone.
+
+    Each comes in the middle of one of n_actions actions, or (never before the first) between two:
+    shoves of 3 to 10 cm and up to half a turn, knocks of 0.2 to 0.5 m/s, goals that move by 3 to
+    10 cm. strength: multiplies these.
+    """
+    rng = np.random.default_rng(seed)
+    script = []
+    for _ in range(n):
+        kind = str(rng.choice(list(kinds)))
+        action, angle = int(rng.integers(n_actions)), rng.uniform(-math.pi, math.pi)
+        low, high = (0.2, 0.5) if kind == "knock" else (0.03, 0.1)
+        size = strength * rng.uniform(low, high)
+        turn = rng.uniform(-math.pi, math.pi) if kind == "shove" else 0.0
+        middle = kind == "knock" or (kind != "shove" and rng.random() < 0.5)
+        at_s = float(rng.uniform(2.0, 5.5)) if middle else None
+        script.append(
+            Disturbance(
+                kind,
+                action if middle else action + 1,
+                float(size * math.cos(angle)),
+                float(size * math.sin(angle)),
+                float(turn),
+                at_s,
+            )
+        )
+    return tuple(script)

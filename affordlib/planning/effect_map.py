@@ -1,0 +1,162 @@
+"""What the actions of one kind do to one object, over all directions and phases, smooth between.
+
+Effects are relative to the object, so an object's whole repertoire is a surface over two numbers:
+the direction of the push relative to the object, and the phase at which it stops. The model is
+asked once, on a grid; cubic B-splines fill the rest. When the object turns, the surface turns with
+it, so one map serves every step of a plan and every node of a search.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from affordlib.models.protocol import observe_actions
+from affordlib.planning.modes import encode_image, plane
+from affordlib.primitives import Drag, Push
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from affordlib.models.protocol import EffectModel
+
+N_DIRECTIONS = 36
+N_PHASES = 41
+FINE_DIRECTIONS = 180
+FINE_PHASES = 51
+_WRAP = 3
+
+
+@dataclass(frozen=True)
+class EffectMap:
+    """Effects of `kind` on one object: ahead, to the left [m] and turn [rad], with σ of each.
+
+    coefficients: (D + 3, T + 3, 6), of cubic B-splines over the direction relative to the object
+    as its image shows it, and over the phase. It is evaluated with torch, so that it can be
+    differentiated.
+    """
+
+    kind: type[Push] | type[Drag]
+    model: EffectModel
+    features: Tensor
+    coefficients: Tensor
+    reach_m: float
+
+    def __call__(self, direction_rad: Tensor, phase: Tensor) -> tuple[Tensor, Tensor]:
+        """Effects and σ (..., 3) in the frame of the action, directions relative to the object."""
+        rows, columns = (n - _WRAP for n in self.coefficients.shape[:2])
+        u = torch.remainder(direction_rad, 2 * math.pi) * (rows / (2 * math.pi))
+        v = phase.clamp(0, 1) * (columns - 1)
+        i, j = u.detach().floor().clamp(0, rows - 1), v.detach().floor().clamp(0, columns - 2)
+        across, along = _basis(u - i), _basis(v - j)
+        four = torch.arange(4)
+        near = self.coefficients[
+            (i.long()[..., None] + four)[..., :, None], (j.long()[..., None] + four)[..., None, :]
+        ]
+        values = (near * across[..., :, None, None] * along[..., None, :, None]).sum(dim=(-3, -2))
+        return values[..., :3], values[..., 3:].clamp_min(1e-6)
+
+    @cached_property
+    def fine_grid(self) -> tuple[Tensor, Tensor, dict[bool, cKDTree]]:
+        """A fine grid of directions and phases, and trees of where its actions bring the object."""
+        angles = torch.arange(FINE_DIRECTIONS, dtype=torch.float64) * (
+            2 * math.pi / FINE_DIRECTIONS
+        )
+        phases = torch.linspace(0, 1, FINE_PHASES, dtype=torch.float64)
+        direction, phase = (v.reshape(-1) for v in torch.meshgrid(angles, phases, indexing="ij"))
+        with torch.no_grad():
+            told, _ = self(direction, phase)
+        c, s = direction.cos(), direction.sin()
+        ends = torch.stack([c * told[:, 0] - s * told[:, 1], s * told[:, 0] + c * told[:, 1]], -1)
+        full = torch.arange(FINE_PHASES - 1, len(ends), FINE_PHASES)
+        return direction, phase, {True: cKDTree(ends), False: cKDTree(ends[full])}
+
+    def nearest(self, wanted_xy_m: Tensor, n: int, partial: bool) -> tuple[Tensor, Tensor]:
+        """Directions and phases (B, n) of the actions that bring it nearest to wanted (B, 2) [m].
+
+        partial: whether they may stop before the end.
+        """
+        direction, phase, trees = self.fine_grid
+        rows = torch.from_numpy(trees[partial].query(wanted_xy_m.numpy(), n)[1]).reshape(-1, n)
+        if not partial:
+            rows = rows * FINE_PHASES + FINE_PHASES - 1
+        return direction[rows], phase[rows]
+
+    @torch.no_grad()
+    def ask_model(self, direction_rad: Tensor, phase: Tensor) -> Tensor:
+        """As the map, for (n,) directions and phases, from the model itself: (n, 3)."""
+        effect, _ = _asked(
+            self.model, self.features, self.kind, direction_rad.numpy(), phase[:, None].float()
+        )
+        return effect[:, 0]
+
+
+def _basis(x: Tensor) -> Tensor:
+    """The four cubic B-splines (..., 4) that do not vanish at x in [0, 1]."""
+    y = 1 - x
+    middle = [4 - 6 * a**2 + 3 * a**3 for a in (x, y)]
+    return torch.stack([y**3, *middle, x**3], dim=-1) / 6
+
+
+def _asked(
+    model: EffectModel,
+    features: Tensor,
+    kind: type[Push] | type[Drag],
+    direction_rad: np.ndarray,
+    t_target: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Effects and σ (n, T, 3), ahead, left and turn, of actions in n directions."""
+    actions = [kind.towards(float(angle)) for angle in direction_rad]
+    told = model.predict(features, observe_actions(model, actions), t_target)
+    columns = plane(model)
+    angle = torch.as_tensor(direction_rad, dtype=torch.float64)[:, None]
+    c, s = angle.cos(), angle.sin()
+    x, y = told.effect_mean[..., columns].double().unbind(-1)
+    u, v = told.effect_std[..., columns].double().square().unbind(-1)
+    effect = [c * x + s * y, c * y - s * x]
+    std = [(c**2 * u + s**2 * v).sqrt(), (s**2 * u + c**2 * v).sqrt()]
+    if "yaw" in model.effect_channels:
+        k = model.effect_channels.index("yaw")
+        effect.append(told.effect_mean[..., k].double())
+        std.append(told.effect_std[..., k].double())
+    else:
+        effect.append(torch.zeros_like(x))
+        std.append(torch.zeros_like(x))
+    return torch.stack(effect, dim=-1), torch.stack(std, dim=-1)
+
+
+@torch.no_grad()
+def map_effects(
+    model: EffectModel,
+    image: np.ndarray,
+    kind: type[Push] | type[Drag] = Push,
+    n_directions: int = N_DIRECTIONS,
+    n_phases: int = N_PHASES,
+) -> EffectMap:
+    """Ask a model about one object, from its depth image (2, 48, 48), once for all plans.
+
+    A model that foresees no yaw is taken to foresee none, and to be sure of it.
+    """
+    for name, value, least in (("n_directions", n_directions, 8), ("n_phases", n_phases, 5)):
+        if isinstance(value, bool) or not isinstance(value, int) or value < least:
+            raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}")
+    features = encode_image(model, image)
+    angles = np.arange(n_directions) * (2 * math.pi / n_directions)
+    t_target = torch.linspace(0, 1, n_phases).expand(n_directions, -1)
+    effect, std = _asked(model, features, kind, angles, t_target)
+    # Before contact nothing has happened; what a model says at t = 0 is no displacement.
+    effect = effect - effect[:, :1]
+    values = torch.cat([effect, std], dim=-1).numpy()
+    smooth = ndimage.spline_filter1d(values, axis=0, mode="grid-wrap")
+    smooth = ndimage.spline_filter1d(smooth, axis=1, mode="mirror")
+    smooth = np.pad(smooth, ((1, 2), (0, 0), (0, 0)), mode="wrap")
+    smooth = np.pad(smooth, ((0, 0), (1, 2), (0, 0)), mode="reflect")
+    reach = float(np.hypot(values[..., 0], values[..., 1]).max())
+    return EffectMap(kind, model, features, torch.from_numpy(smooth), reach)

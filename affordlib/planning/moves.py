@@ -1,0 +1,208 @@
+"""Plans of moves that the arm can follow: the learned model proposes, the kinematics vetoes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from affordlib.planning.routes import CELL_M, find_route, places
+from affordlib.types import Goal, Plan
+
+if TYPE_CHECKING:
+    from affordlib.perception import Percept
+    from affordlib.planning.effect_map import EffectMap
+    from affordlib.planning.modes import PlanMode
+    from affordlib.planning.repertoire import Reachable, Repertoire
+    from affordlib.planning.routes import Judge
+    from affordlib.primitives import Primitive
+    from affordlib.types import Step
+    from affordlib.world import Tabletop
+
+MAX_VETOES = 12
+"""Of plans to one place; then another way is looked for."""
+
+MAX_REFUSED_WAYS = 150
+BARRED_M, BARRED_RAD = 0.01, math.radians(6)
+WAYPOINT_M = 0.01
+
+
+class Ended(Exception):
+    """A pursuit has come to an end: its ending, and the words for it."""
+
+
+@dataclass(frozen=True)
+class Demands:
+    """How exactly a goal is to be met, with how many actions, by which planner; see `pursue`."""
+
+    planner: Callable[..., Plan]
+    mode: PlanMode
+    tolerance_m: float
+    turn_tolerance_rad: float
+    height_tolerance_m: float
+    max_actions: int | None
+    on_action: Callable[[Plan, int], Goal | None] | None
+
+
+class MovePlanner:
+    """Finds steps towards a position; remembers what the kinematics has refused.
+
+    plans: all that were accepted; vetoes: how often the kinematics said no.
+    """
+
+    def __init__(self, world: Tabletop, repertoire: Repertoire, demands: Demands) -> None:
+        self.world, self.repertoire, self.demands = world, repertoire, demands
+        self.plans: list[Plan] = []
+        self.vetoes = 0
+        self._barred: list[tuple[str, np.ndarray, float]] = []
+        self._barred_moves: dict[str, list[tuple[int, int, int]]] = {}
+
+    def steps(self, seen: Percept, goal: Goal, so_far: str) -> list[Step]:
+        """The steps of a plan, from where the object is seen, that the arm can follow.
+
+        Raises `Ended` where there is none; so_far: what to say has been done.
+        """
+        effects = self.repertoire.effects(seen.image)
+        aim = replace(goal, tolerance_m=self.demands.tolerance_m)
+        off = aim.distance_m(seen.xy_m)
+        plan = None
+        if off <= self.demands.mode.max_steps * effects.reach_m:
+            plan = self._plan_to(effects, seen, aim, self.demands.tolerance_m)
+        if plan is None:
+            way = self._way(effects, seen, goal)
+            if way is None:
+                x, y = goal.xy_m
+                raise Ended(
+                    "unreachable",
+                    f"the position ({x:.3f}, {y:.3f}) m: from where the object is, no chain of "
+                    "actions that the arm can carry out leads there",
+                )
+            plan = self._plan_along(effects, seen, goal, way)
+        if plan is None:
+            raise Ended(
+                "gave_up",
+                f"after {so_far}: no action is foreseen to bring the object nearer to its "
+                f"position than {1000 * off:.1f} mm",
+            )
+        self.plans.append(plan)
+        return list(plan.steps)
+
+    def _plan_along(
+        self, effects: EffectMap, seen: Percept, goal: Goal, way: list[tuple[float, float]]
+    ) -> Plan | None:
+        """A plan that goes as far along a way as it can, straight ahead if a way leads on."""
+        here, ahead = np.array(seen.xy_m), np.subtract(goal.xy_m, seen.xy_m)
+        farthest = 0.98 * self.demands.mode.max_steps * effects.reach_m
+        off = float(np.hypot(*ahead))
+        routes = self.repertoire.routes(effects.kind)
+        stops = [tuple(place) for place in way if math.dist(here, place) <= farthest]
+        if off > farthest:
+            straight = tuple((here + farthest / off * ahead).tolist())
+            barred = self._barred_moves[effects.kind.name]
+            if find_route(routes, straight, goal.xy_m, self._judged(effects.kind), barred):
+                stops.append(straight)
+        for stop in reversed(stops):
+            last = stop == tuple(goal.xy_m)
+            within = max(self.demands.tolerance_m, 0.5 * off) if last else WAYPOINT_M
+            plan = self._plan_to(effects, seen, Goal(stop, self.demands.tolerance_m), within)
+            if plan is not None:
+                return plan
+        return None
+
+    def _plan_to(
+        self, effects: EffectMap, seen: Percept, aim: Goal, within_m: float
+    ) -> Plan | None:
+        """A plan that ends within a distance of a goal and that the kinematics lets pass."""
+        kind = effects.kind
+        for _ in range(MAX_VETOES):
+            plan = self.demands.planner(
+                self.repertoire.model(kind),
+                seen.image,
+                seen.xy_m,
+                aim,
+                self.demands.mode,
+                kind,
+                effects=effects,
+                reachable=self._allowed(kind),
+            )
+            if not plan.steps or plan.predicted_distance_m > within_m:
+                return None
+            if not self._vetoed(plan):
+                return plan
+        return None
+
+    def _allowed(self, kind: type[Primitive]) -> Reachable:
+        """Where the arm can act: what was learned, less what its kinematics has refused."""
+        learned = self.repertoire.reachable(kind)
+        barred = [(xy, angle) for name, xy, angle in self._barred if name == kind.name]
+
+        def judge(xy_m: np.ndarray, direction_rad: np.ndarray) -> np.ndarray:
+            good = np.ones(len(xy_m), bool) if learned is None else learned(xy_m, direction_rad)
+            for xy, angle in barred:
+                near = np.hypot(*(xy_m - xy).T) < BARRED_M
+                off = (direction_rad - angle + np.pi) % (2 * np.pi) - np.pi
+                good = good & ~(near & (np.abs(off) < BARRED_RAD))
+            return good
+
+        return judge
+
+    def _judged(self, kind: type[Primitive]) -> Judge:
+        """The same, of actions of any length."""
+        allowed = self._allowed(kind)
+        return lambda xy_m, direction_rad, _: allowed(xy_m, direction_rad)
+
+    def _vetoed(self, plan: Plan) -> bool:
+        """Whether the arm's kinematics refuses a step; that place and direction are barred then."""
+        at = plan.start_xy_m
+        for step in plan.steps:
+            if not self.world.can_reach(step.primitive, step.stop_phase, at):
+                self._bar(step.primitive, at)
+                return True
+            at = step.predicted_end_xy_m
+        return False
+
+    def _bar(self, action: Primitive, xy_m: tuple[float, float]) -> None:
+        self.vetoes += 1
+        self._barred.append((action.name, np.array(xy_m), action.direction_rad))
+
+    def _way(
+        self, effects: EffectMap, seen: Percept, goal: Goal
+    ) -> list[tuple[float, float]] | None:
+        """Places on the way to a goal, every action of it checked by the kinematics."""
+        kind = effects.kind
+        routes = self.repertoire.routes(kind)
+        barred = self._barred_moves.setdefault(kind.name, [])
+        x, y = places()
+        for _ in range(MAX_REFUSED_WAYS):
+            way = find_route(routes, seen.xy_m, goal.xy_m, self._judged(kind), barred)
+            if way is None:
+                return None
+            at = seen.xy_m
+            for k, place in enumerate(way):
+                action, stop = _action_for(effects, np.subtract(place, at))
+                if not self.world.can_reach(action, stop, at):
+                    self._bar(action, at)
+                    if 0 < k < len(way) - 1:
+                        cell = np.argmin(abs(x[:, 0] - at[0])), np.argmin(abs(y[0] - at[1]))
+                        move = np.rint(np.subtract(place, at) / CELL_M)
+                        number = int(np.flatnonzero((routes.moves == move).all(axis=1))[0])
+                        barred.append((number, int(cell[0]), int(cell[1])))
+                    break
+                at = place
+            else:
+                return way
+        return None
+
+
+def _action_for(effects: EffectMap, move_m: np.ndarray) -> tuple[Primitive, float]:
+    """The action straight along a move (2,) [m], and the phase at which it has gone so far."""
+    angle = math.atan2(move_m[1], move_m[0])
+    phase = torch.linspace(0, 1, 101, dtype=torch.float64)
+    with torch.no_grad():
+        ahead = effects(torch.full_like(phase, angle), phase)[0][:, 0].numpy()
+    stop = float(phase[min(int(np.searchsorted(ahead, np.hypot(*move_m))), 100)])
+    return effects.kind.towards(angle), stop

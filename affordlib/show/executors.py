@@ -1,0 +1,53 @@
+"""How a plan is carried out while somebody watches: stops it, disturbs it, moves its goal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from affordlib.planning import carry_out, pursue
+from affordlib.types import Goal, Outcome, Plan
+
+if TYPE_CHECKING:
+    from affordlib.planning import Repertoire
+    from affordlib.world import Tabletop
+
+Planner = Callable[[np.ndarray, tuple[float, float], Goal], Plan]
+"""From an image, where the object is [m] and a goal to a plan."""
+
+Tell = Callable[[], Goal]
+"""Called after every action: shows it, lets what was waiting happen, returns the goal as it is by
+then. Raises `Stopped` when the reader wants no more."""
+
+Executor = Callable[["Tabletop", Plan, Planner, Tell], Outcome]
+
+
+class Stopped(Exception):
+    """The reader has pressed Stop: nothing more is carried out."""
+
+
+def open_loop(world: Tabletop, plan: Plan, planner: Planner, tell: Tell) -> Outcome:
+    """Carry out a plan as it was made, action by action, and measure where the object rests."""
+    paths: tuple[np.ndarray, ...] = ()
+    for step in plan.steps:
+        paths += carry_out(world, replace(plan, steps=(step,))).object_paths_xy_m
+        tell()
+    at_rest = carry_out(world, replace(plan, steps=()))
+    return replace(at_rest, plan=plan, object_paths_xy_m=paths)
+
+
+def closed_loop(repertoire: Repertoire) -> Executor:
+    """An executor that looks after every action and plans anew until the goal is reached.
+
+    It plans by itself, from what it sees, with the models of a repertoire.
+    """
+
+    def execute(world: Tabletop, plan: Plan, planner: Planner, tell: Tell) -> Outcome:
+        done = pursue(world, plan.goal, repertoire, on_action=lambda *_: tell())
+        tilt = world.object_tilt_rad()
+        return Outcome(plan, done.distance_m, done.end_pose, tilt, done.object_paths_xy_m)
+
+    return execute

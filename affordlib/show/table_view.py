@@ -1,0 +1,95 @@
+"""The table from above as a live picture in the notebook: it draws a scene and asks for a goal.
+
+Everything it needs is in this package; nothing is fetched from anywhere.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import anywidget
+import numpy as np
+import traitlets
+
+from affordlib.show.sentences import step_in_words
+from affordlib.types import TABLE_X_M, TABLE_Y_M
+from affordlib.world import BASE_X_M, REACH_M
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from affordlib.types import Goal, Step
+    from affordlib.world import Thing
+
+PUSH_RUN_UP_M = 0.2
+_HERE = Path(__file__).parent
+
+
+class TableView(anywidget.AnyWidget):
+    """Shows a `scene` and plays a `film`; what the reader asks for arrives in `asked`.
+
+    scene: as `make_scene` gives it. film: {"poses": [[x, y, yaw], ...], "seconds": s}, played when
+    it changes. asked: [x_m, y_m, number], the number growing, so that equal goals differ. Pressing
+    Enter or Escape on the table sends {"press": "run"} or {"press": "stop"}.
+    """
+
+    _esm = _HERE / "table_view.js"
+    _css = _HERE / "table_view.css"
+    scene = traitlets.Dict().tag(sync=True)
+    film = traitlets.Dict().tag(sync=True)
+    asked = traitlets.List([0.0, 0.0, 0]).tag(sync=True)
+
+
+def make_scene(
+    thing: Thing,
+    pose: Sequence[float],
+    goal: Goal,
+    steps: Sequence[Step],
+    start_xy_m: Sequence[float],
+    truth_xy_m: Sequence[np.ndarray],
+    half_width_m: float,
+    limit_m: float,
+    answered: int,
+    running: bool = False,
+) -> dict[str, Any]:
+    """What `TableView` draws, in metres.
+
+    pose: (x, y, yaw) of the object; steps: of the plan, from start_xy_m on; truth_xy_m: paths
+    (n, 2) that the object has gone; half_width_m: of the view; limit_m: how far from the middle a
+    goal may be asked for; answered: the number of the question that this answers; running:
+    whether the robot is at work, so that a film goes on.
+
+    The shaded ring is where an object can be pushed towards any side: as far within the tool's
+    reach as a push begins from the object.
+    """
+    inner, outer = REACH_M[0] + PUSH_RUN_UP_M, REACH_M[1] - PUSH_RUN_UP_M
+    starts = [start_xy_m, *(step.predicted_end_xy_m for step in steps)]
+    return {
+        "half_width": half_width_m,
+        "limit": limit_m,
+        "table": [*TABLE_X_M, *TABLE_Y_M],
+        "reach": {"centre": [BASE_X_M, 0.0], "inner": inner, "outer": outer},
+        "object": {"outline": rounded(thing.footprint_m), "pose": rounded(pose)},
+        "goal": {"xy": rounded(goal.xy_m), "tolerance": goal.tolerance_m},
+        "steps": [
+            {
+                "start": rounded(starts[k]),
+                "path": rounded(step.predicted_path_xy_m),
+                "end": rounded(step.predicted_end_xy_m),
+                "std": None if math.isnan(step.std_m) else round(step.std_m, 5),
+                "direction": getattr(step.primitive, "direction_rad", None),
+                "label": f"{k + 1}: {step_in_words(step)}",
+            }
+            for k, step in enumerate(steps)
+        ],
+        "truth": [rounded(path) for path in truth_xy_m],
+        "answered": answered,
+        "running": running,
+    }
+
+
+def rounded(values: Any) -> list:
+    """The numbers as nested lists, to a hundredth of a millimetre."""
+    return np.round(np.asarray(values, dtype=float), 5).tolist()

@@ -1,0 +1,127 @@
+"""Our networks against the `neuralprocesses` package on its own ground: curves of one dimension.
+
+Curves are drawn from a Gaussian process (squared exponential, length 0.25 of the range 2, noise
+0.05), observed at 1 to 10 points and asked at 50. Each pair has about as many parameters, sees the
+same batches of 16 for the same number of steps with the same optimiser, and is judged on the same
+curves: log-likelihood per target (mean ± standard error), and targets a second of one core.
+
+The package is no dependency; without it this says so and ends:
+    .venv/bin/pip install neuralprocesses==0.2.7
+"""
+
+import argparse
+import importlib.util
+import math
+import time
+
+import numpy as np
+import torch
+
+from affordlib.interactions import Normaliser
+from affordlib.models import AttentionConfig, CNPConfig, build
+from affordlib.models.network import gaussian_nll
+from affordlib.types import Observations
+
+BATCH, MOST, TARGETS = 16, 10, 50
+LENGTH, NOISE, RANGE = 0.25, 0.05, 2.0
+CHANNELS = {"action_channels": ("z",), "effect_channels": ("z",), "sigma_floor": 0.01}
+NO_SCALES = Normaliser((1.0,), (1.0,), (0.0, 0.0), (1.0, 1.0))
+
+
+def curves(n, generator):
+    """Phases and values: context (n, MOST), how many of it are seen (n,), target (n, TARGETS)."""
+    t = torch.rand(n, MOST + TARGETS, generator=generator, dtype=torch.float64)
+    distance = (t[:, :, None] - t[:, None]) * RANGE / LENGTH
+    covariance = (-distance.square() / 2).exp() + NOISE**2 * torch.eye(t.shape[1])
+    white = torch.randn(n, t.shape[1], 1, generator=generator, dtype=torch.float64)
+    y = (torch.linalg.cholesky(covariance) @ white).squeeze(2)
+    t, y = t.float(), y.float()
+    count = int(torch.randint(1, MOST + 1, (1,), generator=generator))
+    return t[:, :count], y[:, :count], t[:, MOST:], y[:, MOST:]
+
+
+def ours(config):
+    """Our network as a regression: y is the effect at phase t; no action, an empty image."""
+    model = build(config, NO_SCALES)
+
+    def likelihood(t_seen, y_seen, t, y):
+        n, none = len(t), torch.zeros(len(t), 1)
+        seen = torch.ones_like(t_seen, dtype=torch.bool)
+        observed = Observations(
+            none[..., None], none, none > 0, y_seen[..., None], t_seen, seen, none[:, 0]
+        )
+        _, _, mean, std = model.outputs(model.features(torch.zeros(1, 2, 48, 48)), observed, t)
+        return -gaussian_nll(y, mean[..., 0], std[..., 0]).reshape(n, -1)
+
+    return model, likelihood
+
+
+def theirs(attention, **sizes):
+    import neuralprocesses.torch as nps
+
+    make = nps.construct_agnp if attention else nps.construct_gnp
+    model = make(dim_x=1, dim_y=1, likelihood="het", **sizes)
+
+    def likelihood(t_seen, y_seen, t, y):
+        x_seen, x = (2 * v[:, None] - 1 for v in (t_seen, t))
+        told = model(x_seen, y_seen[:, None], x)
+        mean, variance = told.mean[:, 0], told.var[:, 0]
+        return -gaussian_nll(y, mean, variance.sqrt())
+
+    likelihood(*curves(2, torch.Generator().manual_seed(0)))  # its layers learn their sizes
+    return model, likelihood
+
+
+def trained(pair, steps, rate):
+    """Train; returns the log-likelihood per target of each judged curve and targets a second."""
+    model, likelihood = pair
+    optimiser = torch.optim.AdamW(model.parameters(), rate, weight_decay=0.0, fused=True)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
+    g = torch.Generator().manual_seed(1)
+    busy = 0.0
+    for _ in range(steps):
+        batch = curves(BATCH, g)
+        began = time.process_time()
+        loss = -likelihood(*batch).mean()
+        optimiser.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+        optimiser.step()
+        busy += time.process_time() - began
+        schedule.step()
+    g = torch.Generator().manual_seed(2)
+    with torch.no_grad():
+        told = torch.cat([likelihood(*curves(BATCH, g)).mean(dim=1) for _ in range(100)])
+    return told.numpy(), steps * BATCH * TARGETS / busy
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--steps", type=int, default=3000)
+    parser.add_argument("--rate", type=float, default=5e-4)
+    options = parser.parse_args()
+    if importlib.util.find_spec("neuralprocesses") is None:
+        print("neuralprocesses is not installed; .venv/bin/pip install neuralprocesses==0.2.7")
+        return
+    torch.set_num_threads(1)
+    pairs = {
+        "CNP, ours": lambda: ours(CNPConfig(**CHANNELS)),
+        "CNP, theirs": lambda: theirs(False, dim_embedding=256, width=512),
+        "attention, ours": lambda: ours(AttentionConfig(**CHANNELS, frame="table")),
+        "attention, theirs": lambda: theirs(True, dim_embedding=128, width=256),
+    }
+    for name, make in pairs.items():
+        torch.manual_seed(0)
+        pair = make()
+        size = sum(p.numel() for p in pair[0].parameters())
+        told, rate = trained(pair, options.steps, options.rate)
+        sem = told.std(ddof=1) / math.sqrt(len(told))
+        print(
+            f"{name:18} {size / 1e6:5.2f} M parameters   log-likelihood {np.mean(told):6.3f} "
+            f"± {sem:.3f}   {rate:8.0f} targets a second",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,72 @@
+import re
+import runpy
+
+import nbformat
+import pytest
+
+from affordlib.exercises import EXERCISES, check
+from affordlib.paths import repo_root
+from affordlib.profiles import notebook_paths
+
+NOTEBOOKS = repo_root() / "notebooks"
+PATHS = notebook_paths(NOTEBOOKS)
+SOLUTIONS = sorted((NOTEBOOKS / "solutions").glob("*.py"))
+ASKED = {name[:2] for name in EXERCISES}
+
+
+def test_the_chapters_with_checks_have_two_exercises_and_solutions():
+    assert {path.stem for path in SOLUTIONS} == {n for n in PATHS if n[:2] in ASKED}
+    assert all(sum(e[:2] == number for e in EXERCISES) >= 2 for number in ASKED)
+
+
+@pytest.mark.parametrize("path", SOLUTIONS, ids=lambda path: path.stem)
+def test_every_solution_passes(path):
+    verdicts = runpy.run_path(str(path))["VERDICTS"]
+    assert [v.name for v in verdicts] == [n for n in EXERCISES if n[:2] == path.stem[:2]]
+    for verdict in verdicts:
+        assert verdict.passed, str(verdict)
+        assert "; expected" in str(verdict)
+
+
+@pytest.mark.parametrize("name", [n for n in PATHS if n[:2] in ASKED])
+def test_the_notebook_asks_each_exercise_and_leaves_it_open(name):
+    cells = nbformat.read(PATHS[name], as_version=4).cells
+    asked = re.findall(r'check\("(\d\d\.\d)"', "\n".join(c.source for c in cells))
+    assert asked == [n for n in EXERCISES if n[:2] == name[:2]]
+    shown = [
+        output["data"]["text/plain"]
+        for cell in cells
+        if "check(" in cell.source
+        for output in cell.get("outputs", [])
+        if "data" in output
+    ]
+    assert len(shown) == len(asked)
+    assert all("not attempted" in text for text in shown)
+
+
+@pytest.mark.parametrize("attempt", [None, ..., lambda *_: None, lambda *_: ...])
+def test_what_is_not_attempted(attempt):
+    verdict = check("01.1", attempt)
+    assert (verdict.status, verdict.passed) == ("not attempted", False)
+    assert "Write speed_m_s(t)" in str(verdict)
+
+
+@pytest.mark.parametrize(
+    ("name", "attempt", "says"),
+    [
+        ("01.1", lambda t: 0.0, "failed, 125 mm/s off at worst; expected 0 ± 0.1 mm/s"),
+        ("01.1", lambda t: 1 / 0, "failed (ZeroDivisionError: division by zero); expected"),
+        ("01.1", 3.0, "failed (TypeError"),
+        ("01.2", 1.0, "failed, 9.5"),
+        ("01.2", 7.0, "failed (ValueError: stop_phase must lie in [0, 1]"),
+        ("02.1", 7.5, "failed, 7.5 mm; expected 0.076 ± 0.005 mm"),
+        ("02.2", lambda d: 0.05 + d / 2, "failed, 5.2"),
+    ],
+)
+def test_a_wrong_answer_fails_and_says_by_how_much(name, attempt, says):
+    assert says in str(check(name, attempt))
+
+
+def test_an_unknown_exercise_is_refused():
+    with pytest.raises(ValueError, match=r"exercise '09\.9' is unknown; there are 01\.1"):
+        check("09.9", 1)

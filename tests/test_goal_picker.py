@@ -1,0 +1,287 @@
+import base64
+import io
+import json
+import math
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from affordlib.interactions import open_interactions
+from affordlib.plan_files import load_plan, save_plan
+from affordlib.planning import Repertoire, carry_out, plan_astar
+from affordlib.primitives import Drag, Push, Rotate
+from affordlib.show import GoalPicker
+from affordlib.show.executors import closed_loop, open_loop
+from affordlib.show.table_view import TableView
+from affordlib.types import Goal, Plan, Step
+from affordlib.world import BASE_X_M, REACH_M, Cuboid
+
+
+@pytest.fixture
+def asked_of_planner():
+    return []
+
+
+@pytest.fixture
+def make_picker(world, trained, asked_of_planner, tmp_path):
+    world.place(Cuboid(0.06, 0.05, 0.05))
+
+    def astar(*query):
+        asked_of_planner.append(query[2].xy_m)
+        return plan_astar(trained, *query)
+
+    def broken(*_):
+        raise ValueError("no <plan> today")
+
+    def make(**options):
+        options = {"folder": str(tmp_path), "seconds_per_action": 0.0} | options
+        return GoalPicker(world, {"A*": astar, "broken": broken}, goal_xy_m=(0.12, 0.0), **options)
+
+    return make
+
+
+@pytest.fixture
+def picker(make_picker):
+    return make_picker()
+
+
+def wait_until(condition, seconds=20.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.005)
+
+
+def test_a_picked_goal_is_planned_for_drawn_and_reached(picker, world):
+    picker.pick(0.05, 0.12)
+    assert picker.plan.goal.xy_m == (0.05, 0.12)
+    scene = picker._view.scene
+    assert scene["goal"]["xy"] == [0.05, 0.12]
+    assert len(scene["steps"]) == len(picker.plan.steps) > 0
+    for drawn, step in zip(scene["steps"], picker.plan.steps, strict=True):
+        np.testing.assert_allclose(drawn["path"], step.predicted_path_xy_m, atol=1e-5)
+        assert drawn["direction"] == step.primitive.direction_rad
+        assert f"push to {100 * step.stop_phase:.0f} %" in drawn["label"]
+    picker.run()
+    assert picker.outcome.distance_m == pytest.approx(
+        picker.plan.goal.distance_m(world.object_pose()[:2])
+    )
+    assert "mm</b> from the goal" in picker._words.value
+    assert not picker._run_button.disabled
+    truth = np.vstack(picker._view.scene["truth"])
+    np.testing.assert_allclose(truth[-1], world.object_pose()[:2], atol=1e-3)
+    np.testing.assert_allclose(picker._view.scene["object"]["pose"], world.object_pose(), atol=1e-5)
+
+
+def test_the_picker_carries_out_what_a_plain_call_would(picker, world):
+    plan = picker.plan
+    picker.run()
+    seen = picker.outcome
+    picker.start_over()
+    assert world.object_pose() == pytest.approx((0, 0, 0), abs=1e-12)
+    plain = carry_out(world, plan)
+    assert seen.end_pose == plain.end_pose
+    assert seen.distance_m == plain.distance_m
+    for a, b in zip(seen.object_paths_xy_m, plain.object_paths_xy_m, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_what_the_view_asks_is_answered_once(picker, asked_of_planner):
+    before = len(asked_of_planner)
+    for number, xy in enumerate([(0.081, 0.033), (0.081, 0.033), (-0.05, 0.1234)], 1):
+        picker._view.asked = [*xy, number]
+        assert picker._view.scene["answered"] == number
+    wanted = [(0.081, 0.033), (0.081, 0.033), (-0.05, 0.123)]
+    assert asked_of_planner[before:] == wanted  # once each: no slider has echoed
+    assert (picker._x.value, picker._y.value) == (-5.0, 12.3)
+    assert picker.plan.goal.xy_m == (-0.05, 0.123)
+
+
+def test_sliders_pick(picker, asked_of_planner):
+    picker._x.value = 7.7
+    picker._y.value = -4.0
+    assert asked_of_planner[-2:] == [(0.077, 0.0), (0.077, -0.04)]
+    assert picker._view.scene["goal"]["xy"] == [0.077, -0.04]
+
+
+def test_the_picker_shows_its_errors(picker):
+    picker._planner.value = "broken"
+    assert "<b>ValueError</b>: no &lt;plan&gt; today" in picker._words.value
+    assert picker._view.scene["steps"] == []
+    with pytest.raises(ValueError, match="off the table"):
+        picker.pick(5.0, 0.0)
+    with pytest.raises(RuntimeError, match="no plan to save"):
+        picker.save()
+    picker._planner.value = "A*"
+    assert picker._words.value.count("Plan: ") == 1
+    picker._view.asked = [0.1, 0.0, 1]
+    assert picker._view.scene["steps"]
+
+
+def test_stop_lets_an_action_end_and_begins_no_other(make_picker, world):
+    picker = make_picker(seconds_per_action=30.0)
+    picker.pick(0.24, 0.0)
+    assert len(picker.plan.steps) > 1
+    picker._run_button.click()
+    wait_until(lambda: picker._progress.value == 1)
+    assert picker._stop_button.disabled is False
+    assert picker._run_button.disabled
+    with pytest.raises(RuntimeError, match="still at work"):
+        picker.run()
+    picker._stop_button.click()
+    wait_until(lambda: not picker._work.is_alive())
+    assert "Stopped after 1 action:" in picker._words.value
+    first = picker.plan.steps[0].predicted_end_xy_m
+    assert math.dist(world.object_pose()[:2], first) < 0.03
+    assert not picker._run_button.disabled
+
+
+def test_a_run_is_filmed_at_the_pace_of_the_eye(make_picker):
+    picker = make_picker(seconds_per_action=0.2)
+    films = []
+    picker._view.observe(lambda change: films.append(change["new"]), names="film")
+    picker._view._handle_custom_msg({"press": "run"}, [])
+    wait_until(lambda: not picker._work.is_alive())
+    assert [film["seconds"] for film in films] == [0.2] * len(picker.plan.steps)
+    poses = np.vstack([film["poses"] for film in films])
+    assert len(poses) > 20
+    assert np.hypot(*np.diff(poses[:, :2], axis=0).T).max() < 0.03
+    np.testing.assert_allclose(poses[-1, :2], picker.outcome.end_pose[:2], atol=1e-3)
+    assert picker.world.film is None
+
+
+def test_a_disturbance_waits_for_the_end_of_the_action(make_picker, world):
+    seen = []
+
+    def executor(world, plan, planner, tell):
+        before = world.object_pose()
+        picker.shove_object()
+        picker.move_goal()
+        assert world.object_pose() == before
+        goal = tell()
+        seen.append((before, world.object_pose(), goal))
+        return open_loop(world, planner(world.look(), world.object_pose()[:2], goal), planner, tell)
+
+    picker = make_picker(executors={"mine": executor}, seed=3)
+    first_goal = picker.plan.goal
+    picker.run()
+    (before, after, goal) = seen[0]
+    assert 0.019 < math.dist(before[:2], after[:2]) < 0.041
+    assert 0.039 < math.dist(first_goal.xy_m, goal.xy_m) < 0.081
+    assert picker._view.scene["goal"]["xy"] == list(goal.xy_m)
+    assert picker.outcome.distance_m == pytest.approx(goal.distance_m(world.object_pose()[:2]))
+
+
+def test_a_closed_loop_notices_what_an_open_loop_does_not(make_picker, trained):
+    executors = {"open loop": open_loop, "closed loop": closed_loop(Repertoire({"push": trained}))}
+    off_m = {}
+    for name in executors:
+        picker = make_picker(executors=executors, seconds_per_action=1.0, seed=5)
+        picker._executor.value = name
+        picker.pick(0.2, 0.0)
+        picker._run_button.click()
+        wait_until(lambda picker=picker: picker._progress.value == 1)
+        picker._goal_button.click()
+        picker._shove_button.click()
+        wait_until(lambda picker=picker: not picker._work.is_alive())
+        assert picker.outcome.distance_m == pytest.approx(
+            picker._goal.distance_m(picker.world.object_pose()[:2])
+        )
+        off_m[name] = picker.outcome.distance_m
+        picker.start_over()
+    assert off_m["closed loop"] < 0.01 < 0.03 < off_m["open loop"]
+
+
+def test_disturbances_are_seeded_and_planned_for(make_picker, world):
+    ends = []
+    for seed in (1, 1, 2):
+        picker = make_picker(seed=seed)
+        picker._shove_button.click()
+        ends.append(world.object_pose())
+        assert picker.plan.start_xy_m == ends[-1][:2]
+        picker._goal_button.click()
+        assert picker.plan.goal.xy_m != (0.12, 0.0)
+        picker._over.click()
+        assert picker.plan.start_xy_m == pytest.approx((0.0, 0.0), abs=1e-12)
+    assert ends[0] == ends[1] != ends[2]
+
+
+def test_a_saved_picker_leaves_its_picture(picker):
+    data = base64.b64decode(picker._repr_mimebundle_()["image/png"])
+    assert Image.open(io.BytesIO(data)).size[0] > 300
+
+
+def test_the_view_carries_all_it_draws_with():
+    source = TableView._esm if isinstance(TableView._esm, str) else str(TableView._esm)
+    style = TableView._css if isinstance(TableView._css, str) else str(TableView._css)
+    assert "export default { render }" in source
+    assert "://" not in source.replace('"http://www.w3.org/2000/svg"', "") + style
+
+
+# Plans as files
+
+
+def test_a_plan_comes_back_from_its_file(picker, world, tmp_path):
+    picker.pick(0.1, 0.15)
+    plan = picker.plan
+    picker.save("mine.json")
+    picker.pick(0.0, -0.1)
+    picker.load("mine.json")
+    assert picker._goal == plan.goal
+    assert picker._x.value == 10.0
+    back = picker.plan
+    assert replace(back, steps=()) == replace(plan, steps=())
+    for a, b in zip(back.steps, plan.steps, strict=True):
+        assert (a.primitive, a.stop_phase, a.std_m) == (b.primitive, b.stop_phase, b.std_m)
+        np.testing.assert_array_equal(a.predicted_path_xy_m, b.predicted_path_xy_m)
+    picker.run()
+    assert "mm</b> from the goal" in picker._words.value
+    picker.load("mine.json")
+    assert "from where this plan starts" in picker._words.value
+
+
+@pytest.mark.parametrize("primitive", [Push(0.3, length=0.02), Drag(1.0), Rotate()])
+def test_any_primitive_and_a_decoded_path_come_back(primitive, tmp_path):
+    path = np.array([[0.0, 0.1], [1 / 3, 0.2]])
+    step = Step(primitive, 0.7, (0.1, 0.2), path, path_xy_m=path / 7)
+    plan = Plan(Goal((0.1, 0.2), 0.005), (0.0, 0.0), (step,), "any", False, 3, 0.1)
+    file = save_plan(tmp_path / "new" / "plan.json", plan)
+    (back,) = load_plan(file).steps
+    assert back.primitive == primitive
+    assert math.isnan(back.std_m)
+    np.testing.assert_array_equal(back.path_xy_m, path / 7)
+    assert json.loads(file.read_text())["steps"][0]["std_m"] is None
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("{", "holds no plan"),
+        ("{}", "'goal' is missing"),
+        ('{"goal": {"xy_m": [9, 9], "tolerance_m": 0.02}}', "off the table"),
+    ],
+)
+def test_a_file_without_a_plan_is_refused(text, why, picker, tmp_path):
+    (tmp_path / "bad.json").write_text(text)
+    with pytest.raises(ValueError, match=why):
+        picker.load("bad.json")
+
+
+# What is drawn as being in reach
+
+
+def test_the_ring_is_where_the_arm_can_push_from(world):
+    data = open_interactions("reach")
+    pushes = data["primitive"].values == 0
+    xy = data["believed_xy"].values[pushes]
+    theta = data["theta"].values[pushes]
+    along = np.linspace(0.2, -0.05, 6)[:, None, None]
+    places = xy + along * np.column_stack([np.cos(theta), np.sin(theta)])
+    far = np.hypot(places[..., 0] - BASE_X_M, places[..., 1])
+    inside = ((REACH_M[0] <= far) & (far <= REACH_M[1])).all(axis=0)
+    reached = data["reached"].values[pushes].astype(bool)
+    assert (inside == reached).mean() > 0.93
+    assert reached[inside].mean() > 0.97

@@ -1,0 +1,80 @@
+import math
+
+import pytest
+from dask.distributed import Client
+from test_workbook import Book
+
+from affordlib.profiles import WorkbookError
+from affordlib.results import read_results
+from affordlib.seeds import gather, main, over_seeds, run_seeds
+
+
+def rows(a, b):
+    return [
+        {"planner": "astar", "n": 4, "mean_m": a, "reached": True},
+        {"planner": "astar", "n": 4, "mean_m": 2 * a, "reached": True},
+        {"planner": "gradient", "n": 4, "mean_m": b, "reached": b < 1},
+    ]
+
+
+def test_rows_that_agree_in_words_become_one_with_mean_and_deviation():
+    table = over_seeds([rows(1.0, 0.5), rows(2.0, 0.7), rows(6.0, 3.0)])
+    assert [(row["planner"], row["seeds"], row["reached"]) for row in table] == [
+        ("astar", 3, True),
+        ("astar", 3, True),
+        ("gradient", 2, True),
+        ("gradient", 1, False),
+    ]
+    assert (table[0]["mean_m"], table[1]["mean_m"]) == (3.0, 6.0)
+    assert table[0]["sd_mean_m"] == pytest.approx(math.sqrt(7.0))
+    assert (table[0]["n"], "sd_n" in table[0]) == (4, False)
+    assert (table[3]["mean_m"], "sd_mean_m" in table[3]) == (3.0, False)
+
+
+@pytest.fixture
+def book(tmp_path):
+    book = Book(tmp_path)
+    book.add("01_first", 'tables = {"out": [{"what": "a", "length_m": 0.001 * seed}]}')
+    text = book.path("01_first").read_text().replace("tables={}", "tables=tables")
+    book.path("01_first").write_text(text)
+    return book
+
+
+def run(book, seeds, client=None):
+    def command(arguments):
+        return book.command(*arguments)
+
+    run_seeds(seeds, "mine", ["--profile", "reader"], client, command)
+
+
+def test_seeds_side_by_side_are_gathered_into_one_table_and_page(book):
+    with Client(processes=False, dashboard_address=None, n_workers=2) as client:
+        run(book, [1, 3], client)
+    runs = book.layout.runs
+    folders = {seed: runs / f"mine-seed{seed}" for seed in (1, 3)}
+    page = gather(folders, runs / "mine-seeds")
+    document = read_results(runs / "mine-seeds" / "01_first.json")
+    assert document["parameters"] == {"seeds": [1, 3]}
+    (row,) = document["tables"]["out"]
+    assert row == {
+        "seeds": 2,
+        "what": "a",
+        "length_m": pytest.approx(0.002),
+        "sd_length_m": pytest.approx(0.001 * math.sqrt(2)),
+    }
+    text = page.read_text()
+    assert "Seeds 1, 3." in text
+    assert "sd length, mm" in text
+    assert ">1.41<" in text
+
+
+def test_a_seed_that_fails_is_named_and_the_others_run(book):
+    book.add("02_second", "assert seed != 1, 'no luck'")
+    with pytest.raises(WorkbookError, match=r"(?s)^seed 1:.*no luck"):
+        run(book, [1, 2])
+    assert book.log("mine-seed2") == ["01_first", "02_second"]
+
+
+def test_seeds_must_differ(capsys):
+    assert main(["1", "1"]) == 1
+    assert "SEEDS must differ and be 0 or more, got [1, 1]" in capsys.readouterr().err

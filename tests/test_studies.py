@@ -1,0 +1,117 @@
+"""What is left out in an ablation is left out and nothing else; what rolls is read from images."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from affordlib.evaluation import studies
+from affordlib.evaluation.ablation import actions_only, half_blend, random_contexts
+from affordlib.evaluation.studies import cka, read_study
+from affordlib.interactions import TrainingArrays, open_interactions, split_interactions
+from affordlib.interactions.batches import sample_batch
+from affordlib.models.rollability import learn_rollability
+from affordlib.paths import repo_root
+from affordlib.results import read_results
+from affordlib.world import LyingCylinder, UprightCylinder
+
+
+@pytest.fixture(scope="module")
+def rolls():
+    mixed = open_interactions("mixed")
+    split = split_interactions(mixed.sizes["interaction"])
+    return learn_rollability(mixed, split.train), mixed, split
+
+
+@torch.no_grad()
+def test_what_rolls_is_learned_from_images(rolls):
+    model, mixed, split = rolls
+    right = []
+    for data, rows in ((mixed, split.test), (open_interactions("partial"), slice(None))):
+        told = model(torch.from_numpy(data["image"].values[rows])) > 0.5
+        right.append(told.numpy() == data["rollable"].values[rows])
+    assert np.concatenate(right).mean() >= 0.98
+
+
+@torch.no_grad()
+def test_both_poses_of_a_cylinder_are_told_apart(rolls, world):
+    model, *_ = rolls
+    for diameter, length in ((0.045, 0.07), (0.05, 0.08)):
+        told = []
+        for pose in (UprightCylinder(diameter, length), LyingCylinder(length, diameter)):
+            world.place(pose, (0.0, 0.0), 0.3)
+            told.append(float(model(torch.from_numpy(np.array(world.look()))[None])))
+        assert told[0] < 0.5 < told[1]
+
+
+def test_rollability_wants_both_kinds(pushes):
+    with pytest.raises(ValueError, match="objects that roll and of such that do not"):
+        learn_rollability(pushes, np.arange(10))
+
+
+def test_alignment_of_codes():
+    generator = torch.Generator().manual_seed(0)
+    a, b = (torch.randn(2000, 6, generator=generator) for _ in range(2))
+    turn, _ = torch.linalg.qr(torch.randn(6, 6, generator=generator))
+    assert cka(a, 3 * a @ turn + 1) == pytest.approx(1, abs=1e-5)
+    assert cka(a, b) < 0.02
+    assert cka(a, torch.ones(2000, 3)) is None
+
+
+def test_draws_leave_out_one_thing_each(pushes):
+    arrays = TrainingArrays.from_dataset(pushes, np.arange(80))
+    rows = torch.arange(80)
+
+    def drawn(draw):
+        return draw(arrays, rows, 4, 6, torch.Generator().manual_seed(0))
+
+    plain, blended = drawn(sample_batch), drawn(half_blend)
+    both = (plain.observations.weight > 0) & (plain.observations.weight < 1)
+    assert both.sum() > 10
+    assert (blended.observations.weight[both] == 0.5).all()
+    same = dataclasses.replace(blended.observations, weight=plain.observations.weight)
+    for field in dataclasses.fields(same):
+        assert torch.equal(getattr(same, field.name), getattr(plain.observations, field.name))
+    seen = drawn(actions_only).observations
+    assert not seen.effect_mask.any()
+    assert seen.action_mask.any(dim=1).all()
+    assert torch.equal(
+        seen.action_mask[plain.observations.weight == 1],
+        plain.observations.action_mask[plain.observations.weight == 1],
+    )
+    loose = drawn(random_contexts).observations
+    firsts = [(o.action_t[:, 0] == 0).float().mean() for o in (plain.observations, loose)]
+    assert firsts[0] > 0.3
+    assert firsts[1] < 0.1
+    at = (loose.action_t * (len(arrays.phase) - 1)).round().long()
+    assert torch.equal(loose.action, arrays.action[rows[:, None], at])
+
+
+def test_stale_studies_are_refused(tmp_path, monkeypatch):
+    assert read_study("latent", tmp_path) is None
+    monkeypatch.setattr(studies, "STUDIES", {"small": (lambda: [{"x": 1.0}], ("grasp",), ())})
+    studies.main(["--only", "small", "--out", str(tmp_path)])
+    assert read_study("small", tmp_path) == [{"x": 1.0}]
+    told = json.loads((tmp_path / "small.json").read_text())
+    (tmp_path / "small.json").write_text(json.dumps(told | {"data_sha256": {"grasp": "old"}}))
+    with pytest.raises(ValueError, match=r"small\.json has another data_sha256 .* --only small"):
+        read_study("small", tmp_path)
+
+
+def test_the_committed_studies_tell_the_story():
+    tables = read_results(repo_root() / "data" / "results" / "effect_prediction.json")["tables"]
+    left_out = {row["change"]: row["final_error_mean_m"] for row in tables["ablation"]}
+    for change in ("no image", "table frame", "metres, not standardised"):
+        assert left_out[change] > 1.5 * left_out["nothing"]
+    held_out = [r for r in tables["rollability"] if r["test"] in ("mixed", "partial")]
+    shares = [(r["learned_percent"], r["n"]) for r in held_out if r["object_class"] == "all"]
+    assert sum(share * n for share, n in shares) / sum(n for _, n in shares) >= 98
+    effect, action = (
+        next(r for r in tables["latent"] if r["model"] == "push_cnp" and r["observed"] == kind)
+        for kind in ("effect", "action")
+    )
+    assert effect["cka_action_effect"] > 0.9  # one affordance, told by either
+    assert effect["cosine_to_action"] > effect["cosine_to_other"] + 0.2
+    assert action["action_start_mean_m"] < 0.01

@@ -1,0 +1,73 @@
+import base64
+import io
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from affordlib.models.protocol import observe_actions
+from affordlib.primitives import Push
+from affordlib.show import ConditioningExplorer, PhaseSlider
+from affordlib.world import Cuboid
+
+
+@pytest.fixture
+def push(world):
+    world.place(Cuboid(0.07, 0.05, 0.05), (0.02, -0.01), 0.4)
+    return world.interact(Push.towards(0.6))
+
+
+@pytest.fixture
+def slider(world):
+    world.place(Cuboid(0.07, 0.05, 0.05), (0.02, -0.01), 0.4)
+    return PhaseSlider(world, Push.towards(0.6), phase=0.8)
+
+
+@pytest.fixture
+def explorer(trained, push):
+    return ConditioningExplorer(trained, push)
+
+
+def test_a_stop_leaves_the_object_where_the_slider_said(slider):
+    before = slider._image.value
+    slider._stop.click()
+    expected = slider.expected(0.8)
+    assert np.hypot(*(expected[:2] - slider.rest[0.8][:2])) < 1e-3
+    assert np.hypot(*(expected[:2] - (0.02, -0.01))) > 0.03
+    assert slider._image.value != before
+    assert "Stopped there, it rests <b>" in slider._words.value
+    slider._phase.value = 0.3
+    assert "has moved 0.0 cm" in slider._words.value
+    slider._stop.click()
+    assert slider.rest[0.3] == pytest.approx((0.02, -0.01, 0.4), abs=1e-4)
+
+
+def test_what_is_observed_decides_what_is_foreseen(explorer, trained, push):
+    alone = explorer.prediction.effect_mean
+    told = observe_actions(trained, [push.primitive])
+    t = torch.linspace(0, 1, 101)[None]
+    with torch.no_grad():
+        plain = trained.predict(trained.encode(torch.tensor(push.image)[None]), told, t)
+    torch.testing.assert_close(alone, plain.effect_mean, atol=1e-5, rtol=1e-4)
+    explorer._has_effect.value = True
+    torch.testing.assert_close(explorer.prediction.effect_mean, alone)  # w₁ = 1: not listened to
+    explorer._weight.value = 0.5
+    assert (explorer.prediction.effect_mean - alone).abs().max() > 1e-4
+    explorer.observe_at(action_t=None, effect_t=1.0, weight=1.0)
+    assert float(explorer.observations().weight) == 0.0
+    end = explorer.prediction.effect_mean[0, -1, :2].numpy()
+    assert np.hypot(*(end - push.effect[-1, :2])) < 0.03
+
+
+def test_with_nothing_observed_it_says_so(explorer):
+    before = explorer._image.value
+    explorer._has_action.value = False
+    assert "<b>ValueError</b>: nothing is observed" in explorer._words.value
+    assert explorer._image.value == before
+
+
+@pytest.mark.parametrize("name", ["slider", "explorer"])
+def test_saved_widgets_leave_their_pictures(name, request):
+    bundle = request.getfixturevalue(name)._repr_mimebundle_()
+    assert Image.open(io.BytesIO(base64.b64decode(bundle["image/png"]))).size[0] > 800
