@@ -309,7 +309,7 @@ def _columns(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None) -
     if columns is None:
         return there
     for name in columns:
-        if name not in there:
+        if rows and name not in there:
             raise ValueError(f"columns: {name!r} is not in the table; it has {', '.join(there)}")
     return list(columns)
 

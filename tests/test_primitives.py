@@ -180,8 +180,8 @@ def test_the_arm_says_which_tool_it_needs(world):
 @pytest.mark.parametrize("name", ["push", "drag", "rotate", "grasp"])
 @pytest.mark.parametrize("smooth", [True, False])
 def test_stopped_anywhere_it_rests_where_the_full_one_was(world, name, smooth):
-    gaps = []
-    for index, stop in enumerate((0.6, 0.7, 0.8, 0.9)):
+    held, slipped = [], []
+    for index, stop in enumerate((0.6, 0.7, 0.8, 0.9) * 2):
         _, full = interact(RECIPES[name], index, world)
         then = np.array([np.interp(stop, full.phase, effect) for effect in full.effect.T])
         recipe = RECIPES[name]
@@ -189,10 +189,13 @@ def test_stopped_anywhere_it_rests_where_the_full_one_was(world, name, smooth):
         thing, start = world.thing, full.start_pose
         world.place(thing, start[:2], start[2], config=recipe.world)
         part = world.interact(full.primitive, stop, smooth=smooth)
-        gaps.append(math.dist(part.rest_effect[:3], then[:3]))
-    assert np.median(gaps) < 0.001
-    # A badly grasped object goes on slipping through the fingers.
-    assert max(gaps) < (0.015 if name == "grasp" else 0.003)
+        lost = name == "grasp" and not full.success
+        (slipped if lost else held).append(math.dist(part.rest_effect[:3], then[:3]))
+    assert len(held) >= 4
+    assert np.median(held) < 0.001
+    assert max(held) < 0.003
+    # What has slipped from the fingers may still be rolling when the arm stops.
+    assert max(slipped, default=0) < 0.015
 
 
 def test_what_the_arm_cannot_reach_is_recorded_and_moves_nothing(world):
