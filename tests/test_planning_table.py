@@ -52,7 +52,7 @@ def test_rows_are_told_for_all_for_groups_and_for_classes():
 def test_pairs_are_of_the_same_goals():
     parts = {
         "continuous": records([0.001, 0.002, 0.001]) + records([0.004], "sphere"),
-        "astar": records([0.011, 0.012, 0.011]),
+        "gradient_direction": records([0.011, 0.012, 0.011]),
     }
     (row,) = paired_rows(parts)
     assert row["n"] == 3
@@ -62,15 +62,40 @@ def test_pairs_are_of_the_same_goals():
 
 
 def test_a_task_survives_the_file():
-    for task in frozen_tasks()[:4]:
+    for task in frozen_tasks()[:4] + frozen_tasks("varied")[:4]:
         assert PlanningTask.from_json(json.loads(json.dumps(task.to_json()))) == task
 
 
-def test_frozen_goals_are_never_written_over(capsys):
-    before = tasks_sha256()
-    assert main([]) == 1
+def test_the_worlds_of_the_varied_goals_differ():
+    tasks = frozen_tasks("varied")
+    assert len({t.config.table_friction for t in tasks}) == len(tasks)
+    assert all(t.config.camera == "kinect" for t in tasks)
+    with pytest.raises(ValueError, match=r"world must be one of .*'noisy'"):
+        frozen_tasks("noisy")
+
+
+@pytest.mark.parametrize("which", ["clean", "varied"])
+def test_frozen_goals_are_never_written_over(capsys, which):
+    before = tasks_sha256(which)
+    assert main(["--world", which]) == 1
     assert "frozen" in capsys.readouterr().err
-    assert tasks_sha256() == before
+    assert tasks_sha256(which) == before
+
+
+def test_a_nudged_object_is_off_where_the_robot_believes_it(world, film):
+    task = next(t for t in frozen_tasks() if t.mode == "single_partial" and not t.thing.rollable)
+    planner = VARIANTS["continuous"].make()
+    there, nudged = (attempt(world, task, planner, nudged=n).distance_m for n in (False, True))
+    assert there < 0.001 < nudged < 0.02
+
+
+def test_a_variant_asked_every_so_often_is_compared_on_the_same_goals():
+    every = {"continuous": records([0.001, 0.002, 0.003, 0.004])}
+    every["oracle"] = records([0.001, 0.003])
+    assert VARIANTS["oracle"].every == 2
+    (row,) = paired_rows(every)
+    assert row["n"] == 2
+    assert row["difference_mean_m"] == pytest.approx(0.0)
 
 
 def test_variants_ask_only_for_what_they_can():
@@ -97,7 +122,7 @@ def test_the_committed_table_belongs_to_the_shipped_checkpoints():
     for path in COMMITTED:
         part = json.loads(path.read_text())
         assert part["about"] == VARIANTS[path.stem].about(), f"{path.name} is stale; run it again"
-        assert part["goals_sha256"] == tasks_sha256()
+        assert part["goals_sha256"] == tasks_sha256(VARIANTS[path.stem].world)
     rows = read_results("data/results/planning.json")["tables"]["planning"]
     assert {row["variant"] for row in rows} == {path.stem for path in COMMITTED}
     for row in rows:

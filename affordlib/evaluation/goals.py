@@ -4,9 +4,10 @@ Objects are ones that no model has seen; goals are more than 2 cm from the start
 grid of A*. Two families: *constructed* goals are where executed full or partial actions really
 ended, so they can be reached; *uniform* ones are drawn evenly over the area in reach.
 
-The goals of the tables are frozen in `data/goals/planning.json`; made once, by
+The goals of the tables are frozen in `data/goals/planning.json`, those of the varied, noisy world
+in `data/goals/planning_varied.json`; made once, by
 
-    python -m affordlib.evaluation.goals
+    python -m affordlib.evaluation.goals --world varied
 """
 
 from __future__ import annotations
@@ -16,20 +17,20 @@ import json
 import math
 import sys
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass
-from pathlib import Path
+from dataclasses import asdict, astuple, dataclass, field
 from typing import Any
 
 import numpy as np
 
+from affordlib.interactions.recipes import Variation
 from affordlib.paths import repo_root
 from affordlib.planning import MODES
 from affordlib.primitives import Drag, Push
 from affordlib.results import write_text_atomically
 from affordlib.types import Goal
-from affordlib.world import Tabletop, Thing, family_named
+from affordlib.world import Tabletop, Thing, WorldConfig, family_named
 
-FROZEN = "data/goals/planning.json"
+FROZEN = {"clean": "data/goals/planning.json", "varied": "data/goals/planning_varied.json"}
 FAMILIES = ("constructed", "uniform")
 N_GOALS = {"single_full": 50, "single_partial": 100, "multi_partial": 80}
 """As in Table 3 of the paper."""
@@ -46,17 +47,25 @@ REACH_M = {Push: 0.07, Drag: 0.05}
 
 @dataclass(frozen=True)
 class PlanningTask:
-    """An object at the table's centre, turned by a yaw [rad], and where it should go."""
+    """An object at the table's centre, turned by a yaw [rad], and where it should go.
+
+    config: the world it is in, which no planner is told.
+    """
 
     thing: Thing
     yaw_rad: float
     goal: Goal
     mode: str
     goals: str
+    config: WorldConfig = field(default_factory=WorldConfig)
+
+    def set_up(self, world: Tabletop) -> None:
+        """Stand the object on a table, in its world."""
+        world.place(self.thing, (0.0, 0.0), self.yaw_rad, config=self.config)
 
     def to_json(self) -> dict[str, Any]:
         """Plain values, from which `from_json` makes the same task."""
-        return {
+        plain = {
             "object_class": self.thing.family,
             "size_m": list(astuple(self.thing)),
             "yaw_rad": self.yaw_rad,
@@ -64,13 +73,15 @@ class PlanningTask:
             "mode": self.mode,
             "goals": self.goals,
         }
+        return plain if self.config == WorldConfig() else plain | {"world": asdict(self.config)}
 
     @classmethod
     def from_json(cls, plain: dict[str, Any]) -> PlanningTask:
         """The task that `to_json` wrote."""
         thing = family_named(plain["object_class"])(*plain["size_m"])
         goal = Goal(tuple(plain["goal_xy_m"]))
-        return cls(thing, plain["yaw_rad"], goal, plain["mode"], plain["goals"])
+        config = WorldConfig(**plain.get("world", {}))
+        return cls(thing, plain["yaw_rad"], goal, plain["mode"], plain["goals"], config)
 
 
 def _objects(mode: str, goals: str, seed: int, index: int, classes: Sequence[str]) -> tuple:
@@ -92,16 +103,25 @@ def _off_grid(rng: np.random.Generator, around: float, spread: float) -> float:
 
 
 def constructed_tasks(
-    world: Tabletop, mode: str, n: int, seed: int = 0, classes: Sequence[str] = STANDING
+    world: Tabletop,
+    mode: str,
+    n: int,
+    seed: int = 0,
+    classes: Sequence[str] = STANDING,
+    variation: Variation | None = None,
 ) -> list[PlanningTask]:
-    """Tasks whose goal is where random actions of the mode's kind really took the object."""
+    """Tasks whose goal is where random actions of the mode's kind really took the object.
+
+    variation: draws each task a world of its own.
+    """
     tasks = []
     for index in range(n):
         thing, yaw, rng = _objects(mode, "constructed", seed, index, classes)
         kind = Drag if thing.rollable else Push
+        config = variation.draw(thing, rng) if variation else WorldConfig()
         while True:
             direction = rng.uniform(-math.pi, math.pi)
-            world.place(thing, (0.0, 0.0), yaw)
+            world.place(thing, (0.0, 0.0), yaw, config=config)
             believed = True
             for _ in range(rng.integers(2, MODES[mode].max_steps + 1) if mode[0] == "m" else 1):
                 stop = rng.uniform(EARLIEST_STOP, 1.0) if MODES[mode].partial else 1.0
@@ -111,7 +131,7 @@ def constructed_tasks(
             x, y, _ = world.object_pose()
             if math.hypot(x, y) > MIN_DISTANCE_M and believed:
                 break
-        tasks.append(PlanningTask(thing, yaw, Goal((x, y)), mode, "constructed"))
+        tasks.append(PlanningTask(thing, yaw, Goal((x, y)), mode, "constructed", config))
     return tasks
 
 
@@ -130,14 +150,29 @@ def uniform_tasks(
     return tasks
 
 
-def frozen_tasks(path: str | Path = FROZEN) -> list[PlanningTask]:
-    """The tasks of the tables; a relative path starts at the repository."""
-    path = repo_root() / path
+def frozen_tasks(world: str = "clean") -> list[PlanningTask]:
+    """The tasks of the tables, of the clean or of the varied, noisy world."""
+    if world not in FROZEN:
+        raise ValueError(f"world must be one of {tuple(FROZEN)}, got {world!r}")
+    path = repo_root() / FROZEN[world]
     if not path.is_file():
         raise FileNotFoundError(
-            f"path: there are no goals at {path}; run python -m affordlib.evaluation.goals"
+            f"there are no goals at {path}; "
+            f"run python -m affordlib.evaluation.goals --world {world}"
         )
     return [PlanningTask.from_json(plain) for plain in json.loads(path.read_text())["tasks"]]
+
+
+def _draw_tasks(which: str, seed: int) -> list[PlanningTask]:
+    tasks = []
+    with Tabletop() as world:
+        for mode, n in N_GOALS.items():
+            if which == "varied":
+                tasks += constructed_tasks(world, mode, n, seed, STANDING, Variation())
+                continue
+            tasks += constructed_tasks(world, mode, n, seed, STANDING + ROLLABLE)
+            tasks += uniform_tasks(mode, n, seed, STANDING + ROLLABLE)
+    return tasks
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -145,18 +180,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m affordlib.evaluation.goals", description=main.__doc__
     )
-    parser.add_argument("--to", default=FROZEN)
+    parser.add_argument("--world", choices=tuple(FROZEN), default="clean")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args(argv)
-    path = repo_root() / options.to
+    path = repo_root() / FROZEN[options.world]
     if path.exists():
-        print(f"--to: {path} is there already; goals are frozen before measuring", file=sys.stderr)
+        print(f"{path} is there already; goals are frozen before measuring", file=sys.stderr)
         return 1
-    tasks, classes = [], STANDING + ROLLABLE
-    with Tabletop() as world:
-        for mode, n in N_GOALS.items():
-            tasks += constructed_tasks(world, mode, n, options.seed, classes)
-            tasks += uniform_tasks(mode, n, options.seed, classes)
+    tasks = _draw_tasks(options.world, options.seed)
     path.parent.mkdir(parents=True, exist_ok=True)
     rows = ",\n".join(json.dumps(task.to_json()) for task in tasks)
     write_text_atomically(path, f'{{"seed": {options.seed}, "tasks": [\n{rows}\n]}}\n')

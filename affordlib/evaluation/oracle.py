@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,7 +14,7 @@ from affordlib.types import Observations, Prediction
 
 if TYPE_CHECKING:
     from affordlib.primitives import Drag, Push
-    from affordlib.world import Tabletop, Thing
+    from affordlib.world import Tabletop, Thing, WorldConfig
 
 _STD_M = 1e-5
 
@@ -30,6 +30,7 @@ class SimulatorModel:
     thing: Thing
     yaw_rad: float
     kind: type[Push] | type[Drag]
+    config: WorldConfig
 
     action_channels = ("x", "y")
     effect_channels = ("x", "y", "yaw")
@@ -45,7 +46,7 @@ class SimulatorModel:
         travel = observations.action[:, -1] - observations.action[:, 0]
         effects = []
         for (x, y), t in zip(travel.tolist(), t_target.numpy(), strict=True):
-            self.world.place(self.thing, (0.0, 0.0), self.yaw_rad)
+            self.world.place(self.thing, (0.0, 0.0), self.yaw_rad, config=self.config)
             action = self.kind.towards(math.atan2(y, x))
             if len(t) == 1:
                 # A part of an action is re-timed to its own stop: it is carried out as such.
@@ -63,8 +64,16 @@ class SimulatorModel:
 
 
 def oracle_effects(
-    imagined: Tabletop, world: Tabletop, image: np.ndarray, kind: type[Push] | type[Drag]
+    imagined: Tabletop,
+    world: Tabletop,
+    image: np.ndarray,
+    kind: type[Push] | type[Drag],
+    config: WorldConfig,
 ) -> EffectMap:
-    """The effect map of the object that stands in a world, from actions in an imagined one."""
-    model = SimulatorModel(imagined, world.thing, world.object_pose()[2], kind)
+    """The effect map of the object that stands in a world, from actions in an imagined one.
+
+    config: of the imagined one, in which the camera misses nothing.
+    """
+    config = replace(config, camera="ideal", bias_m=(0.0, 0.0))
+    model = SimulatorModel(imagined, world.thing, world.object_pose()[2], kind, config)
     return map_effects(model, image, kind)

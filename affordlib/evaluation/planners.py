@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from affordlib.evaluation.goals import FAMILIES, ROLLABLE, STANDING
 from affordlib.evaluation.oracle import oracle_effects
@@ -15,12 +15,14 @@ from affordlib.paths import repo_root
 from affordlib.planning import Repertoire, plan_astar, plan_continuous, plan_gradient
 from affordlib.planning.modes import PlanMode, mode_named
 from affordlib.primitives import Drag, Push
-from affordlib.world import Tabletop
+from affordlib.world import Tabletop, WorldConfig
 
 if TYPE_CHECKING:
     import numpy as np
 
     from affordlib.types import Goal, Plan
+
+T = TypeVar("T")
 
 FORMAT = 2
 """Counts the changes of planners that change their numbers."""
@@ -32,7 +34,10 @@ class Variant:
 
     push, drag: names of checkpoints; None where it has none for such objects. samples: stop phases
     of A*, or phases at which the gradient planner queries. full_only: no partial actions. goals:
-    the families of goals that it is asked for.
+    the families of goals that it is asked for; every: of these, each so-many-th. world: whose goals
+    (see `goals.FROZEN`). nominal: whoever plans with the simulator is not told this world's
+    frictions, masses and heights, and starts where the camera sees the object. nudged: the object
+    is a millimetre and a degree off when the plan is carried out.
     """
 
     planner: Callable[..., Plan]
@@ -44,6 +49,10 @@ class Variant:
     corrections: int = 0
     full_only: bool = False
     goals: tuple[str, ...] = FAMILIES
+    every: int = 1
+    world: str = "clean"
+    nominal: bool = False
+    nudged: bool = False
     settings: tuple[tuple[str, Any], ...] = ()
 
     @property
@@ -54,15 +63,24 @@ class Variant:
     @property
     def classes(self) -> tuple[str, ...]:
         """The families of objects that it can be asked about."""
-        every = self.sees_world or (self.push and self.drag)
+        every = (self.sees_world and self.world == "clean") or (self.push and self.drag)
         return STANDING + ROLLABLE if every else STANDING
+
+    def asked(self, tasks: Sequence[T], read: Callable[[T], tuple[str, str]]) -> list[T]:
+        """Of tasks, or their records, those that it is asked; read: their goals and their class."""
+        chosen = []
+        for task in tasks:
+            goals, object_class = read(task)
+            if goals in self.goals and object_class in self.classes:
+                chosen.append(task)
+        return chosen[:: self.every]
 
     def columns(self) -> dict[str, Any]:
         """What a row of the table says of it."""
         return {
             "planner": self.name,
             "model": self.model,
-            "world": "clean",
+            "world": self.world,
             "samples": self.samples,
             "closed_loop": self.corrections > 0,
         }
@@ -73,6 +91,11 @@ class Variant:
         settings = {k: list(v) if isinstance(v, tuple) else v for k, v in self.settings}
         more = {"corrections": self.corrections, "full_only": self.full_only}
         more |= {"settings": settings, "checkpoints": files, "format": FORMAT}
+        if self.every > 1:
+            more["every"] = self.every
+        for name in ("nominal", "nudged"):
+            if getattr(self, name):
+                more[name] = True
         return self.columns() | more
 
     def make(self) -> Callable[..., Plan]:
@@ -126,7 +149,8 @@ def _plan_with_simulator(
     mode: str | PlanMode,
 ) -> Plan:
     kind = Drag if world.object_rolls() else Push
-    effects = oracle_effects(imagined, world, image, kind)
+    config = WorldConfig() if variant.nominal else world.config
+    effects = oracle_effects(imagined, world, image, kind, config)
     return variant.planner(
         effects.model, image, start_xy_m, goal, variant.mode(mode), kind=kind, effects=effects
     )
@@ -134,6 +158,9 @@ def _plan_with_simulator(
 
 _FILM = {"model": "film_5000", "push": "push_film_x10", "drag": "drag_film"}
 _PAPER = {"model": "paper", "push": "push_cnp"}
+_LSTM = {"model": "lstm_tuned", "push": "push_lstm"}
+_VARIED = {"model": "film_5000_varied", "push": "push_film_varied", "world": "varied"}
+_ORACLE = {"model": "simulator", "push": None, "goals": ("constructed",)}
 _FINE = (
     ("n_directions", 72),
     ("stop_phases", tuple(round(0.5 + 0.05 * k, 2) for k in range(1, 11))),
@@ -178,7 +205,20 @@ VARIANTS: dict[str, Variant] = {
     "continuous_paper": _continuous(**_PAPER),
     "continuous_500": _continuous(**_FILM | {"model": "film_500", "push": "push_film"}),
     "continuous_full": _continuous(**_FILM | {"name": "continuous_full"}, full_only=True),
-    "oracle": _continuous(name="oracle_privileged", model="simulator", push=None, **_CONSTRUCTED),
+    "continuous_nudged": _continuous(**_FILM, **_CONSTRUCTED, nudged=True),
+    "astar_lstm": _astar(**_LSTM, **_CONSTRUCTED),
+    "continuous_lstm": _continuous(**_LSTM, **_CONSTRUCTED),
+    "oracle": _continuous(name="oracle_privileged", **_ORACLE, every=2),
+    "varied": _continuous(**_VARIED, **_CONSTRUCTED),
+    "varied_corrected": _continuous(**_VARIED, **_CONSTRUCTED, corrections=2),
+    "varied_clean": _continuous(
+        model="film_5000", push="push_film_x10", world="varied", **_CONSTRUCTED
+    ),
+    "varied_oracle": _continuous(name="oracle_privileged", **_ORACLE, world="varied", every=5),
+    "varied_perceived": _continuous(
+        name="oracle_perceived", **_ORACLE, world="varied", every=5, nominal=True
+    ),
 }
 """The first three of the paper's planners on our best model; the paper's on its own network; what
-each idea is worth; and the simulator itself in the place of a model."""
+each idea is worth; what the world does with a small misperception; a recurrent network under the
+same planners; the simulator itself in the place of a model; and the varied, noisy world."""

@@ -12,8 +12,10 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import math
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,6 +36,7 @@ from affordlib.world import Tabletop, UnreachableError
 if TYPE_CHECKING:
     from affordlib.types import Goal
 
+NUDGE_M, NUDGE_RAD = 0.001, math.radians(1.0)
 PARTS = "data/results/parts/planning"
 NAME = "planning"
 GROUPS = {"all": STANDING + ROLLABLE, "standing": STANDING, "rollable": ROLLABLE} | {
@@ -44,14 +47,25 @@ Planner = Callable[[np.ndarray, tuple[float, float], "Goal", str], Plan]
 """A planner as (image, start_xy_m, goal, mode) → Plan."""
 
 
-def attempt(world: Tabletop, task: PlanningTask, planner: Planner, corrections: int = 0) -> Outcome:
+def attempt(
+    world: Tabletop,
+    task: PlanningTask,
+    planner: Planner,
+    corrections: int = 0,
+    nudged: bool = False,
+) -> Outcome:
     """Plan and carry out one task, correcting the end by up to so many single actions.
 
-    A plan that the arm cannot follow counts with the distance at which it left the object.
+    A plan that the arm cannot follow counts with the distance at which it left the object. nudged:
+    the robot then believes the object `NUDGE_M` and `NUDGE_RAD` off where it is.
     """
-    world.place(task.thing, (0.0, 0.0), task.yaw_rad)
+    task.set_up(world)
     seen = world.perceive()
     plan = planner(seen.image, seen.xy_m, task.goal, task.mode)
+    if nudged:
+        side = NUDGE_M * np.array([math.cos(task.yaw_rad), math.sin(task.yaw_rad)])
+        config = replace(task.config, bias_m=tuple(side))
+        world.place(task.thing, (0.0, 0.0), task.yaw_rad + NUDGE_RAD, config=config)
     once = PlanMode(1, partial=True)
     try:
         return carry_out(world, plan, corrections, lambda *query: planner(*query, once))
@@ -66,10 +80,11 @@ def measure(
     planner: Planner,
     progress: str = "",
     corrections: int = 0,
+    nudged: bool = False,
 ) -> list[Outcome]:
     """Outcomes of all tasks with one planner, in order."""
     bar = tqdm(tasks, desc=progress, unit=" goals", disable=not progress, leave=False)
-    return [attempt(world, task, planner, corrections) for task in bar]
+    return [attempt(world, task, planner, corrections, nudged) for task in bar]
 
 
 def outcome_record(task: PlanningTask, outcome: Outcome) -> dict[str, Any]:
@@ -127,30 +142,32 @@ def run_variant(name: str, tasks: list[PlanningTask], progress: bool = True) -> 
     """The records of a variant on the tasks that it can be asked."""
     variant = VARIANTS[name]
     planner = variant.make()
-    asked = [t for t in tasks if t.thing.family in variant.classes and t.goals in variant.goals]
+    asked = variant.asked(tasks, lambda task: (task.goals, task.thing.family))
     with Tabletop() as world:
         planner_here = partial(planner, world) if variant.sees_world else planner
-        outcomes = measure(world, asked, planner_here, name * progress, variant.corrections)
+        how = (name * progress, variant.corrections, variant.nudged)
+        outcomes = measure(world, asked, planner_here, *how)
     records = [outcome_record(t, o) for t, o in zip(asked, outcomes, strict=True)]
     return {"variant": name, "about": variant.about(), "records": records}
 
 
-def tasks_sha256(path: str | Path = FROZEN) -> str:
-    """Hash of the frozen goals."""
-    return hashlib.sha256((repo_root() / path).read_bytes()).hexdigest()
+def tasks_sha256(world: str = "clean") -> str:
+    """Hash of the frozen goals of a world."""
+    return hashlib.sha256((repo_root() / FROZEN[world]).read_bytes()).hexdigest()
 
 
 def _part(name: str) -> Path:
     return repo_root() / PARTS / f"{name}.json"
 
 
-def _is_done(name: str, goals_sha256: str) -> bool:
-    """Whether there is a part of this variant, as it is now, on these goals."""
+def _is_done(name: str) -> bool:
+    """Whether there is a part of this variant, as it is now, on the goals as they are."""
     path = _part(name)
     if not path.is_file():
         return False
     part = json.loads(path.read_text())
-    return (part["goals_sha256"], part["about"]) == (goals_sha256, VARIANTS[name].about())
+    expected = tasks_sha256(VARIANTS[name].world), VARIANTS[name].about()
+    return (part["goals_sha256"], part["about"]) == expected
 
 
 def assemble() -> Path:
@@ -161,12 +178,14 @@ def assemble() -> Path:
             continue
         part = json.loads(_part(name).read_text())
         parts[name] = part["records"]
-        rows += planning_rows(part["records"], variant=name, **variant.columns())
+        about = {"variant": name, "nudged": variant.nudged}
+        rows += planning_rows(part["records"], **about, **variant.columns())
     if not rows:
         raise FileNotFoundError(f"there are no parts in {PARTS}; run some variants first")
     tables = {"planning": rows, "summary": summary_rows(rows), "paired": paired_rows(parts)}
     tables["error_decomposition"] = decomposition_rows(rows)
-    return write_results("data/results", NAME, {"goals_sha256": tasks_sha256()}, tables)
+    hashes = {world: tasks_sha256(world) for world in FROZEN}
+    return write_results("data/results", NAME, {"goals_sha256": hashes}, tables)
 
 
 def summary_rows(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -176,7 +195,7 @@ def summary_rows(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
         group = row["object_class"]
         if row["goals"] != "constructed" or group not in ("all", "standing", "rollable"):
             continue
-        names = ("variant", "model", "samples", "closed_loop", "object_class")
+        names = ("variant", "model", "world", "samples", "closed_loop", "object_class")
         told = summary.setdefault((row["variant"], group), {name: row[name] for name in names})
         for statistic in ("mean", "sem", "median"):
             told[f"{row['mode']}_{statistic}_m"] = row[f"{statistic}_m"]
@@ -188,20 +207,25 @@ def decomposition_rows(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Where the open-loop error on constructed goals comes from, by variant, mode and group.
 
     search: what the planner itself expected to remain; model: how far from what it expected the
-    object ended; execution: what remains with the simulator as the model.
+    object ended; execution: what remains with the simulator as the model; nudged: what remains of
+    `continuous` when the object is a millimetre and a degree from where it is believed.
     """
-    open_loop = [r for r in rows if r["goals"] == "constructed" and not r["closed_loop"]]
+    open_loop = [
+        r for r in rows if r["goals"] == "constructed" and not r["closed_loop"] and not r["nudged"]
+    ]
 
-    def place(row: dict[str, Any]) -> tuple[str, str]:
-        return row["mode"], row["object_class"]
+    def place(row: dict[str, Any]) -> tuple[str, str, str]:
+        return row["world"], row["mode"], row["object_class"]
 
-    oracle = {place(r): r["mean_m"] for r in open_loop if r["variant"] == "oracle"}
+    oracle = {place(r): r["mean_m"] for r in open_loop if r["planner"] == "oracle_privileged"}
+    nudged = {place(r): r["mean_m"] for r in rows if r["nudged"]}
     return [
         {
-            **{key: row[key] for key in ("variant", "mode", "object_class", "n")},
+            **{key: row[key] for key in ("variant", "world", "mode", "object_class", "n")},
             "search_mean_m": row["predicted_mean_m"],
             "model_mean_m": row["surprise_mean_m"],
             "execution_mean_m": oracle.get(place(row)),
+            "nudged_mean_m": nudged.get(place(row)),
             "total_mean_m": row["mean_m"],
         }
         for row in open_loop
@@ -217,39 +241,31 @@ def paired_rows(
     The interval holds 95 % of the means of goals drawn again with replacement.
     """
     rows: list[dict[str, Any]] = []
-    if than not in parts:
-        return rows
     rng = np.random.default_rng(0)
     for name, records in parts.items():
-        if name == than:
+        variant = VARIANTS[name]
+        if name == than or than not in parts or variant.world != VARIANTS[than].world:
             continue
-        classes = {r["object_class"] for r in records}
-        for goals in dict.fromkeys(r["goals"] for r in records):
-            for mode in dict.fromkeys(r["mode"] for r in records):
-                these, others = (
-                    [
-                        r
-                        for r in some
-                        if (r["goals"], r["mode"]) == (goals, mode) and r["object_class"] in classes
-                    ]
-                    for some in (records, parts[than])
-                )
-                pairs = zip(these, others, strict=True)
-                gain = np.array([r["distance_m"] - o["distance_m"] for r, o in pairs])
-                draws = rng.choice(gain, (n_draws, len(gain))).mean(axis=1)
-                low, high = np.quantile(draws, [0.025, 0.975])
-                rows.append(
-                    {
-                        "variant": name,
-                        "than": than,
-                        "goals": goals,
-                        "mode": mode,
-                        "n": len(gain),
-                        "difference_mean_m": float(gain.mean()),
-                        "low_m": float(low),
-                        "high_m": float(high),
-                    }
-                )
+        others = variant.asked(parts[than], lambda r: (r["goals"], r["object_class"]))
+        pairs: dict[tuple[str, str], list[float]] = {}
+        for one, other in zip(records, others, strict=True):
+            farther = one["distance_m"] - other["distance_m"]
+            pairs.setdefault((one["goals"], one["mode"]), []).append(farther)
+        for (goals, mode), gain in pairs.items():
+            draws = rng.choice(gain, (n_draws, len(gain))).mean(axis=1)
+            low, high = np.quantile(draws, [0.025, 0.975])
+            rows.append(
+                {
+                    "variant": name,
+                    "than": than,
+                    "goals": goals,
+                    "mode": mode,
+                    "n": len(gain),
+                    "difference_mean_m": float(np.mean(gain)),
+                    "low_m": float(low),
+                    "high_m": float(high),
+                }
+            )
     return rows
 
 
@@ -261,12 +277,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--variants", nargs="*", choices=list(VARIANTS), default=list(VARIANTS))
     options = parser.parse_args(argv)
     torch.set_num_threads(1)
-    tasks, goals = frozen_tasks(), tasks_sha256()
     for name in options.variants:
-        if _is_done(name, goals):
+        if _is_done(name):
             print(f"{name}: there already")
             continue
-        part = run_variant(name, tasks) | {"goals_sha256": goals}
+        world = VARIANTS[name].world
+        part = run_variant(name, frozen_tasks(world)) | {"goals_sha256": tasks_sha256(world)}
         _part(name).parent.mkdir(parents=True, exist_ok=True)
         write_text_atomically(_part(name), json.dumps(part, indent=0) + "\n")
         for row in planning_rows(part["records"]):

@@ -173,7 +173,7 @@ SHIPPED = tuple(RECIPES)
 RECIPES |= {
     f"{name}_x10": replace(recipe, n_interactions=10 * recipe.n_interactions, seed=recipe.seed + 10)
     for name, recipe in RECIPES.items()
-    if name in ("push", "drag", "mixed", "grasp", "rotate", "lever_up")
+    if name in ("push", "drag", "mixed", "grasp", "rotate", "lever_up", "push_varied")
 }
 
 
