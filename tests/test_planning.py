@@ -17,6 +17,7 @@ from affordlib.evaluation.planning import measure, outcome_record, planning_rows
 from affordlib.models import EffectModel
 from affordlib.planning import (
     carry_out,
+    effect_map,
     map_effects,
     plan_astar,
     plan_continuous,
@@ -367,3 +368,18 @@ def test_the_frozen_goals_are_those_that_are_drawn(world):
 def test_bad_input_is_named(plan, words):
     with pytest.raises(ValueError, match=words):
         plan()
+
+
+def test_a_map_is_made_once_while_only_the_goal_moves(film, cuboid_image, monkeypatch):
+    made = []
+    monkeypatch.setattr(
+        effect_map, "map_effects", lambda *query: made.append(1) or map_effects(*query)
+    )
+    planner = effect_map.map_once(plan_continuous, film, seed=1)
+    for x in (0.03, 0.06, 0.1):
+        plan = planner(cuboid_image, (0.0, 0.0), Goal((x, 0.04)))
+        afresh = plan_continuous(film, cuboid_image, (0.0, 0.0), Goal((x, 0.04)), seed=1)
+        assert plan.predicted_end_xy_m == afresh.predicted_end_xy_m
+    assert len(made) == 1
+    planner(np.roll(cuboid_image, 2, axis=-1), (0.0, 0.0), Goal((0.1, 0.04)))
+    assert len(made) == 2
