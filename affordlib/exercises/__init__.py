@@ -16,7 +16,10 @@ from affordlib.exercises.world import WORLD
 
 __all__ = ["EXERCISES", "Exercise", "Verdict", "check"]
 
-EXERCISES: dict[str, Exercise] = {n: e for n, e in (WORLD | MODELS | PLANS).items() if n < "04"}
+READY = ("01", "02", "03", "06")
+EXERCISES: dict[str, Exercise] = {
+    n: e for n, e in (WORLD | MODELS | PLANS).items() if n[:2] in READY
+}
 
 
 def check(name: str, attempt: Any) -> Verdict:

@@ -66,7 +66,7 @@ def _push_error_mm(choose: Callable[..., Any]) -> float:
 
 # 07 Closed loop
 
-MOST_ACTIONS = 12
+MOST_ACTIONS = 9
 
 
 def _loop_error_mm(bring: Callable[..., Any]) -> float:
