@@ -1,0 +1,138 @@
+"""Exercises of notebooks 03 to 05: what a network foresees, how sure it is, what it is asked."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from affordlib.evaluation.answers import network_answers
+from affordlib.exercises.checking import Exercise, asked
+from affordlib.interactions import TrainingArrays, open_interactions, split_interactions
+from affordlib.interactions.batches import observe_action
+from affordlib.models import coverage, load_checkpoint
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+# 03 The affordance network
+
+N_PHASES = 61
+
+
+@cache
+@torch.no_grad()
+def _marginals() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mean, σ and truth (50, 61, 2) [m] of the held-out pushes, given image and action."""
+    pushes = open_interactions("push")
+    held_out = split_interactions(pushes.sizes["interaction"]).test
+    arrays = TrainingArrays.from_dataset(pushes, held_out)
+    at = torch.linspace(0, len(arrays.phase) - 1, N_PHASES).round().long()
+    model, _ = load_checkpoint("push_cnp")
+    t_target = arrays.phase[at].expand(len(arrays), -1)
+    told = model.predict(model.encode(arrays.image), observe_action(arrays), t_target)
+    return told.effect_mean.numpy(), told.effect_std.numpy(), arrays.effect[:, at].numpy()
+
+
+def _way_m(courses: np.ndarray) -> np.ndarray:
+    """Lengths (N,) of courses (N, n, 2)."""
+    return np.hypot(*np.moveaxis(np.diff(courses, axis=1), -1, 0)).sum(axis=1)
+
+
+def _drawn_way(draw: Callable[[np.ndarray, np.ndarray, np.random.Generator], np.ndarray]) -> float:
+    """How many times as long as the true courses those are that the reader draws."""
+    mean, sigma, truth = _marginals()
+    rng = np.random.default_rng(0)
+    drawn = np.stack([asked(draw, m, s, rng) for m, s in zip(mean, sigma, strict=True)])
+    if drawn.shape != mean.shape:
+        raise ValueError(f"a course has the shape {mean.shape[1:]}, got {drawn.shape[1:]}")
+    spread = float(((drawn - mean) / sigma).std())
+    if not 0.8 < spread < 1.2:
+        raise ValueError(f"the draws spread by {spread:.2f} σ about the mean, not by 1 σ")
+    return float(_way_m(drawn).mean() / _way_m(truth).mean())
+
+
+# 04 Effect prediction
+
+
+def _lopsided_mm(lopsided_m: Callable[..., float]) -> float:
+    """By how much [mm] the paper's network fails to turn along with the table."""
+
+    def by(name: str) -> float:
+        model, _ = load_checkpoint(name)
+        channels = model.action_channels, model.effect_channels
+        some = TrainingArrays.from_dataset(
+            open_interactions("push_test"), np.arange(200), *channels
+        )
+        return 1000 * float(asked(lopsided_m, model, some))
+
+    ours = by("push_film")
+    if abs(ours) > 0.01:
+        raise ValueError(f"ours turns along, so it should give 0 mm, got {ours:.3g} mm")
+    return by("push_cnp")
+
+
+@cache
+def _foreseen_ends() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Truth, mean and σ (2, 1000) [m] of the ends of `push_test`, by the shipped network."""
+    data = open_interactions("push_test")
+    model, _ = load_checkpoint("push_film")
+    answers = network_answers(model, data, np.arange(data.sizes["interaction"]))
+    truth, mean, std = (
+        torch.tensor([answers[k][c] for c in "xy"]) for k in ("truth", "mean", "std")
+    )
+    return truth, mean, std
+
+
+def _half_inside_percent(factor: float) -> float:
+    truth, mean, std = _foreseen_ends()
+    return 100 * coverage(truth, mean, float(factor) * std, 0.5)
+
+
+MODELS: dict[str, Exercise] = {
+    "03.1": Exercise(
+        "Measure how far [mm] the mean passes from an effect that was observed at t = 0.8.",
+        lambda mine: mine,
+        expected=1.38,
+        within=0.04,
+        unit="mm",
+    ),
+    "03.2": Exercise(
+        "Write draw(mean, sigma, rng): one course, every moment drawn from its own Gaussian.",
+        _drawn_way,
+        expected=3.6,
+        within=0.3,
+        unit="times the true way",
+    ),
+    "04.1": Exercise(
+        "Write lopsided_m(model, arrays): how far an end moves when the table is turned by 90°.",
+        _lopsided_mm,
+        expected=1.86,
+        within=0.05,
+        unit="mm for the paper's network",
+    ),
+    "04.2": Exercise(
+        "Find the factor on σ that puts half of the true ends into the central 50 % interval.",
+        _half_inside_percent,
+        expected=50.0,
+        within=1.5,
+        unit="% inside",
+    ),
+    "05.1": Exercise(
+        "Measure the conditional network's error [cm] at the fifth step if it sees two poses only.",
+        lambda mine: mine,
+        expected=0.299,
+        within=0.002,
+        unit="cm",
+    ),
+    "05.2": Exercise(
+        "Measure how many times as far as the conditional network the recurrent one errs at the "
+        "fifth step, if the poses they see are off by 1 mm.",
+        lambda mine: mine,
+        expected=2.08,
+        within=0.1,
+        unit="times as far",
+    ),
+}

@@ -1,0 +1,185 @@
+"""Exercises of notebooks 06 to 08: chains and stops, the closed loop, and what σ does not know."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from affordlib.exercises.checking import Exercise, answered, asked
+from affordlib.models import load_checkpoint
+from affordlib.planning import map_effects, plan_continuous
+from affordlib.planning.poses import foresee_course
+from affordlib.planning.steps import roll_out
+from affordlib.primitives import Grasp, Push
+from affordlib.types import Goal
+from affordlib.world import Cuboid, Prism, Tabletop, UprightCylinder
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from affordlib.perception import Percept
+    from affordlib.planning import EffectMap
+    from affordlib.types import Plan, Step
+
+BOX = Cuboid(length=0.07, width=0.05, height=0.05)
+YAW_RAD = 0.3
+
+
+@cache
+def _box_effects() -> EffectMap:
+    """The effect map of the box of notebooks 06 and 07."""
+    with Tabletop() as world:
+        world.place(BOX, yaw_rad=YAW_RAD)
+        return map_effects(load_checkpoint("push_film_x10")[0], world.look())
+
+
+# 06 Planning
+
+
+def _chain_error_mm(chain_end: Callable[..., Any]) -> float:
+    """Largest difference [mm] from where 50 random chains of three pushes lead."""
+    effects, rng = _box_effects(), np.random.default_rng(0)
+    direction = torch.from_numpy(rng.uniform(-math.pi, math.pi, (50, 3)))
+    phase = torch.from_numpy(rng.uniform(0.6, 1.0, (50, 3)))
+    with torch.no_grad():
+        ends = roll_out(effects, direction, phase)[0][:, -1].numpy()
+        given = [asked(chain_end, effects, d, p) for d, p in zip(direction, phase, strict=True)]
+    return 1000 * float(np.hypot(*(np.array(given) - ends).T).max())
+
+
+def _push_error_mm(choose: Callable[..., Any]) -> float:
+    """Mean distance [mm] between goals 3 to 7 cm away and where the chosen pushes end."""
+    off = []
+    with Tabletop() as world:
+        for bearing, far_m in ((0.2, 0.03), (1.5, 0.04), (2.8, 0.05), (-1.9, 0.06), (-0.6, 0.07)):
+            goal = far_m * np.array([math.cos(bearing), math.sin(bearing)])
+            direction, phase = asked(choose, _box_effects(), goal)
+            world.place(BOX, yaw_rad=YAW_RAD)
+            went = world.interact(Push.towards(float(direction)), float(phase))
+            off.append(math.dist(goal, went.rest_effect[:2]))
+    return 1000 * float(np.mean(off))
+
+
+# 07 Closed loop
+
+MOST_ACTIONS = 9
+
+
+def _loop_error_mm(bring: Callable[..., Any]) -> float:
+    """Mean distance [mm] to the goal in the end, of two objects that somebody shoves."""
+    return float(np.mean([_shoved_mm(bring, s) for s in ((-0.05, -0.06, 1.0), (0.02, 0.08, -0.7))]))
+
+
+def _shoved_mm(bring: Callable[..., Any], shove: tuple[float, float, float]) -> float:
+    """Distance [mm] to the goal in the end; after the first action the object is shoved."""
+    model, _ = load_checkpoint("push_film_x10")
+    goal, taken = Goal((0.16, 0.09)), []
+
+    def plan(seen: Percept) -> Plan:
+        return plan_continuous(model, seen.image, seen.xy_m, goal)
+
+    def act(step: Step) -> None:
+        if len(taken) == MOST_ACTIONS:
+            raise RuntimeError(f"no end after {MOST_ACTIONS} actions")
+        world.follow(step)
+        taken.append(step)
+        if len(taken) == 1:
+            world.shove(*shove)
+
+    with Tabletop() as world:
+        world.place(BOX, yaw_rad=YAW_RAD)
+        answered(bring, world.perceive, plan, act)
+        return 1000 * goal.distance_m(world.object_pose()[:2])
+
+
+def _lift_error_mm(stop_at: Callable[..., Any]) -> float:
+    """Largest difference [mm] from the heights that were asked for."""
+    model, _ = load_checkpoint("grasp_film")
+    off = []
+    with Tabletop() as world:
+        for height_m in (0.03, 0.09, 0.18):
+            world.place(UprightCylinder(0.045, 0.06))
+            phase, course_m, _ = foresee_course(model, world.look(), Grasp(), "z")
+            stop = float(asked(stop_at, height_m, phase, course_m))
+            off.append(abs(world.interact(Grasp(), stop).effect[-1, 2] - height_m))
+    return 1000 * max(off)
+
+
+# 08 Beyond
+
+
+@cache
+def _looks() -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Images of 40 cuboids and cylinders, and of 40 houses."""
+    rng = np.random.default_rng(0)
+    images: tuple[list[np.ndarray], list[np.ndarray]] = [], []
+    with Tabletop() as world:
+        for k in range(80):
+            thing = _house(rng) if k % 2 else (Cuboid, UprightCylinder)[k // 2 % 2].sample(rng)
+            world.place(thing, yaw_rad=rng.uniform(-math.pi, math.pi))
+            images[k % 2].append(world.look())
+    return images
+
+
+def _house(rng: np.random.Generator) -> Prism:
+    """A square with a gable, as in notebook 08."""
+    w = rng.uniform(0.045, 0.06) / 2
+    gable = rng.uniform(0.3, 0.9) * w
+    return Prism(((-w, -w), (w, -w), (w, w - gable), (0.0, w + gable), (-w, w - gable)), 0.05)
+
+
+def _told_apart_percent(strangeness: Callable[..., Any]) -> float:
+    """Share [%] of pairs of a known object and a house of which the house is the stranger."""
+    known, houses = ([float(asked(strangeness, image)) for image in some] for some in _looks())
+    more = np.subtract.outer(houses, known)
+    return 100 * float((more > 0).mean() + 0.5 * (more == 0).mean())
+
+
+PLANS: dict[str, Exercise] = {
+    "06.1": Exercise(
+        "Write chain_end(effects, direction, phase): where a chain of pushes brings the object.",
+        _chain_error_mm,
+        expected=0.0,
+        within=0.1,
+        unit="mm off at worst",
+    ),
+    "06.2": Exercise(
+        "Write choose(effects, goal_xy_m): direction and stop phase of one push to a goal.",
+        _push_error_mm,
+        expected=0.0,
+        within=3.0,
+        unit="mm from the goal in the mean",
+    ),
+    "07.1": Exercise(
+        "Write bring(look, plan, act): look after every action, and plan anew where needed.",
+        _loop_error_mm,
+        expected=0.0,
+        within=2.5,
+        unit="mm from the goal in the mean",
+    ),
+    "07.2": Exercise(
+        "Write stop_at(height_m, phase, course_m): the phase at which a grasp ends at a height.",
+        _lift_error_mm,
+        expected=0.0,
+        within=3.0,
+        unit="mm off at worst",
+    ),
+    "08.1": Exercise(
+        "Write strangeness(image): larger for a house than for a cuboid or a cylinder.",
+        _told_apart_percent,
+        expected=100.0,
+        within=10.0,
+        unit="% of the pairs told apart",
+    ),
+    "08.2": Exercise(
+        "Measure the mean error [mm] of the half of the pushes of which the network is surest.",
+        lambda mine: mine,
+        expected=0.112,
+        within=0.01,
+        unit="mm",
+    ),
+}

@@ -1,0 +1,84 @@
+"""Exercises of notebooks 01 and 02: the world, and what there is to be learned in it."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from affordlib.exercises.checking import Exercise, asked
+from affordlib.interactions import open_interactions
+from affordlib.primitives import DURATION_S, Push
+from affordlib.world import FAMILIES, Cuboid, Tabletop
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+# 01 The tabletop
+
+
+def _worst_speed_error(speed_m_s: Callable[[float], float]) -> float:
+    """Largest difference [mm/s] from the speed of a push, by finite differences of its path."""
+    t, dt = np.linspace(0.05, 0.95, 19), 1e-4
+    ahead, behind = (Push.towards(0.0).path(t + side * dt)[:, 0] for side in (1, -1))
+    true = (ahead - behind) / (2 * dt * DURATION_S)
+    return 1000 * max(abs(asked(speed_m_s, float(k)) - v) for k, v in zip(t, true, strict=True))
+
+
+def _rest_cm(phase: float) -> float:
+    """How far [cm] the box of notebook 01 has moved, pushed towards 0.6 rad up to a phase."""
+    with Tabletop() as world:
+        world.place(Cuboid(length=0.07, width=0.05, height=0.05), yaw_rad=0.4)
+        return 100 * float(np.hypot(*world.interact(Push.towards(0.6), phase).rest_effect[:2]))
+
+
+# 02 Interactions
+
+
+@cache
+def _cylinders() -> tuple[np.ndarray, np.ndarray]:
+    """Diameters [m] of the upright cylinders in `push`, and how far along they went [m]."""
+    pushes = open_interactions("push")
+    standing = pushes["family"].values == list(FAMILIES).index("upright_cylinder")
+    angle = pushes["theta"].values[standing] + np.pi
+    x, y = pushes["effect"].values[standing, -1, :2].T
+    return pushes["size"].values[standing, 0], np.cos(angle) * x + np.sin(angle) * y
+
+
+def _cylinder_error_mm(end_m: Callable[[float], float]) -> float:
+    diameters, true = _cylinders()
+    given = np.array([asked(end_m, float(d)) for d in diameters])
+    return 1000 * float(np.abs(given - true).mean())
+
+
+WORLD: dict[str, Exercise] = {
+    "01.1": Exercise(
+        "Write speed_m_s(t), the speed of the gripper at phase t of a push.",
+        _worst_speed_error,
+        expected=0.0,
+        within=0.1,
+        unit="mm/s off at worst",
+    ),
+    "01.2": Exercise(
+        "Find the phase at which the push must stop for the box to rest 5 cm from its start.",
+        _rest_cm,
+        expected=5.0,
+        within=0.05,
+        unit="cm",
+    ),
+    "02.1": Exercise(
+        "Compute the mean distance [mm] of the drags' ends from where the mean drag ends.",
+        lambda mine: mine,
+        expected=0.076,
+        within=0.005,
+        unit="mm",
+    ),
+    "02.2": Exercise(
+        "Write end_m(diameter_m): how far a push moves a cylinder, from geometry alone.",
+        _cylinder_error_mm,
+        expected=0.0,
+        within=0.6,
+        unit="mm off in the mean",
+    ),
+}
