@@ -115,3 +115,11 @@ def test_the_committed_studies_tell_the_story():
     assert effect["cka_action_effect"] > 0.9  # one affordance, told by either
     assert effect["cosine_to_action"] > effect["cosine_to_other"] + 0.2
     assert action["action_start_mean_m"] < 0.01
+
+
+def test_our_networks_are_as_likely_as_the_package_s():
+    tables = read_results(repo_root() / "data" / "results" / "neural_processes.json")["tables"]
+    for row in tables["difference"]:
+        assert row["log_likelihood_gain_mean"] > -2 * row["log_likelihood_gain_sem"]
+    *networks, bound = tables["log_likelihood"]
+    assert all(r["log_likelihood_mean"] < bound["log_likelihood_mean"] for r in networks)
