@@ -4,12 +4,16 @@ Curves are drawn from a Gaussian process (squared exponential, length 0.25 of th
 0.05), observed at 1 to 10 points and asked at 50. Each pair has about as many parameters, sees the
 same batches of 16 for the same number of steps with the same optimiser, and is judged on the same
 curves: log-likelihood per target (mean ± standard error), and targets a second of one core.
+Beside them stands what knows the Gaussian process: the best that any network can do.
 
-The package is no dependency; without it this says so and ends:
-    .venv/bin/pip install neuralprocesses==0.2.7
+The package is no dependency; without it this says so and ends. It wants an environment of its own:
+    .venv/bin/python -m pip install neuralprocesses==0.2.7
+    .venv/bin/python benchmarks/bench_neural_processes.py --steps 2000 --out data/results
+writes the numbers to `data/results/neural_processes.json` as well.
 """
 
 import argparse
+import importlib.metadata
 import importlib.util
 import math
 import time
@@ -20,24 +24,42 @@ import torch
 from affordlib.interactions import Normaliser
 from affordlib.models import AttentionConfig, CNPConfig, build
 from affordlib.models.network import gaussian_nll
+from affordlib.results import write_results
 from affordlib.types import Observations
 
 BATCH, MOST, TARGETS = 16, 10, 50
+JUDGED = 1600
 LENGTH, NOISE, RANGE = 0.25, 0.05, 2.0
 CHANNELS = {"action_channels": ("z",), "effect_channels": ("z",), "sigma_floor": 0.01}
 NO_SCALES = Normaliser((1.0,), (1.0,), (0.0, 0.0), (1.0, 1.0))
 
 
-def curves(n, generator):
-    """Phases and values: context (n, MOST), how many of it are seen (n,), target (n, TARGETS)."""
-    t = torch.rand(n, MOST + TARGETS, generator=generator, dtype=torch.float64)
+def covariances(t):
+    """Of the values at phases t (n, m), with noise: (n, m, m)."""
     distance = (t[:, :, None] - t[:, None]) * RANGE / LENGTH
-    covariance = (-distance.square() / 2).exp() + NOISE**2 * torch.eye(t.shape[1])
+    return (-distance.square() / 2).exp() + NOISE**2 * torch.eye(t.shape[1])
+
+
+def curves(n, generator):
+    """Phases and values: context (n, k) for some k up to MOST, and target (n, TARGETS)."""
+    t = torch.rand(n, MOST + TARGETS, generator=generator, dtype=torch.float64)
+    covariance = covariances(t)
     white = torch.randn(n, t.shape[1], 1, generator=generator, dtype=torch.float64)
     y = (torch.linalg.cholesky(covariance) @ white).squeeze(2)
     t, y = t.float(), y.float()
     count = int(torch.randint(1, MOST + 1, (1,), generator=generator))
     return t[:, :count], y[:, :count], t[:, MOST:], y[:, MOST:]
+
+
+def knowing(t_seen, y_seen, t, y):
+    """The log-likelihood of each target under the process itself, given the context."""
+    k = t_seen.shape[1]
+    covariance = covariances(torch.cat([t_seen, t], dim=1).double())
+    across = covariance[:, :k, k:]
+    weights = torch.linalg.solve(covariance[:, :k, :k], across)
+    mean = (weights * y_seen[..., None]).sum(dim=1)
+    variance = covariance[:, k:, k:].diagonal(dim1=1, dim2=2) - (weights * across).sum(dim=1)
+    return -gaussian_nll(y, mean, variance.sqrt())
 
 
 def ours(config):
@@ -89,38 +111,76 @@ def trained(pair, steps, rate):
         optimiser.step()
         busy += time.process_time() - began
         schedule.step()
+    return judged(likelihood), steps * BATCH * TARGETS / busy
+
+
+@torch.no_grad()
+def judged(likelihood):
+    """The log-likelihood per target of each judged curve."""
     g = torch.Generator().manual_seed(2)
-    with torch.no_grad():
-        told = torch.cat([likelihood(*curves(BATCH, g)).mean(dim=1) for _ in range(100)])
-    return told.numpy(), steps * BATCH * TARGETS / busy
+    told = [likelihood(*curves(BATCH, g)).mean(dim=1) for _ in range(JUDGED // BATCH)]
+    return torch.cat(told).double().numpy()
+
+
+def mean_sem(values):
+    return float(np.mean(values)), float(np.std(values, ddof=1) / math.sqrt(len(values)))
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=3000)
     parser.add_argument("--rate", type=float, default=5e-4)
+    parser.add_argument("--out", help="folder for neural_processes.json; none is written without")
     options = parser.parse_args()
     if importlib.util.find_spec("neuralprocesses") is None:
-        print("neuralprocesses is not installed; .venv/bin/pip install neuralprocesses==0.2.7")
+        print("neuralprocesses is not installed; see the head of this file")
         return
     torch.set_num_threads(1)
-    pairs = {
-        "CNP, ours": lambda: ours(CNPConfig(**CHANNELS)),
-        "CNP, theirs": lambda: theirs(False, dim_embedding=256, width=512),
-        "attention, ours": lambda: ours(AttentionConfig(**CHANNELS, frame="table")),
-        "attention, theirs": lambda: theirs(True, dim_embedding=128, width=256),
+    makers = {
+        ("CNP", "ours"): lambda: ours(CNPConfig(**CHANNELS)),
+        ("CNP", "theirs"): lambda: theirs(False, dim_embedding=256, width=512),
+        ("attention", "ours"): lambda: ours(AttentionConfig(**CHANNELS, frame="table")),
+        ("attention", "theirs"): lambda: theirs(True, dim_embedding=128, width=256),
     }
-    for name, make in pairs.items():
+    told, rates, rows = {}, {}, []
+    for (network, whose), make in makers.items():
         torch.manual_seed(0)
         pair = make()
         size = sum(p.numel() for p in pair[0].parameters())
-        told, rate = trained(pair, options.steps, options.rate)
-        sem = told.std(ddof=1) / math.sqrt(len(told))
+        told[network, whose], rate = trained(pair, options.steps, options.rate)
+        rates[network, whose] = rate
+        mean, sem = mean_sem(told[network, whose])
+        name = f"{network}, {whose}"
         print(
-            f"{name:18} {size / 1e6:5.2f} M parameters   log-likelihood {np.mean(told):6.3f} "
+            f"{name:18} {size / 1e6:5.2f} M parameters   log-likelihood {mean:6.3f} "
             f"± {sem:.3f}   {rate:8.0f} targets a second",
             flush=True,
         )
+        row = {"network": network, "whose": whose, "parameters": size, "n": JUDGED}
+        row |= {"log_likelihood_mean": mean, "log_likelihood_sem": sem}
+        rows.append(row | {"targets_per_second": rate})
+    best, sem = mean_sem(judged(knowing))
+    print(f"the process itself: log-likelihood {best:.3f} ± {sem:.3f}")
+    rows.append(
+        {"network": "the process itself", "whose": "known", "n": JUDGED}
+        | {"log_likelihood_mean": best, "log_likelihood_sem": sem}
+    )
+    pairs = []
+    for network in ("CNP", "attention"):
+        mean, sem = mean_sem(told[network, "ours"] - told[network, "theirs"])
+        ratio = rates[network, "ours"] / rates[network, "theirs"]
+        print(
+            f"{network}, ours - theirs: {mean:+.3f} ± {sem:.3f}; speed {ratio:.2f} : 1 (goal 1.5)"
+        )
+        pairs.append(
+            {"network": network, "n": JUDGED, "speed_ratio": ratio}
+            | {"log_likelihood_gain_mean": mean, "log_likelihood_gain_sem": sem}
+        )
+    if options.out:
+        parameters = {"steps": options.steps, "rate": options.rate, "batch": BATCH}
+        parameters["neuralprocesses"] = importlib.metadata.version("neuralprocesses")
+        tables = {"log_likelihood": rows, "difference": pairs}
+        print(write_results(options.out, "neural_processes", parameters, tables))
 
 
 if __name__ == "__main__":

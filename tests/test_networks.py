@@ -203,6 +203,22 @@ def test_harmonics_turn_as_their_image_does(some):
     torch.testing.assert_close(back, known, atol=1e-5, rtol=1e-4)
 
 
+@pytest.mark.parametrize("name", ["push_film", "push_cnp"])
+def test_many_questions_at_once_have_the_answers_of_each(name, some):
+    model, _ = load_checkpoint(name)
+    pushes = [Push(float(theta)) for theta in np.linspace(-3, 3, 40)]
+    features, t_target = model.encode(some.image[:1]), torch.linspace(0, 1, 6).expand(40, -1)
+    observed = observe_actions(model, pushes)
+    with torch.no_grad():
+        together = model.predict(features, observed, t_target)
+        each = [model.predict(features, observe_actions(model, [p]), t_target[:1]) for p in pushes]
+    apart = model.predict(features.expand(40, -1), observed, t_target)  # with gradients
+    for field in dataclasses.fields(together):
+        one_by_one = torch.cat([getattr(told, field.name) for told in each])
+        for other in (one_by_one, getattr(apart, field.name)):
+            assert torch.allclose(getattr(together, field.name), other, atol=1e-6, rtol=0)
+
+
 def test_turned_data_are_those_of_the_turned_push(some):
     """Yaw turns along where it is an orientation, and mirrors where it is a change."""
     turned = some.turned(1, mirror=True)

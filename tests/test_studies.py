@@ -7,14 +7,16 @@ import numpy as np
 import pytest
 import torch
 
-from affordlib.evaluation import studies
+from affordlib.evaluation import one_for_all, studies, tables
 from affordlib.evaluation.ablation import actions_only, half_blend, random_contexts
 from affordlib.evaluation.studies import cka, read_study
 from affordlib.interactions import TrainingArrays, open_interactions, split_interactions
-from affordlib.interactions.batches import sample_batch
+from affordlib.interactions.batches import observe_action, sample_batch
+from affordlib.models.frame import heading
 from affordlib.models.rollability import learn_rollability
 from affordlib.paths import repo_root
-from affordlib.results import read_results
+from affordlib.results import read_results, write_results
+from affordlib.types import Prediction
 from affordlib.world import LyingCylinder, UprightCylinder
 
 
@@ -89,6 +91,60 @@ def test_draws_leave_out_one_thing_each(pushes):
     assert torch.equal(loose.action, arrays.action[rows[:, None], at])
 
 
+@pytest.fixture(scope="module")
+def of_all():
+    """The first interactions of each primitive, with all channels."""
+    channels = one_for_all.NETWORK.action_channels, one_for_all.NETWORK.effect_channels
+    return {
+        name: TrainingArrays.from_dataset(open_interactions(name), np.arange(30), *channels)
+        for name in one_for_all.PRIMITIVES
+    }
+
+
+def test_the_commanded_action_tells_the_primitive(of_all):
+    told = {}
+    for name, arrays in of_all.items():
+        start, end = arrays.action[:, 0], arrays.action[:, -1]
+        beside = (start[:, :2].norm(dim=1) > 0.1, end[:, :2].norm(dim=1) > 0.01)
+        told[name] = torch.stack([*beside, end[:, 2] > 0.1, end[:, 4] < 0.5], dim=1).int()
+        assert (told[name] == told[name][0]).all()
+        towards = heading(observe_action(arrays), arrays.action_channels, arrays.effect_channels)
+        of_table = torch.tensor([1.0, 0.0]).expand(len(arrays), -1)
+        assert torch.equal(towards, of_table) == (name in ("grasp", "rotate"))
+    assert len({tuple(rows[0].tolist()) for rows in told.values()}) == 4
+
+
+def test_copies_keep_the_symmetries_of_each_primitive(of_all):
+    for name, arrays in of_all.items():
+        copies = one_for_all.with_copies(arrays, name)
+        n, each = len(arrays), copies.action.reshape(-1, *arrays.action.shape)
+        assert torch.equal(copies.image[:n], arrays.image)
+        if name in ("grasp", "rotate"):
+            assert all(torch.equal(action, arrays.action) for action in each)
+        else:
+            assert torch.equal(each[1][..., :2], arrays.action[..., :2] * torch.tensor([1.0, -1.0]))
+            assert torch.equal(copies.effect[n:, :, 1], -arrays.effect[..., 1])
+
+
+def test_shares_are_of_the_usual_effect(of_all):
+    class Knowing(torch.nn.Module):
+        known = 1.0
+
+        def encode(self, image):
+            return image
+
+        def predict(self, image, observations, t_target):
+            same = [a for a in of_all.values() if torch.equal(a.image, image)]
+            end = self.known * same[0].effect[:, -1:]
+            return Prediction(end, end, end, end)
+
+    model = Knowing()
+    assert one_for_all.shares(of_all)(model, None).tolist() == [0, 0, 0, 0]
+    model.known = 0.5
+    told = one_for_all.shares(of_all)(model, None)
+    assert ((told > 0.25) & (told <= 0.5)).all()
+
+
 def test_stale_studies_are_refused(tmp_path, monkeypatch):
     assert read_study("latent", tmp_path) is None
     monkeypatch.setattr(studies, "STUDIES", {"small": (lambda: [{"x": 1.0}], ("grasp",), ())})
@@ -100,18 +156,44 @@ def test_stale_studies_are_refused(tmp_path, monkeypatch):
         read_study("small", tmp_path)
 
 
+def test_studies_are_renewed_alone(tmp_path):
+    shipped = read_results(repo_root() / "data" / "results" / "effect_prediction.json")
+    units = {k: v for k, v in shipped["tables"].items() if k not in studies.STUDIES}
+    stale = units | {"latent": [{"cka_action_effect": 0.0}]}
+    write_results(tmp_path, "effect_prediction", shipped["parameters"], stale)
+    path = tables.renew_studies(tmp_path)
+    assert read_results(path) == shipped
+
+
 def test_the_committed_studies_tell_the_story():
-    tables = read_results(repo_root() / "data" / "results" / "effect_prediction.json")["tables"]
-    left_out = {row["change"]: row["final_error_mean_m"] for row in tables["ablation"]}
+    told = read_results(repo_root() / "data" / "results" / "effect_prediction.json")["tables"]
+    left_out = {row["change"]: row["final_error_mean_m"] for row in told["ablation"]}
     for change in ("no image", "table frame", "metres, not standardised"):
         assert left_out[change] > 1.5 * left_out["nothing"]
-    held_out = [r for r in tables["rollability"] if r["test"] in ("mixed", "partial")]
+    held_out = [r for r in told["rollability"] if r["test"] in ("mixed", "partial")]
     shares = [(r["learned_percent"], r["n"]) for r in held_out if r["object_class"] == "all"]
     assert sum(share * n for share, n in shares) / sum(n for _, n in shares) >= 98
+    more = {
+        (r["primitive"], r["effect"], r["test"]): r
+        for r in told["one_for_all"]
+        if r["model"] == one_for_all.ONE_FOR_ALL
+    }
+    assert 0 < more["push", "x, y", "push_test"]["more_mean_m"] < 0.0005
+    assert 0 < more["drag", "x, y", "folds"]["more_mean_m"] < 0.0005
+    grasp = more["grasp", "z", "folds"]
+    assert grasp["more_mean_m"] < 2 * grasp["more_sem_m"]
     effect, action = (
-        next(r for r in tables["latent"] if r["model"] == "push_cnp" and r["observed"] == kind)
+        next(r for r in told["latent"] if r["model"] == "push_cnp" and r["observed"] == kind)
         for kind in ("effect", "action")
     )
     assert effect["cka_action_effect"] > 0.9  # one affordance, told by either
     assert effect["cosine_to_action"] > effect["cosine_to_other"] + 0.2
     assert action["action_start_mean_m"] < 0.01
+
+
+def test_our_networks_are_as_likely_as_the_package_s():
+    told = read_results(repo_root() / "data" / "results" / "neural_processes.json")["tables"]
+    for row in told["difference"]:
+        assert row["log_likelihood_gain_mean"] > -2 * row["log_likelihood_gain_sem"]
+    *networks, bound = told["log_likelihood"]
+    assert all(r["log_likelihood_mean"] < bound["log_likelihood_mean"] for r in networks)

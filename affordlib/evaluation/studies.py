@@ -5,6 +5,8 @@
     rollability   whether an object rolls, read from its image alone
     mixed         one network for pushes and drags: which of them is meant, by the decoded action
     varied        a world that is no clean room: error, and whether σ knows of it
+    one_for_all   one network for all primitives, beside one for each
+    tails         why σ is too wide for most pushes: three readings of what is off, and by how much
 
     python -m affordlib.evaluation.studies --only latent rollability
 
@@ -27,6 +29,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from affordlib.evaluation import one_for_all, tails
 from affordlib.evaluation.ablation import CHANGES, ablated
 from affordlib.evaluation.answers import rounded
 from affordlib.interactions import TrainingArrays, open_interactions, split_interactions
@@ -264,6 +267,8 @@ STUDIES: dict[str, tuple[Callable[[], Rows], tuple[str, ...], tuple[str, ...]]] 
     "rollability": (rollability, ("mixed", "partial", "push_test", "drag", "reach"), ()),
     "mixed": (mixed, ("mixed", "partial"), ()),
     "varied": (varied, ("push_varied",), ()),
+    "tails": (tails.tails, ("push", "drag", "push_test"), tails.CHECKPOINTS),
+    "one_for_all": (one_for_all.one_for_all, (*one_for_all.PRIMITIVES, "push_test"), ()),
 }
 """By name: the study, the data sets and the checkpoints that it reads."""
 
@@ -273,6 +278,8 @@ def hashes(name: str) -> dict[str, Any]:
     _, sets, checkpoints = STUDIES[name]
     training = replace(TRAINING, device="cpu")
     settings = repr((training, SHIPPED["push_film"].network, ABLATION_STEPS, ABLATION_SEEDS))
+    if name == "one_for_all":
+        settings = repr(one_for_all.settings())
     files = {c: resolve_checkpoint(c).read_bytes() for c in checkpoints}
     return {
         "settings_sha256": hashlib.sha256(settings.encode()).hexdigest(),

@@ -38,7 +38,7 @@ def coverage(
 
 
 @torch.no_grad()
-def _at_phases(
+def effects_at(
     model: EffectNetwork, arrays: TrainingArrays, phases: Sequence[float]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Truth, mean and σ of the effects, (N, T, C) each, given image and action."""
@@ -56,7 +56,7 @@ def fit_temperature(
     x and y share one, as they share a scale: no direction of the table is special.
     """
     model.temperature = (1.0,) * len(model.effect_channels)
-    truth, mean, std = _at_phases(model, validation, phases)
+    truth, mean, std = effects_at(model, validation, phases)
     squared = ((truth - mean) / std).square().mean(dim=(0, 1))
     plane = plane_of(model.effect_channels)
     squared[plane] = squared[plane].mean()
@@ -75,7 +75,7 @@ def calibration_rows(
 
     The likelihood is a density of metres or radians; it compares models, not channels.
     """
-    truth, mean, std = _at_phases(model, arrays, phases)
+    truth, mean, std = effects_at(model, arrays, phases)
     rows = []
     for i, phase in enumerate(phases):
         for k, channel in enumerate(model.effect_channels):

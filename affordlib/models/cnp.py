@@ -25,7 +25,7 @@ from affordlib.models.network import (
     EffectNetwork,
     NetworkConfig,
     he_initialise,
-    masked_mean,
+    mean_code,
     with_time,
 )
 from affordlib.types import Observations
@@ -89,10 +89,12 @@ class AffordanceCNP(EffectNetwork):
     def represent(self, observations: Observations) -> Float[Tensor, "b 128"]:
         """r: (B, 128), equations (2) and (3), the means taken over what is observed."""
         o = observations
-        h_a = self.action_encoder(with_time(o.action / self.action_scale, o.action_t))
-        h_e = self.effect_encoder(with_time(o.effect / self.effect_scale, o.effect_t))
+        actions = with_time(o.action / self.action_scale, o.action_t)
+        effects = with_time(o.effect / self.effect_scale, o.effect_t)
+        r_a = mean_code(self.action_encoder, actions, o.action_mask)
+        r_e = mean_code(self.effect_encoder, effects, o.effect_mask)
         w_1 = o.weight[:, None]
-        return w_1 * masked_mean(h_a, o.action_mask) + (1 - w_1) * masked_mean(h_e, o.effect_mask)
+        return w_1 * r_a + (1 - w_1) * r_e
 
     def decode(
         self,

@@ -26,13 +26,16 @@ from affordlib.models.network import (
     EffectNetwork,
     NetworkConfig,
     he_initialise,
-    masked_mean,
+    mean_code,
     with_time,
 )
 from affordlib.types import IMAGE_PIXELS, Observations
 
 if TYPE_CHECKING:
     from affordlib.interactions.batches import Normaliser
+
+FEW_HEADINGS = 32
+"""From this many turns of one image on, its basis pays."""
 
 
 @dataclass(frozen=True)
@@ -128,6 +131,16 @@ class CircularHarmonics(nn.Module):
         turned = torch.complex(cosines, sines) * torch.stack(powers, dim=-1)[:, None, None]
         return torch.stack([turned.real, turned.imag], dim=2).flatten(1)
 
+    def basis(self, values: Float[Tensor, "1 f"]) -> Float[Tensor, "w f"]:
+        """Harmonics (2 orders + 2, F) of one image of which any turn by α is a weighted sum.
+
+        The weights are cos mα of all orders m, then sin mα.
+        """
+        each = torch.eye(self.layout[-1], device=values.device)[:, None, None, None]
+        cosines, sines = values.reshape(self.layout).unbind(dim=1)
+        parts = torch.stack([cosines, sines], dim=1), torch.stack([-sines, cosines], dim=1)
+        return torch.cat([(part * each).flatten(1) for part in parts])
+
 
 class FiLMNetwork(EffectNetwork):
     """Relates object image, action and effect; satisfies `EffectModel`."""
@@ -158,16 +171,30 @@ class FiLMNetwork(EffectNetwork):
     def turned_features(
         self, seen: Float[Tensor, "#b f"], heading: Float[Tensor, "b 2"]
     ) -> Float[Tensor, "b f"]:
-        """f(γ_o) of turned images, given the harmonics of the images as they lie."""
-        return self.image_encoder(self.harmonics.turned(seen, heading))
+        """f(γ_o) of turned images, given the harmonics of the images as they lie.
+
+        Of one image turned in many ways the first layer, linear, is computed of its basis alone.
+        """
+        if len(seen) > 1 or len(heading) < FEW_HEADINGS:
+            return self.image_encoder(self.harmonics.turned(seen, heading))
+        first, *rest = self.image_encoder
+        angle = torch.atan2(heading[:, 1], heading[:, 0])[:, None]
+        angle = angle * torch.arange(self.config.orders + 1, device=angle.device)
+        weights = torch.cat([angle.cos(), angle.sin()], dim=1)
+        x = weights @ F.linear(self.harmonics.basis(seen), first.weight) + first.bias
+        for layer in rest:
+            x = layer(x)
+        return x
 
     def represent(self, observations: Observations) -> Float[Tensor, "b w"]:
         """r: (B, W), equations (2) and (3), the means taken over what is observed."""
         o = observations
-        h_a = self.action_encoder(with_time(o.action / self.action_scale, o.action_t))
-        h_e = self.effect_encoder(with_time(o.effect / self.effect_scale, o.effect_t))
+        actions = with_time(o.action / self.action_scale, o.action_t)
+        effects = with_time(o.effect / self.effect_scale, o.effect_t)
+        r_a = mean_code(self.action_encoder, actions, o.action_mask)
+        r_e = mean_code(self.effect_encoder, effects, o.effect_mask)
         w_1 = o.weight[:, None]
-        return w_1 * masked_mean(h_a, o.action_mask) + (1 - w_1) * masked_mean(h_e, o.effect_mask)
+        return w_1 * r_a + (1 - w_1) * r_e
 
     def outputs(
         self, features: Tensor, observations: Observations, t_target: Tensor

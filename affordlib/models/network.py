@@ -242,6 +242,18 @@ def masked_mean(h: Float[Tensor, "b n c"], mask: Bool[Tensor, "b n"]) -> Float[T
     return (h * seen).sum(dim=1) / seen.sum(dim=1).clamp_min(1)
 
 
+def mean_code(
+    encoder: nn.Module, seen: Float[Tensor, "b n c"], mask: Bool[Tensor, "b n"]
+) -> Float[Tensor, "b h"]:
+    """Mean (B, H) of the codes of the observed of (B, n, C), each with its phase; zero of none.
+
+    Asked without gradients, what no query observes is not encoded: a plan is told no effects.
+    """
+    if not torch.is_grad_enabled() and not mask.any():
+        seen, mask = seen[:, :0], mask[:, :0]
+    return masked_mean(encoder(seen), mask)
+
+
 def gaussian_nll(y: Tensor, mean: Tensor, std: Tensor) -> Tensor:
     """-log N(y; mean, std²), elementwise."""
     return 0.5 * ((y - mean) / std) ** 2 + std.log() + 0.5 * math.log(2 * math.pi)
