@@ -2,6 +2,7 @@ import re
 import runpy
 
 import nbformat
+import numpy as np
 import pytest
 
 from affordlib.exercises import EXERCISES, check
@@ -51,6 +52,17 @@ def test_what_is_not_attempted(attempt):
     assert "Write speed_m_s(t)" in str(verdict)
 
 
+def straight(effects, direction, phase):
+    """A chain of pushes whose object does not turn."""
+    (ahead, left, _), (c, s) = effects(direction, phase)[0].T, (direction.cos(), direction.sin())
+    return float((c * ahead - s * left).sum()), float((s * ahead + c * left).sum())
+
+
+def trusting(plan, act):
+    """Carry a plan out without looking."""
+    return len([act(step) for step in plan.steps])
+
+
 @pytest.mark.parametrize(
     ("name", "attempt", "says"),
     [
@@ -61,6 +73,30 @@ def test_what_is_not_attempted(attempt):
         ("01.2", 7.0, "failed (ValueError: stop_phase must lie in [0, 1]"),
         ("02.1", 7.5, "failed, 7.5 mm; expected 0.076 ± 0.005 mm"),
         ("02.2", lambda d: 0.05 + d / 2, "failed, 5.2"),
+        ("03.1", 0.0, "failed, 0 mm; expected 1.38"),
+        ("03.2", lambda mean, sigma, rng: mean, "failed (ValueError: the draws spread by 0.00 σ"),
+        ("03.2", lambda m, s, rng: m + s * rng.standard_normal(2), "failed, 1.0"),
+        (
+            "03.2",
+            lambda m, s, rng: rng.normal(m, s)[1:],
+            "failed (ValueError: a course has the sha",
+        ),
+        ("04.1", lambda model, arrays: 0.0, "failed, 0 mm for the paper's network"),
+        ("04.1", lambda model, arrays: 0.002, "failed (ValueError: ours turns along"),
+        ("04.2", 1.0, "failed, 89"),
+        ("05.1", 0.276, "failed, 0.276 cm"),
+        ("05.2", 1.06, "failed, 1.06 times as far"),
+        ("06.1", straight, "failed, 23"),
+        ("06.2", lambda effects, goal: (np.arctan2(goal[1], goal[0]), 1.0), "failed, 39"),
+        ("07.1", lambda look, plan, act: trusting(plan(look()), act), "failed, 76"),
+        (
+            "07.1",
+            lambda look, plan, act: [act(plan(look()).steps[0]) for _ in range(99)],
+            "no end a",
+        ),
+        ("07.2", lambda height, phase, course: 1.0, "failed, 220"),
+        ("08.1", lambda image: image[1].mean(), "failed, 31"),
+        ("08.2", 0.42, "failed, 0.42 mm"),
     ],
 )
 def test_a_wrong_answer_fails_and_says_by_how_much(name, attempt, says):

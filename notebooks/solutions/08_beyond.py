@@ -1,0 +1,33 @@
+"""Solutions to the exercises of notebook 08."""
+
+import numpy as np
+
+from affordlib.evaluation.answers import final_error, network_answers
+from affordlib.exercises import check
+from affordlib.interactions import open_interactions
+from affordlib.models import load_checkpoint
+
+
+def strangeness(image):
+    """Cuboids and cylinders look the same turned by half a turn, a house does not.
+
+    It knows this kind of stranger only. A general one would ask how far the image, or its features,
+    are from the nearest of the training.
+    """
+    mask = image[1]
+    return np.abs(mask - mask[::-1, ::-1]).mean()
+
+
+def surest_half_mm():
+    """Half of the pushes, chosen by σ alone, are foreseen several times as well as all of them."""
+    pushes = open_interactions("push_test")
+    model, _ = load_checkpoint("push_film_x10")
+    told = network_answers(model, pushes, np.arange(pushes.sizes["interaction"]))
+    sigma = np.hypot(told["std"]["x"], told["std"]["y"])
+    return 1000 * float(final_error(told)[sigma <= np.median(sigma)].mean())
+
+
+VERDICTS = [check("08.1", strangeness), check("08.2", surest_half_mm())]
+
+if __name__ == "__main__":
+    print(*VERDICTS, sep="\n")
