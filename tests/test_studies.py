@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from affordlib.evaluation import one_for_all, studies, tables
+from affordlib.evaluation import one_for_all, studies
 from affordlib.evaluation.ablation import actions_only, half_blend, random_contexts
 from affordlib.evaluation.studies import cka, read_study
 from affordlib.interactions import TrainingArrays, open_interactions, split_interactions
@@ -15,7 +15,7 @@ from affordlib.interactions.batches import observe_action, sample_batch
 from affordlib.models.frame import heading
 from affordlib.models.rollability import learn_rollability
 from affordlib.paths import repo_root
-from affordlib.results import read_results, write_results
+from affordlib.results import read_results
 from affordlib.types import Prediction
 from affordlib.world import LyingCylinder, UprightCylinder
 
@@ -154,15 +154,6 @@ def test_stale_studies_are_refused(tmp_path, monkeypatch):
     (tmp_path / "small.json").write_text(json.dumps(told | {"data_sha256": {"grasp": "old"}}))
     with pytest.raises(ValueError, match=r"small\.json has another data_sha256 .* --only small"):
         read_study("small", tmp_path)
-
-
-def test_studies_are_renewed_alone(tmp_path):
-    shipped = read_results(repo_root() / "data" / "results" / "effect_prediction.json")
-    units = {k: v for k, v in shipped["tables"].items() if k not in studies.STUDIES}
-    stale = units | {"latent": [{"cka_action_effect": 0.0}]}
-    write_results(tmp_path, "effect_prediction", shipped["parameters"], stale)
-    path = tables.renew_studies(tmp_path)
-    assert read_results(path) == shipped
 
 
 def test_the_committed_studies_tell_the_story():

@@ -2,7 +2,7 @@
 
 import json
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -138,6 +138,24 @@ def test_the_hash_is_of_what_decides_the_numbers(monkeypatch):
     assert hash_with(device="cpu", max_minutes=3.0) == first
     monkeypatch.setattr(units, "FORMAT", units.FORMAT + 1)
     assert configuration_sha256(unit) != first
+
+
+def test_a_large_set_need_not_be_here_but_its_parts_must_agree(tmp_path):
+    unit = Unit("nearest", "rotate_x10")
+    part = {"unit": asdict(unit), "n": 1000, "data_sha256": {"rotate_x10": "a"}}
+    part["configuration_sha256"] = configuration_sha256(unit)
+    (tmp_path / unit.file).write_text(json.dumps(part))
+    assert read_part(unit, tmp_path) == part
+    other = replace(unit, fold=1)
+    more = part | {"unit": asdict(other), "data_sha256": {"rotate_x10": "b"}}
+    more["configuration_sha256"] = configuration_sha256(other)
+    (tmp_path / other.file).write_text(json.dumps(more))
+    with pytest.raises(ValueError, match=r"fold1-seed0\.json is of another 'rotate_x10'"):
+        tables._data(tables.read_parts(tmp_path))
+    part["configuration_sha256"] = "old"
+    (tmp_path / unit.file).write_text(json.dumps(part))
+    with pytest.raises(ValueError, match="another configuration_sha256"):
+        read_part(unit, tmp_path)
 
 
 def test_one_training_is_not_counted_twice(tmp_path):

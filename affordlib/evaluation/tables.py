@@ -6,7 +6,7 @@ Means and standard errors are over objects; `all` is the mean over object classe
 weights, its median and 95th percentile are of all objects together. Of a grasp, by the paper's
 rule, success is μ_z(1) > 0.1 m; TP is the share of the true successes that are foreseen, TN that of
 the true failures, with Wilson's 95 % intervals, folds pooled. A part whose hash is not its unit's
-is refused.
+is refused; the sets of ten times the size need not be here, if their parts agree.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from affordlib.evaluation.studies import STUDIES, read_study
 from affordlib.evaluation.units import MODELS, NETWORKS, PARTS, TEN_TIMES, Unit, read_part
 from affordlib.paths import resolve_out_dir
 from affordlib.primitives import Grasp
-from affordlib.results import read_results, write_results
+from affordlib.results import write_results
 
 NAME = "effect_prediction"
 KNOWS = {
@@ -300,29 +300,11 @@ def assemble(
     }
     tables["baselines"] = baseline_rows(tables)
     tables["frames"] = frame_rows(parts)
-    tables |= study_tables(studies)
+    made = {name: read_study(name, studies) for name in STUDIES}
+    tables |= {name: rows for name, rows in made.items() if rows is not None}
     trained = sum(unit.model in NETWORKS for unit, _ in parts)
     parameters = {"units": len(parts), "trained": trained, "data_sha256": _data(parts)}
     return write_results(out_dir, NAME, parameters, tables)
-
-
-def study_tables(folder: str | Path = STUDIES_FOLDER) -> dict[str, list[dict[str, Any]]]:
-    """The tables of the studies that were made."""
-    made = {name: read_study(name, folder) for name in STUDIES}
-    return {name: rows for name, rows in made.items() if rows is not None}
-
-
-def renew_studies(
-    out_dir: str | Path = "data/results", studies: str | Path = STUDIES_FOLDER
-) -> Path:
-    """Put the studies of today into `effect_prediction.json`; returns its path.
-
-    The tables of the units stay as they are, so the sets they were made of need not be here.
-    """
-    written = read_results(resolve_out_dir(out_dir) / f"{NAME}.json")
-    kept = {name: rows for name, rows in written["tables"].items() if name not in STUDIES}
-    tables = kept | study_tables(studies)
-    return write_results(out_dir, NAME, written["parameters"], tables)
 
 
 FRAMES = {
@@ -347,7 +329,13 @@ def frame_rows(parts: list[tuple[Unit, Part]]) -> list[dict[str, Any]]:
 
 
 def _data(parts: list[tuple[Unit, Part]]) -> dict[str, str]:
-    return dict(sorted({k: v for _, p in parts for k, v in p["data_sha256"].items()}.items()))
+    """Hashes of the sets by name; parts of one set must be of the same data."""
+    found: dict[str, str] = {}
+    for unit, part in parts:
+        for name, sha256 in part["data_sha256"].items():
+            if found.setdefault(name, sha256) != sha256:
+                raise ValueError(f"part {unit.file} is of another {name!r} than others are")
+    return dict(sorted(found.items()))
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -358,14 +346,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--parts", default=PARTS)
     parser.add_argument("--out", default="data/results")
     parser.add_argument("--studies", default=STUDIES_FOLDER)
-    parser.add_argument(
-        "--renew-studies", action="store_true", help="the studies alone; other tables stay"
-    )
     options = parser.parse_args(argv)
-    if options.renew_studies:
-        print(renew_studies(options.out, options.studies))
-    else:
-        print(assemble(options.parts, options.out, options.studies))
+    print(assemble(options.parts, options.out, options.studies))
     return 0
 
 

@@ -176,7 +176,7 @@ def configuration_sha256(unit: Unit) -> str:
 
 
 def data_sha256(unit: Unit) -> dict[str, str]:
-    """Hashes of the sets that a unit reads."""
+    """Hashes of the sets that a unit reads; FileNotFoundError where one is not here."""
     names = [unit.data, task_of(unit.data).also]
     return {name: stored_sha256(name) for name in names if name}
 
@@ -187,8 +187,17 @@ def hashes(unit: Unit) -> dict[str, Any]:
 
 
 def read_part(unit: Unit, folder: Path) -> dict[str, Any] | None:
-    """A unit's part; None when there is none, ValueError when it is another configuration's."""
-    return checked_part(unit, folder, hashes(unit))
+    """A unit's part; None when there is none, ValueError when it is another configuration's.
+
+    Of a set of ten times the size that is not here, which nobody ships, the data are not compared.
+    """
+    expected: dict[str, Any] = {"configuration_sha256": configuration_sha256(unit)}
+    try:
+        expected |= hashes(unit)
+    except FileNotFoundError:
+        if not unit.data.endswith(TEN_TIMES):
+            raise
+    return checked_part(unit, folder, expected)
 
 
 def run_unit(unit: Unit, folder: Path, progress: bool = False) -> bool:
