@@ -160,13 +160,26 @@ def step_rows(parts: Group) -> list[dict[str, Any]]:
     ]
 
 
+def summary_rows(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The windows in one row per model, as the paper's Table 1 has them."""
+    summary: dict[str, dict[str, Any]] = {}
+    for row in rows:
+        if row["protocol"] == "window":
+            names = ("model", "folds", "epochs", "n")
+            told = summary.setdefault(row["model"], {name: row[name] for name in names})
+            told[f"step_{row['steps']}_mean_cm"] = row["mean_cm"]
+    return list(summary.values())
+
+
 def assemble(folder: str | Path = PARTS, out_dir: str | Path = "data/results") -> Path:
     """Write `lever_up.json` from all parts of a folder; returns its path."""
     parts = read_parts(folder)
     if not any(unit.model == BASELINES[0] for unit, _ in parts):
         raise FileNotFoundError(f"folder: no part of the baselines in {folder}; run them first")
+    rows = error_rows(parts)
     tables = {
-        "lever_up": error_rows(parts),
+        "lever_up": rows,
+        "summary": summary_rows(rows),
         "motion": motion_rows(parts),
         "unseen_edges": error_rows(parts, no_edges=True),
         "paired": paired_rows(parts),
