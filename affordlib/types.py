@@ -230,7 +230,8 @@ class Outcome:
 
     distance_m: between the goal and the object at rest, gripper retreated; object_paths_xy_m: one
     (n, 2) path of the object per executed step, in the frame of the table; end_pose: (x, y, yaw);
-    tilt_rad: how far the object's upright axis ended from vertical.
+    tilt_rad: how far the object's upright axis ended from vertical; words: what else there is to
+    say of the ending.
     """
 
     plan: Plan
@@ -238,6 +239,7 @@ class Outcome:
     end_pose: tuple[float, float, float]
     tilt_rad: float
     object_paths_xy_m: tuple[np.ndarray, ...] = field(default=())
+    words: str = ""
 
     def with_goal(self, goal: Goal) -> Outcome:
         """The same outcome, measured against another goal."""

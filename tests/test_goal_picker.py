@@ -285,3 +285,35 @@ def test_the_ring_is_where_the_arm_can_push_from(world):
     reached = data["reached"].values[pushes].astype(bool)
     assert (inside == reached).mean() > 0.93
     assert reached[inside].mean() > 0.97
+
+
+@pytest.fixture
+def posed(make_picker):
+    return make_picker(executors={"closed loop": closed_loop(Repertoire.load())})
+
+
+def test_turn_and_lift_are_asked_for_and_done_in_a_closed_loop(posed, world):
+    posed.pick(0.04, 0.03)
+    posed._turn.value, posed._height.value = 25.0, 6.0
+    goal = posed.plan.goal
+    assert (math.degrees(goal.turn_rad), goal.height_m) == pytest.approx((25.0, 0.06))
+    assert goal.xy_m == (0.04, 0.03)
+    assert "Turn and lift follow there, in a closed loop." in posed._words.value
+    posed.run()
+    said = posed._words.value
+    assert "The turn is off by" in said
+    assert "The height is off by" in said
+    assert world.object_state()[2] == pytest.approx(0.025 + 0.06, abs=0.005)
+    posed.ask_pose()
+    assert posed.plan.goal.turn_rad is None
+    assert posed.plan.goal.height_m is None
+    assert (posed._turn.value, posed._height.value) == (0.0, 0.0)
+    assert world.object_state()[2] < 0.05  # let go, to be seen and planned for
+
+
+def test_a_plan_with_turn_and_lift_is_saved_and_loaded(posed):
+    posed.ask_pose(turn_deg=-30, height_cm=4)
+    posed.save("posed.json")
+    posed.ask_pose()
+    posed.load("posed.json")
+    assert (posed._turn.value, posed._height.value) == (-30.0, 4.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -48,6 +49,14 @@ def closed_loop(repertoire: Repertoire) -> Executor:
     def execute(world: Tabletop, plan: Plan, planner: Planner, tell: Tell) -> Outcome:
         done = pursue(world, plan.goal, repertoire, on_action=lambda *_: tell())
         tilt = world.object_tilt_rad()
-        return Outcome(plan, done.distance_m, done.end_pose, tilt, done.object_paths_xy_m)
+        words = "" if done.reached else f"The loop ended as {done.ending}: {done.words}."
+        for what, off, unit in (
+            ("turn", done.turn_error_rad and math.degrees(done.turn_error_rad), "°"),
+            ("height", done.height_error_m and 1000 * done.height_error_m, " mm"),
+        ):
+            if off is not None:
+                words += f" The {what} is off by {abs(off):.1f}{unit}."
+        paths = done.object_paths_xy_m
+        return Outcome(plan, done.distance_m, done.end_pose, tilt, paths, words.strip())
 
     return execute

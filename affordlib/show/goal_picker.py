@@ -8,22 +8,20 @@ from __future__ import annotations
 
 import base64
 import html
-import io
-import itertools
+import math
 import threading
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import ipywidgets as widgets
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from affordlib.paths import resolve_out_dir
 from affordlib.plan_files import load_plan, save_plan
 from affordlib.planning import carry_out
 from affordlib.show.executors import Stopped, open_loop
-from affordlib.show.plots import plot_footprint, plot_outcome, plot_plan, plot_table
+from affordlib.show.plots import table_picture
+from affordlib.show.pose_film import moving_part, pose_recorder
 from affordlib.show.sentences import outcome_in_words, plan_in_words
 from affordlib.show.table_view import TableView, make_scene, rounded
 from affordlib.types import Goal
@@ -34,11 +32,8 @@ if TYPE_CHECKING:
     from affordlib.show.executors import Executor, Planner
     from affordlib.types import Outcome, Plan
     from affordlib.world import Tabletop
-    from affordlib.world.motion import Film
 
 HALF_WIDTH_M, LIMIT_M = 0.36, 0.35
-FILM_EVERY = 12
-"""Simulation steps (1/240 s) between two poses of the film."""
 
 
 class GoalPicker(widgets.VBox):
@@ -52,9 +47,10 @@ class GoalPicker(widgets.VBox):
     goal_xy_m: [m], in whole millimetres. seed: of the disturbances. folder: where plans are saved,
     relative to the repository.
 
-    `plan` and `outcome` hold what is shown; `pick`, `run`, `stop`, `shove_object`, `move_goal`,
-    `start_over`, `save` and `load` do what mouse and buttons do. *Run* works in the background, at
-    a pace that can be watched; leave the world alone until it is done. `run()` returns when done.
+    `plan` and `outcome` hold what is shown; `pick`, `ask_pose`, `run`, `stop`, `shove_object`,
+    `move_goal`, `start_over`, `save` and `load` do what mouse and buttons do. *Run* works in the
+    background, at a pace that can be watched; leave the world alone until it is done. `run()`
+    returns when done.
     """
 
     def __init__(
@@ -76,7 +72,7 @@ class GoalPicker(widgets.VBox):
         self._rng = np.random.default_rng(seed)
         self._pose = self._first_pose = world.object_pose()
         self._goal = Goal(_whole_mm(*goal_xy_m))
-        self._running = self._setting = False
+        self._running = self._setting = self._lifted = False
         self._stop = threading.Event()
         self._waiting: list[Callable[[], None]] = []
         self._poses: list[tuple[float, ...]] = []  # of the film since the last action
@@ -89,7 +85,17 @@ class GoalPicker(widgets.VBox):
 
     def pick(self, x_m: float, y_m: float) -> None:
         """Set the goal [m], to the nearest millimetre, and make the plan anew."""
-        self._set_goal(Goal(_whole_mm(x_m, y_m), self._goal.tolerance_m))
+        self._set_goal(replace(self._goal, xy_m=_whole_mm(x_m, y_m)))
+        self._replan()
+
+    def ask_pose(self, turn_deg: float = 0.0, height_cm: float = 0.0) -> None:
+        """Ask for a turn and a height beside the position; 0 asks for none. Plans anew.
+
+        A closed loop turns and lifts the object once it is there; an open loop does not.
+        """
+        turn = math.radians(turn_deg) if turn_deg else None
+        height = height_cm / 100 if height_cm else None
+        self._set_goal(replace(self._goal, turn_rad=turn, height_m=height))
         self._replan()
 
     def run(self) -> None:
@@ -146,6 +152,10 @@ class GoalPicker(widgets.VBox):
 
     def _make_plan(self) -> None:
         planner, plan = self.planners[self._planner.value], None
+        if self._lifted:
+            self.world.park()
+            self._lifted = False
+            self._poses.clear()
         self._pose = self.world.object_pose()
         try:
             plan = planner(self.world.look(), self._pose[:2], self._goal)
@@ -161,6 +171,8 @@ class GoalPicker(widgets.VBox):
         try:
             self._goal = goal
             self._x.value, self._y.value = (round(100 * v, 1) for v in goal.xy_m)
+            self._turn.value = round(math.degrees(goal.turn_rad or 0.0), 1)
+            self._height.value = round(100 * (goal.height_m or 0.0), 1)
         finally:
             self._setting = False
 
@@ -188,13 +200,14 @@ class GoalPicker(widgets.VBox):
             if self.plan is None or self.outcome is not None:
                 self._make_plan()
             self._progress.value, self._progress.max = 0, max(1, len(self.plan.steps))
-            self.world.film = self._recorder(before)
+            self.world.film = pose_recorder(self._poses, before)
             try:
                 execute = self.executors[self._executor.value]
                 outcome, how = execute(self.world, self.plan, planner, tell), "Done,"
             except Stopped:
                 outcome, how = carry_out(self.world, replace(self.plan, steps=())), "Stopped after"
             self.outcome = outcome.with_goal(self._goal)
+            self._lifted = bool(self._goal.height_m)
             self._say(outcome_in_words(self.outcome, self._goal, how, done))
         finally:
             self.world.film = before
@@ -203,28 +216,11 @@ class GoalPicker(widgets.VBox):
             self._pose = self.world.object_pose()
             self._show()
 
-    def _recorder(self, before: Film | None) -> Film:
-        """A film for the world that writes down the object's poses, beside the world's own."""
-        steps = itertools.count()
-
-        def record(world: Tabletop) -> None:
-            if before is not None:
-                before(world)
-            if next(steps) % FILM_EVERY == 0:
-                self._poses.append(world.object_pose())
-
-        return record
-
     def _play(self, seconds: float) -> None:
         """Play what was filmed since the last time; a film of an object at rest is skipped."""
-        poses = np.array(self._poses)
+        poses = moving_part(self._poses)
         self._poses.clear()
-        if len(poses) < 2:
-            return
-        moving = np.abs(np.diff(poses, axis=0)).max(axis=1) > 1e-4
-        if moving.any():
-            first, last = np.flatnonzero(moving)[[0, -1]]
-            poses = poses[first : last + 2]
+        if len(poses):
             self._view.film = {"poses": rounded(poses), "seconds": seconds}
             self._stop.wait(seconds)
             self._walked.append(poses[:, :2])
@@ -258,7 +254,7 @@ class GoalPicker(widgets.VBox):
     def _move_goal(self) -> None:
         x, y = self._goal.xy_m
         dx, dy = self._drawn((x, y), 0.04, 0.08)
-        self._set_goal(Goal(_whole_mm(x + dx, y + dy), self._goal.tolerance_m))
+        self._set_goal(replace(self._goal, xy_m=_whole_mm(x + dx, y + dy)))
         self._show()
         self._say(f"The goal was moved by {1000 * np.hypot(dx, dy):.0f} mm.")
 
@@ -279,6 +275,10 @@ class GoalPicker(widgets.VBox):
         self._view = TableView(layout={"width": "480px", "max_width": "100%"})
         self._x = widgets.FloatSlider(value=x_cm, description="x [cm]", **limits)
         self._y = widgets.FloatSlider(value=y_cm, description="y [cm]", **limits)
+        turns = {"min": -90, "max": 90, "step": 5, "readout_format": ".0f"}
+        self._turn = widgets.FloatSlider(description="turn [°]", **turns)
+        heights = {"max": 20, "step": 0.5, "readout_format": ".1f"}
+        self._height = widgets.FloatSlider(description="lift [cm]", **heights)
         self._planner = widgets.Dropdown(options=list(self.planners), description="planner")
         self._executor = widgets.Dropdown(options=list(self.executors), description="carry out")
         self._run_button = _button("Run", "play", "Carry the plan out", button_style="primary")
@@ -293,6 +293,8 @@ class GoalPicker(widgets.VBox):
 
         for slider in (self._x, self._y):
             slider.observe(self._slid, names="value")
+        for slider in (self._turn, self._height):
+            slider.observe(self._posed, names="value")
         self._planner.observe(lambda _: self._safely(self._replan), names="value")
         self._view.observe(self._asked, names="asked")
         self._view.on_msg(self._pressed)
@@ -311,6 +313,8 @@ class GoalPicker(widgets.VBox):
             [self._executor],
             [self._x],
             [self._y],
+            [self._turn],
+            [self._height],
             [self._run_button, self._stop_button, self._progress],
             [widgets.Label("disturb"), self._shove_button, self._goal_button],
             [self._over],
@@ -328,6 +332,10 @@ class GoalPicker(widgets.VBox):
     def _slid(self, _: object) -> None:
         if not self._setting:
             self._safely(lambda: self.pick(self._x.value / 100, self._y.value / 100))
+
+    def _posed(self, _: object) -> None:
+        if not self._setting:
+            self._safely(lambda: self.ask_pose(self._turn.value, self._height.value))
 
     def _pressed(self, _: object, content: dict[str, Any], __: object) -> None:
         presses = {"run": self._run_in_background, "stop": self.stop}
@@ -369,19 +377,8 @@ class GoalPicker(widgets.VBox):
 
     def picture(self) -> bytes:
         """What is shown, as a PNG."""
-        # A figure of its own, outside pyplot: no window, nothing to close.
-        figure = Figure(figsize=(5, 5), layout="constrained")
-        FigureCanvasAgg(figure)
-        ax = plot_table(figure.add_subplot(), half_width_m=HALF_WIDTH_M)
-        if self.outcome is not None:
-            plot_outcome(ax, self.outcome)
-        elif self.plan is not None:
-            plot_plan(ax, self.plan)
-        plot_footprint(ax, self.world.thing, self._pose[:2], self._pose[2], label="object")
-        ax.legend(loc="upper left")
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format="png", dpi=90)
-        return buffer.getvalue()
+        there = self.world.thing, self._pose
+        return table_picture(*there, self.plan, self.outcome, half_width_m=HALF_WIDTH_M)
 
     def _repr_mimebundle_(self, **kwargs: object) -> dict[str, object]:
         # A box of widgets saves only text; the picture stays in the notebook without a kernel.

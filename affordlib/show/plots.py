@@ -5,12 +5,15 @@ Every function draws into the `ax` that it is given and returns it. Positions ar
 
 from __future__ import annotations
 
+import io
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
 from affordlib.perception import CAMERA_HEIGHT_M
 from affordlib.types import CROP_WIDTH_M, TABLE_X_M, TABLE_Y_M
@@ -19,7 +22,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
     from affordlib.planning import Pursuit
     from affordlib.types import Outcome, Plan
@@ -184,3 +186,26 @@ def plot_depth(ax: Axes, image: np.ndarray, title: str = "", width_m: float = CR
     ax.set_ylabel("y [cm]")
     ax.figure.colorbar(drawn, ax=ax, label="height [cm]", shrink=0.8)
     return ax
+
+
+def table_picture(
+    thing: Thing,
+    pose: Sequence[float],
+    plan: Plan | None,
+    outcome: Outcome | None,
+    half_width_m: float,
+) -> bytes:
+    """The table from above as a PNG: the object at (x, y, yaw), and the outcome, else the plan."""
+    # A figure of its own, outside pyplot: no window, nothing to close.
+    figure = Figure(figsize=(5, 5), layout="constrained")
+    FigureCanvasAgg(figure)
+    ax = plot_table(figure.add_subplot(), half_width_m=half_width_m)
+    if outcome is not None:
+        plot_outcome(ax, outcome)
+    elif plan is not None:
+        plot_plan(ax, plan)
+    plot_footprint(ax, thing, pose[:2], pose[2], label="object")
+    ax.legend(loc="upper left")
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=90)
+    return buffer.getvalue()

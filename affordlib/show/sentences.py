@@ -20,9 +20,12 @@ def plan_in_words(plan: Plan) -> str:
     arrives = "" if plan.reaches_goal else " It does not arrive."
     std_m = plan.steps[-1].std_m if plan.steps else math.nan
     unsure = "" if math.isnan(std_m) else f" (σ of the last step {1000 * std_m:.1f} mm)"
+    goal = plan.goal
+    posed = goal.turn_rad is not None or goal.height_m is not None
+    later = " Turn and lift follow there, in a closed loop." if posed else ""
     return (
         f"Plan: {steps}. Expected to end {1000 * plan.predicted_distance_m:.1f} mm from the goal"
-        f"{unsure}.{arrives} Found in {1000 * plan.plan_s:.0f} ms."
+        f"{unsure}.{arrives}{later} Found in {1000 * plan.plan_s:.0f} ms."
     )
 
 
@@ -32,5 +35,5 @@ def outcome_in_words(outcome: Outcome, goal: Goal, how: str, done: int) -> str:
     return (
         f"{how} {done} action{'s' * (done != 1)}: the object rests "
         f"<b>{1000 * outcome.distance_m:.1f} mm</b> from the goal, {within} the tolerance of "
-        f"{1000 * goal.tolerance_m:.0f} mm."
+        f"{1000 * goal.tolerance_m:.0f} mm. {outcome.words}".rstrip()
     )
