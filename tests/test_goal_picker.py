@@ -1,3 +1,4 @@
+import asyncio
 import base64
 import io
 import json
@@ -69,8 +70,8 @@ def test_a_picked_goal_is_planned_for_drawn_and_reached(picker, world):
     assert picker.outcome.distance_m == pytest.approx(
         picker.plan.goal.distance_m(world.object_pose()[:2])
     )
-    assert "mm</b> from the goal" in picker._words.value
-    assert not picker._run_button.disabled
+    assert "mm</b> from the goal" in picker.controls.words.value
+    assert not picker.controls.run.disabled
     truth = np.vstack(picker._view.scene["truth"])
     np.testing.assert_allclose(truth[-1], world.object_pose()[:2], atol=1e-3)
     np.testing.assert_allclose(picker._view.scene["object"]["pose"], world.object_pose(), atol=1e-5)
@@ -96,27 +97,64 @@ def test_what_the_view_asks_is_answered_once(picker, asked_of_planner):
         assert picker._view.scene["answered"] == number
     wanted = [(0.081, 0.033), (0.081, 0.033), (-0.05, 0.123)]
     assert asked_of_planner[before:] == wanted  # once each: no slider has echoed
-    assert (picker._x.value, picker._y.value) == (-5.0, 12.3)
+    assert (picker.controls.x.value, picker.controls.y.value) == (-5.0, 12.3)
     assert picker.plan.goal.xy_m == (-0.05, 0.123)
 
 
+def test_a_draft_until_the_hand_rests(make_picker, asked_of_planner, trained):
+    drafts = []
+
+    def draft(*query):
+        drafts.append(query[2].xy_m)
+        return replace(plan_astar(trained, *query), planner="draft")
+
+    picker = make_picker(draft=draft)
+    assert (picker.plan.planner, drafts) == ("astar", [])  # nobody is in a hurry
+
+    async def hand():
+        asked_of_planner.clear()
+        for number, xy in enumerate([(0.08, 0.03), (0.09, 0.03), (0.10, 0.03)], 1):
+            picker._view.asked = [*xy, number]
+            assert picker.plan.planner == "draft"
+            assert picker._view.scene["draft"]
+            assert picker._view.scene["answered"] == number
+        assert asked_of_planner == []
+        await asyncio.sleep(0.5)
+        assert picker.plan.planner == "astar"
+        assert asked_of_planner == [(0.10, 0.03)]  # once, where the hand came to rest
+        assert not picker._view.scene["draft"]
+        picker.controls.x.value = 7.0
+        assert (picker.plan.planner, len(drafts)) == ("draft", 4)
+        picker.run()  # what is carried out is the plan
+        assert picker.plan.planner == picker.outcome.plan.planner == "astar"
+        picker.controls.x.value = 8.0
+        picker.save()
+        assert load_plan(f"{picker.folder}/plan.json").planner == "astar"
+        picker.controls.x.value = 9.0
+        picker.load()
+        await asyncio.sleep(0.2)
+        assert picker._goal.xy_m[0] == 0.08  # no plan for a goal that was left comes late
+
+    asyncio.run(hand())
+
+
 def test_sliders_pick(picker, asked_of_planner):
-    picker._x.value = 7.7
-    picker._y.value = -4.0
+    picker.controls.x.value = 7.7
+    picker.controls.y.value = -4.0
     assert asked_of_planner[-2:] == [(0.077, 0.0), (0.077, -0.04)]
     assert picker._view.scene["goal"]["xy"] == [0.077, -0.04]
 
 
 def test_the_picker_shows_its_errors(picker):
-    picker._planner.value = "broken"
-    assert "<b>ValueError</b>: no &lt;plan&gt; today" in picker._words.value
+    picker.controls.planner.value = "broken"
+    assert "<b>ValueError</b>: no &lt;plan&gt; today" in picker.controls.words.value
     assert picker._view.scene["steps"] == []
     with pytest.raises(ValueError, match="off the table"):
         picker.pick(5.0, 0.0)
     with pytest.raises(RuntimeError, match="no plan to save"):
         picker.save()
-    picker._planner.value = "A*"
-    assert picker._words.value.count("Plan: ") == 1
+    picker.controls.planner.value = "A*"
+    assert picker.controls.words.value.count("Plan: ") == 1
     picker._view.asked = [0.1, 0.0, 1]
     assert picker._view.scene["steps"]
 
@@ -125,18 +163,18 @@ def test_stop_lets_an_action_end_and_begins_no_other(make_picker, world):
     picker = make_picker(seconds_per_action=30.0)
     picker.pick(0.24, 0.0)
     assert len(picker.plan.steps) > 1
-    picker._run_button.click()
-    wait_until(lambda: picker._progress.value == 1)
-    assert picker._stop_button.disabled is False
-    assert picker._run_button.disabled
+    picker.controls.run.click()
+    wait_until(lambda: picker.controls.progress.value == 1)
+    assert picker.controls.stop.disabled is False
+    assert picker.controls.run.disabled
     with pytest.raises(RuntimeError, match="still at work"):
         picker.run()
-    picker._stop_button.click()
+    picker.controls.stop.click()
     wait_until(lambda: not picker._work.is_alive())
-    assert "Stopped after 1 action:" in picker._words.value
+    assert "Stopped after 1 action:" in picker.controls.words.value
     first = picker.plan.steps[0].predicted_end_xy_m
     assert math.dist(world.object_pose()[:2], first) < 0.03
-    assert not picker._run_button.disabled
+    assert not picker.controls.run.disabled
 
 
 def test_a_run_is_filmed_at_the_pace_of_the_eye(make_picker):
@@ -180,12 +218,12 @@ def test_a_closed_loop_notices_what_an_open_loop_does_not(make_picker, trained):
     off_m = {}
     for name in executors:
         picker = make_picker(executors=executors, seconds_per_action=1.0, seed=5)
-        picker._executor.value = name
+        picker.controls.executor.value = name
         picker.pick(0.2, 0.0)
-        picker._run_button.click()
-        wait_until(lambda picker=picker: picker._progress.value == 1)
-        picker._goal_button.click()
-        picker._shove_button.click()
+        picker.controls.run.click()
+        wait_until(lambda picker=picker: picker.controls.progress.value == 1)
+        picker.controls.move_goal.click()
+        picker.controls.shove.click()
         wait_until(lambda picker=picker: not picker._work.is_alive())
         assert picker.outcome.distance_m == pytest.approx(
             picker._goal.distance_m(picker.world.object_pose()[:2])
@@ -199,12 +237,12 @@ def test_disturbances_are_seeded_and_planned_for(make_picker, world):
     ends = []
     for seed in (1, 1, 2):
         picker = make_picker(seed=seed)
-        picker._shove_button.click()
+        picker.controls.shove.click()
         ends.append(world.object_pose())
         assert picker.plan.start_xy_m == ends[-1][:2]
-        picker._goal_button.click()
+        picker.controls.move_goal.click()
         assert picker.plan.goal.xy_m != (0.12, 0.0)
-        picker._over.click()
+        picker.controls.start_over.click()
         assert picker.plan.start_xy_m == pytest.approx((0.0, 0.0), abs=1e-12)
     assert ends[0] == ends[1] != ends[2]
 
@@ -231,16 +269,16 @@ def test_a_plan_comes_back_from_its_file(picker, world, tmp_path):
     picker.pick(0.0, -0.1)
     picker.load("mine.json")
     assert picker._goal == plan.goal
-    assert picker._x.value == 10.0
+    assert picker.controls.x.value == 10.0
     back = picker.plan
     assert replace(back, steps=()) == replace(plan, steps=())
     for a, b in zip(back.steps, plan.steps, strict=True):
         assert (a.primitive, a.stop_phase, a.std_m) == (b.primitive, b.stop_phase, b.std_m)
         np.testing.assert_array_equal(a.predicted_path_xy_m, b.predicted_path_xy_m)
     picker.run()
-    assert "mm</b> from the goal" in picker._words.value
+    assert "mm</b> from the goal" in picker.controls.words.value
     picker.load("mine.json")
-    assert "from where this plan starts" in picker._words.value
+    assert "from where this plan starts" in picker.controls.words.value
 
 
 @pytest.mark.parametrize("primitive", [Push(0.3, length=0.02), Drag(1.0), Rotate()])
@@ -294,20 +332,20 @@ def posed(make_picker):
 
 def test_turn_and_lift_are_asked_for_and_done_in_a_closed_loop(posed, world):
     posed.pick(0.04, 0.03)
-    posed._turn.value, posed._height.value = 25.0, 6.0
+    posed.controls.turn.value, posed.controls.height.value = 25.0, 6.0
     goal = posed.plan.goal
     assert (math.degrees(goal.turn_rad), goal.height_m) == pytest.approx((25.0, 0.06))
     assert goal.xy_m == (0.04, 0.03)
-    assert "Turn and lift follow there, in a closed loop." in posed._words.value
+    assert "Turn and lift follow there, in a closed loop." in posed.controls.words.value
     posed.run()
-    said = posed._words.value
+    said = posed.controls.words.value
     assert "The turn is off by" in said
     assert "The height is off by" in said
     assert world.object_state()[2] == pytest.approx(0.025 + 0.06, abs=0.005)
     posed.ask_pose()
     assert posed.plan.goal.turn_rad is None
     assert posed.plan.goal.height_m is None
-    assert (posed._turn.value, posed._height.value) == (0.0, 0.0)
+    assert (posed.controls.turn.value, posed.controls.height.value) == (0.0, 0.0)
     assert world.object_state()[2] < 0.05  # let go, to be seen and planned for
 
 
@@ -316,4 +354,4 @@ def test_a_plan_with_turn_and_lift_is_saved_and_loaded(posed):
     posed.save("posed.json")
     posed.ask_pose()
     posed.load("posed.json")
-    assert (posed._turn.value, posed._height.value) == (-30.0, 4.0)
+    assert (posed.controls.turn.value, posed.controls.height.value) == (-30.0, 4.0)

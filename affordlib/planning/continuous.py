@@ -124,7 +124,12 @@ def _descend(
 
 
 def _correct(
-    effects: EffectMap, target: Tensor, direction: Tensor, phase: Tensor, partial: bool
+    effects: EffectMap,
+    target: Tensor,
+    direction: Tensor,
+    phase: Tensor,
+    partial: bool,
+    corrections: int,
 ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
     """One chain (1, K), brought to the target as the model foresees it, by Newton's method.
 
@@ -132,7 +137,7 @@ def _correct(
     turns (K,) that the model foresees.
     """
     ends, turns = _foreseen(effects, direction, phase)
-    for _ in range(CORRECTIONS):
+    for _ in range(corrections):
         off = target - ends[-1]
         if float(off.norm()) < 2e-5:
             break
@@ -182,14 +187,17 @@ def plan_continuous(
     effects: EffectMap | None = None,
     reachable: Reachable | None = None,
     seed: int = 0,
+    draft: bool = False,
     trace: list[tuple[Tensor, Tensor, Tensor]] | None = None,
 ) -> Plan:
     """Plan from the object's position [m] and depth image (2, 48, 48) to a goal, by gradient.
 
     kind: push or drag; effects: the object's map, if it was made before; reachable: a function of
     positions (n, 2) and directions (n,) that says where the arm can act. Where no chain comes near
-    the goal, the plan is the one that comes nearest. trace, if given, receives for each number of
-    actions K the directions and phases (B, K) of the chains that remain, and their costs (B,) [m].
+    the goal, the plan is the one that comes nearest. draft: a first plan in a fifth of the time, of
+    as few actions as the distance allows and without the descent. trace, if given, receives for
+    each number of actions K the directions and phases (B, K) of the chains that remain, and their
+    costs (B,) [m].
     """
     began = time.perf_counter()
     mode = mode_named(mode)
@@ -202,16 +210,19 @@ def plan_continuous(
     best, iterations = None, 0
     if float(target.norm()) > 1e-4:
         for n_actions in range(min(fewest, mode.max_steps), mode.max_steps + 1):
-            found = _best_chain(effects, xy, target, n_actions, mode.partial, reachable, rng, trace)
-            iterations += ITERATIONS
+            found = _best_chain(
+                effects, xy, target, n_actions, mode.partial, reachable, rng, draft, trace
+            )
+            iterations += 0 if draft else ITERATIONS
             if found is not None and (best is None or found[0] < best[0]):
                 best = found
-            if best is not None and n_actions >= fewest + 1:
+            if best is not None and n_actions >= fewest + (not draft):
                 break
     steps = ()
     if best is not None:
         direction, phase = best[1:]
-        chain, foreseen = _correct(effects, target, direction, phase, mode.partial)
+        corrections = 1 if draft else CORRECTIONS
+        chain, foreseen = _correct(effects, target, direction, phase, mode.partial, corrections)
         before = torch.cat([torch.zeros(1, 2), foreseen[0][:-1]])
         if not _allowed(xy, before[None], chain[None, :, 0], reachable).all():
             chain, foreseen = torch.stack([direction[0], phase[0]], dim=1), None
@@ -241,6 +252,7 @@ def _best_chain(
     partial: bool,
     reachable: Reachable | None,
     rng: np.random.Generator,
+    draft: bool,
     trace: list[tuple[Tensor, Tensor, Tensor]] | None,
 ) -> tuple[float, Tensor, Tensor] | None:
     """The cost [m] and the actions (1, K) of the best chain of so many actions, if there is one."""
@@ -257,7 +269,8 @@ def _best_chain(
     if not len(order):
         return None
     direction, phase, cost = direction[order], phase[order], cost[order]
-    if n_actions > 1:  # one action has nothing left to choose once it ends at the goal
+    # One action has nothing left to choose once it ends at the goal.
+    if n_actions > 1 and not draft:
         after = _descend(effects, target, direction, phase, partial)
         better, allowed = judged(*after)
         direction, phase = torch.cat([direction, after[0]]), torch.cat([phase, after[1]])

@@ -169,15 +169,16 @@ def map_once(planner: Callable[..., Plan], model: EffectModel, **settings: Any) 
     """`plan_astar` or `plan_continuous` as (image, start_xy_m, goal) → Plan, quick to ask again.
 
     As long as the image (2, 48, 48) stays the same, as it does while only the goal moves, its
-    effect map is that of the last call.
+    effect map is that of the last call. The function takes further settings of the planner by
+    name.
     """
     last: dict[bytes, EffectMap] = {}
 
-    def plan(image: np.ndarray, start_xy_m: Sequence[float], goal: Goal) -> Plan:
+    def plan(image: np.ndarray, start_xy_m: Sequence[float], goal: Goal, **further: Any) -> Plan:
         seen = np.ascontiguousarray(image).tobytes()
         if seen not in last:
             last.clear()
             last[seen] = map_effects(model, image)
-        return planner(model, image, start_xy_m, goal, effects=last[seen], **settings)
+        return planner(model, image, start_xy_m, goal, effects=last[seen], **settings | further)
 
     return plan

@@ -6,6 +6,7 @@ A view on plain objects: everything it does can be done with a planner, `carry_o
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import html
 import math
@@ -20,6 +21,7 @@ from affordlib.paths import resolve_out_dir
 from affordlib.plan_files import load_plan, save_plan
 from affordlib.planning import carry_out
 from affordlib.show.executors import Stopped, open_loop
+from affordlib.show.picker_controls import PickerControls
 from affordlib.show.plots import table_picture
 from affordlib.show.pose_film import moving_part, pose_recorder
 from affordlib.show.sentences import outcome_in_words, plan_in_words
@@ -34,6 +36,8 @@ if TYPE_CHECKING:
     from affordlib.world import Tabletop
 
 HALF_WIDTH_M, LIMIT_M = 0.36, 0.35
+REST_S = 0.08
+"""A hand that has asked for nothing new for so long has come to rest."""
 
 
 class GoalPicker(widgets.VBox):
@@ -43,7 +47,9 @@ class GoalPicker(widgets.VBox):
     plan, planner, tell) → Outcome that carries a plan out, or plans again with the planner that
     made it. It calls tell() after every action, which shows the reader what happened, lets a
     waiting disturbance happen, returns the goal as it is by then, and raises `Stopped`, to be let
-    through, once Stop was pressed. The default is `open_loop` alone.
+    through, once Stop was pressed. The default is `open_loop` alone. draft: a quick planner whose
+    plan is shown while the hand moves the goal; that of the chosen one takes its place when the
+    hand rests.
     goal_xy_m: [m], in whole millimetres. seed: of the disturbances. folder: where plans are saved,
     relative to the repository.
 
@@ -60,12 +66,13 @@ class GoalPicker(widgets.VBox):
         goal_xy_m: tuple[float, float] = (0.12, 0.10),
         *,
         executors: dict[str, Executor] | None = None,
+        draft: Planner | None = None,
         seed: int = 0,
         seconds_per_action: float = 1.2,
         folder: str = "runs/lab",
     ) -> None:
         self.world, self.planners = world, planners
-        self.executors = executors or {"open loop": open_loop}
+        self.executors, self.draft = executors or {"open loop": open_loop}, draft
         self.seconds_per_action, self.folder = seconds_per_action, folder
         self.plan: Plan | None = None
         self.outcome: Outcome | None = None
@@ -73,6 +80,7 @@ class GoalPicker(widgets.VBox):
         self._pose = self._first_pose = world.object_pose()
         self._goal = Goal(_whole_mm(*goal_xy_m))
         self._running = self._setting = self._lifted = False
+        self._rest: asyncio.TimerHandle | None = None  # while the plan shown is a draft
         self._stop = threading.Event()
         self._waiting: list[Callable[[], None]] = []
         self._poses: list[tuple[float, ...]] = []  # of the film since the last action
@@ -101,6 +109,7 @@ class GoalPicker(widgets.VBox):
     def run(self) -> None:
         """Carry the plan out and show what came of it; the next plan starts from there."""
         self._refuse_while_running()
+        self._settle()
         self._set_running(True)
         self._run(seconds_per_action=0.0)
 
@@ -125,6 +134,7 @@ class GoalPicker(widgets.VBox):
 
     def save(self, name: str = "plan.json") -> None:
         """Save the plan and its goal as JSON in the picker's folder."""
+        self._settle()
         if self.plan is None:
             raise RuntimeError("there is no plan to save; pick a goal that can be planned for")
         path = save_plan(resolve_out_dir(self.folder) / name, self.plan)
@@ -134,6 +144,7 @@ class GoalPicker(widgets.VBox):
         """Show a saved plan with its goal, to be run as it is."""
         self._refuse_while_running()
         plan = load_plan(resolve_out_dir(self.folder) / name)
+        self._no_rest()
         self._set_goal(plan.goal)
         self._pose, self.plan, self.outcome = self.world.object_pose(), plan, None
         self._walked.clear()
@@ -150,8 +161,36 @@ class GoalPicker(widgets.VBox):
         else:
             self._make_plan()
 
-    def _make_plan(self) -> None:
-        planner, plan = self.planners[self._planner.value], None
+    def _follow(self, x_m: float, y_m: float) -> None:
+        """Pick as the hand moves: a draft at once, where there is one, and the plan when it rests.
+
+        Where no loop waits for the hand (a script) there is the plan at once.
+        """
+        try:
+            loop = asyncio.get_running_loop()
+        except RuntimeError:
+            loop = None
+        if self.draft is None or loop is None or self._running:
+            return self.pick(x_m, y_m)
+        self._set_goal(replace(self._goal, xy_m=_whole_mm(x_m, y_m)))
+        try:
+            self._make_plan(self.draft)
+        finally:
+            self._rest = loop.call_later(REST_S, self._safely, self._settle)
+
+    def _settle(self) -> None:
+        """Let the plan of the chosen planner take the place of a draft."""
+        if self._rest is not None:
+            self._make_plan()
+
+    def _no_rest(self) -> None:
+        if self._rest is not None:
+            self._rest.cancel()
+            self._rest = None
+
+    def _make_plan(self, draft: Planner | None = None) -> None:
+        self._no_rest()
+        planner, plan = draft or self.planners[self.controls.planner.value], None
         if self._lifted:
             self.world.park()
             self._lifted = False
@@ -163,16 +202,14 @@ class GoalPicker(widgets.VBox):
         finally:
             self.plan, self.outcome = plan, None
             self._walked.clear()
-            self._show()
+            self._show(draft is not None)
 
     def _set_goal(self, goal: Goal) -> None:
         """Set the goal everywhere; the sliders are told, and what they echo is not listened to."""
         self._setting = True
         try:
             self._goal = goal
-            self._x.value, self._y.value = (round(100 * v, 1) for v in goal.xy_m)
-            self._turn.value = round(math.degrees(goal.turn_rad or 0.0), 1)
-            self._height.value = round(100 * (goal.height_m or 0.0), 1)
+            self.controls.show(goal)
         finally:
             self._setting = False
 
@@ -183,12 +220,12 @@ class GoalPicker(widgets.VBox):
             raise RuntimeError("the robot is still at work; press Stop or wait")
 
     def _run(self, seconds_per_action: float) -> None:
-        planner, before, done = self.planners[self._planner.value], self.world.film, 0
+        planner, before, done = self.planners[self.controls.planner.value], self.world.film, 0
 
         def tell() -> Goal:
             nonlocal done
             done += 1
-            self._progress.value = done
+            self.controls.progress.value = done
             self._play(seconds_per_action)
             while self._waiting and not self._stop.is_set():
                 self._waiting.pop(0)()
@@ -199,10 +236,11 @@ class GoalPicker(widgets.VBox):
         try:
             if self.plan is None or self.outcome is not None:
                 self._make_plan()
-            self._progress.value, self._progress.max = 0, max(1, len(self.plan.steps))
+            self.controls.progress.value = 0
+            self.controls.progress.max = max(1, len(self.plan.steps))
             self.world.film = pose_recorder(self._poses, before)
             try:
-                execute = self.executors[self._executor.value]
+                execute = self.executors[self.controls.executor.value]
                 outcome, how = execute(self.world, self.plan, planner, tell), "Done,"
             except Stopped:
                 outcome, how = carry_out(self.world, replace(self.plan, steps=())), "Stopped after"
@@ -229,9 +267,7 @@ class GoalPicker(widgets.VBox):
     def _set_running(self, running: bool) -> None:
         self._running = running
         self._stop.clear()
-        for control in (self._run_button, self._over, self._planner, self._executor, self._load):
-            control.disabled = running
-        self._stop_button.disabled = not running
+        self.controls.set_running(running)
 
     # Disturbing
 
@@ -270,72 +306,43 @@ class GoalPicker(widgets.VBox):
     # The widget
 
     def _build(self) -> list[widgets.Widget]:
-        limits = {"min": -100 * LIMIT_M, "max": 100 * LIMIT_M, "step": 0.1, "readout_format": ".1f"}
-        x_cm, y_cm = (round(100 * v, 1) for v in self._goal.xy_m)
         self._view = TableView(layout={"width": "480px", "max_width": "100%"})
-        self._x = widgets.FloatSlider(value=x_cm, description="x [cm]", **limits)
-        self._y = widgets.FloatSlider(value=y_cm, description="y [cm]", **limits)
-        turns = {"min": -90, "max": 90, "step": 5, "readout_format": ".0f"}
-        self._turn = widgets.FloatSlider(description="turn [°]", **turns)
-        heights = {"max": 20, "step": 0.5, "readout_format": ".1f"}
-        self._height = widgets.FloatSlider(description="lift [cm]", **heights)
-        self._planner = widgets.Dropdown(options=list(self.planners), description="planner")
-        self._executor = widgets.Dropdown(options=list(self.executors), description="carry out")
-        self._run_button = _button("Run", "play", "Carry the plan out", button_style="primary")
-        self._stop_button = _button("Stop", "stop", "Stop after this action", disabled=True)
-        self._progress = widgets.IntProgress(max=1, layout={"width": "9em"})
-        self._shove_button = _button("Shove it", "hand-o-right", "Disturb: shove the object")
-        self._goal_button = _button("Move goal", "random", "Disturb: move the goal")
-        self._over = _button("Start over", "undo", "Put the object back")
-        self._name = widgets.Text("plan.json", description="file", layout={"width": "14em"})
-        self._save, self._load = _button("Save", "save"), _button("Load", "folder-open")
-        self._words = widgets.HTML()
-
-        for slider in (self._x, self._y):
+        self.controls = controls = PickerControls(
+            self._goal, list(self.planners), list(self.executors), LIMIT_M
+        )
+        for slider in (controls.x, controls.y):
             slider.observe(self._slid, names="value")
-        for slider in (self._turn, self._height):
+        for slider in (controls.turn, controls.height):
             slider.observe(self._posed, names="value")
-        self._planner.observe(lambda _: self._safely(self._replan), names="value")
+        controls.planner.observe(lambda _: self._safely(self._replan), names="value")
         self._view.observe(self._asked, names="asked")
         self._view.on_msg(self._pressed)
         for button, action in {
-            self._run_button: self._run_in_background,
-            self._stop_button: self.stop,
-            self._shove_button: self.shove_object,
-            self._goal_button: self.move_goal,
-            self._over: self.start_over,
-            self._save: lambda: self.save(self._name.value),
-            self._load: lambda: self.load(self._name.value),
+            controls.run: self._run_in_background,
+            controls.stop: self.stop,
+            controls.shove: self.shove_object,
+            controls.move_goal: self.move_goal,
+            controls.start_over: self.start_over,
+            controls.save: lambda: self.save(controls.name.value),
+            controls.load: lambda: self.load(controls.name.value),
         }.items():
             button.on_click(lambda _, action=action: self._safely(action))
-        controls = [
-            [self._planner],
-            [self._executor],
-            [self._x],
-            [self._y],
-            [self._turn],
-            [self._height],
-            [self._run_button, self._stop_button, self._progress],
-            [widgets.Label("disturb"), self._shove_button, self._goal_button],
-            [self._over],
-            [self._name, self._save, self._load],
-            [self._words],
-        ]
-        beside = widgets.VBox([widgets.HBox(row) for row in controls])
         layout = {"flex_flow": "row wrap", "grid_gap": "12px"}
-        return [widgets.HBox([self._view, beside], layout=layout)]
+        return [widgets.HBox([self._view, controls.box()], layout=layout)]
 
     def _asked(self, change: dict[str, Any]) -> None:
         x, y, _ = change["new"]
-        self._safely(lambda: self.pick(x, y))
+        self._safely(lambda: self._follow(x, y))
 
     def _slid(self, _: object) -> None:
-        if not self._setting:
-            self._safely(lambda: self.pick(self._x.value / 100, self._y.value / 100))
+        xy_m = _whole_mm(self.controls.x.value / 100, self.controls.y.value / 100)
+        if not self._setting and xy_m != self._goal.xy_m:  # the page echoes what it was told
+            self._safely(lambda: self._follow(*xy_m))
 
     def _posed(self, _: object) -> None:
         if not self._setting:
-            self._safely(lambda: self.ask_pose(self._turn.value, self._height.value))
+            turn_deg, height_cm = self.controls.turn.value, self.controls.height.value
+            self._safely(lambda: self.ask_pose(turn_deg, height_cm))
 
     def _pressed(self, _: object, content: dict[str, Any], __: object) -> None:
         presses = {"run": self._run_in_background, "stop": self.stop}
@@ -345,6 +352,7 @@ class GoalPicker(widgets.VBox):
     def _run_in_background(self) -> None:
         """So that Stop, a disturbance and a new goal are heard while the robot is at work."""
         self._refuse_while_running()
+        self._settle()
         self._set_running(True)
         self._work = threading.Thread(
             target=lambda: self._safely(lambda: self._run(self.seconds_per_action)), daemon=True
@@ -358,10 +366,9 @@ class GoalPicker(widgets.VBox):
             self._say(f"<b>{type(error).__name__}</b>: {html.escape(str(error))}")
 
     def _say(self, text: str) -> None:
-        style = "width: 27em; max-width: 100%; line-height: 1.4; white-space: normal"
-        self._words.value = f"<div role='status' aria-live='polite' style='{style}'>{text}</div>"
+        self.controls.say(text)
 
-    def _show(self) -> None:
+    def _show(self, draft: bool = False) -> None:
         self._view.scene = make_scene(
             self.world.thing,
             self._pose,
@@ -373,6 +380,7 @@ class GoalPicker(widgets.VBox):
             LIMIT_M,
             answered=self._view.asked[2],
             running=self._running,
+            draft=draft,
         )
 
     def picture(self) -> bytes:
@@ -388,9 +396,3 @@ class GoalPicker(widgets.VBox):
 
 def _whole_mm(x_m: float, y_m: float) -> tuple[float, float]:
     return round(x_m, 3), round(y_m, 3)
-
-
-def _button(name: str, icon: str, tooltip: str = "", **kwargs: Any) -> widgets.Button:
-    return widgets.Button(
-        description=name, icon=icon, tooltip=tooltip or name, layout={"width": "auto"}, **kwargs
-    )

@@ -137,6 +137,7 @@ function render({ model, el }) {
     if (film) show(performance.now());
     else moveObject(now.object.pose);
     svg.dataset.answered = now.answered;
+    svg.dataset.draft = now.draft;
   }
 
   function show(time) {

@@ -53,13 +53,14 @@ def make_scene(
     limit_m: float,
     answered: int,
     running: bool = False,
+    draft: bool = False,
 ) -> dict[str, Any]:
     """What `TableView` draws, in metres.
 
     pose: (x, y, yaw) of the object; steps: of the plan, from start_xy_m on; truth_xy_m: paths
     (n, 2) that the object has gone; half_width_m: of the view; limit_m: how far from the middle a
     goal may be asked for; answered: the number of the question that this answers; running:
-    whether the robot is at work, so that a film goes on.
+    whether the robot is at work, so that a film goes on; draft: whether a better plan will follow.
 
     The shaded ring is where an object can be pushed towards any side: as far within the tool's
     reach as a push begins from the object.
@@ -87,6 +88,7 @@ def make_scene(
         "truth": [rounded(path) for path in truth_xy_m],
         "answered": answered,
         "running": running,
+        "draft": draft,
     }
 
 

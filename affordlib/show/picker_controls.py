@@ -1,0 +1,83 @@
+"""What stands beside the table of a goal picker: sliders, menus, buttons and words."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import ipywidgets as widgets
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from affordlib.types import Goal
+
+
+class PickerControls:
+    """The controls, which do nothing by themselves; lengths in cm, turns in degrees.
+
+    planners, executors: the names to choose from. limit_m: how far from the middle a goal may be.
+    """
+
+    def __init__(
+        self, goal: Goal, planners: Sequence[str], executors: Sequence[str], limit_m: float
+    ) -> None:
+        limits = {"min": -100 * limit_m, "max": 100 * limit_m, "step": 0.1, "readout_format": ".1f"}
+        self.x = widgets.FloatSlider(description="x [cm]", **limits)
+        self.y = widgets.FloatSlider(description="y [cm]", **limits)
+        turns = {"min": -90, "max": 90, "step": 5, "readout_format": ".0f"}
+        self.turn = widgets.FloatSlider(description="turn [°]", **turns)
+        heights = {"max": 20, "step": 0.5, "readout_format": ".1f"}
+        self.height = widgets.FloatSlider(description="lift [cm]", **heights)
+        self.planner = widgets.Dropdown(options=list(planners), description="planner")
+        self.executor = widgets.Dropdown(options=list(executors), description="carry out")
+        self.run = _button("Run", "play", "Carry the plan out", button_style="primary")
+        self.stop = _button("Stop", "stop", "Stop after this action", disabled=True)
+        self.progress = widgets.IntProgress(max=1, layout={"width": "9em"})
+        self.shove = _button("Shove it", "hand-o-right", "Disturb: shove the object")
+        self.move_goal = _button("Move goal", "random", "Disturb: move the goal")
+        self.start_over = _button("Start over", "undo", "Put the object back")
+        self.name = widgets.Text("plan.json", description="file", layout={"width": "14em"})
+        self.save, self.load = _button("Save", "save"), _button("Load", "folder-open")
+        self.words = widgets.HTML()
+        self.show(goal)
+
+    def box(self) -> widgets.VBox:
+        """All of them, one below the other."""
+        rows = [
+            [self.planner],
+            [self.executor],
+            [self.x],
+            [self.y],
+            [self.turn],
+            [self.height],
+            [self.run, self.stop, self.progress],
+            [widgets.Label("disturb"), self.shove, self.move_goal],
+            [self.start_over],
+            [self.name, self.save, self.load],
+            [self.words],
+        ]
+        return widgets.VBox([widgets.HBox(row) for row in rows])
+
+    def show(self, goal: Goal) -> None:
+        """Set the sliders to a goal."""
+        self.x.value, self.y.value = (round(100 * v, 1) for v in goal.xy_m)
+        self.turn.value = round(math.degrees(goal.turn_rad or 0.0), 1)
+        self.height.value = round(100 * (goal.height_m or 0.0), 1)
+
+    def set_running(self, running: bool) -> None:
+        """While the robot is at work, only what it listens to can be pressed."""
+        for control in (self.run, self.start_over, self.planner, self.executor, self.load):
+            control.disabled = running
+        self.stop.disabled = not running
+
+    def say(self, text: str) -> None:
+        """Show a text, as HTML, and have it read aloud where that is wanted."""
+        style = "width: 27em; max-width: 100%; line-height: 1.4; white-space: normal"
+        self.words.value = f"<div role='status' aria-live='polite' style='{style}'>{text}</div>"
+
+
+def _button(name: str, icon: str, tooltip: str = "", **kwargs: Any) -> widgets.Button:
+    return widgets.Button(
+        description=name, icon=icon, tooltip=tooltip or name, layout={"width": "auto"}, **kwargs
+    )

@@ -1,0 +1,61 @@
+"""Notebook 07 in a real browser: all its cells, and a robot that is disturbed by hand."""
+
+import numpy as np
+import pytest
+import yaml
+from lab_pages import (
+    WIDGET,
+    Table,
+    ask,
+    button,
+    goal_of,
+    in_a_browser,
+    opened,
+    picture,
+    saved_outputs,
+    serve,
+    wait_for_words,
+)
+
+from affordlib.paths import repo_root
+
+pytestmark = in_a_browser
+
+NAME = "07_closed_loop"
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory):
+    smoke = yaml.safe_load((repo_root() / "notebooks" / "profiles" / "smoke.yaml").read_text())
+    with serve(tmp_path_factory.mktemp("lab"), NAME, **smoke[NAME]) as lab:
+        yield lab
+
+
+@pytest.fixture(scope="module")
+def page(lab):
+    with opened(lab) as page:
+        yield page
+
+
+def test_all_cells_have_run(page, lab):
+    outputs = saved_outputs(page, lab)
+    assert [o for o in outputs if o.output_type == "error"] == []
+    assert sum("image/png" in o.get("data", ()) for o in outputs) >= 7
+    assert all("image/png" in o["data"] for o in outputs if WIDGET in o.get("data", ()))
+    assert (lab.out / f"{NAME}.json").is_file()
+
+
+def test_disturbed_while_it_works_it_still_arrives(page):
+    table = Table(page)
+    goal = goal_of(page)
+    button(page, "Run").click()
+    page.wait_for_function("() => document.querySelector('.trail')?.getAttribute('points')")
+    button(page, "Shove it").click()
+    button(page, "Move goal").click()
+    wait_for_words(page, "from the goal, within")
+    there = ask(page, "list(picker._goal.xy_m)")
+    assert 0.039 < np.hypot(*np.subtract(there, goal)) < 0.081
+    assert ask(page, "picker.outcome.distance_m") < 0.005
+    np.testing.assert_allclose(table.points(".object").mean(axis=0), there, atol=0.006)
+    np.testing.assert_allclose(table.goal(), there, atol=1e-4)
+    picture(page, "8_disturbed_in_07")
