@@ -78,9 +78,9 @@ def _objective(
     effects: EffectMap, target: Tensor, direction: Tensor, phase: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Expected squared distances (B,) [m²], and where the chains are before each action."""
-    positions, _, variance = roll_out(effects, direction, phase)
+    positions, _, variances = roll_out(effects, direction, phase)
     before = torch.cat([torch.zeros_like(positions[:, :1]), positions[:, :-1]], dim=1)
-    return (positions[:, -1] - target).square().sum(dim=-1) + CAUTION * variance, before
+    return (positions[:, -1] - target).square().sum(dim=-1) + CAUTION * variances[:, -1], before
 
 
 def _slopes(

@@ -35,6 +35,10 @@ N_PHASES = 41
 FINE_DIRECTIONS = 180
 FINE_PHASES = 51
 _WRAP = 3
+_SPLINES = (
+    torch.tensor([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]], dtype=torch.float64)
+    / 6
+)
 
 
 @dataclass(frozen=True)
@@ -54,16 +58,19 @@ class EffectMap:
 
     def __call__(self, direction_rad: Tensor, phase: Tensor) -> tuple[Tensor, Tensor]:
         """Effects and σ (..., 3) in the frame of the action, directions relative to the object."""
-        rows, columns = (n - _WRAP for n in self.coefficients.shape[:2])
-        u = torch.remainder(direction_rad, 2 * math.pi) * (rows / (2 * math.pi))
-        v = phase.clamp(0, 1) * (columns - 1)
+        shape, (height, width, channels) = direction_rad.shape, self.coefficients.shape
+        rows, columns = height - _WRAP, width - _WRAP
+        u = torch.remainder(direction_rad.reshape(-1), 2 * math.pi) * (rows / (2 * math.pi))
+        v = phase.reshape(-1).clamp(0, 1) * (columns - 1)
         i, j = u.detach().floor().clamp(0, rows - 1), v.detach().floor().clamp(0, columns - 2)
-        across, along = _basis(u - i), _basis(v - j)
+        across, along = _basis(torch.stack([u - i, v - j]))
+        weights = (across[:, :, None] * along[:, None, :]).reshape(-1, 1, 16)
+        # Flat indices and a product of matrices: half the time of indexing in two dimensions.
         four = torch.arange(4)
-        near = self.coefficients[
-            (i.long()[..., None] + four)[..., :, None], (j.long()[..., None] + four)[..., None, :]
-        ]
-        values = (near * across[..., :, None, None] * along[..., None, :, None]).sum(dim=(-3, -2))
+        patch = (width * four[:, None] + four).reshape(-1)
+        at = ((width * i + j).long()[:, None] + patch).reshape(-1)
+        near = self.coefficients.reshape(-1, channels).index_select(0, at)
+        values = (weights @ near.reshape(-1, 16, channels)).reshape(*shape, channels)
         return values[..., :3], values[..., 3:].clamp_min(1e-6)
 
     @cached_property
@@ -103,9 +110,8 @@ class EffectMap:
 
 def _basis(x: Tensor) -> Tensor:
     """The four cubic B-splines (..., 4) that do not vanish at x in [0, 1]."""
-    y = 1 - x
-    middle = [4 - 6 * a**2 + 3 * a**3 for a in (x, y)]
-    return torch.stack([y**3, *middle, x**3], dim=-1) / 6
+    powers = torch.stack([torch.ones_like(x), x, x * x, x**3], dim=-1)
+    return powers @ _SPLINES
 
 
 def _asked(

@@ -22,38 +22,46 @@ if TYPE_CHECKING:
 def roll_out(
     effects: EffectMap, direction_rad: Tensor, phase: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Positions (B, K, 2) [m] and turns (B, K) [rad] after each action, and the variance (B,) [m²].
+    """Positions (B, K, 2) [m], turns (B, K) [rad] and variances (B, K) [m²] after each action.
 
     direction_rad, phase: (B, K), of chains that start at the origin. The variance is the trace of
-    the covariance of the last position: what each action adds, and what an unsure turn makes of
-    the actions that follow.
+    the covariance of the position: what each action adds, and what an unsure turn makes of the
+    actions that follow.
     """
     n, k_max = direction_rad.shape
     position, turned = direction_rad.new_zeros(n, 2), direction_rad.new_zeros(n)
-    covariance = direction_rad.new_zeros(n, 3, 3)
-    positions, turns = [], []
+    # Of the covariance: the trace of the position's part, the turn's variance, and what ties them.
+    spread, turn_variance = torch.zeros_like(turned), torch.zeros_like(turned)
+    tie = torch.zeros_like(position)
+    told = []
     nearby = torch.tensor([0.0, -0.02, 0.02], dtype=direction_rad.dtype)
     for k in range(k_max):
         angle = direction_rad[:, k]
-        told, std = effects((angle - turned)[:, None] + nearby, phase[:, k, None].expand(n, 3))
-        slope = (told[:, 2] - told[:, 1]) / (nearby[2] - nearby[1])
-        c, s = angle.cos(), angle.sin()
-        turn = torch.stack([torch.stack([c, -s], -1), torch.stack([s, c], -1)], -2)
-        effect, std = told[:, 0], std[:, 0]
-        position = position + (turn @ effect[:, :2, None])[..., 0]
+        effect, std = effects((angle - turned)[:, None] + nearby, phase[:, k, None].expand(n, 3))
+        slope = (effect[:, 1] - effect[:, 2]) / (nearby[2] - nearby[1])  # by the turn before it
+        effect, added = effect[:, 0], std[:, 0].square()
+        swing = _turned(slope[:, :2], angle)
+        spread = (
+            spread
+            + (2 * tie * swing).sum(dim=-1)
+            + turn_variance * swing.square().sum(dim=-1)
+            + added[:, :2].sum(dim=-1)
+        )
+        kept = 1 + slope[:, 2]
+        tie = kept[:, None] * (tie + turn_variance[:, None] * swing)
+        turn_variance = kept.square() * turn_variance + added[:, 2]
+        position = position + _turned(effect[:, :2], angle)
         turned = turned + effect[:, 2]
-        carry = torch.eye(3, dtype=angle.dtype).repeat(n, 1, 1)
-        carry[:, :2, 2] = -(turn @ slope[:, :2, None])[..., 0]
-        carry[:, 2, 2] = 1 - slope[:, 2]
-        covariance = carry @ covariance @ carry.transpose(1, 2)
-        added = torch.zeros_like(covariance)
-        added[:, :2, :2] = turn @ torch.diag_embed(std[:, :2] ** 2) @ turn.transpose(1, 2)
-        added[:, 2, 2] = std[:, 2] ** 2
-        covariance = covariance + added
-        positions.append(position)
-        turns.append(turned)
-    variance = covariance[:, 0, 0] + covariance[:, 1, 1]
-    return torch.stack(positions, dim=1), torch.stack(turns, dim=1), variance
+        told.append((position, turned, spread))
+    positions, turns, variances = (torch.stack(each, dim=1) for each in zip(*told, strict=True))
+    return positions, turns, variances
+
+
+def _turned(vector: Tensor, angle_rad: Tensor) -> Tensor:
+    """Vectors (B, 2), turned by angles (B,)."""
+    c, s = angle_rad.cos(), angle_rad.sin()
+    x, y = vector.unbind(-1)
+    return torch.stack([c * x - s * y, s * x + c * y], dim=-1)
 
 
 @torch.no_grad()
@@ -71,7 +79,7 @@ def make_steps(
     if not len(chain):
         return ()
     direction, phase = chain.T[:, None]
-    positions, turns, _ = roll_out(effects, direction, phase)
+    positions, turns, variances = roll_out(effects, direction, phase)
     ends, turned = foreseen or (positions[0], turns[0])
     ends, turned = np.asarray(start_xy_m) + ends.numpy(), turned.tolist()
     shares = torch.linspace(0, 1, PATH_SAMPLES, dtype=phase.dtype)
@@ -80,7 +88,6 @@ def make_steps(
         way = effects(torch.full_like(shares, angle - before), stop * shares)[0][:, :2].numpy()
         c, s = math.cos(angle), math.sin(angle)
         path = place + way @ np.array([[c, s], [-s, c]])
-        variance = roll_out(effects, direction[:, : k + 1], phase[:, : k + 1])[2]
         place, before = ends[k], turned[k]
         steps.append(
             Step(
@@ -88,7 +95,7 @@ def make_steps(
                 stop,
                 (float(place[0]), float(place[1])),
                 path,
-                std_m=float(variance.sqrt()),
+                std_m=math.sqrt(variances[0, k]),
                 predicted_turn_rad=before,
             )
         )

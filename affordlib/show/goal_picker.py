@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from affordlib.world import Tabletop
 
 HALF_WIDTH_M, LIMIT_M = 0.36, 0.35
-REST_S = 0.08
+REST_S = 0.05
 """A hand that has asked for nothing new for so long has come to rest."""
 
 
