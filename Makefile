@@ -8,6 +8,7 @@ OUT     =
 ONLY    =
 ARGS    =
 FORCE   =
+KEEP    =
 DRY_RUN =
 SEEDS   = 0 1 2
 WORKERS = 1
@@ -86,9 +87,9 @@ format: $(STAMP) ## Format the code, notebooks included
 	@$(PY) -m ruff check --fix
 	@$(PY) -m ruff format
 
-bench: $(STAMP) ## Run the benchmarks
+bench: $(STAMP) ## Run the benchmarks (KEEP=1 puts the times into data/results/speed.json)
 	@shopt -s nullglob; for file in benchmarks/bench_*.py; do \
-	   echo "== $$file"; $(PY) "$$file" || exit 1; \
+	   echo "== $$file"; $(PY) "$$file" $(if $(KEEP),--keep) || exit 1; \
 	 done
 
 data: $(STAMP) ## Collect the shipped data sets again and compare

@@ -188,7 +188,7 @@ def fill_tables(text: str) -> str:
                 columns = value.split(",")
             else:
                 _columns(rows, [key])
-                rows = [row for row in rows if str(row.get(key)) == value]
+                rows = [row for row in rows if str(row.get(key)) in value.split(",")]
                 if not rows:
                     raise ValueError(f"table: no row of {source} has {option}")
         body = markdown_table(rows, columns)

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from dask.distributed import Client, LocalCluster
+from keeping import keep
 
 from affordlib.interactions.collect import collect
 from affordlib.interactions.recipes import Recipe
@@ -61,6 +62,8 @@ def main():
         f"ratio         median {np.median(ratios):6.2f}"
         f"   ({ratios.min():.2f} to {ratios.max():.2f}; target {TARGET})"
     )
+    rows = [{"workers": n, "per_second_median": np.median(v)} for n, v in samples.items()]
+    keep("collect", [row | {"n": ROUNDS * INTERACTIONS} for row in rows])
 
 
 if __name__ == "__main__":

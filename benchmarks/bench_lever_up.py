@@ -9,6 +9,7 @@ the image alone, of one object and of 64 at once. Ratios are to ours.
 import time
 
 import torch
+from keeping import keep
 
 from affordlib.interactions import Normaliser, open_interactions
 from affordlib.interactions.lever import AHEAD, SEEN, draw_windows, lever_arrays
@@ -85,6 +86,8 @@ def main():
     for name, row in rows.items():
         cells = (f"{row[c]:9.2f} ({row[c] / rows['anchored'][c]:7.2f})" for c in columns)
         print(f"{name:16}" + "".join(f"{cell:>20}" for cell in cells))
+    kept = {name: {c.replace(" ", "_"): v for c, v in row.items()} for name, row in rows.items()}
+    keep("lever_up", [{"model": name} | row for name, row in kept.items()])
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ import time
 
 import numpy as np
 import torch
+from keeping import keep
 
 from affordlib.interactions import (
     Normaliser,
@@ -38,6 +39,7 @@ BATCH, TARGETS = 64, 32
 DIRECTIONS, STEPS = 180, 25
 ROUNDS = 5
 LITERAL_ITERATIONS = 20_000
+KEPT = []
 GOALS = {"training": 150, "share": 0.5, "ends": 100, "courses": 30, "time": 20}
 
 
@@ -71,6 +73,7 @@ def stepper(model, draw, fused):
 def report(what, ratios, goal):
     low, middle, high = min(ratios), np.median(ratios), max(ratios)
     print(f"{what:58} {middle:8.2f}   ({low:.2f} to {high:.2f}; goal {goal})")
+    KEPT.append({"what": what, "ratio_median": middle, "ratio_min": low, "ratio_max": high})
 
 
 def training_rates(training):
@@ -148,6 +151,7 @@ def time_to_error(training, validation):
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--long", action="store_true")
+    parser.add_argument("--keep", action="store_true")
     long = parser.parse_args().long
     torch.set_num_threads(1)
     print(f"one thread; {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}")
@@ -159,6 +163,7 @@ def main():
         asking_rates(training, build(config, Normaliser.fit(training)).eval())
     if long:
         time_to_error(training, TrainingArrays.from_dataset(data, split.validation))
+    keep("models", KEPT)
 
 
 if __name__ == "__main__":

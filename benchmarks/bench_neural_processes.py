@@ -8,7 +8,7 @@ Beside them stands what knows the Gaussian process: the best that any network ca
 
 The package is no dependency; without it this says so and ends. It wants an environment of its own:
     .venv/bin/python -m pip install neuralprocesses==0.2.7
-    .venv/bin/python benchmarks/bench_neural_processes.py --steps 2000 --out data/results
+    .venv/bin/python benchmarks/bench_neural_processes.py --steps 2000 --keep
 writes the numbers to `data/results/neural_processes.json` as well.
 """
 
@@ -130,7 +130,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=3000)
     parser.add_argument("--rate", type=float, default=5e-4)
-    parser.add_argument("--out", help="folder for neural_processes.json; none is written without")
+    parser.add_argument("--keep", action="store_true", help="write neural_processes.json")
     options = parser.parse_args()
     if importlib.util.find_spec("neuralprocesses") is None:
         print("neuralprocesses is not installed; see the head of this file")
@@ -176,11 +176,11 @@ def main():
             {"network": network, "n": JUDGED, "speed_ratio": ratio}
             | {"log_likelihood_gain_mean": mean, "log_likelihood_gain_sem": sem}
         )
-    if options.out:
+    if options.keep:
         parameters = {"steps": options.steps, "rate": options.rate, "batch": BATCH}
         parameters["neuralprocesses"] = importlib.metadata.version("neuralprocesses")
         tables = {"log_likelihood": rows, "difference": pairs}
-        print(write_results(options.out, "neural_processes", parameters, tables))
+        print(write_results("data/results", "neural_processes", parameters, tables))
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ import time
 
 import numpy as np
 import pybullet
+from keeping import keep
 
 from affordlib.interactions.cost import measure_cost
 from affordlib.interactions.recipes import RECIPES
@@ -48,6 +49,7 @@ def naive_push(world):
 def main():
     print(f"{EPISODES} interactions per primitive; ratio: median (5 to 95 %), at most {LIMIT}")
     print(f"{'primitive':10} {'per second':>10} {'whole ms':>9} {'bare ms':>8} {'steps':>6}  ratio")
+    kept = []
     for name in PRIMITIVES:
         cost = measure_cost(RECIPES[name], EPISODES)
         low, middle, high = np.quantile(cost.ratios, [0.05, 0.5, 0.95])
@@ -56,9 +58,12 @@ def main():
             f"{1000 * np.median(cost.bare_s):8.1f} {cost.steps:6}  "
             f"{middle:.3f} ({low:.3f} to {high:.3f})"
         )
+        row = {"primitive": name, "per_second": 1 / cost.whole_s.mean(), "n": EPISODES}
+        kept.append(row | {"ratio_p5": low, "ratio_median": middle, "ratio_p95": high})
     with Tabletop() as world:
         naive = [naive_push(world) for _ in range(NAIVE_EPISODES)]
     print(f"naive push: {np.median(naive):.3f} times its bare physics ({NAIVE_EPISODES} episodes)")
+    keep("primitives", kept)
 
 
 if __name__ == "__main__":

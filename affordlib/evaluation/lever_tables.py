@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from affordlib.evaluation import reported
 from affordlib.evaluation.lever_up import BASELINES, MODELS, NAME, PARTS, LeverUnit, hashes
 from affordlib.evaluation.parts import checked_part
 from affordlib.interactions.lever import POSE_CHANNELS
@@ -179,7 +180,7 @@ def assemble(folder: str | Path = PARTS, out_dir: str | Path = "data/results") -
     rows = error_rows(parts)
     tables = {
         "lever_up": rows,
-        "summary": summary_rows(rows),
+        "summary": [*reported.lever_up_rows(), *summary_rows(rows)],
         "motion": motion_rows(parts),
         "unseen_edges": error_rows(parts, no_edges=True),
         "paired": paired_rows(parts),

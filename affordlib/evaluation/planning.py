@@ -24,6 +24,7 @@ import numpy as np
 import torch
 from tqdm.auto import tqdm
 
+from affordlib.evaluation import reported
 from affordlib.evaluation.effect_prediction import error_row
 from affordlib.evaluation.goals import FROZEN, ROLLABLE, STANDING, PlanningTask, frozen_tasks
 from affordlib.evaluation.planners import VARIANTS
@@ -182,7 +183,8 @@ def assemble() -> Path:
         rows += planning_rows(part["records"], **about, **variant.columns())
     if not rows:
         raise FileNotFoundError(f"there are no parts in {PARTS}; run some variants first")
-    tables = {"planning": rows, "summary": summary_rows(rows), "paired": paired_rows(parts)}
+    summary = [*reported.planning_rows(), *summary_rows(rows)]
+    tables = {"planning": rows, "summary": summary, "paired": paired_rows(parts)}
     tables["error_decomposition"] = decomposition_rows(rows)
     hashes = {world: tasks_sha256(world) for world in FROZEN}
     return write_results("data/results", NAME, {"goals_sha256": hashes}, tables)
