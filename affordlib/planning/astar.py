@@ -12,8 +12,8 @@ import heapq
 import itertools
 import math
 import time
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
@@ -36,6 +36,8 @@ STOP_PHASES = (0.2, 0.4, 0.6, 0.8, 1.0)
 PRUNE_BELOW_M = 0.001
 YAW_STEP_RAD = math.radians(1)
 _SAME_PLACE_M = 1e-4
+_AT_ONCE = 12
+"""Neighbouring yaws are looked up together: what one costs is mostly the call."""
 
 
 @dataclass(frozen=True)
@@ -70,28 +72,35 @@ class BranchTable:
         """The branches of the object turned by an angle; those that do nothing are left out."""
         key = round(turned_rad / YAW_STEP_RAD)
         if key not in self._kept:
-            relative = torch.from_numpy(self._direction - key * YAW_STEP_RAD)
-            with torch.no_grad():
-                told = self.effects(relative, torch.from_numpy(self._phase))[0].numpy()
-            c, s = np.cos(self._direction), np.sin(self._direction)
-            ahead, left, turn = told.T
-            xy = np.column_stack([c * ahead - s * left, s * ahead + c * left])
-            moves = np.hypot(ahead, left) >= PRUNE_BELOW_M
-            columns = (self._direction, self._phase, xy, turn)
-            self._kept[key] = Branches(*(column[moves] for column in columns))
+            first = key - key % _AT_ONCE
+            self._look_up(np.arange(first, first + _AT_ONCE))
         return self._kept[key]
 
+    def _look_up(self, keys: np.ndarray) -> None:
+        relative = torch.from_numpy(self._direction - keys[:, None] * YAW_STEP_RAD)
+        with torch.no_grad():
+            phases = torch.from_numpy(self._phase).expand(relative.shape)
+            told = self.effects(relative, phases)[0].numpy()
+        c, s = np.cos(self._direction), np.sin(self._direction)
+        ahead, left, turn = np.moveaxis(told, -1, 0)
+        xy = np.stack([c * ahead - s * left, s * ahead + c * left], axis=-1)
+        moves = np.hypot(ahead, left) >= PRUNE_BELOW_M
+        for key, *columns, moving in zip(keys.tolist(), xy, turn, moves, strict=True):
+            columns = (self._direction, self._phase, *columns)
+            self._kept[key] = Branches(*(column[moving] for column in columns))
 
-@dataclass(order=True)
-class _Node:
+
+class _Node(NamedTuple):
+    """A place in the frontier; no two have the same order, so nothing after it is compared."""
+
     f: float
     depth: int
     order: int
-    g: float = field(compare=False)
-    xy: np.ndarray = field(compare=False)
-    turned: float = field(compare=False)
-    parent: _Node | None = field(compare=False)
-    action: tuple[float, float] = field(compare=False)
+    g: float
+    xy: tuple[float, float]
+    turned: float
+    parent: _Node | None
+    action: tuple[float, float]
 
 
 def search(
@@ -116,9 +125,10 @@ def search(
     def heuristic(xy: np.ndarray) -> np.ndarray:
         return np.maximum(0.0, np.hypot(*(xy - goal_xy).T) - goal.tolerance_m)
 
-    start = np.asarray(start_xy_m, dtype=float)
+    start = tuple(map(float, start_xy_m))
     counter = itertools.count()
-    root = _Node(float(heuristic(start)), 0, next(counter), 0.0, start, 0.0, None, (0.0, 0.0))
+    h = float(heuristic(np.array(start)))
+    root = _Node(h, 0, next(counter), 0.0, start, 0.0, None, (0.0, 0.0))
     frontier, nearest, expansions = [root], root, 0
     nearest_m = goal.distance_m(start)
     cheapest: dict[tuple[int, int, int, int], float] = {}
@@ -147,24 +157,20 @@ def search(
             here = np.broadcast_to(node.xy, children.shape)
             hopeful[hopeful] = reachable(here[hopeful], branches.direction[hopeful])
         if trace is not None:
-            trace.append((node.xy, children[hopeful]))
-        places = np.round(children / _SAME_PLACE_M).astype(int)
-        turns = np.round(turned / YAW_STEP_RAD).astype(int)
-        for k in np.flatnonzero(hopeful):
-            key = (int(places[k, 0]), int(places[k, 1]), int(turns[k]), depth)
-            if g[k] < cheapest.get(key, np.inf):
-                cheapest[key] = g[k]
-                action = float(branches.direction[k]), float(branches.stop_phase[k])
-                child = _Node(
-                    float(g[k] + h[k]),
-                    depth,
-                    next(counter),
-                    float(g[k]),
-                    children[k],
-                    float(turned[k]),
-                    node,
-                    action,
-                )
+            trace.append((np.array(node.xy), children[hopeful]))
+        rows = np.flatnonzero(hopeful)
+        places = np.round(children[rows] / _SAME_PLACE_M).astype(int)
+        turns = np.round(turned[rows] / YAW_STEP_RAD).astype(int)
+        told = (places, turns, g[rows], g[rows] + h[rows], children[rows], turned[rows])
+        actions = (branches.direction[rows], branches.stop_phase[rows])
+        # Lists, since one number at a time is what arrays are slow at.
+        for (u, v), turn, cost, f, xy, angle, *action in zip(
+            *(column.tolist() for column in (*told, *actions)), strict=True
+        ):
+            key = (u, v, turn, depth)
+            if cost < cheapest.get(key, math.inf):
+                cheapest[key] = cost
+                child = _Node(f, depth, next(counter), cost, tuple(xy), angle, node, tuple(action))
                 heapq.heappush(frontier, child)
     chain = []
     while nearest.parent is not None:
