@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from affordlib.interactions import open_interactions
+from affordlib.interactions import collect, open_interactions
 from affordlib.interactions.batches import Normaliser
+from affordlib.interactions.chunks import Layout, Variable
+from affordlib.interactions.collect import collect as collect_set
 from affordlib.models import AffordanceCNP, CNPConfig, load_checkpoint
 from affordlib.world import Cuboid, Tabletop
 
@@ -47,3 +49,38 @@ def cuboid_image(world):
 @pytest.fixture(scope="session")
 def held_out_pushes():
     return open_interactions("push_test")
+
+
+@pytest.fixture
+def small_chunks(monkeypatch):
+    monkeypatch.setattr(collect, "CHUNK", 2)
+
+
+@pytest.fixture(scope="session")
+def undisturbed(tmp_path_factory):
+    """A function from a recipe to its zip, collected in this process without any disturbance."""
+    made = {}
+
+    def make(recipe):
+        if recipe not in made:
+            path = tmp_path_factory.mktemp("undisturbed") / "set.zarr.zip"
+            made[recipe] = collect_set(recipe, path, progress=False)
+        return made[recipe]
+
+    return make
+
+
+@pytest.fixture
+def cheap(monkeypatch):
+    """Interactions of 20 kB that cost nothing."""
+
+    def layout(recipe, chunk):
+        sizes = {"interaction": recipe.n_interactions, "value": 5000}
+        return Layout({"x": Variable(("interaction", "value"), "float32")}, sizes, {}, chunk)
+
+    def arrays(recipe, indices):
+        values = [np.random.default_rng(i).random(5000, dtype=np.float32) for i in indices]
+        return {"x": np.stack(values)}
+
+    monkeypatch.setattr(collect, "describe", layout)
+    monkeypatch.setattr(collect, "collect_chunk", arrays)

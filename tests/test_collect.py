@@ -3,18 +3,14 @@
 import errno
 import itertools
 import json
-import math
-import os
 import random
 import shutil
 import signal
 import subprocess
 import sys
-import threading
 import time
 import tracemalloc
 import zipfile
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,10 +21,7 @@ import zarr
 
 import affordlib
 from affordlib.interactions import CorruptedDataError, collect, locks, make_data
-from affordlib.interactions.chunks import Layout, Variable
 from affordlib.interactions.collect import collect as collect_set
-from affordlib.interactions.locks import exclusive
-from affordlib.interactions.places import Place
 from affordlib.interactions.recipes import Recipe
 from affordlib.interactions.records import collect_chunk, describe
 from affordlib.interactions.store import dataset_sha256, open_interactions, stored_sha256
@@ -37,24 +30,7 @@ SMALL = Recipe(n_interactions=6, seed=11)
 LONGER = Recipe(n_interactions=12, seed=5)
 ROOT = Path(affordlib.__file__).parents[1]
 
-
-@pytest.fixture(autouse=True)
-def small_chunks(monkeypatch):
-    monkeypatch.setattr(collect, "CHUNK", 2)
-
-
-@pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory):
-    """A function from a recipe to its zip, collected in this process without any disturbance."""
-    made = {}
-
-    def make(recipe):
-        if recipe not in made:
-            path = tmp_path_factory.mktemp("undisturbed") / "set.zarr.zip"
-            made[recipe] = collect_set(recipe, path, progress=False)
-        return made[recipe]
-
-    return make
+pytestmark = pytest.mark.usefixtures("small_chunks")
 
 
 @pytest.fixture(scope="module")
@@ -191,22 +167,6 @@ def test_paths_and_workers_that_cannot_be_are_named(tmp_path):
 # Memory
 
 
-@pytest.fixture
-def cheap(monkeypatch):
-    """Interactions of 20 kB that cost nothing."""
-
-    def layout(recipe, chunk):
-        sizes = {"interaction": recipe.n_interactions, "value": 5000}
-        return Layout({"x": Variable(("interaction", "value"), "float32")}, sizes, {}, chunk)
-
-    def arrays(recipe, indices):
-        values = [np.random.default_rng(i).random(5000, dtype=np.float32) for i in indices]
-        return {"x": np.stack(values)}
-
-    monkeypatch.setattr(collect, "describe", layout)
-    monkeypatch.setattr(collect, "collect_chunk", arrays)
-
-
 def test_memory_does_not_grow_with_the_set(tmp_path, cheap, monkeypatch):
     monkeypatch.setattr(collect, "CHUNK", 50)
 
@@ -318,281 +278,7 @@ def write_nothing(*_):
     raise OSError(errno.ENOSPC, "No space left on device")
 
 
-# Locks
-
-
-@pytest.mark.parametrize("name", ["x.zarr", "x.zarr.zip"])
-def test_a_second_collector_is_refused(tmp_path, cheap, name):
-    with (
-        exclusive(Place.of(tmp_path / name)),
-        pytest.raises(RuntimeError, match=rf"another process is collecting into .*{name}"),
-    ):
-        collect_set(SMALL, tmp_path / name, progress=False)
-    collect_set(SMALL, tmp_path / name, progress=False)
-    assert [p.name for p in tmp_path.iterdir()] == [name]
-
-
-@pytest.fixture
-def lease(monkeypatch):
-    monkeypatch.setattr(locks, "LEASE_S", 0.5)
-    monkeypatch.setattr(locks, "RENEW_S", 0.05)
-    monkeypatch.setattr(locks, "SETTLE_S", 0.1)
-    return lambda place: place.sibling(f".{place.name}.lock")
-
-
-def test_a_lease_that_moves_is_respected_and_then_given_back(lease, cheap):
-    place = Place.of("memory://lease/a.zarr")
-    with exclusive(place) as still_ours:
-        time.sleep(1)  # longer than the lease lasts without renewal
-        with pytest.raises(RuntimeError, match=r"collecting into memory://lease/a\.zarr"):
-            collect_set(SMALL, place.url, progress=False)
-        still_ours()
-    assert not lease(place).read(["lease"])
-    collect_set(SMALL, place.url, progress=False)
-    assert open_interactions(place.url).sizes["interaction"] == 6
-
-
-def test_a_lease_whose_owner_was_killed_is_taken_over(lease, cheap):
-    place = Place.of("memory://lease/b.zarr")
-    lease(place).make_folders(["lease"])
-    lease(place).write("lease", b'{"owner": "a dead one", "count": 7}')
-    began = time.monotonic()
-    with exclusive(place):
-        assert time.monotonic() - began > 0.5
-        assert b"dead" not in lease(place).read(["lease"])["lease"]
-    assert not lease(place).read(["lease"])
-
-
-def test_a_collector_that_lost_its_lease_stops(lease, cheap, monkeypatch):
-    place = Place.of("memory://lease/c.zarr")
-
-    def slow(recipe, indices):
-        time.sleep(0.1)
-        lease(place).write("lease", b'{"owner": "another", "count": 1}')
-        time.sleep(0.2)
-        return {"x": np.zeros((2, 5000), np.float32)}
-
-    monkeypatch.setattr(collect, "collect_chunk", slow)
-    with pytest.raises(RuntimeError, match=r"the lock on .*c\.zarr was lost"):
-        collect_set(SMALL, place.url, progress=False)
-    assert b"another" in lease(place).read(["lease"])["lease"]
-    with pytest.raises(CorruptedDataError, match="not finished"):
-        open_interactions(place.url)
-
-
-def test_of_many_that_come_at_once_one_holds_the_lease(lease, monkeypatch):
-    place, outcomes, barrier = Place.of("memory://lease/d.zarr"), [], threading.Barrier(6)
-    # All have seen that there is no lease before the first one writes its own.
-    monkeypatch.setattr(Place, "make_folders", lambda *_: barrier.wait())
-
-    def take():
-        try:
-            with exclusive(place):
-                time.sleep(1)
-                outcomes.append("held")
-        except RuntimeError:
-            outcomes.append("refused")
-
-    threads = [threading.Thread(target=take) for _ in range(6)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert sorted(outcomes) == ["held"] + ["refused"] * 5
-
-
-# Dask
-
-
-@pytest.fixture(scope="module")
-def client(tmp_path_factory):
-    """A client of a scheduler and two workers that the `dask` command has started."""
-    from dask.distributed import Client
-
-    folder = tmp_path_factory.mktemp("dask")
-    file = folder / "scheduler.json"
-    worker = ["worker", "--scheduler-file", str(file), "--nthreads", "1", "--no-dashboard"]
-    worker += ["--local-directory", str(folder)]
-    host = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard"]
-    commands = [["scheduler", *host, "--scheduler-file", str(file)], worker, worker]
-    processes = [
-        subprocess.Popen(
-            [sys.executable, "-m", "dask", *command],
-            cwd=ROOT,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            start_new_session=True,
-        )
-        for command in commands
-    ]
-    try:
-        with Client(scheduler_file=str(file), timeout=60) as client:
-            client.wait_for_workers(2, timeout=60)
-            yield client
-    finally:
-        for process in processes:
-            os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
-
-
-@pytest.fixture
-def both(client):
-    """The client while both workers are there."""
-    client.wait_for_workers(2, timeout=60)
-    yield client
-    client.wait_for_workers(2, timeout=60)
-
-
-@contextmanager
-def poisoned(client, log, how):
-    """Make all workers, also those started later, fail in the chunk that begins with 6.
-
-    log: a file that gets a letter for each time that they do.
-    """
-    from dask.distributed import WorkerPlugin
-
-    class Poison(WorkerPlugin):
-        name = "poison"
-
-        def setup(self, worker):
-            from affordlib.interactions import collect, records
-
-            def deadly(recipe, indices):
-                if indices.start == 6:
-                    with open(log, "a") as file:
-                        file.write("x")
-                    os._exit(9) if how == "kill" else math.sqrt(-1)
-                return records.collect_chunk(recipe, indices)
-
-            collect.collect_chunk = deadly
-
-        def teardown(self, worker):
-            from affordlib.interactions import collect, records
-
-            collect.collect_chunk = records.collect_chunk
-
-    client.register_plugin(Poison())
-    try:
-        yield
-    finally:
-        client.wait_for_workers(2, timeout=60)
-        client.unregister_worker_plugin("poison")
-
-
-def test_a_cluster_leaves_the_same_file(both, undisturbed, tmp_path, monkeypatch):
-    assert set(both.run(lambda: __import__("affordlib").__file__).values()) == {affordlib.__file__}
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(collect, "WINDOW", 2)
-    submit, most = both.submit, 0
-
-    def counting(*arguments, **options):
-        nonlocal most
-        future = submit(*arguments, **options)
-        most = max(most, sum(f.status == "pending" for f in both.futures.values()))
-        return future
-
-    monkeypatch.setattr(both, "submit", counting)
-    path = collect_set(LONGER, "relative.zarr.zip", both, progress=False)
-    assert Path(path).read_bytes() == undisturbed(LONGER).read_bytes()
-    assert most == 4
-    assert [p.name for p in tmp_path.iterdir()] == ["relative.zarr.zip"]
-
-
-@pytest.mark.parametrize("suffix", [".zarr", ".zarr.zip"])
-def test_a_cluster_writes_where_all_can(both, undisturbed, tmp_path, monkeypatch, suffix):
-    monkeypatch.setattr(locks, "SETTLE_S", 0.1)
-
-    folder = str(tmp_path)
-
-    def register():
-        """Make known a file system that all processes see and that is not local to affordlib."""
-        import fsspec
-        from fsspec.implementations.dirfs import DirFileSystem
-        from fsspec.implementations.local import LocalFileSystem
-
-        class Shared(DirFileSystem):
-            protocol, cachable = "shared", False
-
-            def __init__(self, **_):
-                super().__init__(folder, LocalFileSystem())
-
-        fsspec.register_implementation("shared", Shared, clobber=True)
-
-    register()
-    both.run(register)
-    url = f"shared://set{suffix}"
-    assert not Place.of(url).is_local
-    assert collect_set(SMALL, url, both, progress=False) == url
-    assert dataset_sha256(open_interactions(url)) == stored_sha256(undisturbed(SMALL))
-    assert [p.name for p in tmp_path.iterdir()] == [f"set{suffix}"]
-    if suffix == ".zarr.zip":
-        whole = undisturbed(SMALL).read_bytes()
-        assert (tmp_path / "set.zarr.zip").read_bytes() == whole
-        (tmp_path / "set.zarr.zip").write_bytes(whole[:1000])
-    else:
-        (tmp_path / "set.zarr" / "size" / "c.1.0").unlink()
-    with pytest.raises(CorruptedDataError, match=r"size/c\.1\.0 is missing|directory is damaged"):
-        open_interactions(url)
-
-
-def kill_a_worker(client):
-    pids = list(client.run(os.getpid).values())
-    os.kill(random.choice(pids), signal.SIGKILL)
-
-
-def test_a_killed_worker_is_no_loss(both, undisturbed, tmp_path):
-    path, killed = tmp_path / "set.zarr.zip", []
-
-    def kill():
-        while not list(tmp_path.glob(".set*.chunks/tasks/*.json")):
-            time.sleep(0.005)
-        kill_a_worker(both)
-        killed.append(len(list(tmp_path.glob(".set*.chunks/tasks/*.json"))))
-
-    thread = threading.Thread(target=kill)
-    thread.start()
-    collect_set(LONGER, path, both, progress=False)
-    thread.join()
-    assert killed[0] < 6
-    assert path.read_bytes() == undisturbed(LONGER).read_bytes()
-
-
-def test_a_chunk_that_cannot_be_made_is_named(both, undisturbed, tmp_path):
-    path, log = tmp_path / "set.zarr.zip", tmp_path / "log"
-    reason = r"interactions 6 to 7 could not be collected: ValueError: math domain error"
-    with poisoned(both, log, "raise"), pytest.raises(RuntimeError, match=reason):
-        collect_set(LONGER, path, both, progress=False)
-    assert len(log.read_text()) == 3  # it may have been the disk or the network
-    assert not path.exists()
-    assert list(tmp_path.glob(".set*.chunks/tasks/*.json"))
-    collect_set(LONGER, path, both, progress=False)
-    assert path.read_bytes() == undisturbed(LONGER).read_bytes()
-
-
-def test_a_chunk_that_kills_its_workers_is_named(both, tmp_path):
-    def allow(failures, dask_scheduler):
-        dask_scheduler.allowed_failures, before = failures, dask_scheduler.allowed_failures
-        return before
-
-    path, log = tmp_path / "set.zarr", tmp_path / "log"
-    usual = both.run_on_scheduler(allow, 0)
-    try:
-        with (
-            poisoned(both, log, "kill"),
-            pytest.raises(RuntimeError, match=r"interactions 6 to 7 .*KilledWorker"),
-        ):
-            collect_set(LONGER, path, both, progress=False)
-    finally:
-        both.run_on_scheduler(allow, usual)
-    assert len(log.read_text()) == 2  # among others, and alone
-    with pytest.raises(CorruptedDataError, match="not finished"):
-        open_interactions(path)
-    made = {p.stem for p in (path / "tasks").iterdir()}
-    assert made >= {f"{k:08d}" for k in range(3)}  # though they died with its workers
-    assert f"{3:08d}" not in made
-
-
-# Making the shipped sets again
+# Comparing, and killed by chance
 
 
 def test_make_data_says_how_far_apart_two_sets_are(undisturbed):
@@ -627,17 +313,6 @@ def test_make_data_ends_with_status_1_when_the_sets_differ(
     assert "not the same: 6 interactions, formerly 12" in capsys.readouterr().out
 
 
-def test_make_data_collects_with_a_scheduler(both, undisturbed, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(make_data, "RECIPES", {"push": SMALL})
-    address = ["--scheduler", both.scheduler.address]
-    assert make_data.main(["--only", "push", "--to", str(tmp_path), *address]) == 1
-    assert "not the same: 6 interactions, formerly 500" in capsys.readouterr().out
-    assert (tmp_path / "push.zarr.zip").read_bytes() == undisturbed(SMALL).read_bytes()
-
-
-# Any moment
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(10))
 def test_a_driver_killed_at_any_moment_is_no_loss(undisturbed, tmp_path, seed):
@@ -657,14 +332,3 @@ def test_a_driver_killed_at_any_moment_is_no_loss(undisturbed, tmp_path, seed):
     collect_set(SMALL, path, progress=False)
     assert path.read_bytes() == undisturbed(SMALL).read_bytes()
     assert [p.name for p in tmp_path.iterdir()] == ["set.zarr.zip"]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(10))
-def test_workers_killed_at_any_moment_are_no_loss(both, undisturbed, tmp_path, seed):
-    path = tmp_path / "set.zarr.zip"
-    timer = threading.Timer(random.Random(seed).uniform(0, 0.6), kill_a_worker, [both])
-    timer.start()
-    collect_set(LONGER, path, both, progress=False)
-    timer.join()
-    assert path.read_bytes() == undisturbed(LONGER).read_bytes()

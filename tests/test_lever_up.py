@@ -1,6 +1,5 @@
-"""Lever-ups: arrays in the frame of the lever, what models may know, baselines, parts, tables."""
+"""Lever-ups: arrays in the frame of the lever, what models may know, the older layout, pictures."""
 
-import json
 import math
 from dataclasses import replace
 
@@ -10,8 +9,6 @@ import torch
 from matplotlib.figure import Figure
 from PIL import Image
 
-from affordlib.evaluation import lever_tables, lever_up
-from affordlib.evaluation.lever_up import LeverUnit, guess, run_unit, split_of
 from affordlib.interactions import Normaliser, open_interactions
 from affordlib.interactions.batches import draw_forward, symmetric_copies
 from affordlib.interactions.lever import (
@@ -28,7 +25,7 @@ from affordlib.interactions.lever import (
     write_trajectories,
 )
 from affordlib.interactions.recipes import Recipe, draw_scene
-from affordlib.models import build, load_checkpoint
+from affordlib.models import build
 from affordlib.models.anchored import AnchoredNetwork, _last
 from affordlib.models.lever import (
     LEVER_MODELS,
@@ -40,8 +37,6 @@ from affordlib.models.lever import (
 )
 from affordlib.models.lstm import LSTMConfig, on_grid
 from affordlib.models.lstm_published import PublishedConfig, PublishedLSTM, train_published
-from affordlib.paths import repo_root
-from affordlib.results import read_results
 from affordlib.show import Film, outline_in_lever_frame, plot_levered
 
 
@@ -275,92 +270,6 @@ def test_an_lstm_of_pushes_is_a_model_like_the_others(pushes):
     assert action.grad.abs().sum() > 0
 
 
-# Baselines, units, tables
-
-
-def test_baselines_are_right_about_what_they_assume():
-    steps = torch.arange(26.0)[None, :, None]
-    still, steady = torch.ones(1, 26, 4), steps.expand(1, 26, 4)
-    for baseline, course in (("persistence", still), ("constant_velocity", steady)):
-        mean, truth = guess(baseline, course, "window", 3)
-        torch.testing.assert_close(mean, truth)
-    mean, truth = guess("persistence", steady, "window", 0)
-    assert (truth - mean)[0, :, 0].tolist() == [1, 2, 3, 4, 5]
-    mean, truth = guess("constant_velocity", steady, "first_step")
-    assert mean.abs().max() == 0
-    assert truth.shape[1] == 25
-
-
-@pytest.mark.parametrize(
-    ("fields", "reason"),
-    [
-        ({"model": "gru"}, "model must be one of"),
-        ({"model": "anchored", "fold": 5}, r"fold must lie in \[0, 4\], got 5"),
-        ({"model": "lstm_tuned"}, "trained for one protocol each"),
-        ({"model": "anchored", "trained_for": "window"}, "the others for all"),
-        ({"model": "anchored", "no_edges": 9}, r"no_edges must lie in \[3, 8\]"),
-        ({"model": "anchored", "epochs": 2}, "epochs belong to 'lstm_published'"),
-    ],
-)
-def test_units_that_cannot_be_are_refused(fields, reason):
-    with pytest.raises(ValueError, match=reason):
-        LeverUnit(**fields)
-
-
-def test_folds_test_every_object_at_most_once():
-    whole = open_interactions("lever_up")
-    splits = [split_of(LeverUnit("persistence", fold=k), whole) for k in range(5)]
-    tests = np.concatenate([s.test for s in splits])
-    assert len(set(tests)) == len(tests) == 900
-    for split in splits:
-        parts = [set(p) for p in (split.train, split.validation, split.test)]
-        assert [len(p) for p in parts] == [1440, 180, 180]
-        assert len(set.union(*parts)) == 1800
-    edges = lever_up.edges_of(whole)
-    split = split_of(LeverUnit("persistence", no_edges=3), whole)
-    assert set(edges[split.test]) == {3}
-    assert 3 not in edges[np.concatenate([split.train, split.validation])]
-
-
-def test_units_leave_parts_that_are_not_made_again(tmp_path):
-    unit = LeverUnit("constant_velocity")
-    assert run_unit(unit, tmp_path)
-    assert not run_unit(unit, tmp_path)
-    path = tmp_path / unit.file
-    part = json.loads(path.read_text())
-    path.write_text(json.dumps(part | {"data_sha256": "of another set"}))
-    with pytest.raises(ValueError, match=r"has another data_sha256.*run the unit again"):
-        lever_tables.read_parts(tmp_path)
-    assert run_unit(unit, tmp_path)
-    assert json.loads(path.read_text()) == part
-
-
-def _part(errors_cm):
-    n = len(errors_cm)
-    return {
-        "interaction": list(range(n)),
-        "tests": {p: {"error_cm": [[[e] * 5] * 7 for e in errors_cm]} for p in PROTOCOLS},
-        "window_moves_cm": [[1.0] * 6 + [0.1]] * n,
-    }
-
-
-def test_differences_are_paired_by_object():
-    ours = (LeverUnit("anchored"), _part([0.1, 0.5, 1.0]))
-    rival = (LeverUnit("lstm_tuned", "window"), _part([0.2, 0.6, 1.1]))
-    (row, *_) = lever_tables.paired_rows([ours, rival])
-    assert row["difference_cm"] == pytest.approx(-0.1)
-    assert row["low_cm"] == pytest.approx(row["high_cm"])  # the same for all objects
-    assert row["ours_better_percent"] == 100
-    moving, resting = (
-        next(r for r in lever_tables.motion_rows([ours]) if r["windows"] == kind)
-        for kind in ("moving", "resting")
-    )
-    assert (moving["n_windows"], resting["n_windows"]) == (18, 3)
-    first = lever_tables.error_rows([ours])[0]
-    assert first["mean_cm"] == pytest.approx(1.6 / 3)
-    assert first["sem_cm"] == pytest.approx(np.std([0.1, 0.5, 1.0], ddof=1) / math.sqrt(3))
-
-
 # The older study's layout
 
 
@@ -442,47 +351,3 @@ def test_a_levered_prism_is_drawn_where_it_is():
     film = Film(height=100)
     film.add(figure)
     assert film.frames[0].shape[0] == 100
-
-
-# As committed
-
-
-@pytest.fixture(scope="module")
-def committed():
-    return read_results(repo_root() / "data" / "results" / "lever_up.json")["tables"]
-
-
-def test_committed_tables_have_their_columns(committed):
-    for row in committed["lever_up"]:
-        assert {"model", "protocol", "steps", "folds", "mean_cm", "sem_cm"} <= row.keys()
-    found = {(row["model"], row["protocol"]) for row in committed["lever_up"]}
-    models = set(lever_up.MODELS) - {"lstm_published"}
-    assert found >= {(model, protocol) for model in models for protocol in PROTOCOLS}
-
-
-def test_committed_science(committed):
-    def window(model):
-        rows = [
-            r for r in committed["lever_up"] if (r["model"], r["protocol"]) == (model, "window")
-        ]
-        return [row["mean_cm"] for row in sorted(rows, key=lambda row: row["steps"])]
-
-    ours = window("anchored")
-    assert all(a <= b for a, b in zip(ours, (0.34, 0.35, 0.36, 0.38, 0.39), strict=True))
-    for model in ("persistence", "constant_velocity", "paper"):
-        assert all(a < b for a, b in zip(ours, window(model), strict=True))
-
-
-@pytest.mark.parametrize("name", ["lever_anchored", "lever_lstm_window", "lever_lstm_first_step"])
-def test_shipped_checkpoints_foresee_what_they_have_not_seen(name):
-    whole = open_interactions("lever_up")
-    model, about = load_checkpoint(name)
-    split = split_of(LeverUnit("persistence"), whole)
-    assert not set(about["seen_interactions"]) & set(split.test)
-    few = lever_arrays(whole, split.test[:60], about["view"])
-    if about["trained_for"] != "first_step":
-        assert 100 * window_errors_m(model, few).mean() < 0.3
-    if about["trained_for"] != "window":
-        assert 100 * beginning_errors_m(model, few).mean() < 0.4
-    size = (repo_root() / "data" / "checkpoints" / f"{name}.safetensors").stat().st_size
-    assert size < 5e6
