@@ -136,6 +136,16 @@ def test_the_committed_table_belongs_to_the_shipped_checkpoints():
             assert np.mean(distances) == pytest.approx(row["mean_m"])
 
 
+def test_what_the_paper_reports_stands_beside_it():
+    summary = read_results("data/results/planning.json")["tables"]["summary"]
+    told = {row["variant"]: row for row in summary if row["object_class"] == "reported"}
+    assert list(told) == ["reported_astar", "reported_gradient_100", "reported_gradient_300"]
+    assert told["reported_astar"]["single_full_mean_m"] == 0.020
+    assert told["reported_gradient_300"]["multi_partial_mean_m"] == 0.0022
+    ours = next(row for row in summary if row["variant"] == "continuous")
+    assert told["reported_astar"].keys() <= ours.keys()
+
+
 def test_the_continuous_planner_keeps_its_promise():
     """Open loop within 0.6, 1.0 and 1.5 mm of constructed goals; the means of the table."""
     rows = read_results("data/results/planning.json")["tables"]["planning"]

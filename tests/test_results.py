@@ -227,6 +227,9 @@ def test_blocks_choose_rows_and_columns(tmp_path):
     filled = fill_tables(block.format(source, "planner=gradient columns=n,planner"))
     assert "| 30 | gradient |\n<!-- /table -->" in filled
     assert "astar" not in filled
+    both = fill_tables(block.format(source, "planner=gradient,astar columns=n,planner"))
+    assert "| 30 | gradient |" in both
+    assert "| 30 | astar |" in both
     for option, reason in [("planner=rrt", "no row"), ("columns=x", "'x'"), ("mode=a", "'mode'")]:
         with pytest.raises(ValueError, match=reason):
             fill_tables(block.format(source, option))
