@@ -6,16 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from affordlib.evaluation.closed_loop import N_TRIALS, ROWS, draw_trial
-from affordlib.evaluation.feasibility import is_feasible, on_the_rim, possible
 from affordlib.planning import (
     Disturbance,
     Repertoire,
     action_limit,
-    carry_out,
     draw_disturbances,
-    plan_astar,
-    plan_continuous,
     plan_lift,
     plan_turn,
     pursue,
@@ -325,100 +320,9 @@ def test_the_part_that_cannot_be_had_is_named(table, repertoire):
         plan_turn(repertoire.model(Grasp), image, (0, 0), 0.5)
 
 
-# Open loop, corrected
-
-
-def test_corrections_bring_it_nearer(table, film):
-    """A coarse plan, corrected by a fine planner, at most twice, and never for nothing."""
-    table.place(BOX, (0.0, 0.0), 0.3)
-    goal = Goal((0.1, 0.04))
-    asked = []
-
-    def replan(image, xy, goal):
-        asked.append(goal.tolerance_m)
-        return plan_continuous(film, image, xy, goal, "single_partial")
-
-    plan = plan_astar(film, table.look(), (0.0, 0.0), goal)
-    open_loop = carry_out(table, plan)
-    table.place(BOX, (0.0, 0.0), 0.3)
-    closed = carry_out(table, plan, 2, replan)
-    assert closed.distance_m < open_loop.distance_m
-    assert len(plan.steps) < len(closed.object_paths_xy_m) <= len(plan.steps) + 2
-    assert set(asked) == {0.0003}
-    again = carry_out(table, Plan(goal, goal.xy_m, (), "none", True, 0, 0.0), 2, replan, 0.05)
-    assert again.object_paths_xy_m == ()
-    with pytest.raises(ValueError, match="need a planner"):
-        carry_out(table, plan, 1)
-
-
-# The oracle, and far goals
-
-
-def test_the_kinematic_oracle_is_the_kinematics(table):
-    """Its circles around the base answer as the inverse kinematics of whole actions does."""
-    rng = np.random.default_rng(11)
-    table.place(BOX, (0.0, 0.0))
-    no = 0
-    for _ in range(80):
-        xy, angle = rng.uniform([-0.45, -0.65], [0.65, 0.65]), rng.uniform(-math.pi, math.pi)
-        for kind, half in ((Push, 0.02), (Drag, 0.0)):
-            action = kind.towards(angle)
-            length = action.length + half
-            said = possible(kind, half)(xy[None], np.array([angle]), np.array([length]))[0]
-            truth = table.can_reach(action, 1.0, tuple(xy))
-            near = possible(kind, half, 0.004)(xy[None], np.array([angle]), np.array([length]))[0]
-            far = possible(kind, half, -0.004)(xy[None], np.array([angle]), np.array([length]))[0]
-            assert truth == said or near != far
-            no += not truth
-    assert no > 10
-
-
-def test_an_object_cannot_be_pushed_back_from_where_it_can_be_pushed_to():
-    outside, middle = (0.555, 0.0), (0.0, 0.0)
-    assert is_feasible(Push, 0.03, middle, outside)
-    assert not is_feasible(Push, 0.03, outside, middle)
-    assert is_feasible(Drag, 0.03, outside, middle)
-    assert not is_feasible(Drag, 0.03, middle, (0.68, 0.68))
-    assert on_the_rim(Drag, 0.03, middle, (0.566, 0.0))
-
-
 def test_a_goal_across_the_table_is_reached_in_the_limit(table, repertoire):
     table.place(BALL, (0.2, -0.4), 0.0)
     goal = Goal((0.2, 0.25))
     went = pursue(table, goal, repertoire)
     assert went.reached, went.words
     assert len(went.steps) <= action_limit(0.65)
-
-
-def test_trials_are_a_function_of_seed_and_number():
-    for name in N_TRIALS:
-        assert draw_trial(name, 5, 3) == draw_trial(name, 5, 3)
-        assert draw_trial(name, 5, 3) != draw_trial(name, 5, 4)
-    with pytest.raises(ValueError, match="table must be one of"):
-        draw_trial("speed", 0)
-
-
-def test_rows_tell_the_endings_and_both_rates():
-    def record(feasible, ending, distance_m=0.001):
-        return {
-            "object_class": "sphere",
-            "feasible": feasible,
-            "ending": ending,
-            "on_the_rim": False,
-            "moved": ending != "unreachable",
-            "vetoes": 1,
-            "actions": 3,
-            "distance_m": distance_m,
-            "height_error_m": distance_m,
-        }
-
-    records = [record(True, "reached")] * 6 + [record(True, "gave_up", 0.1)] * 2
-    records += [record(False, "unreachable")] * 3 + [record(False, "gave_up", 0.1)]
-    (row,) = (r for r in ROWS["reachability"](records) if r["goals"] == r["object_class"] == "all")
-    assert row["feasible_reached_percent"] == 75.0
-    assert row["infeasible_refused_percent"] == 75.0
-    assert row["right_percent"] == 75.0
-    assert row["moved_for_nothing_percent"] == 25.0
-    height = ROWS["height"](records)[0]
-    assert (height["feasible"], height["within_percent"]) == (8, 75.0)
-    assert height["off_m_mean"] == pytest.approx(0.001)

@@ -44,6 +44,7 @@ FORMAT = 1
 """Counts the changes of code that change a trial's record."""
 
 N_TRIALS = {"height": 50, "orientation": 50, "disturbances": 200, "reachability": 1000}
+POSE_BY = {"height": "grasp", "orientation": "rotate"}
 CLASSES = ("cuboid", "upright_cylinder", "lying_cylinder", "sphere")
 WITHIN_M, WITHIN_HEIGHT_M, WITHIN_TURN_RAD = 0.005, 0.005, math.radians(3)
 POSE_TOLERANCE_M = 0.004
@@ -288,12 +289,13 @@ ROWS: dict[str, Callable[[Sequence[dict]], list[dict]]] = {
 # Running
 
 
-def settings_sha256(seed: int) -> str:
-    """Hash of what decides a record beside its index: the seed, the models, the code's format."""
+def settings_sha256(table: str, seed: int) -> str:
+    """Hash of what decides a table's records: the seed, the models it needs, the code's format."""
     told = hashlib.sha256(f"{FORMAT} {seed}".encode())
-    for name in CHECKPOINTS.values():
-        path = repo_root() / "data" / "checkpoints" / f"{name}.safetensors"
-        told.update(path.read_bytes())
+    for kind, name in CHECKPOINTS.items():
+        if kind in ("push", "drag", POSE_BY.get(table)):
+            path = repo_root() / "data" / "checkpoints" / f"{name}.safetensors"
+            told.update(path.read_bytes())
     return told.hexdigest()
 
 
@@ -334,7 +336,7 @@ def run_table(
 
     client: a Dask client that shares the folder; None means this process.
     """
-    path, sha256 = _part(table, seed), settings_sha256(seed)
+    path, sha256 = _part(table, seed), settings_sha256(table, seed)
     records = read_records(path, sha256)
     missing = [i for i in range(n) if i not in records]
     batches = [missing[k : k + 5] for k in range(0, len(missing), 5)]
@@ -373,7 +375,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     # Also those of earlier runs.
     tables = {}
     for table, rows in ROWS.items():
-        if records := read_records(_part(table, options.seed), settings_sha256(options.seed)):
+        sha256 = settings_sha256(table, options.seed)
+        if records := read_records(_part(table, options.seed), sha256):
             tables[table] = rows([records[i] for i in sorted(records)])
     path = write_results(options.out, "closed_loop", {"seed": options.seed}, tables)
     print(f"{path.name} written")

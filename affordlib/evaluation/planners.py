@@ -37,7 +37,7 @@ class Variant:
     the families of goals that it is asked for; every: of these, each so-many-th. world: whose goals
     (see `goals.FROZEN`). nominal: whoever plans with the simulator is not told this world's
     frictions, masses and heights, and starts where the camera sees the object. nudged: the object
-    is a millimetre and a degree off when the plan is carried out.
+    is a millimetre and a degree off when the plan is carried out. looks, feels: see `attempt`.
     """
 
     planner: Callable[..., Plan]
@@ -53,6 +53,8 @@ class Variant:
     world: str = "clean"
     nominal: bool = False
     nudged: bool = False
+    looks: int = 1
+    feels: bool = False
     settings: tuple[tuple[str, Any], ...] = ()
 
     @property
@@ -93,7 +95,9 @@ class Variant:
         more |= {"settings": settings, "checkpoints": files, "format": FORMAT}
         if self.every > 1:
             more["every"] = self.every
-        for name in ("nominal", "nudged"):
+        if self.looks > 1:
+            more["looks"] = self.looks
+        for name in ("nominal", "nudged", "feels"):
             if getattr(self, name):
                 more[name] = True
         return self.columns() | more
@@ -211,6 +215,8 @@ VARIANTS: dict[str, Variant] = {
     "oracle": _continuous(name="oracle_privileged", **_ORACLE, every=2),
     "varied": _continuous(**_VARIED, **_CONSTRUCTED),
     "varied_corrected": _continuous(**_VARIED, **_CONSTRUCTED, corrections=2),
+    "varied_looks": _continuous(**_VARIED, **_CONSTRUCTED, corrections=2, looks=8),
+    "varied_touch": _continuous(**_VARIED, **_CONSTRUCTED, corrections=2, looks=8, feels=True),
     "varied_clean": _continuous(
         model="film_5000", push="push_film_x10", world="varied", **_CONSTRUCTED
     ),

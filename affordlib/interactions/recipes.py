@@ -175,6 +175,8 @@ RECIPES |= {
     for name, recipe in RECIPES.items()
     if name in ("push", "drag", "mixed", "grasp", "rotate", "lever_up", "push_varied")
 }
+RECIPES["grasp_firm_x10"] = replace(RECIPES["grasp_x10"], seed=18, world=WorldConfig())
+"""Grasps in the world in which objects are pushed: on things that are less slippery."""
 
 
 def _generator(recipe: Recipe, index: int, *part: int) -> np.random.Generator:

@@ -86,6 +86,12 @@ SHIPPED: dict[str, Shipped] = {
         _TABLE_FRAME,
         GRASP_SYMMETRIES,
     ),
+    "grasp_film_firm": Shipped(
+        "grasp_firm_x10",
+        FiLMConfig(frame="table", action_channels=("z", "gripper"), effect_channels=("z",)),
+        _TABLE_FRAME,
+        GRASP_SYMMETRIES,
+    ),
     "rotate_film": Shipped(
         "rotate_x10",
         FiLMConfig(frame="table", action_channels=("yaw", "gripper"), effect_channels=("yaw",)),
@@ -101,7 +107,7 @@ SHIPPED: dict[str, Shipped] = {
 }
 """Minutes of one core: ten for `push_cnp`, five for the two of 5,000 pushes, one or two for others.
 
-Four learn from sets of ten times the size, which are not shipped: collect them first.
+Five learn from sets of ten times the size, which are not shipped: collect them first.
 """
 
 SHIPPED_LEVER: dict[str, tuple[str, str]] = {

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from affordlib.planning.disturbances import Disturbance
     from affordlib.planning.moves import Demands
     from affordlib.planning.repertoire import Repertoire
-    from affordlib.types import Step
+    from affordlib.types import Interaction, Step
     from affordlib.world import Tabletop
 
 SURPRISE_M = 0.002
@@ -76,10 +76,9 @@ def action_limit(distance_m: float) -> int:
     return math.ceil(distance_m / MOVE_M - 1e-9) + SPARE_ACTIONS
 
 
-def follow(world: Tabletop, step: Step) -> np.ndarray:
-    """Carry out a step; the object's path (n, 2) in the frame of the table."""
-    seen = world.follow(step)
-    return seen.effect[:, :2] + seen.start_pose[:2]
+def path_on_table(done: Interaction) -> np.ndarray:
+    """The object's path (n, 2) [m] while it was acted on, in the frame of the table."""
+    return done.effect[:, :2] + done.start_pose[:2]
 
 
 class Chase:
@@ -175,7 +174,7 @@ class Chase:
             self._give_up(part)
         self.planned_for, self.expected = self.goal, step.predicted_end_xy_m
         with self.script.during(self.world, len(self.steps)):
-            self.paths.append(follow(self.world, step))
+            self.paths.append(path_on_table(self.world.follow(step)))
         self.steps.append(step)
         if self.demands.on_action is not None:
             plan = (

@@ -28,7 +28,7 @@ Reachable = Callable[[np.ndarray, np.ndarray], np.ndarray]
 CHECKPOINTS = {
     "push": "push_film_x10",
     "drag": "drag_film",
-    "grasp": "grasp_film",
+    "grasp": "grasp_film_firm",
     "rotate": "rotate_film",
 }
 

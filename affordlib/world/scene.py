@@ -87,6 +87,7 @@ class Tabletop(Interventions):
         self.thing: Thing | None = None
         self.film: Film | None = None
         self.tool = ""
+        self.looks = 1
         self.reset()
 
     def __enter__(self) -> Tabletop:
@@ -110,6 +111,7 @@ class Tabletop(Interventions):
             self._clear()
         self.thing, self.body = None, -1
         self.noise = np.random.default_rng(self.config.noise_seed)
+        self.eye_off_m = (0.0, 0.0)
         self._set_friction(self.table, -1, self.config.table_friction)
         for link in robot.touching_links(client, self.robot):
             self._set_friction(self.robot, link, self.config.finger_friction)
@@ -248,13 +250,21 @@ class Tabletop(Interventions):
         return z > 0 and TABLE_X_M[0] <= x <= TABLE_X_M[1] and TABLE_Y_M[0] <= y <= TABLE_Y_M[1]
 
     def perceive(self) -> Percept:
-        """Where the robot believes the object to be, and its image; the arm is parked."""
+        """Where the robot believes the object to be, and its image; the arm is parked.
+
+        The mean of so many `looks`, less what the robot takes its eye to be off by.
+        """
         self._require_object()
         x, y, _ = self.object_pose()
         image = None
         if self.config.camera == "kinect":
-            (x, y), image = camera.kinect_view(self.client, self.noise)
-        x, y = x + self.config.bias_m[0], y + self.config.bias_m[1]
+            views = [camera.kinect_view(self.client, self.noise) for _ in range(self.looks)]
+            x, y = np.mean([xy for xy, _ in views], axis=0).tolist()
+            image = views[0][1]
+        x, y = (
+            v + bias - off
+            for v, bias, off in zip((x, y), self.config.bias_m, self.eye_off_m, strict=True)
+        )
         if image is None:
             image = camera.depth_crop(self.client, (x, y))
         return Percept((x, y), image)
