@@ -1,11 +1,14 @@
 """Table 3: its rows, its variants, and that the committed one belongs to what is shipped."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from affordlib.evaluation.goals import ROLLABLE, STANDING, PlanningTask, frozen_tasks, main
+from affordlib.evaluation.oracle import WARY_RAD, touchy
 from affordlib.evaluation.planners import VARIANTS
 from affordlib.evaluation.planning import (
     PARTS,
@@ -15,8 +18,10 @@ from affordlib.evaluation.planning import (
     tasks_sha256,
 )
 from affordlib.paths import repo_root
+from affordlib.planning import map_effects
 from affordlib.primitives import Drag
 from affordlib.results import read_results
+from affordlib.world import Cuboid
 
 COMMITTED = sorted((repo_root() / PARTS).glob("*.json"))
 
@@ -115,6 +120,22 @@ def test_with_the_simulator_as_model_hardly_anything_remains(world, rollable):
     outcome = attempt(world, task, lambda *query: planner(world, *query))
     assert outcome.distance_m < 0.001
     assert isinstance(outcome.plan.steps[0].primitive, Drag) == rollable
+
+
+def test_a_wary_oracle_is_unsure_where_a_degree_matters(world, film):
+    """Its σ is by how much the same push does otherwise to an object turned by a degree."""
+    world.place(Cuboid(0.07, 0.05, 0.05), (0.0, 0.0), 0.3)
+    effects = map_effects(film, world.look())
+    wary = replace(effects, coefficients=touchy(effects.coefficients))
+    angle = torch.arange(36, dtype=torch.float64) * (2 * torch.pi / 36)
+    phase = torch.ones_like(angle)
+    mean, std = wary(angle, phase)
+    assert torch.equal(mean, effects(angle, phase)[0])
+    near = torch.tensor(2 * torch.pi / 36)
+    ahead, behind = (effects(angle + side * near, phase)[0] for side in (1, -1))
+    expected = WARY_RAD * (ahead - behind).abs() / (2 * near)
+    assert torch.corrcoef(torch.stack([std[:, 2], expected[:, 2]]))[0, 1] > 0.95
+    assert std[:, 2].mean() == pytest.approx(float(expected[:, 2].mean()), rel=0.2)
 
 
 def test_the_committed_table_belongs_to_the_shipped_checkpoints():

@@ -9,14 +9,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from affordlib.planning.effect_map import EffectMap, map_effects
+from affordlib.planning.effect_map import WRAP, EffectMap, map_effects
 from affordlib.types import Observations, Prediction
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from affordlib.primitives import Drag, Push
     from affordlib.world import Tabletop, Thing, WorldConfig
 
 _STD_M = 1e-5
+WARY_RAD = math.radians(1.0)
+"""By how much a wary oracle takes the object to be turned otherwise than it is."""
 
 
 @dataclass
@@ -69,11 +73,23 @@ def oracle_effects(
     image: np.ndarray,
     kind: type[Push] | type[Drag],
     config: WorldConfig,
+    wary: bool = False,
 ) -> EffectMap:
     """The effect map of the object that stands in a world, from actions in an imagined one.
 
-    config: of the imagined one, in which the camera misses nothing.
+    config: of the imagined one, in which the camera misses nothing. wary: its σ, else next to
+    nothing, is how much the effect changes with `WARY_RAD`.
     """
     config = replace(config, camera="ideal", bias_m=(0.0, 0.0))
     model = SimulatorModel(imagined, world.thing, world.object_pose()[2], kind, config)
-    return map_effects(model, image, kind)
+    effects = map_effects(model, image, kind)
+    return replace(effects, coefficients=touchy(effects.coefficients)) if wary else effects
+
+
+def touchy(coefficients: Tensor) -> Tensor:
+    """A map (D + 3, T + 3, 6) whose σ is the change of its effect with the direction."""
+    mean = coefficients[:-WRAP, :, :3]
+    slope = (mean.roll(-1, 0) - mean.roll(1, 0)) * (len(mean) / (4 * math.pi))
+    std = WARY_RAD * slope.abs() + _STD_M
+    around = torch.cat([std, std[:WRAP]])
+    return torch.cat([coefficients[..., :3], around], dim=-1)

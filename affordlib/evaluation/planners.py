@@ -36,8 +36,9 @@ class Variant:
     of A*, or phases at which the gradient planner queries. full_only: no partial actions. goals:
     the families of goals that it is asked for; every: of these, each so-many-th. world: whose goals
     (see `goals.FROZEN`). nominal: whoever plans with the simulator is not told this world's
-    frictions, masses and heights, and starts where the camera sees the object. nudged: the object
-    is a millimetre and a degree off when the plan is carried out. looks, feels: see `attempt`.
+    frictions, masses and heights, and starts where the camera sees the object. wary: it has a σ,
+    see `oracle_effects`. nudged: the object is a millimetre and a degree off when the plan is
+    carried out. looks, feels: see `attempt`.
     """
 
     planner: Callable[..., Plan]
@@ -52,6 +53,7 @@ class Variant:
     every: int = 1
     world: str = "clean"
     nominal: bool = False
+    wary: bool = False
     nudged: bool = False
     looks: int = 1
     feels: bool = False
@@ -97,7 +99,7 @@ class Variant:
             more["every"] = self.every
         if self.looks > 1:
             more["looks"] = self.looks
-        for name in ("nominal", "nudged", "feels"):
+        for name in ("nominal", "wary", "nudged", "feels"):
             if getattr(self, name):
                 more[name] = True
         return self.columns() | more
@@ -154,7 +156,7 @@ def _plan_with_simulator(
 ) -> Plan:
     kind = Drag if world.object_rolls() else Push
     config = WorldConfig() if variant.nominal else world.config
-    effects = oracle_effects(imagined, world, image, kind, config)
+    effects = oracle_effects(imagined, world, image, kind, config, variant.wary)
     return variant.planner(
         effects.model, image, start_xy_m, goal, variant.mode(mode), kind=kind, effects=effects
     )
@@ -213,6 +215,7 @@ VARIANTS: dict[str, Variant] = {
     "astar_lstm": _astar(**_LSTM, **_CONSTRUCTED),
     "continuous_lstm": _continuous(**_LSTM, **_CONSTRUCTED),
     "oracle": _continuous(name="oracle_privileged", **_ORACLE, every=2),
+    "oracle_wary": _continuous(name="oracle_privileged", **_ORACLE, every=2, wary=True),
     "varied": _continuous(**_VARIED, **_CONSTRUCTED),
     "varied_corrected": _continuous(**_VARIED, **_CONSTRUCTED, corrections=2),
     "varied_looks": _continuous(**_VARIED, **_CONSTRUCTED, corrections=2, looks=8),

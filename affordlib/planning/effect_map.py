@@ -34,7 +34,7 @@ N_DIRECTIONS = 36
 N_PHASES = 41
 FINE_DIRECTIONS = 180
 FINE_PHASES = 51
-_WRAP = 3
+WRAP = 3
 _SPLINES = (
     torch.tensor([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]], dtype=torch.float64)
     / 6
@@ -59,7 +59,7 @@ class EffectMap:
     def __call__(self, direction_rad: Tensor, phase: Tensor) -> tuple[Tensor, Tensor]:
         """Effects and σ (..., 3) in the frame of the action, directions relative to the object."""
         shape, (height, width, channels) = direction_rad.shape, self.coefficients.shape
-        rows, columns = height - _WRAP, width - _WRAP
+        rows, columns = height - WRAP, width - WRAP
         u = torch.remainder(direction_rad.reshape(-1), 2 * math.pi) * (rows / (2 * math.pi))
         v = phase.reshape(-1).clamp(0, 1) * (columns - 1)
         i, j = u.detach().floor().clamp(0, rows - 1), v.detach().floor().clamp(0, columns - 2)
