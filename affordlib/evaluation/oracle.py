@@ -9,12 +9,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from affordlib.planning.effect_map import WRAP, EffectMap, map_effects
+from affordlib.planning.effect_map import (
+    N_DIRECTIONS,
+    N_PHASES,
+    EffectMap,
+    map_effects,
+    splines_through,
+)
 from affordlib.types import Observations, Prediction
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from affordlib.primitives import Drag, Push
     from affordlib.world import Tabletop, Thing, WorldConfig
 
@@ -83,13 +87,15 @@ def oracle_effects(
     config = replace(config, camera="ideal", bias_m=(0.0, 0.0))
     model = SimulatorModel(imagined, world.thing, world.object_pose()[2], kind, config)
     effects = map_effects(model, image, kind)
-    return replace(effects, coefficients=touchy(effects.coefficients)) if wary else effects
+    return touchy(effects) if wary else effects
 
 
-def touchy(coefficients: Tensor) -> Tensor:
-    """A map (D + 3, T + 3, 6) whose σ is the change of its effect with the direction."""
-    mean = coefficients[:-WRAP, :, :3]
-    slope = (mean.roll(-1, 0) - mean.roll(1, 0)) * (len(mean) / (4 * math.pi))
+def touchy(effects: EffectMap) -> EffectMap:
+    """A map of the same effects, whose σ is by how much they change with `WARY_RAD`."""
+    step = 2 * math.pi / N_DIRECTIONS
+    angles = step * torch.arange(N_DIRECTIONS, dtype=torch.float64)
+    phases = torch.linspace(0, 1, N_PHASES, dtype=torch.float64)
+    mean, _ = effects(*torch.meshgrid(angles, phases, indexing="ij"))
+    slope = (mean.roll(-1, 0) - mean.roll(1, 0)) / (2 * step)
     std = WARY_RAD * slope.abs() + _STD_M
-    around = torch.cat([std, std[:WRAP]])
-    return torch.cat([coefficients[..., :3], around], dim=-1)
+    return replace(effects, coefficients=splines_through(mean, std))

@@ -34,7 +34,7 @@ N_DIRECTIONS = 36
 N_PHASES = 41
 FINE_DIRECTIONS = 180
 FINE_PHASES = 51
-WRAP = 3
+_WRAP = 3
 _SPLINES = (
     torch.tensor([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]], dtype=torch.float64)
     / 6
@@ -59,7 +59,7 @@ class EffectMap:
     def __call__(self, direction_rad: Tensor, phase: Tensor) -> tuple[Tensor, Tensor]:
         """Effects and σ (..., 3) in the frame of the action, directions relative to the object."""
         shape, (height, width, channels) = direction_rad.shape, self.coefficients.shape
-        rows, columns = height - WRAP, width - WRAP
+        rows, columns = height - _WRAP, width - _WRAP
         u = torch.remainder(direction_rad.reshape(-1), 2 * math.pi) * (rows / (2 * math.pi))
         v = phase.reshape(-1).clamp(0, 1) * (columns - 1)
         i, j = u.detach().floor().clamp(0, rows - 1), v.detach().floor().clamp(0, columns - 2)
@@ -162,13 +162,18 @@ def map_effects(
     effect, std = _asked(model, features, kind, angles, t_target)
     # Before contact nothing has happened; what a model says at t = 0 is no displacement.
     effect = effect - effect[:, :1]
+    reach = float(effect[..., :2].norm(dim=-1).max())
+    return EffectMap(kind, model, features, splines_through(effect, std), reach)
+
+
+def splines_through(effect: Tensor, std: Tensor) -> Tensor:
+    """The coefficients of an `EffectMap` with these effects and σ (D, T, 3) on its grid."""
     values = torch.cat([effect, std], dim=-1).numpy()
     smooth = ndimage.spline_filter1d(values, axis=0, mode="grid-wrap")
     smooth = ndimage.spline_filter1d(smooth, axis=1, mode="mirror")
     smooth = np.pad(smooth, ((1, 2), (0, 0), (0, 0)), mode="wrap")
     smooth = np.pad(smooth, ((0, 0), (1, 2), (0, 0)), mode="reflect")
-    reach = float(np.hypot(values[..., 0], values[..., 1]).max())
-    return EffectMap(kind, model, features, torch.from_numpy(smooth), reach)
+    return torch.from_numpy(smooth)
 
 
 def map_once(planner: Callable[..., Plan], model: EffectModel, **settings: Any) -> Callable:
