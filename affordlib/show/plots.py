@@ -88,6 +88,9 @@ def plot_footprint(
     return ax
 
 
+_PLATE = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 1}
+
+
 def plot_plan(ax: Axes, plan: Plan) -> Axes:
     """A plan as predicted: the object's path, where each step stops, and the goal."""
     circle = plt.Circle(
@@ -109,13 +112,13 @@ def plot_plan(ax: Axes, plan: Plan) -> Axes:
         )
         ax.annotate(
             f"{k + 1}: {100 * step.stop_phase:.0f} %",
-            100 * (start - 0.055 * direction),
-            color=NEUTRAL,
-            ha="left" if direction[1] >= 0 else "right",
+            tail,
+            ha="center",
             va="center",
             fontsize=8,
-            xytext=(9 * direction[1], -9 * direction[0]),
+            xytext=tuple(-10 * direction),
             textcoords="offset points",
+            bbox=_PLATE,
         )
         ax.plot(
             *(100 * step.predicted_path_xy_m.T),
@@ -157,8 +160,18 @@ def plot_pursuit(ax: Axes, pursuit: Pursuit, thing: Thing | None = None) -> Axes
         ax.plot(*(100 * path.T), color=TRUTH, lw=2, label="truth" if k == 0 else None)
         end = 100 * np.array(step.predicted_end_xy_m)
         ax.plot(*end, "o", color=PREDICTION, ms=5, label="prediction" if k == 0 else None)
-        middle = 100 * path[len(path) // 2 :].mean(axis=0)
-        ax.annotate(step.primitive.name, middle, (5, 4), textcoords="offset points", fontsize=7)
+        x, y = path[-1] - path[0]
+        aside = np.array([-y, x]) / max(math.hypot(x, y), 1e-6)
+        ax.annotate(
+            f"{k + 1} {step.primitive.name}",
+            100 * path[len(path) // 2 :].mean(axis=0),
+            tuple((-1) ** k * 14 * aside),
+            textcoords="offset points",
+            ha="center",
+            va="center",
+            fontsize=7,
+            bbox=_PLATE,
+        )
         at = path[-1]
     if thing is not None:
         plot_footprint(ax, thing, pursuit.end_pose[:2], pursuit.end_pose[2], TRUTH)
@@ -172,11 +185,20 @@ def _labels(ax: Axes) -> list[str]:
     return ax.get_legend_handles_labels()[1]
 
 
-def plot_depth(ax: Axes, image: np.ndarray, title: str = "", width_m: float = CROP_WIDTH_M) -> Axes:
-    """The depth channel of an image (2, n, n), as height above the table in centimetres."""
+def plot_depth(
+    ax: Axes,
+    image: np.ndarray,
+    title: str = "",
+    width_m: float = CROP_WIDTH_M,
+    top_cm: float | None = None,
+) -> Axes:
+    """The depth channel of an image (2, n, n), as height above the table in centimetres.
+
+    top_cm: where the colours end (default: at the highest point, or 8 cm).
+    """
     half = 50 * width_m
     height_cm = 100 * (CAMERA_HEIGHT_M - image[0])
-    top = max(8.0, float(height_cm.max()))
+    top = top_cm or max(8.0, float(height_cm.max()))
     drawn = ax.imshow(
         height_cm, extent=(-half, half, -half, half), cmap="cividis", vmin=0, vmax=top
     )
