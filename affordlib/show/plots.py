@@ -116,7 +116,7 @@ def plot_plan(ax: Axes, plan: Plan) -> Axes:
             ha="center",
             va="center",
             fontsize=8,
-            xytext=tuple(-10 * direction),
+            xytext=tuple(-10 * direction if k == 0 else 20 * direction[::-1] * (1, -1)),
             textcoords="offset points",
             bbox=_PLATE,
         )
