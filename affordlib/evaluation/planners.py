@@ -38,7 +38,7 @@ class Variant:
     (see `goals.FROZEN`). nominal: whoever plans with the simulator is not told this world's
     frictions, masses and heights, and starts where the camera sees the object. wary: it has a σ,
     see `oracle_effects`. nudged: the object is a millimetre and a degree off when the plan is
-    carried out. looks, feels: see `attempt`.
+    carried out. looks: of which each perception is the mean.
     """
 
     planner: Callable[..., Plan]
@@ -56,7 +56,6 @@ class Variant:
     wary: bool = False
     nudged: bool = False
     looks: int = 1
-    feels: bool = False
     settings: tuple[tuple[str, Any], ...] = ()
 
     @property
@@ -99,7 +98,7 @@ class Variant:
             more["every"] = self.every
         if self.looks > 1:
             more["looks"] = self.looks
-        for name in ("nominal", "wary", "nudged", "feels"):
+        for name in ("nominal", "wary", "nudged"):
             if getattr(self, name):
                 more[name] = True
         return self.columns() | more
@@ -219,7 +218,6 @@ VARIANTS: dict[str, Variant] = {
     "varied": _continuous(**_VARIED, **_CONSTRUCTED),
     "varied_corrected": _continuous(**_VARIED, **_CONSTRUCTED, corrections=2),
     "varied_looks": _continuous(**_VARIED, **_CONSTRUCTED, corrections=2, looks=8),
-    "varied_touch": _continuous(**_VARIED, **_CONSTRUCTED, corrections=2, looks=8, feels=True),
     "varied_clean": _continuous(
         model="film_5000", push="push_film_x10", world="varied", **_CONSTRUCTED
     ),

@@ -30,7 +30,6 @@ from affordlib.evaluation.goals import FROZEN, ROLLABLE, STANDING, PlanningTask,
 from affordlib.evaluation.planners import VARIANTS
 from affordlib.paths import repo_root
 from affordlib.planning import PlanMode, carry_out
-from affordlib.planning.touch import Touch
 from affordlib.results import write_results, write_text_atomically
 from affordlib.types import Outcome, Plan
 from affordlib.world import Tabletop, UnreachableError
@@ -56,13 +55,12 @@ def attempt(
     corrections: int = 0,
     nudged: bool = False,
     looks: int = 1,
-    feels: bool = False,
 ) -> Outcome:
     """Plan and carry out one task, correcting the end by up to so many single actions.
 
     A plan that the arm cannot follow counts with the distance at which it left the object. nudged:
     the robot then believes the object `NUDGE_M` and `NUDGE_RAD` off where it is. looks: of which
-    each perception is the mean; feels: touch calibrates the eye, see `affordlib.planning.touch`.
+    each perception is the mean.
     """
     task.set_up(world)
     world.looks = looks
@@ -74,8 +72,7 @@ def attempt(
         world.place(task.thing, (0.0, 0.0), task.yaw_rad + NUDGE_RAD, config=config)
     once = PlanMode(1, partial=True)
     try:
-        replan, touch = lambda *query: planner(*query, once), Touch() if feels else None
-        return carry_out(world, plan, corrections, replan, touch=touch)
+        return carry_out(world, plan, corrections, lambda *query: planner(*query, once))
     except UnreachableError:
         pose = world.object_pose()
         return Outcome(plan, task.goal.distance_m(pose[:2]), pose, world.object_tilt_rad())
@@ -151,7 +148,7 @@ def run_variant(name: str, tasks: list[PlanningTask], progress: bool = True) -> 
     asked = variant.asked(tasks, lambda task: (task.goals, task.thing.family))
     with Tabletop() as world:
         planner_here = partial(planner, world) if variant.sees_world else planner
-        names = ("corrections", "nudged", "looks", "feels")
+        names = ("corrections", "nudged", "looks")
         how = {option: getattr(variant, option) for option in names}
         outcomes = measure(world, asked, planner_here, name * progress, **how)
     records = [outcome_record(t, o) for t, o in zip(asked, outcomes, strict=True)]

@@ -18,7 +18,7 @@ from affordlib.planning.chase import Chase, Pursuit, action_limit, path_on_table
 from affordlib.planning.continuous import plan_continuous
 from affordlib.planning.modes import PlanMode, is_on_table
 from affordlib.planning.moves import Demands
-from affordlib.primitives import Drag, Push
+from affordlib.primitives import Drag
 from affordlib.types import Goal, Outcome, Plan, check_within
 
 if TYPE_CHECKING:
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
     from affordlib.planning.disturbances import Disturbance
     from affordlib.planning.repertoire import Repertoire
-    from affordlib.planning.touch import Touch
-    from affordlib.types import Step
     from affordlib.world import Tabletop
 
 __all__ = ["Pursuit", "action_limit", "carry_out", "pursue"]
@@ -52,7 +50,6 @@ def carry_out(
     corrections: int = 0,
     replan: Replan | None = None,
     enough_m: float = ENOUGH_M,
-    touch: Touch | None = None,
 ) -> Outcome:
     """Execute a plan's steps, as planned, and measure where the object rests.
 
@@ -63,11 +60,10 @@ def carry_out(
     corrections: after the last step, so many single actions at most, each the first of a plan that
     `replan` makes anew from what is then seen, and each only if the object seems farther than
     enough_m [m] from the goal, the plan expects to bring it nearer, and the arm can do it.
-    touch: learns from every push how far off the eye is, and the robot takes that into account.
     """
     if corrections and replan is None:
         raise ValueError(f"corrections = {corrections} need a planner; give replan as well")
-    paths = [_act(world, step, touch) for step in plan.steps]
+    paths = [path_on_table(world.follow(step)) for step in plan.steps]
     for _ in range(corrections):
         seen = world.perceive()
         off = plan.goal.distance_m(seen.xy_m)
@@ -82,19 +78,10 @@ def carry_out(
             break
         if not world.can_reach(steps[0].primitive, steps[0].stop_phase):
             break
-        paths.append(_act(world, steps[0], touch))
+        paths.append(path_on_table(world.follow(steps[0])))
     pose = world.object_pose()
     distance = plan.goal.distance_m(pose[:2])
     return Outcome(plan, distance, pose, world.object_tilt_rad(), tuple(paths))
-
-
-def _act(world: Tabletop, step: Step, touch: Touch | None) -> np.ndarray:
-    """Carry out a step, and feel where it ended; the object's path (n, 2) on the table."""
-    done = world.follow(step)
-    if touch is not None and isinstance(step.primitive, Push):
-        touch.feel(step, done.believed_xy_m, world.perceive().xy_m)
-        world.eye_off_m = tuple(touch.mean_m.tolist())
-    return path_on_table(done)
 
 
 def pursue(

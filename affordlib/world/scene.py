@@ -111,7 +111,6 @@ class Tabletop(Interventions):
             self._clear()
         self.thing, self.body = None, -1
         self.noise = np.random.default_rng(self.config.noise_seed)
-        self.eye_off_m = (0.0, 0.0)
         self._set_friction(self.table, -1, self.config.table_friction)
         for link in robot.touching_links(client, self.robot):
             self._set_friction(self.robot, link, self.config.finger_friction)
@@ -252,7 +251,7 @@ class Tabletop(Interventions):
     def perceive(self) -> Percept:
         """Where the robot believes the object to be, and its image; the arm is parked.
 
-        The mean of so many `looks`, less what the robot takes its eye to be off by.
+        The place is the mean of so many `looks`, the image the first of them.
         """
         self._require_object()
         x, y, _ = self.object_pose()
@@ -261,10 +260,7 @@ class Tabletop(Interventions):
             views = [camera.kinect_view(self.client, self.noise) for _ in range(self.looks)]
             x, y = np.mean([xy for xy, _ in views], axis=0).tolist()
             image = views[0][1]
-        x, y = (
-            v + bias - off
-            for v, bias, off in zip((x, y), self.config.bias_m, self.eye_off_m, strict=True)
-        )
+        x, y = x + self.config.bias_m[0], y + self.config.bias_m[1]
         if image is None:
             image = camera.depth_crop(self.client, (x, y))
         return Percept((x, y), image)
