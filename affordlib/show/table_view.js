@@ -78,11 +78,15 @@ function drawPlan(svg, steps) {
     if (step.direction !== null) drawArrow(plan, step.start, step.direction);
     add(plan, "polyline", { points: points(step.path), class: "prediction" });
     add(plan, "circle", { cx: x, cy: y, r: 4, class: "prediction-end" });
-    const [u, v] = step.direction === null ? [1, 0] : [Math.cos(step.direction), Math.sin(step.direction)];
-    const [a, b] = mm(step.start);
-    const side = k % 2 ? -14 : 14; // in turn, or the words of pushes in a row would overlap
-    const anchor = side * v >= 0 ? "start" : "end";
-    const at = { x: a - 62 * u + side * v, y: b + 62 * v + side * u + 6, "text-anchor": anchor };
+    // Beside the end, where neither the next push comes from nor its object goes.
+    const last = k === steps.length - 1;
+    const ahead = (last ? step : steps[k + 1]).direction ?? 0;
+    const [right, up] = [Math.cos(ahead) >= 0, Math.sin(ahead) > (k % 2 ? 0.5 : -0.5)];
+    const at = {
+      x: x + (right ? 1 : -1) * (last ? 28 : 12),
+      y: y + (last ? 6 : up ? 26 : -14),
+      "text-anchor": right ? "start" : "end",
+    };
     add(plan, "text", { ...at, class: "step" }, step.label);
   }
 }
