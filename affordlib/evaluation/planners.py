@@ -36,9 +36,9 @@ class Variant:
     of A*, or phases at which the gradient planner queries. full_only: no partial actions. goals:
     the families of goals that it is asked for; every: of these, each so-many-th. world: whose goals
     (see `goals.FROZEN`). nominal: whoever plans with the simulator is not told this world's
-    frictions, masses and heights, and starts where the camera sees the object. wary: it has a σ,
-    see `oracle_effects`. nudged: the object is a millimetre and a degree off when the plan is
-    carried out. looks: of which each perception is the mean.
+    frictions, masses and heights (it starts where the camera sees the object in any case). wary: it
+    has a σ, see `oracle_effects`. nudged: the object is a millimetre and a degree off when the plan
+    is carried out. looks: of which each perception is the mean.
     """
 
     planner: Callable[..., Plan]
