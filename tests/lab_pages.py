@@ -221,7 +221,7 @@ def wait_for_words(page, text, seconds=40):
         time.sleep(0.05)
 
 
-def same_goal(page, table, x_m, y_m, within_m=0.0011):
+def assert_same_goal(page, table, x_m, y_m, within_m=0.0011):
     """What Python plans for, what the sliders say and what is drawn agree."""
     table.wait_for_answer()
     asked = goal_of(page)
@@ -236,7 +236,7 @@ def same_goal(page, table, x_m, y_m, within_m=0.0011):
     np.testing.assert_allclose(drawn, planned, atol=2e-4)
 
 
-def expect_goal(page, condition, seconds=20):
+def assert_goal(page, condition, seconds=20):
     end = time.monotonic() + seconds
     while not condition(goal_of(page)):
         assert time.monotonic() < end, f"the goal stays {goal_of(page)}"

@@ -11,14 +11,14 @@ from lab_pages import (
     WIDGET,
     Table,
     ask,
+    assert_goal,
+    assert_same_goal,
     button,
     choose,
-    expect_goal,
     goal_of,
     in_a_browser,
     opened,
     picture,
-    same_goal,
     saved_outputs,
     serve,
     wait_for_words,
@@ -47,14 +47,14 @@ def table(page):
 
 def test_it_opens_with_a_plan(page, table):
     assert goal_of(page) == (0.15, 0.10)
-    same_goal(page, table, 0.15, 0.10)
+    assert_same_goal(page, table, 0.15, 0.10)
     assert "Plan: push to" in words(page)
     picture(page, "1_open")
 
 
 def test_click(page, table):
     page.mouse.click(*table.at(0.08, -0.11))
-    same_goal(page, table, 0.08, -0.11)
+    assert_same_goal(page, table, 0.08, -0.11)
 
 
 def test_drag(page, table):
@@ -63,9 +63,9 @@ def test_drag(page, table):
     for share in np.linspace(0, 1, 12):
         page.mouse.move(*table.at(0.08 - 0.2 * share, -0.11 + 0.2 * share))
     page.mouse.up()
-    same_goal(page, table, -0.12, 0.09)
+    assert_same_goal(page, table, -0.12, 0.09)
     page.mouse.move(*table.at(0.2, 0.2))  # let go: the star stays
-    same_goal(page, table, -0.12, 0.09)
+    assert_same_goal(page, table, -0.12, 0.09)
     picture(page, "2_dragged")
 
 
@@ -74,7 +74,7 @@ def test_arrow_keys(page, table):
     table.svg.focus()
     for key in ("ArrowRight", "ArrowRight", "ArrowUp", "Shift+ArrowLeft", "Shift+ArrowDown"):
         page.keyboard.press(key)
-    same_goal(page, table, before[0] + 0.019, before[1] + 0.009, within_m=1e-6)
+    assert_same_goal(page, table, before[0] + 0.019, before[1] + 0.009, within_m=1e-6)
     assert page.evaluate("document.activeElement.closest('.affordlib-table') !== null")
 
 
@@ -83,11 +83,11 @@ def test_sliders_by_keyboard(page, table):
     handles = page.locator(".affordlib-picker .noUi-handle")
     handles.nth(0).focus()
     page.keyboard.press("ArrowRight")
-    expect_goal(page, lambda goal: goal[0] > x)
+    assert_goal(page, lambda goal: goal[0] > x)
     handles.nth(1).focus()
     page.keyboard.press("ArrowLeft")
-    expect_goal(page, lambda goal: goal[1] < y)
-    same_goal(page, table, *goal_of(page))
+    assert_goal(page, lambda goal: goal[1] < y)
+    assert_same_goal(page, table, *goal_of(page))
 
 
 def test_planner(page, table):
@@ -95,7 +95,7 @@ def test_planner(page, table):
     end = time.monotonic() + 20
     while ask(page, "picker.plan.planner") != "gradient_direction":
         assert time.monotonic() < end
-    same_goal(page, table, *goal_of(page))
+    assert_same_goal(page, table, *goal_of(page))
     choose(page, "A*")
     while ask(page, "picker.plan.planner") != "astar":
         assert time.monotonic() < end
@@ -104,7 +104,7 @@ def test_planner(page, table):
 
 def test_run(page, table):
     page.mouse.click(*table.at(0.12, 0.12))
-    same_goal(page, table, 0.12, 0.12)
+    assert_same_goal(page, table, 0.12, 0.12)
     before = table.points(".object").mean(axis=0)
     button(page, "Run").click()
     wait_for_words(page, "from the goal, ")
@@ -119,7 +119,7 @@ def test_run(page, table):
 def test_run_and_stop_by_keyboard(page, table):
     button(page, "Start over").click()
     page.mouse.click(*table.at(0.2, -0.2))
-    same_goal(page, table, 0.2, -0.2)
+    assert_same_goal(page, table, 0.2, -0.2)
     assert ask(page, "len(picker.plan.steps)") > 1
     table.svg.focus()
     page.keyboard.press("Enter")
@@ -143,15 +143,15 @@ def test_disturb(page, table):
     moved = table.points(".object").mean(axis=0) - drawn
     np.testing.assert_allclose(moved, np.subtract(shoved[:2], pose[:2]), atol=1e-3)
     button(page, "Move goal").click()
-    expect_goal(page, lambda new: new != goal)
-    same_goal(page, table, *goal_of(page))
+    assert_goal(page, lambda new: new != goal)
+    assert_same_goal(page, table, *goal_of(page))
     picture(page, "5_disturbed")
 
 
 def test_a_closed_loop_follows_a_goal_that_moves(page, table):
     button(page, "Start over").click()
     page.mouse.click(*table.at(0.18, 0.0))
-    same_goal(page, table, 0.18, 0.0)
+    assert_same_goal(page, table, 0.18, 0.0)
     choose(page, "closed loop")
     button(page, "Run").click()
     page.wait_for_function("() => document.querySelector('.trail')?.getAttribute('points')")
@@ -167,15 +167,15 @@ def test_a_closed_loop_follows_a_goal_that_moves(page, table):
 
 def test_save_and_load(page, table):
     page.mouse.click(*table.at(-0.1, 0.05))
-    same_goal(page, table, -0.1, 0.05)
+    assert_same_goal(page, table, -0.1, 0.05)
     button(page, "Save").click()
     wait_for_words(page, "Saved the plan")
     goal = goal_of(page)
     page.mouse.click(*table.at(0.0, 0.15))
-    same_goal(page, table, 0.0, 0.15)
+    assert_same_goal(page, table, 0.0, 0.15)
     button(page, "Load").click()
     wait_for_words(page, "Loaded.")
-    same_goal(page, table, *goal)
+    assert_same_goal(page, table, *goal)
 
 
 def test_the_plan_follows_the_hand(page, table):
@@ -219,13 +219,13 @@ def test_the_plan_follows_the_hand(page, table):
     (PICTURES / "times.json").write_text(json.dumps(measured, indent=1) + "\n")
     assert measured["first_median_ms"] < 500, measured
     assert measured["first_median_ms"] < measured["refined_median_ms"] < 2000, measured
-    same_goal(page, table, *goal_of(page))
+    assert_same_goal(page, table, *goal_of(page))
 
 
 def test_turn_and_lift(page, table):
     button(page, "Start over").click()
     page.mouse.click(*table.at(0.1, 0.04))
-    same_goal(page, table, 0.1, 0.04)
+    assert_same_goal(page, table, 0.1, 0.04)
     handles = page.locator(".affordlib-picker .noUi-handle")
     for slider, key, presses in ((2, "ArrowRight", 6), (3, "ArrowRight", 10)):
         handles.nth(slider).focus()

@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from affordlib.evaluation.goals import frozen_tasks
+from affordlib.evaluation.planning import attempt
 from affordlib.planning import carry_out, plan_astar, plan_continuous
 from affordlib.types import Goal, Plan
 from affordlib.world import Cuboid, WorldConfig
@@ -44,3 +46,15 @@ def test_many_looks_see_better(world):
         world.looks = 1
         world.place(BOX, config=WorldConfig())
     assert 2 < scatter[0] / scatter[1] < 4
+
+
+def test_an_attempt_leaves_the_eye_as_it_was(world, film):
+    task = next(t for t in frozen_tasks("varied") if t.mode == "single_full")
+    seen = []
+
+    def planner(image, xy, goal, mode):
+        seen.append(world.looks)
+        return plan_continuous(film, image, xy, goal, mode)
+
+    attempt(world, task, planner, looks=3)
+    assert (seen, world.looks) == ([3], 1)

@@ -76,6 +76,8 @@ def attempt(
     except UnreachableError:
         pose = world.object_pose()
         return Outcome(plan, task.goal.distance_m(pose[:2]), pose, world.object_tilt_rad())
+    finally:
+        world.looks = 1
 
 
 def measure(

@@ -79,7 +79,10 @@ class WorldConfig:
 
 
 class Tabletop(Interventions):
-    """A table, an arm and at most one object, in a PyBullet client of its own."""
+    """A table, an arm and at most one object, in a PyBullet client of its own.
+
+    looks: so many looks of a noisy camera make one perception.
+    """
 
     def __init__(self, config: WorldConfig | None = None) -> None:
         self.config = config or WorldConfig()
