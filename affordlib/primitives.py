@@ -199,13 +199,14 @@ class Drag(Primitive):
 
 @dataclass(frozen=True)
 class Grasp(Primitive):
-    """Lower the open gripper until it feels the object, close it, lift; it has no parameters.
+    """Lower the open gripper until it feels the object, close it, lift; nothing of it is learned.
 
     seen_height [m] is the object's: the tips aim at 30 mm below its top. None means as the robot
-    sees it.
+    sees it. grip_yaw [rad]: of the gripper, which turns what it closes on into line with itself.
     """
 
     seen_height: float | None = None
+    grip_yaw: float = 0.0
 
     name = "grasp"
     opening_m = 0.105
@@ -217,15 +218,17 @@ class Grasp(Primitive):
     def __post_init__(self) -> None:
         if self.seen_height is not None:
             check_within("seen_height", self.seen_height, 0.0, 0.2, "m")
+        yaw = wrap_angle(check_finite("grip_yaw", self.grip_yaw))
+        object.__setattr__(self, "grip_yaw", yaw)
 
     @cached_property
     def legs(self) -> tuple[Leg, ...]:
-        low = max((self.seen_height or 0.06) - 0.03, TIP_HEIGHT_M)
+        low, yaw = max((self.seen_height or 0.06) - 0.03, TIP_HEIGHT_M), self.grip_yaw
         return _legs(
-            (0.0, (0.0, 0.0, HOVER_M, 0.0, 1.0)),
-            (1.0, (0.0, 0.0, low, 0.0, 1.0)),
-            (0.75, (0.0, 0.0, low, 0.0, 0.0)),
-            (2.0, (0.0, 0.0, low + self.lift_m, 0.0, 0.0)),
+            (0.0, (0.0, 0.0, HOVER_M, yaw, 1.0)),
+            (1.0, (0.0, 0.0, low, yaw, 1.0)),
+            (0.75, (0.0, 0.0, low, yaw, 0.0)),
+            (2.0, (0.0, 0.0, low + self.lift_m, yaw, 0.0)),
             guarded=0,
         )
 

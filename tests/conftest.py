@@ -9,13 +9,21 @@ from affordlib.interactions.batches import Normaliser
 from affordlib.interactions.chunks import Layout, Variable
 from affordlib.interactions.collect import collect as collect_set
 from affordlib.models import AffordanceCNP, CNPConfig, load_checkpoint
-from affordlib.world import Cuboid, Tabletop
+from affordlib.world import Cuboid, Tabletop, WorldConfig
 
 
 @pytest.fixture(scope="session")
-def world():
+def one_world():
     with Tabletop() as tabletop:
         yield tabletop
+
+
+@pytest.fixture
+def world(one_world):
+    """The session's world, whatever the test before has made of its frictions and senses."""
+    one_world.config, one_world.looks, one_world.film = WorldConfig(), 1, None
+    one_world.reset()
+    return one_world
 
 
 @pytest.fixture(scope="session")
@@ -41,9 +49,9 @@ def film():
 
 
 @pytest.fixture(scope="session")
-def cuboid_image(world):
-    world.place(Cuboid(0.06, 0.05, 0.05), (0.0, 0.0), 0.3)
-    return np.array(world.look())
+def cuboid_image(one_world):
+    one_world.place(Cuboid(0.06, 0.05, 0.05), (0.0, 0.0), 0.3, config=WorldConfig())
+    return np.array(one_world.look())
 
 
 @pytest.fixture(scope="session")

@@ -295,15 +295,18 @@ def test_a_turn_is_a_partial_rotation(table, repertoire):
     assert sum(isinstance(s.primitive, Rotate) for s in went.steps) >= 2
 
 
-def test_position_orientation_and_height_are_chained(table, repertoire):
-    table.place(TUBE, (0.0, 0.0), 0.0)
+@pytest.mark.parametrize("thing", [TUBE, BOX], ids=["round", "with flanks"])
+def test_position_orientation_and_height_are_chained(table, repertoire, thing):
+    table.place(thing, (0.0, 0.0), 0.0)
     goal = Goal((0.07, 0.03), turn_rad=0.5, height_m=0.08)
     went = pursue(table, goal, repertoire, tolerance_m=0.004)
     assert went.reached, went.words
     kinds = [type(s.primitive) for s in went.steps]
     assert kinds[0] is Push
     assert kinds[-2:] == [Rotate, Grasp]
-    assert abs(went.turn_error_rad) < math.radians(3)
+    turn = table.object_pose()[2]
+    assert turn == pytest.approx(0.5, abs=math.radians(3))  # not turned back by the grasp
+    assert went.turn_error_rad == pytest.approx(0.5 - turn)
     assert abs(went.height_error_m) < 0.005
 
 

@@ -341,7 +341,8 @@ def test_turn_and_lift_are_asked_for_and_done_in_a_closed_loop(posed, world):
     said = posed.controls.words.value
     assert "The turn is off by" in said
     assert "The height is off by" in said
-    assert world.object_state()[2] == pytest.approx(0.025 + 0.06, abs=0.005)
+    assert world.object_state()[2] == pytest.approx(0.025 + 0.06, abs=0.005), said
+    assert math.degrees(world.object_pose()[2]) == pytest.approx(25.0, abs=2.0), said
     posed.ask_pose()
     assert posed.plan.goal.turn_rad is None
     assert posed.plan.goal.height_m is None

@@ -104,6 +104,7 @@ class Chase:
         self.planned_for: Goal | None = None
         self.expected: tuple[float, float] | None = None
         self.yaw_rad = world.object_pose()[2]
+        self.hand_yaw = 0.0
         self.limit = self._limit_from(world.perceive().xy_m)
         self.z_m = world.object_state()[2]
 
@@ -143,7 +144,9 @@ class Chase:
             lifts += 1
             self.limit += 1
             self._act(self._lift(), "height")
-            if abs(self._height_left()) <= self.demands.height_tolerance_m:
+            off = self._turn_left()
+            turned = off is None or abs(off) <= self.demands.turn_tolerance_rad
+            if turned and abs(self._height_left()) <= self.demands.height_tolerance_m:
                 raise Ended("reached", self._where())
             self.world.park()
 
@@ -176,6 +179,9 @@ class Chase:
         with self.script.during(self.world, len(self.steps)):
             self.paths.append(path_on_table(self.world.follow(step)))
         self.steps.append(step)
+        # A grasp takes an object as the last rotation left it, or it would turn it back.
+        turned = isinstance(step.primitive, Rotate)
+        self.hand_yaw = float(step.primitive.path(step.stop_phase)[0, 3]) if turned else 0.0
         if self.demands.on_action is not None:
             plan = (
                 self.moves.plans[-1]
@@ -211,7 +217,7 @@ class Chase:
     def _lift(self) -> Step:
         self.z_m = self.world.object_state()[2]
         model, height = self.repertoire.model(Grasp), self.goal.height_m
-        step = plan_lift(model, self.seen.image, self.seen.xy_m, height)
+        step = plan_lift(model, self.seen.image, self.seen.xy_m, height, self.hand_yaw)
         wanted = f"the height: {100 * height:.1f} cm"
         if step is None:
             raise Ended("unreachable", f"{wanted}, and no grasp is foreseen to lift it so high")

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from affordlib.models.frame import turn_image
 from affordlib.models.protocol import observe_actions
 from affordlib.perception import aim
 from affordlib.planning.modes import encode_image
@@ -95,15 +96,22 @@ def plan_turn(
 
 
 def plan_lift(
-    model: EffectModel, image: np.ndarray, xy_m: Sequence[float], height_m: float
+    model: EffectModel,
+    image: np.ndarray,
+    xy_m: Sequence[float],
+    height_m: float,
+    grip_yaw: float = 0.0,
 ) -> Step | None:
     """The grasp that ends holding an object from (x, y) at a height [m] above where it stands.
 
-    None when the model is sure (90 %) that it does not get so high, or slips.
+    grip_yaw [rad]: of the hand; the model, which knows only hands at 0, is shown the image turned
+    back by it. None when the model is sure (90 %) that it does not get so high, or slips.
     """
     height = check_within("height_m", height_m, 0.0, 0.5, "m")
-    primitive = Grasp()
-    phase, course, std = foresee_course(model, image, primitive, "z")
+    primitive = aim(Grasp(grip_yaw=grip_yaw), image)
+    back = torch.tensor([[math.cos(grip_yaw), -math.sin(grip_yaw)]])
+    before_hand = turn_image(torch.as_tensor(image)[None].float(), back)[0].numpy()
+    phase, course, std = foresee_course(model, before_hand, primitive, "z")
     if course.max() < height <= course[-1] + PERHAPS * std[-1]:
         # It may slip, or not; if it does not, it goes where the hand goes.
         hand = primitive.path(phase)[:, 2]
