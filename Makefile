@@ -12,6 +12,7 @@ KEEP    =
 DRY_RUN =
 SEEDS   = 0 1 2
 WORKERS = 1
+JOBS    = 2
 
 PY     := .venv/bin/python
 STAMP  := .venv/.installed
@@ -75,11 +76,11 @@ lab: $(STAMP) ## Open the book in JupyterLab, on this machine only
 # On one thread: tests are many small sums, and share their machine with browsers and clusters.
 test test-fast: export OMP_NUM_THREADS := 1
 
-test: $(STAMP) ## Run all tests, notebooks included
-	@$(PY) -m pytest
+test: $(STAMP) ## Run all tests, notebooks included (JOBS=2 side by side)
+	@$(PY) -m pytest -n "$(JOBS)" --dist loadfile
 
 test-fast: $(STAMP) ## Run the tests that take seconds, without the notebooks
-	@$(PY) -m pytest -m "not slow"
+	@$(PY) -m pytest -n "$(JOBS)" --dist loadfile -m "not slow"
 
 test-slow: $(STAMP) ## Run every notebook and solution as the reader does; the log is runs/test-slow.log
 	@mkdir -p runs; { $(PY) -m affordlib.workbook --profile reader --out test-slow --force; \

@@ -239,24 +239,32 @@ class Grasp(Primitive):
 
 @dataclass(frozen=True)
 class Rotate(Primitive):
-    """Lower the open gripper over the object, close it, turn, open; it has no parameters.
+    """Lower the open gripper over the object, close it, turn, open; nothing of it is learned.
 
-    The sweep is fixed: a smaller angle is a rotation stopped at an earlier phase.
+    The sweep is fixed: a smaller angle is a rotation stopped at an earlier phase. grip_yaw [rad]:
+    at which the gripper closes; what it closes on is turned into line with it.
     """
+
+    grip_yaw: float = 0.0
 
     name = "rotate"
     opening_m = 0.14
     force_N = 10.0
     sweep_rad: ClassVar[float] = math.radians(60)
 
+    def __post_init__(self) -> None:
+        yaw = wrap_angle(check_finite("grip_yaw", self.grip_yaw))
+        object.__setattr__(self, "grip_yaw", yaw)
+
     @cached_property
     def legs(self) -> tuple[Leg, ...]:
+        yaw, end = self.grip_yaw, self.grip_yaw + self.sweep_rad
         return _legs(
-            (0.0, (0.0, 0.0, HOVER_M, 0.0, 1.0)),
-            (1.0, (0.0, 0.0, TIP_HEIGHT_M, 0.0, 1.0)),
-            (0.75, (0.0, 0.0, TIP_HEIGHT_M, 0.0, 0.0)),
-            (1.25, (0.0, 0.0, TIP_HEIGHT_M, self.sweep_rad, 0.0)),
-            (0.75, (0.0, 0.0, TIP_HEIGHT_M, self.sweep_rad, 1.0)),
+            (0.0, (0.0, 0.0, HOVER_M, yaw, 1.0)),
+            (1.0, (0.0, 0.0, TIP_HEIGHT_M, yaw, 1.0)),
+            (0.75, (0.0, 0.0, TIP_HEIGHT_M, yaw, 0.0)),
+            (1.25, (0.0, 0.0, TIP_HEIGHT_M, end, 0.0)),
+            (0.75, (0.0, 0.0, TIP_HEIGHT_M, end, 1.0)),
         )
 
     def succeeded(self, effect: np.ndarray) -> bool:

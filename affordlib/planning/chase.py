@@ -12,12 +12,12 @@ from affordlib.perception import looks_fallen
 from affordlib.planning.disturbances import Script
 from affordlib.planning.modes import is_on_table
 from affordlib.planning.moves import Ended, MovePlanner
-from affordlib.planning.poses import plan_lift, plan_turn
+from affordlib.planning.poses import GRIP_YAWS, plan_lift, plan_turn
 from affordlib.primitives import Grasp, Rotate, wrap_angle
 from affordlib.types import Goal, Plan
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from affordlib.perception import Percept
     from affordlib.planning.disturbances import Disturbance
@@ -104,7 +104,7 @@ class Chase:
         self.planned_for: Goal | None = None
         self.expected: tuple[float, float] | None = None
         self.yaw_rad = world.object_pose()[2]
-        self.hand_yaw = 0.0
+        self.grip_yaws = GRIP_YAWS
         self.limit = self._limit_from(world.perceive().xy_m)
         self.z_m = world.object_state()[2]
 
@@ -179,9 +179,11 @@ class Chase:
         with self.script.during(self.world, len(self.steps)):
             self.paths.append(path_on_table(self.world.follow(step)))
         self.steps.append(step)
-        # A grasp takes an object as the last rotation left it, or it would turn it back.
-        turned = isinstance(step.primitive, Rotate)
-        self.hand_yaw = float(step.primitive.path(step.stop_phase)[0, 3]) if turned else 0.0
+        self.grip_yaws = GRIP_YAWS
+        if isinstance(step.primitive, Rotate):
+            # A grasp takes an object as the rotation left it, or it would turn it back.
+            yaw = float(step.primitive.path(step.stop_phase)[0, 3])
+            self.grip_yaws = tuple(wrap_angle(yaw + k * math.pi / 2) for k in (0, 1, -1))
         if self.demands.on_action is not None:
             plan = (
                 self.moves.plans[-1]
@@ -208,30 +210,45 @@ class Chase:
 
     def _turn(self, off_rad: float) -> Step:
         model = self.repertoire.model(Rotate)
-        step = plan_turn(model, self.seen.image, self.seen.xy_m, off_rad)
-        wanted = f"the orientation: {math.degrees(off_rad):.0f}° more"
-        if step is None:
-            raise Ended("unreachable", f"{wanted}, and no rotation is foreseen to turn the object")
-        return self._agreed(step, wanted)
+        return self._agreed(
+            GRIP_YAWS,
+            lambda *seen: plan_turn(model, *seen[:2], off_rad, seen[2]),
+            f"the orientation: {math.degrees(off_rad):.0f}° more",
+            "no rotation is foreseen to turn the object",
+        )
 
     def _lift(self) -> Step:
         self.z_m = self.world.object_state()[2]
         model, height = self.repertoire.model(Grasp), self.goal.height_m
-        step = plan_lift(model, self.seen.image, self.seen.xy_m, height, self.hand_yaw)
-        wanted = f"the height: {100 * height:.1f} cm"
-        if step is None:
-            raise Ended("unreachable", f"{wanted}, and no grasp is foreseen to lift it so high")
-        return self._agreed(step, wanted)
+        return self._agreed(
+            self.grip_yaws,
+            lambda *seen: plan_lift(model, *seen[:2], height, seen[2]),
+            f"the height: {100 * height:.1f} cm",
+            "no grasp is foreseen to lift it so high",
+        )
 
-    def _agreed(self, step: Step, wanted: str) -> Step:
-        if not self.world.can_reach(step.primitive, step.stop_phase, self.seen.xy_m):
+    def _agreed(
+        self,
+        grip_yaws: Sequence[float],
+        plan: Callable[[np.ndarray, Sequence[float], Sequence[float]], Step | None],
+        wanted: str,
+        hopeless: str,
+    ) -> Step:
+        """What is planned of the angles of the hand to which the arm agrees."""
+        yaws, vetoed = list(grip_yaws), None
+        while yaws:
+            step = plan(self.seen.image, self.seen.xy_m, yaws)
+            if step is None:
+                break
+            if self.world.can_reach(step.primitive, step.stop_phase, self.seen.xy_m):
+                return step
             self.moves.vetoes += 1
+            vetoed = step.primitive
+            yaws = [yaw for yaw in yaws if not math.isclose(yaw, vetoed.grip_yaw, abs_tol=1e-6)]
+        if vetoed:
             x, y = self.seen.xy_m
-            raise Ended(
-                "unreachable",
-                f"{wanted}: the arm cannot {step.primitive.name} at ({x:.3f}, {y:.3f}) m",
-            )
-        return step
+            hopeless = f"the arm cannot {vetoed.name} at ({x:.3f}, {y:.3f}) m"
+        raise Ended("unreachable", f"{wanted}{':' if vetoed else ', and'} {hopeless}")
 
     def _count(self) -> str:
         n = len(self.steps)

@@ -45,8 +45,8 @@ def mode_named(mode: str | PlanMode) -> PlanMode:
     return MODES[mode]
 
 
-def encode_image(model: EffectModel, image: np.ndarray) -> torch.Tensor:
-    """Features (1, F) of one depth image (2, 48, 48), checked."""
+def checked_image(image: np.ndarray) -> torch.Tensor:
+    """One depth image (2, 48, 48) as (1, 2, 48, 48); raises ValueError where it is none."""
     image = np.asarray(image, dtype=np.float32)
     if image.shape != (len(IMAGE_CHANNELS), IMAGE_PIXELS, IMAGE_PIXELS):
         raise ValueError(
@@ -55,8 +55,13 @@ def encode_image(model: EffectModel, image: np.ndarray) -> torch.Tensor:
         )
     if not np.isfinite(image).all():
         raise ValueError("image holds numbers that are not finite; look again")
-    with torch.no_grad():
-        return model.encode(torch.from_numpy(image)[None])
+    return torch.from_numpy(image)[None]
+
+
+@torch.no_grad()
+def encode_image(model: EffectModel, image: np.ndarray) -> torch.Tensor:
+    """Features (1, F) of one depth image (2, 48, 48), checked."""
+    return model.encode(checked_image(image))
 
 
 def plane(model: EffectModel) -> list[int]:

@@ -1,12 +1,15 @@
 """Orientation and height: one partial action each, stopped where the model foresees what is wanted.
 
-Grasp and rotate have no parameters (Section 3.3), so the only choice is the phase at which they
-stop. The model's course yaw(t) or z(t) is inverted; t is continuous.
+Grasp and rotate have no parameters (Section 3.3), so a model of them knows only one hand. But a
+turned hand is the same hand in a turned frame: the model is shown the image turned back, and says
+for every angle of the hand what would come of it. The angle is chosen, and the phase at which to
+stop is looked up on the course yaw(t) or z(t) that is foreseen; t is continuous.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,8 +18,8 @@ import torch
 from affordlib.models.frame import turn_image
 from affordlib.models.protocol import observe_actions
 from affordlib.perception import aim
-from affordlib.planning.modes import encode_image
-from affordlib.primitives import Grasp, Primitive, Rotate, wrap_angle
+from affordlib.planning.modes import checked_image
+from affordlib.primitives import Grasp, Rotate, wrap_angle
 from affordlib.types import Step, check_finite, check_within
 
 if TYPE_CHECKING:
@@ -25,26 +28,45 @@ if TYPE_CHECKING:
     from affordlib.models.protocol import EffectModel
 
 SAMPLES = 301
-CAREFUL_RAD, CAREFULLY = math.radians(6), 0.6
-PERHAPS = 1.28
+PERHAPS, MOST = 1.28, 0.9
+
+GRIP_YAWS = tuple(np.radians([0, 15, -15, 30, -30, 45, -45, 60, -60, 75, -75, 90]).tolist())
+"""Angles of the hand that are weighed, the least first: the fingers are alike, so 180° in all."""
 
 
 @torch.no_grad()
-def foresee_course(
-    model: EffectModel, image: np.ndarray, primitive: Primitive, channel: str
+def foresee_courses(
+    model: EffectModel,
+    image: np.ndarray,
+    primitive: Grasp | Rotate,
+    channel: str,
+    grip_yaws: Sequence[float],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Phases (n,), and mean and σ (n,) of one effect channel over them, zero before anything."""
+    """Phases (n,), and mean and σ (m, n) of one effect channel over them, for m angles of the hand.
+
+    The effect is zero before anything. Raises ValueError where the model has no such channel.
+    """
     if channel not in model.effect_channels:
         raise ValueError(
             f"channel {channel!r} is not among the effects {model.effect_channels} of the model; "
             f"give the model of {primitive.name}"
         )
-    t = torch.linspace(0, 1, SAMPLES)[None]
-    observed = observe_actions(model, [aim(primitive, image)])
-    told = model.predict(encode_image(model, image), observed, t)
+    turn = torch.tensor([[math.cos(yaw), -math.sin(yaw)] for yaw in grip_yaws])
+    seen = model.encode(turn_image(checked_image(image), turn))
+    t = torch.linspace(0, 1, SAMPLES).expand(len(turn), -1)
+    observed = observe_actions(model, [replace(aim(primitive, image), grip_yaw=0.0)] * len(turn))
+    told = model.predict(seen, observed, t)
     k = model.effect_channels.index(channel)
-    mean, std = (v[0, :, k].double().numpy() for v in (told.effect_mean, told.effect_std))
-    return t[0].double().numpy(), mean - mean[0], std
+    mean, std = (v[:, :, k].double().numpy() for v in (told.effect_mean, told.effect_std))
+    return t[0].double().numpy(), mean - mean[:, :1], std
+
+
+def foresee_course(
+    model: EffectModel, image: np.ndarray, primitive: Grasp | Rotate, channel: str
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The same for the primitive's own angle of the hand: phases, mean and σ, (n,) each."""
+    phase, mean, std = foresee_courses(model, image, primitive, channel, [primitive.grip_yaw])
+    return phase, mean[0], std[0]
 
 
 def crossings(phase: np.ndarray, values: np.ndarray, wanted: float) -> np.ndarray:
@@ -56,42 +78,45 @@ def crossings(phase: np.ndarray, values: np.ndarray, wanted: float) -> np.ndarra
 
 
 def plan_turn(
-    model: EffectModel, image: np.ndarray, xy_m: Sequence[float], turn_rad: float
+    model: EffectModel,
+    image: np.ndarray,
+    xy_m: Sequence[float],
+    turn_rad: float,
+    grip_yaws: Sequence[float] = GRIP_YAWS,
 ) -> Step | None:
     """The rotation that turns an object at (x, y) by an angle, or as far towards it as it can.
 
-    Closing, the fingers align a cuboid; then the hand turns counter-clockwise, so an angle behind
-    is reached by going on around. Where the wanted angle is not on the foreseen course, the whole
-    rotation is taken and another has to follow. None when it is foreseen to turn nothing.
+    Closing, the fingers align a cuboid; then the hand turns counter-clockwise, so an angle far
+    behind is reached by going on around. Of the angles at which the hand may begin, the one that
+    is surest (least σ) to have the object turned as wanted while it is held. Where none has, the
+    surest whole rotation of those that turn it by most of their sweep is taken, and another has to
+    follow. None when none is foreseen to turn it by 1°.
     """
     wanted = wrap_angle(check_finite("turn_rad", turn_rad))
-    primitive = Rotate()
-    phase, course, _ = foresee_course(model, image, primitive, "yaw")
-    closing, opening = primitive.leg_phases[2], primitive.leg_phases[-2]
-
-    def where(turn: float, low: float, high: float) -> list[float]:
-        there = (phase >= low) & (phase <= high)
-        return [
-            float(stop)
-            for around in (0.0, 2 * math.pi)
-            for stop in crossings(phase[there], course[there], turn + around)
-        ]
-
-    stops = where(wanted, closing, opening)
-    if not stops:
-        # Only the closing fingers turn it so, and that is foreseen to some degrees: by halves.
-        by_halves = wanted if abs(wanted) <= CAREFUL_RAD else CAREFULLY * wanted
-        stops = where(by_halves, 0.0, closing)
-    if not stops and np.ptp(course) < math.radians(1):
-        return None
-    stop = max(stops, default=1.0)
+    phase, courses, stds = foresee_courses(model, image, Rotate(), "yaw", grip_yaws)
+    closed, opening = Rotate().leg_phases[2], Rotate().leg_phases[-2]
+    held = (phase >= closed) & (phase <= opening)
+    stops = [
+        (float(np.interp(stop, phase, std)), k, float(stop))
+        for k, (course, std) in enumerate(zip(courses, stds, strict=True))
+        for around in (0.0, 2 * math.pi)
+        for stop in crossings(phase[held], course[held], wanted + around)
+    ]
+    if stops:
+        _, k, stop = min(stops)
+    else:
+        end = courses[:, -1]
+        if end.max() < math.radians(1):
+            return None
+        enough = end >= min(MOST * Rotate.sweep_rad, end.max())
+        k, stop = int(np.where(enough, stds[:, -1], np.inf).argmin()), 1.0
     return Step(
-        primitive,
+        Rotate(grip_yaws[k]),
         stop,
         (float(xy_m[0]), float(xy_m[1])),
         np.array([xy_m, xy_m], dtype=float),
         std_m=0.0,
-        predicted_turn_rad=float(np.interp(stop, phase, course)),
+        predicted_turn_rad=float(np.interp(stop, phase, courses[k])),
     )
 
 
@@ -100,18 +125,18 @@ def plan_lift(
     image: np.ndarray,
     xy_m: Sequence[float],
     height_m: float,
-    grip_yaw: float = 0.0,
+    grip_yaws: Sequence[float] = GRIP_YAWS,
 ) -> Step | None:
     """The grasp that ends holding an object from (x, y) at a height [m] above where it stands.
 
-    grip_yaw [rad]: of the hand; the model, which knows only hands at 0, is shown the image turned
-    back by it. None when the model is sure (90 %) that it does not get so high, or slips.
+    Of the angles of the hand the one that is sure (mean less σ) to lift it highest, of equals (to
+    a centimetre) the first. None when the model is sure (90 %) that it does not get so high, or
+    slips.
     """
     height = check_within("height_m", height_m, 0.0, 0.5, "m")
-    primitive = aim(Grasp(grip_yaw=grip_yaw), image)
-    back = torch.tensor([[math.cos(grip_yaw), -math.sin(grip_yaw)]])
-    before_hand = turn_image(torch.as_tensor(image)[None].float(), back)[0].numpy()
-    phase, course, std = foresee_course(model, before_hand, primitive, "z")
+    phase, courses, stds = foresee_courses(model, image, Grasp(), "z", grip_yaws)
+    k = int((courses - stds)[:, -1].round(2).argmax())
+    course, std, primitive = courses[k], stds[k], Grasp(grip_yaw=grip_yaws[k])
     if course.max() < height <= course[-1] + PERHAPS * std[-1]:
         # It may slip, or not; if it does not, it goes where the hand goes.
         hand = primitive.path(phase)[:, 2]
