@@ -11,11 +11,8 @@ from affordlib.planning import (
     Repertoire,
     action_limit,
     draw_disturbances,
-    plan_lift,
-    plan_turn,
     pursue,
 )
-from affordlib.planning.poses import crossings
 from affordlib.primitives import Drag, Grasp, Push, Rotate
 from affordlib.types import Goal, Plan, Prediction
 from affordlib.world import Cuboid, Sphere, Tabletop, UnreachableError, UprightCylinder
@@ -256,71 +253,6 @@ def test_a_disturbed_pursuit_is_the_same_again(table, repertoire):
         script = draw_disturbances(7, n=2)
         ends.append(pursue(table, Goal((0.1, 0.1)), repertoire, disturbances=script).end_pose)
     assert ends[0] == ends[1]
-
-
-# Height and orientation
-
-
-def test_crossings_are_where_the_course_has_the_value():
-    phase = np.linspace(0, 1, 5)
-    np.testing.assert_allclose(
-        crossings(phase, np.array([0, 1, 1, 0, 2]), 0.5), [0.125, 0.625, 0.8125]
-    )
-    assert len(crossings(phase, np.zeros(5), 0.5)) == 0
-
-
-@pytest.mark.parametrize("height", [0.03, 0.12])
-def test_a_partial_grasp_ends_holding_at_the_height(table, repertoire, height):
-    table.place(BOX, (0.02, 0.01), 0.0)
-    went = pursue(table, Goal((0.02, 0.01), height_m=height), repertoire)
-    assert went.reached, went.words
-    assert [type(s.primitive) for s in went.steps] == [Grasp]
-    assert 0 < went.steps[0].stop_phase < 1
-    z = table.object_state()[2]
-    assert z - BOX.height_m / 2 == pytest.approx(height, abs=0.003)
-    table.settle(1.0)
-    assert table.object_state()[2] == pytest.approx(z, abs=5e-4)
-
-
-def test_a_turn_is_a_partial_rotation(table, repertoire):
-    table.place(TUBE, (0.0, 0.0), 0.0)
-    went = pursue(table, Goal((0.0, 0.0), turn_rad=0.6), repertoire)
-    assert went.reached, went.words
-    assert table.object_pose()[2] == pytest.approx(0.6, abs=math.radians(3))
-    assert [type(s.primitive) for s in went.steps] == [Rotate]
-    # What one sweep of 60° does not reach takes another.
-    table.place(TUBE, (0.0, 0.0), 0.0)
-    went = pursue(table, Goal((0.0, 0.0), turn_rad=1.9), repertoire)
-    assert went.reached, went.words
-    assert sum(isinstance(s.primitive, Rotate) for s in went.steps) >= 2
-
-
-@pytest.mark.parametrize("thing", [TUBE, BOX], ids=["round", "with flanks"])
-def test_position_orientation_and_height_are_chained(table, repertoire, thing):
-    table.place(thing, (0.0, 0.0), 0.0)
-    goal = Goal((0.07, 0.03), turn_rad=0.5, height_m=0.08)
-    went = pursue(table, goal, repertoire, tolerance_m=0.004)
-    assert went.reached, went.words
-    kinds = [type(s.primitive) for s in went.steps]
-    assert kinds[0] is Push
-    assert kinds[-2:] == [Rotate, Grasp]
-    turn = table.object_pose()[2]
-    assert turn == pytest.approx(0.5, abs=math.radians(3))  # not turned back by the grasp
-    assert went.turn_error_rad == pytest.approx(0.5 - turn)
-    assert abs(went.height_error_m) < 0.005
-
-
-def test_the_part_that_cannot_be_had_is_named(table, repertoire):
-    table.place(BOX, (0.0, 0.0), 0.0)
-    went = pursue(table, Goal((0.0, 0.0), height_m=0.4), repertoire)
-    assert (went.ending, went.steps) == ("unreachable", ())
-    assert "the height: 40.0 cm" in went.words
-    image = table.look()
-    assert plan_lift(repertoire.model(Grasp), image, (0, 0), 0.4) is None
-    step = plan_turn(repertoire.model(Rotate), image, (0, 0), 0.5)
-    assert step.predicted_turn_rad == pytest.approx(0.5)
-    with pytest.raises(ValueError, match="channel 'yaw' is not among the effects"):
-        plan_turn(repertoire.model(Grasp), image, (0, 0), 0.5)
 
 
 def test_a_goal_across_the_table_is_reached_in_the_limit(table, repertoire):
