@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from affordlib.interactions import collect, open_interactions
+from affordlib.interactions import TrainingArrays, collect, open_interactions
 from affordlib.interactions.batches import Normaliser
 from affordlib.interactions.chunks import Layout, Variable
 from affordlib.interactions.collect import collect as collect_set
@@ -57,6 +57,13 @@ def cuboid_image(one_world):
 @pytest.fixture(scope="session")
 def held_out_pushes():
     return open_interactions("push_test")
+
+
+@pytest.fixture(scope="session")
+def some(pushes):
+    """Forty pushes with the yaw of action and effect."""
+    channels = ("x", "y", "yaw")
+    return TrainingArrays.from_dataset(pushes, np.arange(40), channels, channels)
 
 
 @pytest.fixture

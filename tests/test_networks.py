@@ -25,8 +25,7 @@ from affordlib.models import (
     train,
     train_literal,
 )
-from affordlib.models.film import CircularHarmonics
-from affordlib.models.frame import heading, inverse, turn_image
+from affordlib.models.frame import heading
 from affordlib.models.protocol import observe_final_effect
 from affordlib.models.training import batch_loss, final_errors_m, literal_draw
 from affordlib.primitives import Drag, Push
@@ -43,12 +42,6 @@ CONFIGS = {
     "attention, push": AttentionConfig(**YAW, **SMALL),
 }
 IN_PUSH_FRAME = [name for name in CONFIGS if name.endswith("push")]
-
-
-@pytest.fixture(scope="module")
-def some(pushes):
-    """Forty pushes with the yaw of action and effect."""
-    return TrainingArrays.from_dataset(pushes, np.arange(40), *YAW.values())
 
 
 @pytest.fixture(params=CONFIGS)
@@ -173,36 +166,6 @@ def test_the_heading_is_the_push(some):
     torch.testing.assert_close(inverse_question, torch.tensor([[0.6, -0.8], [1.0, 0.0]]))
 
 
-def test_turning_an_image_keeps_the_object(some):
-    angle = 2 * math.pi * torch.rand(40, generator=torch.Generator().manual_seed(0))
-    towards = torch.stack([angle.cos(), angle.sin()], dim=1)
-    turned = turn_image(some.image, towards)
-    for channel, full in ((1, some.image[:, 1]), (0, 1 - some.image[:, 0])):
-        now = turned[:, 1] if channel == 1 else 1 - turned[:, 0]
-        kept = now.sum(dim=(1, 2)) / full.sum(dim=(1, 2))
-        assert (kept - 1).abs().max() < 0.01
-    again = turn_image(turned, inverse(towards))
-    assert (again - some.image)[:, 1].abs().mean() < 0.02
-    quarter = torch.tensor([[0.0, 1.0]]).expand(40, 2)
-    exact = torch.rot90(some.image, 1, (-2, -1))
-    torch.testing.assert_close(turn_image(some.image, quarter), exact, atol=1e-5, rtol=0)
-
-
-def test_harmonics_turn_as_their_image_does(some):
-    harmonics = CircularHarmonics(rings=3, orders=4)
-    known = harmonics(some.image)
-    angle = math.tau * torch.rand(40, generator=torch.Generator().manual_seed(0))
-    for turn, exact in ((torch.full((40,), math.pi / 2), True), (angle, False)):
-        towards = torch.stack([turn.cos(), turn.sin()], dim=-1)
-        turned = torch.rot90(some.image, 1, (-2, -1)) if exact else turn_image(some.image, towards)
-        off = harmonics.turned(known, towards) - harmonics(turned)
-        # An interpolated image is not quite the turned one; the harmonics themselves are.
-        assert off.abs().max() < (1e-4 if exact else 0.03 * known.abs().max())
-        assert (harmonics(turned) - known).abs().max() > 0.2 * known.abs().max()
-    back = harmonics.turned(harmonics.turned(known, towards), inverse(towards))
-    torch.testing.assert_close(back, known, atol=1e-5, rtol=1e-4)
-
-
 @pytest.mark.parametrize("name", ["push_film", "push_cnp"])
 def test_many_questions_at_once_have_the_answers_of_each(name, some):
     model, _ = load_checkpoint(name)
@@ -217,18 +180,6 @@ def test_many_questions_at_once_have_the_answers_of_each(name, some):
         one_by_one = torch.cat([getattr(told, field.name) for told in each])
         for other in (one_by_one, getattr(apart, field.name)):
             assert torch.allclose(getattr(together, field.name), other, atol=1e-6, rtol=0)
-
-
-def test_turned_data_are_those_of_the_turned_push(some):
-    """Yaw turns along where it is an orientation, and mirrors where it is a change."""
-    turned = some.turned(1, mirror=True)
-    push = math.pi / 2 - torch.atan2(some.action[:, 0, 1], some.action[:, 0, 0])
-    for k in range(5):
-        expected = Push(float(push[k])).path(np.array([0.0, 1.0]))[:, [0, 1, 3]]
-        now = turned.action[k, [0, -1]].numpy()
-        np.testing.assert_allclose(now[:, :2], expected[:, :2], atol=1e-5)
-        assert np.abs(np.exp(1j * now[:, 2]) - np.exp(1j * expected[:, 2])).max() < 1e-5
-    torch.testing.assert_close(turned.effect[..., 2], -some.effect[..., 2])
 
 
 @pytest.mark.parametrize("name", IN_PUSH_FRAME)
