@@ -42,7 +42,8 @@ setup: $(STAMP) ## Make .venv and install everything into it (PYTHON=python3.11)
 	@echo "The environment is ready: .venv"
 
 # The stamp is written last and holds the folder. Without it (never finished) or with another
-# folder in it (moved) the environment is made anew; otherwise pip brings it up to date.
+# folder in it (moved) the environment is made anew; otherwise pip brings it up to date. A second
+# make waits for the first, and finds it done.
 ifneq ($(shell cat $(STAMP) 2>/dev/null),$(CURDIR))
 .PHONY: $(STAMP)
 endif
@@ -51,14 +52,17 @@ $(STAMP): $(INPUTS)
 	@[[ "$$("$(PYTHON)" -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null)" == 3.11 ]] \
 	  || { echo "This workbook needs Python 3.11, and '$(PYTHON)' is $$("$(PYTHON)" -c 'import sys; print("Python " + sys.version.split()[0])' 2>/dev/null || echo 'not there')." \
 	            "Install it, or name it: make setup PYTHON=/path/to/python3.11" >&2; exit 1; }
-	@if [[ "$$(cat $@ 2>/dev/null)" != "$(CURDIR)" ]]; then \
+	@exec 9< Makefile; flock 9; \
+	 if [[ "$$(cat $@ 2>/dev/null)" != "$(CURDIR)" ]]; then \
 	   echo "Making .venv (a few minutes, once)"; "$(PYTHON)" -m venv --clear .venv; \
-	 else \
+	 elif [[ -n "$$(find $(INPUTS) -newer $@)" ]]; then \
 	   echo "Bringing .venv up to date"; rm $@; \
-	 fi
-	@$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -r requirements.txt
-	@$(PY) -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
-	@printf '%s' "$(CURDIR)" > $@
+	 else \
+	   exit 0; \
+	 fi; \
+	 $(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -r requirements.txt; \
+	 $(PY) -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .; \
+	 printf '%s' "$(CURDIR)" > $@
 
 workbook: $(STAMP) ## Run all notebooks into runs/ (PROFILE=smoke|reader|full SEED= OUT= ONLY= ARGS= DRY_RUN=1)
 	@set -f; $(PY) -m affordlib.workbook --profile "$${PROFILE:-reader}" --seed "$${SEED:-0}" \
