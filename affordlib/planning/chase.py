@@ -212,7 +212,7 @@ class Chase:
         model = self.repertoire.model(Rotate)
         return self._agreed(
             GRIP_YAWS,
-            lambda *seen: plan_turn(model, *seen[:2], off_rad, seen[2]),
+            lambda yaws: plan_turn(model, self.seen.image, self.seen.xy_m, off_rad, yaws),
             f"the orientation: {math.degrees(off_rad):.0f}° more",
             "no rotation is foreseen to turn the object",
         )
@@ -222,7 +222,7 @@ class Chase:
         model, height = self.repertoire.model(Grasp), self.goal.height_m
         return self._agreed(
             self.grip_yaws,
-            lambda *seen: plan_lift(model, *seen[:2], height, seen[2]),
+            lambda yaws: plan_lift(model, self.seen.image, self.seen.xy_m, height, yaws),
             f"the height: {100 * height:.1f} cm",
             "no grasp is foreseen to lift it so high",
         )
@@ -230,14 +230,14 @@ class Chase:
     def _agreed(
         self,
         grip_yaws: Sequence[float],
-        plan: Callable[[np.ndarray, Sequence[float], Sequence[float]], Step | None],
+        plan: Callable[[Sequence[float]], Step | None],
         wanted: str,
         hopeless: str,
     ) -> Step:
         """What is planned of the angles of the hand to which the arm agrees."""
         yaws, vetoed = list(grip_yaws), None
         while yaws:
-            step = plan(self.seen.image, self.seen.xy_m, yaws)
+            step = plan(yaws)
             if step is None:
                 break
             if self.world.can_reach(step.primitive, step.stop_phase, self.seen.xy_m):

@@ -28,7 +28,11 @@ if TYPE_CHECKING:
     from affordlib.models.protocol import EffectModel
 
 SAMPLES = 301
-PERHAPS, MOST = 1.28, 0.9
+PERHAPS = 1.28
+"""So many σ above a foreseen height are not yet beyond belief (90 %)."""
+
+MOST = 0.9
+"""Of its sweep, by which a whole rotation has to turn an object to count as one."""
 
 GRIP_YAWS = tuple(np.radians([0, 15, -15, 30, -30, 45, -45, 60, -60, 75, -75, 90]).tolist())
 """Angles of the hand that are weighed, the least first: the fingers are alike, so 180° in all."""
