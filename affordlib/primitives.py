@@ -199,7 +199,7 @@ class Drag(Primitive):
 
 @dataclass(frozen=True)
 class Grasp(Primitive):
-    """Lower the open gripper until it feels the object, close it, lift; unparameterised in the paper.
+    """Lower the open gripper until it feels the object, close it, lift: no parameters in the paper.
 
     seen_height [m] is the object's: the tips aim at 30 mm below its top. None means as the robot
     sees it. grip_yaw [rad]: of the gripper, which turns what it closes on into line with itself.
@@ -239,7 +239,7 @@ class Grasp(Primitive):
 
 @dataclass(frozen=True)
 class Rotate(Primitive):
-    """Lower the open gripper over the object, close it, turn, open; unparameterised in the paper.
+    """Lower the open gripper over the object, close it, turn, open: no parameters in the paper.
 
     The sweep is fixed: a smaller angle is a rotation stopped at an earlier phase. grip_yaw [rad]:
     at which the gripper closes; what it closes on is turned into line with it.
