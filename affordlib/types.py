@@ -230,8 +230,8 @@ class Outcome:
 
     distance_m: between the goal and the object at rest, gripper retreated; object_paths_xy_m: one
     (n, 2) path of the object per executed step, in the frame of the table; end_pose: (x, y, yaw);
-    tilt_rad: how far the object's upright axis ended from vertical; words: what else there is to
-    say of the ending.
+    tilt_rad: how far the object's upright axis ended from vertical; turned_rad, lifted_m: how far
+    the object was turned and lifted; words: what else there is to say of the ending.
     """
 
     plan: Plan
@@ -239,6 +239,8 @@ class Outcome:
     end_pose: tuple[float, float, float]
     tilt_rad: float
     object_paths_xy_m: tuple[np.ndarray, ...] = field(default=())
+    turned_rad: float = 0.0
+    lifted_m: float = 0.0
     words: str = ""
 
     def with_goal(self, goal: Goal) -> Outcome:

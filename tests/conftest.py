@@ -9,6 +9,7 @@ from affordlib.interactions.batches import Normaliser
 from affordlib.interactions.chunks import Layout, Variable
 from affordlib.interactions.collect import collect as collect_set
 from affordlib.models import AffordanceCNP, CNPConfig, load_checkpoint
+from affordlib.planning import Repertoire
 from affordlib.world import Cuboid, Tabletop, WorldConfig
 
 
@@ -46,6 +47,11 @@ def trained():
 @pytest.fixture(scope="session")
 def film():
     return load_checkpoint("push_film")[0]
+
+
+@pytest.fixture(scope="session")
+def repertoire():
+    return Repertoire.load()
 
 
 @pytest.fixture(scope="session")

@@ -35,6 +35,7 @@ def test_corrections_bring_it_nearer(world, film):
         carry_out(world, plan, 1)
 
 
+@pytest.mark.slow
 def test_many_looks_see_better(world):
     """Of eight looks the mean scatters by a factor of √8 less; the image is one of them."""
     scatter = []

@@ -82,6 +82,7 @@ def test_a_goal_is_reached(table, repertoire, thing):
     assert again.steps == ()
 
 
+@pytest.mark.slow
 def test_an_unreachable_goal_is_refused_before_any_motion(table, repertoire):
     table.place(BOX, (0.5, 0.3), 0.0)
     pose, moved = table.object_pose(), []

@@ -296,6 +296,7 @@ def test_make_data_says_how_far_apart_two_sets_are(undisturbed):
     assert not make_data.compare(old, old.isel(interaction=slice(3)))[0]
 
 
+@pytest.mark.slow
 def test_make_data_ends_with_status_1_when_the_sets_differ(
     undisturbed, tmp_path, monkeypatch, capsys
 ):

@@ -102,6 +102,7 @@ def poisoned(client, log, how):
         client.unregister_worker_plugin("poison")
 
 
+@pytest.mark.slow
 def test_a_cluster_leaves_the_same_file(both, undisturbed, tmp_path, monkeypatch):
     assert set(both.run(lambda: __import__("affordlib").__file__).values()) == {affordlib.__file__}
     monkeypatch.chdir(tmp_path)
@@ -192,6 +193,7 @@ def test_a_chunk_that_cannot_be_made_is_named(both, undisturbed, tmp_path):
     assert path.read_bytes() == undisturbed(LONGER).read_bytes()
 
 
+@pytest.mark.slow
 def test_a_chunk_that_kills_its_workers_is_named(both, tmp_path):
     def allow(failures, dask_scheduler):
         dask_scheduler.allowed_failures, before = failures, dask_scheduler.allowed_failures
@@ -215,6 +217,7 @@ def test_a_chunk_that_kills_its_workers_is_named(both, tmp_path):
     assert f"{3:08d}" not in made
 
 
+@pytest.mark.slow
 def test_make_data_collects_with_a_scheduler(both, undisturbed, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(make_data, "RECIPES", {"push": SMALL})
     address = ["--scheduler", both.scheduler.address]

@@ -12,7 +12,7 @@ from PIL import Image
 
 from affordlib.interactions import open_interactions
 from affordlib.plan_files import load_plan, save_plan
-from affordlib.planning import Repertoire, carry_out, plan_astar
+from affordlib.planning import Repertoire, carry_out, plan_astar, plan_continuous
 from affordlib.primitives import Drag, Push, Rotate
 from affordlib.show import GoalPicker
 from affordlib.show.executors import closed_loop, open_loop
@@ -213,6 +213,7 @@ def test_a_disturbance_waits_for_the_end_of_the_action(make_picker, world):
     assert picker.outcome.distance_m == pytest.approx(goal.distance_m(world.object_pose()[:2]))
 
 
+@pytest.mark.slow
 def test_a_closed_loop_notices_what_an_open_loop_does_not(make_picker, trained):
     executors = {"open loop": open_loop, "closed loop": closed_loop(Repertoire({"push": trained}))}
     off_m = {}
@@ -326,28 +327,51 @@ def test_the_ring_is_where_the_arm_can_push_from(world):
 
 
 @pytest.fixture
-def posed(make_picker):
-    return make_picker(executors={"closed loop": closed_loop(Repertoire.load())})
+def posed(world, repertoire, tmp_path):
+    world.place(Cuboid(0.06, 0.05, 0.05))
+    return GoalPicker(
+        world,
+        {"continuous": repertoire.planner(plan_continuous)},
+        executors={"open loop": open_loop, "closed loop": closed_loop(repertoire)},
+        folder=str(tmp_path),
+        seconds_per_action=0.0,
+    )
 
 
-def test_turn_and_lift_are_asked_for_and_done_in_a_closed_loop(posed, world):
+@pytest.mark.parametrize("executor", ["open loop", "closed loop"])
+def test_turn_and_lift_are_asked_for_planned_and_done(posed, world, executor):
+    posed.controls.executor.value = executor
     posed.pick(0.04, 0.03)
     posed.controls.turn.value, posed.controls.height.value = 25.0, 6.0
     goal = posed.plan.goal
     assert (math.degrees(goal.turn_rad), goal.height_m) == pytest.approx((25.0, 0.06))
     assert goal.xy_m == (0.04, 0.03)
-    assert "Turn and lift follow there, in a closed loop." in posed.controls.words.value
+    assert "then rotate to" in posed.controls.words.value
+    assert "then grasp to" in posed.controls.words.value
+    scene = posed._view.scene
+    assert scene["goal"]["yaw"] == pytest.approx(math.radians(25.0), abs=1e-4)
+    assert scene["steps"][-1]["yaw"] == pytest.approx(math.radians(25.0), abs=0.04)
+    assert [step["direction"] for step in scene["steps"][-2:]] == [None, None]
+    assert posed.picture()[:4] == b"\x89PNG"
     posed.run()
     said = posed.controls.words.value
     assert "The turn is off by" in said
     assert "The height is off by" in said
+    assert posed.outcome.lifted_m == pytest.approx(0.06, abs=0.005), said
     assert world.object_state()[2] == pytest.approx(0.025 + 0.06, abs=0.005), said
-    assert math.degrees(world.object_pose()[2]) == pytest.approx(25.0, abs=2.0), said
+    assert math.degrees(world.object_pose()[2]) == pytest.approx(25.0, abs=3.0), said
     posed.ask_pose()
     assert posed.plan.goal.turn_rad is None
     assert posed.plan.goal.height_m is None
     assert (posed.controls.turn.value, posed.controls.height.value) == (0.0, 0.0)
     assert world.object_state()[2] < 0.05  # let go, to be seen and planned for
+
+
+def test_what_cannot_be_lifted_so_high_is_said_before_anything_moves(posed):
+    posed.pick(0.04, 0.03)
+    posed._set_goal(Goal((0.04, 0.03), height_m=0.45))
+    posed._replan()
+    assert "not foreseen to be turned or lifted there" in posed.controls.words.value
 
 
 def test_a_plan_with_turn_and_lift_is_saved_and_loaded(posed):

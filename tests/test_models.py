@@ -152,6 +152,7 @@ def test_gradient_with_respect_to_the_observed_effect(untrained):
     assert torch.autograd.gradcheck(predicted, (effect,), eps=1e-7, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_minute_of_training_beats_the_mean_length(pushes):
     """The check that an eighth of the shipped training already learns what an image tells."""
     split = split_interactions(500)
@@ -179,6 +180,7 @@ def test_training_is_repeatable(pushes):
     assert torch.equal(*weights)
 
 
+@pytest.mark.slow
 def test_the_shipped_model_on_the_held_out_pushes(trained, held_out_pushes, pushes):
     """At most 7 mm, and clearly better than a direction and a mean length."""
     test = TrainingArrays.from_dataset(held_out_pushes)

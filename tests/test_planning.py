@@ -17,7 +17,6 @@ from affordlib.evaluation.planning import measure, outcome_record, planning_rows
 from affordlib.models import EffectModel
 from affordlib.planning import (
     carry_out,
-    effect_map,
     map_effects,
     plan_astar,
     plan_continuous,
@@ -254,6 +253,7 @@ def test_the_gradient_planner_finds_direction_and_phase(goal_xy, seed):
     assert heading == pytest.approx(math.atan2(goal_xy[1], goal_xy[0]), abs=0.02)
 
 
+@pytest.mark.slow
 def test_finer_samples_cut_finer():
     goals = [
         Goal((r * math.cos(r * 99), r * math.sin(r * 99))) for r in np.linspace(0.03, 0.08, 20)
@@ -309,6 +309,7 @@ def test_a_decoded_path_is_followed(world):
     np.testing.assert_allclose(decoded.rest_effect[:2], own.rest_effect[:2], atol=0.001)
 
 
+@pytest.mark.slow
 def test_the_shipped_model_reaches_goals(world, trained):
     """A floor, not the table: the mean distance over a few goals of each kind stays small."""
     tasks = constructed_tasks(world, "single_partial", 6, seed=7)
@@ -328,6 +329,7 @@ def test_the_shipped_model_reaches_goals(world, trained):
     assert constructed_tasks(world, "single_partial", 2, seed=7) == tasks[:2]
 
 
+@pytest.mark.slow
 def test_the_continuous_planner_comes_within_millimetres(world, film):
     """A floor again; open loop, and nearer still with corrections."""
     tasks = [t for t in frozen_tasks() if t.goals == "constructed" and t.mode == "multi_partial"]
@@ -368,18 +370,3 @@ def test_the_frozen_goals_are_those_that_are_drawn(world):
 def test_bad_input_is_named(plan, words):
     with pytest.raises(ValueError, match=words):
         plan()
-
-
-def test_a_map_is_made_once_while_only_the_goal_moves(film, cuboid_image, monkeypatch):
-    made = []
-    monkeypatch.setattr(
-        effect_map, "map_effects", lambda *query: made.append(1) or map_effects(*query)
-    )
-    planner = effect_map.map_once(plan_continuous, film, seed=1)
-    for x in (0.03, 0.06, 0.1):
-        plan = planner(cuboid_image, (0.0, 0.0), Goal((x, 0.04)))
-        afresh = plan_continuous(film, cuboid_image, (0.0, 0.0), Goal((x, 0.04)), seed=1)
-        assert plan.predicted_end_xy_m == afresh.predicted_end_xy_m
-    assert len(made) == 1
-    planner(np.roll(cuboid_image, 2, axis=-1), (0.0, 0.0), Goal((0.1, 0.04)))
-    assert len(made) == 2

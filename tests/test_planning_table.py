@@ -110,6 +110,7 @@ def test_variants_ask_only_for_what_they_can():
     assert len(set(abouts)) == len(abouts)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rollable", [False, True])
 def test_with_the_simulator_as_model_hardly_anything_remains(world, rollable):
     task = next(

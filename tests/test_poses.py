@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from affordlib.planning import Repertoire, plan_lift, plan_turn, pursue
+from affordlib.planning import plan_lift, plan_turn, pursue
 from affordlib.planning.poses import GRIP_YAWS, crossings, foresee_courses
 from affordlib.primitives import Grasp, Push, Rotate
 from affordlib.types import Goal
@@ -14,11 +14,6 @@ from affordlib.world import Cuboid, LyingCylinder, Tabletop, UprightCylinder
 BOX, TUBE = Cuboid(0.06, 0.05, 0.05), UprightCylinder(0.05, 0.07)
 DISC = LyingCylinder(0.05, 0.10)
 """On its rim, and as wide as the hand can open: only its faces can be taken."""
-
-
-@pytest.fixture(scope="module")
-def repertoire():
-    return Repertoire.load()
 
 
 def test_crossings_are_where_the_course_has_the_value():
@@ -92,7 +87,7 @@ def test_a_turned_hand_before_a_turned_thing_is_the_same(world, repertoire):
         world.place(BOX, yaw_rad=0.3 + turn)
         angles = [turn + 0.2]
         foreseen.append(
-            foresee_courses(repertoire.model(Rotate), world.look(), Rotate(), "yaw", angles)[1]
+            foresee_courses(repertoire.model(Rotate), world.look(), Rotate(), "yaw", angles).mean
         )
     np.testing.assert_allclose(*foreseen, atol=math.radians(1.5))
 

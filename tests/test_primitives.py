@@ -198,6 +198,7 @@ def test_stopped_anywhere_it_rests_where_the_full_one_was(world, name, smooth):
     assert max(slipped, default=0) < 0.015
 
 
+@pytest.mark.slow
 def test_what_the_arm_cannot_reach_is_recorded_and_moves_nothing(world):
     """Kinematics is the oracle: reached exactly where every pose of the path has a posture."""
     recipe = replace(RECIPES["reach"], seed=21)

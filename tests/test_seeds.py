@@ -47,6 +47,7 @@ def run(book, seeds, client=None):
     run_seeds(seeds, "mine", ["--profile", "reader"], client, command)
 
 
+@pytest.mark.slow
 def test_seeds_side_by_side_are_gathered_into_one_table_and_page(book):
     with Client(processes=False, dashboard_address=None, n_workers=2) as client:
         run(book, [1, 3], client)
@@ -68,6 +69,7 @@ def test_seeds_side_by_side_are_gathered_into_one_table_and_page(book):
     assert ">1.41<" in text
 
 
+@pytest.mark.slow
 def test_a_seed_that_fails_is_named_and_the_others_run(book):
     book.add("02_second", "assert seed != 1, 'no luck'")
     with pytest.raises(WorkbookError, match=r"(?s)^seed 1:.*no luck"):

@@ -43,6 +43,7 @@ def test_a_stop_leaves_the_object_where_the_slider_said(slider):
     assert slider.rest[0.3] == pytest.approx((0.02, -0.01, 0.4), abs=1e-4)
 
 
+@pytest.mark.slow
 def test_what_is_observed_decides_what_is_foreseen(explorer, trained, push):
     alone = explorer.prediction.effect_mean
     told = observe_actions(trained, [push.primitive])

@@ -247,6 +247,7 @@ def test_a_notebook_that_does_not_write_its_numbers_has_failed(book, capsys):
     assert not (book.layout.runs / "reader" / ".complete" / "01_first.json").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
 def test_a_killed_run_counts_as_nothing_and_is_taken_up_again(book, capsys, how):
     root = book.layout.runs.parent

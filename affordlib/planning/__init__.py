@@ -4,7 +4,7 @@ from affordlib.planning.astar import plan_astar
 from affordlib.planning.closed_loop import Pursuit, action_limit, carry_out, pursue
 from affordlib.planning.continuous import plan_continuous
 from affordlib.planning.disturbances import Disturbance, draw_disturbances
-from affordlib.planning.effect_map import EffectMap, map_effects, map_once
+from affordlib.planning.effect_map import EffectMap, map_effects
 from affordlib.planning.gradient import plan_gradient
 from affordlib.planning.modes import MODES, PlanMode
 from affordlib.planning.poses import plan_lift, plan_turn
@@ -21,7 +21,6 @@ __all__ = [
     "carry_out",
     "draw_disturbances",
     "map_effects",
-    "map_once",
     "plan_astar",
     "plan_continuous",
     "plan_gradient",

@@ -19,6 +19,7 @@ import numpy as np
 import torch
 
 from affordlib.planning.effect_map import EffectMap, map_effects
+from affordlib.planning.finish import Finish, finished
 from affordlib.planning.modes import PlanMode, is_on_table, mode_named
 from affordlib.planning.steps import make_steps
 from affordlib.primitives import Push
@@ -111,13 +112,15 @@ def search(
     reachable: Reachable | None = None,
     max_expansions: int = 20_000,
     trace: list[tuple[np.ndarray, np.ndarray]] | None = None,
+    finish: Finish | None = None,
 ) -> tuple[list[tuple[float, float]], bool, int]:
     """The cheapest chain of (direction, phase) into the goal's disc, whether it gets there, and
     how many nodes were expanded.
 
     Where no chain does, the one that ends nearest. Ties go to fewer actions. Positions that are
     off the table or out of reach are not expanded. trace, if given, receives each expanded
-    position (2,) with those of its children (n, 2).
+    position (2,) with those of its children (n, 2). finish: turns and lifts at the end; where it
+    cannot, a node is none of the goal's.
     """
     goal_xy = np.asarray(goal.xy_m)
     reach = table.effects.reach_m
@@ -138,7 +141,9 @@ def search(
         distance = goal.distance_m(node.xy)
         if distance < nearest_m - 1e-12:
             nearest, nearest_m = node, distance
-        if distance <= goal.tolerance_m:
+        if distance <= goal.tolerance_m and (
+            finish is None or finish(goal, node.xy, node.turned) is not None
+        ):
             nearest, reached = node, True
             break
         if node.depth == max_steps:
@@ -190,18 +195,22 @@ def plan_astar(
     reachable: Reachable | None = None,
     n_directions: int = N_DIRECTIONS,
     stop_phases: Sequence[float] = STOP_PHASES,
+    finish: Finish | None = None,
 ) -> Plan:
     """Plan from the object's position [m] and depth image (2, 48, 48) to a goal, by A*.
 
     kind: push or drag; effects: the object's map, if it was made before; reachable: a function of
-    positions (n, 2) and directions (n,) that says where the arm can act.
+    positions (n, 2) and directions (n,) that says where the arm can act; finish: what turns and
+    lifts the object at the end, without which a plan cannot reach a goal that asks for it.
     """
     began = time.perf_counter()
     mode = mode_named(mode)
     start = check_on_table("start_xy_m", start_xy_m)
     effects = effects or map_effects(model, image, kind)
     table = BranchTable(effects, n_directions, tuple(stop_phases) if mode.partial else (1.0,))
-    chain, reached, expansions = search(table, start, goal, mode.max_steps, reachable)
+    chain, reached, expansions = search(
+        table, start, goal, mode.max_steps, reachable, finish=finish
+    )
     steps = make_steps(effects, start, torch.tensor(chain, dtype=torch.float64).reshape(-1, 2))
-    seconds = time.perf_counter() - began
-    return Plan(goal, start, steps, "astar", reached, expansions, seconds)
+    plan = Plan(goal, start, steps, "astar", reached, expansions, 0.0)
+    return finished(plan, finish, began)

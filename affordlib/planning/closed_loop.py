@@ -16,9 +16,10 @@ import numpy as np
 
 from affordlib.planning.chase import Chase, Pursuit, action_limit, path_on_table
 from affordlib.planning.continuous import plan_continuous
+from affordlib.planning.finish import TURN_TOLERANCE_RAD
 from affordlib.planning.modes import PlanMode, is_on_table
 from affordlib.planning.moves import Demands
-from affordlib.primitives import Drag
+from affordlib.primitives import Drag, wrap_angle
 from affordlib.types import Goal, Outcome, Plan, check_within
 
 if TYPE_CHECKING:
@@ -40,7 +41,6 @@ ROLLS_ON_M = 0.002
 """A drag corrects no less: let go, one lying cylinder in ten that is wider than long rolls on."""
 
 TOLERANCE_M = 0.002
-TURN_TOLERANCE_RAD = math.radians(2)
 HEIGHT_TOLERANCE_M = 0.003
 
 
@@ -54,8 +54,9 @@ def carry_out(
     """Execute a plan's steps, as planned, and measure where the object rests.
 
     Open loop: the plan is not revised. Each action is carried out relative to where the object
-    then stands, as actions are defined. The distance is taken after the gripper has retreated and
-    the object has rested 0.5 s. Raises UnreachableError when the arm cannot follow a step.
+    then stands, as actions are defined. The distance is taken after the gripper has retreated,
+    unless it holds the object, and the object has rested 0.5 s. Raises UnreachableError when the
+    arm cannot follow a step.
 
     corrections: after the last step, so many single actions at most, each the first of a plan that
     `replan` makes anew from what is then seen, and each only if the object seems farther than
@@ -63,6 +64,7 @@ def carry_out(
     """
     if corrections and replan is None:
         raise ValueError(f"corrections = {corrections} need a planner; give replan as well")
+    yaw_rad, z_m = world.object_pose()[2], world.object_state()[2]
     paths = [path_on_table(world.follow(step)) for step in plan.steps]
     for _ in range(corrections):
         seen = world.perceive()
@@ -81,7 +83,8 @@ def carry_out(
         paths.append(path_on_table(world.follow(steps[0])))
     pose = world.object_pose()
     distance = plan.goal.distance_m(pose[:2])
-    return Outcome(plan, distance, pose, world.object_tilt_rad(), tuple(paths))
+    turned, lifted = wrap_angle(pose[2] - yaw_rad), world.object_state()[2] - z_m
+    return Outcome(plan, distance, pose, world.object_tilt_rad(), tuple(paths), turned, lifted)
 
 
 def pursue(

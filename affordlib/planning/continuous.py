@@ -20,6 +20,7 @@ import numpy as np
 import torch
 
 from affordlib.planning.effect_map import EffectMap, map_effects
+from affordlib.planning.finish import Finish, finished
 from affordlib.planning.modes import PlanMode, is_on_table, mode_named
 from affordlib.planning.steps import make_steps, roll_out
 from affordlib.primitives import Push
@@ -189,6 +190,7 @@ def plan_continuous(
     seed: int = 0,
     draft: bool = False,
     trace: list[tuple[Tensor, Tensor, Tensor]] | None = None,
+    finish: Finish | None = None,
 ) -> Plan:
     """Plan from the object's position [m] and depth image (2, 48, 48) to a goal, by gradient.
 
@@ -197,7 +199,8 @@ def plan_continuous(
     the goal, the plan is the one that comes nearest. draft: a first plan in a fifth of the time, of
     as few actions as the distance allows and without the descent. trace, if given, receives for
     each number of actions K the directions and phases (B, K) of the chains that remain, and their
-    costs (B,) [m].
+    costs (B,) [m]. finish: what turns and lifts the object at the end, without which a plan cannot
+    reach a goal that asks for it.
     """
     began = time.perf_counter()
     mode = mode_named(mode)
@@ -229,8 +232,8 @@ def plan_continuous(
         steps = make_steps(effects, start, chain, foreseen)
     end = steps[-1].predicted_end_xy_m if steps else start
     reaches = goal.distance_m(end) <= goal.tolerance_m
-    seconds = time.perf_counter() - began
-    return Plan(goal, start, steps, "continuous", reaches, iterations, seconds)
+    plan = Plan(goal, start, steps, "continuous", reaches, iterations, 0.0)
+    return finished(plan, finish, began)
 
 
 def _allowed(

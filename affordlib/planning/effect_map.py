@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -23,12 +23,9 @@ from affordlib.planning.modes import encode_image, plane
 from affordlib.primitives import Drag, Push
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
     from torch import Tensor
 
     from affordlib.models.protocol import EffectModel
-    from affordlib.types import Goal, Plan
 
 N_DIRECTIONS = 36
 N_PHASES = 41
@@ -174,22 +171,3 @@ def splines_through(effect: Tensor, std: Tensor) -> Tensor:
     smooth = np.pad(smooth, ((1, 2), (0, 0), (0, 0)), mode="wrap")
     smooth = np.pad(smooth, ((0, 0), (1, 2), (0, 0)), mode="reflect")
     return torch.from_numpy(smooth)
-
-
-def map_once(planner: Callable[..., Plan], model: EffectModel, **settings: Any) -> Callable:
-    """`plan_astar` or `plan_continuous` as (image, start_xy_m, goal) → Plan, quick to ask again.
-
-    As long as the image (2, 48, 48) stays the same, as it does while only the goal moves, its
-    effect map is that of the last call. The function takes further settings of the planner by
-    name.
-    """
-    last: dict[bytes, EffectMap] = {}
-
-    def plan(image: np.ndarray, start_xy_m: Sequence[float], goal: Goal, **further: Any) -> Plan:
-        seen = np.ascontiguousarray(image).tobytes()
-        if seen not in last:
-            last.clear()
-            last[seen] = map_effects(model, image)
-        return planner(model, image, start_xy_m, goal, effects=last[seen], **settings | further)
-
-    return plan

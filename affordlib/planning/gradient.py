@@ -20,6 +20,7 @@ import numpy as np
 import torch
 
 from affordlib.models.protocol import observe_actions, observe_final_effect
+from affordlib.planning.finish import finished
 from affordlib.planning.modes import PATH_SAMPLES, PlanMode, encode_image, mode_named, plane
 from affordlib.primitives import Push
 from affordlib.types import Goal, Plan, Step, check_on_table
@@ -163,4 +164,4 @@ def plan_gradient(
             break
     reached = bool(np.hypot(*(target - xy)) <= goal.tolerance_m)
     name = "gradient" + "_direction" * direction_only + "_snapped" * snap
-    return Plan(goal, start, tuple(steps), name, reached, iterations, time.perf_counter() - began)
+    return finished(Plan(goal, start, tuple(steps), name, reached, iterations, 0.0), None, began)

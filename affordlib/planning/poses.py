@@ -9,7 +9,7 @@ stop is looked up on the course yaw(t) or z(t) that is foreseen; t is continuous
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -38,17 +38,30 @@ GRIP_YAWS = tuple(np.radians([0, 15, -15, 30, -30, 45, -45, 60, -60, 75, -75, 90
 """Angles of the hand that are weighed, the least first: the fingers are alike, so 180° in all."""
 
 
+@dataclass(frozen=True)
+class Courses:
+    """One channel of the effect over the phase (n,): mean and std (m, n), for m angles of the hand.
+
+    The effect is zero before anything.
+    """
+
+    grip_yaws: tuple[float, ...]
+    phase: np.ndarray
+    mean: np.ndarray
+    std: np.ndarray
+
+
 @torch.no_grad()
 def foresee_courses(
     model: EffectModel,
     image: np.ndarray,
     primitive: Grasp | Rotate,
     channel: str,
-    grip_yaws: Sequence[float],
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Phases (n,), and mean and σ (m, n) of one effect channel over them, for m angles of the hand.
+    grip_yaws: Sequence[float] = GRIP_YAWS,
+) -> Courses:
+    """What a model expects of a primitive for each angle of the hand [rad].
 
-    The effect is zero before anything. Raises ValueError where the model has no such channel.
+    Raises ValueError where the model has no such channel.
     """
     if channel not in model.effect_channels:
         raise ValueError(
@@ -62,15 +75,15 @@ def foresee_courses(
     told = model.predict(seen, observed, t)
     k = model.effect_channels.index(channel)
     mean, std = (v[:, :, k].double().numpy() for v in (told.effect_mean, told.effect_std))
-    return t[0].double().numpy(), mean - mean[:, :1], std
+    return Courses(tuple(grip_yaws), t[0].double().numpy(), mean - mean[:, :1], std)
 
 
 def foresee_course(
     model: EffectModel, image: np.ndarray, primitive: Grasp | Rotate, channel: str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The same for the primitive's own angle of the hand: phases, mean and σ, (n,) each."""
-    phase, mean, std = foresee_courses(model, image, primitive, channel, [primitive.grip_yaw])
-    return phase, mean[0], std[0]
+    told = foresee_courses(model, image, primitive, channel, [primitive.grip_yaw])
+    return told.phase, told.mean[0], told.std[0]
 
 
 def crossings(phase: np.ndarray, values: np.ndarray, wanted: float) -> np.ndarray:
@@ -90,6 +103,14 @@ def plan_turn(
 ) -> Step | None:
     """The rotation that turns an object at (x, y) by an angle, or as far towards it as it can.
 
+    grip_yaws: the angles of the hand to choose from, as `choose_turn` does.
+    """
+    return choose_turn(foresee_courses(model, image, Rotate(), "yaw", grip_yaws), xy_m, turn_rad)
+
+
+def choose_turn(courses: Courses, xy_m: Sequence[float], turn_rad: float) -> Step | None:
+    """Of courses of yaw, the hand and the phase that turn an object at (x, y) by an angle.
+
     Closing, the fingers align a cuboid; then the hand turns counter-clockwise, so an angle far
     behind is reached by going on around. Of the angles at which the hand may begin, the one that
     is surest (least σ) to have the object turned as wanted while it is held. Where none has, the
@@ -97,31 +118,25 @@ def plan_turn(
     follow. None when none is foreseen to turn it by 1°.
     """
     wanted = wrap_angle(check_finite("turn_rad", turn_rad))
-    phase, courses, stds = foresee_courses(model, image, Rotate(), "yaw", grip_yaws)
+    phase, mean, std = courses.phase, courses.mean, courses.std
     closed, opening = Rotate().leg_phases[2], Rotate().leg_phases[-2]
     held = (phase >= closed) & (phase <= opening)
     stops = [
-        (float(np.interp(stop, phase, std)), k, float(stop))
-        for k, (course, std) in enumerate(zip(courses, stds, strict=True))
+        (float(np.interp(stop, phase, unsure)), k, float(stop))
+        for k, (course, unsure) in enumerate(zip(mean, std, strict=True))
         for around in (0.0, 2 * math.pi)
         for stop in crossings(phase[held], course[held], wanted + around)
     ]
     if stops:
         _, k, stop = min(stops)
     else:
-        end = courses[:, -1]
+        end = mean[:, -1]
         if end.max() < math.radians(1):
             return None
         enough = end >= min(MOST * Rotate.sweep_rad, end.max())
-        k, stop = int(np.where(enough, stds[:, -1], np.inf).argmin()), 1.0
-    return Step(
-        Rotate(grip_yaws[k]),
-        stop,
-        (float(xy_m[0]), float(xy_m[1])),
-        np.array([xy_m, xy_m], dtype=float),
-        std_m=0.0,
-        predicted_turn_rad=float(np.interp(stop, phase, courses[k])),
-    )
+        k, stop = int(np.where(enough, std[:, -1], np.inf).argmin()), 1.0
+    turned = float(np.interp(stop, phase, mean[k]))
+    return _step_at(xy_m, Rotate(courses.grip_yaws[k]), stop, predicted_turn_rad=turned)
 
 
 def plan_lift(
@@ -133,14 +148,22 @@ def plan_lift(
 ) -> Step | None:
     """The grasp that ends holding an object from (x, y) at a height [m] above where it stands.
 
+    grip_yaws: the angles of the hand to choose from, as `choose_lift` does.
+    """
+    return choose_lift(foresee_courses(model, image, Grasp(), "z", grip_yaws), xy_m, height_m)
+
+
+def choose_lift(courses: Courses, xy_m: Sequence[float], height_m: float) -> Step | None:
+    """Of courses of z, the hand and the phase that hold an object from (x, y) at a height [m].
+
     Of the angles of the hand the one that is sure (mean less σ) to lift it highest, of equals (to
     a centimetre) the first. None when the model is sure (90 %) that it does not get so high, or
     slips.
     """
     height = check_within("height_m", height_m, 0.0, 0.5, "m")
-    phase, courses, stds = foresee_courses(model, image, Grasp(), "z", grip_yaws)
-    k = int((courses - stds)[:, -1].round(2).argmax())
-    course, std, primitive = courses[k], stds[k], Grasp(grip_yaw=grip_yaws[k])
+    phase = courses.phase
+    k = int((courses.mean - courses.std)[:, -1].round(2).argmax())
+    course, std, primitive = courses.mean[k], courses.std[k], Grasp(grip_yaw=courses.grip_yaws[k])
     if course.max() < height <= course[-1] + PERHAPS * std[-1]:
         # It may slip, or not; if it does not, it goes where the hand goes.
         hand = primitive.path(phase)[:, 2]
@@ -149,11 +172,13 @@ def plan_lift(
     stops = crossings(phase[lifting], course[lifting], height)
     if not len(stops):
         return None
-    return Step(
-        primitive,
-        float(stops[0]),
-        (float(xy_m[0]), float(xy_m[1])),
-        np.array([xy_m, xy_m], dtype=float),
-        std_m=0.0,
-        predicted_height_m=height,
-    )
+    return _step_at(xy_m, primitive, float(stops[0]), predicted_height_m=height)
+
+
+def _step_at(
+    xy_m: Sequence[float], primitive: Grasp | Rotate, stop_phase: float, **foreseen: float
+) -> Step:
+    """A step that leaves the object at its place."""
+    place = float(xy_m[0]), float(xy_m[1])
+    path = np.array([place, place])
+    return Step(primitive, stop_phase, place, path, std_m=0.0, **foreseen)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,13 +14,17 @@ from affordlib.models.checkpoint import load_checkpoint
 from affordlib.paths import repo_root
 from affordlib.perception import looks_rollable
 from affordlib.planning.effect_map import EffectMap, map_effects
+from affordlib.planning.finish import Finish
 from affordlib.planning.reachability import Reachability, learn_reachability
 from affordlib.planning.routes import REACH_M, RouteMap
-from affordlib.primitives import Drag, Primitive, Push, primitive_named
+from affordlib.primitives import Drag, Grasp, Primitive, Push, Rotate, primitive_named
 from affordlib.types import check_within
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from affordlib.models.protocol import EffectModel
+    from affordlib.types import Goal, Plan
 
 Reachable = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Which of the positions (n, 2) and directions (n,) the arm can act at."""
@@ -77,6 +81,47 @@ class Repertoire:
         """What moving the object in an image (2, 48, 48) does."""
         kind = self.kind_for(image)
         return map_effects(self.model(kind), image, kind)
+
+    def finish(self, image: np.ndarray) -> Finish:
+        """What turns and lifts the object in an image (2, 48, 48) at the end of a plan."""
+        return Finish(image, self.model(Rotate), self.model(Grasp), self._can_act)
+
+    def _can_act(self, name: str, xy_m: Sequence[float]) -> bool:
+        if self.reachability is None:
+            return True
+        return bool(self.reachability.probability(name, np.array([xy_m]))[0] >= self.threshold)
+
+    def planner(self, plan: Callable[..., Plan], **settings: Any) -> Callable[..., Plan]:
+        """`plan_astar` or `plan_continuous` as (image, start_xy_m, goal) → Plan.
+
+        Told of the object's primitive, where the arm can act, and what turns and lifts it in the
+        end. As long as the image (2, 48, 48) stays the same, as it does while only the goal moves,
+        what the models say of it is kept. The function takes further settings of the planner.
+        """
+        last: dict[bytes, dict[str, Any]] = {}
+
+        def planner(
+            image: np.ndarray, start_xy_m: Sequence[float], goal: Goal, **further: Any
+        ) -> Plan:
+            seen = np.ascontiguousarray(image).tobytes()
+            if seen not in last:
+                last.clear()
+                last[seen] = self._told_of(image)
+            return plan(start_xy_m=start_xy_m, goal=goal, **last[seen], **settings | further)
+
+        return planner
+
+    def _told_of(self, image: np.ndarray) -> dict[str, Any]:
+        kind = self.kind_for(image)
+        poses = {Rotate.name, Grasp.name} <= set(self.models)
+        return {
+            "image": image,
+            "model": self.model(kind),
+            "kind": kind,
+            "effects": self.effects(image),
+            "reachable": self.reachable(kind),
+            "finish": self.finish(image) if poses else None,
+        }
 
     def reachable(self, kind: type[Primitive]) -> Reachable | None:
         """Where the arm can act with a primitive, as planners ask it."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -24,6 +23,7 @@ Tell = Callable[[], Goal]
 then. Raises `Stopped` when the reader wants no more."""
 
 Executor = Callable[["Tabletop", Plan, Planner, Tell], Outcome]
+"""How far it turned and lifted the object, whoever watches it measures."""
 
 
 class Stopped(Exception):
@@ -48,15 +48,8 @@ def closed_loop(repertoire: Repertoire) -> Executor:
 
     def execute(world: Tabletop, plan: Plan, planner: Planner, tell: Tell) -> Outcome:
         done = pursue(world, plan.goal, repertoire, on_action=lambda *_: tell())
-        tilt = world.object_tilt_rad()
+        tilt, paths = world.object_tilt_rad(), done.object_paths_xy_m
         words = "" if done.reached else f"The loop ended as {done.ending}: {done.words}."
-        for what, off, unit in (
-            ("turn", done.turn_error_rad and math.degrees(done.turn_error_rad), "°"),
-            ("height", done.height_error_m and 1000 * done.height_error_m, " mm"),
-        ):
-            if off is not None:
-                words += f" The {what} is off by {abs(off):.1f}{unit}."
-        paths = done.object_paths_xy_m
-        return Outcome(plan, done.distance_m, done.end_pose, tilt, paths, words.strip())
+        return Outcome(plan, done.distance_m, done.end_pose, tilt, paths, words=words)
 
     return execute

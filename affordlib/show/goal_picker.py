@@ -20,6 +20,7 @@ import numpy as np
 from affordlib.paths import resolve_out_dir
 from affordlib.plan_files import load_plan, save_plan
 from affordlib.planning import carry_out
+from affordlib.primitives import wrap_angle
 from affordlib.show.executors import Stopped, open_loop
 from affordlib.show.picker_controls import PickerControls
 from affordlib.show.plots import table_picture
@@ -77,7 +78,7 @@ class GoalPicker(widgets.VBox):
         self.plan: Plan | None = None
         self.outcome: Outcome | None = None
         self._rng = np.random.default_rng(seed)
-        self._pose = self._first_pose = world.object_pose()
+        self._pose = self._start = self._first_pose = world.object_pose()
         self._goal = Goal(_whole_mm(*goal_xy_m))
         self._running = self._setting = self._lifted = False
         self._rest: asyncio.TimerHandle | None = None  # while the plan shown is a draft
@@ -97,10 +98,7 @@ class GoalPicker(widgets.VBox):
         self._replan()
 
     def ask_pose(self, turn_deg: float = 0.0, height_cm: float = 0.0) -> None:
-        """Ask for a turn and a height beside the position; 0 asks for none. Plans anew.
-
-        A closed loop turns and lifts the object once it is there; an open loop does not.
-        """
+        """Ask for a turn and a height beside the position; 0 asks for none. Plans anew."""
         turn = math.radians(turn_deg) if turn_deg else None
         height = height_cm / 100 if height_cm else None
         self._set_goal(replace(self._goal, turn_rad=turn, height_m=height))
@@ -147,6 +145,7 @@ class GoalPicker(widgets.VBox):
         self._no_rest()
         self._set_goal(plan.goal)
         self._pose, self.plan, self.outcome = self.world.object_pose(), plan, None
+        self._start = (*plan.start_xy_m, self._pose[2])
         self._walked.clear()
         away_m = np.hypot(*np.subtract(plan.start_xy_m, self._pose[:2]))
         note = f" The object is {1000 * away_m:.0f} mm from where this plan starts."
@@ -195,7 +194,7 @@ class GoalPicker(widgets.VBox):
             self.world.park()
             self._lifted = False
             self._poses.clear()
-        self._pose = self.world.object_pose()
+        self._pose = self._start = self.world.object_pose()
         try:
             plan = planner(self.world.look(), self._pose[:2], self._goal)
             self._say(plan_in_words(plan))
@@ -225,7 +224,7 @@ class GoalPicker(widgets.VBox):
         def tell() -> Goal:
             nonlocal done
             done += 1
-            self.controls.progress.value = done
+            self.controls.show_progress(done)
             self._play(seconds_per_action)
             while self._waiting and not self._stop.is_set():
                 self._waiting.pop(0)()
@@ -236,15 +235,19 @@ class GoalPicker(widgets.VBox):
         try:
             if self.plan is None or self.outcome is not None:
                 self._make_plan()
-            self.controls.progress.value = 0
-            self.controls.progress.max = max(1, len(self.plan.steps))
+            self.controls.show_progress(0, max(1, len(self.plan.steps)))
+            yaw, z = self.world.object_pose()[2], self.world.object_state()[2]
             self.world.film = pose_recorder(self._poses, before)
             try:
                 execute = self.executors[self.controls.executor.value]
                 outcome, how = execute(self.world, self.plan, planner, tell), "Done,"
             except Stopped:
                 outcome, how = carry_out(self.world, replace(self.plan, steps=())), "Stopped after"
-            self.outcome = outcome.with_goal(self._goal)
+            self.outcome = replace(
+                outcome.with_goal(self._goal),
+                turned_rad=wrap_angle(self.world.object_pose()[2] - yaw),
+                lifted_m=self.world.object_state()[2] - z,
+            )
             self._lifted = bool(self._goal.height_m)
             self._say(outcome_in_words(self.outcome, self._goal, how, done))
         finally:
@@ -374,7 +377,7 @@ class GoalPicker(widgets.VBox):
             self._pose,
             self._goal,
             self.plan.steps if self.plan else (),
-            self.plan.start_xy_m if self.plan else self._pose[:2],
+            self._start,
             self._walked,
             HALF_WIDTH_M,
             LIMIT_M,
@@ -385,8 +388,7 @@ class GoalPicker(widgets.VBox):
 
     def picture(self) -> bytes:
         """What is shown, as a PNG."""
-        there = self.world.thing, self._pose
-        return table_picture(*there, self.plan, self.outcome, half_width_m=HALF_WIDTH_M)
+        return table_picture(self.world.thing, self._pose, self.plan, self.outcome, HALF_WIDTH_M)
 
     def _repr_mimebundle_(self, **kwargs: object) -> dict[str, object]:
         # A box of widgets saves only text; the picture stays in the notebook without a kernel.

@@ -71,6 +71,10 @@ class PickerControls:
             control.disabled = running
         self.stop.disabled = not running
 
+    def show_progress(self, done: int, of: int | None = None) -> None:
+        """So many actions are done, of so many if that is new."""
+        self.progress.value, self.progress.max = done, of or self.progress.max
+
     def say(self, text: str) -> None:
         """Show a text, as HTML, and have it read aloud where that is wanted."""
         style = "width: 27em; max-width: 100%; line-height: 1.4; white-space: normal"

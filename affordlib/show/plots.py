@@ -16,6 +16,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from affordlib.perception import CAMERA_HEIGHT_M
+from affordlib.primitives import Grasp, Rotate
 from affordlib.types import CROP_WIDTH_M, TABLE_X_M, TABLE_Y_M
 
 if TYPE_CHECKING:
@@ -98,8 +99,21 @@ def plot_plan(ax: Axes, plan: Plan) -> Axes:
     )
     ax.add_patch(circle)
     ax.plot(*(100 * np.array(plan.goal.xy_m)), "*", color=GOAL, ms=13, label="goal", zorder=5)
-    start = np.array(plan.start_xy_m)
+    start, below = np.array(plan.start_xy_m), 0
     for k, step in enumerate(plan.steps):
+        end = 100 * np.array(step.predicted_end_xy_m)
+        label = f"{k + 1}: {100 * step.stop_phase:.0f} %"
+        if isinstance(step.primitive, Grasp | Rotate):
+            below -= 11
+            ax.annotate(
+                f"{label} {step.primitive.name}",
+                end,
+                (8, below),
+                textcoords="offset points",
+                fontsize=8,
+                bbox=_PLATE,
+            )
+            continue
         direction = np.array(
             [math.cos(step.primitive.direction_rad), math.sin(step.primitive.direction_rad)]
         )
@@ -111,7 +125,7 @@ def plot_plan(ax: Axes, plan: Plan) -> Axes:
             arrowprops={"arrowstyle": "-|>", "color": NEUTRAL, "lw": 1.5},
         )
         ax.annotate(
-            f"{k + 1}: {100 * step.stop_phase:.0f} %",
+            label,
             tail,
             ha="center",
             va="center",
@@ -126,7 +140,7 @@ def plot_plan(ax: Axes, plan: Plan) -> Axes:
             lw=2,
             label="prediction" if k == 0 else None,
         )
-        ax.plot(*(100 * np.array(step.predicted_end_xy_m)), "o", color=PREDICTION, ms=5)
+        ax.plot(*end, "o", color=PREDICTION, ms=5)
         start = np.array(step.predicted_end_xy_m)
     return ax
 

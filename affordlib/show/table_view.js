@@ -70,16 +70,23 @@ function drawArrow(parent, start, direction) {
   add(parent, "polygon", { points: head.join(" "), class: "push-head" });
 }
 
-function drawPlan(svg, steps) {
+function drawPlan(svg, steps, outline) {
   const plan = add(svg, "g", { class: "plan" });
+  const moves = steps.filter((step) => step.direction !== null).length;
   for (const [k, step] of steps.entries()) {
     const [x, y] = mm(step.end);
+    if (k >= moves) {
+      // It turns or lifts what is already there: its label goes below the others.
+      const at = { x: x + 28, y: y + 32 + 24 * (k - moves) };
+      add(plan, "text", { ...at, class: "step" }, step.label);
+      continue;
+    }
     if (step.std) add(plan, "circle", { cx: x, cy: y, r: 1000 * step.std, class: "sigma" });
     if (step.direction !== null) drawArrow(plan, step.start, step.direction);
     add(plan, "polyline", { points: points(step.path), class: "prediction" });
     add(plan, "circle", { cx: x, cy: y, r: 4, class: "prediction-end" });
     // Beside the end, where neither the next push comes from nor its object goes.
-    const last = k === steps.length - 1;
+    const last = k === moves - 1;
     const ahead = (last ? step : steps[k + 1]).direction ?? 0;
     const [right, up] = [Math.cos(ahead) >= 0, Math.sin(ahead) > (k % 2 ? 0.5 : -0.5)];
     const at = {
@@ -89,6 +96,9 @@ function drawPlan(svg, steps) {
     };
     add(plan, "text", { ...at, class: "step" }, step.label);
   }
+  const end = steps[steps.length - 1];
+  const foreseen = end ? points(placed(outline, [...end.end, end.yaw])) : "";
+  if (end) add(plan, "polygon", { points: foreseen, class: "prediction foreseen" });
 }
 
 function render({ model, el }) {
@@ -120,6 +130,12 @@ function render({ model, el }) {
   function drawGoal(layer) {
     const [x, y] = mm(goal ?? scene().goal.xy);
     layer.replaceChildren();
+    const { outline } = scene().object;
+    const { yaw } = scene().goal;
+    if (yaw !== null) {
+      const wanted = placed(outline, [...(goal ?? scene().goal.xy), yaw]);
+      add(layer, "polygon", { points: points(wanted), class: "tolerance wanted" });
+    }
     add(layer, "circle", { cx: x, cy: y, r: 1000 * scene().goal.tolerance, class: "tolerance" });
     add(layer, "polygon", { points: star([x, y], 17), class: "goal" });
   }
@@ -134,7 +150,7 @@ function render({ model, el }) {
     svg.replaceChildren();
     drawGround(svg, now);
     object = add(svg, "polygon", { class: "object" });
-    drawPlan(svg, now.steps);
+    drawPlan(svg, now.steps, now.object.outline);
     for (const path of now.truth) add(svg, "polyline", { points: points(path), class: "truth" });
     trail = add(svg, "polyline", { class: "trail" });
     drawGoal(add(svg, "g", { class: "goal-layer" }));

@@ -47,7 +47,7 @@ def make_scene(
     pose: Sequence[float],
     goal: Goal,
     steps: Sequence[Step],
-    start_xy_m: Sequence[float],
+    start: Sequence[float],
     truth_xy_m: Sequence[np.ndarray],
     half_width_m: float,
     limit_m: float,
@@ -57,29 +57,35 @@ def make_scene(
 ) -> dict[str, Any]:
     """What `TableView` draws, in metres.
 
-    pose: (x, y, yaw) of the object; steps: of the plan, from start_xy_m on; truth_xy_m: paths
-    (n, 2) that the object has gone; half_width_m: of the view; limit_m: how far from the middle a
-    goal may be asked for; answered: the number of the question that this answers; running:
+    pose: (x, y, yaw) of the object; steps: of the plan, from start (x, y, yaw) on; truth_xy_m:
+    paths (n, 2) that the object has gone; half_width_m: of the view; limit_m: how far from the
+    middle a goal may be asked for; answered: the number of the question that this answers; running:
     whether the robot is at work, so that a film goes on; draft: whether a better plan will follow.
 
     The shaded ring is where an object can be pushed towards any side: as far within the tool's
     reach as a push begins from the object.
     """
     inner, outer = REACH_M[0] + PUSH_RUN_UP_M, REACH_M[1] - PUSH_RUN_UP_M
-    starts = [start_xy_m, *(step.predicted_end_xy_m for step in steps)]
+    x, y, yaw = start
+    starts = [(x, y), *(step.predicted_end_xy_m for step in steps)]
     return {
         "half_width": half_width_m,
         "limit": limit_m,
         "table": [*TABLE_X_M, *TABLE_Y_M],
         "reach": {"centre": [BASE_X_M, 0.0], "inner": inner, "outer": outer},
         "object": {"outline": rounded(thing.footprint_m), "pose": rounded(pose)},
-        "goal": {"xy": rounded(goal.xy_m), "tolerance": goal.tolerance_m},
+        "goal": {
+            "xy": rounded(goal.xy_m),
+            "tolerance": goal.tolerance_m,
+            "yaw": None if goal.turn_rad is None else round(yaw + goal.turn_rad, 4),
+        },
         "steps": [
             {
                 "start": rounded(starts[k]),
                 "path": rounded(step.predicted_path_xy_m),
                 "end": rounded(step.predicted_end_xy_m),
                 "std": None if math.isnan(step.std_m) else round(step.std_m, 5),
+                "yaw": round(yaw + step.predicted_turn_rad, 4),
                 "direction": getattr(step.primitive, "direction_rad", None),
                 "label": f"{k + 1}: {step_in_words(step)}",
             }

@@ -1,0 +1,117 @@
+"""Plans with an orientation or a height in them, made from one look and carried out blindly.
+
+    python -m affordlib.evaluation.whole_plans
+
+The goals are those of the tables `orientation` and `height` of `closed_loop`, where the robot looks
+after every action; here it looks once, before all of them. A plan is tried even where the planner
+says that it will not arrive.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from tqdm.auto import tqdm
+
+from affordlib.evaluation.closed_loop import (
+    N_TRIALS,
+    WITHIN_HEIGHT_M,
+    WITHIN_TURN_RAD,
+    draw_trial,
+)
+from affordlib.evaluation.effect_prediction import error_row
+from affordlib.planning import Repertoire, carry_out, plan_astar, plan_continuous
+from affordlib.primitives import wrap_angle
+from affordlib.results import write_results
+from affordlib.world import Tabletop, UnreachableError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+PLANNERS = {"astar": plan_astar, "continuous": plan_continuous}
+WITHIN = {"orientation": ("rad", WITHIN_TURN_RAD), "height": ("m", WITHIN_HEIGHT_M)}
+
+
+def run_trial(table: str, index: int, planner: str, world: Tabletop, about: Repertoire) -> dict:
+    """The record of one plan: how it was meant to end, and how it did.
+
+    off: what is missing of the turn [rad] or the height [m].
+    """
+    trial = draw_trial(table, index)
+    world.place(trial.thing, trial.start_xy_m, trial.yaw_rad)
+    plan = about.planner(PLANNERS[planner])(world.look(), trial.start_xy_m, trial.goal)
+    record: dict[str, Any] = {
+        "planner": planner,
+        "object_class": trial.thing.family,
+        "promised": plan.reaches_goal,
+        "actions": len(plan.steps),
+        "arm_refused": False,
+    }
+    yaw, z = world.object_pose()[2], world.object_state()[2]
+    try:
+        carry_out(world, plan)
+    except UnreachableError:
+        record["arm_refused"] = True
+    pose = world.object_pose()
+    if table == "orientation":
+        off = wrap_angle(trial.goal.turn_rad - (pose[2] - yaw))
+    else:
+        off = trial.goal.height_m - (world.object_state()[2] - z)
+    world.park()
+    return record | {"distance_m": trial.goal.distance_m(pose[:2]), "off": abs(off)}
+
+
+def whole_plan_rows(records: Sequence[dict], unit: str, within: float) -> list[dict]:
+    """Rows of one table: for each planner all classes, then class by class."""
+    rows = []
+    for planner in dict.fromkeys(r["planner"] for r in records):
+        of_planner = [r for r in records if r["planner"] == planner]
+        for name in ("all", *dict.fromkeys(r["object_class"] for r in of_planner)):
+            chosen = [r for r in of_planner if name in ("all", r["object_class"])]
+            off, far = (np.array([r[column] for r in chosen]) for column in ("off", "distance_m"))
+            spread = error_row(far)
+            rows.append(
+                {
+                    "planner": planner,
+                    "object_class": name,
+                    "n": len(chosen),
+                    "promised": sum(r["promised"] for r in chosen),
+                    "arm_refused": sum(r["arm_refused"] for r in chosen),
+                    "within_percent": 100 * float((off <= within).mean()),
+                    f"off_{unit}_median": float(np.median(off)),
+                    **{
+                        f"distance_m_{statistic}": spread[f"{statistic}_m"]
+                        for statistic in ("mean", "sem", "median", "p95")
+                    },
+                    "actions_mean": float(np.mean([r["actions"] for r in chosen])),
+                }
+            )
+    return rows
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Make and carry out the plans, and write the table; ten minutes."""
+    parser = argparse.ArgumentParser(
+        prog="python -m affordlib.evaluation.whole_plans", description=main.__doc__
+    )
+    parser.add_argument("--n", type=int, help="trials of each kind of goal (default: all)")
+    parser.add_argument("--out", default="data/results")
+    options = parser.parse_args(argv)
+    repertoire = Repertoire.load()
+    tables = {}
+    with Tabletop() as world:
+        for table, (unit, within) in WITHIN.items():
+            n = min(options.n or N_TRIALS[table], N_TRIALS[table])
+            asked = [(table, index, planner) for index in range(n) for planner in PLANNERS]
+            records = [run_trial(*query, world, repertoire) for query in tqdm(asked, table)]
+            tables[table] = whole_plan_rows(records, unit, within)
+    path = write_results(options.out, "whole_plans", {}, tables)
+    print(f"{path.name} written")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
