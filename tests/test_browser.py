@@ -237,6 +237,11 @@ def test_turn_and_lift(page, table):
         pytest.approx(0.05),
     ]:
         assert time.monotonic() < end
+    wait_for_words(page, "then grasp to")
+    wanted, foreseen = table.points(".wanted"), table.points(".foreseen")
+    np.testing.assert_allclose(foreseen, wanted, atol=0.021)  # placed and turned alike
+    assert page.locator(".affordlib-table .step").last.text_content().endswith("%")
+    picture(page, "7_turn_and_lift")
     choose(page, "closed loop")
     button(page, "Run").click()
     wait_for_words(page, "The height is off by")

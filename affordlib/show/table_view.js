@@ -73,32 +73,35 @@ function drawArrow(parent, start, direction) {
 function drawPlan(svg, steps, outline) {
   const plan = add(svg, "g", { class: "plan" });
   const moves = steps.filter((step) => step.direction !== null).length;
+  const poses = steps.length - moves; // which turn and lift what is already there
+  let stack = null; // of labels beside the end, away from where the object comes from
   for (const [k, step] of steps.entries()) {
     const [x, y] = mm(step.end);
     if (k >= moves) {
-      // It turns or lifts what is already there: its label goes below the others.
-      const at = { x: x + 28, y: y + 32 + 24 * (k - moves) };
-      add(plan, "text", { ...at, class: "step" }, step.label);
+      stack ??= { x: x + 28, y: y - 18, "text-anchor": "start" };
+      stack.y += 24;
+      add(plan, "text", { ...stack, class: "step" }, step.label);
       continue;
     }
     if (step.std) add(plan, "circle", { cx: x, cy: y, r: 1000 * step.std, class: "sigma" });
-    if (step.direction !== null) drawArrow(plan, step.start, step.direction);
+    drawArrow(plan, step.start, step.direction);
     add(plan, "polyline", { points: points(step.path), class: "prediction" });
     add(plan, "circle", { cx: x, cy: y, r: 4, class: "prediction-end" });
     // Beside the end, where neither the next push comes from nor its object goes.
     const last = k === moves - 1;
-    const ahead = (last ? step : steps[k + 1]).direction ?? 0;
+    const ahead = (last ? step : steps[k + 1]).direction;
     const [right, up] = [Math.cos(ahead) >= 0, Math.sin(ahead) > (k % 2 ? 0.5 : -0.5)];
     const at = {
       x: x + (right ? 1 : -1) * (last ? 28 : 12),
-      y: y + (last ? 6 : up ? 26 : -14),
+      y: y + (last ? 6 - (Math.sin(ahead) > 0 ? 24 * poses : 0) : up ? 26 : -14),
       "text-anchor": right ? "start" : "end",
     };
     add(plan, "text", { ...at, class: "step" }, step.label);
+    if (last) stack = at;
   }
   const end = steps[steps.length - 1];
   const foreseen = end ? points(placed(outline, [...end.end, end.yaw])) : "";
-  if (end) add(plan, "polygon", { points: foreseen, class: "prediction foreseen" });
+  if (end) add(plan, "polygon", { points: foreseen, class: "foreseen" });
 }
 
 function render({ model, el }) {
