@@ -12,7 +12,7 @@ from affordlib.perception import looks_fallen
 from affordlib.planning.disturbances import Script
 from affordlib.planning.modes import is_on_table
 from affordlib.planning.moves import Ended, MovePlanner
-from affordlib.planning.poses import GRIP_YAWS, plan_lift, plan_turn
+from affordlib.planning.poses import GRIP_YAWS, hands_in_line, plan_lift, plan_turn
 from affordlib.primitives import Grasp, Rotate, wrap_angle
 from affordlib.types import Goal, Plan
 
@@ -182,8 +182,7 @@ class Chase:
         self.grip_yaws = GRIP_YAWS
         if isinstance(step.primitive, Rotate):
             # A grasp takes an object as the rotation left it, or it would turn it back.
-            yaw = float(step.primitive.path(step.stop_phase)[0, 3])
-            self.grip_yaws = tuple(wrap_angle(yaw + k * math.pi / 2) for k in (0, 1, -1))
+            self.grip_yaws = hands_in_line(float(step.primitive.path(step.stop_phase)[0, 3]))
         if self.demands.on_action is not None:
             plan = (
                 self.moves.plans[-1]

@@ -16,7 +16,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from affordlib.planning.poses import GRIP_YAWS, Courses, choose_lift, choose_turn, foresee_courses
+from affordlib.planning.poses import (
+    GRIP_YAWS,
+    Courses,
+    choose_lift,
+    choose_turn,
+    foresee_courses,
+    hands_in_line,
+)
 from affordlib.primitives import Grasp, Rotate, wrap_angle
 
 if TYPE_CHECKING:
@@ -28,8 +35,6 @@ if TYPE_CHECKING:
 TURN_TOLERANCE_RAD = math.radians(2)
 MAX_TURNS = 7
 """A whole round in sweeps of 60°, and one more for what aligning may turn back."""
-
-QUARTERS = (0.0, math.pi / 2, -math.pi / 2)
 
 
 @dataclass(frozen=True)
@@ -88,8 +93,8 @@ class Finish:
         """A grasp at any angle; after a rotation as that left the object, or it is turned back."""
         angles = GRIP_YAWS
         if after is not None:
-            hand = float(after.primitive.path(after.stop_phase)[0, 3]) - turned_rad
-            angles = tuple(hand + quarter for quarter in QUARTERS)
+            hand = float(after.primitive.path(after.stop_phase)[0, 3])
+            angles = hands_in_line(hand - turned_rad)
         step = choose_lift(self._courses(Grasp, "z", angles), xy_m, height_m)
         if step is None or not self.can_act("grasp", xy_m):
             return None

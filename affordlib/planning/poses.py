@@ -38,6 +38,11 @@ GRIP_YAWS = tuple(np.radians([0, 15, -15, 30, -30, 45, -45, 60, -60, 75, -75, 90
 """Angles of the hand that are weighed, the least first: the fingers are alike, so 180° in all."""
 
 
+def hands_in_line(yaw_rad: float) -> tuple[float, ...]:
+    """Angles at which a hand takes an object as one at another angle has left it, unturned."""
+    return tuple(wrap_angle(yaw_rad + k * math.pi / 2) for k in (0, 1, -1))
+
+
 @dataclass(frozen=True)
 class Courses:
     """One channel of the effect over the phase (n,): mean and std (m, n), for m angles of the hand.
