@@ -8,6 +8,7 @@ from affordlib.book import Book
 from affordlib.paths import repo_root
 from affordlib.profiles import notebook_paths
 
+pytestmark = pytest.mark.slow
 OUTSIDE = re.compile(r"^(?:https?:)?//")
 
 

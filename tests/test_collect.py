@@ -211,6 +211,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("part", "name", "count", "chunks_done"),
     [
@@ -218,8 +219,8 @@ if __name__ == "__main__":
         ("write", "effect/c.1", 0, 1),  # before the second
         ("writestr", "", 9, 3),  # while packing
         # The manifest is there and its hash is not; packed and not yet tidied up.
-        pytest.param("write", "done", 0, 3, marks=pytest.mark.slow),
-        pytest.param("rmtree", ".chunks", 0, 3, marks=pytest.mark.slow),
+        ("write", "done", 0, 3),
+        ("rmtree", ".chunks", 0, 3),
     ],
 )
 def test_killed_and_run_again_it_is_the_same_file(
@@ -240,6 +241,7 @@ def test_killed_and_run_again_it_is_the_same_file(
     assert [p.name for p in tmp_path.iterdir()] == ["killed.zarr.zip"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".zarr", ".zarr.zip"])
 def test_a_full_disk_leaves_nothing_that_is_read(undisturbed, tmp_path, monkeypatch, suffix):
     path = tmp_path / f"full{suffix}"

@@ -164,6 +164,7 @@ def kill_a_worker(client):
     os.kill(random.choice(pids), signal.SIGKILL)
 
 
+@pytest.mark.slow
 def test_a_killed_worker_is_no_loss(both, undisturbed, tmp_path):
     path, killed = tmp_path / "set.zarr.zip", []
 

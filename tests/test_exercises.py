@@ -20,6 +20,7 @@ def test_the_chapters_with_checks_have_two_exercises_and_solutions():
     assert all(sum(e[:2] == number for e in EXERCISES) >= 2 for number in ASKED)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", SOLUTIONS, ids=lambda path: path.stem)
 def test_every_solution_passes(path):
     verdicts = runpy.run_path(str(path))["VERDICTS"]
@@ -63,6 +64,7 @@ def trusting(plan, act):
     return len([act(step) for step in plan.steps])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "attempt", "says"),
     [

@@ -186,6 +186,7 @@ def test_run(name, smoke):
     assert {k: v for k, v in document["parameters"].items() if k in asked}.items() <= asked.items()
 
 
+@pytest.mark.slow
 def test_the_same_route_fails_on_a_broken_notebook(tmp_path):
     copy = prepare(BROKEN, {"seed": 1, "out_dir": str(tmp_path)}, tmp_path)
     done = run_with_nbval(copy)

@@ -281,6 +281,7 @@ def _fingerprint(seen):
     ).hexdigest()
 
 
+@pytest.mark.slow
 def test_no_episode_knows_of_the_one_before(world):
     jobs = [(name, index) for index in range(2) for name in _MIXED]
     first = {}

@@ -202,6 +202,7 @@ def test_only_runs_what_is_asked_and_force_runs_it_again(changeable, capsys):
     assert capsys.readouterr().out.count("skipped: complete") == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("code", "error"),
     [
@@ -232,6 +233,7 @@ def test_a_failing_notebook_stops_the_batch_and_a_rerun_goes_on(book, capsys, co
     assert "[1/3] 01_first: skipped: complete" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_notebook_that_does_not_write_its_numbers_has_failed(book, capsys):
     book.add("01_first")
     assert book.run() == 0
@@ -351,6 +353,7 @@ def test_a_bad_profile_is_refused_before_anything_runs(book, capsys, text, named
     assert not book.layout.runs.exists()
 
 
+@pytest.mark.slow
 def test_in_place_puts_clean_executed_notebooks_back(book, capsys):
     book.add("01_first")
     book.add("02_second")
