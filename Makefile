@@ -84,7 +84,7 @@ test: $(STAMP) ## Run all tests, notebooks included (JOBS=2 side by side)
 	@$(PY) -m pytest -n "$(JOBS)" --dist loadfile
 
 test-fast: $(STAMP) ## Run the tests that take seconds, without the notebooks
-	@$(PY) -m pytest -n "$(JOBS)" --dist loadfile -m "not slow"
+	@$(PY) -m pytest -n "$(JOBS)" --dist worksteal -m "not slow"
 
 test-slow: $(STAMP) ## Run every notebook and solution as the reader does; the log is runs/test-slow.log
 	@mkdir -p runs; { $(PY) -m affordlib.workbook --profile reader --out test-slow --force; \

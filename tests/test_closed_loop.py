@@ -256,6 +256,7 @@ def test_a_disturbed_pursuit_is_the_same_again(table, repertoire):
     assert ends[0] == ends[1]
 
 
+@pytest.mark.slow
 def test_a_goal_across_the_table_is_reached_in_the_limit(table, repertoire):
     table.place(BALL, (0.2, -0.4), 0.0)
     goal = Goal((0.2, 0.25))

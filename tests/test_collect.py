@@ -53,6 +53,7 @@ def files_of(folder):
 # The store
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "path",
     ["a.zarr.zip", "a.zarr", "file://{}/a.zarr", "memory://{}/a.zarr", "memory://m.zarr.zip"],
@@ -167,6 +168,7 @@ def test_paths_and_workers_that_cannot_be_are_named(tmp_path):
 # Memory
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_set(tmp_path, cheap, monkeypatch):
     monkeypatch.setattr(collect, "CHUNK", 50)
 

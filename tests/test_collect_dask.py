@@ -122,6 +122,7 @@ def test_a_cluster_leaves_the_same_file(both, undisturbed, tmp_path, monkeypatch
     assert [p.name for p in tmp_path.iterdir()] == ["relative.zarr.zip"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".zarr", ".zarr.zip"])
 def test_a_cluster_writes_where_all_can(both, undisturbed, tmp_path, monkeypatch, suffix):
     monkeypatch.setattr(locks, "SETTLE_S", 0.1)
@@ -182,6 +183,7 @@ def test_a_killed_worker_is_no_loss(both, undisturbed, tmp_path):
     assert path.read_bytes() == undisturbed(LONGER).read_bytes()
 
 
+@pytest.mark.slow
 def test_a_chunk_that_cannot_be_made_is_named(both, undisturbed, tmp_path):
     path, log = tmp_path / "set.zarr.zip", tmp_path / "log"
     reason = r"interactions 6 to 7 could not be collected: ValueError: math domain error"

@@ -52,6 +52,7 @@ def test_units_that_cannot_be_are_refused(fields, reason):
         LeverUnit(**fields)
 
 
+@pytest.mark.slow
 def test_folds_test_every_object_at_most_once():
     whole = open_interactions("lever_up")
     splits = [split_of(LeverUnit("persistence", fold=k), whole) for k in range(5)]

@@ -37,6 +37,7 @@ def test_a_trial_measures_what_is_missing(world, repertoire, monkeypatch):
     assert idle["distance_m"] == pytest.approx(np.hypot(*trial.goal.xy_m), abs=1e-4)
 
 
+@pytest.mark.slow
 def test_the_table_is_written(tmp_path):
     assert whole_plans.main(["--n", "1", "--out", str(tmp_path)]) == 0
     tables = read_results(tmp_path / "whole_plans.json")["tables"]

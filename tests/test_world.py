@@ -126,6 +126,7 @@ _HASH = (
 )
 
 
+@pytest.mark.slow
 def test_the_same_bits_in_a_second_process_and_another_order(world):
     seen = {i: interact(Recipe(seed=5), i, world)[1] for i in (0, 1, 2, 3)}
     parts = [seen[i].effect.tobytes() + seen[i].image.tobytes() for i in (3, 1)]
