@@ -7,12 +7,13 @@ import subprocess
 import sys
 
 import nbformat
+import numpy as np
 import papermill
 import pytest
 from IPython.core.inputtransformer2 import TransformerManager
 
 from affordlib.profiles import default_parameters, notebook_paths
-from affordlib.results import read_results
+from affordlib.results import read_results, results_table
 from affordlib.workbook import Layout, cleaned, make_jobs
 
 LAYOUT = Layout.of_repository()
@@ -82,6 +83,59 @@ def test_executed_in_order_without_errors(name):
     outputs = [output for cell in cells for output in cell.outputs]
     assert outputs, "run `make notebooks`"
     assert [o for o in outputs if o.output_type == "error" or o.get("name") == "stderr"] == []
+
+
+STORED = [
+    name
+    for name in PATHS
+    if 'read_results("data/results/' in PATHS[name].read_text("utf-8").replace("\\", "")
+]
+
+
+def last_value(source, space):
+    """Execute a cell and return what its last line shows; None where it needs what is not there."""
+    tree = ast.parse(source)
+    last = tree.body.pop() if isinstance(tree.body[-1], ast.Expr) else None
+    try:
+        exec(compile(tree, "cell", "exec"), space)
+        return eval(compile(ast.Expression(last.value), "cell", "eval"), space) if last else None
+    except NameError:
+        return None
+
+
+@pytest.mark.parametrize("name", STORED)
+def test_stored_results_are_shown_as_they_are_now(name):
+    notebook = read(name)
+    space = {"np": np, "read_results": read_results, "results_table": results_table}
+    space |= default_parameters(notebook, name)
+    compared = 0
+    for cell in code_of(notebook):
+        if "results_table(" not in cell.source and "read_results(" not in cell.source:
+            continue
+        value = last_value(cell.source, space)
+        if value is not None:
+            (shown,) = [
+                o.data["text/html"] for o in cell.outputs if "text/html" in o.get("data", {})
+            ]
+            assert shown == value._repr_html_(), f"run `make notebooks`: stale\n{cell.source}"
+            compared += 1
+    assert compared
+
+
+@each_notebook
+def test_closing_cells(name):
+    """What we learned, and from 01 on at least two exercises with their checks and solutions."""
+    notebook = read(name)
+    text = [cell.source for cell in notebook.cells if cell.cell_type == "markdown"]
+    if name != "00_start_here":
+        assert re.search(r"^## What we learned$", "\n".join(text[-4:]), re.MULTILINE)
+        checks = {m for c in code_of(notebook) for m in re.findall(r'check\("([\d.]+)"', c.source)}
+        assert len(checks) >= 2
+        assert all(f"**{number}**" in "".join(text) for number in checks)
+        assert (LAYOUT.notebooks / "solutions" / f"{name}.py").is_file()
+    ways_on = re.findall(r"\]\((\d\d_\w+)\.ipynb", text[-1] if name[:2] != "00" else "".join(text))
+    assert ways_on
+    assert set(ways_on) <= set(PATHS)
 
 
 @each_notebook

@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from affordlib.evaluation import reported
 from affordlib.evaluation.answers import calibration, final_error, yaw_error
 from affordlib.evaluation.studies import FOLDER as STUDIES_FOLDER
 from affordlib.evaluation.studies import STUDIES, read_study
@@ -289,11 +290,12 @@ def assemble(
     parts = read_parts(folder)
     if not parts:
         raise FileNotFoundError(f"folder: there are no parts in {folder}; run units first")
+    grasps = grasp_rows(parts)
     tables = {
         "push": error_rows(parts, "push", "fold_test"),
         "push_test": error_rows(parts, "push", "fixed_test"),
         "drag": error_rows(parts, "drag", "fold_test"),
-        "grasp": grasp_rows(parts),
+        "grasp": [*reported.grasp_rows(grasps[0]), *grasps] if grasps else [],
         "rotate": error_rows(parts, "rotate", "fold_test"),
         "inverse": inverse_rows(parts),
         "calibration": calibration_table(parts),

@@ -32,6 +32,10 @@ SURPRISE_M = 0.002
 DISPLACED_M = 0.03
 """An object that is farther than this from where it should be was moved by somebody else."""
 
+AT_REST_M, BETWEEN_LOOKS_S, MOST_LOOKS = 0.001, 0.25, 20
+"""An object rests that is in the same place a quarter of a second later; after 5 s none is waited
+for."""
+
 RENEWALS = 3
 MOVE_M = 0.05
 SPARE_ACTIONS = 3
@@ -154,17 +158,32 @@ class Chase:
         """Let happen what happens between actions; look, and judge whether the plan still holds."""
         self.script.before(self.world, len(self.steps))
         before, self.seen = self.seen, self.world.perceive()
+        off, fell = self._surprise(before)
+        if DISPLACED_M < off < math.inf or fell:
+            self._wait()
+            off, fell = self._surprise(before)
         self.places.append(self.seen.xy_m)
         if not (self.seen.image[1].any() and is_on_table(np.array([self.seen.xy_m]))[0]):
             raise Ended("lost", f"the object is no longer on the table, after {self._count()}")
-        off = math.inf if self.expected is None else math.dist(self.expected, self.seen.xy_m)
         moved = self.planned_for is not None and self.planned_for != self.goal
         if moved or (self.expected is not None and off > DISPLACED_M and self.renewals > 0):
             self.renewals -= not moved
             self.limit = max(self.limit, len(self.steps) + self._limit_from(self.seen.xy_m))
-        fell = before is not None and looks_fallen(before.image, self.seen.image)
         if off > SURPRISE_M or moved or fell:
             self.queue = []
+
+    def _surprise(self, before: Percept | None) -> tuple[float, bool]:
+        """How far the object is from where it should be [m], and whether it has fallen."""
+        off = math.inf if self.expected is None else math.dist(self.expected, self.seen.xy_m)
+        return off, before is not None and looks_fallen(before.image, self.seen.image)
+
+    def _wait(self) -> None:
+        """Look on until what somebody has set in motion rests."""
+        for _ in range(MOST_LOOKS):
+            self.world.settle(BETWEEN_LOOKS_S)
+            before, self.seen = self.seen, self.world.perceive()
+            if math.dist(before.xy_m, self.seen.xy_m) < AT_REST_M:
+                return
 
     def _limit_from(self, xy_m: Sequence[float]) -> int:
         if self.demands.max_actions is not None:
