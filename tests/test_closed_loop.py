@@ -1,18 +1,24 @@
 """Carrying out: every ending provoked, no endless loop, a veto before any motion."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
+from affordlib.evaluation.closed_loop import Trial, _stays_feasible
 from affordlib.planning import (
     Disturbance,
+    PlanMode,
     Repertoire,
     action_limit,
     draw_disturbances,
+    plan_continuous,
     pursue,
 )
+from affordlib.planning.chase import DISPLACED_M, Chase
+from affordlib.planning.moves import Demands
 from affordlib.primitives import Drag, Grasp, Push, Rotate
 from affordlib.types import Goal, Plan, Prediction
 from affordlib.world import Cuboid, Sphere, Tabletop, UnreachableError, UprightCylinder
@@ -135,6 +141,41 @@ def test_a_veto_bars_and_plans_anew(table, repertoire, monkeypatch):
     assert went.reached, went.words
     assert went.vetoes == len(refused) >= 1
     assert abs(went.steps[0].primitive.direction_rad - refused[0]) > 0.05
+
+
+def test_what_somebody_has_set_rolling_is_waited_for(table, repertoire):
+    demands = Demands(plan_continuous, PlanMode(3, partial=True), 0.002, 0.03, 0.003, None, None)
+    table.place(BALL, (0.0, 0.0))
+    chase = Chase(table, Goal((0.1, 0.0)), repertoire, demands, ())
+    chase.expected = (0.0, 0.0)
+    table.knock(0.0, 0.15)
+    table.settle(0.3)
+    rolling = math.dist(table.object_pose()[:2], (0.0, 0.0))
+    assert rolling > DISPLACED_M
+    chase._look()
+    (seen,) = chase.places
+    assert math.dist(seen, (0.0, 0.0)) > rolling + 0.01
+    table.settle(1.0)
+    assert math.dist(table.object_pose()[:2], seen) < 0.01
+
+
+def test_the_disturbance_and_not_the_robot_makes_a_goal_infeasible(table):
+    """Judged where the object was first seen after it."""
+    goal, off_table = Goal((0.1, 0.0)), (0.9, 0.0)
+    knock = Disturbance("knock", 0, 0.1, 0.3, at_s=2.0)
+    moved = Disturbance("goal", 1, 0.05, 0.0)
+    table.place(BOX)
+
+    def feasible(ending, seen, happened):
+        trial = Trial(BOX, (0.0, 0.0), 0.0, goal, (happened,))
+        went = SimpleNamespace(ending=ending, seen_xy_m=seen, happened=(happened,), goal=goal)
+        return _stays_feasible(table, trial, went)
+
+    at, near = (0.0, 0.0), (0.05, 0.0)
+    assert feasible("reached", (at, near), knock)
+    assert not feasible("lost", (at, off_table), knock)
+    assert feasible("lost", (at, near, off_table), knock)  # it was there to be had
+    assert feasible("lost", (at, off_table), moved)  # nobody has touched it but the robot
 
 
 def test_it_gives_up_at_the_limit_of_actions(table, repertoire):

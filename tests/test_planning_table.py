@@ -12,6 +12,7 @@ from affordlib.evaluation.planners import VARIANTS
 from affordlib.evaluation.planning import (
     PARTS,
     attempt,
+    decomposition_rows,
     paired_rows,
     planning_rows,
     tasks_sha256,
@@ -51,6 +52,22 @@ def test_rows_are_told_for_all_for_groups_and_for_classes():
     assert rows["standing"]["n"] == 2
     assert rows["rollable"]["mean_m"] == pytest.approx(0.005)
     assert rows["cuboid"]["plan_ms_median"] == pytest.approx(20.0)
+
+
+def test_what_execution_costs_is_told_by_the_plain_oracle():
+    """Not by one that has a σ; and who is only asked about what stands has no row of all."""
+    rows = []
+    for name, distance in (("continuous", 1e-3), ("oracle", 2e-3), ("oracle_wary", 3e-3)):
+        both = records([distance]) + records([distance], "sphere")
+        rows += planning_rows(both, variant=name, nudged=False, **VARIANTS[name].columns())
+    alone = records([9e-3])
+    about = VARIANTS["astar_paper"].columns()
+    rows += planning_rows(alone, variant="astar_paper", nudged=False, **about)
+    told = {(r["variant"], r["object_class"]): r for r in decomposition_rows(rows)}
+    assert told["continuous", "standing"]["execution_mean_m"] == pytest.approx(2e-3)
+    assert told["continuous", "all"]["execution_mean_m"] == pytest.approx(2e-3)
+    assert ("astar_paper", "standing") in told
+    assert ("astar_paper", "all") not in told
 
 
 def test_pairs_are_of_the_same_goals():
