@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
@@ -39,8 +38,9 @@ class EffectModel(Protocol):
 
 def observe_actions(model: EffectModel, actions: Sequence[Primitive]) -> Observations:
     """Each commanded action at t = 0 and t = 1, and no effect: B = len(actions)."""
+    ends = np.array([0.0, 1.0])
     columns = [ACTION_CHANNELS.index(name) for name in model.action_channels]
-    action = np.stack([_ends(one)[:, columns] for one in actions])
+    action = np.stack([one.path(ends)[:, columns] for one in actions])
     b = len(actions)
     return Observations(
         torch.as_tensor(action, dtype=torch.float32),
@@ -51,12 +51,6 @@ def observe_actions(model: EffectModel, actions: Sequence[Primitive]) -> Observa
         torch.zeros(b, 1, dtype=torch.bool),
         torch.ones(b),
     )
-
-
-@lru_cache(maxsize=1024)
-def _ends(action: Primitive) -> np.ndarray:
-    """An action at t = 0 and t = 1: (2, 5); kept, since planners ask about the same again."""
-    return action.path(np.array([0.0, 1.0]))
 
 
 def observe_final_effect(model: EffectModel, effect: torch.Tensor) -> Observations:
