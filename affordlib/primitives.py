@@ -63,7 +63,8 @@ class Primitive:
     """An action with its parameters; `legs` says how the gripper moves.
 
     opening_m is the gap between the fingers where the gripper channel is 1, force_N what each
-    finger can press with, `holds` whether the object stays in the hand at the end.
+    finger can press with, `holds` whether the object stays in the hand at the end. Before the
+    phase `acts_from` no object has been touched yet.
     """
 
     name: ClassVar[str]
@@ -71,6 +72,7 @@ class Primitive:
     force_N: ClassVar[float]
     holds: ClassVar[bool] = False
     tool: ClassVar[str] = "gripper"
+    acts_from: ClassVar[float] = 0.0
 
     @cached_property
     def legs(self) -> tuple[Leg, ...]:
@@ -93,6 +95,11 @@ class Primitive:
             share = min_jerk((phase[inside] - start) / (end - start))
             action[inside] = leg.at(share)[:, :5]
         return action
+
+    def ends(self) -> np.ndarray:
+        """The commanded action at t = 0 and t = 1: (2, 5), as `path` tells it, in less time."""
+        first, last = self.legs[0].at(np.zeros(1)), self.legs[-1].at(np.ones(1))
+        return np.concatenate([first, last])[:, :5]
 
     def succeeded(self, effect: np.ndarray) -> bool:
         """Whether a final effect (5,) is what the primitive is for: here, moved by over 1 cm."""
@@ -124,6 +131,7 @@ class Push(Primitive):
     name = "push"
     opening_m = PUSH_GAP_M
     force_N = 200.0
+    acts_from = 0.4
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "theta", check_finite("theta", self.theta) % (2 * math.pi))
@@ -165,6 +173,7 @@ class Drag(Primitive):
     name = "drag"
     opening_m = 0.14
     force_N = 10.0
+    acts_from = 0.25
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "theta", check_finite("theta", self.theta) % (2 * math.pi))

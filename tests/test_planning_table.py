@@ -19,6 +19,7 @@ from affordlib.evaluation.planning import (
 )
 from affordlib.paths import repo_root
 from affordlib.planning import map_effects
+from affordlib.planning.effect_map import N_DIRECTIONS
 from affordlib.primitives import Drag
 from affordlib.results import read_results
 from affordlib.world import Cuboid
@@ -104,10 +105,13 @@ def test_frozen_goals_are_never_written_over(capsys, which):
 
 
 def test_a_nudged_object_is_off_where_the_robot_believes_it(world, film):
-    task = next(t for t in frozen_tasks() if t.mode == "single_partial" and not t.thing.rollable)
+    tasks = [t for t in frozen_tasks() if t.mode == "single_partial" and not t.thing.rollable][:4]
     planner = VARIANTS["continuous"].make()
-    there, nudged = (attempt(world, task, planner, nudged=n).distance_m for n in (False, True))
-    assert there < 0.001 < nudged < 0.02
+    there, nudged = (
+        np.mean([attempt(world, task, planner, nudged=n).distance_m for task in tasks])
+        for n in (False, True)
+    )
+    assert 1.5 * there < nudged < 0.02
 
 
 def test_a_variant_asked_every_so_often_is_compared_on_the_same_goals():
@@ -143,8 +147,9 @@ def test_a_wary_oracle_is_unsure_where_a_degree_matters(world, film):
     """Its σ is by how much the same push does otherwise to an object turned by a degree."""
     world.place(Cuboid(0.07, 0.05, 0.05), (0.0, 0.0), 0.3)
     effects = map_effects(film, world.look())
-    near = torch.tensor(2 * torch.pi / 36, dtype=torch.float64)
-    angle, phase = near * torch.arange(36), torch.ones(36, dtype=torch.float64)
+    near = torch.tensor(2 * torch.pi / N_DIRECTIONS, dtype=torch.float64)
+    angle = near * torch.arange(N_DIRECTIONS)
+    phase = torch.ones_like(angle)
     mean, std = touchy(effects)(angle, phase)
     torch.testing.assert_close(mean, effects(angle, phase)[0])
     ahead, behind = (effects(angle + side * near, phase)[0] for side in (1, -1))

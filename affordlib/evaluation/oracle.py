@@ -11,9 +11,9 @@ import torch
 
 from affordlib.planning.effect_map import (
     N_DIRECTIONS,
-    N_PHASES,
     EffectMap,
     map_effects,
+    phases_of,
     splines_through,
 )
 from affordlib.types import Observations, Prediction
@@ -94,8 +94,7 @@ def touchy(effects: EffectMap) -> EffectMap:
     """A map of the same effects, whose σ is by how much they change with `WARY_RAD`."""
     step = 2 * math.pi / N_DIRECTIONS
     angles = step * torch.arange(N_DIRECTIONS, dtype=torch.float64)
-    phases = torch.linspace(0, 1, N_PHASES, dtype=torch.float64)
-    mean, _ = effects(*torch.meshgrid(angles, phases, indexing="ij"))
+    mean, _ = effects(*torch.meshgrid(angles, phases_of(effects.kind), indexing="ij"))
     slope = (mean.roll(-1, 0) - mean.roll(1, 0)) / (2 * step)
     std = WARY_RAD * slope.abs() + _STD_M
     return replace(effects, coefficients=splines_through(mean, std))

@@ -38,9 +38,8 @@ class EffectModel(Protocol):
 
 def observe_actions(model: EffectModel, actions: Sequence[Primitive]) -> Observations:
     """Each commanded action at t = 0 and t = 1, and no effect: B = len(actions)."""
-    ends = np.array([0.0, 1.0])
     columns = [ACTION_CHANNELS.index(name) for name in model.action_channels]
-    action = np.stack([one.path(ends)[:, columns] for one in actions])
+    action = np.stack([one.ends() for one in actions])[..., columns]
     b = len(actions)
     return Observations(
         torch.as_tensor(action, dtype=torch.float32),

@@ -13,6 +13,7 @@ import itertools
 import math
 import time
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -37,8 +38,6 @@ STOP_PHASES = (0.2, 0.4, 0.6, 0.8, 1.0)
 PRUNE_BELOW_M = 0.001
 YAW_STEP_RAD = math.radians(1)
 _SAME_PLACE_M = 1e-4
-_AT_ONCE = 12
-"""Neighbouring yaws are looked up together: what one costs is mostly the call."""
 
 
 @dataclass(frozen=True)
@@ -53,9 +52,18 @@ class Branches:
     effect_xy_m: np.ndarray
     turn_rad: np.ndarray
 
+    @cached_property
+    def way_m(self) -> np.ndarray:
+        """How far each moves the object: (n,)."""
+        return np.hypot(*self.effect_xy_m.T)
+
 
 class BranchTable:
-    """The branches of an object by how far it has turned since its image was taken."""
+    """The branches of an object by how far it has turned since its image was taken.
+
+    It turns in steps of at most a degree that divide those between the directions, so all that can
+    be asked of the map is asked at once: the effects in every direction relative to the object.
+    """
 
     def __init__(
         self,
@@ -63,32 +71,30 @@ class BranchTable:
         n_directions: int = N_DIRECTIONS,
         stop_phases: Sequence[float] = STOP_PHASES,
     ) -> None:
-        angles = np.arange(n_directions) * (2 * np.pi / n_directions)
+        between = 2 * math.pi / n_directions
+        self._finer = math.ceil(between / YAW_STEP_RAD)
+        self._step_rad = between / self._finer
+        relative = torch.arange(n_directions * self._finer, dtype=torch.float64) * self._step_rad
+        phases = torch.tensor(stop_phases, dtype=torch.float64)
+        with torch.no_grad():
+            grid = torch.meshgrid(relative, phases, indexing="ij")
+            self._told = effects(*grid)[0].numpy()
         self.effects = effects
-        self._direction = np.repeat(angles, len(stop_phases))
-        self._phase = np.tile(np.asarray(stop_phases, dtype=float), n_directions)
+        self._direction = np.repeat(np.arange(n_directions) * between, len(stop_phases))
+        self._phase = np.tile(phases.numpy(), n_directions)
         self._kept: dict[int, Branches] = {}
 
     def at(self, turned_rad: float) -> Branches:
         """The branches of the object turned by an angle; those that do nothing are left out."""
-        key = round(turned_rad / YAW_STEP_RAD)
+        key = round(turned_rad / self._step_rad) % len(self._told)
         if key not in self._kept:
-            first = key - key % _AT_ONCE
-            self._look_up(np.arange(first, first + _AT_ONCE))
+            told = np.roll(self._told, key, axis=0)[:: self._finer].reshape(-1, 3)
+            moves = np.hypot(told[:, 0], told[:, 1]) >= PRUNE_BELOW_M
+            direction, phase = self._direction[moves], self._phase[moves]
+            (ahead, left, turn), c, s = told[moves].T, np.cos(direction), np.sin(direction)
+            xy = np.stack([c * ahead - s * left, s * ahead + c * left], axis=-1)
+            self._kept[key] = Branches(direction, phase, xy, turn)
         return self._kept[key]
-
-    def _look_up(self, keys: np.ndarray) -> None:
-        relative = torch.from_numpy(self._direction - keys[:, None] * YAW_STEP_RAD)
-        with torch.no_grad():
-            phases = torch.from_numpy(self._phase).expand(relative.shape)
-            told = self.effects(relative, phases)[0].numpy()
-        c, s = np.cos(self._direction), np.sin(self._direction)
-        ahead, left, turn = np.moveaxis(told, -1, 0)
-        xy = np.stack([c * ahead - s * left, s * ahead + c * left], axis=-1)
-        moves = np.hypot(ahead, left) >= PRUNE_BELOW_M
-        for key, *columns, moving in zip(keys.tolist(), xy, turn, moves, strict=True):
-            columns = (self._direction, self._phase, *columns)
-            self._kept[key] = Branches(*(column[moving] for column in columns))
 
 
 class _Node(NamedTuple):
@@ -151,22 +157,27 @@ def search(
         expansions += 1
         branches = table.at(node.turned)
         children = node.xy + branches.effect_xy_m
-        turned = node.turned + branches.turn_rad
         depth = node.depth + 1
         h = heuristic(children)
-        g = node.g + np.hypot(*branches.effect_xy_m.T)
-        hopeful = is_on_table(children) & (h <= (max_steps - depth) * reach + nearest_m)
         if max_steps == depth:
-            hopeful &= h < max(nearest_m - goal.tolerance_m, 1e-12)
-        if reachable is not None and hopeful.any():
-            here = np.broadcast_to(node.xy, children.shape)
-            hopeful[hopeful] = reachable(here[hopeful], branches.direction[hopeful])
-        if trace is not None:
-            trace.append((np.array(node.xy), children[hopeful]))
+            hopeful = h < max(nearest_m - goal.tolerance_m, 1e-12)
+        else:
+            hopeful = h <= (max_steps - depth) * reach + nearest_m
         rows = np.flatnonzero(hopeful)
-        places = np.round(children[rows] / _SAME_PLACE_M).astype(int)
-        turns = np.round(turned[rows] / YAW_STEP_RAD).astype(int)
-        told = (places, turns, g[rows], g[rows] + h[rows], children[rows], turned[rows])
+        rows = rows[is_on_table(children[rows])]
+        if reachable is not None and len(rows):
+            here = np.broadcast_to(node.xy, (len(rows), 2))
+            rows = rows[reachable(here, branches.direction[rows])]
+        places = children[rows]
+        if trace is not None:
+            trace.append((np.array(node.xy), places))
+        if not len(rows):
+            continue
+        cells = np.round(places / _SAME_PLACE_M).astype(int)
+        turned = node.turned + branches.turn_rad[rows]
+        turns = np.round(turned / YAW_STEP_RAD).astype(int)
+        g = node.g + branches.way_m[rows]
+        told = (cells, turns, g, g + h[rows], places, turned)
         actions = (branches.direction[rows], branches.stop_phase[rows])
         # Lists, since one number at a time is what arrays are slow at.
         for (u, v), turn, cost, f, xy, angle, *action in zip(

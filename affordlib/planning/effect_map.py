@@ -2,8 +2,9 @@
 
 Effects are relative to the object, so an object's whole repertoire is a surface over two numbers:
 the direction of the push relative to the object, and the phase at which it stops. The model is
-asked once, on a grid; cubic B-splines fill the rest. When the object turns, the surface turns with
-it, so one map serves every step of a plan and every node of a search.
+asked once, on a grid; cubic B-splines fill the rest. No phase is asked about before the action can
+touch an object: nothing has happened there. When the object turns, the surface turns with it, so
+one map serves every step of a plan and every node of a search.
 """
 
 from __future__ import annotations
@@ -27,10 +28,10 @@ if TYPE_CHECKING:
 
     from affordlib.models.protocol import EffectModel
 
-N_DIRECTIONS = 36
-N_PHASES = 41
+N_DIRECTIONS = 48
+N_PHASES = 17
 FINE_DIRECTIONS = 180
-FINE_PHASES = 51
+FINE_PHASES = 31
 _WRAP = 3
 _SPLINES = (
     torch.tensor([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]], dtype=torch.float64)
@@ -43,8 +44,8 @@ class EffectMap:
     """Effects of `kind` on one object: ahead, to the left [m] and turn [rad], with σ of each.
 
     coefficients: (D + 3, T + 3, 6), of cubic B-splines over the direction relative to the object
-    as its image shows it, and over the phase. It is evaluated with torch, so that it can be
-    differentiated.
+    as its image shows it, and over the phases from `kind.acts_from` on. It is evaluated with torch,
+    so that it can be differentiated.
     """
 
     kind: type[Push] | type[Drag]
@@ -58,7 +59,8 @@ class EffectMap:
         shape, (height, width, channels) = direction_rad.shape, self.coefficients.shape
         rows, columns = height - _WRAP, width - _WRAP
         u = torch.remainder(direction_rad.reshape(-1), 2 * math.pi) * (rows / (2 * math.pi))
-        v = phase.reshape(-1).clamp(0, 1) * (columns - 1)
+        first = self.kind.acts_from
+        v = (phase.reshape(-1).clamp(first, 1) - first) * ((columns - 1) / (1 - first))
         i, j = u.detach().floor().clamp(0, rows - 1), v.detach().floor().clamp(0, columns - 2)
         across, along = _basis(torch.stack([u - i, v - j]))
         weights = (across[:, :, None] * along[:, None, :]).reshape(-1, 1, 16)
@@ -76,7 +78,7 @@ class EffectMap:
         angles = torch.arange(FINE_DIRECTIONS, dtype=torch.float64) * (
             2 * math.pi / FINE_DIRECTIONS
         )
-        phases = torch.linspace(0, 1, FINE_PHASES, dtype=torch.float64)
+        phases = phases_of(self.kind, FINE_PHASES)
         direction, phase = (v.reshape(-1) for v in torch.meshgrid(angles, phases, indexing="ij"))
         with torch.no_grad():
             told, _ = self(direction, phase)
@@ -138,6 +140,11 @@ def _asked(
     return torch.stack(effect, dim=-1), torch.stack(std, dim=-1)
 
 
+def phases_of(kind: type[Push] | type[Drag], n_phases: int = N_PHASES) -> Tensor:
+    """The phases (T,) of a map's grid."""
+    return torch.linspace(kind.acts_from, 1, n_phases, dtype=torch.float64)
+
+
 @torch.no_grad()
 def map_effects(
     model: EffectModel,
@@ -155,9 +162,9 @@ def map_effects(
             raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}")
     features = encode_image(model, image)
     angles = np.arange(n_directions) * (2 * math.pi / n_directions)
-    t_target = torch.linspace(0, 1, n_phases).expand(n_directions, -1)
+    t_target = phases_of(kind, n_phases).float().expand(n_directions, -1)
     effect, std = _asked(model, features, kind, angles, t_target)
-    # Before contact nothing has happened; what a model says at t = 0 is no displacement.
+    # What a model says of the time before contact is no displacement.
     effect = effect - effect[:, :1]
     reach = float(effect[..., :2].norm(dim=-1).max())
     return EffectMap(kind, model, features, splines_through(effect, std), reach)

@@ -83,12 +83,14 @@ def make_steps(
     ends, turned = foreseen or (positions[0], turns[0])
     ends, turned = np.asarray(start_xy_m) + ends.numpy(), turned.tolist()
     shares = torch.linspace(0, 1, PATH_SAMPLES, dtype=phase.dtype)
-    steps, place, before = [], np.asarray(start_xy_m, dtype=float), 0.0
+    relative = direction[0] - torch.tensor([0.0, *turned[:-1]], dtype=phase.dtype)
+    relative, stops = torch.broadcast_tensors(relative[:, None], phase[0, :, None] * shares)
+    ways = effects(relative, stops)[0][..., :2].numpy()
+    steps, place = [], np.asarray(start_xy_m, dtype=float)
     for k, (angle, stop) in enumerate(chain.tolist()):
-        way = effects(torch.full_like(shares, angle - before), stop * shares)[0][:, :2].numpy()
         c, s = math.cos(angle), math.sin(angle)
-        path = place + way @ np.array([[c, s], [-s, c]])
-        place, before = ends[k], turned[k]
+        path = place + ways[k] @ np.array([[c, s], [-s, c]])
+        place = ends[k]
         steps.append(
             Step(
                 effects.kind.towards(angle),
@@ -96,7 +98,7 @@ def make_steps(
                 (float(place[0]), float(place[1])),
                 path,
                 std_m=math.sqrt(variances[0, k]),
-                predicted_turn_rad=before,
+                predicted_turn_rad=turned[k],
             )
         )
     return tuple(steps)
