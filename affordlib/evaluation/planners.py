@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-FORMAT = 2
-"""Counts the changes of planners that change their numbers."""
+FORMATS: dict[Callable[..., Plan], int] = {plan_astar: 3, plan_continuous: 3, plan_gradient: 2}
+"""Counts the changes of each planner that change its numbers."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class Variant:
         files = {name: _sha256(name) for name in (self.push, self.drag) if name}
         settings = {k: list(v) if isinstance(v, tuple) else v for k, v in self.settings}
         more = {"corrections": self.corrections, "full_only": self.full_only}
-        more |= {"settings": settings, "checkpoints": files, "format": FORMAT}
+        more |= {"settings": settings, "checkpoints": files, "format": FORMATS[self.planner]}
         if self.every > 1:
             more["every"] = self.every
         if self.looks > 1:
