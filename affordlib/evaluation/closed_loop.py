@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from affordlib.planning import Disturbance, Pursuit
     from affordlib.world import Thing
 
-FORMATS = {"height": 3, "orientation": 3, "disturbances": 2, "reachability": 2}
+FORMATS = {"height": 4, "orientation": 4, "disturbances": 3, "reachability": 2}
 """Counts the changes of code that change a table's records."""
 
 N_TRIALS = {"height": 50, "orientation": 50, "disturbances": 200, "reachability": 1000}
