@@ -46,12 +46,15 @@ def free_port():
 
 
 @contextmanager
-def serve(folder, name, **parameters):
-    """A JupyterLab with settings, workspaces and run-time files of its own, and one notebook."""
+def serve(folder, name, source=None, **parameters):
+    """A JupyterLab with settings, workspaces and run-time files of its own, and one notebook.
+
+    source: the file of one that is not among `notebooks/`.
+    """
     book = folder / "book"
     book.mkdir()
     papermill.execute_notebook(
-        repo_root() / "notebooks" / f"{name}.ipynb",
+        source or repo_root() / "notebooks" / f"{name}.ipynb",
         book / f"{name}.ipynb",
         {"out_dir": str(folder / "out"), **parameters},
         prepare_only=True,
@@ -113,7 +116,7 @@ def wait_for_server(url, server, log):
 
 
 @contextmanager
-def opened(lab):
+def opened(lab, shows=".affordlib-table svg .plan .prediction"):
     """The notebook, all its cells run, and `requests`: every address that was asked for."""
     from playwright.sync_api import sync_playwright
 
@@ -132,7 +135,7 @@ def opened(lab):
             "?.status === 'idle'"
         )
         page.evaluate("window.jupyterapp.commands.execute('notebook:run-all-cells')")
-        page.locator(".affordlib-table svg .plan .prediction").first.wait_for(timeout=90_000)
+        page.locator(shows).first.wait_for(timeout=90_000)
         ask(page, "1")  # answered after all cells
         yield page
         browser.close()

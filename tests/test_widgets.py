@@ -72,3 +72,30 @@ def test_with_nothing_observed_it_says_so(explorer):
 def test_saved_widgets_leave_their_pictures(name, request):
     bundle = request.getfixturevalue(name)._repr_mimebundle_()
     assert Image.open(io.BytesIO(base64.b64decode(bundle["image/png"]))).size[0] > 800
+
+
+def test_what_can_be_dragged_is_where_it_is_drawn(explorer):
+    explorer.observe_at((0.25, 0.75), effect_t=0.9, weight=0.5)
+    handles = explorer._image.handles
+    names = ["first action", "second action", "effect"]
+    assert [h["name"] for h in handles] == names[:2] * 2 + names[2:] * 2
+    pixels = np.asarray(Image.open(io.BytesIO(explorer._image.value)).convert("L"))
+    for handle in handles:
+        row, column = (int(s * n) for s, n in zip((handle["y"], handle["x"]), pixels.shape))
+        assert pixels[row, column] < 30  # black
+        assert handle["top"] < handle["y"] < handle["bottom"]
+
+
+def test_dragging_is_moving_a_slider(explorer, slider):
+    explorer.observe_at((0.25, 0.75), effect_t=0.9, weight=0.5)
+    for name, phase in (("first action", 0.4), ("effect", 0.6), ("second action", 0.2)):
+        explorer._image.dragged = [name, phase, 1]
+    # One end of an action never passes the other.
+    assert explorer._action_t.value == pytest.approx((0.4, 0.4))
+    assert explorer._effect_t.value == pytest.approx(0.6)
+    (line,) = slider._image.handles
+    assert line["y"] is None
+    slider._image.dragged = ["phase", 0.65, 1]
+    assert slider.phase == 0.65
+    (moved,) = slider._image.handles
+    assert moved["x"] < line["x"]

@@ -28,12 +28,12 @@ N_TARGETS = 101
 
 
 class ConditioningExplorer(FigureWidget):
-    """Sliders for when action and effect are observed and how they are blended; below, both.
+    """When action and effect are observed and how they are blended; below, what is foreseen.
 
     model: any `EffectModel`; seen: a full interaction, which is the truth and gives what is
-    observed. The first sliders set at which phases the action is observed (two, as a planner
-    observes it) and the effect (one); a tick takes the observation away. The orange band is
-    mean ± 2 σ. `prediction` is what is shown.
+    observed. The black points in the figure, or the first sliders, are dragged to the phases at
+    which the action is observed (two, as a planner observes it) and the effect (one); a tick takes
+    the observation away. The orange band is mean ± 2 σ. `prediction` is what is shown.
     """
 
     figsize = (10.0, 4.6)
@@ -75,6 +75,16 @@ class ConditioningExplorer(FigureWidget):
                 self._effect_t.value = effect_t
             self._weight.value = weight
         self.refresh()
+
+    def drag(self, name: str, phase: float) -> None:
+        """Observe the action (its first or second point) or the effect at another phase."""
+        first, second = self._action_t.value
+        if name == "effect":
+            self._effect_t.value = phase
+        elif name == "first action":
+            self._action_t.value = min(phase, second), second
+        else:
+            self._action_t.value = first, max(first, phase)
 
     def observations(self) -> Observations:
         """What the model is told now; the weight is 1 or 0 where one modality is missing."""
@@ -127,6 +137,9 @@ class ConditioningExplorer(FigureWidget):
                 if observed[of]:
                     at = told_t[0].numpy(), 100 * points[0, :, c].numpy()
                     ax.plot(*at, "o", color="black", label="observed", zorder=5)
+                    names = ("first action", "second action") if of == "action" else ("effect",)
+                    for point, *place in zip(names, *at, strict=True):
+                        self.let_drag(ax, point, *map(float, place))
                 ax.set_title(f"{of} {name}")
             row[0].set_ylabel("cm")
         for ax in axes[1]:

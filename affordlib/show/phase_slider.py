@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 class PhaseSlider(FigureWidget):
     """A slider over the phase t of an action on the object that stands in a world.
 
+    The dotted line of the figure can be dragged as well.
+
     The action is executed once in full. Wherever the slider stands, the figure shows the gripper's
     path up to t and where the full action had the object at t; `stop_here()`, the button, executes
     the action up to t for comparison. `rest` maps the phases that were tried to the poses
@@ -56,6 +58,10 @@ class PhaseSlider(FigureWidget):
         self.rest[self.phase] = self.world.object_pose()
         self.refresh()
 
+    def drag(self, name: str, phase: float) -> None:
+        """Move the slider to a phase."""
+        self._phase.value = phase
+
     def draw(self, figure: Figure) -> str:
         """Left the table from above, right how far the object has moved over the phase."""
         above, over_time = figure.subplots(1, 2, width_ratios=(1, 1.9))
@@ -71,6 +77,7 @@ class PhaseSlider(FigureWidget):
         moved = 100 * np.hypot(*self.full.effect[:, :2].T)
         over_time.plot(self.full.phase, moved, color=PREDICTION, label="during the full action")
         over_time.axvline(t, color=NEUTRAL, ls=":")
+        self.let_drag(over_time, "phase", t)
         rest_cm = {k: 100 * np.hypot(p[0] - x, p[1] - y) for k, p in self.rest.items()}
         label = "at rest, stopped there"
         over_time.plot(list(rest_cm), list(rest_cm.values()), "o", color=TRUTH, label=label)
