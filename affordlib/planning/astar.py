@@ -53,6 +53,11 @@ class Branches:
     turn_rad: np.ndarray
 
     @cached_property
+    def columns_m(self) -> np.ndarray:
+        """The effects as rows of x and of y (2, n), which are quicker to compute with."""
+        return np.ascontiguousarray(self.effect_xy_m.T)
+
+    @cached_property
     def way_m(self) -> np.ndarray:
         """How far each moves the object: (n,)."""
         return np.hypot(*self.effect_xy_m.T)
@@ -79,8 +84,11 @@ class BranchTable:
         with torch.no_grad():
             grid = torch.meshgrid(relative, phases, indexing="ij")
             self._told = effects(*grid)[0].numpy()
+        self._moves = np.hypot(self._told[..., 0], self._told[..., 1]) >= PRUNE_BELOW_M
         self.effects = effects
+        self._first = np.arange(n_directions) * self._finer
         self._direction = np.repeat(np.arange(n_directions) * between, len(stop_phases))
+        self._heading = np.stack([np.cos(self._direction), np.sin(self._direction)])
         self._phase = np.tile(phases.numpy(), n_directions)
         self._kept: dict[int, Branches] = {}
 
@@ -88,26 +96,28 @@ class BranchTable:
         """The branches of the object turned by an angle; those that do nothing are left out."""
         key = round(turned_rad / self._step_rad) % len(self._told)
         if key not in self._kept:
-            told = np.roll(self._told, key, axis=0)[:: self._finer].reshape(-1, 3)
-            moves = np.hypot(told[:, 0], told[:, 1]) >= PRUNE_BELOW_M
-            direction, phase = self._direction[moves], self._phase[moves]
-            (ahead, left, turn), c, s = told[moves].T, np.cos(direction), np.sin(direction)
+            rows = (self._first - key) % len(self._told)
+            moves = np.flatnonzero(self._moves[rows])
+            ahead, left, turn = self._told[rows].reshape(-1, 3)[moves].T
+            c, s = self._heading[:, moves]
             xy = np.stack([c * ahead - s * left, s * ahead + c * left], axis=-1)
-            self._kept[key] = Branches(direction, phase, xy, turn)
+            self._kept[key] = Branches(self._direction[moves], self._phase[moves], xy, turn)
         return self._kept[key]
 
 
-class _Node(NamedTuple):
-    """A place in the frontier; no two have the same order, so nothing after it is compared."""
+class _Children(NamedTuple):
+    """Where the actions from one node lead: arrays over the actions, and the node they are from.
 
-    f: float
-    depth: int
-    order: int
-    g: float
-    xy: tuple[float, float]
-    turned: float
-    parent: _Node | None
-    action: tuple[float, float]
+    A node of the search is one row of its parent's children.
+    """
+
+    parent: tuple[_Children, int] | None
+    xy_m: np.ndarray
+    turned: np.ndarray
+    way_m: np.ndarray
+    away_m: np.ndarray
+    direction: np.ndarray
+    stop_phase: np.ndarray
 
 
 def search(
@@ -128,70 +138,68 @@ def search(
     position (2,) with those of its children (n, 2). finish: turns and lifts at the end; where it
     cannot, a node is none of the goal's.
     """
-    goal_xy = np.asarray(goal.xy_m)
+    goal_xy, tolerance = np.array(goal.xy_m)[:, None], goal.tolerance_m
     reach = table.effects.reach_m
-
-    def heuristic(xy: np.ndarray) -> np.ndarray:
-        return np.maximum(0.0, np.hypot(*(xy - goal_xy).T) - goal.tolerance_m)
-
-    start = tuple(map(float, start_xy_m))
-    counter = itertools.count()
-    h = float(heuristic(np.array(start)))
-    root = _Node(h, 0, next(counter), 0.0, start, 0.0, None, (0.0, 0.0))
-    frontier, nearest, expansions = [root], root, 0
-    nearest_m = goal.distance_m(start)
-    cheapest: dict[tuple[int, int, int, int], float] = {}
-    reached = False
+    start, nothing = np.array([start_xy_m], dtype=float), np.zeros(1)
+    nearest_m = goal.distance_m(start[0])
+    root = _Children(None, start, nothing, nothing, np.array([nearest_m]), nothing, nothing)
+    # The running number tells nodes of the same f and depth apart, so nothing after it is compared.
+    number = itertools.count()
+    frontier = [(max(0.0, nearest_m - tolerance), 0, next(number), root, 0)]
+    nearest, expansions, reached = (root, 0), 0, False
+    expanded: set[tuple[int, ...]] = set()
     while frontier and expansions < max_expansions:
-        node = heapq.heappop(frontier)
-        distance = goal.distance_m(node.xy)
-        if distance < nearest_m - 1e-12:
-            nearest, nearest_m = node, distance
-        if distance <= goal.tolerance_m and (
-            finish is None or finish(goal, node.xy, node.turned) is not None
-        ):
-            nearest, reached = node, True
+        _, depth, _, family, k = heapq.heappop(frontier)
+        (x, y), turned, away = family.xy_m[k].tolist(), float(family.turned[k]), family.away_m[k]
+        if away < nearest_m - 1e-12:
+            nearest, nearest_m = (family, k), float(away)
+        if away <= tolerance and (finish is None or finish(goal, (x, y), turned) is not None):
+            nearest, reached = (family, k), True
             break
-        if node.depth == max_steps:
+        cell = (round(x / _SAME_PLACE_M), round(y / _SAME_PLACE_M), round(turned / YAW_STEP_RAD))
+        if depth == max_steps or (depth, *cell) in expanded:
             continue
+        expanded.add((depth, *cell))
         expansions += 1
-        branches = table.at(node.turned)
-        children = node.xy + branches.effect_xy_m
-        depth = node.depth + 1
-        h = heuristic(children)
-        if max_steps == depth:
-            hopeful = h < max(nearest_m - goal.tolerance_m, 1e-12)
+        branches = table.at(turned)
+        depth += 1
+        offset = branches.columns_m + (np.array([[x], [y]]) - goal_xy)
+        away = np.hypot(offset[0], offset[1])
+        if depth == max_steps:
+            rows = np.flatnonzero(away < max(nearest_m, tolerance + 1e-12))
         else:
-            hopeful = h <= (max_steps - depth) * reach + nearest_m
-        rows = np.flatnonzero(hopeful)
-        rows = rows[is_on_table(children[rows])]
+            rows = np.flatnonzero(away <= tolerance + (max_steps - depth) * reach + nearest_m)
+        if len(rows):
+            rows = rows[is_on_table((goal_xy + offset[:, rows]).T)]
         if reachable is not None and len(rows):
-            here = np.broadcast_to(node.xy, (len(rows), 2))
+            here = np.broadcast_to((x, y), (len(rows), 2))
             rows = rows[reachable(here, branches.direction[rows])]
-        places = children[rows]
         if trace is not None:
-            trace.append((np.array(node.xy), places))
+            trace.append((np.array((x, y)), (goal_xy + offset[:, rows]).T))
         if not len(rows):
             continue
-        cells = np.round(places / _SAME_PLACE_M).astype(int)
-        turned = node.turned + branches.turn_rad[rows]
-        turns = np.round(turned / YAW_STEP_RAD).astype(int)
-        g = node.g + branches.way_m[rows]
-        told = (cells, turns, g, g + h[rows], places, turned)
-        actions = (branches.direction[rows], branches.stop_phase[rows])
-        # Lists, since one number at a time is what arrays are slow at.
-        for (u, v), turn, cost, f, xy, angle, *action in zip(
-            *(column.tolist() for column in (*told, *actions)), strict=True
-        ):
-            key = (u, v, turn, depth)
-            if cost < cheapest.get(key, math.inf):
-                cheapest[key] = cost
-                child = _Node(f, depth, next(counter), cost, tuple(xy), angle, node, tuple(action))
-                heapq.heappush(frontier, child)
+        if depth == max_steps:
+            # From there nothing goes on: outside the goal's disc only the nearest counts.
+            ends = away[rows] <= tolerance
+            ends[away[rows].argmin()] = True
+            rows = rows[ends]
+        children = _Children(
+            (family, k),
+            (goal_xy + offset[:, rows]).T,
+            turned + branches.turn_rad[rows],
+            family.way_m[k] + branches.way_m[rows],
+            away[rows],
+            branches.direction[rows],
+            branches.stop_phase[rows],
+        )
+        f = children.way_m + np.maximum(0.0, children.away_m - tolerance)
+        for row, value in enumerate(f.tolist()):
+            heapq.heappush(frontier, (value, depth, next(number), children, row))
     chain = []
-    while nearest.parent is not None:
-        chain.append(nearest.action)
-        nearest = nearest.parent
+    family, k = nearest
+    while family.parent is not None:
+        chain.append((float(family.direction[k]), float(family.stop_phase[k])))
+        family, k = family.parent
     return chain[::-1], reached, expansions
 
 
