@@ -63,8 +63,8 @@ class Primitive:
     """An action with its parameters; `legs` says how the gripper moves.
 
     opening_m is the gap between the fingers where the gripper channel is 1, force_N what each
-    finger can press with, `holds` whether the object stays in the hand at the end. Before the
-    phase `acts_from` no object has been touched yet.
+    finger can press with, `holds` whether the object stays in the hand at the end. With its
+    default parameters it touches nothing before the phase `acts_from`.
     """
 
     name: ClassVar[str]

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from affordlib.interactions import open_interactions
 from affordlib.interactions.recipes import RECIPES, Recipe, Variation, interact
 from affordlib.primitives import PRIMITIVES, Drag, Grasp, LeverUp, Push, Rotate, min_jerk
 from affordlib.world import (
@@ -36,6 +37,21 @@ def test_a_path_is_smooth_and_passes_its_keyframes(primitive):
     for leg, begin in zip(primitive.legs, primitive.leg_phases, strict=False):
         np.testing.assert_allclose(primitive.path(begin)[0], leg.start[:5], atol=1e-9)
     assert sum(leg.seconds for leg in primitive.legs) == pytest.approx(3.75)
+
+
+@pytest.mark.parametrize("primitive", EXAMPLES, ids=lambda one: one.name)
+def test_the_ends_of_a_path_are_its_first_and_last_pose(primitive):
+    np.testing.assert_allclose(primitive.ends(), primitive.path([0.0, 1.0]), atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["push", "drag", "push_test", "push_varied"])
+def test_nothing_is_touched_before_an_action_says_so(name):
+    data = open_interactions(name)
+    kind = PRIMITIVES[name.split("_")[0]]
+    before = data["phase"].values <= kind.acts_from
+    assert 0 < before.sum() < before.size
+    moved = np.hypot(*np.moveaxis(data["effect"].values[:, before, :2], -1, 0))
+    assert moved.max() < 2e-4
 
 
 def test_a_drag_path_is_caged_before_it_moves():

@@ -81,7 +81,8 @@ def test_what_can_be_dragged_is_where_it_is_drawn(explorer):
     assert [h["name"] for h in handles] == names[:2] * 2 + names[2:] * 2
     pixels = np.asarray(Image.open(io.BytesIO(explorer._image.value)).convert("L"))
     for handle in handles:
-        row, column = (int(s * n) for s, n in zip((handle["y"], handle["x"]), pixels.shape))
+        row = int(handle["y"] * pixels.shape[0])
+        column = int(handle["x"] * pixels.shape[1])
         assert pixels[row, column] < 30  # black
         assert handle["top"] < handle["y"] < handle["bottom"]
 
