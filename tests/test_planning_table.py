@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from affordlib.evaluation.goals import ROLLABLE, STANDING, PlanningTask, frozen_tasks, main
-from affordlib.evaluation.oracle import WARY_RAD, touchy
+from affordlib.evaluation.oracle import N_DIRECTIONS, WARY_RAD, touchy
 from affordlib.evaluation.planners import VARIANTS
 from affordlib.evaluation.planning import (
     PARTS,
@@ -19,7 +19,6 @@ from affordlib.evaluation.planning import (
 )
 from affordlib.paths import repo_root
 from affordlib.planning import map_effects
-from affordlib.planning.effect_map import N_DIRECTIONS
 from affordlib.primitives import Drag
 from affordlib.results import read_results
 from affordlib.world import Cuboid

@@ -9,19 +9,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from affordlib.planning.effect_map import (
-    N_DIRECTIONS,
-    EffectMap,
-    map_effects,
-    phases_of,
-    splines_through,
-)
+from affordlib.planning.effect_map import EffectMap, map_effects, phases_of, splines_through
 from affordlib.types import Observations, Prediction
 
 if TYPE_CHECKING:
     from affordlib.primitives import Drag, Push
     from affordlib.world import Tabletop, Thing, WorldConfig
 
+N_DIRECTIONS, PHASE_STEP = 36, 0.025
 _STD_M = 1e-5
 WARY_RAD = math.radians(1.0)
 """By how much a wary oracle takes the object to be turned otherwise than it is."""
@@ -86,15 +81,19 @@ def oracle_effects(
     """
     config = replace(config, camera="ideal", bias_m=(0.0, 0.0))
     model = SimulatorModel(imagined, world.thing, world.object_pose()[2], kind, config)
-    effects = map_effects(model, image, kind)
+    effects = map_effects(model, image, kind, N_DIRECTIONS, len(_phases(kind)))
     return touchy(effects) if wary else effects
+
+
+def _phases(kind: type[Push] | type[Drag]) -> torch.Tensor:
+    return phases_of(kind, round((1 - kind.acts_from) / PHASE_STEP) + 1)
 
 
 def touchy(effects: EffectMap) -> EffectMap:
     """A map of the same effects, whose σ is by how much they change with `WARY_RAD`."""
     step = 2 * math.pi / N_DIRECTIONS
     angles = step * torch.arange(N_DIRECTIONS, dtype=torch.float64)
-    mean, _ = effects(*torch.meshgrid(angles, phases_of(effects.kind), indexing="ij"))
+    mean, _ = effects(*torch.meshgrid(angles, _phases(effects.kind), indexing="ij"))
     slope = (mean.roll(-1, 0) - mean.roll(1, 0)) / (2 * step)
     std = WARY_RAD * slope.abs() + _STD_M
     return replace(effects, coefficients=splines_through(mean, std))

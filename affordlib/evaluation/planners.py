@@ -27,6 +27,8 @@ T = TypeVar("T")
 FORMATS: dict[Callable[..., Plan], int] = {plan_astar: 3, plan_continuous: 3, plan_gradient: 2}
 """Counts the changes of each planner that change its numbers."""
 
+ORACLE_FORMAT = 2
+
 
 @dataclass(frozen=True)
 class Variant:
@@ -93,7 +95,11 @@ class Variant:
         files = {name: _sha256(name) for name in (self.push, self.drag) if name}
         settings = {k: list(v) if isinstance(v, tuple) else v for k, v in self.settings}
         more = {"corrections": self.corrections, "full_only": self.full_only}
-        more |= {"settings": settings, "checkpoints": files, "format": FORMATS[self.planner]}
+        more |= {
+            "settings": settings,
+            "checkpoints": files,
+            "format": ORACLE_FORMAT if self.sees_world else FORMATS[self.planner],
+        }
         if self.every > 1:
             more["every"] = self.every
         if self.looks > 1:
