@@ -58,11 +58,12 @@ def drag(page, widget, name, phase):
     return figure, before
 
 
-def wait_until(condition, seconds=15):
+def comes_true(condition, seconds=15):
+    """Whether a condition holds before the time is over."""
     end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end
+    while not condition() and time.monotonic() < end:
         time.sleep(0.05)
+    return condition()
 
 
 @pytest.mark.parametrize(
@@ -75,21 +76,21 @@ def wait_until(condition, seconds=15):
 )
 def test_observations_are_dragged_in_the_figure(page, name, phase, told):
     figure, before = drag(page, "explorer", name, phase)
-    wait_until(lambda: ask(page, told) == pytest.approx(phase, abs=0.011))
-    wait_until(lambda: figure.get_attribute("src") != before)
+    assert comes_true(lambda: ask(page, told) == pytest.approx(phase, abs=0.011))
+    assert comes_true(lambda: figure.get_attribute("src") != before)
 
     def shares():  # in the figure of x as in that of y
         handles = [h for h in ask(page, "explorer._image.handles") if h["name"] == name]
         return [(h["x"] - h["left"]) / (h["right"] - h["left"]) for h in handles]
 
-    wait_until(lambda: shares() == pytest.approx([phase, phase], abs=0.011))
+    assert comes_true(lambda: shares() == pytest.approx([phase, phase], abs=0.011))
     picture(page, f"figure_{name.replace(' ', '_')}")
 
 
 def test_the_line_of_the_phase_slider_is_dragged(page):
     figure, before = drag(page, "slider", "phase", 0.65)
-    wait_until(lambda: ask(page, "slider.phase") == pytest.approx(0.65, abs=0.011))
-    wait_until(lambda: figure.get_attribute("src") != before)
+    assert comes_true(lambda: ask(page, "slider.phase") == pytest.approx(0.65, abs=0.011))
+    assert comes_true(lambda: figure.get_attribute("src") != before)
     picture(page, "figure_phase")
 
 

@@ -144,8 +144,9 @@ def test_an_effect_map_says_what_the_model_says(world, film, kind):
     direction = torch.from_numpy(rng.uniform(-7, 7, 40))
     phase = torch.from_numpy(rng.uniform(0.3, 1, 40))
     told, std = effects(direction, phase)
-    asked = effects.ask_model(direction, phase)
-    assert (told - asked)[:, :2].norm(dim=-1).median() < 2.5e-4
+    # The map tells displacements; what the model says at t = 0 is none.
+    asked = effects.ask_model(direction, phase) - effects.ask_model(direction, 0 * phase)
+    assert (told - asked)[:, :2].norm(dim=-1).median() < 2e-4
     assert (std > 0).all()
     # It is smooth: its slopes are those of finite differences.
     direction.requires_grad_(), phase.requires_grad_()

@@ -163,19 +163,19 @@ def search(
         expansions += 1
         branches = table.at(turned)
         depth += 1
-        offset = branches.columns_m + (np.array([[x], [y]]) - goal_xy)
-        away = np.hypot(offset[0], offset[1])
+        places = (branches.columns_m + np.array([[x], [y]])).T
+        away = np.hypot(*(places.T - goal_xy))
         if depth == max_steps:
             rows = np.flatnonzero(away < max(nearest_m, tolerance + 1e-12))
         else:
             rows = np.flatnonzero(away <= tolerance + (max_steps - depth) * reach + nearest_m)
         if len(rows):
-            rows = rows[is_on_table((goal_xy + offset[:, rows]).T)]
+            rows = rows[is_on_table(places[rows])]
         if reachable is not None and len(rows):
             here = np.broadcast_to((x, y), (len(rows), 2))
             rows = rows[reachable(here, branches.direction[rows])]
         if trace is not None:
-            trace.append((np.array((x, y)), (goal_xy + offset[:, rows]).T))
+            trace.append((np.array((x, y)), places[rows]))
         if not len(rows):
             continue
         if depth == max_steps:
@@ -185,7 +185,7 @@ def search(
             rows = rows[ends]
         children = _Children(
             (family, k),
-            (goal_xy + offset[:, rows]).T,
+            places[rows],
             turned + branches.turn_rad[rows],
             family.way_m[k] + branches.way_m[rows],
             away[rows],
