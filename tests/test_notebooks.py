@@ -55,6 +55,11 @@ def test_parameters(name):
     defaults = default_parameters(read(name), name)
     assert defaults["seed"] == 0
     assert defaults["out_dir"] == "runs/lab"
+    told = papermill.inspect_notebook(str(PATHS[name])).values()
+    assert len(told) == len(defaults)
+    for parameter in told:
+        assert parameter["inferred_type_name"] != "None", f"{parameter['name']} has no type"
+        assert parameter["help"].strip(), f"{parameter['name']} is not explained"
 
 
 @each_notebook
