@@ -151,6 +151,17 @@ def test_small_and_clean(name):
 
 
 @each_notebook
+def test_everything_shown_shows_on_the_web(name):
+    """Pages made from a notebook know no GIFs, and print the name of the object instead."""
+    known = {"image/png", "image/svg+xml", "image/jpeg", "text/html", "text/markdown"}
+    for number, cell in enumerate(read(name).cells, 1):
+        for output in cell.get("outputs", []):
+            data = output.get("data", {})
+            alone = data.get("text/plain", "")
+            assert data.keys() & known or "<" not in alone, f"cell {number} of {name}: {alone}"
+
+
+@each_notebook
 def test_cells_are_short_and_never_empty(name):
     for number, cell in enumerate(read(name).cells, 1):
         assert cell.source.strip(), f"cell {number} of {name} is empty"

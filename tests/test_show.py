@@ -1,3 +1,5 @@
+import io
+
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
@@ -20,7 +22,7 @@ def test_a_film_shows_the_robot_move(world, tmp_path):
     world.place(Cuboid(0.06, 0.05, 0.05))
     film = Film(every=240, width=80, height=60)
     with pytest.raises(RuntimeError, match="the film is empty"):
-        film.gif()
+        film.encoded()
     world.film = film
     try:
         world.interact(Push(1.0))
@@ -29,11 +31,13 @@ def test_a_film_shows_the_robot_move(world, tmp_path):
     assert len(film.frames) == 5
     assert np.abs(film.frames[0].astype(int) - film.frames[-1]).max() > 50
     figure, _ = plt.subplots(figsize=(2, 2))
-    show_animation(film, tmp_path / "push.gif", beside=figure)
+    shown = show_animation(film, tmp_path / "push.gif", beside=figure)
     plt.close(figure)
-    saved = Image.open(tmp_path / "push.gif")
-    assert saved.n_frames >= 4
-    assert saved.size == (60 + 80, 60)
+    for kind, picture in (("GIF", tmp_path / "push.gif"), ("PNG", io.BytesIO(shown.data))):
+        saved = Image.open(picture)
+        assert saved.format == kind
+        assert saved.n_frames >= 4
+        assert saved.size == (60 + 80, 60)
 
 
 def test_a_footprint_is_drawn_where_the_object_is(world, trained):
