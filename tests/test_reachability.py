@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from affordlib.interactions import open_interactions
-from affordlib.planning.reachability import learn_reachability
+from affordlib.planning.reachability import Reachability, learn_reachability
 from affordlib.primitives import Drag, Grasp, Push, Rotate
 from affordlib.world import UnreachableError, robot
 
@@ -49,6 +49,32 @@ def test_it_agrees_with_kinematics_on_places_it_has_not_seen(learned):
     assert np.mean(right[True] + right[False]) >= 0.97
     assert 1 - np.mean(right[False]) < 0.15  # false 'reachable'
     assert len(right[False]) > 60
+
+
+def test_the_shipped_one_was_learned_so(learned, tmp_path):
+    """On another processor sums end in other digits; nothing that matters hangs on them."""
+    shipped = Reachability.load()
+    rng = np.random.default_rng(6)
+    places = rng.uniform([-0.42, -0.62], [0.62, 0.62], (4000, 2))
+    angles = rng.uniform(-math.pi, math.pi, 4000)
+    for name in KINDS:
+        turn = angles if name in ("push", "drag") else None
+        old, new = (m.probability(name, places, turn) for m in (shipped, learned))
+        assert np.mean((old > 0.2) == (new > 0.2)) > 0.99
+    learned.save(tmp_path / "mine.safetensors")
+    mine = Reachability.load(tmp_path / "mine.safetensors").probability("push", places, angles)
+    np.testing.assert_array_equal(mine, learned.probability("push", places, angles))
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.safetensors"]
+
+
+def test_a_damaged_file_is_told(learned, tmp_path):
+    path = tmp_path / "mine.safetensors"
+    learned.save(path)
+    path.write_bytes(path.read_bytes()[:-40])
+    with pytest.raises(ValueError, match=r"does not hold a reachability .* learn it again"):
+        Reachability.load(path)
+    with pytest.raises(FileNotFoundError):
+        Reachability.load(tmp_path / "none.safetensors")
 
 
 def test_it_answers_for_many_places_at_once(learned):

@@ -79,7 +79,7 @@ def resolve_checkpoint(name_or_path: str | Path) -> Path:
         path = folder / f"{name_or_path}{SUFFIX}"
     for file in (path, path.with_suffix(".json")):
         if not file.is_file():
-            shipped = sorted(p.stem for p in folder.glob(f"*{SUFFIX}"))
+            shipped = sorted(p.stem for p in folder.glob("*.json"))
             raise FileNotFoundError(
                 f"checkpoint {str(name_or_path)!r}: there is no file {file}; give one of the "
                 f"shipped names {shipped} or the path of a {SUFFIX} file with its .json beside it"

@@ -6,18 +6,24 @@ recorded interactions alone; no kinematics is told.
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
 from torch import nn
 
+from affordlib.paths import repo_root
 from affordlib.primitives import PRIMITIVES, primitive_named
 
 if TYPE_CHECKING:
     import xarray as xr
 
 _HIDDEN, _STEPS, _RATE = 64, 1500, 1e-2
+SHIPPED = "data/checkpoints/reachability.safetensors"
 
 
 class Reachability(nn.Module):
@@ -32,6 +38,33 @@ class Reachability(nn.Module):
             nn.Tanh(),
             nn.Linear(_HIDDEN, 1),
         )
+
+    @classmethod
+    def load(cls, path: str | Path | None = None) -> Reachability:
+        """What was learned and saved; default: the shipped one, of the set `reach`.
+
+        Raises FileNotFoundError, or ValueError when the file is damaged or of another network.
+        """
+        path = Path(path or repo_root() / SHIPPED)
+        model = cls()
+        try:
+            model.load_state_dict(load_file(path))
+        except (RuntimeError, SafetensorError) as error:
+            raise ValueError(
+                f"{path} does not hold a reachability of this package; learn it again with "
+                f"python -m affordlib.planning.make_reachability"
+            ) from error
+        return model.eval()
+
+    def save(self, path: str | Path) -> None:
+        """Write the weights to a file that `load` reads, whole or not at all."""
+        making = Path(path).with_suffix(f".{os.getpid()}.tmp")
+        try:
+            save_file(self.state_dict(), making)
+            making.chmod(0o644)
+            making.replace(path)
+        finally:
+            making.unlink(missing_ok=True)
 
     @torch.no_grad()
     def probability(

@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from affordlib.interactions import open_interactions
 from affordlib.models.checkpoint import load_checkpoint
 from affordlib.paths import repo_root
 from affordlib.perception import looks_rollable
 from affordlib.planning.effect_map import EffectMap, map_effects
 from affordlib.planning.finish import Finish
-from affordlib.planning.reachability import Reachability, learn_reachability
+from affordlib.planning.reachability import Reachability
 from affordlib.planning.routes import REACH_M, RouteMap
 from affordlib.primitives import Drag, Grasp, Primitive, Push, Rotate, primitive_named
 from affordlib.types import check_within
@@ -56,13 +55,13 @@ class Repertoire:
 
     @classmethod
     def load(cls) -> Repertoire:
-        """The shipped models, and reachability learned from the shipped interactions (3 s)."""
+        """The shipped models, and reachability as it was learned from the shipped interactions."""
         folder = repo_root() / "data" / "checkpoints"
         models = {
             name: load_checkpoint(folder / f"{file}.safetensors")[0]
             for name, file in CHECKPOINTS.items()
         }
-        return cls(models, learn_reachability(open_interactions("reach")))
+        return cls(models, Reachability.load())
 
     def model(self, primitive: type[Primitive]) -> EffectModel:
         """The model of a primitive; raises KeyError naming those that are there."""
