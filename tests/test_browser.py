@@ -30,7 +30,7 @@ pytestmark = in_a_browser
 
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory):
-    with serve(tmp_path_factory.mktemp("lab"), "00_start_here") as lab:
+    with serve(tmp_path_factory.mktemp("lab"), "00_start_here", film_every=240) as lab:
         yield lab
 
 
