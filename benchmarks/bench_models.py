@@ -3,7 +3,8 @@
 Training: target points a second of the paper's loop (one trajectory, one target an iteration)
 against batches of 64 trajectories with 32 targets, and the share of this machine's matrix rate that
 these reach. Asking: the end effects of 180 pushes, and their courses of 25 steps, with one call
-against one call each, which looks at the image each time. Seconds are of one core's work, so others
+against one call each, which looks at the image each time; the one call with its look at the image,
+and, as planners ask, of an image that was encoded before. Seconds are of one core's work, so others
 on the machine take none; pairs alternate. `--long` also trains both to the error that the literal
 loop has after 20,000 iterations (a quarter of an hour), the batched one in batches of 8 with 8.
 """
@@ -73,7 +74,8 @@ def stepper(model, draw, fused):
 def report(what, ratios, goal):
     low, middle, high = min(ratios), np.median(ratios), max(ratios)
     print(f"{what:58} {middle:8.2f}   ({low:.2f} to {high:.2f}; goal {goal})")
-    KEPT.append({"what": what, "ratio_median": middle, "ratio_min": low, "ratio_max": high})
+    row = {"what": what, "ratio_median": middle, "ratio_min": low, "ratio_max": high, "goal": goal}
+    KEPT.append(row)
 
 
 def training_rates(training):
@@ -124,7 +126,14 @@ def asking_rates(training, model):
     def all_courses():
         ask(every, course.expand(DIRECTIONS, -1))
 
+    features = model.encode(image)
+
+    def all_ends_of_kept():
+        model.predict(features, every, end.expand(DIRECTIONS, -1))
+
     compare("180 ends", lambda: [ask(o, end) for o in each], all_ends, GOALS["ends"])
+    of_kept = [lambda: [ask(o, end) for o in each], all_ends_of_kept, GOALS["ends"]]
+    compare("180 ends, image encoded before", *of_kept)
     of_push = [lambda: [ask(o, course) for o in each[::10]], all_courses, GOALS["courses"], 10]
     compare("180 courses, a call a push", *of_push)
     of_time = [lambda: [ask(o, end) for o in each[::10]], all_courses, GOALS["courses"], 10 * STEPS]

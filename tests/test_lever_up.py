@@ -295,6 +295,18 @@ def test_the_older_layout_is_read(older):
     assert window_errors_m(model, small).shape == (2, 7, 5)
 
 
+def test_other_lengths_of_the_older_layout_are_learned_from(older, tmp_path):
+    poses, gray = np.zeros((20, 41, 6)), np.full((20, 128, 128), 0.8)
+    poses[..., 2] = np.linspace(0.0, 0.2, 41)
+    gray[:, 40:80, 64:100] = np.random.default_rng(1).uniform(0.2, 0.4, (20, 40, 36))
+    write_trajectories(tmp_path / "long", poses, gray)
+    arrays = read_trajectories(tmp_path / "long", view="wide")
+    assert arrays.image.shape == (20, 2, 48, 48)
+    for name, kind in (("anchored", "all"), ("lstm_tuned", "window")):
+        model, _ = fit_lever_model(short(name), arrays, arrays, kind, progress=False)
+        assert window_errors_m(model, arrays).shape == (20, 41 - 19, 5)
+
+
 @pytest.mark.parametrize(
     ("spoil", "reason"),
     [

@@ -237,21 +237,34 @@ def test_committed_tables_have_their_columns(committed):
 
 
 def test_committed_science(committed):
-    def final(table, object_class="all"):
-        rows = [r for r in committed[table] if r["object_class"] == object_class]
-        return {row["model"]: row["final_error_mean_m"] for row in rows}
+    def told(table, model, n, object_class="all", column="final_error_mean_m"):
+        (row,) = (
+            row
+            for row in committed[table]
+            if (row["model"], row["n_interactions"], row["object_class"])
+            == (model, n, object_class)
+        )
+        return row[column]
 
     for table in ("push", "push_test"):
-        push = final(table)
-        assert push["film"] < push["paper"] < push["constant"]
-        assert push["film"] < 0.002
-        assert push["paper"] < 0.007
-    assert max(final("drag").values()) < 0.002
-    film = [r for r in committed["grasp"] if r["model"] == "film"]
-    assert {r["rollable"] for r in film} == {True, False}
-    for row in film:
-        assert row["tp_percent"] + row["fn_percent"] == pytest.approx(100)
-        assert row["tp_low_percent"] <= row["tp_percent"] <= row["tp_high_percent"]
+        assert told(table, "film", 500) < told(table, "paper", 500) < told(table, "constant", 500)
+        assert told(table, "paper", 500) <= 0.007
+        assert told(table, "film", 500) <= 0.001
+        assert told(table, "film", 500, "cuboid") <= 0.0015
+        assert told(table, "film", 500, column="final_error_p95_m") <= 0.004
+        assert told(table, "film", 5000) <= 0.0005
+        assert told(table, "film", 5000, "cuboid") <= 0.0008
+        for n, most_deg in ((500, 3.0), (5000, 1.5)):
+            turned = told(table, "film", n, "cuboid", "yaw_error_mean_rad")
+            assert np.degrees(turned) <= most_deg
+    assert told("drag", "film", 500) < 0.0002
+    assert told("rotate", "film", 1000, column="error_mean_rad") < np.radians(2)
+    grasps = {(r["model"], r["n_interactions"], r["rollable"]): r for r in committed["grasp"]}
+    for rolls in (True, False):
+        ours, guess = (grasps[name, 1000, rolls] for name in ("film", "logistic"))
+        assert ours["auc"] > guess["auc"]
+        assert ours["tn_percent"] > guess["tn_percent"] + 5
+        assert ours["tp_low_percent"] <= ours["tp_percent"] <= ours["tp_high_percent"]
 
 
 def test_committed_means_of_all_are_those_of_the_classes(committed):

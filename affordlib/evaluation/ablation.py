@@ -19,6 +19,7 @@ from affordlib.interactions.batches import Batch, observe, sample_batch
 from affordlib.models.checkpoint import build
 from affordlib.models.film import FiLMNetwork
 from affordlib.models.make_checkpoints import SHIPPED
+from affordlib.models.protocol import observe_final_effect
 from affordlib.models.training import final_errors_m, literal_draw, train
 
 
@@ -97,6 +98,8 @@ CHANGES: dict[str, dict[str, Any]] = {
     "table frame": {"network": {"frame": "table"}},
     "no turned and mirrored copies": {"training": {"augment": False}},
     "no FiLM: image joined only": {"start": _no_modulation},
+    "no running mean of the weights": {"training": {"ema": 0.0}},
+    "plain likelihood (β = 0)": {"training": {"beta": 0.0}},
     "PyTorch's initialisation": {"start": _plain_start},
     "one trajectory, one target a step": {"draw": one_at_a_time},
     "random contexts only": {"draw": random_contexts},
@@ -106,8 +109,12 @@ CHANGES: dict[str, dict[str, Any]] = {
 """What is left out or changed, by name."""
 
 
-def ablated(change: str, steps: int, seed: int = 0) -> np.ndarray:
-    """Final errors (N,) [m] on `push_test` after a training on fold 0 of `push` with a change."""
+def ablated(change: str, steps: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """What `push_test` shows after a training on fold 0 of `push` with a change.
+
+    Final errors (N,) [m] of effects foreseen from actions; and, asked the other way, how far the
+    start of the push that is decoded from the true final effect is from the true one (N,) [m].
+    """
     how = {"image": True, "network": {}, "training": {}, "draw": sample_batch} | CHANGES[change]
     shipped = SHIPPED["push_film"]
     config = replace(shipped.training, steps=steps, seed=seed, **how["training"])
@@ -131,4 +138,8 @@ def ablated(change: str, steps: int, seed: int = 0) -> np.ndarray:
     model = build(network, scales(normaliser))
     how.get("start", lambda _: None)(model)
     train(model, training, validation, config, progress=False, draw=how["draw"])
-    return final_errors_m(model, test).numpy()
+    with torch.no_grad():
+        asked = observe_final_effect(model, test.effect[:, -1])
+        told = model.predict(model.encode(test.image), asked, torch.zeros(len(test), 1))
+    start = (told.action_mean[:, 0, :2] - test.action[:, 0, :2]).norm(dim=-1)
+    return final_errors_m(model, test).numpy(), start.numpy()

@@ -4,8 +4,11 @@
     latent        how far r from an action and r from its effect are the same, and what w₁ does
     rollability   whether an object rolls, read from its image alone
     mixed         one network for pushes and drags: which of them is meant, by the decoded action
-    varied        a world that is no clean room: error, and whether σ knows of it
+    varied        a perturbed world: error, and whether σ knows of it
     one_for_all   one network for all primitives, beside one for each
+    floor         the same push of an object that stands a millimetre and a degree off
+    stopped       actions broken off at t: the state then, and where things come to rest
+    reach         where the arm can act, as learned, against its kinematics
     tails         why σ is too wide for most pushes: three readings of what is off, and by how much
 
     python -m affordlib.evaluation.studies --only latent rollability
@@ -29,7 +32,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from affordlib.evaluation import one_for_all, tails
+from affordlib.evaluation import limits, one_for_all, tails
 from affordlib.evaluation.ablation import CHANGES, ablated
 from affordlib.evaluation.answers import rounded
 from affordlib.evaluation.effect_prediction import refuse_seen
@@ -53,7 +56,7 @@ FOLDER = "data/results/studies"
 Rows = list[dict[str, Any]]
 
 ABLATION_STEPS = 500
-ABLATION_SEEDS = 1
+ABLATION_SEEDS = 3
 TRAINING = replace(SHIPPED["push_film"].training, steps=1500)
 """Of `mixed` and `varied`; longer for a network that is shipped."""
 
@@ -68,7 +71,8 @@ def ablation() -> Rows:
     box = test_data["family"].values == 0
     rows = []
     for change in CHANGES:
-        errors = [ablated(change, ABLATION_STEPS, seed) for seed in range(ABLATION_SEEDS)]
+        told = [ablated(change, ABLATION_STEPS, seed) for seed in range(ABLATION_SEEDS)]
+        errors, starts = zip(*told, strict=True)
         mean = np.mean(errors, axis=0)
         each = [(e[box].mean() + e[~box].mean()) / 2 for e in errors]
         rows.append(
@@ -82,6 +86,9 @@ def ablation() -> Rows:
                 "final_error_max_m": float(np.max(each)),
                 "cuboid_mean_m": float(mean[box].mean()),
                 "final_error_p95_m": float(np.quantile(np.concatenate(errors), 0.95)),
+                "action_start_mean_m": float(np.mean(starts)),
+                "action_start_min_m": float(min(start.mean() for start in starts)),
+                "action_start_max_m": float(max(start.mean() for start in starts)),
             }
         )
     return rows
@@ -282,6 +289,9 @@ STUDIES: dict[str, tuple[Callable[[], Rows], tuple[str, ...], tuple[str, ...]]] 
     "varied": (varied, ("push_varied",), ("push_film_varied",)),
     "tails": (tails.tails, ("push", "drag", "push_test"), tails.CHECKPOINTS),
     "one_for_all": (one_for_all.one_for_all, (*one_for_all.PRIMITIVES, "push_test"), ()),
+    "floor": (limits.floor, ("push_test",), ()),
+    "stopped": (limits.stopped, ("partial",), limits.STOPPED),
+    "reach": (limits.reach, (), ()),
 }
 """By name: the study, the data sets and the checkpoints that it reads."""
 
@@ -289,10 +299,16 @@ STUDIES: dict[str, tuple[Callable[[], Rows], tuple[str, ...], tuple[str, ...]]] 
 def hashes(name: str) -> dict[str, Any]:
     """What a written study must hold to be that of today's data, checkpoints and settings."""
     _, sets, checkpoints = STUDIES[name]
-    training = replace(TRAINING, device="cpu")
-    settings = repr((training, SHIPPED["push_film"].network, ABLATION_STEPS, ABLATION_SEEDS))
-    if name == "one_for_all":
-        settings = repr(one_for_all.settings())
+    training, network = replace(TRAINING, device="cpu"), SHIPPED["push_film"].network
+    whole = replace(SHIPPED["push_film"].training, device="cpu")
+    own = {
+        "ablation": lambda: (network, whole, ABLATION_STEPS, ABLATION_SEEDS, list(CHANGES)),
+        "one_for_all": one_for_all.settings,
+        "floor": limits.floor_settings,
+        "stopped": lambda: limits.PHASES,
+        "reach": limits.reach_settings,
+    }
+    settings = repr(own[name]() if name in own else (training, network))
     files = {c: resolve_checkpoint(c).read_bytes() for c in checkpoints}
     return {
         "settings_sha256": hashlib.sha256(settings.encode()).hexdigest(),

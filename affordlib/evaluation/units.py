@@ -35,6 +35,7 @@ from affordlib.evaluation.parts import checked_part, chosen_options, open_once, 
 from affordlib.interactions import Normaliser, TrainingArrays, split_interactions
 from affordlib.interactions.batches import Symmetry, symmetric_copies
 from affordlib.interactions.store import stored_sha256
+from affordlib.models.attention import AttentionConfig
 from affordlib.models.checkpoint import load_checkpoint
 from affordlib.models.cnp import CNPConfig
 from affordlib.models.film import FiLMConfig
@@ -45,6 +46,7 @@ from affordlib.models.make_checkpoints import (
     about_training,
     train_model,
 )
+from affordlib.models.network import NetworkConfig
 from affordlib.models.training import TrainingConfig
 from affordlib.paths import repo_root
 from affordlib.results import write_text_atomically
@@ -54,7 +56,7 @@ if TYPE_CHECKING:
     from dask.distributed import Client
 
     from affordlib.interactions import Split
-    from affordlib.models.network import EffectNetwork, NetworkConfig
+    from affordlib.models.network import EffectNetwork
 
 FORMAT = 2
 """Counts the changes of code that change a unit's numbers without changing its configuration."""
@@ -64,7 +66,7 @@ FEW_STEPS = 800
 """Of training on the sets of 100 interactions."""
 
 PARTS = "data/results/parts"
-NETWORKS = ("paper", "film", "paper_push_frame", "film_table_frame")
+NETWORKS = ("paper", "film", "paper_push_frame", "film_table_frame", "attention")
 MODELS = (*NETWORKS, *BASELINES, "logistic")
 
 
@@ -72,7 +74,7 @@ MODELS = (*NETWORKS, *BASELINES, "logistic")
 class Task:
     """What is asked of a data set: channels, which of its objects' symmetries hold, a test set.
 
-    best_effects: what FiLM and the baselines foresee, where the paper's network foresees less;
+    best_effects: what all but the paper's network foresee, where that foresees less;
     also: a set that tests beside the folds; symmetries: (quarter turns, mirrored) under which the
     primitive stays itself, None where the training turns and mirrors by itself, as for pushes.
     """
@@ -96,6 +98,13 @@ TASKS: dict[str, Task] = {
 }
 
 TEN_TIMES = "_x10"
+KINDS: dict[str, tuple[str, type[NetworkConfig]]] = {
+    "paper": ("push_cnp", CNPConfig),
+    "film": ("push_film", FiLMConfig),
+    "attention": ("push_attention", AttentionConfig),
+}
+"""By the first word of a model: the shipped checkpoint whose training it has, its network."""
+
 OF_SET = {s.data: name for name, s in SHIPPED.items() if isinstance(s.network, FiLMConfig)}
 """The shipped FiLM networks by the sets they learn from."""
 
@@ -144,15 +153,16 @@ def learner(unit: Unit) -> tuple[NetworkConfig, TrainingConfig] | None:
     """
     if unit.model not in NETWORKS:
         return None
-    task, film = task_of(unit.data), unit.model.startswith("film")
-    shipped = SHIPPED["push_film" if film else "push_cnp"]
-    if film and unit.n == "all":
+    task, kind = task_of(unit.data), unit.model.split("_", maxsplit=1)[0]
+    name, config = KINDS[kind]
+    shipped = SHIPPED[name]
+    if kind == "film" and unit.n == "all":
         shipped = SHIPPED.get(OF_SET.get(unit.data, ""), shipped)
-    push_frame = unit.model in ("film", "paper_push_frame") and task.symmetries is None
-    network = (FiLMConfig if film else CNPConfig)(
+    from_behind = unit.model in ("film", "attention", "paper_push_frame")
+    network = config(
         action_channels=task.action_channels,
-        effect_channels=task.all_effects if film else task.effect_channels,
-        frame="push" if push_frame else "table",
+        effect_channels=task.effect_channels if kind == "paper" else task.all_effects,
+        frame="push" if from_behind and task.symmetries is None else "table",
     )
     training = replace(shipped.training, seed=unit.seed)
     if task.symmetries is not None:

@@ -141,14 +141,16 @@ def _asked(part: TrainingArrays, seen: Observations, target: torch.Tensor) -> Ba
 IMAGE_ENDINGS = (".png", ".jpg", ".pgm")
 
 
-def read_trajectories(folder: str | Path, steps: int | None = None) -> TrainingArrays:
+def read_trajectories(
+    folder: str | Path, steps: int | None = None, view: str = "full"
+) -> TrainingArrays:
     """A folder of the older study's layout (Seker, Tekden and Ugur, 2019) as arrays.
 
     folder/trajectories/NAME.txt: one row a step, six numbers x y z [m] roll pitch yaw [rad] of the
     object, in the frame of the lever, separated by blanks or commas; folder/images/NAME.png (or
     .jpg, .pgm): the grayscale image 128×128, moved and turned by contact point and direction, the
     object darker or brighter than the table, whose gray is that of the border. All trajectories
-    need `steps` rows (default: those of the first).
+    need `steps` rows (default: those of the first). view: of the image, see `lever_arrays`.
 
     Poses become changes since the first row, tilt is the angle of the upright axis. There is no
     commanded action in that layout, so both of its channels are zero. The image's first channel is
@@ -171,7 +173,7 @@ def read_trajectories(folder: str | Path, steps: int | None = None) -> TrainingA
         images.append(_read_image(folder / "images", file.stem))
     effect = torch.from_numpy(np.stack(poses)).float()
     return TrainingArrays(
-        torch.from_numpy(np.stack(images)),
+        viewed(torch.from_numpy(np.stack(images)), view),
         torch.linspace(0, 1, effect.shape[1]),
         torch.zeros(*effect.shape[:2], len(ACTION_CHANNELS)),
         effect,

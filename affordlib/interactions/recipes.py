@@ -24,7 +24,7 @@ _OBLIQUE_RAD = 0.18
 
 @dataclass(frozen=True)
 class Variation:
-    """What differs from episode to episode in a world that is no clean room.
+    """What differs from episode to episode in a perturbed world.
 
     Frictions, density and how much higher the gripper moves are drawn uniformly from ranges;
     com_offset: the centre of mass lies off the centre by up to this share of the half extents;
@@ -166,7 +166,7 @@ RECIPES: dict[str, Recipe] = {
     ),
 }
 """The paper's sets; a fixed test set no model trains on; partial executions, for testing only; a
-world that is no clean room; and objects all over the table, within reach or not."""
+perturbed world; and objects all over the table, within reach or not."""
 
 SHIPPED = tuple(RECIPES)
 

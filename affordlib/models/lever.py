@@ -12,7 +12,7 @@ all protocols together; a recurrent one for each by itself.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -169,9 +169,16 @@ def fit_lever_model(
     progress: bool = True,
     checkpoint: Path | None = None,
 ) -> tuple[EffectNetwork, list[TrainingRecord]]:
-    """As `train_lever_model`, of arrays: of another world's lever-ups, for one."""
+    """As `train_lever_model`, of arrays: of another world's lever-ups, for one.
+
+    The network gets as many steps as a trajectory has.
+    """
     torch.manual_seed(lever.training.seed)
-    model = build(lever.network, Normaliser.fit(training))
+    network, steps = lever.network, len(training.phase) - 1
+    for name in ("course_steps", "steps"):
+        if hasattr(network, name):
+            network = replace(network, **{name: steps})
+    model = build(network, Normaliser.fit(training))
     if hasattr(model, "fit_course"):
         model.fit_course(training.effect)
     history = train(

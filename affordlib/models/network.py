@@ -21,6 +21,7 @@ from affordlib.models.frame import (
 )
 from affordlib.types import Observations, Prediction
 
+PHASE_TOLERANCE = 1e-5
 RADIUS_TOLERANCE_M = 0.02
 _END_PHASE = 1e-3
 
@@ -140,8 +141,10 @@ class EffectNetwork(nn.Module, ABC):
     def predict(self, features: Tensor, observations: Observations, t_target: Tensor) -> Prediction:
         """Mean and σ (B, T, C) at t_target (B, T); features (B, F), or (1, F) for all.
 
-        Raises ValueError for actions that start or end elsewhere than those trained on.
+        Raises ValueError for phases outside [0, 1], and for actions that start or end elsewhere
+        than those trained on.
         """
+        self._check_phase(t_target)
         self._check_action(observations)
         push = self.config.frame == "push"
         if push:
@@ -210,6 +213,15 @@ class EffectNetwork(nn.Module, ABC):
             raise ValueError(
                 f"image {int(at_edge.nonzero()[0])}: the object reaches its edge, none trained on "
                 "does; centre the crop on the object, or train on such objects first"
+            )
+
+    @staticmethod
+    def _check_phase(t_target: Tensor) -> None:
+        low, high = t_target.detach().aminmax()
+        if not (low > -PHASE_TOLERANCE and high < 1 + PHASE_TOLERANCE):
+            raise ValueError(
+                f"t_target must lie in [0, 1], the phase of the whole action, got {float(low):.3f} "
+                f"to {float(high):.3f}"
             )
 
     def _check_action(self, o: Observations) -> None:
