@@ -24,6 +24,7 @@ from jinja2 import pass_context
 from nbconvert.exporters import HTMLExporter
 from nbconvert.filters.markdown_mistune import IPythonRenderer, MarkdownWithMath
 
+from affordlib.notebook_files import WIDGET
 from affordlib.paths import repo_root
 from affordlib.profiles import notebook_paths, read_notebook
 from affordlib.results import write_text_atomically
@@ -41,7 +42,6 @@ LINKED = "linked"
 """The folder of what pages link to; nbconvert takes "files/" away from links."""
 
 EQUATION_PX = 17
-WIDGET = "application/vnd.jupyter.widget-view+json"
 
 
 @dataclass(frozen=True)

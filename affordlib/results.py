@@ -156,6 +156,12 @@ def heading(column: str) -> str:
     return " ".join(words) + (f", {UNITS[unit][0]}" if unit else "")
 
 
+def factor(column: str) -> float:
+    """Return what a column's numbers are multiplied by to be in the unit of its heading."""
+    _, unit = _split_unit(column)
+    return UNITS[unit][1] if unit else 1.0
+
+
 def cell(column: str, value: object) -> str:
     """Return a value as shown under its column, in the unit and with the digits of the heading."""
     value = value.item() if isinstance(value, np.generic) else value
@@ -165,8 +171,8 @@ def cell(column: str, value: object) -> str:
         return "yes" if value else "no"
     _, unit = _split_unit(column)
     if unit and isinstance(value, int | float):
-        _, factor, digits = UNITS[unit]
-        return f"{round(value * factor, digits) + 0.0:.{digits}f}"
+        digits = UNITS[unit][2]
+        return f"{round(value * factor(column), digits) + 0.0:.{digits}f}"
     if isinstance(value, float):
         return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
     return str(value)

@@ -5,17 +5,19 @@
 Every seed is a run of `affordlib.workbook` in a folder of its own, `runs/<name>-seed<k>`; with a
 Dask client they run side by side, on workers that share the checkout. What they wrote is gathered
 into `runs/<name>-seeds/`: rows that agree in all their words and truths are one row, their numbers
-become means, and beside those that differ stands the standard deviation over seeds.
+become means, and beside those that differ stands the standard deviation over seeds. The page draws
+what differs, a dot a seed.
 """
 
 from __future__ import annotations
 
 import argparse
+import base64
 import html
 import statistics
 import subprocess
 import sys
-from collections import Counter
+import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -26,6 +28,7 @@ from nbconvert.filters.markdown_mistune import markdown2html_mistune
 from affordlib.paths import repo_root
 from affordlib.profiles import WorkbookError
 from affordlib.results import markdown_table, read_results, write_results, write_text_atomically
+from affordlib.seeds_picture import is_number, same_rows, seeds_picture
 from affordlib.workbook import run_name
 
 if TYPE_CHECKING:
@@ -37,6 +40,7 @@ STYLE = (
     "body{font-family:sans-serif;max-width:70rem;margin:2rem auto;padding:0 1rem;color:#222}"
     "table{border-collapse:collapse;display:block;overflow-x:auto;font-size:.85rem}"
     "th,td{padding:.3rem .7rem;text-align:right;border-bottom:1px solid #ddd}"
+    "img{max-width:100%}.anchor-link{display:none}"
 )
 
 
@@ -54,30 +58,37 @@ def run_seeds(
 ) -> None:
     """Run the batch for every seed into `runs/<name>-seed<k>`, one after another or by a client.
 
-    Raises WorkbookError, after all have ended, with what the failed ones said.
+    Says of each when it is done. Raises WorkbookError, after all have ended, with what the failed
+    ones said.
     """
-    commands = [
-        command(["--seed", str(seed), "--out", f"{name}-seed{seed}", *arguments]) for seed in seeds
+    batches = [
+        (seed, command(["--seed", str(seed), "--out", f"{name}-seed{seed}", *arguments]))
+        for seed in seeds
     ]
     if client is None:
-        done = [_run(one) for one in commands]
+        done = (_run(batch) for batch in batches)
     else:
+        from dask.distributed import as_completed
+
         # Whether a batch has to run is for the batch to say: it skips what is complete.
-        done = client.gather(client.map(_run, commands, pure=False))
-    failed = [
-        f"seed {seed}:\n{said.strip()}"
-        for seed, (code, said) in zip(seeds, done, strict=True)
-        if code
-    ]
+        futures = client.map(_run, batches, pure=False)
+        done = (said for _, said in as_completed(futures, with_results=True))
+    failed = []
+    for seed, code, said, minutes in done:
+        print(f"seed {seed}: {'failed' if code else 'done'} after {minutes:.1f} min", flush=True)
+        if code:
+            failed.append(f"seed {seed}:\n{said.strip()}")
     if failed:
-        raise WorkbookError("\n".join(failed))
+        raise WorkbookError("\n".join(sorted(failed)))
 
 
-def _run(command: Sequence[str]) -> tuple[int, str]:
+def _run(batch: tuple[int, Sequence[str]]) -> tuple[int, int, str, float]:
+    seed, command = batch
+    began = time.monotonic()
     done = subprocess.run(
         command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False
     )
-    return done.returncode, done.stdout
+    return seed, done.returncode, done.stdout, (time.monotonic() - began) / 60
 
 
 def over_seeds(tables: Sequence[Sequence[Row]]) -> list[dict[str, Any]]:
@@ -85,30 +96,19 @@ def over_seeds(tables: Sequence[Sequence[Row]]) -> list[dict[str, Any]]:
 
     Rows are the same if they agree in all that is no number, and in their place among such rows.
     """
-    same: dict[tuple, list[Row]] = {}
-    for rows in tables:
-        seen: Counter = Counter()
-        for row in rows:
-            words = tuple((k, v) for k, v in row.items() if not _is_number(v))
-            seen[words] += 1
-            same.setdefault((words, seen[words]), []).append(row)
-    return [_together(rows) for rows in same.values()]
+    return [_together(rows) for rows in same_rows(tables)]
 
 
 def _together(rows: Sequence[Row]) -> dict[str, Any]:
     row: dict[str, Any] = {"seeds": len(rows)}
     for column, value in rows[0].items():
         values = [each[column] for each in rows]
-        if not _is_number(value) or len(set(values)) == 1:
+        if not is_number(value) or len(set(values)) == 1:
             row[column] = value
             continue
         row[column] = statistics.fmean(values)
         row[f"sd_{column}"] = statistics.stdev(values)
     return row
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def gather(folders: Mapping[int, Path], into: Path) -> Path:
@@ -131,6 +131,10 @@ def gather(folders: Mapping[int, Path], into: Path) -> Path:
         page.append(f"## {name}")
         for table, rows in tables.items():
             page += [f"### {table.replace('_', ' ')}", markdown_table(rows) if rows else "Empty."]
+            told = [document["tables"].get(table, []) for document in documents]
+            if (picture := seeds_picture(told)) is not None:
+                data = base64.b64encode(picture).decode()
+                page.append(f"![each seed of {table}](data:image/png;base64,{data})")
     text = markdown2html_mistune("\n\n".join(page))
     head = f"<!DOCTYPE html><meta charset='utf-8'><title>{html.escape(into.name)}</title>"
     path = into / "index.html"
@@ -146,7 +150,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", default="", metavar="NAME", help="default: the profile")
     parser.add_argument("--only", default="", metavar="'03 06'")
     parser.add_argument("--settings", nargs="*", default=[], metavar="NN_title.parameter=value")
-    parser.add_argument("--workers", type=int, default=1, help="seeds side by side on this machine")
+    parser.add_argument("--workers", type=int, default=2, help="seeds side by side on this machine")
+    parser.add_argument("--force", action="store_true", help="run also what is complete")
+    parser.add_argument("--dry-run", action="store_true", help="say what would run")
     parser.add_argument("--scheduler", help="a Dask scheduler whose workers share the checkout")
     options = parser.parse_args(argv)
     runs = repo_root() / "runs"
@@ -154,10 +160,20 @@ def main(argv: Sequence[str] | None = None) -> int:
         if len(set(options.seeds)) < len(options.seeds) or min(options.seeds) < 0:
             raise WorkbookError(f"SEEDS must differ and be 0 or more, got {options.seeds}")
         name = run_name(options.profile, 0, options.out or None)
-        arguments = ["--profile", options.profile, "--only", options.only, "--", *options.settings]
+        arguments = ["--profile", options.profile, "--only", options.only]
+        arguments += ["--force"] * options.force + ["--", *options.settings]
+        # What would run is said in any case; it is also where wrong settings are refused.
+        for seed in options.seeds:
+            own = ["--seed", str(seed), "--out", f"{name}-seed{seed}", "--dry-run"]
+            _, code, said, _ = _run((seed, command_of(own + arguments)))
+            if code:
+                raise WorkbookError(said.strip())
+            print(f"seed {seed}: {said.strip()}", flush=True)
+        if options.dry_run:
+            return 0
         with ExitStack() as stack:
             client = None
-            if options.scheduler or options.workers > 1:
+            if options.scheduler or min(options.workers, len(options.seeds)) > 1:
                 from dask.distributed import Client, LocalCluster
 
                 cluster = options.scheduler or stack.enter_context(

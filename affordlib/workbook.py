@@ -39,6 +39,7 @@ from jupyter_client.manager import AsyncKernelManager
 from nbclient.exceptions import DeadKernelError
 
 from affordlib import durations
+from affordlib.notebook_files import cleaned, own_cells
 from affordlib.paths import digest_of, repo_root
 from affordlib.profiles import (
     WorkbookError,
@@ -52,8 +53,6 @@ from affordlib.profiles import (
     read_profile,
 )
 from affordlib.results import read_results, write_text_atomically
-
-NOT_OURS = {"injected-parameters", "papermill-error-cell-tag"}  # cells that papermill adds
 
 
 @dataclass(frozen=True)
@@ -301,8 +300,7 @@ def explained(job: Job, copy: Path, error: Exception) -> str:
             reason += " (out of memory, or a crash in compiled code)"
     where, kept = "before its first cell", ""
     with contextlib.suppress(WorkbookError):
-        cells = read_notebook(copy).cells
-        cells = [c for c in cells if not NOT_OURS & set(c.metadata.get("tags", []))]
+        cells = own_cells(read_notebook(copy).cells)
         started = [
             i for i, c in enumerate(cells) if c.metadata.get("papermill", {}).get("start_time")
         ]
@@ -314,21 +312,6 @@ def explained(job: Job, copy: Path, error: Exception) -> str:
         f"{job.name} failed {where}\n{reason}{kept} "
         "The same command goes on from this notebook once it is mended."
     )
-
-
-def cleaned(notebook: nbformat.NotebookNode) -> str:
-    """Return an executed notebook as it is committed: outputs and tags kept, the rest dropped."""
-    cells = [c for c in notebook.cells if not NOT_OURS & set(c.metadata.get("tags", []))]
-    for cell in cells:
-        cell.metadata = {k: cell.metadata[k] for k in ("tags", "jupyter") if cell.metadata.get(k)}
-    clean = nbformat.v4.new_notebook(
-        cells=cells,
-        metadata={
-            "kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"},
-            "language_info": {"name": "python"},
-        },
-    )
-    return nbformat.writes(clean) + "\n"
 
 
 def run_name(profile: str, seed: int, name: str | None) -> str:

@@ -15,18 +15,19 @@ import urllib.request
 from contextlib import contextmanager
 from types import SimpleNamespace
 from urllib.error import URLError
+from urllib.parse import urlparse
 
 import nbformat
 import numpy as np
 import papermill
 import pytest
 
+from affordlib.notebook_files import WIDGET
 from affordlib.paths import repo_root
 
 CHROMIUM = shutil.which("chromium")
 FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"]
 PICTURES = repo_root() / "runs" / "browser"
-WIDGET = "application/vnd.jupyter.widget-view+json"
 
 in_a_browser = [
     pytest.mark.slow,
@@ -60,11 +61,6 @@ def serve(folder, name, source=None, **parameters):
         prepare_only=True,
         kernel_name="python3",
         language="python",
-    )
-    settings = folder / "settings" / "@jupyterlab" / "apputils-extension"
-    settings.mkdir(parents=True)
-    (settings / "notification.jupyterlab-settings").write_text(
-        json.dumps({"fetchNews": "false", "checkForUpdates": False})
     )
     port, token = free_port(), secrets.token_hex(16)
     own = {
@@ -239,11 +235,21 @@ def assert_same_goal(page, table, x_m, y_m, within_m=0.0011):
     np.testing.assert_allclose(drawn, planned, atol=2e-4)
 
 
-def assert_goal(page, condition, seconds=20):
+def wait_until(condition, seconds=20, otherwise="waited in vain"):
     end = time.monotonic() + seconds
-    while not condition(goal_of(page)):
-        assert time.monotonic() < end, f"the goal stays {goal_of(page)}"
+    while not condition():
+        assert time.monotonic() < end, otherwise
         time.sleep(0.05)
+
+
+def assert_goal(page, condition, seconds=20):
+    wait_until(lambda: condition(goal_of(page)), seconds, "the goal stays as it is")
+
+
+def hosts(page):
+    """Where the page has asked anything."""
+    asked = (url for url in page.requests if not url.startswith(("data:", "blob:")))
+    return {urlparse(url).netloc for url in asked}
 
 
 def saved_outputs(page, lab):

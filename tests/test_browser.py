@@ -1,6 +1,7 @@
 """Notebook 00 in a real browser: mouse, keyboard and buttons of its goal picker."""
 
 import json
+import os
 import time
 from urllib.parse import urlparse
 
@@ -16,12 +17,14 @@ from lab_pages import (
     button,
     choose,
     goal_of,
+    hosts,
     in_a_browser,
     opened,
     picture,
     saved_outputs,
     serve,
     wait_for_words,
+    wait_until,
     words,
 )
 
@@ -92,13 +95,10 @@ def test_sliders_by_keyboard(page, table):
 
 def test_planner(page, table):
     choose(page, "gradient")
-    end = time.monotonic() + 20
-    while ask(page, "picker.plan.planner") != "gradient_direction":
-        assert time.monotonic() < end
+    wait_until(lambda: ask(page, "picker.plan.planner") == "gradient_direction")
     assert_same_goal(page, table, *goal_of(page))
     choose(page, "A*")
-    while ask(page, "picker.plan.planner") != "astar":
-        assert time.monotonic() < end
+    wait_until(lambda: ask(page, "picker.plan.planner") == "astar")
     table.wait_for_answer()
 
 
@@ -106,6 +106,10 @@ def test_run(page, table):
     page.mouse.click(*table.at(0.12, 0.12))
     assert_same_goal(page, table, 0.12, 0.12)
     before = table.points(".object").mean(axis=0)
+    std_m = ask(page, "[step.std_m for step in picker.plan.steps]")
+    radii = page.locator(".plan .sigma").evaluate_all("all => all.map((e) => e.r.baseVal.value)")
+    assert radii == pytest.approx([20 * 1000 * s for s in std_m], abs=0.02)
+    assert min(radii) > 3  # which the dot at its centre is
     button(page, "Run").click()
     wait_for_words(page, "from the goal, ")
     outcome = ask(page, "[*picker.outcome.end_pose, picker.outcome.distance_m]")
@@ -136,9 +140,8 @@ def test_disturb(page, table):
     goal, pose = goal_of(page), ask(page, "playground.object_pose()")
     drawn = table.points(".object").mean(axis=0)
     button(page, "Shove it").click()
-    end = time.monotonic() + 20
-    while (shoved := ask(page, "playground.object_pose()")) == pose:
-        assert time.monotonic() < end
+    wait_until(lambda: ask(page, "playground.object_pose()") != pose)
+    shoved = ask(page, "playground.object_pose()")
     assert 0.019 < np.hypot(*np.subtract(shoved[:2], pose[:2])) < 0.041
     moved = table.points(".object").mean(axis=0) - drawn
     np.testing.assert_allclose(moved, np.subtract(shoved[:2], pose[:2]), atol=1e-3)
@@ -165,17 +168,56 @@ def test_a_closed_loop_follows_a_goal_that_moves(page, table):
     choose(page, "open loop")
 
 
-def test_save_and_load(page, table):
+def test_everything_can_be_pressed_without_a_mouse(page, table):
+    button(page, "Start over").click()
+    wait_for_words(page, "Plan:")
+    table.svg.focus()
+    focused = "document.activeElement"
+    names = []
+    while "Shove it" not in names:
+        page.keyboard.press("Tab")
+        names.append(page.evaluate(f"{focused}.innerText || {focused}.className"))
+        assert len(names) < 40, names
+        assert page.evaluate(f"{focused}.closest('.affordlib-picker') !== null"), names
+    assert any(name.strip() == "Run" for name in names), names
+    pose, goal = ask(page, "playground.object_pose()"), goal_of(page)
+    page.keyboard.press("Enter")
+    wait_until(lambda: ask(page, "playground.object_pose()") != pose)
+    page.keyboard.press("Tab")
+    assert page.evaluate(f"{focused}.innerText").strip() == "Move goal"
+    page.keyboard.press("Space")
+    assert_goal(page, lambda new: new != goal)
+
+
+def test_save_and_load(page, table, lab):
     page.mouse.click(*table.at(-0.1, 0.05))
     assert_same_goal(page, table, -0.1, 0.05)
     button(page, "Save").click()
     wait_for_words(page, "Saved the plan")
+    assert (lab.out / "plan.json").is_file()
     goal = goal_of(page)
     page.mouse.click(*table.at(0.0, 0.15))
     assert_same_goal(page, table, 0.0, 0.15)
     button(page, "Load").click()
     wait_for_words(page, "Loaded.")
     assert_same_goal(page, table, *goal)
+
+
+QUIET_S = 0.04
+"""What the sum below takes on a machine of two cores with nothing else to do."""
+
+SHARED = 4
+"""How much longer an answer may take while other tests use the same cores."""
+
+
+def how_much_slower():
+    """How much slower than a quiet machine this one is now, at least 1."""
+    times = []
+    for _ in range(9):
+        began = time.perf_counter()
+        sum(k * k for k in range(500_000))
+        times.append(time.perf_counter() - began)
+    return max(1.0, float(np.median(times)) / QUIET_S)
 
 
 def test_the_plan_follows_the_hand(page, table):
@@ -216,9 +258,13 @@ def test_the_plan_follows_the_hand(page, table):
         for told, share in (("median", 0.5), ("p95", 0.95))
     }
     measured["plan_ms"] = 1000 * ask(page, "picker.plan.plan_s")
-    (PICTURES / "times.json").write_text(json.dumps(measured, indent=1) + "\n")
-    assert measured["first_median_ms"] < 500, measured
-    assert measured["first_median_ms"] < measured["refined_median_ms"] < 2000, measured
+    slower = how_much_slower()
+    if int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", 1)) > 1:
+        slower *= SHARED
+    told = measured | {"slower": slower}
+    (PICTURES / "times.json").write_text(json.dumps(told, indent=1) + "\n")
+    for name, most_ms in (("first_median", 100), ("first_p95", 250), ("refined_median", 400)):
+        assert measured[f"{name}_ms"] < most_ms * slower, told
     assert_same_goal(page, table, *goal_of(page))
 
 
@@ -231,12 +277,8 @@ def test_turn_and_lift(page, table):
         handles.nth(slider).focus()
         for _ in range(presses):
             page.keyboard.press(key)
-    end = time.monotonic() + 20
-    while ask(page, "[picker._goal.turn_rad, picker._goal.height_m]") != [
-        pytest.approx(np.radians(30)),
-        pytest.approx(0.05),
-    ]:
-        assert time.monotonic() < end
+    asked = [pytest.approx(np.radians(30)), pytest.approx(0.05)]
+    wait_until(lambda: ask(page, "[picker._goal.turn_rad, picker._goal.height_m]") == asked)
     wait_for_words(page, "then grasp to")
     wanted, foreseen = table.points(".wanted"), table.points(".foreseen")
     np.testing.assert_allclose(foreseen, wanted, atol=0.021)  # placed and turned alike
@@ -261,8 +303,6 @@ def test_a_saved_notebook_keeps_a_picture(page, lab):
 
 
 def test_no_request_leaves_the_machine(page, lab):
-    hosts = {
-        urlparse(url).netloc for url in page.requests if not url.startswith(("data:", "blob:"))
-    }
-    assert hosts == {urlparse(lab.address).netloc}
+    assert hosts(page) == {urlparse(lab.address).netloc}
     assert any("ws" in urlparse(url).scheme for url in page.requests)
+    assert page.locator("text=Would you like to get notified").count() == 0

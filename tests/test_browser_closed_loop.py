@@ -1,5 +1,7 @@
 """Notebook 07 in a real browser: all its cells, and a robot that is disturbed by hand."""
 
+from urllib.parse import urlparse
+
 import numpy as np
 import pytest
 import yaml
@@ -9,6 +11,7 @@ from lab_pages import (
     ask,
     button,
     goal_of,
+    hosts,
     in_a_browser,
     opened,
     picture,
@@ -45,14 +48,19 @@ def test_all_cells_have_run(page, lab):
     assert (lab.out / f"{NAME}.json").is_file()
 
 
-def test_disturbed_while_it_works_it_still_arrives(page):
+def test_disturbed_while_it_works_it_still_arrives(page, lab):
     table = Table(page)
     goal = goal_of(page)
     button(page, "Run").click()
     page.wait_for_function("() => document.querySelector('.trail')?.getAttribute('points')")
+    first = table.points(".plan .prediction")
     button(page, "Shove it").click()
     button(page, "Move goal").click()
     wait_for_words(page, "from the goal, within")
+    last = table.points(".plan .prediction")  # of the plan that it has come to in the end
+    assert first.shape != last.shape or not np.allclose(first, last)
+    np.testing.assert_allclose(last[-1], ask(page, "list(picker._goal.xy_m)"), atol=0.005)
+    assert hosts(page) == {urlparse(lab.address).netloc}
     there = ask(page, "list(picker._goal.xy_m)")
     assert 0.039 < np.hypot(*np.subtract(there, goal)) < 0.081
     assert ask(page, "picker.outcome.distance_m") < 0.005

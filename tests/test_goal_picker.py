@@ -6,6 +6,7 @@ import math
 import time
 from dataclasses import replace
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from PIL import Image
@@ -16,6 +17,7 @@ from affordlib.planning import Repertoire, carry_out, plan_astar, plan_continuou
 from affordlib.primitives import Drag, Push, Rotate
 from affordlib.show import GoalPicker
 from affordlib.show.executors import closed_loop, open_loop
+from affordlib.show.plots import plot_plan
 from affordlib.show.table_view import TableView
 from affordlib.types import Goal, Plan, Step
 from affordlib.world import BASE_X_M, REACH_M, Cuboid
@@ -324,6 +326,42 @@ def test_the_ring_is_where_the_arm_can_push_from(world):
     reached = data["reached"].values[pushes].astype(bool)
     assert (inside == reached).mean() > 0.93
     assert reached[inside].mean() > 0.97
+
+
+def test_a_closed_loop_shows_the_plans_it_makes_on_the_way(make_picker, trained):
+    repertoire, shown = Repertoire({"push": trained}), []
+    picker = make_picker(executors={"closed loop": closed_loop(repertoire)}, seed=3)
+    picker.planners["A*"] = repertoire.planner(plan_astar)
+    picker.pick(0.2, 0.0)
+    first = picker._view.scene["steps"]
+    picker._view.observe(lambda change: shown.append(change["new"]), names="scene")
+    picker._waiting.append(picker._move_goal)  # as if asked for while it works
+    picker.run()
+    goal = picker._goal
+    planned_for = {tuple(scene["goal"]["xy"]) for scene in shown if scene["steps"] != first}
+    assert goal.xy_m in planned_for
+    assert picker.plan.goal.xy_m == goal.xy_m != (0.2, 0.0)
+    assert picker.plan.planner == "astar"  # as the reader chose
+    end = np.array(picker._view.scene["steps"][-1]["end"])
+    assert np.hypot(*(end - goal.xy_m)) < 0.005  # what is drawn leads to where the goal is now
+    assert picker.outcome.distance_m < 0.01
+
+
+def test_a_planner_that_cannot_be_told_of_the_arm_gives_way_and_it_is_said(make_picker, trained):
+    picker = make_picker(executors={"closed loop": closed_loop(Repertoire({"push": trained}))})
+    picker.run()
+    assert picker.plan.planner == "continuous"
+    assert "planned anew by continuous search" in picker.controls.words.value
+
+
+def test_sigma_is_drawn_so_that_it_can_be_seen(picker):
+    for drawn, step in zip(picker._view.scene["steps"], picker.plan.steps, strict=True):
+        assert drawn["disc"] == pytest.approx(20 * step.std_m, abs=1e-5)
+    figure, ax = plt.subplots()
+    plot_plan(ax, picker.plan)
+    discs = [p.get_radius() for p in ax.patches if p.get_facecolor()[3] not in (0, 1)]
+    assert discs == pytest.approx([100 * 20 * step.std_m for step in picker.plan.steps])
+    plt.close(figure)
 
 
 @pytest.fixture

@@ -102,6 +102,7 @@ class Chase:
         self.paths: list[np.ndarray] = []
         self.moves = MovePlanner(world, repertoire, demands)
         self.places: list[tuple[float, float]] = []
+        self.plan: Plan | None = None  # that is followed
         self.queue: list[Step] = []
         self.seen: Percept | None = None
         self.renewals = RENEWALS
@@ -203,19 +204,20 @@ class Chase:
             # A grasp takes an object as the rotation left it, or it would turn it back.
             self.grip_yaws = hands_in_line(float(step.primitive.path(step.stop_phase)[0, 3]))
         if self.demands.on_action is not None:
-            plan = (
-                self.moves.plans[-1]
-                if self.moves.plans
-                else Plan(self.goal, self.seen.xy_m, (step,), part, False, 0, 0.0)
-            )
-            self.script.goal = self.demands.on_action(plan, len(self.steps)) or self.goal
+            self.script.goal = self.demands.on_action(self.plan, len(self.steps)) or self.goal
 
     def _next_move(self) -> Step:
         if len(self.steps) >= self.limit:
             self._give_up("position")
         if not self.queue:
             self.queue = self.moves.steps(self.seen, self.goal, self._count())
+            self._follow(self.moves.plans[-1])
         return self.queue.pop(0)
+
+    def _follow(self, plan: Plan) -> None:
+        self.plan = plan
+        if self.demands.on_plan is not None:
+            self.demands.on_plan(plan)
 
     def _turn_left(self) -> float | None:
         if self.goal.turn_rad is None:
@@ -259,6 +261,8 @@ class Chase:
             if step is None:
                 break
             if self.world.can_reach(step.primitive, step.stop_phase, self.seen.xy_m):
+                kind, at = step.primitive.name, self.seen.xy_m
+                self._follow(Plan(self.goal, at, (step,), kind, False, len(grip_yaws), 0.0))
                 return step
             self.moves.vetoes += 1
             vetoed = step.primitive

@@ -99,6 +99,7 @@ def pursue(
     disturbances: Sequence[Disturbance] = (),
     horizon: int = 3,
     on_action: Callable[[Plan, int], Goal | None] | None = None,
+    on_plan: Callable[[Plan], None] | None = None,
 ) -> Pursuit:
     """Bring the object to a goal, whatever happens on the way: position, orientation, height.
 
@@ -106,7 +107,8 @@ def pursue(
     for. max_actions: default `action_limit` of the distance, renewed when the goal moves or
     somebody displaces the object (that at most three times). disturbances: what shall happen.
     on_action: called with the plan and the number of actions taken, after each; it may return a
-    new goal. Never moves where the arm's kinematics says no.
+    new goal. on_plan: called with every plan before its first action. Never moves where the arm's
+    kinematics says no.
     """
     for name, value in (("tolerance_m", tolerance_m), ("height_tolerance_m", height_tolerance_m)):
         check_within(name, value, 1e-5, 0.1, "m")
@@ -121,6 +123,7 @@ def pursue(
         height_tolerance_m,
         max_actions,
         on_action,
+        on_plan,
     )
     chase = Chase(world, goal, repertoire, demands, disturbances)
     return chase.run()

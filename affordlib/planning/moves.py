@@ -46,6 +46,7 @@ class Demands:
     height_tolerance_m: float
     max_actions: int | None
     on_action: Callable[[Plan, int], Goal | None] | None
+    on_plan: Callable[[Plan], None] | None = None
 
 
 class MovePlanner:

@@ -95,7 +95,8 @@ class Repertoire:
 
         Told of the object's primitive, where the arm can act, and what turns and lifts it in the
         end. As long as the image (2, 48, 48) stays the same, as it does while only the goal moves,
-        what the models say of it is kept. The function takes further settings of the planner.
+        what the models say of it is kept. The function takes further settings of the planner,
+        which is its `__wrapped__`.
         """
         last: dict[bytes, dict[str, Any]] = {}
 
@@ -108,6 +109,7 @@ class Repertoire:
                 last[seen] = self._told_of(image)
             return plan(start_xy_m=start_xy_m, goal=goal, **last[seen], **settings | further)
 
+        planner.__wrapped__ = plan
         return planner
 
     def _told_of(self, image: np.ndarray) -> dict[str, Any]:

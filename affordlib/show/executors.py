@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from affordlib.planning import carry_out, pursue
+from affordlib.planning import carry_out, plan_continuous, pursue
 from affordlib.types import Goal, Outcome, Plan
 
 if TYPE_CHECKING:
@@ -18,9 +18,17 @@ if TYPE_CHECKING:
 Planner = Callable[[np.ndarray, tuple[float, float], Goal], Plan]
 """From an image, where the object is [m] and a goal to a plan."""
 
-Tell = Callable[[], Goal]
-"""Called after every action: shows it, lets what was waiting happen, returns the goal as it is by
-then. Raises `Stopped` when the reader wants no more."""
+
+class Tell(Protocol):
+    """How an executor tells what it does, and hears what the reader wants."""
+
+    def __call__(self, plan: Plan | None = None) -> Goal:
+        """Show the last action, or, if there is one, the new plan that is followed from now on.
+
+        After an action it lets what was waiting happen. Returns the goal as it is by then; raises
+        `Stopped` when the reader wants no more.
+        """
+
 
 Executor = Callable[["Tabletop", Plan, Planner, Tell], Outcome]
 """How far it turned and lifted the object, whoever watches it measures."""
@@ -43,13 +51,25 @@ def open_loop(world: Tabletop, plan: Plan, planner: Planner, tell: Tell) -> Outc
 def closed_loop(repertoire: Repertoire) -> Executor:
     """An executor that looks after every action and plans anew until the goal is reached.
 
-    It plans by itself, from what it sees, with the models of a repertoire.
+    It plans from what it sees, with the models of a repertoire, as the planner does where that is
+    of `Repertoire.planner`. Any other cannot be told where the arm can act; then it plans with
+    `plan_continuous`, and says so.
     """
 
     def execute(world: Tabletop, plan: Plan, planner: Planner, tell: Tell) -> Outcome:
-        done = pursue(world, plan.goal, repertoire, on_action=lambda *_: tell())
-        tilt, paths = world.object_tilt_rad(), done.object_paths_xy_m
+        search = getattr(planner, "__wrapped__", None)
+        done = pursue(
+            world,
+            plan.goal,
+            repertoire,
+            search or plan_continuous,
+            on_action=lambda *_: tell(),
+            on_plan=tell,
+        )
         words = "" if done.reached else f"The loop ended as {done.ending}: {done.words}."
-        return Outcome(plan, done.distance_m, done.end_pose, tilt, paths, words=words)
+        if search is None:
+            words += " It was planned anew by continuous search."
+        tilt, paths = world.object_tilt_rad(), done.object_paths_xy_m
+        return Outcome(plan, done.distance_m, done.end_pose, tilt, paths, words=words.strip())
 
     return execute

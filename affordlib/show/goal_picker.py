@@ -26,7 +26,7 @@ from affordlib.show.picker_controls import PickerControls
 from affordlib.show.plots import table_picture
 from affordlib.show.pose_film import moving_part, pose_recorder
 from affordlib.show.sentences import outcome_in_words, plan_in_words
-from affordlib.show.table_view import TableView, make_scene, rounded
+from affordlib.show.table_view import TableView, draw_way, make_scene, rounded, whole_mm
 from affordlib.types import Goal
 
 if TYPE_CHECKING:
@@ -46,13 +46,9 @@ class GoalPicker(widgets.VBox):
 
     planners: name → function (image, start_xy_m, goal) → Plan. executors: name → function (world,
     plan, planner, tell) → Outcome that carries a plan out, or plans again with the planner that
-    made it. It calls tell() after every action, which shows the reader what happened, lets a
-    waiting disturbance happen, returns the goal as it is by then, and raises `Stopped`, to be let
-    through, once Stop was pressed. The default is `open_loop` alone. draft: a quick planner whose
-    plan is shown while the hand moves the goal; that of the chosen one takes its place when the
-    hand rests.
-    goal_xy_m: [m], in whole millimetres. seed: of the disturbances. folder: where plans are saved,
-    relative to the repository.
+    made it; see `Tell`. `Stopped` is to be let through. The default is `open_loop` alone. draft: a
+    quick planner whose plan is shown while the hand moves the goal; that of the chosen one takes
+    its place when the hand rests. seed: of the disturbances. folder: where plans are saved.
 
     `plan` and `outcome` hold what is shown; `pick`, `ask_pose`, `run`, `stop`, `shove_object`,
     `move_goal`, `start_over`, `save` and `load` do what mouse and buttons do. *Run* works in the
@@ -79,9 +75,10 @@ class GoalPicker(widgets.VBox):
         self.outcome: Outcome | None = None
         self._rng = np.random.default_rng(seed)
         self._pose = self._start = self._first_pose = world.object_pose()
-        self._goal = Goal(_whole_mm(*goal_xy_m))
+        self._turn_from = self._pose[2]  # what a wanted turn is counted from
+        self._goal = Goal(whole_mm(*goal_xy_m))
         self._running = self._setting = self._lifted = False
-        self._rest: asyncio.TimerHandle | None = None  # while the plan shown is a draft
+        self._rest: asyncio.TimerHandle | None = None  # while a draft is shown
         self._stop = threading.Event()
         self._waiting: list[Callable[[], None]] = []
         self._poses: list[tuple[float, ...]] = []  # of the film since the last action
@@ -94,7 +91,7 @@ class GoalPicker(widgets.VBox):
 
     def pick(self, x_m: float, y_m: float) -> None:
         """Set the goal [m], to the nearest millimetre, and make the plan anew."""
-        self._set_goal(replace(self._goal, xy_m=_whole_mm(x_m, y_m)))
+        self._set_goal(replace(self._goal, xy_m=whole_mm(x_m, y_m)))
         self._replan()
 
     def ask_pose(self, turn_deg: float = 0.0, height_cm: float = 0.0) -> None:
@@ -136,7 +133,9 @@ class GoalPicker(widgets.VBox):
         if self.plan is None:
             raise RuntimeError("there is no plan to save; pick a goal that can be planned for")
         path = save_plan(resolve_out_dir(self.folder) / name, self.plan)
-        self._say(f"Saved the plan and its goal as {html.escape(f'{self.folder}/{path.name}')}.")
+        self.controls.say(
+            f"Saved the plan and its goal as {html.escape(f'{self.folder}/{path.name}')}."
+        )
 
     def load(self, name: str = "plan.json") -> None:
         """Show a saved plan with its goal, to be run as it is."""
@@ -145,11 +144,11 @@ class GoalPicker(widgets.VBox):
         self._no_rest()
         self._set_goal(plan.goal)
         self._pose, self.plan, self.outcome = self.world.object_pose(), plan, None
-        self._start = (*plan.start_xy_m, self._pose[2])
+        self._start, self._turn_from = (*plan.start_xy_m, self._pose[2]), self._pose[2]
         self._walked.clear()
         away_m = np.hypot(*np.subtract(plan.start_xy_m, self._pose[:2]))
         note = f" The object is {1000 * away_m:.0f} mm from where this plan starts."
-        self._say(f"Loaded. {plan_in_words(plan)}{note if away_m > 0.002 else ''}")
+        self.controls.say(f"Loaded. {plan_in_words(plan)}{note if away_m > 0.002 else ''}")
         self._show()
 
     # Planning
@@ -171,7 +170,7 @@ class GoalPicker(widgets.VBox):
             loop = None
         if self.draft is None or loop is None or self._running:
             return self.pick(x_m, y_m)
-        self._set_goal(replace(self._goal, xy_m=_whole_mm(x_m, y_m)))
+        self._set_goal(replace(self._goal, xy_m=whole_mm(x_m, y_m)))
         try:
             self._make_plan(self.draft)
         finally:
@@ -195,9 +194,10 @@ class GoalPicker(widgets.VBox):
             self._lifted = False
             self._poses.clear()
         self._pose = self._start = self.world.object_pose()
+        self._turn_from = self._pose[2]
         try:
             plan = planner(self.world.look(), self._pose[:2], self._goal)
-            self._say(plan_in_words(plan))
+            self.controls.say(plan_in_words(plan))
         finally:
             self.plan, self.outcome = plan, None
             self._walked.clear()
@@ -221,8 +221,11 @@ class GoalPicker(widgets.VBox):
     def _run(self, seconds_per_action: float) -> None:
         planner, before, done = self.planners[self.controls.planner.value], self.world.film, 0
 
-        def tell() -> Goal:
+        def tell(plan: Plan | None = None) -> Goal:
             nonlocal done
+            if plan is not None:
+                self._follow_plan(plan, done)
+                return self._goal
             done += 1
             self.controls.show_progress(done)
             self._play(seconds_per_action)
@@ -241,6 +244,7 @@ class GoalPicker(widgets.VBox):
             try:
                 execute = self.executors[self.controls.executor.value]
                 outcome, how = execute(self.world, self.plan, planner, tell), "Done,"
+                self.controls.show_progress(done, max(1, done))
             except Stopped:
                 outcome, how = carry_out(self.world, replace(self.plan, steps=())), "Stopped after"
             self.outcome = replace(
@@ -249,13 +253,25 @@ class GoalPicker(widgets.VBox):
                 lifted_m=self.world.object_state()[2] - z,
             )
             self._lifted = bool(self._goal.height_m)
-            self._say(outcome_in_words(self.outcome, self._goal, how, done))
+            self.controls.say(outcome_in_words(self.outcome, self._goal, how, done))
         finally:
             self.world.film = before
             self._set_running(False)
             self._play(0.0)
             self._pose = self.world.object_pose()
             self._show()
+
+    def _follow_plan(self, plan: Plan, done: int) -> None:
+        """Show a plan that was made on the way, after so many actions."""
+        arrives = self._goal.distance_m(plan.predicted_end_xy_m) <= self._goal.tolerance_m
+        self.plan = plan = replace(plan, goal=self._goal, reaches_goal=arrives)
+        self._pose = self.world.object_pose()
+        self._start = (*plan.start_xy_m, self._pose[2])
+        self.controls.show_progress(done, done + len(plan.steps))
+        self.controls.say(
+            f"On the way, after {done} action{'s' * (done != 1)}. {plan_in_words(plan)}"
+        )
+        self._show()
 
     def _play(self, seconds: float) -> None:
         """Play what was filmed since the last time; a film of an object at rest is skipped."""
@@ -282,29 +298,19 @@ class GoalPicker(widgets.VBox):
             self._make_plan()
 
     def _shove(self) -> None:
-        x, y, _ = self.world.object_pose()
-        dx, dy = self._drawn((x, y), 0.02, 0.04)
+        dx, dy = draw_way(self._rng, self.world.object_pose()[:2], 0.02, 0.04, LIMIT_M)
         self.world.shove(dx, dy, float(self._rng.uniform(-0.5, 0.5)))
         self._pose = self.world.object_pose()
         self._poses.clear()
         self._show()
-        self._say(f"The object was shoved by {1000 * np.hypot(dx, dy):.0f} mm.")
+        self.controls.say(f"The object was shoved by {1000 * np.hypot(dx, dy):.0f} mm.")
 
     def _move_goal(self) -> None:
+        dx, dy = draw_way(self._rng, self._goal.xy_m, 0.04, 0.08, LIMIT_M)
         x, y = self._goal.xy_m
-        dx, dy = self._drawn((x, y), 0.04, 0.08)
-        self._set_goal(replace(self._goal, xy_m=_whole_mm(x + dx, y + dy)))
+        self._set_goal(replace(self._goal, xy_m=whole_mm(x + dx, y + dy)))
         self._show()
-        self._say(f"The goal was moved by {1000 * np.hypot(dx, dy):.0f} mm.")
-
-    def _drawn(self, xy_m: tuple[float, float], least_m: float, most_m: float) -> np.ndarray:
-        """A random displacement (2,) [m] that stays in sight; from outside, one towards it."""
-        for _ in range(100):
-            angle, far = self._rng.uniform(0, 2 * np.pi), self._rng.uniform(least_m, most_m)
-            way = far * np.array([np.cos(angle), np.sin(angle)])
-            if np.abs(np.add(xy_m, way)).max() < LIMIT_M:
-                return way
-        return -far * np.array(xy_m) / np.hypot(*xy_m)
+        self.controls.say(f"The goal was moved by {1000 * np.hypot(dx, dy):.0f} mm.")
 
     # The widget
 
@@ -338,7 +344,7 @@ class GoalPicker(widgets.VBox):
         self._safely(lambda: self._follow(x, y))
 
     def _slid(self, _: object) -> None:
-        xy_m = _whole_mm(self.controls.x.value / 100, self.controls.y.value / 100)
+        xy_m = whole_mm(self.controls.x.value / 100, self.controls.y.value / 100)
         if not self._setting and xy_m != self._goal.xy_m:  # the page echoes what it was told
             self._safely(lambda: self._follow(*xy_m))
 
@@ -366,10 +372,7 @@ class GoalPicker(widgets.VBox):
         try:
             action()
         except Exception as error:
-            self._say(f"<b>{type(error).__name__}</b>: {html.escape(str(error))}")
-
-    def _say(self, text: str) -> None:
-        self.controls.say(text)
+            self.controls.say(f"<b>{type(error).__name__}</b>: {html.escape(str(error))}")
 
     def _show(self, draft: bool = False) -> None:
         self._view.scene = make_scene(
@@ -378,6 +381,7 @@ class GoalPicker(widgets.VBox):
             self._goal,
             self.plan.steps if self.plan else (),
             self._start,
+            self._turn_from,
             self._walked,
             HALF_WIDTH_M,
             LIMIT_M,
@@ -394,7 +398,3 @@ class GoalPicker(widgets.VBox):
         # A box of widgets saves only text; the picture stays in the notebook without a kernel.
         bundle = super()._repr_mimebundle_(**kwargs) | {"text/plain": "GoalPicker"}
         return {**bundle, "image/png": base64.b64encode(self.picture()).decode()}
-
-
-def _whole_mm(x_m: float, y_m: float) -> tuple[float, float]:
-    return round(x_m, 3), round(y_m, 3)

@@ -30,6 +30,10 @@ if TYPE_CHECKING:
 
 GOAL, PREDICTION, TRUTH, NEUTRAL = "#0072B2", "#D55E00", "#009E73", "#777777"
 
+ENLARGED = 20
+"""So many times σ is the radius of the disc at the end of a foreseen path; σ itself is too small to
+be seen."""
+
 plt.rcParams.update(
     {
         "axes.spines.top": False,
@@ -92,14 +96,18 @@ def plot_footprint(
 _PLATE = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 1}
 
 
-def plot_plan(ax: Axes, plan: Plan) -> Axes:
-    """A plan as predicted: the object's path, where each step stops, and the goal."""
+def plot_plan(ax: Axes, plan: Plan, sigma: bool = True) -> Axes:
+    """A plan as predicted: the object's path, where each step stops and σ there, and the goal.
+
+    sigma: draw a disc at each step's end, with twenty times σ for its radius.
+    """
     circle = plt.Circle(
         100 * np.array(plan.goal.xy_m), 100 * plan.goal.tolerance_m, color=GOAL, fill=False, lw=1
     )
     ax.add_patch(circle)
     ax.plot(*(100 * np.array(plan.goal.xy_m)), "*", color=GOAL, ms=13, label="goal", zorder=5)
-    start, below = np.array(plan.start_xy_m), 0
+    first = start = np.array(plan.start_xy_m)
+    below = 0
     for k, step in enumerate(plan.steps):
         end = 100 * np.array(step.predicted_end_xy_m)
         label = f"{k + 1}: {100 * step.stop_phase:.0f} %"
@@ -124,13 +132,15 @@ def plot_plan(ax: Axes, plan: Plan) -> Axes:
             tail,
             arrowprops={"arrowstyle": "-|>", "color": NEUTRAL, "lw": 1.5},
         )
+        aside = direction[::-1] * (1, -1)
+        aside *= 22 if aside @ (start - first) >= 0 else -22  # away from where the object stood
         ax.annotate(
             label,
             tail,
             ha="center",
             va="center",
             fontsize=8,
-            xytext=tuple(-10 * direction if k == 0 else 20 * direction[::-1] * (1, -1)),
+            xytext=tuple(-10 * direction if k == 0 else aside),
             textcoords="offset points",
             bbox=_PLATE,
         )
@@ -140,14 +150,17 @@ def plot_plan(ax: Axes, plan: Plan) -> Axes:
             lw=2,
             label="prediction" if k == 0 else None,
         )
-        ax.plot(*end, "o", color=PREDICTION, ms=5)
+        ax.plot(*end, "o", color=PREDICTION, ms=3)
+        if sigma and not math.isnan(step.std_m):
+            disc = {"radius": 100 * ENLARGED * step.std_m, "color": PREDICTION, "alpha": 0.35}
+            ax.add_patch(plt.Circle(end, **disc, lw=1, zorder=1.5))
         start = np.array(step.predicted_end_xy_m)
     return ax
 
 
 def plot_outcome(ax: Axes, outcome: Outcome) -> Axes:
     """What carrying out a plan gave: the object's real path, over the plan."""
-    plot_plan(ax, outcome.plan)
+    plot_plan(ax, outcome.plan, sigma=False)
     for k, path in enumerate(outcome.object_paths_xy_m):
         ax.plot(*(100 * path.T), color=TRUTH, lw=2, ls="--", label="truth" if k == 0 else None)
     ax.plot(*(100 * np.array(outcome.end_pose[:2])), "s", color=TRUTH, ms=6)

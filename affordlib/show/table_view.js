@@ -83,10 +83,10 @@ function drawPlan(svg, steps, outline) {
       add(plan, "text", { ...stack, class: "step" }, step.label);
       continue;
     }
-    if (step.std) add(plan, "circle", { cx: x, cy: y, r: 1000 * step.std, class: "sigma" });
+    if (step.disc) add(plan, "circle", { cx: x, cy: y, r: 1000 * step.disc, class: "sigma" });
     drawArrow(plan, step.start, step.direction);
     add(plan, "polyline", { points: points(step.path), class: "prediction" });
-    add(plan, "circle", { cx: x, cy: y, r: 4, class: "prediction-end" });
+    add(plan, "circle", { cx: x, cy: y, r: 3, class: "prediction-end" });
     // Beside the end, where neither the next push comes from nor its object goes.
     const last = k === moves - 1;
     const ahead = (last ? step : steps[k + 1]).direction;

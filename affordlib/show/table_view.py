@@ -13,6 +13,7 @@ import anywidget
 import numpy as np
 import traitlets
 
+from affordlib.show.plots import ENLARGED
 from affordlib.show.sentences import step_in_words
 from affordlib.types import TABLE_X_M, TABLE_Y_M
 from affordlib.world import BASE_X_M, REACH_M
@@ -48,6 +49,7 @@ def make_scene(
     goal: Goal,
     steps: Sequence[Step],
     start: Sequence[float],
+    turn_from_rad: float,
     truth_xy_m: Sequence[np.ndarray],
     half_width_m: float,
     limit_m: float,
@@ -57,10 +59,11 @@ def make_scene(
 ) -> dict[str, Any]:
     """What `TableView` draws, in metres.
 
-    pose: (x, y, yaw) of the object; steps: of the plan, from start (x, y, yaw) on; truth_xy_m:
-    paths (n, 2) that the object has gone; half_width_m: of the view; limit_m: how far from the
-    middle a goal may be asked for; answered: the number of the question that this answers; running:
-    whether the robot is at work, so that a film goes on; draft: whether a better plan will follow.
+    pose: (x, y, yaw) of the object; steps: of the plan, from start (x, y, yaw) on; turn_from_rad:
+    the yaw from which the goal's turn is counted; truth_xy_m: paths (n, 2) that the object has
+    gone; half_width_m: of the view; limit_m: how far from the middle a goal may be asked for;
+    answered: the number of the question that this answers; running: whether the robot is at work,
+    so that a film goes on; draft: whether a better plan will follow.
 
     The shaded ring is where an object can be pushed towards any side: as far within the tool's
     reach as a push begins from the object.
@@ -77,14 +80,14 @@ def make_scene(
         "goal": {
             "xy": rounded(goal.xy_m),
             "tolerance": goal.tolerance_m,
-            "yaw": None if goal.turn_rad is None else round(yaw + goal.turn_rad, 4),
+            "yaw": None if goal.turn_rad is None else round(turn_from_rad + goal.turn_rad, 4),
         },
         "steps": [
             {
                 "start": rounded(starts[k]),
                 "path": rounded(step.predicted_path_xy_m),
                 "end": rounded(step.predicted_end_xy_m),
-                "std": None if math.isnan(step.std_m) else round(step.std_m, 5),
+                "disc": None if math.isnan(step.std_m) else round(ENLARGED * step.std_m, 5),
                 "yaw": round(yaw + step.predicted_turn_rad, 4),
                 "direction": getattr(step.primitive, "direction_rad", None),
                 "label": f"{k + 1}: {step_in_words(step)}",
@@ -96,6 +99,26 @@ def make_scene(
         "running": running,
         "draft": draft,
     }
+
+
+def draw_way(
+    rng: np.random.Generator, xy_m: Sequence[float], least_m: float, most_m: float, limit_m: float
+) -> np.ndarray:
+    """A random displacement (2,) [m] of (x, y) that stays in sight; from outside, one towards it.
+
+    limit_m: how far from the middle x and y may lie.
+    """
+    for _ in range(100):
+        angle, far = rng.uniform(0, 2 * np.pi), rng.uniform(least_m, most_m)
+        way = far * np.array([np.cos(angle), np.sin(angle)])
+        if np.abs(np.add(xy_m, way)).max() < limit_m:
+            return way
+    return -far * np.array(xy_m) / np.hypot(*xy_m)
+
+
+def whole_mm(x_m: float, y_m: float) -> tuple[float, float]:
+    """A position [m] to the nearest millimetre."""
+    return round(x_m, 3), round(y_m, 3)
 
 
 def rounded(values: Any) -> list:
