@@ -11,12 +11,15 @@ FORCE   =
 KEEP    =
 DRY_RUN =
 SEEDS   = 0 1 2
-WORKERS = 1
+WORKERS = 2
 JOBS    = 2
 
 PY     := .venv/bin/python
 STAMP  := .venv/.installed
 INPUTS := requirements.txt constraints.txt pyproject.toml
+
+# JupyterLab asks nobody outside for news or updates.
+QUIET  := {"@jupyterlab/apputils-extension:notification": {"fetchNews": "false", "checkForUpdates": false}}
 
 SHELL         := /bin/bash
 .SHELLFLAGS   := -eu -o pipefail -c
@@ -62,15 +65,18 @@ $(STAMP): $(INPUTS)
 	 fi; \
 	 $(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -r requirements.txt; \
 	 $(PY) -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .; \
+	 mkdir -p .venv/share/jupyter/lab/settings; \
+	 echo '$(QUIET)' > .venv/share/jupyter/lab/settings/overrides.json; \
 	 printf '%s' "$(CURDIR)" > $@
 
 workbook: $(STAMP) ## Run all notebooks into runs/ (PROFILE=smoke|reader|full SEED= OUT= ONLY= ARGS= DRY_RUN=1)
 	@set -f; $(PY) -m affordlib.workbook --profile "$${PROFILE:-reader}" --seed "$${SEED:-0}" \
 	  --out "$$OUT" --only "$$ONLY" $(if $(FORCE),--force) $(if $(DRY_RUN),--dry-run) -- $$ARGS
 
-seeds: $(STAMP) ## Run them for several seeds, and a page over seeds (SEEDS="0 1 2" WORKERS=1 …)
+seeds: $(STAMP) ## Run them for several seeds, and a page over seeds (SEEDS="0 1 2" WORKERS=2 …)
 	@set -f; $(PY) -m affordlib.seeds $$SEEDS --workers "$$WORKERS" \
-	  --profile "$${PROFILE:-reader}" --out "$$OUT" --only "$$ONLY" --settings $$ARGS
+	  --profile "$${PROFILE:-reader}" --out "$$OUT" --only "$$ONLY" $(if $(FORCE),--force) $(if $(DRY_RUN),--dry-run) \
+	  --settings $$ARGS
 
 lab: $(STAMP) ## Open the book in JupyterLab, on this machine only
 	@root=; [[ $$(id -u) == 0 ]] && root=--allow-root; \

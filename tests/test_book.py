@@ -3,6 +3,7 @@ from html.parser import HTMLParser
 from urllib.parse import unquote
 
 import pytest
+from lab_pages import CHROMIUM, FLAGS, PICTURES
 
 from affordlib.book import Book
 from affordlib.paths import repo_root
@@ -101,3 +102,31 @@ def test_a_link_to_nothing_is_refused():
     book = Book()
     with pytest.raises(FileNotFoundError, match=r"README\.md links to no/where\.md"):
         book.address(book.pages[0], "no/where.md")
+
+
+@pytest.mark.browser
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed")
+def test_it_looks_right_in_a_browser_without_any_request_outside(folder):
+    from playwright.sync_api import sync_playwright
+
+    PICTURES.mkdir(parents=True, exist_ok=True)
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        page = browser.new_page(viewport={"width": 1280, "height": 1000})
+        asked, failed, said = [], [], []
+        page.on("request", lambda request: asked.append(request.url))
+        page.on("requestfailed", lambda request: failed.append(request.url))
+        page.on("pageerror", lambda error: said.append(str(error)))
+        for name in ("index", "00_start_here", "03_affordance_cnp"):
+            page.goto((folder / f"{name}.html").as_uri())
+            page.screenshot(path=PICTURES / f"book_{name}.png")
+            images = page.locator("img").evaluate_all("all => all.map((i) => i.naturalWidth)")
+            assert all(images), f"{name}: {images}"
+            wide = page.evaluate("document.documentElement.scrollWidth - window.innerWidth")
+            assert wide <= 0, f"{name} is {wide} pixels wider than the window"
+        assert page.locator("svg").count() > 10  # the equations of 03
+        page.set_viewport_size({"width": 400, "height": 800})
+        assert page.evaluate("document.documentElement.scrollWidth") <= 400
+        browser.close()
+    assert (failed, said) == ([], [])
+    assert {url.split(":")[0] for url in asked} <= {"file", "data"}

@@ -12,9 +12,11 @@ import papermill
 import pytest
 from IPython.core.inputtransformer2 import TransformerManager
 
+from affordlib.notebook_files import WIDGET, cleaned
 from affordlib.profiles import default_parameters, notebook_paths
 from affordlib.results import read_results, results_table
-from affordlib.workbook import Layout, cleaned, make_jobs
+from affordlib.show import GOAL, PREDICTION, TRUTH
+from affordlib.workbook import Layout, make_jobs
 
 LAYOUT = Layout.of_repository()
 PATHS = notebook_paths(LAYOUT.notebooks)
@@ -62,23 +64,63 @@ def test_parameters(name):
         assert parameter["help"].strip(), f"{parameter['name']} is not explained"
 
 
-@each_notebook
-def test_every_parameter_is_used(name):
-    notebook = read(name)
+class Reading(ast.NodeVisitor):
+    """The names that some code reads, but for what it only notes down in `parameters`."""
+
+    def __init__(self):
+        self.names = set()
+
+    def visit_Name(self, node):
+        if isinstance(node.ctx, ast.Load):
+            self.names.add(node.id)
+
+    def visit_Assign(self, node):
+        target = node.targets[0]
+        noted = target.value if isinstance(target, ast.Subscript) else target
+        if not (isinstance(noted, ast.Name) and noted.id == "parameters"):
+            self.generic_visit(node)
+
+    def visit_AugAssign(self, node):
+        if not (isinstance(node.target, ast.Name) and node.target.id == "parameters"):
+            self.generic_visit(node)
+
+
+def unread(notebook, name):
+    """The parameters of a notebook that none of its cells does anything with."""
     cells = code_of(notebook)
     at = next(i for i, c in enumerate(cells) if "parameters" in c.metadata.get("tags", []))
-    used = set()
+    reading = Reading()
     for cell in cells[at + 1 :]:
-        for node in ast.walk(ast.parse(TransformerManager().transform_cell(cell.source))):
-            if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load):
-                used.add(node.id)
-    assert not default_parameters(notebook, name).keys() - used
+        reading.visit(ast.parse(TransformerManager().transform_cell(cell.source)))
+    return default_parameters(notebook, name).keys() - reading.names
+
+
+@each_notebook
+def test_every_parameter_is_used(name):
+    assert not unread(read(name), name)
+
+
+def test_a_parameter_that_is_only_noted_down_is_not_used():
+    notebook = read("00_start_here")
+    tagged = next(c for c in notebook.cells if "parameters" in c.metadata.get("tags", []))
+    tagged.source += "\nfirst: int = 1\nsecond: int = 2\nthird: int = 3"
+    noted = 'parameters = {"first": first}\nparameters["second"] = second'
+    notebook.cells.append(nbformat.v4.new_code_cell(noted))
+    notebook.cells.append(nbformat.v4.new_code_cell('parameters |= {"third": third}'))
+    assert unread(notebook, "00_start_here") == {"first", "second", "third"}
 
 
 @pytest.mark.parametrize("profile", PROFILES)
 def test_every_value_of_a_profile_is_a_parameter_of_its_type(profile):
     jobs = make_jobs(LAYOUT, profile, [], {"seed": 0, "out_dir": "runs/x"})
     assert [job.name for job in jobs] == list(PATHS)
+
+
+@each_notebook
+def test_colours_of_goal_prediction_and_truth_have_no_other_meaning(name):
+    for cell in code_of(read(name)):
+        for colour in (GOAL, PREDICTION, TRUTH):
+            assert colour.lower() not in cell.source.lower(), "use its name, where it is meant"
 
 
 @each_notebook
@@ -148,6 +190,17 @@ def test_small_and_clean(name):
     text = PATHS[name].read_text(encoding="utf-8")
     assert len(text.encode()) < 1_500_000
     assert text == cleaned(read(name)), "metadata is not clean; run `make notebooks`"
+
+
+def test_of_a_widget_its_picture_is_kept():
+    """JupyterLab without the kernel shows it; of a widget alone it would show an error."""
+    shown = {WIDGET: {"model_id": "1"}, "text/plain": "a widget"}
+    both = [nbformat.v4.new_output("display_data", shown | {"image/png": "iVBORw0="})]
+    alone = [nbformat.v4.new_output("display_data", shown)]
+    cells = [nbformat.v4.new_code_cell("a", outputs=outputs) for outputs in (both, alone)]
+    kept = nbformat.reads(cleaned(nbformat.v4.new_notebook(cells=cells)), 4).cells
+    assert set(kept[0].outputs[0].data) == {"image/png", "text/plain"}
+    assert WIDGET in kept[1].outputs[0].data
 
 
 @each_notebook
@@ -265,3 +318,14 @@ def test_the_same_route_fails_on_a_broken_notebook(tmp_path):
     assert "2 failed, 2 passed" in done.stdout
     assert "assert total == 3" in done.stdout
     assert "mismatch 'stdout'" in done.stdout
+
+
+@pytest.mark.slow
+def test_plain_papermill_runs_a_notebook_from_anywhere(tmp_path):
+    name, out = "02_interactions", tmp_path / "out"
+    given = {"n_interactions": 6, "workers": 1, "out_dir": out}
+    options = [word for pair in given.items() for word in ("-p", *map(str, pair))]
+    command = [sys.executable, "-m", "papermill", str(PATHS[name]), "run.ipynb", *options]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert read_results(out / f"{name}.json")["parameters"]["n_interactions"] == 6

@@ -1,12 +1,17 @@
+import io
 import math
 
+import numpy as np
 import pytest
 from dask.distributed import Client
+from PIL import Image
 from test_workbook import Book
 
+from affordlib.paths import repo_root
 from affordlib.profiles import WorkbookError
 from affordlib.results import read_results
 from affordlib.seeds import gather, main, over_seeds, run_seeds
+from affordlib.seeds_picture import seeds_picture
 
 
 def rows(a, b):
@@ -29,6 +34,30 @@ def test_rows_that_agree_in_words_become_one_with_mean_and_deviation():
     assert table[0]["sd_mean_m"] == pytest.approx(math.sqrt(7.0))
     assert (table[0]["n"], "sd_n" in table[0]) == (4, False)
     assert (table[3]["mean_m"], "sd_mean_m" in table[3]) == (3.0, False)
+
+
+def test_what_differs_is_drawn_with_a_dot_for_every_seed():
+    def image(tables):
+        return np.asarray(Image.open(io.BytesIO(seeds_picture(tables))).convert("RGB"))
+
+    wide = image([rows(1.0, 0.5), rows(2.0, 0.7)])
+    assert wide.min() < 50 < 200 < wide.max()
+    assert (image([rows(1.0, 0.5), rows(2.0, 0.7), rows(1.5, 0.6)]) != wide).any()
+    assert seeds_picture([rows(1.0, 0.5), rows(1.0, 0.5)]) is None
+
+
+def test_a_dry_run_runs_nothing_and_passes_everything_on(capsys):
+    before = set((repo_root() / "runs").glob("*")) if (repo_root() / "runs").is_dir() else set()
+    asked = ["7", "8", "--profile", "smoke", "--only", "00", "--out", "dry", "--dry-run", "--force"]
+    assert main([*asked, "--settings", "00.goal_x_m=0.11"]) == 0
+    said = capsys.readouterr().out
+    assert said.count("00_start_here: would run") == 2
+    assert "'goal_x_m': 0.11" in said
+    assert "'seed': 8" in said
+    after = set((repo_root() / "runs").glob("*"))
+    assert not [path for path in after - before if path.name.startswith("dry")]
+    assert main(["7", "--settings", "00.goal=1"]) == 1
+    assert "goal" in capsys.readouterr().err
 
 
 @pytest.fixture
@@ -66,6 +95,7 @@ def test_seeds_side_by_side_are_gathered_into_one_table_and_page(book):
     text = page.read_text()
     assert "Seeds 1, 3." in text
     assert "sd length, mm" in text
+    assert 'src="data:image/png;base64,' in text
     assert ">1.41<" in text
 
 
