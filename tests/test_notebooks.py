@@ -64,6 +64,18 @@ def test_parameters(name):
         assert parameter["help"].strip(), f"{parameter['name']} is not explained"
 
 
+@each_notebook
+def test_every_picture_has_its_caption(name):
+    cells, count = read(name).cells, 0
+    for cell, below in zip(cells, cells[1:], strict=False):
+        kinds = {kind for output in cell.get("outputs", []) for kind in output.get("data", {})}
+        if any(kind.startswith("image/") for kind in kinds):
+            count += 1
+            caption = rf"\*\*Figure {int(name[:2])}\.{count}\.\*\* \S.{{20,}}\.$"
+            assert re.match(caption, below.source), f"below the picture stands {below.source!r}"
+    assert sum(c.source.startswith("**Figure ") for c in cells) == count > 0
+
+
 class Reading(ast.NodeVisitor):
     """The names that some code reads, but for what it only notes down in `parameters`."""
 
