@@ -14,6 +14,7 @@ from affordlib.models import (
     CNPConfig,
     EffectModel,
     FiLMConfig,
+    OutOfRangeWarning,
     TrainingConfig,
     build,
     calibration_rows,
@@ -234,6 +235,12 @@ def test_strange_inputs_are_refused(some):
     for t in (-0.2, 1.5, math.nan):
         with pytest.raises(ValueError, match=r"t_target must lie in \[0, 1\]"):
             network.predict(features, pushed, torch.full((1, 1), t))
+    with pytest.warns(OutOfRangeWarning, match=r"ends 0\.200 m away, those trained on 0\.0\d+ to"):
+        network.predict(
+            features,
+            observe_final_effect(network, torch.tensor([[0.2, 0.0, 0.0]])),
+            torch.ones(1, 1),
+        )
     empty = some.image[:2].clone()
     empty[1, 1] = 0
     with pytest.raises(ValueError, match=r"image 1: the object covers 0\.0% of it"):

@@ -1,6 +1,7 @@
 """Every notebook: as it is committed, and run once with the values of the smoke profile."""
 
 import ast
+import itertools
 import os
 import re
 import subprocess
@@ -67,7 +68,7 @@ def test_parameters(name):
 @each_notebook
 def test_every_picture_has_its_caption(name):
     cells, count = read(name).cells, 0
-    for cell, below in zip(cells, cells[1:], strict=False):
+    for cell, below in itertools.pairwise(cells):
         kinds = {kind for output in cell.get("outputs", []) for kind in output.get("data", {})}
         if any(kind.startswith("image/") for kind in kinds):
             count += 1
@@ -287,6 +288,17 @@ def prepare(path, parameters, folder):
     return copy
 
 
+def append_solutions(copy):
+    """Put the solutions of a notebook's exercises at its end, if it has any, and ask for a pass."""
+    solutions = LAYOUT.notebooks / "solutions" / f"{copy.stem}.py"
+    if solutions.is_file():
+        notebook = nbformat.read(copy, as_version=4)
+        all_pass = "for verdict in VERDICTS:\n    assert verdict.passed, str(verdict)"
+        for code in (solutions.read_text(), all_pass):
+            notebook.cells.append(nbformat.v4.new_code_cell(code))
+        nbformat.write(notebook, copy)
+
+
 def run_with_nbval(copy):
     """Run a prepared notebook in a pytest of its own: asserts, and outputs marked to be checked."""
     command = [sys.executable, "-m", "pytest", "--nbval-lax", "--nbval-current-env"]
@@ -312,6 +324,7 @@ def smoke(tmp_path_factory):
 def test_run(name, smoke):
     folder, jobs = smoke
     copy = prepare(PATHS[name], jobs[name].overrides, folder)
+    append_solutions(copy)
     done = run_with_nbval(copy)
     assert done.returncode == 0, done.stdout + done.stderr
     assert f"{len(code_of(nbformat.read(copy, as_version=4)))} passed" in done.stdout

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from affordlib.evaluation import limits, one_for_all, studies
+from affordlib.evaluation import ablation, limits, one_for_all, studies
 from affordlib.evaluation.ablation import actions_only, half_blend, random_contexts
 from affordlib.evaluation.studies import cka, read_study
 from affordlib.interactions import TrainingArrays, open_interactions, split_interactions
@@ -93,6 +93,28 @@ def test_draws_leave_out_one_thing_each(pushes):
     assert torch.equal(loose.action, arrays.action[rows[:, None], at])
 
 
+def test_changes_of_an_ablation_add_up(monkeypatch):
+    made = []
+
+    def remember(model, training, validation, config, progress, draw):
+        made.append((model, config, draw))
+
+    monkeypatch.setattr(ablation, "train", remember)
+    ablation.ablated(list(ablation.LADDER.values()), 10)
+    ablation.ablated(["random contexts only"], 10)
+    (bare, config, draw), (ours, usual, loose) = made
+    assert draw is ablation.one_at_a_time  # which draws at random moments, too
+    assert (config.augment, config.beta, config.ema) == (False, 0.0, 0.0)
+    assert (bare.config.frame, bare.normaliser.action_scale) == ("table", (1.0, 1.0))
+    assert not any(p.requires_grad for b in bare.blocks for p in b.modulation.parameters())
+    assert loose is random_contexts
+    assert usual.augment
+    assert (usual.beta, ours.config.frame) == (0.5, "push")
+    assert ours.normaliser.action_scale < (0.5, 0.5)
+    first = [next(m for m in net.image_encoder if hasattr(m, "weight")) for net in (bare, ours)]
+    assert not torch.equal(first[0].weight, first[1].weight)
+
+
 @pytest.fixture(scope="module")
 def of_all():
     """The first interactions of each primitive, with all channels."""
@@ -163,6 +185,10 @@ def test_the_committed_studies_tell_the_story():
     left_out = {row["change"]: row["final_error_mean_m"] for row in told["ablation"]}
     for change in ("no image", "table frame", "metres, not standardised"):
         assert left_out[change] > 1.5 * left_out["nothing"]
+    steps = {row["added"]: row["final_error_mean_m"] for row in told["waterfall"]}
+    assert list(steps) == ["nothing", *ablation.LADDER]
+    assert steps["nothing"] > 10 * left_out["nothing"]
+    assert list(steps.values())[-1] == pytest.approx(left_out["nothing"], rel=1e-3)
     held_out = [r for r in told["rollability"] if r["test"] in ("mixed", "partial")]
     shares = [(r["learned_percent"], r["n"]) for r in held_out if r["object_class"] == "all"]
     assert sum(share * n for share, n in shares) / sum(n for _, n in shares) >= 98

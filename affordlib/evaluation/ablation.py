@@ -1,8 +1,8 @@
-"""Our network with one thing left out at a time: what was it worth?"""
+"""What each part of our network is worth: left out by itself, and added one after another."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -21,6 +21,8 @@ from affordlib.models.film import FiLMNetwork
 from affordlib.models.make_checkpoints import SHIPPED
 from affordlib.models.protocol import observe_final_effect
 from affordlib.models.training import final_errors_m, literal_draw, train
+
+Rows = list[dict[str, Any]]
 
 
 def random_contexts(
@@ -108,17 +110,75 @@ CHANGES: dict[str, dict[str, Any]] = {
 }
 """What is left out or changed, by name."""
 
+LADDER = {
+    "channels of unit size": "metres, not standardised",
+    "He's initialisation": "PyTorch's initialisation",
+    "batches": "one trajectory, one target a step",
+    "contexts at the ends": "random contexts only",
+    "the frame of the push": "table frame",
+    "FiLM": "no FiLM: image joined only",
+    "turned and mirrored copies": "no turned and mirrored copies",
+    "β": "plain likelihood (β = 0)",
+    "a running mean of the weights": "no running mean of the weights",
+}
+"""What is added to a training to the paper's letter until it is ours, and the change it undoes."""
 
-def ablated(change: str, steps: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """What `push_test` shows after a training on fold 0 of `push` with a change.
+STEPS, SEEDS = 500, 3
 
-    Final errors (N,) [m] of effects foreseen from actions; and, asked the other way, how far the
-    start of the push that is decoded from the true final effect is from the true one (N,) [m].
+
+def ablation() -> Rows:
+    """Errors on `push_test` of short trainings, each without one thing; means over seeds."""
+    return [{"change": change} | _errors([change]) for change in CHANGES]
+
+
+def waterfall() -> Rows:
+    """The same of trainings that gain one thing after another, from none of `LADDER` to all."""
+    names, changes = list(LADDER), list(LADDER.values())
+    return [
+        {"added": "nothing" if k == 0 else names[k - 1]} | _errors(changes[k:])
+        for k in range(len(names) + 1)
+    ]
+
+
+def _errors(changes: Sequence[str]) -> dict[str, Any]:
+    box = open_interactions("push_test")["family"].values == 0
+    told = [ablated(changes, STEPS, seed) for seed in range(SEEDS)]
+    errors, starts = zip(*told, strict=True)
+    mean = np.mean(errors, axis=0)
+    each = [(e[box].mean() + e[~box].mean()) / 2 for e in errors]
+    return {
+        "steps": STEPS,
+        "seeds": SEEDS,
+        "n": len(mean),
+        "final_error_mean_m": float(np.mean(each)),
+        "final_error_min_m": float(np.min(each)),
+        "final_error_max_m": float(np.max(each)),
+        "cuboid_mean_m": float(mean[box].mean()),
+        "final_error_p95_m": float(np.quantile(np.concatenate(errors), 0.95)),
+        "action_start_mean_m": float(np.mean(starts)),
+        "action_start_min_m": float(min(start.mean() for start in starts)),
+        "action_start_max_m": float(max(start.mean() for start in starts)),
+    }
+
+
+def ablated(changes: Sequence[str], steps: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """What `push_test` shows after a training on fold 0 of `push` with some of `CHANGES`.
+
+    Where two of them say how contexts are drawn, the first does. Final errors (N,) [m] of effects
+    foreseen from actions; and, asked the other way, how far the start of the push that is decoded
+    from the true final effect is from the true one (N,) [m].
     """
-    how = {"image": True, "network": {}, "training": {}, "draw": sample_batch} | CHANGES[change]
+    each = [CHANGES[change] for change in changes]
+    image = all(how.get("image", True) for how in each)
+    scales = next((how["scales"] for how in each if "scales" in how), lambda same: same)
+    draw = next((how["draw"] for how in each if "draw" in how), sample_batch)
+    options: dict[str, dict[str, Any]] = {
+        of: {k: v for how in each for k, v in how.get(of, {}).items()}
+        for of in ("training", "network")
+    }
     shipped = SHIPPED["push_film"]
-    config = replace(shipped.training, steps=steps, seed=seed, **how["training"])
-    network = replace(shipped.network, **how["network"])
+    config = replace(shipped.training, steps=steps, seed=seed, **options["training"])
+    network = replace(shipped.network, **options["network"])
     channels = network.action_channels, network.effect_channels
     data, test_data = open_interactions("push"), open_interactions("push_test")
     split = split_interactions(data.sizes["interaction"])
@@ -127,17 +187,17 @@ def ablated(change: str, steps: int, seed: int = 0) -> tuple[np.ndarray, np.ndar
         TrainingArrays.from_dataset(d, rows, *channels) for d, rows in parts
     )
     normaliser = Normaliser.fit(training)
-    if not how["image"]:
+    if not image:
         blank = training.image.mean(dim=0, keepdim=True)
         training, validation, test = (
             replace(a, image=blank.expand(len(a), -1, -1, -1)) for a in (training, validation, test)
         )
         normaliser = replace(normaliser, mask_share=None)
-    scales: Callable[[Normaliser], Normaliser] = how.get("scales", lambda same: same)
     torch.manual_seed(seed)
     model = build(network, scales(normaliser))
-    how.get("start", lambda _: None)(model)
-    train(model, training, validation, config, progress=False, draw=how["draw"])
+    for how in each:
+        how.get("start", lambda _: None)(model)
+    train(model, training, validation, config, progress=False, draw=draw)
     with torch.no_grad():
         asked = observe_final_effect(model, test.effect[:, -1])
         told = model.predict(model.encode(test.image), asked, torch.zeros(len(test), 1))

@@ -1,6 +1,7 @@
 """Studies beside the cross-validation: what each part of a network is worth, and what it knows.
 
     ablation      our network, one thing left out at a time, on pushes
+    waterfall     the same, one thing added after another to a training by the paper's letter
     latent        how far r from an action and r from its effect are the same, and what w₁ does
     rollability   whether an object rolls, read from its image alone
     mixed         one network for pushes and drags: which of them is meant, by the decoded action
@@ -32,8 +33,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from affordlib.evaluation import limits, one_for_all, tails
-from affordlib.evaluation.ablation import CHANGES, ablated
+from affordlib.evaluation import ablation, limits, one_for_all, tails
 from affordlib.evaluation.answers import rounded
 from affordlib.evaluation.effect_prediction import refuse_seen
 from affordlib.interactions import TrainingArrays, open_interactions, split_interactions
@@ -55,43 +55,12 @@ from affordlib.types import Observations
 FOLDER = "data/results/studies"
 Rows = list[dict[str, Any]]
 
-ABLATION_STEPS = 500
-ABLATION_SEEDS = 3
 TRAINING = replace(SHIPPED["push_film"].training, steps=1500)
 """Of `mixed` and `varied`; longer for a network that is shipped."""
 
 WEIGHTS = (0.25, 0.5, 0.75)
 HALF_WAY_M = 0.1
 """A decoded action that starts farther from the object than this is a push, else a drag."""
-
-
-def ablation() -> Rows:
-    """Errors on `push_test` of short trainings, each without one thing; means over seeds."""
-    test_data = open_interactions("push_test")
-    box = test_data["family"].values == 0
-    rows = []
-    for change in CHANGES:
-        told = [ablated(change, ABLATION_STEPS, seed) for seed in range(ABLATION_SEEDS)]
-        errors, starts = zip(*told, strict=True)
-        mean = np.mean(errors, axis=0)
-        each = [(e[box].mean() + e[~box].mean()) / 2 for e in errors]
-        rows.append(
-            {
-                "change": change,
-                "steps": ABLATION_STEPS,
-                "seeds": ABLATION_SEEDS,
-                "n": len(mean),
-                "final_error_mean_m": float(np.mean(each)),
-                "final_error_min_m": float(np.min(each)),
-                "final_error_max_m": float(np.max(each)),
-                "cuboid_mean_m": float(mean[box].mean()),
-                "final_error_p95_m": float(np.quantile(np.concatenate(errors), 0.95)),
-                "action_start_mean_m": float(np.mean(starts)),
-                "action_start_min_m": float(min(start.mean() for start in starts)),
-                "action_start_max_m": float(max(start.mean() for start in starts)),
-            }
-        )
-    return rows
 
 
 def cka(a: torch.Tensor, b: torch.Tensor) -> float | None:
@@ -282,7 +251,8 @@ def _varied_rows(n_interactions: int, folds: int, error: np.ndarray, judged: lis
 
 
 STUDIES: dict[str, tuple[Callable[[], Rows], tuple[str, ...], tuple[str, ...]]] = {
-    "ablation": (ablation, ("push", "push_test"), ()),
+    "ablation": (ablation.ablation, ("push", "push_test"), ()),
+    "waterfall": (ablation.waterfall, ("push", "push_test"), ()),
     "latent": (latent, ("push_test",), ("push_cnp", "push_film")),
     "rollability": (rollability, ("mixed", "partial", "push_test", "drag", "reach"), ()),
     "mixed": (mixed, ("mixed", "partial"), ()),
@@ -301,8 +271,10 @@ def hashes(name: str) -> dict[str, Any]:
     _, sets, checkpoints = STUDIES[name]
     training, network = replace(TRAINING, device="cpu"), SHIPPED["push_film"].network
     whole = replace(SHIPPED["push_film"].training, device="cpu")
+    ablation_sizes = ablation.STEPS, ablation.SEEDS
     own = {
-        "ablation": lambda: (network, whole, ABLATION_STEPS, ABLATION_SEEDS, list(CHANGES)),
+        "ablation": lambda: (network, whole, *ablation_sizes, list(ablation.CHANGES)),
+        "waterfall": lambda: (network, whole, *ablation_sizes, ablation.LADDER),
         "one_for_all": one_for_all.settings,
         "floor": limits.floor_settings,
         "stopped": lambda: limits.PHASES,

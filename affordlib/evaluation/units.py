@@ -310,7 +310,10 @@ def _shipped(
         # Options that are younger than a checkpoint were off when it was trained.
         settings = vars(TrainingConfig()) | about["training"] | {"device": config.device}
         del settings["max_minutes"]
-        same = expected == about | {"training": settings} and model.normaliser == normaliser
+        known = normaliser
+        if model.normaliser.effect_radius_m is None:
+            known = replace(normaliser, effect_radius_m=None)  # younger than the checkpoint
+        same = expected == about | {"training": settings} and model.normaliser == known
         if same:
             return model, {"checkpoint": name, "temperature": list(model.temperature)}
     return None

@@ -54,7 +54,8 @@ class Normaliser:
 
     Scales bring channels near unit size; x and y share one, and zero stays zero. Ranges (None: not
     known) are of the distance [m] of the action from the object's centre at t = 0 and at t = 1,
-    and of the share of the image that the object covers; whether objects reach the image's edge.
+    and of the share of the image that the object covers; whether objects reach the image's edge;
+    and of the distance [m] that objects have moved at t = 1.
     """
 
     action_scale: tuple[float, ...]
@@ -65,6 +66,7 @@ class Normaliser:
     end_radius_m: Range | None = None
     mask_share: Range | None = None
     at_edge: bool = True
+    effect_radius_m: Range | None = None
 
     @classmethod
     def fit(cls, arrays: TrainingArrays) -> Normaliser:
@@ -73,6 +75,9 @@ class Normaliser:
         radius_m = [None, None]
         if plane := plane_of(arrays.action_channels):
             radius_m = [_range(arrays.action[:, k][:, plane].norm(dim=-1)) for k in (0, -1)]
+        moved_m = None
+        if plane := plane_of(arrays.effect_channels):
+            moved_m = _range(arrays.effect[:, -1][:, plane].norm(dim=-1))
         mask = arrays.image[:, 1]
         return cls(
             _scales(arrays.action, arrays.action_channels),
@@ -82,6 +87,7 @@ class Normaliser:
             *radius_m,
             _range(mask.mean(dim=(1, 2))),
             bool(touches_edge(mask).any()),
+            moved_m,
         )
 
 

@@ -5,7 +5,7 @@ from affordlib.models.calibration import calibration_rows, coverage, fit_tempera
 from affordlib.models.checkpoint import build, load_checkpoint, save_checkpoint
 from affordlib.models.cnp import AffordanceCNP, CNPConfig
 from affordlib.models.film import FiLMConfig, FiLMNetwork
-from affordlib.models.network import EffectNetwork, NetworkConfig
+from affordlib.models.network import EffectNetwork, NetworkConfig, OutOfRangeWarning
 from affordlib.models.protocol import EffectModel, observe_actions
 from affordlib.models.training import TrainingConfig, train, train_literal
 
@@ -19,6 +19,7 @@ __all__ = [
     "FiLMConfig",
     "FiLMNetwork",
     "NetworkConfig",
+    "OutOfRangeWarning",
     "TrainingConfig",
     "build",
     "calibration_rows",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
@@ -24,6 +25,10 @@ from affordlib.types import Observations, Prediction
 PHASE_TOLERANCE = 1e-5
 RADIUS_TOLERANCE_M = 0.02
 _END_PHASE = 1e-3
+
+
+class OutOfRangeWarning(UserWarning):
+    """A network is asked about what it was not trained on, and its answer is a guess."""
 
 
 @dataclass(frozen=True)
@@ -142,10 +147,12 @@ class EffectNetwork(nn.Module, ABC):
         """Mean and σ (B, T, C) at t_target (B, T); features (B, F), or (1, F) for all.
 
         Raises ValueError for phases outside [0, 1], and for actions that start or end elsewhere
-        than those trained on.
+        than those trained on. Warns (`OutOfRangeWarning`) of effects at t = 1 that are farther or
+        less far than those trained on: a planner may pass there on its way.
         """
         self._check_phase(t_target)
         self._check_action(observations)
+        self._check_effect(observations)
         push = self.config.frame == "push"
         if push:
             features, observations, towards = self._enter(features, observations)
@@ -241,6 +248,22 @@ class EffectNetwork(nn.Module, ABC):
                     f"object's centre, those trained on {low:.3f} to {high:.3f} m; train on such "
                     "actions first"
                 )
+
+    def _check_effect(self, o: Observations) -> None:
+        n, plane = self.normaliser, plane_of(self.effect_channels)
+        if n.effect_radius_m is None or not plane or not o.effect_mask.any():
+            return
+        low, high = n.effect_radius_m
+        radius = o.effect.detach()[..., plane].norm(dim=-1)
+        far = (radius < low - RADIUS_TOLERANCE_M) | (radius > high + RADIUS_TOLERANCE_M)
+        strange = far & (o.effect_t > 1 - _END_PHASE) & o.effect_mask
+        if strange.any():
+            warnings.warn(
+                f"an observed effect ends {float(radius[strange][0]):.3f} m away, those trained "
+                f"on {low:.3f} to {high:.3f} m; what is foreseen from it is a guess",
+                OutOfRangeWarning,
+                stacklevel=3,
+            )
 
 
 def with_time(values: Tensor, t: Tensor) -> Tensor:

@@ -14,11 +14,13 @@ from __future__ import annotations
 
 import math
 import time
+import warnings
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
+from affordlib.models.network import OutOfRangeWarning
 from affordlib.models.protocol import observe_actions, observe_final_effect
 from affordlib.planning.finish import finished
 from affordlib.planning.modes import PATH_SAMPLES, PlanMode, encode_image, mode_named, plane
@@ -29,6 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from affordlib.models.protocol import EffectModel
+    from affordlib.types import Prediction
 
 START_RADIUS_M = 0.2
 LEARNING_RATE_M = 0.005
@@ -53,7 +56,8 @@ def descend(
     Descends the gradient of the mean square error with Adam, on the input alone, from some random
     starts side by side, and keeps the best. direction_only keeps the input on the circle of
     effects that full pushes have. trace, if given, receives each iteration's inputs (starts, 2)
-    [m] and losses (starts,) [m²]. Also returns the number of iterations.
+    [m] and losses (starts,) [m²]. Also returns the number of iterations. To the letter it begins,
+    and may end, with effects that no push has; nobody is warned of each.
     """
     columns = plane(model)
     radius = _effect_radius_m(model, features) if direction_only else START_RADIUS_M
@@ -70,7 +74,7 @@ def descend(
         xy = radius * torch.stack([sought.cos(), sought.sin()], dim=1) if direction_only else sought
         effect = torch.zeros(starts, len(model.effect_channels))
         effect[:, columns] = xy
-        prediction = model.predict(features, observe_final_effect(model, effect), at_end)
+        prediction = _predict(model, features, effect, at_end)
         losses = (prediction.effect_mean[:, 0, columns] - target).square().mean(dim=-1)
         if trace is not None:
             trace.append((xy.detach().numpy().copy(), losses.detach().numpy().copy()))
@@ -83,6 +87,13 @@ def descend(
         optimiser.step()
     best = int(losses.detach().argmin())
     return effect.detach()[best : best + 1], iterations
+
+
+def _predict(
+    model: EffectModel, features: torch.Tensor, effect: torch.Tensor, t: torch.Tensor
+) -> Prediction:
+    with warnings.catch_warnings(action="ignore", category=OutOfRangeWarning):
+        return model.predict(features, observe_final_effect(model, effect), t)
 
 
 @torch.no_grad()
@@ -131,7 +142,7 @@ def plan_gradient(
         effect, n = descend(model, features, target - xy, generator, starts, direction_only)
         iterations += n
         with torch.no_grad():
-            prediction = model.predict(features, observe_final_effect(model, effect), t[None])
+            prediction = _predict(model, features, effect, t[None])
         path = prediction.effect_mean[0, :, columns].numpy().astype(float)
         action = prediction.action_mean[0, :, a_columns].numpy().astype(float)
         std = prediction.effect_std[0, :, columns].norm(dim=-1).numpy()
