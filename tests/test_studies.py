@@ -188,7 +188,7 @@ def test_the_committed_studies_tell_the_story():
     steps = {row["added"]: row["final_error_mean_m"] for row in told["waterfall"]}
     assert list(steps) == ["nothing", *ablation.LADDER]
     assert steps["nothing"] > 10 * left_out["nothing"]
-    assert list(steps.values())[-1] == pytest.approx(left_out["nothing"], rel=1e-3)
+    assert list(steps.values())[-1] == pytest.approx(left_out["nothing"], rel=0.01)
     held_out = [r for r in told["rollability"] if r["test"] in ("mixed", "partial")]
     shares = [(r["learned_percent"], r["n"]) for r in held_out if r["object_class"] == "all"]
     assert sum(share * n for share, n in shares) / sum(n for _, n in shares) >= 98
