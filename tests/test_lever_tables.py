@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from affordlib.evaluation import lever_tables, lever_up
+from affordlib.evaluation.lever_tuning import SETTINGS, TRAINED, changed
 from affordlib.evaluation.lever_up import LeverUnit, guess, run_unit, split_of
 from affordlib.interactions import open_interactions
 from affordlib.interactions.lever import (
@@ -15,6 +16,7 @@ from affordlib.interactions.lever import (
 )
 from affordlib.models import load_checkpoint
 from affordlib.models.lever import (
+    LEVER_MODELS,
     PROTOCOLS,
     beginning_errors_m,
     window_errors_m,
@@ -131,6 +133,25 @@ def test_committed_science(committed):
     assert all(a <= b for a, b in zip(ours, (0.34, 0.35, 0.36, 0.38, 0.39), strict=True))
     for model in ("persistence", "constant_velocity", "paper"):
         assert all(a < b for a, b in zip(ours, window(model), strict=True))
+
+
+def test_a_setting_changes_what_it_says():
+    for name, _ in TRAINED:
+        usual = LEVER_MODELS[name]
+        assert changed(usual, "as shipped") == usual
+        assert changed(usual, "half the width").network.width == usual.network.width // 2
+        assert changed(usual, "half the learning rate").training.learning_rate == (
+            usual.training.learning_rate / 2
+        )
+        others = [changed(usual, setting) for setting in SETTINGS]
+        assert all(a != b for k, a in enumerate(others) for b in others[:k])
+
+
+def test_both_networks_had_the_same_budget_of_tuning(committed):
+    rows = {(r["model"], r["trained_for"], r["setting"]): r for r in committed["tuning"]}
+    assert list(rows) == [(*trained, setting) for trained in TRAINED for setting in SETTINGS]
+    assert {row["steps"] for row in rows.values()} == {1000}
+    assert len({row["n"] for row in rows.values()}) == 1
 
 
 @pytest.mark.parametrize("name", ["lever_anchored", "lever_lstm_window", "lever_lstm_first_step"])

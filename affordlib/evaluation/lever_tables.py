@@ -22,6 +22,7 @@ import numpy as np
 from affordlib.evaluation import reported
 from affordlib.evaluation.lever_up import BASELINES, MODELS, NAME, PARTS, LeverUnit, hashes
 from affordlib.evaluation.parts import checked_part
+from affordlib.evaluation.studies import read_study
 from affordlib.interactions.lever import POSE_CHANNELS
 from affordlib.models.lever import PROTOCOLS
 from affordlib.paths import resolve_out_dir
@@ -197,6 +198,7 @@ def assemble(folder: str | Path = PARTS, out_dir: str | Path = "data/results") -
             for u, part in parts
             if "training" in part
         ],
+        "tuning": read_study("lever_tuning") or [],
     }
     parameters = {"units": len(parts), "step_ms": 150, "data_sha256": parts[0][1]["data_sha256"]}
     return write_results(out_dir, NAME, parameters, tables)

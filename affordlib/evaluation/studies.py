@@ -10,12 +10,13 @@
     floor         the same push of an object that stands a millimetre and a degree off
     stopped       actions broken off at t: the state then, and where things come to rest
     reach         where the arm can act, as learned, against its kinematics
+    lever_tuning  ours and the recurrent network on lever-ups, with the same budget of settings
     tails         why σ is too wide for most pushes: three readings of what is off, and by how much
 
     python -m affordlib.evaluation.studies --only latent rollability
 
 Each is written, whole or not at all, to `data/results/studies/` with the hashes of its data and
-settings; `tables.py` puts them beside the tables of the units.
+settings; `tables.py` and `lever_tables.py` put them beside the tables of the units.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from affordlib.evaluation import ablation, limits, one_for_all, tails
+from affordlib.evaluation import ablation, lever_tuning, limits, one_for_all, tails
 from affordlib.evaluation.answers import rounded
 from affordlib.evaluation.effect_prediction import refuse_seen
 from affordlib.interactions import TrainingArrays, open_interactions, split_interactions
@@ -262,6 +263,7 @@ STUDIES: dict[str, tuple[Callable[[], Rows], tuple[str, ...], tuple[str, ...]]] 
     "floor": (limits.floor, ("push_test",), ()),
     "stopped": (limits.stopped, ("partial",), limits.STOPPED),
     "reach": (limits.reach, (), ()),
+    "lever_tuning": (lever_tuning.lever_tuning, (lever_tuning.DATA,), ()),
 }
 """By name: the study, the data sets and the checkpoints that it reads."""
 
@@ -279,6 +281,7 @@ def hashes(name: str) -> dict[str, Any]:
         "floor": limits.floor_settings,
         "stopped": lambda: limits.PHASES,
         "reach": limits.reach_settings,
+        "lever_tuning": lever_tuning.settings,
     }
     settings = repr(own[name]() if name in own else (training, network))
     files = {c: resolve_checkpoint(c).read_bytes() for c in checkpoints}

@@ -71,9 +71,8 @@ class PhaseSlider(FigureWidget):
         until = self.full.phase <= t
         path = 100 * (self.full.action[:, :2] + (x, y))
         above.plot(*path.T, ":", color=NEUTRAL, lw=1)
-        above.plot(*path[until].T, color=NEUTRAL, lw=2, label="gripper")
+        above.plot(*path[until].T, color="black", lw=2, label="gripper")
         plot_footprint(above, thing, (x, y), yaw, label="start")
-        plot_footprint(above, thing, now[:2], now[2], PREDICTION, "full action at t", filled=False)
         moved = 100 * np.hypot(*self.full.effect[:, :2].T)
         over_time.plot(self.full.phase, moved, color=PREDICTION, label="during the full action")
         over_time.axvline(t, color=NEUTRAL, ls=":")
@@ -90,6 +89,8 @@ class PhaseSlider(FigureWidget):
             plot_footprint(above, thing, rest[:2], rest[2], TRUTH, "at rest")
             off_mm = 1000 * np.hypot(rest[0] - now[0], rest[1] - now[1])
             words += f" Stopped there, it rests <b>{off_mm:.2f} mm</b> from where it was then."
+        told = {"label": "full action at t", "filled": False, "style": "--"}  # over what rests
+        plot_footprint(above, thing, now[:2], now[2], PREDICTION, **told)
         above.legend(loc="upper left", fontsize=8)
         over_time.legend(loc="upper left")
         return words

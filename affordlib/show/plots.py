@@ -84,12 +84,13 @@ def plot_footprint(
     color: str = NEUTRAL,
     label: str | None = None,
     filled: bool = True,
+    style: str = "-",
 ) -> Axes:
     """The outline of an object's base at a pose."""
     c, s = math.cos(yaw_rad), math.sin(yaw_rad)
     outline = 100 * (thing.footprint_m @ np.array([[c, s], [-s, c]]) + np.asarray(xy_m))
     ax.fill(*outline.T, facecolor=color if filled else "none", alpha=0.25 if filled else 1, lw=0)
-    ax.plot(*np.vstack([outline, outline[:1]]).T, color=color, lw=1.5, label=label)
+    ax.plot(*np.vstack([outline, outline[:1]]).T, style, color=color, lw=1.5, label=label)
     return ax
 
 
@@ -115,7 +116,7 @@ def plot_plan(ax: Axes, plan: Plan, sigma: bool = True) -> Axes:
             below -= 11
             ax.annotate(
                 f"{label} {step.primitive.name}",
-                end,
+                (end[0] + 100 * plan.goal.tolerance_m, end[1]),
                 (8, below),
                 textcoords="offset points",
                 fontsize=8,
@@ -131,6 +132,7 @@ def plot_plan(ax: Axes, plan: Plan, sigma: bool = True) -> Axes:
             100 * (start - 0.035 * direction),
             tail,
             arrowprops={"arrowstyle": "-|>", "color": NEUTRAL, "lw": 1.5},
+            zorder=4,
         )
         aside = direction[::-1] * (1, -1)
         aside *= 22 if aside @ (start - first) >= 0 else -22  # away from where the object stood

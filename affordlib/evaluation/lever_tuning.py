@@ -1,0 +1,74 @@
+"""The same budget of tuning for ours and for the recurrent network, on lever-ups (Section 4.1).
+
+Each network is trained with each of `SETTINGS`, as long as the shipped one, on the training part of
+fold 0, and judged on its validation part. No test data are seen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from affordlib.evaluation.lever_up import DATA, LeverUnit, split_of
+from affordlib.evaluation.parts import chosen_options
+from affordlib.interactions import open_interactions
+from affordlib.interactions.batches import symmetric_copies
+from affordlib.interactions.lever import MIRRORED, lever_arrays
+from affordlib.models.lever import (
+    LEVER_MODELS,
+    LeverModel,
+    beginning_errors_m,
+    fit_lever_model,
+    window_errors_m,
+)
+
+SETTINGS: dict[str, tuple[dict[str, Any], float]] = {
+    "as shipped": ({}, 1.0),
+    "half the learning rate": ({"learning_rate": 5e-4}, 1.0),
+    "twice the learning rate": ({"learning_rate": 2e-3}, 1.0),
+    "four times the learning rate": ({"learning_rate": 4e-3}, 1.0),
+    "half the width": ({}, 0.5),
+    "no weight decay": ({"weight_decay": 0.0}, 1.0),
+    "plain likelihood (β = 0)": ({"beta": 0.0}, 1.0),
+}
+"""By name: what of the training is changed, and the share of the width."""
+
+TRAINED = (("anchored", "all"), ("lstm_tuned", "window"), ("lstm_tuned", "first_step"))
+
+
+def settings() -> tuple[Any, ...]:
+    """What decides the rows beside the data."""
+    told = [
+        [chosen_options(part) for part in (LEVER_MODELS[name].network, LEVER_MODELS[name].training)]
+        for name, _ in TRAINED
+    ]
+    return SETTINGS, TRAINED, told
+
+
+def changed(lever: LeverModel, setting: str) -> LeverModel:
+    """A network and its training with one of `SETTINGS`."""
+    training, share = SETTINGS[setting]
+    network = replace(lever.network, width=round(share * lever.network.width))
+    return replace(lever, network=network, training=replace(lever.training, **training))
+
+
+def lever_tuning() -> list[dict[str, Any]]:
+    """Mean validation errors [m], of windows and of whole beginnings, of every setting."""
+    data, rows = open_interactions(DATA), []
+    for name, trained_for in TRAINED:
+        lever = LEVER_MODELS[name]
+        split = split_of(LeverUnit(name, trained_for), data)
+        training = symmetric_copies(lever_arrays(data, split.train, lever.view), MIRRORED)
+        validation = lever_arrays(data, split.validation, lever.view)
+        for setting in SETTINGS:
+            model, history = fit_lever_model(
+                changed(lever, setting), training, validation, trained_for, progress=False
+            )
+            row = {"model": name, "trained_for": trained_for, "setting": setting}
+            row |= {"steps": history[-1].step, "n": len(validation)}
+            if trained_for != "first_step":
+                row["window_mean_m"] = float(window_errors_m(model, validation).mean())
+            if trained_for != "window":
+                row["beginning_mean_m"] = float(beginning_errors_m(model, validation).mean())
+            rows.append(row)
+    return rows
