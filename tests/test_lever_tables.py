@@ -18,6 +18,7 @@ from affordlib.models import load_checkpoint
 from affordlib.models.lever import (
     LEVER_MODELS,
     PROTOCOLS,
+    TRAINING,
     beginning_errors_m,
     window_errors_m,
 )
@@ -137,14 +138,13 @@ def test_committed_science(committed):
 
 def test_a_setting_changes_what_it_says():
     for name, _ in TRAINED:
-        usual = LEVER_MODELS[name]
-        assert changed(usual, "as shipped") == usual
-        assert changed(usual, "half the width").network.width == usual.network.width // 2
-        assert changed(usual, "half the learning rate").training.learning_rate == (
-            usual.training.learning_rate / 2
-        )
-        others = [changed(usual, setting) for setting in SETTINGS]
-        assert all(a != b for k, a in enumerate(others) for b in others[:k])
+        ours = LEVER_MODELS[name]
+        first, *others = [changed(ours, setting) for setting in SETTINGS]
+        assert (first.network, first.training) == (ours.network, TRAINING)
+        assert changed(ours, "rate 0.001, half the width").network.width == ours.network.width // 2
+        assert changed(ours, "rate 0.004").training.learning_rate == 4e-3
+        assert all(a != b for k, a in enumerate(others) for b in [first, *others[:k]])
+        assert ours in others
 
 
 def test_both_networks_had_the_same_budget_of_tuning(committed):
@@ -152,6 +152,17 @@ def test_both_networks_had_the_same_budget_of_tuning(committed):
     assert list(rows) == [(*trained, setting) for trained in TRAINED for setting in SETTINGS]
     assert {row["steps"] for row in rows.values()} == {1000}
     assert len({row["n"] for row in rows.values()}) == 1
+    for name in {name for name, _ in TRAINED}:
+        errors = {
+            setting: sum(
+                (row.get("window_mean_m") or 0) + (row.get("beginning_mean_m") or 0) / 3
+                for (model, _, of), row in rows.items()
+                if (model, of) == (name, setting)
+            )
+            for setting in SETTINGS
+        }
+        taken = {of for (model, _, of), row in rows.items() if model == name and row["taken"]}
+        assert taken == {min(errors, key=errors.get)}
 
 
 @pytest.mark.parametrize("name", ["lever_anchored", "lever_lstm_window", "lever_lstm_first_step"])
