@@ -171,7 +171,9 @@ def test_shares_are_of_the_usual_effect(of_all):
 
 def test_stale_studies_are_refused(tmp_path, monkeypatch):
     assert read_study("latent", tmp_path) is None
-    monkeypatch.setattr(studies, "STUDIES", {"small": (lambda: [{"x": 1.0}], ("grasp",), ())})
+    monkeypatch.setattr(
+        studies, "STUDIES", {"small": studies.Study(lambda: [{"x": 1.0}], ("grasp",))}
+    )
     studies.main(["--only", "small", "--out", str(tmp_path)])
     assert read_study("small", tmp_path) == [{"x": 1.0}]
     told = json.loads((tmp_path / "small.json").read_text())

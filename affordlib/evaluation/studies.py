@@ -27,7 +27,7 @@ import json
 import math
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -251,43 +251,69 @@ def _varied_rows(n_interactions: int, folds: int, error: np.ndarray, judged: lis
     return rows
 
 
-STUDIES: dict[str, tuple[Callable[[], Rows], tuple[str, ...], tuple[str, ...]]] = {
-    "ablation": (ablation.ablation, ("push", "push_test"), ()),
-    "waterfall": (ablation.waterfall, ("push", "push_test"), ()),
-    "latent": (latent, ("push_test",), ("push_cnp", "push_film")),
-    "rollability": (rollability, ("mixed", "partial", "push_test", "drag", "reach"), ()),
-    "mixed": (mixed, ("mixed", "partial"), ()),
-    "varied": (varied, ("push_varied",), ("push_film_varied",)),
-    "tails": (tails.tails, ("push", "drag", "push_test"), tails.CHECKPOINTS),
-    "one_for_all": (one_for_all.one_for_all, (*one_for_all.PRIMITIVES, "push_test"), ()),
-    "floor": (limits.floor, ("push_test",), ()),
-    "stopped": (limits.stopped, ("partial",), limits.STOPPED),
-    "reach": (limits.reach, (), ()),
-    "lever_tuning": (lever_tuning.lever_tuning, (lever_tuning.DATA,), ()),
+def _network_settings() -> Any:
+    return replace(TRAINING, device="cpu"), SHIPPED["push_film"].network
+
+
+def _ablation_settings(changes: Any) -> Any:
+    whole = replace(SHIPPED["push_film"].training, device="cpu")
+    return SHIPPED["push_film"].network, whole, ablation.STEPS, ablation.SEEDS, changes
+
+
+@dataclass(frozen=True)
+class Study:
+    """What makes its rows; the data sets and checkpoints it reads, all else that decides it.
+
+    of: the results that show it as one of their tables.
+    """
+
+    rows: Callable[[], Rows]
+    sets: tuple[str, ...] = ()
+    checkpoints: tuple[str, ...] = ()
+    settings: Callable[[], Any] = _network_settings
+    of: str = "effect_prediction"
+
+
+STUDIES = {
+    "ablation": Study(
+        ablation.ablation,
+        ("push", "push_test"),
+        settings=lambda: _ablation_settings(list(ablation.CHANGES)),
+    ),
+    "waterfall": Study(
+        ablation.waterfall,
+        ("push", "push_test"),
+        settings=lambda: _ablation_settings(ablation.LADDER),
+    ),
+    "latent": Study(latent, ("push_test",), ("push_cnp", "push_film")),
+    "rollability": Study(rollability, ("mixed", "partial", "push_test", "drag", "reach")),
+    "mixed": Study(mixed, ("mixed", "partial")),
+    "varied": Study(varied, ("push_varied",), ("push_film_varied",)),
+    "tails": Study(tails.tails, ("push", "drag", "push_test"), tails.CHECKPOINTS),
+    "one_for_all": Study(
+        one_for_all.one_for_all,
+        (*one_for_all.PRIMITIVES, "push_test"),
+        settings=one_for_all.settings,
+    ),
+    "floor": Study(limits.floor, ("push_test",), settings=limits.floor_settings),
+    "stopped": Study(limits.stopped, ("partial",), limits.STOPPED, settings=lambda: limits.PHASES),
+    "reach": Study(limits.reach, settings=limits.reach_settings),
+    "lever_tuning": Study(
+        lever_tuning.lever_tuning,
+        (lever_tuning.DATA,),
+        settings=lever_tuning.settings,
+        of="lever_up",
+    ),
 }
-"""By name: the study, the data sets and the checkpoints that it reads."""
 
 
 def hashes(name: str) -> dict[str, Any]:
     """What a written study must hold to be that of today's data, checkpoints and settings."""
-    _, sets, checkpoints = STUDIES[name]
-    training, network = replace(TRAINING, device="cpu"), SHIPPED["push_film"].network
-    whole = replace(SHIPPED["push_film"].training, device="cpu")
-    ablation_sizes = ablation.STEPS, ablation.SEEDS
-    own = {
-        "ablation": lambda: (network, whole, *ablation_sizes, list(ablation.CHANGES)),
-        "waterfall": lambda: (network, whole, *ablation_sizes, ablation.LADDER),
-        "one_for_all": one_for_all.settings,
-        "floor": limits.floor_settings,
-        "stopped": lambda: limits.PHASES,
-        "reach": limits.reach_settings,
-        "lever_tuning": lever_tuning.settings,
-    }
-    settings = repr(own[name]() if name in own else (training, network))
-    files = {c: resolve_checkpoint(c).read_bytes() for c in checkpoints}
+    study = STUDIES[name]
+    files = {c: resolve_checkpoint(c).read_bytes() for c in study.checkpoints}
     return {
-        "settings_sha256": hashlib.sha256(settings.encode()).hexdigest(),
-        "data_sha256": {s: stored_sha256(s) for s in sets},
+        "settings_sha256": hashlib.sha256(repr(study.settings()).encode()).hexdigest(),
+        "data_sha256": {s: stored_sha256(s) for s in study.sets},
         "checkpoints_sha256": {c: hashlib.sha256(b).hexdigest() for c, b in files.items()},
     }
 
@@ -316,7 +342,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", default=FOLDER)
     options = parser.parse_args(argv)
     for name in options.only:
-        told = hashes(name) | {"rows": rounded(STUDIES[name][0]())}
+        told = hashes(name) | {"rows": rounded(STUDIES[name].rows())}
         path = resolve_out_dir(options.out) / f"{name}.json"
         write_text_atomically(path, json.dumps(told, indent=1, allow_nan=False) + "\n")
         print(path)

@@ -302,7 +302,7 @@ def assemble(
     }
     tables["baselines"] = baseline_rows(tables)
     tables["frames"] = frame_rows(parts)
-    made = {name: read_study(name, studies) for name in STUDIES if name != "lever_tuning"}
+    made = {name: read_study(name, studies) for name in STUDIES if STUDIES[name].of == NAME}
     tables |= {name: rows for name, rows in made.items() if rows is not None}
     trained = sum(unit.model in NETWORKS for unit, _ in parts)
     parameters = {"units": len(parts), "trained": trained, "data_sha256": _data(parts)}
