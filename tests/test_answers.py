@@ -8,8 +8,9 @@ import torch
 
 from affordlib.evaluation.answers import calibration, final_error, network_answers, yaw_error
 from affordlib.evaluation.baselines import constant, gaussian_process, logistic, nearest
+from affordlib.evaluation.grasps import auc, confusion_columns, cut_rows, grasp_rows, shares, wilson
 from affordlib.evaluation.inverse import along_effect, executed_record
-from affordlib.evaluation.tables import Errors, auc, confusion_columns, grasp_rows, wilson
+from affordlib.evaluation.pooled import Errors
 from affordlib.evaluation.units import Unit
 from affordlib.interactions import (
     TrainingArrays,
@@ -142,3 +143,33 @@ def test_grasps_by_the_rule_of_a_tenth_of_a_metre():
     assert (stands["tp_percent"], stands["fp_percent"], rolls["fn_percent"]) == (100, 100, 100)
     assert stands["error_mean_m"] == pytest.approx((0.13 + 0.11) / 2)
     assert stands["auc"] == 1.0
+
+
+def _folds_of_grasps(scores, lifted):
+    parts = []
+    for fold, (score, up) in enumerate(zip(scores, lifted, strict=True)):
+        told = {
+            "rollable": [False] * len(up) + [True] * len(up),
+            "truth": {"z": [0.25 * v for v in (*up, *up)]},
+            "probability": [*score, *score],
+        }
+        parts.append((Unit("logistic", "grasp", fold=fold), {"n": 100, "fold_test": told}))
+    return parts
+
+
+def test_a_folds_own_grasps_never_decide_where_its_probability_is_cut():
+    # Folds 0 and 1 part near 0.8, fold 2 at 0.2: by its own cut all right, by theirs all lost.
+    scores = [[0.9, 0.85, 0.7, 0.6], [0.95, 0.82, 0.78, 0.1], [0.4, 0.3, 0.1, 0.05]]
+    parts = _folds_of_grasps(scores, [[1, 1, 0, 0]] * 3)
+    stands, _ = cut_rows(parts)
+    assert (stands["n_success"], stands["n_failure"], stands["folds"]) == (6, 6, 3)
+    assert stands["tp_percent"] < 100  # fold 2
+    same, _ = cut_rows(_folds_of_grasps([scores[0]] * 3, [[1, 1, 0, 0]] * 3))
+    assert (same["tp_percent"], same["tn_percent"]) == (100, 100)
+    assert same["cut_median"] == pytest.approx(0.775)
+
+
+def test_shares_at_the_ends_are_all_and_nothing():
+    score, lifted = np.array([0.1, 0.4, 0.6, 0.9]), np.array([False, True, False, True])
+    tp, tn = shares(score, lifted, np.array([-np.inf, 0.5, 0.9]))
+    assert (tp.tolist(), tn.tolist()) == ([1, 0.5, 0], [0, 0.5, 1])

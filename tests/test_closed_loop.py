@@ -7,7 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from affordlib.evaluation.closed_loop import Trial, _stays_feasible
+from affordlib.evaluation.closed_loop import (
+    POSE_TOLERANCE_M,
+    Trial,
+    _stays_feasible,
+    draw_trial,
+)
 from affordlib.planning import (
     Disturbance,
     PlanMode,
@@ -304,3 +309,13 @@ def test_a_goal_across_the_table_is_reached_in_the_limit(table, repertoire):
     went = pursue(table, goal, repertoire)
     assert went.reached, went.words
     assert len(went.steps) <= action_limit(0.65)
+
+
+def test_what_the_fingers_have_shifted_far_is_not_called_reached(table, repertoire):
+    """A lying cylinder that the lift takes 28 mm aside."""
+    trial = draw_trial("height", 14)
+    table.place(trial.thing, trial.start_xy_m, trial.yaw_rad)
+    went = pursue(table, trial.goal, repertoire, tolerance_m=POSE_TOLERANCE_M)
+    assert went.reached == (went.distance_m <= 0.005)
+    assert went.ending == "gave_up"
+    assert "the position is not what it should be" in went.words

@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from affordlib.evaluation.closed_loop import N_TRIALS, ROWS, draw_trial
+from affordlib.evaluation.closed_loop import N_TRIALS, draw_trial
+from affordlib.evaluation.closed_loop_tables import ROWS
 from affordlib.evaluation.feasibility import is_feasible, on_the_rim, possible
 from affordlib.primitives import Drag, Push
 from affordlib.world import Cuboid
@@ -71,3 +72,5 @@ def test_rows_tell_the_endings_and_both_rates():
     height = ROWS["height"](records)[0]
     assert (height["feasible"], height["within_percent"]) == (8, 75.0)
     assert height["off_m_mean"] == pytest.approx(0.001)
+    aside = [record(True, "reached") | {"distance_m": 0.02}] * 2  # as high, but not there
+    assert ROWS["height"](records + aside)[0]["within_percent"] == 60.0

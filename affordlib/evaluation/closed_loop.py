@@ -15,7 +15,7 @@ import hashlib
 import json
 import math
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from tqdm.auto import tqdm
 
-from affordlib.evaluation.effect_prediction import error_row
+from affordlib.evaluation.closed_loop_tables import ROWS, WITHIN_HEIGHT_M
 from affordlib.evaluation.feasibility import half_width_m, is_feasible, on_the_rim
 from affordlib.paths import repo_root
 from affordlib.planning import Repertoire, draw_disturbances, pursue
@@ -41,13 +41,12 @@ if TYPE_CHECKING:
     from affordlib.planning import Disturbance, Pursuit
     from affordlib.world import Thing
 
-FORMATS = {"height": 4, "orientation": 4, "disturbances": 3, "reachability": 2}
+FORMATS = {"height": 5, "orientation": 4, "disturbances": 3, "reachability": 2}
 """Counts the changes of code that change a table's records."""
 
 N_TRIALS = {"height": 50, "orientation": 50, "disturbances": 200, "reachability": 1000}
 POSE_BY = {"height": "grasp", "orientation": "rotate"}
 CLASSES = ("cuboid", "upright_cylinder", "lying_cylinder", "sphere")
-WITHIN_M, WITHIN_HEIGHT_M, WITHIN_TURN_RAD = 0.005, 0.005, math.radians(3)
 POSE_TOLERANCE_M = 0.004
 """Of the position where an orientation or a height is asked as well: gripping shifts objects."""
 
@@ -165,138 +164,6 @@ def _stays_feasible(world: Tabletop, trial: Trial, went: Pursuit) -> bool:
         return what.kind == "goal"
     kind = Drag if world.object_rolls() else Push
     return all(is_feasible(kind, half, xy, went.goal.xy_m) for xy in went.seen_xy_m[look:][:1])
-
-
-# Tables
-
-
-def _share(chosen: Sequence[dict], good: Callable[[dict], bool]) -> float | None:
-    return 100 * float(np.mean([good(r) for r in chosen])) if chosen else None
-
-
-def _groups(records: Sequence[dict], *by: str) -> Iterator[tuple[dict[str, Any], list[dict]]]:
-    """All records, and those of each value of some columns."""
-    yield dict.fromkeys(by, "all"), list(records)
-    for name in by:
-        for value in dict.fromkeys(r[name] for r in records):
-            about = dict.fromkeys(by, "all") | {name: value}
-            yield about, [r for r in records if r[name] == value]
-
-
-def _endings(chosen: Sequence[dict]) -> dict[str, int]:
-    names = ("reached", "unreachable", "gave_up", "lost")
-    return {name: sum(r["ending"] == name for r in chosen) for name in names}
-
-
-def pose_rows(records: Sequence[dict], column: str, within: float, unit: str) -> list[dict]:
-    """Rows of `height` or `orientation`: how many feasible goals are hit, and how far off."""
-    rows = []
-    for about, chosen in _groups(records, "object_class"):
-        feasible = [r for r in chosen if r["feasible"]]
-        reached = [r for r in feasible if r["ending"] == "reached"]
-        if not reached:
-            continue
-        spread = error_row(np.array([abs(r[column]) for r in reached]))
-        rows.append(
-            {
-                **about,
-                "n": len(chosen),
-                "feasible": len(feasible),
-                **_endings(chosen),
-                "within_percent": _share(feasible, lambda r: abs(r[column]) <= within),
-                **{
-                    f"off_{unit}_{name}": spread[f"{name}_m"]
-                    for name in ("mean", "sem", "median", "p95")
-                },
-                "distance_m_mean": float(np.mean([r["distance_m"] for r in reached])),
-                "actions_mean": float(np.mean([r["actions"] for r in reached])),
-            }
-        )
-    return rows
-
-
-def disturbance_rows(records: Sequence[dict]) -> list[dict]:
-    """Rows of `disturbances`: endings, and the error with and without what went wrong, paired."""
-    rows = []
-    for about, chosen in _groups(records, "kind", "object_class"):
-        feasible = [r for r in chosen if r["feasible"]]
-        both = [r for r in feasible if r["ending"] == r["undisturbed"]["ending"] == "reached"]
-        if not both:
-            continue
-        with_, without = (
-            np.array([r["distance_m"] for r in rs])
-            for rs in (both, [r["undisturbed"] for r in both])
-        )
-        apart = with_ - without
-        rows.append(
-            {
-                **about,
-                "n": len(chosen),
-                "feasible": len(feasible),
-                **_endings(chosen),
-                "within_percent": _share(feasible, lambda r: r["distance_m"] <= WITHIN_M),
-                "disturbed_mean_m": float(with_.mean()),
-                "undisturbed_mean_m": float(without.mean()),
-                "apart_mean_m": float(apart.mean()),
-                "apart_sem_m": float(apart.std(ddof=1) / math.sqrt(len(apart)))
-                if len(apart) > 1
-                else 0.0,
-                "actions_mean": float(np.mean([r["actions"] for r in feasible])),
-                "undisturbed_actions_mean": float(
-                    np.mean([r["undisturbed"]["actions"] for r in feasible])
-                ),
-            }
-        )
-    return rows
-
-
-def judged_right(record: dict) -> bool:
-    """A plan that was carried out, or 'unreachable' where the oracle agrees."""
-    if record["feasible"]:
-        return record["ending"] == "reached"
-    return record["ending"] == "unreachable"
-
-
-def reachability_rows(records: Sequence[dict]) -> list[dict]:
-    """Rows of `reachability`: both rates, goals on the rim apart."""
-    rows = []
-    for where, of_where in (
-        ("all", records),
-        ("off the rim", [r for r in records if not r["on_the_rim"]]),
-        ("on the rim", [r for r in records if r["on_the_rim"]]),
-    ):
-        for about, chosen in _groups(of_where, "object_class"):
-            if not chosen or (where != "all" and about["object_class"] != "all"):
-                continue
-            yes = [r for r in chosen if r["feasible"]]
-            no = [r for r in chosen if not r["feasible"]]
-            rows.append(
-                {
-                    "goals": where,
-                    **about,
-                    "n": len(chosen),
-                    "feasible": len(yes),
-                    **_endings(chosen),
-                    "right_percent": _share(chosen, judged_right),
-                    "feasible_reached_percent": _share(yes, judged_right),
-                    "infeasible_refused_percent": _share(no, judged_right),
-                    "moved_for_nothing_percent": _share(no, lambda r: r["moved"]),
-                    "vetoes_mean": float(np.mean([r["vetoes"] for r in chosen])),
-                    "actions_mean": float(np.mean([r["actions"] for r in yes])) if yes else 0.0,
-                }
-            )
-    return rows
-
-
-ROWS: dict[str, Callable[[Sequence[dict]], list[dict]]] = {
-    "height": lambda records: pose_rows(records, "height_error_m", WITHIN_HEIGHT_M, "m"),
-    "orientation": lambda records: pose_rows(records, "turn_error_rad", WITHIN_TURN_RAD, "rad"),
-    "disturbances": disturbance_rows,
-    "reachability": reachability_rows,
-}
-
-
-# Running
 
 
 def settings_sha256(table: str, seed: int) -> str:

@@ -36,6 +36,9 @@ AT_REST_M, BETWEEN_LOOKS_S, MOST_LOOKS = 0.001, 0.25, 20
 """An object rests that is in the same place a quarter of a second later; after 5 s none is waited
 for."""
 
+SHIFTED_M = 0.005
+"""Closing fingers may shift what they lift by so much, and it still is where it should be."""
+
 RENEWALS = 3
 MOVE_M = 0.05
 SPARE_ACTIONS = 3
@@ -152,6 +155,9 @@ class Chase:
             off = self._turn_left()
             turned = off is None or abs(off) <= self.demands.turn_tolerance_rad
             if turned and abs(self._height_left()) <= self.demands.height_tolerance_m:
+                shifted = self.goal.distance_m(self.world.object_pose()[:2])
+                if shifted > max(self.demands.tolerance_m, SHIFTED_M):
+                    self._give_up("position")  # put down again, a round thing would roll
                 raise Ended("reached", self._where())
             self.world.park()
 

@@ -97,10 +97,13 @@ def plot_footprint(
 _PLATE = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 1}
 
 
-def plot_plan(ax: Axes, plan: Plan, sigma: bool = True) -> Axes:
+def plot_plan(
+    ax: Axes, plan: Plan, sigma: bool = True, thing: Thing | None = None, yaw_rad: float = 0.0
+) -> Axes:
     """A plan as predicted: the object's path, where each step stops and σ there, and the goal.
 
     sigma: draw a disc at each step's end, with twenty times σ for its radius.
+    thing: drawn dotted as each later push is foreseen to find it, yaw_rad being how it stands now.
     """
     circle = plt.Circle(
         100 * np.array(plan.goal.xy_m), 100 * plan.goal.tolerance_m, color=GOAL, fill=False, lw=1
@@ -108,7 +111,7 @@ def plot_plan(ax: Axes, plan: Plan, sigma: bool = True) -> Axes:
     ax.add_patch(circle)
     ax.plot(*(100 * np.array(plan.goal.xy_m)), "*", color=GOAL, ms=13, label="goal", zorder=5)
     first = start = np.array(plan.start_xy_m)
-    below = 0
+    below, turn = 0, 0.0
     for k, step in enumerate(plan.steps):
         end = 100 * np.array(step.predicted_end_xy_m)
         label = f"{k + 1}: {100 * step.stop_phase:.0f} %"
@@ -126,6 +129,8 @@ def plot_plan(ax: Axes, plan: Plan, sigma: bool = True) -> Axes:
         direction = np.array(
             [math.cos(step.primitive.direction_rad), math.sin(step.primitive.direction_rad)]
         )
+        if thing is not None and k > 0:
+            plot_footprint(ax, thing, start, yaw_rad + turn, PREDICTION, filled=False, style=":")
         tail = 100 * (start - 0.075 * direction)
         ax.annotate(
             "",
@@ -156,13 +161,15 @@ def plot_plan(ax: Axes, plan: Plan, sigma: bool = True) -> Axes:
         if sigma and not math.isnan(step.std_m):
             disc = {"radius": 100 * ENLARGED * step.std_m, "color": PREDICTION, "alpha": 0.35}
             ax.add_patch(plt.Circle(end, **disc, lw=1, zorder=1.5))
-        start = np.array(step.predicted_end_xy_m)
+        start, turn = np.array(step.predicted_end_xy_m), step.predicted_turn_rad
     return ax
 
 
-def plot_outcome(ax: Axes, outcome: Outcome) -> Axes:
-    """What carrying out a plan gave: the object's real path, over the plan."""
-    plot_plan(ax, outcome.plan, sigma=False)
+def plot_outcome(
+    ax: Axes, outcome: Outcome, thing: Thing | None = None, yaw_rad: float = 0.0
+) -> Axes:
+    """What carrying out a plan gave: the object's real path, over the plan (see `plot_plan`)."""
+    plot_plan(ax, outcome.plan, False, thing, yaw_rad)
     for k, path in enumerate(outcome.object_paths_xy_m):
         ax.plot(*(100 * path.T), color=TRUTH, lw=2, ls="--", label="truth" if k == 0 else None)
     ax.plot(*(100 * np.array(outcome.end_pose[:2])), "s", color=TRUTH, ms=6)
@@ -246,15 +253,24 @@ def table_picture(
     outcome: Outcome | None,
     half_width_m: float,
 ) -> bytes:
-    """The table from above as a PNG: the object at (x, y, yaw), and the outcome, else the plan."""
+    """The table from above as a PNG: the object at (x, y, yaw), and the outcome, else the plan.
+
+    What there is to be seen fills it; half_width_m bounds what it shows.
+    """
     # A figure of its own, outside pyplot: no window, nothing to close.
     figure = Figure(figsize=(5, 5), layout="constrained")
     FigureCanvasAgg(figure)
-    ax = plot_table(figure.add_subplot(), half_width_m=half_width_m)
+    shown = [pose[:2]]
+    if (made := outcome.plan if outcome else plan) is not None:
+        ends = [step.predicted_end_xy_m for step in made.steps]
+        shown += [made.start_xy_m, made.goal.xy_m, *ends]
+    low, high = np.min(shown, axis=0), np.max(shown, axis=0)
+    half = min(half_width_m, max(high - low) / 2 + 0.11)
+    ax = plot_table(figure.add_subplot(), (low + high) / 2, half)
     if outcome is not None:
         plot_outcome(ax, outcome)
     elif plan is not None:
-        plot_plan(ax, plan)
+        plot_plan(ax, plan, thing=thing, yaw_rad=pose[2])
     plot_footprint(ax, thing, pose[:2], pose[2], label="object")
     ax.legend(loc="upper left")
     buffer = io.BytesIO()

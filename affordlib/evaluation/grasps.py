@@ -1,0 +1,169 @@
+"""Will a grasp lift its object? Table 2 of the paper, and what its rule leaves on the table.
+
+Success is a gain in height above 0.1 m. The paper foresees it where μ_z(1) > 0.1 m, which is where
+P(z > 0.1 m) > ½. TP is the share of the true successes that are foreseen, TN that of the true
+failures, with Wilson's 95 % intervals, folds pooled.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from affordlib.evaluation.answers import final_error
+from affordlib.evaluation.pooled import Part, by_model
+from affordlib.evaluation.units import Unit
+from affordlib.primitives import Grasp
+
+AIM_TP, AIM_TN = 0.90, 0.95
+"""Shares of the true successes and failures that we would have foreseen."""
+
+
+def wilson(k: int, n: int, z: float = 1.959964) -> tuple[float, float]:
+    """Wilson's 95 % interval of a share of which k of n were seen (JASA 22, 1927)."""
+    if not 0 <= k <= n or n < 1:
+        raise ValueError(f"k of n must be 0 ≤ k ≤ n, n ≥ 1, got {k} of {n}")
+    centre = (k + z * z / 2) / (n + z * z)
+    half = z / (n + z * z) * math.sqrt(k * (n - k) / n + z * z / 4)
+    return max(0.0, centre - half), min(1.0, centre + half)
+
+
+def auc(score: np.ndarray, truth: np.ndarray, fold: np.ndarray) -> float | None:
+    """The share of (success, failure) pairs that the score puts in order; None without pairs.
+
+    Pairs are of one fold each: models of different folds are not on one scale.
+    """
+    pairs = truth[:, None] & ~truth & (fold[:, None] == fold)
+    if not pairs.any():
+        return None
+    order = (score[:, None] > score) + (score[:, None] == score) / 2
+    return float(order[pairs].mean())
+
+
+@dataclass(frozen=True)
+class Held:
+    """Held-out grasps of all folds (N,): P(z > 0.1 m); whether it was lifted, can roll; fold."""
+
+    score: np.ndarray
+    lifted: np.ndarray
+    rolls: np.ndarray
+    fold: np.ndarray
+
+    def __getitem__(self, chosen: np.ndarray) -> Held:
+        return Held(*(getattr(self, f.name)[chosen] for f in fields(self)))
+
+
+def _held(group: list[Part]) -> Held:
+    told = [part["fold_test"] for part in group]
+    return Held(
+        np.concatenate([success_probability(t) for t in told]),
+        np.concatenate([t["truth"]["z"] for t in told]) > Grasp.success_m,
+        np.concatenate([t["rollable"] for t in told]),
+        np.repeat(np.arange(len(told)), [len(t["rollable"]) for t in told]),
+    )
+
+
+def grasp_rows(parts: list[tuple[Unit, Part]]) -> list[dict[str, Any]]:
+    """The paper's Table 2, by its rule: what can roll and what cannot, apart."""
+    rows = []
+    for about, group in by_model(parts, "grasp"):
+        held, error = _held(group), None
+        if "mean" in group[0]["fold_test"]:
+            error = np.concatenate([final_error(part["fold_test"]) for part in group])
+        for rollable in (False, True):
+            chosen = held.rolls == rollable
+            one = held[chosen]
+            row = about | {"rollable": rollable, "n": int(chosen.sum())}
+            row["error_mean_m"] = None if error is None else float(error[chosen].mean())
+            row["error_median_m"] = None if error is None else float(np.median(error[chosen]))
+            row |= confusion_columns(one.score > 0.5, one.lifted)
+            brier = float(np.square(one.score - one.lifted).mean())
+            rows.append(row | {"auc": auc(one.score, one.lifted, one.fold), "brier": brier})
+    return rows
+
+
+def shares(score: np.ndarray, lifted: np.ndarray, cuts: np.ndarray) -> tuple[np.ndarray, ...]:
+    """TP and TN (C,), as shares, of foreseeing success where the score (N,) is above a cut (C,)."""
+    success, failure = np.sort(score[lifted]), np.sort(score[~lifted])
+    tp = 1 - np.searchsorted(success, cuts, side="right") / len(success)
+    return tp, np.searchsorted(failure, cuts, side="right") / len(failure)
+
+
+def best_cut(score: np.ndarray, lifted: np.ndarray) -> float:
+    """The cut at which TP and TN exceed their aims, or miss them, by the most even margin."""
+    known = np.unique(score)
+    cuts = (known[1:] + known[:-1]) / 2
+    tp, tn = shares(score, lifted, cuts)
+    return float(cuts[np.argmax(np.minimum(tp - AIM_TP, tn - AIM_TN))])
+
+
+def cut_rows(parts: list[tuple[Unit, Part]]) -> list[dict[str, Any]]:
+    """Table 2 again, the probability cut not at ½ but where the other folds' grasps say.
+
+    Their networks have not seen the grasps that they are asked about, so nothing that a fold is
+    tested on decides its cut.
+    """
+    rows = []
+    for about, group in by_model(parts, "grasp"):
+        if about["folds"] == 1 or about["model"] == "constant":
+            continue
+        held = _held(group)
+        for rollable in (False, True):
+            one = held[held.rolls == rollable]
+            cuts = {}
+            for fold in np.unique(one.fold):
+                others = one[one.fold != fold]
+                cuts[fold] = best_cut(others.score, others.lifted)
+            cut = np.array([cuts[fold] for fold in one.fold])
+            row = about | {"rollable": rollable, "n": len(cut)}
+            row |= {"cut_median": float(np.median(list(cuts.values())))}
+            rows.append(row | confusion_columns(one.score > cut, one.lifted))
+    return rows
+
+
+def curve_rows(parts: list[tuple[Unit, Part]], n_points: int = 51) -> list[dict[str, Any]]:
+    """All that cutting elsewhere could give: TP and TN over the whole range of cuts.
+
+    Of sets of 1,000 grasps; of 100, a curve is a few steps.
+    """
+    rows = []
+    for about, group in by_model(parts, "grasp"):
+        if about["n_interactions"] < 1000 or about["model"] == "constant":
+            continue
+        held = _held(group)
+        for rollable in (False, True):
+            one = held[held.rolls == rollable]
+            known = np.unique(one.score)
+            tp, tn = shares(one.score, one.lifted, np.concatenate([[-np.inf], known]))
+            kept = np.unique(np.linspace(0, len(tp) - 1, n_points).round().astype(int))
+            for k in kept:
+                shown = {"tp_percent": round(100 * tp[k], 2), "tn_percent": round(100 * tn[k], 2)}
+                rows.append(about | {"rollable": rollable} | shown)
+    return rows
+
+
+def success_probability(answers: dict[str, Any]) -> np.ndarray:
+    """P(z > 0.1 m) (N,); above one half exactly where a Gaussian's mean is above 0.1 m."""
+    if "probability" in answers:
+        return np.array(answers["probability"])
+    mean, std = np.array(answers["mean"]["z"]), np.array(answers["std"]["z"])
+    standard = (mean - Grasp.success_m) / (std * math.sqrt(2))
+    return np.array([(1 + math.erf(v)) / 2 for v in standard])
+
+
+def confusion_columns(foreseen: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
+    """TP and FN in per cent of the true successes, TN and FP of the true failures; intervals."""
+    columns: dict[str, Any] = {}
+    for right, wrong, those in (("tp", "fn", truth), ("tn", "fp", ~truth)):
+        n, k = int(those.sum()), int((foreseen == truth)[those].sum())
+        low, high = wilson(k, n) if n else (None, None)
+        columns |= {
+            f"{right}_percent": 100 * k / n if n else None,
+            f"{right}_low_percent": None if low is None else 100 * low,
+            f"{right}_high_percent": None if high is None else 100 * high,
+            f"{wrong}_percent": 100 * (n - k) / n if n else None,
+        }
+    return columns | {"n_success": int(truth.sum()), "n_failure": int((~truth).sum())}
