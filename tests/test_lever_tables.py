@@ -110,6 +110,16 @@ def test_differences_are_paired_by_object():
     assert first["sem_cm"] == pytest.approx(np.std([0.1, 0.5, 1.0], ddof=1) / math.sqrt(3))
 
 
+def test_shapes_never_seen_stand_beside_the_same_shapes_when_they_are_known():
+    known = (LeverUnit("anchored"), _part([0.1, 0.5, 1.0]))
+    strange = (LeverUnit("anchored", no_edges=3), _part([0.4, 0.6]))
+    rows = lever_tables.unseen_rows([known, strange], {0: 3, 1: 4, 2: 3})
+    assert {row["edges"] for row in rows} == {3}
+    assert (rows[0]["n"], rows[0]["mean_cm"]) == (2, pytest.approx(0.5))
+    assert (rows[0]["known_n"], rows[0]["known_mean_cm"]) == (2, pytest.approx(0.55))
+    assert {row["n"] for row in lever_tables.error_rows([known, strange])} == {3}  # the folds only
+
+
 @pytest.fixture(scope="module")
 def committed():
     return read_results(repo_root() / "data" / "results" / "lever_up.json")["tables"]

@@ -20,7 +20,15 @@ from typing import Any
 import numpy as np
 
 from affordlib.evaluation import reported
-from affordlib.evaluation.lever_up import BASELINES, MODELS, NAME, PARTS, LeverUnit, hashes
+from affordlib.evaluation.lever_up import (
+    BASELINES,
+    MODELS,
+    NAME,
+    PARTS,
+    LeverUnit,
+    hashes,
+    numbered_edges,
+)
 from affordlib.evaluation.parts import checked_part
 from affordlib.evaluation.studies import read_study
 from affordlib.interactions.lever import POSE_CHANNELS
@@ -44,15 +52,15 @@ def read_parts(folder: str | Path = PARTS) -> list[tuple[LeverUnit, dict[str, An
 Group = list[tuple[LeverUnit, dict[str, Any]]]
 
 
-def _groups(parts: Group, no_edges: bool = False) -> Iterable[tuple[dict[str, Any], str, Group]]:
+def _groups(
+    parts: Group, no_edges: int | None = None
+) -> Iterable[tuple[dict[str, Any], str, Group]]:
     """The parts of a model and protocol, and the columns that say which they are."""
     for protocol, model in product(PROTOCOLS, MODELS):
         group = [
             (unit, part)
             for unit, part in parts
-            if unit.model == model
-            and protocol in unit.protocols
-            and (unit.no_edges is not None) == no_edges
+            if unit.model == model and protocol in unit.protocols and unit.no_edges == no_edges
         ]
         if group:
             epochs = [u.epochs for u, _ in group if u.epochs]
@@ -78,14 +86,40 @@ def _told(errors_cm: np.ndarray) -> dict[str, float]:
     }
 
 
-def error_rows(parts: Group, no_edges: bool = False) -> list[dict[str, Any]]:
-    """Table 1: an object's errors are meaned over its windows."""
+def error_rows(parts: Group, no_edges: int | None = None) -> list[dict[str, Any]]:
+    """Table 1: an object's errors are meaned over its windows.
+
+    no_edges: of the trainings that left out polygons of so many edges, on those.
+    """
     rows = []
     for about, protocol, group in _groups(parts, no_edges):
-        if no_edges:
-            about = about | {"edges": ", ".join(str(u.no_edges) for u, _ in group)}
         errors = _pooled(group, protocol).mean(axis=1)
         rows += [about | {"steps": k + 1} | _told(errors[:, k]) for k in range(errors.shape[1])]
+    return rows
+
+
+def unseen_rows(parts: Group, edges: dict[int, int]) -> list[dict[str, Any]]:
+    """Polygons of a number of edges that a network has never seen, beside networks that have.
+
+    edges: of each interaction, by its number. The second are those of the folds, on the polygons of
+    that kind which they are tested on (*known*).
+    """
+    rows = []
+    for left_out in sorted({u.no_edges for u, _ in parts if u.no_edges is not None}):
+        known = {}
+        for about, protocol, group in _groups(parts):
+            alike = [edges[i] == left_out for _, part in group for i in part["interaction"]]
+            errors = _pooled(group, protocol).mean(axis=1)[alike]
+            known |= {
+                (about["model"], protocol, k + 1): {
+                    "known_n": len(errors),
+                    "known_mean_cm": float(errors[:, k].mean()),
+                }
+                for k in range(errors.shape[1])
+            }
+        for row in error_rows(parts, left_out):
+            key = row["model"], row["protocol"], row["steps"]
+            rows.append({"edges": left_out} | row | known.get(key, {}))
     return rows
 
 
@@ -183,7 +217,7 @@ def assemble(folder: str | Path = PARTS, out_dir: str | Path = "data/results") -
         "lever_up": rows,
         "summary": [*reported.lever_up_rows(), *summary_rows(rows)],
         "motion": motion_rows(parts),
-        "unseen_edges": error_rows(parts, no_edges=True),
+        "unseen_edges": unseen_rows(parts, numbered_edges()),
         "paired": paired_rows(parts),
         "coverage": coverage_rows(parts),
         "steps": step_rows(parts),

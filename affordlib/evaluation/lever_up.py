@@ -132,6 +132,12 @@ def edges_of(data: xr.Dataset) -> np.ndarray:
     return np.array([len(draw_scene(recipe, int(i))[0].footprint_m) for i in numbers])
 
 
+def numbered_edges() -> dict[int, int]:
+    """The same by the number of the interaction, of the shipped set."""
+    data = open_once(DATA)
+    return dict(zip(data["interaction"].values.tolist(), edges_of(data).tolist(), strict=True))
+
+
 def split_of(unit: LeverUnit, data: xr.Dataset) -> Split:
     """80/10/10 in five folds whose test parts do not overlap, or all but some edges."""
     split = split_interactions(data.sizes["interaction"], unit.seed, 2 * unit.fold, 2 * N_FOLDS)
