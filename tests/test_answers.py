@@ -8,7 +8,14 @@ import torch
 
 from affordlib.evaluation.answers import calibration, final_error, network_answers, yaw_error
 from affordlib.evaluation.baselines import constant, gaussian_process, logistic, nearest
-from affordlib.evaluation.grasps import auc, confusion_columns, cut_rows, grasp_rows, shares, wilson
+from affordlib.evaluation.grasps import (
+    auc,
+    confusion_columns,
+    grasp_rows,
+    rates,
+    threshold_rows,
+    wilson,
+)
 from affordlib.evaluation.inverse import along_effect, executed_record
 from affordlib.evaluation.pooled import Errors
 from affordlib.evaluation.units import Unit
@@ -157,19 +164,19 @@ def _folds_of_grasps(scores, lifted):
     return parts
 
 
-def test_a_folds_own_grasps_never_decide_where_its_probability_is_cut():
-    # Folds 0 and 1 part near 0.8, fold 2 at 0.2: by its own cut all right, by theirs all lost.
+def test_a_folds_own_grasps_never_decide_its_threshold():
+    # Folds 0 and 1 part near 0.8, fold 2 at 0.2: by its own all right, by theirs all lost.
     scores = [[0.9, 0.85, 0.7, 0.6], [0.95, 0.82, 0.78, 0.1], [0.4, 0.3, 0.1, 0.05]]
     parts = _folds_of_grasps(scores, [[1, 1, 0, 0]] * 3)
-    stands, _ = cut_rows(parts)
+    stands, _ = threshold_rows(parts)
     assert (stands["n_success"], stands["n_failure"], stands["folds"]) == (6, 6, 3)
     assert stands["tp_percent"] < 100  # fold 2
-    same, _ = cut_rows(_folds_of_grasps([scores[0]] * 3, [[1, 1, 0, 0]] * 3))
+    same, _ = threshold_rows(_folds_of_grasps([scores[0]] * 3, [[1, 1, 0, 0]] * 3))
     assert (same["tp_percent"], same["tn_percent"]) == (100, 100)
-    assert same["cut_median"] == pytest.approx(0.775)
+    assert same["threshold_median"] == pytest.approx(0.775)
 
 
-def test_shares_at_the_ends_are_all_and_nothing():
+def test_rates_at_the_ends_are_all_and_nothing():
     score, lifted = np.array([0.1, 0.4, 0.6, 0.9]), np.array([False, True, False, True])
-    tp, tn = shares(score, lifted, np.array([-np.inf, 0.5, 0.9]))
+    tp, tn = rates(score, lifted, np.array([-np.inf, 0.5, 0.9]))
     assert (tp.tolist(), tn.tolist()) == ([1, 0.5, 0], [0, 0.5, 1])

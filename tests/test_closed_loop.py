@@ -1,18 +1,14 @@
 """Carrying out: every ending provoked, no endless loop, a veto before any motion."""
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
-from affordlib.evaluation.closed_loop import (
-    POSE_TOLERANCE_M,
-    Trial,
-    _stays_feasible,
-    draw_trial,
-)
+from affordlib.evaluation.closed_loop import Trial, _stays_feasible
 from affordlib.planning import (
     Disturbance,
     PlanMode,
@@ -311,11 +307,16 @@ def test_a_goal_across_the_table_is_reached_in_the_limit(table, repertoire):
     assert len(went.steps) <= action_limit(0.65)
 
 
-def test_what_the_fingers_have_shifted_far_is_not_called_reached(table, repertoire):
-    """A lying cylinder that the lift takes 28 mm aside."""
-    trial = draw_trial("height", 14)
-    table.place(trial.thing, trial.start_xy_m, trial.yaw_rad)
-    went = pursue(table, trial.goal, repertoire, tolerance_m=POSE_TOLERANCE_M)
-    assert went.reached == (went.distance_m <= 0.005)
-    assert went.ending == "gave_up"
-    assert "the position is not what it should be" in went.words
+@pytest.mark.parametrize(("aside_m", "ending"), [(0.0, "reached"), (0.02, "gave_up")])
+def test_what_is_held_aside_of_its_goal_is_not_called_reached(table, repertoire, aside_m, ending):
+    goal = Goal((0.06, 0.0), height_m=0.1)
+
+    def move_goal(plan, n):
+        lifted = plan.steps[-1].primitive.name == "grasp"
+        return replace(goal, xy_m=(0.06 + aside_m, 0.0)) if lifted else None
+
+    table.place(TUBE)
+    went = pursue(table, goal, repertoire, on_action=move_goal)
+    assert went.ending == ending, went.words
+    assert went.distance_m == pytest.approx(aside_m, abs=0.005)
+    assert abs(went.height_error_m) < 0.003

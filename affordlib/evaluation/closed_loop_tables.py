@@ -143,6 +143,3 @@ ROWS: dict[str, Callable[[Sequence[dict]], list[dict]]] = {
     "disturbances": disturbance_rows,
     "reachability": reachability_rows,
 }
-
-
-# Running

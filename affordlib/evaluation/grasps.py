@@ -85,26 +85,25 @@ def grasp_rows(parts: list[tuple[Unit, Part]]) -> list[dict[str, Any]]:
     return rows
 
 
-def shares(score: np.ndarray, lifted: np.ndarray, cuts: np.ndarray) -> tuple[np.ndarray, ...]:
-    """TP and TN (C,), as shares, of foreseeing success where the score (N,) is above a cut (C,)."""
+def rates(score: np.ndarray, lifted: np.ndarray, thresholds: np.ndarray) -> tuple[np.ndarray, ...]:
+    """True positive and true negative rates (T,) of a score (N,) above thresholds (T,)."""
     success, failure = np.sort(score[lifted]), np.sort(score[~lifted])
-    tp = 1 - np.searchsorted(success, cuts, side="right") / len(success)
-    return tp, np.searchsorted(failure, cuts, side="right") / len(failure)
+    tp = 1 - np.searchsorted(success, thresholds, side="right") / len(success)
+    return tp, np.searchsorted(failure, thresholds, side="right") / len(failure)
 
 
-def best_cut(score: np.ndarray, lifted: np.ndarray) -> float:
-    """The cut at which TP and TN exceed their aims, or miss them, by the most even margin."""
+def best_threshold(score: np.ndarray, lifted: np.ndarray) -> float:
+    """The threshold at which the lesser of the margins of TP and TN over their aims is largest."""
     known = np.unique(score)
-    cuts = (known[1:] + known[:-1]) / 2
-    tp, tn = shares(score, lifted, cuts)
-    return float(cuts[np.argmax(np.minimum(tp - AIM_TP, tn - AIM_TN))])
+    between = (known[1:] + known[:-1]) / 2
+    tp, tn = rates(score, lifted, between)
+    return float(between[np.argmax(np.minimum(tp - AIM_TP, tn - AIM_TN))])
 
 
-def cut_rows(parts: list[tuple[Unit, Part]]) -> list[dict[str, Any]]:
-    """Table 2 again, the probability cut not at ½ but where the other folds' grasps say.
+def threshold_rows(parts: list[tuple[Unit, Part]]) -> list[dict[str, Any]]:
+    """Table 2 again, the threshold not ½ but what suits the other folds' held-out grasps best.
 
-    Their networks have not seen the grasps that they are asked about, so nothing that a fold is
-    tested on decides its cut.
+    What is foreseen of a fold decides nothing about its own threshold.
     """
     rows = []
     for about, group in by_model(parts, "grasp"):
@@ -113,19 +112,19 @@ def cut_rows(parts: list[tuple[Unit, Part]]) -> list[dict[str, Any]]:
         held = _held(group)
         for rollable in (False, True):
             one = held[held.rolls == rollable]
-            cuts = {}
+            chosen = {}
             for fold in np.unique(one.fold):
                 others = one[one.fold != fold]
-                cuts[fold] = best_cut(others.score, others.lifted)
-            cut = np.array([cuts[fold] for fold in one.fold])
-            row = about | {"rollable": rollable, "n": len(cut)}
-            row |= {"cut_median": float(np.median(list(cuts.values())))}
-            rows.append(row | confusion_columns(one.score > cut, one.lifted))
+                chosen[fold] = best_threshold(others.score, others.lifted)
+            threshold = np.array([chosen[fold] for fold in one.fold])
+            row = about | {"rollable": rollable, "n": len(threshold)}
+            row |= {"threshold_median": float(np.median(list(chosen.values())))}
+            rows.append(row | confusion_columns(one.score > threshold, one.lifted))
     return rows
 
 
-def curve_rows(parts: list[tuple[Unit, Part]], n_points: int = 51) -> list[dict[str, Any]]:
-    """All that cutting elsewhere could give: TP and TN over the whole range of cuts.
+def roc_rows(parts: list[tuple[Unit, Part]], n_points: int = 51) -> list[dict[str, Any]]:
+    """The receiver operating characteristic: TP and TN over the whole range of thresholds.
 
     Of sets of 1,000 grasps; of 100, a curve is a few steps.
     """
@@ -137,7 +136,7 @@ def curve_rows(parts: list[tuple[Unit, Part]], n_points: int = 51) -> list[dict[
         for rollable in (False, True):
             one = held[held.rolls == rollable]
             known = np.unique(one.score)
-            tp, tn = shares(one.score, one.lifted, np.concatenate([[-np.inf], known]))
+            tp, tn = rates(one.score, one.lifted, np.concatenate([[-np.inf], known]))
             kept = np.unique(np.linspace(0, len(tp) - 1, n_points).round().astype(int))
             for k in kept:
                 shown = {"tp_percent": round(100 * tp[k], 2), "tn_percent": round(100 * tn[k], 2)}

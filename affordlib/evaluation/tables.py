@@ -19,7 +19,7 @@ import numpy as np
 
 from affordlib.evaluation import reported
 from affordlib.evaluation.answers import calibration, final_error, yaw_error
-from affordlib.evaluation.grasps import curve_rows, cut_rows, grasp_rows
+from affordlib.evaluation.grasps import grasp_rows, roc_rows, threshold_rows
 from affordlib.evaluation.pooled import Part, by_model, pool, read_parts
 from affordlib.evaluation.studies import FOLDER as STUDIES_FOLDER
 from affordlib.evaluation.studies import STUDIES, read_study
@@ -145,8 +145,8 @@ def assemble(
         "push_test": error_rows(parts, "push", "fixed_test"),
         "drag": error_rows(parts, "drag", "fold_test"),
         "grasp": [*reported.grasp_rows(grasps[0]), *grasps] if grasps else [],
-        "grasp_cut": cut_rows(parts),
-        "grasp_curve": curve_rows(parts),
+        "grasp_threshold": threshold_rows(parts),
+        "grasp_roc": roc_rows(parts),
         "rotate": error_rows(parts, "rotate", "fold_test"),
         "inverse": inverse_rows(parts),
         "calibration": calibration_table(parts),
