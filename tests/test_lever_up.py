@@ -223,18 +223,40 @@ def test_the_published_network_is_the_published_one(arrays):
     assert [m.out_channels for m in model.cnn if hasattr(m, "out_channels")] == [32, 64, 128, 256]
 
 
-def test_a_published_training_goes_on_where_it_was_broken_off(tmp_path, arrays, monkeypatch):
+@pytest.fixture
+def small_published(arrays, monkeypatch):
     from affordlib.models import lstm_published
 
     monkeypatch.setattr(lstm_published, "CONVOLUTION_WIDTHS", (2, 2, 2, 2))
     monkeypatch.setattr(lstm_published, "LEVER_IMAGE_PIXELS", 48)
     monkeypatch.setattr(lstm_published, "DENSE", 8)
 
-    def train(epochs, file):
+    def make():
         torch.manual_seed(0)
-        model = PublishedLSTM(
-            PublishedConfig(arrays.action_channels, arrays.effect_channels), Normaliser.fit(arrays)
-        )
+        config = PublishedConfig(arrays.action_channels, arrays.effect_channels)
+        return PublishedLSTM(config, Normaliser.fit(arrays))
+
+    return make
+
+
+def test_its_recurrence_is_that_of_features_repeated_and_concatenated(arrays, small_published):
+    model, start = small_published().eval(), torch.zeros(len(arrays), dtype=torch.long)
+    lstm = torch.nn.LSTM(model.lstm.input_size, model.lstm.hidden_size, batch_first=True)
+    lstm.load_state_dict({f"{k}_l0": v for k, v in model.lstm.state_dict().items()})
+    pose = (arrays.effect / model.effect_scale)[:, : SEEN + 1]
+    ends = (arrays.action[:, [0, -1]] / model.action_scale).flatten(1)
+    again = [model.encode(arrays.image), pose[:, 0], ends]
+    told = torch.cat([x[:, None].expand(-1, SEEN, -1) for x in again], dim=-1)
+    told[:, :, 8 : -ends.shape[1]] = pose[:, :-1]
+    phase = (torch.arange(SEEN) / model.config.steps).expand(len(arrays), -1)[..., None]
+    out, _ = lstm(torch.cat([told, phase], dim=-1))
+    expected = torch.nn.functional.mse_loss(model.next_pose(out), pose[:, 1:])
+    torch.testing.assert_close(model.next_step_loss(arrays, start, SEEN), expected)
+
+
+def test_a_published_training_goes_on_where_it_was_broken_off(tmp_path, arrays, small_published):
+    def train(epochs, file):
+        model = small_published()
         told = train_published(model, arrays, arrays, "window", epochs, checkpoint=file)
         return model, told
 

@@ -22,6 +22,7 @@ from affordlib.primitives import Grasp
 if TYPE_CHECKING:
     import xarray as xr
 
+    from affordlib.models.ensemble import Ensemble
     from affordlib.models.network import EffectNetwork
 
 EVERY = 12
@@ -43,7 +44,7 @@ def believable(data: xr.Dataset, interactions: np.ndarray) -> np.ndarray:
 
 @torch.no_grad()
 def network_answers(
-    model: EffectNetwork, data: xr.Dataset, interactions: np.ndarray
+    model: EffectNetwork | Ensemble, data: xr.Dataset, interactions: np.ndarray
 ) -> dict[str, Any]:
     """What a network foresees of interactions."""
     kept = believable(data, interactions)

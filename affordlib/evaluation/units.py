@@ -36,8 +36,10 @@ from affordlib.interactions import Normaliser, TrainingArrays, split_interaction
 from affordlib.interactions.batches import Symmetry, symmetric_copies
 from affordlib.interactions.store import stored_sha256
 from affordlib.models.attention import AttentionConfig
+from affordlib.models.calibration import fit_temperature
 from affordlib.models.checkpoint import load_checkpoint
 from affordlib.models.cnp import CNPConfig
+from affordlib.models.ensemble import Ensemble
 from affordlib.models.film import FiLMConfig
 from affordlib.models.make_checkpoints import (
     GRASP_SYMMETRIES,
@@ -66,7 +68,7 @@ FEW_STEPS = 800
 """Of training on the sets of 100 interactions."""
 
 PARTS = "data/results/parts"
-NETWORKS = ("paper", "film", "paper_push_frame", "film_table_frame", "attention")
+NETWORKS = ("paper", "film", "paper_push_frame", "film_table_frame", "attention", "ensemble")
 MODELS = (*NETWORKS, *BASELINES, "logistic")
 
 
@@ -102,8 +104,12 @@ KINDS: dict[str, tuple[str, type[NetworkConfig]]] = {
     "paper": ("push_cnp", CNPConfig),
     "film": ("push_film", FiLMConfig),
     "attention": ("push_attention", AttentionConfig),
+    "ensemble": ("push_film", FiLMConfig),
 }
 """By the first word of a model: the shipped checkpoint whose training it has, its network."""
+
+MEMBERS = 5
+"""Networks of an `ensemble`, the first of which is that of `film`."""
 
 OF_SET = {s.data: name for name, s in SHIPPED.items() if isinstance(s.network, FiLMConfig)}
 """The shipped FiLM networks by the sets they learn from."""
@@ -156,9 +162,9 @@ def learner(unit: Unit) -> tuple[NetworkConfig, TrainingConfig] | None:
     task, kind = task_of(unit.data), unit.model.split("_", maxsplit=1)[0]
     name, config = KINDS[kind]
     shipped = SHIPPED[name]
-    if kind == "film" and unit.n == "all":
+    if config is FiLMConfig and unit.n == "all":
         shipped = SHIPPED.get(OF_SET.get(unit.data, ""), shipped)
-    from_behind = unit.model in ("film", "attention", "paper_push_frame")
+    from_behind = unit.model in ("film", "attention", "ensemble", "paper_push_frame")
     network = config(
         action_channels=task.action_channels,
         effect_channels=task.effect_channels if kind == "paper" else task.all_effects,
@@ -182,6 +188,8 @@ def configuration_sha256(unit: Unit) -> str:
         network, training = configs
         told |= {"network": type(network).__name__, **chosen_options(network)}
         told |= {f"training_{name}": value for name, value in chosen_options(training).items()}
+    if unit.model == "ensemble":
+        told |= {"members": MEMBERS}
     return sha256_of(told)
 
 
@@ -238,16 +246,18 @@ def run_unit(unit: Unit, folder: Path, progress: bool = False) -> bool:
             part["inverse"] = executed_record(data, kept, along_effect(data, kept))
     else:
         halfway = folder / f".{unit.file}.{part['configuration_sha256'][:8]}.pt"
-        model, part["training"] = _fit(unit, *configs, data, split, halfway, progress)
+        fit = _fit_ensemble if unit.model == "ensemble" else _fit
+        model, part["training"] = fit(unit, *configs, data, split, halfway, progress)
         told = {name: network_answers(model, *test) for name, test in tests.items()}
         if task.also:
             part["inverse"] = inverse_record(model, data, split.test)
     part["fold_test"] = told["fold"]
     if "fixed" in told:
         part["fixed_test"] = summary(told["fixed"])
-    write_text_atomically(folder / unit.file, json.dumps(rounded(part), allow_nan=False) + "\n")
-    if configs:
-        halfway.unlink(missing_ok=True)
+    text = json.dumps(rounded(part), allow_nan=False, separators=(",", ":"))
+    write_text_atomically(folder / unit.file, text + "\n")
+    for path in folder.glob(f".{unit.file}.*.pt*"):
+        path.unlink()
     return True
 
 
@@ -286,6 +296,28 @@ def _fit(
         "validation_error": best,
         "temperature": model.temperature,
     }
+
+
+def _fit_ensemble(
+    unit: Unit,
+    network: NetworkConfig,
+    config: TrainingConfig,
+    data: xr.Dataset,
+    split: Split,
+    halfway: Path,
+    progress: bool,
+) -> tuple[Ensemble, dict[str, Any]]:
+    members, told = [], []
+    for k in range(MEMBERS):
+        mine = replace(config, seed=MEMBERS * unit.seed + k)
+        place = halfway.with_name(f"{halfway.name}{k}")
+        model, about = _fit(unit, network, mine, data, split, place, progress)
+        members.append(model)
+        told.append(about)
+    ensemble = Ensemble(members)
+    channels = network.action_channels, network.effect_channels
+    fit_temperature(ensemble, TrainingArrays.from_dataset(data, split.validation, *channels))
+    return ensemble, {"members": told, "temperature": ensemble.temperature}
 
 
 def _shipped(

@@ -4,6 +4,7 @@ from affordlib.models.attention import AttentionConfig, AttentiveCNP
 from affordlib.models.calibration import calibration_rows, coverage, fit_temperature
 from affordlib.models.checkpoint import build, load_checkpoint, save_checkpoint
 from affordlib.models.cnp import AffordanceCNP, CNPConfig
+from affordlib.models.ensemble import Ensemble
 from affordlib.models.film import FiLMConfig, FiLMNetwork
 from affordlib.models.network import EffectNetwork, NetworkConfig, OutOfRangeWarning
 from affordlib.models.protocol import EffectModel, observe_actions
@@ -16,6 +17,7 @@ __all__ = [
     "CNPConfig",
     "EffectModel",
     "EffectNetwork",
+    "Ensemble",
     "FiLMConfig",
     "FiLMNetwork",
     "NetworkConfig",

@@ -20,6 +20,7 @@ from affordlib.models.network import gaussian_nll
 
 if TYPE_CHECKING:
     from affordlib.interactions.batches import TrainingArrays
+    from affordlib.models.ensemble import Ensemble
     from affordlib.models.network import EffectNetwork
 
 LEVELS = (0.5, 0.9)
@@ -39,7 +40,7 @@ def coverage(
 
 @torch.no_grad()
 def effects_at(
-    model: EffectNetwork, arrays: TrainingArrays, phases: Sequence[float]
+    model: EffectNetwork | Ensemble, arrays: TrainingArrays, phases: Sequence[float]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Truth, mean and σ of the effects, (N, T, C) each, given image and action."""
     at = (torch.tensor(phases) * (len(arrays.phase) - 1)).round().long()
@@ -49,7 +50,9 @@ def effects_at(
 
 
 def fit_temperature(
-    model: EffectNetwork, validation: TrainingArrays, phases: Sequence[float] = AFTER_CONTACT
+    model: EffectNetwork | Ensemble,
+    validation: TrainingArrays,
+    phases: Sequence[float] = AFTER_CONTACT,
 ) -> tuple[float, ...]:
     """Set, and return, the temperatures (C_e,) under which validation data are likeliest.
 
@@ -65,7 +68,7 @@ def fit_temperature(
 
 
 def calibration_rows(
-    model: EffectNetwork,
+    model: EffectNetwork | Ensemble,
     arrays: TrainingArrays,
     /,
     phases: Sequence[float] = AFTER_CONTACT,

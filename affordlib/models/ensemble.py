@@ -1,0 +1,64 @@
+"""Several networks that differ in nothing but their seed, asked as one.
+
+    μ = mean_k μ_k        σ² = mean_k σ_k² + mean_k (μ_k - μ)²
+
+the first two moments of the even mixture (Lakshminarayanan, Pritzel and Blundell, Simple and
+scalable predictive uncertainty estimation using deep ensembles, NeurIPS 2017). The second term, how
+far the members disagree, is what a single network cannot know of itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from affordlib.models.network import EffectNetwork
+from affordlib.types import Observations, Prediction
+
+
+class Ensemble:
+    """Trained networks of the same channels as one `EffectModel`; temperature: of the mixture's σ.
+
+    The members' own temperatures are set to one.
+    """
+
+    def __init__(self, members: Sequence[EffectNetwork]) -> None:
+        if not members:
+            raise ValueError("members must hold at least one network, got none")
+        first = members[0]
+        self.action_channels, self.effect_channels = first.action_channels, first.effect_channels
+        for k, member in enumerate(members):
+            channels = member.action_channels, member.effect_channels
+            if channels != (self.action_channels, self.effect_channels):
+                raise ValueError(
+                    f"members must have the channels of the first, {self.action_channels} and "
+                    f"{self.effect_channels}; member {k} has {channels[0]} and {channels[1]}"
+                )
+            member.temperature = (1.0,) * len(self.effect_channels)
+        self.members = tuple(members)
+        self.temperature: tuple[float, ...] = first.temperature
+
+    def encode(self, image: Tensor) -> Tensor:
+        """Features (B, K F) of images (B, 2, 48, 48): those of the K members side by side."""
+        return torch.cat([member.encode(image) for member in self.members], dim=-1)
+
+    def predict(self, features: Tensor, observations: Observations, t_target: Tensor) -> Prediction:
+        """Mean and σ (B, T, C) of the mixture at t_target (B, T); features (B, K F) or (1, K F)."""
+        each = features.chunk(len(self.members), dim=-1)
+        told = [
+            member.predict(mine.contiguous(), observations, t_target)
+            for member, mine in zip(self.members, each, strict=True)
+        ]
+        action = _moments([p.action_mean for p in told], [p.action_std for p in told])
+        mean, std = _moments([p.effect_mean for p in told], [p.effect_std for p in told])
+        return Prediction(*action, mean, std * std.new_tensor(self.temperature))
+
+
+def _moments(means: list[Tensor], stds: list[Tensor]) -> tuple[Tensor, Tensor]:
+    """Mean and σ of the even mixture of Gaussians."""
+    every = torch.stack(means)
+    mean = every.mean(dim=0)
+    variance = torch.stack(stds).square().mean(dim=0) + (every - mean).square().mean(dim=0)
+    return mean, variance.sqrt()

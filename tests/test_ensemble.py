@@ -1,0 +1,97 @@
+"""Several networks as one: the moments of their mixture, and that planners can work with it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from affordlib.evaluation import units
+from affordlib.evaluation.units import Unit, configuration_sha256, run_unit
+from affordlib.interactions import TrainingArrays
+from affordlib.models import EffectModel, Ensemble, load_checkpoint, observe_actions
+from affordlib.planning import plan_astar, plan_continuous
+from affordlib.primitives import Push, wrap_angle
+from affordlib.types import Goal
+
+NAMES = ("push_film", "push_film_x10")
+
+
+@pytest.fixture
+def members():
+    return [load_checkpoint(name)[0] for name in NAMES]
+
+
+@pytest.fixture
+def asked(members, pushes):
+    images = TrainingArrays.from_dataset(pushes, np.arange(4)).image
+    return images, observe_actions(members[0], [Push(0.3 * k) for k in range(4)])
+
+
+@torch.no_grad()
+def test_mean_and_sigma_are_those_of_the_mixture(members, asked):
+    images, observed = asked
+    ensemble, t_target = Ensemble(members), torch.tensor([[0.0, 0.5, 1.0]]).expand(4, -1)
+    assert isinstance(ensemble, EffectModel)
+    told = ensemble.predict(ensemble.encode(images), observed, t_target)
+    each = [m.predict(m.encode(images), observed, t_target) for m in members]
+    mean = torch.stack([p.effect_mean for p in each]).mean(dim=0)
+    torch.testing.assert_close(told.effect_mean, mean)
+    # E[y²] - E[y]², in doubles, of a mixture in even shares.
+    second = torch.stack([(p.effect_mean.double() ** 2 + p.effect_std.double() ** 2) for p in each])
+    variance = second.mean(dim=0) - mean.double() ** 2
+    torch.testing.assert_close(told.effect_std.double(), variance.sqrt(), atol=1e-6, rtol=1e-3)
+
+
+@torch.no_grad()
+def test_one_member_is_itself_and_one_object_serves_all_queries(members, asked):
+    images, observed = asked
+    t_target = torch.ones(4, 1)
+    for model in (Ensemble(members), Ensemble(members[:1])):
+        one = model.predict(model.encode(images[:1]), observed, t_target)
+        same = model.predict(model.encode(images[:1]).expand(4, -1), observed, t_target)
+        torch.testing.assert_close(one.effect_mean, same.effect_mean)
+    alone = members[0].predict(members[0].encode(images[:1]), observed, t_target)
+    torch.testing.assert_close(one.effect_mean, alone.effect_mean)
+    torch.testing.assert_close(one.action_std, alone.action_std)
+
+
+def test_members_must_agree_on_channels(members):
+    with pytest.raises(ValueError, match="member 1 has"):
+        Ensemble([members[0], load_checkpoint("push_cnp")[0]])
+    with pytest.raises(ValueError, match="at least one network"):
+        Ensemble([])
+
+
+@pytest.mark.parametrize("plan", [plan_continuous, plan_astar])
+def test_planners_work_with_it(members, plan, cuboid_image):
+    goal = Goal((0.05, 0.03))
+    (step,) = plan(Ensemble(members), cuboid_image, (0.0, 0.0), goal, "single_partial").steps
+    alone = plan(members[1], cuboid_image, (0.0, 0.0), goal, "single_partial").steps[0]
+    assert abs(wrap_angle(step.primitive.theta - alone.primitive.theta)) < 0.15
+    assert abs(step.stop_phase - alone.stop_phase) < 0.1
+
+
+def test_a_unit_trains_each_member_once_and_resumes(tmp_path, monkeypatch):
+    monkeypatch.setattr(units, "FEW_STEPS", 4)
+    monkeypatch.setattr(units, "MEMBERS", 2)
+    short = replace(units.SHIPPED["push_film"].training, validate_every=2, batch_size=8, ema=0.0)
+    shipped = replace(units.SHIPPED["push_film"], training=short)
+    monkeypatch.setattr(units, "SHIPPED", units.SHIPPED | {"push_film": shipped})
+    unit, real, seen = Unit("ensemble", "grasp"), units.train_model, []
+
+    def counted(data, split, config, *others):
+        seen.append(config.seed)
+        if len(seen) == 2:
+            raise KeyboardInterrupt
+        return real(data, split, config, *others)
+
+    monkeypatch.setattr(units, "train_model", counted)
+    with pytest.raises(KeyboardInterrupt):
+        run_unit(unit, tmp_path)
+    assert run_unit(unit, tmp_path)
+    assert seen == [0, 1, 0, 1]
+    assert [path.name for path in tmp_path.iterdir()] == [unit.file]
+    before = configuration_sha256(unit)
+    monkeypatch.setattr(units, "MEMBERS", 3)
+    assert configuration_sha256(unit) != before
