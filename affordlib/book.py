@@ -25,7 +25,7 @@ from nbconvert.exporters import HTMLExporter
 from nbconvert.filters.markdown_mistune import IPythonRenderer, MarkdownWithMath
 
 from affordlib.notebook_files import WIDGET
-from affordlib.paths import repo_root
+from affordlib.paths import repo_root, resolve_out_dir
 from affordlib.profiles import notebook_paths, read_notebook
 from affordlib.results import write_text_atomically
 
@@ -40,6 +40,9 @@ ziamath.config.svg2 = False  # paths alone: SVG 2 would name its glyphs, in ever
 TEMPLATES = Path(__file__).parent / "templates"
 LINKED = "linked"
 """The folder of what pages link to; nbconvert takes "files/" away from links."""
+
+MARKER = ".book"
+"""A file by which a folder is known to be a book, and may be replaced."""
 
 EQUATION_PX = 17
 
@@ -74,10 +77,19 @@ class Book:
         return Page(PurePosixPath(source), html, _title(notebook), notebook)
 
     def build(self, folder: Path) -> None:
-        """Write all pages, and the files they link to, into a folder, replacing what is there."""
+        """Write all pages, and the files they link to, into a folder, in place of an earlier book.
+
+        Raises FileExistsError, and changes nothing, where the folder holds anything else.
+        """
+        if folder.exists() and not (folder / MARKER).is_file() and any(folder.iterdir()):
+            raise FileExistsError(
+                f"{folder} holds other files than a book; give a new folder, or empty this one"
+            )
         making = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
+        before = making.with_suffix(".before")
         making.mkdir(parents=True)
         try:
+            write_text_atomically(making / MARKER, "")
             exporter = _Exporter(self)
             for page in self.pages:
                 write_text_atomically(making / page.html, exporter.page(page))
@@ -87,8 +99,9 @@ class Book:
                 target.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copy(self.root / path, target)
             if folder.exists():
-                shutil.rmtree(folder)
+                folder.replace(before)
             making.replace(folder)
+            shutil.rmtree(before, ignore_errors=True)
         finally:
             shutil.rmtree(making, ignore_errors=True)
 
@@ -180,8 +193,12 @@ def main(argv: list[str] | None = None) -> int:
     """Write the book as web pages."""
     parser = argparse.ArgumentParser(prog="python -m affordlib.book", description=main.__doc__)
     parser.add_argument("folder", nargs="?", default="runs/html", help="default: runs/html")
-    folder = repo_root() / parser.parse_args(argv).folder
-    Book().build(folder)
+    folder = resolve_out_dir(parser.parse_args(argv).folder)
+    try:
+        Book().build(folder)
+    except OSError as error:
+        print(f"book: {error}", file=sys.stderr)
+        return 1
     print(f"The book begins at {os.path.relpath(folder / 'index.html')}")
     return 0
 

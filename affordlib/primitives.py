@@ -226,13 +226,14 @@ class Grasp(Primitive):
 
     def __post_init__(self) -> None:
         if self.seen_height is not None:
-            check_within("seen_height", self.seen_height, 0.0, 0.2, "m")
+            check_within("seen_height", self.seen_height, 0.0, 0.3, "m")
         yaw = wrap_angle(check_finite("grip_yaw", self.grip_yaw))
         object.__setattr__(self, "grip_yaw", yaw)
 
     @cached_property
     def legs(self) -> tuple[Leg, ...]:
-        low, yaw = max((self.seen_height or 0.06) - 0.03, TIP_HEIGHT_M), self.grip_yaw
+        seen = 0.06 if self.seen_height is None else self.seen_height
+        low, yaw = max(seen - 0.03, TIP_HEIGHT_M), self.grip_yaw
         return _legs(
             (0.0, (0.0, 0.0, HOVER_M, yaw, 1.0)),
             (1.0, (0.0, 0.0, low, yaw, 1.0)),

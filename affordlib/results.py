@@ -174,8 +174,8 @@ def cell(column: str, value: object) -> str:
         digits = UNITS[unit][2]
         return f"{round(value * factor(column), digits) + 0.0:.{digits}f}"
     if isinstance(value, float):
-        return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
-    return str(value)
+        return f"{value:.3g}" if abs(value) < 999.5 else f"{value:.0f}"
+    return " ".join(str(value).splitlines())
 
 
 def fill_tables(text: str) -> str:

@@ -26,9 +26,9 @@ from typing import TYPE_CHECKING, Any
 from nbconvert.filters.markdown_mistune import markdown2html_mistune
 
 from affordlib.paths import repo_root
-from affordlib.profiles import WorkbookError
+from affordlib.profiles import WorkbookError, notebook_paths
 from affordlib.results import markdown_table, read_results, write_results, write_text_atomically
-from affordlib.seeds_picture import is_number, same_rows, seeds_picture
+from affordlib.seeds_picture import same_rows, seeds_picture
 from affordlib.workbook import run_name
 
 if TYPE_CHECKING:
@@ -95,26 +95,28 @@ def over_seeds(tables: Sequence[Sequence[Row]]) -> list[dict[str, Any]]:
     """One table of the same table of several seeds.
 
     Rows are the same if they agree in all that is no number, and in their place among such rows.
+    A number that some seeds do not have is meaned over those that do.
     """
     return [_together(rows) for rows in same_rows(tables)]
 
 
 def _together(rows: Sequence[Row]) -> dict[str, Any]:
     row: dict[str, Any] = {"seeds": len(rows)}
-    for column, value in rows[0].items():
-        values = [each[column] for each in rows]
-        if not is_number(value) or len(set(values)) == 1:
-            row[column] = value
-            continue
-        row[column] = statistics.fmean(values)
-        row[f"sd_{column}"] = statistics.stdev(values)
+    for column in dict.fromkeys(name for each in rows for name in each):
+        values = [each[column] for each in rows if each.get(column) is not None]
+        row[column] = values[0] if values else None
+        if len(set(values)) > 1:
+            row[column] = statistics.fmean(values)
+            row[f"sd_{column}"] = statistics.stdev(values)
     return row
 
 
 def gather(folders: Mapping[int, Path], into: Path) -> Path:
     """Write the tables over seeds and the page that shows them; returns the page."""
     seeds = list(folders)
-    names = sorted({path.stem for folder in folders.values() for path in folder.glob("*.json")})
+    there = {path.stem for folder in folders.values() for path in folder.glob("*.json")}
+    # Beside them lie plans that were saved.
+    names = sorted(there & set(notebook_paths(repo_root() / "notebooks")))
     page = [f"# Over {len(seeds)} seeds", f"Seeds {', '.join(map(str, seeds))}."]
     page.append("Means over seeds; *sd* is the standard deviation of one seed among them.")
     for name in names:

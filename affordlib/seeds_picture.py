@@ -27,12 +27,15 @@ def is_number(value: object) -> bool:
 
 
 def same_rows(tables: Sequence[Sequence[Row]]) -> list[list[Row]]:
-    """The rows of several seeds' tables that are the same: in words, and in place among those."""
+    """The rows of several seeds' tables that are the same: in words, and in place among those.
+
+    Nothing (None) is no word: where one seed has no number, others may.
+    """
     same: dict[tuple, list[Row]] = {}
     for rows in tables:
         seen: Counter = Counter()
         for row in rows:
-            words = tuple((k, v) for k, v in row.items() if not is_number(v))
+            words = tuple((k, v) for k, v in row.items() if v is not None and not is_number(v))
             seen[words] += 1
             same.setdefault((words, seen[words]), []).append(row)
     return list(same.values())

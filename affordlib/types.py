@@ -1,4 +1,4 @@
-"""The narrow waist: the few frozen dataclasses that pass between the parts of the package.
+"""The narrow waist: the few frozen dataclasses, and errors, that pass between the package's parts.
 
 Phase t in [0, 1] is the normalised time of a full primitive, everywhere. Positions are metres,
 angles radians. Actions and effects are relative to where the object stood at the start
@@ -34,6 +34,14 @@ FAULT_LIMIT_M = 0.002
 
 TABLE_X_M = (-0.5, 0.7)
 TABLE_Y_M = (-0.7, 0.7)
+
+
+class UnreachableError(ValueError):
+    """The arm cannot take the tool to a pose that was asked for."""
+
+
+class NothingSeenError(RuntimeError):
+    """The camera sees no object on the table."""
 
 
 def check_finite(name: str, value: float) -> float:

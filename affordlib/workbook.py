@@ -314,13 +314,16 @@ def explained(job: Job, copy: Path, error: Exception) -> str:
     )
 
 
+TAKEN = ("lab", "html")
+
+
 def run_name(profile: str, seed: int, name: str | None) -> str:
     """Return the name of the run's folder under `runs/`."""
     name = name or profile + (f"-seed{seed}" if seed else "")
-    if not re.fullmatch(r"\w[\w.-]*", name) or name == "lab":
+    if not re.fullmatch(r"\w[\w.-]*", name) or name in TAKEN:
         raise WorkbookError(
-            f"OUT (--out) must be a plain folder name under runs/, got {name!r}; "
-            "'lab' belongs to the notebooks opened by hand"
+            f"OUT (--out) must be a plain folder name under runs/, got {name!r}; 'lab' belongs to "
+            "the notebooks opened by hand, 'html' to the book as web pages"
         )
     return name
 

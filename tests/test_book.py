@@ -5,7 +5,7 @@ from urllib.parse import unquote
 import pytest
 from lab_pages import CHROMIUM, FLAGS, PICTURES
 
-from affordlib.book import Book
+from affordlib.book import MARKER, Book, main
 from affordlib.paths import repo_root
 from affordlib.profiles import notebook_paths
 
@@ -27,7 +27,8 @@ class Tags(HTMLParser):
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("book") / "html"
     folder.mkdir()
-    (folder / "of_yesterday.html").write_text("")
+    for name in (MARKER, "of_yesterday.html"):
+        (folder / name).write_text("")
     Book().build(folder)
     return folder
 
@@ -130,3 +131,13 @@ def test_it_looks_right_in_a_browser_without_any_request_outside(folder):
         browser.close()
     assert (failed, said) == ([], [])
     assert {url.split(":")[0] for url in asked} <= {"file", "data"}
+
+
+def test_a_folder_of_other_files_is_left_alone(tmp_path, capsys):
+    (tmp_path / "precious.txt").write_text("mine")
+    with pytest.raises(FileExistsError, match="holds other files than a book"):
+        Book().build(tmp_path)
+    assert main([str(tmp_path)]) == 1
+    assert "book: " in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["precious.txt"]
+    assert (tmp_path / "precious.txt").read_text() == "mine"

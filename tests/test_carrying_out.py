@@ -55,3 +55,35 @@ def test_an_attempt_leaves_the_eye_as_it_was(world, film):
 
     attempt(world, task, planner, looks=3)
     assert (seen, world.looks) == ([3], 1)
+
+
+def test_what_is_held_is_not_corrected(world, repertoire):
+    world.place(Cuboid(0.06, 0.05, 0.05))
+    planner = repertoire.planner(plan_continuous)
+    plan = planner(world.look(), (0.0, 0.0), Goal((0.05, 0.0), height_m=0.12))
+    assert plan.steps[-1].primitive.holds
+    done = carry_out(world, plan, 2, planner)
+    assert len(done.object_paths_xy_m) == len(plan.steps)
+    assert done.lifted_m == pytest.approx(0.12, abs=0.01)
+
+
+def test_where_nothing_brings_it_nearer_it_stays(film, cuboid_image):
+    near = Goal((0.015, 0.0), tolerance_m=0.02)
+    plan = plan_continuous(film, cuboid_image, (0.0, 0.0), near, "single_full")
+    assert (plan.steps, plan.reaches_goal) == ((), True)
+    far = plan_continuous(film, cuboid_image, (0.0, 0.0), Goal((0.08, 0.0)), "single_full")
+    assert len(far.steps) == 1
+
+
+def test_settings_of_a_planner_are_those_of_its_search(repertoire, cuboid_image):
+    asked = []
+
+    def spy(**told):
+        asked.append(told["seed"])
+        return plan_continuous(**told)
+
+    planner = repertoire.planner(spy, seed=7, mode="single_partial")
+    planner(cuboid_image, (0.0, 0.0), Goal((0.05, 0.0)))
+    planner(cuboid_image, (0.0, 0.0), Goal((0.05, 0.0)), seed=8, finish=None)
+    assert asked == [7, 8]
+    assert planner.search.keywords == {"seed": 7}

@@ -22,7 +22,14 @@ from affordlib.planning.chase import DISPLACED_M, Chase
 from affordlib.planning.moves import Demands
 from affordlib.primitives import Drag, Grasp, Push, Rotate
 from affordlib.types import Goal, Plan, Prediction
-from affordlib.world import Cuboid, Sphere, Tabletop, UnreachableError, UprightCylinder
+from affordlib.world import (
+    Cuboid,
+    Sphere,
+    Tabletop,
+    UnreachableError,
+    UprightCylinder,
+    WorldConfig,
+)
 
 
 class FollowsTheHand:
@@ -320,3 +327,42 @@ def test_what_is_held_aside_of_its_goal_is_not_called_reached(table, repertoire,
     assert went.ending == ending, went.words
     assert went.distance_m == pytest.approx(aside_m, abs=0.005)
     assert abs(went.height_error_m) < 0.003
+
+
+def test_an_object_that_no_camera_sees_is_lost(table, repertoire):
+    table.place(BALL, (0.6, 0.0), config=WorldConfig(camera="kinect"))
+    off = Disturbance("knock", 0, 1.5, 0.0)
+    went = pursue(table, Goal((0.3, 0.0)), repertoire, disturbances=[off])
+    assert went.ending == "lost", went.words
+    table.place(BOX, (0.0, 0.0), config=WorldConfig())
+
+
+@pytest.mark.parametrize("goal", [{"turn_rad": -0.5}, {"height_m": 0.1}])
+def test_no_more_actions_than_were_allowed(table, repertoire, goal):
+    table.place(BOX, (0.0, 0.0), 0.3)
+    went = pursue(table, Goal((0.0, 0.0), **goal), repertoire, max_actions=0)
+    assert (went.ending, went.steps) == ("gave_up", ())
+    with pytest.raises(ValueError, match=r"whole number from 0 on, got 1\.5"):
+        pursue(table, Goal((0.0, 0.0)), repertoire, max_actions=1.5)
+
+
+def test_a_goal_that_turns_on_the_way_is_followed(table, repertoire):
+    table.place(TUBE, (0.0, 0.0))
+    turns = [-0.4, -0.8]
+
+    def again(plan, n):
+        at = abs(turns[0] - table.object_pose()[2]) if turns else 1.0
+        return Goal((0.0, 0.0), turn_rad=turns.pop(0) - 0.4) if at < 0.05 else None
+
+    went = pursue(table, Goal((0.0, 0.0), turn_rad=-0.4), repertoire, on_action=again)
+    assert went.reached, went.words
+    assert not turns
+    assert went.goal.turn_rad == pytest.approx(-1.2)
+
+
+def test_the_arm_is_asked_about_the_grasp_that_it_will_carry_out(table, repertoire):
+    """At the rim of its reach a hand's height decides, and that goes by the object's."""
+    for x in (0.5, 0.51, 0.52, 0.53):
+        table.place(Cuboid(0.05, 0.05, 0.08), (x, 0.0))
+        went = pursue(table, Goal((x, 0.0), height_m=0.24), repertoire)
+        assert went.ending in ("reached", "unreachable", "gave_up"), went.words

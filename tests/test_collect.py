@@ -137,6 +137,34 @@ def test_a_folder_of_another_recipe_is_left_alone(folder_set):
     assert {name: file.read_bytes() for name, file in files_of(folder_set).items()} == before
 
 
+def test_a_zip_is_made_once_and_no_other_recipe_takes_its_place(tmp_path, cheap, monkeypatch):
+    path, made = tmp_path / "x.zarr.zip", []
+    collect_set(SMALL, path, progress=False)
+    before = path.read_bytes()
+    real = collect.collect_chunk
+
+    def counted(recipe, indices):
+        made.append(indices.start)
+        return real(recipe, indices)
+
+    monkeypatch.setattr(collect, "collect_chunk", counted)
+    assert collect_set(SMALL, path, progress=False) == path
+    assert made == []
+    with monkeypatch.context() as other:
+        layout = replace(collect.describe(SMALL, 2), attrs={"recipe": "another"})
+        other.setattr(collect, "describe", lambda *_: layout)
+        with pytest.raises(ValueError, match=r"x\.zarr\.zip holds a set of another recipe"):
+            collect_set(SMALL, path, progress=False)
+    assert made == []
+    assert path.read_bytes() == before
+    collect_set(SMALL, path, progress=False, replace=True)
+    assert made == [0, 2, 4]
+    path.write_bytes(before[: len(before) // 2])  # damaged: made again
+    collect_set(SMALL, path, progress=False)
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
 @pytest.mark.parametrize("spoil", [{"x": np.zeros(2)}, {"x": np.zeros((3, 2), "f4")}, {}])
 def test_a_chunk_that_is_not_what_was_described_is_refused(tmp_path, cheap, spoil, monkeypatch):
     monkeypatch.setattr(collect, "collect_chunk", lambda *_: spoil)

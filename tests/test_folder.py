@@ -1,6 +1,9 @@
 """Interactions of one's own, from a folder of a table and of images."""
 
+import re
+
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from PIL import Image
@@ -75,4 +78,31 @@ def _replace(folder, old, new):
 def test_errors_say_what_and_where(folder, spoil, says):
     spoil(folder)
     with pytest.raises((ValueError, FileNotFoundError), match=says):
+        read_folder(folder)
+
+
+def test_names_are_names_and_angles_go_around(some, folder):
+    text = (folder / COURSES).read_text()
+    (folder / COURSES).write_text(re.sub("^0001,", "NA,", text, flags=re.MULTILINE))
+    for kind in ("", "_mask"):
+        (folder / "images" / f"0001{kind}.png").rename(folder / "images" / f"NA{kind}.png")
+    assert len(read_folder(folder)) == 3
+    table = pd.read_csv(folder / COURSES, keep_default_na=False)
+    turned = table["effect_yaw"] + np.pi - 0.01  # over the seam, as atan2 tells it
+    table["effect_yaw"] = np.arctan2(np.sin(turned), np.cos(turned))
+    table.to_csv(folder / COURSES, index=False)
+    yaw = read_folder(folder, n_samples=301).effect[..., 2]
+    expected = some.effect[..., 2] + np.pi - 0.01
+    torch.testing.assert_close(yaw, expected, atol=1e-5, rtol=0)
+
+
+def test_a_mask_that_is_not_white_is_refused(folder):
+    path = folder / "images" / "0001_mask.png"
+    with Image.open(path) as file:
+        mask = np.asarray(file)
+    Image.fromarray((mask > 127).astype(np.uint8)).save(path)
+    with pytest.raises(ValueError, match=r"0001_mask\.png must be .* white .* at most 1"):
+        read_folder(folder)
+    Image.fromarray(mask > 127).save(path)
+    with pytest.raises(ValueError, match=r"0001_mask\.png must be .*bool"):
         read_folder(folder)

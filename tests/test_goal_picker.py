@@ -418,3 +418,53 @@ def test_a_plan_with_turn_and_lift_is_saved_and_loaded(posed):
     posed.ask_pose()
     posed.load("posed.json")
     assert (posed.controls.turn.value, posed.controls.height.value) == (-30.0, 4.0)
+
+
+def test_after_a_failed_run_the_next_plan_is_from_where_it_broke_off(make_picker, world):
+    def fails(world, plan, planner, tell):
+        carry_out(world, replace(plan, steps=plan.steps[:1]))
+        raise ValueError("the arm is stuck")
+
+    picker = make_picker(executors={"fails": fails, "open loop": open_loop})
+    picker.pick(0.2, 0.0)
+    with pytest.raises(ValueError, match="stuck"):
+        picker.run()
+    assert picker.plan is None
+    picker.controls.executor.value = "open loop"
+    picker.run()
+    assert picker.outcome.distance_m < 0.03, picker.controls.words.value
+
+
+def test_a_loaded_plan_begins_with_an_object_that_stands(posed, world):
+    posed.pick(0.05, 0.0)
+    posed.save("flat.json")
+    posed.ask_pose(height_cm=8)
+    posed.run()
+    assert world.object_state()[2] > 0.08
+    posed.load("flat.json")
+    assert world.object_state()[2] < 0.04
+
+
+def test_what_waits_when_the_robot_stops_does_not_wait_for_the_next_run(make_picker, world):
+    picker = make_picker(seconds_per_action=30.0)
+    picker.controls.run.click()
+    wait_until(lambda: picker.controls.progress.value == 1)
+    picker.shove_object()
+    picker.stop()
+    wait_until(lambda: not picker._work.is_alive())
+    picker.seconds_per_action = 0.0
+    picker.pick(*(0.05 + v for v in world.object_pose()[:2]))
+    picker.run()
+    assert picker.outcome.distance_m < 0.03, picker.controls.words.value
+
+
+def test_a_slider_moves_what_it_is_for_and_nothing_else(make_picker):
+    picker = make_picker()
+    picker.pick(0.45, 0.1)
+    picker.controls.y.value = 12.0
+    assert picker._goal.xy_m == (0.45, 0.12)
+    picker._set_goal(replace(picker._goal, turn_rad=math.radians(120)))
+    assert picker.controls.turn.value == 90  # all that it can show
+    picker._posed({"owner": picker.controls.height, "new": 3.0})
+    assert math.degrees(picker._goal.turn_rad) == pytest.approx(120)
+    assert picker._goal.height_m == pytest.approx(0.03)

@@ -385,3 +385,28 @@ def test_a_levered_prism_is_drawn_where_it_is():
     film = Film(height=100)
     film.add(figure)
     assert film.frames[0].shape[0] == 100
+
+
+def test_a_published_training_of_something_else_is_not_gone_on_with(
+    tmp_path, arrays, small_published
+):
+    file = tmp_path / "half.pt"
+    train_published(small_published(), arrays, arrays, "window", 1, checkpoint=file)
+    for other in ({"seed": 1}, {"trained_for": "first_step"}):
+        told = {"trained_for": "window", "epochs": 2, "checkpoint": file} | other
+        with pytest.raises(ValueError, match="delete it, or train as it was begun"):
+            train_published(small_published(), arrays, arrays, **told)
+
+
+def test_the_course_of_pushes_is_that_seen_from_behind(pushes):
+    from affordlib.interactions import TrainingArrays
+    from affordlib.models.make_checkpoints import courses
+
+    few = TrainingArrays.from_dataset(pushes, np.arange(60), ("x", "y"), ("x", "y", "yaw"))
+    config = LSTMConfig(effect_channels=("x", "y", "yaw"), frame="push", width=16)
+    model = build(config, Normaliser.fit(few))
+    mean = courses(model, few).mean(dim=0)
+    assert mean.shape == (26, 3)
+    torch.testing.assert_close(mean[:, 1:], torch.zeros(26, 2), atol=1e-6, rtol=0)
+    length = float(few.effect[:, -1, :2].norm(dim=-1).mean())
+    assert float(mean[-1, 0]) == pytest.approx(length, rel=0.2)

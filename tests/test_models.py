@@ -273,3 +273,31 @@ def test_a_model_is_not_judged_on_what_it_saw(pushes, held_out_pushes):
 def test_bad_settings_are_named(make, words):
     with pytest.raises(ValueError, match=words):
         make()
+
+
+def test_of_whatever_size_a_set_of_the_same_recipe_is_known(pushes):
+    _, about = load_checkpoint("push_cnp")
+    larger = json.loads(pushes.attrs["recipe"]) | {"n_interactions": 2000}
+    with pytest.raises(ValueError, match="was trained or tuned on"):
+        refuse_seen(about, pushes.assign_attrs(recipe=json.dumps(larger)), np.arange(500))
+
+
+def test_folded_weights_are_those_of_now(untrained):
+    """A fused optimiser changes weights without leaving a trace on them."""
+    model, t_target = untrained, torch.linspace(0, 1, 120)[None]
+    observed, features = observe_actions(model, [Push(0.3)]), torch.zeros(1, 16)
+
+    def told():
+        with torch.no_grad():
+            return model.eval().predict(features, observed, t_target).effect_mean
+
+    before = told()
+    optimiser = torch.optim.Adam(model.parameters(), 1e-3, fused=True)
+    for _ in range(3):
+        model.train().predict(features, observed, t_target).effect_mean.sum().backward()
+        optimiser.step()
+    after = told()
+    assert (after - before).abs().max() > 1e-4
+    with torch.no_grad():  # few targets: nothing is folded
+        plain = model.predict(features, observed, t_target[:, :1]).effect_mean
+    torch.testing.assert_close(after[:, :1], plain)

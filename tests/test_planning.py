@@ -374,3 +374,9 @@ def test_the_frozen_goals_are_those_that_are_drawn(world):
 def test_bad_input_is_named(plan, words):
     with pytest.raises(ValueError, match=words):
         plan()
+
+
+def test_a_grid_of_nothing_is_refused():
+    for settings, says in (({"n_directions": 0}, "n_directions"), ({"stop_phases": ()}, "phase")):
+        with pytest.raises(ValueError, match=says):
+            plan_astar(MODEL, IMAGE, (0.0, 0.0), Goal((0.1, 0.0)), **settings)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from affordlib.evaluation import planners, planning
 from affordlib.evaluation.goals import ROLLABLE, STANDING, PlanningTask, frozen_tasks, main
 from affordlib.evaluation.oracle import N_DIRECTIONS, WARY_RAD, touchy
 from affordlib.evaluation.planners import VARIANTS
@@ -18,7 +19,7 @@ from affordlib.evaluation.planning import (
     tasks_sha256,
 )
 from affordlib.paths import repo_root
-from affordlib.planning import map_effects
+from affordlib.planning import map_effects, plan_astar
 from affordlib.primitives import Drag
 from affordlib.results import read_results
 from affordlib.world import Cuboid
@@ -196,3 +197,9 @@ def test_the_continuous_planner_keeps_its_promise():
         if (r["variant"], r["goals"], r["object_class"]) == ("continuous", "constructed", "all")
     }
     assert all(told[mode] <= limit for mode, limit in limits.items())
+
+
+def test_parts_of_other_settings_are_refused(monkeypatch):
+    monkeypatch.setitem(planners.FORMATS, plan_astar, 99)
+    with pytest.raises(ValueError, match=r"part astar\w*\.json is of other goals or settings"):
+        planning.assemble()

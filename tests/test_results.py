@@ -249,3 +249,9 @@ def test_shipped_results_are_valid_and_carry_no_path():
         assert read_results(path)["notebook"] == path.stem
         for value in json.loads(path.read_text())["parameters"].values():
             assert not (isinstance(value, str) and os.path.isabs(value))
+
+
+def test_three_digits_below_a_thousand_and_one_line_a_row():
+    assert results.cell("loss", 999.7) == "1000"
+    assert results.cell("loss", -999.4) == "-999"
+    assert results.cell("note", "two\nlines") == "two lines"

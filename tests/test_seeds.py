@@ -9,7 +9,7 @@ from test_workbook import Book
 
 from affordlib.paths import repo_root
 from affordlib.profiles import WorkbookError
-from affordlib.results import read_results
+from affordlib.results import read_results, write_results
 from affordlib.seeds import gather, main, over_seeds, run_seeds
 from affordlib.seeds_picture import seeds_picture
 
@@ -110,3 +110,20 @@ def test_a_seed_that_fails_is_named_and_the_others_run(book):
 def test_seeds_must_differ(capsys):
     assert main(["1", "1"]) == 1
     assert "SEEDS must differ and be 0 or more, got [1, 1]" in capsys.readouterr().err
+
+
+def test_numbers_that_only_some_seeds_have_are_meaned_over_those():
+    one, other = {"m": "a", "x": 1.0, "auc": 0.5}, {"m": "a", "x": 2.0, "auc": None, "late": 3.0}
+    (row,) = over_seeds([[one], [other]])
+    assert row == {"seeds": 2, "m": "a", "x": 1.5, "sd_x": row["sd_x"], "auc": 0.5, "late": 3.0}
+    assert over_seeds([[{"m": "a", "x": None}]]) == [{"seeds": 1, "m": "a", "x": None}]
+
+
+def test_only_results_of_notebooks_are_gathered(tmp_path):
+    for seed in (1, 2):
+        folder = tmp_path / str(seed)
+        write_results(folder, "00_start_here", {"seed": seed}, {"t": [{"m": "a", "x": 1.0 * seed}]})
+        (folder / "plan.json").write_text("{}")
+    page = gather({seed: tmp_path / str(seed) for seed in (1, 2)}, tmp_path / "both")
+    assert "plan" not in page.read_text()
+    assert read_results(tmp_path / "both" / "00_start_here.json")["tables"]["t"][0]["x"] == 1.5

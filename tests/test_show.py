@@ -3,6 +3,7 @@ import io
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
 
 from affordlib.planning import carry_out, plan_astar
@@ -50,3 +51,10 @@ def test_a_footprint_is_drawn_where_the_object_is(world, trained):
     outcome = carry_out(world, plan_astar(trained, world.look(), (0.0, 0.0), Goal((0.12, 0.0))))
     assert "mm from the goal" in plot_outcome(ax, outcome).get_title(loc="left")
     plt.close(figure)
+
+
+def test_all_frames_of_a_film_have_one_size():
+    film = Film(width=320, height=240)
+    film.add(Figure(figsize=(4, 3)))
+    with pytest.raises(ValueError, match="480×240 pixels, those of the film have 320×240"):
+        film.add(Figure(figsize=(6, 3)))

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from affordlib.evaluation import tables, units
+from affordlib.evaluation import grasps as grasps_module
+from affordlib.evaluation import parts, pooled, tables, units
 from affordlib.evaluation.units import Unit, configuration_sha256, read_part, run_unit, run_units
 from affordlib.interactions import (
     Normaliser,
@@ -15,6 +16,7 @@ from affordlib.interactions import (
     open_interactions,
     split_interactions,
 )
+from affordlib.models.checkpoint import checkpoint_sha256, save_checkpoint
 from affordlib.paths import repo_root
 from affordlib.results import read_results
 
@@ -155,7 +157,7 @@ def test_a_large_set_need_not_be_here_but_its_parts_must_agree(tmp_path):
 
 def test_one_training_is_not_counted_twice(tmp_path):
     run_units([FEW[0], replace(FEW[0], n=100)], tmp_path, progress=False)
-    with pytest.raises(ValueError, match="are the same; delete one"):
+    with pytest.raises(ValueError, match="would be one row of the table"):
         tables.read_parts(tmp_path)
 
 
@@ -278,3 +280,50 @@ def test_committed_means_of_all_are_those_of_the_classes(committed):
                 if (r["model"], r["n_interactions"]) == key and r["object_class"] != "all"
             ]
             assert whole["final_error_mean_m"] == pytest.approx(np.mean(classes))
+
+
+def test_whatever_decides_a_training_decides_its_hash(monkeypatch):
+    unit = Unit("film", "push")
+    before, (network, training) = configuration_sha256(unit), units.learner(unit)
+    for changed in ((replace(network, blocks=5), training), (network, replace(training, ema=0.5))):
+        monkeypatch.setattr(units, "learner", lambda _, changed=changed: changed)
+        assert configuration_sha256(unit) != before
+    monkeypatch.setattr(units, "learner", lambda _: (network, replace(training, max_minutes=3.0)))
+    assert configuration_sha256(unit) == before
+    # An option that comes later, and is off, leaves what is there as it is.
+    monkeypatch.setitem(parts.YOUNGER, "ema", training.ema)
+    assert configuration_sha256(unit) != before
+    monkeypatch.setattr(units, "learner", lambda _: (network, replace(training, ema=0.5)))
+    assert "ema" in parts.options_of(replace(training, ema=0.5))
+
+
+def test_a_checkpoint_is_its_scales_too(tmp_path, film):
+    path = save_checkpoint(film, tmp_path / "a.safetensors", {"note": 1})
+    first = checkpoint_sha256(path)
+    save_checkpoint(film, path, {"note": 2})
+    assert checkpoint_sha256(path) == first
+    told = json.loads(path.with_suffix(".json").read_text())
+    told["config"]["temperature"] = [3.0] * 3
+    path.with_suffix(".json").write_text(json.dumps(told))
+    assert checkpoint_sha256(path) != first
+
+
+def test_parts_that_would_be_one_row_are_refused(tmp_path):
+    text = json.dumps({"unit": asdict(Unit("constant", "grasp", 100)), "n": 100})
+    other = json.dumps({"unit": asdict(Unit("constant", "grasp_x10", 100)), "n": 100})
+    told = {"grasp": json.loads(text), "grasp_x10": json.loads(other)}
+    for part in told.values():
+        unit = Unit(**part["unit"])
+        part |= {"configuration_sha256": configuration_sha256(unit)}
+        if unit.data == "grasp":
+            part |= units.hashes(unit)
+        (tmp_path / unit.file).write_text(json.dumps(part))
+    with pytest.raises(ValueError, match="would be one row of the table"):
+        pooled.read_parts(tmp_path)
+
+
+def test_a_second_cross_validation_counts_no_grasp_twice(tmp_path):
+    run_units(FEW, tmp_path, progress=False)
+    one = grasps_module.grasp_rows(pooled.read_parts(tmp_path))
+    run_units([replace(unit, seed=1) for unit in FEW], tmp_path, progress=False)
+    assert grasps_module.grasp_rows(pooled.read_parts(tmp_path)) == one

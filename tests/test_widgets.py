@@ -100,3 +100,10 @@ def test_dragging_is_moving_a_slider(explorer, slider):
     assert slider.phase == 0.65
     (moved,) = slider._image.handles
     assert moved["x"] < line["x"]
+
+
+def test_what_is_set_together_is_drawn_once(explorer, monkeypatch):
+    drawn, real = [], type(explorer).draw
+    monkeypatch.setattr(type(explorer), "draw", lambda *a: drawn.append(1) or real(*a))
+    explorer.observe_at((0.1, 0.9), 0.7, 0.4)
+    assert len(drawn) == 1

@@ -12,6 +12,7 @@ from affordlib.primitives import Push, min_jerk, primitive_named
 from affordlib.types import CROP_WIDTH_M, IMAGE_PIXELS, Goal
 from affordlib.world import (
     Cuboid,
+    Prism,
     Tabletop,
     UnreachableError,
     UprightCylinder,
@@ -189,3 +190,26 @@ def test_a_shoved_object_moves_turns_and_rests(world):
         world.shove(0.0, 0.0, np.nan)
     np.testing.assert_allclose(world.object_pose(), (0.15, -0.03, 0.8), atol=5e-4)
     world.place(thing, config=WorldConfig())
+
+
+def test_a_star_is_no_convex_polygon():
+    angle = np.pi / 2 + 4 * np.pi / 5 * np.arange(5)
+    star = tuple((0.05 * np.cos(a), 0.05 * np.sin(a)) for a in angle)
+    with pytest.raises(ValueError, match="convex polygon"):
+        Prism(star, 0.05)
+
+
+def test_what_lies_can_be_toppled_again(world):
+    world.place(Cuboid(0.04, 0.04, 0.08))
+    for _ in range(2):
+        x = world.object_pose()[0]
+        world.topple(0.0)
+        world.settle(2.0)
+        assert world.object_pose()[0] > x + 0.05
+
+
+def test_another_tool_follows_no_path(world):
+    world.place(Cuboid(0.06, 0.05, 0.05), tool="screwdriver")
+    with pytest.raises(ValueError, match="holds the screwdriver"):
+        world.follow_path(np.array([[-0.2, 0.0], [0.0, 0.0]]))
+    world.place(Cuboid(0.06, 0.05, 0.05))

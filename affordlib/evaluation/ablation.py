@@ -64,7 +64,8 @@ def one_at_a_time(
     arrays: TrainingArrays, rows: torch.Tensor, n_targets: int, obs_max: int, g: torch.Generator
 ) -> Batch:
     """The paper's draw: one trajectory, one target."""
-    return literal_draw(arrays.select(rows[:1]), obs_max, g)
+    row = torch.randint(len(rows), (1,), generator=g)  # any of the batch, turned or mirrored or not
+    return literal_draw(arrays.select(rows[row]), obs_max, g)
 
 
 def _plain_start(model: FiLMNetwork) -> None:

@@ -38,8 +38,8 @@ def steps_of(arrays: TrainingArrays) -> torch.Tensor:
 
 
 def believable(data: xr.Dataset, interactions: np.ndarray) -> np.ndarray:
-    """Those of the interactions that are no faults of the simulator."""
-    return interactions[~data["fault"].values[interactions]]
+    """Those of the interactions that the arm could reach, without faults of the simulator."""
+    return interactions[(data["reached"].values & ~data["fault"].values)[interactions]]
 
 
 @torch.no_grad()

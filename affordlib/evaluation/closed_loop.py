@@ -25,10 +25,12 @@ from tqdm.auto import tqdm
 
 from affordlib.evaluation.closed_loop_tables import ROWS, WITHIN_HEIGHT_M
 from affordlib.evaluation.feasibility import half_width_m, is_feasible, on_the_rim
+from affordlib.models.checkpoint import checkpoint_sha256
 from affordlib.paths import repo_root
 from affordlib.planning import Repertoire, draw_disturbances, pursue
 from affordlib.planning.disturbances import KINDS
 from affordlib.planning.poses import GRIP_YAWS
+from affordlib.planning.reachability import SHIPPED as REACHABILITY
 from affordlib.planning.repertoire import CHECKPOINTS
 from affordlib.primitives import Drag, Grasp, Push
 from affordlib.results import write_results, write_text_atomically
@@ -169,10 +171,10 @@ def _stays_feasible(world: Tabletop, trial: Trial, went: Pursuit) -> bool:
 def settings_sha256(table: str, seed: int) -> str:
     """Hash of what decides a table's records: the seed, the models it needs, the code's format."""
     told = hashlib.sha256(f"{FORMATS[table]} {seed}".encode())
+    told.update((repo_root() / REACHABILITY).read_bytes())
     for kind, name in CHECKPOINTS.items():
         if kind in ("push", "drag", POSE_BY.get(table)):
-            path = repo_root() / "data" / "checkpoints" / f"{name}.safetensors"
-            told.update(path.read_bytes())
+            told.update(checkpoint_sha256(name).encode())
     return told.hexdigest()
 
 
@@ -255,7 +257,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         sha256 = settings_sha256(table, options.seed)
         if records := read_records(_part(table, options.seed), sha256):
             tables[table] = rows([records[i] for i in sorted(records)])
-    path = write_results(options.out, "closed_loop", {"seed": options.seed}, tables)
+    name = f"closed_loop_seed{options.seed}" if options.seed else "closed_loop"
+    path = write_results(options.out, name, {"seed": options.seed}, tables)
     print(f"{path.name} written")
     return 0
 

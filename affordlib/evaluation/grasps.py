@@ -8,6 +8,7 @@ failures, with Wilson's 95 % intervals, folds pooled.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -66,15 +67,23 @@ def _held(group: list[Part]) -> Held:
     )
 
 
+def _of_one_seed(parts: list[tuple[Unit, Part]]) -> Iterable[tuple[dict, list[Part]]]:
+    """By model, of the first seed alone: another cross-validation tests the same grasps again."""
+    first = min((unit.seed for unit, _ in parts), default=0)
+    return by_model([(unit, part) for unit, part in parts if unit.seed == first], "grasp")
+
+
 def grasp_rows(parts: list[tuple[Unit, Part]]) -> list[dict[str, Any]]:
     """The paper's Table 2, by its rule: what can roll and what cannot, apart."""
     rows = []
-    for about, group in by_model(parts, "grasp"):
+    for about, group in _of_one_seed(parts):
         held, error = _held(group), None
         if "mean" in group[0]["fold_test"]:
             error = np.concatenate([final_error(part["fold_test"]) for part in group])
         for rollable in (False, True):
             chosen = held.rolls == rollable
+            if not chosen.any():
+                continue
             one = held[chosen]
             row = about | {"rollable": rollable, "n": int(chosen.sum())}
             row["error_mean_m"] = None if error is None else float(error[chosen].mean())
@@ -106,7 +115,7 @@ def threshold_rows(parts: list[tuple[Unit, Part]]) -> list[dict[str, Any]]:
     What is foreseen of a fold decides nothing about its own threshold.
     """
     rows = []
-    for about, group in by_model(parts, "grasp"):
+    for about, group in _of_one_seed(parts):
         if about["folds"] == 1 or about["model"] == "constant":
             continue
         held = _held(group)
@@ -129,7 +138,7 @@ def roc_rows(parts: list[tuple[Unit, Part]], n_points: int = 51) -> list[dict[st
     Of sets of 1,000 grasps; of 100, a curve is a few steps.
     """
     rows = []
-    for about, group in by_model(parts, "grasp"):
+    for about, group in _of_one_seed(parts):
         if about["n_interactions"] < 1000 or about["model"] == "constant":
             continue
         held = _held(group)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from affordlib.evaluation.answers import believable
 from affordlib.interactions.batches import TrainingArrays
 from affordlib.interactions.recipes import Recipe, draw_scene, draw_world
 from affordlib.models.protocol import EffectModel, observe_final_effect
@@ -50,7 +51,7 @@ def inverse_record(
     model: EffectModel, data: xr.Dataset, interactions: np.ndarray
 ) -> dict[str, list[Any]]:
     """Errors of pushes decoded from the true effects of interactions, one entry an interaction."""
-    kept = interactions[~data["fault"].values[interactions]]
+    kept = believable(data, interactions)
     arrays = TrainingArrays.from_dataset(data, kept, model.action_channels, model.effect_channels)
     theta = decoded_theta_rad(model, arrays.image, arrays.effect[:, -1])
     return executed_record(data, kept, theta)

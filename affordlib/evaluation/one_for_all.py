@@ -179,7 +179,9 @@ def one_for_all(parts: str | Path = PARTS, halfway: str | Path = HALFWAY) -> Row
     }
     fixed: list[tuple[Answers, Answers]] = []
     for fold in range(max(FOLDS.values())):
-        model = train_one_for_all(fold, halfway / f"fold{fold}.pt")
+        checkpoint = halfway / f"fold{fold}.pt"
+        model = train_one_for_all(fold, checkpoint)
+        checkpoint.unlink(missing_ok=True)
         for name in [p for p in PRIMITIVES if fold < FOLDS[p]]:
             unit, data = _separate(name, fold), open_once(name)
             run_unit(unit, folder)

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from affordlib.evaluation.goals import FAMILIES, ROLLABLE, STANDING
 from affordlib.evaluation.oracle import oracle_effects
-from affordlib.models.checkpoint import load_checkpoint
-from affordlib.paths import repo_root
+from affordlib.models.checkpoint import checkpoint_sha256, load_checkpoint
 from affordlib.planning import Repertoire, plan_astar, plan_continuous, plan_gradient
 from affordlib.planning.modes import PlanMode, mode_named
 from affordlib.primitives import Drag, Push
@@ -24,7 +22,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-FORMATS: dict[Callable[..., Plan], int] = {plan_astar: 3, plan_continuous: 3, plan_gradient: 2}
+FORMATS: dict[Callable[..., Plan], int] = {plan_astar: 3, plan_continuous: 4, plan_gradient: 2}
 """Counts the changes of each planner that change its numbers."""
 
 ORACLE_FORMAT = 2
@@ -92,7 +90,7 @@ class Variant:
 
     def about(self) -> dict[str, Any]:
         """All that decides its numbers, checkpoints by their hashes."""
-        files = {name: _sha256(name) for name in (self.push, self.drag) if name}
+        files = {name: checkpoint_sha256(name)[:16] for name in (self.push, self.drag) if name}
         settings = {k: list(v) if isinstance(v, tuple) else v for k, v in self.settings}
         more = {"corrections": self.corrections, "full_only": self.full_only}
         more |= {
@@ -124,12 +122,6 @@ class Variant:
         """The mode, without partial actions if it has none."""
         mode = mode_named(name)
         return PlanMode(mode.max_steps, partial=False) if self.full_only else mode
-
-
-@lru_cache
-def _sha256(checkpoint: str) -> str:
-    path = repo_root() / "data" / "checkpoints" / f"{checkpoint}.safetensors"
-    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
 
 
 def _plan_with_models(

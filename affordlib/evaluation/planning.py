@@ -185,6 +185,11 @@ def assemble() -> Path:
     for name, variant in VARIANTS.items():
         if not _part(name).is_file():
             continue
+        if not _is_done(name):
+            raise ValueError(
+                f"part {_part(name).name} is of other goals or settings than {name!r} has now; run "
+                f"`python -m affordlib.evaluation.planning --only {name}` again, or delete it"
+            )
         part = json.loads(_part(name).read_text())
         parts[name] = part["records"]
         about = {"variant": name, "nudged": variant.nudged}

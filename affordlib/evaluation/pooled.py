@@ -26,9 +26,12 @@ def read_parts(folder: str | Path = PARTS) -> list[tuple[Unit, Part]]:
     kept = [(unit, part) for unit, part in parts if part is not None]
     seen: dict[tuple, Unit] = {}
     for unit, part in kept:
-        key = (unit.model, unit.data, part["n"], unit.fold, unit.seed)
+        task = unit.data.removesuffix(TEN_TIMES)
+        key = (unit.model, task, part["n"], unit.fold, unit.seed)
         if (other := seen.setdefault(key, unit)) != unit:
-            raise ValueError(f"parts {other.file} and {unit.file} are the same; delete one")
+            raise ValueError(
+                f"parts {other.file} and {unit.file} would be one row of the table; delete one"
+            )
     return kept
 
 

@@ -41,7 +41,7 @@ from affordlib.interactions import TrainingArrays, open_interactions, split_inte
 from affordlib.interactions.batches import observe
 from affordlib.interactions.store import stored_sha256
 from affordlib.models.calibration import calibration_rows
-from affordlib.models.checkpoint import load_checkpoint, resolve_checkpoint
+from affordlib.models.checkpoint import checkpoint_sha256, load_checkpoint
 from affordlib.models.film import FiLMConfig
 from affordlib.models.frame import heading, inverse, turn_observations
 from affordlib.models.make_checkpoints import SHIPPED, train_model
@@ -310,11 +310,10 @@ STUDIES = {
 def hashes(name: str) -> dict[str, Any]:
     """What a written study must hold to be that of today's data, checkpoints and settings."""
     study = STUDIES[name]
-    files = {c: resolve_checkpoint(c).read_bytes() for c in study.checkpoints}
     return {
         "settings_sha256": hashlib.sha256(repr(study.settings()).encode()).hexdigest(),
         "data_sha256": {s: stored_sha256(s) for s in study.sets},
-        "checkpoints_sha256": {c: hashlib.sha256(b).hexdigest() for c, b in files.items()},
+        "checkpoints_sha256": {c: checkpoint_sha256(c) for c in study.checkpoints},
     }
 
 

@@ -2,9 +2,10 @@
 
     python -m affordlib.evaluation.tables
 
-Means and standard errors are over objects; `all` is the mean over object classes with equal
-weights, its median and 95th percentile are of all objects together. A part whose hash is not its
-unit's is refused; the sets of ten times the size need not be here, if their parts agree.
+Means and standard errors are over objects, an object's errors by several trainings meaned first;
+`all` is the mean over object classes with equal weights. Medians and 95th percentiles are over all
+predictions, of each object by each training. A part whose hash is not its unit's is refused; the
+sets of ten times the size need not be here, if their parts agree.
 """
 
 from __future__ import annotations
@@ -58,6 +59,8 @@ def error_rows(parts: list[tuple[Unit, Part]], data: str, test: str) -> list[dic
         for name in ("all", *sorted(set(pooled[first].classes))):
             row = about | {"object_class": name, "n": pooled[first].count(name)}
             row |= pooled[first].columns(first, unit, name)
+            each = [pool([t], final).mean_sem(name)[0] for t in told]
+            row[f"trainings_sd_{unit}"] = float(np.std(each, ddof=1)) if len(each) > 1 else None
             for key in ("trajectory_error", "after_contact_error"):
                 row[f"{key}_mean_{unit}"] = pooled[key].mean_sem(name)[0]
             if data == "push":

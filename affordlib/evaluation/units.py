@@ -31,7 +31,7 @@ from affordlib.evaluation.answers import (
 )
 from affordlib.evaluation.baselines import BASELINES
 from affordlib.evaluation.inverse import along_effect, executed_record, inverse_record
-from affordlib.evaluation.parts import checked_part, chosen_options, open_once, run_parts, sha256_of
+from affordlib.evaluation.parts import checked_part, open_once, options_of, run_parts, sha256_of
 from affordlib.interactions import Normaliser, TrainingArrays, split_interactions
 from affordlib.interactions.batches import Symmetry, symmetric_copies
 from affordlib.interactions.store import stored_sha256
@@ -186,8 +186,8 @@ def configuration_sha256(unit: Unit) -> str:
     }
     if configs := learner(unit):
         network, training = configs
-        told |= {"network": type(network).__name__, **chosen_options(network)}
-        told |= {f"training_{name}": value for name, value in chosen_options(training).items()}
+        told |= {"network": type(network).__name__, **options_of(network)}
+        told |= {f"training_{name}": value for name, value in options_of(training).items()}
     if unit.model == "ensemble":
         told |= {"members": MEMBERS}
     return sha256_of(told)
@@ -245,7 +245,7 @@ def run_unit(unit: Unit, folder: Path, progress: bool = False) -> bool:
             kept = believable(data, split.test)
             part["inverse"] = executed_record(data, kept, along_effect(data, kept))
     else:
-        halfway = folder / f".{unit.file}.{part['configuration_sha256'][:8]}.pt"
+        halfway = folder / f".{unit.file}.{sha256_of(hashes(unit))[:8]}.pt"
         fit = _fit_ensemble if unit.model == "ensemble" else _fit
         model, part["training"] = fit(unit, *configs, data, split, halfway, progress)
         told = {name: network_answers(model, *test) for name, test in tests.items()}
@@ -338,6 +338,7 @@ def _shipped(
             model, about = load_checkpoint(name)
         except (FileNotFoundError, ValueError):
             continue
+        same = replace(model.config, sigma_floor=network.sigma_floor, temperature=()) == network
         expected = about_training(data, np.concatenate([split.train, split.validation]), config)
         # Options that are younger than a checkpoint were off when it was trained.
         settings = vars(TrainingConfig()) | about["training"] | {"device": config.device}
@@ -345,7 +346,7 @@ def _shipped(
         known = normaliser
         if model.normaliser.effect_radius_m is None:
             known = replace(normaliser, effect_radius_m=None)  # younger than the checkpoint
-        same = expected == about | {"training": settings} and model.normaliser == known
+        same &= expected == about | {"training": settings} and model.normaliser == known
         if same:
             return model, {"checkpoint": name, "temperature": list(model.temperature)}
     return None

@@ -28,7 +28,7 @@ from affordlib.interactions.locks import exclusive
 from affordlib.interactions.places import Place
 from affordlib.interactions.recipes import Recipe
 from affordlib.interactions.records import collect_chunk, describe
-from affordlib.interactions.store import FOLDER_SUFFIX, SUFFIX, finish, pack
+from affordlib.interactions.store import FOLDER_SUFFIX, SUFFIX, finish, is_finished, pack
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -81,14 +81,16 @@ def collect(
     client: Client | None = None,
     workers: int = 1,
     progress: bool = True,
+    replace: bool = False,
 ) -> str | Path:
     """Collect a recipe into `path` and return it.
 
     path: a file ending in .zarr.zip, or a folder ending in .zarr; local, or an fsspec URL that
     all workers reach. client: a Dask client to collect with; None means `workers` processes of
-    this machine, or this process alone for 1. Interrupted, a rerun goes on with what is missing.
-    Raises ValueError for a path or `workers` that cannot be, RuntimeError while another process
-    collects into the path, and when a chunk cannot be made.
+    this machine, or this process alone for 1. Interrupted, a rerun goes on with what is missing,
+    and a zip that is there, whole, is not made again unless `replace` says so. Raises ValueError
+    for a path or `workers` that cannot be, and where a set of another recipe is; RuntimeError while
+    another process collects into the path, and when a chunk cannot be made.
     """
     if not str(path).endswith((SUFFIX, FOLDER_SUFFIX)):
         raise ValueError(f"path must end in {SUFFIX!r} or {FOLDER_SUFFIX!r}, got {str(path)!r}")
@@ -109,11 +111,14 @@ def collect(
             ) as cluster,
             Client(cluster) as local,
         ):
-            return collect(recipe, path, local, progress=progress)
+            return collect(recipe, path, local, progress=progress, replace=replace)
 
     layout = describe(recipe, CHUNK)
     with exclusive(place) as still_ours:
         work = _working_place(place, layout)
+        if not replace and work != place and is_finished(place, layout):
+            work.delete_all()
+            return path
         create(work, layout)
         task = _Task(recipe, layout, work)
         numbers = range(layout.n_chunks)

@@ -43,9 +43,13 @@ def read_folder(folder: str | Path, n_samples: int = 101) -> TrainingArrays:
             f"folder: there is no {path}; expected are {COURSES} with the columns interaction, t, "
             f"action_x, …, effect_x, …, and {IMAGES}/NAME.png for each interaction"
         )
-    table = pd.read_csv(path, dtype={"interaction": str})
+    # Only an empty entry is missing: "NA" is a name as good as others.
+    table = pd.read_csv(path, dtype={"interaction": str}, keep_default_na=False, na_values=[""])
     actions = _channels(path, table, "action", ACTION_CHANNELS)
     effects = _channels(path, table, "effect", EFFECT_CHANNELS)
+    if table["interaction"].isna().any():
+        row = 2 + int(table["interaction"].isna().argmax())
+        raise ValueError(f"{path}: line {row} has no entry in the column 'interaction'")
     phase = np.linspace(0, 1, n_samples)
     courses, images = [], []
     for name, rows in table.groupby("interaction", sort=False):
@@ -55,6 +59,9 @@ def read_folder(folder: str | Path, n_samples: int = 101) -> TrainingArrays:
             raise ValueError(f"{path}: interaction {name!r} has an entry that is not a number")
         if len(t) < 2 or t[0] != 0 or t[-1] != 1 or (np.diff(t) <= 0).any():
             raise ValueError(f"{path}: t of interaction {name!r} must grow from 0 to 1")
+        for k, channel in enumerate(actions + effects):
+            if channel.endswith("yaw"):
+                values[:, k] = np.unwrap(values[:, k])
         courses.append(np.column_stack([np.interp(phase, t, column) for column in values.T]))
         images.append(_read_image(folder / IMAGES, name))
     if not courses:
@@ -125,7 +132,12 @@ def _read_image(folder: Path, name: str) -> np.ndarray:
     mask = TABLE_M - depth > _HIGHER_M
     if (masked := folder / f"{name}_mask.png").is_file():
         with Image.open(masked) as file:
-            mask = np.asarray(file) / 255.0
-        if mask.shape != size:
-            raise ValueError(f"{masked} must be a gray image of {size[0]}×{size[1]} pixels")
+            values = np.asarray(file)
+        if values.shape != size or values.dtype != np.uint8 or 0 < values.max() < 128:
+            raise ValueError(
+                f"{masked} must be a gray image of {size[0]}×{size[1]} pixels with 8 bits, white "
+                f"(255) where the object is, got {values.shape}, {values.dtype}, at most "
+                f"{values.max()}"
+            )
+        mask = values / 255.0
     return np.stack([depth, mask]).astype(np.float32)

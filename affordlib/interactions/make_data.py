@@ -70,7 +70,8 @@ def main(argv: list[str] | None = None) -> int:
                 old = None
                 print(f"{name}: no former data set to compare with ({error})")
             target = f"{arguments.to}/{name}{SUFFIX}"
-            path = collect(RECIPES[name], target, client, 1 if client else arguments.workers)
+            workers = 1 if client else arguments.workers
+            path = collect(RECIPES[name], target, client, workers, replace=True)
             new = open_interactions(path)
             print(f"{name}: {new.sizes['interaction']} interactions, sha256 {dataset_sha256(new)}")
             if old is not None:

@@ -101,9 +101,9 @@ class Place:
                 path.unlink(missing_ok=True)
 
     def delete_all(self) -> None:
-        """Delete the folder with all that is in it."""
+        """Delete the folder with all that is in it, if it is there."""
         if self.is_local:
             # A worker that was given up may still be writing; what it leaves harms nothing.
             shutil.rmtree(self.root, ignore_errors=True)
-        else:
+        elif self.fs.exists(self.root):
             self.fs.rm(self.root, recursive=True)

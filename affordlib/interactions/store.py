@@ -28,6 +28,7 @@ from affordlib.interactions.chunks import (
     as_json,
     empty_set,
     is_record,
+    metadata_files,
     read_chunk,
     record_name,
     sha256,
@@ -195,7 +196,16 @@ def open_interactions(name_or_path: str | Path) -> xr.Dataset:
     Dimensions: interaction, sample, action_channel, effect_channel, image_channel, row, column.
     Raises FileNotFoundError, or CorruptedDataError naming what is damaged.
     """
-    place = _resolve(name_or_path)
+    files = _read_checked(_resolve(name_or_path))
+    store = MemoryStore(
+        {name: Buffer.from_bytes(files[name]) for name in files if not is_record(name)}
+    )
+    with xr.open_zarr(store, consolidated=False, zarr_format=3) as data:
+        return data[sorted(data.data_vars)].load()
+
+
+def _read_checked(place: Place) -> dict[str, bytes]:
+    """All files of a finished set, or CorruptedDataError naming what is damaged."""
     hashes = _read_manifest(place)["files"]
     files = _read(place, hashes)
     missing = sorted(hashes.keys() - files.keys())
@@ -204,8 +214,22 @@ def open_interactions(name_or_path: str | Path) -> xr.Dataset:
         if names:
             more = f" (and {len(names) - 1} others)" if len(names) > 1 else ""
             raise CorruptedDataError(f"{place.url}: {names[0]}{more} is {what}; {_REMEDY}")
-    store = MemoryStore(
-        {name: Buffer.from_bytes(files[name]) for name in files if not is_record(name)}
-    )
-    with xr.open_zarr(store, consolidated=False, zarr_format=3) as data:
-        return data[sorted(data.data_vars)].load()
+    return files
+
+
+def is_finished(place: Place, layout: Layout) -> bool:
+    """Whether a zip holds this very set, whole; ValueError if it holds another one."""
+    if not place.fs.exists(place.root):
+        return False
+    try:
+        files = _read_checked(place)
+    except CorruptedDataError:
+        return False
+    expected = metadata_files(layout)
+    differing = sorted(name for name in expected if files.get(name) != expected[name])
+    if differing:
+        raise ValueError(
+            f"path {place.url} holds a set of another recipe, or of other package versions "
+            f"({differing[0]} differs); choose another path, delete it, or pass replace=True"
+        )
+    return True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import tempfile
@@ -85,6 +86,14 @@ def resolve_checkpoint(name_or_path: str | Path) -> Path:
                 f"shipped names {shipped} or the path of a {SUFFIX} file with its .json beside it"
             )
     return path
+
+
+def checkpoint_sha256(name_or_path: str | Path) -> str:
+    """Hash of all that decides a checkpoint's answers: weights, configuration and scales."""
+    path = resolve_checkpoint(name_or_path)
+    told = json.loads(path.with_suffix(".json").read_text())
+    decisive = json.dumps({key: told[key] for key in ("model", "config", "normaliser")})
+    return hashlib.sha256(path.read_bytes() + decisive.encode()).hexdigest()
 
 
 def _with_tuples(fields: dict[str, Any]) -> dict[str, Any]:

@@ -82,6 +82,11 @@ class AffordanceCNP(EffectNetwork):
         self._folds: dict[nn.Linear, tuple] = {}
         self.apply(he_initialise)
 
+    def train(self, mode: bool = True) -> AffordanceCNP:
+        """As of torch; folded weights are forgotten, since fused optimisers leave no trace."""
+        self._folds.clear()
+        return super().train(mode)
+
     def features(self, scaled_image: Float[Tensor, "b 2 48 48"]) -> Float[Tensor, "b 16"]:
         """f(γ_o): features (B, 16) of standardised depth and mask (B, 2, 48, 48)."""
         return self.image_encoder(scaled_image)
@@ -127,10 +132,11 @@ class AffordanceCNP(EffectNetwork):
     def _folded(self, first: nn.Linear) -> tuple[Tensor, Tensor]:
         """Weight and bias of the merge layer and a decoder's first layer in one.
 
-        Where no gradient is asked for they are kept until one of the weights changes.
+        Of a network that is not in training, and where no gradient is asked for, they are kept
+        until one of the weights changes.
         """
         merge = self.merge
-        if torch.is_grad_enabled() or first.weight.is_inference():
+        if self.training or torch.is_grad_enabled() or first.weight.is_inference():
             return first.weight @ merge.weight, first.weight @ merge.bias + first.bias
         told_by = (*first.parameters(), *merge.parameters())
         stamp = tuple((w.data_ptr(), w._version) for w in told_by)

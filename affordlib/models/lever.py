@@ -82,7 +82,7 @@ LEVER_MODELS: dict[str, LeverModel] = {
 """Ours, the paper's (its image shrunk to the 48×48 of the appendix), and the recurrent one.
 
 All get as many steps, although one of the paper's network costs three times as much. The rates of
-the first and the last are those of the least validation error (`evaluation/lever_tuning.py`)."""
+the first and the last are chosen by validation error (`evaluation/lever_tuning.py`)."""
 
 
 @torch.no_grad()

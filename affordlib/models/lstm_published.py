@@ -161,8 +161,14 @@ def train_published(
     n = SEEN if trained_for == "window" else len(training.phase) - 1
     score = window_errors_m if trained_for == "window" else beginning_errors_m
     best, best_state, epoch, seconds = math.inf, model.state_dict(), 0, 0.0
+    about = [trained_for, seed, *(float(a.effect.double().sum()) for a in (training, validation))]
     if checkpoint is not None and checkpoint.is_file():
         state = torch.load(checkpoint, weights_only=True)
+        if state["about"] != about:
+            raise ValueError(
+                f"checkpoint {checkpoint} is of a training for {state['about'][0]!r} with seed "
+                f"{state['about'][1]} or of other data; delete it, or train as it was begun"
+            )
         model.load_state_dict(state["model"])
         optimiser.load_state_dict(state["optimiser"])
         plateau.load_state_dict(state["plateau"])
@@ -192,7 +198,7 @@ def train_published(
                 "model": model.state_dict(), "optimiser": optimiser.state_dict(),
                 "plateau": plateau.state_dict(), "generator": generator.get_state(),
                 "torch": torch.get_rng_state(), "best": best, "best_state": best_state,
-                "epoch": epoch, "seconds": seconds,
+                "epoch": epoch, "seconds": seconds, "about": about,
             }  # fmt: skip
             partial = checkpoint.with_name(f".{checkpoint.name}.partial")
             torch.save(state, partial)

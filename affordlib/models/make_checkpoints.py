@@ -20,9 +20,11 @@ from affordlib.interactions import (
 from affordlib.interactions.batches import (
     Symmetry,
     draw_forward,
+    observe_action,
     plane_of,
     sample_batch,
     symmetric_copies,
+    turn,
 )
 from affordlib.interactions.store import SUFFIX as DATA_SUFFIX
 from affordlib.models.attention import AttentionConfig
@@ -30,8 +32,9 @@ from affordlib.models.calibration import fit_temperature
 from affordlib.models.checkpoint import SUFFIX, build, load_checkpoint, save_checkpoint
 from affordlib.models.cnp import CNPConfig
 from affordlib.models.film import FiLMConfig
+from affordlib.models.frame import heading, inverse
 from affordlib.models.lever import LEVER_MODELS, LeverModel, train_lever_model
-from affordlib.models.lstm import LSTMConfig
+from affordlib.models.lstm import LSTMConfig, LSTMNetwork
 from affordlib.models.training import TrainingConfig, TrainingRecord, final_errors_m, train
 from affordlib.paths import repo_root
 
@@ -39,6 +42,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     import xarray as xr
+    from torch import Tensor
 
     from affordlib.interactions import Split
     from affordlib.models.network import EffectNetwork, NetworkConfig
@@ -141,9 +145,22 @@ def train_model(
         training = symmetric_copies(training, symmetries)
     torch.manual_seed(config.seed)
     model = build(model_config, Normaliser.fit(training))
+    if isinstance(model, LSTMNetwork):
+        model.fit_course(courses(model, training))
     history = train(model, training, validation, config, progress, checkpoint, draw)
     fit_temperature(model, validation)
     return model, history
+
+
+def courses(model: LSTMNetwork, arrays: TrainingArrays) -> Tensor:
+    """Effects (2N, steps + 1, C) and their mirror images, in the frame and at the steps of it."""
+    both = arrays.joined(arrays.turned(0, mirror=True))
+    at = torch.linspace(0, len(both.phase) - 1, model.config.steps + 1).round().long()
+    if model.config.frame == "table":
+        return both.effect[:, at]
+    channels = both.action_channels, both.effect_channels
+    back = inverse(heading(observe_action(both), *channels))[:, None]
+    return turn(both.effect[:, at], channels[1], back, absolute_yaw=False)
 
 
 def about_training(data: xr.Dataset, seen: np.ndarray, config: TrainingConfig) -> dict[str, object]:

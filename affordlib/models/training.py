@@ -215,7 +215,8 @@ def train(
     first_floor = model.config.sigma_floor
     about = {
         "model": repr(model.config),
-        "data": [len(training), float(training.effect.double().sum()), len(validation)],
+        "data": [_fingerprint(arrays) for arrays in (training, validation)],
+        "draw and score": [getattr(of, "__name__", type(of).__name__) for of in (draw, score)],
     }
     run = _Run(model, config, about)
     if checkpoint is not None and Path(checkpoint).is_file():
@@ -266,6 +267,11 @@ def train(
     model.sigma_floor = run.best_floor
     model.cpu().eval()
     return run.history
+
+
+def _fingerprint(arrays: TrainingArrays) -> list[float]:
+    of = (arrays.image, arrays.action, arrays.effect)
+    return [len(arrays), *(float(values.double().sum()) for values in of)]
 
 
 def _step(

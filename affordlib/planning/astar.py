@@ -76,6 +76,10 @@ class BranchTable:
         n_directions: int = N_DIRECTIONS,
         stop_phases: Sequence[float] = STOP_PHASES,
     ) -> None:
+        if isinstance(n_directions, bool) or not isinstance(n_directions, int) or n_directions < 1:
+            raise ValueError(f"n_directions must be a whole number from 1 on, got {n_directions!r}")
+        if not len(stop_phases):
+            raise ValueError("stop_phases must hold at least one phase in (0, 1], got none")
         between = 2 * math.pi / n_directions
         self._finer = math.ceil(between / YAW_STEP_RAD)
         self._step_rad = between / self._finer

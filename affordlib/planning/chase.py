@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from affordlib.perception import looks_fallen
+from affordlib.perception import aim, looks_fallen
 from affordlib.planning.disturbances import Script
 from affordlib.planning.modes import is_on_table
 from affordlib.planning.moves import Ended, MovePlanner
 from affordlib.planning.poses import GRIP_YAWS, hands_in_line, plan_lift, plan_turn
 from affordlib.primitives import Grasp, Rotate, wrap_angle
-from affordlib.types import Goal, Plan
+from affordlib.types import Goal, NothingSeenError, Plan, UnreachableError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -113,7 +113,7 @@ class Chase:
         self.expected: tuple[float, float] | None = None
         self.yaw_rad = world.object_pose()[2]
         self.grip_yaws = GRIP_YAWS
-        self.limit = self._limit_from(world.perceive().xy_m)
+        self.turns = self.limit = 0
         self.z_m = world.object_state()[2]
 
     @property
@@ -129,7 +129,8 @@ class Chase:
         raise AssertionError("a pursuit ends by saying how")
 
     def _run(self) -> None:
-        turns = lifts = 0
+        lifts = 0
+        self.limit = self._limit_from(self._perceived().xy_m)
         while True:
             self._look()
             if self.goal.distance_m(self.seen.xy_m) > self.demands.tolerance_m:
@@ -138,11 +139,10 @@ class Chase:
             off = self._turn_left()
             if off is not None and abs(off) > self.demands.turn_tolerance_rad:
                 # Behind it lies what takes a whole round, in sweeps of 60°.
-                if turns == 0:
-                    self.limit += (
-                        math.ceil((off % (2 * math.pi)) / Rotate.sweep_rad) + SPARE_ACTIONS
-                    )
-                turns += 1
+                if self.turns == 0:
+                    sweeps = math.ceil((off % (2 * math.pi)) / Rotate.sweep_rad)
+                    self._allow(sweeps + SPARE_ACTIONS)
+                self.turns += 1
                 self._act(self._turn(off), "orientation")
                 continue
             if self.goal.height_m is None:
@@ -150,7 +150,7 @@ class Chase:
             if lifts == MAX_LIFTS:
                 self._give_up("height")
             lifts += 1
-            self.limit += 1
+            self._allow(1)
             self._act(self._lift(), "height")
             off = self._turn_left()
             turned = off is None or abs(off) <= self.demands.turn_tolerance_rad
@@ -164,7 +164,7 @@ class Chase:
     def _look(self) -> None:
         """Let happen what happens between actions; look, and judge whether the plan still holds."""
         self.script.before(self.world, len(self.steps))
-        before, self.seen = self.seen, self.world.perceive()
+        before, self.seen = self.seen, self._perceived()
         off, fell = self._surprise(before)
         if DISPLACED_M < off < math.inf or fell:
             self._wait()
@@ -175,9 +175,16 @@ class Chase:
         moved = self.planned_for is not None and self.planned_for != self.goal
         if moved or (self.expected is not None and off > DISPLACED_M and self.renewals > 0):
             self.renewals -= not moved
+            self.turns *= not moved  # a goal that has turned may ask for a whole round again
             self.limit = max(self.limit, len(self.steps) + self._limit_from(self.seen.xy_m))
         if off > SURPRISE_M or moved or fell:
             self.queue = []
+
+    def _perceived(self) -> Percept:
+        try:
+            return self.world.perceive()
+        except NothingSeenError:
+            raise Ended("lost", f"no object is seen on the table, after {self._count()}") from None
 
     def _surprise(self, before: Percept | None) -> tuple[float, bool]:
         """How far the object is from where it should be [m], and whether it has fallen."""
@@ -188,7 +195,7 @@ class Chase:
         """Look on until what somebody has set in motion rests."""
         for _ in range(MOST_LOOKS):
             self.world.settle(BETWEEN_LOOKS_S)
-            before, self.seen = self.seen, self.world.perceive()
+            before, self.seen = self.seen, self._perceived()
             if math.dist(before.xy_m, self.seen.xy_m) < AT_REST_M:
                 return
 
@@ -197,13 +204,21 @@ class Chase:
             return self.demands.max_actions
         return action_limit(self.goal.distance_m(xy_m))
 
+    def _allow(self, further: int) -> None:
+        """More actions than the distance is worth, unless it was said how many there may be."""
+        if self.demands.max_actions is None:
+            self.limit += further
+
     def _act(self, step: Step, part: str) -> None:
         """Carry out a step that the arm has agreed to."""
         if len(self.steps) >= self.limit:
             self._give_up(part)
         self.planned_for, self.expected = self.goal, step.predicted_end_xy_m
         with self.script.during(self.world, len(self.steps)):
-            self.paths.append(path_on_table(self.world.follow(step)))
+            try:
+                self.paths.append(path_on_table(self.world.follow(step)))
+            except UnreachableError as error:  # of what it sees now, a hair off what it agreed to
+                raise Ended("unreachable", f"the {part}: {error}") from error
         self.steps.append(step)
         self.grip_yaws = GRIP_YAWS
         if isinstance(step.primitive, Rotate):
@@ -266,7 +281,8 @@ class Chase:
             step = plan(yaws)
             if step is None:
                 break
-            if self.world.can_reach(step.primitive, step.stop_phase, self.seen.xy_m):
+            asked = aim(step.primitive, self.seen.image)
+            if self.world.can_reach(asked, step.stop_phase, self.seen.xy_m):
                 kind, at = step.primitive.name, self.seen.xy_m
                 self._follow(Plan(self.goal, at, (step,), kind, False, len(grip_yaws), 0.0))
                 return step

@@ -20,7 +20,7 @@ from affordlib.planning.finish import TURN_TOLERANCE_RAD
 from affordlib.planning.modes import PlanMode, is_on_table
 from affordlib.planning.moves import Demands
 from affordlib.primitives import Drag, wrap_angle
-from affordlib.types import Goal, Outcome, Plan, check_within
+from affordlib.types import Goal, NothingSeenError, Outcome, Plan, check_within
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -59,15 +59,20 @@ def carry_out(
     arm cannot follow a step.
 
     corrections: after the last step, so many single actions at most, each the first of a plan that
-    `replan` makes anew from what is then seen, and each only if the object seems farther than
-    enough_m [m] from the goal, the plan expects to bring it nearer, and the arm can do it.
+    `replan` makes anew from what is then seen, and each only if the object is seen, and farther
+    than enough_m [m] from the goal, the plan expects to bring it nearer, and the arm can do it.
+    There are none after a plan that ends with the object in the hand.
     """
     if corrections and replan is None:
         raise ValueError(f"corrections = {corrections} need a planner; give replan as well")
     yaw_rad, z_m = world.object_pose()[2], world.object_state()[2]
     paths = [path_on_table(world.follow(step)) for step in plan.steps]
-    for _ in range(corrections):
-        seen = world.perceive()
+    held = bool(plan.steps) and plan.steps[-1].primitive.holds
+    for _ in range(0 if held else corrections):
+        try:
+            seen = world.perceive()
+        except NothingSeenError:
+            break
         off = plan.goal.distance_m(seen.xy_m)
         if off <= enough_m or not is_on_table(np.array([seen.xy_m]))[0] or not seen.image[1].any():
             break
@@ -113,7 +118,8 @@ def pursue(
     for name, value in (("tolerance_m", tolerance_m), ("height_tolerance_m", height_tolerance_m)):
         check_within(name, value, 1e-5, 0.1, "m")
     check_within("turn_tolerance_rad", turn_tolerance_rad, 1e-4, math.pi, "rad")
-    if max_actions is not None and (isinstance(max_actions, bool) or max_actions < 0):
+    whole = isinstance(max_actions, int) and not isinstance(max_actions, bool)
+    if max_actions is not None and not (whole and max_actions >= 0):
         raise ValueError(f"max_actions must be a whole number from 0 on, got {max_actions!r}")
     demands = Demands(
         planner,

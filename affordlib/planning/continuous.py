@@ -49,6 +49,9 @@ with 1 at 0.73, with 10 at 0.41 mm (40 validation goals)."""
 ACTION_COST_M = 0.0005
 """An action more must make the end surer by this much."""
 
+SHORTEST_M = 1e-4
+"""The least way that an action is counted as, when it is told how many a distance asks for."""
+
 
 def _starts(
     effects: EffectMap, target: Tensor, n_actions: int, partial: bool, rng: np.random.Generator
@@ -209,7 +212,7 @@ def plan_continuous(
     rng = np.random.default_rng(seed)
     xy = np.array(start)
     target = torch.from_numpy(np.array(goal.xy_m) - xy)
-    fewest = max(1, math.ceil(float(target.norm()) / effects.reach_m))
+    fewest = max(1, math.ceil(float(target.norm()) / max(effects.reach_m, SHORTEST_M)))
     best, iterations = None, 0
     if float(target.norm()) > 1e-4:
         for n_actions in range(min(fewest, mode.max_steps), mode.max_steps + 1):
@@ -222,7 +225,8 @@ def plan_continuous(
             if best is not None and n_actions >= fewest + (not draft):
                 break
     steps = ()
-    if best is not None:
+    # Where nothing brings it nearer, the object stays.
+    if best is not None and best[0] < float(target.norm()):
         direction, phase = best[1:]
         corrections = 1 if draft else CORRECTIONS
         chain, foreseen = _correct(effects, target, direction, phase, mode.partial, corrections)

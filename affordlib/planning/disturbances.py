@@ -30,7 +30,7 @@ KINDS = ("shove", "knock", "topple", "goal")
 STEPS_PER_S = 240
 TIPPING_S = 1.0
 EDGE_M = 0.15
-"""Of the table, where nothing is shoved to and no goal is put."""
+"""Of the table, where nothing is shoved to and no goal is put; what is there is moved away."""
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -95,8 +95,9 @@ class Repertoire:
 
         Told of the object's primitive, where the arm can act, and what turns and lifts it in the
         end. As long as the image (2, 48, 48) stays the same, as it does while only the goal moves,
-        what the models say of it is kept. The function takes further settings of the planner,
-        which is its `__wrapped__`.
+        what the models say of it is kept. The function takes further settings of the planner;
+        its attribute `search` is the planner with those given here, for who knows the object
+        better.
         """
         last: dict[bytes, dict[str, Any]] = {}
 
@@ -107,9 +108,12 @@ class Repertoire:
             if seen not in last:
                 last.clear()
                 last[seen] = self._told_of(image)
-            return plan(start_xy_m=start_xy_m, goal=goal, **last[seen], **settings | further)
+            told = last[seen] | settings | further
+            return plan(start_xy_m=start_xy_m, goal=goal, **told)
 
-        planner.__wrapped__ = plan
+        told_anew = ("mode", "kind", "effects", "reachable", "finish")
+        kept = {name: value for name, value in settings.items() if name not in told_anew}
+        planner.search = partial(plan, **kept)
         return planner
 
     def _told_of(self, image: np.ndarray) -> dict[str, Any]:

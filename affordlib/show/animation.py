@@ -33,8 +33,15 @@ class Film:
         self._steps += 1
 
     def add(self, figure: Figure) -> None:
-        """Add a picture of a figure, as high as the film is."""
-        self.frames.append(np.asarray(_drawn(figure, self.height)))
+        """Add a picture of a figure, as high as the film is; all frames must be as wide."""
+        frame = np.asarray(_drawn(figure, self.height))
+        if self.frames and frame.shape != self.frames[0].shape:
+            sizes = [f"{f.shape[1]}×{f.shape[0]}" for f in (frame, self.frames[0])]
+            raise ValueError(
+                f"figure makes a frame of {sizes[0]} pixels, those of the film have {sizes[1]}; "
+                "give it the shape of the film, or show it with beside="
+            )
+        self.frames.append(frame)
 
     def encoded(self, kind: str = "GIF", frame_ms: int = 60, beside: Figure | None = None) -> bytes:
         """The frames as an animated picture that loops and rests on its last frame.

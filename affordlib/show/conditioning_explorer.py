@@ -66,7 +66,7 @@ class ConditioningExplorer(FigureWidget):
         weight: float = 1.0,
     ) -> None:
         """Set what is observed and how it is blended, as the sliders do; None: not observed."""
-        with self.hold_trait_notifications():
+        with self.drawing_once():
             self._has_action.value = action_t is not None
             self._has_effect.value = effect_t is not None
             if action_t is not None:
@@ -74,7 +74,6 @@ class ConditioningExplorer(FigureWidget):
             if effect_t is not None:
                 self._effect_t.value = effect_t
             self._weight.value = weight
-        self.refresh()
 
     def drag(self, name: str, phase: float) -> None:
         """Observe the action (its first or second point) or the effect at another phase."""

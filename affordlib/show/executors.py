@@ -57,7 +57,7 @@ def closed_loop(repertoire: Repertoire) -> Executor:
     """
 
     def execute(world: Tabletop, plan: Plan, planner: Planner, tell: Tell) -> Outcome:
-        search = getattr(planner, "__wrapped__", None)
+        search = getattr(planner, "search", None)
         done = pursue(
             world,
             plan.goal,

@@ -5,9 +5,9 @@ Everything it needs is in this package; nothing is fetched from anywhere.
 
 from __future__ import annotations
 
-import base64
 import html
 import io
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,8 +19,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
+from affordlib.show.pictured import Pictured
+
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from matplotlib.axes import Axes
 
@@ -44,7 +46,7 @@ class DraggedFigure(anywidget.AnyWidget):
     dragged = traitlets.List(["", 0.0, 0]).tag(sync=True)
 
 
-class FigureWidget(widgets.VBox):
+class FigureWidget(Pictured, widgets.VBox):
     """Controls above a figure and a line of words below; errors are shown in that line.
 
     A subclass draws in `draw(figure)`, which returns the words (HTML), and calls `let_drag` for
@@ -58,6 +60,7 @@ class FigureWidget(widgets.VBox):
         self._image = DraggedFigure(width=round(DPI * self.figsize[0]))
         self._image.observe(self._dragged, names="dragged")
         self._handles: list[tuple[Axes, str, float, float | None]] = []
+        self._waits = False
         self._words = widgets.HTML()
         for control in controls:
             control.observe(lambda _: self.refresh(), names="value")
@@ -97,8 +100,20 @@ class FigureWidget(widgets.VBox):
             "bottom": 1 - box[1],
         }
 
+    @contextmanager
+    def drawing_once(self) -> Iterator[None]:
+        """While entered nothing is drawn, whatever controls change; then all of it."""
+        self._waits = True
+        try:
+            yield
+        finally:
+            self._waits = False
+            self.refresh()
+
     def refresh(self) -> None:
         """Draw the figure anew."""
+        if self._waits:
+            return
         # A figure of its own, outside pyplot: no window, nothing to close.
         figure = Figure(figsize=self.figsize, dpi=DPI, layout="constrained")
         canvas = FigureCanvasAgg(figure)
@@ -117,9 +132,6 @@ class FigureWidget(widgets.VBox):
                 self._image.value = buffer.getvalue()
         self._words.value = f"<div role='status' aria-live='polite'>{words}</div>"
 
-    def _repr_mimebundle_(self, **kwargs: object) -> dict[str, object]:
-        # A box of widgets saves only text; the picture stays in the notebook without a kernel.
-        bundle = super()._repr_mimebundle_(**kwargs) | {"text/plain": type(self).__name__}
-        if self._image.value:
-            bundle["image/png"] = base64.b64encode(self._image.value).decode()
-        return bundle
+    def picture(self) -> bytes:
+        """What is shown, as a PNG."""
+        return self._image.value

@@ -7,7 +7,6 @@ A view on plain objects: everything it does can be done with a planner, `carry_o
 from __future__ import annotations
 
 import asyncio
-import base64
 import html
 import math
 import threading
@@ -23,6 +22,7 @@ from affordlib.planning import carry_out
 from affordlib.primitives import wrap_angle
 from affordlib.show.executors import Stopped, open_loop
 from affordlib.show.picker_controls import PickerControls
+from affordlib.show.pictured import Pictured
 from affordlib.show.plots import table_picture
 from affordlib.show.pose_film import moving_part, pose_recorder
 from affordlib.show.sentences import outcome_in_words, plan_in_words
@@ -41,7 +41,7 @@ REST_S = 0.05
 """A hand that has asked for nothing new for so long has come to rest."""
 
 
-class GoalPicker(widgets.VBox):
+class GoalPicker(Pictured, widgets.VBox):
     """The table from above, where a goal is picked by mouse, keyboard or sliders.
 
     planners: name → function (image, start_xy_m, goal) → Plan. executors: name → function (world,
@@ -133,15 +133,14 @@ class GoalPicker(widgets.VBox):
         if self.plan is None:
             raise RuntimeError("there is no plan to save; pick a goal that can be planned for")
         path = save_plan(resolve_out_dir(self.folder) / name, self.plan)
-        self.controls.say(
-            f"Saved the plan and its goal as {html.escape(f'{self.folder}/{path.name}')}."
-        )
+        self.controls.say(f"Saved the plan as {html.escape(f'{self.folder}/{path.name}')}.")
 
     def load(self, name: str = "plan.json") -> None:
         """Show a saved plan with its goal, to be run as it is."""
         self._refuse_while_running()
         plan = load_plan(resolve_out_dir(self.folder) / name)
         self._no_rest()
+        self._let_go()
         self._set_goal(plan.goal)
         self._pose, self.plan, self.outcome = self.world.object_pose(), plan, None
         self._start, self._turn_from = (*plan.start_xy_m, self._pose[2]), self._pose[2]
@@ -189,10 +188,7 @@ class GoalPicker(widgets.VBox):
     def _make_plan(self, draft: Planner | None = None) -> None:
         self._no_rest()
         planner, plan = draft or self.planners[self.controls.planner.value], None
-        if self._lifted:
-            self.world.park()
-            self._lifted = False
-            self._poses.clear()
+        self._let_go()
         self._pose = self._start = self.world.object_pose()
         self._turn_from = self._pose[2]
         try:
@@ -202,6 +198,13 @@ class GoalPicker(widgets.VBox):
             self.plan, self.outcome = plan, None
             self._walked.clear()
             self._show(draft is not None)
+
+    def _let_go(self) -> None:
+        """Put down what the last run has lifted."""
+        if self._lifted:
+            self.world.park()
+            self._lifted = False
+            self._poses.clear()
 
     def _set_goal(self, goal: Goal) -> None:
         """Set the goal everywhere; the sliders are told, and what they echo is not listened to."""
@@ -254,8 +257,12 @@ class GoalPicker(widgets.VBox):
             )
             self._lifted = bool(self._goal.height_m)
             self.controls.say(outcome_in_words(self.outcome, self._goal, how, done))
+        except Exception:
+            self.plan = None  # the next run plans from where this one broke off
+            raise
         finally:
             self.world.film = before
+            self._waiting.clear()
             self._set_running(False)
             self._play(0.0)
             self._pose = self.world.object_pose()
@@ -268,9 +275,8 @@ class GoalPicker(widgets.VBox):
         self._pose = self.world.object_pose()
         self._start = (*plan.start_xy_m, self._pose[2])
         self.controls.show_progress(done, done + len(plan.steps))
-        self.controls.say(
-            f"On the way, after {done} action{'s' * (done != 1)}. {plan_in_words(plan)}"
-        )
+        so_far = f"On the way, after {done} action{'s' * (done != 1)}."
+        self.controls.say(f"{so_far} {plan_in_words(plan)}")
         self._show()
 
     def _play(self, seconds: float) -> None:
@@ -343,15 +349,14 @@ class GoalPicker(widgets.VBox):
         x, y, _ = change["new"]
         self._safely(lambda: self._follow(x, y))
 
-    def _slid(self, _: object) -> None:
-        xy_m = whole_mm(self.controls.x.value / 100, self.controls.y.value / 100)
+    def _slid(self, change: dict[str, Any]) -> None:
+        xy_m = whole_mm(*self.controls.place_m(self._goal, change))
         if not self._setting and xy_m != self._goal.xy_m:  # the page echoes what it was told
             self._safely(lambda: self._follow(*xy_m))
 
-    def _posed(self, _: object) -> None:
+    def _posed(self, change: dict[str, Any]) -> None:
         if not self._setting:
-            turn_deg, height_cm = self.controls.turn.value, self.controls.height.value
-            self._safely(lambda: self.ask_pose(turn_deg, height_cm))
+            self._safely(lambda: self.ask_pose(*self.controls.pose(self._goal, change)))
 
     def _pressed(self, _: object, content: dict[str, Any], __: object) -> None:
         presses = {"run": self._run_in_background, "stop": self.stop}
@@ -393,8 +398,3 @@ class GoalPicker(widgets.VBox):
     def picture(self) -> bytes:
         """What is shown, as a PNG."""
         return table_picture(self.world.thing, self._pose, self.plan, self.outcome, HALF_WIDTH_M)
-
-    def _repr_mimebundle_(self, **kwargs: object) -> dict[str, object]:
-        # A box of widgets saves only text; the picture stays in the notebook without a kernel.
-        bundle = super()._repr_mimebundle_(**kwargs) | {"text/plain": "GoalPicker"}
-        return {**bundle, "image/png": base64.b64encode(self.picture()).decode()}

@@ -65,6 +65,18 @@ class PickerControls:
         self.turn.value = round(math.degrees(goal.turn_rad or 0.0), 1)
         self.height.value = round(100 * (goal.height_m or 0.0), 1)
 
+    def place_m(self, goal: Goal, change: dict[str, Any]) -> tuple[float, float]:
+        """The place [m] that a moved slider asks for; the other may end before the goal does."""
+        x, y = goal.xy_m
+        moved = change["new"] / 100
+        return (moved, y) if change["owner"] is self.x else (x, moved)
+
+    def pose(self, goal: Goal, change: dict[str, Any]) -> tuple[float, float]:
+        """The turn [°] and the height [cm] that a moved slider asks for, likewise."""
+        turn_deg, height_cm = math.degrees(goal.turn_rad or 0.0), 100 * (goal.height_m or 0.0)
+        is_turn = change["owner"] is self.turn
+        return (change["new"], height_cm) if is_turn else (turn_deg, change["new"])
+
     def set_running(self, running: bool) -> None:
         """While the robot is at work, only what it listens to can be pressed."""
         for control in (self.run, self.start_over, self.planner, self.executor, self.load):

@@ -1,6 +1,7 @@
 """All that touches PyBullet: the tabletop, its objects, the arm and the camera."""
 
 import affordlib.world._quiet_pybullet  # noqa: F401  (must come first)
+from affordlib.types import NothingSeenError, UnreachableError
 from affordlib.world.objects import (
     FAMILIES,
     Cuboid,
@@ -11,7 +12,7 @@ from affordlib.world.objects import (
     UprightCylinder,
     family_named,
 )
-from affordlib.world.robot import BASE_X_M, REACH_M, UnreachableError
+from affordlib.world.robot import BASE_X_M, REACH_M
 from affordlib.world.scene import Tabletop, WorldConfig
 
 __all__ = [
@@ -20,6 +21,7 @@ __all__ = [
     "REACH_M",
     "Cuboid",
     "LyingCylinder",
+    "NothingSeenError",
     "Prism",
     "Sphere",
     "Tabletop",

@@ -14,7 +14,7 @@ import numpy as np
 import pybullet
 
 from affordlib.perception import CAMERA_HEIGHT_M, centre_m, largest_blob
-from affordlib.types import CROP_WIDTH_M, IMAGE_PIXELS, TABLE_X_M, TABLE_Y_M
+from affordlib.types import CROP_WIDTH_M, IMAGE_PIXELS, TABLE_X_M, TABLE_Y_M, NothingSeenError
 
 _NEAR_M, _FAR_M = 0.5, 1.1
 _MASK_HEIGHT_M = 0.004
@@ -148,13 +148,13 @@ def kinect_view(client: int, noise: np.random.Generator) -> tuple[tuple[float, f
     """Where a Kinect above the table sees the object, (x, y) [m], and a crop (2, 48, 48) of it.
 
     The perspective image is turned into points and seen from straight above, so the crop does not
-    depend on where the object lies. Raises RuntimeError when nothing stands on the table.
+    depend on where the object lies. Raises NothingSeenError when nothing stands on the table.
     """
     table = (TABLE_X_M[1] - TABLE_X_M[0], TABLE_Y_M[1] - TABLE_Y_M[0])
     coarse = _kinect_points(client, _KINECT_XY_M, table, 4, noise)
     high = coarse[coarse[:, 2] > _KINECT_MASK_HEIGHT_M]
     if not len(high):
-        raise RuntimeError("the camera sees no object on the table; call place(...) first")
+        raise NothingSeenError("the camera sees no object on the table; call place(...) first")
     xy = tuple(np.median(high[:, :2], axis=0))
     for _ in range(2):
         points = _kinect_points(client, xy, (1.5 * CROP_WIDTH_M, 1.5 * CROP_WIDTH_M), 1, noise)

@@ -72,7 +72,12 @@ class Interventions:
         self._change_velocity(np.cross(spin, [-out * c, -out * s, up]), spin)
 
     def _corners_m(self) -> np.ndarray:
-        """The object's outline (n, 2) [m] on the table as it stands."""
+        """The object's outline (n, 2) [m] on the table as it stands or lies."""
+        if self.object_fell():
+            outline, half = self.thing.footprint_m, self.thing.height_m / 2
+            ends = np.concatenate([np.insert(outline, 2, z, axis=1) for z in (-half, half)])
+            *centre, i, j, k, w = self.object_state()
+            return Rotation.from_quat([i, j, k, w]).apply(ends)[:, :2] + centre[:2]
         x, y, yaw = self.object_pose()
         c, s = math.cos(yaw), math.sin(yaw)
         return self.thing.footprint_m @ np.array([[c, s], [-s, c]]) + (x, y)

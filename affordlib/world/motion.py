@@ -108,6 +108,22 @@ def stretches(primitive: Primitive, stop_phase: float, smooth: bool = True) -> l
     return way
 
 
+def along_path(
+    path_xy_m: np.ndarray, primitive: Primitive, stop_phase: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Phases (n,) and action (n, 5) along points (n, 2), the fingers facing where they lead."""
+    path = np.asarray(path_xy_m, dtype=float)
+    if path.ndim != 2 or path.shape[1] != 2 or len(path) < 2 or not np.isfinite(path).all():
+        raise ValueError(f"path_xy_m must be finite points (n, 2), n ≥ 2, got {path.shape}")
+    phase = np.linspace(0.0, 1.0, len(path)) * stop_phase
+    action = primitive.path(phase)
+    action[:, :2] = path
+    heading = path[-1] - path[0]
+    if np.hypot(*heading) > 1e-6:
+        action[:, 3] = math.atan2(heading[1], heading[0])
+    return phase, action
+
+
 def stretch_along(action: np.ndarray, phase: np.ndarray, seconds: float) -> Stretch:
     """A given path, action (n, 5) at phases (n,), followed along its length with a smooth stop."""
     n = max(2, math.ceil(seconds / _WAYPOINT_S - 1e-9))

@@ -245,7 +245,9 @@ class Prism(Thing):
         following = np.roll(corners, -1, axis=0)
         edges = following - corners
         turns = _cross(edges, np.roll(edges, -1, axis=0))
-        if (turns <= 0).any() or np.abs(corners).max() > LARGEST_M:
+        inner = np.sum(edges * np.roll(edges, -1, axis=0), axis=1)
+        rounds = np.arctan2(turns, inner).sum() / (2 * math.pi)  # a star goes around twice
+        if (turns <= 0).any() or rounds > 1.5 or np.abs(corners).max() > LARGEST_M:
             raise ValueError(
                 "prism corners must go counter-clockwise around a convex polygon of at most "
                 f"{LARGEST_M:g} m, got {self.corners!r}"

@@ -20,6 +20,8 @@ import numpy as np
 import pybullet
 from ur_analytic_ik import ur10
 
+from affordlib.types import UnreachableError
+
 BASE_X_M = -0.7
 TOOL_LENGTH_M = 0.20
 FINGER_TRAVEL_M = 0.07
@@ -37,10 +39,6 @@ HOME = (0.0, -1.9, 1.6, -1.27, -np.pi / 2, 0.0)
 
 _ARM_RGBA = {"shoulder_link": "0.30 0.45 0.60 1", "wrist_1_link": "0.30 0.45 0.60 1"}
 _GREY, _DARK, _RED = "0.72 0.74 0.77 1", "0.25 0.27 0.30 1", "0.75 0.25 0.15 1"
-
-
-class UnreachableError(ValueError):
-    """The arm cannot take the tool to a pose that was asked for."""
 
 
 @cache

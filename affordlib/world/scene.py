@@ -22,6 +22,7 @@ from affordlib.types import (
     TABLE_X_M,
     TABLE_Y_M,
     Interaction,
+    UnreachableError,
     check_finite,
     check_on_table,
     check_within,
@@ -239,11 +240,13 @@ class Tabletop(Interventions):
 
     def object_fell(self) -> bool:
         """Whether the object lies differently than it was placed."""
-        return self.thing.fallen(self._upward())
+        up = self._upward()
+        return self.thing.fallen(up)
 
     def object_rolls(self) -> bool:
         """Whether the object can roll as it lies now: a cylinder on its side, not upright."""
-        return self.thing.rolls(self._upward())
+        up = self._upward()
+        return self.thing.rolls(up)
 
     @staticmethod
     def on_table(xyz_m: tuple[float, float, float]) -> bool:
@@ -316,31 +319,36 @@ class Tabletop(Interventions):
         Raises UnreachableError when the arm cannot follow the path.
         """
         check_within("stop_phase", stop_phase, 0.0, 1.0)
-        if primitive.tool != self.tool:
-            raise ValueError(
-                f"primitive {primitive.name!r} needs the tool {primitive.tool!r}, and the arm "
-                f"holds the {self.tool}; call place(..., tool={primitive.tool!r})"
-            )
+        self._require_tool(primitive)
         seen = self._percept_for(primitive)
         primitive = aim(primitive, seen.image)
         phase = np.linspace(0.0, 1.0, N_SAMPLES) * stop_phase
         way = motion.stretches(primitive, stop_phase, smooth)
         return execute(self, primitive, way, phase, primitive.path(phase), seen, approach)
 
+    def _require_tool(self, primitive: Primitive) -> None:
+        if primitive.tool != self.tool:
+            raise ValueError(
+                f"primitive {primitive.name!r} needs the tool {primitive.tool!r}, and the arm "
+                f"holds the {self.tool}; call place(..., tool={primitive.tool!r})"
+            )
+
     def can_reach(
         self, primitive: Primitive, stop_phase: float = 1.0, at_xy_m: Sequence[float] | None = None
     ) -> bool:
         """Whether the arm can carry out an action, with approach and way out; nothing moves.
 
-        at_xy_m: where the object is (default: where it is seen). The answer is that of the
-        kinematics by which `interact` plans.
+        at_xy_m: where the object is (default: where it is seen; the action is then aimed at it, as
+        `interact` does). The answer is that of the kinematics by which `interact` plans.
         """
         check_within("stop_phase", stop_phase, 0.0, 1.0)
-        xy = self.perceive().xy_m if at_xy_m is None else at_xy_m
+        if at_xy_m is None:
+            seen = self.perceive()
+            at_xy_m, primitive = seen.xy_m, aim(primitive, seen.image)
         way = motion.stretches(primitive, stop_phase)
         try:
-            plan_motion(primitive, way, place_offset(self, xy), approach=True)
-        except robot.UnreachableError:
+            plan_motion(primitive, way, place_offset(self, at_xy_m), approach=True)
+        except UnreachableError:
             return False
         return True
 
@@ -356,7 +364,7 @@ class Tabletop(Interventions):
         """As `interact`; where the arm cannot reach, an interaction in which nothing happened."""
         try:
             return self.interact(primitive, stop_phase)
-        except robot.UnreachableError:
+        except UnreachableError:
             seen = self._percept_for(primitive)
             phase = np.linspace(0.0, 1.0, N_SAMPLES) * stop_phase
             return refused(self, aim(primitive, seen.image), phase, seen)
@@ -383,16 +391,10 @@ class Tabletop(Interventions):
         Height and timing are those of the primitive (default: a push), up to stop_phase; the
         fingers face where the path leads.
         """
-        path = np.asarray(path_xy_m, dtype=float)
-        if path.ndim != 2 or path.shape[1] != 2 or len(path) < 2 or not np.isfinite(path).all():
-            raise ValueError(f"path_xy_m must be finite points (n, 2), n ≥ 2, got {path.shape}")
+        check_within("stop_phase", stop_phase, 0.0, 1.0)
         primitive = primitive or Push(0.0)
-        phase = np.linspace(0.0, 1.0, len(path)) * check_within("stop_phase", stop_phase, 0.0, 1.0)
-        action = primitive.path(phase)
-        action[:, :2] = path
-        heading = path[-1] - path[0]
-        if np.hypot(*heading) > 1e-6:
-            action[:, 3] = math.atan2(heading[1], heading[0])
+        self._require_tool(primitive)
+        phase, action = motion.along_path(path_xy_m, primitive, stop_phase)
         seconds = DURATION_S * float(min_jerk(phase[-1]))
         way = [motion.stretch_along(action, phase, seconds)]
         return execute(self, primitive, way, phase, action, self.perceive(), approach=True)
