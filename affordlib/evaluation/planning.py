@@ -188,7 +188,7 @@ def assemble() -> Path:
         if not _is_done(name):
             raise ValueError(
                 f"part {_part(name).name} is of other goals or settings than {name!r} has now; run "
-                f"`python -m affordlib.evaluation.planning --only {name}` again, or delete it"
+                f"`python -m affordlib.evaluation.planning --variants {name}` again, or delete it"
             )
         part = json.loads(_part(name).read_text())
         parts[name] = part["records"]

@@ -105,11 +105,12 @@ SHIPPED: dict[str, Shipped] = {
     "push_lstm": Shipped(
         "push",
         LSTMConfig(effect_channels=_YAW, frame="push", width=128),
-        replace(_PUSH_FRAME, steps=2500),
+        _PUSH_FRAME,
         draw=draw_forward,
     ),
 }
-"""Minutes of one core: ten for `push_cnp`, five for the two of 5,000 pushes, one or two for others.
+"""Minutes of one core: ten for `push_cnp`, five for `push_lstm` and the two of 5,000 pushes, one or
+two for others.
 
 Five learn from sets of ten times the size, which are not shipped: collect them first.
 """

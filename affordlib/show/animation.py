@@ -10,6 +10,8 @@ import numpy as np
 from IPython.display import Image as NotebookImage
 from PIL import Image
 
+from affordlib.results import write_atomically
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
@@ -93,6 +95,6 @@ def show_animation(
     if path is not None:
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(film.encoded("GIF", beside=beside))
+        write_atomically(path, film.encoded("GIF", beside=beside))
     # A PNG: pages made from a notebook leave GIFs out, and it is a third smaller.
     return NotebookImage(film.encoded("PNG", beside=beside), format="png")

@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 
 from affordlib.perception import CAMERA_HEIGHT_M
 from affordlib.primitives import Grasp, Rotate
+from affordlib.results import write_atomically
 from affordlib.types import CROP_WIDTH_M, TABLE_X_M, TABLE_Y_M
 
 if TYPE_CHECKING:
@@ -55,7 +56,9 @@ def save_figure(figure: Figure, folder: Path, name: str) -> Path:
     """Save a figure as `figures/<name>.png` in a results folder and return its path."""
     path = Path(folder) / "figures" / f"{name}.png"
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    write_atomically(path, buffer.getvalue())
     return path
 
 
