@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -156,6 +156,7 @@ def assemble(
     }
     tables["baselines"] = baseline_rows(tables)
     tables["frames"] = frame_rows(parts)
+    tables["ensemble"] = ensemble_rows(parts)
     made = {name: read_study(name, studies) for name in STUDIES if STUDIES[name].of == NAME}
     tables |= {name: rows for name, rows in made.items() if rows is not None}
     trained = sum(unit.model in NETWORKS for unit, _ in parts)
@@ -171,17 +172,40 @@ FRAMES = {
 }
 
 
+def of_shared_folds(
+    parts: list[tuple[Unit, Part]], models: Iterable[str]
+) -> list[tuple[Unit, Part]]:
+    """The parts of some models of pushes, of the folds and seeds that all of them have."""
+    every = [(u, p) for u, p in parts if u.model in models and u.data == "push" and u.n == "all"]
+    shared = set.intersection(
+        *({(u.fold, u.seed) for u, _ in every if u.model == model} for model in models)
+    )
+    return [(u, p) for u, p in every if (u.fold, u.seed) in shared]
+
+
 def frame_rows(parts: list[tuple[Unit, Part]]) -> list[dict[str, Any]]:
     """Two networks in two frames, from the same folds of the same pushes, on the fixed test set."""
-    both = [(u, p) for u, p in parts if u.model in FRAMES and u.data == "push" and u.n == "all"]
-    folds = [{(u.fold, u.seed) for u, _ in both if u.model == model} for model in FRAMES]
-    shared = set.intersection(*folds)
-    rows = error_rows([(u, p) for u, p in both if (u.fold, u.seed) in shared], "push", "fixed_test")
     told = []
-    for row in rows:
+    for row in error_rows(of_shared_folds(parts, FRAMES), "push", "fixed_test"):
         network, frame = FRAMES[row["model"]]
         told.append({"network": network, "frame": frame} | row)
     return told
+
+
+def ensemble_rows(parts: list[tuple[Unit, Part]]) -> list[dict[str, Any]]:
+    """One network and several as one, on the fixed test set: errors, and calibration of (x, y)."""
+    both = of_shared_folds(parts, ("film", "ensemble"))
+    calibrated = {}
+    for about, group in by_model(both, "push"):
+        of_plane = [
+            row
+            for part in group
+            for row in part["fixed_test"]["calibration"]
+            if row["channel"] in ("x", "y")
+        ]
+        keys = ("coverage_50", "coverage_90", "nll")
+        calibrated[about["model"]] = {k: float(np.mean([r[k] for r in of_plane])) for k in keys}
+    return [row | calibrated[row["model"]] for row in error_rows(both, "push", "fixed_test")]
 
 
 def _data(parts: list[tuple[Unit, Part]]) -> dict[str, str]:
