@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 from nbconvert.filters.markdown_mistune import markdown2html_mistune
 
 from affordlib.paths import repo_root
-from affordlib.profiles import WorkbookError, notebook_paths
+from affordlib.profiles import WorkbookError
 from affordlib.results import markdown_table, read_results, write_results, write_text_atomically
 from affordlib.seeds_picture import same_rows, seeds_picture
 from affordlib.workbook import run_name
@@ -114,9 +114,9 @@ def _together(rows: Sequence[Row]) -> dict[str, Any]:
 def gather(folders: Mapping[int, Path], into: Path) -> Path:
     """Write the tables over seeds and the page that shows them; returns the page."""
     seeds = list(folders)
-    there = {path.stem for folder in folders.values() for path in folder.glob("*.json")}
-    # Beside them lie plans that were saved.
-    names = sorted(there & set(notebook_paths(repo_root() / "notebooks")))
+    # Of notebooks: beside them lie plans that were saved.
+    there = [path for folder in folders.values() for path in folder.glob("[0-9][0-9]_*.json")]
+    names = sorted({path.stem for path in there})
     page = [f"# Over {len(seeds)} seeds", f"Seeds {', '.join(map(str, seeds))}."]
     page.append("Means over seeds; *sd* is the standard deviation of one seed among them.")
     for name in names:

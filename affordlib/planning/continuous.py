@@ -225,8 +225,7 @@ def plan_continuous(
             if best is not None and n_actions >= fewest + (not draft):
                 break
     steps = ()
-    # Where nothing brings it nearer, the object stays.
-    if best is not None and best[0] < float(target.norm()):
+    if best is not None:
         direction, phase = best[1:]
         corrections = 1 if draft else CORRECTIONS
         chain, foreseen = _correct(effects, target, direction, phase, mode.partial, corrections)
@@ -234,6 +233,8 @@ def plan_continuous(
         if not _allowed(xy, before[None], chain[None, :, 0], reachable).all():
             chain, foreseen = torch.stack([direction[0], phase[0]], dim=1), None
         steps = make_steps(effects, start, chain, foreseen)
+        if goal.distance_m(steps[-1].predicted_end_xy_m) >= goal.distance_m(start):
+            steps = ()  # where nothing brings it nearer, the object stays
     end = steps[-1].predicted_end_xy_m if steps else start
     reaches = goal.distance_m(end) <= goal.tolerance_m
     plan = Plan(goal, start, steps, "continuous", reaches, iterations, 0.0)
