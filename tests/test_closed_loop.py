@@ -362,7 +362,8 @@ def test_a_goal_that_turns_on_the_way_is_followed(table, repertoire):
 
 def test_the_arm_is_asked_about_the_grasp_that_it_will_carry_out(table, repertoire):
     """At the rim of its reach a hand's height decides, and that goes by the object's."""
-    for x in (0.5, 0.51, 0.52, 0.53):
+    for x in (0.52, 0.523, 0.526, 0.529):
         table.place(Cuboid(0.05, 0.05, 0.08), (x, 0.0))
         went = pursue(table, Goal((x, 0.0), height_m=0.24), repertoire)
-        assert went.ending in ("reached", "unreachable", "gave_up"), went.words
+        assert went.ending == ("reached" if x == 0.52 else "unreachable"), went.words
+        assert x == 0.52 or went.steps == ()

@@ -13,8 +13,9 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -246,8 +247,14 @@ def run_unit(unit: Unit, folder: Path, progress: bool = False) -> bool:
             part["inverse"] = executed_record(data, kept, along_effect(data, kept))
     else:
         halfway = folder / f".{unit.file}.{sha256_of(hashes(unit))[:8]}.pt"
-        fit = _fit_ensemble if unit.model == "ensemble" else _fit
-        model, part["training"] = fit(unit, *configs, data, split, halfway, progress)
+        network, config = configs
+        fit = partial(_fit, unit, network, data=data, split=split, progress=progress)
+        if unit.model == "ensemble":
+            channels = network.action_channels, network.effect_channels
+            validation = TrainingArrays.from_dataset(data, split.validation, *channels)
+            model, part["training"] = _fit_ensemble(fit, config, halfway, validation)
+        else:
+            model, part["training"] = fit(config, halfway)
         told = {name: network_answers(model, *test) for name, test in tests.items()}
         if task.also:
             part["inverse"] = inverse_record(model, data, split.test)
@@ -275,9 +282,9 @@ def _fit(
     unit: Unit,
     network: NetworkConfig,
     config: TrainingConfig,
+    halfway: Path,
     data: xr.Dataset,
     split: Split,
-    halfway: Path,
     progress: bool,
 ) -> tuple[EffectNetwork, dict[str, Any]]:
     channels = network.action_channels, network.effect_channels
@@ -299,25 +306,19 @@ def _fit(
 
 
 def _fit_ensemble(
-    unit: Unit,
-    network: NetworkConfig,
+    fit: Callable[[TrainingConfig, Path], tuple[EffectNetwork, dict[str, Any]]],
     config: TrainingConfig,
-    data: xr.Dataset,
-    split: Split,
     halfway: Path,
-    progress: bool,
+    validation: TrainingArrays,
 ) -> tuple[Ensemble, dict[str, Any]]:
-    members, told = [], []
+    """Members fitted one by one, each with a seed of its own; σ of all together calibrated."""
+    fitted = []
     for k in range(MEMBERS):
-        mine = replace(config, seed=MEMBERS * unit.seed + k)
-        place = halfway.with_name(f"{halfway.name}{k}")
-        model, about = _fit(unit, network, mine, data, split, place, progress)
-        members.append(model)
-        told.append(about)
-    ensemble = Ensemble(members)
-    channels = network.action_channels, network.effect_channels
-    fit_temperature(ensemble, TrainingArrays.from_dataset(data, split.validation, *channels))
-    return ensemble, {"members": told, "temperature": ensemble.temperature}
+        mine = replace(config, seed=MEMBERS * config.seed + k)
+        fitted.append(fit(mine, halfway.with_name(f"{halfway.name}{k}")))
+    ensemble = Ensemble([model for model, _ in fitted])
+    temperature = fit_temperature(ensemble, validation)
+    return ensemble, {"members": [told for _, told in fitted], "temperature": temperature}
 
 
 def _shipped(

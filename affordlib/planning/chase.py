@@ -175,7 +175,8 @@ class Chase:
         moved = self.planned_for is not None and self.planned_for != self.goal
         if moved or (self.expected is not None and off > DISPLACED_M and self.renewals > 0):
             self.renewals -= not moved
-            self.turns *= not moved  # a goal that has turned may ask for a whole round again
+            if moved:
+                self.turns = 0  # the goal may ask for a whole round again
             self.limit = max(self.limit, len(self.steps) + self._limit_from(self.seen.xy_m))
         if off > SURPRISE_M or moved or fell:
             self.queue = []
