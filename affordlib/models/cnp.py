@@ -62,7 +62,8 @@ def image_encoder() -> nn.Sequential:
     """f: (B, 2, 48, 48) → (B, 16), five convolutions, each halving the image."""
     layers: list[nn.Module] = []
     for n_in, n_out in zip((2, *CONVOLUTION_WIDTHS[:-1]), CONVOLUTION_WIDTHS, strict=True):
-        layers += [nn.Conv2d(n_in, n_out, 3, padding="same"), nn.LeakyReLU(), nn.MaxPool2d(2)]
+        # The paper activates before it pools, which gives the same of four times as many values.
+        layers += [nn.Conv2d(n_in, n_out, 3, padding="same"), nn.MaxPool2d(2), nn.LeakyReLU()]
     return nn.Sequential(*layers, nn.Flatten(), nn.Linear(CONVOLUTION_WIDTHS[-1], IMAGE_FEATURES))
 
 
@@ -89,7 +90,8 @@ class AffordanceCNP(EffectNetwork):
 
     def features(self, scaled_image: Float[Tensor, "b 2 48 48"]) -> Float[Tensor, "b 16"]:
         """f(γ_o): features (B, 16) of standardised depth and mask (B, 2, 48, 48)."""
-        return self.image_encoder(scaled_image)
+        channels_last = scaled_image.contiguous(memory_format=torch.channels_last)  # twice as fast
+        return self.image_encoder(channels_last)
 
     def represent(self, observations: Observations) -> Float[Tensor, "b 128"]:
         """r: (B, 128), equations (2) and (3), the means taken over what is observed."""
