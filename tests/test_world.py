@@ -8,10 +8,11 @@ import pybullet
 import pytest
 
 from affordlib.interactions.recipes import Recipe, interact
-from affordlib.primitives import Push, min_jerk, primitive_named
+from affordlib.primitives import Drag, Grasp, Push, min_jerk, primitive_named
 from affordlib.types import CROP_WIDTH_M, IMAGE_PIXELS, Goal
 from affordlib.world import (
     Cuboid,
+    LyingCylinder,
     Prism,
     Tabletop,
     UnreachableError,
@@ -213,3 +214,26 @@ def test_another_tool_follows_no_path(world):
     with pytest.raises(ValueError, match="holds the screwdriver"):
         world.follow_path(np.array([[-0.2, 0.0], [0.0, 0.0]]))
     world.place(Cuboid(0.06, 0.05, 0.05))
+
+
+def test_the_fingers_are_tied_only_while_they_close_or_hold(world):
+    def gears():
+        return pybullet.getNumConstraints(physicsClientId=world.client)
+
+    world.place(LyingCylinder(0.08, 0.05))
+    for theta in (0.0, math.pi):
+        world.interact(Drag(theta), approach=True)
+        assert gears() == 0
+    for _ in range(2):
+        world.interact(Grasp(), approach=True)
+        assert gears() == 1
+        world.park()
+        assert gears() == 0
+
+
+def test_a_refused_action_looks_once(world, monkeypatch):
+    looks = []
+    monkeypatch.setattr(world, "perceive", lambda: looks.append(1) or Tabletop.perceive(world))
+    world.place(THINGS[0], (0.45, 0.5))
+    assert not world.attempt(Push(math.pi / 4)).reached
+    assert len(looks) == 1

@@ -22,9 +22,10 @@ from affordlib.world.motion import (
     Stretch,
     joint_move,
     line,
-    mirror_fingers,
     poses,
     put_arm,
+    tie_fingers,
+    untie_fingers,
 )
 
 if TYPE_CHECKING:
@@ -108,7 +109,7 @@ def execute(
     closes = any(np.ptp(gap) > 0 for gap in gaps)
     drive = Drive(world, primitive.force_N, closes)
     if closes:
-        mirror_fingers(world)
+        tie_fingers(world)
     if approach:
         over = joint_move(world.arm, motion.over_start, 1.0)
         drive.along(over, np.linspace(world.gap_m, gaps[0][0], 2))
@@ -137,6 +138,8 @@ def execute(
         if approach:
             drive.along(joint_move(world.arm, home, 1.0), release[[1, 1]])
     drive.wait(SETTLE_STEPS)
+    if not primitive.holds:
+        untie_fingers(world)
     interaction = _record(world, primitive, way, phase, action, seen, start, drive, offset)
     if not (approach or primitive.holds):
         put_arm(world, home, world.gap_m)

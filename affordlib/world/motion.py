@@ -136,11 +136,12 @@ def stretch_along(action: np.ndarray, phase: np.ndarray, seconds: float) -> Stre
     return Stretch(np.column_stack([*columns, np.zeros(n + 1)]), np.interp(wanted, length, phase))
 
 
-def mirror_fingers(world: Tabletop) -> int:
-    """Tie the two fingers by a gear, so that a held object stays in the middle; returns its id.
+def tie_fingers(world: Tabletop) -> None:
+    """Tie the two fingers by a gear, so that a held object stays in the middle.
 
     Driven by two motors alone, a held object is in neutral balance and wanders.
     """
+    untie_fingers(world)
     left, right = world.joints[-2:]
     gear = pybullet.createConstraint(
         world.robot,
@@ -156,7 +157,14 @@ def mirror_fingers(world: Tabletop) -> int:
     pybullet.changeConstraint(
         gear, gearRatio=-1, maxForce=300, erp=0.5, physicsClientId=world.client
     )
-    return gear
+
+
+def untie_fingers(world: Tabletop) -> None:
+    """Take the gear away, so that the next action finds the hand as the first one did."""
+    client = world.client
+    for k in reversed(range(pybullet.getNumConstraints(physicsClientId=client))):
+        gear = pybullet.getConstraintUniqueId(k, physicsClientId=client)
+        pybullet.removeConstraint(gear, physicsClientId=client)
 
 
 class Drive:

@@ -148,10 +148,7 @@ class Tabletop(Interventions):
     def _clear(self) -> None:
         """Back to table and arm alone: exactly as when built, without loading them again."""
         client = self.client
-        for k in reversed(range(pybullet.getNumConstraints(physicsClientId=client))):
-            pybullet.removeConstraint(
-                pybullet.getConstraintUniqueId(k, physicsClientId=client), physicsClientId=client
-            )
+        motion.untie_fingers(self)
         bodies = range(pybullet.getNumBodies(physicsClientId=client))
         for body in [pybullet.getBodyUniqueId(k, physicsClientId=client) for k in bodies]:
             if body not in (self.table, self.robot):
@@ -240,13 +237,11 @@ class Tabletop(Interventions):
 
     def object_fell(self) -> bool:
         """Whether the object lies differently than it was placed."""
-        up = self._upward()
-        return self.thing.fallen(up)
+        return self.thing.fallen(self._upward())
 
     def object_rolls(self) -> bool:
         """Whether the object can roll as it lies now: a cylinder on its side, not upright."""
-        up = self._upward()
-        return self.thing.rolls(up)
+        return self.thing.rolls(self._upward())
 
     @staticmethod
     def on_table(xyz_m: tuple[float, float, float]) -> bool:
@@ -318,13 +313,18 @@ class Tabletop(Interventions):
         prefix of the path, re-timed to its own smooth stop, or with smooth=False cut off.
         Raises UnreachableError when the arm cannot follow the path.
         """
+        primitive, phase, seen = self._look_before(primitive, stop_phase)
+        way = motion.stretches(primitive, stop_phase, smooth)
+        return execute(self, primitive, way, phase, primitive.path(phase), seen, approach)
+
+    def _look_before(
+        self, primitive: Primitive, stop_phase: float
+    ) -> tuple[Primitive, np.ndarray, Percept]:
+        """The primitive aimed at what is seen, the phases to be recorded, and what is seen."""
         check_within("stop_phase", stop_phase, 0.0, 1.0)
         self._require_tool(primitive)
         seen = self._percept_for(primitive)
-        primitive = aim(primitive, seen.image)
-        phase = np.linspace(0.0, 1.0, N_SAMPLES) * stop_phase
-        way = motion.stretches(primitive, stop_phase, smooth)
-        return execute(self, primitive, way, phase, primitive.path(phase), seen, approach)
+        return aim(primitive, seen.image), np.linspace(0.0, 1.0, N_SAMPLES) * stop_phase, seen
 
     def _require_tool(self, primitive: Primitive) -> None:
         if primitive.tool != self.tool:
@@ -359,15 +359,16 @@ class Tabletop(Interventions):
         drive.along(np.repeat(self.arm[None], 13, axis=0), wide)
         drive.along(motion.joint_move(self.arm, np.array(robot.HOME), 1.0), wide[[-1, -1]])
         self.settle()
+        motion.untie_fingers(self)
 
     def attempt(self, primitive: Primitive, stop_phase: float = 1.0) -> Interaction:
         """As `interact`; where the arm cannot reach, an interaction in which nothing happened."""
+        primitive, phase, seen = self._look_before(primitive, stop_phase)
+        way = motion.stretches(primitive, stop_phase)
         try:
-            return self.interact(primitive, stop_phase)
+            return execute(self, primitive, way, phase, primitive.path(phase), seen, approach=False)
         except UnreachableError:
-            seen = self._percept_for(primitive)
-            phase = np.linspace(0.0, 1.0, N_SAMPLES) * stop_phase
-            return refused(self, aim(primitive, seen.image), phase, seen)
+            return refused(self, primitive, phase, seen)
 
     def _percept_for(self, primitive: Primitive) -> Percept:
         """What the robot sees before it acts; a lever-up looks from the contact point."""
@@ -395,6 +396,5 @@ class Tabletop(Interventions):
         primitive = primitive or Push(0.0)
         self._require_tool(primitive)
         phase, action = motion.along_path(path_xy_m, primitive, stop_phase)
-        seconds = DURATION_S * float(min_jerk(phase[-1]))
-        way = [motion.stretch_along(action, phase, seconds)]
+        way = [motion.stretch_along(action, phase, DURATION_S * float(min_jerk(phase[-1])))]
         return execute(self, primitive, way, phase, action, self.perceive(), approach=True)
