@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from affordlib.planning import Disturbance, Pursuit
     from affordlib.world import Thing
 
-FORMATS = {"height": 5, "orientation": 4, "disturbances": 3, "reachability": 2}
+FORMATS = {"height": 6, "orientation": 5, "disturbances": 4, "reachability": 3}
 """Counts the changes of code that change a table's records."""
 
 N_TRIALS = {"height": 50, "orientation": 50, "disturbances": 200, "reachability": 1000}
