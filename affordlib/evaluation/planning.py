@@ -25,6 +25,7 @@ import torch
 from tqdm.auto import tqdm
 
 from affordlib.evaluation import reported
+from affordlib.evaluation.answers import rounded
 from affordlib.evaluation.effect_prediction import error_row
 from affordlib.evaluation.goals import FROZEN, ROLLABLE, STANDING, PlanningTask, frozen_tasks
 from affordlib.evaluation.planners import VARIANTS
@@ -157,7 +158,7 @@ def run_variant(name: str, tasks: list[PlanningTask], progress: bool = True) -> 
         how = {option: getattr(variant, option) for option in names}
         outcomes = measure(world, asked, planner_here, name * progress, **how)
     records = [outcome_record(t, o) for t, o in zip(asked, outcomes, strict=True)]
-    return {"variant": name, "about": variant.about(), "records": records}
+    return {"variant": name, "about": variant.about(), "records": rounded(records)}
 
 
 def tasks_sha256(world: str = "clean") -> str:
@@ -302,7 +303,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         world = VARIANTS[name].world
         part = run_variant(name, frozen_tasks(world)) | {"goals_sha256": tasks_sha256(world)}
         _part(name).parent.mkdir(parents=True, exist_ok=True)
-        write_text_atomically(_part(name), json.dumps(part, indent=0) + "\n")
+        text = json.dumps(part, separators=(",", ":"))
+        write_text_atomically(_part(name), text + "\n")
         for row in planning_rows(part["records"]):
             if row["object_class"] == "all":
                 print(
