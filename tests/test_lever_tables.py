@@ -100,6 +100,14 @@ def test_differences_are_paired_by_object():
     assert row["difference_cm"] == pytest.approx(-0.1)
     assert row["low_cm"] == pytest.approx(row["high_cm"])  # the same for all objects
     assert row["ours_better_percent"] == 100
+    older = (LeverUnit("lstm_published", "window", fold=1, epochs=100), _part([0.1, 0.5, 1.0]))
+    ours_too = (LeverUnit("anchored", fold=1), _part([0.3, 0.7, 1.2]))
+    rows = lever_tables.paired_rows([ours, ours_too, rival, older])
+    apart = {(r["rival"], r["n"]): r["difference_cm"] for r in rows if r["steps"] == 5}
+    assert apart == {  # of each rival the folds that it has
+        ("lstm_tuned", 3): pytest.approx(-0.1),
+        ("lstm_published", 3): pytest.approx(0.2),
+    }
     moving, resting = (
         next(r for r in lever_tables.motion_rows([ours]) if r["windows"] == kind)
         for kind in ("moving", "resting")
