@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from tqdm.auto import tqdm
 
+from affordlib.evaluation.answers import rounded
 from affordlib.evaluation.closed_loop_tables import ROWS, WITHIN_HEIGHT_M
 from affordlib.evaluation.feasibility import half_width_m, is_feasible, on_the_rim
 from affordlib.models.checkpoint import checkpoint_sha256
@@ -194,7 +195,8 @@ def _part(table: str, seed: int) -> Path:
 
 def _write_records(path: Path, sha256: str, records: dict[int, dict]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    lines = [json.dumps(records[k], allow_nan=False) for k in sorted(records)]
+    compact = {"allow_nan": False, "separators": (",", ":")}
+    lines = [json.dumps(records[k], **compact) for k in sorted(records)]
     write_text_atomically(path, "\n".join([json.dumps({"settings_sha256": sha256}), *lines, ""]))
 
 
@@ -205,7 +207,8 @@ def _records_of(table: str, indices: Sequence[int], seed: int) -> list[dict]:
     """Some trials in one process, which keeps its world and its models."""
     if not _here:
         _here.update(world=Tabletop(), repertoire=Repertoire.load())
-    return [run_trial(table, i, _here["world"], _here["repertoire"], seed) for i in indices]
+    here = _here["world"], _here["repertoire"], seed
+    return [rounded(run_trial(table, i, *here)) for i in indices]
 
 
 def run_table(
