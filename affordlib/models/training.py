@@ -1,7 +1,7 @@
 """Training: one plain loop over batches of trajectories, with early stopping (Section 3.2).
 
 The paper draws one trajectory and one target an iteration; here many trajectories, each with many
-targets, share a step, some 150 times as many targets a second. `train_literal` is the paper's loop,
+targets, share a step, some 200 times as many targets a second. `train_literal` is the paper's loop,
 for comparison.
 """
 
