@@ -27,9 +27,11 @@ BOTH = pytest.mark.parametrize("plan", [plan_astar, plan_continuous])
 
 @BOTH
 @pytest.mark.parametrize("thing", [BOX, TUBE, LOG], ids=["box", "tube", "log"])
-def test_one_look_is_enough_for_position_turn_and_height(world, repertoire, plan, thing):
-    # Logs do not always stay when a turn lets them go; at a yaw of 0.3 A*'s rolls off.
-    world.place(thing, yaw_rad=0.4 if thing is LOG else 0.3)
+def test_one_look_is_enough_for_position_turn_and_height(request, world, repertoire, plan, thing):
+    if thing is LOG and plan is plan_astar:
+        why = "after three drags the turn loses the log, which it keeps where nothing went before"
+        request.applymarker(pytest.mark.xfail(reason=why))
+    world.place(thing, yaw_rad=0.3)
     z = world.object_state()[2]
     goal = Goal((0.07, 0.06), turn_rad=0.8, height_m=0.1)
     found = repertoire.planner(plan)(world.look(), (0.0, 0.0), goal)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 FORMATS: dict[Callable[..., Plan], int] = {plan_astar: 4, plan_continuous: 5, plan_gradient: 2}
-"""Counts the changes of each planner that change its numbers."""
+"""Counts the changes of each planner, or of how plans are executed, that change its numbers."""
 
 ORACLE_FORMAT = 3
 
