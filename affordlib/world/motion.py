@@ -160,7 +160,7 @@ def tie_fingers(world: Tabletop) -> None:
 
 
 def untie_fingers(world: Tabletop) -> None:
-    """Take the gear away, so that the next action finds the hand as the first one did."""
+    """Take the gear away, so that closing actions do not pile up gears."""
     client = world.client
     for k in reversed(range(pybullet.getNumConstraints(physicsClientId=client))):
         gear = pybullet.getConstraintUniqueId(k, physicsClientId=client)
