@@ -156,7 +156,7 @@ def test_what_somebody_has_set_rolling_is_waited_for(table, repertoire):
     table.place(BALL, (0.0, 0.0))
     chase = Chase(table, Goal((0.1, 0.0)), repertoire, demands, ())
     chase.expected = (0.0, 0.0)
-    table.knock(0.0, 0.15)
+    table.knock(0.0, 0.25)
     table.settle(0.3)
     rolling = math.dist(table.object_pose()[:2], (0.0, 0.0))
     assert rolling > DISPLACED_M

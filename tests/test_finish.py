@@ -27,10 +27,7 @@ BOTH = pytest.mark.parametrize("plan", [plan_astar, plan_continuous])
 
 @BOTH
 @pytest.mark.parametrize("thing", [BOX, TUBE, LOG], ids=["box", "tube", "log"])
-def test_one_look_is_enough_for_position_turn_and_height(request, world, repertoire, plan, thing):
-    if thing is LOG and plan is plan_astar:
-        why = "after three drags the turn loses the log, which it keeps where nothing went before"
-        request.applymarker(pytest.mark.xfail(reason=why))
+def test_one_look_is_enough_for_position_turn_and_height(world, repertoire, plan, thing):
     world.place(thing, yaw_rad=0.3)
     z = world.object_state()[2]
     goal = Goal((0.07, 0.06), turn_rad=0.8, height_m=0.1)

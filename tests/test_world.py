@@ -21,6 +21,7 @@ from affordlib.world import (
     family_named,
     robot,
 )
+from affordlib.world.motion import Drive
 
 THINGS = (Cuboid(0.05, 0.07, 0.06), UprightCylinder(0.06, 0.05))
 
@@ -229,6 +230,33 @@ def test_the_fingers_are_tied_only_while_they_close_or_hold(world):
         assert gears() == 1
         world.park()
         assert gears() == 0
+
+
+@pytest.mark.parametrize("yaw_rad", [0.0, math.pi / 4])
+def test_what_rolls_on_a_level_table_comes_to_rest(world, yaw_rad):
+    """Unbraked, Bullet's cylinders gain speed."""
+    roll_on = []
+    for braked in (True, False):
+        world.place(LyingCylinder(0.08, 0.05), yaw_rad=yaw_rad)
+        world.knock(-0.1 * math.sin(yaw_rad), 0.1 * math.cos(yaw_rad))
+        if braked:
+            world.settle(2.0)
+        else:
+            Drive(world, 0.0, closes=False).wait(480)
+        before = world.object_pose()[:2]
+        Drive(world, 0.0, closes=False).wait(120)
+        roll_on.append(math.dist(before, world.object_pose()[:2]))
+    assert roll_on[0] < 1e-4
+    assert roll_on[1] > 0.05
+
+
+def test_a_log_that_was_dragged_and_let_go_stays(world):
+    world.place(LyingCylinder(0.08, 0.05), yaw_rad=0.3)
+    for theta in (0.3 + math.pi / 2, 0.3, 0.3 - math.pi / 2):
+        world.interact(Drag(theta), 0.8, approach=True)
+    before = world.object_pose()[:2]
+    world.settle(10.0)
+    assert math.dist(before, world.object_pose()[:2]) < 5e-4
 
 
 def test_a_refused_action_looks_once(world, monkeypatch):

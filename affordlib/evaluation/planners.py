@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-FORMATS: dict[Callable[..., Plan], int] = {plan_astar: 4, plan_continuous: 5, plan_gradient: 2}
+FORMATS: dict[Callable[..., Plan], int] = {plan_astar: 5, plan_continuous: 6, plan_gradient: 2}
 """Counts the changes of each planner, or of how plans are executed, that change its numbers."""
 
-ORACLE_FORMAT = 3
+ORACLE_FORMAT = 4
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pybullet
 
 from affordlib.primitives import TIP_HEIGHT_M, Primitive
 from affordlib.types import Interaction
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
 
 SETTLE_STEPS = 120
 RETREAT_M = 0.02
+ROLLING_M, RESTING_M = 1e-4, 1e-3
+"""Rolling friction [m]: of all bodies, and of a round object that is left alone."""
 RECORDED_SAMPLES = 26
 """One every 3 steps of 50 ms of a full primitive, as in the paper: t = 0 and 25 more."""
 
@@ -90,6 +93,22 @@ def place_offset(world: Tabletop, xy_m: tuple[float, float]) -> np.ndarray:
     return np.array([*xy_m, world.config.tip_offset_m, 0.0, 0.0])
 
 
+def resist_rolling(world: Tabletop, resists: bool) -> None:
+    """Let the table brake an object that can roll as it lies, or no longer.
+
+    Bullet's cylinders gain speed as they roll on a level table, from 0.1 to 0.33 m/s in 2.5 s: one
+    that is let go at a thousandth of that runs away while the arm comes back for it. While an
+    action is recorded nothing brakes, as nothing did when the models' data were collected.
+    """
+    resists = resists and world.object_rolls()
+    pybullet.changeDynamics(
+        world.body,
+        -1,
+        rollingFriction=RESTING_M if resists else ROLLING_M,
+        physicsClientId=world.client,
+    )
+
+
 def execute(
     world: Tabletop,
     primitive: Primitive,
@@ -111,11 +130,13 @@ def execute(
     if closes:
         tie_fingers(world)
     if approach:
+        resist_rolling(world, True)
         over = joint_move(world.arm, motion.over_start, 1.0)
         drive.along(over, np.linspace(world.gap_m, gaps[0][0], 2))
         drive.along(motion.down, gaps[0][[0, 0]])
     else:
         put_arm(world, motion.paths[0][0], gaps[0][0])
+    resist_rolling(world, False)
 
     floor = -math.inf
     for stretch, one, path, gap in zip(way, motion.poses_W, motion.paths, gaps, strict=True):
@@ -127,6 +148,7 @@ def execute(
         if stretch.guarded and gone < 1.0:
             floor = float(np.interp(gone, np.linspace(0, 1, len(one)), one[:, 2]))
     drive.finish()
+    resist_rolling(world, approach)
 
     if not primitive.holds:
         release = (

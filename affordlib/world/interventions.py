@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from affordlib.types import check_finite, check_on_table, check_within
 from affordlib.world import motion
-from affordlib.world.execution import SETTLE_STEPS
+from affordlib.world.execution import resist_rolling
 
 _TOPPLING = 1.5
 """Times the energy that brings an object onto its edge: some of it is lost in sliding."""
@@ -36,7 +36,7 @@ class Interventions:
             (turn * Rotation.from_quat(quaternion)).as_quat(),
             physicsClientId=self.client,
         )
-        motion.Drive(self, 0.0, closes=False).wait(SETTLE_STEPS)
+        self.settle()
 
     def knock(self, dx_m_s: float, dy_m_s: float, spin_rad_s: float = 0.0) -> None:
         """Hit the object: its velocity [m/s] and its spin about the vertical change at once.
@@ -92,6 +92,8 @@ class Interventions:
         )
 
     def settle(self, seconds: float = 0.5) -> None:
-        """Let the world run while the arm stands still."""
+        """Let the world run while the arm stands still; what can roll is braked by the table."""
         steps = round(check_within("seconds", seconds, 0.0, 60.0, "s") / motion.STEP_S)
+        if self.thing is not None:
+            resist_rolling(self, True)
         motion.Drive(self, 0.0, closes=False).wait(steps)

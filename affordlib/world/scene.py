@@ -28,7 +28,7 @@ from affordlib.types import (
     check_within,
 )
 from affordlib.world import camera, motion, robot
-from affordlib.world.execution import execute, place_offset, plan_motion, refused
+from affordlib.world.execution import ROLLING_M, execute, place_offset, plan_motion, refused
 from affordlib.world.interventions import Interventions
 from affordlib.world.objects import DENSITY_KG_M3, create_body, create_footprint
 
@@ -161,7 +161,7 @@ class Tabletop(Interventions):
             link,
             lateralFriction=lateral,
             spinningFriction=1e-3,
-            rollingFriction=1e-4,
+            rollingFriction=ROLLING_M,
             restitution=0.0,
             physicsClientId=self.client,
         )
