@@ -140,7 +140,7 @@ def test_true_and_false_shares_are_of_the_true_classes():
 def test_grasps_by_the_rule_of_a_tenth_of_a_metre():
     told = {
         "rollable": [False, False, True],
-        "family": ["cuboid"] * 3,
+        "family": [0] * 3,
         "interaction": [0, 1, 2],
         "truth": {"z": [0.25, 0.0, 0.25]},
         "mean": {"z": [0.12, 0.11, 0.05]},

@@ -89,12 +89,8 @@ def logistic_answers(
 
 
 def _objects(data: xr.Dataset, kept: np.ndarray) -> dict[str, Any]:
-    names = data["family"].attrs["flag_meanings"].split()
-    return {
-        "interaction": data["interaction"].values[kept].tolist(),
-        "family": [names[k] for k in data["family"].values[kept]],
-        "rollable": data["rollable"].values[kept].tolist(),
-    }
+    names = ("interaction", "family", "rollable")
+    return {name: data[name].values[kept].tolist() for name in names}
 
 
 def _answers(

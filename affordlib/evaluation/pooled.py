@@ -13,6 +13,7 @@ import numpy as np
 
 from affordlib.evaluation.units import MODELS, PARTS, TEN_TIMES, Unit, read_part
 from affordlib.paths import resolve_out_dir
+from affordlib.world.objects import FAMILIES
 
 Part = dict[str, Any]
 
@@ -85,11 +86,15 @@ class Errors:
 
 
 def pool(answers: list[dict[str, Any]], key: str | Callable) -> Errors:
-    """The errors of several folds in one; key: their name in the answers, or how to get them."""
+    """The errors of several folds in one; key: their name in the answers, or how to get them.
+
+    A part names an object's family by its number in `FAMILIES`.
+    """
+    known = list(FAMILIES)
     values, objects, classes = [], [], []
     for told in answers:
         found = key(told) if callable(key) else told[key]
         values += list(found)
         objects += list(told.get("interaction", range(len(found))))
-        classes += told["family"]
+        classes += [known[k] for k in told["family"]]
     return Errors(values, objects, classes)
