@@ -1,5 +1,7 @@
 """Shared fixtures."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -8,7 +10,9 @@ from affordlib.interactions import TrainingArrays, collect, open_interactions
 from affordlib.interactions.batches import Normaliser
 from affordlib.interactions.chunks import Layout, Variable
 from affordlib.interactions.collect import collect as collect_set
+from affordlib.interactions.lever import lever_arrays
 from affordlib.models import AffordanceCNP, CNPConfig, load_checkpoint
+from affordlib.models.lever import LEVER_MODELS
 from affordlib.planning import Repertoire
 from affordlib.world import Cuboid, Tabletop, WorldConfig
 
@@ -70,6 +74,29 @@ def some(pushes):
     """Forty pushes with the yaw of action and effect."""
     channels = ("x", "y", "yaw")
     return TrainingArrays.from_dataset(pushes, np.arange(40), channels, channels)
+
+
+@pytest.fixture(scope="session")
+def levers():
+    return open_interactions("lever_up").isel(interaction=slice(0, 48)).load()
+
+
+@pytest.fixture(scope="session")
+def levered(levers):
+    """48 lever-ups in the frame of the lever."""
+    return lever_arrays(levers)
+
+
+@pytest.fixture(scope="session")
+def short():
+    """A function from the name of a lever-up model to it with a training of a few steps."""
+
+    def short(name, **change):
+        few = {"steps": 4, "batch_size": 8, "validate_every": 2} | change
+        lever = LEVER_MODELS[name]
+        return replace(lever, training=replace(lever.training, **few))
+
+    return short
 
 
 @pytest.fixture

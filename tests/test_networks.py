@@ -1,4 +1,4 @@
-"""What holds for every network and both frames: equivariance, gradients, ranges, training."""
+"""What holds for every network and both frames: equivariance, gradients, ranges, loss."""
 
 import dataclasses
 import math
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from affordlib.interactions import Normaliser, TrainingArrays, split_interactions
+from affordlib.interactions import Normaliser
 from affordlib.interactions.batches import observe_action, sample_batch
 from affordlib.models import (
     AttentionConfig,
@@ -23,12 +23,10 @@ from affordlib.models import (
     load_checkpoint,
     observe_actions,
     save_checkpoint,
-    train,
-    train_literal,
 )
 from affordlib.models.frame import heading
 from affordlib.models.protocol import observe_final_effect
-from affordlib.models.training import batch_loss, final_errors_m, literal_draw
+from affordlib.models.training import batch_loss
 from affordlib.primitives import Drag, Push
 from affordlib.types import Observations
 from affordlib.world import Cuboid, UprightCylinder
@@ -281,67 +279,6 @@ def test_the_literal_loop_and_the_batch_agree(network, some):
         assert (a - b).norm() <= 1e-4 * a.norm() + 1e-5
 
 
-def test_the_literal_loop_learns(some):
-    network = made("film, push", some)
-    losses = train_literal(network, some, 150, learning_rate=1e-3)
-    assert np.mean(losses[-30:]) < np.mean(losses[:30]) - 0.3
-    generator = torch.Generator().manual_seed(0)
-    counts = [literal_draw(some, 10, generator).observations.action_t.shape[1] for _ in range(200)]
-    assert set(counts) == set(range(1, 11))
-
-
-def test_the_literal_loop_stops_early_and_keeps_its_best(some, monkeypatch):
-    errors = iter([3.0, 2.0, 2.5, 2.6, 0.0])
-    kept = {}
-
-    def score(model, arrays):
-        error = next(errors)
-        kept[error] = {k: v.clone() for k, v in model.state_dict().items()}
-        return torch.tensor([error])
-
-    monkeypatch.setattr("affordlib.models.training.final_errors_m", score)
-    network = made("film, push", some)
-    losses = train_literal(network, some, 100, validation=some, validate_every=3, patience=2)
-    assert len(losses) == 12
-    for name, value in network.state_dict().items():
-        assert torch.equal(value, kept[2.0][name])
-
-
-class Stopped(Exception):
-    pass
-
-
-def test_training_resumes_to_the_same_bits(some, tmp_path, monkeypatch):
-    config = TrainingConfig(steps=9, batch_size=16, validate_every=2, ema=0.9, hold_floor=0.3)
-    whole = made("film, push", some)
-    history = train(whole, some, some, config, progress=False)
-
-    broken, calls = made("film, push", some), []
-
-    def stop(model, batch, beta):
-        calls.append(0)
-        if len(calls) == 6:
-            raise Stopped
-        return batch_loss(model, batch, beta)
-
-    file = tmp_path / "run" / "training.pt"
-    with monkeypatch.context() as patch:
-        patch.setattr("affordlib.models.training.batch_loss", stop)
-        with pytest.raises(Stopped):
-            train(broken, some, some, config, progress=False, checkpoint=file)
-    again = made("film, push", some)
-    resumed = train(again, some, some, config, progress=False, checkpoint=file)
-    assert [(h.step, h.loss, h.validation_error_m) for h in resumed] == [
-        (h.step, h.loss, h.validation_error_m) for h in history
-    ]
-    for a, b in zip(whole.parameters(), again.parameters(), strict=True):
-        assert torch.equal(a, b)
-    assert again.sigma_floor == whole.sigma_floor
-    other, fresh = dataclasses.replace(config, steps=10), made("film, push", some)
-    with pytest.raises(ValueError, match=r"training\.pt is of a training with other steps"):
-        train(fresh, some, some, other, progress=False, checkpoint=file)
-
-
 def test_checkpoints_of_every_network(network, some, tmp_path):
     network.sigma_floor, network.temperature = 0.03, (1.7, 1.7, 0.5)
     again, _ = load_checkpoint(save_checkpoint(network, tmp_path / "m.safetensors", {}))
@@ -395,30 +332,3 @@ def test_coverage_and_temperature(some):
 def test_bad_settings_are_named(make, words):
     with pytest.raises(ValueError, match=words):
         make()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "n", "all_mm", "cuboid_mm", "p95_mm", "yaw_deg"),
-    [("push_film", 500, 1.0, 1.5, 4.0, 3.0), ("push_film_x10", 5000, 0.5, 0.8, 2.5, 1.5)],
-)
-def test_the_shipped_films_reach_their_goals(
-    name, n, all_mm, cuboid_mm, p95_mm, yaw_deg, held_out_pushes
-):
-    model, about = load_checkpoint(name)
-    split = split_interactions(n)
-    assert about["seen_interactions"] == sorted([*split.train, *split.validation])
-    test = TrainingArrays.from_dataset(
-        held_out_pushes, None, *(model.action_channels, model.effect_channels)
-    )
-    errors = 1000 * final_errors_m(model, test)
-    box = torch.from_numpy(held_out_pushes["family"].values == 0)
-    assert (errors[box].mean() + errors[~box].mean()) / 2 < all_mm
-    assert errors[box].mean() < cuboid_mm
-    assert errors.quantile(0.95) < p95_mm
-    with torch.no_grad():
-        told = model.predict(
-            model.encode(test.image), observe_action(test), torch.ones(len(test), 1)
-        )
-    off = (told.effect_mean[:, 0, 2] - test.effect[:, -1, 2])[box].abs().mean()
-    assert math.degrees(off) < yaw_deg

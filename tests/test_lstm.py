@@ -1,0 +1,114 @@
+"""Recurrent networks: of pushes, and the older study's, as published."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from affordlib.interactions import Normaliser, TrainingArrays
+from affordlib.interactions.batches import draw_forward
+from affordlib.interactions.lever import SEEN
+from affordlib.models import build
+from affordlib.models.lever import beginning_errors_m, window_errors_m
+from affordlib.models.lstm import LSTMConfig
+from affordlib.models.lstm_published import PublishedConfig, PublishedLSTM, train_published
+from affordlib.models.make_checkpoints import courses
+from affordlib.models.protocol import EffectModel, observe_actions
+from affordlib.primitives import Push
+
+
+def test_the_published_network_is_the_published_one(levered):
+    config = PublishedConfig(levered.action_channels, levered.effect_channels)
+    torch.manual_seed(0)
+    model = PublishedLSTM(config, Normaliser.fit(levered))
+    total = sum(p.numel() for p in model.parameters())
+    assert 71e6 < total < 73e6
+    assert [m.out_channels for m in model.cnn if hasattr(m, "out_channels")] == [32, 64, 128, 256]
+
+
+@pytest.fixture
+def small_published(levered, monkeypatch):
+    from affordlib.models import lstm_published
+
+    monkeypatch.setattr(lstm_published, "CONVOLUTION_WIDTHS", (2, 2, 2, 2))
+    monkeypatch.setattr(lstm_published, "LEVER_IMAGE_PIXELS", 48)
+    monkeypatch.setattr(lstm_published, "DENSE", 8)
+
+    def make():
+        torch.manual_seed(0)
+        config = PublishedConfig(levered.action_channels, levered.effect_channels)
+        return PublishedLSTM(config, Normaliser.fit(levered))
+
+    return make
+
+
+def test_its_recurrence_is_that_of_features_repeated_and_concatenated(levered, small_published):
+    model, start = small_published().eval(), torch.zeros(len(levered), dtype=torch.long)
+    lstm = torch.nn.LSTM(model.lstm.input_size, model.lstm.hidden_size, batch_first=True)
+    lstm.load_state_dict({f"{k}_l0": v for k, v in model.lstm.state_dict().items()})
+    pose = (levered.effect / model.effect_scale)[:, : SEEN + 1]
+    ends = (levered.action[:, [0, -1]] / model.action_scale).flatten(1)
+    again = [model.encode(levered.image), pose[:, 0], ends]
+    told = torch.cat([x[:, None].expand(-1, SEEN, -1) for x in again], dim=-1)
+    told[:, :, 8 : -ends.shape[1]] = pose[:, :-1]
+    phase = (torch.arange(SEEN) / model.config.steps).expand(len(levered), -1)[..., None]
+    out, _ = lstm(torch.cat([told, phase], dim=-1))
+    expected = torch.nn.functional.mse_loss(model.next_pose(out), pose[:, 1:])
+    torch.testing.assert_close(model.next_step_loss(levered, start, SEEN), expected)
+
+
+def test_a_published_training_goes_on_where_it_was_broken_off(tmp_path, levered, small_published):
+    def train(epochs, file):
+        model = small_published()
+        told = train_published(model, levered, levered, "window", epochs, checkpoint=file)
+        return model, told
+
+    whole, told = train(3, None)
+    train(2, tmp_path / "half.pt")
+    again, resumed = train(3, tmp_path / "half.pt")
+    assert told["validation_error"] == resumed["validation_error"]
+    for a, b in zip(whole.parameters(), again.parameters(), strict=True):
+        torch.testing.assert_close(a, b, atol=0, rtol=0)
+    assert window_errors_m(whole, levered).shape == (len(levered), 7, 5)
+    assert beginning_errors_m(whole, levered).shape == (len(levered), 25)
+
+
+def test_an_lstm_of_pushes_is_a_model_like_the_others(pushes):
+    few = TrainingArrays.from_dataset(pushes, np.arange(8))
+    torch.manual_seed(0)
+    model = build(LSTMConfig(frame="push", steps=5, width=16), Normaliser.fit(few)).eval()
+    torch.nn.init.normal_(model.last[-1].weight)  # zero at first, so that it begins by coasting
+    assert isinstance(model, EffectModel)
+    batch = draw_forward(few, torch.arange(8), 3, 1, torch.Generator().manual_seed(0))
+    loss = model.loss(batch.image, batch.observations, batch.t_target, batch.action, batch.effect)
+    assert torch.isfinite(loss)
+    seen = observe_actions(model, [Push(0.3)])
+    action = seen.action.requires_grad_()
+    told = model.predict(
+        model.encode(few.image[:1]), replace(seen, action=action), torch.ones(1, 1)
+    )
+    told.effect_mean.sum().backward()
+    assert action.grad.abs().sum() > 0
+
+
+def test_a_published_training_of_something_else_is_not_gone_on_with(
+    tmp_path, levered, small_published
+):
+    file = tmp_path / "half.pt"
+    train_published(small_published(), levered, levered, "window", 1, checkpoint=file)
+    for other in ({"seed": 1}, {"trained_for": "first_step"}):
+        told = {"trained_for": "window", "epochs": 2, "checkpoint": file} | other
+        with pytest.raises(ValueError, match="delete it, or train as it was begun"):
+            train_published(small_published(), levered, levered, **told)
+
+
+def test_the_course_of_pushes_is_that_seen_from_behind(pushes):
+    few = TrainingArrays.from_dataset(pushes, np.arange(60), ("x", "y"), ("x", "y", "yaw"))
+    config = LSTMConfig(effect_channels=("x", "y", "yaw"), frame="push", width=16)
+    model = build(config, Normaliser.fit(few))
+    mean = courses(model, few).mean(dim=0)
+    assert mean.shape == (26, 3)
+    torch.testing.assert_close(mean[:, 1:], torch.zeros(26, 2), atol=1e-6, rtol=0)
+    length = float(few.effect[:, -1, :2].norm(dim=-1).mean())
+    assert float(mean[-1, 0]) == pytest.approx(length, rel=0.2)

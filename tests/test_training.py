@@ -1,0 +1,117 @@
+"""Training: the paper's loop, the batched one, resumed to the same bits, to its goals."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from affordlib.interactions import Normaliser, TrainingArrays, split_interactions
+from affordlib.interactions.batches import observe_action
+from affordlib.models import (
+    FiLMConfig,
+    TrainingConfig,
+    build,
+    load_checkpoint,
+    train,
+    train_literal,
+)
+from affordlib.models.training import batch_loss, final_errors_m, literal_draw
+
+
+def fresh(arrays):
+    """A small network that has learned nothing."""
+    torch.manual_seed(0)
+    small = FiLMConfig(
+        arrays.action_channels, arrays.effect_channels, width=32, blocks=2, rings=3, orders=4
+    )
+    return build(small, Normaliser.fit(arrays)).eval()
+
+
+def test_the_literal_loop_learns(some):
+    network = fresh(some)
+    losses = train_literal(network, some, 150, learning_rate=1e-3)
+    assert np.mean(losses[-30:]) < np.mean(losses[:30]) - 0.3
+    generator = torch.Generator().manual_seed(0)
+    counts = [literal_draw(some, 10, generator).observations.action_t.shape[1] for _ in range(200)]
+    assert set(counts) == set(range(1, 11))
+
+
+def test_the_literal_loop_stops_early_and_keeps_its_best(some, monkeypatch):
+    errors = iter([3.0, 2.0, 2.5, 2.6, 0.0])
+    kept = {}
+
+    def score(model, arrays):
+        error = next(errors)
+        kept[error] = {k: v.clone() for k, v in model.state_dict().items()}
+        return torch.tensor([error])
+
+    monkeypatch.setattr("affordlib.models.training.final_errors_m", score)
+    network = fresh(some)
+    losses = train_literal(network, some, 100, validation=some, validate_every=3, patience=2)
+    assert len(losses) == 12
+    for name, value in network.state_dict().items():
+        assert torch.equal(value, kept[2.0][name])
+
+
+class Stopped(Exception):
+    pass
+
+
+def test_training_resumes_to_the_same_bits(some, tmp_path, monkeypatch):
+    config = TrainingConfig(steps=9, batch_size=16, validate_every=2, ema=0.9, hold_floor=0.3)
+    whole = fresh(some)
+    history = train(whole, some, some, config, progress=False)
+
+    broken, calls = fresh(some), []
+
+    def stop(model, batch, beta):
+        calls.append(0)
+        if len(calls) == 6:
+            raise Stopped
+        return batch_loss(model, batch, beta)
+
+    file = tmp_path / "run" / "training.pt"
+    with monkeypatch.context() as patch:
+        patch.setattr("affordlib.models.training.batch_loss", stop)
+        with pytest.raises(Stopped):
+            train(broken, some, some, config, progress=False, checkpoint=file)
+    again = fresh(some)
+    resumed = train(again, some, some, config, progress=False, checkpoint=file)
+    assert [(h.step, h.loss, h.validation_error_m) for h in resumed] == [
+        (h.step, h.loss, h.validation_error_m) for h in history
+    ]
+    for a, b in zip(whole.parameters(), again.parameters(), strict=True):
+        assert torch.equal(a, b)
+    assert again.sigma_floor == whole.sigma_floor
+    other = dataclasses.replace(config, steps=10)
+    with pytest.raises(ValueError, match=r"training\.pt is of a training with other steps"):
+        train(fresh(some), some, some, other, progress=False, checkpoint=file)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "n", "all_mm", "cuboid_mm", "p95_mm", "yaw_deg"),
+    [("push_film", 500, 1.0, 1.5, 4.0, 3.0), ("push_film_x10", 5000, 0.5, 0.8, 2.5, 1.5)],
+)
+def test_the_shipped_films_reach_their_goals(
+    name, n, all_mm, cuboid_mm, p95_mm, yaw_deg, held_out_pushes
+):
+    model, about = load_checkpoint(name)
+    split = split_interactions(n)
+    assert about["seen_interactions"] == sorted([*split.train, *split.validation])
+    test = TrainingArrays.from_dataset(
+        held_out_pushes, None, *(model.action_channels, model.effect_channels)
+    )
+    errors = 1000 * final_errors_m(model, test)
+    box = torch.from_numpy(held_out_pushes["family"].values == 0)
+    assert (errors[box].mean() + errors[~box].mean()) / 2 < all_mm
+    assert errors[box].mean() < cuboid_mm
+    assert errors.quantile(0.95) < p95_mm
+    with torch.no_grad():
+        told = model.predict(
+            model.encode(test.image), observe_action(test), torch.ones(len(test), 1)
+        )
+    off = (told.effect_mean[:, 0, 2] - test.effect[:, -1, 2])[box].abs().mean()
+    assert math.degrees(off) < yaw_deg
