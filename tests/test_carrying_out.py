@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
+from affordlib.evaluation.closed_loop import POSE_TOLERANCE_M, draw_trial
 from affordlib.evaluation.goals import frozen_tasks
 from affordlib.evaluation.planning import attempt
-from affordlib.planning import carry_out, plan_astar, plan_continuous
+from affordlib.planning import carry_out, plan_astar, plan_continuous, pursue
+from affordlib.primitives import Grasp, Push
 from affordlib.types import Goal, Plan
 from affordlib.world import Cuboid, WorldConfig
 
@@ -87,3 +89,14 @@ def test_settings_of_a_planner_are_those_of_its_search(repertoire, cuboid_image)
     planner(cuboid_image, (0.0, 0.0), Goal((0.05, 0.0)), seed=8, finish=None)
     assert asked == [7, 8]
     assert planner.search.keywords == {"seed": 7}
+
+
+def test_what_a_lift_has_shifted_is_put_down_and_lifted_again(world, repertoire):
+    """The closing fingers turn the box, and shift it by more than it may be off."""
+    trial = draw_trial("height", 12, seed=3)
+    world.place(trial.thing, trial.start_xy_m, trial.yaw_rad)
+    went = pursue(world, trial.goal, repertoire, tolerance_m=POSE_TOLERANCE_M)
+    kinds = [type(step.primitive) for step in went.steps]
+    assert went.reached, went.words
+    assert kinds.count(Grasp) == 2
+    assert kinds[kinds.index(Grasp) + 1] is Push

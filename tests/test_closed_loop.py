@@ -314,17 +314,29 @@ def test_a_goal_across_the_table_is_reached_in_the_limit(table, repertoire):
     assert len(went.steps) <= action_limit(0.65)
 
 
-@pytest.mark.parametrize(("aside_m", "ending"), [(0.0, "reached"), (0.02, "gave_up")])
-def test_what_is_held_aside_of_its_goal_is_not_called_reached(table, repertoire, aside_m, ending):
+@pytest.mark.parametrize(
+    ("shifts_m", "lifts", "ending"),
+    [((0.0,), 1, "reached"), ((0.02,), 2, "reached"), ((0.02, 0.02), 2, "gave_up")],
+)
+def test_what_is_held_aside_of_its_goal_is_put_down_and_lifted_there(
+    table, repertoire, shifts_m, lifts, ending
+):
+    """The goal moves by so much after each lift."""
     goal = Goal((0.06, 0.0), height_m=0.1)
+    left = list(shifts_m)
 
     def move_goal(plan, n):
-        lifted = plan.steps[-1].primitive.name == "grasp"
-        return replace(goal, xy_m=(0.06 + aside_m, 0.0)) if lifted else None
+        nonlocal goal
+        if plan.steps[-1].primitive.name == "grasp" and left:
+            goal = replace(goal, xy_m=(goal.xy_m[0] + left.pop(0), 0.0))
+            return goal
+        return None
 
     table.place(TUBE)
     went = pursue(table, goal, repertoire, on_action=move_goal)
     assert went.ending == ending, went.words
+    assert sum(isinstance(step.primitive, Grasp) for step in went.steps) == lifts
+    aside_m = 0.0 if ending == "reached" else shifts_m[-1]
     assert went.distance_m == pytest.approx(aside_m, abs=0.005)
     assert abs(went.height_error_m) < 0.003
 

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from affordlib.planning import Disturbance, Pursuit
     from affordlib.world import Thing
 
-FORMATS = {"height": 7, "orientation": 6, "disturbances": 5, "reachability": 4}
+FORMATS = {"height": 8, "orientation": 6, "disturbances": 5, "reachability": 4}
 """Counts the changes of code that change a table's records."""
 
 N_TRIALS = {"height": 50, "orientation": 50, "disturbances": 200, "reachability": 1000}

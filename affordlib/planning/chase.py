@@ -156,9 +156,10 @@ class Chase:
             turned = off is None or abs(off) <= self.demands.turn_tolerance_rad
             if turned and abs(self._height_left()) <= self.demands.height_tolerance_m:
                 shifted = self.goal.distance_m(self.world.object_pose()[:2])
-                if shifted > max(self.demands.tolerance_m, SHIFTED_M):
-                    self._give_up("position")  # put down again, a round thing would roll
-                raise Ended("reached", self._where())
+                if shifted <= max(self.demands.tolerance_m, SHIFTED_M):
+                    raise Ended("reached", self._where())
+                if lifts == MAX_LIFTS:
+                    self._give_up("position")
             self.world.park()
 
     def _look(self) -> None:

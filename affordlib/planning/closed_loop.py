@@ -19,7 +19,7 @@ from affordlib.planning.continuous import plan_continuous
 from affordlib.planning.finish import TURN_TOLERANCE_RAD
 from affordlib.planning.modes import PlanMode, is_on_table
 from affordlib.planning.moves import Demands
-from affordlib.primitives import Drag, wrap_angle
+from affordlib.primitives import wrap_angle
 from affordlib.types import Goal, NothingSeenError, Outcome, Plan, check_within
 
 if TYPE_CHECKING:
@@ -36,9 +36,6 @@ Replan = Callable[[np.ndarray, tuple[float, float], Goal], Plan]
 
 ENOUGH_M = 0.0003
 """What a corrective action leaves anyway; nearer to the goal than this, none is tried."""
-
-ROLLS_ON_M = 0.002
-"""A drag corrects no less: let go, one lying cylinder in ten that is wider than long rolls on."""
 
 TOLERANCE_M = 0.002
 HEIGHT_TOLERANCE_M = 0.003
@@ -80,8 +77,6 @@ def carry_out(
         exactly = replace(plan.goal, tolerance_m=min(plan.goal.tolerance_m, enough_m))
         steps = replan(seen.image, seen.xy_m, exactly).steps[:1]
         if not steps or plan.goal.distance_m(steps[0].predicted_end_xy_m) >= off:
-            break
-        if isinstance(steps[0].primitive, Drag) and off <= ROLLS_ON_M:
             break
         if not world.can_reach(steps[0].primitive, steps[0].stop_phase):
             break
