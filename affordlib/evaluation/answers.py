@@ -18,6 +18,7 @@ from affordlib.interactions.batches import observe_action, plane_of
 from affordlib.models.calibration import LEVELS, coverage
 from affordlib.models.network import gaussian_nll
 from affordlib.primitives import Grasp
+from affordlib.world.objects import FAMILIES
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -89,8 +90,12 @@ def logistic_answers(
 
 
 def _objects(data: xr.Dataset, kept: np.ndarray) -> dict[str, Any]:
-    names = ("interaction", "family", "rollable")
-    return {name: data[name].values[kept].tolist() for name in names}
+    names = data["family"].attrs["flag_meanings"].split()
+    return {
+        "interaction": data["interaction"].values[kept].tolist(),
+        "family": [names[k] for k in data["family"].values[kept]],
+        "rollable": data["rollable"].values[kept].tolist(),
+    }
 
 
 def _answers(
@@ -159,6 +164,18 @@ def summary(answers: dict[str, Any]) -> dict[str, Any]:
     errors |= {k: np.array(answers[k]) for k in ("trajectory_error", "after_contact_error")}
     plain = {k: None if v is None else [float(f"{e:.4g}") for e in v] for k, v in errors.items()}
     return {"family": answers["family"], **plain, "calibration": calibration(answers)}
+
+
+def stored(part: dict[str, Any]) -> dict[str, Any]:
+    """As a part is written: rounded, and families by their numbers in `FAMILIES`."""
+    number = {name: k for k, name in enumerate(FAMILIES)}
+
+    def written(name: str, value: Any) -> Any:
+        if name == "family":
+            return [number[v] for v in value]
+        return stored(value) if isinstance(value, dict) else rounded(value)
+
+    return {name: written(name, value) for name, value in part.items()}
 
 
 def rounded(value: Any) -> Any:

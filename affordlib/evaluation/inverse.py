@@ -63,9 +63,10 @@ def executed_record(
     """Errors of pushes θ (N,) that should have the effects of interactions, carried out."""
     wanted, done = data["effect"].values[kept, -1], execute(data, kept, theta_rad)
     true_theta = data["theta"].values[kept]
+    names = data["family"].attrs["flag_meanings"].split()
     return {
         "interaction": data["interaction"].values[kept].tolist(),
-        "family": data["family"].values[kept].tolist(),
+        "family": [names[k] for k in data["family"].values[kept]],
         "final_error": np.hypot(*(done - wanted)[:, :2].T).tolist(),
         "yaw_error": [abs(wrap_angle(d)) for d in (done - wanted)[:, 3]],
         "theta_error": [

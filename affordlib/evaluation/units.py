@@ -27,7 +27,7 @@ from affordlib.evaluation.answers import (
     believable,
     logistic_answers,
     network_answers,
-    rounded,
+    stored,
     summary,
 )
 from affordlib.evaluation.baselines import BASELINES
@@ -261,7 +261,7 @@ def run_unit(unit: Unit, folder: Path, progress: bool = False) -> bool:
     part["fold_test"] = told["fold"]
     if "fixed" in told:
         part["fixed_test"] = summary(told["fixed"])
-    text = json.dumps(rounded(part), allow_nan=False, separators=(",", ":"))
+    text = json.dumps(stored(part), allow_nan=False, separators=(",", ":"))
     write_text_atomically(folder / unit.file, text + "\n")
     for path in folder.glob(f".{unit.file}.*.pt*"):
         path.unlink()
