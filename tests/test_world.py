@@ -232,6 +232,19 @@ def test_the_fingers_are_tied_only_while_they_close_or_hold(world):
         assert gears() == 0
 
 
+@pytest.mark.parametrize("thing", [*THINGS, LyingCylinder(0.05, 0.07)])
+def test_what_is_held_is_put_down_and_not_dropped(world, thing):
+    world.place(thing, (0.05, 0.1))
+    world.interact(Grasp(), 0.7, approach=True)
+    held, heights = world.object_state(), []
+    assert held[2] > thing.height_m / 2 + 0.05
+    world.film = lambda world: heights.append(world.object_state()[2])
+    world.park()
+    assert -np.diff(heights).min() * 240 < 0.4  # m/s; a fall from there has 1.3
+    assert math.dist(held[:2], world.object_state()[:2]) < 0.001
+    assert world.object_state()[2] == pytest.approx(thing.height_m / 2, abs=5e-4)
+
+
 @pytest.mark.parametrize("yaw_rad", [0.0, math.pi / 4])
 def test_what_rolls_on_a_level_table_comes_to_rest(world, yaw_rad):
     """Unbraked, Bullet's cylinders gain speed."""

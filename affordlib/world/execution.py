@@ -12,12 +12,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pybullet
 
-from affordlib.primitives import TIP_HEIGHT_M, Primitive
+from affordlib.primitives import TIP_HEIGHT_M, Grasp, Primitive
 from affordlib.types import Interaction
 from affordlib.world import robot
 from affordlib.world.motion import (
     HOVER_HEIGHT_M,
     RECORD_EVERY,
+    RESTING_M,
+    ROLLING_M,
     STEPS_PER_WAYPOINT,
     Drive,
     Stretch,
@@ -26,6 +28,7 @@ from affordlib.world.motion import (
     poses,
     put_arm,
     tie_fingers,
+    tool_pose,
     untie_fingers,
 )
 
@@ -34,8 +37,8 @@ if TYPE_CHECKING:
 
 SETTLE_STEPS = 120
 RETREAT_M = 0.02
-ROLLING_M, RESTING_M = 1e-4, 1e-3
-"""Rolling friction [m]: of all bodies, and of a round object that is left alone."""
+PUT_DOWN_M = 0.002
+"""From this height an object that is put down is let go."""
 RECORDED_SAMPLES = 26
 """One every 3 steps of 50 ms of a full primitive, as in the paper: t = 0 and 25 more."""
 
@@ -166,6 +169,24 @@ def execute(
     if not (approach or primitive.holds):
         put_arm(world, home, world.gap_m)
     return interaction
+
+
+def put_down(world: Tabletop) -> None:
+    """Lower what the hand holds to the table, open the fingers, rise and go home."""
+    below_m = 0.0
+    if world.thing is not None:
+        below_m = pybullet.getAABB(world.body, physicsClientId=world.client)[0][2]
+    here = np.append(tool_pose(world)[:4], 0.0)
+    way = np.repeat(world.arm[None], 2, axis=0)
+    if below_m > PUT_DOWN_M:
+        way = line(here, here - (below_m - PUT_DOWN_M) * _UP, world.arm, 1.0, world.tool)
+    wide = np.linspace(world.gap_m, max(world.gap_m, Grasp.opening_m), 13)
+    drive = Drive(world, Grasp.force_N, closes=True)
+    drive.along(way, wide[[0, 0]])
+    drive.along(np.repeat(world.arm[None], 13, axis=0), wide)
+    untie_fingers(world)
+    drive.along(way[::-1], wide[[-1, -1]])
+    drive.along(joint_move(world.arm, np.array(robot.HOME), 1.0), wide[[-1, -1]])
 
 
 def refused(world: Tabletop, primitive: Primitive, phase: np.ndarray, seen: Percept) -> Interaction:

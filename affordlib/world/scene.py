@@ -15,7 +15,7 @@ import pybullet
 from scipy.spatial.transform import Rotation
 
 from affordlib.perception import Percept, aim
-from affordlib.primitives import DURATION_S, PUSH_GAP_M, Grasp, LeverUp, Primitive, Push, min_jerk
+from affordlib.primitives import DURATION_S, PUSH_GAP_M, LeverUp, Primitive, Push, min_jerk
 from affordlib.types import (
     LEVER_CROP_WIDTH_M,
     LEVER_IMAGE_PIXELS,
@@ -28,7 +28,7 @@ from affordlib.types import (
     check_within,
 )
 from affordlib.world import camera, motion, robot
-from affordlib.world.execution import ROLLING_M, execute, place_offset, plan_motion, refused
+from affordlib.world.execution import execute, place_offset, plan_motion, put_down, refused
 from affordlib.world.interventions import Interventions
 from affordlib.world.objects import DENSITY_KG_M3, create_body, create_footprint
 
@@ -161,7 +161,7 @@ class Tabletop(Interventions):
             link,
             lateralFriction=lateral,
             spinningFriction=1e-3,
-            rollingFriction=ROLLING_M,
+            rollingFriction=motion.ROLLING_M,
             restitution=0.0,
             physicsClientId=self.client,
         )
@@ -353,13 +353,9 @@ class Tabletop(Interventions):
         return True
 
     def park(self) -> None:
-        """Open the fingers, which lets go what they hold, and take the arm home."""
-        wide = np.linspace(self.gap_m, max(self.gap_m, Grasp.opening_m), 13)
-        drive = motion.Drive(self, Grasp.force_N, closes=True)
-        drive.along(np.repeat(self.arm[None], 13, axis=0), wide)
-        drive.along(motion.joint_move(self.arm, np.array(robot.HOME), 1.0), wide[[-1, -1]])
+        """Put down what the hand holds, open the fingers and take the arm home."""
+        put_down(self)
         self.settle()
-        motion.untie_fingers(self)
 
     def attempt(self, primitive: Primitive, stop_phase: float = 1.0) -> Interaction:
         """As `interact`; where the arm cannot reach, an interaction in which nothing happened."""
