@@ -1,8 +1,9 @@
 """Where objects shall be brought: goals drawn by seed, before anything plans (Table 3).
 
-Objects are ones that no model has seen; goals are more than 2 cm from the start and off the 10°
-grid of A*. Two families: *constructed* goals are where executed full or partial actions really
-ended, so they can be reached; *uniform* ones are drawn evenly over the area in reach.
+Objects are ones that no model has seen; goals are more than 2 cm from the start. Two families:
+*constructed* goals are where executed full or partial actions really ended, so they can be reached;
+*uniform* ones are drawn evenly over the area in reach. Those actions, or the bearings of uniform
+goals, are off the 10° grid of A*.
 
 The goals of the tables are frozen in `data/goals/planning.json`, those of the varied, noisy world
 in `data/goals/planning_varied.json`; made once, by
@@ -42,7 +43,7 @@ EARLIEST_STOP = 0.55
 STANDING = ("cuboid", "upright_cylinder")
 ROLLABLE = ("lying_cylinder", "sphere")
 REACH_M = {Push: 0.07, Drag: 0.05}
-"""How far one full action takes an object, at least."""
+"""How far one full action takes an object, at least (a push) or about (a drag)."""
 
 
 @dataclass(frozen=True)

@@ -224,6 +224,6 @@ VARIANTS: dict[str, Variant] = {
         name="oracle_perceived", **_ORACLE, world="varied", every=5, nominal=True
     ),
 }
-"""The first three of the paper's planners on our best model; the paper's on its own network; what
-each idea is worth; what the world does with a small misperception; a recurrent network under the
-same planners; the simulator itself in the place of a model; and the varied, noisy world."""
+"""Our planner and A* on our best model; the paper's planners on its own network; what each idea is
+worth; what the world does with a small misperception; a recurrent network under the same planners;
+the simulator itself in the place of a model; and the varied, noisy world."""

@@ -1,9 +1,10 @@
 """Our continuous planner: directions and phases of all actions of a chain, found together.
 
     p_k+1 = p_k + R(φ_k) e(φ_k - ψ_k, t_k),   ψ_k+1 = ψ_k + e_ψ(φ_k - ψ_k, t_k)
-    minimise E|p_K - goal|² = |p_K - goal|² + tr Cov p_K   over φ_1, t_1, …, φ_K, t_K
+    minimise |p_K - goal|² + λ tr Cov p_K   over φ_1, t_1, …, φ_K, t_K
 
-e is the object's effect map, p and ψ its position and how far it has turned. The covariance is
+e is the object's effect map, p and ψ its position and how far it has turned; with λ = 1 it would be
+the expected squared distance, and `CAUTION` weighs the model's doubt more. The covariance is
 carried along the chain, so that of two plans that end at the goal the surer one is taken: a model
 knows which pushes it foresees well. Many chains are started at once, the last action of each looked
 up in the map; the best descend the gradient, and the one that remains is corrected against the
@@ -81,7 +82,7 @@ def _starts(
 def _objective(
     effects: EffectMap, target: Tensor, direction: Tensor, phase: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Expected squared distances (B,) [m²], and where the chains are before each action."""
+    """Squared distances and weighed variance (B,) [m²]; where chains are before each action."""
     positions, _, variances = roll_out(effects, direction, phase)
     before = torch.cat([torch.zeros_like(positions[:, :1]), positions[:, :-1]], dim=1)
     return (positions[:, -1] - target).square().sum(dim=-1) + CAUTION * variances[:, -1], before
@@ -199,11 +200,11 @@ def plan_continuous(
 
     kind: push or drag; effects: the object's map, if it was made before; reachable: a function of
     positions (n, 2) and directions (n,) that says where the arm can act. Where no chain comes near
-    the goal, the plan is the one that comes nearest. draft: a first plan in a fifth of the time, of
-    as few actions as the distance allows and without the descent. trace, if given, receives for
-    each number of actions K the directions and phases (B, K) of the chains that remain, and their
-    costs (B,) [m]. finish: what turns and lifts the object at the end, without which a plan cannot
-    reach a goal that asks for it.
+    the goal, the plan is the one that comes nearest. draft: a first plan, of as few actions as the
+    distance allows and without the descent; of three in a quarter of the time. trace, if given,
+    receives for each number of actions K the directions and phases (B, K) of the chains that
+    remain, and their costs (B,) [m]. finish: what turns and lifts the object at the end, without
+    which a plan cannot reach a goal that asks for it.
     """
     began = time.perf_counter()
     mode = mode_named(mode)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 CELL_M = 0.02
 REACH_M = {Push: 0.075, Drag: 0.045}
-"""How far one action surely takes an object: a little less than the whole action does."""
+"""How far one action takes nearly any object: a little less than the whole action mostly does."""
 
 
 def places() -> tuple[np.ndarray, np.ndarray]:

@@ -99,8 +99,8 @@ def place_offset(world: Tabletop, xy_m: tuple[float, float]) -> np.ndarray:
 def resist_rolling(world: Tabletop, resists: bool) -> None:
     """Let the table brake an object that can roll as it lies, or no longer.
 
-    Bullet's cylinders gain speed as they roll on a level table, from 0.1 to 0.33 m/s in 2.5 s: one
-    that is let go at a thousandth of that runs away while the arm comes back for it. While an
+    Bullet's cylinders gain speed as they roll on a level table, from 0.1 to some 0.3 m/s in 2.5 s:
+    one that is let go at a thousandth of that runs away while the arm comes back for it. While an
     action is recorded nothing brakes, as nothing did when the models' data were collected.
     """
     resists = resists and world.object_rolls()
