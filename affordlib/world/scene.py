@@ -308,7 +308,8 @@ class Tabletop(Interventions):
         """Execute a primitive on the object up to a phase, and record what happens.
 
         approach=False puts the arm at the start of the path and away in the end (collecting);
-        approach=True moves it there through the air and back home (carrying out a plan).
+        approach=True moves it there through the air and back home (carrying out a plan), and the
+        table brakes what rolls before and after what is recorded.
         The effect is recorded at `N_SAMPLES` phases in [0, stop_phase]. A partial action is the
         prefix of the path, re-timed to its own smooth stop, or with smooth=False cut off.
         Raises UnreachableError when the arm cannot follow the path.
