@@ -33,9 +33,8 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
 
     Raises ValueError, naming the file and what is wrong in it, if it holds no plan.
     """
-    text = Path(path).read_text(encoding="utf-8")
     try:
-        return _plan(json.loads(text))
+        return _plan(json.loads(Path(path).read_text(encoding="utf-8")))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         what = f"{error.args[0]!r} is missing" if isinstance(error, KeyError) else str(error)
         raise ValueError(f"path: {path} holds no plan: {what}") from None

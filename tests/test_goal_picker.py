@@ -1,7 +1,6 @@
 import asyncio
 import base64
 import io
-import json
 import math
 import time
 from dataclasses import replace
@@ -12,14 +11,12 @@ import pytest
 from PIL import Image
 
 from affordlib.interactions import open_interactions
-from affordlib.plan_files import load_plan, save_plan
+from affordlib.plan_files import load_plan
 from affordlib.planning import Repertoire, carry_out, plan_astar
-from affordlib.primitives import Drag, Push, Rotate
 from affordlib.show import GoalPicker
 from affordlib.show.executors import closed_loop, open_loop
 from affordlib.show.plots import plot_plan
 from affordlib.show.table_view import TableView
-from affordlib.types import Goal, Plan, Step
 from affordlib.world import BASE_X_M, REACH_M, Cuboid
 
 
@@ -284,30 +281,9 @@ def test_a_plan_comes_back_from_its_file(picker, world, tmp_path):
     assert "from where this plan starts" in picker.controls.words.value
 
 
-@pytest.mark.parametrize("primitive", [Push(0.3, length=0.02), Drag(1.0), Rotate()])
-def test_any_primitive_and_a_decoded_path_come_back(primitive, tmp_path):
-    path = np.array([[0.0, 0.1], [1 / 3, 0.2]])
-    step = Step(primitive, 0.7, (0.1, 0.2), path, path_xy_m=path / 7)
-    plan = Plan(Goal((0.1, 0.2), 0.005), (0.0, 0.0), (step,), "any", False, 3, 0.1)
-    file = save_plan(tmp_path / "new" / "plan.json", plan)
-    (back,) = load_plan(file).steps
-    assert back.primitive == primitive
-    assert math.isnan(back.std_m)
-    np.testing.assert_array_equal(back.path_xy_m, path / 7)
-    assert json.loads(file.read_text())["steps"][0]["std_m"] is None
-
-
-@pytest.mark.parametrize(
-    ("text", "why"),
-    [
-        ("{", "holds no plan"),
-        ("{}", "'goal' is missing"),
-        ('{"goal": {"xy_m": [9, 9], "tolerance_m": 0.02}}', "off the table"),
-    ],
-)
-def test_a_file_without_a_plan_is_refused(text, why, picker, tmp_path):
-    (tmp_path / "bad.json").write_text(text)
-    with pytest.raises(ValueError, match=why):
+def test_a_file_without_a_plan_is_refused(picker, tmp_path):
+    (tmp_path / "bad.json").write_text("{")
+    with pytest.raises(ValueError, match="holds no plan"):
         picker.load("bad.json")
 
 
