@@ -85,11 +85,9 @@ def test_units_leave_parts_that_are_not_made_again(tmp_path):
 
 
 def _part(errors_cm):
-    n = len(errors_cm)
     return {
-        "interaction": list(range(n)),
+        "interaction": list(range(len(errors_cm))),
         "tests": {p: {"error_cm": [[[e] * 5] * 7 for e in errors_cm]} for p in PROTOCOLS},
-        "window_moves_cm": [[1.0] * 6 + [0.1]] * n,
     }
 
 
@@ -108,11 +106,14 @@ def test_differences_are_paired_by_object():
         ("lstm_tuned", 3): pytest.approx(-0.1),
         ("lstm_published", 3): pytest.approx(0.2),
     }
+    still = (LeverUnit("persistence"), _part([1.0, 0.1, 1.0]))
+    rows = lever_tables.motion_rows([still, ours])
     moving, resting = (
-        next(r for r in lever_tables.motion_rows([ours]) if r["windows"] == kind)
+        next(r for r in rows if (r["model"], r["windows"]) == ("anchored", kind))
         for kind in ("moving", "resting")
     )
-    assert (moving["n_windows"], resting["n_windows"]) == (18, 3)
+    assert (moving["n_windows"], resting["n_windows"]) == (14, 7)
+    assert moving["mean_cm"] == pytest.approx(0.55)
     first = lever_tables.error_rows([ours])[0]
     assert first["mean_cm"] == pytest.approx(1.6 / 3)
     assert first["sem_cm"] == pytest.approx(np.std([0.1, 0.5, 1.0], ddof=1) / math.sqrt(3))

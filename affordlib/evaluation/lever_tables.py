@@ -125,13 +125,21 @@ def unseen_rows(parts: Group, edges: dict[int, int]) -> list[dict[str, Any]]:
 
 
 def motion_rows(parts: Group) -> list[dict[str, Any]]:
-    """Windows in which the object moves on and those in which it rests, apart."""
+    """Windows in which the object moves on and those in which it rests, apart.
+
+    How far it moves is by how much persistence errs at the last step.
+    """
+    moved = {
+        unit.fold: np.array(part["tests"]["window"]["error_cm"])[..., -1]
+        for unit, part in parts
+        if unit.model == BASELINES[0] and unit.no_edges is None
+    }
     rows = []
     for about, protocol, group in _groups(parts):
         if protocol != "window":
             continue
         errors = _pooled(group, protocol)
-        moves = np.concatenate([part["window_moves_cm"] for _, part in group])
+        moves = np.concatenate([moved[unit.fold] for unit, _ in group])
         for kind, which in (("moving", moves >= 100 * RESTS_M), ("resting", moves < 100 * RESTS_M)):
             chosen = errors[which]
             for k in range(chosen.shape[1] if len(chosen) else 0):

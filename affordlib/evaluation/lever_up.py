@@ -180,7 +180,6 @@ def run_unit(unit: LeverUnit, folder: Path, progress: bool = False) -> bool:
         told = {protocol: _foreseen(model, test, protocol) for protocol in unit.protocols}
     part["interaction"] = data["interaction"].values[_kept(data, split.test)].tolist()
     part["tests"] = {protocol: _answers(found) for protocol, found in told.items()}
-    part["window_moves_cm"] = _window_moves_cm(test)
     if unit.model == BASELINES[0]:
         part["step_moves_cm"] = (100 * test.effect[..., :3].diff(dim=1).norm(dim=-1)).tolist()
     text = json.dumps(_shortened(part), allow_nan=False, separators=(",", ":"))
@@ -284,13 +283,6 @@ def _answers(found: list[tuple[Prediction, Tensor]]) -> dict[str, Any]:
             for k, channel in enumerate(POSE_CHANNELS)
         }
     return {"error_cm": errors.tolist(), "coverage": covered}
-
-
-def _window_moves_cm(arrays: TrainingArrays) -> list[list[float]]:
-    """How far objects move [cm] from each window's last observed to its last step (N, W)."""
-    last = torch.arange(n_windows(arrays)) + SEEN - 1
-    xyz = 100 * arrays.effect[..., :3]
-    return (xyz[:, last + AHEAD] - xyz[:, last]).norm(dim=-1).tolist()
 
 
 def main(argv: Sequence[str] | None = None) -> int:
