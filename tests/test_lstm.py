@@ -74,6 +74,23 @@ def test_a_published_training_goes_on_where_it_was_broken_off(tmp_path, levered,
     assert beginning_errors_m(whole, levered).shape == (len(levered), 25)
 
 
+def test_gradients_that_vanish_are_forgotten(tmp_path, levered, small_published, monkeypatch):
+    """Most of a published network's units die, and their subnormal means take half of its time."""
+
+    def train(vanishes):
+        monkeypatch.setattr("affordlib.models.lstm_published.VANISHES", vanishes)
+        model, file = small_published(), tmp_path / f"{vanishes}.pt"
+        train_published(model, levered, levered, "window", 2, checkpoint=file)
+        means = [of["exp_avg"] for of in torch.load(file)["optimiser"]["state"].values()]
+        return model.state_dict(), torch.cat([mean.flatten().abs() for mean in means])
+
+    (never, all_means), (usual, means) = train(0.0), train(1e-30)
+    assert all(torch.equal(never[name], usual[name]) for name in never)
+    assert torch.equal(means, torch.where(all_means > 1e-30, all_means, 0.0))
+    _, large = train(1e-4)
+    assert large[large > 0].min() > 1e-4 > all_means[all_means > 0].min()
+
+
 def test_an_lstm_of_pushes_is_a_model_like_the_others(pushes):
     few = TrainingArrays.from_dataset(pushes, np.arange(8))
     torch.manual_seed(0)
