@@ -63,6 +63,13 @@ def check_within(name: str, value: float, low: float, high: float, unit: str = "
     return number
 
 
+def check_count(name: str, value: int, least: int = 1) -> int:
+    """Return `value`, or raise naming the argument that is no whole number from `least` on."""
+    if isinstance(value, bool) or not isinstance(value, int) or value < least:
+        raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}")
+    return value
+
+
 def check_on_table(name: str, xy_m: Sequence[float]) -> tuple[float, float]:
     """Return (x, y) [m] in the frame of the table, or raise when it is not a point on it."""
     pair = np.asarray(xy_m, dtype=float)

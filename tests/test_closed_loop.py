@@ -354,7 +354,7 @@ def test_no_more_actions_than_were_allowed(table, repertoire, goal):
     table.place(BOX, (0.0, 0.0), 0.3)
     went = pursue(table, Goal((0.0, 0.0), **goal), repertoire, max_actions=0)
     assert (went.ending, went.steps) == ("gave_up", ())
-    with pytest.raises(ValueError, match=r"whole number from 0 on, got 1\.5"):
+    with pytest.raises(ValueError, match=r"whole number of at least 0, got 1\.5"):
         pursue(table, Goal((0.0, 0.0)), repertoire, max_actions=1.5)
 
 

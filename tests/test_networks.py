@@ -25,6 +25,8 @@ from affordlib.models import (
     save_checkpoint,
 )
 from affordlib.models.frame import heading
+from affordlib.models.lstm import LSTMConfig
+from affordlib.models.lstm_published import PublishedConfig
 from affordlib.models.protocol import observe_final_effect
 from affordlib.models.training import batch_loss
 from affordlib.primitives import Drag, Push
@@ -323,6 +325,10 @@ def test_coverage_and_temperature(some):
         (lambda: FiLMConfig(frame="object"), r"frame .* 'object'"),
         (lambda: FiLMConfig(effect_channels=("z",)), "effect_channels must name x and y"),
         (lambda: FiLMConfig(blocks=0), "blocks .* 0"),
+        (lambda: AttentionConfig(rings=True), "rings must be a whole number .* True"),
+        (lambda: AttentionConfig(heads=0), "heads .* 0"),
+        (lambda: LSTMConfig(steps=2.5), r"steps .* 2\.5"),
+        (lambda: PublishedConfig(patience=0), "patience .* 0"),
         (lambda: CNPConfig(temperature=(1.0, 0.0)), r"temperature .* \(1\.0, 0\.0\)"),
         (lambda: AttentionConfig(width=30), "width must be a multiple of heads, got 30"),
         (lambda: TrainingConfig(ema=1.0), "ema .* 1"),

@@ -29,6 +29,7 @@ from affordlib.interactions.places import Place
 from affordlib.interactions.recipes import Recipe
 from affordlib.interactions.records import collect_chunk, describe
 from affordlib.interactions.store import FOLDER_SUFFIX, SUFFIX, finish, is_finished, pack
+from affordlib.types import check_count
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -94,8 +95,7 @@ def collect(
     """
     if not str(path).endswith((SUFFIX, FOLDER_SUFFIX)):
         raise ValueError(f"path must end in {SUFFIX!r} or {FOLDER_SUFFIX!r}, got {str(path)!r}")
-    if isinstance(workers, bool) or not isinstance(workers, int) or workers < 1:
-        raise ValueError(f"workers must be a whole number of at least 1, got {workers!r}")
+    check_count("workers", workers)
     place = Place.of(path)
     if place.is_private and (client is not None or workers > 1):
         raise ValueError(

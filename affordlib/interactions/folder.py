@@ -20,7 +20,7 @@ import torch
 from PIL import Image
 
 from affordlib.interactions.batches import TrainingArrays
-from affordlib.types import ACTION_CHANNELS, EFFECT_CHANNELS, IMAGE_PIXELS
+from affordlib.types import ACTION_CHANNELS, EFFECT_CHANNELS, IMAGE_PIXELS, check_count
 
 COURSES, IMAGES = "courses.csv", "images"
 DEPTH_UNIT_M = 1e-4
@@ -35,8 +35,7 @@ def read_folder(folder: str | Path, n_samples: int = 101) -> TrainingArrays:
     that says which file, which row and what is expected.
     """
     folder = Path(folder)
-    if isinstance(n_samples, bool) or not isinstance(n_samples, int) or n_samples < 2:
-        raise ValueError(f"n_samples must be a whole number of at least 2, got {n_samples!r}")
+    check_count("n_samples", n_samples, least=2)
     path = folder / COURSES
     if not path.is_file():
         raise FileNotFoundError(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from affordlib.primitives import Drag, LeverUp, Primitive, Push, primitive_named
-from affordlib.types import TABLE_X_M, TABLE_Y_M, check_within
+from affordlib.types import TABLE_X_M, TABLE_Y_M, check_count, check_within
 from affordlib.world import Tabletop, WorldConfig, family_named
 
 if TYPE_CHECKING:
@@ -105,10 +105,8 @@ class Recipe:
             if low > high:
                 raise ValueError(f"{name} must be a range (low, high), got {(low, high)}")
             object.__setattr__(self, name, (low, high))
-        for name, low in (("n_interactions", 1), ("seed", 0)):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < low:
-                raise ValueError(f"{name} must be a whole number of at least {low}, got {value!r}")
+        check_count("n_interactions", self.n_interactions)
+        check_count("seed", self.seed, least=0)
 
     def to_json(self) -> str:
         """The recipe as JSON with sorted keys."""

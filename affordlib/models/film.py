@@ -54,13 +54,6 @@ class FiLMConfig(NetworkConfig):
     orders: int = 8
     waves: int = 4
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("width", "blocks", "image_features", "rings", "orders", "waves"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}")
-
 
 class FiLMBlock(nn.Module):
     """x + W₂ ς(γ ∘ W₁ n(x) + β), γ and β linear in the condition."""

@@ -43,13 +43,6 @@ class LSTMConfig(NetworkConfig):
     orders: int = 8
     waves: int = 4
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("steps", "width", "image_features", "rings", "orders", "waves"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}")
-
 
 @dataclass(frozen=True)
 class Known:

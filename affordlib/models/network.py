@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from jaxtyping import Bool, Float
@@ -20,7 +20,7 @@ from affordlib.models.frame import (
     turn_observations,
     turn_prediction,
 )
-from affordlib.types import Observations, Prediction
+from affordlib.types import Observations, Prediction, check_count
 
 PHASE_TOLERANCE = 1e-5
 RADIUS_TOLERANCE_M = 0.02
@@ -56,6 +56,9 @@ class NetworkConfig:
             if self.frame == "push" and not plane_of(channels):
                 raise ValueError(f'{name} must name x and y for frame="push", got {channels}')
             object.__setattr__(self, name, channels)
+        for size in fields(self):
+            if size.type == "int":
+                check_count(size.name, getattr(self, size.name))
         if not 0 < self.sigma_floor < 10:
             raise ValueError(f"sigma_floor must lie in (0, 10), got {self.sigma_floor!r}")
         temperature = tuple(self.temperature) or (1.0,) * len(self.effect_channels)

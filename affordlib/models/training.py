@@ -25,7 +25,7 @@ from affordlib.interactions.batches import (
     plane_of,
     sample_batch,
 )
-from affordlib.types import Observations, check_within
+from affordlib.types import Observations, check_count, check_within
 
 if TYPE_CHECKING:
     from affordlib.models.network import EffectNetwork
@@ -66,9 +66,7 @@ class TrainingConfig:
 
     def __post_init__(self) -> None:
         for name in ("steps", "batch_size", "n_targets", "obs_max", "validate_every", "patience"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}")
+            check_count(name, getattr(self, name))
         check_within("learning_rate", self.learning_rate, 1e-7, 1.0)
         check_within("weight_decay", self.weight_decay, 0.0, 10.0)
         check_within("beta", self.beta, 0.0, 1.0)

@@ -24,7 +24,7 @@ from affordlib.planning.finish import Finish, finished
 from affordlib.planning.modes import PlanMode, is_on_table, mode_named
 from affordlib.planning.steps import make_steps
 from affordlib.primitives import Push
-from affordlib.types import Goal, Plan, check_on_table
+from affordlib.types import Goal, Plan, check_count, check_on_table
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -76,8 +76,7 @@ class BranchTable:
         n_directions: int = N_DIRECTIONS,
         stop_phases: Sequence[float] = STOP_PHASES,
     ) -> None:
-        if isinstance(n_directions, bool) or not isinstance(n_directions, int) or n_directions < 1:
-            raise ValueError(f"n_directions must be a whole number from 1 on, got {n_directions!r}")
+        check_count("n_directions", n_directions)
         if not len(stop_phases):
             raise ValueError("stop_phases must hold at least one phase in (0, 1], got none")
         between = 2 * math.pi / n_directions

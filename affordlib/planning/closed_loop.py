@@ -20,7 +20,7 @@ from affordlib.planning.finish import TURN_TOLERANCE_RAD
 from affordlib.planning.modes import PlanMode, is_on_table
 from affordlib.planning.moves import Demands
 from affordlib.primitives import wrap_angle
-from affordlib.types import Goal, NothingSeenError, Outcome, Plan, check_within
+from affordlib.types import Goal, NothingSeenError, Outcome, Plan, check_count, check_within
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -113,9 +113,8 @@ def pursue(
     for name, value in (("tolerance_m", tolerance_m), ("height_tolerance_m", height_tolerance_m)):
         check_within(name, value, 1e-5, 0.1, "m")
     check_within("turn_tolerance_rad", turn_tolerance_rad, 1e-4, math.pi, "rad")
-    whole = isinstance(max_actions, int) and not isinstance(max_actions, bool)
-    if max_actions is not None and not (whole and max_actions >= 0):
-        raise ValueError(f"max_actions must be a whole number from 0 on, got {max_actions!r}")
+    if max_actions is not None:
+        check_count("max_actions", max_actions, least=0)
     demands = Demands(
         planner,
         PlanMode(horizon, partial=True),

@@ -16,6 +16,7 @@ from affordlib.types import (
     TABLE_X_M,
     TABLE_Y_M,
     Goal,
+    check_count,
     check_finite,
     check_on_table,
     check_within,
@@ -53,8 +54,7 @@ class Disturbance:
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
             raise ValueError(f"kind must be one of {KINDS}, got {self.kind!r}")
-        if isinstance(self.action, bool) or not isinstance(self.action, int) or self.action < 0:
-            raise ValueError(f"action must be a whole number from 0 on, got {self.action!r}")
+        check_count("action", self.action, least=0)
         for name in ("x", "y", "turn"):
             check_finite(name, getattr(self, name))
         if self.at_s is not None:

@@ -22,6 +22,7 @@ from scipy.spatial import cKDTree
 from affordlib.models.protocol import observe_actions
 from affordlib.planning.modes import encode_image, plane
 from affordlib.primitives import Drag, Push
+from affordlib.types import check_count
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -157,9 +158,8 @@ def map_effects(
 
     A model that foresees no yaw is taken to foresee none, and to be sure of it.
     """
-    for name, value, least in (("n_directions", n_directions, 8), ("n_phases", n_phases, 5)):
-        if isinstance(value, bool) or not isinstance(value, int) or value < least:
-            raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}")
+    check_count("n_directions", n_directions, least=8)
+    check_count("n_phases", n_phases, least=5)
     features = encode_image(model, image)
     angles = np.arange(n_directions) * (2 * math.pi / n_directions)
     t_target = phases_of(kind, n_phases).float().expand(n_directions, -1)

@@ -25,7 +25,7 @@ from affordlib.models.protocol import observe_actions, observe_final_effect
 from affordlib.planning.finish import finished
 from affordlib.planning.modes import PATH_SAMPLES, PlanMode, encode_image, mode_named, plane
 from affordlib.primitives import Push
-from affordlib.types import Goal, Plan, Step, check_on_table
+from affordlib.types import Goal, Plan, Step, check_count, check_on_table
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -127,9 +127,8 @@ def plan_gradient(
     began = time.perf_counter()
     mode = mode_named(mode)
     start = check_on_table("start_xy_m", start_xy_m)
-    for name, value, least in (("samples", samples, 2), ("starts", starts, 1)):
-        if isinstance(value, bool) or not isinstance(value, int) or value < least:
-            raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}")
+    check_count("samples", samples, least=2)
+    check_count("starts", starts)
     columns = plane(model)
     a_columns = [model.action_channels.index(name) for name in ("x", "y")]
     features = encode_image(model, image)
