@@ -7,11 +7,11 @@ the errors of every test trajectory. Errors are distances between foreseen and t
 cm, after steps of 150 ms. `lever_tables.py` makes the tables.
 
     python -m affordlib.evaluation.lever_up --models anchored,lstm_tuned,paper --folds 3
-    python -m affordlib.evaluation.lever_up --models lstm_published --folds 3 --protocols window
+    python -m affordlib.evaluation.lever_up --models lstm_published --folds 3
 
-The last takes one to two hours of one core a fold. glibc gives its large arrays back after every
-step; with `MALLOC_MMAP_MAX_=0 MALLOC_TRIM_THRESHOLD_=60000000000` before the command, a quarter
-less.
+The last takes an hour of one core for each of its two trainings a fold. glibc gives its large
+arrays back after every step; with `MALLOC_MMAP_MAX_=0 MALLOC_TRIM_THRESHOLD_=60000000000` before
+the command, a quarter less.
 """
 
 from __future__ import annotations
