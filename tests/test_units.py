@@ -148,11 +148,26 @@ def test_a_large_set_need_not_be_here_but_its_parts_must_agree(tmp_path):
     more["configuration_sha256"] = configuration_sha256(other)
     (tmp_path / other.file).write_text(json.dumps(more))
     with pytest.raises(ValueError, match=r"fold1-seed0\.json is of another 'rotate_x10'"):
-        tables._data(tables.read_parts(tmp_path))
+        pooled.data_of(pooled.read_parts(tmp_path))
     part["configuration_sha256"] = "old"
     (tmp_path / unit.file).write_text(json.dumps(part))
     with pytest.raises(ValueError, match="another configuration_sha256"):
         read_part(unit, tmp_path)
+
+
+def test_a_set_that_was_collected_again_is_the_same_where_its_ends_are():
+    def part(sha256, fold, interactions, ends):
+        test = {"interaction": interactions, "truth": {"z": ends}}
+        told = {"data_sha256": {"grasp_x10": sha256}, "fold_test": test}
+        return Unit("film", "grasp_x10", fold=fold), told
+
+    first = [part("a", 0, [4, 7], [0.25, 0.0]), part("a", 1, [5], [0.1])]
+    again = part("b", 1, [5], [0.1 + 5e-7])
+    for parts_of in ([*first, again], [again, *first]):
+        assert set(pooled.data_of(parts_of)["grasp_x10"]) == {"a", "b"}
+    for other in (part("b", 1, [5], [0.1001]), part("b", 2, [6], [0.1]), part("b", 2, [], [])):
+        with pytest.raises(ValueError, match="is of another 'grasp_x10'"):
+            pooled.data_of([*first, other])
 
 
 def test_one_training_is_not_counted_twice(tmp_path):

@@ -48,6 +48,35 @@ def by_model(parts: Iterable[tuple[Unit, Part]], data: str) -> Iterable[tuple[di
         yield about, [part for _, part in group]
 
 
+def data_of(parts: Iterable[tuple[Unit, Part]]) -> dict[str, list[str]]:
+    """Hashes of the sets by name; parts of one set must be of the same data.
+
+    Collected again, by another processor or with younger records beside the same, a set has another
+    hash. Its parts go with the others if of all their test interactions the ends are the same, to
+    1 µm or µrad; else ValueError names one.
+    """
+    files: dict[str, dict[str, str]] = defaultdict(dict)
+    ends: dict[tuple[str, str], dict[tuple[int, str], float]] = defaultdict(dict)
+    for unit, part in parts:
+        for name, sha256 in part["data_sha256"].items():
+            files[name].setdefault(sha256, unit.file)
+            if name != unit.data or "fold_test" not in part:
+                continue
+            test = part["fold_test"]
+            for channel, values in test["truth"].items():
+                numbered = zip(test["interaction"], values, strict=True)
+                ends[name, sha256] |= {(number, channel): end for number, end in numbered}
+    for name, by_hash in files.items():
+        first = max(by_hash, key=lambda sha256: len(ends[name, sha256]))
+        known = ends[name, first]
+        for sha256 in by_hash.keys() - {first}:
+            told, file = ends[name, sha256], by_hash[sha256]
+            alike = [abs(end - known.get(key, math.inf)) <= 1e-6 for key, end in told.items()]
+            if not alike or not all(alike):
+                raise ValueError(f"part {file} is of another {name!r} than others are")
+    return {name: list(by_hash) for name, by_hash in sorted(files.items())}
+
+
 class Errors:
     """Errors of interactions, each with its object and the object's class."""
 

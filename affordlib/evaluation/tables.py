@@ -5,7 +5,7 @@
 Means and standard errors are over objects, an object's errors by several trainings meaned first;
 `all` is the mean over object classes with equal weights. Medians and 95th percentiles are over all
 predictions, of each object by each training. A part whose hash is not its unit's is refused; the
-sets of ten times the size need not be here, if their parts agree.
+sets of ten times the size need not be here, if their parts agree (see `data_of`).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 from affordlib.evaluation import reported
 from affordlib.evaluation.answers import calibration, final_error, yaw_error
 from affordlib.evaluation.grasps import grasp_rows, roc_rows, threshold_rows
-from affordlib.evaluation.pooled import Part, by_model, pool, read_parts
+from affordlib.evaluation.pooled import Part, by_model, data_of, pool, read_parts
 from affordlib.evaluation.studies import FOLDER as STUDIES_FOLDER
 from affordlib.evaluation.studies import STUDIES, read_study
 from affordlib.evaluation.units import NETWORKS, PARTS, Unit
@@ -160,7 +160,7 @@ def assemble(
     made = {name: read_study(name, studies) for name in STUDIES if STUDIES[name].of == NAME}
     tables |= {name: rows for name, rows in made.items() if rows is not None}
     trained = sum(unit.model in NETWORKS for unit, _ in parts)
-    parameters = {"units": len(parts), "trained": trained, "data_sha256": _data(parts)}
+    parameters = {"units": len(parts), "trained": trained, "data_sha256": data_of(parts)}
     return write_results(out_dir, NAME, parameters, tables)
 
 
@@ -206,16 +206,6 @@ def ensemble_rows(parts: list[tuple[Unit, Part]]) -> list[dict[str, Any]]:
         keys = ("coverage_50", "coverage_90", "nll")
         calibrated[about["model"]] = {k: float(np.mean([r[k] for r in of_plane])) for k in keys}
     return [row | calibrated[row["model"]] for row in error_rows(both, "push", "fixed_test")]
-
-
-def _data(parts: list[tuple[Unit, Part]]) -> dict[str, str]:
-    """Hashes of the sets by name; parts of one set must be of the same data."""
-    found: dict[str, str] = {}
-    for unit, part in parts:
-        for name, sha256 in part["data_sha256"].items():
-            if found.setdefault(name, sha256) != sha256:
-                raise ValueError(f"part {unit.file} is of another {name!r} than others are")
-    return dict(sorted(found.items()))
 
 
 def main(argv: Sequence[str] | None = None) -> int:
