@@ -41,7 +41,7 @@ BATCH, LEARNING_RATE, DECAY, EPOCHS = 32, 5e-4, 0.8, 100
 KEPT_EVERY = 10
 VANISHES = 1e-30
 """Means of gradients below are set to zero. Those of units that no longer learn halve every seven
-steps, for ever, and subnormal numbers cost a processor a hundred times as much."""
+steps, for ever, and subnormal numbers cost a processor many times as much."""
 State = tuple[Tensor, Tensor]
 
 
