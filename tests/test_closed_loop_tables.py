@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from affordlib.evaluation import closed_loop
 from affordlib.evaluation.closed_loop import N_TRIALS, draw_trial
 from affordlib.evaluation.closed_loop_tables import ROWS
 from affordlib.evaluation.feasibility import is_feasible, on_the_rim, possible
@@ -72,5 +73,20 @@ def test_rows_tell_the_endings_and_both_rates():
     height = ROWS["height"](records)[0]
     assert (height["feasible"], height["within_percent"]) == (8, 75.0)
     assert height["off_m_mean"] == pytest.approx(0.001)
+    lost = [record(True, "lost") | {"object_class": "cuboid"}] * 2
+    of_class = {r["object_class"]: r for r in ROWS["height"](records + lost)}
+    assert (of_class["cuboid"]["within_percent"], of_class["cuboid"]["lost"]) == (100.0, 2)
+    assert of_class["cuboid"]["off_m_mean"] is None
     aside = [record(True, "reached") | {"distance_m": 0.02}] * 2  # as high, but not there
     assert ROWS["height"](records + aside)[0]["within_percent"] == 60.0
+
+
+def test_a_table_of_other_models_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(closed_loop, "repo_root", lambda: tmp_path)
+    monkeypatch.setattr(closed_loop, "settings_sha256", lambda table, seed: table)
+    monkeypatch.setattr(closed_loop, "run_table", lambda *asked: None)
+    part = closed_loop._part("height", 0)
+    closed_loop._write_records(part, "of other models", {})
+    with pytest.raises(ValueError, match=r"height_0\.jsonl is of other models .*--tables height"):
+        closed_loop.main(["--tables", "reachability", "--out", str(tmp_path)])
+    assert not (tmp_path / "closed_loop.json").exists()

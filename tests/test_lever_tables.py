@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from affordlib.models.lever import (
     beginning_errors_m,
     window_errors_m,
 )
+from affordlib.models.make_checkpoints import shipped_lever_model
 from affordlib.paths import repo_root
 from affordlib.results import read_results
 
@@ -119,6 +121,17 @@ def test_differences_are_paired_by_object():
     assert first["sem_cm"] == pytest.approx(np.std([0.1, 0.5, 1.0], ddof=1) / math.sqrt(3))
 
 
+def test_two_trainings_of_one_fold_are_not_pooled(tmp_path, monkeypatch):
+    monkeypatch.setattr(lever_tables, "checked_part", lambda *asked: {})
+    for epochs in (20, 100):
+        unit = LeverUnit("lstm_published", "window", epochs=epochs)
+        (tmp_path / unit.file).write_text(json.dumps({"unit": asdict(unit)}))
+        if epochs == 20:
+            assert len(lever_tables.read_parts(tmp_path)) == 1
+    with pytest.raises(ValueError, match=r"20epochs.* 100|100epochs.*delete one"):
+        lever_tables.read_parts(tmp_path)
+
+
 def test_shapes_never_seen_stand_beside_the_same_shapes_when_they_are_known():
     known = (LeverUnit("anchored"), _part([0.1, 0.5, 1.0]))
     strange = (LeverUnit("anchored", no_edges=3), _part([0.4, 0.6]))
@@ -182,6 +195,15 @@ def test_both_networks_had_the_same_budget_of_tuning(committed):
         }
         taken = {of for (model, _, of), row in rows.items() if model == name and row["taken"]}
         assert taken == {min(errors, key=errors.get)}
+
+
+def test_the_shipped_network_stands_for_its_own_training_only():
+    whole = open_interactions("lever_up")
+    asked = "anchored", "all", LEVER_MODELS["anchored"]
+    split = split_of(LeverUnit("anchored"), whole)
+    assert shipped_lever_model(*asked, whole, split)[1] == {"checkpoint": "lever_anchored"}
+    other = whole.assign(effect=2 * whole["effect"])  # the same numbers of interactions
+    assert shipped_lever_model(*asked, other, split) is None
 
 
 @pytest.mark.parametrize("name", ["lever_anchored", "lever_lstm_window", "lever_lstm_first_step"])

@@ -235,6 +235,9 @@ def test_strange_inputs_are_refused(some):
     for t in (-0.2, 1.5, math.nan):
         with pytest.raises(ValueError, match=r"t_target must lie in \[0, 1\]"):
             network.predict(features, pushed, torch.full((1, 1), t))
+    nowhere = dataclasses.replace(pushed, action=torch.full_like(pushed.action, math.nan))
+    with pytest.raises(ValueError, match="starts nan m"):
+        network.predict(features, nowhere, torch.ones(1, 1))
     with pytest.warns(OutOfRangeWarning, match=r"ends 0\.200 m away, those trained on 0\.0\d+ to"):
         network.predict(
             features,
@@ -279,6 +282,14 @@ def test_the_literal_loop_and_the_batch_agree(network, some):
     torch.testing.assert_close(sum(losses), batch_loss(network, batch).detach(), rtol=1e-5, atol=0)
     for a, b in zip(together, apart, strict=True):
         assert (a - b).norm() <= 1e-4 * a.norm() + 1e-5
+
+
+def test_what_cannot_be_loaded_is_not_saved(some, tmp_path):
+    mine = made("film, push", some)
+    mine.__class__ = type("Mine", (type(mine),), {})
+    with pytest.raises(TypeError, match=r"model must be one of .*film.*, got a Mine"):
+        save_checkpoint(mine, tmp_path / "m.safetensors", {})
+    assert not list(tmp_path.iterdir())
 
 
 def test_checkpoints_of_every_network(network, some, tmp_path):

@@ -1,13 +1,21 @@
 """Table 3: its rows, its variants, and that the committed one belongs to what is shipped."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from affordlib.evaluation import planners, planning
-from affordlib.evaluation.goals import ROLLABLE, STANDING, PlanningTask, frozen_tasks, main
+from affordlib.evaluation.goals import (
+    FAMILIES,
+    ROLLABLE,
+    STANDING,
+    PlanningTask,
+    frozen_tasks,
+    main,
+)
 from affordlib.evaluation.oracle import N_DIRECTIONS, WARY_RAD, touchy
 from affordlib.evaluation.planners import VARIANTS
 from affordlib.evaluation.planning import (
@@ -19,7 +27,7 @@ from affordlib.evaluation.planning import (
     tasks_sha256,
 )
 from affordlib.paths import repo_root
-from affordlib.planning import map_effects, plan_astar
+from affordlib.planning import MODES, map_effects, plan_astar
 from affordlib.primitives import Drag
 from affordlib.results import read_results
 from affordlib.world import Cuboid
@@ -116,12 +124,29 @@ def test_a_nudged_object_is_off_where_the_robot_believes_it(world, film):
 
 
 def test_a_variant_asked_every_so_often_is_compared_on_the_same_goals():
-    every = {"continuous": records([0.001, 0.002, 0.003, 0.004])}
-    every["oracle"] = records([0.001, 0.003])
-    assert VARIANTS["oracle"].every == 2
-    (row,) = paired_rows(every)
+    every = {"varied": records([0.001, *[0.002] * 4, 0.003, *[0.004] * 4])}
+    every["varied_oracle"] = records([0.001, 0.003])
+    assert VARIANTS["varied_oracle"].every == 5
+    (row,) = paired_rows(every, "varied")
     assert row["n"] == 2
     assert row["difference_mean_m"] == pytest.approx(0.0)
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_variants_are_asked_about_all_their_classes_alike(name):
+    variant = VARIANTS[name]
+    classes = variant.classes if variant.world == "clean" else STANDING
+    asked = variant.asked(frozen_tasks(variant.world), lambda t: (t.goals, t.thing.family))
+    for mode in MODES:
+        of_mode = [t.thing.family for t in asked if t.mode == mode and t.goals == "constructed"]
+        counts = [of_mode.count(family) for family in classes]
+        assert sum(counts) == len(of_mode) > 0
+        assert max(counts) - min(counts) <= 1
+
+
+def test_the_goals_belong_to_what_decides_the_numbers():
+    fewer = VARIANTS["gradient_25"]
+    assert fewer.about() != replace(fewer, goals=FAMILIES).about()
 
 
 def test_variants_ask_only_for_what_they_can():

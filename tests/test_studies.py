@@ -163,10 +163,10 @@ def test_shares_are_of_the_usual_effect(of_all):
             return Prediction(end, end, end, end)
 
     model = Knowing()
-    assert one_for_all.shares(of_all)(model, None).tolist() == [0, 0, 0, 0]
+    assert one_for_all.shares(of_all)(model, None).tolist() == [0]
     model.known = 0.5
-    told = one_for_all.shares(of_all)(model, None)
-    assert ((told > 0.25) & (told <= 0.5)).all()
+    (told,) = one_for_all.shares(of_all)(model, None)
+    assert 0.25 < told <= 0.5
 
 
 def test_stale_studies_are_refused(tmp_path, monkeypatch):
@@ -180,6 +180,28 @@ def test_stale_studies_are_refused(tmp_path, monkeypatch):
     (tmp_path / "small.json").write_text(json.dumps(told | {"data_sha256": {"grasp": "old"}}))
     with pytest.raises(ValueError, match=r"small\.json has another data_sha256 .* --only small"):
         read_study("small", tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "module", "what", "other"),
+    [
+        ("latent", studies, "WEIGHTS", (0.5,)),
+        ("mixed", studies, "HALF_WAY_M", 0.2),
+        ("varied", studies, "VARIED_FOLDS", 1),
+        (
+            "ablation",
+            ablation,
+            "CHANGES",
+            {"plain likelihood (β = 0)": {"training": {"beta": 1.0}}},
+        ),
+        ("one_for_all", one_for_all, "FOLDS", 1),
+    ],
+)
+def test_what_decides_a_study_decides_its_hash(name, module, what, other, monkeypatch):
+    before = studies.hashes(name)
+    now = {**getattr(module, what), **other} if isinstance(other, dict) else other
+    monkeypatch.setattr(module, what, now)
+    assert studies.hashes(name)["settings_sha256"] != before["settings_sha256"]
 
 
 def test_the_committed_studies_tell_the_story():

@@ -55,6 +55,18 @@ def test_the_literal_loop_stops_early_and_keeps_its_best(some, monkeypatch):
         assert torch.equal(value, kept[2.0][name])
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
+def test_a_gpu_trains_what_any_score_judges(some):
+    def score(model, arrays):
+        end = torch.ones(len(arrays), 1)
+        told = model.predict(model.encode(arrays.image), observe_action(arrays), end)
+        return (told.effect_mean[:, 0] - arrays.effect[:, -1]).norm(dim=-1)
+
+    network = fresh(some)
+    train(network, some, some, TrainingConfig(steps=20, validate_every=10), False, score=score)
+    assert next(network.parameters()).device.type == "cpu"
+
+
 class Stopped(Exception):
     pass
 

@@ -337,6 +337,19 @@ def test_parts_that_would_be_one_row_are_refused(tmp_path):
         pooled.read_parts(tmp_path)
 
 
+def test_a_fold_may_lack_a_class():
+    def part(families):
+        errors = [0.001 * (k + 1) for k in range(len(families))]
+        names = ("final_error", "trajectory_error", "after_contact_error")
+        return {"n": 100, "fixed_test": {"family": families, **dict.fromkeys(names, errors)}}
+
+    folds = [part([0, 0, 1]), part([0, 0, 1]), part([0, 0])]
+    told = [(Unit("film", "drag", fold=k), fold) for k, fold in enumerate(folds)]
+    rows = tables.error_rows(told, "drag", "fixed_test")
+    assert [row["trainings_sd_m"] for row in rows[1:]] == pytest.approx([0, 0])
+    assert rows[0]["trainings_sd_m"] == pytest.approx(np.std([2.25, 2.25, 1.5], ddof=1) / 1000)
+
+
 def test_a_second_cross_validation_counts_no_grasp_twice(tmp_path):
     run_units(FEW, tmp_path, progress=False)
     one = grasps_module.grasp_rows(pooled.read_parts(tmp_path))

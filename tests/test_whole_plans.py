@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from affordlib.evaluation import whole_plans
+from affordlib.paths import repo_root
 from affordlib.results import read_results
 
 
@@ -44,3 +45,8 @@ def test_the_table_is_written(tmp_path):
     assert whole_plans.main(["--n", "1", "--out", str(tmp_path)]) == 0
     tables = read_results(tmp_path / "whole_plans.json")["tables"]
     assert [len(tables[name]) for name in ("orientation", "height")] == [4, 4]
+
+
+def test_the_committed_table_is_of_the_shipped_checkpoints():
+    committed = read_results(repo_root() / "data" / "results" / "whole_plans.json")
+    assert committed["parameters"] == whole_plans.made_with()

@@ -14,7 +14,7 @@ import torch
 
 from affordlib.evaluation.baselines import Forecast, features, logistic
 from affordlib.interactions import TrainingArrays
-from affordlib.interactions.batches import observe_action, plane_of
+from affordlib.interactions.batches import believable, observe_action, plane_of
 from affordlib.models.calibration import LEVELS, coverage
 from affordlib.models.network import gaussian_nll
 from affordlib.primitives import Grasp
@@ -36,11 +36,6 @@ CONTACT_M = 0.001
 def steps_of(arrays: TrainingArrays) -> torch.Tensor:
     """Sample numbers of the 25 steps, the last of them t = 1."""
     return torch.arange(EVERY, len(arrays.phase), EVERY)
-
-
-def believable(data: xr.Dataset, interactions: np.ndarray) -> np.ndarray:
-    """Those of the interactions that the arm could reach, without faults of the simulator."""
-    return interactions[(data["reached"].values & ~data["fault"].values)[interactions]]
 
 
 @torch.no_grad()

@@ -257,9 +257,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     # Also those of earlier runs.
     tables = {}
     for table, rows in ROWS.items():
-        sha256 = settings_sha256(table, options.seed)
-        if records := read_records(_part(table, options.seed), sha256):
+        part, sha256 = _part(table, options.seed), settings_sha256(table, options.seed)
+        if records := read_records(part, sha256):
             tables[table] = rows([records[i] for i in sorted(records)])
+        elif part.is_file():
+            raise ValueError(
+                f"part {part.name} is of other models or code than {table!r} has now; run "
+                f"`--tables {table}` again, or delete it"
+            )
     name = f"closed_loop_seed{options.seed}" if options.seed else "closed_loop"
     path = write_results(options.out, name, {"seed": options.seed}, tables)
     print(f"{path.name} written")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,11 @@ WITHIN_M, WITHIN_HEIGHT_M, WITHIN_TURN_RAD = 0.005, 0.005, math.radians(3)
 
 def _share(chosen: Sequence[dict], good: Callable[[dict], bool]) -> float | None:
     return 100 * float(np.mean([good(r) for r in chosen])) if chosen else None
+
+
+def _mean(values: Iterable[float]) -> float | None:
+    values = list(values)
+    return float(np.mean(values)) if values else None
 
 
 def _groups(records: Sequence[dict], *by: str) -> Iterator[tuple[dict[str, Any], list[dict]]]:
@@ -41,9 +46,7 @@ def pose_rows(records: Sequence[dict], column: str, within: float, unit: str) ->
     for about, chosen in _groups(records, "object_class"):
         feasible = [r for r in chosen if r["feasible"]]
         reached = [r for r in feasible if r["ending"] == "reached"]
-        if not reached:
-            continue
-        spread = error_row(np.array([abs(r[column]) for r in reached]))
+        spread = error_row(np.array([abs(r[column]) for r in reached])) if reached else {}
         rows.append(
             {
                 **about,
@@ -54,11 +57,11 @@ def pose_rows(records: Sequence[dict], column: str, within: float, unit: str) ->
                     feasible, lambda r: r["distance_m"] <= WITHIN_M and abs(r[column]) <= within
                 ),
                 **{
-                    f"off_{unit}_{name}": spread[f"{name}_m"]
+                    f"off_{unit}_{name}": spread.get(f"{name}_m")
                     for name in ("mean", "sem", "median", "p95")
                 },
-                "distance_m_mean": float(np.mean([r["distance_m"] for r in reached])),
-                "actions_mean": float(np.mean([r["actions"] for r in reached])),
+                "distance_m_mean": _mean(r["distance_m"] for r in reached),
+                "actions_mean": _mean(r["actions"] for r in reached),
             }
         )
     return rows
@@ -70,13 +73,7 @@ def disturbance_rows(records: Sequence[dict]) -> list[dict]:
     for about, chosen in _groups(records, "kind", "object_class"):
         feasible = [r for r in chosen if r["feasible"]]
         both = [r for r in feasible if r["ending"] == r["undisturbed"]["ending"] == "reached"]
-        if not both:
-            continue
-        with_, without = (
-            np.array([r["distance_m"] for r in rs])
-            for rs in (both, [r["undisturbed"] for r in both])
-        )
-        apart = with_ - without
+        apart = np.array([r["distance_m"] - r["undisturbed"]["distance_m"] for r in both])
         rows.append(
             {
                 **about,
@@ -84,16 +81,14 @@ def disturbance_rows(records: Sequence[dict]) -> list[dict]:
                 "feasible": len(feasible),
                 **_endings(chosen),
                 "within_percent": _share(feasible, lambda r: r["distance_m"] <= WITHIN_M),
-                "disturbed_mean_m": float(with_.mean()),
-                "undisturbed_mean_m": float(without.mean()),
-                "apart_mean_m": float(apart.mean()),
+                "disturbed_mean_m": _mean(r["distance_m"] for r in both),
+                "undisturbed_mean_m": _mean(r["undisturbed"]["distance_m"] for r in both),
+                "apart_mean_m": _mean(apart),
                 "apart_sem_m": float(apart.std(ddof=1) / math.sqrt(len(apart)))
                 if len(apart) > 1
-                else 0.0,
-                "actions_mean": float(np.mean([r["actions"] for r in feasible])),
-                "undisturbed_actions_mean": float(
-                    np.mean([r["undisturbed"]["actions"] for r in feasible])
-                ),
+                else None,
+                "actions_mean": _mean(r["actions"] for r in feasible),
+                "undisturbed_actions_mean": _mean(r["undisturbed"]["actions"] for r in feasible),
             }
         )
     return rows

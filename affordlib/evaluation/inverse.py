@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from affordlib.evaluation.answers import believable
-from affordlib.interactions.batches import TrainingArrays
+from affordlib.interactions.batches import TrainingArrays, believable
 from affordlib.interactions.recipes import Recipe, draw_scene, draw_world
 from affordlib.models.protocol import EffectModel, observe_final_effect
 from affordlib.primitives import Push, wrap_angle

@@ -47,6 +47,16 @@ def read_parts(folder: str | Path = PARTS) -> list[tuple[LeverUnit, dict[str, An
     folder = resolve_out_dir(folder)
     units = [LeverUnit(**json.loads(path.read_text())["unit"]) for path in folder.glob("*.json")]
     units.sort(key=lambda u: (MODELS.index(u.model), u.trained_for, u.no_edges or 0, u.fold))
+    seen: dict[tuple, str] = {}
+    for unit in units:
+        other = seen.setdefault(
+            (unit.model, unit.trained_for, unit.fold, unit.no_edges, unit.seed), unit.file
+        )
+        if other != unit.file:
+            raise ValueError(
+                f"{other} and {unit.file} are of one fold, trained for other numbers of epochs; "
+                "delete one of them"
+            )
     return [(unit, checked_part(unit, folder, hashes(unit))) for unit in units]
 
 

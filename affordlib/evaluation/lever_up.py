@@ -36,6 +36,7 @@ from affordlib.evaluation.parts import (
     sha256_of,
 )
 from affordlib.interactions import Normaliser, Split, split_interactions
+from affordlib.interactions.batches import believable
 from affordlib.interactions.lever import AHEAD, POSE_CHANNELS, SEEN, lever_arrays, n_windows
 from affordlib.interactions.recipes import Recipe, draw_scene
 from affordlib.interactions.store import stored_sha256
@@ -178,7 +179,7 @@ def run_unit(unit: LeverUnit, folder: Path, progress: bool = False) -> bool:
     else:
         model, part["training"] = _fit(unit, data, split, halfway, progress)
         told = {protocol: _foreseen(model, test, protocol) for protocol in unit.protocols}
-    part["interaction"] = data["interaction"].values[_kept(data, split.test)].tolist()
+    part["interaction"] = data["interaction"].values[believable(data, split.test)].tolist()
     part["tests"] = {protocol: _answers(found) for protocol, found in told.items()}
     if unit.model == BASELINES[0]:
         part["step_moves_cm"] = (100 * test.effect[..., :3].diff(dim=1).norm(dim=-1)).tolist()
@@ -200,10 +201,6 @@ def _shortened(value: Any) -> Any:
 def _view(unit: LeverUnit) -> str:
     known = LEVER_MODELS.get(unit.model)
     return known.view if known else "full" if unit.model == "lstm_published" else "near"
-
-
-def _kept(data: xr.Dataset, chosen: np.ndarray) -> np.ndarray:
-    return chosen[(data["reached"].values & ~data["fault"].values)[chosen]]
 
 
 def _fit(

@@ -98,6 +98,8 @@ class Variant:
             "checkpoints": files,
             "format": ORACLE_FORMAT if self.sees_world else FORMATS[self.planner],
         }
+        if self.goals != FAMILIES:
+            more["goals"] = list(self.goals)
         if self.every > 1:
             more["every"] = self.every
         if self.looks > 1:
@@ -211,8 +213,8 @@ VARIANTS: dict[str, Variant] = {
     "continuous_nudged": _continuous(**_FILM, **_CONSTRUCTED, nudged=True),
     "astar_lstm": _astar(**_LSTM, **_CONSTRUCTED),
     "continuous_lstm": _continuous(**_LSTM, **_CONSTRUCTED),
-    "oracle": _continuous(name="oracle_privileged", **_ORACLE, every=2),
-    "oracle_wary": _continuous(name="oracle_privileged", **_ORACLE, every=2, wary=True),
+    "oracle": _continuous(name="oracle_privileged", **_ORACLE),
+    "oracle_wary": _continuous(name="oracle_privileged", **_ORACLE, wary=True),
     "varied": _continuous(**_VARIED, **_CONSTRUCTED),
     "varied_corrected": _continuous(**_VARIED, **_CONSTRUCTED, corrections=2),
     "varied_looks": _continuous(**_VARIED, **_CONSTRUCTED, corrections=2, looks=8),

@@ -198,7 +198,11 @@ def assemble() -> Path:
     if not rows:
         raise FileNotFoundError(f"there are no parts in {PARTS}; run some variants first")
     summary = [*reported.planning_rows(), *summary_rows(rows)]
-    tables = {"planning": rows, "summary": summary, "paired": paired_rows(parts)}
+    tables = {
+        "planning": rows,
+        "summary": summary,
+        "paired": paired_rows(parts) + paired_rows(parts, "varied"),
+    }
     tables["error_decomposition"] = decomposition_rows(rows)
     hashes = {world: tasks_sha256(world) for world in FROZEN}
     return write_results("data/results", NAME, {"goals_sha256": hashes}, tables)

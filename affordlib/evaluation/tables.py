@@ -59,7 +59,8 @@ def error_rows(parts: list[tuple[Unit, Part]], data: str, test: str) -> list[dic
         for name in ("all", *sorted(set(pooled[first].classes))):
             row = about | {"object_class": name, "n": pooled[first].count(name)}
             row |= pooled[first].columns(first, unit, name)
-            each = [pool([t], final).mean_sem(name)[0] for t in told]
+            each = [pool([t], final) for t in told]
+            each = [fold.mean_sem(name)[0] for fold in each if name in ("all", *fold.classes)]
             row[f"trainings_sd_{unit}"] = float(np.std(each, ddof=1)) if len(each) > 1 else None
             for key in ("trajectory_error", "after_contact_error"):
                 row[f"{key}_mean_{unit}"] = pooled[key].mean_sem(name)[0]

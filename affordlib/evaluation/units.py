@@ -24,7 +24,6 @@ import numpy as np
 
 from affordlib.evaluation.answers import (
     baseline_answers,
-    believable,
     logistic_answers,
     network_answers,
     stored,
@@ -34,7 +33,7 @@ from affordlib.evaluation.baselines import BASELINES
 from affordlib.evaluation.inverse import along_effect, executed_record, inverse_record
 from affordlib.evaluation.parts import checked_part, open_once, options_of, run_parts, sha256_of
 from affordlib.interactions import Normaliser, TrainingArrays, split_interactions
-from affordlib.interactions.batches import Symmetry, symmetric_copies
+from affordlib.interactions.batches import Symmetry, believable, symmetric_copies
 from affordlib.interactions.store import stored_sha256
 from affordlib.models.attention import AttentionConfig
 from affordlib.models.calibration import fit_temperature

@@ -19,7 +19,9 @@ from tqdm.auto import tqdm
 from affordlib.evaluation.closed_loop import N_TRIALS, draw_trial
 from affordlib.evaluation.closed_loop_tables import WITHIN_HEIGHT_M, WITHIN_M, WITHIN_TURN_RAD
 from affordlib.evaluation.effect_prediction import error_row
+from affordlib.models.checkpoint import checkpoint_sha256
 from affordlib.planning import Repertoire, carry_out, plan_astar, plan_continuous
+from affordlib.planning.repertoire import CHECKPOINTS
 from affordlib.primitives import wrap_angle
 from affordlib.results import write_results
 from affordlib.world import Tabletop, UnreachableError
@@ -92,6 +94,11 @@ def whole_plan_rows(records: Sequence[dict], unit: str, within: float) -> list[d
     return rows
 
 
+def made_with() -> dict[str, dict[str, str]]:
+    """Hashes of the checkpoints that plan."""
+    return {"checkpoints": {name: checkpoint_sha256(name)[:16] for name in CHECKPOINTS.values()}}
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Make and carry out the plans, and write the table; ten minutes."""
     parser = argparse.ArgumentParser(
@@ -108,7 +115,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             asked = [(table, index, planner) for index in range(n) for planner in PLANNERS]
             records = [run_trial(*query, world, repertoire) for query in tqdm(asked, table)]
             tables[table] = whole_plan_rows(records, unit, within)
-    path = write_results(options.out, "whole_plans", {}, tables)
+    path = write_results(options.out, "whole_plans", made_with(), tables)
     print(f"{path.name} written")
     return 0
 

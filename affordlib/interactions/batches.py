@@ -19,6 +19,11 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
+def believable(data: xr.Dataset, interactions: np.ndarray) -> np.ndarray:
+    """Those of the interactions that the arm could reach, without faults of the simulator."""
+    return interactions[(data["reached"].values & ~data["fault"].values)[interactions]]
+
+
 @dataclass(frozen=True)
 class Split:
     """Interaction numbers for training, validation and test."""
@@ -137,8 +142,7 @@ class TrainingArrays:
         Left out are faults of the simulator and actions that were out of reach.
         """
         chosen = np.arange(data.sizes["interaction"]) if interactions is None else interactions
-        chosen = chosen[(data["reached"].values & ~data["fault"].values)[chosen]]
-        part = data.isel(interaction=chosen)
+        part = data.isel(interaction=believable(data, chosen))
 
         def channels(kind: str, names: tuple[str, ...]) -> torch.Tensor:
             known = data.attrs[f"{kind}_channels"].split()

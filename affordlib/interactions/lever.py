@@ -21,7 +21,14 @@ import torch
 import torch.nn.functional as F
 from PIL import Image
 
-from affordlib.interactions.batches import Batch, Symmetry, TrainingArrays, observe, turn
+from affordlib.interactions.batches import (
+    Batch,
+    Symmetry,
+    TrainingArrays,
+    believable,
+    observe,
+    turn,
+)
 from affordlib.types import LEVER_IMAGE_PIXELS, Observations
 
 if TYPE_CHECKING:
@@ -52,7 +59,7 @@ def lever_arrays(
     channels = ("x", "y", "z"), POSE_CHANNELS
     arrays = TrainingArrays.from_dataset(data, interactions, *channels)
     chosen = np.arange(data.sizes["interaction"]) if interactions is None else interactions
-    chosen = chosen[(data["reached"].values & ~data["fault"].values)[chosen]]
+    chosen = believable(data, chosen)
     theta = torch.from_numpy(data["theta"].values[chosen])
     back = torch.stack([theta.cos(), -theta.sin()], dim=-1).float()[:, None]
     contact = np.stack([data[f"contact_{k}"].values[chosen] for k in "xy"] + [0 * theta], axis=-1)

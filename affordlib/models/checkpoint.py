@@ -51,9 +51,12 @@ def save_checkpoint(model: EffectNetwork, path: str | Path, about: dict[str, Any
     path = Path(path)
     if path.suffix != SUFFIX:
         raise ValueError(f"path must end in {SUFFIX!r}, got {str(path)!r}")
+    kind = next((name for name, (network, _) in NETWORKS.items() if network is type(model)), None)
+    if kind is None:
+        raise TypeError(f"model must be one of {list(NETWORKS)}, got a {type(model).__name__}")
     description = {
         "format": FORMAT,
-        "model": next(name for name, (kind, _) in NETWORKS.items() if kind is type(model)),
+        "model": kind,
         "config": asdict(model.config)
         | {"sigma_floor": model.sigma_floor, "temperature": model.temperature},
         "normaliser": asdict(model.normaliser),

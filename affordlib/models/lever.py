@@ -147,6 +147,11 @@ _DRAWS = {"all": _draw_all, "window": draw_windows, "first_step": draw_beginning
 _SCORES = {"all": _all_errors_m, "window": window_errors_m, "first_step": beginning_errors_m}
 
 
+def lever_training(lever: LeverModel, data: xr.Dataset, split: Split) -> TrainingArrays:
+    """What a network learns from: a split's training part and its mirror image."""
+    return symmetric_copies(lever_arrays(data, split.train, lever.view), MIRRORED)
+
+
 def train_lever_model(
     lever: LeverModel,
     data: xr.Dataset,
@@ -161,7 +166,7 @@ def train_lever_model(
     """
     if trained_for not in TRAINED_FOR:
         raise ValueError(f"trained_for must be one of {TRAINED_FOR}, got {trained_for!r}")
-    training = symmetric_copies(lever_arrays(data, split.train, lever.view), MIRRORED)
+    training = lever_training(lever, data, split)
     validation = lever_arrays(data, split.validation, lever.view)
     return fit_lever_model(lever, training, validation, trained_for, progress, checkpoint)
 

@@ -33,7 +33,12 @@ from affordlib.models.checkpoint import SUFFIX, build, load_checkpoint, save_che
 from affordlib.models.cnp import CNPConfig
 from affordlib.models.film import FiLMConfig
 from affordlib.models.frame import heading, inverse
-from affordlib.models.lever import LEVER_MODELS, LeverModel, train_lever_model
+from affordlib.models.lever import (
+    LEVER_MODELS,
+    LeverModel,
+    lever_training,
+    train_lever_model,
+)
 from affordlib.models.lstm import LSTMConfig, LSTMNetwork
 from affordlib.models.training import TrainingConfig, TrainingRecord, final_errors_m, train
 from affordlib.paths import repo_root
@@ -221,7 +226,8 @@ def shipped_lever_model(
             return None
         expected = about_lever_training(data, split, lever, trained_for)
         network = replace(model.config, sigma_floor=lever.network.sigma_floor)
-        if about == expected and network == lever.network:
+        scales = Normaliser.fit(lever_training(lever, data, split))
+        if about == expected and network == lever.network and model.normaliser == scales:
             return model, {"checkpoint": checkpoint}
     return None
 

@@ -243,8 +243,8 @@ class EffectNetwork(nn.Module, ABC):
             ("starts", n.start_radius_m, o.action_t < _END_PHASE),
             ("ends", n.end_radius_m, o.action_t > 1 - _END_PHASE),
         ):
-            far = (radius < low - RADIUS_TOLERANCE_M) | (radius > high + RADIUS_TOLERANCE_M)
-            strange = far & at_end & o.action_mask
+            near = (radius > low - RADIUS_TOLERANCE_M) & (radius < high + RADIUS_TOLERANCE_M)
+            strange = ~near & at_end & o.action_mask
             if strange.any():
                 raise ValueError(
                     f"an observed action {name} {float(radius[strange][0]):.3f} m from the "
@@ -258,8 +258,8 @@ class EffectNetwork(nn.Module, ABC):
             return
         low, high = n.effect_radius_m
         radius = o.effect.detach()[..., plane].norm(dim=-1)
-        far = (radius < low - RADIUS_TOLERANCE_M) | (radius > high + RADIUS_TOLERANCE_M)
-        strange = far & (o.effect_t > 1 - _END_PHASE) & o.effect_mask
+        near = (radius > low - RADIUS_TOLERANCE_M) & (radius < high + RADIUS_TOLERANCE_M)
+        strange = ~near & (o.effect_t > 1 - _END_PHASE) & o.effect_mask
         if strange.any():
             warnings.warn(
                 f"an observed effect ends {float(radius[strange][0]):.3f} m away, those trained "

@@ -248,7 +248,9 @@ def train(
             state = {k: v.clone() for k, v in model.state_dict().items()}
             candidate = {k: v.clone() for k, v in run.mean.items()} if config.ema else state
             model.load_state_dict(candidate)
-            error = float(score(model, validation).mean())
+            # Any score will do: like the arrays, the model is on the processor while it is judged.
+            error = float(score(model.cpu(), validation).mean())
+            model.to(device)
             model.load_state_dict(state)
             run.seconds = time.perf_counter() - start
             run.history.append(TrainingRecord(run.step, run.seconds, float(loss), error))

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from affordlib.planning import Pursuit
-    from affordlib.types import Outcome, Plan
+    from affordlib.types import Goal, Outcome, Plan
     from affordlib.world import Thing
 
 GOAL, PREDICTION, TRUTH, NEUTRAL = "#0072B2", "#D55E00", "#009E73", "#777777"
@@ -100,6 +100,15 @@ def plot_footprint(
 _PLATE = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 1}
 
 
+def _beside(ax: Axes, words: str, end_cm: np.ndarray, goal: Goal, below: int) -> int:
+    """Name an action that stays in its place, to the right of it and below the one before."""
+    x, y = end_cm
+    at = (x + 100 * goal.tolerance_m, y)
+    offset = (8, below - 11)
+    ax.annotate(words, at, offset, textcoords="offset points", fontsize=8, bbox=_PLATE)
+    return below - 11
+
+
 def plot_plan(
     ax: Axes, plan: Plan, sigma: bool = True, thing: Thing | None = None, yaw_rad: float = 0.0
 ) -> Axes:
@@ -119,15 +128,7 @@ def plot_plan(
         end = 100 * np.array(step.predicted_end_xy_m)
         label = f"{k + 1}: {100 * step.stop_phase:.0f} %"
         if isinstance(step.primitive, Grasp | Rotate):
-            below -= 11
-            ax.annotate(
-                f"{label} {step.primitive.name}",
-                (end[0] + 100 * plan.goal.tolerance_m, end[1]),
-                (8, below),
-                textcoords="offset points",
-                fontsize=8,
-                bbox=_PLATE,
-            )
+            below = _beside(ax, f"{label} {step.primitive.name}", end, plan.goal, below)
             continue
         direction = np.array(
             [math.cos(step.primitive.direction_rad), math.sin(step.primitive.direction_rad)]
@@ -191,6 +192,7 @@ def plot_pursuit(ax: Axes, pursuit: Pursuit, thing: Thing | None = None) -> Axes
         ax.plot(*(100 * np.array(first.xy_m)), "*", color=GOAL, ms=11, mfc="none", zorder=5)
     ax.plot(*(100 * np.array(pursuit.goal.xy_m)), "*", color=GOAL, ms=13, label="goal", zorder=5)
     at = np.array(pursuit.seen_xy_m[0])
+    below = 0
     ax.plot(*(100 * at), "o", color=NEUTRAL, ms=5)
     for k, (step, path) in enumerate(zip(pursuit.steps, pursuit.object_paths_xy_m, strict=True)):
         if np.hypot(*(path[0] - at)) > 0.003:
@@ -199,6 +201,10 @@ def plot_pursuit(ax: Axes, pursuit: Pursuit, thing: Thing | None = None) -> Axes
         ax.plot(*(100 * path.T), color=TRUTH, lw=2, label="truth" if k == 0 else None)
         end = 100 * np.array(step.predicted_end_xy_m)
         ax.plot(*end, "o", color=PREDICTION, ms=5, label="prediction" if k == 0 else None)
+        if isinstance(step.primitive, Grasp | Rotate):
+            below = _beside(ax, f"{k + 1} {step.primitive.name}", end, pursuit.goal, below)
+            at = path[-1]
+            continue
         x, y = path[-1] - path[0]
         aside = np.array([-y, x]) / max(math.hypot(x, y), 1e-6)
         ax.annotate(
