@@ -47,6 +47,7 @@ def test_baselines_are_right_about_what_they_assume():
         ({"model": "gru"}, "model must be one of"),
         ({"model": "anchored", "fold": 5}, r"fold must lie in \[0, 4\], got 5"),
         ({"model": "lstm_tuned"}, "trained for one protocol each"),
+        ({"model": "anchored_single"}, "trained for one protocol each"),
         ({"model": "anchored", "trained_for": "window"}, "the others for all"),
         ({"model": "anchored", "no_edges": 9}, r"no_edges must lie in \[3, 8\]"),
         ({"model": "anchored", "epochs": 2}, "epochs belong to 'lstm_published'"),
@@ -166,6 +167,12 @@ def test_committed_science(committed):
     assert all(a <= b for a, b in zip(ours, (0.34, 0.35, 0.36, 0.38, 0.39), strict=True))
     for model in ("persistence", "constant_velocity", "paper"):
         assert all(a < b for a, b in zip(ours, window(model), strict=True))
+    single, recurrent = window("anchored_single"), window("lstm_tuned")
+    assert all(a < b for a, b in zip(single, ours, strict=True))
+    assert [a < b for a, b in zip(single, recurrent, strict=True)] == [False] + 4 * [True]
+    units = [LeverUnit(model, "window") for model in ("anchored_single", "lstm_tuned")]
+    hashes = [lever_up.hashes(unit) for unit in (*units, LeverUnit("anchored"))]
+    assert len({told["configuration_sha256"] for told in hashes}) == 3
 
 
 def test_a_setting_changes_what_it_says():

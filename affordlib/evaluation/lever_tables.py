@@ -26,6 +26,7 @@ from affordlib.evaluation.lever_up import (
     NAME,
     PARTS,
     RECURRENT,
+    SINGLE,
     LeverUnit,
     hashes,
     numbered_edges,
@@ -161,10 +162,12 @@ def motion_rows(parts: Group) -> list[dict[str, Any]]:
 def paired_rows(parts: Group, draws: int = 2000) -> list[dict[str, Any]]:
     """Ours minus each of the recurrent ones, object by object, with bootstrapped 95 % intervals.
 
+    Ours as it is, and trained for one protocol at a time.
+
     Objects of the folds that both were trained on; of the windows of an object, the mean.
     """
     rng, rows = np.random.default_rng(0), []
-    for rival, protocol in product(RECURRENT, PROTOCOLS):
+    for ours, rival, protocol in product((OURS, SINGLE), RECURRENT, PROTOCOLS):
         found = {
             model: {
                 (unit.fold, number): np.mean(error, axis=0)
@@ -174,17 +177,18 @@ def paired_rows(parts: Group, draws: int = 2000) -> list[dict[str, Any]]:
                     part["interaction"], part["tests"][protocol]["error_cm"], strict=True
                 )
             }
-            for model in (OURS, rival)
+            for model in (ours, rival)
         }
-        both = sorted(found[OURS].keys() & found[rival].keys())
+        both = sorted(found[ours].keys() & found[rival].keys())
         if not both:
             continue
-        gap = np.array([found[OURS][key] - found[rival][key] for key in both])
+        gap = np.array([found[ours][key] - found[rival][key] for key in both])
         means = gap[rng.integers(0, len(gap), (draws, len(gap)))].mean(axis=1)
         low, high = np.quantile(means, [0.025, 0.975], axis=0)
         every = 1 if protocol == "window" else 5
         for k in range(every - 1, gap.shape[1], every):
-            row = {"rival": rival, "protocol": protocol, "steps": k + 1, "n": len(gap)}
+            row = {"ours": ours, "rival": rival, "protocol": protocol}
+            row |= {"steps": k + 1, "n": len(gap)}
             row |= {"difference_cm": float(gap[:, k].mean()), "low_cm": float(low[k])}
             row |= {
                 "high_cm": float(high[k]),

@@ -64,6 +64,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from affordlib.interactions import TrainingArrays
+    from affordlib.models.lever import LeverModel
     from affordlib.models.network import EffectNetwork
 
 FORMAT = 1
@@ -75,7 +76,10 @@ PARTS = "data/results/parts/lever_up"
 N_FOLDS = 5
 BASELINES = ("persistence", "constant_velocity")
 RECURRENT = ("lstm_tuned", "lstm_published")
-MODELS = ("paper", "anchored", "lstm_published", "lstm_tuned", *BASELINES)
+SINGLE = "anchored_single"
+"""Ours, trained for one protocol at a time, as the recurrent ones are."""
+
+MODELS = ("paper", "anchored", SINGLE, "lstm_published", "lstm_tuned", *BASELINES)
 EDGES = range(3, 9)
 
 
@@ -98,9 +102,9 @@ class LeverUnit:
             raise ValueError(f"fold must lie in [0, {N_FOLDS - 1}], got {self.fold!r}")
         if self.no_edges is not None and self.no_edges not in EDGES:
             raise ValueError(f"no_edges must lie in [3, 8], got {self.no_edges!r}")
-        if (self.trained_for == "all") == (self.model in RECURRENT):
+        if (self.trained_for == "all") == (self.model in (SINGLE, *RECURRENT)):
             raise ValueError(
-                f"trained_for: recurrent models {RECURRENT} are trained for one protocol each, the "
+                f"trained_for: {(SINGLE, *RECURRENT)} are trained for one protocol each, the "
                 f"others for all; got {self.trained_for!r} for {self.model!r}"
             )
         if (self.epochs is not None) != (self.model == "lstm_published"):
@@ -123,12 +127,15 @@ class LeverUnit:
 def hashes(unit: LeverUnit) -> dict[str, Any]:
     """What a part must hold to be this unit's: hashes of its configuration and its data."""
     told: dict[str, Any] = {"format": FORMAT, "unit": asdict(unit)}
-    if unit.model in LEVER_MODELS:
-        lever = LEVER_MODELS[unit.model]
+    if lever := _lever(unit):
         told |= {"network": type(lever.network).__name__, "view": lever.view}
         for name in ("network", "training"):
             told |= {f"{name}_{k}": v for k, v in options_of(getattr(lever, name)).items()}
     return {"configuration_sha256": sha256_of(told), "data_sha256": {DATA: stored_sha256(DATA)}}
+
+
+def _lever(unit: LeverUnit) -> LeverModel | None:
+    return LEVER_MODELS.get("anchored" if unit.model == SINGLE else unit.model)
 
 
 def edges_of(data: xr.Dataset) -> np.ndarray:
@@ -199,15 +206,14 @@ def _shortened(value: Any) -> Any:
 
 
 def _view(unit: LeverUnit) -> str:
-    known = LEVER_MODELS.get(unit.model)
+    known = _lever(unit)
     return known.view if known else "full" if unit.model == "lstm_published" else "near"
 
 
 def _fit(
     unit: LeverUnit, data: xr.Dataset, split: Split, halfway: Path, progress: bool
 ) -> tuple[EffectNetwork, dict[str, Any]]:
-    if unit.model in LEVER_MODELS:
-        lever = LEVER_MODELS[unit.model]
+    if lever := _lever(unit):
         lever = replace(lever, training=replace(lever.training, seed=unit.seed))
         if found := shipped_lever_model(unit.model, unit.trained_for, lever, data, split):
             return found
@@ -290,7 +296,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--models", default="anchored,lstm_tuned", help=f"of {','.join(MODELS)}")
     parser.add_argument("--folds", type=int, default=N_FOLDS, help="the first of the five")
     parser.add_argument("--no-edges", type=int, help="leave polygons of so many edges out instead")
-    parser.add_argument("--protocols", default="window,first_step", help="to train the LSTMs for")
+    parser.add_argument(
+        "--protocols",
+        default="window,first_step",
+        help="to train for, one at a time, what is not trained for all",
+    )
     parser.add_argument("--epochs", type=int, default=EPOCHS, help="of the published LSTM")
     parser.add_argument("--out", default=PARTS)
     options = parser.parse_args(argv)
@@ -298,7 +308,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     folds = range(options.folds) if options.no_edges is None else [0]
     for fold, model in product(folds, [*BASELINES, *options.models.split(",")]):
         epochs = options.epochs if model == "lstm_published" else None
-        kinds = options.protocols.split(",") if model in RECURRENT else ["all"]
+        kinds = options.protocols.split(",") if model in (SINGLE, *RECURRENT) else ["all"]
         units += [LeverUnit(model, k, fold, options.no_edges, epochs=epochs) for k in kinds]
     ran = run_parts(units, run_unit, options.out)
     print(f"{ran} of {len(units)} units run, the others were there; {options.out}")
