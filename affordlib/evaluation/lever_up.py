@@ -6,7 +6,7 @@ is one training, or one baseline, tested in every protocol that it is trained fo
 the errors of every test trajectory. Errors are distances between foreseen and true positions, in
 cm, after steps of 150 ms. `lever_tables.py` makes the tables.
 
-    python -m affordlib.evaluation.lever_up --models anchored,lstm_tuned,paper --folds 3
+    python -m affordlib.evaluation.lever_up --models anchored,anchored_single,lstm_tuned,paper
     python -m affordlib.evaluation.lever_up --models lstm_published --folds 3
 
 The last takes an hour of one core for each of its two trainings a fold. glibc gives its large

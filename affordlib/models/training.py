@@ -116,12 +116,11 @@ def final_errors_m(model: EffectNetwork, arrays: TrainingArrays) -> torch.Tensor
     """
     was_training = model.training
     model.eval()
-    device = model.action_scale.device
-    seen, t_target = _to(observe_action(arrays), device), torch.ones(len(arrays), 1, device=device)
-    prediction = model.predict(model.encode(arrays.image.to(device)), seen, t_target)
+    t_target = torch.ones(len(arrays), 1)
+    prediction = model.predict(model.encode(arrays.image), observe_action(arrays), t_target)
     model.train(was_training)
     plane = plane_of(arrays.effect_channels) or list(range(len(arrays.effect_channels)))
-    return (prediction.effect_mean[:, 0, plane].cpu() - arrays.effect[:, -1, plane]).norm(dim=-1)
+    return (prediction.effect_mean[:, 0, plane] - arrays.effect[:, -1, plane]).norm(dim=-1)
 
 
 def _to(batch: Any, device: torch.device) -> Any:
