@@ -1,0 +1,157 @@
+"""What must not move while the code is rearranged: data, predictions, plans, tables.
+
+Write it down at one commit and compare at another, on the same machine (bits differ between
+processors):
+
+    python -m tests.guard write guard.json
+    python -m tests.guard compare guard.json
+
+The comparison names what moved and by how much, and exits with 1 if anything did.
+"""
+
+import argparse
+import hashlib
+import json
+import sys
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from affordlib.evaluation.goals import frozen_tasks
+from affordlib.interactions import TrainingArrays, open_interactions
+from affordlib.interactions.lever import lever_arrays
+from affordlib.interactions.recipes import RECIPES, interact
+from affordlib.models import load_checkpoint
+from affordlib.paths import repo_root
+from affordlib.planning import MODES, Repertoire, plan_astar, plan_continuous, plan_gradient
+from affordlib.planning.reachability import Reachability
+from affordlib.types import Observations
+from affordlib.world import Tabletop
+
+N_INTERACTIONS, N_GOALS = 3, 20
+
+
+def collected() -> dict[str, list[float]]:
+    """Effects of a few interactions of every recipe that ships."""
+    found = {}
+    with Tabletop() as world:
+        for name in ("push", "drag", "grasp", "rotate", "lever_up", "push_varied", "partial"):
+            for seed in (RECIPES[name].seed, 99):
+                recipe = replace(RECIPES[name], seed=seed)
+                for index in range(N_INTERACTIONS):
+                    done = interact(recipe, index, world)[1]
+                    values = [done.action[::30], done.effect[::30], done.rest_effect, done.tool]
+                    digest = hashlib.sha256(np.ascontiguousarray(done.image).tobytes()).digest()[:6]
+                    image = [int.from_bytes(digest, "big")]
+                    flat = [np.ravel(v) for v in values] + [image]
+                    found[f"collected {name} {seed} {index}"] = np.concatenate(flat).tolist()
+    return found
+
+
+def predicted() -> dict[str, list[float]]:
+    """Outputs of every shipped checkpoint, given recorded actions and effects at two times."""
+    found, rows = {}, np.arange(4)
+    levers = lever_arrays(open_interactions("lever_up").isel(interaction=slice(0, 48)))
+    for path in sorted((repo_root() / "data" / "checkpoints").glob("*.safetensors")):
+        if path.stem == "reachability":
+            continue
+        model, kind = load_checkpoint(path)[0], path.stem.split("_")[0]
+        data = levers
+        if kind != "lever":
+            channels = model.action_channels, model.effect_channels
+            data = TrainingArrays.from_dataset(open_interactions(kind), rows, *channels)
+        at = torch.tensor([0, data.phase.shape[-1] - 1])
+        t = data.phase[..., at].float().expand(4, 2)
+        known = torch.ones(4, 2, dtype=torch.bool)
+        action, effect = data.action[:4, at].float(), data.effect[:4, at].float()
+        seen = Observations(action, t, known, effect, t, known, torch.full((4,), 0.5))
+        with torch.no_grad():
+            features = model.encode(data.image[:4].float())
+            answer = model.predict(features, seen, torch.linspace(0.5, 1, 5).expand(4, 5))
+        values = [getattr(answer, field.name).ravel() for field in fields(answer)]
+        found[f"predicted {path.stem}"] = torch.cat(values).tolist()
+    xy = np.stack(np.meshgrid(np.linspace(-0.5, 0.7, 5), np.linspace(-0.7, 0.7, 5)), -1)
+    for name in ("push", "drag", "grasp", "rotate"):
+        turn = 0.3 if name in ("push", "drag") else None
+        chance = Reachability.load().probability(name, xy.reshape(-1, 2), turn)
+        found[f"predicted reachability {name}"] = chance.tolist()
+    return found
+
+
+def planned() -> dict[str, list[float]]:
+    """Plans of all planners on the first frozen goals of each mode."""
+    skills, found = Repertoire.load(), {}
+    tasks = [t for t in frozen_tasks() if t.goals == "constructed"]
+    some = [[t for t in tasks if t.mode == mode][: N_GOALS // 2] for mode in MODES]
+    with Tabletop() as world:
+        for k, task in enumerate((some[1] + some[2])[:N_GOALS]):
+            task.set_up(world)
+            seen = world.perceive()
+            kind = skills.kind_for(seen.image)
+            model, mode = skills.model(kind), MODES[task.mode]
+            plans = [
+                plan_astar(model, seen.image, seen.xy_m, task.goal, mode, kind),
+                plan_continuous(model, seen.image, seen.xy_m, task.goal, mode, kind),
+            ]
+            if kind.name == "push":
+                plans.append(plan_gradient(model, seen.image, seen.xy_m, task.goal, mode, 100))
+            for plan in plans:
+                steps = [(*s.predicted_end_xy_m, s.stop_phase, s.std_m) for s in plan.steps]
+                found[f"planned {k} {plan.planner}"] = np.ravel(steps).tolist()
+    return found
+
+
+def tabled() -> dict[str, list[float]]:
+    """Every number of the committed results, whatever it is called."""
+    found = {}
+    for path in sorted((repo_root() / "data" / "results").glob("*.json")):
+        numbers = []
+
+        def gather(value, numbers=numbers):
+            if isinstance(value, dict):
+                value = list(value.values())
+            if isinstance(value, list):
+                for item in value:
+                    gather(item)
+            elif isinstance(value, int | float) and not isinstance(value, bool):
+                numbers.append(float(value))
+
+        gather(json.loads(path.read_text()))
+        found[f"tabled {path.stem}"] = sorted(numbers)
+    return found
+
+
+def compare(before: dict[str, list[float]], now: dict[str, list[float]]) -> list[str]:
+    """A sentence for each entry that is gone, new, or not the same to the last bit."""
+    moved = [f"{name}: gone" for name in before if name not in now]
+    moved += [f"{name}: new" for name in now if name not in before]
+    for name in before.keys() & now.keys():
+        old, new = np.array(before[name]), np.array(now[name])
+        if old.shape != new.shape:
+            moved.append(f"{name}: {old.size} numbers became {new.size}")
+        elif not np.array_equal(old, new, equal_nan=True):
+            moved.append(f"{name}: moved by up to {np.nanmax(np.abs(old - new)):.2g}")
+    return sorted(moved)
+
+
+def main() -> int:
+    """Write down what is, or compare it with what was written."""
+    parser = argparse.ArgumentParser(prog="python -m tests.guard", description=main.__doc__)
+    parser.add_argument("action", choices=("write", "compare"))
+    parser.add_argument("file", type=Path)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    now = collected() | predicted() | planned() | tabled()
+    if options.action == "write":
+        options.file.write_text(json.dumps(now))
+        print(f"{len(now)} entries written to {options.file}")
+        return 0
+    moved = compare(json.loads(options.file.read_text()), now)
+    print("\n".join(moved) or f"all {len(now)} entries are the same to the last bit")
+    return bool(moved)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
