@@ -122,8 +122,8 @@ notebooks: $(STAMP) ## Execute the committed notebooks in place and clean them (
 html: $(STAMP) ## Write the book as web pages that need no network, into runs/html
 	@$(PY) -m affordlib.book
 
-tables: $(STAMP) ## Draw the tables of the README and the data card from data/results
-	@$(PY) -m affordlib.results README.md data/README.md
+tables: $(STAMP) ## Draw the tables of README, RESULTS and data card from data/results
+	@$(PY) -m affordlib.results README.md RESULTS.md data/README.md
 
 constraints: $(STAMP) ## Write constraints.txt from what is installed
 	@{ sed -n '/^#/p;/^[^#]/q' constraints.txt; \

@@ -30,6 +30,7 @@ from affordlib.profiles import notebook_paths, read_notebook
 from affordlib.results import write_text_atomically
 
 BESIDE = {
+    "RESULTS.md": "results.html",
     "data/README.md": "data.html",
     "CONTRIBUTING.md": "contributing.html",
     "THIRD_PARTY_NOTICES.md": "notices.html",

@@ -5,7 +5,7 @@ from urllib.parse import unquote
 import pytest
 from lab_pages import CHROMIUM, FLAGS, PICTURES
 
-from affordlib.book import MARKER, Book, main
+from affordlib.book import BESIDE, MARKER, Book, main
 from affordlib.paths import repo_root
 from affordlib.profiles import notebook_paths
 
@@ -40,7 +40,7 @@ def pages(folder):
 
 def test_every_notebook_has_a_page_and_nothing_else_is_left(folder, pages):
     notebooks = {f"{name}.html" for name in notebook_paths(repo_root() / "notebooks")}
-    assert notebooks | {"index.html", "data.html", "contributing.html", "notices.html"} == {*pages}
+    assert notebooks | {"index.html", *BESIDE.values()} == {*pages}
     assert [path.name for path in folder.parent.iterdir()] == ["html"]
 
 

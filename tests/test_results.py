@@ -237,7 +237,7 @@ def test_blocks_choose_rows_and_columns(tmp_path):
         fill_tables(f"<!-- table: {source}#planning -->\n")
 
 
-@pytest.mark.parametrize("page", ["README.md", "data/README.md"])
+@pytest.mark.parametrize("page", ["README.md", "RESULTS.md", "data/README.md"])
 def test_the_tables_of_the_pages_are_those_of_their_files(page):
     path = paths.repo_root() / page
     assert results.BLOCK.search(path.read_text(encoding="utf-8")), f"{page} has no table"

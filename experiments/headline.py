@@ -1,0 +1,54 @@
+"""The README's table of main results: `python -m experiments.headline` gathers it.
+
+Every figure stands in a larger table of `data/results`, made by the command of that table.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pandas as pd
+
+from affordlib.results import read_results, write_results
+
+PLANS = {
+    "single_full": "plan one whole push, execute it",
+    "single_partial": "plan one partial push, execute it",
+    "multi_partial": "plan up to three partial pushes, execute them",
+}
+
+
+def _table(file: str, name: str) -> pd.DataFrame:
+    return pd.DataFrame(read_results(f"data/results/{file}.json")["tables"][name])
+
+
+def _row(question: str, n: int, factor: float, reported: float | None, paper: float, ours: float):
+    errors = {"reported": reported, "paper's network": paper, "our network": ours}
+    shown = {name: "–" if e is None else f"{factor * e:.2f}" for name, e in errors.items()}
+    return {"mean error in mm": question, "n": int(n)} | shown
+
+
+def rows() -> list[dict[str, Any]]:
+    """A row a question: n trials, the paper's figure, both networks under equal conditions."""
+    effects = _table("effect_prediction", "push_test").query("object_class == 'all'")
+    pushes = effects[effects.n_interactions == 500].set_index("model")
+    means = pushes.final_error_mean_m
+    question = "predict where a push ends"
+    found = [_row(question, pushes.n["film"], 1000, None, means["paper"], means["film"])]
+    lever = _table("lever_up", "summary").set_index("model")
+    means = lever.step_5_mean_cm[["reported", "paper", "anchored"]]
+    found.append(_row("predict a lever-up 0.75 s ahead", lever.n["anchored"], 10, *means))
+    summary = _table("planning", "summary").query("object_class in ('standing', 'reported')")
+    summary = summary.set_index("variant")
+    each = _table("planning", "planning").query(
+        "variant == 'continuous_500' and object_class == 'standing' and goals == 'constructed'"
+    )
+    for mode, question in PLANS.items():
+        variants = ["reported_gradient_300", "continuous_paper", "continuous_500"]
+        means = summary[f"{mode}_mean_m"][variants]
+        found.append(_row(question, each.set_index("mode").n[mode], 1000, *means))
+    return found
+
+
+if __name__ == "__main__":
+    print(write_results("data/results", "headline", {}, {"main": rows()}))
