@@ -19,12 +19,14 @@ from affordlib.primitives import Primitive, primitive_named
 from affordlib.results import write_text_atomically
 from affordlib.types import Goal, Plan, Step
 
+_MARK = b'{\n "goal"'
+
 
 def save_plan(path: str | os.PathLike[str], plan: Plan) -> Path:
     """Write a plan and its goal to a JSON file and return its path."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_text_atomically(path, json.dumps(_plain(plan), indent=1, allow_nan=False) + "\n")
+    write_text_atomically(path, json.dumps(_plain(plan), indent=1, allow_nan=False) + "\n", _MARK)
     return path
 
 

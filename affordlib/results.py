@@ -42,6 +42,7 @@ UNITS = {
     "rad": ("°", 180 / math.pi, 1),
     "deg": ("°", 1.0, 1),
 }
+_MARK = b'{\n "notebook"'
 STATISTICS = ("mean", "median", "sem", "std", "min", "max", "p5", "p95")
 BLOCK = re.compile(
     r"(?P<open>^<!-- table: (?P<what>.*?) -->\n)(?P<body>.*?)(?P<close>^<!-- /table -->$)",
@@ -82,7 +83,7 @@ def write_results(
     parameters = _parameter(parameters, "parameters")
     tables = {name: _rows(rows, name) for name, rows in tables.items()}
     path = resolve_out_dir(out_dir) / f"{notebook}.json"
-    write_text_atomically(path, _document(notebook, parameters, tables))
+    write_text_atomically(path, _document(notebook, parameters, tables), _MARK)
     return path
 
 
@@ -113,13 +114,22 @@ def read_results(path: str | os.PathLike[str]) -> dict[str, Any]:
     return document
 
 
-def write_text_atomically(path: Path, text: str) -> None:
+def write_text_atomically(path: Path, text: str, mark: bytes = b"") -> None:
     """As `write_atomically`, of a text in UTF-8."""
-    write_atomically(path, text.encode("utf-8"))
+    write_atomically(path, text.encode("utf-8"), mark)
 
 
-def write_atomically(path: Path, content: bytes) -> None:
-    """Replace a file by `content` in one step: a reader, or a crash, meets the old or the new."""
+def write_atomically(path: Path, content: bytes, mark: bytes = b"") -> None:
+    """Replace a file by `content` in one step: a reader, or a crash, meets the old or the new.
+
+    mark: bytes that the beginning of every file of this kind holds; a file without them, a folder
+    or a link to nothing raises FileExistsError and stays.
+    """
+    if (path.is_symlink() or path.exists()) and not _begins_with(path, mark):
+        raise FileExistsError(
+            f"{path} is there and is not a file that this call may replace; delete it, or "
+            "choose another path"
+        )
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         with temporary.open("wb") as file:
@@ -130,6 +140,15 @@ def write_atomically(path: Path, content: bytes) -> None:
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+def _begins_with(path: Path, mark: bytes) -> bool:
+    """Whether a path is a file that is empty, or whose first bytes hold a mark."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        head = file.read(64)
+    return not head or mark in head
 
 
 def results_table(

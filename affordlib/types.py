@@ -48,7 +48,7 @@ def check_finite(name: str, value: float) -> float:
     """Return `value` as a float, or raise naming the argument that is not a finite number."""
     try:
         number = float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         number = math.nan
     if not math.isfinite(number):
         raise ValueError(f"{name} must be a finite number, got {value!r}")

@@ -159,10 +159,28 @@ def test_a_zip_is_made_once_and_no_other_recipe_takes_its_place(tmp_path, cheap,
     assert path.read_bytes() == before
     collect_set(SMALL, path, progress=False, replace=True)
     assert made == [0, 2, 4]
-    path.write_bytes(before[: len(before) // 2])  # damaged: made again
-    collect_set(SMALL, path, progress=False)
+    for foreign in (before[: len(before) // 2], b"notes"):
+        path.write_bytes(foreign)
+        with pytest.raises(ValueError, match=r"is no whole set of interactions.*replace=True"):
+            collect_set(SMALL, path, progress=False)
+        assert path.read_bytes() == foreign
+    collect_set(SMALL, path, progress=False, replace=True)
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def test_nothing_foreign_is_replaced_and_no_interaction_is_made(tmp_path, cheap, monkeypatch):
+    monkeypatch.setattr(collect, "collect_chunk", lambda *_: pytest.fail("it collects"))
+    (tmp_path / "f.zarr.zip").mkdir()
+    (tmp_path / "l.zarr.zip").symlink_to(tmp_path / "nowhere")
+    (tmp_path / "d.zarr").mkdir()
+    (tmp_path / "d.zarr" / "notes").write_text("mine")
+    (tmp_path / "n.zarr").write_text("mine")
+    before = sorted(tmp_path.rglob("*"))
+    for name in ("f.zarr.zip", "l.zarr.zip", "d.zarr", "n.zarr"):
+        with pytest.raises(ValueError, match=rf"path .*{name}.* (choose|delete)"):
+            collect_set(SMALL, tmp_path / name, progress=False)
+    assert sorted(tmp_path.rglob("*")) == before
 
 
 @pytest.mark.parametrize("spoil", [{"x": np.zeros(2)}, {"x": np.zeros((3, 2), "f4")}, {}])

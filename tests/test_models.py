@@ -1,9 +1,11 @@
 import json
 import math
+import pickle
 
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import save
 from torch import nn
 
 from affordlib.evaluation import mean_length_errors_m, refuse_seen
@@ -13,6 +15,7 @@ from affordlib.models import (
     AffordanceCNP,
     CNPConfig,
     EffectModel,
+    FiLMConfig,
     TrainingConfig,
     load_checkpoint,
     observe_actions,
@@ -20,6 +23,8 @@ from affordlib.models import (
     train,
 )
 from affordlib.models.training import final_errors_m
+from affordlib.models.weight_files import read_weights, write_weights
+from affordlib.planning.reachability import Reachability
 from affordlib.primitives import Push
 from affordlib.types import Observations
 
@@ -222,7 +227,7 @@ def test_checkpoint_round_trip(untrained, tmp_path):
     assert again.normaliser == untrained.normaliser
     for name, value in untrained.state_dict().items():
         assert torch.equal(again.state_dict()[name], value)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["m.json", "m.safetensors"]
+    assert [p.name for p in tmp_path.iterdir()] == ["m.safetensors"]
 
 
 def test_a_bad_checkpoint_is_named(untrained, tmp_path):
@@ -230,18 +235,70 @@ def test_a_bad_checkpoint_is_named(untrained, tmp_path):
         load_checkpoint("nobody")
     path = save_checkpoint(untrained, tmp_path / "m.safetensors", {})
     whole = path.read_bytes()
-    path.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(ValueError, match=r"m\.safetensors does not hold the weights"):
-        load_checkpoint(path)
-    three = CNPConfig(effect_channels=("x", "y", "yaw"))
-    other = AffordanceCNP(three, Normaliser((1, 1), (1, 1, 1), (0, 0), (1, 1)))
-    save_checkpoint(other, tmp_path / "other.safetensors", {})
-    path.write_bytes((tmp_path / "other.safetensors").read_bytes())
-    with pytest.raises(ValueError, match="does not hold the weights of the model"):
-        load_checkpoint(path)
-    path.with_suffix(".json").write_text(json.dumps({"format": "something else"}))
-    with pytest.raises(ValueError, match="does not describe a model of this package"):
-        load_checkpoint(path)
+    tensors, description = read_weights(path, "")
+    wrong = {
+        "half": lambda: path.write_bytes(whole[: len(whole) // 2]),
+        "a pickle": lambda: path.write_bytes(pickle.dumps({"weights": [1.0]})),
+        "not a number": lambda: write_weights(path, {"a": torch.tensor([math.nan])}, description),
+        "no description": lambda: path.write_bytes(save(tensors)),
+        "another kind": lambda: write_weights(path, tensors, {"format": "something else"}),
+        "another model": lambda: write_weights(path, tensors, description | {"model": "lstm"}),
+        "half numbers": lambda: write_weights(
+            path, {name: value.half() for name, value in tensors.items()}, description
+        ),
+        "no scale": lambda: write_weights(
+            path,
+            tensors,
+            description | {"normaliser": description["normaliser"] | {"action_scale": [0.0, 1.0]}},
+        ),
+        "one temperature": lambda: write_weights(
+            path, tensors, description | {"config": description["config"] | {"temperature": [1.0]}}
+        ),
+    }
+    for spoil in wrong.values():
+        path.unlink()
+        spoil()
+        with pytest.raises(ValueError, match=r"(?s)m\.safetensors.*train it again"):
+            load_checkpoint(path)
+
+
+def test_a_network_of_absurd_size_is_refused_at_once():
+    with pytest.raises(ValueError, match=r"blocks must lie in \[1, 4096\]"):
+        FiLMConfig(blocks=10**7)
+
+
+def damaged_by_a_bit(content, rng):
+    spoiled = bytearray(content)
+    spoiled[rng.integers(len(content))] ^= 1 << int(rng.integers(8))
+    return bytes(spoiled)
+
+
+def test_no_flipped_bit_loads_as_another_model(untrained, tmp_path):
+    rng = np.random.default_rng(0)
+    reach = Reachability()
+    files = {
+        save_checkpoint(untrained, tmp_path / "m.safetensors", {"note": "none"}): load_checkpoint,
+        reach.save(tmp_path / "r.safetensors"): Reachability.load,
+    }
+    for path, load in files.items():
+        whole = path.read_bytes()
+        header = 8 + int.from_bytes(whole[:8], "little")
+        for number in range(100):
+            part = whole[:header] if number % 2 else whole
+            path.write_bytes(damaged_by_a_bit(part, rng) + whole[len(part) :])
+            with pytest.raises(ValueError, match=path.name):
+                load(path)
+
+
+def test_a_file_that_is_no_checkpoint_is_not_replaced(untrained, tmp_path):
+    notes = tmp_path / "m.safetensors"
+    notes.write_text("notes")
+    (tmp_path / "f.safetensors").mkdir()
+    (tmp_path / "l.safetensors").symlink_to(tmp_path / "nowhere")
+    for name in "mfl":
+        with pytest.raises(FileExistsError, match=f"{name}.safetensors is there and is not"):
+            save_checkpoint(untrained, tmp_path / f"{name}.safetensors", {})
+    assert notes.read_text() == "notes"
 
 
 def test_a_failed_save_leaves_nothing(untrained, tmp_path):
@@ -258,6 +315,22 @@ def test_a_model_is_not_judged_on_what_it_saw(pushes, held_out_pushes):
     for part in (split.train, split.validation):
         with pytest.raises(ValueError, match="was trained or tuned on"):
             refuse_seen(about, pushes, part)
+
+
+def test_in_doubt_a_model_is_not_judged(pushes):
+    """Neither a recipe of an earlier version, with fewer fields, nor none opens the test."""
+    _, about = load_checkpoint("push_cnp")
+    seen = split_interactions(500).train
+    older = json.loads(about["recipe"])
+    del older["anywhere"], older["world"]["tip_offset_m"]
+    rougher = json.loads(about["recipe"])
+    rougher["world"]["table_friction"] = 0.6
+    for recipe in (older, rougher):
+        with pytest.raises(ValueError, match="was trained or tuned on"):
+            refuse_seen(about | {"recipe": json.dumps(recipe)}, pushes, seen)
+    for unknown in ({}, about | {"recipe": "{}"}, about | {"recipe": '{"seeds": 1}'}):
+        with pytest.raises(ValueError, match="does not say which interactions"):
+            refuse_seen(unknown, pushes, seen)
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import pickle
 
 import numpy as np
 import pytest
@@ -100,6 +101,22 @@ def test_training_resumes_to_the_same_bits(some, tmp_path, monkeypatch):
     other = dataclasses.replace(config, steps=10)
     with pytest.raises(ValueError, match=r"training\.pt is of a training with other steps"):
         train(fresh(some), some, some, other, progress=False, checkpoint=file)
+
+
+def test_a_foreign_or_damaged_state_of_a_training_is_named(some, tmp_path):
+    config = TrainingConfig(steps=2, batch_size=4, validate_every=1)
+    file = tmp_path / "training.pt"
+    train(fresh(some), some, some, config, progress=False, checkpoint=file)
+    whole = bytearray(file.read_bytes())
+    whole[len(whole) // 2] ^= 1
+    for content in (bytes(whole), whole[:-9], b"", b"notes", pickle.dumps({"about": 1})):
+        file.write_bytes(content)
+        with pytest.raises(
+            ValueError, match=r"training\.pt is damaged, or not the state"
+        ) as caught:
+            train(fresh(some), some, some, config, progress=False, checkpoint=file)
+        assert "weights_only" not in str(caught.value)
+        assert caught.value.__suppress_context__
 
 
 @pytest.mark.slow

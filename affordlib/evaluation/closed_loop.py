@@ -27,6 +27,7 @@ from affordlib.evaluation.answers import rounded
 from affordlib.evaluation.closed_loop_tables import ROWS, WITHIN_HEIGHT_M
 from affordlib.evaluation.feasibility import half_width_m, is_feasible, on_the_rim
 from affordlib.models.checkpoint import checkpoint_sha256
+from affordlib.models.weight_files import weights_bytes
 from affordlib.paths import repo_root
 from affordlib.planning import Repertoire, draw_disturbances, pursue
 from affordlib.planning.disturbances import KINDS
@@ -172,7 +173,7 @@ def _stays_feasible(world: Tabletop, trial: Trial, went: Pursuit) -> bool:
 def settings_sha256(table: str, seed: int) -> str:
     """Hash of what decides a table's records: the seed, the models it needs, the code's format."""
     told = hashlib.sha256(f"{FORMATS[table]} {seed}".encode())
-    told.update((repo_root() / REACHABILITY).read_bytes())
+    told.update(weights_bytes(repo_root() / REACHABILITY))
     for kind, name in CHECKPOINTS.items():
         if kind in ("push", "drag", POSE_BY.get(table)):
             told.update(checkpoint_sha256(name).encode())

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from affordlib.interactions.recipes import Recipe
 
 if TYPE_CHECKING:
     import torch
@@ -47,18 +48,29 @@ def mean_length_errors_m(training: TrainingArrays, test: TrainingArrays) -> torc
 
 
 def refuse_seen(about: dict[str, Any], data: xr.Dataset, interactions: np.ndarray) -> None:
-    """Raise if a checkpoint was trained on any of these interactions of a data set.
+    """Raise if a checkpoint was, or may have been, trained on objects of these interactions.
 
-    about: what `load_checkpoint` returned beside the model. An interaction is told by its recipe
-    and number, of however many the recipe has.
+    about: what `load_checkpoint` returned beside the model. The seed, the categories and the sizes
+    of a recipe decide its objects, the number which of them it is. A recipe that cannot be read
+    may be any.
     """
-    theirs, mine = (json.loads(text) for text in (about["recipe"], data.attrs["recipe"]))
-    if theirs | {"n_interactions": 0} != mine | {"n_interactions": 0}:
-        return
+    try:
+        theirs, mine = (_objects_of(text) for text in (about["recipe"], data.attrs["recipe"]))
+        trained_on = {int(number) for number in about["seen_interactions"]}
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"about: it does not say which interactions the model was trained on ({error!r}); "
+            "save the checkpoint with the recipe and seen_interactions of its training"
+        ) from error
     numbers = data["interaction"].values[interactions]
-    seen = sorted(set(about["seen_interactions"]) & {int(i) for i in numbers})
-    if seen:
+    seen = sorted(trained_on & {int(i) for i in numbers})
+    if theirs == mine and seen:
         raise ValueError(
             f"interactions: the model was trained or tuned on {len(seen)} of them (such as "
             f"{seen[:5]}); evaluate it on the test part of its split or on another data set"
         )
+
+
+def _objects_of(recipe: str) -> tuple[Any, ...]:
+    r = Recipe.from_json(recipe)
+    return r.seed, r.families, r.size_range_m, r.height_range_m

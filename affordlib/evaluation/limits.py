@@ -23,6 +23,7 @@ from affordlib.interactions import open_interactions
 from affordlib.interactions.recipes import Recipe, draw_scene, draw_world
 from affordlib.models.checkpoint import load_checkpoint
 from affordlib.models.protocol import observe_actions
+from affordlib.models.weight_files import weights_bytes
 from affordlib.paths import repo_root
 from affordlib.planning.reachability import SHIPPED as REACHABILITY
 from affordlib.planning.reachability import Reachability
@@ -48,7 +49,7 @@ def floor_settings() -> tuple[Any, ...]:
 
 def reach_settings() -> tuple[Any, ...]:
     """What decides the rows of `reach`: sizes, and the reachability that is shipped."""
-    shipped = (repo_root() / REACHABILITY).read_bytes()
+    shipped = weights_bytes(repo_root() / REACHABILITY)
     return N_PLACES, EDGE, hashlib.sha256(shipped).hexdigest()
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from affordlib.types import Observations
+from affordlib.types import Observations, check_finite
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -72,6 +72,11 @@ class Normaliser:
     mask_share: Range | None = None
     at_edge: bool = True
     effect_radius_m: Range | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("action_scale", "effect_scale", "image_std"):
+            if not all(check_finite(name, value) > 0 for value in getattr(self, name)):
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)!r}")
 
     @classmethod
     def fit(cls, arrays: TrainingArrays) -> Normaliser:

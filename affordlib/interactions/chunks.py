@@ -116,6 +116,11 @@ def create(place: Place, layout: Layout) -> None:
             f"path {place.url} holds a set of another recipe, or of other package versions "
             f"({differing[0]} differs); choose another path or delete it"
         )
+    if not found and place.holds_something():
+        raise ValueError(
+            f"path {place.url} is there and is no set of interactions; choose another path, or "
+            "delete it"
+        )
     place.delete(DONE)
     place.make_folders([*expected, record_name(0)])
     for name in sorted(expected.keys() - found.keys()):

@@ -114,6 +114,8 @@ def collect(
             return collect(recipe, path, local, progress=progress, replace=replace)
 
     layout = describe(recipe, CHUNK)
+    if str(path).endswith(SUFFIX) and place.fs.isdir(place.root):
+        raise ValueError(f"path {str(path)!r} is a folder; choose another path, or delete it")
     with exclusive(place) as still_ours:
         work = _working_place(place, layout)
         if not replace and work != place and is_finished(place, layout):

@@ -54,6 +54,11 @@ class Place:
     def name(self) -> str:
         return self.url.rpartition("/")[2]
 
+    def holds_something(self) -> bool:
+        """Whether there is a file, or a folder that is not empty."""
+        there = self.fs.exists(self.root)
+        return there and (self.fs.isfile(self.root) or bool(self.fs.ls(self.root, detail=False)))
+
     def sibling(self, name: str) -> Place:
         """The place of another name in the same folder."""
         return Place(f"{self.url.rpartition('/')[0]}/{name}")

@@ -218,18 +218,21 @@ def _read_checked(place: Place) -> dict[str, bytes]:
 
 
 def is_finished(place: Place, layout: Layout) -> bool:
-    """Whether a zip holds this very set, whole; ValueError if it holds another one."""
-    if not place.fs.exists(place.root):
+    """Whether a zip holds this very set, whole; ValueError if something else is there."""
+    if not (place.fs.exists(place.root) or (place.is_local and Path(place.root).is_symlink())):
         return False
+    remedy = "choose another path, delete it, or pass replace=True"
     try:
         files = _read_checked(place)
-    except CorruptedDataError:
-        return False
+    except CorruptedDataError as error:
+        raise ValueError(
+            f"path {place.url} is no whole set of interactions ({error}); {remedy}"
+        ) from error
     expected = metadata_files(layout)
     differing = sorted(name for name in expected if files.get(name) != expected[name])
     if differing:
         raise ValueError(
             f"path {place.url} holds a set of another recipe, or of other package versions "
-            f"({differing[0]} differs); choose another path, delete it, or pass replace=True"
+            f"({differing[0]} differs); {remedy}"
         )
     return True

@@ -1,17 +1,14 @@
-"""Checkpoints: weights as safetensors, everything else as JSON beside them; never pickle."""
+"""Checkpoints: the weights of a model, and all else that it is, in one file of safetensors."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
-import tempfile
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save
 
 from affordlib.interactions.batches import Normaliser
 from affordlib.models.anchored import AnchoredConfig, AnchoredNetwork
@@ -20,10 +17,12 @@ from affordlib.models.cnp import AffordanceCNP, CNPConfig
 from affordlib.models.film import FiLMConfig, FiLMNetwork
 from affordlib.models.lstm import LSTMConfig, LSTMNetwork
 from affordlib.models.network import EffectNetwork, NetworkConfig
+from affordlib.models.weight_files import read_weights, write_weights
 from affordlib.paths import repo_root
 
-FORMAT = "affordlib checkpoint 1"
+FORMAT = "affordlib checkpoint 2"
 SUFFIX = ".safetensors"
+_REMEDY = "give another checkpoint, or train it again with notebook 03"
 NETWORKS: dict[str, tuple[type[EffectNetwork], type[NetworkConfig]]] = {
     "cnp": (AffordanceCNP, CNPConfig),
     "film": (FiLMNetwork, FiLMConfig),
@@ -43,7 +42,7 @@ def build(config: NetworkConfig, normaliser: Normaliser) -> EffectNetwork:
 
 
 def save_checkpoint(model: EffectNetwork, path: str | Path, about: dict[str, Any]) -> Path:
-    """Write `path` (ending in .safetensors) and the JSON beside it; returns the path.
+    """Write a model to `path` (ending in .safetensors), whole or not at all; returns the path.
 
     about: what the reader of the checkpoint should know, such as the data set and the interactions
     that the model was trained on; plain JSON values.
@@ -62,41 +61,30 @@ def save_checkpoint(model: EffectNetwork, path: str | Path, about: dict[str, Any
         "normaliser": asdict(model.normaliser),
         "about": about,
     }
-    text = json.dumps(description, indent=1, allow_nan=False)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
-        weights, sidecar = Path(folder) / "weights", Path(folder) / "json"
-        tensors = {name: value.contiguous() for name, value in model.state_dict().items()}
-        save_file(tensors, weights)
-        weights.chmod(0o644)
-        sidecar.write_text(text + "\n")
-        os.replace(sidecar, path.with_suffix(".json"))
-        os.replace(weights, path)
-    return path
+    return write_weights(path, model.state_dict(), description)
 
 
 def resolve_checkpoint(name_or_path: str | Path) -> Path:
-    """The weights' file of a shipped checkpoint's name, or of a path; raises when there is none."""
+    """The file of a shipped checkpoint's name, or of a path; raises when there is none."""
     path = Path(name_or_path)
+    if path.suffix == SUFFIX and path.is_file():
+        return path
     folder = repo_root() / "data" / "checkpoints"
-    if path.suffix != SUFFIX:
-        path = folder / f"{name_or_path}{SUFFIX}"
-    for file in (path, path.with_suffix(".json")):
-        if not file.is_file():
-            shipped = sorted(p.stem for p in folder.glob("*.json"))
-            raise FileNotFoundError(
-                f"checkpoint {str(name_or_path)!r}: there is no file {file}; give one of the "
-                f"shipped names {shipped} or the path of a {SUFFIX} file with its .json beside it"
-            )
+    path = path if path.suffix == SUFFIX else folder / f"{name_or_path}{SUFFIX}"
+    if not path.is_file():
+        shipped = sorted(p.stem for p in folder.glob(f"*{SUFFIX}") if p.stem != "reachability")
+        raise FileNotFoundError(
+            f"checkpoint {str(name_or_path)!r}: there is no file {path}; give one of the "
+            f"shipped names {shipped} or the path of a {SUFFIX} file"
+        )
     return path
 
 
 def checkpoint_sha256(name_or_path: str | Path) -> str:
     """Hash of all that decides a checkpoint's answers: weights, configuration and scales."""
-    path = resolve_checkpoint(name_or_path)
-    told = json.loads(path.with_suffix(".json").read_text())
-    decisive = json.dumps({key: told[key] for key in ("model", "config", "normaliser")})
-    return hashlib.sha256(path.read_bytes() + decisive.encode()).hexdigest()
+    tensors, description = read_weights(resolve_checkpoint(name_or_path), _REMEDY)
+    decisive = json.dumps({key: description[key] for key in ("model", "config", "normaliser")})
+    return hashlib.sha256(save(tensors) + decisive.encode()).hexdigest()
 
 
 def _with_tuples(fields: dict[str, Any]) -> dict[str, Any]:
@@ -109,9 +97,8 @@ def load_checkpoint(name_or_path: str | Path) -> tuple[EffectNetwork, dict[str, 
     Raises FileNotFoundError, or ValueError when the files are damaged or of another model.
     """
     path = resolve_checkpoint(name_or_path)
-    remedy = "give another checkpoint, or train it again with notebook 03"
+    tensors, description = read_weights(path, _REMEDY)
     try:
-        description = json.loads(path.with_suffix(".json").read_text())
         if description["format"] != FORMAT:
             raise ValueError(f"its format is {description['format']!r}, not {FORMAT!r}")
         kind, config_class = NETWORKS[description["model"]]
@@ -119,17 +106,12 @@ def load_checkpoint(name_or_path: str | Path) -> tuple[EffectNetwork, dict[str, 
             config_class(**_with_tuples(description["config"])),
             Normaliser(**_with_tuples(description["normaliser"])),
         )
-        about = description["about"]
-    except (KeyError, TypeError, ValueError) as error:
+        about, own = description["about"], model.state_dict()
+        if other := [k for k in own if k not in tensors or tensors[k].dtype != own[k].dtype]:
+            raise ValueError(f"{other[0]} is missing or of another type")
+        model.load_state_dict(tensors)
+    except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
         raise ValueError(
-            f"checkpoint {path.with_suffix('.json')} does not describe a model of this package "
-            f"({error}); {remedy}"
-        ) from error
-    try:
-        model.load_state_dict(load_file(path))
-    except (RuntimeError, SafetensorError, OSError) as error:
-        raise ValueError(
-            f"checkpoint {path} does not hold the weights of the model that "
-            f"{path.with_suffix('.json').name} describes; {remedy}"
+            f"checkpoint {path} does not describe a model of this package ({error}); {_REMEDY}"
         ) from error
     return model.eval(), about

@@ -13,7 +13,6 @@ its pose, and poses scaled to unit size. Foreseen poses are its next inputs.
 from __future__ import annotations
 
 import math
-import os
 import time
 from dataclasses import dataclass
 from itertools import pairwise
@@ -30,6 +29,7 @@ from affordlib.interactions.lever import SEEN
 from affordlib.models.lever import beginning_errors_m, window_errors_m
 from affordlib.models.lstm import Known, on_grid
 from affordlib.models.network import EffectNetwork, NetworkConfig, with_time
+from affordlib.models.weight_files import load_state, save_state
 from affordlib.types import LEVER_IMAGE_PIXELS, Observations
 
 if TYPE_CHECKING:
@@ -165,8 +165,8 @@ def train_published(
     score = window_errors_m if trained_for == "window" else beginning_errors_m
     best, best_state, epoch, seconds = math.inf, model.state_dict(), 0, 0.0
     about = [trained_for, seed, *(float(a.effect.double().sum()) for a in (training, validation))]
-    if checkpoint is not None and checkpoint.is_file():
-        state = torch.load(checkpoint, weights_only=True)
+    if checkpoint is not None and checkpoint.exists():
+        state = load_state(checkpoint)
         if state["about"] != about:
             raise ValueError(
                 f"checkpoint {checkpoint} is of a training for {state['about'][0]!r} with seed "
@@ -205,9 +205,7 @@ def train_published(
                 "torch": torch.get_rng_state(), "best": best, "best_state": best_state,
                 "epoch": epoch, "seconds": seconds, "about": about,
             }  # fmt: skip
-            partial = checkpoint.with_name(f".{checkpoint.name}.partial")
-            torch.save(state, partial)
-            os.replace(partial, checkpoint)
+            save_state(checkpoint, state)
     model.load_state_dict(best_state)
     model.eval()
     return {"epochs": epoch, "seconds": seconds, "validation_error": best}

@@ -20,7 +20,7 @@ from affordlib.models.frame import (
     turn_observations,
     turn_prediction,
 )
-from affordlib.types import Observations, Prediction, check_count
+from affordlib.types import Observations, Prediction, check_count, check_within
 
 PHASE_TOLERANCE = 1e-5
 RADIUS_TOLERANCE_M = 0.02
@@ -58,7 +58,7 @@ class NetworkConfig:
             object.__setattr__(self, name, channels)
         for size in fields(self):
             if size.type == "int":
-                check_count(size.name, getattr(self, size.name))
+                check_within(size.name, check_count(size.name, getattr(self, size.name)), 1, 4096)
         if not 0 < self.sigma_floor < 10:
             raise ValueError(f"sigma_floor must lie in (0, 10), got {self.sigma_floor!r}")
         temperature = tuple(self.temperature) or (1.0,) * len(self.effect_channels)

@@ -8,7 +8,6 @@ for comparison.
 from __future__ import annotations
 
 import math
-import os
 import time
 from collections.abc import Callable
 from dataclasses import asdict, astuple, dataclass, fields, replace
@@ -25,6 +24,7 @@ from affordlib.interactions.batches import (
     plane_of,
     sample_batch,
 )
+from affordlib.models.weight_files import load_state, save_state
 from affordlib.types import Observations, check_count, check_within
 
 if TYPE_CHECKING:
@@ -165,13 +165,10 @@ class _Run:
             "generator": self.generator.get_state(),
             "history": [astuple(record) for record in self.history],
         }
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_name(f".{path.name}.partial")
-        torch.save(state, partial)
-        os.replace(partial, path)
+        save_state(path, state)
 
     def load(self, path: Path) -> None:
-        state = torch.load(path, weights_only=True, map_location=self.model.action_scale.device)
+        state = load_state(path)
         if state["about"] != self.about:
             differ = [k for k in self.about if state["about"].get(k) != self.about[k]]
             raise ValueError(
@@ -180,9 +177,12 @@ class _Run:
             )
         for name in self._PLAIN:
             setattr(self, name, state[name])
+        device = self.model.action_scale.device
+        for weights in (self.mean, self.best_state):
+            weights |= {name: value.to(device) for name, value in weights.items()}
         self.model.load_state_dict(state["model"])
         self.optimiser.load_state_dict(state["optimiser"])
-        self.generator.set_state(state["generator"].cpu())
+        self.generator.set_state(state["generator"])
         self.history = [TrainingRecord(*record) for record in state["history"]]
 
 
@@ -216,7 +216,7 @@ def train(
         "draw and score": [getattr(of, "__name__", type(of).__name__) for of in (draw, score)],
     }
     run = _Run(model, config, about)
-    if checkpoint is not None and Path(checkpoint).is_file():
+    if checkpoint is not None and Path(checkpoint).exists():
         run.load(Path(checkpoint))
     start = time.perf_counter() - run.seconds
     with tqdm(

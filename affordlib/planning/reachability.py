@@ -6,16 +6,14 @@ recorded interactions alone; no kinematics is told.
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
 from torch import nn
 
+from affordlib.models.weight_files import read_weights, write_weights
 from affordlib.paths import repo_root
 from affordlib.primitives import PRIMITIVES, primitive_named
 
@@ -24,6 +22,8 @@ if TYPE_CHECKING:
 
 _HIDDEN, _STEPS, _RATE = 64, 1500, 1e-2
 SHIPPED = "data/checkpoints/reachability.safetensors"
+_DESCRIPTION = {"format": "affordlib reachability 1", "primitives": list(PRIMITIVES)}
+_REMEDY = "learn it again with python -m affordlib.planning.make_reachability"
 
 
 class Reachability(nn.Module):
@@ -46,25 +46,21 @@ class Reachability(nn.Module):
         Raises FileNotFoundError, or ValueError when the file is damaged or of another network.
         """
         path = Path(path or repo_root() / SHIPPED)
+        tensors, description = read_weights(path, _REMEDY)
         model = cls()
         try:
-            model.load_state_dict(load_file(path))
-        except (RuntimeError, SafetensorError) as error:
+            if description != _DESCRIPTION:
+                raise ValueError(f"it describes {description}")
+            model.load_state_dict(tensors)
+        except (RuntimeError, ValueError) as error:
             raise ValueError(
-                f"{path} does not hold a reachability of this package; learn it again with "
-                f"python -m affordlib.planning.make_reachability"
+                f"{path} does not hold a reachability of this package ({error}); {_REMEDY}"
             ) from error
         return model.eval()
 
-    def save(self, path: str | Path) -> None:
-        """Write the weights to a file that `load` reads, whole or not at all."""
-        making = Path(path).with_suffix(f".{os.getpid()}.tmp")
-        try:
-            save_file(self.state_dict(), making)
-            making.chmod(0o644)
-            making.replace(path)
-        finally:
-            making.unlink(missing_ok=True)
+    def save(self, path: str | Path) -> Path:
+        """Write the weights to a file that `load` reads, whole or not at all; returns its path."""
+        return write_weights(path, self.state_dict(), _DESCRIPTION)
 
     @torch.no_grad()
     def probability(

@@ -95,6 +95,6 @@ def show_animation(
     if path is not None:
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, film.encoded("GIF", beside=beside))
+        write_atomically(path, film.encoded("GIF", beside=beside), b"GIF8")
     # A PNG: pages made from a notebook leave GIFs out, and it is a third smaller.
     return NotebookImage(film.encoded("PNG", beside=beside), format="png")

@@ -58,7 +58,7 @@ def save_figure(figure: Figure, folder: Path, name: str) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
-    write_atomically(path, buffer.getvalue())
+    write_atomically(path, buffer.getvalue(), b"PNG")
     return path
 
 
