@@ -34,13 +34,21 @@ def test_mean_and_sigma_are_those_of_the_mixture(members, asked):
     ensemble, t_target = Ensemble(members), torch.tensor([[0.0, 0.5, 1.0]]).expand(4, -1)
     assert isinstance(ensemble, EffectModel)
     told = ensemble.predict(ensemble.encode(images), observed, t_target)
-    each = [m.predict(m.encode(images), observed, t_target) for m in members]
-    mean = torch.stack([p.effect_mean for p in each]).mean(dim=0)
-    torch.testing.assert_close(told.effect_mean, mean)
-    # E[y²] - E[y]², in doubles, of a mixture in even shares.
-    second = torch.stack([(p.effect_mean.double() ** 2 + p.effect_std.double() ** 2) for p in each])
-    variance = second.mean(dim=0) - mean.double() ** 2
-    torch.testing.assert_close(told.effect_std.double(), variance.sqrt(), atol=1e-6, rtol=1e-3)
+    each = [m.predict(m.encode(images), observed, t_target) for m in ensemble.members]
+    mean = torch.stack([p.effect_mean for p in each]).double()
+    torch.testing.assert_close(told.effect_mean.double(), mean.mean(dim=0), atol=1e-8, rtol=1e-5)
+    # The variance of each about the mean of all, in doubles: nothing cancels.
+    std = torch.stack([p.effect_std for p in each]).double()
+    variance = (std**2 + (mean - mean.mean(dim=0)) ** 2).mean(dim=0)
+    torch.testing.assert_close(told.effect_std.double(), variance.sqrt(), atol=0, rtol=1e-5)
+
+
+def test_members_are_left_as_they_were(members):
+    before = [member.temperature for member in members]
+    ensemble = Ensemble(members)
+    assert [member.temperature for member in members] == before
+    assert {member.temperature for member in ensemble.members} == {(1.0, 1.0, 1.0)}
+    assert all(t != 1 for temperature in before for t in temperature)
 
 
 @torch.no_grad()

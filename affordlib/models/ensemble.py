@@ -9,6 +9,7 @@ far the members disagree, is what a single network cannot know of itself.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 
 import torch
@@ -21,7 +22,7 @@ from affordlib.types import Observations, Prediction
 class Ensemble:
     """Trained networks of the same channels as one `EffectModel`; temperature: of the mixture's σ.
 
-    The members' own temperatures are set to one.
+    It holds copies of the members, with their weights, whose own temperatures are one.
     """
 
     def __init__(self, members: Sequence[EffectNetwork]) -> None:
@@ -36,9 +37,10 @@ class Ensemble:
                     f"members must have the channels of the first, {self.action_channels} and "
                     f"{self.effect_channels}; member {k} has {channels[0]} and {channels[1]}"
                 )
-            member.temperature = (1.0,) * len(self.effect_channels)
-        self.members = tuple(members)
-        self.temperature: tuple[float, ...] = first.temperature
+        self.members = tuple(copy.copy(member) for member in members)
+        self.temperature = (1.0,) * len(self.effect_channels)
+        for member in self.members:
+            member.temperature = self.temperature
 
     def encode(self, image: Tensor) -> Tensor:
         """Features (B, K F) of images (B, 2, 48, 48): those of the K members side by side."""

@@ -92,8 +92,12 @@ class Interventions:
         )
 
     def settle(self, seconds: float = 0.5) -> None:
-        """Let the world run while the arm stands still; what can roll is braked by the table."""
+        """Let the world run while the arm stands still and keeps hold of what it holds.
+
+        What can roll is braked by the table.
+        """
         steps = round(check_within("seconds", seconds, 0.0, 60.0, "s") / motion.STEP_S)
         if self.thing is not None:
             resist_rolling(self, True)
+            motion.tie_held(self)
         motion.Drive(self, 0.0, closes=False).wait(steps)
