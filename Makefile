@@ -53,10 +53,11 @@ endif
 
 $(STAMP): $(INPUTS)
 	@[[ "$$("$(PYTHON)" -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null)" == 3.11 ]] \
-	  || { echo "This workbook needs Python 3.11, and '$(PYTHON)' is $$("$(PYTHON)" -c 'import sys; print("Python " + sys.version.split()[0])' 2>/dev/null || echo 'not there')." \
+	  || { echo "This workbook needs Python 3.11, and '$(PYTHON)' is $$("$(PYTHON)" -c 'import sys; print("Python " + sys.version.split()[0])' 2>/dev/null || echo 'no Python that runs here')." \
 	            "Install it, or name it: make setup PYTHON=/path/to/python3.11" >&2; exit 1; }
 	@exec 9< Makefile; flock 9; \
 	 if [[ "$$(cat $@ 2>/dev/null)" != "$(CURDIR)" ]]; then \
+	   [[ ! -L .venv ]] || { echo "'.venv' is a link to $$(readlink .venv), which would be emptied; remove the link" >&2; exit 1; }; \
 	   echo "Making .venv (a few minutes, once)"; "$(PYTHON)" -m venv --clear .venv; \
 	 elif [[ -n "$$(find $(INPUTS) -newer $@)" ]]; then \
 	   echo "Bringing .venv up to date"; rm $@; \
@@ -73,7 +74,7 @@ workbook: $(STAMP) ## Run all notebooks into runs/ (PROFILE=smoke|reader|full SE
 	@set -f; $(PY) -m affordlib.workbook --profile "$${PROFILE:-reader}" --seed "$${SEED:-0}" \
 	  --out "$$OUT" --only "$$ONLY" $(if $(FORCE),--force) $(if $(DRY_RUN),--dry-run) -- $$ARGS
 
-seeds: $(STAMP) ## Run them for several seeds, and a page over seeds (SEEDS="0 1 2" WORKERS=2 …)
+seeds: $(STAMP) ## Run them for several seeds, and write tables over seeds (SEEDS="0 1 2" WORKERS=2 …)
 	@set -f; $(PY) -m affordlib.seeds $$SEEDS --workers "$$WORKERS" \
 	  --profile "$${PROFILE:-reader}" --out "$$OUT" --only "$$ONLY" $(if $(FORCE),--force) $(if $(DRY_RUN),--dry-run) \
 	  --settings $$ARGS

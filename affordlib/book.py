@@ -24,6 +24,7 @@ from jinja2 import pass_context
 from nbconvert.exporters import HTMLExporter
 from nbconvert.filters.markdown_mistune import IPythonRenderer, MarkdownWithMath
 
+from affordlib.commands import command
 from affordlib.notebook_files import WIDGET
 from affordlib.paths import repo_root, resolve_out_dir
 from affordlib.profiles import notebook_paths, read_notebook
@@ -190,16 +191,13 @@ def _title(notebook: nbformat.NotebookNode) -> str:
     return notebook.cells[0].source.splitlines()[0].lstrip("# ").strip()
 
 
+@command(OSError)
 def main(argv: list[str] | None = None) -> int:
     """Write the book as web pages."""
     parser = argparse.ArgumentParser(prog="python -m affordlib.book", description=main.__doc__)
     parser.add_argument("folder", nargs="?", default="runs/html", help="default: runs/html")
     folder = resolve_out_dir(parser.parse_args(argv).folder)
-    try:
-        Book().build(folder)
-    except OSError as error:
-        print(f"book: {error}", file=sys.stderr)
-        return 1
+    Book().build(folder)
     print(f"The book begins at {os.path.relpath(folder / 'index.html')}")
     return 0
 

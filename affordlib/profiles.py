@@ -9,6 +9,7 @@ import ast
 import difflib
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -96,7 +97,7 @@ def fitting(where: str, value: object, default: object) -> Any:
     if default is not None and type(value) is not type(default):
         raise WorkbookError(
             f"{where} must be {type(default).__name__} like its default {default!r}, "
-            f"got {type(value).__name__} {value!r}"
+            f"got {type(value).__name__} {value!r:.60}"
         )
     return value
 
@@ -111,11 +112,8 @@ def parse_setting(setting: str) -> tuple[str, str, str]:
 
 def literal(text: str, default: object) -> Any:
     """Return the value that a command line means; text needs no quotes."""
-    try:
-        value = ast.literal_eval(text)
-    except (SyntaxError, ValueError):
-        try:
-            value = yaml.safe_load(text)
-        except yaml.YAMLError:
-            value = text
+    value: object = text
+    for parse in (yaml.safe_load, ast.literal_eval):  # what neither can read is text
+        with suppress(Exception):
+            value = parse(text)
     return text if isinstance(default, str) and not isinstance(value, str) else value

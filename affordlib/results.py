@@ -14,6 +14,7 @@ Any other option, such as `mode=multi_partial`, keeps the rows that have that va
 from __future__ import annotations
 
 import argparse
+import html
 import importlib.metadata
 import json
 import math
@@ -29,6 +30,7 @@ import numpy as np
 import pandas as pd
 
 import affordlib
+from affordlib.commands import command
 from affordlib.paths import repo_root, resolve_out_dir
 
 # unit in the column's name: (unit shown, factor, digits); lengths are stored in metres
@@ -171,6 +173,7 @@ def markdown_table(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | N
         ["---:" if _is_numeric(rows, name) else "---" for name in names],
         *([cell(name, row.get(name)).replace("|", "\\|") for name in names] for row in rows),
     ]
+    lines = [[html.escape(text, quote=False) for text in line] for line in lines]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
 
@@ -230,6 +233,7 @@ def fill_tables(text: str) -> str:
     return filled
 
 
+@command(OSError)
 def main(argv: Sequence[str] | None = None) -> int:
     """Fill the tables of Markdown pages, or with `--check` say which pages are out of date."""
     parser = argparse.ArgumentParser(prog="python -m affordlib.results", description=main.__doc__)

@@ -1,47 +1,44 @@
-"""The same batch for several seeds, and what they say together: a table and a page over seeds.
+"""The same batch for several seeds, and what they say together: tables over seeds.
 
     python -m affordlib.seeds 0 1 2 --profile smoke --only 06 --workers 2
 
 Every seed is a run of `affordlib.workbook` in a folder of its own, `runs/<name>-seed<k>`; with a
 Dask client they run side by side, on workers that share the checkout. What they wrote is gathered
 into `runs/<name>-seeds/`: rows that agree in all their words and truths are one row, their numbers
-become means, and beside those that differ stands the standard deviation over seeds. The page draws
-what differs, a dot a seed.
+become means, and beside those that differ stands the standard deviation over seeds. The same tables
+stand in `index.md`, with pictures of what differs, a dot a seed.
 """
 
 from __future__ import annotations
 
 import argparse
-import base64
 import html
 import statistics
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from nbconvert.filters.markdown_mistune import markdown2html_mistune
-
+from affordlib.commands import command, count_type, seed_type
 from affordlib.paths import repo_root
 from affordlib.profiles import WorkbookError
-from affordlib.results import markdown_table, read_results, write_results, write_text_atomically
+from affordlib.results import (
+    markdown_table,
+    read_results,
+    write_atomically,
+    write_results,
+    write_text_atomically,
+)
 from affordlib.seeds_picture import same_rows, seeds_picture
 from affordlib.workbook import run_name
+from affordlib.workers import dask_client
 
 if TYPE_CHECKING:
     from dask.distributed import Client
 
     Row = Mapping[str, Any]
-
-STYLE = (
-    "body{font-family:sans-serif;max-width:70rem;margin:2rem auto;padding:0 1rem;color:#222}"
-    "table{border-collapse:collapse;display:block;overflow-x:auto;font-size:.85rem}"
-    "th,td{padding:.3rem .7rem;text-align:right;border-bottom:1px solid #ddd}"
-    "img{max-width:100%}.anchor-link{display:none}"
-)
 
 
 def command_of(arguments: Sequence[str]) -> list[str]:
@@ -112,7 +109,7 @@ def _together(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def gather(folders: Mapping[int, Path], into: Path) -> Path:
-    """Write the tables over seeds and the page that shows them; returns the page."""
+    """Write the tables over seeds, as JSON, and as Markdown with pictures; returns the latter."""
     seeds = list(folders)
     # Of notebooks: beside them lie plans that were saved.
     there = [path for folder in folders.values() for path in folder.glob("[0-9][0-9]_*.json")]
@@ -131,64 +128,53 @@ def gather(folders: Mapping[int, Path], into: Path) -> Path:
         }
         write_results(into, name, {"seeds": seeds}, tables)
         page.append(f"## {name}")
-        for table, rows in tables.items():
-            page += [f"### {table.replace('_', ' ')}", markdown_table(rows) if rows else "Empty."]
+        for number, (table, rows) in enumerate(tables.items()):
+            page.append(f"### {html.escape(table.replace('_', ' '))}")
+            page.append(markdown_table(rows) if rows else "Empty.")
             told = [document["tables"].get(table, []) for document in documents]
             if (picture := seeds_picture(told)) is not None:
-                data = base64.b64encode(picture).decode()
-                page.append(f"![each seed of {table}](data:image/png;base64,{data})")
-    text = markdown2html_mistune("\n\n".join(page))
-    head = f"<!DOCTYPE html><meta charset='utf-8'><title>{html.escape(into.name)}</title>"
-    path = into / "index.html"
-    write_text_atomically(path, f"{head}<style>{STYLE}</style>{text}\n")
+                file = f"{name}-{number}.png"
+                write_atomically(into / file, picture)
+                page.append(f"![each seed]({file})")
+    path = into / "index.md"
+    write_text_atomically(path, "\n\n".join(page) + "\n")
     return path
 
 
+@command(OSError, ValueError, WorkbookError)
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the notebooks for several seeds and gather what they wrote."""
     parser = argparse.ArgumentParser(prog="python -m affordlib.seeds", description=main.__doc__)
-    parser.add_argument("seeds", type=int, nargs="+")
+    parser.add_argument("seeds", type=seed_type, nargs="+")
     parser.add_argument("--profile", default="reader")
     parser.add_argument("--out", default="", metavar="NAME", help="default: the profile")
     parser.add_argument("--only", default="", metavar="'03 06'")
     parser.add_argument("--settings", nargs="*", default=[], metavar="NN_title.parameter=value")
-    parser.add_argument("--workers", type=int, default=2, help="seeds side by side on this machine")
+    parser.add_argument("--workers", type=count_type, default=2, help="seeds side by side here")
     parser.add_argument("--force", action="store_true", help="run also what is complete")
     parser.add_argument("--dry-run", action="store_true", help="say what would run")
     parser.add_argument("--scheduler", help="a Dask scheduler whose workers share the checkout")
     options = parser.parse_args(argv)
     runs = repo_root() / "runs"
-    try:
-        if len(set(options.seeds)) < len(options.seeds) or min(options.seeds) < 0:
-            raise WorkbookError(f"SEEDS must differ and be 0 or more, got {options.seeds}")
-        name = run_name(options.profile, 0, options.out or None)
-        arguments = ["--profile", options.profile, "--only", options.only]
-        arguments += ["--force"] * options.force + ["--", *options.settings]
-        # What would run is said in any case; it is also where wrong settings are refused.
-        for seed in options.seeds:
-            own = ["--seed", str(seed), "--out", f"{name}-seed{seed}", "--dry-run"]
-            _, code, said, _ = _run((seed, command_of(own + arguments)))
-            if code:
-                raise WorkbookError(said.strip())
-            print(f"seed {seed}: {said.strip()}", flush=True)
-        if options.dry_run:
-            return 0
-        with ExitStack() as stack:
-            client = None
-            if options.scheduler or min(options.workers, len(options.seeds)) > 1:
-                from dask.distributed import Client, LocalCluster
-
-                cluster = options.scheduler or stack.enter_context(
-                    LocalCluster(options.workers, threads_per_worker=1, dashboard_address=None)
-                )
-                client = stack.enter_context(Client(cluster))
-            run_seeds(options.seeds, name, arguments, client)
-        folders = {seed: runs / f"{name}-seed{seed}" for seed in options.seeds}
-        page = gather(folders, runs / f"{name}-seeds")
-    except (WorkbookError, OSError, ValueError) as error:
-        print(f"seeds: {error}", file=sys.stderr)
-        return 1
-    print(f"The page over seeds is {page.relative_to(repo_root())}")
+    if len(set(options.seeds)) < len(options.seeds):
+        raise WorkbookError(f"SEEDS must differ, got {options.seeds}")
+    name = run_name(options.profile, 0, options.out or None)
+    arguments = ["--profile", options.profile, "--only", options.only]
+    arguments += ["--force"] * options.force + ["--", *options.settings]
+    # What would run is said in any case; it is also where wrong settings are refused.
+    for seed in options.seeds:
+        own = ["--seed", str(seed), "--out", f"{name}-seed{seed}", "--dry-run"]
+        _, code, said, _ = _run((seed, command_of(own + arguments)))
+        if code:
+            raise WorkbookError(said.strip())
+        print(f"seed {seed}: {said.strip()}", flush=True)
+    if options.dry_run:
+        return 0
+    with dask_client(min(options.workers, len(options.seeds)), options.scheduler) as client:
+        run_seeds(options.seeds, name, arguments, client)
+    folders = {seed: runs / f"{name}-seed{seed}" for seed in options.seeds}
+    page = gather(folders, runs / f"{name}-seeds")
+    print(f"The tables over seeds are in {page.relative_to(repo_root())}")
     return 0
 
 

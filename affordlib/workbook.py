@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import fcntl
 import hashlib
 import importlib.metadata
 import json
@@ -20,7 +19,6 @@ import logging
 import os
 import platform
 import re
-import signal
 import subprocess
 import sys
 import time
@@ -34,13 +32,14 @@ import nbformat
 import papermill
 import traitlets
 import zmq
+from filelock import FileLock, Timeout
 from jupyter_client.kernelspec import KernelSpec
 from jupyter_client.manager import AsyncKernelManager
 from nbclient.exceptions import DeadKernelError
 
-from affordlib import durations
+from affordlib.commands import command, seed_type
 from affordlib.notebook_files import cleaned, own_cells
-from affordlib.paths import digest_of, repo_root
+from affordlib.paths import digest_of, repo_root, resolve_out_dir
 from affordlib.profiles import (
     WorkbookError,
     choose,
@@ -163,7 +162,8 @@ def environment_of(layout: Layout) -> dict[str, str]:
     libraries = {name: importlib.metadata.version(name) for name in ("torch", "numpy", "pybullet")}
     return {
         "sources": digest_of(layout.sources),
-        "data": digest_of(layout.data),
+        # What the notebooks themselves have written, copied there, is no input of theirs.
+        "data": digest_of(layout.data, without="results/[0-9][0-9]_*.json"),
         "python": platform.python_version(),
         **libraries,
     }
@@ -172,19 +172,14 @@ def environment_of(layout: Layout) -> dict[str, str]:
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
     """Hold a run's folder; the lock dies with its process, so a kill leaves none behind."""
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / ".lock").open("a+") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            file.seek(0)
-            raise WorkbookError(
-                f"another runner (process {file.read().strip() or 'unknown'}) is writing "
-                f"{shown(folder)}; wait for it, or choose another name with OUT= (--out)"
-            ) from None
-        file.truncate(0)
-        file.write(f"{os.getpid()}\n")
-        file.flush()
+    try:
+        lock = FileLock(resolve_out_dir(folder) / ".lock").acquire(timeout=0)
+    except Timeout:
+        raise WorkbookError(
+            f"another runner is writing {shown(folder)}; wait for it, or choose another name with "
+            "OUT= (--out)"
+        ) from None
+    with lock:
         yield
 
 
@@ -196,16 +191,8 @@ def shown(path: Path) -> str:
 class Batch:
     """A run of the book into one folder; `in_place` also puts the cleaned copies back."""
 
-    def __init__(
-        self,
-        layout: Layout,
-        folder: Path,
-        jobs: Sequence[Job],
-        in_place: bool = False,
-        profile: str | None = None,
-    ):
+    def __init__(self, layout: Layout, folder: Path, jobs: Sequence[Job], in_place: bool = False):
         self.layout, self.folder, self.jobs, self.in_place = layout, folder, jobs, in_place
-        self.minutes = durations.expected_minutes(layout.notebooks, profile, folder)
 
     def copy(self, job: Job) -> Path:
         """The executed copy of a notebook."""
@@ -223,7 +210,7 @@ class Batch:
             read_results(job.results)
             copy = read_notebook(self.copy(job))
             return not self.in_place or cleaned(copy) == job.path.read_text(encoding="utf-8")
-        except (OSError, ValueError, KeyError, TypeError, WorkbookError):
+        except (OSError, ValueError, KeyError, TypeError, RecursionError, WorkbookError):
             return False
 
     def run(self, only: Sequence[str] = (), force: bool = False, dry: bool = False) -> None:
@@ -239,16 +226,12 @@ class Batch:
             else:
                 before[job.name] = mark
                 asked.append((number, job, mark, complete and not force))
-        waiting = [job.name for _, job, _, done in asked if not done]
-        if about := durations.minutes_in_words(waiting, self.minutes):
-            print(f"to run: {len(waiting)} of {len(asked)} notebooks, {about}", flush=True)
         for number, job, mark, done in asked:
             print(f"[{number}/{len(self.jobs)}] {job.name}: ", end="", flush=True)
             if done:
                 print("skipped: complete", flush=True)
             elif dry:
-                about = durations.minutes_in_words([job.name], self.minutes) or "length unknown"
-                print(f"would run ({about}) with {job.parameters}", flush=True)
+                print(f"would run with {job.parameters}", flush=True)
             else:
                 print(f"{self.execute(job, mark):.1f} s", flush=True)
 
@@ -272,6 +255,10 @@ class Batch:
                 kernel_manager_class=OwnKernelManager,
                 coalesce_streams=True,
             )
+        except KeyboardInterrupt:
+            # nbclient's task outlives the interrupt, and would log the kernel's end as an error.
+            logging.getLogger("asyncio").setLevel(logging.CRITICAL)
+            raise
         except Exception as error:
             print("failed", flush=True)
             raise WorkbookError(explained(job, copy, error)) from None
@@ -285,9 +272,8 @@ class Batch:
             ) from None
         if self.in_place:
             write_text_atomically(job.path, cleaned(read_notebook(copy)))
-        seconds = round(time.monotonic() - start, 1)
-        write_text_atomically(record, json.dumps({"fingerprint": mark, "seconds": seconds}) + "\n")
-        return seconds
+        write_text_atomically(record, json.dumps({"fingerprint": mark}) + "\n")
+        return time.monotonic() - start
 
 
 def explained(job: Job, copy: Path, error: Exception) -> str:
@@ -328,12 +314,13 @@ def run_name(profile: str, seed: int, name: str | None) -> str:
     return name
 
 
+@command(OSError, WorkbookError)
 def main(argv: Sequence[str] | None = None, layout: Layout | None = None) -> int:
     """Execute the notebooks of the book in order, skipping what is complete."""
     parser = argparse.ArgumentParser(prog="python -m affordlib.workbook", description=main.__doc__)
     parser.add_argument("settings", nargs="*", metavar="NN_title.parameter=value")
     parser.add_argument("--profile", default="reader", help="smoke, reader (default) or full")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=seed_type, default=0)
     parser.add_argument("--out", metavar="NAME", help="folder under runs/; default: the profile")
     parser.add_argument("--only", default="", metavar="'03 06'", help="run only these notebooks")
     parser.add_argument("--force", action="store_true", help="run also what is complete")
@@ -344,40 +331,27 @@ def main(argv: Sequence[str] | None = None, layout: Layout | None = None) -> int
     options = parser.parse_args(argv)
     layout = layout or Layout.of_repository()
     logging.getLogger("papermill").setLevel(logging.CRITICAL)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        if options.seed < 0:
-            raise WorkbookError(f"SEED (--seed) must be 0 or more, got {options.seed}")
-        if options.in_place:
-            folder = layout.runs / "lab"
-            if options.settings or options.seed or options.out:
-                raise WorkbookError("--in-place takes the notebooks' own defaults, no settings")
-            jobs = make_jobs(layout, None, [], {})
-        else:
-            folder = layout.runs / run_name(options.profile, options.seed, options.out)
-            root = repo_root()
-            out_dir = folder.relative_to(root) if folder.is_relative_to(root) else folder
-            common = {"seed": options.seed, "out_dir": out_dir.as_posix()}
-            jobs = make_jobs(layout, options.profile, options.settings, common)
-        names = [job.name for job in jobs]
-        only = [
-            choose("ONLY: notebook", name, names)
-            for name in re.split(r"[\s,]+", options.only)
-            if name
-        ]
-        profile = None if options.in_place else options.profile
-        batch = Batch(layout, folder, jobs, options.in_place, profile)
-        if options.dry_run:
-            batch.run(only, options.force, dry=True)
-        else:
-            with locked(folder):
-                batch.run(only, options.force)
-    except (WorkbookError, OSError) as error:
-        print(f"workbook: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print("\nworkbook: interrupted; the same command goes on from here", file=sys.stderr)
-        return 130
+    if options.in_place:
+        folder = layout.runs / "lab"
+        if options.settings or options.seed or options.out:
+            raise WorkbookError("--in-place takes the notebooks' own defaults, no settings")
+        jobs = make_jobs(layout, None, [], {})
+    else:
+        folder = layout.runs / run_name(options.profile, options.seed, options.out)
+        root = repo_root()
+        out_dir = folder.relative_to(root) if folder.is_relative_to(root) else folder
+        common = {"seed": options.seed, "out_dir": out_dir.as_posix()}
+        jobs = make_jobs(layout, options.profile, options.settings, common)
+    names = [job.name for job in jobs]
+    only = [
+        choose("ONLY: notebook", name, names) for name in re.split(r"[\s,]+", options.only) if name
+    ]
+    batch = Batch(layout, folder, jobs, options.in_place)
+    if options.dry_run:
+        batch.run(only, options.force, dry=True)
+    else:
+        with locked(folder):
+            batch.run(only, options.force)
     return 0
 
 

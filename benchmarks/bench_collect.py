@@ -32,7 +32,8 @@ def rate(client, recipe):
 
 
 def client_of(workers):
-    cluster = LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=":0")
+    loopback = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
+    cluster = LocalCluster(n_workers=workers, threads_per_worker=1, **loopback)
     client = Client(cluster)
     client.wait_for_workers(workers)
     client.run(collect_chunk, Recipe(n_interactions=5, seed=3), range(5))

@@ -21,8 +21,7 @@ FORBIDDEN = {
     "evaluation": {"show"},
 }
 NO_WORLD = {
-    f"interactions/{name}.py"
-    for name in ("__init__", "batches", "chunks", "locks", "places", "store")
+    f"interactions/{name}.py" for name in ("__init__", "batches", "chunks", "places", "store")
 }
 
 

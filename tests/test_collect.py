@@ -20,7 +20,7 @@ import xarray as xr
 import zarr
 
 import affordlib
-from affordlib.interactions import CorruptedDataError, collect, locks, make_data
+from affordlib.interactions import CorruptedDataError, collect, make_data
 from affordlib.interactions.collect import collect as collect_set
 from affordlib.interactions.recipes import Recipe
 from affordlib.interactions.records import collect_chunk, describe
@@ -59,7 +59,6 @@ def files_of(folder):
     ["a.zarr.zip", "a.zarr", "file://{}/a.zarr", "memory://{}/a.zarr", "memory://m.zarr.zip"],
 )
 def test_wherever_it_lies_it_holds_what_the_interactions_left(tmp_path, monkeypatch, arrays, path):
-    monkeypatch.setattr(locks, "SETTLE_S", 0.01)
     monkeypatch.chdir(tmp_path)
     path = collect_set(SMALL, path.format(tmp_path), progress=False)
     read = open_interactions(path)

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 import affordlib
-from affordlib.interactions import CorruptedDataError, collect, locks, make_data
+from affordlib.interactions import CorruptedDataError, collect, make_data
 from affordlib.interactions.collect import collect as collect_set
 from affordlib.interactions.places import Place
 from affordlib.interactions.recipes import Recipe
@@ -124,9 +124,7 @@ def test_a_cluster_leaves_the_same_file(both, undisturbed, tmp_path, monkeypatch
 
 @pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".zarr", ".zarr.zip"])
-def test_a_cluster_writes_where_all_can(both, undisturbed, tmp_path, monkeypatch, suffix):
-    monkeypatch.setattr(locks, "SETTLE_S", 0.1)
-
+def test_a_cluster_writes_where_all_can(both, undisturbed, tmp_path, suffix):
     folder = str(tmp_path)
 
     def register():
@@ -189,7 +187,7 @@ def test_a_chunk_that_cannot_be_made_is_named(both, undisturbed, tmp_path):
     reason = r"interactions 6 to 7 could not be collected: ValueError: math domain error"
     with poisoned(both, log, "raise"), pytest.raises(RuntimeError, match=reason):
         collect_set(LONGER, path, both, progress=False)
-    assert len(log.read_text()) == 3  # it may have been the disk or the network
+    assert len(log.read_text()) == 1
     assert not path.exists()
     assert list(tmp_path.glob(".set*.chunks/tasks/*.json"))
     collect_set(LONGER, path, both, progress=False)

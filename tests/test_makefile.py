@@ -38,10 +38,11 @@ def project(tmp_path):
     for name in ("requirements.txt", "constraints.txt", "pyproject.toml"):
         (here / name).touch()
 
-    def setup(version="3.11"):
-        python = tmp_path / "python"
-        python.write_text(PRETENDED.format(python=sys.executable, here=str(here), version=version))
-        python.chmod(0o755)
+    def setup(version="3.11", python=tmp_path / "python"):
+        if python == tmp_path / "python":
+            code = PRETENDED.format(python=sys.executable, here=str(here), version=version)
+            python.write_text(code)
+            python.chmod(0o755)
         return subprocess.Popen(
             ["make", "setup", f"PYTHON={python}"],
             cwd=here,
@@ -106,6 +107,24 @@ def test_new_requirements_are_installed_into_what_is_there(project):
     assert code == 0, said
     assert "Bringing .venv up to date" in said
     assert project.log() == INSTALLED
+
+
+def test_what_a_link_leads_to_is_not_emptied(project):
+    other = project.here.parent / "other"
+    other.mkdir()
+    (other / "kept").touch()
+    (project.here / ".venv").symlink_to(other)
+    code, said = ended(project.setup())
+    assert code != 0
+    assert "'.venv' is a link to" in said
+    assert project.log() == []
+    assert (other / "kept").exists()
+
+
+def test_what_is_no_python_is_refused(project):
+    code, said = ended(project.setup(python="/bin/false"))
+    assert code != 0
+    assert "needs Python 3.11, and '/bin/false' is no Python that runs here" in said
 
 
 def test_another_python_is_refused_by_name(project):

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from affordlib.evaluation import grasps as grasps_module
-from affordlib.evaluation import parts, pooled, tables, units
+from affordlib.evaluation import pooled, tables, units
 from affordlib.evaluation.units import Unit, configuration_sha256, read_part, run_unit, run_units
 from affordlib.interactions import (
     Normaliser,
@@ -306,11 +306,6 @@ def test_whatever_decides_a_training_decides_its_hash(monkeypatch):
         assert configuration_sha256(unit) != before
     monkeypatch.setattr(units, "learner", lambda _: (network, replace(training, max_minutes=3.0)))
     assert configuration_sha256(unit) == before
-    # An option that comes later, and is off, leaves what is there as it is.
-    monkeypatch.setitem(parts.YOUNGER, "ema", training.ema)
-    assert configuration_sha256(unit) != before
-    monkeypatch.setattr(units, "learner", lambda _: (network, replace(training, ema=0.5)))
-    assert "ema" in parts.options_of(replace(training, ema=0.5))
 
 
 def test_a_checkpoint_is_its_scales_too(tmp_path, film):

@@ -1,6 +1,9 @@
 """The batch runner on tiny books: what runs, what is skipped, what is refused, what survives."""
 
+import asyncio
+import gc
 import json
+import logging
 import os
 import re
 import shutil
@@ -11,8 +14,10 @@ import time
 from functools import partial
 
 import nbformat
+import papermill
 import psutil
 import pytest
+from nbclient.exceptions import DeadKernelError
 
 from affordlib.notebook_files import cleaned
 from affordlib.results import read_results
@@ -74,13 +79,6 @@ class Book:
             f"sys.exit(main({[*arguments]!r}, Layout(*map(pathlib.Path, {folders!r}))))"
         )
         return [sys.executable, "-c", code]
-
-
-@pytest.fixture(autouse=True)
-def _own_sigterm():
-    before = signal.getsignal(signal.SIGTERM)
-    yield
-    signal.signal(signal.SIGTERM, before)
 
 
 @pytest.fixture
@@ -167,7 +165,14 @@ def edit(path):
     path.write_text(path.read_text() + " ")
 
 
+def copy_of_results(book, name):
+    """What is done with the results of a full run that are to be committed."""
+    (book.layout.data / "results").mkdir()
+    shutil.copy(book.layout.runs / RUN / "01_first.json", book.layout.data / "results" / name)
+
+
 RUN = "reader-seed3"
+DEEP = "[" * 100_000
 
 
 @pytest.mark.parametrize(
@@ -178,10 +183,13 @@ RUN = "reader-seed3"
         (lambda book, run: book.add("01_first", "extra = 1"), True, True),
         (lambda book, run: edit(book.layout.sources / "model.py"), True, True),
         (lambda book, run: (book.layout.data / "push.bin").write_bytes(b"\1\3"), True, True),
+        (lambda book, run: copy_of_results(book, "01_first.json"), False, False),
+        (lambda book, run: copy_of_results(book, "planning.json"), True, True),
         (lambda book, run: (run / "01_first.json").unlink(), True, False),
         (lambda book, run: (run / "02_second.json").write_text('{"note'), False, True),
         (lambda book, run: (run / "02_second.ipynb").unlink(), False, True),
         (lambda book, run: (run / ".complete" / "02_second.json").write_text(""), False, True),
+        (lambda book, run: (run / ".complete" / "01_first.json").write_text(DEEP), True, False),
         (lambda book, run: book.profile("reader", "02_second: {rate: 1}"), False, True),
         (lambda book, run: book.profile("reader", "01_first: {n: 3}"), True, True),
         (lambda book, run: book.profile("reader", "01_first: {n: 2, rate: 0.5}"), False, False),
@@ -190,7 +198,7 @@ RUN = "reader-seed3"
 def test_a_rerun_does_what_a_change_makes_necessary(changeable, capsys, change, first, second):
     change(changeable, changeable.layout.runs / RUN)
     assert changeable.run("--seed", 3, "02_second.n=7", "--dry-run") == 0
-    lines = [x for x in capsys.readouterr().out.splitlines() if not x.startswith("to run")]
+    lines = capsys.readouterr().out.splitlines()
     assert ["would run" in line for line in lines] == [first, second]
     assert ["skipped: complete" in line for line in lines] == [not first, not second]
     assert changeable.log(RUN) == ["01_first", "02_second"]
@@ -278,8 +286,10 @@ def test_a_killed_run_counts_as_nothing_and_is_taken_up_again(book, capsys, how)
     if how == signal.SIGKILL:
         assert process.returncode == -how
     else:
-        assert process.returncode == 130
-        assert err.strip() == "workbook: interrupted; the same command goes on from here"
+        assert process.returncode == 128 + how
+        assert err.strip() == (
+            "workbook: interrupted; what is finished is kept, the same command goes on"
+        )
     run = book.layout.runs / "reader"
     assert [path.stem for path in (run / ".complete").iterdir()] == ["01_first"]
     kernel = int((root / "pid").read_text())
@@ -294,11 +304,45 @@ def test_a_killed_run_counts_as_nothing_and_is_taken_up_again(book, capsys, how)
     assert "[1/2] 01_first: skipped: complete" in capsys.readouterr().out
 
 
+def test_an_interrupt_is_all_that_is_reported(book, monkeypatch, capsys, caplog):
+    async def dies():
+        raise DeadKernelError("Kernel died")
+
+    async def waits_for(task):
+        await asyncio.wait([task])
+
+    def interrupted(*_, **__):
+        loop = asyncio.new_event_loop()
+        task = loop.create_task(dies())  # nobody asks what has become of it
+        loop.run_until_complete(waits_for(task))
+        loop.close()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(papermill, "execute_notebook", interrupted)
+    monkeypatch.setattr(logging.getLogger("asyncio"), "level", logging.NOTSET)
+    book.add("01_first")
+    assert book.run() == 130
+    gc.collect()
+    assert capsys.readouterr().err.count("\n") == 2
+    assert not caplog.records
+
+
+def test_a_file_where_a_folder_is_needed_is_named(book, capsys):
+    book.add("01_first")
+    book.layout.runs.mkdir()
+    (book.layout.runs / "reader").touch()
+    assert book.run() == 1
+    assert re.search(
+        r"out_dir must be a folder, but .*reader is.* a file; choose another",
+        capsys.readouterr().err,
+    )
+
+
 def test_a_second_runner_is_refused(book, capsys):
     book.add("01_first")
     with locked(book.layout.runs / "reader"):
         assert book.run() == 1
-        assert f"(process {os.getpid()})" in capsys.readouterr().err
+        assert "another runner is writing" in capsys.readouterr().err
         assert book.run("--out", "other", "--dry-run") == 0
     assert book.log() == []
     assert book.run("--dry-run") == 0
@@ -313,6 +357,8 @@ def test_a_second_runner_is_refused(book, capsys):
         (["02_second.n=1.5"], r"02_second.n must be int like its default 2, got float 1.5"),
         (["02_second.n=true"], r"02_second.n must be int .* got bool True"),
         (["02_second.modes=full"], r"02_second.modes must be list"),
+        ([f"02_second.n={'1' * 5000}"], r"02_second.n must be int .* got str '1{50,60}\n"),
+        ([f"02_second.modes={DEEP}"], r"02_second.modes must be list .* got str '\[{50,60}\n"),
         (["02_second.modes=[1]"], r"02_second.modes\[0\] must be str"),
         (["02_second.seed=1"], r"use --seed"),
         (["02_second.out_dir=x"], r"use --out"),
@@ -321,7 +367,6 @@ def test_a_second_runner_is_refused(book, capsys):
         (["--only", "07"], r"notebook '07' is unknown"),
         (["--out", "../x"], r"must be a plain folder name"),
         (["--out", "lab"], r"'lab' belongs"),
-        (["--seed", "-1"], r"must be 0 or more"),
         (["--in-place", "02_second.n=1"], r"takes the notebooks' own defaults"),
     ],
 )

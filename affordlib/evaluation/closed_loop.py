@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from tqdm.auto import tqdm
 
+from affordlib.commands import command, count_type, names_type, seed_type
 from affordlib.evaluation.answers import rounded
 from affordlib.evaluation.closed_loop_tables import ROWS, WITHIN_HEIGHT_M
 from affordlib.evaluation.feasibility import half_width_m, is_feasible, on_the_rim
@@ -37,6 +38,7 @@ from affordlib.planning.repertoire import CHECKPOINTS
 from affordlib.primitives import Drag, Grasp, Push
 from affordlib.results import write_results, write_text_atomically
 from affordlib.types import TABLE_X_M, TABLE_Y_M, Goal
+from affordlib.workers import dask_client
 from affordlib.world import Tabletop, family_named
 
 if TYPE_CHECKING:
@@ -236,25 +238,22 @@ def run_table(
     return [records[i] for i in range(n)]
 
 
+@command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the trials of the closed loop that are missing, and write the tables."""
     parser = argparse.ArgumentParser(
         prog="python -m affordlib.evaluation.closed_loop", description=main.__doc__
     )
-    parser.add_argument("--tables", default=",".join(N_TRIALS), help="names, with commas")
-    parser.add_argument("--n", type=int, help="trials of each table (default: all)")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--tables", type=names_type(N_TRIALS), default=",".join(N_TRIALS))
+    parser.add_argument("--n", type=count_type, help="trials of each table (default: all)")
+    parser.add_argument("--seed", type=seed_type, default=0)
     parser.add_argument("--out", default="data/results")
     parser.add_argument("--scheduler", help="address of a Dask scheduler that shares the folder")
     options = parser.parse_args(argv)
-    client = None
-    if options.scheduler:
-        from dask.distributed import Client
-
-        client = Client(options.scheduler)
-    for table in options.tables.split(","):
-        n = min(options.n or N_TRIALS[table], N_TRIALS[table])
-        run_table(table, n, options.seed, client)
+    with dask_client(scheduler=options.scheduler) as client:
+        for table in options.tables:
+            n = min(options.n or N_TRIALS[table], N_TRIALS[table])
+            run_table(table, n, options.seed, client)
     # Also those of earlier runs.
     tables = {}
     for table, rows in ROWS.items():

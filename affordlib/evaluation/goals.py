@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from affordlib.commands import command, seed_type
 from affordlib.interactions.recipes import Variation
 from affordlib.paths import repo_root
 from affordlib.planning import MODES
@@ -176,13 +177,14 @@ def _draw_tasks(which: str, seed: int) -> list[PlanningTask]:
     return tasks
 
 
+@command(OSError)
 def main(argv: Sequence[str] | None = None) -> int:
     """Draw the goals of Table 3 and freeze them in a file, which is never written over."""
     parser = argparse.ArgumentParser(
         prog="python -m affordlib.evaluation.goals", description=main.__doc__
     )
     parser.add_argument("--world", choices=tuple(FROZEN), default="clean")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=seed_type, default=0)
     options = parser.parse_args(argv)
     path = repo_root() / FROZEN[options.world]
     if path.exists():

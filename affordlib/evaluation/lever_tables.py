@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from affordlib.commands import command
 from affordlib.evaluation import reported
 from affordlib.evaluation.lever_up import (
     BASELINES,
@@ -264,6 +265,7 @@ def assemble(folder: str | Path = PARTS, out_dir: str | Path = "data/results") -
     return write_results(out_dir, NAME, parameters, tables)
 
 
+@command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
     """Make the tables of lever-ups from the parts that units wrote."""
     parser = argparse.ArgumentParser(

@@ -28,6 +28,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from affordlib.commands import command, count_type, names_type, whole_type
 from affordlib.evaluation.parts import (
     checked_part,
     open_once,
@@ -288,27 +289,31 @@ def _answers(found: list[tuple[Prediction, Tensor]]) -> dict[str, Any]:
     return {"error_cm": errors.tolist(), "coverage": covered}
 
 
+@command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
     """Train and test models in folds; finished parts are kept, interrupted ones go on."""
     parser = argparse.ArgumentParser(
         prog="python -m affordlib.evaluation.lever_up", description=main.__doc__
     )
-    parser.add_argument("--models", default="anchored,lstm_tuned", help=f"of {','.join(MODELS)}")
-    parser.add_argument("--folds", type=int, default=N_FOLDS, help="the first of the five")
-    parser.add_argument("--no-edges", type=int, help="leave polygons of so many edges out instead")
+    parser.add_argument("--models", type=names_type(MODELS), default="anchored,lstm_tuned")
+    parser.add_argument("--folds", type=whole_type(1, N_FOLDS), default=N_FOLDS, help="of the five")
+    parser.add_argument(
+        "--no-edges", type=whole_type(3, 8), help="leave polygons of so many edges out instead"
+    )
     parser.add_argument(
         "--protocols",
+        type=names_type(TRAINED_FOR),
         default="window,first_step",
         help="to train for, one at a time, what is not trained for all",
     )
-    parser.add_argument("--epochs", type=int, default=EPOCHS, help="of the published LSTM")
+    parser.add_argument("--epochs", type=count_type, default=EPOCHS, help="of the published LSTM")
     parser.add_argument("--out", default=PARTS)
     options = parser.parse_args(argv)
     units = []
     folds = range(options.folds) if options.no_edges is None else [0]
-    for fold, model in product(folds, [*BASELINES, *options.models.split(",")]):
+    for fold, model in product(folds, [*BASELINES, *options.models]):
         epochs = options.epochs if model == "lstm_published" else None
-        kinds = options.protocols.split(",") if model in (SINGLE, *RECURRENT) else ["all"]
+        kinds = options.protocols if model in (SINGLE, *RECURRENT) else ["all"]
         units += [LeverUnit(model, k, fold, options.no_edges, epochs=epochs) for k in kinds]
     ran = run_parts(units, run_unit, options.out)
     print(f"{ran} of {len(units)} units run, the others were there; {options.out}")

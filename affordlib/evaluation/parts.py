@@ -47,16 +47,10 @@ def sha256_of(told: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
 
 
-YOUNGER: dict[str, Any] = {}
-"""Options that are younger than parts which are kept, with the values that turn them off."""
-
-
 def options_of(config: Any) -> dict[str, Any]:
-    """All options that decide a training; those of `YOUNGER` that are off change no hash."""
-    told = {f.name: getattr(config, f.name) for f in fields(config)}
+    """All options that decide a training."""
     apart = ("max_minutes", "device", "temperature")  # of the machine; fitted anyway
-    off = {k for k, v in YOUNGER.items() if told.get(k) == v}
-    return {k: v for k, v in told.items() if k not in apart and k not in off}
+    return {f.name: getattr(config, f.name) for f in fields(config) if f.name not in apart}
 
 
 def checked_part(unit: AnyUnit, folder: Path, expected: dict[str, Any]) -> dict[str, Any] | None:

@@ -24,6 +24,7 @@ import numpy as np
 import torch
 from tqdm.auto import tqdm
 
+from affordlib.commands import command
 from affordlib.evaluation import reported
 from affordlib.evaluation.answers import rounded
 from affordlib.evaluation.effect_prediction import error_row
@@ -292,6 +293,7 @@ def paired_rows(
     return rows
 
 
+@command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
     """Measure planners on the frozen goals and make the table from all that were measured."""
     parser = argparse.ArgumentParser(

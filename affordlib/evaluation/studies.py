@@ -34,6 +34,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from affordlib.commands import command
 from affordlib.evaluation import ablation, lever_tuning, limits, one_for_all, tails
 from affordlib.evaluation.answers import rounded
 from affordlib.evaluation.effect_prediction import refuse_seen
@@ -337,6 +338,7 @@ def read_study(name: str, folder: str | Path = FOLDER) -> Rows | None:
     return told["rows"]
 
 
+@command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
     """Make studies anew and write them."""
     parser = argparse.ArgumentParser(

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from affordlib.commands import command
 from affordlib.evaluation import reported
 from affordlib.evaluation.answers import calibration, final_error, yaw_error
 from affordlib.evaluation.grasps import grasp_rows, roc_rows, threshold_rows
@@ -209,6 +210,7 @@ def ensemble_rows(parts: list[tuple[Unit, Part]]) -> list[dict[str, Any]]:
     return [row | calibrated[row["model"]] for row in error_rows(both, "push", "fixed_test")]
 
 
+@command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
     """Make the tables of effect prediction from the parts that units wrote."""
     parser = argparse.ArgumentParser(

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from affordlib.commands import command, count_type, names_type, whole_type
 from affordlib.evaluation.answers import (
     baseline_answers,
     logistic_answers,
@@ -52,6 +53,7 @@ from affordlib.models.network import NetworkConfig
 from affordlib.models.training import TrainingConfig
 from affordlib.paths import repo_root
 from affordlib.results import write_text_atomically
+from affordlib.workers import dask_client
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -365,32 +367,28 @@ def run_units(
     return run_parts(units, run_unit, out_dir, client, progress)
 
 
+@command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
     """Train and test models in folds; finished parts are kept, interrupted ones go on."""
     parser = argparse.ArgumentParser(
         prog="python -m affordlib.evaluation.units", description=main.__doc__
     )
-    parser.add_argument("--models", default="film,paper", help=f"of {','.join(MODELS)}")
-    parser.add_argument("--sets", default="push", help=f"of {','.join(SETS)}")
-    parser.add_argument("--n", default="all", help="interactions of the set that are used")
-    parser.add_argument("--folds", type=int, default=N_FOLDS, help="the first of the ten")
-    parser.add_argument("--seeds", type=int, default=1)
+    models, sets = (f"of {','.join(known)}" for known in (MODELS, SETS))
+    parser.add_argument("--models", type=names_type(MODELS), default="film,paper", help=models)
+    parser.add_argument("--sets", type=names_type(SETS), default="push", help=sets)
+    parser.add_argument("--n", type=count_type, help="interactions that are used (default: all)")
+    parser.add_argument("--folds", type=whole_type(1, N_FOLDS), default=N_FOLDS, help="of the ten")
+    parser.add_argument("--seeds", type=count_type, default=1)
     parser.add_argument("--out", default=PARTS)
     parser.add_argument("--scheduler", help="address of a Dask scheduler")
-    parser.add_argument("--workers", type=int, default=1, help="processes of this machine")
+    parser.add_argument("--workers", type=count_type, default=1, help="processes of this machine")
     options = parser.parse_args(argv)
-    n = options.n if options.n == "all" else int(options.n)
     seeds, folds = range(options.seeds), range(options.folds)
-    chosen = product(options.sets.split(","), seeds, folds, options.models.split(","))
+    chosen = product(options.sets, seeds, folds, options.models)
+    n = options.n or "all"
     units = [Unit(model, data, n, fold, seed) for data, seed, fold, model in chosen]
-    if options.scheduler or options.workers > 1:
-        from dask.distributed import Client, LocalCluster
-
-        cluster = options.scheduler or LocalCluster(options.workers, threads_per_worker=1)
-        with Client(cluster) as client:
-            ran = run_units(units, options.out, client)
-    else:
-        ran = run_units(units, options.out)
+    with dask_client(options.workers, options.scheduler) as client:
+        ran = run_units(units, options.out, client)
     print(f"{ran} of {len(units)} units run, the others were there; {repo_root() / options.out}")
     return 0
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from tqdm.auto import tqdm
 
+from affordlib.commands import command, count_type
 from affordlib.evaluation.closed_loop import N_TRIALS, draw_trial
 from affordlib.evaluation.closed_loop_tables import WITHIN_HEIGHT_M, WITHIN_M, WITHIN_TURN_RAD
 from affordlib.evaluation.effect_prediction import error_row
@@ -99,12 +100,13 @@ def made_with() -> dict[str, dict[str, str]]:
     return {"checkpoints": {name: checkpoint_sha256(name)[:16] for name in CHECKPOINTS.values()}}
 
 
+@command(OSError)
 def main(argv: Sequence[str] | None = None) -> int:
     """Make and carry out the plans, and write the table; ten minutes."""
     parser = argparse.ArgumentParser(
         prog="python -m affordlib.evaluation.whole_plans", description=main.__doc__
     )
-    parser.add_argument("--n", type=int, help="trials of each kind of goal (default: all)")
+    parser.add_argument("--n", type=count_type, help="trials of each kind of goal (default: all)")
     parser.add_argument("--out", default="data/results")
     options = parser.parse_args(argv)
     repertoire = Repertoire.load()

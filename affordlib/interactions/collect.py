@@ -24,12 +24,12 @@ from affordlib.interactions.chunks import (
     read_chunk,
     write_chunk,
 )
-from affordlib.interactions.locks import exclusive
 from affordlib.interactions.places import Place
 from affordlib.interactions.recipes import Recipe
 from affordlib.interactions.records import collect_chunk, describe
 from affordlib.interactions.store import FOLDER_SUFFIX, SUFFIX, finish, is_finished, pack
 from affordlib.types import check_count
+from affordlib.workers import dask_client
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
 WINDOW = 4
 """Tasks that each worker is given ahead; the driver knows of no more futures than these."""
 
-_RETRIES = 2
 _ONE_WORLD = threading.Lock()
 
 
@@ -103,20 +102,13 @@ def collect(
             "see; collect with workers=1 and no client, or give a path that they share"
         )
     if client is None and workers > 1:
-        from dask.distributed import Client, LocalCluster
-
-        with (
-            LocalCluster(
-                n_workers=workers, threads_per_worker=1, dashboard_address=":0"
-            ) as cluster,
-            Client(cluster) as local,
-        ):
+        with dask_client(workers) as local:
             return collect(recipe, path, local, progress=progress, replace=replace)
 
     layout = describe(recipe, CHUNK)
     if str(path).endswith(SUFFIX) and place.fs.isdir(place.root):
         raise ValueError(f"path {str(path)!r} is a folder; choose another path, or delete it")
-    with exclusive(place) as still_ours:
+    with place.locked():
         work = _working_place(place, layout)
         if not replace and work != place and is_finished(place, layout):
             work.delete_all()
@@ -134,15 +126,17 @@ def collect(
                 disable=not progress,
             ) as bar,
         ):
-            for number, made in results:
-                still_ours()
-                count = len(layout.rows(number))
-                if progress and not made:
-                    bar.initial += count  # what was there says nothing about the rate
-                bar.update(count)
+            try:
+                for number, made in results:
+                    count = len(layout.rows(number))
+                    if progress and not made:
+                        bar.initial += count  # what was there says nothing about the rate
+                    bar.update(count)
+            except KeyboardInterrupt as interrupt:
+                interrupt.add_note("finished chunks are kept; collect into the same path to go on")
+                raise
         finish(work, layout)
         if work != place:
-            still_ours()
             pack(work, place)
             work.delete_all()
     return path
@@ -180,7 +174,7 @@ def _by_workers(
         while True:
             room = WINDOW * max(1, len(client.nthreads())) - len(chunks)
             for number in islice(waiting, max(0, room)):
-                future = client.submit(task, number, pure=False, retries=_RETRIES)
+                future = client.submit(task, number, pure=False)
                 chunks[future] = number
                 running.add(future)
             if not chunks:

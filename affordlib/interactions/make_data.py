@@ -10,19 +10,16 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from contextlib import AbstractContextManager, nullcontext
-from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
 
+from affordlib.commands import command, count_type
 from affordlib.interactions.collect import collect
 from affordlib.interactions.recipes import RECIPES, SHIPPED
 from affordlib.interactions.store import SUFFIX, dataset_sha256, open_interactions
 from affordlib.paths import repo_root
-
-if TYPE_CHECKING:
-    from dask.distributed import Client
+from affordlib.workers import dask_client
 
 TOLERANCE_M = 0.00005
 """Median distance between the final positions of two collections that still are the same set.
@@ -49,20 +46,23 @@ def compare(old: xr.Dataset, new: xr.Dataset) -> tuple[bool, str]:
     )
 
 
+@command(OSError, ValueError, RuntimeError)
 def main(argv: list[str] | None = None) -> int:
     """Collect what `--only` names (default: what is shipped) into `--to` (default: data/).
 
     Returns 1 if a set and its predecessor differ by more than the tolerance, otherwise 0.
     """
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", nargs="*", choices=sorted(RECIPES), default=list(SHIPPED))
+    parser.add_argument("--only", nargs="+", choices=sorted(RECIPES), default=list(SHIPPED))
     parser.add_argument("--to", default=str(repo_root() / "data"), help="a folder or fsspec URL")
     where = parser.add_mutually_exclusive_group()
-    where.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes here")
+    where.add_argument(
+        "--workers", type=count_type, default=os.cpu_count() or 1, help="processes here"
+    )
     where.add_argument("--scheduler", help="a Dask scheduler whose workers reach --to: tcp://…")
     arguments = parser.parse_args(argv)
     agree = True
-    with _client(arguments.scheduler) as client:
+    with dask_client(arguments.workers, arguments.scheduler) as client:
         for name in arguments.only:
             try:
                 old = open_interactions(name)
@@ -70,8 +70,7 @@ def main(argv: list[str] | None = None) -> int:
                 old = None
                 print(f"{name}: no former data set to compare with ({error})")
             target = f"{arguments.to}/{name}{SUFFIX}"
-            workers = 1 if client else arguments.workers
-            path = collect(RECIPES[name], target, client, workers, replace=True)
+            path = collect(RECIPES[name], target, client, replace=True)
             new = open_interactions(path)
             print(f"{name}: {new.sizes['interaction']} interactions, sha256 {dataset_sha256(new)}")
             if old is not None:
@@ -79,14 +78,6 @@ def main(argv: list[str] | None = None) -> int:
                 print(f"{name}: {sentence}")
                 agree &= same
     return 0 if agree else 1
-
-
-def _client(address: str | None) -> AbstractContextManager[Client | None]:
-    if address is None:
-        return nullcontext()
-    from dask.distributed import Client
-
-    return Client(address)
 
 
 if __name__ == "__main__":

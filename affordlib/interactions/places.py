@@ -5,16 +5,18 @@ from __future__ import annotations
 import os
 import shutil
 import uuid
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from filelock import FileLock, Timeout
 from fsspec.core import url_to_fs
 from fsspec.implementations.local import LocalFileSystem
 from fsspec.implementations.memory import MemoryFileSystem
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Iterator
 
     from fsspec import AbstractFileSystem
 
@@ -62,6 +64,30 @@ class Place:
     def sibling(self, name: str) -> Place:
         """The place of another name in the same folder."""
         return Place(f"{self.url.rpartition('/')[0]}/{name}")
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Hold the sole right to collect into a local place; the lock dies with its process.
+
+        Raises RuntimeError while another one holds it. Other places have no lock: whoever collects
+        into them writes the same bits.
+        """
+        if not self.is_local:
+            yield
+            return
+        path = Path(self.sibling(f".{self.name}.lock").root)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            lock = FileLock(path).acquire(timeout=0)
+        except Timeout:
+            raise RuntimeError(
+                f"another process is collecting into {self.url}; wait for it or choose another path"
+            ) from None
+        with lock:
+            try:
+                yield
+            finally:
+                path.unlink(missing_ok=True)  # who has opened it meanwhile finds it gone
 
     def make_folders(self, names: Iterable[str]) -> None:
         """Make the folders in which files of these names lie; `write` makes none."""

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from affordlib.commands import command
 from affordlib.interactions import (
     Normaliser,
     TrainingArrays,
@@ -245,6 +246,7 @@ def make_lever(name: str) -> None:
     print(f"validation {validation:.2f} mm")
 
 
+@command(OSError, ValueError)
 def main() -> int:
     """Train the chosen models on fold 0 of their data and write them to data/checkpoints.
 

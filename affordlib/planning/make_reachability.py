@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import argparse
 import sys
+from collections.abc import Sequence
 
+from affordlib.commands import command
 from affordlib.interactions import open_interactions
 from affordlib.paths import repo_root
 from affordlib.planning.reachability import SHIPPED, learn_reachability
 
 
-def main() -> int:
+@command(OSError, ValueError)
+def main(argv: Sequence[str] | None = None) -> int:
     """Learn from the shipped set `reach` and replace the shipped weights."""
+    argparse.ArgumentParser(description=main.__doc__).parse_args(argv)
     learn_reachability(open_interactions("reach")).save(repo_root() / SHIPPED)
     print(SHIPPED)
     return 0

@@ -1,0 +1,83 @@
+"""What command lines share: the kinds of their arguments, and how they end."""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import inspect
+import signal
+import sys
+from collections.abc import Callable, Collection
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+
+def whole_type(least: int, most: int) -> Callable[[str], int]:
+    """An argparse `type`: whole numbers within limits."""
+
+    def parse(text: str) -> int:
+        with suppress(ValueError):
+            if least <= (number := int(text)) <= most:
+                return number
+        raise argparse.ArgumentTypeError(
+            f"must be a whole number from {least} to {most}, got {text!r:.40}"
+        )
+
+    return parse
+
+
+count_type = whole_type(1, 10**9)
+seed_type = whole_type(0, 2**32 - 1)
+
+
+def names_type(known: Collection[str]) -> Callable[[str], list[str]]:
+    """An argparse `type`: known names, with commas between them."""
+
+    def parse(text: str) -> list[str]:
+        for name in text.split(","):
+            if name not in known:
+                raise argparse.ArgumentTypeError(
+                    f"{name!r:.40} is unknown; choose from {', '.join(known)}"
+                )
+        return text.split(",")
+
+    return parse
+
+
+class _Terminated(KeyboardInterrupt):
+    """SIGTERM, after which a command cleans up as it does after Ctrl-C."""
+
+
+def _terminate(*_: object) -> None:
+    raise _Terminated
+
+
+def command(*errors: type[Exception]) -> Callable[[Callable[..., int]], Callable[..., int]]:
+    """Decorate a command's `main`, which returns its exit status.
+
+    One of these errors, Ctrl-C or SIGTERM ends it with one line and the status 1, 130 or 143.
+    """
+
+    def decorate(main: Callable[..., int]) -> Callable[..., int]:
+        name = Path(inspect.getfile(main)).stem
+
+        @functools.wraps(main)
+        def run(*arguments: Any) -> int:
+            before = signal.signal(signal.SIGTERM, _terminate)
+            try:
+                return main(*arguments)
+            except KeyboardInterrupt as interrupt:
+                print(file=sys.stderr)  # ends a progress bar
+                why, code = "interrupted; what is finished is kept, the same command goes on", 130
+                code += 13 * isinstance(interrupt, _Terminated)
+            except errors as error:
+                why, code = str(error), 1
+            finally:
+                signal.signal(signal.SIGTERM, before)
+            print(f"{name}: {why}", file=sys.stderr)
+            return code
+
+        return run
+
+    return decorate

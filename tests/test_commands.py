@@ -1,0 +1,124 @@
+"""Command lines refuse what is no use, and end with one line."""
+
+import importlib
+import os
+import re
+import signal
+
+import pytest
+
+from affordlib.commands import command
+from affordlib.paths import repo_root
+
+ALL = {
+    path.relative_to(repo_root()).with_suffix("").as_posix().replace("/", ".")
+    for path in (repo_root() / "affordlib").rglob("*.py")
+    if "\nif __name__" in path.read_text()
+}
+
+
+def main_of(name):
+    return importlib.import_module(f"affordlib.{name}").main
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "named"),
+    [
+        ("evaluation.units", ["--models", "film,flim"], "--models: 'flim' is unknown; choose"),
+        ("evaluation.units", ["--sets", "nope"], "--sets: 'nope' is unknown"),
+        (
+            "evaluation.units",
+            ["--folds", "-1"],
+            "--folds: must be a whole number from 1 to 10, got",
+        ),
+        (
+            "evaluation.units",
+            ["--folds", "11"],
+            "--folds: must be a whole number from 1 to 10, got",
+        ),
+        ("evaluation.units", ["--seeds", "0"], "--seeds: must be a whole number from 1"),
+        ("evaluation.units", ["--workers", "-2"], "--workers: must be a whole number from 1"),
+        ("evaluation.units", ["--n", "many"], "--n: must be a whole number from 1"),
+        ("evaluation.closed_loop", ["--tables", "nope"], "--tables: 'nope' is unknown"),
+        ("evaluation.closed_loop", ["--seed", "-1"], "--seed: must be a whole number from 0"),
+        ("evaluation.closed_loop", ["--n", "0"], "--n: must be a whole number from 1"),
+        ("evaluation.whole_plans", ["--n", "-1"], "--n: must be a whole number from 1"),
+        ("evaluation.goals", ["--seed", str(2**32)], "--seed: must be a whole number from 0"),
+        ("evaluation.lever_up", ["--models", ""], "--models: '' is unknown"),
+        ("evaluation.lever_up", ["--protocols", "nope"], "--protocols: 'nope' is unknown"),
+        ("evaluation.lever_up", ["--no-edges", "2"], "--no-edges: must be .* from 3 to 8"),
+        ("evaluation.lever_up", ["--epochs", "-5"], "--epochs: must be a whole number from 1"),
+        ("interactions.make_data", ["--only"], "--only: expected at least one argument"),
+        ("interactions.make_data", ["--only", "nope"], "--only: invalid choice: 'nope'"),
+        (
+            "interactions.make_data",
+            ["--workers", "1" * 5000],
+            "--workers: must be .*'1{5,40}$",
+        ),
+        ("planning.make_reachability", ["nope"], "unrecognized arguments: nope"),
+        ("seeds", ["-1"], "seeds: must be a whole number from 0"),
+        ("seeds", ["0", "--workers", "0"], "--workers: must be a whole number from 1"),
+        ("workbook", ["--seed", "-1"], "--seed: must be a whole number from 0"),
+    ],
+)
+def test_unknown_names_and_impossible_numbers_are_refused(capsys, name, arguments, named):
+    with pytest.raises(SystemExit) as ended:
+        main_of(name)(arguments)
+    assert ended.value.code == 2
+    assert re.search(rf"error: (argument )?{named}", capsys.readouterr().err, re.MULTILINE)
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments"),
+    [
+        ("book", ["{}"]),
+        ("evaluation.units", ["--models", "constant", "--folds", "1", "--out", "{}"]),
+        ("evaluation.tables", ["--parts", "{}"]),
+        ("evaluation.lever_tables", ["--parts", "{}"]),
+        ("evaluation.lever_up", ["--models", "persistence", "--folds", "1", "--out", "{}"]),
+        ("interactions.make_data", ["--only", "grasp", "--workers", "1", "--to", "{}"]),
+    ],
+)
+def test_a_file_in_place_of_a_folder_is_named(tmp_path, capsys, name, arguments):
+    file = tmp_path / "file"
+    file.touch()
+    assert main_of(name)([each.format(file) for each in arguments]) == 1
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith(f"{name.rpartition('.')[2]}: ")
+    assert str(file) in last
+    assert file.read_bytes() == b""
+
+
+def test_every_command_line_ends_in_this_way():
+    for module in ALL:
+        main = importlib.import_module(module).main
+        assert hasattr(main, "__wrapped__"), f"{module}: its main is no `command`"
+
+
+@pytest.mark.parametrize(
+    ("how", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (None, 1), (0, 7)]
+)
+def test_a_command_ends_with_a_status_and_one_line(capsys, how, code):
+    @command(OSError)
+    def main():
+        if how is None:
+            raise OSError("no room")
+        if how:
+            os.kill(os.getpid(), how)
+        return 7
+
+    before = signal.getsignal(signal.SIGTERM)
+    assert main() == code
+    assert signal.getsignal(signal.SIGTERM) is before
+    line = "interrupted; what is finished is kept, the same command goes on"
+    expected = {1: "test_commands: no room\n", 7: ""}
+    assert capsys.readouterr().err == expected.get(code, f"\ntest_commands: {line}\n")
+
+
+def test_other_errors_of_a_command_keep_their_traceback():
+    @command(OSError)
+    def main():
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        main()
