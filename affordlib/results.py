@@ -14,7 +14,6 @@ Any other option, such as `mode=multi_partial`, keeps the rows that have that va
 from __future__ import annotations
 
 import argparse
-import html
 import importlib.metadata
 import json
 import math
@@ -46,6 +45,9 @@ UNITS = {
 }
 _MARK = b'{\n "notebook"'
 STATISTICS = ("mean", "median", "sem", "std", "min", "max", "p5", "p95")
+MARKUP = str.maketrans({"&": "&amp;", "<": "&lt;", ">": "&gt;", "[": "&#91;", "|": "\\|"})
+"""For `str.translate`: keeps what a text of results holds from being markup in Markdown or HTML."""
+
 BLOCK = re.compile(
     r"(?P<open>^<!-- table: (?P<what>.*?) -->\n)(?P<body>.*?)(?P<close>^<!-- /table -->$)",
     re.DOTALL | re.MULTILINE,
@@ -171,9 +173,9 @@ def markdown_table(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | N
     lines = [
         [heading(name) for name in names],
         ["---:" if _is_numeric(rows, name) else "---" for name in names],
-        *([cell(name, row.get(name)).replace("|", "\\|") for name in names] for row in rows),
+        *([cell(name, row.get(name)) for name in names] for row in rows),
     ]
-    lines = [[html.escape(text, quote=False) for text in line] for line in lines]
+    lines = [[text.translate(MARKUP) for text in line] for line in lines]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
 

@@ -12,7 +12,6 @@ stand in `index.md`, with pictures of what differs, a dot a seed.
 from __future__ import annotations
 
 import argparse
-import html
 import statistics
 import subprocess
 import sys
@@ -25,6 +24,7 @@ from affordlib.commands import command, count_type, seed_type
 from affordlib.paths import repo_root
 from affordlib.profiles import WorkbookError
 from affordlib.results import (
+    MARKUP,
     markdown_table,
     read_results,
     write_atomically,
@@ -129,7 +129,7 @@ def gather(folders: Mapping[int, Path], into: Path) -> Path:
         write_results(into, name, {"seeds": seeds}, tables)
         page.append(f"## {name}")
         for number, (table, rows) in enumerate(tables.items()):
-            page.append(f"### {html.escape(table.replace('_', ' '))}")
+            page.append(f"### {table.replace('_', ' ').translate(MARKUP)}")
             page.append(markdown_table(rows) if rows else "Empty.")
             told = [document["tables"].get(table, []) for document in documents]
             if (picture := seeds_picture(told)) is not None:

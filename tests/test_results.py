@@ -1,9 +1,11 @@
 """What a notebook writes comes back the same, whole or not at all, and tables are drawn from it."""
 
 import errno
+import html
 import json
 import math
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -11,6 +13,7 @@ import time
 
 import numpy as np
 import pytest
+from nbconvert.filters.markdown_mistune import markdown2html_mistune
 
 from affordlib import paths, results
 from affordlib.results import fill_tables, markdown_table, read_results, write_results
@@ -255,3 +258,13 @@ def test_three_digits_below_a_thousand_and_one_line_a_row():
     assert results.cell("loss", 999.7) == "1000"
     assert results.cell("loss", -999.4) == "-999"
     assert results.cell("note", "two\nlines") == "two lines"
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["<img src=x onerror=alert(1)>", "[a](javascript:alert(1))", "![a](//x/y.png)", "a|b", "&lt;"],
+)
+def test_texts_of_results_are_no_markup(text):
+    page = markdown2html_mistune(markdown_table([{text: text, "n": 1}]))
+    assert html.unescape(page).count(text) == 2
+    assert set(re.findall(r"<(\w+)", page)) == {"table", "thead", "tbody", "tr", "th", "td"}
