@@ -35,7 +35,7 @@ unexport PYTHONPATH PYTHONHOME PYTHONSTARTUP VIRTUAL_ENV MPLBACKEND
 unexport PIP_USER PIP_TARGET PIP_PREFIX PIP_REQUIREMENT PIP_CONSTRAINT
 unexport PYTEST_ADDOPTS JUPYTER_PATH JUPYTER_TOKEN
 
-.PHONY: help setup workbook seeds lab test test-fast test-slow lint format bench data checkpoints notebooks html tables \
+.PHONY: help setup workbook seeds lab test test-fast test-slow soak lint format bench data checkpoints notebooks html tables \
         constraints clean
 
 help: ## List the targets
@@ -96,6 +96,9 @@ test-fast: $(STAMP) ## Run the tests that take seconds, without the notebooks
 test-slow: $(STAMP) ## Run every notebook and solution as the reader does; the log is runs/test-slow.log
 	@mkdir -p runs; { $(PY) -m affordlib.workbook --profile reader --out test-slow --force; \
 	  $(PY) -m pytest tests/test_exercises.py tests/test_browser*.py; } 2>&1 | tee runs/test-slow.log
+
+soak: $(STAMP) ## Plan and execute 3,000 times: memory must stay, and the same task end the same (30 min)
+	@OMP_NUM_THREADS=1 $(PY) -m tests.soak
 
 lint: $(STAMP) ## Check style and formatting
 	@$(PY) -m ruff check

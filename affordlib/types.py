@@ -37,7 +37,12 @@ TABLE_Y_M = (-0.7, 0.7)
 
 
 class UnreachableError(ValueError):
-    """The arm cannot take the tool to a pose that was asked for."""
+    """The arm cannot take the tool to a pose.
+
+    outcome: where a plan was being carried out, what its actions up to that one gave.
+    """
+
+    outcome: Outcome | None = None
 
 
 class NothingSeenError(RuntimeError):
@@ -124,7 +129,6 @@ class Interaction:
         reasons = {
             "off_path": self.tracking_error_m > FAULT_LIMIT_M,
             "penetration": self.penetration_m > FAULT_LIMIT_M,
-            "left_table": self.left_table,
         }
         return tuple(name for name, so in reasons.items() if so)
 

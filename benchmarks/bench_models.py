@@ -161,7 +161,7 @@ def time_to_error(training, validation):
     sizes = {"batch_size": 8, "n_targets": 8}
     config = TrainingConfig(steps=600, validate_every=10, patience=99, **sizes)
     history = train(model, training, validation, config, progress=False)
-    reached = next((h.seconds for h in history if h.validation_error_m <= error), np.inf)
+    reached = next((h.seconds for h in history if h.validation_error <= error), np.inf)
     print(f"literal: {1000 * error:.2f} mm after {literal_s:.0f} s; batched after {reached:.0f} s")
     report(
         "training", "time to the literal loop's error, literal : batched", [literal_s / reached], 20

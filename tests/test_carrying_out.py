@@ -1,5 +1,7 @@
 """Plans carried out as they are and corrected in the end, and an eye that looks many times."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -8,7 +10,7 @@ from affordlib.evaluation.goals import frozen_tasks
 from affordlib.evaluation.planning import attempt
 from affordlib.planning import carry_out, plan_astar, plan_continuous, pursue
 from affordlib.primitives import Grasp, Push
-from affordlib.types import Goal, Plan
+from affordlib.types import Goal, Plan, Step, UnreachableError
 from affordlib.world import Cuboid, WorldConfig
 
 BOX = Cuboid(0.06, 0.05, 0.05)
@@ -101,3 +103,22 @@ def test_what_a_lift_has_shifted_is_put_down_and_lifted_again(world, repertoire,
     assert went.reached, went.words
     assert kinds.count(Grasp) == 2
     assert kinds[kinds.index(Grasp) + 1] is Push
+
+
+def test_what_was_done_before_the_arm_refused_is_kept(world):
+    world.place(BOX, (0.0, 0.0))
+    can = Step(Push(math.pi), 1.0, (0.05, 0.0), np.zeros((2, 2)))
+    cannot = Step(Grasp(), 1.0, (0.05, 0.0), np.zeros((2, 2)))
+    plan = Plan(Goal((0.1, 0.0)), (0.0, 0.0), (can, can, cannot), "by hand", True, 0, 0.0)
+    follow = world.follow
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(UnreachableError) as refused:
+        patch.setattr(world, "follow", lambda step: follow(step) if step is can else _refuse())
+        carry_out(world, plan)
+    outcome = refused.value.outcome
+    assert len(outcome.object_paths_xy_m) == 2
+    assert outcome.distance_m == pytest.approx(0.0, abs=0.02)
+    assert outcome.end_pose == world.object_pose()
+
+
+def _refuse():
+    raise UnreachableError("out of reach")

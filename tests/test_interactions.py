@@ -47,7 +47,7 @@ def test_the_shipped_sets_are_what_their_recipes_say(shipped, world):
 
 def test_few_interactions_are_flagged_and_all_say_why(shipped):
     name, data = shipped
-    reasons = (data["tracking_error"] > 0.002) | (data["penetration"] > 0.002) | data["left_table"]
+    reasons = (data["tracking_error"] > 0.002) | (data["penetration"] > 0.002)
     np.testing.assert_array_equal(data["fault"].values, reasons.values)
     assert data["fault"].values.mean() < 0.05
     assert not data["effect"].values[~data["reached"].values].any()
@@ -63,6 +63,11 @@ def test_full_executions_train_and_partial_ones_are_a_set_of_their_own(shipped):
         return
     assert 0.05 < stop.min() < 0.1
     assert 0.95 < stop.max() < 1
+    arrays = TrainingArrays.from_dataset(data, np.arange(20))
+    stop = torch.from_numpy(stop[:20]).float()
+    batch = sample_batch(arrays, torch.arange(20), 8, 4, torch.Generator().manual_seed(0))
+    assert torch.equal(batch.t_target[:, 0], stop)
+    assert torch.equal(observe_action(arrays.joined(arrays)).action_t[:, 1], stop.repeat(2))
     gap_m = np.linalg.norm((data["rest_effect"] - data["full_effect"]).values[:, :3], axis=1)
     assert np.median(gap_m) < 0.0005
     assert np.quantile(gap_m, 0.95) < 0.002

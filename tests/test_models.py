@@ -170,7 +170,7 @@ def test_a_minute_of_training_beats_the_mean_length(pushes):
     assert history[-1].loss < history[0].loss
     errors = final_errors_m(model, validation)
     # Early stopping keeps the best weights, not the last.
-    assert errors.mean() == pytest.approx(min(h.validation_error_m for h in history), rel=1e-4)
+    assert errors.mean() == pytest.approx(min(h.validation_error for h in history), rel=1e-4)
     assert errors.mean() < mean_length_errors_m(training, validation).mean()
 
 

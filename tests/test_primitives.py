@@ -243,11 +243,11 @@ def _has_posture(pose):
     return True
 
 
-def test_a_push_over_the_edge_is_flagged(world):
+def test_a_push_over_the_edge_is_an_outcome_and_no_fault(world):
     world.place(Cuboid(0.06, 0.06, 0.06), (0.1, 0.66), config=CLEAN)
     seen = world.interact(Push.towards(math.pi / 2))
     assert seen.left_table
-    assert seen.faults == ("left_table",)
+    assert not seen.faults
 
 
 def test_mass_off_the_centre_turns_a_push_and_not_the_frame(world):

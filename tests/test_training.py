@@ -92,8 +92,8 @@ def test_training_resumes_to_the_same_bits(some, tmp_path, monkeypatch):
             train(broken, some, some, config, progress=False, checkpoint=file)
     again = fresh(some)
     resumed = train(again, some, some, config, progress=False, checkpoint=file)
-    assert [(h.step, h.loss, h.validation_error_m) for h in resumed] == [
-        (h.step, h.loss, h.validation_error_m) for h in history
+    assert [(h.step, h.loss, h.validation_error) for h in resumed] == [
+        (h.step, h.loss, h.validation_error) for h in history
     ]
     for a, b in zip(whole.parameters(), again.parameters(), strict=True):
         assert torch.equal(a, b)

@@ -1,3 +1,4 @@
+import gc
 import hashlib
 import math
 import subprocess
@@ -18,8 +19,10 @@ from affordlib.world import (
     UnreachableError,
     UprightCylinder,
     WorldConfig,
+    execution,
     family_named,
     robot,
+    scene,
 )
 from affordlib.world.motion import Drive
 
@@ -287,3 +290,47 @@ def test_a_refused_action_looks_once(world, monkeypatch):
     world.place(THINGS[0], (0.45, 0.5))
     assert not world.attempt(Push(math.pi / 4)).reached
     assert len(looks) == 1
+
+
+def test_a_world_that_is_closed_or_forgotten_is_disconnected():
+    one, other = Tabletop(), Tabletop()
+    numbers = one.client, other.client
+    one.close()
+    one.close()
+    del other
+    gc.collect()
+    assert not any(pybullet.isConnected(number) for number in numbers)
+    with pytest.raises(RuntimeError, match="this world is closed; make a new Tabletop"):
+        one.place(Cuboid(0.06, 0.05, 0.05))
+
+
+def test_a_world_is_built_anew_before_bullet_has_kept_too_much(world, monkeypatch):
+    built, states = [], []
+    build = Tabletop._build
+    monkeypatch.setattr(Tabletop, "_build", lambda *args: (built.append(args), build(*args)))
+    monkeypatch.setattr(scene, "OBJECTS_PER_BUILD", world._placed + 2)
+    for _ in range(3):
+        world.place(UprightCylinder(0.05, 0.06), (0.1, 0.1))
+        world.interact(Push(0.3))
+        states.append(world.object_state())
+    assert len(built) == 1
+    assert states[0] == states[1] == states[2]
+
+
+def test_an_arm_that_cannot_go_on_from_where_it_feels_the_object_stays_there(world, monkeypatch):
+    """What has begun is recorded, and not said to have been out of reach."""
+    world.place(Cuboid(0.12, 0.12, 0.05))  # too wide: the fingers come down on its top
+    begun = []
+    first = execution.put_arm
+    monkeypatch.setattr(execution, "put_arm", lambda *args: (begun.append(1), first(*args)))
+    path = robot.joint_path
+
+    def until_begun(*args):
+        if begun:
+            raise UnreachableError("out of reach")
+        return path(*args)
+
+    monkeypatch.setattr(robot, "joint_path", until_begun)
+    seen = world.attempt(Grasp(seen_height=0.03))
+    assert seen.reached
+    assert seen.faults == ("off_path",)

@@ -49,7 +49,7 @@ def network_answers(
     told = model.predict(
         model.encode(arrays.image),
         observe_action(arrays),
-        arrays.phase[at].expand(len(arrays), -1),
+        arrays.phases(at),
     )
     return _answers(data, kept, arrays, at, told.effect_mean, told.effect_std)
 

@@ -219,7 +219,7 @@ def _fit(
         if found := shipped_lever_model(unit.model, unit.trained_for, lever, data, split):
             return found
         model, history = train_lever_model(lever, data, split, unit.trained_for, progress, halfway)
-        best = min(record.validation_error_m for record in history)
+        best = min(record.validation_error for record in history)
         seconds = history[-1].seconds
         return model, {"steps": history[-1].step, "seconds": seconds, "validation_error": best}
     training, validation = (

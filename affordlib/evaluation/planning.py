@@ -78,9 +78,8 @@ def attempt(
     once = PlanMode(1, partial=True)
     try:
         return carry_out(world, plan, corrections, lambda *query: planner(*query, once))
-    except UnreachableError:
-        pose = world.object_pose()
-        return Outcome(plan, task.goal.distance_m(pose[:2]), pose, world.object_tilt_rad())
+    except UnreachableError as refused:
+        return refused.outcome
     finally:
         world.looks = 1
 

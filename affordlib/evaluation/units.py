@@ -297,7 +297,7 @@ def _fit(
     if (found := _shipped(network, config, normaliser, data, split)) is not None:
         return found
     model, history = train_model(data, split, config, network, progress, symmetries, halfway)
-    best = min(record.validation_error_m for record in history)
+    best = min(record.validation_error for record in history)
     return model, {
         "steps": history[-1].step,
         "seconds": history[-1].seconds,

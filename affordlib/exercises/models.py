@@ -31,7 +31,7 @@ def _marginals() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     arrays = TrainingArrays.from_dataset(pushes, held_out)
     at = torch.linspace(0, len(arrays.phase) - 1, N_PHASES).round().long()
     model, _ = load_checkpoint("push_cnp")
-    t_target = arrays.phase[at].expand(len(arrays), -1)
+    t_target = arrays.phases(at)
     told = model.predict(model.encode(arrays.image), observe_action(arrays), t_target)
     return told.effect_mean.numpy(), told.effect_std.numpy(), arrays.effect[:, at].numpy()
 

@@ -123,9 +123,15 @@ def _scales(values: torch.Tensor, channels: tuple[str, ...]) -> tuple[float, ...
     return tuple(rms.tolist())
 
 
+_BY_INTERACTION = ("image", "action", "effect", "stop_phase")
+
+
 @dataclass(frozen=True)
 class TrainingArrays:
-    """Interactions as tensors: image (N, 2, 48, 48), phase (S,), action and effect (N, S, C)."""
+    """Interactions as tensors: image (N, 2, 48, 48), phase (S,), action and effect (N, S, C).
+
+    stop_phase: (N,), by which `phase` is multiplied; it is 1 but where actions were broken off.
+    """
 
     image: torch.Tensor
     phase: torch.Tensor
@@ -133,6 +139,11 @@ class TrainingArrays:
     effect: torch.Tensor
     action_channels: tuple[str, ...]
     effect_channels: tuple[str, ...]
+    stop_phase: torch.Tensor = None
+
+    def __post_init__(self) -> None:
+        if self.stop_phase is None:
+            object.__setattr__(self, "stop_phase", torch.ones(len(self)))
 
     @classmethod
     def from_dataset(
@@ -164,16 +175,19 @@ class TrainingArrays:
             channels("effect", effect_channels),
             tuple(action_channels),
             tuple(effect_channels),
+            torch.from_numpy(part["stop_phase"].values).float(),
         )
+
+    def phases(self, at: torch.Tensor) -> torch.Tensor:
+        """Phases (N, k) of the samples with numbers (N, k), or (k,) of all interactions."""
+        return self.phase[at] * self.stop_phase[:, None]
 
     def __len__(self) -> int:
         return len(self.image)
 
     def select(self, rows: torch.Tensor) -> TrainingArrays:
         """The interactions with the given row numbers."""
-        return replace(
-            self, image=self.image[rows], action=self.action[rows], effect=self.effect[rows]
-        )
+        return replace(self, **{n: getattr(self, n)[rows] for n in _BY_INTERACTION})
 
     def joined(self, *others: TrainingArrays) -> TrainingArrays:
         """These interactions and those of others, in order; phases and channels must be the same.
@@ -186,8 +200,9 @@ class TrainingArrays:
                 if mine != theirs:
                     raise ValueError(f"{name} must be the same, got {mine} and {theirs}")
         parts = (self, *others)
-        names = ("image", "action", "effect")
-        return replace(self, **{n: torch.cat([getattr(p, n) for p in parts]) for n in names})
+        return replace(
+            self, **{n: torch.cat([getattr(p, n) for p in parts]) for n in _BY_INTERACTION}
+        )
 
     def turned(self, quarters: int, mirror: bool = False) -> TrainingArrays:
         """The same interactions on a table mirrored in y, then turned by quarter turns.
@@ -267,10 +282,10 @@ def observe(
     rows = torch.arange(len(arrays))[:, None]
     return Observations(
         arrays.action[rows, action_at],
-        arrays.phase[action_at],
+        arrays.phases(action_at),
         action_mask,
         arrays.effect[rows, effect_at],
-        arrays.phase[effect_at],
+        arrays.phases(effect_at),
         effect_mask,
         weight,
     )
@@ -330,7 +345,7 @@ def sample_batch(
     return Batch(
         part.image,
         observe(part, action_at, action_mask, effect_at, effect_mask, blend),
-        part.phase[target_at],
+        part.phases(target_at),
         part.action[index, target_at],
         part.effect[index, target_at],
     )
@@ -351,7 +366,7 @@ def draw_forward(
     return Batch(
         part.image,
         observe_action(part),
-        part.phase[target_at],
+        part.phases(target_at),
         part.action[index, target_at],
         part.effect[index, target_at],
     )

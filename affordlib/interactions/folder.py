@@ -86,7 +86,7 @@ def write_folder(folder: str | Path, arrays: TrainingArrays) -> Path:
     values = torch.cat([arrays.action, arrays.effect], dim=-1).numpy()
     names = [f"{k:04d}" for k in range(len(arrays))]
     table = pd.DataFrame(values.reshape(-1, values.shape[-1]), columns=columns)
-    table.insert(0, "t", np.tile(arrays.phase.numpy(), len(names)))
+    table.insert(0, "t", arrays.phases(torch.arange(len(arrays.phase))).numpy().ravel())
     table.insert(0, "interaction", np.repeat(names, len(arrays.phase)))
     for name, (depth, mask) in zip(names, arrays.image.numpy(), strict=True):
         units = np.round(depth / DEPTH_UNIT_M).astype(np.uint16)

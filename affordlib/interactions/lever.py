@@ -72,6 +72,7 @@ def lever_arrays(
         turn(arrays.effect[:, ::EVERY], POSE_CHANNELS, back, absolute_yaw=False),
         ACTION_CHANNELS,
         POSE_CHANNELS,
+        arrays.stop_phase,
     )
 
 
@@ -141,7 +142,11 @@ def draw_beginnings(
 def _asked(part: TrainingArrays, seen: Observations, target: torch.Tensor) -> Batch:
     index = torch.arange(len(part))[:, None]
     return Batch(
-        part.image, seen, part.phase[target], part.action[index, target], part.effect[index, target]
+        part.image,
+        seen,
+        part.phases(target),
+        part.action[index, target],
+        part.effect[index, target],
     )
 
 

@@ -44,7 +44,7 @@ def effects_at(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Truth, mean and σ of the effects, (N, T, C) each, given image and action."""
     at = (torch.tensor(phases) * (len(arrays.phase) - 1)).round().long()
-    t_target = arrays.phase[at].expand(len(arrays), -1)
+    t_target = arrays.phases(at)
     told = model.predict(model.encode(arrays.image), observe_action(arrays), t_target)
     return arrays.effect[:, at], told.effect_mean, told.effect_std
 

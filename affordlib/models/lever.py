@@ -104,7 +104,7 @@ def foresee(
     first = start + SEEN if protocol == "window" else 1
     steps = torch.arange(first, first + AHEAD if protocol == "window" else last)
     seen = poses_seen(arrays, torch.full((n,), start), n_seen)
-    t_target = arrays.phase[steps].expand(n, -1)
+    t_target = arrays.phases(steps)
     features = model.encode(arrays.image) if features is None else features
     told = model.predict(features, seen, t_target)
     return told, arrays.effect[:, steps]

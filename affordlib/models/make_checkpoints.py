@@ -198,7 +198,7 @@ def make(name: str) -> None:
     save_checkpoint(model, path, about_training(data, seen, shipped.training))
     channels = model.action_channels, model.effect_channels
     test = final_errors_m(model, TrainingArrays.from_dataset(data, split.test, *channels))
-    validation = min(record.validation_error_m for record in history)
+    validation = min(record.validation_error for record in history)
     plane = bool(plane_of(channels[1])) or channels[1] == ("z",)
     factor, unit = (1000, "mm") if plane else (180 / math.pi, "°")
     print(f"{path.name}: {history[-1].step} steps in {history[-1].seconds:.0f} s")
@@ -241,7 +241,7 @@ def make_lever(name: str) -> None:
     model, history = train_lever_model(lever, data, split, trained_for)
     path = repo_root() / "data" / "checkpoints" / f"{name}{SUFFIX}"
     save_checkpoint(model, path, about_lever_training(data, split, lever, trained_for))
-    validation = 1000 * min(record.validation_error_m for record in history)
+    validation = 1000 * min(record.validation_error for record in history)
     print(f"{path.name}: {history[-1].step} steps in {history[-1].seconds:.0f} s")
     print(f"validation {validation:.2f} mm")
 

@@ -92,12 +92,12 @@ class TrainingConfig:
 
 @dataclass(frozen=True)
 class TrainingRecord:
-    """One line of a training's history; errors are final positions, in metres."""
+    """One line of a training's history; the error is the mean score, in the score's own unit."""
 
     step: int
     seconds: float
     loss: float
-    validation_error_m: float
+    validation_error: float
 
 
 def device_named(name: str) -> torch.device:
@@ -253,7 +253,7 @@ def train(
             model.load_state_dict(state)
             run.seconds = time.perf_counter() - start
             run.history.append(TrainingRecord(run.step, run.seconds, float(loss), error))
-            bar.set_postfix_str(f"loss {float(loss):.2f}, validation {error * 1000:.2f} mm")
+            bar.set_postfix_str(f"loss {float(loss):.2f}, validation {error:.3g}")
             run.waited += 1
             if error < run.best:
                 run.best, run.best_state, run.waited = error, candidate, 0

@@ -20,7 +20,15 @@ from affordlib.planning.finish import TURN_TOLERANCE_RAD
 from affordlib.planning.modes import PlanMode, is_on_table
 from affordlib.planning.moves import Demands
 from affordlib.primitives import wrap_angle
-from affordlib.types import Goal, NothingSeenError, Outcome, Plan, check_count, check_within
+from affordlib.types import (
+    Goal,
+    NothingSeenError,
+    Outcome,
+    Plan,
+    UnreachableError,
+    check_count,
+    check_within,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -53,7 +61,7 @@ def carry_out(
     Open loop: the plan is not revised. Each action is carried out relative to where the object
     then stands, as actions are defined. The distance is taken after the gripper has retreated,
     unless it holds the object, and the object has rested 0.5 s. Raises UnreachableError when the
-    arm cannot follow a step.
+    arm cannot follow a step; it has the outcome of those before.
 
     corrections: after the last step, so many single actions at most, each the first of a plan that
     `replan` makes anew from what is then seen, and each only if the object is seen, and farther
@@ -63,7 +71,20 @@ def carry_out(
     if corrections and replan is None:
         raise ValueError(f"corrections = {corrections} need a planner; give replan as well")
     yaw_rad, z_m = world.object_pose()[2], world.object_state()[2]
-    paths = [path_on_table(world.follow(step)) for step in plan.steps]
+    paths: list[np.ndarray] = []
+
+    def measured() -> Outcome:
+        pose = world.object_pose()
+        distance = plan.goal.distance_m(pose[:2])
+        turned, lifted = wrap_angle(pose[2] - yaw_rad), world.object_state()[2] - z_m
+        return Outcome(plan, distance, pose, world.object_tilt_rad(), tuple(paths), turned, lifted)
+
+    for step in plan.steps:
+        try:
+            paths.append(path_on_table(world.follow(step)))
+        except UnreachableError as error:
+            error.outcome = measured()
+            raise
     held = bool(plan.steps) and plan.steps[-1].primitive.holds
     for _ in range(0 if held else corrections):
         try:
@@ -81,10 +102,7 @@ def carry_out(
         if not world.can_reach(steps[0].primitive, steps[0].stop_phase):
             break
         paths.append(path_on_table(world.follow(steps[0])))
-    pose = world.object_pose()
-    distance = plan.goal.distance_m(pose[:2])
-    turned, lifted = wrap_angle(pose[2] - yaw_rad), world.object_state()[2] - z_m
-    return Outcome(plan, distance, pose, world.object_tilt_rad(), tuple(paths), turned, lifted)
+    return measured()
 
 
 def pursue(

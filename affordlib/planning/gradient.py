@@ -153,7 +153,6 @@ def plan_gradient(
                 stop = samples - 1  # the path only trembles at its end: the goal lies beyond it
         if stop == 0:
             break
-        # A model's path need not begin exactly at rest; what counts is how far it carries.
         end = xy + path[stop]
         shown = np.linspace(0, stop, min(PATH_SAMPLES, stop + 1)).round().astype(int)
         heading = action[-1] - action[0]

@@ -13,7 +13,7 @@ import numpy as np
 import pybullet
 
 from affordlib.primitives import TIP_HEIGHT_M, Grasp, Primitive
-from affordlib.types import Interaction
+from affordlib.types import Interaction, UnreachableError
 from affordlib.world import robot
 from affordlib.world.motion import (
     HOVER_HEIGHT_M,
@@ -146,7 +146,10 @@ def execute(
         if one[:, 2].min() < floor:
             one = one.copy()
             one[:, 2] = np.maximum(one[:, 2], floor)
-            path = robot.joint_path(one, world.arm, tool)
+            try:
+                path = robot.joint_path(one, world.arm, tool)
+            except UnreachableError:  # it stays where it felt the object, and is seen off its path
+                path = np.repeat(world.arm[None], len(one), axis=0)
         gone = drive.along(path, gap, one, stretch.guarded, stretch.n_steps)
         if stretch.guarded and gone < 1.0:
             floor = float(np.interp(gone, np.linspace(0, 1, len(one)), one[:, 2]))

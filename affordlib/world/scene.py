@@ -7,6 +7,7 @@ four times finer step with twice the solver's iterations a push ends within 0.02
 from __future__ import annotations
 
 import math
+import weakref
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -38,6 +39,9 @@ if TYPE_CHECKING:
     from affordlib.types import Step
     from affordlib.world.motion import Film
     from affordlib.world.objects import Thing
+
+OBJECTS_PER_BUILD = 256
+"""After so many objects the client is built anew: Bullet keeps 5 kB of each that is removed."""
 
 N_SAMPLES = 301
 """Recorded samples over the phase: one every 3 simulation steps of a full primitive."""
@@ -87,7 +91,8 @@ class Tabletop(Interventions):
 
     def __init__(self, config: WorldConfig | None = None) -> None:
         self.config = config or WorldConfig()
-        self.client = pybullet.connect(pybullet.DIRECT)
+        self._client = pybullet.connect(pybullet.DIRECT)
+        self._disconnect = weakref.finalize(self, pybullet.disconnect, self._client)
         self.thing: Thing | None = None
         self.film: Film | None = None
         self.tool = ""
@@ -101,15 +106,20 @@ class Tabletop(Interventions):
         self.close()
 
     def close(self) -> None:
-        """Disconnect from PyBullet; the world cannot be used afterwards."""
-        if self.client >= 0:
-            pybullet.disconnect(self.client)
-            self.client = -1
+        """Disconnect from PyBullet, as happens to a world that nothing refers to any more."""
+        self._disconnect()
+
+    @property
+    def client(self) -> int:
+        """PyBullet's number of this world; raises RuntimeError when it is closed."""
+        if not self._disconnect.alive:
+            raise RuntimeError("this world is closed; make a new Tabletop()")
+        return self._client
 
     def reset(self, tool: str = "gripper") -> None:
         """Clear the table and park the arm with a tool: the same world, bit for bit, every time."""
         client = self.client
-        if tool != self.tool:
+        if tool != self.tool or self._placed >= OBJECTS_PER_BUILD:
             self._build(tool)
         else:
             self._clear()
@@ -141,7 +151,7 @@ class Tabletop(Interventions):
             basePosition=(sum(TABLE_X_M) / 2, sum(TABLE_Y_M) / 2, -0.05),
             physicsClientId=client,
         )
-        self.tool, self.robot = tool, robot.load_robot(client, tool)
+        self.tool, self.robot, self._placed = tool, robot.load_robot(client, tool), 0
         self.joints = (*robot.ARM_JOINTS, *robot.finger_joints(client, self.robot))
         self._fresh = pybullet.saveState(physicsClientId=client)
 
@@ -185,6 +195,7 @@ class Tabletop(Interventions):
             raise ValueError(f"tool must be one of {sorted(robot.TOOL_OFFSETS_M)}, got {tool!r}")
         self.config = config or self.config
         self.reset(tool)
+        self._placed += 1
         mass = self.config.density_kg_m3 * thing.volume_m3
         com = self.config.com_offset_m
         self.thing = thing

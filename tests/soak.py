@@ -1,0 +1,84 @@
+"""Look, plan and execute 3,000 times: the memory stays, and the same task gives the same bits.
+
+    make soak
+
+Each round has an object, a start and a goal of its own, and A* and the continuous planner take
+turns. Every hundred rounds two fixed tasks are done again. Exits with 1 when memory grew by more
+than 5 MB after the first hundred rounds, or a fixed task ended differently. Half an hour.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import hashlib
+import itertools
+import sys
+
+import numpy as np
+import psutil
+
+from affordlib.planning import Repertoire, carry_out, plan_astar, plan_continuous
+from affordlib.planning.modes import PlanMode
+from affordlib.types import Goal, UnreachableError
+from affordlib.world import Cuboid, LyingCylinder, Tabletop, UprightCylinder
+
+MOST_GROWTH_MB = 5.0
+EVERY = 100
+FAMILIES = (Cuboid, UprightCylinder, LyingCylinder)
+
+
+def one_round(world: Tabletop, planner, thing, start, goal: Goal) -> str:
+    """Look, plan and execute; the hash of the object's path."""
+    world.place(thing, start)
+    seen = world.perceive()
+    try:
+        outcome = carry_out(world, planner(seen.image, seen.xy_m, goal))
+    except UnreachableError:
+        return "unreachable"
+    told = [np.array(outcome.end_pose), *outcome.object_paths_xy_m]
+    return hashlib.sha256(b"".join(part.tobytes() for part in told)).hexdigest()
+
+
+def memory_mb() -> float:
+    """Memory of this process alone [MB]."""
+    gc.collect()
+    own = psutil.Process().memory_full_info()
+    return (own.uss + own.swap) / 2**20
+
+
+def main() -> int:
+    """Run it, and tell."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
+    parser.add_argument("--rounds", type=int, default=3000)
+    rounds = parser.parse_args().rounds
+    rng = np.random.default_rng(0)
+    repertoire, mode = Repertoire.load(), PlanMode(2, partial=True)
+    planners = [repertoire.planner(plan, mode=mode) for plan in (plan_astar, plan_continuous)]
+    fixed = [(Cuboid(0.06, 0.05, 0.07), (0.0, 0.0)), (UprightCylinder(0.06, 0.08), (0.1, 0.2))]
+    first: list[str] = []
+    begin = 0.0
+    with Tabletop() as world:
+        for number, planner in zip(range(1, rounds + 1), itertools.cycle(planners), strict=False):
+            family = FAMILIES[rng.integers(len(FAMILIES))]
+            start = rng.uniform((-0.1, -0.2), (0.2, 0.2))
+            goal = Goal(tuple(start + rng.uniform(-0.1, 0.1, 2)), 0.005)
+            one_round(world, planner, family.sample(rng, (0.05, 0.08)), start, goal)
+            if number % EVERY == 0:
+                again = [
+                    one_round(world, plan, thing, at, Goal((at[0] + 0.08, at[1] + 0.06), 0.005))
+                    for thing, at in fixed
+                    for plan in planners
+                ]
+                first = first or again
+                now = memory_mb()
+                begin = begin or now
+                same = again == first
+                print(f"{number} rounds: {now - begin:+.1f} MB, same bits: {same}", flush=True)
+                if not same or now - begin > MOST_GROWTH_MB:
+                    return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
