@@ -81,6 +81,16 @@ def looks_fallen(before: np.ndarray, after: np.ndarray) -> bool:
     return bool(change > _FALL_M or looks_rollable(before) != looks_rollable(after))
 
 
+def radius_m(image: np.ndarray) -> float:
+    """How far the object reaches from the middle of the image [m], seen from above."""
+    rows, columns = np.nonzero(image[1] > 0.5)
+    if not len(rows):
+        return 0.0
+    middle = (len(image[1]) - 1) / 2
+    pixels = float(np.hypot(rows - middle, columns - middle).max())
+    return (pixels + 0.5) * CROP_WIDTH_M / len(image[1])
+
+
 def largest_blob(mask: np.ndarray) -> np.ndarray:
     """The largest connected part of a mask, its holes filled."""
     labels, n = ndimage.label(mask)

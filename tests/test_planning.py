@@ -71,7 +71,7 @@ class RandomTable:
     def __init__(self, seed: int, n: int = 6) -> None:
         rng = np.random.default_rng(seed)
         self.n, self.xy, self.turn = n, rng.uniform(-0.09, 0.09, (n, 2)), rng.uniform(-1, 1, n)
-        self.effects = SimpleNamespace(reach_m=np.hypot(*self.xy.T).max())
+        self.effects = SimpleNamespace(radius_m=0.0, reach_m=np.hypot(*self.xy.T).max())
 
     def at(self, turned: float) -> Branches:
         c, s = math.cos(turned), math.sin(turned)
@@ -144,9 +144,11 @@ def test_an_effect_map_says_what_the_model_says(world, film, kind):
     direction = torch.from_numpy(rng.uniform(-7, 7, 40))
     phase = torch.from_numpy(rng.uniform(0.3, 1, 40))
     told, std = effects(direction, phase)
-    # The map tells displacements; what the model says at t = 0 is none.
-    asked = effects.ask_model(direction, phase) - effects.ask_model(direction, 0 * phase)
-    assert (told - asked)[:, :2].norm(dim=-1).median() < 2e-4
+    asked = effects.ask_model(direction, phase)
+    off = (told - asked)[:, :2].norm(dim=-1)
+    assert off.median() < 6e-4  # what the splines leave: 0.2 mm of the push, less of the drag
+    at_first = torch.full_like(phase, kind.acts_from)
+    assert effects.ask_model(direction, at_first).abs().max() < 1e-6
     assert (std > 0).all()
     # It is smooth: its slopes are those of finite differences.
     direction.requires_grad_(), phase.requires_grad_()

@@ -11,6 +11,7 @@ from affordlib.primitives import Grasp, Push, Rotate
 from affordlib.types import Goal
 from affordlib.world import Cuboid, LyingCylinder, Sphere, Tabletop, UprightCylinder
 
+EXACT_M = 0.002
 BOX, TUBE = Cuboid(0.06, 0.05, 0.05), UprightCylinder(0.05, 0.07)
 DISC = LyingCylinder(0.05, 0.10)
 """On its rim, and as wide as the hand can open: only its faces can be taken."""
@@ -27,7 +28,7 @@ def test_crossings_are_where_the_course_has_the_value():
 @pytest.mark.parametrize("height", [0.03, 0.12])
 def test_a_partial_grasp_ends_holding_at_the_height(world, repertoire, height):
     world.place(BOX, (0.02, 0.01), 0.0)
-    went = pursue(world, Goal((0.02, 0.01), height_m=height), repertoire)
+    went = pursue(world, Goal((0.02, 0.01), EXACT_M, height_m=height), repertoire)
     assert went.reached, went.words
     assert [type(s.primitive) for s in went.steps] == [Grasp]
     assert 0 < went.steps[0].stop_phase < 1
@@ -50,13 +51,13 @@ def test_what_is_held_stays_in_the_hand(world, thing, stop):
 
 def test_a_turn_is_a_partial_rotation(world, repertoire):
     world.place(TUBE, (0.0, 0.0), 0.0)
-    went = pursue(world, Goal((0.0, 0.0), turn_rad=0.6), repertoire)
+    went = pursue(world, Goal((0.0, 0.0), EXACT_M, turn_rad=0.6), repertoire)
     assert went.reached, went.words
     assert world.object_pose()[2] == pytest.approx(0.6, abs=math.radians(3))
     assert [type(s.primitive) for s in went.steps] == [Rotate]
     # What one sweep of 60° does not reach takes another.
     world.place(TUBE, (0.0, 0.0), 0.0)
-    went = pursue(world, Goal((0.0, 0.0), turn_rad=1.9), repertoire)
+    went = pursue(world, Goal((0.0, 0.0), EXACT_M, turn_rad=1.9), repertoire)
     assert went.reached, went.words
     assert sum(isinstance(s.primitive, Rotate) for s in went.steps) >= 2
 
@@ -64,8 +65,8 @@ def test_a_turn_is_a_partial_rotation(world, repertoire):
 @pytest.mark.parametrize("thing", [TUBE, BOX], ids=["round", "with flanks"])
 def test_position_orientation_and_height_are_chained(world, repertoire, thing):
     world.place(thing, (0.0, 0.0), 0.0)
-    goal = Goal((0.07, 0.03), turn_rad=0.5, height_m=0.08)
-    went = pursue(world, goal, repertoire, tolerance_m=0.004)
+    goal = Goal((0.07, 0.03), 0.004, turn_rad=0.5, height_m=0.08)
+    went = pursue(world, goal, repertoire)
     assert went.reached, went.words
     kinds = [type(s.primitive) for s in went.steps]
     assert kinds[0] is Push
@@ -78,7 +79,7 @@ def test_position_orientation_and_height_are_chained(world, repertoire, thing):
 
 def test_the_part_that_cannot_be_had_is_named(world, repertoire):
     world.place(BOX, (0.0, 0.0), 0.0)
-    went = pursue(world, Goal((0.0, 0.0), height_m=0.4), repertoire)
+    went = pursue(world, Goal((0.0, 0.0), EXACT_M, height_m=0.4), repertoire)
     assert (went.ending, went.steps) == ("unreachable", ())
     assert "the height: 40.0 cm" in went.words
     image = world.look()
@@ -117,7 +118,7 @@ def test_the_hand_takes_what_it_can_hold(world, repertoire):
 @pytest.mark.parametrize("degrees", [-25, 30, 75])
 def test_a_box_is_turned_either_way_in_one_rotation(world, repertoire, degrees):
     world.place(BOX, (0.0, 0.0), 0.2)
-    went = pursue(world, Goal((0.0, 0.0), turn_rad=math.radians(degrees)), repertoire)
+    went = pursue(world, Goal((0.0, 0.0), EXACT_M, turn_rad=math.radians(degrees)), repertoire)
     assert went.reached, went.words
     assert [type(s.primitive) for s in went.steps] == [Rotate]
     turned = math.degrees(world.object_pose()[2] - 0.2)
@@ -133,7 +134,7 @@ def test_an_angle_that_the_arm_refuses_is_not_taken(world, repertoire, monkeypat
 
     world.place(DISC, yaw_rad=0.6)
     monkeypatch.setattr(Tabletop, "can_reach", can_reach)
-    goal = Goal((0.0, 0.0), height_m=0.1)
+    goal = Goal((0.0, 0.0), EXACT_M, height_m=0.1)
     went = pursue(world, goal, repertoire)
     assert went.reached, went.words
     assert went.steps[0].primitive.grip_yaw == asked[-1]

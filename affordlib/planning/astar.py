@@ -21,7 +21,7 @@ import torch
 
 from affordlib.planning.effect_map import EffectMap, map_effects
 from affordlib.planning.finish import Finish, finished
-from affordlib.planning.modes import PlanMode, is_on_table, mode_named
+from affordlib.planning.modes import PlanMode, check_has_room, is_on_table, mode_named
 from affordlib.planning.steps import make_steps
 from affordlib.primitives import Push
 from affordlib.types import Goal, Plan, check_count, check_on_table
@@ -136,10 +136,10 @@ def search(
     """The cheapest chain of (direction, phase) into the goal's disc, whether it gets there, and
     how many nodes were expanded.
 
-    Where no chain does, the one that ends nearest. Ties go to fewer actions. Positions that are
-    off the table or out of reach are not expanded. trace, if given, receives each expanded
-    position (2,) with those of its children (n, 2). finish: turns and lifts at the end; where it
-    cannot, a node is none of the goal's.
+    Where no chain does, the one that ends nearest. Ties go to fewer actions. No action leads where
+    a part of the object would be off the table, or begins out of reach. trace, if given, receives
+    each expanded position (2,) with those of its children (n, 2). finish: turns and lifts at the
+    end; where it cannot, a node is none of the goal's.
     """
     goal_xy, tolerance = np.array(goal.xy_m)[:, None], goal.tolerance_m
     reach = table.effects.reach_m
@@ -173,7 +173,7 @@ def search(
         else:
             rows = np.flatnonzero(away <= tolerance + (max_steps - depth) * reach + nearest_m)
         if len(rows):
-            rows = rows[is_on_table(places[rows])]
+            rows = rows[is_on_table(places[rows], table.effects.radius_m)]
         if reachable is not None and len(rows):
             here = np.broadcast_to((x, y), (len(rows), 2))
             rows = rows[reachable(here, branches.direction[rows])]
@@ -229,6 +229,7 @@ def plan_astar(
     mode = mode_named(mode)
     start = check_on_table("start_xy_m", start_xy_m)
     effects = effects or map_effects(model, image, kind)
+    check_has_room(goal, effects.radius_m)
     table = BranchTable(effects, n_directions, tuple(stop_phases) if mode.partial else (1.0,))
     chain, reached, expansions = search(
         table, start, goal, mode.max_steps, reachable, finish=finish

@@ -133,7 +133,7 @@ class Chase:
         self.limit = self._limit_from(self._perceived().xy_m)
         while True:
             self._look()
-            if self.goal.distance_m(self.seen.xy_m) > self.demands.tolerance_m:
+            if self.goal.distance_m(self.seen.xy_m) > self.goal.tolerance_m:
                 self._act(self._next_move(), "position")
                 continue
             off = self._turn_left()
@@ -156,7 +156,7 @@ class Chase:
             turned = off is None or abs(off) <= self.demands.turn_tolerance_rad
             if turned and abs(self._height_left()) <= self.demands.height_tolerance_m:
                 shifted = self.goal.distance_m(self.world.object_pose()[:2])
-                if shifted <= max(self.demands.tolerance_m, SHIFTED_M):
+                if shifted <= max(self.goal.tolerance_m, SHIFTED_M):
                     raise Ended("reached", self._where())
                 if lifts == MAX_LIFTS:
                     self._give_up("position")

@@ -45,7 +45,6 @@ Replan = Callable[[np.ndarray, tuple[float, float], Goal], Plan]
 ENOUGH_M = 0.0003
 """What a corrective action leaves anyway; nearer to the goal than this, none is tried."""
 
-TOLERANCE_M = 0.002
 HEIGHT_TOLERANCE_M = 0.003
 
 
@@ -110,7 +109,6 @@ def pursue(
     goal: Goal,
     repertoire: Repertoire,
     planner: Callable[..., Plan] = plan_continuous,
-    tolerance_m: float = TOLERANCE_M,
     turn_tolerance_rad: float = TURN_TOLERANCE_RAD,
     height_tolerance_m: float = HEIGHT_TOLERANCE_M,
     max_actions: int | None = None,
@@ -123,20 +121,19 @@ def pursue(
 
     planner: called as plan_astar and plan_continuous are; horizon: the longest chain it is asked
     for. max_actions: default `action_limit` of the distance, renewed when the goal moves or
-    somebody displaces the object (that at most three times). disturbances: what shall happen.
+    somebody displaces the object (that at most three times). The position holds when the object is
+    seen within the goal's own tolerance. disturbances: what shall happen.
     on_action: called with the plan and the number of actions taken, after each; it may return a
     new goal. on_plan: called with every plan before its first action. Never moves where the arm's
     kinematics says no.
     """
-    for name, value in (("tolerance_m", tolerance_m), ("height_tolerance_m", height_tolerance_m)):
-        check_within(name, value, 1e-5, 0.1, "m")
+    check_within("height_tolerance_m", height_tolerance_m, 1e-5, 0.1, "m")
     check_within("turn_tolerance_rad", turn_tolerance_rad, 1e-4, math.pi, "rad")
     if max_actions is not None:
         check_count("max_actions", max_actions, least=0)
     demands = Demands(
         planner,
         PlanMode(horizon, partial=True),
-        tolerance_m,
         turn_tolerance_rad,
         height_tolerance_m,
         max_actions,

@@ -22,7 +22,7 @@ import torch
 
 from affordlib.planning.effect_map import EffectMap, map_effects
 from affordlib.planning.finish import Finish, finished
-from affordlib.planning.modes import PlanMode, is_on_table, mode_named
+from affordlib.planning.modes import PlanMode, check_has_room, is_on_table, mode_named
 from affordlib.planning.steps import make_steps, roll_out
 from affordlib.primitives import Push
 from affordlib.types import Goal, Plan, check_on_table
@@ -82,10 +82,9 @@ def _starts(
 def _objective(
     effects: EffectMap, target: Tensor, direction: Tensor, phase: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Squared distances and weighed variance (B,) [m²]; where chains are before each action."""
+    """Squared distances and weighed variance (B,) [m²]; positions (B, K, 2) after each action."""
     positions, _, variances = roll_out(effects, direction, phase)
-    before = torch.cat([torch.zeros_like(positions[:, :1]), positions[:, :-1]], dim=1)
-    return (positions[:, -1] - target).square().sum(dim=-1) + CAUTION * variances[:, -1], before
+    return (positions[:, -1] - target).square().sum(dim=-1) + CAUTION * variances[:, -1], positions
 
 
 def _slopes(
@@ -210,6 +209,7 @@ def plan_continuous(
     mode = mode_named(mode)
     start = check_on_table("start_xy_m", start_xy_m)
     effects = effects or map_effects(model, image, kind)
+    check_has_room(goal, effects.radius_m)
     rng = np.random.default_rng(seed)
     xy = np.array(start)
     target = torch.from_numpy(np.array(goal.xy_m) - xy)
@@ -230,8 +230,7 @@ def plan_continuous(
         direction, phase = best[1:]
         corrections = 1 if draft else CORRECTIONS
         chain, foreseen = _correct(effects, target, direction, phase, mode.partial, corrections)
-        before = torch.cat([torch.zeros(1, 2), foreseen[0][:-1]])
-        if not _allowed(xy, before[None], chain[None, :, 0], reachable).all():
+        if not _allowed(effects, xy, foreseen[0][None], chain[None, :, 0], reachable).all():
             chain, foreseen = torch.stack([direction[0], phase[0]], dim=1), None
         steps = make_steps(effects, start, chain, foreseen)
         if goal.distance_m(steps[-1].predicted_end_xy_m) >= goal.distance_m(start):
@@ -243,14 +242,20 @@ def plan_continuous(
 
 
 def _allowed(
-    xy: np.ndarray, before: Tensor, direction: Tensor, reachable: Reachable | None
+    effects: EffectMap,
+    xy: np.ndarray,
+    positions: Tensor,
+    direction: Tensor,
+    reachable: Reachable | None,
 ) -> Tensor:
-    """Which chains (B,) act on the table and within reach; before: (B, K, 2), from the start on."""
-    places = xy + before.reshape(-1, 2).numpy()
-    allowed = is_on_table(places)
+    """Which chains (B,) act within reach and keep the object on the table; positions: (B, K, 2)."""
+    ends = xy + positions.numpy()
+    allowed = is_on_table(ends, effects.radius_m)
     if reachable is not None:
-        allowed &= reachable(places, direction.reshape(-1).numpy())
-    return torch.from_numpy(allowed.reshape(direction.shape).all(axis=1))
+        begins = np.concatenate([np.broadcast_to(xy, ends[:, :1].shape), ends[:, :-1]], axis=1)
+        told = reachable(begins.reshape(-1, 2), direction.reshape(-1).numpy())
+        allowed &= told.reshape(direction.shape)
+    return torch.from_numpy(allowed.all(axis=1))
 
 
 def _best_chain(
@@ -268,8 +273,8 @@ def _best_chain(
 
     def judged(direction: Tensor, phase: Tensor) -> tuple[Tensor, Tensor]:
         with torch.no_grad():
-            expected, before = _objective(effects, target, direction, phase)
-        allowed = _allowed(xy, before, direction, reachable)
+            expected, positions = _objective(effects, target, direction, phase)
+        allowed = _allowed(effects, xy, positions, direction, reachable)
         return expected.sqrt() + ACTION_COST_M * n_actions, allowed
 
     direction, phase = _starts(effects, target, n_actions, partial, rng)

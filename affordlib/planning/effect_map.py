@@ -20,6 +20,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from affordlib.models.protocol import observe_actions
+from affordlib.perception import radius_m
 from affordlib.planning.modes import encode_image, plane
 from affordlib.primitives import Drag, Push
 from affordlib.types import check_count
@@ -46,7 +47,7 @@ class EffectMap:
 
     coefficients: (D + 3, T + 3, 6), of cubic B-splines over the direction relative to the object
     as its image shows it, and over the phases from `kind.acts_from` on. It is evaluated with torch,
-    so that it can be differentiated.
+    so that it can be differentiated. radius_m: how far the object reaches from its middle.
     """
 
     kind: type[Push] | type[Drag]
@@ -54,6 +55,7 @@ class EffectMap:
     features: Tensor
     coefficients: Tensor
     reach_m: float
+    radius_m: float = 0.0
 
     def __call__(self, direction_rad: Tensor, phase: Tensor) -> tuple[Tensor, Tensor]:
         """Effects and σ (..., 3) in the frame of the action, directions relative to the object."""
@@ -102,10 +104,10 @@ class EffectMap:
     @torch.no_grad()
     def ask_model(self, direction_rad: Tensor, phase: Tensor) -> Tensor:
         """As the map, for (n,) directions and phases, from the model itself: (n, 3)."""
-        effect, _ = _asked(
-            self.model, self.features, self.kind, direction_rad.numpy(), phase[:, None].float()
-        )
-        return effect[:, 0]
+        first = torch.full_like(phase, self.kind.acts_from)
+        t_target = torch.stack([first, phase.clamp_min(self.kind.acts_from)], dim=1).float()
+        effect, _ = _asked(self.model, self.features, self.kind, direction_rad.numpy(), t_target)
+        return effect[:, 1] - effect[:, 0]
 
 
 def _basis(x: Tensor) -> Tensor:
@@ -167,7 +169,8 @@ def map_effects(
     # What a model says of the time before contact is no displacement.
     effect = effect - effect[:, :1]
     reach = float(effect[..., :2].norm(dim=-1).max())
-    return EffectMap(kind, model, features, splines_through(effect, std), reach)
+    splines = splines_through(effect, std)
+    return EffectMap(kind, model, features, splines, reach, radius_m(np.asarray(image)))
 
 
 def splines_through(effect: Tensor, std: Tensor) -> Tensor:

@@ -22,8 +22,16 @@ import torch
 
 from affordlib.models.network import OutOfRangeWarning
 from affordlib.models.protocol import observe_actions, observe_final_effect
+from affordlib.perception import radius_m
 from affordlib.planning.finish import finished
-from affordlib.planning.modes import PATH_SAMPLES, PlanMode, encode_image, mode_named, plane
+from affordlib.planning.modes import (
+    PATH_SAMPLES,
+    PlanMode,
+    check_has_room,
+    encode_image,
+    mode_named,
+    plane,
+)
 from affordlib.primitives import Push
 from affordlib.types import Goal, Plan, Step, check_count, check_on_table
 
@@ -132,6 +140,7 @@ def plan_gradient(
     columns = plane(model)
     a_columns = [model.action_channels.index(name) for name in ("x", "y")]
     features = encode_image(model, image)
+    check_has_room(goal, radius_m(np.asarray(image)))
     generator = np.random.default_rng(seed)
     xy, target = np.asarray(start), np.asarray(goal.xy_m)
     steps: list[Step] = []

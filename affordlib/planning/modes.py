@@ -12,6 +12,7 @@ from affordlib.types import IMAGE_CHANNELS, IMAGE_PIXELS, TABLE_X_M, TABLE_Y_M
 
 if TYPE_CHECKING:
     from affordlib.models.protocol import EffectModel
+    from affordlib.types import Goal
 
 PATH_SAMPLES = 25
 """Points of the predicted path that a step carries, as in Section 4.3."""
@@ -69,8 +70,18 @@ def plane(model: EffectModel) -> list[int]:
     return [model.effect_channels.index(name) for name in ("x", "y")]
 
 
-def is_on_table(xy_m: np.ndarray) -> np.ndarray:
-    """Which of the points (n, 2) lie on the table."""
-    x, y = xy_m[:, 0], xy_m[:, 1]
-    on_x = (TABLE_X_M[0] <= x) & (x <= TABLE_X_M[1])
-    return on_x & (TABLE_Y_M[0] <= y) & (y <= TABLE_Y_M[1])
+def is_on_table(xy_m: np.ndarray, radius_m: float = 0.0) -> np.ndarray:
+    """Which of the points (n, 2) lie on the table, farther than a radius [m] from its rim."""
+    (x0, x1), (y0, y1) = TABLE_X_M, TABLE_Y_M
+    inside = np.array(xy_m) - (x0 + radius_m, y0 + radius_m)
+    return ((inside >= 0) & (inside <= (x1 - x0 - 2 * radius_m, y1 - y0 - 2 * radius_m))).all(-1)
+
+
+def check_has_room(goal: Goal, radius_m: float) -> None:
+    """Raise ValueError where an object of a radius [m] would not stand on the table as a whole."""
+    if not is_on_table(np.array([goal.xy_m]), radius_m)[0]:
+        x, y = goal.xy_m
+        raise ValueError(
+            f"goal xy_m = ({x:g}, {y:g}) m is too near the rim of the table for an object that "
+            f"reaches {100 * radius_m:.1f} cm from its middle"
+        )

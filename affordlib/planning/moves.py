@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
+from affordlib.planning.modes import check_has_room, is_on_table
 from affordlib.planning.routes import CELL_M, find_route, places
 from affordlib.types import Goal, Plan
 
@@ -41,7 +42,6 @@ class Demands:
 
     planner: Callable[..., Plan]
     mode: PlanMode
-    tolerance_m: float
     turn_tolerance_rad: float
     height_tolerance_m: float
     max_actions: int | None
@@ -68,11 +68,14 @@ class MovePlanner:
         Raises `Ended` where there is none; so_far: what to say has been done.
         """
         effects = self.repertoire.effects(seen.image)
-        aim = replace(goal, tolerance_m=self.demands.tolerance_m)
-        off = aim.distance_m(seen.xy_m)
+        try:
+            check_has_room(goal, effects.radius_m)
+        except ValueError as error:
+            raise Ended("unreachable", f"the position: {error}") from None
+        off = goal.distance_m(seen.xy_m)
         plan = None
         if off <= self.demands.mode.max_steps * effects.reach_m:
-            plan = self._plan_to(effects, seen, aim, self.demands.tolerance_m)
+            plan = self._plan_to(effects, seen, goal, goal.tolerance_m)
         if plan is None:
             way = self._way(effects, seen, goal)
             if way is None:
@@ -103,13 +106,16 @@ class MovePlanner:
         stops = [tuple(place) for place in way if math.dist(here, place) <= farthest]
         if off > farthest:
             straight = tuple((here + farthest / off * ahead).tolist())
-            barred = self._barred_moves[effects.kind.name]
-            if find_route(routes, straight, goal.xy_m, self._judged(effects.kind), barred):
+            barred, room = self._barred_moves[effects.kind.name], effects.radius_m
+            judged = self._judged(effects.kind)
+            if is_on_table(np.array([straight]), room)[0] and find_route(
+                routes, straight, goal.xy_m, judged, barred, room
+            ):
                 stops.append(straight)
         for stop in reversed(stops):
             last = stop == tuple(goal.xy_m)
-            within = max(self.demands.tolerance_m, 0.5 * off) if last else WAYPOINT_M
-            plan = self._plan_to(effects, seen, Goal(stop, self.demands.tolerance_m), within)
+            within = max(goal.tolerance_m, 0.5 * off) if last else WAYPOINT_M
+            plan = self._plan_to(effects, seen, Goal(stop, goal.tolerance_m), within)
             if plan is not None:
                 return plan
         return None
@@ -179,7 +185,8 @@ class MovePlanner:
         barred = self._barred_moves.setdefault(kind.name, [])
         x, y = places()
         for _ in range(MAX_REFUSED_WAYS):
-            way = find_route(routes, seen.xy_m, goal.xy_m, self._judged(kind), barred)
+            judged, room = self._judged(kind), effects.radius_m
+            way = find_route(routes, seen.xy_m, goal.xy_m, judged, barred, room)
             if way is None:
                 return None
             at = seen.xy_m

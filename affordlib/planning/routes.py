@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from affordlib.planning.modes import is_on_table
 from affordlib.primitives import Drag, Push
 from affordlib.types import TABLE_X_M, TABLE_Y_M
 
@@ -61,16 +62,12 @@ class RouteMap:
         said = judge(np.tile(xy, (len(moves), 1)), np.repeat(angle, n), np.repeat(length, n))
         return cls(moves, said.reshape(len(moves), x.size, y.size), reach_m)
 
-    def to_go_m(self, last: np.ndarray, barred: Sequence[tuple[int, int, int]] = ()) -> np.ndarray:
+    def to_go_m(self, last: np.ndarray, allowed: np.ndarray) -> np.ndarray:
         """Lengths (nx, ny) [m] of the shortest ways, inf where there is none.
 
         last: (nx, ny), of the last action to the goal itself, inf where one does not get there.
-        barred: (move, i, j) that are not to be used.
+        allowed: (m, nx, ny), the moves that may be used.
         """
-        allowed = self.allowed
-        if barred:
-            allowed = allowed.copy()
-            allowed[tuple(np.array(barred).T)] = False
         to_go = last.copy()
         lengths = CELL_M * np.hypot(*self.moves.T)
         while True:
@@ -96,10 +93,13 @@ def find_route(
     goal_xy_m: Sequence[float],
     judge: Judge,
     barred: Sequence[tuple[int, int, int]] = (),
+    radius_m: float = 0.0,
 ) -> list[tuple[float, float]] | None:
     """Places (x, y) [m] after each action of the shortest way, the goal last; None: there is none.
 
     judge: which actions the arm can do, of positions (n, 2), directions and lengths (n,).
+    barred: moves that are not to be used, as (move, i, j); radius_m: no place on the way is nearer
+    to the table's rim than this.
     """
     start, goal = np.asarray(start_xy_m, dtype=float), np.asarray(goal_xy_m, dtype=float)
     x, y = places()
@@ -119,16 +119,16 @@ def find_route(
     if np.isfinite(one_action(start, goal[None])[0]):
         return [tuple(goal.tolist())]
     last = one_action(xy.reshape(-1, 2), np.broadcast_to(goal, (x.size * y.size, 2)))
-    to_go = routes.to_go_m(last.reshape(x.size, y.size), barred)
+    last = np.where(is_on_table(xy, radius_m), last.reshape(x.size, y.size), np.inf)
+    open_moves = routes.allowed & is_on_table(xy, radius_m)
+    if barred:
+        open_moves[tuple(np.array(barred).T)] = False
+    to_go = routes.to_go_m(last, open_moves)
     first = one_action(start, xy.reshape(-1, 2)).reshape(to_go.shape) + to_go
     if not np.isfinite(first).any():
         return None
     at = np.unravel_index(int(first.argmin()), first.shape)
     route = [at]
-    last = last.reshape(to_go.shape)
-    open_moves = routes.allowed.copy()
-    if barred:
-        open_moves[tuple(np.array(barred).T)] = False
     lengths = CELL_M * np.hypot(*routes.moves.T)
     while to_go[at] < last[at] - 1e-12:
         ends = [

@@ -48,8 +48,8 @@ def open_loop(world: Tabletop, plan: Plan, planner: Planner, tell: Tell) -> Outc
     return replace(at_rest, plan=plan, object_paths_xy_m=paths)
 
 
-def closed_loop(repertoire: Repertoire) -> Executor:
-    """An executor that looks after every action and plans anew until the goal is reached.
+def closed_loop(repertoire: Repertoire, tolerance_m: float = 0.002) -> Executor:
+    """An executor that looks after every action and plans anew until the goal is this near [m].
 
     It plans from what it sees, with the models of a repertoire, as the planner does where that is
     of `Repertoire.planner`. Any other cannot be told where the arm can act; then it plans with
@@ -57,13 +57,16 @@ def closed_loop(repertoire: Repertoire) -> Executor:
     """
 
     def execute(world: Tabletop, plan: Plan, planner: Planner, tell: Tell) -> Outcome:
+        def exactly(goal: Goal) -> Goal:
+            return replace(goal, tolerance_m=tolerance_m)
+
         search = getattr(planner, "search", None)
         done = pursue(
             world,
-            plan.goal,
+            exactly(plan.goal),
             repertoire,
             search or plan_continuous,
-            on_action=lambda *_: tell(),
+            on_action=lambda *_: exactly(tell()),
             on_plan=tell,
         )
         words = "" if done.reached else f"The loop ended as {done.ending}: {done.words}."

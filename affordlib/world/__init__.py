@@ -2,6 +2,7 @@
 
 import affordlib.world._quiet_pybullet  # noqa: F401  (must come first)
 from affordlib.types import NothingSeenError, UnreachableError
+from affordlib.world.config import WorldConfig
 from affordlib.world.objects import (
     FAMILIES,
     Cuboid,
@@ -13,7 +14,7 @@ from affordlib.world.objects import (
     family_named,
 )
 from affordlib.world.robot import BASE_X_M, REACH_M
-from affordlib.world.scene import Tabletop, WorldConfig
+from affordlib.world.scene import Tabletop
 
 __all__ = [
     "BASE_X_M",

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import weakref
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,9 +28,10 @@ from affordlib.types import (
     check_within,
 )
 from affordlib.world import camera, motion, robot
+from affordlib.world.config import WorldConfig
 from affordlib.world.execution import execute, place_offset, plan_motion, put_down, refused
 from affordlib.world.interventions import Interventions
-from affordlib.world.objects import DENSITY_KG_M3, create_body, create_footprint
+from affordlib.world.objects import create_body, create_footprint
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -45,42 +45,6 @@ OBJECTS_PER_BUILD = 256
 
 N_SAMPLES = 301
 """Recorded samples over the phase: one every 3 simulation steps of a full primitive."""
-
-CAMERAS = ("ideal", "kinect")
-
-
-@dataclass(frozen=True)
-class WorldConfig:
-    """Friction coefficients (Bullet multiplies the two bodies'), the object's inside, the senses.
-
-    com_offset_m: where the centre of mass lies in the object's frame; tip_offset_m: how much
-    higher than commanded the gripper moves. camera: "ideal" tells the robot where the object is
-    and shows it without noise, "kinect" leaves it to measure; bias_m is added to where it believes
-    the object to be, and noise_seed draws the noise of the images.
-    """
-
-    table_friction: float = 0.5
-    object_friction: float = 0.5
-    finger_friction: float = 0.9
-    density_kg_m3: float = DENSITY_KG_M3
-    com_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    tip_offset_m: float = 0.0
-    camera: str = "ideal"
-    bias_m: tuple[float, float] = (0.0, 0.0)
-    noise_seed: int = 0
-
-    def __post_init__(self) -> None:
-        for name in ("table_friction", "object_friction", "finger_friction"):
-            check_within(name, getattr(self, name), 0.01, 2.0)
-        check_within("density_kg_m3", self.density_kg_m3, 50.0, 10_000.0, "kg/m³")
-        check_within("tip_offset_m", self.tip_offset_m, -0.008, 0.1, "m")
-        for name, size in (("com_offset_m", 3), ("bias_m", 2)):
-            values = tuple(check_within(name, v, -0.1, 0.1, "m") for v in getattr(self, name))
-            if len(values) != size:
-                raise ValueError(f"{name} must be {size} numbers [m], got {values!r}")
-            object.__setattr__(self, name, values)
-        if self.camera not in CAMERAS:
-            raise ValueError(f"camera must be one of {CAMERAS}, got {self.camera!r}")
 
 
 class Tabletop(Interventions):
