@@ -1,3 +1,47 @@
 """Learned affordances and planning with partial actions: the package behind the workbook."""
 
+from collections.abc import Sequence
+from numbers import Integral, Real
+from typing import Annotated
+
+import numpy as np
+from beartype import BeartypeConf, FrozenDict, beartype
+from beartype.claw import beartype_packages
+from beartype.vale import Is
+
 __version__ = "0.1.0"
+
+# What a user calls is called with the types that it names: a number is no text and no truth value.
+_NO_BOOL = Is[lambda value: not isinstance(value, bool)]
+_NUMBER = Annotated[Real, _NO_BOOL]
+_NO_TEXT = Is[lambda value: not isinstance(value, str)]
+_NUMBERS = Annotated[Sequence[_NUMBER], _NO_TEXT] | np.ndarray
+_CHECKED = """
+types primitives perception plan_files results world.config world.objects world.interventions
+world.scene planning.astar planning.closed_loop planning.continuous planning.disturbances
+planning.effect_map planning.finish planning.gradient planning.modes planning.poses
+planning.reachability planning.repertoire interactions.batches interactions.collect
+interactions.folder interactions.lever interactions.recipes interactions.store models.calibration
+models.checkpoint models.ensemble models.lever models.protocol models.training
+evaluation.effect_prediction show.animation show.conditioning_explorer show.executors
+show.goal_picker show.lever show.phase_slider show.plots
+"""
+_CONF = BeartypeConf(
+    violation_type=TypeError,
+    claw_is_pep526=False,
+    hint_overrides=FrozenDict(
+        {
+            bool: bool | np.bool_,
+            int: Annotated[Integral, _NO_BOOL],
+            float: _NUMBER,
+            Sequence[float]: _NUMBERS,
+            tuple[float, float]: _NUMBERS,
+            tuple[float, float, float]: _NUMBERS,
+            tuple[str, ...]: tuple[str, ...] | list[str],
+            Sequence[str]: Annotated[Sequence[str], _NO_TEXT],
+        }
+    ),
+)
+beartype_packages(tuple(f"affordlib.{name}" for name in _CHECKED.split()), conf=_CONF)
+checked = beartype(conf=_CONF)
+"""Decorates what is checked of a module that is not checked as a whole."""

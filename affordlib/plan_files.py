@@ -37,7 +37,14 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
     """
     try:
         return _plan(json.loads(Path(path).read_text(encoding="utf-8")))
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (
+        LookupError,
+        TypeError,
+        ArithmeticError,
+        ValueError,
+        AttributeError,
+        RecursionError,
+    ) as error:
         what = f"{error.args[0]!r} is missing" if isinstance(error, KeyError) else str(error)
         raise ValueError(f"path: {path} holds no plan: {what}") from None
 

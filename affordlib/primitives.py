@@ -8,13 +8,14 @@ the start. The world makes the arm follow it; models are conditioned on it.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
 
-from affordlib.types import check_finite, check_within
+from affordlib.types import check_array, check_field, check_finite, check_within
 
 DURATION_S = 3.75
 """Of every primitive: 25 recorded samples, one every 3 steps of 50 ms (Section 4.2)."""
@@ -29,7 +30,7 @@ HOVER_M = 0.16
 BLADE_HEIGHT_M = 0.0015
 
 
-def min_jerk(t: np.ndarray | float) -> np.ndarray:
+def min_jerk(t: np.ndarray | Sequence[float] | float) -> np.ndarray:
     """Share of the path covered at phase t under minimum-jerk timing: 10t³ - 15t⁴ + 6t⁵."""
     t = np.clip(t, 0.0, 1.0)
     return np.asarray(t**3 * (10.0 - 15.0 * t + 6.0 * t**2))
@@ -84,9 +85,11 @@ class Primitive:
         seconds = np.cumsum([0.0, *(leg.seconds for leg in self.legs)])
         return seconds / seconds[-1]
 
-    def path(self, phase: np.ndarray | float) -> np.ndarray:
+    def path(self, phase: np.ndarray | Sequence[float] | float) -> np.ndarray:
         """The commanded action a_t: (n, 5) at the phases (n,), channels `ACTION_CHANNELS`."""
-        phase = np.clip(np.atleast_1d(np.asarray(phase, dtype=float)), 0.0, 1.0)
+        phase = np.clip(np.atleast_1d(check_array("phase", phase)), 0.0, 1.0)
+        if phase.ndim > 1:
+            raise ValueError(f"phase must be numbers (n,), got an array {phase.shape}")
         action = np.empty((len(phase), 5))
         for leg, start, end in zip(
             self.legs, self.leg_phases[:-1], self.leg_phases[1:], strict=True
@@ -135,8 +138,8 @@ class Push(Primitive):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "theta", check_finite("theta", self.theta) % (2 * math.pi))
-        check_within("length", self.length, 0.0, 0.15, "m")
-        check_within("radius", self.radius, 0.1, 0.3, "m")
+        check_field(self, "length", 0.0, 0.15, "m")
+        check_field(self, "radius", 0.1, 0.3, "m")
 
     @classmethod
     def towards(cls, direction_rad: float, **kwargs: float) -> Push:
@@ -177,7 +180,7 @@ class Drag(Primitive):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "theta", check_finite("theta", self.theta) % (2 * math.pi))
-        check_within("length", self.length, 0.0, 0.15, "m")
+        check_field(self, "length", 0.0, 0.15, "m")
         if self.grip_yaw is not None:
             object.__setattr__(
                 self, "grip_yaw", wrap_angle(check_finite("grip_yaw", self.grip_yaw))
@@ -226,7 +229,7 @@ class Grasp(Primitive):
 
     def __post_init__(self) -> None:
         if self.seen_height is not None:
-            check_within("seen_height", self.seen_height, 0.0, 0.3, "m")
+            check_field(self, "seen_height", 0.0, 0.3, "m")
         yaw = wrap_angle(check_finite("grip_yaw", self.grip_yaw))
         object.__setattr__(self, "grip_yaw", yaw)
 
@@ -326,9 +329,9 @@ class LeverUp(Primitive):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "theta", check_finite("theta", self.theta) % (2 * math.pi))
-        check_within("contact_x", self.contact_x, -0.2, 0.2, "m")
-        check_within("contact_y", self.contact_y, -0.2, 0.2, "m")
-        check_within("reach", self.reach, 0.05, 0.4, "m")
+        check_field(self, "contact_x", -0.2, 0.2, "m")
+        check_field(self, "contact_y", -0.2, 0.2, "m")
+        check_field(self, "reach", 0.05, 0.4, "m")
 
     @classmethod
     def at_edge(

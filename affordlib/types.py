@@ -8,17 +8,17 @@ angles radians. Actions and effects are relative to where the object stood at th
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from numbers import Integral, Real
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     import torch
 
-    from affordlib.primitives import Primitive
+    import affordlib.primitives
 
 ACTION_CHANNELS = ("x", "y", "z", "yaw", "gripper")
 EFFECT_CHANNELS = ("x", "y", "z", "yaw", "tilt")
@@ -49,18 +49,19 @@ class NothingSeenError(RuntimeError):
     """The camera sees no object on the table."""
 
 
-def check_finite(name: str, value: float) -> float:
+def check_finite(name: str, value: Any) -> float:
     """Return `value` as a float, or raise naming the argument that is not a finite number."""
     try:
-        number = float(value)
-    except (TypeError, ValueError, OverflowError):
+        known = isinstance(value, Real) and not isinstance(value, bool)
+        number = float(value) if known else math.nan
+    except OverflowError:
         number = math.nan
     if not math.isfinite(number):
         raise ValueError(f"{name} must be a finite number, got {value!r}")
     return number
 
 
-def check_within(name: str, value: float, low: float, high: float, unit: str = "") -> float:
+def check_within(name: str, value: Any, low: float, high: float, unit: str = "") -> float:
     """Return `value` as a float, or raise naming the argument outside [low, high]."""
     number = check_finite(name, value)
     if not low <= number <= high:
@@ -68,19 +69,56 @@ def check_within(name: str, value: float, low: float, high: float, unit: str = "
     return number
 
 
-def check_count(name: str, value: int, least: int = 1) -> int:
-    """Return `value`, or raise naming the argument that is no whole number from `least` on."""
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}")
-    return value
+def check_array(name: str, values: Any, *shape: int) -> np.ndarray:
+    """Return finite numbers as an array, or raise naming the argument; shape: how its ends."""
+    array = np.asarray(values)
+    known = array.dtype.kind in "iuf" and array.size and np.isfinite(array).all()
+    if not known or array.shape[array.ndim - len(shape) :] != shape:
+        wanted = f" of shape (…, {', '.join(map(str, shape))})" if shape else ""
+        raise ValueError(f"{name} must be finite numbers{wanted}, got {values!r:.200}")
+    return array.astype(float)
 
 
-def check_on_table(name: str, xy_m: Sequence[float]) -> tuple[float, float]:
+def check_count(name: str, value: Any, least: int = 1, most: float = math.inf) -> int:
+    """Return `value`, or raise naming the argument that is no whole number in [least, most]."""
+    if isinstance(value, bool) or not isinstance(value, Integral) or not least <= value <= most:
+        span = f"of at least {least}" if most == math.inf else f"in [{least}, {most:g}]"
+        raise ValueError(f"{name} must be a whole number {span}, got {value!r}")
+    return int(value)
+
+
+def check_field(
+    owner: Any, name: str, low: float = -math.inf, high: float = math.inf, unit: str = ""
+) -> None:
+    """Check a number of a frozen dataclass, and keep it as a float; raises naming the field."""
+    checked = check_within(f"{type(owner).__name__}.{name}", getattr(owner, name), low, high, unit)
+    object.__setattr__(owner, name, checked)
+
+
+def check_pair(name: str, pair: Any, what: str = "(x, y) [m]") -> tuple[float, float]:
+    """Return two finite numbers as floats, or raise naming the argument that is something else."""
+    try:
+        one, other = (check_finite(name, value) for value in pair)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must be two finite numbers {what}, got {pair!r}") from None
+    return one, other
+
+
+def check_range(
+    name: str, pair: Any, low: float, high: float, unit: str = ""
+) -> tuple[float, float]:
+    """Return a range (first, last) inside [low, high], or raise naming the argument."""
+    first, last = check_pair(name, pair, "(low, high)")
+    if not low <= first <= last <= high:
+        raise ValueError(
+            f"{name} must be a range (low, high) inside [{low:g}, {high:g}] {unit}, got {pair!r}"
+        )
+    return first, last
+
+
+def check_on_table(name: str, xy_m: Any) -> tuple[float, float]:
     """Return (x, y) [m] in the frame of the table, or raise when it is not a point on it."""
-    pair = np.asarray(xy_m, dtype=float)
-    if pair.shape != (2,) or not np.isfinite(pair).all():
-        raise ValueError(f"{name} must be two finite numbers (x, y) in metres, got {xy_m!r}")
-    x, y = float(pair[0]), float(pair[1])
+    x, y = check_pair(name, xy_m)
     if not (TABLE_X_M[0] <= x <= TABLE_X_M[1] and TABLE_Y_M[0] <= y <= TABLE_Y_M[1]):
         raise ValueError(
             f"{name} = ({x:g}, {y:g}) m lies off the table; choose x in "
@@ -106,7 +144,7 @@ class Interaction:
     the arm could reach at all (if not, nothing happened).
     """
 
-    primitive: Primitive
+    primitive: affordlib.primitives.Primitive
     stop_phase: float
     phase: np.ndarray
     action: np.ndarray
@@ -181,11 +219,11 @@ class Goal:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "xy_m", check_on_table("goal xy_m", self.xy_m))
-        check_within("goal tolerance_m", self.tolerance_m, 0.0, 0.5, "m")
+        check_field(self, "tolerance_m", 0.0, 0.5, "m")
         if self.turn_rad is not None:
-            check_within("goal turn_rad", self.turn_rad, -math.pi, math.pi, "rad")
+            check_field(self, "turn_rad", -math.pi, math.pi, "rad")
         if self.height_m is not None:
-            check_within("goal height_m", self.height_m, 0.0, 0.5, "m")
+            check_field(self, "height_m", 0.0, 0.5, "m")
 
     def distance_m(self, xy_m: Sequence[float]) -> float:
         """Distance [m] between the goal and a point (x, y) [m] of the table."""
@@ -204,7 +242,7 @@ class Step:
     predicted_height_m: how far it expects it to be lifted.
     """
 
-    primitive: Primitive
+    primitive: affordlib.primitives.Primitive
     stop_phase: float
     predicted_end_xy_m: tuple[float, float]
     predicted_path_xy_m: np.ndarray
@@ -214,7 +252,12 @@ class Step:
     predicted_height_m: float = 0.0
 
     def __post_init__(self) -> None:
-        check_within("stop_phase", self.stop_phase, 0.0, 1.0)
+        check_field(self, "stop_phase", 0.0, 1.0)
+        check_field(self, "predicted_turn_rad")
+        check_field(self, "predicted_height_m")
+        for name in ("predicted_end_xy_m", "predicted_path_xy_m", "path_xy_m"):
+            if getattr(self, name) is not None:
+                check_array(name, getattr(self, name), 2)
 
 
 @dataclass(frozen=True)
@@ -231,6 +274,10 @@ class Plan:
     reaches_goal: bool
     evaluations: int
     plan_s: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "start_xy_m", check_on_table("start_xy_m", self.start_xy_m))
+        check_field(self, "plan_s", 0.0)
 
     @property
     def predicted_end_xy_m(self) -> tuple[float, float]:

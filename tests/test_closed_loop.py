@@ -399,7 +399,7 @@ def test_no_more_actions_than_were_allowed(table, repertoire, goal):
     table.place(BOX, (0.0, 0.0), 0.3)
     went = pursue(table, Goal((0.0, 0.0), EXACT_M, **goal), repertoire, max_actions=0)
     assert (went.ending, went.steps) == ("gave_up", ())
-    with pytest.raises(ValueError, match=r"whole number of at least 0, got 1\.5"):
+    with pytest.raises(TypeError, match=r"max_actions=1\.5"):
         pursue(table, Goal((0.0, 0.0), EXACT_M), repertoire, max_actions=1.5)
 
 

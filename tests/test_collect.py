@@ -13,11 +13,13 @@ import tracemalloc
 import zipfile
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import xarray as xr
 import zarr
+from dask.distributed import Client
 
 import affordlib
 from affordlib.interactions import CorruptedDataError, collect, make_data
@@ -205,7 +207,7 @@ def test_paths_and_workers_that_cannot_be_are_named(tmp_path):
     with pytest.raises(ValueError, match=r"memory of one process.*workers=1"):
         collect_set(SMALL, "memory://x.zarr", workers=2)
     with pytest.raises(ValueError, match=r"memory of one process.*workers=1"):
-        collect_set(SMALL, "memory://x.zarr", client=object())
+        collect_set(SMALL, "memory://x.zarr", client=Mock(spec=Client))
     with pytest.raises(FileNotFoundError, match=r"there is no file .*x\.zarr; .*'push'"):
         open_interactions(tmp_path / "x.zarr")
 

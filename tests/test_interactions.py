@@ -158,18 +158,18 @@ def test_a_missing_set_names_the_shipped_ones(tmp_path):
     ("arguments", "words"),
     [
         ({"primitives": ("kick",)}, "primitive 'kick'"),
-        ({"primitives": "push"}, r"primitives must be a sequence .* write \('push',\)"),
+        ({"primitives": "push"}, "primitives='push'"),
         ({"size_range_m": (0.08, 0.04)}, r"size_range_m must be a range .* \(0\.08, 0\.04\)"),
-        ({"height_range_m": (0.0, 0.04)}, r"height_range_m must lie in .* got 0"),
+        ({"height_range_m": (0.0, 0.04)}, r"height_range_m must be a range .* got \(0\.0, 0\.04\)"),
         ({"families": ("cone",)}, "family 'cone'"),
         ({"families": ()}, "families must be a sequence of at least one"),
         ({"n_interactions": 0}, "n_interactions .* 0"),
         ({"seed": -1}, "seed .* -1"),
-        ({"seed": 1.5}, r"seed .* 1\.5"),
+        ({"seed": 1.5}, r"seed=1\.5"),
     ],
 )
 def test_a_bad_recipe_is_named(arguments, words):
-    with pytest.raises(ValueError, match=words):
+    with pytest.raises((TypeError, ValueError), match=words):
         Recipe(**arguments)
 
 
@@ -181,7 +181,7 @@ def test_splits_and_folds():
         assert [len(p) for p in parts] == [400, 50, 50]
         assert len(np.unique(np.concatenate(parts))) == 500
     assert not np.array_equal(folds[0].test, split_interactions(500, seed=4).test)
-    with pytest.raises(ValueError, match="fold must lie in"):
+    with pytest.raises(ValueError, match=r"fold must be a whole number in \[0, 9\], got 10"):
         split_interactions(500, fold=10)
 
 

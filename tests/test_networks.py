@@ -336,9 +336,9 @@ def test_coverage_and_temperature(some):
         (lambda: FiLMConfig(frame="object"), r"frame .* 'object'"),
         (lambda: FiLMConfig(effect_channels=("z",)), "effect_channels must name x and y"),
         (lambda: FiLMConfig(blocks=0), "blocks .* 0"),
-        (lambda: AttentionConfig(rings=True), "rings must be a whole number .* True"),
+        (lambda: AttentionConfig(rings=True), "rings=True"),
         (lambda: AttentionConfig(heads=0), "heads .* 0"),
-        (lambda: LSTMConfig(steps=2.5), r"steps .* 2\.5"),
+        (lambda: LSTMConfig(steps=2.5), r"steps=2\.5"),
         (lambda: PublishedConfig(patience=0), "patience .* 0"),
         (lambda: CNPConfig(temperature=(1.0, 0.0)), r"temperature .* \(1\.0, 0\.0\)"),
         (lambda: AttentionConfig(width=30), "width must be a multiple of heads, got 30"),
@@ -347,5 +347,5 @@ def test_coverage_and_temperature(some):
     ],
 )
 def test_bad_settings_are_named(make, words):
-    with pytest.raises(ValueError, match=words):
+    with pytest.raises((TypeError, ValueError), match=words):
         make()

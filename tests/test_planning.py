@@ -65,7 +65,7 @@ def test_the_known_dynamics_is_an_effect_model():
     assert isinstance(MODEL, EffectModel)
 
 
-class RandomTable:
+class RandomTable(BranchTable):
     """A few branches that also turn the object, and then lead elsewhere."""
 
     def __init__(self, seed: int, n: int = 6) -> None:
@@ -366,7 +366,10 @@ def test_the_frozen_goals_are_those_that_are_drawn(world):
     [
         (lambda: plan_astar(MODEL, IMAGE, (0, 9), Goal((0, 0.1))), r"start_xy_m = \(0, 9\)"),
         (lambda: plan_astar(MODEL, IMAGE[0], (0, 0), Goal((0, 0.1))), r"image .* \(48, 48\)"),
-        (lambda: plan_astar(MODEL, IMAGE / 0, (0, 0), Goal((0, 0.1))), "image .* not finite"),
+        (
+            lambda: plan_astar(MODEL, IMAGE / 0, (0, 0), Goal((0, 0.1))),
+            "image must be finite numbers",
+        ),
         (lambda: plan_astar(MODEL, IMAGE, (0, 0), Goal((0, 0.1)), "two"), "mode 'two' is unknown"),
         (lambda: plan_gradient(MODEL, IMAGE, (0, 0), Goal((0, 0.1)), samples=1), "samples .* 1"),
         (lambda: uniform_tasks("two", 1), "mode 'two' is unknown"),

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import torch
+import xarray as xr
 
+from affordlib.interactions.batches import TrainingArrays
 from affordlib.interactions.recipes import Recipe
-
-if TYPE_CHECKING:
-    import torch
-    import xarray as xr
-
-    from affordlib.interactions.batches import TrainingArrays
+from affordlib.types import check_array
 
 
 def error_row(errors_m: np.ndarray, **columns: Any) -> dict[str, Any]:
@@ -20,8 +18,8 @@ def error_row(errors_m: np.ndarray, **columns: Any) -> dict[str, Any]:
 
     errors_m: (n,) distances [m], one per independent object.
     """
-    errors = np.asarray(errors_m, dtype=float)
-    if errors.ndim != 1 or len(errors) == 0 or not np.isfinite(errors).all():
+    errors = check_array("errors_m", errors_m)
+    if errors.ndim != 1:
         raise ValueError(
             f"errors_m must be finite distances of shape (n,), n ≥ 1, got shape {errors.shape}"
         )

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from affordlib import checked
 from affordlib.exercises.checking import Exercise, Verdict, judge
 from affordlib.exercises.models import MODELS
 from affordlib.exercises.plans import PLANS
@@ -19,6 +20,7 @@ __all__ = ["EXERCISES", "Exercise", "Verdict", "check"]
 EXERCISES: dict[str, Exercise] = WORLD | MODELS | PLANS
 
 
+@checked
 def check(name: str, attempt: Any) -> Verdict:
     """Judge an attempt at an exercise; whatever it does, the notebook goes on.
 

@@ -8,15 +8,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+import xarray as xr
 
-from affordlib.types import Observations, check_finite
-
-if TYPE_CHECKING:
-    import xarray as xr
+from affordlib.types import Observations, check_array, check_count, check_finite, check_pair
 
 
 def believable(data: xr.Dataset, interactions: np.ndarray) -> np.ndarray:
@@ -38,12 +35,10 @@ def split_interactions(n: int, seed: int = 0, fold: int = 0, n_folds: int = 10) 
 
     Each interaction has an object of its own, so this splits by object.
     """
-    if not 3 <= n_folds <= n:
-        raise ValueError(
-            f"n_folds must lie in [3, {n}] (the number of interactions), got {n_folds}"
-        )
-    if not 0 <= fold < n_folds:
-        raise ValueError(f"fold must lie in [0, {n_folds - 1}], got {fold}")
+    check_count("n", n, 3, 10_000_000)
+    check_count("n_folds", n_folds, 3, n)
+    check_count("fold", fold, 0, n_folds - 1)
+    check_count("seed", seed, least=0)
     blocks = np.array_split(np.random.default_rng(seed).permutation(n), n_folds)
     test, validation = fold, (fold + 1) % n_folds
     train = np.concatenate([b for k, b in enumerate(blocks) if k not in (test, validation)])
@@ -77,6 +72,10 @@ class Normaliser:
         for name in ("action_scale", "effect_scale", "image_std"):
             if not all(check_finite(name, value) > 0 for value in getattr(self, name)):
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)!r}")
+        check_array("image_mean", self.image_mean)
+        for name in ("start_radius_m", "end_radius_m", "mask_share", "effect_radius_m"):
+            if getattr(self, name) is not None:
+                check_pair(name, getattr(self, name), "(low, high)")
 
     @classmethod
     def fit(cls, arrays: TrainingArrays) -> Normaliser:
@@ -139,7 +138,7 @@ class TrainingArrays:
     effect: torch.Tensor
     action_channels: tuple[str, ...]
     effect_channels: tuple[str, ...]
-    stop_phase: torch.Tensor = None
+    stop_phase: torch.Tensor | None = None
 
     def __post_init__(self) -> None:
         if self.stop_phase is None:
@@ -158,6 +157,8 @@ class TrainingArrays:
         Left out are faults of the simulator and actions that were out of reach.
         """
         chosen = np.arange(data.sizes["interaction"]) if interactions is None else interactions
+        if chosen.ndim != 1 or chosen.dtype.kind not in "iu" or not len(chosen):
+            raise ValueError(f"interactions must be numbers (n,), got {chosen!r:.80}")
         part = data.isel(interaction=believable(data, chosen))
 
         def channels(kind: str, names: tuple[str, ...]) -> torch.Tensor:
@@ -185,7 +186,7 @@ class TrainingArrays:
     def __len__(self) -> int:
         return len(self.image)
 
-    def select(self, rows: torch.Tensor) -> TrainingArrays:
+    def select(self, rows: torch.Tensor | slice) -> TrainingArrays:
         """The interactions with the given row numbers."""
         return replace(self, **{n: getattr(self, n)[rows] for n in _BY_INTERACTION})
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import threading
+from collections.abc import Iterable, Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from itertools import islice
@@ -32,9 +33,7 @@ from affordlib.types import check_count
 from affordlib.workers import dask_client
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
-
-    from dask.distributed import Client
+    import dask.distributed
 
 WINDOW = 4
 """Tasks that each worker is given ahead; the driver knows of no more futures than these."""
@@ -78,7 +77,7 @@ class _Task:
 def collect(
     recipe: Recipe,
     path: str | Path,
-    client: Client | None = None,
+    client: dask.distributed.Client | None = None,
     workers: int = 1,
     progress: bool = True,
     replace: bool = False,
@@ -163,7 +162,7 @@ def _here(task: _Task, numbers: Iterable[int]) -> Iterator[tuple[int, bool]]:
 
 
 def _by_workers(
-    client: Client, task: _Task, numbers: Iterable[int], alone: bool = False
+    client: dask.distributed.Client, task: _Task, numbers: Iterable[int], alone: bool = False
 ) -> Iterator[tuple[int, bool]]:
     """Yield each chunk's number, and whether it was made, as the client's workers finish it."""
     from dask.distributed import KilledWorker, as_completed

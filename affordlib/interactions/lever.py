@@ -14,11 +14,11 @@ its arc), relative to the contact.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 import torch.nn.functional as F
+import xarray as xr
 from PIL import Image
 
 from affordlib.interactions.batches import (
@@ -30,9 +30,6 @@ from affordlib.interactions.batches import (
     turn,
 )
 from affordlib.types import LEVER_IMAGE_PIXELS, Observations
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 ACTION_CHANNELS = ("x", "z")
 POSE_CHANNELS = ("x", "y", "z", "tilt")

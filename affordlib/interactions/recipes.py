@@ -5,17 +5,19 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import asdict, dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from affordlib.primitives import Drag, LeverUp, Primitive, Push, primitive_named
-from affordlib.types import TABLE_X_M, TABLE_Y_M, check_count, check_within
-from affordlib.world import Tabletop, WorldConfig, family_named
-
-if TYPE_CHECKING:
-    from affordlib.types import Interaction
-    from affordlib.world import Thing
+from affordlib.types import (
+    TABLE_X_M,
+    TABLE_Y_M,
+    Interaction,
+    check_count,
+    check_field,
+    check_range,
+)
+from affordlib.world import Tabletop, Thing, WorldConfig, family_named
 
 _TABLE_MARGIN_M = 0.08
 _LEVER_DRAWS = 20
@@ -41,13 +43,10 @@ class Variation:
     camera: str = "kinect"
 
     def __post_init__(self) -> None:
-        for name in _RANGES:
-            low, high = (float(v) for v in getattr(self, name))
-            if not low <= high:
-                raise ValueError(f"{name} must be a range (low, high), got {(low, high)}")
-            object.__setattr__(self, name, (low, high))
-        check_within("com_offset", self.com_offset, 0.0, 0.5)
-        check_within("bias_sd_m", self.bias_sd_m, 0.0, 0.02, "m")
+        for name, (low, high) in _RANGES.items():
+            object.__setattr__(self, name, check_range(name, getattr(self, name), low, high))
+        check_field(self, "com_offset", 0.0, 0.5)
+        check_field(self, "bias_sd_m", 0.0, 0.02, "m")
 
     def draw(self, thing: Thing, rng: np.random.Generator) -> WorldConfig:
         """One world: what an episode with this thing is like."""
@@ -63,7 +62,13 @@ class Variation:
         )
 
 
-_RANGES = ("table_friction", "object_friction", "finger_friction", "density_kg_m3", "tip_offset_m")
+_RANGES = {
+    "table_friction": (0.01, 2.0),
+    "object_friction": (0.01, 2.0),
+    "finger_friction": (0.01, 2.0),
+    "density_kg_m3": (50.0, 10_000.0),
+    "tip_offset_m": (-0.008, 0.1),
+}
 
 
 @dataclass(frozen=True)
@@ -89,22 +94,16 @@ class Recipe:
 
     def __post_init__(self) -> None:
         for name, check in (("primitives", primitive_named), ("families", family_named)):
-            values = getattr(self, name)
-            if isinstance(values, str):
-                raise ValueError(f"{name} must be a sequence of names: write ({values!r},)")
-            values = tuple(values)
+            values = tuple(getattr(self, name))
             if not values:
                 raise ValueError(f"{name} must be a sequence of at least one name, got none")
             for value in values:
                 check(value)
             object.__setattr__(self, name, values)
         for name in ("size_range_m", "height_range_m"):
-            if getattr(self, name) is None:
-                continue
-            low, high = (check_within(name, v, 0.005, 0.3, "m") for v in getattr(self, name))
-            if low > high:
-                raise ValueError(f"{name} must be a range (low, high), got {(low, high)}")
-            object.__setattr__(self, name, (low, high))
+            if getattr(self, name) is not None:
+                sizes = check_range(name, getattr(self, name), 0.005, 0.3, "m")
+                object.__setattr__(self, name, sizes)
         check_count("n_interactions", self.n_interactions)
         check_count("seed", self.seed, least=0)
 

@@ -13,8 +13,9 @@ import json
 import os
 import tempfile
 import zipfile
+from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -36,9 +37,6 @@ from affordlib.interactions.chunks import (
 from affordlib.interactions.places import Place
 from affordlib.paths import repo_root
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
 SUFFIX = ".zarr.zip"
 FOLDER_SUFFIX = ".zarr"
 MANIFEST = "manifest.json"
@@ -48,7 +46,7 @@ class CorruptedDataError(ValueError):
     """A data set is damaged or unfinished: what was read is not what was written."""
 
 
-def _array_digest(dtype: np.dtype, shape: tuple[int, ...]) -> hashlib._Hash:
+def _array_digest(dtype: np.dtype, shape: tuple[int, ...]) -> Any:
     return hashlib.sha256(f"{dtype.str}{shape}".encode())
 
 

@@ -19,12 +19,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from affordlib import checked
 from affordlib.interactions.batches import Normaliser
 from affordlib.models.film import FiLMConfig, FiLMNetwork, dense, split_outputs, waves
 from affordlib.models.network import masked_mean, with_time
 from affordlib.types import Observations
 
 
+@checked
 @dataclass(frozen=True)
 class AnchoredConfig(FiLMConfig):
     """Sizes as of `FiLMConfig`; course_steps: into how many steps m(t) divides the phase."""

@@ -17,6 +17,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from affordlib import checked
 from affordlib.models.film import CircularHarmonics, dense, split_outputs, waves
 from affordlib.models.network import EffectNetwork, NetworkConfig, he_initialise, with_time
 from affordlib.types import Observations
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from affordlib.interactions.batches import Normaliser
 
 
+@checked
 @dataclass(frozen=True)
 class AttentionConfig(NetworkConfig):
     """Sizes of the network; width must be a multiple of heads. See `FiLMConfig`."""

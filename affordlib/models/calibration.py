@@ -9,19 +9,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from affordlib.interactions.batches import observe_action, plane_of
-from affordlib.models.network import gaussian_nll
-
-if TYPE_CHECKING:
-    from affordlib.interactions.batches import TrainingArrays
-    from affordlib.models.ensemble import Ensemble
-    from affordlib.models.network import EffectNetwork
+from affordlib.interactions.batches import TrainingArrays, observe_action, plane_of
+from affordlib.models.ensemble import Ensemble
+from affordlib.models.network import EffectNetwork, gaussian_nll
+from affordlib.types import check_within
 
 LEVELS = (0.5, 0.9)
 AFTER_CONTACT = (0.8, 0.9, 1.0)
@@ -43,6 +40,9 @@ def effects_at(
     model: EffectNetwork | Ensemble, arrays: TrainingArrays, phases: Sequence[float]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Truth, mean and σ of the effects, (N, T, C) each, given image and action."""
+    phases = [check_within("phases", phase, 0.0, 1.0) for phase in phases]
+    if not phases:
+        raise ValueError("phases must hold at least one phase in [0, 1], got none")
     at = (torch.tensor(phases) * (len(arrays.phase) - 1)).round().long()
     t_target = arrays.phases(at)
     told = model.predict(model.encode(arrays.image), observe_action(arrays), t_target)

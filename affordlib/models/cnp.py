@@ -20,6 +20,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from affordlib import checked
 from affordlib.interactions.batches import Normaliser
 from affordlib.models.network import (
     EffectNetwork,
@@ -38,6 +39,7 @@ IMAGE_FEATURES = 16
 FOLD_FROM_TARGETS = 100
 
 
+@checked
 @dataclass(frozen=True)
 class CNPConfig(NetworkConfig):
     """How the paper's network reads the two places where the paper is unclear.

@@ -22,6 +22,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from affordlib import checked
 from affordlib.models.network import (
     EffectNetwork,
     NetworkConfig,
@@ -38,6 +39,7 @@ FEW_HEADINGS = 32
 """From this many turns of one image on, its basis pays."""
 
 
+@checked
 @dataclass(frozen=True)
 class FiLMConfig(NetworkConfig):
     """Sizes of the network, by default in the frame of the push.

@@ -13,14 +13,15 @@ all protocols together; a recurrent one for each by itself.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import torch
+import xarray as xr
 from jaxtyping import Float
 from torch import Tensor
 
-from affordlib.interactions import Normaliser
-from affordlib.interactions.batches import Batch, symmetric_copies
+from affordlib.interactions import Normaliser, Split
+from affordlib.interactions.batches import Batch, TrainingArrays, symmetric_copies
 from affordlib.interactions.lever import (
     ACTION_CHANNELS,
     AHEAD,
@@ -37,17 +38,9 @@ from affordlib.models.anchored import AnchoredConfig
 from affordlib.models.checkpoint import build
 from affordlib.models.cnp import CNPConfig
 from affordlib.models.lstm import LSTMConfig
+from affordlib.models.network import EffectNetwork, NetworkConfig
 from affordlib.models.training import TrainingConfig, TrainingRecord, train
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    import xarray as xr
-
-    from affordlib.interactions import Split
-    from affordlib.interactions.batches import TrainingArrays
-    from affordlib.models.network import EffectNetwork, NetworkConfig
-    from affordlib.types import Prediction
+from affordlib.types import Prediction
 
 PROTOCOLS = ("window", "first_step", "image_only")
 TRAINED_FOR = ("all", "window", "first_step")

@@ -19,6 +19,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from affordlib import checked
 from affordlib.interactions.batches import Normaliser
 from affordlib.models.anchored import MeanCourse
 from affordlib.models.film import CircularHarmonics, dense, waves
@@ -32,6 +33,7 @@ from affordlib.models.network import (
 from affordlib.types import Observations
 
 
+@checked
 @dataclass(frozen=True)
 class LSTMConfig(NetworkConfig):
     """Sizes of the network; steps: into how many it divides the phase. See `FiLMConfig`."""

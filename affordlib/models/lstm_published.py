@@ -24,6 +24,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from affordlib import checked
 from affordlib.interactions import Normaliser
 from affordlib.interactions.lever import SEEN
 from affordlib.models.lever import beginning_errors_m, window_errors_m
@@ -45,6 +46,7 @@ steps, for ever, and subnormal numbers cost a processor many times as much."""
 State = tuple[Tensor, Tensor]
 
 
+@checked
 @dataclass(frozen=True)
 class PublishedConfig(NetworkConfig):
     """Channels, and the number of steps that the phase has."""

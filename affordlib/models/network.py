@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from affordlib import checked
 from affordlib.interactions.batches import Normaliser, plane_of, touches_edge, turn
 from affordlib.models.frame import (
     FRAMES,
@@ -31,6 +32,7 @@ class OutOfRangeWarning(UserWarning):
     """A network is asked about what it was not trained on, and its answer is a guess."""
 
 
+@checked
 @dataclass(frozen=True)
 class NetworkConfig:
     """Channels and frame of a network.

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from collections.abc import Sequence
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
 
+from affordlib.primitives import Primitive
 from affordlib.types import ACTION_CHANNELS, Observations, Prediction
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from affordlib.primitives import Primitive
 
 
 @runtime_checkable
@@ -38,6 +35,8 @@ class EffectModel(Protocol):
 
 def observe_actions(model: EffectModel, actions: Sequence[Primitive]) -> Observations:
     """Each commanded action at t = 0 and t = 1, and no effect: B = len(actions)."""
+    if not actions:
+        raise ValueError("actions must hold at least one action, got none")
     columns = [ACTION_CHANNELS.index(name) for name in model.action_channels]
     action = np.stack([one.ends() for one in actions])[..., columns]
     b = len(actions)

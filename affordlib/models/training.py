@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, astuple, dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from tqdm.auto import tqdm
@@ -24,12 +24,9 @@ from affordlib.interactions.batches import (
     plane_of,
     sample_batch,
 )
+from affordlib.models.network import EffectNetwork
 from affordlib.models.weight_files import load_state, save_state
-from affordlib.types import Observations, check_count, check_within
-
-if TYPE_CHECKING:
-    from affordlib.models.network import EffectNetwork
-
+from affordlib.types import Observations, check_count, check_field, check_within
 
 Draw = Callable[[TrainingArrays, torch.Tensor, int, int, torch.Generator], Batch]
 Score = Callable[["EffectNetwork", TrainingArrays], torch.Tensor]
@@ -67,12 +64,13 @@ class TrainingConfig:
     def __post_init__(self) -> None:
         for name in ("steps", "batch_size", "n_targets", "obs_max", "validate_every", "patience"):
             check_count(name, getattr(self, name))
-        check_within("learning_rate", self.learning_rate, 1e-7, 1.0)
-        check_within("weight_decay", self.weight_decay, 0.0, 10.0)
-        check_within("beta", self.beta, 0.0, 1.0)
-        check_within("final_sigma_floor", self.final_sigma_floor, 1e-6, 10.0)
-        check_within("hold_floor", self.hold_floor, 0.0, 1.0)
-        check_within("ema", self.ema, 0.0, 0.99999)
+        check_count("seed", self.seed, 0, 2**63 - 1)
+        check_field(self, "learning_rate", 1e-7, 1.0)
+        check_field(self, "weight_decay", 0.0, 10.0)
+        check_field(self, "beta", 0.0, 1.0)
+        check_field(self, "final_sigma_floor", 1e-6, 10.0)
+        check_field(self, "hold_floor", 0.0, 1.0)
+        check_field(self, "ema", 0.0, 0.99999)
         device_named(self.device)
         if not self.max_minutes > 0:
             raise ValueError(f"max_minutes must be positive, got {self.max_minutes!r}")
@@ -334,7 +332,11 @@ def train_literal(
     With validation interactions it stops early, after `patience` validations without a smaller
     final error, and the model ends with the weights of the smallest.
     """
-    generator = torch.Generator().manual_seed(seed)
+    for name, count in (("iterations", iterations), ("obs_max", obs_max), ("patience", patience)):
+        check_count(name, count)
+    check_count("validate_every", validate_every)
+    check_within("learning_rate", learning_rate, 1e-7, 1.0)
+    generator = torch.Generator().manual_seed(check_count("seed", seed, 0, 2**63 - 1))
     optimiser = torch.optim.Adam(model.parameters(), lr=learning_rate)
     losses, best, waited = [], math.inf, 0
     state = model.state_dict()

@@ -96,7 +96,7 @@ def load_state(path: str | Path) -> dict[str, Any]:
         state = None
     if not isinstance(state, dict) or "about" not in state:
         raise ValueError(
-            f"{path} is damaged, or not the state of a training; delete it to begin again, or "
-            "give another path"
+            f"checkpoint {path} is damaged, or not the state of a training; delete it to begin "
+            "again, or give another path"
         ) from None
     return state

@@ -12,26 +12,21 @@ import heapq
 import itertools
 import math
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
 
+from affordlib.models.protocol import EffectModel
 from affordlib.planning.effect_map import EffectMap, map_effects
 from affordlib.planning.finish import Finish, finished
 from affordlib.planning.modes import PlanMode, check_has_room, is_on_table, mode_named
+from affordlib.planning.repertoire import Reachable
 from affordlib.planning.steps import make_steps
-from affordlib.primitives import Push
-from affordlib.types import Goal, Plan, check_count, check_on_table
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from affordlib.models.protocol import EffectModel
-    from affordlib.planning.repertoire import Reachable
-    from affordlib.primitives import Drag
+from affordlib.primitives import Drag, Push
+from affordlib.types import Goal, Plan, Step, check_count, check_on_table, check_within
 
 N_DIRECTIONS = 36
 STOP_PHASES = (0.2, 0.4, 0.6, 0.8, 1.0)
@@ -76,8 +71,9 @@ class BranchTable:
         n_directions: int = N_DIRECTIONS,
         stop_phases: Sequence[float] = STOP_PHASES,
     ) -> None:
-        check_count("n_directions", n_directions)
-        if not len(stop_phases):
+        check_count("n_directions", n_directions, 1, 720)
+        stop_phases = [check_within("stop_phases", phase, 1e-3, 1.0) for phase in stop_phases]
+        if not stop_phases:
             raise ValueError("stop_phases must hold at least one phase in (0, 1], got none")
         between = 2 * math.pi / n_directions
         self._finer = math.ceil(between / YAW_STEP_RAD)
@@ -108,7 +104,8 @@ class BranchTable:
         return self._kept[key]
 
 
-class _Children(NamedTuple):
+@dataclass(slots=True)
+class _Children:
     """Where the actions from one node lead: arrays over the actions, and the node they are from.
 
     A node of the search is one row of its parent's children.
@@ -131,7 +128,7 @@ def search(
     reachable: Reachable | None = None,
     max_expansions: int = 20_000,
     trace: list[tuple[np.ndarray, np.ndarray]] | None = None,
-    finish: Finish | None = None,
+    finish: Callable[..., tuple[Step, ...] | None] | None = None,
 ) -> tuple[list[tuple[float, float]], bool, int]:
     """The cheapest chain of (direction, phase) into the goal's disc, whether it gets there, and
     how many nodes were expanded.

@@ -14,7 +14,7 @@ from affordlib.planning.modes import is_on_table
 from affordlib.planning.moves import Ended, MovePlanner
 from affordlib.planning.poses import GRIP_YAWS, hands_in_line, plan_lift, plan_turn
 from affordlib.primitives import Grasp, Rotate, wrap_angle
-from affordlib.types import Goal, NothingSeenError, Plan, UnreachableError
+from affordlib.types import Goal, NothingSeenError, Plan, UnreachableError, check_within
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -80,6 +80,7 @@ class Pursuit:
 
 def action_limit(distance_m: float) -> int:
     """How many actions a distance is worth: one for every 5 cm, rounded up, and 3 more."""
+    distance_m = check_within("distance_m", distance_m, 0.0, 10.0, "m")
     return math.ceil(distance_m / MOVE_M - 1e-9) + SPARE_ACTIONS
 
 

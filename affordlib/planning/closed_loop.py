@@ -8,7 +8,7 @@ plan. It ends in one of four ways, and says so.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -16,9 +16,11 @@ import numpy as np
 
 from affordlib.planning.chase import Chase, Pursuit, action_limit, path_on_table
 from affordlib.planning.continuous import plan_continuous
+from affordlib.planning.disturbances import Disturbance
 from affordlib.planning.finish import TURN_TOLERANCE_RAD
 from affordlib.planning.modes import PlanMode, is_on_table
 from affordlib.planning.moves import Demands
+from affordlib.planning.repertoire import Repertoire
 from affordlib.primitives import wrap_angle
 from affordlib.types import (
     Goal,
@@ -31,11 +33,7 @@ from affordlib.types import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from affordlib.planning.disturbances import Disturbance
-    from affordlib.planning.repertoire import Repertoire
-    from affordlib.world import Tabletop
+    import affordlib.world
 
 __all__ = ["Pursuit", "action_limit", "carry_out", "pursue"]
 
@@ -49,7 +47,7 @@ HEIGHT_TOLERANCE_M = 0.003
 
 
 def carry_out(
-    world: Tabletop,
+    world: affordlib.world.Tabletop,
     plan: Plan,
     corrections: int = 0,
     replan: Replan | None = None,
@@ -105,7 +103,7 @@ def carry_out(
 
 
 def pursue(
-    world: Tabletop,
+    world: affordlib.world.Tabletop,
     goal: Goal,
     repertoire: Repertoire,
     planner: Callable[..., Plan] = plan_continuous,
@@ -129,6 +127,7 @@ def pursue(
     """
     check_within("height_tolerance_m", height_tolerance_m, 1e-5, 0.1, "m")
     check_within("turn_tolerance_rad", turn_tolerance_rad, 1e-4, math.pi, "rad")
+    check_count("horizon", horizon, 1, 10)
     if max_actions is not None:
         check_count("max_actions", max_actions, least=0)
     demands = Demands(

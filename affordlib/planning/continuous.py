@@ -15,26 +15,20 @@ from __future__ import annotations
 
 import math
 import time
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
+from torch import Tensor
 
+from affordlib.models.protocol import EffectModel
 from affordlib.planning.effect_map import EffectMap, map_effects
 from affordlib.planning.finish import Finish, finished
 from affordlib.planning.modes import PlanMode, check_has_room, is_on_table, mode_named
+from affordlib.planning.repertoire import Reachable
 from affordlib.planning.steps import make_steps, roll_out
-from affordlib.primitives import Push
-from affordlib.types import Goal, Plan, check_on_table
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from torch import Tensor
-
-    from affordlib.models.protocol import EffectModel
-    from affordlib.planning.repertoire import Reachable
-    from affordlib.primitives import Drag
+from affordlib.primitives import Drag, Push
+from affordlib.types import Goal, Plan, check_count, check_on_table
 
 PREFIXES = 192
 SPREAD_RAD = 1.2
@@ -210,7 +204,7 @@ def plan_continuous(
     start = check_on_table("start_xy_m", start_xy_m)
     effects = effects or map_effects(model, image, kind)
     check_has_room(goal, effects.radius_m)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(check_count("seed", seed, least=0))
     xy = np.array(start)
     target = torch.from_numpy(np.array(goal.xy_m) - xy)
     fewest = max(1, math.ceil(float(target.norm()) / max(effects.reach_m, SHORTEST_M)))

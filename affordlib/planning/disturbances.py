@@ -6,6 +6,7 @@ Between actions, or in the middle of one, by the world's callback at every simul
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -17,15 +18,13 @@ from affordlib.types import (
     TABLE_Y_M,
     Goal,
     check_count,
-    check_finite,
+    check_field,
     check_on_table,
     check_within,
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from affordlib.world import Tabletop
+    import affordlib.world
 
 KINDS = ("shove", "knock", "topple", "goal")
 STEPS_PER_S = 240
@@ -56,13 +55,13 @@ class Disturbance:
             raise ValueError(f"kind must be one of {KINDS}, got {self.kind!r}")
         check_count("action", self.action, least=0)
         for name in ("x", "y", "turn"):
-            check_finite(name, getattr(self, name))
+            check_field(self, name)
         if self.at_s is not None:
-            check_within("at_s", self.at_s, 0.0, 60.0, "s")
+            check_field(self, "at_s", 0.0, 60.0, "s")
             if self.kind == "shove":
                 raise ValueError("a shove happens between actions; give no at_s, or take a knock")
 
-    def strike(self, world: Tabletop, goal: Goal) -> Goal:
+    def strike(self, world: affordlib.world.Tabletop, goal: Goal) -> Goal:
         """Let it happen, and return the goal as it is then."""
         if self.kind == "goal":
             return replace(goal, xy_m=_inside(goal.xy_m[0] + self.x, goal.xy_m[1] + self.y))
@@ -99,12 +98,12 @@ class Script:
         self.happened: list[Disturbance] = []
         self._waiting = list(disturbances)
 
-    def _strike(self, world: Tabletop, one: Disturbance) -> None:
+    def _strike(self, world: affordlib.world.Tabletop, one: Disturbance) -> None:
         self._waiting.remove(one)
         self.happened.append(one)
         self.goal = one.strike(world, self.goal)
 
-    def before(self, world: Tabletop, action: int) -> None:
+    def before(self, world: affordlib.world.Tabletop, action: int) -> None:
         """Let happen what comes before an action, and let the object come to rest."""
         due = [one for one in self._waiting if one.action <= action and one.at_s is None]
         for one in due:
@@ -113,12 +112,12 @@ class Script:
                 world.settle(TIPPING_S)
 
     @contextmanager
-    def during(self, world: Tabletop, action: int) -> Iterator[None]:
+    def during(self, world: affordlib.world.Tabletop, action: int) -> Iterator[None]:
         """While entered, what comes in the middle of an action happens when it is due."""
         film, steps = world.film, 0
         due = [one for one in self._waiting if one.action <= action and one.at_s is not None]
 
-        def watch(world: Tabletop) -> None:
+        def watch(world: affordlib.world.Tabletop) -> None:
             nonlocal steps
             steps += 1
             for one in [d for d in due if steps >= STEPS_PER_S * d.at_s]:
@@ -139,7 +138,7 @@ class Script:
 
 
 def draw_disturbances(
-    seed: int | Sequence[int],
+    seed: int,
     n: int = 1,
     n_actions: int = 2,
     kinds: Sequence[str] = KINDS,
@@ -151,7 +150,12 @@ def draw_disturbances(
     shoves of 3 to 10 cm and up to half a turn, knocks of 0.2 to 0.5 m/s, goals that move by 3 to
     10 cm. strength: multiplies these.
     """
-    rng = np.random.default_rng(seed)
+    if not kinds:
+        raise ValueError("kinds must hold at least one kind of disturbance, got none")
+    check_count("n", n, 0, 1000)
+    check_count("n_actions", n_actions, 1, 1000)
+    check_within("strength", strength, 0.0, 10.0)
+    rng = np.random.default_rng(check_count("seed", seed, least=0))
     script = []
     for _ in range(n):
         kind = str(rng.choice(list(kinds)))

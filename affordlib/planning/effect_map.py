@@ -12,23 +12,18 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from scipy import ndimage
 from scipy.spatial import cKDTree
+from torch import Tensor
 
-from affordlib.models.protocol import observe_actions
+from affordlib.models.protocol import EffectModel, observe_actions
 from affordlib.perception import radius_m
 from affordlib.planning.modes import encode_image, plane
 from affordlib.primitives import Drag, Push
 from affordlib.types import check_count
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from affordlib.models.protocol import EffectModel
 
 N_DIRECTIONS = 48
 N_PHASES = 17
@@ -160,8 +155,8 @@ def map_effects(
 
     A model that foresees no yaw is taken to foresee none, and to be sure of it.
     """
-    check_count("n_directions", n_directions, least=8)
-    check_count("n_phases", n_phases, least=5)
+    check_count("n_directions", n_directions, 8, 720)
+    check_count("n_phases", n_phases, 5, 500)
     features = encode_image(model, image)
     angles = np.arange(n_directions) * (2 * math.pi / n_directions)
     t_target = phases_of(kind, n_phases).float().expand(n_directions, -1)
@@ -170,7 +165,7 @@ def map_effects(
     effect = effect - effect[:, :1]
     reach = float(effect[..., :2].norm(dim=-1).max())
     splines = splines_through(effect, std)
-    return EffectMap(kind, model, features, splines, reach, radius_m(np.asarray(image)))
+    return EffectMap(kind, model, features, splines, reach, radius_m(image))
 
 
 def splines_through(effect: Tensor, std: Tensor) -> Tensor:

@@ -11,11 +11,12 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from affordlib.models.protocol import EffectModel
 from affordlib.planning.poses import (
     GRIP_YAWS,
     Courses,
@@ -25,12 +26,7 @@ from affordlib.planning.poses import (
     hands_in_line,
 )
 from affordlib.primitives import Grasp, Rotate, wrap_angle
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from affordlib.models.protocol import EffectModel
-    from affordlib.types import Goal, Plan, Step
+from affordlib.types import Goal, Plan, Step
 
 TURN_TOLERANCE_RAD = math.radians(2)
 MAX_TURNS = 7

@@ -15,13 +15,13 @@ from __future__ import annotations
 import math
 import time
 import warnings
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 
 from affordlib.models.network import OutOfRangeWarning
-from affordlib.models.protocol import observe_actions, observe_final_effect
+from affordlib.models.protocol import EffectModel, observe_actions, observe_final_effect
 from affordlib.perception import radius_m
 from affordlib.planning.finish import finished
 from affordlib.planning.modes import (
@@ -33,13 +33,7 @@ from affordlib.planning.modes import (
     plane,
 )
 from affordlib.primitives import Push
-from affordlib.types import Goal, Plan, Step, check_count, check_on_table
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from affordlib.models.protocol import EffectModel
-    from affordlib.types import Prediction
+from affordlib.types import Goal, Plan, Prediction, Step, check_count, check_on_table
 
 START_RADIUS_M = 0.2
 LEARNING_RATE_M = 0.005
@@ -135,13 +129,15 @@ def plan_gradient(
     began = time.perf_counter()
     mode = mode_named(mode)
     start = check_on_table("start_xy_m", start_xy_m)
-    check_count("samples", samples, least=2)
-    check_count("starts", starts)
+    check_count("samples", samples, 2, 10_000)
+    check_count("starts", starts, 1, 1000)
     columns = plane(model)
     a_columns = [model.action_channels.index(name) for name in ("x", "y")]
     features = encode_image(model, image)
-    check_has_room(goal, radius_m(np.asarray(image)))
-    generator = np.random.default_rng(seed)
+    check_has_room(goal, radius_m(image))
+    with torch.no_grad():  # a model of other actions than pushes refuses one
+        model.predict(features, observe_actions(model, [Push(0.0)]), torch.ones(1, 1))
+    generator = np.random.default_rng(check_count("seed", seed, least=0))
     xy, target = np.asarray(start), np.asarray(goal.xy_m)
     steps: list[Step] = []
     iterations = 0

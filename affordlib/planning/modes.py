@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
-from affordlib.types import IMAGE_CHANNELS, IMAGE_PIXELS, TABLE_X_M, TABLE_Y_M
-
-if TYPE_CHECKING:
-    from affordlib.models.protocol import EffectModel
-    from affordlib.types import Goal
+from affordlib.models.protocol import EffectModel
+from affordlib.types import (
+    IMAGE_CHANNELS,
+    IMAGE_PIXELS,
+    TABLE_X_M,
+    TABLE_Y_M,
+    Goal,
+    check_array,
+    check_count,
+)
 
 PATH_SAMPLES = 25
 """Points of the predicted path that a step carries, as in Section 4.3."""
@@ -26,8 +30,7 @@ class PlanMode:
     partial: bool
 
     def __post_init__(self) -> None:
-        if not 1 <= self.max_steps <= 10:
-            raise ValueError(f"max_steps must lie in [1, 10], got {self.max_steps!r}")
+        check_count("max_steps", self.max_steps, 1, 10)
 
 
 MODES: dict[str, PlanMode] = {
@@ -48,14 +51,12 @@ def mode_named(mode: str | PlanMode) -> PlanMode:
 
 def checked_image(image: np.ndarray) -> torch.Tensor:
     """One depth image (2, 48, 48) as (1, 2, 48, 48); raises ValueError where it is none."""
-    image = np.asarray(image, dtype=np.float32)
+    image = check_array("image", image).astype(np.float32)
     if image.shape != (len(IMAGE_CHANNELS), IMAGE_PIXELS, IMAGE_PIXELS):
         raise ValueError(
             f"image must have the shape (2, {IMAGE_PIXELS}, {IMAGE_PIXELS}) that "
             f"Tabletop.look() gives, got {image.shape}"
         )
-    if not np.isfinite(image).all():
-        raise ValueError("image holds numbers that are not finite; look again")
     return torch.from_numpy(image)[None]
 
 
@@ -66,7 +67,13 @@ def encode_image(model: EffectModel, image: np.ndarray) -> torch.Tensor:
 
 
 def plane(model: EffectModel) -> list[int]:
-    """Where x and y are among the model's effect channels."""
+    """Where x and y are among the model's effect channels; raises where it knows no plane."""
+    for channels in (model.action_channels, model.effect_channels):
+        if not {"x", "y"} <= {*channels}:
+            raise ValueError(
+                f"model: a planner of positions needs one of actions and effects in x and y; this "
+                f"one has {model.action_channels} and {model.effect_channels}"
+            )
     return [model.effect_channels.index(name) for name in ("x", "y")]
 
 

@@ -9,23 +9,18 @@ stop is looked up on the course yaw(t) or z(t) that is foreseen; t is continuous
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from affordlib.models.frame import turn_image
-from affordlib.models.protocol import observe_actions
+from affordlib.models.protocol import EffectModel, observe_actions
 from affordlib.perception import aim
 from affordlib.planning.modes import checked_image
 from affordlib.primitives import Grasp, Rotate, wrap_angle
-from affordlib.types import Step, check_finite, check_within
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from affordlib.models.protocol import EffectModel
+from affordlib.types import Step, check_finite, check_pair, check_within
 
 SAMPLES = 301
 PERHAPS = 1.28
@@ -68,6 +63,9 @@ def foresee_courses(
 
     Raises ValueError where the model has no such channel.
     """
+    if not len(grip_yaws):
+        raise ValueError("grip_yaws must hold at least one angle of the hand, got none")
+    grip_yaws = [check_finite("grip_yaws", yaw) for yaw in grip_yaws]
     if channel not in model.effect_channels:
         raise ValueError(
             f"channel {channel!r} is not among the effects {model.effect_channels} of the model; "
@@ -184,6 +182,6 @@ def _step_at(
     xy_m: Sequence[float], primitive: Grasp | Rotate, stop_phase: float, **foreseen: float
 ) -> Step:
     """A step that leaves the object at its place."""
-    place = float(xy_m[0]), float(xy_m[1])
+    place = check_pair("xy_m", xy_m)
     path = np.array([place, place])
     return Step(primitive, stop_phase, place, path, std_m=0.0, **foreseen)

@@ -7,18 +7,15 @@ recorded interactions alone; no kinematics is told.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+import xarray as xr
 from torch import nn
 
 from affordlib.models.weight_files import read_weights, write_weights
 from affordlib.paths import repo_root
 from affordlib.primitives import PRIMITIVES, primitive_named
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 _HIDDEN, _STEPS, _RATE = 64, 1500, 1e-2
 SHIPPED = "data/checkpoints/reachability.safetensors"

@@ -2,28 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from affordlib.models.checkpoint import load_checkpoint
+from affordlib.models.protocol import EffectModel
 from affordlib.paths import repo_root
 from affordlib.perception import looks_rollable
 from affordlib.planning.effect_map import EffectMap, map_effects
 from affordlib.planning.finish import Finish
+from affordlib.planning.modes import checked_image
 from affordlib.planning.reachability import Reachability
 from affordlib.planning.routes import REACH_M, RouteMap
 from affordlib.primitives import Drag, Grasp, Primitive, Push, Rotate, primitive_named
-from affordlib.types import check_within
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from affordlib.models.protocol import EffectModel
-    from affordlib.types import Goal, Plan
+from affordlib.types import Goal, Plan, check_field
 
 Reachable = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Which of the positions (n, 2) and directions (n,) the arm can act at."""
@@ -51,7 +47,7 @@ class Repertoire:
     def __post_init__(self) -> None:
         for name in self.models:
             primitive_named(name)
-        check_within("threshold", self.threshold, 0.0, 1.0)
+        check_field(self, "threshold", 0.0, 1.0)
 
     @classmethod
     def load(cls) -> Repertoire:
@@ -74,7 +70,7 @@ class Repertoire:
     @staticmethod
     def kind_for(image: np.ndarray) -> type[Push] | type[Drag]:
         """How an object is moved, by its image: what would roll away is caged and dragged."""
-        return Drag if looks_rollable(image) else Push
+        return Drag if looks_rollable(checked_image(image)[0].numpy()) else Push
 
     def effects(self, image: np.ndarray) -> EffectMap:
         """What moving the object in an image (2, 48, 48) does."""

@@ -8,8 +8,8 @@ all places at once. The fine planner then goes from waypoint to waypoint.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,10 +17,7 @@ from affordlib.planning.modes import is_on_table
 from affordlib.primitives import Drag, Push
 from affordlib.types import TABLE_X_M, TABLE_Y_M
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    Judge = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+Judge = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 CELL_M = 0.02
 REACH_M = {Push: 0.075, Drag: 0.045}

@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 import torch
+from torch import Tensor
 
+from affordlib.planning.effect_map import EffectMap
 from affordlib.planning.modes import PATH_SAMPLES
 from affordlib.types import Step
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from torch import Tensor
-
-    from affordlib.planning.effect_map import EffectMap
 
 
 def roll_out(

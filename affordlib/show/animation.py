@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from IPython.display import Image as NotebookImage
+from matplotlib.figure import Figure
 from PIL import Image
 
 from affordlib.results import write_atomically
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from affordlib.world import Tabletop
+from affordlib.world import Tabletop
 
 
 class Film:

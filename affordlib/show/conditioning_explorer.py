@@ -5,24 +5,18 @@ Equation (2) of the paper: the representation is w₁ r_action + w₂ r_effect, 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import ipywidgets as widgets
 import numpy as np
 import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
+from affordlib.models.protocol import EffectModel
 from affordlib.show.figure_widget import FigureWidget
 from affordlib.show.plots import PREDICTION, TRUTH
-from affordlib.types import ACTION_CHANNELS, EFFECT_CHANNELS, Observations, Prediction
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-    from affordlib.models.protocol import EffectModel
-    from affordlib.types import Interaction
+from affordlib.types import ACTION_CHANNELS, EFFECT_CHANNELS, Interaction, Observations, Prediction
 
 N_TARGETS = 101
 

@@ -4,21 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from affordlib.planning import carry_out, plan_continuous, pursue
+from affordlib.planning import Repertoire, carry_out, plan_continuous, pursue
 from affordlib.types import Goal, Outcome, Plan
-
-if TYPE_CHECKING:
-    from affordlib.planning import Repertoire
-    from affordlib.world import Tabletop
+from affordlib.world import Tabletop
 
 Planner = Callable[[np.ndarray, tuple[float, float], Goal], Plan]
 """From an image, where the object is [m] and a goal to a plan."""
 
 
+@runtime_checkable
 class Tell(Protocol):
     """How an executor tells what it does, and hears what the reader wants."""
 

@@ -10,8 +10,9 @@ import asyncio
 import html
 import math
 import threading
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import ipywidgets as widgets
 import numpy as np
@@ -20,21 +21,15 @@ from affordlib.paths import resolve_out_dir
 from affordlib.plan_files import load_plan, save_plan
 from affordlib.planning import carry_out
 from affordlib.primitives import wrap_angle
-from affordlib.show.executors import Stopped, open_loop
+from affordlib.show.executors import Executor, Planner, Stopped, open_loop
 from affordlib.show.picker_controls import PickerControls
 from affordlib.show.pictured import Pictured
 from affordlib.show.plots import table_picture
 from affordlib.show.pose_film import moving_part, pose_recorder
 from affordlib.show.sentences import outcome_in_words, plan_in_words
 from affordlib.show.table_view import TableView, draw_way, make_scene, rounded, whole_mm
-from affordlib.types import Goal
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from affordlib.show.executors import Executor, Planner
-    from affordlib.types import Outcome, Plan
-    from affordlib.world import Tabletop
+from affordlib.types import Goal, Outcome, Plan, check_count, check_on_table
+from affordlib.world import Tabletop
 
 HALF_WIDTH_M, LIMIT_M = 0.36, 0.35
 REST_S = 0.05
@@ -73,10 +68,10 @@ class GoalPicker(Pictured, widgets.VBox):
         self.seconds_per_action, self.folder = seconds_per_action, folder
         self.plan: Plan | None = None
         self.outcome: Outcome | None = None
-        self._rng = np.random.default_rng(seed)
+        self._rng = np.random.default_rng(check_count("seed", seed, least=0))
         self._pose = self._start = self._first_pose = world.object_pose()
         self._turn_from = self._pose[2]  # what a wanted turn is counted from
-        self._goal = Goal(whole_mm(*goal_xy_m))
+        self._goal = Goal(whole_mm(*check_on_table("goal_xy_m", goal_xy_m)))
         self._running = self._setting = self._lifted = False
         self._rest: asyncio.TimerHandle | None = None  # while a draft is shown
         self._stop = threading.Event()

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.axes import Axes
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from affordlib.world import Thing
+from affordlib.world import Thing
 
 _ALONG, _UP = 0.45, 0.3
 

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import ipywidgets as widgets
 import numpy as np
+from matplotlib.figure import Figure
 
+from affordlib.primitives import Primitive
 from affordlib.show.figure_widget import FigureWidget
 from affordlib.show.plots import NEUTRAL, PREDICTION, TRUTH, plot_footprint, plot_table
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from affordlib.primitives import Primitive
-    from affordlib.world import Tabletop
+from affordlib.world import Tabletop
 
 
 class PhaseSlider(FigureWidget):

@@ -7,27 +7,32 @@ from __future__ import annotations
 
 import io
 import math
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from affordlib.perception import CAMERA_HEIGHT_M
+from affordlib.planning import Pursuit
 from affordlib.primitives import Grasp, Rotate
 from affordlib.results import write_atomically
-from affordlib.types import CROP_WIDTH_M, TABLE_X_M, TABLE_Y_M
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from matplotlib.axes import Axes
-
-    from affordlib.planning import Pursuit
-    from affordlib.types import Goal, Outcome, Plan
-    from affordlib.world import Thing
+from affordlib.types import (
+    CROP_WIDTH_M,
+    TABLE_X_M,
+    TABLE_Y_M,
+    Goal,
+    Outcome,
+    Plan,
+    check_array,
+    check_finite,
+    check_pair,
+    check_within,
+)
+from affordlib.world import Thing
 
 GOAL, PREDICTION, TRUTH, NEUTRAL = "#0072B2", "#D55E00", "#009E73", "#777777"
 
@@ -64,6 +69,8 @@ def save_figure(figure: Figure, folder: Path, name: str) -> Path:
 
 def plot_table(ax: Axes, around_m: Sequence[float] = (0.0, 0.0), half_width_m: float = 0.3) -> Axes:
     """An empty top-down view of the table around a point."""
+    around_m = [check_within("around_m", v, -10, 10, "m") for v in check_pair("around_m", around_m)]
+    half_width_m = check_within("half_width_m", half_width_m, 0.01, 10.0, "m")
     ax.set_aspect("equal")
     ax.set_xlim(100 * (around_m[0] - half_width_m), 100 * (around_m[0] + half_width_m))
     ax.set_ylim(100 * (around_m[1] - half_width_m), 100 * (around_m[1] + half_width_m))
@@ -90,8 +97,9 @@ def plot_footprint(
     style: str = "-",
 ) -> Axes:
     """The outline of an object's base at a pose."""
+    yaw_rad = check_finite("yaw_rad", yaw_rad)
     c, s = math.cos(yaw_rad), math.sin(yaw_rad)
-    outline = 100 * (thing.footprint_m @ np.array([[c, s], [-s, c]]) + np.asarray(xy_m))
+    outline = 100 * (thing.footprint_m @ np.array([[c, s], [-s, c]]) + check_pair("xy_m", xy_m))
     ax.fill(*outline.T, facecolor=color if filled else "none", alpha=0.25 if filled else 1, lw=0)
     ax.plot(*np.vstack([outline, outline[:1]]).T, style, color=color, lw=1.5, label=label)
     return ax
@@ -241,7 +249,10 @@ def plot_depth(
 
     top_cm: where the colours end (default: at the highest point, or 8 cm).
     """
-    half = 50 * width_m
+    half = 50 * check_within("width_m", width_m, 0.01, 10.0, "m")
+    image = check_array("image", image)
+    if image.ndim != 3:
+        raise ValueError(f"image must be (2, n, n), got an array {image.shape}")
     height_cm = 100 * (CAMERA_HEIGHT_M - image[0])
     top = top_cm or max(8.0, float(height_cm.max()))
     drawn = ax.imshow(

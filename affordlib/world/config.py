@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from affordlib.types import check_within
+from affordlib.types import check_field, check_within
 from affordlib.world.objects import DENSITY_KG_M3
 
 CAMERAS = ("ideal", "kinect")
@@ -32,9 +32,9 @@ class WorldConfig:
 
     def __post_init__(self) -> None:
         for name in ("table_friction", "object_friction", "finger_friction"):
-            check_within(name, getattr(self, name), 0.01, 2.0)
-        check_within("density_kg_m3", self.density_kg_m3, 50.0, 10_000.0, "kg/m³")
-        check_within("tip_offset_m", self.tip_offset_m, -0.008, 0.1, "m")
+            check_field(self, name, 0.01, 2.0)
+        check_field(self, "density_kg_m3", 50.0, 10_000.0, "kg/m³")
+        check_field(self, "tip_offset_m", -0.008, 0.1, "m")
         for name, size in (("com_offset_m", 3), ("bias_m", 2)):
             values = tuple(check_within(name, v, -0.1, 0.1, "m") for v in getattr(self, name))
             if len(values) != size:

@@ -28,7 +28,7 @@ class Interventions:
         x, y, *_ = centre = np.array(self.object_state()[:3])
         dx, dy = check_finite("dx_m", dx_m), check_finite("dy_m", dy_m)
         turn = Rotation.from_euler("z", check_finite("dyaw_rad", dyaw_rad))
-        check_on_table("the shoved object's centre", (x + dx, y + dy))
+        check_on_table("dx_m, dy_m: the shoved object's centre", (x + dx, y + dy))
         position, quaternion = pybullet.getBasePositionAndOrientation(self.body, self.client)
         pybullet.resetBasePositionAndOrientation(
             self.body,
@@ -45,8 +45,9 @@ class Interventions:
         goes. It may be called from `film`, in the middle of an action.
         """
         self._require_object()
-        change = [check_finite("dx_m_s", dx_m_s), check_finite("dy_m_s", dy_m_s), 0.0]
-        spin = [0.0, 0.0, check_finite("spin_rad_s", spin_rad_s)]
+        speeds = (("dx_m_s", dx_m_s), ("dy_m_s", dy_m_s))
+        change = [*(check_within(name, v, -10.0, 10.0, "m/s") for name, v in speeds), 0.0]
+        spin = [0.0, 0.0, check_within("spin_rad_s", spin_rad_s, -100.0, 100.0, "rad/s")]
         self._change_velocity(np.array(change), np.array(spin))
 
     def topple(self, direction_rad: float) -> None:

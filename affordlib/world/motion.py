@@ -7,6 +7,7 @@ an interaction costs little more than the physics itself.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -18,11 +19,10 @@ from affordlib.primitives import Primitive, min_jerk
 from affordlib.world import robot
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from affordlib.world.scene import Tabletop
 
-    Film = Callable[["Tabletop"], None]
+Film = Callable[["Tabletop"], None]
+"""Called with the world after every step of the simulation."""
 
 STEPS_PER_WAYPOINT = 12
 RECORD_EVERY = 3

@@ -15,7 +15,7 @@ import numpy as np
 import pybullet
 from scipy.spatial import ConvexHull
 
-from affordlib.types import check_finite, check_within
+from affordlib.types import check_field, check_finite
 
 DENSITY_KG_M3 = 600.0
 SIZE_RANGE_M = (0.04, 0.08)
@@ -40,8 +40,7 @@ class Thing(ABC):
 
     def __post_init__(self) -> None:
         for field in fields(self):
-            name = f"{self.family} {field.name}"
-            check_within(name, getattr(self, field.name), 0.005, LARGEST_M, "m")
+            check_field(self, field.name, 0.005, LARGEST_M, "m")
 
     @classmethod
     def sample(
@@ -236,7 +235,7 @@ class Prism(Thing):
     family = "prism"
 
     def __post_init__(self) -> None:
-        check_within("prism height", self.height, 0.005, LARGEST_M, "m")
+        check_field(self, "height", 0.005, LARGEST_M, "m")
         corners = np.array(
             [[check_finite("prism corners", v) for v in corner] for corner in self.corners]
         )

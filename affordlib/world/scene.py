@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import weakref
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 import pybullet
@@ -22,23 +22,21 @@ from affordlib.types import (
     TABLE_X_M,
     TABLE_Y_M,
     Interaction,
+    Step,
     UnreachableError,
+    check_array,
+    check_count,
     check_finite,
     check_on_table,
+    check_pair,
     check_within,
 )
 from affordlib.world import camera, motion, robot
 from affordlib.world.config import WorldConfig
 from affordlib.world.execution import execute, place_offset, plan_motion, put_down, refused
 from affordlib.world.interventions import Interventions
-from affordlib.world.objects import create_body, create_footprint
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from affordlib.types import Step
-    from affordlib.world.motion import Film
-    from affordlib.world.objects import Thing
+from affordlib.world.motion import Film
+from affordlib.world.objects import Thing, create_body, create_footprint
 
 OBJECTS_PER_BUILD = 256
 """After so many objects the client is built anew: Bullet keeps 5 kB of each that is removed."""
@@ -212,10 +210,12 @@ class Tabletop(Interventions):
 
     def object_fell(self) -> bool:
         """Whether the object lies differently than it was placed."""
+        self._require_object()
         return self.thing.fallen(self._upward())
 
     def object_rolls(self) -> bool:
         """Whether the object can roll as it lies now: a cylinder on its side, not upright."""
+        self._require_object()
         return self.thing.rolls(self._upward())
 
     @staticmethod
@@ -251,13 +251,16 @@ class Tabletop(Interventions):
         xy_m: relative to the object, along the table's axes.
         """
         x, y, _ = self.object_pose()
-        at = (x + xy_m[0], y + xy_m[1])
+        dx, dy = (check_within("xy_m", v, -1.0, 1.0, "m") for v in check_pair("xy_m", xy_m))
+        at, turn_rad = (x + dx, y + dy), check_finite("turn_rad", turn_rad)
         return camera.depth_crop(
             self.client, at, LEVER_IMAGE_PIXELS, LEVER_CROP_WIDTH_M, turn_rad, samples=1
         )
 
     def picture(self, width: int = 320, height: int = 240) -> np.ndarray:
         """A colour picture (height, width, 3), uint8, of the robot at work, for people."""
+        for name, pixels in (("width", width), ("height", height)):
+            check_count(name, pixels, 16, 2048)
         return camera.picture(self.client, width, height)
 
     def mark(
@@ -270,6 +273,8 @@ class Tabletop(Interventions):
         """Show the object's footprint at (x, y) [m] on the table, in a colour; only seen."""
         self._require_object()
         x, y = check_on_table("xy_m", xy_m)
+        yaw_rad, scale = check_finite("yaw_rad", yaw_rad), check_within("scale", scale, 0.1, 10.0)
+        rgb = [check_within("rgb", share, 0.0, 1.0) for share in rgb]
         create_footprint(self.client, self.thing, (x, y), yaw_rad, (*rgb, 1.0), scale)
 
     def interact(
@@ -297,7 +302,7 @@ class Tabletop(Interventions):
         self, primitive: Primitive, stop_phase: float
     ) -> tuple[Primitive, np.ndarray, Percept]:
         """The primitive aimed at what is seen, the phases to be recorded, and what is seen."""
-        check_within("stop_phase", stop_phase, 0.0, 1.0)
+        stop_phase = check_within("stop_phase", stop_phase, 0.0, 1.0)
         self._require_tool(primitive)
         seen = self._percept_for(primitive)
         return aim(primitive, seen.image), np.linspace(0.0, 1.0, N_SAMPLES) * stop_phase, seen
@@ -317,7 +322,8 @@ class Tabletop(Interventions):
         at_xy_m: where the object is (default: where it is seen; the action is then aimed at it, as
         `interact` does). The answer is that of the kinematics by which `interact` plans.
         """
-        check_within("stop_phase", stop_phase, 0.0, 1.0)
+        stop_phase = check_within("stop_phase", stop_phase, 0.0, 1.0)
+        at_xy_m = None if at_xy_m is None else check_on_table("at_xy_m", at_xy_m)
         if at_xy_m is None:
             seen = self.perceive()
             at_xy_m, primitive = seen.xy_m, aim(primitive, seen.image)
@@ -364,9 +370,10 @@ class Tabletop(Interventions):
         Height and timing are those of the primitive (default: a push), up to stop_phase; the
         fingers face where the path leads.
         """
-        check_within("stop_phase", stop_phase, 0.0, 1.0)
+        stop_phase = check_within("stop_phase", stop_phase, 0.0, 1.0)
         primitive = primitive or Push(0.0)
         self._require_tool(primitive)
+        path_xy_m = check_array("path_xy_m", path_xy_m, 2)
         phase, action = motion.along_path(path_xy_m, primitive, stop_phase)
         way = [motion.stretch_along(action, phase, DURATION_S * float(min_jerk(phase[-1])))]
         return execute(self, primitive, way, phase, action, self.perceive(), approach=True)

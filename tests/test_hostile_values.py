@@ -1,0 +1,508 @@
+"""Whatever a public callable is given: an error that names the argument, or a sane result."""
+
+import dataclasses
+import decimal
+import fractions
+import inspect
+import math
+import time
+from functools import partial
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import affordlib.interactions.collect as collecting
+from affordlib import evaluation, interactions, models, planning, show, world
+from affordlib.exercises import check
+from affordlib.interactions.recipes import Recipe, Variation
+from affordlib.plan_files import load_plan, save_plan
+from affordlib.primitives import Drag, Grasp, LeverUp, Push, Rotate, primitive_named
+from affordlib.results import read_results, results_table, write_results
+from affordlib.types import Goal, Outcome, Plan, Step, UnreachableError
+
+LIMIT_S = 5.0
+NUMBERS = (math.nan, math.inf, -math.inf, 10**400, -1, 0, 1, 2.5, 1e300, 1e-300, -0.0, 10**6, True)
+WORDS = ("", "0.05", "push", "../../x", "\x00", "ü" * 300, b"0.05", Path("/proc/x"))
+HEAPS = (
+    [],
+    {},
+    set(),
+    (),
+    [[]],
+    {"x": 1},
+    (0.1,),
+    (0.1, "0.2"),
+    (math.nan, 0),
+    (1e9, 1e9),
+    (1, 2, 3),
+)
+ARRAYS = (
+    np.zeros(0),
+    np.full((2, 48, 48), np.nan),
+    np.zeros((2, 48, 48)),
+    np.zeros((48, 48, 2), np.uint8),
+    np.full((3, 2), np.inf),
+    np.array(["a", "b"]),
+    torch.full((2,), math.nan),
+    torch.zeros(1, 2, 48, 48),
+)
+THINGS = (None, object(), lambda: None, 1j, decimal.Decimal("0.05"), fractions.Fraction(1, 20), int)
+OURS = (Goal((0.1, 0.0)), Push(0.0), world.Cuboid(0.06, 0.05, 0.05), planning.PlanMode(1, True))
+HOSTILE = st.one_of(
+    st.sampled_from(NUMBERS + WORDS + ARRAYS + THINGS + OURS),
+    st.sampled_from(HEAPS),
+    st.floats(),
+    st.integers(),
+    st.text(max_size=20),
+    st.lists(st.floats(), max_size=4),
+)
+
+
+@pytest.fixture(scope="module")
+def shop(one_world, repertoire, pushes, tmp_path_factory):
+    """What valid calls are made of."""
+    box = world.Cuboid(0.06, 0.05, 0.05)
+    config = models.CNPConfig()
+    arrays = interactions.TrainingArrays.from_dataset(pushes, np.arange(12))
+    normaliser = interactions.Normaliser.fit(arrays)
+    goal, path = Goal((0.05, 0.02)), np.zeros((3, 2))
+    step = Step(Push(0.0), 0.5, (0.02, 0.0), path)
+    plan = Plan(goal, (0.0, 0.0), (step,), "by hand", True, 1, 0.0)
+    one_world.config = world.WorldConfig()
+    one_world.place(box, (0.0, 0.0), 0.3)
+    image, folder = one_world.look(), tmp_path_factory.mktemp("hostile")
+    return {
+        "world": one_world,
+        "thing": box,
+        "image": image,
+        "goal": goal,
+        "step": step,
+        "plan": plan,
+        "model": repertoire.model(Push),
+        "repertoire": repertoire,
+        "config": config,
+        "normaliser": normaliser,
+        "arrays": arrays,
+        "network": models.build(config, normaliser),
+        "outcome": Outcome(plan, 0.01, (0.04, 0.02, 0.0), 0.0, (path,)),
+        "folder": folder,
+        "seen": one_world.interact(Push(0.0)),
+        "saved": save_plan(folder / "plan.json", plan),
+        "data": pushes,
+    }
+
+
+def valid_calls(shop):
+    """Every public callable: its name, itself, and arguments with which it works."""
+    w, goal, model, image = (shop[name] for name in ("world", "goal", "model", "image"))
+    at, arrays, network, plan = (0.0, 0.0), shop["arrays"], shop["network"], shop["plan"]
+    few = models.TrainingConfig(steps=1, batch_size=2, n_targets=2, device="cpu")
+    query = {"model": model, "image": image, "start_xy_m": at, "goal": goal}
+    planner = shop["repertoire"].planner(planning.plan_astar)
+    corners = tuple((0.03 * math.cos(a), 0.03 * math.sin(a)) for a in (0.0, 2.0, 4.0))
+    ones = torch.ones(4)
+    figure, ax = plt.subplots()
+
+    def on_table(act):
+        def put_back_and(**given):
+            w.place(shop["thing"], at, 0.3, config=world.WorldConfig())
+            return act(**given)
+
+        put_back_and.__signature__ = inspect.signature(act)
+        return put_back_and
+
+    return {
+        "Goal": (Goal, {"xy_m": at, "tolerance_m": 0.02, "turn_rad": 0.1, "height_m": 0.1}),
+        "Step": (Step, {f.name: getattr(shop["step"], f.name) for f in dataclasses.fields(Step)}),
+        "Plan": (Plan, {f.name: getattr(plan, f.name) for f in dataclasses.fields(Plan)}),
+        "Push": (Push, {"theta": 0.0, "length": 0.05, "radius": 0.2}),
+        "Push.towards": (Push.towards, {"direction_rad": 0.0}),
+        "Push.path": (Push(0.0).path, {"phase": 0.5}),
+        "Drag": (Drag, {"theta": 0.0, "length": 0.05, "grip_yaw": 0.0}),
+        "Grasp": (Grasp, {"grip_yaw": 0.0, "seen_height": 0.05}),
+        "Rotate": (Rotate, {"grip_yaw": 0.0}),
+        "LeverUp": (
+            LeverUp,
+            {"theta": 0.0, "contact_x": 0.0, "contact_y": 0.0, "reach": 0.1},
+        ),
+        "primitive_named": (primitive_named, {"name": "push"}),
+        "Cuboid": (world.Cuboid, {"length": 0.05, "width": 0.05, "height": 0.05}),
+        "UprightCylinder": (world.UprightCylinder, {"diameter": 0.05, "height": 0.05}),
+        "LyingCylinder": (world.LyingCylinder, {"length": 0.05, "diameter": 0.05}),
+        "Sphere": (world.Sphere, {"diameter": 0.05}),
+        "Prism": (world.Prism, {"corners": corners, "height": 0.05}),
+        "family_named": (world.family_named, {"name": "cuboid"}),
+        "WorldConfig": (world.WorldConfig, dataclasses.asdict(world.WorldConfig())),
+        "Tabletop": (world.Tabletop, {"config": world.WorldConfig()}),
+        "place": (
+            w.place,
+            {"thing": shop["thing"], "xy_m": at, "yaw_rad": 0.0, "tool": "gripper", "config": None},
+        ),
+        "interact": (on_table(w.interact), {"primitive": Push(0.0), "stop_phase": 0.5}),
+        "attempt": (on_table(w.attempt), {"primitive": Push(0.0), "stop_phase": 0.5}),
+        "follow": (on_table(w.follow), {"step": shop["step"]}),
+        "follow_path": (
+            on_table(w.follow_path),
+            {
+                "path_xy_m": np.array([[-0.1, 0.0], [0.0, 0.0]]),
+                "primitive": None,
+                "stop_phase": 1.0,
+            },
+        ),
+        "can_reach": (
+            on_table(w.can_reach),
+            {"primitive": Push(0.0), "stop_phase": 1.0, "at_xy_m": at},
+        ),
+        "look_from": (on_table(w.look_from), {"xy_m": at, "turn_rad": 0.0}),
+        "picture": (w.picture, {"width": 32, "height": 32}),
+        "mark": (
+            on_table(w.mark),
+            {"xy_m": at, "rgb": (0.0, 0.5, 1.0), "yaw_rad": 0.0, "scale": 1.0},
+        ),
+        "shove": (on_table(w.shove), {"dx_m": 0.01, "dy_m": 0.0, "dyaw_rad": 0.1}),
+        "knock": (on_table(w.knock), {"dx_m_s": 0.1, "dy_m_s": 0.0, "spin_rad_s": 0.1}),
+        "topple": (on_table(w.topple), {"direction_rad": 0.1}),
+        "settle": (on_table(w.settle), {"seconds": 0.1}),
+        "Normaliser": (interactions.Normaliser, dataclasses.asdict(shop["normaliser"])),
+        "from_dataset": (
+            interactions.TrainingArrays.from_dataset,
+            {
+                "data": shop["data"],
+                "interactions": np.arange(4),
+                "action_channels": ("x", "y"),
+                "effect_channels": ("x", "y"),
+            },
+        ),
+        "open_interactions": (interactions.open_interactions, {"name_or_path": "push_test"}),
+        "split_interactions": (
+            interactions.split_interactions,
+            {"n": 20, "seed": 0, "fold": 0, "n_folds": 10},
+        ),
+        "Recipe": (Recipe, {f.name: getattr(Recipe(), f.name) for f in dataclasses.fields(Recipe)}),
+        "Variation": (Variation, dataclasses.asdict(Variation())),
+        "collect": (
+            collecting.collect,
+            {
+                "recipe": Recipe(n_interactions=1),
+                "path": shop["folder"] / "one.zarr.zip",
+                "progress": False,
+                "replace": False,
+            },
+        ),
+        "CNPConfig": (models.CNPConfig, dataclasses.asdict(models.CNPConfig())),
+        "AttentionConfig": (models.AttentionConfig, dataclasses.asdict(models.AttentionConfig())),
+        "FiLMConfig": (models.FiLMConfig, dataclasses.asdict(models.FiLMConfig())),
+        "build": (models.build, {"config": shop["config"], "normaliser": shop["normaliser"]}),
+        "Ensemble": (models.Ensemble, {"members": [network]}),
+        "TrainingConfig": (models.TrainingConfig, dataclasses.asdict(few)),
+        "coverage": (
+            models.coverage,
+            {"truth": ones, "mean": ones, "std": ones, "level": 0.5},
+        ),
+        "fit_temperature": (
+            models.fit_temperature,
+            {"model": network, "validation": arrays, "phases": (0.8, 1.0)},
+        ),
+        "load_checkpoint": (models.load_checkpoint, {"name_or_path": "push_cnp"}),
+        "save_checkpoint": (
+            models.save_checkpoint,
+            {"model": network, "path": shop["folder"] / "net.safetensors", "about": {}},
+        ),
+        "observe_actions": (models.observe_actions, {"model": network, "actions": [Push(0.0)]}),
+        "train": (
+            models.train,
+            {
+                "model": network,
+                "training": arrays,
+                "validation": arrays,
+                "config": few,
+                "progress": False,
+                "checkpoint": None,
+            },
+        ),
+        "train_literal": (
+            partial(models.train_literal, iterations=1),
+            {
+                "model": network,
+                "training": arrays,
+                "obs_max": 2,
+                "learning_rate": 1e-4,
+                "seed": 0,
+                "validation": None,
+                "validate_every": 1,
+                "patience": 1,
+            },
+        ),
+        "PlanMode": (planning.PlanMode, {"max_steps": 2, "partial": True}),
+        "Disturbance": (
+            planning.Disturbance,
+            {"kind": "knock", "action": 0, "x": 0.1, "y": 0.0, "turn": 0.0, "at_s": 1.0},
+        ),
+        "draw_disturbances": (
+            planning.draw_disturbances,
+            {"seed": 0, "n": 1, "n_actions": 2, "kinds": ("knock",), "strength": 1.0},
+        ),
+        "action_limit": (planning.action_limit, {"distance_m": 0.1}),
+        "map_effects": (
+            planning.map_effects,
+            {"model": model, "image": image, "kind": Push, "n_directions": 8, "n_phases": 5},
+        ),
+        "plan_astar": (
+            planning.plan_astar,
+            query | {"mode": "single_partial", "n_directions": 36, "stop_phases": (0.5, 1.0)},
+        ),
+        "plan_continuous": (
+            planning.plan_continuous,
+            query | {"mode": "single_partial", "kind": Push, "seed": 0, "draft": True},
+        ),
+        "plan_gradient": (
+            planning.plan_gradient,
+            query | {"mode": "single_partial", "samples": 10, "starts": 1, "seed": 0},
+        ),
+        "plan_turn": (
+            planning.plan_turn,
+            {
+                "model": shop["repertoire"].model(Rotate),
+                "image": image,
+                "xy_m": at,
+                "turn_rad": 0.3,
+                "grip_yaws": (0.0, 0.1),
+            },
+        ),
+        "plan_lift": (
+            planning.plan_lift,
+            {
+                "model": shop["repertoire"].model(Grasp),
+                "image": image,
+                "xy_m": at,
+                "height_m": 0.05,
+                "grip_yaws": (0.0, 0.1),
+            },
+        ),
+        "kind_for": (shop["repertoire"].kind_for, {"image": image}),
+        "Repertoire": (
+            planning.Repertoire,
+            {"models": {"push": model}, "reachability": None, "threshold": 0.2},
+        ),
+        "carry_out": (
+            on_table(planning.carry_out),
+            {"world": w, "plan": plan, "corrections": 0, "enough_m": 0.001},
+        ),
+        "pursue": (
+            on_table(planning.pursue),
+            {
+                "world": w,
+                "goal": Goal(at, 0.05),
+                "repertoire": shop["repertoire"],
+                "turn_tolerance_rad": 0.1,
+                "height_tolerance_m": 0.01,
+                "max_actions": 1,
+                "disturbances": (),
+                "horizon": 1,
+            },
+        ),
+        "closed_loop": (
+            show.closed_loop,
+            {"repertoire": shop["repertoire"], "tolerance_m": 0.002},
+        ),
+        "plot_depth": (show.plot_depth, {"ax": ax, "image": image, "width_m": 0.16}),
+        "plot_footprint": (
+            show.plot_footprint,
+            {"ax": ax, "thing": shop["thing"], "xy_m": at, "yaw_rad": 0.0},
+        ),
+        "plot_plan": (show.plot_plan, {"ax": ax, "plan": plan, "sigma": True, "yaw_rad": 0.0}),
+        "plot_outcome": (show.plot_outcome, {"ax": ax, "outcome": shop["outcome"]}),
+        "plot_table": (show.plot_table, {"ax": ax, "around_m": at, "half_width_m": 0.3}),
+        "save_figure": (
+            show.save_figure,
+            {"figure": figure, "folder": shop["folder"], "name": "x"},
+        ),
+        "GoalPicker": (
+            on_table(show.GoalPicker),
+            {"world": w, "planners": {"A*": planner}, "goal_xy_m": (0.1, 0.0), "seed": 0},
+        ),
+        "PhaseSlider": (
+            on_table(show.PhaseSlider),
+            {"world": w, "action": Push(0.0), "phase": 0.5},
+        ),
+        "ConditioningExplorer": (
+            show.ConditioningExplorer,
+            {"model": model, "seen": shop["seen"]},
+        ),
+        "error_row": (evaluation.error_row, {"errors_m": np.array([0.1, 0.2])}),
+        "mean_length_errors_m": (
+            evaluation.mean_length_errors_m,
+            {"training": arrays, "test": arrays},
+        ),
+        "save_plan": (save_plan, {"path": shop["folder"] / "p.json", "plan": plan}),
+        "load_plan": (load_plan, {"path": shop["saved"]}),
+        "write_results": (
+            write_results,
+            {"out_dir": shop["folder"], "notebook": "x", "parameters": {}, "tables": {}},
+        ),
+        "read_results": (read_results, {"path": "data/results/planning.json"}),
+        "results_table": (
+            results_table,
+            {"rows": read_results("data/results/planning.json")["tables"]["summary"][:3]},
+        ),
+        "check": (check, {"name": "01.1", "attempt": None}),
+    }
+
+
+NAMES = [
+    "Goal",
+    "Step",
+    "Plan",
+    "Push",
+    "Push.towards",
+    "Push.path",
+    "Drag",
+    "Grasp",
+    "Rotate",
+    "LeverUp",
+    "primitive_named",
+    "Cuboid",
+    "UprightCylinder",
+    "LyingCylinder",
+    "Sphere",
+    "Prism",
+    "family_named",
+    "WorldConfig",
+    "Tabletop",
+    "place",
+    "interact",
+    "attempt",
+    "follow",
+    "follow_path",
+    "can_reach",
+    "look_from",
+    "picture",
+    "mark",
+    "shove",
+    "knock",
+    "topple",
+    "settle",
+    "Normaliser",
+    "from_dataset",
+    "open_interactions",
+    "split_interactions",
+    "Recipe",
+    "Variation",
+    "collect",
+    "CNPConfig",
+    "AttentionConfig",
+    "FiLMConfig",
+    "build",
+    "Ensemble",
+    "TrainingConfig",
+    "coverage",
+    "fit_temperature",
+    "load_checkpoint",
+    "save_checkpoint",
+    "observe_actions",
+    "train",
+    "train_literal",
+    "PlanMode",
+    "Disturbance",
+    "draw_disturbances",
+    "action_limit",
+    "map_effects",
+    "plan_astar",
+    "plan_continuous",
+    "plan_gradient",
+    "plan_turn",
+    "plan_lift",
+    "kind_for",
+    "Repertoire",
+    "carry_out",
+    "pursue",
+    "closed_loop",
+    "plot_depth",
+    "plot_footprint",
+    "plot_plan",
+    "plot_outcome",
+    "plot_table",
+    "save_figure",
+    "GoalPicker",
+    "PhaseSlider",
+    "ConditioningExplorer",
+    "error_row",
+    "mean_length_errors_m",
+    "save_plan",
+    "load_plan",
+    "write_results",
+    "read_results",
+    "results_table",
+    "check",
+]
+
+
+def silent_nans(result):
+    """Fields of a result that are not numbers, though they should be."""
+    if dataclasses.is_dataclass(result) and not isinstance(result, type):
+        fields = {f.name: getattr(result, f.name) for f in dataclasses.fields(result)}
+        return [n for n, v in fields.items() if n != "std_m" and silent_nans(v)]
+    if isinstance(result, np.ndarray) and result.dtype.kind == "f":
+        return ["array"] if np.isnan(result).any() else []
+    if isinstance(result, tuple | list):
+        return [str(k) for k, value in enumerate(result) if silent_nans(value)]
+    return ["number"] if isinstance(result, float) and math.isnan(result) else []
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_hostile_value_is_refused_by_name_or_does_no_harm(shop, name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    call, valid = valid_calls(shop)[name]
+    call(**valid)
+    found = []
+
+    @settings(
+        max_examples=200,
+        derandomize=True,
+        deadline=None,
+        database=None,
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(st.sampled_from(sorted(valid)), HOSTILE)
+    def try_one(argument, value):
+        began, wrong = time.monotonic(), ""
+        try:
+            nans = silent_nans(call(**valid | {argument: value}))
+            wrong = nans and f"gives NaN in {nans}"
+        except UnreachableError:
+            pass
+        except (TypeError, ValueError) as error:
+            named = argument in str(error) or repr(value) in str(error)
+            wrong = not named and f"is not named by {error!r}"
+        except OSError as error:
+            wrong = not isinstance(value, str | bytes | Path) and f"is no path, but {error!r}"
+        except Exception as error:
+            wrong = f"raises {error!r}"
+        took_s = time.monotonic() - began
+        if took_s > LIMIT_S:
+            wrong = f"takes {took_s:.0f} s"
+        if wrong:
+            found.append(f"{argument}={value!r:.60} {wrong:.200}")
+
+    try_one()
+    plt.close("all")
+    assert not found, "\n".join(found)
+
+
+MADE_OF_DRIVEN_ONES = """
+AffordanceCNP AttentiveCNP EffectMap EffectModel EffectNetwork FiLMNetwork Film NetworkConfig
+Pursuit Split Thing TrainingArrays calibration_rows mean_length_errors_m open_loop
+outline_in_lever_frame plot_levered plot_pursuit refuse_seen show_animation
+"""
+
+
+def test_every_public_callable_is_driven():
+    for package in (world, interactions, models, planning, show, evaluation):
+        public = {name for name in package.__all__ if callable(getattr(package, name))}
+        public -= {name for name in public if name.endswith(("Error", "Warning"))}
+        assert public <= {*NAMES, *MADE_OF_DRIVEN_ONES.split()}
