@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ast
 import difflib
+import math
 import re
 from collections.abc import Sequence
 from contextlib import suppress
@@ -99,6 +100,10 @@ def fitting(where: str, value: object, default: object) -> Any:
             f"{where} must be {type(default).__name__} like its default {default!r}, "
             f"got {type(value).__name__} {value!r:.60}"
         )
+    if isinstance(value, int) and value < 0:
+        raise WorkbookError(f"{where} must be a whole number from 0, got {value}")
+    if isinstance(value, float) and not math.isfinite(value):
+        raise WorkbookError(f"{where} must be a finite number, got {value}")
     return value
 
 

@@ -110,10 +110,15 @@ def test_a_draft_until_the_hand_rests(make_picker, asked_of_planner, trained):
     picker = make_picker(draft=draft)
     assert (picker.plan.planner, drafts) == ("astar", [])  # nobody is in a hurry
 
+    async def heard():
+        while not picker._work.done():
+            await asyncio.sleep(0.005)
+
     async def hand():
         asked_of_planner.clear()
         for number, xy in enumerate([(0.08, 0.03), (0.09, 0.03), (0.10, 0.03)], 1):
             picker._view.asked = [*xy, number]
+            await heard()
             assert picker.plan.planner == "draft"
             assert picker._view.scene["draft"]
             assert picker._view.scene["answered"] == number
@@ -123,6 +128,7 @@ def test_a_draft_until_the_hand_rests(make_picker, asked_of_planner, trained):
         assert asked_of_planner == [(0.10, 0.03)]  # once, where the hand came to rest
         assert not picker._view.scene["draft"]
         picker.controls.x.value = 7.0
+        await heard()
         assert (picker.plan.planner, len(drafts)) == ("draft", 4)
         picker.run()  # what is carried out is the plan
         assert picker.plan.planner == picker.outcome.plan.planner == "astar"
@@ -137,6 +143,45 @@ def test_a_draft_until_the_hand_rests(make_picker, asked_of_planner, trained):
     asyncio.run(hand())
 
 
+def test_run_waits_for_the_plan_of_the_goal_that_is_shown(make_picker, trained):
+    """Two clicks and Run, faster than the planner: what runs is the plan of the second."""
+    began = []
+
+    def slow(*query):
+        began.append(query[2].xy_m)
+        time.sleep(0.3)
+        return plan_astar(trained, *query)
+
+    picker = make_picker(draft=lambda *query: plan_astar(trained, *query))
+    picker.planners["A*"] = slow
+
+    async def hand():
+        picker._view.asked = [0.08, 0.03, 1]
+        await asyncio.sleep(0.15)
+        picker._view.asked = [-0.09, 0.05, 2]
+        assert picker._view.scene["planning"]
+        picker.controls.run.click()
+        picker.controls.run.click()  # a second press does nothing
+        while picker.outcome is None or picker._running:
+            await asyncio.sleep(0.02)
+
+    asyncio.run(hand())
+    assert began[-1] == picker.plan.goal.xy_m == picker.outcome.plan.goal.xy_m == (-0.09, 0.05)
+    assert picker.outcome.distance_m == picker._goal.distance_m(picker.world.object_pose()[:2])
+    assert "rests" in picker.controls.words.value
+    assert not picker._view.scene["planning"]
+
+
+@pytest.mark.parametrize("name", ["../x.json", "/tmp/x.json", "sub/y.json", "", ".", "..\\x"])
+def test_plans_stay_in_their_folder(picker, tmp_path, name):
+    for act in (picker.save, picker.load):
+        with pytest.raises(ValueError, match="plain file name"):
+            act(name)
+    picker.controls.name.value = "nosuch.json"
+    picker.controls.load.click()
+    assert "there is no plan &#x27;nosuch.json&#x27; in " in picker.controls.words.value
+
+
 def test_sliders_pick(picker, asked_of_planner):
     picker.controls.x.value = 7.7
     picker.controls.y.value = -4.0
@@ -146,7 +191,7 @@ def test_sliders_pick(picker, asked_of_planner):
 
 def test_the_picker_shows_its_errors(picker):
     picker.controls.planner.value = "broken"
-    assert "<b>ValueError</b>: no &lt;plan&gt; today" in picker.controls.words.value
+    assert "did not work:</b> no &lt;plan&gt; today" in picker.controls.words.value
     assert picker._view.scene["steps"] == []
     with pytest.raises(ValueError, match="off the table"):
         picker.pick(5.0, 0.0)
@@ -169,7 +214,7 @@ def test_stop_lets_an_action_end_and_begins_no_other(make_picker, world):
     with pytest.raises(RuntimeError, match="still at work"):
         picker.run()
     picker.controls.stop.click()
-    wait_until(lambda: not picker._work.is_alive())
+    wait_until(lambda: picker._work.done())
     assert "Stopped after 1 action:" in picker.controls.words.value
     first = picker.plan.steps[0].predicted_end_xy_m
     assert math.dist(world.object_pose()[:2], first) < 0.03
@@ -181,7 +226,7 @@ def test_a_run_is_filmed_at_the_pace_of_the_eye(make_picker):
     films = []
     picker._view.observe(lambda change: films.append(change["new"]), names="film")
     picker._view._handle_custom_msg({"press": "run"}, [])
-    wait_until(lambda: not picker._work.is_alive())
+    wait_until(lambda: picker._work.done())
     assert [film["seconds"] for film in films] == [0.2] * len(picker.plan.steps)
     poses = np.vstack([film["poses"] for film in films])
     assert len(poses) > 20
@@ -224,7 +269,7 @@ def test_a_closed_loop_notices_what_an_open_loop_does_not(make_picker, trained):
         wait_until(lambda picker=picker: picker.controls.progress.value == 1)
         picker.controls.move_goal.click()
         picker.controls.shove.click()
-        wait_until(lambda picker=picker: not picker._work.is_alive())
+        wait_until(lambda picker=picker: picker._work.done())
         assert picker.outcome.distance_m == pytest.approx(
             picker._goal.distance_m(picker.world.object_pose()[:2])
         )
@@ -361,7 +406,7 @@ def test_what_waits_when_the_robot_stops_does_not_wait_for_the_next_run(make_pic
     wait_until(lambda: picker.controls.progress.value == 1)
     picker.shove_object()
     picker.stop()
-    wait_until(lambda: not picker._work.is_alive())
+    wait_until(lambda: picker._work.done())
     picker.seconds_per_action = 0.0
     picker.pick(*(0.05 + v for v in world.object_pose()[:2]))
     picker.run()

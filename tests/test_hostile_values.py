@@ -334,6 +334,7 @@ def valid_calls(shop):
             show.ConditioningExplorer,
             {"model": model, "seen": shop["seen"]},
         ),
+        "Film": (show.Film, {"every": 30, "width": 32, "height": 32}),
         "error_row": (evaluation.error_row, {"errors_m": np.array([0.1, 0.2])}),
         "mean_length_errors_m": (
             evaluation.mean_length_errors_m,
@@ -430,6 +431,7 @@ NAMES = [
     "save_figure",
     "GoalPicker",
     "PhaseSlider",
+    "Film",
     "ConditioningExplorer",
     "error_row",
     "mean_length_errors_m",
@@ -495,7 +497,7 @@ def test_a_hostile_value_is_refused_by_name_or_does_no_harm(shop, name, tmp_path
 
 
 MADE_OF_DRIVEN_ONES = """
-AffordanceCNP AttentiveCNP EffectMap EffectModel EffectNetwork FiLMNetwork Film NetworkConfig
+AffordanceCNP AttentiveCNP EffectMap EffectModel EffectNetwork FiLMNetwork NetworkConfig
 Pursuit Split Thing TrainingArrays calibration_rows mean_length_errors_m open_loop
 outline_in_lever_frame plot_levered plot_pursuit refuse_seen show_animation
 """

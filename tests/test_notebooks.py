@@ -21,6 +21,7 @@ from affordlib.workbook import Layout, make_jobs
 
 LAYOUT = Layout.of_repository()
 PATHS = notebook_paths(LAYOUT.notebooks)
+RESULTS = LAYOUT.notebooks.parent / "data" / "results"
 PROFILES = ("smoke", "reader", "full")
 BROKEN = LAYOUT.notebooks.parent / "tests" / "broken.ipynb"
 # A folder of some machine: a slash that begins a word, and a name that systems use at the root.
@@ -314,7 +315,7 @@ def smoke(tmp_path_factory):
     """The folder of one run, shared: later notebooks may read what earlier ones wrote."""
     folder = tmp_path_factory.mktemp("smoke")
     return folder, {
-        job.name: job for job in make_jobs(LAYOUT, "smoke", [], {"seed": 0, "out_dir": str(folder)})
+        job.name: job for job in make_jobs(LAYOUT, "smoke", [], {"seed": 1, "out_dir": str(folder)})
     }
 
 
@@ -330,6 +331,9 @@ def test_run(name, smoke):
     assert f"{len(code_of(nbformat.read(copy, as_version=4)))} passed" in done.stdout
     document = read_results(folder / f"{name}.json")
     assert document["notebook"] == name
+    # What a run writes it has measured itself, with its own seed: none of the committed tables.
+    committed = [read_results(path)["tables"].values() for path in RESULTS.glob("*.json")]
+    assert not [t for t, rows in document["tables"].items() if any(rows in of for of in committed)]
     asked = jobs[name].parameters
     assert {k: v for k, v in document["parameters"].items() if k in asked}.items() <= asked.items()
 

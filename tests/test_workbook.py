@@ -354,6 +354,8 @@ def test_a_second_runner_is_refused(book, capsys):
         (["02_secnod.n=1"], r"notebook '02_secnod' is unknown; did you mean 02_second"),
         (["02_second.m=1"], r"parameter of 02_second 'm' is unknown; .*\bn\b"),
         (["02_second.rates=1"], r"'rates' is unknown; did you mean rate\?"),
+        (["02_second.n=-3"], r"02_second.n must be a whole number from 0, got -3"),
+        (["02_second.rate=.nan"], r"02_second.rate must be a finite number, got nan"),
         (["02_second.n=1.5"], r"02_second.n must be int like its default 2, got float 1.5"),
         (["02_second.n=true"], r"02_second.n must be int .* got bool True"),
         (["02_second.modes=full"], r"02_second.modes must be list"),

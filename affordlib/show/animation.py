@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from affordlib.results import write_atomically
+from affordlib.types import check_count
 from affordlib.world import Tabletop
 
 
@@ -21,7 +22,9 @@ class Film:
     """
 
     def __init__(self, every: int = 30, width: int = 320, height: int = 240) -> None:
-        self.every, self.width, self.height = every, width, height
+        self.every = check_count("every", every, 1, 100_000)
+        self.width = check_count("width", width, 16, 2048)
+        self.height = check_count("height", height, 16, 2048)
         self.frames: list[np.ndarray] = []
         self._steps = 0
 

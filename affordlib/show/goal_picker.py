@@ -11,7 +11,9 @@ import html
 import math
 import threading
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import ipywidgets as widgets
@@ -46,9 +48,9 @@ class GoalPicker(Pictured, widgets.VBox):
     its place when the hand rests. seed: of the disturbances. folder: where plans are saved.
 
     `plan` and `outcome` hold what is shown; `pick`, `ask_pose`, `run`, `stop`, `shove_object`,
-    `move_goal`, `start_over`, `save` and `load` do what mouse and buttons do. *Run* works in the
-    background, at a pace that can be watched; leave the world alone until it is done. `run()`
-    returns when done.
+    `move_goal`, `start_over`, `save` and `load` do what mouse and buttons do, and return when done.
+    What mouse and buttons ask for is done in the background, one after the other, *Run* at a pace
+    that can be watched; leave the world alone until it is done.
     """
 
     def __init__(
@@ -73,33 +75,35 @@ class GoalPicker(Pictured, widgets.VBox):
         self._turn_from = self._pose[2]  # what a wanted turn is counted from
         self._goal = Goal(whole_mm(*check_on_table("goal_xy_m", goal_xy_m)))
         self._running = self._setting = self._lifted = False
-        self._rest: asyncio.TimerHandle | None = None  # while a draft is shown
+        self._owed = False  # a plan of the chosen planner, for the goal that is shown
+        self._asked = self._answered = 0  # numbers of goals: only the last is planned for
+        self._queue, self._alone = ThreadPoolExecutor(1), threading.RLock()
+        self._work: Future | None = None
         self._stop = threading.Event()
         self._waiting: list[Callable[[], None]] = []
         self._poses: list[tuple[float, ...]] = []  # of the film since the last action
         self._walked: list[np.ndarray] = []  # the object's paths since the plan was made
         super().__init__(self._build())
         self.add_class("affordlib-picker")
-        self._safely(self._replan)
+        self._safely(self._make_plan)
 
     # What mouse and buttons do
 
     def pick(self, x_m: float, y_m: float) -> None:
         """Set the goal [m], to the nearest millimetre, and make the plan anew."""
-        self._set_goal(replace(self._goal, xy_m=whole_mm(x_m, y_m)))
-        self._replan()
+        self._ask_for(replace(self._goal, xy_m=whole_mm(x_m, y_m)))
+        self._settle()
 
     def ask_pose(self, turn_deg: float = 0.0, height_cm: float = 0.0) -> None:
         """Ask for a turn and a height beside the position; 0 asks for none. Plans anew."""
         turn = math.radians(turn_deg) if turn_deg else None
         height = height_cm / 100 if height_cm else None
-        self._set_goal(replace(self._goal, turn_rad=turn, height_m=height))
-        self._replan()
+        self._ask_for(replace(self._goal, turn_rad=turn, height_m=height))
+        self._settle()
 
     def run(self) -> None:
         """Carry the plan out and show what came of it; the next plan starts from there."""
         self._refuse_while_running()
-        self._settle()
         self._set_running(True)
         self._run(seconds_per_action=0.0)
 
@@ -124,17 +128,20 @@ class GoalPicker(Pictured, widgets.VBox):
 
     def save(self, name: str = "plan.json") -> None:
         """Save the plan and its goal as JSON in the picker's folder."""
+        path = self._file(name)
         self._settle()
         if self.plan is None:
             raise RuntimeError("there is no plan to save; pick a goal that can be planned for")
-        path = save_plan(resolve_out_dir(self.folder) / name, self.plan)
-        self.controls.say(f"Saved the plan as {html.escape(f'{self.folder}/{path.name}')}.")
+        save_plan(path, self.plan)
+        self.controls.say(f"Saved the plan as {html.escape(f'{self.folder}/{name}')}.")
 
     def load(self, name: str = "plan.json") -> None:
         """Show a saved plan with its goal, to be run as it is."""
         self._refuse_while_running()
-        plan = load_plan(resolve_out_dir(self.folder) / name)
-        self._no_rest()
+        path = self._file(name)
+        if not path.is_file():
+            raise FileNotFoundError(f"there is no plan {name!r} in {self.folder}")
+        plan = load_plan(path)
         self._let_go()
         self._set_goal(plan.goal)
         self._pose, self.plan, self.outcome = self.world.object_pose(), plan, None
@@ -143,56 +150,74 @@ class GoalPicker(Pictured, widgets.VBox):
         away_m = np.hypot(*np.subtract(plan.start_xy_m, self._pose[:2]))
         note = f" The object is {1000 * away_m:.0f} mm from where this plan starts."
         self.controls.say(f"Loaded. {plan_in_words(plan)}{note if away_m > 0.002 else ''}")
+        self._owed = False
         self._show()
+
+    def _file(self, name: str) -> Path:
+        """A plain file name in the picker's folder."""
+        if not name or name in (".", "..") or Path(name).name != name or "\\" in name:
+            raise ValueError(f"name must be a plain file name such as plan.json, got {name!r}")
+        return resolve_out_dir(self.folder) / name
 
     # Planning
 
-    def _replan(self) -> None:
-        if self._running:  # the executor is told of the new goal after this action
-            self._show()
-        else:
-            self._make_plan()
+    def _ask_for(self, goal: Goal) -> None:
+        """A new goal, for which there is no plan yet."""
+        self._set_goal(goal)
+        self._owed, self._asked = True, self._asked + 1
+        if self._running:  # the executor is told of it after this action
+            self._answered = self._view.asked[2]
+        self._show(planning=not self._running)
 
     def _follow(self, x_m: float, y_m: float) -> None:
         """Pick as the hand moves: a draft at once, where there is one, and the plan when it rests.
 
-        Where no loop waits for the hand (a script) there is the plan at once.
+        Where no page waits for an answer (a script) there is the plan at once.
         """
-        try:
-            loop = asyncio.get_running_loop()
-        except RuntimeError:
-            loop = None
-        if self.draft is None or loop is None or self._running:
-            return self.pick(x_m, y_m)
-        self._set_goal(replace(self._goal, xy_m=whole_mm(x_m, y_m)))
-        try:
-            self._make_plan(self.draft)
-        finally:
-            self._rest = loop.call_later(REST_S, self._safely, self._settle)
+        self._ask_for(replace(self._goal, xy_m=whole_mm(x_m, y_m)))
+        if self.draft is None or not _page_waits():
+            return self._do(self._settle)
+        number = self._asked
+
+        def follow() -> None:
+            if self._owed and number == self._asked and not self._running:
+                self._make_plan(self.draft)
+
+        def rest() -> None:
+            if number == self._asked:
+                self._do(self._settle, page_waits=True)
+
+        self._do(follow)
+        timer = threading.Timer(REST_S, rest)
+        timer.daemon = True
+        timer.start()
+
+    def _plan_anew(self) -> None:
+        self._owed = True
+        self._settle()
 
     def _settle(self) -> None:
-        """Let the plan of the chosen planner take the place of a draft."""
-        if self._rest is not None:
+        """Plan for the goal that is shown, where that is owed; what runs hears of it later."""
+        if self._owed and not self._running:
             self._make_plan()
 
-    def _no_rest(self) -> None:
-        if self._rest is not None:
-            self._rest.cancel()
-            self._rest = None
-
     def _make_plan(self, draft: Planner | None = None) -> None:
-        self._no_rest()
-        planner, plan = draft or self.planners[self.controls.planner.value], None
-        self._let_go()
-        self._pose = self._start = self.world.object_pose()
-        self._turn_from = self._pose[2]
-        try:
-            plan = planner(self.world.look(), self._pose[:2], self._goal)
-            self.controls.say(plan_in_words(plan))
-        finally:
-            self.plan, self.outcome = plan, None
-            self._walked.clear()
-            self._show(draft is not None)
+        with self._alone:
+            self._show(planning=draft is None)
+            planner, plan = draft or self.planners[self.controls.planner.value], None
+            goal, number = self._goal, self._view.asked[2]
+            self._let_go()
+            self._pose = self._start = self.world.object_pose()
+            self._turn_from = self._pose[2]
+            self._owed = draft is not None
+            try:
+                plan = planner(self.world.look(), self._pose[:2], goal)
+                self.controls.say(plan_in_words(plan))
+            finally:
+                self.plan, self.outcome = plan, None
+                self._owed, self._answered = self._owed or goal != self._goal, number
+                self._walked.clear()
+                self._show(draft is not None, planning=goal != self._goal)
 
     def _let_go(self) -> None:
         """Put down what the last run has lifted."""
@@ -233,14 +258,17 @@ class GoalPicker(Pictured, widgets.VBox):
                 raise Stopped
             return self._goal
 
+        self._alone.acquire()
         try:
-            if self.plan is None or self.outcome is not None:
+            if self._owed or self.plan is None or self.outcome is not None:
                 self._make_plan()
             self.controls.show_progress(0, max(1, len(self.plan.steps)))
             yaw, z = self.world.object_pose()[2], self.world.object_state()[2]
             self.world.film = pose_recorder(self._poses, before)
             try:
                 execute = self.executors[self.controls.executor.value]
+                if self._stop.is_set():
+                    raise Stopped
                 outcome, how = execute(self.world, self.plan, planner, tell), "Done,"
                 self.controls.show_progress(done, max(1, done))
             except Stopped:
@@ -258,10 +286,11 @@ class GoalPicker(Pictured, widgets.VBox):
         finally:
             self.world.film = before
             self._waiting.clear()
-            self._set_running(False)
             self._play(0.0)
             self._pose = self.world.object_pose()
+            self._set_running(False)
             self._show()
+            self._alone.release()
 
     def _follow_plan(self, plan: Plan, done: int) -> None:
         """Show a plan that was made on the way, after so many actions."""
@@ -294,7 +323,8 @@ class GoalPicker(Pictured, widgets.VBox):
     def _disturb(self, disturbance: Callable[[], None]) -> None:
         if self._running:
             self._waiting.append(disturbance)
-        else:
+            return
+        with self._alone:
             disturbance()
             self._make_plan()
 
@@ -324,23 +354,23 @@ class GoalPicker(Pictured, widgets.VBox):
             slider.observe(self._slid, names="value")
         for slider in (controls.turn, controls.height):
             slider.observe(self._posed, names="value")
-        controls.planner.observe(lambda _: self._safely(self._replan), names="value")
-        self._view.observe(self._asked, names="asked")
+        controls.planner.observe(lambda _: self._do(self._plan_anew), names="value")
+        self._view.observe(self._heard, names="asked")
         self._view.on_msg(self._pressed)
+        controls.run.on_click(lambda _: self._run_in_background())
+        controls.stop.on_click(lambda _: self.stop())
         for button, action in {
-            controls.run: self._run_in_background,
-            controls.stop: self.stop,
             controls.shove: self.shove_object,
             controls.move_goal: self.move_goal,
             controls.start_over: self.start_over,
             controls.save: lambda: self.save(controls.name.value),
             controls.load: lambda: self.load(controls.name.value),
         }.items():
-            button.on_click(lambda _, action=action: self._safely(action))
+            button.on_click(lambda _, action=action: self._do(action))
         layout = {"flex_flow": "row wrap", "grid_gap": "12px"}
         return [widgets.HBox([self._view, controls.box()], layout=layout)]
 
-    def _asked(self, change: dict[str, Any]) -> None:
+    def _heard(self, change: dict[str, Any]) -> None:
         x, y, _ = change["new"]
         self._safely(lambda: self._follow(x, y))
 
@@ -351,30 +381,37 @@ class GoalPicker(Pictured, widgets.VBox):
 
     def _posed(self, change: dict[str, Any]) -> None:
         if not self._setting:
-            self._safely(lambda: self.ask_pose(*self.controls.pose(self._goal, change)))
+            self._do(lambda: self.ask_pose(*self.controls.pose(self._goal, change)))
 
     def _pressed(self, _: object, content: dict[str, Any], __: object) -> None:
         presses = {"run": self._run_in_background, "stop": self.stop}
         if content.get("press") in presses:
-            self._safely(presses[content["press"]])
+            presses[content["press"]]()
 
     def _run_in_background(self) -> None:
-        """So that Stop, a disturbance and a new goal are heard while the robot is at work."""
-        self._refuse_while_running()
-        self._settle()
-        self._set_running(True)
-        self._work = threading.Thread(
-            target=lambda: self._safely(lambda: self._run(self.seconds_per_action)), daemon=True
-        )
-        self._work.start()
+        """Run the plan of the goal that is shown, when it is made; a second press does nothing."""
+        if not self._running:
+            self._set_running(True)
+            self._do(lambda: self._run(self.seconds_per_action), page_waits=True)
+
+    def _do(self, action: Callable[[], None], page_waits: bool | None = None) -> None:
+        """Do what the page asks for when all is done that it has asked for before.
+
+        So the next click, Stop and a disturbance are heard meanwhile. In a script it is done now.
+        """
+        if _page_waits() if page_waits is None else page_waits:
+            self._work = self._queue.submit(self._safely, action)
+        else:
+            self._safely(action)
 
     def _safely(self, action: Callable[[], None]) -> None:
         try:
             action()
         except Exception as error:
-            self.controls.say(f"<b>{type(error).__name__}</b>: {html.escape(str(error))}")
+            text = str(error) or type(error).__name__
+            self.controls.say(f"<b>This did not work:</b> {html.escape(text)}")
 
-    def _show(self, draft: bool = False) -> None:
+    def _show(self, draft: bool = False, planning: bool = False) -> None:
         self._view.scene = make_scene(
             self.world.thing,
             self._pose,
@@ -385,11 +422,21 @@ class GoalPicker(Pictured, widgets.VBox):
             self._walked,
             HALF_WIDTH_M,
             LIMIT_M,
-            answered=self._view.asked[2],
+            answered=self._answered,
             running=self._running,
             draft=draft,
+            planning=planning,
         )
 
     def picture(self) -> bytes:
         """What is shown, as a PNG."""
         return table_picture(self.world.thing, self._pose, self.plan, self.outcome, HALF_WIDTH_M)
+
+
+def _page_waits() -> bool:
+    """Whether this is called for a page: its messages come by an event loop."""
+    try:
+        asyncio.get_running_loop()
+    except RuntimeError:
+        return False
+    return True

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 from matplotlib.axes import Axes
+from torch import Tensor
 
 from affordlib.world import Thing
 
@@ -26,7 +27,7 @@ def plot_levered(
     ax: Axes,
     outline_m: np.ndarray,
     height_m: float,
-    pose: np.ndarray,
+    pose: np.ndarray | Tensor,
     color: str,
     label: str | None = None,
 ) -> Axes:

@@ -157,10 +157,13 @@ function render({ model, el }) {
     for (const path of now.truth) add(svg, "polyline", { points: points(path), class: "truth" });
     trail = add(svg, "polyline", { class: "trail" });
     drawGoal(add(svg, "g", { class: "goal-layer" }));
+    if (now.planning) add(svg, "text", { x: 0, y: 40 - edge, class: "busy" }, "planning …");
     if (film) show(performance.now());
     else moveObject(now.object.pose);
     svg.dataset.answered = now.answered;
     svg.dataset.draft = now.draft;
+    svg.dataset.planning = now.planning;
+    svg.setAttribute("aria-busy", now.planning);
   }
 
   function show(time) {
@@ -207,8 +210,8 @@ function render({ model, el }) {
   svg.addEventListener("pointerdown", (event) => {
     if (event.button !== 0) return;
     svg.setPointerCapture(event.pointerId);
-    svg.focus();
-    pointed(event);
+    pointed(event); // before the table, when it has the focus, may be scrolled into view
+    svg.focus({ preventScroll: true });
     event.preventDefault();
   });
   svg.addEventListener("pointermove", (event) => {

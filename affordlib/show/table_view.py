@@ -56,6 +56,7 @@ def make_scene(
     answered: int,
     running: bool = False,
     draft: bool = False,
+    planning: bool = False,
 ) -> dict[str, Any]:
     """What `TableView` draws, in metres.
 
@@ -63,7 +64,8 @@ def make_scene(
     the yaw from which the goal's turn is counted; truth_xy_m: paths (n, 2) that the object has
     gone; half_width_m: of the view; limit_m: how far from the middle a goal may be asked for;
     answered: the number of the question that this answers; running: whether the robot is at work,
-    so that a film goes on; draft: whether a better plan will follow.
+    so that a film goes on; draft: whether a better plan will follow;
+    planning: whether one is being made.
 
     The shaded ring is where an object can be pushed towards any side: as far within the tool's
     reach as a push begins from the object.
@@ -98,6 +100,7 @@ def make_scene(
         "answered": answered,
         "running": running,
         "draft": draft,
+        "planning": planning,
     }
 
 
