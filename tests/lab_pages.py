@@ -191,7 +191,7 @@ class Table:
     def wait_for_answer(self):
         self.page.wait_for_function(
             "svg => Number(svg.dataset.answered) >= Number(svg.dataset.asked ?? 0)"
-            " && svg.dataset.draft === 'false'",
+            " && svg.dataset.draft === 'false' && svg.dataset.planning === 'false'",
             arg=self.svg.element_handle(),
         )
 

@@ -60,6 +60,25 @@ def test_click(page, table):
     assert_same_goal(page, table, 0.08, -0.11)
 
 
+def test_the_first_click_after_scrolling_lands_where_the_mouse_is(page, table):
+    table.svg.evaluate(
+        """svg => {
+            document.activeElement.blur();
+            svg.scrollIntoView({block: "start"});
+            let outer = svg.parentElement;
+            const scrolls = (e) => e.scrollHeight > e.clientHeight + 50;
+            while (outer && !scrolls(outer)) outer = outer.parentElement;
+            outer.scrollTop += svg.getBoundingClientRect().height / 2;
+        }"""
+    )
+    page.wait_for_timeout(300)
+    top = table.svg.bounding_box()["y"]
+    assert top < 60  # the upper half is out of sight
+    page.mouse.click(*table.at(0.1, -0.1))
+    assert_same_goal(page, table, 0.1, -0.1)
+    assert abs(table.svg.bounding_box()["y"] - top) < 2
+
+
 def test_drag(page, table):
     page.mouse.move(*table.at(0.08, -0.11))
     page.mouse.down()
@@ -245,7 +264,7 @@ def test_the_plan_follows_the_hand(page, table):
                 await until(() => Number(svg.dataset.answered) >= number);
                 first.push(performance.now() - began);
                 if (k % 4 == 3) {
-                    await until(() => svg.dataset.draft === 'false');
+                    await until(() => svg.dataset.draft + svg.dataset.planning === 'falsefalse');
                     refined.push(performance.now() - began);
                 }
             }
@@ -306,3 +325,22 @@ def test_no_request_leaves_the_machine(page, lab):
     assert hosts(page) == {urlparse(lab.address).netloc}
     assert any("ws" in urlparse(url).scheme for url in page.requests)
     assert page.locator("text=Would you like to get notified").count() == 0
+
+
+def test_run_waits_for_the_plan_of_what_is_shown(page, table):
+    """A slow planner, two clicks, and Run while it still thinks of the first."""
+    button(page, "Start over").click()
+    choose(page, "gradient")
+    table.wait_for_answer()
+    page.mouse.click(*table.at(0.12, 0.1))
+    page.wait_for_timeout(400)
+    page.mouse.click(*table.at(-0.1, 0.08))
+    page.wait_for_function("svg => svg.dataset.planning === 'true'", arg=table.svg.element_handle())
+    button(page, "Run").click()
+    wait_for_words(page, "the object rests")
+    assert ask(page, "list(picker.outcome.plan.goal.xy_m)") == pytest.approx([-0.1, 0.08], abs=2e-3)
+    assert ask(page, "picker.outcome.plan.planner").startswith("gradient")
+    np.testing.assert_allclose(table.goal(), ask(page, "list(picker._goal.xy_m)"), atol=1e-4)
+    choose(page, "continuous")
+    button(page, "Start over").click()
+    table.wait_for_answer()

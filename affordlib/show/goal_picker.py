@@ -167,7 +167,8 @@ class GoalPicker(Pictured, widgets.VBox):
         self._owed, self._asked = True, self._asked + 1
         if self._running:  # the executor is told of it after this action
             self._answered = self._view.asked[2]
-        self._show(planning=not self._running)
+        if self._running or self.draft is None:
+            self._show(planning=not self._running)
 
     def _follow(self, x_m: float, y_m: float) -> None:
         """Pick as the hand moves: a draft at once, where there is one, and the plan when it rests.
@@ -179,18 +180,20 @@ class GoalPicker(Pictured, widgets.VBox):
             return self._do(self._settle)
         number = self._asked
 
-        def follow() -> None:
-            if self._owed and number == self._asked and not self._running:
-                self._make_plan(self.draft)
-
         def rest() -> None:
             if number == self._asked:
                 self._do(self._settle, page_waits=True)
 
+        def follow() -> None:
+            if self._owed and number == self._asked and not self._running:
+                try:
+                    self._make_plan(self.draft)
+                finally:
+                    timer = threading.Timer(REST_S, rest)
+                    timer.daemon = True
+                    timer.start()
+
         self._do(follow)
-        timer = threading.Timer(REST_S, rest)
-        timer.daemon = True
-        timer.start()
 
     def _plan_anew(self) -> None:
         self._owed = True
@@ -203,7 +206,8 @@ class GoalPicker(Pictured, widgets.VBox):
 
     def _make_plan(self, draft: Planner | None = None) -> None:
         with self._alone:
-            self._show(planning=draft is None)
+            if draft is None:
+                self._show(planning=True)
             planner, plan = draft or self.planners[self.controls.planner.value], None
             goal, number = self._goal, self._view.asked[2]
             self._let_go()
