@@ -22,6 +22,12 @@ def repo_root() -> Path:
     return root
 
 
+def from_root(path: str | os.PathLike[str]) -> Path:
+    """Return a path; a relative one starts at the repository."""
+    path = Path(os.path.expanduser(path))
+    return path if path.is_absolute() else repo_root() / path
+
+
 def data_path(name: str) -> Path:
     """Return the path of a file or folder shipped in `data/`.
 
@@ -45,7 +51,7 @@ def resolve_out_dir(out_dir: str | os.PathLike[str]) -> Path:
     """
     if not isinstance(out_dir, str | os.PathLike) or not os.fspath(out_dir):
         raise ValueError(f"out_dir must name a folder, such as 'runs/lab', got {out_dir!r}")
-    path = repo_root() / os.path.expanduser(out_dir)
+    path = from_root(out_dir)
     try:
         path.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError):

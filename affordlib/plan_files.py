@@ -69,10 +69,14 @@ def _plan(data: dict[str, Any]) -> Plan:
         **data
         | {
             "goal": Goal(**goal),
-            "start_xy_m": _xy(data["start_xy_m"]),
-            "steps": tuple(_step(step) for step in data["steps"]),
+            "start_xy_m": tuple(data["start_xy_m"]),
+            "steps": _steps(data["steps"]),
         }
     )
+
+
+def _steps(steps: list[dict[str, Any]]) -> tuple[Step, ...]:
+    return tuple(_step(step) for step in steps)
 
 
 def _step(data: dict[str, Any]) -> Step:
@@ -82,7 +86,7 @@ def _step(data: dict[str, Any]) -> Step:
         **data
         | {
             "primitive": primitive_named(arguments.pop("name"))(**arguments),
-            "predicted_end_xy_m": _xy(data["predicted_end_xy_m"]),
+            "predicted_end_xy_m": tuple(data["predicted_end_xy_m"]),
             "predicted_path_xy_m": _path(data["predicted_path_xy_m"]),
             "path_xy_m": None if path is None else _path(path),
             "std_m": math.nan if data["std_m"] is None else float(data["std_m"]),
@@ -90,13 +94,8 @@ def _step(data: dict[str, Any]) -> Step:
     )
 
 
-def _xy(values: list[float]) -> tuple[float, float]:
-    x, y = (float(value) for value in values)
-    return x, y
-
-
 def _path(values: list[list[float]]) -> np.ndarray:
     path = np.array(values, dtype=float)
-    if path.ndim != 2 or path.shape[1] != 2:
+    if path.ndim != 2:
         raise ValueError(f"a path must be points (n, 2), got an array {path.shape}")
     return path

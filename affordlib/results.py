@@ -30,7 +30,7 @@ import pandas as pd
 
 import affordlib
 from affordlib.commands import command
-from affordlib.paths import repo_root, resolve_out_dir
+from affordlib.paths import from_root, resolve_out_dir
 
 # unit in the column's name: (unit shown, factor, digits); lengths are stored in metres
 UNITS = {
@@ -96,7 +96,7 @@ def read_results(path: str | os.PathLike[str]) -> dict[str, Any]:
 
     Raises FileNotFoundError if it is missing and ValueError if it is not such a file.
     """
-    path = repo_root() / path
+    path = from_root(path)
     if not path.is_file():
         raise FileNotFoundError(
             f"path: there are no results at {path}; run the notebook that writes them"
@@ -104,7 +104,7 @@ def read_results(path: str | os.PathLike[str]) -> dict[str, Any]:
     remedy = "; delete it and run its notebook again"
     try:
         document = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"path: {path} is not valid JSON ({error}){remedy}") from None
     keys = {"notebook": str, "parameters": dict, "versions": dict, "tables": dict}
     for key, kind in keys.items():

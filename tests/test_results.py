@@ -126,6 +126,7 @@ def test_a_kill_never_leaves_half_a_file(tmp_path):
         ),
         ('{"notebook": "a", "parameters": {}, "versions": {}}', "has no 'tables'"),
         ("[]", "has no 'notebook'"),
+        ("[" * 100_000, "is not valid JSON"),
         (
             '{"notebook": "a", "parameters": {}, "versions": {}, "tables": {"t": [{"a": [1]}]}}',
             "holds bad tables",
@@ -162,6 +163,17 @@ def test_relative_folders_start_at_the_repository(tmp_path, monkeypatch):
     assert paths.data_path("push.zarr.zip") == root / "data" / "push.zarr.zip"
     with pytest.raises(FileNotFoundError, match=r"'pull' is not in .*push\.zarr\.zip.*make data"):
         paths.data_path("pull")
+
+
+def test_what_is_named_by_an_absolute_path_needs_no_checkout(tmp_path, monkeypatch):
+    def apart():
+        raise FileNotFoundError("installed apart from its notebooks")
+
+    monkeypatch.setattr(paths, "repo_root", apart)
+    path = write_results(tmp_path, "x", {}, {"t": [{"a": 1}]})
+    assert read_results(path)["tables"] == {"t": [{"a": 1}]}
+    with pytest.raises(FileNotFoundError, match="installed apart"):
+        read_results("data/results/x.json")
 
 
 def test_repo_root_is_the_checkout():

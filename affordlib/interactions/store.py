@@ -180,7 +180,13 @@ def _read_manifest(place: Place) -> dict[str, dict[str, str]]:
             f"{place.url}: {MANIFEST} is not the one whose hash {DONE!r} holds, one of the two was "
             f"changed; {_REMEDY}"
         )
-    return json.loads(found[MANIFEST])
+    try:
+        manifest = json.loads(found[MANIFEST])
+        if all(isinstance(manifest[kind], dict) for kind in ("arrays", "files")):
+            return manifest
+    except (KeyError, TypeError, ValueError, RecursionError):
+        pass
+    raise CorruptedDataError(f"{place.url}: {MANIFEST} does not list a data set; {_REMEDY}")
 
 
 def stored_sha256(name_or_path: str | Path) -> str:
@@ -194,12 +200,16 @@ def open_interactions(name_or_path: str | Path) -> xr.Dataset:
     Dimensions: interaction, sample, action_channel, effect_channel, image_channel, row, column.
     Raises FileNotFoundError, or CorruptedDataError naming what is damaged.
     """
-    files = _read_checked(_resolve(name_or_path))
+    place = _resolve(name_or_path)
+    files = _read_checked(place)
     store = MemoryStore(
         {name: Buffer.from_bytes(files[name]) for name in files if not is_record(name)}
     )
-    with xr.open_zarr(store, consolidated=False, zarr_format=3) as data:
-        return data[sorted(data.data_vars)].load()
+    try:
+        with xr.open_zarr(store, consolidated=False, zarr_format=3) as data:
+            return data[sorted(data.data_vars)].load()
+    except Exception as error:
+        raise CorruptedDataError(f"{place.url} holds no data set ({error}); {_REMEDY}") from error
 
 
 def _read_checked(place: Place) -> dict[str, bytes]:
