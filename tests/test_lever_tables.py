@@ -25,7 +25,6 @@ from affordlib.models.lever import (
 )
 from affordlib.models.make_checkpoints import shipped_lever_model
 from affordlib.paths import repo_root
-from affordlib.results import read_results
 
 
 def test_baselines_are_right_about_what_they_assume():
@@ -143,38 +142,6 @@ def test_shapes_never_seen_stand_beside_the_same_shapes_when_they_are_known():
     assert {row["n"] for row in lever_tables.error_rows([known, strange])} == {3}  # the folds only
 
 
-@pytest.fixture(scope="module")
-def committed():
-    return read_results(repo_root() / "data" / "results" / "lever_up.json")["tables"]
-
-
-def test_committed_tables_have_their_columns(committed):
-    for row in committed["lever_up"]:
-        assert {"model", "protocol", "steps", "folds", "mean_cm", "sem_cm"} <= row.keys()
-    found = {(row["model"], row["protocol"]) for row in committed["lever_up"]}
-    assert found == {(model, protocol) for model in lever_up.MODELS for protocol in PROTOCOLS}
-    assert min(row["folds"] for row in committed["lever_up"]) >= 3
-
-
-def test_committed_science(committed):
-    def window(model):
-        rows = [
-            r for r in committed["lever_up"] if (r["model"], r["protocol"]) == (model, "window")
-        ]
-        return [row["mean_cm"] for row in sorted(rows, key=lambda row: row["steps"])]
-
-    ours = window("anchored")
-    assert all(a <= b for a, b in zip(ours, (0.34, 0.35, 0.36, 0.38, 0.39), strict=True))
-    for model in ("persistence", "constant_velocity", "paper"):
-        assert all(a < b for a, b in zip(ours, window(model), strict=True))
-    single, recurrent = window("anchored_single"), window("lstm_tuned")
-    assert all(a < b for a, b in zip(single, ours, strict=True))
-    assert [a < b for a, b in zip(single, recurrent, strict=True)] == [False] + 4 * [True]
-    units = [LeverUnit(model, "window") for model in ("anchored_single", "lstm_tuned")]
-    hashes = [lever_up.hashes(unit) for unit in (*units, LeverUnit("anchored"))]
-    assert len({told["configuration_sha256"] for told in hashes}) == 3
-
-
 def test_a_setting_changes_what_it_says():
     for name, _ in TRAINED:
         ours = LEVER_MODELS[name]
@@ -184,24 +151,6 @@ def test_a_setting_changes_what_it_says():
         assert changed(ours, "rate 0.004").training.learning_rate == 4e-3
         assert all(a != b for k, a in enumerate(others) for b in [first, *others[:k]])
         assert ours in others
-
-
-def test_both_networks_had_the_same_budget_of_tuning(committed):
-    rows = {(r["model"], r["trained_for"], r["setting"]): r for r in committed["tuning"]}
-    assert list(rows) == [(*trained, setting) for trained in TRAINED for setting in SETTINGS]
-    assert {row["steps"] for row in rows.values()} == {1000}
-    assert len({row["n"] for row in rows.values()}) == 1
-    for name in {name for name, _ in TRAINED}:
-        errors = {
-            setting: sum(
-                (row.get("window_mean_m") or 0) + (row.get("beginning_mean_m") or 0) / 3
-                for (model, _, of), row in rows.items()
-                if (model, of) == (name, setting)
-            )
-            for setting in SETTINGS
-        }
-        taken = {of for (model, _, of), row in rows.items() if model == name and row["taken"]}
-        assert taken == {min(errors, key=errors.get)}
 
 
 def test_the_shipped_network_stands_for_its_own_training_only():

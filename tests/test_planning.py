@@ -290,7 +290,7 @@ def test_a_plan_is_carried_out(world, trained):
     goal = Goal((0.15, 0.0))
     outcome = carry_out(world, plan_astar(trained, world.look(), start, goal))
     assert outcome.distance_m == pytest.approx(goal.distance_m(world.object_pose()[:2]))
-    assert outcome.distance_m < 0.03
+    assert outcome.distance_m < goal.tolerance_m + 0.005  # 15 mm: A* is content within 2 cm
     assert len(outcome.object_paths_xy_m) == len(outcome.plan.steps) == 2
     np.testing.assert_allclose(
         outcome.object_paths_xy_m[0][-1], outcome.object_paths_xy_m[1][0], atol=1e-4
@@ -328,6 +328,7 @@ def test_the_shipped_model_reaches_goals(world, trained):
     records = [outcome_record(t, o) for t, o in zip(tasks, outcomes, strict=True)]
     rows = planning_rows(records, planner="astar", model="paper")
     assert [r["n"] for r in rows if r["object_class"] == "all"] == [6, 6]
+    # 20 and 19 mm of goals that A* counts as reached within 20 mm.
     assert all(r["mean_m"] < 0.03 for r in rows if r["object_class"] == "all")
     assert {r["object_class"] for r in rows} == {"all", "standing", "cuboid", "upright_cylinder"}
     for task in tasks:
@@ -346,7 +347,7 @@ def test_the_continuous_planner_comes_within_millimetres(world, film):
 
     open_loop = [o.distance_m for o in measure(world, tasks, continuous)]
     closed = [o.distance_m for o in measure(world, tasks, continuous, corrections=2)]
-    assert np.mean(open_loop) < 0.006
+    assert np.mean(open_loop) < 0.003  # 1.1 mm
     assert np.mean(closed) < min(0.002, np.mean(open_loop))
 
 

@@ -16,8 +16,6 @@ from affordlib.interactions import TrainingArrays, open_interactions, split_inte
 from affordlib.interactions.batches import observe_action, sample_batch
 from affordlib.models.frame import heading
 from affordlib.models.rollability import learn_rollability
-from affordlib.paths import repo_root
-from affordlib.results import read_results
 from affordlib.types import Prediction
 from affordlib.world import LyingCylinder, UprightCylinder
 
@@ -202,44 +200,6 @@ def test_what_decides_a_study_decides_its_hash(name, module, what, other, monkey
     now = {**getattr(module, what), **other} if isinstance(other, dict) else other
     monkeypatch.setattr(module, what, now)
     assert studies.hashes(name)["settings_sha256"] != before["settings_sha256"]
-
-
-def test_the_committed_studies_tell_the_story():
-    told = read_results(repo_root() / "data" / "results" / "effect_prediction.json")["tables"]
-    left_out = {row["change"]: row["final_error_mean_m"] for row in told["ablation"]}
-    for change in ("no image", "table frame", "metres, not standardised"):
-        assert left_out[change] > 1.5 * left_out["nothing"]
-    steps = {row["added"]: row["final_error_mean_m"] for row in told["waterfall"]}
-    assert list(steps) == ["nothing", *ablation.LADDER]
-    assert steps["nothing"] > 10 * left_out["nothing"]
-    assert list(steps.values())[-1] == pytest.approx(left_out["nothing"], rel=0.01)
-    held_out = [r for r in told["rollability"] if r["test"] in ("mixed", "partial")]
-    shares = [(r["learned_percent"], r["n"]) for r in held_out if r["object_class"] == "all"]
-    assert sum(share * n for share, n in shares) / sum(n for _, n in shares) >= 98
-    more = {
-        (r["primitive"], r["effect"], r["test"]): r
-        for r in told["one_for_all"]
-        if r["model"] == one_for_all.ONE_FOR_ALL
-    }
-    assert 0 < more["push", "x, y", "push_test"]["more_mean_m"] < 0.0005
-    assert 0 < more["drag", "x, y", "folds"]["more_mean_m"] < 0.0005
-    grasp = more["grasp", "z", "folds"]
-    assert grasp["more_mean_m"] < 2 * grasp["more_sem_m"]
-    effect, action = (
-        next(r for r in told["latent"] if r["model"] == "push_cnp" and r["observed"] == kind)
-        for kind in ("effect", "action")
-    )
-    assert effect["cka_action_effect"] > 0.9  # one affordance, told by either
-    assert effect["cosine_to_action"] > effect["cosine_to_other"] + 0.2
-    assert action["action_start_mean_m"] < 0.01
-
-
-def test_our_networks_are_as_likely_as_the_package_s():
-    told = read_results(repo_root() / "data" / "results" / "neural_processes.json")["tables"]
-    for row in told["difference"]:
-        assert row["log_likelihood_gain_mean"] > -2 * row["log_likelihood_gain_sem"]
-    *networks, bound = told["log_likelihood"]
-    assert all(r["log_likelihood_mean"] < bound["log_likelihood_mean"] for r in networks)
 
 
 # What bounds a prediction
