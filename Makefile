@@ -114,10 +114,10 @@ bench: $(STAMP) ## Run the benchmarks (KEEP=1 puts the times into data/results/s
 	 done
 
 data: $(STAMP) ## Collect the shipped data sets again and compare
-	@$(PY) -m affordlib.interactions.make_data
+	@$(PY) -m experiments.make_data
 
 checkpoints: $(STAMP) ## Train the shipped models again (ONLY="push_film")
-	@$(if $(ONLY),,$(PY) -m affordlib.planning.make_reachability)
+	@$(if $(ONLY),,$(PY) -m experiments.make_reachability)
 	@$(PY) -m affordlib.models.make_checkpoints $(if $(ONLY),--only $(ONLY))
 
 notebooks: $(STAMP) ## Execute the committed notebooks in place and clean them (ONLY= FORCE=1)

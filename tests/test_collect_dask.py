@@ -14,11 +14,12 @@ from pathlib import Path
 import pytest
 
 import affordlib
-from affordlib.interactions import CorruptedDataError, collect, make_data
+from affordlib.interactions import CorruptedDataError, collect
 from affordlib.interactions.collect import collect as collect_set
 from affordlib.interactions.places import Place
 from affordlib.interactions.recipes import Recipe
 from affordlib.interactions.store import dataset_sha256, open_interactions, stored_sha256
+from experiments import make_data
 
 SMALL = Recipe(n_interactions=6, seed=11)
 LONGER = Recipe(n_interactions=12, seed=5)

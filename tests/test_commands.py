@@ -12,13 +12,14 @@ from affordlib.paths import repo_root
 
 ALL = {
     path.relative_to(repo_root()).with_suffix("").as_posix().replace("/", ".")
-    for path in (repo_root() / "affordlib").rglob("*.py")
-    if "\nif __name__" in path.read_text()
+    for folder in ("affordlib", "experiments")
+    for path in (repo_root() / folder).rglob("*.py")
+    if "ArgumentParser" in path.read_text() and "\nif __name__" in path.read_text()
 }
 
 
 def main_of(name):
-    return importlib.import_module(f"affordlib.{name}").main
+    return importlib.import_module(name if name in ALL else f"affordlib.{name}").main
 
 
 @pytest.mark.parametrize(
@@ -42,20 +43,20 @@ def main_of(name):
         ("evaluation.closed_loop", ["--tables", "nope"], "--tables: 'nope' is unknown"),
         ("evaluation.closed_loop", ["--seed", "-1"], "--seed: must be a whole number from 0"),
         ("evaluation.closed_loop", ["--n", "0"], "--n: must be a whole number from 1"),
-        ("evaluation.whole_plans", ["--n", "-1"], "--n: must be a whole number from 1"),
+        ("experiments.whole_plans", ["--n", "-1"], "--n: must be a whole number from 1"),
         ("evaluation.goals", ["--seed", str(2**32)], "--seed: must be a whole number from 0"),
         ("evaluation.lever_up", ["--models", ""], "--models: '' is unknown"),
         ("evaluation.lever_up", ["--protocols", "nope"], "--protocols: 'nope' is unknown"),
         ("evaluation.lever_up", ["--no-edges", "2"], "--no-edges: must be .* from 3 to 8"),
         ("evaluation.lever_up", ["--epochs", "-5"], "--epochs: must be a whole number from 1"),
-        ("interactions.make_data", ["--only"], "--only: expected at least one argument"),
-        ("interactions.make_data", ["--only", "nope"], "--only: invalid choice: 'nope'"),
+        ("experiments.make_data", ["--only"], "--only: expected at least one argument"),
+        ("experiments.make_data", ["--only", "nope"], "--only: invalid choice: 'nope'"),
         (
-            "interactions.make_data",
+            "experiments.make_data",
             ["--workers", "1" * 5000],
             "--workers: must be .*'1{5,40}$",
         ),
-        ("planning.make_reachability", ["nope"], "unrecognized arguments: nope"),
+        ("experiments.make_reachability", ["nope"], "unrecognized arguments: nope"),
         ("seeds", ["-1"], "seeds: must be a whole number from 0"),
         ("seeds", ["0", "--workers", "0"], "--workers: must be a whole number from 1"),
         ("workbook", ["--seed", "-1"], "--seed: must be a whole number from 0"),
@@ -76,7 +77,7 @@ def test_unknown_names_and_impossible_numbers_are_refused(capsys, name, argument
         ("evaluation.tables", ["--parts", "{}"]),
         ("evaluation.lever_tables", ["--parts", "{}"]),
         ("evaluation.lever_up", ["--models", "persistence", "--folds", "1", "--out", "{}"]),
-        ("interactions.make_data", ["--only", "grasp", "--workers", "1", "--to", "{}"]),
+        ("experiments.make_data", ["--only", "grasp", "--workers", "1", "--to", "{}"]),
     ],
 )
 def test_a_file_in_place_of_a_folder_is_named(tmp_path, capsys, name, arguments):

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from affordlib.evaluation import whole_plans
 from affordlib.paths import repo_root
 from affordlib.results import read_results
+from experiments import whole_plans
 
 
 def test_rows_are_told_for_each_planner_and_class():

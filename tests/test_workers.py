@@ -111,7 +111,7 @@ def test_ctrl_c_ends_collecting_with_one_error(tmp_path):
 
 def test_make_data_is_ended_with_one_line(tmp_path):
     arguments = ["--only", "push", "--to", tmp_path, "--workers", "2"]
-    process = start("-m", "affordlib.interactions.make_data", *arguments)
+    process = start("-m", "experiments.make_data", *arguments)
     family = []
 
     def at_work():

@@ -7,24 +7,20 @@ lists, one entry an interaction, so that they can be stored as they are.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
+import xarray as xr
 
 from affordlib.evaluation.baselines import Forecast, features, logistic
 from affordlib.interactions import TrainingArrays
 from affordlib.interactions.batches import believable, observe_action, plane_of
 from affordlib.models.calibration import LEVELS, coverage
-from affordlib.models.network import gaussian_nll
+from affordlib.models.ensemble import Ensemble
+from affordlib.models.network import EffectNetwork, gaussian_nll
 from affordlib.primitives import Grasp
 from affordlib.world.objects import FAMILIES
-
-if TYPE_CHECKING:
-    import xarray as xr
-
-    from affordlib.models.ensemble import Ensemble
-    from affordlib.models.network import EffectNetwork
 
 EVERY = 12
 """Every twelfth sample is one of the paper's 25 steps of 150 ms."""

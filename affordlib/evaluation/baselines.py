@@ -14,20 +14,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+import xarray as xr
 from torch import Tensor
 
-from affordlib.interactions.batches import observe_action, plane_of, turn
+from affordlib.interactions.batches import TrainingArrays, observe_action, plane_of, turn
 from affordlib.models.frame import heading, inverse, turn_prediction
 from affordlib.types import Prediction
-
-if TYPE_CHECKING:
-    import xarray as xr
-
-    from affordlib.interactions.batches import TrainingArrays
 
 Forecast = tuple[Tensor, Tensor]
 """Mean and σ (N, T, C) of the effect at some samples."""

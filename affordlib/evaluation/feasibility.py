@@ -8,8 +8,8 @@ there. Turning the wrist costs nothing, so all that counts is how far the tool i
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,9 +18,6 @@ from affordlib.primitives import HOVER_M, TIP_HEIGHT_M, Drag, Push
 from affordlib.world import UnreachableError, robot
 from affordlib.world.execution import RETREAT_M
 from affordlib.world.motion import HOVER_HEIGHT_M
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
 
 BAND_M = 0.01
 """How near to the rim of what can be reached a goal is not judged, but reported apart."""

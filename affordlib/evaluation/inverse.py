@@ -9,19 +9,17 @@ where it should.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
+import xarray as xr
 
 from affordlib.interactions.batches import TrainingArrays, believable
 from affordlib.interactions.recipes import Recipe, draw_scene, draw_world
 from affordlib.models.protocol import EffectModel, observe_final_effect
 from affordlib.primitives import Push, wrap_angle
 from affordlib.world import Tabletop
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 
 @torch.no_grad()

@@ -23,10 +23,12 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
+import xarray as xr
+from torch import Tensor
 
 from affordlib.commands import command, count_type, names_type, whole_type
 from affordlib.evaluation.parts import (
@@ -36,7 +38,7 @@ from affordlib.evaluation.parts import (
     run_parts,
     sha256_of,
 )
-from affordlib.interactions import Normaliser, Split, split_interactions
+from affordlib.interactions import Normaliser, Split, TrainingArrays, split_interactions
 from affordlib.interactions.batches import believable
 from affordlib.interactions.lever import AHEAD, POSE_CHANNELS, SEEN, lever_arrays, n_windows
 from affordlib.interactions.recipes import Recipe, draw_scene
@@ -46,6 +48,7 @@ from affordlib.models.lever import (
     LEVER_MODELS,
     PROTOCOLS,
     TRAINED_FOR,
+    LeverModel,
     errors_m,
     foresee,
     train_lever_model,
@@ -57,16 +60,9 @@ from affordlib.models.lstm_published import (
     train_published,
 )
 from affordlib.models.make_checkpoints import shipped_lever_model
+from affordlib.models.network import EffectNetwork
 from affordlib.results import write_text_atomically
 from affordlib.types import Prediction
-
-if TYPE_CHECKING:
-    import xarray as xr
-    from torch import Tensor
-
-    from affordlib.interactions import TrainingArrays
-    from affordlib.models.lever import LeverModel
-    from affordlib.models.network import EffectNetwork
 
 FORMAT = 1
 """Counts the changes of code that change a unit's numbers without changing its configuration."""

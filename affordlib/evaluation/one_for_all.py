@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,12 +29,10 @@ from affordlib.interactions.batches import Symmetry, observe_action, symmetric_c
 from affordlib.models.checkpoint import build
 from affordlib.models.film import FiLMConfig
 from affordlib.models.make_checkpoints import SHIPPED
+from affordlib.models.network import EffectNetwork
 from affordlib.models.training import train
 from affordlib.paths import resolve_out_dir
 from affordlib.primitives import Grasp
-
-if TYPE_CHECKING:
-    from affordlib.models.network import EffectNetwork
 
 PRIMITIVES = ("push", "drag", "grasp", "rotate")
 NETWORK = FiLMConfig(

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from affordlib.planning.effect_map import EffectMap, map_effects, phases_of, splines_through
+from affordlib.primitives import Drag, Push
 from affordlib.types import Observations, Prediction
-
-if TYPE_CHECKING:
-    from affordlib.primitives import Drag, Push
-    from affordlib.world import Tabletop, Thing, WorldConfig
+from affordlib.world import Tabletop, Thing, WorldConfig
 
 N_DIRECTIONS, PHASE_STEP = 36, 0.025
 _STD_M = 1e-5

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
+
+import numpy as np
 
 from affordlib.evaluation.goals import FAMILIES, ROLLABLE, STANDING
 from affordlib.evaluation.oracle import oracle_effects
@@ -13,12 +15,8 @@ from affordlib.models.checkpoint import checkpoint_sha256, load_checkpoint
 from affordlib.planning import Repertoire, plan_astar, plan_continuous, plan_gradient
 from affordlib.planning.modes import PlanMode, mode_named
 from affordlib.primitives import Drag, Push
+from affordlib.types import Goal, Plan
 from affordlib.world import Tabletop, WorldConfig
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from affordlib.types import Goal, Plan
 
 T = TypeVar("T")
 

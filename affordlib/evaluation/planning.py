@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -33,11 +33,8 @@ from affordlib.evaluation.planners import VARIANTS
 from affordlib.paths import repo_root
 from affordlib.planning import PlanMode, carry_out
 from affordlib.results import write_results, write_text_atomically
-from affordlib.types import Outcome, Plan
+from affordlib.types import Goal, Outcome, Plan
 from affordlib.world import Tabletop, UnreachableError
-
-if TYPE_CHECKING:
-    from affordlib.types import Goal
 
 NUDGE_M, NUDGE_RAD = 0.001, math.radians(1.0)
 PARTS = "data/results/parts/planning"

@@ -5,10 +5,8 @@ In its own simulator, with its own objects, gripper and data, so it is context a
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
+from collections.abc import Iterable
+from typing import Any
 
 LEVER_UP_CM = {
     "reported": (0.340, 0.352, 0.364, 0.375, 0.387),

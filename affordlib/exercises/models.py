@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -13,9 +13,6 @@ from affordlib.exercises.checking import Exercise, asked
 from affordlib.interactions import TrainingArrays, open_interactions, split_interactions
 from affordlib.interactions.batches import observe_action
 from affordlib.models import coverage, load_checkpoint
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 # 03 The affordance network
 

@@ -3,27 +3,22 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 
 from affordlib.exercises.checking import Exercise, answered, asked
 from affordlib.models import load_checkpoint
-from affordlib.planning import map_effects, plan_continuous
+from affordlib.perception import Percept
+from affordlib.planning import EffectMap, map_effects, plan_continuous
 from affordlib.planning.poses import foresee_course
 from affordlib.planning.steps import roll_out
 from affordlib.primitives import Grasp, Push
-from affordlib.types import Goal
+from affordlib.types import Goal, Plan, Step
 from affordlib.world import Cuboid, Prism, Tabletop, UprightCylinder
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from affordlib.perception import Percept
-    from affordlib.planning import EffectMap
-    from affordlib.types import Plan, Step
 
 BOX = Cuboid(length=0.07, width=0.05, height=0.05)
 YAW_RAD = 0.3

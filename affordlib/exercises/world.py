@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,9 +11,6 @@ from affordlib.exercises.checking import Exercise, asked
 from affordlib.interactions import open_interactions
 from affordlib.primitives import DURATION_S, Push
 from affordlib.world import FAMILIES, Cuboid, Tabletop
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 # 01 The tabletop
 

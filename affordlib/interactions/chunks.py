@@ -9,17 +9,14 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
+import numpy as np
 import zarr
+from zarr.buffer.cpu import Buffer
 from zarr.codecs import BloscCodec, Crc32cCodec
 from zarr.storage import MemoryStore
 
-if TYPE_CHECKING:
-    import numpy as np
-    from zarr.buffer.cpu import Buffer
-
-    from affordlib.interactions.places import Place
+from affordlib.interactions.places import Place
 
 CHUNK = 50
 """Interactions in one stored chunk, and in one task of collecting."""

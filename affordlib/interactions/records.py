@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import fields
 from importlib import metadata
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,14 +16,11 @@ from affordlib.types import (
     IMAGE_CHANNELS,
     IMAGE_PIXELS,
     LEVER_IMAGE_PIXELS,
+    Interaction,
 )
-from affordlib.world import FAMILIES, Tabletop
+from affordlib.world import FAMILIES, Tabletop, Thing, WorldConfig
 from affordlib.world.execution import RECORDED_SAMPLES
 from affordlib.world.scene import N_SAMPLES
-
-if TYPE_CHECKING:
-    from affordlib.types import Interaction
-    from affordlib.world import Thing, WorldConfig
 
 GRAIN = 2.0**-20
 """About 1 µm or 1 µrad: what is smaller in a float32 is not kept."""

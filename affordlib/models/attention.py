@@ -10,7 +10,6 @@ ICLR 2019.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 import torch.nn.functional as F
@@ -18,12 +17,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from affordlib import checked
+from affordlib.interactions.batches import Normaliser
 from affordlib.models.film import CircularHarmonics, dense, split_outputs, waves
 from affordlib.models.network import EffectNetwork, NetworkConfig, he_initialise, with_time
 from affordlib.types import Observations
-
-if TYPE_CHECKING:
-    from affordlib.interactions.batches import Normaliser
 
 
 @checked

@@ -15,7 +15,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import torch
 import torch.nn.functional as F
@@ -23,6 +22,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from affordlib import checked
+from affordlib.interactions.batches import Normaliser
 from affordlib.models.network import (
     EffectNetwork,
     NetworkConfig,
@@ -31,9 +31,6 @@ from affordlib.models.network import (
     with_time,
 )
 from affordlib.types import IMAGE_PIXELS, Observations
-
-if TYPE_CHECKING:
-    from affordlib.interactions.batches import Normaliser
 
 FEW_HEADINGS = 32
 """From this many turns of one image on, its basis pays."""

@@ -17,7 +17,6 @@ import time
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
 import torch.nn.functional as F
@@ -26,15 +25,13 @@ from torch import Tensor, nn
 
 from affordlib import checked
 from affordlib.interactions import Normaliser
+from affordlib.interactions.batches import TrainingArrays
 from affordlib.interactions.lever import SEEN
 from affordlib.models.lever import beginning_errors_m, window_errors_m
 from affordlib.models.lstm import Known, on_grid
 from affordlib.models.network import EffectNetwork, NetworkConfig, with_time
 from affordlib.models.weight_files import load_state, save_state
 from affordlib.types import LEVER_IMAGE_PIXELS, Observations
-
-if TYPE_CHECKING:
-    from affordlib.interactions.batches import TrainingArrays
 
 CONVOLUTION_WIDTHS = (32, 64, 128, 256)
 DENSE, HIDDEN = 4096, 256

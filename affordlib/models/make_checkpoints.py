@@ -6,14 +6,17 @@ import argparse
 import math
 import sys
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import torch
+import xarray as xr
+from torch import Tensor
 
 from affordlib.commands import command
 from affordlib.interactions import (
     Normaliser,
+    Split,
     TrainingArrays,
     open_interactions,
     split_interactions,
@@ -41,18 +44,9 @@ from affordlib.models.lever import (
     train_lever_model,
 )
 from affordlib.models.lstm import LSTMConfig, LSTMNetwork
-from affordlib.models.training import TrainingConfig, TrainingRecord, final_errors_m, train
+from affordlib.models.network import EffectNetwork, NetworkConfig
+from affordlib.models.training import Draw, TrainingConfig, TrainingRecord, final_errors_m, train
 from affordlib.paths import repo_root
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    import xarray as xr
-    from torch import Tensor
-
-    from affordlib.interactions import Split
-    from affordlib.models.network import EffectNetwork, NetworkConfig
-    from affordlib.models.training import Draw
 
 
 @dataclass(frozen=True)
@@ -271,7 +265,7 @@ def main() -> int:
         print(
             "Collect what is missing (push_x10 in five to ten minutes of two cores, others faster) "
             "and try again:\n"
-            f"  .venv/bin/python -m affordlib.interactions.make_data --only {chosen} --to data"
+            f"  .venv/bin/python -m experiments.make_data --only {chosen} --to data"
         )
     return 1 if missing else 0
 

@@ -7,17 +7,14 @@ in any number of directions without being interpolated.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+import xarray as xr
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from affordlib.models.film import CircularHarmonics, dense
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 
 class Rollability(nn.Module):

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import Any
 
 import ipywidgets as widgets
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from affordlib.types import Goal
+from affordlib.types import Goal
 
 
 class PickerControls:

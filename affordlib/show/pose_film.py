@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import itertools
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from affordlib.world import Tabletop
-    from affordlib.world.motion import Film
+from affordlib.world import Tabletop
+from affordlib.world.motion import Film
 
 EVERY = 12
 """Simulation steps (1/240 s) between two poses."""

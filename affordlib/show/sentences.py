@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 from affordlib.primitives import wrap_angle
-
-if TYPE_CHECKING:
-    from affordlib.types import Goal, Outcome, Plan, Step
+from affordlib.types import Goal, Outcome, Plan, Step
 
 
 def step_in_words(step: Step) -> str:

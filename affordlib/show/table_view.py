@@ -6,8 +6,9 @@ Everything it needs is in this package; nothing is fetched from anywhere.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import anywidget
 import numpy as np
@@ -15,14 +16,8 @@ import traitlets
 
 from affordlib.show.plots import ENLARGED
 from affordlib.show.sentences import step_in_words
-from affordlib.types import TABLE_X_M, TABLE_Y_M
-from affordlib.world import BASE_X_M, REACH_M
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from affordlib.types import Goal, Step
-    from affordlib.world import Thing
+from affordlib.types import TABLE_X_M, TABLE_Y_M, Goal, Step
+from affordlib.world import BASE_X_M, REACH_M, Thing
 
 PUSH_RUN_UP_M = 0.2
 _HERE = Path(__file__).parent

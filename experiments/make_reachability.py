@@ -1,4 +1,4 @@
-"""`python -m affordlib.planning.make_reachability`: learn the shipped reachability again."""
+"""`python -m experiments.make_reachability`: learn the shipped reachability again."""
 
 from __future__ import annotations
 

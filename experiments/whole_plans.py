@@ -1,6 +1,6 @@
 """Plans with an orientation or a height in them, made from one look and carried out as they are.
 
-    python -m affordlib.evaluation.whole_plans
+    python -m experiments.whole_plans
 
 The goals are those of the tables `orientation` and `height` of `closed_loop`, where the robot looks
 after every action; here it looks once, before all of them, and then only for where to act. A plan
@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import argparse
 import sys
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from tqdm.auto import tqdm
@@ -26,9 +27,6 @@ from affordlib.planning.repertoire import CHECKPOINTS
 from affordlib.primitives import wrap_angle
 from affordlib.results import write_results
 from affordlib.world import Tabletop, UnreachableError
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 PLANNERS = {"astar": plan_astar, "continuous": plan_continuous}
 WITHIN = {"orientation": ("rad", WITHIN_TURN_RAD), "height": ("m", WITHIN_HEIGHT_M)}
@@ -104,7 +102,7 @@ def made_with() -> dict[str, dict[str, str]]:
 def main(argv: Sequence[str] | None = None) -> int:
     """Make and carry out the plans, and write the table; ten minutes."""
     parser = argparse.ArgumentParser(
-        prog="python -m affordlib.evaluation.whole_plans", description=main.__doc__
+        prog="python -m experiments.whole_plans", description=main.__doc__
     )
     parser.add_argument("--n", type=count_type, help="trials of each kind of goal (default: all)")
     parser.add_argument("--out", default="data/results")
