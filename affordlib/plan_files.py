@@ -30,11 +30,20 @@ def save_plan(path: str | os.PathLike[str], plan: Plan) -> Path:
     return path
 
 
+def plan_file(folder: Path, name: str) -> Path:
+    """The file of a plan's name in a folder; raises ValueError for a name that leads elsewhere."""
+    if not name or name in (".", "..") or Path(name).name != name or "\\" in name:
+        raise ValueError(f"name must be a plain file name such as plan.json, got {name!r}")
+    return folder / name
+
+
 def load_plan(path: str | os.PathLike[str]) -> Plan:
     """Return the plan that `save_plan` wrote.
 
-    Raises ValueError, naming the file and what is wrong in it, if it holds no plan.
+    Raises FileNotFoundError, or ValueError naming the file and what is wrong in it.
     """
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"there is no plan {path}")
     try:
         return _plan(json.loads(Path(path).read_text(encoding="utf-8")))
     except (

