@@ -35,7 +35,7 @@ unexport PYTHONPATH PYTHONHOME PYTHONSTARTUP VIRTUAL_ENV MPLBACKEND
 unexport PIP_USER PIP_TARGET PIP_PREFIX PIP_REQUIREMENT PIP_CONSTRAINT
 unexport PYTEST_ADDOPTS JUPYTER_PATH JUPYTER_TOKEN
 
-.PHONY: help setup workbook seeds lab test test-fast test-slow soak lint format bench data checkpoints notebooks html tables \
+.PHONY: help setup workbook seeds lab test test-fast test-plain test-slow soak lint format bench data checkpoints notebooks html tables \
         constraints clean
 
 help: ## List the targets
@@ -85,13 +85,18 @@ lab: $(STAMP) ## Open the book in JupyterLab, on this machine only
 	  --ServerApp.root_dir="$(CURDIR)" --LabApp.default_url=/lab/tree/notebooks/00_start_here.ipynb
 
 # On one thread: tests are many small sums, and share their machine with browsers and clusters.
-test test-fast: export OMP_NUM_THREADS := 1
+test test-fast test-plain: export OMP_NUM_THREADS := 1
 
 test: $(STAMP) ## Run all tests, notebooks included (JOBS=2 side by side)
 	@$(PY) -m pytest -n "$(JOBS)" --dist loadfile
 
 test-fast: $(STAMP) ## Run the tests that take seconds, without the notebooks
 	@$(PY) -m pytest -n "$(JOBS)" --dist worksteal -m "not slow"
+
+test-plain: $(STAMP) ## The same without the processor's vector instructions, as another processor sums
+	@ATEN_CPU_CAPABILITY=default $(if $(filter x86_64,$(shell uname -m)),OPENBLAS_CORETYPE=Nehalem) \
+	  NPY_DISABLE_CPU_FEATURES="$$($(PY) -c 'import numpy._core._multiarray_umath as m; print(*(f for f in m.__cpu_dispatch__ if m.__cpu_features__[f]))')" \
+	  $(PY) -m pytest -n "$(JOBS)" --dist worksteal -m "not slow"
 
 test-slow: $(STAMP) ## Run every notebook and solution as the reader does; the log is runs/test-slow.log
 	@mkdir -p runs; { $(PY) -m affordlib.workbook --profile reader --out test-slow --force; \

@@ -62,8 +62,10 @@ class TrainingConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("steps", "batch_size", "n_targets", "obs_max", "validate_every", "patience"):
+        for name in ("steps", "validate_every", "patience"):
             check_count(name, getattr(self, name))
+        for name in ("batch_size", "n_targets", "obs_max"):
+            check_count(name, getattr(self, name), 1, 100_000)
         check_count("seed", self.seed, 0, 2**63 - 1)
         check_field(self, "learning_rate", 1e-7, 1.0)
         check_field(self, "weight_decay", 0.0, 10.0)
@@ -332,9 +334,10 @@ def train_literal(
     With validation interactions it stops early, after `patience` validations without a smaller
     final error, and the model ends with the weights of the smallest.
     """
-    for name, count in (("iterations", iterations), ("obs_max", obs_max), ("patience", patience)):
-        check_count(name, count)
+    check_count("iterations", iterations)
+    check_count("obs_max", obs_max, 1, 100_000)
     check_count("validate_every", validate_every)
+    check_count("patience", patience)
     check_within("learning_rate", learning_rate, 1e-7, 1.0)
     generator = torch.Generator().manual_seed(check_count("seed", seed, 0, 2**63 - 1))
     optimiser = torch.optim.Adam(model.parameters(), lr=learning_rate)
