@@ -141,5 +141,5 @@ constraints: $(STAMP) ## Write constraints.txt from what is installed
 	@mv constraints.txt.tmp constraints.txt
 
 clean: ## Remove runs/, caches and build leftovers; .venv stays
-	@rm -rf runs build dist *.egg-info .pytest_cache .ruff_cache notebooks/.ipynb_checkpoints
+	@rm -rf runs build dist *.egg-info .pytest_cache .ruff_cache .hypothesis notebooks/.ipynb_checkpoints
 	@find affordlib tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +
