@@ -14,7 +14,7 @@ from affordlib.evaluation.goals import (
     uniform_tasks,
 )
 from affordlib.evaluation.planning import measure, outcome_record, planning_rows
-from affordlib.models import EffectModel
+from affordlib.models import EffectModel, load_checkpoint
 from affordlib.planning import (
     carry_out,
     map_effects,
@@ -386,3 +386,10 @@ def test_a_grid_of_nothing_is_refused():
     for settings, says in (({"n_directions": 0}, "n_directions"), ({"stop_phases": ()}, "phase")):
         with pytest.raises(ValueError, match=says):
             plan_astar(MODEL, IMAGE, (0.0, 0.0), Goal((0.1, 0.0)), **settings)
+
+
+@pytest.mark.parametrize("name", ["lever_anchored", "grasp_film", "rotate_film", "drag_film"])
+@pytest.mark.parametrize("plan", [plan_astar, plan_continuous, plan_gradient])
+def test_a_model_of_other_actions_plans_no_pushes(cuboid_image, name, plan):
+    with pytest.raises(ValueError, match=r"model: a planner|train on such actions"):
+        plan(load_checkpoint(name)[0], cuboid_image, (0.0, 0.0), Goal((0.1, 0.05)))
