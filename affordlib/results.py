@@ -210,7 +210,7 @@ def cell(column: str, value: object) -> str:
 def fill_tables(text: str) -> str:
     """Return a Markdown page with each of its table blocks drawn anew from its results file."""
 
-    def fill(block: re.Match[str]) -> str:
+    def fill(block):
         source, *options = block["what"].split()
         path, _, name = source.partition("#")
         tables = read_results(path)["tables"]
@@ -264,10 +264,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _document(notebook: str, parameters: Any, tables: dict[str, list[dict[str, Any]]]) -> str:
     """Return the JSON text, one line a row, so that a changed number is one changed line."""
 
-    def dump(value: object) -> str:
+    def dump(value):
         return json.dumps(value, allow_nan=False, ensure_ascii=False)
 
-    def block(name: str, rows: list[dict[str, Any]]) -> str:
+    def block(name, rows):
         return f"  {dump(name)}: [\n" + ",\n".join(f"   {dump(row)}" for row in rows) + "\n  ]"
 
     blocks = ",\n".join(block(name, rows) for name, rows in tables.items())

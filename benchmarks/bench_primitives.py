@@ -10,13 +10,13 @@ import time
 
 import numpy as np
 import pybullet
-from clock import SteppingClock
 from keeping import keep
 
 from affordlib.interactions.cost import measure_cost
 from affordlib.interactions.recipes import RECIPES
 from affordlib.primitives import PRIMITIVES, Push
 from affordlib.world import Cuboid, Tabletop, robot
+from affordlib.world.clock import SteppingClock
 
 EPISODES = 24
 NAIVE_EPISODES = 6

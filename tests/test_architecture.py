@@ -8,6 +8,7 @@ import pytest
 import affordlib
 
 ROOT = Path(affordlib.__file__).parent
+CHECKED = affordlib._CHECKED.split()
 MODULES = sorted(p.relative_to(ROOT.parent) for p in ROOT.rglob("*.py"))
 
 FORBIDDEN = {
@@ -64,3 +65,17 @@ def test_modules_are_short_and_well_named(path):
 def test_only_the_world_and_its_users_know_pybullet():
     users = [p for p in MODULES if "import pybullet" in (ROOT.parent / p).read_text()]
     assert {p.parts[1] for p in users} == {"world"}
+
+
+def test_functions_in_functions_are_not_decorated_again_and_again():
+    """What beartype checks it decorates where it is defined: a closure, every time."""
+    for path in MODULES:
+        if path.with_suffix("").as_posix().replace("/", ".").partition(".")[2] not in CHECKED:
+            continue
+        for outer in ast.walk(ast.parse((ROOT.parent / path).read_text())):
+            inner = ast.walk(outer) if isinstance(outer, ast.FunctionDef) else ()
+            for each in inner:
+                if isinstance(each, ast.FunctionDef) and each is not outer:
+                    arguments = [*each.args.args, *each.args.kwonlyargs]
+                    assert not each.returns, f"{path}: {each.name}"
+                    assert not any(argument.annotation for argument in arguments)

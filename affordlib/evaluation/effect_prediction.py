@@ -37,7 +37,7 @@ def error_row(errors_m: np.ndarray, **columns: Any) -> dict[str, Any]:
 def mean_length_errors_m(training: TrainingArrays, test: TrainingArrays) -> torch.Tensor:
     """Final position errors (N,) [m] of knowing only the direction and the mean length."""
 
-    def direction(arrays: TrainingArrays) -> torch.Tensor:
+    def direction(arrays):
         travel = arrays.action[:, -1, :2] - arrays.action[:, 0, :2]
         return travel / travel.norm(dim=-1, keepdim=True)
 

@@ -161,7 +161,7 @@ class TrainingArrays:
             raise ValueError(f"interactions must be numbers (n,), got {chosen!r:.80}")
         part = data.isel(interaction=believable(data, chosen))
 
-        def channels(kind: str, names: tuple[str, ...]) -> torch.Tensor:
+        def channels(kind, names):
             known = data.attrs[f"{kind}_channels"].split()
             unknown = [name for name in names if name not in known]
             if unknown:
@@ -317,13 +317,13 @@ def sample_batch(
     part = arrays.select(rows)
     b, last = len(rows), len(arrays.phase) - 1
 
-    def uniform(*shape: int) -> torch.Tensor:
+    def uniform(*shape):
         return torch.rand(*shape, generator=generator)
 
-    def samples(*shape: int) -> torch.Tensor:
+    def samples(*shape):
         return torch.randint(0, last + 1, shape, generator=generator)
 
-    def counts() -> torch.Tensor:
+    def counts():
         few = torch.randint(1, min(2, obs_max) + 1, (b, 1), generator=generator)
         many = torch.randint(1, obs_max + 1, (b, 1), generator=generator)
         return torch.where(uniform(b, 1) < 0.5, few, many)

@@ -296,7 +296,7 @@ def literal_draw(arrays: TrainingArrays, obs_max: int, generator: torch.Generato
     Action and effect are observed at the same times; w₁ is 1, 0 or uniform between, one in three.
     """
 
-    def draw(high: int, n: int = 1) -> torch.Tensor:
+    def draw(high, n=1):
         return torch.randint(high, (n,), generator=generator)
 
     row, last = int(draw(len(arrays))), len(arrays.phase)

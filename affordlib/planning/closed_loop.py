@@ -70,7 +70,7 @@ def carry_out(
     yaw_rad, z_m = world.object_pose()[2], world.object_state()[2]
     paths: list[np.ndarray] = []
 
-    def measured() -> Outcome:
+    def measured():
         pose = world.object_pose()
         distance = plan.goal.distance_m(pose[:2])
         turned, lifted = wrap_angle(pose[2] - yaw_rad), world.object_state()[2] - z_m

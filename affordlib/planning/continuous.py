@@ -265,7 +265,7 @@ def _best_chain(
 ) -> tuple[float, Tensor, Tensor] | None:
     """The cost [m] and the actions (1, K) of the best chain of so many actions, if there is one."""
 
-    def judged(direction: Tensor, phase: Tensor) -> tuple[Tensor, Tensor]:
+    def judged(direction, phase):
         with torch.no_grad():
             expected, positions = _objective(effects, target, direction, phase)
         allowed = _allowed(effects, xy, positions, direction, reachable)

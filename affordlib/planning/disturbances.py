@@ -117,7 +117,7 @@ class Script:
         film, steps = world.film, 0
         due = [one for one in self._waiting if one.action <= action and one.at_s is not None]
 
-        def watch(world: affordlib.world.Tabletop) -> None:
+        def watch(world):
             nonlocal steps
             steps += 1
             for one in [d for d in due if steps >= STEPS_PER_S * d.at_s]:

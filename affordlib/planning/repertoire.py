@@ -19,7 +19,7 @@ from affordlib.planning.modes import checked_image
 from affordlib.planning.reachability import Reachability
 from affordlib.planning.routes import REACH_M, RouteMap
 from affordlib.primitives import Drag, Grasp, Primitive, Push, Rotate, primitive_named
-from affordlib.types import Goal, Plan, check_field
+from affordlib.types import Plan, check_field
 
 Reachable = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Which of the positions (n, 2) and directions (n,) the arm can act at."""
@@ -97,9 +97,7 @@ class Repertoire:
         """
         last: dict[bytes, dict[str, Any]] = {}
 
-        def planner(
-            image: np.ndarray, start_xy_m: Sequence[float], goal: Goal, **further: Any
-        ) -> Plan:
+        def planner(image, start_xy_m, goal, **further):
             seen = np.ascontiguousarray(image).tobytes()
             if seen not in last:
                 last.clear()
@@ -129,7 +127,7 @@ class Repertoire:
         if self.reachability is None:
             return None
 
-        def judge(xy_m: np.ndarray, direction_rad: np.ndarray) -> np.ndarray:
+        def judge(xy_m, direction_rad):
             return self.reachability.probability(kind.name, xy_m, direction_rad) >= self.threshold
 
         return judge
@@ -139,7 +137,7 @@ class Repertoire:
         if kind not in self._routes:
             judge = self.reachable(kind)
 
-            def allowed(xy_m: np.ndarray, direction_rad: np.ndarray, _: np.ndarray) -> np.ndarray:
+            def allowed(xy_m, direction_rad, _):
                 return np.ones(len(xy_m), bool) if judge is None else judge(xy_m, direction_rad)
 
             self._routes[kind] = RouteMap.of(REACH_M[kind], allowed)

@@ -54,8 +54,8 @@ def closed_loop(repertoire: Repertoire, tolerance_m: float = 0.002) -> Executor:
     `plan_continuous`, and says so.
     """
 
-    def execute(world: Tabletop, plan: Plan, planner: Planner, tell: Tell) -> Outcome:
-        def exactly(goal: Goal) -> Goal:
+    def execute(world, plan, planner, tell):
+        def exactly(goal):
             return replace(goal, tolerance_m=tolerance_m)
 
         search = getattr(planner, "search", None)

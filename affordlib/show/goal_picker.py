@@ -167,11 +167,11 @@ class GoalPicker(Pictured, widgets.VBox):
             return self._queue.do(self._settle)
         number = self._asked
 
-        def rest() -> None:
+        def rest():
             if number == self._asked:
                 self._settle()
 
-        def follow() -> None:
+        def follow():
             if self._owed and number == self._asked and not self._running:
                 try:
                     self._make_plan(self.draft)
@@ -227,7 +227,7 @@ class GoalPicker(Pictured, widgets.VBox):
     def _run(self, seconds_per_action: float) -> None:
         planner, before, done = self.planners[self.controls.planner.value], self.world.film, 0
 
-        def tell(plan: Plan | None = None) -> Goal:
+        def tell(plan=None):
             nonlocal done
             if plan is not None:
                 self._follow_plan(plan, done)
