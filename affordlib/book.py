@@ -25,10 +25,10 @@ from nbconvert.exporters import HTMLExporter
 from nbconvert.filters.markdown_mistune import IPythonRenderer, MarkdownWithMath
 
 from affordlib.commands import command
-from affordlib.notebook_files import WIDGET
 from affordlib.paths import repo_root, resolve_out_dir
 from affordlib.profiles import notebook_paths, read_notebook
 from affordlib.results import write_text_atomically
+from affordlib.workbook import WIDGET
 
 BESIDE = {
     "RESULTS.md": "results.html",

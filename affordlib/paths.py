@@ -28,22 +28,6 @@ def from_root(path: str | os.PathLike[str]) -> Path:
     return path if path.is_absolute() else repo_root() / path
 
 
-def data_path(name: str) -> Path:
-    """Return the path of a file or folder shipped in `data/`.
-
-    Raises FileNotFoundError, naming what is there, if it is missing.
-    """
-    folder = repo_root() / "data"
-    path = folder / name
-    if not path.exists():
-        there = ", ".join(sorted(p.name for p in folder.glob("*"))) or "nothing"
-        raise FileNotFoundError(
-            f"name: {name!r} is not in {folder} (there: {there}); "
-            "restore it with `git checkout data`, or make it anew with `make data`"
-        )
-    return path
-
-
 def resolve_out_dir(out_dir: str | os.PathLike[str]) -> Path:
     """Return the folder for results, made if missing; a relative one starts at the repository.
 

@@ -46,14 +46,7 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
         raise FileNotFoundError(f"there is no plan {path}")
     try:
         return _plan(json.loads(Path(path).read_text(encoding="utf-8")))
-    except (
-        LookupError,
-        TypeError,
-        ArithmeticError,
-        ValueError,
-        AttributeError,
-        RecursionError,
-    ) as error:
+    except Exception as error:
         what = f"{error.args[0]!r} is missing" if isinstance(error, KeyError) else str(error)
         raise ValueError(f"path: {path} holds no plan: {what}") from None
 

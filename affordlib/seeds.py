@@ -38,7 +38,7 @@ from affordlib.workers import dask_client
 if TYPE_CHECKING:
     from dask.distributed import Client
 
-    Row = Mapping[str, Any]
+Row = Mapping[str, Any]
 
 
 def command_of(arguments: Sequence[str]) -> list[str]:

@@ -22,8 +22,8 @@ import numpy as np
 import papermill
 import pytest
 
-from affordlib.notebook_files import WIDGET
 from affordlib.paths import repo_root
+from affordlib.workbook import WIDGET
 
 CHROMIUM = shutil.which("chromium")
 FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"]

@@ -13,11 +13,10 @@ import papermill
 import pytest
 from IPython.core.inputtransformer2 import TransformerManager
 
-from affordlib.notebook_files import WIDGET, cleaned
 from affordlib.profiles import default_parameters, notebook_paths
 from affordlib.results import read_results, results_table
 from affordlib.show import GOAL, PREDICTION, TRUTH
-from affordlib.workbook import Layout, make_jobs
+from affordlib.workbook import WIDGET, Layout, cleaned, make_jobs
 
 LAYOUT = Layout.of_repository()
 PATHS = notebook_paths(LAYOUT.notebooks)

@@ -158,11 +158,6 @@ def test_relative_folders_start_at_the_repository(tmp_path, monkeypatch):
             paths.resolve_out_dir(bad)
     with pytest.raises(ValueError, match="out_dir must name a folder"):
         paths.resolve_out_dir("")
-    (root / "data").mkdir()
-    (root / "data" / "push.zarr.zip").write_text("")
-    assert paths.data_path("push.zarr.zip") == root / "data" / "push.zarr.zip"
-    with pytest.raises(FileNotFoundError, match=r"'pull' is not in .*push\.zarr\.zip.*make data"):
-        paths.data_path("pull")
 
 
 def test_what_is_named_by_an_absolute_path_needs_no_checkout(tmp_path, monkeypatch):

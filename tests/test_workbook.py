@@ -19,9 +19,8 @@ import psutil
 import pytest
 from nbclient.exceptions import DeadKernelError
 
-from affordlib.notebook_files import cleaned
 from affordlib.results import read_results
-from affordlib.workbook import Layout, locked, main
+from affordlib.workbook import Layout, cleaned, locked, main
 
 PARAMETERS = "seed = 0\nout_dir = {lab!r}\nn = 2\nrate = 0.5\nmodes = ['full']"
 # A notebook of these books writes its results by hand, to spare the import of pandas.

@@ -30,7 +30,7 @@ from affordlib.evaluation.feasibility import half_width_m, is_feasible, on_the_r
 from affordlib.models.checkpoint import checkpoint_sha256
 from affordlib.models.weight_files import weights_bytes
 from affordlib.paths import repo_root
-from affordlib.planning import Repertoire, draw_disturbances, pursue
+from affordlib.planning import Disturbance, Pursuit, Repertoire, draw_disturbances, pursue
 from affordlib.planning.disturbances import KINDS
 from affordlib.planning.poses import GRIP_YAWS
 from affordlib.planning.reachability import SHIPPED as REACHABILITY
@@ -39,13 +39,10 @@ from affordlib.primitives import Drag, Grasp, Push
 from affordlib.results import write_results, write_text_atomically
 from affordlib.types import TABLE_X_M, TABLE_Y_M, Goal
 from affordlib.workers import dask_client
-from affordlib.world import Tabletop, family_named
+from affordlib.world import Tabletop, Thing, family_named
 
 if TYPE_CHECKING:
     from dask.distributed import Client
-
-    from affordlib.planning import Disturbance, Pursuit
-    from affordlib.world import Thing
 
 FORMATS = {"height": 8, "orientation": 6, "disturbances": 5, "reachability": 4}
 """Counts the changes of code that change a table's records."""

@@ -14,13 +14,13 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
+import xarray as xr
 from tqdm.auto import tqdm
 
 from affordlib.interactions import open_interactions
 from affordlib.paths import resolve_out_dir
 
 if TYPE_CHECKING:
-    import xarray as xr
     from dask.distributed import Client
 
 

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import xarray as xr
 
 from affordlib.commands import command, count_type, names_type, whole_type
 from affordlib.evaluation.answers import (
@@ -33,7 +34,7 @@ from affordlib.evaluation.answers import (
 from affordlib.evaluation.baselines import BASELINES
 from affordlib.evaluation.inverse import along_effect, executed_record, inverse_record
 from affordlib.evaluation.parts import checked_part, open_once, options_of, run_parts, sha256_of
-from affordlib.interactions import Normaliser, TrainingArrays, split_interactions
+from affordlib.interactions import Normaliser, Split, TrainingArrays, split_interactions
 from affordlib.interactions.batches import Symmetry, believable, symmetric_copies
 from affordlib.interactions.store import stored_sha256
 from affordlib.models.attention import AttentionConfig
@@ -49,18 +50,14 @@ from affordlib.models.make_checkpoints import (
     about_training,
     train_model,
 )
-from affordlib.models.network import NetworkConfig
+from affordlib.models.network import EffectNetwork, NetworkConfig
 from affordlib.models.training import TrainingConfig
 from affordlib.paths import repo_root
 from affordlib.results import write_text_atomically
 from affordlib.workers import dask_client
 
 if TYPE_CHECKING:
-    import xarray as xr
     from dask.distributed import Client
-
-    from affordlib.interactions import Split
-    from affordlib.models.network import EffectNetwork
 
 FORMAT = 2
 """Counts the changes of code that change a unit's numbers without changing its configuration."""

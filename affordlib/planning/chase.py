@@ -3,27 +3,30 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from affordlib.perception import aim, looks_fallen
-from affordlib.planning.disturbances import Script
+from affordlib.perception import Percept, aim, looks_fallen
+from affordlib.planning.disturbances import Disturbance, Script
 from affordlib.planning.modes import is_on_table
-from affordlib.planning.moves import Ended, MovePlanner
+from affordlib.planning.moves import Demands, Ended, MovePlanner
 from affordlib.planning.poses import GRIP_YAWS, hands_in_line, plan_lift, plan_turn
+from affordlib.planning.repertoire import Repertoire
 from affordlib.primitives import Grasp, Rotate, wrap_angle
-from affordlib.types import Goal, NothingSeenError, Plan, UnreachableError, check_within
+from affordlib.types import (
+    Goal,
+    Interaction,
+    NothingSeenError,
+    Plan,
+    Step,
+    UnreachableError,
+    check_within,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from affordlib.perception import Percept
-    from affordlib.planning.disturbances import Disturbance
-    from affordlib.planning.moves import Demands
-    from affordlib.planning.repertoire import Repertoire
-    from affordlib.types import Interaction, Step
     from affordlib.world import Tabletop
 
 SURPRISE_M = 0.002

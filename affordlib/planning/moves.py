@@ -10,18 +10,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from affordlib.planning.modes import check_has_room, is_on_table
-from affordlib.planning.routes import CELL_M, find_route, places
-from affordlib.types import Goal, Plan
+from affordlib.perception import Percept
+from affordlib.planning.effect_map import EffectMap
+from affordlib.planning.modes import PlanMode, check_has_room, is_on_table
+from affordlib.planning.repertoire import Reachable, Repertoire
+from affordlib.planning.routes import CELL_M, Judge, find_route, places
+from affordlib.primitives import Primitive
+from affordlib.types import Goal, Plan, Step
 
 if TYPE_CHECKING:
-    from affordlib.perception import Percept
-    from affordlib.planning.effect_map import EffectMap
-    from affordlib.planning.modes import PlanMode
-    from affordlib.planning.repertoire import Reachable, Repertoire
-    from affordlib.planning.routes import Judge
-    from affordlib.primitives import Primitive
-    from affordlib.types import Step
     from affordlib.world import Tabletop
 
 MAX_VETOES = 12

@@ -5,6 +5,7 @@ Everything it needs is in this package; nothing is fetched from anywhere.
 
 from __future__ import annotations
 
+import base64
 import html
 import io
 from collections.abc import Iterator, Sequence
@@ -20,8 +21,6 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
-
-from affordlib.show.pictured import Pictured
 
 DPI = 90
 _HERE = Path(__file__).parent
@@ -41,6 +40,21 @@ class DraggedFigure(anywidget.AnyWidget):
     width = traitlets.Int().tag(sync=True)
     handles = traitlets.List().tag(sync=True)
     dragged = traitlets.List(["", 0.0, 0]).tag(sync=True)
+
+
+class Pictured:
+    """Before a class of ipywidgets: a box of widgets by itself saves only text."""
+
+    def picture(self) -> bytes:
+        """What is shown, as a PNG; empty where there is nothing yet."""
+        raise NotImplementedError
+
+    def _repr_mimebundle_(self, **kwargs: object) -> dict[str, object]:
+        # Without a kernel the notebook shows the picture.
+        bundle = super()._repr_mimebundle_(**kwargs) | {"text/plain": type(self).__name__}
+        if picture := self.picture():
+            bundle["image/png"] = base64.b64encode(picture).decode()
+        return bundle
 
 
 class FigureWidget(Pictured, widgets.VBox):

@@ -21,9 +21,9 @@ from affordlib.plan_files import load_plan, plan_file, save_plan
 from affordlib.planning import carry_out
 from affordlib.primitives import wrap_angle
 from affordlib.show.executors import Executor, Planner, Stopped, open_loop
+from affordlib.show.figure_widget import Pictured
 from affordlib.show.page_queue import PageQueue
 from affordlib.show.picker_controls import PickerControls
-from affordlib.show.pictured import Pictured
 from affordlib.show.plots import table_picture
 from affordlib.show.pose_film import moving_part, pose_recorder
 from affordlib.show.sentences import outcome_in_words, plan_in_words
