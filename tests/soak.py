@@ -41,10 +41,9 @@ def one_round(world: Tabletop, planner, thing, start, goal: Goal) -> str:
 
 
 def memory_mb() -> float:
-    """Memory of this process alone [MB]."""
+    """Memory that no file backs, in use or swapped out [MB]; pages of files other processes share."""
     gc.collect()
-    own = psutil.Process().memory_full_info()
-    return (own.uss + own.swap) / 2**20
+    return sum(part.anonymous + part.swap for part in psutil.Process().memory_maps()) / 2**20
 
 
 def main() -> int:
