@@ -41,7 +41,7 @@ def one_round(world: Tabletop, planner, thing, start, goal: Goal) -> str:
 
 
 def memory_mb() -> float:
-    """Memory that no file backs, in use or swapped out [MB]; pages of files other processes share."""
+    """Memory that no file backs, swapped out or not [MB]; pages of files are shared with others."""
     gc.collect()
     return sum(part.anonymous + part.swap for part in psutil.Process().memory_maps()) / 2**20
 
