@@ -131,8 +131,11 @@ def test_ways_and_plans_keep_the_whole_object_on_the_table(table, repertoire):
     table.place(BOX, (0.5, 0.66), 0.3)
     effects = repertoire.effects(table.look())
     assert effects.radius_m == pytest.approx(math.hypot(0.03, 0.025), abs=0.004)
-    routes = RouteMap.of(0.075, lambda xy, *_: np.ones(len(xy), bool))
-    anywhere = lambda xy, *_: np.ones(len(xy), bool)  # noqa: E731
+
+    def anywhere(xy, *_):
+        return np.ones(len(xy), bool)
+
+    routes = RouteMap.of(0.075, anywhere)
     way = find_route(routes, (0.2, 0.69), (0.65, 0.65), anywhere, radius_m=0.045)
     assert is_on_table(np.array(way), 0.045).all()
     beside = np.array(find_route(routes, (0.2, 0.69), (0.65, 0.69), anywhere))

@@ -5,6 +5,7 @@ import decimal
 import fractions
 import inspect
 import math
+import re
 import time
 from functools import partial
 from pathlib import Path
@@ -77,6 +78,8 @@ def shop(one_world, repertoire, pushes, tmp_path_factory):
     one_world.config = world.WorldConfig()
     one_world.place(box, (0.0, 0.0), 0.3)
     image, folder = one_world.look(), tmp_path_factory.mktemp("hostile")
+    film = show.Film(1, 16, 16)
+    film(one_world)
     return {
         "world": one_world,
         "thing": box,
@@ -93,8 +96,12 @@ def shop(one_world, repertoire, pushes, tmp_path_factory):
         "outcome": Outcome(plan, 0.01, (0.04, 0.02, 0.0), 0.0, (path,)),
         "folder": folder,
         "seen": one_world.interact(Push(0.0)),
+        "film": film,
+        "pursuit": planning.pursue(one_world, goal, repertoire, max_actions=1),
+        "about": models.load_checkpoint("push_cnp")[1],
         "saved": save_plan(folder / "plan.json", plan),
         "data": pushes,
+        "test": interactions.open_interactions("push_test"),
     }
 
 
@@ -104,6 +111,8 @@ def valid_calls(shop):
     at, arrays, network, plan = (0.0, 0.0), shop["arrays"], shop["network"], shop["plan"]
     few = models.TrainingConfig(steps=1, batch_size=2, n_targets=2, device="cpu")
     query = {"model": model, "image": image, "start_xy_m": at, "goal": goal}
+    grip = {"image": image, "xy_m": at, "grip_yaws": (0.0, 0.1)}
+    build = {"config": shop["config"], "normaliser": shop["normaliser"]}
     planner = shop["repertoire"].planner(planning.plan_astar)
     corners = tuple((0.03 * math.cos(a), 0.03 * math.sin(a)) for a in (0.0, 2.0, 4.0))
     ones = torch.ones(4)
@@ -184,6 +193,8 @@ def valid_calls(shop):
             interactions.split_interactions,
             {"n": 20, "seed": 0, "fold": 0, "n_folds": 10},
         ),
+        "Split": (interactions.Split, vars(interactions.split_interactions(20))),
+        "TrainingArrays": (interactions.TrainingArrays, vars(arrays)),
         "Recipe": (Recipe, {f.name: getattr(Recipe(), f.name) for f in dataclasses.fields(Recipe)}),
         "Variation": (Variation, dataclasses.asdict(Variation())),
         "collect": (
@@ -198,12 +209,19 @@ def valid_calls(shop):
         "CNPConfig": (models.CNPConfig, dataclasses.asdict(models.CNPConfig())),
         "AttentionConfig": (models.AttentionConfig, dataclasses.asdict(models.AttentionConfig())),
         "FiLMConfig": (models.FiLMConfig, dataclasses.asdict(models.FiLMConfig())),
-        "build": (models.build, {"config": shop["config"], "normaliser": shop["normaliser"]}),
+        "build": (models.build, build),
+        "AffordanceCNP": (models.AffordanceCNP, build),
+        "AttentiveCNP": (models.AttentiveCNP, build | {"config": models.AttentionConfig()}),
+        "FiLMNetwork": (models.FiLMNetwork, build | {"config": models.FiLMConfig()}),
         "Ensemble": (models.Ensemble, {"members": [network]}),
         "TrainingConfig": (models.TrainingConfig, dataclasses.asdict(few)),
         "coverage": (
             models.coverage,
             {"truth": ones, "mean": ones, "std": ones, "level": 0.5},
+        ),
+        "calibration_rows": (
+            lambda model, arrays, phases: models.calibration_rows(model, arrays, phases),
+            {"model": network, "arrays": arrays, "phases": (0.8, 1.0)},
         ),
         "fit_temperature": (
             models.fit_temperature,
@@ -267,23 +285,11 @@ def valid_calls(shop):
         ),
         "plan_turn": (
             planning.plan_turn,
-            {
-                "model": shop["repertoire"].model(Rotate),
-                "image": image,
-                "xy_m": at,
-                "turn_rad": 0.3,
-                "grip_yaws": (0.0, 0.1),
-            },
+            grip | {"model": shop["repertoire"].model(Rotate), "turn_rad": 0.3},
         ),
         "plan_lift": (
             planning.plan_lift,
-            {
-                "model": shop["repertoire"].model(Grasp),
-                "image": image,
-                "xy_m": at,
-                "height_m": 0.05,
-                "grip_yaws": (0.0, 0.1),
-            },
+            grip | {"model": shop["repertoire"].model(Grasp), "height_m": 0.05},
         ),
         "kind_for": (shop["repertoire"].kind_for, {"image": image}),
         "Repertoire": (
@@ -336,6 +342,38 @@ def valid_calls(shop):
             {"model": model, "seen": shop["seen"]},
         ),
         "Film": (show.Film, {"every": 30, "width": 32, "height": 32}),
+        "show_animation": (
+            show.show_animation,
+            {"film": shop["film"], "path": shop["folder"] / "film.gif", "beside": figure},
+        ),
+        "plot_levered": (
+            show.plot_levered,
+            {
+                "ax": ax,
+                "outline_m": np.array(corners),
+                "height_m": 0.05,
+                "pose": np.zeros(4),
+                "color": "black",
+                "label": "x",
+            },
+        ),
+        "outline_in_lever_frame": (
+            show.outline_in_lever_frame,
+            {
+                "thing": shop["thing"],
+                "yaw_rad": 0.3,
+                "contact_xy_m": np.array(at),
+                "theta_rad": 0.1,
+            },
+        ),
+        "plot_pursuit": (
+            show.plot_pursuit,
+            {"ax": ax, "pursuit": shop["pursuit"], "thing": shop["thing"]},
+        ),
+        "refuse_seen": (
+            evaluation.refuse_seen,
+            {"about": shop["about"], "data": shop["test"], "interactions": np.arange(2)},
+        ),
         "error_row": (evaluation.error_row, {"errors_m": np.array([0.1, 0.2])}),
         "mean_length_errors_m": (
             evaluation.mean_length_errors_m,
@@ -356,93 +394,23 @@ def valid_calls(shop):
     }
 
 
-NAMES = [
-    "Goal",
-    "Step",
-    "Plan",
-    "Push",
-    "Push.towards",
-    "Push.path",
-    "Drag",
-    "Grasp",
-    "Rotate",
-    "LeverUp",
-    "primitive_named",
-    "Cuboid",
-    "UprightCylinder",
-    "LyingCylinder",
-    "Sphere",
-    "Prism",
-    "family_named",
-    "WorldConfig",
-    "Tabletop",
-    "place",
-    "interact",
-    "attempt",
-    "follow",
-    "follow_path",
-    "can_reach",
-    "look_from",
-    "picture",
-    "mark",
-    "shove",
-    "knock",
-    "topple",
-    "settle",
-    "Normaliser",
-    "from_dataset",
-    "open_interactions",
-    "split_interactions",
-    "Recipe",
-    "Variation",
-    "collect",
-    "CNPConfig",
-    "AttentionConfig",
-    "FiLMConfig",
-    "build",
-    "Ensemble",
-    "TrainingConfig",
-    "coverage",
-    "fit_temperature",
-    "load_checkpoint",
-    "save_checkpoint",
-    "observe_actions",
-    "train",
-    "train_literal",
-    "PlanMode",
-    "Disturbance",
-    "draw_disturbances",
-    "action_limit",
-    "map_effects",
-    "plan_astar",
-    "plan_continuous",
-    "plan_gradient",
-    "plan_turn",
-    "plan_lift",
-    "kind_for",
-    "Repertoire",
-    "carry_out",
-    "pursue",
-    "closed_loop",
-    "plot_depth",
-    "plot_footprint",
-    "plot_plan",
-    "plot_outcome",
-    "plot_table",
-    "save_figure",
-    "GoalPicker",
-    "PhaseSlider",
-    "Film",
-    "ConditioningExplorer",
-    "error_row",
-    "mean_length_errors_m",
-    "save_plan",
-    "load_plan",
-    "write_results",
-    "read_results",
-    "results_table",
-    "check",
-]
+NAMES = re.findall(
+    r"\S+",
+    """
+Goal Step Plan Push Push.towards Push.path Drag Grasp Rotate LeverUp primitive_named Cuboid
+UprightCylinder LyingCylinder Sphere Prism family_named WorldConfig Tabletop place interact
+attempt follow follow_path can_reach look_from picture mark shove knock topple settle Normaliser
+from_dataset open_interactions split_interactions Recipe Variation collect CNPConfig
+AttentionConfig FiLMConfig build Ensemble TrainingConfig coverage fit_temperature
+load_checkpoint save_checkpoint observe_actions train train_literal PlanMode Disturbance
+draw_disturbances action_limit map_effects plan_astar plan_continuous plan_gradient plan_turn
+plan_lift kind_for Repertoire carry_out pursue closed_loop plot_depth plot_footprint plot_plan
+plot_outcome plot_table save_figure GoalPicker PhaseSlider Film ConditioningExplorer error_row
+mean_length_errors_m save_plan load_plan write_results read_results results_table check Split
+TrainingArrays AffordanceCNP AttentiveCNP FiLMNetwork calibration_rows refuse_seen
+outline_in_lever_frame plot_levered plot_pursuit show_animation
+""",
+)
 
 
 def silent_nans(result):
@@ -482,7 +450,8 @@ def test_a_hostile_value_is_refused_by_name_or_does_no_harm(shop, name, tmp_path
         except UnreachableError:
             pass
         except (TypeError, ValueError) as error:
-            named = argument in str(error) or repr(value) in str(error)
+            named = "null byte" in str(error)  # of a path, as the system says it
+            named = named or re.search(rf"\b{argument}\b", str(error)) or repr(value) in str(error)
             wrong = not named and f"is not named by {error!r}"
         except OSError as error:
             wrong = not isinstance(value, str | bytes | Path) and f"is no path, but {error!r}"
@@ -500,10 +469,8 @@ def test_a_hostile_value_is_refused_by_name_or_does_no_harm(shop, name, tmp_path
     assert not list(repo_root().glob("*/x.json"))
 
 
-MADE_OF_DRIVEN_ONES = """
-AffordanceCNP AttentiveCNP EffectMap EffectModel EffectNetwork FiLMNetwork NetworkConfig
-Pursuit Split Thing TrainingArrays calibration_rows mean_length_errors_m open_loop
-outline_in_lever_frame plot_levered plot_pursuit refuse_seen show_animation
+MADE_BY_DRIVEN_ONES = """
+EffectMap EffectModel EffectNetwork NetworkConfig Pursuit Thing open_loop
 """
 
 
@@ -511,4 +478,4 @@ def test_every_public_callable_is_driven():
     for package in (world, interactions, models, planning, show, evaluation):
         public = {name for name in package.__all__ if callable(getattr(package, name))}
         public -= {name for name in public if name.endswith(("Error", "Warning"))}
-        assert public <= {*NAMES, *MADE_OF_DRIVEN_ONES.split()}
+        assert public <= {*NAMES, *MADE_BY_DRIVEN_ONES.split()}

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 import xarray as xr
 
-from affordlib.interactions.batches import TrainingArrays
+from affordlib.interactions.batches import TrainingArrays, check_numbers
 from affordlib.interactions.recipes import Recipe
 from affordlib.types import check_array
 
@@ -60,6 +60,7 @@ def refuse_seen(about: dict[str, Any], data: xr.Dataset, interactions: np.ndarra
             f"about: it does not say which interactions the model was trained on ({error!r}); "
             "save the checkpoint with the recipe and seen_interactions of its training"
         ) from error
+    check_numbers("interactions", interactions)
     numbers = data["interaction"].values[interactions]
     seen = sorted(trained_on & {int(i) for i in numbers})
     if theirs == mine and seen:

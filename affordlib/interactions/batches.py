@@ -21,6 +21,12 @@ def believable(data: xr.Dataset, interactions: np.ndarray) -> np.ndarray:
     return interactions[(data["reached"].values & ~data["fault"].values)[interactions]]
 
 
+def check_numbers(name: str, interactions: np.ndarray) -> None:
+    """Raise, naming the argument, unless these are the numbers (n,) of interactions, n ≥ 1."""
+    if interactions.ndim != 1 or interactions.dtype.kind not in "iu" or not len(interactions):
+        raise ValueError(f"{name} must be numbers (n,) of interactions, got {interactions!r:.80}")
+
+
 @dataclass(frozen=True)
 class Split:
     """Interaction numbers for training, validation and test."""
@@ -28,6 +34,10 @@ class Split:
     train: np.ndarray
     validation: np.ndarray
     test: np.ndarray
+
+    def __post_init__(self) -> None:
+        for name in ("train", "validation", "test"):
+            check_numbers(name, getattr(self, name))
 
 
 def split_interactions(n: int, seed: int = 0, fold: int = 0, n_folds: int = 10) -> Split:
@@ -157,8 +167,7 @@ class TrainingArrays:
         Left out are faults of the simulator and actions that were out of reach.
         """
         chosen = np.arange(data.sizes["interaction"]) if interactions is None else interactions
-        if chosen.ndim != 1 or chosen.dtype.kind not in "iu" or not len(chosen):
-            raise ValueError(f"interactions must be numbers (n,), got {chosen!r:.80}")
+        check_numbers("interactions", chosen)
         part = data.isel(interaction=believable(data, chosen))
 
         def channels(kind, names):

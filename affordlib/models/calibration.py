@@ -31,6 +31,9 @@ def coverage(
     """Share of the values inside the central interval of the given level, such as 0.9."""
     if not 0 < level < 1:
         raise ValueError(f"level must lie in (0, 1), got {level!r}")
+    if not truth.shape == mean.shape == std.shape:
+        shapes = tuple(truth.shape), tuple(mean.shape), tuple(std.shape)
+        raise ValueError(f"truth, mean and std must have one shape, got {shapes}")
     half = math.sqrt(2) * float(torch.erfinv(torch.tensor(level, dtype=torch.float64)))
     return float(((truth - mean).abs() <= half * std).double().mean())
 

@@ -80,6 +80,7 @@ class EffectNetwork(nn.Module, ABC):
     encoded image is what can be read of it before the direction is known.
     """
 
+    @checked
     def __init__(self, config: NetworkConfig, normaliser: Normaliser) -> None:
         super().__init__()
         self.config, self.normaliser = config, normaliser

@@ -336,7 +336,7 @@ class GoalPicker(Pictured, widgets.VBox):
         controls.planner.observe(
             lambda _: self._hear(lambda: self.pick(*self._goal.xy_m)), names="value"
         )
-        self._view.observe(self._heard, names="asked")
+        self._view.observe(self._clicked, names="asked")
         self._view.on_msg(self._pressed)
         controls.run.on_click(lambda _: self._run_in_background())
         controls.stop.on_click(lambda _: self.stop())
@@ -354,14 +354,13 @@ class GoalPicker(Pictured, widgets.VBox):
     def _hear(self, action: Callable[[], None]) -> None:
         (self._queue.attempt if self._running else self._queue.do)(action)
 
-    def _heard(self, change: dict[str, Any]) -> None:
-        x, y, _ = change["new"]
-        self._follow(x, y)
+    def _clicked(self, change: dict[str, Any]) -> None:
+        self._queue.attempt(lambda: self._follow(*change["new"][:2]))
 
     def _slid(self, change: dict[str, Any]) -> None:
         xy_m = whole_mm(*self.controls.place_m(self._goal, change))
         if not self._setting and xy_m != self._goal.xy_m:  # the page echoes what it was told
-            self._follow(*xy_m)
+            self._queue.attempt(lambda: self._follow(*xy_m))
 
     def _posed(self, change: dict[str, Any]) -> None:
         if not self._setting:

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from torch import Tensor
 
+from affordlib.types import check_array, check_finite, check_pair
 from affordlib.world import Thing
 
 _ALONG, _UP = 0.45, 0.3
@@ -17,9 +18,12 @@ def outline_in_lever_frame(
     thing: Thing, yaw_rad: float, contact_xy_m: np.ndarray, theta_rad: float
 ) -> np.ndarray:
     """The base (n, 2) [m] of an object at its start, from the contact point, lever to the right."""
-    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
-    outline = thing.footprint_m @ np.array([[c, s], [-s, c]]) - np.asarray(contact_xy_m)
-    c, s = math.cos(theta_rad), math.sin(theta_rad)
+    yaw, theta = check_finite("yaw_rad", yaw_rad), check_finite("theta_rad", theta_rad)
+    c, s = math.cos(yaw), math.sin(yaw)
+    outline = thing.footprint_m @ np.array([[c, s], [-s, c]]) - check_pair(
+        "contact_xy_m", contact_xy_m
+    )
+    c, s = math.cos(theta), math.sin(theta)
     return outline @ np.array([[c, -s], [s, c]])
 
 
@@ -36,7 +40,8 @@ def plot_levered(
     outline_m: (n, 2), as of `outline_in_lever_frame`. It is tilted about an axis across the lever,
     which for the real one is only roughly so. Across is drawn obliquely; units are centimetres.
     """
-    pose = np.asarray(pose, dtype=float)
+    pose, height_m = check_array("pose", pose, 4), check_finite("height_m", height_m)
+    outline_m = check_array("outline_m", outline_m, 2)
     centre, tilt = outline_m.mean(axis=0), pose[3]
     c, s = math.cos(tilt), math.sin(tilt)
     faces = []

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from affordlib.primitives import Primitive
 from affordlib.show.figure_widget import FigureWidget
 from affordlib.show.plots import NEUTRAL, PREDICTION, TRUTH, plot_footprint, plot_table
+from affordlib.types import check_within
 from affordlib.world import Tabletop
 
 
@@ -29,7 +30,12 @@ class PhaseSlider(FigureWidget):
         self.full = world.interact(action)
         self.rest: dict[float, tuple[float, float, float]] = {}
         self._phase = widgets.FloatSlider(
-            value=phase, min=0, max=1, step=0.01, description="phase t", layout={"width": "26em"}
+            value=check_within("phase", phase, 0.0, 1.0),
+            min=0,
+            max=1,
+            step=0.01,
+            description="phase t",
+            layout={"width": "26em"},
         )
         self._stop = widgets.Button(description="Stop it here", icon="stop")
         self._stop.on_click(lambda _: self.stop_here())

@@ -274,7 +274,7 @@ class Tabletop(Interventions):
         self._require_object()
         x, y = check_on_table("xy_m", xy_m)
         yaw_rad, scale = check_finite("yaw_rad", yaw_rad), check_within("scale", scale, 0.1, 10.0)
-        rgb = [check_within("rgb", share, 0.0, 1.0) for share in rgb]
+        rgb = [check_within("rgb", share, 0.0, 1.0) for share in check_array("rgb", rgb, 3)]
         create_footprint(self.client, self.thing, (x, y), yaw_rad, (*rgb, 1.0), scale)
 
     def interact(
