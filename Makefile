@@ -123,13 +123,16 @@ data: $(STAMP) ## Collect the shipped data sets again and compare
 
 checkpoints: $(STAMP) ## Train the shipped models again (ONLY="push_film")
 	@$(if $(ONLY),,$(PY) -m experiments.make_reachability)
-	@$(PY) -m affordlib.models.make_checkpoints $(if $(ONLY),--only $(ONLY))
+	@$(PY) -m experiments.make_checkpoints $(if $(ONLY),--only $(ONLY))
 
 notebooks: $(STAMP) ## Execute the committed notebooks in place and clean them (ONLY= FORCE=1)
 	@$(PY) -m affordlib.workbook --in-place --only "$$ONLY" $(if $(FORCE),--force)
 
-html: $(STAMP) ## Write the book as web pages that need no network, into runs/html
-	@$(PY) -m affordlib.book
+html: $(STAMP) ## Write the committed notebooks as web pages into runs/html (equations need the network)
+	@$(PY) -m nbconvert --to html --embed-images --log-level=ERROR --output-dir runs/html \
+	  --NbConvertBase.display_data_priority="['text/html','image/png','text/markdown','text/plain']" \
+	  notebooks/*.ipynb
+	@sed -i -E 's/(href="[0-9a-z_]+)\.ipynb/\1.html/g' runs/html/*.html
 
 tables: $(STAMP) ## Draw the tables of README, RESULTS and data card from data/results
 	@$(PY) -m affordlib.results README.md RESULTS.md data/README.md

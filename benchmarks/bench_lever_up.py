@@ -15,8 +15,8 @@ from affordlib.interactions import Normaliser, open_interactions
 from affordlib.interactions.lever import AHEAD, SEEN, draw_windows, lever_arrays
 from affordlib.models import build
 from affordlib.models.lever import LEVER_MODELS, foresee
-from affordlib.models.lstm_published import BATCH, EPOCHS, PublishedConfig, PublishedLSTM
 from affordlib.models.training import batch_loss
+from experiments.lstm_published import BATCH, EPOCHS, PublishedConfig, PublishedLSTM
 
 N = 256
 EPOCH = 1440

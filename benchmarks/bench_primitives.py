@@ -12,11 +12,10 @@ import numpy as np
 import pybullet
 from keeping import keep
 
-from affordlib.interactions.cost import measure_cost
 from affordlib.interactions.recipes import RECIPES
 from affordlib.primitives import PRIMITIVES, Push
 from affordlib.world import Cuboid, Tabletop, robot
-from affordlib.world.clock import SteppingClock
+from experiments.cost import SteppingClock, measure_cost
 
 EPISODES = 24
 NAIVE_EPISODES = 6

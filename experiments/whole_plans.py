@@ -18,8 +18,6 @@ import numpy as np
 from tqdm.auto import tqdm
 
 from affordlib.commands import command, count_type
-from affordlib.evaluation.closed_loop import N_TRIALS, draw_trial
-from affordlib.evaluation.closed_loop_tables import WITHIN_HEIGHT_M, WITHIN_M, WITHIN_TURN_RAD
 from affordlib.evaluation.effect_prediction import error_row
 from affordlib.models.checkpoint import checkpoint_sha256
 from affordlib.planning import Repertoire, carry_out, plan_astar, plan_continuous
@@ -27,6 +25,8 @@ from affordlib.planning.repertoire import CHECKPOINTS
 from affordlib.primitives import wrap_angle
 from affordlib.results import write_results
 from affordlib.world import Tabletop, UnreachableError
+from experiments.closed_loop import N_TRIALS, draw_trial
+from experiments.closed_loop_tables import WITHIN_HEIGHT_M, WITHIN_M, WITHIN_TURN_RAD
 
 PLANNERS = {"astar": plan_astar, "continuous": plan_continuous}
 WITHIN = {"orientation": ("rad", WITHIN_TURN_RAD), "height": ("m", WITHIN_HEIGHT_M)}

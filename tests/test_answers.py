@@ -8,7 +8,10 @@ import torch
 
 from affordlib.evaluation.answers import calibration, final_error, network_answers, yaw_error
 from affordlib.evaluation.baselines import constant, gaussian_process, logistic, nearest
-from affordlib.evaluation.grasps import (
+from affordlib.interactions import (
+    TrainingArrays,
+)
+from experiments.grasps import (
     auc,
     confusion_columns,
     grasp_rows,
@@ -16,12 +19,9 @@ from affordlib.evaluation.grasps import (
     threshold_rows,
     wilson,
 )
-from affordlib.evaluation.inverse import along_effect, executed_record
-from affordlib.evaluation.pooled import Errors
-from affordlib.evaluation.units import Unit
-from affordlib.interactions import (
-    TrainingArrays,
-)
+from experiments.inverse import along_effect, executed_record
+from experiments.pooled import Errors
+from experiments.units import Unit
 
 # Answers
 

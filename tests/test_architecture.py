@@ -43,6 +43,7 @@ def imported(path: Path) -> set[str]:
             names |= {f"{node.module}.{alias.name}" for alias in node.names}
         elif isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
+    assert not any(name.startswith("experiments") for name in names)
     return {n.split(".")[1] for n in names if n.startswith("affordlib.")}
 
 
@@ -57,7 +58,7 @@ def test_imports_point_one_way(path):
 @pytest.mark.parametrize("path", MODULES, ids=str)
 def test_modules_are_short_and_well_named(path):
     text = (ROOT.parent / path).read_text()
-    assert text.count("\n") <= 400
+    assert text.count("\n") <= 500
     assert path.stem not in {"utils", "helpers", "misc", "common"}
     assert ast.get_docstring(ast.parse(text))
 

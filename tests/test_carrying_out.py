@@ -6,13 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from affordlib.evaluation.closed_loop import draw_trial
 from affordlib.evaluation.goals import frozen_tasks
-from affordlib.evaluation.planning import attempt
 from affordlib.planning import carry_out, plan_astar, plan_continuous, pursue
 from affordlib.primitives import Grasp, Push
 from affordlib.types import Goal, Plan, Step, UnreachableError
 from affordlib.world import Cuboid, WorldConfig
+from experiments.closed_loop import draw_trial
+from experiments.planning import attempt
 
 BOX = Cuboid(0.06, 0.05, 0.05)
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from affordlib.evaluation.closed_loop import Trial, _stays_feasible
 from affordlib.planning import (
     Disturbance,
     PlanMode,
@@ -34,6 +33,7 @@ from affordlib.world import (
     UprightCylinder,
     WorldConfig,
 )
+from experiments.closed_loop import Trial, _stays_feasible
 
 
 class FollowsTheHand:

@@ -6,12 +6,12 @@ import re
 import numpy as np
 import pytest
 
-from affordlib.evaluation import closed_loop
-from affordlib.evaluation.closed_loop import N_TRIALS, draw_trial
-from affordlib.evaluation.closed_loop_tables import ROWS
-from affordlib.evaluation.feasibility import is_feasible, on_the_rim, possible
 from affordlib.primitives import Drag, Push
 from affordlib.world import Cuboid
+from experiments import closed_loop
+from experiments.closed_loop import N_TRIALS, draw_trial
+from experiments.closed_loop_tables import ROWS
+from experiments.feasibility import is_feasible, on_the_rim, possible
 
 
 def test_the_kinematic_oracle_is_the_kinematics(world):

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from affordlib.evaluation import units
-from affordlib.evaluation.units import Unit, configuration_sha256, run_unit
 from affordlib.interactions import TrainingArrays
 from affordlib.models import EffectModel, Ensemble, load_checkpoint, observe_actions
 from affordlib.planning import plan_astar, plan_continuous
 from affordlib.primitives import Push, wrap_angle
 from affordlib.types import Goal
+from experiments import units
+from experiments.units import Unit, configuration_sha256, run_unit
 
 NAMES = ("push_film", "push_film_x10")
 

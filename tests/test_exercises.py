@@ -6,9 +6,9 @@ import nbformat
 import numpy as np
 import pytest
 
-from affordlib.exercises import EXERCISES, check
 from affordlib.paths import repo_root
 from affordlib.profiles import notebook_paths
+from exercises import EXERCISES, check
 
 NOTEBOOKS = repo_root() / "notebooks"
 PATHS = notebook_paths(NOTEBOOKS)

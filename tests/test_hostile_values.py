@@ -19,13 +19,13 @@ from hypothesis import strategies as st
 
 import affordlib.interactions.collect as collecting
 from affordlib import evaluation, interactions, models, planning, show, world
-from affordlib.exercises import check
 from affordlib.interactions.recipes import Recipe, Variation
 from affordlib.paths import repo_root
 from affordlib.plan_files import load_plan, save_plan
 from affordlib.primitives import Drag, Grasp, LeverUp, Push, Rotate, primitive_named
 from affordlib.results import read_results, results_table, write_results
 from affordlib.types import Goal, Outcome, Plan, Step, UnreachableError
+from exercises import check
 
 LIMIT_S = 5.0
 NUMBERS = (math.nan, math.inf, -math.inf, 10**400, -1, 0, 1, 2.5, 1e300, 1e-300, -0.0, 10**6, True)
@@ -101,6 +101,7 @@ def shop(one_world, repertoire, pushes, tmp_path_factory):
         "about": models.load_checkpoint("push_cnp")[1],
         "saved": save_plan(folder / "plan.json", plan),
         "data": pushes,
+        "split": interactions.Split(*np.split(np.arange(30), (12, 24))),
         "test": interactions.open_interactions("push_test"),
     }
 
@@ -117,6 +118,12 @@ def valid_calls(shop):
     corners = tuple((0.03 * math.cos(a), 0.03 * math.sin(a)) for a in (0.0, 2.0, 4.0))
     ones = torch.ones(4)
     figure, ax = plt.subplots()
+
+    def train_few(config, **given):
+        return models.train(config=few if config is None else config, **given)
+
+    def train_split(config, **given):
+        return models.train_model(config=few if config is None else config, **given)
 
     def on_table(act):
         def put_back_and(**given):
@@ -234,7 +241,7 @@ def valid_calls(shop):
         ),
         "observe_actions": (models.observe_actions, {"model": network, "actions": [Push(0.0)]}),
         "train": (
-            models.train,
+            train_few,
             {
                 "model": network,
                 "training": arrays,
@@ -242,6 +249,17 @@ def valid_calls(shop):
                 "config": few,
                 "progress": False,
                 "checkpoint": None,
+            },
+        ),
+        "train_model": (
+            train_split,
+            {
+                "data": shop["data"],
+                "split": shop["split"],
+                "config": few,
+                "model_config": shop["config"],
+                "progress": False,
+                "symmetries": (),
             },
         ),
         "train_literal": (
@@ -407,7 +425,7 @@ draw_disturbances action_limit map_effects plan_astar plan_continuous plan_gradi
 plan_lift kind_for Repertoire carry_out pursue closed_loop plot_depth plot_footprint plot_plan
 plot_outcome plot_table save_figure GoalPicker PhaseSlider Film ConditioningExplorer error_row
 mean_length_errors_m save_plan load_plan write_results read_results results_table check Split
-TrainingArrays AffordanceCNP AttentiveCNP FiLMNetwork calibration_rows refuse_seen
+TrainingArrays AffordanceCNP AttentiveCNP FiLMNetwork calibration_rows train_model refuse_seen
 outline_in_lever_frame plot_levered plot_pursuit show_animation
 """,
 )

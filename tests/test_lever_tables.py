@@ -8,9 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from affordlib.evaluation import lever_tables, lever_up
-from affordlib.evaluation.lever_tuning import SETTINGS, TRAINED, changed
-from affordlib.evaluation.lever_up import LeverUnit, guess, run_unit, split_of
 from affordlib.interactions import open_interactions
 from affordlib.interactions.lever import (
     lever_arrays,
@@ -23,8 +20,11 @@ from affordlib.models.lever import (
     beginning_errors_m,
     window_errors_m,
 )
-from affordlib.models.make_checkpoints import shipped_lever_model
 from affordlib.paths import repo_root
+from experiments import lever_tables, lever_up
+from experiments.lever_tuning import SETTINGS, TRAINED, changed
+from experiments.lever_up import LeverUnit, guess, run_unit, split_of
+from experiments.make_checkpoints import shipped_lever_model
 
 
 def test_baselines_are_right_about_what_they_assume():

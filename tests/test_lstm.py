@@ -11,11 +11,10 @@ from affordlib.interactions.batches import draw_forward
 from affordlib.interactions.lever import SEEN
 from affordlib.models import build
 from affordlib.models.lever import beginning_errors_m, window_errors_m
-from affordlib.models.lstm import LSTMConfig
-from affordlib.models.lstm_published import PublishedConfig, PublishedLSTM, train_published
-from affordlib.models.make_checkpoints import courses
+from affordlib.models.lstm import LSTMConfig, courses
 from affordlib.models.protocol import EffectModel, observe_actions
 from affordlib.primitives import Push
+from experiments.lstm_published import PublishedConfig, PublishedLSTM, train_published
 
 
 def test_the_published_network_is_the_published_one(levered):
@@ -29,7 +28,7 @@ def test_the_published_network_is_the_published_one(levered):
 
 @pytest.fixture
 def small_published(levered, monkeypatch):
-    from affordlib.models import lstm_published
+    from experiments import lstm_published
 
     monkeypatch.setattr(lstm_published, "CONVOLUTION_WIDTHS", (2, 2, 2, 2))
     monkeypatch.setattr(lstm_published, "LEVER_IMAGE_PIXELS", 48)
@@ -83,7 +82,7 @@ def test_gradients_that_vanish_are_forgotten(tmp_path, levered, small_published,
         of["exp_avg"].fill_(1e-39)
 
     def go_on(vanishes):
-        monkeypatch.setattr("affordlib.models.lstm_published.VANISHES", vanishes)
+        monkeypatch.setattr("experiments.lstm_published.VANISHES", vanishes)
         model, file = small_published(), tmp_path / f"{vanishes}.pt"
         torch.save(state, file)
         train_published(model, levered, levered, "window", 2, checkpoint=file)

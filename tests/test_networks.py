@@ -26,12 +26,12 @@ from affordlib.models import (
 )
 from affordlib.models.frame import heading
 from affordlib.models.lstm import LSTMConfig
-from affordlib.models.lstm_published import PublishedConfig
 from affordlib.models.protocol import observe_final_effect
 from affordlib.models.training import batch_loss
 from affordlib.primitives import Drag, Push
 from affordlib.types import Observations
 from affordlib.world import Cuboid, UprightCylinder
+from experiments.lstm_published import PublishedConfig
 
 YAW = {"action_channels": ("x", "y", "yaw"), "effect_channels": ("x", "y", "yaw")}
 SMALL = {"width": 32, "blocks": 2, "rings": 3, "orders": 4}

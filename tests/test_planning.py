@@ -13,7 +13,6 @@ from affordlib.evaluation.goals import (
     frozen_tasks,
     uniform_tasks,
 )
-from affordlib.evaluation.planning import measure, outcome_record, planning_rows
 from affordlib.models import EffectModel, load_checkpoint
 from affordlib.planning import (
     carry_out,
@@ -27,6 +26,7 @@ from affordlib.planning.steps import roll_out
 from affordlib.primitives import Drag, Push
 from affordlib.types import Goal, Observations, Prediction
 from affordlib.world import Cuboid
+from experiments.planning import measure, outcome_record, planning_rows
 
 IMAGE = np.zeros((2, 48, 48), dtype=np.float32)
 REACH_M = 0.09

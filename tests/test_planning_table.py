@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from affordlib.evaluation import planners, planning
 from affordlib.evaluation.goals import (
     FAMILIES,
     ROLLABLE,
@@ -15,8 +14,13 @@ from affordlib.evaluation.goals import (
     frozen_tasks,
     main,
 )
-from affordlib.evaluation.planners import VARIANTS
-from affordlib.evaluation.planning import (
+from affordlib.paths import repo_root
+from affordlib.planning import MODES, plan_astar
+from affordlib.primitives import Drag
+from affordlib.results import read_results
+from experiments import planners, planning
+from experiments.planners import VARIANTS
+from experiments.planning import (
     PARTS,
     attempt,
     decomposition_rows,
@@ -24,10 +28,6 @@ from affordlib.evaluation.planning import (
     planning_rows,
     tasks_sha256,
 )
-from affordlib.paths import repo_root
-from affordlib.planning import MODES, plan_astar
-from affordlib.primitives import Drag
-from affordlib.results import read_results
 
 COMMITTED = sorted((repo_root() / PARTS).glob("*.json"))
 
@@ -167,7 +167,7 @@ def test_with_the_simulator_as_model_hardly_anything_remains(world, rollable):
 
 
 def test_the_committed_table_belongs_to_the_shipped_checkpoints():
-    assert COMMITTED, "there are no parts; run python -m affordlib.evaluation.planning"
+    assert COMMITTED, "there are no parts; run python -m experiments.planning"
     for path in COMMITTED:
         part = json.loads(path.read_text())
         assert part["about"] == VARIANTS[path.stem].about(), f"{path.name} is stale; run it again"

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 import torch
 
-from affordlib.evaluation import ablation, limits, one_for_all, studies
-from affordlib.evaluation.ablation import actions_only, half_blend, random_contexts
-from affordlib.evaluation.studies import cka, read_study
 from affordlib.interactions import TrainingArrays, open_interactions, split_interactions
 from affordlib.interactions.batches import observe_action, sample_batch
 from affordlib.models.frame import heading
-from affordlib.models.rollability import learn_rollability
 from affordlib.types import Prediction
 from affordlib.world import LyingCylinder, UprightCylinder
+from experiments import ablation, limits, one_for_all, studies
+from experiments.ablation import actions_only, half_blend, random_contexts
+from experiments.rollability import learn_rollability
+from experiments.studies import cka, read_study
 
 
 @pytest.fixture(scope="module")
@@ -240,7 +240,7 @@ def test_reach_as_learned_agrees_with_the_kinematics(monkeypatch):
 
 
 def test_hashes_of_settings_are_the_same_in_every_process():
-    code = "from affordlib.evaluation.studies import *; print({n: hashes(n) for n in STUDIES})"
+    code = "from experiments.studies import *; print({n: hashes(n) for n in STUDIES})"
     told = {
         subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout
         for _ in range(2)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from affordlib.evaluation.tails import Reading, crps, judge, readings
 from affordlib.paths import repo_root
 from affordlib.results import read_results
+from experiments.tails import Reading, crps, judge, readings
 
 
 @pytest.mark.parametrize("z", [-2.0, 0.0, 0.7])

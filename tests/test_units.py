@@ -7,9 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from affordlib.evaluation import grasps as grasps_module
-from affordlib.evaluation import pooled, tables, units
-from affordlib.evaluation.units import Unit, configuration_sha256, read_part, run_unit, run_units
 from affordlib.interactions import (
     Normaliser,
     TrainingArrays,
@@ -20,6 +17,9 @@ from affordlib.models.checkpoint import checkpoint_sha256, save_checkpoint
 from affordlib.models.weight_files import read_weights, write_weights
 from affordlib.paths import repo_root
 from affordlib.results import read_results
+from experiments import grasps as grasps_module
+from experiments import pooled, tables, units
+from experiments.units import Unit, configuration_sha256, read_part, run_unit, run_units
 
 COMMITTED = repo_root() / "data" / "results" / "effect_prediction.json"
 FEW = [Unit("constant", "grasp", fold=fold) for fold in range(3)]

@@ -8,7 +8,7 @@ from affordlib.models.ensemble import Ensemble
 from affordlib.models.film import FiLMConfig, FiLMNetwork
 from affordlib.models.network import EffectNetwork, NetworkConfig, OutOfRangeWarning
 from affordlib.models.protocol import EffectModel, observe_actions
-from affordlib.models.training import TrainingConfig, train, train_literal
+from affordlib.models.training import TrainingConfig, train, train_literal, train_model
 
 __all__ = [
     "AffordanceCNP",
@@ -32,4 +32,5 @@ __all__ = [
     "save_checkpoint",
     "train",
     "train_literal",
+    "train_model",
 ]

@@ -7,7 +7,7 @@
 `LSTMNetwork` is the well-tuned one, of about a million parameters: it predicts the change of the
 increment, in standardised units, and is trained through its own rollouts. The one of the older
 study (Seker, Tekden and Ugur, Deep effect trajectory prediction in robot manipulation, Robotics and
-Autonomous Systems, 2019) is in `lstm_published.py`.
+Autonomous Systems, 2019) is among the experiments.
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from affordlib import checked
-from affordlib.interactions.batches import Normaliser
+from affordlib.interactions.batches import Normaliser, TrainingArrays, observe_action, turn
 from affordlib.models.anchored import MeanCourse
 from affordlib.models.film import CircularHarmonics, dense, waves
+from affordlib.models.frame import heading, inverse
 from affordlib.models.network import (
     EffectNetwork,
     NetworkConfig,
@@ -183,3 +184,14 @@ def _between(values: Float[Tensor, "b n c"], at: Float[Tensor, "b t"]) -> Float[
         return values.gather(1, index[..., None].expand(-1, -1, values.shape[-1]))
 
     return (1 - share) * pick(below) + share * pick(below + 1)
+
+
+def courses(model: LSTMNetwork, arrays: TrainingArrays) -> Tensor:
+    """Effects (2N, steps + 1, C) and their mirror images, in the frame and at the steps of it."""
+    both = arrays.joined(arrays.turned(0, mirror=True))
+    at = torch.linspace(0, len(both.phase) - 1, model.config.steps + 1).round().long()
+    if model.config.frame == "table":
+        return both.effect[:, at]
+    channels = both.action_channels, both.effect_channels
+    back = inverse(heading(observe_action(both), *channels))[:, None]
+    return turn(both.effect[:, at], channels[1], back, absolute_yaw=False)

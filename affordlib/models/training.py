@@ -14,17 +14,27 @@ from dataclasses import asdict, astuple, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+import xarray as xr
 from tqdm.auto import tqdm
 
 from affordlib.interactions.batches import (
     Batch,
+    Normaliser,
+    Split,
+    Symmetry,
     TrainingArrays,
     observe_action,
     plane_of,
     sample_batch,
+    symmetric_copies,
 )
-from affordlib.models.network import EffectNetwork
+from affordlib.models.calibration import fit_temperature
+from affordlib.models.checkpoint import build
+from affordlib.models.cnp import CNPConfig
+from affordlib.models.lstm import LSTMNetwork, courses
+from affordlib.models.network import EffectNetwork, NetworkConfig
 from affordlib.models.weight_files import load_state, save_state
 from affordlib.types import Observations, check_count, check_field, check_within
 
@@ -359,3 +369,43 @@ def train_literal(
             break
     model.load_state_dict(state)
     return losses
+
+
+def train_model(
+    data: xr.Dataset,
+    split: Split,
+    config: TrainingConfig,
+    model_config: NetworkConfig | None = None,
+    progress: bool = True,
+    symmetries: tuple[Symmetry, ...] = (),
+    checkpoint: str | Path | None = None,
+    draw: Draw = sample_batch,
+) -> tuple[EffectNetwork, list[TrainingRecord]]:
+    """A network (default: the paper's), trained on a split's training part.
+
+    Its validation part stops the training and calibrates σ. symmetries: see `symmetric_copies`;
+    checkpoint, draw: see `train`.
+    """
+    model_config = model_config or CNPConfig()
+    channels = model_config.action_channels, model_config.effect_channels
+    training = TrainingArrays.from_dataset(data, split.train, *channels)
+    validation = TrainingArrays.from_dataset(data, split.validation, *channels)
+    if symmetries:
+        training = symmetric_copies(training, symmetries)
+    torch.manual_seed(config.seed)
+    model = build(model_config, Normaliser.fit(training))
+    if isinstance(model, LSTMNetwork):
+        model.fit_course(courses(model, training))
+    history = train(model, training, validation, config, progress, checkpoint, draw)
+    fit_temperature(model, validation)
+    return model, history
+
+
+def about_training(data: xr.Dataset, seen: np.ndarray, config: TrainingConfig) -> dict[str, object]:
+    """What a checkpoint says of its training: data set, interactions seen, settings."""
+    settings = {k: v for k, v in vars(config).items() if k != "max_minutes"}
+    return {
+        "recipe": data.attrs["recipe"],
+        "seen_interactions": sorted(int(i) for i in data["interaction"].values[seen]),
+        "training": settings,
+    }

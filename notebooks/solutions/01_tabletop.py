@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from affordlib.exercises import check
 from affordlib.primitives import DURATION_S, Push
 from affordlib.world import Cuboid, Tabletop
+from exercises import check
 
 
 def speed_m_s(t):

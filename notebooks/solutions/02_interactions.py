@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
-from affordlib.exercises import check
 from affordlib.interactions import open_interactions
+from exercises import check
 
 
 def spread_of_drags_mm():

@@ -2,10 +2,10 @@
 
 import torch
 
-from affordlib.exercises import check
 from affordlib.interactions import TrainingArrays, open_interactions, split_interactions
 from affordlib.interactions.batches import observe
 from affordlib.models import load_checkpoint
+from exercises import check
 
 
 @torch.no_grad()

@@ -4,10 +4,10 @@ import numpy as np
 import torch
 
 from affordlib.evaluation.answers import network_answers
-from affordlib.exercises import check
 from affordlib.interactions import open_interactions
 from affordlib.interactions.batches import observe_action
 from affordlib.models import load_checkpoint
+from exercises import check
 
 
 @torch.no_grad()

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import torch
 
-from affordlib.evaluation.lever_up import LeverUnit, split_of
-from affordlib.exercises import check
 from affordlib.interactions import open_interactions
 from affordlib.interactions.lever import AHEAD, SEEN, lever_arrays, n_windows, poses_seen
 from affordlib.models import load_checkpoint
 from affordlib.models.lever import errors_m, window_errors_m
+from exercises import check
+from experiments.lever_up import LeverUnit, split_of
 
 levers = open_interactions("lever_up")
 test = lever_arrays(levers, split_of(LeverUnit("anchored"), levers).test)

@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from affordlib.exercises import check
+from exercises import check
 
 
 def chain_end(effects, direction, phase):

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from affordlib.exercises import check
+from exercises import check
 
 
 def bring(look, plan, act):

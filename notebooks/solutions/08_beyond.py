@@ -3,9 +3,9 @@
 import numpy as np
 
 from affordlib.evaluation.answers import final_error, network_answers
-from affordlib.exercises import check
 from affordlib.interactions import open_interactions
 from affordlib.models import load_checkpoint
+from exercises import check
 
 
 def strangeness(image):

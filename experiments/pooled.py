@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from affordlib.evaluation.units import MODELS, PARTS, TEN_TIMES, Unit, read_part
 from affordlib.paths import resolve_out_dir
 from affordlib.world.objects import FAMILIES
+from experiments.units import MODELS, PARTS, TEN_TIMES, Unit, read_part
 
 Part = dict[str, Any]
 

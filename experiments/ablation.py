@@ -18,9 +18,9 @@ from affordlib.interactions import (
 from affordlib.interactions.batches import Batch, observe, sample_batch
 from affordlib.models.checkpoint import build
 from affordlib.models.film import FiLMNetwork
-from affordlib.models.make_checkpoints import SHIPPED
 from affordlib.models.protocol import observe_final_effect
 from affordlib.models.training import final_errors_m, literal_draw, train
+from experiments.make_checkpoints import SHIPPED
 
 Rows = list[dict[str, Any]]
 

@@ -20,7 +20,7 @@ from affordlib.interactions import TrainingArrays, open_interactions, split_inte
 from affordlib.interactions.batches import plane_of
 from affordlib.models.calibration import AFTER_CONTACT, LEVELS, effects_at
 from affordlib.models.checkpoint import load_checkpoint
-from affordlib.models.make_checkpoints import SHIPPED
+from experiments.make_checkpoints import SHIPPED
 
 CHECKPOINTS = ("push_film", "push_cnp", "drag_film")
 """Those whose validation data are shipped."""

@@ -6,12 +6,9 @@ import argparse
 import math
 import sys
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
-import torch
 import xarray as xr
-from torch import Tensor
 
 from affordlib.commands import command
 from affordlib.interactions import (
@@ -24,28 +21,29 @@ from affordlib.interactions import (
 from affordlib.interactions.batches import (
     Symmetry,
     draw_forward,
-    observe_action,
     plane_of,
     sample_batch,
-    symmetric_copies,
-    turn,
 )
 from affordlib.interactions.store import SUFFIX as DATA_SUFFIX
 from affordlib.models.attention import AttentionConfig
-from affordlib.models.calibration import fit_temperature
-from affordlib.models.checkpoint import SUFFIX, build, load_checkpoint, save_checkpoint
+from affordlib.models.checkpoint import SUFFIX, load_checkpoint, save_checkpoint
 from affordlib.models.cnp import CNPConfig
 from affordlib.models.film import FiLMConfig
-from affordlib.models.frame import heading, inverse
 from affordlib.models.lever import (
     LEVER_MODELS,
     LeverModel,
     lever_training,
     train_lever_model,
 )
-from affordlib.models.lstm import LSTMConfig, LSTMNetwork
+from affordlib.models.lstm import LSTMConfig
 from affordlib.models.network import EffectNetwork, NetworkConfig
-from affordlib.models.training import Draw, TrainingConfig, TrainingRecord, final_errors_m, train
+from affordlib.models.training import (
+    Draw,
+    TrainingConfig,
+    about_training,
+    final_errors_m,
+    train_model,
+)
 from affordlib.paths import repo_root
 
 
@@ -121,57 +119,6 @@ SHIPPED_LEVER: dict[str, tuple[str, str]] = {
     "lever_lstm_first_step": ("lstm_tuned", "first_step"),
 }
 """Of lever-ups: which of `LEVER_MODELS`, and the protocol that it was trained for."""
-
-
-def train_model(
-    data: xr.Dataset,
-    split: Split,
-    config: TrainingConfig,
-    model_config: NetworkConfig | None = None,
-    progress: bool = True,
-    symmetries: tuple[Symmetry, ...] = (),
-    checkpoint: str | Path | None = None,
-    draw: Draw = sample_batch,
-) -> tuple[EffectNetwork, list[TrainingRecord]]:
-    """A network (default: the paper's), trained on a split's training part.
-
-    Its validation part stops the training and calibrates σ. symmetries: see `symmetric_copies`;
-    checkpoint, draw: see `train`.
-    """
-    model_config = model_config or CNPConfig()
-    channels = model_config.action_channels, model_config.effect_channels
-    training = TrainingArrays.from_dataset(data, split.train, *channels)
-    validation = TrainingArrays.from_dataset(data, split.validation, *channels)
-    if symmetries:
-        training = symmetric_copies(training, symmetries)
-    torch.manual_seed(config.seed)
-    model = build(model_config, Normaliser.fit(training))
-    if isinstance(model, LSTMNetwork):
-        model.fit_course(courses(model, training))
-    history = train(model, training, validation, config, progress, checkpoint, draw)
-    fit_temperature(model, validation)
-    return model, history
-
-
-def courses(model: LSTMNetwork, arrays: TrainingArrays) -> Tensor:
-    """Effects (2N, steps + 1, C) and their mirror images, in the frame and at the steps of it."""
-    both = arrays.joined(arrays.turned(0, mirror=True))
-    at = torch.linspace(0, len(both.phase) - 1, model.config.steps + 1).round().long()
-    if model.config.frame == "table":
-        return both.effect[:, at]
-    channels = both.action_channels, both.effect_channels
-    back = inverse(heading(observe_action(both), *channels))[:, None]
-    return turn(both.effect[:, at], channels[1], back, absolute_yaw=False)
-
-
-def about_training(data: xr.Dataset, seen: np.ndarray, config: TrainingConfig) -> dict[str, object]:
-    """What a checkpoint says of its training: data set, interactions seen, settings."""
-    settings = {k: v for k, v in vars(config).items() if k != "max_minutes"}
-    return {
-        "recipe": data.attrs["recipe"],
-        "seen_interactions": sorted(int(i) for i in data["interaction"].values[seen]),
-        "training": settings,
-    }
 
 
 def make(name: str) -> None:

@@ -4,7 +4,7 @@ Each planner is a variant: a planner, the models it sees, and how often it may c
 outcomes on the frozen goals are written, whole or not at all, as a part; the table is assembled
 from the parts that are there.
 
-    python -m affordlib.evaluation.planning --variants continuous astar
+    python -m experiments.planning --variants continuous astar
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ import torch
 from tqdm.auto import tqdm
 
 from affordlib.commands import command
-from affordlib.evaluation import reported
 from affordlib.evaluation.answers import rounded
 from affordlib.evaluation.effect_prediction import error_row
 from affordlib.evaluation.goals import FROZEN, ROLLABLE, STANDING, PlanningTask, frozen_tasks
-from affordlib.evaluation.planners import VARIANTS
 from affordlib.paths import repo_root
 from affordlib.planning import PlanMode, carry_out
 from affordlib.results import write_results, write_text_atomically
 from affordlib.types import Goal, Outcome, Plan
 from affordlib.world import Tabletop, UnreachableError
+from experiments import reported
+from experiments.planners import VARIANTS
 
 NUDGE_M, NUDGE_RAD = 0.001, math.radians(1.0)
 PARTS = "data/results/parts/planning"
@@ -186,7 +186,7 @@ def assemble() -> Path:
         if not _is_done(name):
             raise ValueError(
                 f"part {_part(name).name} is of other goals or settings than {name!r} has now; run "
-                f"`python -m affordlib.evaluation.planning --variants {name}` again, or delete it"
+                f"`python -m experiments.planning --variants {name}` again, or delete it"
             )
         part = json.loads(_part(name).read_text())
         parts[name] = part["records"]
@@ -293,7 +293,7 @@ def paired_rows(
 def main(argv: Sequence[str] | None = None) -> int:
     """Measure planners on the frozen goals and make the table from all that were measured."""
     parser = argparse.ArgumentParser(
-        prog="python -m affordlib.evaluation.planning", description=main.__doc__
+        prog="python -m experiments.planning", description=main.__doc__
     )
     parser.add_argument("--variants", nargs="*", choices=list(VARIANTS), default=list(VARIANTS))
     options = parser.parse_args(argv)

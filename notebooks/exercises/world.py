@@ -7,10 +7,10 @@ from functools import cache
 
 import numpy as np
 
-from affordlib.exercises.checking import Exercise, asked
 from affordlib.interactions import open_interactions
 from affordlib.primitives import DURATION_S, Push
 from affordlib.world import FAMILIES, Cuboid, Tabletop
+from exercises.checking import Exercise, asked
 
 # 01 The tabletop
 

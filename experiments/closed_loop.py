@@ -1,6 +1,6 @@
 """Closing the loop, in figures: height, orientation, disturbances, reachability of random goals.
 
-    python -m affordlib.evaluation.closed_loop --tables height,orientation
+    python -m experiments.closed_loop --tables height,orientation
 
 Trial i of a table is a function of the seed and i: object, start, goal and disturbances are drawn
 before anything plans, on objects that no model has seen. A trial's record is kept as soon as it is
@@ -25,8 +25,6 @@ from tqdm.auto import tqdm
 
 from affordlib.commands import command, count_type, names_type, seed_type
 from affordlib.evaluation.answers import rounded
-from affordlib.evaluation.closed_loop_tables import ROWS, WITHIN_HEIGHT_M
-from affordlib.evaluation.feasibility import half_width_m, is_feasible, on_the_rim
 from affordlib.models.checkpoint import checkpoint_sha256
 from affordlib.models.weight_files import weights_bytes
 from affordlib.paths import repo_root
@@ -40,6 +38,8 @@ from affordlib.results import write_results, write_text_atomically
 from affordlib.types import TABLE_X_M, TABLE_Y_M, Goal
 from affordlib.workers import dask_client
 from affordlib.world import Tabletop, Thing, family_named
+from experiments.closed_loop_tables import ROWS, WITHIN_HEIGHT_M
+from experiments.feasibility import half_width_m, is_feasible, on_the_rim
 
 if TYPE_CHECKING:
     from dask.distributed import Client
@@ -240,7 +240,7 @@ def run_table(
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the trials of the closed loop that are missing, and write the tables."""
     parser = argparse.ArgumentParser(
-        prog="python -m affordlib.evaluation.closed_loop", description=main.__doc__
+        prog="python -m experiments.closed_loop", description=main.__doc__
     )
     parser.add_argument("--tables", type=names_type(N_TRIALS), default=",".join(N_TRIALS))
     parser.add_argument("--n", type=count_type, help="trials of each table (default: all)")

@@ -6,8 +6,8 @@ is one training, or one baseline, tested in every protocol that it is trained fo
 the errors of every test trajectory. Errors are distances between foreseen and true positions, in
 cm, after steps of 150 ms. `lever_tables.py` makes the tables.
 
-    python -m affordlib.evaluation.lever_up --models anchored,anchored_single,lstm_tuned,paper
-    python -m affordlib.evaluation.lever_up --models lstm_published --folds 3
+    python -m experiments.lever_up --models anchored,anchored_single,lstm_tuned,paper
+    python -m experiments.lever_up --models lstm_published --folds 3
 
 The last takes an hour of one core for each of its two trainings a fold. glibc gives its large
 arrays back after every step; with `MALLOC_MMAP_MAX_=0 MALLOC_TRIM_THRESHOLD_=60000000000` before
@@ -31,13 +31,6 @@ import xarray as xr
 from torch import Tensor
 
 from affordlib.commands import command, count_type, names_type, whole_type
-from affordlib.evaluation.parts import (
-    checked_part,
-    open_once,
-    options_of,
-    run_parts,
-    sha256_of,
-)
 from affordlib.interactions import Normaliser, Split, TrainingArrays, split_interactions
 from affordlib.interactions.batches import believable
 from affordlib.interactions.lever import AHEAD, POSE_CHANNELS, SEEN, lever_arrays, n_windows
@@ -53,16 +46,23 @@ from affordlib.models.lever import (
     foresee,
     train_lever_model,
 )
-from affordlib.models.lstm_published import (
+from affordlib.models.network import EffectNetwork
+from affordlib.results import write_text_atomically
+from affordlib.types import Prediction
+from experiments.lstm_published import (
     EPOCHS,
     PublishedConfig,
     PublishedLSTM,
     train_published,
 )
-from affordlib.models.make_checkpoints import shipped_lever_model
-from affordlib.models.network import EffectNetwork
-from affordlib.results import write_text_atomically
-from affordlib.types import Prediction
+from experiments.make_checkpoints import shipped_lever_model
+from experiments.parts import (
+    checked_part,
+    open_once,
+    options_of,
+    run_parts,
+    sha256_of,
+)
 
 FORMAT = 1
 """Counts the changes of code that change a unit's numbers without changing its configuration."""
@@ -289,7 +289,7 @@ def _answers(found: list[tuple[Prediction, Tensor]]) -> dict[str, Any]:
 def main(argv: Sequence[str] | None = None) -> int:
     """Train and test models in folds; finished parts are kept, interrupted ones go on."""
     parser = argparse.ArgumentParser(
-        prog="python -m affordlib.evaluation.lever_up", description=main.__doc__
+        prog="python -m experiments.lever_up", description=main.__doc__
     )
     parser.add_argument("--models", type=names_type(MODELS), default="anchored,lstm_tuned")
     parser.add_argument("--folds", type=whole_type(1, N_FOLDS), default=N_FOLDS, help="of the five")

@@ -1,6 +1,6 @@
 """`data/results/lever_up.json` from the parts that `lever_up.py` wrote (Table 1 of the paper).
 
-    python -m affordlib.evaluation.lever_tables
+    python -m experiments.lever_tables
 
 An object's errors are meaned over its windows; means, standard errors and intervals are over
 objects. A part whose hash is not its unit's is refused.
@@ -20,8 +20,12 @@ from typing import Any
 import numpy as np
 
 from affordlib.commands import command
-from affordlib.evaluation import reported
-from affordlib.evaluation.lever_up import (
+from affordlib.interactions.lever import POSE_CHANNELS
+from affordlib.models.lever import PROTOCOLS
+from affordlib.paths import resolve_out_dir
+from affordlib.results import write_results
+from experiments import reported
+from experiments.lever_up import (
     BASELINES,
     MODELS,
     NAME,
@@ -32,12 +36,8 @@ from affordlib.evaluation.lever_up import (
     hashes,
     numbered_edges,
 )
-from affordlib.evaluation.parts import checked_part
-from affordlib.evaluation.studies import read_study
-from affordlib.interactions.lever import POSE_CHANNELS
-from affordlib.models.lever import PROTOCOLS
-from affordlib.paths import resolve_out_dir
-from affordlib.results import write_results
+from experiments.parts import checked_part
+from experiments.studies import read_study
 
 OURS = "anchored"
 RESTS_M = 0.005
@@ -269,7 +269,7 @@ def assemble(folder: str | Path = PARTS, out_dir: str | Path = "data/results") -
 def main(argv: Sequence[str] | None = None) -> int:
     """Make the tables of lever-ups from the parts that units wrote."""
     parser = argparse.ArgumentParser(
-        prog="python -m affordlib.evaluation.lever_tables", description=main.__doc__
+        prog="python -m experiments.lever_tables", description=main.__doc__
     )
     parser.add_argument("--parts", default=PARTS)
     parser.add_argument("--out", default="data/results")

@@ -1,6 +1,6 @@
 """`data/results/effect_prediction.json` from the parts that units wrote.
 
-    python -m affordlib.evaluation.tables
+    python -m experiments.tables
 
 Means and standard errors are over objects, an object's errors by several trainings meaned first;
 `all` is the mean over object classes with equal weights. Medians and 95th percentiles are over all
@@ -19,14 +19,14 @@ from typing import Any
 import numpy as np
 
 from affordlib.commands import command
-from affordlib.evaluation import reported
 from affordlib.evaluation.answers import calibration, final_error, yaw_error
-from affordlib.evaluation.grasps import grasp_rows, roc_rows, threshold_rows
-from affordlib.evaluation.pooled import Part, by_model, data_of, pool, read_parts
-from affordlib.evaluation.studies import FOLDER as STUDIES_FOLDER
-from affordlib.evaluation.studies import STUDIES, read_study
-from affordlib.evaluation.units import NETWORKS, PARTS, Unit
 from affordlib.results import write_results
+from experiments import reported
+from experiments.grasps import grasp_rows, roc_rows, threshold_rows
+from experiments.pooled import Part, by_model, data_of, pool, read_parts
+from experiments.studies import FOLDER as STUDIES_FOLDER
+from experiments.studies import STUDIES, read_study
+from experiments.units import NETWORKS, PARTS, Unit
 
 NAME = "effect_prediction"
 KNOWS = {
@@ -213,9 +213,7 @@ def ensemble_rows(parts: list[tuple[Unit, Part]]) -> list[dict[str, Any]]:
 @command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
     """Make the tables of effect prediction from the parts that units wrote."""
-    parser = argparse.ArgumentParser(
-        prog="python -m affordlib.evaluation.tables", description=main.__doc__
-    )
+    parser = argparse.ArgumentParser(prog="python -m experiments.tables", description=main.__doc__)
     parser.add_argument("--parts", default=PARTS)
     parser.add_argument("--out", default="data/results")
     parser.add_argument("--studies", default=STUDIES_FOLDER)

@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from affordlib.evaluation.planning import NUDGE_M, NUDGE_RAD
 from affordlib.interactions import open_interactions
 from affordlib.interactions.recipes import Recipe, draw_scene, draw_world
 from affordlib.models.checkpoint import load_checkpoint
@@ -29,6 +28,7 @@ from affordlib.planning.reachability import SHIPPED as REACHABILITY
 from affordlib.planning.reachability import Reachability
 from affordlib.primitives import PRIMITIVES, Drag, Grasp, Push, Rotate
 from affordlib.world import Tabletop
+from experiments.planning import NUDGE_M, NUDGE_RAD
 
 Rows = list[dict[str, Any]]
 

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from affordlib.evaluation.answers import final_error
-from affordlib.evaluation.pooled import Part, by_model
-from affordlib.evaluation.units import Unit
 from affordlib.primitives import Grasp
+from experiments.pooled import Part, by_model
+from experiments.units import Unit
 
 AIM_TP, AIM_TN = 0.90, 0.95
 """Shares of the true successes and failures that we would have foreseen."""

@@ -5,7 +5,7 @@ asks it about the test part: the image and the commanded action at t = 0 and t =
 answers are written, whole or not at all, to `data/results/parts/` with the hashes of its
 configuration and of its data; a part that is there is not made again. `tables.py` makes the tables.
 
-    python -m affordlib.evaluation.units --models film,paper --sets push --folds 3
+    python -m experiments.units --models film,paper --sets push --folds 3
 """
 
 from __future__ import annotations
@@ -32,8 +32,6 @@ from affordlib.evaluation.answers import (
     summary,
 )
 from affordlib.evaluation.baselines import BASELINES
-from affordlib.evaluation.inverse import along_effect, executed_record, inverse_record
-from affordlib.evaluation.parts import checked_part, open_once, options_of, run_parts, sha256_of
 from affordlib.interactions import Normaliser, Split, TrainingArrays, split_interactions
 from affordlib.interactions.batches import Symmetry, believable, symmetric_copies
 from affordlib.interactions.store import stored_sha256
@@ -43,18 +41,18 @@ from affordlib.models.checkpoint import load_checkpoint
 from affordlib.models.cnp import CNPConfig
 from affordlib.models.ensemble import Ensemble
 from affordlib.models.film import FiLMConfig
-from affordlib.models.make_checkpoints import (
-    GRASP_SYMMETRIES,
-    HALF_TURNS,
-    SHIPPED,
-    about_training,
-    train_model,
-)
 from affordlib.models.network import EffectNetwork, NetworkConfig
-from affordlib.models.training import TrainingConfig
+from affordlib.models.training import TrainingConfig, about_training, train_model
 from affordlib.paths import repo_root
 from affordlib.results import write_text_atomically
 from affordlib.workers import dask_client
+from experiments.inverse import along_effect, executed_record, inverse_record
+from experiments.make_checkpoints import (
+    GRASP_SYMMETRIES,
+    HALF_TURNS,
+    SHIPPED,
+)
+from experiments.parts import checked_part, open_once, options_of, run_parts, sha256_of
 
 if TYPE_CHECKING:
     from dask.distributed import Client
@@ -367,9 +365,7 @@ def run_units(
 @command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
     """Train and test models in folds; finished parts are kept, interrupted ones go on."""
-    parser = argparse.ArgumentParser(
-        prog="python -m affordlib.evaluation.units", description=main.__doc__
-    )
+    parser = argparse.ArgumentParser(prog="python -m experiments.units", description=main.__doc__)
     models, sets = (f"of {','.join(known)}" for known in (MODELS, SETS))
     parser.add_argument("--models", type=names_type(MODELS), default="film,paper", help=models)
     parser.add_argument("--sets", type=names_type(SETS), default="push", help=sets)

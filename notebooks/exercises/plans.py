@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from affordlib.exercises.checking import Exercise, answered, asked
 from affordlib.models import load_checkpoint
 from affordlib.perception import Percept
 from affordlib.planning import EffectMap, map_effects, plan_continuous
@@ -19,6 +18,7 @@ from affordlib.planning.steps import roll_out
 from affordlib.primitives import Grasp, Push
 from affordlib.types import Goal, Plan, Step
 from affordlib.world import Cuboid, Prism, Tabletop, UprightCylinder
+from exercises.checking import Exercise, answered, asked
 
 BOX = Cuboid(length=0.07, width=0.05, height=0.05)
 YAW_RAD = 0.3

@@ -13,7 +13,7 @@
     lever_tuning  ours and the recurrent network on lever-ups, with the same budget of settings
     tails         why σ is too wide for most pushes: three readings of what is off, and by how much
 
-    python -m affordlib.evaluation.studies --only latent rollability
+    python -m experiments.studies --only latent rollability
 
 Each is written, whole or not at all, to `data/results/studies/` with the hashes of its data and
 settings; `tables.py` and `lever_tables.py` put them beside the tables of the units.
@@ -35,7 +35,6 @@ import numpy as np
 import torch
 
 from affordlib.commands import command
-from affordlib.evaluation import ablation, lever_tuning, limits, one_for_all, tails
 from affordlib.evaluation.answers import rounded
 from affordlib.evaluation.effect_prediction import refuse_seen
 from affordlib.interactions import TrainingArrays, open_interactions, split_interactions
@@ -45,14 +44,15 @@ from affordlib.models.calibration import calibration_rows
 from affordlib.models.checkpoint import checkpoint_sha256, load_checkpoint
 from affordlib.models.film import FiLMConfig
 from affordlib.models.frame import heading, inverse, turn_observations
-from affordlib.models.make_checkpoints import SHIPPED, train_model
 from affordlib.models.protocol import observe_final_effect
-from affordlib.models.rollability import learn_rollability
-from affordlib.models.training import final_errors_m
+from affordlib.models.training import final_errors_m, train_model
 from affordlib.paths import resolve_out_dir
 from affordlib.perception import looks_rollable
 from affordlib.results import write_text_atomically
 from affordlib.types import Observations
+from experiments import ablation, lever_tuning, limits, one_for_all, tails
+from experiments.make_checkpoints import SHIPPED
+from experiments.rollability import learn_rollability
 
 FOLDER = "data/results/studies"
 Rows = list[dict[str, Any]]
@@ -333,7 +333,7 @@ def read_study(name: str, folder: str | Path = FOLDER) -> Rows | None:
         if told.get(key) != expected:
             raise ValueError(
                 f"study {path.name} has another {key} than it would have now; run "
-                f"`python -m affordlib.evaluation.studies --only {name}` again"
+                f"`python -m experiments.studies --only {name}` again"
             )
     return told["rows"]
 
@@ -341,9 +341,7 @@ def read_study(name: str, folder: str | Path = FOLDER) -> Rows | None:
 @command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
     """Make studies anew and write them."""
-    parser = argparse.ArgumentParser(
-        prog="python -m affordlib.evaluation.studies", description=main.__doc__
-    )
+    parser = argparse.ArgumentParser(prog="python -m experiments.studies", description=main.__doc__)
     parser.add_argument("--only", nargs="+", choices=sorted(STUDIES), default=list(STUDIES))
     parser.add_argument("--out", default=FOLDER)
     options = parser.parse_args(argv)

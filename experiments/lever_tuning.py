@@ -11,8 +11,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from affordlib.evaluation.lever_up import DATA, LeverUnit, split_of
-from affordlib.evaluation.parts import options_of
 from affordlib.interactions import open_interactions
 from affordlib.interactions.batches import symmetric_copies
 from affordlib.interactions.lever import MIRRORED, lever_arrays
@@ -24,6 +22,8 @@ from affordlib.models.lever import (
     fit_lever_model,
     window_errors_m,
 )
+from experiments.lever_up import DATA, LeverUnit, split_of
+from experiments.parts import options_of
 
 SETTINGS: dict[str, tuple[dict[str, Any], float]] = {
     "rate 0.001": ({}, 1.0),

@@ -10,10 +10,10 @@ from __future__ import annotations
 from typing import Any
 
 from affordlib import checked
-from affordlib.exercises.checking import Exercise, Verdict, judge
-from affordlib.exercises.models import MODELS
-from affordlib.exercises.plans import PLANS
-from affordlib.exercises.world import WORLD
+from exercises.checking import Exercise, Verdict, judge
+from exercises.models import MODELS
+from exercises.plans import PLANS
+from exercises.world import WORLD
 
 __all__ = ["EXERCISES", "Exercise", "Verdict", "check"]
 

@@ -22,17 +22,17 @@ import numpy as np
 import torch
 
 from affordlib.evaluation.answers import final_error, network_answers, summary, yaw_error
-from affordlib.evaluation.parts import open_once
-from affordlib.evaluation.units import PARTS, TASKS, Unit, configuration_sha256, read_part, run_unit
 from affordlib.interactions import Normaliser, TrainingArrays, split_interactions
 from affordlib.interactions.batches import Symmetry, observe_action, symmetric_copies
 from affordlib.models.checkpoint import build
 from affordlib.models.film import FiLMConfig
-from affordlib.models.make_checkpoints import SHIPPED
 from affordlib.models.network import EffectNetwork
 from affordlib.models.training import train
 from affordlib.paths import resolve_out_dir
 from affordlib.primitives import Grasp
+from experiments.make_checkpoints import SHIPPED
+from experiments.parts import open_once
+from experiments.units import PARTS, TASKS, Unit, configuration_sha256, read_part, run_unit
 
 PRIMITIVES = ("push", "drag", "grasp", "rotate")
 NETWORK = FiLMConfig(

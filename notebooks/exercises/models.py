@@ -9,10 +9,10 @@ import numpy as np
 import torch
 
 from affordlib.evaluation.answers import network_answers
-from affordlib.exercises.checking import Exercise, asked
 from affordlib.interactions import TrainingArrays, open_interactions, split_interactions
 from affordlib.interactions.batches import observe_action
 from affordlib.models import coverage, load_checkpoint
+from exercises.checking import Exercise, asked
 
 # 03 The affordance network
 

@@ -10,13 +10,13 @@ from typing import Any, TypeVar
 import numpy as np
 
 from affordlib.evaluation.goals import FAMILIES, ROLLABLE, STANDING
-from affordlib.evaluation.oracle import oracle_effects
 from affordlib.models.checkpoint import checkpoint_sha256, load_checkpoint
 from affordlib.planning import Repertoire, plan_astar, plan_continuous, plan_gradient
 from affordlib.planning.modes import PlanMode, mode_named
 from affordlib.primitives import Drag, Push
 from affordlib.types import Goal, Plan
 from affordlib.world import Tabletop, WorldConfig
+from experiments.oracle import oracle_effects
 
 T = TypeVar("T")
 

@@ -1,0 +1,1 @@
+"""What made the tables, the shipped data and the shipped checkpoints."""
