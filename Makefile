@@ -75,7 +75,7 @@ workbook: $(STAMP) ## Run all notebooks into runs/ (PROFILE=smoke|reader|full SE
 	  --out "$$OUT" --only "$$ONLY" $(if $(FORCE),--force) $(if $(DRY_RUN),--dry-run) -- $$ARGS
 
 seeds: $(STAMP) ## Run them for several seeds, and write tables over seeds (SEEDS="0 1 2" WORKERS=2 …)
-	@set -f; $(PY) -m affordlib.seeds $$SEEDS --workers "$$WORKERS" \
+	@set -f; $(PY) -m experiments.seeds $$SEEDS --workers "$$WORKERS" \
 	  --profile "$${PROFILE:-reader}" --out "$$OUT" --only "$$ONLY" $(if $(FORCE),--force) $(if $(DRY_RUN),--dry-run) \
 	  --settings $$ARGS
 

@@ -190,6 +190,8 @@ def environment_of(layout: Layout) -> dict[str, str]:
     libraries = {name: importlib.metadata.version(name) for name in ("torch", "numpy", "pybullet")}
     return {
         "sources": digest_of(layout.sources),
+        "experiments": digest_of(layout.sources.parent / "experiments"),
+        "exercises": digest_of(layout.notebooks / "exercises"),
         # What the notebooks themselves have written, copied there, is no input of theirs.
         "data": digest_of(layout.data, without="results/[0-9][0-9]_*.json"),
         "python": platform.python_version(),

@@ -61,8 +61,8 @@ def main_of(name):
             "--workers: must be .*'1{5,40}$",
         ),
         ("experiments.make_reachability", ["nope"], "unrecognized arguments: nope"),
-        ("seeds", ["-1"], "seeds: must be a whole number from 0"),
-        ("seeds", ["0", "--workers", "0"], "--workers: must be a whole number from 1"),
+        ("experiments.seeds", ["-1"], "seeds: must be a whole number from 0"),
+        ("experiments.seeds", ["0", "--workers", "0"], "--workers: must be a whole number from 1"),
         ("workbook", ["--seed", "-1"], "--seed: must be a whole number from 0"),
     ],
 )
@@ -76,7 +76,6 @@ def test_unknown_names_and_impossible_numbers_are_refused(capsys, name, argument
 @pytest.mark.parametrize(
     ("name", "arguments"),
     [
-        ("book", ["{}"]),
         ("experiments.units", ["--models", "constant", "--folds", "1", "--out", "{}"]),
         ("experiments.tables", ["--parts", "{}"]),
         ("experiments.lever_tables", ["--parts", "{}"]),

@@ -11,8 +11,7 @@ from test_workbook import Book
 from affordlib.paths import repo_root
 from affordlib.profiles import WorkbookError
 from affordlib.results import read_results, write_results
-from affordlib.seeds import gather, main, over_seeds, run_seeds
-from affordlib.seeds_picture import seeds_picture
+from experiments.seeds import gather, main, over_seeds, run_seeds, seeds_picture
 
 
 def rows(a, b):
