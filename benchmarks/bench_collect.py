@@ -16,7 +16,7 @@ from keeping import keep
 
 from affordlib.interactions.collect import collect
 from affordlib.interactions.recipes import Recipe
-from affordlib.interactions.records import collect_chunk
+from affordlib.interactions.schema import collect_chunk
 
 INTERACTIONS = 200
 ROUNDS = 4

@@ -54,12 +54,12 @@ def main(argv: list[str] | None = None) -> int:
     """
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", nargs="+", choices=sorted(RECIPES), default=list(SHIPPED))
-    parser.add_argument("--to", default=str(repo_root() / "data"), help="a folder or fsspec URL")
+    parser.add_argument("--to", default=str(repo_root() / "data"), help="a folder")
     where = parser.add_mutually_exclusive_group()
     where.add_argument(
         "--workers", type=count_type, default=os.cpu_count() or 1, help="processes here"
     )
-    where.add_argument("--scheduler", help="a Dask scheduler whose workers reach --to: tcp://…")
+    where.add_argument("--scheduler", help="a Dask scheduler: tcp://…")
     arguments = parser.parse_args(argv)
     agree = True
     with dask_client(arguments.workers, arguments.scheduler) as client:

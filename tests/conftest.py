@@ -8,9 +8,9 @@ import torch
 
 from affordlib.interactions import TrainingArrays, collect, open_interactions
 from affordlib.interactions.batches import Normaliser
-from affordlib.interactions.chunks import Layout, Variable
 from affordlib.interactions.collect import collect as collect_set
 from affordlib.interactions.lever import lever_arrays
+from affordlib.interactions.schema import Schema, Variable
 from affordlib.models import AffordanceCNP, CNPConfig, load_checkpoint
 from affordlib.models.lever import LEVER_MODELS
 from affordlib.planning import Repertoire
@@ -122,13 +122,13 @@ def undisturbed(tmp_path_factory):
 def cheap(monkeypatch):
     """Interactions of 20 kB that cost nothing."""
 
-    def layout(recipe, chunk):
-        sizes = {"interaction": recipe.n_interactions, "value": 5000}
-        return Layout({"x": Variable(("interaction", "value"), "float32")}, sizes, {}, chunk)
+    def schema(recipe):
+        variables = {"x": Variable(("interaction", "value"), "float32")}
+        return Schema(variables, {"recipe": recipe.to_json()})
 
     def arrays(recipe, indices):
         values = [np.random.default_rng(i).random(5000, dtype=np.float32) for i in indices]
         return {"x": np.stack(values)}
 
-    monkeypatch.setattr(collect, "describe", layout)
+    monkeypatch.setattr(collect, "schema_for", schema)
     monkeypatch.setattr(collect, "collect_chunk", arrays)

@@ -21,9 +21,7 @@ FORBIDDEN = {
     "planning": {"world", "evaluation", "show"},
     "evaluation": {"show"},
 }
-NO_WORLD = {
-    f"interactions/{name}.py" for name in ("__init__", "batches", "chunks", "places", "store")
-}
+NO_WORLD = {f"interactions/{name}.py" for name in ("__init__", "batches", "store")}
 
 
 def imported(path: Path) -> set[str]:

@@ -1,31 +1,29 @@
-"""Collecting at scale: the same bits whatever is killed, cut off or shared."""
+"""Collecting: the same bits whatever is killed, cut off or shared."""
 
 import errno
-import itertools
-import json
+import math
+import os
 import random
 import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
-import tracemalloc
 import zipfile
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import xarray as xr
-import zarr
-from dask.distributed import Client
 
 import affordlib
 from affordlib.interactions import CorruptedDataError, collect
 from affordlib.interactions.collect import collect as collect_set
 from affordlib.interactions.recipes import Recipe
-from affordlib.interactions.records import collect_chunk, describe
+from affordlib.interactions.schema import collect_chunk, schema_for
 from affordlib.interactions.store import dataset_sha256, open_interactions, stored_sha256
 from experiments import make_data
 
@@ -36,34 +34,29 @@ ROOT = Path(affordlib.__file__).parents[1]
 pytestmark = pytest.mark.usefixtures("small_chunks")
 
 
-@pytest.fixture(scope="module")
-def arrays():
-    """What the interactions left, before anything is stored."""
-    return collect_chunk(SMALL, range(6))
+def names_in(folder):
+    return [path.name for path in folder.iterdir()]
 
 
 @pytest.fixture
-def folder_set(undisturbed, tmp_path):
-    with zipfile.ZipFile(undisturbed(SMALL)) as archive:
-        archive.extractall(tmp_path / "set.zarr")
-    return tmp_path / "set.zarr"
+def made(cheap, monkeypatch):
+    """The first interactions of the chunks that are made."""
+    made, real = [], collect.collect_chunk
+
+    def counted(recipe, indices):
+        made.append(indices.start)
+        return real(recipe, indices)
+
+    monkeypatch.setattr(collect, "collect_chunk", counted)
+    return made
 
 
-def files_of(folder):
-    return {p.relative_to(folder).as_posix(): p for p in folder.rglob("*") if p.is_file()}
-
-
-# The store
+# The file
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "path",
-    ["a.zarr.zip", "a.zarr", "file://{}/a.zarr", "memory://{}/a.zarr", "memory://m.zarr.zip"],
-)
-def test_wherever_it_lies_it_holds_what_the_interactions_left(tmp_path, monkeypatch, arrays, path):
-    monkeypatch.chdir(tmp_path)
-    path = collect_set(SMALL, path.format(tmp_path), progress=False)
+def test_it_holds_what_the_interactions_left(undisturbed):
+    arrays, path = collect_chunk(SMALL, range(6)), undisturbed(SMALL)
     read = open_interactions(path)
     assert sorted(read.variables) == sorted(arrays)
     for name, array in arrays.items():
@@ -71,266 +64,327 @@ def test_wherever_it_lies_it_holds_what_the_interactions_left(tmp_path, monkeypa
         assert read[name].dtype == array.dtype
     straight = xr.Dataset({n: ([f"{n}{k}" for k in range(a.ndim)], a) for n, a in arrays.items()})
     assert dataset_sha256(read) == dataset_sha256(straight) == stored_sha256(path)
-    if "memory" not in str(path):
-        assert [p.name for p in tmp_path.iterdir()] == [Path(path).name]
+    assert read.attrs == schema_for(SMALL).attrs
+    assert names_in(path.parent) == [path.name]
+    assert dataset_sha256(open_interactions(f"file://{path}")) == dataset_sha256(read)
 
 
-def test_each_file_is_written_by_one_task_with_the_promised_codecs(folder_set, arrays):
-    records = [json.loads(p.read_text()) for p in sorted((folder_set / "tasks").iterdir())]
-    assert [r["interactions"] for r in records] == [[0, 2], [2, 4], [4, 6]]
-    written = list(itertools.chain.from_iterable(r["sha256"] for r in records))
-    assert len(set(written)) == len(written)
-    there = {name for name in files_of(folder_set) if "/c" in name}
-    assert set(written) == there
-    manifest = json.loads((folder_set / "manifest.json").read_text())
-    assert manifest["files"].keys() == files_of(folder_set).keys() - {"manifest.json", "done"}
-    image = zarr.open_group(folder_set, mode="r")["image"]
-    blosc, crc = image.compressors
-    assert (blosc.cname.value, blosc.clevel, blosc.shuffle.value) == ("zstd", 7, "shuffle")
-    assert type(crc).__name__ == "Crc32cCodec"
-    np.testing.assert_array_equal(image[2:4], arrays["image"][2:4])
+def test_whatever_is_damaged_is_named(undisturbed, tmp_path):
+    with zipfile.ZipFile(undisturbed(SMALL)) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
 
+    def stored(**changed):
+        path = tmp_path / "set.zarr.zip"
+        with zipfile.ZipFile(path, "w") as archive:
+            for name, content in (files | changed).items():
+                if content is not None:
+                    archive.writestr(name, content)
+        return path
 
-def test_whatever_is_damaged_is_named(folder_set):
     rng = np.random.default_rng(0)
-    for name, file in files_of(folder_set).items():
-        whole = file.read_bytes()
-        damaged = bytearray(whole)
-        damaged[rng.integers(len(whole))] ^= 1 << int(rng.integers(8))
-        file.write_bytes(damaged)
-        with pytest.raises(CorruptedDataError, match=f"{name}.*again"):
-            open_interactions(folder_set)
-        file.unlink()
-        with pytest.raises(CorruptedDataError, match=f"{name}.*again"):
-            open_interactions(folder_set)
-        file.write_bytes(whole)
-    metadata = folder_set / "zarr.json"
-    metadata.write_text(metadata.read_text().replace("depth mask", "mask depth"))
-    with pytest.raises(CorruptedDataError, match=r"zarr\.json is not what was stored"):
-        open_interactions(folder_set)
+    for name, content in files.items():
+        damaged = bytearray(content)
+        damaged[rng.integers(len(content))] ^= 1 << int(rng.integers(8))
+        for what in (None, bytes(damaged)):
+            if name == "manifest.json" and what is not None:
+                what = b"{}"
+            with pytest.raises(CorruptedDataError, match=f"{name}.*again"):
+                open_interactions(stored(**{name: what}))
 
 
-def test_a_mended_set_is_the_same_again(folder_set, monkeypatch):
-    before = {name: file.read_bytes() for name, file in files_of(folder_set).items()}
-    files_of(folder_set)["effect/c.1.0.0"].unlink()
-    files_of(folder_set)["tasks/00000002.json"].write_text("{}")
-    with files_of(folder_set)["image/c.0.0.0.0"].open("r+b") as file:
-        file.truncate(100)
-    (folder_set / "effect" / ".killed.partial").write_text("what a killed worker left")
-    made = []
-
-    def counted(recipe, indices):
-        assert not (folder_set / "done").exists()
-        made.append(indices.start)
-        return collect_chunk(recipe, indices)
-
-    monkeypatch.setattr(collect, "collect_chunk", counted)
-    collect_set(SMALL, folder_set, progress=False)
-    assert made == [0, 2, 4]
-    assert {name: file.read_bytes() for name, file in files_of(folder_set).items()} == before
-    collect_set(SMALL, folder_set, progress=False)
-    assert made == [0, 2, 4]
-
-
-def test_a_folder_of_another_recipe_is_left_alone(folder_set):
-    before = {name: file.read_bytes() for name, file in files_of(folder_set).items()}
-    with pytest.raises(ValueError, match=r"set\.zarr holds a set of another recipe"):
-        collect_set(Recipe(n_interactions=6, seed=12), folder_set, progress=False)
-    assert {name: file.read_bytes() for name, file in files_of(folder_set).items()} == before
-
-
-def test_a_zip_is_made_once_and_no_other_recipe_takes_its_place(tmp_path, cheap, monkeypatch):
-    path, made = tmp_path / "x.zarr.zip", []
-    collect_set(SMALL, path, progress=False)
-    before = path.read_bytes()
-    real = collect.collect_chunk
-
-    def counted(recipe, indices):
-        made.append(indices.start)
-        return real(recipe, indices)
-
-    monkeypatch.setattr(collect, "collect_chunk", counted)
+def test_a_set_is_made_once_and_no_other_recipe_takes_its_place(tmp_path, made):
+    path = tmp_path / "x.zarr.zip"
     assert collect_set(SMALL, path, progress=False) == path
-    assert made == []
-    with monkeypatch.context() as other:
-        layout = replace(collect.describe(SMALL, 2), attrs={"recipe": "another"})
-        other.setattr(collect, "describe", lambda *_: layout)
-        with pytest.raises(ValueError, match=r"x\.zarr\.zip holds a set of another recipe"):
-            collect_set(SMALL, path, progress=False)
-    assert made == []
-    assert path.read_bytes() == before
-    collect_set(SMALL, path, progress=False, replace=True)
     assert made == [0, 2, 4]
+    before = path.read_bytes()
+    collect_set(SMALL, path, progress=False)
+    assert made == [0, 2, 4]
+    with pytest.raises(ValueError, match=r"x\.zarr\.zip holds a set of another recipe"):
+        collect_set(replace(SMALL, seed=12), path, progress=False)
     for foreign in (before[: len(before) // 2], b"notes"):
         path.write_bytes(foreign)
         with pytest.raises(ValueError, match=r"is no whole set of interactions.*replace=True"):
             collect_set(SMALL, path, progress=False)
         assert path.read_bytes() == foreign
+    assert made == [0, 2, 4]
     collect_set(SMALL, path, progress=False, replace=True)
     assert path.read_bytes() == before
-    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+    assert names_in(tmp_path) == [path.name]
 
 
-def test_nothing_foreign_is_replaced_and_no_interaction_is_made(tmp_path, cheap, monkeypatch):
-    monkeypatch.setattr(collect, "collect_chunk", lambda *_: pytest.fail("it collects"))
+def test_nothing_foreign_is_replaced_and_no_interaction_is_made(tmp_path, made):
     (tmp_path / "f.zarr.zip").mkdir()
     (tmp_path / "l.zarr.zip").symlink_to(tmp_path / "nowhere")
-    (tmp_path / "d.zarr").mkdir()
-    (tmp_path / "d.zarr" / "notes").write_text("mine")
-    (tmp_path / "n.zarr").write_text("mine")
     before = sorted(tmp_path.rglob("*"))
-    for name in ("f.zarr.zip", "l.zarr.zip", "d.zarr", "n.zarr"):
+    for name in ("f.zarr.zip", "l.zarr.zip"):
         with pytest.raises(ValueError, match=rf"path .*{name}.* (choose|delete)"):
             collect_set(SMALL, tmp_path / name, progress=False)
     assert sorted(tmp_path.rglob("*")) == before
+    assert made == []
 
 
-@pytest.mark.parametrize("spoil", [{"x": np.zeros(2)}, {"x": np.zeros((3, 2), "f4")}, {}])
-def test_a_chunk_that_is_not_what_was_described_is_refused(tmp_path, cheap, spoil, monkeypatch):
-    monkeypatch.setattr(collect, "collect_chunk", lambda *_: spoil)
-    with pytest.raises(RuntimeError, match=r"interactions 0 to 1 .*'x'"):
-        collect_set(SMALL, tmp_path / "x.zarr", progress=False)
+def test_what_is_missing_or_damaged_is_made_again(tmp_path, made, monkeypatch):
+    path = tmp_path / "x.zarr.zip"
+    with monkeypatch.context() as full:
+        full.setattr(collect, "write_interactions", no_room)
+        with pytest.raises(OSError, match="No space left"):
+            collect_set(SMALL, path, progress=False)
+    first, second, _ = sorted(tmp_path.glob(".x*.parts/*.npz"))
+    first.unlink()
+    damaged = bytearray(second.read_bytes())
+    damaged[len(damaged) // 2] ^= 1
+    second.write_bytes(damaged)
+    collect_set(SMALL, path, progress=False)
+    assert made == [0, 2, 4, 0, 2]
+    whole = collect_set(SMALL, tmp_path / "y.zarr.zip", progress=False)
+    assert path.read_bytes() == whole.read_bytes()
 
 
-def test_a_worker_with_other_packages_is_refused(tmp_path, monkeypatch):
-    numpys = iter(("2.4.6", "1.0"))
-    layouts = (replace(describe(SMALL, 2), attrs={"versions": f"numpy={n}"}) for n in numpys)
-    monkeypatch.setattr(collect, "describe", lambda *_: next(layouts))
-    with pytest.raises(RuntimeError, match=r"another set .*numpy=1\.0.*, not .*numpy=2\.4\.6"):
-        collect_set(SMALL, tmp_path / "x.zarr", progress=False)
+def no_room(*_):
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_a_full_disk_leaves_nothing_that_is_read(tmp_path, cheap, monkeypatch):
+    path, real, room = tmp_path / "full.zarr.zip", os.fsync, []
+
+    def fsync(handle):
+        if not room:
+            no_room()
+        real(handle)
+        room.pop()
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", fsync)
+        for files in (0, 1, 0, 1):  # then two of the three chunks are there
+            room[:] = [True] * files
+            with pytest.raises(OSError, match="No space left"):
+                collect_set(SMALL, path, progress=False)
+            with pytest.raises(FileNotFoundError, match="no file"):
+                open_interactions(path)
+    assert len(list(tmp_path.rglob("*.npz"))) == 2
+    assert not list(tmp_path.rglob("*.tmp"))
+    collect_set(SMALL, path, progress=False)
+    assert names_in(tmp_path) == [path.name]
 
 
 def test_paths_and_workers_that_cannot_be_are_named(tmp_path):
-    with pytest.raises(ValueError, match=r"path must end in .*'\.zarr', got .*x\.zip"):
-        collect_set(SMALL, tmp_path / "x.zip")
+    for path in (tmp_path / "x.zip", tmp_path / "x.zarr"):
+        with pytest.raises(ValueError, match=r"path must end in .*got .*x\."):
+            collect_set(SMALL, path)
     with pytest.raises(ValueError, match=r"workers must be a whole number .* 0"):
-        collect_set(SMALL, tmp_path / "x.zarr", workers=0)
-    with pytest.raises(ValueError, match=r"memory of one process.*workers=1"):
-        collect_set(SMALL, "memory://x.zarr", workers=2)
-    with pytest.raises(ValueError, match=r"memory of one process.*workers=1"):
-        collect_set(SMALL, "memory://x.zarr", client=Mock(spec=Client))
-    with pytest.raises(FileNotFoundError, match=r"there is no file .*x\.zarr; .*'push'"):
-        open_interactions(tmp_path / "x.zarr")
+        collect_set(SMALL, tmp_path / "x.zarr.zip", workers=0)
+    with pytest.raises(FileNotFoundError, match=r"there is no file .*x\.zarr\.zip; .*'push'"):
+        open_interactions(tmp_path / "x.zarr.zip")
 
 
-# Memory
+def test_a_worker_with_other_packages_is_refused(tmp_path, cheap, monkeypatch):
+    numpys = iter(("2.4.6", "1.0"))
+    schema = collect.schema_for(SMALL)
+    monkeypatch.setattr(
+        collect, "schema_for", lambda _: replace(schema, attrs={"numpy": next(numpys)})
+    )
+    with pytest.raises(RuntimeError, match=r"another set .*1\.0.*, not .*2\.4\.6"):
+        collect_set(SMALL, tmp_path / "x.zarr.zip", progress=False)
 
 
-@pytest.mark.slow
-def test_memory_does_not_grow_with_the_set(tmp_path, cheap, monkeypatch):
-    monkeypatch.setattr(collect, "CHUNK", 50)
-
-    def peak(n):
-        tracemalloc.start()
-        collect_set(Recipe(n_interactions=n), tmp_path / f"{n}.zarr.zip", progress=False)
-        found = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-        return found
-
-    peak(50)  # what is imported and cached once
-    few, many = peak(200), peak(2000)
-    # The whole of 2,000 would be 40 MB; names and hashes of the files are all that grows.
-    assert few > 1_000_000
-    assert many < few + 4_000_000
-    assert (tmp_path / "2000.zarr.zip").stat().st_size > 30_000_000
-
-
-# Kills in one process
+# Kills
 
 _DRIVER = """
-import os, signal, sys
-from affordlib.interactions import collect, places, store
+import sys
+from affordlib.interactions import collect
 from affordlib.interactions.recipes import Recipe
-
 collect.CHUNK = 2
-part, name, count, workers = sys.argv[2], sys.argv[3], int(sys.argv[4]), int(sys.argv[5])
-owner = {"write": places.Place, "writestr": store.zipfile.ZipFile, "rmtree": places.shutil}[part]
-whole = getattr(owner, part)
-
-def deadly(*arguments, **options):
-    global count
-    count -= name in str(arguments[0] if part == "rmtree" else arguments[1])
-    if count < 0:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return whole(*arguments, **options)
-
-setattr(owner, part, deadly)
 recipe = Recipe(n_interactions=6, seed=11)
-if __name__ == "__main__":
-    collect.collect(recipe, sys.argv[1], workers=workers, progress=False)
+collect.collect(recipe, sys.argv[1], workers=int(sys.argv[2]), progress=False)
 """
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("part", "name", "count", "chunks_done"),
-    [
-        ("write", "effect/c", 0, 0),  # in the first chunk
-        ("write", "effect/c.1", 0, 1),  # before the second
-        ("writestr", "", 9, 3),  # while packing
-        # The manifest is there and its hash is not; packed and not yet tidied up.
-        ("write", "done", 0, 3),
-        ("rmtree", ".chunks", 0, 3),
-    ],
-)
-def test_killed_and_run_again_it_is_the_same_file(
-    undisturbed, tmp_path, part, name, count, chunks_done
-):
-    path = tmp_path / "killed.zarr.zip"
-    arguments = [sys.executable, "-c", _DRIVER, str(path), part, name, str(count), "1"]
-    ended = subprocess.run(arguments, cwd=ROOT, capture_output=True, text=True)
-    assert ended.returncode == -signal.SIGKILL, ended.stderr
-    (work,) = tmp_path.glob(".killed*.chunks")
-    assert len(list(work.glob("tasks/*.json"))) == chunks_done
-    if part == "rmtree":
-        assert path.read_bytes() == undisturbed(SMALL).read_bytes()
-    else:
-        assert not path.exists()
+@pytest.mark.parametrize("seed", range(10))
+def test_a_driver_killed_at_any_moment_is_no_loss(undisturbed, tmp_path, seed):
+    path = tmp_path / "set.zarr.zip"
+    command = [sys.executable, "-c", _DRIVER, str(path), str(1 + seed % 2)]
+    process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 60
+    while not list(tmp_path.glob(".set*.parts")) and time.monotonic() < deadline:
+        time.sleep(0.002)
+    time.sleep(random.Random(seed).uniform(0, 0.7))
+    process.kill()
+    process.wait()
     collect_set(SMALL, path, progress=False)
     assert path.read_bytes() == undisturbed(SMALL).read_bytes()
-    assert [p.name for p in tmp_path.iterdir()] == ["killed.zarr.zip"]
+    assert names_in(tmp_path) == [path.name]
+
+
+def test_a_second_collector_is_refused_until_the_first_is_gone(tmp_path, cheap):
+    path = tmp_path / "x.zarr.zip"
+    hold = "import sys, time; from pathlib import Path; from affordlib.interactions import collect"
+    hold += "\nwith collect._alone(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)"
+    holder = subprocess.Popen([sys.executable, "-c", hold, str(path)], stdout=subprocess.PIPE)
+    assert holder.stdout.readline() == b"held\n"
+    with pytest.raises(RuntimeError, match=r"another process is collecting into .*x\.zarr\.zip"):
+        collect_set(SMALL, path, progress=False)
+    os.kill(holder.pid, signal.SIGKILL)
+    holder.communicate()
+    collect_set(SMALL, path, progress=False)
+    assert names_in(tmp_path) == [path.name]
+
+
+# A cluster
+
+
+@pytest.fixture(scope="module")
+def client(tmp_path_factory):
+    """A client of a scheduler and two workers that the `dask` command has started."""
+    from dask.distributed import Client
+
+    folder = tmp_path_factory.mktemp("dask")
+    file = folder / "scheduler.json"
+    worker = ["worker", "--scheduler-file", str(file), "--nthreads", "1", "--no-dashboard"]
+    worker += ["--local-directory", str(folder)]
+    host = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard"]
+    commands = [["scheduler", *host, "--scheduler-file", str(file)], worker, worker]
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-m", "dask", *command],
+            cwd=ROOT,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        for command in commands
+    ]
+    try:
+        with Client(scheduler_file=str(file), timeout=60) as client:
+            client.wait_for_workers(2, timeout=60)
+            yield client
+    finally:
+        for process in processes:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+
+@pytest.fixture
+def both(client):
+    """The client while both workers are there."""
+    client.wait_for_workers(2, timeout=60)
+    yield client
+    client.wait_for_workers(2, timeout=60)
+
+
+@contextmanager
+def poisoned(client, log, how):
+    """Make all workers, also those started later, fail in the chunk that begins with 6.
+
+    log: a file that gets a letter for each time that they do.
+    """
+    from dask.distributed import WorkerPlugin
+
+    class Poison(WorkerPlugin):
+        name = "poison"
+
+        def setup(self, worker):
+            from affordlib.interactions import collect, schema
+
+            def deadly(recipe, indices):
+                if indices.start == 6:
+                    with open(log, "a") as file:
+                        file.write("x")
+                    os._exit(9) if how == "kill" else math.sqrt(-1)
+                return schema.collect_chunk(recipe, indices)
+
+            collect.collect_chunk = deadly
+
+        def teardown(self, worker):
+            from affordlib.interactions import collect, schema
+
+            collect.collect_chunk = schema.collect_chunk
+
+    client.register_plugin(Poison())
+    try:
+        yield
+    finally:
+        client.wait_for_workers(2, timeout=60)
+        client.unregister_worker_plugin("poison")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("suffix", [".zarr", ".zarr.zip"])
-def test_a_full_disk_leaves_nothing_that_is_read(undisturbed, tmp_path, monkeypatch, suffix):
-    path = tmp_path / f"full{suffix}"
-    room = 0
+def test_a_cluster_leaves_the_same_file(both, undisturbed, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(collect, "WINDOW", 2)
+    submit, most = both.submit, 0
 
-    def write(self, content):
-        nonlocal room
-        room -= 1
-        with open(self, "wb") as file:
-            file.write(content if room >= 0 else content[: len(content) // 2])
-        if room < 0:
-            raise OSError(errno.ENOSPC, "No space left on device")
+    def counting(*arguments, **options):
+        nonlocal most
+        future = submit(*arguments, **options)
+        most = max(most, sum(f.status == "pending" for f in both.futures.values()))
+        return future
 
-    with monkeypatch.context() as patch:
-        patch.setattr(Path, "write_bytes", write)
-        for files in (3, 14, 10, 16, 13, 1, 14):  # from the metadata to the last file, `done`
-            room = files
-            with pytest.raises((OSError, RuntimeError), match="No space left"):
-                collect_set(SMALL, path, progress=False)
-            with pytest.raises((FileNotFoundError, CorruptedDataError), match="no file"):
-                open_interactions(path)
-    with monkeypatch.context() as patch:
-        patch.setattr(zipfile.ZipFile, "writestr", write_nothing)
-        if suffix == ".zarr.zip":
-            with pytest.raises(OSError, match="No space left"):
-                collect_set(SMALL, path, progress=False)
-            assert not path.exists()
-    collect_set(SMALL, path, progress=False)
-    expected = open_interactions(undisturbed(SMALL))
-    assert dataset_sha256(open_interactions(path)) == dataset_sha256(expected)
-    assert [p.name for p in tmp_path.iterdir()] == [path.name]
-    assert not list(tmp_path.rglob("*.partial"))
+    monkeypatch.setattr(both, "submit", counting)
+    path = collect_set(LONGER, "relative.zarr.zip", both, progress=False)
+    assert Path(path).read_bytes() == undisturbed(LONGER).read_bytes()
+    assert most == 4
+    assert names_in(tmp_path) == ["relative.zarr.zip"]
 
 
-def write_nothing(*_):
-    raise OSError(errno.ENOSPC, "No space left on device")
+@pytest.mark.slow
+def test_a_chunk_that_cannot_be_made_is_named(both, undisturbed, tmp_path):
+    path, log = tmp_path / "set.zarr.zip", tmp_path / "log"
+    reason = r"interactions 6 to 7 could not be collected: ValueError: math domain error"
+    with poisoned(both, log, "raise"), pytest.raises(RuntimeError, match=reason):
+        collect_set(LONGER, path, both, progress=False)
+    assert len(log.read_text()) == 1
+    assert not path.exists()
+    assert list(tmp_path.glob(".set*.parts/*.npz"))
+    collect_set(LONGER, path, both, progress=False)
+    assert path.read_bytes() == undisturbed(LONGER).read_bytes()
 
 
-# Comparing, and killed by chance
+@pytest.mark.slow
+def test_a_chunk_that_kills_its_workers_is_named(both, tmp_path):
+    def allow(failures, dask_scheduler):
+        dask_scheduler.allowed_failures, before = failures, dask_scheduler.allowed_failures
+        return before
+
+    path, log = tmp_path / "set.zarr.zip", tmp_path / "log"
+    usual = both.run_on_scheduler(allow, 0)
+    try:
+        with (
+            poisoned(both, log, "kill"),
+            pytest.raises(RuntimeError, match=r"interactions 6 to 7 .*KilledWorker"),
+        ):
+            collect_set(LONGER, path, both, progress=False)
+    finally:
+        both.run_on_scheduler(allow, usual)
+    assert len(log.read_text()) == 2  # among others, and alone
+    made = {p.stem for p in tmp_path.glob(".set*.parts/*.npz")}
+    assert made >= {f"{k:08d}" for k in (0, 2, 4)}  # though they died with its workers
+    assert f"{6:08d}" not in made
+
+
+@pytest.mark.slow
+def test_make_data_collects_with_a_scheduler(both, undisturbed, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(make_data, "RECIPES", {"push": SMALL})
+    address = ["--scheduler", both.scheduler.address]
+    assert make_data.main(["--only", "push", "--to", str(tmp_path), *address]) == 1
+    assert "not the same: 6 interactions, formerly 500" in capsys.readouterr().out
+    assert (tmp_path / "push.zarr.zip").read_bytes() == undisturbed(SMALL).read_bytes()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(10))
+def test_workers_killed_at_any_moment_are_no_loss(both, undisturbed, tmp_path, seed):
+    path, pids = tmp_path / "set.zarr.zip", list(both.run(os.getpid).values())
+    kill = threading.Timer(
+        random.Random(seed).uniform(0, 0.6), os.kill, [pids[seed % 2], signal.SIGKILL]
+    )
+    kill.start()
+    collect_set(LONGER, path, both, progress=False)
+    kill.join()
+    assert path.read_bytes() == undisturbed(LONGER).read_bytes()
+
+
+# Comparing
 
 
 def test_make_data_says_how_far_apart_two_sets_are(undisturbed):
@@ -364,24 +418,3 @@ def test_make_data_ends_with_status_1_when_the_sets_differ(
     former["push"] = undisturbed(LONGER)
     assert make_data.main(arguments) == 1
     assert "not the same: 6 interactions, formerly 12" in capsys.readouterr().out
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(10))
-def test_a_driver_killed_at_any_moment_is_no_loss(undisturbed, tmp_path, seed):
-    path = tmp_path / "set.zarr.zip"
-    never, workers = ["write", "no such name", "1"], str(1 + seed % 2)
-    process = subprocess.Popen(
-        [sys.executable, "-c", _DRIVER, str(path), *never, workers],
-        cwd=ROOT,
-        stderr=subprocess.DEVNULL,
-    )
-    deadline = time.monotonic() + 60
-    while not list(tmp_path.glob(".set*.chunks")) and time.monotonic() < deadline:
-        time.sleep(0.002)
-    time.sleep(random.Random(seed).uniform(0, 0.7))
-    process.kill()
-    process.wait()
-    collect_set(SMALL, path, progress=False)
-    assert path.read_bytes() == undisturbed(SMALL).read_bytes()
-    assert [p.name for p in tmp_path.iterdir()] == ["set.zarr.zip"]

@@ -133,19 +133,6 @@ def test_a_damaged_file_is_never_read(small_set, tmp_path):
     assert caught >= 30
 
 
-def test_a_missing_chunk_is_an_error_and_not_zeros(small_set, tmp_path):
-    import zipfile
-
-    path = tmp_path / "holed.zarr.zip"
-    with zipfile.ZipFile(small_set) as source, zipfile.ZipFile(path, "w") as target:
-        for name in source.namelist():
-            if name != "effect/c.0.0.0":
-                target.writestr(name, source.read(name))
-        assert "effect/c.0.0.0" in source.namelist()
-    with pytest.raises(CorruptedDataError, match=r"effect/c\.0\.0\.0 is missing"):
-        open_interactions(path)
-
-
 def test_a_missing_set_names_the_shipped_ones(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"'pull'.*\['drag', 'grasp'.*'push'"):
         open_interactions("pull")

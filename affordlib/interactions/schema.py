@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
 from importlib import metadata
 
 import numpy as np
+import xarray as xr
 
-from affordlib.interactions.chunks import AXIS, CHUNK, Layout, Variable
-from affordlib.interactions.recipes import Recipe, draw_world, interact
+from affordlib.interactions.recipes import Recipe, interact
 from affordlib.primitives import PRIMITIVES, LeverUp, primitive_named
 from affordlib.types import (
     ACTION_CHANNELS,
     EFFECT_CHANNELS,
     IMAGE_CHANNELS,
-    IMAGE_PIXELS,
-    LEVER_IMAGE_PIXELS,
     Interaction,
 )
 from affordlib.world import FAMILIES, Tabletop, Thing, WorldConfig
@@ -25,19 +24,38 @@ from affordlib.world.scene import N_SAMPLES
 GRAIN = 2.0**-20
 """About 1 µm or 1 µrad: what is smaller in a float32 is not kept."""
 
-_SIZES = {
-    "sample": N_SAMPLES,
-    "recorded_sample": RECORDED_SAMPLES,
-    "action_channel": len(ACTION_CHANNELS),
-    "effect_channel": len(EFFECT_CHANNELS),
-    "image_channel": len(IMAGE_CHANNELS),
-    "size_axis": 3,
-    "pose_channel": 3,
-    "xy": 2,
-    "xyz": 3,
-    "tool_channel": 5,
-    "surface": 3,
-}
+AXIS = "interaction"
+
+
+@dataclass(frozen=True)
+class Variable:
+    """One array of a data set; `interaction`, where it has that dimension, comes first."""
+
+    dims: tuple[str, ...]
+    dtype: str
+    attrs: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Schema:
+    """What a data set will hold, known before it is made."""
+
+    variables: dict[str, Variable]
+    attrs: dict[str, str]
+
+    def dataset(self, chunks: Sequence[dict[str, np.ndarray]]) -> xr.Dataset:
+        """The set made of its chunks, in order."""
+        data = {
+            name: (
+                variable.dims,
+                np.concatenate([chunk[name] for chunk in chunks])
+                if AXIS in variable.dims
+                else chunks[0][name],
+                variable.attrs,
+            )
+            for name, variable in self.variables.items()
+        }
+        return xr.Dataset(data, attrs=self.attrs)
 
 
 def _per_interaction(dtype: str, *dims: str, **attrs: str) -> Variable:
@@ -120,15 +138,14 @@ def _variables(recipe: Recipe) -> dict[str, Variable]:
     return variables
 
 
-def describe(recipe: Recipe, chunk: int = CHUNK) -> Layout:
-    """The layout of a recipe's data set: all that is known of it before it is collected."""
+def schema_for(recipe: Recipe) -> Schema:
+    """The schema of a recipe's data set: all that is known of it before it is collected."""
     lever = [name == LeverUp.name for name in recipe.primitives]
     if any(lever) and not all(lever):
         raise ValueError(
             f"primitives {recipe.primitives} have images of different sizes; collect lever_up "
             "in a set of its own"
         )
-    pixels = LEVER_IMAGE_PIXELS if all(lever) else IMAGE_PIXELS
     packages = ("affordlib", "numpy", "pybullet", "example-robot-data", "ur-analytic-ik")
     attrs = {
         "recipe": recipe.to_json(),
@@ -138,21 +155,20 @@ def describe(recipe: Recipe, chunk: int = CHUNK) -> Layout:
         "frame": "origin where the object stood at the start, axes of the table",
         "versions": " ".join(f"{name}={metadata.version(name)}" for name in packages),
     }
-    sizes = {AXIS: recipe.n_interactions, **_SIZES, "row": pixels, "column": pixels}
-    return Layout(_variables(recipe), sizes, attrs, chunk)
+    return Schema(_variables(recipe), attrs)
 
 
 def collect_chunk(recipe: Recipe, indices: range) -> dict[str, np.ndarray]:
     """The interactions of a recipe with the given numbers, as arrays by name.
 
-    The first axis is the interaction, for all that have it in `describe`.
+    The first axis is the interaction, for all that have it in `schema_for`.
     """
     variables = _variables(recipe)
     rows: dict[str, list] = {name: [] for name in variables if name != "phase"}
     with Tabletop(recipe.world) as world:
         for index in indices:
             thing, seen = interact(recipe, index, world)
-            row = _row(thing, seen, draw_world(recipe, index, thing))
+            row = _row(thing, seen, world.config)
             if recipe.partial:
                 _, full = interact(recipe, index, world, stop_phase=1.0)
                 row["full_effect"] = np.array(
