@@ -19,8 +19,8 @@ _NUMBERS = Annotated[Sequence[_NUMBER], _NO_TEXT] | np.ndarray
 _CHECKED = """
 types primitives perception plan_files results world.config world.objects world.interventions
 world.scene planning.astar planning.closed_loop planning.continuous planning.disturbances
-planning.effect_map planning.finish planning.gradient planning.modes planning.poses
-planning.reachability planning.repertoire interactions.batches interactions.collect
+planning.effect_map planning.gradient planning.grasp_rotate planning.problem
+planning.reachability planning.skills interactions.batches interactions.collect
 interactions.folder interactions.lever interactions.recipes interactions.store models.calibration
 models.checkpoint models.ensemble models.lever models.protocol models.training
 evaluation.effect_prediction show.animation show.conditioning_explorer show.executors

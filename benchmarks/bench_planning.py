@@ -23,10 +23,9 @@ from keeping import keep
 
 from affordlib.evaluation.goals import STANDING, uniform_tasks
 from affordlib.models import load_checkpoint, observe_actions
-from affordlib.planning import map_effects, plan_astar, plan_continuous
+from affordlib.planning import EffectMap, PlanningProblem, plan_astar, plan_continuous
 from affordlib.planning.astar import N_DIRECTIONS, STOP_PHASES
 from affordlib.planning.continuous import EARLIEST, KEPT, SPREAD_RAD
-from affordlib.planning.modes import encode_image
 from affordlib.primitives import Push
 from affordlib.world import Tabletop
 
@@ -53,7 +52,7 @@ def naive_branches(model, image) -> None:
     """Every branch a call of the whole network: what one expansion costs without a map."""
     for angle in np.arange(N_DIRECTIONS) * (2 * np.pi / N_DIRECTIONS):
         for stop in STOP_PHASES:
-            features = encode_image(model, image)
+            features = EffectMap(model, image).features
             model.predict(features, observe_actions(model, [Push(angle)]), torch.tensor([[stop]]))
 
 
@@ -80,7 +79,7 @@ def naive_descent(model, image, start_xy_m, goal, mode, rng=None) -> float:
             turn = torch.stack([angle.cos(), -angle.sin(), angle.sin(), angle.cos()]).view(2, 2)
             way = torch.stack([turn @ start, turn @ travel])[None]
             seen = replace(observe_actions(model, [Push.towards(0.0)]), action=way)
-            told = model.predict(encode_image(model, image), seen, stop.view(1, 1))
+            told = model.predict(EffectMap(model, image).features, seen, stop.view(1, 1))
             end = end + told.effect_mean[0, 0, [x, y]]
         loss = (end - target).square().sum()
         if float(loss.detach().sqrt()) < ENOUGH_M:
@@ -104,15 +103,23 @@ def main() -> None:
             for task in uniform_tasks(mode, N_GOALS, SEED, STANDING):
                 world.place(task.thing, (0.0, 0.0), task.yaw_rad)
                 image, start, goal = world.look(), world.object_pose()[:2], task.goal
-                add("map of an object", milliseconds(lambda i=image: map_effects(film, i)))
-                effects = map_effects(film, image)
+                add(
+                    "map of an object",
+                    milliseconds(lambda i=image: EffectMap(film, i).coefficients),
+                )
+                problem = PlanningProblem(start, goal, EffectMap(film, image), mode)
+                effects = problem.effects
+
+                def whole(planner, problem=problem):
+                    anew = EffectMap(film, problem.effects.image)
+                    return planner(replace(problem, effects=anew))
+
                 add("its fine grid", milliseconds(lambda e=effects: e.fine_grid))
                 query = (film, image, start, goal, mode)
-                plan = plan_astar(*query, effects=effects)
+                plan = plan_astar(problem)
                 for name, planner in PLANNERS.items():
-                    spent = milliseconds(lambda p=planner, q=query, e=effects: p(*q, effects=e))
-                    add(f"{name}, {mode}", spent)
-                    add(f"{name}, {mode}, whole", milliseconds(lambda p=planner, q=query: p(*q)))
+                    add(f"{name}, {mode}", milliseconds(lambda p=planner, q=problem: p(q)))
+                    add(f"{name}, {mode}, whole", milliseconds(lambda p=planner, w=whole: w(p)))
                 if len(rows["map of an object"]) % 5 == 1:
                     each = milliseconds(lambda i=image: naive_branches(film, i))
                     add("180 branches, naive", each)

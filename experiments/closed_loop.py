@@ -28,11 +28,17 @@ from affordlib.evaluation.answers import rounded
 from affordlib.models.checkpoint import checkpoint_sha256
 from affordlib.models.weight_files import weights_bytes
 from affordlib.paths import repo_root
-from affordlib.planning import Disturbance, Pursuit, Repertoire, draw_disturbances, pursue
+from affordlib.planning import (
+    ClosedLoopResult,
+    Disturbance,
+    Skills,
+    draw_disturbances,
+    run_closed_loop,
+)
 from affordlib.planning.disturbances import KINDS
-from affordlib.planning.poses import GRIP_YAWS
+from affordlib.planning.grasp_rotate import GRIP_YAWS
 from affordlib.planning.reachability import SHIPPED as REACHABILITY
-from affordlib.planning.repertoire import CHECKPOINTS
+from affordlib.planning.skills import CHECKPOINTS
 from affordlib.primitives import Drag, Grasp, Push
 from affordlib.results import write_results, write_text_atomically
 from affordlib.types import TABLE_X_M, TABLE_Y_M, Goal
@@ -96,12 +102,12 @@ def draw_trial(table: str, index: int, seed: int = 0) -> Trial:
     return Trial(thing, (0.0, 0.0), yaw, Goal(xy, exact), script)
 
 
-def run_trial(table: str, index: int, world: Tabletop, repertoire: Repertoire, seed: int) -> dict:
+def run_trial(table: str, index: int, world: Tabletop, skills: Skills, seed: int) -> dict:
     """The record of a trial: what was asked, how it ended, whether it could be done."""
     trial = draw_trial(table, index, seed)
     record: dict[str, Any] = {"index": index, "object_class": trial.thing.family}
     world.place(trial.thing, trial.start_xy_m, trial.yaw_rad)
-    went = pursue(world, trial.goal, repertoire, disturbances=trial.disturbances)
+    went = run_closed_loop(world, trial.goal, skills, disturbances=trial.disturbances)
     record |= _told(went)
     if table == "height":
         record["feasible"] = _can_be_lifted(world, trial, went)
@@ -113,7 +119,7 @@ def run_trial(table: str, index: int, world: Tabletop, repertoire: Repertoire, s
         record["in_action"] = trial.disturbances[0].at_s is not None
         record["happened"] = len(went.happened)
         world.place(trial.thing, trial.start_xy_m, trial.yaw_rad)
-        undisturbed = pursue(world, trial.goal, repertoire)
+        undisturbed = run_closed_loop(world, trial.goal, skills)
         record["undisturbed"] = _told(undisturbed)
     else:
         asked = _how_moved(trial), half_width_m(trial.thing.footprint_m)
@@ -123,10 +129,10 @@ def run_trial(table: str, index: int, world: Tabletop, repertoire: Repertoire, s
     return record
 
 
-def _told(went: Pursuit) -> dict[str, Any]:
+def _told(went: ClosedLoopResult) -> dict[str, Any]:
     return {
-        "ending": went.ending,
-        "words": went.words,
+        "ending": went.status,
+        "words": went.message,
         "distance_m": went.distance_m,
         "actions": len(went.steps),
         "plans": len(went.plans),
@@ -140,7 +146,7 @@ def _how_moved(trial: Trial) -> type[Push] | type[Drag]:
     return Drag if trial.thing.rollable else Push
 
 
-def _can_be_lifted(world: Tabletop, trial: Trial, went: Pursuit) -> bool:
+def _can_be_lifted(world: Tabletop, trial: Trial, went: ClosedLoopResult) -> bool:
     """Whether the object was lifted as high, or a whole grasp at the goal does so, by any hand."""
     high = trial.goal.height_m - WITHIN_HEIGHT_M
 
@@ -151,7 +157,7 @@ def _can_be_lifted(world: Tabletop, trial: Trial, went: Pursuit) -> bool:
     return went.reached or any(map(lifts, GRIP_YAWS))
 
 
-def _stays_feasible(world: Tabletop, trial: Trial, went: Pursuit) -> bool:
+def _stays_feasible(world: Tabletop, trial: Trial, went: ClosedLoopResult) -> bool:
     """Whether the kinematics allows a way from the start, and from where the disturbance has left
     the object, as it was first seen after it.
 
@@ -164,7 +170,7 @@ def _stays_feasible(world: Tabletop, trial: Trial, went: Pursuit) -> bool:
         return True
     what = went.happened[0]
     look = what.action + (what.at_s is not None)
-    if went.ending == "lost" and len(went.seen_xy_m) == look + 1:
+    if went.status == "lost" and len(went.seen_xy_m) == look + 1:
         return what.kind == "goal"
     kind = Drag if world.object_rolls() else Push
     return all(is_feasible(kind, half, xy, went.goal.xy_m) for xy in went.seen_xy_m[look:][:1])
@@ -207,8 +213,8 @@ _here: dict[str, Any] = {}
 def _records_of(table: str, indices: Sequence[int], seed: int) -> list[dict]:
     """Some trials in one process, which keeps its world and its models."""
     if not _here:
-        _here.update(world=Tabletop(), repertoire=Repertoire.load())
-    here = _here["world"], _here["repertoire"], seed
+        _here.update(world=Tabletop(), skills=Skills.load())
+    here = _here["world"], _here["skills"], seed
     return [rounded(run_trial(table, i, *here)) for i in indices]
 
 

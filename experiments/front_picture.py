@@ -12,7 +12,7 @@ from matplotlib import font_manager
 from PIL import Image, ImageDraw, ImageFont
 
 from affordlib.paths import repo_root
-from affordlib.planning import MODES, Repertoire, carry_out, plan_continuous
+from affordlib.planning import Skills, execute_plan, plan_continuous
 from affordlib.results import write_atomically
 from affordlib.show import Film
 from affordlib.types import Goal
@@ -32,14 +32,14 @@ def filmed(title: str, stop: bool) -> list[np.ndarray]:
     film = Film(FRAME_STEPS, *LARGE)
     with Tabletop() as world:
         world.place(BOX, (0.0, 0.0), 0.3)
-        planner = Repertoire.load().planner(plan_continuous, mode=MODES["single_partial"])
+        planner = Skills.load().planner(plan_continuous, mode="single_partial")
         plan = planner(world.look(), world.object_pose()[:2], GOAL)
         turned = 0.3 + plan.steps[0].predicted_turn_rad
         if not stop:
             plan = replace(plan, steps=(replace(plan.steps[0], stop_phase=1.0),))
         world.mark(GOAL.xy_m, GOAL_RGB, turned, scale=1.3)
         world.film = film
-        outcome = carry_out(world, plan)
+        outcome = execute_plan(world, plan)
     titles = [title.format(plan.steps[0].stop_phase)] * len(film.frames)
     titles[-8:] = [f"{titles[0]}: {1000 * outcome.distance_m:.1f} mm from the goal"] * 8
     return [_titled(*pair) for pair in zip(film.frames, titles, strict=True)]

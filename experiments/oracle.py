@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
 
-from affordlib.planning.effect_map import EffectMap, map_effects, phases_of, splines_through
+from affordlib.planning.effect_map import EffectMap, phases_of
 from affordlib.primitives import Drag, Push
 from affordlib.types import Observations, Prediction
 from affordlib.world import Tabletop, Thing, WorldConfig
@@ -78,19 +79,20 @@ def oracle_effects(
     """
     config = replace(config, camera="ideal", bias_m=(0.0, 0.0))
     model = SimulatorModel(imagined, world.thing, world.object_pose()[2], kind, config)
-    effects = map_effects(model, image, kind, N_DIRECTIONS, len(_phases(kind)))
-    return touchy(effects) if wary else effects
+    a_map = SensitiveMap if wary else EffectMap
+    return a_map(model, image, kind, N_DIRECTIONS, len(_phases(kind)))
 
 
 def _phases(kind: type[Push] | type[Drag]) -> torch.Tensor:
     return phases_of(kind, round((1 - kind.acts_from) / PHASE_STEP) + 1)
 
 
-def touchy(effects: EffectMap) -> EffectMap:
-    """A map of the same effects, whose σ is by how much they change with `WARY_RAD`."""
-    step = 2 * math.pi / N_DIRECTIONS
-    angles = step * torch.arange(N_DIRECTIONS, dtype=torch.float64)
-    mean, _ = effects(*torch.meshgrid(angles, _phases(effects.kind), indexing="ij"))
-    slope = (mean.roll(-1, 0) - mean.roll(1, 0)) / (2 * step)
-    std = WARY_RAD * slope.abs() + _STD_M
-    return replace(effects, coefficients=splines_through(mean, std))
+class SensitiveMap(EffectMap):
+    """A map whose σ is by how much the effects change with `WARY_RAD`."""
+
+    @cached_property
+    def grid(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Effects and σ (D, T, 3) at the grid's directions and phases."""
+        mean, _ = super().grid
+        slope = (mean.roll(-1, 0) - mean.roll(1, 0)) / (4 * math.pi / self.n_directions)
+        return mean, WARY_RAD * slope.abs() + _STD_M

@@ -11,8 +11,15 @@ import numpy as np
 
 from affordlib.evaluation.goals import FAMILIES, ROLLABLE, STANDING
 from affordlib.models.checkpoint import checkpoint_sha256, load_checkpoint
-from affordlib.planning import Repertoire, plan_astar, plan_continuous, plan_gradient
-from affordlib.planning.modes import PlanMode, mode_named
+from affordlib.planning import (
+    EffectMap,
+    PlanningProblem,
+    Skills,
+    plan_astar,
+    plan_continuous,
+    plan_gradient,
+)
+from affordlib.planning.problem import PlanMode, mode_named
 from affordlib.primitives import Drag, Push
 from affordlib.types import Goal, Plan
 from affordlib.world import Tabletop, WorldConfig
@@ -116,7 +123,7 @@ class Variant:
             return partial(_plan_with_simulator, self, Tabletop())
         names = {"push": self.push, "drag": self.drag}
         models = {kind: load_checkpoint(name)[0] for kind, name in names.items() if name}
-        return partial(_plan_with_models, self, Repertoire(models))
+        return partial(_plan_with_models, self, Skills(models))
 
     def mode(self, name: str | PlanMode) -> PlanMode:
         """The mode, without partial actions if it has none."""
@@ -126,7 +133,7 @@ class Variant:
 
 def _plan_with_models(
     variant: Variant,
-    repertoire: Repertoire,
+    skills: Skills,
     image: np.ndarray,
     start_xy_m: tuple[float, float],
     goal: Goal,
@@ -134,12 +141,10 @@ def _plan_with_models(
 ) -> Plan:
     settings = dict(variant.settings)
     goal = replace(goal, tolerance_m=settings.pop("tolerance_m", goal.tolerance_m))
-    kind = Push
-    if variant.drag:
-        kind = repertoire.kind_for(image)
-        settings["kind"] = kind
-    model = repertoire.model(kind)
-    return variant.planner(model, image, start_xy_m, goal, variant.mode(mode), **settings)
+    kind = skills.kind_for(image) if variant.drag else Push
+    effects = EffectMap(skills.model(kind), image, kind)
+    problem = PlanningProblem(start_xy_m, goal, effects, variant.mode(mode))
+    return variant.planner(problem, **settings)
 
 
 def _plan_with_simulator(
@@ -154,9 +159,7 @@ def _plan_with_simulator(
     kind = Drag if world.object_rolls() else Push
     config = WorldConfig() if variant.nominal else world.config
     effects = oracle_effects(imagined, world, image, kind, config, variant.wary)
-    return variant.planner(
-        effects.model, image, start_xy_m, goal, variant.mode(mode), kind=kind, effects=effects
-    )
+    return variant.planner(PlanningProblem(start_xy_m, goal, effects, variant.mode(mode)))
 
 
 _FILM = {"model": "film_5000", "push": "push_film_x10", "drag": "drag_film"}

@@ -29,7 +29,7 @@ from affordlib.evaluation.answers import rounded
 from affordlib.evaluation.effect_prediction import error_row
 from affordlib.evaluation.goals import FROZEN, ROLLABLE, STANDING, PlanningTask, frozen_tasks
 from affordlib.paths import repo_root
-from affordlib.planning import PlanMode, carry_out
+from affordlib.planning import PlanMode, execute_plan
 from affordlib.results import write_results, write_text_atomically
 from affordlib.types import Goal, Outcome, Plan
 from affordlib.world import Tabletop, UnreachableError
@@ -74,7 +74,7 @@ def attempt(
         world.place(task.thing, (0.0, 0.0), task.yaw_rad + NUDGE_RAD, config=config)
     once = PlanMode(1, partial=True)
     try:
-        return carry_out(world, plan, corrections, lambda *query: planner(*query, once))
+        return execute_plan(world, plan, corrections, lambda *query: planner(*query, once))
     except UnreachableError as refused:
         return refused.outcome
     finally:

@@ -20,8 +20,8 @@ from tqdm.auto import tqdm
 from affordlib.commands import command, count_type
 from affordlib.evaluation.effect_prediction import error_row
 from affordlib.models.checkpoint import checkpoint_sha256
-from affordlib.planning import Repertoire, carry_out, plan_astar, plan_continuous
-from affordlib.planning.repertoire import CHECKPOINTS
+from affordlib.planning import Skills, execute_plan, plan_astar, plan_continuous
+from affordlib.planning.skills import CHECKPOINTS
 from affordlib.primitives import wrap_angle
 from affordlib.results import write_results
 from affordlib.world import Tabletop, UnreachableError
@@ -32,7 +32,7 @@ PLANNERS = {"astar": plan_astar, "continuous": plan_continuous}
 WITHIN = {"orientation": ("rad", WITHIN_TURN_RAD), "height": ("m", WITHIN_HEIGHT_M)}
 
 
-def run_trial(table: str, index: int, planner: str, world: Tabletop, about: Repertoire) -> dict:
+def run_trial(table: str, index: int, planner: str, world: Tabletop, about: Skills) -> dict:
     """The record of one plan: how it was meant to end, and how it did.
 
     off: what is missing of the turn [rad] or the height [m].
@@ -49,7 +49,7 @@ def run_trial(table: str, index: int, planner: str, world: Tabletop, about: Repe
     }
     yaw, z = world.object_pose()[2], world.object_state()[2]
     try:
-        carry_out(world, plan)
+        execute_plan(world, plan)
     except UnreachableError:
         record["arm_refused"] = True
     pose = world.object_pose()
@@ -107,13 +107,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--n", type=count_type, help="trials of each kind of goal (default: all)")
     parser.add_argument("--out", default="data/results")
     options = parser.parse_args(argv)
-    repertoire = Repertoire.load()
+    skills = Skills.load()
     tables = {}
     with Tabletop() as world:
         for table, (unit, within) in WITHIN.items():
             n = min(options.n or N_TRIALS[table], N_TRIALS[table])
             asked = [(table, index, planner) for index in range(n) for planner in PLANNERS]
-            records = [run_trial(*query, world, repertoire) for query in tqdm(asked, table)]
+            records = [run_trial(*query, world, skills) for query in tqdm(asked, table)]
             tables[table] = whole_plan_rows(records, unit, within)
     path = write_results(options.out, "whole_plans", made_with(), tables)
     print(f"{path.name} written")

@@ -13,7 +13,7 @@ from affordlib.interactions.lever import lever_arrays
 from affordlib.interactions.schema import Schema, Variable
 from affordlib.models import AffordanceCNP, CNPConfig, load_checkpoint
 from affordlib.models.lever import LEVER_MODELS
-from affordlib.planning import Repertoire
+from affordlib.planning import Skills
 from affordlib.world import Cuboid, Tabletop, WorldConfig
 
 
@@ -54,8 +54,8 @@ def film():
 
 
 @pytest.fixture(scope="session")
-def repertoire():
-    return Repertoire.load()
+def skills():
+    return Skills.load()
 
 
 @pytest.fixture(scope="session")

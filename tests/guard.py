@@ -25,7 +25,15 @@ from affordlib.interactions.lever import lever_arrays
 from affordlib.interactions.recipes import RECIPES, interact
 from affordlib.models import load_checkpoint
 from affordlib.paths import repo_root
-from affordlib.planning import MODES, Repertoire, plan_astar, plan_continuous, plan_gradient
+from affordlib.planning import (
+    MODES,
+    EffectMap,
+    PlanningProblem,
+    Skills,
+    plan_astar,
+    plan_continuous,
+    plan_gradient,
+)
 from affordlib.planning.reachability import Reachability
 from affordlib.types import Observations
 from affordlib.world import Tabletop
@@ -82,7 +90,7 @@ def predicted() -> dict[str, list[float]]:
 
 def planned() -> dict[str, list[float]]:
     """Plans of all planners on the first frozen goals of each mode."""
-    skills, found = Repertoire.load(), {}
+    skills, found = Skills.load(), {}
     tasks = [t for t in frozen_tasks() if t.goals == "constructed"]
     some = [[t for t in tasks if t.mode == mode][: N_GOALS // 2] for mode in MODES]
     with Tabletop() as world:
@@ -90,13 +98,11 @@ def planned() -> dict[str, list[float]]:
             task.set_up(world)
             seen = world.perceive()
             kind = skills.kind_for(seen.image)
-            model, mode = skills.model(kind), MODES[task.mode]
-            plans = [
-                plan_astar(model, seen.image, seen.xy_m, task.goal, mode, kind),
-                plan_continuous(model, seen.image, seen.xy_m, task.goal, mode, kind),
-            ]
+            effects = EffectMap(skills.model(kind), seen.image, kind)
+            problem = PlanningProblem(seen.xy_m, task.goal, effects, task.mode)
+            plans = [plan_astar(problem), plan_continuous(problem)]
             if kind.name == "push":
-                plans.append(plan_gradient(model, seen.image, seen.xy_m, task.goal, mode, 100))
+                plans.append(plan_gradient(problem, 100))
             for plan in plans:
                 steps = [(*s.predicted_end_xy_m, s.stop_phase, s.std_m) for s in plan.steps]
                 found[f"planned {k} {plan.planner}"] = np.ravel(steps).tolist()

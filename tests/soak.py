@@ -18,8 +18,8 @@ import sys
 import numpy as np
 import psutil
 
-from affordlib.planning import Repertoire, carry_out, plan_astar, plan_continuous
-from affordlib.planning.modes import PlanMode
+from affordlib.planning import Skills, execute_plan, plan_astar, plan_continuous
+from affordlib.planning.problem import PlanMode
 from affordlib.types import Goal, UnreachableError
 from affordlib.world import Cuboid, LyingCylinder, Tabletop, UprightCylinder
 
@@ -33,7 +33,7 @@ def one_round(world: Tabletop, planner, thing, start, goal: Goal) -> str:
     world.place(thing, start)
     seen = world.perceive()
     try:
-        outcome = carry_out(world, planner(seen.image, seen.xy_m, goal))
+        outcome = execute_plan(world, planner(seen.image, seen.xy_m, goal))
     except UnreachableError:
         return "unreachable"
     told = [np.array(outcome.end_pose), *outcome.object_paths_xy_m]
@@ -52,8 +52,8 @@ def main() -> int:
     parser.add_argument("--rounds", type=int, default=3000)
     rounds = parser.parse_args().rounds
     rng = np.random.default_rng(0)
-    repertoire, mode = Repertoire.load(), PlanMode(2, partial=True)
-    planners = [repertoire.planner(plan, mode=mode) for plan in (plan_astar, plan_continuous)]
+    skills, mode = Skills.load(), PlanMode(2, partial=True)
+    planners = [skills.planner(plan, mode=mode) for plan in (plan_astar, plan_continuous)]
     fixed = [(Cuboid(0.06, 0.05, 0.07), (0.0, 0.0)), (UprightCylinder(0.06, 0.08), (0.1, 0.2))]
     first: list[str] = []
     begin = 0.0

@@ -5,9 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from problems import problem_of
 
 from affordlib.evaluation.goals import frozen_tasks
-from affordlib.planning import carry_out, plan_astar, plan_continuous, pursue
+from affordlib.planning import execute_plan, plan_astar, plan_continuous, run_closed_loop
 from affordlib.primitives import Grasp, Push
 from affordlib.types import Goal, Plan, Step, UnreachableError
 from affordlib.world import Cuboid, WorldConfig
@@ -25,19 +26,19 @@ def test_corrections_bring_it_nearer(world, film):
 
     def replan(image, xy, goal):
         asked.append(goal.tolerance_m)
-        return plan_continuous(film, image, xy, goal, "single_partial")
+        return plan_continuous(problem_of(film, image, xy, goal, "single_partial"))
 
-    plan = plan_astar(film, world.look(), (0.0, 0.0), goal)
-    open_loop = carry_out(world, plan)
+    plan = plan_astar(problem_of(film, world.look(), (0.0, 0.0), goal))
+    open_loop = execute_plan(world, plan)
     world.place(BOX, (0.0, 0.0), 0.3)
-    closed = carry_out(world, plan, 2, replan)
+    closed = execute_plan(world, plan, 2, replan)
     assert closed.distance_m < open_loop.distance_m
     assert len(plan.steps) < len(closed.object_paths_xy_m) <= len(plan.steps) + 2
     assert set(asked) == {0.0003}
-    again = carry_out(world, Plan(goal, goal.xy_m, (), "none", True, 0, 0.0), 2, replan, 0.05)
+    again = execute_plan(world, Plan(goal, goal.xy_m, (), "none", True, 0, 0.0), 2, replan, 0.05)
     assert again.object_paths_xy_m == ()
     with pytest.raises(ValueError, match="need a planner"):
-        carry_out(world, plan, 1)
+        execute_plan(world, plan, 1)
 
 
 @pytest.mark.slow
@@ -56,52 +57,52 @@ def test_an_attempt_leaves_the_eye_as_it_was(world, film):
 
     def planner(image, xy, goal, mode):
         seen.append(world.looks)
-        return plan_continuous(film, image, xy, goal, mode)
+        return plan_continuous(problem_of(film, image, xy, goal, mode))
 
     attempt(world, task, planner, looks=3)
     assert (seen, world.looks) == ([3], 1)
 
 
-def test_what_is_held_is_not_corrected(world, repertoire):
+def test_what_is_held_is_not_corrected(world, skills):
     world.place(Cuboid(0.06, 0.05, 0.05))
-    planner = repertoire.planner(plan_continuous)
+    planner = skills.planner(plan_continuous)
     plan = planner(world.look(), (0.0, 0.0), Goal((0.05, 0.0), height_m=0.12))
     assert plan.steps[-1].primitive.holds
-    done = carry_out(world, plan, 2, planner)
+    done = execute_plan(world, plan, 2, planner)
     assert len(done.object_paths_xy_m) == len(plan.steps)
     assert done.lifted_m == pytest.approx(0.12, abs=0.01)
 
 
 def test_where_nothing_brings_it_nearer_it_stays(film, cuboid_image):
     near = Goal((0.015, 0.0), tolerance_m=0.02)
-    plan = plan_continuous(film, cuboid_image, (0.0, 0.0), near, "single_full")
+    plan = plan_continuous(problem_of(film, cuboid_image, (0.0, 0.0), near, "single_full"))
     assert (plan.steps, plan.reaches_goal) == ((), True)
-    far = plan_continuous(film, cuboid_image, (0.0, 0.0), Goal((0.08, 0.0)), "single_full")
+    far = plan_continuous(
+        problem_of(film, cuboid_image, (0.0, 0.0), Goal((0.08, 0.0)), "single_full")
+    )
     assert len(far.steps) == 1
 
 
-def test_settings_of_a_planner_are_those_of_its_search(repertoire, cuboid_image):
+def test_settings_of_a_planner_are_passed_on(skills, cuboid_image):
     asked = []
 
-    def spy(**told):
-        asked.append(told["seed"])
-        return plan_continuous(**told)
+    def spy(problem, seed):
+        asked.append((seed, problem.mode.max_steps))
+        return plan_continuous(problem, seed)
 
-    planner = repertoire.planner(spy, seed=7, mode="single_partial")
+    planner = skills.planner(spy, seed=7, mode="single_partial")
     planner(cuboid_image, (0.0, 0.0), Goal((0.05, 0.0)))
-    planner(cuboid_image, (0.0, 0.0), Goal((0.05, 0.0)), seed=8, finish=None)
-    assert asked == [7, 8]
-    assert planner.search.keywords == {"seed": 7}
+    assert asked == [(7, 1)]
 
 
-def test_what_a_lift_has_shifted_is_put_down_and_lifted_again(world, repertoire, monkeypatch):
+def test_what_a_lift_has_shifted_is_put_down_and_lifted_again(world, skills, monkeypatch):
     """The closing fingers turn the box, and shift it by some 5 mm; the second time they do not."""
-    monkeypatch.setattr("affordlib.planning.chase.SHIFTED_M", 0.003)
+    monkeypatch.setattr("affordlib.planning.closed_loop.SHIFTED_M", 0.003)
     trial = draw_trial("height", 12, seed=3)
     world.place(trial.thing, trial.start_xy_m, trial.yaw_rad)
-    went = pursue(world, replace(trial.goal, tolerance_m=0.002), repertoire)
+    went = run_closed_loop(world, replace(trial.goal, tolerance_m=0.002), skills)
     kinds = [type(step.primitive) for step in went.steps]
-    assert went.reached, went.words
+    assert went.reached, went.message
     assert kinds.count(Grasp) == 2
     assert kinds[kinds.index(Grasp) + 1] is Push
 
@@ -120,7 +121,7 @@ def test_what_was_done_before_the_arm_refused_is_kept(world, monkeypatch):
 
     monkeypatch.setattr(world, "follow", follow_pushes)
     with pytest.raises(UnreachableError) as refused:
-        carry_out(world, plan)
+        execute_plan(world, plan)
     outcome = refused.value.outcome
     assert len(outcome.object_paths_xy_m) == 2
     assert math.hypot(*outcome.end_pose[:2]) > 0.05

@@ -7,21 +7,21 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from problems import problem_of
 
 from affordlib.planning import (
+    ClosedLoopConfig,
     Disturbance,
-    PlanMode,
-    Repertoire,
+    Skills,
     action_limit,
     draw_disturbances,
     plan_astar,
     plan_continuous,
     plan_gradient,
-    pursue,
+    run_closed_loop,
 )
-from affordlib.planning.chase import DISPLACED_M, Chase
-from affordlib.planning.modes import is_on_table
-from affordlib.planning.moves import Demands
+from affordlib.planning.closed_loop import DISPLACED_M, _ClosedLoop
+from affordlib.planning.problem import is_on_table
 from affordlib.planning.routes import RouteMap, find_route
 from affordlib.primitives import Drag, Grasp, Push, Rotate
 from affordlib.types import Goal, Plan, Prediction
@@ -67,8 +67,8 @@ def table():
 
 
 @pytest.fixture(scope="module")
-def repertoire(film):
-    return Repertoire(
+def skills(film):
+    return Skills(
         {
             "push": film,
             "drag": FollowsTheHand(Drag, "x", "y"),
@@ -86,50 +86,50 @@ BOX, TUBE, BALL = Cuboid(0.06, 0.05, 0.05), UprightCylinder(0.05, 0.07), Sphere(
 
 
 @pytest.mark.parametrize("thing", [BOX, BALL], ids=["pushed", "dragged"])
-def test_a_goal_is_reached(table, repertoire, thing):
+def test_a_goal_is_reached(table, skills, thing):
     table.place(thing, (0.0, 0.0), 0.3)
     goal = Goal((0.11, -0.06), EXACT_M)
-    went = pursue(table, goal, repertoire)
-    assert went.ending == "reached", went.words
+    went = run_closed_loop(table, goal, skills)
+    assert went.status == "reached", went.message
     assert went.distance_m == goal.distance_m(table.object_pose()[:2]) <= 0.002
-    assert "mm from the goal after" in went.words
+    assert "mm from the goal after" in went.message
     assert {type(step.primitive) for step in went.steps} == {Drag if thing is BALL else Push}
     assert len(went.steps) == len(went.object_paths_xy_m) <= action_limit(math.hypot(0.11, 0.06))
     # Where the goal already is, nothing moves.
-    again = pursue(table, Goal(table.object_pose()[:2], EXACT_M), repertoire)
+    again = run_closed_loop(table, Goal(table.object_pose()[:2], EXACT_M), skills)
     assert again.reached
     assert again.steps == ()
 
 
-def test_the_loop_goes_as_near_as_the_goal_asks(table, repertoire):
+def test_the_loop_goes_as_near_as_the_goal_asks(table, skills):
     table.place(BOX, (0.0, 0.0), 0.3)
-    went = pursue(table, Goal((0.07, 0.0), tolerance_m=0.05), repertoire)
+    went = run_closed_loop(table, Goal((0.07, 0.0), tolerance_m=0.05), skills)
     assert went.reached
     assert went.steps
-    near = pursue(table, Goal(table.object_pose()[:2], tolerance_m=0.0005), repertoire)
+    near = run_closed_loop(table, Goal(table.object_pose()[:2], tolerance_m=0.0005), skills)
     assert near.reached
     assert near.steps == ()
 
 
 @pytest.mark.parametrize("xy", [(0.0, 0.7), (-0.5, 0.0), (-0.48, -0.68), (0.68, 0.0)])
-def test_a_goal_without_room_for_the_object_is_refused(table, repertoire, xy):
+def test_a_goal_without_room_for_the_object_is_refused(table, skills, xy):
     table.place(BOX, (0.0, 0.0), 0.3)
     image, pose, moved = table.look(), table.object_pose(), []
     for plan in (plan_astar, plan_continuous, plan_gradient):
         with pytest.raises(ValueError, match="too near the rim of the table"):
-            plan(repertoire.model(Push), image, (0.0, 0.0), Goal(xy))
+            plan(problem_of(skills.model(Push), image, (0.0, 0.0), Goal(xy)))
     table.film = moved.append
-    went = pursue(table, Goal(xy), repertoire)
+    went = run_closed_loop(table, Goal(xy), skills)
     table.film = None
-    assert went.ending == "unreachable"
-    assert "too near the rim" in went.words
+    assert went.status == "unreachable"
+    assert "too near the rim" in went.message
     assert moved == []
     assert table.object_pose() == pose
 
 
-def test_ways_and_plans_keep_the_whole_object_on_the_table(table, repertoire):
+def test_ways_and_plans_keep_the_whole_object_on_the_table(table, skills):
     table.place(BOX, (0.5, 0.66), 0.3)
-    effects = repertoire.effects(table.look())
+    effects = skills.effects(table.look())
     assert effects.radius_m == pytest.approx(math.hypot(0.03, 0.025), abs=0.004)
 
     def anywhere(xy, *_):
@@ -143,14 +143,14 @@ def test_ways_and_plans_keep_the_whole_object_on_the_table(table, repertoire):
 
 
 @pytest.mark.slow
-def test_an_unreachable_goal_is_refused_before_any_motion(table, repertoire):
+def test_an_unreachable_goal_is_refused_before_any_motion(table, skills):
     table.place(BOX, (0.5, 0.3), 0.0)
     pose, moved = table.object_pose(), []
     table.film = moved.append
-    went = pursue(table, Goal((0.65, 0.65), EXACT_M), repertoire)
+    went = run_closed_loop(table, Goal((0.65, 0.65), EXACT_M), skills)
     table.film = None
-    assert went.ending == "unreachable"
-    assert "the position (0.650, 0.650) m" in went.words
+    assert went.status == "unreachable"
+    assert "the position (0.650, 0.650) m" in went.message
     assert moved == []
     assert table.object_pose() == pose
     assert went.vetoes > 0
@@ -179,7 +179,7 @@ def test_the_kinematics_agrees_with_what_execution_refuses(table):
     assert refused > 10
 
 
-def test_a_veto_bars_and_plans_anew(table, repertoire, monkeypatch):
+def test_a_veto_bars_and_plans_anew(table, skills, monkeypatch):
     """The arm refuses what was planned first; another way to the goal is taken."""
     refused = []
 
@@ -191,16 +191,16 @@ def test_a_veto_bars_and_plans_anew(table, repertoire, monkeypatch):
 
     table.place(BOX, (0.0, 0.0), 0.3)
     monkeypatch.setattr(Tabletop, "can_reach", can_reach)
-    went = pursue(table, Goal((0.1, 0.05), EXACT_M), repertoire)
-    assert went.reached, went.words
+    went = run_closed_loop(table, Goal((0.1, 0.05), EXACT_M), skills)
+    assert went.reached, went.message
     assert went.vetoes == len(refused) >= 1
     assert abs(went.steps[0].primitive.direction_rad - refused[0]) > 0.05
 
 
-def test_what_somebody_has_set_rolling_is_waited_for(table, repertoire):
-    demands = Demands(plan_continuous, PlanMode(3, partial=True), 0.03, 0.003, None, None)
+def test_what_somebody_has_set_rolling_is_waited_for(table, skills):
     table.place(BALL, (0.0, 0.0))
-    chase = Chase(table, Goal((0.1, 0.0), EXACT_M), repertoire, demands, ())
+    goal, config = Goal((0.1, 0.0), EXACT_M), ClosedLoopConfig()
+    chase = _ClosedLoop(table, goal, skills, plan_continuous, config, ())
     chase.expected = (0.0, 0.0)
     table.knock(0.0, 0.25)
     table.settle(0.3)
@@ -222,7 +222,7 @@ def test_the_disturbance_and_not_the_robot_makes_a_goal_infeasible(table):
 
     def feasible(ending, seen, happened):
         trial = Trial(BOX, (0.0, 0.0), 0.0, goal, (happened,))
-        went = SimpleNamespace(ending=ending, seen_xy_m=seen, happened=(happened,), goal=goal)
+        went = SimpleNamespace(status=ending, seen_xy_m=seen, happened=(happened,), goal=goal)
         return _stays_feasible(table, trial, went)
 
     at, near = (0.0, 0.0), (0.05, 0.0)
@@ -232,13 +232,20 @@ def test_the_disturbance_and_not_the_robot_makes_a_goal_infeasible(table):
     assert feasible("lost", (at, off_table), moved)  # nobody has touched it but the robot
 
 
-def test_it_gives_up_at_the_limit_of_actions(table, repertoire):
+def test_it_gives_up_at_the_limit_of_actions(table, skills):
     table.place(BOX, (0.0, 0.0), 0.3)
-    went = pursue(table, Goal((0.25, 0.0), EXACT_M), repertoire, max_actions=1)
-    assert went.ending == "gave_up"
-    assert "after 1 action:" in went.words
+    went = run_closed_loop(
+        table, Goal((0.25, 0.0), EXACT_M), skills, config=ClosedLoopConfig(max_actions=1)
+    )
+    assert went.status == "gave_up"
+    assert "after 1 action:" in went.message
     assert len(went.steps) == 1
-    assert pursue(table, Goal((0.0, 0.3), EXACT_M), repertoire, max_actions=0).steps == ()
+    assert (
+        run_closed_loop(
+            table, Goal((0.0, 0.3), EXACT_M), skills, config=ClosedLoopConfig(max_actions=0)
+        ).steps
+        == ()
+    )
 
 
 @pytest.mark.parametrize(
@@ -248,7 +255,7 @@ def test_the_limit_is_the_distance_over_5_cm_rounded_up_and_3(distance, limit):
     assert action_limit(distance) == limit
 
 
-def test_an_object_that_always_escapes_ends_the_pursuit(table, repertoire):
+def test_an_object_that_always_escapes_ends_the_pursuit(table, skills):
     """Somebody takes it away after every action: no endless loop."""
     table.place(BOX, (0.0, 0.0), 0.3)
 
@@ -256,59 +263,61 @@ def test_an_object_that_always_escapes_ends_the_pursuit(table, repertoire):
         x, y, _ = table.object_pose()
         table.shove(-x, -y, 0.1)
 
-    went = pursue(table, Goal((0.06, 0.0), EXACT_M), repertoire, on_action=take_away)
-    assert went.ending == "gave_up"
+    went = run_closed_loop(
+        table, Goal((0.06, 0.0), EXACT_M), skills, config=ClosedLoopConfig(on_action=take_away)
+    )
+    assert went.status == "gave_up"
     assert len(went.steps) <= 4 * action_limit(0.06)
 
 
-def test_a_planner_that_does_nothing_is_given_up(table, repertoire):
-    def lazy(model, image, start, goal, *args, **kwargs):
-        return Plan(goal, start, (), "lazy", False, 0, 0.0)
+def test_a_planner_that_does_nothing_is_given_up(table, skills):
+    def lazy(problem):
+        return Plan(problem.goal, problem.start_xy_m, (), "lazy", False, 0, 0.0)
 
     table.place(BOX, (0.0, 0.0), 0.3)
-    went = pursue(table, Goal((0.1, 0.0), EXACT_M), repertoire, planner=lazy)
-    assert went.ending == "gave_up"
+    went = run_closed_loop(table, Goal((0.1, 0.0), EXACT_M), skills, planner=lazy)
+    assert went.status == "gave_up"
     assert went.steps == ()
 
 
-def test_an_object_off_the_table_is_lost(table, repertoire):
+def test_an_object_off_the_table_is_lost(table, skills):
     table.place(BALL, (0.5, 0.0), 0.0)
     blow = Disturbance("knock", 1, 1.5, 0.0, at_s=None)
-    went = pursue(table, Goal((0.4, 0.1), EXACT_M), repertoire, disturbances=[blow])
-    assert went.ending == "lost"
-    assert "no longer on the table" in went.words
+    went = run_closed_loop(table, Goal((0.4, 0.1), EXACT_M), skills, disturbances=[blow])
+    assert went.status == "lost"
+    assert "no longer on the table" in went.message
 
 
 # Surprises
 
 
-def test_a_goal_that_moves_is_followed(table, repertoire):
+def test_a_goal_that_moves_is_followed(table, skills):
     table.place(BOX, (0.0, 0.0), 0.3)
     moves = Disturbance("goal", 0, 0.0, 0.08, at_s=3.0)
-    went = pursue(table, Goal((0.1, 0.0), EXACT_M), repertoire, disturbances=[moves])
+    went = run_closed_loop(table, Goal((0.1, 0.0), EXACT_M), skills, disturbances=[moves])
     assert went.happened == (moves,)
     assert went.goal.xy_m == pytest.approx((0.1, 0.08))
-    assert went.reached, went.words
+    assert went.reached, went.message
     assert went.distance_m < 0.005
     assert Goal((0.1, 0.0), EXACT_M).distance_m(went.end_pose[:2]) > 0.07
 
 
-def test_a_shoved_object_is_looked_for_again(table, repertoire):
+def test_a_shoved_object_is_looked_for_again(table, skills):
     table.place(BOX, (0.0, 0.0), 0.3)
     shove = Disturbance("shove", 1, -0.02, 0.07, turn=1.0)
-    went = pursue(table, Goal((0.16, 0.0), EXACT_M), repertoire, disturbances=[shove])
-    assert went.reached, went.words
+    went = run_closed_loop(table, Goal((0.16, 0.0), EXACT_M), skills, disturbances=[shove])
+    assert went.reached, went.message
     assert len(went.plans) >= 2
 
 
-def test_a_toppled_cylinder_is_dragged(table, repertoire):
+def test_a_toppled_cylinder_is_dragged(table, skills):
     """Pushed while it stands; lying it would roll away, so it is caged: told from the image."""
     table.place(TUBE, (0.0, 0.0), 0.0)
     falls = Disturbance("topple", 1, 0.0, 1.0)
-    went = pursue(table, Goal((0.2, 0.0), EXACT_M), repertoire, disturbances=[falls])
+    went = run_closed_loop(table, Goal((0.2, 0.0), EXACT_M), skills, disturbances=[falls])
     assert table.object_fell()
     assert [type(s.primitive) for s in went.steps][:2] == [Push, Drag]
-    assert went.reached, went.words
+    assert went.reached, went.message
 
 
 def test_a_knock_in_the_middle_of_an_action_follows_mechanics(table):
@@ -342,23 +351,23 @@ def test_disturbances_are_a_function_of_the_seed():
         Disturbance("kick", 1, 0.1, 0.0)
 
 
-def test_a_disturbed_pursuit_is_the_same_again(table, repertoire):
+def test_a_disturbed_pursuit_is_the_same_again(table, skills):
     ends = []
     for _ in range(2):
         table.place(TUBE, (0.0, 0.0), 0.0)
         script = draw_disturbances(7, n=2)
         ends.append(
-            pursue(table, Goal((0.1, 0.1), EXACT_M), repertoire, disturbances=script).end_pose
+            run_closed_loop(table, Goal((0.1, 0.1), EXACT_M), skills, disturbances=script).end_pose
         )
     assert ends[0] == ends[1]
 
 
 @pytest.mark.slow
-def test_a_goal_across_the_table_is_reached_in_the_limit(table, repertoire):
+def test_a_goal_across_the_table_is_reached_in_the_limit(table, skills):
     table.place(BALL, (0.2, -0.4), 0.0)
     goal = Goal((0.2, 0.25), EXACT_M)
-    went = pursue(table, goal, repertoire)
-    assert went.reached, went.words
+    went = run_closed_loop(table, goal, skills)
+    assert went.reached, went.message
     assert len(went.steps) <= action_limit(0.65)
 
 
@@ -367,7 +376,7 @@ def test_a_goal_across_the_table_is_reached_in_the_limit(table, repertoire):
     [((0.0,), 1, "reached"), ((0.02,), 2, "reached"), ((0.02, 0.02), 2, "gave_up")],
 )
 def test_what_is_held_aside_of_its_goal_is_put_down_and_lifted_there(
-    table, repertoire, shifts_m, lifts, ending
+    table, skills, shifts_m, lifts, ending
 ):
     """The goal moves by so much after each lift."""
     goal = Goal((0.06, 0.0), EXACT_M, height_m=0.1)
@@ -381,32 +390,36 @@ def test_what_is_held_aside_of_its_goal_is_put_down_and_lifted_there(
         return None
 
     table.place(TUBE)
-    went = pursue(table, goal, repertoire, on_action=move_goal)
-    assert went.ending == ending, went.words
+    went = run_closed_loop(table, goal, skills, config=ClosedLoopConfig(on_action=move_goal))
+    assert went.status == ending, went.message
     assert sum(isinstance(step.primitive, Grasp) for step in went.steps) == lifts
     aside_m = 0.0 if ending == "reached" else shifts_m[-1]
     assert went.distance_m == pytest.approx(aside_m, abs=0.005)
     assert abs(went.height_error_m) < 0.003
 
 
-def test_an_object_that_no_camera_sees_is_lost(table, repertoire):
+def test_an_object_that_no_camera_sees_is_lost(table, skills):
     table.place(BALL, (0.6, 0.0), config=WorldConfig(camera="kinect"))
     off = Disturbance("knock", 0, 1.5, 0.0)
-    went = pursue(table, Goal((0.3, 0.0), EXACT_M), repertoire, disturbances=[off])
-    assert went.ending == "lost", went.words
+    went = run_closed_loop(table, Goal((0.3, 0.0), EXACT_M), skills, disturbances=[off])
+    assert went.status == "lost", went.message
     table.place(BOX, (0.0, 0.0), config=WorldConfig())
 
 
 @pytest.mark.parametrize("goal", [{"turn_rad": -0.5}, {"height_m": 0.1}])
-def test_no_more_actions_than_were_allowed(table, repertoire, goal):
+def test_no_more_actions_than_were_allowed(table, skills, goal):
     table.place(BOX, (0.0, 0.0), 0.3)
-    went = pursue(table, Goal((0.0, 0.0), EXACT_M, **goal), repertoire, max_actions=0)
-    assert (went.ending, went.steps) == ("gave_up", ())
+    went = run_closed_loop(
+        table, Goal((0.0, 0.0), EXACT_M, **goal), skills, config=ClosedLoopConfig(max_actions=0)
+    )
+    assert (went.status, went.steps) == ("gave_up", ())
     with pytest.raises(TypeError, match=r"max_actions=1\.5"):
-        pursue(table, Goal((0.0, 0.0), EXACT_M), repertoire, max_actions=1.5)
+        run_closed_loop(
+            table, Goal((0.0, 0.0), EXACT_M), skills, config=ClosedLoopConfig(max_actions=1.5)
+        )
 
 
-def test_a_goal_that_turns_on_the_way_is_followed(table, repertoire):
+def test_a_goal_that_turns_on_the_way_is_followed(table, skills):
     table.place(TUBE, (0.0, 0.0))
     turns = [-0.4, -0.8]
 
@@ -414,16 +427,21 @@ def test_a_goal_that_turns_on_the_way_is_followed(table, repertoire):
         at = abs(turns[0] - table.object_pose()[2]) if turns else 1.0
         return Goal((0.0, 0.0), EXACT_M, turn_rad=turns.pop(0) - 0.4) if at < 0.05 else None
 
-    went = pursue(table, Goal((0.0, 0.0), EXACT_M, turn_rad=-0.4), repertoire, on_action=again)
-    assert went.reached, went.words
+    went = run_closed_loop(
+        table,
+        Goal((0.0, 0.0), EXACT_M, turn_rad=-0.4),
+        skills,
+        config=ClosedLoopConfig(on_action=again),
+    )
+    assert went.reached, went.message
     assert not turns
     assert went.goal.turn_rad == pytest.approx(-1.2)
 
 
-def test_the_arm_is_asked_about_the_grasp_that_it_will_carry_out(table, repertoire):
+def test_the_arm_is_asked_about_the_grasp_that_it_will_carry_out(table, skills):
     """At the rim of its reach a hand's height decides, and that goes by the object's."""
     for x in (0.52, 0.523, 0.526, 0.529):
         table.place(Cuboid(0.05, 0.05, 0.08), (x, 0.0))
-        went = pursue(table, Goal((x, 0.0), EXACT_M, height_m=0.24), repertoire)
-        assert went.ending == ("reached" if x == 0.52 else "unreachable"), went.words
+        went = run_closed_loop(table, Goal((x, 0.0), EXACT_M, height_m=0.24), skills)
+        assert went.status == ("reached" if x == 0.52 else "unreachable"), went.message
         assert x == 0.52 or went.steps == ()

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from problems import problem_of
 
 from affordlib.interactions import TrainingArrays
 from affordlib.models import EffectModel, Ensemble, load_checkpoint, observe_actions
@@ -74,8 +75,9 @@ def test_members_must_agree_on_channels(members):
 @pytest.mark.parametrize("plan", [plan_continuous, plan_astar])
 def test_planners_work_with_it(members, plan, cuboid_image):
     goal = Goal((0.05, 0.03))
-    (step,) = plan(Ensemble(members), cuboid_image, (0.0, 0.0), goal, "single_partial").steps
-    alone = plan(members[1], cuboid_image, (0.0, 0.0), goal, "single_partial").steps[0]
+    about = cuboid_image, (0.0, 0.0), goal, "single_partial"
+    (step,) = plan(problem_of(Ensemble(members), *about)).steps
+    alone = plan(problem_of(members[1], *about)).steps[0]
     assert abs(wrap_angle(step.primitive.theta - alone.primitive.theta)) < 0.15
     assert abs(step.stop_phase - alone.stop_phase) < 0.1
 

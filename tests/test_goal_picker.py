@@ -9,10 +9,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from PIL import Image
+from problems import problem_of
 
 from affordlib.interactions import open_interactions
 from affordlib.plan_files import load_plan
-from affordlib.planning import Repertoire, carry_out, plan_astar
+from affordlib.planning import Skills, execute_plan, plan_astar
 from affordlib.show import GoalPicker
 from affordlib.show.executors import closed_loop, open_loop
 from affordlib.show.plots import plot_plan
@@ -31,7 +32,7 @@ def make_picker(world, trained, asked_of_planner, tmp_path):
 
     def astar(*query):
         asked_of_planner.append(query[2].xy_m)
-        return plan_astar(trained, *query)
+        return plan_astar(problem_of(trained, *query))
 
     def broken(*_):
         raise ValueError("no <plan> today")
@@ -82,7 +83,7 @@ def test_the_picker_carries_out_what_a_plain_call_would(picker, world):
     seen = picker.outcome
     picker.start_over()
     assert world.object_pose() == pytest.approx((0, 0, 0), abs=1e-12)
-    plain = carry_out(world, plan)
+    plain = execute_plan(world, plan)
     assert seen.end_pose == plain.end_pose
     assert seen.distance_m == plain.distance_m
     for a, b in zip(seen.object_paths_xy_m, plain.object_paths_xy_m, strict=True):
@@ -105,7 +106,7 @@ def test_a_draft_until_the_hand_rests(make_picker, asked_of_planner, trained):
 
     def draft(*query):
         drafts.append(query[2].xy_m)
-        return replace(plan_astar(trained, *query), planner="draft")
+        return replace(plan_astar(problem_of(trained, *query)), planner="draft")
 
     picker = make_picker(draft=draft)
     assert (picker.plan.planner, drafts) == ("astar", [])  # nobody is in a hurry
@@ -150,9 +151,9 @@ def test_run_waits_for_the_plan_of_the_goal_that_is_shown(make_picker, trained):
     def slow(*query):
         began.append(query[2].xy_m)
         time.sleep(0.3)
-        return plan_astar(trained, *query)
+        return plan_astar(problem_of(trained, *query))
 
-    picker = make_picker(draft=lambda *query: plan_astar(trained, *query))
+    picker = make_picker(draft=lambda *query: plan_astar(problem_of(trained, *query)))
     picker.planners["A*"] = slow
 
     async def hand():
@@ -259,7 +260,7 @@ def test_a_disturbance_waits_for_the_end_of_the_action(make_picker, world):
 
 @pytest.mark.slow
 def test_a_closed_loop_notices_what_an_open_loop_does_not(make_picker, trained):
-    executors = {"open loop": open_loop, "closed loop": closed_loop(Repertoire({"push": trained}))}
+    executors = {"open loop": open_loop, "closed loop": closed_loop(Skills({"push": trained}))}
     off_m = {}
     for name in executors:
         picker = make_picker(executors=executors, seconds_per_action=1.0, seed=5)
@@ -350,9 +351,9 @@ def test_the_ring_is_where_the_arm_can_push_from(world):
 
 
 def test_a_closed_loop_shows_the_plans_it_makes_on_the_way(make_picker, trained):
-    repertoire, shown = Repertoire({"push": trained}), []
-    picker = make_picker(executors={"closed loop": closed_loop(repertoire)}, seed=3)
-    picker.planners["A*"] = repertoire.planner(plan_astar)
+    skills, shown = Skills({"push": trained}), []
+    picker = make_picker(executors={"closed loop": closed_loop(skills)}, seed=3)
+    picker.planners["A*"] = skills.planner(plan_astar)
     picker.pick(0.2, 0.0)
     first = picker._view.scene["steps"]
     picker._view.observe(lambda change: shown.append(change["new"]), names="scene")
@@ -369,7 +370,7 @@ def test_a_closed_loop_shows_the_plans_it_makes_on_the_way(make_picker, trained)
 
 
 def test_a_planner_that_cannot_be_told_of_the_arm_gives_way_and_it_is_said(make_picker, trained):
-    picker = make_picker(executors={"closed loop": closed_loop(Repertoire({"push": trained}))})
+    picker = make_picker(executors={"closed loop": closed_loop(Skills({"push": trained}))})
     picker.run()
     assert picker.plan.planner == "continuous"
     assert "planned anew by continuous search" in picker.controls.words.value
@@ -387,7 +388,7 @@ def test_sigma_is_drawn_so_that_it_can_be_seen(picker):
 
 def test_after_a_failed_run_the_next_plan_is_from_where_it_broke_off(make_picker, world):
     def fails(world, plan, planner, tell):
-        carry_out(world, replace(plan, steps=plan.steps[:1]))
+        execute_plan(world, replace(plan, steps=plan.steps[:1]))
         raise ValueError("the arm is stuck")
 
     picker = make_picker(executors={"fails": fails, "open loop": open_loop})

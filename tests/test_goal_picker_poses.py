@@ -12,12 +12,12 @@ from affordlib.world import Cuboid
 
 
 @pytest.fixture
-def posed(world, repertoire, tmp_path):
+def posed(world, skills, tmp_path):
     world.place(Cuboid(0.06, 0.05, 0.05))
     return GoalPicker(
         world,
-        {"continuous": repertoire.planner(plan_continuous)},
-        executors={"open loop": open_loop, "closed loop": closed_loop(repertoire)},
+        {"continuous": skills.planner(plan_continuous)},
+        executors={"open loop": open_loop, "closed loop": closed_loop(skills)},
         folder=str(tmp_path),
         seconds_per_action=0.0,
     )

@@ -66,7 +66,7 @@ HOSTILE = st.one_of(
 
 
 @pytest.fixture(scope="module")
-def shop(one_world, repertoire, pushes, tmp_path_factory):
+def shop(one_world, skills, pushes, tmp_path_factory):
     """What valid calls are made of."""
     box = world.Cuboid(0.06, 0.05, 0.05)
     config = models.CNPConfig()
@@ -87,8 +87,8 @@ def shop(one_world, repertoire, pushes, tmp_path_factory):
         "goal": goal,
         "step": step,
         "plan": plan,
-        "model": repertoire.model(Push),
-        "repertoire": repertoire,
+        "model": skills.model(Push),
+        "skills": skills,
         "config": config,
         "normaliser": normaliser,
         "arrays": arrays,
@@ -97,7 +97,9 @@ def shop(one_world, repertoire, pushes, tmp_path_factory):
         "folder": folder,
         "seen": one_world.interact(Push(0.0)),
         "film": film,
-        "pursuit": planning.pursue(one_world, goal, repertoire, max_actions=1),
+        "pursuit": planning.run_closed_loop(
+            one_world, goal, skills, config=planning.ClosedLoopConfig(max_actions=1)
+        ),
         "about": models.load_checkpoint("push_cnp")[1],
         "saved": save_plan(folder / "plan.json", plan),
         "data": pushes,
@@ -111,10 +113,10 @@ def valid_calls(shop):
     w, goal, model, image = (shop[name] for name in ("world", "goal", "model", "image"))
     at, arrays, network, plan = (0.0, 0.0), shop["arrays"], shop["network"], shop["plan"]
     few = models.TrainingConfig(steps=1, batch_size=2, n_targets=2, device="cpu")
-    query = {"model": model, "image": image, "start_xy_m": at, "goal": goal}
+    problem = planning.PlanningProblem(at, goal, planning.EffectMap(model, image), "single_partial")
     grip = {"image": image, "xy_m": at, "grip_yaws": (0.0, 0.1)}
     build = {"config": shop["config"], "normaliser": shop["normaliser"]}
-    planner = shop["repertoire"].planner(planning.plan_astar)
+    planner = shop["skills"].planner(planning.plan_astar)
     corners = tuple((0.03 * math.cos(a), 0.03 * math.sin(a)) for a in (0.0, 2.0, 4.0))
     ones = torch.ones(4)
     figure, ax = plt.subplots()
@@ -285,55 +287,60 @@ def valid_calls(shop):
             {"seed": 0, "n": 1, "n_actions": 2, "kinds": ("knock",), "strength": 1.0},
         ),
         "action_limit": (planning.action_limit, {"distance_m": 0.1}),
-        "map_effects": (
-            planning.map_effects,
+        "EffectMap": (
+            planning.EffectMap,
             {"model": model, "image": image, "kind": Push, "n_directions": 8, "n_phases": 5},
+        ),
+        "PlanningProblem": (
+            planning.PlanningProblem,
+            {f.name: getattr(problem, f.name) for f in dataclasses.fields(problem)},
+        ),
+        "ClosedLoopConfig": (
+            planning.ClosedLoopConfig,
+            dataclasses.asdict(planning.ClosedLoopConfig()),
         ),
         "plan_astar": (
             planning.plan_astar,
-            query | {"mode": "single_partial", "n_directions": 36, "stop_phases": (0.5, 1.0)},
+            {"problem": problem, "n_directions": 36, "stop_phases": (0.5, 1.0)},
         ),
         "plan_continuous": (
             planning.plan_continuous,
-            query | {"mode": "single_partial", "kind": Push, "seed": 0, "draft": True},
+            {"problem": problem, "seed": 0, "draft": True},
         ),
         "plan_gradient": (
             planning.plan_gradient,
-            query | {"mode": "single_partial", "samples": 10, "starts": 1, "seed": 0},
+            {"problem": problem, "samples": 10, "starts": 1, "seed": 0},
         ),
         "plan_turn": (
             planning.plan_turn,
-            grip | {"model": shop["repertoire"].model(Rotate), "turn_rad": 0.3},
+            grip | {"model": shop["skills"].model(Rotate), "turn_rad": 0.3},
         ),
         "plan_lift": (
             planning.plan_lift,
-            grip | {"model": shop["repertoire"].model(Grasp), "height_m": 0.05},
+            grip | {"model": shop["skills"].model(Grasp), "height_m": 0.05},
         ),
-        "kind_for": (shop["repertoire"].kind_for, {"image": image}),
-        "Repertoire": (
-            planning.Repertoire,
+        "kind_for": (shop["skills"].kind_for, {"image": image}),
+        "Skills": (
+            planning.Skills,
             {"models": {"push": model}, "reachability": None, "threshold": 0.2},
         ),
-        "carry_out": (
-            on_table(planning.carry_out),
+        "execute_plan": (
+            on_table(planning.execute_plan),
             {"world": w, "plan": plan, "corrections": 0, "enough_m": 0.001},
         ),
-        "pursue": (
-            on_table(planning.pursue),
+        "run_closed_loop": (
+            on_table(planning.run_closed_loop),
             {
                 "world": w,
                 "goal": Goal(at, 0.05),
-                "repertoire": shop["repertoire"],
-                "turn_tolerance_rad": 0.1,
-                "height_tolerance_m": 0.01,
-                "max_actions": 1,
+                "skills": shop["skills"],
+                "config": planning.ClosedLoopConfig(max_actions=1, horizon=1),
                 "disturbances": (),
-                "horizon": 1,
             },
         ),
         "closed_loop": (
             show.closed_loop,
-            {"repertoire": shop["repertoire"], "tolerance_m": 0.002},
+            {"skills": shop["skills"], "tolerance_m": 0.002},
         ),
         "plot_depth": (show.plot_depth, {"ax": ax, "image": image, "width_m": 0.16}),
         "plot_footprint": (
@@ -384,8 +391,8 @@ def valid_calls(shop):
                 "theta_rad": 0.1,
             },
         ),
-        "plot_pursuit": (
-            show.plot_pursuit,
+        "plot_closed_loop": (
+            show.plot_closed_loop,
             {"ax": ax, "pursuit": shop["pursuit"], "thing": shop["thing"]},
         ),
         "refuse_seen": (
@@ -421,12 +428,13 @@ attempt follow follow_path can_reach look_from picture mark shove knock topple s
 from_dataset open_interactions split_interactions Recipe Variation collect CNPConfig
 AttentionConfig FiLMConfig build Ensemble TrainingConfig coverage fit_temperature
 load_checkpoint save_checkpoint observe_actions train train_literal PlanMode Disturbance
-draw_disturbances action_limit map_effects plan_astar plan_continuous plan_gradient plan_turn
-plan_lift kind_for Repertoire carry_out pursue closed_loop plot_depth plot_footprint plot_plan
+draw_disturbances action_limit EffectMap PlanningProblem ClosedLoopConfig plan_astar
+plan_continuous plan_gradient plan_turn plan_lift kind_for Skills execute_plan run_closed_loop
+closed_loop plot_depth plot_footprint plot_plan
 plot_outcome plot_table save_figure GoalPicker PhaseSlider Film ConditioningExplorer error_row
 mean_length_errors_m save_plan load_plan write_results read_results results_table check Split
 TrainingArrays AffordanceCNP AttentiveCNP FiLMNetwork calibration_rows train_model refuse_seen
-outline_in_lever_frame plot_levered plot_pursuit show_animation
+outline_in_lever_frame plot_levered plot_closed_loop show_animation
 """,
 )
 
@@ -488,7 +496,7 @@ def test_a_hostile_value_is_refused_by_name_or_does_no_harm(shop, name, tmp_path
 
 
 MADE_BY_DRIVEN_ONES = """
-EffectMap EffectModel EffectNetwork NetworkConfig Pursuit Thing open_loop
+ClosedLoopResult EffectModel EffectNetwork NetworkConfig Thing open_loop
 """
 
 

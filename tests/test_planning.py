@@ -1,10 +1,12 @@
 import itertools
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from problems import problem_of
 
 from affordlib.evaluation.goals import (
     ROLLABLE,
@@ -15,14 +17,14 @@ from affordlib.evaluation.goals import (
 )
 from affordlib.models import EffectModel, load_checkpoint
 from affordlib.planning import (
-    carry_out,
-    map_effects,
+    EffectMap,
+    execute_plan,
     plan_astar,
     plan_continuous,
     plan_gradient,
 )
 from affordlib.planning.astar import Branches, BranchTable, search
-from affordlib.planning.steps import roll_out
+from affordlib.planning.rollout import roll_out
 from affordlib.primitives import Drag, Push
 from affordlib.types import Goal, Observations, Prediction
 from affordlib.world import Cuboid
@@ -102,7 +104,8 @@ def test_astar_finds_what_exhaustive_search_finds(seed):
             nearest = min(nearest, goal.distance_m(end))
             if goal.distance_m(end) <= goal.tolerance_m:
                 best = min(best, length)
-    chain, reached, _ = search(table, (0.0, 0.0), goal, max_steps=3)
+    problem = replace(problem_of(MODEL, IMAGE, (0.0, 0.0), Goal((0.0, 0.0))), goal=goal)
+    chain, reached, _ = search(problem, table)
     assert reached == math.isfinite(best)
     end, length = table.follow([int(k) for k, _ in chain])
     if reached:
@@ -113,7 +116,7 @@ def test_astar_finds_what_exhaustive_search_finds(seed):
 
 
 def test_branches_are_the_papers_180():
-    branches = BranchTable(map_effects(MODEL, IMAGE)).at(0.0)
+    branches = BranchTable(EffectMap(MODEL, IMAGE)).at(0.0)
     # Those that stop before contact do nothing and are pruned: 36 x {80, 100 %} remain.
     assert len(branches.direction) == 72
     assert set(np.round(branches.stop_phase, 3)) == {0.8, 1.0}
@@ -128,8 +131,8 @@ def test_astar_expands_nothing_out_of_reach():
         return xy_m[:, 0] < 0.05
 
     goal = Goal((0.18, 0.06))
-    barred = plan_astar(MODEL, IMAGE, (0.0, 0.0), goal, reachable=only_left)
-    assert plan_astar(MODEL, IMAGE, (0.0, 0.0), goal).reaches_goal
+    barred = plan_astar(problem_of(MODEL, IMAGE, (0.0, 0.0), goal, reachable=only_left))
+    assert plan_astar(problem_of(MODEL, IMAGE, (0.0, 0.0), goal)).reaches_goal
     assert not barred.reaches_goal
     starts = [(0.0, 0.0), *(step.predicted_end_xy_m for step in barred.steps[:-1])]
     assert all(x < 0.05 for x, _ in starts)
@@ -139,7 +142,7 @@ def test_astar_expands_nothing_out_of_reach():
 def test_an_effect_map_says_what_the_model_says(world, film, kind):
     world.place(Cuboid(0.07, 0.05, 0.05), (0.0, 0.0), 0.4)
     model = film if kind is Push else MODEL
-    effects = map_effects(model, world.look(), kind)
+    effects = EffectMap(model, world.look(), kind)
     rng = np.random.default_rng(0)
     direction = torch.from_numpy(rng.uniform(-7, 7, 40))
     phase = torch.from_numpy(rng.uniform(0.3, 1, 40))
@@ -163,7 +166,7 @@ def test_an_effect_map_says_what_the_model_says(world, film, kind):
 def test_a_chain_turns_with_the_object(world, film):
     """Rolling out two pushes at once is asking for the second of the turned object."""
     world.place(Cuboid(0.07, 0.05, 0.05), (0.0, 0.0), 0.4)
-    effects = map_effects(film, world.look())
+    effects = EffectMap(film, world.look())
     direction, phase = torch.tensor([[0.3, 1.2]]).double(), torch.tensor([[1.0, 0.9]]).double()
     positions, turns, variances = roll_out(effects, direction, phase)
     first, _ = effects(direction[:, 0], phase[:, 0])
@@ -177,7 +180,7 @@ def test_a_chain_turns_with_the_object(world, film):
 
 @pytest.mark.parametrize("goal_xy", [(0.05, 0.02), (-0.03, 0.06), (0.13, -0.11), (0.2, 0.05)])
 def test_the_continuous_planner_ends_at_the_goal(goal_xy):
-    plan = plan_continuous(MODEL, IMAGE, (0.0, 0.0), Goal(goal_xy))
+    plan = plan_continuous(problem_of(MODEL, IMAGE, (0.0, 0.0), Goal(goal_xy)))
     assert len(plan.steps) >= math.ceil(math.hypot(*goal_xy) / REACH_M)
     assert plan.predicted_distance_m < 5e-5
     xy = np.zeros(2)
@@ -190,8 +193,8 @@ def test_the_continuous_planner_ends_at_the_goal(goal_xy):
     assert REACH_M * share**2 * math.cos(direction) == pytest.approx(
         xy[0] - (plan.steps[-2].predicted_end_xy_m[0] if len(plan.steps) > 1 else 0), abs=1e-3
     )
-    assert plan_continuous(MODEL, IMAGE, goal_xy, Goal(goal_xy)).steps == ()
-    full = plan_continuous(MODEL, IMAGE, (0, 0), Goal(goal_xy), "single_full")
+    assert plan_continuous(problem_of(MODEL, IMAGE, goal_xy, Goal(goal_xy))).steps == ()
+    full = plan_continuous(problem_of(MODEL, IMAGE, (0, 0), Goal(goal_xy), "single_full"))
     assert [s.stop_phase for s in full.steps] == [1.0]
 
 
@@ -205,7 +208,7 @@ def test_of_two_plans_the_surer_is_taken():
             std = 0.001 + 0.02 * along[..., :1].square().expand_as(told.effect_std)
             return Prediction(told.action_mean, std, told.effect_mean, std)
 
-    plan = plan_continuous(SureUpwards(), IMAGE, (0, 0), Goal((0.0, 0.12)))
+    plan = plan_continuous(problem_of(SureUpwards(), IMAGE, (0, 0), Goal((0.0, 0.12))))
     assert plan.predicted_distance_m < 1e-4
     assert all(abs(math.sin(s.primitive.direction_rad)) > 0.95 for s in plan.steps)
     assert plan.steps[-1].std_m < 0.004
@@ -215,12 +218,14 @@ def test_the_continuous_planner_keeps_to_where_the_arm_reaches():
     def only_left(xy_m, direction_rad):
         return xy_m[:, 0] < 0.05
 
-    plan = plan_continuous(MODEL, IMAGE, (0, 0), Goal((0.2, 0.0)), reachable=only_left)
+    plan = plan_continuous(problem_of(MODEL, IMAGE, (0, 0), Goal((0.2, 0.0)), reachable=only_left))
     assert not plan.reaches_goal
     starts = [(0.0, 0.0), *(s.predicted_end_xy_m for s in plan.steps[:-1])]
     assert all(x < 0.05 for x, _ in starts)
     nowhere = plan_continuous(
-        MODEL, IMAGE, (0, 0), Goal((0.2, 0.0)), reachable=lambda xy, d: np.zeros(len(xy), bool)
+        problem_of(
+            MODEL, IMAGE, (0, 0), Goal((0.2, 0.0)), reachable=lambda xy, d: np.zeros(len(xy), bool)
+        )
     )
     assert nowhere.steps == ()
     assert not nowhere.reaches_goal
@@ -228,7 +233,7 @@ def test_the_continuous_planner_keeps_to_where_the_arm_reaches():
 
 def test_astar_plans():
     goal = Goal((0.18, 0.06))
-    plan = plan_astar(MODEL, IMAGE, (0.0, 0.0), goal)
+    plan = plan_astar(problem_of(MODEL, IMAGE, (0.0, 0.0), goal))
     assert plan.reaches_goal
     assert 2 <= len(plan.steps) <= 3
     assert plan.predicted_distance_m <= goal.tolerance_m
@@ -237,10 +242,10 @@ def test_astar_plans():
         np.testing.assert_allclose(step.predicted_path_xy_m[0], xy, atol=1e-4)
         xy = step.predicted_path_xy_m[-1]
         np.testing.assert_allclose(xy, step.predicted_end_xy_m, atol=1e-9)
-    assert plan_astar(MODEL, IMAGE, (0, 0), Goal((0.01, 0.0))).steps == ()
-    full = plan_astar(MODEL, IMAGE, (0, 0), Goal((0.07, 0.03)), mode="single_full")
+    assert plan_astar(problem_of(MODEL, IMAGE, (0, 0), Goal((0.01, 0.0)))).steps == ()
+    full = plan_astar(problem_of(MODEL, IMAGE, (0, 0), Goal((0.07, 0.03)), mode="single_full"))
     assert [s.stop_phase for s in full.steps] == [1.0]
-    far = plan_astar(MODEL, IMAGE, (0, 0), Goal((0.45, 0.0)))
+    far = plan_astar(problem_of(MODEL, IMAGE, (0, 0), Goal((0.45, 0.0))))
     assert not far.reaches_goal
     assert far.predicted_distance_m == pytest.approx(0.45 - 3 * REACH_M, abs=1e-6)
 
@@ -249,7 +254,7 @@ def test_astar_plans():
 @pytest.mark.parametrize("goal_xy", [(0.05, 0.02), (-0.03, 0.06), (0.13, -0.11)])
 def test_the_gradient_planner_finds_direction_and_phase(goal_xy, seed):
     goal = Goal(goal_xy)
-    plan = plan_gradient(MODEL, IMAGE, (0.0, 0.0), goal, samples=300, seed=seed)
+    plan = plan_gradient(problem_of(MODEL, IMAGE, (0.0, 0.0), goal), samples=300, seed=seed)
     assert len(plan.steps) == math.ceil(math.hypot(*goal_xy) / REACH_M)
     # Between two of 300 samples the object moves 0.75 mm; the direction converges.
     assert plan.predicted_distance_m < 0.001
@@ -265,21 +270,23 @@ def test_finer_samples_cut_finer():
     ]
     errors = []
     for samples in (25, 100, 300):
-        plans = [plan_gradient(MODEL, IMAGE, (0, 0), goal, samples=samples) for goal in goals]
+        plans = [
+            plan_gradient(problem_of(MODEL, IMAGE, (0, 0), goal), samples=samples) for goal in goals
+        ]
         errors.append(np.mean([plan.predicted_distance_m for plan in plans]))
     assert errors[0] > 2 * errors[1] > 4 * errors[2]
 
 
 def test_modes_bind_the_gradient_planner():
     goal = Goal((0.04, 0.0))
-    full = plan_gradient(MODEL, IMAGE, (0, 0), goal, mode="single_full")
+    full = plan_gradient(problem_of(MODEL, IMAGE, (0, 0), goal, mode="single_full"))
     assert [s.stop_phase for s in full.steps] == [1.0]
-    partial = plan_gradient(MODEL, IMAGE, (0, 0), goal, mode="single_partial")
+    partial = plan_gradient(problem_of(MODEL, IMAGE, (0, 0), goal, mode="single_partial"))
     expected = STARTS + (1 - STARTS) * math.sqrt(0.04 / REACH_M)
     assert partial.steps[0].stop_phase == pytest.approx(expected, abs=0.01)
-    again = plan_gradient(MODEL, IMAGE, (0, 0), goal, mode="single_partial")
+    again = plan_gradient(problem_of(MODEL, IMAGE, (0, 0), goal, mode="single_partial"))
     assert np.array_equal(again.steps[0].path_xy_m, partial.steps[0].path_xy_m)
-    snapped = plan_gradient(MODEL, IMAGE, (0, 0), goal, snap=True)
+    snapped = plan_gradient(problem_of(MODEL, IMAGE, (0, 0), goal), snap=True)
     assert snapped.steps[0].path_xy_m is None
     assert snapped.steps[0].primitive.direction_rad == pytest.approx(0.0, abs=0.01)
 
@@ -288,7 +295,7 @@ def test_a_plan_is_carried_out(world, trained):
     world.place(Cuboid(0.06, 0.05, 0.05), (0.0, 0.0), 0.0)
     start = world.object_pose()[:2]
     goal = Goal((0.15, 0.0))
-    outcome = carry_out(world, plan_astar(trained, world.look(), start, goal))
+    outcome = execute_plan(world, plan_astar(problem_of(trained, world.look(), start, goal)))
     assert outcome.distance_m == pytest.approx(goal.distance_m(world.object_pose()[:2]))
     assert outcome.distance_m < goal.tolerance_m + 0.005  # 15 mm: A* is content within 2 cm
     assert len(outcome.object_paths_xy_m) == len(outcome.plan.steps) == 2
@@ -303,7 +310,7 @@ def test_a_decoded_path_is_followed(world):
     thing, push, stop = Cuboid(0.06, 0.05, 0.05), Push(2.2), 0.85
     world.place(thing, (0.0, 0.0), 0.3)
     own = world.interact(push, stop, approach=True)
-    plan = plan_astar(MODEL, IMAGE, (0, 0), Goal((0.08, 0.0)))
+    plan = plan_astar(problem_of(MODEL, IMAGE, (0, 0), Goal((0.08, 0.0))))
     from dataclasses import replace
 
     phase = np.linspace(0, stop, 60)
@@ -322,7 +329,7 @@ def test_the_shipped_model_reaches_goals(world, trained):
     tasks += uniform_tasks("multi_partial", 6, seed=7)
 
     def astar(image, start, goal, mode):
-        return plan_astar(trained, image, start, goal, mode)
+        return plan_astar(problem_of(trained, image, start, goal, mode))
 
     outcomes = measure(world, tasks, astar)
     records = [outcome_record(t, o) for t, o in zip(tasks, outcomes, strict=True)]
@@ -343,7 +350,7 @@ def test_the_continuous_planner_comes_within_millimetres(world, film):
     tasks = [t for t in tasks if not t.thing.rollable][:6]
 
     def continuous(image, start, goal, mode):
-        return plan_continuous(film, image, start, goal, mode)
+        return plan_continuous(problem_of(film, image, start, goal, mode))
 
     open_loop = [o.distance_m for o in measure(world, tasks, continuous)]
     closed = [o.distance_m for o in measure(world, tasks, continuous, corrections=2)]
@@ -365,14 +372,26 @@ def test_the_frozen_goals_are_those_that_are_drawn(world):
 @pytest.mark.parametrize(
     ("plan", "words"),
     [
-        (lambda: plan_astar(MODEL, IMAGE, (0, 9), Goal((0, 0.1))), r"start_xy_m = \(0, 9\)"),
-        (lambda: plan_astar(MODEL, IMAGE[0], (0, 0), Goal((0, 0.1))), r"image .* \(48, 48\)"),
         (
-            lambda: plan_astar(MODEL, IMAGE / 0, (0, 0), Goal((0, 0.1))),
+            lambda: plan_astar(problem_of(MODEL, IMAGE, (0, 9), Goal((0, 0.1)))),
+            r"start_xy_m = \(0, 9\)",
+        ),
+        (
+            lambda: plan_astar(problem_of(MODEL, IMAGE[0], (0, 0), Goal((0, 0.1)))),
+            r"image .* \(48, 48\)",
+        ),
+        (
+            lambda: plan_astar(problem_of(MODEL, IMAGE / 0, (0, 0), Goal((0, 0.1)))),
             "image must be finite numbers",
         ),
-        (lambda: plan_astar(MODEL, IMAGE, (0, 0), Goal((0, 0.1)), "two"), "mode 'two' is unknown"),
-        (lambda: plan_gradient(MODEL, IMAGE, (0, 0), Goal((0, 0.1)), samples=1), "samples .* 1"),
+        (
+            lambda: plan_astar(problem_of(MODEL, IMAGE, (0, 0), Goal((0, 0.1)), "two")),
+            "mode 'two' is unknown",
+        ),
+        (
+            lambda: plan_gradient(problem_of(MODEL, IMAGE, (0, 0), Goal((0, 0.1))), samples=1),
+            "samples .* 1",
+        ),
         (lambda: uniform_tasks("two", 1), "mode 'two' is unknown"),
     ],
 )
@@ -385,11 +404,11 @@ def test_bad_input_is_named(plan, words):
 def test_a_grid_of_nothing_is_refused():
     for settings, says in (({"n_directions": 0}, "n_directions"), ({"stop_phases": ()}, "phase")):
         with pytest.raises(ValueError, match=says):
-            plan_astar(MODEL, IMAGE, (0.0, 0.0), Goal((0.1, 0.0)), **settings)
+            plan_astar(problem_of(MODEL, IMAGE, (0.0, 0.0), Goal((0.1, 0.0))), **settings)
 
 
 @pytest.mark.parametrize("name", ["lever_anchored", "grasp_film", "rotate_film", "drag_film"])
 @pytest.mark.parametrize("plan", [plan_astar, plan_continuous, plan_gradient])
 def test_a_model_of_other_actions_plans_no_pushes(cuboid_image, name, plan):
     with pytest.raises(ValueError, match=r"model: a planner|train on such actions"):
-        plan(load_checkpoint(name)[0], cuboid_image, (0.0, 0.0), Goal((0.1, 0.05)))
+        plan(problem_of(load_checkpoint(name)[0], cuboid_image, (0.0, 0.0), Goal((0.1, 0.05))))

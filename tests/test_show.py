@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from PIL import Image
+from problems import problem_of
 
-from affordlib.planning import carry_out, plan_astar
+from affordlib.planning import execute_plan, plan_astar
 from affordlib.primitives import Push
 from affordlib.show import (
     Film,
@@ -48,7 +49,9 @@ def test_a_footprint_is_drawn_where_the_object_is(world, trained):
     np.testing.assert_allclose(np.ptp(outline, axis=0), [4.0, 6.0], atol=1e-9)
     np.testing.assert_allclose(outline[:-1].mean(axis=0), [10.0, -5.0], atol=1e-9)
     world.place(Cuboid(0.06, 0.05, 0.05))
-    outcome = carry_out(world, plan_astar(trained, world.look(), (0.0, 0.0), Goal((0.12, 0.0))))
+    outcome = execute_plan(
+        world, plan_astar(problem_of(trained, world.look(), (0.0, 0.0), Goal((0.12, 0.0))))
+    )
     assert "mm from the goal" in plot_outcome(ax, outcome).get_title(loc="left")
     plt.close(figure)
 

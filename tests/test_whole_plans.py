@@ -27,15 +27,15 @@ def test_rows_are_told_for_each_planner_and_class():
     assert told["astar", "all"]["distance_m_mean"] == pytest.approx(0.11)
 
 
-def test_a_trial_measures_what_is_missing(world, repertoire, monkeypatch):
-    record = whole_plans.run_trial("height", 0, "continuous", world, repertoire)
+def test_a_trial_measures_what_is_missing(world, skills, monkeypatch):
+    record = whole_plans.run_trial("height", 0, "continuous", world, skills)
     trial = whole_plans.draw_trial("height", 0)
     assert record["promised"]
     assert record["off"] < 0.005
     assert record["distance_m"] < 0.005
     # A plan that does nothing leaves the whole height missing, and the object where it stood.
-    monkeypatch.setattr(whole_plans, "carry_out", lambda *_: None)
-    idle = whole_plans.run_trial("height", 0, "astar", world, repertoire)
+    monkeypatch.setattr(whole_plans, "execute_plan", lambda *_: None)
+    idle = whole_plans.run_trial("height", 0, "astar", world, skills)
     assert idle["off"] == pytest.approx(trial.goal.height_m, abs=1e-4)
     assert idle["distance_m"] == pytest.approx(np.hypot(*trial.goal.xy_m), abs=1e-4)
 

@@ -1,30 +1,37 @@
 """Planning with (partial) actions on any `EffectModel`, and carrying plans out."""
 
 from affordlib.planning.astar import plan_astar
-from affordlib.planning.closed_loop import Pursuit, action_limit, carry_out, pursue
+from affordlib.planning.closed_loop import (
+    ClosedLoopConfig,
+    ClosedLoopResult,
+    action_limit,
+    execute_plan,
+    run_closed_loop,
+)
 from affordlib.planning.continuous import plan_continuous
 from affordlib.planning.disturbances import Disturbance, draw_disturbances
-from affordlib.planning.effect_map import EffectMap, map_effects
+from affordlib.planning.effect_map import EffectMap
 from affordlib.planning.gradient import plan_gradient
-from affordlib.planning.modes import MODES, PlanMode
-from affordlib.planning.poses import plan_lift, plan_turn
-from affordlib.planning.repertoire import Repertoire
+from affordlib.planning.grasp_rotate import plan_lift, plan_turn
+from affordlib.planning.problem import MODES, PlanMode, PlanningProblem
+from affordlib.planning.skills import Skills
 
 __all__ = [
     "MODES",
+    "ClosedLoopConfig",
+    "ClosedLoopResult",
     "Disturbance",
     "EffectMap",
     "PlanMode",
-    "Pursuit",
-    "Repertoire",
+    "PlanningProblem",
+    "Skills",
     "action_limit",
-    "carry_out",
     "draw_disturbances",
-    "map_effects",
+    "execute_plan",
     "plan_astar",
     "plan_continuous",
     "plan_gradient",
     "plan_lift",
     "plan_turn",
-    "pursue",
+    "run_closed_loop",
 ]

@@ -12,21 +12,17 @@ import heapq
 import itertools
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import torch
 
-from affordlib.models.protocol import EffectModel
-from affordlib.planning.effect_map import EffectMap, map_effects
-from affordlib.planning.finish import Finish, finished
-from affordlib.planning.modes import PlanMode, check_has_room, is_on_table, mode_named
-from affordlib.planning.repertoire import Reachable
-from affordlib.planning.steps import make_steps
-from affordlib.primitives import Drag, Push
-from affordlib.types import Goal, Plan, Step, check_count, check_on_table, check_within
+from affordlib.planning.effect_map import EffectMap
+from affordlib.planning.problem import PlanningProblem, is_on_table
+from affordlib.planning.rollout import make_steps
+from affordlib.types import Plan, check_count, check_within
 
 N_DIRECTIONS = 36
 STOP_PHASES = (0.2, 0.4, 0.6, 0.8, 1.0)
@@ -121,26 +117,24 @@ class _Children:
 
 
 def search(
+    problem: PlanningProblem,
     table: BranchTable,
-    start_xy_m: Sequence[float],
-    goal: Goal,
-    max_steps: int,
-    reachable: Reachable | None = None,
     max_expansions: int = 20_000,
     trace: list[tuple[np.ndarray, np.ndarray]] | None = None,
-    finish: Callable[..., tuple[Step, ...] | None] | None = None,
 ) -> tuple[list[tuple[float, float]], bool, int]:
     """The cheapest chain of (direction, phase) into the goal's disc, whether it gets there, and
     how many nodes were expanded.
 
     Where no chain does, the one that ends nearest. Ties go to fewer actions. No action leads where
-    a part of the object would be off the table, or begins out of reach. trace, if given, receives
-    each expanded position (2,) with those of its children (n, 2). finish: turns and lifts at the
-    end; where it cannot, a node is none of the goal's.
+    a part of the object would be off the table, or begins out of reach; a node from which the
+    object cannot be turned and lifted as the goal asks is none of the goal's. trace, if given,
+    receives each expanded position (2,) with those of its children (n, 2).
     """
+    goal, reachable, finish = problem.goal, problem.reachable, problem.pose_planner
+    max_steps = problem.mode.max_steps
     goal_xy, tolerance = np.array(goal.xy_m)[:, None], goal.tolerance_m
     reach = table.effects.reach_m
-    start, nothing = np.array([start_xy_m], dtype=float), np.zeros(1)
+    start, nothing = np.array([problem.start_xy_m]), np.zeros(1)
     nearest_m = goal.distance_m(start[0])
     root = _Children(None, start, nothing, nothing, np.array([nearest_m]), nothing, nothing)
     # The running number tells nodes of the same f and depth apart, so nothing after it is compared.
@@ -204,33 +198,16 @@ def search(
 
 
 def plan_astar(
-    model: EffectModel,
-    image: np.ndarray,
-    start_xy_m: Sequence[float],
-    goal: Goal,
-    mode: str | PlanMode = "multi_partial",
-    kind: type[Push] | type[Drag] = Push,
-    effects: EffectMap | None = None,
-    reachable: Reachable | None = None,
+    problem: PlanningProblem,
     n_directions: int = N_DIRECTIONS,
     stop_phases: Sequence[float] = STOP_PHASES,
-    finish: Finish | None = None,
 ) -> Plan:
-    """Plan from the object's position [m] and depth image (2, 48, 48) to a goal, by A*.
-
-    kind: push or drag; effects: the object's map, if it was made before; reachable: a function of
-    positions (n, 2) and directions (n,) that says where the arm can act; finish: what turns and
-    lifts the object at the end, without which a plan cannot reach a goal that asks for it.
-    """
+    """Plan by A*."""
     began = time.perf_counter()
-    mode = mode_named(mode)
-    start = check_on_table("start_xy_m", start_xy_m)
-    effects = effects or map_effects(model, image, kind)
-    check_has_room(goal, effects.radius_m)
-    table = BranchTable(effects, n_directions, tuple(stop_phases) if mode.partial else (1.0,))
-    chain, reached, expansions = search(
-        table, start, goal, mode.max_steps, reachable, finish=finish
-    )
-    steps = make_steps(effects, start, torch.tensor(chain, dtype=torch.float64).reshape(-1, 2))
-    plan = Plan(goal, start, steps, "astar", reached, expansions, 0.0)
-    return finished(plan, finish, began)
+    mode = problem.mode
+    stops = tuple(stop_phases) if mode.partial else (1.0,)
+    table = BranchTable(problem.effects, n_directions, stops)
+    chain, reached, expansions = search(problem, table)
+    chain = torch.tensor(chain, dtype=torch.float64).reshape(-1, 2)
+    steps = make_steps(problem.effects, problem.start_xy_m, chain)
+    return problem.plan(steps, "astar", reached, expansions, began)

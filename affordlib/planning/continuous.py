@@ -15,20 +15,16 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from affordlib.models.protocol import EffectModel
-from affordlib.planning.effect_map import EffectMap, map_effects
-from affordlib.planning.finish import Finish, finished
-from affordlib.planning.modes import PlanMode, check_has_room, is_on_table, mode_named
-from affordlib.planning.repertoire import Reachable
-from affordlib.planning.steps import make_steps, roll_out
-from affordlib.primitives import Drag, Push
-from affordlib.types import Goal, Plan, check_count, check_on_table
+from affordlib.planning.effect_map import EffectMap
+from affordlib.planning.problem import PlanningProblem, is_on_table
+from affordlib.planning.rollout import make_steps, roll_out
+from affordlib.types import Plan, check_count
 
 PREFIXES = 192
 SPREAD_RAD = 1.2
@@ -176,44 +172,29 @@ def _foreseen(effects: EffectMap, direction: Tensor, phase: Tensor) -> tuple[Ten
 
 
 def plan_continuous(
-    model: EffectModel,
-    image: np.ndarray,
-    start_xy_m: Sequence[float],
-    goal: Goal,
-    mode: str | PlanMode = "multi_partial",
-    kind: type[Push] | type[Drag] = Push,
-    effects: EffectMap | None = None,
-    reachable: Reachable | None = None,
+    problem: PlanningProblem,
     seed: int = 0,
     draft: bool = False,
     trace: list[tuple[Tensor, Tensor, Tensor]] | None = None,
-    finish: Finish | None = None,
 ) -> Plan:
-    """Plan from the object's position [m] and depth image (2, 48, 48) to a goal, by gradient.
+    """Plan over directions and phases at once.
 
-    kind: push or drag; effects: the object's map, if it was made before; reachable: a function of
-    positions (n, 2) and directions (n,) that says where the arm can act. Where no chain comes near
-    the goal, the plan is the one that comes nearest. draft: a first plan, of as few actions as the
-    distance allows and without the descent; of three in a quarter of the time. trace, if given,
-    receives for each number of actions K the directions and phases (B, K) of the chains that
-    remain, and their costs (B,) [m]. finish: what turns and lifts the object at the end, without
-    which a plan cannot reach a goal that asks for it.
+    Where no chain comes near the goal, the plan is the one that comes nearest. draft: a first plan,
+    of as few actions as the distance allows and without the descent; of three in a quarter of the
+    time. trace, if given, receives for each number of actions K the directions and phases (B, K) of
+    the chains that remain, and their costs (B,) [m].
     """
     began = time.perf_counter()
-    mode = mode_named(mode)
-    start = check_on_table("start_xy_m", start_xy_m)
-    effects = effects or map_effects(model, image, kind)
-    check_has_room(goal, effects.radius_m)
+    effects, start, goal, mode = (
+        getattr(problem, name) for name in ("effects", "start_xy_m", "goal", "mode")
+    )
     rng = np.random.default_rng(check_count("seed", seed, least=0))
-    xy = np.array(start)
-    target = torch.from_numpy(np.array(goal.xy_m) - xy)
+    target = torch.from_numpy(np.subtract(goal.xy_m, start))
     fewest = max(1, math.ceil(float(target.norm()) / max(effects.reach_m, SHORTEST_M)))
     best, iterations = None, 0
     if float(target.norm()) > 1e-4:
         for n_actions in range(min(fewest, mode.max_steps), mode.max_steps + 1):
-            found = _best_chain(
-                effects, xy, target, n_actions, mode.partial, reachable, rng, draft, trace
-            )
+            found = _best_chain(problem, target, n_actions, rng, draft, trace)
             iterations += 0 if draft else ITERATIONS
             if found is not None and (best is None or found[0] < best[0]):
                 best = found
@@ -224,27 +205,21 @@ def plan_continuous(
         direction, phase = best[1:]
         corrections = 1 if draft else CORRECTIONS
         chain, foreseen = _correct(effects, target, direction, phase, mode.partial, corrections)
-        if not _allowed(effects, xy, foreseen[0][None], chain[None, :, 0], reachable).all():
+        if not _allowed(problem, foreseen[0][None], chain[None, :, 0]).all():
             chain, foreseen = torch.stack([direction[0], phase[0]], dim=1), None
         steps = make_steps(effects, start, chain, foreseen)
         if goal.distance_m(steps[-1].predicted_end_xy_m) >= goal.distance_m(start):
             steps = ()  # where nothing brings it nearer, the object stays
     end = steps[-1].predicted_end_xy_m if steps else start
     reaches = goal.distance_m(end) <= goal.tolerance_m
-    plan = Plan(goal, start, steps, "continuous", reaches, iterations, 0.0)
-    return finished(plan, finish, began)
+    return problem.plan(steps, "continuous", reaches, iterations, began)
 
 
-def _allowed(
-    effects: EffectMap,
-    xy: np.ndarray,
-    positions: Tensor,
-    direction: Tensor,
-    reachable: Reachable | None,
-) -> Tensor:
+def _allowed(problem: PlanningProblem, positions: Tensor, direction: Tensor) -> Tensor:
     """Which chains (B,) act within reach and keep the object on the table; positions: (B, K, 2)."""
+    xy, reachable = np.array(problem.start_xy_m), problem.reachable
     ends = xy + positions.numpy()
-    allowed = is_on_table(ends, effects.radius_m)
+    allowed = is_on_table(ends, problem.effects.radius_m)
     if reachable is not None:
         begins = np.concatenate([np.broadcast_to(xy, ends[:, :1].shape), ends[:, :-1]], axis=1)
         told = reachable(begins.reshape(-1, 2), direction.reshape(-1).numpy())
@@ -253,22 +228,20 @@ def _allowed(
 
 
 def _best_chain(
-    effects: EffectMap,
-    xy: np.ndarray,
+    problem: PlanningProblem,
     target: Tensor,
     n_actions: int,
-    partial: bool,
-    reachable: Reachable | None,
     rng: np.random.Generator,
     draft: bool,
     trace: list[tuple[Tensor, Tensor, Tensor]] | None,
 ) -> tuple[float, Tensor, Tensor] | None:
     """The cost [m] and the actions (1, K) of the best chain of so many actions, if there is one."""
+    effects, partial = problem.effects, problem.mode.partial
 
     def judged(direction, phase):
         with torch.no_grad():
             expected, positions = _objective(effects, target, direction, phase)
-        allowed = _allowed(effects, xy, positions, direction, reachable)
+        allowed = _allowed(problem, positions, direction)
         return expected.sqrt() + ACTION_COST_M * n_actions, allowed
 
     direction, phase = _starts(effects, target, n_actions, partial, rng)

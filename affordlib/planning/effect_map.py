@@ -1,6 +1,6 @@
 """What the actions of one kind do to one object, over all directions and phases, smooth between.
 
-Effects are relative to the object, so an object's whole repertoire is a surface over two numbers:
+Effects are relative to the object, so an object's whole skills is a surface over two numbers:
 the direction of the push relative to the object, and the phase at which it stops. The model is
 asked once, on a grid; cubic B-splines fill the rest. No phase is asked about before the action can
 touch an object: nothing has happened there. When the object turns, the surface turns with it, so
@@ -21,9 +21,8 @@ from torch import Tensor
 
 from affordlib.models.protocol import EffectModel, observe_actions
 from affordlib.perception import radius_m
-from affordlib.planning.modes import encode_image, plane
 from affordlib.primitives import Drag, Push
-from affordlib.types import check_count
+from affordlib.types import IMAGE_CHANNELS, IMAGE_PIXELS, check_array, check_count
 
 N_DIRECTIONS = 48
 N_PHASES = 17
@@ -36,21 +35,85 @@ _SPLINES = (
 )
 
 
-@dataclass(frozen=True)
-class EffectMap:
-    """Effects of `kind` on one object: ahead, to the left [m] and turn [rad], with σ of each.
+def checked_image(image: np.ndarray) -> torch.Tensor:
+    """One depth image (2, 48, 48) as (1, 2, 48, 48); raises ValueError where it is none."""
+    image = check_array("image", image).astype(np.float32)
+    if image.shape != (len(IMAGE_CHANNELS), IMAGE_PIXELS, IMAGE_PIXELS):
+        raise ValueError(
+            f"image must have the shape (2, {IMAGE_PIXELS}, {IMAGE_PIXELS}) that "
+            f"Tabletop.look() gives, got {image.shape}"
+        )
+    return torch.from_numpy(image)[None]
 
-    coefficients: (D + 3, T + 3, 6), of cubic B-splines over the direction relative to the object
-    as its image shows it, and over the phases from `kind.acts_from` on. It is evaluated with torch,
-    so that it can be differentiated. radius_m: how far the object reaches from its middle.
+
+def plane(model: EffectModel) -> list[int]:
+    """Where x and y are among the model's effect channels; raises where it knows no plane."""
+    for channels in (model.action_channels, model.effect_channels):
+        if not {"x", "y"} <= {*channels}:
+            raise ValueError(
+                f"model: a planner of positions needs one of actions and effects in x and y; this "
+                f"one has {model.action_channels} and {model.effect_channels}"
+            )
+    return [model.effect_channels.index(name) for name in ("x", "y")]
+
+
+@dataclass(frozen=True, eq=False)
+class EffectMap:
+    """Effects of `kind` on the object in an image: ahead, to the left [m] and turn [rad], with σ.
+
+    image: (2, 48, 48). The model is asked when the map is first used, once for all plans, on a grid
+    of n_directions × n_phases. One that predicts no yaw is taken to predict none, and to be sure.
     """
 
-    kind: type[Push] | type[Drag]
     model: EffectModel
-    features: Tensor
-    coefficients: Tensor
-    reach_m: float
-    radius_m: float = 0.0
+    image: np.ndarray
+    kind: type[Push] | type[Drag] = Push
+    n_directions: int = N_DIRECTIONS
+    n_phases: int = N_PHASES
+
+    def __post_init__(self) -> None:
+        check_count("n_directions", self.n_directions, 8, 720)
+        check_count("n_phases", self.n_phases, 5, 500)
+        checked_image(self.image)
+        plane(self.model)
+
+    @cached_property
+    @torch.no_grad()
+    def features(self) -> Tensor:
+        """What the model reads from the image, (1, F)."""
+        return self.model.encode(checked_image(self.image))
+
+    @cached_property
+    def radius_m(self) -> float:
+        """How far the object reaches from its middle."""
+        return radius_m(self.image)
+
+    @cached_property
+    @torch.no_grad()
+    def grid(self) -> tuple[Tensor, Tensor]:
+        """Effects and σ (D, T, 3) at the grid's directions and phases."""
+        angles = np.arange(self.n_directions) * (2 * math.pi / self.n_directions)
+        t_target = phases_of(self.kind, self.n_phases).float().expand(self.n_directions, -1)
+        effect, std = _asked(self.model, self.features, self.kind, angles, t_target)
+        # What a model says of the time before contact is no displacement.
+        return effect - effect[:, :1], std
+
+    @cached_property
+    def reach_m(self) -> float:
+        """How far an action takes the object at most."""
+        return float(self.grid[0][..., :2].norm(dim=-1).max())
+
+    @cached_property
+    def coefficients(self) -> Tensor:
+        """Of cubic B-splines (D + 3, T + 3, 6) over the direction relative to the object as its
+        image shows it, and over the phases from `kind.acts_from` on.
+        """
+        smooth = torch.cat(self.grid, dim=-1).numpy()
+        smooth = ndimage.spline_filter1d(smooth, axis=0, mode="grid-wrap")
+        smooth = ndimage.spline_filter1d(smooth, axis=1, mode="mirror")
+        smooth = np.pad(smooth, ((1, 2), (0, 0), (0, 0)), mode="wrap")
+        smooth = np.pad(smooth, ((0, 0), (1, 2), (0, 0)), mode="reflect")
+        return torch.from_numpy(smooth)
 
     def __call__(self, direction_rad: Tensor, phase: Tensor) -> tuple[Tensor, Tensor]:
         """Effects and σ (..., 3) in the frame of the action, directions relative to the object."""
@@ -141,38 +204,3 @@ def _asked(
 def phases_of(kind: type[Push] | type[Drag], n_phases: int = N_PHASES) -> Tensor:
     """The phases (T,) of a map's grid."""
     return torch.linspace(kind.acts_from, 1, n_phases, dtype=torch.float64)
-
-
-@torch.no_grad()
-def map_effects(
-    model: EffectModel,
-    image: np.ndarray,
-    kind: type[Push] | type[Drag] = Push,
-    n_directions: int = N_DIRECTIONS,
-    n_phases: int = N_PHASES,
-) -> EffectMap:
-    """Ask a model about one object, from its depth image (2, 48, 48), once for all plans.
-
-    A model that foresees no yaw is taken to foresee none, and to be sure of it.
-    """
-    check_count("n_directions", n_directions, 8, 720)
-    check_count("n_phases", n_phases, 5, 500)
-    features = encode_image(model, image)
-    angles = np.arange(n_directions) * (2 * math.pi / n_directions)
-    t_target = phases_of(kind, n_phases).float().expand(n_directions, -1)
-    effect, std = _asked(model, features, kind, angles, t_target)
-    # What a model says of the time before contact is no displacement.
-    effect = effect - effect[:, :1]
-    reach = float(effect[..., :2].norm(dim=-1).max())
-    splines = splines_through(effect, std)
-    return EffectMap(kind, model, features, splines, reach, radius_m(image))
-
-
-def splines_through(effect: Tensor, std: Tensor) -> Tensor:
-    """The coefficients of an `EffectMap` with these effects and σ (D, T, 3) on its grid."""
-    values = torch.cat([effect, std], dim=-1).numpy()
-    smooth = ndimage.spline_filter1d(values, axis=0, mode="grid-wrap")
-    smooth = ndimage.spline_filter1d(smooth, axis=1, mode="mirror")
-    smooth = np.pad(smooth, ((1, 2), (0, 0), (0, 0)), mode="wrap")
-    smooth = np.pad(smooth, ((0, 0), (1, 2), (0, 0)), mode="reflect")
-    return torch.from_numpy(smooth)

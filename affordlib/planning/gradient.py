@@ -15,25 +15,17 @@ from __future__ import annotations
 import math
 import time
 import warnings
-from collections.abc import Sequence
 
 import numpy as np
 import torch
 
 from affordlib.models.network import OutOfRangeWarning
 from affordlib.models.protocol import EffectModel, observe_actions, observe_final_effect
-from affordlib.perception import radius_m
-from affordlib.planning.finish import finished
-from affordlib.planning.modes import (
-    PATH_SAMPLES,
-    PlanMode,
-    check_has_room,
-    encode_image,
-    mode_named,
-    plane,
-)
-from affordlib.primitives import Push
-from affordlib.types import Goal, Plan, Prediction, Step, check_count, check_on_table
+from affordlib.planning.effect_map import EffectMap, plane
+from affordlib.planning.problem import PlanningProblem
+from affordlib.planning.rollout import PATH_SAMPLES
+from affordlib.primitives import Drag
+from affordlib.types import Plan, Prediction, Step, check_count
 
 START_RADIUS_M = 0.2
 LEARNING_RATE_M = 0.005
@@ -45,8 +37,7 @@ NEARER_M = 0.0005
 
 
 def descend(
-    model: EffectModel,
-    features: torch.Tensor,
+    effects: EffectMap,
     target_xy_m: np.ndarray,
     generator: np.random.Generator,
     starts: int = 1,
@@ -61,8 +52,9 @@ def descend(
     [m] and losses (starts,) [m²]. Also returns the number of iterations. To the letter it begins,
     and may end, with effects that no push has; nobody is warned of each.
     """
+    model, features = effects.model, effects.features
     columns = plane(model)
-    radius = _effect_radius_m(model, features) if direction_only else START_RADIUS_M
+    radius = _effect_radius_m(effects) if direction_only else START_RADIUS_M
     angle = torch.as_tensor(generator.uniform(0, 2 * math.pi, size=starts), dtype=torch.float32)
     circle = radius * torch.stack([angle.cos(), angle.sin()], dim=1)
     sought = (angle if direction_only else circle).requires_grad_()
@@ -99,51 +91,48 @@ def _predict(
 
 
 @torch.no_grad()
-def _effect_radius_m(model: EffectModel, features: torch.Tensor) -> float:
-    """Mean length [m] of the effects of full pushes of this object."""
-    pushes = [Push(theta) for theta in np.arange(12) * (math.pi / 6)]
-    prediction = model.predict(features, observe_actions(model, pushes), torch.ones(12, 1))
+def _effect_radius_m(effects: EffectMap) -> float:
+    """Mean length [m] of the effects of full actions on this object."""
+    model, towards = effects.model, effects.kind.towards
+    actions = [towards(angle) for angle in np.arange(12) * (math.pi / 6)]
+    observed = observe_actions(model, actions)
+    prediction = model.predict(effects.features, observed, torch.ones(12, 1))
     return float(prediction.effect_mean[:, 0, plane(model)].norm(dim=-1).mean())
 
 
 def plan_gradient(
-    model: EffectModel,
-    image: np.ndarray,
-    start_xy_m: Sequence[float],
-    goal: Goal,
-    mode: str | PlanMode = "multi_partial",
+    problem: PlanningProblem,
     samples: int = 100,
     starts: int = 1,
     direction_only: bool = False,
     seed: int = 0,
     snap: bool = False,
 ) -> Plan:
-    """Plan from the object's position [m] and depth image (2, 48, 48) to a goal, by gradient.
+    """Plan by gradient, as the paper does.
 
     samples: phases at which the trajectory is queried; they bound how finely an action can be cut.
     starts: random starts of the descent; the paper has one, lost where it lies opposite the goal.
-    direction_only: ours; search on the circle of effects that pushes have, not in the whole plane,
-    where the network can be made to promise anything.
-    snap: execute Push(theta) instead of the decoded action trajectory.
+    direction_only: ours; search on the circle of effects that actions have, not in the whole plane,
+    where the network can be made to promise anything. snap: execute the primitive in the decoded
+    direction instead of the decoded action trajectory, as drags always are. A plan ends before an
+    action that is out of reach.
     """
     began = time.perf_counter()
-    mode = mode_named(mode)
-    start = check_on_table("start_xy_m", start_xy_m)
     check_count("samples", samples, 2, 10_000)
     check_count("starts", starts, 1, 1000)
+    model, kind, features = (getattr(problem.effects, n) for n in ("model", "kind", "features"))
+    goal, mode, reachable = problem.goal, problem.mode, problem.reachable
     columns = plane(model)
     a_columns = [model.action_channels.index(name) for name in ("x", "y")]
-    features = encode_image(model, image)
-    check_has_room(goal, radius_m(image))
-    with torch.no_grad():  # a model of other actions than pushes refuses one
-        model.predict(features, observe_actions(model, [Push(0.0)]), torch.ones(1, 1))
+    with torch.no_grad():  # a model of other actions refuses one
+        model.predict(features, observe_actions(model, [kind.towards(0.0)]), torch.ones(1, 1))
     generator = np.random.default_rng(check_count("seed", seed, least=0))
-    xy, target = np.asarray(start), np.asarray(goal.xy_m)
+    xy, target = np.asarray(problem.start_xy_m), np.asarray(goal.xy_m)
     steps: list[Step] = []
     iterations = 0
     t = torch.linspace(0, 1, samples)
     while len(steps) < mode.max_steps and np.hypot(*(target - xy)) > SUCCESS_M:
-        effect, n = descend(model, features, target - xy, generator, starts, direction_only)
+        effect, n = descend(problem.effects, target - xy, generator, starts, direction_only)
         iterations += n
         with torch.no_grad():
             prediction = _predict(model, features, effect, t[None])
@@ -161,11 +150,13 @@ def plan_gradient(
         end = xy + path[stop]
         shown = np.linspace(0, stop, min(PATH_SAMPLES, stop + 1)).round().astype(int)
         heading = action[-1] - action[0]
-        push = Push.towards(math.atan2(heading[1], heading[0]))
-        decoded = None if snap else action[: stop + 1]
+        angle = math.atan2(heading[1], heading[0])
+        if reachable is not None and not reachable(xy[None], np.array([angle]))[0]:
+            break
+        decoded = None if snap or kind is Drag else action[: stop + 1]
         steps.append(
             Step(
-                push,
+                kind.towards(angle),
                 float(t[stop]),
                 tuple(end.tolist()),
                 xy + path[shown],
@@ -178,4 +169,4 @@ def plan_gradient(
             break
     reached = bool(np.hypot(*(target - xy)) <= goal.tolerance_m)
     name = "gradient" + "_direction" * direction_only + "_snapped" * snap
-    return finished(Plan(goal, start, tuple(steps), name, reached, iterations, 0.0), None, began)
+    return problem.plan(tuple(steps), name, reached, iterations, began)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from affordlib.planning.modes import is_on_table
+from affordlib.planning.problem import is_on_table
 from affordlib.primitives import Drag, Push
 from affordlib.types import TABLE_X_M, TABLE_Y_M
 

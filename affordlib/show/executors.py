@@ -8,7 +8,14 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from affordlib.planning import Repertoire, carry_out, plan_continuous, pursue
+from affordlib.planning import (
+    ClosedLoopConfig,
+    Skills,
+    execute_plan,
+    plan_continuous,
+    run_closed_loop,
+)
+from affordlib.planning.skills import SkillPlanner
 from affordlib.types import Goal, Outcome, Plan
 from affordlib.world import Tabletop
 
@@ -40,35 +47,30 @@ def open_loop(world: Tabletop, plan: Plan, planner: Planner, tell: Tell) -> Outc
     """Carry out a plan as it was made, action by action, and measure where the object rests."""
     paths: tuple[np.ndarray, ...] = ()
     for step in plan.steps:
-        paths += carry_out(world, replace(plan, steps=(step,))).object_paths_xy_m
+        paths += execute_plan(world, replace(plan, steps=(step,))).object_paths_xy_m
         tell()
-    at_rest = carry_out(world, replace(plan, steps=()))
+    at_rest = execute_plan(world, replace(plan, steps=()))
     return replace(at_rest, plan=plan, object_paths_xy_m=paths)
 
 
-def closed_loop(repertoire: Repertoire, tolerance_m: float = 0.002) -> Executor:
+def closed_loop(skills: Skills, tolerance_m: float = 0.002) -> Executor:
     """An executor that looks after every action and plans anew until the goal is this near [m].
 
-    It plans from what it sees, with the models of a repertoire, as the planner does where that is
-    of `Repertoire.planner`. Any other cannot be told where the arm can act; then it plans with
-    `plan_continuous`, and says so.
+    It plans from what it sees, as the planner does where that is of `Skills.planner`. Any other
+    cannot be told where the arm can act; then it plans with `plan_continuous` and these skills, and
+    says so.
     """
 
     def execute(world, plan, planner, tell):
         def exactly(goal):
             return replace(goal, tolerance_m=tolerance_m)
 
-        search = getattr(planner, "search", None)
-        done = pursue(
-            world,
-            exactly(plan.goal),
-            repertoire,
-            search or plan_continuous,
-            on_action=lambda *_: exactly(tell()),
-            on_plan=tell,
-        )
-        words = "" if done.reached else f"The loop ended as {done.ending}: {done.words}."
-        if search is None:
+        known = isinstance(planner, SkillPlanner)
+        search = (planner.skills, planner.plan) if known else (skills, plan_continuous)
+        config = ClosedLoopConfig(on_action=lambda *_: exactly(tell()), on_plan=tell)
+        done = run_closed_loop(world, exactly(plan.goal), *search, config)
+        words = "" if done.reached else f"The loop ended as {done.status}: {done.message}."
+        if not known:
             words += " It was planned anew by continuous search."
         tilt, paths = world.object_tilt_rad(), done.object_paths_xy_m
         return Outcome(plan, done.distance_m, done.end_pose, tilt, paths, words=words.strip())

@@ -1,6 +1,6 @@
 """Pick a goal by hand, see the plan redrawn, run it in the world, disturb it.
 
-A view on plain objects: everything it does can be done with a planner, `carry_out` and
+A view on plain objects: everything it does can be done with a planner, `execute_plan` and
 `Tabletop.shove`.
 """
 
@@ -18,7 +18,7 @@ import numpy as np
 
 from affordlib.paths import resolve_out_dir
 from affordlib.plan_files import load_plan, plan_file, save_plan
-from affordlib.planning import carry_out
+from affordlib.planning import execute_plan
 from affordlib.primitives import wrap_angle
 from affordlib.show.executors import Executor, Planner, Stopped, open_loop
 from affordlib.show.figure_widget import Pictured
@@ -255,7 +255,10 @@ class GoalPicker(Pictured, widgets.VBox):
                 outcome, how = execute(self.world, self.plan, planner, tell), "Done,"
                 self.controls.show_progress(done, max(1, done))
             except Stopped:
-                outcome, how = carry_out(self.world, replace(self.plan, steps=())), "Stopped after"
+                outcome, how = (
+                    execute_plan(self.world, replace(self.plan, steps=())),
+                    "Stopped after",
+                )
             self.outcome = replace(
                 outcome.with_goal(self._goal),
                 turned_rad=wrap_angle(self.world.object_pose()[2] - yaw),

@@ -17,7 +17,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from affordlib.perception import CAMERA_HEIGHT_M
-from affordlib.planning import Pursuit
+from affordlib.planning import ClosedLoopResult
 from affordlib.primitives import Grasp, Rotate
 from affordlib.results import write_atomically
 from affordlib.types import (
@@ -189,7 +189,7 @@ def plot_outcome(
     return ax
 
 
-def plot_pursuit(ax: Axes, pursuit: Pursuit, thing: Thing | None = None) -> Axes:
+def plot_closed_loop(ax: Axes, pursuit: ClosedLoopResult, thing: Thing | None = None) -> Axes:
     """A pursuit from above: where each action took the object, and where it was moved by others.
 
     Dots are where the object was expected after each action; dotted lines what nobody planned.
@@ -229,7 +229,7 @@ def plot_pursuit(ax: Axes, pursuit: Pursuit, thing: Thing | None = None) -> Axes
     if thing is not None:
         plot_footprint(ax, thing, pursuit.end_pose[:2], pursuit.end_pose[2], TRUTH)
     ax.set_title(
-        f"{pursuit.ending}: {1000 * pursuit.distance_m:.1f} mm, {len(pursuit.steps)} actions"
+        f"{pursuit.status}: {1000 * pursuit.distance_m:.1f} mm, {len(pursuit.steps)} actions"
     )
     return ax
 

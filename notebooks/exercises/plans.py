@@ -12,9 +12,9 @@ import torch
 
 from affordlib.models import load_checkpoint
 from affordlib.perception import Percept
-from affordlib.planning import EffectMap, map_effects, plan_continuous
-from affordlib.planning.poses import foresee_course
-from affordlib.planning.steps import roll_out
+from affordlib.planning import EffectMap, PlanningProblem, plan_continuous
+from affordlib.planning.grasp_rotate import foresee_course
+from affordlib.planning.rollout import roll_out
 from affordlib.primitives import Grasp, Push
 from affordlib.types import Goal, Plan, Step
 from affordlib.world import Cuboid, Prism, Tabletop, UprightCylinder
@@ -29,7 +29,7 @@ def _box_effects() -> EffectMap:
     """The effect map of the box of notebooks 06 and 07."""
     with Tabletop() as world:
         world.place(BOX, yaw_rad=YAW_RAD)
-        return map_effects(load_checkpoint("push_film_x10")[0], world.look())
+        return EffectMap(load_checkpoint("push_film_x10")[0], world.look())
 
 
 # 06 Planning
@@ -75,7 +75,8 @@ def _shoved_mm(bring: Callable[..., Any], shove: tuple[float, float, float]) -> 
     goal, taken = Goal((0.16, 0.09)), []
 
     def plan(seen: Percept) -> Plan:
-        return plan_continuous(model, seen.image, seen.xy_m, goal)
+        effects = EffectMap(model, seen.image)
+        return plan_continuous(PlanningProblem(seen.xy_m, goal, effects))
 
     def act(step: Step) -> None:
         if len(taken) == MOST_ACTIONS:

@@ -13,16 +13,13 @@ from affordlib.models.checkpoint import load_checkpoint
 from affordlib.models.protocol import EffectModel
 from affordlib.paths import repo_root
 from affordlib.perception import looks_rollable
-from affordlib.planning.effect_map import EffectMap, map_effects
-from affordlib.planning.finish import Finish
-from affordlib.planning.modes import checked_image
+from affordlib.planning.effect_map import EffectMap, checked_image
+from affordlib.planning.grasp_rotate import PosePlanner
+from affordlib.planning.problem import PlanMode, PlanningProblem, Reachable
 from affordlib.planning.reachability import Reachability
 from affordlib.planning.routes import REACH_M, RouteMap
 from affordlib.primitives import Drag, Grasp, Primitive, Push, Rotate, primitive_named
-from affordlib.types import Plan, check_field
-
-Reachable = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""Which of the positions (n, 2) and directions (n,) the arm can act at."""
+from affordlib.types import Goal, Plan, check_field
 
 CHECKPOINTS = {
     "push": "push_film_x10",
@@ -33,7 +30,7 @@ CHECKPOINTS = {
 
 
 @dataclass(frozen=True)
-class Repertoire:
+class Skills:
     """Models by the name of their primitive, and the probability that the arm can act.
 
     reachability: None means that it can act everywhere; threshold: from which probability on an
@@ -50,7 +47,7 @@ class Repertoire:
         check_field(self, "threshold", 0.0, 1.0)
 
     @classmethod
-    def load(cls) -> Repertoire:
+    def load(cls) -> Skills:
         """The shipped models, and reachability as it was learned from the shipped interactions."""
         folder = repo_root() / "data" / "checkpoints"
         models = {
@@ -73,54 +70,50 @@ class Repertoire:
         return Drag if looks_rollable(checked_image(image)[0].numpy()) else Push
 
     def effects(self, image: np.ndarray) -> EffectMap:
-        """What moving the object in an image (2, 48, 48) does."""
-        kind = self.kind_for(image)
-        return map_effects(self.model(kind), image, kind)
+        """What moving the object in an image (2, 48, 48) does; kept for the last image."""
+        return self._about(image)[0]
 
-    def finish(self, image: np.ndarray) -> Finish:
-        """What turns and lifts the object in an image (2, 48, 48) at the end of a plan."""
-        return Finish(image, self.model(Rotate), self.model(Grasp), self._can_act)
+    def problem(
+        self,
+        image: np.ndarray,
+        start_xy_m: Sequence[float],
+        goal: Goal,
+        mode: str | PlanMode = "multi_partial",
+    ) -> PlanningProblem:
+        """What a planner is asked about the object in an image (2, 48, 48), at (x, y) [m].
+
+        As long as the image stays the same, as it does while only the goal moves, what the models
+        say of it is kept.
+        """
+        effects, poses = self._about(image)
+        reachable = self.reachable(effects.kind)
+        return PlanningProblem(start_xy_m, goal, effects, mode, reachable, poses)
+
+    def planner(
+        self, plan: Callable[..., Plan], mode: str | PlanMode = "multi_partial", **settings: Any
+    ) -> SkillPlanner:
+        """A planner with settings, such as `plan_astar`, as (image, start_xy_m, goal) → Plan."""
+        return SkillPlanner(self, partial(plan, **settings), mode)
+
+    def _about(self, image: np.ndarray) -> tuple[EffectMap, PosePlanner | None]:
+        seen = np.ascontiguousarray(image).tobytes()
+        if seen not in self._last:
+            kind, poses = self.kind_for(image), None
+            if {Rotate.name, Grasp.name} <= set(self.models):
+                models = self.model(Rotate), self.model(Grasp)
+                poses = PosePlanner(image, *models, self._can_act)
+            self._last.clear()
+            self._last[seen] = EffectMap(self.model(kind), image, kind), poses
+        return self._last[seen]
+
+    @cached_property
+    def _last(self) -> dict[bytes, tuple[EffectMap, PosePlanner | None]]:
+        return {}
 
     def _can_act(self, name: str, xy_m: Sequence[float]) -> bool:
         if self.reachability is None:
             return True
         return bool(self.reachability.probability(name, np.array([xy_m]))[0] >= self.threshold)
-
-    def planner(self, plan: Callable[..., Plan], **settings: Any) -> Callable[..., Plan]:
-        """`plan_astar` or `plan_continuous` as (image, start_xy_m, goal) → Plan.
-
-        Told of the object's primitive, where the arm can act, and what turns and lifts it in the
-        end. As long as the image (2, 48, 48) stays the same, as it does while only the goal moves,
-        what the models say of it is kept. The function takes further settings of the planner;
-        its attribute `search` is the planner with those given here, for who knows the object
-        better.
-        """
-        last: dict[bytes, dict[str, Any]] = {}
-
-        def planner(image, start_xy_m, goal, **further):
-            seen = np.ascontiguousarray(image).tobytes()
-            if seen not in last:
-                last.clear()
-                last[seen] = self._told_of(image)
-            told = last[seen] | settings | further
-            return plan(start_xy_m=start_xy_m, goal=goal, **told)
-
-        told_anew = ("mode", "kind", "effects", "reachable", "finish")
-        kept = {name: value for name, value in settings.items() if name not in told_anew}
-        planner.search = partial(plan, **kept)
-        return planner
-
-    def _told_of(self, image: np.ndarray) -> dict[str, Any]:
-        kind = self.kind_for(image)
-        poses = {Rotate.name, Grasp.name} <= set(self.models)
-        return {
-            "image": image,
-            "model": self.model(kind),
-            "kind": kind,
-            "effects": self.effects(image),
-            "reachable": self.reachable(kind),
-            "finish": self.finish(image) if poses else None,
-        }
 
     def reachable(self, kind: type[Primitive]) -> Reachable | None:
         """Where the arm can act with a primitive, as planners ask it."""
@@ -146,3 +139,15 @@ class Repertoire:
     @cached_property
     def _routes(self) -> dict[type[Primitive], RouteMap]:
         return {}
+
+
+@dataclass(frozen=True)
+class SkillPlanner:
+    """Plans (image, start_xy_m, goal) → Plan with the models of some skills."""
+
+    skills: Skills
+    plan: Callable[[PlanningProblem], Plan]
+    mode: str | PlanMode = "multi_partial"
+
+    def __call__(self, image: np.ndarray, start_xy_m: Sequence[float], goal: Goal) -> Plan:
+        return self.plan(self.skills.problem(image, start_xy_m, goal, self.mode))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,9 +11,15 @@ import torch
 
 from affordlib.perception import Percept
 from affordlib.planning.effect_map import EffectMap
-from affordlib.planning.modes import PlanMode, check_has_room, is_on_table
-from affordlib.planning.repertoire import Reachable, Repertoire
+from affordlib.planning.problem import (
+    PlanMode,
+    PlanningProblem,
+    Reachable,
+    check_has_room,
+    is_on_table,
+)
 from affordlib.planning.routes import CELL_M, Judge, find_route, places
+from affordlib.planning.skills import Skills
 from affordlib.primitives import Primitive
 from affordlib.types import Goal, Plan, Step
 
@@ -30,20 +35,7 @@ WAYPOINT_M = 0.01
 
 
 class Ended(Exception):
-    """A pursuit has come to an end: its ending, and the words for it."""
-
-
-@dataclass(frozen=True)
-class Demands:
-    """How exactly a goal is to be met, with how many actions, by which planner; see `pursue`."""
-
-    planner: Callable[..., Plan]
-    mode: PlanMode
-    turn_tolerance_rad: float
-    height_tolerance_m: float
-    max_actions: int | None
-    on_action: Callable[[Plan, int], Goal | None] | None
-    on_plan: Callable[[Plan], None] | None = None
+    """A closed loop has come to an end: its status, and a message."""
 
 
 class MovePlanner:
@@ -52,8 +44,14 @@ class MovePlanner:
     plans: all that were accepted; vetoes: how often the kinematics said no.
     """
 
-    def __init__(self, world: Tabletop, repertoire: Repertoire, demands: Demands) -> None:
-        self.world, self.repertoire, self.demands = world, repertoire, demands
+    def __init__(
+        self,
+        world: Tabletop,
+        skills: Skills,
+        planner: Callable[[PlanningProblem], Plan],
+        mode: PlanMode,
+    ) -> None:
+        self.world, self.skills, self.planner, self.mode = world, skills, planner, mode
         self.plans: list[Plan] = []
         self.vetoes = 0
         self._barred: list[tuple[str, np.ndarray, float]] = []
@@ -64,14 +62,14 @@ class MovePlanner:
 
         Raises `Ended` where there is none; so_far: what to say has been done.
         """
-        effects = self.repertoire.effects(seen.image)
+        effects = self.skills.effects(seen.image)
         try:
             check_has_room(goal, effects.radius_m)
         except ValueError as error:
             raise Ended("unreachable", f"the position: {error}") from None
         off = goal.distance_m(seen.xy_m)
         plan = None
-        if off <= self.demands.mode.max_steps * effects.reach_m:
+        if off <= self.mode.max_steps * effects.reach_m:
             plan = self._plan_to(effects, seen, goal, goal.tolerance_m)
         if plan is None:
             way = self._way(effects, seen, goal)
@@ -97,9 +95,9 @@ class MovePlanner:
     ) -> Plan | None:
         """A plan that goes as far along a way as it can, straight ahead if a way leads on."""
         here, ahead = np.array(seen.xy_m), np.subtract(goal.xy_m, seen.xy_m)
-        farthest = 0.98 * self.demands.mode.max_steps * effects.reach_m
+        farthest = 0.98 * self.mode.max_steps * effects.reach_m
         off = float(np.hypot(*ahead))
-        routes = self.repertoire.routes(effects.kind)
+        routes = self.skills.routes(effects.kind)
         stops = [tuple(place) for place in way if math.dist(here, place) <= farthest]
         if off > farthest:
             straight = tuple((here + farthest / off * ahead).tolist())
@@ -123,16 +121,8 @@ class MovePlanner:
         """A plan that ends within a distance of a goal and that the kinematics lets pass."""
         kind = effects.kind
         for _ in range(MAX_VETOES):
-            plan = self.demands.planner(
-                self.repertoire.model(kind),
-                seen.image,
-                seen.xy_m,
-                aim,
-                self.demands.mode,
-                kind,
-                effects=effects,
-                reachable=self._allowed(kind),
-            )
+            allowed = self._allowed(kind)
+            plan = self.planner(PlanningProblem(seen.xy_m, aim, effects, self.mode, allowed))
             if not plan.steps or plan.predicted_distance_m > within_m:
                 return None
             if not self._vetoed(plan):
@@ -141,7 +131,7 @@ class MovePlanner:
 
     def _allowed(self, kind: type[Primitive]) -> Reachable:
         """Where the arm can act: what was learned, less what its kinematics has refused."""
-        learned = self.repertoire.reachable(kind)
+        learned = self.skills.reachable(kind)
         barred = [(xy, angle) for name, xy, angle in self._barred if name == kind.name]
 
         def judge(xy_m: np.ndarray, direction_rad: np.ndarray) -> np.ndarray:
@@ -178,7 +168,7 @@ class MovePlanner:
     ) -> list[tuple[float, float]] | None:
         """Places on the way to a goal, every action of it checked by the kinematics."""
         kind = effects.kind
-        routes = self.repertoire.routes(kind)
+        routes = self.skills.routes(kind)
         barred = self._barred_moves.setdefault(kind.name, [])
         x, y = places()
         for _ in range(MAX_REFUSED_WAYS):

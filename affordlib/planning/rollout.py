@@ -10,8 +10,10 @@ import torch
 from torch import Tensor
 
 from affordlib.planning.effect_map import EffectMap
-from affordlib.planning.modes import PATH_SAMPLES
 from affordlib.types import Step
+
+PATH_SAMPLES = 25
+"""Points of the predicted path that a step carries, as in Section 4.3."""
 
 
 def roll_out(
