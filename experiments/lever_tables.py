@@ -9,7 +9,6 @@ objects. A part whose hash is not its unit's is refused.
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import sys
 from collections.abc import Iterable, Sequence
@@ -36,7 +35,7 @@ from experiments.lever_up import (
     hashes,
     numbered_edges,
 )
-from experiments.parts import checked_part
+from experiments.parts import checked_part, parts_in
 from experiments.studies import read_study
 
 OURS = "anchored"
@@ -47,7 +46,7 @@ RESTS_M = 0.005
 def read_parts(folder: str | Path = PARTS) -> list[tuple[LeverUnit, dict[str, Any]]]:
     """All parts with their units, in the order of models and folds; stale ones raise."""
     folder = resolve_out_dir(folder)
-    units = [LeverUnit(**json.loads(path.read_text())["unit"]) for path in folder.glob("*.json")]
+    units = [LeverUnit(**part["unit"]) for part in parts_in(folder).values()]
     units.sort(key=lambda u: (MODELS.index(u.model), u.trained_for, u.no_edges or 0, u.fold))
     seen: dict[tuple, str] = {}
     for unit in units:

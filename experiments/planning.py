@@ -28,12 +28,13 @@ from affordlib.commands import command
 from affordlib.evaluation.answers import rounded
 from affordlib.evaluation.effect_prediction import error_row
 from affordlib.evaluation.goals import FROZEN, ROLLABLE, STANDING, PlanningTask, frozen_tasks
-from affordlib.paths import repo_root
+from affordlib.paths import repo_root, resolve_out_dir
 from affordlib.planning import PlanMode, execute_plan
 from affordlib.results import write_results, write_text_atomically
 from affordlib.types import Goal, Outcome, Plan
 from affordlib.world import Tabletop, UnreachableError
 from experiments import reported
+from experiments.parts import pack, part_of
 from experiments.planners import VARIANTS
 
 NUDGE_M, NUDGE_RAD = 0.001, math.radians(1.0)
@@ -163,16 +164,10 @@ def tasks_sha256(world: str = "clean") -> str:
     return hashlib.sha256((repo_root() / FROZEN[world]).read_bytes()).hexdigest()
 
 
-def _part(name: str) -> Path:
-    return repo_root() / PARTS / f"{name}.json"
-
-
-def _is_done(name: str) -> bool:
-    """Whether there is a part of this variant, as it is now, on the goals as they are."""
-    path = _part(name)
-    if not path.is_file():
+def _is_done(name: str, part: dict[str, Any] | None) -> bool:
+    """Whether a part is of this variant, as it is now, on the goals as they are."""
+    if part is None:
         return False
-    part = json.loads(path.read_text())
     expected = tasks_sha256(VARIANTS[name].world), VARIANTS[name].about()
     return (part["goals_sha256"], part["about"]) == expected
 
@@ -181,14 +176,14 @@ def assemble() -> Path:
     """Write `data/results/planning.json` from all parts; returns its path."""
     rows, parts = [], {}
     for name, variant in VARIANTS.items():
-        if not _part(name).is_file():
+        part = part_of(f"{name}.json", repo_root() / PARTS)
+        if part is None:
             continue
-        if not _is_done(name):
+        if not _is_done(name, part):
             raise ValueError(
-                f"part {_part(name).name} is of other goals or settings than {name!r} has now; run "
+                f"part {name}.json is of other goals or settings than {name!r} has now; run "
                 f"`python -m experiments.planning --variants {name}` again, or delete it"
             )
-        part = json.loads(_part(name).read_text())
         parts[name] = part["records"]
         about = {"variant": name, "nudged": variant.nudged}
         rows += planning_rows(part["records"], **about, **variant.columns())
@@ -298,15 +293,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--variants", nargs="*", choices=list(VARIANTS), default=list(VARIANTS))
     options = parser.parse_args(argv)
     torch.set_num_threads(1)
+    folder = resolve_out_dir(PARTS)
     for name in options.variants:
-        if _is_done(name):
+        if _is_done(name, part_of(f"{name}.json", folder)):
             print(f"{name}: there already")
             continue
         world = VARIANTS[name].world
         part = run_variant(name, frozen_tasks(world)) | {"goals_sha256": tasks_sha256(world)}
-        _part(name).parent.mkdir(parents=True, exist_ok=True)
         text = json.dumps(part, separators=(",", ":"))
-        write_text_atomically(_part(name), text + "\n")
+        write_text_atomically(folder / f"{name}.json", text + "\n")
         for row in planning_rows(part["records"]):
             if row["object_class"] == "all":
                 print(
@@ -314,6 +309,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                     f"median {1000 * row['median_m']:.2f} (n = {row['n']})",
                     flush=True,
                 )
+    pack(folder)
     print(assemble())
     return 0
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
@@ -13,6 +12,7 @@ import numpy as np
 
 from affordlib.paths import resolve_out_dir
 from affordlib.world.objects import FAMILIES
+from experiments.parts import parts_in
 from experiments.units import MODELS, PARTS, TEN_TIMES, Unit, read_part
 
 Part = dict[str, Any]
@@ -21,7 +21,7 @@ Part = dict[str, Any]
 def read_parts(folder: str | Path = PARTS) -> list[tuple[Unit, Part]]:
     """All parts with their units, in the order of models, folds and seeds; stale ones raise."""
     folder = resolve_out_dir(folder)
-    units = [Unit(**json.loads(path.read_text())["unit"]) for path in folder.glob("*.json")]
+    units = [Unit(**part["unit"]) for part in parts_in(folder).values()]
     units.sort(key=lambda u: (u.data, MODELS.index(u.model), str(u.n), u.seed, u.fold))
     parts = [(unit, read_part(unit, folder)) for unit in units]
     kept = [(unit, part) for unit, part in parts if part is not None]

@@ -64,7 +64,7 @@ N_FOLDS = 10
 FEW_STEPS = 800
 """Of training on the sets of 100 interactions."""
 
-PARTS = "data/results/parts"
+PARTS = "data/results/parts/effect_prediction"
 NETWORKS = ("paper", "film", "paper_push_frame", "film_table_frame", "attention", "ensemble")
 MODELS = (*NETWORKS, *BASELINES, "logistic")
 

@@ -19,6 +19,7 @@ from affordlib.planning import MODES, plan_astar
 from affordlib.primitives import Drag
 from affordlib.results import read_results
 from experiments import planners, planning
+from experiments.parts import parts_in
 from experiments.planners import VARIANTS
 from experiments.planning import (
     PARTS,
@@ -29,7 +30,7 @@ from experiments.planning import (
     tasks_sha256,
 )
 
-COMMITTED = sorted((repo_root() / PARTS).glob("*.json"))
+COMMITTED = parts_in(repo_root() / PARTS)
 
 
 def records(distances, object_class="cuboid", mode="single_full", goals="constructed"):
@@ -168,18 +169,17 @@ def test_with_the_simulator_as_model_hardly_anything_remains(world, rollable):
 
 def test_the_committed_table_belongs_to_the_shipped_checkpoints():
     assert COMMITTED, "there are no parts; run python -m experiments.planning"
-    for path in COMMITTED:
-        part = json.loads(path.read_text())
-        assert part["about"] == VARIANTS[path.stem].about(), f"{path.name} is stale; run it again"
-        assert part["goals_sha256"] == tasks_sha256(VARIANTS[path.stem].world)
+    parts = {name.removesuffix(".json"): part for name, part in COMMITTED.items()}
+    for name, part in parts.items():
+        assert part["about"] == VARIANTS[name].about(), f"{name} is stale; run it again"
+        assert part["goals_sha256"] == tasks_sha256(VARIANTS[name].world)
     rows = read_results("data/results/planning.json")["tables"]["planning"]
-    assert {row["variant"] for row in rows} == {path.stem for path in COMMITTED}
+    assert {row["variant"] for row in rows} == set(parts)
     for row in rows:
         if row["object_class"] == "all" and row["goals"] == "constructed":
-            part = json.loads((repo_root() / PARTS / f"{row['variant']}.json").read_text())
             distances = [
                 r["distance_m"]
-                for r in part["records"]
+                for r in parts[row["variant"]]["records"]
                 if (r["mode"], r["goals"]) == (row["mode"], row["goals"])
             ]
             assert np.mean(distances) == pytest.approx(row["mean_m"])
