@@ -22,10 +22,11 @@ import numpy as np
 import torch
 
 from affordlib.interactions import Normaliser
-from affordlib.models import AttentionConfig, CNPConfig, build
+from affordlib.models import CNPConfig, build
 from affordlib.models.network import gaussian_nll
 from affordlib.results import write_results
 from affordlib.types import Observations
+from experiments.attention import AttentionConfig
 
 BATCH, MOST, TARGETS = 16, 10, 50
 JUDGED = 1600

@@ -25,7 +25,6 @@ from affordlib.interactions.batches import (
     sample_batch,
 )
 from affordlib.interactions.store import SUFFIX as DATA_SUFFIX
-from affordlib.models.attention import AttentionConfig
 from affordlib.models.checkpoint import SUFFIX, load_checkpoint, save_checkpoint
 from affordlib.models.cnp import CNPConfig
 from affordlib.models.film import FiLMConfig
@@ -45,6 +44,7 @@ from affordlib.models.training import (
     train_model,
 )
 from affordlib.paths import repo_root
+from experiments.attention import AttentionConfig
 
 
 @dataclass(frozen=True)

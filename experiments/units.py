@@ -35,7 +35,6 @@ from affordlib.evaluation.baselines import BASELINES
 from affordlib.interactions import Normaliser, Split, TrainingArrays, split_interactions
 from affordlib.interactions.batches import Symmetry, believable, symmetric_copies
 from affordlib.interactions.store import stored_sha256
-from affordlib.models.attention import AttentionConfig
 from affordlib.models.calibration import fit_temperature
 from affordlib.models.checkpoint import load_checkpoint
 from affordlib.models.cnp import CNPConfig
@@ -46,6 +45,7 @@ from affordlib.models.training import TrainingConfig, about_training, train_mode
 from affordlib.paths import repo_root
 from affordlib.results import write_text_atomically
 from affordlib.workers import dask_client
+from experiments.attention import AttentionConfig
 from experiments.inverse import along_effect, executed_record, inverse_record
 from experiments.make_checkpoints import (
     GRASP_SYMMETRIES,

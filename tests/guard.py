@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+import experiments.attention  # noqa: F401, whose network a checkpoint is of
 from affordlib.evaluation.goals import frozen_tasks
 from affordlib.interactions import TrainingArrays, open_interactions
 from affordlib.interactions.lever import lever_arrays

@@ -216,11 +216,9 @@ def valid_calls(shop):
             },
         ),
         "CNPConfig": (models.CNPConfig, dataclasses.asdict(models.CNPConfig())),
-        "AttentionConfig": (models.AttentionConfig, dataclasses.asdict(models.AttentionConfig())),
         "FiLMConfig": (models.FiLMConfig, dataclasses.asdict(models.FiLMConfig())),
         "build": (models.build, build),
         "AffordanceCNP": (models.AffordanceCNP, build),
-        "AttentiveCNP": (models.AttentiveCNP, build | {"config": models.AttentionConfig()}),
         "FiLMNetwork": (models.FiLMNetwork, build | {"config": models.FiLMConfig()}),
         "Ensemble": (models.Ensemble, {"members": [network]}),
         "TrainingConfig": (models.TrainingConfig, dataclasses.asdict(few)),
@@ -426,14 +424,14 @@ Goal Step Plan Push Push.towards Push.path Drag Grasp Rotate LeverUp primitive_n
 UprightCylinder LyingCylinder Sphere Prism family_named WorldConfig Tabletop place interact
 attempt follow follow_path can_reach look_from picture mark shove knock topple settle Normaliser
 from_dataset open_interactions split_interactions Recipe Variation collect CNPConfig
-AttentionConfig FiLMConfig build Ensemble TrainingConfig coverage fit_temperature
+FiLMConfig build Ensemble TrainingConfig coverage fit_temperature
 load_checkpoint save_checkpoint observe_actions train train_literal PlanMode Disturbance
 draw_disturbances action_limit EffectMap PlanningProblem ClosedLoopConfig plan_astar
 plan_continuous plan_gradient plan_turn plan_lift kind_for Skills execute_plan run_closed_loop
 closed_loop plot_depth plot_footprint plot_plan
 plot_outcome plot_table save_figure GoalPicker PhaseSlider Film ConditioningExplorer error_row
 mean_length_errors_m save_plan load_plan write_results read_results results_table check Split
-TrainingArrays AffordanceCNP AttentiveCNP FiLMNetwork calibration_rows train_model refuse_seen
+TrainingArrays AffordanceCNP FiLMNetwork calibration_rows train_model refuse_seen
 outline_in_lever_frame plot_levered plot_closed_loop show_animation
 """,
 )

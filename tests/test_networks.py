@@ -10,7 +10,6 @@ import torch
 from affordlib.interactions import Normaliser
 from affordlib.interactions.batches import observe_action, sample_batch
 from affordlib.models import (
-    AttentionConfig,
     CNPConfig,
     EffectModel,
     FiLMConfig,
@@ -31,6 +30,7 @@ from affordlib.models.training import batch_loss
 from affordlib.primitives import Drag, Push
 from affordlib.types import Observations
 from affordlib.world import Cuboid, UprightCylinder
+from experiments.attention import AttentionConfig
 from experiments.lstm_published import PublishedConfig
 
 YAW = {"action_channels": ("x", "y", "yaw"), "effect_channels": ("x", "y", "yaw")}

@@ -1,6 +1,5 @@
 """Models that relate an object's image, an action and its effect."""
 
-from affordlib.models.attention import AttentionConfig, AttentiveCNP
 from affordlib.models.calibration import calibration_rows, coverage, fit_temperature
 from affordlib.models.checkpoint import build, load_checkpoint, save_checkpoint
 from affordlib.models.cnp import AffordanceCNP, CNPConfig
@@ -12,8 +11,6 @@ from affordlib.models.training import TrainingConfig, train, train_literal, trai
 
 __all__ = [
     "AffordanceCNP",
-    "AttentionConfig",
-    "AttentiveCNP",
     "CNPConfig",
     "EffectModel",
     "EffectNetwork",

@@ -12,7 +12,6 @@ from safetensors.torch import save
 
 from affordlib.interactions.batches import Normaliser
 from affordlib.models.anchored import AnchoredConfig, AnchoredNetwork
-from affordlib.models.attention import AttentionConfig, AttentiveCNP
 from affordlib.models.cnp import AffordanceCNP, CNPConfig
 from affordlib.models.film import FiLMConfig, FiLMNetwork
 from affordlib.models.lstm import LSTMConfig, LSTMNetwork
@@ -26,10 +25,10 @@ _REMEDY = "give another checkpoint, or train it again with notebook 03"
 NETWORKS: dict[str, tuple[type[EffectNetwork], type[NetworkConfig]]] = {
     "cnp": (AffordanceCNP, CNPConfig),
     "film": (FiLMNetwork, FiLMConfig),
-    "attention": (AttentiveCNP, AttentionConfig),
     "anchored": (AnchoredNetwork, AnchoredConfig),
     "lstm": (LSTMNetwork, LSTMConfig),
 }
+"""By the name that checkpoints have for them; other packages may add theirs."""
 
 
 def build(config: NetworkConfig, normaliser: Normaliser) -> EffectNetwork:

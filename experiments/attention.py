@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from affordlib import checked
 from affordlib.interactions.batches import Normaliser
+from affordlib.models.checkpoint import NETWORKS
 from affordlib.models.film import CircularHarmonics, dense, split_outputs, waves
 from affordlib.models.network import EffectNetwork, NetworkConfig, he_initialise, with_time
 from affordlib.types import Observations
@@ -125,3 +126,6 @@ class AttentiveCNP(EffectNetwork):
         for block in self.blocks:
             x = block(x, tokens, bias)
         return split_outputs(self.last(x), self.config, self.sigma_floor)
+
+
+NETWORKS["attention"] = (AttentiveCNP, AttentionConfig)
