@@ -11,7 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from numbers import Integral, Real
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -176,6 +176,14 @@ class Interaction:
         return self.primitive.succeeded(self.effect[-1])
 
 
+@runtime_checkable
+class HasChannels(Protocol):
+    """A model, or interactions, with these channels of actions and effects."""
+
+    action_channels: tuple[str, ...]
+    effect_channels: tuple[str, ...]
+
+
 @dataclass(frozen=True)
 class Observations:
     """What a model is conditioned on: action and effect at any times, in metres and radians.
@@ -192,6 +200,36 @@ class Observations:
     effect_t: torch.Tensor
     effect_mask: torch.Tensor
     weight: torch.Tensor
+
+    @classmethod
+    def of(
+        cls,
+        model: HasChannels,
+        action: tuple[torch.Tensor, torch.Tensor] | None = None,
+        effect: tuple[torch.Tensor, torch.Tensor] | None = None,
+        weight: torch.Tensor | None = None,
+    ) -> Observations:
+        """What is observed, for a model: action and effect as times (B, n) and values (B, n, C).
+
+        At least one of the two. weight: (B,), by default 1 without an effect, 0 without an action,
+        a half with both.
+        """
+        observed = action or effect
+        if observed is None:
+            raise ValueError("action or effect must be given; nothing would be observed")
+        values = observed[1]
+        b = len(values)
+
+        def columns(what, channels):
+            if what is None:
+                t, empty = values.new_zeros(b, 1), values.new_zeros(b, 1, len(channels))
+                return empty, t, t.bool()
+            return what[1], what[0], what[0].new_ones(what[0].shape).bool()
+
+        if weight is None:
+            weight = values.new_full((b,), (1 + (action is not None) - (effect is not None)) / 2)
+        of_action = columns(action, model.action_channels)
+        return cls(*of_action, *columns(effect, model.effect_channels), weight)
 
 
 @dataclass(frozen=True)

@@ -37,11 +37,9 @@ def some_observations(seed: int = 0, n: int = N, m: int = N) -> Observations:
     def rand(*shape: int) -> torch.Tensor:
         return torch.rand(*shape, generator=g)
 
-    everything = torch.ones(2, n, dtype=torch.bool)
-    return Observations(
-        0.2 * rand(2, n, 2), rand(2, n), everything,
-        0.1 * rand(2, m, 2), rand(2, m), torch.ones(2, m, dtype=torch.bool), rand(2),
-    )  # fmt: skip
+    action, action_t, effect, effect_t = rand(2, n, 2), rand(2, n), rand(2, m, 2), rand(2, m)
+    both = (action_t, 0.2 * action), (effect_t, 0.1 * effect)
+    return Observations.of(CNPConfig(), *both, rand(2))
 
 
 def linear_sizes(module: nn.Module) -> list[tuple[int, int]]:
@@ -145,12 +143,8 @@ def test_gradient_with_respect_to_the_observed_effect(untrained):
     features = model.encode(torch.rand(1, 2, 48, 48, dtype=torch.float64))
 
     def predicted(effect: torch.Tensor) -> torch.Tensor:
-        none = torch.zeros(1, 1, dtype=torch.bool)
         one = torch.ones(1, 1, dtype=torch.float64)
-        seen = Observations(
-            torch.zeros(1, 1, 2, dtype=torch.float64), 0 * one, none,
-            effect[:, None], one, ~none, torch.zeros(1, dtype=torch.float64),
-        )  # fmt: skip
+        seen = Observations.of(model, effect=(one, effect[:, None]))
         return model.predict(features, seen, one).effect_mean
 
     effect = torch.tensor([[0.05, -0.08]], dtype=torch.float64, requires_grad=True)

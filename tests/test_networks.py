@@ -195,21 +195,16 @@ def test_gradients_in_effect_and_action(name, some):
     network = made(name, some).double()
     features = network.encode(some.image[:1].double())
     one = torch.ones(1, 1, dtype=torch.float64)
-    yes, no = torch.ones(1, 1, dtype=torch.bool), torch.zeros(1, 1, dtype=torch.bool)
 
     def of_effect(effect):
-        seen = Observations(
-            torch.zeros(1, 1, 3).double(), 0 * one, no, effect[:, None], one, yes, 0 * one[0]
-        )
+        seen = Observations.of(network, effect=(one, effect[:, None]))
         return network.predict(features, seen, one).effect_mean
 
     def of_direction(angle):
         start = torch.stack([angle.cos(), angle.sin(), angle + math.pi], dim=-1) * one.new_tensor(
             [0.2, 0.2, 1.0]
         )
-        seen = Observations(
-            start[:, None], 0 * one, yes, torch.zeros(1, 1, 3).double(), one, no, one[0]
-        )
+        seen = Observations.of(network, action=(0 * one, start[:, None]))
         return network.predict(features, seen, one).effect_mean
 
     effect = torch.tensor([[0.05, -0.08, 0.1]], dtype=torch.float64, requires_grad=True)

@@ -39,27 +39,10 @@ def observe_actions(model: EffectModel, actions: Sequence[Primitive]) -> Observa
         raise ValueError("actions must hold at least one action, got none")
     columns = [ACTION_CHANNELS.index(name) for name in model.action_channels]
     action = np.stack([one.ends() for one in actions])[..., columns]
-    b = len(actions)
-    return Observations(
-        torch.as_tensor(action, dtype=torch.float32),
-        torch.tensor([0.0, 1.0]).expand(b, 2),
-        torch.ones(b, 2, dtype=torch.bool),
-        torch.zeros(b, 1, len(model.effect_channels)),
-        torch.zeros(b, 1),
-        torch.zeros(b, 1, dtype=torch.bool),
-        torch.ones(b),
-    )
+    t = torch.tensor([0.0, 1.0]).expand(len(actions), 2)
+    return Observations.of(model, action=(t, torch.as_tensor(action, dtype=torch.float32)))
 
 
 def observe_final_effect(model: EffectModel, effect: torch.Tensor) -> Observations:
     """The effect (B, C_e) at t = 1 and no action (w₁ = 0), differentiable in the effect."""
-    b = len(effect)
-    return Observations(
-        torch.zeros(b, 1, len(model.action_channels)),
-        torch.zeros(b, 1),
-        torch.zeros(b, 1, dtype=torch.bool),
-        effect[:, None],
-        torch.ones(b, 1),
-        torch.ones(b, 1, dtype=torch.bool),
-        torch.zeros(b),
-    )
+    return Observations.of(model, effect=(effect.new_ones(len(effect), 1), effect[:, None]))

@@ -312,12 +312,9 @@ def literal_draw(arrays: TrainingArrays, obs_max: int, generator: torch.Generato
     row, last = int(draw(len(arrays))), len(arrays.phase)
     at, target = draw(last, 1 + int(draw(obs_max))), draw(last)
     kind, weight = int(draw(3)), torch.rand(1, generator=generator)
-    seen = torch.ones(1, len(at), dtype=torch.bool)
-    observations = Observations(
-        arrays.action[row, at][None], arrays.phase[at][None], seen,
-        arrays.effect[row, at][None], arrays.phase[at][None], seen,
-        weight if kind == 2 else torch.tensor([float(kind)]),
-    )  # fmt: skip
+    t, weight = arrays.phase[at][None], weight if kind == 2 else torch.tensor([float(kind)])
+    action, effect = arrays.action[row, at][None], arrays.effect[row, at][None]
+    observations = Observations.of(arrays, (t, action), (t, effect), weight)
     return Batch(
         arrays.image[row][None],
         observations,

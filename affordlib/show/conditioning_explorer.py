@@ -84,28 +84,19 @@ class ConditioningExplorer(FigureWidget):
         has_action, has_effect = self._has_action.value, self._has_effect.value
         if not (has_action or has_effect):
             raise ValueError("nothing is observed; tick the action, the effect, or both")
-        weight = self._weight.value if has_action and has_effect else float(has_action)
-        action_t, effect_t = np.array(self._action_t.value), np.array([self._effect_t.value])
-        told = {
-            "action": self._at(action_t, self.seen.action, self.model.action_channels, "action"),
-            "effect": self._at(effect_t, self.seen.effect, self.model.effect_channels, "effect"),
-        }
-        return Observations(
-            **told,
-            action_t=torch.as_tensor(action_t, dtype=torch.float32)[None],
-            action_mask=torch.full((1, 2), has_action),
-            effect_t=torch.as_tensor(effect_t, dtype=torch.float32)[None],
-            effect_mask=torch.full((1, 1), has_effect),
-            weight=torch.tensor([weight]),
-        )
+        weight = torch.tensor([self._weight.value]) if has_action and has_effect else None
+        action = self._at(self._action_t.value, "action") if has_action else None
+        effect = self._at((self._effect_t.value,), "effect") if has_effect else None
+        return Observations.of(self.model, action, effect, weight)
 
-    def _at(
-        self, t: np.ndarray, values: np.ndarray, channels: Sequence[str], of: str
-    ) -> torch.Tensor:
+    def _at(self, t: Sequence[float], of: str) -> tuple[torch.Tensor, torch.Tensor]:
+        """Times (1, n) and the values (1, n, C) then of the action or of the effect."""
         known = ACTION_CHANNELS if of == "action" else EFFECT_CHANNELS
-        columns = [values[:, known.index(name)] for name in channels]
-        at = np.stack([np.interp(t, self.seen.phase, column) for column in columns], axis=-1)
-        return torch.as_tensor(at, dtype=torch.float32)[None]
+        values = getattr(self.seen, of)[
+            :, [known.index(n) for n in getattr(self.model, f"{of}_channels")]
+        ]
+        at = np.stack([np.interp(t, self.seen.phase, column) for column in values.T], axis=-1)
+        return torch.tensor([t], dtype=torch.float32), torch.as_tensor(at).float()[None]
 
     def draw(self, figure: Figure) -> str:
         """Action and effect over the phase, x and y: truth, what was observed, mean ± 2 σ."""
