@@ -88,7 +88,7 @@ lab: $(STAMP) ## Open the book in JupyterLab, on this machine only
 test test-fast test-plain: export OMP_NUM_THREADS := 1
 
 test: $(STAMP) ## Run all tests, notebooks included (JOBS=2 side by side)
-	@$(PY) -m pytest -n "$(JOBS)" --dist loadfile
+	@$(PY) -m pytest -n "$(JOBS)" --dist loadfile --durations=15
 
 test-fast: $(STAMP) ## Run the tests that take seconds, without the notebooks
 	@$(PY) -m pytest -n "$(JOBS)" --dist worksteal -m "not slow"
@@ -102,7 +102,7 @@ test-slow: $(STAMP) ## Run every notebook and solution as the reader does; the l
 	@mkdir -p runs; { $(PY) -m affordlib.workbook --profile reader --out test-slow --force; \
 	  $(PY) -m pytest tests/test_exercises.py tests/test_browser*.py; } 2>&1 | tee runs/test-slow.log
 
-soak: $(STAMP) ## Plan and execute 3,000 times: memory must stay, and the same task end the same (30 min)
+soak: $(STAMP) ## Plan and execute 3,000 times: memory must stay, and the same task end the same (15 min)
 	@OMP_NUM_THREADS=1 $(PY) -m tests.soak
 
 lint: $(STAMP) ## Check style and formatting
