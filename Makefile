@@ -35,7 +35,7 @@ unexport PYTHONPATH PYTHONHOME PYTHONSTARTUP VIRTUAL_ENV MPLBACKEND
 unexport PIP_USER PIP_TARGET PIP_PREFIX PIP_REQUIREMENT PIP_CONSTRAINT
 unexport PYTEST_ADDOPTS JUPYTER_PATH JUPYTER_TOKEN
 
-.PHONY: help setup workbook seeds lab test test-fast test-plain test-slow soak lint format bench data checkpoints notebooks html tables \
+.PHONY: help setup workbook seeds lab test test-fast test-plain test-slow soak size lint format bench data checkpoints notebooks html tables \
         constraints clean
 
 help: ## List the targets
@@ -104,6 +104,10 @@ test-slow: $(STAMP) ## Run every notebook and solution as the reader does; the l
 
 soak: $(STAMP) ## Plan and execute 3,000 times: memory must stay, and the same task end the same (15 min)
 	@OMP_NUM_THREADS=1 $(PY) -m tests.soak
+
+size: ## Count the lines of the package, the experiments and the tests
+	@for folder in affordlib experiments benchmarks tests; do \
+	  printf '%-12s %6d lines in %3d files\n' $$folder $$(git ls-files $$folder | xargs cat | wc -l) $$(git ls-files $$folder | wc -l); done
 
 lint: $(STAMP) ## Check style and formatting
 	@$(PY) -m ruff check
