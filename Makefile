@@ -106,7 +106,7 @@ soak: $(STAMP) ## Plan and execute 3,000 times: memory must stay, and the same t
 	@OMP_NUM_THREADS=1 $(PY) -m tests.soak
 
 size: ## Count the lines of the package, the experiments and the tests
-	@for folder in affordlib experiments benchmarks tests; do \
+	@for folder in affordlib experiments tests; do \
 	  printf '%-12s %6d lines in %3d files\n' $$folder $$(git ls-files $$folder | xargs cat | wc -l) $$(git ls-files $$folder | wc -l); done
 
 lint: $(STAMP) ## Check style and formatting
@@ -118,8 +118,8 @@ format: $(STAMP) ## Format the code, notebooks included
 	@$(PY) -m ruff format
 
 bench: $(STAMP) ## Run the benchmarks (KEEP=1 puts the times into data/results/speed.json)
-	@shopt -s nullglob; for file in benchmarks/bench_*.py; do \
-	   echo "== $$file"; $(PY) "$$file" $(if $(KEEP),--keep) || exit 1; \
+	@for name in collect lever_up models neural_processes planning primitives; do \
+	   echo "== $$name"; $(PY) -m experiments.speed.$$name $(if $(KEEP),--keep) || exit 1; \
 	 done
 
 data: $(STAMP) ## Collect the shipped data sets again and compare
@@ -149,4 +149,4 @@ constraints: $(STAMP) ## Write constraints.txt from what is installed
 
 clean: ## Remove runs/, caches and build leftovers; .venv stays
 	@rm -rf runs build dist *.egg-info .pytest_cache .ruff_cache .hypothesis notebooks/.ipynb_checkpoints
-	@find affordlib tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +
+	@find affordlib tests experiments -name __pycache__ -type d -prune -exec rm -rf {} +

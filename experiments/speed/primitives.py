@@ -10,12 +10,12 @@ import time
 
 import numpy as np
 import pybullet
-from keeping import keep
 
 from affordlib.interactions.recipes import RECIPES
 from affordlib.primitives import PRIMITIVES, Push
 from affordlib.world import Cuboid, Tabletop, robot
 from experiments.cost import SteppingClock, measure_cost
+from experiments.speed.keeping import keep
 
 EPISODES = 24
 NAIVE_EPISODES = 6

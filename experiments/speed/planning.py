@@ -7,7 +7,7 @@ the other, as ours follows at once. A first plan is the continuous planner's dra
 object costs once; `whole` are plans of an object never seen before, its map and all. Seconds are of
 one core's work, so that others on the machine take none.
 
-    python benchmarks/bench_planning.py [--keep]
+    python -m experiments.speed.planning [--keep]
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from functools import partial
 
 import numpy as np
 import torch
-from keeping import keep
 
 from affordlib.evaluation.goals import STANDING, uniform_tasks
 from affordlib.models import load_checkpoint, observe_actions
@@ -28,6 +27,7 @@ from affordlib.planning.astar import N_DIRECTIONS, STOP_PHASES
 from affordlib.planning.continuous import EARLIEST, KEPT, SPREAD_RAD
 from affordlib.primitives import Push
 from affordlib.world import Tabletop
+from experiments.speed.keeping import keep
 
 N_GOALS = 15
 SEED = 300

@@ -9,7 +9,6 @@ the image alone, of one object and of 64 at once. Ratios are to ours.
 import time
 
 import torch
-from keeping import keep
 
 from affordlib.interactions import Normaliser, open_interactions
 from affordlib.interactions.lever import AHEAD, SEEN, draw_windows, lever_arrays
@@ -17,6 +16,7 @@ from affordlib.models import build
 from affordlib.models.lever import LEVER_MODELS, foresee
 from affordlib.models.training import batch_loss
 from experiments.lstm_published import BATCH, EPOCHS, PublishedConfig, PublishedLSTM
+from experiments.speed.keeping import keep
 
 N = 256
 EPOCH = 1440

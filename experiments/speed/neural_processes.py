@@ -8,7 +8,7 @@ Beside them stands what knows the Gaussian process: the best that any network ca
 
 The package is no dependency; without it this says so and ends. It wants an environment of its own:
     .venv/bin/python -m pip install neuralprocesses==0.2.7
-    .venv/bin/python benchmarks/bench_neural_processes.py --steps 2000 --keep
+    .venv/bin/python -m experiments.speed.neural_processes --steps 2000 --keep
 writes the numbers to `data/results/neural_processes.json` as well.
 """
 

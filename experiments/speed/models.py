@@ -17,7 +17,6 @@ from itertools import product
 
 import numpy as np
 import torch
-from keeping import keep
 
 from affordlib.interactions import (
     Normaliser,
@@ -37,6 +36,7 @@ from affordlib.models import (
 )
 from affordlib.models.training import batch_loss, final_errors_m, literal_draw
 from affordlib.primitives import Push
+from experiments.speed.keeping import keep
 
 BATCH, TARGETS = 64, 32
 DIRECTIONS, STEPS = 180, 25

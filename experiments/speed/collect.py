@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 from dask.distributed import Client, LocalCluster
-from keeping import keep
 
 from affordlib.interactions.collect import collect
 from affordlib.interactions.recipes import Recipe
 from affordlib.interactions.schema import collect_chunk
+from experiments.speed.keeping import keep
 
 INTERACTIONS = 200
 ROUNDS = 4
