@@ -467,7 +467,7 @@ def test_a_hostile_value_is_refused_by_name_or_does_no_harm(shop, name, tmp_path
     )
     @given(st.sampled_from(sorted(valid)), HOSTILE)
     def try_one(argument, value):
-        began, wrong = time.monotonic(), ""
+        began, wrong = time.process_time(), ""
         try:
             nans = silent_nans(call(**valid | {argument: value}))
             wrong = nans and f"gives NaN in {nans}"
@@ -481,7 +481,7 @@ def test_a_hostile_value_is_refused_by_name_or_does_no_harm(shop, name, tmp_path
             wrong = not isinstance(value, str | bytes | Path) and f"is no path, but {error!r}"
         except Exception as error:
             wrong = f"raises {error!r}"
-        took_s = time.monotonic() - began
+        took_s = time.process_time() - began  # whatever else the machine does
         if took_s > LIMIT_S:
             wrong = f"takes {took_s:.0f} s"
         if wrong:

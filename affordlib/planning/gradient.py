@@ -119,7 +119,7 @@ def plan_gradient(
     """
     began = time.perf_counter()
     check_count("samples", samples, 2, 10_000)
-    check_count("starts", starts, 1, 1000)
+    check_count("starts", starts, 1, 100)
     model, kind, features = (getattr(problem.effects, n) for n in ("model", "kind", "features"))
     goal, mode, reachable = problem.goal, problem.mode, problem.reachable
     columns = plane(model)

@@ -4,16 +4,17 @@ from affordlib.show.animation import Film, show_animation
 from affordlib.show.conditioning_explorer import ConditioningExplorer
 from affordlib.show.executors import closed_loop, open_loop
 from affordlib.show.goal_picker import GoalPicker
-from affordlib.show.lever import outline_in_lever_frame, plot_levered
 from affordlib.show.phase_slider import PhaseSlider
 from affordlib.show.plots import (
     GOAL,
     NEUTRAL,
     PREDICTION,
     TRUTH,
+    outline_in_lever_frame,
     plot_closed_loop,
     plot_depth,
     plot_footprint,
+    plot_levered,
     plot_outcome,
     plot_plan,
     plot_table,

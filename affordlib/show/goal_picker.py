@@ -6,10 +6,12 @@ A view on plain objects: everything it does can be done with a planner, `execute
 
 from __future__ import annotations
 
+import asyncio
 import html
 import math
 import threading
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
@@ -22,12 +24,17 @@ from affordlib.planning import execute_plan
 from affordlib.primitives import wrap_angle
 from affordlib.show.executors import Executor, Planner, Stopped, open_loop
 from affordlib.show.figure_widget import Pictured
-from affordlib.show.page_queue import PageQueue
-from affordlib.show.picker_controls import PickerControls
+from affordlib.show.picker_controls import PickerControls, outcome_in_words, plan_in_words
 from affordlib.show.plots import table_picture
-from affordlib.show.pose_film import moving_part, pose_recorder
-from affordlib.show.sentences import outcome_in_words, plan_in_words
-from affordlib.show.table_view import TableView, draw_way, make_scene, rounded, whole_mm
+from affordlib.show.table_view import (
+    TableView,
+    draw_way,
+    make_scene,
+    moving_part,
+    pose_recorder,
+    rounded,
+    whole_mm,
+)
 from affordlib.types import Goal, Outcome, Plan, check_count, check_on_table
 from affordlib.world import Tabletop
 
@@ -400,3 +407,46 @@ class GoalPicker(Pictured, widgets.VBox):
     def picture(self) -> bytes:
         """What is shown, as a PNG."""
         return table_picture(self.world.thing, self._pose, self.plan, self.outcome, HALF_WIDTH_M)
+
+
+class PageQueue:
+    """A thread for what a page asks for, so that the next click is heard meanwhile.
+
+    say: is told, in words, what did not work; `last`: the future of what was asked for last.
+    """
+
+    def __init__(self, say: Callable[[str], None]) -> None:
+        self._say, self._thread = say, ThreadPoolExecutor(1)
+        self.last: Future | None = None
+
+    @staticmethod
+    def page_waits() -> bool:
+        """Whether this is called for a page, whose messages come by an event loop."""
+        try:
+            asyncio.get_running_loop()
+        except RuntimeError:
+            return False
+        return True
+
+    def do(self, action: Callable[[], None]) -> None:
+        """Do what is asked for: now in a script, for a page after all that it has asked before."""
+        if self.page_waits():
+            self.put(action)
+        else:
+            self.attempt(action)
+
+    def put(self, action: Callable[[], None], after_s: float = 0.0) -> None:
+        """Do it in the background, and not before so many seconds."""
+        if after_s:
+            timer = threading.Timer(after_s, self.put, [action])
+            timer.daemon = True
+            timer.start()
+        else:
+            self.last = self._thread.submit(self.attempt, action)
+
+    def attempt(self, action: Callable[[], None]) -> None:
+        """Do it now, and say what did not work."""
+        try:
+            action()
+        except Exception as error:
+            self._say(str(error) or type(error).__name__)

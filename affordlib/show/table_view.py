@@ -5,6 +5,7 @@ Everything it needs is in this package; nothing is fetched from anywhere.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,10 +15,11 @@ import anywidget
 import numpy as np
 import traitlets
 
+from affordlib.show.picker_controls import step_in_words
 from affordlib.show.plots import ENLARGED
-from affordlib.show.sentences import step_in_words
 from affordlib.types import TABLE_X_M, TABLE_Y_M, Goal, Step
-from affordlib.world import BASE_X_M, REACH_M, Thing
+from affordlib.world import BASE_X_M, REACH_M, Tabletop, Thing
+from affordlib.world.motion import Film
 
 PUSH_RUN_UP_M = 0.2
 _HERE = Path(__file__).parent
@@ -122,3 +124,32 @@ def whole_mm(x_m: float, y_m: float) -> tuple[float, float]:
 def rounded(values: Any) -> list:
     """The numbers as nested lists, to a hundredth of a millimetre."""
     return np.round(np.asarray(values, dtype=float), 5).tolist()
+
+
+EVERY = 12
+"""Simulation steps (1/240 s) between two poses."""
+
+_RESTING = 1e-4
+
+
+def pose_recorder(poses: list[tuple[float, ...]], before: Film | None) -> Film:
+    """A film for a world that appends the object's poses to a list, beside the world's own film."""
+    steps = itertools.count()
+
+    def record(world: Tabletop) -> None:
+        if before is not None:
+            before(world)
+        if next(steps) % EVERY == 0:
+            poses.append(world.object_pose())
+
+    return record
+
+
+def moving_part(poses: Sequence[tuple[float, ...]]) -> np.ndarray:
+    """The poses (n, 3) from the first move to the last; none where nothing moved."""
+    told = np.array(poses).reshape(-1, 3)
+    moving = np.abs(np.diff(told, axis=0)).max(axis=1, initial=0.0) > _RESTING
+    if not moving.any():
+        return told[:0]
+    first, last = np.flatnonzero(moving)[[0, -1]]
+    return told[first : last + 2]
