@@ -25,8 +25,7 @@ from tqdm.auto import tqdm
 
 from affordlib.commands import command, count_type, names_type, seed_type
 from affordlib.evaluation.answers import rounded
-from affordlib.models.checkpoint import checkpoint_sha256
-from affordlib.models.weight_files import weights_bytes
+from affordlib.models.checkpoint import checkpoint_sha256, weights_bytes
 from affordlib.paths import repo_root
 from affordlib.planning import (
     ClosedLoopResult,

@@ -20,9 +20,8 @@ import torch
 
 from affordlib.interactions import open_interactions
 from affordlib.interactions.recipes import Recipe, draw_scene, draw_world
-from affordlib.models.checkpoint import load_checkpoint
+from affordlib.models.checkpoint import load_checkpoint, weights_bytes
 from affordlib.models.protocol import observe_actions
-from affordlib.models.weight_files import weights_bytes
 from affordlib.paths import repo_root
 from affordlib.planning.reachability import SHIPPED as REACHABILITY
 from affordlib.planning.reachability import Reachability

@@ -27,10 +27,10 @@ from affordlib import checked
 from affordlib.interactions import Normaliser
 from affordlib.interactions.batches import TrainingArrays
 from affordlib.interactions.lever import SEEN
+from affordlib.models.checkpoint import load_state, save_state
 from affordlib.models.lever import beginning_errors_m, window_errors_m
 from affordlib.models.lstm import Known, on_grid
 from affordlib.models.network import EffectNetwork, NetworkConfig, with_time
-from affordlib.models.weight_files import load_state, save_state
 from affordlib.types import LEVER_IMAGE_PIXELS, Observations
 
 CONVOLUTION_WIDTHS = (32, 64, 128, 256)

@@ -22,8 +22,8 @@ from affordlib.models import (
     save_checkpoint,
     train,
 )
+from affordlib.models.checkpoint import read_weights, write_weights
 from affordlib.models.training import final_errors_m
-from affordlib.models.weight_files import read_weights, write_weights
 from affordlib.planning.reachability import Reachability
 from affordlib.primitives import Push
 from affordlib.types import Observations

@@ -13,8 +13,12 @@ from affordlib.interactions import (
     open_interactions,
     split_interactions,
 )
-from affordlib.models.checkpoint import checkpoint_sha256, save_checkpoint
-from affordlib.models.weight_files import read_weights, write_weights
+from affordlib.models.checkpoint import (
+    checkpoint_sha256,
+    read_weights,
+    save_checkpoint,
+    write_weights,
+)
 from affordlib.paths import repo_root
 from affordlib.results import read_results
 from experiments import grasps as grasps_module

@@ -31,11 +31,10 @@ from affordlib.interactions.batches import (
     symmetric_copies,
 )
 from affordlib.models.calibration import fit_temperature
-from affordlib.models.checkpoint import build
+from affordlib.models.checkpoint import build, load_state, save_state
 from affordlib.models.cnp import CNPConfig
 from affordlib.models.lstm import LSTMNetwork, courses
 from affordlib.models.network import EffectNetwork, NetworkConfig
-from affordlib.models.weight_files import load_state, save_state
 from affordlib.types import Observations, check_count, check_field, check_within
 
 Draw = Callable[[TrainingArrays, torch.Tensor, int, int, torch.Generator], Batch]

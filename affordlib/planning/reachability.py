@@ -13,7 +13,7 @@ import torch
 import xarray as xr
 from torch import nn
 
-from affordlib.models.weight_files import read_weights, write_weights
+from affordlib.models.checkpoint import read_weights, write_weights
 from affordlib.paths import repo_root
 from affordlib.primitives import PRIMITIVES, primitive_named
 
