@@ -272,6 +272,8 @@ class GoalPicker(Pictured, widgets.VBox):
                 lifted_m=self.world.object_state()[2] - z,
             )
             self._lifted = bool(self._goal.height_m)
+            if self.plan.goal == self._goal or self.outcome.distance_m <= self._goal.tolerance_m:
+                self._owed = False  # it has followed a goal that was moved
             self.controls.say(outcome_in_words(self.outcome, self._goal, how, done))
         except Exception:
             self.plan = None  # the next run plans from where this one broke off
