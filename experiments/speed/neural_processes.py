@@ -16,11 +16,13 @@ import argparse
 import importlib.metadata
 import importlib.util
 import math
+import sys
 import time
 
 import numpy as np
 import torch
 
+from affordlib.commands import command, count_type
 from affordlib.interactions import Normaliser
 from affordlib.models import CNPConfig, build
 from affordlib.models.network import gaussian_nll
@@ -127,9 +129,11 @@ def mean_sem(values):
     return float(np.mean(values)), float(np.std(values, ddof=1) / math.sqrt(len(values)))
 
 
-def main():
+@command(OSError, ValueError)
+def main() -> int:
+    """Train both kinds of networks side by side and print how well they predict."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--steps", type=int, default=3000)
+    parser.add_argument("--steps", type=count_type, default=3000)
     parser.add_argument("--rate", type=float, default=5e-4)
     parser.add_argument("--keep", action="store_true", help="write neural_processes.json")
     options = parser.parse_args()
@@ -183,6 +187,8 @@ def main():
         tables = {"log_likelihood": rows, "difference": pairs}
         print(write_results("data/results", "neural_processes", parameters, tables))
 
+    return 0
+
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
