@@ -12,12 +12,14 @@ loop has after 20,000 iterations (a quarter of an hour), the batched one in batc
 
 import argparse
 import os
+import sys
 import time
 from itertools import product
 
 import numpy as np
 import torch
 
+from affordlib.commands import command
 from affordlib.interactions import (
     Normaliser,
     TrainingArrays,
@@ -168,7 +170,9 @@ def time_to_error(training, validation):
     )
 
 
-def main():
+@command(OSError, ValueError)
+def main() -> int:
+    """Measure training and predicting beside loops over single trajectories."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--long", action="store_true")
     parser.add_argument("--keep", action="store_true")
@@ -188,6 +192,8 @@ def main():
         keep("training", KEPT["training"])
     keep("asking", KEPT["asking"])
 
+    return 0
+
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
