@@ -101,9 +101,7 @@ class GoalPicker(Pictured, widgets.VBox):
 
     def ask_pose(self, turn_deg: float = 0.0, height_cm: float = 0.0) -> None:
         """Ask for a turn and a height beside the position; 0 asks for none. Plans anew."""
-        turn = math.radians(turn_deg) if turn_deg else None
-        height = height_cm / 100 if height_cm else None
-        self._ask_for(replace(self._goal, turn_rad=turn, height_m=height))
+        self._ask_for(self._posed_goal(turn_deg, height_cm))
         self._settle()
 
     def run(self) -> None:
@@ -154,6 +152,11 @@ class GoalPicker(Pictured, widgets.VBox):
         self.controls.say(f"Loaded. {plan_in_words(plan)}{note if away_m > 0.002 else ''}")
         self._owed = False
         self._show()
+
+    def _posed_goal(self, turn_deg: float, height_cm: float) -> Goal:
+        turn = math.radians(turn_deg) if turn_deg else None
+        height = height_cm / 100 if height_cm else None
+        return replace(self._goal, turn_rad=turn, height_m=height)
 
     def _ask_for(self, goal: Goal) -> None:
         """A new goal, for which there is no plan yet."""
@@ -375,8 +378,11 @@ class GoalPicker(Pictured, widgets.VBox):
             self._queue.attempt(lambda: self._follow(*xy_m))
 
     def _posed(self, change: dict[str, Any]) -> None:
+        """Set the goal at once, or the slider would be told an older one; plan when idle."""
         if not self._setting:
-            self._hear(lambda: self.ask_pose(*self.controls.pose(self._goal, change)))
+            pose = self.controls.pose(self._goal, change)
+            self._queue.attempt(lambda: self._ask_for(self._posed_goal(*pose)))
+            self._hear(self._settle)
 
     def _pressed(self, _: object, content: dict[str, Any], __: object) -> None:
         presses = {"run": self._run_in_background, "stop": self.stop}
