@@ -14,7 +14,7 @@ from PIL import Image, ImageDraw, ImageFont
 from affordlib.paths import repo_root
 from affordlib.planning import Skills, execute_plan, plan_continuous
 from affordlib.results import write_atomically
-from affordlib.show import Film
+from affordlib.show import FrameRecorder
 from affordlib.types import Goal
 from affordlib.world import Cuboid, Tabletop
 
@@ -29,7 +29,7 @@ PICTURE = repo_root() / "figures" / "partial_push.gif"
 
 def filmed(title: str, stop: bool) -> list[np.ndarray]:
     """Frames (h, w, 3) of one planned push, stopped where the plan says or executed whole."""
-    film = Film(FRAME_STEPS, *LARGE)
+    film = FrameRecorder(FRAME_STEPS, *LARGE)
     with Tabletop() as world:
         world.place(BOX, (0.0, 0.0), 0.3)
         planner = Skills.load().planner(plan_continuous, mode="single_partial")
@@ -57,7 +57,7 @@ def _titled(picture: np.ndarray, title: str) -> np.ndarray:
 def main() -> None:
     """Film the push, whole and stopped, and write both side by side."""
     both = filmed("The whole push", stop=False), filmed("Stopped at {:.0%} of it", stop=True)
-    film = Film()
+    film = FrameRecorder()
     for k in range(max(map(len, both))):
         film.frames.append(np.hstack([side[min(k, len(side) - 1)] for side in both]))
     write_atomically(PICTURE, film.encoded("GIF", frame_ms=80))

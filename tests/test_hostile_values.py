@@ -78,7 +78,7 @@ def shop(one_world, skills, pushes, tmp_path_factory):
     one_world.config = world.WorldConfig()
     one_world.place(box, (0.0, 0.0), 0.3)
     image, folder = one_world.look(), tmp_path_factory.mktemp("hostile")
-    film = show.Film(1, 16, 16)
+    film = show.FrameRecorder(1, 16, 16)
     film(one_world)
     return {
         "world": one_world,
@@ -364,10 +364,10 @@ def valid_calls(shop):
             show.ConditioningExplorer,
             {"model": model, "seen": shop["seen"]},
         ),
-        "Film": (show.Film, {"every": 30, "width": 32, "height": 32}),
+        "FrameRecorder": (show.FrameRecorder, {"every": 30, "width": 32, "height": 32}),
         "show_animation": (
             show.show_animation,
-            {"film": shop["film"], "path": shop["folder"] / "film.gif", "beside": figure},
+            {"recorder": shop["film"], "path": shop["folder"] / "film.gif", "beside": figure},
         ),
         "plot_levered": (
             show.plot_levered,
@@ -429,8 +429,8 @@ load_checkpoint save_checkpoint observe_actions train train_literal PlanMode Dis
 draw_disturbances action_limit EffectMap PlanningProblem ClosedLoopConfig plan_astar
 plan_continuous plan_gradient plan_turn plan_lift kind_for Skills execute_plan run_closed_loop
 closed_loop plot_depth plot_footprint plot_plan
-plot_outcome plot_table save_figure GoalPicker PhaseSlider Film ConditioningExplorer error_row
-mean_length_errors_m save_plan load_plan write_results read_results results_table check Split
+plot_outcome plot_table save_figure GoalPicker PhaseSlider FrameRecorder ConditioningExplorer
+error_row mean_length_errors_m save_plan load_plan write_results read_results results_table check Split
 TrainingArrays AffordanceCNP FiLMNetwork calibration_rows train_model refuse_seen
 outline_in_lever_frame plot_levered plot_closed_loop show_animation
 """,

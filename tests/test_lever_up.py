@@ -31,7 +31,7 @@ from affordlib.models.lever import (
     foresee,
 )
 from affordlib.models.lstm import on_grid
-from affordlib.show import Film, outline_in_lever_frame, plot_levered
+from affordlib.show import FrameRecorder, outline_in_lever_frame, plot_levered
 
 
 @pytest.fixture(scope="module", params=["anchored", "lstm_tuned", "paper"])
@@ -227,6 +227,6 @@ def test_a_levered_prism_is_drawn_where_it_is():
     upended = plot_levered(Figure().subplots(), square, 0.04, pose, "k")
     top = max(line.get_ydata().max() for line in upended.lines)
     assert top == pytest.approx(100 * (0.2 + 0.3 * 0.1))
-    film = Film(height=100)
+    film = FrameRecorder(height=100)
     film.add(figure)
     assert film.frames[0].shape[0] == 100

@@ -10,7 +10,7 @@ from problems import problem_of
 from affordlib.planning import execute_plan, plan_astar
 from affordlib.primitives import Push
 from affordlib.show import (
-    Film,
+    FrameRecorder,
     plot_footprint,
     plot_outcome,
     plot_table,
@@ -22,8 +22,8 @@ from affordlib.world import Cuboid
 
 def test_a_film_shows_the_robot_move(world, tmp_path):
     world.place(Cuboid(0.06, 0.05, 0.05))
-    film = Film(every=240, width=80, height=60)
-    with pytest.raises(RuntimeError, match="the film is empty"):
+    film = FrameRecorder(every=240, width=80, height=60)
+    with pytest.raises(RuntimeError, match="there are no frames"):
         film.encoded()
     world.film = film
     try:
@@ -57,7 +57,7 @@ def test_a_footprint_is_drawn_where_the_object_is(world, trained):
 
 
 def test_all_frames_of_a_film_have_one_size():
-    film = Film(width=320, height=240)
+    film = FrameRecorder(width=320, height=240)
     film.add(Figure(figsize=(4, 3)))
-    with pytest.raises(ValueError, match="480×240 pixels, those of the film have 320×240"):
+    with pytest.raises(ValueError, match="480×240 pixels, the others have 320×240"):
         film.add(Figure(figsize=(6, 3)))

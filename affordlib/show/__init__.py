@@ -1,6 +1,6 @@
 """Pictures for people: figures, animations, and widgets to try things by hand."""
 
-from affordlib.show.animation import Film, show_animation
+from affordlib.show.animation import FrameRecorder, show_animation
 from affordlib.show.conditioning_explorer import ConditioningExplorer
 from affordlib.show.executors import closed_loop, open_loop
 from affordlib.show.goal_picker import GoalPicker
@@ -27,7 +27,7 @@ __all__ = [
     "PREDICTION",
     "TRUTH",
     "ConditioningExplorer",
-    "Film",
+    "FrameRecorder",
     "GoalPicker",
     "PhaseSlider",
     "closed_loop",

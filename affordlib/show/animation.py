@@ -15,7 +15,7 @@ from affordlib.types import check_count
 from affordlib.world import Tabletop
 
 
-class Film:
+class FrameRecorder:
     """Takes a picture every `every` simulation steps (1/240 s); give it to `world.film`.
 
     Figures can be added as frames as well, with `add`.
@@ -39,8 +39,8 @@ class Film:
         if self.frames and frame.shape != self.frames[0].shape:
             sizes = [f"{f.shape[1]}×{f.shape[0]}" for f in (frame, self.frames[0])]
             raise ValueError(
-                f"figure makes a frame of {sizes[0]} pixels, those of the film have {sizes[1]}; "
-                "give it the shape of the film, or show it with beside="
+                f"figure makes a frame of {sizes[0]} pixels, the others have {sizes[1]}; "
+                "give it their shape, or show it with beside="
             )
         self.frames.append(frame)
 
@@ -50,7 +50,9 @@ class Film:
         kind: "GIF" or "PNG"; beside: a figure shown to the left of every frame.
         """
         if not self.frames:
-            raise RuntimeError("the film is empty; set world.film = film before the robot moves")
+            raise RuntimeError(
+                "there are no frames; set world.film to the recorder before the robot moves"
+            )
         pictures = [Image.fromarray(frame) for frame in self.frames]
         if beside is not None:
             left = _drawn(beside, pictures[0].height)
@@ -85,15 +87,15 @@ def _joined(left: Image.Image, right: Image.Image) -> Image.Image:
 
 
 def show_animation(
-    film: Film, path: str | Path | None = None, beside: Figure | None = None
+    recorder: FrameRecorder, path: str | Path | None = None, beside: Figure | None = None
 ) -> NotebookImage:
-    """The film as a picture a notebook displays; saved to `path` as a GIF as well, if given.
+    """The frames as an animation that a notebook displays; saved to `path` as a GIF too, if given.
 
     beside: a figure shown to the left of every frame.
     """
     if path is not None:
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, film.encoded("GIF", beside=beside), b"GIF8")
+        write_atomically(path, recorder.encoded("GIF", beside=beside), b"GIF8")
     # A PNG: pages made from a notebook leave GIFs out, and it is a third smaller.
-    return NotebookImage(film.encoded("PNG", beside=beside), format="png")
+    return NotebookImage(recorder.encoded("PNG", beside=beside), format="png")
