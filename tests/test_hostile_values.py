@@ -430,8 +430,8 @@ draw_disturbances action_limit EffectMap PlanningProblem ClosedLoopConfig plan_a
 plan_continuous plan_gradient plan_turn plan_lift kind_for Skills execute_plan run_closed_loop
 closed_loop plot_depth plot_footprint plot_plan
 plot_outcome plot_table save_figure GoalPicker PhaseSlider FrameRecorder ConditioningExplorer
-error_row mean_length_errors_m save_plan load_plan write_results read_results results_table check Split
-TrainingArrays AffordanceCNP FiLMNetwork calibration_rows train_model refuse_seen
+error_row mean_length_errors_m save_plan load_plan write_results read_results results_table check
+Split TrainingArrays AffordanceCNP FiLMNetwork calibration_rows train_model refuse_seen
 outline_in_lever_frame plot_levered plot_closed_loop show_animation
 """,
 )
