@@ -123,11 +123,11 @@ bench: $(STAMP) ## Run the benchmarks (KEEP=1 puts the times into data/results/s
 	 done
 
 data: $(STAMP) ## Collect the shipped data sets again and compare
-	@$(PY) -m experiments.make_data
+	@$(PY) -m experiments.shipped data
 
 checkpoints: $(STAMP) ## Train the shipped models again (ONLY="push_film")
-	@$(if $(ONLY),,$(PY) -m experiments.make_reachability)
-	@$(PY) -m experiments.make_checkpoints $(if $(ONLY),--only $(ONLY))
+	@$(if $(ONLY),,$(PY) -m experiments.shipped reachability)
+	@$(PY) -m experiments.shipped checkpoints $(if $(ONLY),--only $(ONLY))
 
 notebooks: $(STAMP) ## Execute the committed notebooks in place and clean them (ONLY= FORCE=1)
 	@$(PY) -m affordlib.workbook --in-place --only "$$ONLY" $(if $(FORCE),--force)

@@ -20,7 +20,7 @@ from affordlib.models.checkpoint import build
 from affordlib.models.film import FiLMNetwork
 from affordlib.models.protocol import observe_final_effect
 from affordlib.models.training import final_errors_m, literal_draw, train
-from experiments.make_checkpoints import SHIPPED
+from experiments.shipped import CHECKPOINT_SPECS
 
 Rows = list[dict[str, Any]]
 
@@ -177,7 +177,7 @@ def ablated(changes: Sequence[str], steps: int, seed: int = 0) -> tuple[np.ndarr
         of: {k: v for how in each for k, v in how.get(of, {}).items()}
         for of in ("training", "network")
     }
-    shipped = SHIPPED["push_film"]
+    shipped = CHECKPOINT_SPECS["push_film"]
     config = replace(shipped.training, steps=steps, seed=seed, **options["training"])
     network = replace(shipped.network, **options["network"])
     channels = network.action_channels, network.effect_channels

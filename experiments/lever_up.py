@@ -55,7 +55,6 @@ from experiments.lstm_published import (
     PublishedLSTM,
     train_published,
 )
-from experiments.make_checkpoints import shipped_lever_model
 from experiments.parts import (
     checked_part,
     open_once,
@@ -63,6 +62,7 @@ from experiments.parts import (
     run_parts,
     sha256_of,
 )
+from experiments.shipped import shipped_lever_model
 
 FORMAT = 1
 """Counts the changes of code that change a unit's numbers without changing its configuration."""

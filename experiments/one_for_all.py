@@ -30,15 +30,15 @@ from affordlib.models.network import EffectNetwork
 from affordlib.models.training import train
 from affordlib.paths import resolve_out_dir
 from affordlib.primitives import Grasp
-from experiments.make_checkpoints import SHIPPED
 from experiments.parts import open_once
+from experiments.shipped import CHECKPOINT_SPECS
 from experiments.units import PARTS, TASKS, Unit, configuration_sha256, read_part, run_unit
 
 PRIMITIVES = ("push", "drag", "grasp", "rotate")
 NETWORK = FiLMConfig(
     action_channels=("x", "y", "z", "yaw", "gripper"), effect_channels=("x", "y", "z", "yaw")
 )
-TRAINING = replace(SHIPPED["push_film"].training, steps=9600, augment=False)
+TRAINING = replace(CHECKPOINT_SPECS["push_film"].training, steps=9600, augment=False)
 MIRRORED: tuple[Symmetry, ...] = ((0, False), (0, True))
 """Of pushes and drags; turning them is nothing new in the frame of the push."""
 

@@ -51,13 +51,13 @@ from affordlib.perception import looks_rollable
 from affordlib.results import write_text_atomically
 from affordlib.types import Observations
 from experiments import ablation, lever_tuning, limits, one_for_all, tails
-from experiments.make_checkpoints import SHIPPED
 from experiments.rollability import learn_rollability
+from experiments.shipped import CHECKPOINT_SPECS
 
 FOLDER = "data/results/studies"
 Rows = list[dict[str, Any]]
 
-TRAINING = replace(SHIPPED["push_film"].training, steps=1500)
+TRAINING = replace(CHECKPOINT_SPECS["push_film"].training, steps=1500)
 """Of `mixed` and `varied`; longer for a network that is shipped."""
 
 VARIED_FOLDS = 3
@@ -217,7 +217,7 @@ def varied() -> Rows:
     these asked of the network that learned from 4,000 others.
     """
     data = open_interactions("push_varied")
-    network = SHIPPED["push_film"].network
+    network = CHECKPOINT_SPECS["push_film"].network
     channels = network.action_channels, network.effect_channels
     errors, judged = [], []
     for fold in range(VARIED_FOLDS):
@@ -249,16 +249,23 @@ def _varied_rows(n_interactions: int, folds: int, error: np.ndarray, judged: lis
 
 
 def _network_settings(*more: Any) -> Any:
-    return replace(TRAINING, device="cpu"), SHIPPED["push_film"].network, *more
+    return replace(TRAINING, device="cpu"), CHECKPOINT_SPECS["push_film"].network, *more
 
 
 def _ablation_settings(ladder: dict[str, str] | None = None) -> Any:
-    whole = replace(SHIPPED["push_film"].training, device="cpu")
+    whole = replace(CHECKPOINT_SPECS["push_film"].training, device="cpu")
     changes = {
         change: {of: getattr(new, "__name__", new) for of, new in ablation.CHANGES[change].items()}
         for change in (ablation.CHANGES if ladder is None else ladder.values())
     }
-    return SHIPPED["push_film"].network, whole, ablation.STEPS, ablation.SEEDS, changes, ladder
+    return (
+        CHECKPOINT_SPECS["push_film"].network,
+        whole,
+        ablation.STEPS,
+        ablation.SEEDS,
+        changes,
+        ladder,
+    )
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from affordlib.interactions import TrainingArrays, open_interactions, split_inte
 from affordlib.interactions.batches import plane_of
 from affordlib.models.calibration import AFTER_CONTACT, LEVELS, effects_at
 from affordlib.models.checkpoint import load_checkpoint
-from experiments.make_checkpoints import SHIPPED
+from experiments.shipped import CHECKPOINT_SPECS
 
 CHECKPOINTS = ("push_film", "push_cnp", "drag_film")
 """Those whose validation data are shipped."""
@@ -83,7 +83,7 @@ def tails() -> Rows:
         model, _ = load_checkpoint(name)
         model.temperature = (1.0,) * len(model.effect_channels)
         channels = model.action_channels, model.effect_channels
-        source = SHIPPED[name].data
+        source = CHECKPOINT_SPECS[name].data
         data = open_interactions(source)
         split = split_interactions(data.sizes["interaction"])
         other = TESTS.get(source)

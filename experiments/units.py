@@ -47,12 +47,12 @@ from affordlib.results import write_text_atomically
 from affordlib.workers import dask_client
 from experiments.attention import AttentionConfig
 from experiments.inverse import along_effect, executed_record, inverse_record
-from experiments.make_checkpoints import (
+from experiments.parts import checked_part, open_once, options_of, run_parts, sha256_of
+from experiments.shipped import (
+    CHECKPOINT_SPECS,
     GRASP_SYMMETRIES,
     HALF_TURNS,
-    SHIPPED,
 )
-from experiments.parts import checked_part, open_once, options_of, run_parts, sha256_of
 
 if TYPE_CHECKING:
     from dask.distributed import Client
@@ -108,7 +108,7 @@ KINDS: dict[str, tuple[str, type[NetworkConfig]]] = {
 MEMBERS = 5
 """Networks of an `ensemble`, the first of which is that of `film`."""
 
-OF_SET = {s.data: name for name, s in SHIPPED.items() if isinstance(s.network, FiLMConfig)}
+OF_SET = {s.data: name for name, s in CHECKPOINT_SPECS.items() if isinstance(s.network, FiLMConfig)}
 """The shipped FiLM networks by the sets they learn from."""
 
 SETS = (*TASKS, *(f"{name}{TEN_TIMES}" for name in TASKS))
@@ -158,9 +158,9 @@ def learner(unit: Unit) -> tuple[NetworkConfig, TrainingConfig] | None:
         return None
     task, kind = task_of(unit.data), unit.model.split("_", maxsplit=1)[0]
     name, config = KINDS[kind]
-    shipped = SHIPPED[name]
+    shipped = CHECKPOINT_SPECS[name]
     if config is FiLMConfig and unit.n == "all":
-        shipped = SHIPPED.get(OF_SET.get(unit.data, ""), shipped)
+        shipped = CHECKPOINT_SPECS.get(OF_SET.get(unit.data, ""), shipped)
     from_behind = unit.model in ("film", "attention", "ensemble", "paper_push_frame")
     network = config(
         action_channels=task.action_channels,
@@ -328,7 +328,7 @@ def _shipped(
 
     Settings, interactions seen, and all scales of their data must be the same.
     """
-    for name, shipped in SHIPPED.items():
+    for name, shipped in CHECKPOINT_SPECS.items():
         if (shipped.network, shipped.training) != (network, config):
             continue
         try:

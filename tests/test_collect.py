@@ -25,7 +25,7 @@ from affordlib.interactions.collect import collect as collect_set
 from affordlib.interactions.recipes import Recipe
 from affordlib.interactions.schema import collect_chunk, schema_for
 from affordlib.interactions.store import dataset_sha256, open_interactions, stored_sha256
-from experiments import make_data
+from experiments import shipped
 
 SMALL = Recipe(n_interactions=6, seed=11)
 LONGER = Recipe(n_interactions=12, seed=5)
@@ -364,9 +364,9 @@ def test_a_chunk_that_kills_its_workers_is_named(both, tmp_path):
 
 @pytest.mark.slow
 def test_make_data_collects_with_a_scheduler(both, undisturbed, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(make_data, "RECIPES", {"push": SMALL})
+    monkeypatch.setattr(shipped, "RECIPES", {"push": SMALL})
     address = ["--scheduler", both.scheduler.address]
-    assert make_data.main(["--only", "push", "--to", str(tmp_path), *address]) == 1
+    assert shipped.main(["data", "--only", "push", "--to", str(tmp_path), *address]) == 1
     assert "not the same: 6 interactions, formerly 500" in capsys.readouterr().out
     assert (tmp_path / "push.zarr.zip").read_bytes() == undisturbed(SMALL).read_bytes()
 
@@ -389,32 +389,32 @@ def test_workers_killed_at_any_moment_are_no_loss(both, undisturbed, tmp_path, s
 
 def test_make_data_says_how_far_apart_two_sets_are(undisturbed):
     old = open_interactions(undisturbed(SMALL))
-    assert make_data.compare(old, old) == (True, "the same, bit for bit")
+    assert shipped.compare(old, old) == (True, "the same, bit for bit")
     for gap_m, agree in ((0.00004, True), (0.00006, False)):
         new = old.copy(deep=True)
         new["rest_effect"][:, 1] += gap_m
-        same, sentence = make_data.compare(old, new)
+        same, sentence = shipped.compare(old, new)
         assert same is agree
         assert f"{gap_m * 1000:.3f} mm in the median (tolerance 0.05 mm)" in sentence
     one = old.copy(deep=True)
     one["rest_effect"][0, 0] += 0.05  # one object that tipped over the other way
-    assert make_data.compare(old, one)[0]
-    assert not make_data.compare(old, old.isel(interaction=slice(3)))[0]
+    assert shipped.compare(old, one)[0]
+    assert not shipped.compare(old, old.isel(interaction=slice(3)))[0]
 
 
 @pytest.mark.slow
 def test_make_data_ends_with_status_1_when_the_sets_differ(
     undisturbed, tmp_path, monkeypatch, capsys
 ):
-    monkeypatch.setattr(make_data, "RECIPES", {"push": SMALL, "turned": LONGER})
-    arguments = ["--only", "push", "--to", str(tmp_path), "--workers", "1"]
+    monkeypatch.setattr(shipped, "RECIPES", {"push": SMALL, "turned": LONGER})
+    arguments = ["data", "--only", "push", "--to", str(tmp_path), "--workers", "1"]
     shutil.copy(undisturbed(SMALL), tmp_path / "former.zarr.zip")
     former = {"push": tmp_path / "former.zarr.zip"}
     monkeypatch.setattr(
-        make_data, "open_interactions", lambda name: open_interactions(former.get(name, name))
+        shipped, "open_interactions", lambda name: open_interactions(former.get(name, name))
     )
-    assert make_data.main(arguments) == 0
+    assert shipped.main(arguments) == 0
     assert "push: the same, bit for bit" in capsys.readouterr().out
     former["push"] = undisturbed(LONGER)
-    assert make_data.main(arguments) == 1
+    assert shipped.main(arguments) == 1
     assert "not the same: 6 interactions, formerly 12" in capsys.readouterr().out

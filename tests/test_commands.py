@@ -53,14 +53,14 @@ def main_of(name):
         ("experiments.lever_up", ["--protocols", "nope"], "--protocols: 'nope' is unknown"),
         ("experiments.lever_up", ["--no-edges", "2"], "--no-edges: must be .* from 3 to 8"),
         ("experiments.lever_up", ["--epochs", "-5"], "--epochs: must be a whole number from 1"),
-        ("experiments.make_data", ["--only"], "--only: expected at least one argument"),
-        ("experiments.make_data", ["--only", "nope"], "--only: invalid choice: 'nope'"),
+        ("experiments.shipped", ["data", "--only"], "--only: expected at least one argument"),
+        ("experiments.shipped", ["data", "--only", "nope"], "--only: invalid choice: 'nope'"),
         (
-            "experiments.make_data",
-            ["--workers", "1" * 5000],
+            "experiments.shipped",
+            ["data", "--workers", "1" * 5000],
             "--workers: must be .*'1{5,40}$",
         ),
-        ("experiments.make_reachability", ["nope"], "unrecognized arguments: nope"),
+        ("experiments.shipped", ["reachability", "nope"], "unrecognized arguments: nope"),
         ("experiments.seeds", ["-1"], "seeds: must be a whole number from 0"),
         ("experiments.seeds", ["0", "--workers", "0"], "--workers: must be a whole number from 1"),
         ("workbook", ["--seed", "-1"], "--seed: must be a whole number from 0"),
@@ -80,7 +80,7 @@ def test_unknown_names_and_impossible_numbers_are_refused(capsys, name, argument
         ("experiments.tables", ["--parts", "{}"]),
         ("experiments.lever_tables", ["--parts", "{}"]),
         ("experiments.lever_up", ["--models", "persistence", "--folds", "1", "--out", "{}"]),
-        ("experiments.make_data", ["--only", "grasp", "--workers", "1", "--to", "{}"]),
+        ("experiments.shipped", ["data", "--only", "grasp", "--workers", "1", "--to", "{}"]),
     ],
 )
 def test_a_file_in_place_of_a_folder_is_named(tmp_path, capsys, name, arguments):

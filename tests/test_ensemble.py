@@ -85,9 +85,11 @@ def test_planners_work_with_it(members, plan, cuboid_image):
 def test_a_unit_trains_each_member_once_and_resumes(tmp_path, monkeypatch):
     monkeypatch.setattr(units, "FEW_STEPS", 4)
     monkeypatch.setattr(units, "MEMBERS", 2)
-    short = replace(units.SHIPPED["push_film"].training, validate_every=2, batch_size=8, ema=0.0)
-    shipped = replace(units.SHIPPED["push_film"], training=short)
-    monkeypatch.setattr(units, "SHIPPED", units.SHIPPED | {"push_film": shipped})
+    short = replace(
+        units.CHECKPOINT_SPECS["push_film"].training, validate_every=2, batch_size=8, ema=0.0
+    )
+    shipped = replace(units.CHECKPOINT_SPECS["push_film"], training=short)
+    monkeypatch.setattr(units, "CHECKPOINT_SPECS", units.CHECKPOINT_SPECS | {"push_film": shipped})
     unit, real, seen = Unit("ensemble", "grasp"), units.train_model, []
 
     def counted(data, split, config, *others):

@@ -24,7 +24,7 @@ from affordlib.paths import repo_root
 from experiments import lever_tables, lever_up
 from experiments.lever_tuning import SETTINGS, TRAINED, changed
 from experiments.lever_up import LeverUnit, guess, run_unit, split_of
-from experiments.make_checkpoints import shipped_lever_model
+from experiments.shipped import shipped_lever_model
 
 
 def test_baselines_are_right_about_what_they_assume():

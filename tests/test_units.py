@@ -92,9 +92,11 @@ def test_killed_between_parts_only_the_missing_ones_run(tmp_path, monkeypatch):
 
 def test_a_training_that_was_killed_goes_on_to_the_same_part(tmp_path, monkeypatch):
     monkeypatch.setattr(units, "FEW_STEPS", 6)
-    short = replace(units.SHIPPED["push_film"].training, validate_every=2, batch_size=8, ema=0.0)
-    shipped = replace(units.SHIPPED["push_film"], training=short)
-    monkeypatch.setattr(units, "SHIPPED", units.SHIPPED | {"push_film": shipped})
+    short = replace(
+        units.CHECKPOINT_SPECS["push_film"].training, validate_every=2, batch_size=8, ema=0.0
+    )
+    shipped = replace(units.CHECKPOINT_SPECS["push_film"], training=short)
+    monkeypatch.setattr(units, "CHECKPOINT_SPECS", units.CHECKPOINT_SPECS | {"push_film": shipped})
     unit, real, seen = Unit("film", "grasp"), torch.nn.utils.clip_grad_norm_, []
 
     def dies(*arguments):
@@ -134,11 +136,13 @@ def test_stale_parts_are_refused_in_the_table_and_made_again(tmp_path, name):
 def test_the_hash_is_of_what_decides_the_numbers(monkeypatch):
     unit = Unit("film", "push")
     first = configuration_sha256(unit)
-    shipped = units.SHIPPED["push_film"]
+    shipped = units.CHECKPOINT_SPECS["push_film"]
 
     def hash_with(**change):
         changed = replace(shipped, training=replace(shipped.training, **change))
-        monkeypatch.setattr(units, "SHIPPED", units.SHIPPED | {"push_film": changed})
+        monkeypatch.setattr(
+            units, "CHECKPOINT_SPECS", units.CHECKPOINT_SPECS | {"push_film": changed}
+        )
         return configuration_sha256(unit)
 
     assert hash_with(learning_rate=2e-3) != first
@@ -206,7 +210,7 @@ def test_sets_ten_times_as_large_are_asked_the_same():
     ],
 )
 def test_shipped_networks_are_those_of_the_tables(data, name):
-    shipped = units.SHIPPED[name]
+    shipped = units.CHECKPOINT_SPECS[name]
     assert units.learner(Unit("film", data)) == (shipped.network, shipped.training)
     assert (units.task_of(data).symmetries or ()) == shipped.symmetries
 

@@ -111,8 +111,8 @@ def test_ctrl_c_ends_collecting_with_one_error(tmp_path):
 
 
 def test_make_data_is_ended_with_one_line(tmp_path):
-    arguments = ["--only", "push", "--to", tmp_path, "--workers", "2"]
-    process = start("-m", "experiments.make_data", *arguments)
+    arguments = ["data", "--only", "push", "--to", tmp_path, "--workers", "2"]
+    process = start("-m", "experiments.shipped", *arguments)
     family = []
 
     def at_work():
@@ -125,7 +125,7 @@ def test_make_data_is_ended_with_one_line(tmp_path):
     _, err = process.communicate(timeout=60)
     assert process.returncode == 128 + signal.SIGTERM
     assert err.splitlines()[-1] == (
-        "make_data: interrupted; what is finished is kept, the same command goes on"
+        "shipped: interrupted; what is finished is kept, the same command goes on"
     )
     assert "Traceback" not in err
     assert "distributed" not in err

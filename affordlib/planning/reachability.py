@@ -20,7 +20,7 @@ from affordlib.primitives import PRIMITIVES, primitive_named
 _HIDDEN, _STEPS, _RATE = 64, 1500, 1e-2
 SHIPPED = "data/checkpoints/reachability.safetensors"
 _DESCRIPTION = {"format": "affordlib reachability 1", "primitives": list(PRIMITIVES)}
-_REMEDY = "learn it again with python -m experiments.make_reachability"
+_REMEDY = "learn it again with python -m experiments.shipped reachability"
 
 
 class Reachability(nn.Module):
