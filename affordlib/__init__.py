@@ -23,7 +23,7 @@ planning.effect_map planning.gradient planning.grasp_rotate planning.problem
 planning.reachability planning.skills interactions.batches interactions.collect
 interactions.folder interactions.lever interactions.recipes interactions.store models.calibration
 models.checkpoint models.ensemble models.lever models.protocol models.training
-evaluation.effect_prediction show.animation show.conditioning_explorer show.executors
+evaluation.metrics show.animation show.conditioning_explorer show.executors
 show.goal_picker show.phase_slider show.plots
 """
 _CONF = BeartypeConf(

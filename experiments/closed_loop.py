@@ -24,7 +24,7 @@ import numpy as np
 from tqdm.auto import tqdm
 
 from affordlib.commands import command, count_type, names_type, seed_type
-from affordlib.evaluation.answers import rounded
+from affordlib.evaluation.predictions import rounded
 from affordlib.models.checkpoint import checkpoint_sha256, weights_bytes
 from affordlib.paths import repo_root
 from affordlib.planning import (

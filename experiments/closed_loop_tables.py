@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from affordlib.evaluation.effect_prediction import error_row
+from affordlib.evaluation.metrics import error_row
 
 WITHIN_M, WITHIN_HEIGHT_M, WITHIN_TURN_RAD = 0.005, 0.005, math.radians(3)
 

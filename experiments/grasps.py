@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from affordlib.evaluation.answers import final_error
+from affordlib.evaluation.predictions import final_error
 from affordlib.primitives import Grasp
 from experiments.pooled import Part, by_model
 from experiments.units import Unit

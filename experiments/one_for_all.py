@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from affordlib.evaluation.answers import final_error, network_answers, summary, yaw_error
+from affordlib.evaluation.predictions import final_error, network_predictions, summary, yaw_error
 from affordlib.interactions import Normaliser, TrainingArrays, split_interactions
 from affordlib.interactions.batches import Symmetry, observe_action, symmetric_copies
 from affordlib.models.checkpoint import build
@@ -190,7 +190,7 @@ def one_for_all(parts: str | Path = PARTS, halfway: str | Path = HALFWAY) -> Row
             run_unit(unit, folder)
             part: Answers = read_part(unit, folder) or {}
             rows = split_interactions(data.sizes["interaction"], 0, fold).test
-            mine = of_primitive(network_answers(model, data, rows), name)
+            mine = of_primitive(network_predictions(model, data, rows), name)
             if mine["interaction"] != part["fold_test"]["interaction"]:
                 raise ValueError(f"part {unit.file} was tested on other interactions; delete it")
             told[name][ONE_FOR_ALL].append(mine)
@@ -198,7 +198,7 @@ def one_for_all(parts: str | Path = PARTS, halfway: str | Path = HALFWAY) -> Row
             if also := TASKS[name].also:
                 other = open_once(also)
                 every = np.arange(other.sizes["interaction"])
-                mine = summary(of_primitive(network_answers(model, other, every), name))
+                mine = summary(of_primitive(network_predictions(model, other, every), name))
                 fixed.append((mine, part["fixed_test"]))
     rows = []
     for name, answers in told.items():

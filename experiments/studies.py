@@ -35,8 +35,8 @@ import numpy as np
 import torch
 
 from affordlib.commands import command
-from affordlib.evaluation.answers import rounded
-from affordlib.evaluation.effect_prediction import refuse_seen
+from affordlib.evaluation.metrics import refuse_seen
+from affordlib.evaluation.predictions import rounded
 from affordlib.interactions import TrainingArrays, open_interactions, split_interactions
 from affordlib.interactions.batches import believable, observe
 from affordlib.interactions.store import stored_sha256

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from affordlib.commands import command
-from affordlib.evaluation.answers import calibration, final_error, yaw_error
+from affordlib.evaluation.predictions import calibration, final_error, yaw_error
 from affordlib.results import write_results
 from experiments import reported
 from experiments.grasps import grasp_rows, roc_rows, threshold_rows

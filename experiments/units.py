@@ -24,14 +24,14 @@ import numpy as np
 import xarray as xr
 
 from affordlib.commands import command, count_type, names_type, whole_type
-from affordlib.evaluation.answers import (
-    baseline_answers,
-    logistic_answers,
-    network_answers,
+from affordlib.evaluation.baselines import BASELINES
+from affordlib.evaluation.predictions import (
+    baseline_predictions,
+    logistic_predictions,
+    network_predictions,
     stored,
     summary,
 )
-from affordlib.evaluation.baselines import BASELINES
 from affordlib.interactions import Normaliser, Split, TrainingArrays, split_interactions
 from affordlib.interactions.batches import Symmetry, believable, symmetric_copies
 from affordlib.interactions.store import stored_sha256
@@ -251,7 +251,7 @@ def run_unit(unit: Unit, folder: Path, progress: bool = False) -> bool:
             model, part["training"] = _fit_ensemble(fit, config, halfway, validation)
         else:
             model, part["training"] = fit(config, halfway)
-        told = {name: network_answers(model, *test) for name, test in tests.items()}
+        told = {name: network_predictions(model, *test) for name, test in tests.items()}
         if task.also:
             part["inverse"] = inverse_record(model, data, split.test)
     part["fold_test"] = told["fold"]
@@ -268,10 +268,10 @@ def _guess(
     unit: Unit, data: xr.Dataset, train_on: np.ndarray, other: xr.Dataset, asked: np.ndarray
 ) -> dict[str, Any]:
     if unit.model == "logistic":
-        return logistic_answers(data, train_on, other, asked)
+        return logistic_predictions(data, train_on, other, asked)
     task = task_of(unit.data)
     channels = task.action_channels, task.all_effects
-    return baseline_answers(BASELINES[unit.model], channels, data, train_on, other, asked)
+    return baseline_predictions(BASELINES[unit.model], channels, data, train_on, other, asked)
 
 
 def _fit(

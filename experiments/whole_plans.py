@@ -18,7 +18,7 @@ import numpy as np
 from tqdm.auto import tqdm
 
 from affordlib.commands import command, count_type
-from affordlib.evaluation.effect_prediction import error_row
+from affordlib.evaluation.metrics import error_row
 from affordlib.models.checkpoint import checkpoint_sha256
 from affordlib.planning import Skills, execute_plan, plan_astar, plan_continuous
 from affordlib.planning.skills import CHECKPOINTS

@@ -7,7 +7,8 @@ from urllib.parse import urlparse
 
 import numpy as np
 import pytest
-from lab_pages import (
+
+from tests.lab_pages import (
     PICTURES,
     WIDGET,
     Table,

@@ -5,7 +5,9 @@ from urllib.parse import urlparse
 import numpy as np
 import pytest
 import yaml
-from lab_pages import (
+
+from affordlib.paths import repo_root
+from tests.lab_pages import (
     WIDGET,
     Table,
     ask,
@@ -19,8 +21,6 @@ from lab_pages import (
     serve,
     wait_for_words,
 )
-
-from affordlib.paths import repo_root
 
 pytestmark = in_a_browser
 

@@ -4,7 +4,8 @@ import time
 
 import nbformat
 import pytest
-from lab_pages import ask, in_a_browser, opened, picture, serve
+
+from tests.lab_pages import ask, in_a_browser, opened, picture, serve
 
 pytestmark = in_a_browser
 

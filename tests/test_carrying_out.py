@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from problems import problem_of
 
 from affordlib.evaluation.goals import frozen_tasks
 from affordlib.planning import execute_plan, plan_astar, plan_continuous, run_closed_loop
@@ -14,6 +13,7 @@ from affordlib.types import Goal, Plan, Step, UnreachableError
 from affordlib.world import Cuboid, WorldConfig
 from experiments.closed_loop import draw_trial
 from experiments.planning import attempt
+from tests.problems import problem_of
 
 BOX = Cuboid(0.06, 0.05, 0.05)
 

@@ -7,7 +7,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from problems import problem_of
 
 from affordlib.planning import (
     ClosedLoopConfig,
@@ -34,6 +33,7 @@ from affordlib.world import (
     WorldConfig,
 )
 from experiments.closed_loop import Trial, _stays_feasible
+from tests.problems import problem_of
 
 
 class FollowsTheHand:

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from problems import problem_of
 
 from affordlib.interactions import TrainingArrays
 from affordlib.models import EffectModel, Ensemble, load_checkpoint, observe_actions
@@ -14,6 +13,7 @@ from affordlib.primitives import Push, wrap_angle
 from affordlib.types import Goal
 from experiments import units
 from experiments.units import Unit, configuration_sha256, run_unit
+from tests.problems import problem_of
 
 NAMES = ("push_film", "push_film_x10")
 

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from problems import problem_of
 
 from affordlib.planning import (
     EffectMap,
@@ -21,6 +20,7 @@ from affordlib.planning.grasp_rotate import GRIP_YAWS
 from affordlib.primitives import Drag, Grasp, Push, Rotate, wrap_angle
 from affordlib.types import Goal
 from affordlib.world import Cuboid, LyingCylinder, UprightCylinder
+from tests.problems import problem_of
 
 BOX, TUBE, LOG = Cuboid(0.07, 0.05, 0.05), UprightCylinder(0.05, 0.07), LyingCylinder(0.08, 0.05)
 

@@ -9,7 +9,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from PIL import Image
-from problems import problem_of
 
 from affordlib.interactions import open_interactions
 from affordlib.plan_files import load_plan
@@ -19,6 +18,7 @@ from affordlib.show.executors import closed_loop, open_loop
 from affordlib.show.plots import plot_plan
 from affordlib.show.table_view import TableView
 from affordlib.world import BASE_X_M, REACH_M, Cuboid
+from tests.problems import problem_of
 
 
 @pytest.fixture

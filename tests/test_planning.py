@@ -6,7 +6,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from problems import problem_of
 
 from affordlib.evaluation.goals import (
     ROLLABLE,
@@ -29,6 +28,7 @@ from affordlib.primitives import Drag, Push
 from affordlib.types import Goal, Observations, Prediction
 from affordlib.world import Cuboid
 from experiments.planning import measure, outcome_record, planning_rows
+from tests.problems import problem_of
 
 IMAGE = np.zeros((2, 48, 48), dtype=np.float32)
 REACH_M = 0.09

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from dask.distributed import Client
 from PIL import Image
-from test_workbook import Book
 
 from affordlib.paths import repo_root
 from affordlib.profiles import WorkbookError
 from affordlib.results import read_results, write_results
 from experiments.seeds import gather, main, over_seeds, run_seeds, seeds_picture
+from tests.test_workbook import Book
 
 
 def rows(a, b):

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from PIL import Image
-from problems import problem_of
 
 from affordlib.planning import execute_plan, plan_astar
 from affordlib.primitives import Push
@@ -18,6 +17,7 @@ from affordlib.show import (
 )
 from affordlib.types import Goal
 from affordlib.world import Cuboid
+from tests.problems import problem_of
 
 
 def test_a_film_shows_the_robot_move(world, tmp_path):

@@ -68,7 +68,7 @@ def test_all_units_have_parts_of_their_own():
 
 
 def test_killed_between_parts_only_the_missing_ones_run(tmp_path, monkeypatch):
-    ran, real = [], units.baseline_answers
+    ran, real = [], units.baseline_predictions
 
     def counted(*arguments):
         if len(ran) == 2:
@@ -76,12 +76,12 @@ def test_killed_between_parts_only_the_missing_ones_run(tmp_path, monkeypatch):
         ran.append(1)
         return real(*arguments)
 
-    monkeypatch.setattr(units, "baseline_answers", counted)
+    monkeypatch.setattr(units, "baseline_predictions", counted)
     with pytest.raises(KeyboardInterrupt):
         run_units(FEW, tmp_path, progress=False)
     kept = parts_in(tmp_path)
     assert sorted(kept) == [unit.file for unit in FEW[:2]]
-    monkeypatch.setattr(units, "baseline_answers", real)
+    monkeypatch.setattr(units, "baseline_predictions", real)
     assert run_units(FEW, tmp_path, progress=False) == 1
     assert run_units(FEW, tmp_path, progress=False) == 0
     assert parts_in(tmp_path).items() >= kept.items()

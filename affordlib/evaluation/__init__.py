@@ -1,6 +1,6 @@
 """The paper's tables as functions, and the baselines beside them."""
 
-from affordlib.evaluation.effect_prediction import (
+from affordlib.evaluation.metrics import (
     error_row,
     mean_length_errors_m,
     refuse_seen,

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import torch
 
-from affordlib.evaluation.answers import network_answers
+from affordlib.evaluation.predictions import network_predictions
 from affordlib.interactions import TrainingArrays, open_interactions, split_interactions
 from affordlib.interactions.batches import observe_action
 from affordlib.models import coverage, load_checkpoint
@@ -76,7 +76,7 @@ def _foreseen_ends() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Truth, mean and σ (2, 1000) [m] of the ends of `push_test`, by the shipped network."""
     data = open_interactions("push_test")
     model, _ = load_checkpoint("push_film")
-    answers = network_answers(model, data, np.arange(data.sizes["interaction"]))
+    answers = network_predictions(model, data, np.arange(data.sizes["interaction"]))
     truth, mean, std = (
         torch.tensor([answers[k][c] for c in "xy"]) for k in ("truth", "mean", "std")
     )

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from affordlib.evaluation.answers import network_answers
+from affordlib.evaluation.predictions import network_predictions
 from affordlib.interactions import open_interactions
 from affordlib.interactions.batches import observe_action
 from affordlib.models import load_checkpoint
@@ -32,7 +32,7 @@ def factor_for_half():
     """
     data = open_interactions("push_test")
     model, _ = load_checkpoint("push_film")
-    told = network_answers(model, data, np.arange(data.sizes["interaction"]))
+    told = network_predictions(model, data, np.arange(data.sizes["interaction"]))
     mean, truth, std = (np.array([told[k][c] for c in "xy"]) for k in ("mean", "truth", "std"))
     return float(np.median(np.abs(mean - truth) / std) / 0.6745)
 

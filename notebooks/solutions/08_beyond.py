@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from affordlib.evaluation.answers import final_error, network_answers
+from affordlib.evaluation.predictions import final_error, network_predictions
 from affordlib.interactions import open_interactions
 from affordlib.models import load_checkpoint
 from exercises import check
@@ -22,7 +22,7 @@ def surest_half_mm():
     """Half of the pushes, chosen by σ alone, are foreseen several times as well as all of them."""
     pushes = open_interactions("push_test")
     model, _ = load_checkpoint("push_film_x10")
-    told = network_answers(model, pushes, np.arange(pushes.sizes["interaction"]))
+    told = network_predictions(model, pushes, np.arange(pushes.sizes["interaction"]))
     sigma = np.hypot(told["std"]["x"], told["std"]["y"])
     return 1000 * float(final_error(told)[sigma <= np.median(sigma)].mean())
 

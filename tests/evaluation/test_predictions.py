@@ -6,8 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from affordlib.evaluation.answers import calibration, final_error, network_answers, yaw_error
 from affordlib.evaluation.baselines import constant, gaussian_process, logistic, nearest
+from affordlib.evaluation.predictions import (
+    calibration,
+    final_error,
+    network_predictions,
+    yaw_error,
+)
 from affordlib.interactions import (
     TrainingArrays,
 )
@@ -28,7 +33,7 @@ from experiments.units import Unit
 
 def test_answers_are_those_of_the_model_itself(trained, held_out_pushes):
     some = np.arange(5)
-    told = network_answers(trained, held_out_pushes, some)
+    told = network_predictions(trained, held_out_pushes, some)
     from affordlib.models.training import final_errors_m
 
     arrays = TrainingArrays.from_dataset(held_out_pushes, some)

@@ -35,7 +35,7 @@ def steps_of(arrays: TrainingArrays) -> torch.Tensor:
 
 
 @torch.no_grad()
-def network_answers(
+def network_predictions(
     model: EffectNetwork | Ensemble, data: xr.Dataset, interactions: np.ndarray
 ) -> dict[str, Any]:
     """What a network foresees of interactions."""
@@ -50,7 +50,7 @@ def network_answers(
     return _answers(data, kept, arrays, at, told.effect_mean, told.effect_std)
 
 
-def baseline_answers(
+def baseline_predictions(
     baseline: Callable[..., Forecast],
     channels: tuple[tuple[str, ...], tuple[str, ...]],
     data: xr.Dataset,
@@ -68,7 +68,7 @@ def baseline_answers(
     return _answers(other, kept, arrays, at, mean, std)
 
 
-def logistic_answers(
+def logistic_predictions(
     data: xr.Dataset, train_on: np.ndarray, other: xr.Dataset, asked: np.ndarray
 ) -> dict[str, Any]:
     """The probability of a grasp's success, from the object's size alone, and the true heights."""
