@@ -118,9 +118,7 @@ format: $(STAMP) ## Format the code, notebooks included
 	@$(PY) -m ruff format
 
 bench: $(STAMP) ## Run the benchmarks (KEEP=1 puts the times into data/results/speed.json)
-	@for name in collect lever_up models neural_processes planning primitives; do \
-	   echo "== $$name"; $(PY) -m experiments.speed.$$name $(if $(KEEP),--keep) || exit 1; \
-	 done
+	@$(PY) -m experiments.speed $(if $(KEEP),--keep)
 
 data: $(STAMP) ## Collect the shipped data sets again and compare
 	@$(PY) -m experiments.shipped data

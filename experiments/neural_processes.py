@@ -1,0 +1,175 @@
+"""Our networks beside the `neuralprocesses` package, on its own ground: curves of one dimension.
+
+Curves are drawn from a Gaussian process (squared exponential, length 0.25 of the range 2, noise
+0.05), observed at 1 to 10 points and queried at 50. Each pair has about as many parameters, sees
+the same batches for the same number of steps with the same optimiser, and is judged on the same
+curves: log-likelihood per target (mean ± standard error), and targets a second of one core. Beside
+them stands the Gaussian process itself, the best that any network can do.
+
+The package is no dependency; without it this says so and ends:
+    .venv/bin/python -m pip install neuralprocesses==0.2.7
+    .venv/bin/python -m experiments.neural_processes --steps 2000
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.metadata
+import importlib.util
+import sys
+import time
+from collections.abc import Callable, Sequence
+
+import pandas as pd
+import torch
+from scipy.stats import sem
+
+from affordlib.commands import command, count_type
+from affordlib.interactions import Normaliser
+from affordlib.models import CNPConfig, build
+from affordlib.models.network import NetworkConfig, gaussian_nll
+from affordlib.results import write_results
+from affordlib.types import Observations
+from experiments.attention import AttentionConfig
+
+BATCH, MAX_OBSERVED, TARGETS, JUDGED = 16, 10, 50, 1600
+LENGTH, NOISE, RANGE = 0.25, 0.05, 2.0
+CHANNELS = {"action_channels": ("z",), "effect_channels": ("z",), "sigma_floor": 0.01}
+NO_SCALES = Normaliser((1.0,), (1.0,), (0.0, 0.0), (1.0, 1.0))
+
+Likelihood = Callable[..., torch.Tensor]
+"""Log-likelihood (n, TARGETS) of targets (t, y) given observed (t, y): four arguments (n, ·)."""
+
+
+def covariances(t: torch.Tensor) -> torch.Tensor:
+    """Of the values at phases t (n, m), with noise: (n, m, m)."""
+    distance = (t[:, :, None] - t[:, None]) * RANGE / LENGTH
+    return (-distance.square() / 2).exp() + NOISE**2 * torch.eye(t.shape[1])
+
+
+def curves(n: int, generator: torch.Generator) -> tuple[torch.Tensor, ...]:
+    """Phases and values: context (n, k) for some k up to MAX_OBSERVED, and target (n, TARGETS)."""
+    t = torch.rand(n, MAX_OBSERVED + TARGETS, generator=generator, dtype=torch.float64)
+    covariance = covariances(t)
+    white = torch.randn(n, t.shape[1], 1, generator=generator, dtype=torch.float64)
+    y = (torch.linalg.cholesky(covariance) @ white).squeeze(2)
+    t, y = t.float(), y.float()
+    count = int(torch.randint(1, MAX_OBSERVED + 1, (1,), generator=generator))
+    return t[:, :count], y[:, :count], t[:, MAX_OBSERVED:], y[:, MAX_OBSERVED:]
+
+
+def process_likelihood(t_seen, y_seen, t, y):
+    """Under the Gaussian process itself."""
+    k = t_seen.shape[1]
+    covariance = covariances(torch.cat([t_seen, t], dim=1).double())
+    across = covariance[:, :k, k:]
+    weights = torch.linalg.solve(covariance[:, :k, :k], across)
+    mean = (weights * y_seen[..., None]).sum(dim=1)
+    variance = covariance[:, k:, k:].diagonal(dim1=1, dim2=2) - (weights * across).sum(dim=1)
+    return -gaussian_nll(y, mean, variance.sqrt())
+
+
+def ours(config: NetworkConfig) -> tuple[torch.nn.Module, Likelihood]:
+    """Our network as a regression: y is the effect at phase t; no action, an empty image."""
+    model = build(config, NO_SCALES)
+
+    def likelihood(t_seen, y_seen, t, y):
+        observed = Observations.of(model, effect=(t_seen, y_seen[..., None]))
+        _, _, mean, std = model.outputs(model.features(torch.zeros(1, 2, 48, 48)), observed, t)
+        return -gaussian_nll(y, mean[..., 0], std[..., 0]).reshape(len(t), -1)
+
+    return model, likelihood
+
+
+def theirs(attention: bool, **sizes: int) -> tuple[torch.nn.Module, Likelihood]:
+    """The package's network with a Gaussian a target."""
+    import neuralprocesses.torch as nps
+
+    make = nps.construct_agnp if attention else nps.construct_gnp
+    model = make(dim_x=1, dim_y=1, likelihood="het", **sizes)
+
+    def likelihood(t_seen, y_seen, t, y):
+        x_seen, x = (2 * v[:, None] - 1 for v in (t_seen, t))
+        predicted = model(x_seen, y_seen[:, None], x)
+        return -gaussian_nll(y, predicted.mean[:, 0], predicted.var[:, 0].sqrt())
+
+    likelihood(*curves(2, torch.Generator().manual_seed(0)))  # its layers learn their sizes
+    return model, likelihood
+
+
+def trained(model: torch.nn.Module, likelihood: Likelihood, steps: int, rate: float) -> float:
+    """Train; returns targets a second of one core."""
+    optimiser = torch.optim.AdamW(model.parameters(), rate, weight_decay=0.0, fused=True)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
+    generator = torch.Generator().manual_seed(1)
+    busy_s = 0.0
+    for _ in range(steps):
+        batch = curves(BATCH, generator)
+        began = time.process_time()
+        optimiser.zero_grad()
+        (-likelihood(*batch).mean()).backward()
+        torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+        optimiser.step()
+        busy_s += time.process_time() - began
+        schedule.step()
+    return steps * BATCH * TARGETS / busy_s
+
+
+@torch.no_grad()
+def judged(likelihood: Likelihood) -> torch.Tensor:
+    """The log-likelihood per target of each judged curve (JUDGED,)."""
+    generator = torch.Generator().manual_seed(2)
+    each = [likelihood(*curves(BATCH, generator)).mean(dim=1) for _ in range(JUDGED // BATCH)]
+    return torch.cat(each).double().numpy()
+
+
+def _mean_sem(column: str, values) -> dict[str, float]:
+    return {f"{column}_mean": float(values.mean()), f"{column}_sem": float(sem(values))}
+
+
+@command(OSError, ValueError)
+def main(argv: Sequence[str] | None = None) -> int:
+    """Train both kinds of networks side by side; write `neural_processes.json`."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--steps", type=count_type, default=3000)
+    parser.add_argument("--rate", type=float, default=5e-4)
+    parser.add_argument("--out", default="data/results")
+    options = parser.parse_args(argv)
+    if importlib.util.find_spec("neuralprocesses") is None:
+        print("neuralprocesses is not installed; see the head of this file")
+        return 1
+    torch.set_num_threads(1)
+    makers = {
+        ("CNP", "ours"): lambda: ours(CNPConfig(**CHANNELS)),
+        ("CNP", "theirs"): lambda: theirs(False, dim_embedding=256, width=512),
+        ("attention", "ours"): lambda: ours(AttentionConfig(**CHANNELS, frame="table")),
+        ("attention", "theirs"): lambda: theirs(True, dim_embedding=128, width=256),
+    }
+    found, rates, rows, pairs = {}, {}, [], []
+    for (network, whose), make in makers.items():
+        torch.manual_seed(0)
+        model, likelihood = make()
+        size = sum(p.numel() for p in model.parameters())
+        rates[network, whose] = trained(model, likelihood, options.steps, options.rate)
+        found[network, whose] = judged(likelihood)
+        row = {"network": network, "whose": whose, "parameters": size, "n": JUDGED}
+        row |= _mean_sem("log_likelihood", found[network, whose])
+        rows.append(row | {"targets_per_second": rates[network, whose]})
+    row = {"network": "the process itself", "whose": "known", "n": JUDGED}
+    rows.append(row | _mean_sem("log_likelihood", judged(process_likelihood)))
+    for network in ("CNP", "attention"):
+        ratio = rates[network, "ours"] / rates[network, "theirs"]
+        gain = found[network, "ours"] - found[network, "theirs"]
+        row = {"network": network, "n": JUDGED, "speed_ratio": ratio}
+        pairs.append(row | _mean_sem("log_likelihood_gain", gain))
+    for table in (rows, pairs):
+        print(pd.DataFrame(table).to_string(index=False))
+    parameters = {"steps": options.steps, "rate": options.rate, "batch": BATCH}
+    parameters["neuralprocesses"] = importlib.metadata.version("neuralprocesses")
+    tables = {"log_likelihood": rows, "difference": pairs}
+    print(write_results(options.out, "neural_processes", parameters, tables))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,391 @@
+"""How long things take: `make bench`, or `python -m experiments.speed --only planning --keep`.
+
+Each function measures one thing and returns the rows of a table; `--keep` writes them, with the
+load of this machine, to `data/results/speed.json`. What is compared runs in turn, so that a load
+that comes and goes meets both sides.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+from torch.utils.flop_counter import FlopCounterMode
+
+from affordlib.commands import command, names_type
+from affordlib.evaluation.goals import STANDING, uniform_tasks
+from affordlib.interactions import (
+    Normaliser,
+    TrainingArrays,
+    open_interactions,
+    split_interactions,
+)
+from affordlib.interactions.batches import sample_batch
+from affordlib.interactions.collect import collect
+from affordlib.interactions.lever import AHEAD, SEEN, draw_windows, lever_arrays
+from affordlib.interactions.recipes import RECIPES, Recipe
+from affordlib.models import (
+    CNPConfig,
+    FiLMConfig,
+    TrainingConfig,
+    build,
+    load_checkpoint,
+    observe_actions,
+    train,
+    train_literal,
+)
+from affordlib.models.lever import LEVER_MODELS, foresee
+from affordlib.models.network import EffectNetwork
+from affordlib.models.training import batch_loss, final_errors_m, literal_draw
+from affordlib.paths import repo_root
+from affordlib.planning import EffectMap, PlanningProblem, plan_astar, plan_continuous
+from affordlib.planning.astar import N_DIRECTIONS, STOP_PHASES
+from affordlib.planning.continuous import EARLIEST, KEPT, SPREAD_RAD
+from affordlib.primitives import PRIMITIVES, Push
+from affordlib.results import read_results, write_results
+from affordlib.types import Observations
+from affordlib.workers import dask_client
+from affordlib.world import Tabletop
+from experiments.cost import measure_cost
+from experiments.lstm_published import BATCH, EPOCHS, PublishedConfig, PublishedLSTM
+
+RESULTS = "data/results/speed.json"
+Rows = list[dict[str, Any]]
+
+
+def seconds(work: Callable[[], object], repeats: int = 1) -> float:
+    """Mean time of a call [s]: of the processor on one thread, so that other programs take none."""
+    clock = time.process_time if torch.get_num_threads() == 1 else time.perf_counter
+    began = clock()
+    for _ in range(repeats):
+        work()
+    return (clock() - began) / repeats
+
+
+def ratio_row(what: str, ratios: Sequence[float], goal: float) -> dict[str, Any]:
+    """The median and range of the ratios of slow to fast."""
+    row = {"what": what, "ratio_median": float(np.median(ratios))}
+    return row | {"ratio_min": min(ratios), "ratio_max": max(ratios), "goal": goal}
+
+
+def collecting(n: int = 200, rounds: int = 4) -> Rows:
+    """Interactions a second of `collect`, packing too, with one and with two processes."""
+
+    def collect_anew(recipe: Recipe, client: Any) -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            collect(recipe, Path(folder, "set.zarr.zip"), client, progress=False)
+
+    found: dict[int, list[float]] = {1: [], 2: []}
+    with dask_client(2) as two:
+        for client in (None, two):
+            collect_anew(Recipe(n_interactions=10, seed=3), client)  # the workers import everything
+        for _, (workers, client) in product(range(rounds), ((1, None), (2, two))):
+            began = time.perf_counter()
+            collect_anew(Recipe(n_interactions=n, seed=7), client)
+            found[workers].append(n / (time.perf_counter() - began))
+    rows = [{"workers": k, "per_second_median": np.median(v), "n": n} for k, v in found.items()]
+    ratios = [two / one for one, two in zip(*found.values(), strict=True)]
+    return [*rows, ratio_row("two workers : one", ratios, 1.8)]
+
+
+def primitives(n: int = 24) -> Rows:
+    """Interactions a second on one core, and the ratio of the whole to the physics alone."""
+    rows = []
+    for name in PRIMITIVES:
+        cost = measure_cost(RECIPES[name], n)
+        low, median, high = np.quantile(cost.ratios, [0.05, 0.5, 0.95])
+        row = {"primitive": name, "per_second": 1 / cost.whole_s.mean(), "n": n}
+        rows.append(row | {"ratio_p5": low, "ratio_median": median, "ratio_p95": high})
+    return rows
+
+
+def _pushes() -> tuple[TrainingArrays, TrainingArrays]:
+    data = open_interactions("push")
+    split = split_interactions(data.sizes["interaction"])
+    return tuple(TrainingArrays.from_dataset(data, s) for s in (split.train, split.validation))
+
+
+def training(
+    size: int = 64, n_targets: int = 32, rounds: int = 5, iterations: int = 20_000
+) -> Rows:
+    """Target points a second in batches, beside the paper's loop of one trajectory and one target.
+
+    Also the share of this machine's rate of matrix products that a batch reaches, and the time to
+    the error that the paper's loop has after so many iterations (a quarter of an hour).
+    """
+    pushes, validation = _pushes()
+    model = build(CNPConfig(), Normaliser.fit(pushes)).train()
+    generator = torch.Generator().manual_seed(0)
+
+    def batch() -> Any:
+        rows = torch.randint(len(pushes), (size,), generator=generator)
+        return sample_batch(pushes, rows, n_targets, 10, generator)
+
+    def stepper(draw: Callable[[], Any], fused: bool | None) -> Callable[[], None]:
+        optimiser = torch.optim.Adam(model.parameters(), 1e-4, fused=fused)
+
+        def step() -> None:
+            batch_loss(model, draw()).backward()
+            optimiser.step()
+            optimiser.zero_grad(set_to_none=True)
+
+        return step
+
+    literal = stepper(lambda: literal_draw(pushes, 10, generator), None)
+    batched = stepper(batch, True)
+    with FlopCounterMode(display=False) as counter:
+        batch_loss(model, batch()).backward()
+    a, b = torch.rand(2, 1024, 1024)
+    literal(), batched()
+    ratios, shares = [], []
+    for _ in range(5):
+        one, many = seconds(literal, 20), seconds(batched, 3)
+        products_per_s = 2 * 1024**3 / seconds(lambda: a @ b, 10)
+        ratios.append(size * n_targets / many * one)
+        shares.append(counter.get_total_flops() / many / products_per_s)
+    rows = [ratio_row("training, batched : literal", ratios, 150)]
+    rows.append(ratio_row("share of the matrix rate", shares, 0.5))
+
+    torch.manual_seed(0)
+    model = build(CNPConfig(), Normaliser.fit(pushes))
+    began = time.perf_counter()
+    train_literal(model, pushes, iterations)
+    literal_s = time.perf_counter() - began
+    error = float(final_errors_m(model.eval(), validation).mean())
+    torch.manual_seed(0)
+    model = build(CNPConfig(), Normaliser.fit(pushes))
+    # In small batches: while errors are large, many steps gain more than accurate ones.
+    small = TrainingConfig(steps=600, validate_every=10, patience=99, batch_size=8, n_targets=8)
+    history = train(model, pushes, validation, small, progress=False)
+    reached = next((h.seconds for h in history if h.validation_error <= error), np.inf)
+    what = "time to the literal loop's error, literal : batched"
+    return [*rows, ratio_row(what, [literal_s / reached], 20)]
+
+
+def prediction() -> Rows:
+    """One call for 180 pushes, beside one call each, which encodes the image each time.
+
+    First on one core, then on all, for a machine that has nothing else to do.
+    """
+    rows, (pushes, _) = [], _pushes()
+    for threads, config in product(sorted({1, os.cpu_count()}), (CNPConfig(), FiLMConfig())):
+        torch.set_num_threads(threads)
+        model = build(config, Normaliser.fit(pushes)).eval()
+        rows += _prediction_rows(model, pushes.image[:1], threads)
+    torch.set_num_threads(1)
+    return rows
+
+
+@torch.inference_mode()
+def _prediction_rows(model: EffectNetwork, image: torch.Tensor, threads: int) -> Rows:
+    pushes = [Push(float(a)) for a in np.linspace(0, 2 * np.pi, 180, endpoint=False)]
+    each, every = [observe_actions(model, [p]) for p in pushes], observe_actions(model, pushes)
+    end, phases, features = torch.ones(1, 1), torch.linspace(0, 1, 25)[None], model.encode(image)
+
+    def query(observed: Observations, t: torch.Tensor, encoded: torch.Tensor | None = None) -> None:
+        known = model.encode(image) if encoded is None else encoded
+        model.predict(known, observed, t.expand(len(observed.weight), -1))
+
+    def apart(some: list[Observations], t: torch.Tensor) -> None:
+        for observed in some:
+            query(observed, t)
+
+    # What is compared, and how many of the slow calls stand for all.
+    ends, few = partial(apart, each, end), each[::10]
+    encoded, together = partial(query, every, end, features), partial(query, every, phases)
+    name = type(model).__name__ + (f" on {threads} cores" if threads > 1 else "")
+    rows = []
+    for what, slow, fast, share, goal in (
+        ("final positions", ends, partial(query, every, end), 1, 100),
+        ("final positions, image encoded before", ends, encoded, 1, 100),
+        ("trajectories, a call a push", partial(apart, few, phases), together, 10, 30),
+        ("trajectories, a call a step", partial(apart, few, end), together, 250, 30),
+    ):
+        slow(), fast()
+        pairs = np.array([(share * seconds(slow), seconds(fast, 5)) for _ in range(5)])
+        slow_ms, fast_ms = 1000 * np.median(pairs, axis=0)
+        told = f"{name}, 180 {what}: {slow_ms:.0f} : {fast_ms:.1f} ms"
+        rows.append(ratio_row(told, (pairs[:, 0] / pairs[:, 1]).tolist(), goal))
+    return rows
+
+
+def lever_up(n: int = 256, epoch: int = 1440) -> Rows:
+    """Training and prediction of lever-ups, of conditional and recurrent networks.
+
+    An epoch is as many windows as there are training trajectories. Prediction: the five next steps
+    of a window, and all 25 from the image alone, of one object and of 64 at once.
+    """
+    data, rows = open_interactions("lever_up").isel(interaction=slice(0, n + 8)), []
+    for name, lever in [*LEVER_MODELS.items(), ("lstm_published", None)]:
+        view = lever.view if lever else "full"
+        arrays = lever_arrays(data, view=view).select(torch.arange(n))
+        scales, channels = Normaliser.fit(arrays), (arrays.action_channels, arrays.effect_channels)
+        if lever:
+            model, size = build(lever.network, scales).train(), 64
+        else:
+            model, size = PublishedLSTM(PublishedConfig(*channels), scales).train(), BATCH
+        optimiser = torch.optim.Adam(model.parameters(), 1e-4, fused=True)
+        generator = torch.Generator().manual_seed(0)
+
+        def step(model=model, arrays=arrays, size=size, optimiser=optimiser, g=generator) -> None:
+            rows = torch.randint(0, n, (size,), generator=g)
+            optimiser.zero_grad()
+            if isinstance(model, PublishedLSTM):
+                start = torch.randint(0, 11, (size,), generator=g)
+                model.next_step_loss(arrays.select(rows), start, SEEN).backward()
+            else:
+                batch_loss(model, draw_windows(arrays, rows, AHEAD, SEEN, g), 0.5).backward()
+            optimiser.step()
+
+        step()
+        epoch_s = min(seconds(step) for _ in range(5 if lever else 2)) * epoch / size
+        epochs = lever.training.steps * size / epoch if lever else EPOCHS
+        row = {"model": name, "epoch_s": epoch_s, "training_s": epoch_s * epochs}
+        model.eval()
+        for count, protocol in product((1, 64), ("window", "image_only")):
+            query = partial(foresee, model, arrays.select(torch.arange(count)), protocol)
+            query()
+            row[f"{protocol}_{count}_ms"] = 1000 * min(seconds(query) for _ in range(5))
+        rows.append(row)
+    return rows
+
+
+NAIVE = (
+    ("A*", "an expansion is 180 calls"),
+    ("continuous", "one start"),
+    ("continuous", f"{KEPT} starts"),
+    ("first plan", None),
+)
+
+
+def planning(n_goals: int = 15, seed: int = 300) -> Rows:
+    """Milliseconds a plan, beside its naive form; `whole` with the map of an unseen object.
+
+    Naive A* queries the network again for each branch, image and all. The naive continuous planner
+    descends through the whole network in every iteration, until it expects to end within a
+    millimetre: from one start, and from as many, one after the other, as ours refines at once.
+    """
+    film = load_checkpoint("push_film_x10")[0]
+    goals = {"single_partial": "one action", "multi_partial": "up to three actions"}
+    first = partial(plan_continuous, draft=True)
+    planners = {"A*": plan_astar, "continuous": plan_continuous, "first plan": first}
+    times: dict[tuple[str, ...], list[float]] = defaultdict(list)
+    map_ms: list[float] = []
+
+    def whole(planner: Callable, problem: PlanningProblem) -> None:
+        planner(replace(problem, effects=EffectMap(film, problem.effects.image)))
+
+    with Tabletop() as world:
+        for mode in goals:
+            for task in uniform_tasks(mode, n_goals, seed, STANDING):
+                world.place(task.thing, (0.0, 0.0), task.yaw_rad)
+                image, start = world.look(), world.object_pose()[:2]
+                effects = EffectMap(film, image)
+                map_ms.append(1000 * seconds(lambda e=effects: e.coefficients))
+                problem = PlanningProblem(start, task.goal, effects, mode)
+                effects.fine_grid  # noqa: B018, made once an object
+                plan = plan_astar(problem)
+                for name, planner in planners.items():
+                    times[name, mode].append(1000 * seconds(partial(planner, problem)))
+                    times[name, mode, "whole"].append(
+                        1000 * seconds(partial(whole, planner, problem))
+                    )
+                if len(map_ms) % 5 == 1:
+                    rng, naive = np.random.default_rng(seed), partial(_naive_descent, problem)
+                    each = 1000 * seconds(partial(_naive_branches, film, image))
+                    starts = [1000 * seconds(partial(naive, rng)) for _ in range(KEPT)]
+                    times["A*", mode, "an expansion is 180 calls"].append(each * plan.evaluations)
+                    times["continuous", mode, "one start"].append(1000 * seconds(naive))
+                    times["continuous", mode, f"{KEPT} starts"].append(sum(starts))
+    median = {key: float(np.median(values)) for key, values in times.items()}
+    rows = []
+    for mode, (planner, naive) in product(goals, NAIVE):
+        whole_ms = median[planner, mode, "whole"]
+        row = {"planner": planner, "goals": goals[mode], "median_ms": median[planner, mode]}
+        ratio = median[planner, mode, naive] / whole_ms if naive else None
+        rows.append(row | {"whole_median_ms": whole_ms, "naive": naive, "ratio": ratio})
+    row = {"planner": "map", "goals": "an object", "median_ms": float(np.median(map_ms))}
+    return [*rows, row | dict.fromkeys(("whole_median_ms", "naive", "ratio"))]
+
+
+@torch.no_grad()
+def _naive_branches(model: EffectNetwork, image: np.ndarray) -> None:
+    for angle in np.arange(N_DIRECTIONS) * (2 * np.pi / N_DIRECTIONS):
+        for stop in STOP_PHASES:
+            features = EffectMap(model, image).features
+            model.predict(features, observe_actions(model, [Push(angle)]), torch.tensor([[stop]]))
+
+
+def _naive_descent(problem: PlanningProblem, rng: np.random.Generator | None = None) -> None:
+    """From straight at the goal, or with a generator from where one of our many starts might be."""
+    model, image = problem.effects.model, problem.effects.image
+    target = torch.tensor(np.subtract(problem.goal.xy_m, problem.start_xy_m), dtype=torch.float32)
+    n = 1 if problem.mode.max_steps == 1 else max(1, int(np.ceil(float(target.norm()) / 0.09)))
+    direction, phase = torch.atan2(target[1], target[0]).repeat(n), torch.full((n,), 0.9)
+    if rng is not None:
+        direction += torch.from_numpy(rng.uniform(-SPREAD_RAD, SPREAD_RAD, n)).float()
+        phase = torch.from_numpy(rng.uniform(EARLIEST, 1.0, n)).float()
+    optimiser = torch.optim.Adam([direction.requires_grad_(), phase.requires_grad_()], lr=0.02)
+    x, y = (model.effect_channels.index(name) for name in "xy")
+    for _ in range(300):
+        end = torch.zeros(2)
+        for angle, stop in zip(direction, phase.clamp(0, 1), strict=True):
+            straight = observe_actions(model, [Push.towards(0.0)])
+            turn = torch.stack([angle.cos(), -angle.sin(), angle.sin(), angle.cos()]).view(2, 2)
+            seen = replace(straight, action=straight.action[:, [0, -1]] @ turn.T)
+            told = model.predict(EffectMap(model, image).features, seen, stop.view(1, 1))
+            end = end + told.effect_mean[0, 0, [x, y]]
+        loss = (end - target).square().sum()
+        if float(loss.detach().sqrt()) < 0.001:
+            return
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+
+
+MEASUREMENTS: dict[str, Callable[[], Rows]] = {
+    "collect": collecting,
+    "lever_up": lever_up,
+    "planning": planning,
+    "prediction": prediction,
+    "primitives": primitives,
+    "training": training,
+}
+
+
+@command(OSError, ValueError)
+def main(argv: Sequence[str] | None = None) -> int:
+    """Measure what is named, or all but `training`, which takes a quarter of an hour."""
+    parser = argparse.ArgumentParser(prog="python -m experiments.speed", description=main.__doc__)
+    names = ",".join(list(MEASUREMENTS)[:-1])
+    parser.add_argument("--only", type=names_type(MEASUREMENTS), default=names)
+    parser.add_argument("--keep", action="store_true", help=f"write the rows to {RESULTS}")
+    options = parser.parse_args(argv)
+    torch.set_num_threads(1)
+    for name in options.only:
+        rows = MEASUREMENTS[name]()
+        machine = {"load": os.getloadavg()[0], "cores": os.cpu_count()}
+        print(f"{name}: {machine}\n{pd.DataFrame(rows).to_string(index=False)}", flush=True)
+        if options.keep:
+            path = repo_root() / RESULTS
+            tables = read_results(path)["tables"] if path.is_file() else {}
+            tables |= {name: rows, f"{name}_machine": [machine]}
+            write_results(path.parent, path.stem, {}, dict(sorted(tables.items())))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
