@@ -31,11 +31,11 @@ from affordlib.planning import (
     ClosedLoopResult,
     Disturbance,
     Skills,
-    draw_disturbances,
     run_closed_loop,
+    sample_disturbances,
 )
 from affordlib.planning.disturbances import KINDS
-from affordlib.planning.grasp_rotate import GRIP_YAWS
+from affordlib.planning.grasp_rotate import GRIPPER_YAWS_RAD
 from affordlib.planning.reachability import SHIPPED as REACHABILITY
 from affordlib.planning.skills import CHECKPOINTS
 from affordlib.primitives import Drag, Grasp, Push
@@ -97,7 +97,7 @@ def draw_trial(table: str, index: int, seed: int = 0) -> Trial:
         return Trial(thing, (0.0, 0.0), yaw, Goal(xy, exact, turn_rad=turn))
     n_actions = max(1, math.ceil(r / 0.09))
     kinds = [kind for kind in KINDS if kind != "topple" or not thing.rollable]
-    script = draw_disturbances(int(rng.integers(2**32)), 1, n_actions, kinds)
+    script = sample_disturbances(int(rng.integers(2**32)), 1, n_actions, kinds)
     return Trial(thing, (0.0, 0.0), yaw, Goal(xy, exact), script)
 
 
@@ -153,7 +153,7 @@ def _can_be_lifted(world: Tabletop, trial: Trial, went: ClosedLoopResult) -> boo
         world.place(trial.thing, went.goal.xy_m, went.end_pose[2])
         return bool(world.attempt(Grasp(grip_yaw=grip_yaw)).effect[:, 2].max() >= high)
 
-    return went.reached or any(map(lifts, GRIP_YAWS))
+    return went.reached or any(map(lifts, GRIPPER_YAWS_RAD))
 
 
 def _stays_feasible(world: Tabletop, trial: Trial, went: ClosedLoopResult) -> bool:

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from affordlib.evaluation.goals import FAMILIES, ROLLABLE, STANDING
+from affordlib.evaluation.tasks import GOAL_SOURCES, ROLLABLE, STANDING
 from affordlib.models.checkpoint import checkpoint_sha256, load_checkpoint
 from affordlib.planning import (
     EffectMap,
@@ -40,7 +40,7 @@ class Variant:
     push, drag: names of checkpoints; None where it has none for such objects. samples: stop phases
     of A*, or phases at which the gradient planner queries. full_only: no partial actions. goals:
     the families of goals that it is asked for; every: of these, each so-many-th. world: whose goals
-    (see `goals.FROZEN`). nominal: whoever plans with the simulator is not told this world's
+    (see `tasks.FROZEN`). nominal: whoever plans with the simulator is not told this world's
     frictions, masses and heights (it starts where the camera sees the object in any case). wary: it
     has a σ, see `oracle_effects`. nudged: the object is a millimetre and a degree off when the plan
     is carried out. looks: of which each perception is the mean.
@@ -54,7 +54,7 @@ class Variant:
     samples: int | None = None
     corrections: int = 0
     full_only: bool = False
-    goals: tuple[str, ...] = FAMILIES
+    goals: tuple[str, ...] = GOAL_SOURCES
     every: int = 1
     world: str = "clean"
     nominal: bool = False
@@ -103,7 +103,7 @@ class Variant:
             "checkpoints": files,
             "format": ORACLE_FORMAT if self.sees_world else FORMATS[self.planner],
         }
-        if self.goals != FAMILIES:
+        if self.goals != GOAL_SOURCES:
             more["goals"] = list(self.goals)
         if self.every > 1:
             more["every"] = self.every

@@ -25,9 +25,9 @@ import torch
 from tqdm.auto import tqdm
 
 from affordlib.commands import command
-from affordlib.evaluation.goals import FROZEN, ROLLABLE, STANDING, PlanningTask, frozen_tasks
 from affordlib.evaluation.metrics import error_row
 from affordlib.evaluation.predictions import rounded
+from affordlib.evaluation.tasks import FROZEN, ROLLABLE, STANDING, PlanningTask, frozen_tasks
 from affordlib.paths import repo_root, resolve_out_dir
 from affordlib.planning import PlanMode, execute_plan
 from affordlib.results import write_results, write_text_atomically

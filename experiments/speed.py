@@ -26,7 +26,7 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from affordlib.commands import command, names_type
-from affordlib.evaluation.goals import STANDING, uniform_tasks
+from affordlib.evaluation.tasks import STANDING, uniform_tasks
 from affordlib.interactions import (
     Normaliser,
     TrainingArrays,
@@ -53,7 +53,7 @@ from affordlib.models.training import batch_loss, final_errors_m, literal_draw
 from affordlib.paths import repo_root
 from affordlib.planning import EffectMap, PlanningProblem, plan_astar, plan_continuous
 from affordlib.planning.astar import N_DIRECTIONS, STOP_PHASES
-from affordlib.planning.continuous import EARLIEST, KEPT, SPREAD_RAD
+from affordlib.planning.continuous import DIRECTION_SPREAD_RAD, MIN_STOP_PHASE, N_REFINED
 from affordlib.primitives import PRIMITIVES, Push
 from affordlib.results import read_results, write_results
 from affordlib.types import Observations
@@ -266,7 +266,7 @@ def lever_up(n: int = 256, epoch: int = 1440) -> Rows:
 NAIVE = (
     ("A*", "an expansion is 180 calls"),
     ("continuous", "one start"),
-    ("continuous", f"{KEPT} starts"),
+    ("continuous", f"{N_REFINED} starts"),
     ("first plan", None),
 )
 
@@ -306,10 +306,10 @@ def planning(n_goals: int = 15, seed: int = 300) -> Rows:
                 if len(map_ms) % 5 == 1:
                     rng, naive = np.random.default_rng(seed), partial(_naive_descent, problem)
                     each = 1000 * seconds(partial(_naive_branches, film, image))
-                    starts = [1000 * seconds(partial(naive, rng)) for _ in range(KEPT)]
+                    starts = [1000 * seconds(partial(naive, rng)) for _ in range(N_REFINED)]
                     times["A*", mode, "an expansion is 180 calls"].append(each * plan.evaluations)
                     times["continuous", mode, "one start"].append(1000 * seconds(naive))
-                    times["continuous", mode, f"{KEPT} starts"].append(sum(starts))
+                    times["continuous", mode, f"{N_REFINED} starts"].append(sum(starts))
     median = {key: float(np.median(values)) for key, values in times.items()}
     rows = []
     for mode, (planner, naive) in product(goals, NAIVE):
@@ -336,8 +336,10 @@ def _naive_descent(problem: PlanningProblem, rng: np.random.Generator | None = N
     n = 1 if problem.mode.max_steps == 1 else max(1, int(np.ceil(float(target.norm()) / 0.09)))
     direction, phase = torch.atan2(target[1], target[0]).repeat(n), torch.full((n,), 0.9)
     if rng is not None:
-        direction += torch.from_numpy(rng.uniform(-SPREAD_RAD, SPREAD_RAD, n)).float()
-        phase = torch.from_numpy(rng.uniform(EARLIEST, 1.0, n)).float()
+        direction += torch.from_numpy(
+            rng.uniform(-DIRECTION_SPREAD_RAD, DIRECTION_SPREAD_RAD, n)
+        ).float()
+        phase = torch.from_numpy(rng.uniform(MIN_STOP_PHASE, 1.0, n)).float()
     optimiser = torch.optim.Adam([direction.requires_grad_(), phase.requires_grad_()], lr=0.02)
     x, y = (model.effect_channels.index(name) for name in "xy")
     for _ in range(300):

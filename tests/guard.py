@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 import experiments.attention  # noqa: F401, whose network a checkpoint is of
-from affordlib.evaluation.goals import frozen_tasks
+from affordlib.evaluation.tasks import frozen_tasks
 from affordlib.interactions import TrainingArrays, open_interactions
 from affordlib.interactions.lever import lever_arrays
 from affordlib.interactions.recipes import RECIPES, interact

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from affordlib.evaluation.goals import frozen_tasks
+from affordlib.evaluation.tasks import frozen_tasks
 from affordlib.planning import execute_plan, plan_astar, plan_continuous, run_closed_loop
 from affordlib.primitives import Grasp, Push
 from affordlib.types import Goal, Plan, Step, UnreachableError

@@ -13,11 +13,11 @@ from affordlib.planning import (
     Disturbance,
     Skills,
     action_limit,
-    draw_disturbances,
     plan_astar,
     plan_continuous,
     plan_gradient,
     run_closed_loop,
+    sample_disturbances,
 )
 from affordlib.planning.closed_loop import DISPLACED_M, _ClosedLoop
 from affordlib.planning.problem import is_on_table
@@ -327,10 +327,12 @@ def test_a_knock_in_the_middle_of_an_action_follows_mechanics(table):
     table.settle(1.0)
     assert table.object_pose()[0] == pytest.approx(0.5**2 / (2 * 0.25 * 9.81), rel=0.05)
     # The clock counts from where the arm sets out; the push touches after 4 s.
-    from affordlib.planning.disturbances import Script
+    from affordlib.planning.disturbances import DisturbanceSchedule
 
     table.place(BOX, (0.0, 0.0), 0.0)
-    script = Script(Goal((0.1, 0.0), EXACT_M), [Disturbance("knock", 0, 0.0, 0.4, at_s=2.0)])
+    script = DisturbanceSchedule(
+        Goal((0.1, 0.0), EXACT_M), [Disturbance("knock", 0, 0.0, 0.4, at_s=2.0)]
+    )
     with script.during(table, 0):
         table.interact(Push.towards(0.0), 0.8, approach=True)
     assert len(script.happened) == 1
@@ -339,9 +341,9 @@ def test_a_knock_in_the_middle_of_an_action_follows_mechanics(table):
 
 
 def test_disturbances_are_a_function_of_the_seed():
-    assert draw_disturbances(3, n=20) == draw_disturbances(3, n=20)
-    assert draw_disturbances(3, n=20) != draw_disturbances(4, n=20)
-    drawn = draw_disturbances(0, n=300, n_actions=3)
+    assert sample_disturbances(3, n=20) == sample_disturbances(3, n=20)
+    assert sample_disturbances(3, n=20) != sample_disturbances(4, n=20)
+    drawn = sample_disturbances(0, n=300, n_actions=3)
     assert {d.kind for d in drawn} == {"shove", "knock", "topple", "goal"}
     assert all(d.at_s is None for d in drawn if d.kind == "shove")
     assert all(d.action >= 1 for d in drawn if d.at_s is None)
@@ -355,7 +357,7 @@ def test_a_disturbed_pursuit_is_the_same_again(table, skills):
     ends = []
     for _ in range(2):
         table.place(TUBE, (0.0, 0.0), 0.0)
-        script = draw_disturbances(7, n=2)
+        script = sample_disturbances(7, n=2)
         ends.append(
             run_closed_loop(table, Goal((0.1, 0.1), EXACT_M), skills, disturbances=script).end_pose
         )

@@ -45,7 +45,7 @@ def main_of(name):
         ("experiments.closed_loop", ["--n", "0"], "--n: must be a whole number from 1"),
         ("experiments.whole_plans", ["--n", "-1"], "--n: must be a whole number from 1"),
         (
-            "affordlib.evaluation.goals",
+            "affordlib.evaluation.tasks",
             ["--seed", str(2**32)],
             "--seed: must be a whole number from 0",
         ),

@@ -16,7 +16,7 @@ from affordlib.planning import (
     plan_gradient,
 )
 from affordlib.planning.astar import BranchTable, search
-from affordlib.planning.grasp_rotate import GRIP_YAWS
+from affordlib.planning.grasp_rotate import GRIPPER_YAWS_RAD
 from affordlib.primitives import Drag, Grasp, Push, Rotate, wrap_angle
 from affordlib.types import Goal
 from affordlib.world import Cuboid, LyingCylinder, UprightCylinder
@@ -159,4 +159,4 @@ def test_what_models_say_is_kept_while_only_the_goal_moves(skills, cuboid_image)
 
 
 def test_the_hands_that_are_weighed_are_all_there_are():
-    assert len({round(math.degrees(yaw)) % 180 for yaw in GRIP_YAWS}) == 12
+    assert len({round(math.degrees(yaw)) % 180 for yaw in GRIPPER_YAWS_RAD}) == 12

@@ -280,8 +280,8 @@ def valid_calls(shop):
             planning.Disturbance,
             {"kind": "knock", "action": 0, "x": 0.1, "y": 0.0, "turn": 0.0, "at_s": 1.0},
         ),
-        "draw_disturbances": (
-            planning.draw_disturbances,
+        "sample_disturbances": (
+            planning.sample_disturbances,
             {"seed": 0, "n": 1, "n_actions": 2, "kinds": ("knock",), "strength": 1.0},
         ),
         "action_limit": (planning.action_limit, {"distance_m": 0.1}),
@@ -426,7 +426,7 @@ attempt follow follow_path can_reach look_from picture mark shove knock topple s
 from_dataset open_interactions split_interactions Recipe Variation collect CNPConfig
 FiLMConfig build Ensemble TrainingConfig coverage fit_temperature
 load_checkpoint save_checkpoint observe_actions train train_literal PlanMode Disturbance
-draw_disturbances action_limit EffectMap PlanningProblem ClosedLoopConfig plan_astar
+sample_disturbances action_limit EffectMap PlanningProblem ClosedLoopConfig plan_astar
 plan_continuous plan_gradient plan_turn plan_lift kind_for Skills execute_plan run_closed_loop
 closed_loop plot_depth plot_footprint plot_plan
 plot_outcome plot_table save_figure GoalPicker PhaseSlider FrameRecorder ConditioningExplorer

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from affordlib.evaluation.goals import (
+from affordlib.evaluation.tasks import (
     ROLLABLE,
     STANDING,
     constructed_tasks,
@@ -147,11 +147,11 @@ def test_an_effect_map_says_what_the_model_says(world, film, kind):
     direction = torch.from_numpy(rng.uniform(-7, 7, 40))
     phase = torch.from_numpy(rng.uniform(0.3, 1, 40))
     told, std = effects(direction, phase)
-    asked = effects.ask_model(direction, phase)
+    asked = effects.query_model(direction, phase)
     off = (told - asked)[:, :2].norm(dim=-1)
     assert off.median() < 6e-4  # what the splines leave: 0.2 mm of the push, less of the drag
     at_first = torch.full_like(phase, kind.acts_from)
-    assert effects.ask_model(direction, at_first).abs().max() < 1e-6
+    assert effects.query_model(direction, at_first).abs().max() < 1e-6
     assert (std > 0).all()
     # It is smooth: its slopes are those of finite differences.
     direction.requires_grad_(), phase.requires_grad_()

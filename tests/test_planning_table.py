@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from affordlib.evaluation.goals import (
-    FAMILIES,
+from affordlib.evaluation.tasks import (
+    GOAL_SOURCES,
     ROLLABLE,
     STANDING,
     PlanningTask,
@@ -144,7 +144,7 @@ def test_variants_are_asked_about_all_their_classes_alike(name):
 
 def test_the_goals_belong_to_what_decides_the_numbers():
     fewer = VARIANTS["gradient_25"]
-    assert fewer.about() != replace(fewer, goals=FAMILIES).about()
+    assert fewer.about() != replace(fewer, goals=GOAL_SOURCES).about()
 
 
 def test_variants_ask_only_for_what_they_can():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from affordlib.planning import plan_lift, plan_turn, run_closed_loop
-from affordlib.planning.grasp_rotate import GRIP_YAWS, crossings, foresee_courses
+from affordlib.planning.grasp_rotate import GRIPPER_YAWS_RAD, crossings, predict_trajectories
 from affordlib.primitives import Grasp, Push, Rotate
 from affordlib.types import Goal
 from affordlib.world import Cuboid, LyingCylinder, Sphere, Tabletop, UprightCylinder
@@ -99,7 +99,7 @@ def test_a_turned_hand_before_a_turned_thing_is_the_same(world, skills):
         world.place(BOX, yaw_rad=0.3 + turn)
         angles = [turn + 0.2]
         foreseen.append(
-            foresee_courses(skills.model(Rotate), world.look(), Rotate(), "yaw", angles).mean
+            predict_trajectories(skills.model(Rotate), world.look(), Rotate(), "yaw", angles).mean
         )
     np.testing.assert_allclose(*foreseen, atol=math.radians(1.5))
 
@@ -143,5 +143,5 @@ def test_an_angle_that_the_arm_refuses_is_not_taken(world, skills, monkeypatch):
     monkeypatch.setattr(Tabletop, "can_reach", lambda *_: False)
     world.place(BOX)
     went = run_closed_loop(world, goal, skills)
-    assert (went.status, went.steps, went.vetoes) == ("unreachable", (), len(GRIP_YAWS))
+    assert (went.status, went.steps, went.vetoes) == ("unreachable", (), len(GRIPPER_YAWS_RAD))
     assert "the height: 10.0 cm: the arm cannot grasp at (0.000, 0.000) m" in went.message

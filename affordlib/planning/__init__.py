@@ -9,7 +9,7 @@ from affordlib.planning.closed_loop import (
     run_closed_loop,
 )
 from affordlib.planning.continuous import plan_continuous
-from affordlib.planning.disturbances import Disturbance, draw_disturbances
+from affordlib.planning.disturbances import Disturbance, sample_disturbances
 from affordlib.planning.effect_map import EffectMap
 from affordlib.planning.gradient import plan_gradient
 from affordlib.planning.grasp_rotate import plan_lift, plan_turn
@@ -26,7 +26,6 @@ __all__ = [
     "PlanningProblem",
     "Skills",
     "action_limit",
-    "draw_disturbances",
     "execute_plan",
     "plan_astar",
     "plan_continuous",
@@ -34,4 +33,5 @@ __all__ = [
     "plan_lift",
     "plan_turn",
     "run_closed_loop",
+    "sample_disturbances",
 ]

@@ -16,11 +16,11 @@ import numpy as np
 
 from affordlib.perception import Percept, aim, looks_fallen
 from affordlib.planning.continuous import plan_continuous
-from affordlib.planning.disturbances import Disturbance, Script
+from affordlib.planning.disturbances import Disturbance, DisturbanceSchedule
 from affordlib.planning.grasp_rotate import (
-    GRIP_YAWS,
+    GRIPPER_YAWS_RAD,
     TURN_TOLERANCE_RAD,
-    hands_in_line,
+    aligned_gripper_yaws,
     plan_lift,
     plan_turn,
 )
@@ -225,7 +225,7 @@ class _ClosedLoop:
         disturbances: Sequence[Disturbance],
     ) -> None:
         self.world, self.skills, self.config = world, skills, config
-        self.script = Script(goal, disturbances)
+        self.script = DisturbanceSchedule(goal, disturbances)
         self.steps: list[Step] = []
         self.paths: list[np.ndarray] = []
         mode = PlanMode(config.horizon, partial=True)
@@ -238,7 +238,7 @@ class _ClosedLoop:
         self.planned_for: Goal | None = None
         self.expected: tuple[float, float] | None = None
         self.yaw_rad = world.object_pose()[2]
-        self.grip_yaws = GRIP_YAWS
+        self.grip_yaws = GRIPPER_YAWS_RAD
         self.turns = self.limit = 0
         self.z_m = world.object_state()[2]
 
@@ -348,10 +348,10 @@ class _ClosedLoop:
             except UnreachableError as error:  # of what it sees now, a hair off what it agreed to
                 raise Ended("unreachable", f"the {part}: {error}") from error
         self.steps.append(step)
-        self.grip_yaws = GRIP_YAWS
+        self.grip_yaws = GRIPPER_YAWS_RAD
         if isinstance(step.primitive, Rotate):
             # A grasp takes an object as the rotation left it, or it would turn it back.
-            self.grip_yaws = hands_in_line(float(step.primitive.path(step.stop_phase)[0, 3]))
+            self.grip_yaws = aligned_gripper_yaws(float(step.primitive.path(step.stop_phase)[0, 3]))
         if self.config.on_action is not None:
             self.script.goal = self.config.on_action(self.plan, len(self.steps)) or self.goal
 
@@ -380,7 +380,7 @@ class _ClosedLoop:
     def _turn(self, off_rad: float) -> Step:
         model = self.skills.model(Rotate)
         return self._agreed(
-            GRIP_YAWS,
+            GRIPPER_YAWS_RAD,
             lambda yaws: plan_turn(model, self.seen.image, self.seen.xy_m, off_rad, yaws),
             f"the orientation: {math.degrees(off_rad):.0f}° more",
             "no rotation is foreseen to turn the object",

@@ -61,7 +61,7 @@ class Disturbance:
             if self.kind == "shove":
                 raise ValueError("a shove happens between actions; give no at_s, or take a knock")
 
-    def strike(self, world: affordlib.world.Tabletop, goal: Goal) -> Goal:
+    def apply(self, world: affordlib.world.Tabletop, goal: Goal) -> Goal:
         """Let it happen, and return the goal as it is then."""
         if self.kind == "goal":
             return replace(goal, xy_m=_inside(goal.xy_m[0] + self.x, goal.xy_m[1] + self.y))
@@ -87,7 +87,7 @@ def _inside(x: float, y: float) -> tuple[float, float]:
     )
 
 
-class Script:
+class DisturbanceSchedule:
     """Disturbances, each of which happens once, and the goal as it has become.
 
     happened: those that have, in order.
@@ -98,16 +98,16 @@ class Script:
         self.happened: list[Disturbance] = []
         self._waiting = list(disturbances)
 
-    def _strike(self, world: affordlib.world.Tabletop, one: Disturbance) -> None:
+    def _apply(self, world: affordlib.world.Tabletop, one: Disturbance) -> None:
         self._waiting.remove(one)
         self.happened.append(one)
-        self.goal = one.strike(world, self.goal)
+        self.goal = one.apply(world, self.goal)
 
     def before(self, world: affordlib.world.Tabletop, action: int) -> None:
         """Let happen what comes before an action, and let the object come to rest."""
         due = [one for one in self._waiting if one.action <= action and one.at_s is None]
         for one in due:
-            self._strike(world, one)
+            self._apply(world, one)
             if one.kind in ("knock", "topple"):
                 world.settle(TIPPING_S)
 
@@ -122,7 +122,7 @@ class Script:
             steps += 1
             for one in [d for d in due if steps >= STEPS_PER_S * d.at_s]:
                 due.remove(one)
-                self._strike(world, one)
+                self._apply(world, one)
             if film is not None:
                 film(world)
 
@@ -132,12 +132,12 @@ class Script:
         finally:
             world.film = film
         for one in due:
-            self._strike(world, one)
+            self._apply(world, one)
             if one.kind != "goal":
                 world.settle(TIPPING_S)
 
 
-def draw_disturbances(
+def sample_disturbances(
     seed: int,
     n: int = 1,
     n_actions: int = 2,

@@ -160,7 +160,7 @@ class EffectMap:
         return direction[rows], phase[rows]
 
     @torch.no_grad()
-    def ask_model(self, direction_rad: Tensor, phase: Tensor) -> Tensor:
+    def query_model(self, direction_rad: Tensor, phase: Tensor) -> Tensor:
         """As the map, for (n,) directions and phases, from the model itself: (n, 3)."""
         first = torch.full_like(phase, self.kind.acts_from)
         t_target = torch.stack([first, phase.clamp_min(self.kind.acts_from)], dim=1).float()

@@ -28,23 +28,23 @@ from affordlib.primitives import Grasp, Rotate, wrap_angle
 from affordlib.types import Goal, Step, check_finite, check_pair, check_within
 
 SAMPLES = 301
-PERHAPS = 1.28
+Z_90 = 1.28
 """So many σ above a foreseen height are not yet beyond belief (90 %)."""
 
-MOST = 0.9
+FULL_ROTATION_SHARE = 0.9
 """Of its sweep, by which a whole rotation has to turn an object to count as one."""
 
-GRIP_YAWS = tuple(np.radians([0, 15, -15, 30, -30, 45, -45, 60, -60, 75, -75, 90]).tolist())
+GRIPPER_YAWS_RAD = tuple(np.radians([0, 15, -15, 30, -30, 45, -45, 60, -60, 75, -75, 90]).tolist())
 """Angles of the hand that are weighed, the least first: the fingers are alike, so 180° in all."""
 
 
-def hands_in_line(yaw_rad: float) -> tuple[float, ...]:
+def aligned_gripper_yaws(yaw_rad: float) -> tuple[float, ...]:
     """Angles at which a hand takes an object as one at another angle has left it, unturned."""
     return tuple(wrap_angle(yaw_rad + k * math.pi / 2) for k in (0, 1, -1))
 
 
 @dataclass(frozen=True)
-class Courses:
+class PredictedTrajectories:
     """One channel of the effect over the phase (n,): mean and std (m, n), for m angles of the hand.
 
     The effect is zero before anything.
@@ -57,13 +57,13 @@ class Courses:
 
 
 @torch.no_grad()
-def foresee_courses(
+def predict_trajectories(
     model: EffectModel,
     image: np.ndarray,
     primitive: Grasp | Rotate,
     channel: str,
-    grip_yaws: Sequence[float] = GRIP_YAWS,
-) -> Courses:
+    grip_yaws: Sequence[float] = GRIPPER_YAWS_RAD,
+) -> PredictedTrajectories:
     """What a model expects of a primitive for each angle of the hand [rad].
 
     Raises ValueError where the model has no such channel.
@@ -83,14 +83,14 @@ def foresee_courses(
     told = model.predict(seen, observed, t)
     k = model.effect_channels.index(channel)
     mean, std = (v[:, :, k].double().numpy() for v in (told.effect_mean, told.effect_std))
-    return Courses(tuple(grip_yaws), t[0].double().numpy(), mean - mean[:, :1], std)
+    return PredictedTrajectories(tuple(grip_yaws), t[0].double().numpy(), mean - mean[:, :1], std)
 
 
-def foresee_course(
+def predict_trajectory(
     model: EffectModel, image: np.ndarray, primitive: Grasp | Rotate, channel: str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The same for the primitive's own angle of the hand: phases, mean and σ, (n,) each."""
-    told = foresee_courses(model, image, primitive, channel, [primitive.grip_yaw])
+    told = predict_trajectories(model, image, primitive, channel, [primitive.grip_yaw])
     return told.phase, told.mean[0], told.std[0]
 
 
@@ -107,16 +107,20 @@ def plan_turn(
     image: np.ndarray,
     xy_m: Sequence[float],
     turn_rad: float,
-    grip_yaws: Sequence[float] = GRIP_YAWS,
+    grip_yaws: Sequence[float] = GRIPPER_YAWS_RAD,
 ) -> Step | None:
     """The rotation that turns an object at (x, y) by an angle, or as far towards it as it can.
 
     grip_yaws: the angles of the hand to choose from, as `choose_turn` does.
     """
-    return choose_turn(foresee_courses(model, image, Rotate(), "yaw", grip_yaws), xy_m, turn_rad)
+    return choose_turn(
+        predict_trajectories(model, image, Rotate(), "yaw", grip_yaws), xy_m, turn_rad
+    )
 
 
-def choose_turn(courses: Courses, xy_m: Sequence[float], turn_rad: float) -> Step | None:
+def choose_turn(
+    courses: PredictedTrajectories, xy_m: Sequence[float], turn_rad: float
+) -> Step | None:
     """Of courses of yaw, the hand and the phase that turn an object at (x, y) by an angle.
 
     Closing, the fingers align a cuboid; then the hand turns counter-clockwise, so an angle far
@@ -141,7 +145,7 @@ def choose_turn(courses: Courses, xy_m: Sequence[float], turn_rad: float) -> Ste
         end = mean[:, -1]
         if end.max() < math.radians(1):
             return None
-        enough = end >= min(MOST * Rotate.sweep_rad, end.max())
+        enough = end >= min(FULL_ROTATION_SHARE * Rotate.sweep_rad, end.max())
         k, stop = int(np.where(enough, std[:, -1], np.inf).argmin()), 1.0
     turned = float(np.interp(stop, phase, mean[k]))
     return _step_at(xy_m, Rotate(courses.grip_yaws[k]), stop, predicted_turn_rad=turned)
@@ -152,16 +156,18 @@ def plan_lift(
     image: np.ndarray,
     xy_m: Sequence[float],
     height_m: float,
-    grip_yaws: Sequence[float] = GRIP_YAWS,
+    grip_yaws: Sequence[float] = GRIPPER_YAWS_RAD,
 ) -> Step | None:
     """The grasp that ends holding an object from (x, y) at a height [m] above where it stands.
 
     grip_yaws: the angles of the hand to choose from, as `choose_lift` does.
     """
-    return choose_lift(foresee_courses(model, image, Grasp(), "z", grip_yaws), xy_m, height_m)
+    return choose_lift(predict_trajectories(model, image, Grasp(), "z", grip_yaws), xy_m, height_m)
 
 
-def choose_lift(courses: Courses, xy_m: Sequence[float], height_m: float) -> Step | None:
+def choose_lift(
+    courses: PredictedTrajectories, xy_m: Sequence[float], height_m: float
+) -> Step | None:
     """Of courses of z, the hand and the phase that hold an object from (x, y) at a height [m].
 
     Of the angles of the hand the one that is sure (mean less σ) to lift it highest, of equals (to
@@ -172,7 +178,7 @@ def choose_lift(courses: Courses, xy_m: Sequence[float], height_m: float) -> Ste
     phase = courses.phase
     k = int((courses.mean - courses.std)[:, -1].round(2).argmax())
     course, std, primitive = courses.mean[k], courses.std[k], Grasp(grip_yaw=courses.grip_yaws[k])
-    if course.max() < height <= course[-1] + PERHAPS * std[-1]:
+    if course.max() < height <= course[-1] + Z_90 * std[-1]:
         # It may slip, or not; if it does not, it goes where the hand goes.
         hand = primitive.path(phase)[:, 2]
         course = np.maximum(hand - hand[phase >= primitive.leg_phases[-2]][0], 0.0)
@@ -209,7 +215,7 @@ class PosePlanner:
     rotate: EffectModel
     grasp: EffectModel
     can_act: Callable[[str, Sequence[float]], bool] = lambda *_: True
-    _kept: dict[tuple[type, tuple[float, ...]], Courses] = field(default_factory=dict)
+    _kept: dict[tuple[type, tuple[float, ...]], PredictedTrajectories] = field(default_factory=dict)
 
     def __call__(
         self, goal: Goal, xy_m: Sequence[float], turned_rad: float = 0.0, std_m: float = 0.0
@@ -238,7 +244,7 @@ class PosePlanner:
             off = 0.0 if goal.turn_rad is None else wrap_angle(goal.turn_rad - turned)
             if abs(off) <= TURN_TOLERANCE_RAD:
                 return steps
-            courses = self._courses(Rotate, "yaw", GRIP_YAWS)
+            courses = self._courses(Rotate, "yaw", GRIPPER_YAWS_RAD)
             step = choose_turn(courses, xy_m, off)
             if step is None or not self.can_act("rotate", xy_m):
                 return None
@@ -251,10 +257,10 @@ class PosePlanner:
         self, height_m: float, xy_m: Sequence[float], turned_rad: float, after: Step | None
     ) -> Step | None:
         """A grasp at any angle; after a rotation as that left the object, or it is turned back."""
-        angles = GRIP_YAWS
+        angles = GRIPPER_YAWS_RAD
         if after is not None:
             hand = float(after.primitive.path(after.stop_phase)[0, 3])
-            angles = hands_in_line(hand - turned_rad)
+            angles = aligned_gripper_yaws(hand - turned_rad)
         step = choose_lift(self._courses(Grasp, "z", angles), xy_m, height_m)
         if step is None or not self.can_act("grasp", xy_m):
             return None
@@ -262,12 +268,14 @@ class PosePlanner:
 
     def _courses(
         self, kind: type[Grasp] | type[Rotate], channel: str, angles: tuple[float, ...]
-    ) -> Courses:
+    ) -> PredictedTrajectories:
         """What comes of hands at angles relative to the image, to half a degree."""
         key = kind, tuple(round(2 * math.degrees(angle)) / 2 for angle in angles)
         if key not in self._kept:
             model = self.rotate if kind is Rotate else self.grasp
-            told = foresee_courses(model, self.image, kind(), channel, np.radians(key[1]).tolist())
+            told = predict_trajectories(
+                model, self.image, kind(), channel, np.radians(key[1]).tolist()
+            )
             self._kept[key] = told
         return replace(self._kept[key], grip_yaws=angles)
 

@@ -18,7 +18,7 @@ from affordlib.planning.problem import (
     check_has_room,
     is_on_table,
 )
-from affordlib.planning.routes import CELL_M, Judge, find_route, places
+from affordlib.planning.routes import CELL_M, Feasible, find_route, places
 from affordlib.planning.skills import Skills
 from affordlib.primitives import Primitive
 from affordlib.types import Goal, Plan, Step
@@ -144,7 +144,7 @@ class MovePlanner:
 
         return judge
 
-    def _judged(self, kind: type[Primitive]) -> Judge:
+    def _judged(self, kind: type[Primitive]) -> Feasible:
         """The same, of actions of any length."""
         allowed = self._allowed(kind)
         return lambda xy_m, direction_rad, _: allowed(xy_m, direction_rad)

@@ -17,7 +17,7 @@ from affordlib.planning.problem import is_on_table
 from affordlib.primitives import Drag, Push
 from affordlib.types import TABLE_X_M, TABLE_Y_M
 
-Judge = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+Feasible = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 CELL_M = 0.02
 REACH_M = {Push: 0.075, Drag: 0.045}
@@ -48,7 +48,7 @@ class RouteMap:
     reach_m: float
 
     @classmethod
-    def of(cls, reach_m: float, judge: Judge) -> RouteMap:
+    def of(cls, reach_m: float, judge: Feasible) -> RouteMap:
         """judge: which of the positions (n, 2), directions (n,), lengths (n,) [m] are possible."""
         x, y = places()
         moves = moves_within(reach_m)
@@ -88,7 +88,7 @@ def find_route(
     routes: RouteMap,
     start_xy_m: Sequence[float],
     goal_xy_m: Sequence[float],
-    judge: Judge,
+    judge: Feasible,
     barred: Sequence[tuple[int, int, int]] = (),
     radius_m: float = 0.0,
 ) -> list[tuple[float, float]] | None:

@@ -13,7 +13,7 @@ import torch
 from affordlib.models import load_checkpoint
 from affordlib.perception import Percept
 from affordlib.planning import EffectMap, PlanningProblem, plan_continuous
-from affordlib.planning.grasp_rotate import foresee_course
+from affordlib.planning.grasp_rotate import predict_trajectory
 from affordlib.planning.rollout import roll_out
 from affordlib.primitives import Grasp, Push
 from affordlib.types import Goal, Plan, Step
@@ -99,7 +99,7 @@ def _lift_error_mm(stop_at: Callable[..., Any]) -> float:
     with Tabletop() as world:
         for height_m in (0.03, 0.09, 0.18):
             world.place(UprightCylinder(0.045, 0.06))
-            phase, course_m, _ = foresee_course(model, world.look(), Grasp(), "z")
+            phase, course_m, _ = predict_trajectory(model, world.look(), Grasp(), "z")
             stop = float(asked(stop_at, height_m, phase, course_m))
             off.append(abs(world.interact(Grasp(), stop).effect[-1, 2] - height_m))
     return 1000 * max(off)

@@ -8,7 +8,7 @@ goals, are off the 10° grid of A*.
 The goals of the tables are frozen in `data/goals/planning.json`, those of the varied, noisy world
 in `data/goals/planning_varied.json`; made once, by
 
-    python -m affordlib.evaluation.goals --world varied
+    python -m affordlib.evaluation.tasks --world varied
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from affordlib.types import Goal
 from affordlib.world import Tabletop, Thing, WorldConfig, family_named
 
 FROZEN = {"clean": "data/goals/planning.json", "varied": "data/goals/planning_varied.json"}
-FAMILIES = ("constructed", "uniform")
+GOAL_SOURCES = ("constructed", "uniform")
 N_GOALS = {"single_full": 50, "single_partial": 100, "multi_partial": 80}
 """As in Table 3 of the paper."""
 
@@ -89,7 +89,7 @@ class PlanningTask:
 def _objects(mode: str, goals: str, seed: int, index: int, classes: Sequence[str]) -> tuple:
     if mode not in MODES:
         raise ValueError(f"mode {mode!r} is unknown; choose one of {sorted(MODES)}")
-    key = (list(MODES).index(mode), FAMILIES.index(goals), index)
+    key = (list(MODES).index(mode), GOAL_SOURCES.index(goals), index)
     rng = np.random.default_rng(np.random.SeedSequence(2_000_003 + seed, spawn_key=key))
     thing = family_named(classes[index % len(classes)]).sample(rng)
     return thing, float(rng.uniform(-math.pi, math.pi)), rng
@@ -160,7 +160,7 @@ def frozen_tasks(world: str = "clean") -> list[PlanningTask]:
     if not path.is_file():
         raise FileNotFoundError(
             f"there are no goals at {path}; "
-            f"run python -m affordlib.evaluation.goals --world {world}"
+            f"run python -m affordlib.evaluation.tasks --world {world}"
         )
     return [PlanningTask.from_json(plain) for plain in json.loads(path.read_text())["tasks"]]
 
@@ -181,7 +181,7 @@ def _draw_tasks(which: str, seed: int) -> list[PlanningTask]:
 def main(argv: Sequence[str] | None = None) -> int:
     """Draw the goals of Table 3 and freeze them in a file, which is never written over."""
     parser = argparse.ArgumentParser(
-        prog="python -m affordlib.evaluation.goals", description=main.__doc__
+        prog="python -m affordlib.evaluation.tasks", description=main.__doc__
     )
     parser.add_argument("--world", choices=tuple(FROZEN), default="clean")
     parser.add_argument("--seed", type=seed_type, default=0)
