@@ -1,0 +1,109 @@
+"""Jobs: what is there is not made again, what is stale is refused, a kill costs little."""
+
+from dataclasses import dataclass, replace
+
+import pytest
+from dask.distributed import Client
+
+from experiments import runner
+from experiments.runner import Job, frame, read, run
+
+CALLS = []
+
+
+def squares(n, resume_checkpoint=None):
+    """Rows of squares; killed once between its two halves, where `n` is among the deadly."""
+    CALLS.append(n)
+    if n in DEADLY and not resume_checkpoint.exists():
+        resume_checkpoint.write_text("half")
+        raise KeyboardInterrupt
+    return {"rows": [{"k": k, "square": k * k / 3} for k in range(n)]}
+
+
+DEADLY = set()
+
+
+def job(n, **change):
+    return Job(squares, {"n": n}, data=("grasp",), checkpoints=("push_film",), **change)
+
+
+@pytest.fixture(autouse=True)
+def clean():
+    CALLS.clear()
+    DEADLY.clear()
+
+
+def test_a_killed_run_goes_on_where_it_was(tmp_path):
+    DEADLY.add(3)
+    jobs = [job(n) for n in (1, 2, 3, 4)]
+    with pytest.raises(KeyboardInterrupt):
+        run(jobs, "table", folder=tmp_path, progress=False)
+    assert [arguments["n"] for arguments, _ in read("table", job, tmp_path)] == [1, 2]
+    assert len(list(tmp_path.glob("*.pt"))) == 1 == len(list(tmp_path.glob(".*.pt")))
+    results = run(jobs, "table", folder=tmp_path, progress=False)
+    assert CALLS == [1, 2, 3, 3, 4]
+    assert not list(tmp_path.glob(".*.pt"))
+    assert run(jobs[::-1], "table", folder=tmp_path, progress=False) == results[::-1]
+    assert len(CALLS) == 5
+    assert results[1] == {"rows": [{"k": 0, "square": 0.0}, {"k": 1, "square": 0.333333}]}
+    table = frame(read("table", job, tmp_path), "rows")
+    assert table.groupby("n")["square"].max().to_dict() == {1: 0, 2: 0.333333, 3: 1.33333, 4: 3}
+
+
+@dataclass(frozen=True)
+class Settings:
+    rate: float = 0.1
+    device: str = "cpu"
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"version": 2}, "version"),
+        ({"settings": Settings(rate=0.2)}, "settings"),
+        ({"settings": (Settings(), "more")}, "settings"),
+        ({"data": ("drag",)}, "data"),
+        ({"checkpoints": ("push_cnp",)}, "checkpoints"),
+    ],
+)
+def test_what_was_made_of_something_else_is_refused_and_made_again(tmp_path, change, named):
+    def before(n):
+        return job(n, settings=Settings())
+
+    def now(n):
+        return replace(before(n), **change)
+
+    first = run([before(2)], "table", folder=tmp_path, progress=False)
+    with pytest.raises(ValueError, match=f"table: the result of {{'n': 2}} .* another {named}"):
+        read("table", now, tmp_path)
+    assert read("table", now, tmp_path, accept=True)[0][1] == first[0]
+    assert read("table", now, tmp_path)
+    with pytest.raises(ValueError, match=f"another {named}"):
+        read("table", before, tmp_path)
+    assert CALLS == [2]
+    run([before(2)], "table", folder=tmp_path, progress=False)
+    assert CALLS == [2, 2]
+    assert read("table", lambda n: job(n, settings=Settings(device="cuda")), tmp_path)
+
+
+def test_a_data_set_that_is_not_here_is_not_compared(tmp_path, monkeypatch):
+    run([job(2)], "table", folder=tmp_path, progress=False)
+    whole = (tmp_path / "table.jsonl.gz").read_bytes()
+
+    def not_here(name):
+        raise FileNotFoundError(name)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(runner, "stored_sha256", not_here)
+        assert read("table", job, tmp_path, accept=True)
+    assert (tmp_path / "table.jsonl.gz").read_bytes() == whole
+    assert read("table", job, tmp_path)
+
+
+def test_workers_make_the_same_bytes(tmp_path):
+    jobs = [job(n) for n in range(1, 5)]
+    run(jobs, "table", folder=tmp_path / "here", progress=False)
+    with Client(processes=False, dashboard_address=None, n_workers=1) as client:
+        run(jobs[::-1], "table", client, tmp_path / "away", progress=False)
+    here, away = (tmp_path / side / "table.jsonl.gz" for side in ("here", "away"))
+    assert here.read_bytes() == away.read_bytes()
