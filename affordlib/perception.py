@@ -8,7 +8,7 @@ table, as a map is read.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy import ndimage
@@ -20,14 +20,6 @@ CAMERA_HEIGHT_M = 1.0
 _ROUND = 0.8
 """Curvature times radius above which a top counts as round: 1 for a sphere, 0 for a box."""
 _FALL_M = 0.01
-
-
-@dataclass(frozen=True)
-class Percept:
-    """Where the robot believes the object to be, (x, y) [m], and its image (2, 48, 48)."""
-
-    xy_m: tuple[float, float]
-    image: np.ndarray
 
 
 def heights_m(image: np.ndarray) -> np.ndarray:
@@ -107,7 +99,7 @@ def centre_m(mask: np.ndarray) -> tuple[float, float]:
     return float((columns.mean() - middle) * pixel), float((middle - rows.mean()) * pixel)
 
 
-def aim(primitive: Primitive, image: np.ndarray) -> Primitive:
+def adapt_to_object(primitive: Primitive, image: np.ndarray) -> Primitive:
     """The primitive as it suits the object in the image; what was given is kept.
 
     A drag closes its fingers across the axis, a grasp goes by the height.

@@ -128,6 +128,20 @@ def check_on_table(name: str, xy_m: Any) -> tuple[float, float]:
 
 
 @dataclass(frozen=True)
+class Observation:
+    """What the robot sees of the object at rest, its arm parked.
+
+    xy_m: estimated position (x, y) [m] in the frame of the table; image: (2, 48, 48), depth [m]
+    from a plane 1 m above the table and the object's mask, centred there; std_m: σ of the
+    position, where it is known.
+    """
+
+    xy_m: tuple[float, float]
+    image: np.ndarray
+    std_m: float | None = None
+
+
+@dataclass(frozen=True)
 class Interaction:
     """What happened when a primitive was executed on one object.
 

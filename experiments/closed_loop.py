@@ -151,7 +151,12 @@ def _can_be_lifted(world: Tabletop, trial: Trial, went: ClosedLoopResult) -> boo
 
     def lifts(grip_yaw: float) -> bool:
         world.place(trial.thing, went.goal.xy_m, went.end_pose[2])
-        return bool(world.attempt(Grasp(grip_yaw=grip_yaw)).effect[:, 2].max() >= high)
+        return bool(
+            world.execute_primitive(Grasp(grip_yaw=grip_yaw), record_unreachable=True)
+            .effect[:, 2]
+            .max()
+            >= high
+        )
 
     return went.reached or any(map(lifts, GRIPPER_YAWS_RAD))
 

@@ -33,7 +33,7 @@ def filmed(title: str, stop: bool) -> list[np.ndarray]:
     with Tabletop() as world:
         world.place(BOX, (0.0, 0.0), 0.3)
         planner = Skills.load().planner(plan_continuous, mode="single_partial")
-        plan = planner(world.look(), world.object_pose()[:2], GOAL)
+        plan = planner(world.depth_image(), world.object_pose()[:2], GOAL)
         turned = 0.3 + plan.steps[0].predicted_turn_rad
         if not stop:
             plan = replace(plan, steps=(replace(plan.steps[0], stop_phase=1.0),))

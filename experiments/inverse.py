@@ -40,7 +40,9 @@ def execute(data: xr.Dataset, interactions: np.ndarray, theta_rad: np.ndarray) -
             thing, yaw, _ = draw_scene(recipe, int(index))
             config = draw_world(recipe, int(index), thing)
             world.place(thing, (0.0, 0.0), yaw, config=config)
-            effects.append(world.attempt(Push(float(theta))).effect[-1])
+            effects.append(
+                world.execute_primitive(Push(float(theta)), record_unreachable=True).effect[-1]
+            )
     return np.array(effects)
 
 

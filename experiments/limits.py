@@ -69,7 +69,9 @@ def floor() -> Rows:
                 bias = NUDGE_M * np.array([math.cos(side), math.sin(side)])
                 amiss = replace(config, bias_m=tuple(bias))
                 world.place(thing, (0.0, 0.0), yaw + sign * NUDGE_RAD, config=amiss)
-                done = world.attempt(Push(float(data["theta"][k]))).effect[-1]
+                done = world.execute_primitive(
+                    Push(float(data["theta"][k])), record_unreachable=True
+                ).effect[-1]
                 moved[k, r] = math.dist(done[:2], told[:2])
                 ended[k, r] = math.dist(done[:2], told[:2] + bias)
                 turned[k, r] = abs(done[3] - told[3])

@@ -52,10 +52,10 @@ class SimulatorModel:
             if len(t) == 1:
                 # A part of an action is re-timed to its own stop: it is carried out as such.
                 effects.append(
-                    self.world.interact(action, float(t[0])).rest_effect[None, [0, 1, 3]]
+                    self.world.execute_primitive(action, float(t[0])).rest_effect[None, [0, 1, 3]]
                 )
                 continue
-            seen = self.world.interact(action)
+            seen = self.world.execute_primitive(action)
             columns = [np.interp(t, seen.phase, seen.effect[:, c]) for c in (0, 1, 3)]
             effects.append(np.column_stack(columns))
         mean = torch.from_numpy(np.stack(effects)).float()

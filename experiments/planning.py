@@ -67,7 +67,7 @@ def attempt(
     """
     task.set_up(world)
     world.looks = looks
-    seen = world.perceive()
+    seen = world.observe()
     plan = planner(seen.image, seen.xy_m, task.goal, task.mode)
     if nudged:
         side = NUDGE_M * np.array([math.cos(task.yaw_rad), math.sin(task.yaw_rad)])

@@ -39,7 +39,7 @@ def run_trial(table: str, index: int, planner: str, world: Tabletop, about: Skil
     """
     trial = draw_trial(table, index)
     world.place(trial.thing, trial.start_xy_m, trial.yaw_rad)
-    plan = about.planner(PLANNERS[planner])(world.look(), trial.start_xy_m, trial.goal)
+    plan = about.planner(PLANNERS[planner])(world.depth_image(), trial.start_xy_m, trial.goal)
     record: dict[str, Any] = {
         "planner": planner,
         "object_class": trial.thing.family,

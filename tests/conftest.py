@@ -61,7 +61,7 @@ def skills():
 @pytest.fixture(scope="session")
 def cuboid_image(one_world):
     one_world.place(Cuboid(0.06, 0.05, 0.05), (0.0, 0.0), 0.3, config=WorldConfig())
-    return np.array(one_world.look())
+    return np.array(one_world.depth_image())
 
 
 @pytest.fixture(scope="session")

@@ -97,7 +97,7 @@ def planned() -> dict[str, list[float]]:
     with Tabletop() as world:
         for k, task in enumerate((some[1] + some[2])[:N_GOALS]):
             task.set_up(world)
-            seen = world.perceive()
+            seen = world.observe()
             kind = skills.kind_for(seen.image)
             effects = EffectMap(skills.model(kind), seen.image, kind)
             problem = PlanningProblem(seen.xy_m, task.goal, effects, task.mode)

@@ -31,7 +31,7 @@ FAMILIES = (Cuboid, UprightCylinder, LyingCylinder)
 def one_round(world: Tabletop, planner, thing, start, goal: Goal) -> str:
     """Look, plan and execute; the hash of the object's path."""
     world.place(thing, start)
-    seen = world.perceive()
+    seen = world.observe()
     try:
         outcome = execute_plan(world, planner(seen.image, seen.xy_m, goal))
     except UnreachableError:

@@ -28,7 +28,7 @@ def test_corrections_bring_it_nearer(world, film):
         asked.append(goal.tolerance_m)
         return plan_continuous(problem_of(film, image, xy, goal, "single_partial"))
 
-    plan = plan_astar(problem_of(film, world.look(), (0.0, 0.0), goal))
+    plan = plan_astar(problem_of(film, world.depth_image(), (0.0, 0.0), goal))
     open_loop = execute_plan(world, plan)
     world.place(BOX, (0.0, 0.0), 0.3)
     closed = execute_plan(world, plan, 2, replan)
@@ -47,7 +47,7 @@ def test_many_looks_see_better(world):
     scatter = []
     for world.looks in (1, 8):
         world.place(BOX, (0.1, 0.1), 0.4, config=WorldConfig(camera="kinect"))
-        scatter.append(np.std([world.perceive().xy_m for _ in range(40)], axis=0).mean())
+        scatter.append(np.std([world.observe().xy_m for _ in range(40)], axis=0).mean())
     assert 2 < scatter[0] / scatter[1] < 4
 
 
@@ -66,7 +66,7 @@ def test_an_attempt_leaves_the_eye_as_it_was(world, film):
 def test_what_is_held_is_not_corrected(world, skills):
     world.place(Cuboid(0.06, 0.05, 0.05))
     planner = skills.planner(plan_continuous)
-    plan = planner(world.look(), (0.0, 0.0), Goal((0.05, 0.0), height_m=0.12))
+    plan = planner(world.depth_image(), (0.0, 0.0), Goal((0.05, 0.0), height_m=0.12))
     assert plan.steps[-1].primitive.holds
     done = execute_plan(world, plan, 2, planner)
     assert len(done.object_paths_xy_m) == len(plan.steps)
@@ -112,7 +112,7 @@ def test_what_was_done_before_the_arm_refused_is_kept(world, monkeypatch):
     can = Step(Push(math.pi), 1.0, (0.05, 0.0), np.zeros((2, 2)))
     cannot = Step(Grasp(), 1.0, (0.05, 0.0), np.zeros((2, 2)))
     plan = Plan(Goal((0.1, 0.0)), (0.0, 0.0), (can, can, cannot), "by hand", True, 0, 0.0)
-    follow = world.follow
+    follow = world.execute
 
     def follow_pushes(step):
         if step is can:

@@ -114,7 +114,7 @@ def test_the_loop_goes_as_near_as_the_goal_asks(table, skills):
 @pytest.mark.parametrize("xy", [(0.0, 0.7), (-0.5, 0.0), (-0.48, -0.68), (0.68, 0.0)])
 def test_a_goal_without_room_for_the_object_is_refused(table, skills, xy):
     table.place(BOX, (0.0, 0.0), 0.3)
-    image, pose, moved = table.look(), table.object_pose(), []
+    image, pose, moved = table.depth_image(), table.object_pose(), []
     for plan in (plan_astar, plan_continuous, plan_gradient):
         with pytest.raises(ValueError, match="too near the rim of the table"):
             plan(problem_of(skills.model(Push), image, (0.0, 0.0), Goal(xy)))
@@ -129,7 +129,7 @@ def test_a_goal_without_room_for_the_object_is_refused(table, skills, xy):
 
 def test_ways_and_plans_keep_the_whole_object_on_the_table(table, skills):
     table.place(BOX, (0.5, 0.66), 0.3)
-    effects = skills.effects(table.look())
+    effects = skills.effects(table.depth_image())
     assert effects.radius_m == pytest.approx(math.hypot(0.03, 0.025), abs=0.004)
 
     def anywhere(xy, *_):
@@ -170,11 +170,11 @@ def test_the_kinematics_agrees_with_what_execution_refuses(table):
         assert steps == []
         if not said:
             with pytest.raises(UnreachableError):
-                table.interact(action, stop, approach=True)
+                table.execute_primitive(action, stop, approach=True)
             assert steps == []
             refused += 1
         elif rng.random() < 0.3:
-            table.interact(action, stop, approach=True)
+            table.execute_primitive(action, stop, approach=True)
     table.film = None
     assert refused > 10
 
@@ -334,7 +334,7 @@ def test_a_knock_in_the_middle_of_an_action_follows_mechanics(table):
         Goal((0.1, 0.0), EXACT_M), [Disturbance("knock", 0, 0.0, 0.4, at_s=2.0)]
     )
     with script.during(table, 0):
-        table.interact(Push.towards(0.0), 0.8, approach=True)
+        table.execute_primitive(Push.towards(0.0), 0.8, approach=True)
     assert len(script.happened) == 1
     assert table.object_pose()[1] > 0.02
     assert table.film is None

@@ -39,7 +39,7 @@ def test_one_look_is_enough_for_position_turn_and_height(world, skills, plan, th
     world.place(thing, yaw_rad=0.3)
     z = world.object_state()[2]
     goal = Goal((0.07, 0.06), turn_rad=0.8, height_m=0.1)
-    found = skills.planner(plan)(world.look(), (0.0, 0.0), goal)
+    found = skills.planner(plan)(world.depth_image(), (0.0, 0.0), goal)
     assert found.reaches_goal
     kinds = [type(step.primitive) for step in found.steps]
     assert kinds[0] is (Drag if thing is LOG else Push)
@@ -56,7 +56,7 @@ def test_one_look_is_enough_for_position_turn_and_height(world, skills, plan, th
 def test_a_turn_backwards_goes_round_in_several_rotations(world, skills):
     world.place(TUBE)
     goal = Goal((0.0, 0.0), turn_rad=-2.5)
-    found = skills.planner(plan_astar)(world.look(), (0.0, 0.0), goal)
+    found = skills.planner(plan_astar)(world.depth_image(), (0.0, 0.0), goal)
     assert found.reaches_goal
     assert found.evaluations == 0  # it stands where it should: nothing is expanded
     assert [type(step.primitive) for step in found.steps] == [Rotate] * len(found.steps)
@@ -71,10 +71,10 @@ def test_what_is_foreseen_turns_with_the_object(world, skills):
     """A push that turns the box by an angle, or a look at the box turned by it: the same end."""
     goal, turned = Goal((0.0, 0.0), turn_rad=1.2, height_m=0.1), 0.35
     world.place(BOX, yaw_rad=0.2)
-    before = poses_of(skills, world.look())(goal, (0.0, 0.0), turned_rad=turned)
+    before = poses_of(skills, world.depth_image())(goal, (0.0, 0.0), turned_rad=turned)
     world.place(BOX, yaw_rad=0.2 + turned)
     rest = Goal((0.0, 0.0), turn_rad=1.2 - turned, height_m=0.1)
-    after = poses_of(skills, world.look())(rest, (0.0, 0.0))
+    after = poses_of(skills, world.depth_image())(rest, (0.0, 0.0))
     assert [type(step.primitive) for step in before] == [Rotate, Grasp]
     for a, b in zip(before, after, strict=True):
         assert a.predicted_turn_rad - turned == pytest.approx(b.predicted_turn_rad, abs=0.04)
@@ -84,7 +84,7 @@ def test_what_is_foreseen_turns_with_the_object(world, skills):
 
 def test_a_grasp_takes_an_object_as_the_rotation_left_it(world, skills):
     world.place(BOX, yaw_rad=0.3)
-    turn, lift = poses_of(skills, world.look())(
+    turn, lift = poses_of(skills, world.depth_image())(
         Goal((0.0, 0.0), turn_rad=0.9, height_m=0.1), (0.0, 0.0)
     )
     left_at = turn.primitive.path(turn.stop_phase)[0, 3]
@@ -96,12 +96,12 @@ def test_a_grasp_takes_an_object_as_the_rotation_left_it(world, skills):
 def test_a_plan_that_cannot_turn_or_lift_says_so(world, skills, plan):
     world.place(BOX)
     planner = skills.planner(plan)
-    assert planner(world.look(), (0.0, 0.0), Goal((0.05, 0.0))).reaches_goal
-    high = planner(world.look(), (0.0, 0.0), Goal((0.05, 0.0), height_m=0.45))
+    assert planner(world.depth_image(), (0.0, 0.0), Goal((0.05, 0.0))).reaches_goal
+    high = planner(world.depth_image(), (0.0, 0.0), Goal((0.05, 0.0), height_m=0.45))
     assert not high.reaches_goal
     assert high.steps  # as far as it goes
     goal = Goal((0.05, 0.0), height_m=0.1)
-    alone = plan(problem_of(skills.model(Push), world.look(), (0.0, 0.0), goal))
+    alone = plan(problem_of(skills.model(Push), world.depth_image(), (0.0, 0.0), goal))
     assert not alone.reaches_goal  # nobody has told this planner how to lift
     assert alone.predicted_distance_m <= 0.02
 
@@ -137,7 +137,7 @@ def test_a_search_goes_on_where_the_end_cannot_be_had(film, cuboid_image):
 
 def test_an_arm_that_cannot_turn_there_is_not_planned_with(world, skills):
     world.place(BOX)
-    finish = poses_of(skills, world.look())
+    finish = poses_of(skills, world.depth_image())
     goal = Goal((0.0, 0.0), turn_rad=0.5, height_m=0.05)
     assert finish(goal, (0.0, 0.0)) is not None
     assert finish(goal, (0.7, 0.7)) is None  # beyond the arm's reach, as it has learned

@@ -246,7 +246,9 @@ def test_a_disturbance_waits_for_the_end_of_the_action(make_picker, world):
         assert world.object_pose() == before
         goal = tell()
         seen.append((before, world.object_pose(), goal))
-        return open_loop(world, planner(world.look(), world.object_pose()[:2], goal), planner, tell)
+        return open_loop(
+            world, planner(world.depth_image(), world.object_pose()[:2], goal), planner, tell
+        )
 
     picker = make_picker(executors={"mine": executor}, seed=3)
     first_goal = picker.plan.goal

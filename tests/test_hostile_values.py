@@ -77,7 +77,7 @@ def shop(one_world, skills, pushes, tmp_path_factory):
     plan = Plan(goal, (0.0, 0.0), (step,), "by hand", True, 1, 0.0)
     one_world.config = world.WorldConfig()
     one_world.place(box, (0.0, 0.0), 0.3)
-    image, folder = one_world.look(), tmp_path_factory.mktemp("hostile")
+    image, folder = one_world.depth_image(), tmp_path_factory.mktemp("hostile")
     film = show.FrameRecorder(1, 16, 16)
     film(one_world)
     return {
@@ -95,7 +95,7 @@ def shop(one_world, skills, pushes, tmp_path_factory):
         "network": models.build(config, normaliser),
         "outcome": Outcome(plan, 0.01, (0.04, 0.02, 0.0), 0.0, (path,)),
         "folder": folder,
-        "seen": one_world.interact(Push(0.0)),
+        "seen": one_world.execute_primitive(Push(0.0)),
         "film": film,
         "pursuit": planning.run_closed_loop(
             one_world, goal, skills, config=planning.ClosedLoopConfig(max_actions=1)
@@ -162,11 +162,13 @@ def valid_calls(shop):
             w.place,
             {"thing": shop["thing"], "xy_m": at, "yaw_rad": 0.0, "tool": "gripper", "config": None},
         ),
-        "interact": (on_table(w.interact), {"primitive": Push(0.0), "stop_phase": 0.5}),
-        "attempt": (on_table(w.attempt), {"primitive": Push(0.0), "stop_phase": 0.5}),
-        "follow": (on_table(w.follow), {"step": shop["step"]}),
-        "follow_path": (
-            on_table(w.follow_path),
+        "execute_primitive": (
+            on_table(w.execute_primitive),
+            {"primitive": Push(0.0), "stop_phase": 0.5},
+        ),
+        "execute": (on_table(w.execute), {"step": shop["step"]}),
+        "execute_path": (
+            on_table(w.execute_path),
             {
                 "path_xy_m": np.array([[-0.1, 0.0], [0.0, 0.0]]),
                 "primitive": None,
@@ -177,7 +179,7 @@ def valid_calls(shop):
             on_table(w.can_reach),
             {"primitive": Push(0.0), "stop_phase": 1.0, "at_xy_m": at},
         ),
-        "look_from": (on_table(w.look_from), {"xy_m": at, "turn_rad": 0.0}),
+        "depth_image_from": (on_table(w.depth_image_from), {"xy_m": at, "turn_rad": 0.0}),
         "picture": (w.picture, {"width": 32, "height": 32}),
         "mark": (
             on_table(w.mark),
@@ -421,8 +423,8 @@ NAMES = re.findall(
     r"\S+",
     """
 Goal Step Plan Push Push.towards Push.path Drag Grasp Rotate LeverUp primitive_named Cuboid
-UprightCylinder LyingCylinder Sphere Prism family_named WorldConfig Tabletop place interact
-attempt follow follow_path can_reach look_from picture mark shove knock topple settle Normaliser
+UprightCylinder LyingCylinder Sphere Prism family_named WorldConfig Tabletop place execute_primitive
+execute execute_path can_reach depth_image_from picture mark shove knock topple settle Normaliser
 from_dataset open_interactions split_interactions Recipe Variation collect CNPConfig
 FiLMConfig build Ensemble TrainingConfig coverage fit_temperature
 load_checkpoint save_checkpoint observe_actions train train_literal PlanMode Disturbance

@@ -142,7 +142,7 @@ def test_any_turn_of_a_real_object_turns_the_answer_of_the_trained_model(name, t
     for degrees in (0, 11, 33, 45, 62, 78, 90):
         turn_rad = math.radians(degrees)
         world.place(thing, (0.0, 0.0), 0.3 + turn_rad)
-        image = torch.from_numpy(np.array(world.look()))[None]
+        image = torch.from_numpy(np.array(world.depth_image()))[None]
         pushed = [Push(theta + turn_rad) for theta in np.linspace(0, 6, 24)]
         effect = model.predict(
             model.encode(image), observe_actions(model, pushed), torch.ones(24, 1)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from affordlib.perception import (
-    aim,
+    adapt_to_object,
     long_axis_rad,
     looks_fallen,
     looks_rollable,
@@ -27,9 +27,9 @@ CLEAN = WorldConfig()
 
 def _seen(world, thing, yaw=0.3, xy=(0.0, 0.0), **config):
     world.place(thing, xy, yaw, config=WorldConfig(**config))
-    percept = world.perceive()
+    observation = world.observe()
     world.place(thing, xy, yaw, config=CLEAN)
-    return percept
+    return observation
 
 
 @pytest.mark.parametrize("family", FAMILIES.values(), ids=lambda f: f.family)
@@ -55,15 +55,15 @@ def test_a_fallen_cylinder_is_known_to_roll(world):
     """Pushed above its centre, a slender cylinder topples."""
     high = WorldConfig(tip_offset_m=0.06, table_friction=1.0)
     world.place(UprightCylinder(0.034, 0.11), config=high)
-    before = world.look()
+    before = world.depth_image()
     assert not world.object_rolls()
     assert not looks_rollable(before)
-    seen = world.interact(Push.towards(0.0))
+    seen = world.execute_primitive(Push.towards(0.0))
     assert seen.fell
     assert seen.rolls
     assert world.object_fell()
     assert world.object_rolls()
-    after = world.look()
+    after = world.depth_image()
     assert looks_fallen(before, after)
     assert looks_rollable(after)
     assert not looks_fallen(before, before)
@@ -71,10 +71,10 @@ def test_a_fallen_cylinder_is_known_to_roll(world):
 
 def test_actions_suit_what_is_seen(world):
     image = _seen(world, LyingCylinder(0.07, 0.05), 0.6).image
-    assert aim(Drag(1.0), image).grip_yaw == pytest.approx(0.6, abs=0.03)
-    assert aim(Drag(1.0, grip_yaw=0.1), image).grip_yaw == pytest.approx(0.1)
-    assert aim(Grasp(), image).seen_height == pytest.approx(0.05, abs=0.002)
-    assert aim(Push(1.0), image) == Push(1.0)
+    assert adapt_to_object(Drag(1.0), image).grip_yaw == pytest.approx(0.6, abs=0.03)
+    assert adapt_to_object(Drag(1.0, grip_yaw=0.1), image).grip_yaw == pytest.approx(0.1)
+    assert adapt_to_object(Grasp(), image).seen_height == pytest.approx(0.05, abs=0.002)
+    assert adapt_to_object(Push(1.0), image) == Push(1.0)
 
 
 @pytest.mark.parametrize(
@@ -85,9 +85,9 @@ def test_a_kinect_finds_the_object_anywhere(world, thing):
     errors = []
     for k in range(12):
         xy = rng.uniform([-0.3, -0.5], [0.5, 0.5])
-        percept = _seen(world, thing, 0.4, tuple(xy), camera="kinect", noise_seed=k)
-        errors.append(math.dist(percept.xy_m, xy))
-        height = 1.0 - percept.image[0][percept.image[1] > 0]
+        observation = _seen(world, thing, 0.4, tuple(xy), camera="kinect", noise_seed=k)
+        errors.append(math.dist(observation.xy_m, xy))
+        height = 1.0 - observation.image[0][observation.image[1] > 0]
         assert np.quantile(height, 0.9) == pytest.approx(thing.height_m, abs=0.012)
     assert 0.0001 < np.median(errors) < 0.003
     assert max(errors) < 0.008

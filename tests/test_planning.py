@@ -142,7 +142,7 @@ def test_astar_expands_nothing_out_of_reach():
 def test_an_effect_map_says_what_the_model_says(world, film, kind):
     world.place(Cuboid(0.07, 0.05, 0.05), (0.0, 0.0), 0.4)
     model = film if kind is Push else MODEL
-    effects = EffectMap(model, world.look(), kind)
+    effects = EffectMap(model, world.depth_image(), kind)
     rng = np.random.default_rng(0)
     direction = torch.from_numpy(rng.uniform(-7, 7, 40))
     phase = torch.from_numpy(rng.uniform(0.3, 1, 40))
@@ -166,7 +166,7 @@ def test_an_effect_map_says_what_the_model_says(world, film, kind):
 def test_a_chain_turns_with_the_object(world, film):
     """Rolling out two pushes at once is asking for the second of the turned object."""
     world.place(Cuboid(0.07, 0.05, 0.05), (0.0, 0.0), 0.4)
-    effects = EffectMap(film, world.look())
+    effects = EffectMap(film, world.depth_image())
     direction, phase = torch.tensor([[0.3, 1.2]]).double(), torch.tensor([[1.0, 0.9]]).double()
     positions, turns, variances = roll_out(effects, direction, phase)
     first, _ = effects(direction[:, 0], phase[:, 0])
@@ -295,7 +295,7 @@ def test_a_plan_is_carried_out(world, trained):
     world.place(Cuboid(0.06, 0.05, 0.05), (0.0, 0.0), 0.0)
     start = world.object_pose()[:2]
     goal = Goal((0.15, 0.0))
-    outcome = execute_plan(world, plan_astar(problem_of(trained, world.look(), start, goal)))
+    outcome = execute_plan(world, plan_astar(problem_of(trained, world.depth_image(), start, goal)))
     assert outcome.distance_m == pytest.approx(goal.distance_m(world.object_pose()[:2]))
     assert outcome.distance_m < goal.tolerance_m + 0.005  # 15 mm: A* is content within 2 cm
     assert len(outcome.object_paths_xy_m) == len(outcome.plan.steps) == 2
@@ -309,7 +309,7 @@ def test_a_decoded_path_is_followed(world):
     """A decoded path that is the push's own gives what the push gives."""
     thing, push, stop = Cuboid(0.06, 0.05, 0.05), Push(2.2), 0.85
     world.place(thing, (0.0, 0.0), 0.3)
-    own = world.interact(push, stop, approach=True)
+    own = world.execute_primitive(push, stop, approach=True)
     plan = plan_astar(problem_of(MODEL, IMAGE, (0, 0), Goal((0.08, 0.0))))
     from dataclasses import replace
 
@@ -318,7 +318,7 @@ def test_a_decoded_path_is_followed(world):
         plan.steps[0], primitive=push, stop_phase=stop, path_xy_m=push.path(phase)[:, :2]
     )
     world.place(thing, (0.0, 0.0), 0.3)
-    decoded = world.follow(step)
+    decoded = world.execute(step)
     np.testing.assert_allclose(decoded.rest_effect[:2], own.rest_effect[:2], atol=0.001)
 
 

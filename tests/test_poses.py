@@ -40,7 +40,7 @@ def test_a_partial_grasp_ends_holding_at_the_height(world, skills, height):
 def test_what_is_held_stays_in_the_hand(world, thing, stop):
     """Over 10 s; held by friction alone it slips by up to 3 mm."""
     world.place(thing, (0.02, 0.01), 0.3)
-    world.interact(Grasp(), stop, approach=True)
+    world.execute_primitive(Grasp(), stop, approach=True)
     held = world.object_state()[2]
     for _ in range(10):
         world.settle(1.0)
@@ -82,7 +82,7 @@ def test_the_part_that_cannot_be_had_is_named(world, skills):
     went = run_closed_loop(world, Goal((0.0, 0.0), EXACT_M, height_m=0.4), skills)
     assert (went.status, went.steps) == ("unreachable", ())
     assert "the height: 40.0 cm" in went.message
-    image = world.look()
+    image = world.depth_image()
     assert plan_lift(skills.model(Grasp), image, (0, 0), 0.4) is None
     step = plan_turn(skills.model(Rotate), image, (0, 0), 0.5)
     assert step.predicted_turn_rad == pytest.approx(0.5)
@@ -99,20 +99,22 @@ def test_a_turned_hand_before_a_turned_thing_is_the_same(world, skills):
         world.place(BOX, yaw_rad=0.3 + turn)
         angles = [turn + 0.2]
         foreseen.append(
-            predict_trajectories(skills.model(Rotate), world.look(), Rotate(), "yaw", angles).mean
+            predict_trajectories(
+                skills.model(Rotate), world.depth_image(), Rotate(), "yaw", angles
+            ).mean
         )
     np.testing.assert_allclose(*foreseen, atol=math.radians(1.5))
 
 
 def test_the_hand_takes_what_it_can_hold(world, skills):
     world.place(DISC, yaw_rad=0.6)
-    step = plan_lift(skills.model(Grasp), world.look(), (0.0, 0.0), 0.15)
-    assert world.attempt(Grasp()).effect[-1, 2] < 0.01
+    step = plan_lift(skills.model(Grasp), world.depth_image(), (0.0, 0.0), 0.15)
+    assert world.execute_primitive(Grasp(), record_unreachable=True).effect[-1, 2] < 0.01
     world.place(DISC, yaw_rad=0.6)
-    assert world.follow(step).rest_effect[2] == pytest.approx(0.15, abs=0.005)
+    assert world.execute(step).rest_effect[2] == pytest.approx(0.15, abs=0.005)
     assert step.primitive.grip_yaw != 0
     world.place(DISC, yaw_rad=0.6)
-    assert plan_lift(skills.model(Grasp), world.look(), (0.0, 0.0), 0.15, [0.0]) is None
+    assert plan_lift(skills.model(Grasp), world.depth_image(), (0.0, 0.0), 0.15, [0.0]) is None
 
 
 @pytest.mark.parametrize("degrees", [-25, 30, 75])

@@ -121,18 +121,18 @@ def test_a_hundred_dragged_objects_stay(world):
 
 def test_a_pushed_ball_rolls_away_and_a_dragged_one_does_not(world):
     world.place(Sphere(0.06), config=CLEAN)
-    pushed = world.interact(Push.towards(0.0))
+    pushed = world.execute_primitive(Push.towards(0.0))
     world.place(Sphere(0.06))
-    dragged = world.interact(Drag.towards(0.0))
+    dragged = world.execute_primitive(Drag.towards(0.0))
     assert pushed.rest_effect[0] > 0.15
     assert dragged.rest_effect[0] == pytest.approx(0.05, abs=0.001)
 
 
 def test_grasps_lift_what_fits_and_leave_what_does_not(world):
     world.place(Cuboid(0.05, 0.05, 0.06), config=CLEAN)
-    small = world.interact(Grasp())
+    small = world.execute_primitive(Grasp())
     world.place(Cuboid(0.118, 0.118, 0.06))
-    large = world.interact(Grasp())
+    large = world.execute_primitive(Grasp())
     assert small.success
     assert small.rest_effect[2] == pytest.approx(Grasp.lift_m, abs=0.01)
     assert not large.success
@@ -144,18 +144,18 @@ def test_grasps_lift_what_fits_and_leave_what_does_not(world):
 def test_a_partial_grasp_ends_holding(world):
     grasp = Grasp(0.06)
     world.place(Cuboid(0.05, 0.05, 0.06), config=CLEAN)
-    part = world.interact(grasp, 0.75)
+    part = world.execute_primitive(grasp, 0.75)
     raised = grasp.path(0.75)[0, 2] - grasp.path(0.4)[0, 2]
     assert part.rest_effect[2] == pytest.approx(raised, abs=0.003)
 
 
 def test_a_rotation_turns_by_its_sweep(world):
     world.place(Cuboid(0.06, 0.05, 0.05), config=CLEAN)
-    seen = world.interact(Rotate())
+    seen = world.execute_primitive(Rotate())
     assert seen.rest_effect[3] == pytest.approx(Rotate.sweep_rad, abs=0.02)
     assert math.hypot(*seen.rest_effect[:2]) < 0.004
     world.place(Cuboid(0.06, 0.05, 0.05))
-    half_way = world.interact(Rotate(), float(np.mean(Rotate().leg_phases[2:4])))
+    half_way = world.execute_primitive(Rotate(), float(np.mean(Rotate().leg_phases[2:4])))
     assert half_way.rest_effect[3] == pytest.approx(Rotate.sweep_rad / 2, abs=0.02)
 
 
@@ -176,7 +176,7 @@ def test_the_image_of_a_lever_up_turns_with_its_direction(world):
         c, s = math.cos(yaw), math.sin(yaw)
         lever = LeverUp.at_edge(prism.footprint_m @ np.array([[c, s], [-s, c]]), 1)
         world.place(prism, (0.0, 0.0), yaw, tool="screwdriver", config=LEVERING)
-        images.append(world.interact(lever, 0.0).image)
+        images.append(world.execute_primitive(lever, 0.0).image)
         assert images[-1].shape == (2, 128, 128)
     assert (images[0][1] != images[1][1]).mean() < 0.01
     # The contact is in the middle: the object begins there and lies to the right.
@@ -188,7 +188,7 @@ def test_the_image_of_a_lever_up_turns_with_its_direction(world):
 def test_the_arm_says_which_tool_it_needs(world):
     world.place(Cuboid(0.05, 0.05, 0.05), config=CLEAN)
     with pytest.raises(ValueError, match=r"'lever_up' needs the tool 'screwdriver'.*place\("):
-        world.interact(LeverUp(-0.03, 0.0, 0.0, 0.06))
+        world.execute_primitive(LeverUp(-0.03, 0.0, 0.0, 0.06))
     with pytest.raises(ValueError, match=r"tool must be one of .* got 'hammer'"):
         world.place(Cuboid(0.05, 0.05, 0.05), tool="hammer")
 
@@ -204,7 +204,7 @@ def test_stopped_anywhere_it_rests_where_the_full_one_was(world, name, smooth):
         interact(recipe, index, world, stop_phase=0.0)
         thing, start = world.thing, full.start_pose
         world.place(thing, start[:2], start[2], config=recipe.world)
-        part = world.interact(full.primitive, stop, smooth=smooth)
+        part = world.execute_primitive(full.primitive, stop, smooth=smooth)
         lost = name == "grasp" and not full.success
         (slipped if lost else held).append(math.dist(part.rest_effect[:3], then[:3]))
     assert len(held) >= 4
@@ -222,7 +222,7 @@ def test_what_the_arm_cannot_reach_is_recorded_and_moves_nothing(world):
     for index in range(60):
         _, seen = interact(recipe, index, world, stop_phase=0.0)
         world.place(world.thing, seen.start_pose[:2], seen.start_pose[2])
-        seen = world.attempt(seen.primitive)
+        seen = world.execute_primitive(seen.primitive, record_unreachable=True)
         offset = np.array([*seen.start_pose[:2], 0, 0, 0])
         path = seen.primitive.path(np.linspace(0, 1, 40)) + offset
         found.append(seen.reached)
@@ -231,7 +231,7 @@ def test_what_the_arm_cannot_reach_is_recorded_and_moves_nothing(world):
         else:
             assert not seen.effect.any()
             with pytest.raises(UnreachableError):
-                world.interact(seen.primitive)
+                world.execute_primitive(seen.primitive)
     assert 1 <= found.count(False) <= 30
 
 
@@ -245,7 +245,7 @@ def _has_posture(pose):
 
 def test_a_push_over_the_edge_is_an_outcome_and_no_fault(world):
     world.place(Cuboid(0.06, 0.06, 0.06), (0.1, 0.66), config=CLEAN)
-    seen = world.interact(Push.towards(math.pi / 2))
+    seen = world.execute_primitive(Push.towards(math.pi / 2))
     assert seen.left_table
     assert not seen.faults
 
@@ -256,7 +256,7 @@ def test_mass_off_the_centre_turns_a_push_and_not_the_frame(world):
         config = WorldConfig(com_offset_m=(0.0, offset, 0.0))
         world.place(Cuboid(0.06, 0.08, 0.05), (0.05, 0.1), 0.0, config=config)
         np.testing.assert_allclose(world.object_pose(), (0.05, 0.1, 0.0), atol=1e-9)
-        seen = world.interact(Push.towards(0.0))
+        seen = world.execute_primitive(Push.towards(0.0))
         np.testing.assert_allclose(seen.effect[0, :4], 0.0, atol=1e-6)
         turned.append(seen.effect[-1, 3])
     assert abs(turned[1]) > abs(turned[0]) + 0.01
@@ -265,7 +265,7 @@ def test_mass_off_the_centre_turns_a_push_and_not_the_frame(world):
 
 def test_a_biased_robot_places_its_action_beside(world):
     world.place(UprightCylinder(0.06, 0.05), (0.0, 0.0), config=WorldConfig(bias_m=(0.0, 0.004)))
-    seen = world.interact(Push.towards(0.0))
+    seen = world.execute_primitive(Push.towards(0.0))
     assert seen.believed_xy_m == pytest.approx((0.0, 0.004))
     assert seen.tool[-1, 1] == pytest.approx(0.0, abs=1e-3)  # relative to the believed centre
     assert 0.002 < seen.rest_effect[1] < 0.006

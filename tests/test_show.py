@@ -27,7 +27,7 @@ def test_a_film_shows_the_robot_move(world, tmp_path):
         film.encoded()
     world.film = film
     try:
-        world.interact(Push(1.0))
+        world.execute_primitive(Push(1.0))
     finally:
         world.film = None
     assert len(film.frames) == 5
@@ -50,7 +50,7 @@ def test_a_footprint_is_drawn_where_the_object_is(world, trained):
     np.testing.assert_allclose(outline[:-1].mean(axis=0), [10.0, -5.0], atol=1e-9)
     world.place(Cuboid(0.06, 0.05, 0.05))
     outcome = execute_plan(
-        world, plan_astar(problem_of(trained, world.look(), (0.0, 0.0), Goal((0.12, 0.0))))
+        world, plan_astar(problem_of(trained, world.depth_image(), (0.0, 0.0), Goal((0.12, 0.0))))
     )
     assert "mm from the goal" in plot_outcome(ax, outcome).get_title(loc="left")
     plt.close(figure)

@@ -44,7 +44,7 @@ def test_both_poses_of_a_cylinder_are_told_apart(rolls, world):
         told = []
         for pose in (UprightCylinder(diameter, length), LyingCylinder(length, diameter)):
             world.place(pose, (0.0, 0.0), 0.3)
-            told.append(float(model(torch.from_numpy(np.array(world.look()))[None])))
+            told.append(float(model(torch.from_numpy(np.array(world.depth_image()))[None])))
         assert told[0] < 0.5 < told[1]
 
 

@@ -15,7 +15,7 @@ from affordlib.world import Cuboid
 @pytest.fixture
 def push(world):
     world.place(Cuboid(0.07, 0.05, 0.05), (0.02, -0.01), 0.4)
-    return world.interact(Push.towards(0.6))
+    return world.execute_primitive(Push.towards(0.6))
 
 
 @pytest.fixture

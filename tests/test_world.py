@@ -63,7 +63,7 @@ def test_inverse_kinematics_agrees_with_the_description():
 def test_a_push_ends_beyond_the_gripper(world, thing):
     """The gripper stops 5 cm past the centre, so the object ends at 5 cm plus half its extent."""
     world.place(thing, (0.0, 0.0), 0.0)
-    seen = world.interact(Push.towards(0.0))
+    seen = world.execute_primitive(Push.towards(0.0))
     half, finger = np.ptp(thing.footprint_m[:, 0]) / 2, 0.01
     if isinstance(thing, UprightCylinder):  # it sinks in between the fingers, 3 cm apart
         half = math.sqrt(half**2 - 0.015**2)
@@ -80,9 +80,9 @@ def test_a_stopped_push_rests_where_the_full_push_was(world):
     for k, stop in enumerate((0.65, 0.75, 0.85, 0.95)):
         push = Push(1.0 + k)
         world.place(THINGS[k % 2], (0.0, 0.0), 0.3)
-        full = world.interact(push)
+        full = world.execute_primitive(push)
         world.place(THINGS[k % 2], (0.0, 0.0), 0.3)
-        part = world.interact(push, stop)
+        part = world.execute_primitive(push, stop)
         then = [np.interp(stop, full.phase, full.effect[:, c]) for c in range(2)]
         gaps.append(np.hypot(*(part.rest_effect[:2] - then)))
     assert np.median(gaps) < 0.0005
@@ -91,9 +91,9 @@ def test_a_stopped_push_rests_where_the_full_push_was(world):
 
 def test_approach_changes_nothing_that_matters(world):
     world.place(THINGS[0], (0.05, -0.1), 0.4)
-    put = world.interact(Push(2.0))
+    put = world.execute_primitive(Push(2.0))
     world.place(THINGS[0], (0.05, -0.1), 0.4)
-    moved = world.interact(Push(2.0), approach=True)
+    moved = world.execute_primitive(Push(2.0), approach=True)
     np.testing.assert_allclose(moved.rest_effect[:2], put.rest_effect[:2], atol=5e-4)
     end = np.array(world.object_pose()[:2])
     np.testing.assert_allclose(end, np.array([0.05, -0.1]) + moved.rest_effect[:2], atol=1e-5)
@@ -103,7 +103,7 @@ def test_approach_changes_nothing_that_matters(world):
 @pytest.mark.parametrize("xy", [(0.0, 0.0), (0.21, -0.33)])
 def test_camera_measures_the_object(world, thing, xy):
     world.place(thing, xy, 0.5)
-    depth, mask = world.look()
+    depth, mask = world.depth_image()
     pixel = CROP_WIDTH_M / IMAGE_PIXELS
     x, y = thing.footprint_m.T
     true_area = 0.5 * abs(np.dot(x, np.roll(y, 1)) - np.dot(y, np.roll(x, 1)))
@@ -120,9 +120,9 @@ def test_camera_measures_the_object(world, thing, xy):
 
 def test_a_quarter_turn_of_the_table_is_a_quarter_turn_of_the_image(world):
     world.place(THINGS[0], (0.0, 0.0), 0.35)
-    image = world.look()
+    image = world.depth_image()
     world.place(THINGS[0], (0.0, 0.0), 0.35 + math.pi / 2)
-    assert np.abs(np.rot90(image[1]) - world.look()[1]).mean() < 0.002
+    assert np.abs(np.rot90(image[1]) - world.depth_image()[1]).mean() < 0.002
 
 
 _HASH = (
@@ -148,7 +148,7 @@ def test_unreachable_raises_and_moves_nothing(world):
     world.place(THINGS[0], (0.45, 0.5), 0.0)
     before = world.object_state()
     with pytest.raises(UnreachableError, match="cannot reach"):
-        world.interact(Push(math.pi / 4), approach=True)
+        world.execute_primitive(Push(math.pi / 4), approach=True)
     assert world.object_state() == before
 
 
@@ -167,7 +167,7 @@ def test_unreachable_raises_and_moves_nothing(world):
         (lambda w: Goal((0.1, math.nan)), "goal xy_m must be two finite numbers"),
         (lambda w: Goal((0.1, 0.1), tolerance_m=-1), "Goal.tolerance_m .* -1"),
         (lambda w: w.place(THINGS[0], (0.0, 2.0)), "xy_m = .* off the table"),
-        (lambda w: w.interact(Push(0.0), 1.5), "stop_phase .* 1.5"),
+        (lambda w: w.execute_primitive(Push(0.0), 1.5), "stop_phase .* 1.5"),
         (lambda w: WorldConfig(table_friction=-1), "table_friction .* -1"),
     ],
 )
@@ -179,7 +179,7 @@ def test_bad_input_is_named(world, act, words):
 
 def test_an_empty_table_says_so():
     with Tabletop() as empty, pytest.raises(RuntimeError, match=r"call place\(\.\.\.\) first"):
-        empty.interact(Push(0.0))
+        empty.execute_primitive(Push(0.0))
 
 
 def test_a_shoved_object_moves_turns_and_rests(world):
@@ -216,7 +216,7 @@ def test_what_lies_can_be_toppled_again(world):
 def test_another_tool_follows_no_path(world):
     world.place(Cuboid(0.06, 0.05, 0.05), tool="screwdriver")
     with pytest.raises(ValueError, match="holds the screwdriver"):
-        world.follow_path(np.array([[-0.2, 0.0], [0.0, 0.0]]))
+        world.execute_path(np.array([[-0.2, 0.0], [0.0, 0.0]]))
     world.place(Cuboid(0.06, 0.05, 0.05))
 
 
@@ -226,10 +226,10 @@ def test_the_fingers_are_tied_only_while_they_close_or_hold(world):
 
     world.place(LyingCylinder(0.08, 0.05))
     for theta in (0.0, math.pi):
-        world.interact(Drag(theta), approach=True)
+        world.execute_primitive(Drag(theta), approach=True)
         assert gears() == 0
     for _ in range(2):
-        world.interact(Grasp(), approach=True)
+        world.execute_primitive(Grasp(), approach=True)
         assert gears() == 1
         world.park()
         assert gears() == 0
@@ -238,7 +238,7 @@ def test_the_fingers_are_tied_only_while_they_close_or_hold(world):
 @pytest.mark.parametrize("thing", [*THINGS, LyingCylinder(0.05, 0.07)])
 def test_what_is_held_is_put_down_and_not_dropped(world, thing):
     world.place(thing, (0.05, 0.1))
-    world.interact(Grasp(), 0.7, approach=True)
+    world.execute_primitive(Grasp(), 0.7, approach=True)
     held, heights = world.object_state(), []
     assert held[2] > thing.height_m / 2 + 0.05
     world.film = lambda world: heights.append(world.object_state()[2])
@@ -278,7 +278,7 @@ def test_a_log_that_was_dragged_and_let_go_stays(world, thing, yaw_rad, drags):
     """Unbraked, these roll on by 9 cm to 2 m."""
     world.place(thing, yaw_rad=yaw_rad)
     for theta, stop in drags:
-        world.interact(Drag(theta), stop, approach=True)
+        world.execute_primitive(Drag(theta), stop, approach=True)
     before = world.object_pose()[:2]
     world.settle(10.0)
     assert math.dist(before, world.object_pose()[:2]) < 5e-4
@@ -286,9 +286,9 @@ def test_a_log_that_was_dragged_and_let_go_stays(world, thing, yaw_rad, drags):
 
 def test_a_refused_action_looks_once(world, monkeypatch):
     looks = []
-    monkeypatch.setattr(world, "perceive", lambda: looks.append(1) or Tabletop.perceive(world))
+    monkeypatch.setattr(world, "observe", lambda: looks.append(1) or Tabletop.observe(world))
     world.place(THINGS[0], (0.45, 0.5))
-    assert not world.attempt(Push(math.pi / 4)).reached
+    assert not world.execute_primitive(Push(math.pi / 4), record_unreachable=True).reached
     assert len(looks) == 1
 
 
@@ -311,7 +311,7 @@ def test_a_world_is_built_anew_before_bullet_has_kept_too_much(world, monkeypatc
     monkeypatch.setattr(scene, "OBJECTS_PER_BUILD", world._placed + 2)
     for _ in range(3):
         world.place(UprightCylinder(0.05, 0.06), (0.1, 0.1))
-        world.interact(Push(0.3))
+        world.execute_primitive(Push(0.3))
         states.append(world.object_state())
     assert len(built) == 1
     assert states[0] == states[1] == states[2]
@@ -331,6 +331,6 @@ def test_an_arm_that_cannot_go_on_from_where_it_feels_the_object_stays_there(wor
         return path(*args)
 
     monkeypatch.setattr(robot, "joint_path", until_begun)
-    seen = world.attempt(Grasp(seen_height=0.03))
+    seen = world.execute_primitive(Grasp(seen_height=0.03), record_unreachable=True)
     assert seen.reached
     assert seen.faults == ("off_path",)

@@ -128,7 +128,7 @@ def constructed_tasks(
             for _ in range(rng.integers(2, MODES[mode].max_steps + 1) if mode[0] == "m" else 1):
                 stop = rng.uniform(EARLIEST_STOP, 1.0) if MODES[mode].partial else 1.0
                 action = kind.towards(_off_grid(rng, direction, math.pi / 4))
-                seen = world.interact(action, stop, approach=True)
+                seen = world.execute_primitive(action, stop, approach=True)
                 believed &= not (seen.faults or seen.fell or seen.left_table)
             x, y, _ = world.object_pose()
             if math.hypot(x, y) > MIN_DISTANCE_M and believed:

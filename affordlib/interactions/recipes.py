@@ -245,4 +245,4 @@ def interact(
     config = draw_world(recipe, index, thing)
     world.place(thing, draw_place(recipe, index), yaw, tool=action.tool, config=config)
     stop = draw_stop(recipe, index) if stop_phase is None else stop_phase
-    return thing, world.attempt(action, stop)
+    return thing, world.execute_primitive(action, stop, record_unreachable=True)

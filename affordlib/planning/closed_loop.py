@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from affordlib.perception import Percept, aim, looks_fallen
+from affordlib.perception import adapt_to_object, looks_fallen
 from affordlib.planning.continuous import plan_continuous
 from affordlib.planning.disturbances import Disturbance, DisturbanceSchedule
 from affordlib.planning.grasp_rotate import (
@@ -32,6 +32,7 @@ from affordlib.types import (
     Goal,
     Interaction,
     NothingSeenError,
+    Observation,
     Outcome,
     Plan,
     Step,
@@ -102,14 +103,14 @@ def execute_plan(
 
     for step in plan.steps:
         try:
-            paths.append(path_on_table(world.follow(step)))
+            paths.append(path_on_table(world.execute(step)))
         except UnreachableError as error:
             error.outcome = measured()
             raise
     held = bool(plan.steps) and plan.steps[-1].primitive.holds
     for _ in range(0 if held else corrections):
         try:
-            seen = world.perceive()
+            seen = world.observe()
         except NothingSeenError:
             break
         off = plan.goal.distance_m(seen.xy_m)
@@ -122,7 +123,7 @@ def execute_plan(
             break
         if not world.can_reach(steps[0].primitive, steps[0].stop_phase):
             break
-        paths.append(path_on_table(world.follow(steps[0])))
+        paths.append(path_on_table(world.execute(steps[0])))
     return measured()
 
 
@@ -233,7 +234,7 @@ class _ClosedLoop:
         self.places: list[tuple[float, float]] = []
         self.plan: Plan | None = None  # that is followed
         self.queue: list[Step] = []
-        self.seen: Percept | None = None
+        self.seen: Observation | None = None
         self.renewals = RENEWALS
         self.planned_for: Goal | None = None
         self.expected: tuple[float, float] | None = None
@@ -308,13 +309,13 @@ class _ClosedLoop:
         if off > SURPRISE_M or moved or fell:
             self.queue = []
 
-    def _perceived(self) -> Percept:
+    def _perceived(self) -> Observation:
         try:
-            return self.world.perceive()
+            return self.world.observe()
         except NothingSeenError:
             raise Ended("lost", f"no object is seen on the table, after {self._count()}") from None
 
-    def _surprise(self, before: Percept | None) -> tuple[float, bool]:
+    def _surprise(self, before: Observation | None) -> tuple[float, bool]:
         """How far the object is from where it should be [m], and whether it has fallen."""
         off = math.inf if self.expected is None else math.dist(self.expected, self.seen.xy_m)
         return off, before is not None and looks_fallen(before.image, self.seen.image)
@@ -344,7 +345,7 @@ class _ClosedLoop:
         self.planned_for, self.expected = self.goal, step.predicted_end_xy_m
         with self.script.during(self.world, len(self.steps)):
             try:
-                self.paths.append(path_on_table(self.world.follow(step)))
+                self.paths.append(path_on_table(self.world.execute(step)))
             except UnreachableError as error:  # of what it sees now, a hair off what it agreed to
                 raise Ended("unreachable", f"the {part}: {error}") from error
         self.steps.append(step)
@@ -409,7 +410,7 @@ class _ClosedLoop:
             step = plan(yaws)
             if step is None:
                 break
-            asked = aim(step.primitive, self.seen.image)
+            asked = adapt_to_object(step.primitive, self.seen.image)
             if self.world.can_reach(asked, step.stop_phase, self.seen.xy_m):
                 kind, at = step.primitive.name, self.seen.xy_m
                 self._follow(Plan(self.goal, at, (step,), kind, False, len(grip_yaws), 0.0))

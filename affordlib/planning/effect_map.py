@@ -41,7 +41,7 @@ def checked_image(image: np.ndarray) -> torch.Tensor:
     if image.shape != (len(IMAGE_CHANNELS), IMAGE_PIXELS, IMAGE_PIXELS):
         raise ValueError(
             f"image must have the shape (2, {IMAGE_PIXELS}, {IMAGE_PIXELS}) that "
-            f"Tabletop.look() gives, got {image.shape}"
+            f"Tabletop.depth_image() gives, got {image.shape}"
         )
     return torch.from_numpy(image)[None]
 

@@ -22,7 +22,7 @@ import torch
 
 from affordlib.models.frame import turn_image
 from affordlib.models.protocol import EffectModel, observe_actions
-from affordlib.perception import aim
+from affordlib.perception import adapt_to_object
 from affordlib.planning.effect_map import checked_image
 from affordlib.primitives import Grasp, Rotate, wrap_angle
 from affordlib.types import Goal, Step, check_finite, check_pair, check_within
@@ -79,7 +79,9 @@ def predict_trajectories(
     turn = torch.tensor([[math.cos(yaw), -math.sin(yaw)] for yaw in grip_yaws])
     seen = model.encode(turn_image(checked_image(image), turn))
     t = torch.linspace(0, 1, SAMPLES).expand(len(turn), -1)
-    observed = observe_actions(model, [replace(aim(primitive, image), grip_yaw=0.0)] * len(turn))
+    observed = observe_actions(
+        model, [replace(adapt_to_object(primitive, image), grip_yaw=0.0)] * len(turn)
+    )
     told = model.predict(seen, observed, t)
     k = model.effect_channels.index(channel)
     mean, std = (v[:, :, k].double().numpy() for v in (told.effect_mean, told.effect_std))

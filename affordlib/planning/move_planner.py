@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from affordlib.perception import Percept
 from affordlib.planning.effect_map import EffectMap
 from affordlib.planning.problem import (
     PlanMode,
@@ -21,7 +20,7 @@ from affordlib.planning.problem import (
 from affordlib.planning.routes import CELL_M, Feasible, find_route, places
 from affordlib.planning.skills import Skills
 from affordlib.primitives import Primitive
-from affordlib.types import Goal, Plan, Step
+from affordlib.types import Goal, Observation, Plan, Step
 
 if TYPE_CHECKING:
     from affordlib.world import Tabletop
@@ -57,7 +56,7 @@ class MovePlanner:
         self._barred: list[tuple[str, np.ndarray, float]] = []
         self._barred_moves: dict[str, list[tuple[int, int, int]]] = {}
 
-    def steps(self, seen: Percept, goal: Goal, so_far: str) -> list[Step]:
+    def steps(self, seen: Observation, goal: Goal, so_far: str) -> list[Step]:
         """The steps of a plan, from where the object is seen, that the arm can follow.
 
         Raises `Ended` where there is none; so_far: what to say has been done.
@@ -91,7 +90,7 @@ class MovePlanner:
         return list(plan.steps)
 
     def _plan_along(
-        self, effects: EffectMap, seen: Percept, goal: Goal, way: list[tuple[float, float]]
+        self, effects: EffectMap, seen: Observation, goal: Goal, way: list[tuple[float, float]]
     ) -> Plan | None:
         """A plan that goes as far along a way as it can, straight ahead if a way leads on."""
         here, ahead = np.array(seen.xy_m), np.subtract(goal.xy_m, seen.xy_m)
@@ -116,7 +115,7 @@ class MovePlanner:
         return None
 
     def _plan_to(
-        self, effects: EffectMap, seen: Percept, aim: Goal, within_m: float
+        self, effects: EffectMap, seen: Observation, aim: Goal, within_m: float
     ) -> Plan | None:
         """A plan that ends within a distance of a goal and that the kinematics lets pass."""
         kind = effects.kind
@@ -164,7 +163,7 @@ class MovePlanner:
         self._barred.append((action.name, np.array(xy_m), action.direction_rad))
 
     def _way(
-        self, effects: EffectMap, seen: Percept, goal: Goal
+        self, effects: EffectMap, seen: Observation, goal: Goal
     ) -> list[tuple[float, float]] | None:
         """Places on the way to a goal, every action of it checked by the kinematics."""
         kind = effects.kind

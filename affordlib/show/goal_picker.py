@@ -206,7 +206,7 @@ class GoalPicker(Pictured, widgets.VBox):
             self._turn_from = self._pose[2]
             self._owed = draft is not None
             try:
-                plan = planner(self.world.look(), self._pose[:2], goal)
+                plan = planner(self.world.depth_image(), self._pose[:2], goal)
                 self.controls.say(plan_in_words(plan))
             finally:
                 self.plan, self.outcome = plan, None

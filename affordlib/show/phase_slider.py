@@ -27,7 +27,7 @@ class PhaseSlider(FigureWidget):
     def __init__(self, world: Tabletop, action: Primitive, phase: float = 0.8) -> None:
         self.world, self.action = world, action
         self._pose = world.object_pose()
-        self.full = world.interact(action)
+        self.full = world.execute_primitive(action)
         self.rest: dict[float, tuple[float, float, float]] = {}
         self._phase = widgets.FloatSlider(
             value=check_within("phase", phase, 0.0, 1.0),
@@ -55,7 +55,7 @@ class PhaseSlider(FigureWidget):
         """Put the object back, execute the action up to t, and show where the object rests."""
         x, y, yaw = self._pose
         self.world.place(self.world.thing, (x, y), yaw, tool=self.action.tool)
-        self.world.interact(self.action, self.phase)
+        self.world.execute_primitive(self.action, self.phase)
         self.rest[self.phase] = self.world.object_pose()
         self.refresh()
 

@@ -13,7 +13,7 @@ import numpy as np
 import pybullet
 
 from affordlib.primitives import TIP_HEIGHT_M, Grasp, Primitive
-from affordlib.types import Interaction, UnreachableError
+from affordlib.types import Interaction, Observation, UnreachableError
 from affordlib.world import robot
 from affordlib.world.motion import (
     HOVER_HEIGHT_M,
@@ -33,7 +33,7 @@ from affordlib.world.motion import (
 )
 
 if TYPE_CHECKING:
-    from affordlib.world.scene import Percept, Tabletop
+    from affordlib.world.scene import Tabletop
 
 SETTLE_STEPS = 120
 RETREAT_M = 0.02
@@ -118,7 +118,7 @@ def execute(
     way: list[Stretch],
     phase: np.ndarray,
     action: np.ndarray,
-    seen: Percept,
+    seen: Observation,
     approach: bool,
 ) -> Interaction:
     """Follow a way of stretches; phase (n,) and action (n, 5) are what shall be recorded."""
@@ -192,7 +192,9 @@ def put_down(world: Tabletop) -> None:
     drive.along(joint_move(world.arm, np.array(robot.HOME), 1.0), wide[[-1, -1]])
 
 
-def refused(world: Tabletop, primitive: Primitive, phase: np.ndarray, seen: Percept) -> Interaction:
+def refused(
+    world: Tabletop, primitive: Primitive, phase: np.ndarray, seen: Observation
+) -> Interaction:
     """The interaction that was out of the arm's reach: commanded, but nothing moved."""
     x, y, yaw = world.object_pose()
     return Interaction(
@@ -253,7 +255,7 @@ def _record(
     way: list[Stretch],
     phase: np.ndarray,
     action: np.ndarray,
-    seen: Percept,
+    seen: Observation,
     start: np.ndarray,
     drive: Drive,
     offset: np.ndarray,

@@ -14,7 +14,7 @@ import numpy as np
 import pybullet
 from scipy.spatial.transform import Rotation
 
-from affordlib.perception import Percept, aim
+from affordlib.perception import adapt_to_object
 from affordlib.primitives import DURATION_S, PUSH_GAP_M, LeverUp, Primitive, Push, min_jerk
 from affordlib.types import (
     LEVER_CROP_WIDTH_M,
@@ -22,6 +22,7 @@ from affordlib.types import (
     TABLE_X_M,
     TABLE_Y_M,
     Interaction,
+    Observation,
     Step,
     UnreachableError,
     check_array,
@@ -224,10 +225,10 @@ class Tabletop(Interventions):
         x, y, z = xyz_m
         return z > 0 and TABLE_X_M[0] <= x <= TABLE_X_M[1] and TABLE_Y_M[0] <= y <= TABLE_Y_M[1]
 
-    def perceive(self) -> Percept:
-        """Where the robot believes the object to be, and its image; the arm is parked.
+    def observe(self) -> Observation:
+        """The object's estimated position and its image; the arm must be parked.
 
-        The place is the mean of so many `looks`, the image the first of them.
+        The position is the mean over so many images (`looks`), the image is the first of them.
         """
         self._require_object()
         x, y, _ = self.object_pose()
@@ -239,13 +240,13 @@ class Tabletop(Interventions):
         x, y = x + self.config.bias_m[0], y + self.config.bias_m[1]
         if image is None:
             image = camera.depth_crop(self.client, (x, y))
-        return Percept((x, y), image)
+        return Observation((x, y), image)
 
-    def look(self) -> np.ndarray:
+    def depth_image(self) -> np.ndarray:
         """Depth [m] and mask (2, 48, 48) of the table around the object, the arm parked."""
-        return self.perceive().image
+        return self.observe().image
 
-    def look_from(self, xy_m: tuple[float, float], turn_rad: float) -> np.ndarray:
+    def depth_image_from(self, xy_m: tuple[float, float], turn_rad: float) -> np.ndarray:
         """Depth [m] and mask (2, 128, 128) around a point, the direction turn_rad to the right.
 
         xy_m: relative to the object, along the table's axes.
@@ -277,13 +278,14 @@ class Tabletop(Interventions):
         rgb = [check_within("rgb", share, 0.0, 1.0) for share in check_array("rgb", rgb, 3)]
         create_footprint(self.client, self.thing, (x, y), yaw_rad, (*rgb, 1.0), scale)
 
-    def interact(
+    def execute_primitive(
         self,
         primitive: Primitive,
         stop_phase: float = 1.0,
         *,
         approach: bool = False,
         smooth: bool = True,
+        record_unreachable: bool = False,
     ) -> Interaction:
         """Execute a primitive on the object up to a phase, and record what happens.
 
@@ -292,20 +294,30 @@ class Tabletop(Interventions):
         table brakes what rolls before and after what is recorded.
         The effect is recorded at `N_SAMPLES` phases in [0, stop_phase]. A partial action is the
         prefix of the path, re-timed to its own smooth stop, or with smooth=False cut off.
-        Raises UnreachableError when the arm cannot follow the path.
+        Raises UnreachableError when the arm cannot follow the path; with record_unreachable=True
+        the result is then an interaction in which nothing moved (`reached` is False).
         """
         primitive, phase, seen = self._look_before(primitive, stop_phase)
         way = motion.stretches(primitive, stop_phase, smooth)
-        return execute(self, primitive, way, phase, primitive.path(phase), seen, approach)
+        try:
+            return execute(self, primitive, way, phase, primitive.path(phase), seen, approach)
+        except UnreachableError:
+            if not record_unreachable:
+                raise
+            return refused(self, primitive, phase, seen)
 
     def _look_before(
         self, primitive: Primitive, stop_phase: float
-    ) -> tuple[Primitive, np.ndarray, Percept]:
+    ) -> tuple[Primitive, np.ndarray, Observation]:
         """The primitive aimed at what is seen, the phases to be recorded, and what is seen."""
         stop_phase = check_within("stop_phase", stop_phase, 0.0, 1.0)
         self._require_tool(primitive)
-        seen = self._percept_for(primitive)
-        return aim(primitive, seen.image), np.linspace(0.0, 1.0, N_SAMPLES) * stop_phase, seen
+        seen = self._observe_for(primitive)
+        return (
+            adapt_to_object(primitive, seen.image),
+            np.linspace(0.0, 1.0, N_SAMPLES) * stop_phase,
+            seen,
+        )
 
     def _require_tool(self, primitive: Primitive) -> None:
         if primitive.tool != self.tool:
@@ -320,13 +332,13 @@ class Tabletop(Interventions):
         """Whether the arm can carry out an action, with approach and way out; nothing moves.
 
         at_xy_m: where the object is (default: where it is seen; the action is then aimed at it, as
-        `interact` does). The answer is that of the kinematics by which `interact` plans.
+        `execute_primitive` does). The kinematics are those by which `execute_primitive` plans.
         """
         stop_phase = check_within("stop_phase", stop_phase, 0.0, 1.0)
         at_xy_m = None if at_xy_m is None else check_on_table("at_xy_m", at_xy_m)
         if at_xy_m is None:
-            seen = self.perceive()
-            at_xy_m, primitive = seen.xy_m, aim(primitive, seen.image)
+            seen = self.observe()
+            at_xy_m, primitive = seen.xy_m, adapt_to_object(primitive, seen.image)
         way = motion.stretches(primitive, stop_phase)
         try:
             plan_motion(primitive, way, place_offset(self, at_xy_m), approach=True)
@@ -339,30 +351,21 @@ class Tabletop(Interventions):
         put_down(self)
         self.settle()
 
-    def attempt(self, primitive: Primitive, stop_phase: float = 1.0) -> Interaction:
-        """As `interact`; where the arm cannot reach, an interaction in which nothing happened."""
-        primitive, phase, seen = self._look_before(primitive, stop_phase)
-        way = motion.stretches(primitive, stop_phase)
-        try:
-            return execute(self, primitive, way, phase, primitive.path(phase), seen, approach=False)
-        except UnreachableError:
-            return refused(self, primitive, phase, seen)
-
-    def _percept_for(self, primitive: Primitive) -> Percept:
+    def _observe_for(self, primitive: Primitive) -> Observation:
         """What the robot sees before it acts; a lever-up looks from the contact point."""
         if not isinstance(primitive, LeverUp):
-            return self.perceive()
+            return self.observe()
         self._require_object()
         contact = (primitive.contact_x, primitive.contact_y)
-        return Percept(self.object_pose()[:2], self.look_from(contact, primitive.theta))
+        return Observation(self.object_pose()[:2], self.depth_image_from(contact, primitive.theta))
 
-    def follow(self, step: Step) -> Interaction:
-        """Carry out a step of a plan, with approach: its decoded path if it has one."""
+    def execute(self, step: Step) -> Interaction:
+        """Execute a step of a plan, with approach: its decoded path if it has one."""
         if step.path_xy_m is None:
-            return self.interact(step.primitive, step.stop_phase, approach=True)
-        return self.follow_path(step.path_xy_m, step.primitive, step.stop_phase)
+            return self.execute_primitive(step.primitive, step.stop_phase, approach=True)
+        return self.execute_path(step.path_xy_m, step.primitive, step.stop_phase)
 
-    def follow_path(
+    def execute_path(
         self, path_xy_m: np.ndarray, primitive: Push | None = None, stop_phase: float = 1.0
     ) -> Interaction:
         """Move the gripper along a path (n, 2) [m] relative to the object, and record.
@@ -376,4 +379,4 @@ class Tabletop(Interventions):
         path_xy_m = check_array("path_xy_m", path_xy_m, 2)
         phase, action = motion.along_path(path_xy_m, primitive, stop_phase)
         way = [motion.stretch_along(action, phase, DURATION_S * float(min_jerk(phase[-1])))]
-        return execute(self, primitive, way, phase, action, self.perceive(), approach=True)
+        return execute(self, primitive, way, phase, action, self.observe(), approach=True)

@@ -11,12 +11,11 @@ import numpy as np
 import torch
 
 from affordlib.models import load_checkpoint
-from affordlib.perception import Percept
 from affordlib.planning import EffectMap, PlanningProblem, plan_continuous
 from affordlib.planning.grasp_rotate import predict_trajectory
 from affordlib.planning.rollout import roll_out
 from affordlib.primitives import Grasp, Push
-from affordlib.types import Goal, Plan, Step
+from affordlib.types import Goal, Observation, Plan, Step
 from affordlib.world import Cuboid, Prism, Tabletop, UprightCylinder
 from exercises.checking import Exercise, answered, asked
 
@@ -29,7 +28,7 @@ def _box_effects() -> EffectMap:
     """The effect map of the box of notebooks 06 and 07."""
     with Tabletop() as world:
         world.place(BOX, yaw_rad=YAW_RAD)
-        return EffectMap(load_checkpoint("push_film_x10")[0], world.look())
+        return EffectMap(load_checkpoint("push_film_x10")[0], world.depth_image())
 
 
 # 06 Planning
@@ -54,7 +53,7 @@ def _push_error_mm(choose: Callable[..., Any]) -> float:
             goal = far_m * np.array([math.cos(bearing), math.sin(bearing)])
             direction, phase = asked(choose, _box_effects(), goal)
             world.place(BOX, yaw_rad=YAW_RAD)
-            went = world.interact(Push.towards(float(direction)), float(phase))
+            went = world.execute_primitive(Push.towards(float(direction)), float(phase))
             off.append(math.dist(goal, went.rest_effect[:2]))
     return 1000 * float(np.mean(off))
 
@@ -74,21 +73,21 @@ def _shoved_mm(bring: Callable[..., Any], shove: tuple[float, float, float]) -> 
     model, _ = load_checkpoint("push_film_x10")
     goal, taken = Goal((0.16, 0.09)), []
 
-    def plan(seen: Percept) -> Plan:
+    def plan(seen: Observation) -> Plan:
         effects = EffectMap(model, seen.image)
         return plan_continuous(PlanningProblem(seen.xy_m, goal, effects))
 
     def act(step: Step) -> None:
         if len(taken) == MOST_ACTIONS:
             raise RuntimeError(f"no end after {MOST_ACTIONS} actions")
-        world.follow(step)
+        world.execute(step)
         taken.append(step)
         if len(taken) == 1:
             world.shove(*shove)
 
     with Tabletop() as world:
         world.place(BOX, yaw_rad=YAW_RAD)
-        answered(bring, world.perceive, plan, act)
+        answered(bring, world.observe, plan, act)
         return 1000 * goal.distance_m(world.object_pose()[:2])
 
 
@@ -99,9 +98,9 @@ def _lift_error_mm(stop_at: Callable[..., Any]) -> float:
     with Tabletop() as world:
         for height_m in (0.03, 0.09, 0.18):
             world.place(UprightCylinder(0.045, 0.06))
-            phase, course_m, _ = predict_trajectory(model, world.look(), Grasp(), "z")
+            phase, course_m, _ = predict_trajectory(model, world.depth_image(), Grasp(), "z")
             stop = float(asked(stop_at, height_m, phase, course_m))
-            off.append(abs(world.interact(Grasp(), stop).effect[-1, 2] - height_m))
+            off.append(abs(world.execute_primitive(Grasp(), stop).effect[-1, 2] - height_m))
     return 1000 * max(off)
 
 
@@ -117,7 +116,7 @@ def _looks() -> tuple[list[np.ndarray], list[np.ndarray]]:
         for k in range(80):
             thing = _house(rng) if k % 2 else (Cuboid, UprightCylinder)[k // 2 % 2].sample(rng)
             world.place(thing, yaw_rad=rng.uniform(-math.pi, math.pi))
-            images[k % 2].append(world.look())
+            images[k % 2].append(world.depth_image())
     return images
 
 

@@ -27,7 +27,9 @@ def _rest_cm(phase: float) -> float:
     """How far [cm] the box of notebook 01 has moved, pushed towards 0.6 rad up to a phase."""
     with Tabletop() as world:
         world.place(Cuboid(length=0.07, width=0.05, height=0.05), yaw_rad=0.4)
-        return 100 * float(np.hypot(*world.interact(Push.towards(0.6), phase).rest_effect[:2]))
+        return 100 * float(
+            np.hypot(*world.execute_primitive(Push.towards(0.6), phase).rest_effect[:2])
+        )
 
 
 # 02 Interactions

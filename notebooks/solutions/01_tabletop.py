@@ -16,7 +16,7 @@ def phase_for_5_cm():
     """A smooth stop leaves the object where the full push had it: read it off one recording."""
     with Tabletop() as world:
         world.place(Cuboid(length=0.07, width=0.05, height=0.05), yaw_rad=0.4)
-        full = world.interact(Push.towards(0.6))
+        full = world.execute_primitive(Push.towards(0.6))
     return float(np.interp(0.05, np.hypot(*full.effect[:, :2].T), full.phase))
 
 
