@@ -24,10 +24,8 @@ import numpy as np
 import xarray as xr
 
 from affordlib.commands import command, count_type, names_type, whole_type
-from affordlib.evaluation.baselines import BASELINES
+from affordlib.evaluation.baselines import BASELINES, baseline_predictions, logistic_predictions
 from affordlib.evaluation.predictions import (
-    baseline_predictions,
-    logistic_predictions,
     network_predictions,
     stored,
     summary,

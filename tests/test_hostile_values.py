@@ -400,10 +400,6 @@ def valid_calls(shop):
             {"about": shop["about"], "data": shop["test"], "interactions": np.arange(2)},
         ),
         "error_row": (evaluation.error_row, {"errors_m": np.array([0.1, 0.2])}),
-        "mean_length_errors_m": (
-            evaluation.mean_length_errors_m,
-            {"training": arrays, "test": arrays},
-        ),
         "save_plan": (save_plan, {"path": shop["folder"] / "p.json", "plan": plan}),
         "load_plan": (load_plan, {"path": shop["saved"]}),
         "write_results": (
@@ -432,7 +428,7 @@ sample_disturbances action_limit EffectMap PlanningProblem ClosedLoopConfig plan
 plan_continuous plan_gradient plan_turn plan_lift kind_for Skills execute_plan run_closed_loop
 closed_loop plot_depth plot_footprint plot_plan
 plot_outcome plot_table save_figure GoalPicker PhaseSlider FrameRecorder ConditioningExplorer
-error_row mean_length_errors_m save_plan load_plan write_results read_results results_table check
+error_row save_plan load_plan write_results read_results results_table check
 Split TrainingArrays AffordanceCNP FiLMNetwork calibration_rows train_model refuse_seen
 outline_in_lever_frame plot_levered plot_closed_loop show_animation
 """,

@@ -1,9 +1,5 @@
-"""The paper's tables as functions, and the baselines beside them."""
+"""Error statistics, baselines beside the models, their predictions, and planning tasks."""
 
-from affordlib.evaluation.metrics import (
-    error_row,
-    mean_length_errors_m,
-    refuse_seen,
-)
+from affordlib.evaluation.metrics import error_row, refuse_seen
 
-__all__ = ["error_row", "mean_length_errors_m", "refuse_seen"]
+__all__ = ["error_row", "refuse_seen"]

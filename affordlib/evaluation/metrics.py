@@ -1,14 +1,13 @@
-"""How good are the predicted effects? Errors, and a predictor without an image to beat."""
+"""Rows of error statistics, and the guard against testing a model on what it was trained on."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
-import torch
 import xarray as xr
 
-from affordlib.interactions.batches import TrainingArrays, check_numbers
+from affordlib.interactions.batches import check_numbers
 from affordlib.interactions.recipes import Recipe
 from affordlib.types import check_array
 
@@ -32,17 +31,6 @@ def error_row(errors_m: np.ndarray, **columns: Any) -> dict[str, Any]:
         "median_m": float(np.median(errors)),
         "p95_m": float(np.quantile(errors, 0.95)),
     }
-
-
-def mean_length_errors_m(training: TrainingArrays, test: TrainingArrays) -> torch.Tensor:
-    """Final position errors (N,) [m] of knowing only the direction and the mean length."""
-
-    def direction(arrays):
-        travel = arrays.action[:, -1, :2] - arrays.action[:, 0, :2]
-        return travel / travel.norm(dim=-1, keepdim=True)
-
-    length = (training.effect[:, -1, :2] * direction(training)).sum(dim=-1).mean()
-    return (length * direction(test) - test.effect[:, -1, :2]).norm(dim=-1)
 
 
 def refuse_seen(about: dict[str, Any], data: xr.Dataset, interactions: np.ndarray) -> None:
