@@ -1,4 +1,4 @@
-"""The simulator itself as the model: what a planner could do if it foresaw everything."""
+"""The simulator itself as the model: what a planner could do if it predicted everything."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from affordlib.types import Observations, Prediction
 from affordlib.world import Tabletop, Thing, WorldConfig
 
 N_DIRECTIONS, PHASE_STEP = 36, 0.025
-_STD_M = 1e-5
-WARY_RAD = math.radians(1.0)
-"""By how much a wary oracle takes the object to be turned otherwise than it is."""
+STD_M = 1e-5
+YAW_ERROR_RAD = math.radians(1.0)
+"""The error of the object's yaw that the risk-averse oracle allows for."""
 
 
 @dataclass
 class SimulatorModel:
-    """An `EffectModel` that carries the action out in a world of its own.
+    """An `EffectModel` that executes the action in a world of its own.
 
-    It knows the object, its pose and the physics; a model only sees an image.
+    It knows the object, its pose and the physics; a learned model only sees an image.
     """
 
     world: Tabletop
@@ -50,49 +50,47 @@ class SimulatorModel:
             self.world.place(self.thing, (0.0, 0.0), self.yaw_rad, config=self.config)
             action = self.kind.towards(math.atan2(y, x))
             if len(t) == 1:
-                # A part of an action is re-timed to its own stop: it is carried out as such.
-                effects.append(
-                    self.world.execute_primitive(action, float(t[0])).rest_effect[None, [0, 1, 3]]
-                )
-                continue
-            seen = self.world.execute_primitive(action)
-            columns = [np.interp(t, seen.phase, seen.effect[:, c]) for c in (0, 1, 3)]
-            effects.append(np.column_stack(columns))
+                # A partial action is re-timed to its own stop, so it is executed as such.
+                rest = self.world.execute_primitive(action, float(t[0])).rest_effect
+                effects.append(rest[None, [0, 1, 3]])
+            else:
+                done = self.world.execute_primitive(action)
+                columns = [np.interp(t, done.phase, done.effect[:, c]) for c in (0, 1, 3)]
+                effects.append(np.column_stack(columns))
         mean = torch.from_numpy(np.stack(effects)).float()
         action = observations.action[:, -1:].expand(-1, mean.shape[1], -1)
-        std = torch.full_like(mean, _STD_M)
-        return Prediction(action, torch.full_like(action, _STD_M), mean, std)
+        std = torch.full_like(mean, STD_M)
+        return Prediction(action, torch.full_like(action, STD_M), mean, std)
 
 
 def oracle_effects(
     imagined: Tabletop,
     world: Tabletop,
     image: np.ndarray,
-    kind: type[Push] | type[Drag],
-    config: WorldConfig,
-    wary: bool = False,
+    nominal_physics: bool = False,
+    risk_averse: bool = False,
 ) -> EffectMap:
-    """The effect map of the object that stands in a world, from actions in an imagined one.
+    """The effect map of the object in a world, from actions executed in an imagined world.
 
-    config: of the imagined one, in which the camera misses nothing. wary: its σ, else next to
-    nothing, is how much the effect changes with `WARY_RAD`.
+    nominal_physics: the imagined world has the mean frictions, masses and heights instead of this
+    world's; its camera has no error. risk_averse: σ, otherwise next to nothing, is the sensitivity
+    of the effect to `YAW_ERROR_RAD`.
     """
-    config = replace(config, camera="ideal", bias_m=(0.0, 0.0))
+    kind = Drag if world.object_rolls() else Push
+    physics = WorldConfig() if nominal_physics else world.config
+    config = replace(physics, camera="ideal", bias_m=(0.0, 0.0))
     model = SimulatorModel(imagined, world.thing, world.object_pose()[2], kind, config)
-    a_map = SensitiveMap if wary else EffectMap
-    return a_map(model, image, kind, N_DIRECTIONS, len(_phases(kind)))
+    phases = phases_of(kind, round((1 - kind.acts_from) / PHASE_STEP) + 1)
+    effect_map = SensitivityMap if risk_averse else EffectMap
+    return effect_map(model, image, kind, N_DIRECTIONS, len(phases))
 
 
-def _phases(kind: type[Push] | type[Drag]) -> torch.Tensor:
-    return phases_of(kind, round((1 - kind.acts_from) / PHASE_STEP) + 1)
-
-
-class SensitiveMap(EffectMap):
-    """A map whose σ is by how much the effects change with `WARY_RAD`."""
+class SensitivityMap(EffectMap):
+    """A map whose σ is how much the effects change with `YAW_ERROR_RAD`."""
 
     @cached_property
     def grid(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Effects and σ (D, T, 3) at the grid's directions and phases."""
         mean, _ = super().grid
         slope = (mean.roll(-1, 0) - mean.roll(1, 0)) / (4 * math.pi / self.n_directions)
-        return mean, WARY_RAD * slope.abs() + _STD_M
+        return mean, YAW_ERROR_RAD * slope.abs() + STD_M

@@ -1,54 +1,214 @@
-"""Table 3: plan to goals, carry the plans out, measure the distance that remains.
+"""Table 3: plan to goals, execute the plans, measure the distance that remains.
 
-Each planner is a variant: a planner, the models it sees, and how often it may correct itself. Its
-outcomes on the frozen goals are written, whole or not at all, as a part; the table is assembled
-from the parts that are there.
+Each row is a `PlannerConfig`. Its outcomes on the frozen goals are kept by the runner; the tables
+are drawn from all that are there.
 
-    python -m experiments.planning --variants continuous astar
+    python -m experiments.planning --configs continuous,astar
 """
 
 from __future__ import annotations
 
 import argparse
 import hashlib
-import json
 import math
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from functools import partial
-from pathlib import Path
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 from tqdm.auto import tqdm
 
-from affordlib.commands import command
+from affordlib.commands import command, count_type, names_type
 from affordlib.evaluation.metrics import error_row
-from affordlib.evaluation.predictions import rounded
-from affordlib.evaluation.tasks import FROZEN, ROLLABLE, STANDING, PlanningTask, frozen_tasks
-from affordlib.paths import repo_root, resolve_out_dir
-from affordlib.planning import PlanMode, execute_plan
-from affordlib.results import write_results, write_text_atomically
-from affordlib.types import Goal, Outcome, Plan
+from affordlib.evaluation.tasks import (
+    FROZEN,
+    GOAL_SOURCES,
+    ROLLABLE,
+    STANDING,
+    PlanningTask,
+    frozen_tasks,
+)
+from affordlib.models.checkpoint import load_checkpoint
+from affordlib.paths import repo_root
+from affordlib.planning import (
+    EffectMap,
+    PlanningProblem,
+    Skills,
+    execute_plan,
+    plan_astar,
+    plan_continuous,
+    plan_gradient,
+)
+from affordlib.planning.problem import PlanMode
+from affordlib.primitives import Push
+from affordlib.results import write_results
+from affordlib.types import Outcome, Plan
+from affordlib.workers import dask_client
 from affordlib.world import Tabletop, UnreachableError
 from experiments import reported
-from experiments.parts import pack, part_of
-from experiments.planners import VARIANTS
+from experiments.oracle import oracle_effects
+from experiments.runner import Job, read, run
 
-NUDGE_M, NUDGE_RAD = 0.001, math.radians(1.0)
-PARTS = "data/results/parts/planning"
-NAME = "planning"
-ORACLES = ("oracle", "varied_oracle")
-"""What tells what execution costs: plans with the simulator itself, as the world is."""
-
+POSITION_ERROR_M, YAW_ERROR_RAD = 0.001, math.radians(1.0)
 GROUPS = {"all": STANDING + ROLLABLE, "standing": STANDING, "rollable": ROLLABLE} | {
     name: (name,) for name in STANDING + ROLLABLE
 }
+FINE_PHASES = tuple(round(0.5 + 0.05 * k, 2) for k in range(1, 11))
 
-Planner = Callable[[np.ndarray, tuple[float, float], "Goal", str], Plan]
+Planner = Callable[..., Plan]
 """A planner as (image, start_xy_m, goal, mode) → Plan."""
+
+
+def plan_astar_fine(problem: PlanningProblem) -> Plan:
+    """A* with twice as many directions and stop phases, content within 5 mm instead of 20."""
+    problem = replace(problem, goal=replace(problem.goal, tolerance_m=0.005))
+    return plan_astar(problem, n_directions=72, stop_phases=FINE_PHASES)
+
+
+def plan_full(problem: PlanningProblem) -> Plan:
+    """The continuous planner without partial actions."""
+    return plan_continuous(replace(problem, mode=replace(problem.mode, partial=False)))
+
+
+VERSIONS: dict[Callable[..., Plan], int] = {
+    plan_astar: 1,
+    plan_astar_fine: 1,
+    plan_continuous: 1,
+    plan_full: 1,
+    plan_gradient: 1,
+}
+"""Raise one when the planner changes, or how its plans are executed, and its numbers do."""
+
+MODELS: dict[str, dict[str, str]] = {
+    "film_5000": {"push": "push_film_x10", "drag": "drag_film"},
+    "film_500": {"push": "push_film", "drag": "drag_film"},
+    "paper": {"push": "push_cnp"},
+    "lstm_tuned": {"push": "push_lstm"},
+    "film_5000_perturbed": {"push": "push_film_varied"},
+    "simulator": {},
+}
+"""Checkpoints by primitive. One without a model of drags is asked about stable objects only."""
+
+
+@dataclass(frozen=True)
+class PlannerConfig:
+    """A row of Table 3: a planner, its model, and the goals that it is asked for.
+
+    planner: a function of a `PlanningProblem`; arguments: its others. model: of `MODELS`; oracle:
+    the arguments of `oracle_effects`, where that is the simulator. execution: those of `attempt`.
+    world: whose frozen goals; sources: which of them; stride: every so-many-th of these.
+    """
+
+    planner: Callable[..., Plan]
+    model: str = "film_5000"
+    arguments: dict[str, Any] = field(default_factory=dict)
+    execution: dict[str, Any] = field(default_factory=dict)
+    oracle: dict[str, bool] = field(default_factory=dict)
+    world: str = "clean"
+    sources: tuple[str, ...] = ("constructed",)
+    stride: int = 1
+
+    @property
+    def checkpoints(self) -> dict[str, str]:
+        """Of its model by primitive; in the perturbed world, where nothing rolls, of pushes."""
+        files = MODELS[self.model]
+        return files if self.world == "clean" else {k: v for k, v in files.items() if k == "push"}
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """The categories of objects that it is asked about."""
+        drags = "drag" in self.checkpoints or self.model == "simulator"
+        return STANDING + ROLLABLE if drags and self.world == "clean" else STANDING
+
+    def chosen(self, tasks: Sequence[PlanningTask]) -> list[int]:
+        """Which of some tasks it is asked, by number."""
+        fitting = [
+            number
+            for number, task in enumerate(tasks)
+            if task.goals in self.sources and task.thing.family in self.classes
+        ]
+        return fitting[:: self.stride]
+
+    def columns(self) -> dict[str, Any]:
+        """What a row of the table says of it."""
+        samples = {plan_astar: 5, plan_astar_fine: len(FINE_PHASES)}
+        return {
+            "planner": self.planner.__name__.removeprefix("plan_"),
+            "model": self.model,
+            "world": self.world,
+            "samples": self.arguments.get("samples", samples.get(self.planner)),
+            "closed_loop": self.execution.get("corrections", 0) > 0,
+            "perturbed_start": self.execution.get("perturbed_start", False),
+        }
+
+    def make(self, world: Tabletop) -> Planner:
+        """The planner for a world, which nothing but the simulator as a model looks into."""
+        models = {kind: load_checkpoint(name)[0] for kind, name in self.checkpoints.items()}
+        skills, imagined = Skills(models), None if models else Tabletop()
+
+        def plan(image, start_xy_m, goal, mode) -> Plan:
+            if imagined:
+                effects = oracle_effects(imagined, world, image, **self.oracle)
+            else:
+                kind = skills.kind_for(image) if "drag" in models else Push
+                effects = EffectMap(skills.model(kind), image, kind)
+            return self.planner(PlanningProblem(start_xy_m, goal, effects, mode), **self.arguments)
+
+        return plan
+
+
+ALL = {"sources": GOAL_SOURCES}
+CORRECTED = {"execution": {"corrections": 2}}
+ON_RING = {"samples": 100, "starts": 4, "direction_only": True}
+PERTURBED = {"model": "film_5000_perturbed", "world": "perturbed"}
+ORACLE = {"model": "simulator"}
+CONFIGS: dict[str, PlannerConfig] = {
+    # Our planner and A* on our best model.
+    "continuous": PlannerConfig(plan_continuous, **ALL),
+    "continuous_corrected": PlannerConfig(plan_continuous, **CORRECTED, **ALL),
+    "astar": PlannerConfig(plan_astar, **ALL),
+    "astar_fine": PlannerConfig(plan_astar_fine, **ALL),
+    "astar_corrected": PlannerConfig(plan_astar, **CORRECTED, **ALL),
+    # The paper's planners on its own network.
+    "astar_paper": PlannerConfig(plan_astar, "paper", **ALL),
+    "gradient_25": PlannerConfig(plan_gradient, "paper", {"samples": 25}),
+    "gradient_100": PlannerConfig(plan_gradient, "paper", {"samples": 100}, **ALL),
+    "gradient_300": PlannerConfig(plan_gradient, "paper", {"samples": 300}),
+    "gradient_snapped": PlannerConfig(plan_gradient, "paper", {"samples": 100, "snap": True}),
+    "gradient_direction": PlannerConfig(plan_gradient, "paper", ON_RING, **ALL),
+    "gradient_corrected": PlannerConfig(plan_gradient, "paper", ON_RING, **CORRECTED),
+    # What each idea is worth, and what a small error of the object's pose does.
+    "continuous_paper": PlannerConfig(plan_continuous, "paper", **ALL),
+    "continuous_500": PlannerConfig(plan_continuous, "film_500", **ALL),
+    "continuous_full": PlannerConfig(plan_full, **ALL),
+    "continuous_perturbed_start": PlannerConfig(
+        plan_continuous, execution={"perturbed_start": True}
+    ),
+    # A recurrent network under the same planners.
+    "astar_lstm": PlannerConfig(plan_astar, "lstm_tuned"),
+    "continuous_lstm": PlannerConfig(plan_continuous, "lstm_tuned"),
+    # The simulator itself in the place of a model.
+    "oracle": PlannerConfig(plan_continuous, **ORACLE),
+    "oracle_risk_averse": PlannerConfig(plan_continuous, **ORACLE, oracle={"risk_averse": True}),
+    # The perturbed world with a noisy camera.
+    "perturbed": PlannerConfig(plan_continuous, **PERTURBED),
+    "perturbed_corrected": PlannerConfig(plan_continuous, **PERTURBED, **CORRECTED),
+    "perturbed_averaged": PlannerConfig(
+        plan_continuous, **PERTURBED, execution={"corrections": 2, "n_averaged_images": 8}
+    ),
+    "perturbed_film_5000": PlannerConfig(plan_continuous, world="perturbed"),
+    "perturbed_oracle": PlannerConfig(plan_continuous, **ORACLE, world="perturbed", stride=5),
+    "perturbed_oracle_nominal": PlannerConfig(
+        plan_continuous,
+        **ORACLE,
+        oracle={"nominal_physics": True},
+        world="perturbed",
+        stride=5,
+    ),
+}
 
 
 def attempt(
@@ -56,23 +216,23 @@ def attempt(
     task: PlanningTask,
     planner: Planner,
     corrections: int = 0,
-    nudged: bool = False,
-    looks: int = 1,
+    perturbed_start: bool = False,
+    n_averaged_images: int = 1,
 ) -> Outcome:
-    """Plan and carry out one task, correcting the end by up to so many single actions.
+    """Plan and execute one task, correcting the final position by up to so many single actions.
 
-    A plan that the arm cannot follow counts with the distance at which it left the object. nudged:
-    the robot then believes the object `NUDGE_M` and `NUDGE_RAD` off where it is. looks: of which
-    each perception is the mean.
+    A plan that the arm cannot follow counts with the distance at which it left the object.
+    perturbed_start: when the plan is executed, the object is off its estimated pose by
+    `POSITION_ERROR_M` and `YAW_ERROR_RAD`. n_averaged_images: whose mean each observation is.
     """
     task.set_up(world)
-    world.looks = looks
+    world.looks = n_averaged_images
     seen = world.observe()
     plan = planner(seen.image, seen.xy_m, task.goal, task.mode)
-    if nudged:
-        side = NUDGE_M * np.array([math.cos(task.yaw_rad), math.sin(task.yaw_rad)])
+    if perturbed_start:
+        side = POSITION_ERROR_M * np.array([math.cos(task.yaw_rad), math.sin(task.yaw_rad)])
         config = replace(task.config, bias_m=tuple(side))
-        world.place(task.thing, (0.0, 0.0), task.yaw_rad + NUDGE_RAD, config=config)
+        world.place(task.thing, (0.0, 0.0), task.yaw_rad + YAW_ERROR_RAD, config=config)
     once = PlanMode(1, partial=True)
     try:
         return execute_plan(world, plan, corrections, lambda *query: planner(*query, once))
@@ -82,28 +242,21 @@ def attempt(
         world.looks = 1
 
 
-def measure(
-    world: Tabletop,
-    tasks: list[PlanningTask],
-    planner: Planner,
-    progress: str = "",
-    **how: Any,
-) -> list[Outcome]:
-    """Outcomes of all tasks with one planner, in order; how: see `attempt`."""
-    bar = tqdm(tasks, desc=progress, unit=" goals", disable=not progress, leave=False)
-    return [attempt(world, task, planner, **how) for task in bar]
-
-
 def outcome_record(task: PlanningTask, outcome: Outcome) -> dict[str, Any]:
-    """What the table needs of one outcome."""
+    """What the tables need of one outcome.
+
+    predicted_m: the distance from the goal that the planner predicted; prediction_error_m: how far
+    from its predicted position the object ended.
+    """
     plan = outcome.plan
+    error = np.hypot(*np.subtract(plan.predicted_end_xy_m, outcome.end_pose[:2]))
     return {
         "goals": task.goals,
         "mode": task.mode,
         "object_class": task.thing.family,
         "distance_m": outcome.distance_m,
         "predicted_m": plan.predicted_distance_m,
-        "surprise_m": float(np.hypot(*np.subtract(plan.predicted_end_xy_m, outcome.end_pose[:2]))),
+        "prediction_error_m": float(error),
         "std_m": plan.steps[-1].std_m if plan.steps else 0.0,
         "steps": len(plan.steps),
         "actions": len(outcome.object_paths_xy_m),
@@ -111,52 +264,23 @@ def outcome_record(task: PlanningTask, outcome: Outcome) -> dict[str, Any]:
     }
 
 
-def planning_rows(records: list[dict[str, Any]], **columns: Any) -> list[dict[str, Any]]:
-    """Rows of the table `planning`: per family of goals and mode, all objects and each class.
-
-    columns: `planner`, `model`, `world`, `samples`, `closed_loop`, as they describe the outcomes.
-    predicted: how far from the goal the planner expected the end; surprise: how far from there the
-    object really ended, open loop.
-    """
-    rows = []
-    for goals in dict.fromkeys(r["goals"] for r in records):
-        for mode in dict.fromkeys(r["mode"] for r in records if r["goals"] == goals):
-            for group, classes in GROUPS.items():
-                chosen = [
-                    r
-                    for r in records
-                    if (r["goals"], r["mode"]) == (goals, mode) and r["object_class"] in classes
-                ]
-                if not chosen:
-                    continue
-
-                def column(name: str, chosen: list = chosen) -> np.ndarray:
-                    return np.array([r[name] for r in chosen], dtype=float)
-
-                about = {"goals": goals, "object_class": group, "mode": mode}
-                row = error_row(column("distance_m"), **columns, **about)
-                row["plan_ms_median"] = 1000 * float(np.median(column("plan_s")))
-                row["predicted_mean_m"] = float(column("predicted_m").mean())
-                row["surprise_mean_m"] = float(column("surprise_m").mean())
-                row["std_mean_m"] = float(column("std_m").mean())
-                row["steps_mean"] = float(column("steps").mean())
-                row["actions_mean"] = float(column("actions").mean())
-                rows.append(row)
-    return rows
+def measure(
+    world: Tabletop, tasks: Sequence[PlanningTask], planner: Planner, **execution: Any
+) -> list[Outcome]:
+    """Outcomes of tasks with one planner, in order; execution: options of `attempt`."""
+    return [attempt(world, task, planner, **execution) for task in tasks]
 
 
-def run_variant(name: str, tasks: list[PlanningTask], progress: bool = True) -> dict[str, Any]:
-    """The records of a variant on the tasks that it can be asked."""
-    variant = VARIANTS[name]
-    planner = variant.make()
-    asked = variant.asked(tasks, lambda task: (task.goals, task.thing.family))
+def run_config(config: str) -> list[dict[str, Any]]:
+    """Outcome records of a planner on the frozen goals that it is asked, with their numbers."""
+    about, records = CONFIGS[config], []
+    tasks = frozen_tasks(about.world)
     with Tabletop() as world:
-        planner_here = partial(planner, world) if variant.sees_world else planner
-        names = ("corrections", "nudged", "looks")
-        how = {option: getattr(variant, option) for option in names}
-        outcomes = measure(world, asked, planner_here, name * progress, **how)
-    records = [outcome_record(t, o) for t, o in zip(asked, outcomes, strict=True)]
-    return {"variant": name, "about": variant.about(), "records": rounded(records)}
+        planner = about.make(world)
+        for k in tqdm(about.chosen(tasks), config, unit=" goals", leave=False):
+            (outcome,) = measure(world, [tasks[k]], planner, **about.execution)
+            records.append({"task": k} | outcome_record(tasks[k], outcome))
+    return records
 
 
 def tasks_sha256(world: str = "clean") -> str:
@@ -164,153 +288,144 @@ def tasks_sha256(world: str = "clean") -> str:
     return hashlib.sha256((repo_root() / FROZEN[world]).read_bytes()).hexdigest()
 
 
-def _is_done(name: str, part: dict[str, Any] | None) -> bool:
-    """Whether a part is of this variant, as it is now, on the goals as they are."""
-    if part is None:
-        return False
-    expected = tasks_sha256(VARIANTS[name].world), VARIANTS[name].about()
-    return (part["goals_sha256"], part["about"]) == expected
+def job(config: str) -> Job:
+    """The measurement of one planner."""
+    about = CONFIGS[config]
+    return Job(
+        run_config,
+        {"config": config},
+        settings=[about, tasks_sha256(about.world)],
+        checkpoints=tuple(about.checkpoints.values()),
+        version=VERSIONS[about.planner],
+    )
 
 
-def assemble() -> Path:
-    """Write `data/results/planning.json` from all parts; returns its path."""
-    rows, parts = [], {}
-    for name, variant in VARIANTS.items():
-        part = part_of(f"{name}.json", repo_root() / PARTS)
-        if part is None:
-            continue
-        if not _is_done(name, part):
-            raise ValueError(
-                f"part {name}.json is of other goals or settings than {name!r} has now; run "
-                f"`python -m experiments.planning --variants {name}` again, or delete it"
-            )
-        parts[name] = part["records"]
-        about = {"variant": name, "nudged": variant.nudged}
-        rows += planning_rows(part["records"], **about, **variant.columns())
-    if not rows:
-        raise FileNotFoundError(f"there are no parts in {PARTS}; run some variants first")
-    summary = [*reported.planning_rows(), *summary_rows(rows)]
-    tables = {
-        "planning": rows,
-        "summary": summary,
-        "paired": paired_rows(parts) + paired_rows(parts, "varied"),
-    }
-    tables["error_decomposition"] = decomposition_rows(rows)
-    hashes = {world: tasks_sha256(world) for world in FROZEN}
-    return write_results("data/results", NAME, {"goals_sha256": hashes}, tables)
+def planning_rows(records: list[dict[str, Any]], **columns: Any) -> list[dict[str, Any]]:
+    """Rows of the table `planning`: per source of goals and mode, all objects and each category.
+
+    columns: what else the rows say, such as `PlannerConfig.columns`.
+    """
+    rows = []
+    for (goals, mode), some in pd.DataFrame(records).groupby(["goals", "mode"], sort=False):
+        for group, classes in GROUPS.items():
+            chosen = some[some.object_class.isin(classes)]
+            if chosen.empty:
+                continue
+            about = {"goals": goals, "object_class": group, "mode": mode}
+            row = error_row(chosen.distance_m.to_numpy(), **columns, **about)
+            row["plan_ms_median"] = 1000 * float(chosen.plan_s.median())
+            for name in ("predicted_m", "prediction_error_m", "std_m"):
+                row[f"{name.removesuffix('_m')}_mean_m"] = float(chosen[name].mean())
+            for name in ("steps", "actions"):
+                row[f"{name}_mean"] = float(chosen[name].mean())
+            rows.append(row)
+    return rows
 
 
 def summary_rows(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """One row per variant on constructed goals: mean, standard error and median of each mode."""
+    """One row per planner on constructed goals: mean, standard error and median of each mode."""
     summary: dict[tuple[str, str], dict[str, Any]] = {}
     for row in rows:
-        group = row["object_class"]
-        if row["goals"] != "constructed" or group not in ("all", "standing", "rollable"):
+        if row["goals"] != "constructed" or row["object_class"] in STANDING + ROLLABLE:
             continue
         names = ("variant", "model", "world", "samples", "closed_loop", "object_class")
-        told = summary.setdefault((row["variant"], group), {name: row[name] for name in names})
+        new = {name: row[name] for name in names}
+        one = summary.setdefault((row["variant"], row["object_class"]), new)
         for statistic in ("mean", "sem", "median"):
-            told[f"{row['mode']}_{statistic}_m"] = row[f"{statistic}_m"]
-        told[f"{row['mode']}_plan_ms"] = row["plan_ms_median"]
+            one[f"{row['mode']}_{statistic}_m"] = row[f"{statistic}_m"]
+        one[f"{row['mode']}_plan_ms"] = row["plan_ms_median"]
     return list(summary.values())
 
 
 def decomposition_rows(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Where the open-loop error on constructed goals comes from, by variant, mode and group.
+    """Where the open-loop error on constructed goals comes from, by planner, mode and group.
 
-    search: what the planner itself expected to remain; model: how far from what it expected the
-    object ended; execution: what remains with the simulator as the model, which has no σ to prefer
-    sure plans by; nudged: what remains of `continuous` when the object is a millimetre and a degree
-    from where it is believed, in the clean world. Variants that are only asked about what stands
-    have no row of all.
+    search: the distance from the goal that the planner predicted; model: from its predicted
+    position; execution: what remains with the simulator as the model, which has no σ to prefer
+    low-variance plans by; perturbed_start: of `continuous`, where the object's pose has a small
+    error. Planners for stable objects only have no row of all.
     """
-    open_loop = [
-        r for r in rows if r["goals"] == "constructed" and not r["closed_loop"] and not r["nudged"]
-    ]
+    constructed = [row for row in rows if row["goals"] == "constructed"]
 
     def place(row: dict[str, Any]) -> tuple[str, str, str]:
         return row["world"], row["mode"], row["object_class"]
 
-    oracle = {place(r): r["mean_m"] for r in open_loop if r["variant"] in ORACLES}
-    nudged = {place(r): r["mean_m"] for r in rows if r["nudged"]}
+    oracles = ("oracle", "perturbed_oracle")
+    oracle = {place(r): r["mean_m"] for r in constructed if r["variant"] in oracles}
+    perturbed = {place(r): r["mean_m"] for r in constructed if r["perturbed_start"]}
     return [
         {
             **{key: row[key] for key in ("variant", "world", "mode", "object_class", "n")},
             "search_mean_m": row["predicted_mean_m"],
-            "model_mean_m": row["surprise_mean_m"],
+            "model_mean_m": row["prediction_error_mean_m"],
             "execution_mean_m": oracle.get(place(row)),
-            "nudged_mean_m": nudged.get(place(row)),
+            "perturbed_start_mean_m": perturbed.get(place(row)),
             "total_mean_m": row["mean_m"],
         }
-        for row in open_loop
-        if row["object_class"] in ("standing", "rollable")
-        or (row["object_class"] == "all" and VARIANTS[row["variant"]].classes != STANDING)
+        for row in constructed
+        if not row["closed_loop"]
+        and not row["perturbed_start"]
+        and (
+            row["object_class"] in ("standing", "rollable")
+            or (row["object_class"] == "all" and CONFIGS[row["variant"]].classes != STANDING)
+        )
     ]
 
 
 def paired_rows(
-    parts: dict[str, list[dict[str, Any]]], than: str = "continuous", n_draws: int = 2000
+    records: dict[str, list[dict[str, Any]]], than: str = "continuous", n_draws: int = 2000
 ) -> list[dict[str, Any]]:
-    """By how much each variant ends farther from the same goals than `than`: mean [m], interval.
+    """How much farther each planner ends from the same goals than another: mean [m], interval.
 
     The interval holds 95 % of the means of goals drawn again with replacement.
     """
     rows: list[dict[str, Any]] = []
     rng = np.random.default_rng(0)
-    for name, records in parts.items():
-        variant = VARIANTS[name]
-        if name == than or than not in parts or variant.world != VARIANTS[than].world:
+    for name in records if than in records else ():
+        if name == than or CONFIGS[name].world != CONFIGS[than].world:
             continue
-        others = variant.asked(parts[than], lambda r: (r["goals"], r["object_class"]))
-        pairs: dict[tuple[str, str], list[float]] = {}
-        for one, other in zip(records, others, strict=True):
-            farther = one["distance_m"] - other["distance_m"]
-            pairs.setdefault((one["goals"], one["mode"]), []).append(farther)
-        for (goals, mode), gain in pairs.items():
-            draws = rng.choice(gain, (n_draws, len(gain))).mean(axis=1)
+        both = pd.merge(*(pd.DataFrame(records[key]) for key in (name, than)), on="task")
+        both["farther"] = both.distance_m_x - both.distance_m_y
+        for (goals, mode), pairs in both.groupby(["goals_x", "mode_x"], sort=False):
+            farther = pairs.farther.to_numpy()
+            draws = rng.choice(farther, (n_draws, len(farther))).mean(axis=1)
             low, high = np.quantile(draws, [0.025, 0.975])
-            rows.append(
-                {
-                    "variant": name,
-                    "than": than,
-                    "goals": goals,
-                    "mode": mode,
-                    "n": len(gain),
-                    "difference_mean_m": float(np.mean(gain)),
-                    "low_m": float(low),
-                    "high_m": float(high),
-                }
-            )
+            about = {"variant": name, "than": than, "goals": goals, "mode": mode}
+            row = about | {"n": len(pairs), "difference_mean_m": float(farther.mean())}
+            rows.append(row | {"low_m": float(low), "high_m": float(high)})
     return rows
+
+
+def tables(records: dict[str, list[dict[str, Any]]]) -> dict[str, list[dict[str, Any]]]:
+    """All tables of the records of planners."""
+    rows = []
+    for name in CONFIGS:
+        if name in records:
+            rows += planning_rows(records[name], variant=name, **CONFIGS[name].columns())
+    in_order = {name: records[name] for name in CONFIGS if name in records}
+    return {
+        "planning": rows,
+        "summary": [*reported.planning_rows(), *summary_rows(rows)],
+        "paired": [r for than in ("continuous", "perturbed") for r in paired_rows(in_order, than)],
+        "error_decomposition": decomposition_rows(rows),
+    }
 
 
 @command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
-    """Measure planners on the frozen goals and make the table from all that were measured."""
+    """Measure planners on the frozen goals and draw the tables from all that were measured."""
     parser = argparse.ArgumentParser(
         prog="python -m experiments.planning", description=main.__doc__
     )
-    parser.add_argument("--variants", nargs="*", choices=list(VARIANTS), default=list(VARIANTS))
+    parser.add_argument("--configs", type=names_type(CONFIGS), default=",".join(CONFIGS))
+    parser.add_argument("--workers", type=count_type, default=1)
     options = parser.parse_args(argv)
     torch.set_num_threads(1)
-    folder = resolve_out_dir(PARTS)
-    for name in options.variants:
-        if _is_done(name, part_of(f"{name}.json", folder)):
-            print(f"{name}: there already")
-            continue
-        world = VARIANTS[name].world
-        part = run_variant(name, frozen_tasks(world)) | {"goals_sha256": tasks_sha256(world)}
-        text = json.dumps(part, separators=(",", ":"))
-        write_text_atomically(folder / f"{name}.json", text + "\n")
-        for row in planning_rows(part["records"]):
-            if row["object_class"] == "all":
-                print(
-                    f"{name}: {row['goals']} {row['mode']} {1000 * row['mean_m']:.2f} mm, "
-                    f"median {1000 * row['median_m']:.2f} (n = {row['n']})",
-                    flush=True,
-                )
-    pack(folder)
-    print(assemble())
+    with dask_client(options.workers) as client:
+        run([job(name) for name in options.configs], "planning", client)
+    records = {arguments["config"]: result for arguments, result in read("planning", job)}
+    hashes = {world: tasks_sha256(world) for world in FROZEN}
+    print(write_results("data/results", "planning", {"goals_sha256": hashes}, tables(records)))
     return 0
 
 

@@ -52,14 +52,14 @@ def test_many_looks_see_better(world):
 
 
 def test_an_attempt_leaves_the_eye_as_it_was(world, film):
-    task = next(t for t in frozen_tasks("varied") if t.mode == "single_full")
+    task = next(t for t in frozen_tasks("perturbed") if t.mode == "single_full")
     seen = []
 
     def planner(image, xy, goal, mode):
         seen.append(world.looks)
         return plan_continuous(problem_of(film, image, xy, goal, mode))
 
-    attempt(world, task, planner, looks=3)
+    attempt(world, task, planner, n_averaged_images=3)
     assert (seen, world.looks) == ([3], 1)
 
 

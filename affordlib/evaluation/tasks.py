@@ -5,10 +5,10 @@ Objects are ones that no model has seen; goals are more than 2 cm from the start
 *uniform* ones are drawn evenly over the area in reach. Those actions, or the bearings of uniform
 goals, are off the 10° grid of A*.
 
-The goals of the tables are frozen in `data/goals/planning.json`, those of the varied, noisy world
-in `data/goals/planning_varied.json`; made once, by
+The goals of the tables are frozen in `data/goals/planning.json`, those of the perturbed
+world in `data/goals/planning_perturbed.json`; made once, by
 
-    python -m affordlib.evaluation.tasks --world varied
+    python -m affordlib.evaluation.tasks --world perturbed
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from affordlib.results import write_text_atomically
 from affordlib.types import Goal
 from affordlib.world import Tabletop, Thing, WorldConfig, family_named
 
-FROZEN = {"clean": "data/goals/planning.json", "varied": "data/goals/planning_varied.json"}
+FROZEN = {"clean": "data/goals/planning.json", "perturbed": "data/goals/planning_perturbed.json"}
 GOAL_SOURCES = ("constructed", "uniform")
 N_GOALS = {"single_full": 50, "single_partial": 100, "multi_partial": 80}
 """As in Table 3 of the paper."""
@@ -153,7 +153,7 @@ def uniform_tasks(
 
 
 def frozen_tasks(world: str = "clean") -> list[PlanningTask]:
-    """The tasks of the tables, of the clean or of the varied, noisy world."""
+    """The tasks of the tables, of the clean or of the perturbed world."""
     if world not in FROZEN:
         raise ValueError(f"world must be one of {tuple(FROZEN)}, got {world!r}")
     path = repo_root() / FROZEN[world]
@@ -169,7 +169,7 @@ def _draw_tasks(which: str, seed: int) -> list[PlanningTask]:
     tasks = []
     with Tabletop() as world:
         for mode, n in N_GOALS.items():
-            if which == "varied":
+            if which == "perturbed":
                 tasks += constructed_tasks(world, mode, n, seed, STANDING, Variation())
                 continue
             tasks += constructed_tasks(world, mode, n, seed, STANDING + ROLLABLE)
