@@ -42,7 +42,7 @@ def wrap_angle(angle_rad: float) -> float:
 
 
 @dataclass(frozen=True)
-class Leg:
+class Segment:
     """A stretch of a primitive: seconds, and poses (6,) at its start and end.
 
     Poses are x, y, z [m], yaw [rad], gripper (1 open, 0 closed) and pitch [rad, nose down].
@@ -61,7 +61,7 @@ class Leg:
 
 @dataclass(frozen=True)
 class Primitive:
-    """An action with its parameters; `legs` says how the gripper moves.
+    """An action with its parameters; `segments` says how the gripper moves.
 
     opening_m is the gap between the fingers where the gripper channel is 1, force_N what each
     finger can press with, `holds` whether the object stays in the hand at the end. With its
@@ -76,13 +76,13 @@ class Primitive:
     acts_from: ClassVar[float] = 0.0
 
     @cached_property
-    def legs(self) -> tuple[Leg, ...]:
+    def segments(self) -> tuple[Segment, ...]:
         raise NotImplementedError
 
     @cached_property
-    def leg_phases(self) -> np.ndarray:
+    def segment_phases(self) -> np.ndarray:
         """Phases at which the legs begin, and 1: (m + 1,)."""
-        seconds = np.cumsum([0.0, *(leg.seconds for leg in self.legs)])
+        seconds = np.cumsum([0.0, *(segment.seconds for segment in self.segments)])
         return seconds / seconds[-1]
 
     def path(self, phase: np.ndarray | Sequence[float] | float) -> np.ndarray:
@@ -91,17 +91,17 @@ class Primitive:
         if phase.ndim > 1:
             raise ValueError(f"phase must be numbers (n,), got an array {phase.shape}")
         action = np.empty((len(phase), 5))
-        for leg, start, end in zip(
-            self.legs, self.leg_phases[:-1], self.leg_phases[1:], strict=True
+        for segment, start, end in zip(
+            self.segments, self.segment_phases[:-1], self.segment_phases[1:], strict=True
         ):
             inside = (phase >= start) & (phase <= end)
             share = min_jerk((phase[inside] - start) / (end - start))
-            action[inside] = leg.at(share)[:, :5]
+            action[inside] = segment.at(share)[:, :5]
         return action
 
     def ends(self) -> np.ndarray:
         """The commanded action at t = 0 and t = 1: (2, 5), as `path` tells it, in less time."""
-        first, last = self.legs[0].at(np.zeros(1)), self.legs[-1].at(np.ones(1))
+        first, last = self.segments[0].at(np.zeros(1)), self.segments[-1].at(np.ones(1))
         return np.concatenate([first, last])[:, :5]
 
     def succeeded(self, effect: np.ndarray) -> bool:
@@ -109,11 +109,11 @@ class Primitive:
         return bool(np.hypot(effect[0], effect[1]) > 0.01)
 
 
-def _legs(*stops: tuple[float, tuple[float, ...]], guarded: int = -1) -> tuple[Leg, ...]:
+def _segments(*stops: tuple[float, tuple[float, ...]], guarded: int = -1) -> tuple[Segment, ...]:
     """Legs through poses (x, y, z, yaw, gripper), each given with the seconds that lead to it."""
     poses = [np.array([*pose, 0.0]) for _, pose in stops]
     return tuple(
-        Leg(seconds, poses[k], poses[k + 1], guarded == k)
+        Segment(seconds, poses[k], poses[k + 1], guarded == k)
         for k, (seconds, _) in enumerate(stops[1:])
     )
 
@@ -152,12 +152,12 @@ class Push(Primitive):
         return wrap_angle(self.theta + math.pi)
 
     @cached_property
-    def legs(self) -> tuple[Leg, ...]:
+    def segments(self) -> tuple[Segment, ...]:
         yaw = self.direction_rad
         x, y = math.cos(yaw), math.sin(yaw)
         start = (-self.radius * x, -self.radius * y, TIP_HEIGHT_M, yaw, 1.0)
         end = (self.length * x, self.length * y, TIP_HEIGHT_M, yaw, 1.0)
-        return _legs((0.0, start), (DURATION_S, end))
+        return _segments((0.0, start), (DURATION_S, end))
 
 
 @dataclass(frozen=True)
@@ -197,10 +197,10 @@ class Drag(Primitive):
         return wrap_angle(self.theta)
 
     @cached_property
-    def legs(self) -> tuple[Leg, ...]:
+    def segments(self) -> tuple[Segment, ...]:
         end = (self.length * math.cos(self.theta), self.length * math.sin(self.theta))
         yaw = self.grip_yaw or 0.0
-        return _legs(
+        return _segments(
             (0.0, (0.0, 0.0, HOVER_M, yaw, 1.0)),
             (1.0, (0.0, 0.0, TIP_HEIGHT_M, yaw, 1.0)),
             (0.75, (0.0, 0.0, TIP_HEIGHT_M, yaw, 0.0)),
@@ -234,10 +234,10 @@ class Grasp(Primitive):
         object.__setattr__(self, "grip_yaw", yaw)
 
     @cached_property
-    def legs(self) -> tuple[Leg, ...]:
+    def segments(self) -> tuple[Segment, ...]:
         seen = 0.06 if self.seen_height is None else self.seen_height
         low, yaw = max(seen - 0.03, TIP_HEIGHT_M), self.grip_yaw
-        return _legs(
+        return _segments(
             (0.0, (0.0, 0.0, HOVER_M, yaw, 1.0)),
             (1.0, (0.0, 0.0, low, yaw, 1.0)),
             (0.75, (0.0, 0.0, low, yaw, 0.0)),
@@ -270,9 +270,9 @@ class Rotate(Primitive):
         object.__setattr__(self, "grip_yaw", yaw)
 
     @cached_property
-    def legs(self) -> tuple[Leg, ...]:
+    def segments(self) -> tuple[Segment, ...]:
         yaw, end = self.grip_yaw, self.grip_yaw + self.sweep_rad
-        return _legs(
+        return _segments(
             (0.0, (0.0, 0.0, HOVER_M, yaw, 1.0)),
             (1.0, (0.0, 0.0, TIP_HEIGHT_M, yaw, 1.0)),
             (0.75, (0.0, 0.0, TIP_HEIGHT_M, yaw, 0.0)),
@@ -286,7 +286,7 @@ class Rotate(Primitive):
 
 
 @dataclass(frozen=True)
-class _Arc(Leg):
+class _Arc(Segment):
     """The lifting leg: the blade turns by an angle φ about an edge `radius_m` ahead of it."""
 
     radius_m: float = 0.16
@@ -363,14 +363,14 @@ class LeverUp(Primitive):
         return abs(wrap_angle(self.theta - math.atan2(along[0], -along[1])))
 
     @cached_property
-    def legs(self) -> tuple[Leg, ...]:
+    def segments(self) -> tuple[Segment, ...]:
         direction = np.array([math.cos(self.theta), math.sin(self.theta)])
         contact = np.array([self.contact_x, self.contact_y])
         outside = contact - self.run_up_m * direction
         under = contact + self.insertion_m * direction
         poses = [np.array([*xy, BLADE_HEIGHT_M, self.theta, 0.0, 0.0]) for xy in (outside, under)]
         arc = _Arc(2.75, poses[1], poses[1], radius_m=self.reach, angle_rad=self.angle_rad)
-        return Leg(1.0, *poses), arc
+        return Segment(1.0, *poses), arc
 
     def succeeded(self, effect: np.ndarray) -> bool:
         """Whether the object has been tilted by more than half the lever's angle."""

@@ -149,8 +149,8 @@ class Interaction:
     `EFFECT_CHANNELS` (metres and radians; gripper is 1 open, 0 closed); rest_effect: (5,) where
     the object rests after the gripper has retreated; image: (2, 48, 48), depth [m] and mask, of a
     lever-up (2, 128, 128) from the contact point in the lever's direction;
-    start_pose: (x, y, yaw) of the object in the frame of the table; believed_xy_m: where the robot
-    took it to be, and placed its action; tool: (26, 5) measured x, y, z [m], yaw [rad] of the tool
+    start_pose: (x, y, yaw) of the object in the frame of the table; estimated_xy_m: where the
+    robot measured it, and placed its action; tool: (26, 5) measured x, y, z [m], yaw [rad] of the tool
     and gap of the fingers [m], every 3 steps of 50 ms as in the paper.
 
     Of the execution: how far the tool was off its path and how deep bodies sank into each other,
@@ -166,7 +166,7 @@ class Interaction:
     rest_effect: np.ndarray
     image: np.ndarray
     start_pose: tuple[float, float, float]
-    believed_xy_m: tuple[float, float]
+    estimated_xy_m: tuple[float, float]
     tool: np.ndarray
     tracking_error_m: float
     penetration_m: float

@@ -42,7 +42,7 @@ from affordlib.primitives import Drag, Grasp, Push
 from affordlib.results import write_results, write_text_atomically
 from affordlib.types import TABLE_X_M, TABLE_Y_M, Goal
 from affordlib.workers import dask_client
-from affordlib.world import Tabletop, Thing, family_named
+from affordlib.world import Tabletop, TabletopObject, category_named
 from experiments.closed_loop_tables import ROWS, WITHIN_HEIGHT_M
 from experiments.feasibility import half_width_m, is_feasible, on_the_rim
 
@@ -66,7 +66,7 @@ PARTS = "data/results/parts/closed_loop"
 class Trial:
     """An object at a place, turned by a yaw [rad], where it should go, and what will go wrong."""
 
-    thing: Thing
+    obj: TabletopObject
     start_xy_m: tuple[float, float]
     yaw_rad: float
     goal: Goal
@@ -79,33 +79,31 @@ def draw_trial(table: str, index: int, seed: int = 0) -> Trial:
         raise ValueError(f"table must be one of {sorted(N_TRIALS)}, got {table!r}")
     key = (100 + list(N_TRIALS).index(table), index)
     rng = np.random.default_rng(np.random.SeedSequence(2_000_003 + seed, spawn_key=key))
-    thing = family_named(CLASSES[index % len(CLASSES)]).sample(rng)
+    obj = category_named(CLASSES[index % len(CLASSES)]).sample(rng)
     yaw = float(rng.uniform(-math.pi, math.pi))
     if table == "reachability":
         low, high = (np.array([TABLE_X_M[k], TABLE_Y_M[k]]) for k in (0, 1))
         end = rng.uniform(low + EDGE_M, high - EDGE_M).tolist()
-        return Trial(thing, (0.0, 0.0), yaw, Goal(tuple(end), TOLERANCE_M[table]))
+        return Trial(obj, (0.0, 0.0), yaw, Goal(tuple(end), TOLERANCE_M[table]))
     farthest = 0.25 if table == "disturbances" else 0.12
     r, angle = math.sqrt(rng.uniform(0.02**2, farthest**2)), rng.uniform(-math.pi, math.pi)
     xy, exact = (r * math.cos(angle), r * math.sin(angle)), TOLERANCE_M[table]
     if table == "height":
-        return Trial(
-            thing, (0.0, 0.0), yaw, Goal(xy, exact, height_m=float(rng.uniform(0.02, 0.2)))
-        )
+        return Trial(obj, (0.0, 0.0), yaw, Goal(xy, exact, height_m=float(rng.uniform(0.02, 0.2))))
     if table == "orientation":
         turn = float(rng.uniform(-math.pi, math.pi))
-        return Trial(thing, (0.0, 0.0), yaw, Goal(xy, exact, turn_rad=turn))
+        return Trial(obj, (0.0, 0.0), yaw, Goal(xy, exact, turn_rad=turn))
     n_actions = max(1, math.ceil(r / 0.09))
-    kinds = [kind for kind in KINDS if kind != "topple" or not thing.rollable]
+    kinds = [kind for kind in KINDS if kind != "topple" or not obj.rollable]
     script = sample_disturbances(int(rng.integers(2**32)), 1, n_actions, kinds)
-    return Trial(thing, (0.0, 0.0), yaw, Goal(xy, exact), script)
+    return Trial(obj, (0.0, 0.0), yaw, Goal(xy, exact), script)
 
 
 def run_trial(table: str, index: int, world: Tabletop, skills: Skills, seed: int) -> dict:
     """The record of a trial: what was asked, how it ended, whether it could be done."""
     trial = draw_trial(table, index, seed)
-    record: dict[str, Any] = {"index": index, "object_class": trial.thing.family}
-    world.place(trial.thing, trial.start_xy_m, trial.yaw_rad)
+    record: dict[str, Any] = {"index": index, "object_class": trial.obj.category}
+    world.place(trial.obj, trial.start_xy_m, trial.yaw_rad)
     went = run_closed_loop(world, trial.goal, skills, disturbances=trial.disturbances)
     record |= _told(went)
     if table == "height":
@@ -117,11 +115,11 @@ def run_trial(table: str, index: int, world: Tabletop, skills: Skills, seed: int
         record["kind"] = trial.disturbances[0].kind
         record["in_action"] = trial.disturbances[0].at_s is not None
         record["happened"] = len(went.happened)
-        world.place(trial.thing, trial.start_xy_m, trial.yaw_rad)
+        world.place(trial.obj, trial.start_xy_m, trial.yaw_rad)
         undisturbed = run_closed_loop(world, trial.goal, skills)
         record["undisturbed"] = _told(undisturbed)
     else:
-        asked = _how_moved(trial), half_width_m(trial.thing.footprint_m)
+        asked = _how_moved(trial), half_width_m(trial.obj.footprint_m)
         record["feasible"] = is_feasible(*asked, trial.start_xy_m, trial.goal.xy_m)
         record["on_the_rim"] = on_the_rim(*asked, trial.start_xy_m, trial.goal.xy_m)
         record["moved"] = bool(went.steps)
@@ -142,7 +140,7 @@ def _told(went: ClosedLoopResult) -> dict[str, Any]:
 
 
 def _how_moved(trial: Trial) -> type[Push] | type[Drag]:
-    return Drag if trial.thing.rollable else Push
+    return Drag if trial.obj.rollable else Push
 
 
 def _can_be_lifted(world: Tabletop, trial: Trial, went: ClosedLoopResult) -> bool:
@@ -150,7 +148,7 @@ def _can_be_lifted(world: Tabletop, trial: Trial, went: ClosedLoopResult) -> boo
     high = trial.goal.height_m - WITHIN_HEIGHT_M
 
     def lifts(grip_yaw: float) -> bool:
-        world.place(trial.thing, went.goal.xy_m, went.end_pose[2])
+        world.place(trial.obj, went.goal.xy_m, went.end_pose[2])
         return bool(
             world.execute_primitive(Grasp(grip_yaw=grip_yaw), record_unreachable=True)
             .effect[:, 2]
@@ -167,7 +165,7 @@ def _stays_feasible(world: Tabletop, trial: Trial, went: ClosedLoopResult) -> bo
 
     What happens later is the robot's affair.
     """
-    half, start = half_width_m(trial.thing.footprint_m), trial.start_xy_m
+    half, start = half_width_m(trial.obj.footprint_m), trial.start_xy_m
     if not is_feasible(_how_moved(trial), half, start, trial.goal.xy_m):
         return False
     if not went.happened:

@@ -38,7 +38,7 @@ def filmed(title: str, stop: bool) -> list[np.ndarray]:
         if not stop:
             plan = replace(plan, steps=(replace(plan.steps[0], stop_phase=1.0),))
         world.mark(GOAL.xy_m, GOAL_RGB, turned, scale=1.3)
-        world.film = film
+        world.on_step = film
         outcome = execute_plan(world, plan)
     titles = [title.format(plan.steps[0].stop_phase)] * len(film.frames)
     titles[-8:] = [f"{titles[0]}: {1000 * outcome.distance_m:.1f} mm from the goal"] * 8

@@ -37,9 +37,9 @@ def execute(data: xr.Dataset, interactions: np.ndarray, theta_rad: np.ndarray) -
     effects = []
     with Tabletop(recipe.world) as world:
         for index, theta in zip(data["interaction"].values[interactions], theta_rad, strict=True):
-            thing, yaw, _ = draw_scene(recipe, int(index))
-            config = draw_world(recipe, int(index), thing)
-            world.place(thing, (0.0, 0.0), yaw, config=config)
+            obj, yaw, _ = draw_scene(recipe, int(index))
+            config = draw_world(recipe, int(index), obj)
+            world.place(obj, (0.0, 0.0), yaw, config=config)
             effects.append(
                 world.execute_primitive(Push(float(theta)), record_unreachable=True).effect[-1]
             )

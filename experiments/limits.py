@@ -55,20 +55,20 @@ def reach_settings() -> tuple[Any, ...]:
 def floor() -> Rows:
     """What changes if an object does not stand where it is believed to: displacement, and end."""
     data = open_interactions("push_test")
-    recipe, names = Recipe.from_json(data.attrs["recipe"]), _families(data)
+    recipe, names = Recipe.from_json(data.attrs["recipe"]), _categories(data)
     rng = np.random.default_rng(0)
     moved, ended, turned = np.empty((3, N_PUSHES, REPEATS))
     with Tabletop(recipe.world) as world:
         for k in range(N_PUSHES):
             index = int(data["interaction"][k])
-            thing, yaw, _ = draw_scene(recipe, index)
-            config = draw_world(recipe, index, thing)
+            obj, yaw, _ = draw_scene(recipe, index)
+            config = draw_world(recipe, index, obj)
             told = data["effect"].values[k, -1]
             for r in range(REPEATS):
                 side, sign = rng.uniform(0, math.tau), rng.choice([-1, 1])
                 bias = NUDGE_M * np.array([math.cos(side), math.sin(side)])
                 amiss = replace(config, bias_m=tuple(bias))
-                world.place(thing, (0.0, 0.0), yaw + sign * NUDGE_RAD, config=amiss)
+                world.place(obj, (0.0, 0.0), yaw + sign * NUDGE_RAD, config=amiss)
                 done = world.execute_primitive(
                     Push(float(data["theta"][k])), record_unreachable=True
                 ).effect[-1]
@@ -88,7 +88,7 @@ def floor() -> Rows:
     return rows
 
 
-def _families(data: Any) -> list[str]:
+def _categories(data: Any) -> list[str]:
     names = data["family"].attrs["flag_meanings"].split()
     return [names[k] for k in data["family"].values]
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from affordlib.paths import resolve_out_dir
-from affordlib.world.objects import FAMILIES
+from affordlib.world.objects import CATEGORIES
 from experiments.parts import parts_in
 from experiments.units import MODELS, PARTS, TEN_TIMES, Unit, read_part
 
@@ -117,9 +117,9 @@ class Errors:
 def pool(answers: list[dict[str, Any]], key: str | Callable) -> Errors:
     """The errors of several folds in one; key: their name in the answers, or how to get them.
 
-    A part names an object's family by its number in `FAMILIES`.
+    A part names an object's category by its number in `CATEGORIES`.
     """
-    known = list(FAMILIES)
+    known = list(CATEGORIES)
     values, objects, classes = [], [], []
     for told in answers:
         found = key(told) if callable(key) else told[key]

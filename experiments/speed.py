@@ -291,7 +291,7 @@ def planning(n_goals: int = 15, seed: int = 300) -> Rows:
     with Tabletop() as world:
         for mode in goals:
             for task in uniform_tasks(mode, n_goals, seed, STANDING):
-                world.place(task.thing, (0.0, 0.0), task.yaw_rad)
+                world.place(task.obj, (0.0, 0.0), task.yaw_rad)
                 image, start = world.depth_image(), world.object_pose()[:2]
                 effects = EffectMap(film, image)
                 map_ms.append(1000 * seconds(lambda e=effects: e.coefficients))

@@ -148,9 +148,9 @@ def rollability() -> Rows:
             learned = model(torch.from_numpy(images)).numpy() > 0.5
         rule = np.array([looks_rollable(image) for image in images])
         names = np.array(data["family"].attrs["flag_meanings"].split())
-        family = names[data["family"].values[chosen]]
-        for kind in ("all", *np.unique(family)):
-            of = (family == kind) | (kind == "all")
+        category = names[data["family"].values[chosen]]
+        for kind in ("all", *np.unique(category)):
+            of = (category == kind) | (kind == "all")
             rows.append(
                 {
                     "test": name,

@@ -38,11 +38,11 @@ def run_trial(table: str, index: int, planner: str, world: Tabletop, about: Skil
     off: what is missing of the turn [rad] or the height [m].
     """
     trial = draw_trial(table, index)
-    world.place(trial.thing, trial.start_xy_m, trial.yaw_rad)
+    world.place(trial.obj, trial.start_xy_m, trial.yaw_rad)
     plan = about.planner(PLANNERS[planner])(world.depth_image(), trial.start_xy_m, trial.goal)
     record: dict[str, Any] = {
         "planner": planner,
-        "object_class": trial.thing.family,
+        "object_class": trial.obj.category,
         "promised": plan.reaches_goal,
         "actions": len(plan.steps),
         "arm_refused": False,

@@ -26,7 +26,7 @@ def one_world():
 @pytest.fixture
 def world(one_world):
     """The session's world, whatever the test before has made of its frictions and senses."""
-    one_world.config, one_world.looks, one_world.film = WorldConfig(), 1, None
+    one_world.config, one_world.n_averaged_images, one_world.on_step = WorldConfig(), 1, None
     one_world.reset()
     return one_world
 

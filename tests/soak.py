@@ -25,12 +25,12 @@ from affordlib.world import Cuboid, LyingCylinder, Tabletop, UprightCylinder
 
 MOST_GROWTH_MB = 5.0
 EVERY = 100
-FAMILIES = (Cuboid, UprightCylinder, LyingCylinder)
+CATEGORIES = (Cuboid, UprightCylinder, LyingCylinder)
 
 
-def one_round(world: Tabletop, planner, thing, start, goal: Goal) -> str:
+def one_round(world: Tabletop, planner, obj, start, goal: Goal) -> str:
     """Look, plan and execute; the hash of the object's path."""
-    world.place(thing, start)
+    world.place(obj, start)
     seen = world.observe()
     try:
         outcome = execute_plan(world, planner(seen.image, seen.xy_m, goal))
@@ -59,14 +59,14 @@ def main() -> int:
     begin = 0.0
     with Tabletop() as world:
         for number, planner in zip(range(1, rounds + 1), itertools.cycle(planners), strict=False):
-            family = FAMILIES[rng.integers(len(FAMILIES))]
+            category = CATEGORIES[rng.integers(len(CATEGORIES))]
             start = rng.uniform((-0.1, -0.2), (0.2, 0.2))
             goal = Goal(tuple(start + rng.uniform(-0.1, 0.1, 2)), 0.005)
-            one_round(world, planner, family.sample(rng, (0.05, 0.08)), start, goal)
+            one_round(world, planner, category.sample(rng, (0.05, 0.08)), start, goal)
             if number % EVERY == 0:
                 again = [
-                    one_round(world, plan, thing, at, Goal((at[0] + 0.08, at[1] + 0.06), 0.005))
-                    for thing, at in fixed
+                    one_round(world, plan, obj, at, Goal((at[0] + 0.08, at[1] + 0.06), 0.005))
+                    for obj, at in fixed
                     for plan in planners
                 ]
                 first = first or again

@@ -48,7 +48,9 @@ class FollowsTheHand:
     def predict(self, features, observations, t_target):
         path = self.kind(0.0).path if self.kind is Drag else self.kind().path
         columns = [("x", "y", "z", "yaw").index(name) for name in self.effect_channels]
-        held = self.kind(0.0).leg_phases[2] if self.kind is Drag else self.kind().leg_phases[2]
+        held = (
+            self.kind(0.0).segment_phases[2] if self.kind is Drag else self.kind().segment_phases[2]
+        )
         t = t_target.numpy().ravel()
         way = path(np.maximum(t, held)) - path(held)
         if self.kind is Drag:
@@ -85,15 +87,15 @@ BOX, TUBE, BALL = Cuboid(0.06, 0.05, 0.05), UprightCylinder(0.05, 0.07), Sphere(
 # Endings
 
 
-@pytest.mark.parametrize("thing", [BOX, BALL], ids=["pushed", "dragged"])
-def test_a_goal_is_reached(table, skills, thing):
-    table.place(thing, (0.0, 0.0), 0.3)
+@pytest.mark.parametrize("obj", [BOX, BALL], ids=["pushed", "dragged"])
+def test_a_goal_is_reached(table, skills, obj):
+    table.place(obj, (0.0, 0.0), 0.3)
     goal = Goal((0.11, -0.06), EXACT_M)
     went = run_closed_loop(table, goal, skills)
     assert went.status == "reached", went.message
     assert went.distance_m == goal.distance_m(table.object_pose()[:2]) <= 0.002
     assert "mm from the goal after" in went.message
-    assert {type(step.primitive) for step in went.steps} == {Drag if thing is BALL else Push}
+    assert {type(step.primitive) for step in went.steps} == {Drag if obj is BALL else Push}
     assert len(went.steps) == len(went.object_paths_xy_m) <= action_limit(math.hypot(0.11, 0.06))
     # Where the goal already is, nothing moves.
     again = run_closed_loop(table, Goal(table.object_pose()[:2], EXACT_M), skills)
@@ -118,9 +120,9 @@ def test_a_goal_without_room_for_the_object_is_refused(table, skills, xy):
     for plan in (plan_astar, plan_continuous, plan_gradient):
         with pytest.raises(ValueError, match="too near the rim of the table"):
             plan(problem_of(skills.model(Push), image, (0.0, 0.0), Goal(xy)))
-    table.film = moved.append
+    table.on_step = moved.append
     went = run_closed_loop(table, Goal(xy), skills)
-    table.film = None
+    table.on_step = None
     assert went.status == "unreachable"
     assert "too near the rim" in went.message
     assert moved == []
@@ -146,9 +148,9 @@ def test_ways_and_plans_keep_the_whole_object_on_the_table(table, skills):
 def test_an_unreachable_goal_is_refused_before_any_motion(table, skills):
     table.place(BOX, (0.5, 0.3), 0.0)
     pose, moved = table.object_pose(), []
-    table.film = moved.append
+    table.on_step = moved.append
     went = run_closed_loop(table, Goal((0.65, 0.65), EXACT_M), skills)
-    table.film = None
+    table.on_step = None
     assert went.status == "unreachable"
     assert "the position (0.650, 0.650) m" in went.message
     assert moved == []
@@ -165,7 +167,7 @@ def test_the_kinematics_agrees_with_what_execution_refuses(table):
         stop = rng.uniform(0.3, 1.0)
         table.place(BOX, tuple(xy))
         steps = []
-        table.film = steps.append
+        table.on_step = steps.append
         said = table.can_reach(action, stop)
         assert steps == []
         if not said:
@@ -175,7 +177,7 @@ def test_the_kinematics_agrees_with_what_execution_refuses(table):
             refused += 1
         elif rng.random() < 0.3:
             table.execute_primitive(action, stop, approach=True)
-    table.film = None
+    table.on_step = None
     assert refused > 10
 
 
@@ -337,7 +339,7 @@ def test_a_knock_in_the_middle_of_an_action_follows_mechanics(table):
         table.execute_primitive(Push.towards(0.0), 0.8, approach=True)
     assert len(script.happened) == 1
     assert table.object_pose()[1] > 0.02
-    assert table.film is None
+    assert table.on_step is None
 
 
 def test_disturbances_are_a_function_of_the_seed():

@@ -34,15 +34,15 @@ BOTH = pytest.mark.parametrize("plan", [plan_astar, plan_continuous])
 
 
 @BOTH
-@pytest.mark.parametrize("thing", [BOX, TUBE, LOG], ids=["box", "tube", "log"])
-def test_one_look_is_enough_for_position_turn_and_height(world, skills, plan, thing):
-    world.place(thing, yaw_rad=0.3)
+@pytest.mark.parametrize("obj", [BOX, TUBE, LOG], ids=["box", "tube", "log"])
+def test_one_look_is_enough_for_position_turn_and_height(world, skills, plan, obj):
+    world.place(obj, yaw_rad=0.3)
     z = world.object_state()[2]
     goal = Goal((0.07, 0.06), turn_rad=0.8, height_m=0.1)
     found = skills.planner(plan)(world.depth_image(), (0.0, 0.0), goal)
     assert found.reaches_goal
     kinds = [type(step.primitive) for step in found.steps]
-    assert kinds[0] is (Drag if thing is LOG else Push)
+    assert kinds[0] is (Drag if obj is LOG else Push)
     assert kinds[-2:] == [Rotate, Grasp]
     assert found.steps[-1].predicted_height_m == pytest.approx(0.1)
     assert wrap_angle(found.steps[-1].predicted_turn_rad - 0.8) == pytest.approx(0.0, abs=0.035)

@@ -233,7 +233,7 @@ def test_a_run_is_filmed_at_the_pace_of_the_eye(make_picker):
     assert len(poses) > 20
     assert np.hypot(*np.diff(poses[:, :2], axis=0).T).max() < 0.03
     np.testing.assert_allclose(poses[-1, :2], picker.outcome.end_pose[:2], atol=1e-3)
-    assert picker.world.film is None
+    assert picker.world.on_step is None
 
 
 def test_a_disturbance_waits_for_the_end_of_the_action(make_picker, world):

@@ -53,10 +53,18 @@ ARRAYS = (
     torch.full((2,), math.nan),
     torch.zeros(1, 2, 48, 48),
 )
-THINGS = (None, object(), lambda: None, 1j, decimal.Decimal("0.05"), fractions.Fraction(1, 20), int)
+OBJECTS = (
+    None,
+    object(),
+    lambda: None,
+    1j,
+    decimal.Decimal("0.05"),
+    fractions.Fraction(1, 20),
+    int,
+)
 OURS = (Goal((0.1, 0.0)), Push(0.0), world.Cuboid(0.06, 0.05, 0.05), planning.PlanMode(1, True))
 HOSTILE = st.one_of(
-    st.sampled_from(NUMBERS + WORDS + ARRAYS + THINGS + OURS),
+    st.sampled_from(NUMBERS + WORDS + ARRAYS + OBJECTS + OURS),
     st.sampled_from(HEAPS),
     st.floats(),
     st.integers(),
@@ -82,7 +90,7 @@ def shop(one_world, skills, pushes, tmp_path_factory):
     film(one_world)
     return {
         "world": one_world,
-        "thing": box,
+        "obj": box,
         "image": image,
         "goal": goal,
         "step": step,
@@ -129,7 +137,7 @@ def valid_calls(shop):
 
     def on_table(act):
         def put_back_and(**given):
-            w.place(shop["thing"], at, 0.3, config=world.WorldConfig())
+            w.place(shop["obj"], at, 0.3, config=world.WorldConfig())
             return act(**given)
 
         put_back_and.__signature__ = inspect.signature(act)
@@ -155,12 +163,12 @@ def valid_calls(shop):
         "LyingCylinder": (world.LyingCylinder, {"length": 0.05, "diameter": 0.05}),
         "Sphere": (world.Sphere, {"diameter": 0.05}),
         "Prism": (world.Prism, {"corners": corners, "height": 0.05}),
-        "family_named": (world.family_named, {"name": "cuboid"}),
+        "category_named": (world.category_named, {"name": "cuboid"}),
         "WorldConfig": (world.WorldConfig, dataclasses.asdict(world.WorldConfig())),
         "Tabletop": (world.Tabletop, {"config": world.WorldConfig()}),
         "place": (
             w.place,
-            {"thing": shop["thing"], "xy_m": at, "yaw_rad": 0.0, "tool": "gripper", "config": None},
+            {"obj": shop["obj"], "xy_m": at, "yaw_rad": 0.0, "tool": "gripper", "config": None},
         ),
         "execute_primitive": (
             on_table(w.execute_primitive),
@@ -345,7 +353,7 @@ def valid_calls(shop):
         "plot_depth": (show.plot_depth, {"ax": ax, "image": image, "width_m": 0.16}),
         "plot_footprint": (
             show.plot_footprint,
-            {"ax": ax, "thing": shop["thing"], "xy_m": at, "yaw_rad": 0.0},
+            {"ax": ax, "obj": shop["obj"], "xy_m": at, "yaw_rad": 0.0},
         ),
         "plot_plan": (show.plot_plan, {"ax": ax, "plan": plan, "sigma": True, "yaw_rad": 0.0}),
         "plot_outcome": (show.plot_outcome, {"ax": ax, "outcome": shop["outcome"]}),
@@ -385,7 +393,7 @@ def valid_calls(shop):
         "outline_in_lever_frame": (
             show.outline_in_lever_frame,
             {
-                "thing": shop["thing"],
+                "obj": shop["obj"],
                 "yaw_rad": 0.3,
                 "contact_xy_m": np.array(at),
                 "theta_rad": 0.1,
@@ -393,7 +401,7 @@ def valid_calls(shop):
         ),
         "plot_closed_loop": (
             show.plot_closed_loop,
-            {"ax": ax, "pursuit": shop["pursuit"], "thing": shop["thing"]},
+            {"ax": ax, "pursuit": shop["pursuit"], "obj": shop["obj"]},
         ),
         "refuse_seen": (
             evaluation.refuse_seen,
@@ -419,7 +427,7 @@ NAMES = re.findall(
     r"\S+",
     """
 Goal Step Plan Push Push.towards Push.path Drag Grasp Rotate LeverUp primitive_named Cuboid
-UprightCylinder LyingCylinder Sphere Prism family_named WorldConfig Tabletop place execute_primitive
+UprightCylinder LyingCylinder Sphere Prism category_named WorldConfig Tabletop place execute_primitive
 execute execute_path can_reach depth_image_from picture mark shove knock topple settle Normaliser
 from_dataset open_interactions split_interactions Recipe Variation collect CNPConfig
 FiLMConfig build Ensemble TrainingConfig coverage fit_temperature
@@ -492,7 +500,7 @@ def test_a_hostile_value_is_refused_by_name_or_does_no_harm(shop, name, tmp_path
 
 
 MADE_BY_DRIVEN_ONES = """
-ClosedLoopResult EffectModel EffectNetwork NetworkConfig Thing open_loop
+ClosedLoopResult EffectModel EffectNetwork NetworkConfig TabletopObject open_loop
 """
 
 

@@ -36,12 +36,12 @@ def test_the_shipped_sets_are_what_their_recipes_say(shipped, world):
     assert data.sizes["sample"] == 301
     assert np.isfinite(data["effect"].values).all()
     for index in (0, 77):
-        thing, seen = interact(recipe, index, world)
+        obj, seen = interact(recipe, index, world)
         stored = data.isel(interaction=index)
         # Bits are promised on one machine; elsewhere processors round differently.
         gap = np.abs(stored["effect"].values[:, :2] - seen.effect[:, :2]).max()
         assert gap < 0.001
-        assert stored["size"].values[2] == pytest.approx(thing.height_m, abs=2e-6)
+        assert stored["size"].values[2] == pytest.approx(obj.height_m, abs=2e-6)
         assert bool(stored["success"]) == seen.success
 
 
@@ -148,7 +148,7 @@ def test_a_missing_set_names_the_shipped_ones(tmp_path):
         ({"primitives": "push"}, "primitives='push'"),
         ({"size_range_m": (0.08, 0.04)}, r"size_range_m must be a range .* \(0\.08, 0\.04\)"),
         ({"height_range_m": (0.0, 0.04)}, r"height_range_m must be a range .* got \(0\.0, 0\.04\)"),
-        ({"families": ("cone",)}, "family 'cone'"),
+        ({"families": ("cone",)}, "category 'cone'"),
         ({"families": ()}, "families must be a sequence of at least one"),
         ({"n_interactions": 0}, "n_interactions .* 0"),
         ({"seed": -1}, "seed .* -1"),

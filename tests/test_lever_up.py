@@ -207,10 +207,10 @@ def test_the_drawn_polygon_is_the_one_in_the_image(levers):
     kept = np.flatnonzero(~levers["fault"].values)
     for row in (0, 5, 11):
         number = int(kept[row])
-        thing, yaw, _ = draw_scene(recipe, number)
+        obj, yaw, _ = draw_scene(recipe, number)
         lever = levers.isel(interaction=number)
         contact = np.array([float(lever["contact_x"]), float(lever["contact_y"])])
-        outline = outline_in_lever_frame(thing, yaw, contact, float(lever["theta"]))
+        outline = outline_in_lever_frame(obj, yaw, contact, float(lever["theta"]))
         inside = Outline(outline).contains_points(grid).reshape(128, 128)
         assert (inside & masks[row]).sum() > 0.96 * (inside | masks[row]).sum()
 

@@ -133,15 +133,15 @@ def test_a_quarter_turn_of_the_table_turns_the_answer(name, quarters, some):
 
 @torch.no_grad()
 @pytest.mark.parametrize("name", ["push_film", "push_film_x10"])
-@pytest.mark.parametrize("thing", [Cuboid(0.07, 0.05, 0.06), Cuboid(0.06, 0.07, 0.07),
+@pytest.mark.parametrize("obj", [Cuboid(0.07, 0.05, 0.06), Cuboid(0.06, 0.07, 0.07),
                                    UprightCylinder(0.06, 0.06)])  # fmt: skip
-def test_any_turn_of_a_real_object_turns_the_answer_of_the_trained_model(name, thing, world):
+def test_any_turn_of_a_real_object_turns_the_answer_of_the_trained_model(name, obj, world):
     model, _ = load_checkpoint(name)
     plane = slice(0, 2)
     straight, errors = None, []
     for degrees in (0, 11, 33, 45, 62, 78, 90):
         turn_rad = math.radians(degrees)
-        world.place(thing, (0.0, 0.0), 0.3 + turn_rad)
+        world.place(obj, (0.0, 0.0), 0.3 + turn_rad)
         image = torch.from_numpy(np.array(world.depth_image()))[None]
         pushed = [Push(theta + turn_rad) for theta in np.linspace(0, 6, 24)]
         effect = model.predict(

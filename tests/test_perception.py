@@ -14,7 +14,7 @@ from affordlib.perception import (
 )
 from affordlib.primitives import Drag, Grasp, Push
 from affordlib.world import (
-    FAMILIES,
+    CATEGORIES,
     Cuboid,
     LyingCylinder,
     Sphere,
@@ -25,21 +25,21 @@ from affordlib.world import (
 CLEAN = WorldConfig()
 
 
-def _seen(world, thing, yaw=0.3, xy=(0.0, 0.0), **config):
-    world.place(thing, xy, yaw, config=WorldConfig(**config))
+def _seen(world, obj, yaw=0.3, xy=(0.0, 0.0), **config):
+    world.place(obj, xy, yaw, config=WorldConfig(**config))
     observation = world.observe()
-    world.place(thing, xy, yaw, config=CLEAN)
+    world.place(obj, xy, yaw, config=CLEAN)
     return observation
 
 
-@pytest.mark.parametrize("family", FAMILIES.values(), ids=lambda f: f.family)
-def test_round_tops_look_rollable(world, family):
+@pytest.mark.parametrize("category", CATEGORIES.values(), ids=lambda f: f.category)
+def test_round_tops_look_rollable(world, category):
     rng = np.random.default_rng(7)
     for _ in range(10):
-        thing = family.sample(rng)
-        image = _seen(world, thing, rng.uniform(-3, 3)).image
-        assert looks_rollable(image) == thing.rollable
-        assert object_height_m(image) == pytest.approx(thing.height_m, abs=0.003)
+        obj = category.sample(rng)
+        image = _seen(world, obj, rng.uniform(-3, 3)).image
+        assert looks_rollable(image) == obj.rollable
+        assert object_height_m(image) == pytest.approx(obj.height_m, abs=0.003)
 
 
 def test_the_axis_of_a_lying_cylinder_is_seen(world):
@@ -77,18 +77,16 @@ def test_actions_suit_what_is_seen(world):
     assert adapt_to_object(Push(1.0), image) == Push(1.0)
 
 
-@pytest.mark.parametrize(
-    "thing", [Cuboid(0.06, 0.05, 0.05), Sphere(0.06), LyingCylinder(0.07, 0.05)]
-)
-def test_a_kinect_finds_the_object_anywhere(world, thing):
+@pytest.mark.parametrize("obj", [Cuboid(0.06, 0.05, 0.05), Sphere(0.06), LyingCylinder(0.07, 0.05)])
+def test_a_kinect_finds_the_object_anywhere(world, obj):
     rng = np.random.default_rng(9)
     errors = []
     for k in range(12):
         xy = rng.uniform([-0.3, -0.5], [0.5, 0.5])
-        observation = _seen(world, thing, 0.4, tuple(xy), camera="kinect", noise_seed=k)
+        observation = _seen(world, obj, 0.4, tuple(xy), camera="kinect", noise_seed=k)
         errors.append(math.dist(observation.xy_m, xy))
         height = 1.0 - observation.image[0][observation.image[1] > 0]
-        assert np.quantile(height, 0.9) == pytest.approx(thing.height_m, abs=0.012)
+        assert np.quantile(height, 0.9) == pytest.approx(obj.height_m, abs=0.012)
     assert 0.0001 < np.median(errors) < 0.003
     assert max(errors) < 0.008
 

@@ -307,8 +307,8 @@ def test_a_plan_is_carried_out(world, trained):
 
 def test_a_decoded_path_is_followed(world):
     """A decoded path that is the push's own gives what the push gives."""
-    thing, push, stop = Cuboid(0.06, 0.05, 0.05), Push(2.2), 0.85
-    world.place(thing, (0.0, 0.0), 0.3)
+    obj, push, stop = Cuboid(0.06, 0.05, 0.05), Push(2.2), 0.85
+    world.place(obj, (0.0, 0.0), 0.3)
     own = world.execute_primitive(push, stop, approach=True)
     plan = plan_astar(problem_of(MODEL, IMAGE, (0, 0), Goal((0.08, 0.0))))
     from dataclasses import replace
@@ -317,7 +317,7 @@ def test_a_decoded_path_is_followed(world):
     step = replace(
         plan.steps[0], primitive=push, stop_phase=stop, path_xy_m=push.path(phase)[:, :2]
     )
-    world.place(thing, (0.0, 0.0), 0.3)
+    world.place(obj, (0.0, 0.0), 0.3)
     decoded = world.execute(step)
     np.testing.assert_allclose(decoded.rest_effect[:2], own.rest_effect[:2], atol=0.001)
 
@@ -347,7 +347,7 @@ def test_the_shipped_model_reaches_goals(world, trained):
 def test_the_continuous_planner_comes_within_millimetres(world, film):
     """A floor again; open loop, and nearer still with corrections."""
     tasks = [t for t in frozen_tasks() if t.goals == "constructed" and t.mode == "multi_partial"]
-    tasks = [t for t in tasks if not t.thing.rollable][:6]
+    tasks = [t for t in tasks if not t.obj.rollable][:6]
 
     def continuous(image, start, goal, mode):
         return plan_continuous(problem_of(film, image, start, goal, mode))
@@ -363,7 +363,7 @@ def test_the_frozen_goals_are_those_that_are_drawn(world):
     assert len(frozen) == 460
     drawn = constructed_tasks(world, "single_partial", 4, 0, STANDING + ROLLABLE)
     for task, again in zip([t for t in frozen if t.mode == "single_partial"], drawn, strict=False):
-        assert task.thing == again.thing
+        assert task.obj == again.obj
         assert task.goal.distance_m(again.goal.xy_m) < 0.002
     for task in frozen:
         assert math.hypot(*task.goal.xy_m) > 0.02

@@ -36,17 +36,17 @@ def test_a_partial_grasp_ends_holding_at_the_height(world, skills, height):
     assert z - BOX.height_m / 2 == pytest.approx(height, abs=0.003)
 
 
-@pytest.mark.parametrize(("thing", "stop"), [(BOX, 0.7), (TUBE, 0.8), (Sphere(0.06), 1.0)])
-def test_what_is_held_stays_in_the_hand(world, thing, stop):
+@pytest.mark.parametrize(("obj", "stop"), [(BOX, 0.7), (TUBE, 0.8), (Sphere(0.06), 1.0)])
+def test_what_is_held_stays_in_the_hand(world, obj, stop):
     """Over 10 s; held by friction alone it slips by up to 3 mm."""
-    world.place(thing, (0.02, 0.01), 0.3)
+    world.place(obj, (0.02, 0.01), 0.3)
     world.execute_primitive(Grasp(), stop, approach=True)
     held = world.object_state()[2]
     for _ in range(10):
         world.settle(1.0)
         assert world.object_state()[2] == pytest.approx(held, abs=2e-4)
     world.park()
-    assert world.object_state()[2] == pytest.approx(thing.height_m / 2, abs=1e-3)
+    assert world.object_state()[2] == pytest.approx(obj.height_m / 2, abs=1e-3)
 
 
 def test_a_turn_is_a_partial_rotation(world, skills):
@@ -62,9 +62,9 @@ def test_a_turn_is_a_partial_rotation(world, skills):
     assert sum(isinstance(s.primitive, Rotate) for s in went.steps) >= 2
 
 
-@pytest.mark.parametrize("thing", [TUBE, BOX], ids=["round", "with flanks"])
-def test_position_orientation_and_height_are_chained(world, skills, thing):
-    world.place(thing, (0.0, 0.0), 0.0)
+@pytest.mark.parametrize("obj", [TUBE, BOX], ids=["round", "with flanks"])
+def test_position_orientation_and_height_are_chained(world, skills, obj):
+    world.place(obj, (0.0, 0.0), 0.0)
     goal = Goal((0.07, 0.03), 0.004, turn_rad=0.5, height_m=0.08)
     went = run_closed_loop(world, goal, skills)
     assert went.reached, went.message

@@ -11,7 +11,7 @@ from affordlib.interactions import open_interactions
 from affordlib.interactions.recipes import RECIPES, Recipe, Variation, interact
 from affordlib.primitives import PRIMITIVES, Drag, Grasp, LeverUp, Push, Rotate, min_jerk
 from affordlib.world import (
-    FAMILIES,
+    CATEGORIES,
     Cuboid,
     LyingCylinder,
     Prism,
@@ -34,9 +34,9 @@ def test_a_path_is_smooth_and_passes_its_keyframes(primitive):
     phase = np.linspace(0, 1, 3751)
     path = primitive.path(phase)
     assert np.abs(np.diff(path[:, :3], axis=0)).max() * 1000 < 0.75  # m/s
-    for leg, begin in zip(primitive.legs, primitive.leg_phases, strict=False):
-        np.testing.assert_allclose(primitive.path(begin)[0], leg.start[:5], atol=1e-9)
-    assert sum(leg.seconds for leg in primitive.legs) == pytest.approx(3.75)
+    for segment, begin in zip(primitive.segments, primitive.segment_phases, strict=False):
+        np.testing.assert_allclose(primitive.path(begin)[0], segment.start[:5], atol=1e-9)
+    assert sum(segment.seconds for segment in primitive.segments) == pytest.approx(3.75)
 
 
 @pytest.mark.parametrize("primitive", EXAMPLES, ids=lambda one: one.name)
@@ -56,8 +56,8 @@ def test_nothing_is_touched_before_an_action_says_so(name):
 
 def test_a_drag_path_is_caged_before_it_moves():
     drag = Drag.towards(0.5, length=0.04)
-    closed = drag.leg_phases[2]
-    before, after = drag.path(closed)[0], drag.path(drag.leg_phases[3])[0]
+    closed = drag.segment_phases[2]
+    before, after = drag.path(closed)[0], drag.path(drag.segment_phases[3])[0]
     np.testing.assert_allclose(before[[0, 1, 4]], 0.0, atol=1e-12)
     np.testing.assert_allclose(after[:2], 0.04 * np.array([math.cos(0.5), math.sin(0.5)]))
     assert drag.path(1.0)[0, 4] == 1.0
@@ -66,26 +66,26 @@ def test_a_drag_path_is_caged_before_it_moves():
 def test_the_lever_turns_about_the_far_edge():
     """The blade's tip keeps its distance from the far edge, where the object turns."""
     lever = LeverUp(-0.08, 0.0, 0.0, 0.16)
-    path = lever.path(np.linspace(lever.leg_phases[1], 1, 50))
+    path = lever.path(np.linspace(lever.segment_phases[1], 1, 50))
     edge = np.array([path[0, 0] + 0.16, 0, path[0, 2]])
     np.testing.assert_allclose(np.linalg.norm(path[:, :3] - edge, axis=1), 0.16, atol=1e-9)
     raised = math.asin((path[-1, 2] - path[0, 2]) / 0.16)
     assert math.degrees(raised) == pytest.approx(65)
 
 
-@pytest.mark.parametrize("family", FAMILIES.values(), ids=lambda f: f.family)
-def test_things_rest_where_they_are_placed(world, family):
+@pytest.mark.parametrize("category", CATEGORIES.values(), ids=lambda f: f.category)
+def test_things_rest_where_they_are_placed(world, category):
     import pybullet
 
     for seed in range(4):
-        thing = family.sample(np.random.default_rng(seed))
-        world.place(thing, (0.1, -0.2), 0.7, config=CLEAN)
+        obj = category.sample(np.random.default_rng(seed))
+        world.place(obj, (0.1, -0.2), 0.7, config=CLEAN)
         before = np.array(world.object_state())
         for _ in range(120):
             pybullet.stepSimulation(world.client)
         np.testing.assert_allclose(world.object_state()[:3], before[:3], atol=4e-4)
         assert not world.object_fell()
-        assert world.object_rolls() == thing.rollable == (family in (LyingCylinder, Sphere))
+        assert world.object_rolls() == obj.rollable == (category in (LyingCylinder, Sphere))
 
 
 def test_a_prism_is_an_extruded_polygon_about_its_centroid():
@@ -155,7 +155,7 @@ def test_a_rotation_turns_by_its_sweep(world):
     assert seen.rest_effect[3] == pytest.approx(Rotate.sweep_rad, abs=0.02)
     assert math.hypot(*seen.rest_effect[:2]) < 0.004
     world.place(Cuboid(0.06, 0.05, 0.05))
-    half_way = world.execute_primitive(Rotate(), float(np.mean(Rotate().leg_phases[2:4])))
+    half_way = world.execute_primitive(Rotate(), float(np.mean(Rotate().segment_phases[2:4])))
     assert half_way.rest_effect[3] == pytest.approx(Rotate.sweep_rad / 2, abs=0.02)
 
 
@@ -202,8 +202,8 @@ def test_stopped_anywhere_it_rests_where_the_full_one_was(world, name, smooth):
         then = np.array([np.interp(stop, full.phase, effect) for effect in full.effect.T])
         recipe = RECIPES[name]
         interact(recipe, index, world, stop_phase=0.0)
-        thing, start = world.thing, full.start_pose
-        world.place(thing, start[:2], start[2], config=recipe.world)
+        obj, start = world.obj, full.start_pose
+        world.place(obj, start[:2], start[2], config=recipe.world)
         part = world.execute_primitive(full.primitive, stop, smooth=smooth)
         lost = name == "grasp" and not full.success
         (slipped if lost else held).append(math.dist(part.rest_effect[:3], then[:3]))
@@ -221,7 +221,7 @@ def test_what_the_arm_cannot_reach_is_recorded_and_moves_nothing(world):
     found = []
     for index in range(60):
         _, seen = interact(recipe, index, world, stop_phase=0.0)
-        world.place(world.thing, seen.start_pose[:2], seen.start_pose[2])
+        world.place(world.obj, seen.start_pose[:2], seen.start_pose[2])
         seen = world.execute_primitive(seen.primitive, record_unreachable=True)
         offset = np.array([*seen.start_pose[:2], 0, 0, 0])
         path = seen.primitive.path(np.linspace(0, 1, 40)) + offset
@@ -266,7 +266,7 @@ def test_mass_off_the_centre_turns_a_push_and_not_the_frame(world):
 def test_a_biased_robot_places_its_action_beside(world):
     world.place(UprightCylinder(0.06, 0.05), (0.0, 0.0), config=WorldConfig(bias_m=(0.0, 0.004)))
     seen = world.execute_primitive(Push.towards(0.0))
-    assert seen.believed_xy_m == pytest.approx((0.0, 0.004))
+    assert seen.estimated_xy_m == pytest.approx((0.0, 0.004))
     assert seen.tool[-1, 1] == pytest.approx(0.0, abs=1e-3)  # relative to the believed centre
     assert 0.002 < seen.rest_effect[1] < 0.006
     world.place(UprightCylinder(0.06, 0.05), config=CLEAN)

@@ -25,11 +25,11 @@ def test_a_film_shows_the_robot_move(world, tmp_path):
     film = FrameRecorder(every=240, width=80, height=60)
     with pytest.raises(RuntimeError, match="there are no frames"):
         film.encoded()
-    world.film = film
+    world.on_step = film
     try:
         world.execute_primitive(Push(1.0))
     finally:
-        world.film = None
+        world.on_step = None
     assert len(film.frames) == 5
     assert np.abs(film.frames[0].astype(int) - film.frames[-1]).max() > 50
     figure, _ = plt.subplots(figsize=(2, 2))

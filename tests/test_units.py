@@ -347,10 +347,10 @@ def test_parts_that_would_be_one_row_are_refused(tmp_path):
 
 
 def test_a_fold_may_lack_a_class():
-    def part(families):
-        errors = [0.001 * (k + 1) for k in range(len(families))]
+    def part(categories):
+        errors = [0.001 * (k + 1) for k in range(len(categories))]
         names = ("final_error", "trajectory_error", "after_contact_error")
-        return {"n": 100, "fixed_test": {"family": families, **dict.fromkeys(names, errors)}}
+        return {"n": 100, "fixed_test": {"family": categories, **dict.fromkeys(names, errors)}}
 
     folds = [part([0, 0, 1]), part([0, 0, 1]), part([0, 0])]
     told = [(Unit("film", "drag", fold=k), fold) for k, fold in enumerate(folds)]

@@ -19,14 +19,14 @@ from affordlib.world import (
     UnreachableError,
     UprightCylinder,
     WorldConfig,
+    category_named,
     execution,
-    family_named,
     robot,
     scene,
 )
 from affordlib.world.motion import Drive
 
-THINGS = (Cuboid(0.05, 0.07, 0.06), UprightCylinder(0.06, 0.05))
+OBJECTS = (Cuboid(0.05, 0.07, 0.06), UprightCylinder(0.06, 0.05))
 
 
 def test_push_path_is_the_papers():
@@ -59,13 +59,13 @@ def test_inverse_kinematics_agrees_with_the_description():
     pybullet.disconnect(client)
 
 
-@pytest.mark.parametrize("thing", THINGS)
-def test_a_push_ends_beyond_the_gripper(world, thing):
+@pytest.mark.parametrize("obj", OBJECTS)
+def test_a_push_ends_beyond_the_gripper(world, obj):
     """The gripper stops 5 cm past the centre, so the object ends at 5 cm plus half its extent."""
-    world.place(thing, (0.0, 0.0), 0.0)
+    world.place(obj, (0.0, 0.0), 0.0)
     seen = world.execute_primitive(Push.towards(0.0))
-    half, finger = np.ptp(thing.footprint_m[:, 0]) / 2, 0.01
-    if isinstance(thing, UprightCylinder):  # it sinks in between the fingers, 3 cm apart
+    half, finger = np.ptp(obj.footprint_m[:, 0]) / 2, 0.01
+    if isinstance(obj, UprightCylinder):  # it sinks in between the fingers, 3 cm apart
         half = math.sqrt(half**2 - 0.015**2)
     assert seen.effect[-1, 0] == pytest.approx(0.05 + finger + half, abs=0.003)
     assert abs(seen.effect[-1, 1]) < 0.004
@@ -79,9 +79,9 @@ def test_a_stopped_push_rests_where_the_full_push_was(world):
     gaps = []
     for k, stop in enumerate((0.65, 0.75, 0.85, 0.95)):
         push = Push(1.0 + k)
-        world.place(THINGS[k % 2], (0.0, 0.0), 0.3)
+        world.place(OBJECTS[k % 2], (0.0, 0.0), 0.3)
         full = world.execute_primitive(push)
-        world.place(THINGS[k % 2], (0.0, 0.0), 0.3)
+        world.place(OBJECTS[k % 2], (0.0, 0.0), 0.3)
         part = world.execute_primitive(push, stop)
         then = [np.interp(stop, full.phase, full.effect[:, c]) for c in range(2)]
         gaps.append(np.hypot(*(part.rest_effect[:2] - then)))
@@ -90,27 +90,27 @@ def test_a_stopped_push_rests_where_the_full_push_was(world):
 
 
 def test_approach_changes_nothing_that_matters(world):
-    world.place(THINGS[0], (0.05, -0.1), 0.4)
+    world.place(OBJECTS[0], (0.05, -0.1), 0.4)
     put = world.execute_primitive(Push(2.0))
-    world.place(THINGS[0], (0.05, -0.1), 0.4)
+    world.place(OBJECTS[0], (0.05, -0.1), 0.4)
     moved = world.execute_primitive(Push(2.0), approach=True)
     np.testing.assert_allclose(moved.rest_effect[:2], put.rest_effect[:2], atol=5e-4)
     end = np.array(world.object_pose()[:2])
     np.testing.assert_allclose(end, np.array([0.05, -0.1]) + moved.rest_effect[:2], atol=1e-5)
 
 
-@pytest.mark.parametrize("thing", THINGS)
+@pytest.mark.parametrize("obj", OBJECTS)
 @pytest.mark.parametrize("xy", [(0.0, 0.0), (0.21, -0.33)])
-def test_camera_measures_the_object(world, thing, xy):
-    world.place(thing, xy, 0.5)
+def test_camera_measures_the_object(world, obj, xy):
+    world.place(obj, xy, 0.5)
     depth, mask = world.depth_image()
     pixel = CROP_WIDTH_M / IMAGE_PIXELS
-    x, y = thing.footprint_m.T
+    x, y = obj.footprint_m.T
     true_area = 0.5 * abs(np.dot(x, np.roll(y, 1)) - np.dot(y, np.roll(x, 1)))
     # The renderer draws a cylinder 0.9 mm larger than it is.
     assert mask.sum() * pixel**2 == pytest.approx(true_area, rel=0.06)
     seen_height = np.median(depth.max() - depth[mask > 0.5])
-    assert seen_height == pytest.approx(thing.height_m, abs=1e-3)
+    assert seen_height == pytest.approx(obj.height_m, abs=1e-3)
     at = np.arange(IMAGE_PIXELS) - 23.5
     centre = np.array([mask.sum(axis=0) @ at, -(mask.sum(axis=1) @ at)]) / mask.sum() * pixel
     assert np.hypot(*centre) < 0.0002
@@ -119,9 +119,9 @@ def test_camera_measures_the_object(world, thing, xy):
 
 
 def test_a_quarter_turn_of_the_table_is_a_quarter_turn_of_the_image(world):
-    world.place(THINGS[0], (0.0, 0.0), 0.35)
+    world.place(OBJECTS[0], (0.0, 0.0), 0.35)
     image = world.depth_image()
-    world.place(THINGS[0], (0.0, 0.0), 0.35 + math.pi / 2)
+    world.place(OBJECTS[0], (0.0, 0.0), 0.35 + math.pi / 2)
     assert np.abs(np.rot90(image[1]) - world.depth_image()[1]).mean() < 0.002
 
 
@@ -145,7 +145,7 @@ def test_the_same_bits_in_a_second_process_and_another_order(world):
 
 
 def test_unreachable_raises_and_moves_nothing(world):
-    world.place(THINGS[0], (0.45, 0.5), 0.0)
+    world.place(OBJECTS[0], (0.45, 0.5), 0.0)
     before = world.object_state()
     with pytest.raises(UnreachableError, match="cannot reach"):
         world.execute_primitive(Push(math.pi / 4), approach=True)
@@ -160,19 +160,19 @@ def test_unreachable_raises_and_moves_nothing(world):
         (lambda w: Push(0.0, length=-0.1), r"length .* -0\.1"),
         (lambda w: Push(0.0, radius=1.0), "radius .* 1"),
         (lambda w: primitive_named("kick"), "'kick' is unknown; choose one of .'drag', 'grasp'"),
-        (lambda w: family_named("cone"), "'cone' is unknown"),
+        (lambda w: category_named("cone"), "'cone' is unknown"),
         (lambda w: Cuboid(0.05, math.inf, 0.05), "Cuboid.width .* inf"),
         (lambda w: UprightCylinder(0.05, 5.0), "Cylinder.height .* 5"),
         (lambda w: Goal((0.9, 0.0)), r"goal xy_m = \(0\.9, 0\) m lies off the table; choose x in"),
         (lambda w: Goal((0.1, math.nan)), "goal xy_m must be two finite numbers"),
         (lambda w: Goal((0.1, 0.1), tolerance_m=-1), "Goal.tolerance_m .* -1"),
-        (lambda w: w.place(THINGS[0], (0.0, 2.0)), "xy_m = .* off the table"),
+        (lambda w: w.place(OBJECTS[0], (0.0, 2.0)), "xy_m = .* off the table"),
         (lambda w: w.execute_primitive(Push(0.0), 1.5), "stop_phase .* 1.5"),
         (lambda w: WorldConfig(table_friction=-1), "table_friction .* -1"),
     ],
 )
 def test_bad_input_is_named(world, act, words):
-    world.place(THINGS[0])
+    world.place(OBJECTS[0])
     with pytest.raises((TypeError, ValueError), match=words):
         act(world)
 
@@ -183,8 +183,8 @@ def test_an_empty_table_says_so():
 
 
 def test_a_shoved_object_moves_turns_and_rests(world):
-    thing = Cuboid(0.06, 0.04, 0.07)
-    world.place(thing, (0.05, 0.02), 0.3, config=WorldConfig(com_offset_m=(0.01, 0.0, 0.0)))
+    obj = Cuboid(0.06, 0.04, 0.07)
+    world.place(obj, (0.05, 0.02), 0.3, config=WorldConfig(com_offset_m=(0.01, 0.0, 0.0)))
     z = world.object_state()[2]
     world.shove(0.1, -0.05, 0.5)
     np.testing.assert_allclose(world.object_pose(), (0.15, -0.03, 0.8), atol=5e-4)
@@ -194,7 +194,7 @@ def test_a_shoved_object_moves_turns_and_rests(world):
     with pytest.raises(ValueError, match="dyaw_rad must be a finite number"):
         world.shove(0.0, 0.0, np.nan)
     np.testing.assert_allclose(world.object_pose(), (0.15, -0.03, 0.8), atol=5e-4)
-    world.place(thing, config=WorldConfig())
+    world.place(obj, config=WorldConfig())
 
 
 def test_a_star_is_no_convex_polygon():
@@ -235,17 +235,17 @@ def test_the_fingers_are_tied_only_while_they_close_or_hold(world):
         assert gears() == 0
 
 
-@pytest.mark.parametrize("thing", [*THINGS, LyingCylinder(0.05, 0.07)])
-def test_what_is_held_is_put_down_and_not_dropped(world, thing):
-    world.place(thing, (0.05, 0.1))
+@pytest.mark.parametrize("obj", [*OBJECTS, LyingCylinder(0.05, 0.07)])
+def test_what_is_held_is_put_down_and_not_dropped(world, obj):
+    world.place(obj, (0.05, 0.1))
     world.execute_primitive(Grasp(), 0.7, approach=True)
     held, heights = world.object_state(), []
-    assert held[2] > thing.height_m / 2 + 0.05
-    world.film = lambda world: heights.append(world.object_state()[2])
+    assert held[2] > obj.height_m / 2 + 0.05
+    world.on_step = lambda world: heights.append(world.object_state()[2])
     world.park()
     assert -np.diff(heights).min() * 240 < 0.4  # m/s; a fall from there has 1.3
     assert math.dist(held[:2], world.object_state()[:2]) < 0.001
-    assert world.object_state()[2] == pytest.approx(thing.height_m / 2, abs=5e-4)
+    assert world.object_state()[2] == pytest.approx(obj.height_m / 2, abs=5e-4)
 
 
 @pytest.mark.parametrize("yaw_rad", [0.0, math.pi / 4])
@@ -267,16 +267,16 @@ def test_what_rolls_on_a_level_table_comes_to_rest(world, yaw_rad):
 
 
 @pytest.mark.parametrize(
-    ("thing", "yaw_rad", "drags"),
+    ("obj", "yaw_rad", "drags"),
     [
         (LyingCylinder(0.08, 0.05), 0.3, [(0.698, 0.6), (0.524, 1.0), (1.745, 0.6)]),
         (LyingCylinder(0.08, 0.05), 0.7, [(0.7 + math.pi / 2, 0.8)]),
         (LyingCylinder(0.05, 0.07), 0.0, [(math.pi / 2, 0.8), (0.0, 0.8)]),
     ],
 )
-def test_a_log_that_was_dragged_and_let_go_stays(world, thing, yaw_rad, drags):
+def test_a_log_that_was_dragged_and_let_go_stays(world, obj, yaw_rad, drags):
     """Unbraked, these roll on by 9 cm to 2 m."""
-    world.place(thing, yaw_rad=yaw_rad)
+    world.place(obj, yaw_rad=yaw_rad)
     for theta, stop in drags:
         world.execute_primitive(Drag(theta), stop, approach=True)
     before = world.object_pose()[:2]
@@ -287,7 +287,7 @@ def test_a_log_that_was_dragged_and_let_go_stays(world, thing, yaw_rad, drags):
 def test_a_refused_action_looks_once(world, monkeypatch):
     looks = []
     monkeypatch.setattr(world, "observe", lambda: looks.append(1) or Tabletop.observe(world))
-    world.place(THINGS[0], (0.45, 0.5))
+    world.place(OBJECTS[0], (0.45, 0.5))
     assert not world.execute_primitive(Push(math.pi / 4), record_unreachable=True).reached
     assert len(looks) == 1
 

@@ -30,7 +30,7 @@ from affordlib.planning import MODES
 from affordlib.primitives import Drag, Push
 from affordlib.results import write_text_atomically
 from affordlib.types import Goal
-from affordlib.world import Tabletop, Thing, WorldConfig, family_named
+from affordlib.world import Tabletop, TabletopObject, WorldConfig, category_named
 
 FROZEN = {"clean": "data/goals/planning.json", "perturbed": "data/goals/planning_perturbed.json"}
 GOAL_SOURCES = ("constructed", "uniform")
@@ -54,7 +54,7 @@ class PlanningTask:
     config: the world it is in, which no planner is told.
     """
 
-    thing: Thing
+    obj: TabletopObject
     yaw_rad: float
     goal: Goal
     mode: str
@@ -63,13 +63,13 @@ class PlanningTask:
 
     def set_up(self, world: Tabletop) -> None:
         """Stand the object on a table, in its world."""
-        world.place(self.thing, (0.0, 0.0), self.yaw_rad, config=self.config)
+        world.place(self.obj, (0.0, 0.0), self.yaw_rad, config=self.config)
 
     def to_json(self) -> dict[str, Any]:
         """Plain values, from which `from_json` makes the same task."""
         plain = {
-            "object_class": self.thing.family,
-            "size_m": list(astuple(self.thing)),
+            "object_class": self.obj.category,
+            "size_m": list(astuple(self.obj)),
             "yaw_rad": self.yaw_rad,
             "goal_xy_m": list(self.goal.xy_m),
             "mode": self.mode,
@@ -80,10 +80,10 @@ class PlanningTask:
     @classmethod
     def from_json(cls, plain: dict[str, Any]) -> PlanningTask:
         """The task that `to_json` wrote."""
-        thing = family_named(plain["object_class"])(*plain["size_m"])
+        obj = category_named(plain["object_class"])(*plain["size_m"])
         goal = Goal(tuple(plain["goal_xy_m"]))
         config = WorldConfig(**plain.get("world", {}))
-        return cls(thing, plain["yaw_rad"], goal, plain["mode"], plain["goals"], config)
+        return cls(obj, plain["yaw_rad"], goal, plain["mode"], plain["goals"], config)
 
 
 def _objects(mode: str, goals: str, seed: int, index: int, classes: Sequence[str]) -> tuple:
@@ -91,8 +91,8 @@ def _objects(mode: str, goals: str, seed: int, index: int, classes: Sequence[str
         raise ValueError(f"mode {mode!r} is unknown; choose one of {sorted(MODES)}")
     key = (list(MODES).index(mode), GOAL_SOURCES.index(goals), index)
     rng = np.random.default_rng(np.random.SeedSequence(2_000_003 + seed, spawn_key=key))
-    thing = family_named(classes[index % len(classes)]).sample(rng)
-    return thing, float(rng.uniform(-math.pi, math.pi)), rng
+    obj = category_named(classes[index % len(classes)]).sample(rng)
+    return obj, float(rng.uniform(-math.pi, math.pi)), rng
 
 
 def _off_grid(rng: np.random.Generator, around: float, spread: float) -> float:
@@ -118,12 +118,12 @@ def constructed_tasks(
     """
     tasks = []
     for index in range(n):
-        thing, yaw, rng = _objects(mode, "constructed", seed, index, classes)
-        kind = Drag if thing.rollable else Push
-        config = variation.draw(thing, rng) if variation else WorldConfig()
+        obj, yaw, rng = _objects(mode, "constructed", seed, index, classes)
+        kind = Drag if obj.rollable else Push
+        config = variation.draw(obj, rng) if variation else WorldConfig()
         while True:
             direction = rng.uniform(-math.pi, math.pi)
-            world.place(thing, (0.0, 0.0), yaw, config=config)
+            world.place(obj, (0.0, 0.0), yaw, config=config)
             believed = True
             for _ in range(rng.integers(2, MODES[mode].max_steps + 1) if mode[0] == "m" else 1):
                 stop = rng.uniform(EARLIEST_STOP, 1.0) if MODES[mode].partial else 1.0
@@ -133,7 +133,7 @@ def constructed_tasks(
             x, y, _ = world.object_pose()
             if math.hypot(x, y) > MIN_DISTANCE_M and believed:
                 break
-        tasks.append(PlanningTask(thing, yaw, Goal((x, y)), mode, "constructed", config))
+        tasks.append(PlanningTask(obj, yaw, Goal((x, y)), mode, "constructed", config))
     return tasks
 
 
@@ -143,12 +143,12 @@ def uniform_tasks(
     """Tasks whose goal is drawn evenly from the ring between 2 cm and the mode's reach."""
     tasks = []
     for index in range(n):
-        thing, yaw, rng = _objects(mode, "uniform", seed, index, classes)
-        reach = MODES[mode].max_steps * REACH_M[Drag if thing.rollable else Push]
+        obj, yaw, rng = _objects(mode, "uniform", seed, index, classes)
+        reach = MODES[mode].max_steps * REACH_M[Drag if obj.rollable else Push]
         r = math.sqrt(rng.uniform(MIN_DISTANCE_M**2, reach**2))
         angle = _off_grid(rng, 0.0, math.pi)
         goal = Goal((r * math.cos(angle), r * math.sin(angle)))
-        tasks.append(PlanningTask(thing, yaw, goal, mode, "uniform"))
+        tasks.append(PlanningTask(obj, yaw, goal, mode, "uniform"))
     return tasks
 
 

@@ -17,7 +17,7 @@ from affordlib.types import (
     check_field,
     check_range,
 )
-from affordlib.world import Tabletop, Thing, WorldConfig, family_named
+from affordlib.world import Tabletop, TabletopObject, WorldConfig, category_named
 
 _TABLE_MARGIN_M = 0.08
 _LEVER_DRAWS = 20
@@ -48,10 +48,10 @@ class Variation:
         check_field(self, "com_offset", 0.0, 0.5)
         check_field(self, "bias_sd_m", 0.0, 0.02, "m")
 
-    def draw(self, thing: Thing, rng: np.random.Generator) -> WorldConfig:
+    def draw(self, obj: TabletopObject, rng: np.random.Generator) -> WorldConfig:
         """One world: what an episode with this thing is like."""
         drawn = {name: float(rng.uniform(*getattr(self, name))) for name in _RANGES}
-        half = np.array([*np.ptp(thing.footprint_m, axis=0), thing.height_m]) / 2
+        half = np.array([*np.ptp(obj.footprint_m, axis=0), obj.height_m]) / 2
         offset = self.com_offset * half * rng.uniform(-1, 1, size=3)
         return WorldConfig(
             **drawn,
@@ -93,7 +93,7 @@ class Recipe:
     variation: Variation | None = None
 
     def __post_init__(self) -> None:
-        for name, check in (("primitives", primitive_named), ("families", family_named)):
+        for name, check in (("primitives", primitive_named), ("families", category_named)):
             values = tuple(getattr(self, name))
             if not values:
                 raise ValueError(f"{name} must be a sequence of at least one name, got none")
@@ -180,12 +180,12 @@ def _generator(recipe: Recipe, index: int, *part: int) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence(recipe.seed, spawn_key=(index, *part)))
 
 
-def draw_scene(recipe: Recipe, index: int) -> tuple[Thing, float, np.random.Generator]:
+def draw_scene(recipe: Recipe, index: int) -> tuple[TabletopObject, float, np.random.Generator]:
     """Object and yaw [rad] of interaction `index`, and the generator to draw its action from."""
     rng = _generator(recipe, index)
-    family = family_named(recipe.families[rng.integers(len(recipe.families))])
-    thing = family.sample(rng, recipe.size_range_m, recipe.height_range_m)
-    return thing, float(rng.uniform(-math.pi, math.pi)), rng
+    category = category_named(recipe.families[rng.integers(len(recipe.families))])
+    obj = category.sample(rng, recipe.size_range_m, recipe.height_range_m)
+    return obj, float(rng.uniform(-math.pi, math.pi)), rng
 
 
 def draw_place(recipe: Recipe, index: int) -> tuple[float, float]:
@@ -203,16 +203,18 @@ def draw_stop(recipe: Recipe, index: int) -> float:
     return float(_generator(recipe, index, 2).uniform(0.05, 1.0)) if recipe.partial else 1.0
 
 
-def draw_world(recipe: Recipe, index: int, thing: Thing) -> WorldConfig:
+def draw_world(recipe: Recipe, index: int, obj: TabletopObject) -> WorldConfig:
     """The world in which interaction `index` takes place."""
     if recipe.variation is None:
         return recipe.world
-    return recipe.variation.draw(thing, _generator(recipe, index, 3))
+    return recipe.variation.draw(obj, _generator(recipe, index, 3))
 
 
-def _draw_action(recipe: Recipe, thing: Thing, yaw: float, rng: np.random.Generator) -> Primitive:
+def _draw_action(
+    recipe: Recipe, obj: TabletopObject, yaw: float, rng: np.random.Generator
+) -> Primitive:
     """A primitive that suits the thing, with parameters drawn at random."""
-    unsuited = "push" if thing.rollable else "drag"
+    unsuited = "push" if obj.rollable else "drag"
     names = [name for name in recipe.primitives if name != unsuited] or list(recipe.primitives)
     kind = primitive_named(names[rng.integers(len(names))] if len(names) > 1 else names[0])
     if issubclass(kind, Push | Drag):
@@ -220,7 +222,7 @@ def _draw_action(recipe: Recipe, thing: Thing, yaw: float, rng: np.random.Genera
     if not issubclass(kind, LeverUp):
         return kind()
     c, s = math.cos(yaw), math.sin(yaw)
-    outline = thing.footprint_m @ np.array([[c, s], [-s, c]])
+    outline = obj.footprint_m @ np.array([[c, s], [-s, c]])
     levers = []
     for _ in range(_LEVER_DRAWS):
         edge = int(rng.integers(len(outline)))
@@ -235,14 +237,14 @@ def _draw_action(recipe: Recipe, thing: Thing, yaw: float, rng: np.random.Genera
 
 def interact(
     recipe: Recipe, index: int, world: Tabletop, stop_phase: float | None = None
-) -> tuple[Thing, Interaction]:
+) -> tuple[TabletopObject, Interaction]:
     """Carry out interaction `index` of a recipe: the same bits in every process and order.
 
     stop_phase: where to break it off, if not where the recipe says.
     """
-    thing, yaw, rng = draw_scene(recipe, index)
-    action = _draw_action(recipe, thing, yaw, rng)
-    config = draw_world(recipe, index, thing)
-    world.place(thing, draw_place(recipe, index), yaw, tool=action.tool, config=config)
+    obj, yaw, rng = draw_scene(recipe, index)
+    action = _draw_action(recipe, obj, yaw, rng)
+    config = draw_world(recipe, index, obj)
+    world.place(obj, draw_place(recipe, index), yaw, tool=action.tool, config=config)
     stop = draw_stop(recipe, index) if stop_phase is None else stop_phase
-    return thing, world.execute_primitive(action, stop, record_unreachable=True)
+    return obj, world.execute_primitive(action, stop, record_unreachable=True)

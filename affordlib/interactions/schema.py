@@ -17,7 +17,7 @@ from affordlib.types import (
     IMAGE_CHANNELS,
     Interaction,
 )
-from affordlib.world import FAMILIES, Tabletop, Thing, WorldConfig
+from affordlib.world import CATEGORIES, Tabletop, TabletopObject, WorldConfig
 from affordlib.world.execution import RECORDED_SAMPLES
 from affordlib.world.scene import N_SAMPLES
 
@@ -124,7 +124,7 @@ def _parameters(recipe: Recipe) -> list[str]:
 
 def _variables(recipe: Recipe) -> dict[str, Variable]:
     # Read when a set is made: a reader may have added families and primitives.
-    kinds = {"primitive": PRIMITIVES, "family": FAMILIES}
+    kinds = {"primitive": PRIMITIVES, "family": CATEGORIES}
     variables = _VARIABLES | {
         name: _per_interaction("int8", flag_meanings=" ".join(known))
         for name, known in kinds.items()
@@ -167,8 +167,8 @@ def collect_chunk(recipe: Recipe, indices: range) -> dict[str, np.ndarray]:
     rows: dict[str, list] = {name: [] for name in variables if name != "phase"}
     with Tabletop(recipe.world) as world:
         for index in indices:
-            thing, seen = interact(recipe, index, world)
-            row = _row(thing, seen, world.config)
+            obj, seen = interact(recipe, index, world)
+            row = _row(obj, seen, world.config)
             if recipe.partial:
                 _, full = interact(recipe, index, world, stop_phase=1.0)
                 row["full_effect"] = np.array(
@@ -187,7 +187,7 @@ def _grained(value: object, dtype: str) -> np.ndarray:
     return (np.round(np.asarray(value, dtype=np.float64) / GRAIN) * GRAIN).astype(dtype)
 
 
-def _row(thing: Thing, seen: Interaction, config: WorldConfig) -> dict[str, object]:
+def _row(obj: TabletopObject, seen: Interaction, config: WorldConfig) -> dict[str, object]:
     parameters = {name: np.nan for kind in PRIMITIVES.values() for name in _fields(kind)}
     parameters |= {name: getattr(seen.primitive, name) for name in _fields(type(seen.primitive))}
     return parameters | {
@@ -198,15 +198,15 @@ def _row(thing: Thing, seen: Interaction, config: WorldConfig) -> dict[str, obje
         "tool": seen.tool,
         "primitive": list(PRIMITIVES).index(seen.primitive.name),
         "stop_phase": seen.stop_phase,
-        "family": list(FAMILIES).index(thing.family),
-        "size": [*np.ptp(thing.footprint_m, axis=0), thing.height_m],
-        "mass": config.density_kg_m3 * thing.volume_m3,
+        "family": list(CATEGORIES).index(obj.category),
+        "size": [*np.ptp(obj.footprint_m, axis=0), obj.height_m],
+        "mass": config.density_kg_m3 * obj.volume_m3,
         "com_offset": config.com_offset_m,
         "friction": (config.table_friction, config.object_friction, config.finger_friction),
         "tip_offset": config.tip_offset_m,
         "start_pose": seen.start_pose,
-        "believed_xy": seen.believed_xy_m,
-        "rollable": thing.rollable,
+        "believed_xy": seen.estimated_xy_m,
+        "rollable": obj.rollable,
         "rolls": seen.rolls,
         "fell": seen.fell,
         "reached": seen.reached,

@@ -114,7 +114,7 @@ class DisturbanceSchedule:
     @contextmanager
     def during(self, world: affordlib.world.Tabletop, action: int) -> Iterator[None]:
         """While entered, what comes in the middle of an action happens when it is due."""
-        film, steps = world.film, 0
+        before, steps = world.on_step, 0
         due = [one for one in self._waiting if one.action <= action and one.at_s is not None]
 
         def watch(world):
@@ -123,14 +123,14 @@ class DisturbanceSchedule:
             for one in [d for d in due if steps >= STEPS_PER_S * d.at_s]:
                 due.remove(one)
                 self._apply(world, one)
-            if film is not None:
-                film(world)
+            if before is not None:
+                before(world)
 
-        world.film = watch if due else film
+        world.on_step = watch if due else before
         try:
             yield
         finally:
-            world.film = film
+            world.on_step = before
         for one in due:
             self._apply(world, one)
             if one.kind != "goal":

@@ -133,7 +133,7 @@ def choose_turn(
     """
     wanted = wrap_angle(check_finite("turn_rad", turn_rad))
     phase, mean, std = courses.phase, courses.mean, courses.std
-    closed, opening = Rotate().leg_phases[2], Rotate().leg_phases[-2]
+    closed, opening = Rotate().segment_phases[2], Rotate().segment_phases[-2]
     held = (phase >= closed) & (phase <= opening)
     stops = [
         (float(np.interp(stop, phase, unsure)), k, float(stop))
@@ -183,8 +183,8 @@ def choose_lift(
     if course.max() < height <= course[-1] + Z_90 * std[-1]:
         # It may slip, or not; if it does not, it goes where the hand goes.
         hand = primitive.path(phase)[:, 2]
-        course = np.maximum(hand - hand[phase >= primitive.leg_phases[-2]][0], 0.0)
-    lifting = phase >= primitive.leg_phases[-2]
+        course = np.maximum(hand - hand[phase >= primitive.segment_phases[-2]][0], 0.0)
+    lifting = phase >= primitive.segment_phases[-2]
     stops = crossings(phase[lifting], course[lifting], height)
     if not len(stops):
         return None

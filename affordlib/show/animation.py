@@ -16,7 +16,7 @@ from affordlib.world import Tabletop
 
 
 class FrameRecorder:
-    """Takes a picture every `every` simulation steps (1/240 s); give it to `world.film`.
+    """Takes a picture every `every` simulation steps (1/240 s); give it to `world.on_step`.
 
     Figures can be added as frames as well, with `add`.
     """
@@ -51,7 +51,7 @@ class FrameRecorder:
         """
         if not self.frames:
             raise RuntimeError(
-                "there are no frames; set world.film to the recorder before the robot moves"
+                "there are no frames; set world.on_step to the recorder before the robot moves"
             )
         pictures = [Image.fromarray(frame) for frame in self.frames]
         if beside is not None:

@@ -126,7 +126,7 @@ class GoalPicker(Pictured, widgets.VBox):
         """Put the object back where it stood when the picker was made."""
         self._refuse_while_running()
         x, y, yaw = self._first_pose
-        self.world.place(self.world.thing, (x, y), yaw)
+        self.world.place(self.world.obj, (x, y), yaw)
         self._make_plan()
 
     def save(self, name: str = "plan.json") -> None:
@@ -235,7 +235,7 @@ class GoalPicker(Pictured, widgets.VBox):
             raise RuntimeError("the robot is still at work; press Stop or wait")
 
     def _run(self, seconds_per_action: float) -> None:
-        planner, before, done = self.planners[self.controls.planner.value], self.world.film, 0
+        planner, before, done = self.planners[self.controls.planner.value], self.world.on_step, 0
 
         def tell(plan=None):
             nonlocal done
@@ -257,7 +257,7 @@ class GoalPicker(Pictured, widgets.VBox):
                 self._make_plan()
             self.controls.show_progress(0, max(1, len(self.plan.steps)))
             yaw, z = self.world.object_pose()[2], self.world.object_state()[2]
-            self.world.film = pose_recorder(self._poses, before)
+            self.world.on_step = pose_recorder(self._poses, before)
             try:
                 execute = self.executors[self.controls.executor.value]
                 if self._stop.is_set():
@@ -282,7 +282,7 @@ class GoalPicker(Pictured, widgets.VBox):
             self.plan = None  # the next run plans from where this one broke off
             raise
         finally:
-            self.world.film = before
+            self.world.on_step = before
             self._waiting.clear()
             self._play(0.0)
             self._pose = self.world.object_pose()
@@ -397,7 +397,7 @@ class GoalPicker(Pictured, widgets.VBox):
 
     def _show(self, draft: bool = False, planning: bool = False) -> None:
         self._view.scene = make_scene(
-            self.world.thing,
+            self.world.obj,
             self._pose,
             self._goal,
             self.plan.steps if self.plan else (),
@@ -414,7 +414,7 @@ class GoalPicker(Pictured, widgets.VBox):
 
     def picture(self) -> bytes:
         """What is shown, as a PNG."""
-        return table_picture(self.world.thing, self._pose, self.plan, self.outcome, HALF_WIDTH_M)
+        return table_picture(self.world.obj, self._pose, self.plan, self.outcome, HALF_WIDTH_M)
 
 
 class PageQueue:

@@ -54,7 +54,7 @@ class PhaseSlider(FigureWidget):
     def stop_here(self) -> None:
         """Put the object back, execute the action up to t, and show where the object rests."""
         x, y, yaw = self._pose
-        self.world.place(self.world.thing, (x, y), yaw, tool=self.action.tool)
+        self.world.place(self.world.obj, (x, y), yaw, tool=self.action.tool)
         self.world.execute_primitive(self.action, self.phase)
         self.rest[self.phase] = self.world.object_pose()
         self.refresh()
@@ -66,14 +66,14 @@ class PhaseSlider(FigureWidget):
     def draw(self, figure: Figure) -> str:
         """Left the table from above, right how far the object has moved over the phase."""
         above, over_time = figure.subplots(1, 2, width_ratios=(1, 1.9))
-        t, thing, now = self.phase, self.world.thing, self.expected(self.phase)
+        t, obj, now = self.phase, self.world.obj, self.expected(self.phase)
         x, y, yaw = self._pose
         plot_table(above, around_m=(x, y), half_width_m=0.24)
         until = self.full.phase <= t
         path = 100 * (self.full.action[:, :2] + (x, y))
         above.plot(*path.T, ":", color=NEUTRAL, lw=1)
         above.plot(*path[until].T, color="black", lw=2, label="gripper")
-        plot_footprint(above, thing, (x, y), yaw, label="start")
+        plot_footprint(above, obj, (x, y), yaw, label="start")
         moved = 100 * np.hypot(*self.full.effect[:, :2].T)
         over_time.plot(self.full.phase, moved, color=PREDICTION, label="during the full action")
         over_time.axvline(t, color=NEUTRAL, ls=":")
@@ -87,11 +87,11 @@ class PhaseSlider(FigureWidget):
         )
         if t in self.rest:
             rest = self.rest[t]
-            plot_footprint(above, thing, rest[:2], rest[2], TRUTH, "at rest")
+            plot_footprint(above, obj, rest[:2], rest[2], TRUTH, "at rest")
             off_mm = 1000 * np.hypot(rest[0] - now[0], rest[1] - now[1])
             words += f" Stopped there, it rests <b>{off_mm:.2f} mm</b> from where it was then."
         told = {"label": "full action at t", "filled": False, "style": "--"}  # over what rests
-        plot_footprint(above, thing, now[:2], now[2], PREDICTION, **told)
+        plot_footprint(above, obj, now[:2], now[2], PREDICTION, **told)
         above.legend(loc="upper left", fontsize=8)
         over_time.legend(loc="upper left")
         return words

@@ -33,7 +33,7 @@ from affordlib.types import (
     check_pair,
     check_within,
 )
-from affordlib.world import Thing
+from affordlib.world import TabletopObject
 
 GOAL, PREDICTION, TRUTH, NEUTRAL = "#0072B2", "#D55E00", "#009E73", "#777777"
 
@@ -89,7 +89,7 @@ def _corners() -> list[tuple[float, float]]:
 
 def plot_footprint(
     ax: Axes,
-    thing: Thing,
+    obj: TabletopObject,
     xy_m: Sequence[float],
     yaw_rad: float = 0.0,
     color: str = NEUTRAL,
@@ -100,7 +100,7 @@ def plot_footprint(
     """The outline of an object's base at a pose."""
     yaw_rad = check_finite("yaw_rad", yaw_rad)
     c, s = math.cos(yaw_rad), math.sin(yaw_rad)
-    outline = 100 * (thing.footprint_m @ np.array([[c, s], [-s, c]]) + check_pair("xy_m", xy_m))
+    outline = 100 * (obj.footprint_m @ np.array([[c, s], [-s, c]]) + check_pair("xy_m", xy_m))
     ax.fill(*outline.T, facecolor=color if filled else "none", alpha=0.25 if filled else 1, lw=0)
     ax.plot(*np.vstack([outline, outline[:1]]).T, style, color=color, lw=1.5, label=label)
     return ax
@@ -119,12 +119,16 @@ def _beside(ax: Axes, words: str, end_cm: np.ndarray, goal: Goal, below: int) ->
 
 
 def plot_plan(
-    ax: Axes, plan: Plan, sigma: bool = True, thing: Thing | None = None, yaw_rad: float = 0.0
+    ax: Axes,
+    plan: Plan,
+    sigma: bool = True,
+    obj: TabletopObject | None = None,
+    yaw_rad: float = 0.0,
 ) -> Axes:
     """A plan as predicted: the object's path, where each step stops and σ there, and the goal.
 
     sigma: draw a disc at each step's end, with twenty times σ for its radius.
-    thing: drawn dotted as each later push is foreseen to find it, yaw_rad being how it stands now.
+    obj: drawn dotted as each later push is foreseen to find it, yaw_rad being how it stands now.
     """
     circle = plt.Circle(
         100 * np.array(plan.goal.xy_m), 100 * plan.goal.tolerance_m, color=GOAL, fill=False, lw=1
@@ -142,8 +146,8 @@ def plot_plan(
         direction = np.array(
             [math.cos(step.primitive.direction_rad), math.sin(step.primitive.direction_rad)]
         )
-        if thing is not None and k > 0:
-            plot_footprint(ax, thing, start, yaw_rad + turn, PREDICTION, filled=False, style=":")
+        if obj is not None and k > 0:
+            plot_footprint(ax, obj, start, yaw_rad + turn, PREDICTION, filled=False, style=":")
         tail = 100 * (start - 0.075 * direction)
         ax.annotate(
             "",
@@ -179,10 +183,10 @@ def plot_plan(
 
 
 def plot_outcome(
-    ax: Axes, outcome: Outcome, thing: Thing | None = None, yaw_rad: float = 0.0
+    ax: Axes, outcome: Outcome, obj: TabletopObject | None = None, yaw_rad: float = 0.0
 ) -> Axes:
     """What carrying out a plan gave: the object's real path, over the plan (see `plot_plan`)."""
-    plot_plan(ax, outcome.plan, False, thing, yaw_rad)
+    plot_plan(ax, outcome.plan, False, obj, yaw_rad)
     for k, path in enumerate(outcome.object_paths_xy_m):
         ax.plot(*(100 * path.T), color=TRUTH, lw=2, ls="--", label="truth" if k == 0 else None)
     ax.plot(*(100 * np.array(outcome.end_pose[:2])), "s", color=TRUTH, ms=6)
@@ -190,11 +194,13 @@ def plot_outcome(
     return ax
 
 
-def plot_closed_loop(ax: Axes, pursuit: ClosedLoopResult, thing: Thing | None = None) -> Axes:
+def plot_closed_loop(
+    ax: Axes, pursuit: ClosedLoopResult, obj: TabletopObject | None = None
+) -> Axes:
     """A pursuit from above: where each action took the object, and where it was moved by others.
 
     Dots are where the object was expected after each action; dotted lines what nobody planned.
-    thing: drawn as it stands in the end, if given.
+    obj: drawn as it stands in the end, if given.
     """
     first = pursuit.plans[0].goal if pursuit.plans else pursuit.goal
     if first.xy_m != pursuit.goal.xy_m:
@@ -227,8 +233,8 @@ def plot_closed_loop(ax: Axes, pursuit: ClosedLoopResult, thing: Thing | None = 
             bbox=_PLATE,
         )
         at = path[-1]
-    if thing is not None:
-        plot_footprint(ax, thing, pursuit.end_pose[:2], pursuit.end_pose[2], TRUTH)
+    if obj is not None:
+        plot_footprint(ax, obj, pursuit.end_pose[:2], pursuit.end_pose[2], TRUTH)
     ax.set_title(
         f"{pursuit.status}: {1000 * pursuit.distance_m:.1f} mm, {len(pursuit.steps)} actions"
     )
@@ -268,7 +274,7 @@ def plot_depth(
 
 
 def table_picture(
-    thing: Thing,
+    obj: TabletopObject,
     pose: Sequence[float],
     plan: Plan | None,
     outcome: Outcome | None,
@@ -291,8 +297,8 @@ def table_picture(
     if outcome is not None:
         plot_outcome(ax, outcome)
     elif plan is not None:
-        plot_plan(ax, plan, thing=thing, yaw_rad=pose[2])
-    plot_footprint(ax, thing, pose[:2], pose[2], label="object")
+        plot_plan(ax, plan, obj=obj, yaw_rad=pose[2])
+    plot_footprint(ax, obj, pose[:2], pose[2], label="object")
     ax.legend(loc="upper left")
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=90)
@@ -303,12 +309,12 @@ _ALONG, _UP = 0.45, 0.3
 
 
 def outline_in_lever_frame(
-    thing: Thing, yaw_rad: float, contact_xy_m: np.ndarray, theta_rad: float
+    obj: TabletopObject, yaw_rad: float, contact_xy_m: np.ndarray, theta_rad: float
 ) -> np.ndarray:
     """The base (n, 2) [m] of an object at its start, from the contact point, lever to the right."""
     yaw, theta = check_finite("yaw_rad", yaw_rad), check_finite("theta_rad", theta_rad)
     c, s = math.cos(yaw), math.sin(yaw)
-    outline = thing.footprint_m @ np.array([[c, s], [-s, c]]) - check_pair(
+    outline = obj.footprint_m @ np.array([[c, s], [-s, c]]) - check_pair(
         "contact_xy_m", contact_xy_m
     )
     c, s = math.cos(theta), math.sin(theta)

@@ -18,8 +18,8 @@ import traitlets
 from affordlib.show.picker_controls import step_in_words
 from affordlib.show.plots import ENLARGED
 from affordlib.types import TABLE_X_M, TABLE_Y_M, Goal, Step
-from affordlib.world import BASE_X_M, REACH_M, Tabletop, Thing
-from affordlib.world.motion import Film
+from affordlib.world import BASE_X_M, REACH_M, Tabletop, TabletopObject
+from affordlib.world.motion import StepCallback
 
 PUSH_RUN_UP_M = 0.2
 _HERE = Path(__file__).parent
@@ -41,7 +41,7 @@ class TableView(anywidget.AnyWidget):
 
 
 def make_scene(
-    thing: Thing,
+    obj: TabletopObject,
     pose: Sequence[float],
     goal: Goal,
     steps: Sequence[Step],
@@ -75,7 +75,7 @@ def make_scene(
         "limit": limit_m,
         "table": [*TABLE_X_M, *TABLE_Y_M],
         "reach": {"centre": [BASE_X_M, 0.0], "inner": inner, "outer": outer},
-        "object": {"outline": rounded(thing.footprint_m), "pose": rounded(pose)},
+        "object": {"outline": rounded(obj.footprint_m), "pose": rounded(pose)},
         "goal": {
             "xy": rounded(goal.xy_m),
             "tolerance": goal.tolerance_m,
@@ -132,7 +132,7 @@ EVERY = 12
 _RESTING = 1e-4
 
 
-def pose_recorder(poses: list[tuple[float, ...]], before: Film | None) -> Film:
+def pose_recorder(poses: list[tuple[float, ...]], before: StepCallback | None) -> StepCallback:
     """A film for a world that appends the object's poses to a list, beside the world's own film."""
     steps = itertools.count()
 

@@ -4,21 +4,21 @@ import affordlib.world._quiet_pybullet  # noqa: F401  (must come first)
 from affordlib.types import NothingSeenError, UnreachableError
 from affordlib.world.config import WorldConfig
 from affordlib.world.objects import (
-    FAMILIES,
+    CATEGORIES,
     Cuboid,
     LyingCylinder,
     Prism,
     Sphere,
-    Thing,
+    TabletopObject,
     UprightCylinder,
-    family_named,
+    category_named,
 )
 from affordlib.world.robot import BASE_X_M, REACH_M
 from affordlib.world.scene import Tabletop
 
 __all__ = [
     "BASE_X_M",
-    "FAMILIES",
+    "CATEGORIES",
     "REACH_M",
     "Cuboid",
     "LyingCylinder",
@@ -26,9 +26,9 @@ __all__ = [
     "Prism",
     "Sphere",
     "Tabletop",
-    "Thing",
+    "TabletopObject",
     "UnreachableError",
     "UprightCylinder",
     "WorldConfig",
-    "family_named",
+    "category_named",
 ]

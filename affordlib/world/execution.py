@@ -177,7 +177,7 @@ def execute(
 def put_down(world: Tabletop) -> None:
     """Lower what the hand holds to the table, open the fingers, rise and go home."""
     below_m = 0.0
-    if world.thing is not None:
+    if world.obj is not None:
         below_m = pybullet.getAABB(world.body, physicsClientId=world.client)[0][2]
     here = np.append(tool_pose(world)[:4], 0.0)
     way = np.repeat(world.arm[None], 2, axis=0)
@@ -206,7 +206,7 @@ def refused(
         rest_effect=np.zeros(5),
         image=seen.image,
         start_pose=(x, y, yaw),
-        believed_xy_m=seen.xy_m,
+        estimated_xy_m=seen.xy_m,
         tool=np.zeros((RECORDED_SAMPLES, 5)),
         tracking_error_m=0.0,
         penetration_m=0.0,
@@ -281,7 +281,7 @@ def _record(
         image=seen.image,
         start_pose=(float(start[0]), float(start[1]), float(recorded[0, 3])),
         tracking_error_m=drive.off_path_m,
-        believed_xy_m=seen.xy_m,
+        estimated_xy_m=seen.xy_m,
         tool=np.column_stack([np.interp(seldom, at_waypoint, tool[:, c]) for c in range(5)]),
         penetration_m=drive.penetration_m,
         left_table=not world.on_table((x, y, z)),

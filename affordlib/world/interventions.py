@@ -42,7 +42,7 @@ class Interventions:
         """Hit the object: its velocity [m/s] and its spin about the vertical change at once.
 
         An impulse through its centre of mass, so that friction, fingers and table decide where it
-        goes. It may be called from `film`, in the middle of an action.
+        goes. It may be called from `on_step`, in the middle of an action.
         """
         self._require_object()
         speeds = (("dx_m_s", dx_m_s), ("dy_m_s", dy_m_s))
@@ -54,12 +54,12 @@ class Interventions:
         """Tip the object over the edge of its base in a direction [rad], as a blow high up would.
 
         It gets the spin about that edge that carries it a little past its balance. It may be
-        called from `film`; otherwise let it `settle`. Raises ValueError for what cannot fall.
+        called from `on_step`; otherwise let it `settle`. Raises ValueError for what cannot fall.
         """
         self._require_object()
         c, s = math.cos(angle := check_finite("direction_rad", direction_rad)), math.sin(angle)
         if self.object_rolls():
-            raise ValueError(f"a {self.thing.family} that can roll as it lies has no edge to fall")
+            raise ValueError(f"a {self.obj.category} that can roll as it lies has no edge to fall")
         low, high = pybullet.getAABB(self.body, physicsClientId=self.client)
         x, y, z = self.object_state()[:3]
         corners = self._corners_m() - (x, y)
@@ -75,13 +75,13 @@ class Interventions:
     def _corners_m(self) -> np.ndarray:
         """The object's outline (n, 2) [m] on the table as it stands or lies."""
         if self.object_fell():
-            outline, half = self.thing.footprint_m, self.thing.height_m / 2
+            outline, half = self.obj.footprint_m, self.obj.height_m / 2
             ends = np.concatenate([np.insert(outline, 2, z, axis=1) for z in (-half, half)])
             *centre, i, j, k, w = self.object_state()
             return Rotation.from_quat([i, j, k, w]).apply(ends)[:, :2] + centre[:2]
         x, y, yaw = self.object_pose()
         c, s = math.cos(yaw), math.sin(yaw)
-        return self.thing.footprint_m @ np.array([[c, s], [-s, c]]) + (x, y)
+        return self.obj.footprint_m @ np.array([[c, s], [-s, c]]) + (x, y)
 
     def _change_velocity(self, linear: np.ndarray, angular: np.ndarray) -> None:
         moving = pybullet.getBaseVelocity(self.body, physicsClientId=self.client)
@@ -98,7 +98,7 @@ class Interventions:
         What can roll is braked by the table.
         """
         steps = round(check_within("seconds", seconds, 0.0, 60.0, "s") / motion.STEP_S)
-        if self.thing is not None:
+        if self.obj is not None:
             resist_rolling(self, True)
             motion.tie_held(self)
         motion.Drive(self, 0.0, closes=False).wait(steps)

@@ -21,7 +21,7 @@ from affordlib.world import robot
 if TYPE_CHECKING:
     from affordlib.world.scene import Tabletop
 
-Film = Callable[["Tabletop"], None]
+StepCallback = Callable[["Tabletop"], None]
 """Called with the world after every step of the simulation."""
 
 STEPS_PER_WAYPOINT = 12
@@ -92,14 +92,14 @@ def stretches(primitive: Primitive, stop_phase: float, smooth: bool = True) -> l
     otherwise it is followed at full speed and cut off.
     """
     way = []
-    for leg, begin, end in zip(
-        primitive.legs, primitive.leg_phases[:-1], primitive.leg_phases[1:], strict=True
+    for segment, begin, end in zip(
+        primitive.segments, primitive.segment_phases[:-1], primitive.segment_phases[1:], strict=True
     ):
         if way and begin >= stop_phase - 1e-9:
             break
         local = min(1.0, (stop_phase - begin) / (end - begin))
         covered = float(min_jerk(local)) if smooth else 1.0
-        n = max(2, math.ceil(leg.seconds * covered / _WAYPOINT_S - 1e-9))
+        n = max(2, math.ceil(segment.seconds * covered / _WAYPOINT_S - 1e-9))
         share = covered * min_jerk(np.linspace(0, 1, n + 1))
         at_phase = np.linspace(0, 1, n + 1)
         if covered < 1.0:
@@ -107,9 +107,9 @@ def stretches(primitive: Primitive, stop_phase: float, smooth: bool = True) -> l
             at_phase = np.interp(share, min_jerk(fine), fine)
         steps = None
         if not smooth and local < 1.0:
-            steps = RECORD_EVERY * round(local * leg.seconds / STEP_S / RECORD_EVERY)
+            steps = RECORD_EVERY * round(local * segment.seconds / STEP_S / RECORD_EVERY)
         phase = begin + at_phase * (end - begin)
-        way.append(Stretch(leg.at(share), phase, leg.guarded, steps))
+        way.append(Stretch(segment.at(share), phase, segment.guarded, steps))
     return way
 
 
@@ -259,7 +259,7 @@ class Drive:
         # With the velocity fed forward, the target of the next step would put the arm ahead.
         commands = targets[:-1].tolist()
         n_steps = whole if n_steps is None else n_steps
-        record, film = poses_W is not None, world.film
+        record, on_step = poses_W is not None, world.on_step
         now, frozen_at = (targets[0].tolist(), [0.0] * 8), None
         for step in range(n_steps):
             if record and step % RECORD_EVERY == 0:
@@ -282,8 +282,8 @@ class Drive:
                 physicsClientId=client,
             )
             pybullet.stepSimulation(client)
-            if film is not None:
-                film(world)
+            if on_step is not None:
+                on_step(world)
         world.arm, world.gap_m = np.array(now[0][:6]), 2 * now[0][6]
         if n_steps < whole:
             self.hold()
@@ -306,8 +306,8 @@ class Drive:
         """Let the simulation run with the arm held where it is."""
         for _ in range(n_steps):
             pybullet.stepSimulation(self.world.client)
-            if self.world.film is not None:
-                self.world.film(self.world)
+            if self.world.on_step is not None:
+                self.world.on_step(self.world)
 
     def finish(self) -> None:
         """Write down the last state."""

@@ -1,7 +1,7 @@
-"""The things on the table: one class per family, so that a new one is a few lines.
+"""Objects on the table: one class per category, so that a new one is a few lines.
 
-A family is a frozen dataclass with its dimensions. The frame of a body has its origin in the
-centre and z upwards as the thing is placed; the x axis of a lying cylinder is its own axis.
+A category is a frozen dataclass with its dimensions. The frame of a body has its origin in the
+centre and z upwards as the object is placed; the x axis of a lying cylinder is its own axis.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ _UPRIGHT = math.cos(math.radians(45))
 
 
 @dataclass(frozen=True)
-class Thing(ABC):
-    """Something on the table; all its fields are lengths [m]."""
+class TabletopObject(ABC):
+    """An object on the table; all its fields are lengths [m]."""
 
-    family: ClassVar[str]
+    category: ClassVar[str]
     rollable: ClassVar[bool] = False
     """Whether it can roll as it is placed."""
 
@@ -48,8 +48,8 @@ class Thing(ABC):
         rng: np.random.Generator,
         size_range_m: tuple[float, float] = SIZE_RANGE_M,
         height_range_m: tuple[float, float] | None = None,
-    ) -> Thing:
-        """A thing with dimensions drawn uniformly from a range, heights from their own if given."""
+    ) -> TabletopObject:
+        """An object with dimensions drawn uniformly from a range, heights from their own if given."""
         sizes = rng.uniform(*size_range_m, size=len(fields(cls)))
         if height_range_m is not None:
             low, high = size_range_m
@@ -100,14 +100,14 @@ def _rectangle(length: float, width: float) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Cuboid(Thing):
+class Cuboid(TabletopObject):
     """A box with edges `length`, `width` and `height` [m], standing on its base."""
 
     length: float
     width: float
     height: float
 
-    family = "cuboid"
+    category = "cuboid"
 
     @property
     def height_m(self) -> float:
@@ -127,13 +127,13 @@ class Cuboid(Thing):
 
 
 @dataclass(frozen=True)
-class UprightCylinder(Thing):
+class UprightCylinder(TabletopObject):
     """A cylinder of the given `diameter` and `height` [m], standing on its round base."""
 
     diameter: float
     height: float
 
-    family = "upright_cylinder"
+    category = "upright_cylinder"
 
     @property
     def height_m(self) -> float:
@@ -156,13 +156,13 @@ class UprightCylinder(Thing):
 
 
 @dataclass(frozen=True)
-class LyingCylinder(Thing):
+class LyingCylinder(TabletopObject):
     """A cylinder of the given `length` and `diameter` [m], lying on its side."""
 
     length: float
     diameter: float
 
-    family = "lying_cylinder"
+    category = "lying_cylinder"
     rollable = True
 
     @property
@@ -195,12 +195,12 @@ class LyingCylinder(Thing):
 
 
 @dataclass(frozen=True)
-class Sphere(Thing):
+class Sphere(TabletopObject):
     """A ball of the given `diameter` [m]."""
 
     diameter: float
 
-    family = "sphere"
+    category = "sphere"
     rollable = True
 
     @property
@@ -223,7 +223,7 @@ class Sphere(Thing):
 
 
 @dataclass(frozen=True)
-class Prism(Thing):
+class Prism(TabletopObject):
     """An extruded convex polygon: `corners` (x, y) [m] counter-clockwise, and a `height` [m].
 
     Its centroid becomes the origin; the base is chamfered all around.
@@ -232,7 +232,7 @@ class Prism(Thing):
     corners: tuple[tuple[float, float], ...]
     height: float
 
-    family = "prism"
+    category = "prism"
 
     def __post_init__(self) -> None:
         check_field(self, "height", 0.005, LARGEST_M, "m")
@@ -316,16 +316,17 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
 
-FAMILIES: dict[str, type[Thing]] = {
-    family.family: family for family in (Cuboid, UprightCylinder, LyingCylinder, Sphere, Prism)
+CATEGORIES: dict[str, type[TabletopObject]] = {
+    category.category: category
+    for category in (Cuboid, UprightCylinder, LyingCylinder, Sphere, Prism)
 }
 
 
-def family_named(name: str) -> type[Thing]:
-    """The class of the object family called `name`; raises naming the known ones."""
-    if name not in FAMILIES:
-        raise ValueError(f"object family {name!r} is unknown; choose one of {sorted(FAMILIES)}")
-    return FAMILIES[name]
+def category_named(name: str) -> type[TabletopObject]:
+    """The class of the object category called `name`; raises naming the known ones."""
+    if name not in CATEGORIES:
+        raise ValueError(f"object category {name!r} is unknown; choose one of {sorted(CATEGORIES)}")
+    return CATEGORIES[name]
 
 
 def _mesh(vertices: np.ndarray) -> dict[str, Any]:
@@ -346,7 +347,7 @@ def _mesh(vertices: np.ndarray) -> dict[str, Any]:
 
 def create_body(
     client: int,
-    thing: Thing,
+    obj: TabletopObject,
     mass_kg: float,
     rgba: tuple,
     com_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
@@ -355,7 +356,7 @@ def create_body(
 
     com_offset_m: where its centre of mass lies in its frame.
     """
-    shape = thing.shape()
+    shape = obj.shape()
     frame, seen = shape.pop("frame", (0, 0, 0, 1)), shape.pop("seen", None)
     visual = dict(shape) if seen is None else _mesh(seen)
     if "height" in visual:
@@ -374,10 +375,10 @@ def create_body(
 
 
 def create_footprint(
-    client: int, thing: Thing, xy_m: tuple, yaw_rad: float, rgba: tuple, scale: float = 1.0
+    client: int, obj: TabletopObject, xy_m: tuple, yaw_rad: float, rgba: tuple, scale: float = 1.0
 ) -> int:
     """Create the object's outline as a sheet on the table that is only seen; return its id."""
-    outline = scale * thing.footprint_m
+    outline = scale * obj.footprint_m
     # Larger sheets lie lower, so that one on another shows as a frame around it.
     low, high = (np.full((len(outline), 1), z) for z in (-0.005, 0.001 / scale))
     sheet = np.vstack([np.hstack([outline, low]), np.hstack([outline, high])])

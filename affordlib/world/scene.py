@@ -36,8 +36,8 @@ from affordlib.world import camera, motion, robot
 from affordlib.world.config import WorldConfig
 from affordlib.world.execution import execute, place_offset, plan_motion, put_down, refused
 from affordlib.world.interventions import Interventions
-from affordlib.world.motion import Film
-from affordlib.world.objects import Thing, create_body, create_footprint
+from affordlib.world.motion import StepCallback
+from affordlib.world.objects import TabletopObject, create_body, create_footprint
 
 OBJECTS_PER_BUILD = 256
 """After so many objects the client is built anew: Bullet keeps 5 kB of each that is removed."""
@@ -49,17 +49,17 @@ N_SAMPLES = 301
 class Tabletop(Interventions):
     """A table, an arm and at most one object, in a PyBullet client of its own.
 
-    looks: so many looks of a noisy camera make one perception.
+    n_averaged_images: over how many noisy images an observation averages.
     """
 
     def __init__(self, config: WorldConfig | None = None) -> None:
         self.config = config or WorldConfig()
         self._client = pybullet.connect(pybullet.DIRECT)
         self._disconnect = weakref.finalize(self, pybullet.disconnect, self._client)
-        self.thing: Thing | None = None
-        self.film: Film | None = None
+        self.obj: TabletopObject | None = None
+        self.on_step: StepCallback | None = None
         self.tool = ""
-        self.looks = 1
+        self.n_averaged_images = 1
         self.reset()
 
     def __enter__(self) -> Tabletop:
@@ -86,7 +86,7 @@ class Tabletop(Interventions):
             self._build(tool)
         else:
             self._clear()
-        self.thing, self.body = None, -1
+        self.obj, self.body = None, -1
         self.noise = np.random.default_rng(self.config.noise_seed)
         self._set_friction(self.table, -1, self.config.table_friction)
         for link in robot.touching_links(client, self.robot):
@@ -141,7 +141,7 @@ class Tabletop(Interventions):
 
     def place(
         self,
-        thing: Thing,
+        obj: TabletopObject,
         xy_m: tuple[float, float] = (0.0, 0.0),
         yaw_rad: float = 0.0,
         *,
@@ -159,10 +159,10 @@ class Tabletop(Interventions):
         self.config = config or self.config
         self.reset(tool)
         self._placed += 1
-        mass = self.config.density_kg_m3 * thing.volume_m3
+        mass = self.config.density_kg_m3 * obj.volume_m3
         com = self.config.com_offset_m
-        self.thing = thing
-        self.body = create_body(self.client, thing, mass, (0.0, 0.62, 0.45, 1), com)
+        self.obj = obj
+        self.body = create_body(self.client, obj, mass, (0.0, 0.62, 0.45, 1), com)
         self._set_friction(self.body, -1, self.config.object_friction)
         pybullet.changeDynamics(
             self.body, -1, linearDamping=0.0, angularDamping=0.0, physicsClientId=self.client
@@ -173,14 +173,14 @@ class Tabletop(Interventions):
             (
                 x + c * com[0] - s * com[1],
                 y + s * com[0] + c * com[1],
-                thing.height_m / 2 + com[2],
+                obj.height_m / 2 + com[2],
             ),
             pybullet.getQuaternionFromEuler((0, 0, yaw)),
             physicsClientId=self.client,
         )
 
     def _require_object(self) -> None:
-        if self.thing is None:
+        if self.obj is None:
             raise RuntimeError("there is no object on the table; call place(...) first")
 
     def centred(self, states: np.ndarray) -> np.ndarray:
@@ -212,12 +212,12 @@ class Tabletop(Interventions):
     def object_fell(self) -> bool:
         """Whether the object lies differently than it was placed."""
         self._require_object()
-        return self.thing.fallen(self._upward())
+        return self.obj.fallen(self._upward())
 
     def object_rolls(self) -> bool:
         """Whether the object can roll as it lies now: a cylinder on its side, not upright."""
         self._require_object()
-        return self.thing.rolls(self._upward())
+        return self.obj.rolls(self._upward())
 
     @staticmethod
     def on_table(xyz_m: tuple[float, float, float]) -> bool:
@@ -228,13 +228,15 @@ class Tabletop(Interventions):
     def observe(self) -> Observation:
         """The object's estimated position and its image; the arm must be parked.
 
-        The position is the mean over so many images (`looks`), the image is the first of them.
+        The position is the mean over `n_averaged_images` images, the image is the first of them.
         """
         self._require_object()
         x, y, _ = self.object_pose()
         image = None
         if self.config.camera == "kinect":
-            views = [camera.kinect_view(self.client, self.noise) for _ in range(self.looks)]
+            views = [
+                camera.kinect_view(self.client, self.noise) for _ in range(self.n_averaged_images)
+            ]
             x, y = np.mean([xy for xy, _ in views], axis=0).tolist()
             image = views[0][1]
         x, y = x + self.config.bias_m[0], y + self.config.bias_m[1]
@@ -276,7 +278,7 @@ class Tabletop(Interventions):
         x, y = check_on_table("xy_m", xy_m)
         yaw_rad, scale = check_finite("yaw_rad", yaw_rad), check_within("scale", scale, 0.1, 10.0)
         rgb = [check_within("rgb", share, 0.0, 1.0) for share in check_array("rgb", rgb, 3)]
-        create_footprint(self.client, self.thing, (x, y), yaw_rad, (*rgb, 1.0), scale)
+        create_footprint(self.client, self.obj, (x, y), yaw_rad, (*rgb, 1.0), scale)
 
     def execute_primitive(
         self,

@@ -114,8 +114,8 @@ def _looks() -> tuple[list[np.ndarray], list[np.ndarray]]:
     images: tuple[list[np.ndarray], list[np.ndarray]] = [], []
     with Tabletop() as world:
         for k in range(80):
-            thing = _house(rng) if k % 2 else (Cuboid, UprightCylinder)[k // 2 % 2].sample(rng)
-            world.place(thing, yaw_rad=rng.uniform(-math.pi, math.pi))
+            obj = _house(rng) if k % 2 else (Cuboid, UprightCylinder)[k // 2 % 2].sample(rng)
+            world.place(obj, yaw_rad=rng.uniform(-math.pi, math.pi))
             images[k % 2].append(world.depth_image())
     return images
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from affordlib.interactions import open_interactions
 from affordlib.primitives import DURATION_S, Push
-from affordlib.world import FAMILIES, Cuboid, Tabletop
+from affordlib.world import CATEGORIES, Cuboid, Tabletop
 from exercises.checking import Exercise, asked
 
 # 01 The tabletop
@@ -39,7 +39,7 @@ def _rest_cm(phase: float) -> float:
 def _cylinders() -> tuple[np.ndarray, np.ndarray]:
     """Diameters [m] of the upright cylinders in `push`, and how far along they went [m]."""
     pushes = open_interactions("push")
-    standing = pushes["family"].values == list(FAMILIES).index("upright_cylinder")
+    standing = pushes["family"].values == list(CATEGORIES).index("upright_cylinder")
     angle = pushes["theta"].values[standing] + np.pi
     x, y = pushes["effect"].values[standing, -1, :2].T
     return pushes["size"].values[standing, 0], np.cos(angle) * x + np.sin(angle) * y
