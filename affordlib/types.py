@@ -150,8 +150,8 @@ class Interaction:
     the object rests after the gripper has retreated; image: (2, 48, 48), depth [m] and mask, of a
     lever-up (2, 128, 128) from the contact point in the lever's direction;
     start_pose: (x, y, yaw) of the object in the frame of the table; estimated_xy_m: where the
-    robot measured it, and placed its action; tool: (26, 5) measured x, y, z [m], yaw [rad] of the tool
-    and gap of the fingers [m], every 3 steps of 50 ms as in the paper.
+    robot measured it, and placed its action; tool: (26, 5) measured x, y, z [m], yaw [rad] of the
+    tool and gap of the fingers [m], every 3 steps of 50 ms as in the paper.
 
     Of the execution: how far the tool was off its path and how deep bodies sank into each other,
     at most [m]; whether the object left the table, fell over, and can roll as it lies now; whether

@@ -49,7 +49,7 @@ class TabletopObject(ABC):
         size_range_m: tuple[float, float] = SIZE_RANGE_M,
         height_range_m: tuple[float, float] | None = None,
     ) -> TabletopObject:
-        """An object with dimensions drawn uniformly from a range, heights from their own if given."""
+        """An object with dimensions drawn uniformly from a range, heights from another if given."""
         sizes = rng.uniform(*size_range_m, size=len(fields(cls)))
         if height_range_m is not None:
             low, high = size_range_m
