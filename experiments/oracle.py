@@ -12,7 +12,7 @@ import torch
 from affordlib.planning.effect_map import EffectMap, phases_of
 from affordlib.primitives import Drag, Push
 from affordlib.types import Observations, Prediction
-from affordlib.world import Tabletop, Thing, WorldConfig
+from affordlib.world import Tabletop, TabletopObject, WorldConfig
 
 N_DIRECTIONS, PHASE_STEP = 36, 0.025
 STD_M = 1e-5
@@ -28,7 +28,7 @@ class SimulatorModel:
     """
 
     world: Tabletop
-    thing: Thing
+    obj: TabletopObject
     yaw_rad: float
     kind: type[Push] | type[Drag]
     config: WorldConfig
@@ -47,7 +47,7 @@ class SimulatorModel:
         travel = observations.action[:, -1] - observations.action[:, 0]
         effects = []
         for (x, y), t in zip(travel.tolist(), t_target.numpy(), strict=True):
-            self.world.place(self.thing, (0.0, 0.0), self.yaw_rad, config=self.config)
+            self.world.place(self.obj, (0.0, 0.0), self.yaw_rad, config=self.config)
             action = self.kind.towards(math.atan2(y, x))
             if len(t) == 1:
                 # A partial action is re-timed to its own stop, so it is executed as such.
@@ -79,7 +79,7 @@ def oracle_effects(
     kind = Drag if world.object_rolls() else Push
     physics = WorldConfig() if nominal_physics else world.config
     config = replace(physics, camera="ideal", bias_m=(0.0, 0.0))
-    model = SimulatorModel(imagined, world.thing, world.object_pose()[2], kind, config)
+    model = SimulatorModel(imagined, world.obj, world.object_pose()[2], kind, config)
     phases = phases_of(kind, round((1 - kind.acts_from) / PHASE_STEP) + 1)
     effect_map = SensitivityMap if risk_averse else EffectMap
     return effect_map(model, image, kind, N_DIRECTIONS, len(phases))

@@ -128,7 +128,7 @@ class PlannerConfig:
         fitting = [
             number
             for number, task in enumerate(tasks)
-            if task.goals in self.sources and task.thing.family in self.classes
+            if task.goals in self.sources and task.obj.category in self.classes
         ]
         return fitting[:: self.stride]
 
@@ -226,20 +226,20 @@ def attempt(
     `POSITION_ERROR_M` and `YAW_ERROR_RAD`. n_averaged_images: whose mean each observation is.
     """
     task.set_up(world)
-    world.looks = n_averaged_images
+    world.n_averaged_images = n_averaged_images
     seen = world.observe()
     plan = planner(seen.image, seen.xy_m, task.goal, task.mode)
     if perturbed_start:
         side = POSITION_ERROR_M * np.array([math.cos(task.yaw_rad), math.sin(task.yaw_rad)])
         config = replace(task.config, bias_m=tuple(side))
-        world.place(task.thing, (0.0, 0.0), task.yaw_rad + YAW_ERROR_RAD, config=config)
+        world.place(task.obj, (0.0, 0.0), task.yaw_rad + YAW_ERROR_RAD, config=config)
     once = PlanMode(1, partial=True)
     try:
         return execute_plan(world, plan, corrections, lambda *query: planner(*query, once))
     except UnreachableError as refused:
         return refused.outcome
     finally:
-        world.looks = 1
+        world.n_averaged_images = 1
 
 
 def outcome_record(task: PlanningTask, outcome: Outcome) -> dict[str, Any]:
@@ -253,7 +253,7 @@ def outcome_record(task: PlanningTask, outcome: Outcome) -> dict[str, Any]:
     return {
         "goals": task.goals,
         "mode": task.mode,
-        "object_class": task.thing.family,
+        "object_class": task.obj.category,
         "distance_m": outcome.distance_m,
         "predicted_m": plan.predicted_distance_m,
         "prediction_error_m": float(error),

@@ -45,7 +45,7 @@ def test_corrections_bring_it_nearer(world, film):
 def test_many_looks_see_better(world):
     """Of eight looks the mean scatters by a factor of √8 less; the image is one of them."""
     scatter = []
-    for world.looks in (1, 8):
+    for world.n_averaged_images in (1, 8):
         world.place(BOX, (0.1, 0.1), 0.4, config=WorldConfig(camera="kinect"))
         scatter.append(np.std([world.observe().xy_m for _ in range(40)], axis=0).mean())
     assert 2 < scatter[0] / scatter[1] < 4
@@ -56,11 +56,11 @@ def test_an_attempt_leaves_the_eye_as_it_was(world, film):
     seen = []
 
     def planner(image, xy, goal, mode):
-        seen.append(world.looks)
+        seen.append(world.n_averaged_images)
         return plan_continuous(problem_of(film, image, xy, goal, mode))
 
     attempt(world, task, planner, n_averaged_images=3)
-    assert (seen, world.looks) == ([3], 1)
+    assert (seen, world.n_averaged_images) == ([3], 1)
 
 
 def test_what_is_held_is_not_corrected(world, skills):
@@ -99,7 +99,7 @@ def test_what_a_lift_has_shifted_is_put_down_and_lifted_again(world, skills, mon
     """The closing fingers turn the box, and shift it by some 5 mm; the second time they do not."""
     monkeypatch.setattr("affordlib.planning.closed_loop.SHIFTED_M", 0.003)
     trial = draw_trial("height", 12, seed=3)
-    world.place(trial.thing, trial.start_xy_m, trial.yaw_rad)
+    world.place(trial.obj, trial.start_xy_m, trial.yaw_rad)
     went = run_closed_loop(world, replace(trial.goal, tolerance_m=0.002), skills)
     kinds = [type(step.primitive) for step in went.steps]
     assert went.reached, went.message
@@ -119,7 +119,7 @@ def test_what_was_done_before_the_arm_refused_is_kept(world, monkeypatch):
             return follow(step)
         raise UnreachableError("out of reach")
 
-    monkeypatch.setattr(world, "follow", follow_pushes)
+    monkeypatch.setattr(world, "execute", follow_pushes)
     with pytest.raises(UnreachableError) as refused:
         execute_plan(world, plan)
     outcome = refused.value.outcome

@@ -428,8 +428,8 @@ NAMES = re.findall(
     """
 Goal Step Plan Push Push.towards Push.path Drag Grasp Rotate LeverUp primitive_named Cuboid
 UprightCylinder LyingCylinder Sphere Prism category_named WorldConfig Tabletop place
-execute_primitive execute execute_path can_reach depth_image_from picture mark shove knock topple settle Normaliser
-from_dataset open_interactions split_interactions Recipe Variation collect CNPConfig
+execute_primitive execute execute_path can_reach depth_image_from picture mark shove knock
+topple settle Normaliser from_dataset open_interactions split_interactions Recipe Variation collect CNPConfig
 FiLMConfig build Ensemble TrainingConfig coverage fit_temperature
 load_checkpoint save_checkpoint observe_actions train train_literal PlanMode Disturbance
 sample_disturbances action_limit EffectMap PlanningProblem ClosedLoopConfig plan_astar

@@ -17,7 +17,7 @@ from affordlib.interactions.batches import believable, observe_action, plane_of
 from affordlib.models.calibration import LEVELS, coverage
 from affordlib.models.ensemble import Ensemble
 from affordlib.models.network import EffectNetwork, gaussian_nll
-from affordlib.world.objects import FAMILIES
+from affordlib.world.objects import CATEGORIES
 
 EVERY = 12
 """Every twelfth sample is one of the paper's 25 steps of 150 ms."""
@@ -127,8 +127,8 @@ def summary(record: dict[str, Any]) -> dict[str, Any]:
 
 
 def stored(part: dict[str, Any]) -> dict[str, Any]:
-    """As a part is written: rounded, and families by their numbers in `FAMILIES`."""
-    number = {name: k for k, name in enumerate(FAMILIES)}
+    """As a part is written: rounded, and categories by their numbers in `CATEGORIES`."""
+    number = {name: k for k, name in enumerate(CATEGORIES)}
 
     def written(name: str, value: Any) -> Any:
         if name == "family":

@@ -49,7 +49,7 @@ class Variation:
         check_field(self, "bias_sd_m", 0.0, 0.02, "m")
 
     def draw(self, obj: TabletopObject, rng: np.random.Generator) -> WorldConfig:
-        """One world: what an episode with this thing is like."""
+        """One world: what an episode with this object is like."""
         drawn = {name: float(rng.uniform(*getattr(self, name))) for name in _RANGES}
         half = np.array([*np.ptp(obj.footprint_m, axis=0), obj.height_m]) / 2
         offset = self.com_offset * half * rng.uniform(-1, 1, size=3)
@@ -213,7 +213,7 @@ def draw_world(recipe: Recipe, index: int, obj: TabletopObject) -> WorldConfig:
 def _draw_action(
     recipe: Recipe, obj: TabletopObject, yaw: float, rng: np.random.Generator
 ) -> Primitive:
-    """A primitive that suits the thing, with parameters drawn at random."""
+    """A primitive that suits the object, with parameters drawn at random."""
     unsuited = "push" if obj.rollable else "drag"
     names = [name for name in recipe.primitives if name != unsuited] or list(recipe.primitives)
     kind = primitive_named(names[rng.integers(len(names))] if len(names) > 1 else names[0])

@@ -89,7 +89,7 @@ def test_planners_are_asked_about_all_their_categories_alike(name):
     config, tasks = CONFIGS[name], frozen_tasks(CONFIGS[name].world)
     chosen = [tasks[k] for k in config.chosen(tasks)]
     for mode in MODES:
-        of_mode = [t.thing.family for t in chosen if (t.mode, t.goals) == (mode, "constructed")]
+        of_mode = [t.obj.category for t in chosen if (t.mode, t.goals) == (mode, "constructed")]
         counts = [of_mode.count(category) for category in config.classes]
         assert sum(counts) == len(of_mode) > 0
         assert max(counts) - min(counts) <= 1
@@ -102,7 +102,7 @@ def test_planners_differ_and_are_asked_only_for_what_they_can():
 
 
 def test_an_object_with_a_perturbed_start_is_missed_by_as_much(world):
-    tasks = [t for t in frozen_tasks() if t.mode == "single_partial" and not t.thing.rollable][:4]
+    tasks = [t for t in frozen_tasks() if t.mode == "single_partial" and not t.obj.rollable][:4]
     planner = CONFIGS["continuous"].make(world)
     there, perturbed = (
         np.mean([attempt(world, t, planner, perturbed_start=p).distance_m for t in tasks])
@@ -116,7 +116,7 @@ def test_an_object_with_a_perturbed_start_is_missed_by_as_much(world):
 @pytest.mark.parametrize("rollable", [False, True])
 def test_with_the_simulator_as_model_hardly_anything_remains(world, rollable):
     task = next(
-        t for t in frozen_tasks() if t.mode == "single_partial" and t.thing.rollable == rollable
+        t for t in frozen_tasks() if t.mode == "single_partial" and t.obj.rollable == rollable
     )
     outcome = attempt(world, task, CONFIGS["oracle"].make(world))
     assert outcome.distance_m < 0.001
