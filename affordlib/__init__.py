@@ -17,14 +17,14 @@ _NUMBER = Annotated[Real, _NO_BOOL]
 _NO_TEXT = Is[lambda value: not isinstance(value, str)]
 _NUMBERS = Annotated[Sequence[_NUMBER], _NO_TEXT] | np.ndarray
 _CHECKED = """
-types primitives perception plan_files results world.config world.objects world.interventions
-world.scene planning.astar planning.closed_loop planning.continuous planning.disturbances
-planning.effect_map planning.gradient planning.grasp_rotate planning.problem
-planning.reachability planning.skills interactions.batches interactions.collect
-interactions.folder interactions.lever interactions.recipes interactions.store models.calibration
-models.checkpoint models.ensemble models.lever models.protocol models.training
-evaluation.metrics show.animation show.conditioning_explorer show.executors
-show.goal_picker show.phase_slider show.plots
+types geometry primitives perception plan_files results world.config world.objects
+world.interventions world.scene planning.astar planning.closed_loop planning.continuous
+planning.disturbances planning.effect_map planning.gradient planning.grasp_rotate
+planning.problem planning.reachability planning.skills interactions.dataset
+interactions.sampling interactions.collect interactions.import_log interactions.lever_up
+interactions.recipes interactions.store models.calibration models.checkpoint models.ensemble
+models.lever models.protocol models.training evaluation.metrics show.animation
+show.conditioning_explorer show.executors show.goal_picker show.phase_slider show.plots
 """
 _CONF = BeartypeConf(
     violation_type=TypeError,

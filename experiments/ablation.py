@@ -10,45 +10,50 @@ import numpy as np
 import torch
 
 from affordlib.interactions import (
-    Normaliser,
-    TrainingArrays,
+    InteractionTensors,
+    Scaler,
     open_interactions,
     split_interactions,
 )
-from affordlib.interactions.batches import Batch, observe, sample_batch
+from affordlib.interactions.sampling import (
+    Batch,
+    sample_literal,
+    sample_mixed,
+)
 from affordlib.models.checkpoint import build
 from affordlib.models.film import FiLMNetwork
 from affordlib.models.protocol import observe_final_effect
-from affordlib.models.training import final_errors_m, literal_draw, train
+from affordlib.models.training import final_errors_m, train
+from affordlib.types import Observations
 from experiments.shipped import CHECKPOINT_SPECS
 
 Rows = list[dict[str, Any]]
 
 
 def random_contexts(
-    arrays: TrainingArrays, rows: torch.Tensor, n_targets: int, obs_max: int, g: torch.Generator
+    arrays: InteractionTensors, rows: torch.Tensor, n_targets: int, obs_max: int, g: torch.Generator
 ) -> Batch:
-    """As `sample_batch`, but no context is one that will be asked: all phases are random."""
-    batch = sample_batch(arrays, rows, n_targets, obs_max, g)
+    """As `sample_mixed`, but no context is one that will be asked: all phases are random."""
+    batch = sample_mixed(arrays, rows, n_targets, obs_max, g)
     o, n = batch.observations, len(arrays.phase)
     action_at, effect_at = (torch.randint(n, m.shape, generator=g) for m in (o.action_mask,) * 2)
-    seen = observe(
-        arrays.select(rows), action_at, o.action_mask, effect_at, o.effect_mask, o.weight
-    )
-    return replace(batch, observations=seen)
+    part = arrays.select(rows)
+    seen = Observations.of(part, part.action_at(action_at), part.effect_at(effect_at), o.weight)
+    masks = {"action_mask": o.action_mask, "effect_mask": o.effect_mask}
+    return replace(batch, observations=replace(seen, **masks))
 
 
-def half_blend(arrays: TrainingArrays, rows: torch.Tensor, *sizes: Any) -> Batch:
-    """As `sample_batch`, but w₁ = ½ wherever both are observed."""
-    batch = sample_batch(arrays, rows, *sizes)
+def half_blend(arrays: InteractionTensors, rows: torch.Tensor, *sizes: Any) -> Batch:
+    """As `sample_mixed`, but w₁ = ½ wherever both are observed."""
+    batch = sample_mixed(arrays, rows, *sizes)
     o = batch.observations
     both = (o.weight > 0) & (o.weight < 1)
     return replace(batch, observations=replace(o, weight=torch.where(both, 0.5, o.weight)))
 
 
-def actions_only(arrays: TrainingArrays, rows: torch.Tensor, *sizes: Any) -> Batch:
-    """As `sample_batch`, but only actions are observed: effects are never asked about actions."""
-    batch = sample_batch(arrays, rows, *sizes)
+def actions_only(arrays: InteractionTensors, rows: torch.Tensor, *sizes: Any) -> Batch:
+    """As `sample_mixed`, but only actions are observed: effects are never asked about actions."""
+    batch = sample_mixed(arrays, rows, *sizes)
     o = batch.observations
     first = torch.arange(o.action_mask.shape[1]) == 0
     seen = replace(
@@ -61,11 +66,11 @@ def actions_only(arrays: TrainingArrays, rows: torch.Tensor, *sizes: Any) -> Bat
 
 
 def one_at_a_time(
-    arrays: TrainingArrays, rows: torch.Tensor, n_targets: int, obs_max: int, g: torch.Generator
+    arrays: InteractionTensors, rows: torch.Tensor, n_targets: int, obs_max: int, g: torch.Generator
 ) -> Batch:
     """The paper's draw: one trajectory, one target."""
     row = torch.randint(len(rows), (1,), generator=g)  # any of the batch, turned or mirrored or not
-    return literal_draw(arrays.select(rows[row]), obs_max, g)
+    return sample_literal(arrays.select(rows[row]), obs_max, g)
 
 
 def _plain_start(model: FiLMNetwork) -> None:
@@ -83,12 +88,12 @@ def _no_modulation(model: FiLMNetwork) -> None:
             parameter.requires_grad_(False)
 
 
-def _raw(normaliser: Normaliser) -> Normaliser:
+def _raw(scaler: Scaler) -> Scaler:
     """Metres and radians as they are, images too."""
     return replace(
-        normaliser,
-        action_scale=(1.0,) * len(normaliser.action_scale),
-        effect_scale=(1.0,) * len(normaliser.effect_scale),
+        scaler,
+        action_scale=(1.0,) * len(scaler.action_scale),
+        effect_scale=(1.0,) * len(scaler.effect_scale),
         image_mean=(0.0, 0.0),
         image_std=(1.0, 1.0),
     )
@@ -172,7 +177,7 @@ def ablated(changes: Sequence[str], steps: int, seed: int = 0) -> tuple[np.ndarr
     each = [CHANGES[change] for change in changes]
     image = all(how.get("image", True) for how in each)
     scales = next((how["scales"] for how in each if "scales" in how), lambda same: same)
-    draw = next((how["draw"] for how in each if "draw" in how), sample_batch)
+    draw = next((how["draw"] for how in each if "draw" in how), sample_mixed)
     options: dict[str, dict[str, Any]] = {
         of: {k: v for how in each for k, v in how.get(of, {}).items()}
         for of in ("training", "network")
@@ -185,17 +190,17 @@ def ablated(changes: Sequence[str], steps: int, seed: int = 0) -> tuple[np.ndarr
     split = split_interactions(data.sizes["interaction"])
     parts = (data, split.train), (data, split.validation), (test_data, None)
     training, validation, test = (
-        TrainingArrays.from_dataset(d, rows, *channels) for d, rows in parts
+        InteractionTensors.from_dataset(d, rows, *channels) for d, rows in parts
     )
-    normaliser = Normaliser.fit(training)
+    scaler = Scaler.fit(training)
     if not image:
         blank = training.image.mean(dim=0, keepdim=True)
         training, validation, test = (
             replace(a, image=blank.expand(len(a), -1, -1, -1)) for a in (training, validation, test)
         )
-        normaliser = replace(normaliser, mask_share=None)
+        scaler = replace(scaler, mask_share=None)
     torch.manual_seed(seed)
-    model = build(network, scales(normaliser))
+    model = build(network, scales(scaler))
     for how in each:
         how.get("start", lambda _: None)(model)
     train(model, training, validation, config, progress=False, draw=draw)

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from affordlib import checked
-from affordlib.interactions.batches import Normaliser
+from affordlib.interactions.dataset import Scaler
 from affordlib.models.checkpoint import NETWORKS
 from affordlib.models.film import CircularHarmonics, dense, split_outputs, waves
 from affordlib.models.network import EffectNetwork, NetworkConfig, he_initialise, with_time
@@ -74,8 +74,8 @@ class CrossAttention(nn.Module):
 class AttentiveCNP(EffectNetwork):
     """Relates object image, action and effect; satisfies `EffectModel`."""
 
-    def __init__(self, config: AttentionConfig, normaliser: Normaliser) -> None:
-        super().__init__(config, normaliser)
+    def __init__(self, config: AttentionConfig, scaler: Scaler) -> None:
+        super().__init__(config, scaler)
         c, w = config, config.width
         n_a, n_e = len(c.action_channels), len(c.effect_channels)
         self.harmonics = CircularHarmonics(c.rings, c.orders)

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 import xarray as xr
 
-from affordlib.interactions.batches import TrainingArrays, believable
-from affordlib.interactions.recipes import Recipe, draw_scene, draw_world
+from affordlib.interactions.dataset import InteractionTensors, valid_interactions
+from affordlib.interactions.recipes import Recipe, sample_scene, sample_world
 from affordlib.models.protocol import EffectModel, observe_final_effect
 from affordlib.primitives import Push, wrap_angle
 from affordlib.world import Tabletop
@@ -37,8 +37,8 @@ def execute(data: xr.Dataset, interactions: np.ndarray, theta_rad: np.ndarray) -
     effects = []
     with Tabletop(recipe.world) as world:
         for index, theta in zip(data["interaction"].values[interactions], theta_rad, strict=True):
-            obj, yaw, _ = draw_scene(recipe, int(index))
-            config = draw_world(recipe, int(index), obj)
+            obj, yaw, _ = sample_scene(recipe, int(index))
+            config = sample_world(recipe, int(index), obj)
             world.place(obj, (0.0, 0.0), yaw, config=config)
             effects.append(
                 world.execute_primitive(Push(float(theta)), record_unreachable=True).effect[-1]
@@ -50,8 +50,10 @@ def inverse_record(
     model: EffectModel, data: xr.Dataset, interactions: np.ndarray
 ) -> dict[str, list[Any]]:
     """Errors of pushes decoded from the true effects of interactions, one entry an interaction."""
-    kept = believable(data, interactions)
-    arrays = TrainingArrays.from_dataset(data, kept, model.action_channels, model.effect_channels)
+    kept = valid_interactions(data, interactions)
+    arrays = InteractionTensors.from_dataset(
+        data, kept, model.action_channels, model.effect_channels
+    )
     theta = decoded_theta_rad(model, arrays.image, arrays.effect[:, -1])
     return executed_record(data, kept, theta)
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from affordlib.commands import command
-from affordlib.interactions.lever import POSE_CHANNELS
+from affordlib.interactions.lever_up import POSE_CHANNELS
 from affordlib.models.lever import PROTOCOLS
 from affordlib.paths import resolve_out_dir
 from affordlib.results import write_results

@@ -12,8 +12,8 @@ from dataclasses import replace
 from typing import Any
 
 from affordlib.interactions import open_interactions
-from affordlib.interactions.batches import symmetric_copies
-from affordlib.interactions.lever import MIRRORED, lever_arrays
+from affordlib.interactions.dataset import augment_by_symmetry
+from affordlib.interactions.lever_up import MIRRORED, lever_up_tensors
 from affordlib.models.lever import (
     LEVER_MODELS,
     TRAINING,
@@ -59,8 +59,8 @@ def lever_tuning() -> list[dict[str, Any]]:
     for name, trained_for in TRAINED:
         lever = LEVER_MODELS[name]
         split = split_of(LeverUnit(name, trained_for), data)
-        training = symmetric_copies(lever_arrays(data, split.train, lever.view), MIRRORED)
-        validation = lever_arrays(data, split.validation, lever.view)
+        training = augment_by_symmetry(lever_up_tensors(data, split.train, lever.view), MIRRORED)
+        validation = lever_up_tensors(data, split.validation, lever.view)
         for setting in SETTINGS:
             model, history = fit_lever_model(
                 changed(lever, setting), training, validation, trained_for, progress=False

@@ -31,10 +31,16 @@ import xarray as xr
 from torch import Tensor
 
 from affordlib.commands import command, count_type, names_type, whole_type
-from affordlib.interactions import Normaliser, Split, TrainingArrays, split_interactions
-from affordlib.interactions.batches import believable
-from affordlib.interactions.lever import AHEAD, POSE_CHANNELS, SEEN, lever_arrays, n_windows
-from affordlib.interactions.recipes import Recipe, draw_scene
+from affordlib.interactions import InteractionTensors, Scaler, Split, split_interactions
+from affordlib.interactions.dataset import valid_interactions
+from affordlib.interactions.lever_up import (
+    N_OBSERVED,
+    N_PREDICTED,
+    POSE_CHANNELS,
+    lever_up_tensors,
+    n_windows,
+)
+from affordlib.interactions.recipes import Recipe, sample_scene
 from affordlib.interactions.store import stored_sha256
 from affordlib.models.calibration import LEVELS, coverage
 from affordlib.models.lever import (
@@ -139,7 +145,7 @@ def edges_of(data: xr.Dataset) -> np.ndarray:
     """How many edges the polygon of each interaction has (n,)."""
     recipe = Recipe.from_json(data.attrs["recipe"])
     numbers = data["interaction"].values
-    return np.array([len(draw_scene(recipe, int(i))[0].footprint_m) for i in numbers])
+    return np.array([len(sample_scene(recipe, int(i))[0].footprint_m) for i in numbers])
 
 
 def numbered_edges() -> dict[int, int]:
@@ -176,14 +182,14 @@ def run_unit(unit: LeverUnit, folder: Path, progress: bool = False) -> bool:
     split = split_of(unit, data)
     part: dict[str, Any] = {"unit": asdict(unit)} | hashes(unit)
     halfway = folder / f".{unit.file}.{sha256_of(hashes(unit))[:8]}.pt"
-    test = lever_arrays(data, split.test, _view(unit))
+    test = lever_up_tensors(data, split.test, _view(unit))
     told: dict[str, list[tuple[Prediction, Tensor]]]
     if unit.model in BASELINES:
         told = {protocol: _guesses(unit.model, test, protocol) for protocol in unit.protocols}
     else:
         model, part["training"] = _fit(unit, data, split, halfway, progress)
         told = {protocol: _foreseen(model, test, protocol) for protocol in unit.protocols}
-    part["interaction"] = data["interaction"].values[believable(data, split.test)].tolist()
+    part["interaction"] = data["interaction"].values[valid_interactions(data, split.test)].tolist()
     part["tests"] = {protocol: _answers(found) for protocol, found in told.items()}
     if unit.model == BASELINES[0]:
         part["step_moves_cm"] = (100 * test.effect[..., :3].diff(dim=1).norm(dim=-1)).tolist()
@@ -219,23 +225,23 @@ def _fit(
         seconds = history[-1].seconds
         return model, {"steps": history[-1].step, "seconds": seconds, "validation_error": best}
     training, validation = (
-        lever_arrays(data, part, "full") for part in (split.train, split.validation)
+        lever_up_tensors(data, part, "full") for part in (split.train, split.validation)
     )
     channels = {f"{k}_channels": getattr(training, f"{k}_channels") for k in ("action", "effect")}
     torch.manual_seed(unit.seed)
-    published = PublishedLSTM(PublishedConfig(**channels), Normaliser.fit(training))
+    published = PublishedLSTM(PublishedConfig(**channels), Scaler.fit(training))
     epochs = unit.epochs or EPOCHS
     return published, train_published(
         published, training, validation, unit.trained_for, epochs, unit.seed, checkpoint=halfway
     )
 
 
-def _starts(arrays: TrainingArrays, protocol: str) -> range:
+def _starts(arrays: InteractionTensors, protocol: str) -> range:
     return range(n_windows(arrays) if protocol == "window" else 1)
 
 
 def _foreseen(
-    model: EffectNetwork, arrays: TrainingArrays, protocol: str
+    model: EffectNetwork, arrays: InteractionTensors, protocol: str
 ) -> list[tuple[Prediction, Tensor]]:
     with torch.no_grad():
         features = model.encode(arrays.image)
@@ -248,8 +254,8 @@ def guess(baseline: str, effect: Tensor, protocol: str, start: int = 0) -> tuple
     From the first step alone the velocity is not known; then both say that nothing moves.
     """
     window = protocol == "window"
-    last = start + SEEN - 1 if window else 0
-    n = AHEAD if window else effect.shape[1] - 1
+    last = start + N_OBSERVED - 1 if window else 0
+    n = N_PREDICTED if window else effect.shape[1] - 1
     ahead = torch.arange(1, n + 1)
     velocity = torch.zeros_like(effect[:, last])
     if window and baseline == "constant_velocity":
@@ -259,7 +265,7 @@ def guess(baseline: str, effect: Tensor, protocol: str, start: int = 0) -> tuple
 
 
 def _guesses(
-    baseline: str, arrays: TrainingArrays, protocol: str
+    baseline: str, arrays: InteractionTensors, protocol: str
 ) -> list[tuple[Prediction, Tensor]]:
     found = []
     for start in _starts(arrays, protocol):

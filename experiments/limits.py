@@ -19,9 +19,9 @@ import numpy as np
 import torch
 
 from affordlib.interactions import open_interactions
-from affordlib.interactions.recipes import Recipe, draw_scene, draw_world
+from affordlib.interactions.recipes import Recipe, sample_scene, sample_world
 from affordlib.models.checkpoint import load_checkpoint, weights_bytes
-from affordlib.models.protocol import observe_actions
+from affordlib.models.protocol import condition_on_primitives
 from affordlib.paths import repo_root
 from affordlib.planning.reachability import SHIPPED as REACHABILITY
 from affordlib.planning.reachability import Reachability
@@ -61,8 +61,8 @@ def floor() -> Rows:
     with Tabletop(recipe.world) as world:
         for k in range(N_PUSHES):
             index = int(data["interaction"][k])
-            obj, yaw, _ = draw_scene(recipe, index)
-            config = draw_world(recipe, index, obj)
+            obj, yaw, _ = sample_scene(recipe, index)
+            config = sample_world(recipe, index, obj)
             told = data["effect"].values[k, -1]
             for r in range(REPEATS):
                 side, sign = rng.uniform(0, math.tau), rng.choice([-1, 1])
@@ -109,7 +109,7 @@ def stopped() -> Rows:
         actions = [kind(float(theta)) for theta in data["theta"].values[mine]]
         seen = torch.from_numpy(data["image"].values[mine])
         at = torch.from_numpy(phase[mine]).float()[:, None]
-        told = model.predict(model.encode(seen), observe_actions(model, actions), at)
+        told = model.predict(model.encode(seen), condition_on_primitives(model, actions), at)
         columns = [model.effect_channels.index(c) for c in "xy"]
         mean = told.effect_mean[:, 0, columns].numpy()
         errors = [np.hypot(*(mean - truth[mine, :2]).T) for truth in (whole, rest)]

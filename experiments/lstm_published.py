@@ -24,9 +24,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from affordlib import checked
-from affordlib.interactions import Normaliser
-from affordlib.interactions.batches import TrainingArrays
-from affordlib.interactions.lever import SEEN
+from affordlib.interactions import Scaler
+from affordlib.interactions.dataset import InteractionTensors
+from affordlib.interactions.lever_up import N_OBSERVED
 from affordlib.models.checkpoint import load_state, save_state
 from affordlib.models.lever import beginning_errors_m, window_errors_m
 from affordlib.models.lstm import Known, on_grid
@@ -55,8 +55,8 @@ class PublishedConfig(NetworkConfig):
 class PublishedLSTM(EffectNetwork):
     """CNN and LSTM, step by step; σ is not foreseen and is the floor."""
 
-    def __init__(self, config: PublishedConfig, normaliser: Normaliser) -> None:
-        super().__init__(config, normaliser)
+    def __init__(self, config: PublishedConfig, scaler: Scaler) -> None:
+        super().__init__(config, scaler)
         n_a, n_e = len(config.action_channels), len(config.effect_channels)
         layers: list[nn.Module] = []
         for n_in, n_out in pairwise((2, *CONVOLUTION_WIDTHS)):
@@ -127,7 +127,7 @@ class PublishedLSTM(EffectNetwork):
             hidden.append(h)
         return torch.stack(hidden, dim=1), (h, c)
 
-    def next_step_loss(self, arrays: TrainingArrays, start: Tensor, n: int) -> Tensor:
+    def next_step_loss(self, arrays: InteractionTensors, start: Tensor, n: int) -> Tensor:
         """Mean squared error of the next pose at each of n observed steps from `start` (N,) on."""
         rows = torch.arange(len(arrays))[:, None]
         k = start[:, None] + torch.arange(n)
@@ -141,8 +141,8 @@ class PublishedLSTM(EffectNetwork):
 
 def train_published(
     model: PublishedLSTM,
-    training: TrainingArrays,
-    validation: TrainingArrays,
+    training: InteractionTensors,
+    validation: InteractionTensors,
     trained_for: str = "window",
     epochs: int = EPOCHS,
     seed: int = 0,
@@ -160,7 +160,7 @@ def train_published(
         optimiser, factor=DECAY, patience=model.config.patience
     )
     generator = torch.Generator().manual_seed(seed)
-    n = SEEN if trained_for == "window" else len(training.phase) - 1
+    n = N_OBSERVED if trained_for == "window" else len(training.phase) - 1
     score = window_errors_m if trained_for == "window" else beginning_errors_m
     best, best_state, epoch, seconds = math.inf, model.state_dict(), 0, 0.0
     about = [trained_for, seed, *(float(a.effect.double().sum()) for a in (training, validation))]

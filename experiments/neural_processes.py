@@ -25,7 +25,7 @@ import torch
 from scipy.stats import sem
 
 from affordlib.commands import command, count_type
-from affordlib.interactions import Normaliser
+from affordlib.interactions import Scaler
 from affordlib.models import CNPConfig, build
 from affordlib.models.network import NetworkConfig, gaussian_nll
 from affordlib.results import write_results
@@ -35,7 +35,7 @@ from experiments.attention import AttentionConfig
 BATCH, MAX_OBSERVED, TARGETS, JUDGED = 16, 10, 50, 1600
 LENGTH, NOISE, RANGE = 0.25, 0.05, 2.0
 CHANNELS = {"action_channels": ("z",), "effect_channels": ("z",), "sigma_floor": 0.01}
-NO_SCALES = Normaliser((1.0,), (1.0,), (0.0, 0.0), (1.0, 1.0))
+NO_SCALES = Scaler((1.0,), (1.0,), (0.0, 0.0), (1.0, 1.0))
 
 Likelihood = Callable[..., torch.Tensor]
 """Log-likelihood (n, TARGETS) of targets (t, y) given observed (t, y): four arguments (n, ·)."""

@@ -22,8 +22,9 @@ import numpy as np
 import torch
 
 from affordlib.evaluation.predictions import final_error, network_predictions, summary, yaw_error
-from affordlib.interactions import Normaliser, TrainingArrays, split_interactions
-from affordlib.interactions.batches import Symmetry, observe_action, symmetric_copies
+from affordlib.interactions import InteractionTensors, Scaler, split_interactions
+from affordlib.interactions.dataset import Symmetry, augment_by_symmetry
+from affordlib.interactions.sampling import condition_on_recorded_action
 from affordlib.models.checkpoint import build
 from affordlib.models.film import FiLMConfig
 from affordlib.models.network import EffectNetwork
@@ -67,40 +68,44 @@ def _separate(primitive: str, fold: int) -> Unit:
     return Unit("film", primitive, fold=fold)
 
 
-def with_copies(arrays: TrainingArrays, primitive: str) -> TrainingArrays:
+def with_copies(arrays: InteractionTensors, primitive: str) -> InteractionTensors:
     """Interactions and what they would be under the symmetries of their primitive.
 
     A push and a drag are mirrored with their action; the action of a primitive without a direction
-    stays, see `symmetric_copies`.
+    stays, see `augment_by_symmetry`.
     """
     symmetries = TASKS[primitive].symmetries
     if symmetries is not None:
-        return symmetric_copies(arrays, symmetries)
-    first, *others = (arrays.turned(*symmetry) for symmetry in MIRRORED)
+        return augment_by_symmetry(arrays, symmetries)
+    first, *others = (arrays.rotated_and_mirrored(*symmetry) for symmetry in MIRRORED)
     return first.joined(*others)
 
 
-def _part(primitive: str, fold: int, which: str) -> TrainingArrays:
+def _part(primitive: str, fold: int, which: str) -> InteractionTensors:
     data = open_once(primitive)
     rows = getattr(split_interactions(data.sizes["interaction"], 0, fold), which)
-    return TrainingArrays.from_dataset(data, rows, NETWORK.action_channels, NETWORK.effect_channels)
+    return InteractionTensors.from_dataset(
+        data, rows, NETWORK.action_channels, NETWORK.effect_channels
+    )
 
 
 def shares(
-    validation: dict[str, TrainingArrays],
-) -> Callable[[EffectNetwork, TrainingArrays], torch.Tensor]:
+    validation: dict[str, InteractionTensors],
+) -> Callable[[EffectNetwork, InteractionTensors], torch.Tensor]:
     """A score for `train`: of the primitives' final errors, as shares of their usual effects, the
     geometric mean.
     """
 
     @torch.no_grad()
-    def score(model: EffectNetwork, _: TrainingArrays) -> torch.Tensor:
+    def score(model: EffectNetwork, _: InteractionTensors) -> torch.Tensor:
         model.eval()
         told = []
         for primitive, arrays in validation.items():
             kept = [NETWORK.effect_channels.index(c) for c in TASKS[primitive].effect_channels]
             end = torch.ones(len(arrays), 1)
-            mean = model.predict(model.encode(arrays.image), observe_action(arrays), end)
+            mean = model.predict(
+                model.encode(arrays.image), condition_on_recorded_action(arrays), end
+            )
             truth = arrays.effect[:, -1, kept]
             error = (mean.effect_mean[:, 0, kept] - truth).norm(dim=-1).mean()
             told.append(error / truth.norm(dim=-1).square().mean().sqrt())
@@ -116,7 +121,7 @@ def train_one_for_all(fold: int, halfway: Path | None = None) -> EffectNetwork:
     validation = {name: _part(name, fold, "validation") for name in PRIMITIVES}
     training = copies[0].joined(*copies[1:])
     torch.manual_seed(TRAINING.seed)
-    model = build(NETWORK, Normaliser.fit(training))
+    model = build(NETWORK, Scaler.fit(training))
     first, *others = validation.values()
     everything = first.joined(*others)
     train(model, training, everything, TRAINING, False, halfway, score=shares(validation))

@@ -18,16 +18,18 @@ import numpy as np
 import xarray as xr
 
 from affordlib.commands import command, count_type
+from affordlib.geometry import xy_columns
 from affordlib.interactions import (
-    Normaliser,
+    InteractionTensors,
+    Scaler,
     Split,
-    TrainingArrays,
     open_interactions,
     split_interactions,
 )
-from affordlib.interactions.batches import Symmetry, draw_forward, plane_of, sample_batch
 from affordlib.interactions.collect import collect
+from affordlib.interactions.dataset import Symmetry
 from affordlib.interactions.recipes import RECIPES, SHIPPED
+from affordlib.interactions.sampling import sample_forward, sample_mixed
 from affordlib.interactions.store import SUFFIX as DATA_SUFFIX
 from affordlib.interactions.store import dataset_sha256
 from affordlib.models.checkpoint import SUFFIX, load_checkpoint, save_checkpoint
@@ -54,14 +56,14 @@ from experiments.attention import AttentionConfig
 class CheckpointSpec:
     """A shipped checkpoint: the data set it learns from, its network, and its training.
 
-    symmetries: see `symmetric_copies`; draw: see `train`.
+    symmetries: see `augment_by_symmetry`; draw: see `train`.
     """
 
     data: str
     network: NetworkConfig
     training: TrainingConfig
     symmetries: tuple[Symmetry, ...] = ()
-    draw: Draw = sample_batch
+    draw: Draw = sample_mixed
 
 
 _PUSH_FRAME = TrainingConfig(
@@ -90,7 +92,7 @@ CHECKPOINT_SPECS: dict[str, CheckpointSpec] = {
     "grasp_film": CheckpointSpec("grasp_x10", _LIFT, _TABLE_FRAME, GRASP_SYMMETRIES),
     "grasp_film_firm": CheckpointSpec("grasp_firm_x10", _LIFT, _TABLE_FRAME, GRASP_SYMMETRIES),
     "rotate_film": CheckpointSpec("rotate_x10", _TURN, _TABLE_FRAME, HALF_TURNS),
-    "push_lstm": CheckpointSpec("push", _LSTM, _PUSH_FRAME, draw=draw_forward),
+    "push_lstm": CheckpointSpec("push", _LSTM, _PUSH_FRAME, draw=sample_forward),
 }
 """Minutes of one core: ten for `push_cnp`, five for `push_lstm` and the two of 5,000 pushes, one or
 two for others. Five learn from sets of ten times the size, which are not shipped."""
@@ -169,8 +171,8 @@ def shipped_lever_model(
             return None
         expected = about_lever_training(data, split, lever, trained_for)
         network = replace(model.config, sigma_floor=lever.network.sigma_floor)
-        scales = Normaliser.fit(lever_training(lever, data, split))
-        if about == expected and network == lever.network and model.normaliser == scales:
+        scales = Scaler.fit(lever_training(lever, data, split))
+        if about == expected and network == lever.network and model.scaler == scales:
             return model, {"checkpoint": checkpoint}
     return None
 
@@ -192,9 +194,9 @@ def train_checkpoint(name: str) -> None:
         seen = np.concatenate([split.train, split.validation])
         about = about_training(data, seen, spec.training)
         channels = model.action_channels, model.effect_channels
-        if not plane_of(channels[1]) and channels[1] != ("z",):
+        if not xy_columns(channels[1]) and channels[1] != ("z",):
             factor, unit = 180 / math.pi, "°"
-        error = final_errors_m(model, TrainingArrays.from_dataset(data, split.test, *channels))
+        error = final_errors_m(model, InteractionTensors.from_dataset(data, split.test, *channels))
         test = f", test {factor * error.mean():.2f} {unit}"
     path = repo_root() / "data" / "checkpoints" / f"{name}{SUFFIX}"
     save_checkpoint(model, path, about)

@@ -28,28 +28,28 @@ from torch.utils.flop_counter import FlopCounterMode
 from affordlib.commands import command, names_type
 from affordlib.evaluation.tasks import STANDING, uniform_tasks
 from affordlib.interactions import (
-    Normaliser,
-    TrainingArrays,
+    InteractionTensors,
+    Scaler,
     open_interactions,
     split_interactions,
 )
-from affordlib.interactions.batches import sample_batch
 from affordlib.interactions.collect import collect
-from affordlib.interactions.lever import AHEAD, SEEN, draw_windows, lever_arrays
+from affordlib.interactions.lever_up import N_OBSERVED, N_PREDICTED, lever_up_tensors
 from affordlib.interactions.recipes import RECIPES, Recipe
+from affordlib.interactions.sampling import sample_literal, sample_mixed, sample_windows
 from affordlib.models import (
     CNPConfig,
     FiLMConfig,
     TrainingConfig,
     build,
+    condition_on_primitives,
     load_checkpoint,
-    observe_actions,
     train,
     train_literal,
 )
 from affordlib.models.lever import LEVER_MODELS, foresee
 from affordlib.models.network import EffectNetwork
-from affordlib.models.training import batch_loss, final_errors_m, literal_draw
+from affordlib.models.training import batch_loss, final_errors_m
 from affordlib.paths import repo_root
 from affordlib.planning import EffectMap, PlanningProblem, plan_astar, plan_continuous
 from affordlib.planning.astar import N_DIRECTIONS, STOP_PHASES
@@ -112,10 +112,10 @@ def primitives(n: int = 24) -> Rows:
     return rows
 
 
-def _pushes() -> tuple[TrainingArrays, TrainingArrays]:
+def _pushes() -> tuple[InteractionTensors, InteractionTensors]:
     data = open_interactions("push")
     split = split_interactions(data.sizes["interaction"])
-    return tuple(TrainingArrays.from_dataset(data, s) for s in (split.train, split.validation))
+    return tuple(InteractionTensors.from_dataset(data, s) for s in (split.train, split.validation))
 
 
 def training(
@@ -127,12 +127,12 @@ def training(
     the error that the paper's loop has after so many iterations (a quarter of an hour).
     """
     pushes, validation = _pushes()
-    model = build(CNPConfig(), Normaliser.fit(pushes)).train()
+    model = build(CNPConfig(), Scaler.fit(pushes)).train()
     generator = torch.Generator().manual_seed(0)
 
     def batch() -> Any:
         rows = torch.randint(len(pushes), (size,), generator=generator)
-        return sample_batch(pushes, rows, n_targets, 10, generator)
+        return sample_mixed(pushes, rows, n_targets, 10, generator)
 
     def stepper(draw: Callable[[], Any], fused: bool | None) -> Callable[[], None]:
         optimiser = torch.optim.Adam(model.parameters(), 1e-4, fused=fused)
@@ -144,7 +144,7 @@ def training(
 
         return step
 
-    literal = stepper(lambda: literal_draw(pushes, 10, generator), None)
+    literal = stepper(lambda: sample_literal(pushes, 10, generator), None)
     batched = stepper(batch, True)
     with FlopCounterMode(display=False) as counter:
         batch_loss(model, batch()).backward()
@@ -160,13 +160,13 @@ def training(
     rows.append(ratio_row("share of the matrix rate", shares, 0.5))
 
     torch.manual_seed(0)
-    model = build(CNPConfig(), Normaliser.fit(pushes))
+    model = build(CNPConfig(), Scaler.fit(pushes))
     began = time.perf_counter()
     train_literal(model, pushes, iterations)
     literal_s = time.perf_counter() - began
     error = float(final_errors_m(model.eval(), validation).mean())
     torch.manual_seed(0)
-    model = build(CNPConfig(), Normaliser.fit(pushes))
+    model = build(CNPConfig(), Scaler.fit(pushes))
     # In small batches: while errors are large, many steps gain more than accurate ones.
     small = TrainingConfig(steps=600, validate_every=10, patience=99, batch_size=8, n_targets=8)
     history = train(model, pushes, validation, small, progress=False)
@@ -183,7 +183,7 @@ def prediction() -> Rows:
     rows, (pushes, _) = [], _pushes()
     for threads, config in product(sorted({1, os.cpu_count()}), (CNPConfig(), FiLMConfig())):
         torch.set_num_threads(threads)
-        model = build(config, Normaliser.fit(pushes)).eval()
+        model = build(config, Scaler.fit(pushes)).eval()
         rows += _prediction_rows(model, pushes.image[:1], threads)
     torch.set_num_threads(1)
     return rows
@@ -192,7 +192,10 @@ def prediction() -> Rows:
 @torch.inference_mode()
 def _prediction_rows(model: EffectNetwork, image: torch.Tensor, threads: int) -> Rows:
     pushes = [Push(float(a)) for a in np.linspace(0, 2 * np.pi, 180, endpoint=False)]
-    each, every = [observe_actions(model, [p]) for p in pushes], observe_actions(model, pushes)
+    each, every = (
+        [condition_on_primitives(model, [p]) for p in pushes],
+        condition_on_primitives(model, pushes),
+    )
     end, phases, features = torch.ones(1, 1), torch.linspace(0, 1, 25)[None], model.encode(image)
 
     def query(observed: Observations, t: torch.Tensor, encoded: torch.Tensor | None = None) -> None:
@@ -231,8 +234,8 @@ def lever_up(n: int = 256, epoch: int = 1440) -> Rows:
     data, rows = open_interactions("lever_up").isel(interaction=slice(0, n + 8)), []
     for name, lever in [*LEVER_MODELS.items(), ("lstm_published", None)]:
         view = lever.view if lever else "full"
-        arrays = lever_arrays(data, view=view).select(torch.arange(n))
-        scales, channels = Normaliser.fit(arrays), (arrays.action_channels, arrays.effect_channels)
+        arrays = lever_up_tensors(data, view=view).select(torch.arange(n))
+        scales, channels = Scaler.fit(arrays), (arrays.action_channels, arrays.effect_channels)
         if lever:
             model, size = build(lever.network, scales).train(), 64
         else:
@@ -245,9 +248,11 @@ def lever_up(n: int = 256, epoch: int = 1440) -> Rows:
             optimiser.zero_grad()
             if isinstance(model, PublishedLSTM):
                 start = torch.randint(0, 11, (size,), generator=g)
-                model.next_step_loss(arrays.select(rows), start, SEEN).backward()
+                model.next_step_loss(arrays.select(rows), start, N_OBSERVED).backward()
             else:
-                batch_loss(model, draw_windows(arrays, rows, AHEAD, SEEN, g), 0.5).backward()
+                batch_loss(
+                    model, sample_windows(arrays, rows, N_PREDICTED, N_OBSERVED, g), 0.5
+                ).backward()
             optimiser.step()
 
         step()
@@ -326,7 +331,9 @@ def _naive_branches(model: EffectNetwork, image: np.ndarray) -> None:
     for angle in np.arange(N_DIRECTIONS) * (2 * np.pi / N_DIRECTIONS):
         for stop in STOP_PHASES:
             features = EffectMap(model, image).features
-            model.predict(features, observe_actions(model, [Push(angle)]), torch.tensor([[stop]]))
+            model.predict(
+                features, condition_on_primitives(model, [Push(angle)]), torch.tensor([[stop]])
+            )
 
 
 def _naive_descent(problem: PlanningProblem, rng: np.random.Generator | None = None) -> None:
@@ -345,7 +352,7 @@ def _naive_descent(problem: PlanningProblem, rng: np.random.Generator | None = N
     for _ in range(300):
         end = torch.zeros(2)
         for angle, stop in zip(direction, phase.clamp(0, 1), strict=True):
-            straight = observe_actions(model, [Push.towards(0.0)])
+            straight = condition_on_primitives(model, [Push.towards(0.0)])
             turn = torch.stack([angle.cos(), -angle.sin(), angle.sin(), angle.cos()]).view(2, 2)
             seen = replace(straight, action=straight.action[:, [0, -1]] @ turn.T)
             told = model.predict(EffectMap(model, image).features, seen, stop.view(1, 1))

@@ -37,8 +37,8 @@ import torch
 from affordlib.commands import command
 from affordlib.evaluation.metrics import refuse_seen
 from affordlib.evaluation.predictions import rounded
-from affordlib.interactions import TrainingArrays, open_interactions, split_interactions
-from affordlib.interactions.batches import believable, observe
+from affordlib.interactions import InteractionTensors, open_interactions, split_interactions
+from affordlib.interactions.dataset import valid_interactions
 from affordlib.interactions.store import stored_sha256
 from affordlib.models.calibration import calibration_rows
 from affordlib.models.checkpoint import checkpoint_sha256, load_checkpoint
@@ -79,12 +79,16 @@ def cka(a: torch.Tensor, b: torch.Tensor) -> float | None:
     return float((a.T @ b).square().sum() / ((a.T @ a).norm() * (b.T @ b).norm()))
 
 
-def _seen_by(arrays: TrainingArrays, action: bool, effect: bool, weight: float) -> Observations:
+def _seen_by(arrays: InteractionTensors, action: bool, effect: bool, weight: float) -> Observations:
     """The action at t = 0 and 1, the effect at t = 0.8 and 1, or both, blended by w₁."""
-    n, last = len(arrays), len(arrays.phase) - 1
-    at = [torch.tensor(v).expand(n, -1) for v in ([0, last], [round(0.8 * last), last])]
-    seen = [torch.full((n, 2), v) for v in (action, effect)]
-    return observe(arrays, at[0], seen[0], at[1], seen[1], torch.full((n,), weight))
+    last = len(arrays.phase) - 1
+    ends, late = torch.tensor([0, last]), torch.tensor([round(0.8 * last), last])
+    return Observations.of(
+        arrays,
+        arrays.action_at(ends) if action else None,
+        arrays.effect_at(late) if effect else None,
+        torch.full((len(arrays),), weight),
+    )
 
 
 @torch.no_grad()
@@ -95,7 +99,7 @@ def latent() -> Rows:
     for name in ("push_cnp", "push_film"):
         model, _ = load_checkpoint(name)
         channels = model.action_channels, model.effect_channels
-        arrays = TrainingArrays.from_dataset(data, None, *channels)
+        arrays = InteractionTensors.from_dataset(data, None, *channels)
 
         def code(observed: Observations, model: Any = model, channels: Any = channels) -> Any:
             if model.config.frame == "push":
@@ -172,15 +176,17 @@ def mixed() -> Rows:
     data, other = open_interactions("mixed"), open_interactions("partial")
     split = split_interactions(data.sizes["interaction"])
     model, _ = train_model(data, split, TRAINING, FiLMConfig(), progress=False)
-    arrays = TrainingArrays.from_dataset(data, split.train)
-    rolls = data["rollable"].values[believable(data, split.train)]
+    arrays = InteractionTensors.from_dataset(data, split.train)
+    rolls = data["rollable"].values[valid_interactions(data, split.train)]
     length = arrays.effect[:, -1].norm(dim=-1)
     usual_m = [float(length[torch.from_numpy(rolls == kind)].median()) for kind in (True, False)]
-    test = TrainingArrays.from_dataset(data, split.test)
+    test = InteractionTensors.from_dataset(data, split.test)
     errors = final_errors_m(model, test).numpy()
-    forward = data["rollable"].values[believable(data, split.test)]
-    asked = TrainingArrays.from_dataset(other)
-    rolls = other["rollable"].values[believable(other, np.arange(other.sizes["interaction"]))]
+    forward = data["rollable"].values[valid_interactions(data, split.test)]
+    asked = InteractionTensors.from_dataset(other)
+    rolls = other["rollable"].values[
+        valid_interactions(other, np.arange(other.sizes["interaction"]))
+    ]
     rows = []
     for wanted_m in usual_m:
         wanted = wanted_m * _unit(len(asked))
@@ -223,14 +229,14 @@ def varied() -> Rows:
     for fold in range(VARIED_FOLDS):
         split = split_interactions(data.sizes["interaction"], 0, fold)
         model, _ = train_model(data, split, TRAINING, network, progress=False)
-        test = TrainingArrays.from_dataset(data, split.test, *channels)
+        test = InteractionTensors.from_dataset(data, split.test, *channels)
         errors.append(final_errors_m(model, test).numpy())
         judged.append(calibration_rows(model, test))
     rows = _varied_rows(500, VARIED_FOLDS, np.concatenate(errors), judged)
     model, about = load_checkpoint("push_film_varied")
     everything = np.arange(data.sizes["interaction"])
     refuse_seen(about, data, everything)
-    test = TrainingArrays.from_dataset(data, everything, *channels)
+    test = InteractionTensors.from_dataset(data, everything, *channels)
     error = final_errors_m(model, test).numpy()
     return rows + _varied_rows(5000, 1, error, [calibration_rows(model, test)])
 

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from scipy import optimize, stats
 
-from affordlib.interactions import TrainingArrays, open_interactions, split_interactions
-from affordlib.interactions.batches import plane_of
+from affordlib.geometry import xy_columns
+from affordlib.interactions import InteractionTensors, open_interactions, split_interactions
 from affordlib.models.calibration import AFTER_CONTACT, LEVELS, effects_at
 from affordlib.models.checkpoint import load_checkpoint
 from experiments.shipped import CHECKPOINT_SPECS
@@ -68,7 +68,7 @@ def readings(residual: np.ndarray, std: np.ndarray) -> list[Reading]:
 
 
 def _residuals(
-    model: Any, arrays: TrainingArrays, columns: list[int]
+    model: Any, arrays: InteractionTensors, columns: list[int]
 ) -> tuple[np.ndarray, np.ndarray]:
     truth, mean, std = (
         v[..., columns].double().flatten().numpy() for v in effects_at(model, arrays, AFTER_CONTACT)
@@ -89,10 +89,10 @@ def tails() -> Rows:
         other = TESTS.get(source)
         test_set = (open_interactions(other), None) if other else (data, split.test)
         judged = {
-            "validation": TrainingArrays.from_dataset(data, split.validation, *channels),
-            "test": TrainingArrays.from_dataset(*test_set, *channels),
+            "validation": InteractionTensors.from_dataset(data, split.validation, *channels),
+            "test": InteractionTensors.from_dataset(*test_set, *channels),
         }
-        plane = plane_of(channels[1])
+        plane = xy_columns(channels[1])
         for columns in (plane, *([k] for k in range(len(channels[1])) if k not in plane)):
             channel = ", ".join(channels[1][k] for k in columns)
             told = {test: _residuals(model, a, columns) for test, a in judged.items()}

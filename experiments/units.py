@@ -30,8 +30,8 @@ from affordlib.evaluation.predictions import (
     stored,
     summary,
 )
-from affordlib.interactions import Normaliser, Split, TrainingArrays, split_interactions
-from affordlib.interactions.batches import Symmetry, believable, symmetric_copies
+from affordlib.interactions import InteractionTensors, Scaler, Split, split_interactions
+from affordlib.interactions.dataset import Symmetry, augment_by_symmetry, valid_interactions
 from affordlib.interactions.store import stored_sha256
 from affordlib.models.calibration import fit_temperature
 from affordlib.models.checkpoint import load_checkpoint
@@ -237,7 +237,7 @@ def run_unit(unit: Unit, folder: Path, progress: bool = False) -> bool:
     if configs is None:
         told = {name: _guess(unit, data, split.train, *test) for name, test in tests.items()}
         if unit.model == "constant" and task.also:
-            kept = believable(data, split.test)
+            kept = valid_interactions(data, split.test)
             part["inverse"] = executed_record(data, kept, along_effect(data, kept))
     else:
         halfway = folder / f".{unit.file}.{sha256_of(hashes(unit))[:8]}.pt"
@@ -245,7 +245,7 @@ def run_unit(unit: Unit, folder: Path, progress: bool = False) -> bool:
         fit = partial(_fit, unit, network, data=data, split=split, progress=progress)
         if unit.model == "ensemble":
             channels = network.action_channels, network.effect_channels
-            validation = TrainingArrays.from_dataset(data, split.validation, *channels)
+            validation = InteractionTensors.from_dataset(data, split.validation, *channels)
             model, part["training"] = _fit_ensemble(fit, config, halfway, validation)
         else:
             model, part["training"] = fit(config, halfway)
@@ -282,12 +282,12 @@ def _fit(
     progress: bool,
 ) -> tuple[EffectNetwork, dict[str, Any]]:
     channels = network.action_channels, network.effect_channels
-    training = TrainingArrays.from_dataset(data, split.train, *channels)
+    training = InteractionTensors.from_dataset(data, split.train, *channels)
     symmetries = task_of(unit.data).symmetries or ()
     if symmetries:
-        training = symmetric_copies(training, symmetries)
-    normaliser = Normaliser.fit(training)
-    if (found := _shipped(network, config, normaliser, data, split)) is not None:
+        training = augment_by_symmetry(training, symmetries)
+    scaler = Scaler.fit(training)
+    if (found := _shipped(network, config, scaler, data, split)) is not None:
         return found
     model, history = train_model(data, split, config, network, progress, symmetries, halfway)
     best = min(record.validation_error for record in history)
@@ -303,7 +303,7 @@ def _fit_ensemble(
     fit: Callable[[TrainingConfig, Path], tuple[EffectNetwork, dict[str, Any]]],
     config: TrainingConfig,
     halfway: Path,
-    validation: TrainingArrays,
+    validation: InteractionTensors,
 ) -> tuple[Ensemble, dict[str, Any]]:
     """Members fitted one by one, each with a seed of its own; σ of all together calibrated."""
     fitted = []
@@ -318,7 +318,7 @@ def _fit_ensemble(
 def _shipped(
     network: NetworkConfig,
     config: TrainingConfig,
-    normaliser: Normaliser,
+    scaler: Scaler,
     data: xr.Dataset,
     split: Split,
 ) -> tuple[EffectNetwork, dict[str, Any]] | None:
@@ -338,10 +338,10 @@ def _shipped(
         # Options that are younger than a checkpoint were off when it was trained.
         settings = vars(TrainingConfig()) | about["training"] | {"device": config.device}
         del settings["max_minutes"]
-        known = normaliser
-        if model.normaliser.effect_radius_m is None:
-            known = replace(normaliser, effect_radius_m=None)  # younger than the checkpoint
-        same &= expected == about | {"training": settings} and model.normaliser == known
+        known = scaler
+        if model.scaler.effect_radius_m is None:
+            known = replace(scaler, effect_radius_m=None)  # younger than the checkpoint
+        same &= expected == about | {"training": settings} and model.scaler == known
         if same:
             return model, {"checkpoint": name, "temperature": list(model.temperature)}
     return None

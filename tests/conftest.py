@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from affordlib.interactions import TrainingArrays, collect, open_interactions
-from affordlib.interactions.batches import Normaliser
+from affordlib.interactions import InteractionTensors, collect, open_interactions
 from affordlib.interactions.collect import collect as collect_set
-from affordlib.interactions.lever import lever_arrays
+from affordlib.interactions.dataset import Scaler
+from affordlib.interactions.lever_up import lever_up_tensors
 from affordlib.interactions.schema import Schema, Variable
 from affordlib.models import AffordanceCNP, CNPConfig, load_checkpoint
 from affordlib.models.lever import LEVER_MODELS
@@ -39,8 +39,8 @@ def pushes():
 @pytest.fixture
 def untrained():
     torch.manual_seed(0)
-    normaliser = Normaliser((0.1, 0.1), (0.03, 0.03), (0.99, 0.13), (0.02, 0.33))
-    return AffordanceCNP(CNPConfig(), normaliser).eval()
+    scaler = Scaler((0.1, 0.1), (0.03, 0.03), (0.99, 0.13), (0.02, 0.33))
+    return AffordanceCNP(CNPConfig(), scaler).eval()
 
 
 @pytest.fixture(scope="session")
@@ -73,7 +73,7 @@ def held_out_pushes():
 def some(pushes):
     """Forty pushes with the yaw of action and effect."""
     channels = ("x", "y", "yaw")
-    return TrainingArrays.from_dataset(pushes, np.arange(40), channels, channels)
+    return InteractionTensors.from_dataset(pushes, np.arange(40), channels, channels)
 
 
 @pytest.fixture(scope="session")
@@ -84,7 +84,7 @@ def levers():
 @pytest.fixture(scope="session")
 def levered(levers):
     """48 lever-ups in the frame of the lever."""
-    return lever_arrays(levers)
+    return lever_up_tensors(levers)
 
 
 @pytest.fixture(scope="session")

@@ -21,8 +21,8 @@ import torch
 
 import experiments.attention  # noqa: F401, whose network a checkpoint is of
 from affordlib.evaluation.tasks import frozen_tasks
-from affordlib.interactions import TrainingArrays, open_interactions
-from affordlib.interactions.lever import lever_arrays
+from affordlib.interactions import InteractionTensors, open_interactions
+from affordlib.interactions.lever_up import lever_up_tensors
 from affordlib.interactions.recipes import RECIPES, interact
 from affordlib.models import load_checkpoint
 from affordlib.paths import repo_root
@@ -62,7 +62,7 @@ def collected() -> dict[str, list[float]]:
 def predicted() -> dict[str, list[float]]:
     """Outputs of every shipped checkpoint, given recorded actions and effects at two times."""
     found, rows = {}, np.arange(4)
-    levers = lever_arrays(open_interactions("lever_up").isel(interaction=slice(0, 48)))
+    levers = lever_up_tensors(open_interactions("lever_up").isel(interaction=slice(0, 48)))
     for path in sorted((repo_root() / "data" / "checkpoints").glob("*.safetensors")):
         if path.stem == "reachability":
             continue
@@ -70,7 +70,7 @@ def predicted() -> dict[str, list[float]]:
         data = levers
         if kind != "lever":
             channels = model.action_channels, model.effect_channels
-            data = TrainingArrays.from_dataset(open_interactions(kind), rows, *channels)
+            data = InteractionTensors.from_dataset(open_interactions(kind), rows, *channels)
         at = torch.tensor([0, data.phase.shape[-1] - 1])
         t = data.phase[..., at].float().expand(4, 2)
         known = torch.ones(4, 2, dtype=torch.bool)

@@ -21,7 +21,10 @@ FORBIDDEN = {
     "planning": {"world", "evaluation", "show"},
     "evaluation": {"show"},
 }
-NO_WORLD = {f"interactions/{name}.py" for name in ("__init__", "batches", "store")}
+NO_WORLD = {
+    f"interactions/{name}.py"
+    for name in ("__init__", "dataset", "sampling", "lever_up", "import_log", "store")
+}
 
 
 def imported(path: Path) -> set[str]:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from affordlib.interactions import TrainingArrays
-from affordlib.models import EffectModel, Ensemble, load_checkpoint, observe_actions
+from affordlib.interactions import InteractionTensors
+from affordlib.models import EffectModel, Ensemble, condition_on_primitives, load_checkpoint
 from affordlib.planning import plan_astar, plan_continuous
 from affordlib.primitives import Push, wrap_angle
 from affordlib.types import Goal
@@ -25,8 +25,8 @@ def members():
 
 @pytest.fixture
 def asked(members, pushes):
-    images = TrainingArrays.from_dataset(pushes, np.arange(4)).image
-    return images, observe_actions(members[0], [Push(0.3 * k) for k in range(4)])
+    images = InteractionTensors.from_dataset(pushes, np.arange(4)).image
+    return images, condition_on_primitives(members[0], [Push(0.3 * k) for k in range(4)])
 
 
 @torch.no_grad()

@@ -8,24 +8,24 @@ import pytest
 import torch
 from PIL import Image
 
-from affordlib.interactions import TrainingArrays
-from affordlib.interactions.folder import COURSES, read_folder, write_folder
+from affordlib.interactions import InteractionTensors
+from affordlib.interactions.import_log import TABLE, read_log, write_log
 
 CHANNELS = ("x", "y"), ("x", "y", "yaw")
 
 
 @pytest.fixture
 def some(pushes):
-    return TrainingArrays.from_dataset(pushes, np.arange(3), *CHANNELS)
+    return InteractionTensors.from_dataset(pushes, np.arange(3), *CHANNELS)
 
 
 @pytest.fixture
 def folder(some, tmp_path):
-    return write_folder(tmp_path / "mine", some)
+    return write_log(tmp_path / "mine", some)
 
 
 def test_what_was_written_is_read_again(some, folder):
-    back = read_folder(folder, n_samples=301)
+    back = read_log(folder, n_samples=301)
     assert (back.action_channels, back.effect_channels) == CHANNELS
     torch.testing.assert_close(back.effect, some.effect, atol=1e-6, rtol=0)
     torch.testing.assert_close(back.action, some.action, atol=1e-6, rtol=0)
@@ -36,34 +36,34 @@ def test_what_was_written_is_read_again(some, folder):
 def test_a_network_foresees_the_same_from_the_folder(film, some, folder):
     from affordlib.models.training import final_errors_m
 
-    ours, theirs = (final_errors_m(film, a) for a in (some, read_folder(folder, 301)))
+    ours, theirs = (final_errors_m(film, a) for a in (some, read_log(folder, 301)))
     torch.testing.assert_close(ours, theirs, atol=2e-4, rtol=0)
 
 
 def test_courses_of_any_length_are_brought_to_the_same_phases(folder):
-    rows = (folder / COURSES).read_text().splitlines()
+    rows = (folder / TABLE).read_text().splitlines()
     thinned = rows[:1] + [r for k, r in enumerate(rows[1:]) if k % 301 in (0, 150, 300)]
-    (folder / COURSES).write_text("\n".join(thinned))
-    assert read_folder(folder, n_samples=21).effect.shape == (3, 21, 3)
+    (folder / TABLE).write_text("\n".join(thinned))
+    assert read_log(folder, n_samples=21).effect.shape == (3, 21, 3)
 
 
 def test_without_a_mask_what_is_high_is_the_object(some, folder):
     for path in (folder / "images").glob("*_mask.png"):
         path.unlink()
-    mask = read_folder(folder).image[:, 1]
+    mask = read_log(folder).image[:, 1]
     assert ((mask > 0.5) == (some.image[:, 1] > 0.5)).float().mean() > 0.98
 
 
 def _replace(folder, old, new):
-    text = (folder / COURSES).read_text()
+    text = (folder / TABLE).read_text()
     assert old in text
-    (folder / COURSES).write_text(text.replace(old, new, 1))
+    (folder / TABLE).write_text(text.replace(old, new, 1))
 
 
 @pytest.mark.parametrize(
     ("spoil", "says"),
     [
-        (lambda f: (f / COURSES).unlink(), r"there is no .*courses\.csv; expected"),
+        (lambda f: (f / TABLE).unlink(), r"there is no .*trajectories\.csv; expected"),
         (lambda f: (f / "images" / "0001.png").unlink(), r"image of interaction '0001'"),
         (lambda f: _replace(f, "action_x", "action_q"), r"'action_q' is unknown; choose from"),
         (lambda f: _replace(f, "interaction", "object"), r"column 'interaction' is missing"),
@@ -71,27 +71,27 @@ def _replace(folder, old, new):
         (lambda f: _replace(f, "0000,0.0,", "0000,zero,"), r"column 't' must hold numbers"),
         (
             lambda f: Image.fromarray(np.zeros((48, 48), np.uint8)).save(f / "images" / "0002.png"),
-            r"0002\.png must be a gray image of 48×48 pixels with 16 bits",
+            r"0002\.png must be an image of 48×48 pixels, gray, 16 bits",
         ),
     ],
 )
 def test_errors_say_what_and_where(folder, spoil, says):
     spoil(folder)
     with pytest.raises((ValueError, FileNotFoundError), match=says):
-        read_folder(folder)
+        read_log(folder)
 
 
 def test_names_are_names_and_angles_go_around(some, folder):
-    text = (folder / COURSES).read_text()
-    (folder / COURSES).write_text(re.sub("^0001,", "NA,", text, flags=re.MULTILINE))
+    text = (folder / TABLE).read_text()
+    (folder / TABLE).write_text(re.sub("^0001,", "NA,", text, flags=re.MULTILINE))
     for kind in ("", "_mask"):
         (folder / "images" / f"0001{kind}.png").rename(folder / "images" / f"NA{kind}.png")
-    assert len(read_folder(folder)) == 3
-    table = pd.read_csv(folder / COURSES, keep_default_na=False)
+    assert len(read_log(folder)) == 3
+    table = pd.read_csv(folder / TABLE, keep_default_na=False)
     turned = table["effect_yaw"] + np.pi - 0.01  # over the seam, as atan2 tells it
     table["effect_yaw"] = np.arctan2(np.sin(turned), np.cos(turned))
-    table.to_csv(folder / COURSES, index=False)
-    yaw = read_folder(folder, n_samples=301).effect[..., 2]
+    table.to_csv(folder / TABLE, index=False)
+    yaw = read_log(folder, n_samples=301).effect[..., 2]
     expected = some.effect[..., 2] + np.pi - 0.01
     torch.testing.assert_close(yaw, expected, atol=1e-5, rtol=0)
 
@@ -102,7 +102,7 @@ def test_a_mask_that_is_not_white_is_refused(folder):
         mask = np.asarray(file)
     Image.fromarray((mask > 127).astype(np.uint8)).save(path)
     with pytest.raises(ValueError, match=r"0001_mask\.png must be .* white .* at most 1"):
-        read_folder(folder)
+        read_log(folder)
     Image.fromarray(mask > 127).save(path)
     with pytest.raises(ValueError, match=r"0001_mask\.png must be .*bool"):
-        read_folder(folder)
+        read_log(folder)

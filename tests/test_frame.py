@@ -42,7 +42,7 @@ def test_harmonics_turn_as_their_image_does(some):
 
 def test_turned_data_are_those_of_the_turned_push(some):
     """Yaw turns along where it is an orientation, and mirrors where it is a change."""
-    turned = some.turned(1, mirror=True)
+    turned = some.rotated_and_mirrored(1, mirror=True)
     push = math.pi / 2 - torch.atan2(some.action[:, 0, 1], some.action[:, 0, 0])
     for k in range(5):
         expected = Push(float(push[k])).path(np.array([0.0, 1.0]))[:, [0, 1, 3]]

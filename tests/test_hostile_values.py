@@ -78,8 +78,8 @@ def shop(one_world, skills, pushes, tmp_path_factory):
     """What valid calls are made of."""
     box = world.Cuboid(0.06, 0.05, 0.05)
     config = models.CNPConfig()
-    arrays = interactions.TrainingArrays.from_dataset(pushes, np.arange(12))
-    normaliser = interactions.Normaliser.fit(arrays)
+    arrays = interactions.InteractionTensors.from_dataset(pushes, np.arange(12))
+    scaler = interactions.Scaler.fit(arrays)
     goal, path = Goal((0.05, 0.02)), np.zeros((3, 2))
     step = Step(Push(0.0), 0.5, (0.02, 0.0), path)
     plan = Plan(goal, (0.0, 0.0), (step,), "by hand", True, 1, 0.0)
@@ -98,9 +98,9 @@ def shop(one_world, skills, pushes, tmp_path_factory):
         "model": skills.model(Push),
         "skills": skills,
         "config": config,
-        "normaliser": normaliser,
+        "scaler": scaler,
         "arrays": arrays,
-        "network": models.build(config, normaliser),
+        "network": models.build(config, scaler),
         "outcome": Outcome(plan, 0.01, (0.04, 0.02, 0.0), 0.0, (path,)),
         "folder": folder,
         "seen": one_world.execute_primitive(Push(0.0)),
@@ -123,7 +123,7 @@ def valid_calls(shop):
     few = models.TrainingConfig(steps=1, batch_size=2, n_targets=2, device="cpu")
     problem = planning.PlanningProblem(at, goal, planning.EffectMap(model, image), "single_partial")
     grip = {"image": image, "xy_m": at, "grip_yaws": (0.0, 0.1)}
-    build = {"config": shop["config"], "normaliser": shop["normaliser"]}
+    build = {"config": shop["config"], "scaler": shop["scaler"]}
     planner = shop["skills"].planner(planning.plan_astar)
     corners = tuple((0.03 * math.cos(a), 0.03 * math.sin(a)) for a in (0.0, 2.0, 4.0))
     ones = torch.ones(4)
@@ -197,9 +197,9 @@ def valid_calls(shop):
         "knock": (on_table(w.knock), {"dx_m_s": 0.1, "dy_m_s": 0.0, "spin_rad_s": 0.1}),
         "topple": (on_table(w.topple), {"direction_rad": 0.1}),
         "settle": (on_table(w.settle), {"seconds": 0.1}),
-        "Normaliser": (interactions.Normaliser, dataclasses.asdict(shop["normaliser"])),
+        "Scaler": (interactions.Scaler, dataclasses.asdict(shop["scaler"])),
         "from_dataset": (
-            interactions.TrainingArrays.from_dataset,
+            interactions.InteractionTensors.from_dataset,
             {
                 "data": shop["data"],
                 "interactions": np.arange(4),
@@ -213,7 +213,7 @@ def valid_calls(shop):
             {"n": 20, "seed": 0, "fold": 0, "n_folds": 10},
         ),
         "Split": (interactions.Split, vars(interactions.split_interactions(20))),
-        "TrainingArrays": (interactions.TrainingArrays, vars(arrays)),
+        "InteractionTensors": (interactions.InteractionTensors, vars(arrays)),
         "Recipe": (Recipe, {f.name: getattr(Recipe(), f.name) for f in dataclasses.fields(Recipe)}),
         "Variation": (Variation, dataclasses.asdict(Variation())),
         "collect": (
@@ -249,7 +249,10 @@ def valid_calls(shop):
             models.save_checkpoint,
             {"model": network, "path": shop["folder"] / "net.safetensors", "about": {}},
         ),
-        "observe_actions": (models.observe_actions, {"model": network, "actions": [Push(0.0)]}),
+        "condition_on_primitives": (
+            models.condition_on_primitives,
+            {"model": network, "actions": [Push(0.0)]},
+        ),
         "train": (
             train_few,
             {
@@ -429,15 +432,15 @@ NAMES = re.findall(
 Goal Step Plan Push Push.towards Push.path Drag Grasp Rotate LeverUp primitive_named Cuboid
 UprightCylinder LyingCylinder Sphere Prism category_named WorldConfig Tabletop place
 execute_primitive execute execute_path can_reach depth_image_from picture mark shove knock
-topple settle Normaliser from_dataset open_interactions split_interactions Recipe Variation collect CNPConfig
-FiLMConfig build Ensemble TrainingConfig coverage fit_temperature
-load_checkpoint save_checkpoint observe_actions train train_literal PlanMode Disturbance
+topple settle Scaler from_dataset open_interactions split_interactions Recipe Variation collect
+CNPConfig FiLMConfig build Ensemble TrainingConfig coverage fit_temperature
+load_checkpoint save_checkpoint condition_on_primitives train train_literal PlanMode Disturbance
 sample_disturbances action_limit EffectMap PlanningProblem ClosedLoopConfig plan_astar
 plan_continuous plan_gradient plan_turn plan_lift kind_for Skills execute_plan run_closed_loop
 closed_loop plot_depth plot_footprint plot_plan
 plot_outcome plot_table save_figure GoalPicker PhaseSlider FrameRecorder ConditioningExplorer
 error_row save_plan load_plan write_results read_results results_table check
-Split TrainingArrays AffordanceCNP FiLMNetwork calibration_rows train_model refuse_seen
+Split InteractionTensors AffordanceCNP FiLMNetwork calibration_rows train_model refuse_seen
 outline_in_lever_frame plot_levered plot_closed_loop show_animation
 """,
 )

@@ -4,14 +4,14 @@ import torch
 
 from affordlib.interactions import (
     CorruptedDataError,
-    Normaliser,
-    TrainingArrays,
+    InteractionTensors,
+    Scaler,
     open_interactions,
     split_interactions,
 )
-from affordlib.interactions.batches import observe_action, sample_batch
 from affordlib.interactions.collect import collect as collect_set
 from affordlib.interactions.recipes import RECIPES, SHIPPED, Recipe, interact
+from affordlib.interactions.sampling import condition_on_recorded_action, sample_mixed
 from affordlib.interactions.store import dataset_sha256, stored_sha256
 from affordlib.paths import repo_root
 
@@ -63,11 +63,13 @@ def test_full_executions_train_and_partial_ones_are_a_set_of_their_own(shipped):
         return
     assert 0.05 < stop.min() < 0.1
     assert 0.95 < stop.max() < 1
-    arrays = TrainingArrays.from_dataset(data, np.arange(20))
+    arrays = InteractionTensors.from_dataset(data, np.arange(20))
     stop = torch.from_numpy(stop[:20]).float()
-    batch = sample_batch(arrays, torch.arange(20), 8, 4, torch.Generator().manual_seed(0))
+    batch = sample_mixed(arrays, torch.arange(20), 8, 4, torch.Generator().manual_seed(0))
     assert torch.equal(batch.t_target[:, 0], stop)
-    assert torch.equal(observe_action(arrays.joined(arrays)).action_t[:, 1], stop.repeat(2))
+    assert torch.equal(
+        condition_on_recorded_action(arrays.joined(arrays)).action_t[:, 1], stop.repeat(2)
+    )
     gap_m = np.linalg.norm((data["rest_effect"] - data["full_effect"]).values[:, :3], axis=1)
     assert np.median(gap_m) < 0.0005
     assert np.quantile(gap_m, 0.95) < 0.002
@@ -173,13 +175,13 @@ def test_splits_and_folds():
 
 
 def test_quarter_turns_turn_image_action_and_effect_alike(pushes):
-    arrays = TrainingArrays.from_dataset(pushes, np.arange(20))
+    arrays = InteractionTensors.from_dataset(pushes, np.arange(20))
     turned = arrays
     for _ in range(4):
-        turned = turned.turned(1)
+        turned = turned.rotated_and_mirrored(1)
     assert torch.equal(turned.image, arrays.image)
     assert torch.equal(turned.effect, arrays.effect)
-    once = arrays.turned(1, mirror=True)
+    once = arrays.rotated_and_mirrored(1, mirror=True)
     start = arrays.action[:, 0] * torch.tensor([1.0, -1.0])
     assert torch.allclose(once.action[:, 0], torch.stack([-start[:, 1], start[:, 0]], dim=1))
 
@@ -187,13 +189,13 @@ def test_quarter_turns_turn_image_action_and_effect_alike(pushes):
 @pytest.mark.parametrize(("quarters", "mirror"), [(1, False), (2, False), (1, True), (3, True)])
 def test_what_lies_in_the_image_turns_as_the_effect_does(pushes, quarters, mirror):
     """A mark drawn where the object will end is, turned, still where the object will end."""
-    arrays = TrainingArrays.from_dataset(pushes, np.arange(4))
+    arrays = InteractionTensors.from_dataset(pushes, np.arange(4))
     arrays.image.zero_()
     arrays.effect[:, -1] = torch.tensor([0.05, 0.02])
     pixel_m = 0.16 / 48
     row, column = round(23.5 - 0.02 / pixel_m), round(23.5 + 0.05 / pixel_m)
     arrays.image[:, 1, row, column] = 1
-    turned = arrays.turned(quarters, mirror)
+    turned = arrays.rotated_and_mirrored(quarters, mirror)
     _, row, column = turned.image[:, 1].nonzero().T
     seen = torch.stack([column - 23.5, 23.5 - row], dim=1) * pixel_m
     torch.testing.assert_close(seen, turned.effect[:, -1], atol=pixel_m, rtol=0)
@@ -201,16 +203,16 @@ def test_what_lies_in_the_image_turns_as_the_effect_does(pushes, quarters, mirro
 
 
 def test_normaliser_keeps_zero_and_gives_unit_size(pushes):
-    arrays = TrainingArrays.from_dataset(pushes)
-    normaliser = Normaliser.fit(arrays)
-    assert normaliser.effect_scale[0] == normaliser.effect_scale[1]
-    scaled = arrays.effect / torch.tensor(normaliser.effect_scale)
+    arrays = InteractionTensors.from_dataset(pushes)
+    scaler = Scaler.fit(arrays)
+    assert scaler.effect_scale[0] == scaler.effect_scale[1]
+    scaled = arrays.effect / torch.tensor(scaler.effect_scale)
     assert scaled.square().mean().sqrt() == pytest.approx(1.0, abs=1e-4)
 
 
 def test_batches_hold_what_the_trajectories_hold(pushes):
-    arrays = TrainingArrays.from_dataset(pushes, np.arange(8))
-    batch = sample_batch(arrays, torch.arange(8), 5, 10, torch.Generator().manual_seed(0))
+    arrays = InteractionTensors.from_dataset(pushes, np.arange(8))
+    batch = sample_mixed(arrays, torch.arange(8), 5, 10, torch.Generator().manual_seed(0))
     at = (batch.t_target * 300).round().long()
     assert torch.equal(batch.effect, arrays.effect[torch.arange(8)[:, None], at])
     assert (batch.t_target[:, 0] == 1).all()
@@ -219,10 +221,10 @@ def test_batches_hold_what_the_trajectories_hold(pushes):
     assert not nothing.any()
     assert (seen.weight[~seen.effect_mask.any(1)] == 1).all()
     assert (seen.weight[~seen.action_mask.any(1)] == 0).all()
-    ends = observe_action(arrays)
+    ends = condition_on_recorded_action(arrays)
     assert ends.action_t.unique().tolist() == [0.0, 1.0]
     with pytest.raises(ValueError, match="'spin'"):
-        TrainingArrays.from_dataset(pushes, effect_channels=("x", "spin"))
+        InteractionTensors.from_dataset(pushes, effect_channels=("x", "spin"))
 
 
 def test_shipped_files_record_their_units(pushes):

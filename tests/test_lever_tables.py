@@ -9,9 +9,7 @@ import pytest
 import torch
 
 from affordlib.interactions import open_interactions
-from affordlib.interactions.lever import (
-    lever_arrays,
-)
+from affordlib.interactions.lever_up import lever_up_tensors
 from affordlib.models import load_checkpoint
 from affordlib.models.lever import (
     LEVER_MODELS,
@@ -168,7 +166,7 @@ def test_shipped_checkpoints_foresee_what_they_have_not_seen(name):
     model, about = load_checkpoint(name)
     split = split_of(LeverUnit("persistence"), whole)
     assert not set(about["seen_interactions"]) & set(split.test)
-    few = lever_arrays(whole, split.test[:60], about["view"])
+    few = lever_up_tensors(whole, split.test[:60], about["view"])
     if about["trained_for"] != "first_step":
         assert 100 * window_errors_m(model, few).mean() < 0.3
     if about["trained_for"] != "window":

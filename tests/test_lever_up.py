@@ -8,19 +8,17 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 
-from affordlib.interactions import Normaliser
-from affordlib.interactions.batches import symmetric_copies
-from affordlib.interactions.lever import (
-    AHEAD,
+from affordlib.interactions import Scaler
+from affordlib.interactions.dataset import augment_by_symmetry
+from affordlib.interactions.lever_up import (
     MIRRORED,
-    SEEN,
-    draw_beginnings,
-    draw_windows,
-    lever_arrays,
+    N_OBSERVED,
+    N_PREDICTED,
+    lever_up_tensors,
     n_windows,
-    poses_seen,
 )
-from affordlib.interactions.recipes import Recipe, draw_scene
+from affordlib.interactions.recipes import Recipe, sample_scene
+from affordlib.interactions.sampling import condition_on_poses, sample_from_start, sample_windows
 from affordlib.models import build
 from affordlib.models.anchored import AnchoredNetwork, _last
 from affordlib.models.lever import (
@@ -37,7 +35,7 @@ from affordlib.show import FrameRecorder, outline_in_lever_frame, plot_levered
 @pytest.fixture(scope="module", params=["anchored", "lstm_tuned", "paper"])
 def untrained(request, levered):
     torch.manual_seed(0)
-    model = build(LEVER_MODELS[request.param].network, Normaliser.fit(levered))
+    model = build(LEVER_MODELS[request.param].network, Scaler.fit(levered))
     if hasattr(model, "fit_course"):
         model.fit_course(levered.effect)
     return model.eval()
@@ -63,18 +61,18 @@ def test_arrays_are_in_the_frame_of_the_lever(levers, levered):
 
 
 def test_no_view_cuts_an_object_off(levers, levered):
-    wide, full = (lever_arrays(levers, view=view).image for view in ("wide", "full"))
+    wide, full = (lever_up_tensors(levers, view=view).image for view in ("wide", "full"))
     assert full.shape[-1] == 128
     assert levered.image.shape[-1] == wide.shape[-1] == 48
     area = full[:, 1].sum(dim=(1, 2)) / 128**2
     torch.testing.assert_close(4 * levered.image[:, 1].sum(dim=(1, 2)), full[:, 1].sum(dim=(1, 2)))
     torch.testing.assert_close(wide[:, 1].mean(dim=(1, 2)), area, rtol=0.02, atol=0)
     with pytest.raises(ValueError, match="view must be one of"):
-        lever_arrays(levers, view="far")
+        lever_up_tensors(levers, view="far")
 
 
 def test_mirror_images_mirror_only_what_is_across(levered):
-    both = symmetric_copies(levered, MIRRORED)
+    both = augment_by_symmetry(levered, MIRRORED)
     n = len(levered)
     sign = torch.tensor([1.0, -1.0, 1.0, 1.0])
     torch.testing.assert_close(both.effect[n:], levered.effect * sign)
@@ -85,7 +83,7 @@ def test_mirror_images_mirror_only_what_is_across(levered):
 def test_windows_are_fifteen_steps_and_the_next_five(levered):
     generator = torch.Generator().manual_seed(0)
     assert n_windows(levered) == 7
-    batch = draw_windows(levered, torch.arange(len(levered)), AHEAD, SEEN, generator)
+    batch = sample_windows(levered, torch.arange(len(levered)), N_PREDICTED, N_OBSERVED, generator)
     seen = (batch.observations.effect_t * 25).round()
     assert (seen.diff(dim=1) == 1).all()
     assert {int(s) for s in seen[:, 0]} == set(range(7))
@@ -93,7 +91,7 @@ def test_windows_are_fifteen_steps_and_the_next_five(levered):
     assert batch.observations.effect_mask.all()
     told = {
         bool(
-            draw_beginnings(
+            sample_from_start(
                 levered, torch.arange(2), 0, 0, generator
             ).observations.effect_mask.any()
         )
@@ -107,7 +105,7 @@ def test_windows_are_fifteen_steps_and_the_next_five(levered):
 
 def test_no_model_sees_what_it_has_to_foresee(untrained, levered):
     """Whatever happens after the observed steps, predictions stay."""
-    for protocol, last in zip(PROTOCOLS, (SEEN - 1, 0, 0), strict=True):
+    for protocol, last in zip(PROTOCOLS, (N_OBSERVED - 1, 0, 0), strict=True):
         later = levered.effect.clone()
         later[:, last + 1 :] += 0.05
         told, _ = foresee(untrained, levered, protocol)
@@ -118,7 +116,7 @@ def test_no_model_sees_what_it_has_to_foresee(untrained, levered):
 
 def test_models_use_what_they_observe(untrained, levered):
     earlier = levered.effect.clone()
-    earlier[:, SEEN - 1] += 0.05
+    earlier[:, N_OBSERVED - 1] += 0.05
     told, _ = foresee(untrained, levered, "window")
     other, _ = foresee(untrained, replace(levered, effect=earlier), "window")
     assert (told.effect_mean - other.effect_mean).abs().max() > 1e-3
@@ -127,7 +125,7 @@ def test_models_use_what_they_observe(untrained, levered):
 def test_the_first_pose_tells_nothing_to_those_that_anchor(levered):
     for name in ("anchored", "lstm_tuned"):
         torch.manual_seed(0)
-        model = build(LEVER_MODELS[name].network, Normaliser.fit(levered)).eval()
+        model = build(LEVER_MODELS[name].network, Scaler.fit(levered)).eval()
         first, none = (foresee(model, levered, p)[0].effect_mean for p in PROTOCOLS[1:])
         if name == "lstm_tuned":
             torch.testing.assert_close(first, none)
@@ -147,10 +145,10 @@ def test_the_last_observation_is_found_in_any_order():
 
 def test_an_anchored_network_begins_where_the_object_is(levered):
     torch.manual_seed(0)
-    model = build(LEVER_MODELS["anchored"].network, Normaliser.fit(levered)).eval()
+    model = build(LEVER_MODELS["anchored"].network, Scaler.fit(levered)).eval()
     assert isinstance(model, AnchoredNetwork)
     model.fit_course(levered.effect)
-    seen = poses_seen(levered, torch.zeros(len(levered), dtype=torch.long), 10)
+    seen = condition_on_poses(levered, torch.zeros(len(levered), dtype=torch.long), 10)
     t = levered.phase[[9]].expand(len(levered), -1)
     with torch.no_grad():
         told = model.predict(model.encode(levered.image), seen, t)
@@ -168,9 +166,9 @@ def test_observations_fall_on_their_steps():
 
 def test_a_rollout_does_not_depend_on_how_far_it_is_asked(levered):
     torch.manual_seed(0)
-    model = build(LEVER_MODELS["lstm_tuned"].network, Normaliser.fit(levered)).eval()
+    model = build(LEVER_MODELS["lstm_tuned"].network, Scaler.fit(levered)).eval()
     torch.nn.init.normal_(model.last[-1].weight, std=0.02)
-    seen = poses_seen(levered, torch.zeros(len(levered), dtype=torch.long), 5)
+    seen = condition_on_poses(levered, torch.zeros(len(levered), dtype=torch.long), 5)
     ask = levered.phase[[5, 12, 25]].expand(len(levered), -1)
     with torch.no_grad():
         features = model.encode(levered.image)
@@ -201,13 +199,13 @@ def test_the_drawn_polygon_is_the_one_in_the_image(levers):
     from matplotlib.path import Path as Outline
 
     recipe = Recipe.from_json(levers.attrs["recipe"])
-    masks = lever_arrays(levers, view="full").image[:, 1].numpy() > 0.5
+    masks = lever_up_tensors(levers, view="full").image[:, 1].numpy() > 0.5
     centre = ((np.arange(128) + 0.5) / 128 - 0.5) * 0.56
     grid = np.stack(np.meshgrid(centre, -centre), axis=-1).reshape(-1, 2)
     kept = np.flatnonzero(~levers["fault"].values)
     for row in (0, 5, 11):
         number = int(kept[row])
-        obj, yaw, _ = draw_scene(recipe, number)
+        obj, yaw, _ = sample_scene(recipe, number)
         lever = levers.isel(interaction=number)
         contact = np.array([float(lever["contact_x"]), float(lever["contact_y"])])
         outline = outline_in_lever_frame(obj, yaw, contact, float(lever["theta"]))

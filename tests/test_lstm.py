@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from affordlib.interactions import Normaliser, TrainingArrays
-from affordlib.interactions.batches import draw_forward
-from affordlib.interactions.lever import SEEN
+from affordlib.interactions import InteractionTensors, Scaler
+from affordlib.interactions.lever_up import N_OBSERVED
+from affordlib.interactions.sampling import sample_forward
 from affordlib.models import build
 from affordlib.models.lever import beginning_errors_m, window_errors_m
 from affordlib.models.lstm import LSTMConfig, courses
-from affordlib.models.protocol import EffectModel, observe_actions
+from affordlib.models.protocol import EffectModel, condition_on_primitives
 from affordlib.primitives import Push
 from experiments.lstm_published import PublishedConfig, PublishedLSTM, train_published
 
@@ -20,7 +20,7 @@ from experiments.lstm_published import PublishedConfig, PublishedLSTM, train_pub
 def test_the_published_network_is_the_published_one(levered):
     config = PublishedConfig(levered.action_channels, levered.effect_channels)
     torch.manual_seed(0)
-    model = PublishedLSTM(config, Normaliser.fit(levered))
+    model = PublishedLSTM(config, Scaler.fit(levered))
     total = sum(p.numel() for p in model.parameters())
     assert 71e6 < total < 73e6
     assert [m.out_channels for m in model.cnn if hasattr(m, "out_channels")] == [32, 64, 128, 256]
@@ -37,7 +37,7 @@ def small_published(levered, monkeypatch):
     def make():
         torch.manual_seed(0)
         config = PublishedConfig(levered.action_channels, levered.effect_channels)
-        return PublishedLSTM(config, Normaliser.fit(levered))
+        return PublishedLSTM(config, Scaler.fit(levered))
 
     return make
 
@@ -46,15 +46,15 @@ def test_its_recurrence_is_that_of_features_repeated_and_concatenated(levered, s
     model, start = small_published().eval(), torch.zeros(len(levered), dtype=torch.long)
     lstm = torch.nn.LSTM(model.lstm.input_size, model.lstm.hidden_size, batch_first=True)
     lstm.load_state_dict({f"{k}_l0": v for k, v in model.lstm.state_dict().items()})
-    pose = (levered.effect / model.effect_scale)[:, : SEEN + 1]
+    pose = (levered.effect / model.effect_scale)[:, : N_OBSERVED + 1]
     ends = (levered.action[:, [0, -1]] / model.action_scale).flatten(1)
     again = [model.encode(levered.image), pose[:, 0], ends]
-    told = torch.cat([x[:, None].expand(-1, SEEN, -1) for x in again], dim=-1)
+    told = torch.cat([x[:, None].expand(-1, N_OBSERVED, -1) for x in again], dim=-1)
     told[:, :, 8 : -ends.shape[1]] = pose[:, :-1]
-    phase = (torch.arange(SEEN) / model.config.steps).expand(len(levered), -1)[..., None]
+    phase = (torch.arange(N_OBSERVED) / model.config.steps).expand(len(levered), -1)[..., None]
     out, _ = lstm(torch.cat([told, phase], dim=-1))
     expected = torch.nn.functional.mse_loss(model.next_pose(out), pose[:, 1:])
-    torch.testing.assert_close(model.next_step_loss(levered, start, SEEN), expected)
+    torch.testing.assert_close(model.next_step_loss(levered, start, N_OBSERVED), expected)
 
 
 def test_a_published_training_goes_on_where_it_was_broken_off(tmp_path, levered, small_published):
@@ -97,15 +97,15 @@ def test_gradients_that_vanish_are_forgotten(tmp_path, levered, small_published,
 
 
 def test_an_lstm_of_pushes_is_a_model_like_the_others(pushes):
-    few = TrainingArrays.from_dataset(pushes, np.arange(8))
+    few = InteractionTensors.from_dataset(pushes, np.arange(8))
     torch.manual_seed(0)
-    model = build(LSTMConfig(frame="push", steps=5, width=16), Normaliser.fit(few)).eval()
+    model = build(LSTMConfig(frame="push", steps=5, width=16), Scaler.fit(few)).eval()
     torch.nn.init.normal_(model.last[-1].weight)  # zero at first, so that it begins by coasting
     assert isinstance(model, EffectModel)
-    batch = draw_forward(few, torch.arange(8), 3, 1, torch.Generator().manual_seed(0))
+    batch = sample_forward(few, torch.arange(8), 3, 1, torch.Generator().manual_seed(0))
     loss = model.loss(batch.image, batch.observations, batch.t_target, batch.action, batch.effect)
     assert torch.isfinite(loss)
-    seen = observe_actions(model, [Push(0.3)])
+    seen = condition_on_primitives(model, [Push(0.3)])
     action = seen.action.requires_grad_()
     told = model.predict(
         model.encode(few.image[:1]), replace(seen, action=action), torch.ones(1, 1)
@@ -126,9 +126,9 @@ def test_a_published_training_of_something_else_is_not_gone_on_with(
 
 
 def test_the_course_of_pushes_is_that_seen_from_behind(pushes):
-    few = TrainingArrays.from_dataset(pushes, np.arange(60), ("x", "y"), ("x", "y", "yaw"))
+    few = InteractionTensors.from_dataset(pushes, np.arange(60), ("x", "y"), ("x", "y", "yaw"))
     config = LSTMConfig(effect_channels=("x", "y", "yaw"), frame="push", width=16)
-    model = build(config, Normaliser.fit(few))
+    model = build(config, Scaler.fit(few))
     mean = courses(model, few).mean(dim=0)
     assert mean.shape == (26, 3)
     torch.testing.assert_close(mean[:, 1:], torch.zeros(26, 2), atol=1e-6, rtol=0)

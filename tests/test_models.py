@@ -10,16 +10,16 @@ from torch import nn
 
 from affordlib.evaluation import refuse_seen
 from affordlib.evaluation.baselines import constant
-from affordlib.interactions import Normaliser, TrainingArrays, split_interactions
-from affordlib.interactions.batches import observe, observe_action
+from affordlib.interactions import InteractionTensors, Scaler, split_interactions
+from affordlib.interactions.sampling import condition_on_recorded_action
 from affordlib.models import (
     AffordanceCNP,
     CNPConfig,
     EffectModel,
     FiLMConfig,
     TrainingConfig,
+    condition_on_primitives,
     load_checkpoint,
-    observe_actions,
     save_checkpoint,
     train,
 )
@@ -162,10 +162,10 @@ def mean_length_error_m(training, test):
 def test_a_minute_of_training_beats_the_mean_length(pushes):
     """The check that an eighth of the shipped training already learns what an image tells."""
     split = split_interactions(500)
-    training = TrainingArrays.from_dataset(pushes, split.train)
-    validation = TrainingArrays.from_dataset(pushes, split.validation)
+    training = InteractionTensors.from_dataset(pushes, split.train)
+    validation = InteractionTensors.from_dataset(pushes, split.validation)
     torch.manual_seed(0)
-    model = AffordanceCNP(CNPConfig(), Normaliser.fit(training))
+    model = AffordanceCNP(CNPConfig(), Scaler.fit(training))
     config = TrainingConfig(steps=600, n_targets=8, batch_size=48, validate_every=200)
     history = train(model, training, validation, config, progress=False)
     assert history[-1].loss < history[0].loss
@@ -176,11 +176,11 @@ def test_a_minute_of_training_beats_the_mean_length(pushes):
 
 
 def test_training_is_repeatable(pushes):
-    arrays = TrainingArrays.from_dataset(pushes, np.arange(40))
+    arrays = InteractionTensors.from_dataset(pushes, np.arange(40))
     weights = []
     for _ in range(2):
         torch.manual_seed(1)
-        model = AffordanceCNP(CNPConfig(), Normaliser.fit(arrays))
+        model = AffordanceCNP(CNPConfig(), Scaler.fit(arrays))
         train(model, arrays, arrays, TrainingConfig(steps=3, batch_size=8), progress=False)
         weights.append(model.merge.weight.detach().clone())
     assert torch.equal(*weights)
@@ -189,17 +189,15 @@ def test_training_is_repeatable(pushes):
 @pytest.mark.slow
 def test_the_shipped_model_on_the_held_out_pushes(trained, held_out_pushes, pushes):
     """Under 4 mm, and clearly better than a direction and a mean length."""
-    test = TrainingArrays.from_dataset(held_out_pushes)
-    training = TrainingArrays.from_dataset(pushes, split_interactions(500).train)
+    test = InteractionTensors.from_dataset(held_out_pushes)
+    training = InteractionTensors.from_dataset(pushes, split_interactions(500).train)
     errors = final_errors_m(trained, test)
     assert len(errors) == 1000
     assert errors.mean() < 0.004  # 2.7 mm
     assert errors.mean() < 0.75 * mean_length_error_m(training, test)
     # Conditioned on the effect instead, it finds the action that gives it.
     n = len(test)
-    one, none = torch.ones(n, 1, dtype=torch.bool), torch.zeros(n, 1, dtype=torch.bool)
-    at_end = torch.full((n, 1), 300)
-    seen = observe(test, at_end, none, at_end, one, torch.zeros(n))
+    seen = Observations.of(test, effect=test.effect_at(torch.tensor([-1])))
     action = trained.predict(trained.encode(test.image), seen, torch.zeros(n, 1)).action_mean
     turned = torch.atan2(action[:, 0, 1], action[:, 0, 0]) - torch.atan2(
         test.action[:, 0, 1], test.action[:, 0, 0]
@@ -209,15 +207,15 @@ def test_the_shipped_model_on_the_held_out_pushes(trained, held_out_pushes, push
 
 
 def test_encoding_once_equals_encoding_each_time(trained, held_out_pushes):
-    one = TrainingArrays.from_dataset(held_out_pushes, np.arange(1))
+    one = InteractionTensors.from_dataset(held_out_pushes, np.arange(1))
     pushed = [Push(theta) for theta in np.linspace(0, 6, 8)]
-    seen, t = observe_actions(trained, pushed), torch.ones(8, 1)
+    seen, t = condition_on_primitives(trained, pushed), torch.ones(8, 1)
     once = trained.predict(trained.encode(one.image), seen, t)
     each = trained.predict(trained.encode(one.image.expand(8, -1, -1, -1)), seen, t)
     torch.testing.assert_close(once.effect_mean, each.effect_mean, rtol=1e-4, atol=1e-6)
-    # What observe_actions commands is what the data set stores.
-    recorded = observe_action(one)
-    again = observe_actions(trained, [Push(float(held_out_pushes["theta"][0]))])
+    # What condition_on_primitives commands is what the data set stores.
+    recorded = condition_on_recorded_action(one)
+    again = condition_on_primitives(trained, [Push(float(held_out_pushes["theta"][0]))])
     torch.testing.assert_close(recorded.action, again.action, atol=1e-6, rtol=0)
 
 
@@ -225,7 +223,7 @@ def test_checkpoint_round_trip(untrained, tmp_path):
     path = save_checkpoint(untrained, tmp_path / "m.safetensors", {"note": "none"})
     again, about = load_checkpoint(path)
     assert about == {"note": "none"}
-    assert again.normaliser == untrained.normaliser
+    assert again.scaler == untrained.scaler
     for name, value in untrained.state_dict().items():
         assert torch.equal(again.state_dict()[name], value)
     assert [p.name for p in tmp_path.iterdir()] == ["m.safetensors"]
@@ -359,7 +357,7 @@ def test_of_whatever_size_a_set_of_the_same_recipe_is_known(pushes):
 def test_folded_weights_are_those_of_now(untrained):
     """A fused optimiser changes weights without leaving a trace on them."""
     model, t_target = untrained, torch.linspace(0, 1, 120)[None]
-    observed, features = observe_actions(model, [Push(0.3)]), torch.zeros(1, 16)
+    observed, features = condition_on_primitives(model, [Push(0.3)]), torch.zeros(1, 16)
 
     def told():
         with torch.no_grad():

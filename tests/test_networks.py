@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from affordlib.interactions import Normaliser
-from affordlib.interactions.batches import observe_action, sample_batch
+from affordlib.interactions import Scaler
+from affordlib.interactions.sampling import sample_mixed
 from affordlib.models import (
     CNPConfig,
     EffectModel,
@@ -17,10 +17,10 @@ from affordlib.models import (
     TrainingConfig,
     build,
     calibration_rows,
+    condition_on_primitives,
     coverage,
     fit_temperature,
     load_checkpoint,
-    observe_actions,
     save_checkpoint,
 )
 from affordlib.models.frame import heading
@@ -52,7 +52,7 @@ def network(request, some):
 
 def made(name, arrays):
     torch.manual_seed(0)
-    network = build(CONFIGS[name], Normaliser.fit(arrays)).eval()
+    network = build(CONFIGS[name], Scaler.fit(arrays)).eval()
     with torch.no_grad():  # blocks begin at zero; let them speak
         for parameter in network.parameters():
             parameter.add_(0.02 * torch.randn_like(parameter))
@@ -62,7 +62,7 @@ def made(name, arrays):
 def asked(arrays, seed=0, n_targets=5):
     """A batch of all kinds of contexts for all interactions."""
     generator = torch.Generator().manual_seed(seed)
-    return sample_batch(arrays, torch.arange(len(arrays)), n_targets, 4, generator)
+    return sample_mixed(arrays, torch.arange(len(arrays)), n_targets, 4, generator)
 
 
 def answers(network, image, observations, t_target):
@@ -110,12 +110,12 @@ def test_what_is_masked_counts_for_nothing(network, some):
 @pytest.mark.parametrize("quarters", [1, 2, 3])
 def test_a_quarter_turn_of_the_table_turns_the_answer(name, quarters, some):
     network = made(name, some)
-    turned = some.turned(quarters)
+    turned = some.rotated_and_mirrored(quarters)
     a, b = asked(some), asked(turned)
     # What was predicted is turned like data are: by the data's own turning.
     mean_a, std_a, mean_e, std_e = answers(network, a.image, a.observations, a.t_target)
     t_mean_a, t_std_a, t_mean_e, t_std_e = answers(network, b.image, b.observations, b.t_target)
-    told = dataclasses.replace(some, action=mean_a, effect=mean_e).turned(quarters)
+    told = dataclasses.replace(some, action=mean_a, effect=mean_e).rotated_and_mirrored(quarters)
     # Where nothing tells a direction, as an effect before contact, the frame is the table's.
     o = a.observations
     seen_e = o.effect_mask & (o.effect[..., :2].norm(dim=-1) > 1e-3)
@@ -145,7 +145,7 @@ def test_any_turn_of_a_real_object_turns_the_answer_of_the_trained_model(name, o
         image = torch.from_numpy(np.array(world.depth_image()))[None]
         pushed = [Push(theta + turn_rad) for theta in np.linspace(0, 6, 24)]
         effect = model.predict(
-            model.encode(image), observe_actions(model, pushed), torch.ones(24, 1)
+            model.encode(image), condition_on_primitives(model, pushed), torch.ones(24, 1)
         ).effect_mean[:, 0, plane]
         c, s = math.cos(turn_rad), math.sin(turn_rad)
         effect = effect @ torch.tensor([[c, -s], [s, c]])
@@ -161,7 +161,9 @@ def test_any_turn_of_a_real_object_turns_the_answer_of_the_trained_model(name, o
 
 def test_the_heading_is_the_push(some):
     def towards(arrays, samples):
-        return heading(observe_action(arrays, samples), *YAW.values())
+        return heading(
+            Observations.of(arrays, arrays.action_at(torch.tensor(samples))), *YAW.values()
+        )
 
     travel = some.action[:, -1, :2] - some.action[:, 0, :2]
     expected = travel / travel.norm(dim=-1, keepdim=True)
@@ -178,10 +180,13 @@ def test_many_questions_at_once_have_the_answers_of_each(name, some):
     model, _ = load_checkpoint(name)
     pushes = [Push(float(theta)) for theta in np.linspace(-3, 3, 40)]
     features, t_target = model.encode(some.image[:1]), torch.linspace(0, 1, 6).expand(40, -1)
-    observed = observe_actions(model, pushes)
+    observed = condition_on_primitives(model, pushes)
     with torch.no_grad():
         together = model.predict(features, observed, t_target)
-        each = [model.predict(features, observe_actions(model, [p]), t_target[:1]) for p in pushes]
+        each = [
+            model.predict(features, condition_on_primitives(model, [p]), t_target[:1])
+            for p in pushes
+        ]
     apart = model.predict(features.expand(40, -1), observed, t_target)  # with gradients
     for field in dataclasses.fields(together):
         one_by_one = torch.cat([getattr(told, field.name) for told in each])
@@ -218,15 +223,15 @@ def test_strange_inputs_are_refused(some):
     features = network.encode(some.image[:1])
     with pytest.raises(ValueError, match=r"starts 0\.260 m .* trained on 0\.200 to 0\.200 m"):
         network.predict(
-            features, observe_actions(network, [Push(0, radius=0.26)]), torch.ones(1, 1)
+            features, condition_on_primitives(network, [Push(0, radius=0.26)]), torch.ones(1, 1)
         )
     with pytest.raises(ValueError, match=r"starts 0\.000 m"):
-        network.predict(features, observe_actions(network, [Drag(0)]), torch.ones(1, 1))
+        network.predict(features, condition_on_primitives(network, [Drag(0)]), torch.ones(1, 1))
     with pytest.raises(ValueError, match=r"ends 0\.120 m"):
         network.predict(
-            features, observe_actions(network, [Push(0, length=0.12)]), torch.ones(1, 1)
+            features, condition_on_primitives(network, [Push(0, length=0.12)]), torch.ones(1, 1)
         )
-    pushed = observe_actions(network, [Push(0)])
+    pushed = condition_on_primitives(network, [Push(0)])
     for t in (-0.2, 1.5, math.nan):
         with pytest.raises(ValueError, match=r"t_target must lie in \[0, 1\]"):
             network.predict(features, pushed, torch.full((1, 1), t))
@@ -294,7 +299,7 @@ def test_checkpoints_of_every_network(network, some, tmp_path):
     assert again.config == dataclasses.replace(
         network.config, sigma_floor=0.03, temperature=(1.7, 1.7, 0.5)
     )
-    assert again.normaliser == network.normaliser
+    assert again.scaler == network.scaler
     batch = asked(some)
     told, repeated = (
         answers(n, batch.image, batch.observations, batch.t_target) for n in (network, again)

@@ -7,7 +7,8 @@ import pytest
 import torch
 from PIL import Image
 
-from affordlib.interactions.lever import POSE_CHANNELS, read_trajectories, write_trajectories
+from affordlib.interactions.import_log import read_trajectories, write_trajectories
+from affordlib.interactions.lever_up import POSE_CHANNELS
 from affordlib.models.lever import fit_lever_model, window_errors_m
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from affordlib.interactions import TrainingArrays, open_interactions, split_interactions
-from affordlib.interactions.batches import observe_action, sample_batch
+from affordlib.interactions import InteractionTensors, open_interactions, split_interactions
+from affordlib.interactions.sampling import condition_on_recorded_action, sample_mixed
 from affordlib.models.frame import heading
 from affordlib.types import Prediction
 from affordlib.world import LyingCylinder, UprightCylinder
@@ -63,13 +63,13 @@ def test_alignment_of_codes():
 
 
 def test_draws_leave_out_one_thing_each(pushes):
-    arrays = TrainingArrays.from_dataset(pushes, np.arange(80))
+    arrays = InteractionTensors.from_dataset(pushes, np.arange(80))
     rows = torch.arange(80)
 
     def drawn(draw):
         return draw(arrays, rows, 4, 6, torch.Generator().manual_seed(0))
 
-    plain, blended = drawn(sample_batch), drawn(half_blend)
+    plain, blended = drawn(sample_mixed), drawn(half_blend)
     both = (plain.observations.weight > 0) & (plain.observations.weight < 1)
     assert both.sum() > 10
     assert (blended.observations.weight[both] == 0.5).all()
@@ -103,12 +103,12 @@ def test_changes_of_an_ablation_add_up(monkeypatch):
     (bare, config, draw), (ours, usual, loose) = made
     assert draw is ablation.one_at_a_time  # which draws at random moments, too
     assert (config.augment, config.beta, config.ema) == (False, 0.0, 0.0)
-    assert (bare.config.frame, bare.normaliser.action_scale) == ("table", (1.0, 1.0))
+    assert (bare.config.frame, bare.scaler.action_scale) == ("table", (1.0, 1.0))
     assert not any(p.requires_grad for b in bare.blocks for p in b.modulation.parameters())
     assert loose is random_contexts
     assert usual.augment
     assert (usual.beta, ours.config.frame) == (0.5, "push")
-    assert ours.normaliser.action_scale < (0.5, 0.5)
+    assert ours.scaler.action_scale < (0.5, 0.5)
     first = [next(m for m in net.image_encoder if hasattr(m, "weight")) for net in (bare, ours)]
     assert not torch.equal(first[0].weight, first[1].weight)
 
@@ -118,7 +118,7 @@ def of_all():
     """The first interactions of each primitive, with all channels."""
     channels = one_for_all.NETWORK.action_channels, one_for_all.NETWORK.effect_channels
     return {
-        name: TrainingArrays.from_dataset(open_interactions(name), np.arange(30), *channels)
+        name: InteractionTensors.from_dataset(open_interactions(name), np.arange(30), *channels)
         for name in one_for_all.PRIMITIVES
     }
 
@@ -130,7 +130,9 @@ def test_the_commanded_action_tells_the_primitive(of_all):
         beside = (start[:, :2].norm(dim=1) > 0.1, end[:, :2].norm(dim=1) > 0.01)
         told[name] = torch.stack([*beside, end[:, 2] > 0.1, end[:, 4] < 0.5], dim=1).int()
         assert (told[name] == told[name][0]).all()
-        towards = heading(observe_action(arrays), arrays.action_channels, arrays.effect_channels)
+        towards = heading(
+            condition_on_recorded_action(arrays), arrays.action_channels, arrays.effect_channels
+        )
         of_table = torch.tensor([1.0, 0.0]).expand(len(arrays), -1)
         assert torch.equal(towards, of_table) == (name in ("grasp", "rotate"))
     assert len({tuple(rows[0].tolist()) for rows in told.values()}) == 4

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from affordlib.interactions import Normaliser, TrainingArrays, split_interactions
-from affordlib.interactions.batches import observe_action
+from affordlib.interactions import InteractionTensors, Scaler, split_interactions
+from affordlib.interactions.sampling import condition_on_recorded_action, sample_literal
 from affordlib.models import (
     FiLMConfig,
     TrainingConfig,
@@ -18,7 +18,7 @@ from affordlib.models import (
     train,
     train_literal,
 )
-from affordlib.models.training import batch_loss, final_errors_m, literal_draw
+from affordlib.models.training import batch_loss, final_errors_m
 
 
 def fresh(arrays):
@@ -27,7 +27,7 @@ def fresh(arrays):
     small = FiLMConfig(
         arrays.action_channels, arrays.effect_channels, width=32, blocks=2, rings=3, orders=4
     )
-    return build(small, Normaliser.fit(arrays)).eval()
+    return build(small, Scaler.fit(arrays)).eval()
 
 
 def test_the_literal_loop_learns(some):
@@ -35,7 +35,9 @@ def test_the_literal_loop_learns(some):
     losses = train_literal(network, some, 150, learning_rate=1e-3)
     assert np.mean(losses[-30:]) < np.mean(losses[:30]) - 0.3
     generator = torch.Generator().manual_seed(0)
-    counts = [literal_draw(some, 10, generator).observations.action_t.shape[1] for _ in range(200)]
+    counts = [
+        sample_literal(some, 10, generator).observations.action_t.shape[1] for _ in range(200)
+    ]
     assert set(counts) == set(range(1, 11))
 
 
@@ -60,7 +62,7 @@ def test_the_literal_loop_stops_early_and_keeps_its_best(some, monkeypatch):
 def test_a_gpu_trains_what_any_score_judges(some):
     def score(model, arrays):
         end = torch.ones(len(arrays), 1)
-        told = model.predict(model.encode(arrays.image), observe_action(arrays), end)
+        told = model.predict(model.encode(arrays.image), condition_on_recorded_action(arrays), end)
         return (told.effect_mean[:, 0] - arrays.effect[:, -1]).norm(dim=-1)
 
     network = fresh(some)
@@ -130,7 +132,7 @@ def test_the_shipped_films_reach_their_goals(
     model, about = load_checkpoint(name)
     split = split_interactions(n)
     assert about["seen_interactions"] == sorted([*split.train, *split.validation])
-    test = TrainingArrays.from_dataset(
+    test = InteractionTensors.from_dataset(
         held_out_pushes, None, *(model.action_channels, model.effect_channels)
     )
     errors = 1000 * final_errors_m(model, test)
@@ -140,7 +142,7 @@ def test_the_shipped_films_reach_their_goals(
     assert errors.quantile(0.95) < p95_mm
     with torch.no_grad():
         told = model.predict(
-            model.encode(test.image), observe_action(test), torch.ones(len(test), 1)
+            model.encode(test.image), condition_on_recorded_action(test), torch.ones(len(test), 1)
         )
     off = (told.effect_mean[:, 0, 2] - test.effect[:, -1, 2])[box].abs().mean()
     assert math.degrees(off) < yaw_deg

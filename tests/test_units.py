@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from affordlib.interactions import (
-    Normaliser,
-    TrainingArrays,
+    InteractionTensors,
+    Scaler,
     open_interactions,
     split_interactions,
 )
@@ -219,9 +219,9 @@ def test_the_shipped_checkpoint_stands_for_its_own_training_only(pushes):
     def found(fold, **change):
         network, training = units.learner(Unit("paper", "push", fold=fold))
         split = split_interactions(pushes.sizes["interaction"], 0, fold)
-        normaliser = Normaliser.fit(TrainingArrays.from_dataset(pushes, split.train))
-        normaliser = replace(normaliser, **change)
-        return units._shipped(network, training, normaliser, pushes, split)
+        scaler = Scaler.fit(InteractionTensors.from_dataset(pushes, split.train))
+        scaler = replace(scaler, **change)
+        return units._shipped(network, training, scaler, pushes, split)
 
     model, told = found(0)
     assert told["checkpoint"] == "push_cnp"

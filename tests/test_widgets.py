@@ -6,7 +6,7 @@ import pytest
 import torch
 from PIL import Image
 
-from affordlib.models.protocol import observe_actions
+from affordlib.models.protocol import condition_on_primitives
 from affordlib.primitives import Push
 from affordlib.show import ConditioningExplorer, PhaseSlider
 from affordlib.world import Cuboid
@@ -46,7 +46,7 @@ def test_a_stop_leaves_the_object_where_the_slider_said(slider):
 @pytest.mark.slow
 def test_what_is_observed_decides_what_is_foreseen(explorer, trained, push):
     alone = explorer.prediction.effect_mean
-    told = observe_actions(trained, [push.primitive])
+    told = condition_on_primitives(trained, [push.primitive])
     t = torch.linspace(0, 1, 101)[None]
     with torch.no_grad():
         plain = trained.predict(trained.encode(torch.tensor(push.image)[None]), told, t)

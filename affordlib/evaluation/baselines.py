@@ -29,13 +29,9 @@ from sklearn.preprocessing import StandardScaler
 from torch import Tensor
 
 from affordlib.evaluation.predictions import about_objects, prediction_record, steps_of
-from affordlib.interactions.batches import (
-    TrainingArrays,
-    believable,
-    observe_action,
-    plane_of,
-    turn,
-)
+from affordlib.geometry import rotate_channels, xy_columns
+from affordlib.interactions.dataset import InteractionTensors, valid_interactions
+from affordlib.interactions.sampling import condition_on_recorded_action
 from affordlib.models.frame import heading, inverse, turn_prediction
 from affordlib.primitives import Grasp
 from affordlib.types import Prediction
@@ -56,9 +52,9 @@ def baseline_predictions(
     queried: np.ndarray,
 ) -> dict[str, Any]:
     """What a baseline, fitted to interactions of `data`, predicts of those `queried` of `other`."""
-    known, kept = believable(data, train_on), believable(other, queried)
-    training = TrainingArrays.from_dataset(data, known, *channels)
-    arrays = TrainingArrays.from_dataset(other, kept, *channels)
+    known, kept = valid_interactions(data, train_on), valid_interactions(other, queried)
+    training = InteractionTensors.from_dataset(data, known, *channels)
+    arrays = InteractionTensors.from_dataset(other, kept, *channels)
     train_features = features(data.isel(interaction=known))
     at = steps_of(arrays)
     mean, std = baseline(
@@ -71,7 +67,7 @@ def logistic_predictions(
     data: xr.Dataset, train_on: np.ndarray, other: xr.Dataset, queried: np.ndarray
 ) -> dict[str, Any]:
     """The probability of a grasp's success, from the object's size alone, and the true heights."""
-    known, kept = believable(data, train_on), believable(other, queried)
+    known, kept = valid_interactions(data, train_on), valid_interactions(other, queried)
     lifted = data["effect"].values[known, -1, 2] > Grasp.success_m
     probability = logistic(data["size"].values[known], lifted, other["size"].values[kept])
     height = other["effect"].values[kept, -1, 2].tolist()
@@ -105,18 +101,20 @@ def features(data: xr.Dataset) -> Tensor:
     )
 
 
-def constant(train: TrainingArrays, test: TrainingArrays, at: Tensor, *_: Tensor) -> Forecast:
+def constant(
+    train: InteractionTensors, test: InteractionTensors, at: Tensor, *_: Tensor
+) -> Forecast:
     """The mean trajectory in the direction of the action; σ is the spread about it."""
     effect = _in_action_frame(train, at)
     mean = effect.mean(dim=0)
     if _has_direction(train):
-        mean[:, plane_of(train.effect_channels)[1]] = 0.0
+        mean[:, xy_columns(train.effect_channels)[1]] = 0.0
     std = (effect - mean).square().mean(dim=0).sqrt()
     return _in_table_frame(test, at, mean.expand(len(test), -1, -1), _floor(std))
 
 
 def nearest(
-    train: TrainingArrays, test: TrainingArrays, at: Tensor, known: Tensor, queried: Tensor
+    train: InteractionTensors, test: InteractionTensors, at: Tensor, known: Tensor, queried: Tensor
 ) -> Forecast:
     """The training trajectory of the most similar object; σ from leaving one out."""
     effect, neighbours = _in_action_frame(train, at), NearestNeighbors(n_neighbors=1).fit(known)
@@ -128,7 +126,7 @@ def nearest(
 
 
 def gaussian_process(
-    train: TrainingArrays, test: TrainingArrays, at: Tensor, known: Tensor, queried: Tensor
+    train: InteractionTensors, test: InteractionTensors, at: Tensor, known: Tensor, queried: Tensor
 ) -> Forecast:
     """One exact Gaussian process per effect channel.
 
@@ -157,20 +155,20 @@ def logistic(size: np.ndarray, success: np.ndarray, queried: np.ndarray) -> np.n
     return regression.fit(size, success).predict_proba(queried)[:, 1]
 
 
-def _has_direction(arrays: TrainingArrays) -> bool:
-    return bool(plane_of(arrays.action_channels) and plane_of(arrays.effect_channels))
+def _has_direction(arrays: InteractionTensors) -> bool:
+    return bool(xy_columns(arrays.action_channels) and xy_columns(arrays.effect_channels))
 
 
-def _in_action_frame(arrays: TrainingArrays, at: Tensor) -> Tensor:
+def _in_action_frame(arrays: InteractionTensors, at: Tensor) -> Tensor:
     """True effects (N, T, C) in the frame of the action."""
     effect, channels = arrays.effect[:, at], (arrays.action_channels, arrays.effect_channels)
     if not _has_direction(arrays):
         return effect
-    back = inverse(heading(observe_action(arrays), *channels))[:, None]
-    return turn(effect, arrays.effect_channels, back, absolute_yaw=False)
+    back = inverse(heading(condition_on_recorded_action(arrays), *channels))[:, None]
+    return rotate_channels(effect, arrays.effect_channels, back, absolute_yaw=False)
 
 
-def _in_table_frame(arrays: TrainingArrays, at: Tensor, mean: Tensor, std: Tensor) -> Forecast:
+def _in_table_frame(arrays: InteractionTensors, at: Tensor, mean: Tensor, std: Tensor) -> Forecast:
     """What was predicted in the frame of the action, in the table's."""
     std = std.expand_as(mean)
     if not _has_direction(arrays):
@@ -178,7 +176,9 @@ def _in_table_frame(arrays: TrainingArrays, at: Tensor, mean: Tensor, std: Tenso
     channels = arrays.action_channels, arrays.effect_channels
     action = arrays.action[:, at]
     prediction = Prediction(action, torch.zeros_like(action), mean, std)
-    prediction = turn_prediction(prediction, heading(observe_action(arrays), *channels), *channels)
+    prediction = turn_prediction(
+        prediction, heading(condition_on_recorded_action(arrays), *channels), *channels
+    )
     return prediction.effect_mean, prediction.effect_std
 
 

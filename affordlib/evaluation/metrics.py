@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from affordlib.interactions.batches import check_numbers
+from affordlib.interactions.dataset import check_numbers
 from affordlib.interactions.recipes import Recipe
 from affordlib.types import check_array
 

@@ -12,8 +12,10 @@ import numpy as np
 import torch
 import xarray as xr
 
-from affordlib.interactions import TrainingArrays
-from affordlib.interactions.batches import believable, observe_action, plane_of
+from affordlib.geometry import xy_columns
+from affordlib.interactions import InteractionTensors
+from affordlib.interactions.dataset import valid_interactions
+from affordlib.interactions.sampling import condition_on_recorded_action
 from affordlib.models.calibration import LEVELS, coverage
 from affordlib.models.ensemble import Ensemble
 from affordlib.models.network import EffectNetwork, gaussian_nll
@@ -26,7 +28,7 @@ CONTACT_M = 0.001
 """From where on an object counts as touched: moved by this much (or turned by as many rad)."""
 
 
-def steps_of(arrays: TrainingArrays) -> torch.Tensor:
+def steps_of(arrays: InteractionTensors) -> torch.Tensor:
     """Sample numbers of the 25 steps, the last of them t = 1."""
     return torch.arange(EVERY, len(arrays.phase), EVERY)
 
@@ -36,10 +38,12 @@ def network_predictions(
     model: EffectNetwork | Ensemble, data: xr.Dataset, interactions: np.ndarray
 ) -> dict[str, Any]:
     """What a network predicts of interactions: see `prediction_record`."""
-    kept = believable(data, interactions)
-    arrays = TrainingArrays.from_dataset(data, kept, model.action_channels, model.effect_channels)
+    kept = valid_interactions(data, interactions)
+    arrays = InteractionTensors.from_dataset(
+        data, kept, model.action_channels, model.effect_channels
+    )
     t = arrays.phases(steps_of(arrays))
-    prediction = model.predict(model.encode(arrays.image), observe_action(arrays), t)
+    prediction = model.predict(model.encode(arrays.image), condition_on_recorded_action(arrays), t)
     return prediction_record(data, kept, arrays, prediction.effect_mean, prediction.effect_std)
 
 
@@ -56,7 +60,7 @@ def about_objects(data: xr.Dataset, kept: np.ndarray) -> dict[str, Any]:
 def prediction_record(
     data: xr.Dataset,
     kept: np.ndarray,
-    arrays: TrainingArrays,
+    arrays: InteractionTensors,
     mean: torch.Tensor,
     std: torch.Tensor,
 ) -> dict[str, Any]:
@@ -66,7 +70,7 @@ def prediction_record(
     `steps_of(arrays)`.
     """
     truth, names = arrays.effect[:, steps_of(arrays)], arrays.effect_channels
-    columns = plane_of(names) or [0]
+    columns = xy_columns(names) or [0]
     error = (mean - truth)[..., columns].norm(dim=-1)
     touched = truth[..., columns].norm(dim=-1) > CONTACT_M
     after = (error * touched).sum(dim=1) / touched.sum(dim=1).clamp_min(1)

@@ -180,7 +180,7 @@ def _generator(recipe: Recipe, index: int, *part: int) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence(recipe.seed, spawn_key=(index, *part)))
 
 
-def draw_scene(recipe: Recipe, index: int) -> tuple[TabletopObject, float, np.random.Generator]:
+def sample_scene(recipe: Recipe, index: int) -> tuple[TabletopObject, float, np.random.Generator]:
     """Object and yaw [rad] of interaction `index`, and the generator to draw its action from."""
     rng = _generator(recipe, index)
     category = category_named(recipe.families[rng.integers(len(recipe.families))])
@@ -188,7 +188,7 @@ def draw_scene(recipe: Recipe, index: int) -> tuple[TabletopObject, float, np.ra
     return obj, float(rng.uniform(-math.pi, math.pi)), rng
 
 
-def draw_place(recipe: Recipe, index: int) -> tuple[float, float]:
+def sample_position(recipe: Recipe, index: int) -> tuple[float, float]:
     """Where on the table the object of interaction `index` lies, (x, y) [m]."""
     if not recipe.anywhere:
         return 0.0, 0.0
@@ -198,12 +198,12 @@ def draw_place(recipe: Recipe, index: int) -> tuple[float, float]:
     return float(x), float(y)
 
 
-def draw_stop(recipe: Recipe, index: int) -> float:
+def sample_stop_phase(recipe: Recipe, index: int) -> float:
     """The phase at which interaction `index` is broken off; 1 if it is not."""
     return float(_generator(recipe, index, 2).uniform(0.05, 1.0)) if recipe.partial else 1.0
 
 
-def draw_world(recipe: Recipe, index: int, obj: TabletopObject) -> WorldConfig:
+def sample_world(recipe: Recipe, index: int, obj: TabletopObject) -> WorldConfig:
     """The world in which interaction `index` takes place."""
     if recipe.variation is None:
         return recipe.world
@@ -242,9 +242,9 @@ def interact(
 
     stop_phase: where to break it off, if not where the recipe says.
     """
-    obj, yaw, rng = draw_scene(recipe, index)
+    obj, yaw, rng = sample_scene(recipe, index)
     action = _draw_action(recipe, obj, yaw, rng)
-    config = draw_world(recipe, index, obj)
-    world.place(obj, draw_place(recipe, index), yaw, tool=action.tool, config=config)
-    stop = draw_stop(recipe, index) if stop_phase is None else stop_phase
+    config = sample_world(recipe, index, obj)
+    world.place(obj, sample_position(recipe, index), yaw, tool=action.tool, config=config)
+    stop = sample_stop_phase(recipe, index) if stop_phase is None else stop_phase
     return obj, world.execute_primitive(action, stop, record_unreachable=True)

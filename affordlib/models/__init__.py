@@ -6,7 +6,7 @@ from affordlib.models.cnp import AffordanceCNP, CNPConfig
 from affordlib.models.ensemble import Ensemble
 from affordlib.models.film import FiLMConfig, FiLMNetwork
 from affordlib.models.network import EffectNetwork, NetworkConfig, OutOfRangeWarning
-from affordlib.models.protocol import EffectModel, observe_actions
+from affordlib.models.protocol import EffectModel, condition_on_primitives
 from affordlib.models.training import TrainingConfig, train, train_literal, train_model
 
 __all__ = [
@@ -22,10 +22,10 @@ __all__ = [
     "TrainingConfig",
     "build",
     "calibration_rows",
+    "condition_on_primitives",
     "coverage",
     "fit_temperature",
     "load_checkpoint",
-    "observe_actions",
     "save_checkpoint",
     "train",
     "train_literal",

@@ -20,7 +20,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from affordlib import checked
-from affordlib.interactions.batches import Normaliser
+from affordlib.interactions.dataset import Scaler
 from affordlib.models.film import FiLMConfig, FiLMNetwork, dense, split_outputs, waves
 from affordlib.models.network import masked_mean, with_time
 from affordlib.types import Observations
@@ -62,8 +62,8 @@ class MeanCourse(nn.Module):
 class AnchoredNetwork(FiLMNetwork):
     """Foresees a course from any observed part of it; satisfies `EffectModel`."""
 
-    def __init__(self, config: AnchoredConfig, normaliser: Normaliser) -> None:
-        super().__init__(config, normaliser)
+    def __init__(self, config: AnchoredConfig, scaler: Scaler) -> None:
+        super().__init__(config, scaler)
         c, w = config, config.width
         n_e = len(c.effect_channels)
         self.course = MeanCourse(c.course_steps, n_e)

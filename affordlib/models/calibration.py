@@ -15,7 +15,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from affordlib.interactions.batches import TrainingArrays, observe_action, plane_of
+from affordlib.geometry import xy_columns
+from affordlib.interactions.dataset import InteractionTensors
+from affordlib.interactions.sampling import condition_on_recorded_action
 from affordlib.models.ensemble import Ensemble
 from affordlib.models.network import EffectNetwork, gaussian_nll
 from affordlib.types import check_within
@@ -40,7 +42,7 @@ def coverage(
 
 @torch.no_grad()
 def effects_at(
-    model: EffectNetwork | Ensemble, arrays: TrainingArrays, phases: Sequence[float]
+    model: EffectNetwork | Ensemble, arrays: InteractionTensors, phases: Sequence[float]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Truth, mean and σ of the effects, (N, T, C) each, given image and action."""
     phases = [check_within("phases", phase, 0.0, 1.0) for phase in phases]
@@ -48,13 +50,13 @@ def effects_at(
         raise ValueError("phases must hold at least one phase in [0, 1], got none")
     at = (torch.tensor(phases) * (len(arrays.phase) - 1)).round().long()
     t_target = arrays.phases(at)
-    told = model.predict(model.encode(arrays.image), observe_action(arrays), t_target)
+    told = model.predict(model.encode(arrays.image), condition_on_recorded_action(arrays), t_target)
     return arrays.effect[:, at], told.effect_mean, told.effect_std
 
 
 def fit_temperature(
     model: EffectNetwork | Ensemble,
-    validation: TrainingArrays,
+    validation: InteractionTensors,
     phases: Sequence[float] = AFTER_CONTACT,
 ) -> tuple[float, ...]:
     """Set, and return, the temperatures (C_e,) under which validation data are likeliest.
@@ -64,7 +66,7 @@ def fit_temperature(
     model.temperature = (1.0,) * len(model.effect_channels)
     truth, mean, std = effects_at(model, validation, phases)
     squared = ((truth - mean) / std).square().mean(dim=(0, 1))
-    plane = plane_of(model.effect_channels)
+    plane = xy_columns(model.effect_channels)
     squared[plane] = squared[plane].mean()
     model.temperature = tuple(squared.clamp_min(1e-6).sqrt().tolist())
     return model.temperature
@@ -72,7 +74,7 @@ def fit_temperature(
 
 def calibration_rows(
     model: EffectNetwork | Ensemble,
-    arrays: TrainingArrays,
+    arrays: InteractionTensors,
     /,
     phases: Sequence[float] = AFTER_CONTACT,
     **columns: Any,

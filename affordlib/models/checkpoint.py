@@ -19,7 +19,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
-from affordlib.interactions.batches import Normaliser
+from affordlib.interactions.dataset import Scaler
 from affordlib.models.anchored import AnchoredConfig, AnchoredNetwork
 from affordlib.models.cnp import AffordanceCNP, CNPConfig
 from affordlib.models.film import FiLMConfig, FiLMNetwork
@@ -40,11 +40,11 @@ NETWORKS: dict[str, tuple[type[EffectNetwork], type[NetworkConfig]]] = {
 """By the name that checkpoints have for them; other packages may add theirs."""
 
 
-def build(config: NetworkConfig, normaliser: Normaliser) -> EffectNetwork:
+def build(config: NetworkConfig, scaler: Scaler) -> EffectNetwork:
     """An untrained network of the architecture that the configuration belongs to."""
     for network, config_class in NETWORKS.values():
         if type(config) is config_class:
-            return network(config, normaliser)
+            return network(config, scaler)
     known = [config_class.__name__ for _, config_class in NETWORKS.values()]
     raise TypeError(f"config must be one of {known}, got {config!r}")
 
@@ -66,7 +66,7 @@ def save_checkpoint(model: EffectNetwork, path: str | Path, about: dict[str, Any
         "model": kind,
         "config": asdict(model.config)
         | {"sigma_floor": model.sigma_floor, "temperature": model.temperature},
-        "normaliser": asdict(model.normaliser),
+        "normaliser": asdict(model.scaler),
         "about": about,
     }
     return write_weights(path, model.state_dict(), description)
@@ -112,7 +112,7 @@ def load_checkpoint(name_or_path: str | Path) -> tuple[EffectNetwork, dict[str, 
         kind, config_class = NETWORKS[description["model"]]
         model = kind(
             config_class(**_with_tuples(description["config"])),
-            Normaliser(**_with_tuples(description["normaliser"])),
+            Scaler(**_with_tuples(description["normaliser"])),
         )
         about, own = description["about"], model.state_dict()
         if other := [k for k in own if k not in tensors or tensors[k].dtype != own[k].dtype]:

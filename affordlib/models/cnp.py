@@ -21,7 +21,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from affordlib import checked
-from affordlib.interactions.batches import Normaliser
+from affordlib.interactions.dataset import Scaler
 from affordlib.models.network import (
     EffectNetwork,
     NetworkConfig,
@@ -72,8 +72,8 @@ def image_encoder() -> nn.Sequential:
 class AffordanceCNP(EffectNetwork):
     """Relates object image, action and effect; satisfies `EffectModel`."""
 
-    def __init__(self, config: CNPConfig, normaliser: Normaliser) -> None:
-        super().__init__(config, normaliser)
+    def __init__(self, config: CNPConfig, scaler: Scaler) -> None:
+        super().__init__(config, scaler)
         n_a, n_e = len(config.action_channels), len(config.effect_channels)
         self.image_encoder = image_encoder()
         self.action_encoder = _dense((n_a + 1, *ENCODER_WIDTHS), activate_last=True)

@@ -22,7 +22,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from affordlib import checked
-from affordlib.interactions.batches import Normaliser
+from affordlib.interactions.dataset import Scaler
 from affordlib.models.network import (
     EffectNetwork,
     NetworkConfig,
@@ -137,8 +137,8 @@ class CircularHarmonics(nn.Module):
 class FiLMNetwork(EffectNetwork):
     """Relates object image, action and effect; satisfies `EffectModel`."""
 
-    def __init__(self, config: FiLMConfig, normaliser: Normaliser) -> None:
-        super().__init__(config, normaliser)
+    def __init__(self, config: FiLMConfig, scaler: Scaler) -> None:
+        super().__init__(config, scaler)
         c, w = config, config.width
         n_a, n_e = len(c.action_channels), len(c.effect_channels)
         self.harmonics = CircularHarmonics(c.rings, c.orders)

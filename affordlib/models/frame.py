@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from affordlib.interactions.batches import plane_of, turn
+from affordlib.geometry import rotate_channels, xy_columns
 from affordlib.types import Observations, Prediction
 
 FRAMES = ("table", "push")
@@ -35,8 +35,8 @@ def heading(
     """
     o = observations
     action, effect = (
-        o.action[..., plane_of(action_channels)],
-        o.effect[..., plane_of(effect_channels)],
+        o.action[..., xy_columns(action_channels)],
+        o.effect[..., xy_columns(effect_channels)],
     )
     acts = o.action_mask & (o.weight > 0)[:, None]
     shifts = o.effect_mask & (o.weight < 1)[:, None]
@@ -88,8 +88,8 @@ def turn_observations(
     h = heading[:, None]
     return replace(
         observations,
-        action=turn(observations.action, action_channels, h, absolute_yaw=True),
-        effect=turn(observations.effect, effect_channels, h, absolute_yaw=False),
+        action=rotate_channels(observations.action, action_channels, h, absolute_yaw=True),
+        effect=rotate_channels(observations.effect, effect_channels, h, absolute_yaw=False),
     )
 
 
@@ -103,9 +103,9 @@ def turn_prediction(
     """
     p, h = prediction, heading[:, None]
     return Prediction(
-        turn(p.action_mean, action_channels, h, absolute_yaw=True),
+        rotate_channels(p.action_mean, action_channels, h, absolute_yaw=True),
         _turn_std(p.action_std, action_channels, h),
-        turn(p.effect_mean, effect_channels, h, absolute_yaw=False),
+        rotate_channels(p.effect_mean, effect_channels, h, absolute_yaw=False),
         _turn_std(p.effect_std, effect_channels, h),
     )
 
@@ -113,7 +113,7 @@ def turn_prediction(
 def _turn_std(std: Tensor, channels: Channels, heading: Tensor) -> Tensor:
     cos2, sin2 = heading.square().unbind(-1)
     columns = list(std.unbind(-1))
-    i, j = plane_of(channels)
+    i, j = xy_columns(channels)
     u, v = columns[i].square(), columns[j].square()
     columns[i], columns[j] = (cos2 * u + sin2 * v).sqrt(), (sin2 * u + cos2 * v).sqrt()
     return torch.stack(columns, dim=-1)

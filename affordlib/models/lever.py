@@ -20,19 +20,22 @@ import xarray as xr
 from jaxtyping import Float
 from torch import Tensor
 
-from affordlib.interactions import Normaliser, Split
-from affordlib.interactions.batches import Batch, TrainingArrays, symmetric_copies
-from affordlib.interactions.lever import (
-    ACTION_CHANNELS,
-    AHEAD,
+from affordlib.interactions import Scaler, Split
+from affordlib.interactions.dataset import InteractionTensors, augment_by_symmetry
+from affordlib.interactions.lever_up import (
+    LEVER_ACTION_CHANNELS,
     MIRRORED,
+    N_OBSERVED,
+    N_PREDICTED,
     POSE_CHANNELS,
-    SEEN,
-    draw_beginnings,
-    draw_windows,
-    lever_arrays,
+    lever_up_tensors,
     n_windows,
-    poses_seen,
+)
+from affordlib.interactions.sampling import (
+    Batch,
+    condition_on_poses,
+    sample_from_start,
+    sample_windows,
 )
 from affordlib.models.anchored import AnchoredConfig
 from affordlib.models.checkpoint import build
@@ -46,16 +49,16 @@ PROTOCOLS = ("window", "first_step", "image_only")
 TRAINED_FOR = ("all", "window", "first_step")
 """`first_step` stands for `image_only` as well, see above."""
 
-_CHANNELS = {"action_channels": ACTION_CHANNELS, "effect_channels": POSE_CHANNELS}
+_CHANNELS = {"action_channels": LEVER_ACTION_CHANNELS, "effect_channels": POSE_CHANNELS}
 TRAINING = TrainingConfig(
-    steps=1000, n_targets=AHEAD, obs_max=SEEN, patience=99, beta=0.5, weight_decay=0.1,
+    steps=1000, n_targets=N_PREDICTED, obs_max=N_OBSERVED, patience=99, beta=0.5, weight_decay=0.1,
     final_sigma_floor=0.005, ema=0.99, augment=False, validate_every=125,
 )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class LeverModel:
-    """A network, how it is trained, and which part of the image it sees (see `lever_arrays`)."""
+    """A network, how it is trained, and which part of the image it sees (`lever_up_tensors`)."""
 
     network: NetworkConfig
     training: TrainingConfig = TRAINING
@@ -81,7 +84,7 @@ the first and the last are chosen by validation error (`evaluation/lever_tuning.
 @torch.no_grad()
 def foresee(
     model: EffectNetwork,
-    arrays: TrainingArrays,
+    arrays: InteractionTensors,
     protocol: str,
     start: int = 0,
     features: Tensor | None = None,
@@ -93,10 +96,10 @@ def foresee(
     if protocol not in PROTOCOLS:
         raise ValueError(f"protocol must be one of {PROTOCOLS}, got {protocol!r}")
     n, last = len(arrays), len(arrays.phase)
-    n_seen = {"window": SEEN, "first_step": 1, "image_only": 0}[protocol]
-    first = start + SEEN if protocol == "window" else 1
-    steps = torch.arange(first, first + AHEAD if protocol == "window" else last)
-    seen = poses_seen(arrays, torch.full((n,), start), n_seen)
+    n_seen = {"window": N_OBSERVED, "first_step": 1, "image_only": 0}[protocol]
+    first = start + N_OBSERVED if protocol == "window" else 1
+    steps = torch.arange(first, first + N_PREDICTED if protocol == "window" else last)
+    seen = condition_on_poses(arrays, torch.full((n,), start), n_seen)
     t_target = arrays.phases(steps)
     features = model.encode(arrays.image) if features is None else features
     told = model.predict(features, seen, t_target)
@@ -109,7 +112,7 @@ def errors_m(told: Prediction, truth: Tensor) -> Float[Tensor, "n t"]:
 
 
 @torch.no_grad()
-def window_errors_m(model: EffectNetwork, arrays: TrainingArrays) -> Float[Tensor, "n w t"]:
+def window_errors_m(model: EffectNetwork, arrays: InteractionTensors) -> Float[Tensor, "n w t"]:
     """Errors [m] of all windows of all trajectories, 1 to 5 steps ahead."""
     features = model.encode(arrays.image)
     found = [foresee(model, arrays, "window", s, features) for s in range(n_windows(arrays))]
@@ -117,32 +120,36 @@ def window_errors_m(model: EffectNetwork, arrays: TrainingArrays) -> Float[Tenso
 
 
 def beginning_errors_m(
-    model: EffectNetwork, arrays: TrainingArrays, protocol: str = "image_only"
+    model: EffectNetwork, arrays: InteractionTensors, protocol: str = "image_only"
 ) -> Float[Tensor, "n t"]:
     """Errors [m] at all steps after the first."""
     return errors_m(*foresee(model, arrays, protocol))
 
 
-def _all_errors_m(model: EffectNetwork, arrays: TrainingArrays) -> Tensor:
+def _all_errors_m(model: EffectNetwork, arrays: InteractionTensors) -> Tensor:
     """Window and beginning weighed about equally: beginnings err about three times as far."""
     window, beginning = window_errors_m(model, arrays), beginning_errors_m(model, arrays)
     return window.mean(dim=(1, 2)) + beginning.mean(dim=1) / 3
 
 
 def _draw_all(
-    arrays: TrainingArrays, rows: Tensor, n_targets: int, obs_max: int, generator: torch.Generator
+    arrays: InteractionTensors,
+    rows: Tensor,
+    n_targets: int,
+    obs_max: int,
+    generator: torch.Generator,
 ) -> Batch:
-    draw = (draw_windows, draw_beginnings)[int(torch.randint(0, 2, (1,), generator=generator))]
+    draw = (sample_windows, sample_from_start)[int(torch.randint(0, 2, (1,), generator=generator))]
     return draw(arrays, rows, n_targets, obs_max, generator)
 
 
-_DRAWS = {"all": _draw_all, "window": draw_windows, "first_step": draw_beginnings}
+_DRAWS = {"all": _draw_all, "window": sample_windows, "first_step": sample_from_start}
 _SCORES = {"all": _all_errors_m, "window": window_errors_m, "first_step": beginning_errors_m}
 
 
-def lever_training(lever: LeverModel, data: xr.Dataset, split: Split) -> TrainingArrays:
+def lever_training(lever: LeverModel, data: xr.Dataset, split: Split) -> InteractionTensors:
     """What a network learns from: a split's training part and its mirror image."""
-    return symmetric_copies(lever_arrays(data, split.train, lever.view), MIRRORED)
+    return augment_by_symmetry(lever_up_tensors(data, split.train, lever.view), MIRRORED)
 
 
 def train_lever_model(
@@ -160,14 +167,14 @@ def train_lever_model(
     if trained_for not in TRAINED_FOR:
         raise ValueError(f"trained_for must be one of {TRAINED_FOR}, got {trained_for!r}")
     training = lever_training(lever, data, split)
-    validation = lever_arrays(data, split.validation, lever.view)
+    validation = lever_up_tensors(data, split.validation, lever.view)
     return fit_lever_model(lever, training, validation, trained_for, progress, checkpoint)
 
 
 def fit_lever_model(
     lever: LeverModel,
-    training: TrainingArrays,
-    validation: TrainingArrays,
+    training: InteractionTensors,
+    validation: InteractionTensors,
     trained_for: str = "all",
     progress: bool = True,
     checkpoint: Path | None = None,
@@ -181,7 +188,7 @@ def fit_lever_model(
     for name in ("course_steps", "steps"):
         if hasattr(network, name):
             network = replace(network, **{name: steps})
-    model = build(network, Normaliser.fit(training))
+    model = build(network, Scaler.fit(training))
     if hasattr(model, "fit_course"):
         model.fit_course(training.effect)
     history = train(

@@ -20,7 +20,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from affordlib import checked
-from affordlib.interactions.batches import Normaliser, TrainingArrays, observe_action, turn
+from affordlib.geometry import rotate_channels
+from affordlib.interactions.dataset import InteractionTensors, Scaler
+from affordlib.interactions.sampling import condition_on_recorded_action
 from affordlib.models.anchored import MeanCourse
 from affordlib.models.film import CircularHarmonics, dense, waves
 from affordlib.models.frame import heading, inverse
@@ -78,8 +80,8 @@ class LSTMNetwork(EffectNetwork):
     Between two steps it is linear, so that any phase can be asked for, with gradients.
     """
 
-    def __init__(self, config: LSTMConfig, normaliser: Normaliser) -> None:
-        super().__init__(config, normaliser)
+    def __init__(self, config: LSTMConfig, scaler: Scaler) -> None:
+        super().__init__(config, scaler)
         c, w = config, config.width
         n_a, n_e = len(c.action_channels), len(c.effect_channels)
         self.course = MeanCourse(c.steps, n_e)
@@ -186,12 +188,12 @@ def _between(values: Float[Tensor, "b n c"], at: Float[Tensor, "b t"]) -> Float[
     return (1 - share) * pick(below) + share * pick(below + 1)
 
 
-def courses(model: LSTMNetwork, arrays: TrainingArrays) -> Tensor:
+def courses(model: LSTMNetwork, arrays: InteractionTensors) -> Tensor:
     """Effects (2N, steps + 1, C) and their mirror images, in the frame and at the steps of it."""
-    both = arrays.joined(arrays.turned(0, mirror=True))
+    both = arrays.joined(arrays.rotated_and_mirrored(0, mirror=True))
     at = torch.linspace(0, len(both.phase) - 1, model.config.steps + 1).round().long()
     if model.config.frame == "table":
         return both.effect[:, at]
     channels = both.action_channels, both.effect_channels
-    back = inverse(heading(observe_action(both), *channels))[:, None]
-    return turn(both.effect[:, at], channels[1], back, absolute_yaw=False)
+    back = inverse(heading(condition_on_recorded_action(both), *channels))[:, None]
+    return rotate_channels(both.effect[:, at], channels[1], back, absolute_yaw=False)

@@ -12,7 +12,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from affordlib import checked
-from affordlib.interactions.batches import Normaliser, plane_of, touches_edge, turn
+from affordlib.geometry import rotate_channels, xy_columns
+from affordlib.interactions.dataset import Scaler, touches_border
 from affordlib.models.frame import (
     FRAMES,
     heading,
@@ -55,7 +56,7 @@ class NetworkConfig:
             channels = tuple(getattr(self, name))
             if not channels:
                 raise ValueError(f"{name} must name at least one channel, got none")
-            if self.frame == "push" and not plane_of(channels):
+            if self.frame == "push" and not xy_columns(channels):
                 raise ValueError(f'{name} must name x and y for frame="push", got {channels}')
             object.__setattr__(self, name, channels)
         for size in fields(self):
@@ -76,25 +77,25 @@ class EffectNetwork(nn.Module, ABC):
     """A network that satisfies `EffectModel`.
 
     Inputs and outputs are in metres and radians, in the frame of the table; scaling by the
-    normaliser and turning into the network's frame happen inside. In the frame of the push an
+    scaler and turning into the network's frame happen inside. In the frame of the push an
     encoded image is what can be read of it before the direction is known.
     """
 
     @checked
-    def __init__(self, config: NetworkConfig, normaliser: Normaliser) -> None:
+    def __init__(self, config: NetworkConfig, scaler: Scaler) -> None:
         super().__init__()
-        self.config, self.normaliser = config, normaliser
+        self.config, self.scaler = config, scaler
         self.action_channels = config.action_channels
         self.effect_channels = config.effect_channels
         self.sigma_floor, self.temperature = config.sigma_floor, config.temperature
         for kind in ("action", "effect"):
             width = len(getattr(config, f"{kind}_channels"))
-            if len(getattr(normaliser, f"{kind}_scale")) != width:
+            if len(getattr(scaler, f"{kind}_scale")) != width:
                 raise ValueError(
-                    f"normaliser {kind}_scale must have {width} channels as the config does"
+                    f"scaler {kind}_scale must have {width} channels as the config does"
                 )
         for name in ("action_scale", "effect_scale", "image_mean", "image_std"):
-            values = torch.tensor(getattr(normaliser, name), dtype=torch.float32)
+            values = torch.tensor(getattr(scaler, name), dtype=torch.float32)
             self.register_buffer(name, values, persistent=False)
 
     @abstractmethod
@@ -200,8 +201,8 @@ class EffectNetwork(nn.Module, ABC):
         mu_a, sigma_a, mu_e, sigma_e = self(image, observations, t_target)
         if self.config.frame == "push":
             back = inverse(heading(observations, *self._channels))[:, None]
-            action = turn(action, self.action_channels, back, absolute_yaw=True)
-            effect = turn(effect, self.effect_channels, back, absolute_yaw=False)
+            action = rotate_channels(action, self.action_channels, back, absolute_yaw=True)
+            effect = rotate_channels(effect, self.effect_channels, back, absolute_yaw=False)
         nll_a = gaussian_nll(action / self.action_scale, mu_a, sigma_a)
         nll_e = gaussian_nll(effect / self.effect_scale, mu_e, sigma_e)
         if beta:
@@ -210,11 +211,11 @@ class EffectNetwork(nn.Module, ABC):
         return (nll_a.mean() + nll_e.mean()) / 2
 
     def _check_image(self, image: Tensor) -> None:
-        n, mask = self.normaliser, image[:, 1]
+        n, mask = self.scaler, image[:, 1]
         if n.mask_share is None:
             return
         low, high = n.mask_share
-        share, at_edge = mask.mean(dim=(1, 2)), touches_edge(mask)
+        share, at_edge = mask.mean(dim=(1, 2)), touches_border(mask)
         strange = ~((share > low / 2) & (share < 1.5 * high))
         if strange.any():
             raise ValueError(
@@ -238,7 +239,7 @@ class EffectNetwork(nn.Module, ABC):
             )
 
     def _check_action(self, o: Observations) -> None:
-        n, plane = self.normaliser, plane_of(self.action_channels)
+        n, plane = self.scaler, xy_columns(self.action_channels)
         if n.start_radius_m is None or not plane:
             return
         radius = o.action.detach()[..., plane].norm(dim=-1)
@@ -256,7 +257,7 @@ class EffectNetwork(nn.Module, ABC):
                 )
 
     def _check_effect(self, o: Observations) -> None:
-        n, plane = self.normaliser, plane_of(self.effect_channels)
+        n, plane = self.scaler, xy_columns(self.effect_channels)
         if n.effect_radius_m is None or not plane or not o.effect_mask.any():
             return
         low, high = n.effect_radius_m

@@ -33,7 +33,7 @@ class EffectModel(Protocol):
         ...
 
 
-def observe_actions(model: EffectModel, actions: Sequence[Primitive]) -> Observations:
+def condition_on_primitives(model: EffectModel, actions: Sequence[Primitive]) -> Observations:
     """Each commanded action at t = 0 and t = 1, and no effect: B = len(actions)."""
     if not actions:
         raise ValueError("actions must hold at least one action, got none")

@@ -19,26 +19,29 @@ import torch
 import xarray as xr
 from tqdm.auto import tqdm
 
-from affordlib.interactions.batches import (
-    Batch,
-    Normaliser,
+from affordlib.geometry import xy_columns
+from affordlib.interactions.dataset import (
+    InteractionTensors,
+    Scaler,
     Split,
     Symmetry,
-    TrainingArrays,
-    observe_action,
-    plane_of,
-    sample_batch,
-    symmetric_copies,
+    augment_by_symmetry,
+)
+from affordlib.interactions.sampling import (
+    Batch,
+    condition_on_recorded_action,
+    sample_literal,
+    sample_mixed,
 )
 from affordlib.models.calibration import fit_temperature
 from affordlib.models.checkpoint import build, load_state, save_state
 from affordlib.models.cnp import CNPConfig
 from affordlib.models.lstm import LSTMNetwork, courses
 from affordlib.models.network import EffectNetwork, NetworkConfig
-from affordlib.types import Observations, check_count, check_field, check_within
+from affordlib.types import check_count, check_field, check_within
 
-Draw = Callable[[TrainingArrays, torch.Tensor, int, int, torch.Generator], Batch]
-Score = Callable[["EffectNetwork", TrainingArrays], torch.Tensor]
+Draw = Callable[[InteractionTensors, torch.Tensor, int, int, torch.Generator], Batch]
+Score = Callable[["EffectNetwork", InteractionTensors], torch.Tensor]
 _AUTO = "cuda" if torch.cuda.is_available() else "cpu"
 
 
@@ -118,7 +121,7 @@ def device_named(name: str) -> torch.device:
 
 
 @torch.no_grad()
-def final_errors_m(model: EffectNetwork, arrays: TrainingArrays) -> torch.Tensor:
+def final_errors_m(model: EffectNetwork, arrays: InteractionTensors) -> torch.Tensor:
     """Distance (N,) [m] between predicted and true (x, y) at t = 1, given image and action.
 
     Where x and y are not predicted, that of what is (z [m], yaw [rad]).
@@ -126,9 +129,11 @@ def final_errors_m(model: EffectNetwork, arrays: TrainingArrays) -> torch.Tensor
     was_training = model.training
     model.eval()
     t_target = torch.ones(len(arrays), 1)
-    prediction = model.predict(model.encode(arrays.image), observe_action(arrays), t_target)
+    prediction = model.predict(
+        model.encode(arrays.image), condition_on_recorded_action(arrays), t_target
+    )
     model.train(was_training)
-    plane = plane_of(arrays.effect_channels) or list(range(len(arrays.effect_channels)))
+    plane = xy_columns(arrays.effect_channels) or list(range(len(arrays.effect_channels)))
     return (prediction.effect_mean[:, 0, plane] - arrays.effect[:, -1, plane]).norm(dim=-1)
 
 
@@ -141,11 +146,12 @@ def _to(batch: Any, device: torch.device) -> Any:
     return replace(batch, **moved)
 
 
-def _augmented(arrays: TrainingArrays) -> TrainingArrays:
+def _augmented(arrays: InteractionTensors) -> InteractionTensors:
     """The interactions turned and mirrored in all eight ways, in turn."""
     eighths = torch.arange(len(arrays)).tensor_split(8)
     parts = [
-        arrays.select(rows).turned(k // 2, mirror=k % 2 == 1) for k, rows in enumerate(eighths)
+        arrays.select(rows).rotated_and_mirrored(k // 2, mirror=k % 2 == 1)
+        for k, rows in enumerate(eighths)
     ]
     return parts[0].joined(*parts[1:])
 
@@ -197,17 +203,17 @@ class _Run:
 
 def train(
     model: EffectNetwork,
-    training: TrainingArrays,
-    validation: TrainingArrays,
+    training: InteractionTensors,
+    validation: InteractionTensors,
     config: TrainingConfig | None = None,
     progress: bool = True,
     checkpoint: str | Path | None = None,
-    draw: Draw = sample_batch,
+    draw: Draw = sample_mixed,
     score: Score = final_errors_m,
 ) -> list[TrainingRecord]:
     """Train a model in place and return its history; it ends with the best validated weights.
 
-    draw: makes a batch of context and targets, as `sample_batch`. Early stopping watches the mean
+    draw: makes a batch of context and targets, as `sample_mixed`. Early stopping watches the mean
     of score, by default of the final position errors, on the validation interactions.
     checkpoint: a file, written at every validation, from which the same call continues; on one
     machine's processor to the same bits as without the break.
@@ -277,7 +283,7 @@ def train(
     return run.history
 
 
-def _fingerprint(arrays: TrainingArrays) -> list[float]:
+def _fingerprint(arrays: InteractionTensors) -> list[float]:
     of = (arrays.image, arrays.action, arrays.effect)
     return [len(arrays), *(float(values.double().sum()) for values in of)]
 
@@ -299,38 +305,14 @@ def batch_loss(model: EffectNetwork, batch: Batch, beta: float = 0.0) -> torch.T
     return model.loss(b.image, b.observations, b.t_target, b.action, b.effect, beta)
 
 
-def literal_draw(arrays: TrainingArrays, obs_max: int, generator: torch.Generator) -> Batch:
-    """The paper's draw: one trajectory, k observations, k uniform in 1 … obs_max, one target.
-
-    Action and effect are observed at the same times; w₁ is 1, 0 or uniform between, one in three.
-    """
-
-    def draw(high, n=1):
-        return torch.randint(high, (n,), generator=generator)
-
-    row, last = int(draw(len(arrays))), len(arrays.phase)
-    at, target = draw(last, 1 + int(draw(obs_max))), draw(last)
-    kind, weight = int(draw(3)), torch.rand(1, generator=generator)
-    t, weight = arrays.phase[at][None], weight if kind == 2 else torch.tensor([float(kind)])
-    action, effect = arrays.action[row, at][None], arrays.effect[row, at][None]
-    observations = Observations.of(arrays, (t, action), (t, effect), weight)
-    return Batch(
-        arrays.image[row][None],
-        observations,
-        arrays.phase[target][None],
-        arrays.action[row, target][None],
-        arrays.effect[row, target][None],
-    )
-
-
 def train_literal(
     model: EffectNetwork,
-    training: TrainingArrays,
+    training: InteractionTensors,
     iterations: int = 1_000_000,
     obs_max: int = 10,
     learning_rate: float = 1e-4,
     seed: int = 0,
-    validation: TrainingArrays | None = None,
+    validation: InteractionTensors | None = None,
     validate_every: int = 1000,
     patience: int = 20,
 ) -> list[float]:
@@ -350,7 +332,7 @@ def train_literal(
     losses, best, waited = [], math.inf, 0
     state = model.state_dict()
     for number in range(1, iterations + 1):
-        loss = batch_loss(model, literal_draw(training, obs_max, generator))
+        loss = batch_loss(model, sample_literal(training, obs_max, generator))
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
@@ -375,21 +357,21 @@ def train_model(
     progress: bool = True,
     symmetries: tuple[Symmetry, ...] = (),
     checkpoint: str | Path | None = None,
-    draw: Draw = sample_batch,
+    draw: Draw = sample_mixed,
 ) -> tuple[EffectNetwork, list[TrainingRecord]]:
     """A network (default: the paper's), trained on a split's training part.
 
-    Its validation part stops the training and calibrates σ. symmetries: see `symmetric_copies`;
+    Its validation part stops the training and calibrates σ. symmetries: see `augment_by_symmetry`;
     checkpoint, draw: see `train`.
     """
     model_config = model_config or CNPConfig()
     channels = model_config.action_channels, model_config.effect_channels
-    training = TrainingArrays.from_dataset(data, split.train, *channels)
-    validation = TrainingArrays.from_dataset(data, split.validation, *channels)
+    training = InteractionTensors.from_dataset(data, split.train, *channels)
+    validation = InteractionTensors.from_dataset(data, split.validation, *channels)
     if symmetries:
-        training = symmetric_copies(training, symmetries)
+        training = augment_by_symmetry(training, symmetries)
     torch.manual_seed(config.seed)
-    model = build(model_config, Normaliser.fit(training))
+    model = build(model_config, Scaler.fit(training))
     if isinstance(model, LSTMNetwork):
         model.fit_course(courses(model, training))
     history = train(model, training, validation, config, progress, checkpoint, draw)

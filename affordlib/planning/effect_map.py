@@ -19,7 +19,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from affordlib.models.protocol import EffectModel, observe_actions
+from affordlib.models.protocol import EffectModel, condition_on_primitives
 from affordlib.perception import radius_m
 from affordlib.primitives import Drag, Push
 from affordlib.types import IMAGE_CHANNELS, IMAGE_PIXELS, check_array, check_count
@@ -183,7 +183,7 @@ def _asked(
 ) -> tuple[Tensor, Tensor]:
     """Effects and σ (n, T, 3), ahead, left and turn, of actions in n directions."""
     actions = [kind.towards(float(angle)) for angle in direction_rad]
-    told = model.predict(features, observe_actions(model, actions), t_target)
+    told = model.predict(features, condition_on_primitives(model, actions), t_target)
     columns = plane(model)
     angle = torch.as_tensor(direction_rad, dtype=torch.float64)[:, None]
     c, s = angle.cos(), angle.sin()

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from affordlib.models.network import OutOfRangeWarning
-from affordlib.models.protocol import EffectModel, observe_actions, observe_final_effect
+from affordlib.models.protocol import EffectModel, condition_on_primitives, observe_final_effect
 from affordlib.planning.effect_map import EffectMap, plane
 from affordlib.planning.problem import PlanningProblem
 from affordlib.planning.rollout import PATH_SAMPLES
@@ -95,7 +95,7 @@ def _effect_radius_m(effects: EffectMap) -> float:
     """Mean length [m] of the effects of full actions on this object."""
     model, towards = effects.model, effects.kind.towards
     actions = [towards(angle) for angle in np.arange(12) * (math.pi / 6)]
-    observed = observe_actions(model, actions)
+    observed = condition_on_primitives(model, actions)
     prediction = model.predict(effects.features, observed, torch.ones(12, 1))
     return float(prediction.effect_mean[:, 0, plane(model)].norm(dim=-1).mean())
 
@@ -125,7 +125,9 @@ def plan_gradient(
     columns = plane(model)
     a_columns = [model.action_channels.index(name) for name in ("x", "y")]
     with torch.no_grad():  # a model of other actions refuses one
-        model.predict(features, observe_actions(model, [kind.towards(0.0)]), torch.ones(1, 1))
+        model.predict(
+            features, condition_on_primitives(model, [kind.towards(0.0)]), torch.ones(1, 1)
+        )
     generator = np.random.default_rng(check_count("seed", seed, least=0))
     xy, target = np.asarray(problem.start_xy_m), np.asarray(goal.xy_m)
     steps: list[Step] = []

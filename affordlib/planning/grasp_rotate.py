@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from affordlib.models.frame import turn_image
-from affordlib.models.protocol import EffectModel, observe_actions
+from affordlib.models.protocol import EffectModel, condition_on_primitives
 from affordlib.perception import adapt_to_object
 from affordlib.planning.effect_map import checked_image
 from affordlib.primitives import Grasp, Rotate, wrap_angle
@@ -79,7 +79,7 @@ def predict_trajectories(
     turn = torch.tensor([[math.cos(yaw), -math.sin(yaw)] for yaw in grip_yaws])
     seen = model.encode(turn_image(checked_image(image), turn))
     t = torch.linspace(0, 1, SAMPLES).expand(len(turn), -1)
-    observed = observe_actions(
+    observed = condition_on_primitives(
         model, [replace(adapt_to_object(primitive, image), grip_yaw=0.0)] * len(turn)
     )
     told = model.predict(seen, observed, t)

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from affordlib.evaluation.predictions import network_predictions
-from affordlib.interactions import TrainingArrays, open_interactions, split_interactions
-from affordlib.interactions.batches import observe_action
+from affordlib.interactions import InteractionTensors, open_interactions, split_interactions
+from affordlib.interactions.sampling import condition_on_recorded_action
 from affordlib.models import coverage, load_checkpoint
 from exercises.checking import Exercise, asked
 
@@ -25,11 +25,11 @@ def _marginals() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mean, σ and truth (50, 61, 2) [m] of the held-out pushes, given image and action."""
     pushes = open_interactions("push")
     held_out = split_interactions(pushes.sizes["interaction"]).test
-    arrays = TrainingArrays.from_dataset(pushes, held_out)
+    arrays = InteractionTensors.from_dataset(pushes, held_out)
     at = torch.linspace(0, len(arrays.phase) - 1, N_PHASES).round().long()
     model, _ = load_checkpoint("push_cnp")
     t_target = arrays.phases(at)
-    told = model.predict(model.encode(arrays.image), observe_action(arrays), t_target)
+    told = model.predict(model.encode(arrays.image), condition_on_recorded_action(arrays), t_target)
     return told.effect_mean.numpy(), told.effect_std.numpy(), arrays.effect[:, at].numpy()
 
 
@@ -60,7 +60,7 @@ def _lopsided_mm(lopsided_m: Callable[..., float]) -> float:
     def by(name: str) -> float:
         model, _ = load_checkpoint(name)
         channels = model.action_channels, model.effect_channels
-        some = TrainingArrays.from_dataset(
+        some = InteractionTensors.from_dataset(
             open_interactions("push_test"), np.arange(200), *channels
         )
         return 1000 * float(asked(lopsided_m, model, some))

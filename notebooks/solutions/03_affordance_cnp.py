@@ -2,9 +2,9 @@
 
 import torch
 
-from affordlib.interactions import TrainingArrays, open_interactions, split_interactions
-from affordlib.interactions.batches import observe
+from affordlib.interactions import InteractionTensors, open_interactions, split_interactions
 from affordlib.models import load_checkpoint
+from affordlib.types import Observations
 from exercises import check
 
 
@@ -18,14 +18,13 @@ def passes_by_mm(t=0.8):
     """
     model, _ = load_checkpoint("push_cnp")
     pushes = open_interactions("push")
-    held_out = TrainingArrays.from_dataset(pushes, split_interactions(len(pushes.interaction)).test)
-    n = len(held_out)
-    at = torch.full((n, 1), round(t * (len(held_out.phase) - 1)))
-    yes = torch.ones(n, 1, dtype=torch.bool)
-    seen = observe(held_out, at, ~yes, at, yes, torch.zeros(n))
-    told = model.predict(model.encode(held_out.image), seen, held_out.phase[at])
-    off = told.effect_mean[:, 0] - held_out.effect[torch.arange(n), at[:, 0]]
-    return 1000 * float(off.norm(dim=-1).mean())
+    held_out = InteractionTensors.from_dataset(
+        pushes, split_interactions(len(pushes.interaction)).test
+    )
+    at, effect = held_out.effect_at(torch.tensor([round(t * (len(held_out.phase) - 1))]))
+    observed = Observations.of(held_out, effect=(at, effect))
+    predicted = model.predict(model.encode(held_out.image), observed, at).effect_mean
+    return 1000 * float((predicted - effect).norm(dim=-1).mean())
 
 
 def draw(mean, sigma, rng):

@@ -5,7 +5,7 @@ import torch
 
 from affordlib.evaluation.predictions import network_predictions
 from affordlib.interactions import open_interactions
-from affordlib.interactions.batches import observe_action
+from affordlib.interactions.sampling import condition_on_recorded_action
 from affordlib.models import load_checkpoint
 from exercises import check
 
@@ -16,12 +16,12 @@ def lopsided_m(model, arrays):
 
     def ends(these):
         t = torch.ones(len(these), 1)
-        told = model.predict(model.encode(these.image), observe_action(these), t)
+        told = model.predict(model.encode(these.image), condition_on_recorded_action(these), t)
         return told.effect_mean[:, 0, :2]
 
     x, y = ends(arrays).T
     turned = torch.stack([-y, x], dim=1)
-    return float((ends(arrays.turned(1)) - turned).norm(dim=1).mean())
+    return float((ends(arrays.rotated_and_mirrored(1)) - turned).norm(dim=1).mean())
 
 
 def factor_for_half():

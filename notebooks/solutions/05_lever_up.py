@@ -5,26 +5,27 @@ from dataclasses import replace
 import torch
 
 from affordlib.interactions import open_interactions
-from affordlib.interactions.lever import AHEAD, SEEN, lever_arrays, n_windows, poses_seen
+from affordlib.interactions.lever_up import N_OBSERVED, N_PREDICTED, lever_up_tensors, n_windows
+from affordlib.interactions.sampling import condition_on_poses
 from affordlib.models import load_checkpoint
 from affordlib.models.lever import errors_m, window_errors_m
 from exercises import check
 from experiments.lever_up import LeverUnit, split_of
 
 levers = open_interactions("lever_up")
-test = lever_arrays(levers, split_of(LeverUnit("anchored"), levers).test)
+test = lever_up_tensors(levers, split_of(LeverUnit("anchored"), levers).test)
 conditional, _ = load_checkpoint("lever_anchored")
 recurrent, _ = load_checkpoint("lever_lstm_window")
 
 
 @torch.no_grad()
-def fifth_step_cm(model, arrays, last=SEEN):
+def fifth_step_cm(model, arrays, last=N_OBSERVED):
     """The mean error five steps ahead, from the last so many poses of what `arrays` shows."""
     features, errors = model.encode(test.image), []
     for start in range(n_windows(test)):
-        first = torch.full((len(test),), start + SEEN - last)
-        at = start + SEEN + AHEAD - 1
-        seen, t = poses_seen(arrays, first, last), test.phase[[at]].expand(len(test), -1)
+        first = torch.full((len(test),), start + N_OBSERVED - last)
+        at = start + N_OBSERVED + N_PREDICTED - 1
+        seen, t = condition_on_poses(arrays, first, last), test.phase[[at]].expand(len(test), -1)
         errors.append(errors_m(model.predict(features, seen, t), test.effect[:, [at]]))
     return 100 * float(torch.cat(errors).mean())
 

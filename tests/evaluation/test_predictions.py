@@ -14,7 +14,7 @@ from affordlib.evaluation.predictions import (
     yaw_error,
 )
 from affordlib.interactions import (
-    TrainingArrays,
+    InteractionTensors,
 )
 from experiments.grasps import (
     auc,
@@ -36,7 +36,7 @@ def test_answers_are_those_of_the_model_itself(trained, held_out_pushes):
     told = network_predictions(trained, held_out_pushes, some)
     from affordlib.models.training import final_errors_m
 
-    arrays = TrainingArrays.from_dataset(held_out_pushes, some)
+    arrays = InteractionTensors.from_dataset(held_out_pushes, some)
     torch.testing.assert_close(
         torch.tensor(final_error(told)).float(), final_errors_m(trained, arrays)
     )
@@ -68,7 +68,7 @@ def arrays_of(effect, theta):
     action = torch.stack([-0.2 * out, 0.05 * out], dim=1)
     effect = torch.stack([torch.zeros(n, 2), effect], dim=1)
     phase, image = torch.tensor([0.0, 1.0]), torch.zeros(n, 2, 4, 4)
-    return TrainingArrays(image, phase, action, effect, ("x", "y"), ("x", "y"))
+    return InteractionTensors(image, phase, action, effect, ("x", "y"), ("x", "y"))
 
 
 def test_baselines_know_the_direction_and_recover_a_law_of_size():

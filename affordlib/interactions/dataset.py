@@ -1,22 +1,21 @@
-"""From a data set to training batches: splits and folds, scales, context and targets.
+"""From a data set to tensors: which interactions train, validate and test, and their scales.
 
-Section 3.2 and 4.3 of the paper: 80/10/10 inside each of 10 folds; k observations, k uniform in
-1 … obs_max, at random phases of a random trajectory.
+Section 4.3 of the paper: 80/10/10 inside each of 10 folds.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 import xarray as xr
 
-from affordlib.types import Observations, check_array, check_count, check_finite, check_pair
+from affordlib.geometry import rotate_channels, xy_columns
+from affordlib.types import check_array, check_count, check_finite, check_pair
 
 
-def believable(data: xr.Dataset, interactions: np.ndarray) -> np.ndarray:
+def valid_interactions(data: xr.Dataset, interactions: np.ndarray) -> np.ndarray:
     """Those of the interactions that the arm could reach, without faults of the simulator."""
     return interactions[(data["reached"].values & ~data["fault"].values)[interactions]]
 
@@ -59,7 +58,7 @@ Range = tuple[float, float]
 
 
 @dataclass(frozen=True)
-class Normaliser:
+class Scaler:
     """What models take from training data: scales, and ranges outside which they know nothing.
 
     Scales bring channels near unit size; x and y share one, and zero stays zero. Ranges (None: not
@@ -88,14 +87,14 @@ class Normaliser:
                 check_pair(name, getattr(self, name), "(low, high)")
 
     @classmethod
-    def fit(cls, arrays: TrainingArrays) -> Normaliser:
+    def fit(cls, arrays: InteractionTensors) -> Scaler:
         """Scales of training data: root mean square of the channels, mean and std of the image."""
         image = arrays.image.double()
         radius_m = [None, None]
-        if plane := plane_of(arrays.action_channels):
+        if plane := xy_columns(arrays.action_channels):
             radius_m = [_range(arrays.action[:, k][:, plane].norm(dim=-1)) for k in (0, -1)]
         moved_m = None
-        if plane := plane_of(arrays.effect_channels):
+        if plane := xy_columns(arrays.effect_channels):
             moved_m = _range(arrays.effect[:, -1][:, plane].norm(dim=-1))
         mask = arrays.image[:, 1]
         return cls(
@@ -105,17 +104,12 @@ class Normaliser:
             tuple(image.std(dim=(0, 2, 3)).clamp_min(1e-6).tolist()),
             *radius_m,
             _range(mask.mean(dim=(1, 2))),
-            bool(touches_edge(mask).any()),
+            bool(touches_border(mask).any()),
             moved_m,
         )
 
 
-def plane_of(channels: tuple[str, ...]) -> list[int]:
-    """Where x and y are among the channels; empty if they are not both there."""
-    return [channels.index(name) for name in "xy"] if {"x", "y"} <= {*channels} else []
-
-
-def touches_edge(mask: torch.Tensor) -> torch.Tensor:
+def touches_border(mask: torch.Tensor) -> torch.Tensor:
     """Which of the masks (N, n, n) reach the edge of their image, not just by a corner: (N,)."""
     rim = torch.cat([mask[:, (0, -1)].flatten(1), mask[:, :, (0, -1)].flatten(1)], dim=1)
     return (rim > 0.5).sum(dim=1) > 2
@@ -136,10 +130,10 @@ _BY_INTERACTION = ("image", "action", "effect", "stop_phase")
 
 
 @dataclass(frozen=True)
-class TrainingArrays:
+class InteractionTensors:
     """Interactions as tensors: image (N, 2, 48, 48), phase (S,), action and effect (N, S, C).
 
-    stop_phase: (N,), by which `phase` is multiplied; it is 1 but where actions were broken off.
+    stop_phase: (N,), by which `phase` is multiplied: below 1 where an action was truncated.
     """
 
     image: torch.Tensor
@@ -161,14 +155,14 @@ class TrainingArrays:
         interactions: np.ndarray | None = None,
         action_channels: tuple[str, ...] = ("x", "y"),
         effect_channels: tuple[str, ...] = ("x", "y"),
-    ) -> TrainingArrays:
+    ) -> InteractionTensors:
         """The chosen interactions (default: all) and channels.
 
         Left out are faults of the simulator and actions that were out of reach.
         """
         chosen = np.arange(data.sizes["interaction"]) if interactions is None else interactions
         check_numbers("interactions", chosen)
-        part = data.isel(interaction=believable(data, chosen))
+        part = data.isel(interaction=valid_interactions(data, chosen))
 
         def channels(kind, names):
             known = data.attrs[f"{kind}_channels"].split()
@@ -192,14 +186,22 @@ class TrainingArrays:
         """Phases (N, k) of the samples with numbers (N, k), or (k,) of all interactions."""
         return self.phase[at] * self.stop_phase[:, None]
 
+    def action_at(self, at: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Phases (N, k) and actions (N, k, C) of samples, numbered as in `phases`."""
+        return self.phases(at), self.action[torch.arange(len(self))[:, None], at]
+
+    def effect_at(self, at: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Phases (N, k) and effects (N, k, C) of samples, numbered as in `phases`."""
+        return self.phases(at), self.effect[torch.arange(len(self))[:, None], at]
+
     def __len__(self) -> int:
         return len(self.image)
 
-    def select(self, rows: torch.Tensor | slice) -> TrainingArrays:
+    def select(self, rows: torch.Tensor | slice) -> InteractionTensors:
         """The interactions with the given row numbers."""
         return replace(self, **{n: getattr(self, n)[rows] for n in _BY_INTERACTION})
 
-    def joined(self, *others: TrainingArrays) -> TrainingArrays:
+    def joined(self, *others: InteractionTensors) -> InteractionTensors:
         """These interactions and those of others, in order; phases and channels must be the same.
 
         Raises ValueError where they are not.
@@ -214,7 +216,7 @@ class TrainingArrays:
             self, **{n: torch.cat([getattr(p, n) for p in parts]) for n in _BY_INTERACTION}
         )
 
-    def turned(self, quarters: int, mirror: bool = False) -> TrainingArrays:
+    def rotated_and_mirrored(self, quarters: int, mirror: bool = False) -> InteractionTensors:
         """The same interactions on a table mirrored in y, then turned by quarter turns.
 
         Exact: no pixel is interpolated. Physics on a level table does not mind.
@@ -228,8 +230,8 @@ class TrainingArrays:
         return replace(
             self,
             image=torch.rot90(image, quarters, (-2, -1)),
-            action=turn(action, self.action_channels, heading, absolute_yaw=True),
-            effect=turn(effect, self.effect_channels, heading, absolute_yaw=False),
+            action=rotate_channels(action, self.action_channels, heading, absolute_yaw=True),
+            effect=rotate_channels(effect, self.effect_channels, heading, absolute_yaw=False),
         )
 
 
@@ -237,146 +239,16 @@ Symmetry = tuple[int, bool]
 """A number of quarter turns, and whether the table is mirrored before."""
 
 
-def symmetric_copies(arrays: TrainingArrays, symmetries: tuple[Symmetry, ...]) -> TrainingArrays:
+def augment_by_symmetry(
+    arrays: InteractionTensors, symmetries: tuple[Symmetry, ...]
+) -> InteractionTensors:
     """Interactions of a primitive without a direction, and what they would be under symmetries.
 
     Image and effect are turned and mirrored; the commanded action stays, as it does in the world.
     """
-    parts = [replace(arrays.turned(*s), action=arrays.action) for s in symmetries]
+    parts = [replace(arrays.rotated_and_mirrored(*s), action=arrays.action) for s in symmetries]
     return parts[0].joined(*parts[1:])
 
 
 def _mirror(values: torch.Tensor, channels: tuple[str, ...]) -> torch.Tensor:
     return values * torch.tensor([-1.0 if name in ("y", "yaw") else 1.0 for name in channels])
-
-
-def turn(
-    values: torch.Tensor, channels: tuple[str, ...], heading: torch.Tensor, absolute_yaw: bool
-) -> torch.Tensor:
-    """Values (..., C) turned by the angles whose (cos, sin) are `heading` (..., 2).
-
-    A yaw that is an orientation turns along; one that is a change, as an effect's, stays.
-    """
-    cos, sin = heading.unbind(-1)
-    columns = list(values.unbind(-1))
-    if plane := plane_of(channels):
-        x, y = (columns[k] for k in plane)
-        columns[plane[0]], columns[plane[1]] = cos * x - sin * y, sin * x + cos * y
-    if absolute_yaw and "yaw" in channels:
-        k = channels.index("yaw")
-        yaw = columns[k] + torch.atan2(sin, cos)
-        columns[k] = torch.remainder(yaw + math.pi, 2 * math.pi) - math.pi
-    return torch.stack(columns, dim=-1)
-
-
-@dataclass(frozen=True)
-class Batch:
-    """Images, observations and the targets (B, T, C) at t_target (B, T) they should predict."""
-
-    image: torch.Tensor
-    observations: Observations
-    t_target: torch.Tensor
-    action: torch.Tensor
-    effect: torch.Tensor
-
-
-def observe(
-    arrays: TrainingArrays,
-    action_at: torch.Tensor,
-    action_mask: torch.Tensor,
-    effect_at: torch.Tensor,
-    effect_mask: torch.Tensor,
-    weight: torch.Tensor,
-) -> Observations:
-    """Observations of whole arrays at sample numbers (N, n) and (N, m)."""
-    rows = torch.arange(len(arrays))[:, None]
-    return Observations(
-        arrays.action[rows, action_at],
-        arrays.phases(action_at),
-        action_mask,
-        arrays.effect[rows, effect_at],
-        arrays.phases(effect_at),
-        effect_mask,
-        weight,
-    )
-
-
-def observe_action(arrays: TrainingArrays, samples: tuple[int, ...] = (0, -1)) -> Observations:
-    """Only the commanded action, at the given samples (default: t = 0 and t = 1), w₁ = 1."""
-    n = len(arrays)
-    last = len(arrays.phase)
-    at = torch.tensor([s % last for s in samples]).expand(n, -1)
-    seen = torch.ones(n, len(samples), dtype=torch.bool)
-    none = torch.zeros(n, 1, dtype=torch.bool)
-    return observe(arrays, at, seen, torch.zeros(n, 1, dtype=torch.long), none, torch.ones(n))
-
-
-def sample_batch(
-    arrays: TrainingArrays,
-    rows: torch.Tensor,
-    n_targets: int,
-    obs_max: int,
-    generator: torch.Generator,
-) -> Batch:
-    """Draw context and targets for the interactions in `rows`.
-
-    A share of the contexts is what will be asked later: the action at t = 0 (and 1), the effect
-    at t = 1. t = 1 is always a target.
-    """
-    part = arrays.select(rows)
-    b, last = len(rows), len(arrays.phase) - 1
-
-    def uniform(*shape):
-        return torch.rand(*shape, generator=generator)
-
-    def samples(*shape):
-        return torch.randint(0, last + 1, shape, generator=generator)
-
-    def counts():
-        few = torch.randint(1, min(2, obs_max) + 1, (b, 1), generator=generator)
-        many = torch.randint(1, obs_max + 1, (b, 1), generator=generator)
-        return torch.where(uniform(b, 1) < 0.5, few, many)
-
-    action_at, effect_at = samples(b, obs_max), samples(b, obs_max)
-    asked = uniform(b) < 0.5
-    action_at[asked, 0] = 0
-    action_at[asked, min(1, obs_max - 1)] = last if obs_max > 1 else 0
-    effect_at[uniform(b) < 0.5, 0] = last
-
-    slot = torch.arange(obs_max)
-    kind = uniform(b, 1)
-    action_mask = (slot < counts()) & ((kind < 0.5) | (kind > 0.75))
-    effect_mask = (slot < counts()) & (kind >= 0.5)
-    blend = torch.where(kind > 0.75, uniform(b, 1), (kind < 0.5).float()).squeeze(1)
-
-    target_at = samples(b, n_targets)
-    target_at[:, 0] = last
-    index = torch.arange(b)[:, None]
-    return Batch(
-        part.image,
-        observe(part, action_at, action_mask, effect_at, effect_mask, blend),
-        part.phases(target_at),
-        part.action[index, target_at],
-        part.effect[index, target_at],
-    )
-
-
-def draw_forward(
-    arrays: TrainingArrays,
-    rows: torch.Tensor,
-    n_targets: int,
-    obs_max: int,
-    generator: torch.Generator,
-) -> Batch:
-    """Only the forward question: the action at t = 0 and 1 is observed; obs_max is not used."""
-    part, last = arrays.select(rows), len(arrays.phase) - 1
-    target_at = torch.randint(0, last + 1, (len(rows), n_targets), generator=generator)
-    target_at[:, 0] = last
-    index = torch.arange(len(rows))[:, None]
-    return Batch(
-        part.image,
-        observe_action(part),
-        part.phases(target_at),
-        part.action[index, target_at],
-        part.effect[index, target_at],
-    )

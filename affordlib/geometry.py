@@ -1,0 +1,31 @@
+"""Rotations of values that are stored by channel, such as x, y, z, yaw."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+
+def xy_columns(channels: tuple[str, ...]) -> list[int]:
+    """Where x and y are among the channels; empty if they are not both there."""
+    return [channels.index(name) for name in "xy"] if {"x", "y"} <= {*channels} else []
+
+
+def rotate_channels(
+    values: torch.Tensor, channels: tuple[str, ...], heading: torch.Tensor, absolute_yaw: bool
+) -> torch.Tensor:
+    """Values (..., C) rotated by the angles whose (cos, sin) are `heading` (..., 2).
+
+    A yaw that is an orientation rotates along; one that is a change, as an effect's, stays.
+    """
+    cos, sin = heading.unbind(-1)
+    columns = list(values.unbind(-1))
+    if plane := xy_columns(channels):
+        x, y = (columns[k] for k in plane)
+        columns[plane[0]], columns[plane[1]] = cos * x - sin * y, sin * x + cos * y
+    if absolute_yaw and "yaw" in channels:
+        k = channels.index("yaw")
+        yaw = columns[k] + torch.atan2(sin, cos)
+        columns[k] = torch.remainder(yaw + math.pi, 2 * math.pi) - math.pi
+    return torch.stack(columns, dim=-1)

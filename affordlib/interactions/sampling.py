@@ -1,0 +1,161 @@
+"""Training batches: which context a model observes, and at which phases it has to predict.
+
+Section 3.2 of the paper: k observations, k uniform in 1 … obs_max, at random phases of a random
+trajectory. A sampler takes interactions, the numbers of those in the batch, n_targets, obs_max and
+a generator, and returns a `Batch`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+
+from affordlib.interactions.dataset import InteractionTensors
+from affordlib.types import Observations
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Images, observations and the targets (B, T, C) at t_target (B, T) they should predict."""
+
+    image: torch.Tensor
+    observations: Observations
+    t_target: torch.Tensor
+    action: torch.Tensor
+    effect: torch.Tensor
+
+    @classmethod
+    def of(
+        cls, tensors: InteractionTensors, observations: Observations, target_at: torch.Tensor
+    ) -> Batch:
+        """A batch of whole tensors whose targets are the samples with numbers (B, T), or (T,)."""
+        t_target, action = tensors.action_at(target_at)
+        effect = tensors.effect_at(target_at)[1]
+        return cls(tensors.image, observations, t_target, action, effect)
+
+
+def condition_on_recorded_action(tensors: InteractionTensors) -> Observations:
+    """Only the commanded action, at t = 0 and t = 1 (w₁ = 1)."""
+    return Observations.of(tensors, action=tensors.action_at(torch.tensor([0, -1])))
+
+
+def condition_on_poses(
+    tensors: InteractionTensors, start: torch.Tensor, n_poses: int
+) -> Observations:
+    """The commanded action at t = 0 and 1, and n_poses effects from the samples `start` (N,) on.
+
+    Without a pose only the action is observed (w₁ = 1), else both (w₁ = 1/2).
+    """
+    at = start[:, None] + torch.arange(n_poses)
+    effect = tensors.effect_at(at) if n_poses else None
+    return Observations.of(tensors, tensors.action_at(torch.tensor([0, -1])), effect)
+
+
+def sample_mixed(
+    tensors: InteractionTensors,
+    rows: torch.Tensor,
+    n_targets: int,
+    obs_max: int,
+    generator: torch.Generator,
+) -> Batch:
+    """Action, effect or both are observed; half of the contexts are those of the later queries.
+
+    These are the action at t = 0 (and 1), and the effect at t = 1. t = 1 is always a target.
+    """
+    part = tensors.select(rows)
+    b, last = len(rows), len(tensors.phase) - 1
+
+    def uniform(*shape):
+        return torch.rand(*shape, generator=generator)
+
+    def samples(*shape):
+        return torch.randint(0, last + 1, shape, generator=generator)
+
+    def counts():
+        few = torch.randint(1, min(2, obs_max) + 1, (b, 1), generator=generator)
+        many = torch.randint(1, obs_max + 1, (b, 1), generator=generator)
+        return torch.where(uniform(b, 1) < 0.5, few, many)
+
+    action_at, effect_at = samples(b, obs_max), samples(b, obs_max)
+    as_queried = uniform(b) < 0.5
+    action_at[as_queried, 0] = 0
+    action_at[as_queried, min(1, obs_max - 1)] = last if obs_max > 1 else 0
+    effect_at[uniform(b) < 0.5, 0] = last
+
+    slot = torch.arange(obs_max)
+    kind = uniform(b, 1)
+    action_mask = (slot < counts()) & ((kind < 0.5) | (kind > 0.75))
+    effect_mask = (slot < counts()) & (kind >= 0.5)
+    weight = torch.where(kind > 0.75, uniform(b, 1), (kind < 0.5).float()).squeeze(1)
+
+    target_at = samples(b, n_targets)
+    target_at[:, 0] = last
+    observed = Observations.of(part, part.action_at(action_at), part.effect_at(effect_at), weight)
+    return Batch.of(
+        part, replace(observed, action_mask=action_mask, effect_mask=effect_mask), target_at
+    )
+
+
+def sample_forward(
+    tensors: InteractionTensors,
+    rows: torch.Tensor,
+    n_targets: int,
+    obs_max: int,
+    generator: torch.Generator,
+) -> Batch:
+    """Only the action at t = 0 and 1 is observed; obs_max is not used."""
+    part, last = tensors.select(rows), len(tensors.phase) - 1
+    target_at = torch.randint(0, last + 1, (len(rows), n_targets), generator=generator)
+    target_at[:, 0] = last
+    return Batch.of(part, condition_on_recorded_action(part), target_at)
+
+
+def sample_windows(
+    tensors: InteractionTensors,
+    rows: torch.Tensor,
+    n_targets: int,
+    obs_max: int,
+    generator: torch.Generator,
+) -> Batch:
+    """Windows anywhere: obs_max samples are observed, the n_targets after them are targets."""
+    part = tensors.select(rows)
+    latest = len(tensors.phase) - obs_max - n_targets
+    start = torch.randint(0, latest + 1, (len(rows),), generator=generator)
+    target_at = start[:, None] + obs_max + torch.arange(n_targets)
+    return Batch.of(part, condition_on_poses(part, start, obs_max), target_at)
+
+
+def sample_from_start(
+    tensors: InteractionTensors,
+    rows: torch.Tensor,
+    n_targets: int,
+    obs_max: int,
+    generator: torch.Generator,
+) -> Batch:
+    """All later samples are targets; the first pose is observed in every other batch.
+
+    n_targets and obs_max are not used.
+    """
+    part = tensors.select(rows)
+    n_poses = int(torch.randint(0, 2, (1,), generator=generator))
+    start = torch.zeros(len(rows), dtype=torch.long)
+    target_at = torch.arange(1, len(tensors.phase))
+    return Batch.of(part, condition_on_poses(part, start, n_poses), target_at)
+
+
+def sample_literal(tensors: InteractionTensors, obs_max: int, generator: torch.Generator) -> Batch:
+    """As in the paper: one trajectory, k observations, k uniform in 1 … obs_max, one target.
+
+    Action and effect are observed at the same times; w₁ is 1, 0 or uniform between, one in three.
+    """
+
+    def draw(high, n=1):
+        return torch.randint(high, (n,), generator=generator)
+
+    part, last = tensors.select(draw(len(tensors))), len(tensors.phase)
+    at, target_at = draw(last, 1 + int(draw(obs_max))), draw(last)
+    kind, weight = int(draw(3)), torch.rand(1, generator=generator)
+    weight = weight if kind == 2 else torch.tensor([float(kind)])
+    observed = Observations.of(part, part.action_at(at), part.effect_at(at), weight)
+    return Batch.of(part, observed, target_at)
