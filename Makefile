@@ -100,7 +100,7 @@ test-plain: $(STAMP) ## The same without the processor's vector instructions, as
 
 test-slow: $(STAMP) ## Run every notebook and solution as the reader does; the log is runs/test-slow.log
 	@mkdir -p runs; { $(PY) -m affordlib.workbook --profile reader --out test-slow --force; \
-	  $(PY) -m pytest tests/test_exercises.py tests/test_browser*.py; } 2>&1 | tee runs/test-slow.log
+	  $(PY) -m pytest tests/test_exercises.py tests/show/test_browser*.py; } 2>&1 | tee runs/test-slow.log
 
 soak: $(STAMP) ## Plan and execute 3,000 times: memory must stay, and the same task end the same (15 min)
 	@OMP_NUM_THREADS=1 $(PY) -m tests.soak

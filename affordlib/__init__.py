@@ -24,7 +24,7 @@ planning.problem planning.reachability planning.skills interactions.dataset
 interactions.sampling interactions.collect interactions.import_log interactions.lever_up
 interactions.recipes interactions.store models.calibration models.checkpoint models.ensemble
 models.lever models.protocol models.training evaluation.metrics show.animation
-show.conditioning_explorer show.executors show.goal_picker show.phase_slider show.plots
+show.executors show.explorers show.goal_picker show.plots
 """
 _CONF = BeartypeConf(
     violation_type=TypeError,

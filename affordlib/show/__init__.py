@@ -1,10 +1,9 @@
 """Pictures for people: figures, animations, and widgets to try things by hand."""
 
 from affordlib.show.animation import FrameRecorder, show_animation
-from affordlib.show.conditioning_explorer import ConditioningExplorer
 from affordlib.show.executors import closed_loop, open_loop
+from affordlib.show.explorers import ConditioningExplorer, PhaseSlider
 from affordlib.show.goal_picker import GoalPicker
-from affordlib.show.phase_slider import PhaseSlider
 from affordlib.show.plots import (
     GOAL,
     NEUTRAL,

@@ -6,112 +6,133 @@ A view on plain objects: everything it does can be done with a planner, `execute
 
 from __future__ import annotations
 
-import asyncio
 import html
+import itertools
 import math
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import ipywidgets as widgets
 import numpy as np
 
 from affordlib.paths import resolve_out_dir
-from affordlib.plan_files import load_plan, plan_file, save_plan
+from affordlib.plan_files import load_plan, save_plan
 from affordlib.planning import execute_plan
 from affordlib.primitives import wrap_angle
+from affordlib.show.drawing import Drawing, WithPicture
 from affordlib.show.executors import Executor, Planner, Stopped, open_loop
-from affordlib.show.figure_widget import Pictured
 from affordlib.show.picker_controls import PickerControls, outcome_in_words, plan_in_words
 from affordlib.show.plots import table_picture
 from affordlib.show.table_view import (
-    TableView,
-    draw_way,
-    make_scene,
-    moving_part,
-    pose_recorder,
-    rounded,
-    whole_mm,
+    HALF_WIDTH_M,
+    LIMIT_M,
+    draw_goal,
+    draw_ground,
+    draw_object,
+    draw_path,
+    draw_plan,
+    to_mm,
 )
 from affordlib.types import Goal, Outcome, Plan, check_count, check_on_table
 from affordlib.world import Tabletop
 
-HALF_WIDTH_M, LIMIT_M = 0.36, 0.35
 REST_S = 0.05
-"""A hand that has asked for nothing new for so long has come to rest."""
+"""A hand that has not moved the goal for so long has come to rest."""
+
+POSE_EVERY = 12
+"""Simulation steps (1/240 s) between two poses of the movement that is played."""
+
+_MOVED = 1e-4
+_HELP = (
+    "Table from above. Arrow keys move the goal by 1 cm, with Shift by 1 mm; Enter runs the plan, "
+    "Escape stops it."
+)
 
 
-class GoalPicker(Pictured, widgets.VBox):
+class GoalPicker(WithPicture, widgets.VBox):
     """The table from above, where a goal is picked by mouse, keyboard or sliders.
 
     planners: name → function (image, start_xy_m, goal) → Plan. executors: name → function (world,
-    plan, planner, tell) → Outcome that carries a plan out, or plans again with the planner that
-    made it; see `Tell`. `Stopped` is to be let through. The default is `open_loop` alone. draft: a
-    quick planner whose plan is shown while the hand moves the goal; that of the chosen one takes
-    its place when the hand rests. seed: of the disturbances. folder: where plans are saved.
+    plan, planner, report) → Outcome that executes a plan, or replans with the planner that made it;
+    see `executors.Report`. The default is `open_loop` alone. draft: a quick planner whose plan is
+    shown while the hand moves the goal; that of the chosen one takes its place when the hand rests.
+    seed: of the disturbances. folder: where plans are saved.
 
-    `plan` and `outcome` hold what is shown; `pick`, `ask_pose`, `run`, `stop`, `shove_object`,
-    `move_goal`, `start_over`, `save` and `load` do what mouse and buttons do, and return when done.
-    What mouse and buttons ask for is done in the background, one after the other, *Run* at a pace
-    that can be watched; leave the world alone until it is done.
+    `goal`, `plan` and `outcome` are what is shown; `pick`, `set_pose`, `run`, `stop`,
+    `shove_object`, `move_goal`, `start_over`, `save` and `load` do what mouse and buttons do, and
+    return when it is done. Mouse and buttons only queue it: it is done in the background, one after
+    the other, *Run* with `seconds_per_action` to watch each. Leave the world alone until then.
     """
+
+    seconds_per_action = 1.2
 
     def __init__(
         self,
         world: Tabletop,
         planners: dict[str, Planner],
         goal_xy_m: tuple[float, float] = (0.12, 0.10),
-        *,
         executors: dict[str, Executor] | None = None,
         draft: Planner | None = None,
         seed: int = 0,
-        seconds_per_action: float = 1.2,
         folder: str = "runs/lab",
     ) -> None:
-        self.world, self.planners = world, planners
-        self.executors, self.draft = executors or {"open loop": open_loop}, draft
-        self.seconds_per_action, self.folder = seconds_per_action, folder
+        self.world, self.planners, self.draft, self.folder = world, planners, draft, folder
+        self.executors = executors or {"open loop": open_loop}
         self.plan: Plan | None = None
         self.outcome: Outcome | None = None
         self._rng = np.random.default_rng(check_count("seed", seed, least=0))
-        self._pose = self._start = self._first_pose = world.object_pose()
-        self._turn_from = self._pose[2]  # what a wanted turn is counted from
-        self._goal = Goal(whole_mm(*check_on_table("goal_xy_m", goal_xy_m)))
-        self._running = self._setting = self._lifted = False
-        self._owed = False  # a plan of the chosen planner, for the goal that is shown
-        self._asked = self._answered = 0  # numbers of goals: only the last is planned for
-        self._alone = threading.RLock()
-        self._queue = PageQueue(
-            lambda why: self.controls.say(f"<b>This did not work:</b> {html.escape(why)}")
+        self._first_pose = self._pose = self._plan_pose = world.object_pose()
+        self._turn_from = self._pose[2]  # the yaw from which a wanted turn is counted
+        self._running = self._lifted = False
+        self._stale = True  # what is shown is not the chosen planner's plan for the goal
+        self._answered = 0  # the number of the last goal of the page that there is a plan for
+        self._alone = threading.RLock()  # held by what plans, or moves something in the world
+        self._queue, self._last = ThreadPoolExecutor(1), Future()
+        self._goal_moved, self._stop = threading.Event(), threading.Event()
+        self._disturbances: list[Callable[[], None]] = []  # that wait for the end of the action
+        self._poses: list[tuple[float, ...]] = []  # of the object since the last action
+        self._paths: list[np.ndarray] = []  # of the object since the plan was made
+        self._view = Drawing(
+            label=_HELP, keyboard=True, layout={"width": "480px", "max_width": "100%"}
         )
-        self._stop = threading.Event()
-        self._waiting: list[Callable[[], None]] = []
-        self._poses: list[tuple[float, ...]] = []  # of the film since the last action
-        self._walked: list[np.ndarray] = []  # the object's paths since the plan was made
-        super().__init__(self._build())
+        self._view.add_class("affordlib-table")
+        goal = Goal(_whole_mm(check_on_table("goal_xy_m", goal_xy_m)))
+        self.controls = PickerControls(goal, list(planners), list(self.executors), self._follow)
+        self._listen()
+        layout = {"flex_flow": "row wrap", "grid_gap": "12px"}
+        super().__init__([widgets.HBox([self._view, self.controls], layout=layout)])
         self.add_class("affordlib-picker")
-        self._queue.attempt(self._make_plan)
+        self._attempt(self._make_plan)
+
+    @property
+    def goal(self) -> Goal:
+        """The goal that is shown."""
+        return self.controls.goal
 
     def pick(self, x_m: float, y_m: float) -> None:
-        """Set the goal [m], to the nearest millimetre, and make the plan anew."""
-        self._ask_for(replace(self._goal, xy_m=whole_mm(x_m, y_m)))
-        self._settle()
+        """Set the goal [m], to the nearest millimetre, and replan."""
+        self._set_goal(replace(self.goal, xy_m=_whole_mm((x_m, y_m))))
+        self._update_plan()
 
-    def ask_pose(self, turn_deg: float = 0.0, height_cm: float = 0.0) -> None:
-        """Ask for a turn and a height beside the position; 0 asks for none. Plans anew."""
-        self._ask_for(self._posed_goal(turn_deg, height_cm))
-        self._settle()
+    def set_pose(self, turn_deg: float = 0.0, height_cm: float = 0.0) -> None:
+        """Ask for a turn and a height beside the position; 0 asks for none. Replans."""
+        turn, height = math.radians(turn_deg) or None, height_cm / 100 or None
+        self._set_goal(replace(self.goal, turn_rad=turn, height_m=height))
+        self._update_plan()
 
     def run(self) -> None:
-        """Carry the plan out and show what came of it; the next plan starts from there."""
+        """Execute the plan and show what came of it; the next plan starts from there."""
         self._refuse_while_running()
         self._set_running(True)
         self._run(seconds_per_action=0.0)
 
     def stop(self) -> None:
-        """Let the action that is under way end, and carry out nothing more."""
+        """Let the action that is under way end, and execute nothing more."""
         self._stop.set()
 
     def shove_object(self) -> None:
@@ -125,14 +146,15 @@ class GoalPicker(Pictured, widgets.VBox):
     def start_over(self) -> None:
         """Put the object back where it stood when the picker was made."""
         self._refuse_while_running()
-        x, y, yaw = self._first_pose
-        self.world.place(self.world.obj, (x, y), yaw)
-        self._make_plan()
+        with self._alone:
+            x, y, yaw = self._first_pose
+            self.world.place(self.world.obj, (x, y), yaw)
+            self._make_plan()
 
     def save(self, name: str = "plan.json") -> None:
         """Save the plan and its goal as JSON in the picker's folder."""
-        path = plan_file(resolve_out_dir(self.folder), name)
-        self._settle()
+        path = self._file(name)
+        self._update_plan()
         if self.plan is None:
             raise RuntimeError("there is no plan to save; pick a goal that can be planned for")
         save_plan(path, self.plan)
@@ -141,218 +163,28 @@ class GoalPicker(Pictured, widgets.VBox):
     def load(self, name: str = "plan.json") -> None:
         """Show a saved plan with its goal, to be run as it is."""
         self._refuse_while_running()
-        plan = load_plan(plan_file(resolve_out_dir(self.folder), name))
-        self._let_go()
-        self._set_goal(plan.goal)
-        self._pose, self.plan, self.outcome = self.world.object_pose(), plan, None
-        self._start, self._turn_from = (*plan.start_xy_m, self._pose[2]), self._pose[2]
-        self._walked.clear()
-        away_m = np.hypot(*np.subtract(plan.start_xy_m, self._pose[:2]))
-        note = f" The object is {1000 * away_m:.0f} mm from where this plan starts."
-        self.controls.say(f"Loaded. {plan_in_words(plan)}{note if away_m > 0.002 else ''}")
-        self._owed = False
-        self._show()
-
-    def _posed_goal(self, turn_deg: float, height_cm: float) -> Goal:
-        turn = math.radians(turn_deg) if turn_deg else None
-        height = height_cm / 100 if height_cm else None
-        return replace(self._goal, turn_rad=turn, height_m=height)
-
-    def _ask_for(self, goal: Goal) -> None:
-        """A new goal, for which there is no plan yet."""
-        self._set_goal(goal)
-        self._owed, self._asked = True, self._asked + 1
-        if self._running:  # the executor is told of it after this action
-            self._answered = self._view.asked[2]
-        if self._running or self.draft is None:
-            self._show(planning=not self._running)
-
-    def _follow(self, x_m: float, y_m: float) -> None:
-        """Pick as the hand moves: a draft at once, where there is one, and the plan when it rests.
-
-        Where no page waits for an answer (a script) there is the plan at once.
-        """
-        self._ask_for(replace(self._goal, xy_m=whole_mm(x_m, y_m)))
-        if self.draft is None or not self._queue.page_waits():
-            return self._queue.do(self._settle)
-        number = self._asked
-
-        def rest():
-            if number == self._asked:
-                self._settle()
-
-        def follow():
-            if self._owed and number == self._asked and not self._running:
-                try:
-                    self._make_plan(self.draft)
-                finally:
-                    self._queue.put(rest, REST_S)
-
-        self._queue.put(follow)
-
-    def _settle(self) -> None:
-        """Plan for the goal that is shown, where that is owed; what runs hears of it later."""
-        if self._owed and not self._running:
-            self._make_plan()
-
-    def _make_plan(self, draft: Planner | None = None) -> None:
+        plan = load_plan(self._file(name))
         with self._alone:
-            if draft is None:
-                self._show(planning=True)
-            planner, plan = draft or self.planners[self.controls.planner.value], None
-            goal, number = self._goal, self._view.asked[2]
-            self._let_go()
-            self._pose = self._start = self.world.object_pose()
-            self._turn_from = self._pose[2]
-            self._owed = draft is not None
-            try:
-                plan = planner(self.world.depth_image(), self._pose[:2], goal)
-                self.controls.say(plan_in_words(plan))
-            finally:
-                self.plan, self.outcome = plan, None
-                self._owed, self._answered = self._owed or goal != self._goal, number
-                self._walked.clear()
-                self._show(draft is not None, planning=goal != self._goal)
-
-    def _let_go(self) -> None:
-        """Put down what the last run has lifted."""
-        if self._lifted:
-            self.world.park()
-            self._lifted = False
-            self._poses.clear()
-
-    def _set_goal(self, goal: Goal) -> None:
-        """Set the goal everywhere; the sliders are told, and what they echo is not listened to."""
-        self._setting = True
-        try:
-            self._goal = goal
-            self.controls.show(goal)
-        finally:
-            self._setting = False
-
-    def _refuse_while_running(self) -> None:
-        if self._running:
-            raise RuntimeError("the robot is still at work; press Stop or wait")
-
-    def _run(self, seconds_per_action: float) -> None:
-        planner, before, done = self.planners[self.controls.planner.value], self.world.on_step, 0
-
-        def tell(plan=None):
-            nonlocal done
-            if plan is not None:
-                self._follow_plan(plan, done)
-                return self._goal
-            done += 1
-            self.controls.show_progress(done)
-            self._play(seconds_per_action)
-            while self._waiting and not self._stop.is_set():
-                self._waiting.pop(0)()
-            if self._stop.is_set():
-                raise Stopped
-            return self._goal
-
-        self._alone.acquire()
-        try:
-            if self._owed or self.plan is None or self.outcome is not None:
-                self._make_plan()
-            self.controls.show_progress(0, max(1, len(self.plan.steps)))
-            yaw, z = self.world.object_pose()[2], self.world.object_state()[2]
-            self.world.on_step = pose_recorder(self._poses, before)
-            try:
-                execute = self.executors[self.controls.executor.value]
-                if self._stop.is_set():
-                    raise Stopped
-                outcome, how = execute(self.world, self.plan, planner, tell), "Done,"
-                self.controls.show_progress(done, max(1, done))
-            except Stopped:
-                outcome, how = (
-                    execute_plan(self.world, replace(self.plan, steps=())),
-                    "Stopped after",
-                )
-            self.outcome = replace(
-                outcome.with_goal(self._goal),
-                turned_rad=wrap_angle(self.world.object_pose()[2] - yaw),
-                lifted_m=self.world.object_state()[2] - z,
-            )
-            self._lifted = bool(self._goal.height_m)
-            if self.plan.goal == self._goal or self.outcome.distance_m <= self._goal.tolerance_m:
-                self._owed = False  # it has followed a goal that was moved
-            self.controls.say(outcome_in_words(self.outcome, self._goal, how, done))
-        except Exception:
-            self.plan = None  # the next run plans from where this one broke off
-            raise
-        finally:
-            self.world.on_step = before
-            self._waiting.clear()
-            self._play(0.0)
-            self._pose = self.world.object_pose()
-            self._set_running(False)
+            self._set_goal(plan.goal)
+            self._put_down()
+            self._begin(plan)
+            away_m = math.dist(plan.start_xy_m, self._pose[:2])
+            note = f" The object is {1000 * away_m:.0f} mm from where this plan starts."
+            self.controls.say(f"Loaded. {plan_in_words(plan)}{note if away_m > 0.002 else ''}")
+            self._stale = False
             self._show()
-            self._alone.release()
 
-    def _follow_plan(self, plan: Plan, done: int) -> None:
-        """Show a plan that was made on the way, after so many actions."""
-        arrives = self._goal.distance_m(plan.predicted_end_xy_m) <= self._goal.tolerance_m
-        self.plan = plan = replace(plan, goal=self._goal, reaches_goal=arrives)
-        self._pose = self.world.object_pose()
-        self._start = (*plan.start_xy_m, self._pose[2])
-        self.controls.show_progress(done, done + len(plan.steps))
-        so_far = f"On the way, after {done} action{'s' * (done != 1)}."
-        self.controls.say(f"{so_far} {plan_in_words(plan)}")
-        self._show()
+    def picture(self) -> bytes:
+        """What is shown, as a PNG."""
+        return table_picture(self.world.obj, self._pose, self.plan, self.outcome, HALF_WIDTH_M)
 
-    def _play(self, seconds: float) -> None:
-        """Play what was filmed since the last time; a film of an object at rest is skipped."""
-        poses = moving_part(self._poses)
-        self._poses.clear()
-        if len(poses):
-            self._view.film = {"poses": rounded(poses), "seconds": seconds}
-            self._stop.wait(seconds)
-            self._walked.append(poses[:, :2])
-            self._pose = tuple(poses[-1])
+    # What the page asks for
 
-    def _set_running(self, running: bool) -> None:
-        self._running = running
-        self._stop.clear()
-        self.controls.set_running(running)
-
-    def _disturb(self, disturbance: Callable[[], None]) -> None:
-        if self._running:
-            self._waiting.append(disturbance)
-            return
-        with self._alone:
-            disturbance()
-            self._make_plan()
-
-    def _shove(self) -> None:
-        dx, dy = draw_way(self._rng, self.world.object_pose()[:2], 0.02, 0.04, LIMIT_M)
-        self.world.shove(dx, dy, float(self._rng.uniform(-0.5, 0.5)))
-        self._pose = self.world.object_pose()
-        self._poses.clear()
-        self._show()
-        self.controls.say(f"The object was shoved by {1000 * np.hypot(dx, dy):.0f} mm.")
-
-    def _move_goal(self) -> None:
-        dx, dy = draw_way(self._rng, self._goal.xy_m, 0.04, 0.08, LIMIT_M)
-        x, y = self._goal.xy_m
-        self._set_goal(replace(self._goal, xy_m=whole_mm(x + dx, y + dy)))
-        self._show()
-        self.controls.say(f"The goal was moved by {1000 * np.hypot(dx, dy):.0f} mm.")
-
-    def _build(self) -> list[widgets.Widget]:
-        self._view = TableView(layout={"width": "480px", "max_width": "100%"})
-        self.controls = controls = PickerControls(
-            self._goal, list(self.planners), list(self.executors), LIMIT_M
-        )
-        for slider in (controls.x, controls.y):
-            slider.observe(self._slid, names="value")
-        for slider in (controls.turn, controls.height):
-            slider.observe(self._posed, names="value")
-        controls.planner.observe(
-            lambda _: self._hear(lambda: self.pick(*self._goal.xy_m)), names="value"
-        )
-        self._view.observe(self._clicked, names="asked")
+    def _listen(self) -> None:
+        controls = self.controls
+        self._view.observe(self._clicked, names="wanted")
         self._view.on_msg(self._pressed)
+        controls.planner.observe(lambda _: self._follow(self.goal), names="value")
         controls.run.on_click(lambda _: self._run_in_background())
         controls.stop.on_click(lambda _: self.stop())
         for button, action in {
@@ -362,27 +194,26 @@ class GoalPicker(Pictured, widgets.VBox):
             controls.save: lambda: self.save(controls.name.value),
             controls.load: lambda: self.load(controls.name.value),
         }.items():
-            button.on_click(lambda _, action=action: self._hear(action))
-        layout = {"flex_flow": "row wrap", "grid_gap": "12px"}
-        return [widgets.HBox([self._view, controls.box()], layout=layout)]
+            button.on_click(lambda _, action=action: self._soon(action))
 
-    def _hear(self, action: Callable[[], None]) -> None:
-        (self._queue.attempt if self._running else self._queue.do)(action)
+    def _soon(self, action: Callable[[], None]) -> None:
+        """Do it in the background, after what was asked before; while the robot works, now."""
+        if self._running:
+            self._attempt(action)
+        else:
+            self._last = self._queue.submit(self._attempt, action)
+
+    def _attempt(self, action: Callable[[], None]) -> None:
+        """Do it, and say what did not work."""
+        try:
+            action()
+        except Exception as error:
+            why = html.escape(str(error) or type(error).__name__)
+            self.controls.say(f"<b>This did not work:</b> {why}")
 
     def _clicked(self, change: dict[str, Any]) -> None:
-        self._queue.attempt(lambda: self._follow(*change["new"][:2]))
-
-    def _slid(self, change: dict[str, Any]) -> None:
-        xy_m = whole_mm(*self.controls.place_m(self._goal, change))
-        if not self._setting and xy_m != self._goal.xy_m:  # the page echoes what it was told
-            self._queue.attempt(lambda: self._follow(*xy_m))
-
-    def _posed(self, change: dict[str, Any]) -> None:
-        """Set the goal at once, or the slider would be told an older one; plan when idle."""
-        if not self._setting:
-            pose = self.controls.pose(self._goal, change)
-            self._queue.attempt(lambda: self._ask_for(self._posed_goal(*pose)))
-            self._hear(self._settle)
+        _, x, y, _ = change["new"]
+        self._follow(replace(self.goal, xy_m=_whole_mm((x / 1000, -y / 1000))))
 
     def _pressed(self, _: object, content: dict[str, Any], __: object) -> None:
         presses = {"run": self._run_in_background, "stop": self.stop}
@@ -393,68 +224,245 @@ class GoalPicker(Pictured, widgets.VBox):
         """Run the plan of the goal that is shown, when it is made; a second press does nothing."""
         if not self._running:
             self._set_running(True)
-            self._queue.put(lambda: self._run(self.seconds_per_action))
+            action = partial(self._run, self.seconds_per_action)
+            self._last = self._queue.submit(self._attempt, action)
+
+    def _follow(self, goal: Goal) -> None:
+        """Set the goal; soon show a draft for it, and the plan if the hand rests there."""
+        goal = replace(goal)  # a new object, by which this move of the hand is known
+        self._set_goal(goal)
+
+        def plan():
+            self._goal_moved.clear()
+            if goal is not self.goal or self._running:
+                return
+            if self.draft is not None:
+                self._make_plan(draft=True)
+                if self._goal_moved.wait(REST_S):
+                    return
+            self._update_plan()
+
+        if not self._running:
+            self._soon(plan)
+
+    # Goals and plans
+
+    def _set_goal(self, goal: Goal) -> None:
+        """Show a goal for which there is no plan yet."""
+        self.controls.show(goal)
+        self._stale = True
+        self._goal_moved.set()
+        if self._running:  # the executor learns of it after this action
+            self._answered = self._view.wanted[3]
+        if self._running or self.draft is None:
+            self._show(planning=not self._running)
+
+    def _update_plan(self) -> None:
+        """Plan for the goal that is shown, if there is no plan yet and the robot is idle."""
+        if self._stale and not self._running:
+            self._make_plan()
+
+    def _make_plan(self, draft: bool = False) -> None:
+        with self._alone:
+            if not draft:
+                self._show(planning=True)
+            planner = self.draft if draft else self._planner()
+            goal, number, plan = self.goal, self._view.wanted[3], None
+            self._put_down()
+            try:
+                plan = planner(self.world.depth_image(), self._pose[:2], goal)
+                self.controls.say(plan_in_words(plan))
+            finally:
+                self._begin(plan)
+                self._answered = number
+                self._stale = draft or goal is not self.goal
+                self._show(draft, planning=goal is not self.goal)
+
+    def _put_down(self) -> None:
+        if self._lifted:
+            self.world.park()
+            self._lifted = False
+        self._pose = self.world.object_pose()
+
+    def _begin(self, plan: Plan | None) -> None:
+        """Show a plan that begins with the object as it is."""
+        self.plan, self.outcome = plan, None
+        self._poses.clear()
+        self._paths.clear()
+        self._plan_pose, self._turn_from = self._pose, self._pose[2]
+
+    def _planner(self) -> Planner:
+        return self.planners[self.controls.planner.value]
+
+    # Execution
+
+    def _refuse_while_running(self) -> None:
+        if self._running:
+            raise RuntimeError("the robot is still at work; press Stop or wait")
+
+    def _set_running(self, running: bool) -> None:
+        self._running = running
+        self._stop.clear()
+        self.controls.set_running(running)
+
+    def _run(self, seconds_per_action: float) -> None:
+        """Execute the plan; a new one first, if that which is shown is not for here and now."""
+        done = 0
+
+        def report(plan=None):
+            nonlocal done
+            if plan is not None:
+                self._replace_plan(plan, done)
+                return self.goal
+            done += 1
+            self.controls.show_progress(done)
+            self._play(seconds_per_action)
+            while self._disturbances and not self._stop.is_set():
+                self._disturbances.pop(0)()
+            if self._stop.is_set():
+                raise Stopped
+            return self.goal
+
+        with self._alone:
+            on_step = self.world.on_step
+            try:
+                if self._stale or self.plan is None or self.outcome is not None:
+                    self._make_plan()
+                self.controls.show_progress(0, max(1, len(self.plan.steps)))
+                yaw, z = self.world.object_pose()[2], self.world.object_state()[2]
+                self.world.on_step = self._pose_log(on_step)
+                try:
+                    outcome, how = self._execute(report), "Done,"
+                    self.controls.show_progress(done, max(1, done))
+                except Stopped:
+                    at_rest = replace(self.plan, steps=())
+                    outcome, how = execute_plan(self.world, at_rest), "Stopped after"
+                turned = wrap_angle(self.world.object_pose()[2] - yaw)
+                lifted = self.world.object_state()[2] - z
+                outcome = replace(outcome.with_goal(self.goal), turned_rad=turned, lifted_m=lifted)
+                self.outcome, self._lifted = outcome, bool(self.goal.height_m)
+                if self.plan.goal == self.goal or outcome.distance_m <= self.goal.tolerance_m:
+                    self._stale = False  # it has followed a goal that was moved
+                self.controls.say(outcome_in_words(outcome, self.goal, how, done))
+            except Exception:
+                self.plan = None  # the next run plans from where this one ended
+                raise
+            finally:
+                self.world.on_step = on_step
+                self._disturbances.clear()
+                self._play(0.0)
+                self._pose = self.world.object_pose()
+                self._set_running(False)
+                self._show()
+
+    def _execute(self, report: Callable[..., Goal]) -> Outcome:
+        if self._stop.is_set():
+            raise Stopped
+        execute = self.executors[self.controls.executor.value]
+        return execute(self.world, self.plan, self._planner(), report)
+
+    def _replace_plan(self, plan: Plan, done: int) -> None:
+        """Show a plan that was made on the way, after so many actions."""
+        arrives = self.goal.distance_m(plan.predicted_end_xy_m) <= self.goal.tolerance_m
+        self.plan = plan = replace(plan, goal=self.goal, reaches_goal=arrives)
+        self._pose = self.world.object_pose()
+        self._plan_pose = (*plan.start_xy_m, self._pose[2])
+        self.controls.show_progress(done, done + len(plan.steps))
+        so_far = f"On the way, after {done} action{'s' * (done != 1)}."
+        self.controls.say(f"{so_far} {plan_in_words(plan)}")
+        self._show()
+
+    def _pose_log(self, also: Callable[[Tabletop], None] | None) -> Callable[[Tabletop], None]:
+        """A callback for the world's steps that logs the object's poses, beside another."""
+        steps = itertools.count()
+
+        def log(world):
+            if also is not None:
+                also(world)
+            if next(steps) % POSE_EVERY == 0:
+                self._poses.append(world.object_pose())
+
+        return log
+
+    def _play(self, seconds: float) -> None:
+        """Play what was logged since the last time, from the first move to the last."""
+        poses = np.array(self._poses).reshape(-1, 3)
+        self._poses.clear()
+        moves = np.flatnonzero(np.abs(np.diff(poses, axis=0)).max(axis=1, initial=0.0) > _MOVED)
+        if len(moves):
+            poses = poses[moves[0] : moves[-1] + 2]
+            drawn = (poses * (1000, -1000, -180 / np.pi)).round(2)
+            self._view.playback = {"poses": drawn.tolist(), "seconds": seconds}
+            self._stop.wait(seconds)
+            self._paths.append(poses[:, :2])
+            self._pose = tuple(poses[-1])
+
+    # Disturbances
+
+    def _disturb(self, disturbance: Callable[[], None]) -> None:
+        if self._running:
+            self._disturbances.append(disturbance)
+            return
+        with self._alone:
+            disturbance()
+            self._make_plan()
+
+    def _shove(self) -> None:
+        dx, dy = self._displacement(self.world.object_pose()[:2], 0.02, 0.04)
+        self.world.shove(dx, dy, float(self._rng.uniform(-0.5, 0.5)))
+        self._pose = self.world.object_pose()
+        self._poses.clear()
+        self._show()
+        self.controls.say(f"The object was shoved by {1000 * np.hypot(dx, dy):.0f} mm.")
+
+    def _move_goal(self) -> None:
+        by = self._displacement(self.goal.xy_m, 0.04, 0.08)
+        self._set_goal(replace(self.goal, xy_m=_whole_mm(self.goal.xy_m + by)))
+        self.controls.say(f"The goal was moved by {1000 * np.hypot(*by):.0f} mm.")
+
+    def _displacement(self, xy_m: tuple[float, float], least_m: float, most_m: float) -> np.ndarray:
+        """A random displacement (2,) [m] that stays in sight; from outside, one to the middle."""
+        for _ in range(100):
+            angle, far = self._rng.uniform(0, 2 * np.pi), self._rng.uniform(least_m, most_m)
+            by = far * np.array([np.cos(angle), np.sin(angle)])
+            if np.abs(np.add(xy_m, by)).max() < LIMIT_M:
+                return by
+        return -far * np.array(xy_m) / np.hypot(*xy_m)
+
+    # What is seen
 
     def _show(self, draft: bool = False, planning: bool = False) -> None:
-        self._view.scene = make_scene(
-            self.world.obj,
-            self._pose,
-            self._goal,
-            self.plan.steps if self.plan else (),
-            self._start,
-            self._turn_from,
-            self._walked,
-            HALF_WIDTH_M,
-            LIMIT_M,
-            answered=self._answered,
-            running=self._running,
-            draft=draft,
-            planning=planning,
-        )
+        obj, edge = self.world.obj, 1000 * HALF_WIDTH_M
+        x, y = to_mm(self.goal.xy_m)
+        limits = {"left": -1000 * LIMIT_M, "right": 1000 * LIMIT_M}
+        limits |= {"top": limits["left"], "bottom": limits["right"], "step": 1}
+        drawing = [
+            draw_ground(),
+            draw_object(obj, self._pose),
+            draw_plan(obj, self.plan.steps if self.plan else (), self._plan_pose),
+            *(draw_path(path, "truth") for path in self._paths),
+            '<polyline class="trail"/><g data-handle="goal">',
+            draw_goal(obj, self.goal, self._turn_from),
+            f'</g><text class="busy" y="{40 - edge}">{"planning …" * planning}</text>',
+        ]
+        self._view.scene = {
+            "inside": "".join(drawing),
+            "box": f"{-edge} {-edge} {2 * edge} {2 * edge}",
+            "handles": [{"name": "goal", "x": x, "y": y, "anywhere": True} | limits],
+            "answered": self._answered,
+            "running": self._running,
+            "draft": draft,
+            "planning": planning,
+        }
 
-    def picture(self) -> bytes:
-        """What is shown, as a PNG."""
-        return table_picture(self.world.obj, self._pose, self.plan, self.outcome, HALF_WIDTH_M)
+    def _file(self, name: str) -> Path:
+        """The file of a plan's name in the folder; raises ValueError for a name that leads out."""
+        if not name or name in (".", "..") or Path(name).name != name or "\\" in name:
+            raise ValueError(f"name must be a plain file name such as plan.json, got {name!r}")
+        return resolve_out_dir(self.folder) / name
 
 
-class PageQueue:
-    """A thread for what a page asks for, so that the next click is heard meanwhile.
-
-    say: is told, in words, what did not work; `last`: the future of what was asked for last.
-    """
-
-    def __init__(self, say: Callable[[str], None]) -> None:
-        self._say, self._thread = say, ThreadPoolExecutor(1)
-        self.last: Future | None = None
-
-    @staticmethod
-    def page_waits() -> bool:
-        """Whether this is called for a page, whose messages come by an event loop."""
-        try:
-            asyncio.get_running_loop()
-        except RuntimeError:
-            return False
-        return True
-
-    def do(self, action: Callable[[], None]) -> None:
-        """Do what is asked for: now in a script, for a page after all that it has asked before."""
-        if self.page_waits():
-            self.put(action)
-        else:
-            self.attempt(action)
-
-    def put(self, action: Callable[[], None], after_s: float = 0.0) -> None:
-        """Do it in the background, and not before so many seconds."""
-        if after_s:
-            timer = threading.Timer(after_s, self.put, [action])
-            timer.daemon = True
-            timer.start()
-        else:
-            self.last = self._thread.submit(self.attempt, action)
-
-    def attempt(self, action: Callable[[], None]) -> None:
-        """Do it now, and say what did not work."""
-        try:
-            action()
-        except Exception as error:
-            self._say(str(error) or type(error).__name__)
+def _whole_mm(xy_m: Any) -> tuple[float, float]:
+    """A position [m] to the nearest millimetre."""
+    x, y = np.round(xy_m, 3).tolist()
+    return x, y

@@ -1,33 +1,43 @@
-"""What stands beside the table of a goal picker: sliders, menus, buttons and words."""
+"""What stands beside the table of a goal picker: menus, sliders, buttons and words."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import ipywidgets as widgets
 
 from affordlib.primitives import wrap_angle
-from affordlib.types import Goal, Outcome, Plan, Step
+from affordlib.show.table_view import LIMIT_M, step_in_words
+from affordlib.types import Goal, Outcome, Plan
+
+_SLIDERS = {
+    "x [cm]": {"min": -100 * LIMIT_M, "max": 100 * LIMIT_M, "step": 0.1, "readout_format": ".1f"},
+    "y [cm]": {"min": -100 * LIMIT_M, "max": 100 * LIMIT_M, "step": 0.1, "readout_format": ".1f"},
+    "turn [°]": {"min": -90, "max": 90, "step": 5, "readout_format": ".0f"},
+    "lift [cm]": {"max": 20, "step": 0.5, "readout_format": ".1f"},
+}
 
 
-class PickerControls:
-    """The controls, which do nothing by themselves; lengths in cm, turns in degrees.
+class PickerControls(widgets.VBox):
+    """The controls, which do nothing alone; lengths in cm, turns in degrees, 0 for no matter.
 
-    planners, executors: the names to choose from. limit_m: how far from the middle a goal may be.
+    goal: shown first; planners, executors: the names to choose from; on_goal: is called with the
+    goal that a moved slider asks for.
     """
 
     def __init__(
-        self, goal: Goal, planners: Sequence[str], executors: Sequence[str], limit_m: float
+        self,
+        goal: Goal,
+        planners: Sequence[str],
+        executors: Sequence[str],
+        on_goal: Callable[[Goal], None],
     ) -> None:
-        limits = {"min": -100 * limit_m, "max": 100 * limit_m, "step": 0.1, "readout_format": ".1f"}
-        self.x = widgets.FloatSlider(description="x [cm]", **limits)
-        self.y = widgets.FloatSlider(description="y [cm]", **limits)
-        turns = {"min": -90, "max": 90, "step": 5, "readout_format": ".0f"}
-        self.turn = widgets.FloatSlider(description="turn [°]", **turns)
-        heights = {"max": 20, "step": 0.5, "readout_format": ".1f"}
-        self.height = widgets.FloatSlider(description="lift [cm]", **heights)
+        self.goal = goal
+        self.sliders = [widgets.FloatSlider(description=n, **s) for n, s in _SLIDERS.items()]
+        self.x, self.y, self.turn, self.height = self.sliders
         self.planner = widgets.Dropdown(options=list(planners), description="planner")
         self.executor = widgets.Dropdown(options=list(executors), description="carry out")
         self.run = _button("Run", "play", "Carry the plan out", button_style="primary")
@@ -40,41 +50,47 @@ class PickerControls:
         self.save, self.load = _button("Save", "save"), _button("Load", "folder-open")
         self.words = widgets.HTML()
         self.show(goal)
-
-    def box(self) -> widgets.VBox:
-        """All of them, one below the other."""
+        for slider in self.sliders:
+            slider.observe(lambda change: self._slid(change["owner"], on_goal), names="value")
         rows = [
             [self.planner],
             [self.executor],
-            [self.x],
-            [self.y],
-            [self.turn],
-            [self.height],
+            *([slider] for slider in self.sliders),
             [self.run, self.stop, self.progress],
             [widgets.Label("disturb"), self.shove, self.move_goal],
             [self.start_over],
             [self.name, self.save, self.load],
             [self.words],
         ]
-        return widgets.VBox([widgets.HBox(row) for row in rows])
+        super().__init__([widgets.HBox(row) for row in rows])
 
     def show(self, goal: Goal) -> None:
-        """Set the sliders to a goal."""
-        self.x.value, self.y.value = (round(100 * v, 1) for v in goal.xy_m)
-        self.turn.value = round(math.degrees(goal.turn_rad or 0.0), 1)
-        self.height.value = round(100 * (goal.height_m or 0.0), 1)
+        """Set the sliders to a goal, as near as they can show it."""
+        self.goal = goal
+        for slider, value in zip(self.sliders, self._shown(goal), strict=True):
+            slider.value = value
 
-    def place_m(self, goal: Goal, change: dict[str, Any]) -> tuple[float, float]:
-        """The place [m] that a moved slider asks for; the other may end before the goal does."""
-        x, y = goal.xy_m
-        moved = change["new"] / 100
-        return (moved, y) if change["owner"] is self.x else (x, moved)
+    def _shown(self, goal: Goal) -> list[float]:
+        turn_deg = math.degrees(goal.turn_rad or 0.0)
+        values = [*(100 * v for v in goal.xy_m), turn_deg, 100 * (goal.height_m or 0.0)]
+        return [
+            round(min(max(value, slider.min), slider.max), 1)
+            for slider, value in zip(self.sliders, values, strict=True)
+        ]
 
-    def pose(self, goal: Goal, change: dict[str, Any]) -> tuple[float, float]:
-        """The turn [°] and the height [cm] that a moved slider asks for, likewise."""
-        turn_deg, height_cm = math.degrees(goal.turn_rad or 0.0), 100 * (goal.height_m or 0.0)
-        is_turn = change["owner"] is self.turn
-        return (change["new"], height_cm) if is_turn else (turn_deg, change["new"])
+    def _slid(self, slider: widgets.FloatSlider, on_goal: Callable[[Goal], None]) -> None:
+        """Change that of the goal which the slider is for, unless it only shows what is so."""
+        k, value = self.sliders.index(slider), slider.value
+        if value == self._shown(self.goal)[k]:
+            return
+        x, y = self.goal.xy_m
+        change = [
+            {"xy_m": (round(value / 100, 3), y)},
+            {"xy_m": (x, round(value / 100, 3))},
+            {"turn_rad": math.radians(value) or None},
+            {"height_m": value / 100 or None},
+        ]
+        on_goal(replace(self.goal, **change[k]))
 
     def set_running(self, running: bool) -> None:
         """While the robot is at work, only what it listens to can be pressed."""
@@ -93,14 +109,10 @@ class PickerControls:
 
 
 def _button(name: str, icon: str, tooltip: str = "", **kwargs: Any) -> widgets.Button:
+    layout = {"width": "auto"}
     return widgets.Button(
-        description=name, icon=icon, tooltip=tooltip or name, layout={"width": "auto"}, **kwargs
+        description=name, icon=icon, tooltip=tooltip or name, layout=layout, **kwargs
     )
-
-
-def step_in_words(step: Step) -> str:
-    """Which primitive, and to which share of its phase."""
-    return f"{step.primitive.name.replace('_', ' ')} to {100 * step.stop_phase:.0f} %"
 
 
 def plan_in_words(plan: Plan) -> str:
@@ -108,7 +120,7 @@ def plan_in_words(plan: Plan) -> str:
     steps = ", then ".join(step_in_words(step) for step in plan.steps) or "stay"
     arrives = "" if plan.reaches_goal else " It does not arrive."
     if not plan.reaches_goal and plan.predicted_distance_m <= plan.goal.tolerance_m:
-        arrives = " It arrives, but is not foreseen to be turned or lifted there as the goal asks."
+        arrives = " It arrives, but is not predicted to be turned or lifted as the goal asks."
     std_m = plan.steps[-1].std_m if plan.steps else math.nan
     unsure = "" if math.isnan(std_m) else f" (σ of the last step {1000 * std_m:.1f} mm)"
     return (

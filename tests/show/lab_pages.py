@@ -179,11 +179,17 @@ class Table:
 
     def points(self, selector):
         """(n, 2) [m]: the corners of all that is drawn with a class."""
-        lists = self.svg.locator(selector).evaluate_all(
-            "all => all.map((e) => e.getAttribute('points'))"
+        corners = self.svg.locator(selector).evaluate_all(
+            """all => all.flatMap((shape) => {
+                const screen = shape.ownerSVGElement.getScreenCTM().inverse();
+                const inPicture = screen.multiply(shape.getScreenCTM());
+                return [...shape.points].map((corner) => {
+                    const {x, y} = corner.matrixTransform(inPicture);
+                    return [x, y];
+                });
+            })"""
         )
-        numbers = [pair.split(",") for text in lists for pair in (text or "").split()]
-        return np.array(numbers, dtype=float).reshape(-1, 2) * [1e-3, -1e-3]
+        return np.array(corners, dtype=float).reshape(-1, 2) * [1e-3, -1e-3]
 
     def goal(self):
         return self.points(".goal").mean(axis=0)

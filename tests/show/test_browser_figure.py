@@ -5,7 +5,7 @@ import time
 import nbformat
 import pytest
 
-from tests.lab_pages import ask, in_a_browser, opened, picture, serve
+from tests.show.lab_pages import ask, in_a_browser, opened, picture, serve
 
 pytestmark = in_a_browser
 
@@ -37,24 +37,36 @@ def page(tmp_path_factory):
     nbformat.write(notebook, folder / "dragged.ipynb")
     with (
         serve(folder, "dragged", source=folder / "dragged.ipynb") as lab,
-        opened(lab, shows=".affordlib-figure >> nth=1") as page,
+        opened(lab, shows=".affordlib-drawing img >> nth=1") as page,
     ):
         yield page
 
 
+def handle_of(page, widget, name):
+    """A handle in the figure, in shares of its width and height, and the phase where it is."""
+    k = ask(page, f"[name for _, name, *_ in {widget}._handles]").index(name)
+    scene = ask(page, f"{widget}._drawing.scene")
+    width, height = map(float, scene["box"].split()[2:])
+    at = scene["handles"][k]
+    y = (at["top"] + at["bottom"]) / 2 if at["y"] is None else at["y"]
+    phase = (at["x"] - at["left"]) / (at["right"] - at["left"])
+    return at["left"] / width, at["right"] / width, y / height, phase
+
+
 def drag(page, widget, name, phase):
     """Take a handle of a figure by mouse to a phase; what is drawn before and after."""
-    figure = page.locator(".affordlib-figure img").nth(["explorer", "slider"].index(widget))
+    figure = page.locator(".affordlib-drawing img").nth(["explorer", "slider"].index(widget))
     figure.scroll_into_view_if_needed()
     before, box = figure.get_attribute("src"), figure.bounding_box()
-    handles = ask(page, f"{widget}._image.handles")
-    handle = next(h for h in handles if h["name"] == name)
-    y = handle["y"] or (handle["top"] + handle["bottom"]) / 2
-    x = handle["left"] + phase * (handle["right"] - handle["left"])
-    place = [(box["x"] + u * box["width"], box["y"] + y * box["height"]) for u in (handle["x"], x)]
-    page.mouse.move(*place[0])
+    left, right, y, now = handle_of(page, widget, name)
+    start, end = (
+        (box["x"] + (left + at * (right - left)) * box["width"], box["y"] + y * box["height"])
+        for at in (now, phase)
+    )
+    page.mouse.move(*start)
     page.mouse.down()
-    page.mouse.move(*place[1], steps=6)
+    page.mouse.move(*end, steps=6)
+    picture(page, f"figure_{name.replace(' ', '_')}_held")
     page.mouse.up()
     return figure, before
 
@@ -80,11 +92,9 @@ def test_observations_are_dragged_in_the_figure(page, name, phase, told):
     assert comes_true(lambda: ask(page, told) == pytest.approx(phase, abs=0.011))
     assert comes_true(lambda: figure.get_attribute("src") != before)
 
-    def shares():  # in the figure of x as in that of y
-        handles = [h for h in ask(page, "explorer._image.handles") if h["name"] == name]
-        return [(h["x"] - h["left"]) / (h["right"] - h["left"]) for h in handles]
-
-    assert comes_true(lambda: shares() == pytest.approx([phase, phase], abs=0.011))
+    assert comes_true(
+        lambda: handle_of(page, "explorer", name)[3] == pytest.approx(phase, abs=0.011)
+    )
     picture(page, f"figure_{name.replace(' ', '_')}")
 
 
@@ -96,10 +106,10 @@ def test_the_line_of_the_phase_slider_is_dragged(page):
 
 
 def test_beside_the_handles_nothing_is_dragged(page):
-    before = ask(page, "slider._image.dragged")
-    box = page.locator(".affordlib-figure img").nth(1).bounding_box()
+    before = ask(page, "slider._drawing.wanted")
+    box = page.locator(".affordlib-drawing img").nth(1).bounding_box()
     page.mouse.move(box["x"] + 5, box["y"] + 5)
     page.mouse.down()
     page.mouse.move(box["x"] + 200, box["y"] + 50, steps=4)
     page.mouse.up()
-    assert ask(page, "slider._image.dragged") == before
+    assert ask(page, "slider._drawing.wanted") == before

@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 from affordlib.paths import repo_root
-from tests.lab_pages import (
+from tests.show.lab_pages import (
     WIDGET,
     Table,
     ask,
@@ -59,9 +59,9 @@ def test_disturbed_while_it_works_it_still_arrives(page, lab):
     wait_for_words(page, "from the goal, within")
     last = table.points(".plan .prediction")  # of the plan that it has come to in the end
     assert first.shape != last.shape or not np.allclose(first, last)
-    np.testing.assert_allclose(last[-1], ask(page, "list(picker._goal.xy_m)"), atol=0.005)
+    np.testing.assert_allclose(last[-1], ask(page, "list(picker.goal.xy_m)"), atol=0.005)
     assert hosts(page) == {urlparse(lab.address).netloc}
-    there = ask(page, "list(picker._goal.xy_m)")
+    there = ask(page, "list(picker.goal.xy_m)")
     assert 0.039 < np.hypot(*np.subtract(there, goal)) < 0.081
     assert ask(page, "picker.outcome.distance_m") < 0.005
     np.testing.assert_allclose(table.points(".object").mean(axis=0), there, atol=0.006)

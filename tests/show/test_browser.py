@@ -8,7 +8,7 @@ from urllib.parse import urlparse
 import numpy as np
 import pytest
 
-from tests.lab_pages import (
+from tests.show.lab_pages import (
     PICTURES,
     WIDGET,
     Table,
@@ -181,7 +181,7 @@ def test_a_closed_loop_follows_a_goal_that_moves(page, table):
     page.mouse.click(*table.at(0.1, 0.16))
     wait_for_words(page, "from the goal, within")
     assert ask(page, "picker.outcome.distance_m") < 0.01
-    goal = ask(page, "picker._goal.xy_m")
+    goal = ask(page, "picker.goal.xy_m")
     assert goal == pytest.approx((0.1, 0.16), abs=0.0011)
     np.testing.assert_allclose(table.points(".object").mean(axis=0), goal, atol=0.011)
     picture(page, "6_closed_loop")
@@ -298,10 +298,10 @@ def test_turn_and_lift(page, table):
         for _ in range(presses):
             page.keyboard.press(key)
     asked = [pytest.approx(np.radians(30)), pytest.approx(0.05)]
-    wait_until(lambda: ask(page, "[picker._goal.turn_rad, picker._goal.height_m]") == asked)
+    wait_until(lambda: ask(page, "[picker.goal.turn_rad, picker.goal.height_m]") == asked)
     wait_for_words(page, "then grasp to")
-    wanted, foreseen = table.points(".wanted"), table.points(".foreseen")
-    np.testing.assert_allclose(foreseen, wanted, atol=0.021)  # placed and turned alike
+    wanted, predicted = table.points(".wanted"), table.points(".predicted")
+    np.testing.assert_allclose(predicted, wanted, atol=0.021)  # placed and turned alike
     assert page.locator(".affordlib-table .step").last.text_content().endswith("%")
     picture(page, "7_turn_and_lift")
     choose(page, "closed loop")
@@ -341,7 +341,7 @@ def test_run_waits_for_the_plan_of_what_is_shown(page, table):
     wait_for_words(page, "the object rests")
     assert ask(page, "list(picker.outcome.plan.goal.xy_m)") == pytest.approx([-0.1, 0.08], abs=2e-3)
     assert ask(page, "picker.outcome.plan.planner").startswith("gradient")
-    np.testing.assert_allclose(table.goal(), ask(page, "list(picker._goal.xy_m)"), atol=1e-4)
+    np.testing.assert_allclose(table.goal(), ask(page, "list(picker.goal.xy_m)"), atol=1e-4)
     choose(page, "continuous")
     button(page, "Start over").click()
     table.wait_for_answer()

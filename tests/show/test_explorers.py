@@ -30,12 +30,12 @@ def explorer(trained, push):
 
 
 def test_a_stop_leaves_the_object_where_the_slider_said(slider):
-    before = slider._image.value
+    before = slider.picture()
     slider._stop.click()
     expected = slider.expected(0.8)
     assert np.hypot(*(expected[:2] - slider.rest[0.8][:2])) < 1e-3
     assert np.hypot(*(expected[:2] - (0.02, -0.01))) > 0.03
-    assert slider._image.value != before
+    assert slider.picture() != before
     assert "Stopped there, it rests <b>" in slider._words.value
     slider._phase.value = 0.3
     assert "has moved 0.0 cm" in slider._words.value
@@ -44,7 +44,7 @@ def test_a_stop_leaves_the_object_where_the_slider_said(slider):
 
 
 @pytest.mark.slow
-def test_what_is_observed_decides_what_is_foreseen(explorer, trained, push):
+def test_what_is_observed_decides_what_is_predicted(explorer, trained, push):
     alone = explorer.prediction.effect_mean
     told = condition_on_primitives(trained, [push.primitive])
     t = torch.linspace(0, 1, 101)[None]
@@ -62,10 +62,10 @@ def test_what_is_observed_decides_what_is_foreseen(explorer, trained, push):
 
 
 def test_with_nothing_observed_it_says_so(explorer):
-    before = explorer._image.value
+    before = explorer.picture()
     explorer._has_action.value = False
     assert "<b>ValueError</b>: nothing is observed" in explorer._words.value
-    assert explorer._image.value == before
+    assert explorer.picture() == before
 
 
 @pytest.mark.parametrize("name", ["slider", "explorer"])
@@ -76,30 +76,32 @@ def test_saved_widgets_leave_their_pictures(name, request):
 
 def test_what_can_be_dragged_is_where_it_is_drawn(explorer):
     explorer.observe_at((0.25, 0.75), effect_t=0.9, weight=0.5)
-    handles = explorer._image.handles
-    names = ["first action", "second action", "effect"]
-    assert [h["name"] for h in handles] == names[:2] * 2 + names[2:] * 2
-    pixels = np.asarray(Image.open(io.BytesIO(explorer._image.value)).convert("L"))
+    handles = explorer._drawing.scene["handles"]
+    points = ["first action", "second action", "effect"]
+    assert [h[1] for h in explorer._handles] == points[:2] * 2 + points[2:] * 2
+    pixels = np.asarray(Image.open(io.BytesIO(explorer.picture())).convert("L"))
     for handle in handles:
-        row = int(handle["y"] * pixels.shape[0])
-        column = int(handle["x"] * pixels.shape[1])
-        assert pixels[row, column] < 30  # black
-        assert handle["top"] < handle["y"] < handle["bottom"]
+        assert pixels[int(handle["y"]), int(handle["x"])] < 30  # black
 
 
 def test_dragging_is_moving_a_slider(explorer, slider):
+    def drag(widget, point, phase):
+        k = [name for _, name, _, _ in widget._handles].index(point)
+        handle = widget._drawing.scene["handles"][k]
+        x = handle["left"] + phase * (handle["right"] - handle["left"])
+        widget._drawing.wanted = [str(k), x, handle["top"], 1]
+        return handle
+
     explorer.observe_at((0.25, 0.75), effect_t=0.9, weight=0.5)
-    for name, phase in (("first action", 0.4), ("effect", 0.6), ("second action", 0.2)):
-        explorer._image.dragged = [name, phase, 1]
+    for point, phase in (("first action", 0.4), ("effect", 0.6), ("second action", 0.2)):
+        drag(explorer, point, phase)
     # One end of an action never passes the other.
     assert explorer._action_t.value == pytest.approx((0.4, 0.4))
     assert explorer._effect_t.value == pytest.approx(0.6)
-    (line,) = slider._image.handles
-    assert line["y"] is None
-    slider._image.dragged = ["phase", 0.65, 1]
+    before = drag(slider, "phase", 0.65)
+    assert before["y"] is None
     assert slider.phase == 0.65
-    (moved,) = slider._image.handles
-    assert moved["x"] < line["x"]
+    assert slider._drawing.scene["handles"][0]["x"] < before["x"]
 
 
 def test_what_is_set_together_is_drawn_once(explorer, monkeypatch):

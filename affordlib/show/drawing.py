@@ -1,0 +1,157 @@
+"""What the widgets are made of: a drawing with handles, and figures with controls and handles.
+
+Everything they need is in this package; nothing is fetched from anywhere.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import anywidget
+import ipywidgets as widgets
+import numpy as np
+import traitlets
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from PIL import Image
+
+DPI = 90
+_HERE = Path(__file__).parent
+
+
+class Drawing(anywidget.AnyWidget):
+    """Shows a picture and over it an SVG drawing whose handles can be dragged.
+
+    picture: a data URL, or empty. scene: {"inside": what is in the SVG; "box": its viewBox;
+    "handles": of each the name of the element (`data-handle`) that it moves, x and y (None: any),
+    the range left, right, top, bottom and the step of its places, and if it can be grabbed
+    anywhere; "answered": the number of the last place that this takes account of; "running":
+    whether a movement is played on; "draft", "planning": whether a better one follows, is made}.
+    playback: {"poses": [[x, y, degrees], …], "seconds"} of the element .object, played when set.
+    wanted: [name, x, y, number], the number growing, where a handle is wanted. keyboard: whether
+    arrow keys move the first handle, and Enter and Escape send {"press": "run"} and "stop".
+    """
+
+    _esm = _HERE / "drawing.js"
+    _css = _HERE / "drawing.css"
+    label = traitlets.Unicode().tag(sync=True)
+    keyboard = traitlets.Bool(False).tag(sync=True)
+    picture = traitlets.Unicode().tag(sync=True)
+    scene = traitlets.Dict().tag(sync=True)
+    playback = traitlets.Dict().tag(sync=True)
+    wanted = traitlets.List(["", 0.0, 0.0, 0]).tag(sync=True)
+
+
+class WithPicture:
+    """Before a class of ipywidgets: a saved notebook shows its picture where there is no kernel."""
+
+    def picture(self) -> bytes:
+        """What is shown, as a PNG; empty where there is nothing yet."""
+        raise NotImplementedError
+
+    def _repr_mimebundle_(self, **kwargs: object) -> dict[str, object]:
+        bundle = super()._repr_mimebundle_(**kwargs) | {"text/plain": type(self).__name__}
+        if picture := self.picture():
+            bundle["image/png"] = base64.b64encode(picture).decode()
+        return bundle
+
+
+class FigureWidget(WithPicture, widgets.VBox):
+    """Controls above a figure and a line of words below; errors are shown in that line.
+
+    A subclass draws in `draw(figure)`, which returns the words (HTML), and calls `add_handle` for
+    what can be moved by hand; `drag(name, phase)` then does what a control does.
+    """
+
+    figsize = (10.0, 3.6)
+
+    def __init__(self, controls: Sequence[widgets.Widget]) -> None:
+        label = "Drag what is marked in the figure, or move the controls above it."
+        layout = {"width": f"{DPI * self.figsize[0]:.0f}px", "max_width": "100%"}
+        self._drawing = Drawing(label=label, layout=layout)
+        self._drawing.observe(self._dragged, names="wanted")
+        self._handles: list[tuple[Axes, str, float, float | None]] = []
+        self._words = widgets.HTML()
+        self._png = b""
+        self._waits = False
+        for control in controls:
+            control.observe(lambda _: self.refresh(), names="value")
+        row = widgets.HBox(list(controls), layout={"flex_flow": "row wrap"})
+        super().__init__([row, self._drawing, self._words])
+        self.refresh()
+
+    def draw(self, figure: Figure) -> str:
+        """Draw what the controls say into an empty figure; return it in words."""
+        raise NotImplementedError
+
+    def drag(self, name: str, phase: float) -> None:
+        """Move a handle to a phase."""
+        raise NotImplementedError
+
+    def add_handle(self, ax: Axes, name: str, phase: float, y: float | None = None) -> None:
+        """Offer to the hand a point of axes over the phase, or with y None a vertical line."""
+        self._handles.append((ax, name, phase, y))
+
+    def set_controls(self, values: dict[widgets.Widget, Any]) -> None:
+        """Set the values of controls, and draw once."""
+        self._waits = True
+        try:
+            for control, value in values.items():
+                control.value = value
+        finally:
+            self._waits = False
+            self.refresh()
+
+    def refresh(self) -> None:
+        """Draw the figure again."""
+        if self._waits:
+            return
+        # A figure of its own, outside pyplot: no window, nothing to close.
+        figure = Figure(figsize=self.figsize, dpi=DPI, layout="constrained")
+        canvas = FigureCanvasAgg(figure)
+        self._handles.clear()
+        try:
+            words = self.draw(figure)
+        except Exception as error:
+            words = f"<b>{type(error).__name__}</b>: {html.escape(str(error))}"
+        else:
+            # `savefig` would draw everything twice, once for the layout.
+            canvas.draw()
+            buffer = io.BytesIO()
+            Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB").save(buffer, "png")
+            self._png = buffer.getvalue()
+            with self._drawing.hold_sync():
+                self._drawing.scene = self._scene(*canvas.get_width_height())
+                url = base64.b64encode(self._png).decode()
+                self._drawing.picture = f"data:image/png;base64,{url}"
+        self._words.value = f"<div role='status' aria-live='polite'>{words}</div>"
+
+    def picture(self) -> bytes:
+        """What is shown, as a PNG."""
+        return self._png
+
+    def _scene(self, width: int, height: int) -> dict[str, Any]:
+        """The handles in pixels from the upper left corner, a hundred places over the phase."""
+        handles, rings = [], ""
+        for k, (ax, _, phase, y) in enumerate(self._handles):
+            x, left, right = ax.transData.transform([(t, y or 0) for t in (phase, 0, 1)])
+            handle = {"name": str(k), "x": x[0], "left": left[0], "right": right[0]}
+            handle |= {"y": None, "top": height - ax.bbox.y1, "bottom": height - ax.bbox.y0}
+            if y is not None:
+                handle["y"] = handle["top"] = handle["bottom"] = height - x[1]
+            handles.append(handle | {"step": (right[0] - left[0]) / 100})
+            rings += f'<circle class="hand" data-handle="{k}" r="8"/>'
+        box, answered = f"0 0 {width} {height}", self._drawing.wanted[3]
+        return {"inside": rings, "box": box, "handles": handles, "answered": answered}
+
+    def _dragged(self, change: dict[str, Any]) -> None:
+        k, x, _, _ = change["new"]
+        handle = self._drawing.scene["handles"][int(k)]
+        phase = (x - handle["left"]) / (handle["right"] - handle["left"])
+        self.drag(self._handles[int(k)][1], round(phase, 2))

@@ -1,0 +1,431 @@
+import base64
+import io
+import math
+import time
+from dataclasses import replace
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from affordlib.interactions import open_interactions
+from affordlib.plan_files import load_plan
+from affordlib.planning import Skills, execute_plan, plan_astar, plan_continuous
+from affordlib.show import GoalPicker, goal_picker
+from affordlib.show.drawing import Drawing
+from affordlib.show.executors import closed_loop, open_loop
+from affordlib.types import Goal
+from affordlib.world import BASE_X_M, REACH_M, Cuboid
+from tests.problems import problem_of
+
+
+@pytest.fixture
+def planned_for():
+    """Positions of the goals that A* has planned for."""
+    return []
+
+
+@pytest.fixture
+def make_picker(world, trained, planned_for, tmp_path):
+    world.place(Cuboid(0.06, 0.05, 0.05))
+
+    def astar(*query):
+        planned_for.append(query[2].xy_m)
+        return plan_astar(problem_of(trained, *query))
+
+    def broken(*_):
+        raise ValueError("no <plan> today")
+
+    def make(seconds_per_action=0.0, **options):
+        planners = options.pop("planners", {"A*": astar, "broken": broken})
+        goal = options.pop("goal_xy_m", (0.12, 0.0))
+        picker = GoalPicker(world, planners, goal, folder=str(tmp_path), **options)
+        picker.seconds_per_action = seconds_per_action
+        return picker
+
+    return make
+
+
+@pytest.fixture
+def picker(make_picker):
+    return make_picker()
+
+
+@pytest.fixture
+def posed(make_picker, skills):
+    """A picker whose plans turn and lift."""
+    planners = {"continuous": skills.planner(plan_continuous)}
+    executors = {"open loop": open_loop, "closed loop": closed_loop(skills)}
+    return make_picker(planners=planners, executors=executors)
+
+
+def wait_until(condition, seconds=20.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.005)
+
+
+def want(picker, x_m, y_m, number):
+    """The hand puts the goal somewhere."""
+    picker._view.wanted = ["goal", 1000 * x_m, -1000 * y_m, number]
+
+
+def in_time(picker):
+    """What is done when all that was asked for before is done."""
+    picker._queue.submit(int).result(60)
+    return picker
+
+
+def shapes(picker, css):
+    """All that is drawn with a class."""
+    drawing = ElementTree.fromstring(f"<svg>{picker._view.scene['inside']}</svg>")
+    return [e for e in drawing.iter() if css in e.get("class", "").split()]
+
+
+def corners(picker, css):
+    """(n, 2) [m]: the corners of all that is drawn with a class."""
+    pairs = [p.split(",") for e in shapes(picker, css) for p in e.get("points").split()]
+    return np.array(pairs, dtype=float).reshape(-1, 2) * [1e-3, -1e-3]
+
+
+def drawn_goal(picker):
+    (goal,) = picker._view.scene["handles"]
+    return goal["x"] / 1000, -goal["y"] / 1000
+
+
+def test_a_picked_goal_is_planned_for_drawn_and_reached(picker, world):
+    picker.pick(0.05, 0.12)
+    plan = picker.plan
+    assert plan.goal.xy_m == drawn_goal(picker) == (0.05, 0.12)
+    paths = np.vstack([step.predicted_path_xy_m for step in plan.steps])
+    np.testing.assert_allclose(corners(picker, "prediction"), paths, atol=1e-5)
+    for arrow, step in zip(shapes(picker, "arrow"), plan.steps, strict=True):
+        assert f"rotate({-math.degrees(step.primitive.direction_rad):.2f})" in arrow.get(
+            "transform"
+        )
+    said = [shape.text for shape in shapes(picker, "step")]
+    assert all(
+        f"push to {100 * s.stop_phase:.0f} %" in t for s, t in zip(plan.steps, said, strict=True)
+    )
+    radii = [float(disc.get("r")) for disc in shapes(picker, "sigma")]
+    assert radii == pytest.approx([20_000 * step.std_m for step in plan.steps], abs=0.01)
+    picker.run()
+    outcome = picker.outcome
+    assert outcome.distance_m == plan.goal.distance_m(world.object_pose()[:2])
+    assert "mm</b> from the goal" in picker.controls.words.value
+    assert not picker.controls.run.disabled
+    np.testing.assert_allclose(corners(picker, "truth")[-1], world.object_pose()[:2], atol=1e-3)
+    picker.start_over()
+    assert world.object_pose() == pytest.approx((0, 0, 0), abs=1e-12)
+    plain = execute_plan(world, plan)  # gives what the picker gave, to the last bit
+    assert outcome.end_pose == plain.end_pose
+    for a, b in zip(outcome.object_paths_xy_m, plain.object_paths_xy_m, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_what_the_hand_wants_is_planned_for_once(picker, planned_for):
+    before = len(planned_for)
+    for number, xy in enumerate([(0.081, 0.033), (0.081, 0.033), (-0.05, 0.1234)], 1):
+        want(picker, *xy, number)
+        assert in_time(picker)._view.scene["answered"] == number
+    wanted = [(0.081, 0.033), (0.081, 0.033), (-0.05, 0.123)]
+    assert planned_for[before:] == wanted  # once each: no slider has echoed
+    assert (picker.controls.x.value, picker.controls.y.value) == (-5.0, 12.3)
+    picker.controls.x.value = 7.7
+    assert in_time(picker).plan.goal.xy_m == drawn_goal(picker) == (0.077, 0.123)
+
+
+def test_a_draft_until_the_hand_rests(make_picker, planned_for, trained, monkeypatch):
+    monkeypatch.setattr(goal_picker, "REST_S", 1.0)
+
+    def draft(*query):
+        return replace(plan_astar(problem_of(trained, *query)), planner="draft")
+
+    def show_a_draft(x_m, number):
+        want(picker, x_m, 0.03, number)
+        wait_until(lambda: picker._view.scene["answered"] == number)
+        assert picker.plan.planner == "draft"
+        assert picker._view.scene["draft"]
+
+    picker = make_picker(draft=draft)
+    assert picker.plan.planner == "astar"  # nobody is in a hurry
+    planned_for.clear()
+    for number, x in enumerate((0.08, 0.09, 0.10), 1):
+        show_a_draft(x, number)
+    assert planned_for == []
+    assert in_time(picker).plan.planner == "astar"
+    assert planned_for == [(0.10, 0.03)]  # once, where the hand came to rest
+    assert not picker._view.scene["draft"]
+    show_a_draft(0.07, 4)
+    picker.run()  # what is executed is the plan
+    assert picker.plan.planner == picker.outcome.plan.planner == "astar"
+    show_a_draft(0.08, 5)
+    picker.save()
+    assert load_plan(f"{picker.folder}/plan.json").planner == "astar"
+    show_a_draft(0.09, 6)
+    picker.load()
+    assert in_time(picker).goal.xy_m[0] == 0.08  # no plan for a goal that was left comes late
+
+
+def test_run_waits_for_the_plan_of_the_goal_that_is_shown(make_picker, trained):
+    """Two clicks and Run, faster than the planner: what runs is the plan of the second."""
+    began = []
+
+    def slow(*query):
+        began.append(query[2].xy_m)
+        time.sleep(0.3)
+        return plan_astar(problem_of(trained, *query))
+
+    picker = make_picker(draft=lambda *query: plan_astar(problem_of(trained, *query)))
+    picker.planners["A*"] = slow
+    want(picker, 0.08, 0.03, 1)
+    wait_until(lambda: began)
+    want(picker, -0.09, 0.05, 2)
+    assert picker._view.scene["planning"]
+    picker.controls.run.click()
+    picker.controls.run.click()  # a second press does nothing
+    in_time(picker)
+    assert began[-1] == picker.plan.goal.xy_m == picker.outcome.plan.goal.xy_m == (-0.09, 0.05)
+    assert picker.outcome.distance_m == picker.goal.distance_m(picker.world.object_pose()[:2])
+    assert "rests" in picker.controls.words.value
+    assert not picker._view.scene["planning"]
+
+
+def test_the_picker_shows_its_errors(picker, tmp_path):
+    picker.controls.planner.value = "broken"
+    assert "did not work:</b> no &lt;plan&gt; today" in in_time(picker).controls.words.value
+    assert shapes(picker, "step") == []
+    with pytest.raises(ValueError, match="off the table"):
+        picker.pick(5.0, 0.0)
+    with pytest.raises(RuntimeError, match="no plan to save"):
+        picker.save()
+    picker.controls.name.value = "nosuch.json"
+    picker.controls.load.click()
+    assert "there is no plan " in in_time(picker).controls.words.value
+    (tmp_path / "bad.json").write_text("{")
+    with pytest.raises(ValueError, match="holds no plan"):
+        picker.load("bad.json")
+    picker.controls.planner.value = "A*"
+    assert in_time(picker).controls.words.value.count("Plan: ") == 1
+    assert shapes(picker, "step")
+
+
+@pytest.mark.parametrize("name", ["../x.json", "/tmp/x.json", "sub/y.json", "", ".", "..\\x"])
+def test_plans_stay_in_their_folder(picker, name):
+    for act in (picker.save, picker.load):
+        with pytest.raises(ValueError, match="plain file name"):
+            act(name)
+
+
+def test_stop_lets_an_action_end_and_begins_no_other(make_picker, world):
+    picker = make_picker(seconds_per_action=30.0)
+    picker.pick(0.24, 0.0)
+    assert len(picker.plan.steps) > 1
+    first = picker.plan.steps[0].predicted_end_xy_m
+    picker.controls.run.click()
+    wait_until(lambda: picker.controls.progress.value == 1)
+    assert picker.controls.stop.disabled is False
+    assert picker.controls.run.disabled
+    with pytest.raises(RuntimeError, match="still at work"):
+        picker.run()
+    picker.shove_object()
+    picker.controls.stop.click()
+    assert "Stopped after 1 action:" in in_time(picker).controls.words.value
+    assert math.dist(world.object_pose()[:2], first) < 0.03
+    assert not picker.controls.run.disabled
+    # What waited when the robot stopped does not wait for the next run.
+    picker.pick(*(0.05 + v for v in world.object_pose()[:2]))
+    picker.run()
+    assert picker.outcome.distance_m < 0.03, picker.controls.words.value
+
+
+def test_a_run_can_be_watched(make_picker):
+    picker = make_picker(seconds_per_action=0.2)
+    played = []
+    picker._view.observe(lambda change: played.append(change["new"]), names="playback")
+    picker._view._handle_custom_msg({"press": "run"}, [])
+    in_time(picker)
+    assert [movement["seconds"] for movement in played] == [0.2] * len(picker.plan.steps)
+    poses = np.vstack([movement["poses"] for movement in played]) / (1000, -1000, -180 / np.pi)
+    assert len(poses) > 20
+    assert np.hypot(*np.diff(poses[:, :2], axis=0).T).max() < 0.03
+    np.testing.assert_allclose(poses[-1], picker.outcome.end_pose, atol=2e-3)
+    assert picker.world.on_step is None
+
+
+def test_a_disturbance_waits_for_the_end_of_the_action(make_picker, world):
+    seen = []
+
+    def executor(world, plan, planner, report):
+        before = world.object_pose()
+        picker.shove_object()
+        picker.move_goal()
+        assert world.object_pose() == before
+        goal = report()
+        seen.append((before, world.object_pose(), goal))
+        plan = planner(world.depth_image(), world.object_pose()[:2], goal)
+        return open_loop(world, plan, planner, report)
+
+    picker = make_picker(executors={"mine": executor}, seed=3)
+    first_goal = picker.plan.goal
+    picker.run()
+    (before, after, goal) = seen[0]
+    assert 0.019 < math.dist(before[:2], after[:2]) < 0.041
+    assert 0.039 < math.dist(first_goal.xy_m, goal.xy_m) < 0.081
+    assert drawn_goal(picker) == goal.xy_m
+    assert picker.outcome.distance_m == pytest.approx(goal.distance_m(world.object_pose()[:2]))
+
+
+def test_disturbances_are_seeded_and_planned_for(make_picker, world):
+    ends = []
+    for seed in (1, 1, 2):
+        picker = make_picker(seed=seed)
+        picker.controls.shove.click()
+        ends.append(in_time(picker).world.object_pose())
+        assert picker.plan.start_xy_m == ends[-1][:2]
+        picker.move_goal()
+        assert picker.plan.goal.xy_m != (0.12, 0.0)
+        picker.start_over()
+        assert picker.plan.start_xy_m == pytest.approx((0.0, 0.0), abs=1e-12)
+    assert ends[0] == ends[1] != ends[2]
+
+
+@pytest.mark.slow
+def test_a_closed_loop_replans_where_an_open_loop_does_not(make_picker, trained):
+    """A goal that moves and a shove after the first action."""
+    skills, error_m, shown = Skills({"push": trained}), {}, []
+    for name, executor in {"open loop": open_loop, "closed loop": closed_loop(skills)}.items():
+        picker = make_picker(executors={name: executor}, seed=5)
+        picker.planners["A*"] = skills.planner(plan_astar)
+        picker.pick(0.2, 0.0)
+        first = corners(picker, "prediction")
+        picker._view.observe(lambda change: shown.append(change["new"]), names="scene")
+        picker._disturbances += [picker._move_goal, picker._shove]  # as if asked for meanwhile
+        picker.run()
+        goal = picker.goal
+        error_m[name] = picker.outcome.distance_m
+        assert error_m[name] == pytest.approx(goal.distance_m(picker.world.object_pose()[:2]))
+        if name == "closed loop":
+            handles = [scene["handles"][0] for scene in shown]
+            assert goal.xy_m in [(at["x"] / 1000, -at["y"] / 1000) for at in handles]
+            assert picker.plan.goal.xy_m == goal.xy_m != (0.2, 0.0)
+            assert picker.plan.planner == "astar"  # as the reader chose
+            last = corners(picker, "prediction")
+            assert last.shape != first.shape or np.abs(last - first).max() > 0.01
+            assert math.dist(last[-1], goal.xy_m) < 0.005
+        picker.start_over()
+    assert error_m["closed loop"] < 0.01 < 0.03 < error_m["open loop"]
+
+
+def test_a_planner_that_does_not_know_the_arm_gives_way_and_it_is_said(make_picker, trained):
+    picker = make_picker(executors={"closed loop": closed_loop(Skills({"push": trained}))})
+    picker.run()
+    assert picker.plan.planner == "continuous"
+    assert "replanned by continuous search" in picker.controls.words.value
+
+
+def test_after_a_failed_run_the_next_plan_is_from_where_it_ended(make_picker):
+    def fails(world, plan, planner, report):
+        execute_plan(world, replace(plan, steps=plan.steps[:1]))
+        raise ValueError("the arm is stuck")
+
+    picker = make_picker(executors={"fails": fails, "open loop": open_loop})
+    picker.pick(0.2, 0.0)
+    with pytest.raises(ValueError, match="stuck"):
+        picker.run()
+    assert picker.plan is None
+    picker.controls.executor.value = "open loop"
+    picker.run()
+    assert picker.outcome.distance_m < 0.03, picker.controls.words.value
+
+
+def test_a_slider_moves_what_it_is_for_and_nothing_else(picker):
+    picker.pick(0.45, 0.1)
+    picker.controls.y.value = 12.0
+    assert in_time(picker).goal.xy_m == (0.45, 0.12)
+    picker.set_pose(turn_deg=120)
+    assert picker.controls.turn.value == 90  # all that it can show
+    picker.controls.height.value = 3.0
+    assert math.degrees(in_time(picker).goal.turn_rad) == pytest.approx(120)
+    assert picker.goal.height_m == pytest.approx(0.03)
+
+
+def test_a_saved_picker_leaves_its_picture(picker):
+    data = base64.b64decode(picker._repr_mimebundle_()["image/png"])
+    assert Image.open(io.BytesIO(data)).size[0] > 300
+
+
+def test_the_drawing_carries_all_it_is_made_with():
+    source = str(Drawing._esm) + str(Drawing._css)
+    assert "export default { render }" in source
+    assert "://" not in source.replace('"http://www.w3.org/2000/svg"', "")
+
+
+def test_a_plan_comes_back_from_its_file(posed):
+    posed.pick(0.1, 0.15)
+    posed.set_pose(turn_deg=-30, height_cm=4)
+    plan = posed.plan
+    posed.save("mine.json")
+    posed.pick(0.0, -0.1)
+    posed.set_pose()
+    posed.load("mine.json")
+    assert posed.goal == plan.goal
+    assert [s.value for s in posed.controls.sliders] == pytest.approx([10.0, 15.0, -30.0, 4.0])
+    assert replace(posed.plan, steps=()) == replace(plan, steps=())
+    for a, b in zip(posed.plan.steps, plan.steps, strict=True):
+        assert (a.primitive, a.stop_phase) == (b.primitive, b.stop_phase)
+        np.testing.assert_array_equal([a.std_m], [b.std_m])
+        np.testing.assert_array_equal(a.predicted_path_xy_m, b.predicted_path_xy_m)
+    posed.run()
+    assert posed.world.object_state()[2] > 0.04
+    posed.load("mine.json")
+    assert "from where this plan starts" in posed.controls.words.value
+    assert posed.world.object_state()[2] < 0.04  # put down before it begins again
+
+
+@pytest.mark.parametrize(("executor", "within_deg"), [("open loop", 3.0), ("closed loop", 2.0)])
+def test_turn_and_lift_are_planned_and_done(posed, world, executor, within_deg):
+    posed.controls.executor.value = executor
+    posed.pick(0.04, 0.03)
+    posed.controls.turn.value, posed.controls.height.value = 25.0, 6.0
+    goal = in_time(posed).plan.goal
+    assert (math.degrees(goal.turn_rad), goal.height_m) == pytest.approx((25.0, 0.06))
+    assert goal.xy_m == (0.04, 0.03)
+    assert "then rotate to" in posed.controls.words.value
+    assert "then grasp to" in posed.controls.words.value
+    (wanted,), (predicted,) = shapes(posed, "wanted"), shapes(posed, "predicted")
+    yaws = [float(e.get("transform").split("rotate(")[1].strip(")")) for e in (wanted, predicted)]
+    assert yaws == pytest.approx([-25.0, -25.0], abs=2.3)
+    assert posed.picture()[:4] == b"\x89PNG"
+    posed.run()
+    said = posed.controls.words.value
+    assert "The turn is off by" in said
+    assert "The height is off by" in said
+    assert posed.outcome.lifted_m == pytest.approx(0.06, abs=0.005), said
+    assert world.object_state()[2] == pytest.approx(0.025 + 0.06, abs=0.005), said
+    assert math.degrees(world.object_pose()[2]) == pytest.approx(25.0, abs=within_deg), said
+    posed.set_pose()
+    assert (posed.plan.goal.turn_rad, posed.plan.goal.height_m) == (None, None)
+    assert (posed.controls.turn.value, posed.controls.height.value) == (0.0, 0.0)
+    assert world.object_state()[2] < 0.05  # let go, to be seen and planned for
+
+
+def test_what_cannot_be_lifted_so_high_is_said_before_anything_moves(posed):
+    posed._follow(Goal((0.04, 0.03), height_m=0.45))
+    assert "not predicted to be turned or lifted" in in_time(posed).controls.words.value
+
+
+def test_the_ring_is_where_the_arm_can_push_from(world):
+    data = open_interactions("reach")
+    pushes = data["primitive"].values == 0
+    xy = data["believed_xy"].values[pushes]
+    theta = data["theta"].values[pushes]
+    along = np.linspace(0.2, -0.05, 6)[:, None, None]
+    places = xy + along * np.column_stack([np.cos(theta), np.sin(theta)])
+    far = np.hypot(places[..., 0] - BASE_X_M, places[..., 1])
+    inside = ((REACH_M[0] <= far) & (far <= REACH_M[1])).all(axis=0)
+    reached = data["reached"].values[pushes].astype(bool)
+    assert (inside == reached).mean() > 0.93
+    assert reached[inside].mean() > 0.97
