@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
-from fnmatch import fnmatch
 from pathlib import Path
 
 
@@ -43,20 +41,3 @@ def resolve_out_dir(out_dir: str | os.PathLike[str]) -> Path:
             f"out_dir must be a folder, but {path} is, or lies under, a file; choose another"
         ) from None
     return path
-
-
-def digest_of(folder: Path, without: str = "") -> str:
-    """Return a digest of the names and contents of all files of a folder.
-
-    Left out are caches, and the files whose path in the folder matches the pattern `without`.
-    """
-    digest = hashlib.sha256()
-    for path in sorted(folder.rglob("*")):
-        parts = path.relative_to(folder).parts
-        left_out = without and fnmatch("/".join(parts), without)
-        left_out = left_out or any(p.startswith((".", "__pycache__")) for p in parts)
-        if path.is_file() and not left_out:
-            with path.open("rb") as file:
-                content = hashlib.file_digest(file, "sha256").hexdigest()
-            digest.update(f"{'/'.join(parts)}\n{path.stat().st_size}\n{content}\n".encode())
-    return digest.hexdigest()

@@ -24,7 +24,6 @@ from matplotlib.figure import Figure
 
 from affordlib.commands import command, count_type, seed_type
 from affordlib.paths import repo_root
-from affordlib.profiles import WorkbookError
 from affordlib.results import (
     MARKUP,
     factor,
@@ -35,7 +34,7 @@ from affordlib.results import (
     write_results,
     write_text_atomically,
 )
-from affordlib.workbook import run_name
+from affordlib.workbook import WorkbookError, run_name
 from affordlib.workers import dask_client
 
 if TYPE_CHECKING:
@@ -198,7 +197,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = parser.parse_args(argv)
     if len(set(options.seeds)) < len(options.seeds):
         raise WorkbookError(f"SEEDS must differ, got {options.seeds}")
-    name = run_name(options.profile, 0, options.out or None)
+    name = run_name(options.profile, 0, options.out)
     arguments = ["--profile", options.profile, "--only", options.only]
     arguments += ["--force"] * options.force + ["--", *options.settings]
     # What would run is said in any case; it is also where wrong settings are refused.

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from affordlib.paths import repo_root
-from affordlib.profiles import notebook_paths
+from affordlib.workbook import notebook_paths
 from exercises import EXERCISES, check
 
 NOTEBOOKS = repo_root() / "notebooks"
-PATHS = notebook_paths(NOTEBOOKS)
+PATHS = notebook_paths(repo_root())
 SOLUTIONS = sorted((NOTEBOOKS / "solutions").glob("*.py"))
 ASKED = {name[:2] for name in EXERCISES}
 

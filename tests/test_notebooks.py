@@ -13,16 +13,16 @@ import papermill
 import pytest
 from IPython.core.inputtransformer2 import TransformerManager
 
-from affordlib.profiles import default_parameters, notebook_paths
+from affordlib.paths import repo_root
 from affordlib.results import read_results, results_table
 from affordlib.show import GOAL, PREDICTION, TRUTH
-from affordlib.workbook import WIDGET, Layout, cleaned, make_jobs
+from affordlib.workbook import WIDGET, cleaned, default_parameters, make_jobs, notebook_paths
 
-LAYOUT = Layout.of_repository()
-PATHS = notebook_paths(LAYOUT.notebooks)
-RESULTS = LAYOUT.notebooks.parent / "data" / "results"
+ROOT = repo_root()
+PATHS = notebook_paths(ROOT)
+RESULTS = ROOT / "data" / "results"
 PROFILES = ("smoke", "reader", "full")
-BROKEN = LAYOUT.notebooks.parent / "tests" / "broken.ipynb"
+BROKEN = ROOT / "tests" / "broken.ipynb"
 # A folder of some machine: a slash that begins a word, and a name that systems use at the root.
 ABSOLUTE = re.compile(
     r"(?<![\w.~/:-])/(?:home|root|tmp|work|usr|var|opt|mnt|media|Users|private)/\w|\b[A-Z]:\\\w"
@@ -125,7 +125,7 @@ def test_a_parameter_that_is_only_noted_down_is_not_used():
 
 @pytest.mark.parametrize("profile", PROFILES)
 def test_every_value_of_a_profile_is_a_parameter_of_its_type(profile):
-    jobs = make_jobs(LAYOUT, profile, [], {"seed": 0, "out_dir": "runs/x"})
+    jobs = make_jobs(ROOT, profile)
     assert [job.name for job in jobs] == list(PATHS)
 
 
@@ -192,7 +192,7 @@ def test_closing_cells(name):
         checks = {m for c in code_of(notebook) for m in re.findall(r'check\("([\d.]+)"', c.source)}
         assert len(checks) >= 2
         assert all(f"**{number}**" in "".join(text) for number in checks)
-        assert (LAYOUT.notebooks / "solutions" / f"{name}.py").is_file()
+        assert (ROOT / "notebooks" / "solutions" / f"{name}.py").is_file()
     ways_on = re.findall(r"\]\((\d\d_\w+)\.ipynb", text[-1] if name[:2] != "00" else "".join(text))
     assert ways_on
     assert set(ways_on) <= set(PATHS)
@@ -291,7 +291,7 @@ def prepare(path, parameters, folder):
 
 def append_solutions(copy):
     """Put the solutions of a notebook's exercises at its end, if it has any, and ask for a pass."""
-    solutions = LAYOUT.notebooks / "solutions" / f"{copy.stem}.py"
+    solutions = ROOT / "notebooks" / "solutions" / f"{copy.stem}.py"
     if solutions.is_file():
         notebook = nbformat.read(copy, as_version=4)
         all_pass = "for verdict in VERDICTS:\n    assert verdict.passed, str(verdict)"
@@ -314,9 +314,7 @@ def run_with_nbval(copy):
 def smoke(tmp_path_factory):
     """The folder of one run, shared: later notebooks may read what earlier ones wrote."""
     folder = tmp_path_factory.mktemp("smoke")
-    return folder, {
-        job.name: job for job in make_jobs(LAYOUT, "smoke", [], {"seed": 1, "out_dir": str(folder)})
-    }
+    return folder, {job.name: job for job in make_jobs(ROOT, "smoke", seed=1)}
 
 
 @pytest.mark.slow
@@ -324,7 +322,8 @@ def smoke(tmp_path_factory):
 @each_notebook
 def test_run(name, smoke):
     folder, jobs = smoke
-    copy = prepare(PATHS[name], jobs[name].overrides, folder)
+    own = {"out_dir": str(folder)}
+    copy = prepare(PATHS[name], jobs[name].overrides | own, folder)
     append_solutions(copy)
     done = run_with_nbval(copy)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -335,8 +334,8 @@ def test_run(name, smoke):
     others = [path for path in RESULTS.glob("*.json") if path.stem != name]
     committed = [read_results(path)["tables"].values() for path in others]
     assert not [t for t, rows in document["tables"].items() if any(rows in of for of in committed)]
-    asked = jobs[name].parameters
-    assert {k: v for k, v in document["parameters"].items() if k in asked}.items() <= asked.items()
+    given = jobs[name].parameters | own
+    assert {k: v for k, v in document["parameters"].items() if k in given}.items() <= given.items()
 
 
 @pytest.mark.slow

@@ -8,8 +8,8 @@ from dask.distributed import Client
 from PIL import Image
 
 from affordlib.paths import repo_root
-from affordlib.profiles import WorkbookError
 from affordlib.results import read_results, write_results
+from affordlib.workbook import WorkbookError
 from experiments.seeds import gather, main, over_seeds, run_seeds, seeds_picture
 from tests.test_workbook import Book
 
@@ -80,7 +80,7 @@ def run(book, seeds, client=None):
 def test_seeds_side_by_side_are_gathered_into_one_table_and_page(book):
     with Client(processes=False, dashboard_address=None, n_workers=2) as client:
         run(book, [1, 3], client)
-    runs = book.layout.runs
+    runs = book.runs
     folders = {seed: runs / f"mine-seed{seed}" for seed in (1, 3)}
     page = gather(folders, runs / "mine-seeds")
     document = read_results(runs / "mine-seeds" / "01_first.json")
