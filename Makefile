@@ -123,7 +123,7 @@ bench: $(STAMP) ## Run the benchmarks (KEEP=1 puts the times into data/results/s
 data: $(STAMP) ## Collect the shipped data sets again and compare
 	@$(PY) -m experiments.shipped data
 
-checkpoints: $(STAMP) ## Train the shipped models again (ONLY="push_film")
+checkpoints: $(STAMP) ## Train the shipped models again (ONLY="film_500")
 	@$(if $(ONLY),,$(PY) -m experiments.shipped reachability)
 	@$(PY) -m experiments.shipped checkpoints $(if $(ONLY),--only $(ONLY))
 

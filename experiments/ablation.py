@@ -182,7 +182,7 @@ def ablated(changes: Sequence[str], steps: int, seed: int = 0) -> tuple[np.ndarr
         of: {k: v for how in each for k, v in how.get(of, {}).items()}
         for of in ("training", "network")
     }
-    shipped = CHECKPOINT_SPECS["push_film"]
+    shipped = CHECKPOINT_SPECS["film_500"]
     config = replace(shipped.training, steps=steps, seed=seed, **options["training"])
     network = replace(shipped.network, **options["network"])
     channels = network.action_channels, network.effect_channels

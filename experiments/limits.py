@@ -32,7 +32,7 @@ from experiments.planning import NUDGE_M, NUDGE_RAD
 Rows = list[dict[str, Any]]
 
 N_PUSHES, REPEATS = 200, 3
-STOPPED = ("push_film", "push_film_x10", "drag_film")
+STOPPED = ("film_500", "film_5000", "drag_film_500")
 PHASES = (0.0, 0.55, 0.65, 0.75, 1.0)
 """Edges of the bins of phases; nothing is touched before 0.5."""
 
@@ -104,7 +104,7 @@ def stopped() -> Rows:
     rows = []
     for name in STOPPED:
         model, _ = load_checkpoint(name)
-        kind = Push if name.startswith("push") else Drag
+        kind = Drag if name.startswith("drag") else Push
         mine = np.flatnonzero((kinds == kind.name) & ~data["fault"].values)
         actions = [kind(float(theta)) for theta in data["theta"].values[mine]]
         seen = torch.from_numpy(data["image"].values[mine])

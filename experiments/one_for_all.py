@@ -39,7 +39,7 @@ PRIMITIVES = ("push", "drag", "grasp", "rotate")
 NETWORK = FiLMConfig(
     action_channels=("x", "y", "z", "yaw", "gripper"), effect_channels=("x", "y", "z", "yaw")
 )
-TRAINING = replace(CHECKPOINT_SPECS["push_film"].training, steps=9600, augment=False)
+TRAINING = replace(CHECKPOINT_SPECS["film_500"].training, steps=9600, augment=False)
 MIRRORED: tuple[Symmetry, ...] = ((0, False), (0, True))
 """Of pushes and drags; turning them is nothing new in the frame of the push."""
 

@@ -83,11 +83,11 @@ VERSIONS: dict[Callable[..., Plan], int] = {
 """Raise one when the planner changes, or how its plans are executed, and its numbers do."""
 
 MODELS: dict[str, dict[str, str]] = {
-    "film_5000": {"push": "push_film_x10", "drag": "drag_film"},
-    "film_500": {"push": "push_film", "drag": "drag_film"},
-    "paper": {"push": "push_cnp"},
-    "lstm_tuned": {"push": "push_lstm"},
-    "film_5000_perturbed": {"push": "push_film_varied"},
+    "film_5000": {"push": "film_5000", "drag": "drag_film_500"},
+    "film_500": {"push": "film_500", "drag": "drag_film_500"},
+    "paper": {"push": "cnp_500"},
+    "lstm_tuned": {"push": "lstm_500"},
+    "film_5000_perturbed": {"push": "film_5000_perturbed"},
     "simulator": {},
 }
 """Checkpoints by primitive. One without a model of drags is asked about stable objects only."""

@@ -1,7 +1,7 @@
 """The shipped data sets, checkpoints and reachability, made again: `make data`, `make checkpoints`.
 
 python -m experiments.shipped data --only push_x10 --to data
-python -m experiments.shipped checkpoints --only push_film
+python -m experiments.shipped checkpoints --only film_500
 python -m experiments.shipped reachability
 """
 
@@ -81,26 +81,26 @@ GRASP_SYMMETRIES: tuple[Symmetry, ...] = (*HALF_TURNS, (0, True), (2, True))
 """Under which rotations and grasps, which have no direction, stay themselves."""
 
 CHECKPOINT_SPECS: dict[str, CheckpointSpec] = {
-    "push_cnp": CheckpointSpec("push", CNPConfig(), TrainingConfig(steps=5000, patience=20)),
-    "push_attention": CheckpointSpec(
+    "cnp_500": CheckpointSpec("push", CNPConfig(), TrainingConfig(steps=5000, patience=20)),
+    "attention_500": CheckpointSpec(
         "push", AttentionConfig(effect_channels=_YAW.effect_channels), _PUSH_FRAME
     ),
-    "push_film": CheckpointSpec("push", _YAW, _PUSH_FRAME),
-    "push_film_x10": CheckpointSpec("push_x10", _YAW, _LONG),
-    "push_film_varied": CheckpointSpec("push_varied_x10", _YAW, _LONG),
-    "drag_film": CheckpointSpec("drag", FiLMConfig(), _PUSH_FRAME),
-    "grasp_film": CheckpointSpec("grasp_x10", _LIFT, _TABLE_FRAME, GRASP_SYMMETRIES),
-    "grasp_film_firm": CheckpointSpec("grasp_firm_x10", _LIFT, _TABLE_FRAME, GRASP_SYMMETRIES),
-    "rotate_film": CheckpointSpec("rotate_x10", _TURN, _TABLE_FRAME, HALF_TURNS),
-    "push_lstm": CheckpointSpec("push", _LSTM, _PUSH_FRAME, draw=sample_forward),
+    "film_500": CheckpointSpec("push", _YAW, _PUSH_FRAME),
+    "film_5000": CheckpointSpec("push_x10", _YAW, _LONG),
+    "film_5000_perturbed": CheckpointSpec("push_varied_x10", _YAW, _LONG),
+    "drag_film_500": CheckpointSpec("drag", FiLMConfig(), _PUSH_FRAME),
+    "grasp_film_1000": CheckpointSpec("grasp_x10", _LIFT, _TABLE_FRAME, GRASP_SYMMETRIES),
+    "grasp_film_1000_firm": CheckpointSpec("grasp_firm_x10", _LIFT, _TABLE_FRAME, GRASP_SYMMETRIES),
+    "rotate_film_1000": CheckpointSpec("rotate_x10", _TURN, _TABLE_FRAME, HALF_TURNS),
+    "lstm_500": CheckpointSpec("push", _LSTM, _PUSH_FRAME, draw=sample_forward),
 }
-"""Minutes of one core: ten for `push_cnp`, five for `push_lstm` and the two of 5,000 pushes, one or
+"""Minutes of one core: ten for `cnp_500`, five for `lstm_500` and the two of 5,000 pushes, one or
 two for others. Five learn from sets of ten times the size, which are not shipped."""
 
 LEVER_CHECKPOINTS: dict[str, tuple[str, str]] = {
-    "lever_anchored": ("anchored", "all"),
-    "lever_lstm_window": ("lstm_tuned", "window"),
-    "lever_lstm_first_step": ("lstm_tuned", "first_step"),
+    "lever_up_last_pose_1800": ("anchored", "all"),
+    "lever_up_lstm_1800_window": ("lstm_tuned", "window"),
+    "lever_up_lstm_1800_first_step": ("lstm_tuned", "first_step"),
 }
 """Of lever-ups: which of `LEVER_MODELS`, and the protocol that it was trained for."""
 

@@ -283,7 +283,7 @@ def planning(n_goals: int = 15, seed: int = 300) -> Rows:
     descends through the whole network in every iteration, until it expects to end within a
     millimetre: from one start, and from as many, one after the other, as ours refines at once.
     """
-    film = load_checkpoint("push_film_x10")[0]
+    film = load_checkpoint("film_5000")[0]
     goals = {"single_partial": "one action", "multi_partial": "up to three actions"}
     first = partial(plan_continuous, draft=True)
     planners = {"A*": plan_astar, "continuous": plan_continuous, "first plan": first}

@@ -57,7 +57,7 @@ from experiments.shipped import CHECKPOINT_SPECS
 FOLDER = "data/results/studies"
 Rows = list[dict[str, Any]]
 
-TRAINING = replace(CHECKPOINT_SPECS["push_film"].training, steps=1500)
+TRAINING = replace(CHECKPOINT_SPECS["film_500"].training, steps=1500)
 """Of `mixed` and `varied`; longer for a network that is shipped."""
 
 VARIED_FOLDS = 3
@@ -96,7 +96,7 @@ def latent() -> Rows:
     """Alignment of the codes r of `push_test`, and the errors of what is decoded from them."""
     data = open_interactions("push_test")
     rows = []
-    for name in ("push_cnp", "push_film"):
+    for name in ("cnp_500", "film_500"):
         model, _ = load_checkpoint(name)
         channels = model.action_channels, model.effect_channels
         arrays = InteractionTensors.from_dataset(data, None, *channels)
@@ -223,7 +223,7 @@ def varied() -> Rows:
     these asked of the network that learned from 4,000 others.
     """
     data = open_interactions("push_varied")
-    network = CHECKPOINT_SPECS["push_film"].network
+    network = CHECKPOINT_SPECS["film_500"].network
     channels = network.action_channels, network.effect_channels
     errors, judged = [], []
     for fold in range(VARIED_FOLDS):
@@ -233,7 +233,7 @@ def varied() -> Rows:
         errors.append(final_errors_m(model, test).numpy())
         judged.append(calibration_rows(model, test))
     rows = _varied_rows(500, VARIED_FOLDS, np.concatenate(errors), judged)
-    model, about = load_checkpoint("push_film_varied")
+    model, about = load_checkpoint("film_5000_perturbed")
     everything = np.arange(data.sizes["interaction"])
     refuse_seen(about, data, everything)
     test = InteractionTensors.from_dataset(data, everything, *channels)
@@ -255,17 +255,17 @@ def _varied_rows(n_interactions: int, folds: int, error: np.ndarray, judged: lis
 
 
 def _network_settings(*more: Any) -> Any:
-    return replace(TRAINING, device="cpu"), CHECKPOINT_SPECS["push_film"].network, *more
+    return replace(TRAINING, device="cpu"), CHECKPOINT_SPECS["film_500"].network, *more
 
 
 def _ablation_settings(ladder: dict[str, str] | None = None) -> Any:
-    whole = replace(CHECKPOINT_SPECS["push_film"].training, device="cpu")
+    whole = replace(CHECKPOINT_SPECS["film_500"].training, device="cpu")
     changes = {
         change: {of: getattr(new, "__name__", new) for of, new in ablation.CHANGES[change].items()}
         for change in (ablation.CHANGES if ladder is None else ladder.values())
     }
     return (
-        CHECKPOINT_SPECS["push_film"].network,
+        CHECKPOINT_SPECS["film_500"].network,
         whole,
         ablation.STEPS,
         ablation.SEEDS,
@@ -299,13 +299,13 @@ STUDIES = {
         ("push", "push_test"),
         settings=lambda: _ablation_settings(ablation.LADDER),
     ),
-    "latent": Study(latent, ("push_test",), ("push_cnp", "push_film"), settings=lambda: WEIGHTS),
+    "latent": Study(latent, ("push_test",), ("cnp_500", "film_500"), settings=lambda: WEIGHTS),
     "rollability": Study(rollability, ("mixed", "partial", "push_test", "drag", "reach")),
     "mixed": Study(mixed, ("mixed", "partial"), settings=lambda: _network_settings(HALF_WAY_M)),
     "varied": Study(
         varied,
         ("push_varied",),
-        ("push_film_varied",),
+        ("film_5000_perturbed",),
         settings=lambda: _network_settings(VARIED_FOLDS),
     ),
     "tails": Study(tails.tails, ("push", "drag", "push_test"), tails.CHECKPOINTS),

@@ -22,7 +22,7 @@ from affordlib.models.calibration import AFTER_CONTACT, LEVELS, effects_at
 from affordlib.models.checkpoint import load_checkpoint
 from experiments.shipped import CHECKPOINT_SPECS
 
-CHECKPOINTS = ("push_film", "push_cnp", "drag_film")
+CHECKPOINTS = ("film_500", "cnp_500", "drag_film_500")
 """Those whose validation data are shipped."""
 
 TESTS = {"push": "push_test"}

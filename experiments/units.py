@@ -96,10 +96,10 @@ TASKS: dict[str, Task] = {
 
 TEN_TIMES = "_x10"
 KINDS: dict[str, tuple[str, type[NetworkConfig]]] = {
-    "paper": ("push_cnp", CNPConfig),
-    "film": ("push_film", FiLMConfig),
-    "attention": ("push_attention", AttentionConfig),
-    "ensemble": ("push_film", FiLMConfig),
+    "paper": ("cnp_500", CNPConfig),
+    "film": ("film_500", FiLMConfig),
+    "attention": ("attention_500", AttentionConfig),
+    "ensemble": ("film_500", FiLMConfig),
 }
 """By the first word of a model: the shipped checkpoint whose training it has, its network."""
 

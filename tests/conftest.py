@@ -45,12 +45,12 @@ def untrained():
 
 @pytest.fixture(scope="session")
 def trained():
-    return load_checkpoint("push_cnp")[0]
+    return load_checkpoint("cnp_500")[0]
 
 
 @pytest.fixture(scope="session")
 def film():
-    return load_checkpoint("push_film")[0]
+    return load_checkpoint("film_500")[0]
 
 
 @pytest.fixture(scope="session")

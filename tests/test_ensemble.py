@@ -15,7 +15,7 @@ from experiments import units
 from experiments.units import Unit, configuration_sha256, run_unit
 from tests.problems import problem_of
 
-NAMES = ("push_film", "push_film_x10")
+NAMES = ("film_500", "film_5000")
 
 
 @pytest.fixture
@@ -67,7 +67,7 @@ def test_one_member_is_itself_and_one_object_serves_all_queries(members, asked):
 
 def test_members_must_agree_on_channels(members):
     with pytest.raises(ValueError, match="member 1 has"):
-        Ensemble([members[0], load_checkpoint("push_cnp")[0]])
+        Ensemble([members[0], load_checkpoint("cnp_500")[0]])
     with pytest.raises(ValueError, match="at least one network"):
         Ensemble([])
 
@@ -86,10 +86,10 @@ def test_a_unit_trains_each_member_once_and_resumes(tmp_path, monkeypatch):
     monkeypatch.setattr(units, "FEW_STEPS", 4)
     monkeypatch.setattr(units, "MEMBERS", 2)
     short = replace(
-        units.CHECKPOINT_SPECS["push_film"].training, validate_every=2, batch_size=8, ema=0.0
+        units.CHECKPOINT_SPECS["film_500"].training, validate_every=2, batch_size=8, ema=0.0
     )
-    shipped = replace(units.CHECKPOINT_SPECS["push_film"], training=short)
-    monkeypatch.setattr(units, "CHECKPOINT_SPECS", units.CHECKPOINT_SPECS | {"push_film": shipped})
+    shipped = replace(units.CHECKPOINT_SPECS["film_500"], training=short)
+    monkeypatch.setattr(units, "CHECKPOINT_SPECS", units.CHECKPOINT_SPECS | {"film_500": shipped})
     unit, real, seen = Unit("ensemble", "grasp"), units.train_model, []
 
     def counted(data, split, config, *others):

@@ -108,7 +108,7 @@ def shop(one_world, skills, pushes, tmp_path_factory):
         "pursuit": planning.run_closed_loop(
             one_world, goal, skills, config=planning.ClosedLoopConfig(max_actions=1)
         ),
-        "about": models.load_checkpoint("push_cnp")[1],
+        "about": models.load_checkpoint("cnp_500")[1],
         "saved": save_plan(folder / "plan.json", plan),
         "data": pushes,
         "split": interactions.Split(*np.split(np.arange(30), (12, 24))),
@@ -244,7 +244,7 @@ def valid_calls(shop):
             models.fit_temperature,
             {"model": network, "validation": arrays, "phases": (0.8, 1.0)},
         ),
-        "load_checkpoint": (models.load_checkpoint, {"name_or_path": "push_cnp"}),
+        "load_checkpoint": (models.load_checkpoint, {"name_or_path": "cnp_500"}),
         "save_checkpoint": (
             models.save_checkpoint,
             {"model": network, "path": shop["folder"] / "net.safetensors", "about": {}},

@@ -155,12 +155,15 @@ def test_the_shipped_network_stands_for_its_own_training_only():
     whole = open_interactions("lever_up")
     asked = "anchored", "all", LEVER_MODELS["anchored"]
     split = split_of(LeverUnit("anchored"), whole)
-    assert shipped_lever_model(*asked, whole, split)[1] == {"checkpoint": "lever_anchored"}
+    assert shipped_lever_model(*asked, whole, split)[1] == {"checkpoint": "lever_up_last_pose_1800"}
     other = whole.assign(effect=2 * whole["effect"])  # the same numbers of interactions
     assert shipped_lever_model(*asked, other, split) is None
 
 
-@pytest.mark.parametrize("name", ["lever_anchored", "lever_lstm_window", "lever_lstm_first_step"])
+@pytest.mark.parametrize(
+    "name",
+    ["lever_up_last_pose_1800", "lever_up_lstm_1800_window", "lever_up_lstm_1800_first_step"],
+)
 def test_shipped_checkpoints_foresee_what_they_have_not_seen(name):
     whole = open_interactions("lever_up")
     model, about = load_checkpoint(name)

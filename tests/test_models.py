@@ -230,7 +230,7 @@ def test_checkpoint_round_trip(untrained, tmp_path):
 
 
 def test_a_bad_checkpoint_is_named(untrained, tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"'nobody'.*'push_cnp'"):
+    with pytest.raises(FileNotFoundError, match=r"'nobody'.*'cnp_500'"):
         load_checkpoint("nobody")
     path = save_checkpoint(untrained, tmp_path / "m.safetensors", {})
     whole = path.read_bytes()
@@ -307,7 +307,7 @@ def test_a_failed_save_leaves_nothing(untrained, tmp_path):
 
 
 def test_a_model_is_not_judged_on_what_it_saw(pushes, held_out_pushes):
-    _, about = load_checkpoint("push_cnp")
+    _, about = load_checkpoint("cnp_500")
     split = split_interactions(500)
     refuse_seen(about, pushes, split.test)
     refuse_seen(about, held_out_pushes, np.arange(1000))
@@ -318,7 +318,7 @@ def test_a_model_is_not_judged_on_what_it_saw(pushes, held_out_pushes):
 
 def test_in_doubt_a_model_is_not_judged(pushes):
     """Neither a recipe of an earlier version, with fewer fields, nor none opens the test."""
-    _, about = load_checkpoint("push_cnp")
+    _, about = load_checkpoint("cnp_500")
     seen = split_interactions(500).train
     older = json.loads(about["recipe"])
     del older["anywhere"], older["world"]["tip_offset_m"]
@@ -348,7 +348,7 @@ def test_bad_settings_are_named(make, words):
 
 
 def test_of_whatever_size_a_set_of_the_same_recipe_is_known(pushes):
-    _, about = load_checkpoint("push_cnp")
+    _, about = load_checkpoint("cnp_500")
     larger = json.loads(pushes.attrs["recipe"]) | {"n_interactions": 2000}
     with pytest.raises(ValueError, match="was trained or tuned on"):
         refuse_seen(about, pushes.assign_attrs(recipe=json.dumps(larger)), np.arange(500))

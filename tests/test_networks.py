@@ -132,7 +132,7 @@ def test_a_quarter_turn_of_the_table_turns_the_answer(name, quarters, some):
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("name", ["push_film", "push_film_x10"])
+@pytest.mark.parametrize("name", ["film_500", "film_5000"])
 @pytest.mark.parametrize("obj", [Cuboid(0.07, 0.05, 0.06), Cuboid(0.06, 0.07, 0.07),
                                    UprightCylinder(0.06, 0.06)])  # fmt: skip
 def test_any_turn_of_a_real_object_turns_the_answer_of_the_trained_model(name, obj, world):
@@ -175,7 +175,7 @@ def test_the_heading_is_the_push(some):
     torch.testing.assert_close(inverse_question, torch.tensor([[0.6, -0.8], [1.0, 0.0]]))
 
 
-@pytest.mark.parametrize("name", ["push_film", "push_cnp"])
+@pytest.mark.parametrize("name", ["film_500", "cnp_500"])
 def test_many_questions_at_once_have_the_answers_of_each(name, some):
     model, _ = load_checkpoint(name)
     pushes = [Push(float(theta)) for theta in np.linspace(-3, 3, 40)]

@@ -124,7 +124,7 @@ def test_a_foreign_or_damaged_state_of_a_training_is_named(some, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "n", "all_mm", "cuboid_mm", "p95_mm", "yaw_deg"),
-    [("push_film", 500, 1.0, 1.5, 4.0, 3.0), ("push_film_x10", 5000, 0.5, 0.8, 2.5, 1.5)],
+    [("film_500", 500, 1.0, 1.5, 4.0, 3.0), ("film_5000", 5000, 0.5, 0.8, 2.5, 1.5)],
 )
 def test_the_shipped_films_reach_their_goals(
     name, n, all_mm, cuboid_mm, p95_mm, yaw_deg, held_out_pushes

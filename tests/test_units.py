@@ -93,10 +93,10 @@ def test_killed_between_parts_only_the_missing_ones_run(tmp_path, monkeypatch):
 def test_a_training_that_was_killed_goes_on_to_the_same_part(tmp_path, monkeypatch):
     monkeypatch.setattr(units, "FEW_STEPS", 6)
     short = replace(
-        units.CHECKPOINT_SPECS["push_film"].training, validate_every=2, batch_size=8, ema=0.0
+        units.CHECKPOINT_SPECS["film_500"].training, validate_every=2, batch_size=8, ema=0.0
     )
-    shipped = replace(units.CHECKPOINT_SPECS["push_film"], training=short)
-    monkeypatch.setattr(units, "CHECKPOINT_SPECS", units.CHECKPOINT_SPECS | {"push_film": shipped})
+    shipped = replace(units.CHECKPOINT_SPECS["film_500"], training=short)
+    monkeypatch.setattr(units, "CHECKPOINT_SPECS", units.CHECKPOINT_SPECS | {"film_500": shipped})
     unit, real, seen = Unit("film", "grasp"), torch.nn.utils.clip_grad_norm_, []
 
     def dies(*arguments):
@@ -136,12 +136,12 @@ def test_stale_parts_are_refused_in_the_table_and_made_again(tmp_path, name):
 def test_the_hash_is_of_what_decides_the_numbers(monkeypatch):
     unit = Unit("film", "push")
     first = configuration_sha256(unit)
-    shipped = units.CHECKPOINT_SPECS["push_film"]
+    shipped = units.CHECKPOINT_SPECS["film_500"]
 
     def hash_with(**change):
         changed = replace(shipped, training=replace(shipped.training, **change))
         monkeypatch.setattr(
-            units, "CHECKPOINT_SPECS", units.CHECKPOINT_SPECS | {"push_film": changed}
+            units, "CHECKPOINT_SPECS", units.CHECKPOINT_SPECS | {"film_500": changed}
         )
         return configuration_sha256(unit)
 
@@ -202,11 +202,11 @@ def test_sets_ten_times_as_large_are_asked_the_same():
 @pytest.mark.parametrize(
     ("data", "name"),
     [
-        ("push", "push_film"),
-        ("push_x10", "push_film_x10"),
-        ("drag", "drag_film"),
-        ("grasp_x10", "grasp_film"),
-        ("rotate_x10", "rotate_film"),
+        ("push", "film_500"),
+        ("push_x10", "film_5000"),
+        ("drag", "drag_film_500"),
+        ("grasp_x10", "grasp_film_1000"),
+        ("rotate_x10", "rotate_film_1000"),
     ],
 )
 def test_shipped_networks_are_those_of_the_tables(data, name):
@@ -224,7 +224,7 @@ def test_the_shipped_checkpoint_stands_for_its_own_training_only(pushes):
         return units._shipped(network, training, scaler, pushes, split)
 
     model, told = found(0)
-    assert told["checkpoint"] == "push_cnp"
+    assert told["checkpoint"] == "cnp_500"
     assert model.effect_channels == ("x", "y")
     assert found(1) is None
     assert found(0, effect_scale=(0.03, 0.03)) is None  # of other data

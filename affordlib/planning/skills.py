@@ -22,10 +22,10 @@ from affordlib.primitives import Drag, Grasp, Primitive, Push, Rotate, primitive
 from affordlib.types import Goal, Plan, check_field
 
 CHECKPOINTS = {
-    "push": "push_film_x10",
-    "drag": "drag_film",
-    "grasp": "grasp_film_firm",
-    "rotate": "rotate_film",
+    "push": "film_5000",
+    "drag": "drag_film_500",
+    "grasp": "grasp_film_1000_firm",
+    "rotate": "rotate_film_1000",
 }
 
 

@@ -27,7 +27,7 @@ def _marginals() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     held_out = split_interactions(pushes.sizes["interaction"]).test
     arrays = InteractionTensors.from_dataset(pushes, held_out)
     at = torch.linspace(0, len(arrays.phase) - 1, N_PHASES).round().long()
-    model, _ = load_checkpoint("push_cnp")
+    model, _ = load_checkpoint("cnp_500")
     t_target = arrays.phases(at)
     told = model.predict(model.encode(arrays.image), condition_on_recorded_action(arrays), t_target)
     return told.effect_mean.numpy(), told.effect_std.numpy(), arrays.effect[:, at].numpy()
@@ -65,17 +65,17 @@ def _lopsided_mm(lopsided_m: Callable[..., float]) -> float:
         )
         return 1000 * float(asked(lopsided_m, model, some))
 
-    ours = by("push_film")
+    ours = by("film_500")
     if abs(ours) > 0.01:
         raise ValueError(f"ours turns along, so it should give 0 mm, got {ours:.3g} mm")
-    return by("push_cnp")
+    return by("cnp_500")
 
 
 @cache
 def _foreseen_ends() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Truth, mean and σ (2, 1000) [m] of the ends of `push_test`, by the shipped network."""
     data = open_interactions("push_test")
-    model, _ = load_checkpoint("push_film")
+    model, _ = load_checkpoint("film_500")
     answers = network_predictions(model, data, np.arange(data.sizes["interaction"]))
     truth, mean, std = (
         torch.tensor([answers[k][c] for c in "xy"]) for k in ("truth", "mean", "std")

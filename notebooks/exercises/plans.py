@@ -28,7 +28,7 @@ def _box_effects() -> EffectMap:
     """The effect map of the box of notebooks 06 and 07."""
     with Tabletop() as world:
         world.place(BOX, yaw_rad=YAW_RAD)
-        return EffectMap(load_checkpoint("push_film_x10")[0], world.depth_image())
+        return EffectMap(load_checkpoint("film_5000")[0], world.depth_image())
 
 
 # 06 Planning
@@ -70,7 +70,7 @@ def _loop_error_mm(bring: Callable[..., Any]) -> float:
 
 def _shoved_mm(bring: Callable[..., Any], shove: tuple[float, float, float]) -> float:
     """Distance [mm] to the goal in the end; after the first action the object is shoved."""
-    model, _ = load_checkpoint("push_film_x10")
+    model, _ = load_checkpoint("film_5000")
     goal, taken = Goal((0.16, 0.09)), []
 
     def plan(seen: Observation) -> Plan:
@@ -93,7 +93,7 @@ def _shoved_mm(bring: Callable[..., Any], shove: tuple[float, float, float]) -> 
 
 def _lift_error_mm(stop_at: Callable[..., Any]) -> float:
     """Largest difference [mm] from the heights that were asked for."""
-    model, _ = load_checkpoint("grasp_film")
+    model, _ = load_checkpoint("grasp_film_1000")
     off = []
     with Tabletop() as world:
         for height_m in (0.03, 0.09, 0.18):

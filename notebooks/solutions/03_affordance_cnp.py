@@ -16,7 +16,7 @@ def passes_by_mm(t=0.8):
     answer to it but training. It helps (told the action alone, the mean is 2.07 mm off there), and
     it is not obeyed.
     """
-    model, _ = load_checkpoint("push_cnp")
+    model, _ = load_checkpoint("cnp_500")
     pushes = open_interactions("push")
     held_out = InteractionTensors.from_dataset(
         pushes, split_interactions(len(pushes.interaction)).test

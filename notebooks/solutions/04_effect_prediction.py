@@ -31,7 +31,7 @@ def factor_for_half():
     thousand pushes, to look at them; to correct a network one would take validation data.)
     """
     data = open_interactions("push_test")
-    model, _ = load_checkpoint("push_film")
+    model, _ = load_checkpoint("film_500")
     told = network_predictions(model, data, np.arange(data.sizes["interaction"]))
     mean, truth, std = (np.array([told[k][c] for c in "xy"]) for k in ("mean", "truth", "std"))
     return float(np.median(np.abs(mean - truth) / std) / 0.6745)

@@ -14,8 +14,8 @@ from experiments.lever_up import LeverUnit, split_of
 
 levers = open_interactions("lever_up")
 test = lever_up_tensors(levers, split_of(LeverUnit("anchored"), levers).test)
-conditional, _ = load_checkpoint("lever_anchored")
-recurrent, _ = load_checkpoint("lever_lstm_window")
+conditional, _ = load_checkpoint("lever_up_last_pose_1800")
+recurrent, _ = load_checkpoint("lever_up_lstm_1800_window")
 
 
 @torch.no_grad()

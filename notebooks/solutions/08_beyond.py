@@ -21,7 +21,7 @@ def strangeness(image):
 def surest_half_mm():
     """Half of the pushes, chosen by σ alone, are foreseen several times as well as all of them."""
     pushes = open_interactions("push_test")
-    model, _ = load_checkpoint("push_film_x10")
+    model, _ = load_checkpoint("film_5000")
     told = network_predictions(model, pushes, np.arange(pushes.sizes["interaction"]))
     sigma = np.hypot(told["std"]["x"], told["std"]["y"])
     return 1000 * float(final_error(told)[sigma <= np.median(sigma)].mean())

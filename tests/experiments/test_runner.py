@@ -24,7 +24,7 @@ DEADLY = set()
 
 
 def job(n, **change):
-    return Job(squares, {"n": n}, data=("grasp",), checkpoints=("push_film",), **change)
+    return Job(squares, {"n": n}, data=("grasp",), checkpoints=("film_500",), **change)
 
 
 @pytest.fixture(autouse=True)
@@ -63,7 +63,7 @@ class Settings:
         ({"settings": Settings(rate=0.2)}, "settings"),
         ({"settings": (Settings(), "more")}, "settings"),
         ({"data": ("drag",)}, "data"),
-        ({"checkpoints": ("push_cnp",)}, "checkpoints"),
+        ({"checkpoints": ("cnp_500",)}, "checkpoints"),
     ],
 )
 def test_what_was_made_of_something_else_is_refused_and_made_again(tmp_path, change, named):

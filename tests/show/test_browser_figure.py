@@ -19,7 +19,7 @@ from affordlib.world import Cuboid, Tabletop
 world = Tabletop()
 world.place(Cuboid(0.07, 0.05, 0.05), (0.02, -0.01), 0.4)
 seen = world.execute_primitive(Push.towards(0.6))
-explorer = ConditioningExplorer(load_checkpoint("push_film")[0], seen)
+explorer = ConditioningExplorer(load_checkpoint("film_500")[0], seen)
 explorer.observe_at((0.1, 0.9), 0.7, 0.5)
 explorer""",
     """world.place(Cuboid(0.07, 0.05, 0.05), (0.02, -0.01), 0.4)
