@@ -13,13 +13,11 @@ import argparse
 import io
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pandas as pd
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from affordlib.commands import command, count_type, seed_type
@@ -43,111 +41,76 @@ if TYPE_CHECKING:
 PANELS = 4
 """Columns that are drawn at most."""
 
-
-def command_of(arguments: Sequence[str]) -> list[str]:
-    """The command that runs a batch."""
-    return [sys.executable, "-m", "affordlib.workbook", *arguments]
+Table = Sequence[Mapping[str, Any]]
 
 
-def run_seeds(
-    seeds: Sequence[int],
-    name: str,
-    arguments: Sequence[str],
-    client: Client | None = None,
-    command: Callable[[Sequence[str]], list[str]] = command_of,
-) -> None:
-    """Run the batch for every seed into `runs/<name>-seed<k>`, one after another or by a client.
+def command_of(seed: int, name: str, arguments: Sequence[str]) -> list[str]:
+    """The command that runs the book for one seed."""
+    own = ["--seed", str(seed), "--out", f"{name}-seed{seed}"]
+    return [sys.executable, "-m", "affordlib.workbook", *own, *arguments]
+
+
+def run_all(commands: Mapping[int, Sequence[str]], client: Client | None = None) -> None:
+    """Run the command of each seed, one after another or by a client.
 
     Raises WorkbookError, after all have ended, with what the failed ones printed.
     """
-    batches = [
-        (seed, command(["--seed", str(seed), "--out", f"{name}-seed{seed}", *arguments]))
-        for seed in seeds
-    ]
-    if client is None:
-        done = map(_run, batches)
-    else:
-        from dask.distributed import as_completed
-
-        # A batch skips by itself what is complete: it is given out even if it was run before.
-        futures = client.map(_run, batches, pure=False)
-        done = (result for _, result in as_completed(futures, with_results=True))
-    failed = []
-    for seed, code, printed, minutes in done:
-        print(f"seed {seed}: {'failed' if code else 'done'} after {minutes:.1f} min", flush=True)
-        if code:
-            failed.append(f"seed {seed}:\n{printed.strip()}")
-    if failed:
-        raise WorkbookError("\n".join(sorted(failed)))
-
-
-def _run(batch: tuple[int, Sequence[str]]) -> tuple[int, int, str, float]:
-    seed, command = batch
-    began = time.monotonic()
-    done = subprocess.run(
-        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False
+    # A batch skips by itself what is complete: it is given out even if it was run before.
+    futures = (
+        [client.submit(_run, line, pure=False) for line in commands.values()] if client else ()
     )
-    return seed, done.returncode, done.stdout, (time.monotonic() - began) / 60
+    done = (future.result() for future in futures) if client else map(_run, commands.values())
+    failed = []
+    for seed, (code, printed) in zip(commands, done, strict=True):
+        print(f"seed {seed}: {'failed' if code else 'done'}", flush=True)
+        failed += [f"seed {seed}:\n{printed.strip()}"] * bool(code)
+    if failed:
+        raise WorkbookError("\n".join(failed))
 
 
-def _stacked(tables: Sequence[Sequence[Mapping[str, Any]]]) -> tuple[pd.DataFrame, list[str]]:
-    """The rows of all seeds with the columns `seed` and `row`, and which columns hold numbers.
+def _run(line: Sequence[str]) -> tuple[int, str]:
+    done = subprocess.run(line, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    return done.returncode, done.stdout
 
-    Rows with the same `row` agree in all that is no number, and in their place among such rows.
+
+def over_seeds(tables: Sequence[Table]) -> tuple[list[dict[str, Any]], bytes | None]:
+    """One table of the same table of several seeds, and a picture of what differs, as a PNG.
+
+    Rows of several seeds are one if they agree in all that is no number, and in their place among
+    such rows: `seeds` counts them, numbers are their means, sd_… their standard deviations.
     """
     every = pd.DataFrame([{**row, "seed": k} for k, rows in enumerate(tables) for row in rows])
-    own = every.columns.drop("seed")
-    numbers = [name for name in own if every[name].dtype.kind in "iuf"]
-    words = [name for name in own if name not in numbers]
+    if every.empty:
+        return [], None
+    numbers = [c for c in every.columns.drop("seed") if every[c].dtype.kind in "iuf"]
+    words = [*every.columns.drop(["seed", *numbers])]
     every["place"] = every.groupby(["seed", *words], dropna=False, sort=False).cumcount()
-    every["row"] = every.groupby([*words, "place"], dropna=False, sort=False).ngroup()
-    return every.drop(columns="place"), numbers
+    same = every.groupby([*words, "place"], dropna=False, sort=False)
+    differ = [c for c in numbers if same[c].nunique().max() > 1]
+    parts = [same.size().rename("seeds")]
+    for c in numbers:
+        parts += (
+            [same[c].mean(), same[c].std().rename(f"sd_{c}")] if c in differ else [same[c].first()]
+        )
+    table = pd.concat(parts, axis=1).reset_index().drop(columns="place")
+    rows = table.astype(object).where(table.notna(), None).to_dict("records")
+    return rows, _picture(every.assign(row=same.ngroup()), words, differ[:PANELS])
 
 
-def over_seeds(tables: Sequence[Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:
-    """One table of the same table of several seeds: means, and sd where seeds differ.
-
-    A number that some seeds do not have is averaged over those that do.
-    """
-    if not any(tables):
-        return []
-    every, numbers = _stacked(tables)
-    rows = []
-    for _, same in every.groupby("row", sort=False):
-        row: dict[str, Any] = {"seeds": len(same)}
-        for name in every.columns.drop(["seed", "row"]):
-            values = same[name].dropna()
-            row[name] = values.iloc[0] if len(values) else None
-            if name in numbers and values.nunique() > 1:
-                row |= {name: values.mean(), f"sd_{name}": values.std()}
-        rows.append(row)
-    return rows
-
-
-def seeds_picture(tables: Sequence[Sequence[Mapping[str, Any]]]) -> bytes | None:
-    """The first columns that differ between seeds, a dot for every seed, as a PNG; None if none."""
-    if not any(tables):
+def _picture(every: pd.DataFrame, words: list[str], columns: list[str]) -> bytes | None:
+    """A dot for the number of every seed, a bar for the mean; None without columns that differ."""
+    if not columns:
         return None
-    every, numbers = _stacked(tables)
-    spread = every.groupby("row")[numbers].nunique().max()
-    differ = list(spread.index[spread > 1][:PANELS])
-    if not differ:
-        return None
-    words = every.columns.drop([*numbers, "seed", "row"])
-    names = (
-        every.drop_duplicates("row").sort_values("row")[words].astype(str).agg(", ".join, axis=1)
-    )
-    figure = Figure(
-        figsize=(2.6 * len(differ) + 3.4, 0.28 * len(names) + 1.1), layout="constrained"
-    )
-    FigureCanvasAgg(figure)
-    axes = figure.subplots(1, len(differ), sharey=True, squeeze=False)[0]
-    for ax, name in zip(axes, differ, strict=True):
-        ax.plot(factor(name) * every[name], every["row"], "o", color="gray", ms=4, alpha=0.7)
+    names = every.drop_duplicates("row").sort_values("row")[words].astype(str)
+    size = 2.6 * len(columns) + 3.4, 0.28 * len(names) + 1.1
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(1, len(columns), sharey=True, squeeze=False)[0]
+    for ax, name in zip(axes, columns, strict=True):
         means = factor(name) * every.groupby("row")[name].mean()
+        ax.plot(factor(name) * every[name], every["row"], "o", color="gray", ms=4, alpha=0.7)
         ax.plot(means, means.index, "|", color="black", ms=12)
         ax.set_xlabel(heading(name))
-        ax.set_yticks(range(len(names)), [text[:48] for text in names])
+        ax.set_yticks(range(len(names)), [text[:48] for text in names.agg(", ".join, axis=1)])
         ax.grid(alpha=0.3)
     axes[0].invert_yaxis()
     buffer = io.BytesIO()
@@ -157,28 +120,25 @@ def seeds_picture(tables: Sequence[Sequence[Mapping[str, Any]]]) -> bytes | None
 
 def gather(folders: Mapping[int, Path], into: Path) -> Path:
     """Write the tables over seeds, as JSON, and as Markdown with pictures; returns the latter."""
-    # Only results of notebooks: beside them lie plans that were saved.
-    there = [path for folder in folders.values() for path in folder.glob("[0-9][0-9]_*.json")]
+    into.mkdir(parents=True, exist_ok=True)
     page = [f"# Over {len(folders)} seeds", f"Seeds {', '.join(map(str, folders))}."]
     page.append("Means over seeds; *sd* is the standard deviation of one seed among them.")
-    for name in sorted({path.stem for path in there}):
-        documents = [read_results(path)["tables"] for path in there if path.stem == name]
-        by_table = {
-            table: [tables.get(table, []) for tables in documents]
-            for table in dict.fromkeys(table for tables in documents for table in tables)
-        }
-        together = {table: over_seeds(tables) for table, tables in by_table.items()}
-        write_results(into, name, {"seeds": list(folders)}, together)
+    # Only results of notebooks: beside them lie plans that were saved.
+    paths = [path for folder in folders.values() for path in folder.glob("[0-9][0-9]_*.json")]
+    for name in sorted({path.stem for path in paths}):
+        runs = [read_results(path)["tables"] for path in paths if path.stem == name]
+        together = {}
         page.append(f"## {name}")
-        for number, (table, rows) in enumerate(together.items()):
+        for number, table in enumerate(dict.fromkeys(table for run in runs for table in run)):
+            together[table], picture = over_seeds([run.get(table, []) for run in runs])
             page.append(f"### {table.replace('_', ' ').translate(MARKUP)}")
-            page.append(markdown_table(rows) if rows else "Empty.")
-            if (picture := seeds_picture(by_table[table])) is not None:
+            page.append(markdown_table(together[table]) if together[table] else "Empty.")
+            if picture:
                 write_atomically(into / f"{name}-{number}.png", picture)
                 page.append(f"![each seed]({name}-{number}.png)")
-    path = into / "index.md"
-    write_text_atomically(path, "\n\n".join(page) + "\n")
-    return path
+        write_results(into, name, {"seeds": list(folders)}, together)
+    write_text_atomically(into / "index.md", "\n\n".join(page) + "\n")
+    return into / "index.md"
 
 
 @command(OSError, ValueError, WorkbookError)
@@ -199,23 +159,21 @@ def main(argv: Sequence[str] | None = None) -> int:
         raise WorkbookError(f"SEEDS must differ, got {options.seeds}")
     name = run_name(options.profile, 0, options.out)
     arguments = ["--profile", options.profile, "--only", options.only]
-    arguments += ["--force"] * options.force + ["--", *options.settings]
-    # What would run is said in any case; it is also where wrong settings are refused.
-    for seed in options.seeds:
-        own = ["--seed", str(seed), "--out", f"{name}-seed{seed}", "--dry-run"]
-        _, code, printed, _ = _run((seed, command_of(own + arguments)))
-        if code:
-            raise WorkbookError(printed.strip())
-        print(f"seed {seed}: {printed.strip()}", flush=True)
+    arguments += ["--force"] * options.force + ["--dry-run"] * options.dry_run
+    arguments += ["--", *options.settings]
+    commands = {seed: command_of(seed, name, arguments) for seed in options.seeds}
     if options.dry_run:
+        for seed, line in commands.items():
+            code, printed = _run(line)
+            print(f"seed {seed}: {printed.strip()}", flush=True)
+            if code:
+                return code
         return 0
     with dask_client(min(options.workers, len(options.seeds)), options.scheduler) as client:
-        run_seeds(options.seeds, name, arguments, client)
+        run_all(commands, client)
     runs = repo_root() / "runs"
-    page = gather(
-        {seed: runs / f"{name}-seed{seed}" for seed in options.seeds}, runs / f"{name}-seeds"
-    )
-    print(f"The tables over seeds are in {page.relative_to(repo_root())}")
+    folders = {seed: runs / f"{name}-seed{seed}" for seed in options.seeds}
+    print(f"The tables over seeds are in {gather(folders, runs / f'{name}-seeds')}")
     return 0
 
 
