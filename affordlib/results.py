@@ -81,11 +81,9 @@ def write_results(
             f"notebook must be a plain name such as '06_planning', got {notebook!r}; "
             "leave out folder and ending"
         )
-    for argument, value in (("parameters", parameters), ("tables", tables)):
-        if not isinstance(value, Mapping):
-            raise TypeError(f"{argument} must be a dict, got {type(value).__name__}: {value!r:.60}")
-    parameters = _parameter(parameters, "parameters")
-    tables = {name: _rows(rows, name) for name, rows in tables.items()}
+    parameters = _plain(parameters, "parameters")
+    _plain(dict.fromkeys(tables), "tables")
+    tables = {name: _table(name, rows) for name, rows in tables.items()}
     path = resolve_out_dir(out_dir) / f"{notebook}.json"
     write_text_atomically(path, _document(notebook, parameters, tables), _MARK)
     return path
@@ -101,20 +99,16 @@ def read_results(path: str | os.PathLike[str]) -> dict[str, Any]:
         raise FileNotFoundError(
             f"path: there are no results at {path}; run the notebook that writes them"
         )
-    remedy = "; delete it and run its notebook again"
     try:
-        document = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"path: {path} is not valid JSON ({error}){remedy}") from None
-    keys = {"notebook": str, "parameters": dict, "versions": dict, "tables": dict}
-    for key, kind in keys.items():
-        if not isinstance(document, dict) or not isinstance(document.get(key), kind):
-            raise ValueError(f"path: {path} has no {key!r} of type {kind.__name__}{remedy}")
-    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+        for key in ("notebook", "parameters", "versions", "tables"):
+            document[key]
         for name, rows in document["tables"].items():
-            _rows(rows, name)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"path: {path} holds bad tables: {error}{remedy}") from None
+            _table(name, rows)
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        raise ValueError(
+            f"path: {path} holds no results ({error!r}); delete it and run its notebook again"
+        ) from None
     return document
 
 
@@ -169,12 +163,9 @@ def results_table(
 
 def markdown_table(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = None) -> str:
     """Return rows as a Markdown table with the headings and digits of `results_table`."""
-    names = _columns(rows, columns)
-    lines = [
-        [heading(name) for name in names],
-        ["---:" if _is_numeric(rows, name) else "---" for name in names],
-        *([cell(name, row.get(name)) for name in names] for row in rows),
-    ]
+    frame = results_table(rows, columns)
+    numeric = [_is_numeric(rows, name) for name in _columns(rows, columns)]
+    lines = [list(frame.columns), ["---:" if n else "---" for n in numeric], *frame.values.tolist()]
     lines = [[text.translate(MARKUP) for text in line] for line in lines]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
@@ -235,30 +226,24 @@ def fill_tables(text: str) -> str:
     return filled
 
 
-@command(OSError)
+@command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
     """Fill the tables of Markdown pages, or with `--check` say which pages are out of date."""
     parser = argparse.ArgumentParser(prog="python -m affordlib.results", description=main.__doc__)
     parser.add_argument("pages", nargs="+", type=Path)
     parser.add_argument("--check", action="store_true", help="change nothing, fail if one would")
     options = parser.parse_args(argv)
-    stale = []
+    stale = False
     for page in options.pages:
-        try:
-            text = page.read_text(encoding="utf-8")
-            filled = fill_tables(text)
-        except (OSError, ValueError) as error:
-            print(f"{page}: {error}", file=sys.stderr)
-            return 2
-        if filled != text:
-            stale.append(page)
-            if not options.check:
-                write_text_atomically(page, filled)
-    if stale and options.check:
-        pages = " ".join(map(str, stale))
-        print(f"tables out of date; run: python -m affordlib.results {pages}", file=sys.stderr)
-        return 1
-    return 0
+        text = page.read_text(encoding="utf-8")
+        if (filled := fill_tables(text)) == text:
+            continue
+        if options.check:
+            print(f"out of date; run: python -m affordlib.results {page}", file=sys.stderr)
+            stale = True
+        else:
+            write_text_atomically(page, filled)
+    return int(stale)
 
 
 def _document(notebook: str, parameters: Any, tables: dict[str, list[dict[str, Any]]]) -> str:
@@ -267,63 +252,51 @@ def _document(notebook: str, parameters: Any, tables: dict[str, list[dict[str, A
     def dump(value):
         return json.dumps(value, allow_nan=False, ensure_ascii=False)
 
-    def block(name, rows):
-        return f"  {dump(name)}: [\n" + ",\n".join(f"   {dump(row)}" for row in rows) + "\n  ]"
-
-    blocks = ",\n".join(block(name, rows) for name, rows in tables.items())
+    blocks = ",\n".join(
+        f"  {dump(name)}: [\n" + ",\n".join(f"   {dump(row)}" for row in rows) + "\n  ]"
+        for name, rows in tables.items()
+    )
     return (
         f'{{\n "notebook": {dump(notebook)},\n "parameters": {dump(parameters)},\n'
         f' "versions": {dump(versions())},\n "tables": {{\n{blocks}\n }}\n}}\n'
     )
 
 
-def _refuse_constant(name: str) -> None:
-    raise ValueError(f"it holds {name}")
+def _plain(value: Any, where: str, depth: float = math.inf) -> Any:
+    """Return data as JSON knows them; NumPy's scalars are converted.
 
-
-def _plain(value: object, where: str) -> Any:
-    """Return a number, text, truth or None as JSON knows it; NumPy's scalars are converted."""
+    depth: how many dicts and lists may lie in each other. Raises TypeError or ValueError, naming
+    the place, for anything else than these, finite numbers, text, True, False and None.
+    """
     if isinstance(value, np.generic) or (isinstance(value, np.ndarray) and value.ndim == 0):
         value = value.item()
     if isinstance(value, float) and not math.isfinite(value):
         raise ValueError(f"{where} is {value}; write None for a number that does not exist")
     if value is None or isinstance(value, str | bool | int | float):
         return value
+    if depth and isinstance(value, Mapping):
+        for key in value:
+            if not isinstance(key, str) or not key:
+                raise TypeError(f"{where} has the key {key!r}; names must be non-empty text")
+        return {k: _plain(v, f"{where}[{k!r}]", depth - 1) for k, v in value.items()}
+    if depth and isinstance(value, list | tuple):
+        return [_plain(v, f"{where}[{i}]", depth - 1) for i, v in enumerate(value)]
     raise TypeError(
         f"{where} must be a number, text, True, False or None, got {type(value).__name__} "
         f"{value!r:.60}; convert it, or spread it over columns"
     )
 
 
-def _parameter(value: object, where: str) -> Any:
-    if isinstance(value, Mapping):
-        return {_name(k, where): _parameter(v, f"{where}[{k!r}]") for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_parameter(v, f"{where}[{i}]") for i, v in enumerate(value)]
-    return _plain(value, where)
-
-
-def _rows(rows: object, table: object) -> list[dict[str, Any]]:
-    where = f"tables[{_name(table, 'tables')!r}]"
+def _table(name: str, rows: Any) -> list[dict[str, Any]]:
+    """Return the rows of a table as plain data; raises as `_plain`."""
+    where = f"tables[{name!r}]"
     if isinstance(rows, str | Mapping) or not isinstance(rows, Iterable):
         raise TypeError(f"{where} must be a list of rows, got {type(rows).__name__}")
-    plain = []
+    rows = list(rows)
     for i, row in enumerate(rows):
         if not isinstance(row, Mapping):
-            raise TypeError(
-                f"{where}[{i}] must map columns to values, got {type(row).__name__}; "
-                "make each row a dict"
-            )
-        plain.append(
-            {_name(k, f"{where}[{i}]"): _plain(v, f"{where}[{i}][{k!r}]") for k, v in row.items()}
-        )
-    return plain
-
-
-def _name(key: object, where: str) -> str:
-    if not isinstance(key, str) or not key:
-        raise TypeError(f"{where} has the key {key!r}; names must be non-empty text, use str()")
-    return key
+            raise TypeError(f"{where}[{i}] must map columns to values, got {type(row).__name__}")
+    return _plain(rows, where, depth=2)
 
 
 def _split_unit(column: str) -> tuple[list[str], str | None]:
