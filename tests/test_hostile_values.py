@@ -404,7 +404,7 @@ def valid_calls(shop):
         ),
         "plot_closed_loop": (
             show.plot_closed_loop,
-            {"ax": ax, "pursuit": shop["pursuit"], "obj": shop["obj"]},
+            {"ax": ax, "result": shop["pursuit"], "obj": shop["obj"]},
         ),
         "refuse_seen": (
             evaluation.refuse_seen,

@@ -214,8 +214,8 @@ class PhaseSlider(FigureWidget):
             plot_footprint(above, obj, rest[:2], rest[2], TRUTH, "at rest")
             off_mm = 1000 * np.hypot(rest[0] - now[0], rest[1] - now[1])
             words += f" Stopped there, it rests <b>{off_mm:.2f} mm</b> from where it was then."
-        look = {"label": "full action at t", "filled": False, "style": "--"}  # over what rests
-        plot_footprint(above, obj, now[:2], now[2], PREDICTION, **look)
+        label = "full action at t"  # drawn over what rests
+        plot_footprint(above, obj, now[:2], now[2], PREDICTION, label, style="--")
         above.legend(loc="upper left", fontsize=8)
         over_time.legend(loc="upper left")
         return words

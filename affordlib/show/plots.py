@@ -9,11 +9,11 @@ import io
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from torch import Tensor
 
@@ -28,6 +28,7 @@ from affordlib.types import (
     Goal,
     Outcome,
     Plan,
+    Step,
     check_array,
     check_finite,
     check_pair,
@@ -38,8 +39,7 @@ from affordlib.world import TabletopObject
 GOAL, PREDICTION, TRUTH, NEUTRAL = "#0072B2", "#D55E00", "#009E73", "#777777"
 
 ENLARGED = 20
-"""So many times σ is the radius of the disc at the end of a foreseen path; σ itself is too small to
-be seen."""
+"""A disc at the end of a predicted path has this many σ for its radius: one is too small to see."""
 
 plt.rcParams.update(
     {
@@ -70,21 +70,13 @@ def save_figure(figure: Figure, folder: Path, name: str) -> Path:
 
 def plot_table(ax: Axes, around_m: Sequence[float] = (0.0, 0.0), half_width_m: float = 0.3) -> Axes:
     """An empty top-down view of the table around a point."""
-    around_m = [check_within("around_m", v, -10, 10, "m") for v in check_pair("around_m", around_m)]
-    half_width_m = check_within("half_width_m", half_width_m, 0.01, 10.0, "m")
-    ax.set_aspect("equal")
-    ax.set_xlim(100 * (around_m[0] - half_width_m), 100 * (around_m[0] + half_width_m))
-    ax.set_ylim(100 * (around_m[1] - half_width_m), 100 * (around_m[1] + half_width_m))
-    corners = 100 * np.array([[x, y] for x, y in _corners()])
-    ax.plot(*corners.T, color=NEUTRAL, lw=1)
-    ax.set_xlabel("x [cm]")
-    ax.set_ylabel("y [cm]")
+    x, y = (100 * check_within("around_m", v, -10, 10, "m") for v in check_pair("around", around_m))
+    half = 100 * check_within("half_width_m", half_width_m, 0.01, 10.0, "m")
+    corners = np.array([(u, v) for u in TABLE_X_M for v in TABLE_Y_M])[[0, 1, 3, 2, 0]]
+    ax.plot(*_cm(corners), color=NEUTRAL, lw=1)
+    ax.set(xlabel="x [cm]", ylabel="y [cm]", aspect="equal")
+    ax.set(xlim=(x - half, x + half), ylim=(y - half, y + half))
     return ax
-
-
-def _corners() -> list[tuple[float, float]]:
-    (x0, x1), (y0, y1) = TABLE_X_M, TABLE_Y_M
-    return [(x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0)]
 
 
 def plot_footprint(
@@ -94,28 +86,48 @@ def plot_footprint(
     yaw_rad: float = 0.0,
     color: str = NEUTRAL,
     label: str | None = None,
-    filled: bool = True,
-    style: str = "-",
+    style: str = "filled",
 ) -> Axes:
-    """The outline of an object's base at a pose."""
-    yaw_rad = check_finite("yaw_rad", yaw_rad)
-    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
-    outline = 100 * (obj.footprint_m @ np.array([[c, s], [-s, c]]) + check_pair("xy_m", xy_m))
-    ax.fill(*outline.T, facecolor=color if filled else "none", alpha=0.25 if filled else 1, lw=0)
-    ax.plot(*np.vstack([outline, outline[:1]]).T, style, color=color, lw=1.5, label=label)
+    """The outline of an object's base at a pose, filled or with a style of line such as "--"."""
+    outline = _rotated(obj.footprint_m, check_finite("yaw_rad", yaw_rad))
+    outline = _cm(outline + check_pair("xy_m", xy_m))
+    filled = style == "filled"
+    ax.fill(*outline, facecolor=color if filled else "none", alpha=0.25 if filled else 1, lw=0)
+    ax.plot(*_closed(outline), "-" if filled else style, color=color, lw=1.5, label=label)
     return ax
 
 
-_PLATE = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 1}
+def _cm(xy_m: Any) -> np.ndarray:
+    """Points (n, 2) or one (2,) in metres as x and y in centimetres."""
+    return 100 * np.asarray(xy_m, dtype=float).T
 
 
-def _beside(ax: Axes, words: str, end_cm: np.ndarray, goal: Goal, below: int) -> int:
-    """Name an action that stays in its place, to the right of it and below the one before."""
-    x, y = end_cm
-    at = (x + 100 * goal.tolerance_m, y)
-    offset = (8, below - 11)
-    ax.annotate(words, at, offset, textcoords="offset points", fontsize=8, bbox=_PLATE)
-    return below - 11
+def _closed(xy: np.ndarray) -> np.ndarray:
+    return np.hstack([xy, xy[:, :1]])
+
+
+def _rotated(xy_m: np.ndarray, angle_rad: float) -> np.ndarray:
+    """Points (n, 2) rotated anticlockwise about the origin."""
+    c, s = math.cos(angle_rad), math.sin(angle_rad)
+    return xy_m @ np.array([[c, s], [-s, c]])
+
+
+def _name(ax: Axes, text: str, at_cm: Sequence[float], offset: Sequence[float], **style) -> None:
+    """Write the name of an action, so many points away from where it belongs."""
+    plate = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 1}
+    style = {"fontsize": 8, "ha": "center", "va": "center"} | style
+    ax.annotate(text, at_cm, tuple(offset), textcoords="offset points", bbox=plate, **style)
+
+
+def _name_in_place(ax: Axes, text: str, step: Step, goal: Goal, row: int) -> None:
+    """Name an action that does not move the object: to the right of it, one below the other."""
+    x, y = _cm(step.predicted_end_xy_m)
+    at = x + 100 * goal.tolerance_m, y
+    _name(ax, f"{text} {step.primitive.name}", at, (8, -11 * row), ha="left", va="baseline")
+
+
+def _moves(step: Step) -> bool:
+    return not isinstance(step.primitive, Grasp | Rotate)
 
 
 def plot_plan(
@@ -128,121 +140,84 @@ def plot_plan(
     """A plan as predicted: the object's path, where each step stops and σ there, and the goal.
 
     sigma: draw a disc at each step's end, with twenty times σ for its radius.
-    obj: drawn dotted as each later push is foreseen to find it, yaw_rad being how it stands now.
+    obj: drawn dotted as each later push is predicted to find it, yaw_rad being how it stands now.
     """
-    circle = plt.Circle(
-        100 * np.array(plan.goal.xy_m), 100 * plan.goal.tolerance_m, color=GOAL, fill=False, lw=1
-    )
-    ax.add_patch(circle)
-    ax.plot(*(100 * np.array(plan.goal.xy_m)), "*", color=GOAL, ms=13, label="goal", zorder=5)
-    first = start = np.array(plan.start_xy_m)
-    below, turn = 0, 0.0
+    goal, first, turn, row = plan.goal, np.array(plan.start_xy_m), 0.0, 0
+    radius = 100 * goal.tolerance_m
+    ax.add_patch(plt.Circle(_cm(goal.xy_m), radius, color=GOAL, fill=False, lw=1))
+    ax.plot(*_cm(goal.xy_m), "*", color=GOAL, ms=13, label="goal", zorder=5)
+    start = first
     for k, step in enumerate(plan.steps):
-        end = 100 * np.array(step.predicted_end_xy_m)
-        label = f"{k + 1}: {100 * step.stop_phase:.0f} %"
-        if isinstance(step.primitive, Grasp | Rotate):
-            below = _beside(ax, f"{label} {step.primitive.name}", end, plan.goal, below)
+        end = np.array(step.predicted_end_xy_m)
+        text = f"{k + 1}: {100 * step.stop_phase:.0f} %"
+        if not _moves(step):
+            row += 1
+            _name_in_place(ax, text, step, goal, row)
             continue
-        direction = np.array(
-            [math.cos(step.primitive.direction_rad), math.sin(step.primitive.direction_rad)]
-        )
         if obj is not None and k > 0:
-            plot_footprint(ax, obj, start, yaw_rad + turn, PREDICTION, filled=False, style=":")
-        tail = 100 * (start - 0.075 * direction)
-        ax.annotate(
-            "",
-            100 * (start - 0.035 * direction),
-            tail,
-            arrowprops={"arrowstyle": "-|>", "color": NEUTRAL, "lw": 1.5},
-            zorder=4,
-        )
+            plot_footprint(ax, obj, start, yaw_rad + turn, PREDICTION, style=":")
+        theta = step.primitive.direction_rad
+        direction = np.array([math.cos(theta), math.sin(theta)])
+        tail, tip = _cm(start - 0.075 * direction), _cm(start - 0.035 * direction)
+        arrow = {"arrowstyle": "-|>", "color": NEUTRAL, "lw": 1.5}
+        ax.annotate("", tip, tail, arrowprops=arrow, zorder=4)
         aside = direction[::-1] * (1, -1)
         aside *= 22 if aside @ (start - first) >= 0 else -22  # away from where the object stood
-        ax.annotate(
-            label,
-            tail,
-            ha="center",
-            va="center",
-            fontsize=8,
-            xytext=tuple(-10 * direction if k == 0 else aside),
-            textcoords="offset points",
-            bbox=_PLATE,
-        )
-        ax.plot(
-            *(100 * step.predicted_path_xy_m.T),
-            color=PREDICTION,
-            lw=2,
-            label="prediction" if k == 0 else None,
-        )
-        ax.plot(*end, "o", color=PREDICTION, ms=3)
+        _name(ax, text, tail, -10 * direction if k == 0 else aside)
+        label = "prediction" if k == 0 else None
+        ax.plot(*_cm(step.predicted_path_xy_m), color=PREDICTION, lw=2, label=label)
+        ax.plot(*_cm(end), "o", color=PREDICTION, ms=3)
         if sigma and not math.isnan(step.std_m):
             disc = {"radius": 100 * ENLARGED * step.std_m, "color": PREDICTION, "alpha": 0.35}
-            ax.add_patch(plt.Circle(end, **disc, lw=1, zorder=1.5))
-        start, turn = np.array(step.predicted_end_xy_m), step.predicted_turn_rad
+            ax.add_patch(plt.Circle(_cm(end), **disc, lw=1, zorder=1.5))
+        start, turn = end, step.predicted_turn_rad
     return ax
 
 
-def plot_outcome(
-    ax: Axes, outcome: Outcome, obj: TabletopObject | None = None, yaw_rad: float = 0.0
-) -> Axes:
-    """What carrying out a plan gave: the object's real path, over the plan (see `plot_plan`)."""
-    plot_plan(ax, outcome.plan, False, obj, yaw_rad)
+def plot_outcome(ax: Axes, outcome: Outcome) -> Axes:
+    """The object's real path when a plan was executed, over the plan (see `plot_plan`)."""
+    plot_plan(ax, outcome.plan, sigma=False)
     for k, path in enumerate(outcome.object_paths_xy_m):
-        ax.plot(*(100 * path.T), color=TRUTH, lw=2, ls="--", label="truth" if k == 0 else None)
-    ax.plot(*(100 * np.array(outcome.end_pose[:2])), "s", color=TRUTH, ms=6)
+        ax.plot(*_cm(path), color=TRUTH, lw=2, ls="--", label="truth" if k == 0 else None)
+    ax.plot(*_cm(outcome.end_pose[:2]), "s", color=TRUTH, ms=6)
     ax.set_title(f"{outcome.plan.planner}: {1000 * outcome.distance_m:.1f} mm from the goal")
     return ax
 
 
-def plot_closed_loop(
-    ax: Axes, pursuit: ClosedLoopResult, obj: TabletopObject | None = None
-) -> Axes:
-    """A pursuit from above: where each action took the object, and where it was moved by others.
+def plot_closed_loop(ax: Axes, result: ClosedLoopResult, obj: TabletopObject | None = None) -> Axes:
+    """A closed loop from above: where each action took the object, and where others moved it.
 
-    Dots are where the object was expected after each action; dotted lines what nobody planned.
+    Dots are where the object was predicted after each action; dotted lines what nobody planned.
     obj: drawn as it stands in the end, if given.
     """
-    first = pursuit.plans[0].goal if pursuit.plans else pursuit.goal
-    if first.xy_m != pursuit.goal.xy_m:
-        ax.plot(*(100 * np.array(first.xy_m)), "*", color=GOAL, ms=11, mfc="none", zorder=5)
-    ax.plot(*(100 * np.array(pursuit.goal.xy_m)), "*", color=GOAL, ms=13, label="goal", zorder=5)
-    at = np.array(pursuit.seen_xy_m[0])
-    below = 0
-    ax.plot(*(100 * at), "o", color=NEUTRAL, ms=5)
-    for k, (step, path) in enumerate(zip(pursuit.steps, pursuit.object_paths_xy_m, strict=True)):
-        if np.hypot(*(path[0] - at)) > 0.003:
-            label = "moved by others" if "moved by others" not in _labels(ax) else None
-            ax.plot(*(100 * np.array([at, path[0]]).T), ":", color="black", lw=1.2, label=label)
-        ax.plot(*(100 * path.T), color=TRUTH, lw=2, label="truth" if k == 0 else None)
-        end = 100 * np.array(step.predicted_end_xy_m)
-        ax.plot(*end, "o", color=PREDICTION, ms=5, label="prediction" if k == 0 else None)
-        if isinstance(step.primitive, Grasp | Rotate):
-            below = _beside(ax, f"{k + 1} {step.primitive.name}", end, pursuit.goal, below)
-            at = path[-1]
+    goal = result.goal
+    first = result.plans[0].goal if result.plans else goal
+    if first.xy_m != goal.xy_m:
+        ax.plot(*_cm(first.xy_m), "*", color=GOAL, ms=11, mfc="none", zorder=5)
+    ax.plot(*_cm(goal.xy_m), "*", color=GOAL, ms=13, label="goal", zorder=5)
+    at, row, others = np.array(result.seen_xy_m[0]), 0, "moved by others"
+    ax.plot(*_cm(at), "o", color=NEUTRAL, ms=5)
+    for k, (step, path) in enumerate(zip(result.steps, result.object_paths_xy_m, strict=True)):
+        if math.dist(path[0], at) > 0.003:
+            ax.plot(*_cm([at, path[0]]), ":", color="black", lw=1.2, label=others)
+            others = None
+        truth, prediction = ("truth", "prediction") if k == 0 else (None, None)
+        ax.plot(*_cm(path), color=TRUTH, lw=2, label=truth)
+        ax.plot(*_cm(step.predicted_end_xy_m), "o", color=PREDICTION, ms=5, label=prediction)
+        at = path[-1]
+        if not _moves(step):
+            row += 1
+            _name_in_place(ax, f"{k + 1}", step, goal, row)
             continue
         x, y = path[-1] - path[0]
-        aside = np.array([-y, x]) / max(math.hypot(x, y), 1e-6)
-        ax.annotate(
-            f"{k + 1} {step.primitive.name}",
-            100 * path[len(path) // 2 :].mean(axis=0),
-            tuple((-1) ** k * 14 * aside),
-            textcoords="offset points",
-            ha="center",
-            va="center",
-            fontsize=7,
-            bbox=_PLATE,
-        )
-        at = path[-1]
+        aside = (-1) ** k * 14 * np.array([-y, x]) / max(math.hypot(x, y), 1e-6)
+        middle = _cm(path[len(path) // 2 :].mean(axis=0))
+        _name(ax, f"{k + 1} {step.primitive.name}", middle, aside, fontsize=7)
     if obj is not None:
-        plot_footprint(ax, obj, pursuit.end_pose[:2], pursuit.end_pose[2], TRUTH)
-    ax.set_title(
-        f"{pursuit.status}: {1000 * pursuit.distance_m:.1f} mm, {len(pursuit.steps)} actions"
-    )
+        plot_footprint(ax, obj, result.end_pose[:2], result.end_pose[2], TRUTH)
+    actions = len(result.steps)
+    ax.set_title(f"{result.status}: {1000 * result.distance_m:.1f} mm, {actions} actions")
     return ax
-
-
-def _labels(ax: Axes) -> list[str]:
-    return ax.get_legend_handles_labels()[1]
 
 
 def plot_depth(
@@ -262,13 +237,10 @@ def plot_depth(
         raise ValueError(f"image must be (2, n, n), got an array {image.shape}")
     height_cm = 100 * (CAMERA_HEIGHT_M - image[0])
     top = top_cm or max(8.0, float(height_cm.max()))
-    drawn = ax.imshow(
-        height_cm, extent=(-half, half, -half, half), cmap="cividis", vmin=0, vmax=top
-    )
+    extent = (-half, half, -half, half)
+    drawn = ax.imshow(height_cm, extent=extent, cmap="cividis", vmin=0, vmax=top)
     ax.grid(False)
-    ax.set_title(title)
-    ax.set_xlabel("x [cm]")
-    ax.set_ylabel("y [cm]")
+    ax.set(title=title, xlabel="x [cm]", ylabel="y [cm]")
     ax.figure.colorbar(drawn, ax=ax, label="height [cm]", shrink=0.8)
     return ax
 
@@ -284,15 +256,13 @@ def table_picture(
 
     What there is to be seen fills it; half_width_m bounds what it shows.
     """
-    # A figure of its own, outside pyplot: no window, nothing to close.
-    figure = Figure(figsize=(5, 5), layout="constrained")
-    FigureCanvasAgg(figure)
     shown = [pose[:2]]
     if (made := outcome.plan if outcome else plan) is not None:
         ends = [step.predicted_end_xy_m for step in made.steps]
         shown += [made.start_xy_m, made.goal.xy_m, *ends]
     low, high = np.min(shown, axis=0), np.max(shown, axis=0)
     half = min(half_width_m, max(high - low) / 2 + 0.11)
+    figure = Figure(figsize=(5, 5), layout="constrained")  # outside pyplot: nothing to close
     ax = plot_table(figure.add_subplot(), (low + high) / 2, half)
     if outcome is not None:
         plot_outcome(ax, outcome)
@@ -312,13 +282,9 @@ def outline_in_lever_frame(
     obj: TabletopObject, yaw_rad: float, contact_xy_m: np.ndarray, theta_rad: float
 ) -> np.ndarray:
     """The base (n, 2) [m] of an object at its start, from the contact point, lever to the right."""
-    yaw, theta = check_finite("yaw_rad", yaw_rad), check_finite("theta_rad", theta_rad)
-    c, s = math.cos(yaw), math.sin(yaw)
-    outline = obj.footprint_m @ np.array([[c, s], [-s, c]]) - check_pair(
-        "contact_xy_m", contact_xy_m
-    )
-    c, s = math.cos(theta), math.sin(theta)
-    return outline @ np.array([[c, -s], [s, c]])
+    outline = _rotated(obj.footprint_m, check_finite("yaw_rad", yaw_rad))
+    outline = outline - check_pair("contact_xy_m", contact_xy_m)
+    return _rotated(outline, -check_finite("theta_rad", theta_rad))
 
 
 def plot_levered(
@@ -336,20 +302,17 @@ def plot_levered(
     """
     pose, height_m = check_array("pose", pose, 4), check_finite("height_m", height_m)
     outline_m = check_array("outline_m", outline_m, 2)
-    centre, tilt = outline_m.mean(axis=0), pose[3]
-    c, s = math.cos(tilt), math.sin(tilt)
+    across = outline_m[:, 1] + pose[1]
+    along = outline_m[:, 0] - outline_m[:, 0].mean()
+    centre = np.array([outline_m[:, 0].mean() + pose[0], height_m / 2 + pose[2]])
     faces = []
     for z in (-height_m / 2, height_m / 2):
-        x, y = (outline_m - centre).T
-        x, z = c * x + s * z, c * z - s * x
-        x, y, z = x + centre[0] + pose[0], y + centre[1] + pose[1], z + height_m / 2 + pose[2]
-        faces.append(100 * np.column_stack([x + _ALONG * y, z + _UP * y]))
+        side = _rotated(np.column_stack([along, np.full(len(along), z)]), -pose[3]) + centre
+        faces.append(_cm(side + across[:, None] * (_ALONG, _UP)))
     for face in faces:
-        ax.fill(*face.T, facecolor=color, alpha=0.15, lw=0)
-        ax.plot(*np.vstack([face, face[:1]]).T, color=color, lw=1.2, label=label)
+        ax.fill(*face, facecolor=color, alpha=0.15, lw=0)
+        ax.plot(*_closed(face), color=color, lw=1.2, label=label)
         label = None
-    for low, high in zip(*faces, strict=True):
-        ax.plot(*np.array([low, high]).T, color=color, lw=0.8)
-    ax.set_aspect("equal")
-    ax.set(xlabel="along the lever [cm]", ylabel="height [cm]")
+    ax.plot(*np.stack(faces, axis=1), color=color, lw=0.8)
+    ax.set(xlabel="along the lever [cm]", ylabel="height [cm]", aspect="equal")
     return ax
