@@ -18,8 +18,8 @@ _NO_TEXT = Is[lambda value: not isinstance(value, str)]
 _NUMBERS = Annotated[Sequence[_NUMBER], _NO_TEXT] | np.ndarray
 _CHECKED = """
 types geometry primitives perception plan_files results world.config world.objects
-world.interventions world.scene planning.astar planning.closed_loop planning.continuous
-planning.disturbances planning.effect_map planning.gradient planning.grasp_rotate
+world.tabletop planning.astar planning.closed_loop planning.continuous planning.disturbances
+ planning.effect_map planning.gradient planning.grasp_rotate
 planning.problem planning.reachability planning.skills interactions.dataset
 interactions.sampling interactions.collect interactions.import_log interactions.lever_up
 interactions.recipes interactions.store models.calibration models.checkpoint models.ensemble

@@ -1,10 +1,20 @@
-"""Rotations of values that are stored by channel, such as x, y, z, yaw."""
+"""Angles, and rotations in the plane of the table, of points and of values by channel."""
 
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
-import torch
+import numpy as np
+
+if TYPE_CHECKING:
+    import torch
+
+
+def rotated(xy: np.ndarray, angle_rad: float) -> np.ndarray:
+    """Points (..., 2) rotated about the origin, counter-clockwise."""
+    c, s = math.cos(angle_rad), math.sin(angle_rad)
+    return xy @ np.array([[c, s], [-s, c]])
 
 
 def xy_columns(channels: tuple[str, ...]) -> list[int]:
@@ -19,6 +29,8 @@ def rotate_channels(
 
     A yaw that is an orientation rotates along; one that is a change, as an effect's, stays.
     """
+    import torch  # here, for what simulates only need not wait for it
+
     cos, sin = heading.unbind(-1)
     columns = list(values.unbind(-1))
     if plane := xy_columns(channels):

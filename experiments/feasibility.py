@@ -16,8 +16,7 @@ import numpy as np
 from affordlib.planning.routes import RouteMap, find_route
 from affordlib.primitives import HOVER_M, TIP_HEIGHT_M, Drag, Push
 from affordlib.world import UnreachableError, robot
-from affordlib.world.execution import RETREAT_M
-from affordlib.world.motion import HOVER_HEIGHT_M
+from affordlib.world.trajectory import RETREAT_M
 
 BAND_M = 0.01
 """How near to the rim of what can be reached a goal is not judged, but reported apart."""
@@ -52,7 +51,7 @@ def possible(
     half_m: of the object, behind whose centre the fingers of a push stop; slack_m: by how much
     the arm is taken to reach farther than it does.
     """
-    low, up = tool_reach_m(TIP_HEIGHT_M), tool_reach_m(HOVER_HEIGHT_M + TIP_HEIGHT_M)
+    low, up = tool_reach_m(TIP_HEIGHT_M), tool_reach_m(HOVER_M + TIP_HEIGHT_M)
     caging = tool_reach_m(HOVER_M)
 
     def judge(xy_m: np.ndarray, direction_rad: np.ndarray, length_m: np.ndarray) -> np.ndarray:

@@ -20,11 +20,10 @@ from affordlib.world import (
     UprightCylinder,
     WorldConfig,
     category_named,
-    execution,
     robot,
-    scene,
+    tabletop,
 )
-from affordlib.world.motion import Drive
+from affordlib.world.controller import JointController
 
 OBJECTS = (Cuboid(0.05, 0.07, 0.06), UprightCylinder(0.06, 0.05))
 
@@ -258,9 +257,9 @@ def test_what_rolls_on_a_level_table_comes_to_rest(world, yaw_rad):
         if braked:
             world.settle(2.0)
         else:
-            Drive(world, 0.0, closes=False).wait(480)
+            world.arm.wait(480)
         before = world.object_pose()[:2]
-        Drive(world, 0.0, closes=False).wait(120)
+        world.arm.wait(120)
         roll_on.append(math.dist(before, world.object_pose()[:2]))
     assert roll_on[0] < 1e-4
     assert roll_on[1] > 0.05
@@ -308,7 +307,7 @@ def test_a_world_is_built_anew_before_bullet_has_kept_too_much(world, monkeypatc
     built, states = [], []
     build = Tabletop._build
     monkeypatch.setattr(Tabletop, "_build", lambda *args: (built.append(args), build(*args)))
-    monkeypatch.setattr(scene, "OBJECTS_PER_BUILD", world._placed + 2)
+    monkeypatch.setattr(tabletop, "OBJECTS_PER_BUILD", world._n_placed + 2)
     for _ in range(3):
         world.place(UprightCylinder(0.05, 0.06), (0.1, 0.1))
         world.execute_primitive(Push(0.3))
@@ -321,8 +320,8 @@ def test_an_arm_that_cannot_go_on_from_where_it_feels_the_object_stays_there(wor
     """What has begun is recorded, and not said to have been out of reach."""
     world.place(Cuboid(0.12, 0.12, 0.05))  # too wide: the fingers come down on its top
     begun = []
-    first = execution.put_arm
-    monkeypatch.setattr(execution, "put_arm", lambda *args: (begun.append(1), first(*args)))
+    put = JointController.put
+    monkeypatch.setattr(JointController, "put", lambda *args: (begun.append(1), put(*args)))
     path = robot.joint_path
 
     def until_begun(*args):

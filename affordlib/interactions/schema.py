@@ -19,7 +19,7 @@ from affordlib.types import (
 )
 from affordlib.world import CATEGORIES, Tabletop, TabletopObject, WorldConfig
 from affordlib.world.execution import RECORDED_SAMPLES
-from affordlib.world.scene import N_SAMPLES
+from affordlib.world.trajectory import N_SAMPLES
 
 GRAIN = 2.0**-20
 """About 1 µm or 1 µrad: what is smaller in a float32 is not kept."""

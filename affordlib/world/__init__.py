@@ -14,7 +14,7 @@ from affordlib.world.objects import (
     category_named,
 )
 from affordlib.world.robot import BASE_X_M, REACH_M
-from affordlib.world.scene import Tabletop
+from affordlib.world.tabletop import Tabletop
 
 __all__ = [
     "BASE_X_M",

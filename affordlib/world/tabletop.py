@@ -6,16 +6,14 @@ four times finer step with twice the solver's iterations a push ends within 0.02
 
 from __future__ import annotations
 
-import math
 import weakref
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pybullet
-from scipy.spatial.transform import Rotation
 
 from affordlib.perception import adapt_to_object
-from affordlib.primitives import DURATION_S, PUSH_GAP_M, LeverUp, Primitive, Push, min_jerk
+from affordlib.primitives import PUSH_GAP_M, LeverUp, Primitive, Push
 from affordlib.types import (
     LEVER_CROP_WIDTH_M,
     LEVER_IMAGE_PIXELS,
@@ -32,33 +30,31 @@ from affordlib.types import (
     check_pair,
     check_within,
 )
-from affordlib.world import camera, motion, robot
+from affordlib.world import camera, robot
 from affordlib.world.config import WorldConfig
-from affordlib.world.execution import execute, place_offset, plan_motion, put_down, refused
-from affordlib.world.interventions import Interventions
-from affordlib.world.motion import StepCallback
-from affordlib.world.objects import TabletopObject, create_body, create_footprint
+from affordlib.world.controller import JointController
+from affordlib.world.execution import execute, put_down, unreached
+from affordlib.world.objects import TabletopObject
+from affordlib.world.placed_object import PlacedObject, create_footprint, set_friction
+from affordlib.world.trajectory import STEP_S, Command, plan_motion, segments_until
 
 OBJECTS_PER_BUILD = 256
-"""After so many objects the client is built anew: Bullet keeps 5 kB of each that is removed."""
-
-N_SAMPLES = 301
-"""Recorded samples over the phase: one every 3 simulation steps of a full primitive."""
+"""After so many objects the client is built again: Bullet keeps 5 kB of each that is removed."""
 
 
-class Tabletop(Interventions):
+class Tabletop:
     """A table, an arm and at most one object, in a PyBullet client of its own.
 
-    n_averaged_images: over how many noisy images an observation averages.
+    n_averaged_images: over how many noisy images an observation averages; on_step: called with the
+    world after every step of the simulation.
     """
 
     def __init__(self, config: WorldConfig | None = None) -> None:
         self.config = config or WorldConfig()
         self._client = pybullet.connect(pybullet.DIRECT)
         self._disconnect = weakref.finalize(self, pybullet.disconnect, self._client)
-        self.obj: TabletopObject | None = None
-        self.on_step: StepCallback | None = None
-        self.tool = ""
+        self.arm: JointController | None = None
+        self.on_step: Callable[[Tabletop], None] | None = None
         self.n_averaged_images = 1
         self.reset()
 
@@ -82,23 +78,23 @@ class Tabletop(Interventions):
     def reset(self, tool: str = "gripper") -> None:
         """Clear the table and park the arm with a tool: the same world, bit for bit, every time."""
         client = self.client
-        if tool != self.tool or self._placed >= OBJECTS_PER_BUILD:
+        if self.arm is None or tool != self.arm.tool or self._n_placed >= OBJECTS_PER_BUILD:
             self._build(tool)
         else:
             self._clear()
-        self.obj, self.body = None, -1
+        self._placed: PlacedObject | None = None
         self.noise = np.random.default_rng(self.config.noise_seed)
-        self._set_friction(self.table, -1, self.config.table_friction)
-        for link in robot.touching_links(client, self.robot):
-            self._set_friction(self.robot, link, self.config.finger_friction)
-        motion.put_arm(self, np.array(robot.HOME), PUSH_GAP_M)
+        set_friction(client, self._table, -1, self.config.table_friction)
+        for link in robot.touching_links(client, self.arm.robot):
+            set_friction(client, self.arm.robot, link, self.config.finger_friction)
+        self.arm.put(np.array(robot.HOME), PUSH_GAP_M)
 
     def _build(self, tool: str) -> None:
         client = self.client
         pybullet.resetSimulation(physicsClientId=client)
         pybullet.setGravity(0, 0, -9.81, physicsClientId=client)
         pybullet.setPhysicsEngineParameter(
-            fixedTimeStep=motion.STEP_S,
+            fixedTimeStep=STEP_S,
             numSolverIterations=50,
             restitutionVelocityThreshold=0.0,
             deterministicOverlappingPairs=1,
@@ -106,7 +102,7 @@ class Tabletop(Interventions):
         )
         half = [(TABLE_X_M[1] - TABLE_X_M[0]) / 2, (TABLE_Y_M[1] - TABLE_Y_M[0]) / 2, 0.05]
         shape = {"shapeType": pybullet.GEOM_BOX, "halfExtents": half, "physicsClientId": client}
-        self.table = pybullet.createMultiBody(
+        self._table = pybullet.createMultiBody(
             baseCollisionShapeIndex=pybullet.createCollisionShape(**shape),
             baseVisualShapeIndex=pybullet.createVisualShape(
                 **shape, rgbaColor=(0.93, 0.90, 0.85, 1)
@@ -114,30 +110,24 @@ class Tabletop(Interventions):
             basePosition=(sum(TABLE_X_M) / 2, sum(TABLE_Y_M) / 2, -0.05),
             physicsClientId=client,
         )
-        self.tool, self.robot, self._placed = tool, robot.load_robot(client, tool), 0
-        self.joints = (*robot.ARM_JOINTS, *robot.finger_joints(client, self.robot))
+        world = weakref.proxy(self)  # no circle of references: it would keep the client connected
+        self.arm = JointController(client, tool, lambda: world._stepped())
+        self._n_placed = 0
         self._fresh = pybullet.saveState(physicsClientId=client)
+
+    def _stepped(self) -> None:
+        if self.on_step is not None:
+            self.on_step(self)
 
     def _clear(self) -> None:
         """Back to table and arm alone: exactly as when built, without loading them again."""
         client = self.client
-        motion.untie_fingers(self)
+        self.arm.untie()
         bodies = range(pybullet.getNumBodies(physicsClientId=client))
         for body in [pybullet.getBodyUniqueId(k, physicsClientId=client) for k in bodies]:
-            if body not in (self.table, self.robot):
+            if body not in (self._table, self.arm.robot):
                 pybullet.removeBody(body, physicsClientId=client)
         pybullet.restoreState(stateId=self._fresh, physicsClientId=client)
-
-    def _set_friction(self, body: int, link: int, lateral: float) -> None:
-        pybullet.changeDynamics(
-            body,
-            link,
-            lateralFriction=lateral,
-            spinningFriction=1e-3,
-            rollingFriction=motion.ROLLING_M,
-            restitution=0.0,
-            physicsClientId=self.client,
-        )
 
     def place(
         self,
@@ -152,91 +142,92 @@ class Tabletop(Interventions):
 
         tool: "gripper" or "screwdriver"; config: from now on (default: as it is).
         """
-        x, y = check_on_table("xy_m", xy_m)
-        yaw = check_finite("yaw_rad", yaw_rad)
+        xy_m, yaw_rad = check_on_table("xy_m", xy_m), check_finite("yaw_rad", yaw_rad)
         if tool not in robot.TOOL_OFFSETS_M:
             raise ValueError(f"tool must be one of {sorted(robot.TOOL_OFFSETS_M)}, got {tool!r}")
         self.config = config or self.config
         self.reset(tool)
-        self._placed += 1
-        mass = self.config.density_kg_m3 * obj.volume_m3
-        com = self.config.com_offset_m
-        self.obj = obj
-        self.body = create_body(self.client, obj, mass, (0.0, 0.62, 0.45, 1), com)
-        self._set_friction(self.body, -1, self.config.object_friction)
-        pybullet.changeDynamics(
-            self.body, -1, linearDamping=0.0, angularDamping=0.0, physicsClientId=self.client
-        )
-        c, s = math.cos(yaw), math.sin(yaw)
-        pybullet.resetBasePositionAndOrientation(
-            self.body,
-            (
-                x + c * com[0] - s * com[1],
-                y + s * com[0] + c * com[1],
-                obj.height_m / 2 + com[2],
-            ),
-            pybullet.getQuaternionFromEuler((0, 0, yaw)),
-            physicsClientId=self.client,
-        )
+        self._n_placed += 1
+        self._placed = PlacedObject(self.client, obj, self.config, xy_m, yaw_rad)
 
-    def _require_object(self) -> None:
-        if self.obj is None:
+    @property
+    def placed(self) -> PlacedObject:
+        """The object on the table; raises RuntimeError when there is none."""
+        if self._placed is None:
             raise RuntimeError("there is no object on the table; call place(...) first")
+        return self._placed
 
-    def centred(self, states: np.ndarray) -> np.ndarray:
-        """States (n, 7) of the object's centre, given those of its centre of mass."""
-        offset = np.array(self.config.com_offset_m)
-        if not offset.any():
-            return states
-        shift = Rotation.from_quat(states[:, 3:]).apply(offset)
-        return np.column_stack([states[:, :3] - shift, states[:, 3:]])
+    @property
+    def obj(self) -> TabletopObject:
+        """The object on the table: its category and dimensions."""
+        return self.placed.obj
 
     def object_state(self) -> tuple[float, ...]:
         """Position (x, y, z) [m] and quaternion (x, y, z, w) of the object, seven numbers."""
-        self._require_object()
-        position, quaternion = pybullet.getBasePositionAndOrientation(self.body, self.client)
-        return tuple(self.centred(np.array([[*position, *quaternion]]))[0])
+        return self.placed.state()
 
     def object_pose(self) -> tuple[float, float, float]:
         """The object's (x, y) [m] and yaw [rad] in the frame of the table."""
-        x, y, _, yaw, _ = motion.poses(np.array([self.object_state()]))[0]
-        return float(x), float(y), float(yaw)
-
-    def object_tilt_rad(self) -> float:
-        """Angle between the object's own upright axis and the vertical [rad]."""
-        return float(motion.poses(np.array([self.object_state()]))[0, 4])
-
-    def _upward(self) -> np.ndarray:
-        return Rotation.from_quat(self.object_state()[3:]).as_matrix()[2]
+        return self.placed.pose()
 
     def object_fell(self) -> bool:
         """Whether the object lies differently than it was placed."""
-        self._require_object()
-        return self.obj.fallen(self._upward())
+        return self.placed.fell()
 
     def object_rolls(self) -> bool:
         """Whether the object can roll as it lies now: a cylinder on its side, not upright."""
-        self._require_object()
-        return self.obj.rolls(self._upward())
+        return self.placed.rolls()
 
-    @staticmethod
-    def on_table(xyz_m: tuple[float, float, float]) -> bool:
-        """Whether a point (x, y, z) [m] is above the table."""
-        x, y, z = xyz_m
-        return z > 0 and TABLE_X_M[0] <= x <= TABLE_X_M[1] and TABLE_Y_M[0] <= y <= TABLE_Y_M[1]
+    def shove(self, dx_m: float, dy_m: float, dyaw_rad: float = 0.0) -> None:
+        """Displace the object by (dx, dy) [m], turn it by a yaw [rad], and let it settle.
+
+        The arm is not told. Raises ValueError, and moves nothing, when the object's centre would
+        leave the table.
+        """
+        self.placed.displace(dx_m, dy_m, dyaw_rad)
+        self.settle()
+
+    def knock(self, dx_m_s: float, dy_m_s: float, spin_rad_s: float = 0.0) -> None:
+        """Hit the object: its velocity [m/s] and its spin about the vertical change at once.
+
+        It may be called from `on_step`, in the middle of an action.
+        """
+        self.placed.knock(dx_m_s, dy_m_s, spin_rad_s)
+
+    def topple(self, direction_rad: float) -> None:
+        """Tip the object over the edge of its base in a direction [rad], as a blow high up would.
+
+        It may be called from `on_step`; otherwise let it `settle`. Raises ValueError for what
+        cannot fall.
+        """
+        self.placed.topple(direction_rad)
+
+    def settle(self, seconds: float = 0.5) -> None:
+        """Let the world run while the arm stands still and keeps hold of what it holds.
+
+        What can roll is braked by the table.
+        """
+        steps = round(check_within("seconds", seconds, 0.0, 60.0, "s") / STEP_S)
+        if self._placed is not None:
+            self.placed.brake(True)
+            self.arm.tie_held(self.placed.body)
+        self.arm.wait(steps)
+
+    def park(self) -> None:
+        """Put down what the hand holds, open the fingers and take the arm home."""
+        put_down(self.arm, self._placed)
+        self.settle()
 
     def observe(self) -> Observation:
         """The object's estimated position and its image; the arm must be parked.
 
         The position is the mean over `n_averaged_images` images, the image is the first of them.
         """
-        self._require_object()
         x, y, _ = self.object_pose()
         image = None
         if self.config.camera == "kinect":
-            views = [
-                camera.kinect_view(self.client, self.noise) for _ in range(self.n_averaged_images)
-            ]
+            images = range(self.n_averaged_images)
+            views = [camera.kinect_view(self.client, self.noise) for _ in images]
             x, y = np.mean([xy for xy, _ in views], axis=0).tolist()
             image = views[0][1]
         x, y = x + self.config.bias_m[0], y + self.config.bias_m[1]
@@ -274,11 +265,35 @@ class Tabletop(Interventions):
         scale: float = 1.0,
     ) -> None:
         """Show the object's footprint at (x, y) [m] on the table, in a colour; only seen."""
-        self._require_object()
-        x, y = check_on_table("xy_m", xy_m)
+        obj, xy_m = self.obj, check_on_table("xy_m", xy_m)
         yaw_rad, scale = check_finite("yaw_rad", yaw_rad), check_within("scale", scale, 0.1, 10.0)
         rgb = [check_within("rgb", share, 0.0, 1.0) for share in check_array("rgb", rgb, 3)]
-        create_footprint(self.client, self.obj, (x, y), yaw_rad, (*rgb, 1.0), scale)
+        create_footprint(self.client, obj, xy_m, yaw_rad, (*rgb, 1.0), scale)
+
+    def can_reach(
+        self, primitive: Primitive, stop_phase: float = 1.0, at_xy_m: Sequence[float] | None = None
+    ) -> bool:
+        """Whether the arm can execute an action, with approach and way out; nothing moves.
+
+        at_xy_m: where the object is (default: where it is observed, and the action adapted to it).
+        The kinematics are those by which `execute_primitive` plans.
+        """
+        stop_phase = check_within("stop_phase", stop_phase, 0.0, 1.0)
+        if at_xy_m is None:
+            seen = self.observe()
+            at_xy_m, primitive = seen.xy_m, adapt_to_object(primitive, seen.image)
+        offset = np.array([*check_on_table("at_xy_m", at_xy_m), self.config.tip_offset_m, 0.0, 0.0])
+        try:
+            plan_motion(primitive, segments_until(primitive, stop_phase), offset, approach=True)
+        except UnreachableError:
+            return False
+        return True
+
+    def execute(self, step: Step) -> Interaction:
+        """Execute a step of a plan, with approach: its decoded path if it has one."""
+        if step.path_xy_m is None:
+            return self.execute_primitive(step.primitive, step.stop_phase, approach=True)
+        return self.execute_path(step.path_xy_m, step.primitive, step.stop_phase)
 
     def execute_primitive(
         self,
@@ -292,80 +307,28 @@ class Tabletop(Interventions):
         """Execute a primitive on the object up to a phase, and record what happens.
 
         approach=False puts the arm at the start of the path and away in the end (collecting);
-        approach=True moves it there through the air and back home (carrying out a plan), and the
+        approach=True moves it there through the air and back home (executing a plan), and the
         table brakes what rolls before and after what is recorded.
-        The effect is recorded at `N_SAMPLES` phases in [0, stop_phase]. A partial action is the
-        prefix of the path, re-timed to its own smooth stop, or with smooth=False cut off.
+        The effect is recorded at 301 phases in [0, stop_phase]. A partial action is the prefix of
+        the path, re-timed to its own smooth stop, or with smooth=False stopped abruptly.
         Raises UnreachableError when the arm cannot follow the path; with record_unreachable=True
         the result is then an interaction in which nothing moved (`reached` is False).
         """
-        primitive, phase, seen = self._look_before(primitive, stop_phase)
-        way = motion.stretches(primitive, stop_phase, smooth)
+        stop_phase = check_within("stop_phase", stop_phase, 0.0, 1.0)
+        self._require_tool(primitive)
+        if isinstance(primitive, LeverUp):  # seen from the contact point
+            contact = (primitive.contact_x, primitive.contact_y)
+            image = self.depth_image_from(contact, primitive.theta)
+            seen = Observation(self.object_pose()[:2], image)
+        else:
+            seen = self.observe()
+        command = Command.of(adapt_to_object(primitive, seen.image), stop_phase, smooth)
         try:
-            return execute(self, primitive, way, phase, primitive.path(phase), seen, approach)
+            return self._execute(command, seen, approach)
         except UnreachableError:
             if not record_unreachable:
                 raise
-            return refused(self, primitive, phase, seen)
-
-    def _look_before(
-        self, primitive: Primitive, stop_phase: float
-    ) -> tuple[Primitive, np.ndarray, Observation]:
-        """The primitive aimed at what is seen, the phases to be recorded, and what is seen."""
-        stop_phase = check_within("stop_phase", stop_phase, 0.0, 1.0)
-        self._require_tool(primitive)
-        seen = self._observe_for(primitive)
-        return (
-            adapt_to_object(primitive, seen.image),
-            np.linspace(0.0, 1.0, N_SAMPLES) * stop_phase,
-            seen,
-        )
-
-    def _require_tool(self, primitive: Primitive) -> None:
-        if primitive.tool != self.tool:
-            raise ValueError(
-                f"primitive {primitive.name!r} needs the tool {primitive.tool!r}, and the arm "
-                f"holds the {self.tool}; call place(..., tool={primitive.tool!r})"
-            )
-
-    def can_reach(
-        self, primitive: Primitive, stop_phase: float = 1.0, at_xy_m: Sequence[float] | None = None
-    ) -> bool:
-        """Whether the arm can carry out an action, with approach and way out; nothing moves.
-
-        at_xy_m: where the object is (default: where it is seen; the action is then aimed at it, as
-        `execute_primitive` does). The kinematics are those by which `execute_primitive` plans.
-        """
-        stop_phase = check_within("stop_phase", stop_phase, 0.0, 1.0)
-        at_xy_m = None if at_xy_m is None else check_on_table("at_xy_m", at_xy_m)
-        if at_xy_m is None:
-            seen = self.observe()
-            at_xy_m, primitive = seen.xy_m, adapt_to_object(primitive, seen.image)
-        way = motion.stretches(primitive, stop_phase)
-        try:
-            plan_motion(primitive, way, place_offset(self, at_xy_m), approach=True)
-        except UnreachableError:
-            return False
-        return True
-
-    def park(self) -> None:
-        """Put down what the hand holds, open the fingers and take the arm home."""
-        put_down(self)
-        self.settle()
-
-    def _observe_for(self, primitive: Primitive) -> Observation:
-        """What the robot sees before it acts; a lever-up looks from the contact point."""
-        if not isinstance(primitive, LeverUp):
-            return self.observe()
-        self._require_object()
-        contact = (primitive.contact_x, primitive.contact_y)
-        return Observation(self.object_pose()[:2], self.depth_image_from(contact, primitive.theta))
-
-    def execute(self, step: Step) -> Interaction:
-        """Execute a step of a plan, with approach: its decoded path if it has one."""
-        if step.path_xy_m is None:
-            return self.execute_primitive(step.primitive, step.stop_phase, approach=True)
-        return self.execute_path(step.path_xy_m, step.primitive, step.stop_phase)
+            return unreached(command, self.placed, seen)
 
     def execute_path(
         self, path_xy_m: np.ndarray, primitive: Push | None = None, stop_phase: float = 1.0
@@ -378,7 +341,15 @@ class Tabletop(Interventions):
         stop_phase = check_within("stop_phase", stop_phase, 0.0, 1.0)
         primitive = primitive or Push(0.0)
         self._require_tool(primitive)
-        path_xy_m = check_array("path_xy_m", path_xy_m, 2)
-        phase, action = motion.along_path(path_xy_m, primitive, stop_phase)
-        way = [motion.stretch_along(action, phase, DURATION_S * float(min_jerk(phase[-1])))]
-        return execute(self, primitive, way, phase, action, self.observe(), approach=True)
+        command = Command.along(check_array("path_xy_m", path_xy_m, 2), primitive, stop_phase)
+        return self._execute(command, self.observe(), approach=True)
+
+    def _execute(self, command: Command, seen: Observation, approach: bool) -> Interaction:
+        return execute(self.arm, self.placed, command, seen, self.config.tip_offset_m, approach)
+
+    def _require_tool(self, primitive: Primitive) -> None:
+        if primitive.tool != self.arm.tool:
+            raise ValueError(
+                f"primitive {primitive.name!r} needs the tool {primitive.tool!r}, and the arm "
+                f"holds the {self.arm.tool}; call place(..., tool={primitive.tool!r})"
+            )

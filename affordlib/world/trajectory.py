@@ -1,0 +1,211 @@
+"""From a primitive to waypoints of the arm's joints; no physics, and nothing moves.
+
+Inverse kinematics runs at 20 Hz, with a spline in between (its error is a few µm), so that an
+interaction costs little more than the physics itself. A whole action is planned before anything
+moves: what is out of reach raises first.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from affordlib.primitives import DURATION_S, HOVER_M, TIP_HEIGHT_M, Primitive, min_jerk
+from affordlib.world import robot
+
+STEP_S = 1 / 240
+STEPS_PER_WAYPOINT = 12
+RECORD_EVERY = 3
+"""Simulation steps from one recorded state of the object to the next."""
+
+N_SAMPLES = 301
+"""Recorded samples over the phase: one every 3 simulation steps of a full primitive."""
+
+RETREAT_M = 0.02
+"""How far the gripper moves back along its path after an action that does not cage the object."""
+
+_WAYPOINT_S = STEPS_PER_WAYPOINT * STEP_S
+UP = np.array([0.0, 0.0, 1.0, 0.0, 0.0])
+"""The direction up in poses (x, y, z, yaw, pitch)."""
+
+
+@dataclass(frozen=True)
+class TrajectorySegment:
+    """Waypoints 50 ms apart: poses (n, 6) as in `Segment`, phases (n,) at which they are passed.
+
+    n_steps: how many simulation steps of it are taken before the arm is stopped abruptly (default:
+    all). A guarded segment freezes when the robot presses on the object.
+    """
+
+    poses: np.ndarray
+    phase: np.ndarray
+    guarded: bool = False
+    n_steps: int | None = None
+
+
+@dataclass(frozen=True)
+class Command:
+    """An action as the arm is to execute it, relative to where the robot measured the object.
+
+    phase: (n,) and action: (n, 5), as they are recorded; segments: the trajectory.
+    """
+
+    primitive: Primitive
+    phase: np.ndarray
+    action: np.ndarray
+    segments: list[TrajectorySegment]
+
+    @classmethod
+    def of(cls, primitive: Primitive, stop_phase: float, smooth: bool = True) -> Command:
+        """A primitive up to a phase."""
+        phase = np.linspace(0.0, 1.0, N_SAMPLES) * stop_phase
+        segments = segments_until(primitive, stop_phase, smooth)
+        return cls(primitive, phase, primitive.path(phase), segments)
+
+    @classmethod
+    def along(cls, path_xy_m: np.ndarray, primitive: Primitive, stop_phase: float) -> Command:
+        """Points (n, 2) [m], n ≥ 2, with the heights of a primitive; the fingers face their end."""
+        if path_xy_m.ndim != 2 or len(path_xy_m) < 2:
+            raise ValueError(f"path_xy_m must be points (n, 2), n ≥ 2, got {path_xy_m.shape}")
+        phase = np.linspace(0.0, 1.0, len(path_xy_m)) * stop_phase
+        action = primitive.path(phase)
+        action[:, :2] = path_xy_m
+        heading = path_xy_m[-1] - path_xy_m[0]
+        if np.hypot(*heading) > 1e-6:
+            action[:, 3] = math.atan2(heading[1], heading[0])
+        return cls(primitive, phase, action, [_segment_along(action, phase)])
+
+
+def segments_until(
+    primitive: Primitive, stop_phase: float, smooth: bool = True
+) -> list[TrajectorySegment]:
+    """The trajectory of a primitive up to a phase, segment by segment.
+
+    smooth: the segment in which it stops keeps its path and gets a minimum-jerk stop of its own;
+    otherwise it is followed at full speed and stopped abruptly.
+    """
+    segments = []
+    phases = primitive.segment_phases
+    for segment, begin, end in zip(primitive.segments, phases[:-1], phases[1:], strict=True):
+        if segments and begin >= stop_phase - 1e-9:
+            break
+        local = min(1.0, (stop_phase - begin) / (end - begin))
+        covered = float(min_jerk(local)) if smooth else 1.0
+        n = max(2, math.ceil(segment.seconds * covered / _WAYPOINT_S - 1e-9))
+        share = covered * min_jerk(np.linspace(0, 1, n + 1))
+        at_phase = np.linspace(0, 1, n + 1)
+        if covered < 1.0:
+            fine = np.linspace(0, local, 301)
+            at_phase = np.interp(share, min_jerk(fine), fine)
+        steps = None
+        if not smooth and local < 1.0:
+            steps = RECORD_EVERY * round(local * segment.seconds / STEP_S / RECORD_EVERY)
+        phase = begin + at_phase * (end - begin)
+        segments.append(TrajectorySegment(segment.at(share), phase, segment.guarded, steps))
+    return segments
+
+
+def _segment_along(action: np.ndarray, phase: np.ndarray) -> TrajectorySegment:
+    """An action (n, 5) at phases (n,), followed along its length with a smooth stop."""
+    n = max(2, math.ceil(DURATION_S * float(min_jerk(phase[-1])) / _WAYPOINT_S - 1e-9))
+    # Along its length, a minimum-jerk path is the same path whatever its speed.
+    length = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(action[:, :2], axis=0).T))])
+    if length[-1] < 1e-9:
+        return TrajectorySegment(np.repeat([[*action[0], 0.0]], n + 1, axis=0), np.zeros(n + 1))
+    wanted = min_jerk(np.linspace(0, 1, n + 1)) * length[-1]
+    columns = [np.interp(wanted, length, action[:, c]) for c in range(5)]
+    poses = np.column_stack([*columns, np.zeros(n + 1)])
+    return TrajectorySegment(poses, np.interp(wanted, length, phase))
+
+
+def recorded_phases(segments: list[TrajectorySegment]) -> tuple[np.ndarray, np.ndarray]:
+    """Phases at which states of the object, and poses of the tool, are recorded, in order."""
+    per = STEPS_PER_WAYPOINT // RECORD_EVERY
+    at_sample, at_waypoint = [], []
+    for segment in segments:
+        waypoints = np.arange(len(segment.phase))
+        steps = segment.n_steps
+        records = waypoints[-1] * per if steps is None else steps // RECORD_EVERY
+        samples = np.interp(np.arange(records) / per, waypoints, segment.phase)
+        at_sample.append(samples)
+        at_waypoint.append(samples[::per])
+        end = np.interp(records / per, waypoints, segment.phase)
+    return np.concatenate([*at_sample, [end]]), np.concatenate([*at_waypoint, [end]])
+
+
+def joint_move(start: np.ndarray, end: np.ndarray, seconds: float) -> np.ndarray:
+    """Joint waypoints (n, 6) of a smooth move between two postures."""
+    n = max(2, math.ceil(seconds / _WAYPOINT_S))
+    return start + min_jerk(np.linspace(0, 1, n + 1))[:, None] * (end - start)
+
+
+def line(start_W: np.ndarray, end_W: np.ndarray, near: np.ndarray, seconds: float, tool: str):
+    """Joint waypoints (n, 6) of a smooth straight line between two poses (x, y, z, yaw, pitch)."""
+    return robot.joint_path(joint_move(start_W, end_W, seconds), near, tool)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """All joint waypoints of an action, found before anything moves.
+
+    over_start: (6,) above the start; down: (n, 6) from there to it; poses_W: (n, 5) of the tool at
+    the waypoints `paths` (n, 6), and gaps of the fingers (n,) there, of each segment; retreat,
+    lift: (n, 6), the way out.
+    """
+
+    over_start: np.ndarray
+    down: np.ndarray
+    poses_W: list[np.ndarray]
+    paths: list[np.ndarray]
+    gaps: list[np.ndarray]
+    retreat: np.ndarray
+    lift: np.ndarray
+
+
+def plan_motion(
+    primitive: Primitive, segments: list[TrajectorySegment], offset: np.ndarray, approach: bool
+) -> Motion:
+    """The arm's motion along segments; offset (5,) is added to their poses.
+
+    Raises UnreachableError where any of it is out of reach.
+    """
+    home, tool = np.array(robot.HOME), primitive.tool
+    # A gripper is symmetric: of its two equal yaws, take the one that turns the wrist less.
+    turns = (0.0, math.pi) if tool == "gripper" else (0.0,)
+    options = [
+        [s.poses[:, [0, 1, 2, 3, 5]] + offset + np.array([0, 0, 0, turn, 0]) for s in segments]
+        for turn in turns
+    ]
+    up = max(HOVER_M + TIP_HEIGHT_M - segments[0].poses[0, 2], 0.0) * UP
+    poses_W, over_start = min(
+        ((option, robot.joint_path(option[0][:1] + up, home, tool)[0]) for option in options),
+        key=lambda option: abs(option[1][5] - home[5]),
+    )
+    paths, near = [], over_start
+    for one in poses_W:
+        paths.append(robot.joint_path(one, near, tool))
+        near = paths[-1][-1]
+
+    # The way out: back along the path, then up; only up where the fingers cage the object.
+    n_steps, at = segments[-1].n_steps, np.arange(len(paths[-1]))
+    stop = at[-1] if n_steps is None else n_steps / STEPS_PER_WAYPOINT
+    end = np.array([np.interp(stop, at, column) for column in poses_W[-1].T])
+    near = np.array([np.interp(stop, at, column) for column in paths[-1].T])
+    caged = primitive.path(0.0)[0, 2] > TIP_HEIGHT_M
+    retreat, back = near[None], np.zeros(5)
+    if not (caged or primitive.holds):
+        back[:3] = poses_W[0][0, :3] - end[:3]
+        back *= RETREAT_M / max(np.linalg.norm(back), RETREAT_M)
+        retreat = line(end, end + back, near, 0.25, tool)
+    lift = retreat[-1:]
+    if (caged or approach) and not primitive.holds:
+        rise = max(HOVER_M - end[2], 0.0) if caged else HOVER_M
+        lift = line(end + back, end + back + rise * UP, retreat[-1], 0.5, tool)
+
+    down = over_start[None]
+    if approach:
+        down = line(poses_W[0][0] + up, poses_W[0][0], over_start, 1.0, tool)
+    gaps = [primitive.opening_m * s.poses[:, 4] for s in segments]
+    return Motion(over_start, down, poses_W, paths, gaps, retreat, lift)
