@@ -35,7 +35,7 @@ from affordlib.world.config import WorldConfig
 from affordlib.world.controller import JointController
 from affordlib.world.execution import execute, put_down, unreached
 from affordlib.world.objects import TabletopObject
-from affordlib.world.placed_object import PlacedObject, create_footprint, set_friction
+from affordlib.world.placed_object import PlacedObject, create_footprint, poses, set_friction
 from affordlib.world.trajectory import STEP_S, Command, plan_motion, segments_until
 
 OBJECTS_PER_BUILD = 256
@@ -169,6 +169,10 @@ class Tabletop:
     def object_pose(self) -> tuple[float, float, float]:
         """The object's (x, y) [m] and yaw [rad] in the frame of the table."""
         return self.placed.pose()
+
+    def object_tilt_rad(self) -> float:
+        """Angle between the object's own upright axis and the vertical [rad]."""
+        return float(poses(np.array([self.object_state()]))[0, 4])
 
     def object_fell(self) -> bool:
         """Whether the object lies differently than it was placed."""
