@@ -19,7 +19,7 @@ _NUMBERS = Annotated[Sequence[_NUMBER], _NO_TEXT] | np.ndarray
 _CHECKED = """
 types geometry primitives perception plan_files results world.config world.objects
 world.tabletop planning.astar planning.closed_loop planning.continuous planning.disturbances
- planning.effect_map planning.gradient planning.grasp_rotate
+planning.effect_map planning.gradient planning.grasp_rotate
 planning.problem planning.reachability planning.skills interactions.dataset
 interactions.sampling interactions.collect interactions.import_log interactions.lever_up
 interactions.recipes interactions.store models.calibration models.checkpoint models.ensemble
