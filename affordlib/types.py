@@ -133,12 +133,13 @@ class Observation:
 
     xy_m: estimated position (x, y) [m] in the frame of the table; image: (2, 48, 48), depth [m]
     from a plane 1 m above the table and the object's mask, centred there; std_m: σ of the
-    position, where it is known.
+    position, and yaw_rad: how the object is turned, where they are known.
     """
 
     xy_m: tuple[float, float]
     image: np.ndarray
     std_m: float | None = None
+    yaw_rad: float | None = None
 
 
 @dataclass(frozen=True)
@@ -183,6 +184,17 @@ class Interaction:
             "penetration": self.penetration_m > FAULT_LIMIT_M,
         }
         return tuple(name for name, so in reasons.items() if so)
+
+    @property
+    def object_path(self) -> np.ndarray:
+        """(n + 2, 4) of the object, from before the action until it rests or is held after it.
+
+        x, y [m], height above where it stood [m] and yaw [rad], in the frame of the table; of a
+        `Tabletop` the simulator's state.
+        """
+        moved = np.vstack([np.zeros(5), self.effect, self.rest_effect])[:, :4]
+        x, y, yaw = self.start_pose
+        return moved + np.array([x, y, 0.0, yaw])
 
     @property
     def success(self) -> bool:
@@ -344,18 +356,17 @@ class Plan:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What carrying out a plan gave.
+    """What carrying out a plan gave, as the robot measured it.
 
     distance_m: between the goal and the object at rest, gripper retreated; object_paths_xy_m: one
     (n, 2) path of the object per executed step, in the frame of the table; end_pose: (x, y, yaw);
-    tilt_rad: how far the object's upright axis ended from vertical; turned_rad, lifted_m: how far
-    the object was turned and lifted; words: what else there is to say of the ending.
+    turned_rad, lifted_m: how far the object was turned and lifted; words: what else there is to
+    say of the ending.
     """
 
     plan: Plan
     distance_m: float
     end_pose: tuple[float, float, float]
-    tilt_rad: float
     object_paths_xy_m: tuple[np.ndarray, ...] = field(default=())
     turned_rad: float = 0.0
     lifted_m: float = 0.0

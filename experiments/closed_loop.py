@@ -30,6 +30,7 @@ from affordlib.paths import repo_root
 from affordlib.planning import (
     ClosedLoopResult,
     Disturbance,
+    DisturbanceSchedule,
     Skills,
     run_closed_loop,
     sample_disturbances,
@@ -104,20 +105,21 @@ def run_trial(table: str, index: int, world: Tabletop, skills: Skills, seed: int
     trial = draw_trial(table, index, seed)
     record: dict[str, Any] = {"index": index, "object_class": trial.obj.category}
     world.place(trial.obj, trial.start_xy_m, trial.yaw_rad)
-    went = run_closed_loop(world, trial.goal, skills, disturbances=trial.disturbances)
-    record |= _told(went)
+    disturbed = DisturbanceSchedule(world, trial.goal, trial.disturbances)
+    went = run_closed_loop(disturbed, disturbed.current_goal, skills)
+    record |= _told(world, went)
     if table == "height":
         record["feasible"] = _can_be_lifted(world, trial, went)
     elif table == "orientation":
         record["feasible"] = True
     elif table == "disturbances":
-        record["feasible"] = _stays_feasible(world, trial, went)
+        record["feasible"] = _stays_feasible(world, trial, went, disturbed.happened)
         record["kind"] = trial.disturbances[0].kind
         record["in_action"] = trial.disturbances[0].at_s is not None
-        record["happened"] = len(went.happened)
+        record["happened"] = len(disturbed.happened)
         world.place(trial.obj, trial.start_xy_m, trial.yaw_rad)
         undisturbed = run_closed_loop(world, trial.goal, skills)
-        record["undisturbed"] = _told(undisturbed)
+        record["undisturbed"] = _told(world, undisturbed)
     else:
         asked = _how_moved(trial), half_width_m(trial.obj.footprint_m)
         record["feasible"] = is_feasible(*asked, trial.start_xy_m, trial.goal.xy_m)
@@ -126,11 +128,12 @@ def run_trial(table: str, index: int, world: Tabletop, skills: Skills, seed: int
     return record
 
 
-def _told(went: ClosedLoopResult) -> dict[str, Any]:
+def _told(world: Tabletop, went: ClosedLoopResult) -> dict[str, Any]:
+    """What the tables need of a closed loop; the distance is measured in the world."""
     return {
         "ending": went.status,
         "words": went.message,
-        "distance_m": went.distance_m,
+        "distance_m": went.goal.distance_m(world.object_pose()[:2]),
         "actions": len(went.steps),
         "plans": len(went.plans),
         "vetoes": went.vetoes,
@@ -159,7 +162,9 @@ def _can_be_lifted(world: Tabletop, trial: Trial, went: ClosedLoopResult) -> boo
     return went.reached or any(map(lifts, GRIPPER_YAWS_RAD))
 
 
-def _stays_feasible(world: Tabletop, trial: Trial, went: ClosedLoopResult) -> bool:
+def _stays_feasible(
+    world: Tabletop, trial: Trial, went: ClosedLoopResult, happened: Sequence[Disturbance]
+) -> bool:
     """Whether the kinematics allows a way from the start, and from where the disturbance has left
     the object, as it was first seen after it.
 
@@ -168,9 +173,9 @@ def _stays_feasible(world: Tabletop, trial: Trial, went: ClosedLoopResult) -> bo
     half, start = half_width_m(trial.obj.footprint_m), trial.start_xy_m
     if not is_feasible(_how_moved(trial), half, start, trial.goal.xy_m):
         return False
-    if not went.happened:
+    if not happened:
         return True
-    what = went.happened[0]
+    what = happened[0]
     look = what.action + (what.at_s is not None)
     if went.status == "lost" and len(went.seen_xy_m) == look + 1:
         return what.kind == "goal"

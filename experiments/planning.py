@@ -221,7 +221,8 @@ def attempt(
 ) -> Outcome:
     """Plan and execute one task, correcting the final position by up to so many single actions.
 
-    A plan that the arm cannot follow counts with the distance at which it left the object.
+    The distance is measured in the world, not by the robot. A plan that the arm cannot follow
+    counts with the distance at which it left the object.
     perturbed_start: when the plan is executed, the object is off its estimated pose by
     `POSITION_ERROR_M` and `YAW_ERROR_RAD`. n_averaged_images: whose mean each observation is.
     """
@@ -235,11 +236,13 @@ def attempt(
         world.place(task.obj, (0.0, 0.0), task.yaw_rad + YAW_ERROR_RAD, config=config)
     once = PlanMode(1, partial=True)
     try:
-        return execute_plan(world, plan, corrections, lambda *query: planner(*query, once))
+        outcome = execute_plan(world, plan, corrections, lambda *query: planner(*query, once))
     except UnreachableError as refused:
-        return refused.outcome
+        outcome = refused.outcome
     finally:
         world.n_averaged_images = 1
+    pose = world.object_pose()
+    return replace(outcome, distance_m=task.goal.distance_m(pose[:2]), end_pose=pose)
 
 
 def outcome_record(task: PlanningTask, outcome: Outcome) -> dict[str, Any]:

@@ -101,7 +101,7 @@ def shop(one_world, skills, pushes, tmp_path_factory):
         "scaler": scaler,
         "arrays": arrays,
         "network": models.build(config, scaler),
-        "outcome": Outcome(plan, 0.01, (0.04, 0.02, 0.0), 0.0, (path,)),
+        "outcome": Outcome(plan, 0.01, (0.04, 0.02, 0.0), (path,)),
         "folder": folder,
         "seen": one_world.execute_primitive(Push(0.0)),
         "film": film,
@@ -122,7 +122,7 @@ def valid_calls(shop):
     at, arrays, network, plan = (0.0, 0.0), shop["arrays"], shop["network"], shop["plan"]
     few = models.TrainingConfig(steps=1, batch_size=2, n_targets=2, device="cpu")
     problem = planning.PlanningProblem(at, goal, planning.EffectMap(model, image), "single_partial")
-    grip = {"image": image, "xy_m": at, "grip_yaws": (0.0, 0.1)}
+    grip = {"image": image, "xy_m": at, "gripper_yaws_rad": (0.0, 0.1)}
     build = {"config": shop["config"], "scaler": shop["scaler"]}
     planner = shop["skills"].planner(planning.plan_astar)
     corners = tuple((0.03 * math.cos(a), 0.03 * math.sin(a)) for a in (0.0, 2.0, 4.0))
@@ -337,16 +337,15 @@ def valid_calls(shop):
         ),
         "execute_plan": (
             on_table(planning.execute_plan),
-            {"world": w, "plan": plan, "corrections": 0, "enough_m": 0.001},
+            {"robot": w, "plan": plan, "corrections": 0, "enough_m": 0.001},
         ),
         "run_closed_loop": (
             on_table(planning.run_closed_loop),
             {
-                "world": w,
+                "robot": w,
                 "goal": Goal(at, 0.05),
                 "skills": shop["skills"],
                 "config": planning.ClosedLoopConfig(max_actions=1, horizon=1),
-                "disturbances": (),
             },
         ),
         "closed_loop": (
@@ -503,7 +502,8 @@ def test_a_hostile_value_is_refused_by_name_or_does_no_harm(shop, name, tmp_path
 
 
 MADE_BY_DRIVEN_ONES = """
-ClosedLoopResult EffectModel EffectNetwork NetworkConfig TabletopObject open_loop
+ClosedLoopResult DisturbanceSchedule EffectModel Execution Robot
+EffectNetwork NetworkConfig TabletopObject open_loop
 """
 
 

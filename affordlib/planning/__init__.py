@@ -9,11 +9,16 @@ from affordlib.planning.closed_loop import (
     run_closed_loop,
 )
 from affordlib.planning.continuous import plan_continuous
-from affordlib.planning.disturbances import Disturbance, sample_disturbances
+from affordlib.planning.disturbances import (
+    Disturbance,
+    DisturbanceSchedule,
+    sample_disturbances,
+)
 from affordlib.planning.effect_map import EffectMap
 from affordlib.planning.gradient import plan_gradient
 from affordlib.planning.grasp_rotate import plan_lift, plan_turn
 from affordlib.planning.problem import MODES, PlanMode, PlanningProblem
+from affordlib.planning.robot import Execution, Robot
 from affordlib.planning.skills import Skills
 
 __all__ = [
@@ -21,9 +26,12 @@ __all__ = [
     "ClosedLoopConfig",
     "ClosedLoopResult",
     "Disturbance",
+    "DisturbanceSchedule",
     "EffectMap",
+    "Execution",
     "PlanMode",
     "PlanningProblem",
+    "Robot",
     "Skills",
     "action_limit",
     "execute_plan",

@@ -1,36 +1,38 @@
-"""Carrying plans out in the world; the only part of planning that acts.
+"""Carrying plans out; the only part of planning that acts.
 
-`execute_plan` trusts a plan. `run_closed_loop` looks after every action (Section 3.4 of the paper):
-is the object where it should be, has the goal changed, has the object fallen? If so a new image, a
-new plan. It ends in one of four ways, and says so.
+`execute_plan` trusts a plan. `run_closed_loop` observes after every action (Section 3.4 of the
+paper): is the object where it was predicted to be, has the goal changed, has the object fallen? If
+so it plans again, from a new image. It ends in one of four ways, and says so.
+
+Both know only a `Robot`. What they say of the object is what the robot says; how far the object
+really is from its goal is for the caller to measure, where somebody knows.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from affordlib.perception import adapt_to_object, looks_fallen
 from affordlib.planning.continuous import plan_continuous
-from affordlib.planning.disturbances import Disturbance, DisturbanceSchedule
 from affordlib.planning.grasp_rotate import (
     GRIPPER_YAWS_RAD,
     TURN_TOLERANCE_RAD,
     aligned_gripper_yaws,
-    plan_lift,
-    plan_turn,
+    candidate_lifts,
+    candidate_turns,
+    predict_trajectories,
 )
-from affordlib.planning.move_planner import Ended, MovePlanner
+from affordlib.planning.move_planner import Ending, MovePlanner
 from affordlib.planning.problem import PlanMode, PlanningProblem, is_on_table
+from affordlib.planning.robot import Execution, Robot
 from affordlib.planning.skills import Skills
 from affordlib.primitives import Grasp, Rotate, wrap_angle
 from affordlib.types import (
     Goal,
-    Interaction,
     NothingSeenError,
     Observation,
     Outcome,
@@ -42,9 +44,6 @@ from affordlib.types import (
     check_within,
 )
 
-if TYPE_CHECKING:
-    import affordlib.world
-
 Replan = Callable[[np.ndarray, tuple[float, float], Goal], Plan]
 """A planner as (image, start_xy_m, goal) → Plan."""
 
@@ -52,79 +51,96 @@ ENOUGH_M = 0.0003
 """What a corrective action leaves anyway; nearer to the goal than this, none is tried."""
 
 SURPRISE_M = 0.002
-"""An object that is farther than this from where the plan has it makes the plan worthless."""
+"""An object that is farther than this from its predicted position makes the plan worthless."""
 
 DISPLACED_M = 0.03
-"""An object that is farther than this from where it should be was moved by somebody else."""
+"""An object that is farther than this from its predicted position was moved by somebody else."""
 
-AT_REST_M, BETWEEN_LOOKS_S, MOST_LOOKS = 0.001, 0.25, 20
-"""An object rests that is in the same place a quarter of a second later; after 5 s none is waited
+AT_REST_M, OBSERVE_EVERY_S, MAX_OBSERVATIONS = 0.001, 0.25, 20
+"""An object rests that is within a millimetre a quarter of a second later; after 5 s none is waited
 for."""
 
 SHIFTED_M = 0.005
-"""Closing fingers may shift what they lift by so much, and it still is where it should be."""
+"""Closing fingers may shift what they lift by so much, and the position still counts as reached."""
 
-RENEWALS = 3
-MOVE_M = 0.05
-SPARE_ACTIONS = 3
+MOVE_M, SPARE_ACTIONS = 0.05, 3
+"""An action is allowed for every 5 cm of distance, and three more."""
+
+MAX_RENEWALS = 3
+"""So many times more actions are allowed because somebody displaced the object."""
+
 MAX_LIFTS = 2
 STATUSES = ("reached", "unreachable", "gave_up", "lost")
 
 
 def execute_plan(
-    world: affordlib.world.Tabletop,
+    robot: Robot,
     plan: Plan,
     corrections: int = 0,
     replan: Replan | None = None,
     enough_m: float = ENOUGH_M,
 ) -> Outcome:
-    """Execute a plan's steps, as planned, and measure where the object rests.
+    """Execute a plan's steps, as planned.
 
     Open loop: the plan is not revised. Each action is carried out relative to where the object
-    then stands, as actions are defined. The distance is taken after the gripper has retreated,
-    unless it holds the object, and the object has rested 0.5 s. Raises UnreachableError when the
-    arm cannot follow a step; it has the outcome of those before.
+    then stands, as actions are defined. The outcome is what the robot measured: of a `Tabletop` the
+    simulator's state after the gripper has retreated, unless it holds the object, and the object
+    has rested 0.5 s. Raises UnreachableError when the arm cannot follow a step; it has the outcome
+    of those before.
 
     corrections: after the last step, so many single actions at most, each the first of a plan that
-    `replan` makes anew from what is then seen, and each only if the object is seen, and farther
-    than enough_m [m] from the goal, the plan expects to bring it nearer, and the arm can do it.
-    There are none after a plan that ends with the object in the hand.
+    `replan` makes from a new image, and each only if the object is seen, and farther than enough_m
+    [m] from the goal, the plan expects to bring it nearer, and the arm can do it. There are none
+    after a plan that ends with the object in the hand.
     """
     if corrections and replan is None:
         raise ValueError(f"corrections = {corrections} need a planner; give replan as well")
-    yaw_rad, z_m = world.object_pose()[2], world.object_state()[2]
-    paths: list[np.ndarray] = []
-
-    def measured():
-        pose = world.object_pose()
-        distance = plan.goal.distance_m(pose[:2])
-        turned, lifted = wrap_angle(pose[2] - yaw_rad), world.object_state()[2] - z_m
-        return Outcome(plan, distance, pose, world.object_tilt_rad(), tuple(paths), turned, lifted)
-
+    done: list[Execution] = []
     for step in plan.steps:
         try:
-            paths.append(path_on_table(world.execute(step)))
+            done.append(robot.execute(step))
         except UnreachableError as error:
-            error.outcome = measured()
+            error.outcome = _outcome(robot, plan, done)
             raise
     held = bool(plan.steps) and plan.steps[-1].primitive.holds
     for _ in range(0 if held else corrections):
         try:
-            seen = world.observe()
+            seen = robot.observe()
         except NothingSeenError:
             break
-        off = plan.goal.distance_m(seen.xy_m)
-        if off <= enough_m or not is_on_table(np.array([seen.xy_m]))[0] or not seen.image[1].any():
+        distance_m = plan.goal.distance_m(seen.xy_m)
+        if distance_m <= enough_m or not _is_seen_on_table(seen):
             break
         # A planner content within the goal's tolerance would have nothing to correct.
         exactly = replace(plan.goal, tolerance_m=min(plan.goal.tolerance_m, enough_m))
         steps = replan(seen.image, seen.xy_m, exactly).steps[:1]
-        if not steps or plan.goal.distance_m(steps[0].predicted_end_xy_m) >= off:
+        if not steps or plan.goal.distance_m(steps[0].predicted_end_xy_m) >= distance_m:
             break
-        if not world.can_reach(steps[0].primitive, steps[0].stop_phase):
+        if not robot.can_reach(steps[0].primitive, steps[0].stop_phase):
             break
-        paths.append(path_on_table(world.execute(steps[0])))
-    return measured()
+        done.append(robot.execute(steps[0]))
+    return _outcome(robot, plan, done)
+
+
+def _outcome(robot: Robot, plan: Plan, done: Sequence[Execution]) -> Outcome:
+    paths = [execution.object_path for execution in done]
+    if paths:
+        x, y, _, yaw = paths[-1][-1].tolist()
+    else:
+        seen = robot.observe()
+        (x, y), yaw = seen.xy_m, seen.yaw_rad or 0.0
+    return Outcome(
+        plan,
+        plan.goal.distance_m((x, y)),
+        (x, y, yaw),
+        tuple(path[:, :2] for path in paths),
+        turned_rad=wrap_angle(yaw - paths[0][0, 3]) if paths else 0.0,
+        lifted_m=float(sum(path[-1, 2] for path in paths)),
+    )
+
+
+def _is_seen_on_table(seen: Observation) -> bool:
+    return bool(seen.image[1].any() and is_on_table(np.array([seen.xy_m]))[0])
 
 
 @dataclass(frozen=True)
@@ -133,16 +149,16 @@ class ClosedLoopConfig:
 
     The position holds when the object is seen within the goal's own tolerance. max_actions: default
     `action_limit` of the distance, renewed when the goal moves or somebody displaces the object
-    (that at most three times). horizon: the longest chain the planner is asked for. on_action:
-    called with the plan and the number of actions taken, after each; it may return a new goal.
-    on_plan: called with every plan before its first action.
+    (that at most three times). horizon: the longest chain the planner may return. on_action:
+    called with the plan and the number of actions taken, after each. on_plan: called with every
+    plan before its first action.
     """
 
     turn_tolerance_rad: float = TURN_TOLERANCE_RAD
     height_tolerance_m: float = 0.003
     max_actions: int | None = None
     horizon: int = 3
-    on_action: Callable[[Plan, int], Goal | None] | None = None
+    on_action: Callable[[Plan, int], None] | None = None
     on_plan: Callable[[Plan], None] | None = None
 
     def __post_init__(self) -> None:
@@ -155,14 +171,14 @@ class ClosedLoopConfig:
 
 @dataclass(frozen=True)
 class ClosedLoopResult:
-    """What came of a closed loop.
+    """What came of a closed loop, as the robot observed it.
 
-    status: one of `STATUSES`; message: the same in words; goal: as it was in the end; distance_m:
-    between it and the object's true position; turn_error_rad, height_error_m: likewise, None where
-    the goal does not ask; steps: the actions taken; object_paths_xy_m: one (n, 2) path of the
-    object for each; plans: all that were made; seen_xy_m: where the object was seen before every
-    decision; happened: the disturbances that came to pass; vetoes: planned actions that the arm's
-    kinematics refused before any motion.
+    status: one of `STATUSES`; message: the same in words; goal: as it was in the end; end_pose:
+    (x, y, yaw) of the object, yaw 0 where the robot does not know it; distance_m: between that and
+    the goal; turn_error_rad, height_error_m: likewise, None where the goal does not ask; steps: the
+    actions taken; object_paths_xy_m: one (n, 2) path of the object for each; plans: all that were
+    made; seen_xy_m: where the object was seen before every decision; vetoes: planned actions that
+    the arm's kinematics refused before any motion.
     """
 
     goal: Goal
@@ -174,7 +190,6 @@ class ClosedLoopResult:
     plans: tuple[Plan, ...]
     seen_xy_m: tuple[tuple[float, float], ...]
     end_pose: tuple[float, float, float]
-    happened: tuple[Disturbance, ...] = ()
     vetoes: int = 0
     turn_error_rad: float | None = None
     height_error_m: float | None = None
@@ -191,142 +206,225 @@ def action_limit(distance_m: float) -> int:
     return math.ceil(distance_m / MOVE_M - 1e-9) + SPARE_ACTIONS
 
 
-def path_on_table(done: Interaction) -> np.ndarray:
-    """The object's path (n, 2) [m] while it was acted on, in the frame of the table."""
-    return done.effect[:, :2] + done.start_pose[:2]
-
-
 def run_closed_loop(
-    world: affordlib.world.Tabletop,
-    goal: Goal,
+    robot: Robot,
+    goal: Goal | Callable[[], Goal],
     skills: Skills,
     planner: Callable[[PlanningProblem], Plan] = plan_continuous,
     config: ClosedLoopConfig | None = None,
-    disturbances: Sequence[Disturbance] = (),
 ) -> ClosedLoopResult:
     """Bring the object to a goal, whatever happens on the way: position, orientation, height.
 
-    planner: such as plan_astar, plan_continuous, plan_gradient. disturbances: what shall happen.
-    Never moves where the arm's kinematics says no.
+    goal: or a function that returns it, where it may move. planner: such as plan_astar,
+    plan_continuous, plan_gradient. Never moves where the arm's kinematics says no. Raises
+    NothingSeenError where no object is seen to begin with.
     """
-    config = config or ClosedLoopConfig()
-    return _ClosedLoop(world, goal, skills, planner, config, disturbances).run()
+    goal_now = (lambda: goal) if isinstance(goal, Goal) else goal
+    if not isinstance(goal_now(), Goal):
+        raise TypeError(f"goal must be a Goal, or a function that returns one, got {goal!r}")
+    return _ClosedLoop(robot, goal_now, skills, planner, config or ClosedLoopConfig()).run()
 
 
 class _ClosedLoop:
-    """A closed loop while it lasts: look, judge whether the plan holds, plan anew, act."""
+    """A closed loop while it lasts: observe, judge whether the plan holds, plan again, act."""
 
     def __init__(
         self,
-        world: affordlib.world.Tabletop,
-        goal: Goal,
+        robot: Robot,
+        goal_now: Callable[[], Goal],
         skills: Skills,
         planner: Callable[[PlanningProblem], Plan],
         config: ClosedLoopConfig,
-        disturbances: Sequence[Disturbance],
     ) -> None:
-        self.world, self.skills, self.config = world, skills, config
-        self.script = DisturbanceSchedule(goal, disturbances)
+        self.robot, self.goal_now, self.skills, self.config = robot, goal_now, skills, config
+        self.moves = MovePlanner(robot, skills, planner, PlanMode(config.horizon, partial=True))
         self.steps: list[Step] = []
         self.paths: list[np.ndarray] = []
-        mode = PlanMode(config.horizon, partial=True)
-        self.moves = MovePlanner(world, skills, planner, mode)
-        self.places: list[tuple[float, float]] = []
+        self.plans: list[Plan] = []
+        self.seen_xy_m: list[tuple[float, float]] = []
         self.plan: Plan | None = None  # that is followed
-        self.queue: list[Step] = []
-        self.seen: Observation | None = None
-        self.renewals = RENEWALS
-        self.planned_for: Goal | None = None
-        self.expected: tuple[float, float] | None = None
-        self.yaw_rad = world.object_pose()[2]
-        self.grip_yaws = GRIPPER_YAWS_RAD
-        self.turns = self.limit = 0
-        self.z_m = world.object_state()[2]
+        self.queue: list[Step] = []  # what is left of it
+        self.acted_for: Goal | None = None
+        self.renewals, self.turn_allowed = MAX_RENEWALS, False
+        self.lifted_m = 0.0
+        self.seen = robot.observe()
+        self.first_yaw_rad = self.seen.yaw_rad
+        self.limit = self._limit_from(self.seen.xy_m)
 
     @property
     def goal(self) -> Goal:
-        return self.script.goal
+        return self.goal_now()
 
     def run(self) -> ClosedLoopResult:
         """Position, orientation, height, again until all hold or one cannot be had."""
-        try:
-            self._run()
-        except Ended as end:
-            return self._ended(*end.args)
-        raise AssertionError("a closed loop ends by saying how")
+        ending = None
+        while ending is None:
+            try:
+                ending = self._observe() or self._decide_and_act()
+            except NothingSeenError:
+                ending = Ending("lost", f"no object is seen on the table, after {self._count()}")
+        goal, seen = self.goal, self.seen
+        return ClosedLoopResult(
+            goal=goal,
+            status=ending.status,
+            message=ending.message,
+            distance_m=goal.distance_m(seen.xy_m),
+            steps=tuple(self.steps),
+            object_paths_xy_m=tuple(path[:, :2] for path in self.paths),
+            plans=tuple(self.plans),
+            seen_xy_m=tuple(self.seen_xy_m),
+            end_pose=(*seen.xy_m, seen.yaw_rad or 0.0),
+            vetoes=self.moves.vetoes,
+            turn_error_rad=self._turn_left(),
+            height_error_m=self._height_left(),
+        )
 
-    def _run(self) -> None:
-        lifts = 0
-        self.limit = self._limit_from(self._perceived().xy_m)
-        while True:
-            self._look()
-            if self.goal.distance_m(self.seen.xy_m) > self.goal.tolerance_m:
-                self._act(self._next_move(), "position")
-                continue
-            off = self._turn_left()
-            if off is not None and abs(off) > self.config.turn_tolerance_rad:
-                # Behind it lies what takes a whole round, in sweeps of 60°.
-                if self.turns == 0:
-                    sweeps = math.ceil((off % (2 * math.pi)) / Rotate.sweep_rad)
-                    self._allow(sweeps + SPARE_ACTIONS)
-                self.turns += 1
-                self._act(self._turn(off), "orientation")
-                continue
-            if self.goal.height_m is None:
-                raise Ended("reached", self._where())
-            if lifts == MAX_LIFTS:
-                self._give_up("height")
-            lifts += 1
-            self._allow(1)
-            self._act(self._lift(), "height")
-            off = self._turn_left()
-            turned = off is None or abs(off) <= self.config.turn_tolerance_rad
-            if turned and abs(self._height_left()) <= self.config.height_tolerance_m:
-                shifted = self.goal.distance_m(self.world.object_pose()[:2])
-                if shifted <= max(self.goal.tolerance_m, SHIFTED_M):
-                    raise Ended("reached", self._where())
-                if lifts == MAX_LIFTS:
-                    self._give_up("position")
-            self.world.park()
+    def _observe(self) -> Ending | None:
+        """Observe, and judge whether the plan still holds."""
+        before, self.seen = self.seen, self.robot.observe()
+        expected = self.steps[-1].predicted_end_xy_m if self.steps else None
 
-    def _look(self) -> None:
-        """Let happen what happens between actions; look, and judge whether the plan still holds."""
-        self.script.before(self.world, len(self.steps))
-        before, self.seen = self.seen, self._perceived()
-        off, fell = self._surprise(before)
-        if DISPLACED_M < off < math.inf or fell:
+        def surprise():
+            off_m = math.inf if expected is None else math.dist(expected, self.seen.xy_m)
+            fell = expected is not None and looks_fallen(before.image, self.seen.image)
+            return off_m, fell
+
+        off_m, fell = surprise()
+        if DISPLACED_M < off_m < math.inf or fell:
             self._wait()
-            off, fell = self._surprise(before)
-        self.places.append(self.seen.xy_m)
-        if not (self.seen.image[1].any() and is_on_table(np.array([self.seen.xy_m]))[0]):
-            raise Ended("lost", f"the object is no longer on the table, after {self._count()}")
-        moved = self.planned_for is not None and self.planned_for != self.goal
-        if moved or (self.expected is not None and off > DISPLACED_M and self.renewals > 0):
-            self.renewals -= not moved
-            if moved:
-                self.turns = 0  # the goal may ask for a whole round again
+            off_m, fell = surprise()
+        self.seen_xy_m.append(self.seen.xy_m)
+        if not _is_seen_on_table(self.seen):
+            return Ending("lost", f"the object is no longer on the table, after {self._count()}")
+        goal_moved = self.acted_for is not None and self.acted_for != self.goal
+        displaced = DISPLACED_M < off_m < math.inf and self.renewals > 0
+        if goal_moved or displaced:
+            self.renewals -= not goal_moved
+            self.turn_allowed &= not goal_moved  # the goal may ask for a whole round again
             self.limit = max(self.limit, len(self.steps) + self._limit_from(self.seen.xy_m))
-        if off > SURPRISE_M or moved or fell:
+        if off_m > SURPRISE_M or goal_moved or fell:
             self.queue = []
-
-    def _perceived(self) -> Observation:
-        try:
-            return self.world.observe()
-        except NothingSeenError:
-            raise Ended("lost", f"no object is seen on the table, after {self._count()}") from None
-
-    def _surprise(self, before: Observation | None) -> tuple[float, bool]:
-        """How far the object is from where it should be [m], and whether it has fallen."""
-        off = math.inf if self.expected is None else math.dist(self.expected, self.seen.xy_m)
-        return off, before is not None and looks_fallen(before.image, self.seen.image)
+        return None
 
     def _wait(self) -> None:
-        """Look on until what somebody has set in motion rests."""
-        for _ in range(MOST_LOOKS):
-            self.world.settle(BETWEEN_LOOKS_S)
-            before, self.seen = self.seen, self._perceived()
+        """Observe until what somebody has set in motion rests."""
+        for _ in range(MAX_OBSERVATIONS):
+            self.robot.settle(OBSERVE_EVERY_S)
+            before, self.seen = self.seen, self.robot.observe()
             if math.dist(before.xy_m, self.seen.xy_m) < AT_REST_M:
                 return
+
+    def _decide_and_act(self) -> Ending | None:
+        """One action towards what is not yet as the goal wants it; an ending where all is, or
+        nothing helps.
+        """
+        turn_rad = self._turn_left()
+        if self.goal.distance_m(self.seen.xy_m) > self.goal.tolerance_m:
+            return self._act("position", self._move)
+        if turn_rad is not None and abs(turn_rad) > self.config.turn_tolerance_rad:
+            if not self.turn_allowed:  # as far as a whole round, in sweeps of 60°
+                sweeps = math.ceil((turn_rad % (2 * math.pi)) / Rotate.sweep_rad)
+                self._allow(sweeps + SPARE_ACTIONS)
+            self.turn_allowed = True
+            return self._act("orientation", self._turn)
+        if self.goal.height_m is None:
+            return Ending("reached", self._where())
+        lifts = sum(isinstance(step.primitive, Grasp) for step in self.steps)
+        if lifts == MAX_LIFTS:
+            return self._give_up("height")
+        self._allow(1)
+        return self._act("height", self._lift) or self._judge_lift(last=lifts + 1 == MAX_LIFTS)
+
+    def _judge_lift(self, last: bool) -> Ending | None:
+        """Whether what is held is where it should be; otherwise it is put down."""
+        x, y, self.lifted_m, yaw_rad = self.paths[-1][-1].tolist()
+        self.seen = replace(self.seen, xy_m=(x, y), yaw_rad=yaw_rad)
+        turn_rad, height_m = self._turn_left() or 0.0, self._height_left()
+        if (
+            abs(turn_rad) <= self.config.turn_tolerance_rad
+            and abs(height_m) <= self.config.height_tolerance_m
+        ):
+            if self.goal.distance_m((x, y)) <= max(self.goal.tolerance_m, SHIFTED_M):
+                return Ending("reached", self._where())
+            if last:
+                return self._give_up("position")
+        self.robot.park()
+        self.lifted_m = 0.0
+        return None
+
+    def _act(self, part: str, choose: Callable[[], Step | Ending]) -> Ending | None:
+        """Carry out what is chosen, if the arm agrees and there may be another action."""
+        if len(self.steps) >= self.limit:
+            return self._give_up(part)
+        step = choose()
+        if isinstance(step, Ending):
+            return step
+        self.acted_for = self.goal
+        try:
+            self.paths.append(self.robot.execute(step).object_path)
+        except UnreachableError as error:  # of what it sees now, a hair off what it agreed to
+            return Ending("unreachable", f"the {part}: {error}")
+        self.steps.append(step)
+        if self.config.on_action is not None:
+            self.config.on_action(self.plan, len(self.steps))
+        return None
+
+    def _move(self) -> Step | Ending:
+        if not self.queue:
+            plan = self.moves.plan(self.seen, self.goal)
+            if isinstance(plan, Ending):
+                return plan
+            self.plans.append(plan)
+            self.queue = list(plan.steps)
+            self._follow(plan)
+        return self.queue.pop(0)
+
+    def _turn(self) -> Step | Ending:
+        turn_rad, image = self._turn_left(), self.seen.image
+        model = self.skills.model(Rotate)
+        predicted = predict_trajectories(model, image, Rotate(), "yaw", GRIPPER_YAWS_RAD)
+        return self._first_possible(
+            candidate_turns(predicted, self.seen.xy_m, turn_rad),
+            f"the orientation: {math.degrees(turn_rad):.0f}° more",
+            "no rotation is predicted to turn the object",
+        )
+
+    def _lift(self) -> Step | Ending:
+        yaws, height_m = GRIPPER_YAWS_RAD, self.goal.height_m
+        last = self.steps[-1] if self.steps else None
+        if last is not None and isinstance(last.primitive, Rotate):
+            # A grasp takes an object as the rotation left it, or it would turn it back.
+            yaws = aligned_gripper_yaws(float(last.primitive.path(last.stop_phase)[0, 3]))
+        model = self.skills.model(Grasp)
+        predicted = predict_trajectories(model, self.seen.image, Grasp(), "z", yaws)
+        return self._first_possible(
+            candidate_lifts(predicted, self.seen.xy_m, height_m),
+            f"the height: {100 * height_m:.1f} cm",
+            "no grasp is predicted to lift it so high",
+        )
+
+    def _first_possible(
+        self, candidates: Iterable[Step], wanted: str, hopeless: str
+    ) -> Step | Ending:
+        """The first of some steps, each with another gripper yaw, to which the arm agrees."""
+        at, refused = self.seen.xy_m, None
+        for step in candidates:
+            primitive = adapt_to_object(step.primitive, self.seen.image)
+            if self.robot.can_reach(primitive, step.stop_phase, at):
+                self._follow(Plan(self.goal, at, (step,), primitive.name, False, 0, 0.0))
+                return step
+            self.moves.vetoes += 1
+            refused = primitive.name
+        if refused is not None:
+            return Ending(
+                "unreachable", f"{wanted}: the arm cannot {refused} at ({at[0]:.3f}, {at[1]:.3f}) m"
+            )
+        return Ending("unreachable", f"{wanted}, and {hopeless}")
+
+    def _follow(self, plan: Plan) -> None:
+        self.plan = plan
+        if self.config.on_plan is not None:
+            self.config.on_plan(plan)
 
     def _limit_from(self, xy_m: Sequence[float]) -> int:
         if self.config.max_actions is not None:
@@ -338,121 +436,27 @@ class _ClosedLoop:
         if self.config.max_actions is None:
             self.limit += further
 
-    def _act(self, step: Step, part: str) -> None:
-        """Carry out a step that the arm has agreed to."""
-        if len(self.steps) >= self.limit:
-            self._give_up(part)
-        self.planned_for, self.expected = self.goal, step.predicted_end_xy_m
-        with self.script.during(self.world, len(self.steps)):
-            try:
-                self.paths.append(path_on_table(self.world.execute(step)))
-            except UnreachableError as error:  # of what it sees now, a hair off what it agreed to
-                raise Ended("unreachable", f"the {part}: {error}") from error
-        self.steps.append(step)
-        self.grip_yaws = GRIPPER_YAWS_RAD
-        if isinstance(step.primitive, Rotate):
-            # A grasp takes an object as the rotation left it, or it would turn it back.
-            self.grip_yaws = aligned_gripper_yaws(float(step.primitive.path(step.stop_phase)[0, 3]))
-        if self.config.on_action is not None:
-            self.script.goal = self.config.on_action(self.plan, len(self.steps)) or self.goal
-
-    def _next_move(self) -> Step:
-        if len(self.steps) >= self.limit:
-            self._give_up("position")
-        if not self.queue:
-            self.queue = self.moves.steps(self.seen, self.goal, self._count())
-            self._follow(self.moves.plans[-1])
-        return self.queue.pop(0)
-
-    def _follow(self, plan: Plan) -> None:
-        self.plan = plan
-        if self.config.on_plan is not None:
-            self.config.on_plan(plan)
-
     def _turn_left(self) -> float | None:
         if self.goal.turn_rad is None:
             return None
-        turned = self.world.object_pose()[2] - self.yaw_rad
-        return wrap_angle(self.goal.turn_rad - turned)
+        if self.seen.yaw_rad is None:
+            raise ValueError("goal.turn_rad needs a robot whose observations have a yaw_rad")
+        return wrap_angle(self.goal.turn_rad - (self.seen.yaw_rad - self.first_yaw_rad))
 
-    def _height_left(self) -> float:
-        return self.goal.height_m - (self.world.object_state()[2] - self.z_m)
-
-    def _turn(self, off_rad: float) -> Step:
-        model = self.skills.model(Rotate)
-        return self._agreed(
-            GRIPPER_YAWS_RAD,
-            lambda yaws: plan_turn(model, self.seen.image, self.seen.xy_m, off_rad, yaws),
-            f"the orientation: {math.degrees(off_rad):.0f}° more",
-            "no rotation is foreseen to turn the object",
-        )
-
-    def _lift(self) -> Step:
-        self.z_m = self.world.object_state()[2]
-        model, height = self.skills.model(Grasp), self.goal.height_m
-        return self._agreed(
-            self.grip_yaws,
-            lambda yaws: plan_lift(model, self.seen.image, self.seen.xy_m, height, yaws),
-            f"the height: {100 * height:.1f} cm",
-            "no grasp is foreseen to lift it so high",
-        )
-
-    def _agreed(
-        self,
-        grip_yaws: Sequence[float],
-        plan: Callable[[Sequence[float]], Step | None],
-        wanted: str,
-        hopeless: str,
-    ) -> Step:
-        """What is planned of the angles of the hand to which the arm agrees."""
-        yaws, vetoed = list(grip_yaws), None
-        while yaws:
-            step = plan(yaws)
-            if step is None:
-                break
-            asked = adapt_to_object(step.primitive, self.seen.image)
-            if self.world.can_reach(asked, step.stop_phase, self.seen.xy_m):
-                kind, at = step.primitive.name, self.seen.xy_m
-                self._follow(Plan(self.goal, at, (step,), kind, False, len(grip_yaws), 0.0))
-                return step
-            self.moves.vetoes += 1
-            vetoed = step.primitive
-            yaws = [yaw for yaw in yaws if not math.isclose(yaw, vetoed.grip_yaw, abs_tol=1e-6)]
-        if vetoed:
-            x, y = self.seen.xy_m
-            hopeless = f"the arm cannot {vetoed.name} at ({x:.3f}, {y:.3f}) m"
-        raise Ended("unreachable", f"{wanted}{':' if vetoed else ', and'} {hopeless}")
+    def _height_left(self) -> float | None:
+        return None if self.goal.height_m is None else self.goal.height_m - self.lifted_m
 
     def _count(self) -> str:
         n = len(self.steps)
         return f"{n} action{'s' * (n != 1)}"
 
     def _where(self) -> str:
-        parts = [f"{1000 * self.goal.distance_m(self.world.object_pose()[:2]):.1f} mm"]
+        parts = [f"{1000 * self.goal.distance_m(self.seen.xy_m):.1f} mm"]
         if self.goal.turn_rad is not None:
             parts.append(f"{math.degrees(abs(self._turn_left())):.1f}°")
         if self.goal.height_m is not None:
             parts.append(f"{1000 * abs(self._height_left()):.1f} mm in height")
         return f"{', '.join(parts)} from the goal after {self._count()}"
 
-    def _give_up(self, part: str) -> None:
-        raise Ended("gave_up", f"{self._where()}: the {part} is not what it should be")
-
-    def _ended(self, status: str, message: str) -> ClosedLoopResult:
-        """The loop as it ended, measured against the truth."""
-        pose = self.world.object_pose()
-        return ClosedLoopResult(
-            goal=self.goal,
-            status=status,
-            message=message,
-            distance_m=self.goal.distance_m(pose[:2]),
-            steps=tuple(self.steps),
-            object_paths_xy_m=tuple(self.paths),
-            plans=tuple(self.moves.plans),
-            seen_xy_m=tuple(self.places),
-            end_pose=pose,
-            happened=tuple(self.script.happened),
-            vetoes=self.moves.vetoes,
-            turn_error_rad=self._turn_left(),
-            height_error_m=None if self.goal.height_m is None else self._height_left(),
-        )
+    def _give_up(self, part: str) -> Ending:
+        return Ending("gave_up", f"{self._where()}: the {part} is not what it should be")

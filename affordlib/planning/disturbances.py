@@ -1,4 +1,4 @@
-"""A seeded script of what goes wrong: the object shoved, knocked or toppled, the goal moved.
+"""A seeded schedule of what goes wrong: the object shoved, knocked or toppled, the goal moved.
 
 Between actions, or in the middle of one, by the world's callback at every simulation step.
 """
@@ -6,17 +6,20 @@ Between actions, or in the middle of one, by the world's callback at every simul
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from affordlib.planning.robot import Execution
+from affordlib.primitives import Primitive
 from affordlib.types import (
     TABLE_X_M,
     TABLE_Y_M,
     Goal,
+    Observation,
+    Step,
     check_count,
     check_field,
     check_on_table,
@@ -88,53 +91,76 @@ def _inside(x: float, y: float) -> tuple[float, float]:
 
 
 class DisturbanceSchedule:
-    """Disturbances, each of which happens once, and the goal as it has become.
+    """A `Robot` at a tabletop where disturbances happen, each once; the robot is not told.
 
-    happened: those that have, in order.
+    goal: as it has become (for `run_closed_loop` give `schedule.current_goal`); happened: the
+    disturbances up to now, in order.
     """
 
-    def __init__(self, goal: Goal, disturbances: Sequence[Disturbance] = ()) -> None:
-        self.goal = goal
+    def __init__(
+        self,
+        world: affordlib.world.Tabletop,
+        goal: Goal,
+        disturbances: Sequence[Disturbance] = (),
+    ) -> None:
+        self.world, self.goal = world, goal
         self.happened: list[Disturbance] = []
         self._waiting = list(disturbances)
+        self._n_actions = 0
 
-    def _apply(self, world: affordlib.world.Tabletop, one: Disturbance) -> None:
-        self._waiting.remove(one)
-        self.happened.append(one)
-        self.goal = one.apply(world, self.goal)
+    def current_goal(self) -> Goal:
+        """The goal as it is now."""
+        return self.goal
 
-    def before(self, world: affordlib.world.Tabletop, action: int) -> None:
-        """Let happen what comes before an action, and let the object come to rest."""
-        due = [one for one in self._waiting if one.action <= action and one.at_s is None]
-        for one in due:
-            self._apply(world, one)
-            if one.kind in ("knock", "topple"):
-                world.settle(TIPPING_S)
+    def observe(self) -> Observation:
+        """As the tabletop does, after what comes before the next action has happened."""
+        self._apply([d for d in self._waiting if d.action <= self._n_actions and d.at_s is None])
+        return self.world.observe()
 
-    @contextmanager
-    def during(self, world: affordlib.world.Tabletop, action: int) -> Iterator[None]:
-        """While entered, what comes in the middle of an action happens when it is due."""
-        before, steps = world.on_step, 0
-        due = [one for one in self._waiting if one.action <= action and one.at_s is not None]
+    def execute(self, step: Step) -> Execution:
+        """As the tabletop does; what comes in the middle of the action happens when it is due."""
+        world, n_steps, on_step = self.world, 0, self.world.on_step
+        due = [d for d in self._waiting if d.action <= self._n_actions and d.at_s is not None]
 
         def watch(world):
-            nonlocal steps
-            steps += 1
-            for one in [d for d in due if steps >= STEPS_PER_S * d.at_s]:
+            nonlocal n_steps
+            n_steps += 1
+            for one in [d for d in due if n_steps >= STEPS_PER_S * d.at_s]:
                 due.remove(one)
-                self._apply(world, one)
-            if before is not None:
-                before(world)
+                self._apply([one], settle=False)
+            if on_step is not None:
+                on_step(world)
 
-        world.on_step = watch if due else before
+        world.on_step = watch if due else on_step
         try:
-            yield
+            done = world.execute(step)
         finally:
-            world.on_step = before
+            world.on_step = on_step
+        self._apply(due)
+        self._n_actions += 1
+        return done
+
+    def _apply(self, due: Sequence[Disturbance], settle: bool = True) -> None:
         for one in due:
-            self._apply(world, one)
-            if one.kind != "goal":
-                world.settle(TIPPING_S)
+            self._waiting.remove(one)
+            self.happened.append(one)
+            self.goal = one.apply(self.world, self.goal)
+            if settle and one.kind in ("knock", "topple"):
+                self.world.settle(TIPPING_S)
+
+    def can_reach(
+        self, primitive: Primitive, stop_phase: float = 1.0, at_xy_m: Sequence[float] | None = None
+    ) -> bool:
+        """As the tabletop says."""
+        return self.world.can_reach(primitive, stop_phase, at_xy_m)
+
+    def park(self) -> None:
+        """As the tabletop does."""
+        self.world.park()
+
+    def settle(self, seconds: float = 0.5) -> None:
+        """As the tabletop does."""
+        self.world.settle(seconds)
 
 
 def sample_disturbances(
@@ -144,7 +170,7 @@ def sample_disturbances(
     kinds: Sequence[str] = KINDS,
     strength: float = 1.0,
 ) -> tuple[Disturbance, ...]:
-    """A script of n disturbances, a function of the seed alone.
+    """A schedule of n disturbances, a function of the seed alone.
 
     Each comes in the middle of one of n_actions actions, or (never before the first) between two:
     shoves of 3 to 10 cm and up to half a turn, knocks of 0.2 to 0.5 m/s, goals that move by 3 to
@@ -156,7 +182,7 @@ def sample_disturbances(
     check_count("n_actions", n_actions, 1, 1000)
     check_within("strength", strength, 0.0, 10.0)
     rng = np.random.default_rng(check_count("seed", seed, least=0))
-    script = []
+    drawn = []
     for _ in range(n):
         kind = str(rng.choice(list(kinds)))
         action, angle = int(rng.integers(n_actions)), rng.uniform(-math.pi, math.pi)
@@ -165,14 +191,6 @@ def sample_disturbances(
         turn = rng.uniform(-math.pi, math.pi) if kind == "shove" else 0.0
         middle = kind == "knock" or (kind != "shove" and rng.random() < 0.5)
         at_s = float(rng.uniform(2.0, 5.5)) if middle else None
-        script.append(
-            Disturbance(
-                kind,
-                action if middle else action + 1,
-                float(size * math.cos(angle)),
-                float(size * math.sin(angle)),
-                float(turn),
-                at_s,
-            )
-        )
-    return tuple(script)
+        xy = float(size * math.cos(angle)), float(size * math.sin(angle))
+        drawn.append(Disturbance(kind, action + (not middle), *xy, float(turn), at_s))
+    return tuple(drawn)

@@ -1,20 +1,21 @@
-"""Orientation and height: one partial action each, stopped where the model foresees what is wanted.
+"""Orientation and height: one partial action each, stopped where the model predicts what is wanted.
 
-Grasp and rotate have no parameters (Section 3.3), so a model of them knows only one hand. But a
-turned hand is the same hand in a turned frame: the model is shown the image turned back, and says
-for every angle of the hand what would come of it. The angle is chosen, and the phase at which to
-stop is looked up on the course yaw(t) or z(t) that is foreseen; t is continuous.
+Grasp and rotate have no parameters (Section 3.3), so a model of them knows only one gripper yaw.
+But grasping with the hand rotated by α is equivalent to grasping the object rotated by -α: the
+model is shown the image rotated back, and predicts the effect for every yaw of the gripper. The yaw
+is chosen, and the phase at which to stop is looked up on the predicted trajectory yaw(t) or z(t); t
+is continuous.
 
 The paper adds grasp and rotate to the branches of the search when the goal asks for them (Section
 3.4). They leave the position as it is and nothing can follow a grasp, so `PosePlanner` puts them
-after what brings the object to its place. One image serves all of it: a hand before a thing that a
-push has turned is, in the frame of the image taken before, a hand turned back.
+after the actions that bring the object to its position. One image serves all of it: a hand at an
+object that a push has rotated is, in the frame of the image taken before, a hand rotated back.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -27,33 +28,39 @@ from affordlib.planning.effect_map import checked_image
 from affordlib.primitives import Grasp, Rotate, wrap_angle
 from affordlib.types import Goal, Step, check_finite, check_pair, check_within
 
-SAMPLES = 301
+N_PHASES = 301
 Z_90 = 1.28
-"""So many σ above a foreseen height are not yet beyond belief (90 %)."""
+"""One-sided 90 % quantile of a Gaussian: a height more σ above the predicted one is ruled out."""
 
 FULL_ROTATION_SHARE = 0.9
-"""Of its sweep, by which a whole rotation has to turn an object to count as one."""
+"""Of the hand's sweep: a whole rotation that turns the object by less has slipped."""
 
 GRIPPER_YAWS_RAD = tuple(np.radians([0, 15, -15, 30, -30, 45, -45, 60, -60, 75, -75, 90]).tolist())
-"""Angles of the hand that are weighed, the least first: the fingers are alike, so 180° in all."""
+"""Yaws of the gripper to choose from, the smallest first: the fingers are alike, so 180° in all."""
 
 
 def aligned_gripper_yaws(yaw_rad: float) -> tuple[float, ...]:
-    """Angles at which a hand takes an object as one at another angle has left it, unturned."""
+    """Yaws at which a gripper takes an object as one at another yaw has left it, unturned."""
     return tuple(wrap_angle(yaw_rad + k * math.pi / 2) for k in (0, 1, -1))
 
 
 @dataclass(frozen=True)
 class PredictedTrajectories:
-    """One channel of the effect over the phase (n,): mean and std (m, n), for m angles of the hand.
+    """One channel of the effect over the phase (n,): mean and std (m, n), for m gripper yaws.
 
-    The effect is zero before anything.
+    The effect is zero at the first phase.
     """
 
-    grip_yaws: tuple[float, ...]
+    gripper_yaws_rad: tuple[float, ...]
     phase: np.ndarray
     mean: np.ndarray
     std: np.ndarray
+
+    def without(self, k: int) -> PredictedTrajectories:
+        """The same but for gripper yaw number k."""
+        yaws = self.gripper_yaws_rad[:k] + self.gripper_yaws_rad[k + 1 :]
+        mean, std = np.delete(self.mean, k, axis=0), np.delete(self.std, k, axis=0)
+        return PredictedTrajectories(yaws, self.phase, mean, std)
 
 
 @torch.no_grad()
@@ -62,42 +69,34 @@ def predict_trajectories(
     image: np.ndarray,
     primitive: Grasp | Rotate,
     channel: str,
-    grip_yaws: Sequence[float] = GRIPPER_YAWS_RAD,
+    gripper_yaws_rad: Sequence[float] = GRIPPER_YAWS_RAD,
 ) -> PredictedTrajectories:
-    """What a model expects of a primitive for each angle of the hand [rad].
+    """What a model predicts of a primitive for each yaw of the gripper [rad].
 
     Raises ValueError where the model has no such channel.
     """
-    if not len(grip_yaws):
-        raise ValueError("grip_yaws must hold at least one angle of the hand, got none")
-    grip_yaws = [check_finite("grip_yaws", yaw) for yaw in grip_yaws]
+    if not len(gripper_yaws_rad):
+        raise ValueError("gripper_yaws_rad must hold at least one yaw of the gripper, got none")
+    yaws = tuple(check_finite("gripper_yaws_rad", yaw) for yaw in gripper_yaws_rad)
     if channel not in model.effect_channels:
         raise ValueError(
             f"channel {channel!r} is not among the effects {model.effect_channels} of the model; "
             f"give the model of {primitive.name}"
         )
-    turn = torch.tensor([[math.cos(yaw), -math.sin(yaw)] for yaw in grip_yaws])
-    seen = model.encode(turn_image(checked_image(image), turn))
-    t = torch.linspace(0, 1, SAMPLES).expand(len(turn), -1)
-    observed = condition_on_primitives(
-        model, [replace(adapt_to_object(primitive, image), grip_yaw=0.0)] * len(turn)
-    )
-    told = model.predict(seen, observed, t)
+    turn = torch.tensor([[math.cos(yaw), -math.sin(yaw)] for yaw in yaws])
+    features = model.encode(turn_image(checked_image(image), turn))
+    t = torch.linspace(0, 1, N_PHASES).expand(len(turn), -1)
+    action = replace(adapt_to_object(primitive, image), grip_yaw=0.0)
+    prediction = model.predict(features, condition_on_primitives(model, [action] * len(turn)), t)
     k = model.effect_channels.index(channel)
-    mean, std = (v[:, :, k].double().numpy() for v in (told.effect_mean, told.effect_std))
-    return PredictedTrajectories(tuple(grip_yaws), t[0].double().numpy(), mean - mean[:, :1], std)
-
-
-def predict_trajectory(
-    model: EffectModel, image: np.ndarray, primitive: Grasp | Rotate, channel: str
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The same for the primitive's own angle of the hand: phases, mean and σ, (n,) each."""
-    told = predict_trajectories(model, image, primitive, channel, [primitive.grip_yaw])
-    return told.phase, told.mean[0], told.std[0]
+    mean, std = (
+        v[:, :, k].double().numpy() for v in (prediction.effect_mean, prediction.effect_std)
+    )
+    return PredictedTrajectories(yaws, t[0].double().numpy(), mean - mean[:, :1], std)
 
 
 def crossings(phase: np.ndarray, values: np.ndarray, wanted: float) -> np.ndarray:
-    """Phases at which a course, straight between its samples, has the wanted value."""
+    """Phases at which a trajectory, straight between its samples, has the wanted value."""
     below = values < wanted
     at = np.flatnonzero(below[1:] != below[:-1])
     share = (wanted - values[at]) / (values[at + 1] - values[at])
@@ -109,48 +108,14 @@ def plan_turn(
     image: np.ndarray,
     xy_m: Sequence[float],
     turn_rad: float,
-    grip_yaws: Sequence[float] = GRIPPER_YAWS_RAD,
+    gripper_yaws_rad: Sequence[float] = GRIPPER_YAWS_RAD,
 ) -> Step | None:
     """The rotation that turns an object at (x, y) by an angle, or as far towards it as it can.
 
-    grip_yaws: the angles of the hand to choose from, as `choose_turn` does.
+    gripper_yaws_rad: to choose from. None when none is predicted to turn it by 1°.
     """
-    return choose_turn(
-        predict_trajectories(model, image, Rotate(), "yaw", grip_yaws), xy_m, turn_rad
-    )
-
-
-def choose_turn(
-    courses: PredictedTrajectories, xy_m: Sequence[float], turn_rad: float
-) -> Step | None:
-    """Of courses of yaw, the hand and the phase that turn an object at (x, y) by an angle.
-
-    Closing, the fingers align a cuboid; then the hand turns counter-clockwise, so an angle far
-    behind is reached by going on around. Of the angles at which the hand may begin, the one that
-    is surest (least σ) to have the object turned as wanted while it is held. Where none has, the
-    surest whole rotation of those that turn it by most of their sweep is taken, and another has to
-    follow. None when none is foreseen to turn it by 1°.
-    """
-    wanted = wrap_angle(check_finite("turn_rad", turn_rad))
-    phase, mean, std = courses.phase, courses.mean, courses.std
-    closed, opening = Rotate().segment_phases[2], Rotate().segment_phases[-2]
-    held = (phase >= closed) & (phase <= opening)
-    stops = [
-        (float(np.interp(stop, phase, unsure)), k, float(stop))
-        for k, (course, unsure) in enumerate(zip(mean, std, strict=True))
-        for around in (0.0, 2 * math.pi)
-        for stop in crossings(phase[held], course[held], wanted + around)
-    ]
-    if stops:
-        _, k, stop = min(stops)
-    else:
-        end = mean[:, -1]
-        if end.max() < math.radians(1):
-            return None
-        enough = end >= min(FULL_ROTATION_SHARE * Rotate.sweep_rad, end.max())
-        k, stop = int(np.where(enough, std[:, -1], np.inf).argmin()), 1.0
-    turned = float(np.interp(stop, phase, mean[k]))
-    return _step_at(xy_m, Rotate(courses.grip_yaws[k]), stop, predicted_turn_rad=turned)
+    predicted = predict_trajectories(model, image, Rotate(), "yaw", gripper_yaws_rad)
+    return next(candidate_turns(predicted, xy_m, turn_rad), None)
 
 
 def plan_lift(
@@ -158,46 +123,84 @@ def plan_lift(
     image: np.ndarray,
     xy_m: Sequence[float],
     height_m: float,
-    grip_yaws: Sequence[float] = GRIPPER_YAWS_RAD,
+    gripper_yaws_rad: Sequence[float] = GRIPPER_YAWS_RAD,
 ) -> Step | None:
     """The grasp that ends holding an object from (x, y) at a height [m] above where it stands.
 
-    grip_yaws: the angles of the hand to choose from, as `choose_lift` does.
+    gripper_yaws_rad: to choose from. None when the model is sure (90 %) that the object does not
+    get so high, or slips.
     """
-    return choose_lift(predict_trajectories(model, image, Grasp(), "z", grip_yaws), xy_m, height_m)
+    predicted = predict_trajectories(model, image, Grasp(), "z", gripper_yaws_rad)
+    return next(candidate_lifts(predicted, xy_m, height_m), None)
 
 
-def choose_lift(
-    courses: PredictedTrajectories, xy_m: Sequence[float], height_m: float
-) -> Step | None:
-    """Of courses of z, the hand and the phase that hold an object from (x, y) at a height [m].
+def candidate_turns(
+    predicted: PredictedTrajectories, xy_m: Sequence[float], turn_rad: float
+) -> Iterator[Step]:
+    """Rotations that turn an object at (x, y) by an angle, each with another gripper yaw, best
+    first.
 
-    Of the angles of the hand the one that is sure (mean less σ) to lift it highest, of equals (to
-    a centimetre) the first. None when the model is sure (90 %) that it does not get so high, or
-    slips.
+    Closing, the fingers align a cuboid; then the hand turns counter-clockwise, so an angle far
+    behind is reached by going on around. The best is the one with the least σ of those predicted to
+    have the object turned as wanted while it is held. Where none has, it is the whole rotation with
+    the least σ of those that turn it by most of their sweep, and another has to follow.
+    """
+    wanted = wrap_angle(check_finite("turn_rad", turn_rad))
+    place, phase = check_pair("xy_m", xy_m), predicted.phase
+    closed, opening = Rotate().segment_phases[2], Rotate().segment_phases[-2]
+    held = (phase >= closed) & (phase <= opening)
+    while predicted.gripper_yaws_rad:
+        stops = [
+            (float(np.interp(stop, phase, std)), k, float(stop))
+            for k, (mean, std) in enumerate(zip(predicted.mean, predicted.std, strict=True))
+            for around in (0.0, 2 * math.pi)
+            for stop in crossings(phase[held], mean[held], wanted + around)
+        ]
+        if stops:
+            _, k, stop = min(stops)
+        else:
+            end = predicted.mean[:, -1]
+            if end.max() < math.radians(1):
+                return
+            enough = end >= min(FULL_ROTATION_SHARE * Rotate.sweep_rad, end.max())
+            k, stop = int(np.where(enough, predicted.std[:, -1], np.inf).argmin()), 1.0
+        turned = float(np.interp(stop, phase, predicted.mean[k]))
+        primitive = Rotate(predicted.gripper_yaws_rad[k])
+        yield _step_at(place, primitive, stop, predicted_turn_rad=turned)
+        predicted = predicted.without(k)
+
+
+def candidate_lifts(
+    predicted: PredictedTrajectories, xy_m: Sequence[float], height_m: float
+) -> Iterator[Step]:
+    """Grasps that hold an object from (x, y) at a height [m], each with another gripper yaw, best
+    first.
+
+    The best is sure (mean less σ) to lift it highest, of equals (to a centimetre) the first.
     """
     height = check_within("height_m", height_m, 0.0, 0.5, "m")
-    phase = courses.phase
-    k = int((courses.mean - courses.std)[:, -1].round(2).argmax())
-    course, std, primitive = courses.mean[k], courses.std[k], Grasp(grip_yaw=courses.grip_yaws[k])
-    if course.max() < height <= course[-1] + Z_90 * std[-1]:
-        # It may slip, or not; if it does not, it goes where the hand goes.
-        hand = primitive.path(phase)[:, 2]
-        course = np.maximum(hand - hand[phase >= primitive.segment_phases[-2]][0], 0.0)
-    lifting = phase >= primitive.segment_phases[-2]
-    stops = crossings(phase[lifting], course[lifting], height)
-    if not len(stops):
-        return None
-    return _step_at(xy_m, primitive, float(stops[0]), predicted_height_m=height)
+    place, phase = check_pair("xy_m", xy_m), predicted.phase
+    while predicted.gripper_yaws_rad:
+        k = int((predicted.mean - predicted.std)[:, -1].round(2).argmax())
+        mean, std = predicted.mean[k], predicted.std[k]
+        primitive = Grasp(grip_yaw=predicted.gripper_yaws_rad[k])
+        closed = phase >= primitive.segment_phases[-2]
+        if mean.max() < height <= mean[-1] + Z_90 * std[-1]:
+            # It may slip, or not; if it does not, it goes where the hand goes.
+            hand = primitive.path(phase)[:, 2]
+            mean = np.maximum(hand - hand[closed][0], 0.0)
+        stops = crossings(phase[closed], mean[closed], height)
+        if not len(stops):
+            return
+        yield _step_at(place, primitive, float(stops[0]), predicted_height_m=height)
+        predicted = predicted.without(k)
 
 
 def _step_at(
-    xy_m: Sequence[float], primitive: Grasp | Rotate, stop_phase: float, **foreseen: float
+    place: tuple[float, float], primitive: Grasp | Rotate, stop_phase: float, **predicted: float
 ) -> Step:
     """A step that leaves the object at its place."""
-    place = check_pair("xy_m", xy_m)
-    path = np.array([place, place])
-    return Step(primitive, stop_phase, place, path, std_m=0.0, **foreseen)
+    return Step(primitive, stop_phase, place, np.array([place, place]), std_m=0.0, **predicted)
 
 
 TURN_TOLERANCE_RAD = math.radians(2)
@@ -210,7 +213,7 @@ class PosePlanner:
     """The steps that turn and lift an object as a goal wants it, from one image (2, 48, 48) of it.
 
     rotate, grasp: the models; can_act: whether the arm can act, by primitive and position [m].
-    What the models say is kept, so that a search can ask at every node.
+    Predictions are kept, so that a search can ask at every node.
     """
 
     image: np.ndarray
@@ -226,62 +229,42 @@ class PosePlanner:
 
         std_m: σ of that position. None where the goal's orientation or height cannot be had.
         """
-        if goal.turn_rad is None and goal.height_m is None:
-            return ()
-        turns = self._turns(goal, xy_m, turned_rad)
-        if turns is None:
-            return None
-        turned = turns[-1].predicted_turn_rad if turns else turned_rad
-        lifts = ()
-        if goal.height_m is not None:
-            lift = self._lift(goal.height_m, xy_m, turned, turns[-1] if turns else None)
-            if lift is None:
+        steps: list[Step] = []
+        turned, lift_yaws = turned_rad, GRIPPER_YAWS_RAD
+        while goal.turn_rad is not None:
+            left_rad = wrap_angle(goal.turn_rad - turned)
+            if abs(left_rad) <= TURN_TOLERANCE_RAD:
+                break
+            predicted = self._predicted(Rotate, "yaw", GRIPPER_YAWS_RAD)
+            step = next(candidate_turns(predicted, xy_m, left_rad), None)
+            if step is None or len(steps) == MAX_TURNS or not self.can_act("rotate", xy_m):
                 return None
-            lifts = (replace(lift, predicted_turn_rad=turned),)
-        return tuple(replace(step, std_m=std_m) for step in (*turns, *lifts))
-
-    def _turns(self, goal: Goal, xy_m: Sequence[float], turned_rad: float) -> list[Step] | None:
-        steps, turned = [], turned_rad
-        for _ in range(MAX_TURNS + 1):
-            off = 0.0 if goal.turn_rad is None else wrap_angle(goal.turn_rad - turned)
-            if abs(off) <= TURN_TOLERANCE_RAD:
-                return steps
-            courses = self._courses(Rotate, "yaw", GRIPPER_YAWS_RAD)
-            step = choose_turn(courses, xy_m, off)
-            if step is None or not self.can_act("rotate", xy_m):
-                return None
-            hand = Rotate(_least(step.primitive.grip_yaw + turned))
+            primitive = Rotate(_smallest_yaw(step.primitive.grip_yaw + turned))
             turned += step.predicted_turn_rad
-            steps.append(replace(step, primitive=hand, predicted_turn_rad=turned))
-        return None
+            steps.append(replace(step, primitive=primitive, predicted_turn_rad=turned))
+            # A grasp takes the object as the rotation left it, or it would turn it back.
+            hand_rad = float(primitive.path(step.stop_phase)[0, 3])
+            lift_yaws = aligned_gripper_yaws(hand_rad - turned)
+        if goal.height_m is not None:
+            predicted = self._predicted(Grasp, "z", lift_yaws)
+            step = next(candidate_lifts(predicted, xy_m, goal.height_m), None)
+            if step is None or not self.can_act("grasp", xy_m):
+                return None
+            primitive = Grasp(grip_yaw=_smallest_yaw(step.primitive.grip_yaw + turned))
+            steps.append(replace(step, primitive=primitive, predicted_turn_rad=turned))
+        return tuple(replace(step, std_m=std_m) for step in steps)
 
-    def _lift(
-        self, height_m: float, xy_m: Sequence[float], turned_rad: float, after: Step | None
-    ) -> Step | None:
-        """A grasp at any angle; after a rotation as that left the object, or it is turned back."""
-        angles = GRIPPER_YAWS_RAD
-        if after is not None:
-            hand = float(after.primitive.path(after.stop_phase)[0, 3])
-            angles = aligned_gripper_yaws(hand - turned_rad)
-        step = choose_lift(self._courses(Grasp, "z", angles), xy_m, height_m)
-        if step is None or not self.can_act("grasp", xy_m):
-            return None
-        return replace(step, primitive=Grasp(grip_yaw=_least(step.primitive.grip_yaw + turned_rad)))
-
-    def _courses(
-        self, kind: type[Grasp] | type[Rotate], channel: str, angles: tuple[float, ...]
+    def _predicted(
+        self, kind: type[Grasp] | type[Rotate], channel: str, yaws: tuple[float, ...]
     ) -> PredictedTrajectories:
-        """What comes of hands at angles relative to the image, to half a degree."""
-        key = kind, tuple(round(2 * math.degrees(angle)) / 2 for angle in angles)
+        """Predictions for gripper yaws relative to the image, to half a degree."""
+        key = kind, tuple(round(2 * math.degrees(yaw)) / 2 for yaw in yaws)
         if key not in self._kept:
-            model = self.rotate if kind is Rotate else self.grasp
-            told = predict_trajectories(
-                model, self.image, kind(), channel, np.radians(key[1]).tolist()
-            )
-            self._kept[key] = told
-        return replace(self._kept[key], grip_yaws=angles)
+            model, near = self.rotate if kind is Rotate else self.grasp, np.radians(key[1])
+            self._kept[key] = predict_trajectories(model, self.image, kind(), channel, near)
+        return replace(self._kept[key], gripper_yaws_rad=yaws)
 
 
-def _least(yaw_rad: float) -> float:
+def _smallest_yaw(yaw_rad: float) -> float:
     """The same hand, its fingers being alike, turned as little as can be."""
     return (yaw_rad + math.pi / 2) % math.pi - math.pi / 2

@@ -3,200 +3,181 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import TYPE_CHECKING
+from collections import defaultdict
+from collections.abc import Callable, Iterable
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 import torch
 
 from affordlib.planning.effect_map import EffectMap
-from affordlib.planning.problem import (
-    PlanMode,
-    PlanningProblem,
-    Reachable,
-    check_has_room,
-    is_on_table,
-)
-from affordlib.planning.routes import CELL_M, Feasible, find_route, places
+from affordlib.planning.problem import PlanMode, PlanningProblem, check_has_room, is_on_table
+from affordlib.planning.robot import Robot
+from affordlib.planning.routes import Feasible, find_route, place_at
 from affordlib.planning.skills import Skills
 from affordlib.primitives import Primitive
-from affordlib.types import Goal, Observation, Plan, Step
+from affordlib.types import Goal, Observation, Plan
 
-if TYPE_CHECKING:
-    from affordlib.world import Tabletop
+Point = tuple[float, float]
 
-MAX_VETOES = 12
-"""Of plans to one place; then another way is looked for."""
+MAX_VETOED_PLANS = 12
+"""Of plans to one place; then another route is looked for."""
 
-MAX_REFUSED_WAYS = 150
-BARRED_M, BARRED_RAD = 0.01, math.radians(6)
-WAYPOINT_M = 0.01
+MAX_VETOED_ROUTES = 150
+REFUSED_WITHIN_M, REFUSED_WITHIN_RAD = 0.01, math.radians(6)
+"""How near to a refused action, in place and direction, none is planned again."""
+
+WAYPOINT_TOLERANCE_M = 0.01
 
 
-class Ended(Exception):
-    """A closed loop has come to an end: its status, and a message."""
+class Ending(NamedTuple):
+    """How a closed loop ends: one of `closed_loop.STATUSES`, and the same in words."""
+
+    status: str
+    message: str
 
 
 class MovePlanner:
-    """Finds steps towards a position; remembers what the kinematics has refused.
+    """Finds plans to a position; remembers which actions the kinematics has refused.
 
-    plans: all that were accepted; vetoes: how often the kinematics said no.
+    vetoes: how many those are.
     """
 
     def __init__(
         self,
-        world: Tabletop,
+        robot: Robot,
         skills: Skills,
         planner: Callable[[PlanningProblem], Plan],
         mode: PlanMode,
     ) -> None:
-        self.world, self.skills, self.planner, self.mode = world, skills, planner, mode
-        self.plans: list[Plan] = []
+        self.robot, self.skills, self.planner, self.mode = robot, skills, planner, mode
         self.vetoes = 0
-        self._barred: list[tuple[str, np.ndarray, float]] = []
-        self._barred_moves: dict[str, list[tuple[int, int, int]]] = {}
+        self._refused: list[tuple[str, np.ndarray, float]] = []
+        self._blocked: dict[type[Primitive], set[tuple[int, int]]] = defaultdict(set)
 
-    def steps(self, seen: Observation, goal: Goal, so_far: str) -> list[Step]:
-        """The steps of a plan, from where the object is seen, that the arm can follow.
-
-        Raises `Ended` where there is none; so_far: what to say has been done.
-        """
+    def plan(self, seen: Observation, goal: Goal) -> Plan | Ending:
+        """A plan that the arm can follow, from where the object is seen, or why there is none."""
         effects = self.skills.effects(seen.image)
         try:
             check_has_room(goal, effects.radius_m)
         except ValueError as error:
-            raise Ended("unreachable", f"the position: {error}") from None
-        off = goal.distance_m(seen.xy_m)
+            return Ending("unreachable", f"the position: {error}")
+        distance_m = goal.distance_m(seen.xy_m)
         plan = None
-        if off <= self.mode.max_steps * effects.reach_m:
-            plan = self._plan_to(effects, seen, goal, goal.tolerance_m)
+        if distance_m <= self.mode.max_steps * effects.reach_m:
+            plan = self._plan_to(effects, seen.xy_m, goal, goal.tolerance_m)
         if plan is None:
-            way = self._way(effects, seen, goal)
-            if way is None:
+            route = self._feasible_route(effects, seen.xy_m, goal.xy_m)
+            if route is None:
                 x, y = goal.xy_m
-                raise Ended(
+                return Ending(
                     "unreachable",
                     f"the position ({x:.3f}, {y:.3f}) m: from where the object is, no chain of "
                     "actions that the arm can carry out leads there",
                 )
-            plan = self._plan_along(effects, seen, goal, way)
-        if plan is None:
-            raise Ended(
-                "gave_up",
-                f"after {so_far}: no action is foreseen to bring the object nearer to its "
-                f"position than {1000 * off:.1f} mm",
-            )
-        self.plans.append(plan)
-        return list(plan.steps)
+            plan = self._plan_along(effects, seen.xy_m, goal, route)
+        return plan or Ending(
+            "gave_up",
+            "no action is predicted to bring the object nearer to its position than "
+            f"{1000 * distance_m:.1f} mm",
+        )
 
     def _plan_along(
-        self, effects: EffectMap, seen: Observation, goal: Goal, way: list[tuple[float, float]]
+        self, effects: EffectMap, start: Point, goal: Goal, route: list[Point]
     ) -> Plan | None:
-        """A plan that goes as far along a way as it can, straight ahead if a way leads on."""
-        here, ahead = np.array(seen.xy_m), np.subtract(goal.xy_m, seen.xy_m)
-        farthest = 0.98 * self.mode.max_steps * effects.reach_m
-        off = float(np.hypot(*ahead))
-        routes = self.skills.routes(effects.kind)
-        stops = [tuple(place) for place in way if math.dist(here, place) <= farthest]
-        if off > farthest:
-            straight = tuple((here + farthest / off * ahead).tolist())
-            barred, room = self._barred_moves[effects.kind.name], effects.radius_m
-            judged = self._judged(effects.kind)
-            if is_on_table(np.array([straight]), room)[0] and find_route(
-                routes, straight, goal.xy_m, judged, barred, room
+        """A plan that goes as far along a route as it can, straight ahead if a route leads on."""
+        farthest_m = 0.98 * self.mode.max_steps * effects.reach_m
+        ahead = np.subtract(goal.xy_m, start)
+        distance_m = float(np.hypot(*ahead))
+        stops = [place for place in route if math.dist(start, place) <= farthest_m]
+        if distance_m > farthest_m:
+            straight = tuple((np.array(start) + farthest_m / distance_m * ahead).tolist())
+            if is_on_table(np.array([straight]), effects.radius_m)[0] and self._route(
+                effects, straight, goal.xy_m
             ):
                 stops.append(straight)
         for stop in reversed(stops):
-            last = stop == tuple(goal.xy_m)
-            within = max(goal.tolerance_m, 0.5 * off) if last else WAYPOINT_M
-            plan = self._plan_to(effects, seen, Goal(stop, goal.tolerance_m), within)
+            within_m = WAYPOINT_TOLERANCE_M
+            if stop == tuple(goal.xy_m):
+                within_m = max(goal.tolerance_m, 0.5 * distance_m)
+            plan = self._plan_to(effects, start, Goal(stop, goal.tolerance_m), within_m)
             if plan is not None:
                 return plan
         return None
 
     def _plan_to(
-        self, effects: EffectMap, seen: Observation, aim: Goal, within_m: float
+        self, effects: EffectMap, start: Point, goal: Goal, within_m: float
     ) -> Plan | None:
         """A plan that ends within a distance of a goal and that the kinematics lets pass."""
-        kind = effects.kind
-        for _ in range(MAX_VETOES):
-            allowed = self._allowed(kind)
-            plan = self.planner(PlanningProblem(seen.xy_m, aim, effects, self.mode, allowed))
+        for _ in range(MAX_VETOED_PLANS):
+            allowed = self._allowed(effects.kind)
+            plan = self.planner(PlanningProblem(start, goal, effects, self.mode, allowed))
             if not plan.steps or plan.predicted_distance_m > within_m:
                 return None
-            if not self._vetoed(plan):
+            starts = [start, *(step.predicted_end_xy_m for step in plan.steps)]
+            actions = [(step.primitive, step.stop_phase) for step in plan.steps]
+            if (
+                self._first_refused((*a, at) for a, at in zip(actions, starts, strict=False))
+                is None
+            ):
                 return plan
         return None
 
-    def _allowed(self, kind: type[Primitive]) -> Reachable:
+    def _feasible_route(
+        self, effects: EffectMap, start: Point, goal_xy_m: Point
+    ) -> list[Point] | None:
+        """Places on the way to a goal, every action of it checked by the kinematics."""
+        for _ in range(MAX_VETOED_ROUTES):
+            route = self._route(effects, start, goal_xy_m)
+            if route is None:
+                return None
+            moves = list(pairwise([start, *route]))
+            k = self._first_refused((*_straight_action(effects, a, b), a) for a, b in moves)
+            if k is None:
+                return route
+            if 0 < k < len(moves) - 1:
+                self._blocked[effects.kind].add((place_at(moves[k][0]), place_at(moves[k][1])))
+        return None
+
+    def _route(self, effects: EffectMap, start: Point, goal_xy_m: Point) -> list[Point] | None:
+        kind = effects.kind
+        routes, allowed = self.skills.routes(kind), self._allowed(kind)
+        return find_route(routes, start, goal_xy_m, allowed, self._blocked[kind], effects.radius_m)
+
+    def _allowed(self, kind: type[Primitive]) -> Feasible:
         """Where the arm can act: what was learned, less what its kinematics has refused."""
         learned = self.skills.reachable(kind)
-        barred = [(xy, angle) for name, xy, angle in self._barred if name == kind.name]
+        refused = [(xy, angle) for name, xy, angle in self._refused if name == kind.name]
 
-        def judge(xy_m: np.ndarray, direction_rad: np.ndarray) -> np.ndarray:
-            good = np.ones(len(xy_m), bool) if learned is None else learned(xy_m, direction_rad)
-            for xy, angle in barred:
-                near = np.hypot(*(xy_m - xy).T) < BARRED_M
+        def allowed(xy_m, direction_rad, length_m=None):
+            ok = np.ones(len(xy_m), bool) if learned is None else learned(xy_m, direction_rad)
+            for xy, angle in refused:
+                near = np.hypot(*(xy_m - xy).T) < REFUSED_WITHIN_M
                 off = (direction_rad - angle + np.pi) % (2 * np.pi) - np.pi
-                good = good & ~(near & (np.abs(off) < BARRED_RAD))
-            return good
+                ok = ok & ~(near & (np.abs(off) < REFUSED_WITHIN_RAD))
+            return ok
 
-        return judge
+        return allowed
 
-    def _judged(self, kind: type[Primitive]) -> Feasible:
-        """The same, of actions of any length."""
-        allowed = self._allowed(kind)
-        return lambda xy_m, direction_rad, _: allowed(xy_m, direction_rad)
-
-    def _vetoed(self, plan: Plan) -> bool:
-        """Whether the arm's kinematics refuses a step; that place and direction are barred then."""
-        at = plan.start_xy_m
-        for step in plan.steps:
-            if not self.world.can_reach(step.primitive, step.stop_phase, at):
-                self._bar(step.primitive, at)
-                return True
-            at = step.predicted_end_xy_m
-        return False
-
-    def _bar(self, action: Primitive, xy_m: tuple[float, float]) -> None:
-        self.vetoes += 1
-        self._barred.append((action.name, np.array(xy_m), action.direction_rad))
-
-    def _way(
-        self, effects: EffectMap, seen: Observation, goal: Goal
-    ) -> list[tuple[float, float]] | None:
-        """Places on the way to a goal, every action of it checked by the kinematics."""
-        kind = effects.kind
-        routes = self.skills.routes(kind)
-        barred = self._barred_moves.setdefault(kind.name, [])
-        x, y = places()
-        for _ in range(MAX_REFUSED_WAYS):
-            judged, room = self._judged(kind), effects.radius_m
-            way = find_route(routes, seen.xy_m, goal.xy_m, judged, barred, room)
-            if way is None:
-                return None
-            at = seen.xy_m
-            for k, place in enumerate(way):
-                action, stop = _action_for(effects, np.subtract(place, at))
-                if not self.world.can_reach(action, stop, at):
-                    self._bar(action, at)
-                    if 0 < k < len(way) - 1:
-                        cell = np.argmin(abs(x[:, 0] - at[0])), np.argmin(abs(y[0] - at[1]))
-                        move = np.rint(np.subtract(place, at) / CELL_M)
-                        number = int(np.flatnonzero((routes.moves == move).all(axis=1))[0])
-                        barred.append((number, int(cell[0]), int(cell[1])))
-                    break
-                at = place
-            else:
-                return way
+    def _first_refused(self, actions: Iterable[tuple[Primitive, float, Point]]) -> int | None:
+        """The number of the first action that the kinematics refuses, and is not to be planned
+        again; actions: with the phase at which each stops, and where the object is before it.
+        """
+        for k, (action, stop_phase, at) in enumerate(actions):
+            if not self.robot.can_reach(action, stop_phase, at):
+                self.vetoes += 1
+                self._refused.append((action.name, np.array(at), action.direction_rad))
+                return k
         return None
 
 
-def _action_for(effects: EffectMap, move_m: np.ndarray) -> tuple[Primitive, float]:
-    """The action straight along a move (2,) [m], and the phase at which it has gone so far."""
-    angle = math.atan2(move_m[1], move_m[0])
+def _straight_action(effects: EffectMap, start: Point, end: Point) -> tuple[Primitive, float]:
+    """The action straight from a place to another, and the phase at which it has gone so far."""
+    move = np.subtract(end, start)
+    angle = math.atan2(move[1], move[0])
     phase = torch.linspace(0, 1, 101, dtype=torch.float64)
     with torch.no_grad():
         ahead = effects(torch.full_like(phase, angle), phase)[0][:, 0].numpy()
-    stop = float(phase[min(int(np.searchsorted(ahead, np.hypot(*move_m))), 100)])
+    stop = float(phase[min(int(np.searchsorted(ahead, np.hypot(*move))), 100)])
     return effects.kind.towards(angle), stop

@@ -42,8 +42,15 @@ def open_loop(world: Tabletop, plan: Plan, planner: Planner, report: Report) -> 
     for step in plan.steps:
         paths += execute_plan(world, replace(plan, steps=(step,))).object_paths_xy_m
         report()
-    at_rest = execute_plan(world, replace(plan, steps=()))
-    return replace(at_rest, plan=plan, object_paths_xy_m=paths)
+    return measured(world, plan, paths)
+
+
+def measured(
+    world: Tabletop, plan: Plan, paths_xy_m: tuple[np.ndarray, ...] = (), words: str = ""
+) -> Outcome:
+    """The outcome of a plan by where the object really is now."""
+    pose = world.object_pose()
+    return Outcome(plan, plan.goal.distance_m(pose[:2]), pose, paths_xy_m, words=words)
 
 
 def closed_loop(skills: Skills, tolerance_m: float = 0.002) -> Executor:
@@ -54,17 +61,22 @@ def closed_loop(skills: Skills, tolerance_m: float = 0.002) -> Executor:
     """
 
     def execute(world, plan, planner, report):
-        def exact(goal):
+        goal = plan.goal
+
+        def exact_goal():
             return replace(goal, tolerance_m=tolerance_m)
+
+        def on_action(*_):
+            nonlocal goal
+            goal = report()
 
         known = isinstance(planner, SkillPlanner)
         search = (planner.skills, planner.plan) if known else (skills, plan_continuous)
-        config = ClosedLoopConfig(on_action=lambda *_: exact(report()), on_plan=report)
-        done = run_closed_loop(world, exact(plan.goal), *search, config)
+        config = ClosedLoopConfig(on_action=on_action, on_plan=report)
+        done = run_closed_loop(world, exact_goal, *search, config)
         words = "" if done.reached else f"The loop ended as {done.status}: {done.message}."
         if not known:
             words += " It replanned by continuous search."
-        tilt, paths = world.object_tilt_rad(), done.object_paths_xy_m
-        return Outcome(plan, done.distance_m, done.end_pose, tilt, paths, words=words.strip())
+        return measured(world, plan, done.object_paths_xy_m, words.strip()).with_goal(goal)
 
     return execute

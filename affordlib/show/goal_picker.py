@@ -22,10 +22,9 @@ import numpy as np
 
 from affordlib.paths import resolve_out_dir
 from affordlib.plan_files import load_plan, save_plan
-from affordlib.planning import execute_plan
 from affordlib.primitives import wrap_angle
 from affordlib.show.drawing import Drawing, WithPicture
-from affordlib.show.executors import Executor, Planner, Stopped, open_loop
+from affordlib.show.executors import Executor, Planner, Stopped, measured, open_loop
 from affordlib.show.picker_controls import PickerControls, outcome_in_words, plan_in_words
 from affordlib.show.plots import table_picture
 from affordlib.show.table_view import (
@@ -335,8 +334,7 @@ class GoalPicker(WithPicture, widgets.VBox):
                     outcome, how = self._execute(report), "Done,"
                     self.controls.show_progress(done, max(1, done))
                 except Stopped:
-                    at_rest = replace(self.plan, steps=())
-                    outcome, how = execute_plan(self.world, at_rest), "Stopped after"
+                    outcome, how = measured(self.world, self.plan), "Stopped after"
                 turned = wrap_angle(self.world.object_pose()[2] - yaw)
                 lifted = self.world.object_state()[2] - z
                 outcome = replace(outcome.with_goal(self.goal), turned_rad=turned, lifted_m=lifted)

@@ -170,10 +170,6 @@ class Tabletop:
         """The object's (x, y) [m] and yaw [rad] in the frame of the table."""
         return self.placed.pose()
 
-    def object_tilt_rad(self) -> float:
-        """Angle between the object's own upright axis and the vertical [rad]."""
-        return float(poses(np.array([self.object_state()]))[0, 4])
-
     def object_fell(self) -> bool:
         """Whether the object lies differently than it was placed."""
         return self.placed.fell()
@@ -226,8 +222,10 @@ class Tabletop:
         """The object's estimated position and its image; the arm must be parked.
 
         The position is the mean over `n_averaged_images` images, the image is the first of them.
+        The yaw is not estimated from the image: it is the simulator's, which no camera could know
+        of an upright cylinder or a sphere.
         """
-        x, y, _ = self.object_pose()
+        x, y, yaw = self.object_pose()
         image = None
         if self.config.camera == "kinect":
             images = range(self.n_averaged_images)
@@ -237,7 +235,7 @@ class Tabletop:
         x, y = x + self.config.bias_m[0], y + self.config.bias_m[1]
         if image is None:
             image = camera.depth_crop(self.client, (x, y))
-        return Observation((x, y), image)
+        return Observation((x, y), image, yaw_rad=yaw)
 
     def depth_image(self) -> np.ndarray:
         """Depth [m] and mask (2, 48, 48) of the table around the object, the arm parked."""

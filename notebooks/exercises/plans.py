@@ -12,7 +12,7 @@ import torch
 
 from affordlib.models import load_checkpoint
 from affordlib.planning import EffectMap, PlanningProblem, plan_continuous
-from affordlib.planning.grasp_rotate import predict_trajectory
+from affordlib.planning.grasp_rotate import predict_trajectories
 from affordlib.planning.rollout import roll_out
 from affordlib.primitives import Grasp, Push
 from affordlib.types import Goal, Observation, Plan, Step
@@ -98,8 +98,8 @@ def _lift_error_mm(stop_at: Callable[..., Any]) -> float:
     with Tabletop() as world:
         for height_m in (0.03, 0.09, 0.18):
             world.place(UprightCylinder(0.045, 0.06))
-            phase, course_m, _ = predict_trajectory(model, world.depth_image(), Grasp(), "z")
-            stop = float(asked(stop_at, height_m, phase, course_m))
+            grasp = predict_trajectories(model, world.depth_image(), Grasp(), "z", [0.0])
+            stop = float(asked(stop_at, height_m, grasp.phase, grasp.mean[0]))
             off.append(abs(world.execute_primitive(Grasp(), stop).effect[-1, 2] - height_m))
     return 1000 * max(off)
 
