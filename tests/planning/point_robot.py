@@ -1,0 +1,131 @@
+"""A robot in pure Python, and models that know what it does: no simulator, no network."""
+
+import math
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+
+import numpy as np
+import torch
+
+from affordlib.planning import Skills
+from affordlib.primitives import Grasp, Rotate
+from affordlib.types import NothingSeenError, Observation, Observations, Prediction
+
+REACH_M = 0.09
+STARTS = 0.6
+
+
+def moved_m(phase):
+    """How far a push that stops at a phase moves the object [m]."""
+    return REACH_M * (np.clip(phase - STARTS, 0, 1 - STARTS) / (1 - STARTS)) ** 2
+
+
+class KnownDynamics:
+    """An `EffectModel` of pushes of which everything is known.
+
+    The object moves away from where the gripper starts, from t = 0.6 on, by 9 cm in all; queried by
+    a final effect, it answers with the nearest push.
+    """
+
+    action_channels = effect_channels = ("x", "y")
+
+    def encode(self, image: torch.Tensor) -> torch.Tensor:
+        return torch.zeros(len(image), 1)
+
+    def predict(self, features: torch.Tensor, observations: Observations, t_target: torch.Tensor):
+        start = observations.action[:, 0] + 1e-9
+        wanted = observations.effect[:, 0]
+        by_effect = observations.effect_mask.any(1, keepdim=True)
+        direction = torch.where(by_effect, wanted, -start)
+        direction = direction / direction.norm(dim=-1, keepdim=True)
+        share = ((t_target - STARTS) / (1 - STARTS)).clamp(0, 1).square()[..., None]
+        effect = REACH_M * share * direction[:, None]
+        action = (-0.2 + 0.25 * t_target[..., None]) * direction[:, None]
+        std = torch.full_like(effect, 0.001)
+        return Prediction(action, std, effect, std)
+
+
+class FollowsTheHand:
+    """An `EffectModel` of a held object: from closing to opening it goes where the hand goes."""
+
+    def __init__(self, kind, channel):
+        self.kind, self.action_channels, self.effect_channels = kind, (channel,), (channel,)
+
+    def encode(self, image):
+        return torch.zeros(len(image), 1)
+
+    def predict(self, features, observations, t_target):
+        column = {"z": 2, "yaw": 3}[self.effect_channels[0]]
+        way = hand_moves(self.kind(), t_target.numpy().ravel())[:, column]
+        effect = torch.from_numpy(way).reshape(*t_target.shape, 1).float()
+        std = torch.full_like(effect, 0.001)
+        return Prediction(effect, std, effect, std)
+
+
+def hand_moves(primitive, phase):
+    """How the hand moves (n, 5) while it is closed."""
+    closed, opens = primitive.segment_phases[2], primitive.segment_phases[-2]
+    if primitive.holds:
+        opens = 1.0
+    return primitive.path(np.clip(phase, closed, opens)) - primitive.path(closed)
+
+
+def point_skills():
+    """What the robot can do, and everywhere."""
+    grasp, rotate = FollowsTheHand(Grasp, "z"), FollowsTheHand(Rotate, "yaw")
+    return Skills({"push": KnownDynamics(), "grasp": grasp, "rotate": rotate})
+
+
+def disc_image(height_m=0.05, radius_m=0.02):
+    """What a camera sees of an upright cylinder."""
+    at = (np.arange(48) - 23.5) * 0.16 / 48
+    mask = np.hypot(at, at[:, None]) < radius_m
+    return np.stack([1.0 - height_m * mask, mask]).astype(np.float32)
+
+
+@dataclass
+class PointRobot:
+    """A `Robot` that pushes, turns and lifts a disc; pushes go a share too far.
+
+    refuses: which actions at which places its arm cannot do. before: called before it observes,
+    with the robot. velocity: of the object [m/s], which half a second brakes.
+    """
+
+    xy_m: tuple[float, float] = (0.0, 0.0)
+    too_far: float = 0.05
+    refuses: object = lambda *_: False
+    before: object = lambda *_: None
+    yaw_rad: float | None = 0.2
+    velocity: tuple[float, float] = (0.0, 0.0)
+    visible: bool = True
+    height_m: float = 0.05
+    executed: list = field(default_factory=list)
+
+    def observe(self):
+        self.before(self)
+        if not self.visible:
+            raise NothingSeenError("nothing is seen")
+        return Observation(self.xy_m, disc_image(self.height_m), yaw_rad=self.yaw_rad)
+
+    def execute(self, step):
+        primitive, (x, y) = step.primitive, self.xy_m
+        height, yaw = 0.0, self.yaw_rad or 0.0
+        if primitive.name == "push":
+            angle, far = primitive.direction_rad, (1 + self.too_far) * moved_m(step.stop_phase)
+            self.xy_m = (x + far * math.cos(angle), y + far * math.sin(angle))
+        else:
+            _, _, height, turned, _ = hand_moves(primitive, np.array([step.stop_phase]))[0].tolist()
+            self.yaw_rad = yaw + turned
+        self.executed.append(step)
+        path = np.array([[x, y, 0.0, yaw], [*self.xy_m, height, self.yaw_rad or 0.0]])
+        return SimpleNamespace(tool=np.zeros((1, 5)), object_path=path)
+
+    def can_reach(self, primitive, stop_phase=1.0, at_xy_m=None):
+        return not self.refuses(primitive, at_xy_m or self.xy_m)
+
+    def park(self):
+        pass
+
+    def settle(self, seconds=0.5):
+        self.xy_m = tuple(np.add(self.xy_m, np.multiply(seconds, self.velocity)).tolist())
+        self.velocity = tuple(max(0.0, 1 - 2 * seconds) * v for v in self.velocity)

@@ -1,0 +1,469 @@
+"""The closed loop and execution: every ending provoked, no endless loop, a veto before motion."""
+
+import math
+import subprocess
+import sys
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from affordlib.paths import repo_root
+from affordlib.planning import (
+    ClosedLoopConfig,
+    Disturbance,
+    DisturbanceSchedule,
+    Robot,
+    action_limit,
+    execute_plan,
+    plan_astar,
+    plan_continuous,
+    plan_gradient,
+    run_closed_loop,
+    sample_disturbances,
+)
+from affordlib.planning.closed_loop import DISPLACED_M
+from affordlib.planning.grasp_rotate import GRIPPER_YAWS_RAD
+from affordlib.planning.reachability import Reachability
+from affordlib.primitives import Drag, Grasp, Push, Rotate
+from affordlib.types import Goal, Plan, Step
+from affordlib.world import (
+    Cuboid,
+    Sphere,
+    UnreachableError,
+    UprightCylinder,
+    WorldConfig,
+)
+from experiments.closed_loop import Trial, _stays_feasible, draw_trial
+from tests.planning.point_robot import PointRobot, point_skills
+from tests.problems import problem_of
+
+EXACT_M = 0.002
+BOX, TUBE, BALL = Cuboid(0.06, 0.05, 0.05), UprightCylinder(0.05, 0.07), Sphere(0.06)
+
+
+def loop(robot, goal, skills=None, planner=plan_continuous, **config):
+    """A closed loop, which by default knows what a `PointRobot` does but for its inaccuracy."""
+    skills = skills or point_skills()
+    return run_closed_loop(robot, goal, skills, planner, config=ClosedLoopConfig(**config))
+
+
+def disturbed(world, goal, skills, *disturbances):
+    schedule = DisturbanceSchedule(world, goal, disturbances)
+    return run_closed_loop(schedule, schedule.current_goal, skills), schedule
+
+
+# On a robot in pure Python
+
+
+@pytest.mark.parametrize("planner", [plan_astar, plan_continuous, plan_gradient])
+def test_every_planner_brings_a_pose_about(planner):
+    robot, goal = PointRobot(), Goal((0.21, -0.06), 0.01, turn_rad=1.3, height_m=0.1)
+    went = loop(robot, goal, planner=planner)
+    assert went.reached, went.message
+    kinds = [type(step.primitive) for step in went.steps]
+    assert kinds == [Push] * (len(kinds) - 3) + [Rotate, Rotate, Grasp]  # in sweeps of 60°
+    assert robot.executed == list(went.steps)
+    assert went.distance_m == goal.distance_m(robot.xy_m) <= 0.01
+    assert went.turn_error_rad == pytest.approx(1.5 - robot.yaw_rad)
+    assert abs(went.turn_error_rad) < math.radians(2)
+    assert abs(went.height_error_m) < 0.003
+    assert "from the goal after" in went.message
+    assert len(went.steps) == len(went.object_paths_xy_m) <= action_limit(0.22) + 6
+    # Where the goal already is, nothing moves.
+    assert loop(robot, Goal(robot.xy_m, EXACT_M)).steps == ()
+
+
+def test_the_loop_needs_no_simulator():
+    code = """
+import sys
+sys.modules["pybullet"] = sys.modules["affordlib.world"] = None
+from affordlib.planning import run_closed_loop
+from affordlib.types import Goal
+from tests.planning.point_robot import PointRobot, point_skills
+went = run_closed_loop(PointRobot(), Goal((0.1, 0.05), 0.002, height_m=0.1), point_skills())
+print(went.status)
+"""
+    run = [sys.executable, "-c", code]
+    done = subprocess.run(run, capture_output=True, text=True, cwd=repo_root(), check=False)
+    assert done.stdout == "reached\n", done.stderr
+    assert isinstance(PointRobot(), Robot)
+
+
+def test_the_loop_goes_as_near_as_the_goal_asks():
+    assert len(loop(PointRobot(), Goal((0.08, 0.0), 0.01)).steps) == 1
+    assert len(loop(PointRobot(), Goal((0.08, 0.0), 0.001)).steps) == 2
+
+
+@pytest.mark.parametrize("pose", [{}, {"turn_rad": -0.5}, {"height_m": 0.1}])
+def test_no_more_actions_than_were_allowed(pose):
+    for limit in (0, 1):
+        far = 0.3 * (limit if pose else 1)
+        went = loop(PointRobot(), Goal((far, 0.0), EXACT_M, **pose), max_actions=limit)
+        assert (went.status, len(went.steps)) == ("gave_up", limit), went.message
+    assert "after 1 action:" in went.message
+    with pytest.raises(TypeError, match=r"max_actions=1\.5"):
+        loop(PointRobot(), Goal((0.0, 0.0)), max_actions=1.5)
+
+
+@pytest.mark.parametrize(
+    ("distance", "limit"), [(0.0, 3), (0.01, 4), (0.05, 4), (0.051, 5), (0.25, 8)]
+)
+def test_the_limit_is_the_distance_over_5_cm_rounded_up_and_3(distance, limit):
+    assert action_limit(distance) == limit
+
+
+def test_an_object_that_always_escapes_ends_the_loop():
+    robot = PointRobot()
+
+    def take_away(plan, n):
+        robot.xy_m = (0.0, 0.0)
+
+    went = loop(robot, Goal((0.06, 0.0), EXACT_M), on_action=take_away)
+    assert went.status == "gave_up"
+    assert 5 < len(went.steps) <= 4 * action_limit(0.06)
+
+
+def test_a_planner_that_does_nothing_is_given_up():
+    def lazy(problem):
+        return Plan(problem.goal, problem.start_xy_m, (), "lazy", False, 0, 0.0)
+
+    went = loop(PointRobot(), Goal((0.1, 0.0), EXACT_M), planner=lazy)
+    assert (went.status, went.steps) == ("gave_up", ())
+
+
+@pytest.mark.parametrize("change", [{"xy_m": (0.75, 0.0)}, {"visible": False}])
+def test_an_object_that_is_gone_is_lost(change):
+    robot = PointRobot()
+    went = loop(robot, Goal((0.2, 0.0)), on_action=lambda *_: vars(robot).update(change))
+    assert (went.status, len(went.steps)) == ("lost", 1)
+
+
+def test_a_goal_that_moves_is_followed():
+    goal, robot = Goal((0.1, 0.0), EXACT_M, turn_rad=-0.4), PointRobot(yaw_rad=0.0)
+    goals = [Goal((0.1, 0.08), EXACT_M, turn_rad=turn) for turn in (-0.4, -0.8, -1.2)]
+
+    def move(plan, n):
+        nonlocal goal
+        off = abs(math.remainder(goal.turn_rad - robot.yaw_rad, 2 * math.pi))
+        if goals and (off < 0.05 or goal.xy_m == (0.1, 0.0)):
+            goal = goals.pop(0)
+
+    went = loop(robot, lambda: goal, on_action=move)
+    assert went.reached, went.message
+    assert (goals, went.goal) == ([], goal)
+    assert goal.distance_m(robot.xy_m) < EXACT_M
+    with pytest.raises(TypeError, match="goal must be a Goal"):
+        loop(robot, lambda: (0.1, 0.1))
+
+
+def test_a_displaced_object_is_planned_for_again():
+    robot = PointRobot()
+
+    def displace(plan, n):
+        if n == 1:
+            robot.xy_m = (-0.1, 0.2)
+
+    went = loop(robot, Goal((0.16, 0.0), EXACT_M), on_action=displace)
+    assert went.reached, went.message
+    assert len(went.steps) > action_limit(0.16) - 2
+    assert len(went.plans) >= 2
+
+
+def test_what_somebody_has_set_rolling_is_waited_for():
+    robot = PointRobot()
+
+    def knock(plan, n):
+        if n == 1:
+            x, y = robot.xy_m
+            robot.xy_m, robot.velocity = (x, y + DISPLACED_M + 0.01), (0.0, 0.2)
+
+    went = loop(robot, Goal((0.16, 0.0), EXACT_M), on_action=knock)
+    assert went.reached
+    assert robot.velocity[1] < 0.01
+    assert went.seen_xy_m[1][1] > DISPLACED_M + 0.09
+
+
+def test_a_veto_is_remembered_and_another_plan_made():
+    refused = []
+
+    def refuses(primitive, at):
+        if not refused or abs(primitive.direction_rad - refused[0]) < 0.05:
+            refused.append(primitive.direction_rad)
+            return True
+        return False
+
+    went = loop(PointRobot(refuses=refuses), Goal((0.1, 0.05), EXACT_M))
+    assert went.reached, went.message
+    assert went.vetoes == len(refused) >= 1
+    assert abs(went.steps[0].primitive.direction_rad - refused[0]) > 0.05
+
+
+def test_what_the_arm_cannot_do_is_refused_before_any_motion():
+    robot = PointRobot((0.5, 0.3), refuses=lambda primitive, at: at[1] > 0.45)
+    went = loop(robot, Goal((0.5, 0.62), EXACT_M))
+    assert (went.status, robot.executed) == ("unreachable", [])
+    assert "the position (0.500, 0.620) m" in went.message
+    assert went.vetoes > 0
+    went = loop(robot, Goal((0.5, 0.69)))
+    assert (went.status, robot.executed) == ("unreachable", [])
+    assert "too near the rim" in went.message
+    hands = PointRobot(refuses=lambda primitive, at: primitive.name != "push")
+    went = loop(hands, Goal((0.0, 0.0), height_m=0.1))
+    assert (went.status, went.steps, went.vetoes) == ("unreachable", (), len(GRIPPER_YAWS_RAD))
+    assert "the height: 10.0 cm: the arm cannot grasp at (0.000, 0.000) m" in went.message
+    asked = []
+    hands.refuses = lambda primitive, at: asked.append(primitive.grip_yaw) or len(asked) < 3
+    went = loop(hands, Goal((0.0, 0.0), turn_rad=0.5))
+    assert (went.status, went.vetoes) == ("reached", 2)
+    assert went.steps[0].primitive.grip_yaw == asked[-1]
+    assert len(set(asked)) == 3
+
+
+def test_a_far_goal_is_reached_round_what_the_arm_cannot_do():
+    class Learned(Reachability):
+        def probability(self, primitive, xy_m, direction_rad=None):
+            return 1.0 - ((xy_m[:, 0] > 0.1) & (np.abs(xy_m[:, 1]) < 0.06))
+
+    robot, skills = PointRobot((0.2, -0.3)), replace(point_skills(), reachability=Learned())
+    went = loop(robot, Goal((0.2, 0.25), EXACT_M), skills, max_actions=20)
+    assert went.reached, went.message
+    assert min(path[0, 0] for path in went.object_paths_xy_m) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("shifts_m", "lifts", "status"),
+    [((0.0,), 1, "reached"), ((0.02,), 2, "reached"), ((0.02, 0.02), 2, "gave_up")],
+)
+def test_what_is_held_aside_of_its_goal_is_put_down_and_lifted_there(shifts_m, lifts, status):
+    """The goal moves by so much after each lift."""
+    goal, left = Goal((0.06, 0.0), EXACT_M, height_m=0.1), list(shifts_m)
+
+    def move_goal(plan, n):
+        nonlocal goal
+        if plan.steps[-1].primitive.name == "grasp" and left:
+            goal = replace(goal, xy_m=(goal.xy_m[0] + left.pop(0), 0.0))
+
+    went = loop(PointRobot(), lambda: goal, on_action=move_goal)
+    assert went.status == status, went.message
+    assert sum(isinstance(step.primitive, Grasp) for step in went.steps) == lifts
+    aside_m = 0.0 if status == "reached" else shifts_m[-1]
+    assert went.distance_m == pytest.approx(aside_m, abs=0.005)
+    assert abs(went.height_error_m) < 0.003
+
+
+def test_a_robot_that_does_not_know_the_yaw_turns_nothing():
+    robot = PointRobot(yaw_rad=None)
+    assert loop(robot, Goal((0.1, 0.0), EXACT_M)).reached
+    with pytest.raises(ValueError, match=r"goal\.turn_rad needs a robot"):
+        loop(robot, Goal((0.1, 0.0), turn_rad=0.3))
+
+
+def test_corrections_bring_it_nearer_and_stop_where_enough():
+    goal, asked = Goal((0.1, 0.04)), []
+
+    def replan(image, xy, goal):
+        asked.append(goal.tolerance_m)
+        return plan_continuous(problem_of(point_skills().model(Push), image, xy, goal))
+
+    robot = PointRobot()
+    plan = plan_astar(problem_of(point_skills().model(Push), robot.observe().image, (0, 0), goal))
+    open_loop, closed = execute_plan(PointRobot(), plan), execute_plan(robot, plan, 2, replan)
+    assert closed.distance_m == goal.distance_m(robot.xy_m) < 0.5 * open_loop.distance_m
+    assert len(plan.steps) < len(closed.object_paths_xy_m) <= len(plan.steps) + 2
+    assert set(asked) == {0.0003}
+    none = Plan(goal, goal.xy_m, (), "none", True, 0, 0.0)
+    assert execute_plan(robot, none, 2, replan, 0.05).object_paths_xy_m == ()
+    with pytest.raises(ValueError, match="need a planner"):
+        execute_plan(robot, plan, 1)
+    held = replace(plan, steps=(Step(Grasp(), 1.0, (0.0, 0.0), np.zeros((2, 2))),))
+    assert len(execute_plan(PointRobot(), held, 2, replan).object_paths_xy_m) == 1
+
+
+def test_what_was_done_before_the_arm_refused_is_kept():
+    class Refuses(PointRobot):
+        def execute(self, step):
+            if step.primitive.name == "grasp":
+                raise UnreachableError("out of reach")
+            return super().execute(step)
+
+    robot, path = Refuses(), np.zeros((2, 2))
+    can, cannot = Step(Push(math.pi), 1.0, (0.09, 0.0), path), Step(Grasp(), 1.0, (0.0, 0.0), path)
+    plan = Plan(Goal((0.1, 0.0)), (0.0, 0.0), (can, can, cannot), "by hand", True, 0, 0.0)
+    with pytest.raises(UnreachableError) as refused:
+        execute_plan(robot, plan)
+    outcome = refused.value.outcome
+    assert len(outcome.object_paths_xy_m) == 2
+    assert outcome.end_pose[:2] == robot.xy_m == pytest.approx((0.189, 0.0))
+    assert outcome.distance_m == plan.goal.distance_m(robot.xy_m)
+    robot.refuses = lambda *_: False  # it agrees to what it then cannot do
+    went = loop(robot, Goal(robot.xy_m, height_m=0.1))
+    assert (went.status, went.message) == ("unreachable", "the height: out of reach")
+
+
+# On the simulated table
+
+
+@pytest.mark.parametrize("obj", [BOX, BALL], ids=["pushed", "dragged"])
+def test_an_object_is_brought_to_its_goal(world, skills, obj):
+    world.place(obj, (0.0, 0.0), 0.3)
+    goal = Goal((0.11, -0.06), EXACT_M)
+    went = run_closed_loop(world, goal, skills)
+    assert went.status == "reached", went.message
+    assert went.distance_m == goal.distance_m(world.object_pose()[:2])
+    assert went.end_pose == world.object_pose()
+    assert {type(step.primitive) for step in went.steps} == {Drag if obj is BALL else Push}
+
+
+def test_a_plan_is_executed(world, trained):
+    world.place(BOX, (0.0, 0.0), 0.0)
+    goal = Goal((0.15, 0.0))
+    plan = plan_astar(problem_of(trained, world.depth_image(), world.object_pose()[:2], goal))
+    outcome = execute_plan(world, plan)
+    assert outcome.end_pose == pytest.approx(world.object_pose())
+    assert outcome.distance_m == pytest.approx(goal.distance_m(world.object_pose()[:2]))
+    assert outcome.distance_m < goal.tolerance_m + 0.005  # 15 mm: A* is content within 2 cm
+    assert len(outcome.object_paths_xy_m) == len(outcome.plan.steps) == 2
+    first, second = outcome.object_paths_xy_m
+    np.testing.assert_allclose(first[-1], second[0], atol=1e-9)
+    assert outcome.with_goal(Goal((0.0, 0.0))).distance_m > 0.1
+
+
+def test_the_kinematics_agrees_with_what_execution_refuses(world):
+    rng = np.random.default_rng(4)
+    refused, steps = 0, []
+    for _ in range(60):
+        xy, angle = rng.uniform([-0.45, -0.65], [0.65, 0.65]), rng.uniform(-math.pi, math.pi)
+        action = (Push.towards(angle), Drag.towards(angle), Grasp(), Rotate())[rng.integers(4)]
+        stop = rng.uniform(0.3, 1.0)
+        world.place(BOX, tuple(xy))
+        if not world.can_reach(action, stop):
+            world.on_step = steps.append
+            with pytest.raises(UnreachableError):
+                world.execute_primitive(action, stop, approach=True)
+            world.on_step = None
+            refused += 1
+        elif rng.random() < 0.1:
+            world.execute_primitive(action, stop, approach=True)
+    assert (steps, refused > 8) == ([], True)
+
+
+def test_the_arm_is_asked_about_the_grasp_that_it_will_execute(world, skills):
+    """At the rim of its reach a hand's height decides, and that goes by the object's."""
+    for x, status in ((0.52, "reached"), (0.526, "unreachable")):
+        world.place(Cuboid(0.05, 0.05, 0.08), (x, 0.0))
+        went = run_closed_loop(world, Goal((x, 0.0), EXACT_M, height_m=0.24), skills)
+        assert went.status == status, went.message
+        assert x == 0.52 or went.steps == ()
+
+
+def test_a_toppled_cylinder_is_dragged(world, skills):
+    """Pushed while it stands; lying it would roll away, so it is caged, as its image shows."""
+    world.place(TUBE, (0.0, 0.0), 0.0)
+    falls = Disturbance("topple", 1, 0.0, 1.0)
+    went, schedule = disturbed(world, Goal((0.2, 0.0), EXACT_M), skills, falls)
+    assert schedule.happened == [falls]
+    assert world.object_fell()
+    assert [type(s.primitive) for s in went.steps][:2] == [Push, Drag]
+    assert went.reached, went.message
+
+
+def test_a_goal_moves_and_an_object_is_shoved_as_scheduled(world, skills):
+    world.place(BOX, (0.0, 0.0), 0.3)
+    moves = Disturbance("goal", 0, 0.0, 0.08, at_s=3.0)
+    shove = Disturbance("shove", 1, -0.02, 0.07, turn=1.0)
+    went, schedule = disturbed(world, Goal((0.1, 0.0), EXACT_M), skills, moves, shove)
+    assert schedule.happened == [moves, shove]
+    assert went.goal.xy_m == pytest.approx((0.1, 0.08))
+    assert went.reached, went.message
+    assert went.goal.distance_m(world.object_pose()[:2]) < 0.005
+
+
+def test_an_object_that_no_camera_sees_is_lost(world, skills):
+    world.place(BALL, (0.5, 0.0), config=WorldConfig(camera="kinect"))
+    off = Disturbance("knock", 1, 1.5, 0.0)
+    went, _ = disturbed(world, Goal((0.4, 0.1), EXACT_M), skills, off)
+    assert went.status == "lost", went.message
+
+
+def test_a_knock_in_the_middle_of_an_action_follows_mechanics(world):
+    """It slides v²/(2 μ g) and stops; under the fingers it stays on the table."""
+    world.place(BOX, (0.0, 0.0), 0.0)
+    world.knock(0.5, 0.0)
+    world.settle(1.0)
+    assert world.object_pose()[0] == pytest.approx(0.5**2 / (2 * 0.25 * 9.81), rel=0.05)
+    # The clock counts from where the arm sets out; the push touches after 4 s.
+    world.place(BOX, (0.0, 0.0), 0.0)
+    knock = Disturbance("knock", 0, 0.0, 0.4, at_s=2.0)
+    schedule = DisturbanceSchedule(world, Goal((0.1, 0.0), EXACT_M), [knock])
+    schedule.execute(Step(Push.towards(0.0), 0.8, (0.05, 0.0), np.zeros((2, 2))))
+    assert schedule.happened == [knock]
+    assert world.object_pose()[1] > 0.02
+    assert world.on_step is None
+
+
+def test_a_disturbed_loop_is_the_same_again(world, skills):
+    ends = []
+    for _ in range(2):
+        world.place(TUBE, (0.0, 0.0), 0.0)
+        script = sample_disturbances(7, n=2)
+        ends.append(disturbed(world, Goal((0.1, 0.1), EXACT_M), skills, *script)[0].end_pose)
+    assert ends[0] == ends[1]
+
+
+def test_disturbances_are_a_function_of_the_seed():
+    assert sample_disturbances(3, n=20) == sample_disturbances(3, n=20)
+    assert sample_disturbances(3, n=20) != sample_disturbances(4, n=20)
+    drawn = sample_disturbances(0, n=300, n_actions=3)
+    assert {d.kind for d in drawn} == {"shove", "knock", "topple", "goal"}
+    assert all(d.at_s is None for d in drawn if d.kind == "shove")
+    assert all(d.action >= 1 for d in drawn if d.at_s is None)
+    with pytest.raises(ValueError, match="a shove happens between actions"):
+        Disturbance("shove", 1, 0.1, 0.0, at_s=1.0)
+    with pytest.raises(ValueError, match="kind must be one of"):
+        Disturbance("kick", 1, 0.1, 0.0)
+
+
+def test_the_disturbance_and_not_the_robot_makes_a_goal_infeasible(world):
+    """Judged where the object was first seen after it."""
+    goal, off_table = Goal((0.1, 0.0), EXACT_M), (0.9, 0.0)
+    knock = Disturbance("knock", 0, 0.1, 0.3, at_s=2.0)
+    moved = Disturbance("goal", 1, 0.05, 0.0)
+    world.place(BOX)
+
+    def feasible(status, seen, happened):
+        trial = Trial(BOX, (0.0, 0.0), 0.0, goal, (happened,))
+        went = SimpleNamespace(status=status, seen_xy_m=seen, goal=goal)
+        return _stays_feasible(world, trial, went, (happened,))
+
+    at, near = (0.0, 0.0), (0.05, 0.0)
+    assert feasible("reached", (at, near), knock)
+    assert not feasible("lost", (at, off_table), knock)
+    assert feasible("lost", (at, near, off_table), knock)  # it was there to be had
+    assert feasible("lost", (at, off_table), moved)  # nobody has touched it but the robot
+
+
+def test_what_a_lift_has_shifted_is_put_down_and_lifted_again(world, skills, monkeypatch):
+    """The closing fingers turn the box, and shift it by some 5 mm; the second time they do not."""
+    monkeypatch.setattr("affordlib.planning.closed_loop.SHIFTED_M", 0.003)
+    trial = draw_trial("height", 12, seed=3)
+    world.place(trial.obj, trial.start_xy_m, trial.yaw_rad)
+    went = run_closed_loop(world, replace(trial.goal, tolerance_m=0.002), skills)
+    kinds = [type(step.primitive) for step in went.steps]
+    assert went.reached, went.message
+    assert kinds.count(Grasp) == 2
+    assert kinds[kinds.index(Grasp) + 1] is Push
+
+
+@pytest.mark.slow
+def test_a_goal_across_the_table_is_reached_in_the_limit_or_refused(world, skills):
+    world.place(BALL, (0.2, -0.4), 0.0)
+    went = run_closed_loop(world, Goal((0.2, 0.25), EXACT_M), skills)
+    assert went.reached, went.message
+    assert len(went.steps) <= action_limit(0.65)
+    world.place(BOX, (0.5, 0.3), 0.0)
+    pose = world.object_pose()
+    went = run_closed_loop(world, Goal((0.65, 0.65), EXACT_M), skills)
+    assert (went.status, went.steps) == ("unreachable", ())
+    assert world.object_pose() == pose
