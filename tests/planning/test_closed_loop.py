@@ -467,3 +467,13 @@ def test_a_goal_across_the_table_is_reached_in_the_limit_or_refused(world, skill
     went = run_closed_loop(world, Goal((0.65, 0.65), EXACT_M), skills)
     assert (went.status, went.steps) == ("unreachable", ())
     assert world.object_pose() == pose
+
+
+@pytest.mark.slow
+def test_the_mean_of_many_images_is_more_exact(world):
+    """Of eight the mean scatters by a factor of √8 less."""
+    scatter = []
+    for world.n_averaged_images in (1, 8):
+        world.place(BOX, (0.1, 0.1), 0.4, config=WorldConfig(camera="kinect"))
+        scatter.append(np.std([world.observe().xy_m for _ in range(40)], axis=0).mean())
+    assert 2 < scatter[0] / scatter[1] < 4
