@@ -35,7 +35,7 @@ from affordlib.world.config import WorldConfig
 from affordlib.world.controller import JointController
 from affordlib.world.execution import execute, put_down, unreached
 from affordlib.world.objects import TabletopObject
-from affordlib.world.placed_object import PlacedObject, create_footprint, poses, set_friction
+from affordlib.world.placed_object import PlacedObject, create_footprint, set_friction
 from affordlib.world.trajectory import STEP_S, Command, plan_motion, segments_until
 
 OBJECTS_PER_BUILD = 256
