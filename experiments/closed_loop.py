@@ -1,37 +1,38 @@
-"""Closing the loop, in figures: height, orientation, disturbances, reachability of random goals.
+"""The closed loop, measured: height, orientation, disturbances, reachability of random goals.
 
     python -m experiments.closed_loop --tables height,orientation
 
 Trial i of a table is a function of the seed and i: object, start, goal and disturbances are drawn
-before anything plans, on objects that no model has seen. A trial's record is kept as soon as it is
-made, so a run that is killed goes on. Whether a goal is feasible is judged by the kinematic oracle
-(position) and by grasping in full (height), never by the planner under test.
+before anything plans, on objects that no model has seen. Whether a goal is feasible is judged by
+the arm's kinematics (position) and by whole grasps (height), never by the planner under test. The
+goals of `height` and `orientation` are also planned open loop: each from one image, executed
+without observing again (`open_loop_pose_goals`).
 """
 
 from __future__ import annotations
 
 import argparse
 import hashlib
-import json
 import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from functools import cache
+from typing import Any
 
 import numpy as np
-from tqdm.auto import tqdm
 
 from affordlib.commands import command, count_type, names_type, seed_type
-from affordlib.evaluation.predictions import rounded
-from affordlib.models.checkpoint import checkpoint_sha256, weights_bytes
+from affordlib.models.checkpoint import weights_bytes
 from affordlib.paths import repo_root
 from affordlib.planning import (
     ClosedLoopResult,
     Disturbance,
     DisturbanceSchedule,
     Skills,
+    execute_plan,
+    plan_astar,
+    plan_continuous,
     run_closed_loop,
     sample_disturbances,
 )
@@ -39,28 +40,27 @@ from affordlib.planning.disturbances import KINDS
 from affordlib.planning.grasp_rotate import GRIPPER_YAWS_RAD
 from affordlib.planning.reachability import SHIPPED as REACHABILITY
 from affordlib.planning.skills import CHECKPOINTS
-from affordlib.primitives import Drag, Grasp, Push
-from affordlib.results import write_results, write_text_atomically
+from affordlib.primitives import Drag, Grasp, Push, wrap_angle
+from affordlib.results import write_results
 from affordlib.types import TABLE_X_M, TABLE_Y_M, Goal
 from affordlib.workers import dask_client
-from affordlib.world import Tabletop, TabletopObject, category_named
-from experiments.closed_loop_tables import ROWS, WITHIN_HEIGHT_M
+from affordlib.world import Tabletop, TabletopObject, UnreachableError, category_named
+from experiments.closed_loop_tables import OPEN_LOOP_ROWS, ROWS, WITHIN_HEIGHT_M
 from experiments.feasibility import half_width_m, is_feasible, on_the_rim
-
-if TYPE_CHECKING:
-    from dask.distributed import Client
-
-FORMATS = {"height": 8, "orientation": 6, "disturbances": 5, "reachability": 4}
-"""Counts the changes of code that change a table's records."""
+from experiments.runner import Job, read, run
 
 N_TRIALS = {"height": 50, "orientation": 50, "disturbances": 200, "reachability": 1000}
-POSE_BY = {"height": "grasp", "orientation": "rotate"}
-CLASSES = ("cuboid", "upright_cylinder", "lying_cylinder", "sphere")
+VERSIONS = dict.fromkeys((*N_TRIALS, "open_loop_pose_goals"), 1)
+"""Raise one when the code changes and the table's numbers do."""
+
+POSE_PRIMITIVES = {"height": "grasp", "orientation": "rotate"}
+CATEGORIES = ("cuboid", "upright_cylinder", "lying_cylinder", "sphere")
+PLANNERS = {"astar": plan_astar, "continuous": plan_continuous}
 TOLERANCE_M = {"height": 0.004, "orientation": 0.004, "disturbances": 0.002, "reachability": 0.002}
 """Of the position; gripping shifts objects."""
 
 EDGE_M = 0.05
-PARTS = "data/results/parts/closed_loop"
+"""Goals of `reachability` are at least this far from the table's edge."""
 
 
 @dataclass(frozen=True)
@@ -73,212 +73,221 @@ class Trial:
     goal: Goal
     disturbances: tuple[Disturbance, ...] = ()
 
+    @property
+    def kind(self) -> type[Push] | type[Drag]:
+        """How its object is moved."""
+        return Drag if self.obj.rollable else Push
 
-def draw_trial(table: str, index: int, seed: int = 0) -> Trial:
-    """Trial number `index` of a table."""
+
+def sample_trial(table: str, index: int, seed: int = 0) -> Trial:
+    """Trial number `index` of a table, a function of the seed and the number alone."""
     if table not in N_TRIALS:
         raise ValueError(f"table must be one of {sorted(N_TRIALS)}, got {table!r}")
     key = (100 + list(N_TRIALS).index(table), index)
     rng = np.random.default_rng(np.random.SeedSequence(2_000_003 + seed, spawn_key=key))
-    obj = category_named(CLASSES[index % len(CLASSES)]).sample(rng)
-    yaw = float(rng.uniform(-math.pi, math.pi))
+    obj = category_named(CATEGORIES[index % len(CATEGORIES)]).sample(rng)
+    about: dict[str, Any] = {"obj": obj, "start_xy_m": (0.0, 0.0)}
+    about["yaw_rad"] = float(rng.uniform(-math.pi, math.pi))
+    tolerance_m = TOLERANCE_M[table]
     if table == "reachability":
         low, high = (np.array([TABLE_X_M[k], TABLE_Y_M[k]]) for k in (0, 1))
         end = rng.uniform(low + EDGE_M, high - EDGE_M).tolist()
-        return Trial(obj, (0.0, 0.0), yaw, Goal(tuple(end), TOLERANCE_M[table]))
+        return Trial(**about, goal=Goal(tuple(end), tolerance_m))
     farthest = 0.25 if table == "disturbances" else 0.12
     r, angle = math.sqrt(rng.uniform(0.02**2, farthest**2)), rng.uniform(-math.pi, math.pi)
-    xy, exact = (r * math.cos(angle), r * math.sin(angle)), TOLERANCE_M[table]
+    xy = (r * math.cos(angle), r * math.sin(angle))
     if table == "height":
-        return Trial(obj, (0.0, 0.0), yaw, Goal(xy, exact, height_m=float(rng.uniform(0.02, 0.2))))
+        height_m = float(rng.uniform(0.02, 0.2))
+        return Trial(**about, goal=Goal(xy, tolerance_m, height_m=height_m))
     if table == "orientation":
-        turn = float(rng.uniform(-math.pi, math.pi))
-        return Trial(obj, (0.0, 0.0), yaw, Goal(xy, exact, turn_rad=turn))
+        turn_rad = float(rng.uniform(-math.pi, math.pi))
+        return Trial(**about, goal=Goal(xy, tolerance_m, turn_rad=turn_rad))
     n_actions = max(1, math.ceil(r / 0.09))
     kinds = [kind for kind in KINDS if kind != "topple" or not obj.rollable]
-    script = sample_disturbances(int(rng.integers(2**32)), 1, n_actions, kinds)
-    return Trial(obj, (0.0, 0.0), yaw, Goal(xy, exact), script)
+    disturbances = sample_disturbances(int(rng.integers(2**32)), 1, n_actions, kinds)
+    return Trial(**about, goal=Goal(xy, tolerance_m), disturbances=disturbances)
 
 
-def run_trial(table: str, index: int, world: Tabletop, skills: Skills, seed: int) -> dict:
-    """The record of a trial: what was asked, how it ended, whether it could be done."""
-    trial = draw_trial(table, index, seed)
-    record: dict[str, Any] = {"index": index, "object_class": trial.obj.category}
+@cache
+def _tabletop_and_skills() -> tuple[Tabletop, Skills]:
+    """One of each for a process."""
+    return Tabletop(), Skills.load()
+
+
+def run_trial(table: str, index: int, seed: int = 0) -> dict[str, Any]:
+    """The record of a trial: how it ended, and whether it could be done."""
+    world, skills = _tabletop_and_skills()
+    trial = sample_trial(table, index, seed)
     world.place(trial.obj, trial.start_xy_m, trial.yaw_rad)
-    disturbed = DisturbanceSchedule(world, trial.goal, trial.disturbances)
-    went = run_closed_loop(disturbed, disturbed.current_goal, skills)
-    record |= _told(world, went)
+    robot = DisturbanceSchedule(world, trial.goal, trial.disturbances)
+    result = run_closed_loop(robot, robot.current_goal, skills)
+    record = {"object_class": trial.obj.category, **_measured(world, result)}
     if table == "height":
-        record["feasible"] = _can_be_lifted(world, trial, went)
+        record["feasible"] = _can_be_lifted(world, trial, result)
     elif table == "orientation":
         record["feasible"] = True
     elif table == "disturbances":
-        record["feasible"] = _stays_feasible(world, trial, went, disturbed.happened)
+        record["feasible"] = _stays_feasible(world, trial, result, robot.happened)
         record["kind"] = trial.disturbances[0].kind
-        record["in_action"] = trial.disturbances[0].at_s is not None
-        record["happened"] = len(disturbed.happened)
         world.place(trial.obj, trial.start_xy_m, trial.yaw_rad)
-        undisturbed = run_closed_loop(world, trial.goal, skills)
-        record["undisturbed"] = _told(world, undisturbed)
+        record["undisturbed"] = _measured(world, run_closed_loop(world, trial.goal, skills))
     else:
-        asked = _how_moved(trial), half_width_m(trial.obj.footprint_m)
-        record["feasible"] = is_feasible(*asked, trial.start_xy_m, trial.goal.xy_m)
-        record["on_the_rim"] = on_the_rim(*asked, trial.start_xy_m, trial.goal.xy_m)
-        record["moved"] = bool(went.steps)
+        query = trial.kind, half_width_m(trial.obj.footprint_m)
+        record["feasible"] = is_feasible(*query, trial.start_xy_m, trial.goal.xy_m)
+        record["on_the_rim"] = on_the_rim(*query, trial.start_xy_m, trial.goal.xy_m)
     return record
 
 
-def _told(world: Tabletop, went: ClosedLoopResult) -> dict[str, Any]:
-    """What the tables need of a closed loop; the distance is measured in the world."""
+def _measured(world: Tabletop, result: ClosedLoopResult) -> dict[str, Any]:
+    """What the tables need of a closed loop; the distance is the ground truth."""
     return {
-        "ending": went.status,
-        "words": went.message,
-        "distance_m": went.goal.distance_m(world.object_pose()[:2]),
-        "actions": len(went.steps),
-        "plans": len(went.plans),
-        "vetoes": went.vetoes,
-        "turn_error_rad": went.turn_error_rad,
-        "height_error_m": went.height_error_m,
+        "status": result.status,
+        "message": result.message,
+        "distance_m": result.goal.distance_m(world.object_pose()[:2]),
+        "actions": len(result.steps),
+        "plans": len(result.plans),
+        "ik_rejections": result.vetoes,
+        "turn_error_rad": result.turn_error_rad,
+        "height_error_m": result.height_error_m,
     }
 
 
-def _how_moved(trial: Trial) -> type[Push] | type[Drag]:
-    return Drag if trial.obj.rollable else Push
-
-
-def _can_be_lifted(world: Tabletop, trial: Trial, went: ClosedLoopResult) -> bool:
+def _can_be_lifted(world: Tabletop, trial: Trial, result: ClosedLoopResult) -> bool:
     """Whether the object was lifted as high, or a whole grasp at the goal does so, by any hand."""
     high = trial.goal.height_m - WITHIN_HEIGHT_M
 
     def lifts(grip_yaw: float) -> bool:
-        world.place(trial.obj, went.goal.xy_m, went.end_pose[2])
-        return bool(
-            world.execute_primitive(Grasp(grip_yaw=grip_yaw), record_unreachable=True)
-            .effect[:, 2]
-            .max()
-            >= high
-        )
+        world.place(trial.obj, result.goal.xy_m, result.end_pose[2])
+        done = world.execute_primitive(Grasp(grip_yaw=grip_yaw), record_unreachable=True)
+        return bool(done.effect[:, 2].max() >= high)
 
-    return went.reached or any(map(lifts, GRIPPER_YAWS_RAD))
+    return result.reached or any(map(lifts, GRIPPER_YAWS_RAD))
 
 
 def _stays_feasible(
-    world: Tabletop, trial: Trial, went: ClosedLoopResult, happened: Sequence[Disturbance]
+    world: Tabletop, trial: Trial, result: ClosedLoopResult, happened: Sequence[Disturbance]
 ) -> bool:
     """Whether the kinematics allows a way from the start, and from where the disturbance has left
     the object, as it was first seen after it.
 
-    What happens later is the robot's affair.
+    What happens later is up to the robot.
     """
     half, start = half_width_m(trial.obj.footprint_m), trial.start_xy_m
-    if not is_feasible(_how_moved(trial), half, start, trial.goal.xy_m):
+    if not is_feasible(trial.kind, half, start, trial.goal.xy_m):
         return False
     if not happened:
         return True
-    what = happened[0]
-    look = what.action + (what.at_s is not None)
-    if went.status == "lost" and len(went.seen_xy_m) == look + 1:
-        return what.kind == "goal"
+    disturbance = happened[0]
+    first = disturbance.action + (disturbance.at_s is not None)
+    if result.status == "lost" and len(result.seen_xy_m) == first + 1:
+        return disturbance.kind == "goal"
     kind = Drag if world.object_rolls() else Push
-    return all(is_feasible(kind, half, xy, went.goal.xy_m) for xy in went.seen_xy_m[look:][:1])
+    seen = result.seen_xy_m[first:][:1]
+    return all(is_feasible(kind, half, xy, result.goal.xy_m) for xy in seen)
 
 
-def settings_sha256(table: str, seed: int) -> str:
-    """Hash of what decides a table's records: the seed, the models it needs, the code's format."""
-    told = hashlib.sha256(f"{FORMATS[table]} {seed}".encode())
-    told.update(weights_bytes(repo_root() / REACHABILITY))
-    for kind, name in CHECKPOINTS.items():
-        if kind in ("push", "drag", POSE_BY.get(table)):
-            told.update(checkpoint_sha256(name).encode())
-    return told.hexdigest()
+def run_open_loop(table: str, index: int, planner: str) -> dict[str, Any]:
+    """The record of one plan of a whole pose, tried even where the planner predicts to fail.
 
-
-def read_records(path: Path, sha256: str) -> dict[int, dict]:
-    """Records of a part by index; none where there are none of these settings."""
-    if not path.is_file():
-        return {}
-    head, *lines = path.read_text().splitlines()
-    if json.loads(head) != {"settings_sha256": sha256}:
-        return {}
-    return {r["index"]: r for r in map(json.loads, lines)}
-
-
-def _part(table: str, seed: int) -> Path:
-    return repo_root() / PARTS / f"{table}_{seed}.jsonl"
-
-
-def _write_records(path: Path, sha256: str, records: dict[int, dict]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    compact = {"allow_nan": False, "separators": (",", ":")}
-    lines = [json.dumps(records[k], **compact) for k in sorted(records)]
-    write_text_atomically(path, "\n".join([json.dumps({"settings_sha256": sha256}), *lines, ""]))
-
-
-_here: dict[str, Any] = {}
-
-
-def _records_of(table: str, indices: Sequence[int], seed: int) -> list[dict]:
-    """Some trials in one process, which keeps its world and its models."""
-    if not _here:
-        _here.update(world=Tabletop(), skills=Skills.load())
-    here = _here["world"], _here["skills"], seed
-    return [rounded(run_trial(table, i, *here)) for i in indices]
-
-
-def run_table(
-    table: str, n: int, seed: int = 0, client: Client | None = None, progress: bool = True
-) -> list[dict]:
-    """The records of a table's first n trials, those that are there not made again.
-
-    client: a Dask client that shares the folder; None means this process.
+    pose_error: what is missing of the turn [rad] or of the height [m].
     """
-    path, sha256 = _part(table, seed), settings_sha256(table, seed)
-    records = read_records(path, sha256)
-    missing = [i for i in range(n) if i not in records]
-    batches = [missing[k : k + 5] for k in range(0, len(missing), 5)]
-    if client is None:
-        done = (_records_of(table, batch, seed) for batch in batches)
+    world, skills = _tabletop_and_skills()
+    trial = sample_trial(table, index)
+    world.place(trial.obj, trial.start_xy_m, trial.yaw_rad)
+    image = world.depth_image()
+    plan = skills.planner(PLANNERS[planner])(image, trial.start_xy_m, trial.goal)
+    yaw, z = world.object_pose()[2], world.object_state()[2]
+    refused = False
+    try:
+        execute_plan(world, plan)
+    except UnreachableError:
+        refused = True
+    pose = world.object_pose()
+    if table == "orientation":
+        pose_error = wrap_angle(trial.goal.turn_rad - (pose[2] - yaw))
     else:
-        from dask.distributed import as_completed
+        pose_error = trial.goal.height_m - (world.object_state()[2] - z)
+    world.park()
+    return {
+        "object_class": trial.obj.category,
+        "predicted_reached": plan.reaches_goal,
+        "actions": len(plan.steps),
+        "arm_refused": refused,
+        "distance_m": trial.goal.distance_m(pose[:2]),
+        "pose_error": abs(pose_error),
+    }
 
-        futures = [client.submit(_records_of, table, b, seed, pure=False) for b in batches]
-        done = (future.result() for future in as_completed(futures))
-    for some in tqdm(done, desc=table, total=len(batches), disable=not progress):
-        records |= {r["index"]: r for r in some}
-        _write_records(path, sha256, records)
-    return [records[i] for i in range(n)]
+
+@cache
+def _reachability_sha256() -> str:
+    return hashlib.sha256(weights_bytes(repo_root() / REACHABILITY)).hexdigest()
+
+
+def job(table: str, index: int, seed: int) -> Job:
+    """One trial of the closed loop."""
+    arguments = {"table": table, "index": index, "seed": seed}
+    used = ("push", "drag", POSE_PRIMITIVES.get(table))
+    files = tuple(file for kind, file in CHECKPOINTS.items() if kind in used)
+    return Job(run_trial, arguments, _reachability_sha256(), (), files, VERSIONS[table])
+
+
+def open_loop_job(table: str, index: int, planner: str) -> Job:
+    """One plan of a whole pose."""
+    arguments = {"table": table, "index": index, "planner": planner}
+    files, version = tuple(CHECKPOINTS.values()), VERSIONS["open_loop_pose_goals"]
+    return Job(run_open_loop, arguments, (), (), files, version)
+
+
+def _in_order(results: list[tuple[dict, dict]]) -> list[dict[str, Any]]:
+    return sorted((about | record for about, record in results), key=lambda r: r["index"])
+
+
+def tables(seed: int = 0) -> dict[str, list[dict[str, Any]]]:
+    """All tables of the trials of a seed that were run."""
+    found = _in_order(read("closed_loop", job))
+    some = {name: [r for r in found if (r["table"], r["seed"]) == (name, seed)] for name in ROWS}
+    return {name: rows(some[name]) for name, rows in ROWS.items() if some[name]}
+
+
+def open_loop_tables() -> dict[str, list[dict[str, Any]]]:
+    """The tables of plans that were executed without observing again."""
+    found = _in_order(read("open_loop_pose_goals", open_loop_job))
+    some = {name: [r for r in found if r["table"] == name] for name in OPEN_LOOP_ROWS}
+    return {name: rows(some[name]) for name, rows in OPEN_LOOP_ROWS.items() if some[name]}
 
 
 @command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the trials of the closed loop that are missing, and write the tables."""
+    """Run the trials that are missing, and write the tables of all that were run."""
     parser = argparse.ArgumentParser(
         prog="python -m experiments.closed_loop", description=main.__doc__
     )
-    parser.add_argument("--tables", type=names_type(N_TRIALS), default=",".join(N_TRIALS))
-    parser.add_argument("--n", type=count_type, help="trials of each table (default: all)")
+    parser.add_argument("--tables", type=names_type(VERSIONS), default=",".join(VERSIONS))
+    parser.add_argument("--n", type=count_type, default=1000, help="trials of each table")
     parser.add_argument("--seed", type=seed_type, default=0)
     parser.add_argument("--out", default="data/results")
+    parser.add_argument("--workers", type=count_type, default=1, help="processes here")
     parser.add_argument("--scheduler", help="address of a Dask scheduler that shares the folder")
     options = parser.parse_args(argv)
-    with dask_client(scheduler=options.scheduler) as client:
+    with dask_client(options.workers, options.scheduler) as client:
         for table in options.tables:
-            n = min(options.n or N_TRIALS[table], N_TRIALS[table])
-            run_table(table, n, options.seed, client)
-    # Also those of earlier runs.
-    tables = {}
-    for table, rows in ROWS.items():
-        part, sha256 = _part(table, options.seed), settings_sha256(table, options.seed)
-        if records := read_records(part, sha256):
-            tables[table] = rows([records[i] for i in sorted(records)])
-        elif part.is_file():
-            raise ValueError(
-                f"part {part.name} is of other models or code than {table!r} has now; run "
-                f"`--tables {table}` again, or delete it"
+            if table in N_TRIALS:
+                n = min(options.n, N_TRIALS[table])
+                run([job(table, i, options.seed) for i in range(n)], "closed_loop", client)
+                continue
+            run(
+                [
+                    open_loop_job(goals, index, planner)
+                    for goals in OPEN_LOOP_ROWS
+                    for index in range(min(options.n, N_TRIALS[goals]))
+                    for planner in PLANNERS
+                ],
+                table,
+                client,
             )
     name = f"closed_loop_seed{options.seed}" if options.seed else "closed_loop"
-    path = write_results(options.out, name, {"seed": options.seed}, tables)
-    print(f"{path.name} written")
+    print(write_results(options.out, name, {"seed": options.seed}, tables(options.seed)))
+    print(write_results(options.out, "open_loop_pose_goals", {}, open_loop_tables()))
     return 0
 
 

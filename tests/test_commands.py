@@ -43,7 +43,6 @@ def main_of(name):
         ("experiments.closed_loop", ["--tables", "nope"], "--tables: 'nope' is unknown"),
         ("experiments.closed_loop", ["--seed", "-1"], "--seed: must be a whole number from 0"),
         ("experiments.closed_loop", ["--n", "0"], "--n: must be a whole number from 1"),
-        ("experiments.whole_plans", ["--n", "-1"], "--n: must be a whole number from 1"),
         (
             "affordlib.evaluation.tasks",
             ["--seed", str(2**32)],

@@ -35,7 +35,7 @@ from affordlib.world import (
     UprightCylinder,
     WorldConfig,
 )
-from experiments.closed_loop import Trial, _stays_feasible, draw_trial
+from experiments.closed_loop import Trial, _stays_feasible, sample_trial
 from tests.planning.point_robot import PointRobot, point_skills
 from tests.problems import problem_of
 
@@ -447,7 +447,7 @@ def test_the_disturbance_and_not_the_robot_makes_a_goal_infeasible(world):
 def test_what_a_lift_has_shifted_is_put_down_and_lifted_again(world, skills, monkeypatch):
     """The closing fingers turn the box, and shift it by some 5 mm; the second time they do not."""
     monkeypatch.setattr("affordlib.planning.closed_loop.SHIFTED_M", 0.003)
-    trial = draw_trial("height", 12, seed=3)
+    trial = sample_trial("height", 12, seed=3)
     world.place(trial.obj, trial.start_xy_m, trial.yaw_rad)
     went = run_closed_loop(world, replace(trial.goal, tolerance_m=0.002), skills)
     kinds = [type(step.primitive) for step in went.steps]

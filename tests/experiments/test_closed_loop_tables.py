@@ -1,0 +1,111 @@
+"""The tables of the closed loop: trials by seed, the kinematic oracle, what rows say."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from affordlib.primitives import Drag, Push
+from affordlib.results import read_results
+from affordlib.world import Cuboid
+from experiments import closed_loop
+from experiments.closed_loop import N_TRIALS, run_open_loop, sample_trial
+from experiments.closed_loop_tables import OPEN_LOOP_ROWS, ROWS
+from experiments.feasibility import is_feasible, on_the_rim, possible
+
+
+def test_the_kinematic_oracle_is_the_kinematics(world):
+    """Its circles around the base answer as the inverse kinematics of whole actions does."""
+    rng = np.random.default_rng(11)
+    world.place(Cuboid(0.06, 0.05, 0.05), (0.0, 0.0))
+    no = 0
+    for _ in range(80):
+        xy, angle = rng.uniform([-0.45, -0.65], [0.65, 0.65]), rng.uniform(-math.pi, math.pi)
+        for kind, half in ((Push, 0.02), (Drag, 0.0)):
+            action = kind.towards(angle)
+            query = xy[None], np.array([angle]), np.array([action.length + half])
+            said, near, far = (possible(kind, half, s)(*query)[0] for s in (0.0, 0.004, -0.004))
+            truth = world.can_reach(action, 1.0, tuple(xy))
+            assert truth == said or near != far
+            no += not truth
+    assert no > 10
+
+
+def test_an_object_cannot_be_pushed_back_from_where_it_can_be_pushed_to():
+    outside, middle = (0.555, 0.0), (0.0, 0.0)
+    assert is_feasible(Push, 0.03, middle, outside)
+    assert not is_feasible(Push, 0.03, outside, middle)
+    assert is_feasible(Drag, 0.03, outside, middle)
+    assert not is_feasible(Drag, 0.03, middle, (0.68, 0.68))
+    assert on_the_rim(Drag, 0.03, middle, (0.566, 0.0))
+
+
+def test_trials_are_a_function_of_seed_and_number():
+    for name in N_TRIALS:
+        assert sample_trial(name, 5, 3) == sample_trial(name, 5, 3)
+        assert sample_trial(name, 5, 3) != sample_trial(name, 5, 4)
+    with pytest.raises(ValueError, match="table must be one of"):
+        sample_trial("speed", 0)
+
+
+def record(feasible, status, distance_m=0.001, object_class="sphere"):
+    about = {"object_class": object_class, "feasible": feasible, "status": status}
+    about |= {"distance_m": distance_m, "height_error_m": -distance_m, "on_the_rim": False}
+    return about | {"ik_rejections": 1, "actions": 0 if status == "unreachable" else 3}
+
+
+def test_rows_have_statuses_and_both_rates():
+    records = [record(True, "reached")] * 6 + [record(True, "gave_up", 0.1)] * 2
+    records += [record(False, "unreachable")] * 3 + [record(False, "gave_up", 0.1)]
+    rows = ROWS["reachability"](records)
+    assert [(r["goals"], r["object_class"]) for r in rows] == [
+        ("all", "all"),
+        ("all", "sphere"),
+        ("off the rim", "all"),
+    ]
+    rates = ("feasible_reached", "infeasible_refused", "right", "moved_for_nothing")
+    assert [rows[0][f"{rate}_percent"] for rate in rates] == [75.0, 75.0, 75.0, 25.0]
+    height = ROWS["height"](records)[0]
+    assert (height["feasible"], height["within_percent"]) == (8, 75.0)
+    assert height["pose_error_m_mean"] == pytest.approx(0.001)
+    lost = [record(True, "lost", object_class="cuboid")] * 2
+    of_category = {r["object_class"]: r for r in ROWS["height"](records + lost)}
+    assert (of_category["cuboid"]["within_percent"], of_category["cuboid"]["lost"]) == (100.0, 2)
+    assert of_category["cuboid"]["pose_error_m_mean"] is None
+    aside = [record(True, "reached") | {"distance_m": 0.02}] * 2  # as high, but not there
+    assert ROWS["height"](records + aside)[0]["within_percent"] == 60.0
+
+
+def test_rows_of_open_loop_plans_are_of_each_planner_and_category():
+    records = [
+        {"planner": planner, "object_class": name, "pose_error": error, "distance_m": 10 * error}
+        | {"predicted_reached": error < 0.01, "arm_refused": False, "actions": 3}
+        for planner, factor in (("astar", 1.0), ("continuous", 0.1))
+        for name, error in (("sphere", 0.002 * factor), ("cuboid", 0.02 * factor))
+    ]
+    rows = {(r["planner"], r["object_class"]): r for r in OPEN_LOOP_ROWS["height"](records)}
+    assert len(rows) == 6
+    both = ("within_percent", "pose_within_percent")
+    assert [rows["astar", "all"][name] for name in both] == [0.0, 50.0]  # 20 mm at the best
+    assert [rows["continuous", "all"][name] for name in both] == [50.0, 100.0]
+    assert rows["astar", "cuboid"]["pose_error_m_median"] == 0.02
+    assert rows["astar", "all"]["predicted_reached"] == 1
+    assert rows["astar", "all"]["distance_m_mean"] == pytest.approx(0.11)
+
+
+def test_an_open_loop_trial_measures_what_is_missing(monkeypatch):
+    found, trial = run_open_loop("height", 0, "continuous"), sample_trial("height", 0)
+    assert found["predicted_reached"]
+    assert max(found["pose_error"], found["distance_m"]) < 0.005
+    # A plan that does nothing leaves the whole height missing, and the object where it stood.
+    monkeypatch.setattr(closed_loop, "execute_plan", lambda *_: None)
+    idle = run_open_loop("height", 0, "astar")
+    assert idle["pose_error"] == pytest.approx(trial.goal.height_m, abs=1e-4)
+    assert idle["distance_m"] == pytest.approx(np.hypot(*trial.goal.xy_m), abs=1e-4)
+
+
+@pytest.mark.parametrize("name", ["closed_loop", "open_loop_pose_goals"])
+def test_the_committed_tables_are_of_what_is_shipped(name):
+    made = closed_loop.tables() if name == "closed_loop" else closed_loop.open_loop_tables()
+    assert json.loads(json.dumps(made)) == read_results(f"data/results/{name}.json")["tables"]
