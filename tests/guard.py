@@ -57,6 +57,9 @@ FORMER_NAMES = {
 }
 """Checkpoints by what they were called when the first guard was written."""
 
+FORMER = {"open_loop_pose_goals": "whole_plans"}
+"""What was called something else when the entries were written down."""
+
 
 def collected() -> dict[str, list[float]]:
     """Effects of a few interactions of every recipe that ships."""
@@ -143,7 +146,7 @@ def tabled() -> dict[str, list[float]]:
                 numbers.append(float(value))
 
         gather(json.loads(path.read_text()))
-        found[f"tabled {path.stem}"] = sorted(numbers)
+        found[f"tabled {FORMER.get(path.stem, path.stem)}"] = sorted(numbers)
     return found
 
 
