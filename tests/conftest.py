@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from affordlib.interactions import InteractionTensors, collect, open_interactions
-from affordlib.interactions.collect import collect as collect_set
+from affordlib.interactions import InteractionTensors, open_interactions
 from affordlib.interactions.dataset import Scaler
 from affordlib.interactions.lever_up import lever_up_tensors
-from affordlib.interactions.schema import Schema, Variable
 from affordlib.models import AffordanceCNP, CNPConfig, load_checkpoint
 from affordlib.models.lever import LEVER_MODELS
 from affordlib.planning import Skills
@@ -97,38 +95,3 @@ def short():
         return replace(lever, training=replace(lever.training, **few))
 
     return short
-
-
-@pytest.fixture
-def small_chunks(monkeypatch):
-    monkeypatch.setattr(collect, "CHUNK", 2)
-
-
-@pytest.fixture(scope="session")
-def undisturbed(tmp_path_factory):
-    """A function from a recipe to its zip, collected in this process without any disturbance."""
-    made = {}
-
-    def make(recipe):
-        if recipe not in made:
-            path = tmp_path_factory.mktemp("undisturbed") / "set.zarr.zip"
-            made[recipe] = collect_set(recipe, path, progress=False)
-        return made[recipe]
-
-    return make
-
-
-@pytest.fixture
-def cheap(monkeypatch):
-    """Interactions of 20 kB that cost nothing."""
-
-    def schema(recipe):
-        variables = {"x": Variable(("interaction", "value"), "float32")}
-        return Schema(variables, {"recipe": recipe.to_json()})
-
-    def arrays(recipe, indices):
-        values = [np.random.default_rng(i).random(5000, dtype=np.float32) for i in indices]
-        return {"x": np.stack(values)}
-
-    monkeypatch.setattr(collect, "schema_for", schema)
-    monkeypatch.setattr(collect, "collect_chunk", arrays)

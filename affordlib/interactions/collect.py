@@ -8,30 +8,26 @@ collected it, in whatever order.
 from __future__ import annotations
 
 import hashlib
-import io
 import shutil
 import threading
-import zipfile
-from collections.abc import Iterable, Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Iterator
+from contextlib import closing
 from functools import partial
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
+import xarray as xr
 from filelock import FileLock, Timeout
 from tqdm.auto import tqdm
 
 from affordlib.interactions.recipes import Recipe
-from affordlib.interactions.schema import collect_chunk, schema_for
+from affordlib.interactions.schema import attributes_for, collect_chunk
 from affordlib.interactions.store import (
     SUFFIX,
     CorruptedDataError,
     open_interactions,
     write_interactions,
 )
-from affordlib.results import write_atomically
 from affordlib.types import check_count
 from affordlib.workers import dask_client
 
@@ -41,23 +37,7 @@ if TYPE_CHECKING:
 CHUNK = 50
 """Interactions that are made, sent and kept together."""
 
-WINDOW = 4
-"""Chunks that each worker is given ahead; the driver knows of no more futures than these."""
-
 _ONE_WORLD = threading.Lock()
-_Arrays = dict[str, np.ndarray]
-
-
-def _make(recipe: Recipe, rows: range, attrs: dict[str, str]) -> _Arrays:
-    """A chunk of a set that has these attributes; what a worker is sent."""
-    here = schema_for(recipe).attrs
-    if here != attrs:
-        raise RuntimeError(
-            f"this worker would make another set than the collector described: it has {here}, "
-            f"not {attrs}; give both the same packages"
-        )
-    with _ONE_WORLD:  # threads of one worker take turns: the simulator gains nothing by them
-        return collect_chunk(recipe, rows)
 
 
 def collect(
@@ -83,58 +63,20 @@ def collect(
         with dask_client(workers) as local:
             return collect(recipe, path, local, progress=progress, replace=replace)
 
-    schema, file = schema_for(recipe), Path(path).absolute()
-    with _alone(file):
-        digest = hashlib.sha256(str(schema.attrs).encode()).hexdigest()[:8]
-        parts = file.with_name(f".{file.name}.{digest}.parts")
-        if _is_there(file, schema.attrs, replace):
-            shutil.rmtree(parts, ignore_errors=True)
-            return path
-        parts.mkdir(exist_ok=True)
-        numbers = range(0, recipe.n_interactions, CHUNK)
-        rows = {k: range(k, min(k + CHUNK, recipe.n_interactions)) for k in numbers}
-        chunks = {k: _read_part(parts / f"{k:08d}.npz") for k in numbers}
-        missing = [rows[k] for k in numbers if chunks[k] is None]
-        n_there = recipe.n_interactions - sum(map(len, missing))
-        task = partial(_make, recipe, attrs=schema.attrs)
-        made = _here(task, missing) if client is None else _by_workers(client, task, missing)
-        bar = tqdm(
-            total=recipe.n_interactions,
-            initial=n_there,
-            desc=file.name,
-            unit=" interactions",
-            disable=not progress,
-        )
-        with closing(made), bar:
-            try:
-                for of, arrays in made:
-                    _write_part(parts / f"{of.start:08d}.npz", arrays)
-                    chunks[of.start] = arrays
-                    bar.update(len(of))
-            except (KeyboardInterrupt, OSError) as error:
-                error.add_note("finished chunks are kept; collect into the same path to go on")
-                raise
-        write_interactions(schema.dataset([chunks[k] for k in numbers]), file)
-        shutil.rmtree(parts, ignore_errors=True)
-    return path
-
-
-@contextmanager
-def _alone(file: Path) -> Iterator[None]:
-    """Hold the sole right to collect into a file; the lock dies with its process."""
-    lock = file.with_name(f".{file.name}.lock")
-    lock.parent.mkdir(parents=True, exist_ok=True)
+    attrs, file = attributes_for(recipe), Path(path).absolute()
+    is_there = _is_there(file, attrs, replace)
+    parts = file.with_name(f".{file.name}.parts")
+    parts.mkdir(parents=True, exist_ok=True)
     try:
-        held = FileLock(lock).acquire(timeout=0)
+        with FileLock(parts / "lock", timeout=0):
+            if not is_there:
+                _collect(recipe, attrs, parts, file, client, progress)
+            shutil.rmtree(parts, ignore_errors=True)
     except Timeout:
         raise RuntimeError(
             f"another process is collecting into {file}; wait for it or choose another path"
         ) from None
-    with held:
-        try:
-            yield
-        finally:
-            lock.unlink(missing_ok=True)  # who has opened it meanwhile finds it gone
+    return path
 
 
 def _is_there(file: Path, attrs: dict[str, str], replace: bool) -> bool:
@@ -157,72 +99,80 @@ def _is_there(file: Path, attrs: dict[str, str], replace: bool) -> bool:
     return True
 
 
-def _write_part(path: Path, arrays: _Arrays) -> None:
-    content = io.BytesIO()
-    np.savez_compressed(content, **arrays)
-    write_atomically(path, content.getvalue())
-
-
-def _read_part(path: Path) -> _Arrays | None:
-    """A chunk that was kept; None if it is missing or damaged, which its checksums tell."""
+def _collect(
+    recipe: Recipe,
+    attrs: dict[str, str],
+    parts: Path,
+    file: Path,
+    client: dask.distributed.Client | None,
+    progress: bool,
+) -> None:
+    """Make the chunks that are missing among the parts, and the file of all."""
+    digest = hashlib.sha256(str(attrs).encode()).hexdigest()[:8]
+    starts = range(0, recipe.n_interactions, CHUNK)
+    rows = [range(k, min(k + CHUNK, recipe.n_interactions)) for k in starts]
+    kept = {r: parts / f"{digest}-{r.start:08d}{SUFFIX}" for r in rows}
+    missing = [r for r in rows if not _is_whole(kept[r])]
+    made = _made(partial(_make, recipe, attrs), missing, client)
+    total, there = recipe.n_interactions, recipe.n_interactions - sum(map(len, missing))
+    unit = " interactions"
+    bar = tqdm(total=total, initial=there, desc=file.name, unit=unit, disable=not progress)
     try:
-        with np.load(path, allow_pickle=False) as arrays:
-            return dict(arrays)
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile):
-        return None
+        with closing(made), bar:
+            for r, chunk in made:
+                write_interactions(chunk, kept[r])
+                bar.update(len(r))
+        chunks = [open_interactions(path) for path in kept.values()]
+        whole = xr.concat(chunks, "interaction", data_vars="minimal", combine_attrs="override")
+        write_interactions(whole, file)
+    except (KeyboardInterrupt, OSError) as error:
+        error.add_note("finished chunks are kept; collect into the same path to go on")
+        raise
 
 
-def _failure(rows: range, error: Exception) -> RuntimeError:
-    """The error that says which interactions could not be made, and why."""
-    return RuntimeError(
-        f"interactions {rows.start} to {rows.stop - 1} could not be collected: "
-        f"{type(error).__name__}: {error}; finished chunks are kept, collect again into the same "
-        "path when the cause is mended"
-    )
-
-
-def _here(task: partial, missing: Iterable[range]) -> Iterator[tuple[range, _Arrays]]:
-    """Yield each chunk's interactions and arrays, made in this process."""
-    for rows in missing:
-        try:
-            arrays = task(rows)
-        except Exception as error:
-            raise _failure(rows, error) from error
-        yield rows, arrays
-
-
-def _by_workers(
-    client: dask.distributed.Client, task: partial, missing: Iterable[range], alone: bool = False
-) -> Iterator[tuple[range, _Arrays]]:
-    """Yield each chunk's interactions and arrays, as the client's workers finish them."""
-    from dask.distributed import KilledWorker, as_completed
-
-    waiting, running, killed = iter(missing), as_completed(), []
-    chunks = {}
+def _is_whole(part: Path) -> bool:
     try:
-        while True:
-            room = WINDOW * max(1, len(client.nthreads())) - len(chunks)
-            for rows in islice(waiting, max(0, room)):
-                future = client.submit(task, rows, pure=False)
-                chunks[future] = rows
-                running.add(future)
-            if not chunks:
-                break
-            future = next(running)
-            rows = chunks.pop(future)
+        open_interactions(part)
+    except (CorruptedDataError, OSError):
+        return False
+    return True
+
+
+def _make(recipe: Recipe, attrs: dict[str, str], rows: range) -> xr.Dataset:
+    """A chunk of a set that has these attributes; what a worker is sent."""
+    here = attributes_for(recipe)
+    if here != attrs:
+        raise RuntimeError(
+            f"this worker would make another set than the collector described: it has {here}, "
+            f"not {attrs}; give both the same packages"
+        )
+    with _ONE_WORLD:  # threads of one worker take turns: the simulator gains nothing by them
+        return collect_chunk(recipe, rows)
+
+
+def _made(
+    make: partial, missing: list[range], client: dask.distributed.Client | None
+) -> Iterator[tuple[range, xr.Dataset]]:
+    """Yield the rows and the data of each chunk as it is made, here or by the client's workers."""
+    futures = {}
+    if client is None:
+        results = ((rows, partial(make, rows)) for rows in missing)
+    else:
+        from dask.distributed import as_completed
+
+        futures = {client.submit(make, rows, pure=False): rows for rows in missing}
+        results = ((futures.pop(f), f.result) for f in as_completed(list(futures)))
+    try:
+        for rows, result in results:
             try:
-                arrays = future.result()
-            except KilledWorker as error:
-                if alone:
-                    raise _failure(rows, error) from error
-                killed.append(rows)
-                continue
+                chunk = result()
             except Exception as error:
-                raise _failure(rows, error) from error
-            yield rows, arrays
+                raise RuntimeError(
+                    f"interactions {rows.start} to {rows.stop - 1} could not be collected: "
+                    f"{type(error).__name__}: {error}; finished chunks are kept, collect again "
+                    "into the same path when the cause is fixed"
+                ) from error
+            yield rows, chunk
     finally:
-        if chunks:
-            client.cancel(list(chunks))
-    # A chunk may only have shared its workers with the one that kills them: each goes alone now.
-    for rows in killed:
-        yield from _by_workers(client, task, [rows], alone=True)
+        if futures:
+            client.cancel(list(futures))

@@ -1,0 +1,374 @@
+"""Collecting: the same bits whatever is killed, interrupted or shared."""
+
+import errno
+import os
+import random
+import signal
+import subprocess
+import sys
+import threading
+import time
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+
+import affordlib
+from affordlib.interactions import collect
+from affordlib.interactions.collect import collect as collect_set
+from affordlib.interactions.recipes import Recipe
+from affordlib.interactions.schema import attributes_for, collect_chunk
+from affordlib.interactions.store import dataset_sha256, open_interactions, stored_sha256
+from affordlib.workers import dask_client
+from experiments import shipped
+
+SMALL = Recipe(n_interactions=6, seed=11)
+LONGER = Recipe(n_interactions=12, seed=5)
+ROOT = Path(affordlib.__file__).parents[1]
+
+pytestmark = pytest.mark.usefixtures("small_chunks")
+
+
+def names_in(folder):
+    return [path.name for path in folder.iterdir()]
+
+
+def no_room(*_):
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+@pytest.mark.slow
+def test_a_file_holds_what_the_interactions_left(undisturbed):
+    expected, path = collect_chunk(SMALL, range(6)), undisturbed(SMALL)
+    for read in (open_interactions(path), open_interactions(f"file://{path}")):
+        assert read.identical(expected[list(read.data_vars)])
+        assert all(read[name].dtype == expected[name].dtype for name in expected.variables)
+        assert dataset_sha256(read) == dataset_sha256(expected) == stored_sha256(path)
+        assert read.attrs == attributes_for(SMALL)
+    assert names_in(path.parent) == [path.name]
+
+
+def test_a_set_is_made_once_and_nothing_else_is_replaced(tmp_path, made):
+    path = tmp_path / "x.zarr.zip"
+    for _ in range(2):
+        assert collect_set(SMALL, path, progress=False) == path
+        assert made == [0, 2, 4]
+    before = path.read_bytes()
+    with pytest.raises(ValueError, match=r"x\.zarr\.zip holds a set of another recipe"):
+        collect_set(replace(SMALL, seed=12), path, progress=False)
+    (tmp_path / "folder.zarr.zip").mkdir()
+    (tmp_path / "link.zarr.zip").symlink_to(tmp_path / "nowhere")
+    (tmp_path / "half.zarr.zip").write_bytes(before[: len(before) // 2])
+    there = sorted(tmp_path.rglob("*"))
+    for name in ("folder", "link", "half"):
+        with pytest.raises(ValueError, match=rf"path .*{name}.* (choose|delete)"):
+            collect_set(SMALL, tmp_path / f"{name}.zarr.zip", progress=False)
+    assert sorted(tmp_path.rglob("*")) == there
+    assert (path.read_bytes(), made) == (before, [0, 2, 4])
+    collect_set(SMALL, tmp_path / "half.zarr.zip", progress=False, replace=True)
+    assert (tmp_path / "half.zarr.zip").read_bytes() == before
+
+
+def test_what_a_full_disk_has_left_out_or_damaged_is_made_again(tmp_path, made, monkeypatch):
+    path, real, room = tmp_path / "x.zarr.zip", os.fsync, [True] * 3
+    with monkeypatch.context() as full:
+        full.setattr(os, "fsync", lambda handle: real(handle) if room and room.pop() else no_room())
+        with pytest.raises(OSError, match="No space left") as failure:
+            collect_set(SMALL, path, progress=False)
+    assert failure.value.__notes__ == [
+        "finished chunks are kept; collect into the same path to go on"
+    ]
+    with pytest.raises(FileNotFoundError, match="no file"):
+        open_interactions(path)
+    assert not list(tmp_path.rglob("*.tmp"))
+    first, second, _ = sorted(tmp_path.glob(".x*.parts/*.zip"))
+    first.unlink()
+    damaged = bytearray(second.read_bytes())
+    damaged[len(damaged) // 2] ^= 1
+    second.write_bytes(damaged)
+    collect_set(SMALL, path, progress=False)
+    assert made == [0, 2, 4, 0, 2]
+    whole = collect_set(SMALL, tmp_path / "y.zarr.zip", progress=False)
+    assert path.read_bytes() == whole.read_bytes()
+    assert sorted(names_in(tmp_path)) == ["x.zarr.zip", "y.zarr.zip"]
+
+
+def test_paths_and_workers_that_cannot_be_are_named(tmp_path):
+    for path in (tmp_path / "x.zip", tmp_path / "x.zarr"):
+        with pytest.raises(ValueError, match=r"path must end in .*got .*x\."):
+            collect_set(SMALL, path)
+    with pytest.raises(ValueError, match=r"workers must be a whole number .* 0"):
+        collect_set(SMALL, tmp_path / "x.zarr.zip", workers=0)
+
+
+def test_a_worker_with_other_packages_is_refused(tmp_path, made, monkeypatch):
+    numpys = iter(("2.4.6", "1.0"))
+    monkeypatch.setattr(collect, "attributes_for", lambda _: {"numpy": next(numpys)})
+    with pytest.raises(RuntimeError, match=r"another set .*1\.0.*, not .*2\.4\.6"):
+        collect_set(SMALL, tmp_path / "x.zarr.zip", progress=False)
+
+
+def test_a_second_collector_is_refused_until_the_first_is_gone(tmp_path, made):
+    path = tmp_path / "x.zarr.zip"
+    hold = (
+        "import sys, time; from filelock import FileLock\n"
+        "with FileLock(sys.argv[1]): print('held', flush=True); time.sleep(60)"
+    )
+    lock = tmp_path / ".x.zarr.zip.parts" / "lock"
+    lock.parent.mkdir()
+    holder = subprocess.Popen([sys.executable, "-c", hold, str(lock)], stdout=subprocess.PIPE)
+    assert holder.stdout.readline() == b"held\n"
+    with pytest.raises(RuntimeError, match=r"another process is collecting into .*x\.zarr\.zip"):
+        collect_set(SMALL, path, progress=False)
+    holder.kill()
+    holder.communicate()
+    collect_set(SMALL, path, progress=False)
+    assert names_in(tmp_path) == [path.name]
+
+
+# Processes of this machine
+
+SCRIPT = """
+import sys
+from affordlib.interactions import collect
+from affordlib.interactions.recipes import Recipe
+
+print("started", flush=True)
+collect.CHUNK = 2
+recipe = Recipe(n_interactions=int(sys.argv[2]), seed=11)
+collect.collect(recipe, sys.argv[1], workers=int(sys.argv[3]), progress=False)
+"""
+
+
+def start(*arguments, **options):
+    """Start Python so that Ctrl-C reaches it, though jobs in the background ignore that."""
+
+    def heed():
+        os.setsid()
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "stdin": subprocess.DEVNULL}
+    command = [sys.executable, *map(str, arguments)]
+    return subprocess.Popen(command, preexec_fn=heed, cwd=ROOT, text=True, **pipes | options)
+
+
+def wait_for(what, process):
+    deadline = time.monotonic() + 120
+    while not what():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(2))
+def test_a_collector_killed_at_any_moment_is_no_loss(undisturbed, tmp_path, seed):
+    path = tmp_path / "set.zarr.zip"
+    process = start("-c", SCRIPT, path, 6, 1 + seed % 2)
+    wait_for(lambda: list(tmp_path.glob(".set*.parts")), process)
+    time.sleep(random.Random(seed).uniform(0, 3))
+    family = psutil.Process(process.pid).children(recursive=True)
+    process.kill()
+    process.communicate()
+    assert not psutil.wait_procs(family, timeout=60)[1]  # it leaves no workers
+    collect_set(SMALL, path, progress=False)
+    assert path.read_bytes() == undisturbed(SMALL).read_bytes()
+    assert names_in(tmp_path) == [path.name]
+
+
+@pytest.mark.slow
+def test_nobody_outside_reaches_a_scheduler_or_its_workers():
+    with dask_client(2) as client:
+        client.wait_for_workers(2, timeout=60)
+        here = psutil.Process()
+        family = [here, *here.children(recursive=True)]
+        listening = [
+            connection.laddr.ip
+            for process in family
+            for connection in process.net_connections("inet")
+            if connection.status == psutil.CONN_LISTEN
+        ]
+        assert len(listening) >= 5  # the scheduler's, and at least two of each worker
+        assert set(listening) == {"127.0.0.1"}
+
+
+@pytest.mark.slow
+def test_a_script_with_workers_needs_no_guard(undisturbed, tmp_path):
+    script, path = tmp_path / "script.py", tmp_path / "a.zarr.zip"
+    script.write_text(SCRIPT)
+    process = start(script, path, 6, 2)
+    assert (*process.communicate(timeout=120), process.returncode) == ("started\n", "", 0)
+    assert path.read_bytes() == undisturbed(SMALL).read_bytes()
+    assert set(names_in(tmp_path)) == {script.name, path.name}
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_collecting_with_one_error(tmp_path):
+    process = start("-c", SCRIPT, tmp_path / "set.zarr.zip", 100, 2)
+    wait_for(lambda: list(tmp_path.glob(".set*.parts/*.zip")), process)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == -signal.SIGINT
+    assert err.count("Traceback") == 1
+    assert err.splitlines()[-2:] == [
+        "KeyboardInterrupt",
+        "finished chunks are kept; collect into the same path to go on",
+    ]
+
+
+@pytest.mark.slow
+def test_make_data_is_ended_with_one_line(tmp_path):
+    arguments = ["data", "--only", "push", "--to", tmp_path, "--workers", "2"]
+    process = start("-m", "experiments.shipped", *arguments)
+    wait_for(lambda: list(tmp_path.glob(".push*.parts/lock")), process)
+    time.sleep(2)
+    family = psutil.Process(process.pid).children(recursive=True)
+    process.terminate()
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 128 + signal.SIGTERM
+    assert err.splitlines()[-1] == (
+        "shipped: interrupted; what is finished is kept, the same command goes on"
+    )
+    for noise in ("Traceback", "distributed", "leaked"):
+        assert noise not in err
+    assert not psutil.wait_procs(family, timeout=20)[1]
+    assert not (tmp_path / "push.zarr.zip").exists()
+
+
+# A cluster
+
+
+@pytest.fixture(scope="module")
+def client(tmp_path_factory):
+    """A client of a scheduler and two workers that the `dask` command has started."""
+    from dask.distributed import Client
+
+    folder = tmp_path_factory.mktemp("dask")
+    file = folder / "scheduler.json"
+    worker = ["worker", "--scheduler-file", file, "--nthreads", 1, "--no-dashboard"]
+    worker += ["--local-directory", folder]
+    host = ["--host", "127.0.0.1", "--port", 0, "--no-dashboard"]
+    commands = [["scheduler", *host, "--scheduler-file", file], worker, worker]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    processes = [start("-m", "dask", *command, **quiet) for command in commands]
+    try:
+        with Client(scheduler_file=str(file), timeout=60) as client:
+            yield client
+    finally:
+        for process in processes:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+
+@pytest.fixture
+def both(client):
+    """The client while both workers are there."""
+    client.wait_for_workers(2, timeout=60)
+    return client
+
+
+@contextmanager
+def poisoned(client, log, how):
+    """Make all workers, also those started later, fail in the chunk that begins with 6.
+
+    log: a file that gets a letter for each time that they do.
+    """
+    from dask.distributed import WorkerPlugin
+
+    class Poison(WorkerPlugin):
+        name = "poison"
+
+        def setup(self, worker):
+            from affordlib.interactions import collect, schema
+
+            def deadly(recipe, numbers):
+                if numbers.start == 6:
+                    with open(log, "a") as file:
+                        file.write("x")
+                    os._exit(9) if how == "kill" else [].pop()
+                return schema.collect_chunk(recipe, numbers)
+
+            collect.collect_chunk = deadly
+
+        def teardown(self, worker):
+            from affordlib.interactions import collect, schema
+
+            collect.collect_chunk = schema.collect_chunk
+
+    client.register_plugin(Poison())
+    try:
+        yield
+    finally:
+        client.wait_for_workers(2, timeout=60)
+        client.unregister_worker_plugin("poison")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("how", "reason"), [("raise", "IndexError: pop"), ("kill", "KilledWorker")]
+)
+def test_a_chunk_that_cannot_be_made_is_named(both, undisturbed, tmp_path, how, reason):
+    path, log = tmp_path / "set.zarr.zip", tmp_path / "log"
+    said = rf"interactions \d+ to \d+ could not be collected: {reason}"
+    with poisoned(both, log, how), pytest.raises(RuntimeError, match=said) as failure:
+        collect_set(LONGER, path, both, progress=False)
+    assert how == "kill" or "interactions 6 to 7" in str(failure.value)
+    assert log.exists()
+    assert not path.exists()
+    collect_set(LONGER, path, both, progress=False)
+    assert path.read_bytes() == undisturbed(LONGER).read_bytes()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(2))
+def test_workers_killed_at_any_moment_are_no_loss(both, undisturbed, tmp_path, monkeypatch, seed):
+    monkeypatch.chdir(tmp_path)
+    pids = list(both.run(os.getpid).values())
+    moment = random.Random(seed).uniform(0, 0.6)
+    kill = threading.Timer(moment, os.kill, [pids[seed % 2], signal.SIGKILL])
+    kill.start()
+    collect_set(LONGER, "relative.zarr.zip", both, progress=False)
+    kill.join()
+    assert Path("relative.zarr.zip").read_bytes() == undisturbed(LONGER).read_bytes()
+    assert names_in(tmp_path) == ["relative.zarr.zip"]
+
+
+# Making the shipped sets again
+
+
+@pytest.mark.slow
+def test_make_data_compares_with_what_was_there(both, undisturbed, tmp_path, monkeypatch, capsys):
+    """With a scheduler; its status tells whether the sets agree."""
+    monkeypatch.setattr(shipped, "RECIPES", {"push": SMALL})
+    where = ["--to", str(tmp_path), "--scheduler", both.scheduler.address]
+    arguments = ["data", "--only", "push", *where]
+    assert shipped.main(arguments) == 1
+    assert "not the same: 6 interactions, formerly 500" in capsys.readouterr().out
+    assert (tmp_path / "push.zarr.zip").read_bytes() == undisturbed(SMALL).read_bytes()
+    real = shipped.open_interactions
+    there = {"push": undisturbed(SMALL)}
+    monkeypatch.setattr(shipped, "open_interactions", lambda name: real(there.get(name, name)))
+    assert shipped.main(arguments) == 0
+    assert "push: the same, bit for bit" in capsys.readouterr().out
+
+
+def test_how_far_apart_two_sets_are_is_said(undisturbed):
+    old = open_interactions(undisturbed(SMALL))
+    for gap_m, agree in ((0.00004, True), (0.00006, False)):
+        new = old.copy(deep=True)
+        new["rest_effect"][:, 1] += gap_m
+        same, sentence = shipped.compare(old, new)
+        assert same is agree
+        assert f"{gap_m * 1000:.3f} mm in the median (tolerance 0.05 mm)" in sentence
+    one = old.copy(deep=True)
+    one["rest_effect"][0, 0] += 0.05  # one object that tipped over the other way
+    assert shipped.compare(old, one)[0]
+
+
+def test_another_seed_gives_another_set(undisturbed):
+    other = stored_sha256(undisturbed(replace(SMALL, seed=12)))
+    assert other != stored_sha256(undisturbed(SMALL))
+    assert np.unique([other, stored_sha256("push")]).size == 2
