@@ -9,16 +9,12 @@ import torch
 from matplotlib.figure import Figure
 
 from affordlib.interactions import Scaler
-from affordlib.interactions.dataset import augment_by_symmetry
 from affordlib.interactions.lever_up import (
-    MIRRORED,
     N_OBSERVED,
-    N_PREDICTED,
     lever_up_tensors,
-    n_windows,
 )
 from affordlib.interactions.recipes import Recipe, sample_scene
-from affordlib.interactions.sampling import condition_on_poses, sample_from_start, sample_windows
+from affordlib.interactions.sampling import condition_on_poses
 from affordlib.models import build
 from affordlib.models.anchored import AnchoredNetwork, _last
 from affordlib.models.lever import (
@@ -39,65 +35,6 @@ def untrained(request, levered):
     if hasattr(model, "fit_course"):
         model.fit_course(levered.effect)
     return model.eval()
-
-
-# Data
-
-
-def test_arrays_are_in_the_frame_of_the_lever(levers, levered):
-    assert levered.effect.shape == (len(levered), 26, 4)
-    assert levered.effect[:, 0].abs().max() == 0
-    # Turning changes no length, and objects go where the lever points.
-    kept = ~levers["fault"].values
-    raw = levers["effect"].values[kept][:, ::12]
-    np.testing.assert_allclose(
-        levered.effect[..., :2].norm(dim=-1), np.hypot(raw[..., 0], raw[..., 1]), atol=1e-6
-    )
-    assert levered.effect[:, -1, 0].min() > 0.02
-    # The blade comes from behind the contact, slides 12 mm under, and never leaves its plane.
-    assert levered.action[:, 0, 0].numpy() == pytest.approx(-0.03, abs=1e-5)
-    assert levered.action[:, 7, 0].numpy() == pytest.approx(0.012, abs=1e-4)
-    assert (levered.action[:, -1, 1] > 0.1 * math.sin(math.radians(65))).any()
-
-
-def test_no_view_cuts_an_object_off(levers, levered):
-    wide, full = (lever_up_tensors(levers, view=view).image for view in ("wide", "full"))
-    assert full.shape[-1] == 128
-    assert levered.image.shape[-1] == wide.shape[-1] == 48
-    area = full[:, 1].sum(dim=(1, 2)) / 128**2
-    torch.testing.assert_close(4 * levered.image[:, 1].sum(dim=(1, 2)), full[:, 1].sum(dim=(1, 2)))
-    torch.testing.assert_close(wide[:, 1].mean(dim=(1, 2)), area, rtol=0.02, atol=0)
-    with pytest.raises(ValueError, match="view must be one of"):
-        lever_up_tensors(levers, view="far")
-
-
-def test_mirror_images_mirror_only_what_is_across(levered):
-    both = augment_by_symmetry(levered, MIRRORED)
-    n = len(levered)
-    sign = torch.tensor([1.0, -1.0, 1.0, 1.0])
-    torch.testing.assert_close(both.effect[n:], levered.effect * sign)
-    torch.testing.assert_close(both.image[n:], levered.image.flip(-2))
-    torch.testing.assert_close(both.action[n:], levered.action)
-
-
-def test_windows_are_fifteen_steps_and_the_next_five(levered):
-    generator = torch.Generator().manual_seed(0)
-    assert n_windows(levered) == 7
-    batch = sample_windows(levered, torch.arange(len(levered)), N_PREDICTED, N_OBSERVED, generator)
-    seen = (batch.observations.effect_t * 25).round()
-    assert (seen.diff(dim=1) == 1).all()
-    assert {int(s) for s in seen[:, 0]} == set(range(7))
-    torch.testing.assert_close((batch.t_target[:, 0] * 25).round(), seen[:, -1] + 1)
-    assert batch.observations.effect_mask.all()
-    told = {
-        bool(
-            sample_from_start(
-                levered, torch.arange(2), 0, 0, generator
-            ).observations.effect_mask.any()
-        )
-        for _ in range(20)
-    }
-    assert told == {True, False}
 
 
 # Models

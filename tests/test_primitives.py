@@ -275,7 +275,7 @@ def test_a_biased_robot_places_its_action_beside(world):
 def test_worlds_vary_within_their_ranges():
     recipe = RECIPES["push_varied"]
     rng = np.random.default_rng(0)
-    worlds = [recipe.variation.draw(Cuboid(0.05, 0.06, 0.07), rng) for _ in range(200)]
+    worlds = [recipe.variation.sample(Cuboid(0.05, 0.06, 0.07), rng) for _ in range(200)]
     for name in ("table_friction", "finger_friction", "density_kg_m3", "tip_offset_m"):
         low, high = getattr(recipe.variation, name)
         values = np.array([getattr(w, name) for w in worlds])

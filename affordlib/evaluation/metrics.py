@@ -60,4 +60,4 @@ def refuse_seen(about: dict[str, Any], data: xr.Dataset, interactions: np.ndarra
 
 def _objects_of(recipe: str) -> tuple[Any, ...]:
     r = Recipe.from_json(recipe)
-    return r.seed, r.families, r.size_range_m, r.height_range_m
+    return r.seed, r.categories, r.size_range_m, r.height_range_m

@@ -120,7 +120,7 @@ def constructed_tasks(
     for index in range(n):
         obj, yaw, rng = _objects(mode, "constructed", seed, index, classes)
         kind = Drag if obj.rollable else Push
-        config = variation.draw(obj, rng) if variation else WorldConfig()
+        config = variation.sample(obj, rng) if variation else WorldConfig()
         while True:
             direction = rng.uniform(-math.pi, math.pi)
             world.place(obj, (0.0, 0.0), yaw, config=config)

@@ -9,14 +9,7 @@ from dataclasses import asdict, dataclass, field, replace
 import numpy as np
 
 from affordlib.primitives import Drag, LeverUp, Primitive, Push, primitive_named
-from affordlib.types import (
-    TABLE_X_M,
-    TABLE_Y_M,
-    Interaction,
-    check_count,
-    check_field,
-    check_range,
-)
+from affordlib.types import TABLE_X_M, TABLE_Y_M, Interaction, check_count, check_field, check_range
 from affordlib.world import Tabletop, TabletopObject, WorldConfig, category_named
 
 _TABLE_MARGIN_M = 0.08
@@ -30,7 +23,7 @@ class Variation:
 
     Frictions, density and how much higher the gripper moves are drawn uniformly from ranges;
     com_offset: the centre of mass lies off the centre by up to this share of the half extents;
-    bias_sd_m: of where the robot believes the object to be, beside the camera's own error.
+    bias_sd_m: of the estimated position of the object, beside the camera's own error.
     """
 
     table_friction: tuple[float, float] = (0.35, 0.65)
@@ -48,7 +41,7 @@ class Variation:
         check_field(self, "com_offset", 0.0, 0.5)
         check_field(self, "bias_sd_m", 0.0, 0.02, "m")
 
-    def draw(self, obj: TabletopObject, rng: np.random.Generator) -> WorldConfig:
+    def sample(self, obj: TabletopObject, rng: np.random.Generator) -> WorldConfig:
         """One world: what an episode with this object is like."""
         drawn = {name: float(rng.uniform(*getattr(self, name))) for name in _RANGES}
         half = np.array([*np.ptp(obj.footprint_m, axis=0), obj.height_m]) / 2
@@ -73,18 +66,18 @@ _RANGES = {
 
 @dataclass(frozen=True)
 class Recipe:
-    """What is collected: primitives on objects of some families, in a world, from a seed.
+    """What is collected: primitives on objects of some categories, in a world, from a seed.
 
     Of several primitives one is drawn that suits the object: a push for what does not roll, a drag
     for what does. size_range_m and height_range_m: of the objects (heights default to the sizes).
     anywhere: objects lie all over the table, within reach or not, instead of at its centre.
-    partial: the action is broken off at a random phase. variation: worlds drawn episode by episode.
+    partial: the action is truncated at a random phase. variation: worlds drawn episode by episode.
     """
 
     primitives: tuple[str, ...] = ("push",)
     n_interactions: int = 500
     seed: int = 0
-    families: tuple[str, ...] = ("cuboid", "upright_cylinder")
+    categories: tuple[str, ...] = ("cuboid", "upright_cylinder")
     size_range_m: tuple[float, float] = (0.04, 0.08)
     height_range_m: tuple[float, float] | None = None
     anywhere: bool = False
@@ -93,7 +86,7 @@ class Recipe:
     variation: Variation | None = None
 
     def __post_init__(self) -> None:
-        for name, check in (("primitives", primitive_named), ("families", category_named)):
+        for name, check in (("primitives", primitive_named), ("categories", category_named)):
             values = tuple(getattr(self, name))
             if not values:
                 raise ValueError(f"{name} must be a sequence of at least one name, got none")
@@ -108,13 +101,16 @@ class Recipe:
         check_count("seed", self.seed, least=0)
 
     def to_json(self) -> str:
-        """The recipe as JSON with sorted keys."""
-        return json.dumps(asdict(self), sort_keys=True)
+        """The recipe as JSON with sorted keys, in which categories are called families."""
+        fields = asdict(self)
+        fields["families"] = fields.pop("categories")
+        return json.dumps(fields, sort_keys=True)
 
     @classmethod
     def from_json(cls, text: str) -> Recipe:
         """The recipe that `to_json` wrote."""
         fields = json.loads(text)
+        fields["categories"] = fields.pop("families")
         fields["world"] = WorldConfig(**fields["world"])
         if fields["variation"] is not None:
             fields["variation"] = Variation(**fields["variation"])
@@ -122,58 +118,57 @@ class Recipe:
 
 
 _ROLLABLE = ("lying_cylinder", "sphere")
-_STANDING = ("cuboid", "upright_cylinder")
+_STABLE = ("cuboid", "upright_cylinder")
 _PUSH = Recipe()
-_DRAG = Recipe(primitives=("drag",), families=_ROLLABLE, seed=1)
-_MIXED = Recipe(primitives=("push", "drag"), families=_STANDING + _ROLLABLE, seed=2)
+_MIXED = Recipe(primitives=("push", "drag"), categories=_STABLE + _ROLLABLE, seed=2)
 
-RECIPES: dict[str, Recipe] = {
+_SHIPPED = {
     "push": _PUSH,
-    "drag": _DRAG,
+    "drag": Recipe(primitives=("drag",), categories=_ROLLABLE, seed=1),
     "mixed": _MIXED,
     "grasp": Recipe(
         primitives=("grasp",),
         n_interactions=100,
         seed=3,
-        families=_STANDING + _ROLLABLE,
+        categories=_STABLE + _ROLLABLE,
         size_range_m=(0.03, 0.12),
         world=WorldConfig(object_friction=0.25),
     ),
     "rotate": Recipe(
-        primitives=("rotate",), n_interactions=100, seed=4, families=(*_STANDING, "prism")
+        primitives=("rotate",), n_interactions=100, seed=4, categories=(*_STABLE, "prism")
     ),
     "lever_up": Recipe(
         primitives=("lever_up",),
         n_interactions=1800,
         seed=5,
-        families=("prism",),
+        categories=("prism",),
         size_range_m=(0.15, 0.24),
         height_range_m=(0.03, 0.06),
         world=WorldConfig(table_friction=1.0, object_friction=0.8, finger_friction=1.2),
     ),
     "push_test": replace(_PUSH, n_interactions=1000, seed=1_000_003),
     "partial": replace(_MIXED, n_interactions=300, seed=1_000_004, partial=True),
-    "push_varied": replace(_PUSH, seed=6, families=(*_STANDING, "prism"), variation=Variation()),
+    "push_varied": replace(_PUSH, seed=6, categories=(*_STABLE, "prism"), variation=Variation()),
     "reach": Recipe(
         primitives=("push", "drag", "grasp", "rotate"),
         n_interactions=1000,
         seed=7,
-        families=(*_STANDING, *_ROLLABLE, "prism"),
+        categories=(*_STABLE, *_ROLLABLE, "prism"),
         anywhere=True,
     ),
 }
-"""The paper's sets; a fixed test set no model trains on; partial executions, for testing only; a
-perturbed world; and objects all over the table, within reach or not."""
-
-SHIPPED = tuple(RECIPES)
-
-RECIPES |= {
+_TEN_TIMES = {
     f"{name}_x10": replace(recipe, n_interactions=10 * recipe.n_interactions, seed=recipe.seed + 10)
-    for name, recipe in RECIPES.items()
-    if name in ("push", "drag", "mixed", "grasp", "rotate", "lever_up", "push_varied")
+    for name, recipe in _SHIPPED.items()
+    if name not in ("push_test", "partial", "reach")
 }
-RECIPES["grasp_firm_x10"] = replace(RECIPES["grasp_x10"], seed=18, world=WorldConfig())
-"""Grasps in the world in which objects are pushed: on things that are less slippery."""
+_FIRM = replace(_TEN_TIMES["grasp_x10"], seed=18, world=WorldConfig())
+
+SHIPPED = tuple(_SHIPPED)
+RECIPES: dict[str, Recipe] = _SHIPPED | _TEN_TIMES | {"grasp_firm_x10": _FIRM}
+"""The paper's sets; a fixed test set no model trains on; partial executions, for testing only; a
+perturbed world; objects all over the table, within reach or not; sets of ten times as many; and
+grasps in the world in which objects are pushed, where they are less slippery."""
 
 
 def _generator(recipe: Recipe, index: int, *part: int) -> np.random.Generator:
@@ -183,7 +178,7 @@ def _generator(recipe: Recipe, index: int, *part: int) -> np.random.Generator:
 def sample_scene(recipe: Recipe, index: int) -> tuple[TabletopObject, float, np.random.Generator]:
     """Object and yaw [rad] of interaction `index`, and the generator to draw its action from."""
     rng = _generator(recipe, index)
-    category = category_named(recipe.families[rng.integers(len(recipe.families))])
+    category = category_named(recipe.categories[rng.integers(len(recipe.categories))])
     obj = category.sample(rng, recipe.size_range_m, recipe.height_range_m)
     return obj, float(rng.uniform(-math.pi, math.pi)), rng
 
@@ -199,7 +194,7 @@ def sample_position(recipe: Recipe, index: int) -> tuple[float, float]:
 
 
 def sample_stop_phase(recipe: Recipe, index: int) -> float:
-    """The phase at which interaction `index` is broken off; 1 if it is not."""
+    """The phase at which interaction `index` is truncated; 1 if it is not."""
     return float(_generator(recipe, index, 2).uniform(0.05, 1.0)) if recipe.partial else 1.0
 
 
@@ -207,10 +202,10 @@ def sample_world(recipe: Recipe, index: int, obj: TabletopObject) -> WorldConfig
     """The world in which interaction `index` takes place."""
     if recipe.variation is None:
         return recipe.world
-    return recipe.variation.draw(obj, _generator(recipe, index, 3))
+    return recipe.variation.sample(obj, _generator(recipe, index, 3))
 
 
-def _draw_action(
+def _sample_action(
     recipe: Recipe, obj: TabletopObject, yaw: float, rng: np.random.Generator
 ) -> Primitive:
     """A primitive that suits the object, with parameters drawn at random."""
@@ -240,10 +235,10 @@ def interact(
 ) -> tuple[TabletopObject, Interaction]:
     """Carry out interaction `index` of a recipe: the same bits in every process and order.
 
-    stop_phase: where to break it off, if not where the recipe says.
+    stop_phase: where to truncate it, if not where the recipe says.
     """
     obj, yaw, rng = sample_scene(recipe, index)
-    action = _draw_action(recipe, obj, yaw, rng)
+    action = _sample_action(recipe, obj, yaw, rng)
     config = sample_world(recipe, index, obj)
     world.place(obj, sample_position(recipe, index), yaw, tool=action.tool, config=config)
     stop = sample_stop_phase(recipe, index) if stop_phase is None else stop_phase

@@ -11,7 +11,6 @@ import io
 import json
 import os
 import zipfile
-from collections.abc import Iterable
 from pathlib import Path
 
 import fsspec
@@ -89,35 +88,26 @@ def _url_of(name_or_path: str | Path) -> str:
     return url
 
 
-def _read(url: str, names: Iterable[str] | None = None) -> dict[str, bytes]:
-    """Those files of a zip that exist (default: all)."""
+def _read(url: str, only: str | None = None) -> tuple[dict[str, dict[str, str]], dict[str, bytes]]:
+    """The manifest of a set, and the files of its zip (all, or only one) by name."""
     found, name = {}, "its directory"
     try:
         with fsspec.open(url, "rb") as file, zipfile.ZipFile(file) as archive:
-            for name in archive.namelist():
-                if names is None or name in names:
-                    found[name] = archive.read(name)
+            for name in archive.namelist() if only is None else [only]:
+                found[name] = archive.read(name)
+            name = MANIFEST
+            manifest = json.loads(found[MANIFEST])
+            return {kind: dict(manifest[kind]) for kind in ("arrays", "files")}, found
     except Exception as error:
         raise CorruptedDataError(
-            f"{url} cannot be read: {name} is damaged ({error}); {_REMEDY}"
+            f"{url} cannot be read: {name} is damaged or missing ({error!r}); {_REMEDY}"
         ) from error
-    return found
-
-
-def _manifest(url: str, files: dict[str, bytes]) -> dict[str, dict[str, str]]:
-    try:
-        manifest = json.loads(files[MANIFEST])
-        if all(isinstance(manifest[kind], dict) for kind in ("arrays", "files")):
-            return manifest
-    except (KeyError, TypeError, ValueError, RecursionError):
-        pass
-    raise CorruptedDataError(f"{url}: it has no {MANIFEST} that lists a data set; {_REMEDY}")
 
 
 def stored_sha256(name_or_path: str | Path) -> str:
     """The `dataset_sha256` of a stored set, from its manifest, without reading the arrays."""
     url = _url_of(name_or_path)
-    return _set_sha256(_manifest(url, _read(url, [MANIFEST]))["arrays"])
+    return _set_sha256(_read(url, MANIFEST)[0]["arrays"])
 
 
 def open_interactions(name_or_path: str | Path) -> xr.Dataset:
@@ -127,12 +117,10 @@ def open_interactions(name_or_path: str | Path) -> xr.Dataset:
     Raises FileNotFoundError, or CorruptedDataError naming what is damaged.
     """
     url = _url_of(name_or_path)
-    files = _read(url)
-    for name, digest in _manifest(url, files)["files"].items():
-        if name not in files:
-            raise CorruptedDataError(f"{url}: {name} is missing; {_REMEDY}")
-        if hashlib.sha256(files[name]).hexdigest() != digest:
-            raise CorruptedDataError(f"{url}: {name} is not what was stored; {_REMEDY}")
+    manifest, files = _read(url)
+    for name, digest in manifest["files"].items():
+        if hashlib.sha256(files.get(name, b"")).hexdigest() != digest:
+            raise CorruptedDataError(f"{url}: {name} is missing or damaged; {_REMEDY}")
     store = MemoryStore({n: Buffer.from_bytes(c) for n, c in files.items() if n != MANIFEST})
     try:
         with xr.open_zarr(store, consolidated=False, zarr_format=3) as data:

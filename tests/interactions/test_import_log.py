@@ -9,7 +9,16 @@ import torch
 from PIL import Image
 
 from affordlib.interactions import InteractionTensors
-from affordlib.interactions.import_log import TABLE, read_log, write_log
+from affordlib.interactions.import_log import (
+    TABLE,
+    read_log,
+    read_trajectories,
+    write_log,
+    write_trajectories,
+)
+from affordlib.interactions.lever_up import POSE_CHANNELS
+from affordlib.models.lever import fit_lever_model, window_errors_m
+from affordlib.models.training import final_errors_m
 
 CHANNELS = ("x", "y"), ("x", "y", "yaw")
 
@@ -33,14 +42,12 @@ def test_what_was_written_is_read_again(some, folder):
     torch.testing.assert_close(back.image[:, 1], some.image[:, 1], atol=0.003, rtol=0)
 
 
-def test_a_network_foresees_the_same_from_the_folder(film, some, folder):
-    from affordlib.models.training import final_errors_m
-
+def test_a_network_predicts_the_same_from_the_folder(film, some, folder):
     ours, theirs = (final_errors_m(film, a) for a in (some, read_log(folder, 301)))
     torch.testing.assert_close(ours, theirs, atol=2e-4, rtol=0)
 
 
-def test_courses_of_any_length_are_brought_to_the_same_phases(folder):
+def test_trajectories_of_any_length_are_brought_to_the_same_phases(folder):
     rows = (folder / TABLE).read_text().splitlines()
     thinned = rows[:1] + [r for k, r in enumerate(rows[1:]) if k % 301 in (0, 150, 300)]
     (folder / TABLE).write_text("\n".join(thinned))
@@ -73,6 +80,14 @@ def _replace(folder, old, new):
             lambda f: Image.fromarray(np.zeros((48, 48), np.uint8)).save(f / "images" / "0002.png"),
             r"0002\.png must be an image of 48×48 pixels, gray, 16 bits",
         ),
+        (
+            lambda f: Image.fromarray(np.ones((48, 48), np.uint8)).save(f / "images/0001_mask.png"),
+            r"0001_mask\.png must be .* white .* at most 1$",
+        ),
+        (
+            lambda f: Image.fromarray(np.ones((48, 48), bool)).save(f / "images/0001_mask.png"),
+            r"0001_mask\.png must be .*bool",
+        ),
     ],
 )
 def test_errors_say_what_and_where(folder, spoil, says):
@@ -96,13 +111,56 @@ def test_names_are_names_and_angles_go_around(some, folder):
     torch.testing.assert_close(yaw, expected, atol=1e-5, rtol=0)
 
 
-def test_a_mask_that_is_not_white_is_refused(folder):
-    path = folder / "images" / "0001_mask.png"
-    with Image.open(path) as file:
-        mask = np.asarray(file)
-    Image.fromarray((mask > 127).astype(np.uint8)).save(path)
-    with pytest.raises(ValueError, match=r"0001_mask\.png must be .* white .* at most 1"):
-        read_log(folder)
-    Image.fromarray(mask > 127).save(path)
-    with pytest.raises(ValueError, match=r"0001_mask\.png must be .*bool"):
-        read_log(folder)
+# The layout of Seker et al.
+
+
+@pytest.fixture
+def older(tmp_path):
+    """Two trajectories of 26 poses and their images."""
+    poses, gray = np.zeros((2, 26, 6)), np.full((2, 128, 128), 0.8)
+    poses[..., 0], poses[..., 4] = np.linspace(0.3, 0.4, 26), np.linspace(0, 1.0, 26)
+    gray[:, 40:80, 64:100] = np.random.default_rng(0).uniform(0.2, 0.4, (2, 40, 36))
+    write_trajectories(tmp_path, poses, gray)
+    return tmp_path
+
+
+def test_the_older_layout_is_read(older):
+    tensors = read_trajectories(older)
+    assert tensors.effect_channels == POSE_CHANNELS
+    assert tensors.effect.shape == (2, 26, 4)
+    torch.testing.assert_close(tensors.effect[0, -1], torch.tensor([0.1, 0.0, 0.0, 1.0]))
+    assert tensors.image[:, 1].sum(dim=(1, 2)).tolist() == [40 * 36] * 2
+
+
+@pytest.mark.parametrize(("name", "kind"), [("anchored", "all"), ("lstm_tuned", "window")])
+@pytest.mark.parametrize("steps", [26, 41])
+def test_the_older_layout_is_learned_from(tmp_path, short, name, kind, steps):
+    poses, gray = np.zeros((8, steps, 6)), np.full((8, 128, 128), 0.8)
+    poses[..., 2] = np.linspace(0.0, 0.2, steps)
+    gray[:, 40:80, 64:100] = np.random.default_rng(1).uniform(0.2, 0.4, (8, 40, 36))
+    write_trajectories(tmp_path, poses, gray)
+    tensors = read_trajectories(tmp_path, view="wide")
+    assert tensors.image.shape == (8, 2, 48, 48)
+    model, history = fit_lever_model(short(name), tensors, tensors, kind, progress=False)
+    assert len(history) == 2
+    assert window_errors_m(model, tensors).shape == (8, steps - 19, 5)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "reason"),
+    [
+        (lambda f: (f / "images" / "0001.png").unlink(), "no image 0001.png"),
+        (lambda f: (f / "trajectories" / "0001.txt").write_text("1 2 3\n"), "six finite numbers"),
+        (
+            lambda f: (f / "trajectories" / "0001.txt").write_text("1 2 x 4 5 6\n"),
+            "0001.txt: every row",
+        ),
+        (lambda f: (f / "trajectories" / "0001.txt").write_text("0 0 0 0 0 0\n"), "has 1 rows"),
+        (lambda f: [p.unlink() for p in (f / "trajectories").iterdir()], "no file trajectories"),
+        (lambda f: Image.new("L", (9, 9)).save(f / "images" / "0001.png"), "must be 128×128"),
+    ],
+)
+def test_what_is_wrong_with_the_older_layout_is_said(older, spoil, reason):
+    spoil(older)
+    with pytest.raises((ValueError, FileNotFoundError), match=reason):
+        read_trajectories(older)
