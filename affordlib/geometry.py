@@ -11,6 +11,16 @@ if TYPE_CHECKING:
     import torch
 
 
+def wrap_angle(angle_rad: float) -> float:
+    """The same angle in [-π, π)."""
+    return (angle_rad + math.pi) % (2 * math.pi) - math.pi
+
+
+def unit_vector(angle_rad: float) -> np.ndarray:
+    """The direction (2,) at an angle [rad]."""
+    return np.array([math.cos(angle_rad), math.sin(angle_rad)])
+
+
 def rotated(xy: np.ndarray, angle_rad: float) -> np.ndarray:
     """Points (..., 2) rotated about the origin, counter-clockwise."""
     c, s = math.cos(angle_rad), math.sin(angle_rad)

@@ -1,7 +1,7 @@
 """What an action is, as a path in phase; no physics here (Section 3.3 and Figure 2 of the paper).
 
-A primitive is a chain of legs between keyframes, each covered with minimum-jerk timing. It gives
-the commanded end-effector path over the phase t in [0, 1], relative to where the object stood at
+A primitive is a chain of segments between keyframes, each covered with minimum-jerk timing. It
+gives the commanded end-effector path over the phase t in [0, 1], relative to where the object stood at
 the start. The world makes the arm follow it; models are conditioned on it.
 """
 
@@ -15,6 +15,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from affordlib.geometry import unit_vector, wrap_angle
 from affordlib.types import check_array, check_field, check_finite, check_within
 
 DURATION_S = 3.75
@@ -36,17 +37,12 @@ def min_jerk(t: np.ndarray | Sequence[float] | float) -> np.ndarray:
     return np.asarray(t**3 * (10.0 - 15.0 * t + 6.0 * t**2))
 
 
-def wrap_angle(angle_rad: float) -> float:
-    """The same angle in [-π, π)."""
-    return (angle_rad + math.pi) % (2 * math.pi) - math.pi
-
-
 @dataclass(frozen=True)
 class Segment:
-    """A stretch of a primitive: seconds, and poses (6,) at its start and end.
+    """A part of a primitive: seconds, and poses (6,) at its start and end.
 
     Poses are x, y, z [m], yaw [rad], gripper (1 open, 0 closed) and pitch [rad, nose down].
-    A guarded leg stops when the robot feels the object.
+    A guarded segment stops when the robot feels the object.
     """
 
     seconds: float
@@ -55,7 +51,7 @@ class Segment:
     guarded: bool = False
 
     def at(self, share: np.ndarray) -> np.ndarray:
-        """Poses (n, 6) where the shares (n,) of the leg are covered."""
+        """Poses (n, 6) where the shares (n,) of the segment are covered."""
         return self.start + np.asarray(share)[:, None] * (self.end - self.start)
 
 
@@ -81,7 +77,7 @@ class Primitive:
 
     @cached_property
     def segment_phases(self) -> np.ndarray:
-        """Phases at which the legs begin, and 1: (m + 1,)."""
+        """Phases at which the segments begin, and 1: (m + 1,)."""
         seconds = np.cumsum([0.0, *(segment.seconds for segment in self.segments)])
         return seconds / seconds[-1]
 
@@ -109,8 +105,26 @@ class Primitive:
         return bool(np.hypot(effect[0], effect[1]) > 0.01)
 
 
+def _check_angle(owner: Primitive, name: str, from_zero: bool = False) -> None:
+    """Keep an angle of a primitive in [-π, π), or in [0, 2π); raises naming what is no number."""
+    angle = check_finite(name, getattr(owner, name))
+    object.__setattr__(owner, name, angle % (2 * math.pi) if from_zero else wrap_angle(angle))
+
+
+def _caged(grip_yaw: float, end: tuple[float, float, float]) -> tuple[Segment, ...]:
+    """Lower the open gripper over the object, close it, move to an end (x, y, yaw), and open it."""
+    x, y, yaw = end
+    return _segments(
+        (0.0, (0.0, 0.0, HOVER_M, grip_yaw, 1.0)),
+        (1.0, (0.0, 0.0, TIP_HEIGHT_M, grip_yaw, 1.0)),
+        (0.75, (0.0, 0.0, TIP_HEIGHT_M, grip_yaw, 0.0)),
+        (1.25, (x, y, TIP_HEIGHT_M, yaw, 0.0)),
+        (0.75, (x, y, TIP_HEIGHT_M, yaw, 1.0)),
+    )
+
+
 def _segments(*stops: tuple[float, tuple[float, ...]], guarded: int = -1) -> tuple[Segment, ...]:
-    """Legs through poses (x, y, z, yaw, gripper), each given with the seconds that lead to it."""
+    """Segments through poses (x, y, z, yaw, gripper), each given with the seconds that lead to it."""
     poses = [np.array([*pose, 0.0]) for _, pose in stops]
     return tuple(
         Segment(seconds, poses[k], poses[k + 1], guarded == k)
@@ -137,7 +151,7 @@ class Push(Primitive):
     acts_from = 0.4
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "theta", check_finite("theta", self.theta) % (2 * math.pi))
+        _check_angle(self, "theta", from_zero=True)
         check_field(self, "length", 0.0, 0.15, "m")
         check_field(self, "radius", 0.1, 0.3, "m")
 
@@ -179,12 +193,10 @@ class Drag(Primitive):
     acts_from = 0.25
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "theta", check_finite("theta", self.theta) % (2 * math.pi))
+        _check_angle(self, "theta", from_zero=True)
         check_field(self, "length", 0.0, 0.15, "m")
         if self.grip_yaw is not None:
-            object.__setattr__(
-                self, "grip_yaw", wrap_angle(check_finite("grip_yaw", self.grip_yaw))
-            )
+            _check_angle(self, "grip_yaw")
 
     @classmethod
     def towards(cls, direction_rad: float, **kwargs: float) -> Drag:
@@ -198,15 +210,9 @@ class Drag(Primitive):
 
     @cached_property
     def segments(self) -> tuple[Segment, ...]:
-        end = (self.length * math.cos(self.theta), self.length * math.sin(self.theta))
+        x, y = self.length * math.cos(self.theta), self.length * math.sin(self.theta)
         yaw = self.grip_yaw or 0.0
-        return _segments(
-            (0.0, (0.0, 0.0, HOVER_M, yaw, 1.0)),
-            (1.0, (0.0, 0.0, TIP_HEIGHT_M, yaw, 1.0)),
-            (0.75, (0.0, 0.0, TIP_HEIGHT_M, yaw, 0.0)),
-            (1.25, (*end, TIP_HEIGHT_M, yaw, 0.0)),
-            (0.75, (*end, TIP_HEIGHT_M, yaw, 1.0)),
-        )
+        return _caged(yaw, (x, y, yaw))
 
 
 @dataclass(frozen=True)
@@ -230,8 +236,7 @@ class Grasp(Primitive):
     def __post_init__(self) -> None:
         if self.seen_height is not None:
             check_field(self, "seen_height", 0.0, 0.3, "m")
-        yaw = wrap_angle(check_finite("grip_yaw", self.grip_yaw))
-        object.__setattr__(self, "grip_yaw", yaw)
+        _check_angle(self, "grip_yaw")
 
     @cached_property
     def segments(self) -> tuple[Segment, ...]:
@@ -266,19 +271,11 @@ class Rotate(Primitive):
     sweep_rad: ClassVar[float] = math.radians(60)
 
     def __post_init__(self) -> None:
-        yaw = wrap_angle(check_finite("grip_yaw", self.grip_yaw))
-        object.__setattr__(self, "grip_yaw", yaw)
+        _check_angle(self, "grip_yaw")
 
     @cached_property
     def segments(self) -> tuple[Segment, ...]:
-        yaw, end = self.grip_yaw, self.grip_yaw + self.sweep_rad
-        return _segments(
-            (0.0, (0.0, 0.0, HOVER_M, yaw, 1.0)),
-            (1.0, (0.0, 0.0, TIP_HEIGHT_M, yaw, 1.0)),
-            (0.75, (0.0, 0.0, TIP_HEIGHT_M, yaw, 0.0)),
-            (1.25, (0.0, 0.0, TIP_HEIGHT_M, end, 0.0)),
-            (0.75, (0.0, 0.0, TIP_HEIGHT_M, end, 1.0)),
-        )
+        return _caged(self.grip_yaw, (0.0, 0.0, self.grip_yaw + self.sweep_rad))
 
     def succeeded(self, effect: np.ndarray) -> bool:
         """Whether the object has turned by more than half the sweep."""
@@ -287,7 +284,7 @@ class Rotate(Primitive):
 
 @dataclass(frozen=True)
 class _Arc(Segment):
-    """The lifting leg: the blade turns by an angle φ about an edge `radius_m` ahead of it."""
+    """The lifting segment: the blade turns by an angle φ about an edge `radius_m` ahead of it."""
 
     radius_m: float = 0.16
     angle_rad: float = 0.0
@@ -328,7 +325,7 @@ class LeverUp(Primitive):
     run_up_m: ClassVar[float] = 0.03
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "theta", check_finite("theta", self.theta) % (2 * math.pi))
+        _check_angle(self, "theta", from_zero=True)
         check_field(self, "contact_x", -0.2, 0.2, "m")
         check_field(self, "contact_y", -0.2, 0.2, "m")
         check_field(self, "reach", 0.05, 0.4, "m")
@@ -364,7 +361,7 @@ class LeverUp(Primitive):
 
     @cached_property
     def segments(self) -> tuple[Segment, ...]:
-        direction = np.array([math.cos(self.theta), math.sin(self.theta)])
+        direction = unit_vector(self.theta)
         contact = np.array([self.contact_x, self.contact_y])
         outside = contact - self.run_up_m * direction
         under = contact + self.insertion_m * direction

@@ -15,10 +15,11 @@ import numpy as np
 import torch
 import xarray as xr
 
+from affordlib.geometry import wrap_angle
 from affordlib.interactions.dataset import InteractionTensors, valid_interactions
 from affordlib.interactions.recipes import Recipe, sample_scene, sample_world
 from affordlib.models.protocol import EffectModel, observe_final_effect
-from affordlib.primitives import Push, wrap_angle
+from affordlib.primitives import Push
 from affordlib.world import Tabletop
 
 

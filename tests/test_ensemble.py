@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import torch
 
+from affordlib.geometry import wrap_angle
 from affordlib.interactions import InteractionTensors
 from affordlib.models import EffectModel, Ensemble, condition_on_primitives, load_checkpoint
 from affordlib.planning import plan_astar, plan_continuous
-from affordlib.primitives import Push, wrap_angle
+from affordlib.primitives import Push
 from affordlib.types import Goal
 from experiments import units
 from experiments.units import Unit, configuration_sha256, run_unit

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from affordlib.geometry import wrap_angle
 from affordlib.planning import (
     EffectMap,
     PlanMode,
@@ -17,7 +18,7 @@ from affordlib.planning import (
 )
 from affordlib.planning.astar import BranchTable, search
 from affordlib.planning.grasp_rotate import GRIPPER_YAWS_RAD
-from affordlib.primitives import Drag, Grasp, Push, Rotate, wrap_angle
+from affordlib.primitives import Drag, Grasp, Push, Rotate
 from affordlib.types import Goal
 from affordlib.world import Cuboid, LyingCylinder, UprightCylinder
 from tests.problems import problem_of

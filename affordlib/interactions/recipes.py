@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
+from affordlib.geometry import rotated
 from affordlib.primitives import Drag, LeverUp, Primitive, Push, primitive_named
 from affordlib.types import TABLE_X_M, TABLE_Y_M, Interaction, check_count, check_field, check_range
 from affordlib.world import Tabletop, TabletopObject, WorldConfig, category_named
@@ -216,8 +217,7 @@ def _sample_action(
         return kind(float(rng.uniform(0, 2 * math.pi)))
     if not issubclass(kind, LeverUp):
         return kind()
-    c, s = math.cos(yaw), math.sin(yaw)
-    outline = obj.footprint_m @ np.array([[c, s], [-s, c]])
+    outline = rotated(obj.footprint_m, yaw)
     levers = []
     for _ in range(_LEVER_DRAWS):
         edge = int(rng.integers(len(outline)))

@@ -9,7 +9,7 @@ from typing import Any
 
 import ipywidgets as widgets
 
-from affordlib.primitives import wrap_angle
+from affordlib.geometry import wrap_angle
 from affordlib.show.table_view import LIMIT_M, step_in_words
 from affordlib.types import Goal, Outcome, Plan
 

@@ -17,6 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from affordlib.geometry import rotated
 from affordlib.perception import CAMERA_HEIGHT_M
 from affordlib.planning import ClosedLoopResult
 from affordlib.primitives import Grasp, Rotate
@@ -89,7 +90,7 @@ def plot_footprint(
     style: str = "filled",
 ) -> Axes:
     """The outline of an object's base at a pose, filled or with a style of line such as "--"."""
-    outline = _rotated(obj.footprint_m, check_finite("yaw_rad", yaw_rad))
+    outline = rotated(obj.footprint_m, check_finite("yaw_rad", yaw_rad))
     outline = _cm(outline + check_pair("xy_m", xy_m))
     filled = style == "filled"
     ax.fill(*outline, facecolor=color if filled else "none", alpha=0.25 if filled else 1, lw=0)
@@ -104,12 +105,6 @@ def _cm(xy_m: Any) -> np.ndarray:
 
 def _closed(xy: np.ndarray) -> np.ndarray:
     return np.hstack([xy, xy[:, :1]])
-
-
-def _rotated(xy_m: np.ndarray, angle_rad: float) -> np.ndarray:
-    """Points (n, 2) rotated anticlockwise about the origin."""
-    c, s = math.cos(angle_rad), math.sin(angle_rad)
-    return xy_m @ np.array([[c, s], [-s, c]])
 
 
 def _name(ax: Axes, text: str, at_cm: Sequence[float], offset: Sequence[float], **style) -> None:
@@ -282,9 +277,9 @@ def outline_in_lever_frame(
     obj: TabletopObject, yaw_rad: float, contact_xy_m: np.ndarray, theta_rad: float
 ) -> np.ndarray:
     """The base (n, 2) [m] of an object at its start, from the contact point, lever to the right."""
-    outline = _rotated(obj.footprint_m, check_finite("yaw_rad", yaw_rad))
+    outline = rotated(obj.footprint_m, check_finite("yaw_rad", yaw_rad))
     outline = outline - check_pair("contact_xy_m", contact_xy_m)
-    return _rotated(outline, -check_finite("theta_rad", theta_rad))
+    return rotated(outline, -check_finite("theta_rad", theta_rad))
 
 
 def plot_levered(
@@ -307,7 +302,7 @@ def plot_levered(
     centre = np.array([outline_m[:, 0].mean() + pose[0], height_m / 2 + pose[2]])
     faces = []
     for z in (-height_m / 2, height_m / 2):
-        side = _rotated(np.column_stack([along, np.full(len(along), z)]), -pose[3]) + centre
+        side = rotated(np.column_stack([along, np.full(len(along), z)]), -pose[3]) + centre
         faces.append(_cm(side + across[:, None] * (_ALONG, _UP)))
     for face in faces:
         ax.fill(*face, facecolor=color, alpha=0.15, lw=0)

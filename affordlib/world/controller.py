@@ -53,9 +53,10 @@ class JointController:
     def __init__(self, client: int, tool: str, after_step: Callable[[], None]) -> None:
         self.client, self.tool, self.after_step = client, tool, after_step
         self.robot = robot.load_robot(client, tool)
-        self.fingers = robot.finger_joints(client, self.robot)
+        self.links = robot.links(client, self.robot)
+        self.fingers = self.links["left_finger"], self.links["right_finger"]
         self.joints = (*robot.ARM_JOINTS, *self.fingers)
-        self.palm = robot.ARM_JOINTS[-1] + 1
+        self.palm = self.links["palm"]
 
     def put(self, angles_rad: np.ndarray, gap_m: float) -> None:
         """Place the arm (without motion) at joint angles (6,) with the fingers a gap [m] apart."""

@@ -58,8 +58,9 @@ class TabletopObject(ABC):
         return cls(*(float(size) for size in sizes))
 
     @property
-    @abstractmethod
-    def height_m(self) -> float: ...
+    def height_m(self) -> float:
+        """Height as it is placed [m]: the dimension `height` where there is one."""
+        return self.height
 
     @property
     @abstractmethod
@@ -110,10 +111,6 @@ class Cuboid(TabletopObject):
     category = "cuboid"
 
     @property
-    def height_m(self) -> float:
-        return self.height
-
-    @property
     def volume_m3(self) -> float:
         return self.length * self.width * self.height
 
@@ -126,37 +123,48 @@ class Cuboid(TabletopObject):
         return {"shapeType": pybullet.GEOM_BOX, "halfExtents": half}
 
 
+class _Cylinder(TabletopObject):
+    """A cylinder about the x axis (0) or the z axis (2) of its body."""
+
+    axis: ClassVar[int]
+
+    @property
+    def _length_m(self) -> float:
+        return self.length if self.axis == 0 else self.height
+
+    @property
+    def volume_m3(self) -> float:
+        return math.pi * self.diameter**2 / 4 * self._length_m
+
+    def shape(self) -> dict[str, Any]:
+        return {
+            "shapeType": pybullet.GEOM_CYLINDER,
+            "radius": self.diameter / 2,
+            "height": self._length_m,
+            "frame": pybullet.getQuaternionFromEuler((0, math.pi / 2 * (self.axis == 0), 0)),
+        }
+
+    def rolls(self, upward: np.ndarray) -> bool:
+        return bool(abs(upward[self.axis]) < _UPRIGHT)
+
+
 @dataclass(frozen=True)
-class UprightCylinder(TabletopObject):
+class UprightCylinder(_Cylinder):
     """A cylinder of the given `diameter` and `height` [m], standing on its round base."""
 
     diameter: float
     height: float
 
     category = "upright_cylinder"
-
-    @property
-    def height_m(self) -> float:
-        return self.height
-
-    @property
-    def volume_m3(self) -> float:
-        return math.pi * self.diameter**2 / 4 * self.height
+    axis = 2
 
     @property
     def footprint_m(self) -> np.ndarray:
         return _circle(self.diameter)
 
-    def shape(self) -> dict[str, Any]:
-        radius = self.diameter / 2
-        return {"shapeType": pybullet.GEOM_CYLINDER, "radius": radius, "height": self.height}
-
-    def rolls(self, upward: np.ndarray) -> bool:
-        return self.fallen(upward) and bool(upward[2] > -_UPRIGHT)
-
 
 @dataclass(frozen=True)
-class LyingCylinder(TabletopObject):
+class LyingCylinder(_Cylinder):
     """A cylinder of the given `length` and `diameter` [m], lying on its side."""
 
     length: float
@@ -164,34 +172,18 @@ class LyingCylinder(TabletopObject):
 
     category = "lying_cylinder"
     rollable = True
+    axis = 0
 
     @property
     def height_m(self) -> float:
         return self.diameter
 
     @property
-    def volume_m3(self) -> float:
-        return math.pi * self.diameter**2 / 4 * self.length
-
-    @property
     def footprint_m(self) -> np.ndarray:
         return _rectangle(self.length, self.diameter)
 
-    def shape(self) -> dict[str, Any]:
-        radius = self.diameter / 2
-        frame = pybullet.getQuaternionFromEuler((0, math.pi / 2, 0))
-        return {
-            "shapeType": pybullet.GEOM_CYLINDER,
-            "radius": radius,
-            "height": self.length,
-            "frame": frame,
-        }
-
     def fallen(self, upward: np.ndarray) -> bool:
-        return bool(abs(upward[0]) > _UPRIGHT)
-
-    def rolls(self, upward: np.ndarray) -> bool:
-        return not self.fallen(upward)
+        return not self.rolls(upward)
 
 
 @dataclass(frozen=True)
@@ -270,10 +262,6 @@ class Prism(TabletopObject):
         corners = radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
         height = rng.uniform(*(height_range_m or size_range_m))
         return cls(tuple((float(x), float(y)) for x, y in corners), float(height))
-
-    @property
-    def height_m(self) -> float:
-        return self.height
 
     @property
     def volume_m3(self) -> float:

@@ -53,30 +53,44 @@ def _description_folder() -> Path:
     )
 
 
-def _box_link(name: str, size: str, xyz: str, mass: float, rgba: str) -> ET.Element:
-    link = ET.Element("link", name=name)
-    for kind in ("visual", "collision"):
-        part = ET.SubElement(link, kind)
-        ET.SubElement(part, "origin", xyz=xyz, rpy="0 0 0")
-        ET.SubElement(ET.SubElement(part, "geometry"), "box", size=size)
-        if kind == "visual":
-            material = ET.SubElement(part, "material", name=f"{name}_colour")
-            ET.SubElement(material, "color", rgba=rgba)
-    inertial = ET.SubElement(link, "inertial")
-    ET.SubElement(inertial, "origin", xyz=xyz, rpy="0 0 0")
-    ET.SubElement(inertial, "mass", value=str(mass))
-    ET.SubElement(
-        inertial, "inertia", ixx="1e-3", iyy="1e-3", izz="1e-3", ixy="0", ixz="0", iyz="0"
-    )
-    return link
+def _box(
+    name: str, size: str, centre: str, mass_kg: float, rgba: str, *joint: str, axis: str = ""
+) -> str:
+    """A box in URDF, held by a joint: parent, and where it is held as xyz and rpy.
+
+    axis: along which it slides; "" for a box that is fixed.
+    """
+    parent, xyz, rpy = joint
+    shape = f'<origin xyz="{centre}"/><geometry><box size="{size}"/></geometry>'
+    limit = f'<limit lower="0" upper="{FINGER_TRAVEL_M}" effort="200" velocity="0.5"/>'
+    return f"""
+    <link name="{name}">
+      <visual>{shape}<material name="{name}_colour"><color rgba="{rgba}"/></material></visual>
+      <collision>{shape}</collision>
+      <inertial>
+        <origin xyz="{centre}"/><mass value="{mass_kg}"/>
+        <inertia ixx="1e-3" iyy="1e-3" izz="1e-3" ixy="0" ixz="0" iyz="0"/>
+      </inertial>
+    </link>
+    <joint name="{name}_joint" type="{"prismatic" if axis else "fixed"}">
+      <parent link="{parent}"/><child link="{name}"/><origin xyz="{xyz}" rpy="{rpy}"/>
+      {f'<axis xyz="{axis}"/>{limit}' if axis else ""}
+    </joint>"""
 
 
-def _joint(name: str, kind: str, parent: str, child: str, xyz: str, rpy: str) -> ET.Element:
-    joint = ET.Element("joint", name=name, type=kind)
-    ET.SubElement(joint, "parent", link=parent)
-    ET.SubElement(joint, "child", link=child)
-    ET.SubElement(joint, "origin", xyz=xyz, rpy=rpy)
-    return joint
+def _gripper(tool: str) -> str:
+    """Palm and fingers in URDF, and the screwdriver if it is the tool."""
+    flange, none = ("wrist_3_link", "0 0.0922 0", f"{-np.pi / 2} 0 0"), "0 0 0"
+    boxes = [_box("palm", "0.05 0.17 0.06", "0 0 0.04", 0.8, _DARK, *flange)]
+    for side, y in (("left", 1), ("right", -1)):
+        finger = f"{side}_finger", "0.02 0.012 0.13", f"0 {0.006 * y} 0.135", 0.1, _DARK
+        boxes.append(_box(*finger, "palm", none, none, axis=f"0 {y} 0"))
+    if tool == "screwdriver":
+        shaft = f"0.01 0.01 {SHAFT_LENGTH_M - 0.1}", f"0 0 {(0.1 + SHAFT_LENGTH_M) / 2}"
+        blade = f"{BLADE_LENGTH_M} 0.012 {BLADE_THICKNESS_M}", f"{BLADE_LENGTH_M / 2} 0 0"
+        boxes.append(_box("shaft", *shaft, 0.05, _RED, "palm", none, none))
+        boxes.append(_box("blade", *blade, 0.02, _RED, "shaft", f"0 0 {SHAFT_LENGTH_M}", none))
+    return f"<robot>{''.join(boxes)}</robot>"
 
 
 @cache
@@ -100,31 +114,7 @@ def robot_description(tool: str = "gripper") -> str:
             mesh.set("filename", path)
         material = ET.SubElement(link.find("visual"), "material", name=f"{link.get('name')}_colour")
         ET.SubElement(material, "color", rgba=_ARM_RGBA.get(link.get("name"), _GREY))
-
-    half_pi = str(-np.pi / 2)
-    root.append(_box_link("palm", "0.05 0.17 0.06", "0 0 0.04", 0.8, _DARK))
-    root.append(
-        _joint("palm_joint", "fixed", "wrist_3_link", "palm", "0 0.0922 0", f"{half_pi} 0 0")
-    )
-    for side, sign in (("left", 1), ("right", -1)):
-        name = f"{side}_finger"
-        root.append(_box_link(name, "0.02 0.012 0.13", f"0 {0.006 * sign} 0.135", 0.1, _DARK))
-        joint = _joint(f"{name}_joint", "prismatic", "palm", name, "0 0 0", "0 0 0")
-        ET.SubElement(joint, "axis", xyz=f"0 {sign} 0")
-        ET.SubElement(
-            joint, "limit", lower="0", upper=str(FINGER_TRAVEL_M), effort="200", velocity="0.5"
-        )
-        root.append(joint)
-    if tool == "screwdriver":
-        middle = (0.1 + SHAFT_LENGTH_M) / 2
-        shaft = f"0.01 0.01 {SHAFT_LENGTH_M - 0.1}", f"0 0 {middle}"
-        blade = f"{BLADE_LENGTH_M} 0.012 {BLADE_THICKNESS_M}", f"{BLADE_LENGTH_M / 2} 0 0"
-        root.append(_box_link("shaft", *shaft, 0.05, _RED))
-        root.append(_joint("shaft_joint", "fixed", "palm", "shaft", "0 0 0", "0 0 0"))
-        root.append(_box_link("blade", *blade, 0.02, _RED))
-        root.append(
-            _joint("blade_joint", "fixed", "shaft", "blade", f"0 0 {SHAFT_LENGTH_M}", "0 0 0")
-        )
+    root.extend(ET.fromstring(_gripper(tool)))
     return ET.tostring(root, encoding="unicode")
 
 
@@ -138,23 +128,10 @@ def load_robot(client: int, tool: str = "gripper") -> int:
         )
 
 
-def _link_names(client: int, robot: int) -> list[str]:
-    count = pybullet.getNumJoints(robot, physicsClientId=client)
-    return [
-        pybullet.getJointInfo(robot, j, physicsClientId=client)[12].decode() for j in range(count)
-    ]
-
-
-def finger_joints(client: int, robot: int) -> tuple[int, int]:
-    """Indices of the two prismatic finger joints."""
-    names = _link_names(client, robot)
-    return names.index("left_finger"), names.index("right_finger")
-
-
-def touching_links(client: int, robot: int) -> list[int]:
-    """Indices of the links made to touch objects: the fingers and, if held, the blade."""
-    names = _link_names(client, robot)
-    return [k for k, name in enumerate(names) if name in ("left_finger", "right_finger", "blade")]
+def links(client: int, robot: int) -> dict[str, int]:
+    """Index of each link, and of the joint that moves it, by the link's name."""
+    count = range(pybullet.getNumJoints(robot, physicsClientId=client))
+    return {pybullet.getJointInfo(robot, k, client)[12].decode(): k for k in count}
 
 
 def _flange_pose(

@@ -85,8 +85,10 @@ class Tabletop:
         self._placed: PlacedObject | None = None
         self.noise = np.random.default_rng(self.config.noise_seed)
         set_friction(client, self._table, -1, self.config.table_friction)
-        for link in robot.touching_links(client, self.arm.robot):
-            set_friction(client, self.arm.robot, link, self.config.finger_friction)
+        for name in ("left_finger", "right_finger", "blade"):
+            if name in self.arm.links:
+                link, friction = self.arm.links[name], self.config.finger_friction
+                set_friction(client, self.arm.robot, link, friction)
         self.arm.put(np.array(robot.HOME), PUSH_GAP_M)
 
     def _build(self, tool: str) -> None:
