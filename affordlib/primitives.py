@@ -1,8 +1,8 @@
 """What an action is, as a path in phase; no physics here (Section 3.3 and Figure 2 of the paper).
 
 A primitive is a chain of segments between keyframes, each covered with minimum-jerk timing. It
-gives the commanded end-effector path over the phase t in [0, 1], relative to where the object stood at
-the start. The world makes the arm follow it; models are conditioned on it.
+gives the commanded end-effector path over the phase t in [0, 1], relative to where the object
+stood at the start. The world makes the arm follow it; models are conditioned on it.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ def _caged(grip_yaw: float, end: tuple[float, float, float]) -> tuple[Segment, .
 
 
 def _segments(*stops: tuple[float, tuple[float, ...]], guarded: int = -1) -> tuple[Segment, ...]:
-    """Segments through poses (x, y, z, yaw, gripper), each given with the seconds that lead to it."""
+    """Segments through poses (x, y, z, yaw, gripper), each with the seconds that lead to it."""
     poses = [np.array([*pose, 0.0]) for _, pose in stops]
     return tuple(
         Segment(seconds, poses[k], poses[k + 1], guarded == k)

@@ -20,9 +20,9 @@ from typing import Any
 import ipywidgets as widgets
 import numpy as np
 
+from affordlib.geometry import wrap_angle
 from affordlib.paths import resolve_out_dir
 from affordlib.plan_files import load_plan, save_plan
-from affordlib.primitives import wrap_angle
 from affordlib.show.drawing import Drawing, WithPicture
 from affordlib.show.executors import Executor, Planner, Stopped, measured, open_loop
 from affordlib.show.picker_controls import PickerControls, outcome_in_words, plan_in_words
