@@ -7,7 +7,7 @@ collected it, in whatever order.
 
 from __future__ import annotations
 
-import hashlib
+import os
 import shutil
 import threading
 from collections.abc import Iterator
@@ -70,72 +70,59 @@ def collect(
     try:
         with FileLock(parts / "lock", timeout=0):
             if not is_there:
-                _collect(recipe, attrs, parts, file, client, progress)
+                whole = _collected(recipe, attrs, parts, client, progress)
+                write_interactions(whole, file)
             shutil.rmtree(parts, ignore_errors=True)
     except Timeout:
         raise RuntimeError(
             f"another process is collecting into {file}; wait for it or choose another path"
         ) from None
+    except (KeyboardInterrupt, OSError) as error:
+        error.add_note("finished chunks are kept; collect into the same path to go on")
+        raise
     return path
+
+
+def _attributes(file: Path) -> dict[str, str] | None:
+    """The attributes of a set that is there, whole."""
+    try:
+        return open_interactions(file).attrs
+    except (CorruptedDataError, OSError):
+        return None
 
 
 def _is_there(file: Path, attrs: dict[str, str], replace: bool) -> bool:
     """Whether this very set is there, and is to stay; ValueError if anything else is."""
-    if file.is_dir():
-        raise ValueError(f"path {file} is a folder; choose another path, or delete it")
-    if replace or not (file.exists() or file.is_symlink()):
-        return False
-    remedy = "choose another path, delete it, or pass replace=True"
-    try:
-        found = open_interactions(file).attrs
-    except (CorruptedDataError, OSError) as error:
+    found = None if replace else _attributes(file)
+    if found != attrs and (file.is_dir() or (os.path.lexists(file) and not replace)):
+        what = "a set of another recipe, or of other package versions" if found else "no whole set"
         raise ValueError(
-            f"path {file} is no whole set of interactions ({error}); {remedy}"
-        ) from error
-    if found != attrs:
-        raise ValueError(
-            f"path {file} holds a set of another recipe, or of other package versions; {remedy}"
+            f"path {file} is {what}; choose another path, delete it, or pass replace=True"
         )
-    return True
+    return found == attrs
 
 
-def _collect(
+def _collected(
     recipe: Recipe,
     attrs: dict[str, str],
     parts: Path,
-    file: Path,
     client: dask.distributed.Client | None,
     progress: bool,
-) -> None:
-    """Make the chunks that are missing among the parts, and the file of all."""
-    digest = hashlib.sha256(str(attrs).encode()).hexdigest()[:8]
-    starts = range(0, recipe.n_interactions, CHUNK)
-    rows = [range(k, min(k + CHUNK, recipe.n_interactions)) for k in starts]
-    kept = {r: parts / f"{digest}-{r.start:08d}{SUFFIX}" for r in rows}
-    missing = [r for r in rows if not _is_whole(kept[r])]
+) -> xr.Dataset:
+    """The whole set; chunks that are missing among the parts are made."""
+    n = recipe.n_interactions
+    rows = [range(k, min(k + CHUNK, n)) for k in range(0, n, CHUNK)]
+    kept = {r: parts / f"{r.start:08d}{SUFFIX}" for r in rows}
+    missing = [r for r in rows if _attributes(kept[r]) != attrs]
     made = _made(partial(_make, recipe, attrs), missing, client)
-    total, there = recipe.n_interactions, recipe.n_interactions - sum(map(len, missing))
-    unit = " interactions"
-    bar = tqdm(total=total, initial=there, desc=file.name, unit=unit, disable=not progress)
-    try:
-        with closing(made), bar:
-            for r, chunk in made:
-                write_interactions(chunk, kept[r])
-                bar.update(len(r))
-        chunks = [open_interactions(path) for path in kept.values()]
-        whole = xr.concat(chunks, "interaction", data_vars="minimal", combine_attrs="override")
-        write_interactions(whole, file)
-    except (KeyboardInterrupt, OSError) as error:
-        error.add_note("finished chunks are kept; collect into the same path to go on")
-        raise
-
-
-def _is_whole(part: Path) -> bool:
-    try:
-        open_interactions(part)
-    except (CorruptedDataError, OSError):
-        return False
-    return True
+    there, disable = n - sum(map(len, missing)), not progress
+    bar = tqdm(total=n, initial=there, unit=" interactions", disable=disable)
+    with closing(made), bar:
+        for r, chunk in made:
+            write_interactions(chunk, kept[r])
+            bar.update(len(r))
+    chunks = [open_interactions(path) for path in kept.values()]
+    return xr.concat(chunks, "interaction", data_vars="minimal", combine_attrs="override")
 
 
 def _make(recipe: Recipe, attrs: dict[str, str], rows: range) -> xr.Dataset:

@@ -36,7 +36,6 @@ TABLE, IMAGES, POSES = "trajectories.csv", "images", "trajectories"
 DEPTH_UNIT_M = 1e-4
 TABLE_DEPTH_M = 1.0
 _HIGHER_M = 0.002
-_ENDINGS = (".png", ".jpg", ".pgm")
 
 
 def read_log(folder: str | Path, n_samples: int = 101) -> InteractionTensors:
@@ -56,6 +55,7 @@ def read_log(folder: str | Path, n_samples: int = 101) -> InteractionTensors:
     # Only an empty entry is missing: "NA" is a name as good as others.
     table = pd.read_csv(path, dtype={"interaction": str}, keep_default_na=False, na_values=[""])
     actions, effects = _columns(path, table)
+    yaws = [name.endswith("yaw") for name in actions + effects]
     trajectories, images = [], []
     for name, rows in table.groupby("interaction", sort=False):
         t, values = rows["t"].to_numpy(float), rows[actions + effects].to_numpy(float)
@@ -63,11 +63,9 @@ def read_log(folder: str | Path, n_samples: int = 101) -> InteractionTensors:
             raise ValueError(f"{path}: interaction {name!r} has an entry that is not a number")
         if len(t) < 2 or t[0] != 0 or t[-1] != 1 or (np.diff(t) <= 0).any():
             raise ValueError(f"{path}: t of interaction {name!r} must grow from 0 to 1")
-        for k, channel in enumerate(actions + effects):
-            if channel.endswith("yaw"):
-                values[:, k] = np.unwrap(values[:, k])
+        values[:, yaws] = np.unwrap(values[:, yaws], axis=0)
         trajectories.append(np.column_stack([np.interp(phase, t, column) for column in values.T]))
-        images.append(_read_depth(folder / IMAGES, name))
+        images.append(_read_depth(folder / IMAGES / f"{name}.png"))
     if not trajectories:
         raise ValueError(f"{path}: there are no rows")
     both = torch.from_numpy(np.stack(trajectories)).float()
@@ -99,58 +97,55 @@ def write_log(folder: str | Path, tensors: InteractionTensors) -> Path:
     return folder
 
 
-def _columns(path: Path, table: pd.DataFrame) -> tuple[list[str], list[str]]:
+def _columns(path: Path, table: pd.DataFrame) -> list[list[str]]:
     """The table's columns of actions and of effects; raises ValueError for what is wrong."""
     for name in ("interaction", "t"):
         if name not in table:
             raise ValueError(f"{path}: the column {name!r} is missing")
-    found = {}
+    found = []
     for kind, channels in (("action", ACTION_CHANNELS), ("effect", EFFECT_CHANNELS)):
         known = [f"{kind}_{channel}" for channel in channels]
-        found[kind] = [name for name in table if name.startswith(f"{kind}_")]
-        unknown = [name for name in found[kind] if name not in known]
-        if unknown or not found[kind]:
-            wrong = f"{unknown[0]!r} is unknown" if unknown else f"there is no column {kind}_…"
-            raise ValueError(f"{path}: {wrong}; choose from {', '.join(known)}")
-    for name in (*found["action"], *found["effect"], "t"):
+        found.append([name for name in table if name.startswith(f"{kind}_")])
+        if not found[-1] or not {*found[-1]} <= {*known}:
+            raise ValueError(
+                f"{path}: the columns of the {kind} are {found[-1]}; choose from {known}"
+            )
+    for name in ("t", *found[0], *found[1]):
         if not pd.api.types.is_numeric_dtype(table[name]):
             raise ValueError(f"{path}: the column {name!r} must hold numbers only")
-    if table["interaction"].isna().any():
-        row = 2 + int(table["interaction"].isna().argmax())
+    if (empty := table["interaction"].isna()).any():
+        row = 2 + int(empty.argmax())
         raise ValueError(f"{path}: line {row} has no entry in the column 'interaction'")
-    return found["action"], found["effect"]
+    return found
 
 
-def _read_gray(path: Path, pixels: int, valid, expected: str) -> np.ndarray:
-    """An image (n, n), or a ValueError that names the file and what is expected."""
+def _pixels(path: Path, n: int, mode: str | None = None) -> np.ndarray:
+    """The values (n, n) of an image, converted to a mode of Pillow if one is given."""
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no image {path} of the interaction of that name")
     with Image.open(path) as file:
-        values = np.asarray(file)
-    if values.shape[:2] != (pixels, pixels) or not valid(values):
-        raise ValueError(
-            f"{path} must be an image of {pixels}×{pixels} pixels, {expected}; got "
-            f"{values.shape}, {values.dtype}, at most {values.max()}"
-        )
+        values = np.asarray(file.convert(mode) if mode else file)
+    if values.shape != (n, n):
+        raise ValueError(f"{path} must be a gray image of {n}×{n} pixels, got {values.shape}")
     return values
 
 
-def _read_depth(folder: Path, name: str) -> np.ndarray:
+def _read_depth(path: Path) -> np.ndarray:
     """Depth [m] and mask (2, 48, 48)."""
-    path, mask_path = (folder / f"{name}{ending}.png" for ending in ("", "_mask"))
-    if not path.is_file():
-        raise FileNotFoundError(f"the image of interaction {name!r} is missing: {path}")
-
-    def is_depth(values):
-        return values.ndim == 2 and np.issubdtype(values.dtype, np.integer) and values.max() > 255
-
-    def is_mask(values):
-        return values.ndim == 2 and values.dtype == np.uint8 and not 0 < values.max() < 128
-
-    depth = DEPTH_UNIT_M * _read_gray(path, IMAGE_PIXELS, is_depth, "gray, 16 bits of 0.1 mm")
-    mask = TABLE_DEPTH_M - depth > _HIGHER_M
-    if mask_path.is_file():
-        white = "gray, 8 bits, white (255) where the object is"
-        mask = _read_gray(mask_path, IMAGE_PIXELS, is_mask, white) / 255.0
-    return np.stack([depth, mask]).astype(np.float32)
+    units, mask_path = _pixels(path, IMAGE_PIXELS), path.with_name(f"{path.stem}_mask.png")
+    if not np.issubdtype(units.dtype, np.integer) or units.max() <= 255:
+        got = f"{units.dtype}, at most {units.max()}"
+        raise ValueError(f"{path} must hold depth in 16 bits of 0.1 mm, got {got}")
+    depth = units * DEPTH_UNIT_M
+    if not mask_path.is_file():
+        return np.stack([depth, TABLE_DEPTH_M - depth > _HIGHER_M]).astype(np.float32)
+    mask = _pixels(mask_path, IMAGE_PIXELS)
+    if mask.dtype != np.uint8 or 0 < mask.max() < 128:
+        got = f"{mask.dtype}, at most {mask.max()}"
+        raise ValueError(
+            f"{mask_path} must have 8 bits, white (255) where the object is, got {got}"
+        )
+    return np.stack([depth, mask / 255.0]).astype(np.float32)
 
 
 def read_trajectories(
@@ -183,7 +178,7 @@ def read_trajectories(
             raise ValueError(f"{file} has {len(rows)} rows, expected {steps} as in {files[0].name}")
         tilt = np.arccos(np.clip(np.cos(rows[:, 3]) * np.cos(rows[:, 4]), -1, 1))
         poses.append(np.column_stack([rows[:, :3] - rows[0, :3], tilt - tilt[0]]))
-        images.append(_read_gray_and_mask(folder / IMAGES, file.stem))
+        images.append(_read_gray(folder / IMAGES, file.stem))
     effect = torch.from_numpy(np.stack(poses)).float()
     return InteractionTensors(
         select_view(torch.from_numpy(np.stack(images)), view),
@@ -206,15 +201,11 @@ def _read_poses(file: Path) -> np.ndarray:
     return poses
 
 
-def _read_gray_and_mask(folder: Path, name: str) -> np.ndarray:
+def _read_gray(folder: Path, name: str) -> np.ndarray:
     """Gray values in [0, 1] and mask (2, 128, 128) of an image."""
-    file = next((p for end in _ENDINGS if (p := folder / f"{name}{end}").is_file()), None)
-    if file is None:
-        raise FileNotFoundError(f"{folder} has no image {name}.png (or .jpg, .pgm) of {name}.txt")
-    with Image.open(file) as picture:
-        gray = np.asarray(picture.convert("L"), dtype=np.float32) / 255
-    if gray.shape != (LEVER_IMAGE_PIXELS, LEVER_IMAGE_PIXELS):
-        raise ValueError(f"{file} must be {LEVER_IMAGE_PIXELS}×{LEVER_IMAGE_PIXELS} pixels")
+    files = [folder / f"{name}{ending}" for ending in (".png", ".jpg", ".pgm")]
+    file = next((file for file in files if file.is_file()), files[0])
+    gray = _pixels(file, LEVER_IMAGE_PIXELS, "L").astype(np.float32) / 255
     table = np.median(np.concatenate([gray[0], gray[-1], gray[:, 0], gray[:, -1]]))
     return np.stack([gray, (np.abs(gray - table) > 0.1).astype(np.float32)])
 

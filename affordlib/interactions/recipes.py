@@ -184,21 +184,6 @@ def sample_scene(recipe: Recipe, index: int) -> tuple[TabletopObject, float, np.
     return obj, float(rng.uniform(-math.pi, math.pi)), rng
 
 
-def sample_position(recipe: Recipe, index: int) -> tuple[float, float]:
-    """Where on the table the object of interaction `index` lies, (x, y) [m]."""
-    if not recipe.anywhere:
-        return 0.0, 0.0
-    low = np.array([TABLE_X_M[0], TABLE_Y_M[0]]) + _TABLE_MARGIN_M
-    high = np.array([TABLE_X_M[1], TABLE_Y_M[1]]) - _TABLE_MARGIN_M
-    x, y = _generator(recipe, index, 1).uniform(low, high)
-    return float(x), float(y)
-
-
-def sample_stop_phase(recipe: Recipe, index: int) -> float:
-    """The phase at which interaction `index` is truncated; 1 if it is not."""
-    return float(_generator(recipe, index, 2).uniform(0.05, 1.0)) if recipe.partial else 1.0
-
-
 def sample_world(recipe: Recipe, index: int, obj: TabletopObject) -> WorldConfig:
     """The world in which interaction `index` takes place."""
     if recipe.variation is None:
@@ -239,7 +224,13 @@ def interact(
     """
     obj, yaw, rng = sample_scene(recipe, index)
     action = _sample_action(recipe, obj, yaw, rng)
-    config = sample_world(recipe, index, obj)
-    world.place(obj, sample_position(recipe, index), yaw, tool=action.tool, config=config)
-    stop = sample_stop_phase(recipe, index) if stop_phase is None else stop_phase
+    config, xy_m, stop = sample_world(recipe, index, obj), (0.0, 0.0), 1.0
+    if recipe.anywhere:
+        low = np.array([TABLE_X_M[0], TABLE_Y_M[0]]) + _TABLE_MARGIN_M
+        high = np.array([TABLE_X_M[1], TABLE_Y_M[1]]) - _TABLE_MARGIN_M
+        xy_m = tuple(_generator(recipe, index, 1).uniform(low, high).tolist())
+    if recipe.partial:
+        stop = float(_generator(recipe, index, 2).uniform(0.05, 1.0))
+    world.place(obj, xy_m, yaw, tool=action.tool, config=config)
+    stop = stop if stop_phase is None else stop_phase
     return obj, world.execute_primitive(action, stop, record_unreachable=True)

@@ -34,20 +34,24 @@ class CorruptedDataError(ValueError):
     """A data set is damaged: what was read is not what was written."""
 
 
-def array_sha256(array: np.ndarray) -> str:
-    """Hash of an array's type, shape and bytes."""
-    digest = hashlib.sha256(f"{array.dtype.str}{array.shape}".encode())
-    digest.update(np.ascontiguousarray(array).reshape(-1).view(np.uint8))
-    return digest.hexdigest()
+def _hashes(data: xr.Dataset) -> dict[str, str]:
+    """Hashes of the type, shape and bytes of each array."""
+    found = {}
+    for name in data.variables:
+        array = data[name].values
+        digest = hashlib.sha256(f"{array.dtype.str}{array.shape}".encode())
+        digest.update(np.ascontiguousarray(array).reshape(-1).view(np.uint8))
+        found[str(name)] = digest.hexdigest()
+    return found
 
 
-def _set_sha256(arrays: dict[str, str]) -> str:
-    return hashlib.sha256(json.dumps(arrays, sort_keys=True).encode()).hexdigest()
+def _hash_of(hashes: dict[str, str]) -> str:
+    return hashlib.sha256(json.dumps(hashes, sort_keys=True).encode()).hexdigest()
 
 
 def dataset_sha256(data: xr.Dataset) -> str:
     """One hash for all arrays of a data set; it depends neither on workers nor on the file."""
-    return _set_sha256({str(name): array_sha256(data[name].values) for name in data.variables})
+    return _hash_of(_hashes(data))
 
 
 def write_interactions(data: xr.Dataset, path: Path) -> None:
@@ -60,7 +64,7 @@ def write_interactions(data: xr.Dataset, path: Path) -> None:
     data.to_zarr(MemoryStore(buffers), zarr_format=3, consolidated=False, encoding=encoding)
     files = {name: buffer.to_bytes() for name, buffer in buffers.items()}
     manifest = {
-        "arrays": {str(name): array_sha256(data[name].values) for name in data.variables},
+        "arrays": _hashes(data),
         "files": {name: hashlib.sha256(content).hexdigest() for name, content in files.items()},
     }
     files[MANIFEST] = json.dumps(manifest, indent=1, sort_keys=True).encode()
@@ -107,7 +111,7 @@ def _read(url: str, only: str | None = None) -> tuple[dict[str, dict[str, str]],
 def stored_sha256(name_or_path: str | Path) -> str:
     """The `dataset_sha256` of a stored set, from its manifest, without reading the arrays."""
     url = _url_of(name_or_path)
-    return _set_sha256(_read(url, MANIFEST)[0]["arrays"])
+    return _hash_of(_read(url, MANIFEST)[0]["arrays"])
 
 
 def open_interactions(name_or_path: str | Path) -> xr.Dataset:

@@ -71,22 +71,25 @@ def _replace(folder, old, new):
     ("spoil", "says"),
     [
         (lambda f: (f / TABLE).unlink(), r"there is no .*trajectories\.csv; expected"),
-        (lambda f: (f / "images" / "0001.png").unlink(), r"image of interaction '0001'"),
-        (lambda f: _replace(f, "action_x", "action_q"), r"'action_q' is unknown; choose from"),
+        (lambda f: (f / "images" / "0001.png").unlink(), r"no image .*0001\.png"),
+        (
+            lambda f: _replace(f, "action_x", "action_q"),
+            r"action are \['action_q', 'action_y'\]; choose from",
+        ),
         (lambda f: _replace(f, "interaction", "object"), r"column 'interaction' is missing"),
         (lambda f: _replace(f, "0001,0.0,", "0001,0.5,"), r"t of interaction '0001' must grow"),
         (lambda f: _replace(f, "0000,0.0,", "0000,zero,"), r"column 't' must hold numbers"),
         (
             lambda f: Image.fromarray(np.zeros((48, 48), np.uint8)).save(f / "images" / "0002.png"),
-            r"0002\.png must be an image of 48×48 pixels, gray, 16 bits",
+            r"0002\.png must hold depth in 16 bits",
         ),
         (
             lambda f: Image.fromarray(np.ones((48, 48), np.uint8)).save(f / "images/0001_mask.png"),
-            r"0001_mask\.png must be .* white .* at most 1$",
+            r"0001_mask\.png must .* white .* at most 1$",
         ),
         (
             lambda f: Image.fromarray(np.ones((48, 48), bool)).save(f / "images/0001_mask.png"),
-            r"0001_mask\.png must be .*bool",
+            r"0001_mask\.png must .*bool",
         ),
     ],
 )
@@ -149,7 +152,7 @@ def test_the_older_layout_is_learned_from(tmp_path, short, name, kind, steps):
 @pytest.mark.parametrize(
     ("spoil", "reason"),
     [
-        (lambda f: (f / "images" / "0001.png").unlink(), "no image 0001.png"),
+        (lambda f: (f / "images" / "0001.png").unlink(), "no image .*0001.png"),
         (lambda f: (f / "trajectories" / "0001.txt").write_text("1 2 3\n"), "six finite numbers"),
         (
             lambda f: (f / "trajectories" / "0001.txt").write_text("1 2 x 4 5 6\n"),
@@ -157,7 +160,7 @@ def test_the_older_layout_is_learned_from(tmp_path, short, name, kind, steps):
         ),
         (lambda f: (f / "trajectories" / "0001.txt").write_text("0 0 0 0 0 0\n"), "has 1 rows"),
         (lambda f: [p.unlink() for p in (f / "trajectories").iterdir()], "no file trajectories"),
-        (lambda f: Image.new("L", (9, 9)).save(f / "images" / "0001.png"), "must be 128×128"),
+        (lambda f: Image.new("L", (9, 9)).save(f / "images" / "0001.png"), "128×128 pixels"),
     ],
 )
 def test_what_is_wrong_with_the_older_layout_is_said(older, spoil, reason):
