@@ -27,7 +27,7 @@ from affordlib.planning.reachability import SHIPPED as REACHABILITY
 from affordlib.planning.reachability import Reachability
 from affordlib.primitives import PRIMITIVES, Drag, Grasp, Push, Rotate
 from affordlib.world import Tabletop
-from experiments.planning import NUDGE_M, NUDGE_RAD
+from experiments.planning import POSITION_ERROR_M, YAW_ERROR_RAD
 
 Rows = list[dict[str, Any]]
 
@@ -43,7 +43,7 @@ EDGE = (0.2, 0.8)
 
 def floor_settings() -> tuple[Any, ...]:
     """What decides the rows of `floor` beside its data."""
-    return N_PUSHES, REPEATS, NUDGE_M, NUDGE_RAD
+    return N_PUSHES, REPEATS, POSITION_ERROR_M, YAW_ERROR_RAD
 
 
 def reach_settings() -> tuple[Any, ...]:
@@ -66,9 +66,9 @@ def floor() -> Rows:
             told = data["effect"].values[k, -1]
             for r in range(REPEATS):
                 side, sign = rng.uniform(0, math.tau), rng.choice([-1, 1])
-                bias = NUDGE_M * np.array([math.cos(side), math.sin(side)])
+                bias = POSITION_ERROR_M * np.array([math.cos(side), math.sin(side)])
                 amiss = replace(config, bias_m=tuple(bias))
-                world.place(obj, (0.0, 0.0), yaw + sign * NUDGE_RAD, config=amiss)
+                world.place(obj, (0.0, 0.0), yaw + sign * YAW_ERROR_RAD, config=amiss)
                 done = world.execute_primitive(
                     Push(float(data["theta"][k])), record_unreachable=True
                 ).effect[-1]
@@ -79,7 +79,7 @@ def floor() -> Rows:
     for name in ("all", *sorted(set(kinds))):
         of = (kinds == name) | (name == "all")
         row = {"object_class": name, "n": int(of.sum()), "repeats": REPEATS}
-        row |= {"nudged_m": NUDGE_M, "nudged_rad": NUDGE_RAD}
+        row |= {"nudged_m": POSITION_ERROR_M, "nudged_rad": YAW_ERROR_RAD}
         for what, error in (("displacement", moved), ("end", ended)):
             row[f"{what}_mean_m"] = float(np.mean([error[kinds == c].mean() for c in {*kinds[of]}]))
             row[f"{what}_median_m"] = float(np.median(error[of]))
