@@ -11,7 +11,7 @@ import itertools
 import math
 import threading
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -47,6 +47,7 @@ POSE_EVERY = 12
 """Simulation steps (1/240 s) between two poses of the movement that is played."""
 
 _MOVED = 1e-4
+_LAYOUT = {"width": "480px", "max_width": "100%"}
 _HELP = (
     "Table from above. Arrow keys move the goal by 1 cm, with Shift by 1 mm; Enter runs the plan, "
     "Escape stops it."
@@ -91,14 +92,12 @@ class GoalPicker(WithPicture, widgets.VBox):
         self._stale = True  # what is shown is not the chosen planner's plan for the goal
         self._answered = 0  # the number of the last goal of the page that there is a plan for
         self._alone = threading.RLock()  # held by what plans, or moves something in the world
-        self._queue, self._last = ThreadPoolExecutor(1), Future()
+        self._queue = ThreadPoolExecutor(1)
         self._goal_moved, self._stop = threading.Event(), threading.Event()
         self._disturbances: list[Callable[[], None]] = []  # that wait for the end of the action
         self._poses: list[tuple[float, ...]] = []  # of the object since the last action
         self._paths: list[np.ndarray] = []  # of the object since the plan was made
-        self._view = Drawing(
-            label=_HELP, keyboard=True, layout={"width": "480px", "max_width": "100%"}
-        )
+        self._view = Drawing(label=_HELP, keyboard=True, layout=_LAYOUT)
         self._view.add_class("affordlib-table")
         goal = Goal(_whole_mm(check_on_table("goal_xy_m", goal_xy_m)))
         self.controls = PickerControls(goal, list(planners), list(self.executors), self._follow)
@@ -182,7 +181,8 @@ class GoalPicker(WithPicture, widgets.VBox):
     def _listen(self) -> None:
         controls = self.controls
         self._view.observe(self._clicked, names="wanted")
-        self._view.on_msg(self._pressed)
+        presses = {"run": self._run_in_background, "stop": self.stop}
+        self._view.on_msg(lambda _, message, __: presses[message["press"]]())
         controls.planner.observe(lambda _: self._follow(self.goal), names="value")
         controls.run.on_click(lambda _: self._run_in_background())
         controls.stop.on_click(lambda _: self.stop())
@@ -200,7 +200,7 @@ class GoalPicker(WithPicture, widgets.VBox):
         if self._running:
             self._attempt(action)
         else:
-            self._last = self._queue.submit(self._attempt, action)
+            self._queue.submit(self._attempt, action)
 
     def _attempt(self, action: Callable[[], None]) -> None:
         """Do it, and say what did not work."""
@@ -214,17 +214,11 @@ class GoalPicker(WithPicture, widgets.VBox):
         _, x, y, _ = change["new"]
         self._follow(replace(self.goal, xy_m=_whole_mm((x / 1000, -y / 1000))))
 
-    def _pressed(self, _: object, content: dict[str, Any], __: object) -> None:
-        presses = {"run": self._run_in_background, "stop": self.stop}
-        if content.get("press") in presses:
-            presses[content["press"]]()
-
     def _run_in_background(self) -> None:
         """Run the plan of the goal that is shown, when it is made; a second press does nothing."""
         if not self._running:
             self._set_running(True)
-            action = partial(self._run, self.seconds_per_action)
-            self._last = self._queue.submit(self._attempt, action)
+            self._queue.submit(self._attempt, partial(self._run, self.seconds_per_action))
 
     def _follow(self, goal: Goal) -> None:
         """Set the goal; soon show a draft for it, and the plan if the hand rests there."""
@@ -331,7 +325,11 @@ class GoalPicker(WithPicture, widgets.VBox):
                 yaw, z = self.world.object_pose()[2], self.world.object_state()[2]
                 self.world.on_step = self._pose_log(on_step)
                 try:
-                    outcome, how = self._execute(report), "Done,"
+                    if self._stop.is_set():
+                        raise Stopped
+                    execute = self.executors[self.controls.executor.value]
+                    outcome = execute(self.world, self.plan, self._planner(), report)
+                    how = "Done,"
                     self.controls.show_progress(done, max(1, done))
                 except Stopped:
                     outcome, how = measured(self.world, self.plan), "Stopped after"
@@ -352,12 +350,6 @@ class GoalPicker(WithPicture, widgets.VBox):
                 self._pose = self.world.object_pose()
                 self._set_running(False)
                 self._show()
-
-    def _execute(self, report: Callable[..., Goal]) -> Outcome:
-        if self._stop.is_set():
-            raise Stopped
-        execute = self.executors[self.controls.executor.value]
-        return execute(self.world, self.plan, self._planner(), report)
 
     def _replace_plan(self, plan: Plan, done: int) -> None:
         """Show a plan that was made on the way, after so many actions."""
@@ -420,12 +412,11 @@ class GoalPicker(WithPicture, widgets.VBox):
 
     def _displacement(self, xy_m: tuple[float, float], least_m: float, most_m: float) -> np.ndarray:
         """A random displacement (2,) [m] that stays in sight; from outside, one to the middle."""
-        for _ in range(100):
-            angle, far = self._rng.uniform(0, 2 * np.pi), self._rng.uniform(least_m, most_m)
-            by = far * np.array([np.cos(angle), np.sin(angle)])
-            if np.abs(np.add(xy_m, by)).max() < LIMIT_M:
-                return by
-        return -far * np.array(xy_m) / np.hypot(*xy_m)
+        angle, far = self._rng.uniform(0, 2 * np.pi, 100), self._rng.uniform(least_m, most_m)
+        ways = far * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        in_sight = np.abs(ways + xy_m).max(axis=1) < LIMIT_M
+        to_middle = -far * np.array(xy_m) / np.hypot(*xy_m)
+        return ways[in_sight.argmax()] if in_sight.any() else to_middle
 
     # What is seen
 

@@ -47,25 +47,26 @@ def free_port():
 
 
 @contextmanager
-def serve(folder, name, source=None, **parameters):
+def serve(folder, name, more_cells=(), **parameters):
     """A JupyterLab with settings, workspaces and run-time files of its own, and one notebook.
 
-    source: the file of one that is not among `notebooks/`.
+    more_cells: code that is added to the end of the notebook.
     """
     book = folder / "book"
     book.mkdir()
-    papermill.execute_notebook(
-        source or repo_root() / "notebooks" / f"{name}.ipynb",
-        book / f"{name}.ipynb",
-        {"out_dir": str(folder / "out"), **parameters},
+    file, out = book / f"{name}.ipynb", folder / "out"
+    notebook = papermill.execute_notebook(
+        repo_root() / "notebooks" / f"{name}.ipynb",
+        None,
+        {"out_dir": str(out), **parameters},
         prepare_only=True,
         kernel_name="python3",
         language="python",
     )
+    notebook.cells += [nbformat.v4.new_code_cell(cell) for cell in more_cells]
+    nbformat.write(notebook, file)
     port, token = free_port(), secrets.token_hex(16)
-    own = {
-        f"JUPYTER_{name}_DIR": str(folder / name.lower()) for name in ("CONFIG", "DATA", "RUNTIME")
-    }
+    own = {f"JUPYTER_{part}_DIR": str(folder / part) for part in ("CONFIG", "DATA", "RUNTIME")}
     options = [
         "--no-browser",
         "--allow-root",
@@ -88,31 +89,27 @@ def serve(folder, name, source=None, **parameters):
         address = f"http://127.0.0.1:{port}"
         try:
             wait_for_server(f"{address}/api?token={token}", server, folder / "lab.log")
-            yield SimpleNamespace(
-                address=address,
-                url=f"{address}/doc/tree/{name}.ipynb?token={token}",
-                notebook=book / f"{name}.ipynb",
-                out=folder / "out",
-            )
+            url = f"{address}/doc/tree/{name}.ipynb?token={token}"
+            yield SimpleNamespace(address=address, url=url, notebook=file, out=out)
         finally:
             server.terminate()
             server.wait(timeout=30)
 
 
 def wait_for_server(url, server, log):
-    end = time.monotonic() + 60
-    while time.monotonic() < end:
+    def answers():
         assert server.poll() is None, log.read_text()
         try:
             urllib.request.urlopen(url, timeout=5).close()
-            return
         except (URLError, OSError):
-            time.sleep(0.2)
-    raise AssertionError(f"JupyterLab did not answer:\n{log.read_text()}")
+            return False
+        return True
+
+    wait_until(answers, 60, f"JupyterLab did not answer, see {log}")
 
 
 @contextmanager
-def opened(lab, shows=".affordlib-table svg .plan .prediction"):
+def opened(lab):
     """The notebook, all its cells run, and `requests`: every address that was asked for."""
     from playwright.sync_api import sync_playwright
 
@@ -131,7 +128,7 @@ def opened(lab, shows=".affordlib-table svg .plan .prediction"):
             "?.status === 'idle'"
         )
         page.evaluate("window.jupyterapp.commands.execute('notebook:run-all-cells')")
-        page.locator(shows).first.wait_for(timeout=90_000)
+        page.locator(".affordlib-table .prediction").first.wait_for(timeout=90_000)
         ask(page, "1")  # answered after all cells
         yield page
         browser.close()
@@ -219,11 +216,15 @@ def words(page):
     return page.locator(".affordlib-picker [role=status]").inner_text()
 
 
-def wait_for_words(page, text, seconds=40):
+def wait_until(condition, seconds=20, otherwise="waited in vain"):
     end = time.monotonic() + seconds
-    while text not in words(page):
-        assert time.monotonic() < end, f"waited for {text!r}, but it says {words(page)!r}"
+    while not condition():
+        assert time.monotonic() < end, otherwise
         time.sleep(0.05)
+
+
+def wait_for_words(page, text, seconds=40):
+    wait_until(lambda: text in words(page), seconds, f"waited for {text!r}")
 
 
 def assert_same_goal(page, table, x_m, y_m, within_m=0.0011):
@@ -241,17 +242,6 @@ def assert_same_goal(page, table, x_m, y_m, within_m=0.0011):
     np.testing.assert_allclose(drawn, planned, atol=2e-4)
 
 
-def wait_until(condition, seconds=20, otherwise="waited in vain"):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, otherwise
-        time.sleep(0.05)
-
-
-def assert_goal(page, condition, seconds=20):
-    wait_until(lambda: condition(goal_of(page)), seconds, "the goal stays as it is")
-
-
 def hosts(page):
     """Where the page has asked anything."""
     asked = (url for url in page.requests if not url.startswith(("data:", "blob:")))
@@ -261,11 +251,12 @@ def hosts(page):
 def saved_outputs(page, lab):
     """The notebook is saved as a reader saves it: all outputs that are then in its file."""
     page.evaluate("window.jupyterapp.commands.execute('docmanager:save')")
-    end = time.monotonic() + 20
-    while True:
+    outputs = []
+
+    def saved():
         cells = nbformat.read(lab.notebook, as_version=4).cells
-        outputs = [output for cell in cells for output in cell.get("outputs", [])]
-        if any(WIDGET in output.get("data", ()) for output in outputs):
-            return outputs
-        assert time.monotonic() < end, "the notebook was not saved with its widget"
-        time.sleep(0.05)
+        outputs[:] = [output for cell in cells for output in cell.get("outputs", [])]
+        return any(WIDGET in output.get("data", ()) for output in outputs)
+
+    wait_until(saved, otherwise="the notebook was not saved with its widget")
+    return outputs

@@ -1,4 +1,4 @@
-"""Notebook 00 in a real browser: mouse, keyboard and buttons of its goal picker."""
+"""Notebook 00, and the two explorers, in a real browser: mouse, keyboard, buttons, requests."""
 
 import json
 import os
@@ -13,7 +13,6 @@ from tests.show.lab_pages import (
     WIDGET,
     Table,
     ask,
-    assert_goal,
     assert_same_goal,
     button,
     choose,
@@ -31,10 +30,26 @@ from tests.show.lab_pages import (
 
 pytestmark = in_a_browser
 
+EXPLORERS = [
+    """from affordlib.primitives import Push
+from affordlib.show import ConditioningExplorer, PhaseSlider
+
+table = Tabletop()
+table.place(Cuboid(0.07, 0.05, 0.05), (0.02, -0.01), 0.4)
+seen = table.execute_primitive(Push.towards(0.6))
+explorer = ConditioningExplorer(load_checkpoint("push_film")[0], seen)
+explorer.observe_at((0.1, 0.9), 0.7, 0.5)
+explorer""",
+    """table.place(Cuboid(0.07, 0.05, 0.05), (0.02, -0.01), 0.4)
+slider = PhaseSlider(table, Push.towards(0.6), phase=0.8)
+slider""",
+]
+
 
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory):
-    with serve(tmp_path_factory.mktemp("lab"), "00_start_here", film_every=240) as lab:
+    folder = tmp_path_factory.mktemp("lab")
+    with serve(folder, "00_start_here", EXPLORERS, film_every=240) as lab:
         yield lab
 
 
@@ -104,22 +119,26 @@ def test_arrow_keys(page, table):
 def test_sliders_by_keyboard(page, table):
     x, y = goal_of(page)
     handles = page.locator(".affordlib-picker .noUi-handle")
-    handles.nth(0).focus()
-    page.keyboard.press("ArrowRight")
-    assert_goal(page, lambda goal: goal[0] > x)
-    handles.nth(1).focus()
-    page.keyboard.press("ArrowLeft")
-    assert_goal(page, lambda goal: goal[1] < y)
-    assert_same_goal(page, table, *goal_of(page))
-
-
-def test_planner(page, table):
-    choose(page, "gradient")
-    wait_until(lambda: ask(page, "picker.plan.planner") == "gradient_direction")
-    assert_same_goal(page, table, *goal_of(page))
-    choose(page, "A*")
-    wait_until(lambda: ask(page, "picker.plan.planner") == "astar")
+    for slider, key, presses in (
+        (0, "Right", 1),
+        (1, "Left", 1),
+        (2, "Right", 6),
+        (3, "Right", 10),
+    ):
+        handles.nth(slider).focus()
+        for _ in range(presses):
+            page.keyboard.press(f"Arrow{key}")
+    wanted = [pytest.approx(np.radians(30)), pytest.approx(0.05)]  # no key press is lost
+    wait_until(lambda: ask(page, "[picker.goal.turn_rad, picker.goal.height_m]") == wanted)
+    wait_for_words(page, "then grasp to")
     table.wait_for_answer()
+    goal = goal_of(page)
+    assert goal[0] > x
+    assert goal[1] < y
+    assert_same_goal(page, table, *goal)
+    np.testing.assert_allclose(table.points(".predicted"), table.points(".wanted"), atol=0.021)
+    picture(page, "7_turn_and_lift")
+    ask(page, "picker.set_pose()")
 
 
 def test_run(page, table):
@@ -154,23 +173,6 @@ def test_run_and_stop_by_keyboard(page, table):
     assert ask(page, "picker.outcome.distance_m") > 0.05
 
 
-def test_disturb(page, table):
-    button(page, "Start over").click()
-    wait_for_words(page, "Plan:")
-    goal, pose = goal_of(page), ask(page, "playground.object_pose()")
-    drawn = table.points(".object").mean(axis=0)
-    button(page, "Shove it").click()
-    wait_until(lambda: ask(page, "playground.object_pose()") != pose)
-    shoved = ask(page, "playground.object_pose()")
-    assert 0.019 < np.hypot(*np.subtract(shoved[:2], pose[:2])) < 0.041
-    moved = table.points(".object").mean(axis=0) - drawn
-    np.testing.assert_allclose(moved, np.subtract(shoved[:2], pose[:2]), atol=1e-3)
-    button(page, "Move goal").click()
-    assert_goal(page, lambda new: new != goal)
-    assert_same_goal(page, table, *goal_of(page))
-    picture(page, "5_disturbed")
-
-
 def test_a_closed_loop_follows_a_goal_that_moves(page, table):
     button(page, "Start over").click()
     page.mouse.click(*table.at(0.18, 0.0))
@@ -179,6 +181,7 @@ def test_a_closed_loop_follows_a_goal_that_moves(page, table):
     button(page, "Run").click()
     page.wait_for_function("() => document.querySelector('.trail')?.getAttribute('points')")
     page.mouse.click(*table.at(0.1, 0.16))
+    button(page, "Shove it").click()
     wait_for_words(page, "from the goal, within")
     assert ask(page, "picker.outcome.distance_m") < 0.01
     goal = ask(page, "picker.goal.xy_m")
@@ -206,21 +209,7 @@ def test_everything_can_be_pressed_without_a_mouse(page, table):
     page.keyboard.press("Tab")
     assert page.evaluate(f"{focused}.innerText").strip() == "Move goal"
     page.keyboard.press("Space")
-    assert_goal(page, lambda new: new != goal)
-
-
-def test_save_and_load(page, table, lab):
-    page.mouse.click(*table.at(-0.1, 0.05))
-    assert_same_goal(page, table, -0.1, 0.05)
-    button(page, "Save").click()
-    wait_for_words(page, "Saved the plan")
-    assert (lab.out / "plan.json").is_file()
-    goal = goal_of(page)
-    page.mouse.click(*table.at(0.0, 0.15))
-    assert_same_goal(page, table, 0.0, 0.15)
-    button(page, "Load").click()
-    wait_for_words(page, "Loaded.")
-    assert_same_goal(page, table, *goal)
+    wait_until(lambda: goal_of(page) != goal)
 
 
 QUIET_S = 0.04
@@ -288,29 +277,46 @@ def test_the_plan_follows_the_hand(page, table):
     assert_same_goal(page, table, *goal_of(page))
 
 
-def test_turn_and_lift(page, table):
-    button(page, "Start over").click()
-    page.mouse.click(*table.at(0.1, 0.04))
-    assert_same_goal(page, table, 0.1, 0.04)
-    handles = page.locator(".affordlib-picker .noUi-handle")
-    for slider, key, presses in ((2, "ArrowRight", 6), (3, "ArrowRight", 10)):
-        handles.nth(slider).focus()
-        for _ in range(presses):
-            page.keyboard.press(key)
-    asked = [pytest.approx(np.radians(30)), pytest.approx(0.05)]
-    wait_until(lambda: ask(page, "[picker.goal.turn_rad, picker.goal.height_m]") == asked)
-    wait_for_words(page, "then grasp to")
-    wanted, predicted = table.points(".wanted"), table.points(".predicted")
-    np.testing.assert_allclose(predicted, wanted, atol=0.021)  # placed and turned alike
-    assert page.locator(".affordlib-table .step").last.text_content().endswith("%")
-    picture(page, "7_turn_and_lift")
-    choose(page, "closed loop")
-    button(page, "Run").click()
-    wait_for_words(page, "The height is off by")
-    assert "The turn is off by" in words(page)
-    assert ask(page, "playground.object_state()[2]") == pytest.approx(0.025 + 0.05, abs=0.01)
-    picture(page, "7_turned_and_lifted")
-    choose(page, "open loop")
+def handle_of(page, widget, name):
+    """A handle in a figure, in shares of its width and height, and the phase where it is."""
+    k = ask(page, f"[name for _, name, *_ in {widget}._handles]").index(name)
+    scene = ask(page, f"{widget}._drawing.scene")
+    width, height = map(float, scene["box"].split()[2:])
+    at = scene["handles"][k]
+    y = (at["top"] + at["bottom"]) / 2 if at["y"] is None else at["y"]
+    phase = (at["x"] - at["left"]) / (at["right"] - at["left"])
+    return at["left"] / width, at["right"] / width, y / height, phase
+
+
+@pytest.mark.parametrize(
+    ("widget", "name", "phase", "control"),
+    [
+        ("explorer", "first action", 0.3, "explorer._action_t.value[0]"),
+        ("explorer", "second action", 0.6, "explorer._action_t.value[1]"),
+        ("explorer", "effect", 0.95, "explorer._effect_t.value"),
+        ("slider", "phase", 0.65, "slider.phase"),
+    ],
+)
+def test_what_is_marked_in_a_figure_is_dragged(page, widget, name, phase, control):
+    figure = page.locator(".affordlib-drawing img:visible").nth(widget == "slider")
+    figure.scroll_into_view_if_needed()
+    before, box = figure.get_attribute("src"), figure.bounding_box()
+    left, right, y, now = handle_of(page, widget, name)
+    x0, x1 = (box["x"] + (left + at * (right - left)) * box["width"] for at in (now, phase))
+    page.mouse.move(x0, box["y"] + y * box["height"])
+    page.mouse.down()
+    page.mouse.move(x1, box["y"] + y * box["height"], steps=6)
+    picture(page, f"figure_{name.replace(' ', '_')}")
+    page.mouse.up()
+    there = pytest.approx(phase, abs=0.011)
+    wait_until(lambda: ask(page, control) == there == handle_of(page, widget, name)[3])
+    wait_until(lambda: figure.get_attribute("src") != before)
+    wanted = ask(page, f"{widget}._drawing.wanted")
+    page.mouse.move(box["x"] + 5, box["y"] + 5)  # where no handle is
+    page.mouse.down()
+    page.mouse.move(box["x"] + 200, box["y"] + 50, steps=4)
+    page.mouse.up()
+    assert ask(page, f"{widget}._drawing.wanted") == wanted
 
 
 def test_a_saved_notebook_keeps_a_picture(page, lab):
@@ -326,22 +332,3 @@ def test_no_request_leaves_the_machine(page, lab):
     assert hosts(page) == {urlparse(lab.address).netloc}
     assert any("ws" in urlparse(url).scheme for url in page.requests)
     assert page.locator("text=Would you like to get notified").count() == 0
-
-
-def test_run_waits_for_the_plan_of_what_is_shown(page, table):
-    """A slow planner, two clicks, and Run while it still thinks of the first."""
-    button(page, "Start over").click()
-    choose(page, "gradient")
-    table.wait_for_answer()
-    page.mouse.click(*table.at(0.12, 0.1))
-    page.wait_for_timeout(400)
-    page.mouse.click(*table.at(-0.1, 0.08))
-    page.wait_for_function("svg => svg.dataset.planning === 'true'", arg=table.svg.element_handle())
-    button(page, "Run").click()
-    wait_for_words(page, "the object rests")
-    assert ask(page, "list(picker.outcome.plan.goal.xy_m)") == pytest.approx([-0.1, 0.08], abs=2e-3)
-    assert ask(page, "picker.outcome.plan.planner").startswith("gradient")
-    np.testing.assert_allclose(table.goal(), ask(page, "list(picker.goal.xy_m)"), atol=1e-4)
-    choose(page, "continuous")
-    button(page, "Start over").click()
-    table.wait_for_answer()
