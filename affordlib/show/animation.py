@@ -1,4 +1,4 @@
-"""Small animations of the robot at work: frames while the world runs, a GIF or PNG by Pillow."""
+"""Small animations of the robot at work: recorded frames, encoded as a GIF or PNG by Pillow."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ class FrameRecorder:
         self._steps += 1
 
     def add(self, figure: Figure) -> None:
-        """Add a picture of a figure, as high as the film is; all frames must be as wide."""
-        frame = np.asarray(_drawn(figure, self.height))
+        """Add a picture of a figure, in the recorder's height; all frames must be as wide."""
+        frame = _drawn(figure, self.height)
         if self.frames and frame.shape != self.frames[0].shape:
             sizes = [f"{f.shape[1]}×{f.shape[0]}" for f in (frame, self.frames[0])]
             raise ValueError(
@@ -53,17 +53,19 @@ class FrameRecorder:
             raise RuntimeError(
                 "there are no frames; set world.on_step to the recorder before the robot moves"
             )
-        pictures = [Image.fromarray(frame) for frame in self.frames]
+        frames = self.frames
         if beside is not None:
-            left = _drawn(beside, pictures[0].height)
-            pictures = [_joined(left, picture) for picture in pictures]
+            left = _drawn(beside, frames[0].shape[0])
+            frames = [np.hstack([left, frame]) for frame in frames]
         # One palette for all frames, drawn from a few of them, or colours flicker.
-        few = [pictures[round(k * (len(pictures) - 1) / 3)] for k in range(4)]
-        sheet = Image.new("RGB", (few[0].width, len(few) * few[0].height))
-        for k, picture in enumerate(few):
-            sheet.paste(picture, (0, k * picture.height))
-        palette = sheet.quantize(255, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
-        indexed = [p.quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures]
+        few = [frames[round(k * (len(frames) - 1) / 3)] for k in range(4)]
+        palette = Image.fromarray(np.vstack(few)).quantize(
+            255, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE
+        )
+        indexed = [
+            Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE)
+            for frame in frames
+        ]
         buffer = io.BytesIO()
         durations = [frame_ms] * (len(indexed) - 1) + [1500]
         indexed[0].save(
@@ -72,18 +74,13 @@ class FrameRecorder:
         return buffer.getvalue()
 
 
-def _drawn(figure: Figure, height: int) -> Image.Image:
+def _drawn(figure: Figure, height: int) -> np.ndarray:
+    """A figure as pixels (height, width, 3)."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=2 * height / figure.get_figheight())
     picture = Image.open(buffer).convert("RGB")
-    return picture.resize((picture.width // 2, picture.height // 2), Image.Resampling.LANCZOS)
-
-
-def _joined(left: Image.Image, right: Image.Image) -> Image.Image:
-    both = Image.new("RGB", (left.width + right.width, right.height), "white")
-    both.paste(left, (0, 0))
-    both.paste(right, (left.width, 0))
-    return both
+    size = (picture.width // 2, picture.height // 2)
+    return np.asarray(picture.resize(size, Image.Resampling.LANCZOS))
 
 
 def show_animation(
