@@ -37,7 +37,7 @@ from affordlib.show import ConditioningExplorer, PhaseSlider
 table = Tabletop()
 table.place(Cuboid(0.07, 0.05, 0.05), (0.02, -0.01), 0.4)
 seen = table.execute_primitive(Push.towards(0.6))
-explorer = ConditioningExplorer(load_checkpoint("push_film")[0], seen)
+explorer = ConditioningExplorer(load_checkpoint("film_500")[0], seen)
 explorer.observe_at((0.1, 0.9), 0.7, 0.5)
 explorer""",
     """table.place(Cuboid(0.07, 0.05, 0.05), (0.02, -0.01), 0.4)
@@ -119,23 +119,22 @@ def test_arrow_keys(page, table):
 def test_sliders_by_keyboard(page, table):
     x, y = goal_of(page)
     handles = page.locator(".affordlib-picker .noUi-handle")
-    for slider, key, presses in (
-        (0, "Right", 1),
-        (1, "Left", 1),
-        (2, "Right", 6),
-        (3, "Right", 10),
-    ):
+
+    def press(slider, key, presses):
         handles.nth(slider).focus()
         for _ in range(presses):
-            page.keyboard.press(f"Arrow{key}")
+            page.keyboard.press(key)
+
+    press(0, "ArrowRight", 1)
+    press(1, "ArrowLeft", 1)
+    wait_until(lambda: goal_of(page)[0] > x and goal_of(page)[1] < y)
+    assert_same_goal(page, table, *goal_of(page))
+    press(2, "ArrowRight", 6)
+    press(3, "ArrowRight", 10)
     wanted = [pytest.approx(np.radians(30)), pytest.approx(0.05)]  # no key press is lost
     wait_until(lambda: ask(page, "[picker.goal.turn_rad, picker.goal.height_m]") == wanted)
     wait_for_words(page, "then grasp to")
     table.wait_for_answer()
-    goal = goal_of(page)
-    assert goal[0] > x
-    assert goal[1] < y
-    assert_same_goal(page, table, *goal)
     np.testing.assert_allclose(table.points(".predicted"), table.points(".wanted"), atol=0.021)
     picture(page, "7_turn_and_lift")
     ask(page, "picker.set_pose()")
