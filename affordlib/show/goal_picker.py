@@ -412,11 +412,12 @@ class GoalPicker(WithPicture, widgets.VBox):
 
     def _displacement(self, xy_m: tuple[float, float], least_m: float, most_m: float) -> np.ndarray:
         """A random displacement (2,) [m] that stays in sight; from outside, one to the middle."""
-        angle, far = self._rng.uniform(0, 2 * np.pi, 100), self._rng.uniform(least_m, most_m)
-        ways = far * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        in_sight = np.abs(ways + xy_m).max(axis=1) < LIMIT_M
-        to_middle = -far * np.array(xy_m) / np.hypot(*xy_m)
-        return ways[in_sight.argmax()] if in_sight.any() else to_middle
+        for _ in range(100):
+            angle, far = self._rng.uniform(0, 2 * np.pi), self._rng.uniform(least_m, most_m)
+            by = far * np.array([np.cos(angle), np.sin(angle)])
+            if np.abs(np.add(xy_m, by)).max() < LIMIT_M:
+                return by
+        return -far * np.array(xy_m) / np.hypot(*xy_m)
 
     # What is seen
 

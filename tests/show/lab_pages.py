@@ -50,7 +50,7 @@ def free_port():
 def serve(folder, name, more_cells=(), **parameters):
     """A JupyterLab with settings, workspaces and run-time files of its own, and one notebook.
 
-    more_cells: code that is added to the end of the notebook.
+    more_cells: code that is added after the goal picker; what is far off is not in the page.
     """
     book = folder / "book"
     book.mkdir()
@@ -63,7 +63,8 @@ def serve(folder, name, more_cells=(), **parameters):
         kernel_name="python3",
         language="python",
     )
-    notebook.cells += [nbformat.v4.new_code_cell(cell) for cell in more_cells]
+    after = [k for k, cell in enumerate(notebook.cells) if "GoalPicker(" in cell.source][-1] + 1
+    notebook.cells[after:after] = [nbformat.v4.new_code_cell(cell) for cell in more_cells]
     nbformat.write(notebook, file)
     port, token = free_port(), secrets.token_hex(16)
     own = {f"JUPYTER_{part}_DIR": str(folder / part) for part in ("CONFIG", "DATA", "RUNTIME")}

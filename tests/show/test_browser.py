@@ -297,7 +297,7 @@ def handle_of(page, widget, name):
     ],
 )
 def test_what_is_marked_in_a_figure_is_dragged(page, widget, name, phase, control):
-    figure = page.locator(".affordlib-drawing img:visible").nth(widget == "slider")
+    figure = page.locator(".affordlib-drawing img:not([hidden])").nth(int(widget == "slider"))
     figure.scroll_into_view_if_needed()
     before, box = figure.get_attribute("src"), figure.bounding_box()
     left, right, y, now = handle_of(page, widget, name)
