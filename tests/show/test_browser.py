@@ -121,9 +121,8 @@ def test_sliders_by_keyboard(page, table):
     handles = page.locator(".affordlib-picker .noUi-handle")
 
     def press(slider, key, presses):
-        handles.nth(slider).focus()
         for _ in range(presses):
-            page.keyboard.press(key)
+            handles.nth(slider).press(key)
 
     press(0, "ArrowRight", 1)
     press(1, "ArrowLeft", 1)
@@ -278,7 +277,9 @@ def test_the_plan_follows_the_hand(page, table):
 
 def handle_of(page, widget, name):
     """A handle in a figure, in shares of its width and height, and the phase where it is."""
-    k = ask(page, f"[name for _, name, *_ in {widget}._handles]").index(name)
+    names = f"[name for _, name, *_ in {widget}._handles]"
+    wait_until(lambda: name in ask(page, names))  # not while the figure is being drawn
+    k = ask(page, names).index(name)
     scene = ask(page, f"{widget}._drawing.scene")
     width, height = map(float, scene["box"].split()[2:])
     at = scene["handles"][k]
