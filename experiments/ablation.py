@@ -31,29 +31,29 @@ Rows = list[dict[str, Any]]
 
 
 def random_contexts(
-    arrays: InteractionTensors, rows: torch.Tensor, n_targets: int, obs_max: int, g: torch.Generator
+    arrays: InteractionTensors, n_targets: int, obs_max: int, g: torch.Generator
 ) -> Batch:
     """As `sample_mixed`, but no context is one that will be asked: all phases are random."""
-    batch = sample_mixed(arrays, rows, n_targets, obs_max, g)
+    batch = sample_mixed(arrays, n_targets, obs_max, g)
     o, n = batch.observations, len(arrays.phase)
     action_at, effect_at = (torch.randint(n, m.shape, generator=g) for m in (o.action_mask,) * 2)
-    part = arrays.select(rows)
-    seen = Observations.of(part, part.action_at(action_at), part.effect_at(effect_at), o.weight)
+    action, effect = arrays.action_at(action_at), arrays.effect_at(effect_at)
+    seen = Observations.of(arrays, action, effect, o.weight)
     masks = {"action_mask": o.action_mask, "effect_mask": o.effect_mask}
     return replace(batch, observations=replace(seen, **masks))
 
 
-def half_blend(arrays: InteractionTensors, rows: torch.Tensor, *sizes: Any) -> Batch:
+def half_blend(arrays: InteractionTensors, *sizes: Any) -> Batch:
     """As `sample_mixed`, but w₁ = ½ wherever both are observed."""
-    batch = sample_mixed(arrays, rows, *sizes)
+    batch = sample_mixed(arrays, *sizes)
     o = batch.observations
     both = (o.weight > 0) & (o.weight < 1)
     return replace(batch, observations=replace(o, weight=torch.where(both, 0.5, o.weight)))
 
 
-def actions_only(arrays: InteractionTensors, rows: torch.Tensor, *sizes: Any) -> Batch:
+def actions_only(arrays: InteractionTensors, *sizes: Any) -> Batch:
     """As `sample_mixed`, but only actions are observed: effects are never asked about actions."""
-    batch = sample_mixed(arrays, rows, *sizes)
+    batch = sample_mixed(arrays, *sizes)
     o = batch.observations
     first = torch.arange(o.action_mask.shape[1]) == 0
     seen = replace(
@@ -66,11 +66,11 @@ def actions_only(arrays: InteractionTensors, rows: torch.Tensor, *sizes: Any) ->
 
 
 def one_at_a_time(
-    arrays: InteractionTensors, rows: torch.Tensor, n_targets: int, obs_max: int, g: torch.Generator
+    arrays: InteractionTensors, n_targets: int, obs_max: int, g: torch.Generator
 ) -> Batch:
-    """The paper's draw: one trajectory, one target."""
-    row = torch.randint(len(rows), (1,), generator=g)  # any of the batch, turned or mirrored or not
-    return sample_literal(arrays.select(rows[row]), obs_max, g)
+    """As in the paper: one trajectory, one target."""
+    row = torch.randint(len(arrays), (1,), generator=g)  # any of the batch, rotated or not
+    return sample_literal(arrays.select(row), obs_max, g)
 
 
 def _plain_start(model: FiLMNetwork) -> None:

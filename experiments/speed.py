@@ -132,7 +132,7 @@ def training(
 
     def batch() -> Any:
         rows = torch.randint(len(pushes), (size,), generator=generator)
-        return sample_mixed(pushes, rows, n_targets, 10, generator)
+        return sample_mixed(pushes.select(rows), n_targets, 10, generator)
 
     def stepper(draw: Callable[[], Any], fused: bool | None) -> Callable[[], None]:
         optimiser = torch.optim.Adam(model.parameters(), 1e-4, fused=fused)
@@ -244,15 +244,14 @@ def lever_up(n: int = 256, epoch: int = 1440) -> Rows:
         generator = torch.Generator().manual_seed(0)
 
         def step(model=model, arrays=arrays, size=size, optimiser=optimiser, g=generator) -> None:
-            rows = torch.randint(0, n, (size,), generator=g)
+            part = arrays.select(torch.randint(0, n, (size,), generator=g))
             optimiser.zero_grad()
             if isinstance(model, PublishedLSTM):
                 start = torch.randint(0, 11, (size,), generator=g)
-                model.next_step_loss(arrays.select(rows), start, N_OBSERVED).backward()
+                model.next_step_loss(part, start, N_OBSERVED).backward()
             else:
-                batch_loss(
-                    model, sample_windows(arrays, rows, N_PREDICTED, N_OBSERVED, g), 0.5
-                ).backward()
+                batch = sample_windows(part, N_PREDICTED, N_OBSERVED, g)
+                batch_loss(model, batch, 0.5).backward()
             optimiser.step()
 
         step()

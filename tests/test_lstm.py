@@ -102,7 +102,7 @@ def test_an_lstm_of_pushes_is_a_model_like_the_others(pushes):
     model = build(LSTMConfig(frame="push", steps=5, width=16), Scaler.fit(few)).eval()
     torch.nn.init.normal_(model.last[-1].weight)  # zero at first, so that it begins by coasting
     assert isinstance(model, EffectModel)
-    batch = sample_forward(few, torch.arange(8), 3, 1, torch.Generator().manual_seed(0))
+    batch = sample_forward(few.select(torch.arange(8)), 3, 1, torch.Generator().manual_seed(0))
     loss = model.loss(batch.image, batch.observations, batch.t_target, batch.action, batch.effect)
     assert torch.isfinite(loss)
     seen = condition_on_primitives(model, [Push(0.3)])

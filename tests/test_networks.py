@@ -62,7 +62,7 @@ def made(name, arrays):
 def asked(arrays, seed=0, n_targets=5):
     """A batch of all kinds of contexts for all interactions."""
     generator = torch.Generator().manual_seed(seed)
-    return sample_mixed(arrays, torch.arange(len(arrays)), n_targets, 4, generator)
+    return sample_mixed(arrays, n_targets, 4, generator)
 
 
 def answers(network, image, observations, t_target):

@@ -67,7 +67,7 @@ def test_draws_leave_out_one_thing_each(pushes):
     rows = torch.arange(80)
 
     def drawn(draw):
-        return draw(arrays, rows, 4, 6, torch.Generator().manual_seed(0))
+        return draw(arrays, 4, 6, torch.Generator().manual_seed(0))
 
     plain, blended = drawn(sample_mixed), drawn(half_blend)
     both = (plain.observations.weight > 0) & (plain.observations.weight < 1)

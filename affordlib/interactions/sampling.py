@@ -1,8 +1,8 @@
 """Training batches: which context a model observes, and at which phases it has to predict.
 
 Section 3.2 of the paper: k observations, k uniform in 1 … obs_max, at random phases of a random
-trajectory. A sampler takes interactions, the numbers of those in the batch, n_targets, obs_max and
-a generator, and returns a `Batch`.
+trajectory. A sampler takes the interactions of a batch, n_targets, obs_max and a generator, and
+returns a `Batch`.
 """
 
 from __future__ import annotations
@@ -53,18 +53,13 @@ def condition_on_poses(
 
 
 def sample_mixed(
-    tensors: InteractionTensors,
-    rows: torch.Tensor,
-    n_targets: int,
-    obs_max: int,
-    generator: torch.Generator,
+    tensors: InteractionTensors, n_targets: int, obs_max: int, generator: torch.Generator
 ) -> Batch:
     """Action, effect or both are observed; half of the contexts are those of the later queries.
 
     These are the action at t = 0 (and 1), and the effect at t = 1. t = 1 is always a target.
     """
-    part = tensors.select(rows)
-    b, last = len(rows), len(tensors.phase) - 1
+    b, last = len(tensors), len(tensors.phase) - 1
 
     def uniform(*shape):
         return torch.rand(*shape, generator=generator)
@@ -91,57 +86,44 @@ def sample_mixed(
 
     target_at = samples(b, n_targets)
     target_at[:, 0] = last
-    observed = Observations.of(part, part.action_at(action_at), part.effect_at(effect_at), weight)
-    return Batch.of(
-        part, replace(observed, action_mask=action_mask, effect_mask=effect_mask), target_at
+    observed = Observations.of(
+        tensors, tensors.action_at(action_at), tensors.effect_at(effect_at), weight
     )
+    observed = replace(observed, action_mask=action_mask, effect_mask=effect_mask)
+    return Batch.of(tensors, observed, target_at)
 
 
 def sample_forward(
-    tensors: InteractionTensors,
-    rows: torch.Tensor,
-    n_targets: int,
-    obs_max: int,
-    generator: torch.Generator,
+    tensors: InteractionTensors, n_targets: int, obs_max: int, generator: torch.Generator
 ) -> Batch:
     """Only the action at t = 0 and 1 is observed; obs_max is not used."""
-    part, last = tensors.select(rows), len(tensors.phase) - 1
-    target_at = torch.randint(0, last + 1, (len(rows), n_targets), generator=generator)
+    last = len(tensors.phase) - 1
+    target_at = torch.randint(0, last + 1, (len(tensors), n_targets), generator=generator)
     target_at[:, 0] = last
-    return Batch.of(part, condition_on_recorded_action(part), target_at)
+    return Batch.of(tensors, condition_on_recorded_action(tensors), target_at)
 
 
 def sample_windows(
-    tensors: InteractionTensors,
-    rows: torch.Tensor,
-    n_targets: int,
-    obs_max: int,
-    generator: torch.Generator,
+    tensors: InteractionTensors, n_targets: int, obs_max: int, generator: torch.Generator
 ) -> Batch:
     """Windows anywhere: obs_max samples are observed, the n_targets after them are targets."""
-    part = tensors.select(rows)
     latest = len(tensors.phase) - obs_max - n_targets
-    start = torch.randint(0, latest + 1, (len(rows),), generator=generator)
+    start = torch.randint(0, latest + 1, (len(tensors),), generator=generator)
     target_at = start[:, None] + obs_max + torch.arange(n_targets)
-    return Batch.of(part, condition_on_poses(part, start, obs_max), target_at)
+    return Batch.of(tensors, condition_on_poses(tensors, start, obs_max), target_at)
 
 
 def sample_from_start(
-    tensors: InteractionTensors,
-    rows: torch.Tensor,
-    n_targets: int,
-    obs_max: int,
-    generator: torch.Generator,
+    tensors: InteractionTensors, n_targets: int, obs_max: int, generator: torch.Generator
 ) -> Batch:
     """All later samples are targets; the first pose is observed in every other batch.
 
     n_targets and obs_max are not used.
     """
-    part = tensors.select(rows)
     n_poses = int(torch.randint(0, 2, (1,), generator=generator))
-    start = torch.zeros(len(rows), dtype=torch.long)
+    start = torch.zeros(len(tensors), dtype=torch.long)
     target_at = torch.arange(1, len(tensors.phase))
-    return Batch.of(part, condition_on_poses(part, start, n_poses), target_at)
+    return Batch.of(tensors, condition_on_poses(tensors, start, n_poses), target_at)
 
 
 def sample_literal(tensors: InteractionTensors, obs_max: int, generator: torch.Generator) -> Batch:

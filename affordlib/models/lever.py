@@ -134,13 +134,12 @@ def _all_errors_m(model: EffectNetwork, arrays: InteractionTensors) -> Tensor:
 
 def _draw_all(
     arrays: InteractionTensors,
-    rows: Tensor,
     n_targets: int,
     obs_max: int,
     generator: torch.Generator,
 ) -> Batch:
     draw = (sample_windows, sample_from_start)[int(torch.randint(0, 2, (1,), generator=generator))]
-    return draw(arrays, rows, n_targets, obs_max, generator)
+    return draw(arrays, n_targets, obs_max, generator)
 
 
 _DRAWS = {"all": _draw_all, "window": sample_windows, "first_step": sample_from_start}

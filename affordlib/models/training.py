@@ -40,7 +40,7 @@ from affordlib.models.lstm import LSTMNetwork, courses
 from affordlib.models.network import EffectNetwork, NetworkConfig
 from affordlib.types import check_count, check_field, check_within
 
-Draw = Callable[[InteractionTensors, torch.Tensor, int, int, torch.Generator], Batch]
+Draw = Callable[[InteractionTensors, int, int, torch.Generator], Batch]
 Score = Callable[["EffectNetwork", InteractionTensors], torch.Tensor]
 _AUTO = "cuda" if torch.cuda.is_available() else "cpu"
 
@@ -246,7 +246,6 @@ def train(
             arrays = training.select(rows)
             batch = draw(
                 _augmented(arrays) if config.augment else arrays,
-                torch.arange(len(rows)),
                 config.n_targets,
                 config.obs_max,
                 run.generator,

@@ -61,7 +61,7 @@ def test_full_executions_train_and_partial_ones_are_a_set_of_their_own(shipped):
     assert 0.95 < stop.max() < 1
     arrays = InteractionTensors.from_dataset(data, np.arange(20))
     stop = torch.from_numpy(stop[:20]).float()
-    batch = sample_mixed(arrays, torch.arange(20), 8, 4, torch.Generator().manual_seed(0))
+    batch = sample_mixed(arrays, 8, 4, torch.Generator().manual_seed(0))
     assert torch.equal(batch.t_target[:, 0], stop)
     assert torch.equal(
         condition_on_recorded_action(arrays.joined(arrays)).action_t[:, 1], stop.repeat(2)
@@ -206,7 +206,7 @@ def test_scaler_keeps_zero_and_gives_unit_size(pushes):
 
 def test_batches_hold_what_the_trajectories_hold(pushes):
     arrays = InteractionTensors.from_dataset(pushes, np.arange(8))
-    batch = sample_mixed(arrays, torch.arange(8), 5, 10, torch.Generator().manual_seed(0))
+    batch = sample_mixed(arrays, 5, 10, torch.Generator().manual_seed(0))
     at = (batch.t_target * 300).round().long()
     assert torch.equal(batch.effect, arrays.effect[torch.arange(8)[:, None], at])
     assert (batch.t_target[:, 0] == 1).all()
