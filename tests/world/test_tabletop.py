@@ -9,12 +9,13 @@ import pybullet
 import pytest
 
 from affordlib.interactions.recipes import Recipe, interact
-from affordlib.primitives import Drag, Grasp, Push, min_jerk, primitive_named
+from affordlib.primitives import Drag, Grasp, LeverUp, Push, primitive_named
 from affordlib.types import CROP_WIDTH_M, IMAGE_PIXELS, Goal
 from affordlib.world import (
     Cuboid,
     LyingCylinder,
     Prism,
+    Sphere,
     Tabletop,
     UnreachableError,
     UprightCylinder,
@@ -26,18 +27,8 @@ from affordlib.world import (
 from affordlib.world.controller import JointController
 
 OBJECTS = (Cuboid(0.05, 0.07, 0.06), UprightCylinder(0.06, 0.05))
-
-
-def test_push_path_is_the_papers():
-    push = Push(theta=0.7)
-    path = push.path(np.linspace(0, 1, 301))
-    start, end = path[0, :2], path[-1, :2]
-    np.testing.assert_allclose(start, 0.2 * np.array([math.cos(0.7), math.sin(0.7)]), atol=1e-12)
-    np.testing.assert_allclose(end, -0.05 * np.array([math.cos(0.7), math.sin(0.7)]), atol=1e-12)
-    speed = np.hypot(*np.diff(path[:, :2], axis=0).T)
-    assert speed.argmax() in (149, 150)
-    assert min_jerk(0.5) == pytest.approx(0.5)
-    assert Push.towards(0.4).direction_rad == pytest.approx(0.4)
+LEVER = LeverUp(-0.03, 0.0, 0.0, 0.06)
+STAR = tuple((0.05 * math.cos(a), 0.05 * math.sin(a)) for a in 0.8 * math.pi * np.arange(5))
 
 
 def test_inverse_kinematics_agrees_with_the_description():
@@ -72,20 +63,6 @@ def test_a_push_ends_beyond_the_gripper(world, obj):
     assert np.abs(seen.effect[: 301 // 2, :2]).max() < 1e-4  # nothing moves before contact
     assert seen.phase.shape == (301,)
     assert seen.action.shape == seen.effect.shape == (301, 5)
-
-
-def test_a_stopped_push_rests_where_the_full_push_was(world):
-    gaps = []
-    for k, stop in enumerate((0.65, 0.75, 0.85, 0.95)):
-        push = Push(1.0 + k)
-        world.place(OBJECTS[k % 2], (0.0, 0.0), 0.3)
-        full = world.execute_primitive(push)
-        world.place(OBJECTS[k % 2], (0.0, 0.0), 0.3)
-        part = world.execute_primitive(push, stop)
-        then = [np.interp(stop, full.phase, full.effect[:, c]) for c in range(2)]
-        gaps.append(np.hypot(*(part.rest_effect[:2] - then)))
-    assert np.median(gaps) < 0.0005
-    assert max(gaps) < 0.0015
 
 
 def test_approach_changes_nothing_that_matters(world):
@@ -143,42 +120,44 @@ def test_the_same_bits_in_a_second_process_and_another_order(world):
     assert seen[0].effect.tobytes() != seen[1].effect.tobytes()
 
 
-def test_unreachable_raises_and_moves_nothing(world):
+def test_unreachable_raises_or_is_recorded_and_moves_nothing(world, monkeypatch):
+    images = []
+    observe = lambda: images.append(1) or Tabletop.observe(world)  # noqa: E731
+    monkeypatch.setattr(world, "observe", observe)
     world.place(OBJECTS[0], (0.45, 0.5), 0.0)
     before = world.object_state()
     with pytest.raises(UnreachableError, match="cannot reach"):
         world.execute_primitive(Push(math.pi / 4), approach=True)
+    assert not world.execute_primitive(Push(math.pi / 4), record_unreachable=True).reached
     assert world.object_state() == before
+    assert len(images) == 2  # noise is drawn once an attempt
 
 
 @pytest.mark.parametrize(
     ("act", "words"),
     [
         (lambda w: Push(math.nan), "theta .* nan"),
-        (lambda w: Push("left"), "theta='left'"),
         (lambda w: Push(0.0, length=-0.1), r"length .* -0\.1"),
         (lambda w: Push(0.0, radius=1.0), "radius .* 1"),
         (lambda w: primitive_named("kick"), "'kick' is unknown; choose one of .'drag', 'grasp'"),
         (lambda w: category_named("cone"), "'cone' is unknown"),
-        (lambda w: Cuboid(0.05, math.inf, 0.05), "Cuboid.width .* inf"),
         (lambda w: UprightCylinder(0.05, 5.0), "Cylinder.height .* 5"),
         (lambda w: Goal((0.9, 0.0)), r"goal xy_m = \(0\.9, 0\) m lies off the table; choose x in"),
-        (lambda w: Goal((0.1, math.nan)), "goal xy_m must be two finite numbers"),
         (lambda w: Goal((0.1, 0.1), tolerance_m=-1), "Goal.tolerance_m .* -1"),
         (lambda w: w.place(OBJECTS[0], (0.0, 2.0)), "xy_m = .* off the table"),
         (lambda w: w.execute_primitive(Push(0.0), 1.5), "stop_phase .* 1.5"),
+        (lambda w: w.place(OBJECTS[0], tool="hammer"), "tool must be one of .* got 'hammer'"),
+        (lambda w: w.execute_primitive(LEVER), r"'lever_up' needs the tool 'screwdriver'.*place\("),
+        (lambda w: w.reset() or w.execute_primitive(Push(0.0)), r"call place\(\.\.\.\) first"),
+        (lambda w: Prism(STAR, 0.05), "convex polygon"),
         (lambda w: WorldConfig(table_friction=-1), "table_friction .* -1"),
+        (lambda w: WorldConfig(camera="sonar"), "camera must be one of .* got 'sonar'"),
     ],
 )
 def test_bad_input_is_named(world, act, words):
     world.place(OBJECTS[0])
-    with pytest.raises((TypeError, ValueError), match=words):
+    with pytest.raises((RuntimeError, TypeError, ValueError), match=words):
         act(world)
-
-
-def test_an_empty_table_says_so():
-    with Tabletop() as empty, pytest.raises(RuntimeError, match=r"call place\(\.\.\.\) first"):
-        empty.execute_primitive(Push(0.0))
 
 
 def test_a_shoved_object_moves_turns_and_rests(world):
@@ -196,13 +175,6 @@ def test_a_shoved_object_moves_turns_and_rests(world):
     world.place(obj, config=WorldConfig())
 
 
-def test_a_star_is_no_convex_polygon():
-    angle = np.pi / 2 + 4 * np.pi / 5 * np.arange(5)
-    star = tuple((0.05 * np.cos(a), 0.05 * np.sin(a)) for a in angle)
-    with pytest.raises(ValueError, match="convex polygon"):
-        Prism(star, 0.05)
-
-
 def test_what_lies_can_be_toppled_again(world):
     world.place(Cuboid(0.04, 0.04, 0.08))
     for _ in range(2):
@@ -210,13 +182,6 @@ def test_what_lies_can_be_toppled_again(world):
         world.topple(0.0)
         world.settle(2.0)
         assert world.object_pose()[0] > x + 0.05
-
-
-def test_another_tool_follows_no_path(world):
-    world.place(Cuboid(0.06, 0.05, 0.05), tool="screwdriver")
-    with pytest.raises(ValueError, match="holds the screwdriver"):
-        world.execute_path(np.array([[-0.2, 0.0], [0.0, 0.0]]))
-    world.place(Cuboid(0.06, 0.05, 0.05))
 
 
 def test_the_fingers_are_tied_only_while_they_close_or_hold(world):
@@ -234,12 +199,15 @@ def test_the_fingers_are_tied_only_while_they_close_or_hold(world):
         assert gears() == 0
 
 
-@pytest.mark.parametrize("obj", [*OBJECTS, LyingCylinder(0.05, 0.07)])
-def test_what_is_held_is_put_down_and_not_dropped(world, obj):
+@pytest.mark.parametrize("obj", [*OBJECTS, LyingCylinder(0.05, 0.07), Sphere(0.06)])
+def test_what_is_held_stays_in_the_hand_and_is_put_down(world, obj):
+    """Held by friction alone it slips by up to 3 mm in 10 s."""
     world.place(obj, (0.05, 0.1))
     world.execute_primitive(Grasp(), 0.7, approach=True)
     held, heights = world.object_state(), []
     assert held[2] > obj.height_m / 2 + 0.05
+    world.settle(10.0)
+    assert world.object_state()[2] == pytest.approx(held[2], abs=2e-4)
     world.on_step = lambda world: heights.append(world.object_state()[2])
     world.park()
     assert -np.diff(heights).min() * 240 < 0.4  # m/s; a fall from there has 1.3
@@ -281,14 +249,6 @@ def test_a_log_that_was_dragged_and_let_go_stays(world, obj, yaw_rad, drags):
     before = world.object_pose()[:2]
     world.settle(10.0)
     assert math.dist(before, world.object_pose()[:2]) < 5e-4
-
-
-def test_a_refused_action_looks_once(world, monkeypatch):
-    looks = []
-    monkeypatch.setattr(world, "observe", lambda: looks.append(1) or Tabletop.observe(world))
-    world.place(OBJECTS[0], (0.45, 0.5))
-    assert not world.execute_primitive(Push(math.pi / 4), record_unreachable=True).reached
-    assert len(looks) == 1
 
 
 def test_a_world_that_is_closed_or_forgotten_is_disconnected():

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from affordlib.geometry import rotated, unit_vector
 from affordlib.interactions import open_interactions
 from affordlib.interactions.recipes import RECIPES, Recipe, Variation, interact
 from affordlib.primitives import PRIMITIVES, Drag, Grasp, LeverUp, Push, Rotate, min_jerk
@@ -36,12 +37,18 @@ def test_a_path_is_smooth_and_passes_its_keyframes(primitive):
     assert np.abs(np.diff(path[:, :3], axis=0)).max() * 1000 < 0.75  # m/s
     for segment, begin in zip(primitive.segments, primitive.segment_phases, strict=False):
         np.testing.assert_allclose(primitive.path(begin)[0], segment.start[:5], atol=1e-9)
+    np.testing.assert_allclose(primitive.ends(), path[[0, -1]], atol=1e-12)
     assert sum(segment.seconds for segment in primitive.segments) == pytest.approx(3.75)
 
 
-@pytest.mark.parametrize("primitive", EXAMPLES, ids=lambda one: one.name)
-def test_the_ends_of_a_path_are_its_first_and_last_pose(primitive):
-    np.testing.assert_allclose(primitive.ends(), primitive.path([0.0, 1.0]), atol=1e-12)
+def test_push_path_is_the_papers():
+    push = Push(theta=0.7)
+    path = push.path(np.linspace(0, 1, 301))[:, :2]
+    np.testing.assert_allclose(path[0], 0.2 * unit_vector(0.7), atol=1e-12)
+    np.testing.assert_allclose(path[-1], -0.05 * unit_vector(0.7), atol=1e-12)
+    assert np.hypot(*np.diff(path, axis=0).T).argmax() in (149, 150)
+    assert min_jerk(np.array([0.0, 0.5, 1.0])).tolist() == [0.0, 0.5, 1.0]
+    assert Push.towards(0.4).direction_rad == pytest.approx(0.4)
 
 
 @pytest.mark.parametrize("name", ["push", "drag", "push_test", "push_varied"])
@@ -59,7 +66,7 @@ def test_a_drag_path_is_caged_before_it_moves():
     closed = drag.segment_phases[2]
     before, after = drag.path(closed)[0], drag.path(drag.segment_phases[3])[0]
     np.testing.assert_allclose(before[[0, 1, 4]], 0.0, atol=1e-12)
-    np.testing.assert_allclose(after[:2], 0.04 * np.array([math.cos(0.5), math.sin(0.5)]))
+    np.testing.assert_allclose(after[:2], 0.04 * unit_vector(0.5))
     assert drag.path(1.0)[0, 4] == 1.0
 
 
@@ -74,15 +81,12 @@ def test_the_lever_turns_about_the_far_edge():
 
 
 @pytest.mark.parametrize("category", CATEGORIES.values(), ids=lambda f: f.category)
-def test_things_rest_where_they_are_placed(world, category):
-    import pybullet
-
+def test_objects_rest_where_they_are_placed(world, category):
     for seed in range(4):
         obj = category.sample(np.random.default_rng(seed))
         world.place(obj, (0.1, -0.2), 0.7, config=CLEAN)
         before = np.array(world.object_state())
-        for _ in range(120):
-            pybullet.stepSimulation(world.client)
+        world.arm.wait(120)
         np.testing.assert_allclose(world.object_state()[:3], before[:3], atol=4e-4)
         assert not world.object_fell()
         assert world.object_rolls() == obj.rollable == (category in (LyingCylinder, Sphere))
@@ -103,20 +107,10 @@ def test_a_prism_is_an_extruded_polygon_about_its_centroid():
 def test_a_dragged_object_stays_where_it_is_let_go(world, index):
     _, seen = interact(RECIPES["drag"], index, world)
     let_go = [np.interp(0.8, seen.phase, effect) for effect in seen.effect.T]
-    wanted = 0.05 * np.array([math.cos(seen.primitive.theta), math.sin(seen.primitive.theta)])
+    wanted = 0.05 * unit_vector(seen.primitive.theta)
     assert math.dist(seen.rest_effect[:2], let_go[:2]) < 0.001
     assert math.dist(seen.rest_effect[:2], wanted) < 0.001
     assert seen.success
-
-
-@pytest.mark.slow
-def test_a_hundred_dragged_objects_stay(world):
-    moved = []
-    for index in range(100):
-        _, seen = interact(replace(RECIPES["drag"], seed=99), index, world)
-        let_go = [np.interp(0.8, seen.phase, effect) for effect in seen.effect.T]
-        moved.append(math.dist(seen.rest_effect[:2], let_go[:2]))
-    assert sum(np.array(moved) < 0.001) >= 99
 
 
 def test_a_pushed_ball_rolls_away_and_a_dragged_one_does_not(world):
@@ -139,14 +133,6 @@ def test_grasps_lift_what_fits_and_leave_what_does_not(world):
     assert not large.faults
     # The fingers felt its top and went no further.
     assert large.tool[:14, 2].min() > 0.06 - 0.003
-
-
-def test_a_partial_grasp_ends_holding(world):
-    grasp = Grasp(0.06)
-    world.place(Cuboid(0.05, 0.05, 0.06), config=CLEAN)
-    part = world.execute_primitive(grasp, 0.75)
-    raised = grasp.path(0.75)[0, 2] - grasp.path(0.4)[0, 2]
-    assert part.rest_effect[2] == pytest.approx(raised, abs=0.003)
 
 
 def test_a_rotation_turns_by_its_sweep(world):
@@ -173,8 +159,7 @@ def test_the_image_of_a_lever_up_turns_with_its_direction(world):
     prism = Prism.sample(np.random.default_rng(4), (0.18, 0.2), (0.04, 0.05))
     images = []
     for yaw in (0.0, 0.9):
-        c, s = math.cos(yaw), math.sin(yaw)
-        lever = LeverUp.at_edge(prism.footprint_m @ np.array([[c, s], [-s, c]]), 1)
+        lever = LeverUp.at_edge(rotated(prism.footprint_m, yaw), 1)
         world.place(prism, (0.0, 0.0), yaw, tool="screwdriver", config=LEVERING)
         images.append(world.execute_primitive(lever, 0.0).image)
         assert images[-1].shape == (2, 128, 128)
@@ -185,14 +170,6 @@ def test_the_image_of_a_lever_up_turns_with_its_direction(world):
     assert not row[:62].any()
 
 
-def test_the_arm_says_which_tool_it_needs(world):
-    world.place(Cuboid(0.05, 0.05, 0.05), config=CLEAN)
-    with pytest.raises(ValueError, match=r"'lever_up' needs the tool 'screwdriver'.*place\("):
-        world.execute_primitive(LeverUp(-0.03, 0.0, 0.0, 0.06))
-    with pytest.raises(ValueError, match=r"tool must be one of .* got 'hammer'"):
-        world.place(Cuboid(0.05, 0.05, 0.05), tool="hammer")
-
-
 @pytest.mark.parametrize("name", ["push", "drag", "rotate", "grasp"])
 @pytest.mark.parametrize("smooth", [True, False])
 def test_stopped_anywhere_it_rests_where_the_full_one_was(world, name, smooth):
@@ -200,10 +177,8 @@ def test_stopped_anywhere_it_rests_where_the_full_one_was(world, name, smooth):
     for index, stop in enumerate((0.6, 0.7, 0.8, 0.9) * 2):
         _, full = interact(RECIPES[name], index, world)
         then = np.array([np.interp(stop, full.phase, effect) for effect in full.effect.T])
-        recipe = RECIPES[name]
-        interact(recipe, index, world, stop_phase=0.0)
-        obj, start = world.obj, full.start_pose
-        world.place(obj, start[:2], start[2], config=recipe.world)
+        start = full.start_pose
+        world.place(world.obj, start[:2], start[2])
         part = world.execute_primitive(full.primitive, stop, smooth=smooth)
         lost = name == "grasp" and not full.success
         (slipped if lost else held).append(math.dist(part.rest_effect[:3], then[:3]))
@@ -219,7 +194,7 @@ def test_what_the_arm_cannot_reach_is_recorded_and_moves_nothing(world):
     """Kinematics is the oracle: reached exactly where every pose of the path has a posture."""
     recipe = replace(RECIPES["reach"], seed=21)
     found = []
-    for index in range(60):
+    for index in range(24):
         _, seen = interact(recipe, index, world, stop_phase=0.0)
         world.place(world.obj, seen.start_pose[:2], seen.start_pose[2])
         seen = world.execute_primitive(seen.primitive, record_unreachable=True)
@@ -232,7 +207,7 @@ def test_what_the_arm_cannot_reach_is_recorded_and_moves_nothing(world):
             assert not seen.effect.any()
             with pytest.raises(UnreachableError):
                 world.execute_primitive(seen.primitive)
-    assert 1 <= found.count(False) <= 30
+    assert 1 <= found.count(False) <= 12
 
 
 def _has_posture(pose):
@@ -263,11 +238,11 @@ def test_mass_off_the_centre_turns_a_push_and_not_the_frame(world):
     world.place(Cuboid(0.06, 0.06, 0.05), config=CLEAN)
 
 
-def test_a_biased_robot_places_its_action_beside(world):
+def test_a_biased_estimate_moves_the_action(world):
     world.place(UprightCylinder(0.06, 0.05), (0.0, 0.0), config=WorldConfig(bias_m=(0.0, 0.004)))
     seen = world.execute_primitive(Push.towards(0.0))
     assert seen.estimated_xy_m == pytest.approx((0.0, 0.004))
-    assert seen.tool[-1, 1] == pytest.approx(0.0, abs=1e-3)  # relative to the believed centre
+    assert seen.tool[-1, 1] == pytest.approx(0.0, abs=1e-3)  # relative to the estimated centre
     assert 0.002 < seen.rest_effect[1] < 0.006
     world.place(UprightCylinder(0.06, 0.05), config=CLEAN)
 
@@ -309,22 +284,17 @@ def test_no_episode_knows_of_the_one_before(world):
 
 
 @pytest.mark.slow
-def test_hundreds_of_episodes_leave_no_trace(world):
+def test_many_episodes_leave_no_trace(world):
     def resident_mb():
         with open("/proc/self/statm") as file:
             return int(file.read().split()[1]) * 4096 / 1e6
 
     first = {}
-    for k in range(450):
-        if k == 50:
+    for k in range(105):
+        if k == 35:
             before = resident_mb()
         name = _MIXED[k % len(_MIXED)]
-        index = (k // len(_MIXED)) % 30
+        index = (k // len(_MIXED)) % 8
         mark = _fingerprint(interact(RECIPES[name], index, world)[1])
         assert first.setdefault((name, index), mark) == mark
     assert resident_mb() - before < 20
-
-
-def test_every_primitive_is_named_and_timed():
-    assert list(PRIMITIVES) == ["push", "drag", "grasp", "rotate", "lever_up"]
-    assert min_jerk(np.array([0.0, 0.5, 1.0])).tolist() == [0.0, 0.5, 1.0]
