@@ -112,7 +112,7 @@ def _collected(
     """The whole set; chunks that are missing among the parts are made."""
     n = recipe.n_interactions
     rows = [range(k, min(k + CHUNK, n)) for k in range(0, n, CHUNK)]
-    kept = {r: parts / f"{r.start:08d}{SUFFIX}" for r in rows}
+    kept = {r: parts / f"{r.start:08d}-{r.stop:08d}{SUFFIX}" for r in rows}
     missing = [r for r in rows if _attributes(kept[r]) != attrs]
     made = _made(partial(_make, recipe, attrs), missing, client)
     there, disable = n - sum(map(len, missing)), not progress

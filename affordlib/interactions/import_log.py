@@ -148,20 +148,18 @@ def _read_depth(path: Path) -> np.ndarray:
     return np.stack([depth, mask / 255.0]).astype(np.float32)
 
 
-def read_trajectories(
-    folder: str | Path, steps: int | None = None, view: str = "full"
-) -> InteractionTensors:
+def read_trajectories(folder: str | Path, view: str = "full") -> InteractionTensors:
     """Lever-ups in the layout of Seker, Tekden and Ugur (2019).
 
-    folder/trajectories/NAME.txt: one row a step, six numbers x y z [m] roll pitch yaw [rad] of the
-    object, in the frame of the lever, separated by blanks or commas; folder/images/NAME.png (or
-    .jpg, .pgm): the grayscale image 128×128, moved and turned by contact point and direction, the
-    object darker or brighter than the table, whose gray is that of the border. All trajectories
-    need `steps` rows (default: those of the first). view: of the image, see `lever_up_tensors`.
+    folder/trajectories/NAME.txt: one row a step, as many in every file, of six numbers x y z [m]
+    roll pitch yaw [rad] of the object in the frame of the lever, separated by blanks or commas;
+    folder/images/NAME.png (or .jpg, .pgm): gray, 128×128, moved and turned by contact point and
+    direction, the object darker or brighter than the table, whose gray is that of the border.
+    view: of the image, see `lever_up_tensors`.
 
-    Poses become changes since the first row, tilt is the angle of the upright axis. There is no
-    commanded action in that layout, so both of its channels are zero. The image's first channel is
-    the gray value in [0, 1], the second the mask.
+    Poses become changes since the first row, tilt is the angle of the upright axis. That layout
+    has no commanded action, so both of its channels are zero. The image's first channel is the
+    gray value in [0, 1], the second the mask.
     """
     folder = Path(folder)
     files = sorted((folder / POSES).glob("*.txt"))
@@ -170,18 +168,18 @@ def read_trajectories(
             f"folder: {folder} has no file {POSES}/*.txt; expected are {POSES}/NAME.txt "
             f"with six numbers a row and {IMAGES}/NAME.png beside it"
         )
-    poses, images = [], []
-    for file in files:
-        rows = _read_poses(file)
-        steps = steps or len(rows)
-        if len(rows) != steps:
-            raise ValueError(f"{file} has {len(rows)} rows, expected {steps} as in {files[0].name}")
-        tilt = np.arccos(np.clip(np.cos(rows[:, 3]) * np.cos(rows[:, 4]), -1, 1))
-        poses.append(np.column_stack([rows[:, :3] - rows[0, :3], tilt - tilt[0]]))
-        images.append(_read_gray(folder / IMAGES, file.stem))
-    effect = torch.from_numpy(np.stack(poses)).float()
+    poses = [_read_poses(file) for file in files]
+    for file, rows in zip(files, poses, strict=True):
+        if len(rows) != len(poses[0]):
+            expected = f"expected {len(poses[0])} as in {files[0].name}"
+            raise ValueError(f"{file} has {len(rows)} rows, {expected}")
+    xyz, roll, pitch, _ = np.split(np.stack(poses), (3, 4, 5), axis=-1)
+    tilt = np.arccos(np.clip(np.cos(roll) * np.cos(pitch), -1, 1))
+    since_start = np.concatenate([xyz - xyz[:, :1], tilt - tilt[:, :1]], axis=-1)
+    images = np.stack([_read_gray(folder / IMAGES, file.stem) for file in files])
+    effect = torch.from_numpy(since_start).float()
     return InteractionTensors(
-        select_view(torch.from_numpy(np.stack(images)), view),
+        select_view(torch.from_numpy(images), view),
         torch.linspace(0, 1, effect.shape[1]),
         torch.zeros(*effect.shape[:2], len(LEVER_ACTION_CHANNELS)),
         effect,
@@ -210,17 +208,12 @@ def _read_gray(folder: Path, name: str) -> np.ndarray:
     return np.stack([gray, (np.abs(gray - table) > 0.1).astype(np.float32)])
 
 
-def write_trajectories(
-    folder: str | Path, poses: np.ndarray, images: np.ndarray, first: int = 0
-) -> None:
-    """Write poses (N, S, 6) and gray images (N, 128, 128) in [0, 1] as `read_trajectories` reads.
-
-    first: the number that the first file is named by.
-    """
+def write_trajectories(folder: str | Path, poses: np.ndarray, images: np.ndarray) -> None:
+    """Write poses (N, S, 6) and gray images (N, 128, 128) in [0, 1] for `read_trajectories`."""
     folder = Path(folder)
     for kind in (POSES, IMAGES):
         (folder / kind).mkdir(parents=True, exist_ok=True)
-    for number, (rows, gray) in enumerate(zip(poses, images, strict=True), first):
+    for number, (rows, gray) in enumerate(zip(poses, images, strict=True)):
         np.savetxt(folder / POSES / f"{number:04}.txt", rows, fmt="%.6f")
         picture = Image.fromarray((255 * np.clip(gray, 0, 1)).round().astype(np.uint8))
         picture.save(folder / IMAGES / f"{number:04}.png")
