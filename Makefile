@@ -105,9 +105,8 @@ test-slow: $(STAMP) ## Run every notebook and solution as the reader does; the l
 soak: $(STAMP) ## Plan and execute 3,000 times: memory must stay, and the same task end the same (15 min)
 	@OMP_NUM_THREADS=1 $(PY) -m tests.soak
 
-size: ## Count the lines of the package, the experiments and the tests
-	@for folder in affordlib experiments tests; do \
-	  printf '%-12s %6d lines in %3d files\n' $$folder $$(git ls-files $$folder | xargs cat | wc -l) $$(git ls-files $$folder | wc -l); done
+size: $(STAMP) ## Count lines and files, and fail above the budgets
+	@$(PY) -m tests.size
 
 lint: $(STAMP) ## Check style and formatting
 	@$(PY) -m ruff check

@@ -1,83 +1,143 @@
 """Imports point one way, and the promises of the layout hold."""
 
 import ast
+import graphlib
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 import affordlib
+from tests.size import ROOT, code_lines
 
-ROOT = Path(affordlib.__file__).parent
 CHECKED = affordlib._CHECKED.split()
-MODULES = sorted(p.relative_to(ROOT.parent) for p in ROOT.rglob("*.py"))
+MODULES = sorted(p.relative_to(ROOT) for p in (ROOT / "affordlib").rglob("*.py"))
+EXPERIMENTS = sorted(p.relative_to(ROOT) for p in (ROOT / "experiments").rglob("*.py"))
+TREES = {path: ast.parse((ROOT / path).read_text()) for path in [*MODULES, *EXPERIMENTS]}
 
-FORBIDDEN = {
-    "types": {"world", "interactions", "models", "planning", "evaluation", "show"},
-    "perception": {"world", "interactions", "models", "planning", "evaluation", "show"},
-    "primitives": {"world", "interactions", "models", "planning", "evaluation", "show"},
-    "world": {"interactions", "models", "planning", "evaluation", "show"},
-    "interactions": {"models", "planning", "evaluation", "show"},
-    "models": {"world", "planning", "evaluation", "show"},
-    "planning": {"world", "evaluation", "show"},
-    "evaluation": {"show"},
-}
-NO_WORLD = {
-    f"interactions/{name}.py"
-    for name in ("__init__", "dataset", "sampling", "lever_up", "import_log", "store")
-}
+UP = ("world", "interactions", "models", "planning", "evaluation", "show")
+"""The parts in order: each may know those before it, but for `EXCEPT`."""
+EXCEPT = {"models": {"world"}, "planning": {"world"}}
+USE_WORLD = {"recipes", "schema", "collect"}
+"""The modules of `interactions` that know the world."""
+
+MOST_PARAMETERS = 7
 
 
-def imported(path: Path) -> set[str]:
-    """First-level parts of affordlib that a module imports when it runs."""
-    tree = ast.parse((ROOT.parent / path).read_text())
+def name_of(path):
+    """A module as it is imported."""
+    return ".".join(path.with_suffix("").parts).removesuffix(".__init__")
+
+
+def imported(path):
+    """The modules and names that a module imports when it runs."""
     typing_only = {
         id(node)
-        for block in ast.walk(tree)
+        for block in ast.walk(TREES[path])
         if isinstance(block, ast.If) and ast.unparse(block.test) == "TYPE_CHECKING"
         for node in ast.walk(block)
     }
     names = set()
-    for node in ast.walk(tree):
+    for node in ast.walk(TREES[path]):
         if id(node) in typing_only:
             continue
-        if isinstance(node, ast.ImportFrom) and node.module:
-            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+        if isinstance(node, ast.ImportFrom):
+            names |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
         elif isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
-    assert not any(name.startswith("experiments") for name in names)
-    return {n.split(".")[1] for n in names if n.startswith("affordlib.")}
+    return names
 
 
 @pytest.mark.parametrize("path", MODULES, ids=str)
 def test_imports_point_one_way(path):
-    part = path.with_suffix("").parts[1] if len(path.parts) > 1 else ""
-    assert not imported(path) & FORBIDDEN.get(part, set())
-    if path.relative_to("affordlib").as_posix() in NO_WORLD:
-        assert "world" not in imported(path)
+    names = imported(path)
+    assert not any(name.split(".")[0] in ("experiments", "exercises", "tests") for name in names)
+    parts = {name.split(".")[1] for name in names if name.startswith("affordlib.")}
+    part = path.parts[1].removesuffix(".py")
+    below = UP[: UP.index(part) + 1] if part in UP else ()  # what is no folder stands below all
+    allowed = set(below) - EXCEPT.get(part, set())
+    if part == "interactions" and path.stem not in USE_WORLD:
+        allowed.remove("world")
+    assert not parts & set(UP) - allowed
+
+
+@pytest.mark.xfail(strict=False, reason="the world's modules need each other")
+def test_no_module_needs_itself():
+    modules = {name_of(path): path for path in TREES}
+    needs = {name: imported(path) & modules.keys() - {name} for name, path in modules.items()}
+    assert len(list(graphlib.TopologicalSorter(needs).static_order())) == len(modules)
 
 
 @pytest.mark.parametrize("path", MODULES, ids=str)
 def test_modules_are_short_and_well_named(path):
-    text = (ROOT.parent / path).read_text()
-    assert text.count("\n") <= 500
+    assert (ROOT / path).read_text().count("\n") <= 500
     assert path.stem not in {"utils", "helpers", "misc", "common"}
-    assert ast.get_docstring(ast.parse(text))
+    assert ast.get_docstring(TREES[path])
 
 
-def test_only_the_world_and_its_users_know_pybullet():
-    users = [p for p in MODULES if "import pybullet" in (ROOT.parent / p).read_text()]
-    assert {p.parts[1] for p in users} == {"world"}
+@pytest.mark.xfail(strict=False, reason="a few functions are left")
+def test_no_function_has_too_many_parameters():
+    for path, tree in TREES.items():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.FunctionDef):
+                a = node.args
+                each = {x.arg for x in [*a.posonlyargs, *a.args, *a.kwonlyargs]} - {"self", "cls"}
+                assert len(each) <= MOST_PARAMETERS, f"{path}: {node.name}"
+
+
+def test_only_the_world_knows_pybullet():
+    assert {p.parts[1] for p in MODULES if "pybullet" in imported(p)} == {"world"}
 
 
 def test_functions_in_functions_are_not_decorated_again_and_again():
     """What beartype checks it decorates where it is defined: a closure, every time."""
     for path in MODULES:
-        if path.with_suffix("").as_posix().replace("/", ".").partition(".")[2] not in CHECKED:
+        if name_of(path).removeprefix("affordlib.") not in CHECKED:
             continue
-        for outer in ast.walk(ast.parse((ROOT.parent / path).read_text())):
+        for outer in ast.walk(TREES[path]):
             inner = ast.walk(outer) if isinstance(outer, ast.FunctionDef) else ()
             for each in inner:
                 if isinstance(each, ast.FunctionDef) and each is not outer:
                     arguments = [*each.args.args, *each.args.kwonlyargs]
                     assert not each.returns, f"{path}: {each.name}"
                     assert not any(argument.annotation for argument in arguments)
+
+
+IMPORT = """
+import os, threading, time
+import numpy as np
+began = time.process_time()
+import torch
+torch_s = time.process_time() - began
+
+def state():
+    return (dict(os.environ), os.getcwd(), os.listdir(),
+            str(np.random.get_state()), torch.initial_seed(), torch.get_num_threads(),
+            torch.get_default_dtype(), torch.is_grad_enabled(), threading.active_count())
+
+before, began = state(), time.process_time()
+import affordlib.{part}
+took_s = time.process_time() - began
+assert state() == before, [pair for pair in zip(state(), before) if pair[0] != pair[1]]
+print(torch_s, took_s)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("part", UP)
+def test_importing_is_quick_and_changes_nothing(part, tmp_path):
+    """On an idle machine it takes a second; here less than three times what PyTorch takes."""
+    code = IMPORT.format(part=part)
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    torch_s, took_s = done.stdout.split()
+    assert float(took_s) < 3 * float(torch_s)
+
+
+def test_lines_of_code_are_counted_without_words():
+    text = '"""Words."""\n\nX = 1\n"""Of X."""\n# why\ndef f():\n    return """a\n\nb"""\n'
+    assert code_lines(text) == 5
+    assert code_lines(Path(__file__).read_text()) > 50
