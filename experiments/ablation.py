@@ -1,4 +1,4 @@
-"""What each part of our network is worth: left out by itself, and added one after another."""
+"""Studies: what each part of our network is worth, left out alone, and added one after another."""
 
 from __future__ import annotations
 
@@ -15,11 +15,7 @@ from affordlib.interactions import (
     open_interactions,
     split_interactions,
 )
-from affordlib.interactions.sampling import (
-    Batch,
-    sample_literal,
-    sample_mixed,
-)
+from affordlib.interactions.sampling import Batch, sample_literal, sample_mixed
 from affordlib.models.checkpoint import build
 from affordlib.models.film import FiLMNetwork
 from affordlib.models.protocol import observe_final_effect
@@ -33,7 +29,7 @@ Rows = list[dict[str, Any]]
 def random_contexts(
     arrays: InteractionTensors, n_targets: int, obs_max: int, g: torch.Generator
 ) -> Batch:
-    """As `sample_mixed`, but no context is one that will be asked: all phases are random."""
+    """As `sample_mixed`, but no context is at a phase that will be queried: all are random."""
     batch = sample_mixed(arrays, n_targets, obs_max, g)
     o, n = batch.observations, len(arrays.phase)
     action_at, effect_at = (torch.randint(n, m.shape, generator=g) for m in (o.action_mask,) * 2)
@@ -52,7 +48,7 @@ def half_blend(arrays: InteractionTensors, *sizes: Any) -> Batch:
 
 
 def actions_only(arrays: InteractionTensors, *sizes: Any) -> Batch:
-    """As `sample_mixed`, but only actions are observed: effects are never asked about actions."""
+    """As `sample_mixed`, but only actions are observed: nothing is inferred from effects."""
     batch = sample_mixed(arrays, *sizes)
     o = batch.observations
     first = torch.arange(o.action_mask.shape[1]) == 0
@@ -104,11 +100,11 @@ CHANGES: dict[str, dict[str, Any]] = {
     "no image": {"image": False},
     "metres, not standardised": {"scales": _raw},
     "table frame": {"network": {"frame": "table"}},
-    "no turned and mirrored copies": {"training": {"augment": False}},
+    "no rotation and reflection augmentation": {"training": {"augment": False}},
     "no FiLM: image joined only": {"start": _no_modulation},
-    "no running mean of the weights": {"training": {"ema": 0.0}},
+    "no EMA of the weights": {"training": {"ema": 0.0}},
     "plain likelihood (β = 0)": {"training": {"beta": 0.0}},
-    "PyTorch's initialisation": {"start": _plain_start},
+    "PyTorch initialisation": {"start": _plain_start},
     "one trajectory, one target a step": {"draw": one_at_a_time},
     "random contexts only": {"draw": random_contexts},
     "w₁ = ½": {"draw": half_blend},
@@ -118,16 +114,16 @@ CHANGES: dict[str, dict[str, Any]] = {
 
 LADDER = {
     "channels of unit size": "metres, not standardised",
-    "He's initialisation": "PyTorch's initialisation",
+    "He initialisation": "PyTorch initialisation",
     "batches": "one trajectory, one target a step",
     "contexts at the ends": "random contexts only",
-    "the frame of the push": "table frame",
+    "push frame": "table frame",
     "FiLM": "no FiLM: image joined only",
-    "turned and mirrored copies": "no turned and mirrored copies",
+    "rotation and reflection augmentation": "no rotation and reflection augmentation",
     "β": "plain likelihood (β = 0)",
-    "a running mean of the weights": "no running mean of the weights",
+    "EMA of the weights": "no EMA of the weights",
 }
-"""What is added to a training to the paper's letter until it is ours, and the change it undoes."""
+"""What is added to the published training until it is ours, and the change it undoes."""
 
 STEPS, SEEDS = 500, 3
 
@@ -137,7 +133,7 @@ def ablation() -> Rows:
     return [{"change": change} | _errors([change]) for change in CHANGES]
 
 
-def waterfall() -> Rows:
+def incremental_ablation() -> Rows:
     """The same of trainings that gain one thing after another, from none of `LADDER` to all."""
     names, changes = list(LADDER), list(LADDER.values())
     return [
@@ -148,8 +144,8 @@ def waterfall() -> Rows:
 
 def _errors(changes: Sequence[str]) -> dict[str, Any]:
     box = open_interactions("push_test")["family"].values == 0
-    told = [ablated(changes, STEPS, seed) for seed in range(SEEDS)]
-    errors, starts = zip(*told, strict=True)
+    each_seed = [ablated(changes, STEPS, seed) for seed in range(SEEDS)]
+    errors, starts = zip(*each_seed, strict=True)
     mean = np.mean(errors, axis=0)
     each = [(e[box].mean() + e[~box].mean()) / 2 for e in errors]
     return {
@@ -168,11 +164,11 @@ def _errors(changes: Sequence[str]) -> dict[str, Any]:
 
 
 def ablated(changes: Sequence[str], steps: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """What `push_test` shows after a training on fold 0 of `push` with some of `CHANGES`.
+    """Errors on `push_test` after a training on fold 0 of `push` with some of `CHANGES`.
 
-    Where two of them say how contexts are drawn, the first does. Final errors (N,) [m] of effects
-    foreseen from actions; and, asked the other way, how far the start of the push that is decoded
-    from the true final effect is from the true one (N,) [m].
+    Where two of them sample contexts, the first does. Final errors (N,) [m] of effects predicted
+    from actions; and distances (N,) [m] between the start of the recorded push and of the push that
+    is decoded from its final effect.
     """
     each = [CHANGES[change] for change in changes]
     image = all(how.get("image", True) for how in each)
@@ -205,7 +201,7 @@ def ablated(changes: Sequence[str], steps: int, seed: int = 0) -> tuple[np.ndarr
         how.get("start", lambda _: None)(model)
     train(model, training, validation, config, progress=False, draw=draw)
     with torch.no_grad():
-        asked = observe_final_effect(model, test.effect[:, -1])
-        told = model.predict(model.encode(test.image), asked, torch.zeros(len(test), 1))
-    start = (told.action_mean[:, 0, :2] - test.action[:, 0, :2]).norm(dim=-1)
+        observed = observe_final_effect(model, test.effect[:, -1])
+        decoded = model.predict(model.encode(test.image), observed, torch.zeros(len(test), 1))
+    start = (decoded.action_mean[:, 0, :2] - test.action[:, 0, :2]).norm(dim=-1)
     return final_errors_m(model, test).numpy(), start.numpy()

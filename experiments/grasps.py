@@ -1,26 +1,25 @@
-"""Will a grasp lift its object? Table 2 of the paper, and what its rule leaves on the table.
+"""Will a grasp lift its object? Table 2 of the paper, and other thresholds than its own.
 
-Success is a gain in height above 0.1 m. The paper foresees it where μ_z(1) > 0.1 m, which is where
-P(z > 0.1 m) > ½. TP is the share of the true successes that are foreseen, TN that of the true
-failures, with Wilson's 95 % intervals, folds pooled.
+Success is a gain in height above 0.1 m. The paper predicts it where μ_z(1) > 0.1 m, which is where
+P(z > 0.1 m) > ½. TP is the share of the successes that are predicted, TN that of the failures, with
+Wilson's 95 % intervals, folds together.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
-from affordlib.evaluation.predictions import final_error
 from affordlib.primitives import Grasp
-from experiments.pooled import Part, by_model
-from experiments.units import Unit
 
-AIM_TP, AIM_TN = 0.90, 0.95
-"""Shares of the true successes and failures that we would have foreseen."""
+GOAL_TP, GOAL_TN = 0.90, 0.95
+"""Shares of the successes and failures that we would like to be predicted."""
+
+Rows = list[dict[str, Any]]
 
 
 def wilson(k: int, n: int, z: float = 1.959964) -> tuple[float, float]:
@@ -44,53 +43,47 @@ def auc(score: np.ndarray, truth: np.ndarray, fold: np.ndarray) -> float | None:
     return float(order[pairs].mean())
 
 
-@dataclass(frozen=True)
-class Held:
-    """Held-out grasps of all folds (N,): P(z > 0.1 m); whether it was lifted, can roll; fold."""
-
-    score: np.ndarray
-    lifted: np.ndarray
-    rolls: np.ndarray
-    fold: np.ndarray
-
-    def __getitem__(self, chosen: np.ndarray) -> Held:
-        return Held(*(getattr(self, f.name)[chosen] for f in fields(self)))
+def success_probability(mean_z: np.ndarray, std_z: np.ndarray) -> np.ndarray:
+    """P(z > 0.1 m) (N,) of Gaussians; above one half exactly where their mean is above 0.1 m."""
+    standard = (np.asarray(mean_z) - Grasp.success_m) / (np.asarray(std_z) * math.sqrt(2))
+    return np.array([(1 + math.erf(v)) / 2 for v in standard])
 
 
-def _held(group: list[Part]) -> Held:
-    told = [part["fold_test"] for part in group]
-    return Held(
-        np.concatenate([success_probability(t) for t in told]),
-        np.concatenate([t["truth"]["z"] for t in told]) > Grasp.success_m,
-        np.concatenate([t["rollable"] for t in told]),
-        np.repeat(np.arange(len(told)), [len(t["rollable"]) for t in told]),
-    )
+Held = tuple[dict[str, Any], bool, pd.DataFrame]
 
 
-def _of_one_seed(parts: list[tuple[Unit, Part]]) -> Iterable[tuple[dict, list[Part]]]:
-    """By model, of the first seed alone: another cross-validation tests the same grasps again."""
-    first = min((unit.seed for unit, _ in parts), default=0)
-    return by_model([(unit, part) for unit, part in parts if unit.seed == first], "grasp")
+def _held_out(grasps: pd.DataFrame) -> Iterator[Held]:
+    """Held-out grasps of each model, what can roll and what cannot, with `score` and `lifted`.
+
+    Of the first seed alone: another cross-validation tests the same grasps again.
+    """
+    if grasps.empty:
+        return
+    grasps = grasps[grasps["seed"] == grasps["seed"].min()]
+    for (_, model, n), group in grasps.groupby(["data", "model", "n"], sort=False):
+        about = {"model": model, "n_interactions": int(n), "folds": group["fold"].nunique()}
+        if model == "logistic":
+            score = group["probability"]
+        else:
+            score = success_probability(group["mean_z"], group["std_z"])
+        group = group.assign(score=score, lifted=group["truth_z"] > Grasp.success_m)
+        for rollable, some in group.groupby("rollable"):
+            yield about | {"seeds": 1}, bool(rollable), some
 
 
-def grasp_rows(parts: list[tuple[Unit, Part]]) -> list[dict[str, Any]]:
-    """The paper's Table 2, by its rule: what can roll and what cannot, apart."""
+def grasp_rows(grasps: pd.DataFrame) -> Rows:
+    """The paper's Table 2, by its rule; grasps: predictions with the jobs' arguments as columns."""
     rows = []
-    for about, group in _of_one_seed(parts):
-        held, error = _held(group), None
-        if "mean" in group[0]["fold_test"]:
-            error = np.concatenate([final_error(part["fold_test"]) for part in group])
-        for rollable in (False, True):
-            chosen = held.rolls == rollable
-            if not chosen.any():
-                continue
-            one = held[chosen]
-            row = about | {"rollable": rollable, "n": int(chosen.sum())}
-            row["error_mean_m"] = None if error is None else float(error[chosen].mean())
-            row["error_median_m"] = None if error is None else float(np.median(error[chosen]))
-            row |= confusion_columns(one.score > 0.5, one.lifted)
-            brier = float(np.square(one.score - one.lifted).mean())
-            rows.append(row | {"auc": auc(one.score, one.lifted, one.fold), "brier": brier})
+    for about, rollable, some in _held_out(grasps):
+        score, lifted = some["score"].to_numpy(), some["lifted"].to_numpy()
+        known = about["model"] != "logistic"
+        error = some["final_error"].to_numpy()
+        row = about | {"rollable": rollable, "n": len(some)}
+        row["error_mean_m"] = float(error.mean()) if known else None
+        row["error_median_m"] = float(np.median(error)) if known else None
+        row |= confusion_columns(score > 0.5, lifted)
+        row["auc"] = auc(score, lifted, some["fold"].to_numpy())
+        rows.append(row | {"brier": float(np.square(score - lifted).mean())})
     return rows
 
 
@@ -102,71 +95,53 @@ def rates(score: np.ndarray, lifted: np.ndarray, thresholds: np.ndarray) -> tupl
 
 
 def best_threshold(score: np.ndarray, lifted: np.ndarray) -> float:
-    """The threshold at which the lesser of the margins of TP and TN over their aims is largest."""
+    """The threshold at which the lesser margin of TP and TN over their goals is largest."""
     known = np.unique(score)
     between = (known[1:] + known[:-1]) / 2
     tp, tn = rates(score, lifted, between)
-    return float(between[np.argmax(np.minimum(tp - AIM_TP, tn - AIM_TN))])
+    return float(between[np.argmax(np.minimum(tp - GOAL_TP, tn - GOAL_TN))])
 
 
-def threshold_rows(parts: list[tuple[Unit, Part]]) -> list[dict[str, Any]]:
-    """Table 2 again, the threshold not ½ but what suits the other folds' held-out grasps best.
+def threshold_rows(grasps: pd.DataFrame) -> Rows:
+    """Table 2 again, with the threshold that suits the other folds' held-out grasps best.
 
-    What is foreseen of a fold decides nothing about its own threshold.
+    Predictions of a fold decide nothing about its own threshold.
     """
     rows = []
-    for about, group in _of_one_seed(parts):
+    for about, rollable, some in _held_out(grasps):
         if about["folds"] == 1 or about["model"] == "constant":
             continue
-        held = _held(group)
-        for rollable in (False, True):
-            one = held[held.rolls == rollable]
-            chosen = {}
-            for fold in np.unique(one.fold):
-                others = one[one.fold != fold]
-                chosen[fold] = best_threshold(others.score, others.lifted)
-            threshold = np.array([chosen[fold] for fold in one.fold])
-            row = about | {"rollable": rollable, "n": len(threshold)}
-            row |= {"threshold_median": float(np.median(list(chosen.values())))}
-            rows.append(row | confusion_columns(one.score > threshold, one.lifted))
+        score, lifted, fold = (some[name].to_numpy() for name in ("score", "lifted", "fold"))
+        chosen = {k: best_threshold(score[fold != k], lifted[fold != k]) for k in np.unique(fold)}
+        row = about | {"rollable": rollable, "n": len(some)}
+        row["threshold_median"] = float(np.median(list(chosen.values())))
+        rows.append(row | confusion_columns(score > [chosen[k] for k in fold], lifted))
     return rows
 
 
-def roc_rows(parts: list[tuple[Unit, Part]], n_points: int = 51) -> list[dict[str, Any]]:
+def roc_rows(grasps: pd.DataFrame, n_points: int = 51) -> Rows:
     """The receiver operating characteristic: TP and TN over the whole range of thresholds.
 
-    Of sets of 1,000 grasps; of 100, a curve is a few steps.
+    Only from sets of 1,000 grasps; with 100, a curve has only a few steps.
     """
     rows = []
-    for about, group in _of_one_seed(parts):
+    for about, rollable, some in _held_out(grasps):
         if about["n_interactions"] < 1000 or about["model"] == "constant":
             continue
-        held = _held(group)
-        for rollable in (False, True):
-            one = held[held.rolls == rollable]
-            known = np.unique(one.score)
-            tp, tn = rates(one.score, one.lifted, np.concatenate([[-np.inf], known]))
-            kept = np.unique(np.linspace(0, len(tp) - 1, n_points).round().astype(int))
-            for k in kept:
-                shown = {"tp_percent": round(100 * tp[k], 2), "tn_percent": round(100 * tn[k], 2)}
-                rows.append(about | {"rollable": rollable} | shown)
+        score = some["score"].to_numpy()
+        thresholds = np.concatenate([[-np.inf], np.unique(score)])
+        tp, tn = rates(score, some["lifted"].to_numpy(), thresholds)
+        for k in np.unique(np.linspace(0, len(tp) - 1, n_points).round().astype(int)):
+            shown = {"tp_percent": round(100 * tp[k], 2), "tn_percent": round(100 * tn[k], 2)}
+            rows.append(about | {"rollable": rollable} | shown)
     return rows
 
 
-def success_probability(answers: dict[str, Any]) -> np.ndarray:
-    """P(z > 0.1 m) (N,); above one half exactly where a Gaussian's mean is above 0.1 m."""
-    if "probability" in answers:
-        return np.array(answers["probability"])
-    mean, std = np.array(answers["mean"]["z"]), np.array(answers["std"]["z"])
-    standard = (mean - Grasp.success_m) / (std * math.sqrt(2))
-    return np.array([(1 + math.erf(v)) / 2 for v in standard])
-
-
-def confusion_columns(foreseen: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
-    """TP and FN in per cent of the true successes, TN and FP of the true failures; intervals."""
+def confusion_columns(predicted: np.ndarray, lifted: np.ndarray) -> dict[str, Any]:
+    """TP and FN in per cent of the successes, TN and FP of the failures; intervals."""
     columns: dict[str, Any] = {}
-    for right, wrong, those in (("tp", "fn", truth), ("tn", "fp", ~truth)):
-        n, k = int(those.sum()), int((foreseen == truth)[those].sum())
+    for right, wrong, those in (("tp", "fn", lifted), ("tn", "fp", ~lifted)):
+        n, k = int(those.sum()), int((predicted == lifted)[those].sum())
         low, high = wilson(k, n) if n else (None, None)
         columns |= {
             f"{right}_percent": 100 * k / n if n else None,
@@ -174,4 +149,4 @@ def confusion_columns(foreseen: np.ndarray, truth: np.ndarray) -> dict[str, Any]
             f"{right}_high_percent": None if high is None else 100 * high,
             f"{wrong}_percent": 100 * (n - k) / n if n else None,
         }
-    return columns | {"n_success": int(truth.sum()), "n_failure": int((~truth).sum())}
+    return columns | {"n_success": int(lifted.sum()), "n_failure": int((~lifted).sum())}

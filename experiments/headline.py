@@ -34,10 +34,10 @@ def rows() -> list[dict[str, Any]]:
     pushes = effects[effects.n_interactions == 500].set_index("model")
     means = pushes.final_error_mean_m
     question = "predict where a push ends"
-    found = [_row(question, pushes.n["film"], 1000, None, means["paper"], means["film"])]
+    found = [_row(question, pushes.n["film"], 1000, None, means["cnp"], means["film"])]
     lever = _table("lever_up", "summary").set_index("model")
-    means = lever.step_5_mean_cm[["reported", "paper", "anchored"]]
-    found.append(_row("predict a lever-up 0.75 s ahead", lever.n["anchored"], 10, *means))
+    means = lever.step_5_mean_cm[["reported", "cnp", "cnp_last_pose"]]
+    found.append(_row("predict a lever-up 0.75 s ahead", lever.n["cnp_last_pose"], 10, *means))
     summary = _table("planning", "summary").query("object_class in ('standing', 'reported')")
     summary = summary.set_index("variant")
     each = _table("planning", "planning").query(

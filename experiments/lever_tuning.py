@@ -1,9 +1,9 @@
-"""The same budget of tuning for ours and for the recurrent network, on lever-ups (Section 4.1).
+"""A study: the same budget of tuning for ours and for the recurrent network (Section 4.1).
 
 Each network is trained with each of `SETTINGS`, as long as the shipped one, on the training part of
-fold 0, and judged on its validation part. `LEVER_MODELS` has one rate for each network: the best,
-or within a thousandth of the best where the two trainings of the recurrent one differ. No test data
-are seen.
+fold 0 of the lever-ups, and evaluated on its validation part. `LEVER_MODELS` has one learning rate
+for each network: the best, or within a thousandth of the best where the two trainings of the
+recurrent one differ. No test data are used.
 """
 
 from __future__ import annotations
@@ -22,8 +22,7 @@ from affordlib.models.lever import (
     fit_lever_model,
     window_errors_m,
 )
-from experiments.lever_up import DATA, LeverUnit, split_of
-from experiments.parts import options_of
+from experiments.lever_cross_validation import DATA, lever_split
 
 SETTINGS: dict[str, tuple[dict[str, Any], float]] = {
     "rate 0.001": ({}, 1.0),
@@ -37,13 +36,10 @@ SETTINGS: dict[str, tuple[dict[str, Any], float]] = {
 }
 """By name: what is changed in `TRAINING`, where both began, and the share of the width."""
 
-TRAINED = (("anchored", "all"), ("lstm_tuned", "window"), ("lstm_tuned", "first_step"))
+TRAINED = (("cnp_last_pose", "all"), ("lstm_tuned", "window"), ("lstm_tuned", "first_step"))
 
 
-def settings() -> tuple[Any, ...]:
-    """What decides the rows beside the data."""
-    networks = [options_of(LEVER_MODELS[name].network) for name, _ in TRAINED]
-    return SETTINGS, TRAINED, networks, options_of(TRAINING)
+DECISIVE = (SETTINGS, TRAINED, [LEVER_MODELS[name].network for name, _ in TRAINED], TRAINING)
 
 
 def changed(lever: LeverModel, setting: str) -> LeverModel:
@@ -53,12 +49,12 @@ def changed(lever: LeverModel, setting: str) -> LeverModel:
     return replace(lever, network=network, training=replace(TRAINING, **training))
 
 
-def lever_tuning() -> list[dict[str, Any]]:
+def tuning() -> list[dict[str, Any]]:
     """Mean validation errors [m], of windows and of whole beginnings, of every setting."""
     data, rows = open_interactions(DATA), []
     for name, trained_for in TRAINED:
         lever = LEVER_MODELS[name]
-        split = split_of(LeverUnit(name, trained_for), data)
+        split = lever_split(data)
         training = augment_by_symmetry(lever_up_tensors(data, split.train, lever.view), MIRRORED)
         validation = lever_up_tensors(data, split.validation, lever.view)
         for setting in SETTINGS:

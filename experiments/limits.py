@@ -1,15 +1,13 @@
-"""Studies of what bounds a prediction: how the world spreads, where stopping differs, the arm.
+"""Studies of what limits a prediction: where the object is, where an action stops, the arm.
 
-floor: the same push of the same object, which stands a millimetre and a degree off where the robot
-believes it: how far its displacement changes, and the place where it ends. stopped: what becomes of
-an object when its action is broken off at t, by the state at t of the whole action, and by where
-the object comes to rest. reach: the learned reachability against the arm's kinematics, on places
-that it was not trained on.
+pose_sensitivity: the same push of an object that is a millimetre and a degree from where the robot
+believes it. partial_execution: models of whole actions on actions that stop at a phase t, compared
+with the state at t of the whole action and with where the object comes to rest.
+reachability_accuracy: the learned reachability against the arm's kinematics, at new places.
 """
 
 from __future__ import annotations
 
-import hashlib
 import math
 from dataclasses import replace
 from itertools import pairwise
@@ -20,10 +18,8 @@ import torch
 
 from affordlib.interactions import open_interactions
 from affordlib.interactions.recipes import Recipe, sample_scene, sample_world
-from affordlib.models.checkpoint import load_checkpoint, weights_bytes
+from affordlib.models.checkpoint import load_checkpoint
 from affordlib.models.protocol import condition_on_primitives
-from affordlib.paths import repo_root
-from affordlib.planning.reachability import SHIPPED as REACHABILITY
 from affordlib.planning.reachability import Reachability
 from affordlib.primitives import PRIMITIVES, Drag, Grasp, Push, Rotate
 from affordlib.world import Tabletop
@@ -32,30 +28,19 @@ from experiments.planning import POSITION_ERROR_M, YAW_ERROR_RAD
 Rows = list[dict[str, Any]]
 
 N_PUSHES, REPEATS = 200, 3
-STOPPED = ("film_500", "film_5000", "drag_film_500")
+WHOLE_ACTION_MODELS = ("film_500", "film_5000", "drag_film_500")
 PHASES = (0.0, 0.55, 0.65, 0.75, 1.0)
 """Edges of the bins of phases; nothing is touched before 0.5."""
 
 N_PLACES = 1000
-EDGE = (0.2, 0.8)
-"""Between these the learned probability says that a place is near the edge of the reach."""
+NEAR_THE_LIMIT = (0.2, 0.8)
+"""Learned probabilities between these are of places near the limit of the arm's reach."""
 
 
-def floor_settings() -> tuple[Any, ...]:
-    """What decides the rows of `floor` beside its data."""
-    return N_PUSHES, REPEATS, POSITION_ERROR_M, YAW_ERROR_RAD
-
-
-def reach_settings() -> tuple[Any, ...]:
-    """What decides the rows of `reach`: sizes, and the reachability that is shipped."""
-    shipped = weights_bytes(repo_root() / REACHABILITY)
-    return N_PLACES, EDGE, hashlib.sha256(shipped).hexdigest()
-
-
-def floor() -> Rows:
-    """What changes if an object does not stand where it is believed to: displacement, and end."""
+def pose_sensitivity() -> Rows:
+    """Change of displacement, final position and rotation when an object is not where believed."""
     data = open_interactions("push_test")
-    recipe, names = Recipe.from_json(data.attrs["recipe"]), _categories(data)
+    recipe = Recipe.from_json(data.attrs["recipe"])
     rng = np.random.default_rng(0)
     moved, ended, turned = np.empty((3, N_PUSHES, REPEATS))
     with Tabletop(recipe.world) as world:
@@ -63,23 +48,24 @@ def floor() -> Rows:
             index = int(data["interaction"][k])
             obj, yaw, _ = sample_scene(recipe, index)
             config = sample_world(recipe, index, obj)
-            told = data["effect"].values[k, -1]
+            recorded = data["effect"].values[k, -1]
             for r in range(REPEATS):
                 side, sign = rng.uniform(0, math.tau), rng.choice([-1, 1])
                 bias = POSITION_ERROR_M * np.array([math.cos(side), math.sin(side)])
-                amiss = replace(config, bias_m=tuple(bias))
-                world.place(obj, (0.0, 0.0), yaw + sign * YAW_ERROR_RAD, config=amiss)
+                perturbed = replace(config, bias_m=tuple(bias))
+                world.place(obj, (0.0, 0.0), yaw + sign * YAW_ERROR_RAD, config=perturbed)
                 done = world.execute_primitive(
                     Push(float(data["theta"][k])), record_unreachable=True
                 ).effect[-1]
-                moved[k, r] = math.dist(done[:2], told[:2])
-                ended[k, r] = math.dist(done[:2], told[:2] + bias)
-                turned[k, r] = abs(done[3] - told[3])
-    rows, kinds = [], np.array(names[:N_PUSHES])
+                moved[k, r] = math.dist(done[:2], recorded[:2])
+                ended[k, r] = math.dist(done[:2], recorded[:2] + bias)
+                turned[k, r] = abs(done[3] - recorded[3])
+    names = np.array(data["family"].attrs["flag_meanings"].split())
+    rows, kinds = [], names[data["family"].values[:N_PUSHES]]
     for name in ("all", *sorted(set(kinds))):
         of = (kinds == name) | (name == "all")
         row = {"object_class": name, "n": int(of.sum()), "repeats": REPEATS}
-        row |= {"nudged_m": POSITION_ERROR_M, "nudged_rad": YAW_ERROR_RAD}
+        row |= {"perturbed_m": POSITION_ERROR_M, "perturbed_rad": YAW_ERROR_RAD}
         for what, error in (("displacement", moved), ("end", ended)):
             row[f"{what}_mean_m"] = float(np.mean([error[kinds == c].mean() for c in {*kinds[of]}]))
             row[f"{what}_median_m"] = float(np.median(error[of]))
@@ -88,30 +74,25 @@ def floor() -> Rows:
     return rows
 
 
-def _categories(data: Any) -> list[str]:
-    names = data["family"].attrs["flag_meanings"].split()
-    return [names[k] for k in data["family"].values]
-
-
 @torch.no_grad()
-def stopped() -> Rows:
-    """Errors of networks that learned from whole actions alone, on actions broken off at t."""
+def partial_execution() -> Rows:
+    """Errors of networks that learned from whole actions alone, on partial actions."""
     data = open_interactions("partial")
     kinds = np.array(list(PRIMITIVES))[data["primitive"].values]
     phase = data["stop_phase"].values
     whole, rest = (data[name].values for name in ("full_effect", "rest_effect"))
     slid = np.hypot(*(rest - whole)[:, :2].T)
     rows = []
-    for name in STOPPED:
+    for name in WHOLE_ACTION_MODELS:
         model, _ = load_checkpoint(name)
         kind = Drag if name.startswith("drag") else Push
         mine = np.flatnonzero((kinds == kind.name) & ~data["fault"].values)
         actions = [kind(float(theta)) for theta in data["theta"].values[mine]]
-        seen = torch.from_numpy(data["image"].values[mine])
+        image = torch.from_numpy(data["image"].values[mine])
         at = torch.from_numpy(phase[mine]).float()[:, None]
-        told = model.predict(model.encode(seen), condition_on_primitives(model, actions), at)
+        predicted = model.predict(model.encode(image), condition_on_primitives(model, actions), at)
         columns = [model.effect_channels.index(c) for c in "xy"]
-        mean = told.effect_mean[:, 0, columns].numpy()
+        mean = predicted.effect_mean[:, 0, columns].numpy()
         errors = [np.hypot(*(mean - truth[mine, :2]).T) for truth in (whole, rest)]
         for low, high in pairwise(PHASES):
             of = (phase[mine] > low) & (phase[mine] <= high)
@@ -123,8 +104,8 @@ def stopped() -> Rows:
     return rows
 
 
-def reach() -> Rows:
-    """Agreement of the learned reachability, cut at one half, with the arm's kinematics."""
+def reachability_accuracy() -> Rows:
+    """Agreement of the learned reachability, at a threshold of one half, with the kinematics."""
     model, rng = Reachability.load(), np.random.default_rng(0)
     rows = []
     with Tabletop() as world:
@@ -137,7 +118,7 @@ def reach() -> Rows:
                 can[k] = world.can_reach(action, at_xy_m=tuple(place))
                 likely[k] = model.probability(kind.name, place[None], angle)[0]
             right = (likely > 0.5) == can
-            inside = (likely > EDGE[0]) & (likely < EDGE[1])
+            near = (likely > NEAR_THE_LIMIT[0]) & (likely < NEAR_THE_LIMIT[1])
             both = (right[can].mean() + right[~can].mean()) / 2
             rows.append(
                 {
@@ -146,8 +127,8 @@ def reach() -> Rows:
                     "can_percent": 100 * float(can.mean()),
                     "agree_percent": 100 * float(right.mean()),
                     "balanced_percent": 100 * float(both),
-                    "edge_percent": 100 * float(inside.mean()),
-                    "agree_off_edge_percent": 100 * float(right[~inside].mean()),
+                    "edge_percent": 100 * float(near.mean()),
+                    "agree_off_edge_percent": 100 * float(right[~near].mean()),
                 }
             )
     every = {k: float(np.mean([r[k] for r in rows])) for k in rows[0] if k.endswith("_percent")}

@@ -32,8 +32,9 @@ from tqdm.auto import tqdm
 from affordlib.evaluation.predictions import rounded
 from affordlib.interactions import open_interactions
 from affordlib.interactions.store import stored_sha256
-from affordlib.models.checkpoint import checkpoint_sha256
-from affordlib.paths import resolve_out_dir
+from affordlib.models.checkpoint import checkpoint_sha256, weights_bytes
+from affordlib.paths import repo_root, resolve_out_dir
+from affordlib.planning.reachability import SHIPPED as REACHABILITY
 from affordlib.results import write_atomically
 
 if TYPE_CHECKING:
@@ -102,7 +103,7 @@ def run(
         if key not in records or _stale(records[key], job)
     }
     made, last = (
-        tqdm(_made([*tasks.values()], client), table, len(tasks), disable=not progress),
+        tqdm(_made([*tasks.values()], client), table, len(tasks), disable=not (progress and tasks)),
         0.0,
     )
     new: dict[str, dict[str, Any]] = {}
@@ -195,6 +196,8 @@ def _stale(record: dict[str, Any], job: Job) -> str | None:
 
 @lru_cache
 def _hash_of(name: str, kind: str) -> str | None:
+    if name == "reachability":  # a checkpoint of another kind, which has no description
+        return hashlib.sha256(weights_bytes(repo_root() / REACHABILITY)).hexdigest()
     if kind == "checkpoint":
         return checkpoint_sha256(name)
     try:

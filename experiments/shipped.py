@@ -98,7 +98,7 @@ CHECKPOINT_SPECS: dict[str, CheckpointSpec] = {
 two for others. Five learn from sets of ten times the size, which are not shipped."""
 
 LEVER_CHECKPOINTS: dict[str, tuple[str, str]] = {
-    "lever_up_last_pose_1800": ("anchored", "all"),
+    "lever_up_last_pose_1800": ("cnp_last_pose", "all"),
     "lever_up_lstm_1800_window": ("lstm_tuned", "window"),
     "lever_up_lstm_1800_first_step": ("lstm_tuned", "first_step"),
 }

@@ -60,7 +60,7 @@ from affordlib.types import Observations
 from affordlib.workers import dask_client
 from affordlib.world import Tabletop
 from experiments.cost import measure_cost
-from experiments.lstm_published import BATCH, EPOCHS, PublishedConfig, PublishedLSTM
+from experiments.lstm_seker2019 import BATCH, EPOCHS, SekerConfig, SekerLSTM
 
 RESULTS = "data/results/speed.json"
 Rows = list[dict[str, Any]]
@@ -232,21 +232,21 @@ def lever_up(n: int = 256, epoch: int = 1440) -> Rows:
     of a window, and all 25 from the image alone, of one object and of 64 at once.
     """
     data, rows = open_interactions("lever_up").isel(interaction=slice(0, n + 8)), []
-    for name, lever in [*LEVER_MODELS.items(), ("lstm_published", None)]:
+    for name, lever in [*LEVER_MODELS.items(), ("lstm_seker2019", None)]:
         view = lever.view if lever else "full"
         arrays = lever_up_tensors(data, view=view).select(torch.arange(n))
         scales, channels = Scaler.fit(arrays), (arrays.action_channels, arrays.effect_channels)
         if lever:
             model, size = build(lever.network, scales).train(), 64
         else:
-            model, size = PublishedLSTM(PublishedConfig(*channels), scales).train(), BATCH
+            model, size = SekerLSTM(SekerConfig(*channels), scales).train(), BATCH
         optimiser = torch.optim.Adam(model.parameters(), 1e-4, fused=True)
         generator = torch.Generator().manual_seed(0)
 
         def step(model=model, arrays=arrays, size=size, optimiser=optimiser, g=generator) -> None:
             part = arrays.select(torch.randint(0, n, (size,), generator=g))
             optimiser.zero_grad()
-            if isinstance(model, PublishedLSTM):
+            if isinstance(model, SekerLSTM):
                 start = torch.randint(0, 11, (size,), generator=g)
                 model.next_step_loss(part, start, N_OBSERVED).backward()
             else:

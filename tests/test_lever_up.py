@@ -28,7 +28,7 @@ from affordlib.models.lstm import on_grid
 from affordlib.show import FrameRecorder, outline_in_lever_frame, plot_levered
 
 
-@pytest.fixture(scope="module", params=["anchored", "lstm_tuned", "paper"])
+@pytest.fixture(scope="module", params=["cnp_last_pose", "lstm_tuned", "cnp"])
 def untrained(request, levered):
     torch.manual_seed(0)
     model = build(LEVER_MODELS[request.param].network, Scaler.fit(levered))
@@ -60,7 +60,7 @@ def test_models_use_what_they_observe(untrained, levered):
 
 
 def test_the_first_pose_tells_nothing_to_those_that_anchor(levered):
-    for name in ("anchored", "lstm_tuned"):
+    for name in ("cnp_last_pose", "lstm_tuned"):
         torch.manual_seed(0)
         model = build(LEVER_MODELS[name].network, Scaler.fit(levered)).eval()
         first, none = (foresee(model, levered, p)[0].effect_mean for p in PROTOCOLS[1:])
@@ -82,7 +82,7 @@ def test_the_last_observation_is_found_in_any_order():
 
 def test_an_anchored_network_begins_where_the_object_is(levered):
     torch.manual_seed(0)
-    model = build(LEVER_MODELS["anchored"].network, Scaler.fit(levered)).eval()
+    model = build(LEVER_MODELS["cnp_last_pose"].network, Scaler.fit(levered)).eval()
     assert isinstance(model, AnchoredNetwork)
     model.fit_course(levered.effect)
     seen = condition_on_poses(levered, torch.zeros(len(levered), dtype=torch.long), 10)
@@ -120,7 +120,7 @@ def test_a_rollout_does_not_depend_on_how_far_it_is_asked(levered):
     torch.testing.assert_close(between.effect_mean, middle, atol=1e-5, rtol=1e-4)
 
 
-@pytest.mark.parametrize(("name", "kind"), [("anchored", "all"), ("lstm_tuned", "first_step")])
+@pytest.mark.parametrize(("name", "kind"), [("cnp_last_pose", "all"), ("lstm_tuned", "first_step")])
 def test_training_learns(levered, short, name, kind):
     lever = short(name, steps=60, batch_size=16, validate_every=30, ema=0.0)
     model, history = fit_lever_model(lever, levered, levered, kind, progress=False)

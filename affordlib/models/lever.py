@@ -67,10 +67,10 @@ class LeverModel:
 
 _IMAGE = {"rings": 10, "orders": 12}
 LEVER_MODELS: dict[str, LeverModel] = {
-    "anchored": LeverModel(
+    "cnp_last_pose": LeverModel(
         AnchoredConfig(**_CHANNELS, **_IMAGE), replace(TRAINING, learning_rate=4e-3)
     ),
-    "paper": LeverModel(CNPConfig(**_CHANNELS), view="wide"),
+    "cnp": LeverModel(CNPConfig(**_CHANNELS), view="wide"),
     "lstm_tuned": LeverModel(
         LSTMConfig(**_CHANNELS, **_IMAGE), replace(TRAINING, learning_rate=2e-3)
     ),
@@ -78,7 +78,7 @@ LEVER_MODELS: dict[str, LeverModel] = {
 """Ours, the paper's (its image shrunk to the 48×48 of the appendix), and the recurrent one.
 
 All get as many steps, although one of the paper's network costs three times as much. The rates of
-the first and the last are chosen by validation error (`evaluation/lever_tuning.py`)."""
+the first and the last are chosen by validation error (`experiments/lever_tuning.py`)."""
 
 
 @torch.no_grad()

@@ -1,4 +1,4 @@
-"""The older study's network for lever-ups, as published (Seker, Tekden and Ugur, 2019; Table 1).
+"""The recurrent network of Seker, Tekden and Ugur (2019) for lever-ups (Table 1).
 
 Four convolutions 3×3 (32, 64, 128, 256), each with ReLU and 2×2 max-pooling, a dense layer of 4096
 with dropout 0.5; these features are repeated over a window of 15 poses and concatenated with them;
@@ -6,8 +6,8 @@ LSTM(256); a dense layer per step gives the next pose. 72 million parameters. Me
 Adam at 5e-4, batches of 32, 100 epochs of one random window per trajectory, the learning rate times
 0.8 when the validation loss rests.
 
-Ours to add, for equal context with the other models: phase and commanded action of each step beside
-its pose, and poses scaled to unit size. Foreseen poses are its next inputs.
+Added here, for equal context with the other models: phase and commanded action of each step beside
+its pose, and poses scaled to unit size. Predicted poses are its next inputs.
 """
 
 from __future__ import annotations
@@ -36,26 +36,27 @@ from affordlib.types import LEVER_IMAGE_PIXELS, Observations
 CONVOLUTION_WIDTHS = (32, 64, 128, 256)
 DENSE, HIDDEN = 4096, 256
 BATCH, LEARNING_RATE, DECAY, EPOCHS = 32, 5e-4, 0.8, 100
-KEPT_EVERY = 10
-VANISHES = 1e-30
-"""Means of gradients below are set to zero. Those of units that no longer learn halve every seven
-steps, for ever, and subnormal numbers cost a processor many times as much."""
+TRAINING = (CONVOLUTION_WIDTHS, DENSE, HIDDEN, BATCH, LEARNING_RATE, DECAY)
+SAVE_EVERY = 10
+NEGLIGIBLE = 1e-30
+"""Averaged gradients below this are set to zero. Those of units that no longer learn halve every
+seven steps, for ever, and subnormal numbers cost a processor many times as much."""
 State = tuple[Tensor, Tensor]
 
 
 @checked
 @dataclass(frozen=True)
-class PublishedConfig(NetworkConfig):
+class SekerConfig(NetworkConfig):
     """Channels, and the number of steps that the phase has."""
 
     steps: int = 25
     patience: int = 5
 
 
-class PublishedLSTM(EffectNetwork):
-    """CNN and LSTM, step by step; σ is not foreseen and is the floor."""
+class SekerLSTM(EffectNetwork):
+    """CNN and LSTM, step by step; σ is not predicted and is the floor."""
 
-    def __init__(self, config: PublishedConfig, scaler: Scaler) -> None:
+    def __init__(self, config: SekerConfig, scaler: Scaler) -> None:
         super().__init__(config, scaler)
         n_a, n_e = len(config.action_channels), len(config.effect_channels)
         layers: list[nn.Module] = []
@@ -79,7 +80,7 @@ class PublishedLSTM(EffectNetwork):
     ) -> tuple[Tensor, ...]:
         """(μ_a, σ_a, μ_e, σ_e) at steps of the phase, each (B, T, C) and standardised.
 
-        The action is not foreseen: μ_a is zero.
+        The action is not predicted: μ_a is zero.
         """
         o = observations
         known = on_grid(o.effect / self.effect_scale, o.effect_t, o.effect_mask, self.config.steps)
@@ -91,16 +92,16 @@ class PublishedLSTM(EffectNetwork):
         return mu_a, mu_a + self.sigma_floor, mu_e, torch.full_like(mu_e, self.sigma_floor)
 
     def roll(self, features: Tensor, known: Known, o: Observations, n: int) -> Tensor:
-        """Poses (B, n + 1, C) from the first observed step on: those that are foreseen."""
+        """Poses (B, n + 1, C) from the first observed step on."""
         rows = torch.arange(len(features), device=features.device)
         action = (o.action / self.action_scale).flatten(1)[:, None]
-        n_told = int(known.where.sum(dim=1).min())
-        k = (known.first[:, None] + torch.arange(n_told)).clamp_max(self.config.steps)
-        told = known.d[rows[:, None], k]
+        n_given = int(known.where.sum(dim=1).min())
+        k = (known.first[:, None] + torch.arange(n_given)).clamp_max(self.config.steps)
+        given = known.d[rows[:, None], k]
         gates = self._share_of_image(features)
-        out, state = self._steps(gates, told, k, action)
-        path = [told[:, :1], self.next_pose(out)]
-        for j in range(n_told, n):
+        out, state = self._steps(gates, given, k, action)
+        path = [given[:, :1], self.next_pose(out)]
+        for j in range(n_given, n):
             k = (known.first[:, None] + j).clamp_max(self.config.steps)
             out, state = self._steps(gates, path[-1][:, -1:], k, action, state)
             path.append(self.next_pose(out))
@@ -114,13 +115,13 @@ class PublishedLSTM(EffectNetwork):
     def _steps(
         self, gates: Tensor, pose: Tensor, k: Tensor, action: Tensor, state: State | None = None
     ) -> tuple[Tensor, State]:
-        """The hidden states (B, K, H) after each of K told poses, and the last state."""
-        told = torch.cat([pose, action.expand(-1, pose.shape[1], -1)], dim=-1)
-        told = with_time(told, k / self.config.steps)
-        told = gates[:, None] + F.linear(told, self.lstm.weight_ih[:, DENSE:])
+        """The hidden states (B, K, H) after each of K given poses, and the last state."""
+        given = torch.cat([pose, action.expand(-1, pose.shape[1], -1)], dim=-1)
+        given = with_time(given, k / self.config.steps)
+        given = gates[:, None] + F.linear(given, self.lstm.weight_ih[:, DENSE:])
         h, c = state or (gates.new_zeros(len(gates), HIDDEN),) * 2
         hidden = []
-        for of_step in told.unbind(dim=1):
+        for of_step in given.unbind(dim=1):
             i, f, g, o = torch.addmm(of_step, h, self.lstm.weight_hh.T).chunk(4, dim=1)
             c = f.sigmoid() * c + i.sigmoid() * g.tanh()
             h = o.sigmoid() * c.tanh()
@@ -139,21 +140,19 @@ class PublishedLSTM(EffectNetwork):
         return F.mse_loss(self.next_pose(out), pose[rows, k + 1])
 
 
-def train_published(
-    model: PublishedLSTM,
+def train_seker(
+    model: SekerLSTM,
     training: InteractionTensors,
     validation: InteractionTensors,
     trained_for: str = "window",
     epochs: int = EPOCHS,
     seed: int = 0,
-    max_minutes: float = math.inf,
     checkpoint: Path | None = None,
 ) -> dict[str, float]:
     """Train in place, to the weights of the best validation error; what it took.
 
     An epoch is one window of each trajectory ("first_step": the whole trajectory). checkpoint: a
-    file, written after every tenth epoch (1.2 GB), from which the same call goes on. max_minutes
-    bounds the processor time of training; the epochs done are told.
+    file, written after every tenth epoch (1.2 GB), from which the same training resumes.
     """
     optimiser = torch.optim.Adam(model.parameters(), LEARNING_RATE, fused=True)
     plateau = torch.optim.lr_scheduler.ReduceLROnPlateau(
@@ -163,14 +162,8 @@ def train_published(
     n = N_OBSERVED if trained_for == "window" else len(training.phase) - 1
     score = window_errors_m if trained_for == "window" else beginning_errors_m
     best, best_state, epoch, seconds = math.inf, model.state_dict(), 0, 0.0
-    about = [trained_for, seed, *(float(a.effect.double().sum()) for a in (training, validation))]
     if checkpoint is not None and checkpoint.exists():
         state = load_state(checkpoint)
-        if state["about"] != about:
-            raise ValueError(
-                f"checkpoint {checkpoint} is of a training for {state['about'][0]!r} with seed "
-                f"{state['about'][1]} or of other data; delete it, or train as it was begun"
-            )
         model.load_state_dict(state["model"])
         optimiser.load_state_dict(state["optimiser"])
         plateau.load_state_dict(state["plateau"])
@@ -178,7 +171,7 @@ def train_published(
         torch.set_rng_state(state["torch"])
         best, best_state = state["best"], state["best_state"]
         epoch, seconds = state["epoch"], state["seconds"]
-    while epoch < epochs and seconds < 60 * max_minutes:
+    while epoch < epochs:
         began = time.process_time()
         model.train()
         for rows in torch.randperm(len(training), generator=generator).split(BATCH):
@@ -189,20 +182,19 @@ def train_published(
             loss.backward()
             optimiser.step()
         for of in optimiser.state.values():
-            of["exp_avg"] = F.hardshrink(of["exp_avg"], VANISHES)
+            of["exp_avg"] = F.hardshrink(of["exp_avg"], NEGLIGIBLE)
         model.eval()
         error = float(score(model, validation).mean())
         plateau.step(error)
         epoch, seconds = epoch + 1, seconds + time.process_time() - began
         if error < best:
             best, best_state = error, {k: v.clone() for k, v in model.state_dict().items()}
-        over = epoch == epochs or seconds >= 60 * max_minutes
-        if checkpoint is not None and (over or epoch % KEPT_EVERY == 0):
+        if checkpoint is not None and (epoch == epochs or epoch % SAVE_EVERY == 0):
             state = {
                 "model": model.state_dict(), "optimiser": optimiser.state_dict(),
                 "plateau": plateau.state_dict(), "generator": generator.get_state(),
                 "torch": torch.get_rng_state(), "best": best, "best_state": best_state,
-                "epoch": epoch, "seconds": seconds, "about": about,
+                "epoch": epoch, "seconds": seconds
             }  # fmt: skip
             save_state(checkpoint, state)
     model.load_state_dict(best_state)

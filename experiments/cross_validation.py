@@ -1,0 +1,228 @@
+"""Cross-validation of effect prediction: jobs that train on a fold's training part and test.
+
+A job is told by model, data set, size, fold and seed. It trains on the training part, stops early
+on the validation part, and predicts the effects of the test part from the image and the commanded
+action at t = 0 and t = 1. `experiments.effect_prediction` runs jobs and makes the tables.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from affordlib.evaluation.baselines import (
+    BASELINES,
+    baseline_predictions,
+    logistic_predictions,
+)
+from affordlib.evaluation.predictions import (
+    network_predictions,
+    summary,
+)
+from affordlib.interactions import InteractionTensors, Split, split_interactions
+from affordlib.interactions.dataset import Symmetry, valid_interactions
+from affordlib.models.calibration import fit_temperature
+from affordlib.models.cnp import CNPConfig
+from affordlib.models.ensemble import Ensemble
+from affordlib.models.film import FiLMConfig
+from affordlib.models.network import EffectNetwork, NetworkConfig
+from affordlib.models.training import train_model
+from experiments.attention import AttentionConfig
+from experiments.inverse import executed_columns, inverse_columns, theta_along_effect
+from experiments.runner import Job, open_once
+from experiments.shipped import CHECKPOINT_SPECS, GRASP_SYMMETRIES, HALF_TURNS
+
+VERSION = 2
+N_FOLDS = 10
+STEPS_ON_100 = 800
+"""Training steps on the sets of 100 interactions."""
+
+LARGE = "_x10"
+"""What the names of sets of ten times the size end in. They are collected, not shipped."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is predicted of a primitive's effects, and from which channels of the action.
+
+    all_effects: predicted by all models but the paper's network.
+    symmetries: (quarter turns, mirrored) under which the primitive stays itself; None for those
+    with a direction, whose training rotates and mirrors by itself. test_set: a second test set.
+    """
+
+    action_channels: tuple[str, ...]
+    effect_channels: tuple[str, ...]
+    all_effects: tuple[str, ...]
+    symmetries: tuple[Symmetry, ...] | None = None
+    test_set: str | None = None
+
+
+TASKS: dict[str, Task] = {
+    "push": Task(("x", "y"), ("x", "y"), ("x", "y", "yaw"), test_set="push_test"),
+    "drag": Task(("x", "y"), ("x", "y"), ("x", "y")),
+    "grasp": Task(("z", "gripper"), ("z",), ("z",), GRASP_SYMMETRIES),
+    "rotate": Task(("yaw", "gripper"), ("yaw",), ("yaw",), HALF_TURNS),
+}
+PLANE = ("push", "drag")
+"""Primitives whose effect is a displacement in the plane of the table."""
+
+CHANNELS = ("x", "y", "z", "yaw")
+SETS = (*TASKS, *(f"{name}{LARGE}" for name in TASKS))
+
+
+@dataclass(frozen=True)
+class Network:
+    """A network to compare: its kind, the shipped checkpoint whose training it has, its frame."""
+
+    config: type[NetworkConfig]
+    checkpoint: str
+    push_frame: bool = True
+    members: int = 1
+
+
+NETWORKS = {
+    "cnp": Network(CNPConfig, "cnp_500", push_frame=False),
+    "film": Network(FiLMConfig, "film_500"),
+    "cnp_push_frame": Network(CNPConfig, "cnp_500"),
+    "film_table_frame": Network(FiLMConfig, "film_500", push_frame=False),
+    "attention": Network(AttentionConfig, "attention_500"),
+    "ensemble": Network(FiLMConfig, "film_500", members=5),
+}
+MODELS = (*NETWORKS, *BASELINES, "logistic")
+
+
+def task_of(data: str) -> Task:
+    """The task of a set or of the one that is ten times as large."""
+    return TASKS[data.removesuffix(LARGE)]
+
+
+def network_and_training(model: str, data: str, n: int | str = "all") -> tuple[Any, ...]:
+    """The configurations of a network and of its training: those of the shipped checkpoints.
+
+    FiLM has those of the checkpoint that learns from this very set, if there is one; the sets of
+    100 grasps and rotations get fewer steps.
+    """
+    task, network = task_of(data), NETWORKS[model]
+    training = CHECKPOINT_SPECS[network.checkpoint].training
+    if network.config is FiLMConfig and n == "all":
+        specs = [s for s in CHECKPOINT_SPECS.values() if isinstance(s.network, FiLMConfig)]
+        training = next((s.training for s in specs if s.data == data), training)
+    if task.symmetries is not None:
+        steps = training.steps if data.endswith(LARGE) else STEPS_ON_100
+        training = replace(training, augment=False, steps=steps)
+    effects = task.effect_channels if network.config is CNPConfig else task.all_effects
+    frame = "push" if network.push_frame and task.symmetries is None else "table"
+    channels = {"action_channels": task.action_channels, "effect_channels": effects}
+    return network.config(**channels, frame=frame), training
+
+
+def job(model: str, data: str, n: int | str = "all", fold: int = 0, seed: int = 0) -> Job:
+    """One training and its tests; n counts the interactions of which ten folds are made."""
+    for name, value, known in (("model", model, MODELS), ("data", data, SETS)):
+        if value not in known:
+            raise ValueError(f"{name} must be one of {known}, got {value!r}")
+    if n != "all" and (not isinstance(n, int) or n < N_FOLDS):
+        raise ValueError(f'n must be "all" or at least {N_FOLDS}, got {n!r}')
+    if fold not in range(N_FOLDS):
+        raise ValueError(f"fold must lie in [0, {N_FOLDS - 1}], got {fold!r}")
+    task, settings = task_of(data), ()
+    if model == "logistic" and not data.startswith("grasp"):
+        raise ValueError(f"model 'logistic' predicts the success of grasps, not {data!r}")
+    if task.symmetries is not None and model.endswith("_frame"):
+        raise ValueError(f"data {data!r} has no direction, so no use for model {model!r}")
+    if model in NETWORKS:
+        settings = (network_and_training(model, data, n), NETWORKS[model].members)
+    arguments = {"model": model, "data": data, "n": n, "fold": fold, "seed": seed}
+    sets = (data, task.test_set) if task.test_set else (data,)
+    return Job(cross_validate, arguments, (task, settings), sets, version=VERSION)
+
+
+def cross_validate(
+    model: str, data: str, n: int | str, fold: int, seed: int, resume_checkpoint: Path
+) -> dict[str, Any]:
+    """Predictions of the test part as columns; errors on the second test set; inverse problems."""
+    interactions, task = open_once(data), task_of(data)
+    available = interactions.sizes["interaction"]
+    size = available if n == "all" else int(n)
+    if size > available:
+        raise ValueError(f"n = {n}, but {data!r} has {available} interactions")
+    split = split_interactions(size, seed, fold, N_FOLDS)
+    tests = {"fold_test": (interactions, split.test)}
+    if task.test_set:
+        other = open_once(task.test_set)
+        tests["fixed_test"] = (other, np.arange(other.sizes["interaction"]))
+    result: dict[str, Any] = {"n_interactions": size}
+    if model in NETWORKS:
+        network, result["training"] = _train(model, data, n, seed, split, resume_checkpoint)
+        found = {name: network_predictions(network, *test) for name, test in tests.items()}
+        if task.test_set:
+            result["inverse"] = inverse_columns(network, interactions, split.test)
+    elif model == "logistic":
+        known = interactions, split.train
+        found = {name: logistic_predictions(*known, *test) for name, test in tests.items()}
+    else:
+        known = (task.action_channels, task.all_effects), interactions, split.train
+        found = {
+            name: baseline_predictions(BASELINES[model], *known, *test)
+            for name, test in tests.items()
+        }
+        if model == "constant" and task.test_set:
+            kept = valid_interactions(interactions, split.test)
+            theta = theta_along_effect(interactions, kept)
+            result["inverse"] = executed_columns(interactions, kept, theta)
+    result["fold_test"] = prediction_columns(found["fold_test"])
+    if task.test_set:
+        told = summary(found["fixed_test"])
+        rows = told.pop("calibration")
+        result["fixed_calibration"] = [{"n_values": row.pop("n")} | row for row in rows]
+        result["fixed_test"] = {
+            "interaction": found["fixed_test"]["interaction"], "category": told.pop("family"),
+        } | {name: values for name, values in told.items() if values is not None}  # fmt: skip
+    return result
+
+
+def prediction_columns(predictions: dict[str, Any]) -> dict[str, Any]:
+    """Predictions as the columns of a table: `truth_x`, `mean_x`, `std_x`, … and errors."""
+    columns = {"category" if k == "family" else k: v for k, v in predictions.items()}
+    for kind in ("truth", "mean", "std"):
+        by_channel = columns.pop(kind, {})
+        columns |= {f"{kind}_{channel}": values for channel, values in by_channel.items()}
+    return columns
+
+
+def add_errors(table: pd.DataFrame, primitive: str) -> None:
+    """Add the errors at t = 1 to a table of predictions: in (x, y) [m], in z or yaw; and in yaw."""
+    off = {c: table[f"mean_{c}"] - table[f"truth_{c}"] for c in CHANNELS if f"mean_{c}" in table}
+    if primitive in PLANE:
+        table["final_error"] = np.hypot(off["x"], off["y"])
+    else:
+        table["final_error"] = abs(off[TASKS[primitive].effect_channels[0]])
+    if "yaw" in off:
+        table["yaw_error"] = abs((off["yaw"] + np.pi) % (2 * np.pi) - np.pi)
+
+
+def _train(
+    model: str, data: str, n: int | str, seed: int, split: Split, resume_checkpoint: Path
+) -> tuple[EffectNetwork | Ensemble, dict[str, Any]]:
+    """A trained network, or an ensemble whose members differ by their seeds."""
+    network, training = network_and_training(model, data, n)
+    interactions, members = open_once(data), NETWORKS[model].members
+    symmetries, trained, told = task_of(data).symmetries or (), [], []
+    for k in range(members):
+        config = replace(training, seed=members * seed + k)
+        path = resume_checkpoint.with_name(f"{resume_checkpoint.name}{k}")
+        one, history = train_model(interactions, split, config, network, False, symmetries, path)
+        best = min(record.validation_error for record in history)
+        steps = {"steps": history[-1].step, "seconds": history[-1].seconds}
+        told.append(steps | {"validation_error": best, "temperature": list(one.temperature)})
+        trained.append(one)
+    if members == 1:
+        return trained[0], told[0]
+    ensemble = Ensemble(trained)
+    channels = network.action_channels, network.effect_channels
+    validation = InteractionTensors.from_dataset(interactions, split.validation, *channels)
+    return ensemble, {"members": told, "temperature": fit_temperature(ensemble, validation)}

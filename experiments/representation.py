@@ -1,0 +1,239 @@
+"""Studies of what networks represent: the latent space, rollability, and which behaviour to use.
+
+latent: how similar the code r of an action and that of its effect are, and what w₁ changes.
+rollability: whether an object rolls, learned from its depth image alone, beside the rule by
+curvature. push_and_drag_model: the paper's single model of pushes and drags, which decodes from the
+wanted effect which of the two an object needs.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+import xarray as xr
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from affordlib.interactions import InteractionTensors, open_interactions, split_interactions
+from affordlib.interactions.dataset import valid_interactions
+from affordlib.models.checkpoint import load_checkpoint
+from affordlib.models.film import CircularHarmonics, FiLMConfig, dense
+from affordlib.models.frame import heading, inverse, turn_observations
+from affordlib.models.protocol import observe_final_effect
+from affordlib.models.training import final_errors_m, train_model
+from affordlib.perception import looks_rollable
+from affordlib.types import Observations
+from experiments.shipped import CHECKPOINT_SPECS
+
+Rows = list[dict[str, Any]]
+
+TRAINING = replace(CHECKPOINT_SPECS["film_500"].training, steps=1500)
+"""Of `push_and_drag_model` and `perturbed_world`; shorter than that of the shipped networks."""
+
+LATENT_MODELS = ("cnp_500", "film_500")
+WEIGHTS = (0.25, 0.5, 0.75)
+PUSH_START_MIN_RADIUS_M = 0.1
+"""A decoded action that starts farther from the object is a push, else a drag."""
+
+
+def cka(a: torch.Tensor, b: torch.Tensor) -> float | None:
+    """Linear centred kernel alignment of codes (N, D) and (N, E), 1 for equal up to a turn.
+
+    None where codes are all the same, as those of actions in the frame of the push. Kornblith et
+    al., Similarity of neural network representations revisited, ICML 2019.
+    """
+    if min(v.std(dim=0).norm() / v.mean(dim=0).norm() for v in (a, b)) < 1e-3:
+        return None
+    a, b = (v - v.mean(dim=0) for v in (a.double(), b.double()))
+    return float((a.T @ b).square().sum() / ((a.T @ a).norm() * (b.T @ b).norm()))
+
+
+def _seen_by(arrays: InteractionTensors, action: bool, effect: bool, weight: float) -> Observations:
+    """The action at t = 0 and 1, the effect at t = 0.8 and 1, or both, blended by w₁."""
+    last = len(arrays.phase) - 1
+    ends, late = torch.tensor([0, last]), torch.tensor([round(0.8 * last), last])
+    return Observations.of(
+        arrays,
+        arrays.action_at(ends) if action else None,
+        arrays.effect_at(late) if effect else None,
+        torch.full((len(arrays),), weight),
+    )
+
+
+@torch.no_grad()
+def latent() -> Rows:
+    """Alignment of the codes r of `push_test`, and the errors of what is decoded from them."""
+    data = open_interactions("push_test")
+    rows = []
+    for name in LATENT_MODELS:
+        model, _ = load_checkpoint(name)
+        channels = model.action_channels, model.effect_channels
+        arrays = InteractionTensors.from_dataset(data, None, *channels)
+
+        def code(observed: Observations, model: Any = model, channels: Any = channels) -> Any:
+            if model.config.frame == "push":
+                back = inverse(heading(observed, *channels))
+                observed = turn_observations(observed, back, *channels)
+            return model.represent(observed)
+
+        r_a, r_e = code(_seen_by(arrays, True, False, 1.0)), code(_seen_by(arrays, False, True, 0))
+        other = r_e.roll(1, dims=0)
+        features, t_target = model.encode(arrays.image), torch.tensor([[0.0, 1.0]])
+        for action, effect, weights in (
+            (True, False, (1.0,)),
+            (False, True, (0.0,)),
+            (True, True, WEIGHTS),
+        ):
+            for weight in weights:
+                observed = _seen_by(arrays, action, effect, weight)
+                predicted = model.predict(features, observed, t_target.expand(len(arrays), -1))
+                start = (predicted.action_mean[:, 0, :2] - arrays.action[:, 0, :2]).norm(dim=-1)
+                end = (predicted.effect_mean[:, 1, :2] - arrays.effect[:, -1, :2]).norm(dim=-1)
+                r = code(observed)
+                rows.append(
+                    {
+                        "model": name,
+                        "observed": "both" if action and effect else "action" * action or "effect",
+                        "w_1": weight,
+                        "n": len(arrays),
+                        "cosine_to_action": float(torch.cosine_similarity(r, r_a).mean()),
+                        "cosine_to_effect": float(torch.cosine_similarity(r, r_e).mean()),
+                        "cosine_to_other": float(torch.cosine_similarity(r, other).mean()),
+                        "cka_action_effect": cka(r_a, r_e),
+                        "action_start_mean_m": float(start.mean()),
+                        "final_error_mean_m": float(end.mean()),
+                    }
+                )
+    return rows
+
+
+class Rollability(nn.Module):
+    """P(rolls) of the object in an image (B, 2, 48, 48); see `learn_rollability`."""
+
+    def __init__(self, image_mean: Tensor, image_std: Tensor, width: int = 32) -> None:
+        super().__init__()
+        self.harmonics = CircularHarmonics(orders=4)
+        self.register_buffer("image_mean", image_mean)
+        self.register_buffer("image_std", image_std)
+        self.head = nn.Sequential(*dense(self.harmonics.n_features, width, width, 1))
+
+    def image_features(self, image: Float[Tensor, "b 2 48 48"]) -> Float[Tensor, "b f"]:
+        """The circular harmonics (B, F) of standardised depth and mask."""
+        mean, std = (v[:, None, None] for v in (self.image_mean, self.image_std))
+        return self.harmonics((image - mean) / std)
+
+    def forward(self, image: Float[Tensor, "b 2 48 48"]) -> Float[Tensor, " b"]:
+        """P(rolls) (B,)."""
+        return torch.sigmoid(self.head(self.image_features(image)).squeeze(1))
+
+
+def learn_rollability(
+    data: xr.Dataset, interactions: np.ndarray, steps: int = 400, seed: int = 0
+) -> Rollability:
+    """Learn from the images of interactions and whether their objects rolled, in a few seconds."""
+    images = torch.from_numpy(data["image"].values[interactions])
+    rolls = torch.from_numpy(data["rollable"].values[interactions].astype(np.float32))
+    if not 0 < rolls.mean() < 1:
+        raise ValueError("interactions must be of objects that roll and of such that do not")
+    torch.manual_seed(seed)
+    generator = torch.Generator().manual_seed(seed)
+    std = images.std(dim=(0, 2, 3)).clamp_min(1e-6)
+    model = Rollability(images.mean(dim=(0, 2, 3)), std)
+    seen = model.image_features(images)
+    optimiser = torch.optim.AdamW(model.parameters(), 3e-3, weight_decay=0.1)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
+    for _ in range(steps):
+        rows = torch.randint(len(seen), (128,), generator=generator)
+        angle = math.tau * torch.rand(len(rows), generator=generator)
+        turned = model.harmonics.turned(seen[rows], torch.stack([angle.cos(), angle.sin()], dim=1))
+        logit = model.head(turned).squeeze(1)
+        loss = nn.functional.binary_cross_entropy_with_logits(logit, rolls[rows])
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        schedule.step()
+    return model.eval()
+
+
+def rollability() -> Rows:
+    """Accuracy of rollability: learned from 400 images of `mixed`, and by curvature."""
+    mixed = open_interactions("mixed")
+    split = split_interactions(mixed.sizes["interaction"])
+    model = learn_rollability(mixed, split.train)
+    rows = []
+    for name in ("mixed", "partial", "push_test", "drag", "reach"):
+        data = open_interactions(name)
+        chosen = split.test if name == "mixed" else np.arange(data.sizes["interaction"])
+        images, rolls = data["image"].values[chosen], data["rollable"].values[chosen]
+        with torch.no_grad():
+            learned = model(torch.from_numpy(images)).numpy() > 0.5
+        rule = np.array([looks_rollable(image) for image in images])
+        names = np.array(data["family"].attrs["flag_meanings"].split())
+        category = names[data["family"].values[chosen]]
+        for kind in ("all", *np.unique(category)):
+            of = (category == kind) | (kind == "all")
+            rows.append(
+                {
+                    "test": name,
+                    "object_class": str(kind),
+                    "n": int(of.sum()),
+                    "learned_percent": 100 * float((learned == rolls)[of].mean()),
+                    "curvature_percent": 100 * float((rule == rolls)[of].mean()),
+                }
+            )
+    return rows
+
+
+def push_and_drag_model() -> Rows:
+    """One model of pushes and drags decodes, from the wanted effect alone, which of them to use.
+
+    Objects of `partial` are to be moved in random directions by the median effect of drags, and by
+    that of pushes; the model was trained on none of these objects, and gets no switch.
+    """
+    data, other = open_interactions("mixed"), open_interactions("partial")
+    split = split_interactions(data.sizes["interaction"])
+    model, _ = train_model(data, split, TRAINING, FiLMConfig(), progress=False)
+    arrays = InteractionTensors.from_dataset(data, split.train)
+    rolls = data["rollable"].values[valid_interactions(data, split.train)]
+    length = arrays.effect[:, -1].norm(dim=-1)
+    usual_m = [float(length[torch.from_numpy(rolls == kind)].median()) for kind in (True, False)]
+    test = InteractionTensors.from_dataset(data, split.test)
+    errors = final_errors_m(model, test).numpy()
+    forward = data["rollable"].values[valid_interactions(data, split.test)]
+    new = InteractionTensors.from_dataset(other)
+    rolls = other["rollable"].values[
+        valid_interactions(other, np.arange(other.sizes["interaction"]))
+    ]
+    rows = []
+    for wanted_m in usual_m:
+        wanted = wanted_m * _unit_vectors(len(new))
+        with torch.no_grad():
+            decoded = model.predict(
+                model.encode(new.image),
+                observe_final_effect(model, wanted),
+                torch.zeros(len(new), 1),
+            )
+        radius = decoded.action_mean[:, 0].norm(dim=-1).numpy()
+        for kind in (False, True):
+            rows.append(
+                {
+                    "rollable": kind,
+                    "n": int((rolls == kind).sum()),
+                    "wanted_mean_m": wanted_m,
+                    "behaviour_right_percent": 100
+                    * float(((radius > PUSH_START_MIN_RADIUS_M) != kind)[rolls == kind].mean()),
+                    "start_radius_median_m": float(np.median(radius[rolls == kind])),
+                    "n_forward": int((forward == kind).sum()),
+                    "final_error_mean_m": float(errors[forward == kind].mean()),
+                }
+            )
+    return rows
+
+
+def _unit_vectors(n: int) -> torch.Tensor:
+    angle = math.tau * torch.rand(n, generator=torch.Generator().manual_seed(0))
+    return torch.stack([angle.cos(), angle.sin()], dim=-1)

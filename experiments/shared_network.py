@@ -1,0 +1,187 @@
+"""A study: one network for push, drag, grasp and rotate, beside a network for each of them.
+
+The shared network observes all five action channels and predicts x, y, z and yaw. Which primitive
+is meant follows from the commanded action: a push starts beside the object, a drag ends beside it,
+a grasp ends high above it and a rotation ends rotated. It works in the push frame, which for an
+action without a direction is the table's.
+
+Both learn from the same training parts of the same folds and are tested on the same test parts; the
+shared one is trained for about as many steps as the four together. Its early stopping watches the
+geometric mean of the final errors, each as a share of its primitive's usual effect: to halve any of
+them counts the same. (An arithmetic mean is that of the ten grasps that a validation part holds.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+
+from affordlib.evaluation.predictions import network_predictions
+from affordlib.interactions import InteractionTensors, Scaler, split_interactions
+from affordlib.interactions.dataset import Symmetry, augment_by_symmetry
+from affordlib.interactions.sampling import condition_on_recorded_action
+from affordlib.models.checkpoint import build
+from affordlib.models.film import FiLMConfig
+from affordlib.models.network import EffectNetwork
+from affordlib.models.training import train
+from affordlib.primitives import Grasp
+from experiments.cross_validation import TASKS, add_errors, job, prediction_columns
+from experiments.runner import open_once, run
+from experiments.shipped import CHECKPOINT_SPECS
+
+PRIMITIVES = ("push", "drag", "grasp", "rotate")
+NETWORK = FiLMConfig(
+    action_channels=("x", "y", "z", "yaw", "gripper"), effect_channels=("x", "y", "z", "yaw")
+)
+TRAINING = replace(CHECKPOINT_SPECS["film_500"].training, steps=9600, augment=False)
+MIRRORED: tuple[Symmetry, ...] = ((0, False), (0, True))
+"""Symmetries of pushes and drags; rotating them is nothing new in the push frame."""
+
+FOLDS = 3
+SEPARATE_JOBS = {
+    name: [job("film", name, fold=fold) for fold in range(FOLDS)] for name in PRIMITIVES
+}
+SHARED, SEPARATE = "shared network", "separate networks"
+Rows = list[dict[str, Any]]
+
+
+def with_copies(arrays: InteractionTensors, primitive: str) -> InteractionTensors:
+    """Interactions and what they would be under the symmetries of their primitive.
+
+    A push and a drag are mirrored with their action; the action of a primitive without a direction
+    stays, see `augment_by_symmetry`.
+    """
+    symmetries = TASKS[primitive].symmetries
+    if symmetries is not None:
+        return augment_by_symmetry(arrays, symmetries)
+    first, *others = (arrays.rotated_and_mirrored(*symmetry) for symmetry in MIRRORED)
+    return first.joined(*others)
+
+
+def _part(primitive: str, fold: int, part: str) -> InteractionTensors:
+    data = open_once(primitive)
+    rows = getattr(split_interactions(data.sizes["interaction"], 0, fold), part)
+    return InteractionTensors.from_dataset(
+        data, rows, NETWORK.action_channels, NETWORK.effect_channels
+    )
+
+
+def shares(
+    validation: dict[str, InteractionTensors],
+) -> Callable[[EffectNetwork, InteractionTensors], torch.Tensor]:
+    """A score for `train`: the geometric mean of the primitives' final errors, each as a share of
+    its usual effect.
+    """
+
+    @torch.no_grad()
+    def score(model: EffectNetwork, _: InteractionTensors) -> torch.Tensor:
+        model.eval()
+        relative = []
+        for primitive, arrays in validation.items():
+            kept = [NETWORK.effect_channels.index(c) for c in TASKS[primitive].effect_channels]
+            end = torch.ones(len(arrays), 1)
+            mean = model.predict(
+                model.encode(arrays.image), condition_on_recorded_action(arrays), end
+            )
+            truth = arrays.effect[:, -1, kept]
+            error = (mean.effect_mean[:, 0, kept] - truth).norm(dim=-1).mean()
+            relative.append(error / truth.norm(dim=-1).square().mean().sqrt())
+        model.train()
+        return torch.stack(relative).log().mean(dim=0, keepdim=True).exp()
+
+    return score
+
+
+def train_shared(fold: int, resume_checkpoint: Path | None = None) -> EffectNetwork:
+    """The shared network, trained on a fold of all four sets."""
+    copies = [with_copies(_part(name, fold, "train"), name) for name in PRIMITIVES]
+    validation = {name: _part(name, fold, "validation") for name in PRIMITIVES}
+    training = copies[0].joined(*copies[1:])
+    torch.manual_seed(TRAINING.seed)
+    model = build(NETWORK, Scaler.fit(training))
+    first, *others = validation.values()
+    everything = first.joined(*others)
+    train(model, training, everything, TRAINING, False, resume_checkpoint, score=shares(validation))
+    return model
+
+
+def shared_network(resume_checkpoint: Path) -> Rows:
+    """Errors by primitive and effect; the separate networks are jobs of `cross_validation`."""
+    tests: dict[tuple[str, str], list[pd.DataFrame]] = {}
+    for fold in range(FOLDS):
+        path = resume_checkpoint.with_name(f"{resume_checkpoint.name}{fold}")
+        model = train_shared(fold, path)
+        for name in PRIMITIVES:
+            (result,) = run([SEPARATE_JOBS[name][fold]], "effect_prediction", progress=False)
+            data = open_once(name)
+            rows = split_interactions(data.sizes["interaction"], 0, fold).test
+            pair = _pair(model, name, data, rows, result["fold_test"])
+            tests.setdefault((name, "folds"), []).append(pair)
+            if test_set := TASKS[name].test_set:
+                other = open_once(test_set)
+                rows = np.arange(other.sizes["interaction"])
+                pair = _pair(model, name, other, rows, result["fixed_test"])
+                tests.setdefault((name, test_set), []).append(pair)
+    rows = []
+    for (name, test), pairs in tests.items():
+        table = pd.concat(pairs)
+        if test != "folds":  # an object has one error: the mean over the networks of the folds
+            table = table.groupby(["model", "interaction"], sort=False).mean(numeric_only=True)
+            table = table.reset_index()
+        effect, unit = {"grasp": ("z", "m"), "rotate": ("yaw", "rad")}.get(name, ("x, y", "m"))
+        about = {"primitive": name, "effect": effect, "test": test, "folds": len(pairs)}
+        rows += _rows(table, "final_error", about, unit)
+        if name == "push":
+            rows += _rows(table, "yaw_error", about | {"effect": "yaw"}, "rad")
+    return rows
+
+
+def _pair(
+    model: EffectNetwork, primitive: str, data: Any, rows: np.ndarray, separate: dict[str, Any]
+) -> pd.DataFrame:
+    """Errors of both on the same interactions, in two blocks of rows."""
+    shared = pd.DataFrame(prediction_columns(network_predictions(model, data, rows)))
+    add_errors(shared, primitive)
+    alone = pd.DataFrame(separate)
+    if "final_error" not in alone:
+        add_errors(alone, primitive)
+    if shared["interaction"].tolist() != alone["interaction"].tolist():
+        raise ValueError(f"{primitive}: the separate network was tested on other interactions")
+    return pd.concat([shared.assign(model=SHARED), alone.assign(model=SEPARATE)])
+
+
+def _rows(table: pd.DataFrame, column: str, about: dict[str, Any], unit: str) -> Rows:
+    """A row of each model's errors, and by how much the shared network's exceed the others'."""
+    error = {model: group[column].to_numpy() for model, group in table.groupby("model")}
+    rows = []
+    for model in (SHARED, SEPARATE):
+        more = error[SHARED] - error[SEPARATE] if model == SHARED else None
+        columns = {
+            "error_mean": error[model].mean(),
+            "error_sem": _sem(error[model]),
+            "error_median": np.median(error[model]),
+            "error_p95": np.quantile(error[model], 0.95),
+            "more_mean": None if more is None else more.mean(),
+            "more_sem": None if more is None else _sem(more),
+        }
+        row: dict[str, Any] = {"model": model} | about | {"n": len(error[model])}
+        for u in ("m", "rad"):
+            row |= {f"{k}_{u}": None if u != unit or v is None else float(v)
+                    for k, v in columns.items()}  # fmt: skip
+        right = None
+        if about["primitive"] == "grasp":
+            of_model = table[table["model"] == model]
+            lifts = (of_model[f"{kind}_z"] > Grasp.success_m for kind in ("truth", "mean"))
+            right = 100 * float(np.equal(*lifts).mean())
+        rows.append(row | {"success_right_percent": right})
+    return rows
+
+
+def _sem(values: np.ndarray) -> float:
+    return float(values.std(ddof=1) / np.sqrt(len(values)))
