@@ -10,10 +10,10 @@ from affordlib.interactions.sampling import condition_on_poses
 from affordlib.models import load_checkpoint
 from affordlib.models.lever import errors_m, window_errors_m
 from exercises import check
-from experiments.lever_up import LeverUnit, split_of
+from experiments.lever_cross_validation import lever_split
 
 levers = open_interactions("lever_up")
-test = lever_up_tensors(levers, split_of(LeverUnit("anchored"), levers).test)
+test = lever_up_tensors(levers, lever_split(levers).test)
 conditional, _ = load_checkpoint("lever_up_last_pose_1800")
 recurrent, _ = load_checkpoint("lever_up_lstm_1800_window")
 
