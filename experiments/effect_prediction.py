@@ -65,7 +65,10 @@ def sorted_results(folder: str | Path = FOLDER) -> list[Result]:
     truth = tests.filter(like="truth_").groupby([tests["data"], tests["interaction"]])
     apart = (truth.max() - truth.min()).max(axis=1)
     if apart.max() > SAME_TRUTH:
-        raise ValueError(f"{NAME}: results of {apart.idxmax()} are of other data")
+        data, number = apart.idxmax()
+        raise ValueError(
+            f"{NAME}: results of {data!r} differ in the effect of interaction {number}"
+        )
     return results
 
 
@@ -95,12 +98,12 @@ def by_category(group: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
 
 def mean_sem(group: pd.DataFrame, column: str) -> tuple[float, float]:
     """Mean and standard error over objects; categories have equal weights."""
-    if not group.duplicated(["category", "interaction"]).any():
-        objects = group.set_index(["category", "interaction"])[column].sort_index()
-    else:
-        trainings = group.groupby(["category", "interaction"])[column]
-        objects = trainings.apply(lambda errors: errors.to_numpy().mean())
-    each = [v.to_numpy() for _, v in objects.groupby("category")]
+    each = []
+    for _, some in group.groupby("category"):
+        number, error = some["interaction"].to_numpy(), some[column].to_numpy()
+        order = np.argsort(number, kind="stable")
+        trainings = np.split(error[order], np.flatnonzero(np.diff(number[order])) + 1)
+        each.append(np.array([errors.mean() for errors in trainings]))
     sems = [v.std(ddof=1) / np.sqrt(len(v)) if len(v) > 1 else 0.0 for v in each]
     sem = np.sqrt(np.square(sems).sum()) / len(sems)
     return float(np.mean([v.mean() for v in each])), float(sem)

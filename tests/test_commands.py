@@ -25,21 +25,33 @@ def main_of(name):
 @pytest.mark.parametrize(
     ("name", "arguments", "named"),
     [
-        ("experiments.units", ["--models", "film,flim"], "--models: 'flim' is unknown; choose"),
-        ("experiments.units", ["--sets", "nope"], "--sets: 'nope' is unknown"),
         (
-            "experiments.units",
+            "experiments.effect_prediction",
+            ["--models", "film,flim"],
+            "--models: 'flim' is unknown; choose",
+        ),
+        ("experiments.effect_prediction", ["--sets", "nope"], "--sets: 'nope' is unknown"),
+        (
+            "experiments.effect_prediction",
             ["--folds", "-1"],
             "--folds: must be a whole number from 1 to 10, got",
         ),
         (
-            "experiments.units",
+            "experiments.effect_prediction",
             ["--folds", "11"],
             "--folds: must be a whole number from 1 to 10, got",
         ),
-        ("experiments.units", ["--seeds", "0"], "--seeds: must be a whole number from 1"),
-        ("experiments.units", ["--workers", "-2"], "--workers: must be a whole number from 1"),
-        ("experiments.units", ["--n", "many"], "--n: must be a whole number from 1"),
+        (
+            "experiments.effect_prediction",
+            ["--seeds", "0"],
+            "--seeds: must be a whole number from 1",
+        ),
+        (
+            "experiments.effect_prediction",
+            ["--workers", "-2"],
+            "--workers: must be a whole number from 1",
+        ),
+        ("experiments.effect_prediction", ["--n", "many"], "--n: must be a whole number from 1"),
         ("experiments.closed_loop", ["--tables", "nope"], "--tables: 'nope' is unknown"),
         ("experiments.closed_loop", ["--seed", "-1"], "--seed: must be a whole number from 0"),
         ("experiments.closed_loop", ["--n", "0"], "--n: must be a whole number from 1"),
@@ -75,10 +87,9 @@ def test_unknown_names_and_impossible_numbers_are_refused(capsys, name, argument
 @pytest.mark.parametrize(
     ("name", "arguments"),
     [
-        ("experiments.units", ["--models", "constant", "--folds", "1", "--out", "{}"]),
-        ("experiments.tables", ["--parts", "{}"]),
-        ("experiments.lever_tables", ["--parts", "{}"]),
-        ("experiments.lever_up", ["--models", "persistence", "--folds", "1", "--out", "{}"]),
+        ("experiments.effect_prediction", ["--models", "constant", "--raw", "{}"]),
+        ("experiments.lever_up", ["--raw", "{}"]),
+        ("experiments.studies", ["--only", "latent", "--raw", "{}"]),
         ("experiments.shipped", ["data", "--only", "grasp", "--workers", "1", "--to", "{}"]),
     ],
 )

@@ -1,7 +1,5 @@
 """Several networks as one: the moments of their mixture, and that planners can work with it."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -12,8 +10,6 @@ from affordlib.models import EffectModel, Ensemble, condition_on_primitives, loa
 from affordlib.planning import plan_astar, plan_continuous
 from affordlib.primitives import Push
 from affordlib.types import Goal
-from experiments import units
-from experiments.units import Unit, configuration_sha256, run_unit
 from tests.problems import problem_of
 
 NAMES = ("film_500", "film_5000")
@@ -81,30 +77,3 @@ def test_planners_work_with_it(members, plan, cuboid_image):
     alone = plan(problem_of(members[1], *about)).steps[0]
     assert abs(wrap_angle(step.primitive.theta - alone.primitive.theta)) < 0.15
     assert abs(step.stop_phase - alone.stop_phase) < 0.1
-
-
-def test_a_unit_trains_each_member_once_and_resumes(tmp_path, monkeypatch):
-    monkeypatch.setattr(units, "FEW_STEPS", 4)
-    monkeypatch.setattr(units, "MEMBERS", 2)
-    short = replace(
-        units.CHECKPOINT_SPECS["film_500"].training, validate_every=2, batch_size=8, ema=0.0
-    )
-    shipped = replace(units.CHECKPOINT_SPECS["film_500"], training=short)
-    monkeypatch.setattr(units, "CHECKPOINT_SPECS", units.CHECKPOINT_SPECS | {"film_500": shipped})
-    unit, real, seen = Unit("ensemble", "grasp"), units.train_model, []
-
-    def counted(data, split, config, *others):
-        seen.append(config.seed)
-        if len(seen) == 2:
-            raise KeyboardInterrupt
-        return real(data, split, config, *others)
-
-    monkeypatch.setattr(units, "train_model", counted)
-    with pytest.raises(KeyboardInterrupt):
-        run_unit(unit, tmp_path)
-    assert run_unit(unit, tmp_path)
-    assert seen == [0, 1, 0, 1]
-    assert [path.name for path in tmp_path.iterdir()] == [unit.file]
-    before = configuration_sha256(unit)
-    monkeypatch.setattr(units, "MEMBERS", 3)
-    assert configuration_sha256(unit) != before

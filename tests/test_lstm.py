@@ -14,13 +14,13 @@ from affordlib.models.lever import beginning_errors_m, window_errors_m
 from affordlib.models.lstm import LSTMConfig, courses
 from affordlib.models.protocol import EffectModel, condition_on_primitives
 from affordlib.primitives import Push
-from experiments.lstm_published import PublishedConfig, PublishedLSTM, train_published
+from experiments.lstm_seker2019 import SekerConfig, SekerLSTM, train_seker
 
 
 def test_the_published_network_is_the_published_one(levered):
-    config = PublishedConfig(levered.action_channels, levered.effect_channels)
+    config = SekerConfig(levered.action_channels, levered.effect_channels)
     torch.manual_seed(0)
-    model = PublishedLSTM(config, Scaler.fit(levered))
+    model = SekerLSTM(config, Scaler.fit(levered))
     total = sum(p.numel() for p in model.parameters())
     assert 71e6 < total < 73e6
     assert [m.out_channels for m in model.cnn if hasattr(m, "out_channels")] == [32, 64, 128, 256]
@@ -28,16 +28,16 @@ def test_the_published_network_is_the_published_one(levered):
 
 @pytest.fixture
 def small_published(levered, monkeypatch):
-    from experiments import lstm_published
+    from experiments import lstm_seker2019
 
-    monkeypatch.setattr(lstm_published, "CONVOLUTION_WIDTHS", (2, 2, 2, 2))
-    monkeypatch.setattr(lstm_published, "LEVER_IMAGE_PIXELS", 48)
-    monkeypatch.setattr(lstm_published, "DENSE", 8)
+    monkeypatch.setattr(lstm_seker2019, "CONVOLUTION_WIDTHS", (2, 2, 2, 2))
+    monkeypatch.setattr(lstm_seker2019, "LEVER_IMAGE_PIXELS", 48)
+    monkeypatch.setattr(lstm_seker2019, "DENSE", 8)
 
     def make():
         torch.manual_seed(0)
-        config = PublishedConfig(levered.action_channels, levered.effect_channels)
-        return PublishedLSTM(config, Scaler.fit(levered))
+        config = SekerConfig(levered.action_channels, levered.effect_channels)
+        return SekerLSTM(config, Scaler.fit(levered))
 
     return make
 
@@ -60,7 +60,7 @@ def test_its_recurrence_is_that_of_features_repeated_and_concatenated(levered, s
 def test_a_published_training_goes_on_where_it_was_broken_off(tmp_path, levered, small_published):
     def train(epochs, file):
         model = small_published()
-        told = train_published(model, levered, levered, "window", epochs, checkpoint=file)
+        told = train_seker(model, levered, levered, "window", epochs, checkpoint=file)
         return model, told
 
     whole, told = train(3, None)
@@ -76,16 +76,16 @@ def test_a_published_training_goes_on_where_it_was_broken_off(tmp_path, levered,
 def test_gradients_that_vanish_are_forgotten(tmp_path, levered, small_published, monkeypatch):
     """Most of a published network's units die, and their subnormal means take half of its time."""
     begun = tmp_path / "begun.pt"
-    train_published(small_published(), levered, levered, "window", 1, checkpoint=begun)
+    train_seker(small_published(), levered, levered, "window", 1, checkpoint=begun)
     state = torch.load(begun)
     for of in state["optimiser"]["state"].values():
         of["exp_avg"].fill_(1e-39)
 
     def go_on(vanishes):
-        monkeypatch.setattr("experiments.lstm_published.VANISHES", vanishes)
+        monkeypatch.setattr("experiments.lstm_seker2019.NEGLIGIBLE", vanishes)
         model, file = small_published(), tmp_path / f"{vanishes}.pt"
         torch.save(state, file)
-        train_published(model, levered, levered, "window", 2, checkpoint=file)
+        train_seker(model, levered, levered, "window", 2, checkpoint=file)
         left = torch.load(file)
         means = [of["exp_avg"] for of in left["optimiser"]["state"].values()]
         return left["model"], torch.cat([mean.flatten().abs() for mean in means])
@@ -112,17 +112,6 @@ def test_an_lstm_of_pushes_is_a_model_like_the_others(pushes):
     )
     told.effect_mean.sum().backward()
     assert action.grad.abs().sum() > 0
-
-
-def test_a_published_training_of_something_else_is_not_gone_on_with(
-    tmp_path, levered, small_published
-):
-    file = tmp_path / "half.pt"
-    train_published(small_published(), levered, levered, "window", 1, checkpoint=file)
-    for other in ({"seed": 1}, {"trained_for": "first_step"}):
-        told = {"trained_for": "window", "epochs": 2, "checkpoint": file} | other
-        with pytest.raises(ValueError, match="delete it, or train as it was begun"):
-            train_published(small_published(), levered, levered, **told)
 
 
 def test_the_course_of_pushes_is_that_seen_from_behind(pushes):

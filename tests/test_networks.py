@@ -31,7 +31,7 @@ from affordlib.primitives import Drag, Push
 from affordlib.types import Observations
 from affordlib.world import Cuboid, UprightCylinder
 from experiments.attention import AttentionConfig
-from experiments.lstm_published import PublishedConfig
+from experiments.lstm_seker2019 import SekerConfig
 
 YAW = {"action_channels": ("x", "y", "yaw"), "effect_channels": ("x", "y", "yaw")}
 SMALL = {"width": 32, "blocks": 2, "rings": 3, "orders": 4}
@@ -339,7 +339,7 @@ def test_coverage_and_temperature(some):
         (lambda: AttentionConfig(rings=True), "rings=True"),
         (lambda: AttentionConfig(heads=0), "heads .* 0"),
         (lambda: LSTMConfig(steps=2.5), r"steps=2\.5"),
-        (lambda: PublishedConfig(patience=0), "patience .* 0"),
+        (lambda: SekerConfig(patience=0), "patience .* 0"),
         (lambda: CNPConfig(temperature=(1.0, 0.0)), r"temperature .* \(1\.0, 0\.0\)"),
         (lambda: AttentionConfig(width=30), "width must be a multiple of heads, got 30"),
         (lambda: TrainingConfig(ema=1.0), "ema .* 1"),

@@ -16,17 +16,6 @@ from affordlib.evaluation.predictions import (
 from affordlib.interactions import (
     InteractionTensors,
 )
-from experiments.grasps import (
-    auc,
-    confusion_columns,
-    grasp_rows,
-    rates,
-    threshold_rows,
-    wilson,
-)
-from experiments.inverse import along_effect, executed_record
-from experiments.pooled import Errors
-from experiments.units import Unit
 
 # Answers
 
@@ -97,91 +86,3 @@ def test_logistic_regression_finds_the_boundary():
     fits = size[:, 0] < 0.08
     told = logistic(size[:200], fits[:200], size[200:])
     assert ((told > 0.5) == fits[200:]).mean() > 0.95
-
-
-def test_the_very_push_brings_its_effect_about(pushes):
-    some = np.flatnonzero(pushes["family"].values == 1)[:2]
-    right = executed_record(pushes, some, pushes["theta"].values[some])
-    assert max(right["final_error"]) < 1e-5  # the same simulation again, stored to a micrometre
-    guess = executed_record(pushes, some, along_effect(pushes, some))
-    assert max(guess["theta_error"]) < 0.02  # cylinders go where they are pushed
-
-
-# Tables
-
-
-@pytest.mark.parametrize(
-    ("k", "n", "low", "high"),
-    [(8, 10, 0.4902, 0.9433), (0, 10, 0.0, 0.2775), (50, 100, 0.4038, 0.5962)],
-)
-def test_wilson_intervals_are_the_published_ones(k, n, low, high):
-    assert wilson(k, n) == pytest.approx((low, high), abs=1e-4)
-
-
-def test_all_weighs_classes_equally_and_seeds_are_no_further_objects():
-    errors = Errors([1, 1, 1, 3, 5], [0, 1, 2, 3, 3], ["a", "a", "a", "b", "b"])
-    assert errors.mean_sem("all") == (2.5, 0.0)
-    assert (errors.count("all"), errors.count("b")) == (4, 1)
-    spread = Errors([0, 2, 0, 4], range(4), ["a", "a", "b", "b"])
-    assert spread.mean_sem("all") == (1.5, pytest.approx(math.hypot(1, 2) / 2))
-
-
-def test_auc_counts_pairs_in_order_within_folds():
-    truth, one = np.array([True, False, True, False]), np.zeros(4)
-    score = np.array([0.9, 0.1, 0.4, 0.4])
-    assert auc(score, truth, one) == (3 + 0.5) / 4
-    assert auc(score, truth, np.array([0, 0, 1, 1])) == (1 + 0.5) / 2
-    assert auc(score, truth, np.arange(4)) is None
-
-
-def test_true_and_false_shares_are_of_the_true_classes():
-    truth = np.array([True] * 4 + [False] * 2)
-    row = confusion_columns(np.array([True, True, True, False, False, True]), truth)
-    assert [row[f"{k}_percent"] for k in ("tp", "fn", "tn", "fp")] == [75, 25, 50, 50]
-    none = confusion_columns(np.array([True]), np.array([True]))
-    assert none["tn_percent"] is none["tn_low_percent"] is None
-
-
-def test_grasps_by_the_rule_of_a_tenth_of_a_metre():
-    told = {
-        "rollable": [False, False, True],
-        "family": [0] * 3,
-        "interaction": [0, 1, 2],
-        "truth": {"z": [0.25, 0.0, 0.25]},
-        "mean": {"z": [0.12, 0.11, 0.05]},
-        "std": {"z": [0.1, 0.1, 0.1]},
-    }
-    stands, rolls = grasp_rows([(Unit("film", "grasp"), {"n": 100, "fold_test": told})])
-    assert (stands["tp_percent"], stands["fp_percent"], rolls["fn_percent"]) == (100, 100, 100)
-    assert stands["error_mean_m"] == pytest.approx((0.13 + 0.11) / 2)
-    assert stands["auc"] == 1.0
-
-
-def _folds_of_grasps(scores, lifted):
-    parts = []
-    for fold, (score, up) in enumerate(zip(scores, lifted, strict=True)):
-        told = {
-            "rollable": [False] * len(up) + [True] * len(up),
-            "truth": {"z": [0.25 * v for v in (*up, *up)]},
-            "probability": [*score, *score],
-        }
-        parts.append((Unit("logistic", "grasp", fold=fold), {"n": 100, "fold_test": told}))
-    return parts
-
-
-def test_a_folds_own_grasps_never_decide_its_threshold():
-    # Folds 0 and 1 part near 0.8, fold 2 at 0.2: by its own all right, by theirs all lost.
-    scores = [[0.9, 0.85, 0.7, 0.6], [0.95, 0.82, 0.78, 0.1], [0.4, 0.3, 0.1, 0.05]]
-    parts = _folds_of_grasps(scores, [[1, 1, 0, 0]] * 3)
-    stands, _ = threshold_rows(parts)
-    assert (stands["n_success"], stands["n_failure"], stands["folds"]) == (6, 6, 3)
-    assert stands["tp_percent"] < 100  # fold 2
-    same, _ = threshold_rows(_folds_of_grasps([scores[0]] * 3, [[1, 1, 0, 0]] * 3))
-    assert (same["tp_percent"], same["tn_percent"]) == (100, 100)
-    assert same["threshold_median"] == pytest.approx(0.775)
-
-
-def test_rates_at_the_ends_are_all_and_nothing():
-    score, lifted = np.array([0.1, 0.4, 0.6, 0.9]), np.array([False, True, False, True])
-    tp, tn = rates(score, lifted, np.array([-np.inf, 0.5, 0.9]))
-    assert (tp.tolist(), tn.tolist()) == ([1, 0.5, 0], [0, 0.5, 1])

@@ -1,23 +1,25 @@
-"""What is left out in an ablation is left out and nothing else; what rolls is read from images."""
+"""Studies: what an ablation leaves out, what rolls, residuals, what limits a prediction."""
 
 import dataclasses
-import json
 import subprocess
 import sys
 
 import numpy as np
 import pytest
 import torch
+from scipy import integrate, stats
 
 from affordlib.interactions import InteractionTensors, open_interactions, split_interactions
 from affordlib.interactions.sampling import condition_on_recorded_action, sample_mixed
 from affordlib.models.frame import heading
+from affordlib.paths import repo_root
+from affordlib.results import read_results
 from affordlib.types import Prediction
 from affordlib.world import LyingCylinder, UprightCylinder
-from experiments import ablation, limits, one_for_all, studies
+from experiments import ablation, limits, shared_network, studies
 from experiments.ablation import actions_only, half_blend, random_contexts
-from experiments.rollability import learn_rollability
-from experiments.studies import cka, read_study
+from experiments.representation import cka, learn_rollability
+from experiments.residual_distribution import Fit, coverage_columns, crps, fits
 
 
 @pytest.fixture(scope="module")
@@ -116,10 +118,10 @@ def test_changes_of_an_ablation_add_up(monkeypatch):
 @pytest.fixture(scope="module")
 def of_all():
     """The first interactions of each primitive, with all channels."""
-    channels = one_for_all.NETWORK.action_channels, one_for_all.NETWORK.effect_channels
+    channels = shared_network.NETWORK.action_channels, shared_network.NETWORK.effect_channels
     return {
         name: InteractionTensors.from_dataset(open_interactions(name), np.arange(30), *channels)
-        for name in one_for_all.PRIMITIVES
+        for name in shared_network.PRIMITIVES
     }
 
 
@@ -140,7 +142,7 @@ def test_the_commanded_action_tells_the_primitive(of_all):
 
 def test_copies_keep_the_symmetries_of_each_primitive(of_all):
     for name, arrays in of_all.items():
-        copies = one_for_all.with_copies(arrays, name)
+        copies = shared_network.with_copies(arrays, name)
         n, each = len(arrays), copies.action.reshape(-1, *arrays.action.shape)
         assert torch.equal(copies.image[:n], arrays.image)
         if name in ("grasp", "rotate"):
@@ -163,69 +165,87 @@ def test_shares_are_of_the_usual_effect(of_all):
             return Prediction(end, end, end, end)
 
     model = Knowing()
-    assert one_for_all.shares(of_all)(model, None).tolist() == [0]
+    assert shared_network.shares(of_all)(model, None).tolist() == [0]
     model.known = 0.5
-    (told,) = one_for_all.shares(of_all)(model, None)
+    (told,) = shared_network.shares(of_all)(model, None)
     assert 0.25 < told <= 0.5
 
 
-def test_stale_studies_are_refused(tmp_path, monkeypatch):
-    assert read_study("latent", tmp_path) is None
-    monkeypatch.setattr(
-        studies, "STUDIES", {"small": studies.Study(lambda: [{"x": 1.0}], ("grasp",))}
-    )
-    studies.main(["--only", "small", "--out", str(tmp_path)])
-    assert read_study("small", tmp_path) == [{"x": 1.0}]
-    told = json.loads((tmp_path / "small.json").read_text())
-    (tmp_path / "small.json").write_text(json.dumps(told | {"data_sha256": {"grasp": "old"}}))
-    with pytest.raises(ValueError, match=r"small\.json has another data_sha256 .* --only small"):
-        read_study("small", tmp_path)
+# Residuals
 
 
-@pytest.mark.parametrize(
-    ("name", "module", "what", "other"),
-    [
-        ("latent", studies, "WEIGHTS", (0.5,)),
-        ("mixed", studies, "HALF_WAY_M", 0.2),
-        ("varied", studies, "VARIED_FOLDS", 1),
-        (
-            "ablation",
-            ablation,
-            "CHANGES",
-            {"plain likelihood (β = 0)": {"training": {"beta": 1.0}}},
-        ),
-        ("one_for_all", one_for_all, "FOLDS", 1),
-    ],
-)
-def test_what_decides_a_study_decides_its_hash(name, module, what, other, monkeypatch):
-    before = studies.hashes(name)
-    now = {**getattr(module, what), **other} if isinstance(other, dict) else other
-    monkeypatch.setattr(module, what, now)
-    assert studies.hashes(name)["settings_sha256"] != before["settings_sha256"]
+@pytest.mark.parametrize("z", [-2.0, 0.0, 0.7])
+def test_the_score_is_its_integral(z):
+    def squared(x):
+        return (stats.norm.cdf(x) - (x >= z)) ** 2
+
+    expected = sum(integrate.quad(squared, *ends)[0] for ends in ((-12, z), (z, 12)))
+    assert crps(np.array(z)) == pytest.approx(expected, abs=1e-8)
 
 
-# What bounds a prediction
+def test_all_fits_to_gaussian_residuals_agree():
+    residual = np.random.default_rng(0).normal(0, 2.5, 4000)
+    found = fits(residual, np.ones(4000))
+    assert [fit.scale for fit in found] == pytest.approx([2.5] * 3, rel=0.05)
+    assert found[-1].freedom > 20
+
+
+def test_heavy_tails_show_in_their_degrees_of_freedom():
+    rng = np.random.default_rng(1)
+    seen, new = (0.5 * rng.standard_t(1.5, 4000) for _ in range(2))
+    likely, scored, student = fits(seen, np.ones(4000))
+    assert student.freedom == pytest.approx(1.5, rel=0.1)
+    assert student.scale == pytest.approx(0.5, rel=0.1)
+    assert student.scale < scored.scale < likely.scale
+    row = coverage_columns(student, new, np.ones(4000), "m")
+    assert row["coverage_50"] == pytest.approx(0.5, abs=0.03)
+    assert row["coverage_90"] == pytest.approx(0.9, abs=0.03)
+    assert row["nll"] < coverage_columns(likely, new, np.ones(4000), "m")["nll"]
+
+
+def test_intervals_of_a_standard_gaussian():
+    residual, std = np.array([1.3, 1.4, -3.2, 3.4]), np.full(4, 0.1)
+    row = coverage_columns(Fit("N", 2.0), residual, std, "rad")
+    assert row["coverage_50"] == 0.25
+    assert row["coverage_90"] == 0.75
+    assert row["half_width_90_mean_rad"] == pytest.approx(1.644854 * 0.2)
+    assert row["half_width_90_mean_m"] is None
+
+
+def test_the_committed_residuals_have_heavy_tails():
+    tables = read_results(repo_root() / "data" / "results" / "effect_prediction.json")["tables"]
+    rows = [r for r in tables["residual_distribution"] if r["model"] in ("film_500", "cnp_500")]
+    tests = [r for r in rows if r["test"] == "test"]
+    wide, _, student = (tests[k::3] for k in range(3))
+    assert len(student) == 3
+    for before, after in zip(wide, student, strict=True):
+        assert after["degrees_of_freedom"] < 2
+        assert abs(after["coverage_50"] - 0.5) < abs(before["coverage_50"] - 0.5) / 2
+        assert after["nll"] < before["nll"] - 0.2
+
+
+# What limits a prediction
 
 
 @pytest.mark.slow
 def test_an_object_that_is_not_where_it_is_believed_is_moved_otherwise(monkeypatch):
     monkeypatch.setattr(limits, "N_PUSHES", 8)
     monkeypatch.setattr(limits, "REPEATS", 2)
-    rows = {row["object_class"]: row for row in limits.floor()}
+    rows = {row["object_class"]: row for row in limits.pose_sensitivity()}
     assert sum(rows[name]["n"] for name in rows if name != "all") == rows["all"]["n"] == 8
     # A cylinder goes where the gripper goes: its way changes by what the eye erred, its end hardly.
     round_one = rows["upright_cylinder"]
-    assert round_one["displacement_median_m"] == pytest.approx(limits.NUDGE_M, rel=0.1)
-    assert round_one["end_median_m"] < 0.3 * limits.NUDGE_M
-    monkeypatch.setattr(limits, "NUDGE_M", 0.0)
-    monkeypatch.setattr(limits, "NUDGE_RAD", 0.0)
-    exact = limits.floor()[0]
+    assert round_one["displacement_median_m"] == pytest.approx(limits.POSITION_ERROR_M, rel=0.1)
+    assert round_one["end_median_m"] < 0.3 * limits.POSITION_ERROR_M
+    monkeypatch.setattr(limits, "POSITION_ERROR_M", 0.0)
+    monkeypatch.setattr(limits, "YAW_ERROR_RAD", 0.0)
+    exact = limits.pose_sensitivity()[0]
     assert max(exact["displacement_p95_m"], exact["end_p95_m"]) < 1e-4
 
 
 def test_networks_of_whole_actions_foresee_what_broken_off_ones_do():
-    rows = limits.stopped()
-    assert {row["model"] for row in rows} == set(limits.STOPPED)
+    rows = limits.partial_execution()
+    assert {row["model"] for row in rows} == set(limits.WHOLE_ACTION_MODELS)
     late = [row for row in rows if row["from_phase"] >= 0.55]
     assert min(row["n"] for row in late) > 10
     assert max(row["whole_median_m"] for row in late) < 0.001
@@ -236,16 +256,13 @@ def test_networks_of_whole_actions_foresee_what_broken_off_ones_do():
 
 def test_reach_as_learned_agrees_with_the_kinematics(monkeypatch):
     monkeypatch.setattr(limits, "N_PLACES", 120)
-    rows = {row["primitive"]: row for row in limits.reach()}
+    rows = {row["primitive"]: row for row in limits.reachability_accuracy()}
     assert rows["all"]["agree_percent"] >= 97
     assert min(row["agree_percent"] for row in rows.values()) > 92
 
 
-def test_hashes_of_settings_are_the_same_in_every_process():
-    code = "from experiments.studies import *; print({n: hashes(n) for n in STUDIES})"
-    told = {
-        subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout
-        for _ in range(2)
-    }
-    assert len(told) == 1
-    assert b"ablation" in told.pop()
+def test_what_decides_a_study_is_the_same_in_every_process():
+    code = "from experiments.studies import *; print([job(name).made_of() for name in STUDIES])"
+    here = str([studies.job(name).made_of() for name in studies.STUDIES])
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, text=True)
+    assert run.stdout.strip() == here
