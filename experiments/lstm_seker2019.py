@@ -194,7 +194,7 @@ def train_seker(
                 "model": model.state_dict(), "optimiser": optimiser.state_dict(),
                 "plateau": plateau.state_dict(), "generator": generator.get_state(),
                 "torch": torch.get_rng_state(), "best": best, "best_state": best_state,
-                "epoch": epoch, "seconds": seconds
+                "epoch": epoch, "seconds": seconds, "about": trained_for,
             }  # fmt: skip
             save_state(checkpoint, state)
     model.load_state_dict(best_state)

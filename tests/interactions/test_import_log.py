@@ -135,7 +135,7 @@ def test_the_older_layout_is_read(older):
     assert tensors.image[:, 1].sum(dim=(1, 2)).tolist() == [40 * 36] * 2
 
 
-@pytest.mark.parametrize(("name", "kind"), [("anchored", "all"), ("lstm_tuned", "window")])
+@pytest.mark.parametrize(("name", "kind"), [("cnp_last_pose", "all"), ("lstm_tuned", "window")])
 @pytest.mark.parametrize("steps", [26, 41])
 def test_the_older_layout_is_learned_from(tmp_path, short, name, kind, steps):
     poses, gray = np.zeros((8, steps, 6)), np.full((8, 128, 128), 0.8)
