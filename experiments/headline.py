@@ -39,13 +39,13 @@ def rows() -> list[dict[str, Any]]:
     means = lever.step_5_mean_cm[["reported", "cnp", "cnp_last_pose"]]
     found.append(_row("predict a lever-up 0.75 s ahead", lever.n["cnp_last_pose"], 10, *means))
     summary = _table("planning", "summary").query("object_class in ('standing', 'reported')")
-    summary = summary.set_index("variant")
+    summary = summary.set_index("planner")
     each = _table("planning", "planning").query(
-        "variant == 'continuous_500' and object_class == 'standing' and goals == 'constructed'"
+        "planner == 'continuous_film_500' and object_class == 'standing' and goals == 'constructed'"
     )
     for mode, question in PLANS.items():
-        variants = ["reported_gradient_300", "continuous_paper", "continuous_500"]
-        means = summary[f"{mode}_mean_m"][variants]
+        planners = ["reported_gradient_300", "continuous_cnp_500", "continuous_film_500"]
+        means = summary[f"{mode}_mean_m"][planners]
         found.append(_row(question, each.set_index("mode").n[mode], 1000, *means))
     return found
 

@@ -82,24 +82,14 @@ VERSIONS: dict[Callable[..., Plan], int] = {
 }
 """Raise one when the planner changes, or how its plans are executed, and its numbers do."""
 
-MODELS: dict[str, dict[str, str]] = {
-    "film_5000": {"push": "film_5000", "drag": "drag_film_500"},
-    "film_500": {"push": "film_500", "drag": "drag_film_500"},
-    "paper": {"push": "cnp_500"},
-    "lstm_tuned": {"push": "lstm_500"},
-    "film_5000_perturbed": {"push": "film_5000_perturbed"},
-    "simulator": {},
-}
-"""Checkpoints by primitive. One without a model of drags is asked about stable objects only."""
-
 
 @dataclass(frozen=True)
 class PlannerConfig:
     """A row of Table 3: a planner, its model, and the goals that it is asked for.
 
-    planner: a function of a `PlanningProblem`; arguments: its others. model: of `MODELS`; oracle:
-    the arguments of `oracle_effects`, where that is the simulator. execution: those of `attempt`.
-    world: whose frozen goals; sources: which of them; stride: every so-many-th of these.
+    planner: a function of a `PlanningProblem`; arguments: its others; execution: those of
+    `attempt`. model: a checkpoint of pushes, or "simulator"; oracle: then the arguments of
+    `oracle_effects`. world: whose frozen goals; sources: which of them; stride: every so-many-th.
     """
 
     planner: Callable[..., Plan]
@@ -113,9 +103,11 @@ class PlannerConfig:
 
     @property
     def checkpoints(self) -> dict[str, str]:
-        """Of its model by primitive; in the perturbed world, where nothing rolls, of pushes."""
-        files = MODELS[self.model]
-        return files if self.world == "clean" else {k: v for k, v in files.items() if k == "push"}
+        """Of its model by primitive; one of drags beside our network of pushes, if it needs one."""
+        if self.model == "simulator":
+            return {}
+        drags = self.model in ("film_500", "film_5000") and self.world == "clean"
+        return {"push": self.model} | ({"drag": "drag_film_500"} if drags else {})
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -136,7 +128,7 @@ class PlannerConfig:
         """What a row of the table says of it."""
         samples = {plan_astar: 5, plan_astar_fine: len(FINE_PHASES)}
         return {
-            "planner": self.planner.__name__.removeprefix("plan_"),
+            "algorithm": self.planner.__name__.removeprefix("plan_"),
             "model": self.model,
             "world": self.world,
             "samples": self.arguments.get("samples", samples.get(self.planner)),
@@ -173,23 +165,23 @@ CONFIGS: dict[str, PlannerConfig] = {
     "astar_fine": PlannerConfig(plan_astar_fine, **ALL),
     "astar_corrected": PlannerConfig(plan_astar, **CORRECTED, **ALL),
     # The paper's planners on its own network.
-    "astar_paper": PlannerConfig(plan_astar, "paper", **ALL),
-    "gradient_25": PlannerConfig(plan_gradient, "paper", {"samples": 25}),
-    "gradient_100": PlannerConfig(plan_gradient, "paper", {"samples": 100}, **ALL),
-    "gradient_300": PlannerConfig(plan_gradient, "paper", {"samples": 300}),
-    "gradient_snapped": PlannerConfig(plan_gradient, "paper", {"samples": 100, "snap": True}),
-    "gradient_direction": PlannerConfig(plan_gradient, "paper", ON_RING, **ALL),
-    "gradient_corrected": PlannerConfig(plan_gradient, "paper", ON_RING, **CORRECTED),
+    "astar_cnp_500": PlannerConfig(plan_astar, "cnp_500", **ALL),
+    "gradient_25": PlannerConfig(plan_gradient, "cnp_500", {"samples": 25}),
+    "gradient_100": PlannerConfig(plan_gradient, "cnp_500", {"samples": 100}, **ALL),
+    "gradient_300": PlannerConfig(plan_gradient, "cnp_500", {"samples": 300}),
+    "gradient_snapped": PlannerConfig(plan_gradient, "cnp_500", {"samples": 100, "snap": True}),
+    "gradient_direction": PlannerConfig(plan_gradient, "cnp_500", ON_RING, **ALL),
+    "gradient_corrected": PlannerConfig(plan_gradient, "cnp_500", ON_RING, **CORRECTED),
     # What each idea is worth, and what a small error of the object's pose does.
-    "continuous_paper": PlannerConfig(plan_continuous, "paper", **ALL),
-    "continuous_500": PlannerConfig(plan_continuous, "film_500", **ALL),
+    "continuous_cnp_500": PlannerConfig(plan_continuous, "cnp_500", **ALL),
+    "continuous_film_500": PlannerConfig(plan_continuous, "film_500", **ALL),
     "continuous_full": PlannerConfig(plan_full, **ALL),
     "continuous_perturbed_start": PlannerConfig(
         plan_continuous, execution={"perturbed_start": True}
     ),
     # A recurrent network under the same planners.
-    "astar_lstm": PlannerConfig(plan_astar, "lstm_tuned"),
-    "continuous_lstm": PlannerConfig(plan_continuous, "lstm_tuned"),
+    "astar_lstm_500": PlannerConfig(plan_astar, "lstm_500"),
+    "continuous_lstm_500": PlannerConfig(plan_continuous, "lstm_500"),
     # The simulator itself in the place of a model.
     "oracle": PlannerConfig(plan_continuous, **ORACLE),
     "oracle_risk_averse": PlannerConfig(plan_continuous, **ORACLE, oracle={"risk_averse": True}),
@@ -331,9 +323,9 @@ def summary_rows(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     for row in rows:
         if row["goals"] != "constructed" or row["object_class"] in STANDING + ROLLABLE:
             continue
-        names = ("variant", "model", "world", "samples", "closed_loop", "object_class")
+        names = ("planner", "model", "world", "samples", "closed_loop", "object_class")
         new = {name: row[name] for name in names}
-        one = summary.setdefault((row["variant"], row["object_class"]), new)
+        one = summary.setdefault((row["planner"], row["object_class"]), new)
         for statistic in ("mean", "sem", "median"):
             one[f"{row['mode']}_{statistic}_m"] = row[f"{statistic}_m"]
         one[f"{row['mode']}_plan_ms"] = row["plan_ms_median"]
@@ -354,11 +346,11 @@ def decomposition_rows(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
         return row["world"], row["mode"], row["object_class"]
 
     oracles = ("oracle", "perturbed_oracle")
-    oracle = {place(r): r["mean_m"] for r in constructed if r["variant"] in oracles}
+    oracle = {place(r): r["mean_m"] for r in constructed if r["planner"] in oracles}
     perturbed = {place(r): r["mean_m"] for r in constructed if r["perturbed_start"]}
     return [
         {
-            **{key: row[key] for key in ("variant", "world", "mode", "object_class", "n")},
+            **{key: row[key] for key in ("planner", "world", "mode", "object_class", "n")},
             "search_mean_m": row["predicted_mean_m"],
             "model_mean_m": row["prediction_error_mean_m"],
             "execution_mean_m": oracle.get(place(row)),
@@ -370,7 +362,7 @@ def decomposition_rows(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
         and not row["perturbed_start"]
         and (
             row["object_class"] in ("standing", "rollable")
-            or (row["object_class"] == "all" and CONFIGS[row["variant"]].classes != STANDING)
+            or (row["object_class"] == "all" and CONFIGS[row["planner"]].classes != STANDING)
         )
     ]
 
@@ -393,7 +385,7 @@ def paired_rows(
             farther = pairs.farther.to_numpy()
             draws = rng.choice(farther, (n_draws, len(farther))).mean(axis=1)
             low, high = np.quantile(draws, [0.025, 0.975])
-            about = {"variant": name, "than": than, "goals": goals, "mode": mode}
+            about = {"planner": name, "than": than, "goals": goals, "mode": mode}
             row = about | {"n": len(pairs), "difference_mean_m": float(farther.mean())}
             rows.append(row | {"low_m": float(low), "high_m": float(high)})
     return rows
@@ -404,7 +396,7 @@ def tables(records: dict[str, list[dict[str, Any]]]) -> dict[str, list[dict[str,
     rows = []
     for name in CONFIGS:
         if name in records:
-            rows += planning_rows(records[name], variant=name, **CONFIGS[name].columns())
+            rows += planning_rows(records[name], planner=name, **CONFIGS[name].columns())
     in_order = {name: records[name] for name in CONFIGS if name in records}
     return {
         "planning": rows,

@@ -53,7 +53,7 @@ def planning_rows() -> list[dict[str, Any]]:
     """Table 3 with the columns of our summary of planners, its own objects as a group."""
     modes = ("single_full", "single_partial", "multi_partial")
     return [
-        {"variant": name, "model": "reported", "world": "reported", "object_class": "reported"}
+        {"planner": name, "model": "reported", "world": "reported", "object_class": "reported"}
         | {
             f"{mode}_{statistic}_m": value
             for mode, pair in zip(modes, told, strict=True)

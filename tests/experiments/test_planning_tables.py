@@ -46,15 +46,15 @@ def test_the_cost_of_execution_is_that_of_the_plain_oracle():
     rows = []
     for name, distance in (("continuous", 1e-3), ("oracle", 2e-3), ("oracle_risk_averse", 3e-3)):
         both = records([distance]) + records([distance], "sphere")
-        rows += planning_rows(both, variant=name, **CONFIGS[name].columns())
+        rows += planning_rows(both, planner=name, **CONFIGS[name].columns())
     rows += planning_rows(
-        records([9e-3]), variant="astar_paper", **CONFIGS["astar_paper"].columns()
+        records([9e-3]), planner="astar_cnp_500", **CONFIGS["astar_cnp_500"].columns()
     )
-    found = {(r["variant"], r["object_class"]): r for r in decomposition_rows(rows)}
+    found = {(r["planner"], r["object_class"]): r for r in decomposition_rows(rows)}
     assert found["continuous", "standing"]["execution_mean_m"] == pytest.approx(2e-3)
     assert found["continuous", "all"]["execution_mean_m"] == pytest.approx(2e-3)
-    assert ("astar_paper", "standing") in found
-    assert ("astar_paper", "all") not in found
+    assert ("astar_cnp_500", "standing") in found
+    assert ("astar_cnp_500", "all") not in found
 
 
 def test_pairs_are_of_the_same_goals():
