@@ -298,7 +298,7 @@ def planning(n_goals: int = 15, seed: int = 300) -> Rows:
                 world.place(task.obj, (0.0, 0.0), task.yaw_rad)
                 image, start = world.depth_image(), world.object_pose()[:2]
                 effects = EffectMap(film, image)
-                map_ms.append(1000 * seconds(lambda e=effects: e.coefficients))
+                map_ms.append(1000 * seconds(lambda e=effects: e.spline))
                 problem = PlanningProblem(start, task.goal, effects, mode)
                 effects.fine_grid  # noqa: B018, made once an object
                 plan = plan_astar(problem)

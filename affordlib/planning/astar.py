@@ -3,7 +3,7 @@
 An edge costs the distance that the object travels; the heuristic is the Euclidean distance to the
 goal's disc, max(0, d - tolerance), which never overestimates. The search ends at the first node
 within the tolerance (2 cm in the paper). A push turns the object as well, so its effects are looked
-up relative to the yaw that the model foresees; they are kept by degrees and used again.
+up relative to the yaw that the model predicts; they are kept by degrees and used again.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import torch
@@ -33,32 +32,22 @@ _SAME_PLACE_M = 1e-4
 
 @dataclass(frozen=True)
 class Branches:
-    """Every action of the search, and what it does to the object standing as it does.
+    """Every action of the search, and what it does to the object as it is turned now.
 
-    direction, stop_phase: (n,); effect_xy_m: (n, 2) along the table's axes; turn_rad: (n,).
+    direction, stop_phase: (n,); effect_m: (2, n) along the table's axes; turn_rad: (n,).
     """
 
     direction: np.ndarray
     stop_phase: np.ndarray
-    effect_xy_m: np.ndarray
+    effect_m: np.ndarray
     turn_rad: np.ndarray
-
-    @cached_property
-    def columns_m(self) -> np.ndarray:
-        """The effects as rows of x and of y (2, n), which are quicker to compute with."""
-        return np.ascontiguousarray(self.effect_xy_m.T)
-
-    @cached_property
-    def way_m(self) -> np.ndarray:
-        """How far each moves the object: (n,)."""
-        return np.hypot(*self.effect_xy_m.T)
 
 
 class BranchTable:
     """The branches of an object by how far it has turned since its image was taken.
 
-    It turns in steps of at most a degree that divide those between the directions, so all that can
-    be asked of the map is asked at once: the effects in every direction relative to the object.
+    It turns in steps of at most a degree that divide those between the directions, so the map is
+    queried once: for the effects in every direction relative to the object.
     """
 
     def __init__(
@@ -72,31 +61,29 @@ class BranchTable:
         if not stop_phases:
             raise ValueError("stop_phases must hold at least one phase in (0, 1], got none")
         between = 2 * math.pi / n_directions
-        self._finer = math.ceil(between / YAW_STEP_RAD)
-        self._step_rad = between / self._finer
-        relative = torch.arange(n_directions * self._finer, dtype=torch.float64) * self._step_rad
+        finer = math.ceil(between / YAW_STEP_RAD)
+        self._step_rad = between / finer
+        relative = torch.arange(n_directions * finer, dtype=torch.float64) * self._step_rad
         phases = torch.tensor(stop_phases, dtype=torch.float64)
-        with torch.no_grad():
-            grid = torch.meshgrid(relative, phases, indexing="ij")
-            self._told = effects(*grid)[0].numpy()
-        self._moves = np.hypot(self._told[..., 0], self._told[..., 1]) >= PRUNE_BELOW_M
+        self._effects = effects(*torch.meshgrid(relative, phases, indexing="ij"))[0].numpy()
+        self._moves = np.hypot(*self._effects[..., :2].T).T >= PRUNE_BELOW_M
         self.effects = effects
-        self._first = np.arange(n_directions) * self._finer
+        self._first = np.arange(n_directions) * finer
         self._direction = np.repeat(np.arange(n_directions) * between, len(stop_phases))
-        self._heading = np.stack([np.cos(self._direction), np.sin(self._direction)])
         self._phase = np.tile(phases.numpy(), n_directions)
         self._kept: dict[int, Branches] = {}
 
     def at(self, turned_rad: float) -> Branches:
         """The branches of the object turned by an angle; those that do nothing are left out."""
-        key = round(turned_rad / self._step_rad) % len(self._told)
+        key = round(turned_rad / self._step_rad) % len(self._effects)
         if key not in self._kept:
-            rows = (self._first - key) % len(self._told)
+            rows = (self._first - key) % len(self._effects)
             moves = np.flatnonzero(self._moves[rows])
-            ahead, left, turn = self._told[rows].reshape(-1, 3)[moves].T
-            c, s = self._heading[:, moves]
-            xy = np.stack([c * ahead - s * left, s * ahead + c * left], axis=-1)
-            self._kept[key] = Branches(self._direction[moves], self._phase[moves], xy, turn)
+            ahead, left, turn = self._effects[rows].reshape(-1, 3)[moves].T
+            direction = self._direction[moves]
+            c, s = np.cos(direction), np.sin(direction)
+            effect_m = np.stack([c * ahead - s * left, s * ahead + c * left])
+            self._kept[key] = Branches(direction, self._phase[moves], effect_m, turn)
         return self._kept[key]
 
 
@@ -130,14 +117,15 @@ def search(
     object cannot be turned and lifted as the goal asks is none of the goal's. trace, if given,
     receives each expanded position (2,) with those of its children (n, 2).
     """
-    goal, reachable, finish = problem.goal, problem.reachable, problem.pose_planner
+    goal, pose_planner = problem.goal, problem.pose_planner
     max_steps = problem.mode.max_steps
     goal_xy, tolerance = np.array(goal.xy_m)[:, None], goal.tolerance_m
     reach = table.effects.reach_m
     start, nothing = np.array([problem.start_xy_m]), np.zeros(1)
     nearest_m = goal.distance_m(start[0])
     root = _Children(None, start, nothing, nothing, np.array([nearest_m]), nothing, nothing)
-    # The running number tells nodes of the same f and depth apart, so nothing after it is compared.
+    # The running number tells nodes of the same f and depth apart, so nothing after it is compared;
+    # f is rounded, lest the last digits of a sum choose between two orders of the same actions.
     number = itertools.count()
     frontier = [(max(0.0, nearest_m - tolerance), 0, next(number), root, 0)]
     nearest, expansions, reached = (root, 0), 0, False
@@ -147,7 +135,9 @@ def search(
         (x, y), turned, away = family.xy_m[k].tolist(), float(family.turned[k]), family.away_m[k]
         if away < nearest_m - 1e-12:
             nearest, nearest_m = (family, k), float(away)
-        if away <= tolerance and (finish is None or finish(goal, (x, y), turned) is not None):
+        if away <= tolerance and (
+            not pose_planner or pose_planner(goal, (x, y), turned) is not None
+        ):
             nearest, reached = (family, k), True
             break
         cell = (round(x / _SAME_PLACE_M), round(y / _SAME_PLACE_M), round(turned / YAW_STEP_RAD))
@@ -157,7 +147,7 @@ def search(
         expansions += 1
         branches = table.at(turned)
         depth += 1
-        places = (branches.columns_m + np.array([[x], [y]])).T
+        places = (branches.effect_m + np.array([[x], [y]])).T
         away = np.hypot(*(places.T - goal_xy))
         if depth == max_steps:
             rows = np.flatnonzero(away < max(nearest_m, tolerance + 1e-12))
@@ -165,9 +155,8 @@ def search(
             rows = np.flatnonzero(away <= tolerance + (max_steps - depth) * reach + nearest_m)
         if len(rows):
             rows = rows[is_on_table(places[rows], table.effects.radius_m)]
-        if reachable is not None and len(rows):
             here = np.broadcast_to((x, y), (len(rows), 2))
-            rows = rows[reachable(here, branches.direction[rows])]
+            rows = rows[problem.reachable(here, branches.direction[rows])]
         if trace is not None:
             trace.append((np.array((x, y)), places[rows]))
         if not len(rows):
@@ -181,12 +170,12 @@ def search(
             (family, k),
             places[rows],
             turned + branches.turn_rad[rows],
-            family.way_m[k] + branches.way_m[rows],
+            family.way_m[k] + np.hypot(*branches.effect_m[:, rows]),
             away[rows],
             branches.direction[rows],
             branches.stop_phase[rows],
         )
-        f = children.way_m + np.maximum(0.0, children.away_m - tolerance)
+        f = np.round(children.way_m + np.maximum(0.0, children.away_m - tolerance), 12)
         for row, value in enumerate(f.tolist()):
             heapq.heappush(frontier, (value, depth, next(number), children, row))
     chain = []

@@ -19,9 +19,10 @@ import warnings
 import numpy as np
 import torch
 
+from affordlib.geometry import xy_columns
 from affordlib.models.network import OutOfRangeWarning
 from affordlib.models.protocol import EffectModel, condition_on_primitives, observe_final_effect
-from affordlib.planning.effect_map import EffectMap, plane
+from affordlib.planning.effect_map import EffectMap
 from affordlib.planning.problem import PlanningProblem
 from affordlib.planning.rollout import PATH_SAMPLES
 from affordlib.primitives import Drag
@@ -53,7 +54,7 @@ def descend(
     and may end, with effects that no push has; nobody is warned of each.
     """
     model, features = effects.model, effects.features
-    columns = plane(model)
+    columns = xy_columns(model.effect_channels)
     radius = _effect_radius_m(effects) if direction_only else START_RADIUS_M
     angle = torch.as_tensor(generator.uniform(0, 2 * math.pi, size=starts), dtype=torch.float32)
     circle = radius * torch.stack([angle.cos(), angle.sin()], dim=1)
@@ -97,7 +98,9 @@ def _effect_radius_m(effects: EffectMap) -> float:
     actions = [towards(angle) for angle in np.arange(12) * (math.pi / 6)]
     observed = condition_on_primitives(model, actions)
     prediction = model.predict(effects.features, observed, torch.ones(12, 1))
-    return float(prediction.effect_mean[:, 0, plane(model)].norm(dim=-1).mean())
+    return float(
+        prediction.effect_mean[:, 0, xy_columns(model.effect_channels)].norm(dim=-1).mean()
+    )
 
 
 def plan_gradient(
@@ -120,13 +123,13 @@ def plan_gradient(
     began = time.perf_counter()
     check_count("samples", samples, 2, 10_000)
     check_count("starts", starts, 1, 100)
-    model, kind, features = (getattr(problem.effects, n) for n in ("model", "kind", "features"))
-    goal, mode, reachable = problem.goal, problem.mode, problem.reachable
-    columns = plane(model)
+    effects, (model, kind) = problem.effects, (problem.effects.model, problem.effects.kind)
+    goal, mode = problem.goal, problem.mode
+    columns = xy_columns(model.effect_channels)
     a_columns = [model.action_channels.index(name) for name in ("x", "y")]
     with torch.no_grad():  # a model of other actions refuses one
         model.predict(
-            features, condition_on_primitives(model, [kind.towards(0.0)]), torch.ones(1, 1)
+            effects.features, condition_on_primitives(model, [kind.towards(0.0)]), torch.ones(1, 1)
         )
     generator = np.random.default_rng(check_count("seed", seed, least=0))
     xy, target = np.asarray(problem.start_xy_m), np.asarray(goal.xy_m)
@@ -134,10 +137,10 @@ def plan_gradient(
     iterations = 0
     t = torch.linspace(0, 1, samples)
     while len(steps) < mode.max_steps and np.hypot(*(target - xy)) > SUCCESS_M:
-        effect, n = descend(problem.effects, target - xy, generator, starts, direction_only)
+        effect, n = descend(effects, target - xy, generator, starts, direction_only)
         iterations += n
         with torch.no_grad():
-            prediction = _predict(model, features, effect, t[None])
+            prediction = _predict(model, effects.features, effect, t[None])
         path = prediction.effect_mean[0, :, columns].numpy().astype(float)
         action = prediction.action_mean[0, :, a_columns].numpy().astype(float)
         std = prediction.effect_std[0, :, columns].norm(dim=-1).numpy()
@@ -153,7 +156,7 @@ def plan_gradient(
         shown = np.linspace(0, stop, min(PATH_SAMPLES, stop + 1)).round().astype(int)
         heading = action[-1] - action[0]
         angle = math.atan2(heading[1], heading[0])
-        if reachable is not None and not reachable(xy[None], np.array([angle]))[0]:
+        if not problem.reachable(xy[None], np.array([angle]))[0]:
             break
         decoded = None if snap or kind is Drag else action[: stop + 1]
         steps.append(

@@ -151,7 +151,7 @@ class MovePlanner:
         refused = [(xy, angle) for name, xy, angle in self._refused if name == kind.name]
 
         def allowed(xy_m, direction_rad, length_m=None):
-            ok = np.ones(len(xy_m), bool) if learned is None else learned(xy_m, direction_rad)
+            ok = learned(xy_m, direction_rad)
             for xy, angle in refused:
                 near = np.hypot(*(xy_m - xy).T) < REFUSED_WITHIN_M
                 off = (direction_rad - angle + np.pi) % (2 * np.pi) - np.pi

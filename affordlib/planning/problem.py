@@ -15,6 +15,11 @@ Reachable = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Which of the positions (n, 2) and directions (n,) the arm can act at."""
 
 
+def everywhere(xy_m: np.ndarray, *_: np.ndarray) -> np.ndarray:
+    """The arm can act at all positions (n, 2), in all directions."""
+    return np.ones(len(xy_m), bool)
+
+
 @dataclass(frozen=True)
 class PlanMode:
     """How many actions a plan may have, and whether they may stop before the end."""
@@ -73,7 +78,7 @@ class PlanningProblem:
     goal: Goal
     effects: EffectMap
     mode: str | PlanMode = "multi_partial"
-    reachable: Reachable | None = None
+    reachable: Reachable = everywhere
     pose_planner: Callable[..., tuple[Step, ...] | None] | None = None
 
     def __post_init__(self) -> None:

@@ -11,11 +11,10 @@ import numpy as np
 
 from affordlib.models.checkpoint import load_checkpoint
 from affordlib.models.protocol import EffectModel
-from affordlib.paths import repo_root
 from affordlib.perception import looks_rollable
 from affordlib.planning.effect_map import EffectMap, checked_image
 from affordlib.planning.grasp_rotate import PosePlanner
-from affordlib.planning.problem import PlanMode, PlanningProblem, Reachable
+from affordlib.planning.problem import PlanMode, PlanningProblem, Reachable, everywhere
 from affordlib.planning.reachability import Reachability
 from affordlib.planning.routes import REACH_M, RouteMap
 from affordlib.primitives import Drag, Grasp, Primitive, Push, Rotate, primitive_named
@@ -49,11 +48,7 @@ class Skills:
     @classmethod
     def load(cls) -> Skills:
         """The shipped models, and reachability as it was learned from the shipped interactions."""
-        folder = repo_root() / "data" / "checkpoints"
-        models = {
-            name: load_checkpoint(folder / f"{file}.safetensors")[0]
-            for name, file in CHECKPOINTS.items()
-        }
+        models = {primitive: load_checkpoint(name)[0] for primitive, name in CHECKPOINTS.items()}
         return cls(models, Reachability.load())
 
     def model(self, primitive: type[Primitive]) -> EffectModel:
@@ -69,10 +64,6 @@ class Skills:
         """How an object is moved, by its image: what would roll away is caged and dragged."""
         return Drag if looks_rollable(checked_image(image)[0].numpy()) else Push
 
-    def effects(self, image: np.ndarray) -> EffectMap:
-        """What moving the object in an image (2, 48, 48) does; kept for the last image."""
-        return self._about(image)[0]
-
     def problem(
         self,
         image: np.ndarray,
@@ -83,9 +74,9 @@ class Skills:
         """What a planner is asked about the object in an image (2, 48, 48), at (x, y) [m].
 
         As long as the image stays the same, as it does while only the goal moves, what the models
-        say of it is kept.
+        predict of it is kept.
         """
-        effects, poses = self._about(image)
+        effects, poses = self._predictions(image)
         reachable = self.reachable(effects.kind)
         return PlanningProblem(start_xy_m, goal, effects, mode, reachable, poses)
 
@@ -95,16 +86,20 @@ class Skills:
         """A planner with settings, such as `plan_astar`, as (image, start_xy_m, goal) → Plan."""
         return SkillPlanner(self, partial(plan, **settings), mode)
 
-    def _about(self, image: np.ndarray) -> tuple[EffectMap, PosePlanner | None]:
-        seen = np.ascontiguousarray(image).tobytes()
-        if seen not in self._last:
+    def effects(self, image: np.ndarray) -> EffectMap:
+        """What moving the object in an image (2, 48, 48) does; kept for the last image."""
+        return self._predictions(image)[0]
+
+    def _predictions(self, image: np.ndarray) -> tuple[EffectMap, PosePlanner | None]:
+        key = np.ascontiguousarray(image).tobytes()
+        if key not in self._last:
             kind, poses = self.kind_for(image), None
             if {Rotate.name, Grasp.name} <= set(self.models):
                 models = self.model(Rotate), self.model(Grasp)
                 poses = PosePlanner(image, *models, self._can_act)
             self._last.clear()
-            self._last[seen] = EffectMap(self.model(kind), image, kind), poses
-        return self._last[seen]
+            self._last[key] = EffectMap(self.model(kind), image, kind), poses
+        return self._last[key]
 
     @cached_property
     def _last(self) -> dict[bytes, tuple[EffectMap, PosePlanner | None]]:
@@ -115,25 +110,20 @@ class Skills:
             return True
         return bool(self.reachability.probability(name, np.array([xy_m]))[0] >= self.threshold)
 
-    def reachable(self, kind: type[Primitive]) -> Reachable | None:
-        """Where the arm can act with a primitive, as planners ask it."""
+    def reachable(self, kind: type[Primitive]) -> Reachable:
+        """Where the arm can act with a primitive."""
         if self.reachability is None:
-            return None
+            return everywhere
 
-        def judge(xy_m, direction_rad):
+        def reachable(xy_m, direction_rad, *_):
             return self.reachability.probability(kind.name, xy_m, direction_rad) >= self.threshold
 
-        return judge
+        return reachable
 
     def routes(self, kind: type[Push] | type[Drag]) -> RouteMap:
         """Where the arm can take an object from where, all over the table; made once."""
         if kind not in self._routes:
-            judge = self.reachable(kind)
-
-            def allowed(xy_m, direction_rad, _):
-                return np.ones(len(xy_m), bool) if judge is None else judge(xy_m, direction_rad)
-
-            self._routes[kind] = RouteMap.of(REACH_M[kind], allowed)
+            self._routes[kind] = RouteMap.of(REACH_M[kind], self.reachable(kind))
         return self._routes[kind]
 
     @cached_property

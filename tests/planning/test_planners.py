@@ -1,0 +1,385 @@
+"""The planners against exhaustive search, known dynamics and execution; the frozen goals."""
+
+import itertools
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from affordlib.evaluation.tasks import (
+    ROLLABLE,
+    STANDING,
+    constructed_tasks,
+    frozen_tasks,
+    uniform_tasks,
+)
+from affordlib.geometry import rotated
+from affordlib.models import EffectModel, load_checkpoint
+from affordlib.planning import (
+    EffectMap,
+    PlanMode,
+    plan_astar,
+    plan_continuous,
+    plan_gradient,
+)
+from affordlib.planning.astar import Branches, BranchTable, search
+from affordlib.planning.problem import is_on_table
+from affordlib.planning.rollout import roll_out
+from affordlib.planning.routes import RouteMap, find_route, place_at
+from affordlib.primitives import Drag, Push
+from affordlib.types import Goal, Prediction
+from affordlib.world import Cuboid
+from experiments.planning import attempt
+from tests.planning.point_robot import REACH_M, STARTS, KnownDynamics, moved_m
+from tests.problems import problem_of
+
+IMAGE = np.zeros((2, 48, 48), dtype=np.float32)
+MODEL = KnownDynamics()
+PLANNERS = (plan_astar, plan_continuous, plan_gradient)
+
+
+def known(goal_xy, mode="multi_partial", tolerance_m=0.02, model=MODEL, **more):
+    """A problem of known dynamics, from the middle of the table."""
+    return problem_of(model, IMAGE, (0.0, 0.0), Goal(goal_xy, tolerance_m), mode, **more)
+
+
+# The map
+
+
+@pytest.mark.parametrize("kind", [Push, Drag])
+def test_an_effect_map_says_what_the_model_says(world, film, kind):
+    world.place(Cuboid(0.07, 0.05, 0.05), (0.0, 0.0), 0.4)
+    effects = EffectMap(film if kind is Push else MODEL, world.depth_image(), kind)
+    assert effects.radius_m == pytest.approx(math.hypot(0.035, 0.025), abs=0.004)
+    rng = np.random.default_rng(0)
+    direction = torch.from_numpy(rng.uniform(-7, 7, 40))
+    phase = torch.from_numpy(rng.uniform(0.3, 1, 40))
+    effect, std = effects(direction, phase)
+    off = (effect - effects.query_model(direction, phase))[:, :2].norm(dim=-1)
+    assert off.median() < 6e-4  # what the splines leave: 0.2 mm of the push, less of the drag
+    at_first = torch.full_like(phase, kind.acts_from)
+    assert effects.query_model(direction, at_first).abs().max() < 1e-6
+    assert (std > 0).all()
+    torch.testing.assert_close(effects(direction + 2 * math.pi, phase)[0], effect)
+
+
+def test_a_chain_turns_with_the_object(world, film):
+    """Rolling out two pushes together is querying the second of the turned object."""
+    world.place(Cuboid(0.07, 0.05, 0.05), (0.0, 0.0), 0.4)
+    effects = EffectMap(film, world.depth_image())
+    direction, phase = torch.tensor([[0.3, 1.2]]).double(), torch.tensor([[1.0, 0.9]]).double()
+    positions, turns, variances = roll_out(effects, direction, phase)
+    first, _ = effects(direction[:, 0], phase[:, 0])
+    second, _ = effects(direction[:, 1] - first[:, 2], phase[:, 1])
+    moved = rotated(second[0, :2].numpy(), 1.2)
+    np.testing.assert_allclose(positions[0, 1] - positions[0, 0], moved, atol=1e-12)
+    assert float(turns[0, 1]) == pytest.approx(float(first[0, 2] + second[0, 2]))
+    assert float(variances[0, 1]) > float(variances[0, 0]) > 0
+
+
+# A*
+
+
+class RandomTable(BranchTable):
+    """A few branches that also turn the object, and then lead elsewhere."""
+
+    def __init__(self, seed: int, n: int = 6) -> None:
+        rng = np.random.default_rng(seed)
+        self.n, self.xy, self.turn = n, rng.uniform(-0.09, 0.09, (n, 2)), rng.uniform(-1, 1, n)
+        self.effects = SimpleNamespace(radius_m=0.0, reach_m=np.hypot(*self.xy.T).max())
+
+    def at(self, turned: float) -> Branches:
+        # The number of a branch stands in for its direction.
+        return Branches(np.arange(self.n), np.ones(self.n), rotated(self.xy, turned).T, self.turn)
+
+    def follow(self, chain) -> tuple[np.ndarray, float]:
+        xy, turned, length = np.zeros(2), 0.0, 0.0
+        for k in chain:
+            step = self.at(turned).effect_m[:, k]
+            xy, turned, length = xy + step, turned + self.turn[k], length + math.hypot(*step)
+        return xy, length
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_astar_finds_what_exhaustive_search_finds(seed):
+    table, rng = RandomTable(seed), np.random.default_rng(1000 + seed)
+    problem = known(tuple(rng.uniform(-0.2, 0.2, 2)))
+    goal, best, nearest = problem.goal, math.inf, math.inf
+    for depth in (0, 1, 2, 3):
+        for chain in itertools.product(range(6), repeat=depth):
+            end, length = table.follow(chain)
+            nearest = min(nearest, goal.distance_m(end))
+            if goal.distance_m(end) <= goal.tolerance_m:
+                best = min(best, length)
+    chain, reached, _ = search(problem, table)
+    end, length = table.follow([int(k) for k, _ in chain])
+    assert reached == math.isfinite(best)
+    if reached:
+        assert goal.distance_m(end) <= goal.tolerance_m
+        assert length == pytest.approx(best, abs=1e-9)
+    else:
+        assert goal.distance_m(end) == pytest.approx(nearest, abs=1e-9)
+
+
+def test_branches_are_the_papers_180():
+    branches = BranchTable(EffectMap(MODEL, IMAGE)).at(0.0)
+    # Those that stop before contact do nothing and are pruned: 36 x {80, 100 %} remain.
+    assert len(branches.direction) == 72
+    assert set(np.round(branches.stop_phase, 3)) == {0.8, 1.0}
+    full = branches.stop_phase == 1.0
+    direction = branches.direction[full]
+    expected = REACH_M * np.stack([np.cos(direction), np.sin(direction)])
+    np.testing.assert_allclose(branches.effect_m[:, full], expected, atol=1e-4)
+    for settings, says in (({"n_directions": 0}, "n_directions"), ({"stop_phases": ()}, "phase")):
+        with pytest.raises(ValueError, match=says):
+            plan_astar(known((0.1, 0.0)), **settings)
+
+
+def test_astar_plans():
+    plan = plan_astar(known((0.18, 0.06)))
+    assert plan.reaches_goal
+    assert 2 <= len(plan.steps) <= 3
+    assert plan.predicted_distance_m <= 0.02
+    xy = np.zeros(2)
+    for step in plan.steps:
+        np.testing.assert_allclose(step.predicted_path_xy_m[0], xy, atol=1e-4)
+        xy = step.predicted_path_xy_m[-1]
+        np.testing.assert_allclose(xy, step.predicted_end_xy_m, atol=1e-9)
+    assert plan_astar(known((0.01, 0.0))).steps == ()
+    far = plan_astar(known((0.45, 0.0)))
+    assert not far.reaches_goal
+    assert far.predicted_distance_m == pytest.approx(0.45 - 3 * REACH_M, abs=1e-6)
+
+
+def test_a_search_goes_on_where_the_end_cannot_be_had(film, cuboid_image):
+    """A node within the tolerance from which the turn cannot be had is none of the goal's."""
+    goal, asked = Goal((0.08, 0.0), turn_rad=0.1), []
+
+    def only_beyond(goal, xy_m, turned_rad):
+        asked.append(xy_m)
+        return () if xy_m[0] > 0.085 else None
+
+    two = PlanMode(2, partial=True)
+    problem = problem_of(film, cuboid_image, (0.0, 0.0), goal, two, pose_planner=only_beyond)
+    table = BranchTable(problem.effects)
+    chain, reached, _ = search(problem, table)
+    assert reached
+    assert len(asked) > 1
+    assert asked[-1][0] > 0.085
+    assert all(goal.distance_m(xy) <= goal.tolerance_m for xy in asked)
+    one = PlanMode(1, partial=True)
+    assert not search(replace(problem, mode=one, pose_planner=lambda *_: None), table)[1]
+    assert len(chain) >= 1
+
+
+# The continuous planner
+
+
+@pytest.mark.parametrize("goal_xy", [(0.05, 0.02), (-0.03, 0.06), (0.13, -0.11), (0.2, 0.05)])
+def test_the_continuous_planner_ends_at_the_goal(goal_xy):
+    plan = plan_continuous(known(goal_xy))
+    assert len(plan.steps) >= math.ceil(math.hypot(*goal_xy) / REACH_M)
+    assert plan.predicted_distance_m < 5e-5
+    xy = np.zeros(2)
+    for step in plan.steps:
+        np.testing.assert_allclose(step.predicted_path_xy_m[0], xy, atol=5e-4)
+        angle, far = step.primitive.direction_rad, moved_m(step.stop_phase)
+        end = xy + far * np.array([math.cos(angle), math.sin(angle)])
+        np.testing.assert_allclose(step.predicted_end_xy_m, end, atol=1e-5)
+        xy = np.array(step.predicted_end_xy_m)
+    here = problem_of(MODEL, IMAGE, goal_xy, Goal(goal_xy))
+    assert plan_continuous(here).steps == ()
+
+
+def test_where_nothing_brings_it_nearer_it_stays(film, cuboid_image):
+    near, far = (Goal((x, 0.0), tolerance_m=0.02) for x in (0.015, 0.08))
+    plan = plan_continuous(problem_of(film, cuboid_image, (0.0, 0.0), near, "single_full"))
+    assert (plan.steps, plan.reaches_goal) == ((), True)
+    plan = plan_continuous(problem_of(film, cuboid_image, (0.0, 0.0), far, "single_full"))
+    assert len(plan.steps) == 1
+
+
+def test_of_two_plans_that_of_lower_variance_is_taken():
+    class SureUpwards(KnownDynamics):
+        """σ is small for pushes along y, and ten times as large along x."""
+
+        def predict(self, features, observations, t_target):
+            known = super().predict(features, observations, t_target)
+            along = known.effect_mean / known.effect_mean.norm(dim=-1, keepdim=True).clamp_min(1e-9)
+            std = 0.001 + 0.02 * along[..., :1].square().expand_as(known.effect_std)
+            return Prediction(known.action_mean, std, known.effect_mean, std)
+
+    plan = plan_continuous(known((0.0, 0.12), model=SureUpwards()))
+    assert plan.predicted_distance_m < 1e-4
+    assert all(abs(math.sin(s.primitive.direction_rad)) > 0.95 for s in plan.steps)
+    assert plan.steps[-1].std_m < 0.004
+
+
+# The paper's gradient planner
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("goal_xy", [(0.05, 0.02), (-0.03, 0.06), (0.13, -0.11)])
+def test_the_gradient_planner_finds_direction_and_phase(goal_xy, seed):
+    plan = plan_gradient(known(goal_xy), samples=300, seed=seed)
+    assert len(plan.steps) == math.ceil(math.hypot(*goal_xy) / REACH_M)
+    # Between two of 300 samples the object moves 0.75 mm; the direction converges.
+    assert plan.predicted_distance_m < 0.001
+    decoded = plan.steps[0].path_xy_m
+    heading = math.atan2(*(decoded[-1] - decoded[0])[::-1])
+    assert heading == pytest.approx(math.atan2(goal_xy[1], goal_xy[0]), abs=0.02)
+
+
+@pytest.mark.slow
+def test_finer_samples_stop_nearer():
+    errors = []
+    for samples in (25, 100, 300):
+        goals = [(r * math.cos(r * 99), r * math.sin(r * 99)) for r in np.linspace(0.03, 0.08, 20)]
+        plans = [plan_gradient(known(xy), samples=samples) for xy in goals]
+        errors.append(np.mean([plan.predicted_distance_m for plan in plans]))
+    assert errors[0] > 2 * errors[1] > 4 * errors[2]
+
+
+def test_modes_bind_the_gradient_planner():
+    partial, again = (plan_gradient(known((0.04, 0.0), "single_partial")) for _ in range(2))
+    expected = STARTS + (1 - STARTS) * math.sqrt(0.04 / REACH_M)
+    assert partial.steps[0].stop_phase == pytest.approx(expected, abs=0.01)
+    assert np.array_equal(again.steps[0].path_xy_m, partial.steps[0].path_xy_m)
+    snapped = plan_gradient(known((0.04, 0.0)), snap=True)
+    assert snapped.steps[0].path_xy_m is None
+    assert snapped.steps[0].primitive.direction_rad == pytest.approx(0.0, abs=0.01)
+
+
+def test_a_decoded_path_is_followed(world):
+    """A decoded path that is the push's own gives what the push gives."""
+    obj, push, stop = Cuboid(0.06, 0.05, 0.05), Push(2.2), 0.85
+    world.place(obj, (0.0, 0.0), 0.3)
+    own = world.execute_primitive(push, stop, approach=True)
+    path = push.path(np.linspace(0, stop, 60))[:, :2]
+    step = plan_astar(known((0.08, 0.0))).steps[0]
+    world.place(obj, (0.0, 0.0), 0.3)
+    done = world.execute(replace(step, primitive=push, stop_phase=stop, path_xy_m=path))
+    np.testing.assert_allclose(done.rest_effect[:2], own.rest_effect[:2], atol=0.001)
+
+
+# All of them
+
+
+@pytest.mark.parametrize("plan", PLANNERS)
+def test_planners_keep_to_mode_reach_and_table(plan):
+    full = plan(known((0.07, 0.03), "single_full"))
+    assert [step.stop_phase for step in full.steps] == [1.0]
+    assert len(plan(known((0.2, 0.1), "single_partial")).steps) == 1
+    barred = plan(known((0.2, 0.0), reachable=lambda xy_m, _: xy_m[:, 0] < 0.05))
+    assert not barred.reaches_goal
+    assert plan(known((0.2, 0.0))).reaches_goal
+    assert all(x < 0.05 for x, _ in (step.predicted_end_xy_m for step in barred.steps[:-1]))
+    nowhere = plan(known((0.2, 0.0), reachable=lambda xy_m, _: xy_m[:, 0] > 9))
+    assert (nowhere.steps, nowhere.reaches_goal) == ((), False)
+    posed = replace(known((0.05, 0.05)), goal=Goal((0.05, 0.05), height_m=0.1))
+    assert not plan(posed).reaches_goal  # nothing is known of how to lift
+
+
+@pytest.mark.parametrize("xy", [(0.0, 0.7), (-0.5, 0.0), (-0.48, -0.68), (0.68, 0.0)])
+def test_a_goal_without_room_for_the_object_is_refused(film, cuboid_image, xy):
+    with pytest.raises(ValueError, match="too near the rim of the table"):
+        problem_of(film, cuboid_image, (0.0, 0.0), Goal(xy))
+
+
+@pytest.mark.parametrize(
+    ("start", "image", "mode", "words"),
+    [
+        ((0, 9), IMAGE, "single_full", r"start_xy_m = \(0, 9\)"),
+        ((0, 0), IMAGE[0], "single_full", r"image .* \(48, 48\)"),
+        ((0, 0), np.full_like(IMAGE, np.nan), "single_full", "image must be finite numbers"),
+        ((0, 0), IMAGE, "two", "mode 'two' is unknown"),
+    ],
+)
+def test_bad_input_is_named(start, image, mode, words):
+    with pytest.raises(ValueError, match=words):
+        problem_of(MODEL, image, start, Goal((0.0, 0.1)), mode)
+    with pytest.raises(ValueError, match="mode 'two' is unknown"):
+        uniform_tasks("two", 1)
+    assert isinstance(MODEL, EffectModel)
+
+
+@pytest.mark.parametrize("name", ["grasp_film_1000", "rotate_film_1000", "drag_film_500"])
+@pytest.mark.parametrize("plan", PLANNERS)
+def test_a_model_of_other_actions_plans_no_pushes(cuboid_image, name, plan):
+    with pytest.raises(ValueError, match=r"model: a planner|train on such actions"):
+        plan(problem_of(load_checkpoint(name)[0], cuboid_image, (0.0, 0.0), Goal((0.1, 0.05))))
+
+
+# Routes
+
+
+def test_a_route_is_the_shortest_and_keeps_the_whole_object_on_the_table():
+    def gap(xy_m, direction_rad, length_m):
+        return (np.abs(xy_m[:, 1]) > 0.1) | (xy_m[:, 0] < -0.2)
+
+    routes, start, goal = RouteMap.of(0.075, gap), (0.2, 0.3), (0.2, -0.3)
+    route = np.array([start, *find_route(routes, start, goal, gap)])
+    lengths = np.hypot(*np.diff(route, axis=0).T)
+    assert lengths.max() <= 0.075
+    round_it = np.hypot(0.4, 0.2) * 2 + 0.2  # by way of the gap's corners
+    assert 0.95 * round_it < lengths.sum() < 1.05 * round_it
+    assert gap(route[:-1], None, None).all()
+    wall = RouteMap.of(0.075, lambda xy_m, *_: np.abs(xy_m[:, 1]) > 0.1)
+    assert find_route(wall, start, goal, gap) is None
+    inside = np.array(find_route(routes, (0.2, 0.65), (0.62, 0.65), gap, radius_m=0.045))
+    assert is_on_table(inside, 0.045).all()
+    move = tuple(place_at(xy) for xy in route[3:5])
+    around = np.array([start, *find_route(routes, start, goal, gap, {move})])
+    assert move not in itertools.pairwise(place_at(xy) for xy in around)
+    assert np.hypot(*np.diff(around, axis=0).T).sum() >= lengths.sum()
+
+
+# Goals, and plans that are executed
+
+
+@pytest.mark.slow
+def test_plans_come_within_what_their_planner_promises(world, trained, film):
+    """A floor, not the table: A* is content within 2 cm, the continuous planner is not."""
+    tasks = constructed_tasks(world, "single_partial", 4, seed=7)
+    tasks += uniform_tasks("multi_partial", 4, seed=7)
+    assert constructed_tasks(world, "single_partial", 2, seed=7) == tasks[:2]
+    assert all(math.hypot(*task.goal.xy_m) > 0.02 for task in tasks)
+
+    def distances(plan, model, tasks, **how):
+        def planner(image, start, goal, mode):
+            return plan(problem_of(model, image, start, goal, mode))
+
+        return [attempt(world, task, planner, **how).distance_m for task in tasks]
+
+    assert np.mean(distances(plan_astar, trained, tasks)) < 0.03
+    hard = [t for t in frozen_tasks() if (t.goals, t.mode) == ("constructed", "multi_partial")]
+    hard = [t for t in hard if not t.obj.rollable][:5]
+    open_loop = distances(plan_continuous, film, hard)
+    corrected = distances(plan_continuous, film, hard, corrections=2)
+    assert np.mean(open_loop) < 0.003  # 1.1 mm
+    assert np.mean(corrected) < min(0.002, np.mean(open_loop))
+
+
+def test_the_frozen_goals_are_those_that_are_drawn(world):
+    frozen = frozen_tasks()
+    assert len(frozen) == 460
+    drawn = constructed_tasks(world, "single_partial", 4, 0, STANDING + ROLLABLE)
+    for task, again in zip([t for t in frozen if t.mode == "single_partial"], drawn, strict=False):
+        assert task.obj == again.obj
+        assert task.goal.distance_m(again.goal.xy_m) < 0.002
+    assert all(math.hypot(*task.goal.xy_m) > 0.02 for task in frozen)
+
+
+def test_an_attempt_averages_as_many_images_as_it_is_told(world, film):
+    task = next(t for t in frozen_tasks("perturbed") if t.mode == "single_full")
+    seen = []
+
+    def planner(image, xy, goal, mode):
+        seen.append(world.n_averaged_images)
+        return plan_continuous(problem_of(film, image, xy, goal, mode))
+
+    attempt(world, task, planner, n_averaged_images=3)
+    assert (seen, world.n_averaged_images) == ([3], 1)
