@@ -25,7 +25,6 @@ from affordlib.workers import dask_client
 from experiments import shipped
 
 SMALL = Recipe(n_interactions=6, seed=11)
-LONGER = Recipe(n_interactions=12, seed=5)
 ROOT = Path(affordlib.__file__).parents[1]
 
 pytestmark = pytest.mark.usefixtures("small_chunks")
@@ -271,7 +270,7 @@ def both(client):
 
 @contextmanager
 def poisoned(client, log, how):
-    """Make all workers, also those started later, fail in the chunk that begins with 6.
+    """Make all workers, also those started later, fail in the chunk that begins with 4.
 
     log: a file that gets a letter for each time that they do.
     """
@@ -284,7 +283,7 @@ def poisoned(client, log, how):
             from affordlib.interactions import collect, schema
 
             def deadly(recipe, numbers):
-                if numbers.start == 6:
+                if numbers.start == 4:
                     with open(log, "a") as file:
                         file.write("x")
                     os._exit(9) if how == "kill" else [].pop()
@@ -313,12 +312,12 @@ def test_a_chunk_that_cannot_be_made_is_named(both, undisturbed, tmp_path, how, 
     path, log = tmp_path / "set.zarr.zip", tmp_path / "log"
     said = rf"interactions \d+ to \d+ could not be collected: {reason}"
     with poisoned(both, log, how), pytest.raises(RuntimeError, match=said) as failure:
-        collect_set(LONGER, path, both, progress=False)
-    assert how == "kill" or "interactions 6 to 7" in str(failure.value)
+        collect_set(SMALL, path, both, progress=False)
+    assert how == "kill" or "interactions 4 to 5" in str(failure.value)
     assert log.exists()
     assert not path.exists()
-    collect_set(LONGER, path, both, progress=False)
-    assert path.read_bytes() == undisturbed(LONGER).read_bytes()
+    collect_set(SMALL, path, both, progress=False)
+    assert path.read_bytes() == undisturbed(SMALL).read_bytes()
 
 
 @pytest.mark.slow
@@ -329,9 +328,9 @@ def test_workers_killed_at_any_moment_are_no_loss(both, undisturbed, tmp_path, m
     moment = random.Random(seed).uniform(0, 0.6)
     kill = threading.Timer(moment, os.kill, [pids[seed % 2], signal.SIGKILL])
     kill.start()
-    collect_set(LONGER, "relative.zarr.zip", both, progress=False)
+    collect_set(SMALL, "relative.zarr.zip", both, progress=False)
     kill.join()
-    assert Path("relative.zarr.zip").read_bytes() == undisturbed(LONGER).read_bytes()
+    assert Path("relative.zarr.zip").read_bytes() == undisturbed(SMALL).read_bytes()
     assert names_in(tmp_path) == ["relative.zarr.zip"]
 
 

@@ -28,6 +28,7 @@ def test_the_shipped_sets_are_what_their_recipes_say(shipped, world):
     name, data = shipped
     recipe = RECIPES[name]
     assert Recipe.from_json(data.attrs["recipe"]) == recipe
+    assert data.attrs["recipe"] == recipe.to_json()
     assert data.sizes["interaction"] == recipe.n_interactions
     assert data.sizes["sample"] == 301
     assert np.isfinite(data["effect"].values).all()
