@@ -3,11 +3,13 @@
 python -m experiments.shipped data --only push_x10 --to data
 python -m experiments.shipped checkpoints --only film_500
 python -m experiments.shipped reachability
+python -m experiments.shipped goals
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import os
 import sys
@@ -18,6 +20,14 @@ import numpy as np
 import xarray as xr
 
 from affordlib.commands import command, count_type
+from affordlib.evaluation.tasks import (
+    FROZEN,
+    ROLLABLE,
+    STANDING,
+    PlanningTask,
+    constructed_tasks,
+    uniform_tasks,
+)
 from affordlib.geometry import xy_columns
 from affordlib.interactions import (
     InteractionTensors,
@@ -28,7 +38,7 @@ from affordlib.interactions import (
 )
 from affordlib.interactions.collect import collect
 from affordlib.interactions.dataset import Symmetry
-from affordlib.interactions.recipes import RECIPES, SHIPPED
+from affordlib.interactions.recipes import RECIPES, SHIPPED, Variation
 from affordlib.interactions.sampling import sample_forward, sample_mixed
 from affordlib.interactions.store import SUFFIX as DATA_SUFFIX
 from affordlib.interactions.store import dataset_sha256
@@ -48,7 +58,9 @@ from affordlib.models.training import (
 from affordlib.paths import repo_root
 from affordlib.planning.reachability import SHIPPED as REACHABILITY
 from affordlib.planning.reachability import learn_reachability
+from affordlib.results import write_text_atomically
 from affordlib.workers import dask_client
+from affordlib.world import Tabletop
 from experiments.attention import AttentionConfig
 
 
@@ -103,6 +115,9 @@ LEVER_CHECKPOINTS: dict[str, tuple[str, str]] = {
     "lever_up_lstm_1800_first_step": ("lstm_tuned", "first_step"),
 }
 """Of lever-ups: which of `LEVER_MODELS`, and the protocol that it was trained for."""
+
+N_GOALS = {"single_full": 50, "single_partial": 100, "multi_partial": 80}
+"""Goals of each mode, as in Table 3 of the paper."""
 
 TOLERANCE_M = 0.00005
 """Median distance between the final positions of two collections that still are the same set.
@@ -232,6 +247,25 @@ def train_reachability(_: argparse.Namespace) -> bool:
     return True
 
 
+def draw_goals(_: argparse.Namespace) -> bool:
+    """Draw the goals of Table 3 into files, which are never written over: they are frozen."""
+    missing = [world for world, path in FROZEN.items() if not (repo_root() / path).exists()]
+    for name in missing:
+        tasks: list[PlanningTask] = []
+        with Tabletop() as world:
+            for mode, n in N_GOALS.items():
+                if name == "perturbed":
+                    tasks += constructed_tasks(world, mode, n, 0, STANDING, Variation())
+                    continue
+                tasks += constructed_tasks(world, mode, n, 0, STANDING + ROLLABLE)
+                tasks += uniform_tasks(mode, n, 0, STANDING + ROLLABLE)
+        rows = ",\n".join(json.dumps(task.to_json()) for task in tasks)
+        text = f'{{"seed": 0, "tasks": [\n{rows}\n]}}\n'
+        write_text_atomically(repo_root() / FROZEN[name], text)
+    print(f"goals drawn of the worlds: {', '.join(missing) or 'none, all are there'}")
+    return True
+
+
 @command(OSError, ValueError, RuntimeError)
 def main(argv: Sequence[str] | None = None) -> int:
     """Make what is shipped again; returns 1 where sets differ or data are missing, else 0."""
@@ -252,6 +286,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     kinds.add_parser("reachability", help=train_reachability.__doc__).set_defaults(
         make=train_reachability
     )
+    kinds.add_parser("goals", help=draw_goals.__doc__).set_defaults(make=draw_goals)
     options = parser.parse_args(argv)
     return 0 if options.make(options) else 1
 

@@ -55,11 +55,6 @@ def main_of(name):
         ("experiments.closed_loop", ["--tables", "nope"], "--tables: 'nope' is unknown"),
         ("experiments.closed_loop", ["--seed", "-1"], "--seed: must be a whole number from 0"),
         ("experiments.closed_loop", ["--n", "0"], "--n: must be a whole number from 1"),
-        (
-            "affordlib.evaluation.tasks",
-            ["--seed", str(2**32)],
-            "--seed: must be a whole number from 0",
-        ),
         ("experiments.lever_up", ["--models", ""], "--models: '' is unknown"),
         ("experiments.lever_up", ["--protocols", "nope"], "--protocols: 'nope' is unknown"),
         ("experiments.lever_up", ["--no-edges", "2"], "--no-edges: must be .* from 3 to 8"),

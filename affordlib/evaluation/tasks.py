@@ -6,36 +6,28 @@ Objects are ones that no model has seen; goals are more than 2 cm from the start
 goals, are off the 10° grid of A*.
 
 The goals of the tables are frozen in `data/goals/planning.json`, those of the perturbed
-world in `data/goals/planning_perturbed.json`; made once, by
-
-    python -m affordlib.evaluation.tasks --world perturbed
+world in `data/goals/planning_perturbed.json`; `python -m experiments.shipped goals` drew them.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
-import sys
 from collections.abc import Sequence
 from dataclasses import asdict, astuple, dataclass, field
 from typing import Any
 
 import numpy as np
 
-from affordlib.commands import command, seed_type
 from affordlib.interactions.recipes import Variation
 from affordlib.paths import repo_root
 from affordlib.planning import MODES
 from affordlib.primitives import Drag, Push
-from affordlib.results import write_text_atomically
 from affordlib.types import Goal
 from affordlib.world import Tabletop, TabletopObject, WorldConfig, category_named
 
 FROZEN = {"clean": "data/goals/planning.json", "perturbed": "data/goals/planning_perturbed.json"}
 GOAL_SOURCES = ("constructed", "uniform")
-N_GOALS = {"single_full": 50, "single_partial": 100, "multi_partial": 80}
-"""As in Table 3 of the paper."""
 
 MIN_DISTANCE_M = 0.02
 EARLIEST_STOP = 0.55
@@ -51,7 +43,7 @@ REACH_M = {Push: 0.07, Drag: 0.05}
 class PlanningTask:
     """An object at the table's centre, turned by a yaw [rad], and where it should go.
 
-    config: the world it is in, which no planner is told.
+    config: the world it is in, which no planner knows.
     """
 
     obj: TabletopObject
@@ -124,14 +116,14 @@ def constructed_tasks(
         while True:
             direction = rng.uniform(-math.pi, math.pi)
             world.place(obj, (0.0, 0.0), yaw, config=config)
-            believed = True
+            valid = True
             for _ in range(rng.integers(2, MODES[mode].max_steps + 1) if mode[0] == "m" else 1):
                 stop = rng.uniform(EARLIEST_STOP, 1.0) if MODES[mode].partial else 1.0
                 action = kind.towards(_off_grid(rng, direction, math.pi / 4))
                 seen = world.execute_primitive(action, stop, approach=True)
-                believed &= not (seen.faults or seen.fell or seen.left_table)
+                valid &= not (seen.faults or seen.fell or seen.left_table)
             x, y, _ = world.object_pose()
-            if math.hypot(x, y) > MIN_DISTANCE_M and believed:
+            if math.hypot(x, y) > MIN_DISTANCE_M and valid:
                 break
         tasks.append(PlanningTask(obj, yaw, Goal((x, y)), mode, "constructed", config))
     return tasks
@@ -159,44 +151,6 @@ def frozen_tasks(world: str = "clean") -> list[PlanningTask]:
     path = repo_root() / FROZEN[world]
     if not path.is_file():
         raise FileNotFoundError(
-            f"there are no goals at {path}; "
-            f"run python -m affordlib.evaluation.tasks --world {world}"
+            f"there are no goals at {path}; run python -m experiments.shipped goals"
         )
     return [PlanningTask.from_json(plain) for plain in json.loads(path.read_text())["tasks"]]
-
-
-def _draw_tasks(which: str, seed: int) -> list[PlanningTask]:
-    tasks = []
-    with Tabletop() as world:
-        for mode, n in N_GOALS.items():
-            if which == "perturbed":
-                tasks += constructed_tasks(world, mode, n, seed, STANDING, Variation())
-                continue
-            tasks += constructed_tasks(world, mode, n, seed, STANDING + ROLLABLE)
-            tasks += uniform_tasks(mode, n, seed, STANDING + ROLLABLE)
-    return tasks
-
-
-@command(OSError)
-def main(argv: Sequence[str] | None = None) -> int:
-    """Draw the goals of Table 3 and freeze them in a file, which is never written over."""
-    parser = argparse.ArgumentParser(
-        prog="python -m affordlib.evaluation.tasks", description=main.__doc__
-    )
-    parser.add_argument("--world", choices=tuple(FROZEN), default="clean")
-    parser.add_argument("--seed", type=seed_type, default=0)
-    options = parser.parse_args(argv)
-    path = repo_root() / FROZEN[options.world]
-    if path.exists():
-        print(f"{path} is there already; goals are frozen before measuring", file=sys.stderr)
-        return 1
-    tasks = _draw_tasks(options.world, options.seed)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    rows = ",\n".join(json.dumps(task.to_json()) for task in tasks)
-    write_text_atomically(path, f'{{"seed": {options.seed}, "tasks": [\n{rows}\n]}}\n')
-    print(f"{len(tasks)} goals frozen in {path}")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -91,7 +91,7 @@ def _inside(x: float, y: float) -> tuple[float, float]:
 
 
 class DisturbanceSchedule:
-    """A `Robot` at a tabletop where disturbances happen, each once; the robot is not told.
+    """A `Robot` at a tabletop where disturbances happen, each once, without the robot's knowledge.
 
     goal: as it has become (for `run_closed_loop` give `schedule.current_goal`); happened: the
     disturbances up to now, in order.

@@ -1,4 +1,4 @@
-"""The paper's continuous planner (Section 3.4, Algorithm 1), its two slips mended.
+"""The paper's continuous planner (Section 3.4, Algorithm 1), its two slips fixed.
 
     direction ← random point on the circle of radius 0.2 m
     repeat    loss ← mean square of (target - predicted effect at t = 1 | e_1 = direction)
@@ -116,7 +116,7 @@ def plan_gradient(
     samples: phases at which the trajectory is queried; they bound how finely an action can be cut.
     starts: random starts of the descent; the paper has one, lost where it lies opposite the goal.
     direction_only: ours; search on the circle of effects that actions have, not in the whole plane,
-    where the network can be made to promise anything. snap: execute the primitive in the decoded
+    where the network can be made to predict anything. snap: execute the primitive in the decoded
     direction instead of the decoded action trajectory, as drags always are. A plan ends before an
     action that is out of reach.
     """
@@ -149,7 +149,7 @@ def plan_gradient(
             distance = np.hypot(*(xy + path - target).T)
             stop = int(np.argmin(distance))
             if distance[stop] > SUCCESS_M and distance[-1] - distance[stop] < NEARER_M:
-                stop = samples - 1  # the path only trembles at its end: the goal lies beyond it
+                stop = samples - 1  # the path only jitters at its end: the goal lies beyond it
         if stop == 0:
             break
         end = xy + path[stop]

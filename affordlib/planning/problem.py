@@ -1,4 +1,4 @@
-"""What every planner is asked, and the three settings of Table 3."""
+"""What every planner solves, and the three settings of Table 3."""
 
 from __future__ import annotations
 

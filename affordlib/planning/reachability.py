@@ -1,7 +1,7 @@
 """Where the arm can act: learned from what it could and could not do (Section 3.4 of the paper).
 
 A small network answers for a primitive, a place on the table and a direction. It is trained on
-recorded interactions alone; no kinematics is told.
+recorded interactions alone; the kinematics stays unknown.
 """
 
 from __future__ import annotations

@@ -71,7 +71,7 @@ class Skills:
         goal: Goal,
         mode: str | PlanMode = "multi_partial",
     ) -> PlanningProblem:
-        """What a planner is asked about the object in an image (2, 48, 48), at (x, y) [m].
+        """The problem of bringing the object in an image (2, 48, 48) from (x, y) [m] to a goal.
 
         As long as the image stays the same, as it does while only the goal moves, what the models
         predict of it is kept.
