@@ -242,7 +242,7 @@ def write_tables(folder: str | Path = FOLDER, out_dir: str | Path = "data/result
     edges = dict(zip(data["interaction"].values.tolist(), edges_of(data).tolist(), strict=True))
     tables = {
         "lever_up": rows,
-        "summary": [*reported.lever_up_rows(), *summary_rows(rows)],
+        "summary": [*reported.LEVER_UP_ROWS, *summary_rows(rows)],
         "motion": motion_rows(results),
         "unseen_edges": unseen_rows(results, edges),
         "paired": paired_rows(results),

@@ -400,7 +400,7 @@ def tables(records: dict[str, list[dict[str, Any]]]) -> dict[str, list[dict[str,
     in_order = {name: records[name] for name in CONFIGS if name in records}
     return {
         "planning": rows,
-        "summary": [*reported.planning_rows(), *summary_rows(rows)],
+        "summary": [*reported.PLANNING_ROWS, *summary_rows(rows)],
         "paired": [r for than in ("continuous", "perturbed") for r in paired_rows(in_order, than)],
         "error_decomposition": decomposition_rows(rows),
     }

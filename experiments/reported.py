@@ -1,4 +1,4 @@
-"""What the paper reports, to stand beside what was measured here: its Tables 1 to 3.
+"""What the paper reports, to stand beside what was measured here: rows of its Tables 1 to 3.
 
 In its own simulator, with its own objects, gripper and data, so it is context and no opponent.
 """
@@ -8,10 +8,16 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-LEVER_UP_CM = {
-    "reported": (0.340, 0.352, 0.364, 0.375, 0.387),
-    "reported_lstm": (1.02, 1.00, 0.96, 1.01, 0.91),
-}
+
+def _lever_up(model: str, *errors_cm: float) -> dict[str, Any]:
+    steps = {f"step_{k}_mean_cm": error for k, error in enumerate(errors_cm, 1)}
+    return {"model": model, "folds": 5, "epochs": None, "n": None} | steps
+
+
+LEVER_UP_ROWS = [
+    _lever_up("reported", 0.340, 0.352, 0.364, 0.375, 0.387),
+    _lever_up("reported_lstm", 1.02, 1.00, 0.96, 1.01, 0.91),
+]
 """Table 1: the error [cm] of 1 to 5 steps ahead, of the paper's network and a recurrent one."""
 
 GRASP = {
@@ -21,43 +27,23 @@ GRASP = {
 """Table 2, by whether the object can roll. False negatives are printed as 21.38 and 28.28 %, the
 first of which makes 101 % with the true positives; they are left out."""
 
-PLANNING_M = {
-    "reported_astar": ((0.020, 0.002), (0.013, 0.002), (0.013, 0.002)),
-    "reported_gradient_100": ((0.0074, 0.0017), (0.0077, 0.0016), (0.0077, 0.0013)),
-    "reported_gradient_300": ((0.0021, 0.00044), (0.0022, 0.00068), (0.0022, 0.00046)),
-}
-"""Table 3: distance from the goal and its ± [m], which the paper does not name: single full, single
-partial, multi partial."""
-
-
-def lever_up_rows() -> list[dict[str, Any]]:
-    """Table 1 with the columns of our summary of windows; what the paper does not tell is None."""
-    return [
-        {"model": name, "folds": 5, "epochs": None, "n": None}
-        | {f"step_{k}_mean_cm": error for k, error in enumerate(errors, 1)}
-        for name, errors in LEVER_UP_CM.items()
-    ]
-
 
 def grasp_rows(columns: Iterable[str]) -> list[dict[str, Any]]:
-    """Table 2 with the columns of our table of grasps; what the paper does not tell is None."""
-    return [
-        dict.fromkeys(columns)
-        | {"model": "reported", "n_interactions": 100, "rollable": can}
-        | told
-        for can, told in GRASP.items()
-    ]
+    """Table 2 with the columns of our table of grasps; what the paper does not report is None."""
+    about = dict.fromkeys(columns) | {"model": "reported", "n_interactions": 100}
+    return [about | {"rollable": can} | row for can, row in GRASP.items()]
 
 
-def planning_rows() -> list[dict[str, Any]]:
-    """Table 3 with the columns of our summary of planners, its own objects as a group."""
+def _planning(planner: str, *values_m: float) -> dict[str, Any]:
     modes = ("single_full", "single_partial", "multi_partial")
-    return [
-        {"planner": name, "model": "reported", "world": "reported", "object_class": "reported"}
-        | {
-            f"{mode}_{statistic}_m": value
-            for mode, pair in zip(modes, told, strict=True)
-            for statistic, value in zip(("mean", "sem"), pair, strict=True)
-        }
-        for name, told in PLANNING_M.items()
-    ]
+    columns = [f"{mode}_{statistic}_m" for mode in modes for statistic in ("mean", "sem")]
+    about = dict.fromkeys(("model", "world", "object_class"), "reported")
+    return {"planner": planner} | about | dict(zip(columns, values_m, strict=True))
+
+
+PLANNING_ROWS = [
+    _planning("reported_astar", 0.020, 0.002, 0.013, 0.002, 0.013, 0.002),
+    _planning("reported_gradient_100", 0.0074, 0.0017, 0.0077, 0.0016, 0.0077, 0.0013),
+    _planning("reported_gradient_300", 0.0021, 0.00044, 0.0022, 0.00068, 0.0022, 0.00046),
+]
+"""Table 3: distance from the goal and its ± [m], which the paper does not name."""
