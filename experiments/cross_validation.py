@@ -200,7 +200,7 @@ def add_errors(table: pd.DataFrame, primitive: str) -> None:
     if primitive in PLANE:
         table["final_error"] = np.hypot(off["x"], off["y"])
     else:
-        table["final_error"] = abs(off[TASKS[primitive].effect_channels[0]])
+        table["final_error"] = abs(off.get(TASKS[primitive].effect_channels[0], np.nan))
     if "yaw" in off:
         table["yaw_error"] = abs((off["yaw"] + np.pi) % (2 * np.pi) - np.pi)
 

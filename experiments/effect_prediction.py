@@ -52,7 +52,7 @@ Rows = list[dict[str, Any]]
 
 
 def sorted_results(folder: str | Path = FOLDER) -> list[Result]:
-    """All results in the order of sets, models, seeds and folds, with the size of the set as `n`.
+    """All results in the order of sets, models, sizes, seeds and folds.
 
     ValueError if results are stale, or do not agree about the effects of an interaction.
     """
@@ -60,7 +60,6 @@ def sorted_results(folder: str | Path = FOLDER) -> list[Result]:
     order = ["data", "model", "n", "seed", "fold"]
     results.sort(key=lambda r: [MODELS.index(v) if k == "model" else str(v) if k == "n" else v
                                 for k, v in ((k, r[0][k]) for k in order)])  # fmt: skip
-    results = [(about | {"n": result["n_interactions"]}, result) for about, result in results]
     tests = frame(results, "fold_test")
     truth = tests.filter(like="truth_").groupby([tests["data"], tests["interaction"]])
     apart = (truth.max() - truth.min()).max(axis=1)
@@ -74,7 +73,9 @@ def sorted_results(folder: str | Path = FOLDER) -> list[Result]:
 
 def predictions_of(results: Iterable[Result], primitive: str, part: str) -> pd.DataFrame:
     """Test interactions of a primitive, a row each; part: `fold_test`, `fixed_test`, `inverse`."""
-    table = frame([r for r in results if r[0]["data"].removesuffix(LARGE) == primitive], part)
+    results = [(about | {"n": result["n_interactions"]}, result) for about, result in results
+               if about["data"].removesuffix(LARGE) == primitive]  # fmt: skip
+    table = frame(results, part)
     if part == "fold_test" and len(table):
         add_errors(table, primitive)
     return table
@@ -208,7 +209,7 @@ FRAMES = {
 def of_shared_folds(results: list[Result], models: Iterable[str]) -> list[Result]:
     """The results of some models of all pushes, of the folds and seeds that all of them have."""
     every = [r for r in results if r[0]["model"] in models and r[0]["data"] == "push"]
-    every = [r for r in every if r[0]["n"] == 500]
+    every = [r for r in every if r[0]["n"] == "all"]
     folds = {model: {(a["fold"], a["seed"]) for a, _ in every if a["model"] == model}
              for model in models}  # fmt: skip
     shared = set.intersection(*folds.values())

@@ -19,7 +19,6 @@ from affordlib.interactions.sampling import condition_on_recorded_action
 from affordlib.models.calibration import LEVELS, coverage
 from affordlib.models.ensemble import Ensemble
 from affordlib.models.network import EffectNetwork, gaussian_nll
-from affordlib.world.objects import CATEGORIES
 
 EVERY = 12
 """Every twelfth sample is one of the paper's 25 steps of 150 ms."""
@@ -128,18 +127,6 @@ def summary(record: dict[str, Any]) -> dict[str, Any]:
     errors |= {k: np.array(record[k]) for k in ("trajectory_error", "after_contact_error")}
     plain = {k: None if v is None else [float(f"{e:.4g}") for e in v] for k, v in errors.items()}
     return {"family": record["family"], **plain, "calibration": calibration(record)}
-
-
-def stored(part: dict[str, Any]) -> dict[str, Any]:
-    """As a part is written: rounded, and categories by their numbers in `CATEGORIES`."""
-    number = {name: k for k, name in enumerate(CATEGORIES)}
-
-    def written(name: str, value: Any) -> Any:
-        if name == "family":
-            return [number[v] for v in value]
-        return stored(value) if isinstance(value, dict) else rounded(value)
-
-    return {name: written(name, value) for name, value in part.items()}
 
 
 def rounded(value: Any) -> Any:

@@ -156,7 +156,7 @@ def test_a_fold_may_lack_a_category():
         names = ("final_error", "trajectory_error", "after_contact_error")
         columns = {"interaction": range(len(errors)), "category": list(categories)}
         about = {"model": "film", "data": "drag", "n": 100, "fold": fold, "seed": 0}
-        return about, {"fixed_test": columns | dict.fromkeys(names, errors)}
+        return about, {"n_interactions": 100, "fixed_test": columns | dict.fromkeys(names, errors)}
 
     folds = [result(k, categories) for k, categories in enumerate(("aab", "aab", "aa"))]
     rows = tables.error_rows(tables.predictions_of(folds, "drag", "fixed_test"), "drag")
@@ -255,7 +255,9 @@ def test_grasps_by_the_rule_of_a_tenth_of_a_metre():
         "category": ["a"] * 3,
         "interaction": range(3),
     }
-    table = tables.predictions_of([(about, {"fold_test": columns})], "grasp", "fold_test")
+    table = tables.predictions_of(
+        [(about, {"n_interactions": 100, "fold_test": columns})], "grasp", "fold_test"
+    )
     stands, rolls = grasp_rows(table)
     assert (stands["tp_percent"], stands["fp_percent"], rolls["fn_percent"]) == (100, 100, 100)
     assert stands["error_mean_m"] == pytest.approx((0.13 + 0.11) / 2)
