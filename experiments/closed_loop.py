@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from affordlib.commands import command, count_type, names_type, seed_type
+from affordlib.geometry import wrap_angle
 from affordlib.models.checkpoint import weights_bytes
 from affordlib.paths import repo_root
 from affordlib.planning import (
@@ -40,7 +41,7 @@ from affordlib.planning.disturbances import KINDS
 from affordlib.planning.grasp_rotate import GRIPPER_YAWS_RAD
 from affordlib.planning.reachability import SHIPPED as REACHABILITY
 from affordlib.planning.skills import CHECKPOINTS
-from affordlib.primitives import Drag, Grasp, Push, wrap_angle
+from affordlib.primitives import Drag, Grasp, Push
 from affordlib.results import write_results
 from affordlib.types import TABLE_X_M, TABLE_Y_M, Goal
 from affordlib.workers import dask_client

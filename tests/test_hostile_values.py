@@ -187,7 +187,6 @@ def valid_calls(shop):
             on_table(w.can_reach),
             {"primitive": Push(0.0), "stop_phase": 1.0, "at_xy_m": at},
         ),
-        "depth_image_from": (on_table(w.depth_image_from), {"xy_m": at, "turn_rad": 0.0}),
         "picture": (w.picture, {"width": 32, "height": 32}),
         "mark": (
             on_table(w.mark),
@@ -430,7 +429,7 @@ NAMES = re.findall(
     """
 Goal Step Plan Push Push.towards Push.path Drag Grasp Rotate LeverUp primitive_named Cuboid
 UprightCylinder LyingCylinder Sphere Prism category_named WorldConfig Tabletop place
-execute_primitive execute execute_path can_reach depth_image_from picture mark shove knock
+execute_primitive execute execute_path can_reach picture mark shove knock
 topple settle Scaler from_dataset open_interactions split_interactions Recipe Variation collect
 CNPConfig FiLMConfig build Ensemble TrainingConfig coverage fit_temperature
 load_checkpoint save_checkpoint condition_on_primitives train train_literal PlanMode Disturbance

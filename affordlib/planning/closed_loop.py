@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from affordlib.geometry import wrap_angle
 from affordlib.perception import adapt_to_object, looks_fallen
 from affordlib.planning.continuous import plan_continuous
 from affordlib.planning.grasp_rotate import (
@@ -30,7 +31,7 @@ from affordlib.planning.move_planner import Ending, MovePlanner
 from affordlib.planning.problem import PlanMode, PlanningProblem, is_on_table
 from affordlib.planning.robot import Execution, Robot
 from affordlib.planning.skills import Skills
-from affordlib.primitives import Grasp, Rotate, wrap_angle
+from affordlib.primitives import Grasp, Rotate
 from affordlib.types import (
     Goal,
     NothingSeenError,

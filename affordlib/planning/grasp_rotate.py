@@ -21,11 +21,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import torch
 
+from affordlib.geometry import wrap_angle
 from affordlib.models.frame import turn_image
 from affordlib.models.protocol import EffectModel, condition_on_primitives
 from affordlib.perception import adapt_to_object
 from affordlib.planning.effect_map import checked_image
-from affordlib.primitives import Grasp, Rotate, wrap_angle
+from affordlib.primitives import Grasp, Rotate
 from affordlib.types import Goal, Step, check_finite, check_pair, check_within
 
 N_PHASES = 301

@@ -42,27 +42,20 @@ def _orthographic(half_width_m: float, pixels: int) -> np.ndarray:
     return projection
 
 
-def _depth_buffer(client: int, view: tuple, projection: np.ndarray, shape: tuple) -> np.ndarray:
-    """The renderer's depth buffer as (rows, columns)."""
-    rows, columns = shape
-    _, _, _, buffer, _ = pybullet.getCameraImage(
-        columns,
-        rows,
-        view,
-        projection.T.ravel().tolist(),
-        renderer=pybullet.ER_TINY_RENDERER,
-        flags=pybullet.ER_NO_SEGMENTATION_MASK,
-        shadow=0,
-        physicsClientId=client,
-    )
-    return np.asarray(buffer, dtype=np.float64).reshape(rows, columns)
+_RENDERER = {"renderer": pybullet.ER_TINY_RENDERER, "flags": pybullet.ER_NO_SEGMENTATION_MASK}
 
 
-def _distance_m(buffer: np.ndarray, projection: np.ndarray) -> np.ndarray:
-    """Distance from the camera's plane [m], given the renderer's depth buffer.
+def _distance_m(client: int, view: tuple, projection: np.ndarray, shape: tuple) -> np.ndarray:
+    """Distance from the camera's plane [m], (rows, columns).
 
-    TinyRenderer warps every buffer as if the projection were a perspective one.
+    TinyRenderer warps every depth buffer as if the projection were a perspective one.
     """
+    rows, columns = shape
+    matrix = projection.T.ravel().tolist()
+    image = pybullet.getCameraImage(
+        columns, rows, view, matrix, shadow=0, physicsClientId=client, **_RENDERER
+    )
+    buffer = np.asarray(image[3], dtype=np.float64).reshape(rows, columns)
     far = projection[2, 3] / (projection[2, 2] + 1)
     near = projection[2, 3] / (projection[2, 2] - 1)
     return far * near / (far - buffer * (far - near))
@@ -87,7 +80,7 @@ def depth_crop(
     view = pybullet.computeViewMatrix((x, y, CAMERA_HEIGHT_M), (x, y, 0), up)
     fine = pixels * samples
     projection = _orthographic(width_m / 2, fine)
-    depth = _distance_m(_depth_buffer(client, view, projection, (fine, fine)), projection)
+    depth = _distance_m(client, view, projection, (fine, fine))
     rays = np.stack([depth, depth < CAMERA_HEIGHT_M - _MASK_HEIGHT_M])
     blocks = rays.reshape(2, pixels, samples, pixels, samples)
     return blocks.mean(axis=(2, 4)).astype(np.float32)
@@ -118,7 +111,7 @@ def _kinect_points(
     projection[2, 2:] = -(far + near) / (far - near), -2 * far * near / (far - near)
     projection[3, 2] = -1
     view = pybullet.computeViewMatrix((*stand, KINECT_HEIGHT_M), (*stand, 0), (0, 1, 0))
-    distance = _distance_m(_depth_buffer(client, view, projection, (rows, columns)), projection)
+    distance = _distance_m(client, view, projection, (rows, columns))
 
     jitter = noise.normal(0, 0.8 / step, size=(2, rows, columns)) + np.indices((rows, columns))
     row, column = np.rint(jitter).astype(int)
@@ -185,9 +178,8 @@ def picture(client: int, width: int = 320, height: int = 240) -> np.ndarray:
         lightDirection=(0.6, -0.7, 1.6),
         lightDistance=3.0,
         shadow=1,
-        renderer=pybullet.ER_TINY_RENDERER,
-        flags=pybullet.ER_NO_SEGMENTATION_MASK,
         physicsClientId=client,
+        **_RENDERER,
     )
     rgb = np.asarray(rgba, dtype=np.uint16).reshape(2 * height, 2 * width, 4)[..., :3]
     rows = rgb[::2] + rgb[1::2]

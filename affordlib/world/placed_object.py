@@ -46,7 +46,7 @@ def poses(states: np.ndarray) -> np.ndarray:
     return np.column_stack([states[:, :3], np.unwrap(yaw), tilt])
 
 
-def set_friction(client: int, body: int, link: int, lateral: float) -> None:
+def set_friction(client: int, body: int, link: int, lateral: float, **more: float) -> None:
     """Give a link of a body a lateral friction, and what all bodies have in common."""
     pybullet.changeDynamics(
         body,
@@ -55,6 +55,7 @@ def set_friction(client: int, body: int, link: int, lateral: float) -> None:
         spinningFriction=1e-3,
         rollingFriction=ROLLING_M,
         restitution=0.0,
+        **more,
         physicsClientId=client,
     )
 
@@ -91,10 +92,8 @@ class PlacedObject:
             baseInertialFramePosition=config.com_offset_m,
             physicsClientId=client,
         )
-        set_friction(client, self.body, -1, config.object_friction)
-        pybullet.changeDynamics(
-            self.body, -1, linearDamping=0.0, angularDamping=0.0, physicsClientId=client
-        )
+        undamped = {"linearDamping": 0.0, "angularDamping": 0.0}
+        set_friction(client, self.body, -1, config.object_friction, **undamped)
         c, s, (x, y, z) = math.cos(yaw_rad), math.sin(yaw_rad), config.com_offset_m
         position = (xy_m[0] + c * x - s * y, xy_m[1] + s * x + c * y, obj.height_m / 2 + z)
         orientation = pybullet.getQuaternionFromEuler((0, 0, yaw_rad))

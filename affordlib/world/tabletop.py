@@ -27,7 +27,6 @@ from affordlib.types import (
     check_count,
     check_finite,
     check_on_table,
-    check_pair,
     check_within,
 )
 from affordlib.world import camera, robot
@@ -239,21 +238,22 @@ class Tabletop:
             image = camera.depth_crop(self.client, (x, y))
         return Observation((x, y), image, yaw_rad=yaw)
 
+    def _observe_edge(self, lever: LeverUp) -> Observation:
+        """The image (2, 128, 128) around a lever-up's contact, its direction to the right."""
+        x, y, _ = self.object_pose()
+        image = camera.depth_crop(
+            self.client,
+            (x + lever.contact_x, y + lever.contact_y),
+            LEVER_IMAGE_PIXELS,
+            LEVER_CROP_WIDTH_M,
+            lever.theta,
+            samples=1,
+        )
+        return Observation((x, y), image)
+
     def depth_image(self) -> np.ndarray:
         """Depth [m] and mask (2, 48, 48) of the table around the object, the arm parked."""
         return self.observe().image
-
-    def depth_image_from(self, xy_m: tuple[float, float], turn_rad: float) -> np.ndarray:
-        """Depth [m] and mask (2, 128, 128) around a point, the direction turn_rad to the right.
-
-        xy_m: relative to the object, along the table's axes.
-        """
-        x, y, _ = self.object_pose()
-        dx, dy = (check_within("xy_m", v, -1.0, 1.0, "m") for v in check_pair("xy_m", xy_m))
-        at, turn_rad = (x + dx, y + dy), check_finite("turn_rad", turn_rad)
-        return camera.depth_crop(
-            self.client, at, LEVER_IMAGE_PIXELS, LEVER_CROP_WIDTH_M, turn_rad, samples=1
-        )
 
     def picture(self, width: int = 320, height: int = 240) -> np.ndarray:
         """A colour picture (height, width, 3), uint8, of the robot at work, for people."""
@@ -320,12 +320,7 @@ class Tabletop:
         """
         stop_phase = check_within("stop_phase", stop_phase, 0.0, 1.0)
         self._require_tool(primitive)
-        if isinstance(primitive, LeverUp):  # seen from the contact point
-            contact = (primitive.contact_x, primitive.contact_y)
-            image = self.depth_image_from(contact, primitive.theta)
-            seen = Observation(self.object_pose()[:2], image)
-        else:
-            seen = self.observe()
+        seen = self._observe_edge(primitive) if isinstance(primitive, LeverUp) else self.observe()
         command = Command.of(adapt_to_object(primitive, seen.image), stop_phase, smooth)
         try:
             return self._execute(command, seen, approach)
