@@ -1,8 +1,8 @@
 """Cross-validation of effect prediction: jobs that train on a fold's training part and test.
 
-A job is told by model, data set, size, fold and seed. It trains on the training part, stops early
-on the validation part, and predicts the effects of the test part from the image and the commanded
-action at t = 0 and t = 1. `experiments.effect_prediction` runs jobs and makes the tables.
+A job is a model, a data set, its size, a fold and a seed. It trains on the training part, stops
+early on the validation part, and predicts the effects of the test part from the image and the
+commanded action at t = 0 and t = 1. `experiments.effect_prediction` runs jobs and makes the tables.
 """
 
 from __future__ import annotations
@@ -176,12 +176,12 @@ def cross_validate(
             result["inverse"] = executed_columns(interactions, kept, theta)
     result["fold_test"] = prediction_columns(found["fold_test"])
     if task.test_set:
-        told = summary(found["fixed_test"])
-        rows = told.pop("calibration")
+        errors = summary(found["fixed_test"])
+        rows = errors.pop("calibration")
         result["fixed_calibration"] = [{"n_values": row.pop("n")} | row for row in rows]
         result["fixed_test"] = {
-            "interaction": found["fixed_test"]["interaction"], "category": told.pop("family"),
-        } | {name: values for name, values in told.items() if values is not None}  # fmt: skip
+            "interaction": found["fixed_test"]["interaction"], "category": errors.pop("family"),
+        } | {name: values for name, values in errors.items() if values is not None}  # fmt: skip
     return result
 
 
@@ -211,18 +211,18 @@ def _train(
     """A trained network, or an ensemble whose members differ by their seeds."""
     network, training = network_and_training(model, data, n)
     interactions, members = open_once(data), NETWORKS[model].members
-    symmetries, trained, told = task_of(data).symmetries or (), [], []
+    symmetries, trained, records = task_of(data).symmetries or (), [], []
     for k in range(members):
         config = replace(training, seed=members * seed + k)
         path = resume_checkpoint.with_name(f"{resume_checkpoint.name}{k}")
         one, history = train_model(interactions, split, config, network, False, symmetries, path)
         best = min(record.validation_error for record in history)
         steps = {"steps": history[-1].step, "seconds": history[-1].seconds}
-        told.append(steps | {"validation_error": best, "temperature": list(one.temperature)})
+        records.append(steps | {"validation_error": best, "temperature": list(one.temperature)})
         trained.append(one)
     if members == 1:
-        return trained[0], told[0]
+        return trained[0], records[0]
     ensemble = Ensemble(trained)
     channels = network.action_channels, network.effect_channels
     validation = InteractionTensors.from_dataset(interactions, split.validation, *channels)
-    return ensemble, {"members": told, "temperature": fit_temperature(ensemble, validation)}
+    return ensemble, {"members": records, "temperature": fit_temperature(ensemble, validation)}

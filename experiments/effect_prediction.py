@@ -115,8 +115,8 @@ def spread(group: pd.DataFrame, column: str, name: str, unit: str) -> dict[str, 
     mean, sem = mean_sem(group, column)
     values = group[column].to_numpy()
     median, p95 = float(np.median(values)), float(np.quantile(values, 0.95))
-    told = {"mean": mean, "sem": sem, "median": median, "p95": p95}
-    return {f"{name}_{statistic}_{unit}": value for statistic, value in told.items()}
+    statistics = {"mean": mean, "sem": sem, "median": median, "p95": p95}
+    return {f"{name}_{statistic}_{unit}": value for statistic, value in statistics.items()}
 
 
 def error_rows(table: pd.DataFrame, primitive: str) -> Rows:

@@ -119,8 +119,8 @@ def unseen_rows(results: list[Result], edges: dict[int, int]) -> Rows:
             alike = [edges[i] == left_out for _, result in group for i in result["interaction"]]
             errors = _errors_cm(group, protocol).mean(axis=1)[alike]
             for k in range(errors.shape[1]):
-                told = {"known_n": len(errors), "known_mean_cm": float(errors[:, k].mean())}
-                known[about["model"], protocol, k + 1] = told
+                columns = {"known_n": len(errors), "known_mean_cm": float(errors[:, k].mean())}
+                known[about["model"], protocol, k + 1] = columns
         for row in error_rows(results, left_out):
             key = row["model"], row["protocol"], row["steps"]
             rows.append({"edges": left_out} | row | known.get(key, {}))
@@ -146,8 +146,8 @@ def motion_rows(results: list[Result]) -> Rows:
         for kind, which in (("moving", moves >= 100 * RESTS_M), ("resting", moves < 100 * RESTS_M)):
             chosen = errors[which]
             for k in range(chosen.shape[1] if len(chosen) else 0):
-                told = {"n_windows": len(chosen), "mean_cm": float(chosen[:, k].mean())}
-                rows.append(about | {"windows": kind, "steps": k + 1} | told)
+                columns = {"n_windows": len(chosen), "mean_cm": float(chosen[:, k].mean())}
+                rows.append(about | {"windows": kind, "steps": k + 1} | columns)
     return rows
 
 
@@ -202,11 +202,11 @@ def coverage_rows(results: list[Result]) -> Rows:
 
 def step_rows(results: list[Result]) -> Rows:
     """How far the object moves in each step of 150 ms."""
-    told = [result["step_moves_cm"] for about, result in results
+    moves = [result["step_moves_cm"] for about, result in results
             if "step_moves_cm" in result and about["edges_left_out"] is None]  # fmt: skip
     return [
         {"step": k + 1, "mean_cm": float(move.mean()), "p95_cm": float(np.quantile(move, 0.95))}
-        for k, move in enumerate(np.concatenate(told).T)
+        for k, move in enumerate(np.concatenate(moves).T)
     ]
 
 
@@ -224,10 +224,10 @@ def summary_rows(rows: Rows) -> Rows:
 
 def training_rows(results: list[Result]) -> Rows:
     """What each training took."""
-    keys, told = ("model", "trained_for", "fold", "edges_left_out"), ("steps", "epochs", "seconds")
+    keys, costs = ("model", "trained_for", "fold", "edges_left_out"), ("steps", "epochs", "seconds")
     return [
         {key: about[key] for key in keys}
-        | {key: result["training"].get(key) for key in (*told, "checkpoint")}
+        | {key: result["training"].get(key) for key in (*costs, "checkpoint")}
         for about, result in results
         if "training" in result
     ]
