@@ -26,7 +26,6 @@ from affordlib.results import write_atomically
 
 SUFFIX = ".zarr.zip"
 MANIFEST = "manifest.json"
-_CODEC = BloscCodec(cname="zstd", clevel=9, shuffle="shuffle")
 _REMEDY = "fetch it again, or collect it again (the shipped sets with `make data`)"
 
 
@@ -54,11 +53,15 @@ def dataset_sha256(data: xr.Dataset) -> str:
     return _hash_of(_hashes(data))
 
 
-def write_interactions(data: xr.Dataset, path: Path) -> None:
-    """Write a set as one file, whole or not at all; equal sets give equal bytes."""
+def write_interactions(data: xr.Dataset, path: Path, level: int = 9) -> None:
+    """Write a set as one file, whole or not at all; equal sets give equal bytes.
+
+    level: how hard to compress, from 0 to 9.
+    """
+    codec = BloscCodec(cname="zstd", clevel=level, shuffle="shuffle")
     buffers: dict[str, Buffer] = {}
     encoding = {
-        name: {"compressors": [_CODEC], "chunks": variable.shape, "_FillValue": None}
+        name: {"compressors": [codec], "chunks": variable.shape, "_FillValue": None}
         for name, variable in data.variables.items()
     }
     data.to_zarr(MemoryStore(buffers), zarr_format=3, consolidated=False, encoding=encoding)
