@@ -18,7 +18,7 @@ from affordlib.interactions import (
 from affordlib.interactions.sampling import Batch, sample_literal, sample_mixed
 from affordlib.models.checkpoint import build
 from affordlib.models.film import FiLMNetwork
-from affordlib.models.protocol import observe_final_effect
+from affordlib.models.protocol import condition_on_final_effect
 from affordlib.models.training import final_errors_m, train
 from affordlib.types import Observations
 from experiments.shipped import CHECKPOINT_SPECS
@@ -199,9 +199,9 @@ def ablated(changes: Sequence[str], steps: int, seed: int = 0) -> tuple[np.ndarr
     model = build(network, scales(scaler))
     for how in each:
         how.get("start", lambda _: None)(model)
-    train(model, training, validation, config, progress=False, draw=draw)
+    train(model, training, validation, config, sampler=draw)
     with torch.no_grad():
-        observed = observe_final_effect(model, test.effect[:, -1])
+        observed = condition_on_final_effect(model, test.effect[:, -1])
         decoded = model.predict(model.encode(test.image), observed, torch.zeros(len(test), 1))
     start = (decoded.action_mean[:, 0, :2] - test.action[:, 0, :2]).norm(dim=-1)
     return final_errors_m(model, test).numpy(), start.numpy()

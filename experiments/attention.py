@@ -18,9 +18,10 @@ from torch import Tensor, nn
 
 from affordlib import checked
 from affordlib.interactions.dataset import Scaler
+from affordlib.models.base import EffectNetwork, NetworkConfig, he_initialise, with_time
 from affordlib.models.checkpoint import NETWORKS
-from affordlib.models.film import CircularHarmonics, dense, split_outputs, waves
-from affordlib.models.network import EffectNetwork, NetworkConfig, he_initialise, with_time
+from affordlib.models.domain import TrainingDomain
+from affordlib.models.harmonics import CircularHarmonics, dense, waves
 from affordlib.types import Observations
 
 
@@ -74,8 +75,10 @@ class CrossAttention(nn.Module):
 class AttentiveCNP(EffectNetwork):
     """Relates object image, action and effect; satisfies `EffectModel`."""
 
-    def __init__(self, config: AttentionConfig, scaler: Scaler) -> None:
-        super().__init__(config, scaler)
+    def __init__(
+        self, config: AttentionConfig, scaler: Scaler, domain: TrainingDomain | None = None
+    ) -> None:
+        super().__init__(config, scaler, domain)
         c, w = config, config.width
         n_a, n_e = len(c.action_channels), len(c.effect_channels)
         self.harmonics = CircularHarmonics(c.rings, c.orders)
@@ -93,15 +96,15 @@ class AttentiveCNP(EffectNetwork):
         """The circular harmonics of standardised depth and mask."""
         return self.harmonics(scaled_image)
 
-    def look(self, image: Float[Tensor, "b 2 48 48"]) -> Float[Tensor, "b f"]:
+    def unoriented_features(self, image: Float[Tensor, "b 2 48 48"]) -> Float[Tensor, "b f"]:
         """The circular harmonics (B, F) of images."""
         return self.harmonics(self._scaled(image))
 
-    def turned_features(
-        self, seen: Float[Tensor, "#b f"], heading: Float[Tensor, "b 2"]
+    def oriented_features(
+        self, unoriented: Float[Tensor, "#b f"], rotation: Float[Tensor, "b 2"]
     ) -> Float[Tensor, "b f"]:
-        """The harmonics of turned images, given those of the images as they lie."""
-        return self.harmonics.turned(seen, heading)
+        """The harmonics of the rotated images, of those of the images."""
+        return self.harmonics.rotated(unoriented, rotation)
 
     def outputs(
         self, features: Tensor, observations: Observations, t_target: Tensor
@@ -125,7 +128,7 @@ class AttentiveCNP(EffectNetwork):
         x = self.ask(waves(t_target, self.config.waves)) + self.image_summary(features)[:, None]
         for block in self.blocks:
             x = block(x, tokens, bias)
-        return split_outputs(self.last(x), self.config, self.sigma_floor)
+        return self.split_outputs(self.last(x))
 
 
 NETWORKS["attention"] = (AttentiveCNP, AttentionConfig)

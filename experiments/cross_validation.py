@@ -25,13 +25,13 @@ from affordlib.evaluation.predictions import (
 )
 from affordlib.interactions import InteractionTensors, Split, split_interactions
 from affordlib.interactions.dataset import Symmetry, valid_interactions
-from affordlib.models.calibration import fit_temperature
+from affordlib.models.base import EffectNetwork, NetworkConfig
+from affordlib.models.calibration import fit_sigma_scale
 from affordlib.models.cnp import CNPConfig
-from affordlib.models.ensemble import Ensemble
 from affordlib.models.film import FiLMConfig
-from affordlib.models.network import EffectNetwork, NetworkConfig
 from affordlib.models.training import train_model
 from experiments.attention import AttentionConfig
+from experiments.ensemble import Ensemble
 from experiments.inverse import executed_columns, inverse_columns, theta_along_effect
 from experiments.runner import Job, open_once
 from experiments.shipped import CHECKPOINT_SPECS, GRASP_SYMMETRIES, HALF_TURNS
@@ -215,14 +215,14 @@ def _train(
     for k in range(members):
         config = replace(training, seed=members * seed + k)
         path = resume_checkpoint.with_name(f"{resume_checkpoint.name}{k}")
-        one, history = train_model(interactions, split, config, network, False, symmetries, path)
+        one, history = train_model(interactions, split, config, network, symmetries, path)
         best = min(record.validation_error for record in history)
         steps = {"steps": history[-1].step, "seconds": history[-1].seconds}
-        records.append(steps | {"validation_error": best, "temperature": list(one.temperature)})
+        records.append(steps | {"validation_error": best, "temperature": list(one.sigma_scale)})
         trained.append(one)
     if members == 1:
         return trained[0], records[0]
     ensemble = Ensemble(trained)
     channels = network.action_channels, network.effect_channels
     validation = InteractionTensors.from_dataset(interactions, split.validation, *channels)
-    return ensemble, {"members": records, "temperature": fit_temperature(ensemble, validation)}
+    return ensemble, {"members": records, "temperature": fit_sigma_scale(ensemble, validation)}

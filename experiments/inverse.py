@@ -17,7 +17,7 @@ import xarray as xr
 from affordlib.geometry import wrap_angle
 from affordlib.interactions.dataset import InteractionTensors, valid_interactions
 from affordlib.interactions.recipes import Recipe, sample_scene, sample_world
-from affordlib.models.protocol import EffectModel, observe_final_effect
+from affordlib.models.protocol import EffectModel, condition_on_final_effect
 from affordlib.primitives import Push
 from affordlib.world import Tabletop
 
@@ -25,7 +25,7 @@ from affordlib.world import Tabletop
 @torch.no_grad()
 def decoded_theta_rad(model: EffectModel, image: torch.Tensor, wanted: torch.Tensor) -> np.ndarray:
     """Angles θ (N,) of the pushes that should have the effects (N, C) on the objects of images."""
-    observations = observe_final_effect(model, wanted)
+    observations = condition_on_final_effect(model, wanted)
     decoded = model.predict(model.encode(image), observations, torch.zeros(len(wanted), 1))
     x, y = (decoded.action_mean[:, 0, model.action_channels.index(name)] for name in "xy")
     return torch.atan2(y, x).numpy()

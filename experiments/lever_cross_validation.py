@@ -28,16 +28,17 @@ from affordlib.interactions.lever_up import (
     n_windows,
 )
 from affordlib.interactions.recipes import Recipe, sample_scene
+from affordlib.models.base import EffectNetwork
 from affordlib.models.calibration import LEVELS, coverage
-from affordlib.models.lever import (
+from affordlib.models.domain import TrainingDomain
+from affordlib.models.lever_up import (
     LEVER_MODELS,
     PROTOCOLS,
     TRAINED_FOR,
     errors_m,
-    foresee,
+    predict_steps,
     train_lever_model,
 )
-from affordlib.models.network import EffectNetwork
 from affordlib.types import Prediction
 from experiments import lstm_seker2019
 from experiments.lstm_seker2019 import SekerConfig, SekerLSTM, train_seker
@@ -169,7 +170,7 @@ def _train(
     """A network trained here, or the shipped checkpoint of this very training."""
     if found := shipped_lever_model(model, trained_for, lever, data, split):
         return found
-    network, history = train_lever_model(lever, data, split, trained_for, False, path)
+    network, history = train_lever_model(lever, data, split, trained_for, path)
     best = min(record.validation_error for record in history)
     told = {"steps": history[-1].step, "seconds": history[-1].seconds}
     return network, told | {"validation_error": best}
@@ -183,7 +184,8 @@ def _train_seker(
     )
     channels = {f"{k}_channels": getattr(training, f"{k}_channels") for k in ("action", "effect")}
     torch.manual_seed(seed)
-    network = SekerLSTM(SekerConfig(**channels), Scaler.fit(training))
+    scales = Scaler.fit(training), TrainingDomain.fit(training)
+    network = SekerLSTM(SekerConfig(**channels), *scales)
     epochs = epochs or lstm_seker2019.EPOCHS
     return network, train_seker(network, training, validation, trained_for, epochs, seed, path)
 
@@ -197,7 +199,7 @@ def _predicted(
 ) -> list[tuple[Prediction, Tensor]]:
     with torch.no_grad():
         features = model.encode(arrays.image)
-    return [foresee(model, arrays, protocol, k, features) for k in _starts(arrays, protocol)]
+    return [predict_steps(model, arrays, protocol, k, features) for k in _starts(arrays, protocol)]
 
 
 def extrapolate(

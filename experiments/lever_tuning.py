@@ -14,12 +14,12 @@ from typing import Any
 from affordlib.interactions import open_interactions
 from affordlib.interactions.dataset import augment_by_symmetry
 from affordlib.interactions.lever_up import MIRRORED, lever_up_tensors
-from affordlib.models.lever import (
+from affordlib.models.lever_up import (
     LEVER_MODELS,
     TRAINING,
     LeverModel,
-    beginning_errors_m,
     fit_lever_model,
+    from_start_errors_m,
     window_errors_m,
 )
 from experiments.lever_cross_validation import DATA, lever_split
@@ -59,7 +59,7 @@ def tuning() -> list[dict[str, Any]]:
         validation = lever_up_tensors(data, split.validation, lever.view)
         for setting in SETTINGS:
             model, history = fit_lever_model(
-                changed(lever, setting), training, validation, trained_for, progress=False
+                changed(lever, setting), training, validation, trained_for
             )
             row = {"model": name, "trained_for": trained_for, "setting": setting}
             row |= {"taken": changed(lever, setting) == lever}
@@ -67,6 +67,6 @@ def tuning() -> list[dict[str, Any]]:
             if trained_for != "first_step":
                 row["window_mean_m"] = float(window_errors_m(model, validation).mean())
             if trained_for != "window":
-                row["beginning_mean_m"] = float(beginning_errors_m(model, validation).mean())
+                row["beginning_mean_m"] = float(from_start_errors_m(model, validation).mean())
             rows.append(row)
     return rows

@@ -26,7 +26,7 @@ import numpy as np
 
 from affordlib.commands import command, count_type, names_type, whole_type
 from affordlib.interactions.lever_up import POSE_CHANNELS
-from affordlib.models.lever import PROTOCOLS, TRAINED_FOR
+from affordlib.models.lever_up import PROTOCOLS, TRAINED_FOR
 from affordlib.results import write_results
 from affordlib.workers import dask_client
 from experiments import reported, studies

@@ -27,10 +27,11 @@ from affordlib import checked
 from affordlib.interactions import Scaler
 from affordlib.interactions.dataset import InteractionTensors
 from affordlib.interactions.lever_up import N_OBSERVED
+from affordlib.models.base import EffectNetwork, NetworkConfig, with_time
 from affordlib.models.checkpoint import load_state, save_state
-from affordlib.models.lever import beginning_errors_m, window_errors_m
+from affordlib.models.domain import TrainingDomain
+from affordlib.models.lever_up import from_start_errors_m, window_errors_m
 from affordlib.models.lstm import Known, on_grid
-from affordlib.models.network import EffectNetwork, NetworkConfig, with_time
 from affordlib.types import LEVER_IMAGE_PIXELS, Observations
 
 CONVOLUTION_WIDTHS = (32, 64, 128, 256)
@@ -56,8 +57,10 @@ class SekerConfig(NetworkConfig):
 class SekerLSTM(EffectNetwork):
     """CNN and LSTM, step by step; σ is not predicted and is the floor."""
 
-    def __init__(self, config: SekerConfig, scaler: Scaler) -> None:
-        super().__init__(config, scaler)
+    def __init__(
+        self, config: SekerConfig, scaler: Scaler, domain: TrainingDomain | None = None
+    ) -> None:
+        super().__init__(config, scaler, domain)
         n_a, n_e = len(config.action_channels), len(config.effect_channels)
         layers: list[nn.Module] = []
         for n_in, n_out in pairwise((2, *CONVOLUTION_WIDTHS)):
@@ -134,7 +137,7 @@ class SekerLSTM(EffectNetwork):
         k = start[:, None] + torch.arange(n)
         pose = arrays.effect / self.effect_scale
         ends = arrays.action[:, [0, -1]] / self.action_scale
-        features = self._see(arrays.image)
+        features = self.encode(arrays.image, check=False)
         gates, action = self._share_of_image(features), ends.flatten(1)[:, None]
         out, _ = self._steps(gates, pose[rows, k], k, action)
         return F.mse_loss(self.next_pose(out), pose[rows, k + 1])
@@ -160,7 +163,7 @@ def train_seker(
     )
     generator = torch.Generator().manual_seed(seed)
     n = N_OBSERVED if trained_for == "window" else len(training.phase) - 1
-    score = window_errors_m if trained_for == "window" else beginning_errors_m
+    score = window_errors_m if trained_for == "window" else from_start_errors_m
     best, best_state, epoch, seconds = math.inf, model.state_dict(), 0, 0.0
     if checkpoint is not None and checkpoint.exists():
         state = load_state(checkpoint)

@@ -27,7 +27,7 @@ from scipy.stats import sem
 from affordlib.commands import command, count_type
 from affordlib.interactions import Scaler
 from affordlib.models import CNPConfig, build
-from affordlib.models.network import NetworkConfig, gaussian_nll
+from affordlib.models.base import NetworkConfig, gaussian_nll
 from affordlib.results import write_results
 from affordlib.types import Observations
 from experiments.attention import AttentionConfig

@@ -21,9 +21,10 @@ from torch import Tensor, nn
 from affordlib.interactions import InteractionTensors, open_interactions, split_interactions
 from affordlib.interactions.dataset import valid_interactions
 from affordlib.models.checkpoint import load_checkpoint
-from affordlib.models.film import CircularHarmonics, FiLMConfig, dense
-from affordlib.models.frame import heading, inverse, turn_observations
-from affordlib.models.protocol import observe_final_effect
+from affordlib.models.film import FiLMConfig
+from affordlib.models.harmonics import CircularHarmonics, dense
+from affordlib.models.protocol import condition_on_final_effect
+from affordlib.models.push_frame import inverse, push_direction, rotate_observations
 from affordlib.models.training import final_errors_m, train_model
 from affordlib.perception import looks_rollable
 from affordlib.types import Observations
@@ -76,8 +77,8 @@ def latent() -> Rows:
 
         def code(observed: Observations, model: Any = model, channels: Any = channels) -> Any:
             if model.config.frame == "push":
-                back = inverse(heading(observed, *channels))
-                observed = turn_observations(observed, back, *channels)
+                back = inverse(push_direction(observed, *channels))
+                observed = rotate_observations(observed, back, *channels)
             return model.represent(observed)
 
         r_a, r_e = code(_seen_by(arrays, True, False, 1.0)), code(_seen_by(arrays, False, True, 0))
@@ -149,7 +150,7 @@ def learn_rollability(
     for _ in range(steps):
         rows = torch.randint(len(seen), (128,), generator=generator)
         angle = math.tau * torch.rand(len(rows), generator=generator)
-        turned = model.harmonics.turned(seen[rows], torch.stack([angle.cos(), angle.sin()], dim=1))
+        turned = model.harmonics.rotated(seen[rows], torch.stack([angle.cos(), angle.sin()], dim=1))
         logit = model.head(turned).squeeze(1)
         loss = nn.functional.binary_cross_entropy_with_logits(logit, rolls[rows])
         optimiser.zero_grad()
@@ -196,7 +197,7 @@ def push_and_drag_model() -> Rows:
     """
     data, other = open_interactions("mixed"), open_interactions("partial")
     split = split_interactions(data.sizes["interaction"])
-    model, _ = train_model(data, split, TRAINING, FiLMConfig(), progress=False)
+    model, _ = train_model(data, split, TRAINING, FiLMConfig())
     arrays = InteractionTensors.from_dataset(data, split.train)
     rolls = data["rollable"].values[valid_interactions(data, split.train)]
     length = arrays.effect[:, -1].norm(dim=-1)
@@ -214,7 +215,7 @@ def push_and_drag_model() -> Rows:
         with torch.no_grad():
             decoded = model.predict(
                 model.encode(new.image),
-                observe_final_effect(model, wanted),
+                condition_on_final_effect(model, wanted),
                 torch.zeros(len(new), 1),
             )
         radius = decoded.action_mean[:, 0].norm(dim=-1).numpy()

@@ -81,7 +81,7 @@ def residual_distribution() -> Rows:
     rows = []
     for name in CHECKPOINTS:
         model, _ = load_checkpoint(name)
-        model.temperature = (1.0,) * len(model.effect_channels)
+        model.sigma_scale = (1.0,) * len(model.effect_channels)
         channels = model.action_channels, model.effect_channels
         source = CHECKPOINT_SPECS[name].data
         data = open_interactions(source)

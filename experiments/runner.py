@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 FOLDER = "data/results/raw"
 WRITE_EVERY_S = 30
-NOT_DECISIVE = ("device", "max_minutes", "temperature")
+NOT_DECISIVE = ("device", "max_minutes", "sigma_scale")
 """Options of trainings and networks that belong to the machine, or are fitted afterwards."""
 
 open_once = lru_cache(maxsize=4)(open_interactions)

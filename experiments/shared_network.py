@@ -26,9 +26,10 @@ from affordlib.evaluation.predictions import network_predictions
 from affordlib.interactions import InteractionTensors, Scaler, split_interactions
 from affordlib.interactions.dataset import Symmetry, augment_by_symmetry
 from affordlib.interactions.sampling import condition_on_recorded_action
+from affordlib.models.base import EffectNetwork
 from affordlib.models.checkpoint import build
+from affordlib.models.domain import TrainingDomain
 from affordlib.models.film import FiLMConfig
-from affordlib.models.network import EffectNetwork
 from affordlib.models.training import train
 from affordlib.primitives import Grasp
 from experiments.cross_validation import TASKS, add_errors, job, prediction_columns
@@ -104,10 +105,10 @@ def train_shared(fold: int, resume_checkpoint: Path | None = None) -> EffectNetw
     validation = {name: _part(name, fold, "validation") for name in PRIMITIVES}
     training = copies[0].joined(*copies[1:])
     torch.manual_seed(TRAINING.seed)
-    model = build(NETWORK, Scaler.fit(training))
+    model = build(NETWORK, Scaler.fit(training), TrainingDomain.fit(training))
     first, *others = validation.values()
     everything = first.joined(*others)
-    train(model, training, everything, TRAINING, False, resume_checkpoint, score=shares(validation))
+    train(model, training, everything, TRAINING, resume_checkpoint, score=shares(validation))
     return model
 
 

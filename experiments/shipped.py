@@ -42,14 +42,15 @@ from affordlib.interactions.recipes import RECIPES, SHIPPED, Variation
 from affordlib.interactions.sampling import sample_forward, sample_mixed
 from affordlib.interactions.store import SUFFIX as DATA_SUFFIX
 from affordlib.interactions.store import dataset_sha256
+from affordlib.models.base import EffectNetwork, NetworkConfig
 from affordlib.models.checkpoint import SUFFIX, load_checkpoint, save_checkpoint
 from affordlib.models.cnp import CNPConfig
+from affordlib.models.domain import TrainingDomain
 from affordlib.models.film import FiLMConfig
-from affordlib.models.lever import LEVER_MODELS, LeverModel, lever_training, train_lever_model
+from affordlib.models.lever_up import LEVER_MODELS, LeverModel, lever_training, train_lever_model
 from affordlib.models.lstm import LSTMConfig
-from affordlib.models.network import EffectNetwork, NetworkConfig
 from affordlib.models.training import (
-    Draw,
+    Sampler,
     TrainingConfig,
     about_training,
     final_errors_m,
@@ -75,7 +76,7 @@ class CheckpointSpec:
     network: NetworkConfig
     training: TrainingConfig
     symmetries: tuple[Symmetry, ...] = ()
-    draw: Draw = sample_mixed
+    sampler: Sampler = sample_mixed
 
 
 _PUSH_FRAME = TrainingConfig(
@@ -104,7 +105,7 @@ CHECKPOINT_SPECS: dict[str, CheckpointSpec] = {
     "grasp_film_1000": CheckpointSpec("grasp_x10", _LIFT, _TABLE_FRAME, GRASP_SYMMETRIES),
     "grasp_film_1000_firm": CheckpointSpec("grasp_firm_x10", _LIFT, _TABLE_FRAME, GRASP_SYMMETRIES),
     "rotate_film_1000": CheckpointSpec("rotate_x10", _TURN, _TABLE_FRAME, HALF_TURNS),
-    "lstm_500": CheckpointSpec("push", _LSTM, _PUSH_FRAME, draw=sample_forward),
+    "lstm_500": CheckpointSpec("push", _LSTM, _PUSH_FRAME, sampler=sample_forward),
 }
 """Minutes of one core: ten for `cnp_500`, five for `lstm_500` and the two of 5,000 pushes, one or
 two for others. Five learn from sets of ten times the size, which are not shipped."""
@@ -186,8 +187,13 @@ def shipped_lever_model(
             return None
         expected = about_lever_training(data, split, lever, trained_for)
         network = replace(model.config, sigma_floor=lever.network.sigma_floor)
-        scales = Scaler.fit(lever_training(lever, data, split))
-        if about == expected and network == lever.network and model.scaler == scales:
+        training = lever_training(lever, data, split)
+        scales = Scaler.fit(training), TrainingDomain.fit(training)
+        if (
+            about == expected
+            and network == lever.network
+            and (model.scaler, model.domain) == scales
+        ):
             return model, {"checkpoint": checkpoint}
     return None
 

@@ -47,8 +47,8 @@ from affordlib.models import (
     train,
     train_literal,
 )
-from affordlib.models.lever import LEVER_MODELS, foresee
-from affordlib.models.network import EffectNetwork
+from affordlib.models.base import EffectNetwork
+from affordlib.models.lever_up import LEVER_MODELS, predict_steps
 from affordlib.models.training import batch_loss, final_errors_m
 from affordlib.paths import repo_root
 from affordlib.planning import EffectMap, PlanningProblem, plan_astar, plan_continuous
@@ -169,7 +169,7 @@ def training(
     model = build(CNPConfig(), Scaler.fit(pushes))
     # In small batches: while errors are large, many steps gain more than accurate ones.
     small = TrainingConfig(steps=600, validate_every=10, patience=99, batch_size=8, n_targets=8)
-    history = train(model, pushes, validation, small, progress=False)
+    history = train(model, pushes, validation, small)
     reached = next((h.seconds for h in history if h.validation_error <= error), np.inf)
     what = "time to the literal loop's error, literal : batched"
     return [*rows, ratio_row(what, [literal_s / reached], 20)]
@@ -260,7 +260,7 @@ def lever_up(n: int = 256, epoch: int = 1440) -> Rows:
         row = {"model": name, "epoch_s": epoch_s, "training_s": epoch_s * epochs}
         model.eval()
         for count, protocol in product((1, 64), ("window", "image_only")):
-            query = partial(foresee, model, arrays.select(torch.arange(count)), protocol)
+            query = partial(predict_steps, model, arrays.select(torch.arange(count)), protocol)
             query()
             row[f"{protocol}_{count}_ms"] = 1000 * min(seconds(query) for _ in range(5))
         rows.append(row)

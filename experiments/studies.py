@@ -66,7 +66,7 @@ def perturbed_world() -> Rows:
     errors, calibrated = [], []
     for fold in range(PERTURBED_FOLDS):
         split = split_interactions(data.sizes["interaction"], 0, fold)
-        model, _ = train_model(data, split, TRAINING, NETWORK, progress=False)
+        model, _ = train_model(data, split, TRAINING, NETWORK)
         test = InteractionTensors.from_dataset(data, split.test, *channels)
         errors.append(final_errors_m(model, test).numpy())
         calibrated.append(calibration_rows(model, test))

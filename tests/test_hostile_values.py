@@ -100,7 +100,7 @@ def shop(one_world, skills, pushes, tmp_path_factory):
         "config": config,
         "scaler": scaler,
         "arrays": arrays,
-        "network": models.build(config, scaler),
+        "network": models.build(config, scaler, models.TrainingDomain.fit(arrays)),
         "outcome": Outcome(plan, 0.01, (0.04, 0.02, 0.0), (path,)),
         "folder": folder,
         "seen": one_world.execute_primitive(Push(0.0)),
@@ -229,18 +229,18 @@ def valid_calls(shop):
         "build": (models.build, build),
         "AffordanceCNP": (models.AffordanceCNP, build),
         "FiLMNetwork": (models.FiLMNetwork, build | {"config": models.FiLMConfig()}),
-        "Ensemble": (models.Ensemble, {"members": [network]}),
+        "TrainingDomain": (models.TrainingDomain, dataclasses.asdict(network.domain)),
         "TrainingConfig": (models.TrainingConfig, dataclasses.asdict(few)),
         "coverage": (
             models.coverage,
             {"truth": ones, "mean": ones, "std": ones, "level": 0.5},
         ),
         "calibration_rows": (
-            lambda model, arrays, phases: models.calibration_rows(model, arrays, phases),
-            {"model": network, "arrays": arrays, "phases": (0.8, 1.0)},
+            lambda model, tensors, phases: models.calibration_rows(model, tensors, phases),
+            {"model": network, "tensors": arrays, "phases": (0.8, 1.0)},
         ),
-        "fit_temperature": (
-            models.fit_temperature,
+        "fit_sigma_scale": (
+            models.fit_sigma_scale,
             {"model": network, "validation": arrays, "phases": (0.8, 1.0)},
         ),
         "load_checkpoint": (models.load_checkpoint, {"name_or_path": "cnp_500"}),
@@ -259,8 +259,7 @@ def valid_calls(shop):
                 "training": arrays,
                 "validation": arrays,
                 "config": few,
-                "progress": False,
-                "checkpoint": None,
+                "resume_checkpoint": None,
             },
         ),
         "train_model": (
@@ -270,7 +269,6 @@ def valid_calls(shop):
                 "split": shop["split"],
                 "config": few,
                 "model_config": shop["config"],
-                "progress": False,
                 "symmetries": (),
             },
         ),
@@ -431,7 +429,7 @@ Goal Step Plan Push Push.towards Push.path Drag Grasp Rotate LeverUp primitive_n
 UprightCylinder LyingCylinder Sphere Prism category_named WorldConfig Tabletop place
 execute_primitive execute execute_path can_reach picture mark shove knock
 topple settle Scaler from_dataset open_interactions split_interactions Recipe Variation collect
-CNPConfig FiLMConfig build Ensemble TrainingConfig coverage fit_temperature
+CNPConfig FiLMConfig build TrainingDomain TrainingConfig coverage fit_sigma_scale
 load_checkpoint save_checkpoint condition_on_primitives train train_literal PlanMode Disturbance
 sample_disturbances action_limit EffectMap PlanningProblem ClosedLoopConfig plan_astar
 plan_continuous plan_gradient plan_turn plan_lift kind_for Skills execute_plan run_closed_loop

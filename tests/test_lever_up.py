@@ -16,13 +16,13 @@ from affordlib.interactions.lever_up import (
 from affordlib.interactions.recipes import Recipe, sample_scene
 from affordlib.interactions.sampling import condition_on_poses
 from affordlib.models import build
-from affordlib.models.anchored import AnchoredNetwork, _last
-from affordlib.models.lever import (
+from affordlib.models.last_pose import LastPoseCNP, _last
+from affordlib.models.lever_up import (
     LEVER_MODELS,
     PROTOCOLS,
-    beginning_errors_m,
     fit_lever_model,
-    foresee,
+    from_start_errors_m,
+    predict_steps,
 )
 from affordlib.models.lstm import on_grid
 from affordlib.show import FrameRecorder, outline_in_lever_frame, plot_levered
@@ -32,8 +32,8 @@ from affordlib.show import FrameRecorder, outline_in_lever_frame, plot_levered
 def untrained(request, levered):
     torch.manual_seed(0)
     model = build(LEVER_MODELS[request.param].network, Scaler.fit(levered))
-    if hasattr(model, "fit_course"):
-        model.fit_course(levered.effect)
+    if hasattr(model, "mean_trajectory"):
+        model.mean_trajectory.fit(levered.effect, model.effect_scale)
     return model.eval()
 
 
@@ -45,8 +45,8 @@ def test_no_model_sees_what_it_has_to_foresee(untrained, levered):
     for protocol, last in zip(PROTOCOLS, (N_OBSERVED - 1, 0, 0), strict=True):
         later = levered.effect.clone()
         later[:, last + 1 :] += 0.05
-        told, _ = foresee(untrained, levered, protocol)
-        again, truth = foresee(untrained, replace(levered, effect=later), protocol)
+        told, _ = predict_steps(untrained, levered, protocol)
+        again, truth = predict_steps(untrained, replace(levered, effect=later), protocol)
         torch.testing.assert_close(told.effect_mean, again.effect_mean)
         assert truth.shape == told.effect_mean.shape == told.effect_std.shape
 
@@ -54,8 +54,8 @@ def test_no_model_sees_what_it_has_to_foresee(untrained, levered):
 def test_models_use_what_they_observe(untrained, levered):
     earlier = levered.effect.clone()
     earlier[:, N_OBSERVED - 1] += 0.05
-    told, _ = foresee(untrained, levered, "window")
-    other, _ = foresee(untrained, replace(levered, effect=earlier), "window")
+    told, _ = predict_steps(untrained, levered, "window")
+    other, _ = predict_steps(untrained, replace(levered, effect=earlier), "window")
     assert (told.effect_mean - other.effect_mean).abs().max() > 1e-3
 
 
@@ -63,7 +63,7 @@ def test_the_first_pose_tells_nothing_to_those_that_anchor(levered):
     for name in ("cnp_last_pose", "lstm_tuned"):
         torch.manual_seed(0)
         model = build(LEVER_MODELS[name].network, Scaler.fit(levered)).eval()
-        first, none = (foresee(model, levered, p)[0].effect_mean for p in PROTOCOLS[1:])
+        first, none = (predict_steps(model, levered, p)[0].effect_mean for p in PROTOCOLS[1:])
         if name == "lstm_tuned":
             torch.testing.assert_close(first, none)
         assert first[:, 0, :3].abs().max() < 0.05
@@ -83,8 +83,8 @@ def test_the_last_observation_is_found_in_any_order():
 def test_an_anchored_network_begins_where_the_object_is(levered):
     torch.manual_seed(0)
     model = build(LEVER_MODELS["cnp_last_pose"].network, Scaler.fit(levered)).eval()
-    assert isinstance(model, AnchoredNetwork)
-    model.fit_course(levered.effect)
+    assert isinstance(model, LastPoseCNP)
+    model.mean_trajectory.fit(levered.effect, model.effect_scale)
     seen = condition_on_poses(levered, torch.zeros(len(levered), dtype=torch.long), 10)
     t = levered.phase[[9]].expand(len(levered), -1)
     with torch.no_grad():
@@ -123,9 +123,9 @@ def test_a_rollout_does_not_depend_on_how_far_it_is_asked(levered):
 @pytest.mark.parametrize(("name", "kind"), [("cnp_last_pose", "all"), ("lstm_tuned", "first_step")])
 def test_training_learns(levered, short, name, kind):
     lever = short(name, steps=60, batch_size=16, validate_every=30, ema=0.0)
-    model, history = fit_lever_model(lever, levered, levered, kind, progress=False)
+    model, history = fit_lever_model(lever, levered, levered, kind)
     moves = levered.effect[:, 1:, :3].norm(dim=-1).mean()
-    assert beginning_errors_m(model, levered).mean() < moves / 3
+    assert from_start_errors_m(model, levered).mean() < moves / 3
     assert len(history) == 2
 
 

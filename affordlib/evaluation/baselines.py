@@ -32,7 +32,7 @@ from affordlib.evaluation.predictions import about_objects, prediction_record, s
 from affordlib.geometry import rotate_channels, xy_columns
 from affordlib.interactions.dataset import InteractionTensors, valid_interactions
 from affordlib.interactions.sampling import condition_on_recorded_action
-from affordlib.models.frame import heading, inverse, turn_prediction
+from affordlib.models.push_frame import inverse, push_direction, rotate_prediction
 from affordlib.primitives import Grasp
 from affordlib.types import Prediction
 
@@ -164,7 +164,7 @@ def _in_action_frame(arrays: InteractionTensors, at: Tensor) -> Tensor:
     effect, channels = arrays.effect[:, at], (arrays.action_channels, arrays.effect_channels)
     if not _has_direction(arrays):
         return effect
-    back = inverse(heading(condition_on_recorded_action(arrays), *channels))[:, None]
+    back = inverse(push_direction(condition_on_recorded_action(arrays), *channels))[:, None]
     return rotate_channels(effect, arrays.effect_channels, back, absolute_yaw=False)
 
 
@@ -176,8 +176,8 @@ def _in_table_frame(arrays: InteractionTensors, at: Tensor, mean: Tensor, std: T
     channels = arrays.action_channels, arrays.effect_channels
     action = arrays.action[:, at]
     prediction = Prediction(action, torch.zeros_like(action), mean, std)
-    prediction = turn_prediction(
-        prediction, heading(condition_on_recorded_action(arrays), *channels), *channels
+    prediction = rotate_prediction(
+        prediction, push_direction(condition_on_recorded_action(arrays), *channels), *channels
     )
     return prediction.effect_mean, prediction.effect_std
 

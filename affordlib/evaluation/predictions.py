@@ -16,9 +16,9 @@ from affordlib.geometry import xy_columns
 from affordlib.interactions import InteractionTensors
 from affordlib.interactions.dataset import valid_interactions
 from affordlib.interactions.sampling import condition_on_recorded_action
+from affordlib.models.base import gaussian_nll
 from affordlib.models.calibration import LEVELS, coverage
-from affordlib.models.ensemble import Ensemble
-from affordlib.models.network import EffectNetwork, gaussian_nll
+from affordlib.models.protocol import EffectModel
 
 EVERY = 12
 """Every twelfth sample is one of the paper's 25 steps of 150 ms."""
@@ -34,7 +34,7 @@ def steps_of(arrays: InteractionTensors) -> torch.Tensor:
 
 @torch.no_grad()
 def network_predictions(
-    model: EffectNetwork | Ensemble, data: xr.Dataset, interactions: np.ndarray
+    model: EffectModel, data: xr.Dataset, interactions: np.ndarray
 ) -> dict[str, Any]:
     """What a network predicts of interactions: see `prediction_record`."""
     kept = valid_interactions(data, interactions)

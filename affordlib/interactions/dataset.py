@@ -11,8 +11,8 @@ import numpy as np
 import torch
 import xarray as xr
 
-from affordlib.geometry import rotate_channels, xy_columns
-from affordlib.types import check_array, check_count, check_finite, check_pair
+from affordlib.geometry import rotate_channels
+from affordlib.types import check_array, check_count, check_finite
 
 
 def valid_interactions(data: xr.Dataset, interactions: np.ndarray) -> np.ndarray:
@@ -54,69 +54,34 @@ def split_interactions(n: int, seed: int = 0, fold: int = 0, n_folds: int = 10) 
     return Split(np.sort(train), np.sort(blocks[validation]), np.sort(blocks[test]))
 
 
-Range = tuple[float, float]
-
-
 @dataclass(frozen=True)
 class Scaler:
-    """What models take from training data: scales, and ranges outside which they know nothing.
+    """Scales that bring channels near unit size; x and y share one, and zero stays zero.
 
-    Scales bring channels near unit size; x and y share one, and zero stays zero. Ranges (None: not
-    known) are of the distance [m] of the action from the object's centre at t = 0 and at t = 1,
-    and of the share of the image that the object covers; whether objects reach the image's edge;
-    and of the distance [m] that objects have moved at t = 1.
+    image_mean, image_std: of depth and mask.
     """
 
     action_scale: tuple[float, ...]
     effect_scale: tuple[float, ...]
     image_mean: tuple[float, ...]
     image_std: tuple[float, ...]
-    start_radius_m: Range | None = None
-    end_radius_m: Range | None = None
-    mask_share: Range | None = None
-    at_edge: bool = True
-    effect_radius_m: Range | None = None
 
     def __post_init__(self) -> None:
         for name in ("action_scale", "effect_scale", "image_std"):
             if not all(check_finite(name, value) > 0 for value in getattr(self, name)):
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)!r}")
         check_array("image_mean", self.image_mean)
-        for name in ("start_radius_m", "end_radius_m", "mask_share", "effect_radius_m"):
-            if getattr(self, name) is not None:
-                check_pair(name, getattr(self, name), "(low, high)")
 
     @classmethod
-    def fit(cls, arrays: InteractionTensors) -> Scaler:
+    def fit(cls, tensors: InteractionTensors) -> Scaler:
         """Scales of training data: root mean square of the channels, mean and std of the image."""
-        image = arrays.image.double()
-        radius_m = [None, None]
-        if plane := xy_columns(arrays.action_channels):
-            radius_m = [_range(arrays.action[:, k][:, plane].norm(dim=-1)) for k in (0, -1)]
-        moved_m = None
-        if plane := xy_columns(arrays.effect_channels):
-            moved_m = _range(arrays.effect[:, -1][:, plane].norm(dim=-1))
-        mask = arrays.image[:, 1]
+        image = tensors.image.double()
         return cls(
-            _scales(arrays.action, arrays.action_channels),
-            _scales(arrays.effect, arrays.effect_channels),
+            _scales(tensors.action, tensors.action_channels),
+            _scales(tensors.effect, tensors.effect_channels),
             tuple(image.mean(dim=(0, 2, 3)).tolist()),
             tuple(image.std(dim=(0, 2, 3)).clamp_min(1e-6).tolist()),
-            *radius_m,
-            _range(mask.mean(dim=(1, 2))),
-            bool(touches_border(mask).any()),
-            moved_m,
         )
-
-
-def touches_border(mask: torch.Tensor) -> torch.Tensor:
-    """Which of the masks (N, n, n) reach the edge of their image, not just by a corner: (N,)."""
-    rim = torch.cat([mask[:, (0, -1)].flatten(1), mask[:, :, (0, -1)].flatten(1)], dim=1)
-    return (rim > 0.5).sum(dim=1) > 2
-
-
-def _range(values: torch.Tensor) -> Range:
-    return float(values.min()), float(values.max())
 
 
 def _scales(values: torch.Tensor, channels: tuple[str, ...]) -> tuple[float, ...]:

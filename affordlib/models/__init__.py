@@ -1,11 +1,11 @@
 """Models that relate an object's image, an action and its effect."""
 
-from affordlib.models.calibration import calibration_rows, coverage, fit_temperature
+from affordlib.models.base import EffectNetwork, NetworkConfig
+from affordlib.models.calibration import calibration_rows, coverage, fit_sigma_scale
 from affordlib.models.checkpoint import build, load_checkpoint, save_checkpoint
 from affordlib.models.cnp import AffordanceCNP, CNPConfig
-from affordlib.models.ensemble import Ensemble
+from affordlib.models.domain import OutOfRangeWarning, TrainingDomain
 from affordlib.models.film import FiLMConfig, FiLMNetwork
-from affordlib.models.network import EffectNetwork, NetworkConfig, OutOfRangeWarning
 from affordlib.models.protocol import EffectModel, condition_on_primitives
 from affordlib.models.training import TrainingConfig, train, train_literal, train_model
 
@@ -14,17 +14,17 @@ __all__ = [
     "CNPConfig",
     "EffectModel",
     "EffectNetwork",
-    "Ensemble",
     "FiLMConfig",
     "FiLMNetwork",
     "NetworkConfig",
     "OutOfRangeWarning",
     "TrainingConfig",
+    "TrainingDomain",
     "build",
     "calibration_rows",
     "condition_on_primitives",
     "coverage",
-    "fit_temperature",
+    "fit_sigma_scale",
     "load_checkpoint",
     "save_checkpoint",
     "train",

@@ -1,8 +1,9 @@
-"""Is σ right? Coverage of the central intervals, negative log-likelihood, and a temperature.
+"""Is σ right? Coverage of the central intervals, negative log-likelihood, and variance scaling.
 
-Of a calibrated Gaussian the truth lies in the central 50 % interval μ ± 0.674 σ half of the time.
-A temperature τ multiplies σ of an effect channel; the one of greatest likelihood is
-τ² = mean ((e - μ) / σ)² (Guo et al., On calibration of modern neural networks, ICML 2017).
+With a calibrated Gaussian half of the ground truth lies in the central 50 % interval μ ± 0.674 σ.
+Variance scaling multiplies σ of an effect channel by s; that of greatest likelihood is
+s² = mean ((e - μ) / σ)² (a temperature: Guo et al., On calibration of modern neural networks, ICML
+2017).
 """
 
 from __future__ import annotations
@@ -18,13 +19,13 @@ from torch import Tensor
 from affordlib.geometry import xy_columns
 from affordlib.interactions.dataset import InteractionTensors
 from affordlib.interactions.sampling import condition_on_recorded_action
-from affordlib.models.ensemble import Ensemble
-from affordlib.models.network import EffectNetwork, gaussian_nll
+from affordlib.models.base import gaussian_nll
+from affordlib.models.protocol import EffectModel
 from affordlib.types import check_within
 
 LEVELS = (0.5, 0.9)
 AFTER_CONTACT = (0.8, 0.9, 1.0)
-"""Phases at which every push has moved its object; before contact the effect is zero and told."""
+"""Phases at which every push has moved its object; before contact the effect is always zero."""
 
 
 def coverage(
@@ -42,39 +43,42 @@ def coverage(
 
 @torch.no_grad()
 def effects_at(
-    model: EffectNetwork | Ensemble, arrays: InteractionTensors, phases: Sequence[float]
+    model: EffectModel, tensors: InteractionTensors, phases: Sequence[float]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Truth, mean and σ of the effects, (N, T, C) each, given image and action."""
     phases = [check_within("phases", phase, 0.0, 1.0) for phase in phases]
     if not phases:
         raise ValueError("phases must hold at least one phase in [0, 1], got none")
-    at = (torch.tensor(phases) * (len(arrays.phase) - 1)).round().long()
-    t_target = arrays.phases(at)
-    told = model.predict(model.encode(arrays.image), condition_on_recorded_action(arrays), t_target)
-    return arrays.effect[:, at], told.effect_mean, told.effect_std
+    at = (torch.tensor(phases) * (len(tensors.phase) - 1)).round().long()
+    t_target = tensors.phases(at)
+    predicted = model.predict(
+        model.encode(tensors.image), condition_on_recorded_action(tensors), t_target
+    )
+    return tensors.effect[:, at], predicted.effect_mean, predicted.effect_std
 
 
-def fit_temperature(
-    model: EffectNetwork | Ensemble,
+def fit_sigma_scale(
+    model: EffectModel,
     validation: InteractionTensors,
     phases: Sequence[float] = AFTER_CONTACT,
 ) -> tuple[float, ...]:
-    """Set, and return, the temperatures (C_e,) under which validation data are likeliest.
+    """Set, and return, the sigma_scale (C_e,) of greatest likelihood of validation data.
 
-    x and y share one, as they share a scale: no direction of the table is special.
+    model: a network, or what else has a `sigma_scale`. x and y share one, as they share a scale: no
+    direction of the table is special.
     """
-    model.temperature = (1.0,) * len(model.effect_channels)
+    model.sigma_scale = (1.0,) * len(model.effect_channels)
     truth, mean, std = effects_at(model, validation, phases)
     squared = ((truth - mean) / std).square().mean(dim=(0, 1))
     plane = xy_columns(model.effect_channels)
     squared[plane] = squared[plane].mean()
-    model.temperature = tuple(squared.clamp_min(1e-6).sqrt().tolist())
-    return model.temperature
+    model.sigma_scale = tuple(squared.clamp_min(1e-6).sqrt().tolist())
+    return model.sigma_scale
 
 
 def calibration_rows(
-    model: EffectNetwork | Ensemble,
-    arrays: InteractionTensors,
+    model: EffectModel,
+    tensors: InteractionTensors,
     /,
     phases: Sequence[float] = AFTER_CONTACT,
     **columns: Any,
@@ -83,7 +87,7 @@ def calibration_rows(
 
     The likelihood is a density of metres or radians; it compares models, not channels.
     """
-    truth, mean, std = effects_at(model, arrays, phases)
+    truth, mean, std = effects_at(model, tensors, phases)
     rows = []
     for i, phase in enumerate(phases):
         for k, channel in enumerate(model.effect_channels):

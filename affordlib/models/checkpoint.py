@@ -20,31 +20,34 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
 from affordlib.interactions.dataset import Scaler
-from affordlib.models.anchored import AnchoredConfig, AnchoredNetwork
+from affordlib.models.base import EffectNetwork, NetworkConfig
 from affordlib.models.cnp import AffordanceCNP, CNPConfig
+from affordlib.models.domain import TrainingDomain
 from affordlib.models.film import FiLMConfig, FiLMNetwork
+from affordlib.models.last_pose import LastPoseCNP, LastPoseConfig
 from affordlib.models.lstm import LSTMConfig, LSTMNetwork
-from affordlib.models.network import EffectNetwork, NetworkConfig
 from affordlib.paths import repo_root
 from affordlib.results import write_atomically
 
-FORMAT = "affordlib checkpoint 2"
+FORMAT = "affordlib checkpoint 3"
 SUFFIX = ".safetensors"
 _REMEDY = "give another checkpoint, or train it again with notebook 03"
 NETWORKS: dict[str, tuple[type[EffectNetwork], type[NetworkConfig]]] = {
     "cnp": (AffordanceCNP, CNPConfig),
     "film": (FiLMNetwork, FiLMConfig),
-    "anchored": (AnchoredNetwork, AnchoredConfig),
+    "cnp_last_pose": (LastPoseCNP, LastPoseConfig),
     "lstm": (LSTMNetwork, LSTMConfig),
 }
 """By the name that checkpoints have for them; other packages may add theirs."""
 
 
-def build(config: NetworkConfig, scaler: Scaler) -> EffectNetwork:
+def build(
+    config: NetworkConfig, scaler: Scaler, domain: TrainingDomain | None = None
+) -> EffectNetwork:
     """An untrained network of the architecture that the configuration belongs to."""
     for network, config_class in NETWORKS.values():
         if type(config) is config_class:
-            return network(config, scaler)
+            return network(config, scaler, domain)
     known = [config_class.__name__ for _, config_class in NETWORKS.values()]
     raise TypeError(f"config must be one of {known}, got {config!r}")
 
@@ -65,8 +68,9 @@ def save_checkpoint(model: EffectNetwork, path: str | Path, about: dict[str, Any
         "format": FORMAT,
         "model": kind,
         "config": asdict(model.config)
-        | {"sigma_floor": model.sigma_floor, "temperature": model.temperature},
-        "normaliser": asdict(model.scaler),
+        | {"sigma_floor": model.sigma_floor, "sigma_scale": model.sigma_scale},
+        "scaler": asdict(model.scaler),
+        "domain": asdict(model.domain),
         "about": about,
     }
     return write_weights(path, model.state_dict(), description)
@@ -89,10 +93,10 @@ def resolve_checkpoint(name_or_path: str | Path) -> Path:
 
 
 def checkpoint_sha256(name_or_path: str | Path) -> str:
-    """Hash of all that decides a checkpoint's answers: weights, configuration and scales."""
+    """Hash of all that decides a checkpoint's answers: weights, configuration, scales, domain."""
     tensors, description = read_weights(resolve_checkpoint(name_or_path), _REMEDY)
-    decisive = json.dumps({key: description[key] for key in ("model", "config", "normaliser")})
-    return hashlib.sha256(save(tensors) + decisive.encode()).hexdigest()
+    decisive = {key: description[key] for key in ("model", "config", "scaler", "domain")}
+    return _sha256(tensors, json.dumps(decisive))
 
 
 def _with_tuples(fields: dict[str, Any]) -> dict[str, Any]:
@@ -112,7 +116,8 @@ def load_checkpoint(name_or_path: str | Path) -> tuple[EffectNetwork, dict[str, 
         kind, config_class = NETWORKS[description["model"]]
         model = kind(
             config_class(**_with_tuples(description["config"])),
-            Scaler(**_with_tuples(description["normaliser"])),
+            Scaler(**_with_tuples(description["scaler"])),
+            TrainingDomain(**_with_tuples(description["domain"])),
         )
         about, own = description["about"], model.state_dict()
         if other := [k for k in own if k not in tensors or tensors[k].dtype != own[k].dtype]:
@@ -184,12 +189,12 @@ def save_state(path: str | Path, state: dict[str, Any]) -> None:
     write_atomically(Path(path), buffer.getvalue(), mark=b"/data.pkl")
 
 
-def load_state(path: str | Path) -> dict[str, Any]:
+def load_state(path: str | Path, device: torch.device | str = "cpu") -> dict[str, Any]:
     """The state that `save_state` wrote; raises ValueError when the file is damaged or foreign."""
     try:
         with zipfile.ZipFile(path) as archive:
             damaged = archive.testzip()
-        state = None if damaged else torch.load(path, weights_only=True, map_location="cpu")
+        state = None if damaged else torch.load(path, weights_only=True, map_location=device)
     except (
         zipfile.BadZipFile,
         pickle.UnpicklingError,

@@ -22,13 +22,8 @@ from torch import Tensor, nn
 
 from affordlib import checked
 from affordlib.interactions.dataset import Scaler
-from affordlib.models.network import (
-    EffectNetwork,
-    NetworkConfig,
-    he_initialise,
-    mean_code,
-    with_time,
-)
+from affordlib.models.base import EffectNetwork, NetworkConfig, he_initialise, with_time
+from affordlib.models.domain import TrainingDomain
 from affordlib.types import Observations
 
 ENCODER_WIDTHS = (32, 64, 64, 128, 128, 256, 128)
@@ -42,10 +37,9 @@ FOLD_FROM_TARGETS = 100
 @checked
 @dataclass(frozen=True)
 class CNPConfig(NetworkConfig):
-    """How the paper's network reads the two places where the paper is unclear.
+    """leaky_output: a LeakyReLU on the decoders' last layer, as the appendix literally has it.
 
-    leaky_output puts a LeakyReLU on the decoders' last layer, as the appendix literally has it; it
-    keeps means from becoming negative easily.
+    It keeps means from becoming negative easily.
     """
 
     leaky_output: bool = False
@@ -72,8 +66,10 @@ def image_encoder() -> nn.Sequential:
 class AffordanceCNP(EffectNetwork):
     """Relates object image, action and effect; satisfies `EffectModel`."""
 
-    def __init__(self, config: CNPConfig, scaler: Scaler) -> None:
-        super().__init__(config, scaler)
+    def __init__(
+        self, config: CNPConfig, scaler: Scaler, domain: TrainingDomain | None = None
+    ) -> None:
+        super().__init__(config, scaler, domain)
         n_a, n_e = len(config.action_channels), len(config.effect_channels)
         self.image_encoder = image_encoder()
         self.action_encoder = _dense((n_a + 1, *ENCODER_WIDTHS), activate_last=True)
@@ -86,7 +82,7 @@ class AffordanceCNP(EffectNetwork):
         self.apply(he_initialise)
 
     def train(self, mode: bool = True) -> AffordanceCNP:
-        """As of torch; folded weights are forgotten, since fused optimisers leave no trace."""
+        """As of torch; folded weights are dropped: fused optimisers do not raise their version."""
         self._folds.clear()
         return super().train(mode)
 
@@ -94,16 +90,6 @@ class AffordanceCNP(EffectNetwork):
         """f(γ_o): features (B, 16) of standardised depth and mask (B, 2, 48, 48)."""
         channels_last = scaled_image.contiguous(memory_format=torch.channels_last)  # twice as fast
         return self.image_encoder(channels_last)
-
-    def represent(self, observations: Observations) -> Float[Tensor, "b 128"]:
-        """r: (B, 128), equations (2) and (3), the means taken over what is observed."""
-        o = observations
-        actions = with_time(o.action / self.action_scale, o.action_t)
-        effects = with_time(o.effect / self.effect_scale, o.effect_t)
-        r_a = mean_code(self.action_encoder, actions, o.action_mask)
-        r_e = mean_code(self.effect_encoder, effects, o.effect_mask)
-        w_1 = o.weight[:, None]
-        return w_1 * r_a + (1 - w_1) * r_e
 
     def decode(
         self,
@@ -114,8 +100,8 @@ class AffordanceCNP(EffectNetwork):
         """(μ_a, σ_a, μ_e, σ_e), each (B, T, C) and standardised, of r (B, 128) at t_target (B, T).
 
         The merge layer has no activation, so it folds exactly into each decoder's first layer, and
-        of the sum only the column of t differs between the targets of one query. Folding pays from
-        some tens of targets on.
+        of the sum only the column of t differs between the targets of one query. Folding is faster
+        for many targets.
         """
         known = torch.cat([r, features.expand(len(r), -1)], dim=1)
         folds = t_target.numel() >= FOLD_FROM_TARGETS
@@ -136,14 +122,13 @@ class AffordanceCNP(EffectNetwork):
     def _folded(self, first: nn.Linear) -> tuple[Tensor, Tensor]:
         """Weight and bias of the merge layer and a decoder's first layer in one.
 
-        Of a network that is not in training, and where no gradient is asked for, they are kept
-        until one of the weights changes.
+        Without training and gradients they are kept until one of the weights changes.
         """
         merge = self.merge
         if self.training or torch.is_grad_enabled() or first.weight.is_inference():
             return first.weight @ merge.weight, first.weight @ merge.bias + first.bias
-        told_by = (*first.parameters(), *merge.parameters())
-        stamp = tuple((w.data_ptr(), w._version) for w in told_by)
+        weights = (*first.parameters(), *merge.parameters())
+        stamp = tuple((w.data_ptr(), w._version) for w in weights)
         if self._folds.get(first, (None,))[0] != stamp:
             weight = first.weight @ merge.weight
             self._folds[first] = stamp, weight, first.weight @ merge.bias + first.bias

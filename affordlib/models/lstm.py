@@ -1,11 +1,11 @@
-"""Recurrent networks: what happens next, step by step, each prediction the next step's input.
+"""Recurrent networks: an autoregressive rollout, each prediction the input of the next step.
 
-    x_k = {d_k, d_k - d_{k-1}, t_k, observed?, f(γ_o), h_a}      d = e - m, m the mean course
+    x_k = {d_k, d_k - d_{k-1}, t_k, observed?, f(γ_o), h_a}      d = e - m, m the mean trajectory
     (h_k+1, c_k+1) = LSTM(x_k, h_k, c_k)
-    d_k+1 = d_k + (d_k - d_{k-1}) + g(h_k+1)                     observed where it is, else foreseen
+    d_k+1 = d_k + (d_k - d_{k-1}) + g(h_k+1)                 observed where it is, else predicted
 
-`LSTMNetwork` is the well-tuned one, of about a million parameters: it predicts the change of the
-increment, in standardised units, and is trained through its own rollouts. The one of the older
+`LSTMNetwork` is the tuned one, of about a million parameters: it predicts the change of the
+increment, in standardised units, and is trained through its own rollouts. The one of the earlier
 study (Seker, Tekden and Ugur, Deep effect trajectory prediction in robot manipulation, Robotics and
 Autonomous Systems, 2019) is among the experiments.
 """
@@ -23,30 +23,24 @@ from affordlib import checked
 from affordlib.geometry import rotate_channels
 from affordlib.interactions.dataset import InteractionTensors, Scaler
 from affordlib.interactions.sampling import condition_on_recorded_action
-from affordlib.models.anchored import MeanCourse
-from affordlib.models.film import CircularHarmonics, dense, waves
-from affordlib.models.frame import heading, inverse
-from affordlib.models.network import (
-    EffectNetwork,
-    NetworkConfig,
-    he_initialise,
-    masked_mean,
-    with_time,
-)
+from affordlib.models.base import masked_mean, with_time
+from affordlib.models.domain import TrainingDomain
+from affordlib.models.harmonics import HarmonicsConfig, HarmonicsNetwork, dense, waves
+from affordlib.models.last_pose import MeanTrajectory
+from affordlib.models.push_frame import inverse, push_direction
 from affordlib.types import Observations
+
+_CERTAIN = -6.0
+"""Raw σ of what is observed: a softplus of nearly zero."""
 
 
 @checked
 @dataclass(frozen=True)
-class LSTMConfig(NetworkConfig):
-    """Sizes of the network; steps: into how many it divides the phase. See `FiLMConfig`."""
+class LSTMConfig(HarmonicsConfig):
+    """Width of the network; steps: into how many it divides the phase."""
 
     steps: int = 25
     width: int = 192
-    image_features: int = 64
-    rings: int = 7
-    orders: int = 8
-    waves: int = 4
 
 
 @dataclass(frozen=True)
@@ -58,36 +52,35 @@ class Known:
     first: Tensor
 
 
-def on_grid(off: Tensor, t: Tensor, seen: Tensor, steps: int) -> Known:
-    """Observations (B, m, C) at phases t (B, m) put on a grid of steps + 1 phases.
+def on_grid(effect: Tensor, t: Tensor, seen: Tensor, steps: int) -> Known:
+    """Observed effects (B, m, C) at phases t (B, m) put on a grid of steps + 1 phases.
 
     Where nothing is observed, the effect at t = 0 is known to be zero.
     """
-    b, n = len(off), steps + 1
+    b, n, c = len(effect), steps + 1, effect.shape[-1]
     # What is not observed goes to a column of its own, which is cut off.
     at = torch.where(seen, (t * steps).round().long(), n)
-    d = off.new_zeros(b, n + 1, off.shape[-1])
-    d = d.scatter(1, at[..., None].expand(-1, -1, off.shape[-1]), off)[:, :n]
-    where = torch.zeros(b, n + 1, dtype=torch.bool, device=off.device)
+    d = effect.new_zeros(b, n + 1, c)
+    d = d.scatter(1, at[..., None].expand(-1, -1, c), effect)[:, :n]
+    where = torch.zeros(b, n + 1, dtype=torch.bool, device=effect.device)
     where = where.scatter(1, at, torch.ones_like(seen))[:, :n]
     where[:, 0] |= ~where.any(dim=1)
     return Known(d, where, where.to(torch.uint8).argmax(dim=1))
 
 
-class LSTMNetwork(EffectNetwork):
-    """Rolls a course out step by step from what is observed; satisfies `EffectModel`.
+class LSTMNetwork(HarmonicsNetwork):
+    """Rolls a trajectory out step by step from what is observed; satisfies `EffectModel`.
 
-    Between two steps it is linear, so that any phase can be asked for, with gradients.
+    Between two steps it is linear, so that any phase can be queried, with gradients.
     """
 
-    def __init__(self, config: LSTMConfig, scaler: Scaler) -> None:
-        super().__init__(config, scaler)
+    def __init__(
+        self, config: LSTMConfig, scaler: Scaler, domain: TrainingDomain | None = None
+    ) -> None:
+        super().__init__(config, scaler, domain)
         c, w = config, config.width
         n_a, n_e = len(c.action_channels), len(c.effect_channels)
-        self.course = MeanCourse(c.steps, n_e)
-        self.harmonics, n = CircularHarmonics(c.rings, c.orders), c.image_features
-        self.image_encoder = nn.Sequential(*dense(self.harmonics.n_features, 4 * n, 2 * n, n))
-        self.image_encoder.apply(he_initialise)
+        self.mean_trajectory = MeanTrajectory(c.steps, n_e)
         self.action_encoder = nn.Sequential(*dense(n_a + 1, w, w, c.image_features))
         static = 2 * c.image_features
         self.begin = nn.Linear(static, 2 * w)
@@ -95,26 +88,8 @@ class LSTMNetwork(EffectNetwork):
         self.last = nn.Sequential(nn.LayerNorm(w), *dense(w, w, 2 * n_e))
         nn.init.zeros_(self.last[-1].weight)
         nn.init.zeros_(self.last[-1].bias)
-        # The commanded action is told, not foreseen; this completes it at other phases.
+        # The commanded action is given, not predicted; this completes it at other phases.
         self.action_decoder = nn.Sequential(*dense(static + 2 * c.waves + 1, w, w, 2 * n_a))
-
-    def fit_course(self, effect: Float[Tensor, "n s c"]) -> None:
-        """Learn m(t) from training effects [m, rad]; before training."""
-        self.course.fit(effect, self.effect_scale)
-
-    def features(self, scaled_image: Float[Tensor, "b 2 48 48"]) -> Float[Tensor, "b f"]:
-        """f(γ_o): (B, F) of standardised depth and mask."""
-        return self.image_encoder(self.harmonics(scaled_image))
-
-    def look(self, image: Float[Tensor, "b 2 48 48"]) -> Float[Tensor, "b f"]:
-        """The circular harmonics (B, F) of images."""
-        return self.harmonics(self._scaled(image))
-
-    def turned_features(
-        self, seen: Float[Tensor, "#b f"], heading: Float[Tensor, "b 2"]
-    ) -> Float[Tensor, "b f"]:
-        """f(γ_o) of turned images, given the harmonics of the images as they lie."""
-        return self.image_encoder(self.harmonics.turned(seen, heading))
 
     def outputs(
         self, features: Tensor, observations: Observations, t_target: Tensor
@@ -125,22 +100,22 @@ class LSTMNetwork(EffectNetwork):
             self.action_encoder(with_time(o.action / self.action_scale, o.action_t)), o.action_mask
         )
         static = torch.cat([features.expand(b, -1), code], dim=1)
-        off = o.effect / self.effect_scale - self.course(o.effect_t)
-        known = on_grid(off, o.effect_t, o.effect_mask, self.config.steps)
+        d = o.effect / self.effect_scale - self.mean_trajectory(o.effect_t)
+        known = on_grid(d, o.effect_t, o.effect_mask, self.config.steps)
         at = (t_target * self.config.steps - known.first[:, None]).clamp_min(0)
         path, raw = self.roll(known, static, max(1, int(at.detach().max().ceil())))
-        mu_e = self.course(t_target) + _between(path, at)
+        mu_e = self.mean_trajectory(t_target) + _between(path, at)
         sigma_e = self.sigma_floor + F.softplus(_between(raw, at))
         times = waves(t_target, self.config.waves)
-        told = torch.cat([static[:, None].expand(-1, times.shape[1], -1), times], dim=-1)
-        mu_a, raw_a = self.action_decoder(told).chunk(2, dim=-1)
+        given = torch.cat([static[:, None].expand(-1, times.shape[1], -1), times], dim=-1)
+        mu_a, raw_a = self.action_decoder(given).chunk(2, dim=-1)
         return mu_a, self.sigma_floor + F.softplus(raw_a), mu_e, sigma_e
 
     def roll(self, known: Known, static: Tensor, n: int) -> tuple[Tensor, Tensor]:
-        """Courses d and raw σ (B, n + 1, C) of n steps from the first observed one on.
+        """d and raw σ (B, n + 1, C) of n steps from the first observed one on.
 
-        The gates' share of what stays is computed once; a step that all have observed is not
-        foreseen.
+        What the gates get of the static inputs is computed once; a step that all have observed is
+        not predicted.
         """
         rows, last = torch.arange(len(static), device=static.device), self.config.steps
         h, c = self.begin(static).tanh().chunk(2, dim=-1)
@@ -150,31 +125,28 @@ class LSTMNetwork(EffectNetwork):
         weight = torch.cat([w_in[:, :moving], w_h], dim=1).T
         phases = torch.linspace(0, 1, last + 1, device=static.device)[None]
         times = waves(phases, self.config.waves)[0]
-        foreseen = previous = known.d[rows, known.first]
-        certain = torch.full_like(foreseen, _CERTAIN)
-        path, sigmas = [foreseen], [certain]
+        predicted = previous = known.d[rows, known.first]
+        certain = torch.full_like(predicted, _CERTAIN)
+        path, sigmas = [predicted], [certain]
         for j in range(n):
             k = (known.first + j).clamp_max(last)
-            told = known.where[rows, k][:, None]
-            d = torch.where(told, known.d[rows, k], foreseen)
+            observed = known.where[rows, k][:, None]
+            d = torch.where(observed, known.d[rows, k], predicted)
             change = d - previous
-            x = torch.cat([d, change, times[k], told.to(d.dtype), h], dim=1)
+            x = torch.cat([d, change, times[k], observed.to(d.dtype), h], dim=1)
             i, f, g, o = torch.addmm(fixed, x, weight).chunk(4, dim=1)
             c = f.sigmoid() * c + i.sigmoid() * g.tanh()
             h = o.sigmoid() * c.tanh()
             after = (k + 1).clamp_max(last)
             if bool(known.where[rows, after].all()):
-                foreseen, raw = known.d[rows, after], certain
+                predicted, raw = known.d[rows, after], certain
             else:
                 bend, raw = self.last(h).chunk(2, dim=-1)
-                foreseen = d + change + bend
+                predicted = d + change + bend
             previous = d
-            path.append(foreseen)
+            path.append(predicted)
             sigmas.append(raw)
         return torch.stack(path, dim=1), torch.stack(sigmas, dim=1)
-
-
-_CERTAIN = -6.0
 
 
 def _between(values: Float[Tensor, "b n c"], at: Float[Tensor, "b t"]) -> Float[Tensor, "b t c"]:
@@ -188,12 +160,12 @@ def _between(values: Float[Tensor, "b n c"], at: Float[Tensor, "b t"]) -> Float[
     return (1 - share) * pick(below) + share * pick(below + 1)
 
 
-def courses(model: LSTMNetwork, arrays: InteractionTensors) -> Tensor:
+def effects_at_steps(model: LSTMNetwork, tensors: InteractionTensors) -> Tensor:
     """Effects (2N, steps + 1, C) and their mirror images, in the frame and at the steps of it."""
-    both = arrays.joined(arrays.rotated_and_mirrored(0, mirror=True))
+    both = tensors.joined(tensors.rotated_and_mirrored(0, mirror=True))
     at = torch.linspace(0, len(both.phase) - 1, model.config.steps + 1).round().long()
     if model.config.frame == "table":
         return both.effect[:, at]
     channels = both.action_channels, both.effect_channels
-    back = inverse(heading(condition_on_recorded_action(both), *channels))[:, None]
+    back = inverse(push_direction(condition_on_recorded_action(both), *channels))[:, None]
     return rotate_channels(both.effect[:, at], channels[1], back, absolute_yaw=False)

@@ -43,6 +43,6 @@ def condition_on_primitives(model: EffectModel, actions: Sequence[Primitive]) ->
     return Observations.of(model, action=(t, torch.as_tensor(action, dtype=torch.float32)))
 
 
-def observe_final_effect(model: EffectModel, effect: torch.Tensor) -> Observations:
+def condition_on_final_effect(model: EffectModel, effect: torch.Tensor) -> Observations:
     """The effect (B, C_e) at t = 1 and no action (w₁ = 0), differentiable in the effect."""
     return Observations.of(model, effect=(effect.new_ones(len(effect), 1), effect[:, None]))

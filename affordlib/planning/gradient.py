@@ -20,8 +20,12 @@ import numpy as np
 import torch
 
 from affordlib.geometry import xy_columns
-from affordlib.models.network import OutOfRangeWarning
-from affordlib.models.protocol import EffectModel, condition_on_primitives, observe_final_effect
+from affordlib.models.domain import OutOfRangeWarning
+from affordlib.models.protocol import (
+    EffectModel,
+    condition_on_final_effect,
+    condition_on_primitives,
+)
 from affordlib.planning.effect_map import EffectMap
 from affordlib.planning.problem import PlanningProblem
 from affordlib.planning.rollout import PATH_SAMPLES
@@ -88,7 +92,7 @@ def _predict(
     model: EffectModel, features: torch.Tensor, effect: torch.Tensor, t: torch.Tensor
 ) -> Prediction:
     with warnings.catch_warnings(action="ignore", category=OutOfRangeWarning):
-        return model.predict(features, observe_final_effect(model, effect), t)
+        return model.predict(features, condition_on_final_effect(model, effect), t)
 
 
 @torch.no_grad()

@@ -22,8 +22,8 @@ import numpy as np
 import torch
 
 from affordlib.geometry import wrap_angle
-from affordlib.models.frame import turn_image
 from affordlib.models.protocol import EffectModel, condition_on_primitives
+from affordlib.models.push_frame import rotate_image
 from affordlib.perception import adapt_to_object
 from affordlib.planning.effect_map import checked_image
 from affordlib.primitives import Grasp, Rotate
@@ -85,7 +85,7 @@ def predict_trajectories(
             f"give the model of {primitive.name}"
         )
     turn = torch.tensor([[math.cos(yaw), -math.sin(yaw)] for yaw in yaws])
-    features = model.encode(turn_image(checked_image(image), turn))
+    features = model.encode(rotate_image(checked_image(image), turn))
     t = torch.linspace(0, 1, N_PHASES).expand(len(turn), -1)
     action = replace(adapt_to_object(primitive, image), grip_yaw=0.0)
     prediction = model.predict(features, condition_on_primitives(model, [action] * len(turn)), t)

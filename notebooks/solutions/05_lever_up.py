@@ -8,7 +8,7 @@ from affordlib.interactions import open_interactions
 from affordlib.interactions.lever_up import N_OBSERVED, N_PREDICTED, lever_up_tensors, n_windows
 from affordlib.interactions.sampling import condition_on_poses
 from affordlib.models import load_checkpoint
-from affordlib.models.lever import errors_m, window_errors_m
+from affordlib.models.lever_up import errors_m, window_errors_m
 from exercises import check
 from experiments.lever_cross_validation import lever_split
 

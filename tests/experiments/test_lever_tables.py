@@ -9,11 +9,11 @@ import torch
 from affordlib.interactions import open_interactions
 from affordlib.interactions.lever_up import lever_up_tensors
 from affordlib.models import load_checkpoint
-from affordlib.models.lever import (
+from affordlib.models.lever_up import (
     LEVER_MODELS,
     PROTOCOLS,
     TRAINING,
-    beginning_errors_m,
+    from_start_errors_m,
     window_errors_m,
 )
 from affordlib.paths import repo_root
@@ -168,6 +168,6 @@ def test_shipped_checkpoints_predict_what_they_have_not_seen(name):
     if about["trained_for"] != "first_step":
         assert 100 * window_errors_m(model, few).mean() < 0.3
     if about["trained_for"] != "window":
-        assert 100 * beginning_errors_m(model, few).mean() < 0.4
+        assert 100 * from_start_errors_m(model, few).mean() < 0.4
     size = (repo_root() / "data" / "checkpoints" / f"{name}.safetensors").stat().st_size
     assert size < 5e6

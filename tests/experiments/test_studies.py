@@ -11,7 +11,7 @@ from scipy import integrate, stats
 
 from affordlib.interactions import InteractionTensors, open_interactions, split_interactions
 from affordlib.interactions.sampling import condition_on_recorded_action, sample_mixed
-from affordlib.models.frame import heading
+from affordlib.models.push_frame import push_direction
 from affordlib.paths import repo_root
 from affordlib.results import read_results
 from affordlib.types import Prediction
@@ -96,8 +96,8 @@ def test_draws_leave_out_one_thing_each(pushes):
 def test_changes_of_an_ablation_add_up(monkeypatch):
     made = []
 
-    def remember(model, training, validation, config, progress, draw):
-        made.append((model, config, draw))
+    def remember(model, training, validation, config, sampler):
+        made.append((model, config, sampler))
 
     monkeypatch.setattr(ablation, "train", remember)
     ablation.ablated(list(ablation.LADDER.values()), 10)
@@ -132,7 +132,7 @@ def test_the_commanded_action_tells_the_primitive(of_all):
         beside = (start[:, :2].norm(dim=1) > 0.1, end[:, :2].norm(dim=1) > 0.01)
         told[name] = torch.stack([*beside, end[:, 2] > 0.1, end[:, 4] < 0.5], dim=1).int()
         assert (told[name] == told[name][0]).all()
-        towards = heading(
+        towards = push_direction(
             condition_on_recorded_action(arrays), arrays.action_channels, arrays.effect_channels
         )
         of_table = torch.tensor([1.0, 0.0]).expand(len(arrays), -1)

@@ -17,7 +17,7 @@ from affordlib.interactions.import_log import (
     write_trajectories,
 )
 from affordlib.interactions.lever_up import POSE_CHANNELS
-from affordlib.models.lever import fit_lever_model, window_errors_m
+from affordlib.models.lever_up import fit_lever_model, window_errors_m
 from affordlib.models.training import final_errors_m
 
 CHANNELS = ("x", "y"), ("x", "y", "yaw")
@@ -144,7 +144,7 @@ def test_the_older_layout_is_learned_from(tmp_path, short, name, kind, steps):
     write_trajectories(tmp_path, poses, gray)
     tensors = read_trajectories(tmp_path, view="wide")
     assert tensors.image.shape == (8, 2, 48, 48)
-    model, history = fit_lever_model(short(name), tensors, tensors, kind, progress=False)
+    model, history = fit_lever_model(short(name), tensors, tensors, kind)
     assert len(history) == 2
     assert window_errors_m(model, tensors).shape == (8, steps - 19, 5)
 

@@ -1,13 +1,13 @@
-"""Lever-ups: what models are asked in Section 4.1 and Table 1, and how they are trained for it.
+"""Lever-ups: what is predicted in Section 4.1 and Table 1, and how models are trained for it.
 
-    window      15 poses observed, anywhere in the trajectory; the next 1 to 5 steps foreseen
-    first_step  the first pose observed; all later steps foreseen
+    window      15 poses observed, anywhere in the trajectory; the next 1 to 5 steps predicted
+    first_step  the first pose observed; all later steps predicted
     image_only  no pose observed
 
-All see the image and the commanded action at t = 0 and t = 1. A pose is the change since the start,
-so the first one is zero for all and first_step tells a model no more than image_only does; a
+All models observe the image and the commanded action at t = 0 and t = 1. A pose is the change since
+the start, so the first one is zero for all, and first_step contains no more than image_only does; a
 network trained for the one is trained for the other. A conditional network is trained once, for
-all protocols together; a recurrent one for each by itself.
+all protocols together; a recurrent one for each alone.
 """
 
 from __future__ import annotations
@@ -37,17 +37,16 @@ from affordlib.interactions.sampling import (
     sample_from_start,
     sample_windows,
 )
-from affordlib.models.anchored import AnchoredConfig
+from affordlib.models.base import EffectNetwork, NetworkConfig
 from affordlib.models.checkpoint import build
 from affordlib.models.cnp import CNPConfig
+from affordlib.models.domain import TrainingDomain
+from affordlib.models.last_pose import LastPoseConfig
 from affordlib.models.lstm import LSTMConfig
-from affordlib.models.network import EffectNetwork, NetworkConfig
 from affordlib.models.training import TrainingConfig, TrainingRecord, train
 from affordlib.types import Prediction
 
 PROTOCOLS = ("window", "first_step", "image_only")
-TRAINED_FOR = ("all", "window", "first_step")
-"""`first_step` stands for `image_only` as well, see above."""
 
 _CHANNELS = {"action_channels": LEVER_ACTION_CHANNELS, "effect_channels": POSE_CHANNELS}
 TRAINING = TrainingConfig(
@@ -68,82 +67,86 @@ class LeverModel:
 _IMAGE = {"rings": 10, "orders": 12}
 LEVER_MODELS: dict[str, LeverModel] = {
     "cnp_last_pose": LeverModel(
-        AnchoredConfig(**_CHANNELS, **_IMAGE), replace(TRAINING, learning_rate=4e-3)
+        LastPoseConfig(**_CHANNELS, **_IMAGE), replace(TRAINING, learning_rate=4e-3)
     ),
     "cnp": LeverModel(CNPConfig(**_CHANNELS), view="wide"),
     "lstm_tuned": LeverModel(
         LSTMConfig(**_CHANNELS, **_IMAGE), replace(TRAINING, learning_rate=2e-3)
     ),
 }
-"""Ours, the paper's (its image shrunk to the 48×48 of the appendix), and the recurrent one.
+"""Ours, the paper's (its image scaled to the 48×48 of the appendix), and the recurrent one.
 
 All get as many steps, although one of the paper's network costs three times as much. The rates of
 the first and the last are chosen by validation error (`experiments/lever_tuning.py`)."""
 
 
 @torch.no_grad()
-def foresee(
+def predict_steps(
     model: EffectNetwork,
-    arrays: InteractionTensors,
+    tensors: InteractionTensors,
     protocol: str,
     start: int = 0,
     features: Tensor | None = None,
 ) -> tuple[Prediction, Float[Tensor, "n t c"]]:
-    """Prediction and truth of the steps that a protocol asks for; start: of the window.
+    """Prediction and ground truth of the steps that a protocol queries; start: of the window.
 
     features: of the images, where they are encoded already.
     """
     if protocol not in PROTOCOLS:
         raise ValueError(f"protocol must be one of {PROTOCOLS}, got {protocol!r}")
-    n, last = len(arrays), len(arrays.phase)
-    n_seen = {"window": N_OBSERVED, "first_step": 1, "image_only": 0}[protocol]
+    n, last = len(tensors), len(tensors.phase)
+    n_poses = {"window": N_OBSERVED, "first_step": 1, "image_only": 0}[protocol]
     first = start + N_OBSERVED if protocol == "window" else 1
     steps = torch.arange(first, first + N_PREDICTED if protocol == "window" else last)
-    seen = condition_on_poses(arrays, torch.full((n,), start), n_seen)
-    t_target = arrays.phases(steps)
-    features = model.encode(arrays.image) if features is None else features
-    told = model.predict(features, seen, t_target)
-    return told, arrays.effect[:, steps]
+    observed = condition_on_poses(tensors, torch.full((n,), start), n_poses)
+    features = model.encode(tensors.image) if features is None else features
+    return model.predict(features, observed, tensors.phases(steps)), tensors.effect[:, steps]
 
 
-def errors_m(told: Prediction, truth: Tensor) -> Float[Tensor, "n t"]:
+def errors_m(prediction: Prediction, truth: Tensor) -> Float[Tensor, "n t"]:
     """Distances [m] between predicted and true positions."""
-    return (told.effect_mean - truth)[..., :3].norm(dim=-1)
+    return (prediction.effect_mean - truth)[..., :3].norm(dim=-1)
 
 
 @torch.no_grad()
-def window_errors_m(model: EffectNetwork, arrays: InteractionTensors) -> Float[Tensor, "n w t"]:
+def window_errors_m(model: EffectNetwork, tensors: InteractionTensors) -> Float[Tensor, "n w t"]:
     """Errors [m] of all windows of all trajectories, 1 to 5 steps ahead."""
-    features = model.encode(arrays.image)
-    found = [foresee(model, arrays, "window", s, features) for s in range(n_windows(arrays))]
-    return torch.stack([errors_m(*told) for told in found], dim=1)
+    features = model.encode(tensors.image)
+    starts = range(n_windows(tensors))
+    found = [predict_steps(model, tensors, "window", start, features) for start in starts]
+    return torch.stack([errors_m(*one) for one in found], dim=1)
 
 
-def beginning_errors_m(
-    model: EffectNetwork, arrays: InteractionTensors, protocol: str = "image_only"
+def from_start_errors_m(
+    model: EffectNetwork, tensors: InteractionTensors, protocol: str = "image_only"
 ) -> Float[Tensor, "n t"]:
     """Errors [m] at all steps after the first."""
-    return errors_m(*foresee(model, arrays, protocol))
+    return errors_m(*predict_steps(model, tensors, protocol))
 
 
-def _all_errors_m(model: EffectNetwork, arrays: InteractionTensors) -> Tensor:
-    """Window and beginning weighed about equally: beginnings err about three times as far."""
-    window, beginning = window_errors_m(model, arrays), beginning_errors_m(model, arrays)
-    return window.mean(dim=(1, 2)) + beginning.mean(dim=1) / 3
-
-
-def _draw_all(
-    arrays: InteractionTensors,
+def _sample_all(
+    tensors: InteractionTensors,
     n_targets: int,
     obs_max: int,
     generator: torch.Generator,
 ) -> Batch:
-    draw = (sample_windows, sample_from_start)[int(torch.randint(0, 2, (1,), generator=generator))]
-    return draw(arrays, n_targets, obs_max, generator)
+    kind = int(torch.randint(0, 2, (1,), generator=generator))
+    sampler = (sample_windows, sample_from_start)[kind]
+    return sampler(tensors, n_targets, obs_max, generator)
 
 
-_DRAWS = {"all": _draw_all, "window": sample_windows, "first_step": sample_from_start}
-_SCORES = {"all": _all_errors_m, "window": window_errors_m, "first_step": beginning_errors_m}
+def _all_errors_m(model: EffectNetwork, tensors: InteractionTensors) -> Tensor:
+    """About equal weights: errors from the start are three times as large."""
+    window, start = window_errors_m(model, tensors), from_start_errors_m(model, tensors)
+    return window.mean(dim=(1, 2)) + start.mean(dim=1) / 3
+
+
+TRAINED_FOR = {
+    "all": (_sample_all, _all_errors_m),
+    "window": (sample_windows, window_errors_m),
+    "first_step": (sample_from_start, from_start_errors_m),
+}
+"""Sampler and score of each training; `first_step` stands for `image_only` as well, see above."""
 
 
 def lever_training(lever: LeverModel, data: xr.Dataset, split: Split) -> InteractionTensors:
@@ -156,18 +159,15 @@ def train_lever_model(
     data: xr.Dataset,
     split: Split,
     trained_for: str = "all",
-    progress: bool = True,
-    checkpoint: Path | None = None,
+    resume_checkpoint: Path | None = None,
 ) -> tuple[EffectNetwork, list[TrainingRecord]]:
     """A network trained on a split's training part and its mirror image.
 
     Its validation part chooses the weights, by the errors of what it is trained for.
     """
-    if trained_for not in TRAINED_FOR:
-        raise ValueError(f"trained_for must be one of {TRAINED_FOR}, got {trained_for!r}")
     training = lever_training(lever, data, split)
     validation = lever_up_tensors(data, split.validation, lever.view)
-    return fit_lever_model(lever, training, validation, trained_for, progress, checkpoint)
+    return fit_lever_model(lever, training, validation, trained_for, resume_checkpoint)
 
 
 def fit_lever_model(
@@ -175,23 +175,22 @@ def fit_lever_model(
     training: InteractionTensors,
     validation: InteractionTensors,
     trained_for: str = "all",
-    progress: bool = True,
-    checkpoint: Path | None = None,
+    resume_checkpoint: Path | None = None,
 ) -> tuple[EffectNetwork, list[TrainingRecord]]:
-    """As `train_lever_model`, of arrays: of another world's lever-ups, for one.
+    """As `train_lever_model`, of tensors: of another world's lever-ups, for one.
 
     The network gets as many steps as a trajectory has.
     """
+    if trained_for not in TRAINED_FOR:
+        raise ValueError(f"trained_for must be one of {[*TRAINED_FOR]}, got {trained_for!r}")
     torch.manual_seed(lever.training.seed)
-    network, steps = lever.network, len(training.phase) - 1
-    for name in ("course_steps", "steps"):
-        if hasattr(network, name):
-            network = replace(network, **{name: steps})
-    model = build(network, Scaler.fit(training))
-    if hasattr(model, "fit_course"):
-        model.fit_course(training.effect)
+    network = lever.network
+    if hasattr(network, "steps"):
+        network = replace(network, steps=len(training.phase) - 1)
+    model = build(network, Scaler.fit(training), TrainingDomain.fit(training))
+    if hasattr(model, "mean_trajectory"):
+        model.mean_trajectory.fit(training.effect, model.effect_scale)
     history = train(
-        model, training, validation, lever.training, progress, checkpoint,
-        draw=_DRAWS[trained_for], score=_SCORES[trained_for],
-    )  # fmt: skip
+        model, training, validation, lever.training, resume_checkpoint, *TRAINED_FOR[trained_for]
+    )
     return model, history

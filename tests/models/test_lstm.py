@@ -10,8 +10,8 @@ from affordlib.interactions import InteractionTensors, Scaler
 from affordlib.interactions.lever_up import N_OBSERVED
 from affordlib.interactions.sampling import sample_forward
 from affordlib.models import build
-from affordlib.models.lever import beginning_errors_m, window_errors_m
-from affordlib.models.lstm import LSTMConfig, courses
+from affordlib.models.lever_up import from_start_errors_m, window_errors_m
+from affordlib.models.lstm import LSTMConfig, effects_at_steps
 from affordlib.models.protocol import EffectModel, condition_on_primitives
 from affordlib.primitives import Push
 from experiments.lstm_seker2019 import SekerConfig, SekerLSTM, train_seker
@@ -70,7 +70,7 @@ def test_a_published_training_goes_on_where_it_was_broken_off(tmp_path, levered,
     for a, b in zip(whole.parameters(), again.parameters(), strict=True):
         torch.testing.assert_close(a, b, atol=0, rtol=0)
     assert window_errors_m(whole, levered).shape == (len(levered), 7, 5)
-    assert beginning_errors_m(whole, levered).shape == (len(levered), 25)
+    assert from_start_errors_m(whole, levered).shape == (len(levered), 25)
 
 
 def test_gradients_that_vanish_are_forgotten(tmp_path, levered, small_published, monkeypatch):
@@ -118,7 +118,7 @@ def test_the_course_of_pushes_is_that_seen_from_behind(pushes):
     few = InteractionTensors.from_dataset(pushes, np.arange(60), ("x", "y"), ("x", "y", "yaw"))
     config = LSTMConfig(effect_channels=("x", "y", "yaw"), frame="push", width=16)
     model = build(config, Scaler.fit(few))
-    mean = courses(model, few).mean(dim=0)
+    mean = effects_at_steps(model, few).mean(dim=0)
     assert mean.shape == (26, 3)
     torch.testing.assert_close(mean[:, 1:], torch.zeros(26, 2), atol=1e-6, rtol=0)
     length = float(few.effect[:, -1, :2].norm(dim=-1).mean())

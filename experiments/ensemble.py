@@ -1,4 +1,4 @@
-"""Several networks that differ in nothing but their seed, asked as one.
+"""Several networks that differ in nothing but their seed, queried as one.
 
     μ = mean_k μ_k        σ² = mean_k σ_k² + mean_k (μ_k - μ)²
 
@@ -15,14 +15,14 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from affordlib.models.network import EffectNetwork
+from affordlib.models.base import EffectNetwork
 from affordlib.types import Observations, Prediction
 
 
 class Ensemble:
-    """Trained networks of the same channels as one `EffectModel`; temperature: of the mixture's σ.
+    """Trained networks of the same channels as one `EffectModel`; sigma_scale: of the mixture's σ.
 
-    It holds copies of the members, with their weights, whose own temperatures are one.
+    It holds copies of the members, with their weights, whose own sigma_scale is one.
     """
 
     def __init__(self, members: Sequence[EffectNetwork]) -> None:
@@ -38,9 +38,9 @@ class Ensemble:
                     f"{self.effect_channels}; member {k} has {channels[0]} and {channels[1]}"
                 )
         self.members = tuple(copy.copy(member) for member in members)
-        self.temperature = (1.0,) * len(self.effect_channels)
+        self.sigma_scale = (1.0,) * len(self.effect_channels)
         for member in self.members:
-            member.temperature = self.temperature
+            member.sigma_scale = self.sigma_scale
 
     def encode(self, image: Tensor) -> Tensor:
         """Features (B, K F) of images (B, 2, 48, 48): those of the K members side by side."""
@@ -49,13 +49,13 @@ class Ensemble:
     def predict(self, features: Tensor, observations: Observations, t_target: Tensor) -> Prediction:
         """Mean and σ (B, T, C) of the mixture at t_target (B, T); features (B, K F) or (1, K F)."""
         each = features.chunk(len(self.members), dim=-1)
-        told = [
+        predicted = [
             member.predict(mine.contiguous(), observations, t_target)
             for member, mine in zip(self.members, each, strict=True)
         ]
-        action = _moments([p.action_mean for p in told], [p.action_std for p in told])
-        mean, std = _moments([p.effect_mean for p in told], [p.effect_std for p in told])
-        return Prediction(*action, mean, std * std.new_tensor(self.temperature))
+        action = _moments([p.action_mean for p in predicted], [p.action_std for p in predicted])
+        mean, std = _moments([p.effect_mean for p in predicted], [p.effect_std for p in predicted])
+        return Prediction(*action, mean, std * std.new_tensor(self.sigma_scale))
 
 
 def _moments(means: list[Tensor], stds: list[Tensor]) -> tuple[Tensor, Tensor]:

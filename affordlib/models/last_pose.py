@@ -1,13 +1,13 @@
-"""Our network for lever-ups: conditional, and anchored to the last pose that was observed.
+"""Our network for lever-ups: a CNP in the frame of the last observed pose.
 
-    d(t)  = e(t) - m(t)                              m: mean course of the training trajectories
+    d(t)  = e(t) - m(t)                              m: mean of the training trajectories
     r     = w₁ mean h_a(a_i, t_i) + w₂ mean h_e(d_i - d_l, t_i - t_l, t_i),  l the last observed
     μ(t)  = m(t) + d_l + ḋ_l s(t) + n(t) g(r, ḋ_l, d_l, f(γ_o), t - t_l, t),    σ(t) from g
 
-A mean of codes, as in equations (2) and (3) of the paper, forgets where exactly the object was a
-moment ago; here that is told, with the velocity ḋ_l between the last two observations, which
-lasts for a while, s(t) = (t - t_l) exp(-(t - t_l)/0.2); the network says what else changes from
-there on; n rises from 0 at t_l to 1. It is asked for any t at once: nothing is fed back.
+A mean of codes, as in equations (2) and (3) of the paper, does not keep where exactly the object
+was a moment ago; here that is an input, with the velocity ḋ_l between the last two observations,
+which lasts for a while, s(t) = (t - t_l) exp(-|t - t_l| / 0.2); the network predicts what else
+changes from there on; n rises from 0 at t_l to 1. Any t is predicted directly, not by a rollout.
 With nothing observed d_l is that of t = 0, where a displacement is zero.
 """
 
@@ -21,21 +21,26 @@ from torch import Tensor, nn
 
 from affordlib import checked
 from affordlib.interactions.dataset import Scaler
-from affordlib.models.film import FiLMConfig, FiLMNetwork, dense, split_outputs, waves
-from affordlib.models.network import masked_mean, with_time
+from affordlib.models.base import masked_mean, with_time
+from affordlib.models.domain import TrainingDomain
+from affordlib.models.film import FiLMConfig, FiLMNetwork
+from affordlib.models.harmonics import dense, waves
 from affordlib.types import Observations
+
+_NEAR_PHASE = 0.1
+_VELOCITY_PHASE = 0.2
 
 
 @checked
 @dataclass(frozen=True)
-class AnchoredConfig(FiLMConfig):
-    """Sizes as of `FiLMConfig`; course_steps: into how many steps m(t) divides the phase."""
+class LastPoseConfig(FiLMConfig):
+    """Sizes as of `FiLMConfig`; steps: into how many m(t) divides the phase."""
 
     frame: str = "table"
-    course_steps: int = 25
+    steps: int = 25
 
 
-class MeanCourse(nn.Module):
+class MeanTrajectory(nn.Module):
     """m(t): the mean effect over the phase, linear between steps, in standardised units."""
 
     def __init__(self, steps: int, channels: int) -> None:
@@ -43,7 +48,7 @@ class MeanCourse(nn.Module):
         self.register_buffer("values", torch.zeros(steps + 1, channels))
 
     def fit(self, effect: Float[Tensor, "n s c"], scale: Float[Tensor, " c"]) -> None:
-        """Take it from effects of training trajectories, at the same number of steps."""
+        """Take it from effects of training trajectories [m, rad], at the same number of steps."""
         if effect.shape[1:] != self.values.shape:
             raise ValueError(
                 f"effect must have (steps, channels) = {tuple(self.values.shape)}, "
@@ -59,69 +64,61 @@ class MeanCourse(nn.Module):
         return (1 - share) * self.values[below] + share * self.values[below + 1]
 
 
-class AnchoredNetwork(FiLMNetwork):
-    """Foresees a course from any observed part of it; satisfies `EffectModel`."""
+class LastPoseCNP(FiLMNetwork):
+    """Predicts a trajectory from any observed part of it; satisfies `EffectModel`."""
 
-    def __init__(self, config: AnchoredConfig, scaler: Scaler) -> None:
-        super().__init__(config, scaler)
+    def __init__(
+        self, config: LastPoseConfig, scaler: Scaler, domain: TrainingDomain | None = None
+    ) -> None:
+        super().__init__(config, scaler, domain)
         c, w = config, config.width
         n_e = len(c.effect_channels)
-        self.course = MeanCourse(c.course_steps, n_e)
+        self.mean_trajectory = MeanTrajectory(c.steps, n_e)
         self.effect_encoder = nn.Sequential(*dense(n_e + 2, w, w, w))
         known = w + c.image_features + 2 * n_e + 2
         self.merge = nn.Linear(known + 2 * (2 * c.waves + 1), w)
-
-    def fit_course(self, effect: Float[Tensor, "n s c"]) -> None:
-        """Learn m(t) from training effects [m, rad]; before training."""
-        self.course.fit(effect, self.effect_scale)
 
     def outputs(
         self, features: Tensor, observations: Observations, t_target: Tensor
     ) -> tuple[Tensor, ...]:
         """(μ_a, σ_a, μ_e, σ_e), each (B, T, C) and standardised."""
         o = observations
-        off = o.effect / self.effect_scale - self.course(o.effect_t)
-        anchor, at, speed = _last(off, o.effect_t, o.effect_mask)
+        d = o.effect / self.effect_scale - self.mean_trajectory(o.effect_t)
+        d_last, t_last, velocity = _last(d, o.effect_t, o.effect_mask)
         h_a = self.action_encoder(with_time(o.action / self.action_scale, o.action_t))
-        since = o.effect_t - at
+        since = o.effect_t - t_last
         h_e = self.effect_encoder(
-            torch.cat([off - anchor[:, None], since[..., None], o.effect_t[..., None]], dim=-1)
+            torch.cat([d - d_last[:, None], since[..., None], o.effect_t[..., None]], dim=-1)
         )
         w_1 = o.weight[:, None]
         r = w_1 * masked_mean(h_a, o.action_mask) + (1 - w_1) * masked_mean(h_e, o.effect_mask)
         seen = o.effect_mask.any(dim=1, keepdim=True).to(r.dtype)
-        known = torch.cat([r, features.expand(len(r), -1), anchor, speed, at, seen], dim=1)
-        ahead = t_target - at
+        image = features.expand(len(r), -1)
+        known = torch.cat([r, image, d_last, velocity, t_last, seen], dim=1)
+        ahead = t_target - t_last
         n = self.config.waves
         times = torch.cat([waves(t_target, n), waves(ahead, n)], dim=-1)
         x = self.merge(torch.cat([known[:, None].expand(-1, times.shape[1], -1), times], dim=-1))
-        for block in self.blocks:
-            x = block(x, features)
-        mu_a, sigma_a, change, sigma_e = split_outputs(
-            self.last(self.head(x)), self.config, self.sigma_floor
-        )
-        # Nothing has changed at the anchor; the velocity lasts for a while.
+        mu_a, sigma_a, change, sigma_e = self.decode(x, features)
+        # Nothing has changed at the last pose; the velocity lasts for a while.
         near = ahead.abs()[..., None] / (ahead.abs()[..., None] + _NEAR_PHASE)
-        coasting = speed[:, None] * (10 * ahead * (-ahead.abs() / _COASTING_PHASE).exp())[..., None]
-        mu_e = self.course(t_target) + anchor[:, None] + coasting + near * change
+        lasting = (10 * ahead * (-ahead.abs() / _VELOCITY_PHASE).exp())[..., None]
+        moving = velocity[:, None] * lasting
+        mu_e = self.mean_trajectory(t_target) + d_last[:, None] + moving + near * change
         return mu_a, sigma_a, mu_e, sigma_e
 
 
-_NEAR_PHASE = 0.1
-_COASTING_PHASE = 0.2
-
-
 def _last(
-    off: Float[Tensor, "b m c"], t: Float[Tensor, "b m"], seen: Tensor
+    d: Float[Tensor, "b m c"], t: Float[Tensor, "b m"], seen: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Value (B, C) and phase (B, 1) of the last observation, and its velocity per tenth of phase.
 
     All are zero where nothing is observed; the velocity also where only one is.
     """
     order = t.masked_fill(~seen, -1.0).argsort(dim=1)[:, -2:]
-    rows = torch.arange(len(off), device=off.device)
+    rows = torch.arange(len(d), device=d.device)
     late, early = order[:, -1], order[:, 0]
     any_seen, two = seen.any(dim=1), seen.sum(dim=1) >= 2
     gap = (t[rows, late] - t[rows, early]).clamp_min(1e-3)[:, None]
-    speed = (off[rows, late] - off[rows, early]) * (0.1 / gap) * two[:, None]
-    return off[rows, late] * any_seen[:, None], (t[rows, late] * any_seen)[:, None], speed
+    velocity = (d[rows, late] - d[rows, early]) * (0.1 / gap) * two[:, None]
+    return d[rows, late] * any_seen[:, None], (t[rows, late] * any_seen)[:, None], velocity

@@ -1,28 +1,29 @@
-"""Turning: images, harmonics and whole data sets."""
+"""Rotations: images, harmonics and whole data sets; the direction of a push."""
 
 import math
 
 import numpy as np
 import torch
 
-from affordlib.models.film import CircularHarmonics
-from affordlib.models.frame import inverse, turn_image
+from affordlib.models.harmonics import CircularHarmonics
+from affordlib.models.push_frame import inverse, push_direction, rotate_image
 from affordlib.primitives import Push
+from affordlib.types import Observations
 
 
 def test_turning_an_image_keeps_the_object(some):
     angle = 2 * math.pi * torch.rand(40, generator=torch.Generator().manual_seed(0))
     towards = torch.stack([angle.cos(), angle.sin()], dim=1)
-    turned = turn_image(some.image, towards)
+    turned = rotate_image(some.image, towards)
     for channel, full in ((1, some.image[:, 1]), (0, 1 - some.image[:, 0])):
         now = turned[:, 1] if channel == 1 else 1 - turned[:, 0]
         kept = now.sum(dim=(1, 2)) / full.sum(dim=(1, 2))
         assert (kept - 1).abs().max() < 0.01
-    again = turn_image(turned, inverse(towards))
+    again = rotate_image(turned, inverse(towards))
     assert (again - some.image)[:, 1].abs().mean() < 0.02
     quarter = torch.tensor([[0.0, 1.0]]).expand(40, 2)
     exact = torch.rot90(some.image, 1, (-2, -1))
-    torch.testing.assert_close(turn_image(some.image, quarter), exact, atol=1e-5, rtol=0)
+    torch.testing.assert_close(rotate_image(some.image, quarter), exact, atol=1e-5, rtol=0)
 
 
 def test_harmonics_turn_as_their_image_does(some):
@@ -31,12 +32,14 @@ def test_harmonics_turn_as_their_image_does(some):
     angle = math.tau * torch.rand(40, generator=torch.Generator().manual_seed(0))
     for turn, exact in ((torch.full((40,), math.pi / 2), True), (angle, False)):
         towards = torch.stack([turn.cos(), turn.sin()], dim=-1)
-        turned = torch.rot90(some.image, 1, (-2, -1)) if exact else turn_image(some.image, towards)
-        off = harmonics.turned(known, towards) - harmonics(turned)
+        turned = (
+            torch.rot90(some.image, 1, (-2, -1)) if exact else rotate_image(some.image, towards)
+        )
+        off = harmonics.rotated(known, towards) - harmonics(turned)
         # An interpolated image is not quite the turned one; the harmonics themselves are.
         assert off.abs().max() < (1e-4 if exact else 0.03 * known.abs().max())
         assert (harmonics(turned) - known).abs().max() > 0.2 * known.abs().max()
-    back = harmonics.turned(harmonics.turned(known, towards), inverse(towards))
+    back = harmonics.rotated(harmonics.rotated(known, towards), inverse(towards))
     torch.testing.assert_close(back, known, atol=1e-5, rtol=1e-4)
 
 
@@ -50,3 +53,18 @@ def test_turned_data_are_those_of_the_turned_push(some):
         np.testing.assert_allclose(now[:, :2], expected[:, :2], atol=1e-5)
         assert np.abs(np.exp(1j * now[:, 2]) - np.exp(1j * expected[:, 2])).max() < 1e-5
     torch.testing.assert_close(turned.effect[..., 2], -some.effect[..., 2])
+
+
+def test_the_direction_is_that_of_the_push(some):
+    channels = some.action_channels, some.effect_channels
+    travel = some.action[:, -1, :2] - some.action[:, 0, :2]
+    expected = travel / travel.norm(dim=-1, keepdim=True)
+    for samples in ((0, -1), (0,), (-1, 0), (10, 20)):
+        observed = Observations.of(some, some.action_at(torch.tensor(samples)))
+        direction = push_direction(observed, *channels)
+        torch.testing.assert_close(direction, expected, atol=1e-4, rtol=0)
+    # Of the inverse query it is the direction of the effect; of no effect, the table's.
+    end = torch.tensor([[0.03, -0.04, 0.1], [0.0, 0.0, 0.0]])
+    observed = Observations.of(some, effect=(torch.ones(2, 1), end[:, None]))
+    direction = push_direction(observed, *channels)
+    torch.testing.assert_close(direction, torch.tensor([[0.6, -0.8], [1.0, 0.0]]))

@@ -6,10 +6,11 @@ import torch
 
 from affordlib.geometry import wrap_angle
 from affordlib.interactions import InteractionTensors
-from affordlib.models import EffectModel, Ensemble, condition_on_primitives, load_checkpoint
+from affordlib.models import EffectModel, condition_on_primitives, load_checkpoint
 from affordlib.planning import plan_astar, plan_continuous
 from affordlib.primitives import Push
 from affordlib.types import Goal
+from experiments.ensemble import Ensemble
 from tests.problems import problem_of
 
 NAMES = ("film_500", "film_5000")
@@ -42,11 +43,11 @@ def test_mean_and_sigma_are_those_of_the_mixture(members, asked):
 
 
 def test_members_are_left_as_they_were(members):
-    before = [member.temperature for member in members]
+    before = [member.sigma_scale for member in members]
     ensemble = Ensemble(members)
-    assert [member.temperature for member in members] == before
-    assert {member.temperature for member in ensemble.members} == {(1.0, 1.0, 1.0)}
-    assert all(t != 1 for temperature in before for t in temperature)
+    assert [member.sigma_scale for member in members] == before
+    assert {member.sigma_scale for member in ensemble.members} == {(1.0, 1.0, 1.0)}
+    assert all(t != 1 for scale in before for t in scale)
 
 
 @torch.no_grad()

@@ -1,0 +1,261 @@
+"""What all networks share: scales, domain, frame and loss; subclasses are the architectures."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, fields
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from affordlib import checked
+from affordlib.geometry import rotate_channels, xy_columns
+from affordlib.interactions.dataset import Scaler
+from affordlib.models.domain import TrainingDomain
+from affordlib.models.push_frame import (
+    FRAMES,
+    inverse,
+    push_direction,
+    rotate_image,
+    rotate_observations,
+    rotate_prediction,
+)
+from affordlib.types import Observations, Prediction, check_count, check_within
+
+
+@checked
+@dataclass(frozen=True)
+class NetworkConfig:
+    """Channels and frame of a network.
+
+    frame: "table", or "push" to rotate everything into the direction of the push, see
+    `push_frame.py`. sigma_floor is in standardised units. sigma_scale multiplies σ of each effect
+    channel (none given: by 1), see `calibration.py`.
+    """
+
+    action_channels: tuple[str, ...] = ("x", "y")
+    effect_channels: tuple[str, ...] = ("x", "y")
+    sigma_floor: float = 0.1
+    frame: str = "table"
+    sigma_scale: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.frame not in FRAMES:
+            raise ValueError(f"frame must be one of {FRAMES}, got {self.frame!r}")
+        for name in ("action_channels", "effect_channels"):
+            channels = tuple(getattr(self, name))
+            if not channels:
+                raise ValueError(f"{name} must name at least one channel, got none")
+            if self.frame == "push" and not xy_columns(channels):
+                raise ValueError(f'{name} must name x and y for frame="push", got {channels}')
+            object.__setattr__(self, name, channels)
+        for size in fields(self):
+            if size.type == "int":
+                check_within(size.name, check_count(size.name, getattr(self, size.name)), 1, 4096)
+        if not 0 < self.sigma_floor < 10:
+            raise ValueError(f"sigma_floor must lie in (0, 10), got {self.sigma_floor!r}")
+        scale = tuple(self.sigma_scale) or (1.0,) * len(self.effect_channels)
+        if len(scale) != len(self.effect_channels) or not min(scale) > 0:
+            raise ValueError(
+                f"sigma_scale must hold {len(self.effect_channels)} positive numbers, one per "
+                f"effect channel, got {self.sigma_scale!r}"
+            )
+        object.__setattr__(self, "sigma_scale", scale)
+
+
+class EffectNetwork(nn.Module, ABC):
+    """A network that satisfies `EffectModel`.
+
+    Inputs and outputs are in metres and radians, in the frame of the table; standardisation and
+    rotation into the network's frame happen inside. A subclass gives `features` of an image and
+    `outputs`; both know nothing of frames and units.
+    """
+
+    @checked
+    def __init__(
+        self, config: NetworkConfig, scaler: Scaler, domain: TrainingDomain | None = None
+    ) -> None:
+        super().__init__()
+        self.config, self.scaler, self.domain = config, scaler, domain or TrainingDomain()
+        self.action_channels = config.action_channels
+        self.effect_channels = config.effect_channels
+        self.sigma_floor, self.sigma_scale = config.sigma_floor, config.sigma_scale
+        for kind in ("action", "effect"):
+            width = len(getattr(config, f"{kind}_channels"))
+            if len(getattr(scaler, f"{kind}_scale")) != width:
+                raise ValueError(
+                    f"scaler {kind}_scale must have {width} channels as the config does"
+                )
+        for name in ("action_scale", "effect_scale", "image_mean", "image_std"):
+            values = torch.tensor(getattr(scaler, name), dtype=torch.float32)
+            self.register_buffer(name, values, persistent=False)
+
+    @abstractmethod
+    def features(self, scaled_image: Float[Tensor, "b 2 n n"]) -> Float[Tensor, "b f"]:
+        """f(γ_o): what the network reads from a standardised image."""
+
+    @abstractmethod
+    def outputs(
+        self,
+        features: Float[Tensor, "#b f"],
+        observations: Observations,
+        t_target: Float[Tensor, "b t"],
+    ) -> tuple[Float[Tensor, "b t _"], ...]:
+        """(μ_a, σ_a, μ_e, σ_e), each (B, T, C), standardised, in the network's frame."""
+
+    def represent(self, observations: Observations) -> Float[Tensor, "b w"]:
+        """r: (B, W), equations (2) and (3), the means taken over what is observed.
+
+        Of networks with an `action_encoder` and an `effect_encoder`.
+        """
+        o = observations
+        actions = with_time(o.action / self.action_scale, o.action_t)
+        effects = with_time(o.effect / self.effect_scale, o.effect_t)
+        r_a = mean_code(self.action_encoder, actions, o.action_mask)
+        r_e = mean_code(self.effect_encoder, effects, o.effect_mask)
+        w_1 = o.weight[:, None]
+        return w_1 * r_a + (1 - w_1) * r_e
+
+    def split_outputs(self, y: Float[Tensor, "b t _"]) -> tuple[Float[Tensor, "b t _"], ...]:
+        """(μ_a, σ_a, μ_e, σ_e) of a last layer's values (B, T, 2 C_a + 2 C_e)."""
+        n_a, n_e = len(self.action_channels), len(self.effect_channels)
+        mu_a, raw_a, mu_e, raw_e = y.split([n_a, n_a, n_e, n_e], dim=-1)
+        return (
+            mu_a,
+            self.sigma_floor + F.softplus(raw_a),
+            mu_e,
+            self.sigma_floor + F.softplus(raw_e),
+        )
+
+    @property
+    def _channels(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        return self.action_channels, self.effect_channels
+
+    def _scaled(self, image: Tensor) -> Tensor:
+        mean, std = (v[:, None, None] for v in (self.image_mean, self.image_std))
+        return (image - mean) / std
+
+    def unoriented_features(self, image: Float[Tensor, "b 2 n n"]) -> Float[Tensor, "b f"]:
+        """What can be read of an image before the direction is known: here, the image itself."""
+        return image.flatten(1)
+
+    def oriented_features(
+        self, unoriented: Float[Tensor, "#b f"], rotation: Float[Tensor, "b 2"]
+    ) -> Float[Tensor, "b f"]:
+        """Features of the rotated images, of their `unoriented_features`."""
+        pixels = math.isqrt(unoriented.shape[1] // 2)
+        image = rotate_image(unoriented.reshape(-1, 2, pixels, pixels), rotation)
+        return self.features(self._scaled(image))
+
+    def encode(self, image: Float[Tensor, "b 2 n n"], check: bool = True) -> Float[Tensor, "b f"]:
+        """Features (B, F) of depth and mask (B, 2, 48, 48), unoriented in the frame of the push.
+
+        Raises ValueError where the object is unlike those the network was trained on.
+        """
+        if check:
+            self.domain.check_image(image)
+        if self.config.frame == "push":
+            return self.unoriented_features(image)
+        return self.features(self._scaled(image))
+
+    def predict(self, features: Tensor, observations: Observations, t_target: Tensor) -> Prediction:
+        """Mean and σ (B, T, C) at t_target (B, T); features (B, F), or (1, F) for all.
+
+        Raises ValueError for phases outside [0, 1], and for actions that start or end elsewhere
+        than those trained on. Warns (`OutOfRangeWarning`) of effects at t = 1 that are farther or
+        less far than those trained on: a planner may pass there on its way.
+        """
+        self.domain.check_query(observations, t_target, *self._channels)
+        (mu_a, sigma_a, mu_e, sigma_e), direction = self._decode(features, observations, t_target)
+        a, e = self.action_scale, self.effect_scale
+        prediction = Prediction(
+            mu_a * a, sigma_a * a, mu_e * e, sigma_e * e * e.new_tensor(self.sigma_scale)
+        )
+        if direction is None:
+            return prediction
+        return rotate_prediction(prediction, direction, *self._channels)
+
+    def forward(
+        self, image: Tensor, observations: Observations, t_target: Tensor
+    ) -> tuple[Tensor, ...]:
+        """(μ_a, σ_a, μ_e, σ_e) in standardised units, in the network's frame."""
+        return self._decode(self.encode(image, check=False), observations, t_target)[0]
+
+    def _decode(
+        self, encoded: Tensor, observations: Observations, t_target: Tensor
+    ) -> tuple[tuple[Tensor, ...], Tensor | None]:
+        """`outputs` for encoded images, and the direction (B, 2) of the network's frame, if any."""
+        if self.config.frame == "table":
+            return self.outputs(encoded, observations, t_target), None
+        direction = push_direction(observations, *self._channels)
+        back = inverse(direction)
+        aligned = rotate_observations(observations, back, *self._channels)
+        features = self.oriented_features(encoded, back)
+        return self.outputs(features, aligned, t_target), direction
+
+    def loss(
+        self,
+        image: Tensor,
+        observations: Observations,
+        t_target: Tensor,
+        action: Tensor,
+        effect: Tensor,
+        beta: float = 0.0,
+    ) -> Tensor:
+        """Negative log-likelihood (Section 3.2) of the targets (B, T, C), per value.
+
+        The likelihood is of the standardised values, in the network's frame. beta weighs each value
+        by σ^(2 beta), so that what is hard to predict is not given up for a large σ: with 0 it is
+        the likelihood, with 1 means learn as from the squared error (Seitzer et al., On the
+        pitfalls of heteroscedastic uncertainty estimation, ICLR 2022).
+        """
+        encoded = self.encode(image, check=False)
+        (mu_a, sigma_a, mu_e, sigma_e), direction = self._decode(encoded, observations, t_target)
+        if direction is not None:
+            back = inverse(direction)[:, None]
+            action = rotate_channels(action, self.action_channels, back, absolute_yaw=True)
+            effect = rotate_channels(effect, self.effect_channels, back, absolute_yaw=False)
+        nll_a = gaussian_nll(action / self.action_scale, mu_a, sigma_a)
+        nll_e = gaussian_nll(effect / self.effect_scale, mu_e, sigma_e)
+        if beta:
+            nll_a = nll_a * sigma_a.detach() ** (2 * beta)
+            nll_e = nll_e * sigma_e.detach() ** (2 * beta)
+        return (nll_a.mean() + nll_e.mean()) / 2
+
+
+def with_time(values: Tensor, t: Tensor) -> Tensor:
+    """Values (..., C) and their phases (...): (..., C + 1)."""
+    return torch.cat([values, t[..., None]], dim=-1)
+
+
+def masked_mean(h: Float[Tensor, "b n c"], mask: Bool[Tensor, "b n"]) -> Float[Tensor, "b c"]:
+    """Mean (B, H) over the observed of (B, n, H); zero where nothing is observed."""
+    seen = mask[..., None].to(h.dtype)
+    return (h * seen).sum(dim=1) / seen.sum(dim=1).clamp_min(1)
+
+
+def mean_code(
+    encoder: nn.Module, seen: Float[Tensor, "b n c"], mask: Bool[Tensor, "b n"]
+) -> Float[Tensor, "b h"]:
+    """Mean (B, H) of the codes of the observed of (B, n, C), each with its phase; zero of none.
+
+    Without gradients, what no query observes is not encoded: planners observe no effects.
+    """
+    if not torch.is_grad_enabled() and not mask.any():
+        seen, mask = seen[:, :0], mask[:, :0]
+    return masked_mean(encoder(seen), mask)
+
+
+def gaussian_nll(y: Tensor, mean: Tensor, std: Tensor) -> Tensor:
+    """-log N(y; mean, std²), elementwise."""
+    return 0.5 * ((y - mean) / std) ** 2 + std.log() + 0.5 * math.log(2 * math.pi)
+
+
+def he_initialise(module: nn.Module) -> None:
+    """He initialisation for leaky layers; PyTorch's default never learns a push's direction."""
+    if isinstance(module, nn.Linear | nn.Conv2d):
+        nn.init.kaiming_normal_(module.weight, a=0.01, nonlinearity="leaky_relu")
+        nn.init.zeros_(module.bias)

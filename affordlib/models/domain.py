@@ -1,0 +1,137 @@
+"""The domain of a trained model: images, actions and effects of which it has learned something."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from affordlib.geometry import xy_columns
+from affordlib.interactions.dataset import InteractionTensors
+from affordlib.types import Observations, check_pair
+
+Range = tuple[float, float]
+PHASE_TOLERANCE = 1e-5
+RADIUS_TOLERANCE_M = 0.02
+_END_PHASE = 1e-3
+
+
+class OutOfRangeWarning(UserWarning):
+    """A network is queried outside of what it was trained on, and extrapolates."""
+
+
+@dataclass(frozen=True)
+class TrainingDomain:
+    """Ranges of the training data, None where not known.
+
+    start_radius_m, end_radius_m: distance [m] of the action from the object's centre at t = 0 and
+    at t = 1; mask_share: part of the image that the object covers; touches_border: whether objects
+    reach the image's edge; effect_radius_m: distance [m] that objects have moved at t = 1.
+    """
+
+    start_radius_m: Range | None = None
+    end_radius_m: Range | None = None
+    mask_share: Range | None = None
+    touches_border: bool = True
+    effect_radius_m: Range | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("start_radius_m", "end_radius_m", "mask_share", "effect_radius_m"):
+            if getattr(self, name) is not None:
+                check_pair(name, getattr(self, name), "(low, high)")
+        if not isinstance(self.touches_border, bool):
+            raise TypeError(f"touches_border must be True or False, got {self.touches_border!r}")
+
+    @classmethod
+    def fit(cls, tensors: InteractionTensors) -> TrainingDomain:
+        """The ranges of training data."""
+        start = end = moved = None
+        if plane := xy_columns(tensors.action_channels):
+            start, end = (_range(tensors.action[:, k][:, plane].norm(dim=-1)) for k in (0, -1))
+        if plane := xy_columns(tensors.effect_channels):
+            moved = _range(tensors.effect[:, -1][:, plane].norm(dim=-1))
+        mask = tensors.image[:, 1]
+        share, border = _range(mask.mean(dim=(1, 2))), bool(touches_border(mask).any())
+        return cls(start, end, share, border, moved)
+
+    def check_image(self, image: Tensor) -> None:
+        """Raise ValueError where an object's size in the image, or its place, is out of range."""
+        if self.mask_share is None:
+            return
+        mask, (low, high) = image[:, 1], self.mask_share
+        share, at_border = mask.mean(dim=(1, 2)), touches_border(mask)
+        outside = ~((share > low / 2) & (share < 1.5 * high))
+        if outside.any():
+            raise ValueError(
+                f"image {int(outside.nonzero()[0])}: the object covers "
+                f"{float(share[outside][0]):.1%} of it, those trained on {low:.1%} to {high:.1%}; "
+                "train on such objects first"
+            )
+        if not self.touches_border and at_border.any():
+            raise ValueError(
+                f"image {int(at_border.nonzero()[0])}: the object reaches its edge, none trained "
+                "on does; centre the crop on the object, or train on such objects first"
+            )
+
+    def check_query(
+        self,
+        observations: Observations,
+        t_target: Tensor,
+        action_channels: tuple[str, ...],
+        effect_channels: tuple[str, ...],
+    ) -> None:
+        """Raise ValueError where a phase or an observed action is out of range.
+
+        Warn (`OutOfRangeWarning`) where an observed final effect is.
+        """
+        low, high = t_target.detach().aminmax()
+        if not (low > -PHASE_TOLERANCE and high < 1 + PHASE_TOLERANCE):
+            raise ValueError(
+                f"t_target must lie in [0, 1], the phase of the whole action, got {float(low):.3f} "
+                f"to {float(high):.3f}"
+            )
+        o = observations
+        for name, known, t in (
+            ("starts", self.start_radius_m, o.action_t),
+            ("ends", self.end_radius_m, 1 - o.action_t),
+        ):
+            seen = (t < _END_PHASE) & o.action_mask
+            if (radius := _outside(o.action, action_channels, seen, known)) is not None:
+                raise ValueError(
+                    f"an observed action {name} {radius:.3f} m from the object's centre, those "
+                    f"trained on {known[0]:.3f} to {known[1]:.3f} m; train on such actions first"
+                )
+        seen = (1 - o.effect_t < _END_PHASE) & o.effect_mask
+        known = self.effect_radius_m
+        if (radius := _outside(o.effect, effect_channels, seen, known)) is not None:
+            warnings.warn(
+                f"an observed effect ends {radius:.3f} m away, those trained on {known[0]:.3f} to "
+                f"{known[1]:.3f} m; what is predicted from it is an extrapolation",
+                OutOfRangeWarning,
+                stacklevel=3,
+            )
+
+
+def touches_border(mask: Tensor) -> Tensor:
+    """Which of the masks (N, n, n) reach the edge of their image, not just by a corner: (N,)."""
+    rim = torch.cat([mask[:, (0, -1)].flatten(1), mask[:, :, (0, -1)].flatten(1)], dim=1)
+    return (rim > 0.5).sum(dim=1) > 2
+
+
+def _range(values: Tensor) -> Range:
+    return float(values.min()), float(values.max())
+
+
+def _outside(
+    values: Tensor, channels: tuple[str, ...], seen: Tensor, known: Range | None
+) -> float | None:
+    """The first distance from the origin [m] of what is seen that is out of range, if any is."""
+    plane = xy_columns(channels)
+    if known is None or not plane or not seen.any():
+        return None
+    radius = values.detach()[..., plane].norm(dim=-1)
+    low, high = known[0] - RADIUS_TOLERANCE_M, known[1] + RADIUS_TOLERANCE_M
+    outside = seen & ~((radius > low) & (radius < high))
+    return float(radius[outside][0]) if outside.any() else None

@@ -1,0 +1,132 @@
+"""Checkpoints: the same model again, or a refusal; and what a model has seen is known."""
+
+import dataclasses
+import json
+import math
+import pickle
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save
+
+from affordlib.evaluation import refuse_seen
+from affordlib.interactions import split_interactions
+from affordlib.models import load_checkpoint, save_checkpoint
+from affordlib.models.checkpoint import checkpoint_sha256, read_weights, write_weights
+from affordlib.planning.reachability import Reachability
+
+
+def test_round_trip(untrained, tmp_path):
+    untrained.sigma_floor, untrained.sigma_scale = 0.03, (1.7, 0.5)
+    path = save_checkpoint(untrained, tmp_path / "m.safetensors", {"note": "none"})
+    again, about = load_checkpoint(path)
+    assert about == {"note": "none"}
+    assert (again.scaler, again.domain) == (untrained.scaler, untrained.domain)
+    assert again.config == dataclasses.replace(
+        untrained.config, sigma_floor=0.03, sigma_scale=(1.7, 0.5)
+    )
+    for name, value in untrained.state_dict().items():
+        assert torch.equal(again.state_dict()[name], value)
+    assert [p.name for p in tmp_path.iterdir()] == ["m.safetensors"]
+
+
+def test_the_hash_is_of_all_that_decides_the_predictions(untrained, tmp_path):
+    def sha256(about):
+        return checkpoint_sha256(save_checkpoint(untrained, tmp_path / "m.safetensors", about))
+
+    first = sha256({})
+    assert sha256({"note": "another"}) == first
+    untrained.sigma_scale = (3.0, 3.0)
+    assert sha256({}) != first
+
+
+def test_a_bad_checkpoint_is_named(untrained, tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"'nobody'.*'cnp_500'"):
+        load_checkpoint("nobody")
+    path = save_checkpoint(untrained, tmp_path / "m.safetensors", {})
+    whole = path.read_bytes()
+    tensors, description = read_weights(path, "")
+
+    def described(**changes):
+        return write_weights(path, tensors, description | changes)
+
+    half = {name: value.half() for name, value in tensors.items()}
+    scaler = description["scaler"] | {"action_scale": [0.0, 1.0]}
+    for spoil in (
+        lambda: path.write_bytes(whole[: len(whole) // 2]),
+        lambda: path.write_bytes(pickle.dumps({"weights": [1.0]})),
+        lambda: path.write_bytes(save(tensors)),
+        lambda: write_weights(path, {"a": torch.tensor([math.nan])}, description),
+        lambda: write_weights(path, tensors, {"format": "something else"}),
+        lambda: write_weights(path, half, description),
+        lambda: described(model="lstm"),
+        lambda: described(scaler=scaler),
+        lambda: described(config=description["config"] | {"sigma_scale": [1.0]}),
+    ):
+        path.unlink()
+        spoil()
+        with pytest.raises(ValueError, match=r"(?s)m\.safetensors.*train it again"):
+            load_checkpoint(path)
+
+
+def test_no_flipped_bit_loads_as_another_model(untrained, tmp_path):
+    rng = np.random.default_rng(0)
+    files = {
+        save_checkpoint(untrained, tmp_path / "m.safetensors", {"note": "none"}): load_checkpoint,
+        Reachability().save(tmp_path / "r.safetensors"): Reachability.load,
+    }
+    for path, load in files.items():
+        whole = path.read_bytes()
+        header = 8 + int.from_bytes(whole[:8], "little")
+        for number in range(50):
+            spoiled = bytearray(whole)
+            at = rng.integers(header if number % 2 else len(whole))
+            spoiled[at] ^= 1 << int(rng.integers(8))
+            path.write_bytes(spoiled)
+            with pytest.raises(ValueError, match=path.name):
+                load(path)
+
+
+def test_what_is_no_checkpoint_is_not_replaced(untrained, tmp_path):
+    (tmp_path / "m.safetensors").write_text("notes")
+    (tmp_path / "f.safetensors").mkdir()
+    (tmp_path / "l.safetensors").symlink_to(tmp_path / "nowhere")
+    for name in "mfl":
+        with pytest.raises(FileExistsError, match=f"{name}.safetensors is there and is not"):
+            save_checkpoint(untrained, tmp_path / f"{name}.safetensors", {})
+    assert (tmp_path / "m.safetensors").read_text() == "notes"
+
+
+def test_what_cannot_be_loaded_is_not_saved(untrained, tmp_path):
+    path = tmp_path / "m.safetensors"
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        save_checkpoint(untrained, path, {"loss": math.nan})
+    untrained.__class__ = type("Mine", (type(untrained),), {})
+    with pytest.raises(TypeError, match=r"model must be one of .*film.*, got a Mine"):
+        save_checkpoint(untrained, path, {})
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_model_is_not_judged_on_what_it_saw(pushes, held_out_pushes):
+    """Nor in doubt: sets of any size of a recipe, or of one with fewer fields, are the same."""
+    _, about = load_checkpoint("cnp_500")
+    split = split_interactions(500)
+    refuse_seen(about, pushes, split.test)
+    refuse_seen(about, held_out_pushes, np.arange(1000))
+    older, rougher = json.loads(about["recipe"]), json.loads(about["recipe"])
+    del older["anywhere"], older["world"]["tip_offset_m"]
+    rougher["world"]["table_friction"] = 0.6
+    larger = json.loads(pushes.attrs["recipe"]) | {"n_interactions": 2000}
+    for known, data, part in (
+        (about, pushes, split.train),
+        (about, pushes, split.validation),
+        (about | {"recipe": json.dumps(older)}, pushes, split.train),
+        (about | {"recipe": json.dumps(rougher)}, pushes, split.train),
+        (about, pushes.assign_attrs(recipe=json.dumps(larger)), np.arange(500)),
+    ):
+        with pytest.raises(ValueError, match="was trained or tuned on"):
+            refuse_seen(known, data, part)
+    for unknown in ({}, about | {"recipe": "{}"}, about | {"recipe": '{"seeds": 1}'}):
+        with pytest.raises(ValueError, match="does not say which interactions"):
+            refuse_seen(unknown, pushes, split.train)
