@@ -206,7 +206,7 @@ def load_state(path: str | Path, device: torch.device | str = "cpu") -> dict[str
         state = None
     if not isinstance(state, dict) or "about" not in state:
         raise ValueError(
-            f"resume_checkpoint {str(path)!r} is damaged, or not the state of a training; delete it "
-            "to begin again, or give another path"
+            f"resume_checkpoint {str(path)!r} is damaged, or not the state of a training; delete "
+            "it to begin again, or give another path"
         ) from None
     return state
