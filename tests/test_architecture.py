@@ -76,7 +76,6 @@ def test_modules_are_short_and_well_named(path):
     assert ast.get_docstring(TREES[path])
 
 
-@pytest.mark.xfail(strict=False, reason="a few functions are left")
 def test_no_function_has_too_many_parameters():
     for path, tree in TREES.items():
         for node in ast.walk(tree):

@@ -116,6 +116,16 @@ def shop(one_world, skills, pushes, tmp_path_factory):
     }
 
 
+def call(act, **given):
+    """What is called, and the arguments that it is given."""
+    return act, given
+
+
+def given_to(made):
+    """The class of a dataclass's instance, and the arguments that give it."""
+    return type(made), {f.name: getattr(made, f.name) for f in dataclasses.fields(made)}
+
+
 def valid_calls(shop):
     """Every public callable: its name, itself, and arguments with which it works."""
     w, goal, model, image = (shop[name] for name in ("world", "goal", "model", "image"))
@@ -144,299 +154,215 @@ def valid_calls(shop):
         return put_back_and
 
     return {
-        "Goal": (Goal, {"xy_m": at, "tolerance_m": 0.02, "turn_rad": 0.1, "height_m": 0.1}),
-        "Step": (Step, {f.name: getattr(shop["step"], f.name) for f in dataclasses.fields(Step)}),
-        "Plan": (Plan, {f.name: getattr(plan, f.name) for f in dataclasses.fields(Plan)}),
-        "Push": (Push, {"theta": 0.0, "length": 0.05, "radius": 0.2}),
-        "Push.towards": (Push.towards, {"direction_rad": 0.0}),
-        "Push.path": (Push(0.0).path, {"phase": 0.5}),
-        "Drag": (Drag, {"theta": 0.0, "length": 0.05, "grip_yaw": 0.0}),
-        "Grasp": (Grasp, {"grip_yaw": 0.0, "seen_height": 0.05}),
-        "Rotate": (Rotate, {"grip_yaw": 0.0}),
-        "LeverUp": (
-            LeverUp,
-            {"theta": 0.0, "contact_x": 0.0, "contact_y": 0.0, "reach": 0.1},
+        "Goal": call(Goal, xy_m=at, tolerance_m=0.02, turn_rad=0.1, height_m=0.1),
+        "Step": given_to(shop["step"]),
+        "Plan": given_to(plan),
+        "Push": call(Push, theta=0.0, length=0.05, radius=0.2),
+        "Push.towards": call(Push.towards, direction_rad=0.0),
+        "Push.path": call(Push(0.0).path, phase=0.5),
+        "Drag": call(Drag, theta=0.0, length=0.05, grip_yaw=0.0),
+        "Grasp": call(Grasp, grip_yaw=0.0, seen_height=0.05),
+        "Rotate": call(Rotate, grip_yaw=0.0),
+        "LeverUp": call(LeverUp, theta=0.0, contact_x=0.0, contact_y=0.0, reach=0.1),
+        "primitive_named": call(primitive_named, name="push"),
+        "Cuboid": call(world.Cuboid, length=0.05, width=0.05, height=0.05),
+        "UprightCylinder": call(world.UprightCylinder, diameter=0.05, height=0.05),
+        "LyingCylinder": call(world.LyingCylinder, length=0.05, diameter=0.05),
+        "Sphere": call(world.Sphere, diameter=0.05),
+        "Prism": call(world.Prism, corners=corners, height=0.05),
+        "category_named": call(world.category_named, name="cuboid"),
+        "WorldConfig": given_to(world.WorldConfig()),
+        "Tabletop": call(world.Tabletop, config=world.WorldConfig()),
+        "place": call(w.place, obj=shop["obj"], xy_m=at, yaw_rad=0.0, tool="gripper", config=None),
+        "execute_primitive": call(
+            on_table(w.execute_primitive), primitive=Push(0.0), stop_phase=0.5
         ),
-        "primitive_named": (primitive_named, {"name": "push"}),
-        "Cuboid": (world.Cuboid, {"length": 0.05, "width": 0.05, "height": 0.05}),
-        "UprightCylinder": (world.UprightCylinder, {"diameter": 0.05, "height": 0.05}),
-        "LyingCylinder": (world.LyingCylinder, {"length": 0.05, "diameter": 0.05}),
-        "Sphere": (world.Sphere, {"diameter": 0.05}),
-        "Prism": (world.Prism, {"corners": corners, "height": 0.05}),
-        "category_named": (world.category_named, {"name": "cuboid"}),
-        "WorldConfig": (world.WorldConfig, dataclasses.asdict(world.WorldConfig())),
-        "Tabletop": (world.Tabletop, {"config": world.WorldConfig()}),
-        "place": (
-            w.place,
-            {"obj": shop["obj"], "xy_m": at, "yaw_rad": 0.0, "tool": "gripper", "config": None},
-        ),
-        "execute_primitive": (
-            on_table(w.execute_primitive),
-            {"primitive": Push(0.0), "stop_phase": 0.5},
-        ),
-        "execute": (on_table(w.execute), {"step": shop["step"]}),
-        "execute_path": (
+        "execute": call(on_table(w.execute), step=shop["step"]),
+        "execute_path": call(
             on_table(w.execute_path),
-            {
-                "path_xy_m": np.array([[-0.1, 0.0], [0.0, 0.0]]),
-                "primitive": None,
-                "stop_phase": 1.0,
-            },
+            path_xy_m=np.array([[-0.1, 0.0], [0.0, 0.0]]),
+            primitive=None,
+            stop_phase=1.0,
         ),
-        "can_reach": (
-            on_table(w.can_reach),
-            {"primitive": Push(0.0), "stop_phase": 1.0, "at_xy_m": at},
-        ),
-        "picture": (w.picture, {"width": 32, "height": 32}),
-        "mark": (
-            on_table(w.mark),
-            {"xy_m": at, "rgb": (0.0, 0.5, 1.0), "yaw_rad": 0.0, "scale": 1.0},
-        ),
-        "shove": (on_table(w.shove), {"dx_m": 0.01, "dy_m": 0.0, "dyaw_rad": 0.1}),
-        "knock": (on_table(w.knock), {"dx_m_s": 0.1, "dy_m_s": 0.0, "spin_rad_s": 0.1}),
-        "topple": (on_table(w.topple), {"direction_rad": 0.1}),
-        "settle": (on_table(w.settle), {"seconds": 0.1}),
-        "Scaler": (interactions.Scaler, dataclasses.asdict(shop["scaler"])),
-        "from_dataset": (
+        "can_reach": call(on_table(w.can_reach), primitive=Push(0.0), stop_phase=1.0, at_xy_m=at),
+        "picture": call(w.picture, width=32, height=32),
+        "mark": call(on_table(w.mark), xy_m=at, rgb=(0.0, 0.5, 1.0), yaw_rad=0.0, scale=1.0),
+        "shove": call(on_table(w.shove), dx_m=0.01, dy_m=0.0, dyaw_rad=0.1),
+        "knock": call(on_table(w.knock), dx_m_s=0.1, dy_m_s=0.0, spin_rad_s=0.1),
+        "topple": call(on_table(w.topple), direction_rad=0.1),
+        "settle": call(on_table(w.settle), seconds=0.1),
+        "Scaler": given_to(shop["scaler"]),
+        "from_dataset": call(
             interactions.InteractionTensors.from_dataset,
-            {
-                "data": shop["data"],
-                "interactions": np.arange(4),
-                "action_channels": ("x", "y"),
-                "effect_channels": ("x", "y"),
-            },
+            data=shop["data"],
+            interactions=np.arange(4),
+            action_channels=("x", "y"),
+            effect_channels=("x", "y"),
         ),
-        "open_interactions": (interactions.open_interactions, {"name_or_path": "push_test"}),
-        "split_interactions": (
-            interactions.split_interactions,
-            {"n": 20, "seed": 0, "fold": 0, "n_folds": 10},
+        "open_interactions": call(interactions.open_interactions, name_or_path="push_test"),
+        "split_interactions": call(
+            interactions.split_interactions, n=20, seed=0, fold=0, n_folds=10
         ),
-        "Split": (interactions.Split, vars(interactions.split_interactions(20))),
-        "InteractionTensors": (interactions.InteractionTensors, vars(arrays)),
-        "Recipe": (Recipe, {f.name: getattr(Recipe(), f.name) for f in dataclasses.fields(Recipe)}),
-        "Variation": (Variation, dataclasses.asdict(Variation())),
-        "collect": (
+        "Split": given_to(interactions.split_interactions(20)),
+        "InteractionTensors": given_to(arrays),
+        "Recipe": given_to(Recipe()),
+        "Variation": given_to(Variation()),
+        "collect": call(
             collecting.collect,
-            {
-                "recipe": Recipe(n_interactions=1),
-                "path": shop["folder"] / "one.zarr.zip",
-                "progress": False,
-                "replace": False,
-            },
+            recipe=Recipe(n_interactions=1),
+            path=shop["folder"] / "one.zarr.zip",
+            progress=False,
+            replace=False,
         ),
-        "CNPConfig": (models.CNPConfig, dataclasses.asdict(models.CNPConfig())),
-        "FiLMConfig": (models.FiLMConfig, dataclasses.asdict(models.FiLMConfig())),
+        "CNPConfig": given_to(models.CNPConfig()),
+        "FiLMConfig": given_to(models.FiLMConfig()),
         "build": (models.build, build),
         "AffordanceCNP": (models.AffordanceCNP, build),
-        "FiLMNetwork": (models.FiLMNetwork, build | {"config": models.FiLMConfig()}),
-        "TrainingDomain": (models.TrainingDomain, dataclasses.asdict(network.domain)),
-        "TrainingConfig": (models.TrainingConfig, dataclasses.asdict(few)),
-        "coverage": (
-            models.coverage,
-            {"truth": ones, "mean": ones, "std": ones, "level": 0.5},
-        ),
-        "calibration_rows": (
+        "FiLMNetwork": call(models.FiLMNetwork, scaler=shop["scaler"], config=models.FiLMConfig()),
+        "TrainingDomain": given_to(network.domain),
+        "TrainingConfig": given_to(few),
+        "coverage": call(models.coverage, truth=ones, mean=ones, std=ones, level=0.5),
+        "calibration_rows": call(
             lambda model, tensors, phases: models.calibration_rows(model, tensors, phases),
-            {"model": network, "tensors": arrays, "phases": (0.8, 1.0)},
+            model=network,
+            tensors=arrays,
+            phases=(0.8, 1.0),
         ),
-        "fit_sigma_scale": (
-            models.fit_sigma_scale,
-            {"model": network, "validation": arrays, "phases": (0.8, 1.0)},
+        "fit_sigma_scale": call(
+            models.fit_sigma_scale, model=network, validation=arrays, phases=(0.8, 1.0)
         ),
-        "load_checkpoint": (models.load_checkpoint, {"name_or_path": "cnp_500"}),
-        "save_checkpoint": (
-            models.save_checkpoint,
-            {"model": network, "path": shop["folder"] / "net.safetensors", "about": {}},
+        "load_checkpoint": call(models.load_checkpoint, name_or_path="cnp_500"),
+        "save_checkpoint": call(
+            models.save_checkpoint, model=network, path=shop["folder"] / "net.safetensors", about={}
         ),
-        "condition_on_primitives": (
-            models.condition_on_primitives,
-            {"model": network, "actions": [Push(0.0)]},
+        "condition_on_primitives": call(
+            models.condition_on_primitives, model=network, actions=[Push(0.0)]
         ),
-        "train": (
+        "train": call(
             train_few,
-            {
-                "model": network,
-                "training": arrays,
-                "validation": arrays,
-                "config": few,
-                "resume_checkpoint": None,
-            },
+            model=network,
+            training=arrays,
+            validation=arrays,
+            config=few,
+            resume_checkpoint=None,
         ),
-        "train_model": (
+        "train_model": call(
             train_split,
-            {
-                "data": shop["data"],
-                "split": shop["split"],
-                "config": few,
-                "model_config": shop["config"],
-                "symmetries": (),
-            },
+            data=shop["data"],
+            split=shop["split"],
+            config=few,
+            model_config=shop["config"],
+            symmetries=(),
         ),
-        "train_literal": (
+        "train_literal": call(
             partial(models.train_literal, iterations=1),
-            {
-                "model": network,
-                "training": arrays,
-                "obs_max": 2,
-                "learning_rate": 1e-4,
-                "seed": 0,
-            },
+            model=network,
+            training=arrays,
+            obs_max=2,
+            learning_rate=0.0001,
+            seed=0,
         ),
-        "PlanMode": (planning.PlanMode, {"max_steps": 2, "partial": True}),
-        "Disturbance": (
-            planning.Disturbance,
-            {"kind": "knock", "action": 0, "x": 0.1, "y": 0.0, "turn": 0.0, "at_s": 1.0},
+        "PlanMode": call(planning.PlanMode, max_steps=2, partial=True),
+        "Disturbance": call(
+            planning.Disturbance, kind="knock", action=0, x=0.1, y=0.0, turn=0.0, at_s=1.0
         ),
-        "sample_disturbances": (
-            planning.sample_disturbances,
-            {"seed": 0, "n": 1, "n_actions": 2, "kinds": ("knock",), "strength": 1.0},
+        "sample_disturbances": call(
+            planning.sample_disturbances, seed=0, n=1, n_actions=2, kinds=("knock",), strength=1.0
         ),
-        "action_limit": (planning.action_limit, {"distance_m": 0.1}),
-        "EffectMap": (
-            planning.EffectMap,
-            {"model": model, "image": image, "kind": Push, "n_directions": 8, "n_phases": 5},
+        "action_limit": call(planning.action_limit, distance_m=0.1),
+        "EffectMap": call(
+            planning.EffectMap, model=model, image=image, kind=Push, n_directions=8, n_phases=5
         ),
-        "PlanningProblem": (
-            planning.PlanningProblem,
-            {f.name: getattr(problem, f.name) for f in dataclasses.fields(problem)},
+        "PlanningProblem": given_to(problem),
+        "ClosedLoopConfig": given_to(planning.ClosedLoopConfig()),
+        "plan_astar": call(
+            planning.plan_astar, problem=problem, n_directions=36, stop_phases=(0.5, 1.0)
         ),
-        "ClosedLoopConfig": (
-            planning.ClosedLoopConfig,
-            dataclasses.asdict(planning.ClosedLoopConfig()),
+        "plan_continuous": call(planning.plan_continuous, problem=problem, seed=0, draft=True),
+        "plan_gradient": call(
+            planning.plan_gradient, problem=problem, samples=10, starts=1, seed=0
         ),
-        "plan_astar": (
-            planning.plan_astar,
-            {"problem": problem, "n_directions": 36, "stop_phases": (0.5, 1.0)},
+        "plan_turn": call(
+            planning.plan_turn, **grip, model=shop["skills"].model(Rotate), turn_rad=0.3
         ),
-        "plan_continuous": (
-            planning.plan_continuous,
-            {"problem": problem, "seed": 0, "draft": True},
+        "plan_lift": call(
+            planning.plan_lift, **grip, model=shop["skills"].model(Grasp), height_m=0.05
         ),
-        "plan_gradient": (
-            planning.plan_gradient,
-            {"problem": problem, "samples": 10, "starts": 1, "seed": 0},
+        "kind_for": call(shop["skills"].kind_for, image=image),
+        "Skills": call(planning.Skills, models={"push": model}, reachability=None, threshold=0.2),
+        "execute_plan": call(
+            on_table(planning.execute_plan), robot=w, plan=plan, corrections=0, enough_m=0.001
         ),
-        "plan_turn": (
-            planning.plan_turn,
-            grip | {"model": shop["skills"].model(Rotate), "turn_rad": 0.3},
-        ),
-        "plan_lift": (
-            planning.plan_lift,
-            grip | {"model": shop["skills"].model(Grasp), "height_m": 0.05},
-        ),
-        "kind_for": (shop["skills"].kind_for, {"image": image}),
-        "Skills": (
-            planning.Skills,
-            {"models": {"push": model}, "reachability": None, "threshold": 0.2},
-        ),
-        "execute_plan": (
-            on_table(planning.execute_plan),
-            {"robot": w, "plan": plan, "corrections": 0, "enough_m": 0.001},
-        ),
-        "run_closed_loop": (
+        "run_closed_loop": call(
             on_table(planning.run_closed_loop),
-            {
-                "robot": w,
-                "goal": Goal(at, 0.05),
-                "skills": shop["skills"],
-                "config": planning.ClosedLoopConfig(max_actions=1, horizon=1),
-            },
+            robot=w,
+            goal=Goal(at, 0.05),
+            skills=shop["skills"],
+            config=planning.ClosedLoopConfig(max_actions=1, horizon=1),
         ),
-        "closed_loop": (
-            show.closed_loop,
-            {"skills": shop["skills"], "tolerance_m": 0.002},
-        ),
-        "plot_depth": (show.plot_depth, {"ax": ax, "image": image, "width_m": 0.16}),
-        "plot_footprint": (
-            show.plot_footprint,
-            {"ax": ax, "obj": shop["obj"], "xy_m": at, "yaw_rad": 0.0},
-        ),
-        "plot_plan": (show.plot_plan, {"ax": ax, "plan": plan, "sigma": True, "yaw_rad": 0.0}),
-        "plot_outcome": (show.plot_outcome, {"ax": ax, "outcome": shop["outcome"]}),
-        "plot_table": (show.plot_table, {"ax": ax, "around_m": at, "half_width_m": 0.3}),
-        "save_figure": (
-            show.save_figure,
-            {"figure": figure, "folder": shop["folder"], "name": "x"},
-        ),
-        "GoalPicker": (
+        "closed_loop": call(show.closed_loop, skills=shop["skills"], tolerance_m=0.002),
+        "plot_depth": call(show.plot_depth, ax=ax, image=image, width_m=0.16),
+        "plot_footprint": call(show.plot_footprint, ax=ax, obj=shop["obj"], xy_m=at, yaw_rad=0.0),
+        "plot_plan": call(show.plot_plan, ax=ax, plan=plan, sigma=True, yaw_rad=0.0),
+        "plot_outcome": call(show.plot_outcome, ax=ax, outcome=shop["outcome"]),
+        "plot_table": call(show.plot_table, ax=ax, around_m=at, half_width_m=0.3),
+        "save_figure": call(show.save_figure, figure=figure, folder=shop["folder"], name="x"),
+        "GoalPicker": call(
             on_table(show.GoalPicker),
-            {"world": w, "planners": {"A*": planner}, "goal_xy_m": (0.1, 0.0), "seed": 0},
+            world=w,
+            planners={"A*": planner},
+            goal_xy_m=(0.1, 0.0),
+            seed=0,
         ),
-        "PhaseSlider": (
-            on_table(show.PhaseSlider),
-            {"world": w, "action": Push(0.0), "phase": 0.5},
-        ),
-        "ConditioningExplorer": (
-            show.ConditioningExplorer,
-            {"model": model, "seen": shop["seen"]},
-        ),
-        "FrameRecorder": (show.FrameRecorder, {"every": 30, "width": 32, "height": 32}),
-        "show_animation": (
+        "PhaseSlider": call(on_table(show.PhaseSlider), world=w, action=Push(0.0), phase=0.5),
+        "ConditioningExplorer": call(show.ConditioningExplorer, model=model, seen=shop["seen"]),
+        "FrameRecorder": call(show.FrameRecorder, every=30, width=32, height=32),
+        "show_animation": call(
             show.show_animation,
-            {"recorder": shop["film"], "path": shop["folder"] / "film.gif", "beside": figure},
+            recorder=shop["film"],
+            path=shop["folder"] / "film.gif",
+            beside=figure,
         ),
-        "plot_levered": (
+        "plot_levered": call(
             show.plot_levered,
-            {
-                "ax": ax,
-                "outline_m": np.array(corners),
-                "height_m": 0.05,
-                "pose": np.zeros(4),
-                "color": "black",
-                "label": "x",
-            },
+            ax=ax,
+            outline_m=np.array(corners),
+            height_m=0.05,
+            pose=np.zeros(4),
+            color="black",
+            label="x",
         ),
-        "outline_in_lever_frame": (
+        "outline_in_lever_frame": call(
             show.outline_in_lever_frame,
-            {
-                "obj": shop["obj"],
-                "yaw_rad": 0.3,
-                "contact_xy_m": np.array(at),
-                "theta_rad": 0.1,
-            },
+            obj=shop["obj"],
+            yaw_rad=0.3,
+            contact_xy_m=np.array(at),
+            theta_rad=0.1,
         ),
-        "plot_closed_loop": (
-            show.plot_closed_loop,
-            {"ax": ax, "result": shop["pursuit"], "obj": shop["obj"]},
+        "plot_closed_loop": call(
+            show.plot_closed_loop, ax=ax, result=shop["pursuit"], obj=shop["obj"]
         ),
-        "refuse_seen": (
+        "refuse_seen": call(
             evaluation.refuse_seen,
-            {"about": shop["about"], "data": shop["test"], "interactions": np.arange(2)},
+            about=shop["about"],
+            data=shop["test"],
+            interactions=np.arange(2),
         ),
-        "error_row": (evaluation.error_row, {"errors_m": np.array([0.1, 0.2])}),
-        "save_plan": (save_plan, {"path": shop["folder"] / "p.json", "plan": plan}),
-        "load_plan": (load_plan, {"path": shop["saved"]}),
-        "write_results": (
-            write_results,
-            {"out_dir": shop["folder"], "notebook": "x", "parameters": {}, "tables": {}},
+        "error_row": call(evaluation.error_row, errors_m=np.array([0.1, 0.2])),
+        "save_plan": call(save_plan, path=shop["folder"] / "p.json", plan=plan),
+        "load_plan": call(load_plan, path=shop["saved"]),
+        "write_results": call(
+            write_results, out_dir=shop["folder"], notebook="x", parameters={}, tables={}
         ),
-        "read_results": (read_results, {"path": "data/results/planning.json"}),
-        "results_table": (
-            results_table,
-            {"rows": read_results("data/results/planning.json")["tables"]["summary"][:3]},
+        "read_results": call(read_results, path="data/results/planning.json"),
+        "results_table": call(
+            results_table, rows=read_results("data/results/planning.json")["tables"]["summary"][:3]
         ),
-        "check": (check, {"name": "01.1", "attempt": None}),
+        "check": call(check, name="01.1", attempt=None),
     }
 
 
-NAMES = re.findall(
-    r"\S+",
-    """
-Goal Step Plan Push Push.towards Push.path Drag Grasp Rotate LeverUp primitive_named Cuboid
-UprightCylinder LyingCylinder Sphere Prism category_named WorldConfig Tabletop place
-execute_primitive execute execute_path can_reach picture mark shove knock
-topple settle Scaler from_dataset open_interactions split_interactions Recipe Variation collect
-CNPConfig FiLMConfig build TrainingDomain TrainingConfig coverage fit_sigma_scale
-load_checkpoint save_checkpoint condition_on_primitives train train_literal PlanMode Disturbance
-sample_disturbances action_limit EffectMap PlanningProblem ClosedLoopConfig plan_astar
-plan_continuous plan_gradient plan_turn plan_lift kind_for Skills execute_plan run_closed_loop
-closed_loop plot_depth plot_footprint plot_plan
-plot_outcome plot_table save_figure GoalPicker PhaseSlider FrameRecorder ConditioningExplorer
-error_row save_plan load_plan write_results read_results results_table check
-Split InteractionTensors AffordanceCNP FiLMNetwork calibration_rows train_model refuse_seen
-outline_in_lever_frame plot_levered plot_closed_loop show_animation
-""",
-)
+NAMES = re.findall(r'^        "(\S+)": ', inspect.getsource(valid_calls), re.MULTILINE)
 
 
 def silent_nans(result):
@@ -461,7 +387,7 @@ def test_a_hostile_value_is_refused_by_name_or_does_no_harm(shop, name, tmp_path
     found = []
 
     @settings(
-        max_examples=200,
+        max_examples=120,
         derandomize=True,
         deadline=None,
         database=None,

@@ -92,7 +92,10 @@ class Recipe:
             if not values:
                 raise ValueError(f"{name} must be a sequence of at least one name, got none")
             for value in values:
-                check(value)
+                try:
+                    check(value)
+                except (TypeError, ValueError) as error:
+                    raise type(error)(f"{name}: {error}") from None
             object.__setattr__(self, name, values)
         for name in ("size_range_m", "height_range_m"):
             if getattr(self, name) is not None:

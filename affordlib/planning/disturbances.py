@@ -176,8 +176,8 @@ def sample_disturbances(
     shoves of 3 to 10 cm and up to half a turn, knocks of 0.2 to 0.5 m/s, goals that move by 3 to
     10 cm. strength: multiplies these.
     """
-    if not kinds:
-        raise ValueError("kinds must hold at least one kind of disturbance, got none")
+    if not kinds or not set(map(str, kinds)) <= set(KINDS):
+        raise ValueError(f"kinds must be at least one of {KINDS}, got {kinds!r:.100}")
     check_count("n", n, 0, 1000)
     check_count("n_actions", n_actions, 1, 1000)
     check_within("strength", strength, 0.0, 10.0)
