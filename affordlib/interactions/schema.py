@@ -18,51 +18,40 @@ from affordlib.world.trajectory import N_SAMPLES
 GRAIN = 2.0**-20
 """About 1 µm or 1 µrad: what is smaller in a float32 is not kept."""
 
-_UNITS = {"units": "m, rad"}
-_VARIABLES: dict[str, tuple[str, str, dict[str, str]]] = {
-    "interaction": ("int64", "", {}),
-    "image": ("float32", "image_channel row column", {"units": "m (depth), 1"}),
-    "action": ("float32", "sample action_channel", {"units": "m, rad; gripper 1 open, 0 closed"}),
-    "effect": ("float32", "sample effect_channel", _UNITS),
-    "rest_effect": ("float32", "effect_channel", _UNITS),
+_VARIABLES = {
+    "interaction": ("int64", ""),
+    "image": ("float32", "image_channel row column", "m (depth), 1"),
+    "action": ("float32", "sample action_channel", "m, rad; gripper 1 open, 0 closed"),
+    "effect": ("float32", "sample effect_channel", "m, rad"),
+    "rest_effect": ("float32", "effect_channel", "m, rad"),
     "tool": (
         "float32",
         "recorded_sample tool_channel",
-        {
-            "units": "m, rad, m",
-            "long_name": "measured x, y, z, yaw and finger gap, every 150 ms of a full execution",
-        },
+        "m, rad, m",
+        "measured x, y, z, yaw and finger gap, every 150 ms of a full execution",
     ),
-    "stop_phase": ("float64", "", {}),
-    "size": ("float32", "size_axis", {"units": "m"}),
-    "mass": ("float32", "", {"units": "kg"}),
-    "com_offset": ("float32", "xyz", {"units": "m"}),
-    "friction": ("float32", "surface", {"long_name": "of table, object, fingers"}),
-    "tip_offset": (
-        "float32",
-        "",
-        {"units": "m", "long_name": "how much higher than commanded the tool moved"},
-    ),
-    "start_pose": ("float64", "pose_channel", {"units": "m, m, rad"}),
-    "believed_xy": (
-        "float64",
-        "xy",
-        {"units": "m", "long_name": "where the robot took the object to be"},
-    ),
-    "rollable": ("bool", "", {"long_name": "can roll as it was placed"}),
-    "rolls": ("bool", "", {"long_name": "can roll as it lies at the end"}),
-    "fell": ("bool", "", {"long_name": "lies differently than it was placed"}),
-    "reached": ("bool", "", {"long_name": "the arm could do it; if not, nothing happened"}),
-    "success": ("bool", "", {"long_name": "the primitive did what it is for"}),
-    "tracking_error": ("float32", "", {"units": "m"}),
-    "penetration": ("float32", "", {"units": "m"}),
-    "left_table": ("bool", "", {}),
-    "fault": ("bool", "", {"long_name": "not to be believed: exclude"}),
+    "stop_phase": ("float64", ""),
+    "size": ("float32", "size_axis", "m"),
+    "mass": ("float32", "", "kg"),
+    "com_offset": ("float32", "xyz", "m"),
+    "friction": ("float32", "surface", "", "of table, object, fingers"),
+    "tip_offset": ("float32", "", "m", "how much higher than commanded the tool moved"),
+    "start_pose": ("float64", "pose_channel", "m, m, rad"),
+    "believed_xy": ("float64", "xy", "m", "where the robot took the object to be"),
+    "rollable": ("bool", "", "", "can roll as it was placed"),
+    "rolls": ("bool", "", "", "can roll as it lies at the end"),
+    "fell": ("bool", "", "", "lies differently than it was placed"),
+    "reached": ("bool", "", "", "the arm could do it; if not, nothing happened"),
+    "success": ("bool", "", "", "the primitive did what it is for"),
+    "tracking_error": ("float32", "", "m"),
+    "penetration": ("float32", "", "m"),
+    "left_table": ("bool", ""),
+    "fault": ("bool", "", "", "not to be believed: exclude"),
 }
-"""Type, dimensions after the interaction, and attributes of what every set holds."""
+"""Type, dimensions after the interaction, unit and meaning of what every set holds."""
 
-_PARAMETER = {"units": "m or rad", "long_name": "parameter of the primitive"}
-_FULL_EFFECT = _UNITS | {"long_name": "the state of the full execution at stop_phase"}
+_PARAMETER = ("float64", "", "m or rad", "parameter of the primitive")
+_FULL_EFFECT = "the state of the full execution at stop_phase"
 _PHASE = {
     "long_name": "normalised time of the primitive; of a partial one, times stop_phase",
     "every_150_ms": f"every {(N_SAMPLES - 1) // (RECORDED_SAMPLES - 1)}th sample",
@@ -90,15 +79,13 @@ def attributes_for(recipe: Recipe) -> dict[str, str]:
 def collect_chunk(recipe: Recipe, numbers: range) -> xr.Dataset:
     """The interactions of a recipe with the given numbers."""
     # Read when a set is made: a reader may have added categories and primitives.
-    variables = _VARIABLES | {
-        name: ("int8", "", {"flag_meanings": " ".join(known)})
-        for name, known in (("primitive", PRIMITIVES), ("family", CATEGORIES))
-    }
+    flags = {"primitive": " ".join(PRIMITIVES), "family": " ".join(CATEGORIES)}
+    variables = _VARIABLES | dict.fromkeys(flags, ("int8", ""))
     kinds = [primitive_named(name) for name in recipe.primitives]
     parameters = sorted({name for kind in kinds for name in _field_names(kind)})
-    variables |= dict.fromkeys(parameters, ("float64", "", _PARAMETER))
+    variables |= dict.fromkeys(parameters, _PARAMETER)
     if recipe.partial:
-        variables["full_effect"] = ("float32", "effect_channel", _FULL_EFFECT)
+        variables["full_effect"] = ("float32", "effect_channel", "m, rad", _FULL_EFFECT)
     rows = []
     with Tabletop(recipe.world) as world:
         for number in numbers:
@@ -111,7 +98,9 @@ def collect_chunk(recipe: Recipe, numbers: range) -> xr.Dataset:
                 ]
             rows.append(row | {"interaction": number})
     data = {"phase": ("sample", np.linspace(0, 1, N_SAMPLES), _PHASE)}
-    for name, (dtype, dims, attrs) in variables.items():
+    for name, (dtype, dims, *about) in variables.items():
+        known = zip(("units", "long_name"), about, strict=False)
+        attrs = {"flag_meanings": flags[name]} if name in flags else {k: v for k, v in known if v}
         values = np.stack([_grained(row[name], dtype) for row in rows])
         data[name] = (("interaction", *dims.split()), values, attrs)
     return xr.Dataset(data, attrs=attributes_for(recipe))

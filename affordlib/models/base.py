@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -70,8 +71,8 @@ class EffectNetwork(nn.Module, ABC):
     """A network that satisfies `EffectModel`.
 
     Inputs and outputs are in metres and radians, in the frame of the table; standardisation and
-    rotation into the network's frame happen inside. A subclass gives `features` of an image and
-    `outputs`; both know nothing of frames and units.
+    rotation into the network's frame happen inside. A subclass gives `features` and
+    `outputs`, which know nothing of frames and units, and makes its layers in `make_layers`.
     """
 
     @checked
@@ -92,6 +93,10 @@ class EffectNetwork(nn.Module, ABC):
         for name in ("action_scale", "effect_scale", "image_mean", "image_std"):
             values = torch.tensor(getattr(scaler, name), dtype=torch.float32)
             self.register_buffer(name, values, persistent=False)
+        self.make_layers(config)
+
+    def make_layers(self, config: Any) -> None:
+        """Make the layers that the configuration describes."""
 
     @abstractmethod
     def features(self, scaled_image: Float[Tensor, "b 2 n n"]) -> Float[Tensor, "b f"]:

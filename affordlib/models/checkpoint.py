@@ -79,8 +79,6 @@ def save_checkpoint(model: EffectNetwork, path: str | Path, about: dict[str, Any
 def resolve_checkpoint(name_or_path: str | Path) -> Path:
     """The file of a shipped checkpoint's name, or of a path; raises when there is none."""
     path = Path(name_or_path)
-    if path.suffix == SUFFIX and path.is_file():
-        return path
     folder = repo_root() / "data" / "checkpoints"
     path = path if path.suffix == SUFFIX else folder / f"{name_or_path}{SUFFIX}"
     if not path.is_file():
@@ -195,14 +193,7 @@ def load_state(path: str | Path, device: torch.device | str = "cpu") -> dict[str
         with zipfile.ZipFile(path) as archive:
             damaged = archive.testzip()
         state = None if damaged else torch.load(path, weights_only=True, map_location=device)
-    except (
-        zipfile.BadZipFile,
-        pickle.UnpicklingError,
-        RuntimeError,
-        EOFError,
-        OSError,
-        ValueError,
-    ):
+    except (zipfile.BadZipFile, pickle.PickleError, RuntimeError, EOFError, OSError, ValueError):
         state = None
     if not isinstance(state, dict) or "about" not in state:
         raise ValueError(

@@ -21,9 +21,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from affordlib import checked
-from affordlib.interactions.dataset import Scaler
 from affordlib.models.base import EffectNetwork, NetworkConfig, he_initialise, with_time
-from affordlib.models.domain import TrainingDomain
 from affordlib.types import Observations
 
 ENCODER_WIDTHS = (32, 64, 64, 128, 128, 256, 128)
@@ -66,10 +64,8 @@ def image_encoder() -> nn.Sequential:
 class AffordanceCNP(EffectNetwork):
     """Relates object image, action and effect; satisfies `EffectModel`."""
 
-    def __init__(
-        self, config: CNPConfig, scaler: Scaler, domain: TrainingDomain | None = None
-    ) -> None:
-        super().__init__(config, scaler, domain)
+    def make_layers(self, config: CNPConfig) -> None:
+        """Encoders and decoders as described above."""
         n_a, n_e = len(config.action_channels), len(config.effect_channels)
         self.image_encoder = image_encoder()
         self.action_encoder = _dense((n_a + 1, *ENCODER_WIDTHS), activate_last=True)

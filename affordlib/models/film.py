@@ -20,8 +20,6 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from affordlib import checked
-from affordlib.interactions.dataset import Scaler
-from affordlib.models.domain import TrainingDomain
 from affordlib.models.harmonics import HarmonicsConfig, HarmonicsNetwork, dense, waves
 from affordlib.types import Observations
 
@@ -60,10 +58,9 @@ class FiLMBlock(nn.Module):
 class FiLMNetwork(HarmonicsNetwork):
     """Relates object image, action and effect; satisfies `EffectModel`."""
 
-    def __init__(
-        self, config: FiLMConfig, scaler: Scaler, domain: TrainingDomain | None = None
-    ) -> None:
-        super().__init__(config, scaler, domain)
+    def make_layers(self, config: FiLMConfig) -> None:
+        """Encoders and decoders as described above."""
+        super().make_layers(config)
         c, w = config, config.width
         n_a, n_e = len(c.action_channels), len(c.effect_channels)
         self.action_encoder = nn.Sequential(*dense(n_a + 1, w, w, w))

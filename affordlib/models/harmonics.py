@@ -11,9 +11,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from affordlib import checked
-from affordlib.interactions.dataset import Scaler
 from affordlib.models.base import EffectNetwork, NetworkConfig, he_initialise
-from affordlib.models.domain import TrainingDomain
 from affordlib.types import IMAGE_PIXELS
 
 
@@ -87,10 +85,8 @@ class HarmonicsConfig(NetworkConfig):
 class HarmonicsNetwork(EffectNetwork):
     """A network whose image encoder reads the circular harmonics of the image."""
 
-    def __init__(
-        self, config: HarmonicsConfig, scaler: Scaler, domain: TrainingDomain | None = None
-    ) -> None:
-        super().__init__(config, scaler, domain)
+    def make_layers(self, config: HarmonicsConfig) -> None:
+        """The harmonics, and the encoder of the image that reads them."""
         self.harmonics, n = CircularHarmonics(config.rings, config.orders), config.image_features
         self.image_encoder = nn.Sequential(*dense(self.harmonics.n_features, 4 * n, 2 * n, n))
         self.image_encoder.apply(he_initialise)

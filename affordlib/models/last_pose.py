@@ -20,9 +20,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from affordlib import checked
-from affordlib.interactions.dataset import Scaler
 from affordlib.models.base import masked_mean, with_time
-from affordlib.models.domain import TrainingDomain
 from affordlib.models.film import FiLMConfig, FiLMNetwork
 from affordlib.models.harmonics import dense, waves
 from affordlib.types import Observations
@@ -38,6 +36,17 @@ class LastPoseConfig(FiLMConfig):
 
     frame: str = "table"
     steps: int = 25
+
+
+def between(values: Float[Tensor, "b n c"], at: Float[Tensor, "b t"]) -> Float[Tensor, "b t c"]:
+    """Values at places between steps, linearly."""
+    below = at.detach().floor().long().clamp(0, values.shape[1] - 2)
+    share = (at - below)[..., None]
+
+    def pick(index: Tensor) -> Tensor:
+        return values.gather(1, index[..., None].expand(-1, -1, values.shape[-1]))
+
+    return (1 - share) * pick(below) + share * pick(below + 1)
 
 
 class MeanTrajectory(nn.Module):
@@ -57,20 +66,16 @@ class MeanTrajectory(nn.Module):
         self.values = effect.mean(dim=0) / scale
 
     def forward(self, t: Float[Tensor, "b t"]) -> Float[Tensor, "b t c"]:
-        last = len(self.values) - 1
-        at = t.clamp(0, 1) * last
-        below = at.detach().floor().clamp(0, last - 1).long()
-        share = (at - below)[..., None]
-        return (1 - share) * self.values[below] + share * self.values[below + 1]
+        at = t.clamp(0, 1) * (len(self.values) - 1)
+        return between(self.values.expand(len(t), -1, -1), at)
 
 
 class LastPoseCNP(FiLMNetwork):
     """Predicts a trajectory from any observed part of it; satisfies `EffectModel`."""
 
-    def __init__(
-        self, config: LastPoseConfig, scaler: Scaler, domain: TrainingDomain | None = None
-    ) -> None:
-        super().__init__(config, scaler, domain)
+    def make_layers(self, config: LastPoseConfig) -> None:
+        """Encoders and decoders as described above."""
+        super().make_layers(config)
         c, w = config, config.width
         n_e = len(c.effect_channels)
         self.mean_trajectory = MeanTrajectory(c.steps, n_e)

@@ -125,14 +125,10 @@ def from_start_errors_m(
 
 
 def _sample_all(
-    tensors: InteractionTensors,
-    n_targets: int,
-    obs_max: int,
-    generator: torch.Generator,
+    tensors: InteractionTensors, n_targets: int, obs_max: int, generator: torch.Generator
 ) -> Batch:
     kind = int(torch.randint(0, 2, (1,), generator=generator))
-    sampler = (sample_windows, sample_from_start)[kind]
-    return sampler(tensors, n_targets, obs_max, generator)
+    return (sample_windows, sample_from_start)[kind](tensors, n_targets, obs_max, generator)
 
 
 def _all_errors_m(model: EffectNetwork, tensors: InteractionTensors) -> Tensor:

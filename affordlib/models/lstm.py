@@ -16,17 +16,15 @@ from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
 from torch import Tensor, nn
 
 from affordlib import checked
 from affordlib.geometry import rotate_channels
-from affordlib.interactions.dataset import InteractionTensors, Scaler
+from affordlib.interactions.dataset import InteractionTensors
 from affordlib.interactions.sampling import condition_on_recorded_action
 from affordlib.models.base import masked_mean, with_time
-from affordlib.models.domain import TrainingDomain
 from affordlib.models.harmonics import HarmonicsConfig, HarmonicsNetwork, dense, waves
-from affordlib.models.last_pose import MeanTrajectory
+from affordlib.models.last_pose import MeanTrajectory, between
 from affordlib.models.push_frame import inverse, push_direction
 from affordlib.types import Observations
 
@@ -74,10 +72,9 @@ class LSTMNetwork(HarmonicsNetwork):
     Between two steps it is linear, so that any phase can be queried, with gradients.
     """
 
-    def __init__(
-        self, config: LSTMConfig, scaler: Scaler, domain: TrainingDomain | None = None
-    ) -> None:
-        super().__init__(config, scaler, domain)
+    def make_layers(self, config: LSTMConfig) -> None:
+        """Encoders and decoders as described above."""
+        super().make_layers(config)
         c, w = config, config.width
         n_a, n_e = len(c.action_channels), len(c.effect_channels)
         self.mean_trajectory = MeanTrajectory(c.steps, n_e)
@@ -104,8 +101,8 @@ class LSTMNetwork(HarmonicsNetwork):
         known = on_grid(d, o.effect_t, o.effect_mask, self.config.steps)
         at = (t_target * self.config.steps - known.first[:, None]).clamp_min(0)
         path, raw = self.roll(known, static, max(1, int(at.detach().max().ceil())))
-        mu_e = self.mean_trajectory(t_target) + _between(path, at)
-        sigma_e = self.sigma_floor + F.softplus(_between(raw, at))
+        mu_e = self.mean_trajectory(t_target) + between(path, at)
+        sigma_e = self.sigma_floor + F.softplus(between(raw, at))
         times = waves(t_target, self.config.waves)
         given = torch.cat([static[:, None].expand(-1, times.shape[1], -1), times], dim=-1)
         mu_a, raw_a = self.action_decoder(given).chunk(2, dim=-1)
@@ -147,17 +144,6 @@ class LSTMNetwork(HarmonicsNetwork):
             path.append(predicted)
             sigmas.append(raw)
         return torch.stack(path, dim=1), torch.stack(sigmas, dim=1)
-
-
-def _between(values: Float[Tensor, "b n c"], at: Float[Tensor, "b t"]) -> Float[Tensor, "b t c"]:
-    """Values at places between steps, linearly."""
-    below = at.detach().floor().long().clamp(0, values.shape[1] - 2)
-    share = (at - below)[..., None]
-
-    def pick(index: Tensor) -> Tensor:
-        return values.gather(1, index[..., None].expand(-1, -1, values.shape[-1]))
-
-    return (1 - share) * pick(below) + share * pick(below + 1)
 
 
 def effects_at_steps(model: LSTMNetwork, tensors: InteractionTensors) -> Tensor:

@@ -1,7 +1,5 @@
 """The paper's network: its layers, its equations, its likelihood."""
 
-import dataclasses
-
 import pytest
 import torch
 from torch import nn
@@ -62,17 +60,6 @@ def test_representation_is_equations_2_and_3(untrained):
             r_i.append(w_1 * h_a + (1 - w_1) * h_e)
         expected.append(torch.stack(r_i).mean(dim=0))
     torch.testing.assert_close(untrained.represent(seen), torch.stack(expected))
-
-
-def test_masked_observations_have_no_effect(untrained):
-    """Masked ones are as if they were not there, whatever they hold."""
-    seen, mask = some_observations(), (torch.arange(N) < 3).expand(2, -1)
-    action = torch.where(mask[..., None], seen.action, 1e3)
-    masked = dataclasses.replace(seen, action=action, action_mask=mask)
-    short = dataclasses.replace(
-        seen, **{n: getattr(seen, n)[:, :3] for n in ("action", "action_t", "action_mask")}
-    )
-    torch.testing.assert_close(untrained.represent(masked), untrained.represent(short))
 
 
 def test_folded_decoding_equals_the_layers_one_by_one(untrained):

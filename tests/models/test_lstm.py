@@ -1,19 +1,14 @@
 """Recurrent networks: of pushes, and the older study's, as published."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
 
 from affordlib.interactions import InteractionTensors, Scaler
 from affordlib.interactions.lever_up import N_OBSERVED
-from affordlib.interactions.sampling import sample_forward
 from affordlib.models import build
 from affordlib.models.lever_up import from_start_errors_m, window_errors_m
 from affordlib.models.lstm import LSTMConfig, effects_at_steps
-from affordlib.models.protocol import EffectModel, condition_on_primitives
-from affordlib.primitives import Push
 from experiments.lstm_seker2019 import SekerConfig, SekerLSTM, train_seker
 
 
@@ -71,47 +66,6 @@ def test_a_published_training_goes_on_where_it_was_broken_off(tmp_path, levered,
         torch.testing.assert_close(a, b, atol=0, rtol=0)
     assert window_errors_m(whole, levered).shape == (len(levered), 7, 5)
     assert from_start_errors_m(whole, levered).shape == (len(levered), 25)
-
-
-def test_gradients_that_vanish_are_forgotten(tmp_path, levered, small_published, monkeypatch):
-    """Most of a published network's units die, and their subnormal means take half of its time."""
-    begun = tmp_path / "begun.pt"
-    train_seker(small_published(), levered, levered, "window", 1, checkpoint=begun)
-    state = torch.load(begun)
-    for of in state["optimiser"]["state"].values():
-        of["exp_avg"].fill_(1e-39)
-
-    def go_on(vanishes):
-        monkeypatch.setattr("experiments.lstm_seker2019.NEGLIGIBLE", vanishes)
-        model, file = small_published(), tmp_path / f"{vanishes}.pt"
-        torch.save(state, file)
-        train_seker(model, levered, levered, "window", 2, checkpoint=file)
-        left = torch.load(file)
-        means = [of["exp_avg"] for of in left["optimiser"]["state"].values()]
-        return left["model"], torch.cat([mean.flatten().abs() for mean in means])
-
-    (never, all_means), (usual, means) = go_on(0.0), go_on(1e-30)
-    assert ((all_means > 0) & (all_means < 1e-38)).any()
-    assert torch.equal(means, torch.where(all_means > 1e-30, all_means, 0.0))
-    assert all(torch.equal(never[name], usual[name]) for name in never)
-
-
-def test_an_lstm_of_pushes_is_a_model_like_the_others(pushes):
-    few = InteractionTensors.from_dataset(pushes, np.arange(8))
-    torch.manual_seed(0)
-    model = build(LSTMConfig(frame="push", steps=5, width=16), Scaler.fit(few)).eval()
-    torch.nn.init.normal_(model.last[-1].weight)  # zero at first, so that it begins by coasting
-    assert isinstance(model, EffectModel)
-    batch = sample_forward(few.select(torch.arange(8)), 3, 1, torch.Generator().manual_seed(0))
-    loss = model.loss(batch.image, batch.observations, batch.t_target, batch.action, batch.effect)
-    assert torch.isfinite(loss)
-    seen = condition_on_primitives(model, [Push(0.3)])
-    action = seen.action.requires_grad_()
-    told = model.predict(
-        model.encode(few.image[:1]), replace(seen, action=action), torch.ones(1, 1)
-    )
-    told.effect_mean.sum().backward()
-    assert action.grad.abs().sum() > 0
 
 
 def test_the_course_of_pushes_is_that_seen_from_behind(pushes):

@@ -9,14 +9,10 @@ import torch
 from matplotlib.figure import Figure
 
 from affordlib.interactions import Scaler
-from affordlib.interactions.lever_up import (
-    N_OBSERVED,
-    lever_up_tensors,
-)
+from affordlib.interactions.lever_up import N_OBSERVED, lever_up_tensors
 from affordlib.interactions.recipes import Recipe, sample_scene
 from affordlib.interactions.sampling import condition_on_poses
 from affordlib.models import build
-from affordlib.models.last_pose import LastPoseCNP, _last
 from affordlib.models.lever_up import (
     LEVER_MODELS,
     PROTOCOLS,
@@ -24,20 +20,20 @@ from affordlib.models.lever_up import (
     from_start_errors_m,
     predict_steps,
 )
-from affordlib.models.lstm import on_grid
 from affordlib.show import FrameRecorder, outline_in_lever_frame, plot_levered
+
+
+def made(name, levered):
+    torch.manual_seed(0)
+    model = build(LEVER_MODELS[name].network, Scaler.fit(levered)).eval()
+    if hasattr(model, "mean_trajectory"):
+        model.mean_trajectory.fit(levered.effect, model.effect_scale)
+    return model
 
 
 @pytest.fixture(scope="module", params=["cnp_last_pose", "lstm_tuned", "cnp"])
 def untrained(request, levered):
-    torch.manual_seed(0)
-    model = build(LEVER_MODELS[request.param].network, Scaler.fit(levered))
-    if hasattr(model, "mean_trajectory"):
-        model.mean_trajectory.fit(levered.effect, model.effect_scale)
-    return model.eval()
-
-
-# Models
+    return made(request.param, levered)
 
 
 def test_no_model_sees_what_it_has_to_foresee(untrained, levered):
@@ -59,32 +55,8 @@ def test_models_use_what_they_observe(untrained, levered):
     assert (told.effect_mean - other.effect_mean).abs().max() > 1e-3
 
 
-def test_the_first_pose_tells_nothing_to_those_that_anchor(levered):
-    for name in ("cnp_last_pose", "lstm_tuned"):
-        torch.manual_seed(0)
-        model = build(LEVER_MODELS[name].network, Scaler.fit(levered)).eval()
-        first, none = (predict_steps(model, levered, p)[0].effect_mean for p in PROTOCOLS[1:])
-        if name == "lstm_tuned":
-            torch.testing.assert_close(first, none)
-        assert first[:, 0, :3].abs().max() < 0.05
-
-
-def test_the_last_observation_is_found_in_any_order():
-    off = torch.tensor([[[1.0], [4.0], [2.0], [9.0]]])
-    t = torch.tensor([[0.1, 0.4, 0.2, 0.9]])
-    seen = torch.tensor([[True, True, True, False]])
-    value, at, speed = _last(off, t, seen)
-    assert (value.item(), at.item()) == (4.0, pytest.approx(0.4))
-    torch.testing.assert_close(speed, torch.tensor([[1.0]]))
-    value, at, speed = _last(off, t, torch.zeros_like(seen))
-    assert value.abs().sum() + at.abs().sum() + speed.abs().sum() == 0
-
-
 def test_an_anchored_network_begins_where_the_object_is(levered):
-    torch.manual_seed(0)
-    model = build(LEVER_MODELS["cnp_last_pose"].network, Scaler.fit(levered)).eval()
-    assert isinstance(model, LastPoseCNP)
-    model.mean_trajectory.fit(levered.effect, model.effect_scale)
+    model = made("cnp_last_pose", levered)
     seen = condition_on_poses(levered, torch.zeros(len(levered), dtype=torch.long), 10)
     t = levered.phase[[9]].expand(len(levered), -1)
     with torch.no_grad():
@@ -92,29 +64,17 @@ def test_an_anchored_network_begins_where_the_object_is(levered):
     torch.testing.assert_close(told.effect_mean[:, 0], levered.effect[:, 9], atol=1e-5, rtol=0)
 
 
-def test_observations_fall_on_their_steps():
-    t = torch.tensor([[0.2, 0.4, 0.0], [0.0, 0.0, 0.0]])
-    seen = torch.tensor([[True, True, False], [False, False, False]])
-    known = on_grid(torch.arange(6.0).reshape(2, 3, 1) + 1, t, seen, 5)
-    assert known.where.tolist() == [[False, True, True] + [False] * 3, [True] + [False] * 5]
-    assert known.first.tolist() == [1, 0]
-    assert known.d[0, :, 0].tolist() == [0, 1, 2, 0, 0, 0]
-
-
 def test_a_rollout_does_not_depend_on_how_far_it_is_asked(levered):
-    torch.manual_seed(0)
-    model = build(LEVER_MODELS["lstm_tuned"].network, Scaler.fit(levered)).eval()
+    model = made("lstm_tuned", levered)
     torch.nn.init.normal_(model.last[-1].weight, std=0.02)
     seen = condition_on_poses(levered, torch.zeros(len(levered), dtype=torch.long), 5)
     ask = levered.phase[[5, 12, 25]].expand(len(levered), -1)
     with torch.no_grad():
-        features = model.encode(levered.image)
-        whole = model.predict(features, seen, ask)
-        near = model.predict(features, seen, ask[:, :1])
-        between = model.predict(
-            features, seen, (levered.phase[[5]] + 0.02).expand(len(levered), -1)
+        features, step = model.encode(levered.image), levered.phase[5]
+        whole, near, between, next_one = (
+            model.predict(features, seen, t)
+            for t in (ask, ask[:, :1], 0 * ask[:, :1] + step + 0.02, 0 * ask[:, :1] + 6 / 25)
         )
-        next_one = model.predict(features, seen, levered.phase[[6]].expand(len(levered), -1))
     torch.testing.assert_close(whole.effect_mean[:, :1], near.effect_mean)
     middle = (near.effect_mean + next_one.effect_mean) / 2
     torch.testing.assert_close(between.effect_mean, middle, atol=1e-5, rtol=1e-4)
@@ -127,9 +87,6 @@ def test_training_learns(levered, short, name, kind):
     moves = levered.effect[:, 1:, :3].norm(dim=-1).mean()
     assert from_start_errors_m(model, levered).mean() < moves / 3
     assert len(history) == 2
-
-
-# Pictures
 
 
 def test_the_drawn_polygon_is_the_one_in_the_image(levers):
