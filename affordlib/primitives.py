@@ -1,15 +1,14 @@
 """What an action is, as a path in phase; no physics here (Section 3.3 and Figure 2 of the paper).
 
-A primitive is a chain of segments between keyframes, each covered with minimum-jerk timing. It
-gives the commanded end-effector path over the phase t in [0, 1], relative to where the object
-stood at the start. The world makes the arm follow it; models are conditioned on it.
+A primitive is a chain of segments, each with minimum-jerk timing: the commanded path of the gripper
+over the phase t in [0, 1], relative to where the object stood at the start.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import ClassVar
 
@@ -70,6 +69,20 @@ class Primitive:
     holds: ClassVar[bool] = False
     tool: ClassVar[str] = "gripper"
     acts_from: ClassVar[float] = 0.0
+    lengths_m: ClassVar[dict[str, tuple[float, float]]] = {}
+    """Where those of its parameters that are no angles must lie."""
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            name, value = field.name, getattr(self, field.name)
+            if value is None and field.default is None:
+                continue
+            if name in self.lengths_m:
+                check_field(self, name, *self.lengths_m[name], "m")
+            else:
+                angle = check_finite(name, value)
+                angle = angle % (2 * math.pi) if name == "theta" else wrap_angle(angle)
+                object.__setattr__(self, name, angle)
 
     @cached_property
     def segments(self) -> tuple[Segment, ...]:
@@ -105,12 +118,6 @@ class Primitive:
         return bool(np.hypot(effect[0], effect[1]) > 0.01)
 
 
-def _check_angle(owner: Primitive, name: str, from_zero: bool = False) -> None:
-    """Keep an angle of a primitive in [-π, π), or in [0, 2π); raises naming what is no number."""
-    angle = check_finite(name, getattr(owner, name))
-    object.__setattr__(owner, name, angle % (2 * math.pi) if from_zero else wrap_angle(angle))
-
-
 def _caged(grip_yaw: float, end: tuple[float, float, float]) -> tuple[Segment, ...]:
     """Lower the open gripper over the object, close it, move to an end (x, y, yaw), and open it."""
     x, y, yaw = end
@@ -132,8 +139,24 @@ def _segments(*stops: tuple[float, tuple[float, ...]], guarded: int = -1) -> tup
     )
 
 
+class _Move(Primitive):
+    """What moves an object in a straight line, in a direction that depends on theta."""
+
+    ahead_rad: ClassVar[float] = 0.0
+
+    @classmethod
+    def towards(cls, direction_rad: float, **kwargs: float) -> _Move:
+        """The action that moves an object towards the given direction [rad]."""
+        return cls(check_finite("direction_rad", direction_rad) + cls.ahead_rad, **kwargs)
+
+    @property
+    def direction_rad(self) -> float:
+        """The direction in which the object is moved, in [-π, π)."""
+        return wrap_angle(self.theta + self.ahead_rad)
+
+
 @dataclass(frozen=True)
-class Push(Primitive):
+class Push(_Move):
     """A straight push through the object's centre (Section 3.3).
 
     The gripper starts on a circle around the object at the angle theta [rad], travels through
@@ -149,33 +172,19 @@ class Push(Primitive):
     opening_m = PUSH_GAP_M
     force_N = 200.0
     acts_from = 0.4
-
-    def __post_init__(self) -> None:
-        _check_angle(self, "theta", from_zero=True)
-        check_field(self, "length", 0.0, 0.15, "m")
-        check_field(self, "radius", 0.1, 0.3, "m")
-
-    @classmethod
-    def towards(cls, direction_rad: float, **kwargs: float) -> Push:
-        """The push that moves an object towards the given direction [rad]."""
-        return cls(check_finite("direction_rad", direction_rad) + math.pi, **kwargs)
-
-    @property
-    def direction_rad(self) -> float:
-        """The direction in which the gripper travels, in [-π, π)."""
-        return wrap_angle(self.theta + math.pi)
+    ahead_rad = math.pi
+    lengths_m: ClassVar = {"length": (0.0, 0.15), "radius": (0.1, 0.3)}
 
     @cached_property
     def segments(self) -> tuple[Segment, ...]:
         yaw = self.direction_rad
-        x, y = math.cos(yaw), math.sin(yaw)
-        start = (-self.radius * x, -self.radius * y, TIP_HEIGHT_M, yaw, 1.0)
-        end = (self.length * x, self.length * y, TIP_HEIGHT_M, yaw, 1.0)
-        return _segments((0.0, start), (DURATION_S, end))
+        start, end = (s * unit_vector(yaw) for s in (-self.radius, self.length))
+        facing = TIP_HEIGHT_M, yaw, 1.0
+        return _segments((0.0, (*start, *facing)), (DURATION_S, (*end, *facing)))
 
 
 @dataclass(frozen=True)
-class Drag(Primitive):
+class Drag(_Move):
     """The paper's push for objects that roll: cage the object, take it along, let it go.
 
     The open gripper is lowered over the object's centre, closed, moved by `length` [m] towards
@@ -191,28 +200,12 @@ class Drag(Primitive):
     opening_m = 0.14
     force_N = 10.0
     acts_from = 0.25
-
-    def __post_init__(self) -> None:
-        _check_angle(self, "theta", from_zero=True)
-        check_field(self, "length", 0.0, 0.15, "m")
-        if self.grip_yaw is not None:
-            _check_angle(self, "grip_yaw")
-
-    @classmethod
-    def towards(cls, direction_rad: float, **kwargs: float) -> Drag:
-        """The drag that takes an object towards the given direction [rad]."""
-        return cls(direction_rad, **kwargs)
-
-    @property
-    def direction_rad(self) -> float:
-        """The direction in which the object is taken, in [-π, π)."""
-        return wrap_angle(self.theta)
+    lengths_m: ClassVar = {"length": (0.0, 0.15)}
 
     @cached_property
     def segments(self) -> tuple[Segment, ...]:
-        x, y = self.length * math.cos(self.theta), self.length * math.sin(self.theta)
         yaw = self.grip_yaw or 0.0
-        return _caged(yaw, (x, y, yaw))
+        return _caged(yaw, (*(self.length * unit_vector(self.theta)), yaw))
 
 
 @dataclass(frozen=True)
@@ -232,11 +225,7 @@ class Grasp(Primitive):
     holds = True
     lift_m: ClassVar[float] = 0.25
     success_m: ClassVar[float] = 0.1
-
-    def __post_init__(self) -> None:
-        if self.seen_height is not None:
-            check_field(self, "seen_height", 0.0, 0.3, "m")
-        _check_angle(self, "grip_yaw")
+    lengths_m: ClassVar = {"seen_height": (0.0, 0.3)}
 
     @cached_property
     def segments(self) -> tuple[Segment, ...]:
@@ -269,9 +258,6 @@ class Rotate(Primitive):
     opening_m = 0.14
     force_N = 10.0
     sweep_rad: ClassVar[float] = math.radians(60)
-
-    def __post_init__(self) -> None:
-        _check_angle(self, "grip_yaw")
 
     @cached_property
     def segments(self) -> tuple[Segment, ...]:
@@ -323,12 +309,7 @@ class LeverUp(Primitive):
     angle_rad: ClassVar[float] = math.radians(65)
     insertion_m: ClassVar[float] = 0.012
     run_up_m: ClassVar[float] = 0.03
-
-    def __post_init__(self) -> None:
-        _check_angle(self, "theta", from_zero=True)
-        check_field(self, "contact_x", -0.2, 0.2, "m")
-        check_field(self, "contact_y", -0.2, 0.2, "m")
-        check_field(self, "reach", 0.05, 0.4, "m")
+    lengths_m: ClassVar = {"contact_x": (-0.2, 0.2), "contact_y": (-0.2, 0.2), "reach": (0.05, 0.4)}
 
     @classmethod
     def at_edge(
@@ -336,10 +317,9 @@ class LeverUp(Primitive):
     ) -> LeverUp:
         """The lever-up from a point on an edge of an outline (n, 2) [m], counter-clockwise.
 
-        The outline is around the centroid. Lifted there, the object turns about the edge that
-        needs the least force, weight · distance to the centroid / distance to the contact. The
-        blade goes midway between that edge's normal and its own edge's, but for turn_rad; share:
-        how far along the edge.
+        share: how far along it. The object turns about the edge that needs the least force, weight
+        · distance to the centroid / distance to the contact; the blade goes midway between that
+        edge's normal and its own edge's, but for turn_rad.
         """
         following = np.roll(outline_m, -1, axis=0)
         along = following - outline_m

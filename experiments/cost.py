@@ -32,14 +32,14 @@ def measure_cost(recipe: Recipe, episodes: int) -> Cost:
     Raises RuntimeError if the two do not give the same bits.
     """
     whole_s, bare_s = np.zeros((2, episodes))
-    step_simulation = pybullet.stepSimulation
     with Tabletop() as world:
+        step_simulation = world.client.stepSimulation
         interact(recipe, 0, world)
         for index in range(episodes):
 
-            def timed_step(client: int, index: int = index) -> None:
+            def timed_step(index: int = index) -> None:
                 began = time.perf_counter()
-                step_simulation(client)
+                step_simulation()
                 bare_s[index] += time.perf_counter() - began
 
             began = time.perf_counter()

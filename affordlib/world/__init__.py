@@ -2,7 +2,6 @@
 
 import affordlib.world._quiet_pybullet  # noqa: F401  (must come first)
 from affordlib.types import NothingSeenError, UnreachableError
-from affordlib.world.config import WorldConfig
 from affordlib.world.objects import (
     CATEGORIES,
     Cuboid,
@@ -11,6 +10,7 @@ from affordlib.world.objects import (
     Sphere,
     TabletopObject,
     UprightCylinder,
+    WorldConfig,
     category_named,
 )
 from affordlib.world.robot import BASE_X_M, REACH_M

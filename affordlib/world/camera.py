@@ -1,9 +1,7 @@
 """What the robot sees: a top-down depth image of the object, and pictures for people.
 
-The ideal camera hangs vertically above the object and is rectified: its rays are parallel, so the
-crop does not depend on where on the table the object stands. Depth is the distance [m] from the
-camera's plane; the mask is read from the depth (what stands above the table), not told. The Kinect
-has a perspective, noise, and must find the object itself.
+The ideal camera hangs above the object, with parallel rays; the Kinect has a perspective, noise,
+and must find the object itself. The mask is read from the depth: what stands above the table.
 """
 
 from __future__ import annotations
@@ -12,6 +10,7 @@ import math
 
 import numpy as np
 import pybullet
+from pybullet_utils.bullet_client import BulletClient
 
 from affordlib.perception import CAMERA_HEIGHT_M, centre_m, largest_blob
 from affordlib.types import CROP_WIDTH_M, IMAGE_PIXELS, TABLE_X_M, TABLE_Y_M, NothingSeenError
@@ -45,16 +44,16 @@ def _orthographic(half_width_m: float, pixels: int) -> np.ndarray:
 _RENDERER = {"renderer": pybullet.ER_TINY_RENDERER, "flags": pybullet.ER_NO_SEGMENTATION_MASK}
 
 
-def _distance_m(client: int, view: tuple, projection: np.ndarray, shape: tuple) -> np.ndarray:
+def _distance_m(
+    client: BulletClient, view: tuple, projection: np.ndarray, shape: tuple
+) -> np.ndarray:
     """Distance from the camera's plane [m], (rows, columns).
 
     TinyRenderer warps every depth buffer as if the projection were a perspective one.
     """
     rows, columns = shape
     matrix = projection.T.ravel().tolist()
-    image = pybullet.getCameraImage(
-        columns, rows, view, matrix, shadow=0, physicsClientId=client, **_RENDERER
-    )
+    image = client.getCameraImage(columns, rows, view, matrix, shadow=0, **_RENDERER)
     buffer = np.asarray(image[3], dtype=np.float64).reshape(rows, columns)
     far = projection[2, 3] / (projection[2, 2] + 1)
     near = projection[2, 3] / (projection[2, 2] - 1)
@@ -62,7 +61,7 @@ def _distance_m(client: int, view: tuple, projection: np.ndarray, shape: tuple) 
 
 
 def depth_crop(
-    client: int,
+    client: BulletClient,
     xy_m: tuple[float, float],
     pixels: int = IMAGE_PIXELS,
     width_m: float = CROP_WIDTH_M,
@@ -71,9 +70,8 @@ def depth_crop(
 ) -> np.ndarray:
     """Depth [m] and mask (2, n, n) of the square around (x, y), as float32.
 
-    Columns run along the direction turn_rad of the table, rows a quarter turn to its right: by
-    default as a map is read. A pixel is the mean of samples x samples rays, so at the object's rim
-    the mask is the share that it covers.
+    Columns run along the direction turn_rad of the table, rows a quarter turn to its right. A pixel
+    is the mean of samples x samples rays: at the object's rim the mask is the share it covers.
     """
     x, y = xy_m
     up = (-math.sin(turn_rad), math.cos(turn_rad), 0)
@@ -87,11 +85,7 @@ def depth_crop(
 
 
 def _kinect_points(
-    client: int,
-    centre_m: tuple[float, float],
-    width_m: tuple[float, float],
-    step: int,
-    noise: np.random.Generator,
+    client: BulletClient, centre_m: tuple, width_m: tuple, step: int, noise: np.random.Generator
 ) -> np.ndarray:
     """Points (n, 3) [m] that a Kinect above the table's centre measures around a place.
 
@@ -116,9 +110,8 @@ def _kinect_points(
     jitter = noise.normal(0, 0.8 / step, size=(2, rows, columns)) + np.indices((rows, columns))
     row, column = np.rint(jitter).astype(int)
     distance = distance[row.clip(0, rows - 1), column.clip(0, columns - 1)]
-    distance = distance + noise.normal(size=distance.shape) * (
-        0.0012 + 0.0019 * (distance - 0.4) ** 2
-    )
+    deviation = 0.0012 + 0.0019 * (distance - 0.4) ** 2
+    distance = distance + noise.normal(size=distance.shape) * deviation
     focal = KINECT_FOCAL_PX * KINECT_BASELINE_M
     distance = focal / (np.rint(8 * focal / distance) / 8)
     x = stand[0] + (tangent[0] - half[0] + pitch * (np.arange(columns) + 0.5))[None] * distance
@@ -137,11 +130,13 @@ def _height_map(points: np.ndarray, centre_m: tuple[float, float]) -> np.ndarray
     return (total / np.maximum(count, 1)).reshape(IMAGE_PIXELS, IMAGE_PIXELS)
 
 
-def kinect_view(client: int, noise: np.random.Generator) -> tuple[tuple[float, float], np.ndarray]:
+def kinect_view(
+    client: BulletClient, noise: np.random.Generator
+) -> tuple[tuple[float, float], np.ndarray]:
     """Where a Kinect above the table sees the object, (x, y) [m], and a crop (2, 48, 48) of it.
 
-    The perspective image is turned into points and seen from straight above, so the crop does not
-    depend on where the object lies. Raises NothingSeenError when nothing stands on the table.
+    The points of its image are seen from straight above. Raises NothingSeenError when there is
+    nothing on the table.
     """
     table = (TABLE_X_M[1] - TABLE_X_M[0], TABLE_Y_M[1] - TABLE_Y_M[0])
     coarse = _kinect_points(client, _KINECT_XY_M, table, 4, noise)
@@ -163,23 +158,16 @@ def kinect_view(client: int, noise: np.random.Generator) -> tuple[tuple[float, f
     return xy, np.stack([CAMERA_HEIGHT_M - height, mask]).astype(np.float32)
 
 
-def picture(client: int, width: int = 320, height: int = 240) -> np.ndarray:
+def picture(client: BulletClient, width: int = 320, height: int = 240) -> np.ndarray:
     """A colour picture (height, width, 3), uint8, of the robot at work, for people."""
     view = pybullet.computeViewMatrixFromYawPitchRoll(
         (-0.05, 0.0, 0.06), distance=1.0, yaw=62, pitch=-33, roll=0, upAxisIndex=2
     )
     projection = pybullet.computeProjectionMatrixFOV(45, width / height, 0.1, 4.0)
+    light = {"lightDirection": (0.6, -0.7, 1.6), "lightDistance": 3.0, "shadow": 1}
     # Twice the size, halved: TinyRenderer has jagged edges.
-    _, _, rgba, _, _ = pybullet.getCameraImage(
-        2 * width,
-        2 * height,
-        view,
-        projection,
-        lightDirection=(0.6, -0.7, 1.6),
-        lightDistance=3.0,
-        shadow=1,
-        physicsClientId=client,
-        **_RENDERER,
+    _, _, rgba, _, _ = client.getCameraImage(
+        *(2 * width, 2 * height, view, projection), **light, **_RENDERER
     )
     rgb = np.asarray(rgba, dtype=np.uint16).reshape(2 * height, 2 * width, 4)[..., :3]
     rows = rgb[::2] + rgb[1::2]

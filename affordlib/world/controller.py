@@ -8,15 +8,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pybullet
+from pybullet_utils.bullet_client import BulletClient
 from scipy.interpolate import CubicSpline
 
 from affordlib.world import robot
-from affordlib.world.trajectory import (
-    RECORD_EVERY,
-    STEP_S,
-    STEPS_PER_WAYPOINT,
-    TrajectorySegment,
-)
+from affordlib.world.trajectory import RECORD_EVERY, STEP_S, STEPS_PER_WAYPOINT, TrajectorySegment
 
 GUARD_FORCE_N = 30.0
 """A guarded segment freezes when the object presses on the robot with more than this."""
@@ -50,7 +46,7 @@ class JointController:
     distance of the fingers [m] where they were last sent.
     """
 
-    def __init__(self, client: int, tool: str, after_step: Callable[[], None]) -> None:
+    def __init__(self, client: BulletClient, tool: str, after_step: Callable[[], None]) -> None:
         self.client, self.tool, self.after_step = client, tool, after_step
         self.robot = robot.load_robot(client, tool)
         self.links = robot.links(client, self.robot)
@@ -62,7 +58,7 @@ class JointController:
         """Place the arm (without motion) at joint angles (6,) with the fingers a gap [m] apart."""
         targets = [*angles_rad, gap_m / 2, gap_m / 2]
         for joint, angle in zip(self.joints, targets, strict=True):
-            pybullet.resetJointState(self.robot, joint, angle, 0.0, physicsClientId=self.client)
+            self.client.resetJointState(self.robot, joint, angle, 0.0)
         self._set_motors(targetPositions=targets)
         self.angles_rad, self.gap_m = np.array(angles_rad, dtype=float), gap_m
 
@@ -97,6 +93,7 @@ class JointController:
         commands = targets[:-1].tolist()
         n_steps = whole if segment is None or segment.n_steps is None else segment.n_steps
         guarded = segment is not None and segment.guarded
+        drive = {"forces": self.forces, "positionGains": self.gains}
         now, frozen_at = (targets[0].tolist(), [0.0] * 8), None
         for step in range(n_steps):
             if recording is not None and step % RECORD_EVERY == 0:
@@ -107,43 +104,31 @@ class JointController:
                 now = commands[step], velocities[step]
                 if guarded and self._pressed(recording.body):
                     frozen_at, now = step, (commands[step], [0.0] * 8)
-            self._set_motors(
-                targetPositions=now[0],
-                targetVelocities=now[1],
-                forces=self.forces,
-                positionGains=self.gains,
-            )
-            pybullet.stepSimulation(client)
+            self._set_motors(targetPositions=now[0], targetVelocities=now[1], **drive)
+            client.stepSimulation()
             self.after_step()
         self.angles_rad, self.gap_m = np.array(now[0][:6]), 2 * now[0][6]
         if n_steps < whole:  # stand still where it was last sent
-            self._set_motors(
-                targetPositions=[*self.angles_rad, self.gap_m / 2, self.gap_m / 2],
-                forces=self.forces,
-                positionGains=self.gains,
-            )
+            still = [*self.angles_rad, self.gap_m / 2, self.gap_m / 2]
+            self._set_motors(targetPositions=still, **drive)
         return 1.0 if frozen_at is None else frozen_at / whole
 
     def _set_motors(self, **targets: list[float]) -> None:
-        pybullet.setJointMotorControlArray(
-            self.robot,
-            self.joints,
-            pybullet.POSITION_CONTROL,
-            **targets,
-            physicsClientId=self.client,
+        self.client.setJointMotorControlArray(
+            self.robot, self.joints, pybullet.POSITION_CONTROL, **targets
         )
 
     def wait(self, n_steps: int) -> None:
         """Let the simulation run with the arm held where it is."""
         for _ in range(n_steps):
-            pybullet.stepSimulation(self.client)
+            self.client.stepSimulation()
             self.after_step()
 
     def record(
         self, recording: Recording, with_tool: bool = True, wanted_W: np.ndarray | None = None
     ) -> None:
         """Write down the body's state, the tool's against where it is wanted, and the contacts."""
-        state = pybullet.getBasePositionAndOrientation(recording.body, self.client)
+        state = self.client.getBasePositionAndOrientation(recording.body)
         recording.states.append((*state[0], *state[1]))
         if not with_tool:
             return
@@ -151,22 +136,20 @@ class JointController:
         if wanted_W is not None:
             off_m = math.dist(recording.tool[-1][:3], wanted_W[:3])
             recording.off_path_m = max(recording.off_path_m, off_m)
-        for contact in pybullet.getContactPoints(recording.body, physicsClientId=self.client):
+        for contact in self.client.getContactPoints(recording.body):
             recording.penetration_m = max(recording.penetration_m, -contact[8])
 
     def _pressed(self, body: int) -> bool:
-        contacts = pybullet.getContactPoints(self.robot, body, physicsClientId=self.client)
+        contacts = self.client.getContactPoints(self.robot, body)
         return sum(contact[9] for contact in contacts) > GUARD_FORCE_N
 
     def tool_pose(self) -> np.ndarray:
         """Measured x, y, z [m] of the tool's point, its yaw [rad], the gap of the fingers [m]."""
-        state = pybullet.getLinkState(
-            self.robot, self.palm, computeForwardKinematics=1, physicsClientId=self.client
-        )
+        state = self.client.getLinkState(self.robot, self.palm, computeForwardKinematics=1)
         axes = np.array(pybullet.getMatrixFromQuaternion(state[5])).reshape(3, 3)
         along, below = robot.TOOL_OFFSETS_M[self.tool]
         tip = np.array(state[4]) + along * axes[:, 0] + below * axes[:, 2]
-        fingers = pybullet.getJointStates(self.robot, self.fingers, physicsClientId=self.client)
+        fingers = self.client.getJointStates(self.robot, self.fingers)
         yaw = math.atan2(axes[1, 0], axes[0, 0])
         return np.array([*tip, yaw, fingers[0][0] + fingers[1][0]])
 
@@ -176,27 +159,23 @@ class JointController:
         Driven by two motors alone, a held object is in neutral balance and wanders.
         """
         self.untie()
-        gear = pybullet.createConstraint(
+        gear = self.client.createConstraint(
             self.robot,
             self.fingers[0],
             self.robot,
             self.fingers[1],
-            jointType=pybullet.JOINT_GEAR,
-            jointAxis=(0, 1, 0),
-            parentFramePosition=(0, 0, 0),
-            childFramePosition=(0, 0, 0),
-            physicsClientId=self.client,
+            pybullet.JOINT_GEAR,
+            (0, 1, 0),
+            (0, 0, 0),
+            (0, 0, 0),
         )
-        pybullet.changeConstraint(
-            gear, gearRatio=-1, maxForce=300, erp=0.5, physicsClientId=self.client
-        )
+        self.client.changeConstraint(gear, gearRatio=-1, maxForce=300, erp=0.5)
 
     def untie(self) -> None:
         """Let go: take away the gear between the fingers, and what ties an object to them."""
         client = self.client
-        for k in reversed(range(pybullet.getNumConstraints(physicsClientId=client))):
-            constraint = pybullet.getConstraintUniqueId(k, physicsClientId=client)
-            pybullet.removeConstraint(constraint, physicsClientId=client)
+        for k in reversed(range(client.getNumConstraints())):
+            client.removeConstraint(client.getConstraintUniqueId(k))
 
     def tie_held(self, body: int) -> None:
         """Fix what both tied fingers hold to the hand, until `untie`.
@@ -204,24 +183,15 @@ class JointController:
         Friction in Bullet creeps: what is held slips by some 0.3 mm a second.
         """
         client = self.client
-        contacts = pybullet.getContactPoints(self.robot, body, physicsClientId=client)
+        contacts = client.getContactPoints(self.robot, body)
         touching = {contact[3] for contact in contacts}
-        gears = pybullet.getNumConstraints(physicsClientId=client)
-        if gears != 1 or not touching.issuperset(self.fingers):
+        if client.getNumConstraints() != 1 or not touching.issuperset(self.fingers):
             return
-        hand = pybullet.getLinkState(self.robot, self.palm, physicsClientId=client)[:2]
-        held = pybullet.getBasePositionAndOrientation(body, client)
+        hand = client.getLinkState(self.robot, self.palm)[:2]
+        held = client.getBasePositionAndOrientation(body)
         position, orientation = pybullet.multiplyTransforms(*pybullet.invertTransform(*hand), *held)
-        joint = pybullet.createConstraint(
-            self.robot,
-            self.palm,
-            body,
-            -1,
-            jointType=pybullet.JOINT_FIXED,
-            jointAxis=(0, 0, 0),
-            parentFramePosition=position,
-            childFramePosition=(0, 0, 0),
-            parentFrameOrientation=orientation,
-            physicsClientId=client,
+        bodies = self.robot, self.palm, body, -1
+        joint = client.createConstraint(
+            *bodies, pybullet.JOINT_FIXED, (0, 0, 0), position, (0, 0, 0), orientation
         )
-        pybullet.changeConstraint(joint, maxForce=20, physicsClientId=client)
+        client.changeConstraint(joint, maxForce=20)

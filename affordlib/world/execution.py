@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -76,7 +77,7 @@ def execute(
         release = np.array([arm.gap_m, primitive.opening_m if closes else arm.gap_m])
         if release[1] > release[0]:
             arm.follow(np.repeat(arm.angles_rad[None], 13, axis=0), np.linspace(*release, 13))
-        arm.follow(np.concatenate([motion.retreat, motion.lift[1:]]), release[[1, 1]])
+        arm.follow(motion.out, release[[1, 1]])
         if approach:
             arm.follow(joint_move(arm.angles_rad, _HOME, 1.0), release[[1, 1]])
     arm.wait(SETTLE_STEPS)
@@ -109,42 +110,43 @@ def _interaction(
     tool[:, 3] = np.unwrap(tool[:, 3])
     seldom = np.linspace(0, phase[-1], RECORDED_SAMPLES)
     return Interaction(
-        primitive=command.primitive,
-        stop_phase=float(phase[-1]),
-        phase=phase,
-        action=command.action,
+        **_commanded(command, placed, seen),
         effect=np.column_stack([np.interp(phase, at_sample, effect[:, c]) for c in range(5)]),
         rest_effect=rest - origin,
-        image=seen.image,
         start_pose=(float(start[0]), float(start[1]), float(recorded[0, 3])),
         tracking_error_m=recording.off_path_m,
-        estimated_xy_m=seen.xy_m,
         tool=np.column_stack([np.interp(seldom, at_waypoint, tool[:, c]) for c in range(5)]),
         penetration_m=recording.penetration_m,
         left_table=placed.left_table(),
         fell=placed.fell(),
-        rolls=placed.rolls(),
     )
+
+
+def _commanded(command: Command, placed: PlacedObject, seen: Observation) -> dict[str, Any]:
+    """What an interaction tells of the action, and of what was seen, whether it was reached."""
+    return {
+        "primitive": command.primitive,
+        "stop_phase": float(command.phase[-1]),
+        "phase": command.phase,
+        "action": command.action,
+        "image": seen.image,
+        "estimated_xy_m": seen.xy_m,
+        "rolls": placed.rolls(),
+    }
 
 
 def unreached(command: Command, placed: PlacedObject, seen: Observation) -> Interaction:
     """The interaction that was out of the arm's reach: commanded, but nothing moved."""
     return Interaction(
-        primitive=command.primitive,
-        stop_phase=float(command.phase[-1]),
-        phase=command.phase,
-        action=command.action,
+        **_commanded(command, placed, seen),
         effect=np.zeros((len(command.phase), 5)),
         rest_effect=np.zeros(5),
-        image=seen.image,
         start_pose=placed.pose(),
-        estimated_xy_m=seen.xy_m,
         tool=np.zeros((RECORDED_SAMPLES, 5)),
         tracking_error_m=0.0,
         penetration_m=0.0,
         left_table=False,
         fell=False,
-        rolls=placed.rolls(),
         reached=False,
     )
 

@@ -1,4 +1,4 @@
-"""Objects on the table: one class per category, so that a new one is a few lines.
+"""Objects on the table, one class per category, and what the world around them is like.
 
 A category is a frozen dataclass with its dimensions. The frame of a body has its origin in the
 centre and z upwards as the object is placed; the x axis of a lying cylinder is its own axis.
@@ -15,7 +15,7 @@ import numpy as np
 import pybullet
 from scipy.spatial import ConvexHull
 
-from affordlib.types import check_field, check_finite
+from affordlib.types import check_field, check_finite, check_within
 
 DENSITY_KG_M3 = 600.0
 SIZE_RANGE_M = (0.04, 0.08)
@@ -32,11 +32,16 @@ _UPRIGHT = math.cos(math.radians(45))
 
 @dataclass(frozen=True)
 class TabletopObject(ABC):
-    """An object on the table; all its fields are lengths [m]."""
+    """An object on the table; all its fields are lengths [m].
+
+    rollable: whether it can roll as it is placed; footprint_m: corners (n, 2) of its outline seen
+    from above, around its centre, before turning.
+    """
 
     category: ClassVar[str]
     rollable: ClassVar[bool] = False
-    """Whether it can roll as it is placed."""
+    volume_m3: ClassVar[float]
+    footprint_m: ClassVar[np.ndarray]
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -57,38 +62,23 @@ class TabletopObject(ABC):
             sizes[-1] = height_range_m[0] + share * (height_range_m[1] - height_range_m[0])
         return cls(*(float(size) for size in sizes))
 
-    @property
-    def height_m(self) -> float:
-        """Height as it is placed [m]: the dimension `height` where there is one."""
-        return self.height
-
-    @property
-    @abstractmethod
-    def volume_m3(self) -> float: ...
-
-    @property
-    @abstractmethod
-    def footprint_m(self) -> np.ndarray:
-        """Corners (n, 2) of the outline seen from above, around the centre, before turning."""
+    height_m = property(lambda self: self.height)
 
     @abstractmethod
     def shape(self) -> dict[str, Any]:
-        """The arguments from which PyBullet builds it.
-
-        `frame` turns the shape into the body's frame; `seen` are the corners that are drawn, where
-        they are not those that are felt.
-        """
+        """PyBullet's arguments for it; `frame` turns it, `seen` are corners only for drawing."""
 
     def fallen(self, upward: np.ndarray) -> bool:
-        """Whether it lies differently than it was placed.
-
-        upward: (3,) the vertical components of the body's x, y and z axes.
-        """
+        """Whether it lies otherwise than placed; upward: (3,) how far x, y and z axes point up."""
         return bool(upward[2] < _UPRIGHT)
 
     def rolls(self, upward: np.ndarray) -> bool:
         """Whether it can roll as it lies now."""
         return self.rollable
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
 
 def _circle(diameter: float) -> np.ndarray:
@@ -109,14 +99,8 @@ class Cuboid(TabletopObject):
     height: float
 
     category = "cuboid"
-
-    @property
-    def volume_m3(self) -> float:
-        return self.length * self.width * self.height
-
-    @property
-    def footprint_m(self) -> np.ndarray:
-        return _rectangle(self.length, self.width)
+    volume_m3 = property(lambda self: self.length * self.width * self.height)
+    footprint_m = property(lambda self: _rectangle(self.length, self.width))
 
     def shape(self) -> dict[str, Any]:
         half = [self.length / 2, self.width / 2, self.height / 2]
@@ -128,13 +112,8 @@ class _Cylinder(TabletopObject):
 
     axis: ClassVar[int]
 
-    @property
-    def _length_m(self) -> float:
-        return self.length if self.axis == 0 else self.height
-
-    @property
-    def volume_m3(self) -> float:
-        return math.pi * self.diameter**2 / 4 * self._length_m
+    _length_m = property(lambda self: self.length if self.axis == 0 else self.height)
+    volume_m3 = property(lambda self: math.pi * self.diameter**2 / 4 * self._length_m)
 
     def shape(self) -> dict[str, Any]:
         return {
@@ -157,10 +136,7 @@ class UprightCylinder(_Cylinder):
 
     category = "upright_cylinder"
     axis = 2
-
-    @property
-    def footprint_m(self) -> np.ndarray:
-        return _circle(self.diameter)
+    footprint_m = property(lambda self: _circle(self.diameter))
 
 
 @dataclass(frozen=True)
@@ -173,14 +149,8 @@ class LyingCylinder(_Cylinder):
     category = "lying_cylinder"
     rollable = True
     axis = 0
-
-    @property
-    def height_m(self) -> float:
-        return self.diameter
-
-    @property
-    def footprint_m(self) -> np.ndarray:
-        return _rectangle(self.length, self.diameter)
+    height_m = property(lambda self: self.diameter)
+    footprint_m = property(lambda self: _rectangle(self.length, self.diameter))
 
     def fallen(self, upward: np.ndarray) -> bool:
         return not self.rolls(upward)
@@ -194,18 +164,9 @@ class Sphere(TabletopObject):
 
     category = "sphere"
     rollable = True
-
-    @property
-    def height_m(self) -> float:
-        return self.diameter
-
-    @property
-    def volume_m3(self) -> float:
-        return math.pi * self.diameter**3 / 6
-
-    @property
-    def footprint_m(self) -> np.ndarray:
-        return _circle(self.diameter)
+    height_m = property(lambda self: self.diameter)
+    volume_m3 = property(lambda self: math.pi * self.diameter**3 / 6)
+    footprint_m = property(lambda self: _circle(self.diameter))
 
     def shape(self) -> dict[str, Any]:
         return {"shapeType": pybullet.GEOM_SPHERE, "radius": self.diameter / 2}
@@ -228,9 +189,8 @@ class Prism(TabletopObject):
 
     def __post_init__(self) -> None:
         check_field(self, "height", 0.005, LARGEST_M, "m")
-        corners = np.array(
-            [[check_finite("prism corners", v) for v in corner] for corner in self.corners]
-        )
+        points = [[check_finite("prism corners", v) for v in corner] for corner in self.corners]
+        corners = np.array(points)
         if corners.shape != (len(corners), 2) or not N_EDGES[0] <= len(corners) <= N_EDGES[1]:
             raise ValueError(f"prism corners must be 3 to 8 points (x, y), got {corners.shape}")
         following = np.roll(corners, -1, axis=0)
@@ -263,13 +223,8 @@ class Prism(TabletopObject):
         height = rng.uniform(*(height_range_m or size_range_m))
         return cls(tuple((float(x), float(y)) for x, y in corners), float(height))
 
-    @property
-    def volume_m3(self) -> float:
-        return float(ConvexHull(self._vertices()).volume)
-
-    @property
-    def footprint_m(self) -> np.ndarray:
-        return np.array(self.corners)
+    volume_m3 = property(lambda self: float(ConvexHull(self._vertices()).volume))
+    footprint_m = property(lambda self: np.array(self.corners))
 
     def _vertices(self, inset_m: float = 0.0) -> np.ndarray:
         """Corners (3n, 3) of the solid: of its top, of the chamfer's upper rim, of its base.
@@ -281,32 +236,16 @@ class Prism(TabletopObject):
         half = self.height / 2
         outline = self.footprint_m * (1 - inset_m / inradius)
         base = self.footprint_m * (1 - inset_m / inradius - min(width / inradius, 0.5))
-        return np.vstack(
-            [
-                np.column_stack([points, np.full(len(points), z)])
-                for points, z in (
-                    (outline, half - inset_m),
-                    (outline, rise - half),
-                    (base, inset_m - half),
-                )
-            ]
-        )
+        levels = (outline, half - inset_m), (outline, rise - half), (base, inset_m - half)
+        return np.vstack([np.insert(points, 2, z, axis=1) for points, z in levels])
 
     def shape(self) -> dict[str, Any]:
-        return {
-            "shapeType": pybullet.GEOM_MESH,
-            "vertices": self._vertices(_HULL_MARGIN_M).tolist(),
-            "seen": self._vertices(),
-        }
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+        felt = self._vertices(_HULL_MARGIN_M).tolist()
+        return {"shapeType": pybullet.GEOM_MESH, "vertices": felt, "seen": self._vertices()}
 
 
 CATEGORIES: dict[str, type[TabletopObject]] = {
-    category.category: category
-    for category in (Cuboid, UprightCylinder, LyingCylinder, Sphere, Prism)
+    kind.category: kind for kind in (Cuboid, UprightCylinder, LyingCylinder, Sphere, Prism)
 }
 
 
@@ -315,3 +254,39 @@ def category_named(name: str) -> type[TabletopObject]:
     if name not in CATEGORIES:
         raise ValueError(f"object category {name!r} is unknown; choose one of {sorted(CATEGORIES)}")
     return CATEGORIES[name]
+
+
+CAMERAS = ("ideal", "kinect")
+
+
+@dataclass(frozen=True)
+class WorldConfig:
+    """Friction coefficients (Bullet multiplies the two bodies'), the object's inside, the senses.
+
+    com_offset_m: the centre of mass in the object's frame; tip_offset_m: how much higher than
+    commanded the gripper moves; bias_m: added to where the robot believes the object to be.
+    camera: "ideal" tells where it is, "kinect" measures it, with noise drawn from noise_seed.
+    """
+
+    table_friction: float = 0.5
+    object_friction: float = 0.5
+    finger_friction: float = 0.9
+    density_kg_m3: float = DENSITY_KG_M3
+    com_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    tip_offset_m: float = 0.0
+    camera: str = "ideal"
+    bias_m: tuple[float, float] = (0.0, 0.0)
+    noise_seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("table_friction", "object_friction", "finger_friction"):
+            check_field(self, name, 0.01, 2.0)
+        check_field(self, "density_kg_m3", 50.0, 10_000.0, "kg/m³")
+        check_field(self, "tip_offset_m", -0.008, 0.1, "m")
+        for name, size in (("com_offset_m", 3), ("bias_m", 2)):
+            values = tuple(check_within(name, v, -0.1, 0.1, "m") for v in getattr(self, name))
+            if len(values) != size:
+                raise ValueError(f"{name} must be {size} numbers [m], got {values!r}")
+            object.__setattr__(self, name, values)
+        if self.camera not in CAMERAS:
+            raise ValueError(f"camera must be one of {CAMERAS}, got {self.camera!r}")

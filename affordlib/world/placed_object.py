@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pybullet
+from pybullet_utils.bullet_client import BulletClient
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
@@ -14,12 +15,12 @@ from affordlib.geometry import rotated
 from affordlib.types import (
     TABLE_X_M,
     TABLE_Y_M,
+    check_array,
     check_finite,
     check_on_table,
     check_within,
 )
-from affordlib.world.config import WorldConfig
-from affordlib.world.objects import TabletopObject
+from affordlib.world.objects import TabletopObject, WorldConfig
 
 ROLLING_M, BRAKED_ROLLING_M = 1e-4, 1e-3
 """Rolling friction [m] of all bodies, and of a round object that is left alone.
@@ -46,18 +47,10 @@ def poses(states: np.ndarray) -> np.ndarray:
     return np.column_stack([states[:, :3], np.unwrap(yaw), tilt])
 
 
-def set_friction(client: int, body: int, link: int, lateral: float, **more: float) -> None:
+def set_friction(client: BulletClient, body: int, link: int, lateral: float, **more: float) -> None:
     """Give a link of a body a lateral friction, and what all bodies have in common."""
-    pybullet.changeDynamics(
-        body,
-        link,
-        lateralFriction=lateral,
-        spinningFriction=1e-3,
-        rollingFriction=ROLLING_M,
-        restitution=0.0,
-        **more,
-        physicsClientId=client,
-    )
+    common = {"spinningFriction": 1e-3, "rollingFriction": ROLLING_M, "restitution": 0.0}
+    client.changeDynamics(body, link, lateralFriction=lateral, **common, **more)
 
 
 class PlacedObject:
@@ -65,10 +58,10 @@ class PlacedObject:
 
     def __init__(
         self,
-        client: int,
+        client: BulletClient,
         obj: TabletopObject,
         config: WorldConfig,
-        xy_m: tuple[float, float],
+        xy_m: tuple,
         yaw_rad: float,
     ) -> None:
         self.client, self.obj = client, obj
@@ -78,28 +71,22 @@ class PlacedObject:
         visual = dict(shape) if seen is None else _mesh(seen)
         if "height" in visual:
             visual["length"] = visual.pop("height")
-        self.body = pybullet.createMultiBody(
+        self.body = client.createMultiBody(
             baseMass=config.density_kg_m3 * obj.volume_m3,
-            baseCollisionShapeIndex=pybullet.createCollisionShape(
-                **shape, collisionFrameOrientation=frame, physicsClientId=client
+            baseCollisionShapeIndex=client.createCollisionShape(
+                **shape, collisionFrameOrientation=frame
             ),
-            baseVisualShapeIndex=pybullet.createVisualShape(
-                **visual,
-                visualFrameOrientation=frame,
-                rgbaColor=(0.0, 0.62, 0.45, 1),
-                physicsClientId=client,
+            baseVisualShapeIndex=client.createVisualShape(
+                **visual, visualFrameOrientation=frame, rgbaColor=(0.0, 0.62, 0.45, 1)
             ),
             baseInertialFramePosition=config.com_offset_m,
-            physicsClientId=client,
         )
         undamped = {"linearDamping": 0.0, "angularDamping": 0.0}
         set_friction(client, self.body, -1, config.object_friction, **undamped)
         c, s, (x, y, z) = math.cos(yaw_rad), math.sin(yaw_rad), config.com_offset_m
         position = (xy_m[0] + c * x - s * y, xy_m[1] + s * x + c * y, obj.height_m / 2 + z)
         orientation = pybullet.getQuaternionFromEuler((0, 0, yaw_rad))
-        pybullet.resetBasePositionAndOrientation(
-            self.body, position, orientation, physicsClientId=client
-        )
+        client.resetBasePositionAndOrientation(self.body, position, orientation)
 
     def states_of_centre(self, states: np.ndarray) -> np.ndarray:
         """States (n, 7) of the object's centre, given those of its centre of mass."""
@@ -110,7 +97,7 @@ class PlacedObject:
 
     def state(self) -> tuple[float, ...]:
         """Position (x, y, z) [m] of the centre and quaternion (x, y, z, w)."""
-        position, quaternion = pybullet.getBasePositionAndOrientation(self.body, self.client)
+        position, quaternion = self.client.getBasePositionAndOrientation(self.body)
         return tuple(self.states_of_centre(np.array([[*position, *quaternion]]))[0])
 
     def pose(self) -> tuple[float, float, float]:
@@ -120,7 +107,7 @@ class PlacedObject:
 
     def lowest_m(self) -> float:
         """Height of the lowest point of its bounding box [m]."""
-        return pybullet.getAABB(self.body, physicsClientId=self.client)[0][2]
+        return self.client.getAABB(self.body)[0][2]
 
     def _upward(self) -> np.ndarray:
         return Rotation.from_quat(self.state()[3:]).as_matrix()[2]
@@ -142,17 +129,11 @@ class PlacedObject:
     def brake(self, brakes: bool) -> None:
         """Let the table brake it where it can roll as it lies, or no longer.
 
-        Bullet's cylinders gain speed as they roll on a level table, from 0.1 to some 0.3 m/s in
-        2.5 s: one that is let go at a thousandth of that runs away while the arm comes back for it.
-        While an action is recorded nothing brakes, as nothing did when the models' data were
-        collected.
+        Bullet's cylinders gain speed on a level table. While an action is recorded nothing brakes,
+        as nothing did when the models' data were collected.
         """
-        pybullet.changeDynamics(
-            self.body,
-            -1,
-            rollingFriction=BRAKED_ROLLING_M if brakes and self.rolls() else ROLLING_M,
-            physicsClientId=self.client,
-        )
+        rolling = BRAKED_ROLLING_M if brakes and self.rolls() else ROLLING_M
+        self.client.changeDynamics(self.body, -1, rollingFriction=rolling)
 
     def displace(self, dx_m: float, dy_m: float, dyaw_rad: float) -> None:
         """Move it by (dx, dy) [m] and turn it by a yaw [rad], at its height and as it lies.
@@ -163,37 +144,30 @@ class PlacedObject:
         dx, dy = check_finite("dx_m", dx_m), check_finite("dy_m", dy_m)
         turn = Rotation.from_euler("z", check_finite("dyaw_rad", dyaw_rad))
         check_on_table("dx_m, dy_m: the shoved object's centre", (x + dx, y + dy))
-        position, quaternion = pybullet.getBasePositionAndOrientation(self.body, self.client)
-        pybullet.resetBasePositionAndOrientation(
+        position, quaternion = self.client.getBasePositionAndOrientation(self.body)
+        self.client.resetBasePositionAndOrientation(
             self.body,
             turn.apply(position - centre) + np.add(centre, (dx, dy, 0.0)),
             (turn * Rotation.from_quat(quaternion)).as_quat(),
-            physicsClientId=self.client,
         )
 
     def knock(self, dx_m_s: float, dy_m_s: float, spin_rad_s: float) -> None:
-        """Change its velocity [m/s] and its spin about the vertical at once.
-
-        An impulse through its centre of mass, so that friction, fingers and table decide where it
-        goes.
-        """
+        """Change its velocity [m/s] and its spin about the vertical at once."""
         speeds = (("dx_m_s", dx_m_s), ("dy_m_s", dy_m_s))
         change = [*(check_within(name, v, -10.0, 10.0, "m/s") for name, v in speeds), 0.0]
         spin = [0.0, 0.0, check_within("spin_rad_s", spin_rad_s, -100.0, 100.0, "rad/s")]
         self._change_velocity(np.array(change), np.array(spin))
 
     def topple(self, direction_rad: float) -> None:
-        """Tip it over the edge of its base in a direction [rad], as a blow high up would.
+        """Give it the spin that tips it over the edge of its base in a direction [rad].
 
-        It gets the spin about that edge that carries it a little past its balance. Raises
-        ValueError for what cannot fall.
+        Raises ValueError for what cannot fall.
         """
         c, s = math.cos(angle := check_finite("direction_rad", direction_rad)), math.sin(angle)
         if self.rolls():
-            raise ValueError(
-                f"a {self.obj.category} that can roll as it lies has no edge to fall over"
-            )
-        low, high = pybullet.getAABB(self.body, physicsClientId=self.client)
+            kind = self.obj.category
+            raise ValueError(f"a {kind} that can roll as it lies has no edge to fall over")
+        low, high = self.client.getAABB(self.body)
         x, y, z = self.state()[:3]
         corners = self._corners_m() - (x, y)
         out, up = float((corners @ (c, s)).max()), z - low[2]
@@ -215,14 +189,23 @@ class PlacedObject:
         x, y, yaw = self.pose()
         return np.add(rotated(self.obj.footprint_m, yaw), (x, y))
 
-    def _change_velocity(self, linear: np.ndarray, angular: np.ndarray) -> None:
-        moving = pybullet.getBaseVelocity(self.body, physicsClientId=self.client)
-        pybullet.resetBaseVelocity(
-            self.body,
-            (np.array(moving[0]) + linear).tolist(),
-            (np.array(moving[1]) + angular).tolist(),
-            physicsClientId=self.client,
+    def draw_outline(self, xy_m: tuple, rgb: tuple, yaw_rad: float, scale: float) -> None:
+        """Show its footprint at (x, y) [m] on the table, in a colour, `scale` times as large."""
+        xy_m, yaw_rad = check_on_table("xy_m", xy_m), check_finite("yaw_rad", yaw_rad)
+        outline = check_within("scale", scale, 0.1, 10.0) * self.obj.footprint_m
+        rgb = [check_within("rgb", share, 0.0, 1.0) for share in check_array("rgb", rgb, 3)]
+        # Larger sheets lie lower, so that one on another shows as a frame around it.
+        sheet = np.vstack([np.insert(outline, 2, z, axis=1) for z in (-0.005, 0.001 / scale)])
+        self.client.createMultiBody(
+            baseVisualShapeIndex=self.client.createVisualShape(**_mesh(sheet), rgbaColor=(*rgb, 1)),
+            basePosition=(*xy_m, 0.0),
+            baseOrientation=pybullet.getQuaternionFromEuler((0, 0, yaw_rad)),
         )
+
+    def _change_velocity(self, linear: np.ndarray, angular: np.ndarray) -> None:
+        moving = self.client.getBaseVelocity(self.body)
+        changed = np.add(moving, (linear, angular)).tolist()
+        self.client.resetBaseVelocity(self.body, *changed)
 
 
 def _mesh(vertices: np.ndarray) -> dict[str, Any]:
@@ -239,21 +222,3 @@ def _mesh(vertices: np.ndarray) -> dict[str, Any]:
         "indices": list(range(3 * len(triangles))),
         "normals": np.repeat(normals, 3, axis=0).tolist(),
     }
-
-
-def create_footprint(
-    client: int, obj: TabletopObject, xy_m: tuple, yaw_rad: float, rgba: tuple, scale: float = 1.0
-) -> int:
-    """Create the object's outline as a sheet on the table that is only seen; return its id."""
-    outline = scale * obj.footprint_m
-    # Larger sheets lie lower, so that one on another shows as a frame around it.
-    low, high = (np.full((len(outline), 1), z) for z in (-0.005, 0.001 / scale))
-    sheet = np.vstack([np.hstack([outline, low]), np.hstack([outline, high])])
-    return pybullet.createMultiBody(
-        baseVisualShapeIndex=pybullet.createVisualShape(
-            **_mesh(sheet), rgbaColor=rgba, physicsClientId=client
-        ),
-        basePosition=(*xy_m, 0.0),
-        baseOrientation=pybullet.getQuaternionFromEuler((0, 0, yaw_rad)),
-        physicsClientId=client,
-    )

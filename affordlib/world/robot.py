@@ -1,10 +1,9 @@
 """The UR10 with a parallel gripper: its model for PyBullet and its analytic kinematics.
 
-The arm's description and meshes come from the package `example-robot-data`; the gripper, two box
-fingers on prismatic joints, is merged into the same description, because a gripper held by a
-constraint slips. For levering it holds a screwdriver: a shaft straight down and, at its end, a flat
-blade along x. Frames: W the table's centre, B the arm's base, T the tool (between the finger tips
-or at the blade's tip; unpitched, z points down and y along the opening).
+Its description comes from the package `example-robot-data`; the gripper, two box fingers on
+prismatic joints, is merged into it, because one held by a constraint slips. The screwdriver is a
+shaft straight down with a flat blade along x. W is the frame of the table's centre, T of the tool:
+between the finger tips or at the blade's tip, z down and y along the opening.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from importlib import metadata
 from pathlib import Path
 
 import numpy as np
-import pybullet
+from pybullet_utils.bullet_client import BulletClient
 from ur_analytic_ik import ur10
 
 from affordlib.types import UnreachableError
@@ -41,25 +40,17 @@ _ARM_RGBA = {"shoulder_link": "0.30 0.45 0.60 1", "wrist_1_link": "0.30 0.45 0.6
 _GREY, _DARK, _RED = "0.72 0.74 0.77 1", "0.25 0.27 0.30 1", "0.75 0.25 0.15 1"
 
 
-@cache
 def _description_folder() -> Path:
-    files = metadata.files("example-robot-data") or []
-    for file in files:
+    for file in metadata.files("example-robot-data") or []:
         if file.name == "ur10_robot.urdf":
             return Path(file.locate()).resolve().parents[2]
-    raise FileNotFoundError(
-        "the UR10 description of the package example-robot-data was not found; "
-        "install the environment again with `make setup`"
-    )
+    raise FileNotFoundError("example-robot-data has no UR10 description; run `make setup` again")
 
 
 def _box(
     name: str, size: str, centre: str, mass_kg: float, rgba: str, *joint: str, axis: str = ""
 ) -> str:
-    """A box in URDF, held by a joint: parent, and where it is held as xyz and rpy.
-
-    axis: along which it slides; "" for a box that is fixed.
-    """
+    """A box in URDF, held by a joint (parent, xyz, rpy), which slides along an axis if given."""
     parent, xyz, rpy = joint
     shape = f'<origin xyz="{centre}"/><geometry><box size="{size}"/></geometry>'
     limit = f'<limit lower="0" upper="{FINGER_TRAVEL_M}" effort="200" velocity="0.5"/>'
@@ -118,20 +109,18 @@ def robot_description(tool: str = "gripper") -> str:
     return ET.tostring(root, encoding="unicode")
 
 
-def load_robot(client: int, tool: str = "gripper") -> int:
+def load_robot(client: BulletClient, tool: str = "gripper") -> int:
     """Load the arm with a tool into a PyBullet client and return the body id."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "ur10.urdf"
         path.write_text(robot_description(tool))
-        return pybullet.loadURDF(
-            str(path), basePosition=(BASE_X_M, 0, 0), useFixedBase=True, physicsClientId=client
-        )
+        return client.loadURDF(str(path), basePosition=(BASE_X_M, 0, 0), useFixedBase=True)
 
 
-def links(client: int, robot: int) -> dict[str, int]:
+def links(client: BulletClient, robot: int) -> dict[str, int]:
     """Index of each link, and of the joint that moves it, by the link's name."""
-    count = range(pybullet.getNumJoints(robot, physicsClientId=client))
-    return {pybullet.getJointInfo(robot, k, client)[12].decode(): k for k in count}
+    count = range(client.getNumJoints(robot))
+    return {client.getJointInfo(robot, k)[12].decode(): k for k in count}
 
 
 def _flange_pose(
@@ -143,14 +132,8 @@ def _flange_pose(
     z_axis = np.array([-c * sp, -s * sp, -cp])
     x, y, z = xyz_W - offsets_m[0] * x_axis - offsets_m[1] * z_axis
     # The analytic solver's base is turned by 180° about z against the URDF's.
-    return np.array(
-        [
-            [-x_axis[0], -s, -z_axis[0], BASE_X_M - x],
-            [-x_axis[1], c, -z_axis[1], -y],
-            [x_axis[2], 0.0, z_axis[2], z],
-            [0.0, 0.0, 0.0, 1.0],
-        ]
-    )
+    turned = np.column_stack([x_axis, (s, -c, 0.0), z_axis, (x - BASE_X_M, y, z)])
+    return np.vstack([turned * [[-1.0], [-1.0], [1.0]], (0.0, 0.0, 0.0, 1.0)])
 
 
 def inverse_kinematics(
@@ -162,10 +145,9 @@ def inverse_kinematics(
 ) -> np.ndarray:
     """Joint angles (6,) [rad] that put the tool at a pose.
 
-    xyz_W: the tool's point in the frame of the table [m]; yaw_rad: direction of its x axis;
-    pitch_rad: how far that axis dips below the horizontal; near: joint angles (6,) whose turn (of
-    2π) is kept. Of the solver's postures one with the elbow up is taken, wrist forward where the
-    tool hangs straight, and otherwise the nearest, so that a path never flips.
+    xyz_W: the tool's point on the table [m]; yaw_rad, pitch_rad: direction of its x axis, and how
+    far it dips; near: joint angles (6,) whose turn (of 2π) is kept. Taken is a posture with the
+    elbow up, wrist forward where the tool hangs, else the nearest: a path never flips.
     Raises UnreachableError when the arm cannot get there.
     """
     best, least = None, 1.0

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 
 import numpy as np
 import pybullet
+from pybullet_utils.bullet_client import BulletClient
 
 from affordlib.perception import adapt_to_object
 from affordlib.primitives import PUSH_GAP_M, LeverUp, Primitive, Push
@@ -30,18 +32,17 @@ from affordlib.types import (
     check_within,
 )
 from affordlib.world import camera, robot
-from affordlib.world.config import WorldConfig
 from affordlib.world.controller import JointController
 from affordlib.world.execution import execute, put_down, unreached
-from affordlib.world.objects import TabletopObject
-from affordlib.world.placed_object import PlacedObject, create_footprint, set_friction
+from affordlib.world.objects import TabletopObject, WorldConfig
+from affordlib.world.placed_object import PlacedObject, set_friction
 from affordlib.world.trajectory import STEP_S, Command, plan_motion, segments_until
 
 OBJECTS_PER_BUILD = 256
 """After so many objects the client is built again: Bullet keeps 5 kB of each that is removed."""
 
 
-class Tabletop:
+class Tabletop(AbstractContextManager):
     """A table, an arm and at most one object, in a PyBullet client of its own.
 
     n_averaged_images: over how many noisy images an observation averages; on_step: called with the
@@ -50,27 +51,25 @@ class Tabletop:
 
     def __init__(self, config: WorldConfig | None = None) -> None:
         self.config = config or WorldConfig()
-        self._client = pybullet.connect(pybullet.DIRECT)
-        self._disconnect = weakref.finalize(self, pybullet.disconnect, self._client)
+        self._client: BulletClient | None = BulletClient(pybullet.DIRECT)
         self.arm: JointController | None = None
         self.on_step: Callable[[Tabletop], None] | None = None
         self.n_averaged_images = 1
         self.reset()
-
-    def __enter__(self) -> Tabletop:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
         """Disconnect from PyBullet, as happens to a world that nothing refers to any more."""
-        self._disconnect()
+        if self._client is not None:
+            self._client.disconnect()
+            self._client = None
 
     @property
-    def client(self) -> int:
-        """PyBullet's number of this world; raises RuntimeError when it is closed."""
-        if not self._disconnect.alive:
+    def client(self) -> BulletClient:
+        """PyBullet with this world's number; raises RuntimeError when it is closed."""
+        if self._client is None:
             raise RuntimeError("this world is closed; make a new Tabletop()")
         return self._client
 
@@ -79,56 +78,46 @@ class Tabletop:
         client = self.client
         if self.arm is None or tool != self.arm.tool or self._n_placed >= OBJECTS_PER_BUILD:
             self._build(tool)
-        else:
-            self._clear()
+        else:  # exactly as when built, without loading table and arm again
+            self.arm.untie()
+            for body in [client.getBodyUniqueId(k) for k in range(client.getNumBodies())]:
+                if body not in (self._table, self.arm.robot):
+                    client.removeBody(body)
+            client.restoreState(stateId=self._fresh)
         self._placed: PlacedObject | None = None
         self.noise = np.random.default_rng(self.config.noise_seed)
         set_friction(client, self._table, -1, self.config.table_friction)
         for name in ("left_finger", "right_finger", "blade"):
             if name in self.arm.links:
-                link, friction = self.arm.links[name], self.config.finger_friction
-                set_friction(client, self.arm.robot, link, friction)
+                finger = self.arm.robot, self.arm.links[name]
+                set_friction(client, *finger, self.config.finger_friction)
         self.arm.put(np.array(robot.HOME), PUSH_GAP_M)
 
     def _build(self, tool: str) -> None:
         client = self.client
-        pybullet.resetSimulation(physicsClientId=client)
-        pybullet.setGravity(0, 0, -9.81, physicsClientId=client)
-        pybullet.setPhysicsEngineParameter(
+        client.resetSimulation()
+        client.setGravity(0, 0, -9.81)
+        client.setPhysicsEngineParameter(
             fixedTimeStep=STEP_S,
             numSolverIterations=50,
             restitutionVelocityThreshold=0.0,
             deterministicOverlappingPairs=1,
-            physicsClientId=client,
         )
         half = [(TABLE_X_M[1] - TABLE_X_M[0]) / 2, (TABLE_Y_M[1] - TABLE_Y_M[0]) / 2, 0.05]
-        shape = {"shapeType": pybullet.GEOM_BOX, "halfExtents": half, "physicsClientId": client}
-        self._table = pybullet.createMultiBody(
-            baseCollisionShapeIndex=pybullet.createCollisionShape(**shape),
-            baseVisualShapeIndex=pybullet.createVisualShape(
-                **shape, rgbaColor=(0.93, 0.90, 0.85, 1)
-            ),
+        shape = {"shapeType": pybullet.GEOM_BOX, "halfExtents": half}
+        self._table = client.createMultiBody(
+            baseCollisionShapeIndex=client.createCollisionShape(**shape),
+            baseVisualShapeIndex=client.createVisualShape(**shape, rgbaColor=(0.93, 0.90, 0.85, 1)),
             basePosition=(sum(TABLE_X_M) / 2, sum(TABLE_Y_M) / 2, -0.05),
-            physicsClientId=client,
         )
         world = weakref.proxy(self)  # no circle of references: it would keep the client connected
         self.arm = JointController(client, tool, lambda: world._stepped())
         self._n_placed = 0
-        self._fresh = pybullet.saveState(physicsClientId=client)
+        self._fresh = client.saveState()
 
     def _stepped(self) -> None:
         if self.on_step is not None:
             self.on_step(self)
-
-    def _clear(self) -> None:
-        """Back to table and arm alone: exactly as when built, without loading them again."""
-        client = self.client
-        self.arm.untie()
-        bodies = range(pybullet.getNumBodies(physicsClientId=client))
-        for body in [pybullet.getBodyUniqueId(k, physicsClientId=client) for k in bodies]:
-            if body not in (self._table, self.arm.robot):
-                pybullet.removeBody(body, physicsClientId=client)
-        pybullet.restoreState(stateId=self._fresh, physicsClientId=client)
 
     def place(
         self,
@@ -182,32 +171,21 @@ class Tabletop:
     def shove(self, dx_m: float, dy_m: float, dyaw_rad: float = 0.0) -> None:
         """Displace the object by (dx, dy) [m], turn it by a yaw [rad], and let it settle.
 
-        The arm is not told. Raises ValueError, and moves nothing, when the object's centre would
-        leave the table.
+        Raises ValueError, and moves nothing, when its centre would leave the table.
         """
         self.placed.displace(dx_m, dy_m, dyaw_rad)
         self.settle()
 
     def knock(self, dx_m_s: float, dy_m_s: float, spin_rad_s: float = 0.0) -> None:
-        """Hit the object: its velocity [m/s] and its spin about the vertical change at once.
-
-        It may be called from `on_step`, in the middle of an action.
-        """
+        """Change the object's velocity [m/s] and its spin about the vertical at once."""
         self.placed.knock(dx_m_s, dy_m_s, spin_rad_s)
 
     def topple(self, direction_rad: float) -> None:
-        """Tip the object over the edge of its base in a direction [rad], as a blow high up would.
-
-        It may be called from `on_step`; otherwise let it `settle`. Raises ValueError for what
-        cannot fall.
-        """
+        """Begin to tip the object over an edge of its base; raises ValueError for what rolls."""
         self.placed.topple(direction_rad)
 
     def settle(self, seconds: float = 0.5) -> None:
-        """Let the world run while the arm stands still and keeps hold of what it holds.
-
-        What can roll is braked by the table.
-        """
+        """Let the world run while the arm holds what it holds and the table brakes what rolls."""
         steps = round(check_within("seconds", seconds, 0.0, 60.0, "s") / STEP_S)
         if self._placed is not None:
             self.placed.brake(True)
@@ -222,34 +200,24 @@ class Tabletop:
     def observe(self) -> Observation:
         """The object's estimated position and its image; the arm must be parked.
 
-        The position is the mean over `n_averaged_images` images, the image is the first of them.
-        The yaw is not estimated from the image: it is the simulator's, which no camera could know
-        of an upright cylinder or a sphere.
+        The position is the mean over `n_averaged_images` images, the image is the first of them,
+        and the yaw is the simulator's.
         """
         x, y, yaw = self.object_pose()
-        image = None
+        views = []
         if self.config.camera == "kinect":
             images = range(self.n_averaged_images)
             views = [camera.kinect_view(self.client, self.noise) for _ in images]
             x, y = np.mean([xy for xy, _ in views], axis=0).tolist()
-            image = views[0][1]
-        x, y = x + self.config.bias_m[0], y + self.config.bias_m[1]
-        if image is None:
-            image = camera.depth_crop(self.client, (x, y))
-        return Observation((x, y), image, yaw_rad=yaw)
+        xy = x + self.config.bias_m[0], y + self.config.bias_m[1]
+        image = views[0][1] if views else camera.depth_crop(self.client, xy)
+        return Observation(xy, image, yaw_rad=yaw)
 
     def _observe_edge(self, lever: LeverUp) -> Observation:
         """The image (2, 128, 128) around a lever-up's contact, its direction to the right."""
         x, y, _ = self.object_pose()
-        image = camera.depth_crop(
-            self.client,
-            (x + lever.contact_x, y + lever.contact_y),
-            LEVER_IMAGE_PIXELS,
-            LEVER_CROP_WIDTH_M,
-            lever.theta,
-            samples=1,
-        )
-        return Observation((x, y), image)
+        window = (x + lever.contact_x, y + lever.contact_y), LEVER_IMAGE_PIXELS, LEVER_CROP_WIDTH_M
+        return Observation((x, y), camera.depth_crop(self.client, *window, lever.theta, samples=1))
 
     def depth_image(self) -> np.ndarray:
         """Depth [m] and mask (2, 48, 48) of the table around the object, the arm parked."""
@@ -269,10 +237,7 @@ class Tabletop:
         scale: float = 1.0,
     ) -> None:
         """Show the object's footprint at (x, y) [m] on the table, in a colour; only seen."""
-        obj, xy_m = self.obj, check_on_table("xy_m", xy_m)
-        yaw_rad, scale = check_finite("yaw_rad", yaw_rad), check_within("scale", scale, 0.1, 10.0)
-        rgb = [check_within("rgb", share, 0.0, 1.0) for share in check_array("rgb", rgb, 3)]
-        create_footprint(self.client, obj, xy_m, yaw_rad, (*rgb, 1.0), scale)
+        self.placed.draw_outline(xy_m, rgb, yaw_rad, scale)
 
     def can_reach(
         self, primitive: Primitive, stop_phase: float = 1.0, at_xy_m: Sequence[float] | None = None
@@ -280,7 +245,6 @@ class Tabletop:
         """Whether the arm can execute an action, with approach and way out; nothing moves.
 
         at_xy_m: where the object is (default: where it is observed, and the action adapted to it).
-        The kinematics are those by which `execute_primitive` plans.
         """
         stop_phase = check_within("stop_phase", stop_phase, 0.0, 1.0)
         if at_xy_m is None:
@@ -310,20 +274,19 @@ class Tabletop:
     ) -> Interaction:
         """Execute a primitive on the object up to a phase, and record what happens.
 
-        approach=False puts the arm at the start of the path and away in the end (collecting);
-        approach=True moves it there through the air and back home (executing a plan), and the
-        table brakes what rolls before and after what is recorded.
+        approach: the arm moves there and back home through the air, and the table brakes what
+        rolls before and after; otherwise it is put at the start of the path, and away in the end.
         The effect is recorded at 301 phases in [0, stop_phase]. A partial action is the prefix of
         the path, re-timed to its own smooth stop, or with smooth=False stopped abruptly.
-        Raises UnreachableError when the arm cannot follow the path; with record_unreachable=True
-        the result is then an interaction in which nothing moved (`reached` is False).
+        Raises UnreachableError out of the arm's reach, or returns, with record_unreachable=True,
+        an interaction in which nothing moved (`reached` is False).
         """
         stop_phase = check_within("stop_phase", stop_phase, 0.0, 1.0)
         self._require_tool(primitive)
         seen = self._observe_edge(primitive) if isinstance(primitive, LeverUp) else self.observe()
         command = Command.of(adapt_to_object(primitive, seen.image), stop_phase, smooth)
         try:
-            return self._execute(command, seen, approach)
+            return execute(self.arm, self.placed, command, seen, self.config.tip_offset_m, approach)
         except UnreachableError:
             if not record_unreachable:
                 raise
@@ -341,10 +304,8 @@ class Tabletop:
         primitive = primitive or Push(0.0)
         self._require_tool(primitive)
         command = Command.along(check_array("path_xy_m", path_xy_m, 2), primitive, stop_phase)
-        return self._execute(command, self.observe(), approach=True)
-
-    def _execute(self, command: Command, seen: Observation, approach: bool) -> Interaction:
-        return execute(self.arm, self.placed, command, seen, self.config.tip_offset_m, approach)
+        seen = self.observe()
+        return execute(self.arm, self.placed, command, seen, self.config.tip_offset_m, True)
 
     def _require_tool(self, primitive: Primitive) -> None:
         if primitive.tool != self.arm.tool:

@@ -1,8 +1,6 @@
-"""From a primitive to waypoints of the arm's joints; no physics, and nothing moves.
+"""From a primitive to waypoints of the arm's joints, found before anything moves.
 
-Inverse kinematics runs at 20 Hz, with a spline in between (its error is a few µm), so that an
-interaction costs little more than the physics itself. A whole action is planned before anything
-moves: what is out of reach raises first.
+Inverse kinematics runs at 20 Hz, with a spline in between (its error is a few µm).
 """
 
 from __future__ import annotations
@@ -81,11 +79,7 @@ class Command:
 def segments_until(
     primitive: Primitive, stop_phase: float, smooth: bool = True
 ) -> list[TrajectorySegment]:
-    """The trajectory of a primitive up to a phase, segment by segment.
-
-    smooth: the segment in which it stops keeps its path and gets a minimum-jerk stop of its own;
-    otherwise it is followed at full speed and stopped abruptly.
-    """
+    """The trajectory of a primitive up to a phase, with a minimum-jerk stop or an abrupt one."""
     segments = []
     phases = primitive.segment_phases
     for segment, begin, end in zip(primitive.segments, phases[:-1], phases[1:], strict=True):
@@ -148,11 +142,10 @@ def line(start_W: np.ndarray, end_W: np.ndarray, near: np.ndarray, seconds: floa
 
 @dataclass(frozen=True)
 class Motion:
-    """All joint waypoints of an action, found before anything moves.
+    """All joint waypoints (n, 6) of an action, found before anything moves.
 
-    over_start: (6,) above the start; down: (n, 6) from there to it; poses_W: (n, 5) of the tool at
-    the waypoints `paths` (n, 6), and gaps of the fingers (n,) there, of each segment; retreat,
-    lift: (n, 6), the way out.
+    over_start: (6,) above the start; down: from there to it; poses_W: (n, 5) of the tool at the
+    waypoints `paths`, and gaps of the fingers (n,) there, of each segment; out: back and up.
     """
 
     over_start: np.ndarray
@@ -160,8 +153,7 @@ class Motion:
     poses_W: list[np.ndarray]
     paths: list[np.ndarray]
     gaps: list[np.ndarray]
-    retreat: np.ndarray
-    lift: np.ndarray
+    out: np.ndarray
 
 
 def plan_motion(
@@ -208,4 +200,4 @@ def plan_motion(
     if approach:
         down = line(poses_W[0][0] + up, poses_W[0][0], over_start, 1.0, tool)
     gaps = [primitive.opening_m * s.poses[:, 4] for s in segments]
-    return Motion(over_start, down, poses_W, paths, gaps, retreat, lift)
+    return Motion(over_start, down, poses_W, paths, gaps, np.concatenate([retreat, lift[1:]]))
