@@ -218,7 +218,7 @@ def attempt(
     perturbed_start: when the plan is executed, the object is off its estimated pose by
     `POSITION_ERROR_M` and `YAW_ERROR_RAD`. n_averaged_images: whose mean each observation is.
     """
-    task.set_up(world)
+    world.place(task.obj, (0.0, 0.0), task.yaw_rad, config=task.config)
     world.n_averaged_images = n_averaged_images
     seen = world.observe()
     plan = planner(seen.image, seen.xy_m, task.goal, task.mode)

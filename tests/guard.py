@@ -116,7 +116,7 @@ def planned() -> dict[str, list[float]]:
     some = [[t for t in tasks if t.mode == mode][: N_GOALS // 2] for mode in MODES]
     with Tabletop() as world:
         for k, task in enumerate((some[1] + some[2])[:N_GOALS]):
-            task.set_up(world)
+            world.place(task.obj, (0.0, 0.0), task.yaw_rad, config=task.config)
             seen = world.observe()
             kind = skills.kind_for(seen.image)
             effects = EffectMap(skills.model(kind), seen.image, kind)

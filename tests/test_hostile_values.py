@@ -132,7 +132,6 @@ def valid_calls(shop):
     at, arrays, network, plan = (0.0, 0.0), shop["arrays"], shop["network"], shop["plan"]
     few = models.TrainingConfig(steps=1, batch_size=2, n_targets=2, device="cpu")
     problem = planning.PlanningProblem(at, goal, planning.EffectMap(model, image), "single_partial")
-    grip = {"image": image, "xy_m": at, "gripper_yaws_rad": (0.0, 0.1)}
     build = {"config": shop["config"], "scaler": shop["scaler"]}
     planner = shop["skills"].planner(planning.plan_astar)
     corners = tuple((0.03 * math.cos(a), 0.03 * math.sin(a)) for a in (0.0, 2.0, 4.0))
@@ -267,7 +266,7 @@ def valid_calls(shop):
             planning.Disturbance, kind="knock", action=0, x=0.1, y=0.0, turn=0.0, at_s=1.0
         ),
         "sample_disturbances": call(
-            planning.sample_disturbances, seed=0, n=1, n_actions=2, kinds=("knock",), strength=1.0
+            planning.sample_disturbances, seed=0, n=1, n_actions=2, kinds=("knock",)
         ),
         "action_limit": call(planning.action_limit, distance_m=0.1),
         "EffectMap": call(
@@ -282,17 +281,9 @@ def valid_calls(shop):
         "plan_gradient": call(
             planning.plan_gradient, problem=problem, samples=10, starts=1, seed=0
         ),
-        "plan_turn": call(
-            planning.plan_turn, **grip, model=shop["skills"].model(Rotate), turn_rad=0.3
-        ),
-        "plan_lift": call(
-            planning.plan_lift, **grip, model=shop["skills"].model(Grasp), height_m=0.05
-        ),
         "kind_for": call(shop["skills"].kind_for, image=image),
         "Skills": call(planning.Skills, models={"push": model}, reachability=None, threshold=0.2),
-        "execute_plan": call(
-            on_table(planning.execute_plan), robot=w, plan=plan, corrections=0, enough_m=0.001
-        ),
+        "execute_plan": call(on_table(planning.execute_plan), robot=w, plan=plan, corrections=0),
         "run_closed_loop": call(
             on_table(planning.run_closed_loop),
             robot=w,

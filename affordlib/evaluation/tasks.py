@@ -1,12 +1,9 @@
 """Where objects shall be brought: goals drawn by seed, before anything plans (Table 3).
 
-Objects are ones that no model has seen; goals are more than 2 cm from the start. Two families:
-*constructed* goals are where executed full or partial actions really ended, so they can be reached;
-*uniform* ones are drawn evenly over the area in reach. Those actions, or the bearings of uniform
-goals, are off the 10° grid of A*.
-
-The goals of the tables are frozen in `data/goals/planning.json`, those of the perturbed
-world in `data/goals/planning_perturbed.json`; `python -m experiments.shipped goals` drew them.
+Objects are ones that no model has seen; goals are more than 2 cm from the start. *Constructed* ones
+are where executed actions really ended, so they can be reached; *uniform* ones are drawn evenly
+over the area in reach; both off the 10° grid of A*. Those of the tables are frozen in files, which
+`python -m experiments.shipped goals` wrote.
 """
 
 from __future__ import annotations
@@ -52,10 +49,6 @@ class PlanningTask:
     mode: str
     goals: str
     config: WorldConfig = field(default_factory=WorldConfig)
-
-    def set_up(self, world: Tabletop) -> None:
-        """Stand the object on a table, in its world."""
-        world.place(self.obj, (0.0, 0.0), self.yaw_rad, config=self.config)
 
     def to_json(self) -> dict[str, Any]:
         """Plain values, from which `from_json` makes the same task."""

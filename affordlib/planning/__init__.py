@@ -16,7 +16,6 @@ from affordlib.planning.disturbances import (
 )
 from affordlib.planning.effect_map import EffectMap
 from affordlib.planning.gradient import plan_gradient
-from affordlib.planning.grasp_rotate import plan_lift, plan_turn
 from affordlib.planning.problem import MODES, PlanMode, PlanningProblem
 from affordlib.planning.robot import Execution, Robot
 from affordlib.planning.skills import Skills
@@ -38,8 +37,6 @@ __all__ = [
     "plan_astar",
     "plan_continuous",
     "plan_gradient",
-    "plan_lift",
-    "plan_turn",
     "run_closed_loop",
     "sample_disturbances",
 ]

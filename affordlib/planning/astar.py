@@ -28,14 +28,12 @@ STOP_PHASES = (0.2, 0.4, 0.6, 0.8, 1.0)
 PRUNE_BELOW_M = 0.001
 YAW_STEP_RAD = math.radians(1)
 _SAME_PLACE_M = 1e-4
+MAX_EXPANSIONS = 20_000
 
 
 @dataclass(frozen=True)
 class Branches:
-    """Every action of the search, and what it does to the object as it is turned now.
-
-    direction, stop_phase: (n,); effect_m: (2, n) along the table's axes; turn_rad: (n,).
-    """
+    """The actions (n,) of a search, their effects (2, n) along the table's axes, and turns (n,)."""
 
     direction: np.ndarray
     stop_phase: np.ndarray
@@ -87,103 +85,67 @@ class BranchTable:
         return self._kept[key]
 
 
-@dataclass(slots=True)
-class _Children:
-    """Where the actions from one node lead: arrays over the actions, and the node they are from.
-
-    A node of the search is one row of its parent's children.
-    """
-
-    parent: tuple[_Children, int] | None
-    xy_m: np.ndarray
-    turned: np.ndarray
-    way_m: np.ndarray
-    away_m: np.ndarray
-    direction: np.ndarray
-    stop_phase: np.ndarray
-
-
 def search(
     problem: PlanningProblem,
     table: BranchTable,
-    max_expansions: int = 20_000,
     trace: list[tuple[np.ndarray, np.ndarray]] | None = None,
 ) -> tuple[list[tuple[float, float]], bool, int]:
-    """The cheapest chain of (direction, phase) into the goal's disc, whether it gets there, and
-    how many nodes were expanded.
+    """The cheapest chain of (direction, phase) into the goal's disc, or the one that ends nearest.
 
-    Where no chain does, the one that ends nearest. Ties go to fewer actions. No action leads where
-    a part of the object would be off the table, or begins out of reach; a node from which the
-    object cannot be turned and lifted as the goal asks is none of the goal's. trace, if given,
-    receives each expanded position (2,) with those of its children (n, 2).
+    Also whether it gets there, and how many nodes were expanded. Ties go to fewer actions. A node
+    from which the object cannot be turned and lifted as the goal asks is none of the goal's. trace,
+    if given, receives each expanded position (2,) with those of its children (n, 2).
     """
-    goal, pose_planner = problem.goal, problem.pose_planner
-    max_steps = problem.mode.max_steps
-    goal_xy, tolerance = np.array(goal.xy_m)[:, None], goal.tolerance_m
-    reach = table.effects.reach_m
-    start, nothing = np.array([problem.start_xy_m]), np.zeros(1)
-    nearest_m = goal.distance_m(start[0])
-    root = _Children(None, start, nothing, nothing, np.array([nearest_m]), nothing, nothing)
+    goal, pose_planner, effects = problem.goal, problem.pose_planner, table.effects
+    max_steps, tolerance = problem.mode.max_steps, goal.tolerance_m
+    nearest, nearest_m = (), goal.distance_m(problem.start_xy_m)
     # The running number tells nodes of the same f and depth apart, so nothing after it is compared;
     # f is rounded, lest the last digits of a sum choose between two orders of the same actions.
     number = itertools.count()
-    frontier = [(max(0.0, nearest_m - tolerance), 0, next(number), root, 0)]
-    nearest, expansions, reached = (root, 0), 0, False
+    root = *problem.start_xy_m, 0.0, 0.0, nearest_m, ()
+    frontier = [(max(0.0, nearest_m - tolerance), 0, next(number), root)]
     expanded: set[tuple[int, ...]] = set()
-    while frontier and expansions < max_expansions:
-        _, depth, _, family, k = heapq.heappop(frontier)
-        (x, y), turned, away = family.xy_m[k].tolist(), float(family.turned[k]), family.away_m[k]
-        if away < nearest_m - 1e-12:
-            nearest, nearest_m = (family, k), float(away)
-        if away <= tolerance and (
+    reached = False
+    while frontier and len(expanded) < MAX_EXPANSIONS:
+        _, depth, _, (x, y, turned, way_m, away_m, chain) = heapq.heappop(frontier)
+        if away_m < nearest_m - 1e-12:
+            nearest, nearest_m = chain, away_m
+        if away_m <= tolerance and (
             not pose_planner or pose_planner(goal, (x, y), turned) is not None
         ):
-            nearest, reached = (family, k), True
+            nearest, reached = chain, True
             break
         cell = (round(x / _SAME_PLACE_M), round(y / _SAME_PLACE_M), round(turned / YAW_STEP_RAD))
         if depth == max_steps or (depth, *cell) in expanded:
             continue
         expanded.add((depth, *cell))
-        expansions += 1
         branches = table.at(turned)
         depth += 1
-        places = (branches.effect_m + np.array([[x], [y]])).T
-        away = np.hypot(*(places.T - goal_xy))
+        places = branches.effect_m.T + np.array([x, y])
+        away = np.hypot(*(places - goal.xy_m).T)
         if depth == max_steps:
             rows = np.flatnonzero(away < max(nearest_m, tolerance + 1e-12))
         else:
-            rows = np.flatnonzero(away <= tolerance + (max_steps - depth) * reach + nearest_m)
-        if len(rows):
-            rows = rows[is_on_table(places[rows], table.effects.radius_m)]
-            here = np.broadcast_to((x, y), (len(rows), 2))
-            rows = rows[problem.reachable(here, branches.direction[rows])]
+            within_m = tolerance + (max_steps - depth) * effects.reach_m + nearest_m
+            rows = np.flatnonzero(away <= within_m)
+        rows = rows[is_on_table(places[rows], effects.radius_m)]
+        here = np.broadcast_to((x, y), (len(rows), 2))
+        rows = rows[problem.reachable(here, branches.direction[rows])]
         if trace is not None:
             trace.append((np.array((x, y)), places[rows]))
-        if not len(rows):
-            continue
-        if depth == max_steps:
+        if depth == max_steps and len(rows):
             # From there nothing goes on: outside the goal's disc only the nearest counts.
             ends = away[rows] <= tolerance
             ends[away[rows].argmin()] = True
             rows = rows[ends]
-        children = _Children(
-            (family, k),
-            places[rows],
-            turned + branches.turn_rad[rows],
-            family.way_m[k] + np.hypot(*branches.effect_m[:, rows]),
-            away[rows],
-            branches.direction[rows],
-            branches.stop_phase[rows],
-        )
-        f = np.round(children.way_m + np.maximum(0.0, children.away_m - tolerance), 12)
-        for row, value in enumerate(f.tolist()):
-            heapq.heappush(frontier, (value, depth, next(number), children, row))
-    chain = []
-    family, k = nearest
-    while family.parent is not None:
-        chain.append((float(family.direction[k]), float(family.stop_phase[k])))
-        family, k = family.parent
-    return chain[::-1], reached, expansions
+        way = way_m + np.hypot(*branches.effect_m[:, rows])
+        f = np.round(way + np.maximum(0.0, away[rows] - tolerance), 12)
+        turns = turned + branches.turn_rad[rows]
+        actions = branches.direction[rows], branches.stop_phase[rows]
+        for row in np.column_stack([f, places[rows], turns, way, away[rows], *actions]).tolist():
+            node = (*row[1:6], (*chain, tuple(row[6:])))
+            heapq.heappush(frontier, (row[0], depth, next(number), node))
+    return list(nearest), reached, len(expanded)
 
 
 def plan_astar(
@@ -193,8 +155,7 @@ def plan_astar(
 ) -> Plan:
     """Plan by A*."""
     began = time.perf_counter()
-    mode = problem.mode
-    stops = tuple(stop_phases) if mode.partial else (1.0,)
+    stops = tuple(stop_phases) if problem.mode.partial else (1.0,)
     table = BranchTable(problem.effects, n_directions, stops)
     chain, reached, expansions = search(problem, table)
     chain = torch.tensor(chain, dtype=torch.float64).reshape(-1, 2)

@@ -1,11 +1,8 @@
-"""Carrying plans out; the only part of planning that acts.
+"""Carrying plans out; the only part of planning that acts, and knows only a `Robot`.
 
 `execute_plan` trusts a plan. `run_closed_loop` observes after every action (Section 3.4 of the
 paper): is the object where it was predicted to be, has the goal changed, has the object fallen? If
-so it plans again, from a new image. It ends in one of four ways, and says so.
-
-Both know only a `Robot`. What they say of the object is what the robot says; how far the object
-really is from its goal is for the caller to measure, where somebody knows.
+so it plans again, from a new image.
 """
 
 from __future__ import annotations
@@ -41,7 +38,6 @@ from affordlib.types import (
     Step,
     UnreachableError,
     check_count,
-    check_field,
     check_within,
 )
 
@@ -71,6 +67,7 @@ MAX_RENEWALS = 3
 """So many times more actions are allowed because somebody displaced the object."""
 
 MAX_LIFTS = 2
+HEIGHT_TOLERANCE_M = 0.003
 STATUSES = ("reached", "unreachable", "gave_up", "lost")
 
 
@@ -79,20 +76,13 @@ def execute_plan(
     plan: Plan,
     corrections: int = 0,
     replan: Replan | None = None,
-    enough_m: float = ENOUGH_M,
 ) -> Outcome:
-    """Execute a plan's steps, as planned.
+    """Execute a plan's steps as planned, each action relative to where the object then stands.
 
-    Open loop: the plan is not revised. Each action is carried out relative to where the object
-    then stands, as actions are defined. The outcome is what the robot measured: of a `Tabletop` the
-    simulator's state after the gripper has retreated, unless it holds the object, and the object
-    has rested 0.5 s. Raises UnreachableError when the arm cannot follow a step; it has the outcome
-    of those before.
-
-    corrections: after the last step, so many single actions at most, each the first of a plan that
-    `replan` makes from a new image, and each only if the object is seen, and farther than enough_m
-    [m] from the goal, the plan expects to bring it nearer, and the arm can do it. There are none
-    after a plan that ends with the object in the hand.
+    The outcome is what the robot measured. Raises UnreachableError when the arm cannot follow a
+    step; it has the outcome of those before. corrections: after the last step, unless it holds the
+    object, at most so many single actions, each the first of a plan that `replan` makes from a new
+    image, and each only if it is expected to bring the object nearer.
     """
     if corrections and replan is None:
         raise ValueError(f"corrections = {corrections} need a planner; give replan as well")
@@ -110,10 +100,10 @@ def execute_plan(
         except NothingSeenError:
             break
         distance_m = plan.goal.distance_m(seen.xy_m)
-        if distance_m <= enough_m or not _is_seen_on_table(seen):
+        if distance_m <= ENOUGH_M or not _is_seen_on_table(seen):
             break
         # A planner content within the goal's tolerance would have nothing to correct.
-        exactly = replace(plan.goal, tolerance_m=min(plan.goal.tolerance_m, enough_m))
+        exactly = replace(plan.goal, tolerance_m=min(plan.goal.tolerance_m, ENOUGH_M))
         steps = replan(seen.image, seen.xy_m, exactly).steps[:1]
         if not steps or plan.goal.distance_m(steps[0].predicted_end_xy_m) >= distance_m:
             break
@@ -146,25 +136,19 @@ def _is_seen_on_table(seen: Observation) -> bool:
 
 @dataclass(frozen=True)
 class ClosedLoopConfig:
-    """How exactly a goal is to be met, and with how many actions.
+    """With how many actions a goal is to be met, and who is told of them.
 
-    The position holds when the object is seen within the goal's own tolerance. max_actions: default
-    `action_limit` of the distance, renewed when the goal moves or somebody displaces the object
-    (that at most three times). horizon: the longest chain the planner may return. on_action:
-    called with the plan and the number of actions taken, after each. on_plan: called with every
-    plan before its first action.
+    max_actions: default `action_limit` of the distance, renewed when the goal moves or somebody
+    displaces the object. horizon: the longest chain the planner may return. on_action: called with
+    the plan and the number of actions taken, after each; on_plan: with a plan before its first.
     """
 
-    turn_tolerance_rad: float = TURN_TOLERANCE_RAD
-    height_tolerance_m: float = 0.003
     max_actions: int | None = None
     horizon: int = 3
-    on_action: Callable[[Plan, int], None] | None = None
-    on_plan: Callable[[Plan], None] | None = None
+    on_action: Callable[[Plan, int], None] = lambda *_: None
+    on_plan: Callable[[Plan], None] = lambda *_: None
 
     def __post_init__(self) -> None:
-        check_field(self, "height_tolerance_m", 1e-5, 0.1, "m")
-        check_field(self, "turn_tolerance_rad", 1e-4, math.pi, "rad")
         check_count("horizon", self.horizon, 1, 10)
         if self.max_actions is not None:
             check_count("max_actions", self.max_actions, least=0)
@@ -174,12 +158,10 @@ class ClosedLoopConfig:
 class ClosedLoopResult:
     """What came of a closed loop, as the robot observed it.
 
-    status: one of `STATUSES`; message: the same in words; goal: as it was in the end; end_pose:
-    (x, y, yaw) of the object, yaw 0 where the robot does not know it; distance_m: between that and
-    the goal; turn_error_rad, height_error_m: likewise, None where the goal does not ask; steps: the
-    actions taken; object_paths_xy_m: one (n, 2) path of the object for each; plans: all that were
-    made; seen_xy_m: where the object was seen before every decision; vetoes: planned actions that
-    the arm's kinematics refused before any motion.
+    status: one of `STATUSES`; goal: as it was in the end; end_pose: (x, y, yaw) of the object, yaw
+    0 where it is not known; turn_error_rad, height_error_m: None where the goal does not ask;
+    steps: the actions taken, with a path (n, 2) of the object for each; plans: all that were made;
+    seen_xy_m: before every decision; vetoes: planned actions that the arm's kinematics refused.
     """
 
     goal: Goal
@@ -216,8 +198,7 @@ def run_closed_loop(
 ) -> ClosedLoopResult:
     """Bring the object to a goal, whatever happens on the way: position, orientation, height.
 
-    goal: or a function that returns it, where it may move. planner: such as plan_astar,
-    plan_continuous, plan_gradient. Never moves where the arm's kinematics says no. Raises
+    goal: or a function that returns it, where it may move. planner: such as plan_astar. Raises
     NothingSeenError where no object is seen to begin with.
     """
     goal_now = (lambda: goal) if isinstance(goal, Goal) else goal
@@ -322,7 +303,7 @@ class _ClosedLoop:
         turn_rad = self._turn_left()
         if self.goal.distance_m(self.seen.xy_m) > self.goal.tolerance_m:
             return self._act("position", self._move)
-        if turn_rad is not None and abs(turn_rad) > self.config.turn_tolerance_rad:
+        if turn_rad is not None and abs(turn_rad) > TURN_TOLERANCE_RAD:
             if not self.turn_allowed:  # as far as a whole round, in sweeps of 60°
                 sweeps = math.ceil((turn_rad % (2 * math.pi)) / Rotate.sweep_rad)
                 self._allow(sweeps + SPARE_ACTIONS)
@@ -341,10 +322,7 @@ class _ClosedLoop:
         x, y, self.lifted_m, yaw_rad = self.paths[-1][-1].tolist()
         self.seen = replace(self.seen, xy_m=(x, y), yaw_rad=yaw_rad)
         turn_rad, height_m = self._turn_left() or 0.0, self._height_left()
-        if (
-            abs(turn_rad) <= self.config.turn_tolerance_rad
-            and abs(height_m) <= self.config.height_tolerance_m
-        ):
+        if abs(turn_rad) <= TURN_TOLERANCE_RAD and abs(height_m) <= HEIGHT_TOLERANCE_M:
             if self.goal.distance_m((x, y)) <= max(self.goal.tolerance_m, SHIFTED_M):
                 return Ending("reached", self._where())
             if last:
@@ -366,8 +344,7 @@ class _ClosedLoop:
         except UnreachableError as error:  # of what it sees now, a hair off what it agreed to
             return Ending("unreachable", f"the {part}: {error}")
         self.steps.append(step)
-        if self.config.on_action is not None:
-            self.config.on_action(self.plan, len(self.steps))
+        self.config.on_action(self.plan, len(self.steps))
         return None
 
     def _move(self) -> Step | Ending:
@@ -381,9 +358,9 @@ class _ClosedLoop:
         return self.queue.pop(0)
 
     def _turn(self) -> Step | Ending:
-        turn_rad, image = self._turn_left(), self.seen.image
+        turn_rad = self._turn_left()
         model = self.skills.model(Rotate)
-        predicted = predict_trajectories(model, image, Rotate(), "yaw", GRIPPER_YAWS_RAD)
+        predicted = predict_trajectories(model, self.seen.image, Rotate(), "yaw")
         return self._first_possible(
             candidate_turns(predicted, self.seen.xy_m, turn_rad),
             f"the orientation: {math.degrees(turn_rad):.0f}° more",
@@ -408,24 +385,19 @@ class _ClosedLoop:
         self, candidates: Iterable[Step], wanted: str, hopeless: str
     ) -> Step | Ending:
         """The first of some steps, each with another gripper yaw, to which the arm agrees."""
-        at, refused = self.seen.xy_m, None
+        at = self.seen.xy_m
         for step in candidates:
             primitive = adapt_to_object(step.primitive, self.seen.image)
             if self.robot.can_reach(primitive, step.stop_phase, at):
                 self._follow(Plan(self.goal, at, (step,), primitive.name, False, 0, 0.0))
                 return step
             self.moves.vetoes += 1
-            refused = primitive.name
-        if refused is not None:
-            return Ending(
-                "unreachable", f"{wanted}: the arm cannot {refused} at ({at[0]:.3f}, {at[1]:.3f}) m"
-            )
-        return Ending("unreachable", f"{wanted}, and {hopeless}")
+            hopeless = f"the arm cannot {primitive.name} at ({at[0]:.3f}, {at[1]:.3f}) m"
+        return Ending("unreachable", f"{wanted}: {hopeless}")
 
     def _follow(self, plan: Plan) -> None:
         self.plan = plan
-        if self.config.on_plan is not None:
-            self.config.on_plan(plan)
+        self.config.on_plan(plan)
 
     def _limit_from(self, xy_m: Sequence[float]) -> int:
         if self.config.max_actions is not None:

@@ -8,12 +8,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from affordlib.planning.robot import Execution
-from affordlib.primitives import Primitive
 from affordlib.types import (
     TABLE_X_M,
     TABLE_Y_M,
@@ -22,8 +21,6 @@ from affordlib.types import (
     Step,
     check_count,
     check_field,
-    check_on_table,
-    check_within,
 )
 
 if TYPE_CHECKING:
@@ -81,13 +78,8 @@ class Disturbance:
 
 def _inside(x: float, y: float) -> tuple[float, float]:
     """The nearest place that is not at the table's edge."""
-    return check_on_table(
-        "disturbed place",
-        (
-            min(max(x, TABLE_X_M[0] + EDGE_M), TABLE_X_M[1] - EDGE_M),
-            min(max(y, TABLE_Y_M[0] + EDGE_M), TABLE_Y_M[1] - EDGE_M),
-        ),
-    )
+    (x0, x1), (y0, y1) = TABLE_X_M, TABLE_Y_M
+    return min(max(x, x0 + EDGE_M), x1 - EDGE_M), min(max(y, y0 + EDGE_M), y1 - EDGE_M)
 
 
 class DisturbanceSchedule:
@@ -98,10 +90,7 @@ class DisturbanceSchedule:
     """
 
     def __init__(
-        self,
-        world: affordlib.world.Tabletop,
-        goal: Goal,
-        disturbances: Sequence[Disturbance] = (),
+        self, world: affordlib.world.Tabletop, goal: Goal, disturbances: Sequence[Disturbance] = ()
     ) -> None:
         self.world, self.goal = world, goal
         self.happened: list[Disturbance] = []
@@ -148,46 +137,31 @@ class DisturbanceSchedule:
             if settle and one.kind in ("knock", "topple"):
                 self.world.settle(TIPPING_S)
 
-    def can_reach(
-        self, primitive: Primitive, stop_phase: float = 1.0, at_xy_m: Sequence[float] | None = None
-    ) -> bool:
-        """As the tabletop says."""
-        return self.world.can_reach(primitive, stop_phase, at_xy_m)
-
-    def park(self) -> None:
-        """As the tabletop does."""
-        self.world.park()
-
-    def settle(self, seconds: float = 0.5) -> None:
-        """As the tabletop does."""
-        self.world.settle(seconds)
+    def __getattr__(self, name: str) -> Any:
+        """All else as the tabletop does."""
+        return getattr(self.world, name)
 
 
 def sample_disturbances(
-    seed: int,
-    n: int = 1,
-    n_actions: int = 2,
-    kinds: Sequence[str] = KINDS,
-    strength: float = 1.0,
+    seed: int, n: int = 1, n_actions: int = 2, kinds: Sequence[str] = KINDS
 ) -> tuple[Disturbance, ...]:
     """A schedule of n disturbances, a function of the seed alone.
 
     Each comes in the middle of one of n_actions actions, or (never before the first) between two:
     shoves of 3 to 10 cm and up to half a turn, knocks of 0.2 to 0.5 m/s, goals that move by 3 to
-    10 cm. strength: multiplies these.
+    10 cm.
     """
     if not kinds or not set(map(str, kinds)) <= set(KINDS):
         raise ValueError(f"kinds must be at least one of {KINDS}, got {kinds!r:.100}")
     check_count("n", n, 0, 1000)
     check_count("n_actions", n_actions, 1, 1000)
-    check_within("strength", strength, 0.0, 10.0)
     rng = np.random.default_rng(check_count("seed", seed, least=0))
     drawn = []
     for _ in range(n):
         kind = str(rng.choice(list(kinds)))
         action, angle = int(rng.integers(n_actions)), rng.uniform(-math.pi, math.pi)
         low, high = (0.2, 0.5) if kind == "knock" else (0.03, 0.1)
-        size = strength * rng.uniform(low, high)
+        size = rng.uniform(low, high)
         turn = rng.uniform(-math.pi, math.pi) if kind == "shove" else 0.0
         middle = kind == "knock" or (kind != "shove" and rng.random() < 0.5)
         at_s = float(rng.uniform(2.0, 5.5)) if middle else None

@@ -104,37 +104,6 @@ def crossings(phase: np.ndarray, values: np.ndarray, wanted: float) -> np.ndarra
     return phase[at] + share * (phase[at + 1] - phase[at])
 
 
-def plan_turn(
-    model: EffectModel,
-    image: np.ndarray,
-    xy_m: Sequence[float],
-    turn_rad: float,
-    gripper_yaws_rad: Sequence[float] = GRIPPER_YAWS_RAD,
-) -> Step | None:
-    """The rotation that turns an object at (x, y) by an angle, or as far towards it as it can.
-
-    gripper_yaws_rad: to choose from. None when none is predicted to turn it by 1°.
-    """
-    predicted = predict_trajectories(model, image, Rotate(), "yaw", gripper_yaws_rad)
-    return next(candidate_turns(predicted, xy_m, turn_rad), None)
-
-
-def plan_lift(
-    model: EffectModel,
-    image: np.ndarray,
-    xy_m: Sequence[float],
-    height_m: float,
-    gripper_yaws_rad: Sequence[float] = GRIPPER_YAWS_RAD,
-) -> Step | None:
-    """The grasp that ends holding an object from (x, y) at a height [m] above where it stands.
-
-    gripper_yaws_rad: to choose from. None when the model is sure (90 %) that the object does not
-    get so high, or slips.
-    """
-    predicted = predict_trajectories(model, image, Grasp(), "z", gripper_yaws_rad)
-    return next(candidate_lifts(predicted, xy_m, height_m), None)
-
-
 def candidate_turns(
     predicted: PredictedTrajectories, xy_m: Sequence[float], turn_rad: float
 ) -> Iterator[Step]:

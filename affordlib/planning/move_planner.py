@@ -70,18 +70,11 @@ class MovePlanner:
         if plan is None:
             route = self._feasible_route(effects, seen.xy_m, goal.xy_m)
             if route is None:
-                x, y = goal.xy_m
-                return Ending(
-                    "unreachable",
-                    f"the position ({x:.3f}, {y:.3f}) m: from where the object is, no chain of "
-                    "actions that the arm can carry out leads there",
-                )
+                at = "({:.3f}, {:.3f}) m".format(*goal.xy_m)
+                return Ending("unreachable", f"the position {at}: the arm cannot bring it there")
             plan = self._plan_along(effects, seen.xy_m, goal, route)
-        return plan or Ending(
-            "gave_up",
-            "no action is predicted to bring the object nearer to its position than "
-            f"{1000 * distance_m:.1f} mm",
-        )
+        nearest = f"no action is predicted to bring it nearer than {1000 * distance_m:.1f} mm"
+        return plan or Ending("gave_up", nearest)
 
     def _plan_along(
         self, effects: EffectMap, start: Point, goal: Goal, route: list[Point]
@@ -116,11 +109,8 @@ class MovePlanner:
             if not plan.steps or plan.predicted_distance_m > within_m:
                 return None
             starts = [start, *(step.predicted_end_xy_m for step in plan.steps)]
-            actions = [(step.primitive, step.stop_phase) for step in plan.steps]
-            if (
-                self._first_refused((*a, at) for a, at in zip(actions, starts, strict=False))
-                is None
-            ):
+            moves = zip(plan.steps, starts, strict=False)
+            if self._first_refused((s.primitive, s.stop_phase, at) for s, at in moves) is None:
                 return plan
         return None
 

@@ -73,8 +73,7 @@ class Skills:
     ) -> PlanningProblem:
         """The problem of bringing the object in an image (2, 48, 48) from (x, y) [m] to a goal.
 
-        As long as the image stays the same, as it does while only the goal moves, what the models
-        predict of it is kept.
+        What the models predict is kept for the last image.
         """
         effects, poses = self._predictions(image)
         reachable = self.reachable(effects.kind)
@@ -106,9 +105,7 @@ class Skills:
         return {}
 
     def _can_act(self, name: str, xy_m: Sequence[float]) -> bool:
-        if self.reachability is None:
-            return True
-        return bool(self.reachability.probability(name, np.array([xy_m]))[0] >= self.threshold)
+        return bool(self.reachable(primitive_named(name))(np.array([xy_m]), None)[0])
 
     def reachable(self, kind: type[Primitive]) -> Reachable:
         """Where the arm can act with a primitive."""

@@ -6,8 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from affordlib.planning import execute_plan, plan_astar, plan_continuous, plan_lift, plan_turn
-from affordlib.planning.grasp_rotate import GRIPPER_YAWS_RAD, crossings, predict_trajectories
+from affordlib.planning import execute_plan, plan_astar, plan_continuous
+from affordlib.planning.grasp_rotate import (
+    GRIPPER_YAWS_RAD,
+    candidate_lifts,
+    candidate_turns,
+    crossings,
+    predict_trajectories,
+)
 from affordlib.primitives import Drag, Grasp, Push, Rotate, wrap_angle
 from affordlib.types import Goal
 from affordlib.world import Cuboid, LyingCylinder, UprightCylinder
@@ -19,6 +25,19 @@ DISC = LyingCylinder(0.05, 0.10)
 
 PLANNERS = pytest.mark.parametrize("plan", [plan_astar, plan_continuous])
 AT = (0.0, 0.0)
+
+
+def plan_turn(model, image, xy_m, turn_rad):
+    return next(
+        candidate_turns(predict_trajectories(model, image, Rotate(), "yaw"), xy_m, turn_rad), None
+    )
+
+
+def plan_lift(model, image, xy_m, height_m, yaws=GRIPPER_YAWS_RAD):
+    return next(
+        candidate_lifts(predict_trajectories(model, image, Grasp(), "z", yaws), xy_m, height_m),
+        None,
+    )
 
 
 def test_crossings_are_where_the_trajectory_has_the_value():

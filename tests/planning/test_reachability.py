@@ -75,14 +75,5 @@ def test_a_damaged_file_is_told(learned, tmp_path):
         Reachability.load(path)
     with pytest.raises(FileNotFoundError):
         Reachability.load(tmp_path / "none.safetensors")
-
-
-def test_it_answers_for_many_places_at_once(learned):
-    places = np.array([[0.0, 0.0], [0.0, 0.3], [0.65, 0.65]])
-    many = learned.probability("push", places, 0.5)
-    single = [learned.probability("push", place, 0.5)[0] for place in places]
-    np.testing.assert_allclose(many, single, atol=1e-6)
-    assert many[0] > 0.95
-    assert many[2] < 0.2
     with pytest.raises(ValueError, match="primitive 'kick'"):
-        learned.probability("kick", places)
+        learned.probability("kick", np.zeros((1, 2)))
