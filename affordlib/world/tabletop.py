@@ -6,6 +6,7 @@ four times finer step with twice the solver's iterations a push ends within 0.02
 
 from __future__ import annotations
 
+import os
 import weakref
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
@@ -42,6 +43,14 @@ OBJECTS_PER_BUILD = 256
 """After so many objects the client is built again: Bullet keeps 5 kB of each that is removed."""
 
 
+class _Client(BulletClient):
+    """PyBullet with a client's number, connected without options, which Bullet would print."""
+
+    def __init__(self) -> None:
+        self._pid = os.getpid()
+        self._client = pybullet.connect(pybullet.DIRECT)
+
+
 class Tabletop(AbstractContextManager):
     """A table, an arm and at most one object, in a PyBullet client of its own.
 
@@ -51,7 +60,7 @@ class Tabletop(AbstractContextManager):
 
     def __init__(self, config: WorldConfig | None = None) -> None:
         self.config = config or WorldConfig()
-        self._client: BulletClient | None = BulletClient(pybullet.DIRECT)
+        self._client: BulletClient | None = _Client()
         self.arm: JointController | None = None
         self.on_step: Callable[[Tabletop], None] | None = None
         self.n_averaged_images = 1
