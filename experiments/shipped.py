@@ -69,7 +69,7 @@ from experiments.attention import AttentionConfig
 class CheckpointSpec:
     """A shipped checkpoint: the data set it learns from, its network, and its training.
 
-    symmetries: see `augment_by_symmetry`; draw: see `train`.
+    symmetries: see `augment_by_symmetry`; sampler: see `train`.
     """
 
     data: str
@@ -210,7 +210,7 @@ def train_checkpoint(name: str) -> None:
         model, history = train_lever_model(lever, data, split, trained_for)
         about = about_lever_training(data, split, lever, trained_for)
     else:
-        how = {"symmetries": spec.symmetries, "draw": spec.draw}
+        how = {"symmetries": spec.symmetries, "sampler": spec.sampler}
         model, history = train_model(data, split, spec.training, spec.network, **how)
         seen = np.concatenate([split.train, split.validation])
         about = about_training(data, seen, spec.training)

@@ -1,6 +1,7 @@
 """Table 3: its rows, its planners, and that the committed one belongs to what is shipped."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -81,6 +82,16 @@ def test_frozen_goals_are_never_written_over(capsys):
     assert shipped.main(["goals"]) == 0
     assert "all are there" in capsys.readouterr().out
     assert [tasks_sha256(which) for which in FROZEN] == before
+
+
+def test_a_shipped_checkpoint_can_be_trained_again(monkeypatch, capsys):
+    spec, saved = shipped.CHECKPOINT_SPECS["cnp_500"], []
+    short = replace(spec, training=replace(spec.training, steps=2, batch_size=4, augment=False))
+    monkeypatch.setitem(shipped.CHECKPOINT_SPECS, "cnp_500", short)
+    monkeypatch.setattr(shipped, "save_checkpoint", lambda _, path, about: saved.append(path.name))
+    shipped.train_checkpoint("cnp_500")
+    assert saved == ["cnp_500.safetensors"]
+    assert "2 steps" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("name", CONFIGS)
