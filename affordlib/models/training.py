@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 import xarray as xr
-from tqdm.auto import tqdm
+from tqdm import tqdm
 
 from affordlib.geometry import xy_columns
 from affordlib.interactions.dataset import (
