@@ -79,7 +79,7 @@ class Primitive:
                 continue
             if name in self.lengths_m:
                 check_field(self, name, *self.lengths_m[name], "m")
-            else:
+            elif name in ("theta", "grip_yaw"):
                 angle = check_finite(name, value)
                 angle = angle % (2 * math.pi) if name == "theta" else wrap_angle(angle)
                 object.__setattr__(self, name, angle)
