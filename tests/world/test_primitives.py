@@ -2,7 +2,7 @@
 
 import hashlib
 import math
-from dataclasses import replace
+from dataclasses import make_dataclass, replace
 
 import numpy as np
 import psutil
@@ -255,3 +255,8 @@ def test_no_episode_knows_of_the_one_before(world):
     for job in [*reversed(jobs), *jobs, *reversed(jobs)]:
         assert _fingerprint(world, job).digest() == first[job]
     assert psutil.Process().memory_info().rss - before < 20e6
+
+
+def test_a_field_of_its_own_is_no_angle():
+    timed = make_dataclass("Timed", [("seconds", float, 3.75)], bases=(Push,), frozen=True)
+    assert timed.towards(0.5, seconds=9.0).seconds == 9.0
