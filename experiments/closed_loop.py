@@ -11,21 +11,21 @@ without observing again (`open_loop_pose_goals`).
 
 from __future__ import annotations
 
-import argparse
-import hashlib
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
+from itertools import islice
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from affordlib.commands import command, count_type, names_type, seed_type
+from affordlib.evaluation.metrics import error_row
 from affordlib.geometry import wrap_angle
-from affordlib.models.checkpoint import weights_bytes
-from affordlib.paths import repo_root
 from affordlib.planning import (
     ClosedLoopResult,
     Disturbance,
@@ -39,17 +39,16 @@ from affordlib.planning import (
 )
 from affordlib.planning.disturbances import KINDS
 from affordlib.planning.grasp_rotate import GRIPPER_YAWS_RAD
-from affordlib.planning.reachability import SHIPPED as REACHABILITY
 from affordlib.planning.skills import CHECKPOINTS
 from affordlib.primitives import Drag, Grasp, Push
 from affordlib.results import write_results
 from affordlib.types import TABLE_X_M, TABLE_Y_M, Goal
-from affordlib.workers import dask_client
 from affordlib.world import Tabletop, TabletopObject, UnreachableError, category_named
-from experiments.closed_loop_tables import OPEN_LOOP_ROWS, ROWS, WITHIN_HEIGHT_M
+from experiments import runner
 from experiments.feasibility import half_width_m, is_feasible, on_the_rim
-from experiments.runner import Job, read, run
+from experiments.runner import FOLDER, Job
 
+Rows = list[dict[str, Any]]
 N_TRIALS = {"height": 50, "orientation": 50, "disturbances": 200, "reachability": 1000}
 VERSIONS = dict.fromkeys((*N_TRIALS, "open_loop_pose_goals"), 1)
 """Raise one when the code changes and the table's numbers do."""
@@ -60,6 +59,8 @@ PLANNERS = {"astar": plan_astar, "continuous": plan_continuous}
 TOLERANCE_M = {"height": 0.004, "orientation": 0.004, "disturbances": 0.002, "reachability": 0.002}
 """Of the position; gripping shifts objects."""
 
+WITHIN_M, WITHIN_HEIGHT_M, WITHIN_TURN_RAD = 0.005, 0.005, math.radians(3)
+STATUSES = ("reached", "unreachable", "gave_up", "lost")
 EDGE_M = 0.05
 """Goals of `reachability` are at least this far from the table's edge."""
 
@@ -219,9 +220,114 @@ def run_open_loop(table: str, index: int, planner: str) -> dict[str, Any]:
     }
 
 
-@cache
-def _reachability_sha256() -> str:
-    return hashlib.sha256(weights_bytes(repo_root() / REACHABILITY)).hexdigest()
+def _groups(table: pd.DataFrame, *by: str) -> Iterator[tuple[dict[str, Any], pd.DataFrame]]:
+    """All records, and those of each value of some columns, with the columns that all have."""
+    groups = [({}, table)]
+    groups += [({k: value}, some) for k in by for value, some in table.groupby(k, sort=False)]
+    for about, some in groups:
+        row = dict.fromkeys(by, "all") | about | {"n": len(some)}
+        if "status" in some:
+            row["feasible"] = int(some.feasible.sum())
+            row |= {name: int((some.status == name).sum()) for name in STATUSES}
+        yield row, some
+
+
+def _percent(good: pd.Series) -> float | None:
+    return 100 * float(good.mean()) if len(good) else None
+
+
+def _mean(values: pd.Series) -> float | None:
+    return float(values.mean()) if len(values) else None
+
+
+def pose_rows(records: Rows, column: str, within: float, unit: str) -> Rows:
+    """Rows of `height` or `orientation`: how many feasible goals are hit, and with what error.
+
+    Hit is within 5 mm of the position, and also within so much of the height [m] or turn [rad]; the
+    errors are of those that say they reached it.
+    """
+    rows = []
+    for row, some in _groups(pd.DataFrame(records), "object_class"):
+        feasible = some[some.feasible]
+        reached = feasible[feasible.status == "reached"]
+        hit = (feasible.distance_m <= WITHIN_M) & (feasible[column].abs() <= within)
+        spread = error_row(reached[column].abs().to_numpy(float)) if len(reached) else {}
+        row["within_percent"] = _percent(hit)
+        for name in ("mean", "sem", "median", "p95"):
+            row[f"pose_error_{unit}_{name}"] = spread.get(f"{name}_m")
+        row["distance_m_mean"] = _mean(reached.distance_m)
+        rows.append(row | {"actions_mean": _mean(reached.actions)})
+    return rows
+
+
+def disturbance_rows(records: Rows) -> Rows:
+    """Rows of `disturbances`: how trials ended, and errors with and without disturbance, paired."""
+    rows = []
+    table = pd.json_normalize(list(records), sep="_")
+    for row, some in _groups(table, "kind", "object_class"):
+        feasible = some[some.feasible]
+        both = feasible[(feasible[["status", "undisturbed_status"]] == "reached").all(axis=1)]
+        apart = both.distance_m - both.undisturbed_distance_m
+        row["within_percent"] = _percent(feasible.distance_m <= WITHIN_M)
+        row["disturbed_mean_m"] = _mean(both.distance_m)
+        row["undisturbed_mean_m"] = _mean(both.undisturbed_distance_m)
+        row["apart_mean_m"] = _mean(apart)
+        row["apart_sem_m"] = float(apart.sem()) if len(apart) > 1 else None
+        row["actions_mean"] = _mean(feasible.actions)
+        rows.append(row | {"undisturbed_actions_mean": _mean(feasible.undisturbed_actions)})
+    return rows
+
+
+def reachability_rows(records: Rows) -> Rows:
+    """Rows of `reachability`: both rates, goals on the rim of what can be reached apart.
+
+    Right is a plan that was carried out, or 'unreachable' where the kinematics agrees.
+    """
+    table, rows = pd.DataFrame(records), []
+    table["right"] = table.status == table.feasible.map({True: "reached", False: "unreachable"})
+    rim = table.on_the_rim
+    for goals, some in {"all": table, "off the rim": table[~rim], "on the rim": table[rim]}.items():
+        groups = _groups(some, "object_class")
+        for row, group in groups if goals == "all" else islice(groups, min(1, len(some))):
+            yes, no = group[group.feasible], group[~group.feasible]
+            row["right_percent"] = _percent(group.right)
+            row["feasible_reached_percent"] = _percent(yes.right)
+            row["infeasible_refused_percent"] = _percent(no.right)
+            row["moved_for_nothing_percent"] = _percent(no.actions > 0)
+            row["ik_rejections_mean"] = _mean(group.ik_rejections)
+            rows.append({"goals": goals} | row | {"actions_mean": _mean(yes.actions) or 0.0})
+    return rows
+
+
+def open_loop_rows(records: Rows, within: float, unit: str) -> Rows:
+    """Rows of plans that are executed open loop: for each planner, all categories and each.
+
+    Hit is within 5 mm of the position as well; of the height or turn alone, *pose within*.
+    """
+    rows = []
+    for planner, of_planner in pd.DataFrame(records).groupby("planner", sort=False):
+        for row, some in _groups(of_planner, "object_class"):
+            good, spread = some.pose_error <= within, error_row(some.distance_m.to_numpy())
+            row |= {k: int(some[k].sum()) for k in ("predicted_reached", "arm_refused")}
+            row["within_percent"] = _percent(good & (some.distance_m <= WITHIN_M))
+            row["pose_within_percent"] = _percent(good)
+            row[f"pose_error_{unit}_median"] = float(some.pose_error.median())
+            for name in ("mean", "sem", "median", "p95"):
+                row[f"distance_m_{name}"] = spread[f"{name}_m"]
+            rows.append({"planner": planner} | row | {"actions_mean": _mean(some.actions)})
+    return rows
+
+
+ROWS: dict[str, Callable[[Rows], Rows]] = {
+    "height": partial(pose_rows, column="height_error_m", within=WITHIN_HEIGHT_M, unit="m"),
+    "orientation": partial(pose_rows, column="turn_error_rad", within=WITHIN_TURN_RAD, unit="rad"),
+    "disturbances": disturbance_rows,
+    "reachability": reachability_rows,
+}
+OPEN_LOOP_ROWS: dict[str, Callable[[Rows], Rows]] = {
+    "orientation": partial(open_loop_rows, within=WITHIN_TURN_RAD, unit="rad"),
+    "height": partial(open_loop_rows, within=WITHIN_HEIGHT_M, unit="m"),
+}
 
 
 def job(table: str, index: int, seed: int) -> Job:
@@ -229,7 +335,8 @@ def job(table: str, index: int, seed: int) -> Job:
     arguments = {"table": table, "index": index, "seed": seed}
     used = ("push", "drag", POSE_PRIMITIVES.get(table))
     files = tuple(file for kind, file in CHECKPOINTS.items() if kind in used)
-    return Job(run_trial, arguments, _reachability_sha256(), (), files, VERSIONS[table])
+    reach = runner.hash_of("reachability", "checkpoint")
+    return Job(run_trial, arguments, reach, (), files, VERSIONS[table])
 
 
 def open_loop_job(table: str, index: int, planner: str) -> Job:
@@ -239,57 +346,47 @@ def open_loop_job(table: str, index: int, planner: str) -> Job:
     return Job(run_open_loop, arguments, (), (), files, version)
 
 
-def _in_order(results: list[tuple[dict, dict]]) -> list[dict[str, Any]]:
-    return sorted((about | record for about, record in results), key=lambda r: r["index"])
+FILES = {"closed_loop": (job, ROWS), "open_loop_pose_goals": (open_loop_job, OPEN_LOOP_ROWS)}
+"""The job of each file of tables, and how its rows are made."""
 
 
-def tables(seed: int = 0) -> dict[str, list[dict[str, Any]]]:
-    """All tables of the trials of a seed that were run."""
-    found = _in_order(read("closed_loop", job))
-    some = {name: [r for r in found if (r["table"], r["seed"]) == (name, seed)] for name in ROWS}
-    return {name: rows(some[name]) for name, rows in ROWS.items() if some[name]}
+def tables(name: str, seed: int = 0, folder: str | Path = FOLDER) -> dict[str, Rows]:
+    """The tables of a file, of the trials that were run; of closed loops, those of a seed."""
+    make, rows = FILES[name]
+    found = [about | record for about, record in runner.read(name, make, folder)]
+    found = sorted(found, key=lambda record: record["index"])
+    some = {k: [r for r in found if r["table"] == k and r.get("seed", seed) == seed] for k in rows}
+    return {k: rows[k](some[k]) for k in rows if some[k]}
 
 
-def open_loop_tables() -> dict[str, list[dict[str, Any]]]:
-    """The tables of plans that were executed without observing again."""
-    found = _in_order(read("open_loop_pose_goals", open_loop_job))
-    some = {name: [r for r in found if r["table"] == name] for name in OPEN_LOOP_ROWS}
-    return {name: rows(some[name]) for name, rows in OPEN_LOOP_ROWS.items() if some[name]}
+def write_tables(
+    folder: str | Path = FOLDER, out_dir: str | Path = "data/results", seed: int = 0
+) -> Path:
+    """Write `closed_loop.json`, of another seed than 0 with its number."""
+    name = f"closed_loop_seed{seed}" if seed else "closed_loop"
+    return write_results(out_dir, name, {"seed": seed}, tables("closed_loop", seed, folder))
+
+
+def write_open_loop(folder: str | Path = FOLDER, out_dir: str | Path = "data/results") -> Path:
+    """Write `open_loop_pose_goals.json`."""
+    name = "open_loop_pose_goals"
+    return write_results(out_dir, name, {}, tables(name, folder=folder))
 
 
 @command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the trials that are missing, and write the tables of all that were run."""
-    parser = argparse.ArgumentParser(
-        prog="python -m experiments.closed_loop", description=main.__doc__
-    )
-    parser.add_argument("--tables", type=names_type(VERSIONS), default=",".join(VERSIONS))
+    parser = runner.parser("closed_loop", main.__doc__)
+    parser.add_argument("--tables", type=names_type(VERSIONS), default=list(VERSIONS))
     parser.add_argument("--n", type=count_type, default=1000, help="trials of each table")
     parser.add_argument("--seed", type=seed_type, default=0)
-    parser.add_argument("--out", default="data/results")
-    parser.add_argument("--workers", type=count_type, default=1, help="processes here")
-    parser.add_argument("--scheduler", help="address of a Dask scheduler that shares the folder")
     options = parser.parse_args(argv)
-    with dask_client(options.workers, options.scheduler) as client:
-        for table in options.tables:
-            if table in N_TRIALS:
-                n = min(options.n, N_TRIALS[table])
-                run([job(table, i, options.seed) for i in range(n)], "closed_loop", client)
-                continue
-            run(
-                [
-                    open_loop_job(goals, index, planner)
-                    for goals in OPEN_LOOP_ROWS
-                    for index in range(min(options.n, N_TRIALS[goals]))
-                    for planner in PLANNERS
-                ],
-                table,
-                client,
-            )
-    name = f"closed_loop_seed{options.seed}" if options.seed else "closed_loop"
-    print(write_results(options.out, name, {"seed": options.seed}, tables(options.seed)))
-    print(write_results(options.out, "open_loop_pose_goals", {}, open_loop_tables()))
-    return 0
+    asked = {table: range(min(options.n, n)) for table, n in N_TRIALS.items()}
+    trials = [job(t, i, options.seed) for t in ROWS if t in options.tables for i in asked[t]]
+    plans = [open_loop_job(t, i, p) for t in OPEN_LOOP_ROWS for i in asked[t] for p in PLANNERS]
+    runner.make(trials, "closed_loop", options, partial(write_tables, seed=options.seed))
+    some = plans if "open_loop_pose_goals" in options.tables else []
+    return runner.make(some, "open_loop_pose_goals", options, write_open_loop)
 
 
 if __name__ == "__main__":

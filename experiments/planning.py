@@ -8,12 +8,12 @@ are drawn from all that are there.
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import math
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,20 +21,15 @@ import pandas as pd
 import torch
 from tqdm.auto import tqdm
 
-from affordlib.commands import command, count_type, names_type
+from affordlib.commands import command, names_type
+from affordlib.evaluation import tasks as goals
 from affordlib.evaluation.metrics import error_row
-from affordlib.evaluation.tasks import (
-    FROZEN,
-    GOAL_SOURCES,
-    ROLLABLE,
-    STANDING,
-    PlanningTask,
-    frozen_tasks,
-)
+from affordlib.evaluation.tasks import ROLLABLE, STANDING, PlanningTask, frozen_tasks
 from affordlib.models.checkpoint import load_checkpoint
 from affordlib.paths import repo_root
 from affordlib.planning import (
     EffectMap,
+    PlanMode,
     PlanningProblem,
     Skills,
     execute_plan,
@@ -42,15 +37,13 @@ from affordlib.planning import (
     plan_continuous,
     plan_gradient,
 )
-from affordlib.planning.problem import PlanMode
 from affordlib.primitives import Push
 from affordlib.results import write_results
 from affordlib.types import Outcome, Plan
-from affordlib.workers import dask_client
 from affordlib.world import Tabletop, UnreachableError
-from experiments import reported
+from experiments import reported, runner
 from experiments.oracle import oracle_effects
-from experiments.runner import Job, read, run
+from experiments.runner import FOLDER, Job
 
 POSITION_ERROR_M, YAW_ERROR_RAD = 0.001, math.radians(1.0)
 GROUPS = {"all": STANDING + ROLLABLE, "standing": STANDING, "rollable": ROLLABLE} | {
@@ -58,6 +51,7 @@ GROUPS = {"all": STANDING + ROLLABLE, "standing": STANDING, "rollable": ROLLABLE
 }
 FINE_PHASES = tuple(round(0.5 + 0.05 * k, 2) for k in range(1, 11))
 
+Rows = list[dict[str, Any]]
 Planner = Callable[..., Plan]
 """A planner as (image, start_xy_m, goal, mode) → Plan."""
 
@@ -73,13 +67,9 @@ def plan_full(problem: PlanningProblem) -> Plan:
     return plan_continuous(replace(problem, mode=replace(problem.mode, partial=False)))
 
 
-VERSIONS: dict[Callable[..., Plan], int] = {
-    plan_astar: 1,
-    plan_astar_fine: 1,
-    plan_continuous: 1,
-    plan_full: 1,
-    plan_gradient: 1,
-}
+VERSIONS: dict[Planner, int] = dict.fromkeys(
+    (plan_astar, plan_astar_fine, plan_continuous, plan_full, plan_gradient), 1
+)
 """Raise one when the planner changes, or how its plans are executed, and its numbers do."""
 
 
@@ -117,12 +107,8 @@ class PlannerConfig:
 
     def chosen(self, tasks: Sequence[PlanningTask]) -> list[int]:
         """Which of some tasks it is asked, by number."""
-        fitting = [
-            number
-            for number, task in enumerate(tasks)
-            if task.goals in self.sources and task.obj.category in self.classes
-        ]
-        return fitting[:: self.stride]
+        asked = [t.goals in self.sources and t.obj.category in self.classes for t in tasks]
+        return np.flatnonzero(asked)[:: self.stride].tolist()
 
     def columns(self) -> dict[str, Any]:
         """What a row of the table says of it."""
@@ -152,7 +138,7 @@ class PlannerConfig:
         return plan
 
 
-ALL = {"sources": GOAL_SOURCES}
+ALL = {"sources": goals.GOAL_SOURCES}
 CORRECTED = {"execution": {"corrections": 2}}
 ON_RING = {"samples": 100, "starts": 4, "direction_only": True}
 PERTURBED = {"model": "film_5000_perturbed", "world": "perturbed"}
@@ -194,11 +180,7 @@ CONFIGS: dict[str, PlannerConfig] = {
     "perturbed_film_5000": PlannerConfig(plan_continuous, world="perturbed"),
     "perturbed_oracle": PlannerConfig(plan_continuous, **ORACLE, world="perturbed", stride=5),
     "perturbed_oracle_nominal": PlannerConfig(
-        plan_continuous,
-        **ORACLE,
-        oracle={"nominal_physics": True},
-        world="perturbed",
-        stride=5,
+        plan_continuous, **ORACLE, oracle={"nominal_physics": True}, world="perturbed", stride=5
     ),
 }
 
@@ -273,66 +255,59 @@ def run_config(config: str) -> list[dict[str, Any]]:
     with Tabletop() as world:
         planner = about.make(world)
         for k in tqdm(about.chosen(tasks), config, unit=" goals", leave=False):
-            (outcome,) = measure(world, [tasks[k]], planner, **about.execution)
+            outcome = attempt(world, tasks[k], planner, **about.execution)
             records.append({"task": k} | outcome_record(tasks[k], outcome))
     return records
 
 
 def tasks_sha256(world: str = "clean") -> str:
     """Hash of the frozen goals of a world."""
-    return hashlib.sha256((repo_root() / FROZEN[world]).read_bytes()).hexdigest()
+    return hashlib.sha256((repo_root() / goals.FROZEN[world]).read_bytes()).hexdigest()
 
 
 def job(config: str) -> Job:
     """The measurement of one planner."""
     about = CONFIGS[config]
-    return Job(
-        run_config,
-        {"config": config},
-        settings=[about, tasks_sha256(about.world)],
-        checkpoints=tuple(about.checkpoints.values()),
-        version=VERSIONS[about.planner],
-    )
+    settings, files = [about, tasks_sha256(about.world)], tuple(about.checkpoints.values())
+    return Job(run_config, {"config": config}, settings, (), files, VERSIONS[about.planner])
 
 
-def planning_rows(records: list[dict[str, Any]], **columns: Any) -> list[dict[str, Any]]:
+def planning_rows(records: Rows, **columns: Any) -> Rows:
     """Rows of the table `planning`: per source of goals and mode, all objects and each category.
 
     columns: what else the rows say, such as `PlannerConfig.columns`.
     """
     rows = []
-    for (goals, mode), some in pd.DataFrame(records).groupby(["goals", "mode"], sort=False):
+    for (source, mode), some in pd.DataFrame(records).groupby(["goals", "mode"], sort=False):
         for group, classes in GROUPS.items():
             chosen = some[some.object_class.isin(classes)]
             if chosen.empty:
                 continue
-            about = {"goals": goals, "object_class": group, "mode": mode}
+            about = {"goals": source, "object_class": group, "mode": mode}
             row = error_row(chosen.distance_m.to_numpy(), **columns, **about)
-            row["plan_ms_median"] = 1000 * float(chosen.plan_s.median())
-            for name in ("predicted_m", "prediction_error_m", "std_m"):
-                row[f"{name.removesuffix('_m')}_mean_m"] = float(chosen[name].mean())
-            for name in ("steps", "actions"):
-                row[f"{name}_mean"] = float(chosen[name].mean())
+            row["plan_ms_median"] = 1000 * chosen.plan_s.median()
+            for name in ("predicted_m", "prediction_error_m", "std_m", "steps", "actions"):
+                unit = "_m" * name.endswith("_m")
+                row[f"{name.removesuffix('_m')}_mean{unit}"] = chosen[name].mean()
             rows.append(row)
     return rows
 
 
-def summary_rows(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def summary_rows(rows: Rows) -> Rows:
     """One row per planner on constructed goals: mean, standard error and median of each mode."""
+    names = ("planner", "model", "world", "samples", "closed_loop", "object_class")
     summary: dict[tuple[str, str], dict[str, Any]] = {}
     for row in rows:
-        if row["goals"] != "constructed" or row["object_class"] in STANDING + ROLLABLE:
-            continue
-        names = ("planner", "model", "world", "samples", "closed_loop", "object_class")
-        new = {name: row[name] for name in names}
-        one = summary.setdefault((row["planner"], row["object_class"]), new)
-        for statistic in ("mean", "sem", "median"):
-            one[f"{row['mode']}_{statistic}_m"] = row[f"{statistic}_m"]
-        one[f"{row['mode']}_plan_ms"] = row["plan_ms_median"]
+        if row["goals"] == "constructed" and row["object_class"] not in STANDING + ROLLABLE:
+            new = {name: row[name] for name in names}
+            one = summary.setdefault((row["planner"], row["object_class"]), new)
+            for statistic in ("mean", "sem", "median"):
+                one[f"{row['mode']}_{statistic}_m"] = row[f"{statistic}_m"]
+            one[f"{row['mode']}_plan_ms"] = row["plan_ms_median"]
     return list(summary.values())
 
 
-def decomposition_rows(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def decomposition_rows(rows: Rows) -> Rows:
     """Where the open-loop error on constructed goals comes from, by planner, mode and group.
 
     search: the distance from the goal that the planner predicted; model: from its predicted
@@ -340,88 +315,74 @@ def decomposition_rows(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     low-variance plans by; perturbed_start: of `continuous`, where the object's pose has a small
     error. Planners for stable objects only have no row of all.
     """
-    constructed = [row for row in rows if row["goals"] == "constructed"]
-
-    def place(row: dict[str, Any]) -> tuple[str, str, str]:
-        return row["world"], row["mode"], row["object_class"]
-
-    oracles = ("oracle", "perturbed_oracle")
-    oracle = {place(r): r["mean_m"] for r in constructed if r["planner"] in oracles}
-    perturbed = {place(r): r["mean_m"] for r in constructed if r["perturbed_start"]}
-    return [
-        {
-            **{key: row[key] for key in ("planner", "world", "mode", "object_class", "n")},
-            "search_mean_m": row["predicted_mean_m"],
-            "model_mean_m": row["prediction_error_mean_m"],
-            "execution_mean_m": oracle.get(place(row)),
-            "perturbed_start_mean_m": perturbed.get(place(row)),
-            "total_mean_m": row["mean_m"],
-        }
-        for row in constructed
-        if not row["closed_loop"]
-        and not row["perturbed_start"]
-        and (
-            row["object_class"] in ("standing", "rollable")
-            or (row["object_class"] == "all" and CONFIGS[row["planner"]].classes != STANDING)
-        )
-    ]
+    place = ["world", "mode", "object_class"]
+    table = pd.DataFrame(rows).query("goals == 'constructed'")
+    oracle = table.planner.isin(["oracle", "perturbed_oracle"])
+    for some, name in ((oracle, "execution"), (table.perturbed_start, "perturbed_start")):
+        error = table[some].set_index(place).mean_m.rename(f"{name}_mean_m")
+        table = table.join(error, on=place)
+    for_all = table.planner.map(lambda name: CONFIGS[name].classes != STANDING)
+    groups = table.object_class.isin(["standing", "rollable"])
+    table = table[groups | (table.object_class == "all") & for_all]
+    table = table[~(table.closed_loop | table.perturbed_start)].rename(
+        columns={"predicted_mean_m": "search_mean_m", "prediction_error_mean_m": "model_mean_m"}
+    )
+    table["total_mean_m"] = table.pop("mean_m")
+    parts = ("search", "model", "execution", "perturbed_start", "total")
+    table = table[["planner", *place, "n", *(f"{part}_mean_m" for part in parts)]]
+    return table.astype(object).where(table.notna(), None).to_dict("records")
 
 
-def paired_rows(
-    records: dict[str, list[dict[str, Any]]], than: str = "continuous", n_draws: int = 2000
-) -> list[dict[str, Any]]:
+def paired_rows(records: dict[str, Rows], than: str = "continuous", n_draws: int = 2000) -> Rows:
     """How much farther each planner ends from the same goals than another: mean [m], interval.
 
     The interval holds 95 % of the means of goals drawn again with replacement.
     """
-    rows: list[dict[str, Any]] = []
+    rows: Rows = []
     rng = np.random.default_rng(0)
     for name in records if than in records else ():
         if name == than or CONFIGS[name].world != CONFIGS[than].world:
             continue
         both = pd.merge(*(pd.DataFrame(records[key]) for key in (name, than)), on="task")
         both["farther"] = both.distance_m_x - both.distance_m_y
-        for (goals, mode), pairs in both.groupby(["goals_x", "mode_x"], sort=False):
+        for (source, mode), pairs in both.groupby(["goals_x", "mode_x"], sort=False):
             farther = pairs.farther.to_numpy()
             draws = rng.choice(farther, (n_draws, len(farther))).mean(axis=1)
             low, high = np.quantile(draws, [0.025, 0.975])
-            about = {"planner": name, "than": than, "goals": goals, "mode": mode}
-            row = about | {"n": len(pairs), "difference_mean_m": float(farther.mean())}
-            rows.append(row | {"low_m": float(low), "high_m": float(high)})
+            row = {"planner": name, "than": than, "goals": source, "mode": mode, "n": len(pairs)}
+            rows.append(row | {"difference_mean_m": farther.mean(), "low_m": low, "high_m": high})
     return rows
 
 
-def tables(records: dict[str, list[dict[str, Any]]]) -> dict[str, list[dict[str, Any]]]:
-    """All tables of the records of planners."""
-    rows = []
-    for name in CONFIGS:
-        if name in records:
-            rows += planning_rows(records[name], planner=name, **CONFIGS[name].columns())
-    in_order = {name: records[name] for name in CONFIGS if name in records}
+def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
+    """All tables, of the planners that were measured."""
+    found = {about["config"]: result for about, result in runner.read("planning", job, folder)}
+    records, rows = {name: found[name] for name in CONFIGS if name in found}, []
+    for name, some in records.items():
+        rows += planning_rows(some, planner=name, **CONFIGS[name].columns())
     return {
         "planning": rows,
         "summary": [*reported.PLANNING_ROWS, *summary_rows(rows)],
-        "paired": [r for than in ("continuous", "perturbed") for r in paired_rows(in_order, than)],
+        "paired": [r for than in ("continuous", "perturbed") for r in paired_rows(records, than)],
         "error_decomposition": decomposition_rows(rows),
     }
+
+
+def write_tables(folder: str | Path = FOLDER, out_dir: str | Path = "data/results") -> Path:
+    """Write `planning.json` from the results of a folder."""
+    hashes = {world: tasks_sha256(world) for world in goals.FROZEN}
+    return write_results(out_dir, "planning", {"goals_sha256": hashes}, tables(folder))
 
 
 @command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
     """Measure planners on the frozen goals and draw the tables from all that were measured."""
-    parser = argparse.ArgumentParser(
-        prog="python -m experiments.planning", description=main.__doc__
-    )
-    parser.add_argument("--configs", type=names_type(CONFIGS), default=",".join(CONFIGS))
-    parser.add_argument("--workers", type=count_type, default=1)
+    parser = runner.parser("planning", main.__doc__)
+    parser.add_argument("--configs", type=names_type(CONFIGS), default=list(CONFIGS))
     options = parser.parse_args(argv)
     torch.set_num_threads(1)
-    with dask_client(options.workers) as client:
-        run([job(name) for name in options.configs], "planning", client)
-    records = {arguments["config"]: result for arguments, result in read("planning", job)}
-    hashes = {world: tasks_sha256(world) for world in FROZEN}
-    print(write_results("data/results", "planning", {"goals_sha256": hashes}, tables(records)))
-    return 0
+    jobs = [job(name) for name in options.configs]
+    return runner.make(jobs, "planning", options, write_tables)
 
 
 if __name__ == "__main__":

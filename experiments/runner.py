@@ -14,6 +14,7 @@ a minute. Equal results give equal bytes.
 
 from __future__ import annotations
 
+import argparse
 import gzip
 import hashlib
 import inspect
@@ -29,6 +30,7 @@ import pandas as pd
 from filelock import FileLock
 from tqdm.auto import tqdm
 
+from affordlib.commands import count_type
 from affordlib.evaluation.predictions import rounded
 from affordlib.interactions import open_interactions
 from affordlib.interactions.store import stored_sha256
@@ -36,6 +38,7 @@ from affordlib.models.checkpoint import checkpoint_sha256, weights_bytes
 from affordlib.paths import repo_root, resolve_out_dir
 from affordlib.planning.reachability import SHIPPED as REACHABILITY
 from affordlib.results import write_atomically
+from affordlib.workers import dask_client
 
 if TYPE_CHECKING:
     from dask.distributed import Client
@@ -75,8 +78,8 @@ class Job:
         return {
             "version": self.version,
             "settings": _sha256(_values(self.settings)),
-            "data": [_hash_of(name, "data") for name in self.data],
-            "checkpoints": [_hash_of(name, "checkpoint") for name in self.checkpoints],
+            "data": [hash_of(name, "data") for name in self.data],
+            "checkpoints": [hash_of(name, "checkpoint") for name in self.checkpoints],
         }
 
     def record(self, resume_checkpoint: Path) -> dict[str, Any]:
@@ -153,6 +156,26 @@ def frame(results: Iterable[Result], part: str) -> pd.DataFrame:
     return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
 
 
+def parser(table: str, description: str | None) -> argparse.ArgumentParser:
+    """A parser of the options that the commands of all tables share."""
+    shared = argparse.ArgumentParser(prog=f"python -m experiments.{table}", description=description)
+    shared.add_argument("--raw", default=FOLDER, help="the folder of the jobs' results")
+    shared.add_argument("--out", default="data/results")
+    shared.add_argument("--scheduler", help="address of a Dask scheduler")
+    shared.add_argument("--workers", type=count_type, default=1, help="processes of this machine")
+    return shared
+
+
+def make(
+    jobs: Sequence[Job], table: str, options: argparse.Namespace, write: Callable[..., Path]
+) -> int:
+    """Run the jobs of a command, then write its tables."""
+    with dask_client(options.workers, options.scheduler) as client:
+        run(jobs, table, client, options.raw)
+    print(write(options.raw, options.out))
+    return 0
+
+
 def _made(tasks: list[tuple[Job, Path]], client: Client | None) -> Iterator[dict[str, Any]]:
     if client is None:
         yield from (job.record(path) for job, path in tasks)
@@ -172,7 +195,7 @@ def _key(arguments: dict[str, Any]) -> str:
 
 def _records(table: str, folder: Path) -> dict[str, dict[str, Any]]:
     """The lines of a table by their arguments."""
-    _hash_of.cache_clear()
+    hash_of.cache_clear()
     path = folder / f"{table}.jsonl.gz"
     lines = gzip.decompress(path.read_bytes()).splitlines() if path.is_file() else []
     return {_key(record["arguments"]): record for record in map(json.loads, lines)}
@@ -195,7 +218,8 @@ def _stale(record: dict[str, Any], job: Job) -> str | None:
 
 
 @lru_cache
-def _hash_of(name: str, kind: str) -> str | None:
+def hash_of(name: str, kind: str) -> str | None:
+    """Of what is shipped: a kind "data" or "checkpoint" by its name; None where it is not here."""
     if name == "reachability":  # a checkpoint of another kind, which has no description
         return hashlib.sha256(weights_bytes(repo_root() / REACHABILITY)).hexdigest()
     if kind == "checkpoint":

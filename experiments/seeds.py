@@ -20,18 +20,9 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 from matplotlib.figure import Figure
 
+from affordlib import results
 from affordlib.commands import command, count_type, seed_type
 from affordlib.paths import repo_root
-from affordlib.results import (
-    MARKUP,
-    factor,
-    heading,
-    markdown_table,
-    read_results,
-    write_atomically,
-    write_results,
-    write_text_atomically,
-)
 from affordlib.workbook import WorkbookError, run_name
 from affordlib.workers import dask_client
 
@@ -44,25 +35,17 @@ PANELS = 4
 Table = Sequence[Mapping[str, Any]]
 
 
-def command_of(seed: int, name: str, arguments: Sequence[str]) -> list[str]:
-    """The command that runs the book for one seed."""
-    own = ["--seed", str(seed), "--out", f"{name}-seed{seed}"]
-    return [sys.executable, "-m", "affordlib.workbook", *own, *arguments]
-
-
 def run_all(commands: Mapping[int, Sequence[str]], client: Client | None = None) -> None:
-    """Run the command of each seed, one after another or by a client.
+    """Run the command of each seed, one after another or by a client, and say what they print.
 
     Raises WorkbookError, after all have ended, with what the failed ones printed.
     """
+    lines, failed = list(commands.values()), []
     # A batch skips by itself what is complete: it is given out even if it was run before.
-    futures = (
-        [client.submit(_run, line, pure=False) for line in commands.values()] if client else ()
-    )
-    done = (future.result() for future in futures) if client else map(_run, commands.values())
-    failed = []
+    some = client.map(_run, lines, pure=False) if client else []
+    done = (future.result() for future in some) if client else map(_run, lines)
     for seed, (code, printed) in zip(commands, done, strict=True):
-        print(f"seed {seed}: {'failed' if code else 'done'}", flush=True)
+        print(f"seed {seed}: {'failed' if code else printed.strip() or 'done'}", flush=True)
         failed += [f"seed {seed}:\n{printed.strip()}"] * bool(code)
     if failed:
         raise WorkbookError("\n".join(failed))
@@ -87,12 +70,10 @@ def over_seeds(tables: Sequence[Table]) -> tuple[list[dict[str, Any]], bytes | N
     every["place"] = every.groupby(["seed", *words], dropna=False, sort=False).cumcount()
     same = every.groupby([*words, "place"], dropna=False, sort=False)
     differ = [c for c in numbers if same[c].nunique().max() > 1]
-    parts = [same.size().rename("seeds")]
+    columns = {"seeds": ("seed", "size")}
     for c in numbers:
-        parts += (
-            [same[c].mean(), same[c].std().rename(f"sd_{c}")] if c in differ else [same[c].first()]
-        )
-    table = pd.concat(parts, axis=1).reset_index().drop(columns="place")
+        columns |= {c: (c, "mean"), f"sd_{c}": (c, "std")} if c in differ else {c: (c, "first")}
+    table = same.agg(**columns).reset_index().drop(columns="place")
     rows = table.astype(object).where(table.notna(), None).to_dict("records")
     return rows, _picture(every.assign(row=same.ngroup()), words, differ[:PANELS])
 
@@ -105,12 +86,13 @@ def _picture(every: pd.DataFrame, words: list[str], columns: list[str]) -> bytes
     size = 2.6 * len(columns) + 3.4, 0.28 * len(names) + 1.1
     figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots(1, len(columns), sharey=True, squeeze=False)[0]
+    axes[0].set_yticks(range(len(names)), [text[:48] for text in names.agg(", ".join, axis=1)])
     for ax, name in zip(axes, columns, strict=True):
-        means = factor(name) * every.groupby("row")[name].mean()
-        ax.plot(factor(name) * every[name], every["row"], "o", color="gray", ms=4, alpha=0.7)
+        numbers = results.factor(name) * every.set_index("row")[name]
+        means = numbers.groupby("row").mean()
+        ax.plot(numbers, numbers.index, "o", color="gray", ms=4, alpha=0.7)
         ax.plot(means, means.index, "|", color="black", ms=12)
-        ax.set_xlabel(heading(name))
-        ax.set_yticks(range(len(names)), [text[:48] for text in names.agg(", ".join, axis=1)])
+        ax.set_xlabel(results.heading(name))
         ax.grid(alpha=0.3)
     axes[0].invert_yaxis()
     buffer = io.BytesIO()
@@ -126,18 +108,18 @@ def gather(folders: Mapping[int, Path], into: Path) -> Path:
     # Only results of notebooks: beside them lie plans that were saved.
     paths = [path for folder in folders.values() for path in folder.glob("[0-9][0-9]_*.json")]
     for name in sorted({path.stem for path in paths}):
-        runs = [read_results(path)["tables"] for path in paths if path.stem == name]
+        runs = [results.read_results(path)["tables"] for path in paths if path.stem == name]
         together = {}
         page.append(f"## {name}")
         for number, table in enumerate(dict.fromkeys(table for run in runs for table in run)):
             together[table], picture = over_seeds([run.get(table, []) for run in runs])
-            page.append(f"### {table.replace('_', ' ').translate(MARKUP)}")
-            page.append(markdown_table(together[table]) if together[table] else "Empty.")
+            page.append(f"### {table.replace('_', ' ').translate(results.MARKUP)}")
+            page.append(results.markdown_table(together[table]) if together[table] else "Empty.")
             if picture:
-                write_atomically(into / f"{name}-{number}.png", picture)
+                results.write_atomically(into / f"{name}-{number}.png", picture)
                 page.append(f"![each seed]({name}-{number}.png)")
-        write_results(into, name, {"seeds": list(folders)}, together)
-    write_text_atomically(into / "index.md", "\n\n".join(page) + "\n")
+        results.write_results(into, name, {"seeds": list(folders)}, together)
+    results.write_text_atomically(into / "index.md", "\n\n".join(page) + "\n")
     return into / "index.md"
 
 
@@ -157,23 +139,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = parser.parse_args(argv)
     if len(set(options.seeds)) < len(options.seeds):
         raise WorkbookError(f"SEEDS must differ, got {options.seeds}")
-    name = run_name(options.profile, 0, options.out)
-    arguments = ["--profile", options.profile, "--only", options.only]
-    arguments += ["--force"] * options.force + ["--dry-run"] * options.dry_run
-    arguments += ["--", *options.settings]
-    commands = {seed: command_of(seed, name, arguments) for seed in options.seeds}
-    if options.dry_run:
-        for seed, line in commands.items():
-            code, printed = _run(line)
-            print(f"seed {seed}: {printed.strip()}", flush=True)
-            if code:
-                return code
-        return 0
-    with dask_client(min(options.workers, len(options.seeds)), options.scheduler) as client:
-        run_all(commands, client)
-    runs = repo_root() / "runs"
+    runs, name = repo_root() / "runs", run_name(options.profile, 0, options.out)
     folders = {seed: runs / f"{name}-seed{seed}" for seed in options.seeds}
-    print(f"The tables over seeds are in {gather(folders, runs / f'{name}-seeds')}")
+    book = [sys.executable, "-m", "affordlib.workbook", "--profile", options.profile]
+    book += ["--only", options.only, *["--force"] * options.force]
+    book += ["--dry-run"] * options.dry_run
+    ends = {seed: ["--seed", str(seed), "--out", folder.name] for seed, folder in folders.items()}
+    commands = {seed: [*book, *end, "--", *options.settings] for seed, end in ends.items()}
+    workers = 1 if options.dry_run else min(options.workers, len(folders))
+    with dask_client(workers, options.scheduler) as client:
+        run_all(commands, client)
+    if not options.dry_run:
+        print(f"The tables over seeds are in {gather(folders, runs / f'{name}-seeds')}")
     return 0
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import os
 import sys
 from collections.abc import Sequence
@@ -28,34 +27,18 @@ from affordlib.evaluation.tasks import (
     constructed_tasks,
     uniform_tasks,
 )
-from affordlib.geometry import xy_columns
-from affordlib.interactions import (
-    InteractionTensors,
-    Scaler,
-    Split,
-    open_interactions,
-    split_interactions,
-)
+from affordlib.interactions import Scaler, Split, open_interactions, split_interactions
 from affordlib.interactions.collect import collect
 from affordlib.interactions.dataset import Symmetry
 from affordlib.interactions.recipes import RECIPES, SHIPPED, Variation
 from affordlib.interactions.sampling import sample_forward, sample_mixed
 from affordlib.interactions.store import SUFFIX as DATA_SUFFIX
 from affordlib.interactions.store import dataset_sha256
-from affordlib.models.base import EffectNetwork, NetworkConfig
+from affordlib.models import CNPConfig, EffectNetwork, FiLMConfig, NetworkConfig, TrainingDomain
 from affordlib.models.checkpoint import SUFFIX, load_checkpoint, save_checkpoint
-from affordlib.models.cnp import CNPConfig
-from affordlib.models.domain import TrainingDomain
-from affordlib.models.film import FiLMConfig
 from affordlib.models.lever_up import LEVER_MODELS, LeverModel, lever_training, train_lever_model
 from affordlib.models.lstm import LSTMConfig
-from affordlib.models.training import (
-    Sampler,
-    TrainingConfig,
-    about_training,
-    final_errors_m,
-    train_model,
-)
+from affordlib.models.training import Sampler, TrainingConfig, about_training, train_model
 from affordlib.paths import repo_root
 from affordlib.planning.reachability import SHIPPED as REACHABILITY
 from affordlib.planning.reachability import learn_reachability
@@ -165,85 +148,71 @@ def collect_sets(options: argparse.Namespace) -> bool:
     return agree
 
 
-def about_lever_training(
-    data: xr.Dataset, split: Split, lever: LeverModel, trained_for: str
+def about_checkpoint(
+    data: xr.Dataset, split: Split, training: TrainingConfig, **more: str
 ) -> dict[str, object]:
-    """As `about_training`, with what the network was trained for and which view it has."""
-    seen = np.concatenate([split.train, split.validation])
-    about = about_training(data, seen, lever.training)
-    return about | {"trained_for": trained_for, "view": lever.view}
+    """What a shipped checkpoint says of its training, and of lever-ups more."""
+    return about_training(data, np.concatenate([split.train, split.validation]), training) | more
 
 
 def shipped_lever_model(
     name: str, trained_for: str, lever: LeverModel, data: xr.Dataset, split: Split
 ) -> tuple[EffectNetwork, dict[str, object]] | None:
     """The shipped checkpoint that this very training gave, if there is one, and its name."""
-    for checkpoint, key in LEVER_CHECKPOINTS.items():
-        if key != (name, trained_for):
-            continue
-        try:
-            model, about = load_checkpoint(checkpoint)
-        except (FileNotFoundError, ValueError):
-            return None
-        expected = about_lever_training(data, split, lever, trained_for)
-        network = replace(model.config, sigma_floor=lever.network.sigma_floor)
-        training = lever_training(lever, data, split)
-        scales = Scaler.fit(training), TrainingDomain.fit(training)
-        if (
-            about == expected
-            and network == lever.network
-            and (model.scaler, model.domain) == scales
-        ):
-            return model, {"checkpoint": checkpoint}
-    return None
+    names = {key: checkpoint for checkpoint, key in LEVER_CHECKPOINTS.items()}
+    try:
+        checkpoint = names[name, trained_for]
+        model, about = load_checkpoint(checkpoint)
+    except (KeyError, FileNotFoundError, ValueError):
+        return None
+    more = {"trained_for": trained_for, "view": lever.view}
+    training = lever_training(lever, data, split)
+    network = replace(model.config, sigma_floor=lever.network.sigma_floor)
+    found = about, network, model.scaler, model.domain
+    same = about_checkpoint(data, split, lever.training, **more), lever.network
+    same += Scaler.fit(training), TrainingDomain.fit(training)
+    return (model, {"checkpoint": checkpoint}) if found == same else None
+
+
+def data_of(checkpoint: str) -> str:
+    """The name of the data set that a shipped checkpoint learns from."""
+    return CHECKPOINT_SPECS[checkpoint].data if checkpoint in CHECKPOINT_SPECS else "lever_up"
 
 
 def train_checkpoint(name: str) -> None:
     """Train a shipped model on fold 0 of its data and write it to data/checkpoints."""
-    spec = CHECKPOINT_SPECS.get(name)
-    data = open_interactions(spec.data if spec else "lever_up")
-    split, test = split_interactions(data.sizes["interaction"]), ""
-    factor, unit = 1000, "mm"
-    if spec is None:
+    data = open_interactions(data_of(name))
+    split = split_interactions(data.sizes["interaction"])
+    if name in LEVER_CHECKPOINTS:
         lever_name, trained_for = LEVER_CHECKPOINTS[name]
-        lever = LEVER_MODELS[lever_name]
-        model, history = train_lever_model(lever, data, split, trained_for)
-        about = about_lever_training(data, split, lever, trained_for)
+        spec = LEVER_MODELS[lever_name]
+        model, history = train_lever_model(spec, data, split, trained_for)
+        more = {"trained_for": trained_for, "view": spec.view}
     else:
+        spec, more = CHECKPOINT_SPECS[name], {}
         how = {"symmetries": spec.symmetries, "sampler": spec.sampler}
         model, history = train_model(data, split, spec.training, spec.network, **how)
-        seen = np.concatenate([split.train, split.validation])
-        about = about_training(data, seen, spec.training)
-        channels = model.action_channels, model.effect_channels
-        if not xy_columns(channels[1]) and channels[1] != ("z",):
-            factor, unit = 180 / math.pi, "°"
-        error = final_errors_m(model, InteractionTensors.from_dataset(data, split.test, *channels))
-        test = f", test {factor * error.mean():.2f} {unit}"
     path = repo_root() / "data" / "checkpoints" / f"{name}{SUFFIX}"
-    save_checkpoint(model, path, about)
-    validation = min(record.validation_error for record in history)
-    print(f"{path.name}: {history[-1].step} steps in {history[-1].seconds:.0f} s")
-    print(f"validation {factor * validation:.2f} {unit}{test}")
+    save_checkpoint(model, path, about_checkpoint(data, split, spec.training, **more))
+    error = 1000 * min(record.validation_error for record in history)
+    steps, seconds = history[-1].step, history[-1].seconds
+    print(f"{path.name}: {steps} steps in {seconds:.0f} s, validation {error:.2f} mm or mrad")
 
 
 def train_checkpoints(options: argparse.Namespace) -> bool:
     """Train checkpoints; whether the data of all were there, others are left as they are."""
-    missing = []
+    complete = True
     for name in options.only or [*CHECKPOINT_SPECS, *LEVER_CHECKPOINTS]:
-        data = CHECKPOINT_SPECS[name].data if name in CHECKPOINT_SPECS else "lever_up"
+        data = data_of(name)
         if (repo_root() / "data" / f"{data}{DATA_SUFFIX}").is_file():
             train_checkpoint(name)
             continue
-        missing.append(data)
-        print(f"{name}: left as it is; it learns from {data}, which is not shipped and not here")
-    if missing:
-        chosen = " ".join(dict.fromkeys(missing))
+        complete = False
         print(
-            "Collect what is missing (push_x10 in five to ten minutes of two cores, others faster) "
-            "and try again:\n"
-            f"  .venv/bin/python -m experiments.shipped data --only {chosen} --to data"
+            f"{name}: left as it is; it learns from {data}, which is not shipped and not here. "
+            f"Collect it: .venv/bin/python -m experiments.shipped data --only {data} --to data"
         )
-    return not missing
+    return complete
 
 
 def train_reachability(_: argparse.Namespace) -> bool:
@@ -272,27 +241,30 @@ def draw_goals(_: argparse.Namespace) -> bool:
     return True
 
 
+COMMANDS = {
+    "data": collect_sets,
+    "checkpoints": train_checkpoints,
+    "reachability": train_reachability,
+    "goals": draw_goals,
+}
+
+
 @command(OSError, ValueError, RuntimeError)
 def main(argv: Sequence[str] | None = None) -> int:
     """Make what is shipped again; returns 1 where sets differ or data are missing, else 0."""
     parser = argparse.ArgumentParser(prog="python -m experiments.shipped", description=main.__doc__)
-    kinds = parser.add_subparsers(required=True)
-    data = kinds.add_parser("data", help=collect_sets.__doc__)
+    kinds, commands = parser.add_subparsers(required=True), {}
+    for name, make in COMMANDS.items():
+        commands[name] = kinds.add_parser(name, help=make.__doc__)
+        commands[name].set_defaults(make=make)
+    data, checkpoints = commands["data"], commands["checkpoints"]
     data.add_argument("--only", nargs="+", choices=sorted(RECIPES), help="default: the shipped")
     data.add_argument("--to", default=str(repo_root() / "data"), help="a folder")
-    where = data.add_mutually_exclusive_group()
     cores = os.cpu_count() or 1
-    where.add_argument("--workers", type=count_type, default=cores, help="processes here")
-    where.add_argument("--scheduler", help="a Dask scheduler: tcp://…")
-    data.set_defaults(make=collect_sets)
-    checkpoints = kinds.add_parser("checkpoints", help=train_checkpoints.__doc__)
+    data.add_argument("--workers", type=count_type, default=cores, help="processes here")
+    data.add_argument("--scheduler", help="a Dask scheduler in their place: tcp://…")
     names = sorted([*CHECKPOINT_SPECS, *LEVER_CHECKPOINTS])
     checkpoints.add_argument("--only", nargs="+", choices=names, help="default: all")
-    checkpoints.set_defaults(make=train_checkpoints)
-    kinds.add_parser("reachability", help=train_reachability.__doc__).set_defaults(
-        make=train_reachability
-    )
-    kinds.add_parser("goals", help=draw_goals.__doc__).set_defaults(make=draw_goals)
     options = parser.parse_args(argv)
     return 0 if options.make(options) else 1
 

@@ -10,14 +10,12 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,29 +23,18 @@ import pandas as pd
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
+from affordlib import models
 from affordlib.commands import command, names_type
 from affordlib.evaluation.tasks import STANDING, uniform_tasks
 from affordlib.interactions import (
     InteractionTensors,
     Scaler,
     open_interactions,
+    sampling,
     split_interactions,
 )
-from affordlib.interactions.collect import collect
 from affordlib.interactions.lever_up import N_OBSERVED, N_PREDICTED, lever_up_tensors
-from affordlib.interactions.recipes import RECIPES, Recipe
-from affordlib.interactions.sampling import sample_literal, sample_mixed, sample_windows
-from affordlib.models import (
-    CNPConfig,
-    FiLMConfig,
-    TrainingConfig,
-    build,
-    condition_on_primitives,
-    load_checkpoint,
-    train,
-    train_literal,
-)
-from affordlib.models.base import EffectNetwork
+from affordlib.interactions.recipes import RECIPES
 from affordlib.models.lever_up import LEVER_MODELS, predict_steps
 from affordlib.models.training import batch_loss, final_errors_m
 from affordlib.paths import repo_root
@@ -57,10 +44,9 @@ from affordlib.planning.continuous import DIRECTION_SPREAD_RAD, MIN_STOP_PHASE, 
 from affordlib.primitives import PRIMITIVES, Push
 from affordlib.results import read_results, write_results
 from affordlib.types import Observations
-from affordlib.workers import dask_client
 from affordlib.world import Tabletop
+from experiments import lstm_seker2019
 from experiments.cost import measure_cost
-from experiments.lstm_seker2019 import BATCH, EPOCHS, SekerConfig, SekerLSTM
 
 RESULTS = "data/results/speed.json"
 Rows = list[dict[str, Any]]
@@ -81,26 +67,6 @@ def ratio_row(what: str, ratios: Sequence[float], goal: float) -> dict[str, Any]
     return row | {"ratio_min": min(ratios), "ratio_max": max(ratios), "goal": goal}
 
 
-def collecting(n: int = 200, rounds: int = 4) -> Rows:
-    """Interactions a second of `collect`, packing too, with one and with two processes."""
-
-    def collect_anew(recipe: Recipe, client: Any) -> None:
-        with tempfile.TemporaryDirectory() as folder:
-            collect(recipe, Path(folder, "set.zarr.zip"), client, progress=False)
-
-    found: dict[int, list[float]] = {1: [], 2: []}
-    with dask_client(2) as two:
-        for client in (None, two):
-            collect_anew(Recipe(n_interactions=10, seed=3), client)  # the workers import everything
-        for _, (workers, client) in product(range(rounds), ((1, None), (2, two))):
-            began = time.perf_counter()
-            collect_anew(Recipe(n_interactions=n, seed=7), client)
-            found[workers].append(n / (time.perf_counter() - began))
-    rows = [{"workers": k, "per_second_median": np.median(v), "n": n} for k, v in found.items()]
-    ratios = [two / one for one, two in zip(*found.values(), strict=True)]
-    return [*rows, ratio_row("two workers : one", ratios, 1.8)]
-
-
 def primitives(n: int = 24) -> Rows:
     """Interactions a second on one core, and the ratio of the whole to the physics alone."""
     rows = []
@@ -112,10 +78,23 @@ def primitives(n: int = 24) -> Rows:
     return rows
 
 
-def _pushes() -> tuple[InteractionTensors, InteractionTensors]:
+def _pushes() -> list[InteractionTensors]:
+    """Those of training, and those of validation."""
     data = open_interactions("push")
     split = split_interactions(data.sizes["interaction"])
-    return tuple(InteractionTensors.from_dataset(data, s) for s in (split.train, split.validation))
+    return [InteractionTensors.from_dataset(data, part) for part in (split.train, split.validation)]
+
+
+def _step(network: models.EffectNetwork, loss: Callable, fused: bool | None) -> Callable[[], None]:
+    """A step of training on what `loss` draws."""
+    optimiser = torch.optim.Adam(network.parameters(), 1e-4, fused=fused)
+
+    def step() -> None:
+        loss().backward()
+        optimiser.step()
+        optimiser.zero_grad(set_to_none=True)
+
+    return step
 
 
 def training(
@@ -127,52 +106,46 @@ def training(
     the error that the paper's loop has after so many iterations (a quarter of an hour).
     """
     pushes, validation = _pushes()
-    model = build(CNPConfig(), Scaler.fit(pushes)).train()
     generator = torch.Generator().manual_seed(0)
 
-    def batch() -> Any:
-        rows = torch.randint(len(pushes), (size,), generator=generator)
-        return sample_mixed(pushes.select(rows), n_targets, 10, generator)
+    def network() -> models.EffectNetwork:
+        torch.manual_seed(0)
+        return models.build(models.CNPConfig(), Scaler.fit(pushes))
 
-    def stepper(draw: Callable[[], Any], fused: bool | None) -> Callable[[], None]:
-        optimiser = torch.optim.Adam(model.parameters(), 1e-4, fused=fused)
+    def one() -> torch.Tensor:
+        return batch_loss(model, sampling.sample_literal(pushes, 10, generator))
 
-        def step() -> None:
-            batch_loss(model, draw()).backward()
-            optimiser.step()
-            optimiser.zero_grad(set_to_none=True)
+    def many() -> torch.Tensor:
+        some = pushes.select(torch.randint(len(pushes), (size,), generator=generator))
+        return batch_loss(model, sampling.sample_mixed(some, n_targets, 10, generator))
 
-        return step
-
-    literal = stepper(lambda: sample_literal(pushes, 10, generator), None)
-    batched = stepper(batch, True)
+    model = network().train()
+    literal, batched = _step(model, one, None), _step(model, many, True)
     with FlopCounterMode(display=False) as counter:
-        batch_loss(model, batch()).backward()
+        many().backward()
     a, b = torch.rand(2, 1024, 1024)
     literal(), batched()
     ratios, shares = [], []
-    for _ in range(5):
-        one, many = seconds(literal, 20), seconds(batched, 3)
+    for _ in range(rounds):
+        one_s, many_s = seconds(literal, 20), seconds(batched, 3)
         products_per_s = 2 * 1024**3 / seconds(lambda: a @ b, 10)
-        ratios.append(size * n_targets / many * one)
-        shares.append(counter.get_total_flops() / many / products_per_s)
-    rows = [ratio_row("training, batched : literal", ratios, 150)]
-    rows.append(ratio_row("share of the matrix rate", shares, 0.5))
+        ratios.append(size * n_targets * one_s / many_s)
+        shares.append(counter.get_total_flops() / many_s / products_per_s)
 
-    torch.manual_seed(0)
-    model = build(CNPConfig(), Scaler.fit(pushes))
-    began = time.perf_counter()
-    train_literal(model, pushes, iterations)
+    model, began = network(), time.perf_counter()
+    models.train_literal(model, pushes, iterations)
     literal_s = time.perf_counter() - began
     error = float(final_errors_m(model.eval(), validation).mean())
-    torch.manual_seed(0)
-    model = build(CNPConfig(), Scaler.fit(pushes))
     # In small batches: while errors are large, many steps gain more than accurate ones.
-    small = TrainingConfig(steps=600, validate_every=10, patience=99, batch_size=8, n_targets=8)
-    history = train(model, pushes, validation, small)
+    small = {"steps": 600, "validate_every": 10, "patience": 99, "batch_size": 8, "n_targets": 8}
+    history = models.train(network(), pushes, validation, models.TrainingConfig(**small))
     reached = next((h.seconds for h in history if h.validation_error <= error), np.inf)
     what = "time to the literal loop's error, literal : batched"
-    return [*rows, ratio_row(what, [literal_s / reached], 20)]
+    return [
+        ratio_row("training, batched : literal", ratios, 150),
+        ratio_row("share of the matrix rate", shares, 0.5),
+        ratio_row(what, [literal_s / reached], 20),
+    ]
 
 
 def prediction() -> Rows:
@@ -181,41 +154,42 @@ def prediction() -> Rows:
     First on one core, then on all, for a machine that has nothing else to do.
     """
     rows, (pushes, _) = [], _pushes()
-    for threads, config in product(sorted({1, os.cpu_count()}), (CNPConfig(), FiLMConfig())):
+    configs = (models.CNPConfig(), models.FiLMConfig())
+    for threads, config in product(sorted({1, os.cpu_count()}), configs):
         torch.set_num_threads(threads)
-        model = build(config, Scaler.fit(pushes)).eval()
+        model = models.build(config, Scaler.fit(pushes)).eval()
         rows += _prediction_rows(model, pushes.image[:1], threads)
     torch.set_num_threads(1)
     return rows
 
 
 @torch.inference_mode()
-def _prediction_rows(model: EffectNetwork, image: torch.Tensor, threads: int) -> Rows:
+def _prediction_rows(model: models.EffectNetwork, image: torch.Tensor, threads: int) -> Rows:
     pushes = [Push(float(a)) for a in np.linspace(0, 2 * np.pi, 180, endpoint=False)]
-    each, every = (
-        [condition_on_primitives(model, [p]) for p in pushes],
-        condition_on_primitives(model, pushes),
-    )
-    end, phases, features = torch.ones(1, 1), torch.linspace(0, 1, 25)[None], model.encode(image)
+    each = [models.condition_on_primitives(model, [p]) for p in pushes]
+    every = models.condition_on_primitives(model, pushes)
+    end, phases, encoded = torch.ones(1, 1), torch.linspace(0, 1, 25)[None], model.encode(image)
 
-    def query(observed: Observations, t: torch.Tensor, encoded: torch.Tensor | None = None) -> None:
-        known = model.encode(image) if encoded is None else encoded
-        model.predict(known, observed, t.expand(len(observed.weight), -1))
-
-    def apart(some: list[Observations], t: torch.Tensor) -> None:
-        for observed in some:
-            query(observed, t)
+    def query(t: torch.Tensor, *some: Observations, features: torch.Tensor | None = None) -> None:
+        for seen in some:
+            known = model.encode(image) if features is None else features
+            model.predict(known, seen, t.expand(len(seen.weight), -1))
 
     # What is compared, and how many of the slow calls stand for all.
-    ends, few = partial(apart, each, end), each[::10]
-    encoded, together = partial(query, every, end, features), partial(query, every, phases)
+    ends, together = partial(query, end, *each), partial(query, phases, every, features=encoded)
     name = type(model).__name__ + (f" on {threads} cores" if threads > 1 else "")
     rows = []
     for what, slow, fast, share, goal in (
-        ("final positions", ends, partial(query, every, end), 1, 100),
-        ("final positions, image encoded before", ends, encoded, 1, 100),
-        ("trajectories, a call a push", partial(apart, few, phases), together, 10, 30),
-        ("trajectories, a call a step", partial(apart, few, end), together, 250, 30),
+        ("final positions", ends, partial(query, end, every), 1, 100),
+        (
+            "final positions, image encoded before",
+            ends,
+            partial(query, end, every, features=encoded),
+            1,
+            100,
+        ),
+        ("trajectories, a call a push", partial(query, phases, *each[::10]), together, 10, 30),
+        ("trajectories, a call a step", partial(query, end, *each[::10]), together, 250, 30),
     ):
         slow(), fast()
         pairs = np.array([(share * seconds(slow), seconds(fast, 5)) for _ in range(5)])
@@ -233,30 +207,29 @@ def lever_up(n: int = 256, epoch: int = 1440) -> Rows:
     """
     data, rows = open_interactions("lever_up").isel(interaction=slice(0, n + 8)), []
     for name, lever in [*LEVER_MODELS.items(), ("lstm_seker2019", None)]:
-        view = lever.view if lever else "full"
-        arrays = lever_up_tensors(data, view=view).select(torch.arange(n))
-        scales, channels = Scaler.fit(arrays), (arrays.action_channels, arrays.effect_channels)
+        arrays = lever_up_tensors(data, view=lever.view if lever else "full")
+        arrays = arrays.select(torch.arange(n))
         if lever:
-            model, size = build(lever.network, scales).train(), 64
+            model, size = models.build(lever.network, Scaler.fit(arrays)).train(), 64
+            epochs = lever.training.steps * size / epoch
         else:
-            model, size = SekerLSTM(SekerConfig(*channels), scales).train(), BATCH
-        optimiser = torch.optim.Adam(model.parameters(), 1e-4, fused=True)
+            channels = arrays.action_channels, arrays.effect_channels
+            config = lstm_seker2019.SekerConfig(*channels)
+            model = lstm_seker2019.SekerLSTM(config, Scaler.fit(arrays)).train()
+            size, epochs = lstm_seker2019.BATCH, lstm_seker2019.EPOCHS
         generator = torch.Generator().manual_seed(0)
 
-        def step(model=model, arrays=arrays, size=size, optimiser=optimiser, g=generator) -> None:
+        def loss(model=model, arrays=arrays, size=size, lever=lever, g=generator) -> torch.Tensor:
             part = arrays.select(torch.randint(0, n, (size,), generator=g))
-            optimiser.zero_grad()
-            if isinstance(model, SekerLSTM):
+            if lever is None:
                 start = torch.randint(0, 11, (size,), generator=g)
-                model.next_step_loss(part, start, N_OBSERVED).backward()
-            else:
-                batch = sample_windows(part, N_PREDICTED, N_OBSERVED, g)
-                batch_loss(model, batch, 0.5).backward()
-            optimiser.step()
+                return model.next_step_loss(part, start, N_OBSERVED)
+            batch = sampling.sample_windows(part, N_PREDICTED, N_OBSERVED, g)
+            return batch_loss(model, batch, 0.5)
 
+        step = _step(model, loss, True)
         step()
         epoch_s = min(seconds(step) for _ in range(5 if lever else 2)) * epoch / size
-        epochs = lever.training.steps * size / epoch if lever else EPOCHS
         row = {"model": name, "epoch_s": epoch_s, "training_s": epoch_s * epochs}
         model.eval()
         for count, protocol in product((1, 64), ("window", "image_only")):
@@ -282,57 +255,53 @@ def planning(n_goals: int = 15, seed: int = 300) -> Rows:
     descends through the whole network in every iteration, until it expects to end within a
     millimetre: from one start, and from as many, one after the other, as ours refines at once.
     """
-    film = load_checkpoint("film_5000")[0]
-    goals = {"single_partial": "one action", "multi_partial": "up to three actions"}
+    film = models.load_checkpoint("film_5000")[0]
+    modes = {"single_partial": "one action", "multi_partial": "up to three actions"}
     first = partial(plan_continuous, draft=True)
     planners = {"A*": plan_astar, "continuous": plan_continuous, "first plan": first}
-    times: dict[tuple[str, ...], list[float]] = defaultdict(list)
-    map_ms: list[float] = []
+    times: dict[tuple[str | None, ...], list[float]] = defaultdict(list)
 
     def whole(planner: Callable, problem: PlanningProblem) -> None:
         planner(replace(problem, effects=EffectMap(film, problem.effects.image)))
 
+    def measure(work: Callable[[], object], *key: str, times_as_much: int = 1) -> None:
+        times[key].append(1000 * times_as_much * seconds(work))
+
     with Tabletop() as world:
-        for mode in goals:
-            for task in uniform_tasks(mode, n_goals, seed, STANDING):
-                world.place(task.obj, (0.0, 0.0), task.yaw_rad)
-                image, start = world.depth_image(), world.object_pose()[:2]
-                effects = EffectMap(film, image)
-                map_ms.append(1000 * seconds(lambda e=effects: e.spline))
-                problem = PlanningProblem(start, task.goal, effects, mode)
-                effects.fine_grid  # noqa: B018, made once an object
-                plan = plan_astar(problem)
-                for name, planner in planners.items():
-                    times[name, mode].append(1000 * seconds(partial(planner, problem)))
-                    times[name, mode, "whole"].append(
-                        1000 * seconds(partial(whole, planner, problem))
-                    )
-                if len(map_ms) % 5 == 1:
-                    rng, naive = np.random.default_rng(seed), partial(_naive_descent, problem)
-                    each = 1000 * seconds(partial(_naive_branches, film, image))
-                    starts = [1000 * seconds(partial(naive, rng)) for _ in range(N_REFINED)]
-                    times["A*", mode, "an expansion is 180 calls"].append(each * plan.evaluations)
-                    times["continuous", mode, "one start"].append(1000 * seconds(naive))
-                    times["continuous", mode, f"{N_REFINED} starts"].append(sum(starts))
+        for task in [t for mode in modes for t in uniform_tasks(mode, n_goals, seed, STANDING)]:
+            world.place(task.obj, (0.0, 0.0), task.yaw_rad)
+            image, mode = world.depth_image(), task.mode
+            effects = EffectMap(film, image)
+            measure(lambda e=effects: e.spline, "map")
+            problem = PlanningProblem(world.object_pose()[:2], task.goal, effects, mode)
+            effects.fine_grid  # noqa: B018, made once an object
+            evaluations = plan_astar(problem).evaluations
+            for name, planner in planners.items():
+                measure(partial(planner, problem), name, mode)
+                measure(partial(whole, planner, problem), name, mode, "whole")
+            if len(times["A*", mode]) % 5 == 1:
+                rng, naive = np.random.default_rng(seed), partial(_naive_descent, problem)
+                branches = partial(_naive_branches, film, image)
+                measure(branches, "A*", mode, NAIVE[0][1], times_as_much=evaluations)
+                measure(naive, "continuous", mode, NAIVE[1][1])
+                each = [seconds(partial(naive, rng)) for _ in range(N_REFINED)]
+                times["continuous", mode, NAIVE[2][1]].append(1000 * sum(each))
     median = {key: float(np.median(values)) for key, values in times.items()}
     rows = []
-    for mode, (planner, naive) in product(goals, NAIVE):
+    for mode, (planner, naive) in product(modes, NAIVE):
         whole_ms = median[planner, mode, "whole"]
-        row = {"planner": planner, "goals": goals[mode], "median_ms": median[planner, mode]}
+        row = {"planner": planner, "goals": modes[mode], "median_ms": median[planner, mode]}
         ratio = median[planner, mode, naive] / whole_ms if naive else None
         rows.append(row | {"whole_median_ms": whole_ms, "naive": naive, "ratio": ratio})
-    row = {"planner": "map", "goals": "an object", "median_ms": float(np.median(map_ms))}
+    row = {"planner": "map", "goals": "an object", "median_ms": median["map",]}
     return [*rows, row | dict.fromkeys(("whole_median_ms", "naive", "ratio"))]
 
 
 @torch.no_grad()
-def _naive_branches(model: EffectNetwork, image: np.ndarray) -> None:
-    for angle in np.arange(N_DIRECTIONS) * (2 * np.pi / N_DIRECTIONS):
-        for stop in STOP_PHASES:
-            features = EffectMap(model, image).features
-            model.predict(
-                features, condition_on_primitives(model, [Push(angle)]), torch.tensor([[stop]])
-            )
+def _naive_branches(model: models.EffectNetwork, image: np.ndarray) -> None:
+    for angle, stop in product(np.arange(N_DIRECTIONS) * (2 * np.pi / N_DIRECTIONS), STOP_PHASES):
+        features, push = EffectMap(model, image).features, [Push(angle)]
+        model.predict(features, models.condition_on_primitives(model, push), torch.tensor([[stop]]))
 
 
 def _naive_descent(problem: PlanningProblem, rng: np.random.Generator | None = None) -> None:
@@ -342,16 +311,15 @@ def _naive_descent(problem: PlanningProblem, rng: np.random.Generator | None = N
     n = 1 if problem.mode.max_steps == 1 else max(1, int(np.ceil(float(target.norm()) / 0.09)))
     direction, phase = torch.atan2(target[1], target[0]).repeat(n), torch.full((n,), 0.9)
     if rng is not None:
-        direction += torch.from_numpy(
-            rng.uniform(-DIRECTION_SPREAD_RAD, DIRECTION_SPREAD_RAD, n)
-        ).float()
+        spread = rng.uniform(-DIRECTION_SPREAD_RAD, DIRECTION_SPREAD_RAD, n)
+        direction += torch.from_numpy(spread).float()
         phase = torch.from_numpy(rng.uniform(MIN_STOP_PHASE, 1.0, n)).float()
     optimiser = torch.optim.Adam([direction.requires_grad_(), phase.requires_grad_()], lr=0.02)
     x, y = (model.effect_channels.index(name) for name in "xy")
     for _ in range(300):
         end = torch.zeros(2)
         for angle, stop in zip(direction, phase.clamp(0, 1), strict=True):
-            straight = condition_on_primitives(model, [Push.towards(0.0)])
+            straight = models.condition_on_primitives(model, [Push.towards(0.0)])
             turn = torch.stack([angle.cos(), -angle.sin(), angle.sin(), angle.cos()]).view(2, 2)
             seen = replace(straight, action=straight.action[:, [0, -1]] @ turn.T)
             told = model.predict(EffectMap(model, image).features, seen, stop.view(1, 1))
@@ -364,14 +332,7 @@ def _naive_descent(problem: PlanningProblem, rng: np.random.Generator | None = N
         optimiser.step()
 
 
-MEASUREMENTS: dict[str, Callable[[], Rows]] = {
-    "collect": collecting,
-    "lever_up": lever_up,
-    "planning": planning,
-    "prediction": prediction,
-    "primitives": primitives,
-    "training": training,
-}
+MEASUREMENTS = {f.__name__: f for f in (lever_up, planning, prediction, primitives, training)}
 
 
 @command(OSError, ValueError)

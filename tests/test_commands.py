@@ -14,7 +14,7 @@ ALL = {
     path.relative_to(repo_root()).with_suffix("").as_posix().replace("/", ".")
     for folder in ("affordlib", "experiments")
     for path in (repo_root() / folder).rglob("*.py")
-    if "ArgumentParser" in path.read_text() and "\nif __name__" in path.read_text()
+    if "parse_args" in path.read_text() and "\nif __name__" in path.read_text()
 }
 
 
