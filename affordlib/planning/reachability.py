@@ -6,6 +6,7 @@ recorded interactions alone; the kinematics stays unknown.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,21 +16,25 @@ from torch import nn
 
 from affordlib.models.checkpoint import read_weights, write_weights
 from affordlib.paths import repo_root
-from affordlib.primitives import PRIMITIVES, primitive_named
+from affordlib.primitives import primitive_named
 
 _HIDDEN, _STEPS, _RATE = 64, 1500, 1e-2
 SHIPPED = "data/checkpoints/reachability.safetensors"
-_DESCRIPTION = {"format": "affordlib reachability 1", "primitives": list(PRIMITIVES)}
+_FORMAT = "affordlib reachability 1"
 _REMEDY = "learn it again with python -m experiments.shipped reachability"
 
 
 class Reachability(nn.Module):
-    """The probability that the arm can carry out a primitive at a place."""
+    """The probability that the arm can carry out a primitive at a place.
 
-    def __init__(self) -> None:
+    primitives: names of those that it learns, or has learned.
+    """
+
+    def __init__(self, primitives: Sequence[str]) -> None:
         super().__init__()
+        self.primitives = tuple(primitives)
         self.layers = nn.Sequential(
-            nn.Linear(4 + len(PRIMITIVES), _HIDDEN),
+            nn.Linear(4 + len(self.primitives), _HIDDEN),
             nn.Tanh(),
             nn.Linear(_HIDDEN, _HIDDEN),
             nn.Tanh(),
@@ -44,12 +49,12 @@ class Reachability(nn.Module):
         """
         path = Path(path or repo_root() / SHIPPED)
         tensors, description = read_weights(path, _REMEDY)
-        model = cls()
         try:
-            if description != _DESCRIPTION:
+            if description.get("format") != _FORMAT:
                 raise ValueError(f"it describes {description}")
+            model = cls(description["primitives"])
             model.load_state_dict(tensors)
-        except (RuntimeError, ValueError) as error:
+        except (RuntimeError, ValueError, KeyError, TypeError) as error:
             raise ValueError(
                 f"{path} does not hold a reachability of this package ({error}); {_REMEDY}"
             ) from error
@@ -57,7 +62,9 @@ class Reachability(nn.Module):
 
     def save(self, path: str | Path) -> Path:
         """Write the weights to a file that `load` reads, whole or not at all; returns its path."""
-        return write_weights(path, self.state_dict(), _DESCRIPTION)
+        return write_weights(
+            path, self.state_dict(), {"format": _FORMAT, "primitives": [*self.primitives]}
+        )
 
     @torch.no_grad()
     def probability(
@@ -65,22 +72,24 @@ class Reachability(nn.Module):
     ) -> np.ndarray:
         """Probability (n,) that `primitive` is in reach of objects at xy_m: (n, 2).
 
+        It is 1 for a primitive that was not learned: then the arm's kinematics alone decides.
         direction_rad: (n,) or one number, in which a push or drag moves; None for the others.
         """
         primitive_named(primitive)
         xy_m = np.atleast_2d(np.asarray(xy_m, dtype=float))
-        number = list(PRIMITIVES).index(primitive)
+        if primitive not in self.primitives:
+            return np.ones(len(xy_m))
         turn = np.nan if direction_rad is None else direction_rad
         turn = np.broadcast_to(np.asarray(turn, dtype=float), len(xy_m))
-        features = _features(np.full(len(xy_m), number), xy_m, turn)
+        number = np.full(len(xy_m), self.primitives.index(primitive))
+        features = _features(np.eye(len(self.primitives))[number], xy_m, turn)
         return torch.sigmoid(self.layers(features)).squeeze(-1).numpy()
 
 
-def _features(number: np.ndarray, xy_m: np.ndarray, direction_rad: np.ndarray) -> torch.Tensor:
+def _features(kind: np.ndarray, xy_m: np.ndarray, direction_rad: np.ndarray) -> torch.Tensor:
     """(n, 4 + primitives): place, direction (zero where there is none), which primitive."""
     ahead = np.column_stack([np.cos(direction_rad), np.sin(direction_rad)])
     ahead[np.isnan(direction_rad)] = 0.0
-    kind = np.eye(len(PRIMITIVES))[number]
     return torch.from_numpy(np.hstack([2 * xy_m, ahead, kind])).float()
 
 
@@ -91,14 +100,15 @@ def learn_reachability(data: xr.Dataset, seed: int = 0) -> Reachability:
     """
     number = data["primitive"].values
     xy_m = data["believed_xy"].values
-    push = list(PRIMITIVES).index("push")
-    direction = data["theta"].values + np.where(number == push, np.pi, 0.0)
+    names = data["primitive"].attrs["flag_meanings"].split()
+    direction = data["theta"].values + np.where(number == names.index("push"), np.pi, 0.0)
+    kind = np.eye(len(names))[number]
     reached = torch.from_numpy(data["reached"].values).float()
     inputs = torch.cat(
-        [_features(number, xy_m, direction), _features(number, xy_m * [1, -1], -direction)]
+        [_features(kind, xy_m, direction), _features(kind, xy_m * [1, -1], -direction)]
     )
     torch.manual_seed(seed)
-    model = Reachability()
+    model = Reachability(names)
     optimiser = torch.optim.AdamW(model.parameters(), _RATE)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, _RATE, _STEPS)
     for _ in range(_STEPS):

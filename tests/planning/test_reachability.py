@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from affordlib import primitives
 from affordlib.interactions import open_interactions
 from affordlib.planning.reachability import Reachability, learn_reachability
 from affordlib.primitives import Drag, Grasp, Push, Rotate
@@ -65,6 +66,11 @@ def test_the_shipped_one_was_learned_so(learned, tmp_path):
     mine = Reachability.load(tmp_path / "mine.safetensors").probability("push", places, angles)
     np.testing.assert_array_equal(mine, learned.probability("push", places, angles))
     assert [path.name for path in tmp_path.iterdir()] == ["mine.safetensors"]
+
+
+def test_a_primitive_that_was_not_learned_is_left_to_the_kinematics(monkeypatch):
+    monkeypatch.setitem(primitives.PRIMITIVES, "tap", type("Tap", (Push,), {"name": "tap"}))
+    assert (Reachability.load().probability("tap", np.zeros((2, 2))) == 1.0).all()
 
 
 def test_a_damaged_file_is_told(learned, tmp_path):
