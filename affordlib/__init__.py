@@ -22,8 +22,8 @@ world.tabletop planning.astar planning.closed_loop planning.continuous planning.
 planning.effect_map planning.gradient planning.grasp_rotate
 planning.problem planning.reachability planning.skills interactions.dataset
 interactions.sampling interactions.collect interactions.import_log interactions.lever_up
-interactions.recipes interactions.store models.calibration models.checkpoint models.domain
-models.lever_up models.protocol models.training evaluation.metrics show.animation
+interactions.log interactions.recipes interactions.store models.calibration models.checkpoint
+models.domain models.lever_up models.protocol models.training evaluation.metrics show.animation
 show.executors show.explorers show.goal_picker show.plots
 """
 _CONF = BeartypeConf(

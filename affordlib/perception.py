@@ -11,10 +11,12 @@ import math
 from dataclasses import replace
 
 import numpy as np
+from matplotlib.path import Path
 from scipy import ndimage
+from scipy.spatial import ConvexHull
 
 from affordlib.primitives import Drag, Grasp, Primitive
-from affordlib.types import CROP_WIDTH_M
+from affordlib.types import CROP_WIDTH_M, IMAGE_PIXELS, check_array, check_pair, check_within
 
 CAMERA_HEIGHT_M = 1.0
 _ROUND = 0.8
@@ -109,3 +111,72 @@ def adapt_to_object(primitive: Primitive, image: np.ndarray) -> Primitive:
     if isinstance(primitive, Grasp) and primitive.seen_height is None:
         return replace(primitive, seen_height=object_height_m(image))
     return primitive
+
+
+def height_map(
+    points: np.ndarray, centre_m: tuple[float, float], width_m: float = CROP_WIDTH_M
+) -> np.ndarray:
+    """Mean height [m] of points (n, 3) in each pixel of a crop, seen from above; gaps are table."""
+    pixel = width_m / IMAGE_PIXELS
+    at = np.floor((points[:, :2] - np.array(centre_m)) / pixel + IMAGE_PIXELS / 2)
+    inside = ((at >= 0) & (at < IMAGE_PIXELS)).all(axis=1)
+    column, row = at[inside].astype(int).T
+    cell = (IMAGE_PIXELS - 1 - row) * IMAGE_PIXELS + column
+    count = np.bincount(cell, minlength=IMAGE_PIXELS**2)
+    total = np.bincount(cell, weights=points[inside, 2], minlength=IMAGE_PIXELS**2)
+    return (total / np.maximum(count, 1)).reshape(IMAGE_PIXELS, IMAGE_PIXELS)
+
+
+def crop_from_depth(
+    depth: np.ndarray,
+    intrinsics: tuple[float, float, float, float],
+    camera_pose: np.ndarray,
+    centre: tuple[float, float],
+    width_m: float = CROP_WIDTH_M,
+    noise_m: float = 0.004,
+) -> np.ndarray:
+    """Depth [m] and mask (2, 48, 48) of an object, seen by a camera of one's own.
+
+    depth: (rows, columns) [m] along the optical axis, zero where not known; intrinsics: focal
+    lengths and principal point fx, fy, cx, cy [px]; camera_pose: (4, 4), to the world, whose z is
+    up and 0 on the table, from the camera, whose z looks ahead and y down; centre: (x, y) [m] of
+    the crop; noise_m: what is higher than this is the object.
+    """
+    depth, pose = check_array("depth", depth), check_array("camera_pose", camera_pose, 4, 4)
+    focal_and_middle = check_array("intrinsics", intrinsics, 4)
+    if depth.ndim != 2 or pose.ndim != 2 or focal_and_middle.ndim != 1:
+        raise ValueError(f"depth must be an image (rows, columns), got {depth.shape}")
+    fx, fy, cx, cy = focal_and_middle
+    width_m = check_within("width_m", width_m, 0.01, 10.0, "m")
+    row, column = np.nonzero(depth > 0)
+    z = depth[row, column]
+    ray = np.stack([(column - cx) / fx, (row - cy) / fy, np.ones_like(z), 1 / z], axis=1)
+    points = (z[:, None] * ray) @ pose[:3].T
+    height = height_map(points, check_pair("centre", centre), width_m)
+    mask = largest_blob(height > check_within("noise_m", noise_m, 0.0, 0.1, "m"))
+    return np.stack([CAMERA_HEIGHT_M - height, mask]).astype(np.float32)
+
+
+def outline_image(
+    outline_m: np.ndarray, width_m: float = CROP_WIDTH_M, height_m: float = 0.05
+) -> np.ndarray:
+    """Depth [m] and mask (2, 48, 48) of a prism with corners (k, 2) [m] around the image's middle.
+
+    A pixel is the mean of 3 x 3 rays, as of the ideal camera.
+    """
+    rays = 3
+    n = rays * IMAGE_PIXELS
+    at = width_m * ((np.arange(n) + 0.5) / n - 0.5)
+    x, y = np.meshgrid(at, -at)
+    inside = Path(outline_m).contains_points(np.column_stack([x.ravel(), y.ravel()]))
+    mask = inside.reshape(IMAGE_PIXELS, rays, IMAGE_PIXELS, rays).mean(axis=(1, 3))
+    return np.stack([CAMERA_HEIGHT_M - height_m * mask, mask]).astype(np.float32)
+
+
+def outline_of(image: np.ndarray, width_m: float = CROP_WIDTH_M) -> np.ndarray:
+    """Corners (k, 2) [m] of the convex outline of an image's object, around the image's middle."""
+    rows, columns = np.nonzero(image[1] > 0.5)
+    n = len(image[1])
+    corners = [(columns + dx, n - rows - dy) for dx in (0, 1) for dy in (0, 1)]
+    points = np.concatenate([np.stack(c, axis=1) for c in corners])
+    return (points[ConvexHull(points).vertices] / n - 0.5) * width_m

@@ -21,6 +21,7 @@ import affordlib.interactions.collect as collecting
 from affordlib import evaluation, interactions, models, planning, show, world
 from affordlib.interactions.recipes import Recipe, Variation
 from affordlib.paths import repo_root
+from affordlib.perception import crop_from_depth
 from affordlib.plan_files import load_plan, save_plan
 from affordlib.primitives import Drag, Grasp, LeverUp, Push, Rotate, primitive_named
 from affordlib.results import read_results, results_table, write_results
@@ -204,6 +205,28 @@ def valid_calls(shop):
         ),
         "Split": given_to(interactions.split_interactions(20)),
         "InteractionTensors": given_to(arrays),
+        "Log": call(
+            interactions.Log, unit="m", outline=corners, crop_width_m=0.16, angle_unit="rad"
+        ),
+        "Log.add": call(
+            interactions.Log("m", corners).add,
+            start=(0.0, 0.0, 0.0),
+            tool_t=(0.0, 1.0),
+            tool_xy=((-0.1, 0.0), (0.0, 0.0)),
+            end=(0.02, 0.0, 0.0),
+            poses=None,
+            context={"support": "felt"},
+            group="all",
+        ),
+        "crop_from_depth": call(
+            crop_from_depth,
+            depth=np.full((4, 4), 0.9),
+            intrinsics=(9.0, 9.0, 2.0, 2.0),
+            camera_pose=np.diag([1.0, -1.0, -1.0, 1.0]),
+            centre=at,
+            width_m=0.16,
+            noise_m=0.004,
+        ),
         "Recipe": given_to(Recipe()),
         "Variation": given_to(Variation()),
         "collect": call(
@@ -414,7 +437,7 @@ def test_a_hostile_value_is_refused_by_name_or_does_no_harm(shop, name, tmp_path
 
 MADE_BY_DRIVEN_ONES = """
 ClosedLoopResult DisturbanceSchedule EffectModel Execution Robot
-EffectNetwork NetworkConfig TabletopObject open_loop
+EffectNetwork NetworkConfig PushLog TabletopObject open_loop
 """
 
 

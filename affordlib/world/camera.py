@@ -12,7 +12,7 @@ import numpy as np
 import pybullet
 from pybullet_utils.bullet_client import BulletClient
 
-from affordlib.perception import CAMERA_HEIGHT_M, centre_m, largest_blob
+from affordlib.perception import CAMERA_HEIGHT_M, centre_m, height_map, largest_blob
 from affordlib.types import CROP_WIDTH_M, IMAGE_PIXELS, TABLE_X_M, TABLE_Y_M, NothingSeenError
 
 _NEAR_M, _FAR_M = 0.5, 1.1
@@ -119,17 +119,6 @@ def _kinect_points(
     return np.stack([x, y, KINECT_HEIGHT_M - distance], axis=-1).reshape(-1, 3)
 
 
-def _height_map(points: np.ndarray, centre_m: tuple[float, float]) -> np.ndarray:
-    """Mean height [m] of the points in each pixel of a crop, seen from above; gaps are table."""
-    pixel = CROP_WIDTH_M / IMAGE_PIXELS
-    at = np.floor((points[:, :2] - np.array(centre_m)) / pixel + IMAGE_PIXELS / 2).astype(int)
-    inside = ((at >= 0) & (at < IMAGE_PIXELS)).all(axis=1)
-    cell = (IMAGE_PIXELS - 1 - at[inside, 1]) * IMAGE_PIXELS + at[inside, 0]
-    count = np.bincount(cell, minlength=IMAGE_PIXELS**2)
-    total = np.bincount(cell, weights=points[inside, 2], minlength=IMAGE_PIXELS**2)
-    return (total / np.maximum(count, 1)).reshape(IMAGE_PIXELS, IMAGE_PIXELS)
-
-
 def kinect_view(
     client: BulletClient, noise: np.random.Generator
 ) -> tuple[tuple[float, float], np.ndarray]:
@@ -146,14 +135,14 @@ def kinect_view(
     xy = tuple(np.median(high[:, :2], axis=0))
     for _ in range(2):
         points = _kinect_points(client, xy, (1.5 * CROP_WIDTH_M, 1.5 * CROP_WIDTH_M), 1, noise)
-        height = _height_map(points, xy)
+        height = height_map(points, xy)
         mask = largest_blob(height > _KINECT_MASK_HEIGHT_M)
         if mask.any():
             # Of the walls it sees only those that face it, which draws the mean towards it;
             # above 45 % of the height (measured) the centre is hardly biased.
             dx, dy = centre_m(mask & (height > 0.45 * np.quantile(height[mask], 0.9)))
             xy = (float(xy[0] + dx), float(xy[1] + dy))
-    height = _height_map(points, xy)
+    height = height_map(points, xy)
     mask = largest_blob(height > _KINECT_MASK_HEIGHT_M)
     return xy, np.stack([CAMERA_HEIGHT_M - height, mask]).astype(np.float32)
 

@@ -1,0 +1,336 @@
+"""A log of one's own: pushes of one object as a robot recorded them, checked and made comparable.
+
+`Log` takes raw numbers, in millimetres or metres and in the frame of the world; `Log.tensors` gives
+a `PushLog`, in metres and radians and in the object's frame as it stood before each push: its
+origin is the centroid of the outline, its axes are those of the recorded pose.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from affordlib.geometry import rotated
+from affordlib.interactions.dataset import InteractionTensors
+from affordlib.perception import outline_image
+from affordlib.types import CROP_WIDTH_M, check_array, check_within
+
+UNITS_M = {"mm": 1e-3, "m": 1.0}
+UNITS_RAD = {"deg": math.pi / 180, "rad": 1.0}
+N_PHASES = 51
+MOST_ROWS = 20_000
+LARGEST_M = 1.0
+NEAR_M = 0.03
+"""A tool that has a width of its own touches from this far."""
+
+
+@dataclass(frozen=True)
+class PushLog:
+    """n pushes of one object, each in the object's frame as it stood before; metres and radians.
+
+    contact_m: (n, 2) where the tool first touches the outline; normal: (n, 2) unit, inward, there;
+    direction: (n, 2) unit and length_m: (n,), from there to where the tool ends;
+    displacement_m: (n, 2) of the centroid and turn_rad: (n,), at the end; outline_m: (k, 2)
+    counter-clockwise; groups: (n,); context: what else is known of each, by name (n,); action:
+    (n, T, 2) of the tool and effect: (n, T, 3) x, y, yaw at equally spaced phases in [0, 1], NaN
+    where not known; crop_width_m: of images of the object.
+    """
+
+    contact_m: np.ndarray
+    normal: np.ndarray
+    direction: np.ndarray
+    length_m: np.ndarray
+    displacement_m: np.ndarray
+    turn_rad: np.ndarray
+    groups: np.ndarray
+    context: dict[str, np.ndarray]
+    action: np.ndarray
+    effect: np.ndarray
+    outline_m: np.ndarray
+    crop_width_m: float = CROP_WIDTH_M
+
+    def __len__(self) -> int:
+        return len(self.contact_m)
+
+    def select(self, rows: np.ndarray) -> PushLog:
+        """The pushes with these numbers, or where a mask (n,) is true."""
+        taken = {f.name: getattr(self, f.name) for f in fields(self)[:-2]}
+        taken["context"] = {name: values[rows] for name, values in self.context.items()}
+        return replace(self, **{n: v if n == "context" else v[rows] for n, v in taken.items()})
+
+    def image(self) -> np.ndarray:
+        """Depth [m] and mask (2, 48, 48) of the object in its own axes, rendered from the outline.
+
+        Its height is not known; 5 cm are drawn.
+        """
+        return outline_image(self.outline_m, self.crop_width_m)
+
+    def interaction_tensors(self) -> InteractionTensors:
+        """The same as the book's networks take them, at the phases where all effects are known."""
+        known = np.flatnonzero(np.isfinite(self.effect).all(axis=(0, 2)))
+        image = torch.from_numpy(self.image()).expand(len(self), -1, -1, -1)
+        phase = torch.linspace(0, 1, self.action.shape[1])[known]
+        both = (torch.from_numpy(v[:, known]).float() for v in (self.action, self.effect))
+        return InteractionTensors(image, phase, *both, ("x", "y"), ("x", "y", "yaw"))
+
+
+class Log:
+    """Pushes of one object, added one by one; wrong numbers are refused where they are added.
+
+    unit: of all lengths, "mm" or "m"; angle_unit: of yaws, "rad" or "deg"; outline: corners (x, y)
+    in the frame whose pose is recorded, without crossing itself (of an image: `outline_of`);
+    crop_width_m: of images of the object, which must fit in.
+    """
+
+    def __init__(
+        self,
+        unit: str,
+        outline: Sequence[tuple[float, float]] | np.ndarray,
+        crop_width_m: float = CROP_WIDTH_M,
+        angle_unit: str = "rad",
+    ) -> None:
+        for name, value, known in (
+            ("unit", unit, UNITS_M),
+            ("angle_unit", angle_unit, UNITS_RAD),
+        ):
+            if value not in known:
+                raise ValueError(f"{name} must be one of {sorted(known)}, got {value!r}")
+        self._metres, self._radians = UNITS_M[unit], UNITS_RAD[angle_unit]
+        self._unit, self._angle_unit = unit, angle_unit
+        corners = check_array("outline", outline, 2) * self._metres
+        self.origin_m, self.outline_m = _centred(corners)
+        wide = 2 * float(np.linalg.norm(self.outline_m, axis=1).max())
+        if wide > 2 * LARGEST_M:
+            raise ValueError(f"outline is {wide:.3g} m wide; is it in {unit}?")
+        self.crop_width_m = check_within("crop_width_m", crop_width_m, wide, 10 * wide, "m")
+        self._pushes: list[dict[str, Any]] = []
+
+    def __len__(self) -> int:
+        return len(self._pushes)
+
+    def add(
+        self,
+        start: Sequence[float],
+        tool_t: Sequence[float] | np.ndarray,
+        tool_xy: Sequence[Sequence[float]] | np.ndarray,
+        end: Sequence[float] | None = None,
+        poses: tuple[np.ndarray, np.ndarray] | None = None,
+        context: Mapping[str, Any] | None = None,
+        group: str = "all",
+    ) -> None:
+        """Add one push, in the frame of the world.
+
+        start, end: pose (x, y, yaw) of the object before and after; poses: times (k,) and poses
+        (k, 3) instead of `end` where they are known in between, on the clock of the tool; tool_t:
+        (m,) growing; tool_xy: (m, 2) of the tool; context: what else is known, numbers or words;
+        group: of pushes that belong together. Raises ValueError that names the push, what it holds
+        and what is expected; nothing is added then.
+        """
+        where = f"interaction {len(self)} (group {group!r})"
+        t, xy = self._tool(where, tool_t, tool_xy)
+        first = self._poses(where, "start", start)
+        if (end is None) == (poses is None):
+            raise ValueError(f"{where}: give either end or poses")
+        at, known = t[[0, -1]], np.stack([first, first])
+        if end is not None:
+            known[1] = self._poses(where, "end", end)
+        else:
+            at = _growing(where, "the times of poses", poses[0])
+            known = self._poses(where, "poses", poses[1])
+            if known.shape != (len(at), 3):
+                raise ValueError(f"{where}: poses hold {len(at)} times and {len(known)} poses")
+            if not np.allclose(known[0], first, atol=1e-3):
+                raise ValueError(
+                    f"{where}: the first of poses is {np.round(known[0] - first, 4)} (m, rad) away "
+                    "from start; expected is the same, for effects begin at zero"
+                )
+        centre = known[:, :2] + np.stack([rotated(self.origin_m, yaw) for yaw in known[:, 2]])
+        centre, tool = (rotated(p - centre[0], -first[2]) for p in (centre, xy))
+        turn = np.unwrap(known[:, 2]) - first[2]
+        push = _contact(where, self.outline_m, tool, self._unit)
+        name = "poses" if end is None else "end"
+        self._refuse_jumps(where, name, np.column_stack([centre, turn]), push["length_m"])
+        phase = np.linspace(0, 1, N_PHASES)
+        tool_phase, at = ((v - t[0]) / (t[-1] - t[0]) for v in (t, at))
+        effect = np.full((N_PHASES, 3), np.nan)
+        inside = (phase >= at[0]) & (phase <= at[-1]) if end is None else np.isin(phase, (0.0, 1.0))
+        for c, values in enumerate((*centre.T, turn)):
+            effect[inside, c] = np.interp(phase[inside], at, values)
+        effect[0], effect[-1] = 0.0, (*centre[-1], turn[-1])
+        self._pushes.append(
+            {
+                **push,
+                "displacement_m": centre[-1],
+                "turn_rad": turn[-1],
+                "groups": group,
+                "context": self._context(where, context or {}),
+                "action": np.column_stack([np.interp(phase, tool_phase, v) for v in tool.T]),
+                "effect": effect,
+            }
+        )
+
+    def tensors(self) -> PushLog:
+        """All pushes that were added; raises ValueError where there are none."""
+        if not self._pushes:
+            raise ValueError("the log is empty; add(...) interactions first")
+        by_name = {n: np.array([p[n] for p in self._pushes]) for n in self._pushes[0]}
+        by_name["context"] = {
+            n: np.array([p["context"][n] for p in self._pushes]) for n in self._pushes[0]["context"]
+        }
+        return PushLog(**by_name, outline_m=self.outline_m, crop_width_m=self.crop_width_m)
+
+    def _tool(self, where: str, tool_t: Any, tool_xy: Any) -> tuple[np.ndarray, np.ndarray]:
+        t = _growing(where, "tool_t", tool_t)
+        xy = _array(where, "tool_xy", tool_xy) * self._metres
+        if xy.shape != (len(t), 2):
+            raise ValueError(
+                f"{where}: tool_xy must hold x and y at each of the {len(t)} times of tool_t, got "
+                f"an array {xy.shape}"
+            )
+        return t, xy
+
+    def _poses(self, where: str, name: str, values: Any) -> np.ndarray:
+        """Poses (..., 3) in metres and radians."""
+        poses = _array(where, name, values)
+        if poses.shape[-1:] != (3,):
+            raise ValueError(f"{where}: {name} must be x, y and yaw, got {values!r:.80}")
+        poses = poses * [self._metres, self._metres, self._radians]
+        if (most := float(np.abs(poses[..., 2]).max())) > 2 * math.pi:
+            raise ValueError(
+                f"{where}: {name} has a yaw of {most:.3g} rad, expected is at most 2π; angles are "
+                f"taken in {self._angle_unit}, see Log(angle_unit=...)"
+            )
+        return poses
+
+    def _refuse_jumps(self, where: str, name: str, moved: np.ndarray, length_m: float) -> None:
+        """Raise where the object moves (k, 3) farther than the tool can take it.
+
+        It turns about a point that is hardly nearer to the tool than the inscribed circle's radius.
+        """
+        most_m = length_m + NEAR_M
+        most_rad = min(most_m / _inradius_m(self.outline_m), math.pi)
+        for row, (x, y, turn) in enumerate(moved.tolist()):
+            if math.hypot(x, y) > most_m:
+                raise ValueError(
+                    f"{where}: pose {row} of start and {name} is {math.hypot(x, y):.3g} m away, "
+                    f"but the tool moves {length_m:.3g} m after contact; is it another push's?"
+                )
+            if abs(turn) > most_rad:
+                raise ValueError(
+                    f"{where}: pose {row} of start and {name} is turned by {turn:.3g} rad, "
+                    f"expected are at most {most_rad:.2g}; yaws are taken in {self._angle_unit}"
+                )
+
+    def _context(self, where: str, context: Mapping[str, Any]) -> dict[str, Any]:
+        expected = self._pushes[0]["context"] if self._pushes else context
+        if set(context) != set(expected):
+            raise ValueError(
+                f"{where}: context names {sorted(context)}, that of interaction 0 "
+                f"{sorted(expected)}; give all of them the same names"
+            )
+        return dict(context)
+
+
+def _array(where: str, name: str, values: Any) -> np.ndarray:
+    try:
+        array = check_array(name, values)
+    except (TypeError, ValueError):
+        raise ValueError(f"{where}: {name} must be finite numbers, got {values!r:.80}") from None
+    if len(array) > MOST_ROWS:
+        raise ValueError(
+            f"{where}: {name} has {len(array)} rows, expected are those of one push, at most "
+            f"{MOST_ROWS}; cut the recording at each push, or thin it"
+        )
+    return array
+
+
+def _growing(where: str, name: str, times: Any) -> np.ndarray:
+    t = _array(where, name, times)
+    if t.ndim != 1 or len(t) < 2:
+        raise ValueError(f"{where}: {name} must be at least two times (m,), got {t.shape}")
+    if (stuck := np.flatnonzero(np.diff(t) <= 0)).size:
+        row = int(stuck[0]) + 1
+        raise ValueError(
+            f"{where}: {name} must grow, but row {row} is {t[row]!r} after {t[row - 1]!r}; leave "
+            "out repeated rows"
+        )
+    return t
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
+def _centred(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The centroid (2,) of a polygon, and its corners (k, 2) around it, counter-clockwise."""
+    if corners.ndim != 2 or len(corners) < 3:
+        raise ValueError(f"outline must be at least three corners (k, 2), got {corners.shape}")
+    following = np.roll(corners, -1, axis=0)
+    k = len(corners)
+    for i in range(k):
+        for j in range(i + 2, k - (i == 0)):
+            sides = [
+                np.sign(_cross(following[a] - corners[a], p - corners[a]))
+                for a, b in ((i, j), (j, i))
+                for p in (corners[b], following[b])
+            ]
+            if sides[0] * sides[1] <= 0 and sides[2] * sides[3] <= 0:
+                raise ValueError(
+                    f"outline crosses itself: its edges from corner {i} and from corner {j} meet; "
+                    "give the corners in order around it, each once"
+                )
+    doubled = _cross(corners, following)
+    if abs(doubled.sum()) < 1e-9:
+        raise ValueError("outline has no area; give its corners in order around it")
+    centroid = ((corners + following) * doubled[:, None]).sum(axis=0) / (3 * doubled.sum())
+    return centroid, (corners - centroid)[:: 1 if doubled.sum() > 0 else -1]
+
+
+def _inradius_m(outline_m: np.ndarray) -> float:
+    """Distance [m] of the nearest edge from the centroid."""
+    edges = np.roll(outline_m, -1, axis=0) - outline_m
+    return float(np.abs(_cross(edges, outline_m) / np.linalg.norm(edges, axis=1)).min())
+
+
+def _contact(where: str, outline_m: np.ndarray, tool: np.ndarray, unit: str) -> dict[str, Any]:
+    """Where and how a tool's path (m, 2) meets the outline; nearest to it if it has a width."""
+    edges = np.roll(outline_m, -1, axis=0) - outline_m
+    inward = np.stack([-edges[:, 1], edges[:, 0]], axis=1) / np.linalg.norm(edges, axis=1)[:, None]
+    # Signed distance of points to edges; a step enters where it crosses one from outside.
+    off = tool[:, None] - outline_m
+    depth = (off * inward).sum(axis=-1)
+    share = depth[:-1] / np.where(depth[:-1] == depth[1:], np.inf, depth[:-1] - depth[1:])
+    at = tool[:-1, None] + share[..., None] * (tool[1:] - tool[:-1])[:, None]
+    along = ((at - outline_m) * edges).sum(axis=-1) / (edges**2).sum(axis=-1)
+    enters = (depth[:-1] <= 0) & (depth[1:] > 0) & (along >= 0) & (along <= 1)
+    if enters.any():
+        step, edge = np.argwhere(enters)[0]
+        contact = at[step, edge]
+    else:
+        on = np.clip((off * edges).sum(axis=-1) / (edges**2).sum(axis=-1), 0, 1)
+        gap = np.linalg.norm(off - on[..., None] * edges, axis=-1)
+        step, edge = np.unravel_index(gap.argmin(), gap.shape)
+        contact = outline_m[edge] + on[step, edge] * edges[edge]
+        if gap.min() > NEAR_M:
+            raise ValueError(
+                f"{where}: the tool comes no nearer than {gap.min():.3g} m to the object, expected "
+                f"is that it touches it; start and tool_xy must be in one frame, and in {unit}"
+            )
+    travelled = tool[-1] - contact
+    length = float(np.linalg.norm(travelled))
+    if not 1e-4 < length < LARGEST_M:
+        raise ValueError(
+            f"{where}: the tool travels {length:.3g} m after it touches the object, expected is "
+            f"0.1 mm to {LARGEST_M:g} m; lengths are taken in {unit}"
+        )
+    return {
+        "contact_m": contact,
+        "normal": inward[edge],
+        "direction": travelled / length,
+        "length_m": length,
+    }
