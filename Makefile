@@ -132,8 +132,8 @@ notebooks: $(STAMP) ## Execute the committed notebooks in place and clean them (
 html: $(STAMP) ## Write the committed notebooks as web pages into runs/html (equations need the network)
 	@$(PY) -m nbconvert --to html --embed-images --log-level=ERROR --output-dir runs/html \
 	  --NbConvertBase.display_data_priority="['text/html','image/png','text/markdown','text/plain']" \
-	  notebooks/*.ipynb
-	@sed -i -E 's/(href="[0-9a-z_]+)\.ipynb/\1.html/g' runs/html/*.html
+	  notebooks/*.ipynb notebooks/appendix/*.ipynb
+	@sed -i -E 's#href="(\.\./|appendix/)?([0-9A-Za-z_]+)\.ipynb#href="\2.html#g' runs/html/*.html
 
 tables: $(STAMP) ## Draw the tables of README, RESULTS and data card from data/results
 	@$(PY) -m affordlib.results README.md RESULTS.md data/README.md

@@ -79,8 +79,10 @@ class Job:
 
 
 def notebook_paths(root: Path) -> dict[str, Path]:
-    """Return the notebooks of the book in a checkout, in order, by name."""
-    return {path.stem: path for path in sorted(root.glob("notebooks/[0-9][0-9]_*.ipynb"))}
+    """Return the notebooks of the book in a checkout, by name, in order, the appendix last."""
+    pages = sorted(root.glob("notebooks/[0-9][0-9]_*.ipynb"))
+    appendix = sorted(root.glob("notebooks/appendix/A[0-9]_*.ipynb"))
+    return {path.stem: path for path in pages + appendix}
 
 
 def read_notebook(path: Path) -> nbformat.NotebookNode:
@@ -126,7 +128,8 @@ def choose(kind: str, given: str, known: Sequence[str]) -> str:
 
     A notebook may be meant by its number alone.
     """
-    matches = [name for name in known if name == given or (given.isdigit() and name[:2] == given)]
+    number = re.fullmatch(r"A?\d+", given)
+    matches = [n for n in known if n == given or (number and n.startswith(f"{given}_"))]
     if len(matches) == 1:
         return matches[0]
     near = difflib.get_close_matches(given, known, n=3, cutoff=0.5)

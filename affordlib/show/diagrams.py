@@ -1,0 +1,29 @@
+"""Drawings of what flows where: boxes and arrows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from matplotlib.axes import Axes
+
+from affordlib.show.plots import NEUTRAL
+
+
+def plot_flow(
+    ax: Axes,
+    boxes: Mapping[str, tuple[float, float, str]],
+    arrows: Sequence[tuple[str, str]],
+    bend: float = 0.0,
+) -> Axes:
+    """Texts in boxes at (x, y), coloured by their third entry, and arrows between them by name."""
+    drawn = {}
+    for text, (x, y, color) in boxes.items():
+        style = {"boxstyle": "round,pad=0.4", "fc": "white", "ec": color, "lw": 1.5}
+        drawn[text] = ax.text(x, y, text, ha="center", va="center", bbox=style)
+    for tail, tip in arrows:
+        arrow = {"arrowstyle": "-|>", "color": NEUTRAL, "connectionstyle": f"arc3,rad={bend}"}
+        ends = {name: drawn[text].get_bbox_patch() for name, text in (("A", tail), ("B", tip))}
+        arrow |= {f"patch{k}": patch for k, patch in ends.items()}
+        ax.annotate("", boxes[tip][:2], boxes[tail][:2], arrowprops=arrow)
+    ax.axis("off")
+    return ax
