@@ -1,9 +1,9 @@
 """A* over (partial) actions (Section 3.4): 36 directions x 20, 40, 60, 80, 100 % of the phase.
 
-An edge costs the distance that the object travels; the heuristic is the Euclidean distance to the
-goal's disc, max(0, d - tolerance), which never overestimates. The search ends at the first node
-within the tolerance (2 cm in the paper). A push turns the object as well, so its effects are looked
-up relative to the yaw that the model predicts; they are kept by degrees and used again.
+An edge costs the distance that the object travels. The heuristic is the Euclidean distance to the
+goal, as in the paper, or to the goal's disc, which never overestimates. The search ends at the
+first node within the tolerance (2 cm in the paper). A push turns the object as well, so its effects
+are looked up relative to the yaw that the model predicts; they are kept by degrees and used again.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from affordlib.planning.rollout import make_steps
 from affordlib.types import Plan, check_count, check_within
 
 N_DIRECTIONS = 36
+HEURISTICS = ("goal", "disc")
 STOP_PHASES = (0.2, 0.4, 0.6, 0.8, 1.0)
 PRUNE_BELOW_M = 0.001
 YAW_STEP_RAD = math.radians(1)
@@ -89,21 +90,27 @@ def search(
     problem: PlanningProblem,
     table: BranchTable,
     trace: list[tuple[np.ndarray, np.ndarray]] | None = None,
+    heuristic: str = "goal",
 ) -> tuple[list[tuple[float, float]], bool, int]:
-    """The cheapest chain of (direction, phase) into the goal's disc, or the one that ends nearest.
+    """The best chain of (direction, phase) into the goal's disc, or the one that ends nearest.
 
-    Also whether it gets there, and how many nodes were expanded. Ties go to fewer actions. A node
-    from which the object cannot be turned and lifted as the goal asks is none of the goal's. trace,
-    if given, receives each expanded position (2,) with those of its children (n, 2).
+    Also whether it gets there, and how many nodes were expanded. The best is the shortest way to
+    the goal (heuristic "goal": what the chain leaves counts) or to its disc ("disc": it does not).
+    Ties go to fewer actions. A node from which the object cannot be turned and lifted as the goal
+    asks is none of the goal's. trace, if given, receives each expanded position (2,) with those of
+    its children (n, 2).
     """
+    if heuristic not in HEURISTICS:
+        raise ValueError(f"heuristic must be one of {HEURISTICS}, got {heuristic!r}")
     goal, pose_planner, effects = problem.goal, problem.pose_planner, table.effects
     max_steps, tolerance = problem.mode.max_steps, goal.tolerance_m
+    radius = tolerance if heuristic == "disc" else 0.0
     nearest, nearest_m = (), goal.distance_m(problem.start_xy_m)
     # The running number tells nodes of the same f and depth apart, so nothing after it is compared;
     # f is rounded, lest the last digits of a sum choose between two orders of the same actions.
     number = itertools.count()
     root = *problem.start_xy_m, 0.0, 0.0, nearest_m, ()
-    frontier = [(max(0.0, nearest_m - tolerance), 0, next(number), root)]
+    frontier = [(max(0.0, nearest_m - radius), 0, next(number), root)]
     expanded: set[tuple[int, ...]] = set()
     reached = False
     while frontier and len(expanded) < MAX_EXPANSIONS:
@@ -139,7 +146,7 @@ def search(
             ends[away[rows].argmin()] = True
             rows = rows[ends]
         way = way_m + np.hypot(*branches.effect_m[:, rows])
-        f = np.round(way + np.maximum(0.0, away[rows] - tolerance), 12)
+        f = np.round(way + np.maximum(0.0, away[rows] - radius), 12)
         turns = turned + branches.turn_rad[rows]
         actions = branches.direction[rows], branches.stop_phase[rows]
         for row in np.column_stack([f, places[rows], turns, way, away[rows], *actions]).tolist():
@@ -152,12 +159,13 @@ def plan_astar(
     problem: PlanningProblem,
     n_directions: int = N_DIRECTIONS,
     stop_phases: Sequence[float] = STOP_PHASES,
+    heuristic: str = "goal",
 ) -> Plan:
-    """Plan by A*."""
+    """Plan by A*; heuristic: the distance to the "goal", as in the paper, or to its "disc"."""
     began = time.perf_counter()
     stops = tuple(stop_phases) if problem.mode.partial else (1.0,)
     table = BranchTable(problem.effects, n_directions, stops)
-    chain, reached, expansions = search(problem, table)
+    chain, reached, expansions = search(problem, table, heuristic=heuristic)
     chain = torch.tensor(chain, dtype=torch.float64).reshape(-1, 2)
     steps = make_steps(problem.effects, problem.start_xy_m, chain)
     return problem.plan(steps, "astar", reached, expansions, began)

@@ -25,7 +25,7 @@ from affordlib.planning import (
     plan_continuous,
     plan_gradient,
 )
-from affordlib.planning.astar import Branches, BranchTable, search
+from affordlib.planning.astar import HEURISTICS, Branches, BranchTable, search
 from affordlib.planning.problem import is_on_table
 from affordlib.planning.rollout import roll_out
 from affordlib.planning.routes import RouteMap, find_route, place_at
@@ -103,23 +103,28 @@ class RandomTable(BranchTable):
         return xy, length
 
 
+@pytest.mark.parametrize("heuristic", HEURISTICS)
 @pytest.mark.parametrize("seed", range(40))
-def test_astar_finds_what_exhaustive_search_finds(seed):
+def test_astar_finds_what_exhaustive_search_finds(seed, heuristic):
     table, rng = RandomTable(seed), np.random.default_rng(1000 + seed)
     problem = known(tuple(rng.uniform(-0.2, 0.2, 2)))
     goal, best, nearest = problem.goal, math.inf, math.inf
+
+    def way_to(end, length):  # to the goal itself, or only into its disc
+        return length + (goal.distance_m(end) if heuristic == "goal" else 0.0)
+
     for depth in (0, 1, 2, 3):
         for chain in itertools.product(range(6), repeat=depth):
             end, length = table.follow(chain)
             nearest = min(nearest, goal.distance_m(end))
             if goal.distance_m(end) <= goal.tolerance_m:
-                best = min(best, length)
-    chain, reached, _ = search(problem, table)
+                best = min(best, way_to(end, length))
+    chain, reached, _ = search(problem, table, heuristic=heuristic)
     end, length = table.follow([int(k) for k, _ in chain])
     assert reached == math.isfinite(best)
     if reached:
         assert goal.distance_m(end) <= goal.tolerance_m
-        assert length == pytest.approx(best, abs=1e-9)
+        assert way_to(end, length) == pytest.approx(best, abs=1e-9)
     else:
         assert goal.distance_m(end) == pytest.approx(nearest, abs=1e-9)
 
@@ -133,9 +138,9 @@ def test_branches_are_the_papers_180():
     direction = branches.direction[full]
     expected = REACH_M * np.stack([np.cos(direction), np.sin(direction)])
     np.testing.assert_allclose(branches.effect_m[:, full], expected, atol=1e-4)
-    for settings, says in (({"n_directions": 0}, "n_directions"), ({"stop_phases": ()}, "phase")):
-        with pytest.raises(ValueError, match=says):
-            plan_astar(known((0.1, 0.0)), **settings)
+    for wrong in ({"n_directions": 0}, {"stop_phases": ()}, {"heuristic": "far"}):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            plan_astar(known((0.1, 0.0)), **wrong)
 
 
 def test_astar_plans():
