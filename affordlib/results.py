@@ -14,6 +14,7 @@ Any other option, such as `mode=multi_partial`, keeps the rows that have that va
 from __future__ import annotations
 
 import argparse
+import glob
 import importlib.metadata
 import json
 import math
@@ -27,6 +28,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import psutil
 
 import affordlib
 from affordlib.commands import command
@@ -128,6 +130,10 @@ def write_atomically(path: Path, content: bytes, mark: bytes = b"") -> None:
             f"{path} is there and is not a file that this call may replace; delete it, or "
             "choose another path"
         )
+    for left in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):  # by a killed process
+        pid = left.name.split(".")[-2]
+        if pid.isdigit() and not psutil.pid_exists(int(pid)):
+            left.unlink(missing_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         with temporary.open("wb") as file:

@@ -19,60 +19,29 @@ ALL = {
 
 
 def main_of(name):
-    return importlib.import_module(name if name in ALL else f"affordlib.{name}").main
+    return importlib.import_module(name).main
 
 
 @pytest.mark.parametrize(
-    ("name", "arguments", "named"),
+    ("line", "named"),
     [
-        (
-            "experiments.effect_prediction",
-            ["--models", "film,flim"],
-            "--models: 'flim' is unknown; choose",
-        ),
-        ("experiments.effect_prediction", ["--sets", "nope"], "--sets: 'nope' is unknown"),
-        (
-            "experiments.effect_prediction",
-            ["--folds", "-1"],
-            "--folds: must be a whole number from 1 to 10, got",
-        ),
-        (
-            "experiments.effect_prediction",
-            ["--folds", "11"],
-            "--folds: must be a whole number from 1 to 10, got",
-        ),
-        (
-            "experiments.effect_prediction",
-            ["--seeds", "0"],
-            "--seeds: must be a whole number from 1",
-        ),
-        (
-            "experiments.effect_prediction",
-            ["--workers", "-2"],
-            "--workers: must be a whole number from 1",
-        ),
-        ("experiments.effect_prediction", ["--n", "many"], "--n: must be a whole number from 1"),
-        ("experiments.closed_loop", ["--tables", "nope"], "--tables: 'nope' is unknown"),
-        ("experiments.closed_loop", ["--seed", "-1"], "--seed: must be a whole number from 0"),
-        ("experiments.closed_loop", ["--n", "0"], "--n: must be a whole number from 1"),
-        ("experiments.lever_up", ["--models", ""], "--models: '' is unknown"),
-        ("experiments.lever_up", ["--protocols", "nope"], "--protocols: 'nope' is unknown"),
-        ("experiments.lever_up", ["--no-edges", "2"], "--no-edges: must be .* from 3 to 8"),
-        ("experiments.lever_up", ["--epochs", "-5"], "--epochs: must be a whole number from 1"),
-        ("experiments.shipped", ["data", "--only"], "--only: expected at least one argument"),
-        ("experiments.shipped", ["data", "--only", "nope"], "--only: invalid choice: 'nope'"),
-        (
-            "experiments.shipped",
-            ["data", "--workers", "1" * 5000],
-            "--workers: must be .*'1{5,40}$",
-        ),
-        ("experiments.shipped", ["reachability", "nope"], "unrecognized arguments: nope"),
-        ("experiments.seeds", ["-1"], "seeds: must be a whole number from 0"),
-        ("experiments.seeds", ["0", "--workers", "0"], "--workers: must be a whole number from 1"),
-        ("workbook", ["--seed", "-1"], "--seed: must be a whole number from 0"),
+        ("experiments.effect_prediction --models film,flim", "--models: 'flim' is unknown; choose"),
+        ("experiments.effect_prediction --folds 11", "--folds: must be .* from 1 to 10, got"),
+        ("experiments.effect_prediction --workers -2", "--workers: must be .* from 1"),
+        ("experiments.effect_prediction --n many", "--n: must be a whole number from 1"),
+        ("experiments.closed_loop --tables nope", "--tables: 'nope' is unknown"),
+        ("experiments.closed_loop --seed -1", "--seed: must be a whole number from 0"),
+        ("experiments.lever_up --no-edges 2", "--no-edges: must be .* from 3 to 8"),
+        ("experiments.shipped data --only", "--only: expected at least one argument"),
+        ("experiments.shipped data --only nope", "--only: invalid choice: 'nope'"),
+        (f"experiments.shipped data --workers {'1' * 5000}", "--workers: must be .*'1{5,40}$"),
+        ("experiments.shipped reachability nope", "unrecognized arguments: nope"),
+        ("experiments.seeds -1", "seeds: must be a whole number from 0"),
+        ("affordlib.workbook --seed -1", "--seed: must be a whole number from 0"),
     ],
 )
-def test_unknown_names_and_impossible_numbers_are_refused(capsys, name, arguments, named):
+def test_unknown_names_and_impossible_numbers_are_refused(capsys, line, named):
+    name, *arguments = line.split()
     with pytest.raises(SystemExit) as ended:
         main_of(name)(arguments)
     assert ended.value.code == 2
@@ -80,18 +49,19 @@ def test_unknown_names_and_impossible_numbers_are_refused(capsys, name, argument
 
 
 @pytest.mark.parametrize(
-    ("name", "arguments"),
+    "line",
     [
-        ("experiments.effect_prediction", ["--models", "constant", "--raw", "{}"]),
-        ("experiments.lever_up", ["--raw", "{}"]),
-        ("experiments.studies", ["--only", "latent", "--raw", "{}"]),
-        ("experiments.shipped", ["data", "--only", "grasp", "--workers", "1", "--to", "{}"]),
+        "experiments.effect_prediction --models constant --raw {}",
+        "experiments.lever_up --raw {}",
+        "experiments.studies --only latent --raw {}",
+        "experiments.shipped data --only grasp --workers 1 --to {}",
     ],
 )
-def test_a_file_in_place_of_a_folder_is_named(tmp_path, capsys, name, arguments):
+def test_a_file_in_place_of_a_folder_is_named(tmp_path, capsys, line):
     file = tmp_path / "file"
     file.touch()
-    assert main_of(name)([each.format(file) for each in arguments]) == 1
+    name, *arguments = line.format(file).split()
+    assert main_of(name)(arguments) == 1
     last = capsys.readouterr().err.splitlines()[-1]
     assert last.startswith(f"{name.rpartition('.')[2]}: ")
     assert str(file) in last
@@ -99,9 +69,7 @@ def test_a_file_in_place_of_a_folder_is_named(tmp_path, capsys, name, arguments)
 
 
 def test_every_command_line_ends_in_this_way():
-    for module in ALL:
-        main = importlib.import_module(module).main
-        assert hasattr(main, "__wrapped__"), f"{module}: its main is no `command`"
+    assert all(hasattr(main_of(module), "__wrapped__") for module in ALL)  # is a `command`
 
 
 @pytest.mark.parametrize(
@@ -129,9 +97,5 @@ def test_a_command_ends_with_a_status_and_one_line(capsys, how, code):
 
 
 def test_other_errors_of_a_command_keep_their_traceback():
-    @command(OSError)
-    def main():
-        raise ZeroDivisionError
-
     with pytest.raises(ZeroDivisionError):
-        main()
+        command(OSError)(lambda: 1 / 0)()

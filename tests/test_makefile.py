@@ -27,86 +27,65 @@ elif sys.argv[1:3] == ["-m", "venv"]:
 elif (here / "no_network").exists():
     sys.exit("no network")
 """
+INSTALLED = ["-m pip", "-m pip"]
+pytestmark = pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
 
 
 @pytest.fixture
 def project(tmp_path):
-    """A folder with the Makefile, in which `setup(...)` starts make and `log()` tells what ran."""
+    """A folder with the Makefile: `setup()` runs make and gives status, words and what ran."""
     here = tmp_path / "a project"  # with a blank in its name
     here.mkdir()
     shutil.copy(repo_root() / "Makefile", here)
     for name in ("requirements.txt", "constraints.txt", "pyproject.toml"):
         (here / name).touch()
 
-    def setup(version="3.11", python=tmp_path / "python"):
-        if python == tmp_path / "python":
-            code = PRETENDED.format(python=sys.executable, here=str(here), version=version)
-            python.write_text(code)
-            python.chmod(0o755)
-        return subprocess.Popen(
-            ["make", "setup", f"PYTHON={python}"],
-            cwd=here,
-            env={name: value for name, value in os.environ.items() if "MAKE" not in name},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
+    def setup(version="3.11", python=None, copies=1):
+        own = tmp_path / "python"
+        own.write_text(PRETENDED.format(python=sys.executable, here=str(here), version=version))
+        own.chmod(0o755)
+        environment = {name: value for name, value in os.environ.items() if "MAKE" not in name}
+        started = [
+            subprocess.Popen(
+                ["make", "setup", f"PYTHON={python or own}"],
+                cwd=here,
+                env=environment,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
+            )
+            for _ in range(copies)
+        ]
+        said = [process.communicate(timeout=60)[0] for process in started]
+        log = here / "log"
+        ran = log.read_text().splitlines() if log.exists() else []
+        log.unlink(missing_ok=True)
+        ran = [line for line in ran if not line.startswith("-c")]
+        return any(process.returncode for process in started), "".join(said), ran
 
-    def log():
-        ran = (here / "log").read_text().splitlines() if (here / "log").exists() else []
-        (here / "log").unlink(missing_ok=True)
-        return [line for line in ran if not line.startswith("-c")]
-
-    return SimpleNamespace(here=here, setup=setup, log=log)
-
-
-def ended(process):
-    said, _ = process.communicate(timeout=60)
-    return process.returncode, said
-
-
-INSTALLED = ["-m pip", "-m pip"]
-pytestmark = pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
+    return SimpleNamespace(here=here, setup=setup)
 
 
-def test_it_installs_once_and_then_has_nothing_to_do(project):
-    code, said = ended(project.setup())
-    assert code == 0, said
-    assert "Making .venv" in said
-    assert project.log() == ["-m venv", *INSTALLED]
-    code, said = ended(project.setup())
-    assert (code, project.log()) == (0, [])
+def test_it_installs_once_even_when_two_begin_and_then_has_nothing_to_do(project):
+    failed, said, ran = project.setup(copies=2)
+    assert (failed, ran) == (False, ["-m venv", *INSTALLED]), said
+    failed, said, ran = project.setup()
+    assert (failed, ran) == (False, [])
     assert "The environment is ready" in said
-
-
-def test_two_at_once_make_it_once(project):
-    both = [project.setup(), project.setup()]
-    for code, said in map(ended, both):
-        assert code == 0, said
-    assert project.log() == ["-m venv", *INSTALLED]
+    later = (project.here / ".venv" / ".installed").stat().st_mtime + 5
+    os.utime(project.here / "requirements.txt", (later, later))
+    failed, said, ran = project.setup()
+    assert (failed, ran) == (False, INSTALLED), said  # into what is there
 
 
 def test_an_installation_that_failed_is_made_anew(project):
     (project.here / "no_network").touch()
-    code, said = ended(project.setup())
-    assert code != 0
+    failed, said, _ = project.setup()
+    assert failed
     assert "no network" in said
-    project.log()
     (project.here / "no_network").unlink()
     shutil.rmtree(project.here / ".venv")  # as `venv --clear` does
-    assert ended(project.setup())[0] == 0
-    assert project.log() == ["-m venv", *INSTALLED]
-
-
-def test_new_requirements_are_installed_into_what_is_there(project):
-    ended(project.setup())
-    project.log()
-    later = (project.here / ".venv" / ".installed").stat().st_mtime + 5
-    os.utime(project.here / "requirements.txt", (later, later))
-    code, said = ended(project.setup())
-    assert code == 0, said
-    assert "Bringing .venv up to date" in said
-    assert project.log() == INSTALLED
+    assert project.setup()[::2] == (False, ["-m venv", *INSTALLED])
 
 
 def test_what_a_link_leads_to_is_not_emptied(project):
@@ -114,21 +93,18 @@ def test_what_a_link_leads_to_is_not_emptied(project):
     other.mkdir()
     (other / "kept").touch()
     (project.here / ".venv").symlink_to(other)
-    code, said = ended(project.setup())
-    assert code != 0
+    failed, said, ran = project.setup()
+    assert (failed, ran) == (True, [])
     assert "'.venv' is a link to" in said
-    assert project.log() == []
     assert (other / "kept").exists()
 
 
-def test_what_is_no_python_is_refused(project):
-    code, said = ended(project.setup(python="/bin/false"))
-    assert code != 0
-    assert "needs Python 3.11, and '/bin/false' is no Python that runs here" in said
-
-
-def test_another_python_is_refused_by_name(project):
-    code, said = ended(project.setup(version="3.9"))
-    assert code != 0
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [({"python": "/bin/false"}, "'/bin/false' is no Python"), ({"version": "3.9"}, "Python 3.11")],
+)
+def test_what_is_no_python_or_another_is_refused(project, options, why):
+    failed, said, ran = project.setup(**options)
+    assert (failed, ran) == (True, [])
     assert "This workbook needs Python 3.11" in said
-    assert project.log() == []
+    assert why in said

@@ -6,7 +6,6 @@ import json
 import math
 import os
 import re
-import signal
 import subprocess
 import sys
 import time
@@ -25,51 +24,37 @@ ROWS = [
 
 
 def test_round_trip_converts_numpy_scalars(tmp_path):
-    row = {
-        "n": np.int64(3),
-        "mean_m": np.float32(0.5),
-        "ok": np.bool_(True),
-        "name": "a|b",
-        "x": None,
-    }
+    row = {"n": np.int64(3), "mean_m": np.float32(0.5), "ok": np.bool_(True), "x": None}
     path = write_results(tmp_path, "06_planning", {"modes": ("full", "partial")}, {"t": [row]})
     document = read_results(path)
     assert path == tmp_path / "06_planning.json"
     assert document["notebook"] == "06_planning"
     assert document["parameters"] == {"modes": ["full", "partial"]}
-    assert document["tables"] == {
-        "t": [{"n": 3, "mean_m": 0.5, "ok": True, "name": "a|b", "x": None}]
-    }
+    assert document["tables"] == {"t": [{"n": 3, "mean_m": 0.5, "ok": True, "x": None}]}
     assert document["tables"]["t"][0]["ok"] is True
+    assert {"python", "torch", "pybullet", "platform"} < document["versions"].keys()
     assert read_results(write_results(tmp_path, "a", {}, {"t": []}))["tables"] == {"t": []}
-    assert set(document["versions"]) == {
-        "python", "affordlib", "torch", "pybullet", "numpy", "platform",
-    }  # fmt: skip
 
 
 @pytest.mark.parametrize(
-    ("tables", "error", "named"),
+    ("table", "named"),
     [
-        (
-            {"t": [{"mean_m": math.nan}]},
-            ValueError,
-            r"tables\['t'\]\[0\]\['mean_m'\] is nan; .*None",
-        ),
-        ({"t": [{"a": 1.0}, {"a": np.float64("-inf")}]}, ValueError, r"\[1\]\['a'\] is -inf"),
-        ({"t": [{"path": [1, 2]}]}, TypeError, r"\['path'\] must be a number.*list \[1, 2\]"),
-        ({"t": [{"a": np.zeros(2)}]}, TypeError, r"\['a'\] must be a number.*ndarray"),
-        ({"t": [{3: 1}]}, TypeError, r"tables\['t'\]\[0\] has the key 3"),
-        ({"t": {"a": 1}}, TypeError, r"tables\['t'\] must be a list of rows, got dict"),
-        ({"t": [[1]]}, TypeError, r"tables\['t'\]\[0\] must map columns"),
+        ([{"mean_m": math.nan}], r"tables\['t'\]\[0\]\['mean_m'\] is nan"),
+        ([{"a": 1.0}, {"a": np.float64("-inf")}], r"\[1\]\['a'\] is -inf"),
+        ([{"path": [1, 2]}], r"\['path'\] .*list \[1, 2\]"),
+        ([{"a": np.zeros(2)}], r"\['a'\] .*ndarray"),
+        ([{3: 1}], r"tables\['t'\]\[0\] has the key 3"),
+        ({"a": 1}, r"tables\['t'\] .*dict"),
+        ([[1]], r"tables\['t'\]\[0\]"),
     ],
 )
-def test_bad_tables_are_refused_before_anything_is_written(tmp_path, tables, error, named):
-    with pytest.raises(error, match=named):
-        write_results(tmp_path, "06_planning", {}, tables)
+def test_bad_tables_are_refused_before_anything_is_written(tmp_path, table, named):
+    with pytest.raises((TypeError, ValueError), match=named):
+        write_results(tmp_path, "06_planning", {}, {"t": table})
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("name", ["", "a/b", "../a", ".a", "06_planning.json", "06_planning.ipynb"])
+@pytest.mark.parametrize("name", ["", "a/b", "../a", ".a", "06_planning.json"])
 def test_bad_notebook_names_are_refused(tmp_path, name):
     with pytest.raises(ValueError, match="notebook must be a plain name"):
         write_results(tmp_path, name, {}, {})
@@ -91,25 +76,31 @@ def test_a_full_disk_leaves_the_old_file(tmp_path, monkeypatch, step):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_kill_never_leaves_half_a_file(tmp_path):
+def test_a_kill_leaves_no_half_file_and_the_next_writer_no_leftovers(tmp_path):
     code = (
-        "import itertools, sys\n"
+        "import itertools, os, sys\n"
         "from affordlib.results import write_results\n"
-        "rows = [{'n': i, 'text': 'x' * 200} for i in range(2000)]\n"
+        "rows, slow = [{'n': i, 'text': 'x' * 200} for i in range(2000)], 'slow' in sys.argv\n"
+        "os.fsync = (lambda _: input()) if slow else os.fsync\n"
         "for i in itertools.count():\n"
         "    write_results(sys.argv[1], 'a', {'i': i}, {'t': rows})\n"
     )
-    process = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)])
-    try:
-        while not (tmp_path / "a.json").exists():
-            assert process.poll() is None
-            time.sleep(0.01)
-        time.sleep(0.3)
-    finally:
-        process.send_signal(signal.SIGKILL)
-        process.wait()
-    document = read_results(tmp_path / "a.json")
-    assert [row["n"] for row in document["tables"]["t"]] == list(range(2000))
+    path, left = tmp_path / "a.json", []
+    for how in ("fast", "slow"):  # killed somewhere, and before the file gets its name
+        command = [sys.executable, "-c", code, str(tmp_path), how]
+        with subprocess.Popen(command, stdin=subprocess.PIPE) as process:
+            while not list(tmp_path.glob("a.json" if how == "fast" else f".*.{process.pid}.tmp")):
+                assert process.poll() is None
+                time.sleep(0.01)
+            time.sleep(0.3)
+            process.kill()
+        left = [p.name for p in tmp_path.iterdir() if p != path]
+        assert [row["n"] for row in read_results(path)["tables"]["t"]] == list(range(2000))
+    assert left == [f".a.json.{process.pid}.tmp"]
+    living = tmp_path / f".a.json.{os.getppid()}.tmp"
+    living.touch()  # of a writer that is still at work
+    write_results(tmp_path, "a", {}, {})
+    assert sorted(tmp_path.iterdir()) == [living, path]
 
 
 @pytest.mark.parametrize(
@@ -123,16 +114,11 @@ def test_a_kill_never_leaves_half_a_file(tmp_path):
         ('{"notebook": 1, "parameters": 1, "versions": 1, "tables": {"t": [{"a": [1]}]}}', "list"),
     ],
 )
-def test_damaged_results_are_refused_with_a_remedy(tmp_path, text, reason):
+def test_damaged_or_missing_results_are_named(tmp_path, text, reason):
     (tmp_path / "a.json").write_text(text)
-    with pytest.raises(
-        ValueError, match=rf"a\.json holds no results .*{reason}.*delete it and run"
-    ):
+    with pytest.raises(ValueError, match=rf"a\.json .*{reason}.*delete it and run"):
         read_results(tmp_path / "a.json")
-
-
-def test_missing_results_are_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"no results at .*b\.json; run the notebook"):
+    with pytest.raises(FileNotFoundError, match=r"b\.json; run the notebook"):
         read_results(tmp_path / "b.json")
 
 
@@ -143,13 +129,10 @@ def test_relative_folders_start_at_the_repository(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path / "elsewhere")
     assert paths.resolve_out_dir("runs/lab") == root / "runs" / "lab"
     assert (root / "runs" / "lab").is_dir()
-    assert paths.resolve_out_dir(tmp_path / "x") == tmp_path / "x"
     (root / "file").write_text("")
     for bad in ("file", "file/under"):
         with pytest.raises(NotADirectoryError, match="out_dir must be a folder"):
             paths.resolve_out_dir(bad)
-    with pytest.raises(ValueError, match="out_dir must name a folder"):
-        paths.resolve_out_dir("")
 
 
 def test_what_is_named_by_an_absolute_path_needs_no_checkout(tmp_path, monkeypatch):
@@ -171,14 +154,15 @@ MARKDOWN = """\
 """
 
 
-def test_markdown_table_shows_units_and_few_digits():
+def test_tables_show_units_and_few_digits():
     assert markdown_table(ROWS) == MARKDOWN
-    assert (
-        markdown_table(ROWS[:1], ["n", "planner"])
-        == "| n | planner |\n| ---: | --- |\n| 30 | astar |\n"
-    )
+    short = "| n | planner |\n| ---: | --- |\n| 30 | astar |\n"
+    assert markdown_table(ROWS[:1], ["n", "planner"]) == short
     with pytest.raises(ValueError, match="'speed' is not in the table; it has planner, n"):
         markdown_table(ROWS, ["speed"])
+    table = results.results_table(ROWS, ["planner", "mean_m"])
+    assert list(table.columns) == ["planner", "mean, mm"]
+    assert table.to_numpy().tolist() == [["astar", "4.41"], ["gradient", "–"]]
 
 
 @pytest.mark.parametrize(
@@ -188,24 +172,14 @@ def test_markdown_table_shows_units_and_few_digits():
         ("theta_rad", math.pi / 2, "theta, °", "90.0"),
         ("error_mm", -0.001, "error, mm", "0.00"),
         ("loss", 0.123456, "loss", "0.123"),
-        ("loss", 999.7, "loss", "1000"),
-        ("loss", -999.4, "loss", "-999"),
+        ("loss", -999.7, "loss", "-1000"),
         ("note", "two\nlines", "note", "two lines"),
         ("closed_loop", False, "closed loop", "no"),
-        ("samples", np.int64(300), "samples", "300"),
-        ("mean_m", np.float32(0.5), "mean, mm", "500.00"),
         ("m", 3, "m", "3"),
     ],
 )
 def test_units_come_from_the_name(column, value, head, shown):
-    assert results.heading(column) == head
-    assert results.cell(column, value) == shown
-
-
-def test_results_table_holds_the_same_cells_as_the_markdown():
-    table = results.results_table(ROWS, ["planner", "mean_m"])
-    assert list(table.columns) == ["planner", "mean, mm"]
-    assert table.to_numpy().tolist() == [["astar", "4.41"], ["gradient", "–"]]
+    assert (results.heading(column), results.cell(column, value)) == (head, shown)
 
 
 def test_pages_are_filled_and_checked(tmp_path, capsys):
@@ -224,12 +198,10 @@ def test_pages_are_filled_and_checked(tmp_path, capsys):
 def test_blocks_choose_rows_and_columns(tmp_path):
     source = write_results(tmp_path, "06_planning", {}, {"planning": ROWS})
     block = "<!-- table: {}#planning {} -->\n<!-- /table -->\n"
-    filled = fill_tables(block.format(source, "planner=gradient columns=n,planner"))
-    assert "| 30 | gradient |\n<!-- /table -->" in filled
-    assert "astar" not in filled
+    one = fill_tables(block.format(source, "planner=gradient columns=n,planner"))
     both = fill_tables(block.format(source, "planner=gradient,astar columns=n,planner"))
-    assert "| 30 | gradient |" in both
-    assert "| 30 | astar |" in both
+    assert "| 30 | gradient |\n<!-- /table -->" in one
+    assert ["astar" in filled for filled in (one, both)] == [False, True]
     for option, reason in [("planner=rrt", "no row"), ("columns=x", "'x'"), ("mode=a", "'mode'")]:
         with pytest.raises(ValueError, match=reason):
             fill_tables(block.format(source, option))
@@ -237,18 +209,15 @@ def test_blocks_choose_rows_and_columns(tmp_path):
         fill_tables(f"<!-- table: {source}#planning -->\n")
 
 
-@pytest.mark.parametrize("page", ["README.md", "RESULTS.md", "data/README.md"])
-def test_the_tables_of_the_pages_are_those_of_their_files(page):
-    path = paths.repo_root() / page
-    assert results.BLOCK.search(path.read_text(encoding="utf-8")), f"{page} has no table"
-    assert results.main(["--check", str(path)]) == 0
-
-
-def test_shipped_results_are_valid_and_carry_no_path():
-    for path in sorted((paths.repo_root() / "data" / "results").glob("*.json")):
+def test_the_pages_and_the_shipped_results_agree_and_carry_no_path():
+    pages = [
+        str(paths.repo_root() / name) for name in ("README.md", "RESULTS.md", "data/README.md")
+    ]
+    assert results.main(["--check", *pages]) == 0
+    for path in (paths.repo_root() / "data" / "results").glob("*.json"):
         assert read_results(path)["notebook"] == path.stem
-        for value in json.loads(path.read_text())["parameters"].values():
-            assert not (isinstance(value, str) and os.path.isabs(value))
+        given = json.loads(path.read_text())["parameters"].values()
+        assert not [v for v in given if isinstance(v, str) and os.path.isabs(v)]
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ import psutil
 import pytest
 from filelock import FileLock
 
-from affordlib.results import read_results
+from affordlib.results import read_results, write_results
 from affordlib.workbook import WorkbookError, cleaned, default_parameters, fitting, literal, main
 
 PARAMETERS = "seed = 0\nout_dir = {lab!r}\nn = 2\nrate = 0.5\nmodes = ['full']"
@@ -89,42 +89,32 @@ def finished(tmp_path_factory):
     book.add("02_second")
     kernel = root / "jupyter" / "kernels" / "python3"
     kernel.mkdir(parents=True)
-    (kernel / "kernel.json").write_text(
-        json.dumps({"argv": ["/bin/false"], "display_name": "wrong", "language": "python"})
-    )
+    wrong = {"argv": ["/bin/false"], "display_name": "wrong", "language": "python"}
+    (kernel / "kernel.json").write_text(json.dumps(wrong))
     environment = os.environ | {"JUPYTER_PATH": str(root / "jupyter"), "MPLBACKEND": "Agg"}
     command = book.command("--seed", "3", "02_second.n=7")
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=root)
-    return book, done
+    return book, subprocess.run(
+        command, env=environment, capture_output=True, text=True, cwd=root, check=False
+    )
 
 
-def test_a_run_prints_one_line_a_notebook_and_leaves_copies_and_results(finished):
+def test_a_run_leaves_copies_and_results_with_their_parameters(finished):
     book, done = finished
     assert (done.returncode, done.stderr) == (0, "")
-    one, two = done.stdout.splitlines()
-    assert re.fullmatch(r"\[1/2\] 01_first: \d+\.\d s", one)
-    assert re.fullmatch(r"\[2/2\] 02_second: \d+\.\d s", two)
+    said = r"\[1/2\] 01_first: \d+\.\d s\n\[2/2\] 02_second: \d+\.\d s\n"
+    assert re.fullmatch(said, done.stdout)
     run = book.runs / RUN
-    names = {
-        f"{name}.{ending}" for name in ("01_first", "02_second") for ending in ("ipynb", "json")
-    }
-    assert {path.name for path in run.iterdir()} == {*names, ".lock", "log.txt"}
+    files = {f"{name}.{end}" for name in ("01_first", "02_second") for end in ("ipynb", "json")}
+    assert {path.name for path in run.iterdir()} == {*files, ".lock", "log.txt"}
     copy = nbformat.read(run / "02_second.ipynb", as_version=4)
     assert "3.5\n" in [output.get("text") for output in copy.cells[-1].outputs]  # 7 * 0.5
     assert not os.path.isabs(copy.metadata.papermill.output_path)
-
-
-def test_parameters_reach_the_notebook_and_the_kernel_is_this_interpreter_in_its_folder(finished):
-    book, _ = finished
-    first, second = (
-        read_results(book.runs / RUN / f"{name}.json")["parameters"]
-        for name in ("01_first", "02_second")
-    )
-    assert (first["n"], first["rate"], first["seed"]) == (2, 0.5, 3)
-    assert (second["n"], second["rate"], second["seed"]) == (7, 0.5, 3)
-    assert first["python"] == sys.executable
-    assert os.path.samefile(first["cwd"], book.root / "notebooks")
-    assert first["backend"].endswith("inline")
+    told = [read_results(run / f"{n}.json")["parameters"] for n in ("01_first", "02_second")]
+    assert [(t["n"], t["rate"], t["seed"]) for t in told] == [(2, 0.5, 3), (7, 0.5, 3)]
+    # The kernel is this interpreter, in the notebooks' folder, whatever is registered.
+    assert told[0]["python"] == sys.executable
+    assert os.path.samefile(told[0]["cwd"], book.root / "notebooks")
+    assert told[0]["backend"].endswith("inline")
 
 
 @pytest.fixture
@@ -135,10 +125,6 @@ def changeable(finished, tmp_path):
     yield book
     shutil.rmtree(book.root)
     shutil.copytree(tmp_path / "backup", book.root)
-
-
-def edit(path):
-    path.write_text(path.read_text() + " ")
 
 
 def copy_of_results(book, name):
@@ -157,7 +143,7 @@ DEEP = "[" * 100_000
         (lambda book, run: None, False, False),
         (lambda book, run: book.add("02_second", text="Other words."), False, True),
         (lambda book, run: book.add("01_first", "extra = 1"), True, True),
-        (lambda book, run: edit(book.root / "affordlib" / "model.py"), True, True),
+        (lambda book, run: (book.root / "affordlib" / "model.py").write_text("a = 2"), True, True),
         (lambda book, run: (book.data / "push.bin").write_bytes(b"\1\3"), True, True),
         (lambda book, run: copy_of_results(book, "01_first.json"), False, False),
         (lambda book, run: copy_of_results(book, "planning.json"), True, True),
@@ -190,59 +176,45 @@ def test_only_runs_what_is_asked_and_force_runs_it_again(changeable, capsys):
 @pytest.mark.parametrize(
     ("code", "error"),
     [
-        ("# divide\nn / 0", "ZeroDivisionError: division by zero"),
-        (
-            "# divide\nimport ctypes\nctypes.string_at(0)",
-            "DeadKernelError: Kernel died",
-        ),
+        ("# divide\nn / 0", "in cell 4, which begins `# divide`.*ZeroDivisionError: division by"),
+        ("import ctypes\nctypes.string_at(0)", "in cell 4.*DeadKernelError: Kernel died"),
+        ("out_dir += '/other'", "run the notebook that writes them"),
     ],
 )
 def test_a_failing_notebook_stops_the_batch_and_a_rerun_goes_on(book, capsys, code, error):
     book.add("01_first")
     book.add("02_second", "fine = 1", code)
     book.add("03_third")
+    write_results(book.runs / "reader", "02_second", {}, {})  # an earlier run's must not count
     assert book.run() == 1
     out, err = capsys.readouterr()
-    assert "02_second failed in cell 4, which begins `# divide`" in err
-    assert error in err
-    assert "runs/reader/02_second.ipynb" in err
+    assert re.search(rf"(?s)02_second failed.*{error}", err)
     assert out.splitlines()[-1] == "[2/3] 02_second: failed"
     copy = nbformat.read(book.runs / "reader" / "02_second.ipynb", as_version=4)
     assert code in [cell.source for cell in copy.cells]
-    assert book.log() == ["01_first"]
-
+    before = book.log()
+    assert before[0] == "01_first"
     book.add("02_second", "fine = 1")
     assert book.run() == 0
-    assert book.log() == ["01_first", "02_second", "03_third"]
+    assert book.log() == [*before, "02_second", "03_third"]
     assert "[1/3] 01_first: skipped: complete" in capsys.readouterr().out
 
 
-@pytest.mark.slow
-def test_a_notebook_that_does_not_write_its_numbers_has_failed(book, capsys):
-    book.add("01_first")
-    assert book.run() == 0
-    # The results of the earlier run must not pass for those of this one.
-    book.path("01_first").write_text(
-        book.path("01_first").read_text().replace("01_first.json", "x")
-    )
-    book.add("01_first", f"raise_not = {str(book.runs)!r}\nout_dir = raise_not + '/other'")
-    assert book.run() == 1
-    err = capsys.readouterr().err
-    assert "01_first failed" in err
-    assert "run the notebook that writes them" in err
-    assert book.run("--dry-run") == 0
-    assert "01_first: would run" in capsys.readouterr().out
+def wait_for(what):
+    deadline = time.monotonic() + 60
+    while not what():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
 def test_a_killed_run_counts_as_nothing_and_is_taken_up_again(book, capsys, how):
-    root = book.root
+    pid, go = book.root / "pid", book.root / "go"
     wait = (
         "import os, pathlib, time\n"
-        f"root = pathlib.Path({str(root)!r})\n"
-        "(root / 'pid').write_text(str(os.getpid()))\n"
-        "while not (root / 'go').exists():\n"
+        f"pathlib.Path({str(pid)!r}).write_text(str(os.getpid()))\n"
+        f"while not pathlib.Path({str(go)!r}).exists():\n"
         "    time.sleep(0.05)"
     )
     book.add("01_first")
@@ -251,11 +223,7 @@ def test_a_killed_run_counts_as_nothing_and_is_taken_up_again(book, capsys, how)
     heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
     process = subprocess.Popen(book.command(), stderr=subprocess.PIPE, text=True, preexec_fn=heed)
     try:
-        deadline = time.monotonic() + 60
-        while not (root / "pid").exists() or not (root / "pid").read_text():
-            assert process.poll() is None
-            assert time.monotonic() < deadline
-            time.sleep(0.05)
+        wait_for(lambda: pid.exists() and pid.read_text() and process.poll() is None)
     finally:
         process.send_signal(how)
         _, err = process.communicate(timeout=60)
@@ -263,41 +231,25 @@ def test_a_killed_run_counts_as_nothing_and_is_taken_up_again(book, capsys, how)
         assert process.returncode == -how
     else:
         assert process.returncode == 128 + how
-        assert err.strip() == (
-            "workbook: interrupted; what is finished is kept, the same command goes on"
-        )
-    kernel = int((root / "pid").read_text())
-    deadline = time.monotonic() + 20
-    while psutil.pid_exists(kernel):
-        assert time.monotonic() < deadline, "the kernel outlived its runner"
-        time.sleep(0.05)
-
-    (root / "go").touch()
+        assert re.fullmatch("workbook: interrupted; .*the same command goes on", err.strip())
+    wait_for(lambda: not psutil.pid_exists(int(pid.read_text())))  # no kernel outlives its runner
+    go.touch()
     assert book.run() == 0
     assert book.log() == ["01_first", "02_second"]
     assert "[1/2] 01_first: skipped: complete" in capsys.readouterr().out
 
 
-def test_a_file_where_a_folder_is_needed_is_named(book, capsys):
-    book.add("01_first")
-    book.runs.mkdir()
-    (book.runs / "reader").touch()
-    assert book.run() == 1
-    assert re.search(
-        r"out_dir must be a folder, but .*reader is.* a file; choose another",
-        capsys.readouterr().err,
-    )
-
-
-def test_a_second_runner_is_refused(book, capsys):
+def test_a_second_runner_or_a_file_in_place_of_the_folder_is_refused(book, capsys):
     book.add("01_first")
     book.runs.joinpath("reader").mkdir(parents=True)
     with FileLock(book.runs / "reader" / ".lock"):
         assert book.run() == 1
         assert "another runner is writing" in capsys.readouterr().err
         assert book.run("--out", "other", "--dry-run") == 0
+    (book.runs / "mine").touch()
+    assert book.run("--out", "mine") == 1
+    assert "out_dir must be a folder" in capsys.readouterr().err
     assert book.log() == []
-    assert book.run("--dry-run") == 0
 
 
 @pytest.mark.parametrize(
@@ -305,12 +257,10 @@ def test_a_second_runner_is_refused(book, capsys):
     [
         (["02_secnod.n=1"], r"notebook '02_secnod' is unknown; did you mean 02_second"),
         (["02_second.m=1"], r"parameter of 02_second 'm' is unknown; .*\bn\b"),
-        (["02_second.rates=1"], r"'rates' is unknown; did you mean rate\?"),
         (["02_second.n=-3"], r"02_second.n must be int from 0, .* got int -3"),
         (["02_second.rate=.nan"], r"02_second.rate must be float, finite, .* got float nan"),
-        (["02_second.n=1.5"], r"02_second.n must be int from 0, like its default 2, got float 1.5"),
+        (["02_second.n=1.5"], r"02_second.n must be int .* got float 1.5"),
         (["02_second.n=true"], r"02_second.n must be int .* got bool True"),
-        (["02_second.modes=full"], r"02_second.modes must be list"),
         ([f"02_second.n={'1' * 5000}"], r"02_second.n must be int .* got str '1{50,60}\n"),
         ([f"02_second.modes={DEEP}"], r"02_second.modes must be list, .* got str '\[{50,60}\n"),
         (["02_second.modes=[1]"], r"02_second.modes\[0\] must be str"),
@@ -321,21 +271,6 @@ def test_a_second_runner_is_refused(book, capsys):
         (["--out", "../x"], r"must be a plain folder name"),
         (["--out", "lab"], r"neither lab nor html"),
         (["--in-place", "02_second.n=1"], r"takes the notebooks' own defaults"),
-    ],
-)
-def test_what_is_unknown_or_does_not_fit_is_refused_before_anything_runs(
-    book, capsys, arguments, named
-):
-    book.add("01_first")
-    book.add("02_second")
-    assert book.run(*arguments) == 1
-    assert re.search(named, capsys.readouterr().err)
-    assert not book.runs.exists()
-
-
-@pytest.mark.parametrize(
-    ("text", "named"),
-    [
         ("02_second: {goals: 3}", r"reader.yaml: parameter of 02_second 'goals' is unknown"),
         ("03_third: {n: 1}", r"reader.yaml: notebook '03_third' is unknown"),
         ("02_second: {n: three}", r"02_second.n must be int .* got str 'three'"),
@@ -343,11 +278,14 @@ def test_what_is_unknown_or_does_not_fit_is_refused_before_anything_runs(
         ("02_second: {n: [}", r"must map notebooks to their parameters"),
     ],
 )
-def test_a_bad_profile_is_refused_before_anything_runs(book, capsys, text, named):
+def test_what_does_not_fit_is_refused_before_anything_runs(book, capsys, arguments, named):
+    """On the command line, or in the profile."""
     book.add("01_first")
     book.add("02_second")
-    book.profile("reader", text)
-    assert book.run() == 1
+    if isinstance(arguments, str):
+        book.profile("reader", arguments)
+        arguments = ()
+    assert book.run(*arguments) == 1
     assert re.search(named, capsys.readouterr().err)
     assert not book.runs.exists()
 
@@ -358,16 +296,13 @@ def test_in_place_puts_clean_executed_notebooks_back(book, capsys):
     book.add("02_second")
     before = nbformat.read(book.path("02_second"), as_version=4)
     assert book.run("--in-place") == 0
-    after = nbformat.read(book.path("02_second"), as_version=4)
+    text = book.path("02_second").read_text()
+    after = nbformat.reads(text, as_version=4)
     assert [(c.id, c.source) for c in after.cells] == [(c.id, c.source) for c in before.cells]
     assert [c.metadata for c in after.cells] == [{}, {"tags": ["parameters"]}, {}]
     assert after.cells[-1].outputs == [{"output_type": "stream", "name": "stdout", "text": "1.0\n"}]
     assert [c.execution_count for c in after.cells[1:]] == [1, 2]
-    assert after.metadata == {
-        "kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"},
-        "language_info": {"name": "python"},
-    }
-    text = book.path("02_second").read_text()
+    assert after.metadata.keys() == {"kernelspec", "language_info"}
     assert book.run("--in-place", "--force") == 0
     assert book.path("02_second").read_text() == text
     capsys.readouterr()
@@ -379,37 +314,23 @@ def test_in_place_puts_clean_executed_notebooks_back(book, capsys):
 
 
 @pytest.mark.parametrize(
-    ("value", "default", "expected"),
-    [
-        (1, 0.5, 1.0),
-        (2, 3, 2),
-        ([1], [0.5], [1.0]),
-        ([], ["a"], []),
-        ("x", None, "x"),
-        (1, None, 1),
-    ],
-)
-def test_values_take_the_type_of_their_default(value, default, expected):
-    fitted = fitting("p", value, default)
-    assert fitted == expected
-    assert type(fitted) is type(expected)
-
-
-@pytest.mark.parametrize(
     ("text", "default", "value"),
     [
         ("3", 1, 3),
+        ("1", 0.5, 1.0),
         ("1e-3", 0.1, 0.001),
         ("true", False, True),
         ("12", "a", "12"),
-        ("astar", "a", "astar"),
+        ("[1]", [0.5], [1.0]),
+        ("[]", ["a"], []),
         ("[astar, gradient]", [], ["astar", "gradient"]),
-        ('["astar"]', [], ["astar"]),
         ("null", None, None),
+        ("x", None, "x"),
     ],
 )
-def test_the_command_line_needs_no_quotes(text, default, value):
-    assert literal(text, default) == value
+def test_the_command_line_needs_no_quotes_and_values_take_their_defaults_type(text, default, value):
+    fitted = fitting("p", literal(text, default), default)
+    assert repr(fitted) == repr(value)
 
 
 @pytest.mark.parametrize(
