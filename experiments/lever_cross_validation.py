@@ -3,8 +3,8 @@
 Five folds, 80/10/10, by object (each interaction has an object of its own, so the random split of
 Seker et al. 2019 is the same); or all objects with some number of edges left out of training. A job
 is one training, or one baseline, tested in every protocol that it is trained for. Errors are
-distances between predicted and true positions [cm], after steps of 150 ms.
-`experiments.lever_up` runs jobs and makes the tables.
+distances between predicted and true positions [cm], after steps of 150 ms. `experiments.lever_up`
+runs jobs and makes the tables; `tuning` is a study (`experiments.studies`).
 """
 
 from __future__ import annotations
@@ -18,42 +18,31 @@ import torch
 import xarray as xr
 from torch import Tensor
 
-from affordlib.interactions import InteractionTensors, Scaler, Split, split_interactions
-from affordlib.interactions.dataset import valid_interactions
-from affordlib.interactions.lever_up import (
-    N_OBSERVED,
-    N_PREDICTED,
-    POSE_CHANNELS,
-    lever_up_tensors,
-    n_windows,
-)
+from affordlib.interactions import Scaler, Split, split_interactions
+from affordlib.interactions import lever_up as levers
+from affordlib.interactions.dataset import augment_by_symmetry, valid_interactions
+from affordlib.interactions.lever_up import lever_up_tensors
 from affordlib.interactions.recipes import Recipe, sample_scene
+from affordlib.models import lever_up as models
 from affordlib.models.base import EffectNetwork
 from affordlib.models.calibration import LEVELS, coverage
 from affordlib.models.domain import TrainingDomain
-from affordlib.models.lever_up import (
-    LEVER_MODELS,
-    PROTOCOLS,
-    TRAINED_FOR,
-    errors_m,
-    predict_steps,
-    train_lever_model,
-)
+from affordlib.models.lever_up import LEVER_MODELS, PROTOCOLS, LeverModel
 from affordlib.types import Prediction
 from experiments import lstm_seker2019
 from experiments.lstm_seker2019 import SekerConfig, SekerLSTM, train_seker
-from experiments.runner import Job, open_once
+from experiments.runner import Job, one_of, open_once
 from experiments.shipped import shipped_lever_model
 
-DATA = "lever_up"
-N_FOLDS = 5
-EDGES = range(3, 9)
+DATA, N_FOLDS = "lever_up", 5
 BASELINES = ("persistence", "constant_velocity")
 RECURRENT = ("lstm_tuned", "lstm_seker2019")
 SINGLE = "cnp_last_pose_single"
 """`cnp_last_pose`, trained for one protocol at a time, as the recurrent networks are."""
 
 MODELS = ("cnp", "cnp_last_pose", SINGLE, "lstm_seker2019", "lstm_tuned", *BASELINES)
+TESTED = {"all": PROTOCOLS, "window": PROTOCOLS[:1], "first_step": PROTOCOLS[1:]}
+"""The protocols in which a training is tested, by what it is trained for."""
 
 
 def job(
@@ -68,47 +57,27 @@ def job(
 
     epochs: of `lstm_seker2019` alone.
     """
-    for name, value, known in (("model", model, MODELS), ("trained_for", trained_for, TRAINED_FOR)):
-        if value not in known:
-            raise ValueError(f"{name} must be one of {known}, got {value!r}")
-    if fold not in range(N_FOLDS):
-        raise ValueError(f"fold must lie in [0, {N_FOLDS - 1}], got {fold!r}")
-    if edges_left_out is not None and edges_left_out not in EDGES:
-        raise ValueError(f"edges_left_out must lie in [3, 8], got {edges_left_out!r}")
-    if (trained_for == "all") == (model in (SINGLE, *RECURRENT)):
-        raise ValueError(
-            f"trained_for: {(SINGLE, *RECURRENT)} are trained for one protocol each, the others "
-            f"for all; got {trained_for!r} for {model!r}"
-        )
-    if (epochs is not None) != (model == "lstm_seker2019"):
+    one_of("model", model, MODELS)
+    each = model in (SINGLE, *RECURRENT)
+    one_of(f"trained_for of {model!r}", trained_for, [*TESTED][1:] if each else ["all"])
+    one_of("fold", fold, range(N_FOLDS))
+    one_of("edges_left_out", edges_left_out, (None, *range(3, 9)))
+    published = model == "lstm_seker2019"
+    if (epochs is not None) != published:
         raise ValueError(f"epochs belong to 'lstm_seker2019', got {epochs!r} for {model!r}")
-    settings = _lever_model(model)
-    if model == "lstm_seker2019":
-        settings = (SekerConfig(), lstm_seker2019.TRAINING)
-    arguments = {
-        "model": model,
-        "trained_for": trained_for,
-        "fold": fold,
-        "edges_left_out": edges_left_out,
-        "seed": seed,
-        "epochs": epochs,
-    }
+    settings = (SekerConfig(), lstm_seker2019.TRAINING) if published else _lever_model(model)
+    arguments = {"model": model, "trained_for": trained_for, "fold": fold}
+    arguments |= {"edges_left_out": edges_left_out, "seed": seed, "epochs": epochs}
     return Job(cross_validate, arguments, settings, (DATA,))
 
 
-def protocols_of(trained_for: str) -> tuple[str, ...]:
-    """The protocols in which a training is tested."""
-    return {"all": PROTOCOLS, "window": PROTOCOLS[:1], "first_step": PROTOCOLS[1:]}[trained_for]
-
-
-def _lever_model(model: str) -> Any:
+def _lever_model(model: str) -> LeverModel | None:
     return LEVER_MODELS.get("cnp_last_pose" if model == SINGLE else model)
 
 
 def edges_of(data: xr.Dataset) -> np.ndarray:
     """How many edges the polygon of each interaction has (n,)."""
-    recipe = Recipe.from_json(data.attrs["recipe"])
-    numbers = data["interaction"].values
+    recipe, numbers = Recipe.from_json(data.attrs["recipe"]), data["interaction"].values
     return np.array([len(sample_scene(recipe, int(i))[0].footprint_m) for i in numbers])
 
 
@@ -138,39 +107,28 @@ def cross_validate(
     resume_checkpoint: Path,
 ) -> dict[str, Any]:
     """Errors of every window of every test trajectory, by protocol, and how often σ covers them."""
-    data = open_once(DATA)
+    data, lever = open_once(DATA), _lever_model(model)
     split = lever_split(data, fold, seed, edges_left_out)
-    lever = _lever_model(model)
     view = lever.view if lever else "full" if model == "lstm_seker2019" else "near"
+    kept = valid_interactions(data, split.test)
+    result: dict[str, Any] = {"interaction": data["interaction"].values[kept].tolist()}
+    network: EffectNetwork | str = model
+    if model == "lstm_seker2019":
+        network, told = _train_seker(data, split, trained_for, epochs, seed, resume_checkpoint)
+    elif lever:
+        lever = replace(lever, training=replace(lever.training, seed=seed))
+        found = shipped_lever_model(model, trained_for, lever, data, split)
+        network, told = found or _train(lever, data, split, trained_for, resume_checkpoint)
+    if network is not model:
+        result["training"] = told
     test = lever_up_tensors(data, split.test, view)
-    result: dict[str, Any] = {
-        "interaction": data["interaction"].values[valid_interactions(data, split.test)].tolist()
-    }
-    if model in BASELINES:
-        predict = lambda protocol: _extrapolated(model, test, protocol)  # noqa: E731
-    else:
-        if lever:
-            lever = replace(lever, training=replace(lever.training, seed=seed))
-            found = _train(model, lever, data, split, trained_for, resume_checkpoint)
-        else:
-            found = _train_seker(data, split, trained_for, epochs, seed, resume_checkpoint)
-        network, result["training"] = found
-        predict = lambda protocol: _predicted(network, test, protocol)  # noqa: E731
-    for protocol in protocols_of(trained_for):
-        result[protocol] = _errors(predict(protocol))
-    if model == "persistence":
-        moves_cm = 100 * test.effect[..., :3].diff(dim=1).norm(dim=-1)
-        result["step_moves_cm"] = _four_decimals(moves_cm)
-    return result
+    return result | {protocol: _errors(network, test, protocol) for protocol in TESTED[trained_for]}
 
 
 def _train(
-    model: str, lever: Any, data: xr.Dataset, split: Split, trained_for: str, path: Path
+    lever: LeverModel, data: xr.Dataset, split: Split, trained_for: str, path: Path
 ) -> tuple[EffectNetwork, dict[str, Any]]:
-    """A network trained here, or the shipped checkpoint of this very training."""
-    if found := shipped_lever_model(model, trained_for, lever, data, split):
-        return found
-    network, history = train_lever_model(lever, data, split, trained_for, path)
+    network, history = models.train_lever_model(lever, data, split, trained_for, path)
     best = min(record.validation_error for record in history)
     told = {"steps": history[-1].step, "seconds": history[-1].seconds}
     return network, told | {"validation_error": best}
@@ -179,27 +137,12 @@ def _train(
 def _train_seker(
     data: xr.Dataset, split: Split, trained_for: str, epochs: int | None, seed: int, path: Path
 ) -> tuple[EffectNetwork, dict[str, Any]]:
-    training, validation = (
-        lever_up_tensors(data, part, "full") for part in (split.train, split.validation)
-    )
-    channels = {f"{k}_channels": getattr(training, f"{k}_channels") for k in ("action", "effect")}
+    parts = [lever_up_tensors(data, part, "full") for part in (split.train, split.validation)]
+    config = SekerConfig(parts[0].action_channels, parts[0].effect_channels)
     torch.manual_seed(seed)
-    scales = Scaler.fit(training), TrainingDomain.fit(training)
-    network = SekerLSTM(SekerConfig(**channels), *scales)
+    network = SekerLSTM(config, Scaler.fit(parts[0]), TrainingDomain.fit(parts[0]))
     epochs = epochs or lstm_seker2019.EPOCHS
-    return network, train_seker(network, training, validation, trained_for, epochs, seed, path)
-
-
-def _starts(arrays: InteractionTensors, protocol: str) -> range:
-    return range(n_windows(arrays) if protocol == "window" else 1)
-
-
-def _predicted(
-    model: EffectNetwork, arrays: InteractionTensors, protocol: str
-) -> list[tuple[Prediction, Tensor]]:
-    with torch.no_grad():
-        features = model.encode(arrays.image)
-    return [predict_steps(model, arrays, protocol, k, features) for k in _starts(arrays, protocol)]
+    return network, train_seker(network, *parts, trained_for, epochs, seed, path)
 
 
 def extrapolate(
@@ -210,43 +153,84 @@ def extrapolate(
     From the first step alone the velocity is unknown; then both predict that nothing moves.
     """
     window = protocol == "window"
-    last = start + N_OBSERVED - 1 if window else 0
-    n = N_PREDICTED if window else effect.shape[1] - 1
-    ahead = torch.arange(1, n + 1)
+    last = start + levers.N_OBSERVED - 1 if window else 0
+    ahead = torch.arange(1, (levers.N_PREDICTED if window else effect.shape[1] - 1) + 1)
     velocity = torch.zeros_like(effect[:, last])
     if window and baseline == "constant_velocity":
         velocity = effect[:, last] - effect[:, last - 1]
-    mean = effect[:, last, None] + ahead[:, None] * velocity[:, None]
-    return mean, effect[:, last + ahead]
+    return effect[:, last, None] + ahead[:, None] * velocity[:, None], effect[:, last + ahead]
 
 
-def _extrapolated(
-    baseline: str, arrays: InteractionTensors, protocol: str
-) -> list[tuple[Prediction, Tensor]]:
-    found = []
-    for start in _starts(arrays, protocol):
-        mean, truth = extrapolate(baseline, arrays.effect, protocol, start)
-        zero = torch.zeros_like(mean)
-        found.append((Prediction(zero, zero, mean, zero), truth))
-    return found
-
-
-def _errors(found: list[tuple[Prediction, Tensor]]) -> dict[str, Any]:
-    """Errors (N, W, T) [cm] of a protocol's windows, and the coverage of σ by channel."""
-    errors = torch.stack([100 * errors_m(told, truth) for told, truth in found], dim=1)
-    mean, std, truth = (
-        torch.cat(parts).flatten(0, 1)
-        for parts in zip(*((p.effect_mean, p.effect_std, e) for p, e in found), strict=True)
-    )
+def _errors(network: EffectNetwork | str, arrays: Any, protocol: str) -> dict[str, Any]:
+    """Errors (N, W, T) [cm] of a network's or baseline's windows, coverage of σ by channel."""
+    starts = range(levers.n_windows(arrays) if protocol == "window" else 1)
+    if isinstance(network, str):
+        found = [extrapolate(network, arrays.effect, protocol, start) for start in starts]
+        found = [(Prediction(mean, mean, mean, 0 * mean), truth) for mean, truth in found]
+    else:
+        with torch.no_grad():
+            seen = network.encode(arrays.image)
+        found = [models.predict_steps(network, arrays, protocol, start, seen) for start in starts]
+    errors = torch.stack([100 * models.errors_m(told, truth) for told, truth in found], dim=1)
+    values = [(told.effect_mean, told.effect_std, truth) for told, truth in found]
+    mean, std, truth = (torch.cat(v).flatten(0, 1) for v in zip(*values, strict=True))
     covered = None
     if std.min() > 0:
         covered = {
             channel: [round(coverage(truth[:, k], mean[:, k], std[:, k], v), 4) for v in LEVELS]
-            for k, channel in enumerate(POSE_CHANNELS)
+            for k, channel in enumerate(levers.POSE_CHANNELS)
         }
-    return {"error_cm": _four_decimals(errors), "coverage": covered}
+    # Centimetres to a micrometre, as lists.
+    return {"error_cm": errors.double().numpy().round(4).tolist(), "coverage": covered}
 
 
-def _four_decimals(values_cm: Tensor) -> list[Any]:
-    """Centimetres to a micrometre, as lists."""
-    return values_cm.double().numpy().round(4).tolist()
+SETTINGS: dict[str, tuple[dict[str, Any], float]] = {
+    "rate 0.001": ({}, 1.0),
+    "rate 0.0005": ({"learning_rate": 5e-4}, 1.0),
+    "rate 0.002": ({"learning_rate": 2e-3}, 1.0),
+    "rate 0.004": ({"learning_rate": 4e-3}, 1.0),
+    "rate 0.008": ({"learning_rate": 8e-3}, 1.0),
+    "rate 0.001, half the width": ({}, 0.5),
+    "rate 0.001, no weight decay": ({"weight_decay": 0.0}, 1.0),
+    "rate 0.001, plain likelihood": ({"beta": 0.0}, 1.0),
+}
+"""By name: what is changed in `TRAINING`, where both networks began, and the share of the width."""
+
+TUNED = (("cnp_last_pose", "all"), ("lstm_tuned", "window"), ("lstm_tuned", "first_step"))
+TUNING = (SETTINGS, TUNED, [LEVER_MODELS[name].network for name, _ in TUNED], models.TRAINING)
+"""What decides the study `tuning`."""
+
+
+def changed(lever: LeverModel, setting: str) -> LeverModel:
+    """A network with one of `SETTINGS`."""
+    training, share = SETTINGS[setting]
+    network = replace(lever.network, width=round(share * lever.network.width))
+    return replace(lever, network=network, training=replace(models.TRAINING, **training))
+
+
+def tuning() -> list[dict[str, Any]]:
+    """The same budget of tuning for ours and for the recurrent network (Section 4.1).
+
+    Mean validation errors [m], of windows and of whole beginnings, of every setting, trained on the
+    training part of fold 0 as long as the shipped network. `LEVER_MODELS` has one learning rate for
+    each network: the best, or within a thousandth of the best where the two trainings of the
+    recurrent one differ. No test data are used.
+    """
+    data, rows = open_once(DATA), []
+    split = lever_split(data)
+    for name, trained_for in TUNED:
+        lever = LEVER_MODELS[name]
+        parts = [lever_up_tensors(data, p, lever.view) for p in (split.train, split.validation)]
+        parts[0] = augment_by_symmetry(parts[0], levers.MIRRORED)
+        for setting in SETTINGS:
+            one = changed(lever, setting)
+            network, history = models.fit_lever_model(one, *parts, trained_for)
+            row = {"model": name, "trained_for": trained_for, "setting": setting}
+            row |= {"taken": one == lever, "steps": history[-1].step, "n": len(parts[1])}
+            if trained_for != "first_step":
+                row["window_mean_m"] = float(models.window_errors_m(network, parts[1]).mean())
+            if trained_for != "window":
+                off = models.from_start_errors_m(network, parts[1])
+                row["beginning_mean_m"] = float(off.mean())
+            rows.append(row)
+    return rows

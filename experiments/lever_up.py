@@ -14,8 +14,6 @@ objects.
 
 from __future__ import annotations
 
-import argparse
-import math
 import sys
 from collections.abc import Iterator, Sequence
 from itertools import product
@@ -25,11 +23,11 @@ from typing import Any
 import numpy as np
 
 from affordlib.commands import command, count_type, names_type, whole_type
+from affordlib.evaluation.metrics import error_row
 from affordlib.interactions.lever_up import POSE_CHANNELS
 from affordlib.models.lever_up import PROTOCOLS, TRAINED_FOR
 from affordlib.results import write_results
-from affordlib.workers import dask_client
-from experiments import reported, studies
+from experiments import reported, runner, studies
 from experiments.lever_cross_validation import (
     BASELINES,
     DATA,
@@ -41,11 +39,11 @@ from experiments.lever_cross_validation import (
     job,
 )
 from experiments.lstm_seker2019 import EPOCHS
-from experiments.runner import FOLDER, Result, open_once, read, run
+from experiments.runner import FOLDER, Result, open_once, read
 
 NAME = "lever_up"
 OURS = "cnp_last_pose"
-RESTS_M = 0.005
+RESTS_CM = 0.5
 """An object rests in a window where it moves by less, from the last observed step to the end."""
 
 Rows = list[dict[str, Any]]
@@ -53,39 +51,27 @@ Rows = list[dict[str, Any]]
 
 def sorted_results(folder: str | Path = FOLDER) -> list[Result]:
     """All results in the order of models and folds."""
-    names = ("edges_left_out", "fold", "epochs", "seed")
-    results = read(NAME, job, folder)
-    return sorted(
-        results,
-        key=lambda r: (
-            MODELS.index(r[0]["model"]),
-            r[0]["trained_for"],
-            [r[0][name] or 0 for name in names],
-        ),
-    )
+
+    def order(result: Result) -> list[Any]:
+        about = {name: value or 0 for name, value in result[0].items()}
+        names = ("trained_for", "edges_left_out", "fold", "epochs", "seed")
+        return [MODELS.index(about["model"]), *(about[name] for name in names)]
+
+    return sorted(read(NAME, job, folder), key=order)
 
 
 def _groups(
     results: list[Result], edges_left_out: int | None = None
-) -> Iterator[tuple[dict[str, Any], str, list[Result]]]:
-    """The results of each protocol and model, and the columns that say which they are."""
+) -> Iterator[tuple[dict[str, Any], list[Result], np.ndarray]]:
+    """Columns, results and errors (N, W, T) [cm] of each protocol, model and length of training."""
     for protocol, model in product(PROTOCOLS, MODELS):
-        group = [
-            (about, result)
-            for about, result in results
-            if (about["model"], about["edges_left_out"]) == (model, edges_left_out)
-            and protocol in result
-        ]
-        for epochs in sorted({about["epochs"] for about, _ in group}, key=str):
-            same = [r for r in group if r[0]["epochs"] == epochs]
-            folds = len({about["fold"] for about, _ in same})
-            columns = {"model": model, "protocol": protocol, "folds": folds, "epochs": epochs}
-            yield columns, protocol, same
-
-
-def _errors_cm(group: list[Result], protocol: str) -> np.ndarray:
-    """Errors (N, W, T) [cm] of all folds together."""
-    return np.concatenate([result[protocol]["error_cm"] for _, result in group])
+        wanted = {"model": model, "edges_left_out": edges_left_out}
+        mine = [r for r in results if wanted.items() <= r[0].items() and protocol in r[1]]
+        for epochs in sorted({about["epochs"] for about, _ in mine}, key=str):
+            same = [r for r in mine if r[0]["epochs"] == epochs]
+            columns = {"model": model, "protocol": protocol}
+            columns |= {"folds": len({about["fold"] for about, _ in same}), "epochs": epochs}
+            yield columns, same, np.concatenate([r[protocol]["error_cm"] for _, r in same])
 
 
 def error_rows(results: list[Result], edges_left_out: int | None = None) -> Rows:
@@ -94,15 +80,11 @@ def error_rows(results: list[Result], edges_left_out: int | None = None) -> Rows
     edges_left_out: of the trainings without polygons with so many edges, on those.
     """
     rows = []
-    for about, protocol, group in _groups(results, edges_left_out):
-        errors = _errors_cm(group, protocol).mean(axis=1)
-        n = len(errors)
-        for k, error in enumerate(errors.T):
-            error = error.copy()  # contiguous, as the last digit of a sum depends on it
-            row = about | {"steps": k + 1, "n": n, "mean_cm": float(error.mean())}
-            row["sem_cm"] = float(error.std(ddof=1) / math.sqrt(n)) if n > 1 else 0.0
-            row["median_cm"] = float(np.median(error))
-            rows.append(row | {"p95_cm": float(np.quantile(error, 0.95))})
+    for about, _, errors in _groups(results, edges_left_out):
+        for k, error in enumerate(errors.mean(axis=1).T):
+            # Copied, as the last digit of a sum depends on how it lies in memory.
+            row = error_row(error.copy(), **about, steps=k + 1)
+            rows.append({name.replace("_m", "_cm"): value for name, value in row.items()})
     return rows
 
 
@@ -115,15 +97,15 @@ def unseen_rows(results: list[Result], edges: dict[int, int]) -> Rows:
     rows = []
     for left_out in sorted({a["edges_left_out"] for a, _ in results} - {None}):
         known = {}
-        for about, protocol, group in _groups(results):
+        for about, group, errors in _groups(results):
             alike = [edges[i] == left_out for _, result in group for i in result["interaction"]]
-            errors = _errors_cm(group, protocol).mean(axis=1)[alike]
-            for k in range(errors.shape[1]):
-                columns = {"known_n": len(errors), "known_mean_cm": float(errors[:, k].mean())}
-                known[about["model"], protocol, k + 1] = columns
+            some = errors.mean(axis=1)[alike]
+            for k in range(some.shape[1]):
+                columns = {"known_n": len(some), "known_mean_cm": float(some[:, k].mean())}
+                known[about["model"], about["protocol"], k + 1] = columns
         for row in error_rows(results, left_out):
-            key = row["model"], row["protocol"], row["steps"]
-            rows.append({"edges": left_out} | row | known.get(key, {}))
+            same = known.get((row["model"], row["protocol"], row["steps"]), {})
+            rows.append({"edges": left_out} | row | same)
     return rows
 
 
@@ -138,15 +120,14 @@ def motion_rows(results: list[Result]) -> Rows:
         if about["model"] == "persistence" and about["edges_left_out"] is None
     }
     rows = []
-    for about, protocol, group in _groups(results):
-        if protocol != "window":
+    for about, group, errors in _groups(results):
+        if about["protocol"] != "window":
             continue
-        errors = _errors_cm(group, protocol)
-        moves = np.concatenate([moved[of["fold"]] for of, _ in group])
-        for kind, which in (("moving", moves >= 100 * RESTS_M), ("resting", moves < 100 * RESTS_M)):
-            chosen = errors[which]
-            for k in range(chosen.shape[1] if len(chosen) else 0):
-                columns = {"n_windows": len(chosen), "mean_cm": float(chosen[:, k].mean())}
+        moves = np.concatenate([moved[of["fold"]] for of, _ in group]) >= RESTS_CM
+        for kind, which in (("moving", moves), ("resting", ~moves)):
+            for k in range(errors.shape[2] if which.any() else 0):
+                chosen = errors[which][:, k]
+                columns = {"n_windows": len(chosen), "mean_cm": float(chosen.mean())}
                 rows.append(about | {"windows": kind, "steps": k + 1} | columns)
     return rows
 
@@ -157,23 +138,16 @@ def paired_rows(results: list[Result], n_draws: int = 2000) -> Rows:
     Ours as it is, and trained for one protocol at a time; objects of the folds that both were
     trained on, the windows of an object averaged.
     """
-    rng, rows = np.random.default_rng(0), []
+    rng, rows, found = np.random.default_rng(0), [], {}
+    for about, group, errors in _groups(results):
+        objects = [(of["fold"], i) for of, result in group for i in result["interaction"]]
+        means = dict(zip(objects, (error.mean(axis=0) for error in errors), strict=True))
+        found.setdefault((about["model"], about["protocol"]), {}).update(means)
     for ours, rival, protocol in product((OURS, SINGLE), RECURRENT, PROTOCOLS):
-        found = {
-            model: {
-                (about["fold"], number): np.mean(error, axis=0)
-                for about, result in results
-                if (about["model"], about["edges_left_out"]) == (model, None) and protocol in result
-                for number, error in zip(
-                    result["interaction"], result[protocol]["error_cm"], strict=True
-                )
-            }
-            for model in (ours, rival)
-        }
-        both = sorted(found[ours].keys() & found[rival].keys())
-        if not both:
+        one, other = (found.get((model, protocol), {}) for model in (ours, rival))
+        if not (both := sorted(one.keys() & other.keys())):
             continue
-        gap = np.array([found[ours][key] - found[rival][key] for key in both])
+        gap = np.array([one[key] - other[key] for key in both])
         means = gap[rng.integers(0, len(gap), (n_draws, len(gap)))].mean(axis=1)
         low, high = np.quantile(means, [0.025, 0.975], axis=0)
         stride = 1 if protocol == "window" else 5
@@ -181,16 +155,15 @@ def paired_rows(results: list[Result], n_draws: int = 2000) -> Rows:
             row = {"ours": ours, "rival": rival, "protocol": protocol, "steps": k + 1}
             row |= {"n": len(gap), "difference_cm": float(gap[:, k].mean())}
             row |= {"low_cm": float(low[k]), "high_cm": float(high[k])}
-            better = 100 * (gap[:, k] < 0).mean()
-            rows.append(row | {"ours_better_percent": float(better)})
+            rows.append(row | {"ours_better_percent": float(100 * (gap[:, k] < 0).mean())})
     return rows
 
 
 def coverage_rows(results: list[Result]) -> Rows:
     """How often the truth lies in the central 50 and 90 % intervals, by channel."""
     rows = []
-    for about, protocol, group in _groups(results):
-        covered = [result[protocol]["coverage"] for _, result in group]
+    for about, group, _ in _groups(results):
+        covered = [result[about["protocol"]]["coverage"] for _, result in group]
         if about["model"] == "lstm_seker2019" or None in covered:
             continue
         for channel in POSE_CHANNELS:
@@ -200,37 +173,15 @@ def coverage_rows(results: list[Result]) -> Rows:
     return rows
 
 
-def step_rows(results: list[Result]) -> Rows:
-    """How far the object moves in each step of 150 ms."""
-    moves = [result["step_moves_cm"] for about, result in results
-            if "step_moves_cm" in result and about["edges_left_out"] is None]  # fmt: skip
-    return [
-        {"step": k + 1, "mean_cm": float(move.mean()), "p95_cm": float(np.quantile(move, 0.95))}
-        for k, move in enumerate(np.concatenate(moves).T)
-    ]
-
-
 def summary_rows(rows: Rows) -> Rows:
     """The windows in one row per model, as the paper's Table 1 has them."""
     summary: dict[tuple, dict[str, Any]] = {}
     for row in rows:
         if row["protocol"] == "window":
-            names = ("model", "folds", "epochs", "n")
-            columns = {name: row[name] for name in names}
+            columns = {name: row[name] for name in ("model", "folds", "epochs", "n")}
             one = summary.setdefault((row["model"], row["epochs"]), columns)
             one[f"step_{row['steps']}_mean_cm"] = row["mean_cm"]
     return list(summary.values())
-
-
-def training_rows(results: list[Result]) -> Rows:
-    """What each training took."""
-    keys, costs = ("model", "trained_for", "fold", "edges_left_out"), ("steps", "epochs", "seconds")
-    return [
-        {key: about[key] for key in keys}
-        | {key: result["training"].get(key) for key in (*costs, "checkpoint")}
-        for about, result in results
-        if "training" in result
-    ]
 
 
 def write_tables(folder: str | Path = FOLDER, out_dir: str | Path = "data/results") -> Path:
@@ -247,8 +198,6 @@ def write_tables(folder: str | Path = FOLDER, out_dir: str | Path = "data/result
         "unseen_edges": unseen_rows(results, edges),
         "paired": paired_rows(results),
         "coverage": coverage_rows(results),
-        "steps": step_rows(results),
-        "training": training_rows(results),
     } | studies.tables(NAME, folder)
     return write_results(out_dir, NAME, {"jobs": len(results), "step_ms": 150}, tables)
 
@@ -256,25 +205,15 @@ def write_tables(folder: str | Path = FOLDER, out_dir: str | Path = "data/result
 @command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
     """Train and test models in folds, and make the tables; what is there is not made again."""
-    parser = argparse.ArgumentParser(
-        prog="python -m experiments.lever_up", description=main.__doc__
-    )
+    parser = runner.parser(NAME, main.__doc__)
     parser.add_argument("--models", type=names_type(MODELS), default=[], help=",".join(MODELS))
     parser.add_argument("--folds", type=whole_type(1, N_FOLDS), default=N_FOLDS, help="of the five")
-    parser.add_argument(
-        "--no-edges", type=whole_type(3, 8), help="leave polygons with so many edges out instead"
-    )
-    parser.add_argument(
-        "--protocols",
-        type=names_type(TRAINED_FOR),
-        default="window,first_step",
-        help="to train for, one at a time, what is not trained for all",
-    )
+    edges = "leave polygons with so many edges out instead"
+    parser.add_argument("--no-edges", type=whole_type(3, 8), help=edges)
+    kinds = "to train for, one at a time, what is not trained for all"
+    known, usual = names_type(TRAINED_FOR), "window,first_step"
+    parser.add_argument("--protocols", type=known, default=usual, help=kinds)
     parser.add_argument("--epochs", type=count_type, default=EPOCHS, help="of lstm_seker2019")
-    parser.add_argument("--raw", default=FOLDER, help="the folder of the jobs' results")
-    parser.add_argument("--out", default="data/results")
-    parser.add_argument("--scheduler", help="address of a Dask scheduler")
-    parser.add_argument("--workers", type=count_type, default=1, help="processes of this machine")
     options = parser.parse_args(argv)
     jobs = []
     folds = range(options.folds) if options.no_edges is None else [0]
@@ -283,10 +222,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         epochs = options.epochs if model == "lstm_seker2019" else None
         kinds = options.protocols if model in (SINGLE, *RECURRENT) else ["all"]
         jobs += [job(model, kind, fold, options.no_edges, epochs=epochs) for kind in kinds]
-    with dask_client(options.workers, options.scheduler) as client:
-        run(jobs, NAME, client, options.raw)
-    print(write_tables(options.raw, options.out))
-    return 0
+    return runner.make(jobs, NAME, options, write_tables)
 
 
 if __name__ == "__main__":

@@ -39,7 +39,7 @@ from affordlib.models.film import FiLMConfig
 from affordlib.models.training import final_errors_m, train_model
 from experiments import (
     ablation,
-    lever_tuning,
+    lever_cross_validation,
     limits,
     representation,
     residual_distribution,
@@ -163,9 +163,9 @@ STUDIES: dict[str, Study] = {
         settings=(limits.N_PLACES, limits.NEAR_THE_LIMIT),
     ),
     "tuning": Study(
-        lever_tuning.tuning,
+        lever_cross_validation.tuning,
         ("lever_up",),
-        settings=lever_tuning.DECISIVE,
+        settings=lever_cross_validation.TUNING,
         table="lever_up",
     ),
 }

@@ -77,7 +77,7 @@ LEVER_MODELS: dict[str, LeverModel] = {
 """Ours, the paper's (its image scaled to the 48×48 of the appendix), and the recurrent one.
 
 All get as many steps, although one of the paper's network costs three times as much. The rates of
-the first and the last are chosen by validation error (`experiments/lever_tuning.py`)."""
+the first and the last are chosen by validation error (`experiments/lever_cross_validation.py`)."""
 
 
 @torch.no_grad()
