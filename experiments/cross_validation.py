@@ -2,38 +2,40 @@
 
 A job is a model, a data set, its size, a fold and a seed. It trains on the training part, stops
 early on the validation part, and predicts the effects of the test part from the image and the
-commanded action at t = 0 and t = 1. `experiments.effect_prediction` runs jobs and makes the tables.
+commanded action at t = 0 and t = 1. Networks of pushes also decode the push that should have the
+effect of each test interaction, which is executed on its object. `experiments.effect_prediction`
+runs jobs and makes the tables.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+import torch
+import xarray as xr
 
-from affordlib.evaluation.baselines import (
-    BASELINES,
-    baseline_predictions,
-    logistic_predictions,
-)
-from affordlib.evaluation.predictions import (
-    network_predictions,
-    summary,
-)
+from affordlib.evaluation.baselines import BASELINES, baseline_predictions, logistic_predictions
+from affordlib.evaluation.predictions import network_predictions, summary
+from affordlib.geometry import wrap_angle
 from affordlib.interactions import InteractionTensors, Split, split_interactions
 from affordlib.interactions.dataset import Symmetry, valid_interactions
+from affordlib.interactions.recipes import Recipe, sample_scene, sample_world
 from affordlib.models.base import EffectNetwork, NetworkConfig
 from affordlib.models.calibration import fit_sigma_scale
 from affordlib.models.cnp import CNPConfig
 from affordlib.models.film import FiLMConfig
+from affordlib.models.protocol import EffectModel, condition_on_final_effect
 from affordlib.models.training import train_model
+from affordlib.primitives import Push
+from affordlib.world import Tabletop
 from experiments.attention import AttentionConfig
 from experiments.ensemble import Ensemble
-from experiments.inverse import executed_columns, inverse_columns, theta_along_effect
-from experiments.runner import Job, open_once
+from experiments.runner import Job, one_of, open_once
 from experiments.shipped import CHECKPOINT_SPECS, GRASP_SYMMETRIES, HALF_TURNS
 
 VERSION = 2
@@ -122,13 +124,11 @@ def network_and_training(model: str, data: str, n: int | str = "all") -> tuple[A
 
 def job(model: str, data: str, n: int | str = "all", fold: int = 0, seed: int = 0) -> Job:
     """One training and its tests; n counts the interactions of which ten folds are made."""
-    for name, value, known in (("model", model, MODELS), ("data", data, SETS)):
-        if value not in known:
-            raise ValueError(f"{name} must be one of {known}, got {value!r}")
+    one_of("model", model, MODELS)
+    one_of("data", data, SETS)
+    one_of("fold", fold, range(N_FOLDS))
     if n != "all" and (not isinstance(n, int) or n < N_FOLDS):
         raise ValueError(f'n must be "all" or at least {N_FOLDS}, got {n!r}')
-    if fold not in range(N_FOLDS):
-        raise ValueError(f"fold must lie in [0, {N_FOLDS - 1}], got {fold!r}")
     task, settings = task_of(data), ()
     if model == "logistic" and not data.startswith("grasp"):
         raise ValueError(f"model 'logistic' predicts the success of grasps, not {data!r}")
@@ -151,37 +151,33 @@ def cross_validate(
     if size > available:
         raise ValueError(f"n = {n}, but {data!r} has {available} interactions")
     split = split_interactions(size, seed, fold, N_FOLDS)
-    tests = {"fold_test": (interactions, split.test)}
-    if task.test_set:
-        other = open_once(task.test_set)
-        tests["fixed_test"] = (other, np.arange(other.sizes["interaction"]))
     result: dict[str, Any] = {"n_interactions": size}
+    known = interactions, split.train
     if model in NETWORKS:
         network, result["training"] = _train(model, data, n, seed, split, resume_checkpoint)
-        found = {name: network_predictions(network, *test) for name, test in tests.items()}
-        if task.test_set:
-            result["inverse"] = inverse_columns(network, interactions, split.test)
-    elif model == "logistic":
-        known = interactions, split.train
-        found = {name: logistic_predictions(*known, *test) for name, test in tests.items()}
-    else:
-        known = (task.action_channels, task.all_effects), interactions, split.train
-        found = {
-            name: baseline_predictions(BASELINES[model], *known, *test)
-            for name, test in tests.items()
-        }
-        if model == "constant" and task.test_set:
-            kept = valid_interactions(interactions, split.test)
-            theta = theta_along_effect(interactions, kept)
-            result["inverse"] = executed_columns(interactions, kept, theta)
-    result["fold_test"] = prediction_columns(found["fold_test"])
+
+    def predicted(test_set: xr.Dataset, rows: np.ndarray) -> dict[str, Any]:
+        if model in NETWORKS:
+            return network_predictions(network, test_set, rows)
+        if model == "logistic":
+            return logistic_predictions(*known, test_set, rows)
+        channels = task.action_channels, task.all_effects
+        return baseline_predictions(BASELINES[model], channels, *known, test_set, rows)
+
+    result["fold_test"] = prediction_columns(predicted(interactions, split.test))
     if task.test_set:
-        errors = summary(found["fixed_test"])
-        rows = errors.pop("calibration")
-        result["fixed_calibration"] = [{"n_values": row.pop("n")} | row for row in rows]
-        result["fixed_test"] = {
-            "interaction": found["fixed_test"]["interaction"], "category": errors.pop("family"),
-        } | {name: values for name, values in errors.items() if values is not None}  # fmt: skip
+        rows = valid_interactions(interactions, split.test)
+        if model in NETWORKS or model == "constant":
+            decode = decoded_theta_rad if model in NETWORKS else theta_along_effect
+            theta = decode(network if model in NETWORKS else None, interactions, rows)
+            result["inverse"] = executed_columns(interactions, rows, theta)
+        other = open_once(task.test_set)
+        found = predicted(other, np.arange(other.sizes["interaction"]))
+        errors = summary(found)
+        calibrated = errors.pop("calibration")
+        result["fixed_calibration"] = [{"n_values": row.pop("n")} | row for row in calibrated]
+        about = {"interaction": found["interaction"], "category": errors.pop("family")}
+        result["fixed_test"] = about | {k: v for k, v in errors.items() if v is not None}
     return result
 
 
@@ -226,3 +222,47 @@ def _train(
     channels = network.action_channels, network.effect_channels
     validation = InteractionTensors.from_dataset(interactions, split.validation, *channels)
     return ensemble, {"members": records, "temperature": fit_sigma_scale(ensemble, validation)}
+
+
+@torch.no_grad()
+def decoded_theta_rad(model: EffectModel, data: xr.Dataset, rows: np.ndarray) -> np.ndarray:
+    """Angles θ (N,) of the pushes that should have the effects of interactions, as decoded.
+
+    The inverse problem: the model observes the effect at t = 1 alone (w₁ = 0); the first point of
+    the action that it decodes says from where to push.
+    """
+    channels = model.action_channels, model.effect_channels
+    arrays = InteractionTensors.from_dataset(data, rows, *channels)
+    observed = condition_on_final_effect(model, arrays.effect[:, -1])
+    decoded = model.predict(model.encode(arrays.image), observed, torch.zeros(len(arrays), 1))
+    x, y = (decoded.action_mean[:, 0, channels[0].index(name)] for name in "xy")
+    return torch.atan2(y, x).numpy()
+
+
+def theta_along_effect(_: None, data: xr.Dataset, rows: np.ndarray) -> np.ndarray:
+    """The baseline: push in the direction of the wanted effect, θ (N,)."""
+    x, y = data["effect"].values[rows, -1, :2].T
+    return np.arctan2(y, x) + math.pi
+
+
+def executed_columns(
+    data: xr.Dataset, rows: np.ndarray, theta_rad: np.ndarray
+) -> dict[str, list[Any]]:
+    """Errors of executing pushes θ (N,) that should have the effects of interactions, by column."""
+    recipe, effects = Recipe.from_json(data.attrs["recipe"]), []
+    with Tabletop(recipe.world) as world:
+        for index, theta in zip(data["interaction"].values[rows].tolist(), theta_rad, strict=True):
+            obj, yaw, _ = sample_scene(recipe, index)
+            world.place(obj, (0.0, 0.0), yaw, config=sample_world(recipe, index, obj))
+            done = world.execute_primitive(Push(float(theta)), record_unreachable=True)
+            effects.append(done.effect[-1])
+    off = np.array(effects) - data["effect"].values[rows, -1]
+    theta_off = theta_rad - data["theta"].values[rows]
+    names = data["family"].attrs["flag_meanings"].split()
+    return {
+        "interaction": data["interaction"].values[rows].tolist(),
+        "category": [names[k] for k in data["family"].values[rows]],
+        "final_error": np.hypot(*off[:, :2].T).tolist(),
+        "yaw_error": [abs(wrap_angle(d)) for d in off[:, 3].tolist()],
+        "theta_error": [abs(wrap_angle(d)) for d in theta_off.tolist()],
+    }

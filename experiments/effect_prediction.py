@@ -12,7 +12,6 @@ predictions, of each object by each training.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import product
@@ -23,11 +22,9 @@ import numpy as np
 import pandas as pd
 
 from affordlib.commands import command, count_type, names_type, whole_type
-from affordlib.evaluation.baselines import BASELINES
 from affordlib.evaluation.predictions import calibration
 from affordlib.results import write_results
-from affordlib.workers import dask_client
-from experiments import reported, studies
+from experiments import reported, runner, studies
 from experiments.cross_validation import (
     LARGE,
     MODELS,
@@ -35,19 +32,19 @@ from experiments.cross_validation import (
     NETWORKS,
     PLANE,
     SETS,
+    TASKS,
     add_errors,
     job,
 )
 from experiments.grasps import grasp_rows, roc_rows, threshold_rows
-from experiments.runner import FOLDER, Result, frame, read, run
+from experiments.runner import FOLDER, Result, frame, read
 
 NAME = "effect_prediction"
-KNOWN_TO = dict.fromkeys(BASELINES, "size, yaw and category of the object, direction of the action")
-KNOWN_TO |= {"constant": "direction of the action, where it has one", "logistic": "size"}
 SAME_TRUTH = 1e-6
 """Results of one data set may differ by so much [m or rad] in the effects that were recorded: a set
 collected again, by another processor, has another hash, but the same effects."""
 
+CALIBRATION = ["coverage_50", "coverage_90", "std_mean", "nll"]
 Rows = list[dict[str, Any]]
 
 
@@ -57,9 +54,8 @@ def sorted_results(folder: str | Path = FOLDER) -> list[Result]:
     ValueError if results are stale, or do not agree about the effects of an interaction.
     """
     results = read(NAME, job, folder)
-    order = ["data", "model", "n", "seed", "fold"]
-    results.sort(key=lambda r: [MODELS.index(v) if k == "model" else str(v) if k == "n" else v
-                                for k, v in ((k, r[0][k]) for k in order)])  # fmt: skip
+    results.sort(key=lambda r: (r[0]["data"], MODELS.index(r[0]["model"]),
+                                str(r[0]["n"]), r[0]["seed"], r[0]["fold"]))  # fmt: skip
     tests = frame(results, "fold_test")
     truth = tests.filter(like="truth_").groupby([tests["data"], tests["interaction"]])
     apart = (truth.max() - truth.min()).max(axis=1)
@@ -91,66 +87,39 @@ def by_model(table: pd.DataFrame) -> Iterator[tuple[dict[str, Any], pd.DataFrame
         yield about | counts, group
 
 
-def by_category(group: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
-    """All rows, then those of each category."""
-    yield "all", group
-    yield from group.groupby("category")
-
-
 def mean_sem(group: pd.DataFrame, column: str) -> tuple[float, float]:
     """Mean and standard error over objects; categories have equal weights."""
-    each = []
-    for _, some in group.groupby("category"):
-        number, error = some["interaction"].to_numpy(), some[column].to_numpy()
-        order = np.argsort(number, kind="stable")
-        trainings = np.split(error[order], np.flatnonzero(np.diff(number[order])) + 1)
-        each.append(np.array([errors.mean() for errors in trainings]))
-    sems = [v.std(ddof=1) / np.sqrt(len(v)) if len(v) > 1 else 0.0 for v in each]
-    sem = np.sqrt(np.square(sems).sum()) / len(sems)
-    return float(np.mean([v.mean() for v in each])), float(sem)
-
-
-def spread(group: pd.DataFrame, column: str, name: str, unit: str) -> dict[str, float]:
-    """Columns of a table: mean and standard error, median, 95th percentile."""
-    mean, sem = mean_sem(group, column)
-    values = group[column].to_numpy()
-    median, p95 = float(np.median(values)), float(np.quantile(values, 0.95))
-    statistics = {"mean": mean, "sem": sem, "median": median, "p95": p95}
-    return {f"{name}_{statistic}_{unit}": value for statistic, value in statistics.items()}
+    objects = group.groupby(["category", "interaction"])[column].mean()
+    each = objects.groupby("category")
+    sems = each.sem().fillna(0)
+    return float(each.mean().mean()), float(np.sqrt(sems.pow(2).sum()) / len(sems))
 
 
 def error_rows(table: pd.DataFrame, primitive: str) -> Rows:
-    """Rows of final, trajectory and yaw errors; the yaw only of cuboids, which others have not."""
+    """Rows of errors by model and category; the yaw only of cuboids, which others have not.
+
+    table: of predictions, or of decoded pushes that were executed, which have an error in θ.
+    """
     unit, name = ("m", "final_error") if primitive in PLANE else ("rad", "error")
     rows = []
     for about, group in by_model(table):
         yaw_predicted = "yaw_error" in group and group["yaw_error"].notna().all()
-        for category, some in by_category(group):
+        for category, some in [("all", group), *group.groupby("category")]:
             row = about | {"object_class": category, "n": some["interaction"].nunique()}
-            row |= spread(some, "final_error", name, unit)
-            each = [mean_sem(one, "final_error")[0] for _, one in some.groupby(["seed", "fold"])]
-            row[f"trainings_sd_{unit}"] = float(np.std(each, ddof=1)) if len(each) > 1 else None
-            for key in ("trajectory_error", "after_contact_error"):
-                row[f"{key}_mean_{unit}"] = mean_sem(some, key)[0]
+            mean, sem = mean_sem(some, "final_error")
+            median, p95 = some["final_error"].quantile([0.5, 0.95])
+            for told, value in (("mean", mean), ("sem", sem), ("median", median), ("p95", p95)):
+                row[f"{name}_{told}_{unit}"] = float(value)
+            if "theta_error" in some:
+                row["theta_error_mean_rad"] = mean_sem(some, "theta_error")[0]
+            else:
+                each = [mean_sem(v, "final_error")[0] for _, v in some.groupby(["seed", "fold"])]
+                row[f"trainings_sd_{unit}"] = float(np.std(each, ddof=1)) if each[1:] else None
+                for key in ("trajectory_error", "after_contact_error"):
+                    row[f"{key}_mean_{unit}"] = mean_sem(some, key)[0]
             if primitive == "push":
-                turned = some["yaw_error"] if yaw_predicted and category == "cuboid" else None
-                mean = None if turned is None else mean_sem(some, "yaw_error")[0]
-                median = None if turned is None else float(np.median(turned))
-                row |= {"yaw_error_mean_rad": mean, "yaw_error_median_rad": median}
-            rows.append(row)
-    return rows
-
-
-def inverse_rows(results: list[Result]) -> Rows:
-    """Pushes decoded from wanted effects, executed."""
-    rows = []
-    for about, group in by_model(predictions_of(results, "push", "inverse")):
-        for category, some in by_category(group):
-            row = about | {"object_class": category, "n": some["interaction"].nunique()}
-            row |= spread(some, "final_error", "final_error", "m")
-            row["theta_error_mean_rad"] = mean_sem(some, "theta_error")[0]
-            cuboids = category == "cuboid"
-            row["yaw_error_mean_rad"] = mean_sem(some, "yaw_error")[0] if cuboids else None
+                turns = yaw_predicted and category == "cuboid"
+                row["yaw_error_mean_rad"] = mean_sem(some, "yaw_error")[0] if turns else None
             rows.append(row)
     return rows
 
@@ -158,43 +127,23 @@ def inverse_rows(results: list[Result]) -> Rows:
 def calibration_rows(results: list[Result]) -> Rows:
     """Coverage and likelihood at t = 1 by channel: folds together, and on the fixed test set."""
     rows = []
-    for primitive in ("push", "drag", "grasp", "rotate"):
+    for primitive in TASKS:
         table = predictions_of(results, primitive, "fixed_calibration")
         fixed = {tuple(about.values()): group for about, group in by_model(table)}
         for about, group in by_model(predictions_of(results, primitive, "fold_test")):
-            channels = [c for c in ("x", "y", "z", "yaw") if group.get(f"std_{c}") is not None
-                        and group[f"std_{c}"].notna().all()]  # fmt: skip
+            channels = [c[4:] for c in group.filter(like="std_") if group[c].notna().all()]
             together = {k: {c: group[f"{k}_{c}"].tolist() for c in channels}
                         for k in ("truth", "mean", "std")}  # fmt: skip
             columns = {"data": primitive, **about}
             rows += [columns | {"test": "folds"} | row for row in calibration(together)]
-            if tuple(about.values()) in fixed:
-                rows += [columns | {"test": "push_test"} | row
-                         for row in mean_calibration(fixed[tuple(about.values())])]  # fmt: skip
-    return rows
-
-
-def mean_calibration(group: pd.DataFrame) -> Rows:
-    """The calibration of each channel, averaged over trainings."""
-    rows = []
-    for channel, some in group.groupby("channel", sort=False):
-        keys = ("coverage_50", "coverage_90", "std_mean", "nll")
-        mean = {key: float(np.mean(some[key].to_numpy())) for key in keys}
-        rows.append({"channel": channel, "n": int(some["n_values"].iloc[0])} | mean)
-    return rows
-
-
-def baseline_rows(tables: dict[str, Rows]) -> Rows:
-    """What each baseline knows and its error, beside the networks, all categories together."""
-    rows = []
-    for data in ("push", "drag", "rotate"):
-        for row in tables[data]:
-            if row["object_class"] == "all":
-                about = {"data": data, **{key: row[key] for key in ("model", "folds", "n")}}
-                about["knows"] = KNOWN_TO.get(row["model"], "image, action at t = 0 and t = 1")
-                about["error_mean_m"] = row.get("final_error_mean_m")
-                about["error_mean_rad"] = row.get("error_mean_rad")
-                rows.append(about)
+            if (trainings := fixed.get(tuple(about.values()))) is not None:
+                for channel, some in trainings.groupby("channel", sort=False):
+                    test = {
+                        "test": "push_test",
+                        "channel": channel,
+                        "n": int(some["n_values"].max()),
+                    }
+                    rows.append(columns | test | some[CALIBRATION].mean().to_dict())
     return rows
 
 
@@ -206,32 +155,37 @@ FRAMES = {
 }
 
 
-def of_shared_folds(results: list[Result], models: Iterable[str]) -> list[Result]:
-    """The results of some models of all pushes, of the folds and seeds that all of them have."""
-    every = [r for r in results if r[0]["model"] in models and r[0]["data"] == "push"]
-    every = [r for r in every if r[0]["n"] == "all"]
-    folds = {model: {(a["fold"], a["seed"]) for a, _ in every if a["model"] == model}
-             for model in models}  # fmt: skip
+def of_shared_folds(results: list[Result], models: Iterable[str], part: str) -> pd.DataFrame:
+    """Tests of some models of all pushes, of the folds and seeds that all of them have."""
+    folds = {
+        model: {
+            (about["fold"], about["seed"])
+            for about, _ in results
+            if (about["model"], about["data"], about["n"]) == (model, "push", "all")
+        }
+        for model in models
+    }
     shared = set.intersection(*folds.values())
-    return [r for r in every if (r[0]["fold"], r[0]["seed"]) in shared]
+    every = [
+        r for r in results if r[0]["model"] in folds and (r[0]["fold"], r[0]["seed"]) in shared
+    ]
+    every = [r for r in every if (r[0]["data"], r[0]["n"]) == ("push", "all")]
+    return predictions_of(every, "push", part)
 
 
 def frame_rows(results: list[Result]) -> Rows:
     """Two networks in two frames, from the same folds of the same pushes, on the fixed test set."""
-    table = predictions_of(of_shared_folds(results, FRAMES), "push", "fixed_test")
-    rows = error_rows(table, "push")
+    rows = error_rows(of_shared_folds(results, FRAMES, "fixed_test"), "push")
     return [FRAMES[row["model"]] | row for row in rows]
 
 
 def ensemble_rows(results: list[Result]) -> Rows:
     """One network and several as one, on the fixed test set: errors, and calibration of (x, y)."""
-    both, calibrated = of_shared_folds(results, ("film", "ensemble")), {}
-    for about, group in by_model(predictions_of(both, "push", "fixed_calibration")):
-        plane = group[group["channel"].isin(("x", "y"))]
-        keys = ("coverage_50", "coverage_90", "nll")
-        calibrated[about["model"]] = {key: float(np.mean(plane[key].to_numpy())) for key in keys}
-    rows = error_rows(predictions_of(both, "push", "fixed_test"), "push")
-    return [row | calibrated[row["model"]] for row in rows]
+    both = "film", "ensemble"
+    plane = of_shared_folds(results, both, "fixed_calibration").query("channel in ('x', 'y')")
+    calibrated = plane.groupby("model")[["coverage_50", "coverage_90", "nll"]].mean()
+    rows = error_rows(of_shared_folds(results, both, "fixed_test"), "push")
+    return [row | calibrated.loc[row["model"]].to_dict() for row in rows]
 
 
 def write_tables(folder: str | Path = FOLDER, out_dir: str | Path = "data/results") -> Path:
@@ -253,10 +207,9 @@ def write_tables(folder: str | Path = FOLDER, out_dir: str | Path = "data/result
         "grasp_threshold": threshold_rows(grasps),
         "grasp_roc": roc_rows(grasps),
         "rotate": errors("rotate", "fold_test"),
-        "inverse": inverse_rows(results),
+        "inverse": errors("push", "inverse"),
         "calibration": calibration_rows(results),
     }
-    tables["baselines"] = baseline_rows(tables)
     tables["frames"], tables["ensemble"] = frame_rows(results), ensemble_rows(results)
     tables |= studies.tables(NAME, folder)
     trained = sum(about["model"] in NETWORKS for about, _ in results)
@@ -266,26 +219,17 @@ def write_tables(folder: str | Path = FOLDER, out_dir: str | Path = "data/result
 @command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
     """Train and test models in folds, and make the tables; what is there is not made again."""
-    parser = argparse.ArgumentParser(
-        prog="python -m experiments.effect_prediction", description=main.__doc__
-    )
+    parser = runner.parser(NAME, main.__doc__)
     models, sets = (f"of {','.join(known)}" for known in (MODELS, SETS))
     parser.add_argument("--models", type=names_type(MODELS), default=[], help=models)
     parser.add_argument("--sets", type=names_type(SETS), default="push", help=sets)
     parser.add_argument("--n", type=count_type, help="interactions that are used (default: all)")
     parser.add_argument("--folds", type=whole_type(1, N_FOLDS), default=N_FOLDS, help="of the ten")
     parser.add_argument("--seeds", type=count_type, default=1)
-    parser.add_argument("--raw", default=FOLDER, help="the folder of the jobs' results")
-    parser.add_argument("--out", default="data/results")
-    parser.add_argument("--scheduler", help="address of a Dask scheduler")
-    parser.add_argument("--workers", type=count_type, default=1, help="processes of this machine")
     options = parser.parse_args(argv)
     chosen = product(options.sets, range(options.seeds), range(options.folds), options.models)
     jobs = [job(model, data, options.n or "all", fold, seed) for data, seed, fold, model in chosen]
-    with dask_client(options.workers, options.scheduler) as client:
-        run(jobs, NAME, client, options.raw)
-    print(write_tables(options.raw, options.out))
-    return 0
+    return runner.make(jobs, NAME, options, write_tables)
 
 
 if __name__ == "__main__":

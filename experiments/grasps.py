@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy import stats
 
 from affordlib.primitives import Grasp
 
@@ -22,13 +23,9 @@ GOAL_TP, GOAL_TN = 0.90, 0.95
 Rows = list[dict[str, Any]]
 
 
-def wilson(k: int, n: int, z: float = 1.959964) -> tuple[float, float]:
+def wilson(k: int, n: int) -> tuple[float, float]:
     """Wilson's 95 % interval of a share of which k of n were seen (JASA 22, 1927)."""
-    if not 0 <= k <= n or n < 1:
-        raise ValueError(f"k of n must be 0 ≤ k ≤ n, n ≥ 1, got {k} of {n}")
-    centre = (k + z * z / 2) / (n + z * z)
-    half = z / (n + z * z) * math.sqrt(k * (n - k) / n + z * z / 4)
-    return max(0.0, centre - half), min(1.0, centre + half)
+    return tuple(stats.binomtest(k, n).proportion_ci(method="wilson"))
 
 
 def auc(score: np.ndarray, truth: np.ndarray, fold: np.ndarray) -> float | None:
@@ -49,10 +46,7 @@ def success_probability(mean_z: np.ndarray, std_z: np.ndarray) -> np.ndarray:
     return np.array([(1 + math.erf(v)) / 2 for v in standard])
 
 
-Held = tuple[dict[str, Any], bool, pd.DataFrame]
-
-
-def _held_out(grasps: pd.DataFrame) -> Iterator[Held]:
+def _held_out(grasps: pd.DataFrame) -> Iterator[tuple[dict[str, Any], bool, pd.DataFrame]]:
     """Held-out grasps of each model, what can roll and what cannot, with `score` and `lifted`.
 
     Of the first seed alone: another cross-validation tests the same grasps again.
