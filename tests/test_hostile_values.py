@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 import affordlib.interactions.collect as collecting
 from affordlib import evaluation, interactions, models, planning, show, world
 from affordlib.interactions.recipes import Recipe, Variation
+from affordlib.models.fit import EFFORT
 from affordlib.paths import repo_root
 from affordlib.perception import crop_from_depth
 from affordlib.plan_files import load_plan, save_plan
@@ -218,6 +219,7 @@ def valid_calls(shop):
             context={"support": "felt"},
             group="all",
         ),
+        "fit": call(quick_fit, data=log_of_eight(corners), model="np", seed=0),
         "crop_from_depth": call(
             crop_from_depth,
             depth=np.full((4, 4), 0.9),
@@ -377,6 +379,21 @@ def valid_calls(shop):
 
 
 NAMES = re.findall(r'^        "(\S+)": ', inspect.getsource(valid_calls), re.MULTILINE)
+
+
+def log_of_eight(corners):
+    """The same push eight times."""
+    log = interactions.Log("m", corners)
+    for _ in range(8):
+        log.add((0, 0, 0), (0, 1), ((-0.1, 0), (0, 0)), end=(0.01, 0, 0))
+    return log.tensors()
+
+
+def quick_fit(data, model, seed):
+    """`models.fit` with a single step of training."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(EFFORT, "few", (1, 1e-4, 1))
+        return models.fit(data, model, seed)
 
 
 def silent_nans(result):

@@ -1,0 +1,180 @@
+"""Models of a log of one's own: `fit` gives one that predicts where pushes take the object.
+
+Recipes that work from some 35 pushes on. What is called an outcome here has three columns:
+displacement x, y [m] and turn [rad], in the object's frame at the start.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from affordlib.interactions.log import PushLog
+from affordlib.models.neural_process import (
+    FEET,
+    NeuralProcess,
+    in_contact_frame,
+    load_neural_process,
+    train_neural_process,
+)
+from affordlib.models.quasi_static import quarter_turn
+from affordlib.types import check_count
+
+INNER_FOLDS = 3
+FEW, MOST_CONTEXT = 100, 64
+EFFORT = {"few": (100, 1e-4, 8), "many": (300, 3e-4, 8)}
+"""Of tuning to fewer than `FEW` pushes or more: steps, learning rate, tasks a step."""
+_PRIOR = 20.0
+
+
+@runtime_checkable
+class PushModel(Protocol):
+    """What predicts the outcomes of pushes."""
+
+    def predict(self, pushes: PushLog) -> tuple[np.ndarray, np.ndarray]:
+        """Mean and σ (n, 3) of displacement [m] and turn [rad], in the object's frame."""
+        ...
+
+
+def gyration_radius_m(outline_m: np.ndarray) -> float:
+    """Radius of gyration [m] of a polygon (k, 2) about its centroid, the origin."""
+    following = np.roll(outline_m, -1, axis=0)
+    area = outline_m[:, 0] * following[:, 1] - outline_m[:, 1] * following[:, 0]
+    squares = (outline_m**2 + outline_m * following + following**2).sum(axis=1)
+    return math.sqrt((area * squares).sum() / (6 * area.sum()))
+
+
+def push_rows(pushes: PushLog) -> Tensor:
+    """Pushes (n, 10) as `neural_process` and `quasi_static` take them, the outcome last."""
+    scale = gyration_radius_m(pushes.outline_m)
+    lengths = (pushes.contact_m / scale, pushes.length_m[:, None] / scale)
+    outcome = (pushes.displacement_m / scale, pushes.turn_rad[:, None])
+    parts = (lengths[0], pushes.normal, pushes.direction, lengths[1], *outcome)
+    return torch.from_numpy(np.concatenate(parts, axis=1)).float()
+
+
+def told_feet(pushes: PushLog) -> Tensor:
+    """Feet (n, 12, 3) in units of the radius of gyration; (n, 0, 3) where none are told.
+
+    They are told by `context["feet"]`, (n, k, 3): x, y [m] and share of the weight; k at most 12.
+    """
+    feet = torch.zeros(len(pushes), FEET if "feet" in pushes.context else 0, 3)
+    if feet.shape[1]:
+        known = np.asarray(pushes.context["feet"], dtype=np.float32)
+        if known.ndim != 3 or known.shape[2] != 3 or known.shape[1] > FEET:
+            raise ValueError(f"context feet must be (n, up to {FEET}, 3), got {known.shape}")
+        feet[:, : known.shape[1]] = torch.from_numpy(known)
+        feet[..., :2] /= gyration_radius_m(pushes.outline_m)
+    return feet
+
+
+class FittedNeuralProcess:
+    """The pretrained neural process, tuned to a log; the log itself is its context.
+
+    Other pushes of a query's group are the context; a group that the log does not have has none.
+    Of the log a few copies learn, each from all but a fold of it: their mean predicts, and how far
+    each is off on its own fold scales σ.
+    """
+
+    def __init__(self, data: PushLog, seed: int = 0) -> None:
+        self.rows, self.groups = push_rows(data), data.groups
+        self.fold = _folds(data.groups, INNER_FOLDS, seed)
+        self.members = [self._tuned(data, k, seed) for k in range(INNER_FOLDS)]
+        off = [self._off(data, k) for k in range(INNER_FOLDS)]
+        self.sigma_scale = sigma_scale(torch.cat(off))
+
+    def _tuned(self, data: PushLog, fold: int, seed: int) -> NeuralProcess:
+        """A copy of the pretrained network, tuned to all but a fold."""
+        kept = self.fold != fold
+        names = [g for g in np.unique(self.groups) if (kept & (self.groups == g)).sum() > 1]
+        model = copy.deepcopy(load_neural_process())
+        if names:
+            tasks = [self.rows[kept & (self.groups == g)] for g in names]
+            feet = told_feet(data)
+            feet = torch.stack([feet[kept & (self.groups == g)][0] for g in names])
+            effort = EFFORT["few" if len(data) < FEW else "many"]
+            generator = torch.Generator().manual_seed(seed)
+            train_neural_process(model, tasks, feet, effort, generator)
+        return model
+
+    def _off(self, data: PushLog, fold: int) -> Tensor:
+        """Residuals of a fold, in units of σ."""
+        held = data.select(self.fold == fold)
+        mean, std = self._predicted(held, self.members[fold], self.fold != fold)
+        rows = push_rows(held)
+        return (in_contact_frame(rows, rows[:, 7:]) - mean) / std
+
+    def _predicted(
+        self, pushes: PushLog, model: NeuralProcess, kept: np.ndarray
+    ) -> tuple[Tensor, Tensor]:
+        """Mean and σ (n, 3) in the frames of the contacts, given what is kept of the log."""
+        rows, feet = push_rows(pushes), told_feet(pushes)
+        mean, std = torch.zeros(len(rows), 3), torch.zeros(len(rows), 3)
+        for group in np.unique(pushes.groups):
+            of_group, known = pushes.groups == group, np.flatnonzero(kept & (self.groups == group))
+            few = np.linspace(0, len(known) - 1, min(len(known), MOST_CONTEXT)).round().astype(int)
+            query = torch.from_numpy(of_group)
+            mean[query], std[query] = model.predict(
+                rows[query, :7], self.rows[known[few]], feet[query][0]
+            )
+        return mean, std
+
+    def predict(self, pushes: PushLog) -> tuple[np.ndarray, np.ndarray]:
+        """Mean and σ (n, 3) of displacement [m] and turn [rad], in the object's frame."""
+        every = np.ones(len(self.rows), dtype=bool)
+        means, stds = zip(*(self._predicted(pushes, m, every) for m in self.members), strict=True)
+        mean = torch.stack(means).mean(0)
+        std = torch.stack(stds).mean(0) * self.sigma_scale
+        return in_object_frame(pushes, mean, std)
+
+
+def in_object_frame(pushes: PushLog, mean: Tensor, std: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    """Outcomes (n, 3) of unit lengths in the frames of the contacts, in metres in the object's."""
+    normal = torch.from_numpy(pushes.normal).float()
+    axes = torch.stack([normal, quarter_turn(normal)], 1)
+    metres = gyration_radius_m(pushes.outline_m)
+    xy = (mean[:, None, :2] @ axes)[:, 0] * metres
+    spread = (std[:, None, :2].square() @ axes.square())[:, 0].sqrt() * metres
+    both = torch.cat([xy, mean[:, 2:]], 1), torch.cat([spread, std[:, 2:]], 1)
+    return both[0].double().numpy(), both[1].double().numpy()
+
+
+def sigma_scale(off: Tensor) -> Tensor:
+    """Factors (3,) with which residuals (n, 3), in units of σ, fill its 50 and 90 % intervals.
+
+    x and y share one. Shrunk towards 1 as by 20 residuals, so that few are no lottery.
+    """
+    factors = []
+    for z in (off[:, :2].abs().flatten(), off[:, 2].abs()):
+        found = (z.quantile(0.5) / 0.6745).log() + (z.quantile(0.9) / 1.6449).log()
+        factors.append((found / 2 * len(z) / (len(z) + _PRIOR)).exp())
+    return torch.stack([factors[0], *factors])
+
+
+def _folds(groups: np.ndarray, k: int, seed: int) -> np.ndarray:
+    """The fold (n,) of each push, drawn within its group."""
+    rng, fold = np.random.default_rng(seed), np.zeros(len(groups), dtype=int)
+    for group in np.unique(groups):
+        of_group = groups == group
+        fold[of_group] = rng.permutation(of_group.sum()) % k
+    return fold
+
+
+def fit(data: PushLog, model: str = "np", seed: int = 0) -> PushModel:
+    """A model of a log: "np" is the pretrained neural process, tuned to it in 15 s of a core.
+
+    Raises ValueError for an unknown name, and for fewer than eight pushes in all.
+    """
+    if model not in MODELS:
+        raise ValueError(f"model must be one of {sorted(MODELS)}, got {model!r}")
+    if len(data) < 8:
+        raise ValueError(f"data must hold at least 8 interactions to learn from, got {len(data)}")
+    return MODELS[model](data, check_count("seed", seed, 0, 2**31))
+
+
+MODELS = {"np": FittedNeuralProcess}

@@ -1,0 +1,141 @@
+"""Quasi-static pushes of an object on point feet, in batches: what a planar push does by physics.
+
+A pusher moves slowly with Coulomb friction at one point of the object's edge; the feet rub on the
+table. While the pusher sticks, the object turns so that Σ w_i |v_i| is least, w_i the weight on
+foot i and v_i its velocity; if the force that this takes lies outside of the friction cone, the
+pusher slides with its force on the cone's edge (Peshkin and Sanderson, The motion of a pushed,
+sliding workpiece, IEEE J. Robotics and Automation 1988). Solved by reweighted least squares.
+
+Lengths are in units of the object's radius of gyration, vectors in its frame at the start, from its
+centroid. A push is a row of 7: contact point, inward normal and direction of the pusher (two each),
+and the pusher's travel from contact on. Feet are rows of 3: x, y and weight (in all 1).
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from scipy.optimize import minimize
+from torch import Tensor
+
+STEPS = 6
+"""Of a push; then the mean error is 0.1 % of the radius of gyration, against 40 steps."""
+ELLIPSOID = 100.0
+"""A smoothing with which |v_i| becomes its square: the ellipsoidal limit surface."""
+
+
+def cross(a: Tensor, b: Tensor) -> Tensor:
+    """The z component of the product of vectors (..., 2)."""
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
+def quarter_turn(a: Tensor) -> Tensor:
+    """Vectors (..., 2) turned by +90°."""
+    return torch.stack([-a[..., 1], a[..., 0]], -1)
+
+
+def quasi_static_push(
+    push: Tensor, feet: Tensor, friction: Tensor, smoothing: float = 0.05
+) -> Tensor:
+    """Displacement of the centroid and turn (B, 3), in the object's frame at the start.
+
+    push: (B, 7); feet: (B, F, 3); friction: (B,), of pusher and edge. smoothing: below this share
+    of the pusher's velocity a foot's friction falls linearly, instead of jumping at rest.
+    """
+    contact, normal, direction, travel = push.split([2, 2, 2, 1], dim=-1)
+    turn, moved = torch.zeros_like(friction), torch.zeros_like(contact)
+    tangent, state = quarter_turn(normal), torch.zeros(3, *friction.shape)
+    for _ in range(STEPS):
+        step = _rotated(direction, -turn) * travel / STEPS
+        at_contact, spin, state = _motion(contact, normal, step, feet, (friction, smoothing), state)
+        at_centroid = at_contact - spin[:, None] * quarter_turn(contact)
+        moved = moved + _rotated(at_centroid, turn + spin / 2)
+        contact = contact + ((step - at_contact) * tangent).sum(-1, keepdim=True) * tangent
+        turn = turn + spin
+    return torch.cat([moved, turn[:, None]], -1)
+
+
+def _rotated(a: Tensor, angle: Tensor) -> Tensor:
+    return angle.cos()[:, None] * a + angle.sin()[:, None] * quarter_turn(a)
+
+
+def _motion(
+    contact: Tensor,
+    normal: Tensor,
+    step: Tensor,
+    feet: Tensor,
+    friction_smoothing: tuple[Tensor, float],
+    state: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """How the object's point at the contact moves (B, 2), its turn (B,), and where to go on."""
+    friction, smoothing = friction_smoothing
+    size = step.norm(dim=-1, keepdim=True)
+    u = step / size
+    per_turn = quarter_turn(feet[..., :2] - contact[:, None])  # velocity of a foot
+
+    def weights(v: Tensor) -> Tensor:
+        return feet[..., 2] / (v.square().sum(-1) + smoothing**2).sqrt()
+
+    turn, along, turn_sliding = state
+    for _ in range(3):
+        v = u[:, None] + turn[:, None, None] * per_turn
+        k = weights(v)
+        turn = -(k * (u[:, None] * per_turn).sum(-1)).sum(1)
+        turn = turn / ((k * per_turn.square().sum(-1)).sum(1) + 1e-9)
+    v = u[:, None] + turn[:, None, None] * per_turn
+    force, tangent = (weights(v)[..., None] * v).sum(1), quarter_turn(normal)
+    sideways = (force * tangent).sum(-1)
+    slides = sideways.abs() > friction * (force * normal).sum(-1)
+    edge = normal + (friction * sideways.sign())[:, None] * tangent
+    edge = edge / edge.norm(dim=-1, keepdim=True)
+    across = quarter_turn(edge)
+    for _ in range(5):  # v_i = edge + along * across + turn * per_turn, up to a factor
+        v = (edge + along[:, None] * across)[:, None] + turn_sliding[:, None, None] * per_turn
+        k = weights(v)
+        a = (across[:, None] * per_turn).sum(-1)
+        a11, a12 = k.sum(1), (k * a).sum(1)
+        a22 = (k * per_turn.square().sum(-1)).sum(1)
+        right = -(k * (edge[:, None] * per_turn).sum(-1)).sum(1)
+        det = a11 * a22 - a12**2 + 1e-9
+        along, turn_sliding = -a12 * right / det, a11 * right / det
+    sliding = edge + along[:, None] * across
+    factor = (u * normal).sum(-1) / (sliding * normal).sum(-1).clamp_min(0.05)
+    at_contact = torch.where(slides[:, None], sliding * factor[:, None], u)
+    spin = torch.where(slides, turn_sliding * factor, turn)
+    return at_contact * size, spin * size[:, 0], torch.stack([turn, along, turn_sliding])
+
+
+class AnalyticPusher:
+    """Physics with two numbers fitted to pushes: friction, and size or smoothing of the support.
+
+    Without feet the limit surface is an ellipsoid and the size its ratio of torque to force, in
+    radii of gyration; with known feet (F, 3) it is their smoothing.
+    """
+
+    def __init__(self, push: Tensor, outcome: Tensor, feet: Tensor | None = None) -> None:
+        """push: (N, 7); outcome: (N, 3), displacement and turn. Raises ValueError for none."""
+        if not len(push):
+            raise ValueError("push must hold at least one push, got none")
+        self.feet = feet
+
+        def cost(logs: list[float]) -> float:
+            self.friction, self.size = (math.exp(v) for v in logs)
+            error = (self.predict(push) - outcome).norm(dim=-1)
+            far = sum((v - c) ** 2 for v, c in zip(logs, self.middle, strict=True))
+            return float(error.sum()) + 0.05 * far
+
+        self.middle = math.log(0.35), math.log(0.8 if feet is None else 0.08)
+        best = minimize(cost, self.middle, method="Nelder-Mead", options={"maxfev": 60})
+        self.friction, self.size = (math.exp(v) for v in best.x)
+
+    @torch.no_grad()
+    def predict(self, push: Tensor) -> Tensor:
+        """Displacement and turn (N, 3) of pushes (N, 7)."""
+        feet, smoothing = self.feet, self.size
+        if feet is None:
+            angle = torch.arange(3) * (2 * math.pi / 3)
+            ring = [self.size * angle.cos(), self.size * angle.sin(), torch.full((3,), 1 / 3)]
+            feet, smoothing = torch.stack(ring, -1), ELLIPSOID
+        friction = torch.full((len(push),), self.friction)
+        return quasi_static_push(push, feet.expand(len(push), -1, -1), friction, smoothing)

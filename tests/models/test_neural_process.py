@@ -1,0 +1,195 @@
+"""Physics of a quasi-static push, and the neural process that is pretrained on it."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import minimize
+
+from affordlib.interactions.log import PushLog
+from affordlib.models.fit import fit, sigma_scale
+from affordlib.models.neural_process import (
+    NeuralProcess,
+    in_contact_frame,
+    load_neural_process,
+    rotation,
+    save_neural_process,
+    transformed,
+)
+from affordlib.models.quasi_static import ELLIPSOID, AnalyticPusher, quasi_static_push
+from experiments.pretrain_np import simulate
+
+TRIANGLE_M = np.array([(-0.05, -0.05), (0.1, -0.05), (-0.05, 0.1)])
+
+
+@pytest.fixture(scope="module")
+def simulated():
+    return simulate(24, torch.Generator().manual_seed(5))
+
+
+@pytest.fixture(scope="module")
+def shipped():
+    return load_neural_process()
+
+
+def log_of(rows, group="a"):
+    """Simulated pushes (n, 10) of an object of one's own as a log."""
+    rows = rows.double().numpy()
+    n = len(rows)
+    return PushLog(
+        rows[:, :2] * 0.05,
+        rows[:, 2:4],
+        rows[:, 4:6],
+        rows[:, 6] * 0.05,
+        rows[:, 7:9] * 0.05,
+        rows[:, 9],
+        np.array([group] * n),
+        {},
+        np.full((n, 2, 2), np.nan),
+        np.full((n, 2, 3), np.nan),
+        TRIANGLE_M,
+    )
+
+
+def test_push_through_the_centre_of_friction_goes_straight():
+    feet = torch.tensor([[[1.0, 0.0, 0.25], [-1, 0, 0.25], [0, 1, 0.25], [0, -1, 0.25]]])
+    push = torch.tensor([[-1.0, 0.0, 1.0, 0.0, 1.0, 0.0, 0.4]])
+    got = quasi_static_push(push, feet, torch.tensor([0.3]))
+    torch.testing.assert_close(got, torch.tensor([[0.4, 0.0, 0.0]]))
+
+
+def test_sticking_pusher_with_an_ellipsoid_turns_as_the_closed_form_says():
+    # Lynch and Mason, Stable pushing, IJRR 1996: with r the lever and c the ratio of torque to
+    # force, a sticking pusher along x at (0, r) turns by -r / (c² + r²) per distance.
+    r, c, small = 0.5, 0.8, 1e-3
+    angle = torch.arange(3) * (2 * math.pi / 3)
+    feet = torch.stack([c * angle.cos(), c * angle.sin(), torch.full((3,), 1 / 3)], -1)[None]
+    push = torch.tensor([[-0.7, r, 1.0, 0.0, 1.0, 0.0, small]])
+    got = quasi_static_push(push, feet, torch.tensor([5.0]), ELLIPSOID)[0, 2] / small
+    lever = np.array([-0.7, r])
+    dissipation = minimize(
+        lambda w: (1 + w[0] * lever[1]) ** 2 + (w[0] * lever[0]) ** 2 + c**2 * w[0] ** 2, [0.0]
+    )
+    assert float(got) == pytest.approx(dissipation.x[0], rel=1e-3)
+
+
+def test_frictionless_pusher_moves_the_contact_along_the_normal_force_only():
+    # The force is the normal, and an ellipsoid answers it: v_y = 0 at the centroid.
+    angle = torch.arange(3) * (2 * math.pi / 3)
+    feet = torch.stack([angle.cos(), angle.sin(), torch.full((3,), 1 / 3)], -1)[None]
+    push = torch.tensor([[-0.7, 0.3, 1.0, 0.0, math.cos(0.6), math.sin(0.6), 1e-3]])
+    x, y, turn = quasi_static_push(push, feet, torch.tensor([0.0]), ELLIPSOID)[0].tolist()
+    assert abs(y) < 1e-3 * x
+    assert turn == pytest.approx(-0.3 * x, rel=1e-2)  # torque -0.3, c = 1
+
+
+def test_simulated_pushes_turn_and_mirror_with_the_object(simulated):
+    rows, feet, _ = simulated
+    matrix = rotation(torch.tensor([0.7]), torch.tensor([True]))
+    got, friction = [], torch.full((48,), 0.4)
+    for m in (torch.eye(2)[None], matrix):
+        push, support = transformed(rows[:1], m), transformed(feet[:1], m)
+        got.append(quasi_static_push(push[0, :, :7], support.expand(48, -1, -1), friction))
+    both = torch.cat([rows[:1, :, :7], got[0][None]], -1)
+    torch.testing.assert_close(transformed(both, matrix)[0, :, 7:], got[1], atol=2e-5, rtol=0)
+
+
+def test_analytic_pusher_finds_the_numbers_that_made_the_pushes(simulated):
+    push = simulated[0][0, :40, :7]
+    made = AnalyticPusher(push, torch.zeros(40, 3))
+    made.friction, made.size = 0.3, 0.6
+    found = AnalyticPusher(push, made.predict(push))
+    assert (found.friction, found.size) == pytest.approx((0.3, 0.6), rel=0.1)
+
+
+def test_order_of_context_and_what_is_not_seen_do_not_matter(shipped, simulated):
+    rows, feet, _ = simulated
+    query, context, told = rows[:4, 32:], rows[:4, :20], feet[:4]
+    with torch.no_grad():
+        expected = shipped(query, context, told)
+        order = torch.randperm(20, generator=torch.Generator().manual_seed(0))
+        got = shipped(query, context[:, order], told.flip(1))
+        seen = torch.arange(32).expand(4, -1) < 20
+        hidden = shipped(query, rows[:4, :32], told, seen)
+        alone = shipped(query[:, 3:4], context, told)
+    for mine, other, masked, one in zip(expected, got, hidden, alone, strict=True):
+        torch.testing.assert_close(mine, other, atol=1e-5, rtol=0)
+        torch.testing.assert_close(mine, masked, atol=1e-5, rtol=0)
+        torch.testing.assert_close(mine[:, 3:4], one, atol=1e-5, rtol=0)
+
+
+def test_prediction_turns_and_mirrors_with_the_object(shipped, simulated):
+    rows, feet, _ = simulated
+    matrix = rotation(torch.tensor([math.pi / 2]), torch.tensor([True]))
+    expected = shipped.predict(rows[0, 32:, :7], rows[0, :20], feet[0])
+    turned = [transformed(v[:1], matrix)[0] for v in (rows, feet)]
+    got = shipped.predict(turned[0][32:, :7], turned[0][:20], turned[1])
+    torch.testing.assert_close(got[0], expected[0] * torch.tensor([1, -1, -1]), atol=1e-5, rtol=0)
+    torch.testing.assert_close(got[1], expected[1], atol=1e-5, rtol=0)
+
+
+def test_context_and_feet_make_predictions_better(shipped, simulated):
+    rows, feet, truth = simulated
+    truth, off = in_contact_frame(rows, truth)[:, 32:], []
+    for n, told in ((0, 0), (5, 0), (20, 0), (0, 1)):
+        with torch.no_grad():
+            mean, std = shipped(rows[:, 32:], rows[:, :n], feet * told)
+        assert bool((std > 0).all())
+        off.append(float((mean - truth).norm(dim=-1).mean()))
+    assert off[0] > off[1] > off[2], off
+    assert off[3] < off[0], off
+
+
+def test_checkpoint_gives_back_the_same_bits(shipped, simulated, tmp_path):
+    rows, feet, _ = simulated
+    again = load_neural_process(save_neural_process(shipped, tmp_path / "x.safetensors", {}))
+    for one, other in zip(
+        shipped.predict(rows[0, :5, :7], rows[0, 5:], feet[0]),
+        again.predict(rows[0, :5, :7], rows[0, 5:], feet[0]),
+        strict=True,
+    ):
+        assert torch.equal(one, other)
+    with pytest.raises(ValueError, match="no neural process"):
+        load_neural_process("film_500")
+
+
+def test_tuning_lowers_the_error_where_the_world_is_another():
+    # A world in which everything goes 15 % less far than in the one pretrained on.
+    rows = simulate(1, torch.Generator().manual_seed(8))[0][0]
+    rows[:, 7:] *= 0.85
+    train, test = log_of(rows[:40]), log_of(rows[40:])
+    model = fit(train, "np")
+    truth = np.column_stack([test.displacement_m, test.turn_rad]) / [0.05, 0.05, 1]
+    untuned = FittedOnNothing(train)
+    off = [np.abs(m.predict(test)[0] / [0.05, 0.05, 1] - truth).mean() for m in (model, untuned)]
+    assert off[0] < off[1], off
+
+
+class FittedOnNothing:
+    """The pretrained network with a log as context."""
+
+    def __init__(self, data):
+        self.model = fit(data, "np")
+        self.model.members = [load_neural_process()]
+
+    def predict(self, pushes):
+        return self.model.predict(pushes)
+
+
+def test_sigma_scale_is_that_of_the_residuals_where_there_are_many():
+    off = torch.randn(4000, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([2, 2, 3])
+    torch.testing.assert_close(sigma_scale(off), torch.tensor([2.0, 2, 3]), atol=0.1, rtol=0)
+    assert (sigma_scale(off[:1]).log().abs() < 0.2).all()
+
+
+def test_fit_refuses_what_it_does_not_know():
+    rows = simulate(1, torch.Generator().manual_seed(8))[0][0]
+    with pytest.raises(ValueError, match="model must be one of"):
+        fit(log_of(rows), "x")
+    with pytest.raises(ValueError, match="at least 8"):
+        fit(log_of(rows[:7]))
+
+
+def test_untrained_network_has_the_stated_size():
+    assert sum(p.numel() for p in NeuralProcess().parameters()) < 250_000
