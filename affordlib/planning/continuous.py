@@ -111,8 +111,12 @@ def _descend(effects: EffectMap, target: Tensor, chains: Chains, partial: bool) 
     return direction, phase
 
 
-def _correct(
-    effects: EffectMap, target: Tensor, chain: Chains, partial: bool, corrections: int
+def correct(
+    effects: EffectMap,
+    target: Tensor,
+    chain: Chains,
+    partial: bool,
+    corrections: int = CORRECTIONS,
 ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
     """One chain (B = 1), brought to the target as the model predicts it, by Newton's method.
 
@@ -186,7 +190,7 @@ def plan_continuous(
     steps = ()
     if candidates:
         best = min(candidates, key=lambda one: one[0])[1:]
-        chain, predicted = _correct(
+        chain, predicted = correct(
             effects, target, best, mode.partial, 1 if draft else CORRECTIONS
         )
         if not _allowed(problem, predicted[0][None], chain[None, :, 0]).all():

@@ -49,10 +49,10 @@ def descend(
     direction_only: bool = False,
     trace: list[tuple[np.ndarray, np.ndarray]] | None = None,
 ) -> tuple[torch.Tensor, int]:
-    """The effect input (1, C_e) whose predicted effect at t = 1 is nearest to the target (2,).
+    """Effect inputs (starts, C_e) whose predicted effect at t = 1 is near the target (2,).
 
     Descends the gradient of the mean square error with Adam, on the input alone, from some random
-    starts side by side, and keeps the best. direction_only keeps the input on the circle of
+    starts side by side; the best is the first. direction_only keeps the input on the circle of
     effects that full pushes have. trace, if given, receives each iteration's inputs (starts, 2)
     [m] and losses (starts,) [m²]. Also returns the number of iterations. To the letter it begins,
     and may end, with effects that no push has; nobody is warned of each.
@@ -84,8 +84,7 @@ def descend(
         before = xy.detach().clone()
         (sought.grad,) = torch.autograd.grad(losses.sum(), [sought])
         optimiser.step()
-    best = int(losses.detach().argmin())
-    return effect.detach()[best : best + 1], iterations
+    return effect.detach()[losses.detach().argsort(stable=True)], iterations
 
 
 def _predict(
@@ -121,8 +120,8 @@ def plan_gradient(
     starts: random starts of the descent; the paper has one, lost where it lies opposite the goal.
     direction_only: ours; search on the circle of effects that actions have, not in the whole plane,
     where the network can be made to predict anything. snap: execute the primitive in the decoded
-    direction instead of the decoded action trajectory, as drags always are. A plan ends before an
-    action that is out of reach.
+    direction instead of the decoded action trajectory, as drags always are. Of the starts the best
+    that is in reach is taken; where none is, the plan ends.
     """
     began = time.perf_counter()
     check_count("samples", samples, 2, 10_000)
@@ -138,15 +137,21 @@ def plan_gradient(
     generator = np.random.default_rng(check_count("seed", seed, least=0))
     xy, target = np.asarray(problem.start_xy_m), np.asarray(goal.xy_m)
     steps: list[Step] = []
-    iterations = 0
+    iterations, turned = 0, 0.0
     t = torch.linspace(0, 1, samples)
     while len(steps) < mode.max_steps and np.hypot(*(target - xy)) > SUCCESS_M:
-        effect, n = descend(effects, target - xy, generator, starts, direction_only)
+        found, n = descend(effects, target - xy, generator, starts, direction_only)
         iterations += n
-        with torch.no_grad():
-            prediction = _predict(model, effects.features, effect, t[None])
+        for effect in found:  # the best that is in reach
+            with torch.no_grad():
+                prediction = _predict(model, effects.features, effect[None], t[None])
+            action = prediction.action_mean[0, :, a_columns].numpy().astype(float)
+            angle = math.atan2(*(action[-1] - action[0])[::-1])
+            if problem.reachable(xy[None], np.array([angle]))[0]:
+                break
+        else:
+            break
         path = prediction.effect_mean[0, :, columns].numpy().astype(float)
-        action = prediction.action_mean[0, :, a_columns].numpy().astype(float)
         std = prediction.effect_std[0, :, columns].norm(dim=-1).numpy()
         stop = samples - 1
         if mode.partial:
@@ -156,24 +161,21 @@ def plan_gradient(
                 stop = samples - 1  # the path only jitters at its end: the goal lies beyond it
         if stop == 0:
             break
-        end = xy + path[stop]
+        xy_before, xy = xy, xy + path[stop]
+        if "yaw" in model.effect_channels:
+            turned += float(prediction.effect_mean[0, stop, model.effect_channels.index("yaw")])
         shown = np.linspace(0, stop, min(PATH_SAMPLES, stop + 1)).round().astype(int)
-        heading = action[-1] - action[0]
-        angle = math.atan2(heading[1], heading[0])
-        if not problem.reachable(xy[None], np.array([angle]))[0]:
-            break
-        decoded = None if snap or kind is Drag else action[: stop + 1]
         steps.append(
             Step(
                 kind.towards(angle),
                 float(t[stop]),
-                tuple(end.tolist()),
-                xy + path[shown],
-                decoded,
+                tuple(xy.tolist()),
+                xy_before + path[shown],
+                None if snap or kind is Drag else action[: stop + 1],
                 float(std[stop]),
+                turned,
             )
         )
-        xy = end
         if stop < samples - 1:
             break
     reached = bool(np.hypot(*(target - xy)) <= goal.tolerance_m)

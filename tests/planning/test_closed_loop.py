@@ -137,7 +137,8 @@ def test_an_object_that_is_gone_is_lost(change):
     assert (went.status, len(went.steps)) == ("lost", 1)
 
 
-def test_a_goal_that_moves_is_followed():
+@pytest.mark.parametrize("planner", [plan_astar, plan_continuous, plan_gradient])
+def test_a_goal_that_moves_is_followed(planner):
     goal, robot = Goal((0.1, 0.0), EXACT_M, turn_rad=-0.4), PointRobot(yaw_rad=0.0)
     goals = [Goal((0.1, 0.08), EXACT_M, turn_rad=turn) for turn in (-0.4, -0.8, -1.2)]
 
@@ -147,7 +148,7 @@ def test_a_goal_that_moves_is_followed():
         if goals and (off < 0.05 or goal.xy_m == (0.1, 0.0)):
             goal = goals.pop(0)
 
-    went = loop(robot, lambda: goal, on_action=move)
+    went = loop(robot, lambda: goal, on_action=move, planner=planner)
     assert went.reached, went.message
     assert (goals, went.goal) == ([], goal)
     assert goal.distance_m(robot.xy_m) < EXACT_M
