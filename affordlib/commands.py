@@ -1,7 +1,5 @@
 """What command lines share: the kinds of their arguments, and how they end."""
 
-from __future__ import annotations
-
 import argparse
 import functools
 import inspect

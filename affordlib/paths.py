@@ -1,7 +1,5 @@
 """Where things lie: the repository, its shipped data, and the folders that runs write to."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

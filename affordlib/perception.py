@@ -5,8 +5,6 @@ Images are (2, 48, 48): depth [m] from a plane 1 m above the table, and the mask
 table, as a map is read.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

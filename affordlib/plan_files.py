@@ -3,8 +3,6 @@
 Numbers come back to the last bit; a σ that the planner did not give is null in the file.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import os

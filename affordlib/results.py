@@ -11,8 +11,6 @@ and `python -m affordlib.results README.md` fills it; `--check` fails if that wo
 Any other option, such as `mode=multi_partial`, keeps the rows that have that value.
 """
 
-from __future__ import annotations
-
 import argparse
 import glob
 import importlib.metadata

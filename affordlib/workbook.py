@@ -9,8 +9,6 @@ results exist and its executed copy holds the hash of all that they depend on, w
 skips what is complete and goes on from there.
 """
 
-from __future__ import annotations
-
 import argparse
 import ast
 import copy

@@ -1,5 +1,3 @@
 """Error statistics, baselines beside the models, their predictions, and planning tasks."""
 
 from affordlib.evaluation.metrics import error_row, refuse_seen
-
-__all__ = ["error_row", "refuse_seen"]

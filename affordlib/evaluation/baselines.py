@@ -10,8 +10,6 @@ Networks must read size and yaw from the image; nearest and gaussian_process are
 work in the frame of the action, which networks in the frame of the table do not.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """Rows of error statistics, and the guard against testing a model on what it was trained on."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -4,8 +4,6 @@ Models see the image and the commanded action at t = 0 and t = 1, and no effect.
 lists, one entry an interaction, so that they can be stored as they are.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

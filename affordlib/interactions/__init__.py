@@ -3,14 +3,3 @@
 from affordlib.interactions.dataset import InteractionTensors, Scaler, Split, split_interactions
 from affordlib.interactions.log import Log, PushLog
 from affordlib.interactions.store import CorruptedDataError, open_interactions
-
-__all__ = [
-    "CorruptedDataError",
-    "InteractionTensors",
-    "Log",
-    "PushLog",
-    "Scaler",
-    "Split",
-    "open_interactions",
-    "split_interactions",
-]

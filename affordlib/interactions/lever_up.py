@@ -8,8 +8,6 @@ body that is tilted by 65°. Of the commanded action x and z change, relative to
 blade slides in, then lifts along its arc).
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

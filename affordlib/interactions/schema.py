@@ -1,7 +1,5 @@
 """What one interaction leaves in a data set: its arrays, dimensions, units and provenance."""
 
-from __future__ import annotations
-
 from dataclasses import fields
 from importlib import metadata
 

@@ -4,8 +4,6 @@
 and of every array, so that sets can be compared without reading them.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json

@@ -9,27 +9,3 @@ from affordlib.models.film import FiLMConfig, FiLMNetwork
 from affordlib.models.fit import fit
 from affordlib.models.protocol import EffectModel, condition_on_primitives
 from affordlib.models.training import TrainingConfig, train, train_literal, train_model
-
-__all__ = [
-    "AffordanceCNP",
-    "CNPConfig",
-    "EffectModel",
-    "EffectNetwork",
-    "FiLMConfig",
-    "FiLMNetwork",
-    "NetworkConfig",
-    "OutOfRangeWarning",
-    "TrainingConfig",
-    "TrainingDomain",
-    "build",
-    "calibration_rows",
-    "condition_on_primitives",
-    "coverage",
-    "fit",
-    "fit_sigma_scale",
-    "load_checkpoint",
-    "save_checkpoint",
-    "train",
-    "train_literal",
-    "train_model",
-]

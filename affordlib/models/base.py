@@ -1,7 +1,5 @@
 """What all networks share: scales, domain, frame and loss; subclasses are the architectures."""
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields
@@ -54,7 +52,7 @@ class NetworkConfig:
                 raise ValueError(f'{name} must name x and y for frame="push", got {channels}')
             object.__setattr__(self, name, channels)
         for size in fields(self):
-            if size.type == "int":
+            if type(size.default) is int:
                 check_within(size.name, check_count(size.name, getattr(self, size.name)), 1, 4096)
         if not 0 < self.sigma_floor < 10:
             raise ValueError(f"sigma_floor must lie in (0, 10), got {self.sigma_floor!r}")

@@ -6,8 +6,6 @@ s² = mean ((e - μ) / σ)² (a temperature: Guo et al., On calibration of moder
 2017).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

@@ -4,8 +4,6 @@ One file is replaced in one step, with a hash inside of weights and description.
 training that can be resumed is a zip of PyTorch's, read without running any code in it.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json

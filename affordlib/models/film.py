@@ -10,8 +10,6 @@ f: a small network on the image's circular harmonics, which rotate exactly into 
 visual reasoning with a general conditioning layer, AAAI 2018.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

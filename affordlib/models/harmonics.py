@@ -1,7 +1,5 @@
 """Circular harmonics of an image, which rotate exactly, and what networks that read them share."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from itertools import pairwise

@@ -11,8 +11,6 @@ changes from there on; n rises from 0 at t_l to 1. Any t is predicted directly, 
 With nothing observed d_l is that of t = 0, where a displacement is zero.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

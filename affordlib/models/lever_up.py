@@ -10,8 +10,6 @@ network trained for the one is trained for the other. A conditional network is t
 all protocols together; a recurrent one for each alone.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 

@@ -10,8 +10,6 @@ study (Seker, Tekden and Ugur, Deep effect trajectory prediction in robot manipu
 Autonomous Systems, 2019) is among the experiments.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

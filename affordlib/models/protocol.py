@@ -1,7 +1,5 @@
 """What every model offers and planners see: encode an object once, predict many queries at once."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Protocol, runtime_checkable
 

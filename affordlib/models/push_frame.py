@@ -5,8 +5,6 @@ what a rotation does. Image, action and effect are rotated into the frame, predi
 back. A rotation is given by (cos α, sin α), one per query.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

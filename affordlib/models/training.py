@@ -5,8 +5,6 @@ targets, share a step, some 200 times as many targets a second. `train_literal` 
 for comparison. `train_model` does all: data set and split in, calibrated network out.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable

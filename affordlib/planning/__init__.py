@@ -19,24 +19,3 @@ from affordlib.planning.gradient import plan_gradient
 from affordlib.planning.problem import MODES, PlanMode, PlanningProblem
 from affordlib.planning.robot import Execution, Robot
 from affordlib.planning.skills import Skills
-
-__all__ = [
-    "MODES",
-    "ClosedLoopConfig",
-    "ClosedLoopResult",
-    "Disturbance",
-    "DisturbanceSchedule",
-    "EffectMap",
-    "Execution",
-    "PlanMode",
-    "PlanningProblem",
-    "Robot",
-    "Skills",
-    "action_limit",
-    "execute_plan",
-    "plan_astar",
-    "plan_continuous",
-    "plan_gradient",
-    "run_closed_loop",
-    "sample_disturbances",
-]

@@ -19,26 +19,3 @@ from affordlib.show.plots import (
     plot_table,
     save_figure,
 )
-
-__all__ = [
-    "GOAL",
-    "NEUTRAL",
-    "PREDICTION",
-    "TRUTH",
-    "ConditioningExplorer",
-    "FrameRecorder",
-    "GoalPicker",
-    "PhaseSlider",
-    "closed_loop",
-    "open_loop",
-    "outline_in_lever_frame",
-    "plot_closed_loop",
-    "plot_depth",
-    "plot_footprint",
-    "plot_levered",
-    "plot_outcome",
-    "plot_plan",
-    "plot_table",
-    "save_figure",
-    "show_animation",
-]

@@ -1,7 +1,5 @@
 """Small animations of the robot at work: recorded frames, encoded as a GIF or PNG by Pillow."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 

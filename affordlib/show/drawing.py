@@ -3,8 +3,6 @@
 Everything they need is in this package; nothing is fetched from anywhere.
 """
 
-from __future__ import annotations
-
 import base64
 import html
 import io

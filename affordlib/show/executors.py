@@ -1,7 +1,5 @@
 """How a plan is executed while somebody watches, who may stop it, disturb it, or move its goal."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

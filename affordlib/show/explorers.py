@@ -1,7 +1,5 @@
 """Two widgets: what a model predicts from what it is given, and where a partial action ends."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import ipywidgets as widgets

@@ -4,8 +4,6 @@ A view on plain objects: everything it does can be done with a planner, `execute
 `Tabletop.shove`.
 """
 
-from __future__ import annotations
-
 import html
 import itertools
 import math

@@ -1,7 +1,5 @@
 """What stands beside the table of a goal picker: menus, sliders, buttons and words."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace

@@ -3,8 +3,6 @@
 Every function draws into the `ax` that it is given and returns it. Positions are in centimetres.
 """
 
-from __future__ import annotations
-
 import io
 import math
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """The table from above, drawn as SVG: millimetres from its middle, y downwards."""
 
-from __future__ import annotations
-
 import html
 import math
 from collections.abc import Sequence

@@ -1,6 +1,6 @@
 """All that touches PyBullet: the tabletop, its objects, the arm and the camera."""
 
-import affordlib.world._quiet_pybullet  # noqa: F401  (must come first)
+import affordlib.world._quiet_pybullet  # must come first
 from affordlib.types import NothingSeenError, UnreachableError
 from affordlib.world.objects import (
     CATEGORIES,
@@ -15,20 +15,3 @@ from affordlib.world.objects import (
 )
 from affordlib.world.robot import BASE_X_M, REACH_M
 from affordlib.world.tabletop import Tabletop
-
-__all__ = [
-    "BASE_X_M",
-    "CATEGORIES",
-    "REACH_M",
-    "Cuboid",
-    "LyingCylinder",
-    "NothingSeenError",
-    "Prism",
-    "Sphere",
-    "Tabletop",
-    "TabletopObject",
-    "UnreachableError",
-    "UprightCylinder",
-    "WorldConfig",
-    "category_named",
-]

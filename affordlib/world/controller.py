@@ -1,7 +1,5 @@
 """The arm in a PyBullet client: follows waypoints of its joints, and measures what it can feel."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Executing one command on the object, from the arm's approach to the object at rest."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """An object in a PyBullet client: its body, how it lies, and what may disturb it."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

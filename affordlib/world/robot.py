@@ -6,8 +6,6 @@ shaft straight down with a flat blade along x. W is the frame of the table's cen
 between the finger tips or at the blade's tip, z down and y along the opening.
 """
 
-from __future__ import annotations
-
 import math
 import tempfile
 import xml.etree.ElementTree as ET
