@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from affordlib.primitives import Primitive, primitive_named
-from affordlib.results import write_text_atomically
+from affordlib.results import write_atomically
 from affordlib.types import Goal, Plan, Step
 
 _MARK = b'{\n "goal"'
@@ -24,7 +24,7 @@ def save_plan(path: str | os.PathLike[str], plan: Plan) -> Path:
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     text = json.dumps(plan, default=_as_data, indent=1, allow_nan=False)
-    write_text_atomically(path, text + "\n", _MARK)
+    write_atomically(path, text + "\n", _MARK)
     return path
 
 

@@ -2,7 +2,7 @@
 
 A notebook writes `<out_dir>/<notebook>.json`, which is
 `{"notebook", "parameters", "versions", "tables": {name: [flat rows]}}`. Columns carry their units
-(`mean_m`, `plan_ms_median`, `tp_percent`). No table is typed: a page in Markdown holds
+(`mean_m`, `plan_ms_median`, `tp_percent`). A page in Markdown holds
 
     <!-- table: data/results/06_planning.json#planning columns=planner,mode,mean_m -->
     <!-- /table -->
@@ -20,7 +20,7 @@ import os
 import platform
 import re
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -81,16 +81,45 @@ def write_results(
             f"notebook must be a plain name such as '06_planning', got {notebook!r}; "
             "leave out folder and ending"
         )
-    parameters = _plain(parameters, "parameters")
-    _plain(dict.fromkeys(tables), "tables")
-    tables = {name: _table(name, rows) for name, rows in tables.items()}
+    about = {"notebook": notebook, "parameters": _plain(parameters, "parameters")}
+    lines = [f" {_dump(k)}: {_dump(v)},\n" for k, v in (about | {"versions": versions()}).items()]
+    blocks = []
+    for name, rows in _plain(tables, "tables").items():
+        if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+            kind = type(rows).__name__
+            raise TypeError(f"tables[{name!r}] must be a list of rows, each a dict, got {kind}")
+        # One line a row: a changed number is one changed line.
+        body = ",\n".join(f"   {_dump(row)}" for row in rows)
+        blocks.append(f"  {_dump(name)}: [\n{body}\n  ]")
+    text = "".join(["{\n", *lines, ' "tables": {\n', ",\n".join(blocks), "\n }\n}\n"])
     path = resolve_out_dir(out_dir) / f"{notebook}.json"
-    write_text_atomically(path, _document(notebook, parameters, tables), _MARK)
+    write_atomically(path, text, _MARK)
     return path
 
 
+def _dump(value: Any) -> str:
+    return json.dumps(value, ensure_ascii=False)
+
+
+def _plain(value: Any, where: str) -> Any:
+    """Data as JSON knows them, NumPy's scalars converted; raises naming the place of others."""
+    value = value.item() if isinstance(value, np.generic) else value
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ValueError(f"{where} is {value}; write None for a number that does not exist")
+    if isinstance(value, Mapping):
+        for key in value:
+            if not isinstance(key, str) or not key:
+                raise TypeError(f"{where} has the key {key!r}; names must be non-empty text")
+        return {k: _plain(v, f"{where}[{k!r}]") for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v, f"{where}[{i}]") for i, v in enumerate(value)]
+    if value is None or isinstance(value, str | bool | int | float):
+        return value
+    raise TypeError(f"{where} must be a number, text, True, False or None, got {type(value).__name__}")
+
+
 def read_results(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read and check what `write_results` wrote; a relative path starts at the repository.
+    """Read what `write_results` wrote; a relative path starts at the repository.
 
     Raises FileNotFoundError if it is missing and ValueError if it is not such a file.
     """
@@ -100,34 +129,31 @@ def read_results(path: str | os.PathLike[str]) -> dict[str, Any]:
             f"path: there are no results at {path}; run the notebook that writes them"
         )
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-        for key in ("notebook", "parameters", "versions", "tables"):
-            document[key]
-        for name, rows in document["tables"].items():
-            _table(name, rows)
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        document = _plain(json.loads(path.read_text(encoding="utf-8")), "it")
+        return {key: document[key] for key in ("notebook", "parameters", "versions", "tables")}
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
         raise ValueError(
             f"path: {path} holds no results ({error!r}); delete it and run its notebook again"
         ) from None
-    return document
 
 
-def write_text_atomically(path: Path, text: str, mark: bytes = b"") -> None:
-    """As `write_atomically`, of a text in UTF-8."""
-    write_atomically(path, text.encode("utf-8"), mark)
-
-
-def write_atomically(path: Path, content: bytes, mark: bytes = b"") -> None:
+def write_atomically(path: Path, content: bytes | str, mark: bytes = b"") -> None:
     """Replace a file by `content` in one step: a reader, or a crash, meets the old or the new.
 
     mark: bytes that the beginning of every file of this kind holds; a file without them, a folder
-    or a link to nothing raises FileExistsError and stays.
+    or a link to nothing raises FileExistsError and stays. Missing folders are made.
     """
-    if (path.is_symlink() or path.exists()) and not _begins_with(path, mark):
-        raise FileExistsError(
-            f"{path} is there and is not a file that this call may replace; delete it, or "
-            "choose another path"
-        )
+    if path.is_symlink() or path.exists():
+        head = b""
+        if path.is_file():
+            with path.open("rb") as file:
+                head = file.read(64) or mark
+        if not path.is_file() or mark not in head:
+            raise FileExistsError(
+                f"{path} is there and is not a file that this call may replace; delete it, or "
+                "choose another path"
+            )
+    path.parent.mkdir(parents=True, exist_ok=True)
     for left in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):  # by a killed process
         pid = left.name.split(".")[-2]
         if pid.isdigit() and not psutil.pid_exists(int(pid)):
@@ -135,22 +161,13 @@ def write_atomically(path: Path, content: bytes, mark: bytes = b"") -> None:
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         with temporary.open("wb") as file:
-            file.write(content)
+            file.write(content.encode() if isinstance(content, str) else content)
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
-
-
-def _begins_with(path: Path, mark: bytes) -> bool:
-    """Whether a path is a file that is empty, or whose first bytes hold a mark."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        head = file.read(64)
-    return not head or mark in head
 
 
 def results_table(
@@ -167,11 +184,13 @@ def results_table(
 
 def markdown_table(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = None) -> str:
     """Return rows as a Markdown table with the headings and digits of `results_table`."""
-    frame = results_table(rows, columns)
-    numeric = [_is_numeric(rows, name) for name in _columns(rows, columns)]
-    lines = [list(frame.columns), ["---:" if n else "---" for n in numeric], *frame.values.tolist()]
-    lines = [[text.translate(MARKUP) for text in line] for line in lines]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+    frame, lines = results_table(rows, columns), []
+    for name in _columns(rows, columns):
+        values = {type(v) for row in rows if (v := row.get(name)) is not None}
+        lines.append("---:" if values and values <= {int, float} else "---")
+    lines = [list(frame.columns), lines, *frame.values.tolist()]
+    lines = [" | ".join(text.translate(MARKUP) for text in line) for line in lines]
+    return "".join(f"| {line} |\n" for line in lines)
 
 
 def heading(column: str) -> str:
@@ -221,8 +240,7 @@ def fill_tables(text: str) -> str:
                 rows = [row for row in rows if str(row.get(key)) in value.split(",")]
                 if not rows:
                     raise ValueError(f"table: no row of {source} has {option}")
-        body = markdown_table(rows, columns)
-        return f"{block['open']}{body}{block['close']}"
+        return f"{block['open']}{markdown_table(rows, columns)}{block['close']}"
 
     filled, count = BLOCK.subn(fill, text)
     if count != text.count("<!-- table:") or count != text.count("<!-- /table -->"):
@@ -246,68 +264,12 @@ def main(argv: Sequence[str] | None = None) -> int:
             print(f"out of date; run: python -m affordlib.results {page}", file=sys.stderr)
             stale = True
         else:
-            write_text_atomically(page, filled)
+            write_atomically(page, filled)
     return int(stale)
 
 
-def _document(notebook: str, parameters: Any, tables: dict[str, list[dict[str, Any]]]) -> str:
-    """Return the JSON text, one line a row, so that a changed number is one changed line."""
-
-    def dump(value):
-        return json.dumps(value, allow_nan=False, ensure_ascii=False)
-
-    blocks = ",\n".join(
-        f"  {dump(name)}: [\n" + ",\n".join(f"   {dump(row)}" for row in rows) + "\n  ]"
-        for name, rows in tables.items()
-    )
-    return (
-        f'{{\n "notebook": {dump(notebook)},\n "parameters": {dump(parameters)},\n'
-        f' "versions": {dump(versions())},\n "tables": {{\n{blocks}\n }}\n}}\n'
-    )
-
-
-def _plain(value: Any, where: str, depth: float = math.inf) -> Any:
-    """Return data as JSON knows them; NumPy's scalars are converted.
-
-    depth: how many dicts and lists may lie in each other. Raises TypeError or ValueError, naming
-    the place, for anything else than these, finite numbers, text, True, False and None.
-    """
-    if isinstance(value, np.generic) or (isinstance(value, np.ndarray) and value.ndim == 0):
-        value = value.item()
-    if isinstance(value, float) and not math.isfinite(value):
-        raise ValueError(f"{where} is {value}; write None for a number that does not exist")
-    if value is None or isinstance(value, str | bool | int | float):
-        return value
-    if depth and isinstance(value, Mapping):
-        for key in value:
-            if not isinstance(key, str) or not key:
-                raise TypeError(f"{where} has the key {key!r}; names must be non-empty text")
-        return {k: _plain(v, f"{where}[{k!r}]", depth - 1) for k, v in value.items()}
-    if depth and isinstance(value, list | tuple):
-        return [_plain(v, f"{where}[{i}]", depth - 1) for i, v in enumerate(value)]
-    raise TypeError(
-        f"{where} must be a number, text, True, False or None, got {type(value).__name__} "
-        f"{value!r:.60}; convert it, or spread it over columns"
-    )
-
-
-def _table(name: str, rows: Any) -> list[dict[str, Any]]:
-    """Return the rows of a table as plain data; raises as `_plain`."""
-    where = f"tables[{name!r}]"
-    if isinstance(rows, str | Mapping) or not isinstance(rows, Iterable):
-        raise TypeError(f"{where} must be a list of rows, got {type(rows).__name__}")
-    rows = list(rows)
-    for i, row in enumerate(rows):
-        if not isinstance(row, Mapping):
-            raise TypeError(f"{where}[{i}] must map columns to values, got {type(row).__name__}")
-    return _plain(rows, where, depth=2)
-
-
 def _split_unit(column: str) -> tuple[list[str], str | None]:
-    """Return the words of a column without its unit, and the unit.
-
-    The unit is the last word, or the last before a statistic (`plan_ms_median`).
-    """
+    """The words of a column but its unit, the last or the last before a statistic, and the unit."""
     words = column.split("_")
     for at in range(len(words) - 1, 0, -1):
         if words[at] in UNITS:
@@ -319,19 +281,10 @@ def _split_unit(column: str) -> tuple[list[str], str | None]:
 
 def _columns(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None) -> list[str]:
     there = list(dict.fromkeys(name for row in rows for name in row))
-    if columns is None:
-        return there
-    for name in columns:
+    for name in columns or ():
         if rows and name not in there:
             raise ValueError(f"columns: {name!r} is not in the table; it has {', '.join(there)}")
-    return list(columns)
-
-
-def _is_numeric(rows: Sequence[Mapping[str, Any]], column: str) -> bool:
-    values = [row.get(column) for row in rows if row.get(column) is not None]
-    return bool(values) and all(
-        isinstance(v, int | float | np.number) and not isinstance(v, bool) for v in values
-    )
+    return there if columns is None else list(columns)
 
 
 if __name__ == "__main__":

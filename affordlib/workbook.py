@@ -41,7 +41,7 @@ from jupyter_client.manager import AsyncKernelManager
 
 from affordlib.commands import command, seed_type
 from affordlib.paths import repo_root, resolve_out_dir
-from affordlib.results import read_results, write_text_atomically
+from affordlib.results import read_results, write_atomically
 
 WIDGET = "application/vnd.jupyter.widget-view+json"
 INJECTED = {"injected-parameters", "papermill-error-cell-tag"}
@@ -320,9 +320,9 @@ def execute(job: Job, mark: str) -> float:
         raise WorkbookError(explained(job, error)) from None
     notebook = read_notebook(job.copy)
     if job.in_place:
-        write_text_atomically(job.path, cleaned(copy.deepcopy(notebook)))
+        write_atomically(job.path, cleaned(copy.deepcopy(notebook)))
     notebook.metadata["complete"] = mark
-    write_text_atomically(job.copy, nbformat.writes(notebook))
+    write_atomically(job.copy, nbformat.writes(notebook))
     return time.monotonic() - start
 
 

@@ -119,7 +119,7 @@ def gather(folders: Mapping[int, Path], into: Path) -> Path:
                 results.write_atomically(into / f"{name}-{number}.png", picture)
                 page.append(f"![each seed]({name}-{number}.png)")
         results.write_results(into, name, {"seeds": list(folders)}, together)
-    results.write_text_atomically(into / "index.md", "\n\n".join(page) + "\n")
+    results.write_atomically(into / "index.md", "\n\n".join(page) + "\n")
     return into / "index.md"
 
 

@@ -42,7 +42,7 @@ from affordlib.models.training import Sampler, TrainingConfig, about_training, t
 from affordlib.paths import repo_root
 from affordlib.planning.reachability import SHIPPED as REACHABILITY
 from affordlib.planning.reachability import learn_reachability
-from affordlib.results import write_text_atomically
+from affordlib.results import write_atomically
 from affordlib.workers import dask_client
 from affordlib.world import Tabletop
 from experiments.attention import AttentionConfig
@@ -236,7 +236,7 @@ def draw_goals(_: argparse.Namespace) -> bool:
                 tasks += uniform_tasks(mode, n, 0, STANDING + ROLLABLE)
         rows = ",\n".join(json.dumps(task.to_json()) for task in tasks)
         text = f'{{"seed": 0, "tasks": [\n{rows}\n]}}\n'
-        write_text_atomically(repo_root() / FROZEN[name], text)
+        write_atomically(repo_root() / FROZEN[name], text)
     print(f"goals drawn of the worlds: {', '.join(missing) or 'none, all are there'}")
     return True
 

@@ -41,11 +41,10 @@ def test_round_trip_converts_numpy_scalars(tmp_path):
     [
         ([{"mean_m": math.nan}], r"tables\['t'\]\[0\]\['mean_m'\] is nan"),
         ([{"a": 1.0}, {"a": np.float64("-inf")}], r"\[1\]\['a'\] is -inf"),
-        ([{"path": [1, 2]}], r"\['path'\] .*list \[1, 2\]"),
         ([{"a": np.zeros(2)}], r"\['a'\] .*ndarray"),
         ([{3: 1}], r"tables\['t'\]\[0\] has the key 3"),
         ({"a": 1}, r"tables\['t'\] .*dict"),
-        ([[1]], r"tables\['t'\]\[0\]"),
+        ([[1]], r"tables\['t'\] .*each a dict"),
     ],
 )
 def test_bad_tables_are_refused_before_anything_is_written(tmp_path, table, named):
