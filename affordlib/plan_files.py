@@ -22,7 +22,6 @@ _MARK = b'{\n "goal"'
 def save_plan(path: str | os.PathLike[str], plan: Plan) -> Path:
     """Write a plan and its goal to a JSON file and return its path."""
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     text = json.dumps(plan, default=_as_data, indent=1, allow_nan=False)
     write_atomically(path, text + "\n", _MARK)
     return path

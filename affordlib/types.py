@@ -104,15 +104,11 @@ def check_pair(name: str, pair: Any, what: str = "(x, y) [m]") -> tuple[float, f
     return one, other
 
 
-def check_range(
-    name: str, pair: Any, low: float, high: float, unit: str = ""
-) -> tuple[float, float]:
+def check_range(name: str, pair: Any, low: float, high: float) -> tuple[float, float]:
     """Return a range (first, last) inside [low, high], or raise naming the argument."""
     first, last = check_pair(name, pair, "(low, high)")
     if not low <= first <= last <= high:
-        raise ValueError(
-            f"{name} must be a range (low, high) inside [{low:g}, {high:g}] {unit}, got {pair!r}"
-        )
+        raise ValueError(f"{name} must be a range inside [{low:g}, {high:g}], got {pair!r}")
     return first, last
 
 
@@ -179,19 +175,12 @@ class Interaction:
     @property
     def faults(self) -> tuple[str, ...]:
         """Why the episode must not be believed; empty when nothing is wrong with it."""
-        reasons = {
-            "off_path": self.tracking_error_m > FAULT_LIMIT_M,
-            "penetration": self.penetration_m > FAULT_LIMIT_M,
-        }
-        return tuple(name for name, so in reasons.items() if so)
+        found = {"off_path": self.tracking_error_m, "penetration": self.penetration_m}
+        return tuple(name for name, by_m in found.items() if by_m > FAULT_LIMIT_M)
 
     @property
     def object_path(self) -> np.ndarray:
-        """(n + 2, 4) of the object, from before the action until it rests or is held after it.
-
-        x, y [m], height above where it stood [m] and yaw [rad], in the frame of the table; of a
-        `Tabletop` the simulator's state.
-        """
+        """(n + 2, 4) x, y [m], height above the start [m], yaw [rad], until the object rests."""
         moved = np.vstack([np.zeros(5), self.effect, self.rest_effect])[:, :4]
         x, y, yaw = self.start_pose
         return moved + np.array([x, y, 0.0, yaw])

@@ -327,7 +327,7 @@ def execute(job: Job, mark: str) -> float:
 
 
 def explained(job: Job, error: Exception) -> str:
-    """Return what failed: notebook, cell as numbered in the committed notebook, and error."""
+    """What failed: notebook, cell as numbered in the committed notebook, and error."""
     reason, where = f"{type(error).__name__}: {error}", ""
     if isinstance(error, papermill.PapermillExecutionError):
         reason = f"{error.ename}: {error.evalue}"

@@ -14,8 +14,7 @@ from affordlib.geometry import xy_columns
 from affordlib.interactions import InteractionTensors
 from affordlib.interactions.dataset import valid_interactions
 from affordlib.interactions.sampling import condition_on_recorded_action
-from affordlib.models.base import gaussian_nll
-from affordlib.models.calibration import LEVELS, coverage
+from affordlib.models.calibration import calibration_row
 from affordlib.models.protocol import EffectModel
 
 EVERY = 12
@@ -107,14 +106,9 @@ def calibration(record: dict[str, Any]) -> list[dict[str, Any]]:
     """Per effect channel at t = 1: n, coverage of the central intervals, mean σ and NLL."""
     rows = []
     for channel, values in record["std"].items():
-        truth, mean, std = (
-            torch.tensor(v, dtype=torch.float64)
-            for v in (record["truth"][channel], record["mean"][channel], values)
-        )
-        covered = {f"coverage_{v:.0%}"[:-1]: coverage(truth, mean, std, v) for v in LEVELS}
-        nll = float(gaussian_nll(truth, mean, std).mean())
-        row = {"channel": channel, "n": len(truth), **covered, "std_mean": float(std.mean())}
-        rows.append(row | {"nll": nll})
+        given = record["truth"][channel], record["mean"][channel], values
+        row = calibration_row(*(torch.tensor(v, dtype=torch.float64) for v in given))
+        rows.append({"channel": channel, **row})
     return rows
 
 

@@ -121,10 +121,7 @@ class InteractionTensors:
         action_channels: tuple[str, ...] = ("x", "y"),
         effect_channels: tuple[str, ...] = ("x", "y"),
     ) -> InteractionTensors:
-        """The chosen interactions (default: all) and channels.
-
-        Left out are faults of the simulator and actions that were out of reach.
-        """
+        """The chosen (default: all) interactions that are valid, and channels."""
         chosen = np.arange(data.sizes["interaction"]) if interactions is None else interactions
         check_numbers("interactions", chosen)
         part = data.isel(interaction=valid_interactions(data, chosen))
@@ -167,25 +164,16 @@ class InteractionTensors:
         return replace(self, **{n: getattr(self, n)[rows] for n in _BY_INTERACTION})
 
     def joined(self, *others: InteractionTensors) -> InteractionTensors:
-        """These interactions and those of others, in order; phases and channels must be the same.
-
-        Raises ValueError where they are not.
-        """
-        for other in others:
-            for name in ("action_channels", "effect_channels"):
-                mine, theirs = getattr(self, name), getattr(other, name)
-                if mine != theirs:
-                    raise ValueError(f"{name} must be the same, got {mine} and {theirs}")
+        """These interactions and those of others of the same phases and channels, in order."""
         parts = (self, *others)
+        if len({(p.action_channels, p.effect_channels) for p in parts}) > 1:
+            raise ValueError("action_channels and effect_channels of others must be the same")
         return replace(
             self, **{n: torch.cat([getattr(p, n) for p in parts]) for n in _BY_INTERACTION}
         )
 
     def rotated_and_mirrored(self, quarters: int, mirror: bool = False) -> InteractionTensors:
-        """The same interactions on a table mirrored in y, then turned by quarter turns.
-
-        Exact: no pixel is interpolated. Physics on a level table does not mind.
-        """
+        """The same interactions on a table mirrored in y, then turned by quarter turns."""
         heading = torch.tensor([(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)][quarters % 4])
         image, action, effect = self.image, self.action, self.effect
         if mirror:

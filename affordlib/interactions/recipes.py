@@ -9,9 +9,9 @@ from dataclasses import asdict, dataclass, field, replace
 import numpy as np
 
 from affordlib.geometry import rotated
-from affordlib.primitives import Drag, LeverUp, Primitive, Push, primitive_named
+from affordlib.primitives import PRIMITIVES, Drag, LeverUp, Primitive, Push, primitive_named
 from affordlib.types import TABLE_X_M, TABLE_Y_M, Interaction, check_count, check_field, check_range
-from affordlib.world import Tabletop, TabletopObject, WorldConfig, category_named
+from affordlib.world import CATEGORIES, Tabletop, TabletopObject, WorldConfig, category_named
 
 _TABLE_MARGIN_M = 0.08
 _LEVER_DRAWS = 20
@@ -87,19 +87,14 @@ class Recipe:
     variation: Variation | None = None
 
     def __post_init__(self) -> None:
-        for name, check in (("primitives", primitive_named), ("categories", category_named)):
+        for name, known in (("primitives", PRIMITIVES), ("categories", CATEGORIES)):
             values = tuple(getattr(self, name))
-            if not values:
-                raise ValueError(f"{name} must be a sequence of at least one name, got none")
-            for value in values:
-                try:
-                    check(value)
-                except (TypeError, ValueError) as error:
-                    raise type(error)(f"{name}: {error}") from None
+            if not values or not set(values) <= set(known):
+                raise ValueError(f"{name} must be some of {sorted(known)}, got {values!r}")
             object.__setattr__(self, name, values)
         for name in ("size_range_m", "height_range_m"):
             if getattr(self, name) is not None:
-                sizes = check_range(name, getattr(self, name), 0.005, 0.3, "m")
+                sizes = check_range(name, getattr(self, name), 0.005, 0.3)
                 object.__setattr__(self, name, sizes)
         check_count("n_interactions", self.n_interactions)
         check_count("seed", self.seed, least=0)

@@ -118,7 +118,6 @@ def stored_sha256(name_or_path: str | Path) -> str:
 def open_interactions(name_or_path: str | Path) -> xr.Dataset:
     """Read a data set, whole and checked, given a shipped name (`"push"`), a path or an fsspec URL.
 
-    Dimensions: interaction, sample, action_channel, effect_channel, image_channel, row, column.
     Raises FileNotFoundError, or CorruptedDataError naming what is damaged.
     """
     url = _url_of(name_or_path)

@@ -89,10 +89,13 @@ def calibration_rows(
     rows = []
     for i, phase in enumerate(phases):
         for k, channel in enumerate(model.effect_channels):
-            y, mu, sigma = truth[:, i, k], mean[:, i, k], std[:, i, k]
-            row = {"phase": phase, "channel": channel, "n": len(y)}
-            row |= {f"coverage_{level:.0%}"[:-1]: coverage(y, mu, sigma, level) for level in LEVELS}
-            row |= {"std_mean": float(sigma.mean())}
-            row |= {"nll": float(gaussian_nll(y, mu, sigma).mean())}
-            rows.append(columns | row)
+            row = calibration_row(truth[:, i, k], mean[:, i, k], std[:, i, k])
+            rows.append({**columns, "phase": phase, "channel": channel, **row})
     return rows
+
+
+def calibration_row(truth: Tensor, mean: Tensor, std: Tensor) -> dict[str, Any]:
+    """n, coverage of the central intervals, mean σ and NLL of values (N,)."""
+    row = {f"coverage_{v:.0%}"[:-1]: coverage(truth, mean, std, v) for v in LEVELS}
+    nll = float(gaussian_nll(truth, mean, std).mean())
+    return {"n": len(truth), **row, "std_mean": float(std.mean()), "nll": nll}

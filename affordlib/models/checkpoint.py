@@ -144,7 +144,6 @@ def write_weights(
     text = json.dumps(description, allow_nan=False)
     content = json.dumps({"sha256": _sha256(tensors, text), "description": text})
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, save(tensors, {_KEY: content}), mark=f'"{_KEY}"'.encode())
     return path
 
@@ -181,7 +180,6 @@ def save_state(path: str | Path, state: dict[str, Any]) -> None:
     """Write the state of a training to a file that `load_state` reads, whole or not at all."""
     buffer = io.BytesIO()
     torch.save(state, buffer)
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
     write_atomically(Path(path), buffer.getvalue(), mark=b"/data.pkl")
 
 

@@ -18,8 +18,7 @@ import xarray as xr
 from jaxtyping import Float
 from torch import Tensor
 
-from affordlib.interactions import Scaler, Split
-from affordlib.interactions.dataset import InteractionTensors, augment_by_symmetry
+from affordlib.interactions.dataset import InteractionTensors, Split, augment_by_symmetry
 from affordlib.interactions.lever_up import (
     LEVER_ACTION_CHANNELS,
     MIRRORED,
@@ -36,9 +35,7 @@ from affordlib.interactions.sampling import (
     sample_windows,
 )
 from affordlib.models.base import EffectNetwork, NetworkConfig
-from affordlib.models.checkpoint import build
 from affordlib.models.cnp import CNPConfig
-from affordlib.models.domain import TrainingDomain
 from affordlib.models.last_pose import LastPoseConfig
 from affordlib.models.lstm import LSTMConfig
 from affordlib.models.training import TrainingConfig, TrainingRecord, train
@@ -155,10 +152,7 @@ def train_lever_model(
     trained_for: str = "all",
     resume_checkpoint: Path | None = None,
 ) -> tuple[EffectNetwork, list[TrainingRecord]]:
-    """A network trained on a split's training part and its mirror image.
-
-    Its validation part chooses the weights, by the errors of what it is trained for.
-    """
+    """`fit_lever_model` on a split's training part and its mirror image."""
     training = lever_training(lever, data, split)
     validation = lever_up_tensors(data, split.validation, lever.view)
     return fit_lever_model(lever, training, validation, trained_for, resume_checkpoint)
@@ -171,17 +165,16 @@ def fit_lever_model(
     trained_for: str = "all",
     resume_checkpoint: Path | None = None,
 ) -> tuple[EffectNetwork, list[TrainingRecord]]:
-    """As `train_lever_model`, of tensors: of another world's lever-ups, for one.
+    """A network with as many steps as a trajectory has, trained for some or all protocols.
 
-    The network gets as many steps as a trajectory has.
+    The validation errors of what it is trained for choose its weights.
     """
     if trained_for not in TRAINED_FOR:
         raise ValueError(f"trained_for must be one of {[*TRAINED_FOR]}, got {trained_for!r}")
-    torch.manual_seed(lever.training.seed)
     network = lever.network
     if hasattr(network, "steps"):
         network = replace(network, steps=len(training.phase) - 1)
-    model = build(network, Scaler.fit(training), TrainingDomain.fit(training))
+    model = untrained(network, training, lever.training.seed)
     if hasattr(model, "mean_trajectory"):
         model.mean_trajectory.fit(training.effect, model.effect_scale)
     history = train(

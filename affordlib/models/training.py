@@ -41,19 +41,16 @@ from affordlib.models.lstm import LSTMNetwork, effects_at_steps
 from affordlib.types import check_count, check_field, check_within
 
 Sampler = Callable[[InteractionTensors, int, int, torch.Generator], Batch]
-Score = Callable[["EffectNetwork", InteractionTensors], torch.Tensor]
-_AUTO = "cuda" if torch.cuda.is_available() else "cpu"
+Score = Callable[[EffectNetwork, InteractionTensors], torch.Tensor]
 
 
 @dataclass(frozen=True)
 class TrainingConfig:
     """How to train: steps and sizes; the σ floor falls from the model's to `final_sigma_floor`.
 
-    beta: see `EffectNetwork.loss`. augment rotates and mirrors: each batch holds all eight images
-    of the square in equal shares. ema: decay of the exponential moving average of the weights,
-    which is what is validated and kept; 0 for none. patience counts validations (one every
-    `validate_every` steps) without improvement. max_minutes bounds wall time. device: as of torch,
-    or "auto" for a GPU where there is one.
+    beta: see `EffectNetwork.loss`. augment: each batch is rotated and mirrored in all eight ways.
+    ema: decay of the exponential moving average of the weights, which is then validated and kept.
+    patience counts validations without improvement. device: as of torch, or "auto".
     """
 
     steps: int = 3000
@@ -90,9 +87,8 @@ class TrainingConfig:
     def rate(self, step: int) -> float:
         """The learning rate at a step: it rises for a tenth of them, then falls as a cosine."""
         share = (step - 0.5) / self.steps
-        rising = share / 0.1
         falling = (1 + math.cos(math.pi * (share - 0.1) / 0.9)) / 2
-        return self.learning_rate * (rising if share < 0.1 else falling)
+        return self.learning_rate * (share / 0.1 if share < 0.1 else falling)
 
     def sigma_floor(self, step: int, first: float) -> float:
         """The floor at a step, falling geometrically from `first`."""
@@ -111,8 +107,9 @@ class TrainingRecord:
 
 def device_named(name: str) -> torch.device:
     """The torch device of a name; "auto" is a GPU where there is one, or else the processor."""
+    auto = "cuda" if torch.cuda.is_available() else "cpu"
     try:
-        return torch.device(_AUTO if name == "auto" else name)
+        return torch.device(auto if name == "auto" else name)
     except RuntimeError:
         raise ValueError(f'device must be "auto" or as "cpu" or "cuda", got {name!r}') from None
 
@@ -144,10 +141,9 @@ def train(
 ) -> list[TrainingRecord]:
     """Train a model in place and return its history; it ends with the best validated weights.
 
-    sampler: makes a batch of context and targets. Early stopping watches the mean of score, by
-    default of the final position errors, on the validation interactions. resume_checkpoint: a file,
-    written at every validation, from which the same call continues; on one machine's processor to
-    the same bits as without the break. A terminal shows a progress bar.
+    sampler: makes a batch of context and targets. Early stopping watches the mean of score (N,) on
+    the validation interactions. resume_checkpoint: a file, written at every validation, from which
+    the same call continues to the same bits.
     """
     config = config or TrainingConfig()
     for name, tensors in (("training", training), ("validation", validation)):
@@ -160,8 +156,14 @@ def train(
     optimiser = torch.optim.AdamW(
         model.parameters(), config.learning_rate, weight_decay=config.weight_decay, fused=True
     )
+    sums = [
+        [len(t), *(float(v.double().sum()) for v in (t.image, t.action, t.effect))]
+        for t in (training, validation)
+    ]
+    names = [getattr(f, "__name__", type(f).__name__) for f in (sampler, score)]
+    about = {"model": repr(model.config), "data": sums, "sampler and score": names}
     run = SimpleNamespace(
-        about=_about_run(model, training, validation, config, (sampler, score)),
+        about=about | asdict(replace(config, max_minutes=math.inf, device="cpu")),
         step=0,
         seconds=0.0,
         history=[],
@@ -170,7 +172,16 @@ def train(
         validations_without_improvement=0,
     )
     if resume_checkpoint is not None and Path(resume_checkpoint).exists():
-        _resume(run, load_state(resume_checkpoint, device), model, optimiser, generator)
+        state = load_state(resume_checkpoint, device)
+        if differ := [k for k, v in run.about.items() if state["about"].get(k) != v]:
+            raise ValueError(
+                f"resume_checkpoint is of a training with other {', '.join(differ)}; delete it, "
+                "or train as it was begun"
+            )
+        model.load_state_dict(state.pop("model"))
+        optimiser.load_state_dict(state.pop("optimiser"))
+        generator.set_state(state.pop("generator").cpu())
+        vars(run).update(state)
     start = time.perf_counter() - run.seconds
     bar = tqdm(total=config.steps, initial=run.step, desc="training", unit=" steps", disable=None)
     while run.step < config.steps and run.validations_without_improvement < config.patience:
@@ -180,12 +191,8 @@ def train(
             group["lr"] = config.rate(run.step)
         rows = torch.randint(0, len(training), (config.batch_size,), generator=generator)
         tensors = training.select(rows)
-        batch = sampler(
-            _augmented(tensors) if config.augment else tensors,
-            config.n_targets,
-            config.obs_max,
-            generator,
-        )
+        tensors = _augmented(tensors) if config.augment else tensors
+        batch = sampler(tensors, config.n_targets, config.obs_max, generator)
         loss = batch_loss(model, _to(batch, device), config.beta)
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
@@ -221,42 +228,6 @@ def train(
     model.load_state_dict(weights)
     model.cpu().eval()
     return [TrainingRecord(*record) for record in run.history]
-
-
-def _about_run(
-    model: EffectNetwork,
-    training: InteractionTensors,
-    validation: InteractionTensors,
-    config: TrainingConfig,
-    functions: tuple[Callable[..., Any], ...],
-) -> dict[str, Any]:
-    """What must be the same for a training to be resumed."""
-    sums = [
-        [len(t), *(float(v.double().sum()) for v in (t.image, t.action, t.effect))]
-        for t in (training, validation)
-    ]
-    names = [getattr(f, "__name__", type(f).__name__) for f in functions]
-    about = {"model": repr(model.config), "data": sums, "sampler and score": names}
-    return about | asdict(replace(config, max_minutes=math.inf, device="cpu"))
-
-
-def _resume(
-    run: SimpleNamespace,
-    state: dict[str, Any],
-    model: EffectNetwork,
-    optimiser: torch.optim.Optimizer,
-    generator: torch.Generator,
-) -> None:
-    if state["about"] != run.about:
-        differ = [k for k in run.about if state["about"].get(k) != run.about[k]]
-        raise ValueError(
-            f"resume_checkpoint is of a training with other {', '.join(differ)}; delete it, or "
-            "train as it was begun"
-        )
-    model.load_state_dict(state.pop("model"))
-    optimiser.load_state_dict(state.pop("optimiser"))
-    generator.set_state(state.pop("generator").cpu())
-    vars(run).update(state)
 
 
 def _copy(model: EffectNetwork) -> dict[str, torch.Tensor]:
@@ -296,9 +267,9 @@ def train_literal(
     learning_rate: float = 1e-4,
     seed: int = 0,
 ) -> list[float]:
-    """The paper's loop (Section 3.2): one trajectory and one target an iteration, Adam.
+    """The paper's loop (Section 3.2), in place: one trajectory and one target an iteration, Adam.
 
-    Trains in place and returns the losses. A million iterations, as in the paper, take hours.
+    Returns the losses. A million iterations, as in the paper, take hours.
     """
     check_count("iterations", iterations)
     check_count("obs_max", obs_max, 1, 100_000)
@@ -313,6 +284,12 @@ def train_literal(
         optimiser.step()
         losses.append(loss.item())
     return losses
+
+
+def untrained(config: NetworkConfig, training: InteractionTensors, seed: int) -> EffectNetwork:
+    """A network of seeded weights, with scales and domain of training data."""
+    torch.manual_seed(seed)
+    return build(config, Scaler.fit(training), TrainingDomain.fit(training))
 
 
 def train_model(
@@ -335,8 +312,7 @@ def train_model(
     validation = InteractionTensors.from_dataset(data, split.validation, *channels)
     if symmetries:
         training = augment_by_symmetry(training, symmetries)
-    torch.manual_seed(config.seed)
-    model = build(model_config, Scaler.fit(training), TrainingDomain.fit(training))
+    model = untrained(model_config, training, config.seed)
     if isinstance(model, LSTMNetwork):
         model.mean_trajectory.fit(effects_at_steps(model, training), model.effect_scale)
     history = train(model, training, validation, config, resume_checkpoint, sampler)

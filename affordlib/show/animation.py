@@ -89,8 +89,6 @@ def show_animation(
     beside: a figure shown to the left of every frame.
     """
     if path is not None:
-        path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, recorder.encoded("GIF", beside=beside), b"GIF8")
+        write_atomically(Path(path), recorder.encoded("GIF", beside=beside), b"GIF8")
     # A PNG: pages made from a notebook leave GIFs out, and it is a third smaller.
     return NotebookImage(recorder.encoded("PNG", beside=beside), format="png")

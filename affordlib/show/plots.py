@@ -60,7 +60,6 @@ plt.rcParams.update(
 def save_figure(figure: Figure, folder: Path, name: str) -> Path:
     """Save a figure as `figures/<name>.png` in a results folder and return its path."""
     path = Path(folder) / "figures" / f"{name}.png"
-    path.parent.mkdir(parents=True, exist_ok=True)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
     write_atomically(path, buffer.getvalue(), b"PNG")

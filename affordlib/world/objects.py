@@ -15,7 +15,7 @@ import numpy as np
 import pybullet
 from scipy.spatial import ConvexHull
 
-from affordlib.types import check_field, check_finite, check_within
+from affordlib.types import check_array, check_field, check_within
 
 DENSITY_KG_M3 = 600.0
 SIZE_RANGE_M = (0.04, 0.08)
@@ -189,9 +189,8 @@ class Prism(TabletopObject):
 
     def __post_init__(self) -> None:
         check_field(self, "height", 0.005, LARGEST_M, "m")
-        points = [[check_finite("prism corners", v) for v in corner] for corner in self.corners]
-        corners = np.array(points)
-        if corners.shape != (len(corners), 2) or not N_EDGES[0] <= len(corners) <= N_EDGES[1]:
+        corners = check_array("prism corners", self.corners, 2)
+        if corners.ndim != 2 or not N_EDGES[0] <= len(corners) <= N_EDGES[1]:
             raise ValueError(f"prism corners must be 3 to 8 points (x, y), got {corners.shape}")
         following = np.roll(corners, -1, axis=0)
         edges = following - corners
