@@ -115,7 +115,9 @@ def _plain(value: Any, where: str) -> Any:
         return [_plain(v, f"{where}[{i}]") for i, v in enumerate(value)]
     if value is None or isinstance(value, str | bool | int | float):
         return value
-    raise TypeError(f"{where} must be a number, text, True, False or None, got {type(value).__name__}")
+    raise TypeError(
+        f"{where} must be a number, text, True, False or None, got {type(value).__name__}"
+    )
 
 
 def read_results(path: str | os.PathLike[str]) -> dict[str, Any]:

@@ -110,7 +110,6 @@ def test_a_kill_leaves_no_half_file_and_the_next_writer_no_leftovers(tmp_path):
         ('{"notebook": "a", "parameters": {}, "versions": {}}', "KeyError.'tables'"),
         ("[]", "TypeError"),
         ("[" * 100_000, "RecursionError"),
-        ('{"notebook": 1, "parameters": 1, "versions": 1, "tables": {"t": [{"a": [1]}]}}', "list"),
     ],
 )
 def test_damaged_or_missing_results_are_named(tmp_path, text, reason):
