@@ -25,7 +25,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import psutil
 
 import affordlib
@@ -174,14 +173,16 @@ def write_atomically(path: Path, content: bytes | str, mark: bytes = b"") -> Non
 
 def results_table(
     rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = None
-) -> pd.DataFrame:
+) -> "pandas.DataFrame":
     """Return rows as a table to look at: text cells, lengths in mm, angles in degrees, few digits.
 
     `columns` chooses and orders. To compute, use the rows.
     """
+    import pandas  # here, for it takes as long to import as all else
+
     names = _columns(rows, columns)
     cells = [[cell(name, row.get(name)) for name in names] for row in rows]
-    return pd.DataFrame(cells, columns=[heading(n) for n in names], index=[""] * len(cells))
+    return pandas.DataFrame(cells, columns=[heading(n) for n in names], index=[""] * len(cells))
 
 
 def markdown_table(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = None) -> str:

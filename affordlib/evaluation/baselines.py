@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 import torch
-import xarray as xr
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
@@ -44,9 +43,9 @@ _CATEGORY_GAP = 3.0
 def baseline_predictions(
     baseline: Callable[..., Forecast],
     channels: tuple[tuple[str, ...], tuple[str, ...]],
-    data: xr.Dataset,
+    data: "xarray.Dataset",
     train_on: np.ndarray,
-    other: xr.Dataset,
+    other: "xarray.Dataset",
     queried: np.ndarray,
 ) -> dict[str, Any]:
     """What a baseline, fitted to interactions of `data`, predicts of those `queried` of `other`."""
@@ -62,7 +61,7 @@ def baseline_predictions(
 
 
 def logistic_predictions(
-    data: xr.Dataset, train_on: np.ndarray, other: xr.Dataset, queried: np.ndarray
+    data: "xarray.Dataset", train_on: np.ndarray, other: "xarray.Dataset", queried: np.ndarray
 ) -> dict[str, Any]:
     """The probability of a grasp's success, from the object's size alone, and the true heights."""
     known, kept = valid_interactions(data, train_on), valid_interactions(other, queried)
@@ -73,7 +72,7 @@ def logistic_predictions(
     return record | {"probability": probability.tolist()}
 
 
-def features(data: xr.Dataset) -> Tensor:
+def features(data: "xarray.Dataset") -> Tensor:
     """What is known of objects, near unit size: (N, 3 + 2 + categories) sizes, yaw, category.
 
     Yaw is that of the object against the action (against the table where the action has no

@@ -3,7 +3,6 @@
 from typing import Any
 
 import numpy as np
-import xarray as xr
 
 from affordlib.interactions.dataset import check_numbers
 from affordlib.interactions.recipes import Recipe
@@ -31,7 +30,7 @@ def error_row(errors_m: np.ndarray, **columns: Any) -> dict[str, Any]:
     }
 
 
-def refuse_seen(about: dict[str, Any], data: xr.Dataset, interactions: np.ndarray) -> None:
+def refuse_seen(about: dict[str, Any], data: "xarray.Dataset", interactions: np.ndarray) -> None:
     """Raise if a checkpoint was, or may have been, trained on objects of these interactions.
 
     about: what `load_checkpoint` returned beside the model. The seed, the categories and the sizes

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import torch
-import xarray as xr
 
 from affordlib.geometry import xy_columns
 from affordlib.interactions import InteractionTensors
@@ -31,7 +30,7 @@ def steps_of(arrays: InteractionTensors) -> torch.Tensor:
 
 @torch.no_grad()
 def network_predictions(
-    model: EffectModel, data: xr.Dataset, interactions: np.ndarray
+    model: EffectModel, data: "xarray.Dataset", interactions: np.ndarray
 ) -> dict[str, Any]:
     """What a network predicts of interactions: see `prediction_record`."""
     kept = valid_interactions(data, interactions)
@@ -43,7 +42,7 @@ def network_predictions(
     return prediction_record(data, kept, arrays, prediction.effect_mean, prediction.effect_std)
 
 
-def about_objects(data: xr.Dataset, kept: np.ndarray) -> dict[str, Any]:
+def about_objects(data: "xarray.Dataset", kept: np.ndarray) -> dict[str, Any]:
     """Number of each interaction, and its object's category and whether it rolls."""
     names = data["family"].attrs["flag_meanings"].split()
     return {
@@ -54,7 +53,7 @@ def about_objects(data: xr.Dataset, kept: np.ndarray) -> dict[str, Any]:
 
 
 def prediction_record(
-    data: xr.Dataset,
+    data: "xarray.Dataset",
     kept: np.ndarray,
     arrays: InteractionTensors,
     mean: torch.Tensor,

@@ -3,19 +3,17 @@
 Section 4.3 of the paper: 80/10/10 inside each of 10 folds.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 import torch
-import xarray as xr
 
 from affordlib.geometry import rotate_channels
 from affordlib.types import check_array, check_count, check_finite
 
 
-def valid_interactions(data: xr.Dataset, interactions: np.ndarray) -> np.ndarray:
+def valid_interactions(data: "xarray.Dataset", interactions: np.ndarray) -> np.ndarray:
     """Those of the interactions that the arm could reach, without faults of the simulator."""
     return interactions[(data["reached"].values & ~data["fault"].values)[interactions]]
 
@@ -73,7 +71,7 @@ class Scaler:
         check_array("image_mean", self.image_mean)
 
     @classmethod
-    def fit(cls, tensors: InteractionTensors) -> Scaler:
+    def fit(cls, tensors: "InteractionTensors") -> Self:
         """Scales of training data: root mean square of the channels, mean and std of the image."""
         image = tensors.image.double()
         return cls(
@@ -116,11 +114,11 @@ class InteractionTensors:
     @classmethod
     def from_dataset(
         cls,
-        data: xr.Dataset,
+        data: "xarray.Dataset",
         interactions: np.ndarray | None = None,
         action_channels: tuple[str, ...] = ("x", "y"),
         effect_channels: tuple[str, ...] = ("x", "y"),
-    ) -> InteractionTensors:
+    ) -> Self:
         """The chosen (default: all) interactions that are valid, and channels."""
         chosen = np.arange(data.sizes["interaction"]) if interactions is None else interactions
         check_numbers("interactions", chosen)
@@ -159,11 +157,11 @@ class InteractionTensors:
     def __len__(self) -> int:
         return len(self.image)
 
-    def select(self, rows: torch.Tensor | slice) -> InteractionTensors:
+    def select(self, rows: torch.Tensor | slice) -> Self:
         """The interactions with the given row numbers."""
         return replace(self, **{n: getattr(self, n)[rows] for n in _BY_INTERACTION})
 
-    def joined(self, *others: InteractionTensors) -> InteractionTensors:
+    def joined(self, *others: "InteractionTensors") -> Self:
         """These interactions and those of others of the same phases and channels, in order."""
         parts = (self, *others)
         if len({(p.action_channels, p.effect_channels) for p in parts}) > 1:
@@ -172,7 +170,7 @@ class InteractionTensors:
             self, **{n: torch.cat([getattr(p, n) for p in parts]) for n in _BY_INTERACTION}
         )
 
-    def rotated_and_mirrored(self, quarters: int, mirror: bool = False) -> InteractionTensors:
+    def rotated_and_mirrored(self, quarters: int, mirror: bool = False) -> Self:
         """The same interactions on a table mirrored in y, then turned by quarter turns."""
         heading = torch.tensor([(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)][quarters % 4])
         image, action, effect = self.image, self.action, self.effect

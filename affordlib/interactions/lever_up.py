@@ -13,7 +13,6 @@ from dataclasses import replace
 import numpy as np
 import torch
 import torch.nn.functional as F
-import xarray as xr
 
 from affordlib.geometry import rotate_channels
 from affordlib.interactions.dataset import InteractionTensors, Symmetry, valid_interactions
@@ -33,7 +32,7 @@ _NEAR = slice(16, 112), slice(32, 128)
 
 
 def lever_up_tensors(
-    data: xr.Dataset, interactions: np.ndarray | None = None, view: str = "near"
+    data: "xarray.Dataset", interactions: np.ndarray | None = None, view: str = "near"
 ) -> InteractionTensors:
     """Lever-ups as 26 steps of poses and commanded actions, in the frame of the lever.
 

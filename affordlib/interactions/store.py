@@ -13,11 +13,7 @@ from pathlib import Path
 
 import fsspec
 import numpy as np
-import xarray as xr
 from fsspec.core import url_to_fs
-from zarr.buffer.cpu import Buffer
-from zarr.codecs import BloscCodec
-from zarr.storage import MemoryStore
 
 from affordlib.paths import repo_root
 from affordlib.results import write_atomically
@@ -31,7 +27,7 @@ class CorruptedDataError(ValueError):
     """A data set is damaged: what was read is not what was written."""
 
 
-def _hashes(data: xr.Dataset) -> dict[str, str]:
+def _hashes(data: "xarray.Dataset") -> dict[str, str]:
     """Hashes of the type, shape and bytes of each array."""
     found = {}
     for name in data.variables:
@@ -46,18 +42,21 @@ def _hash_of(hashes: dict[str, str]) -> str:
     return hashlib.sha256(json.dumps(hashes, sort_keys=True).encode()).hexdigest()
 
 
-def dataset_sha256(data: xr.Dataset) -> str:
+def dataset_sha256(data: "xarray.Dataset") -> str:
     """One hash for all arrays of a data set; it depends neither on workers nor on the file."""
     return _hash_of(_hashes(data))
 
 
-def write_interactions(data: xr.Dataset, path: Path, level: int = 9) -> None:
+def write_interactions(data: "xarray.Dataset", path: Path, level: int = 9) -> None:
     """Write a set as one file, whole or not at all; equal sets give equal bytes.
 
     level: how hard to compress, from 0 to 9.
     """
+    from zarr.codecs import BloscCodec
+    from zarr.storage import MemoryStore
+
     codec = BloscCodec(cname="zstd", clevel=level, shuffle="shuffle")
-    buffers: dict[str, Buffer] = {}
+    buffers = {}
     encoding = {
         name: {"compressors": [codec], "chunks": variable.shape, "_FillValue": None}
         for name, variable in data.variables.items()
@@ -115,11 +114,15 @@ def stored_sha256(name_or_path: str | Path) -> str:
     return _hash_of(_read(url, MANIFEST)[0]["arrays"])
 
 
-def open_interactions(name_or_path: str | Path) -> xr.Dataset:
+def open_interactions(name_or_path: str | Path) -> "xarray.Dataset":
     """Read a data set, whole and checked, given a shipped name (`"push"`), a path or an fsspec URL.
 
     Raises FileNotFoundError, or CorruptedDataError naming what is damaged.
     """
+    import xarray
+    from zarr.buffer.cpu import Buffer
+    from zarr.storage import MemoryStore
+
     url = _url_of(name_or_path)
     manifest, files = _read(url)
     for name, digest in manifest["files"].items():
@@ -127,7 +130,7 @@ def open_interactions(name_or_path: str | Path) -> xr.Dataset:
             raise CorruptedDataError(f"{url}: {name} is missing or damaged; {_REMEDY}")
     store = MemoryStore({n: Buffer.from_bytes(c) for n, c in files.items() if n != MANIFEST})
     try:
-        with xr.open_zarr(store, consolidated=False, zarr_format=3) as data:
+        with xarray.open_zarr(store, consolidated=False, zarr_format=3) as data:
             return data[sorted(data.data_vars)].load()
     except Exception as error:
         raise CorruptedDataError(f"{url} holds no data set ({error}); {_REMEDY}") from error

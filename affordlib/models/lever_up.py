@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-import xarray as xr
 from jaxtyping import Float
 from torch import Tensor
 
@@ -140,14 +139,14 @@ TRAINED_FOR = {
 """Sampler and score of each training; `first_step` stands for `image_only` as well, see above."""
 
 
-def lever_training(lever: LeverModel, data: xr.Dataset, split: Split) -> InteractionTensors:
+def lever_training(lever: LeverModel, data: "xarray.Dataset", split: Split) -> InteractionTensors:
     """What a network learns from: a split's training part and its mirror image."""
     return augment_by_symmetry(lever_up_tensors(data, split.train, lever.view), MIRRORED)
 
 
 def train_lever_model(
     lever: LeverModel,
-    data: xr.Dataset,
+    data: "xarray.Dataset",
     split: Split,
     trained_for: str = "all",
     resume_checkpoint: Path | None = None,

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import torch
-import xarray as xr
 from tqdm import tqdm
 
 from affordlib.geometry import xy_columns
@@ -293,7 +292,7 @@ def untrained(config: NetworkConfig, training: InteractionTensors, seed: int) ->
 
 
 def train_model(
-    data: xr.Dataset,
+    data: "xarray.Dataset",
     split: Split,
     config: TrainingConfig,
     model_config: NetworkConfig | None = None,
@@ -320,7 +319,9 @@ def train_model(
     return model, history
 
 
-def about_training(data: xr.Dataset, seen: np.ndarray, config: TrainingConfig) -> dict[str, object]:
+def about_training(
+    data: "xarray.Dataset", seen: np.ndarray, config: TrainingConfig
+) -> dict[str, object]:
     """What a checkpoint says of its training: data set, interactions seen, settings."""
     settings = {k: v for k, v in vars(config).items() if k != "max_minutes"}
     return {

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import xarray as xr
 from torch import nn
 
 from affordlib.models.checkpoint import read_weights, write_weights
@@ -93,7 +92,7 @@ def _features(kind: np.ndarray, xy_m: np.ndarray, direction_rad: np.ndarray) -> 
     return torch.from_numpy(np.hstack([2 * xy_m, ahead, kind])).float()
 
 
-def learn_reachability(data: xr.Dataset, seed: int = 0) -> Reachability:
+def learn_reachability(data: xarray.Dataset, seed: int = 0) -> Reachability:
     """Train on a set of interactions with objects all over the table; seconds on one core.
 
     The arm stands on the table's x axis, so every interaction is seen mirrored as well.
