@@ -347,10 +347,8 @@ class Plan:
 class Outcome:
     """What carrying out a plan gave, as the robot measured it.
 
-    distance_m: between the goal and the object at rest, gripper retreated; object_paths_xy_m: one
-    (n, 2) path of the object per executed step, in the frame of the table; end_pose: (x, y, yaw);
-    turned_rad, lifted_m: how far the object was turned and lifted; words: what else there is to
-    say of the ending.
+    distance_m: between the goal and the object at rest; object_paths_xy_m: one (n, 2) path of the
+    object per executed step, in the frame of the table; end_pose: (x, y, yaw); words: on the end.
     """
 
     plan: Plan

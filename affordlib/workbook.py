@@ -122,10 +122,7 @@ def read_profile(root: Path, profile: str) -> list[tuple[str, str, Any]]:
 
 
 def choose(kind: str, given: str, known: Sequence[str]) -> str:
-    """Return the known name that is meant; raises WorkbookError naming the near ones.
-
-    A notebook may be meant by its number alone.
-    """
+    """The known name, or number of a notebook, that is meant; WorkbookError names near ones."""
     number = re.fullmatch(r"A?\d+", given)
     matches = [n for n in known if n == given or (number and n.startswith(f"{given}_"))]
     if len(matches) == 1:
@@ -165,11 +162,7 @@ def literal(text: str, default: object) -> Any:
 def make_jobs(
     root: Path, profile: str | None, settings: Sequence[str] = (), seed: int = 0, out: str = ""
 ) -> list[Job]:
-    """Return every notebook with its parameters, all names and types checked.
-
-    Profile None takes the defaults alone, and puts the executed notebooks in place of the
-    committed ones.
-    """
+    """Every notebook with its parameters, checked; profile None: defaults, executed in place."""
     paths = notebook_paths(root)
     if not paths:
         raise WorkbookError(f"there is no notebook NN_title.ipynb in {root / 'notebooks'}")

@@ -17,8 +17,7 @@ _LOOPBACK = {"host": "127.0.0.1", "dashboard": False, "dashboard_address": "127.
 def dask_client(workers: int = 1, scheduler: str | None = None) -> Iterator[Client | None]:
     """A client of the scheduler at an address, or else of `workers` new processes of this machine.
 
-    None for one worker, which is this process. The new processes listen on this machine only. They
-    do not import the running script, so it needs no `if __name__ == "__main__":`.
+    None for one worker, which is this process. The new processes listen on this machine only.
     """
     if scheduler is None and workers == 1:
         yield None

@@ -33,9 +33,7 @@ def error_row(errors_m: np.ndarray, **columns: Any) -> dict[str, Any]:
 def refuse_seen(about: dict[str, Any], data: "xarray.Dataset", interactions: np.ndarray) -> None:
     """Raise if a checkpoint was, or may have been, trained on objects of these interactions.
 
-    about: what `load_checkpoint` returned beside the model. The seed, the categories and the sizes
-    of a recipe decide its objects, the number which of them it is. A recipe that cannot be read
-    may be any.
+    about: what `load_checkpoint` returned beside the model.
     """
     try:
         theirs, mine = (_objects_of(text) for text in (about["recipe"], data.attrs["recipe"]))

@@ -1,8 +1,4 @@
-"""What models predict of interactions beside what happened, and the errors of the predictions.
-
-Models see the image and the commanded action at t = 0 and t = 1, and no effect. Records are plain
-lists, one entry an interaction, so that they can be stored as they are.
-"""
+"""Predictions from image and commanded action beside what happened, as plain lists."""
 
 from typing import Any
 

@@ -50,11 +50,9 @@ def collect(
 ) -> str | Path:
     """Collect a recipe into a local file and return its path, which ends in .zarr.zip.
 
-    client: a Dask client to collect with; None means `workers` processes of this machine, or this
-    process alone for 1. Interrupted, a rerun goes on with what is missing, and a file that is
-    there, whole, is not made again unless `replace` says so. Raises ValueError for a path or
-    `workers` that cannot be, and where anything else is; RuntimeError while another process
-    collects into the path, and when a chunk cannot be made.
+    client: of Dask; None means `workers` processes of this machine. A rerun makes what is missing;
+    a whole file is made again only with `replace`. Raises ValueError for a path where anything else
+    is, RuntimeError while another process collects into it, and when a chunk cannot be made.
     """
     if not str(path).endswith(SUFFIX):
         raise ValueError(f"path must end in {SUFFIX!r}, got {str(path)!r}")

@@ -69,8 +69,7 @@ _RANGES = {
 class Recipe:
     """What is collected: primitives on objects of some categories, in a world, from a seed.
 
-    Of several primitives one is drawn that suits the object: a push for what does not roll, a drag
-    for what does. size_range_m and height_range_m: of the objects (heights default to the sizes).
+    Of several primitives one is drawn that suits the object. height_range_m defaults to the sizes.
     anywhere: objects lie all over the table, within reach or not, instead of at its centre.
     partial: the action is truncated at a random phase. variation: worlds drawn episode by episode.
     """

@@ -55,10 +55,7 @@ def condition_on_poses(
 def sample_mixed(
     tensors: InteractionTensors, n_targets: int, obs_max: int, generator: torch.Generator
 ) -> Batch:
-    """Action, effect or both are observed; half of the contexts are those of the later queries.
-
-    These are the action at t = 0 (and 1), and the effect at t = 1. t = 1 is always a target.
-    """
+    """Action, effect or both are observed, half of the time as in later queries."""
     b, last = len(tensors), len(tensors.phase) - 1
 
     def uniform(*shape):
@@ -116,10 +113,7 @@ def sample_windows(
 def sample_from_start(
     tensors: InteractionTensors, n_targets: int, obs_max: int, generator: torch.Generator
 ) -> Batch:
-    """All later samples are targets; the first pose is observed in every other batch.
-
-    n_targets and obs_max are not used.
-    """
+    """All later samples are targets; the first pose is observed in every other batch."""
     n_poses = int(torch.randint(0, 2, (1,), generator=generator))
     start = torch.zeros(len(tensors), dtype=torch.long)
     target_at = torch.arange(1, len(tensors.phase))

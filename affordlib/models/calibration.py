@@ -60,11 +60,7 @@ def fit_sigma_scale(
     validation: InteractionTensors,
     phases: Sequence[float] = AFTER_CONTACT,
 ) -> tuple[float, ...]:
-    """Set, and return, the sigma_scale (C_e,) of greatest likelihood of validation data.
-
-    model: a network, or what else has a `sigma_scale`. x and y share one, as they share a scale: no
-    direction of the table is special.
-    """
+    """Set, and return, the sigma_scale (C_e,) of greatest likelihood; x and y share one."""
     model.sigma_scale = (1.0,) * len(model.effect_channels)
     truth, mean, std = effects_at(model, validation, phases)
     squared = ((truth - mean) / std).square().mean(dim=(0, 1))

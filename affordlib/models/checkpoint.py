@@ -136,10 +136,7 @@ def _sha256(tensors: dict[str, torch.Tensor], text: str) -> str:
 def write_weights(
     path: str | Path, tensors: dict[str, torch.Tensor], description: dict[str, Any]
 ) -> Path:
-    """Write tensors and a description of plain JSON values as one file; returns its path.
-
-    A file of weights that is there is replaced; for anything else, FileExistsError.
-    """
+    """Write tensors and a description of plain JSON values as one file; returns its path."""
     tensors = {name: value.contiguous() for name, value in tensors.items()}
     text = json.dumps(description, allow_nan=False)
     content = json.dumps({"sha256": _sha256(tensors, text), "description": text})
@@ -149,11 +146,7 @@ def write_weights(
 
 
 def read_weights(path: str | Path, remedy: str) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-    """Tensors and description of a file that `write_weights` wrote.
-
-    Raises FileNotFoundError, or ValueError with the file and the remedy when it is damaged, is no
-    such file, or holds numbers that are not finite.
-    """
+    """Tensors and description of a file of `write_weights`; ValueError, if damaged, with remedy."""
     try:
         with safe_open(path, "pt") as file:
             content = json.loads((file.metadata() or {})[_KEY])

@@ -37,7 +37,7 @@ from affordlib.models.base import EffectNetwork, NetworkConfig
 from affordlib.models.cnp import CNPConfig
 from affordlib.models.last_pose import LastPoseConfig
 from affordlib.models.lstm import LSTMConfig
-from affordlib.models.training import TrainingConfig, TrainingRecord, train
+from affordlib.models.training import TrainingConfig, TrainingRecord, train, untrained
 from affordlib.types import Prediction
 
 PROTOCOLS = ("window", "first_step", "image_only")

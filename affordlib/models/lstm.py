@@ -49,10 +49,7 @@ class Known:
 
 
 def on_grid(effect: Tensor, t: Tensor, seen: Tensor, steps: int) -> Known:
-    """Observed effects (B, m, C) at phases t (B, m) put on a grid of steps + 1 phases.
-
-    Where nothing is observed, the effect at t = 0 is known to be zero.
-    """
+    """Observed effects (B, m, C) at t (B, m) on a grid of steps + 1 phases; else zero at t = 0."""
     b, n, c = len(effect), steps + 1, effect.shape[-1]
     # What is not observed goes to a column of its own, which is cut off.
     at = torch.where(seen, (t * steps).round().long(), n)

@@ -60,11 +60,7 @@ def inverse(rotation: Tensor) -> Tensor:
 
 
 def rotate_image(image: Float[Tensor, "#b 2 n n"], rotation: Tensor) -> Float[Tensor, "b 2 n n"]:
-    """Images (B or 1, 2, n, n) rotated (B, 2), bilinearly; beyond the edge, table.
-
-    The covered area changes by less than 1 % as long as the object keeps within the inscribed
-    circle; quarter turns are exact.
-    """
+    """Images (B or 1, 2, n, n) rotated (B, 2), bilinearly; beyond the edge, table."""
     cos, sin = rotation.unbind(-1)
     # From coordinates of the rotated image to those of the image; rows run along -y.
     rows = [torch.stack([cos, -sin], -1), torch.stack([sin, cos], -1)]
@@ -92,10 +88,7 @@ def rotate_observations(
 def rotate_prediction(
     prediction: Prediction, rotation: Tensor, action_channels: Channels, effect_channels: Channels
 ) -> Prediction:
-    """A prediction rotated (B, 2).
-
-    σ of x and y become those of the rotated Gaussian's marginals; their correlation is dropped.
-    """
+    """A prediction rotated (B, 2); the correlation that rotation gives σ of x and y is dropped."""
     p, r = prediction, rotation[:, None]
     return Prediction(
         rotate_channels(p.action_mean, action_channels, r, absolute_yaw=True),

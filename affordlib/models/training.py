@@ -115,10 +115,7 @@ def device_named(name: str) -> torch.device:
 
 @torch.no_grad()
 def final_errors_m(model: EffectNetwork, tensors: InteractionTensors) -> torch.Tensor:
-    """Distance (N,) [m] between predicted and true (x, y) at t = 1, given image and action.
-
-    Where x and y are not predicted, that of what is (z [m], yaw [rad]).
-    """
+    """Distance (N,) [m] between predicted and true (x, y), else all channels, at t = 1."""
     was_training = model.training
     model.eval()
     t_target = torch.ones(len(tensors), 1)

@@ -31,10 +31,8 @@ class ConditioningExplorer(FigureWidget):
 
     Equation (2) of the paper: the representation is w₁ r_action + w₂ r_effect, w₂ = 1 - w₁.
 
-    model: any `EffectModel`; seen: a full interaction, which is the ground truth and gives what is
-    observed. The black points in the figure, or the first sliders, are dragged to the phases at
-    which the action is observed (two, as a planner observes it) and the effect (one); a tick takes
-    the observation away. The orange band is mean ± 2 σ. `prediction` is what is shown.
+    seen: a full interaction, the ground truth, which gives what is observed. The black points, or
+    sliders, set the phases of the observations, a tick takes one away; the band is mean ± 2 σ.
     """
 
     figsize = (10.0, 4.6)
@@ -144,14 +142,10 @@ class ConditioningExplorer(FigureWidget):
 
 
 class PhaseSlider(FigureWidget):
-    """A slider over the phase t at which an action on the object in a world is stopped.
+    """A slider, or a dotted line, at the phase t at which an action on the object is stopped.
 
-    The dotted line of the figure can be dragged as well.
-
-    The action is executed once in full. Wherever the slider stands, the figure shows the gripper's
-    path up to t and where the full action had the object at t; `stop_here()`, the button, executes
-    the action up to t for comparison. `rest` maps the phases that were tried to the poses
-    (x, y, yaw) in which the object came to rest.
+    The figure shows where the full action had the object at t; `stop_here()`, the button, executes
+    it up to t. `rest` maps the phases that were tried to the poses (x, y, yaw) at rest.
     """
 
     def __init__(self, world: Tabletop, action: Primitive, phase: float = 0.8) -> None:

@@ -61,10 +61,8 @@ class GoalPicker(WithPicture, widgets.VBox):
     shown while the hand moves the goal; that of the chosen one takes its place when the hand rests.
     seed: of the disturbances. folder: where plans are saved.
 
-    `goal`, `plan` and `outcome` are what is shown; `pick`, `set_pose`, `run`, `stop`,
-    `shove_object`, `move_goal`, `start_over`, `save` and `load` do what mouse and buttons do, and
-    return when it is done. Mouse and buttons only queue it: it is done in the background, one after
-    the other, *Run* with `seconds_per_action` to watch each. Leave the world alone until then.
+    `goal`, `plan` and `outcome` are what is shown. Methods do what mouse and buttons do, and return
+    when it is done; mouse and buttons queue it in the background, *Run* with `seconds_per_action`.
     """
 
     seconds_per_action = 1.2

@@ -244,10 +244,7 @@ def table_picture(
     outcome: Outcome | None,
     half_width_m: float,
 ) -> bytes:
-    """The table from above as a PNG: the object at (x, y, yaw), and the outcome, else the plan.
-
-    What there is to be seen fills it; half_width_m bounds what it shows.
-    """
+    """The table from above as a PNG: the object at (x, y, yaw), and the outcome, else the plan."""
     shown = [pose[:2]]
     if (made := outcome.plan if outcome else plan) is not None:
         ends = [step.predicted_end_xy_m for step in made.steps]

@@ -152,10 +152,7 @@ class JointController:
         return np.array([*tip, yaw, fingers[0][0] + fingers[1][0]])
 
     def tie_fingers(self) -> None:
-        """Tie the two fingers by a gear, so that a held object stays in the middle.
-
-        Driven by two motors alone, a held object is in neutral balance and wanders.
-        """
+        """Tie the two fingers by a gear: between two motors alone a held object wanders."""
         self.untie()
         gear = self.client.createConstraint(
             self.robot,
@@ -176,10 +173,7 @@ class JointController:
             client.removeConstraint(client.getConstraintUniqueId(k))
 
     def tie_held(self, body: int) -> None:
-        """Fix what both tied fingers hold to the hand, until `untie`.
-
-        Friction in Bullet creeps: what is held slips by some 0.3 mm a second.
-        """
+        """Fix what both tied fingers hold to the hand: friction creeps by 0.3 mm a second."""
         client = self.client
         contacts = client.getContactPoints(self.robot, body)
         touching = {contact[3] for contact in contacts}

@@ -125,11 +125,7 @@ class PlacedObject:
         return not (z > 0 and inside)
 
     def brake(self, brakes: bool) -> None:
-        """Let the table brake it where it can roll as it lies, or no longer.
-
-        Bullet's cylinders gain speed on a level table. While an action is recorded nothing brakes,
-        as nothing did when the models' data were collected.
-        """
+        """Let the table brake what can roll as it lies (Bullet's gain speed), or no longer."""
         rolling = BRAKED_ROLLING_M if brakes and self.rolls() else ROLLING_M
         self.client.changeDynamics(self.body, -1, rollingFriction=rolling)
 

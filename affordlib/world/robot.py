@@ -84,10 +84,9 @@ def _gripper(tool: str) -> str:
 
 @cache
 def robot_description(tool: str = "gripper") -> str:
-    """The URDF text of arm, gripper and, if it is the tool, screwdriver; meshes as absolute paths.
+    """The URDF text of arm and tool, with the collision meshes alone, which load ten times faster.
 
-    The detailed visual meshes are replaced by the collision ones (they load ten times faster) and
-    the mass-less frames are dropped (PyBullet would give each a mass of 1 kg).
+    Mass-less frames are dropped: PyBullet would give each a mass of 1 kg.
     """
     folder = _description_folder()
     root = ET.parse(folder / "ur_description" / "urdf" / "ur10_robot.urdf").getroot()
