@@ -74,7 +74,7 @@ def test_no_flipped_bit_loads_as_another_model(untrained, tmp_path):
     rng = np.random.default_rng(0)
     files = {
         save_checkpoint(untrained, tmp_path / "m.safetensors", {"note": "none"}): load_checkpoint,
-        Reachability().save(tmp_path / "r.safetensors"): Reachability.load,
+        Reachability(("push",)).save(tmp_path / "r.safetensors"): Reachability.load,
     }
     for path, load in files.items():
         whole = path.read_bytes()
