@@ -24,7 +24,8 @@ planning.problem planning.reachability planning.skills interactions.dataset
 interactions.sampling interactions.collect interactions.import_log interactions.lever_up
 interactions.log interactions.recipes interactions.store models.calibration models.checkpoint
 models.domain models.fit models.lever_up models.protocol models.training evaluation.metrics
-show.animation show.executors show.explorers show.goal_picker show.plots
+evaluation.cross_validate planning.push_at show.animation show.executors show.explorers
+show.goal_picker show.plots
 """
 _CONF = BeartypeConf(
     violation_type=TypeError,

@@ -15,7 +15,7 @@ from typing import ClassVar
 import numpy as np
 
 from affordlib.geometry import unit_vector, wrap_angle
-from affordlib.types import check_array, check_field, check_finite, check_within
+from affordlib.types import check_array, check_field, check_finite, check_pair, check_within
 
 DURATION_S = 3.75
 """Of every primitive: 25 recorded samples, one every 3 steps of 50 ms (Section 4.2)."""
@@ -26,6 +26,9 @@ PUSH_GAP_M = 0.03
 TIP_HEIGHT_M = 0.01
 HOVER_M = 0.16
 """Height of the finger tips before they are lowered over an object."""
+
+ROD_GAP_M = 0.006
+"""So far before the contact a push with the rod begins."""
 
 BLADE_HEIGHT_M = 0.0015
 
@@ -180,6 +183,39 @@ class Push(_Move):
         yaw = self.direction_rad
         start, end = (s * unit_vector(yaw) for s in (-self.radius, self.length))
         facing = TIP_HEIGHT_M, yaw, 1.0
+        return _segments((0.0, (*start, *facing)), (DURATION_S, (*end, *facing)))
+
+
+@dataclass(frozen=True)
+class PushAt(Primitive):
+    """A straight push with a thin rod, off the centre: at any point and in any direction.
+
+    The rod comes in `direction` [rad], meets the object at `contact` (x, y) [m], relative to its
+    centre in the table's axes, and moves on by `length` [m].
+    """
+
+    contact: tuple[float, float]
+    direction: float
+    length: float = 0.016
+
+    name = "push_at"
+    opening_m = 0.0
+    force_N = 200.0
+    tool = "rod"
+    lengths_m: ClassVar = {"length": (0.0, 0.15)}
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        contact = check_pair("contact", self.contact)
+        for value in contact:
+            check_within("contact", value, -0.3, 0.3, "m")
+        object.__setattr__(self, "contact", contact)
+        object.__setattr__(self, "direction", wrap_angle(check_finite("direction", self.direction)))
+
+    @cached_property
+    def segments(self) -> tuple[Segment, ...]:
+        ahead, facing = unit_vector(self.direction), (TIP_HEIGHT_M, self.direction, 0.0)
+        start, end = (self.contact + s * ahead for s in (-ROD_GAP_M, self.length))
         return _segments((0.0, (*start, *facing)), (DURATION_S, (*end, *facing)))
 
 

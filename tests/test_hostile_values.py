@@ -24,7 +24,7 @@ from affordlib.models.fit import EFFORT
 from affordlib.paths import repo_root
 from affordlib.perception import crop_from_depth
 from affordlib.plan_files import load_plan, save_plan
-from affordlib.primitives import Drag, Grasp, LeverUp, Push, Rotate, primitive_named
+from affordlib.primitives import Drag, Grasp, LeverUp, Push, PushAt, Rotate, primitive_named
 from affordlib.results import read_results, results_table, write_results
 from affordlib.types import Goal, Outcome, Plan, Step, UnreachableError
 from exercises import check
@@ -161,6 +161,7 @@ def valid_calls(shop):
         "Push": call(Push, theta=0.0, length=0.05, radius=0.2),
         "Push.towards": call(Push.towards, direction_rad=0.0),
         "Push.path": call(Push(0.0).path, phase=0.5),
+        "PushAt": call(PushAt, contact=(0.0, -0.03), direction=1.5, length=0.01),
         "Drag": call(Drag, theta=0.0, length=0.05, grip_yaw=0.0),
         "Grasp": call(Grasp, grip_yaw=0.0, seen_height=0.05),
         "Rotate": call(Rotate, grip_yaw=0.0),
@@ -454,7 +455,7 @@ def test_a_hostile_value_is_refused_by_name_or_does_no_harm(shop, name, tmp_path
 
 MADE_BY_DRIVEN_ONES = """
 ClosedLoopResult DisturbanceSchedule EffectModel Execution Robot
-EffectNetwork NetworkConfig PushLog TabletopObject open_loop
+EffectNetwork NetworkConfig PushLog TabletopObject cross_validate open_loop plan_push_at
 """
 
 

@@ -25,8 +25,8 @@ UNITS_RAD = {"deg": math.pi / 180, "rad": 1.0}
 N_PHASES = 51
 MOST_ROWS = 20_000
 LARGEST_M = 1.0
-NEAR_M = 0.03
-"""A tool that has a width of its own touches from this far."""
+SLACK_M = 0.03
+"""So much farther than its tool an object may have moved."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,8 @@ class Log:
 
     unit: of all lengths, "mm" or "m"; angle_unit: of yaws, "rad" or "deg"; outline: corners (x, y)
     in the frame whose pose is recorded, without crossing itself (of an image: `outline_of`);
-    crop_width_m: of images of the object, which must fit in.
+    crop_width_m: of images of the object, which must fit in; tool_radius: of a tool whose middle is
+    recorded.
     """
 
     def __init__(
@@ -93,6 +94,7 @@ class Log:
         outline: Sequence[tuple[float, float]] | np.ndarray,
         crop_width_m: float = CROP_WIDTH_M,
         angle_unit: str = "rad",
+        tool_radius: float = 0.0,
     ) -> None:
         for name, value, known in (
             ("unit", unit, UNITS_M),
@@ -101,13 +103,14 @@ class Log:
             if value not in known:
                 raise ValueError(f"{name} must be one of {sorted(known)}, got {value!r}")
         self._metres, self._radians = UNITS_M[unit], UNITS_RAD[angle_unit]
-        self._unit, self._angle_unit = unit, angle_unit
+        self._angle_unit = angle_unit
         corners = check_array("outline", outline, 2) * self._metres
         self.origin_m, self.outline_m = _centred(corners)
         wide = 2 * float(np.linalg.norm(self.outline_m, axis=1).max())
         if wide > 2 * LARGEST_M:
             raise ValueError(f"outline is {wide:.3g} m wide; is it in {unit}?")
         self.crop_width_m = check_within("crop_width_m", crop_width_m, wide, 10 * wide, "m")
+        self._radius_m = check_within("tool_radius", tool_radius, 0.0, 1e3) * self._metres
         self._pushes: list[dict[str, Any]] = []
 
     def __len__(self) -> int:
@@ -152,7 +155,7 @@ class Log:
         centre = known[:, :2] + np.stack([rotated(self.origin_m, yaw) for yaw in known[:, 2]])
         centre, tool = (rotated(p - centre[0], -first[2]) for p in (centre, xy))
         turn = np.unwrap(known[:, 2]) - first[2]
-        push = _contact(where, self.outline_m, tool, self._unit)
+        push = _contact(where, self.outline_m, tool, self._radius_m)
         name = "poses" if end is None else "end"
         self._refuse_jumps(where, name, np.column_stack([centre, turn]), push["length_m"])
         phase = np.linspace(0, 1, N_PHASES)
@@ -212,18 +215,18 @@ class Log:
 
         It turns about a point that is hardly nearer to the tool than the inscribed circle's radius.
         """
-        most_m = length_m + NEAR_M
+        most_m = length_m + SLACK_M
         most_rad = min(most_m / _inradius_m(self.outline_m), math.pi)
         for row, (x, y, turn) in enumerate(moved.tolist()):
-            if math.hypot(x, y) > most_m:
-                raise ValueError(
-                    f"{where}: pose {row} of start and {name} is {math.hypot(x, y):.3g} m away, "
-                    f"but the tool moves {length_m:.3g} m after contact; is it another push's?"
-                )
             if abs(turn) > most_rad:
                 raise ValueError(
                     f"{where}: pose {row} of start and {name} is turned by {turn:.3g} rad, "
                     f"expected are at most {most_rad:.2g}; yaws are taken in {self._angle_unit}"
+                )
+            if math.hypot(x, y) > most_m:
+                raise ValueError(
+                    f"{where}: pose {row} of start and {name} is {math.hypot(x, y):.3g} m away, "
+                    f"but the tool moves {length_m:.3g} m after contact; is it another push's?"
                 )
 
     def _context(self, where: str, context: Mapping[str, Any]) -> dict[str, Any]:
@@ -240,7 +243,8 @@ def _array(where: str, name: str, values: Any) -> np.ndarray:
     try:
         array = check_array(name, values)
     except (TypeError, ValueError):
-        raise ValueError(f"{where}: {name} must be finite numbers, got {values!r:.80}") from None
+        got = " ".join(f"{values!r:.80}".split())
+        raise ValueError(f"{where}: {name} must be finite numbers, got {got}") from None
     if len(array) > MOST_ROWS:
         raise ValueError(
             f"{where}: {name} has {len(array)} rows, expected are those of one push, at most "
@@ -262,7 +266,7 @@ def _growing(where: str, name: str, times: Any) -> np.ndarray:
     return t
 
 
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray | np.floating:
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
@@ -297,39 +301,33 @@ def _inradius_m(outline_m: np.ndarray) -> float:
     return float(np.abs(_cross(edges, outline_m) / np.linalg.norm(edges, axis=1)).min())
 
 
-def _contact(where: str, outline_m: np.ndarray, tool: np.ndarray, unit: str) -> dict[str, Any]:
-    """Where and how a tool's path (m, 2) meets the outline; nearest to it if it has a width."""
+def _contact(where: str, outline_m: np.ndarray, tool: np.ndarray, radius_m: float) -> dict:
+    """Where and how the path (m, 2) of a tool with a radius first enters the outline."""
     edges = np.roll(outline_m, -1, axis=0) - outline_m
     inward = np.stack([-edges[:, 1], edges[:, 0]], axis=1) / np.linalg.norm(edges, axis=1)[:, None]
-    # Signed distance of points to edges; a step enters where it crosses one from outside.
     off = tool[:, None] - outline_m
-    depth = (off * inward).sum(axis=-1)
+    depth = (off * inward).sum(axis=-1) + radius_m
     share = depth[:-1] / np.where(depth[:-1] == depth[1:], np.inf, depth[:-1] - depth[1:])
-    at = tool[:-1, None] + share[..., None] * (tool[1:] - tool[:-1])[:, None]
+    at = tool[:-1, None] + share[..., None] * (tool[1:] - tool[:-1])[:, None] + radius_m * inward
     along = ((at - outline_m) * edges).sum(axis=-1) / (edges**2).sum(axis=-1)
     enters = (depth[:-1] <= 0) & (depth[1:] > 0) & (along >= 0) & (along <= 1)
-    if enters.any():
-        step, edge = np.argwhere(enters)[0]
-        contact = at[step, edge]
-    else:
+    if not enters.any():
         on = np.clip((off * edges).sum(axis=-1) / (edges**2).sum(axis=-1), 0, 1)
-        gap = np.linalg.norm(off - on[..., None] * edges, axis=-1)
-        step, edge = np.unravel_index(gap.argmin(), gap.shape)
-        contact = outline_m[edge] + on[step, edge] * edges[edge]
-        if gap.min() > NEAR_M:
-            raise ValueError(
-                f"{where}: the tool comes no nearer than {gap.min():.3g} m to the object, expected "
-                f"is that it touches it; start and tool_xy must be in one frame, and in {unit}"
-            )
-    travelled = tool[-1] - contact
+        gap = np.linalg.norm(off - on[..., None] * edges, axis=-1).min() - radius_m
+        raise ValueError(
+            f"{where}: tool_xy never enters the outline from outside, it comes within {gap:.3g} m; "
+            "start and tool_xy must be in one frame and unit, and a thick tool needs tool_radius"
+        )
+    step, edge = np.argwhere(enters)[0]
+    travelled = tool[-1] + radius_m * inward[edge] - at[step, edge]
     length = float(np.linalg.norm(travelled))
     if not 1e-4 < length < LARGEST_M:
         raise ValueError(
-            f"{where}: the tool travels {length:.3g} m after it touches the object, expected is "
-            f"0.1 mm to {LARGEST_M:g} m; lengths are taken in {unit}"
+            f"{where}: tool_xy goes on for {length:.3g} m after contact, expected are 0.1 mm to "
+            f"{LARGEST_M:g} m; check the unit of lengths"
         )
     return {
-        "contact_m": contact,
+        "contact_m": at[step, edge],
         "normal": inward[edge],
         "direction": travelled / length,
         "length_m": length,

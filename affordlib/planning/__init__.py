@@ -17,5 +17,6 @@ from affordlib.planning.disturbances import (
 from affordlib.planning.effect_map import EffectMap
 from affordlib.planning.gradient import plan_gradient
 from affordlib.planning.problem import MODES, PlanMode, PlanningProblem
+from affordlib.planning.push_at import plan_push_at
 from affordlib.planning.robot import Execution, Robot
 from affordlib.planning.skills import Skills

@@ -2,8 +2,9 @@
 
 Its description comes from the package `example-robot-data`; the gripper, two box fingers on
 prismatic joints, is merged into it, because one held by a constraint slips. The screwdriver is a
-shaft straight down with a flat blade along x. W is the frame of the table's centre, T of the tool:
-between the finger tips or at the blade's tip, z down and y along the opening.
+shaft straight down with a flat blade along x, the rod a thin one. W is the frame of the table's
+centre, T of the tool: between the finger tips or at the tip of blade or rod, z down and y along the
+opening.
 """
 
 import math
@@ -25,7 +26,12 @@ FINGER_TRAVEL_M = 0.07
 SHAFT_LENGTH_M = 0.26
 BLADE_LENGTH_M = 0.05
 BLADE_THICKNESS_M = 0.002
-TOOL_OFFSETS_M = {"gripper": (0.0, TOOL_LENGTH_M), "screwdriver": (BLADE_LENGTH_M, SHAFT_LENGTH_M)}
+ROD_WIDTH_M = 0.003
+TOOL_OFFSETS_M = {
+    "gripper": (0.0, TOOL_LENGTH_M),
+    "screwdriver": (BLADE_LENGTH_M, SHAFT_LENGTH_M),
+    "rod": (0.0, SHAFT_LENGTH_M),
+}
 """How far the tool's point lies from the flange along the tool's x and z axes."""
 REACH_M = (0.17, 1.26)
 """How near to its base and how far from it a hanging tool gets, up to hovering height; the wrist
@@ -79,6 +85,11 @@ def _gripper(tool: str) -> str:
         blade = f"{BLADE_LENGTH_M} 0.012 {BLADE_THICKNESS_M}", f"{BLADE_LENGTH_M / 2} 0 0"
         boxes.append(_box("shaft", *shaft, 0.05, _RED, "palm", none, none))
         boxes.append(_box("blade", *blade, 0.02, _RED, "shaft", f"0 0 {SHAFT_LENGTH_M}", none))
+    if tool == "rod":
+        rod = f"{ROD_WIDTH_M} {ROD_WIDTH_M} {SHAFT_LENGTH_M - 0.1}"
+        boxes.append(
+            _box("rod", rod, f"0 0 {(0.1 + SHAFT_LENGTH_M) / 2}", 0.05, _RED, "palm", none, none)
+        )
     return f"<robot>{''.join(boxes)}</robot>"
 
 

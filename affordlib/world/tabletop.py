@@ -96,7 +96,7 @@ class Tabletop(AbstractContextManager):
         self._placed: PlacedObject | None = None
         self.noise = np.random.default_rng(self.config.noise_seed)
         set_friction(client, self._table, -1, self.config.table_friction)
-        for name in ("left_finger", "right_finger", "blade"):
+        for name in ("left_finger", "right_finger", "blade", "rod"):
             if name in self.arm.links:
                 finger = self.arm.robot, self.arm.links[name]
                 set_friction(client, *finger, self.config.finger_friction)
@@ -139,7 +139,7 @@ class Tabletop(AbstractContextManager):
     ) -> None:
         """Clear the table, park the arm and stand an object at (x, y) [m], turned by a yaw.
 
-        tool: "gripper" or "screwdriver"; config: from now on (default: as it is).
+        tool: "gripper", "screwdriver" or "rod"; config: from now on (default: as it is).
         """
         xy_m, yaw_rad = check_on_table("xy_m", xy_m), check_finite("yaw_rad", yaw_rad)
         if tool not in robot.TOOL_OFFSETS_M:

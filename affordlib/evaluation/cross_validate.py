@@ -1,0 +1,273 @@
+"""Cross-validation of models on a log of one's own, always beside predictors without a network.
+
+constant          the mean effect, in the direction of the push
+nearest           the effect of the training push with the nearest contact point and direction
+ridge             quadratic in contact point and direction
+gaussian_process  of contact point and direction, and of mirrored copies where the outline allows
+physics           a quasi-static push with two fitted numbers (`AnalyticPusher`); physics_feet:
+                  with the support that `context["feet"]` tells
+physics_gp        the same, and a Gaussian process of what it leaves; physics_feet_gp
+
+What `context` tells is told to all that can take it, where it differs among the training pushes.
+"""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pandas as pd
+import torch
+from joblib import Parallel, delayed
+from scipy.stats import norm
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
+from sklearn.linear_model import RidgeCV
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import PolynomialFeatures, StandardScaler
+
+from affordlib.interactions.log import PushLog
+from affordlib.models.fit import MODELS, fit, gyration_radius_m, push_rows, told_feet
+from affordlib.models.neural_process import transformed
+from affordlib.models.quasi_static import AnalyticPusher
+from affordlib.types import check_count
+
+MOST_PUSHES = 3000
+"""Time of a Gaussian process grows as the cube of the number."""
+WITHIN = ("group", "all", "others")
+
+Forecast = tuple[np.ndarray, np.ndarray]
+"""Mean and σ (n, 3) of displacement and turn, in the object's frame."""
+
+
+def cross_validate(
+    data: PushLog,
+    models: Sequence[str] = tuple(MODELS),
+    folds: int = 5,
+    within: str = "group",
+    seed: int = 0,
+) -> pd.DataFrame:
+    """Errors and coverage of models, and of all baselines, by group and of all pushes.
+
+    models: names for `fit`; folds: of each group, each tested once; within: "group" trains on the
+    other folds of the same group, "all" on those of all groups, "others" on the other groups. A
+    row per model and group, and group "all": n_train, n, mean, standard error and median of the
+    position error [m], mean and standard error of the yaw error [rad], and the share of x, y and
+    yaw inside the 50 and 90 % intervals.
+    """
+    errors = push_errors(data, models, folds, within, seed)
+    rows = [summary(part, *keys) for keys, part in errors.groupby(["model", "group"], sort=False)]
+    rows += [summary(part, name, "all") for name, part in errors.groupby("model", sort=False)]
+    return pd.DataFrame(rows)
+
+
+def push_errors(
+    data: PushLog, models: Sequence[str], folds: int = 5, within: str = "group", seed: int = 0
+) -> pd.DataFrame:
+    """A row per model and push, with its number: what `cross_validate` is the summary of."""
+    check_count("folds", folds, 2)
+    check_count("seed", seed, least=0)
+    if unknown := set(models) - set(MODELS):
+        raise ValueError(f"models must be among {sorted(MODELS)}, got {sorted(map(str, unknown))}")
+    names, counts = np.unique(data.groups, return_counts=True)
+    if within not in WITHIN or (within == "others" and len(names) < 2):
+        raise ValueError(
+            f"within must be one of {WITHIN}, got {within!r}; data has {len(names)} groups"
+        )
+    if counts.min() < 2 * folds or len(data) > MOST_PUSHES:
+        raise ValueError(
+            f"data must hold at least {2 * folds} interactions of each group for {folds} folds and "
+            f"at most {MOST_PUSHES}, got {dict(zip(names.tolist(), counts.tolist(), strict=True))}"
+        )
+    fold, rng = np.zeros(len(data), dtype=int), np.random.default_rng(seed)
+    for name, count in zip(names, counts, strict=True):
+        fold[data.groups == name] = rng.permutation(count) % folds
+    jobs = [(data.groups == name, k) for name in names for k in range(folds)]
+    if within == "all":
+        jobs = [(np.ones(len(data), dtype=bool), k) for k in range(folds)]
+    tests = [g if within == "others" else g & (fold == k) for g, k in jobs]
+    tests = tests[:: folds if within == "others" else 1]
+    pool = [~t if within == "others" else g for t, (g, _) in zip(tests, jobs, strict=False)]
+    parts = Parallel(n_jobs=min(len(tests), os.cpu_count()))(
+        delayed(_errors)(data, g & ~t, t, tuple(models), seed)
+        for g, t in zip(pool, tests, strict=True)
+    )
+    return pd.concat(parts, ignore_index=True)
+
+
+def summary(errors: pd.DataFrame, model: str, group: str) -> dict[str, float]:
+    """The row of a table of errors per push."""
+    position, yaw = errors["position_m"], errors["yaw_rad"]
+    return {
+        "model": model,
+        "group": group,
+        "n_train": round(errors["n_train"].mean()),
+        "n": len(errors),
+        "position_mean_m": position.mean(),
+        "position_sem_m": position.sem(),
+        "position_median_m": position.median(),
+        "yaw_mean_rad": yaw.mean(),
+        "yaw_sem_rad": yaw.sem(),
+        "coverage_50": errors["inside_50"].mean(),
+        "coverage_90": errors["inside_90"].mean(),
+    }
+
+
+def _errors(
+    data: PushLog, trained: np.ndarray, tested: np.ndarray, models: tuple[str, ...], seed: int
+) -> pd.DataFrame:
+    """Errors of all predictors of the pushes tested (n,), after those trained on (n,)."""
+    torch.set_num_threads(1)
+    train, test, scale = (
+        data.select(trained),
+        data.select(tested),
+        gyration_radius_m(data.outline_m),
+    )
+    frames = []
+    for name in (*_BASELINES, *models):
+        if name.startswith("physics_feet") and "feet" not in data.context:
+            continue
+        if name in _BASELINES:
+            mean, std = _BASELINES[name](train, test)
+            mean, std = (v * [scale, scale, 1.0] for v in (mean, std))
+        else:
+            mean, std = fit(train, name, seed).predict(test)
+        truth = np.column_stack([test.displacement_m, test.turn_rad])
+        off = np.abs(mean - truth)
+        inside = {p: (off < norm.ppf((1 + p / 100) / 2) * std).mean(axis=1) for p in (50, 90)}
+        frames.append(
+            pd.DataFrame(
+                {
+                    "model": name,
+                    "group": test.groups,
+                    "push": np.flatnonzero(tested),
+                    "n_train": trained.sum(),
+                    "position_m": np.hypot(off[:, 0], off[:, 1]),
+                    "yaw_rad": off[:, 2],
+                    "inside_50": inside[50],
+                    "inside_90": inside[90],
+                }
+            )
+        )
+    return pd.concat(frames)
+
+
+def mirrors(outline_m: np.ndarray) -> list[np.ndarray]:
+    """Matrices (2, 2) of the reflections that take an outline (k, 2) to itself."""
+    corners = outline_m @ np.array([1, 1j])
+    found = []
+    for corner in corners:
+        turn = corners[0] * corner / abs(corners[0]) / abs(corner)
+        gaps = np.abs((turn * corners.conj())[:, None] - corners).min(axis=1)
+        if gaps.max() < 0.01 * np.abs(corners).max():
+            found.append(np.array([[turn.real, turn.imag], [turn.imag, -turn.real]]))
+    return found
+
+
+def _features(log: PushLog, like: PushLog) -> np.ndarray:
+    """Contact point and direction (n, 4 + c), length and context where they differ in `like`."""
+    columns = [push_rows(log)[:, [0, 1, 4, 5]].double().numpy()]
+    if like.length_m.std() > 0.05 * like.length_m.mean():
+        columns.append(log.length_m[:, None] / gyration_radius_m(log.outline_m))
+    for name, values in log.context.items():
+        known = np.unique(like.context[name]) if name != "feet" else ()
+        if len(known) > 1 and values.dtype.kind in "US":
+            columns.append((values[:, None] == known).astype(float))
+        elif len(known) > 1:
+            columns.append(((values - known.mean()) / known.std())[:, None])
+    return np.hstack(columns)
+
+
+def _outcome(log: PushLog) -> np.ndarray:
+    return push_rows(log)[:, 7:].double().numpy()
+
+
+def _constant(train: PushLog, test: PushLog) -> Forecast:
+    ahead = _turned(train.direction * [1, -1], _outcome(train))
+    mean, spread = ahead.mean(axis=0), ahead.std(axis=0)
+    of_test = _turned(test.direction, np.tile(mean, (len(test), 1)))
+    return of_test, np.tile([np.hypot(*spread[:2]) / 2**0.5] * 2 + [spread[2]], (len(test), 1))
+
+
+def _turned(direction: np.ndarray, outcome: np.ndarray) -> np.ndarray:
+    """Outcomes (n, 3) whose x axis becomes the directions (n, 2)."""
+    (c, s), (x, y, turn) = direction.T, outcome.T
+    return np.column_stack([c * x - s * y, s * x + c * y, turn])
+
+
+def _nearest(train: PushLog, test: PushLog) -> Forecast:
+    known, outcome = _features(train, train), _outcome(train)
+    gap = np.linalg.norm(known[:, None] - known, axis=-1) + np.diag([np.inf] * len(known))
+    std = (outcome[gap.argmin(axis=1)] - outcome).std(axis=0)
+    found = np.linalg.norm(_features(test, train)[:, None] - known, axis=-1).argmin(axis=1)
+    return outcome[found], np.tile(std, (len(test), 1))
+
+
+def _ridge(train: PushLog, test: PushLog) -> Forecast:
+    model = make_pipeline(PolynomialFeatures(2), StandardScaler(), RidgeCV(np.logspace(-3, 2, 11)))
+    known, outcome = _features(train, train), _outcome(train)
+    std = (outcome - model.fit(known, outcome).predict(known)).std(axis=0)
+    return model.predict(_features(test, train)), np.tile(std, (len(test), 1))
+
+
+def _gaussian_process(train: PushLog, test: PushLog, target: np.ndarray | None = None) -> Forecast:
+    """target: (n, 3), the outcome if not given."""
+    known, target = _features(train, train), _outcome(train) if target is None else target
+    rows = push_rows(train)
+    rows[:, 7:] = torch.from_numpy(target)
+    known, target = [known], [target]
+    for mirror in mirrors(train.outline_m):
+        copy = transformed(rows[None], torch.from_numpy(mirror)[None].float())[0].double().numpy()
+        known.append(np.hstack([copy[:, [0, 1, 4, 5]], known[0][:, 4:]]))
+        target.append(copy[:, 7:])
+    known, target = np.vstack(known), np.vstack(target)
+    prior = ConstantKernel() * RBF([1.0] * known.shape[1], (1e-2, 1e4)) + WhiteKernel(0.1)
+    with warnings.catch_warnings():  # the length of a feature that does not matter is bounded
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        both = [
+            GaussianProcessRegressor(prior, normalize_y=True)
+            .fit(known, column)
+            .predict(_features(test, train), return_std=True)
+            for column in target.T
+        ]
+    mean, std = (np.column_stack(v) for v in zip(*both, strict=True))
+    return mean, std
+
+
+def _physics(feet: bool, process: bool) -> Callable[[PushLog, PushLog], Forecast]:
+    """A quasi-static pusher of each group, or of all where a group is not among the training."""
+
+    def predicted(train, test):
+        means = [np.zeros((len(log), 3)) for log in (train, test)]
+        for group in np.unique(np.concatenate([train.groups, test.groups])):
+            known = train.groups == group
+            fitted = train.select(known if known.any() else known | True)
+            rows, chosen = push_rows(fitted), test.select(test.groups == group)
+            told = [told_feet(log)[0] if feet and len(log) else None for log in (fitted, chosen)]
+            pusher = AnalyticPusher(rows[:, :7], rows[:, 7:], told[0])
+            for mean, log, support in zip(means, (train, test), told, strict=True):
+                if (of_group := log.groups == group).any():
+                    pusher.feet = support
+                    mean[of_group] = pusher.predict(push_rows(log)[of_group, :7]).numpy()
+        left = _outcome(train) - means[0]
+        if process:
+            mean, std = _gaussian_process(train, test, left)
+            return means[1] + mean, std
+        return means[1], np.tile(np.sqrt((left**2).mean(axis=0)), (len(test), 1))
+
+    return predicted
+
+
+_BASELINES: dict[str, Callable[[PushLog, PushLog], Forecast]] = {
+    "constant": _constant,
+    "nearest": _nearest,
+    "ridge": _ridge,
+    "gaussian_process": _gaussian_process,
+    "physics": _physics(False, False),
+    "physics_gp": _physics(False, True),
+    "physics_feet": _physics(True, False),
+    "physics_feet_gp": _physics(True, True),
+}

@@ -1,0 +1,132 @@
+"""Planning with off-centre pushes: where one pushes steers position and yaw.
+
+What a push does in the object's frame does not depend on where the object is. So a library of
+pushes (contact on the outline, direction, length) is predicted once, by any model of a log, and
+chains of one to three are looked up in it: all pairs are a tree in (x, y, ρ yaw), in which what a
+first push leaves is sought. Of the chains found the one with the least expected squared distance
+to the goal is taken; ρ, the object's radius of gyration, makes a length of a turn.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from affordlib.geometry import rotated
+from affordlib.interactions.log import PushLog
+from affordlib.models.fit import PushModel, gyration_radius_m
+from affordlib.primitives import PushAt
+from affordlib.types import Goal, Plan, Step, check_array, check_count, check_on_table
+
+N_CANDIDATES = 600
+MOST_INCIDENCE_RAD = math.radians(50)
+CORNER_SHARE = 0.08
+"""So much of an edge is left out at either end."""
+SHORTEST_SHARE = 0.3
+_NEIGHBOURS = 30
+
+
+def plan_push_at(
+    model: PushModel,
+    log: PushLog,
+    pose: tuple[float, float, float],
+    goal: Goal,
+    n_pushes: int = 3,
+    seed: int = 0,
+) -> Plan:
+    """Plan off-centre pushes from a pose (x, y, yaw) to a goal; its turn counts if it has one.
+
+    log: what the model was fitted to, of one group; the object, its context and the longest push
+    are taken from it. Raises ValueError where a group is not alone.
+    """
+    began = time.perf_counter()
+    x, y, yaw = check_array("pose", pose, 3)
+    check_on_table("pose", (x, y))
+    check_count("n_pushes", n_pushes, 1, 3)
+    if len(names := np.unique(log.groups)) > 1:
+        raise ValueError(f"log must hold one group, got {names.tolist()}; select(...) one")
+    pushes = _candidates(log, np.random.default_rng(check_count("seed", seed, least=0)))
+    effect, std = model.predict(pushes)
+    turn_m = gyration_radius_m(log.outline_m)
+    weights = np.array([1.0, 1.0, turn_m if goal.turn_rad is not None else 1e-6])
+    risk = (weights * std) ** 2
+    target = np.array([*rotated(np.subtract(goal.xy_m, (x, y)), -yaw), goal.turn_rad or 0.0])
+
+    def best(chains):
+        ends = np.zeros((len(chains), 3))
+        for k in range(chains.shape[1]):
+            ends = _after(ends, effect[chains[:, k]])
+        cost = ((weights * (ends - target)) ** 2).sum(axis=1) + risk[chains].sum(axis=(1, 2))
+        return cost.min(), chains[cost.argmin()]
+
+    n = len(pushes)
+    pairs = np.stack(np.meshgrid(np.arange(n), np.arange(n)), axis=-1).reshape(-1, 2)
+    found = [best(chains) for chains in (np.arange(n)[:, None], pairs)[:n_pushes]]
+    if n_pushes == 3:
+        tree = cKDTree(weights * _after(effect[pairs[:, 0]], effect[pairs[:, 1]]))
+        left = target - effect
+        left[:, :2] = _turned(left[:, :2], -effect[:, 2])
+        near = tree.query(weights * left, _NEIGHBOURS)[1].ravel()
+        first = np.repeat(np.arange(n), _NEIGHBOURS)
+        found.append(best(np.column_stack([first, pairs[near]])))
+    chain = min(found, key=lambda each: each[0])[1]
+    steps, end = [], np.zeros((1, 3))
+    for k in chain:
+        heading = yaw + end[0, 2]
+        direction = math.atan2(pushes.direction[k, 1], pushes.direction[k, 0]) + heading
+        primitive = PushAt(
+            rotated(pushes.contact_m[k], heading), direction, float(pushes.length_m[k])
+        )
+        path = [np.add((x, y), rotated(end[0, :2], yaw))]
+        end = _after(end, effect[k : k + 1])
+        path.append(np.add((x, y), rotated(end[0, :2], yaw)))
+        std_m = float(np.hypot(*std[k, :2]))
+        turn = float(end[0, 2])
+        steps.append(Step(primitive, 1.0, tuple(path[1]), np.array(path), None, std_m, turn))
+    reaches = goal.distance_m(steps[-1].predicted_end_xy_m) <= goal.tolerance_m
+    took_s = time.perf_counter() - began
+    return Plan(goal, (x, y), tuple(steps), "push_at", reaches, n, took_s)
+
+
+def _turned(xy: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """Points (n, 2), each turned by an angle (n,)."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.column_stack([c * xy[:, 0] - s * xy[:, 1], s * xy[:, 0] + c * xy[:, 1]])
+
+
+def _after(pose: np.ndarray, effect: np.ndarray) -> np.ndarray:
+    """Poses (n, 3) after effects (n, 3) in the frame of each."""
+    return np.column_stack(
+        [pose[:, :2] + _turned(effect[:, :2], pose[:, 2]), pose[:, 2] + effect[:, 2]]
+    )
+
+
+def _candidates(log: PushLog, rng: np.random.Generator) -> PushLog:
+    """Pushes drawn all around the outline, up to the longest of the log; their effects are zero."""
+    edges = np.roll(log.outline_m, -1, axis=0) - log.outline_m
+    lengths = np.linalg.norm(edges, axis=1)
+    edge = rng.choice(len(edges), N_CANDIDATES, p=lengths / lengths.sum())
+    share = rng.uniform(CORNER_SHARE, 1 - CORNER_SHARE, (N_CANDIDATES, 1))
+    contact = log.outline_m[edge] + share * edges[edge]
+    normal = np.stack([-edges[:, 1], edges[:, 0]], axis=1)[edge] / lengths[edge, None]
+    incidence = rng.uniform(-MOST_INCIDENCE_RAD, MOST_INCIDENCE_RAD, N_CANDIDATES)
+    direction = _turned(normal, incidence)
+    length = log.length_m.max() * rng.uniform(SHORTEST_SHARE, 1, N_CANDIDATES)
+    ends = contact + length[:, None] * direction
+    t = np.linspace(0, 1, log.action.shape[1])[None, :, None]
+    taken = log.select(np.zeros(N_CANDIDATES, dtype=int))
+    return replace(
+        taken,
+        contact_m=contact,
+        normal=normal,
+        direction=direction,
+        length_m=length,
+        displacement_m=np.zeros((N_CANDIDATES, 2)),
+        turn_rad=np.zeros(N_CANDIDATES),
+        action=contact[:, None] + t * (ends - contact)[:, None],
+        effect=np.zeros((N_CANDIDATES, *log.effect.shape[1:])),
+    )

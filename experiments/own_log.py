@@ -1,0 +1,209 @@
+"""The embedded log of page 09, and plans with off-centre pushes, executed.
+
+`python -m experiments.own_log` collects `data/own_log/SURFACE_SUPPORT.txt.xz` in the simulated
+world, in the text format of Zhou et al.: 50 pushes of one drawn triangle with a thin rod for each
+of five drawn surfaces (friction) and supports (where its weight rests); then it plans and executes
+50 goals on the fitted models. `--only log` or `--only goals` does one of the two.
+"""
+
+from __future__ import annotations
+
+import argparse
+import lzma
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from affordlib.geometry import rotated, unit_vector, wrap_angle
+from affordlib.interactions.log import Log, PushLog
+from affordlib.models.fit import PushModel, fit
+from affordlib.paths import repo_root
+from affordlib.planning.push_at import plan_push_at
+from affordlib.primitives import PushAt
+from affordlib.results import write_results
+from affordlib.types import Goal, UnreachableError
+from affordlib.world import Prism, Tabletop, WorldConfig
+from affordlib.world.robot import ROD_WIDTH_M
+
+FOLDER = repo_root() / "data" / "own_log"
+N_PUSHES, N_GOALS = 50, 50
+TRIANGLE_M = ((0.0, 0.0), (0.13, 0.0), (0.03, 0.11))
+"""Corners in the recorded frame, drawn once (scalene: it has no mirror image of its own)."""
+HEIGHT_M = 0.02
+SUPPORTS = {"mid": (0.0, 0.0), "left": (-0.02, -0.005), "right": (0.022, -0.01)}
+SURFACES = {"felt": 0.9, "steel": 0.35}
+CONDITIONS = ("felt_mid", "felt_left", "steel_mid", "steel_right", "steel_left")
+TURN_M = 0.03
+"""So many metres a radian counts."""
+NOISE_M, NOISE_RAD = 0.0003, 0.003
+"""Of the tracked poses."""
+
+
+def world_config(condition: str) -> WorldConfig:
+    """The world of a condition."""
+    surface, support = condition.split("_")
+    x, y = SUPPORTS[support]
+    # The centre of mass lies low, so that the triangle does not tip.
+    inside = {"com_offset_m": (x, y, -0.3 * HEIGHT_M)}
+    friction = {"table_friction": SURFACES[surface], "finger_friction": SURFACES[surface]}
+    return WorldConfig(**inside, **friction)
+
+
+def _pushes(text: str) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Poses (2, 3) before and after, times and positions of the tool, of each push of a file."""
+    numbers = iter(text.split())
+
+    def table(columns, rows=None):
+        rows = int(next(numbers)) if rows is None else rows
+        return np.array([[float(next(numbers)) for _ in range(columns)] for _ in range(rows)])
+
+    for _ in range(int(next(numbers))):
+        poses, _forces, tool = table(7, rows=2), table(3), table(8)
+        yaw = 2 * np.arctan2(poses[:, 6], poses[:, 3])
+        yield np.column_stack([poses[:, :2], yaw]), tool[:, 0], tool[:, 1:3]
+
+
+def read_log(folder: Path = FOLDER) -> PushLog:
+    """The embedded log."""
+    log = Log("mm", np.array(TRIANGLE_M) * 1e3, 0.24, tool_radius=500 * ROD_WIDTH_M)
+    for path in sorted(folder.glob("*.txt.xz")):
+        name = path.name.removesuffix(".txt.xz")
+        told = dict(zip(("surface", "support"), name.split("_"), strict=True))
+        for (start, end), t, xy in _pushes(lzma.decompress(path.read_bytes()).decode()):
+            log.add(start, t, xy, end, context=told, group=name)
+    return log.tensors()
+
+
+def drawn_push(outline_m: np.ndarray, yaw: float, rng: np.random.Generator) -> PushAt:
+    """A push anywhere on the outline, up to 50° off the normal."""
+    edges = np.roll(outline_m, -1, axis=0) - outline_m
+    sizes = np.linalg.norm(edges, axis=1)
+    k = rng.choice(len(edges), p=sizes / sizes.sum())
+    contact = outline_m[k] + rng.uniform(0.06, 0.94) * edges[k]
+    inward = math.atan2(edges[k, 0], -edges[k, 1])
+    direction = inward + math.radians(rng.uniform(-50, 50))
+    return PushAt(rotated(contact, yaw), direction + yaw, float(rng.uniform(0.009, 0.017)))
+
+
+def collect(condition: str, seed: int) -> str:
+    """The text of a condition's log."""
+    rng = np.random.default_rng(seed)
+    prism = Prism(TRIANGLE_M, HEIGHT_M)
+    corner = np.array(prism.corners[0])
+    lines, n = [], 0
+    with Tabletop(world_config(condition)) as world:
+        while n < N_PUSHES:
+            world.place(prism, (0.0, 0.0), rng.uniform(-math.pi, math.pi), tool="rod")
+            x, y, yaw = world.object_pose()
+            try:
+                done = world.execute_primitive(drawn_push(prism.footprint_m, yaw, rng))
+            except UnreachableError:
+                continue
+            if done.faults or done.fell:
+                continue
+            tool = done.tool[:, :2] + done.estimated_xy_m
+            rows = [
+                "{:.2f} {:.3f} {:.3f} 0 1 0 0 0".format(t, *xy)
+                for t, xy in zip(np.linspace(0, 3.75, len(tool)), 1e3 * tool, strict=True)
+            ]
+            poses = []
+            for px, py, a in ((x, y, yaw), world.object_pose()):
+                at = np.add((px, py), rotated(corner, a)) + rng.normal(0, NOISE_M, 2)
+                a = (a + rng.normal(0, NOISE_RAD)) / 2
+                at = 1e3 * at
+                poses.append(f"{at[0]:.3f} {at[1]:.3f} 0 {math.cos(a):.6f} 0 0 {math.sin(a):.6f}")
+            lines += [*poses, "0", str(len(rows)), *rows]
+            n += 1
+    return "\n".join([str(n), *lines]) + "\n"
+
+
+def pursue(world: Tabletop, model: PushModel, log: PushLog, goal: tuple, corrected: bool) -> dict:
+    """What is left to a goal (x, y, turn) of the object at the origin, and pushes that it took.
+
+    corrected: look after each push and plan anew, up to six pushes, until a plan does not help.
+    """
+    yaw, pushes = world.object_pose()[2], 0
+    while pushes < (6 if corrected else 1):
+        pose = world.object_pose()
+        left = wrap_angle(yaw + goal[2] - pose[2])
+        now = math.hypot(math.dist(pose[:2], goal[:2]), TURN_M * left)
+        plan = plan_push_at(model, log, pose, Goal(goal[:2], 0.001, left))
+        end = plan.steps[-1]
+        there = TURN_M * wrap_angle(end.predicted_turn_rad - left)
+        if math.hypot(plan.predicted_distance_m, there) + end.std_m > now:
+            break
+        for step in plan.steps[: 1 if corrected else 3]:
+            world.execute_primitive(step.primitive)
+            pushes += 1
+        if not corrected:
+            break
+    end = world.object_pose()
+    turn = abs(wrap_angle(end[2] - yaw - goal[2]))
+    return {"position_m": math.dist(end[:2], goal[:2]), "yaw_rad": turn, "pushes": pushes}
+
+
+class Remembered:
+    """A model that predicts the candidates of plans once, for they are the same for one seed."""
+
+    def __init__(self, model: PushModel) -> None:
+        self.model, self.known = model, None
+
+    def predict(self, pushes: PushLog) -> tuple[np.ndarray, np.ndarray]:
+        """As the model predicted the first pushes."""
+        if self.known is None:
+            self.known = self.model.predict(pushes)
+        return self.known
+
+
+def goals(n: int = N_GOALS) -> list[dict]:
+    """Errors of executed plans, by whether they are corrected between pushes."""
+    log, found = read_log(), {False: [], True: []}
+    prism, rng = Prism(TRIANGLE_M, HEIGHT_M), np.random.default_rng(1)
+    for condition in CONDITIONS:
+        of_one = log.select(log.groups == condition)
+        model = Remembered(fit(of_one, "np"))
+        with Tabletop(world_config(condition)) as world:
+            for _ in range(n // len(CONDITIONS)):
+                xy = rng.uniform(0.008, 0.03) * unit_vector(rng.uniform(-math.pi, math.pi))
+                goal = *xy, rng.uniform(-0.35, 0.35)
+                for corrected, errors in found.items():
+                    world.place(prism, (0.0, 0.0), 0.0, tool="rod")
+                    errors.append(pursue(world, model, of_one, goal, corrected))
+    rows = []
+    for corrected, errors in found.items():
+        table = pd.DataFrame(errors)
+        rows.append(
+            {
+                "corrected": corrected,
+                "n": len(table),
+                "position_mean_m": table["position_m"].mean(),
+                "position_sem_m": table["position_m"].sem(),
+                "position_median_m": table["position_m"].median(),
+                "yaw_mean_rad": table["yaw_rad"].mean(),
+                "yaw_sem_rad": table["yaw_rad"].sem(),
+                "pushes": table["pushes"].mean(),
+            }
+        )
+    return rows
+
+
+def main() -> None:
+    """Collect the log, execute plans, or both."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only", choices=("log", "goals"))
+    only = parser.parse_args().only
+    if only != "goals":
+        FOLDER.mkdir(parents=True, exist_ok=True)
+        for seed, condition in enumerate(CONDITIONS):
+            text = collect(condition, seed)
+            (FOLDER / f"{condition}.txt.xz").write_bytes(lzma.compress(text.encode()))
+    if only != "log":
+        tables = {"goals": goals()}
+        write_results(repo_root() / "data" / "results", "own_log", {"n_goals": N_GOALS}, tables)
+
+
+if __name__ == "__main__":
+    main()

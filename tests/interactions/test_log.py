@@ -1,0 +1,195 @@
+"""A log of one's own: what is wrong is said in a sentence, what is right is the same anywhere."""
+
+import numpy as np
+import pytest
+
+from affordlib.evaluation import cross_validate
+from affordlib.evaluation.cross_validate import mirrors
+from affordlib.geometry import rotated
+from affordlib.interactions import Log
+from affordlib.perception import crop_from_depth, outline_image, outline_of
+from affordlib.world import Prism
+from affordlib.world.camera import depth_crop
+
+TRIANGLE_MM = ((0, 0), (150, 0), (0, 150))
+CENTRE_MM = np.array([50.0, 50.0])
+PUSH = {
+    "start": (600.0, -20.0, 0.3),
+    "tool_t": np.linspace(0, 6.6, 12),
+    "end": (605.0, -14.0, 0.38),
+    "context": {"surface": "felt"},
+    "group": "felt_mid",
+}
+
+
+def tool(angle=0.3, at=(600.0, -20.0)):
+    """A tool that comes from below, seen from the triangle, 30 mm from its corner."""
+    way = np.stack([np.linspace(30, 35, 12), np.linspace(-2, 14, 12)], axis=1)
+    return rotated(way, angle) + at
+
+
+def one(**changed):
+    """Arguments of a good push, some of them changed."""
+    return PUSH | {"tool_xy": tool()} | changed
+
+
+def test_a_push_is_told_in_the_frame_of_the_object():
+    log = Log("mm", TRIANGLE_MM, 0.24)
+    log.add(**one())
+    data = log.tensors()
+    np.testing.assert_allclose(data.contact_m[0], [(30.625 - 50) / 1e3, -0.05], atol=1e-9)
+    np.testing.assert_allclose(data.normal, [[0, 1]], atol=1e-12)
+    np.testing.assert_allclose(data.direction, [[5, 16] / np.hypot(5, 16)], atol=1e-9)
+    assert data.length_m[0] == pytest.approx(0.014 * np.hypot(5, 16) / 16)
+    after, before = (
+        rotated(CENTRE_MM, p[2]) + np.array(p[:2]) for p in (PUSH["end"], PUSH["start"])
+    )
+    np.testing.assert_allclose(data.displacement_m[0], rotated(after - before, -0.3) / 1e3)
+    assert data.turn_rad[0] == pytest.approx(0.08)
+    assert np.isnan(data.effect[0, 1:-1]).all()
+    assert np.isfinite(data.effect[0, [0, -1]]).all()
+    assert data.interaction_tensors().effect.shape == (1, 2, 3)
+
+
+def test_units_frames_and_poses_in_between_change_nothing():
+    log = Log("mm", TRIANGLE_MM, 0.24)
+    log.add(**one())
+    x, y, yaw = PUSH["end"]
+    elsewhere = {
+        "start": (0.0, 0.0, -40.0),
+        "end": (*rotated(np.array([x, y]) - (600, -20), np.radians(-40) - 0.3) / 1e3, None),
+        "tool_xy": rotated(tool(0.0, (0, 0)), np.radians(-40)) / 1e3,
+    }
+    elsewhere["end"] = (*elsewhere["end"][:2], -40 + np.degrees(yaw - 0.3))
+    other = Log("m", np.array(TRIANGLE_MM) / 1e3, 0.24, angle_unit="deg")
+    other.add(**one(**elsewhere))
+    between = Log("mm", TRIANGLE_MM, 0.24)
+    times, poses = np.array([0.0, 3.3, 6.6]), np.array([PUSH["start"], PUSH["start"], PUSH["end"]])
+    between.add(**one(end=None, poses=(times, poses)))
+    for name in ("contact_m", "normal", "direction", "length_m", "displacement_m", "turn_rad"):
+        for data in (other.tensors(), between.tensors()):
+            expected = getattr(log.tensors(), name)
+            np.testing.assert_allclose(getattr(data, name), expected, atol=1e-9)
+    assert np.isfinite(between.tensors().effect).all()
+
+
+BAD = {
+    "millimetres as metres": ({}, {"unit": "m"}, r"outline is \d+ m wide; is it in m\?"),
+    "another outline's unit": (
+        {},
+        {"unit": "m", "outline": np.array(TRIANGLE_MM) / 1e3},
+        r"interaction 0 .*tool_xy never enters .*one frame and unit",
+    ),
+    "degrees as radians": (
+        {"start": (600.0, -20.0, 17.2)},
+        {},
+        r"interaction 0 .*start has a yaw of 17.2 rad, .*angle_unit",
+    ),
+    "degrees of the end alone": (
+        {"end": (605.0, -14.0, 4.5)},
+        {},
+        r"interaction 0 .*end is turned by .* rad, expected .*rad",
+    ),
+    "absolute tool, relative object": (
+        {"start": (0.0, 0.0, 0.0)},
+        {},
+        r"interaction 0 .*tool_xy never enters the outline .*one frame",
+    ),
+    "a pose of another push": (
+        {"end": (700.0, -14.0, 0.38)},
+        {},
+        r"interaction 0 .*pose 1 of start and end is .* m away, but the tool moves 0.0147 m",
+    ),
+    "a missing column": (
+        {"tool_xy": np.zeros(12)},
+        {},
+        r"interaction 0 .*tool_xy must hold x and y at each of the 12 times",
+    ),
+    "a missing column of the pose": (
+        {"end": (605.0, -14.0)},
+        {},
+        r"interaction 0 .*end must be x, y and yaw",
+    ),
+    "repeated times": (
+        {"tool_t": np.array([0, 1, 2, 3, 4, 5, 5, 7, 8, 9, 10, 11.0])},
+        {},
+        r"interaction 0 .*tool_t must grow, but row 6 .*leave out",
+    ),
+    "a gap": (
+        {"tool_xy": np.vstack([tool()[:-1], [[np.nan, 0]]])},
+        {},
+        r"interaction 0 .*tool_xy must be finite",
+    ),
+    "effects that do not begin at zero": (
+        {"end": None, "poses": (np.array([0, 6.6]), np.array([(610, -20, 0.3), PUSH["end"]]))},
+        {},
+        r"interaction 0 .*first of poses is .*effects begin at zero",
+    ),
+    "a whole session": (
+        {"tool_t": np.arange(1e5), "tool_xy": np.zeros((100_000, 2))},
+        {},
+        r"interaction 0 .*tool_t has 100000 rows, .*cut the recording",
+    ),
+    "an outline that crosses itself": (
+        {},
+        {"outline": ((0, 0), (150, 150), (150, 0), (0, 150))},
+        r"outline crosses itself: .*corner 0 and from corner 2",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_what_is_wrong_is_said_in_a_sentence_and_not_added(name):
+    changed, settings, says = BAD[name]
+    given = {"unit": "mm", "outline": TRIANGLE_MM, "crop_width_m": 0.24} | settings
+    logs = []
+
+    def read():
+        logs.append(Log(**given))
+        logs[0].add(**one(**changed))
+
+    with pytest.raises(ValueError, match=says) as raised:
+        read()
+    assert "\n" not in str(raised.value)
+    assert not any(map(len, logs))
+
+
+def test_one_interaction_is_too_few():
+    log = Log("mm", TRIANGLE_MM, 0.24)
+    with pytest.raises(ValueError, match="log is empty"):
+        log.tensors()
+    log.add(**one())
+    with pytest.raises(ValueError, match=r"at least 10 interactions .*'felt_mid': 1"):
+        cross_validate(log.tensors())
+    with pytest.raises(ValueError, match=r"context names .*'load'.*that of interaction 0"):
+        log.add(**one(context={"load": 1.0}))
+
+
+def test_outlines_are_drawn_as_the_camera_sees_them(one_world):
+    prism = Prism(((0.0, 0.0), (0.07, 0.0), (0.0, 0.08)), 0.05)
+    one_world.place(prism, (0.0, 0.0), 0.0)
+    seen, drawn = depth_crop(one_world.client, (0.0, 0.0)), outline_image(prism.footprint_m)
+    assert np.abs(seen[1] - drawn[1]).mean() < 0.005
+    pixel = 0.16 / 48
+    corners = outline_of(drawn)
+    for corner in prism.footprint_m:
+        assert np.linalg.norm(corners - corner, axis=1).min() < 2 * pixel
+
+
+def test_a_camera_of_ones_own_is_rectified():
+    """A box of 6 cm, 5 cm high, seen from 1 m above at 30 cm to the side of it."""
+    rows, columns = np.mgrid[:480, :640]
+    depth = np.ones((480, 640))
+    top = 0.95 * np.stack([(columns - 320) / 500, (240 - rows) / 500])
+    depth[(np.abs(top[0] - 0.3) < 0.03) & (np.abs(top[1]) < 0.03)] = 0.95
+    pose = np.diag([1.0, -1.0, -1.0, 1.0])
+    pose[2, 3] = 1.0
+    image = crop_from_depth(depth, (500, 500, 320, 240), pose, (0.3, 0.0), 0.12)
+    assert image[1].mean() == pytest.approx(0.25, abs=0.02)
+    assert np.median(image[0][image[1] > 0]) == pytest.approx(0.95, abs=1e-3)
+
+
+def test_the_mirrors_of_outlines():
+    square = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * 0.03
+    assert len(mirrors(square)) == 4
+    assert not mirrors(np.array([[0.0, 0.05], [-0.04, -0.01], [0.04, -0.04]]))
