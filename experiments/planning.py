@@ -14,6 +14,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,7 @@ from affordlib.models.checkpoint import load_checkpoint
 from affordlib.paths import repo_root
 from affordlib.planning import (
     EffectMap,
+    Execution,
     PlanMode,
     PlanningProblem,
     Skills,
@@ -39,9 +41,9 @@ from affordlib.planning import (
 )
 from affordlib.primitives import Push
 from affordlib.results import write_results
-from affordlib.types import Outcome, Plan
+from affordlib.types import Outcome, Plan, Step
 from affordlib.world import Tabletop, UnreachableError
-from experiments import reported, runner
+from experiments import planners, reported, runner
 from experiments.oracle import oracle_effects
 from experiments.runner import FOLDER, Job
 
@@ -49,28 +51,13 @@ POSITION_ERROR_M, YAW_ERROR_RAD = 0.001, math.radians(1.0)
 GROUPS = {"all": STANDING + ROLLABLE, "standing": STANDING, "rollable": ROLLABLE} | {
     name: (name,) for name in STANDING + ROLLABLE
 }
-FINE_PHASES = tuple(round(0.5 + 0.05 * k, 2) for k in range(1, 11))
-
 Rows = list[dict[str, Any]]
 Planner = Callable[..., Plan]
 """A planner as (image, start_xy_m, goal, mode) → Plan."""
 
 
-def plan_astar_fine(problem: PlanningProblem) -> Plan:
-    """A* with twice as many directions and stop phases, content within 5 mm instead of 20."""
-    problem = replace(problem, goal=replace(problem.goal, tolerance_m=0.005))
-    return plan_astar(problem, n_directions=72, stop_phases=FINE_PHASES)
-
-
-def plan_full(problem: PlanningProblem) -> Plan:
-    """The continuous planner without partial actions."""
-    return plan_continuous(replace(problem, mode=replace(problem.mode, partial=False)))
-
-
-VERSIONS: dict[Planner, int] = dict.fromkeys(
-    (plan_astar, plan_astar_fine, plan_continuous, plan_full, plan_gradient), 1
-)
-"""Raise one when the planner changes, or how its plans are executed, and its numbers do."""
+VERSIONS: dict[Planner, int] = {plan_astar: 2, planners.plan_astar_fine: 2}
+"""Of planners, 1 unless one changed, or how its plans are executed, and with it its numbers."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +66,8 @@ class PlannerConfig:
 
     planner: a function of a `PlanningProblem`; arguments: its others; execution: those of
     `attempt`. model: a checkpoint of pushes, or "simulator"; oracle: then the arguments of
-    `oracle_effects`. world: whose frozen goals; sources: which of them; stride: every so-many-th.
+    `oracle_effects`. world: whose frozen goals; sources: which of them; stride: every so-many-th;
+    standing: no objects that roll.
     """
 
     planner: Callable[..., Plan]
@@ -90,6 +78,7 @@ class PlannerConfig:
     world: str = "clean"
     sources: tuple[str, ...] = ("constructed",)
     stride: int = 1
+    standing: bool = False
 
     @property
     def checkpoints(self) -> dict[str, str]:
@@ -103,7 +92,8 @@ class PlannerConfig:
     def classes(self) -> tuple[str, ...]:
         """The categories of objects that it is asked about."""
         drags = "drag" in self.checkpoints or self.model == "simulator"
-        return STANDING + ROLLABLE if drags and self.world == "clean" else STANDING
+        drags &= self.world == "clean" and not self.standing
+        return STANDING + ROLLABLE if drags else STANDING
 
     def chosen(self, tasks: Sequence[PlanningTask]) -> list[int]:
         """Which of some tasks it is asked, by number."""
@@ -112,12 +102,15 @@ class PlannerConfig:
 
     def columns(self) -> dict[str, Any]:
         """What a row of the table says of it."""
-        samples = {plan_astar: 5, plan_astar_fine: len(FINE_PHASES)}
+        fine = len(planners.FINE_PHASES)
+        samples = {plan_astar: 5, planners.plan_astar_full: 1, planners.plan_astar_fine: fine}
+        placed = "plan" if self.execution.get("by_plan") else "observation"
         return {
             "algorithm": self.planner.__name__.removeprefix("plan_"),
             "model": self.model,
             "world": self.world,
             "samples": self.arguments.get("samples", samples.get(self.planner)),
+            "placed_by": placed,
             "closed_loop": self.execution.get("corrections", 0) > 0,
             "perturbed_start": self.execution.get("perturbed_start", False),
         }
@@ -139,34 +132,45 @@ class PlannerConfig:
 
 
 ALL = {"sources": goals.GOAL_SOURCES}
-CORRECTED = {"execution": {"corrections": 2}}
-ON_RING = {"samples": 100, "starts": 4, "direction_only": True}
+CORRECTED, BY_PLAN = {"execution": {"corrections": 2}}, {"execution": {"by_plan": True}}
+LITERAL, ON_RING = {"samples": 100}, {"samples": 100, "starts": 4, "direction_only": True}
+DISC = {"heuristic": "disc"}
 PERTURBED = {"model": "film_5000_perturbed", "world": "perturbed"}
 ORACLE = {"model": "simulator"}
+RISK_WEIGHTS = (0.0, 1.0, 10.0, 30.0)
+"""Of the continuous planner, tried on the validation goals."""
+
 CONFIGS: dict[str, PlannerConfig] = {
     # Our planner and A* on our best model.
     "continuous": PlannerConfig(plan_continuous, **ALL),
     "continuous_corrected": PlannerConfig(plan_continuous, **CORRECTED, **ALL),
-    "astar": PlannerConfig(plan_astar, **ALL),
-    "astar_fine": PlannerConfig(plan_astar_fine, **ALL),
-    "astar_corrected": PlannerConfig(plan_astar, **CORRECTED, **ALL),
+    "continuous_by_plan": PlannerConfig(plan_continuous, **BY_PLAN, standing=True),
+    "astar": PlannerConfig(plan_astar, standing=True),
+    "astar_corrected": PlannerConfig(plan_astar, **CORRECTED, standing=True),
+    "astar_by_plan": PlannerConfig(plan_astar, **BY_PLAN, standing=True),
+    "astar_disc": PlannerConfig(plan_astar, arguments=DISC, **ALL),
+    "astar_disc_corrected": PlannerConfig(plan_astar, arguments=DISC, **CORRECTED, **ALL),
+    "astar_disc_fine": PlannerConfig(planners.plan_astar_fine, arguments=DISC, **ALL),
     # The paper's planners on its own network.
-    "astar_cnp_500": PlannerConfig(plan_astar, "cnp_500", **ALL),
+    "astar_cnp_500": PlannerConfig(plan_astar, "cnp_500"),
+    "astar_disc_cnp_500": PlannerConfig(plan_astar, "cnp_500", DISC, **ALL),
     "gradient_25": PlannerConfig(plan_gradient, "cnp_500", {"samples": 25}),
-    "gradient_100": PlannerConfig(plan_gradient, "cnp_500", {"samples": 100}, **ALL),
+    "gradient_100": PlannerConfig(plan_gradient, "cnp_500", LITERAL, **ALL),
     "gradient_300": PlannerConfig(plan_gradient, "cnp_500", {"samples": 300}),
     "gradient_snapped": PlannerConfig(plan_gradient, "cnp_500", {"samples": 100, "snap": True}),
     "gradient_direction": PlannerConfig(plan_gradient, "cnp_500", ON_RING, **ALL),
     "gradient_corrected": PlannerConfig(plan_gradient, "cnp_500", ON_RING, **CORRECTED),
+    # Without partial actions.
+    "continuous_full": PlannerConfig(planners.plan_continuous_full, **ALL),
+    "astar_full": PlannerConfig(planners.plan_astar_full, standing=True),
     # What each idea is worth, and what a small error of the object's pose does.
     "continuous_cnp_500": PlannerConfig(plan_continuous, "cnp_500", **ALL),
     "continuous_film_500": PlannerConfig(plan_continuous, "film_500", **ALL),
-    "continuous_full": PlannerConfig(plan_full, **ALL),
     "continuous_perturbed_start": PlannerConfig(
         plan_continuous, execution={"perturbed_start": True}
     ),
     # A recurrent network under the same planners.
-    "astar_lstm_500": PlannerConfig(plan_astar, "lstm_500"),
+    "astar_disc_lstm_500": PlannerConfig(plan_astar, "lstm_500", DISC),
     "continuous_lstm_500": PlannerConfig(plan_continuous, "lstm_500"),
     # The simulator itself in the place of a model.
     "oracle": PlannerConfig(plan_continuous, **ORACLE),
@@ -182,6 +186,13 @@ CONFIGS: dict[str, PlannerConfig] = {
     "perturbed_oracle_nominal": PlannerConfig(
         plan_continuous, **ORACLE, oracle={"nominal_physics": True}, world="perturbed", stride=5
     ),
+    # A constant, on the validation goals.
+    **{
+        f"RISK_WEIGHT={weight:g}": PlannerConfig(
+            planners.plan_continuous_with, arguments={"RISK_WEIGHT": weight}, world="validation"
+        )
+        for weight in RISK_WEIGHTS
+    },
 }
 
 
@@ -192,6 +203,7 @@ def attempt(
     corrections: int = 0,
     perturbed_start: bool = False,
     n_averaged_images: int = 1,
+    by_plan: bool = False,
 ) -> Outcome:
     """Plan and execute one task, correcting the final position by up to so many single actions.
 
@@ -199,6 +211,7 @@ def attempt(
     counts with the distance at which it left the object.
     perturbed_start: when the plan is executed, the object is off its estimated pose by
     `POSITION_ERROR_M` and `YAW_ERROR_RAD`. n_averaged_images: whose mean each observation is.
+    by_plan: each action is placed where the plan has the object, instead of where it is observed.
     """
     world.place(task.obj, (0.0, 0.0), task.yaw_rad, config=task.config)
     world.n_averaged_images = n_averaged_images
@@ -208,9 +221,19 @@ def attempt(
         side = POSITION_ERROR_M * np.array([math.cos(task.yaw_rad), math.sin(task.yaw_rad)])
         config = replace(task.config, bias_m=tuple(side))
         world.place(task.obj, (0.0, 0.0), task.yaw_rad + YAW_ERROR_RAD, config=config)
-    once = PlanMode(1, partial=True)
+    once, at_xy_m = PlanMode(1, partial=True), seen.xy_m
+
+    def execute(step: Step) -> Execution:
+        nonlocal at_xy_m
+        bias_m = np.subtract(at_xy_m, world.object_pose()[:2])
+        world.config = replace(world.config, bias_m=tuple(bias_m.tolist()))
+        at_xy_m = step.predicted_end_xy_m
+        return world.execute(step)
+
+    same = {name: getattr(world, name) for name in ("observe", "can_reach", "park", "settle")}
+    robot = SimpleNamespace(execute=execute, **same) if by_plan else world
     try:
-        outcome = execute_plan(world, plan, corrections, lambda *query: planner(*query, once))
+        outcome = execute_plan(robot, plan, corrections, lambda *query: planner(*query, once))
     except UnreachableError as refused:
         outcome = refused.outcome
     finally:
@@ -269,7 +292,8 @@ def job(config: str) -> Job:
     """The measurement of one planner."""
     about = CONFIGS[config]
     settings, files = [about, tasks_sha256(about.world)], tuple(about.checkpoints.values())
-    return Job(run_config, {"config": config}, settings, (), files, VERSIONS[about.planner])
+    version = VERSIONS.get(about.planner, 1)
+    return Job(run_config, {"config": config}, settings, (), files, version)
 
 
 def planning_rows(records: Rows, **columns: Any) -> Rows:
@@ -295,7 +319,7 @@ def planning_rows(records: Rows, **columns: Any) -> Rows:
 
 def summary_rows(rows: Rows) -> Rows:
     """One row per planner on constructed goals: mean, standard error and median of each mode."""
-    names = ("planner", "model", "world", "samples", "closed_loop", "object_class")
+    names = ("planner", "model", "world", "samples", "placed_by", "closed_loop", "object_class")
     summary: dict[tuple[str, str], dict[str, Any]] = {}
     for row in rows:
         if row["goals"] == "constructed" and row["object_class"] not in STANDING + ROLLABLE:
@@ -304,6 +328,7 @@ def summary_rows(rows: Rows) -> Rows:
             for statistic in ("mean", "sem", "median"):
                 one[f"{row['mode']}_{statistic}_m"] = row[f"{statistic}_m"]
             one[f"{row['mode']}_plan_ms"] = row["plan_ms_median"]
+            one["n"] = f"{one['n']}, {row['n']}" if "n" in one else str(row["n"])
     return list(summary.values())
 
 
@@ -333,6 +358,21 @@ def decomposition_rows(rows: Rows) -> Rows:
     return table.astype(object).where(table.notna(), None).to_dict("records")
 
 
+VARIANTS = {
+    "astar_disc": "astar",
+    "astar_disc_cnp_500": "astar_cnp_500",
+    "astar_full": "astar",
+    "continuous_full": "continuous",
+    "continuous_by_plan": "continuous",
+    "astar_by_plan": "astar",
+    "astar_corrected": "astar",
+    "astar_disc_corrected": "astar_disc",
+    "gradient_corrected": "gradient_direction",
+    "continuous_corrected": "continuous",
+}
+"""Planners with one thing changed, and without: compared goal by goal, on objects that stand."""
+
+
 def paired_rows(records: dict[str, Rows], than: str = "continuous", n_draws: int = 2000) -> Rows:
     """How much farther each planner ends from the same goals than another: mean [m], interval.
 
@@ -354,6 +394,16 @@ def paired_rows(records: dict[str, Rows], than: str = "continuous", n_draws: int
     return rows
 
 
+def variant_rows(records: dict[str, Rows]) -> Rows:
+    """`paired_rows` of `VARIANTS`, on constructed goals of objects that stand."""
+    standing = {
+        name: [r for r in some if r["goals"] == "constructed" and r["object_class"] in STANDING]
+        for name, some in records.items()
+    }
+    pairs = [(k, v) for k, v in VARIANTS.items() if {k, v} <= set(records)]
+    return [r for pair in pairs for r in paired_rows({k: standing[k] for k in pair}, pair[1])]
+
+
 def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
     """All tables, of the planners that were measured."""
     found = {about["config"]: result for about, result in runner.read("planning", job, folder)}
@@ -364,6 +414,7 @@ def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
         "planning": rows,
         "summary": [*reported.PLANNING_ROWS, *summary_rows(rows)],
         "paired": [r for than in ("continuous", "perturbed") for r in paired_rows(records, than)],
+        "variants": variant_rows(records),
         "error_decomposition": decomposition_rows(rows),
     }
 

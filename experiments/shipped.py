@@ -101,6 +101,7 @@ LEVER_CHECKPOINTS: dict[str, tuple[str, str]] = {
 """Of lever-ups: which of `LEVER_MODELS`, and the protocol that it was trained for."""
 
 N_GOALS = {"single_full": 50, "single_partial": 100, "multi_partial": 80}
+VALIDATION_GOALS = {"multi_partial": 40}
 """Goals of each mode, as in Table 3 of the paper."""
 
 TOLERANCE_M = 0.00005
@@ -223,19 +224,21 @@ def train_reachability(_: argparse.Namespace) -> bool:
 
 
 def draw_goals(_: argparse.Namespace) -> bool:
-    """Draw the goals of Table 3 into files, which are never written over: they are frozen."""
+    """Draw the goals of Table 3, and 40 to choose constants on, into files that are frozen."""
     missing = [world for world, path in FROZEN.items() if not (repo_root() / path).exists()]
     for name in missing:
         tasks: list[PlanningTask] = []
+        seed, counts = (1, VALIDATION_GOALS) if name == "validation" else (0, N_GOALS)
         with Tabletop() as world:
-            for mode, n in N_GOALS.items():
-                if name == "perturbed":
-                    tasks += constructed_tasks(world, mode, n, 0, STANDING, Variation())
+            for mode, n in counts.items():
+                if name != "clean":
+                    variation = Variation() if name == "perturbed" else None
+                    tasks += constructed_tasks(world, mode, n, seed, STANDING, variation)
                     continue
                 tasks += constructed_tasks(world, mode, n, 0, STANDING + ROLLABLE)
                 tasks += uniform_tasks(mode, n, 0, STANDING + ROLLABLE)
         rows = ",\n".join(json.dumps(task.to_json()) for task in tasks)
-        text = f'{{"seed": 0, "tasks": [\n{rows}\n]}}\n'
+        text = f'{{"seed": {seed}, "tasks": [\n{rows}\n]}}\n'
         write_atomically(repo_root() / FROZEN[name], text)
     print(f"goals drawn of the worlds: {', '.join(missing) or 'none, all are there'}")
     return True

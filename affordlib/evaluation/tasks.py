@@ -23,7 +23,11 @@ from affordlib.primitives import Drag, Push
 from affordlib.types import Goal
 from affordlib.world import Tabletop, TabletopObject, WorldConfig, category_named
 
-FROZEN = {"clean": "data/goals/planning.json", "perturbed": "data/goals/planning_perturbed.json"}
+FROZEN = {
+    "clean": "data/goals/planning.json",
+    "perturbed": "data/goals/planning_perturbed.json",
+    "validation": "data/goals/planning_validation.json",
+}
 GOAL_SOURCES = ("constructed", "uniform")
 
 MIN_DISTANCE_M = 0.02
@@ -138,7 +142,7 @@ def uniform_tasks(
 
 
 def frozen_tasks(world: str = "clean") -> list[PlanningTask]:
-    """The tasks of the tables, of the clean or of the perturbed world."""
+    """The tasks of the tables in the clean or the perturbed world, or those for choices."""
     if world not in FROZEN:
         raise ValueError(f"world must be one of {tuple(FROZEN)}, got {world!r}")
     path = repo_root() / FROZEN[world]
