@@ -83,7 +83,7 @@ def predicted() -> dict[str, list[float]]:
     found, rows = {}, np.arange(4)
     levers = lever_up_tensors(open_interactions("lever_up").isel(interaction=slice(0, 48)))
     for path in sorted((repo_root() / "data" / "checkpoints").glob("*.safetensors")):
-        if path.stem == "reachability":
+        if path.stem in ("reachability", "np_simulated_pushes"):
             continue
         name = FORMER_NAMES[path.stem]
         model, kind = load_checkpoint(path)[0], name.split("_")[0]

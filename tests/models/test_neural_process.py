@@ -33,22 +33,27 @@ def shipped():
     return load_neural_process()
 
 
-def log_of(rows, group="a"):
-    """Simulated pushes (n, 10) of an object of one's own as a log."""
-    rows = rows.double().numpy()
-    n = len(rows)
+def log_of(rows, context=None, crop_width_m=0.24):
+    """Simulated pushes (n, 10) of a triangle as a log; only the ends are known."""
+    rows = rows.double().numpy() * [0.05, 0.05, 1, 1, 1, 1, 0.05, 0.05, 0.05, 1]
+    n, ends = len(rows), np.zeros((len(rows), 2, 3))
+    ends[:, 1] = rows[:, 7:]
+    way = np.stack(
+        [rows[:, :2] - 0.01 * rows[:, 4:6], rows[:, :2] + rows[:, 6:7] * rows[:, 4:6]], 1
+    )
     return PushLog(
-        rows[:, :2] * 0.05,
+        rows[:, :2],
         rows[:, 2:4],
         rows[:, 4:6],
-        rows[:, 6] * 0.05,
-        rows[:, 7:9] * 0.05,
+        rows[:, 6],
+        rows[:, 7:9],
         rows[:, 9],
-        np.array([group] * n),
-        {},
-        np.full((n, 2, 2), np.nan),
-        np.full((n, 2, 3), np.nan),
+        np.array(["a"] * n),
+        context or {},
+        way,
+        ends,
         TRIANGLE_M,
+        crop_width_m,
     )
 
 
@@ -193,3 +198,20 @@ def test_fit_refuses_what_it_does_not_know():
 
 def test_untrained_network_has_the_stated_size():
     assert sum(p.numel() for p in NeuralProcess().parameters()) < 250_000
+
+
+@pytest.mark.parametrize("name", ["film", "cnp"])
+def test_networks_learn_from_a_log_what_context_tells(name):
+    # The same pushes with opposite outcomes, as a word of the context says.
+    rows = simulate(1, torch.Generator().manual_seed(8))[0][0]
+    rows = torch.cat([rows, rows])
+    rows[48:, 7:] *= -1
+    words = np.repeat(["forth", "back"], 48)
+    log = log_of(rows, {"way": words})
+    fitted = fit(log, name)
+    mean, std = fitted.predict(log)
+    truth = np.column_stack([log.displacement_m, log.turn_rad])
+    assert np.abs(mean - truth).mean() < 0.6 * np.abs(truth).mean()
+    assert (std > 0).all()
+    with pytest.raises(ValueError, match="crop_width_m is"):
+        fitted.predict(log_of(rows, {"way": words}, 0.2))
