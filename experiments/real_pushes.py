@@ -26,7 +26,7 @@ from affordlib.interactions.log import Log, PushLog
 from affordlib.models.fit import EFFORT, fit
 from affordlib.models.neural_process import PRETRAINED
 from affordlib.paths import repo_root
-from affordlib.results import write_text_atomically
+from affordlib.results import write_atomically
 from experiments.runner import Job, frame, read, run
 
 TABLE = "real_pushes"
@@ -212,7 +212,7 @@ def main() -> None:
         ]
         run(jobs, TABLE)
     text = json.dumps(tables(), indent=1)
-    write_text_atomically(repo_root() / f"data/results/{TABLE}.json", text + "\n")
+    write_atomically(repo_root() / f"data/results/{TABLE}.json", (text + "\n").encode())
 
 
 if __name__ == "__main__":

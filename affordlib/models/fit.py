@@ -176,7 +176,8 @@ class FittedNetwork:
         train_on, validate_on = arrays.select(fold > 0), arrays.select(fold == 0)
         torch.manual_seed(seed)
         self.network = build(config, Scaler.fit(train_on))
-        training = replace(NETWORK_TRAINING, augment=not data.context, seed=seed)
+        steps = NETWORK_TRAINING.steps if name == "film" else 250  # its convolutions take longer
+        training = replace(NETWORK_TRAINING, steps=steps, augment=not data.context, seed=seed)
         score = _relative_errors(gyration_radius_m(data.outline_m))
         train(self.network, train_on, validate_on, training, sampler=sample_forward, score=score)
         fit_sigma_scale(self.network, validate_on, (1.0,))
@@ -254,7 +255,7 @@ def _folds(groups: np.ndarray, k: int, seed: int) -> np.ndarray:
 
 
 def fit(data: PushLog, model: str = "np", seed: int = 0) -> PushModel:
-    """A model of a log: "np", "film" or "cnp", in about 15 s of a core.
+    """A model of a log: "np", "film" or "cnp", in 10 to 25 s of a core.
 
     "np" is the pretrained neural process, tuned to it; the others are the book's own networks.
     Raises ValueError for an unknown name, and for fewer than eight pushes in all.
