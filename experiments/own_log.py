@@ -8,6 +8,7 @@ of five drawn surfaces (friction) and supports (where its weight rests); then it
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import argparse
 import lzma
 import math
@@ -17,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from affordlib.commands import command
 from affordlib.geometry import rotated, unit_vector, wrap_angle
 from affordlib.interactions.log import Log, PushLog
 from affordlib.models.fit import PushModel, fit
@@ -190,11 +192,12 @@ def goals(n: int = N_GOALS) -> list[dict]:
     return rows
 
 
-def main() -> None:
+@command(OSError, ValueError)
+def main(argv: Sequence[str] | None = None) -> int:
     """Collect the log, execute plans, or both."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", choices=("log", "goals"))
-    only = parser.parse_args().only
+    only = parser.parse_args(argv).only
     if only != "goals":
         FOLDER.mkdir(parents=True, exist_ok=True)
         for seed, condition in enumerate(CONDITIONS):
@@ -203,7 +206,8 @@ def main() -> None:
     if only != "log":
         tables = {"goals": goals()}
         write_results(repo_root() / "data" / "results", "own_log", {"n_goals": N_GOALS}, tables)
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(main())

@@ -9,6 +9,7 @@ without that scatter, with 0, 5 and 32 pushes as context, told the feet or not.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import argparse
 import math
 import time
@@ -16,6 +17,7 @@ import time
 import torch
 from torch import Tensor
 
+from affordlib.commands import command, whole_type
 from affordlib.models.neural_process import (
     FEET,
     PRETRAINED,
@@ -174,13 +176,14 @@ def held_out_errors(model: NeuralProcess, held_out: list[Tensor]) -> dict[str, l
     return errors
 
 
-def main() -> None:
+@command(OSError, ValueError)
+def main(argv: Sequence[str] | None = None) -> int:
     """Simulate, train, and write the checkpoint with its held-out errors."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--objects", type=int, default=12288)
-    parser.add_argument("--steps", type=int, default=7000)
+    parser.add_argument("--objects", type=whole_type(64, 10**6), default=12288)
+    parser.add_argument("--steps", type=whole_type(1, 10**7), default=7000)
     parser.add_argument("--to", default=repo_root() / f"data/checkpoints/{PRETRAINED}.safetensors")
-    options = parser.parse_args()
+    options = parser.parse_args(argv)
     start = time.perf_counter()
     rows, feet, _ = simulate_many(options.objects, seed=0)
     held_out = simulate_many(256, seed=99)
@@ -197,7 +200,8 @@ def main() -> None:
 
     g = torch.Generator().manual_seed(0)
     train_neural_process(model, rows, feet, (options.steps, 1.2e-3, 48), g, report)
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(main())

@@ -5,11 +5,12 @@
 makes `data/results/real_pushes.json`. FOLDER holds the logs of seven conditions, as published (or
 compressed by xz): github.com/robinzhoucmu/Pushing, icra_data_proc/SensorLogs (Apache License 2.0;
 Zhou, Paolini, Bagnell and Mason, A convex polynomial force-motion model for planar sliding, ICRA
-2016). Choices (steps, rates, folds) were made on `CHOSEN_ON`, by folds within their training parts.
+2016). Steps and rates were taken over from an earlier trial on the same logs, not chosen here.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import argparse
 import json
 import lzma
@@ -22,8 +23,9 @@ import numpy as np
 import pandas as pd
 from scipy.stats import norm
 
+from affordlib.commands import command, names_type, whole_type
 from affordlib.interactions.log import Log, PushLog
-from affordlib.models.fit import EFFORT, fit
+from affordlib.models.fit import EFFORT, MODELS, fit
 from affordlib.models.neural_process import PRETRAINED
 from affordlib.paths import repo_root
 from affordlib.results import write_atomically
@@ -43,7 +45,6 @@ CONDITIONS = (
     *(f"hardboard_{support}" for support in ("3points1", "3points2", "3points3", "patch")),
     *(f"plywood_{support}" for support in ("3points1", "3points3", "3points4")),
 )
-CHOSEN_ON = ("hardboard_3points1", "plywood_3points3")
 
 
 def feet_of(support: str) -> np.ndarray:
@@ -194,26 +195,28 @@ def tables() -> dict[str, list[dict]]:
     return {"errors": rows}
 
 
-def main() -> None:
+@command(OSError, ValueError)
+def main(argv: Sequence[str] | None = None) -> int:
     """Run what is missing, and make the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--logs", help="folder of the published logs; without it, tables alone")
-    parser.add_argument("--models", default="np")
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--protocols", default=",".join(PROTOCOLS))
-    options = parser.parse_args()
+    parser.add_argument("--models", type=names_type(MODELS), default=["np"])
+    parser.add_argument("--seeds", type=whole_type(1, 100), default=3)
+    parser.add_argument("--protocols", type=names_type(PROTOCOLS), default=list(PROTOCOLS))
+    options = parser.parse_args(argv)
     if options.logs:
         jobs = [
             job(protocol, model, seed, fold, options.logs)
             for seed in range(options.seeds)
-            for model in options.models.split(",")
-            for protocol in options.protocols.split(",")
+            for model in options.models
+            for protocol in options.protocols
             for fold in range(PROTOCOLS[protocol][1])
         ]
         run(jobs, TABLE)
     text = json.dumps(tables(), indent=1)
     write_atomically(repo_root() / f"data/results/{TABLE}.json", (text + "\n").encode())
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(main())

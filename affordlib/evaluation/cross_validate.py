@@ -20,14 +20,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pandas as pd
 import torch
-from joblib import Parallel, delayed
 from scipy.stats import norm
-from sklearn.exceptions import ConvergenceWarning
-from sklearn.gaussian_process import GaussianProcessRegressor
-from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
-from sklearn.linear_model import RidgeCV
-from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import PolynomialFeatures, StandardScaler
 
 from affordlib.interactions.log import PushLog
 from affordlib.models.fit import MODELS, fit, gyration_radius_m, push_rows, told_feet
@@ -91,6 +84,8 @@ def push_errors(
     tests = [g if within == "others" else g & (fold == k) for g, k in jobs]
     tests = tests[:: folds if within == "others" else 1]
     pool = [~t if within == "others" else g for t, (g, _) in zip(tests, jobs, strict=False)]
+    from joblib import Parallel, delayed  # sets variables of the environment when it is imported
+
     parts = Parallel(n_jobs=min(len(tests), os.cpu_count()))(
         delayed(_errors)(data, g & ~t, t, tuple(models), seed)
         for g, t in zip(pool, tests, strict=True)
@@ -98,7 +93,7 @@ def push_errors(
     return pd.concat(parts, ignore_index=True)
 
 
-def summary(errors: pd.DataFrame, model: str, group: str) -> dict[str, float]:
+def summary(errors: pd.DataFrame, model: str, group: str) -> dict[str, str | float]:
     """The row of a table of errors per push."""
     position, yaw = errors["position_m"], errors["yaw_rad"]
     return {
@@ -207,6 +202,10 @@ def _nearest(train: PushLog, test: PushLog) -> Forecast:
 
 
 def _ridge(train: PushLog, test: PushLog) -> Forecast:
+    from sklearn.linear_model import RidgeCV
+    from sklearn.pipeline import make_pipeline
+    from sklearn.preprocessing import PolynomialFeatures, StandardScaler
+
     model = make_pipeline(PolynomialFeatures(2), StandardScaler(), RidgeCV(np.logspace(-3, 2, 11)))
     known, outcome = _features(train, train), _outcome(train)
     std = (outcome - model.fit(known, outcome).predict(known)).std(axis=0)
@@ -215,6 +214,10 @@ def _ridge(train: PushLog, test: PushLog) -> Forecast:
 
 def _gaussian_process(train: PushLog, test: PushLog, target: np.ndarray | None = None) -> Forecast:
     """target: (n, 3), the outcome if not given."""
+    from sklearn.exceptions import ConvergenceWarning
+    from sklearn.gaussian_process import GaussianProcessRegressor
+    from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
+
     known, target = _features(train, train), _outcome(train) if target is None else target
     rows = push_rows(train)
     rows[:, 7:] = torch.from_numpy(target)

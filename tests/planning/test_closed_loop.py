@@ -211,7 +211,7 @@ def test_a_far_goal_is_reached_round_what_the_arm_cannot_do():
         def probability(self, primitive, xy_m, direction_rad=None):
             return 1.0 - ((xy_m[:, 0] > 0.1) & (np.abs(xy_m[:, 1]) < 0.06))
 
-    robot, skills = PointRobot((0.2, -0.3)), replace(point_skills(), reachability=Learned())
+    robot, skills = PointRobot((0.2, -0.3)), replace(point_skills(), reachability=Learned(["push"]))
     went = loop(robot, Goal((0.2, 0.25), EXACT_M), skills, max_actions=20)
     assert went.reached, went.message
     assert min(path[0, 0] for path in went.object_paths_xy_m) < 0.1
