@@ -1,0 +1,60 @@
+"""The page of a log of one's own: its thirty lines run, and lead to a table and a plan."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from affordlib.paths import repo_root
+from affordlib.planning import plan_push_at
+from affordlib.types import Goal
+
+IMPORTS = """
+import lzma, numpy as np
+from affordlib.evaluation import cross_validate
+from affordlib.interactions import Log
+from affordlib.models import fit
+from affordlib.paths import repo_root
+from affordlib.planning import plan_push_at
+from affordlib.types import Goal
+"""
+
+
+@pytest.fixture(scope="module")
+def script():
+    """What the page does in thirty lines, run on one condition, with quick models."""
+    path = repo_root() / "notebooks" / "09_a_log_of_your_own.ipynb"
+    cells = json.loads(path.read_text())["cells"]
+    (cell,) = [c for c in cells if "script" in c["metadata"].get("tags", [])]
+    return IMPORTS + "".join(cell["source"])
+
+
+@pytest.mark.slow
+def test_the_script_of_thirty_lines(script):
+    lines = [line for line in script.splitlines() if line.strip()]
+    assert len(lines) <= 30 + 1
+    outline = ((0, 0), (130, 0), (30, 110))
+    names = {"logs": "data/own_log", "outline": outline, "tool_radius": 1.5, "folds": 2, "seed": 0}
+    exec(script, names)
+    table, plan = names["table"], names["plan"]
+    assert table.columns.tolist() == [
+        *("model", "group", "n_train", "n", "position_mean_m", "position_sem_m"),
+        *("position_median_m", "yaw_mean_rad", "yaw_sem_rad", "coverage_50", "coverage_90"),
+    ]
+    error = table[table["group"] == "all"].set_index("model")["position_mean_m"]
+    assert error["physics_gp"] < error["gaussian_process"] < error["constant"]
+    assert error["np"] < error["constant"]
+    assert plan.predicted_distance_m < 0.003
+    assert abs(plan.steps[-1].predicted_turn_rad - 0.25) < 0.1
+
+
+def test_plans_want_one_group(script):
+    read = re.split(r"^one = ", script, flags=re.MULTILINE)[0]
+    names = {"logs": "data/own_log", "outline": ((0, 0), (130, 0), (30, 110)), "tool_radius": 1.5}
+    exec(read, names)
+    data = names["data"]
+    assert len(data) == 250
+    assert np.degrees(np.arccos((data.normal * data.direction).sum(axis=1))).max() < 52
+    with pytest.raises(ValueError, match="log must hold one group"):
+        plan_push_at(None, data, (0.0, 0.0, 0.0), Goal((0.01, 0.0)))
