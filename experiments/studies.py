@@ -37,14 +37,8 @@ from affordlib.models.calibration import calibration_rows
 from affordlib.models.checkpoint import load_checkpoint
 from affordlib.models.film import FiLMConfig
 from affordlib.models.training import final_errors_m, train_model
-from experiments import (
-    ablation,
-    lever_cross_validation,
-    limits,
-    representation,
-    residual_distribution,
-    shared_network,
-)
+from experiments import ablation, limits, representation, residual_distribution, shared_network
+from experiments import lever_cross_validation as lever
 from experiments.representation import TRAINING
 from experiments.runner import FOLDER, Job, read, run
 from experiments.shipped import CHECKPOINT_SPECS
@@ -96,78 +90,44 @@ def _perturbed_rows(
 
 @dataclass(frozen=True)
 class Study:
-    """A function of rows, and what decides them; table: the results that they stand beside."""
+    """A function of rows, and what decides them."""
 
     rows: Callable[..., Rows]
     data: tuple[str, ...] = ()
     checkpoints: tuple[str, ...] = ()
     settings: Any = ()
-    table: str = "effect_prediction"
 
 
-_PUSHES = ("push", "push_test")
+_PUSHES, _ROLLING = ("push", "push_test"), ("mixed", "partial", "push_test", "drag", "reach")
 _ABLATION = (NETWORK, CHECKPOINT_SPECS["film_500"].training, ablation.STEPS, ablation.SEEDS)
+_ADDED = [ablation.CHANGES[change] for change in ablation.LADDER.values()]
+_BOTH = (TRAINING, FiLMConfig(), representation.PUSH_START_MIN_RADIUS_M)
+_SEPARATE = [j.settings for jobs in shared_network.SEPARATE_JOBS.values() for j in jobs]
+_SHARED = (shared_network.NETWORK, shared_network.TRAINING, _SEPARATE)
+_POSE = (limits.N_PUSHES, limits.REPEATS, limits.POSITION_ERROR_M, limits.YAW_ERROR_RAD)
+_REACH = (limits.N_PLACES, limits.NEAR_THE_LIMIT)
+_MODELS, _RESIDUALS = representation.LATENT_MODELS, residual_distribution.CHECKPOINTS
+_VARIED = ("push_varied",), ("film_5000_perturbed",), (TRAINING, NETWORK, PERTURBED_FOLDS)
+_FOUR = (*shared_network.PRIMITIVES, "push_test")
 
-STUDIES: dict[str, Study] = {
-    "ablation": Study(ablation.ablation, _PUSHES, settings=(_ABLATION, ablation.CHANGES)),
-    "incremental_ablation": Study(
-        ablation.incremental_ablation,
-        _PUSHES,
-        settings=(_ABLATION, [ablation.CHANGES[change] for change in ablation.LADDER.values()]),
-    ),
-    "latent": Study(
-        representation.latent,
-        ("push_test",),
-        representation.LATENT_MODELS,
-        representation.WEIGHTS,
-    ),
-    "rollability": Study(
-        representation.rollability, ("mixed", "partial", "push_test", "drag", "reach")
-    ),
-    "push_and_drag_model": Study(
-        representation.push_and_drag_model,
-        ("mixed", "partial"),
-        settings=(TRAINING, FiLMConfig(), representation.PUSH_START_MIN_RADIUS_M),
-    ),
-    "perturbed_world": Study(
-        perturbed_world,
-        ("push_varied",),
-        ("film_5000_perturbed",),
-        (TRAINING, NETWORK, PERTURBED_FOLDS),
-    ),
-    "residual_distribution": Study(
-        residual_distribution.residual_distribution,
-        ("push", "drag", "push_test"),
-        residual_distribution.CHECKPOINTS,
-    ),
-    "shared_network": Study(
-        shared_network.shared_network,
-        (*shared_network.PRIMITIVES, "push_test"),
-        settings=(
-            shared_network.NETWORK,
-            shared_network.TRAINING,
-            [j.settings for jobs in shared_network.SEPARATE_JOBS.values() for j in jobs],
+STUDIES = {
+    study.rows.__name__: study
+    for study in (
+        Study(ablation.ablation, _PUSHES, (), (_ABLATION, ablation.CHANGES)),
+        Study(ablation.incremental_ablation, _PUSHES, (), (_ABLATION, _ADDED)),
+        Study(representation.latent, ("push_test",), _MODELS, representation.WEIGHTS),
+        Study(representation.rollability, _ROLLING),
+        Study(representation.push_and_drag_model, ("mixed", "partial"), (), _BOTH),
+        Study(perturbed_world, *_VARIED),
+        Study(
+            residual_distribution.residual_distribution, ("push", "drag", "push_test"), _RESIDUALS
         ),
-    ),
-    "pose_sensitivity": Study(
-        limits.pose_sensitivity,
-        ("push_test",),
-        settings=(limits.N_PUSHES, limits.REPEATS, limits.POSITION_ERROR_M, limits.YAW_ERROR_RAD),
-    ),
-    "partial_execution": Study(
-        limits.partial_execution, ("partial",), limits.WHOLE_ACTION_MODELS, limits.PHASES
-    ),
-    "reachability_accuracy": Study(
-        limits.reachability_accuracy,
-        checkpoints=("reachability",),
-        settings=(limits.N_PLACES, limits.NEAR_THE_LIMIT),
-    ),
-    "tuning": Study(
-        lever_cross_validation.tuning,
-        ("lever_up",),
-        settings=lever_cross_validation.TUNING,
-        table="lever_up",
-    ),
+        Study(shared_network.shared_network, _FOUR, (), _SHARED),
+        Study(limits.pose_sensitivity, ("push_test",), (), _POSE),
+        Study(limits.partial_execution, ("partial",), limits.WHOLE_ACTION_MODELS, limits.PHASES),
+        Study(limits.reachability_accuracy, (), ("reachability",), _REACH),
+        Study(lever.tuning, ("lever_up",), (), lever.TUNING),
+    )
 }
 
 
@@ -186,7 +146,8 @@ def make_rows(study: str, resume_checkpoint: Path) -> Rows:
 def tables(table: str, folder: str | Path = FOLDER) -> dict[str, Rows]:
     """The rows of the studies that stand beside a table; stale ones raise ValueError."""
     made = {arguments["study"]: rows for arguments, rows in read(NAME, job, folder)}
-    return {k: made[k] for k, study in STUDIES.items() if study.table == table and k in made}
+    here = [name for name in STUDIES if (name == "tuning") == (table == "lever_up")]
+    return {name: made[name] for name in here if name in made}
 
 
 @command(OSError, ValueError)
