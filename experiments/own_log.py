@@ -8,11 +8,10 @@ of five drawn surfaces (friction) and supports (where its weight rests); then it
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 import argparse
 import lzma
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np

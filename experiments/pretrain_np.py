@@ -9,10 +9,10 @@ without that scatter, with 0, 5 and 32 pushes as context, told the feet or not.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 import argparse
 import math
 import time
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor

@@ -10,11 +10,11 @@ Zhou, Paolini, Bagnell and Mason, A convex polynomial force-motion model for pla
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 import argparse
 import json
 import lzma
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
