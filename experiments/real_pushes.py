@@ -11,7 +11,6 @@ Zhou, Paolini, Bagnell and Mason, A convex polynomial force-motion model for pla
 from __future__ import annotations
 
 import argparse
-import json
 import lzma
 import math
 from collections.abc import Sequence
@@ -27,8 +26,7 @@ from affordlib.commands import command, names_type, whole_type
 from affordlib.interactions.log import Log, PushLog
 from affordlib.models.fit import EFFORT, MODELS, fit
 from affordlib.models.neural_process import PRETRAINED
-from affordlib.paths import repo_root
-from affordlib.results import write_atomically
+from affordlib.results import write_results
 from experiments.runner import Job, frame, read, run
 
 TABLE = "real_pushes"
@@ -180,19 +178,24 @@ def tables() -> dict[str, list[dict]]:
     keys = ["protocol", "model", "told", "shots"]
     pushes = every.groupby([*keys, "push"]).mean(numeric_only=True).reset_index()
     pushes["condition"] = np.array(CONDITIONS)[pushes["push"] // 50]
-    rows = []
-    for by in (keys, [*keys, "condition"]):
-        for key, part in pushes.groupby(by):
-            row = dict(zip(by, key, strict=True)) | {"n": len(part)}
-            row["seeds"] = int(every[every.model == row["model"]]["seed"].nunique())
-            row["position_mean_mm"] = part.position_m.mean() * 1e3
-            row["position_sem_mm"] = part.position_m.sem() * 1e3
-            row["position_median_mm"] = part.position_m.median() * 1e3
-            row["yaw_mean_deg"] = math.degrees(part.yaw_rad.mean())
-            row["yaw_sem_deg"] = math.degrees(part.yaw_rad.sem())
-            row |= {f"coverage_{p}": part[f"inside_{p}"].mean() for p in (50, 90)}
-            rows.append({k: round(v, 4) if isinstance(v, float) else v for k, v in row.items()})
-    return {"errors": rows}
+    seeds = every.groupby("model")["seed"].nunique()
+    found = {}
+    for name, by in (("errors", keys), ("conditions", [*keys, "condition"])):
+        found[name] = [
+            dict(zip(by, key, strict=True))
+            | {
+                "n": len(part),
+                "seeds": int(seeds[part["model"].iloc[0]]),
+                "position_mean_m": part["position_m"].mean(),
+                "position_sem_m": part["position_m"].sem(),
+                "position_median_m": part["position_m"].median(),
+                "yaw_mean_rad": part["yaw_rad"].mean(),
+                "yaw_sem_rad": part["yaw_rad"].sem(),
+            }
+            | {f"coverage_{p}": part[f"inside_{p}"].mean() for p in (50, 90)}
+            for key, part in pushes.groupby(by)
+        ]
+    return found
 
 
 @command(OSError, ValueError)
@@ -213,8 +216,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             for fold in range(PROTOCOLS[protocol][1])
         ]
         run(jobs, TABLE)
-    text = json.dumps(tables(), indent=1)
-    write_atomically(repo_root() / f"data/results/{TABLE}.json", (text + "\n").encode())
+    write_results("data/results", TABLE, {"conditions": list(CONDITIONS)}, tables())
     return 0
 
 
