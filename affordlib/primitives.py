@@ -15,7 +15,14 @@ from typing import ClassVar
 import numpy as np
 
 from affordlib.geometry import unit_vector, wrap_angle
-from affordlib.types import check_array, check_field, check_finite, check_pair, check_within
+from affordlib.types import (
+    check_array,
+    check_choice,
+    check_field,
+    check_finite,
+    check_pair,
+    check_within,
+)
 
 DURATION_S = 3.75
 """Of every primitive: 25 recorded samples, one every 3 steps of 50 ms (Section 4.2)."""
@@ -82,7 +89,7 @@ class Primitive:
                 continue
             if name in self.lengths_m:
                 check_field(self, name, *self.lengths_m[name], "m")
-            elif name in ("theta", "grip_yaw"):
+            elif name in ("theta", "grip_yaw", "direction"):
                 angle = check_finite(name, value)
                 angle = angle % (2 * math.pi) if name == "theta" else wrap_angle(angle)
                 object.__setattr__(self, name, angle)
@@ -206,11 +213,9 @@ class PushAt(Primitive):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        contact = check_pair("contact", self.contact)
-        for value in contact:
-            check_within("contact", value, -0.3, 0.3, "m")
+        x, y = check_pair("contact", self.contact)
+        contact = tuple(check_within("contact", v, -0.3, 0.3, "m") for v in (x, y))
         object.__setattr__(self, "contact", contact)
-        object.__setattr__(self, "direction", wrap_angle(check_finite("direction", self.direction)))
 
     @cached_property
     def segments(self) -> tuple[Segment, ...]:
@@ -348,14 +353,12 @@ class LeverUp(Primitive):
     lengths_m: ClassVar = {"contact_x": (-0.2, 0.2), "contact_y": (-0.2, 0.2), "reach": (0.05, 0.4)}
 
     @classmethod
-    def at_edge(
-        cls, outline_m: np.ndarray, edge: int, share: float = 0.5, turn_rad: float = 0.0
-    ) -> LeverUp:
+    def at_edge(cls, outline_m: np.ndarray, edge: int, share: float = 0.5) -> LeverUp:
         """The lever-up from a point on an edge of an outline (n, 2) [m], counter-clockwise.
 
         share: how far along it. The object turns about the edge that needs the least force, weight
         · distance to the centroid / distance to the contact; the blade goes midway between that
-        edge's normal and its own edge's, but for turn_rad.
+        edge's normal and its own edge's.
         """
         following = np.roll(outline_m, -1, axis=0)
         along = following - outline_m
@@ -367,7 +370,7 @@ class LeverUp(Primitive):
         far = to_contact > to_contact.max() / 3
         pivot = int(np.argmin(np.where(far, to_centre / np.where(far, to_contact, 1.0), np.inf)))
         middle = outward[pivot] - outward[edge]
-        theta = math.atan2(middle[1], middle[0]) + turn_rad
+        theta = math.atan2(middle[1], middle[0])
         return cls(float(contact[0]), float(contact[1]), theta, max(0.05, float(to_contact[pivot])))
 
     def obliqueness_rad(self, outline_m: np.ndarray, edge: int) -> float:
@@ -397,6 +400,4 @@ PRIMITIVES: dict[str, type[Primitive]] = {
 
 def primitive_named(name: str) -> type[Primitive]:
     """The class of the primitive called `name`; raises naming the known ones."""
-    if name not in PRIMITIVES:
-        raise ValueError(f"primitive {name!r} is unknown; choose one of {sorted(PRIMITIVES)}")
-    return PRIMITIVES[name]
+    return PRIMITIVES[check_choice("primitive", name, PRIMITIVES)]

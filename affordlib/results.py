@@ -43,7 +43,8 @@ UNITS = {
     "deg": ("°", 1.0, 1),
 }
 _MARK = b'{\n "notebook"'
-STATISTICS = ("mean", "median", "sem", "std", "min", "max", "p5", "p95")
+_STATISTIC = "_(?:mean|median|sem|std|min|max|p5|p95)"
+_WITH_UNIT = re.compile(f"(.+?)_({'|'.join(UNITS)})((?:{_STATISTIC})*)")
 MARKUP = str.maketrans({"&": "&amp;", "<": "&lt;", ">": "&gt;", "[": "&#91;", "|": "\\|"})
 """For `str.translate`: keeps what a text of results holds from being markup in Markdown or HTML."""
 
@@ -198,8 +199,8 @@ def markdown_table(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | N
 
 def heading(column: str) -> str:
     """Return the heading of a column: `plan_ms_median` becomes `plan median, ms`."""
-    words, unit = _split_unit(column)
-    return " ".join(words) + (f", {UNITS[unit][0]}" if unit else "")
+    name, unit = _split_unit(column)
+    return name.replace("_", " ") + (f", {UNITS[unit][0]}" if unit else "")
 
 
 def factor(column: str) -> float:
@@ -271,15 +272,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     return int(stale)
 
 
-def _split_unit(column: str) -> tuple[list[str], str | None]:
-    """The words of a column but its unit, the last or the last before a statistic, and the unit."""
-    words = column.split("_")
-    for at in range(len(words) - 1, 0, -1):
-        if words[at] in UNITS:
-            return words[:at] + words[at + 1 :], words[at]
-        if words[at] not in STATISTICS:
-            break
-    return words, None
+def _split_unit(column: str) -> tuple[str, str | None]:
+    """A column's name without its unit, the last word or the last before a statistic, and that."""
+    found = _WITH_UNIT.fullmatch(column)
+    return (found[1] + found[3], found[2]) if found else (column, None)
 
 
 def _columns(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None) -> list[str]:

@@ -8,7 +8,7 @@ angles radians. Actions and effects are relative to where the object stood at th
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
@@ -87,6 +87,13 @@ def check_count(name: str, value: Any, least: int = 1, most: float = math.inf) -
     return int(value)
 
 
+def check_choice(name: str, value: Any, known: Collection[Any]) -> Any:
+    """Return `value`, or raise naming the argument that is none of what is known."""
+    if value not in known:
+        raise ValueError(f"{name} must be one of {sorted(known)}, got {value!r}")
+    return value
+
+
 def check_field(
     owner: Any, name: str, low: float = -math.inf, high: float = math.inf, unit: str = ""
 ) -> None:
@@ -150,9 +157,9 @@ class Interaction:
     robot measured it, and placed its action; tool: (26, 5) measured x, y, z [m], yaw [rad] of the
     tool and gap of the fingers [m], every 3 steps of 50 ms as in the paper.
 
-    Of the execution: how far the tool was off its path and how deep bodies sank into each other,
-    at most [m]; whether the object left the table, fell over, and can roll as it lies now; whether
-    the arm could reach at all (if not, nothing happened).
+    Of the execution: whether the object can roll as it lies now; how far the tool was off its path
+    and how deep bodies sank into each other, at most [m]; whether the object left the table, and
+    fell over; whether the arm could reach at all (if not, nothing happened).
     """
 
     primitive: affordlib.primitives.Primitive
@@ -165,11 +172,11 @@ class Interaction:
     start_pose: tuple[float, float, float]
     estimated_xy_m: tuple[float, float]
     tool: np.ndarray
-    tracking_error_m: float
-    penetration_m: float
-    left_table: bool
-    fell: bool
     rolls: bool
+    tracking_error_m: float = 0.0
+    penetration_m: float = 0.0
+    left_table: bool = False
+    fell: bool = False
     reached: bool = True
 
     @property

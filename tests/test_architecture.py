@@ -19,7 +19,7 @@ TREES = {path: ast.parse((ROOT / path).read_text()) for path in [*MODULES, *EXPE
 UP = ("world", "interactions", "models", "planning", "evaluation", "show")
 """The parts in order: each may know those before it, but for `EXCEPT`."""
 EXCEPT = {"models": {"world"}, "planning": {"world"}}
-USE_WORLD = {"recipes", "schema", "collect"}
+USE_WORLD = {"recipes", "collect"}
 """The modules of `interactions` that know the world."""
 
 MOST_PARAMETERS = 7

@@ -335,7 +335,7 @@ def valid_calls(shop):
             config=planning.ClosedLoopConfig(max_actions=1, horizon=1),
         ),
         "closed_loop": call(show.closed_loop, skills=shop["skills"], tolerance_m=0.002),
-        "plot_depth": call(show.plot_depth, ax=ax, image=image, width_m=0.16),
+        "plot_depth": call(show.plot_depth, ax=ax, image=image),
         "plot_footprint": call(show.plot_footprint, ax=ax, obj=shop["obj"], xy_m=at, yaw_rad=0.0),
         "plot_plan": call(show.plot_plan, ax=ax, plan=plan, sigma=True, yaw_rad=0.0),
         "plot_outcome": call(show.plot_outcome, ax=ax, outcome=shop["outcome"]),

@@ -20,7 +20,7 @@ from affordlib.interactions.recipes import Variation
 from affordlib.paths import repo_root
 from affordlib.planning import MODES
 from affordlib.primitives import Drag, Push
-from affordlib.types import Goal
+from affordlib.types import Goal, check_choice
 from affordlib.world import Tabletop, TabletopObject, WorldConfig, category_named
 
 FROZEN = {
@@ -76,9 +76,7 @@ class PlanningTask:
 
 
 def _objects(mode: str, goals: str, seed: int, index: int, classes: Sequence[str]) -> tuple:
-    if mode not in MODES:
-        raise ValueError(f"mode {mode!r} is unknown; choose one of {sorted(MODES)}")
-    key = (list(MODES).index(mode), GOAL_SOURCES.index(goals), index)
+    key = (list(MODES).index(check_choice("mode", mode, MODES)), GOAL_SOURCES.index(goals), index)
     rng = np.random.default_rng(np.random.SeedSequence(2_000_003 + seed, spawn_key=key))
     obj = category_named(classes[index % len(classes)]).sample(rng)
     return obj, float(rng.uniform(-math.pi, math.pi)), rng
@@ -143,9 +141,7 @@ def uniform_tasks(
 
 def frozen_tasks(world: str = "clean") -> list[PlanningTask]:
     """The tasks of the tables in the clean or the perturbed world, or those for choices."""
-    if world not in FROZEN:
-        raise ValueError(f"world must be one of {tuple(FROZEN)}, got {world!r}")
-    path = repo_root() / FROZEN[world]
+    path = repo_root() / FROZEN[check_choice("world", world, FROZEN)]
     if not path.is_file():
         raise FileNotFoundError(
             f"there are no goals at {path}; run python -m experiments.shipped goals"

@@ -16,6 +16,7 @@ import torch.nn.functional as F
 
 from affordlib.geometry import rotate_channels
 from affordlib.interactions.dataset import InteractionTensors, Symmetry, valid_interactions
+from affordlib.types import check_choice
 
 LEVER_ACTION_CHANNELS = ("x", "z")
 POSE_CHANNELS = ("x", "y", "z", "tilt")
@@ -59,10 +60,7 @@ def lever_up_tensors(
 
 def select_view(image: torch.Tensor, view: str) -> torch.Tensor:
     """Images (N, C, 128, 128) as `lever_up_tensors` shows them to a model."""
-    views = ("near", "wide", "full")
-    if view not in views:
-        raise ValueError(f"view must be one of {views}, got {view!r}")
-    if view == "full":
+    if check_choice("view", view, ("near", "wide", "full")) == "full":
         return image
     if view == "near":
         return F.avg_pool2d(image[..., _NEAR[0], _NEAR[1]], 2)

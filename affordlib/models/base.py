@@ -22,7 +22,7 @@ from affordlib.models.push_frame import (
     rotate_observations,
     rotate_prediction,
 )
-from affordlib.types import Observations, Prediction, check_count, check_within
+from affordlib.types import Observations, Prediction, check_choice, check_count, check_within
 
 
 @checked
@@ -42,8 +42,7 @@ class NetworkConfig:
     sigma_scale: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.frame not in FRAMES:
-            raise ValueError(f"frame must be one of {FRAMES}, got {self.frame!r}")
+        check_choice("frame", self.frame, FRAMES)
         for name in ("action_channels", "effect_channels"):
             channels = tuple(getattr(self, name))
             if not channels:

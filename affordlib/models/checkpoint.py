@@ -21,8 +21,7 @@ from affordlib.interactions.dataset import Scaler
 from affordlib.models.base import EffectNetwork, NetworkConfig
 from affordlib.models.cnp import AffordanceCNP, CNPConfig
 from affordlib.models.domain import TrainingDomain
-from affordlib.models.film import FiLMConfig, FiLMNetwork
-from affordlib.models.last_pose import LastPoseCNP, LastPoseConfig
+from affordlib.models.film import FiLMConfig, FiLMNetwork, LastPoseCNP, LastPoseConfig
 from affordlib.models.lstm import LSTMConfig, LSTMNetwork
 from affordlib.paths import repo_root
 from affordlib.results import write_atomically

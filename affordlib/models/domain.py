@@ -41,8 +41,6 @@ class TrainingDomain:
         for name in ("start_radius_m", "end_radius_m", "mask_share", "effect_radius_m"):
             if getattr(self, name) is not None:
                 check_pair(name, getattr(self, name), "(low, high)")
-        if not isinstance(self.touches_border, bool):
-            raise TypeError(f"touches_border must be True or False, got {self.touches_border!r}")
 
     @classmethod
     def fit(cls, tensors: InteractionTensors) -> TrainingDomain:
@@ -93,25 +91,16 @@ class TrainingDomain:
                 f"to {float(high):.3f}"
             )
         o = observations
-        for name, known, t in (
-            ("starts", self.start_radius_m, o.action_t),
-            ("ends", self.end_radius_m, 1 - o.action_t),
-        ):
+        known = {"starts": (self.start_radius_m, o.action_t)}
+        known["ends"] = self.end_radius_m, 1 - o.action_t
+        for name, (radius_m, t) in known.items():
             seen = (t < _END_PHASE) & o.action_mask
-            if (radius := _outside(o.action, action_channels, seen, known)) is not None:
-                raise ValueError(
-                    f"an observed action {name} {radius:.3f} m from the object's centre, those "
-                    f"trained on {known[0]:.3f} to {known[1]:.3f} m; train on such actions first"
-                )
+            if off := _outside(o.action, action_channels, seen, radius_m):
+                raise ValueError(f"an observed action {name} {off}; train on such actions first")
         seen = (1 - o.effect_t < _END_PHASE) & o.effect_mask
-        known = self.effect_radius_m
-        if (radius := _outside(o.effect, effect_channels, seen, known)) is not None:
-            warnings.warn(
-                f"an observed effect ends {radius:.3f} m away, those trained on {known[0]:.3f} to "
-                f"{known[1]:.3f} m; what is predicted from it is an extrapolation",
-                OutOfRangeWarning,
-                stacklevel=3,
-            )
+        if off := _outside(o.effect, effect_channels, seen, self.effect_radius_m):
+            words = f"an observed effect ends {off}; what is predicted from it is an extrapolation"
+            warnings.warn(words, OutOfRangeWarning, stacklevel=3)
 
 
 def touches_border(mask: Tensor) -> Tensor:
@@ -124,14 +113,12 @@ def _range(values: Tensor) -> Range:
     return float(values.min()), float(values.max())
 
 
-def _outside(
-    values: Tensor, channels: tuple[str, ...], seen: Tensor, known: Range | None
-) -> float | None:
-    """The first distance from the origin [m] of what is seen that is out of range, if any is."""
+def _outside(values: Tensor, channels: tuple[str, ...], seen: Tensor, known: Range | None) -> str:
+    """How far from the object's centre the first of what is seen is that is out of range."""
     plane = xy_columns(channels)
     if known is None or not plane or not seen.any():
-        return None
-    radius = values.detach()[..., plane].norm(dim=-1)
-    low, high = known[0] - RADIUS_TOLERANCE_M, known[1] + RADIUS_TOLERANCE_M
-    outside = seen & ~((radius > low) & (radius < high))
-    return float(radius[outside][0]) if outside.any() else None
+        return ""
+    radius, (low, high) = values.detach()[..., plane].norm(dim=-1), known
+    near = (radius > low - RADIUS_TOLERANCE_M) & (radius < high + RADIUS_TOLERANCE_M)
+    far = radius[seen & ~near].tolist()
+    return f"{far[0]:.3f} m away, those trained on {low:.3f} to {high:.3f} m" if far else ""

@@ -1,4 +1,4 @@
-"""Our improved network: the features of the image modulate residual blocks (FiLM).
+"""Our networks: the features of the image modulate residual blocks (FiLM).
 
     r      = w₁ mean h_a(a_i) + w₂ mean h_e(e_i)             as in the paper, equations (2) and (3)
     x_0    = W {r, f(γ_o), φ(t_target)}
@@ -8,6 +8,18 @@
 f: a small network on the image's circular harmonics, which rotate exactly into the push frame;
 ς: SiLU; n: layer normalisation; φ: t with its first sines and cosines. Source: Perez et al., FiLM:
 visual reasoning with a general conditioning layer, AAAI 2018.
+
+`LastPoseCNP`, for lever-ups, is one in the frame of the last observed pose:
+
+    d(t)  = e(t) - m(t)                              m: mean of the training trajectories
+    r     = w₁ mean h_a(a_i, t_i) + w₂ mean h_e(d_i - d_l, t_i - t_l, t_i),  l the last observed
+    μ(t)  = m(t) + d_l + ḋ_l s(t) + n(t) g(r, ḋ_l, d_l, f(γ_o), t - t_l, t),    σ(t) from g
+
+A mean of codes, as in equations (2) and (3) of the paper, does not keep where exactly the object
+was a moment ago; here that is an input, with the velocity ḋ_l between the last two observations,
+which lasts for a while, s(t) = (t - t_l) exp(-|t - t_l| / 0.2); the network predicts what else
+changes from there on; n rises from 0 at t_l to 1. Any t is predicted directly, not by a rollout.
+With nothing observed d_l is that of t = 0, where a displacement is zero.
 """
 
 from dataclasses import dataclass
@@ -18,11 +30,15 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from affordlib import checked
+from affordlib.models.base import masked_mean, with_time
 from affordlib.models.harmonics import HarmonicsConfig, HarmonicsNetwork, dense, waves
 from affordlib.types import Observations
 
 FEW_ROTATIONS = 32
 """From this many rotations of one image on, its basis is faster."""
+
+_NEAR_PHASE = 0.1
+_VELOCITY_PHASE = 0.2
 
 
 @checked
@@ -102,3 +118,103 @@ class FiLMNetwork(HarmonicsNetwork):
         for block in self.blocks:
             x = block(x, features)
         return self.split_outputs(self.last(self.head(x)))
+
+
+@checked
+@dataclass(frozen=True)
+class LastPoseConfig(FiLMConfig):
+    """Sizes as of `FiLMConfig`; steps: into how many m(t) divides the phase."""
+
+    frame: str = "table"
+    steps: int = 25
+
+
+def between(values: Float[Tensor, "b n c"], at: Float[Tensor, "b t"]) -> Float[Tensor, "b t c"]:
+    """Values at places between steps, linearly."""
+    below = at.detach().floor().long().clamp(0, values.shape[1] - 2)
+    share = (at - below)[..., None]
+
+    def pick(index: Tensor) -> Tensor:
+        return values.gather(1, index[..., None].expand(-1, -1, values.shape[-1]))
+
+    return (1 - share) * pick(below) + share * pick(below + 1)
+
+
+class MeanTrajectory(nn.Module):
+    """m(t): the mean effect over the phase, linear between steps, in standardised units."""
+
+    def __init__(self, steps: int, channels: int) -> None:
+        super().__init__()
+        self.register_buffer("values", torch.zeros(steps + 1, channels))
+
+    def fit(self, effect: Float[Tensor, "n s c"], scale: Float[Tensor, " c"]) -> None:
+        """Take it from effects of training trajectories [m, rad], at the same number of steps."""
+        if effect.shape[1:] != self.values.shape:
+            raise ValueError(
+                f"effect must have (steps, channels) = {tuple(self.values.shape)}, "
+                f"got {tuple(effect.shape[1:])}"
+            )
+        self.values = effect.mean(dim=0) / scale
+
+    def forward(self, t: Float[Tensor, "b t"]) -> Float[Tensor, "b t c"]:
+        at = t.clamp(0, 1) * (len(self.values) - 1)
+        return between(self.values.expand(len(t), -1, -1), at)
+
+
+class LastPoseCNP(FiLMNetwork):
+    """Predicts a trajectory from any observed part of it; satisfies `EffectModel`."""
+
+    def make_layers(self, config: LastPoseConfig) -> None:
+        """Encoders and decoders as described above."""
+        super().make_layers(config)
+        c, w = config, config.width
+        n_e = len(c.effect_channels)
+        self.mean_trajectory = MeanTrajectory(c.steps, n_e)
+        self.effect_encoder = nn.Sequential(*dense(n_e + 2, w, w, w))
+        known = w + c.image_features + 2 * n_e + 2
+        self.merge = nn.Linear(known + 2 * (2 * c.waves + 1), w)
+
+    def outputs(
+        self, features: Tensor, observations: Observations, t_target: Tensor
+    ) -> tuple[Tensor, ...]:
+        """(μ_a, σ_a, μ_e, σ_e), each (B, T, C) and standardised."""
+        o = observations
+        d = o.effect / self.effect_scale - self.mean_trajectory(o.effect_t)
+        d_last, t_last, velocity = _last(d, o.effect_t, o.effect_mask)
+        h_a = self.action_encoder(with_time(o.action / self.action_scale, o.action_t))
+        since = o.effect_t - t_last
+        h_e = self.effect_encoder(
+            torch.cat([d - d_last[:, None], since[..., None], o.effect_t[..., None]], dim=-1)
+        )
+        w_1 = o.weight[:, None]
+        r = w_1 * masked_mean(h_a, o.action_mask) + (1 - w_1) * masked_mean(h_e, o.effect_mask)
+        seen = o.effect_mask.any(dim=1, keepdim=True).to(r.dtype)
+        image = features.expand(len(r), -1)
+        known = torch.cat([r, image, d_last, velocity, t_last, seen], dim=1)
+        ahead = t_target - t_last
+        n = self.config.waves
+        times = torch.cat([waves(t_target, n), waves(ahead, n)], dim=-1)
+        x = self.merge(torch.cat([known[:, None].expand(-1, times.shape[1], -1), times], dim=-1))
+        mu_a, sigma_a, change, sigma_e = self.decode(x, features)
+        # Nothing has changed at the last pose; the velocity lasts for a while.
+        near = ahead.abs()[..., None] / (ahead.abs()[..., None] + _NEAR_PHASE)
+        lasting = (10 * ahead * (-ahead.abs() / _VELOCITY_PHASE).exp())[..., None]
+        moving = velocity[:, None] * lasting
+        mu_e = self.mean_trajectory(t_target) + d_last[:, None] + moving + near * change
+        return mu_a, sigma_a, mu_e, sigma_e
+
+
+def _last(
+    d: Float[Tensor, "b m c"], t: Float[Tensor, "b m"], seen: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Value (B, C) and phase (B, 1) of the last observation, and its velocity per tenth of phase.
+
+    All are zero where nothing is observed; the velocity also where only one is.
+    """
+    order = t.masked_fill(~seen, -1.0).argsort(dim=1)[:, -2:]
+    rows = torch.arange(len(d), device=d.device)
+    late, early = order[:, -1], order[:, 0]
+    any_seen, two = seen.any(dim=1), seen.sum(dim=1) >= 2
+    gap = (t[rows, late] - t[rows, early]).clamp_min(1e-3)[:, None]
+    velocity = (d[rows, late] - d[rows, early]) * (0.1 / gap) * two[:, None]
+    return d[rows, late] * any_seen[:, None], (t[rows, late] * any_seen)[:, None], velocity

@@ -35,10 +35,10 @@ from affordlib.interactions.sampling import (
 )
 from affordlib.models.base import EffectNetwork, NetworkConfig
 from affordlib.models.cnp import CNPConfig
-from affordlib.models.last_pose import LastPoseConfig
+from affordlib.models.film import LastPoseConfig
 from affordlib.models.lstm import LSTMConfig
 from affordlib.models.training import TrainingConfig, TrainingRecord, train, untrained
-from affordlib.types import Prediction
+from affordlib.types import Prediction, check_choice
 
 PROTOCOLS = ("window", "first_step", "image_only")
 
@@ -86,8 +86,7 @@ def predict_steps(
 
     features: of the images, where they are encoded already.
     """
-    if protocol not in PROTOCOLS:
-        raise ValueError(f"protocol must be one of {PROTOCOLS}, got {protocol!r}")
+    check_choice("protocol", protocol, PROTOCOLS)
     n, last = len(tensors), len(tensors.phase)
     n_poses = {"window": N_OBSERVED, "first_step": 1, "image_only": 0}[protocol]
     first = start + N_OBSERVED if protocol == "window" else 1
@@ -111,11 +110,9 @@ def window_errors_m(model: EffectNetwork, tensors: InteractionTensors) -> Float[
     return torch.stack([errors_m(*one) for one in found], dim=1)
 
 
-def from_start_errors_m(
-    model: EffectNetwork, tensors: InteractionTensors, protocol: str = "image_only"
-) -> Float[Tensor, "n t"]:
-    """Errors [m] at all steps after the first."""
-    return errors_m(*predict_steps(model, tensors, protocol))
+def from_start_errors_m(model: EffectNetwork, tensors: InteractionTensors) -> Float[Tensor, "n t"]:
+    """Errors [m] at all steps after the first, of the image alone."""
+    return errors_m(*predict_steps(model, tensors, "image_only"))
 
 
 def _sample_all(
@@ -168,15 +165,13 @@ def fit_lever_model(
 
     The validation errors of what it is trained for choose its weights.
     """
-    if trained_for not in TRAINED_FOR:
-        raise ValueError(f"trained_for must be one of {[*TRAINED_FOR]}, got {trained_for!r}")
+    trained_for = TRAINED_FOR[check_choice("trained_for", trained_for, TRAINED_FOR)]
     network = lever.network
     if hasattr(network, "steps"):
         network = replace(network, steps=len(training.phase) - 1)
     model = untrained(network, training, lever.training.seed)
     if hasattr(model, "mean_trajectory"):
         model.mean_trajectory.fit(training.effect, model.effect_scale)
-    history = train(
-        model, training, validation, lever.training, resume_checkpoint, *TRAINED_FOR[trained_for]
+    return model, train(
+        model, training, validation, lever.training, resume_checkpoint, *trained_for
     )
-    return model, history

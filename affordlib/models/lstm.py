@@ -21,8 +21,8 @@ from affordlib.geometry import rotate_channels
 from affordlib.interactions.dataset import InteractionTensors
 from affordlib.interactions.sampling import condition_on_recorded_action
 from affordlib.models.base import masked_mean, with_time
+from affordlib.models.film import MeanTrajectory, between
 from affordlib.models.harmonics import HarmonicsConfig, HarmonicsNetwork, dense, waves
-from affordlib.models.last_pose import MeanTrajectory, between
 from affordlib.models.push_frame import inverse, push_direction
 from affordlib.types import Observations
 

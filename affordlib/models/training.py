@@ -25,14 +25,9 @@ from affordlib.interactions.dataset import (
     Symmetry,
     augment_by_symmetry,
 )
-from affordlib.interactions.sampling import (
-    Batch,
-    condition_on_recorded_action,
-    sample_literal,
-    sample_mixed,
-)
+from affordlib.interactions.sampling import Batch, sample_literal, sample_mixed
 from affordlib.models.base import EffectNetwork, NetworkConfig
-from affordlib.models.calibration import fit_sigma_scale
+from affordlib.models.calibration import effects_at, fit_sigma_scale
 from affordlib.models.checkpoint import build, load_state, save_state
 from affordlib.models.cnp import CNPConfig
 from affordlib.models.domain import TrainingDomain
@@ -113,17 +108,13 @@ def device_named(name: str) -> torch.device:
         raise ValueError(f'device must be "auto" or as "cpu" or "cuda", got {name!r}') from None
 
 
-@torch.no_grad()
 def final_errors_m(model: EffectNetwork, tensors: InteractionTensors) -> torch.Tensor:
     """Distance (N,) [m] between predicted and true (x, y), else all channels, at t = 1."""
     was_training = model.training
-    model.eval()
-    t_target = torch.ones(len(tensors), 1)
-    observed = condition_on_recorded_action(tensors)
-    prediction = model.predict(model.encode(tensors.image), observed, t_target)
+    truth, mean, _ = effects_at(model.eval(), tensors, (1.0,))
     model.train(was_training)
     columns = xy_columns(tensors.effect_channels) or list(range(len(tensors.effect_channels)))
-    return (prediction.effect_mean[:, 0, columns] - tensors.effect[:, -1, columns]).norm(dim=-1)
+    return (mean - truth)[:, 0, columns].norm(dim=-1)
 
 
 def train(

@@ -21,7 +21,7 @@ import torch
 from affordlib.planning.effect_map import EffectMap
 from affordlib.planning.problem import PlanningProblem, is_on_table
 from affordlib.planning.rollout import make_steps
-from affordlib.types import Plan, check_count, check_within
+from affordlib.types import Plan, check_choice, check_count, check_within
 
 N_DIRECTIONS = 36
 HEURISTICS = ("goal", "disc")
@@ -100,8 +100,7 @@ def search(
     asks is none of the goal's. trace, if given, receives each expanded position (2,) with those of
     its children (n, 2).
     """
-    if heuristic not in HEURISTICS:
-        raise ValueError(f"heuristic must be one of {HEURISTICS}, got {heuristic!r}")
+    check_choice("heuristic", heuristic, HEURISTICS)
     goal, pose_planner, effects = problem.goal, problem.pose_planner, table.effects
     max_steps, tolerance = problem.mode.max_steps, goal.tolerance_m
     radius = tolerance if heuristic == "disc" else 0.0

@@ -9,7 +9,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from affordlib.planning.effect_map import EffectMap
-from affordlib.types import TABLE_X_M, TABLE_Y_M, Goal, Plan, Step, check_count, check_on_table
+from affordlib.types import (
+    TABLE_X_M,
+    TABLE_Y_M,
+    Goal,
+    Plan,
+    Step,
+    check_choice,
+    check_count,
+    check_on_table,
+)
 
 Reachable = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Which of the positions (n, 2) and directions (n,) the arm can act at."""
@@ -36,15 +45,6 @@ MODES: dict[str, PlanMode] = {
     "single_partial": PlanMode(1, partial=True),
     "multi_partial": PlanMode(3, partial=True),
 }
-
-
-def mode_named(mode: str | PlanMode) -> PlanMode:
-    """The mode of a name in `MODES`, or the mode itself; raises naming the known ones."""
-    if isinstance(mode, PlanMode):
-        return mode
-    if mode not in MODES:
-        raise ValueError(f"mode {mode!r} is unknown; choose one of {sorted(MODES)}")
-    return MODES[mode]
 
 
 def is_on_table(xy_m: np.ndarray, radius_m: float = 0.0) -> np.ndarray:
@@ -83,7 +83,8 @@ class PlanningProblem:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "start_xy_m", check_on_table("start_xy_m", self.start_xy_m))
-        object.__setattr__(self, "mode", mode_named(self.mode))
+        if not isinstance(self.mode, PlanMode):
+            object.__setattr__(self, "mode", MODES[check_choice("mode", self.mode, MODES)])
         check_has_room(self.goal, self.effects.radius_m)
 
     def plan(

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cached_property, partial
+from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -28,6 +28,9 @@ CHECKPOINTS = {
 }
 
 
+_KEPT = {"default_factory": dict, "init": False, "repr": False, "compare": False}
+
+
 @dataclass(frozen=True)
 class Skills:
     """Models by the name of their primitive, and the probability that the arm can act.
@@ -39,6 +42,8 @@ class Skills:
     models: dict[str, EffectModel]
     reachability: Reachability | None = None
     threshold: float = 0.2
+    _last: dict[bytes, tuple[EffectMap, PosePlanner | None]] = field(**_KEPT)
+    _routes: dict[type[Primitive], RouteMap] = field(**_KEPT)
 
     def __post_init__(self) -> None:
         for name in self.models:
@@ -100,10 +105,6 @@ class Skills:
             self._last[key] = EffectMap(self.model(kind), image, kind), poses
         return self._last[key]
 
-    @cached_property
-    def _last(self) -> dict[bytes, tuple[EffectMap, PosePlanner | None]]:
-        return {}
-
     def _can_act(self, name: str, xy_m: Sequence[float]) -> bool:
         return bool(self.reachable(primitive_named(name))(np.array([xy_m]), None)[0])
 
@@ -122,10 +123,6 @@ class Skills:
         if kind not in self._routes:
             self._routes[kind] = RouteMap.of(REACH_M[kind], self.reachable(kind))
         return self._routes[kind]
-
-    @cached_property
-    def _routes(self) -> dict[type[Primitive], RouteMap]:
-        return {}
 
 
 @dataclass(frozen=True)

@@ -18,21 +18,23 @@ from typing import Any
 import ipywidgets as widgets
 import numpy as np
 
-from affordlib.geometry import wrap_angle
+from affordlib.geometry import unit_vector, wrap_angle
 from affordlib.paths import resolve_out_dir
 from affordlib.plan_files import load_plan, save_plan
 from affordlib.show.drawing import Drawing, WithPicture
 from affordlib.show.executors import Executor, Planner, Stopped, measured, open_loop
-from affordlib.show.picker_controls import PickerControls, outcome_in_words, plan_in_words
 from affordlib.show.plots import table_picture
 from affordlib.show.table_view import (
     HALF_WIDTH_M,
     LIMIT_M,
+    PickerControls,
     draw_goal,
     draw_ground,
     draw_object,
     draw_path,
     draw_plan,
+    outcome_in_words,
+    plan_in_words,
     to_mm,
 )
 from affordlib.types import Goal, Outcome, Plan, check_count, check_on_table
@@ -407,13 +409,10 @@ class GoalPicker(WithPicture, widgets.VBox):
         self.controls.say(f"The goal was moved by {1000 * np.hypot(*by):.0f} mm.")
 
     def _displacement(self, xy_m: tuple[float, float], least_m: float, most_m: float) -> np.ndarray:
-        """A random displacement (2,) [m] that stays in sight; from outside, one to the middle."""
-        for _ in range(100):
-            angle, far = self._rng.uniform(0, 2 * np.pi), self._rng.uniform(least_m, most_m)
-            by = far * np.array([np.cos(angle), np.sin(angle)])
-            if np.abs(np.add(xy_m, by)).max() < LIMIT_M:
-                return by
-        return -far * np.array(xy_m) / np.hypot(*xy_m)
+        """A random displacement (2,) [m], to the middle where it would lead out of sight."""
+        by = self._rng.uniform(least_m, most_m) * unit_vector(self._rng.uniform(0, 2 * np.pi))
+        inside = np.abs(np.add(xy_m, by)) < LIMIT_M
+        return np.where(inside, by, -np.copysign(by, xy_m))
 
     # What is seen
 

@@ -18,6 +18,7 @@ from torch import Tensor
 from affordlib.geometry import rotated
 from affordlib.perception import CAMERA_HEIGHT_M
 from affordlib.planning import ClosedLoopResult
+from affordlib.planning.effect_map import checked_image
 from affordlib.primitives import Grasp, Rotate
 from affordlib.results import write_atomically
 from affordlib.types import (
@@ -212,23 +213,10 @@ def plot_closed_loop(ax: Axes, result: ClosedLoopResult, obj: TabletopObject | N
     return ax
 
 
-def plot_depth(
-    ax: Axes,
-    image: np.ndarray,
-    title: str = "",
-    width_m: float = CROP_WIDTH_M,
-    top_cm: float | None = None,
-) -> Axes:
-    """The depth channel of an image (2, n, n), as height above the table in centimetres.
-
-    top_cm: where the colours end (default: at the highest point, or 8 cm).
-    """
-    half = 50 * check_within("width_m", width_m, 0.01, 10.0, "m")
-    image = check_array("image", image)
-    if image.ndim != 3:
-        raise ValueError(f"image must be (2, n, n), got an array {image.shape}")
-    height_cm = 100 * (CAMERA_HEIGHT_M - image[0])
-    top = top_cm or max(8.0, float(height_cm.max()))
+def plot_depth(ax: Axes, image: np.ndarray, title: str = "") -> Axes:
+    """The depth channel of an image (2, 48, 48), as height above the table in centimetres."""
+    height_cm = 100 * (CAMERA_HEIGHT_M - checked_image(image)[0, 0].numpy())
+    half, top = 50 * CROP_WIDTH_M, max(8.0, float(height_cm.max()))
     extent = (-half, half, -half, half)
     drawn = ax.imshow(height_cm, extent=extent, cmap="cividis", vmin=0, vmax=top)
     ax.grid(False)

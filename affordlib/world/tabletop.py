@@ -27,16 +27,15 @@ from affordlib.types import (
     Step,
     UnreachableError,
     check_array,
+    check_choice,
     check_count,
     check_finite,
     check_on_table,
     check_within,
 )
 from affordlib.world import camera, robot
-from affordlib.world.controller import JointController
-from affordlib.world.execution import execute, put_down, unreached
-from affordlib.world.objects import TabletopObject, WorldConfig
-from affordlib.world.placed_object import PlacedObject, set_friction
+from affordlib.world.execution import JointController, execute, put_down, unreached
+from affordlib.world.objects import PlacedObject, TabletopObject, WorldConfig, set_friction
 from affordlib.world.trajectory import STEP_S, Command, plan_motion, segments_until
 
 OBJECTS_PER_BUILD = 256
@@ -142,10 +141,8 @@ class Tabletop(AbstractContextManager):
         tool: "gripper", "screwdriver" or "rod"; config: from now on (default: as it is).
         """
         xy_m, yaw_rad = check_on_table("xy_m", xy_m), check_finite("yaw_rad", yaw_rad)
-        if tool not in robot.TOOL_OFFSETS_M:
-            raise ValueError(f"tool must be one of {sorted(robot.TOOL_OFFSETS_M)}, got {tool!r}")
         self.config = config or self.config
-        self.reset(tool)
+        self.reset(check_choice("tool", tool, robot.TOOL_OFFSETS_M))
         self._n_placed += 1
         self._placed = PlacedObject(self.client, obj, self.config, xy_m, yaw_rad)
 

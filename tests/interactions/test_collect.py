@@ -17,9 +17,9 @@ import pytest
 
 import affordlib
 from affordlib.interactions import collect
+from affordlib.interactions.collect import attributes_for, collect_chunk
 from affordlib.interactions.collect import collect as collect_set
 from affordlib.interactions.recipes import Recipe
-from affordlib.interactions.schema import attributes_for, collect_chunk
 from affordlib.interactions.store import dataset_sha256, open_interactions, stored_sha256
 from affordlib.workers import dask_client
 from experiments import shipped
@@ -280,21 +280,23 @@ def poisoned(client, log, how):
         name = "poison"
 
         def setup(self, worker):
-            from affordlib.interactions import collect, schema
+            from affordlib.interactions import collect
+
+            self.unharmed = unharmed = collect.collect_chunk
 
             def deadly(recipe, numbers):
                 if numbers.start == 4:
                     with open(log, "a") as file:
                         file.write("x")
                     os._exit(9) if how == "kill" else [].pop()
-                return schema.collect_chunk(recipe, numbers)
+                return unharmed(recipe, numbers)
 
             collect.collect_chunk = deadly
 
         def teardown(self, worker):
-            from affordlib.interactions import collect, schema
+            from affordlib.interactions import collect
 
-            collect.collect_chunk = schema.collect_chunk
+            collect.collect_chunk = self.unharmed
 
     client.register_plugin(Poison())
     try:

@@ -24,7 +24,7 @@ from affordlib.models import (
     load_checkpoint,
     save_checkpoint,
 )
-from affordlib.models.last_pose import LastPoseConfig
+from affordlib.models.film import LastPoseConfig
 from affordlib.models.lstm import LSTMConfig
 from affordlib.models.protocol import condition_on_final_effect
 from affordlib.models.push_frame import push_direction

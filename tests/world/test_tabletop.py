@@ -21,7 +21,7 @@ from affordlib.world import (
     robot,
     tabletop,
 )
-from affordlib.world.controller import JointController
+from affordlib.world.execution import JointController
 
 OBJECTS = (Cuboid(0.05, 0.07, 0.06), UprightCylinder(0.06, 0.05))
 LEVER = LeverUp(-0.03, 0.0, 0.0, 0.06)
@@ -109,8 +109,8 @@ def test_unreachable_raises_or_is_recorded_and_moves_nothing(world):
         (lambda w: Push(math.nan), "theta .* nan"),
         (lambda w: Push(0.0, length=-0.1), r"length .* -0\.1"),
         (lambda w: Push(0.0, radius=1.0), "radius .* 1"),
-        (lambda w: primitive_named("kick"), "'kick' is unknown; choose one of .'drag', 'grasp'"),
-        (lambda w: category_named("cone"), "'cone' is unknown"),
+        (lambda w: primitive_named("kick"), "must be one of .'drag', 'grasp'.* got 'kick'"),
+        (lambda w: category_named("cone"), "object category must be one of .* got 'cone'"),
         (lambda w: UprightCylinder(0.05, 5.0), "Cylinder.height .* 5"),
         (lambda w: Goal((0.9, 0.0)), r"goal xy_m = \(0\.9, 0\) m lies off the table; choose x in"),
         (lambda w: Goal((0.1, 0.1), tolerance_m=-1), "Goal.tolerance_m .* -1"),
