@@ -35,7 +35,7 @@ unexport PYTHONPATH PYTHONHOME PYTHONSTARTUP VIRTUAL_ENV MPLBACKEND
 unexport PIP_USER PIP_TARGET PIP_PREFIX PIP_REQUIREMENT PIP_CONSTRAINT
 unexport PYTEST_ADDOPTS JUPYTER_PATH JUPYTER_TOKEN
 
-.PHONY: help setup workbook seeds lab test test-fast test-plain test-slow soak size lint format bench data checkpoints notebooks html tables \
+.PHONY: help setup workbook seeds lab test test-fast test-plain test-slow soak size book-check lint format bench data checkpoints notebooks html tables \
         constraints clean
 
 help: ## List the targets
@@ -108,6 +108,9 @@ soak: $(STAMP) ## Plan and execute 3,000 times: memory must stay, and the same t
 size: $(STAMP) ## Count lines and files, and fail above the budgets
 	@$(PY) -m tests.size
 
+book-check: $(STAMP) ## Measure every page of the book, and fail on what its style does not allow
+	@$(PY) -m tests.book_check
+
 lint: $(STAMP) ## Check style and formatting
 	@$(PY) -m ruff check
 	@$(PY) -m ruff format --check
@@ -130,10 +133,12 @@ notebooks: $(STAMP) ## Execute the committed notebooks in place and clean them (
 	@$(PY) -m affordlib.workbook --in-place --only "$$ONLY" $(if $(FORCE),--force)
 
 html: $(STAMP) ## Write the committed notebooks as web pages into runs/html (equations need the network)
-	@$(PY) -m nbconvert --to html --embed-images --log-level=ERROR --output-dir runs/html \
+	@$(PY) -m nbconvert --to html --template book_html --TemplateExporter.extra_template_basedirs=notebooks \
+	  --embed-images --log-level=ERROR --output-dir runs/html \
 	  --NbConvertBase.display_data_priority="['text/html','image/png','text/markdown','text/plain']" \
 	  notebooks/*.ipynb notebooks/appendix/*.ipynb
-	@sed -i -E 's#href="(\.\./|appendix/)?([0-9A-Za-z_]+)\.ipynb#href="\2.html#g' runs/html/*.html
+	@sed -i -E -e 's#href="(\.\./|appendix/)?([0-9A-Za-z_]+)\.ipynb#href="\2.html#g' \
+	  -e 's#href="(\.\./)+((data/)?[A-Za-z]+\.md)#href="../../\2#g' -e 's#href="solutions/#href="../../notebooks/solutions/#g' runs/html/*.html
 
 tables: $(STAMP) ## Draw the tables of README, RESULTS and data card from data/results
 	@$(PY) -m affordlib.results README.md RESULTS.md data/README.md

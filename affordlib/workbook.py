@@ -216,12 +216,16 @@ def cleaned(notebook: nbformat.NotebookNode) -> str:
     """Return an executed notebook as it is committed: outputs and tags kept, the rest dropped.
 
     Of a widget its picture is kept: without its kernel JupyterLab would show an error in its place.
+    The caption in the cell below is the alternative text of a picture.
     """
     cells = own_cells(notebook)
-    for cell in cells:
+    for cell, below in zip(cells, cells[1:] + cells[-1:], strict=True):
+        caption = re.match(r"\*\*Figure .*?\*\* (.*)", below.source)
         for output in cell.get("outputs", []):
             if "image/png" in output.get("data", ()):
                 output.data.pop(WIDGET, None)
+                if caption:
+                    output.metadata.setdefault("image/png", {})["alt"] = caption[1]
         cell.metadata = {k: cell.metadata[k] for k in ("tags", "jupyter") if cell.metadata.get(k)}
     kernel = {"display_name": "Python 3", "language": "python", "name": "python3"}
     metadata = {"kernelspec": kernel, "language_info": {"name": "python"}}

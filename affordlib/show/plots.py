@@ -171,7 +171,7 @@ def plot_outcome(ax: Axes, outcome: Outcome) -> Axes:
     """The object's real path when a plan was executed, over the plan (see `plot_plan`)."""
     plot_plan(ax, outcome.plan, sigma=False)
     for k, path in enumerate(outcome.object_paths_xy_m):
-        ax.plot(*_cm(path), color=TRUTH, lw=2, ls="--", label="truth" if k == 0 else None)
+        ax.plot(*_cm(path), color=TRUTH, lw=2, ls="--", label="executed" if k == 0 else None)
     ax.plot(*_cm(outcome.end_pose[:2]), "s", color=TRUTH, ms=6)
     ax.set_title(f"{outcome.plan.planner}: {1000 * outcome.distance_m:.1f} mm from the goal")
     return ax
@@ -194,7 +194,7 @@ def plot_closed_loop(ax: Axes, result: ClosedLoopResult, obj: TabletopObject | N
         if math.dist(path[0], at) > 0.003:
             ax.plot(*_cm([at, path[0]]), ":", color="black", lw=1.2, label=others)
             others = None
-        truth, prediction = ("truth", "prediction") if k == 0 else (None, None)
+        truth, prediction = ("ground truth", "prediction") if k == 0 else (None, None)
         ax.plot(*_cm(path), color=TRUTH, lw=2, label=truth)
         ax.plot(*_cm(step.predicted_end_xy_m), "o", color=PREDICTION, ms=5, label=prediction)
         at = path[-1]

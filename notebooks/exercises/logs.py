@@ -1,4 +1,4 @@
-"""Exercises of notebook 09: frames, and copies that cost nothing."""
+"""Exercises of notebook 09: frames, and mirrored pushes."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ LOGS: dict[str, Exercise] = {
         _frame_error_mm,
         expected=0.0,
         within=0.1,
-        unit="mm off at worst",
+        unit="mm, largest error",
     ),
     "09.2": Exercise(
         "Write mirrored(contact, direction, displacement, turn): seven numbers, mirrored at x.",
         _mirror_error,
         expected=0.0,
         within=1e-6,
-        unit="off at worst",
+        unit="largest error",
     ),
 }

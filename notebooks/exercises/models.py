@@ -1,4 +1,4 @@
-"""Exercises of notebooks 03 to 05: what a network foresees, how sure it is, what it is asked."""
+"""Exercises of notebooks 03 to 05: predictions, their σ, and queries."""
 
 from __future__ import annotations
 
@@ -22,40 +22,43 @@ N_PHASES = 61
 @cache
 @torch.no_grad()
 def _marginals() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean, σ and truth (50, 61, 2) [m] of the held-out pushes, given image and action."""
+    """Mean, σ and ground truth (50, 61, 2) [m] of the held-out pushes, given image and action."""
     pushes = open_interactions("push")
     held_out = split_interactions(pushes.sizes["interaction"]).test
     arrays = InteractionTensors.from_dataset(pushes, held_out)
     at = torch.linspace(0, len(arrays.phase) - 1, N_PHASES).round().long()
     model, _ = load_checkpoint("cnp_500")
     t_target = arrays.phases(at)
-    told = model.predict(model.encode(arrays.image), condition_on_recorded_action(arrays), t_target)
-    return told.effect_mean.numpy(), told.effect_std.numpy(), arrays.effect[:, at].numpy()
+    query = condition_on_recorded_action(arrays)
+    answer = model.predict(model.encode(arrays.image), query, t_target)
+    return answer.effect_mean.numpy(), answer.effect_std.numpy(), arrays.effect[:, at].numpy()
 
 
-def _way_m(courses: np.ndarray) -> np.ndarray:
-    """Lengths (N,) of courses (N, n, 2)."""
-    return np.hypot(*np.moveaxis(np.diff(courses, axis=1), -1, 0)).sum(axis=1)
+def _length_m(paths: np.ndarray) -> np.ndarray:
+    """Lengths (N,) of trajectories (N, n, 2)."""
+    return np.hypot(*np.moveaxis(np.diff(paths, axis=1), -1, 0)).sum(axis=1)
 
 
-def _drawn_way(draw: Callable[[np.ndarray, np.ndarray, np.random.Generator], np.ndarray]) -> float:
-    """How many times as long as the true courses those are that the reader draws."""
+def _drawn_length(
+    draw: Callable[[np.ndarray, np.ndarray, np.random.Generator], np.ndarray],
+) -> float:
+    """How many times as long as the real trajectories those are that the reader draws."""
     mean, sigma, truth = _marginals()
     rng = np.random.default_rng(0)
     drawn = np.stack([asked(draw, m, s, rng) for m, s in zip(mean, sigma, strict=True)])
     if drawn.shape != mean.shape:
-        raise ValueError(f"a course has the shape {mean.shape[1:]}, got {drawn.shape[1:]}")
+        raise ValueError(f"a trajectory has the shape {mean.shape[1:]}, got {drawn.shape[1:]}")
     spread = float(((drawn - mean) / sigma).std())
     if not 0.8 < spread < 1.2:
         raise ValueError(f"the draws spread by {spread:.2f} σ about the mean, not by 1 σ")
-    return float(_way_m(drawn).mean() / _way_m(truth).mean())
+    return float(_length_m(drawn).mean() / _length_m(truth).mean())
 
 
 # 04 Effect prediction
 
 
 def _lopsided_mm(lopsided_m: Callable[..., float]) -> float:
-    """By how much [mm] the paper's network fails to turn along with the table."""
+    """By how much [mm] the paper's network fails to rotate with the table."""
 
     def by(name: str) -> float:
         model, _ = load_checkpoint(name)
@@ -67,13 +70,13 @@ def _lopsided_mm(lopsided_m: Callable[..., float]) -> float:
 
     ours = by("film_500")
     if abs(ours) > 0.01:
-        raise ValueError(f"ours turns along, so it should give 0 mm, got {ours:.3g} mm")
+        raise ValueError(f"ours rotates with the table, so it should give 0 mm, got {ours:.3g} mm")
     return by("cnp_500")
 
 
 @cache
-def _foreseen_ends() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Truth, mean and σ (2, 1000) [m] of the ends of `push_test`, by the shipped network."""
+def _predicted_ends() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Ground truth, mean and σ (2, 1000) [m] of the final positions of `push_test`."""
     data = open_interactions("push_test")
     model, _ = load_checkpoint("film_500")
     answers = network_predictions(model, data, np.arange(data.sizes["interaction"]))
@@ -84,7 +87,7 @@ def _foreseen_ends() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
 
 
 def _half_inside_percent(factor: float) -> float:
-    truth, mean, std = _foreseen_ends()
+    truth, mean, std = _predicted_ends()
     return 100 * coverage(truth, mean, float(factor) * std, 0.5)
 
 
@@ -97,11 +100,11 @@ MODELS: dict[str, Exercise] = {
         unit="mm",
     ),
     "03.2": Exercise(
-        "Write draw(mean, sigma, rng): one course, every moment drawn from its own Gaussian.",
-        _drawn_way,
+        "Write draw(mean, sigma, rng): one trajectory, every phase drawn from its own Gaussian.",
+        _drawn_length,
         expected=3.6,
         within=0.3,
-        unit="times the true way",
+        unit="times the real length",
     ),
     "04.1": Exercise(
         "Write lopsided_m(model, arrays): how far an end moves when the table is turned by 90°.",
@@ -125,11 +128,11 @@ MODELS: dict[str, Exercise] = {
         unit="cm",
     ),
     "05.2": Exercise(
-        "Measure how many times as far as the conditional network the recurrent one errs at the "
-        "fifth step, if the poses they see are off by 1 mm.",
+        "Measure the recurrent network's error as a multiple of the conditional one's at the fifth "
+        "step, if the observed poses have errors of 1 mm.",
         lambda mine: mine,
         expected=2.03,
         within=0.1,
-        unit="times as far",
+        unit="times",
     ),
 }

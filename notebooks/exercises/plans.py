@@ -1,4 +1,4 @@
-"""Exercises of notebooks 06 to 08: chains and stops, the closed loop, and what σ does not know."""
+"""Exercises of notebooks 06 to 08: chains and stops, the closed loop, and new objects."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def _shoved_mm(bring: Callable[..., Any], shove: tuple[float, float, float]) -> 
 
 
 def _lift_error_mm(stop_at: Callable[..., Any]) -> float:
-    """Largest difference [mm] from the heights that were asked for."""
+    """Largest difference [mm] from the desired heights."""
     model, _ = load_checkpoint("grasp_film_1000")
     off = []
     with Tabletop() as world:
@@ -140,38 +140,38 @@ PLANS: dict[str, Exercise] = {
         _chain_error_mm,
         expected=0.0,
         within=0.1,
-        unit="mm off at worst",
+        unit="mm, largest error",
     ),
     "06.2": Exercise(
         "Write choose(effects, goal_xy_m): direction and stop phase of one push to a goal.",
         _push_error_mm,
         expected=0.0,
         within=3.0,
-        unit="mm from the goal in the mean",
+        unit="mm from the goal on average",
     ),
     "07.1": Exercise(
-        "Write bring(look, plan, act): look after every action, and plan anew where needed.",
+        "Write bring(look, plan, act): observe after every action, and plan again where needed.",
         _loop_error_mm,
         expected=0.0,
         within=2.5,
-        unit="mm from the goal in the mean",
+        unit="mm from the goal on average",
     ),
     "07.2": Exercise(
-        "Write stop_at(height_m, phase, course_m): the phase at which a grasp ends at a height.",
+        "Write stop_at(height_m, phase, height_curve_m): where a grasp ends at a height.",
         _lift_error_mm,
         expected=0.0,
         within=3.0,
-        unit="mm off at worst",
+        unit="mm, largest error",
     ),
     "08.1": Exercise(
         "Write strangeness(image): larger for a house than for a cuboid or a cylinder.",
         _told_apart_percent,
         expected=100.0,
         within=10.0,
-        unit="% of the pairs told apart",
+        unit="% of the pairs in the right order",
     ),
     "08.2": Exercise(
-        "Measure the mean error [mm] of the half of the pushes of which the network is surest.",
+        "Measure the mean error [mm] of the half of the pushes with the smallest σ.",
         lambda mine: mine,
         expected=0.112,
         within=0.01,

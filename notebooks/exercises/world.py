@@ -1,4 +1,4 @@
-"""Exercises of notebooks 01 and 02: the world, and what there is to be learned in it."""
+"""Exercises of notebooks 01 and 02: the world, and what there is to learn in it."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ WORLD: dict[str, Exercise] = {
         _worst_speed_error,
         expected=0.0,
         within=0.1,
-        unit="mm/s off at worst",
+        unit="mm/s, largest error",
     ),
     "01.2": Exercise(
         "Find the phase at which the push must stop for the box to rest 5 cm from its start.",
@@ -78,6 +78,6 @@ WORLD: dict[str, Exercise] = {
         _cylinder_error_mm,
         expected=0.0,
         within=0.6,
-        unit="mm off in the mean",
+        unit="mm, mean error",
     ),
 }

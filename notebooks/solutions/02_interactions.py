@@ -9,7 +9,7 @@ from exercises import check
 
 
 def spread_of_drags_mm():
-    """A drag ends where it is told to: nothing remains to be learned from an image."""
+    """A drag ends where it is commanded to: an image adds nothing."""
     drags = open_interactions("drag")
     angle = drags["theta"].values
     x, y = 1000 * drags["effect"].values[:, -1, :2].T

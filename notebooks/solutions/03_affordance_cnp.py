@@ -10,11 +10,11 @@ from exercises import check
 
 @torch.no_grad()
 def passes_by_mm(t=0.8):
-    """Observe the effect at t and nothing else, ask for the effect at the same t.
+    """Observe the effect at t and nothing else, query the effect at the same t.
 
     The observation went through an encoder and a mean of 128 numbers; nothing ties the decoder's
-    answer to it but training. It helps (told the action alone, the mean is 2.07 mm off there), and
-    it is not obeyed.
+    answer to it but training. It helps (given the action alone, the mean has an error of 2.07 mm
+    there), but it is not reproduced.
     """
     model, _ = load_checkpoint("cnp_500")
     pushes = open_interactions("push")
@@ -28,11 +28,11 @@ def passes_by_mm(t=0.8):
 
 
 def draw(mean, sigma, rng):
-    """Each moment by itself: right at every moment, and no object ever moved like that.
+    """Each phase alone: right at every phase, and no object ever moved like that.
 
-    The marginals do not say how neighbouring moments go together, so neighbours disagree by σ. One
-    draw for the whole course, mean + sigma * rng.standard_normal(2), is as right at every moment
-    and as smooth as the mean; the network cannot say which of the two is the truth.
+    The marginals do not say how neighbouring phases go together, so neighbours disagree by σ. One
+    draw for the whole trajectory, mean + sigma * rng.standard_normal(2), is as right at every phase
+    and as smooth as the mean; the network cannot say which of the two is real.
     """
     return rng.normal(mean, sigma)
 

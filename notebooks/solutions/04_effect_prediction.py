@@ -12,12 +12,12 @@ from exercises import check
 
 @torch.no_grad()
 def lopsided_m(model, arrays):
-    """Foresee the ends on the table and on the turned table; turn the first, and compare."""
+    """Predict the ends on the table and on the rotated table; rotate the first, and compare."""
 
     def ends(these):
         t = torch.ones(len(these), 1)
-        told = model.predict(model.encode(these.image), condition_on_recorded_action(these), t)
-        return told.effect_mean[:, 0, :2]
+        answer = model.predict(model.encode(these.image), condition_on_recorded_action(these), t)
+        return answer.effect_mean[:, 0, :2]
 
     x, y = ends(arrays).T
     turned = torch.stack([-y, x], dim=1)
@@ -32,8 +32,8 @@ def factor_for_half():
     """
     data = open_interactions("push_test")
     model, _ = load_checkpoint("film_500")
-    told = network_predictions(model, data, np.arange(data.sizes["interaction"]))
-    mean, truth, std = (np.array([told[k][c] for c in "xy"]) for k in ("mean", "truth", "std"))
+    answers = network_predictions(model, data, np.arange(data.sizes["interaction"]))
+    mean, truth, std = (np.array([answers[k][c] for c in "xy"]) for k in ("mean", "truth", "std"))
     return float(np.median(np.abs(mean - truth) / std) / 0.6745)
 
 

@@ -8,7 +8,7 @@ from exercises import check
 
 
 def chain_end(effects, direction, phase):
-    """Every effect is turned into the direction of its push; every push meets a turned object."""
+    """Every effect is rotated into the direction of its push; every push meets a turned object."""
     x = y = turned = 0.0
     for angle, stop in zip(direction, phase, strict=True):
         ahead, left, turn = effects(angle - turned, stop)[0]
@@ -19,7 +19,7 @@ def chain_end(effects, direction, phase):
 
 
 def choose(effects, goal_xy_m):
-    """Ask for all directions (by 1°) and phases (by 0.005) and take the nearest end."""
+    """Query all directions (by 1°) and phases (by 0.005) and take the nearest end."""
     angle = torch.arange(360, dtype=torch.float64)[:, None] * (math.pi / 180)
     stop = torch.linspace(0.5, 1, 101, dtype=torch.float64)[None, :]
     angle, stop = torch.broadcast_tensors(angle, stop)

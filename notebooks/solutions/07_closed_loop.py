@@ -8,10 +8,10 @@ from exercises import check
 
 
 def bring(look, plan, act):
-    """Go on with a plan while the object is where the plan has it, else make another.
+    """Keep a plan while the object is where it was predicted to be, else make another.
 
-    To plan anew after *every* action is not the same: a plan of two actions may begin with a
-    detour, and whoever only ever takes the first of two never arrives.
+    To plan again after *every* action is not the same: a plan of two actions may begin with a
+    detour, and a robot that only ever takes the first of two may never arrive.
     """
     taken, queue, expected = 0, [], None
     while True:
@@ -28,10 +28,10 @@ def bring(look, plan, act):
         taken, expected = taken + 1, step.predicted_end_xy_m
 
 
-def stop_at(height_m, phase, course_m):
-    """The first phase from which on the course stays above the height, between two samples."""
-    above = int(np.flatnonzero(course_m < height_m)[-1]) + 1
-    return np.interp(height_m, course_m[above - 1 : above + 1], phase[above - 1 : above + 1])
+def stop_at(height_m, phase, height_curve_m):
+    """The first phase from which the curve stays above the height, between two samples."""
+    above = int(np.flatnonzero(height_curve_m < height_m)[-1]) + 1
+    return np.interp(height_m, height_curve_m[above - 1 : above + 1], phase[above - 1 : above + 1])
 
 
 VERDICTS = [check("07.1", bring), check("07.2", stop_at)]

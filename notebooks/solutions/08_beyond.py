@@ -9,22 +9,22 @@ from exercises import check
 
 
 def strangeness(image):
-    """Cuboids and cylinders look the same turned by half a turn, a house does not.
+    """Cuboids and cylinders look the same after half a turn, a house does not.
 
-    It knows this kind of stranger only. A general one would ask how far the image, or its features,
-    are from the nearest of the training.
+    It detects this kind of object only. A general test would measure the distance of the image, or
+    of its features, to the nearest one of the training data.
     """
     mask = image[1]
     return np.abs(mask - mask[::-1, ::-1]).mean()
 
 
 def surest_half_mm():
-    """Half of the pushes, chosen by σ alone, are foreseen several times as well as all of them."""
+    """Half of the pushes, chosen by σ alone, have a fraction of the error of all of them."""
     pushes = open_interactions("push_test")
     model, _ = load_checkpoint("film_5000")
-    told = network_predictions(model, pushes, np.arange(pushes.sizes["interaction"]))
-    sigma = np.hypot(told["std"]["x"], told["std"]["y"])
-    return 1000 * float(final_error(told)[sigma <= np.median(sigma)].mean())
+    answers = network_predictions(model, pushes, np.arange(pushes.sizes["interaction"]))
+    sigma = np.hypot(answers["std"]["x"], answers["std"]["y"])
+    return 1000 * float(final_error(answers)[sigma <= np.median(sigma)].mean())
 
 
 VERDICTS = [check("08.1", strangeness), check("08.2", surest_half_mm())]
