@@ -65,8 +65,8 @@ def table(page):
 
 
 def test_it_opens_with_a_plan(page, table):
-    assert goal_of(page) == (0.15, 0.10)
-    assert_same_goal(page, table, 0.15, 0.10)
+    assert goal_of(page) == (0.12, 0.08)
+    assert_same_goal(page, table, 0.12, 0.08)
     assert "Plan: push to" in words(page)
     picture(page, "1_open")
 
