@@ -21,6 +21,7 @@ from affordlib.models.film import FiLMNetwork
 from affordlib.models.protocol import condition_on_final_effect
 from affordlib.models.training import final_errors_m, train
 from affordlib.types import Observations
+from experiments.runner import study
 from experiments.shipped import CHECKPOINT_SPECS
 
 Rows = list[dict[str, Any]]
@@ -126,13 +127,17 @@ LADDER = {
 """What is added to the published training until it is ours, and the change it undoes."""
 
 STEPS, SEEDS = 500, 3
+SHIPPED = CHECKPOINT_SPECS["film_500"]
+_ABOUT = (SHIPPED.network, SHIPPED.training, STEPS, SEEDS)
 
 
+@study("push", "push_test", settings=(_ABOUT, CHANGES))
 def ablation() -> Rows:
     """Errors on `push_test` of short trainings, each without one thing; means over seeds."""
     return [{"change": change} | _errors([change]) for change in CHANGES]
 
 
+@study("push", "push_test", settings=(_ABOUT, [CHANGES[change] for change in LADDER.values()]))
 def incremental_ablation() -> Rows:
     """The same of trainings that gain one thing after another, from none of `LADDER` to all."""
     names, changes = list(LADDER), list(LADDER.values())
@@ -178,9 +183,8 @@ def ablated(changes: Sequence[str], steps: int, seed: int = 0) -> tuple[np.ndarr
         of: {k: v for how in each for k, v in how.get(of, {}).items()}
         for of in ("training", "network")
     }
-    shipped = CHECKPOINT_SPECS["film_500"]
-    config = replace(shipped.training, steps=steps, seed=seed, **options["training"])
-    network = replace(shipped.network, **options["network"])
+    config = replace(SHIPPED.training, steps=steps, seed=seed, **options["training"])
+    network = replace(SHIPPED.network, **options["network"])
     channels = network.action_channels, network.effect_channels
     data, test_data = open_interactions("push"), open_interactions("push_test")
     split = split_interactions(data.sizes["interaction"])

@@ -31,7 +31,7 @@ from affordlib.models.lever_up import LEVER_MODELS, PROTOCOLS, LeverModel
 from affordlib.types import Prediction
 from experiments import lstm_seker2019
 from experiments.lstm_seker2019 import SekerConfig, SekerLSTM, train_seker
-from experiments.runner import Job, one_of, open_once
+from experiments.runner import Job, one_of, open_once, study
 from experiments.shipped import shipped_lever_model
 
 DATA, N_FOLDS = "lever_up", 5
@@ -197,8 +197,7 @@ SETTINGS: dict[str, tuple[dict[str, Any], float]] = {
 """By name: what is changed in `TRAINING`, where both networks began, and the share of the width."""
 
 TUNED = (("cnp_last_pose", "all"), ("lstm_tuned", "window"), ("lstm_tuned", "first_step"))
-TUNING = (SETTINGS, TUNED, [LEVER_MODELS[name].network for name, _ in TUNED], models.TRAINING)
-"""What decides the study `tuning`."""
+_TUNING = (SETTINGS, TUNED, [LEVER_MODELS[name].network for name, _ in TUNED], models.TRAINING)
 
 
 def changed(lever: LeverModel, setting: str) -> LeverModel:
@@ -208,6 +207,7 @@ def changed(lever: LeverModel, setting: str) -> LeverModel:
     return replace(lever, network=network, training=replace(models.TRAINING, **training))
 
 
+@study(DATA, settings=_TUNING)
 def tuning() -> list[dict[str, Any]]:
     """The same budget of tuning for ours and for the recurrent network (Section 4.1).
 

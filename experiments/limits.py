@@ -24,6 +24,7 @@ from affordlib.planning.reachability import Reachability
 from affordlib.primitives import PRIMITIVES, Drag, Grasp, Push, Rotate
 from affordlib.world import Tabletop
 from experiments.planning import POSITION_ERROR_M, YAW_ERROR_RAD
+from experiments.runner import study
 
 Rows = list[dict[str, Any]]
 
@@ -37,6 +38,7 @@ NEAR_THE_LIMIT = (0.2, 0.8)
 """Learned probabilities between these are of places near the limit of the arm's reach."""
 
 
+@study("push_test", settings=(N_PUSHES, REPEATS, POSITION_ERROR_M, YAW_ERROR_RAD))
 def pose_sensitivity() -> Rows:
     """Change of displacement, final position and rotation when an object is not where believed."""
     data = open_interactions("push_test")
@@ -74,6 +76,7 @@ def pose_sensitivity() -> Rows:
     return rows
 
 
+@study("partial", checkpoints=WHOLE_ACTION_MODELS, settings=PHASES)
 @torch.no_grad()
 def partial_execution() -> Rows:
     """Errors of networks that learned from whole actions alone, on partial actions."""
@@ -104,6 +107,7 @@ def partial_execution() -> Rows:
     return rows
 
 
+@study(checkpoints=("reachability",), settings=(N_PLACES, NEAR_THE_LIMIT))
 def reachability_accuracy() -> Rows:
     """Agreement of the learned reachability, at a threshold of one half, with the kinematics."""
     model, rng = Reachability.load(), np.random.default_rng(0)

@@ -96,17 +96,18 @@ class SekerLSTM(EffectNetwork):
 
     def roll(self, features: Tensor, known: Known, o: Observations, n: int) -> Tensor:
         """Poses (B, n + 1, C) from the first observed step on."""
-        rows = torch.arange(len(features), device=features.device)
         action = (o.action / self.action_scale).flatten(1)[:, None]
-        n_given = int(known.where.sum(dim=1).min())
-        k = (known.first[:, None] + torch.arange(n_given)).clamp_max(self.config.steps)
-        given = known.d[rows[:, None], k]
+        k = torch.arange(max(n, 1), device=features.device) + known.first[:, None]
+        k = k.clamp_max(self.config.steps)
+        rows = torch.arange(len(features), device=features.device)[:, None]
+        given, seen = known.d[rows, k], known.where[rows, k]
+        n_given = int(seen.all(dim=0).cumprod(dim=0).sum())  # by all rows
         gates = self._share_of_image(features)
-        out, state = self._steps(gates, given, k, action)
+        out, state = self._steps(gates, given[:, :n_given], k[:, :n_given], action)
         path = [given[:, :1], self.next_pose(out)]
         for j in range(n_given, n):
-            k = (known.first[:, None] + j).clamp_max(self.config.steps)
-            out, state = self._steps(gates, path[-1][:, -1:], k, action, state)
+            pose = torch.where(seen[:, j, None, None], given[:, [j]], path[-1][:, -1:])
+            out, state = self._steps(gates, pose, k[:, [j]], action, state)
             path.append(self.next_pose(out))
         return torch.cat(path, dim=1)
 

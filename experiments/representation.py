@@ -28,6 +28,7 @@ from affordlib.models.push_frame import inverse, push_direction, rotate_observat
 from affordlib.models.training import final_errors_m, train_model
 from affordlib.perception import looks_rollable
 from affordlib.types import Observations
+from experiments.runner import study
 from experiments.shipped import CHECKPOINT_SPECS
 
 Rows = list[dict[str, Any]]
@@ -65,6 +66,7 @@ def _seen_by(arrays: InteractionTensors, action: bool, effect: bool, weight: flo
     )
 
 
+@study("push_test", checkpoints=LATENT_MODELS, settings=WEIGHTS)
 @torch.no_grad()
 def latent() -> Rows:
     """Alignment of the codes r of `push_test`, and the errors of what is decoded from them."""
@@ -160,13 +162,17 @@ def learn_rollability(
     return model.eval()
 
 
+ROLLING = ("mixed", "partial", "push_test", "drag", "reach")
+
+
+@study(*ROLLING)
 def rollability() -> Rows:
     """Accuracy of rollability: learned from 400 images of `mixed`, and by curvature."""
     mixed = open_interactions("mixed")
     split = split_interactions(mixed.sizes["interaction"])
     model = learn_rollability(mixed, split.train)
     rows = []
-    for name in ("mixed", "partial", "push_test", "drag", "reach"):
+    for name in ROLLING:
         data = open_interactions(name)
         chosen = split.test if name == "mixed" else np.arange(data.sizes["interaction"])
         images, rolls = data["image"].values[chosen], data["rollable"].values[chosen]
@@ -189,6 +195,7 @@ def rollability() -> Rows:
     return rows
 
 
+@study("mixed", "partial", settings=(TRAINING, FiLMConfig(), PUSH_START_MIN_RADIUS_M))
 def push_and_drag_model() -> Rows:
     """One model of pushes and drags decodes, from the wanted effect alone, which of them to use.
 

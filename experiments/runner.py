@@ -90,6 +90,20 @@ class Job:
         return {"arguments": self.arguments, "made_of": self.made_of(), "result": result}
 
 
+STUDIES: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {}
+"""Functions of rows by name, and what decides them; `experiments.studies` imports all."""
+
+
+def study(*data: str, **decides: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Make a study of the function below: the data that it reads, and more fields of its `Job`."""
+
+    def register(rows: Callable[..., Any]) -> Callable[..., Any]:
+        STUDIES[rows.__name__] = rows, {"data": data} | decides
+        return rows
+
+    return register
+
+
 def run(
     jobs: Sequence[Job],
     table: str,

@@ -33,7 +33,7 @@ from affordlib.models.film import FiLMConfig
 from affordlib.models.training import train
 from affordlib.primitives import Grasp
 from experiments.cross_validation import TASKS, add_errors, job, prediction_columns
-from experiments.runner import open_once, run
+from experiments.runner import open_once, run, study
 from experiments.shipped import CHECKPOINT_SPECS
 
 PRIMITIVES = ("push", "drag", "grasp", "rotate")
@@ -112,6 +112,10 @@ def train_shared(fold: int, resume_checkpoint: Path | None = None) -> EffectNetw
     return model
 
 
+_SEPARATE = [j.settings for jobs in SEPARATE_JOBS.values() for j in jobs]
+
+
+@study(*PRIMITIVES, "push_test", settings=(NETWORK, TRAINING, _SEPARATE))
 def shared_network(resume_checkpoint: Path) -> Rows:
     """Errors by primitive and effect; the separate networks are jobs of `cross_validation`."""
     tests: dict[tuple[str, str], list[pd.DataFrame]] = {}

@@ -106,8 +106,8 @@ class LSTMNetwork(HarmonicsNetwork):
     def roll(self, known: Known, static: Tensor, n: int) -> tuple[Tensor, Tensor]:
         """d and raw σ (B, n + 1, C) of n steps from the first observed one on.
 
-        What the gates get of the static inputs is computed once; a step that all have observed is
-        not predicted.
+        What the gates get of the static inputs is computed once; a step that is observed is not
+        predicted, whatever other rows have observed.
         """
         rows, last = torch.arange(len(static), device=static.device), self.config.steps
         h, c = self.begin(static).tanh().chunk(2, dim=-1)
@@ -130,11 +130,13 @@ class LSTMNetwork(HarmonicsNetwork):
             c = f.sigmoid() * c + i.sigmoid() * g.tanh()
             h = o.sigmoid() * c.tanh()
             after = (k + 1).clamp_max(last)
-            if bool(known.where[rows, after].all()):
-                predicted, raw = known.d[rows, after], certain
+            seen, to_come = known.where[rows, after][:, None], known.d[rows, after]
+            if bool(seen.all()):
+                predicted, raw = to_come, certain
             else:
                 bend, raw = self.last(h).chunk(2, dim=-1)
-                predicted = d + change + bend
+                predicted = torch.where(seen, to_come, d + change + bend)
+                raw = torch.where(seen, certain, raw)
             previous = d
             path.append(predicted)
             sigmas.append(raw)

@@ -12,17 +12,12 @@ from affordlib.models import load_checkpoint
 from affordlib.models.lever_up import (
     LEVER_MODELS,
     PROTOCOLS,
-    TRAINING,
     from_start_errors_m,
     window_errors_m,
 )
 from affordlib.paths import repo_root
-from affordlib.results import read_results
 from experiments import lever_up
 from experiments.lever_cross_validation import (
-    SETTINGS,
-    TUNED,
-    changed,
     edges_of,
     extrapolate,
     job,
@@ -76,12 +71,6 @@ def test_folds_test_every_object_at_most_once():
     split = lever_split(whole, edges_left_out=3)
     assert set(edges[split.test]) == {3}
     assert 3 not in edges[np.concatenate([split.train, split.validation])]
-
-
-def test_the_committed_tables_are_drawn_from_the_committed_results(tmp_path):
-    path = lever_up.write_tables(out_dir=tmp_path)
-    committed = read_results("data/results/lever_up.json")
-    assert read_results(path)["tables"] == committed["tables"]
 
 
 def test_a_job_gives_the_committed_errors_again(tmp_path):
@@ -146,17 +135,6 @@ def test_shapes_never_seen_stand_beside_the_same_shapes_when_they_are_known():
     assert (rows[0]["n"], rows[0]["mean_cm"]) == (2, pytest.approx(0.5))
     assert (rows[0]["known_n"], rows[0]["known_mean_cm"]) == (2, pytest.approx(0.55))
     assert {row["n"] for row in lever_up.error_rows([known, unseen])} == {3}  # the folds only
-
-
-def test_a_setting_changes_what_it_says():
-    for name, _ in TUNED:
-        ours = LEVER_MODELS[name]
-        first, *others = [changed(ours, setting) for setting in SETTINGS]
-        assert (first.network, first.training) == (ours.network, TRAINING)
-        assert changed(ours, "rate 0.001, half the width").network.width == ours.network.width // 2
-        assert changed(ours, "rate 0.004").training.learning_rate == 4e-3
-        assert all(a != b for k, a in enumerate(others) for b in [first, *others[:k]])
-        assert ours in others
 
 
 def test_the_shipped_network_stands_for_its_own_training_only():

@@ -9,7 +9,6 @@ import pytest
 from affordlib.evaluation.tasks import FROZEN, ROLLABLE, STANDING, PlanningTask, frozen_tasks
 from affordlib.planning import MODES
 from affordlib.primitives import Drag
-from affordlib.results import read_results
 from experiments import planning, shipped
 from experiments.planning import CONFIGS, attempt, planning_rows, tasks_sha256
 
@@ -127,10 +126,8 @@ def test_with_the_simulator_as_model_hardly_anything_remains(world, rollable):
     assert isinstance(outcome.plan.steps[0].primitive, Drag) == rollable
 
 
-def test_the_committed_tables_are_of_what_is_shipped(monkeypatch):
-    committed = read_results("data/results/planning.json")["tables"]
-    assert json.loads(json.dumps(planning.tables())) == committed
-    assert {row["planner"] for row in committed["planning"]} == set(CONFIGS)
+def test_another_version_of_a_planner_makes_its_results_stale(monkeypatch):
+    assert {row["planner"] for row in planning.tables()["planning"]} == set(CONFIGS)
     monkeypatch.setitem(planning.VERSIONS, planning.plan_astar, 99)
     with pytest.raises(ValueError, match=r"'astar\w*'} was made of another version"):
         planning.tables()

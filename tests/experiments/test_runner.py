@@ -5,7 +5,16 @@ from dataclasses import dataclass, replace
 import pytest
 from dask.distributed import Client
 
-from experiments import runner
+from affordlib.results import read_results, write_results
+from experiments import (
+    closed_loop,
+    effect_prediction,
+    headline,
+    lever_up,
+    planning,
+    real_pushes,
+    runner,
+)
 from experiments.runner import Job, frame, read, run
 
 CALLS = []
@@ -107,3 +116,24 @@ def test_workers_make_the_same_bytes(tmp_path):
         run(jobs[::-1], "table", client, tmp_path / "away", progress=False)
     here, away = (tmp_path / side / "table.jsonl.gz" for side in ("here", "away"))
     assert here.read_bytes() == away.read_bytes()
+
+
+def drawn(name, tables):
+    return lambda out_dir: write_results(out_dir, name, {}, tables())
+
+
+WRITE = {
+    "effect_prediction": effect_prediction.write_tables,
+    "lever_up": lever_up.write_tables,
+    "planning": planning.write_tables,
+    "closed_loop": closed_loop.write_tables,
+    "open_loop_pose_goals": closed_loop.write_open_loop,
+    "real_pushes": drawn("real_pushes", real_pushes.tables),
+    "headline": drawn("headline", lambda: {"main": headline.rows()}),
+}
+
+
+@pytest.mark.parametrize("name", WRITE)
+def test_the_committed_tables_are_drawn_from_the_committed_results(tmp_path, name):
+    made = read_results(WRITE[name](out_dir=tmp_path))
+    assert made["tables"] == read_results(f"data/results/{name}.json")["tables"]

@@ -178,19 +178,17 @@ def test_a_collector_killed_at_any_moment_is_no_loss(undisturbed, tmp_path, seed
 
 
 @pytest.mark.slow
-def test_nobody_outside_reaches_a_scheduler_or_its_workers():
-    with dask_client(2) as client:
-        client.wait_for_workers(2, timeout=60)
-        here = psutil.Process()
-        family = [here, *here.children(recursive=True)]
-        listening = [
-            connection.laddr.ip
-            for process in family
-            for connection in process.net_connections("inet")
-            if connection.status == psutil.CONN_LISTEN
-        ]
-        assert len(listening) >= 5  # the scheduler's, and at least two of each worker
-        assert set(listening) == {"127.0.0.1"}
+def test_nobody_outside_reaches_a_scheduler_or_its_workers(both):
+    here = psutil.Process()
+    family = [here, *here.children(recursive=True)]
+    listening = [
+        connection.laddr.ip
+        for process in family
+        for connection in process.net_connections("inet")
+        if connection.status == psutil.CONN_LISTEN
+    ]
+    assert len(listening) >= 5  # the scheduler's, and at least two of each worker
+    assert set(listening) == {"127.0.0.1"}
 
 
 @pytest.mark.slow
@@ -240,32 +238,16 @@ def test_make_data_is_ended_with_one_line(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def client(tmp_path_factory):
-    """A client of a scheduler and two workers that the `dask` command has started."""
-    from dask.distributed import Client
-
-    folder = tmp_path_factory.mktemp("dask")
-    file = folder / "scheduler.json"
-    worker = ["worker", "--scheduler-file", file, "--nthreads", 1, "--no-dashboard"]
-    worker += ["--local-directory", folder]
-    host = ["--host", "127.0.0.1", "--port", 0, "--no-dashboard"]
-    commands = [["scheduler", *host, "--scheduler-file", file], worker, worker]
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    processes = [start("-m", "dask", *command, **quiet) for command in commands]
-    try:
-        with Client(scheduler_file=str(file), timeout=60) as client:
-            yield client
-    finally:
-        for process in processes:
-            os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
+def cluster():
+    with dask_client(2) as client:
+        yield client
 
 
 @pytest.fixture
-def both(client):
-    """The client while both workers are there."""
-    client.wait_for_workers(2, timeout=60)
-    return client
+def both(cluster):
+    """A client while both workers of its scheduler are there."""
+    cluster.wait_for_workers(2, timeout=60)
+    return cluster
 
 
 @contextmanager

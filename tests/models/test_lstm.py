@@ -6,6 +6,7 @@ import torch
 
 from affordlib.interactions import InteractionTensors, Scaler
 from affordlib.interactions.lever_up import N_OBSERVED
+from affordlib.interactions.sampling import condition_on_poses
 from affordlib.models import build
 from affordlib.models.lever_up import from_start_errors_m, window_errors_m
 from affordlib.models.lstm import LSTMConfig, effects_at_steps
@@ -50,6 +51,20 @@ def test_its_recurrence_is_that_of_features_repeated_and_concatenated(levered, s
     out, _ = lstm(torch.cat([told, phase], dim=-1))
     expected = torch.nn.functional.mse_loss(model.next_pose(out), pose[:, 1:])
     torch.testing.assert_close(model.next_step_loss(levered, start, N_OBSERVED), expected)
+
+
+@torch.no_grad()
+def test_a_row_alone_is_predicted_as_beside_one_that_has_observed_less(levered, small_published):
+    model, two = small_published().eval(), levered.select(torch.arange(2))
+    seen = condition_on_poses(two, torch.tensor([3, 0]), N_OBSERVED)
+    seen.effect_mask[1, 1:] = False
+    t_target = torch.tensor([[0.4, 0.72, 1.0]]).expand(2, -1)
+    features = model.encode(two.image)
+    together = model.predict(features, seen, t_target).effect_mean
+    for row, n in ((0, N_OBSERVED), (1, 1)):
+        one = condition_on_poses(two.select(torch.tensor([row])), torch.tensor([3 - 3 * row]), n)
+        alone = model.predict(features[[row]], one, t_target[:1]).effect_mean
+        torch.testing.assert_close(together[[row]], alone, atol=1e-6, rtol=1e-5)
 
 
 def test_a_published_training_goes_on_where_it_was_broken_off(tmp_path, levered, small_published):

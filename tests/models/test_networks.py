@@ -1,6 +1,7 @@
 """What holds for every network and both frames: equivariance, gradients, ranges, loss."""
 
 import dataclasses
+import itertools
 import math
 
 import numpy as np
@@ -28,6 +29,7 @@ from affordlib.models.film import LastPoseConfig
 from affordlib.models.lstm import LSTMConfig
 from affordlib.models.protocol import condition_on_final_effect
 from affordlib.models.push_frame import push_direction
+from affordlib.models.training import batch_loss
 from affordlib.primitives import Drag, Push
 from affordlib.types import Observations
 from affordlib.world import Cuboid, UprightCylinder
@@ -43,6 +45,7 @@ CONFIGS = {
     "film, push": FiLMConfig(**YAW, **SMALL),
     "attention, push": AttentionConfig(**YAW, **SMALL),
     "last pose, table": LastPoseConfig(**YAW, **SMALL),
+    "lstm, push": LSTMConfig(**YAW, frame="push", width=16),
 }
 IN_PUSH_FRAME = [name for name in CONFIGS if name.endswith("push")]
 
@@ -62,9 +65,10 @@ def made(name, arrays):
 
 
 def batch_of(arrays, seed=0, n_targets=5):
-    """A batch of all kinds of contexts for all interactions."""
-    generator = torch.Generator().manual_seed(seed)
-    return sample_mixed(arrays, n_targets, 4, generator)
+    """A batch of all kinds of contexts for all interactions, at the paper's samples."""
+    every = {"phase": arrays.phase[::12], "action": arrays.action[:, ::12]}
+    arrays = dataclasses.replace(arrays, **every, effect=arrays.effect[:, ::12])
+    return sample_mixed(arrays, n_targets, 4, torch.Generator().manual_seed(seed))
 
 
 def predictions(network, batch, observations=None):
@@ -102,6 +106,47 @@ def test_order_and_what_is_masked_have_no_effect(network, some, tmp_path):
     )
     for a, b in zip(predicted, predictions(network, batch, shuffled), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5)
+
+
+def row_of(observations, row):
+    """What one row has observed; of what is not, one value under its mask."""
+    one = {f.name: getattr(observations, f.name)[[row]] for f in dataclasses.fields(observations)}
+    for kind in ("action", "effect"):
+        seen = one[f"{kind}_mask"][0]
+        seen = seen | ~seen.any() & (torch.arange(len(seen)) == 0)
+        one |= {f"{kind}{part}": one[f"{kind}{part}"][:, seen] for part in ("", "_t", "_mask")}
+    return Observations(**one)
+
+
+@torch.no_grad()
+def test_a_row_alone_is_predicted_as_in_a_batch(network, some):
+    batch = batch_of(some)
+    together = predictions(network, batch)
+    for row in range(len(some)):
+        part = {"image": batch.image[[row]], "t_target": batch.t_target[[row]]}
+        one = dataclasses.replace(batch, observations=row_of(batch.observations, row), **part)
+        for a, b in zip(together, predictions(network, one), strict=True):
+            torch.testing.assert_close(a[[row]], b, atol=4e-5, rtol=1e-4)  # 8e-6
+
+
+def test_the_literal_loop_and_the_batch_agree(network, some):
+    """On the same draw: the mean over single targets has the loss and gradients of the batch."""
+    batch = batch_of(some.select(torch.arange(6)), n_targets=3)
+    batch_loss(network, batch).backward()
+    together = [p.grad.clone() for p in network.parameters() if p.grad is not None]
+    network.zero_grad()
+    losses = []
+    for b, j in itertools.product(range(6), range(3)):
+        names = ("t_target", "action", "effect")
+        target = {name: getattr(batch, name)[[b], j : j + 1] for name in names}
+        seen = row_of(batch.observations, b)
+        one = dataclasses.replace(batch, image=batch.image[[b]], observations=seen, **target)
+        losses.append(batch_loss(network, one) / 18)
+        losses[-1].backward()
+    apart = [p.grad for p in network.parameters() if p.grad is not None]
+    torch.testing.assert_close(sum(losses), batch_loss(network, batch), rtol=1e-5, atol=0)
+    for a, b in zip(together, apart, strict=True):
+        assert (a - b).norm() <= 1e-4 * a.norm() + 1e-5
 
 
 @torch.no_grad()

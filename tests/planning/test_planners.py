@@ -238,6 +238,16 @@ def test_the_gradient_planner_finds_direction_and_phase(goal_xy, seed):
     assert heading == pytest.approx(math.atan2(goal_xy[1], goal_xy[0]), abs=0.02)
 
 
+@pytest.mark.slow
+def test_finer_samples_stop_nearer():
+    errors = []
+    for samples in (25, 100, 300):
+        goals = [(r * math.cos(r * 99), r * math.sin(r * 99)) for r in np.linspace(0.03, 0.08, 8)]
+        plans = [plan_gradient(known(xy), samples=samples) for xy in goals]
+        errors.append(np.mean([plan.predicted_distance_m for plan in plans]))
+    assert errors[0] > 2 * errors[1] > 4 * errors[2]
+
+
 def test_modes_bind_the_gradient_planner():
     partial, again = (plan_gradient(known((0.04, 0.0), "single_partial")) for _ in range(2))
     expected = STARTS + (1 - STARTS) * math.sqrt(0.04 / REACH_M)
