@@ -17,14 +17,14 @@ _NUMBER = Annotated[Real, _NO_BOOL]
 _NO_TEXT = Is[lambda value: not isinstance(value, str)]
 _NUMBERS = Annotated[Sequence[_NUMBER], _NO_TEXT] | np.ndarray
 _CHECKED = """
-types geometry primitives perception plan_files results world.objects
+types geometry primitives perception results world.objects
 world.tabletop planning.astar planning.closed_loop planning.continuous planning.disturbances
 planning.effect_map planning.gradient planning.grasp_rotate
 planning.problem planning.reachability planning.skills interactions.dataset
 interactions.sampling interactions.collect interactions.import_log interactions.lever_up
 interactions.log interactions.recipes interactions.store models.calibration models.checkpoint
 models.domain models.fit models.lever_up models.protocol models.training evaluation.metrics
-evaluation.cross_validate planning.push_at show.animation show.executors show.explorers
+evaluation.cross_validate planning.push_at show.executors show.explorers
 show.goal_picker show.plots
 """
 _CONF = BeartypeConf(

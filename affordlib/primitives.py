@@ -4,13 +4,11 @@ A primitive is a chain of segments, each with minimum-jerk timing: the commanded
 over the phase t in [0, 1], relative to where the object stood at the start.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -155,7 +153,7 @@ class _Move(Primitive):
     ahead_rad: ClassVar[float] = 0.0
 
     @classmethod
-    def towards(cls, direction_rad: float, **kwargs: float) -> _Move:
+    def towards(cls, direction_rad: float, **kwargs: float) -> Self:
         """The action that moves an object towards the given direction [rad]."""
         return cls(check_finite("direction_rad", direction_rad) + cls.ahead_rad, **kwargs)
 
@@ -353,7 +351,7 @@ class LeverUp(Primitive):
     lengths_m: ClassVar = {"contact_x": (-0.2, 0.2), "contact_y": (-0.2, 0.2), "reach": (0.05, 0.4)}
 
     @classmethod
-    def at_edge(cls, outline_m: np.ndarray, edge: int, share: float = 0.5) -> LeverUp:
+    def at_edge(cls, outline_m: np.ndarray, edge: int, share: float = 0.5) -> Self:
         """The lever-up from a point on an edge of an outline (n, 2) [m], counter-clockwise.
 
         share: how far along it. The object turns about the edge that needs the least force, weight

@@ -9,6 +9,9 @@ A notebook writes `<out_dir>/<notebook>.json`, which is
 
 and `python -m affordlib.results README.md` fills it; `--check` fails if that would change it.
 Any other option, such as `mode=multi_partial`, keeps the rows that have that value.
+
+Plans, with their goals, are JSON files too, that can be kept, sent, and executed later. Numbers
+come back to the last bit; a σ that the planner did not give is null in the file.
 """
 
 import argparse
@@ -21,6 +24,7 @@ import platform
 import re
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +34,8 @@ import psutil
 import affordlib
 from affordlib.commands import command
 from affordlib.paths import from_root, resolve_out_dir
+from affordlib.primitives import Primitive, primitive_named
+from affordlib.types import Goal, Plan, Step
 
 # unit in the column's name: (unit shown, factor, digits); lengths are stored in metres
 UNITS = {
@@ -42,7 +48,7 @@ UNITS = {
     "rad": ("°", 180 / math.pi, 1),
     "deg": ("°", 1.0, 1),
 }
-_MARK = b'{\n "notebook"'
+_MARK, _PLAN_MARK = b'{\n "notebook"', b'{\n "goal"'
 _STATISTIC = "_(?:mean|median|sem|std|min|max|p5|p95)"
 _WITH_UNIT = re.compile(f"(.+?)_({'|'.join(UNITS)})((?:{_STATISTIC})*)")
 MARKUP = str.maketrans({"&": "&amp;", "<": "&lt;", ">": "&gt;", "[": "&#91;", "|": "\\|"})
@@ -170,6 +176,57 @@ def write_atomically(path: Path, content: bytes | str, mark: bytes = b"") -> Non
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+def save_plan(path: str | os.PathLike[str], plan: Plan) -> Path:
+    """Write a plan and its goal to a JSON file and return its path."""
+    path = Path(path)
+    text = json.dumps(plan, default=_as_data, indent=1, allow_nan=False)
+    write_atomically(path, text + "\n", _PLAN_MARK)
+    return path
+
+
+def load_plan(path: str | os.PathLike[str]) -> Plan:
+    """Return the plan that `save_plan` wrote.
+
+    Raises FileNotFoundError, or ValueError naming the file and what is wrong in it.
+    """
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"there is no plan {path}")
+    try:
+        data = json.loads(Path(path).read_text(encoding="utf-8"))
+        return Plan(**data | {"goal": Goal(**data["goal"]), "steps": _steps(data["steps"])})
+    except Exception as error:
+        what = f"{error.args[0]!r} is missing" if isinstance(error, KeyError) else str(error)
+        raise ValueError(f"path: {path} holds no plan: {what}") from None
+
+
+def _as_data(value: Any) -> Any:
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    data = {field.name: getattr(value, field.name) for field in fields(value)}
+    if isinstance(value, Primitive):
+        return {"name": value.name} | data
+    if isinstance(value, Step) and math.isnan(value.std_m):
+        data["std_m"] = None
+    return data
+
+
+def _steps(steps: list[dict[str, Any]]) -> tuple[Step, ...]:
+    return tuple(_step(**step) for step in steps)
+
+
+def _step(**data: Any) -> Step:
+    arguments = dict(data["primitive"])
+    data["primitive"] = primitive_named(arguments.pop("name"))(**arguments)
+    data["predicted_end_xy_m"] = tuple(data["predicted_end_xy_m"])
+    data["std_m"] = math.nan if data["std_m"] is None else float(data["std_m"])
+    for name in ("predicted_path_xy_m", "path_xy_m"):
+        if data[name] is not None:
+            data[name] = np.array(data[name], dtype=float)
+            if data[name].ndim != 2:
+                raise ValueError(f"{name} must be points (n, 2), got {data[name].shape}")
+    return Step(**data)
 
 
 def results_table(

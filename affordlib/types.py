@@ -11,14 +11,9 @@ import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from numbers import Integral, Real
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-
-if TYPE_CHECKING:
-    import torch
-
-    import affordlib.primitives
 
 ACTION_CHANNELS = ("x", "y", "z", "yaw", "gripper")
 EFFECT_CHANNELS = ("x", "y", "z", "yaw", "tilt")

@@ -222,10 +222,10 @@ def cleaned(notebook: nbformat.NotebookNode) -> str:
     for cell, below in zip(cells, cells[1:] + cells[-1:], strict=True):
         caption = re.match(r"\*\*Figure .*?\*\* (.*)", below.source)
         for output in cell.get("outputs", []):
-            if "image/png" in output.get("data", ()):
+            for kind in {"image/png", "image/svg+xml"} & output.get("data", {}).keys():
                 output.data.pop(WIDGET, None)
                 if caption:
-                    output.metadata.setdefault("image/png", {})["alt"] = caption[1]
+                    output.metadata.setdefault(kind, {})["alt"] = caption[1]
         cell.metadata = {k: cell.metadata[k] for k in ("tags", "jupyter") if cell.metadata.get(k)}
     kernel = {"display_name": "Python 3", "language": "python", "name": "python3"}
     metadata = {"kernelspec": kernel, "language_info": {"name": "python"}}

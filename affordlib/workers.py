@@ -1,20 +1,14 @@
 """Processes that share work: those of a Dask scheduler, or some of this machine."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from dask.distributed import Client
 
 _LOOPBACK = {"host": "127.0.0.1", "dashboard": False, "dashboard_address": "127.0.0.1:0"}
 
 
 @contextmanager
-def dask_client(workers: int = 1, scheduler: str | None = None) -> Iterator[Client | None]:
+def dask_client(workers: int = 1, scheduler: str | None = None) -> "Iterator[Client | None]":
     """A client of the scheduler at an address, or else of `workers` new processes of this machine.
 
     None for one worker, which is this process. The new processes listen on this machine only.

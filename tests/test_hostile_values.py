@@ -23,9 +23,8 @@ from affordlib.interactions.recipes import Recipe, Variation
 from affordlib.models.fit import EFFORT
 from affordlib.paths import repo_root
 from affordlib.perception import crop_from_depth
-from affordlib.plan_files import load_plan, save_plan
 from affordlib.primitives import Drag, Grasp, LeverUp, Push, PushAt, Rotate, primitive_named
-from affordlib.results import read_results, results_table, write_results
+from affordlib.results import load_plan, read_results, results_table, save_plan, write_results
 from affordlib.types import Goal, Outcome, Plan, Step, UnreachableError
 from exercises import check
 

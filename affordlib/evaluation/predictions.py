@@ -8,8 +8,7 @@ import torch
 from affordlib.geometry import xy_columns
 from affordlib.interactions import InteractionTensors
 from affordlib.interactions.dataset import valid_interactions
-from affordlib.interactions.sampling import condition_on_recorded_action
-from affordlib.models.calibration import calibration_row
+from affordlib.models.calibration import calibration_row, effects_at
 from affordlib.models.protocol import EffectModel
 
 EVERY = 12
@@ -24,7 +23,6 @@ def steps_of(arrays: InteractionTensors) -> torch.Tensor:
     return torch.arange(EVERY, len(arrays.phase), EVERY)
 
 
-@torch.no_grad()
 def network_predictions(
     model: EffectModel, data: "xarray.Dataset", interactions: np.ndarray
 ) -> dict[str, Any]:
@@ -33,9 +31,8 @@ def network_predictions(
     arrays = InteractionTensors.from_dataset(
         data, kept, model.action_channels, model.effect_channels
     )
-    t = arrays.phases(steps_of(arrays))
-    prediction = model.predict(model.encode(arrays.image), condition_on_recorded_action(arrays), t)
-    return prediction_record(data, kept, arrays, prediction.effect_mean, prediction.effect_std)
+    phases = (steps_of(arrays) / (len(arrays.phase) - 1)).tolist()
+    return prediction_record(data, kept, arrays, *effects_at(model, arrays, phases)[1:])
 
 
 def about_objects(data: "xarray.Dataset", kept: np.ndarray) -> dict[str, Any]:

@@ -6,13 +6,11 @@ over the area in reach; both off the 10° grid of A*. Those of the tables are fr
 `python -m experiments.shipped goals` wrote.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, astuple, dataclass, field
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -67,7 +65,7 @@ class PlanningTask:
         return plain if self.config == WorldConfig() else plain | {"world": asdict(self.config)}
 
     @classmethod
-    def from_json(cls, plain: dict[str, Any]) -> PlanningTask:
+    def from_json(cls, plain: dict[str, Any]) -> Self:
         """The task that `to_json` wrote."""
         obj = category_named(plain["object_class"])(*plain["size_m"])
         goal = Goal(tuple(plain["goal_xy_m"]))

@@ -7,8 +7,6 @@ all are there; a rerun makes only what is missing. The finished set is the same 
 collected it, in whatever order.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import threading
@@ -18,7 +16,6 @@ from dataclasses import fields
 from functools import partial
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
@@ -44,9 +41,6 @@ from affordlib.workers import dask_client
 from affordlib.world import CATEGORIES, Tabletop, TabletopObject, WorldConfig
 from affordlib.world.execution import RECORDED_SAMPLES
 from affordlib.world.trajectory import N_SAMPLES
-
-if TYPE_CHECKING:
-    import dask.distributed
 
 CHUNK = 50
 """Interactions that are made, sent and kept together."""
@@ -99,7 +93,7 @@ _PHASE = {
 def collect(
     recipe: Recipe,
     path: str | Path,
-    client: dask.distributed.Client | None = None,
+    client: "dask.distributed.Client | None" = None,
     workers: int = 1,
     progress: bool = True,
     replace: bool = False,
@@ -160,7 +154,7 @@ def _collected(
     recipe: Recipe,
     attrs: dict[str, str],
     parts: Path,
-    client: dask.distributed.Client | None,
+    client: "dask.distributed.Client | None",
     progress: bool,
 ) -> xr.Dataset:
     """The whole set; chunks that are missing among the parts are made."""
@@ -192,7 +186,7 @@ def _make(recipe: Recipe, attrs: dict[str, str], rows: range) -> xr.Dataset:
 
 
 def _made(
-    make: partial, missing: list[range], client: dask.distributed.Client | None
+    make: partial, missing: list[range], client: "dask.distributed.Client | None"
 ) -> Iterator[tuple[range, xr.Dataset]]:
     """Yield the rows and the data of each chunk as it is made, here or by the client's workers."""
     futures = {}

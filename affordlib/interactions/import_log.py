@@ -12,8 +12,6 @@ images/NAME_mask.png the object, 8 bits, white where it fills the pixel; where t
 Likewise the lever-ups of Seker, Tekden and Ugur (2019): see `read_trajectories`.
 """
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 

@@ -1,10 +1,9 @@
 """A recipe says how a data set is made; interaction i is a pure function of (recipe, i)."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import asdict, dataclass, field, replace
+from typing import Self
 
 import numpy as np
 
@@ -105,7 +104,7 @@ class Recipe:
         return json.dumps(fields, sort_keys=True)
 
     @classmethod
-    def from_json(cls, text: str) -> Recipe:
+    def from_json(cls, text: str) -> Self:
         """The recipe that `to_json` wrote."""
         fields = json.loads(text)
         fields["categories"] = fields.pop("families")

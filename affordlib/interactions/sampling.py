@@ -5,9 +5,8 @@ trajectory. A sampler takes the interactions of a batch, n_targets, obs_max and 
 returns a `Batch`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
+from typing import Self
 
 import torch
 
@@ -28,7 +27,7 @@ class Batch:
     @classmethod
     def of(
         cls, tensors: InteractionTensors, observations: Observations, target_at: torch.Tensor
-    ) -> Batch:
+    ) -> Self:
         """A batch of whole tensors whose targets are the samples with numbers (B, T), or (T,)."""
         t_target, action = tensors.action_at(target_at)
         effect = tensors.effect_at(target_at)[1]

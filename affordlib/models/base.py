@@ -108,14 +108,18 @@ class EffectNetwork(nn.Module, ABC):
     ) -> tuple[Float[Tensor, "b t _"], ...]:
         """(μ_a, σ_a, μ_e, σ_e), each (B, T, C), standardised, in the network's frame."""
 
-    def represent(self, observations: Observations) -> Float[Tensor, "b w"]:
+    def represent(
+        self, observations: Observations, effects: Tensor | None = None
+    ) -> Float[Tensor, "b w"]:
         """r: (B, W), equations (2) and (3), the means taken over what is observed.
 
-        Of networks with an `action_encoder` and an `effect_encoder`.
+        Of networks with an `action_encoder` and an `effect_encoder`; effects: what the latter gets,
+        by default the standardised effects with their phases.
         """
         o = observations
         actions = with_time(o.action / self.action_scale, o.action_t)
-        effects = with_time(o.effect / self.effect_scale, o.effect_t)
+        if effects is None:
+            effects = with_time(o.effect / self.effect_scale, o.effect_t)
         r_a = mean_code(self.action_encoder, actions, o.action_mask)
         r_e = mean_code(self.effect_encoder, effects, o.effect_mask)
         w_1 = o.weight[:, None]

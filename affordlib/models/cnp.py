@@ -10,8 +10,6 @@ Since both sums are linear, r = w₁ mean(h_a) + w₂ mean(h_e): actions and eff
 different times and in different numbers.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -77,7 +75,7 @@ class AffordanceCNP(EffectNetwork):
         self._folds: dict[nn.Linear, tuple] = {}
         self.apply(he_initialise)
 
-    def train(self, mode: bool = True) -> AffordanceCNP:
+    def train(self, mode: bool = True) -> "AffordanceCNP":
         """As of torch; folded weights are dropped: fused optimisers do not raise their version."""
         self._folds.clear()
         return super().train(mode)

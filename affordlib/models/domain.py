@@ -1,9 +1,8 @@
 """The domain of a trained model: images, actions and effects of which it has learned something."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import dataclass
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -43,7 +42,7 @@ class TrainingDomain:
                 check_pair(name, getattr(self, name), "(low, high)")
 
     @classmethod
-    def fit(cls, tensors: InteractionTensors) -> TrainingDomain:
+    def fit(cls, tensors: InteractionTensors) -> Self:
         """The ranges of training data."""
         start = end = moved = None
         if plane := xy_columns(tensors.action_channels):

@@ -30,7 +30,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from affordlib import checked
-from affordlib.models.base import masked_mean, with_time
+from affordlib.models.base import with_time
 from affordlib.models.harmonics import HarmonicsConfig, HarmonicsNetwork, dense, waves
 from affordlib.types import Observations
 
@@ -181,13 +181,8 @@ class LastPoseCNP(FiLMNetwork):
         o = observations
         d = o.effect / self.effect_scale - self.mean_trajectory(o.effect_t)
         d_last, t_last, velocity = _last(d, o.effect_t, o.effect_mask)
-        h_a = self.action_encoder(with_time(o.action / self.action_scale, o.action_t))
-        since = o.effect_t - t_last
-        h_e = self.effect_encoder(
-            torch.cat([d - d_last[:, None], since[..., None], o.effect_t[..., None]], dim=-1)
-        )
-        w_1 = o.weight[:, None]
-        r = w_1 * masked_mean(h_a, o.action_mask) + (1 - w_1) * masked_mean(h_e, o.effect_mask)
+        since = with_time(d - d_last[:, None], o.effect_t - t_last)
+        r = self.represent(o, with_time(since, o.effect_t))
         seen = o.effect_mask.any(dim=1, keepdim=True).to(r.dtype)
         image = features.expand(len(r), -1)
         known = torch.cat([r, image, d_last, velocity, t_last, seen], dim=1)

@@ -7,18 +7,15 @@ import numpy as np
 import torch
 
 from affordlib.primitives import Primitive
-from affordlib.types import ACTION_CHANNELS, Observations, Prediction
+from affordlib.types import ACTION_CHANNELS, HasChannels, Observations, Prediction
 
 
 @runtime_checkable
-class EffectModel(Protocol):
+class EffectModel(HasChannels, Protocol):
     """A model of what actions do; everything in and out is in metres, radians and phase.
 
     Both methods are differentiable in their inputs.
     """
-
-    action_channels: tuple[str, ...]
-    effect_channels: tuple[str, ...]
 
     def encode(self, image: torch.Tensor) -> torch.Tensor:
         """Features (B, F) of images (B, 2, 48, 48)."""

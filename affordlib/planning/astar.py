@@ -6,8 +6,6 @@ first node within the tolerance (2 cm in the paper). A push turns the object as 
 are looked up relative to the yaw that the model predicts; they are kept by degrees and used again.
 """
 
-from __future__ import annotations
-
 import heapq
 import itertools
 import math

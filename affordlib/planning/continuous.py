@@ -11,8 +11,6 @@ action of each looked up in the map; the best descend the gradient, and the one 
 corrected against the model itself until its predicted end is the goal.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable

@@ -7,8 +7,6 @@ action can touch an object: nothing has happened there. When the object turns, t
 with it, so one map serves every step of a plan and every node of a search.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cached_property

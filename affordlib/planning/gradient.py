@@ -10,8 +10,6 @@ The decoded action trajectory is what the robot executes; `snap` replaces it by 
 direction.
 """
 
-from __future__ import annotations
-
 import math
 import time
 import warnings

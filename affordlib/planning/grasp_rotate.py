@@ -12,8 +12,6 @@ after the actions that bring the object to its position. One image serves all of
 object that a push has rotated is, in the frame of the image taken before, a hand rotated back.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -56,12 +54,6 @@ class PredictedTrajectories:
     phase: np.ndarray
     mean: np.ndarray
     std: np.ndarray
-
-    def without(self, k: int) -> PredictedTrajectories:
-        """The same but for gripper yaw number k."""
-        yaws = self.gripper_yaws_rad[:k] + self.gripper_yaws_rad[k + 1 :]
-        mean, std = np.delete(self.mean, k, axis=0), np.delete(self.std, k, axis=0)
-        return PredictedTrajectories(yaws, self.phase, mean, std)
 
 
 @torch.no_grad()
@@ -119,25 +111,26 @@ def candidate_turns(
     place, phase = check_pair("xy_m", xy_m), predicted.phase
     closed, opening = Rotate().segment_phases[2], Rotate().segment_phases[-2]
     held = (phase >= closed) & (phase <= opening)
-    while predicted.gripper_yaws_rad:
-        stops = [
-            (float(np.interp(stop, phase, std)), k, float(stop))
-            for k, (mean, std) in enumerate(zip(predicted.mean, predicted.std, strict=True))
-            for around in (0.0, 2 * math.pi)
-            for stop in crossings(phase[held], mean[held], wanted + around)
-        ]
-        if stops:
-            _, k, stop = min(stops)
+    stops = [
+        (float(np.interp(stop, phase, std)), k, float(stop))
+        for k, (mean, std) in enumerate(zip(predicted.mean, predicted.std, strict=True))
+        for around in (0.0, 2 * math.pi)
+        for stop in crossings(phase[held], mean[held], wanted + around)
+    ]
+    left = list(range(len(predicted.mean)))
+    while left:
+        if first := min((one for one in stops if one[1] in left), default=None):
+            _, k, stop = first
         else:
-            end = predicted.mean[:, -1]
+            end = predicted.mean[left, -1]
             if end.max() < math.radians(1):
                 return
             enough = end >= min(FULL_ROTATION_SHARE * Rotate.sweep_rad, end.max())
-            k, stop = int(np.where(enough, predicted.std[:, -1], np.inf).argmin()), 1.0
+            k, stop = left[np.where(enough, predicted.std[left, -1], np.inf).argmin()], 1.0
         turned = float(np.interp(stop, phase, predicted.mean[k]))
         primitive = Rotate(predicted.gripper_yaws_rad[k])
         yield _step_at(place, primitive, stop, predicted_turn_rad=turned)
-        predicted = predicted.without(k)
+        left.remove(k)
 
 
 def candidate_lifts(
@@ -150,8 +143,8 @@ def candidate_lifts(
     """
     height = check_within("height_m", height_m, 0.0, 0.5, "m")
     place, phase = check_pair("xy_m", xy_m), predicted.phase
-    while predicted.gripper_yaws_rad:
-        k = int((predicted.mean - predicted.std)[:, -1].round(2).argmax())
+    surely = (predicted.mean - predicted.std)[:, -1].round(2)
+    for k in np.argsort(-surely, kind="stable"):
         mean, std = predicted.mean[k], predicted.std[k]
         primitive = Grasp(grip_yaw=predicted.gripper_yaws_rad[k])
         closed = phase >= primitive.segment_phases[-2]
@@ -163,7 +156,6 @@ def candidate_lifts(
         if not len(stops):
             return
         yield _step_at(place, primitive, float(stops[0]), predicted_height_m=height)
-        predicted = predicted.without(k)
 
 
 def _step_at(

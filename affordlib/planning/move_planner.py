@@ -1,7 +1,5 @@
 """Plans of moves that the arm can follow: the learned model proposes, the kinematics vetoes."""
 
-from __future__ import annotations
-
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable

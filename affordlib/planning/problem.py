@@ -1,7 +1,5 @@
 """What every planner solves, and the three settings of Table 3."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass

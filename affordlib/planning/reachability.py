@@ -4,10 +4,9 @@ A small network answers for a primitive, a place on the table and a direction. I
 recorded interactions alone; the kinematics stays unknown.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 import torch
@@ -41,7 +40,7 @@ class Reachability(nn.Module):
         )
 
     @classmethod
-    def load(cls, path: str | Path | None = None) -> Reachability:
+    def load(cls, path: str | Path | None = None) -> Self:
         """What was learned and saved; default: the shipped one, of the set `reach`.
 
         Raises FileNotFoundError, or ValueError when the file is damaged or of another network.
@@ -92,7 +91,7 @@ def _features(kind: np.ndarray, xy_m: np.ndarray, direction_rad: np.ndarray) -> 
     return torch.from_numpy(np.hstack([2 * xy_m, ahead, kind])).float()
 
 
-def learn_reachability(data: xarray.Dataset, seed: int = 0) -> Reachability:
+def learn_reachability(data: "xarray.Dataset", seed: int = 0) -> Reachability:
     """Train on a set of interactions with objects all over the table; seconds on one core.
 
     The arm stands on the table's x axis, so every interaction is seen mirrored as well.

@@ -1,7 +1,5 @@
 """Chains of actions on an effect map: where they lead, with σ, and as steps of a plan."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

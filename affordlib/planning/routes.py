@@ -5,11 +5,10 @@ and by which route, is a question of where the arm can act; Dijkstra's algorithm
 answers it for all places at once. The fine planner then goes from waypoint to waypoint.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -47,7 +46,7 @@ class RouteMap:
     length_m: np.ndarray
 
     @classmethod
-    def of(cls, reach_m: float, feasible: Feasible) -> RouteMap:
+    def of(cls, reach_m: float, feasible: Feasible) -> Self:
         """The map of an arm that can carry out some actions."""
         n, shape = math.floor(reach_m / CELL_M), np.array([len(_X_M), len(_Y_M)])
         moves = np.mgrid[-n : n + 1, -n : n + 1].reshape(2, -1).T

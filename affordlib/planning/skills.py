@@ -1,11 +1,9 @@
 """What the robot can do: a model for each primitive, and where its arm can act."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -51,7 +49,7 @@ class Skills:
         check_field(self, "threshold", 0.0, 1.0)
 
     @classmethod
-    def load(cls) -> Skills:
+    def load(cls) -> Self:
         """The shipped models, and reachability as it was learned from the shipped interactions."""
         models = {primitive: load_checkpoint(name)[0] for primitive, name in CHECKPOINTS.items()}
         return cls(models, Reachability.load())
@@ -86,7 +84,7 @@ class Skills:
 
     def planner(
         self, plan: Callable[..., Plan], mode: str | PlanMode = "multi_partial", **settings: Any
-    ) -> SkillPlanner:
+    ) -> "SkillPlanner":
         """A planner with settings, such as `plan_astar`, as (image, start_xy_m, goal) → Plan."""
         return SkillPlanner(self, partial(plan, **settings), mode)
 

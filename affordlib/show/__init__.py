@@ -1,6 +1,5 @@
 """Pictures for people: figures, animations, and widgets to try things by hand."""
 
-from affordlib.show.animation import FrameRecorder, show_animation
 from affordlib.show.executors import closed_loop, open_loop
 from affordlib.show.explorers import ConditioningExplorer, PhaseSlider
 from affordlib.show.goal_picker import GoalPicker
@@ -9,6 +8,7 @@ from affordlib.show.plots import (
     NEUTRAL,
     PREDICTION,
     TRUTH,
+    FrameRecorder,
     outline_in_lever_frame,
     plot_closed_loop,
     plot_depth,
@@ -18,4 +18,5 @@ from affordlib.show.plots import (
     plot_plan,
     plot_table,
     save_figure,
+    show_animation,
 )

@@ -1,7 +1,5 @@
 """Drawings of what flows where: boxes and arrows."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 from matplotlib.axes import Axes

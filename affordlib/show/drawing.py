@@ -49,15 +49,16 @@ class Drawing(anywidget.AnyWidget):
 class WithPicture:
     """Before a class of ipywidgets: a saved notebook shows its picture where there is no kernel."""
 
-    def picture(self) -> bytes:
-        """What is shown, as a PNG; empty where there is nothing yet."""
+    def picture(self) -> bytes | str:
+        """What is shown, as a PNG (bytes) or SVG (text); empty where there is nothing yet."""
         raise NotImplementedError
 
     def _repr_mimebundle_(self, **kwargs: object) -> dict[str, object]:
         bundle = super()._repr_mimebundle_(**kwargs) | {"text/plain": type(self).__name__}
-        if picture := self.picture():
-            bundle["image/png"] = base64.b64encode(picture).decode()
-        return bundle
+        picture = self.picture()
+        if isinstance(picture, str):
+            return bundle | {"image/svg+xml": picture}
+        return bundle | ({"image/png": base64.b64encode(picture).decode()} if picture else {})
 
 
 class FigureWidget(WithPicture, widgets.VBox):

@@ -20,10 +20,9 @@ import numpy as np
 
 from affordlib.geometry import unit_vector, wrap_angle
 from affordlib.paths import resolve_out_dir
-from affordlib.plan_files import load_plan, save_plan
+from affordlib.results import load_plan, save_plan
 from affordlib.show.drawing import Drawing, WithPicture
 from affordlib.show.executors import Executor, Planner, Stopped, measured, open_loop
-from affordlib.show.plots import table_picture
 from affordlib.show.table_view import (
     HALF_WIDTH_M,
     LIMIT_M,
@@ -170,9 +169,15 @@ class GoalPicker(WithPicture, widgets.VBox):
             self._stale = False
             self._show()
 
-    def picture(self) -> bytes:
-        """What is shown, as a PNG."""
-        return table_picture(self.world.obj, self._pose, self.plan, self.outcome, HALF_WIDTH_M)
+    def picture(self) -> str:
+        """What is shown, as an SVG."""
+        scene = self._view.scene
+        return (
+            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="{scene["box"]}" width="480" '
+            'role="img" aria-label="The table from above, with goal and plan" '
+            f'style="background: white; font-family: sans-serif"><style>{Drawing._css}</style>'
+            f'<g class="affordlib-table">{scene["inside"]}</g></svg>'
+        )
 
     # What the page asks for
 
@@ -426,7 +431,7 @@ class GoalPicker(WithPicture, widgets.VBox):
             draw_object(obj, self._pose),
             draw_plan(obj, self.plan.steps if self.plan else (), self._plan_pose),
             *(draw_path(path, "truth") for path in self._paths),
-            '<polyline class="trail"/><g data-handle="goal">',
+            f'<polyline class="trail"/><g data-handle="goal" transform="translate({x} {y})">',
             draw_goal(obj, self.goal, self._turn_from),
             f'</g><text class="busy" y="{40 - edge}">{"planning …" * planning}</text>',
         ]

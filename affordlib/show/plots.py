@@ -1,6 +1,7 @@
 """Figures of one look: fixed, colour-blind-safe colours for goal, prediction and truth.
 
-Every function draws into the `ax` that it is given and returns it. Positions are in centimetres.
+What plots draws into the `ax` that it is given and returns it. Positions are in centimetres. Small
+animations of the robot at work are recorded frames, encoded as a GIF or PNG by Pillow.
 """
 
 import io
@@ -11,8 +12,10 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+from IPython.display import Image as NotebookImage
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from PIL import Image
 from torch import Tensor
 
 from affordlib.geometry import rotated
@@ -30,11 +33,12 @@ from affordlib.types import (
     Plan,
     Step,
     check_array,
+    check_count,
     check_finite,
     check_pair,
     check_within,
 )
-from affordlib.world import TabletopObject
+from affordlib.world import Tabletop, TabletopObject
 
 GOAL, PREDICTION, TRUTH, NEUTRAL = "#0072B2", "#D55E00", "#009E73", "#777777"
 
@@ -225,33 +229,6 @@ def plot_depth(ax: Axes, image: np.ndarray, title: str = "") -> Axes:
     return ax
 
 
-def table_picture(
-    obj: TabletopObject,
-    pose: Sequence[float],
-    plan: Plan | None,
-    outcome: Outcome | None,
-    half_width_m: float,
-) -> bytes:
-    """The table from above as a PNG: the object at (x, y, yaw), and the outcome, else the plan."""
-    shown = [pose[:2]]
-    if (made := outcome.plan if outcome else plan) is not None:
-        ends = [step.predicted_end_xy_m for step in made.steps]
-        shown += [made.start_xy_m, made.goal.xy_m, *ends]
-    low, high = np.min(shown, axis=0), np.max(shown, axis=0)
-    half = min(half_width_m, max(high - low) / 2 + 0.11)
-    figure = Figure(figsize=(5, 5), layout="constrained")  # outside pyplot: nothing to close
-    ax = plot_table(figure.add_subplot(), (low + high) / 2, half)
-    if outcome is not None:
-        plot_outcome(ax, outcome)
-    elif plan is not None:
-        plot_plan(ax, plan, obj=obj, yaw_rad=pose[2])
-    plot_footprint(ax, obj, pose[:2], pose[2], label="object")
-    ax.legend(loc="upper left")
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=90)
-    return buffer.getvalue()
-
-
 _ALONG, _UP = 0.45, 0.3
 
 
@@ -293,3 +270,84 @@ def plot_levered(
     ax.plot(*np.stack(faces, axis=1), color=color, lw=0.8)
     ax.set(xlabel="along the lever [cm]", ylabel="height [cm]", aspect="equal")
     return ax
+
+
+class FrameRecorder:
+    """Takes a picture every `every` simulation steps (1/240 s); give it to `world.on_step`.
+
+    Figures can be added as frames as well, with `add`.
+    """
+
+    def __init__(self, every: int = 30, width: int = 320, height: int = 240) -> None:
+        self.every = check_count("every", every, 1, 100_000)
+        self.width = check_count("width", width, 16, 2048)
+        self.height = check_count("height", height, 16, 2048)
+        self.frames: list[np.ndarray] = []
+        self._steps = 0
+
+    def __call__(self, world: Tabletop) -> None:
+        if self._steps % self.every == 0:
+            self.frames.append(world.picture(self.width, self.height))
+        self._steps += 1
+
+    def add(self, figure: Figure) -> None:
+        """Add a picture of a figure, in the recorder's height; all frames must be as wide."""
+        frame = _drawn(figure, self.height)
+        if self.frames and frame.shape != self.frames[0].shape:
+            sizes = [f"{f.shape[1]}×{f.shape[0]}" for f in (frame, self.frames[0])]
+            raise ValueError(
+                f"figure makes a frame of {sizes[0]} pixels, the others have {sizes[1]}; "
+                "give it their shape, or show it with beside="
+            )
+        self.frames.append(frame)
+
+    def encoded(self, kind: str = "GIF", frame_ms: int = 60, beside: Figure | None = None) -> bytes:
+        """The frames as an animated picture that loops and rests on its last frame.
+
+        kind: "GIF" or "PNG"; beside: a figure shown to the left of every frame.
+        """
+        if not self.frames:
+            raise RuntimeError(
+                "there are no frames; set world.on_step to the recorder before the robot moves"
+            )
+        frames = self.frames
+        if beside is not None:
+            left = _drawn(beside, frames[0].shape[0])
+            frames = [np.hstack([left, frame]) for frame in frames]
+        # One palette for all frames, drawn from a few of them, or colours flicker.
+        few = [frames[round(k * (len(frames) - 1) / 3)] for k in range(4)]
+        palette = Image.fromarray(np.vstack(few)).quantize(
+            255, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE
+        )
+        indexed = [
+            Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE)
+            for frame in frames
+        ]
+        buffer = io.BytesIO()
+        durations = [frame_ms] * (len(indexed) - 1) + [1500]
+        indexed[0].save(
+            buffer, kind, save_all=True, append_images=indexed[1:], duration=durations, loop=0
+        )
+        return buffer.getvalue()
+
+
+def _drawn(figure: Figure, height: int) -> np.ndarray:
+    """A figure as pixels (height, width, 3)."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=2 * height / figure.get_figheight())
+    picture = Image.open(buffer).convert("RGB")
+    size = (picture.width // 2, picture.height // 2)
+    return np.asarray(picture.resize(size, Image.Resampling.LANCZOS))
+
+
+def show_animation(
+    recorder: FrameRecorder, path: str | Path | None = None, beside: Figure | None = None
+) -> NotebookImage:
+    """The frames as an animation that a notebook displays; saved to `path` as a GIF too, if given.
+
+    beside: a figure shown to the left of every frame.
+    """
+    if path is not None:
+        write_atomically(Path(path), recorder.encoded("GIF", beside=beside), b"GIF8")
+    # A PNG: pages made from a notebook leave GIFs out, and it is a third smaller.
+    return NotebookImage(recorder.encoded("PNG", beside=beside), format="png")

@@ -4,8 +4,6 @@ The ideal camera hangs above the object, with parallel rays; the Kinect has a pe
 and must find the object itself. The mask is read from the depth: what stands above the table.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

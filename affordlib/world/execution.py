@@ -5,8 +5,7 @@ The arm follows waypoints of its joints, and measures what it can feel.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pybullet
@@ -301,8 +300,9 @@ def _interaction(
     tool = np.array(recording.tool) - np.array([*offset[:3], 0.0, 0.0])
     tool[:, 3] = np.unwrap(tool[:, 3])
     seldom = np.linspace(0, phase[-1], RECORDED_SAMPLES)
-    return Interaction(
-        **_commanded(command, placed, seen),
+    return replace(
+        unreached(command, placed, seen),
+        reached=True,
         effect=np.column_stack([np.interp(phase, at_sample, effect[:, c]) for c in range(5)]),
         rest_effect=rest - origin,
         start_pose=(float(start[0]), float(start[1]), float(recorded[0, 3])),
@@ -314,23 +314,16 @@ def _interaction(
     )
 
 
-def _commanded(command: Command, placed: PlacedObject, seen: Observation) -> dict[str, Any]:
-    """What an interaction tells of the action, and of what was seen, whether it was reached."""
-    return {
-        "primitive": command.primitive,
-        "stop_phase": float(command.phase[-1]),
-        "phase": command.phase,
-        "action": command.action,
-        "image": seen.image,
-        "estimated_xy_m": seen.xy_m,
-        "rolls": placed.rolls(),
-    }
-
-
 def unreached(command: Command, placed: PlacedObject, seen: Observation) -> Interaction:
     """The interaction that was out of the arm's reach: commanded, but nothing moved."""
     return Interaction(
-        **_commanded(command, placed, seen),
+        primitive=command.primitive,
+        stop_phase=float(command.phase[-1]),
+        phase=command.phase,
+        action=command.action,
+        image=seen.image,
+        estimated_xy_m=seen.xy_m,
+        rolls=placed.rolls(),
         effect=np.zeros((len(command.phase), 5)),
         rest_effect=np.zeros(5),
         start_pose=placed.pose(),

@@ -4,12 +4,10 @@ A category is a frozen dataclass with its dimensions. The frame of a body has it
 centre and z upwards as the object is placed; the x axis of a lying cylinder is its own axis.
 """
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import pybullet
@@ -65,7 +63,7 @@ class TabletopObject(ABC):
         rng: np.random.Generator,
         size_range_m: tuple[float, float] = SIZE_RANGE_M,
         height_range_m: tuple[float, float] | None = None,
-    ) -> TabletopObject:
+    ) -> Self:
         """An object with dimensions drawn uniformly from a range, heights from another if given."""
         sizes = rng.uniform(*size_range_m, size=len(fields(cls)))
         if height_range_m is not None:
@@ -225,7 +223,7 @@ class Prism(TabletopObject):
         rng: np.random.Generator,
         size_range_m: tuple[float, float] = SIZE_RANGE_M,
         height_range_m: tuple[float, float] | None = None,
-    ) -> Prism:
+    ) -> Self:
         """A polygon of 3 to 8 edges whose corners lie on a circle as wide as the drawn size."""
         n = int(rng.integers(N_EDGES[0], N_EDGES[1] + 1))
         angle = (np.arange(n) + rng.uniform(-0.3, 0.3, size=n)) * 2 * math.pi / n

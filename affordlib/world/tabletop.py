@@ -4,8 +4,6 @@ Use it as a context manager; everything in it is deterministic. Settings were me
 four times finer step with twice the solver's iterations a push ends within 0.02 mm (median).
 """
 
-from __future__ import annotations
-
 import os
 import weakref
 from collections.abc import Callable, Sequence

@@ -3,10 +3,9 @@
 Inverse kinematics runs at 20 Hz, with a spline in between (its error is a few µm).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -56,14 +55,14 @@ class Command:
     segments: list[TrajectorySegment]
 
     @classmethod
-    def of(cls, primitive: Primitive, stop_phase: float, smooth: bool = True) -> Command:
+    def of(cls, primitive: Primitive, stop_phase: float, smooth: bool = True) -> Self:
         """A primitive up to a phase."""
         phase = np.linspace(0.0, 1.0, N_SAMPLES) * stop_phase
         segments = segments_until(primitive, stop_phase, smooth)
         return cls(primitive, phase, primitive.path(phase), segments)
 
     @classmethod
-    def along(cls, path_xy_m: np.ndarray, primitive: Primitive, stop_phase: float) -> Command:
+    def along(cls, path_xy_m: np.ndarray, primitive: Primitive, stop_phase: float) -> Self:
         """Points (n, 2) [m], n ≥ 2, with the heights of a primitive; the fingers face their end."""
         if path_xy_m.ndim != 2 or len(path_xy_m) < 2:
             raise ValueError(f"path_xy_m must be points (n, 2), n ≥ 2, got {path_xy_m.shape}")

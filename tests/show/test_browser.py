@@ -323,7 +323,7 @@ def test_a_saved_notebook_keeps_a_picture(page, lab):
     outputs = saved_outputs(page, lab)
     widget = [o for o in outputs if WIDGET in o.get("data", ())]
     assert widget
-    assert all("image/png" in output["data"] for output in widget)
+    assert all({"image/png", "image/svg+xml"} & output["data"].keys() for output in widget)
     assert [o for o in outputs if o.output_type == "error"] == []
     assert (lab.out / "00_start_here.json").is_file()
 

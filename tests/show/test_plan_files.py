@@ -4,8 +4,8 @@ import math
 import numpy as np
 import pytest
 
-from affordlib.plan_files import load_plan, save_plan
 from affordlib.primitives import Drag, Push, Rotate
+from affordlib.results import load_plan, save_plan
 from affordlib.types import Goal, Plan, Step
 
 PATH = np.array([[0.0, 0.1], [1 / 3, 0.2]])
