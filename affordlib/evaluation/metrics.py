@@ -36,7 +36,7 @@ def refuse_seen(about: dict[str, Any], data: "xarray.Dataset", interactions: np.
     about: what `load_checkpoint` returned beside the model.
     """
     try:
-        theirs, mine = (_objects_of(text) for text in (about["recipe"], data.attrs["recipe"]))
+        recipes = [Recipe.from_json(text) for text in (about["recipe"], data.attrs["recipe"])]
         trained_on = {int(number) for number in about["seen_interactions"]}
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(
@@ -46,13 +46,9 @@ def refuse_seen(about: dict[str, Any], data: "xarray.Dataset", interactions: np.
     check_numbers("interactions", interactions)
     numbers = data["interaction"].values[interactions]
     seen = sorted(trained_on & {int(i) for i in numbers})
-    if theirs == mine and seen:
+    objects = [(r.seed, r.categories, r.size_range_m, r.height_range_m) for r in recipes]
+    if objects[0] == objects[1] and seen:
         raise ValueError(
             f"interactions: the model was trained or tuned on {len(seen)} of them (such as "
             f"{seen[:5]}); evaluate it on the test part of its split or on another data set"
         )
-
-
-def _objects_of(recipe: str) -> tuple[Any, ...]:
-    r = Recipe.from_json(recipe)
-    return r.seed, r.categories, r.size_range_m, r.height_range_m

@@ -183,7 +183,12 @@ class GoalPicker(WithPicture, widgets.VBox):
 
     def _listen(self) -> None:
         controls = self.controls
-        self._view.observe(self._clicked, names="wanted")
+
+        def place(change):
+            _, x, y, _ = change["new"]
+            self._follow(replace(self.goal, xy_m=_whole_mm((x / 1000, -y / 1000))))
+
+        self._view.observe(place, names="wanted")
         presses = {"run": self._run_in_background, "stop": self.stop}
         self._view.on_msg(lambda _, message, __: presses[message["press"]]())
         controls.planner.observe(lambda _: self._follow(self.goal), names="value")
@@ -212,10 +217,6 @@ class GoalPicker(WithPicture, widgets.VBox):
         except Exception as error:
             why = html.escape(str(error) or type(error).__name__)
             self.controls.say(f"<b>This did not work:</b> {why}")
-
-    def _clicked(self, change: dict[str, Any]) -> None:
-        _, x, y, _ = change["new"]
-        self._follow(replace(self.goal, xy_m=_whole_mm((x / 1000, -y / 1000))))
 
     def _run_in_background(self) -> None:
         """Run the plan of the goal that is shown, when it is made; a second press does nothing."""

@@ -125,7 +125,7 @@ class JointController:
                 self.record(recording, at_waypoint, wanted)
             if frozen_at is None:
                 now = commands[step], velocities[step]
-                if guarded and self._pressed(recording.body):
+                if guarded and self._force_N(recording.body) > GUARD_FORCE_N:
                     frozen_at, now = step, (commands[step], [0.0] * 8)
             self._set_motors(targetPositions=now[0], targetVelocities=now[1], **drive)
             client.stepSimulation()
@@ -162,9 +162,8 @@ class JointController:
         for contact in self.client.getContactPoints(recording.body):
             recording.penetration_m = max(recording.penetration_m, -contact[8])
 
-    def _pressed(self, body: int) -> bool:
-        contacts = self.client.getContactPoints(self.robot, body)
-        return sum(contact[9] for contact in contacts) > GUARD_FORCE_N
+    def _force_N(self, body: int) -> float:
+        return sum(contact[9] for contact in self.client.getContactPoints(self.robot, body))
 
     def tool_pose(self) -> np.ndarray:
         """Measured x, y, z [m] of the tool's point, its yaw [rad], the gap of the fingers [m]."""
@@ -179,16 +178,9 @@ class JointController:
     def tie_fingers(self) -> None:
         """Tie the two fingers by a gear: between two motors alone a held object wanders."""
         self.untie()
-        gear = self.client.createConstraint(
-            self.robot,
-            self.fingers[0],
-            self.robot,
-            self.fingers[1],
-            pybullet.JOINT_GEAR,
-            (0, 1, 0),
-            (0, 0, 0),
-            (0, 0, 0),
-        )
+        left, right = self.fingers
+        links, axis, origin = (self.robot, left, self.robot, right), (0, 1, 0), (0, 0, 0)
+        gear = self.client.createConstraint(*links, pybullet.JOINT_GEAR, axis, origin, origin)
         self.client.changeConstraint(gear, gearRatio=-1, maxForce=300, erp=0.5)
 
     def untie(self) -> None:
