@@ -13,6 +13,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from scipy import ndimage
 from scipy.interpolate import NdBSpline
 from scipy.spatial import cKDTree
@@ -20,9 +21,10 @@ from torch import Tensor
 
 from affordlib.geometry import xy_columns
 from affordlib.models.protocol import EffectModel, condition_on_primitives
+from affordlib.models.push_frame import rotate_prediction
 from affordlib.perception import radius_m
 from affordlib.primitives import Drag, Push
-from affordlib.types import IMAGE_CHANNELS, IMAGE_PIXELS, check_array, check_count
+from affordlib.types import IMAGE_CHANNELS, IMAGE_PIXELS, Prediction, check_array, check_count
 
 FINE_DIRECTIONS, FINE_PHASES = 180, 31
 
@@ -151,21 +153,17 @@ class EffectMap:
     @torch.no_grad()
     def _query(self, direction_rad: np.ndarray, t_target: Tensor) -> tuple[Tensor, Tensor]:
         """Effects and σ (n, T, 3), ahead, left and turn, of actions in n directions."""
-        actions = [self.kind.towards(float(angle)) for angle in direction_rad]
-        observed = condition_on_primitives(self.model, actions)
+        pushes = [self.kind.towards(float(angle)) for angle in direction_rad]
+        observed = condition_on_primitives(self.model, pushes)
         prediction = self.model.predict(self.features, observed, t_target)
-        mean, std = prediction.effect_mean.double(), prediction.effect_std.double()
-        channels = self.model.effect_channels
-        columns, angle = xy_columns(channels), torch.as_tensor(direction_rad)[:, None]
-        c, s = angle.cos(), angle.sin()
-        x, y = mean[..., columns].unbind(-1)
-        u, v = std[..., columns].square().unbind(-1)
-        effect = [c * x + s * y, c * y - s * x]
-        spread = [(c**2 * u + s**2 * v).sqrt(), (s**2 * u + c**2 * v).sqrt()]
-        k = channels.index("yaw") if "yaw" in channels else None
-        effect.append(torch.zeros_like(x) if k is None else mean[..., k])
-        spread.append(torch.zeros_like(x) if k is None else std[..., k])
-        return torch.stack(effect, dim=-1), torch.stack(spread, dim=-1)
+        prediction = Prediction(*(value.double() for value in vars(prediction).values()))
+        angle = torch.as_tensor(direction_rad)
+        back = torch.stack([angle.cos(), -angle.sin()], dim=-1)
+        actions, effects = self.model.action_channels, self.model.effect_channels
+        ahead = rotate_prediction(prediction, back, actions, effects)
+        columns = [effects.index(name) for name in ("x", "y", "yaw") if name in effects]
+        effect, std = ahead.effect_mean[..., columns], ahead.effect_std[..., columns]
+        return tuple(F.pad(value, (0, 3 - len(columns))) for value in (effect, std))
 
 
 def phases_of(kind: type[Push] | type[Drag], n_phases: int) -> Tensor:
