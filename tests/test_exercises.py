@@ -18,6 +18,7 @@ ASKED = {name[:2] for name in EXERCISES}
 
 def test_the_chapters_with_checks_have_two_exercises_and_solutions():
     assert {path.stem for path in SOLUTIONS} == {n for n in PATHS if n[:2] in ASKED}
+    assert {name[:2] for name in PATHS if name[0] == "0"} == {*ASKED, "00"}
     assert all(sum(e[:2] == number for e in EXERCISES) >= 2 for number in ASKED)
 
 
@@ -34,8 +35,10 @@ def test_every_solution_passes(path):
 @pytest.mark.parametrize("name", [n for n in PATHS if n[:2] in ASKED])
 def test_the_notebook_asks_each_exercise_and_leaves_it_open(name):
     cells = nbformat.read(PATHS[name], as_version=4).cells
-    asked = re.findall(r'check\("(\d\d\.\d)"', "\n".join(c.source for c in cells))
+    text = "\n".join(c.source for c in cells)
+    asked = re.findall(r'check\("(\d\d\.\d)"', text)
     assert asked == [n for n in EXERCISES if n[:2] == name[:2]]
+    assert all(f"**{number}**" in text for number in asked)
     shown = [
         output["data"]["text/plain"]
         for cell in cells

@@ -106,22 +106,16 @@ def test_unreachable_raises_or_is_recorded_and_moves_nothing(world):
 @pytest.mark.parametrize(
     ("act", "words"),
     [
-        (lambda w: Push(math.nan), "theta .* nan"),
-        (lambda w: Push(0.0, length=-0.1), r"length .* -0\.1"),
         (lambda w: Push(0.0, radius=1.0), "radius .* 1"),
         (lambda w: primitive_named("kick"), "must be one of .'drag', 'grasp'.* got 'kick'"),
         (lambda w: category_named("cone"), "object category must be one of .* got 'cone'"),
         (lambda w: UprightCylinder(0.05, 5.0), "Cylinder.height .* 5"),
         (lambda w: Goal((0.9, 0.0)), r"goal xy_m = \(0\.9, 0\) m lies off the table; choose x in"),
-        (lambda w: Goal((0.1, 0.1), tolerance_m=-1), "Goal.tolerance_m .* -1"),
         (lambda w: w.place(OBJECTS[0], (0.0, 2.0)), "xy_m = .* off the table"),
-        (lambda w: w.execute_primitive(Push(0.0), 1.5), "stop_phase .* 1.5"),
         (lambda w: w.place(OBJECTS[0], tool="hammer"), "tool must be one of .* got 'hammer'"),
         (lambda w: w.execute_primitive(LEVER), r"'lever_up' needs the tool 'screwdriver'.*place\("),
         (lambda w: w.reset() or w.execute_primitive(Push(0.0)), r"call place\(\.\.\.\) first"),
         (lambda w: Prism(STAR, 0.05), "convex polygon"),
-        (lambda w: WorldConfig(table_friction=-1), "table_friction .* -1"),
-        (lambda w: WorldConfig(camera="sonar"), "camera must be one of .* got 'sonar'"),
     ],
 )
 def test_bad_input_is_named(world, act, words):
