@@ -52,9 +52,12 @@ def cross_validate(
     yaw inside the 50 and 90 % intervals.
     """
     errors = push_errors(data, models, folds, within, seed)
-    rows = [summary(part, *keys) for keys, part in errors.groupby(["model", "group"], sort=False)]
-    rows += [summary(part, name, "all") for name, part in errors.groupby("model", sort=False)]
-    return pd.DataFrame(rows)
+    parts = [*errors.groupby(["model", "group"], sort=False)]
+    parts += [((name, "all"), part) for name, part in errors.groupby("model", sort=False)]
+    return pd.DataFrame(
+        {"model": model, "group": group, "n_train": round(part["n_train"].mean())} | summary(part)
+        for (model, group), part in parts
+    )
 
 
 def push_errors(
@@ -87,19 +90,16 @@ def push_errors(
     from joblib import Parallel, delayed  # sets variables of the environment when it is imported
 
     parts = Parallel(n_jobs=min(len(tests), os.cpu_count()))(
-        delayed(_errors)(data, g & ~t, t, tuple(models), seed)
+        delayed(errors_of)(data, g & ~t, t, (*BASELINES, *models), seed)
         for g, t in zip(pool, tests, strict=True)
     )
     return pd.concat(parts, ignore_index=True)
 
 
-def summary(errors: pd.DataFrame, model: str, group: str) -> dict[str, str | float]:
-    """The row of a table of errors per push."""
+def summary(errors: pd.DataFrame) -> dict[str, float]:
+    """The numbers of a row of a table of errors per push."""
     position, yaw = errors["position_m"], errors["yaw_rad"]
     return {
-        "model": model,
-        "group": group,
-        "n_train": round(errors["n_train"].mean()),
         "n": len(errors),
         "position_mean_m": position.mean(),
         "position_sem_m": position.sem(),
@@ -111,43 +111,32 @@ def summary(errors: pd.DataFrame, model: str, group: str) -> dict[str, str | flo
     }
 
 
-def _errors(
-    data: PushLog, trained: np.ndarray, tested: np.ndarray, models: tuple[str, ...], seed: int
+def errors_of(
+    data: PushLog, trained: np.ndarray, tested: np.ndarray, names: Sequence[str], seed: int = 0
 ) -> pd.DataFrame:
-    """Errors of all predictors of the pushes tested (n,), after those trained on (n,)."""
+    """A row per predictor and push tested (n,), after those trained on (n,); both are masks."""
     torch.set_num_threads(1)
-    train, test, scale = (
-        data.select(trained),
-        data.select(tested),
-        gyration_radius_m(data.outline_m),
-    )
-    frames = []
-    for name in (*_BASELINES, *models):
+    train, test = data.select(trained), data.select(tested)
+    scale, frames = [*[gyration_radius_m(data.outline_m)] * 2, 1.0], []
+    for name in names:
         if name.startswith("physics_feet") and "feet" not in data.context:
             continue
-        if name in _BASELINES:
-            mean, std = _BASELINES[name](train, test)
-            mean, std = (v * [scale, scale, 1.0] for v in (mean, std))
+        if name in BASELINES:
+            forecast = tuple(v * scale for v in BASELINES[name](train, test))
         else:
-            mean, std = fit(train, name, seed).predict(test)
-        truth = np.column_stack([test.displacement_m, test.turn_rad])
-        off = np.abs(mean - truth)
-        inside = {p: (off < norm.ppf((1 + p / 100) / 2) * std).mean(axis=1) for p in (50, 90)}
-        frames.append(
-            pd.DataFrame(
-                {
-                    "model": name,
-                    "group": test.groups,
-                    "push": np.flatnonzero(tested),
-                    "n_train": trained.sum(),
-                    "position_m": np.hypot(off[:, 0], off[:, 1]),
-                    "yaw_rad": off[:, 2],
-                    "inside_50": inside[50],
-                    "inside_90": inside[90],
-                }
-            )
-        )
-    return pd.concat(frames)
+            forecast = fit(train, name, seed).predict(test)
+        frames.append(forecast_errors(forecast, test).assign(model=name))
+    table = pd.concat(frames, ignore_index=True)
+    return table.assign(push=np.tile(np.flatnonzero(tested), len(frames)), n_train=trained.sum())
+
+
+def forecast_errors(forecast: Forecast, test: PushLog) -> pd.DataFrame:
+    """A row per push: errors, and the shares of x, y and yaw in the 50 and 90 % intervals."""
+    mean, std = forecast
+    off = np.abs(mean - np.column_stack([test.displacement_m, test.turn_rad]))
+    inside = {f"inside_{p}": (off < norm.ppf(0.5 + p / 200) * std).mean(axis=1) for p in (50, 90)}
+    errors = {"position_m": np.hypot(off[:, 0], off[:, 1]), "yaw_rad": off[:, 2]}
+    return pd.DataFrame({"group": test.groups} | errors | inside)
 
 
 def mirrors(outline_m: np.ndarray) -> list[np.ndarray]:
@@ -264,7 +253,7 @@ def _physics(feet: bool, process: bool) -> Callable[[PushLog, PushLog], Forecast
     return predicted
 
 
-_BASELINES: dict[str, Callable[[PushLog, PushLog], Forecast]] = {
+BASELINES: dict[str, Callable[[PushLog, PushLog], Forecast]] = {
     "constant": _constant,
     "nearest": _nearest,
     "ridge": _ridge,
