@@ -173,22 +173,16 @@ def goals(n: int = N_GOALS) -> list[dict]:
                 for corrected, errors in found.items():
                     world.place(prism, (0.0, 0.0), 0.0, tool="rod")
                     errors.append(pursue(world, model, of_one, goal, corrected))
-    rows = []
-    for corrected, errors in found.items():
-        table = pd.DataFrame(errors)
-        rows.append(
-            {
-                "corrected": corrected,
-                "n": len(table),
-                "position_mean_m": table["position_m"].mean(),
-                "position_sem_m": table["position_m"].sem(),
-                "position_median_m": table["position_m"].median(),
-                "yaw_mean_rad": table["yaw_rad"].mean(),
-                "yaw_sem_rad": table["yaw_rad"].sem(),
-                "pushes": table["pushes"].mean(),
-            }
-        )
-    return rows
+    tables = {corrected: pd.DataFrame(errors) for corrected, errors in found.items()}
+    return [
+        {"corrected": corrected, "n": len(table), "pushes": table["pushes"].mean()}
+        | {
+            f"{column}_{statistic}_{unit}": table[f"{column}_{unit}"].agg(statistic)
+            for column, unit in (("position", "m"), ("yaw", "rad"))
+            for statistic in ("mean", "sem", "median")
+        }
+        for corrected, table in tables.items()
+    ]
 
 
 @command(OSError, ValueError)

@@ -25,7 +25,7 @@ from scipy.stats import bootstrap
 from affordlib.commands import command, names_type, whole_type
 from affordlib.evaluation.cross_validate import BASELINES, errors_of, forecast_errors, summary
 from affordlib.interactions.log import Log, PushLog
-from affordlib.models.fit import EFFORT, MODELS, fit
+from affordlib.models.fit import EFFORT, MODELS, fit, folds_of
 from affordlib.models.neural_process import PRETRAINED
 from affordlib.results import write_results
 from experiments.runner import Job, frame, read, run
@@ -97,17 +97,9 @@ def read_logs(folder: str | Path, told: bool = True) -> PushLog:
     return log.tensors()
 
 
-def fold_of(data: PushLog, seed: int, folds: int = 5) -> np.ndarray:
-    """The fold (n,) of each push, drawn within its condition."""
-    rng, fold = np.random.default_rng(seed), np.zeros(len(data), dtype=int)
-    for group in CONDITIONS:
-        fold[data.groups == group] = rng.permutation((data.groups == group).sum()) % folds
-    return fold
-
-
 def from_40(data: PushLog, names: tuple[str, ...], seed: int, fold: int) -> pd.DataFrame:
     """Of each condition, trained on its other folds alone."""
-    tested, parts = fold_of(data, seed) == fold, []
+    tested, parts = folds_of(data.groups, 5, seed) == fold, []
     for name in CONDITIONS:
         of_group = data.groups == name
         parts.append(errors_of(data, of_group & ~tested, of_group & tested, names, seed))
@@ -116,7 +108,7 @@ def from_40(data: PushLog, names: tuple[str, ...], seed: int, fold: int) -> pd.D
 
 def pooled(data: PushLog, names: tuple[str, ...], seed: int, fold: int) -> pd.DataFrame:
     """Trained on the other folds of all conditions."""
-    tested = fold_of(data, seed) == fold
+    tested = folds_of(data.groups, 5, seed) == fold
     return errors_of(data, ~tested, tested, names, seed)
 
 

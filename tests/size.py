@@ -10,10 +10,10 @@ import tokenize
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-LINES = {"affordlib": 12_980, "experiments": 5730, "tests": 8940}
+LINES = {"affordlib": 12_970, "experiments": 5740, "tests": 8940}
 """What is there, rounded up: lower it with every cut. The aim is 9,500, 3,500 and 6,500."""
 
-FILES, CODE = 75, 8920
+FILES, CODE = 75, 8905
 """Of affordlib: files of all kinds, and lines of Python without docstrings, comments and blanks.
 
 The aim is 6,800 of the latter."""

@@ -23,7 +23,7 @@ import torch
 from scipy.stats import norm
 
 from affordlib.interactions.log import PushLog
-from affordlib.models.fit import MODELS, fit, gyration_radius_m, push_rows, told_feet
+from affordlib.models.fit import MODELS, fit, folds_of, gyration_radius_m, push_rows, told_feet
 from affordlib.models.neural_process import transformed
 from affordlib.models.quasi_static import AnalyticPusher
 from affordlib.types import check_count
@@ -78,9 +78,7 @@ def push_errors(
             f"data must hold at least {2 * folds} interactions of each group for {folds} folds and "
             f"at most {MOST_PUSHES}, got {dict(zip(names.tolist(), counts.tolist(), strict=True))}"
         )
-    fold, rng = np.zeros(len(data), dtype=int), np.random.default_rng(seed)
-    for name, count in zip(names, counts, strict=True):
-        fold[data.groups == name] = rng.permutation(count) % folds
+    fold = folds_of(data.groups, folds, seed)
     jobs = [(data.groups == name, k) for name in names for k in range(folds)]
     if within == "all":
         jobs = [(np.ones(len(data), dtype=bool), k) for k in range(folds)]

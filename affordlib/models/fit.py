@@ -102,7 +102,7 @@ class FittedNeuralProcess:
 
     def __init__(self, data: PushLog, seed: int = 0) -> None:
         self.rows, self.groups = push_rows(data), data.groups
-        self.fold = _folds(data.groups, INNER_FOLDS, seed)
+        self.fold = folds_of(data.groups, INNER_FOLDS, seed)
         self.members = [self._tuned(data, k, seed) for k in range(INNER_FOLDS)]
         off = [self._off(data, k) for k in range(INNER_FOLDS)]
         self.sigma_scale = sigma_scale(torch.cat(off))
@@ -172,7 +172,7 @@ class FittedNetwork:
         arrays = self._tensors(data)
         channels = {"action_channels": arrays.action_channels, "effect_channels": ("x", "y", "yaw")}
         config = FiLMConfig(**channels) if name == "film" else CNPConfig(**channels)
-        fold = torch.from_numpy(_folds(data.groups, 5, seed))
+        fold = torch.from_numpy(folds_of(data.groups, 5, seed))
         train_on, validate_on = arrays.select(fold > 0), arrays.select(fold == 0)
         torch.manual_seed(seed)
         self.network = build(config, Scaler.fit(train_on))
@@ -245,7 +245,7 @@ def sigma_scale(off: Tensor) -> Tensor:
     return torch.stack([factors[0], *factors])
 
 
-def _folds(groups: np.ndarray, k: int, seed: int) -> np.ndarray:
+def folds_of(groups: np.ndarray, k: int, seed: int) -> np.ndarray:
     """The fold (n,) of each push, drawn within its group."""
     rng, fold = np.random.default_rng(seed), np.zeros(len(groups), dtype=int)
     for group in np.unique(groups):
