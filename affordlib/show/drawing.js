@@ -48,6 +48,11 @@ function render({ model, el }) {
     Object.assign(svg.dataset, { answered, draft, planning });
     if (answered >= number) hand = null;
     handles.forEach(placeHandle);
+    // Sliders beside a drawing have no names of their own for those who hear the page.
+    for (const slider of el.closest(".widget-vbox")?.querySelectorAll(".widget-slider") ?? []) {
+      const name = slider.querySelector(".widget-label")?.textContent;
+      slider.querySelectorAll("[role=slider]").forEach((e) => e.setAttribute("aria-label", name));
+    }
     if (!running) playing = null;
     if (playing) show(performance.now());
   }

@@ -17,7 +17,7 @@ from affordlib.show.plots import ENLARGED
 from affordlib.types import Goal, Outcome, Plan, Step
 from affordlib.world import BASE_X_M, REACH_M, TabletopObject
 
-HALF_WIDTH_M, LIMIT_M = 0.36, 0.35
+HALF_WIDTH_M, LIMIT_M = 0.40, 0.35
 """What is seen of the table, and how far from its middle a goal can be put by hand [m]."""
 
 PUSH_RUN_UP_M = 0.2
@@ -80,7 +80,7 @@ def draw_plan(obj: TabletopObject, steps: Sequence[Step], start: Sequence[float]
     shapes, at, right, y_label = [], start, True, 0.0
     x, y = to_mm(at)
     for k, step in enumerate(steps):
-        label = f"{k + 1}: {step_in_words(step)}"
+        label = f"{k + 1}: {step_in_words(step).removeprefix('push to ')}"
         if k < len(moves):
             arrow = _at(*at[:2], step.primitive.direction_rad)
             shapes.append(_shape("g", "arrow", _ARROW, transform=arrow))
@@ -103,8 +103,10 @@ def draw_plan(obj: TabletopObject, steps: Sequence[Step], start: Sequence[float]
             x, y_label = x + 28, y + 6
         else:
             y_label += 24
-        anchor = "start" if right else "end"
-        shapes.append(_shape("text", "step", label, x=x, y=y_label, text_anchor=anchor))
+        # A name, of 10 mm a letter, that would be cut off at the rim of the drawing moves inwards.
+        room = 1000 * HALF_WIDTH_M - 10 * len(label)
+        x_label, anchor = (min(x, room), "start") if right else (max(x, -room), "end")
+        shapes.append(_shape("text", "step", label, x=x_label, y=y_label, text_anchor=anchor))
     if steps:
         end = (*steps[-1].predicted_end_xy_m, start[2] + steps[-1].predicted_turn_rad)
         shapes.append(draw_object(obj, end, "predicted"))

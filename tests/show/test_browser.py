@@ -347,6 +347,8 @@ def test_arrow_keys(page, table):
 def test_sliders_by_keyboard(page, table):
     x, y = goal_of(page)
     handles = page.locator(".affordlib-picker .noUi-handle")
+    named = handles.evaluate_all("all => all.map((e) => e.getAttribute('aria-label'))")
+    assert named == ["x [cm]", "y [cm]", "turn [°]", "lift [cm]"]
 
     def press(slider, key, presses):
         for _ in range(presses):
