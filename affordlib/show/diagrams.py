@@ -8,10 +8,7 @@ from affordlib.show.plots import NEUTRAL
 
 
 def plot_flow(
-    ax: Axes,
-    boxes: Mapping[str, tuple[float, float, str]],
-    arrows: Sequence[tuple[str, str]],
-    bend: float = 0.0,
+    ax: Axes, boxes: Mapping[str, tuple[float, float, str]], arrows: Sequence[tuple[str, str]]
 ) -> Axes:
     """Texts in boxes at (x, y), coloured by their third entry, and arrows between them by name."""
     drawn = {}
@@ -19,9 +16,8 @@ def plot_flow(
         style = {"boxstyle": "round,pad=0.4", "fc": "white", "ec": color, "lw": 1.5}
         drawn[text] = ax.text(x, y, text, ha="center", va="center", bbox=style)
     for tail, tip in arrows:
-        arrow = {"arrowstyle": "-|>", "color": NEUTRAL, "connectionstyle": f"arc3,rad={bend}"}
-        ends = {name: drawn[text].get_bbox_patch() for name, text in (("A", tail), ("B", tip))}
-        arrow |= {f"patch{k}": patch for k, patch in ends.items()}
+        arrow = {"arrowstyle": "-|>", "color": NEUTRAL}
+        arrow |= {"patchA": drawn[tail].get_bbox_patch(), "patchB": drawn[tip].get_bbox_patch()}
         ax.annotate("", boxes[tip][:2], boxes[tail][:2], arrowprops=arrow)
     ax.axis("off")
     return ax

@@ -49,10 +49,10 @@ function render({ model, el }) {
     if (answered >= number) hand = null;
     handles.forEach(placeHandle);
     // Sliders beside a drawing have no names of their own for those who hear the page.
-    for (const slider of el.closest(".widget-vbox")?.querySelectorAll(".widget-slider") ?? []) {
-      const name = slider.querySelector(".widget-label")?.textContent;
-      slider.querySelectorAll("[role=slider]").forEach((e) => e.setAttribute("aria-label", name));
-    }
+    el.closest(".widget-vbox")?.querySelectorAll("[role=slider]").forEach((handle) => {
+      const name = handle.closest(".widget-slider").querySelector(".widget-label");
+      handle.setAttribute("aria-label", name.textContent);
+    });
     if (!running) playing = null;
     if (playing) show(performance.now());
   }
