@@ -48,11 +48,6 @@ function render({ model, el }) {
     Object.assign(svg.dataset, { answered, draft, planning });
     if (answered >= number) hand = null;
     handles.forEach(placeHandle);
-    // Sliders beside a drawing have no names of their own for those who hear the page.
-    el.closest(".widget-vbox")?.querySelectorAll("[role=slider]").forEach((handle) => {
-      const name = handle.closest(".widget-slider").querySelector(".widget-label");
-      handle.setAttribute("aria-label", name.textContent);
-    });
     if (!running) playing = null;
     if (playing) show(performance.now());
   }
@@ -148,6 +143,12 @@ function render({ model, el }) {
     event.stopPropagation();
   });
 
+  // Sliders beside a drawing have no names of their own for those who hear the page.
+  const nameSliders = () =>
+    el.closest(".widget-vbox")?.querySelectorAll("[role=slider]").forEach((handle) => {
+      handle.ariaLabel = handle.closest(".widget-slider").querySelector(".widget-label").textContent;
+    });
+  new ResizeObserver(() => setTimeout(nameSliders, 500)).observe(el); // when all is in the page
   const listeners = { scene: draw, picture: drawPicture, playback: play };
   for (const [name, heard] of Object.entries(listeners)) model.on(`change:${name}`, heard);
   drawPicture();
