@@ -13,6 +13,7 @@ from matplotlib.path import Path
 from scipy import ndimage
 from scipy.spatial import ConvexHull
 
+from affordlib.geometry import wrap_angle
 from affordlib.primitives import Drag, Grasp, Primitive
 from affordlib.types import CROP_WIDTH_M, IMAGE_PIXELS, check_array, check_pair, check_within
 
@@ -20,6 +21,18 @@ CAMERA_HEIGHT_M = 1.0
 _ROUND = 0.8
 """Curvature times radius above which a top counts as round: 1 for a sphere, 0 for a box."""
 _FALL_M = 0.01
+
+_N_ANGLES = 360
+_UNROUND = 0.01
+"""How much better the turned image of an object must fit than the mean over all angles, as a share
+of its squared heights, for the turn to be seen. Of round objects it is at most 0.007 (one image of
+the ideal camera, the mean of eight of the Kinect), of nearly all prisms 0.012 and more."""
+_ALIKE = 0.1
+"""Angles fit alike that are worse than the best by less than this share of the mean. Half a round
+of a cuboid is at most 0.05 worse, a wrong corner of a prism mostly 0.2 and more."""
+_NEIGHBOURS = 2.3
+"""Errors are so many times those of independent pixels: noise reaches over several. The three were
+chosen on 120 objects that no table has, each seen at two places by both cameras."""
 
 
 def heights_m(image: np.ndarray) -> np.ndarray:
@@ -71,6 +84,48 @@ def looks_fallen(before: np.ndarray, after: np.ndarray) -> bool:
     """Whether an object lies differently than before: other height or other kind of top."""
     change = abs(object_height_m(after) - object_height_m(before))
     return bool(change > _FALL_M or looks_rollable(before) != looks_rollable(after))
+
+
+def _heights_around(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Heights [m] around the centre of an object's top, and the areas [pixels] they stand for.
+
+    Both are (radii, angles); the latter (radii, 1).
+    """
+    near = ndimage.binary_dilation(image[1] > 0.5)
+    height = np.where(near, CAMERA_HEIGHT_M - image[0].astype(float), 0.0)
+    top = height * (height > 0.45 * object_height_m(image))
+    row, column = ndimage.center_of_mass(top)
+    radius = np.arange(0.5, len(height) / 2)[:, None]
+    angle = 2 * math.pi / _N_ANGLES * np.arange(_N_ANGLES)
+    at = row - radius * np.sin(angle), column + radius * np.cos(angle)
+    return ndimage.map_coordinates(height, at, order=1), radius * angle[1]
+
+
+def turn_between(
+    before: np.ndarray, after: np.ndarray, expected_rad: float | None = None
+) -> tuple[float, float] | None:
+    """How far an object has turned between two images (2, n, n), in [-π, π), and its σ [rad].
+
+    The heights around its centre are laid over each other at every angle, and the best is refined
+    by a parabola. Of angles that fit alike, as of a cuboid half a round apart, it is the nearest to
+    expected_rad. None where all look alike: of spheres and upright cylinders.
+    """
+    (then, area), (now, _) = _heights_around(before), _heights_around(after)
+    overlap = np.fft.rfft(now, axis=1) * np.fft.rfft(then, axis=1).conj()
+    power = (area * (then**2 + now**2)).sum()
+    left = power * (1 + 1e-9) - 2 * np.fft.irfft((area * overlap).sum(axis=0), _N_ANGLES)
+    best, contrast = left.min(), left.mean() - left.min()
+    if contrast < _UNROUND * (area * now**2).sum():
+        return None
+    step, following, preceding = 2 * math.pi / _N_ANGLES, np.roll(left, -1), np.roll(left, 1)
+    fits = (left <= preceding) & (left < following) & (left <= best + _ALIKE * contrast)
+    at = np.flatnonzero(fits)
+    bend = (following - 2 * left + preceding)[at]
+    turns = step * (at + (preceding - following)[at] / (2 * bend))
+    off = left[at] if expected_rad is None else -np.cos(turns - expected_rad)
+    k = int(off.argmin())
+    n_pixels = (after[1] > 0.5).sum() / _NEIGHBOURS**2
+    return wrap_angle(float(turns[k])), step * math.sqrt(2 * left[at[k]] / (n_pixels * bend[k]))
 
 
 def radius_m(image: np.ndarray) -> float:

@@ -28,6 +28,9 @@ DURATION_S = 3.75
 PUSH_GAP_M = 0.03
 """Distance between the fingers while pushing: they cradle the object's near face."""
 
+EMPTY_M = 0.005
+"""Fingers that have closed to less than this hold nothing."""
+
 TIP_HEIGHT_M = 0.01
 HOVER_M = 0.16
 """Height of the finger tips before they are lowered over an object."""

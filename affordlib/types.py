@@ -131,13 +131,15 @@ class Observation:
 
     xy_m: estimated position (x, y) [m] in the frame of the table; image: (2, 48, 48), depth [m]
     from a plane 1 m above the table and the object's mask, centred there; std_m: σ of the
-    position, and yaw_rad: how the object is turned, where they are known.
+    position, where it is known. yaw_rad: how the object is turned, where the robot can tell, and
+    yaw_std_rad: its σ; None where it was not seen but reckoned.
     """
 
     xy_m: tuple[float, float]
     image: np.ndarray
     std_m: float | None = None
     yaw_rad: float | None = None
+    yaw_std_rad: float | None = None
 
 
 @dataclass(frozen=True)

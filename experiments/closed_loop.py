@@ -3,7 +3,9 @@
     python -m experiments.closed_loop --tables height,orientation
 
 Trial i of a table is a function of the seed and i: object, start, goal and disturbances are drawn
-before anything plans, on objects that no model has seen. Whether a goal is feasible is judged by
+before anything plans, on objects that no model has seen. Each is run in the clean world with the
+ideal camera, and in a perturbed one (`Variation`) with the Kinect. Errors are measured in the
+simulator, where the robot does not look. Whether a goal is feasible is judged by
 the arm's kinematics (position) and by whole grasps (height), never by the planner under test. The
 goals of `height` and `orientation` are also planned open loop: each from one image, executed
 without observing again (`open_loop_pose_goals`).
@@ -14,7 +16,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from itertools import islice
 from pathlib import Path
@@ -22,14 +24,19 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy.spatial import ConvexHull
 
 from affordlib.commands import command, count_type, names_type, seed_type
 from affordlib.evaluation.metrics import error_row
 from affordlib.geometry import wrap_angle
+from affordlib.interactions.recipes import Variation
+from affordlib.models import load_checkpoint
 from affordlib.planning import (
+    ClosedLoopConfig,
     ClosedLoopResult,
     Disturbance,
     DisturbanceSchedule,
+    Robot,
     Skills,
     execute_plan,
     plan_astar,
@@ -43,21 +50,49 @@ from affordlib.planning.skills import CHECKPOINTS
 from affordlib.primitives import Drag, Grasp, Push
 from affordlib.results import write_results
 from affordlib.types import TABLE_X_M, TABLE_Y_M, Goal
-from affordlib.world import Tabletop, TabletopObject, UnreachableError, category_named
+from affordlib.world import (
+    Tabletop,
+    TabletopObject,
+    UnreachableError,
+    WorldConfig,
+    category_named,
+)
 from experiments import runner
 from experiments.feasibility import half_width_m, is_feasible, on_the_rim
 from experiments.runner import FOLDER, Job
 
 Rows = list[dict[str, Any]]
-N_TRIALS = {"height": 50, "orientation": 50, "disturbances": 200, "reachability": 1000}
-VERSIONS = dict.fromkeys((*N_TRIALS, "open_loop_pose_goals"), 1)
+N_TRIALS = {
+    "height": 50,
+    "orientation": 50,
+    "disturbances": 200,
+    "reachability": 1000,
+    "orientation_unseen": 50,
+}
+VERSIONS = dict.fromkeys(N_TRIALS, 1) | dict.fromkeys(("height", "orientation"), 2)
+VERSIONS["open_loop_pose_goals"] = 2
 """Raise one when the code changes and the table's numbers do."""
 
-POSE_PRIMITIVES = {"height": "grasp", "orientation": "rotate"}
-CATEGORIES = ("cuboid", "upright_cylinder", "lying_cylinder", "sphere")
+POSE_PRIMITIVES = {"height": "grasp", "orientation": "rotate", "orientation_unseen": "rotate"}
+TURN_SHOWS, TURN_IS_HIDDEN = ("cuboid", "lying_cylinder", "prism"), ("upright_cylinder", "sphere")
+CATEGORIES = {"orientation": TURN_SHOWS, "orientation_unseen": TURN_IS_HIDDEN}
+"""Of a table; of others the four below."""
+FOUR_CATEGORIES = ("cuboid", "upright_cylinder", "lying_cylinder", "sphere")
+
+WORLDS = {"clean": 1, "perturbed": 8}
+"""And of how many images an observation is the mean there."""
+PERTURBED_PUSHES = "film_5000_perturbed"
+AT_REST_S = 3.0
+"""After so long even an unbalanced ball lies still, before the trial begins."""
+
+SMALLEST_M2 = 0.001
+"""Smaller footprints, of a prism, are drawn again: models refuse what is much smaller than what
+they were trained on."""
+
+REACH_BY = ("both", "learned", "kinematics")
 PLANNERS = {"astar": plan_astar, "continuous": plan_continuous}
-TOLERANCE_M = {"height": 0.004, "orientation": 0.004, "disturbances": 0.002, "reachability": 0.002}
-"""Of the position; gripping shifts objects."""
+TOLERANCE_M = dict.fromkeys(POSE_PRIMITIVES, 0.004)
+"""Of the position, where it is not 2 mm; gripping shifts objects."""
 
 WITHIN_M, WITHIN_HEIGHT_M, WITHIN_TURN_RAD = 0.005, 0.005, math.radians(3)
 STATUSES = ("reached", "unreachable", "gave_up", "lost")
@@ -74,23 +109,42 @@ class Trial:
     yaw_rad: float
     goal: Goal
     disturbances: tuple[Disturbance, ...] = ()
+    config: WorldConfig = field(default_factory=WorldConfig)
 
     @property
     def kind(self) -> type[Push] | type[Drag]:
         """How its object is moved."""
         return Drag if self.obj.rollable else Push
 
+    def place(self, world: Tabletop) -> None:
+        """Put its object on the table, and let it come to rest."""
+        world.place(self.obj, self.start_xy_m, self.yaw_rad, config=self.config)
+        if self.config != WorldConfig():
+            world.settle(AT_REST_S)
 
-def sample_trial(table: str, index: int, seed: int = 0) -> Trial:
-    """Trial number `index` of a table, a function of the seed and the number alone."""
+
+def sample_trial(table: str, index: int, seed: int = 0, world: str = "clean") -> Trial:
+    """Trial number `index` of a table, a function of its arguments alone; alike in each world."""
+    trial = _clean_trial(table, index, seed)
+    if world == "clean":
+        return trial
+    key = (200 + list(N_TRIALS).index(table), index)
+    rng = np.random.default_rng(np.random.SeedSequence(2_000_003 + seed, spawn_key=key))
+    return replace(trial, config=Variation().sample(trial.obj, rng))
+
+
+def _clean_trial(table: str, index: int, seed: int) -> Trial:
     if table not in N_TRIALS:
         raise ValueError(f"table must be one of {sorted(N_TRIALS)}, got {table!r}")
     key = (100 + list(N_TRIALS).index(table), index)
     rng = np.random.default_rng(np.random.SeedSequence(2_000_003 + seed, spawn_key=key))
-    obj = category_named(CATEGORIES[index % len(CATEGORIES)]).sample(rng)
+    categories = CATEGORIES.get(table, FOUR_CATEGORIES)
+    obj = category_named(categories[index % len(categories)]).sample(rng)
+    while ConvexHull(obj.footprint_m).volume < SMALLEST_M2:
+        obj = type(obj).sample(rng)
     about: dict[str, Any] = {"obj": obj, "start_xy_m": (0.0, 0.0)}
     about["yaw_rad"] = float(rng.uniform(-math.pi, math.pi))
-    tolerance_m = TOLERANCE_M[table]
+    tolerance_m = TOLERANCE_M.get(table, 0.002)
     if table == "reachability":
         low, high = (np.array([TABLE_X_M[k], TABLE_Y_M[k]]) for k in (0, 1))
         end = rng.uniform(low + EDGE_M, high - EDGE_M).tolist()
@@ -101,7 +155,7 @@ def sample_trial(table: str, index: int, seed: int = 0) -> Trial:
     if table == "height":
         height_m = float(rng.uniform(0.02, 0.2))
         return Trial(**about, goal=Goal(xy, tolerance_m, height_m=height_m))
-    if table == "orientation":
+    if table.startswith("orientation"):
         turn_rad = float(rng.uniform(-math.pi, math.pi))
         return Trial(**about, goal=Goal(xy, tolerance_m, turn_rad=turn_rad))
     n_actions = max(1, math.ceil(r / 0.09))
@@ -111,28 +165,47 @@ def sample_trial(table: str, index: int, seed: int = 0) -> Trial:
 
 
 @cache
-def _tabletop_and_skills() -> tuple[Tabletop, Skills]:
+def _tabletop_and_skills(world: str = "clean", reach_by: str = "both") -> tuple[Tabletop, Skills]:
     """One of each for a process."""
-    return Tabletop(), Skills.load()
+    skills = Skills.load()
+    if world == "perturbed":
+        push = load_checkpoint(PERTURBED_PUSHES)[0]
+        skills = replace(skills, models=skills.models | {"push": push})
+    if reach_by == "kinematics":
+        skills = replace(skills, reachability=None)
+    return Tabletop(), skills
 
 
-def run_trial(table: str, index: int, seed: int = 0) -> dict[str, Any]:
-    """The record of a trial: how it ended, and whether it could be done."""
-    world, skills = _tabletop_and_skills()
-    trial = sample_trial(table, index, seed)
-    world.place(trial.obj, trial.start_xy_m, trial.yaw_rad)
-    robot = DisturbanceSchedule(world, trial.goal, trial.disturbances)
-    result = run_closed_loop(robot, robot.current_goal, skills)
-    record = {"object_class": trial.obj.category, **_measured(world, result)}
+def run_trial(
+    table: str, index: int, seed: int = 0, world: str = "clean", reach_by: str = "both"
+) -> dict[str, Any]:
+    """The record of a trial: how it ended, and whether it could be done.
+
+    reach_by: who says where the arm can act: the learned model, the kinematics, or both.
+    """
+    tabletop, skills = _tabletop_and_skills(world, reach_by)
+    trial = sample_trial(table, index, seed, world)
+    robot = DisturbanceSchedule(tabletop, trial.goal, trial.disturbances)
+    if reach_by == "learned":
+        robot.can_reach = lambda *_: True
+
+    def pursue(goal: Goal | Callable[[], Goal], robot: Robot) -> tuple[ClosedLoopResult, dict]:
+        trial.place(tabletop)
+        yaw, z = tabletop.object_pose()[2], tabletop.object_state()[2]
+        config = ClosedLoopConfig(n_images=WORLDS[world])
+        result = run_closed_loop(robot, goal, skills, config=config)
+        return result, _measured(tabletop, result, yaw, z)
+
+    result, measured = pursue(robot.current_goal, robot)
+    record = {"object_class": trial.obj.category, **measured}
     if table == "height":
-        record["feasible"] = _can_be_lifted(world, trial, result)
-    elif table == "orientation":
+        record["feasible"] = _can_be_lifted(tabletop, trial, result)
+    elif table in POSE_PRIMITIVES:
         record["feasible"] = True
     elif table == "disturbances":
-        record["feasible"] = _stays_feasible(world, trial, result, robot.happened)
+        record["feasible"] = _stays_feasible(tabletop, trial, result, robot.happened)
         record["kind"] = trial.disturbances[0].kind
-        world.place(trial.obj, trial.start_xy_m, trial.yaw_rad)
-        record["undisturbed"] = _measured(world, run_closed_loop(world, trial.goal, skills))
+        record["undisturbed"] = pursue(trial.goal, tabletop)[1]
     else:
         query = trial.kind, half_width_m(trial.obj.footprint_m)
         record["feasible"] = is_feasible(*query, trial.start_xy_m, trial.goal.xy_m)
@@ -140,26 +213,36 @@ def run_trial(table: str, index: int, seed: int = 0) -> dict[str, Any]:
     return record
 
 
-def _measured(world: Tabletop, result: ClosedLoopResult) -> dict[str, Any]:
-    """What the tables need of a closed loop; the distance is the ground truth."""
+def _measured(world: Tabletop, result: ClosedLoopResult, yaw: float, z: float) -> dict[str, Any]:
+    """What the tables need of a closed loop; the errors are the ground truth.
+
+    yaw, z: of the object at the start.
+    """
+    goal, pose = result.goal, world.object_pose()
+    turn_error = height_error = None
+    if goal.turn_rad is not None:
+        turn_error = wrap_angle(goal.turn_rad - (pose[2] - yaw))
+    if goal.height_m is not None:
+        height_error = goal.height_m - (world.object_state()[2] - z)
     return {
         "status": result.status,
         "message": result.message,
-        "distance_m": result.goal.distance_m(world.object_pose()[:2]),
+        "distance_m": goal.distance_m(pose[:2]),
         "actions": len(result.steps),
         "plans": len(result.plans),
         "ik_rejections": result.vetoes,
-        "turn_error_rad": result.turn_error_rad,
-        "height_error_m": result.height_error_m,
+        "turn_error_rad": turn_error,
+        "height_error_m": height_error,
+        "orientation_reckoned": "orientation" in result.reckoned,
     }
 
 
 def _can_be_lifted(world: Tabletop, trial: Trial, result: ClosedLoopResult) -> bool:
     """Whether the object was lifted as high, or a whole grasp at the goal does so, by any hand."""
-    high = trial.goal.height_m - WITHIN_HEIGHT_M
+    high, yaw_rad = trial.goal.height_m - WITHIN_HEIGHT_M, world.object_pose()[2]
 
     def lifts(grip_yaw: float) -> bool:
-        world.place(trial.obj, result.goal.xy_m, result.end_pose[2])
+        replace(trial, start_xy_m=result.goal.xy_m, yaw_rad=yaw_rad).place(world)
         done = world.execute_primitive(Grasp(grip_yaw=grip_yaw), record_unreachable=True)
         return bool(done.effect[:, 2].max() >= high)
 
@@ -256,21 +339,24 @@ def pose_rows(records: Rows, column: str, within: float, unit: str) -> Rows:
         for name in ("mean", "sem", "median", "p95"):
             row[f"pose_error_{unit}_{name}"] = spread.get(f"{name}_m")
         row["distance_m_mean"] = _mean(reached.distance_m)
+        row["reckoned"] = int(some.orientation_reckoned.sum())
         rows.append(row | {"actions_mean": _mean(reached.actions)})
     return rows
 
 
 def disturbance_rows(records: Rows) -> Rows:
-    """Rows of `disturbances`: how trials ended, and errors with and without disturbance, paired."""
+    """Rows of `disturbances`: how trials ended, and errors with and without disturbance, paired.
+
+    The means are of all feasible trials, those that did not arrive among them.
+    """
     rows = []
     table = pd.json_normalize(list(records), sep="_")
     for row, some in _groups(table, "kind", "object_class"):
         feasible = some[some.feasible]
-        both = feasible[(feasible[["status", "undisturbed_status"]] == "reached").all(axis=1)]
-        apart = both.distance_m - both.undisturbed_distance_m
+        apart = feasible.distance_m - feasible.undisturbed_distance_m
         row["within_percent"] = _percent(feasible.distance_m <= WITHIN_M)
-        row["disturbed_mean_m"] = _mean(both.distance_m)
-        row["undisturbed_mean_m"] = _mean(both.undisturbed_distance_m)
+        row["disturbed_mean_m"] = _mean(feasible.distance_m)
+        row["undisturbed_mean_m"] = _mean(feasible.undisturbed_distance_m)
         row["apart_mean_m"] = _mean(apart)
         row["apart_sem_m"] = float(apart.sem()) if len(apart) > 1 else None
         row["actions_mean"] = _mean(feasible.actions)
@@ -318,9 +404,11 @@ def open_loop_rows(records: Rows, within: float, unit: str) -> Rows:
     return rows
 
 
+_TURNS = partial(pose_rows, column="turn_error_rad", within=WITHIN_TURN_RAD, unit="rad")
 ROWS: dict[str, Callable[[Rows], Rows]] = {
     "height": partial(pose_rows, column="height_error_m", within=WITHIN_HEIGHT_M, unit="m"),
-    "orientation": partial(pose_rows, column="turn_error_rad", within=WITHIN_TURN_RAD, unit="rad"),
+    "orientation": _TURNS,
+    "orientation_unseen": _TURNS,
     "disturbances": disturbance_rows,
     "reachability": reachability_rows,
 }
@@ -330,11 +418,14 @@ OPEN_LOOP_ROWS: dict[str, Callable[[Rows], Rows]] = {
 }
 
 
-def job(table: str, index: int, seed: int) -> Job:
+def job(table: str, index: int, seed: int, world: str = "clean", reach_by: str = "both") -> Job:
     """One trial of the closed loop."""
-    arguments = {"table": table, "index": index, "seed": seed}
+    arguments: dict[str, Any] = {"table": table, "index": index, "seed": seed}
+    arguments |= {"world": world} if world != "clean" else {}
+    arguments |= {"reach_by": reach_by} if reach_by != "both" else {}
     used = ("push", "drag", POSE_PRIMITIVES.get(table))
-    files = tuple(file for kind, file in CHECKPOINTS.items() if kind in used)
+    models = CHECKPOINTS | ({"push": PERTURBED_PUSHES} if world == "perturbed" else {})
+    files = tuple(file for kind, file in models.items() if kind in used)
     reach = runner.hash_of("reachability", "checkpoint")
     return Job(run_trial, arguments, reach, (), files, VERSIONS[table])
 
@@ -355,8 +446,35 @@ def tables(name: str, seed: int = 0, folder: str | Path = FOLDER) -> dict[str, R
     make, rows = FILES[name]
     found = [about | record for about, record in runner.read(name, make, folder)]
     found = sorted(found, key=lambda record: record["index"])
-    some = {k: [r for r in found if r["table"] == k and r.get("seed", seed) == seed] for k in rows}
-    return {k: rows[k](some[k]) for k in rows if some[k]}
+    found = [record for record in found if record.get("seed", seed) == seed]
+    made: dict[str, Rows] = {}
+    for table in rows:
+        some = [record for record in found if record["table"] == table]
+        if name != "closed_loop":
+            made[table] = rows[table](some)
+            continue
+        for world in WORLDS:
+            run = [r for r in some if _world_and_reach(r) == (world, "both")]
+            if run:
+                new = [{"world": world} | row for row in rows[table](run)]
+                made[table] = made.get(table, []) + new
+    if apart := [record for record in found if record.get("reach_by", "both") != "both"]:
+        made["reachability_by"] = reach_by_rows(found, max(r["index"] for r in apart) + 1)
+    return {table: some for table, some in made.items() if some}
+
+
+def _world_and_reach(record: dict[str, Any]) -> tuple[str, str]:
+    return record.get("world", "clean"), record.get("reach_by", "both")
+
+
+def reach_by_rows(records: Rows, n: int) -> Rows:
+    """Rows of the first n goals by who says where the arm can act, in the clean world."""
+    rows = []
+    for by in REACH_BY:
+        some = [r for r in records if r["table"] == "reachability" and r["index"] < n]
+        some = [r for r in some if _world_and_reach(r) == ("clean", by)]
+        rows += [{"reach_by": by} | reachability_rows(some)[0]] if some else []
+    return rows
 
 
 def write_tables(
@@ -380,9 +498,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--tables", type=names_type(VERSIONS), default=list(VERSIONS))
     parser.add_argument("--n", type=count_type, default=1000, help="trials of each table")
     parser.add_argument("--seed", type=seed_type, default=0)
+    parser.add_argument("--worlds", type=names_type(WORLDS), default=list(WORLDS))
+    parser.add_argument("--reach-by", type=names_type(REACH_BY), default=["both"])
     options = parser.parse_args(argv)
     asked = {table: range(min(options.n, n)) for table, n in N_TRIALS.items()}
-    trials = [job(t, i, options.seed) for t in ROWS if t in options.tables for i in asked[t]]
+    trials = [
+        job(t, i, options.seed, world, by)
+        for t in ROWS
+        for world in options.worlds
+        for by in (options.reach_by if (t, world) == ("reachability", "clean") else ["both"])
+        for i in asked[t]
+        if t in options.tables
+    ]
     plans = [open_loop_job(t, i, p) for t in OPEN_LOOP_ROWS for i in asked[t] for p in PLANNERS]
     runner.make(trials, "closed_loop", options, partial(write_tables, seed=options.seed))
     some = plans if "open_loop_pose_goals" in options.tables else []

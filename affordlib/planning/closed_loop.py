@@ -2,7 +2,8 @@
 
 `execute_plan` trusts a plan. `run_closed_loop` observes after every action (Section 3.4 of the
 paper): is the object where it was predicted to be, has the goal changed, has the object fallen? If
-so it plans again, from a new image.
+so it plans again, from a new image. How far the object has turned it tells from two images, how
+high it is lifted from the hand; what shows in neither is reckoned from what was done.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from affordlib.geometry import wrap_angle
-from affordlib.perception import adapt_to_object, looks_fallen
+from affordlib.perception import adapt_to_object, looks_fallen, turn_between
 from affordlib.planning.continuous import plan_continuous
 from affordlib.planning.grasp_rotate import (
     GRIPPER_YAWS_RAD,
@@ -28,7 +29,7 @@ from affordlib.planning.move_planner import Ending, MovePlanner
 from affordlib.planning.problem import PlanMode, PlanningProblem, is_on_table
 from affordlib.planning.robot import Execution, Robot
 from affordlib.planning.skills import Skills
-from affordlib.primitives import Grasp, Rotate
+from affordlib.primitives import EMPTY_M, Drag, Grasp, Rotate
 from affordlib.types import (
     Goal,
     NothingSeenError,
@@ -56,9 +57,6 @@ DISPLACED_M = 0.03
 AT_REST_M, OBSERVE_EVERY_S, MAX_OBSERVATIONS = 0.001, 0.25, 20
 """An object rests that is within a millimetre a quarter of a second later; after 5 s none is waited
 for."""
-
-SHIFTED_M = 0.005
-"""Closing fingers may shift what they lift by so much, and the position still counts as reached."""
 
 MOVE_M, SPARE_ACTIONS = 0.05, 3
 """An action is allowed for every 5 cm of distance, and three more."""
@@ -139,17 +137,21 @@ class ClosedLoopConfig:
     """With how many actions a goal is to be met, and who is told of them.
 
     max_actions: default `action_limit` of the distance, renewed when the goal moves or somebody
-    displaces the object. horizon: the longest chain the planner may return. on_action: called with
-    the plan and the number of actions taken, after each; on_plan: with a plan before its first.
+    displaces the object. horizon: the longest chain the planner may return. n_images: of which an
+    observation is the mean; with eight of the Kinect a turn is seen to a degree. on_action: called
+    with the plan and the number of actions taken, after each; on_plan: with a plan before its
+    first.
     """
 
     max_actions: int | None = None
     horizon: int = 3
+    n_images: int = 1
     on_action: Callable[[Plan, int], None] = lambda *_: None
     on_plan: Callable[[Plan], None] = lambda *_: None
 
     def __post_init__(self) -> None:
         check_count("horizon", self.horizon, 1, 10)
+        check_count("n_images", self.n_images, 1, 100)
         if self.max_actions is not None:
             check_count("max_actions", self.max_actions, least=0)
 
@@ -158,10 +160,12 @@ class ClosedLoopConfig:
 class ClosedLoopResult:
     """What came of a closed loop, as the robot observed it.
 
-    status: one of `STATUSES`; goal: as it was in the end; end_pose: (x, y, yaw) of the object, yaw
-    0 where it is not known; turn_error_rad, height_error_m: None where the goal does not ask;
-    steps: the actions taken, with a path (n, 2) of the object for each; plans: all that were made;
-    seen_xy_m: before every decision; vetoes: planned actions that the arm's kinematics refused.
+    status: one of `STATUSES`; goal: as it was in the end; end_pose: (x, y, turn since the start) of
+    the object, and turn_std_rad; reckoned: which of "position" and "orientation" was not seen in
+    the end, but follows from what the hand did; turn_error_rad, height_error_m: None where the goal
+    does not ask; steps: the actions taken, and executions, what was recorded of them; plans: all
+    that were made; seen_xy_m: before every decision; vetoes: planned actions that the arm's
+    kinematics refused.
     """
 
     goal: Goal
@@ -169,10 +173,12 @@ class ClosedLoopResult:
     message: str
     distance_m: float
     steps: tuple[Step, ...]
-    object_paths_xy_m: tuple[np.ndarray, ...]
+    executions: tuple[Execution, ...]
     plans: tuple[Plan, ...]
     seen_xy_m: tuple[tuple[float, float], ...]
     end_pose: tuple[float, float, float]
+    turn_std_rad: float | None
+    reckoned: tuple[str, ...]
     vetoes: int = 0
     turn_error_rad: float | None = None
     height_error_m: float | None = None
@@ -181,6 +187,11 @@ class ClosedLoopResult:
     def reached(self) -> bool:
         """Whether the object was seen where, and as, the goal wants it."""
         return self.status == "reached"
+
+    @property
+    def object_paths_xy_m(self) -> tuple[np.ndarray, ...]:
+        """The path (n, 2) of the object in each action, as it was recorded."""
+        return tuple(execution.object_path[:, :2] for execution in self.executions)
 
 
 def action_limit(distance_m: float) -> int:
@@ -221,16 +232,18 @@ class _ClosedLoop:
         self.robot, self.goal_now, self.skills, self.config = robot, goal_now, skills, config
         self.moves = MovePlanner(robot, skills, planner, PlanMode(config.horizon, partial=True))
         self.steps: list[Step] = []
-        self.paths: list[np.ndarray] = []
+        self.executions: list[Execution] = []
         self.plans: list[Plan] = []
         self.seen_xy_m: list[tuple[float, float]] = []
         self.plan: Plan | None = None  # that is followed
         self.queue: list[Step] = []  # what is left of it
         self.acted_for: Goal | None = None
         self.renewals, self.turn_allowed = MAX_RENEWALS, False
-        self.lifted_m = 0.0
-        self.seen = robot.observe()
-        self.first_yaw_rad = self.seen.yaw_rad
+        self.lifted_m, self.held = 0.0, False
+        seen = self._mean_of_images()
+        yaw_rad, std_rad = seen.yaw_rad or 0.0, seen.yaw_std_rad or 0.0
+        self.seen = self.first = replace(seen, yaw_rad=yaw_rad, yaw_std_rad=std_rad)
+        self.start_yaw_rad = self.expected_rad = self.reckoned_rad = yaw_rad
         self.limit = self._limit_from(self.seen.xy_m)
 
     @property
@@ -252,10 +265,12 @@ class _ClosedLoop:
             message=ending.message,
             distance_m=goal.distance_m(seen.xy_m),
             steps=tuple(self.steps),
-            object_paths_xy_m=tuple(path[:, :2] for path in self.paths),
+            executions=tuple(self.executions),
             plans=tuple(self.plans),
             seen_xy_m=tuple(self.seen_xy_m),
-            end_pose=(*seen.xy_m, seen.yaw_rad or 0.0),
+            end_pose=(*seen.xy_m, wrap_angle(seen.yaw_rad - self.start_yaw_rad)),
+            turn_std_rad=seen.yaw_std_rad,
+            reckoned=self._reckoned(),
             vetoes=self.moves.vetoes,
             turn_error_rad=self._turn_left(),
             height_error_m=self._height_left(),
@@ -263,18 +278,19 @@ class _ClosedLoop:
 
     def _observe(self) -> Ending | None:
         """Observe, and judge whether the plan still holds."""
-        before, self.seen = self.seen, self.robot.observe()
+        before, seen = self.seen, self._mean_of_images()
         expected = self.steps[-1].predicted_end_xy_m if self.steps else None
 
         def surprise():
-            off_m = math.inf if expected is None else math.dist(expected, self.seen.xy_m)
-            fell = expected is not None and looks_fallen(before.image, self.seen.image)
+            off_m = math.inf if expected is None else math.dist(expected, seen.xy_m)
+            fell = expected is not None and looks_fallen(before.image, seen.image)
             return off_m, fell
 
         off_m, fell = surprise()
         if DISPLACED_M < off_m < math.inf or fell:
-            self._wait()
+            seen = self._wait(seen)
             off_m, fell = surprise()
+        self.seen = self._with_yaw(seen, fell, DISPLACED_M < off_m < math.inf)
         self.seen_xy_m.append(self.seen.xy_m)
         if not _is_seen_on_table(self.seen):
             return Ending("lost", f"the object is no longer on the table, after {self._count()}")
@@ -288,26 +304,48 @@ class _ClosedLoop:
             self.queue = []
         return None
 
-    def _wait(self) -> None:
+    def _wait(self, seen: Observation) -> Observation:
         """Observe until what somebody has set in motion rests."""
         for _ in range(MAX_OBSERVATIONS):
             self.robot.settle(OBSERVE_EVERY_S)
-            before, self.seen = self.seen, self.robot.observe()
-            if math.dist(before.xy_m, self.seen.xy_m) < AT_REST_M:
-                return
+            before, seen = seen, self._mean_of_images()
+            if math.dist(before.xy_m, seen.xy_m) < AT_REST_M:
+                break
+        return seen
+
+    def _mean_of_images(self) -> Observation:
+        views = [self.robot.observe() for _ in range(self.config.n_images)]
+        x, y = np.mean([view.xy_m for view in views], axis=0).tolist()
+        image = np.mean([view.image for view in views], axis=0)
+        return replace(views[-1], xy_m=(x, y), image=image)
+
+    def _with_yaw(self, seen: Observation, fell: bool, displaced: bool) -> Observation:
+        """What is seen, with its yaw: by the robot, by the images since the first, or reckoned.
+
+        A hand that turns what looks alike from all sides turns it by as much.
+        """
+        if seen.yaw_rad is None:
+            expected = None if displaced else self.expected_rad - self.first.yaw_rad
+            told = None if fell else turn_between(self.first.image, seen.image, expected)
+            turn, std = told or (self.reckoned_rad - self.first.yaw_rad, None)
+            seen = replace(seen, yaw_rad=self.first.yaw_rad + turn, yaw_std_rad=std)
+        self.expected_rad = self.reckoned_rad = seen.yaw_rad
+        self.first = seen if fell else self.first
+        return seen
 
     def _decide_and_act(self) -> Ending | None:
         """One action towards what is not yet as the goal wants it; an ending where all is, or
         nothing helps.
         """
         turn_rad = self._turn_left()
+        turns = turn_rad is not None and abs(turn_rad) > TURN_TOLERANCE_RAD
+        if turns and not self.turn_allowed:  # as far as a whole round, in sweeps of 60°
+            sweeps = math.ceil((turn_rad % (2 * math.pi)) / Rotate.sweep_rad)
+            self._allow(2 * sweeps + SPARE_ACTIONS)  # each may shift it off its position
+            self.turn_allowed = True
         if self.goal.distance_m(self.seen.xy_m) > self.goal.tolerance_m:
             return self._act("position", self._move)
-        if turn_rad is not None and abs(turn_rad) > TURN_TOLERANCE_RAD:
-            if not self.turn_allowed:  # as far as a whole round, in sweeps of 60°
-                sweeps = math.ceil((turn_rad % (2 * math.pi)) / Rotate.sweep_rad)
-                self._allow(sweeps + SPARE_ACTIONS)
-            self.turn_allowed = True
+        if turns:
             return self._act("orientation", self._turn)
         if self.goal.height_m is None:
             return Ending("reached", self._where())
@@ -319,16 +357,17 @@ class _ClosedLoop:
 
     def _judge_lift(self, last: bool) -> Ending | None:
         """Whether what is held is where it should be; otherwise it is put down."""
-        x, y, self.lifted_m, yaw_rad = self.paths[-1][-1].tolist()
-        self.seen = replace(self.seen, xy_m=(x, y), yaw_rad=yaw_rad)
+        tool = self.executions[-1].tool
+        self.held = bool(tool[-1, 4] > EMPTY_M)
+        self.lifted_m = float(tool[-1, 2] - tool[:, 2].min()) if self.held else 0.0
         turn_rad, height_m = self._turn_left() or 0.0, self._height_left()
         if abs(turn_rad) <= TURN_TOLERANCE_RAD and abs(height_m) <= HEIGHT_TOLERANCE_M:
-            if self.goal.distance_m((x, y)) <= max(self.goal.tolerance_m, SHIFTED_M):
+            if self.goal.distance_m(self.seen.xy_m) <= self.goal.tolerance_m:
                 return Ending("reached", self._where())
             if last:
                 return self._give_up("position")
         self.robot.park()
-        self.lifted_m = 0.0
+        self.lifted_m, self.held = 0.0, False
         return None
 
     def _act(self, part: str, choose: Callable[[], Step | Ending]) -> Ending | None:
@@ -340,22 +379,46 @@ class _ClosedLoop:
             return step
         self.acted_for = self.goal
         try:
-            self.paths.append(self.robot.execute(step).object_path)
+            execution = self.robot.execute(step)
         except UnreachableError as error:  # of what it sees now, a hair off what it agreed to
             return Ending("unreachable", f"the {part}: {error}")
         self.steps.append(step)
+        self.executions.append(execution)
+        self._reckon(step, execution.tool)
         self.config.on_action(self.plan, len(self.steps))
         return None
 
+    def _reckon(self, step: Step, tool: np.ndarray) -> None:
+        """How the object should be turned now, by the model, and by the hand if that turned it."""
+        by_rad = step.predicted_turn_rad - self.turned_by_plan_rad
+        self.turned_by_plan_rad = step.predicted_turn_rad
+        self.expected_rad = self.reckoned_rad = self.seen.yaw_rad + by_rad
+        if isinstance(step.primitive, Rotate):
+            phase, hand_rad = np.linspace(0, step.stop_phase, len(tool)), np.unwrap(tool[:, 3])
+            closed_rad = np.interp(step.primitive.segment_phases[2], phase, hand_rad)
+            self.reckoned_rad = self.seen.yaw_rad + float(hand_rad[-1] - closed_rad)
+
     def _move(self) -> Step | Ending:
         if not self.queue:
-            plan = self.moves.plan(self.seen, self.goal)
+            plan = self.moves.plan(self.seen, self.goal, self._grip_yaw())
             if isinstance(plan, Ending):
                 return plan
             self.plans.append(plan)
             self.queue = list(plan.steps)
             self._follow(plan)
         return self.queue.pop(0)
+
+    def _grip_yaw(self) -> float | None:
+        """Of the hand that has just let go of a rotated object.
+
+        Closed again at this yaw, it turns nothing: so the object is carried to its position.
+        """
+        last = self.steps[-1] if self.steps else None
+        if last is None or not isinstance(last.primitive, Rotate | Drag):
+            return None
+        if last.primitive.grip_yaw is None:  # as it saw the object before it moved it
+            return None
+        return float(last.primitive.path(last.stop_phase)[0, 3])
 
     def _turn(self) -> Step | Ending:
         turn_rad = self._turn_left()
@@ -368,11 +431,10 @@ class _ClosedLoop:
         )
 
     def _lift(self) -> Step | Ending:
-        yaws, height_m = GRIPPER_YAWS_RAD, self.goal.height_m
-        last = self.steps[-1] if self.steps else None
-        if last is not None and isinstance(last.primitive, Rotate):
+        yaws, height_m, grip_yaw = GRIPPER_YAWS_RAD, self.goal.height_m, self._grip_yaw()
+        if grip_yaw is not None:
             # A grasp takes an object as the rotation left it, or it would turn it back.
-            yaws = aligned_gripper_yaws(float(last.primitive.path(last.stop_phase)[0, 3]))
+            yaws = aligned_gripper_yaws(grip_yaw)
         model = self.skills.model(Grasp)
         predicted = predict_trajectories(model, self.seen.image, Grasp(), "z", yaws)
         return self._first_possible(
@@ -396,7 +458,7 @@ class _ClosedLoop:
         return Ending("unreachable", f"{wanted}: {hopeless}")
 
     def _follow(self, plan: Plan) -> None:
-        self.plan = plan
+        self.plan, self.turned_by_plan_rad = plan, 0.0
         self.config.on_plan(plan)
 
     def _limit_from(self, xy_m: Sequence[float]) -> int:
@@ -412,12 +474,14 @@ class _ClosedLoop:
     def _turn_left(self) -> float | None:
         if self.goal.turn_rad is None:
             return None
-        if self.seen.yaw_rad is None:
-            raise ValueError("goal.turn_rad needs a robot whose observations have a yaw_rad")
-        return wrap_angle(self.goal.turn_rad - (self.seen.yaw_rad - self.first_yaw_rad))
+        return wrap_angle(self.goal.turn_rad - (self.seen.yaw_rad - self.start_yaw_rad))
 
     def _height_left(self) -> float | None:
         return None if self.goal.height_m is None else self.goal.height_m - self.lifted_m
+
+    def _reckoned(self) -> tuple[str, ...]:
+        hidden = {"position": self.held, "orientation": self.held or self.seen.yaw_std_rad is None}
+        return tuple(part for part, is_hidden in hidden.items() if is_hidden)
 
     def _count(self) -> str:
         n = len(self.steps)

@@ -3,6 +3,7 @@
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -14,7 +15,7 @@ from affordlib.planning.problem import PlanMode, PlanningProblem, check_has_room
 from affordlib.planning.robot import Robot
 from affordlib.planning.routes import Feasible, find_route, place_at
 from affordlib.planning.skills import Skills
-from affordlib.primitives import Primitive
+from affordlib.primitives import Drag, Primitive, Push
 from affordlib.types import Goal, Observation, Plan
 
 Point = tuple[float, float]
@@ -54,9 +55,23 @@ class MovePlanner:
         self._refused: list[tuple[str, np.ndarray, float]] = []
         self._blocked: dict[type[Primitive], set[tuple[int, int]]] = defaultdict(set)
 
-    def plan(self, seen: Observation, goal: Goal) -> Plan | Ending:
-        """A plan that the arm can follow, from where the object is seen, or why there is none."""
-        effects = self.skills.effects(seen.image)
+    def plan(self, seen: Observation, goal: Goal, grip_yaw: float | None = None) -> Plan | Ending:
+        """A plan that the arm can follow, from where the object is seen, or why there is none.
+
+        grip_yaw: of a hand that carries the object, where it can, whatever suits its image.
+        """
+        if grip_yaw is not None and Drag.name in self.skills.models:
+            plan = self._plan(seen, goal, Drag)
+            if isinstance(plan, Plan):
+                grips = (replace(step.primitive, grip_yaw=grip_yaw) for step in plan.steps)
+                steps = zip(plan.steps, grips, strict=True)
+                return replace(plan, steps=tuple(replace(s, primitive=grip) for s, grip in steps))
+        return self._plan(seen, goal)
+
+    def _plan(
+        self, seen: Observation, goal: Goal, kind: type[Push] | type[Drag] | None = None
+    ) -> Plan | Ending:
+        effects = self.skills.effects(seen.image, kind)
         try:
             check_has_room(goal, effects.radius_m)
         except ValueError as error:

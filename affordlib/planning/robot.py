@@ -18,7 +18,8 @@ from affordlib.types import Observation, Step
 class Execution(Protocol):
     """What the robot itself measured while it carried out an action.
 
-    tool: (n, 5) x, y, z [m] and yaw [rad] of the tool, gap of the fingers [m].
+    tool: (n, 5) x, y, z [m] and yaw [rad] of the tool, gap of the fingers [m], evenly over the
+    phases from 0 to where the action stopped.
     """
 
     tool: np.ndarray
@@ -28,8 +29,7 @@ class Execution(Protocol):
         """(m, 4) of the object, from before the action until it rests or is held after it.
 
         x, y [m] and yaw [rad] in the frame of the table, height [m] above where it stood before:
-        (x, y, height, yaw). The closed loop reads the last row only of what is held, which an arm
-        knows from its hand.
+        (x, y, height, yaw). It is recorded for figures and tables; the closed loop never reads it.
         """
 
 

@@ -88,9 +88,14 @@ class Skills:
         """A planner with settings, such as `plan_astar`, as (image, start_xy_m, goal) → Plan."""
         return SkillPlanner(self, partial(plan, **settings), mode)
 
-    def effects(self, image: np.ndarray) -> EffectMap:
-        """What moving the object in an image (2, 48, 48) does; kept for the last image."""
-        return self._predictions(image)[0]
+    def effects(self, image: np.ndarray, kind: type[Push] | type[Drag] | None = None) -> EffectMap:
+        """What moving the object in an image (2, 48, 48) does; kept for the last image.
+
+        kind: how it is moved (default: `kind_for` the image).
+        """
+        if kind in (None, self.kind_for(image)):
+            return self._predictions(image)[0]
+        return EffectMap(self.model(kind), image, kind)
 
     def _predictions(self, image: np.ndarray) -> tuple[EffectMap, PosePlanner | None]:
         key = np.ascontiguousarray(image).tobytes()

@@ -181,11 +181,13 @@ def plot_outcome(ax: Axes, outcome: Outcome) -> Axes:
     return ax
 
 
-def plot_closed_loop(ax: Axes, result: ClosedLoopResult, obj: TabletopObject | None = None) -> Axes:
+def plot_closed_loop(
+    ax: Axes, result: ClosedLoopResult, obj: TabletopObject | None = None, yaw_rad: float = 0.0
+) -> Axes:
     """A closed loop from above: where each action took the object, and where others moved it.
 
     Dots are where the object was predicted after each action; dotted lines what nobody planned.
-    obj: drawn as it stands in the end, if given.
+    obj: drawn as it stands in the end, if given; yaw_rad: how it stood at the start.
     """
     goal = result.goal
     first = result.plans[0].goal if result.plans else goal
@@ -211,7 +213,8 @@ def plot_closed_loop(ax: Axes, result: ClosedLoopResult, obj: TabletopObject | N
         middle = _cm(path[len(path) // 2 :].mean(axis=0))
         _name(ax, f"{k + 1} {step.primitive.name}", middle, aside, fontsize=7)
     if obj is not None:
-        plot_footprint(ax, obj, result.end_pose[:2], result.end_pose[2], TRUTH)
+        x, y, turned_rad = result.end_pose
+        plot_footprint(ax, obj, (x, y), check_finite("yaw_rad", yaw_rad) + turned_rad, TRUTH)
     actions = len(result.steps)
     ax.set_title(f"{result.status}: {1000 * result.distance_m:.1f} mm, {actions} actions")
     return ax

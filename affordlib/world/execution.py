@@ -12,7 +12,7 @@ import pybullet
 from pybullet_utils.bullet_client import BulletClient
 from scipy.interpolate import CubicSpline
 
-from affordlib.primitives import Grasp
+from affordlib.primitives import EMPTY_M, Grasp
 from affordlib.types import Interaction, Observation, UnreachableError
 from affordlib.world import robot
 from affordlib.world.objects import PlacedObject, poses
@@ -66,7 +66,8 @@ class JointController:
     """Drives the joints of an arm that it loads, holding a tool, into a client.
 
     after_step: called after every step of the simulation; angles_rad: (6,) joint angles and gap_m:
-    distance of the fingers [m] where they were last sent.
+    distance of the fingers [m] where they were last sent; raised_m: how high the hand has lifted
+    what it has closed on.
     """
 
     def __init__(self, client: BulletClient, tool: str, after_step: Callable[[], None]) -> None:
@@ -84,6 +85,7 @@ class JointController:
             self.client.resetJointState(self.robot, joint, angle, 0.0)
         self._set_motors(targetPositions=targets)
         self.angles_rad, self.gap_m = np.array(angles_rad, dtype=float), gap_m
+        self.raised_m = 0.0
 
     def set_fingers(self, force_N: float, closing: bool) -> None:
         """How hard each finger can press from now on, and whether it moves lightly, to close."""
@@ -256,6 +258,9 @@ def execute(
     arm.record(recording)
     placed.brake(approach)
 
+    if primitive.holds and closes:
+        heights_m = np.array(recording.tool)[:, 2]
+        arm.raised_m = float(heights_m[-1] - heights_m.min())
     if not primitive.holds:
         release = np.array([arm.gap_m, primitive.opening_m if closes else arm.gap_m])
         if release[1] > release[0]:
@@ -324,10 +329,10 @@ def unreached(command: Command, placed: PlacedObject, seen: Observation) -> Inte
     )
 
 
-def put_down(arm: JointController, placed: PlacedObject | None) -> None:
-    """Lower what the hand holds to the table, open the fingers, rise and go home."""
-    below_m = 0.0 if placed is None else placed.lowest_m()
-    here = np.append(arm.tool_pose()[:4], 0.0)
+def put_down(arm: JointController) -> None:
+    """Lower what the hand holds to where it was taken, open the fingers, rise and go home."""
+    *pose, gap_m = arm.tool_pose()
+    here, below_m = np.array([*pose, 0.0]), arm.raised_m if gap_m > EMPTY_M else 0.0
     down = np.repeat(arm.angles_rad[None], 2, axis=0)
     if below_m > PUT_DOWN_M:
         down = line(here, here - (below_m - PUT_DOWN_M) * UP, arm.angles_rad, 1.0, arm.tool)
@@ -338,3 +343,4 @@ def put_down(arm: JointController, placed: PlacedObject | None) -> None:
     arm.untie()
     arm.follow(down[::-1], wide[[-1, -1]])
     arm.follow(joint_move(arm.angles_rad, _HOME, 1.0), wide[[-1, -1]])
+    arm.raised_m = 0.0

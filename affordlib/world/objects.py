@@ -381,10 +381,6 @@ class PlacedObject:
         x, y, _, yaw, _ = poses(np.array([self.state()]))[0]
         return float(x), float(y), float(yaw)
 
-    def lowest_m(self) -> float:
-        """Height of the lowest point of its bounding box [m]."""
-        return self.client.getAABB(self.body)[0][2]
-
     def _upward(self) -> np.ndarray:
         return Rotation.from_quat(self.state()[3:]).as_matrix()[2]
 

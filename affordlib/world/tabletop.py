@@ -198,16 +198,15 @@ class Tabletop(AbstractContextManager):
 
     def park(self) -> None:
         """Put down what the hand holds, open the fingers and take the arm home."""
-        put_down(self.arm, self._placed)
+        put_down(self.arm)
         self.settle()
 
     def observe(self) -> Observation:
         """The object's estimated position and its image; the arm must be parked.
 
-        The position is the mean over `n_averaged_images` images, the image is the first of them,
-        and the yaw is the simulator's.
+        The position is the mean over `n_averaged_images` images, the image is the first of them.
         """
-        x, y, yaw = self.object_pose()
+        x, y, _ = self.object_pose()
         views = []
         if self.config.camera == "kinect":
             images = range(self.n_averaged_images)
@@ -215,7 +214,7 @@ class Tabletop(AbstractContextManager):
             x, y = np.mean([xy for xy, _ in views], axis=0).tolist()
         xy = x + self.config.bias_m[0], y + self.config.bias_m[1]
         image = views[0][1] if views else camera.depth_crop(self.client, xy)
-        return Observation(xy, image, yaw_rad=yaw)
+        return Observation(xy, image)
 
     def _observe_edge(self, lever: LeverUp) -> Observation:
         """The image (2, 128, 128) around a lever-up's contact, its direction to the right."""

@@ -1,12 +1,13 @@
 """The tables of the closed loop: trials by seed, the kinematic oracle, what rows say."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from affordlib.primitives import Drag, Push
-from affordlib.world import Cuboid
+from affordlib.world import Cuboid, WorldConfig
 from experiments import closed_loop
 from experiments.closed_loop import N_TRIALS, OPEN_LOOP_ROWS, ROWS, run_open_loop, sample_trial
 from experiments.feasibility import is_feasible, on_the_rim, possible
@@ -42,6 +43,9 @@ def test_trials_are_a_function_of_seed_and_number():
     for name in N_TRIALS:
         assert sample_trial(name, 5, 3) == sample_trial(name, 5, 3)
         assert sample_trial(name, 5, 3) != sample_trial(name, 5, 4)
+        perturbed = sample_trial(name, 5, 3, "perturbed")
+        assert perturbed.config.camera == "kinect"
+        assert replace(perturbed, config=WorldConfig()) == sample_trial(name, 5, 3)
     with pytest.raises(ValueError, match="table must be one of"):
         sample_trial("speed", 0)
 
@@ -49,6 +53,7 @@ def test_trials_are_a_function_of_seed_and_number():
 def record(feasible, status, distance_m=0.001, object_class="sphere"):
     about = {"object_class": object_class, "feasible": feasible, "status": status}
     about |= {"distance_m": distance_m, "height_error_m": -distance_m, "on_the_rim": False}
+    about["orientation_reckoned"] = object_class == "sphere"
     return about | {"ik_rejections": 1, "actions": 0 if status == "unreachable" else 3}
 
 
@@ -67,6 +72,14 @@ def test_rows_have_statuses_and_both_rates():
     assert (cuboid["lost"], cuboid["pose_error_m_mean"]) == (2, None)
     aside = [record(True, "reached") | {"distance_m": 0.02}] * 2  # as high, but not there
     assert ROWS["height"](records + aside)[0]["within_percent"] == 60.0
+
+
+def test_the_means_of_disturbed_trials_have_those_that_did_not_arrive():
+    arrived, lost = record(True, "reached", 0.001), record(True, "lost", 0.5)
+    records = [r | {"kind": "knock", "undisturbed": arrived} for r in (arrived, lost)]
+    row = ROWS["disturbances"](records)[0]
+    means = [row[f"{name}_mean_m"] for name in ("disturbed", "undisturbed", "apart")]
+    assert means == pytest.approx([0.2505, 0.001, 0.2495])
 
 
 def test_rows_of_open_loop_plans_are_of_each_planner_and_category():

@@ -1,7 +1,7 @@
 """A robot in pure Python, and models that know what it does: no simulator, no network."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -78,8 +78,9 @@ def point_skills():
 
 def disc_image(height_m=0.05, radius_m=0.02):
     """What a camera sees of an upright cylinder."""
-    at = (np.arange(48) - 23.5) * 0.16 / 48
-    mask = np.hypot(at, at[:, None]) < radius_m
+    pixel_m = 0.16 / 48
+    at = (np.arange(48) - 23.5) * pixel_m
+    mask = np.clip((radius_m - np.hypot(at, at[:, None])) / pixel_m + 0.5, 0, 1)
     return np.stack([1.0 - height_m * mask, mask]).astype(np.float32)
 
 
@@ -88,14 +89,17 @@ class PointRobot:
     """A `Robot` that pushes, turns and lifts a disc; pushes go a share too far.
 
     refuses: which actions at which places its arm cannot do. before: called before it observes,
-    with the robot. velocity: of the object [m/s], which half a second brakes.
+    with the robot. sees_yaw: whether it measures the yaw, as by a marker. slips: how many lifts
+    the object slips out of the hand. velocity: of the object [m/s], which half a second brakes.
     """
 
     xy_m: tuple[float, float] = (0.0, 0.0)
     too_far: float = 0.05
     refuses: object = lambda *_: False
     before: object = lambda *_: None
-    yaw_rad: float | None = 0.2
+    yaw_rad: float = 0.2
+    sees_yaw: bool = True
+    slips: int = 0
     velocity: tuple[float, float] = (0.0, 0.0)
     visible: bool = True
     height_m: float = 0.05
@@ -105,20 +109,25 @@ class PointRobot:
         self.before(self)
         if not self.visible:
             raise NothingSeenError("nothing is seen")
-        return Observation(self.xy_m, disc_image(self.height_m), yaw_rad=self.yaw_rad)
+        seen = Observation(self.xy_m, disc_image(self.height_m))
+        return replace(seen, yaw_rad=self.yaw_rad, yaw_std_rad=0.01) if self.sees_yaw else seen
 
     def execute(self, step):
         primitive, (x, y) = step.primitive, self.xy_m
-        height, yaw = 0.0, self.yaw_rad or 0.0
+        phase = np.linspace(0, step.stop_phase, 26)
+        tool, holds = primitive.path(phase), primitive.holds and not self.slips
+        tool[:, 4] = np.maximum(primitive.opening_m * tool[:, 4], 0.04 * holds)
+        height, yaw = 0.0, self.yaw_rad
         if primitive.name == "push":
             angle, far = primitive.direction_rad, (1 + self.too_far) * moved_m(step.stop_phase)
             self.xy_m = (x + far * math.cos(angle), y + far * math.sin(angle))
         else:
             _, _, height, turned, _ = hand_moves(primitive, np.array([step.stop_phase]))[0].tolist()
             self.yaw_rad = yaw + turned
+        self.slips -= primitive.holds and self.slips > 0
         self.executed.append(step)
-        path = np.array([[x, y, 0.0, yaw], [*self.xy_m, height, self.yaw_rad or 0.0]])
-        return SimpleNamespace(tool=np.zeros((1, 5)), object_path=path)
+        path = np.array([[x, y, 0.0, yaw], [*self.xy_m, holds * height, self.yaw_rad]])
+        return SimpleNamespace(tool=tool, object_path=path)
 
     def can_reach(self, primitive, stop_phase=1.0, at_xy_m=None):
         return not self.refuses(primitive, at_xy_m or self.xy_m)
