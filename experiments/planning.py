@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pandas as pd
@@ -34,6 +35,7 @@ from affordlib.planning import (
     PlanMode,
     PlanningProblem,
     Skills,
+    continuous,
     execute_plan,
     plan_astar,
     plan_continuous,
@@ -43,7 +45,7 @@ from affordlib.primitives import Push
 from affordlib.results import write_results
 from affordlib.types import Outcome, Plan, Step
 from affordlib.world import Tabletop, UnreachableError
-from experiments import planners, reported, runner
+from experiments import reported, runner
 from experiments.oracle import oracle_effects
 from experiments.runner import FOLDER, Job
 
@@ -52,11 +54,40 @@ GROUPS = {"all": STANDING + ROLLABLE, "standing": STANDING, "rollable": ROLLABLE
     name: (name,) for name in STANDING + ROLLABLE
 }
 Rows = list[dict[str, Any]]
+FINE_PHASES = tuple(round(0.5 + 0.05 * k, 2) for k in range(1, 11))
+
+
+def _whole(planner: Callable[..., Plan]) -> Callable[..., Plan]:
+    """A planner without partial actions."""
+
+    def plan(problem: PlanningProblem, **arguments: Any) -> Plan:
+        return planner(replace(problem, mode=replace(problem.mode, partial=False)), **arguments)
+
+    plan.__name__ = f"{planner.__name__}_full"
+    return plan
+
+
+plan_astar_full = _whole(plan_astar)
+plan_continuous_full = _whole(plan_continuous)
+
+
+def plan_astar_fine(problem: PlanningProblem, heuristic: str = "goal") -> Plan:
+    """A* with twice as many directions and stop phases, content within 5 mm instead of 20."""
+    problem = replace(problem, goal=replace(problem.goal, tolerance_m=0.005))
+    return plan_astar(problem, 72, FINE_PHASES, heuristic)
+
+
+def plan_continuous_with(problem: PlanningProblem, **constants: Any) -> Plan:
+    """The continuous planner with other values of its module's constants."""
+    with mock.patch.multiple(continuous, **constants):
+        return plan_continuous(problem)
+
+
 Planner = Callable[..., Plan]
 """A planner as (image, start_xy_m, goal, mode) → Plan."""
 
 
-VERSIONS: dict[Planner, int] = {plan_astar: 2, planners.plan_astar_fine: 2}
+VERSIONS: dict[Planner, int] = {plan_astar: 2, plan_astar_fine: 2}
 """Of planners, 1 unless one changed, or how its plans are executed, and with it its numbers."""
 
 
@@ -102,8 +133,8 @@ class PlannerConfig:
 
     def columns(self) -> dict[str, Any]:
         """What a row of the table says of it."""
-        fine = len(planners.FINE_PHASES)
-        samples = {plan_astar: 5, planners.plan_astar_full: 1, planners.plan_astar_fine: fine}
+        fine = len(FINE_PHASES)
+        samples = {plan_astar: 5, plan_astar_full: 1, plan_astar_fine: fine}
         placed = "plan" if self.execution.get("by_plan") else "observation"
         return {
             "algorithm": self.planner.__name__.removeprefix("plan_"),
@@ -150,7 +181,7 @@ CONFIGS: dict[str, PlannerConfig] = {
     "astar_by_plan": PlannerConfig(plan_astar, **BY_PLAN, standing=True),
     "astar_disc": PlannerConfig(plan_astar, arguments=DISC, **ALL),
     "astar_disc_corrected": PlannerConfig(plan_astar, arguments=DISC, **CORRECTED, **ALL),
-    "astar_disc_fine": PlannerConfig(planners.plan_astar_fine, arguments=DISC, **ALL),
+    "astar_disc_fine": PlannerConfig(plan_astar_fine, arguments=DISC, **ALL),
     # The paper's planners on its own network.
     "astar_cnp_500": PlannerConfig(plan_astar, "cnp_500"),
     "astar_disc_cnp_500": PlannerConfig(plan_astar, "cnp_500", DISC, **ALL),
@@ -161,8 +192,8 @@ CONFIGS: dict[str, PlannerConfig] = {
     "gradient_direction": PlannerConfig(plan_gradient, "cnp_500", ON_RING, **ALL),
     "gradient_corrected": PlannerConfig(plan_gradient, "cnp_500", ON_RING, **CORRECTED),
     # Without partial actions.
-    "continuous_full": PlannerConfig(planners.plan_continuous_full, **ALL),
-    "astar_full": PlannerConfig(planners.plan_astar_full, standing=True),
+    "continuous_full": PlannerConfig(plan_continuous_full, **ALL),
+    "astar_full": PlannerConfig(plan_astar_full, standing=True),
     # What each idea is worth, and what a small error of the object's pose does.
     "continuous_cnp_500": PlannerConfig(plan_continuous, "cnp_500", **ALL),
     "continuous_film_500": PlannerConfig(plan_continuous, "film_500", **ALL),
@@ -189,7 +220,7 @@ CONFIGS: dict[str, PlannerConfig] = {
     # A constant, on the validation goals.
     **{
         f"RISK_WEIGHT={weight:g}": PlannerConfig(
-            planners.plan_continuous_with, arguments={"RISK_WEIGHT": weight}, world="validation"
+            plan_continuous_with, arguments={"RISK_WEIGHT": weight}, world="validation"
         )
         for weight in RISK_WEIGHTS
     },
