@@ -7,7 +7,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from functools import partial
 
 import nbformat
@@ -17,6 +16,7 @@ from filelock import FileLock
 
 from affordlib.results import read_results, write_results
 from affordlib.workbook import WorkbookError, cleaned, default_parameters, fitting, literal, main
+from tests.waiting import wait_until
 
 PARAMETERS = "seed = 0\nout_dir = {lab!r}\nn = 2\nrate = 0.5\nmodes = ['full']"
 # A notebook of these books writes its results by hand, to spare the import of pandas.
@@ -200,13 +200,6 @@ def test_a_failing_notebook_stops_the_batch_and_a_rerun_goes_on(book, capsys, co
     assert "[1/3] 01_first: skipped: complete" in capsys.readouterr().out
 
 
-def wait_for(what):
-    deadline = time.monotonic() + 60
-    while not what():
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
 def test_a_killed_run_counts_as_nothing_and_is_taken_up_again(book, capsys, how):
@@ -223,7 +216,7 @@ def test_a_killed_run_counts_as_nothing_and_is_taken_up_again(book, capsys, how)
     heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
     process = subprocess.Popen(book.command(), stderr=subprocess.PIPE, text=True, preexec_fn=heed)
     try:
-        wait_for(lambda: pid.exists() and pid.read_text() and process.poll() is None)
+        wait_until(lambda: pid.exists() and pid.read_text() and process.poll() is None)
     finally:
         process.send_signal(how)
         _, err = process.communicate(timeout=60)
@@ -232,7 +225,7 @@ def test_a_killed_run_counts_as_nothing_and_is_taken_up_again(book, capsys, how)
     else:
         assert process.returncode == 128 + how
         assert re.fullmatch("workbook: interrupted; .*the same command goes on", err.strip())
-    wait_for(lambda: not psutil.pid_exists(int(pid.read_text())))  # no kernel outlives its runner
+    wait_until(lambda: not psutil.pid_exists(int(pid.read_text())))  # no kernel outlives its runner
     go.touch()
     assert book.run() == 0
     assert book.log() == ["01_first", "02_second"]

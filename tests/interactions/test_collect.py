@@ -23,6 +23,7 @@ from affordlib.interactions.recipes import Recipe
 from affordlib.interactions.store import dataset_sha256, open_interactions, stored_sha256
 from affordlib.workers import dask_client
 from experiments import shipped
+from tests.waiting import wait_until
 
 SMALL = Recipe(n_interactions=6, seed=11)
 ROOT = Path(affordlib.__file__).parents[1]
@@ -153,20 +154,12 @@ def start(*arguments, **options):
     return subprocess.Popen(command, preexec_fn=heed, cwd=ROOT, text=True, **pipes | options)
 
 
-def wait_for(what, process):
-    deadline = time.monotonic() + 120
-    while not what():
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_a_collector_killed_at_any_moment_is_no_loss(undisturbed, tmp_path, seed):
     path = tmp_path / "set.zarr.zip"
     process = start("-c", SCRIPT, path, 6, 1 + seed % 2)
-    wait_for(lambda: list(tmp_path.glob(".set*.parts")), process)
+    wait_until(lambda: list(tmp_path.glob(".set*.parts")), 120, process)
     time.sleep(random.Random(seed).uniform(0, 3))
     family = psutil.Process(process.pid).children(recursive=True)
     process.kill()
@@ -204,7 +197,7 @@ def test_a_script_with_workers_needs_no_guard(undisturbed, tmp_path):
 @pytest.mark.slow
 def test_ctrl_c_ends_collecting_with_one_error(tmp_path):
     process = start("-c", SCRIPT, tmp_path / "set.zarr.zip", 100, 2)
-    wait_for(lambda: list(tmp_path.glob(".set*.parts/*.zip")), process)
+    wait_until(lambda: list(tmp_path.glob(".set*.parts/*.zip")), 120, process)
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does
     _, err = process.communicate(timeout=60)
     assert process.returncode == -signal.SIGINT
@@ -219,7 +212,7 @@ def test_ctrl_c_ends_collecting_with_one_error(tmp_path):
 def test_make_data_is_ended_with_one_line(tmp_path):
     arguments = ["data", "--only", "push", "--to", tmp_path, "--workers", "2"]
     process = start("-m", "experiments.shipped", *arguments)
-    wait_for(lambda: list(tmp_path.glob(".push*.parts/lock")), process)
+    wait_until(lambda: list(tmp_path.glob(".push*.parts/lock")), 120, process)
     time.sleep(2)
     family = psutil.Process(process.pid).children(recursive=True)
     process.terminate()

@@ -24,6 +24,7 @@ import pytest
 
 from affordlib.paths import repo_root
 from affordlib.workbook import WIDGET
+from tests.waiting import wait_until
 
 CHROMIUM = shutil.which("chromium")
 FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"]
@@ -86,8 +87,7 @@ def serve(folder, name, more_cells=(), **parameters):
         )
         address = f"http://127.0.0.1:{port}"
         try:
-            wait_until(lambda: server.poll() is not None or answers(f"{address}/api"), 60)
-            assert server.poll() is None, (folder / "lab.log").read_text()
+            wait_until(lambda: answers(f"{address}/api"), 60, server, f"see {folder / 'lab.log'}")
             url = f"{address}/doc/tree/{name}.ipynb?token={token}"
             yield SimpleNamespace(address=address, url=url, notebook=file, out=out)
         finally:
@@ -212,15 +212,8 @@ def words(page):
     return page.locator(".affordlib-picker [role=status]").inner_text()
 
 
-def wait_until(condition, seconds=20, otherwise="waited in vain"):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, otherwise
-        time.sleep(0.05)
-
-
 def wait_for_words(page, text, seconds=40):
-    wait_until(lambda: text in words(page), seconds, f"waited for {text!r}")
+    wait_until(lambda: text in words(page), seconds, otherwise=f"waited for {text!r}")
 
 
 def assert_same_goal(page, table, x_m, y_m, within_m=0.0011):

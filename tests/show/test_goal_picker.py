@@ -15,6 +15,7 @@ from affordlib.show.executors import closed_loop, open_loop
 from affordlib.types import Goal
 from affordlib.world import BASE_X_M, REACH_M, Cuboid
 from tests.problems import problem_of
+from tests.waiting import wait_until
 
 
 @pytest.fixture
@@ -55,13 +56,6 @@ def posed(make_picker, skills):
     planners = {"continuous": skills.planner(plan_continuous)}
     executors = {"open loop": open_loop, "closed loop": closed_loop(skills)}
     return make_picker(planners=planners, executors=executors)
-
-
-def wait_until(condition, seconds=20.0):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.005)
 
 
 def want(picker, x_m, y_m, number):
