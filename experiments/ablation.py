@@ -21,10 +21,8 @@ from affordlib.models.film import FiLMNetwork
 from affordlib.models.protocol import condition_on_final_effect
 from affordlib.models.training import final_errors_m, train
 from affordlib.types import Observations
-from experiments.runner import study
+from experiments.runner import Rows, study
 from experiments.shipped import CHECKPOINT_SPECS
-
-Rows = list[dict[str, Any]]
 
 
 def random_contexts(

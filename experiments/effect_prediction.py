@@ -37,7 +37,7 @@ from experiments.cross_validation import (
     job,
 )
 from experiments.grasps import grasp_rows, roc_rows, threshold_rows
-from experiments.runner import FOLDER, Result, frame, read
+from experiments.runner import FOLDER, Result, Rows, frame, read
 
 NAME = "effect_prediction"
 SAME_TRUTH = 1e-6
@@ -45,7 +45,6 @@ SAME_TRUTH = 1e-6
 collected again, by another processor, has another hash, but the same effects."""
 
 CALIBRATION = ["coverage_50", "coverage_90", "std_mean", "nll"]
-Rows = list[dict[str, Any]]
 
 
 def sorted_results(folder: str | Path = FOLDER) -> list[Result]:
@@ -157,19 +156,12 @@ FRAMES = {
 
 def of_shared_folds(results: list[Result], models: Iterable[str], part: str) -> pd.DataFrame:
     """Tests of some models of all pushes, of the folds and seeds that all of them have."""
-    folds = {
-        model: {
-            (about["fold"], about["seed"])
-            for about, _ in results
-            if (about["model"], about["data"], about["n"]) == (model, "push", "all")
-        }
-        for model in models
-    }
-    shared = set.intersection(*folds.values())
-    every = [
-        r for r in results if r[0]["model"] in folds and (r[0]["fold"], r[0]["seed"]) in shared
-    ]
-    every = [r for r in every if (r[0]["data"], r[0]["n"]) == ("push", "all")]
+    folds: dict[str, dict[tuple[int, int], Result]] = {m: {} for m in MODELS if m in models}
+    for about, result in results:
+        if about["model"] in folds and (about["data"], about["n"]) == ("push", "all"):
+            folds[about["model"]][about["fold"], about["seed"]] = about, result
+    shared = set.intersection(*map(set, folds.values()))
+    every = [of[key] for of in folds.values() for key in of if key in shared]
     return predictions_of(every, "push", part)
 
 

@@ -16,11 +16,10 @@ import pandas as pd
 from scipy import stats
 
 from affordlib.primitives import Grasp
+from experiments.runner import Rows
 
 GOAL_TP, GOAL_TN = 0.90, 0.95
 """Shares of the successes and failures that we would like to be predicted."""
-
-Rows = list[dict[str, Any]]
 
 
 def wilson(k: int, n: int) -> tuple[float, float]:

@@ -39,14 +39,12 @@ from experiments.lever_cross_validation import (
     job,
 )
 from experiments.lstm_seker2019 import EPOCHS
-from experiments.runner import FOLDER, Result, open_once, read
+from experiments.runner import FOLDER, Result, Rows, open_once, read
 
 NAME = "lever_up"
 OURS = "cnp_last_pose"
 RESTS_CM = 0.5
 """An object rests in a window where it moves by less, from the last observed step to the end."""
-
-Rows = list[dict[str, Any]]
 
 
 def sorted_results(folder: str | Path = FOLDER) -> list[Result]:

@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import torch
@@ -24,9 +23,7 @@ from affordlib.planning.reachability import Reachability
 from affordlib.primitives import PRIMITIVES, Drag, Grasp, Push, Rotate
 from affordlib.world import Tabletop
 from experiments.planning import POSITION_ERROR_M, YAW_ERROR_RAD
-from experiments.runner import study
-
-Rows = list[dict[str, Any]]
+from experiments.runner import Rows, study
 
 N_PUSHES, REPEATS = 200, 3
 WHOLE_ACTION_MODELS = ("film_500", "film_5000", "drag_film_500")

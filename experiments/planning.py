@@ -47,13 +47,12 @@ from affordlib.types import Outcome, Plan, Step
 from affordlib.world import Tabletop, UnreachableError
 from experiments import reported, runner
 from experiments.oracle import oracle_effects
-from experiments.runner import FOLDER, Job
+from experiments.runner import FOLDER, Job, Rows
 
 POSITION_ERROR_M, YAW_ERROR_RAD = 0.001, math.radians(1.0)
 GROUPS = {"all": STANDING + ROLLABLE, "standing": STANDING, "rollable": ROLLABLE} | {
     name: (name,) for name in STANDING + ROLLABLE
 }
-Rows = list[dict[str, Any]]
 FINE_PHASES = tuple(round(0.5 + 0.05 * k, 2) for k in range(1, 11))
 
 

@@ -28,10 +28,8 @@ from affordlib.models.push_frame import inverse, push_direction, rotate_observat
 from affordlib.models.training import final_errors_m, train_model
 from affordlib.perception import looks_rollable
 from affordlib.types import Observations
-from experiments.runner import study
+from experiments.runner import Rows, study
 from experiments.shipped import CHECKPOINT_SPECS
-
-Rows = list[dict[str, Any]]
 
 TRAINING = replace(CHECKPOINT_SPECS["film_500"].training, steps=1500)
 """Of `push_and_drag_model` and `perturbed_world`; shorter than that of the shipped networks."""

@@ -51,6 +51,7 @@ NOT_DECISIVE = ("device", "max_minutes", "sigma_scale")
 open_once = lru_cache(maxsize=4)(open_interactions)
 """A data set by its name, kept open from job to job."""
 
+Rows = list[dict[str, Any]]
 Result = tuple[dict[str, Any], Any]
 """The arguments of a job, and what its function returned."""
 

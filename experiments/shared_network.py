@@ -33,7 +33,7 @@ from affordlib.models.film import FiLMConfig
 from affordlib.models.training import train
 from affordlib.primitives import Grasp
 from experiments.cross_validation import TASKS, add_errors, job, prediction_columns
-from experiments.runner import open_once, run, study
+from experiments.runner import Rows, open_once, run, study
 from experiments.shipped import CHECKPOINT_SPECS
 
 PRIMITIVES = ("push", "drag", "grasp", "rotate")
@@ -49,7 +49,6 @@ SEPARATE_JOBS = {
     name: [job("film", name, fold=fold) for fold in range(FOLDS)] for name in PRIMITIVES
 }
 SHARED, SEPARATE = "shared network", "separate networks"
-Rows = list[dict[str, Any]]
 
 
 def with_copies(arrays: InteractionTensors, primitive: str) -> InteractionTensors:

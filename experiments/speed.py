@@ -48,9 +48,9 @@ from affordlib.results import read_results, write_results
 from affordlib.types import Observations
 from affordlib.world import Tabletop
 from experiments import lstm_seker2019
+from experiments.runner import Rows
 
 RESULTS = "data/results/speed.json"
-Rows = list[dict[str, Any]]
 
 
 def seconds(work: Callable[[], object], repeats: int = 1) -> float:

@@ -14,17 +14,14 @@ import inspect
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from affordlib.commands import command
-from experiments.runner import FOLDER, STUDIES, Job, read, run
+from experiments.runner import FOLDER, STUDIES, Job, Rows, read, run
 
 NAME = "studies"
 MODULES = ("ablation", "representation", "uncertainty", "shared_network", "limits")
 for module in (*MODULES, "lever_cross_validation"):
     importlib.import_module(f"experiments.{module}")
-
-Rows = list[dict[str, Any]]
 
 
 def job(study: str) -> Job:

@@ -25,7 +25,7 @@ from affordlib.models.calibration import AFTER_CONTACT, LEVELS, calibration_rows
 from affordlib.models.checkpoint import load_checkpoint
 from affordlib.models.training import final_errors_m, train_model
 from experiments.representation import TRAINING
-from experiments.runner import study
+from experiments.runner import Rows, study
 from experiments.shipped import CHECKPOINT_SPECS
 
 CHECKPOINTS = ("film_500", "cnp_500", "drag_film_500")
@@ -33,8 +33,6 @@ CHECKPOINTS = ("film_500", "cnp_500", "drag_film_500")
 
 TEST_SETS = {"push": "push_test"}
 """A set that has none is tested on the test part of its fold 0."""
-
-Rows = list[dict[str, Any]]
 
 PERTURBED_FOLDS = 3
 NETWORK = CHECKPOINT_SPECS["film_500"].network
