@@ -100,13 +100,13 @@ def collect(
 ) -> str | Path:
     """Collect a recipe into a local file and return its path, which ends in .zarr.zip.
 
-    client: of Dask; None means `workers` processes of this machine. A rerun makes what is missing;
+    client: of Dask; None means `workers` processes here, at most 256. A rerun makes what is missing;
     a whole file is made again only with `replace`. Raises ValueError for a path where anything else
     is, RuntimeError while another process collects into it, and when a chunk cannot be made.
     """
     if not str(path).endswith(SUFFIX):
         raise ValueError(f"path must end in {SUFFIX!r}, got {str(path)!r}")
-    check_count("workers", workers)
+    check_count("workers", workers, 1, 256)
     if client is None and workers > 1:
         with dask_client(workers) as local:
             return collect(recipe, path, local, progress=progress, replace=replace)
