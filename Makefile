@@ -35,7 +35,7 @@ unexport PYTHONPATH PYTHONHOME PYTHONSTARTUP VIRTUAL_ENV MPLBACKEND
 unexport PIP_USER PIP_TARGET PIP_PREFIX PIP_REQUIREMENT PIP_CONSTRAINT
 unexport PYTEST_ADDOPTS JUPYTER_PATH JUPYTER_TOKEN
 
-.PHONY: help setup workbook seeds lab test test-fast test-plain test-slow soak size lint format bench data checkpoints notebooks html tables \
+.PHONY: help setup workbook seeds lab test test-fast test-plain test-slow soak size book-check lint format bench data checkpoints notebooks html tables \
         constraints clean
 
 help: ## List the targets
@@ -107,6 +107,9 @@ soak: $(STAMP) ## Plan and execute 3,000 times: memory must stay, and the same t
 
 size: $(STAMP) ## Count lines and files, and fail above the budgets
 	@$(PY) -m tests.size
+
+book-check: $(STAMP) ## Measure every page of the book, and fail on what its style does not allow
+	@$(PY) -m tests.book_check
 
 lint: $(STAMP) ## Check style and formatting
 	@$(PY) -m ruff check

@@ -1,6 +1,7 @@
 """Every notebook: as it is committed, and run once with the values of the smoke profile."""
 
 import ast
+import base64
 import itertools
 import os
 import re
@@ -17,6 +18,7 @@ from affordlib.paths import repo_root
 from affordlib.results import read_results, results_table
 from affordlib.show import GOAL, PREDICTION, TRUTH
 from affordlib.workbook import WIDGET, cleaned, default_parameters, make_jobs, notebook_paths
+from tests import book_check
 
 ROOT = repo_root()
 PATHS = notebook_paths(ROOT)
@@ -216,16 +218,6 @@ def test_everything_shown_shows_on_the_web(name):
 
 
 @each_notebook
-def test_cells_are_short_and_never_empty(name):
-    for number, cell in enumerate(read(name).cells, 1):
-        assert cell.source.strip(), f"cell {number} of {name} is empty"
-        if cell.cell_type == "code" and "hide-input" not in cell.metadata.get("tags", []):
-            imports = re.match(r"(?:(?:import|from) .*\n(?:    .*\n|\)\n)*|\n)*", cell.source)
-            lines = cell.source[imports.end() :].count("\n") + 1
-            assert lines <= 30, f"cell {number} of {name} has {lines} lines"
-
-
-@each_notebook
 def test_nothing_depends_on_the_machine(name):
     for number, cell in enumerate(read(name).cells, 1):
         outputs = [
@@ -241,12 +233,32 @@ def test_nothing_depends_on_the_machine(name):
             assert "filterwarnings" not in cell.source
 
 
-@each_notebook
-def test_links_lead_somewhere(name):
-    text = "\n".join(cell.source for cell in read(name).cells if cell.cell_type == "markdown")
-    for link in re.findall(r"\]\(([^)\s#]+)", text):
-        if "://" not in link and not link.startswith("attachment:"):
-            assert (PATHS[name].parent / link).exists(), f"{name} links to {link}"
+def test_the_book_keeps_to_its_style():
+    assert book_check.check()[1] == []
+
+
+BAD = (
+    """It foresees $t$ by CRPS, see [there](no.md) and [here](README.md#nowhere) and `anew`.
+| a | b |
+| --- | --- |
+"""
+    + 9 * "| 1 | 2 |\n"
+)
+
+
+def test_what_the_style_does_not_allow_is_found():
+    wrong = " ".join(book_check.faults(ROOT / "README.md", BAD))
+    for what in ("'foresees'", "CRPS", "no.md is dead", "README.md#nowhere is dead"):
+        assert what in wrong
+    assert "anew" not in wrong
+    folded = nbformat.v4.new_code_cell("\n".join(40 * "a"), metadata={"tags": ["hide-input"]})
+    picture = {"image/png": base64.b64encode(b"\x89PNG" + 12 * b"-" + b"\0\0\x04\0" * 2).decode()}
+    shown = [nbformat.v4.new_output("display_data", picture)]
+    cells = [nbformat.v4.new_markdown_cell(BAD), folded]
+    cells.append(nbformat.v4.new_code_cell("a\n\nb", outputs=shown))
+    found = book_check.measure(nbformat.v4.new_notebook(cells=cells))
+    wanted = {"words": 9, "cells": 3, "tables": 1, "rows": 9, "code": 2, "figures": 1, "px": 1024}
+    assert found.items() >= (wanted | {"no alt": 1, "private": 1, "minutes": 1}).items()
 
 
 @pytest.mark.parametrize(
