@@ -100,9 +100,10 @@ def collect(
 ) -> str | Path:
     """Collect a recipe into a local file and return its path, which ends in .zarr.zip.
 
-    client: of Dask; None means `workers` processes here, at most 256. A rerun goes on;
-    a whole file is made again only with `replace`. Raises ValueError for a path where anything else
-    is, RuntimeError while another process collects into it, and when a chunk cannot be made.
+    client: of Dask; None means `workers` processes of this machine, at most 256. A rerun makes what
+    is missing; a whole file is made again only with `replace`. Raises ValueError for a path where
+    anything else is, RuntimeError while another process collects into it, and when a chunk cannot
+    be made.
     """
     if not str(path).endswith(SUFFIX):
         raise ValueError(f"path must end in {SUFFIX!r}, got {str(path)!r}")
