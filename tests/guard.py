@@ -40,25 +40,6 @@ from affordlib.types import Observations
 from affordlib.world import Tabletop
 
 N_INTERACTIONS, N_GOALS = 3, 20
-FORMER_NAMES = {
-    "cnp_500": "push_cnp",
-    "film_500": "push_film",
-    "film_5000": "push_film_x10",
-    "film_5000_perturbed": "push_film_varied",
-    "attention_500": "push_attention",
-    "lstm_500": "push_lstm",
-    "drag_film_500": "drag_film",
-    "grasp_film_1000": "grasp_film",
-    "grasp_film_1000_firm": "grasp_film_firm",
-    "rotate_film_1000": "rotate_film",
-    "lever_up_last_pose_1800": "lever_anchored",
-    "lever_up_lstm_1800_window": "lever_lstm_window",
-    "lever_up_lstm_1800_first_step": "lever_lstm_first_step",
-}
-"""Checkpoints by what they were called when the first guard was written."""
-
-FORMER = {"open_loop_pose_goals": "whole_plans"}
-"""What was called something else when the entries were written down."""
 
 
 def collected() -> dict[str, list[float]]:
@@ -85,10 +66,9 @@ def predicted() -> dict[str, list[float]]:
     for path in sorted((repo_root() / "data" / "checkpoints").glob("*.safetensors")):
         if path.stem in ("reachability", "np_simulated_pushes"):
             continue
-        name = FORMER_NAMES[path.stem]
-        model, kind = load_checkpoint(path)[0], name.split("_")[0]
-        data = levers
+        model, data, kind = load_checkpoint(path)[0], levers, path.stem.split("_")[0]
         if kind != "lever":
+            kind = kind if kind in ("drag", "grasp", "rotate") else "push"
             channels = model.action_channels, model.effect_channels
             data = InteractionTensors.from_dataset(open_interactions(kind), rows, *channels)
         at = torch.tensor([0, data.phase.shape[-1] - 1])
@@ -100,7 +80,7 @@ def predicted() -> dict[str, list[float]]:
             features = model.encode(data.image[:4].float())
             answer = model.predict(features, seen, torch.linspace(0.5, 1, 5).expand(4, 5))
         values = [getattr(answer, field.name).ravel() for field in fields(answer)]
-        found[f"predicted {name}"] = torch.cat(values).tolist()
+        found[f"predicted {path.stem}"] = torch.cat(values).tolist()
     xy = np.stack(np.meshgrid(np.linspace(-0.5, 0.7, 5), np.linspace(-0.7, 0.7, 5)), -1)
     for name in ("push", "drag", "grasp", "rotate"):
         turn = 0.3 if name in ("push", "drag") else None
@@ -146,7 +126,7 @@ def tabled() -> dict[str, list[float]]:
                 numbers.append(float(value))
 
         gather(json.loads(path.read_text()))
-        found[f"tabled {FORMER.get(path.stem, path.stem)}"] = sorted(numbers)
+        found[f"tabled {path.stem}"] = sorted(numbers)
     return found
 
 
