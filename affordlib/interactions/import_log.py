@@ -8,11 +8,8 @@ images/NAME.png      NAME is the entry in the column interaction: depth seen fro
                      a plane 1 m above the table (so the table is 10000)
 images/NAME_mask.png the object, 8 bits, white where it fills the pixel; where there is none,
                      all that is higher than 2 mm is taken for the object
-
-Likewise the lever-ups of Seker, Tekden and Ugur (2019): see `read_trajectories`.
 """
 
-import io
 from pathlib import Path
 
 import numpy as np
@@ -21,16 +18,9 @@ import torch
 from PIL import Image
 
 from affordlib.interactions.dataset import InteractionTensors
-from affordlib.interactions.lever_up import LEVER_ACTION_CHANNELS, POSE_CHANNELS, select_view
-from affordlib.types import (
-    ACTION_CHANNELS,
-    EFFECT_CHANNELS,
-    IMAGE_PIXELS,
-    LEVER_IMAGE_PIXELS,
-    check_count,
-)
+from affordlib.types import ACTION_CHANNELS, EFFECT_CHANNELS, IMAGE_PIXELS, check_count
 
-TABLE, IMAGES, POSES = "trajectories.csv", "images", "trajectories"
+TABLE, IMAGES = "trajectories.csv", "images"
 DEPTH_UNIT_M = 1e-4
 TABLE_DEPTH_M = 1.0
 _HIGHER_M = 0.002
@@ -117,12 +107,13 @@ def _columns(path: Path, table: pd.DataFrame) -> list[list[str]]:
     return found
 
 
-def _pixels(path: Path, n: int, mode: str | None = None) -> np.ndarray:
-    """The values (n, n) of an image, converted to a mode of Pillow if one is given."""
+def _pixels(path: Path) -> np.ndarray:
+    """The values (48, 48) of an image."""
+    n = IMAGE_PIXELS
     if not path.is_file():
         raise FileNotFoundError(f"there is no image {path} of the interaction of that name")
     with Image.open(path) as file:
-        values = np.asarray(file.convert(mode) if mode else file)
+        values = np.asarray(file)
     if values.shape != (n, n):
         raise ValueError(f"{path} must be a gray image of {n}×{n} pixels, got {values.shape}")
     return values
@@ -130,88 +121,17 @@ def _pixels(path: Path, n: int, mode: str | None = None) -> np.ndarray:
 
 def _read_depth(path: Path) -> np.ndarray:
     """Depth [m] and mask (2, 48, 48)."""
-    units, mask_path = _pixels(path, IMAGE_PIXELS), path.with_name(f"{path.stem}_mask.png")
+    units, mask_path = _pixels(path), path.with_name(f"{path.stem}_mask.png")
     if not np.issubdtype(units.dtype, np.integer) or units.max() <= 255:
         got = f"{units.dtype}, at most {units.max()}"
         raise ValueError(f"{path} must hold depth in 16 bits of 0.1 mm, got {got}")
     depth = units * DEPTH_UNIT_M
     if not mask_path.is_file():
         return np.stack([depth, TABLE_DEPTH_M - depth > _HIGHER_M]).astype(np.float32)
-    mask = _pixels(mask_path, IMAGE_PIXELS)
+    mask = _pixels(mask_path)
     if mask.dtype != np.uint8 or 0 < mask.max() < 128:
         got = f"{mask.dtype}, at most {mask.max()}"
         raise ValueError(
             f"{mask_path} must have 8 bits, white (255) where the object is, got {got}"
         )
     return np.stack([depth, mask / 255.0]).astype(np.float32)
-
-
-def read_trajectories(folder: str | Path, view: str = "full") -> InteractionTensors:
-    """Lever-ups in the layout of Seker, Tekden and Ugur (2019).
-
-    folder/trajectories/NAME.txt: one row a step, as many in every file, of six numbers x y z [m]
-    roll pitch yaw [rad] of the object in the frame of the lever, separated by blanks or commas;
-    folder/images/NAME.png (or .jpg, .pgm): gray, 128×128, moved and turned by contact point and
-    direction, the object darker or brighter than the table, whose gray is that of the border.
-    view: of the image, see `lever_up_tensors`.
-
-    Poses become changes since the first row, tilt is the angle of the upright axis. That layout
-    has no commanded action, so both of its channels are zero. The image's first channel is the
-    gray value in [0, 1], the second the mask.
-    """
-    folder = Path(folder)
-    files = sorted((folder / POSES).glob("*.txt"))
-    if not files:
-        raise FileNotFoundError(
-            f"folder: {folder} has no file {POSES}/*.txt; expected are {POSES}/NAME.txt "
-            f"with six numbers a row and {IMAGES}/NAME.png beside it"
-        )
-    poses = [_read_poses(file) for file in files]
-    for file, rows in zip(files, poses, strict=True):
-        if len(rows) != len(poses[0]):
-            expected = f"expected {len(poses[0])} as in {files[0].name}"
-            raise ValueError(f"{file} has {len(rows)} rows, {expected}")
-    xyz, roll, pitch, _ = np.split(np.stack(poses), (3, 4, 5), axis=-1)
-    tilt = np.arccos(np.clip(np.cos(roll) * np.cos(pitch), -1, 1))
-    since_start = np.concatenate([xyz - xyz[:, :1], tilt - tilt[:, :1]], axis=-1)
-    images = np.stack([_read_gray(folder / IMAGES, file.stem) for file in files])
-    effect = torch.from_numpy(since_start).float()
-    return InteractionTensors(
-        select_view(torch.from_numpy(images), view),
-        torch.linspace(0, 1, effect.shape[1]),
-        torch.zeros(*effect.shape[:2], len(LEVER_ACTION_CHANNELS)),
-        effect,
-        LEVER_ACTION_CHANNELS,
-        POSE_CHANNELS,
-    )
-
-
-def _read_poses(file: Path) -> np.ndarray:
-    """Rows (n, 6) of a file of poses."""
-    try:
-        poses = np.loadtxt(io.StringIO(file.read_text().replace(",", " ")), ndmin=2)
-    except ValueError as error:
-        raise ValueError(f"{file}: every row must hold six numbers ({error})") from None
-    if poses.shape[1] != 6 or not np.isfinite(poses).all():
-        raise ValueError(f"{file}: every row must hold six finite numbers, got {poses.shape}")
-    return poses
-
-
-def _read_gray(folder: Path, name: str) -> np.ndarray:
-    """Gray values in [0, 1] and mask (2, 128, 128) of an image."""
-    files = [folder / f"{name}{ending}" for ending in (".png", ".jpg", ".pgm")]
-    file = next((file for file in files if file.is_file()), files[0])
-    gray = _pixels(file, LEVER_IMAGE_PIXELS, "L").astype(np.float32) / 255
-    table = np.median(np.concatenate([gray[0], gray[-1], gray[:, 0], gray[:, -1]]))
-    return np.stack([gray, (np.abs(gray - table) > 0.1).astype(np.float32)])
-
-
-def write_trajectories(folder: str | Path, poses: np.ndarray, images: np.ndarray) -> None:
-    """Write poses (N, S, 6) and gray images (N, 128, 128) in [0, 1] for `read_trajectories`."""
-    folder = Path(folder)
-    for kind in (POSES, IMAGES):
-        (folder / kind).mkdir(parents=True, exist_ok=True)
-    for number, (rows, gray) in enumerate(zip(poses, images, strict=True)):
-        np.savetxt(folder / POSES / f"{number:04}.txt", rows, fmt="%.6f")
-        picture = Image.fromarray((255 * np.clip(gray, 0, 1)).round().astype(np.uint8))
-        picture.save(folder / IMAGES / f"{number:04}.png")

@@ -9,15 +9,7 @@ import torch
 from PIL import Image
 
 from affordlib.interactions import InteractionTensors
-from affordlib.interactions.import_log import (
-    TABLE,
-    read_log,
-    read_trajectories,
-    write_log,
-    write_trajectories,
-)
-from affordlib.interactions.lever_up import POSE_CHANNELS
-from affordlib.models.lever_up import fit_lever_model, window_errors_m
+from affordlib.interactions.import_log import TABLE, read_log, write_log
 from affordlib.models.training import final_errors_m
 
 CHANNELS = ("x", "y"), ("x", "y", "yaw")
@@ -112,58 +104,3 @@ def test_names_are_names_and_angles_go_around(some, folder):
     yaw = read_log(folder, n_samples=301).effect[..., 2]
     expected = some.effect[..., 2] + np.pi - 0.01
     torch.testing.assert_close(yaw, expected, atol=1e-5, rtol=0)
-
-
-# The layout of Seker et al.
-
-
-@pytest.fixture
-def older(tmp_path):
-    """Two trajectories of 26 poses and their images."""
-    poses, gray = np.zeros((2, 26, 6)), np.full((2, 128, 128), 0.8)
-    poses[..., 0], poses[..., 4] = np.linspace(0.3, 0.4, 26), np.linspace(0, 1.0, 26)
-    gray[:, 40:80, 64:100] = np.random.default_rng(0).uniform(0.2, 0.4, (2, 40, 36))
-    write_trajectories(tmp_path, poses, gray)
-    return tmp_path
-
-
-def test_the_older_layout_is_read(older):
-    tensors = read_trajectories(older)
-    assert tensors.effect_channels == POSE_CHANNELS
-    assert tensors.effect.shape == (2, 26, 4)
-    torch.testing.assert_close(tensors.effect[0, -1], torch.tensor([0.1, 0.0, 0.0, 1.0]))
-    assert tensors.image[:, 1].sum(dim=(1, 2)).tolist() == [40 * 36] * 2
-
-
-@pytest.mark.parametrize(("name", "kind"), [("cnp_last_pose", "all"), ("lstm_tuned", "window")])
-@pytest.mark.parametrize("steps", [26, 41])
-def test_the_older_layout_is_learned_from(tmp_path, short, name, kind, steps):
-    poses, gray = np.zeros((8, steps, 6)), np.full((8, 128, 128), 0.8)
-    poses[..., 2] = np.linspace(0.0, 0.2, steps)
-    gray[:, 40:80, 64:100] = np.random.default_rng(1).uniform(0.2, 0.4, (8, 40, 36))
-    write_trajectories(tmp_path, poses, gray)
-    tensors = read_trajectories(tmp_path, view="wide")
-    assert tensors.image.shape == (8, 2, 48, 48)
-    model, history = fit_lever_model(short(name), tensors, tensors, kind)
-    assert len(history) == 2
-    assert window_errors_m(model, tensors).shape == (8, steps - 19, 5)
-
-
-@pytest.mark.parametrize(
-    ("spoil", "reason"),
-    [
-        (lambda f: (f / "images" / "0001.png").unlink(), "no image .*0001.png"),
-        (lambda f: (f / "trajectories" / "0001.txt").write_text("1 2 3\n"), "six finite numbers"),
-        (
-            lambda f: (f / "trajectories" / "0001.txt").write_text("1 2 x 4 5 6\n"),
-            "0001.txt: every row",
-        ),
-        (lambda f: (f / "trajectories" / "0001.txt").write_text("0 0 0 0 0 0\n"), "has 1 rows"),
-        (lambda f: [p.unlink() for p in (f / "trajectories").iterdir()], "no file trajectories"),
-        (lambda f: Image.new("L", (9, 9)).save(f / "images" / "0001.png"), "128×128 pixels"),
-    ],
-)
-def test_what_is_wrong_with_the_older_layout_is_said(older, spoil, reason):
-    spoil(older)
-    with pytest.raises((ValueError, FileNotFoundError), match=reason):
-        read_trajectories(older)
