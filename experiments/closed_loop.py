@@ -89,7 +89,6 @@ SMALLEST_M2 = 0.001
 """Smaller footprints, of a prism, are drawn again: models refuse what is much smaller than what
 they were trained on."""
 
-REACH_BY = ("both", "learned", "kinematics")
 PLANNERS = {"astar": plan_astar, "continuous": plan_continuous}
 TOLERANCE_M = dict.fromkeys(POSE_PRIMITIVES, 0.004)
 """Of the position, where it is not 2 mm; gripping shifts objects."""
@@ -165,29 +164,20 @@ def _clean_trial(table: str, index: int, seed: int) -> Trial:
 
 
 @cache
-def _tabletop_and_skills(world: str = "clean", reach_by: str = "both") -> tuple[Tabletop, Skills]:
+def _tabletop_and_skills(world: str = "clean") -> tuple[Tabletop, Skills]:
     """One of each for a process."""
     skills = Skills.load()
     if world == "perturbed":
         push = load_checkpoint(PERTURBED_PUSHES)[0]
         skills = replace(skills, models=skills.models | {"push": push})
-    if reach_by == "kinematics":
-        skills = replace(skills, reachability=None)
     return Tabletop(), skills
 
 
-def run_trial(
-    table: str, index: int, seed: int = 0, world: str = "clean", reach_by: str = "both"
-) -> dict[str, Any]:
-    """The record of a trial: how it ended, and whether it could be done.
-
-    reach_by: who says where the arm can act: the learned model, the kinematics, or both.
-    """
-    tabletop, skills = _tabletop_and_skills(world, reach_by)
+def run_trial(table: str, index: int, seed: int = 0, world: str = "clean") -> dict[str, Any]:
+    """The record of a trial: how it ended, and whether it could be done."""
+    tabletop, skills = _tabletop_and_skills(world)
     trial = sample_trial(table, index, seed, world)
     robot = DisturbanceSchedule(tabletop, trial.goal, trial.disturbances)
-    if reach_by == "learned":
-        robot.can_reach = lambda *_: True
 
     def pursue(goal: Goal | Callable[[], Goal], robot: Robot) -> tuple[ClosedLoopResult, dict]:
         trial.place(tabletop)
@@ -418,11 +408,10 @@ OPEN_LOOP_ROWS: dict[str, Callable[[Rows], Rows]] = {
 }
 
 
-def job(table: str, index: int, seed: int, world: str = "clean", reach_by: str = "both") -> Job:
+def job(table: str, index: int, seed: int, world: str = "clean") -> Job:
     """One trial of the closed loop."""
     arguments: dict[str, Any] = {"table": table, "index": index, "seed": seed}
     arguments |= {"world": world} if world != "clean" else {}
-    arguments |= {"reach_by": reach_by} if reach_by != "both" else {}
     used = ("push", "drag", POSE_PRIMITIVES.get(table))
     models = CHECKPOINTS | ({"push": PERTURBED_PUSHES} if world == "perturbed" else {})
     files = tuple(file for kind, file in models.items() if kind in used)
@@ -454,27 +443,11 @@ def tables(name: str, seed: int = 0, folder: str | Path = FOLDER) -> dict[str, R
             made[table] = rows[table](some)
             continue
         for world in WORLDS:
-            run = [r for r in some if _world_and_reach(r) == (world, "both")]
+            run = [r for r in some if r.get("world", "clean") == world]
             if run:
                 new = [{"world": world} | row for row in rows[table](run)]
                 made[table] = made.get(table, []) + new
-    if apart := [record for record in found if record.get("reach_by", "both") != "both"]:
-        made["reachability_by"] = reach_by_rows(found, max(r["index"] for r in apart) + 1)
     return {table: some for table, some in made.items() if some}
-
-
-def _world_and_reach(record: dict[str, Any]) -> tuple[str, str]:
-    return record.get("world", "clean"), record.get("reach_by", "both")
-
-
-def reach_by_rows(records: Rows, n: int) -> Rows:
-    """Rows of the first n goals by who says where the arm can act, in the clean world."""
-    rows = []
-    for by in REACH_BY:
-        some = [r for r in records if r["table"] == "reachability" and r["index"] < n]
-        some = [r for r in some if _world_and_reach(r) == ("clean", by)]
-        rows += [{"reach_by": by} | reachability_rows(some)[0]] if some else []
-    return rows
 
 
 def write_tables(
@@ -499,14 +472,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--n", type=count_type, default=1000, help="trials of each table")
     parser.add_argument("--seed", type=seed_type, default=0)
     parser.add_argument("--worlds", type=names_type(WORLDS), default=list(WORLDS))
-    parser.add_argument("--reach-by", type=names_type(REACH_BY), default=["both"])
     options = parser.parse_args(argv)
     asked = {table: range(min(options.n, n)) for table, n in N_TRIALS.items()}
     trials = [
-        job(t, i, options.seed, world, by)
+        job(t, i, options.seed, world)
         for t in ROWS
         for world in options.worlds
-        for by in (options.reach_by if (t, world) == ("reachability", "clean") else ["both"])
         for i in asked[t]
         if t in options.tables
     ]

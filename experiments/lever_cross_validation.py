@@ -25,7 +25,6 @@ from affordlib.interactions.lever_up import lever_up_tensors
 from affordlib.interactions.recipes import Recipe, sample_scene
 from affordlib.models import lever_up as models
 from affordlib.models.base import EffectNetwork
-from affordlib.models.calibration import LEVELS, coverage
 from affordlib.models.domain import TrainingDomain
 from affordlib.models.lever_up import LEVER_MODELS, PROTOCOLS, LeverModel
 from affordlib.types import Prediction
@@ -106,7 +105,7 @@ def cross_validate(
     epochs: int | None,
     resume_checkpoint: Path,
 ) -> dict[str, Any]:
-    """Errors of every window of every test trajectory, by protocol, and how often σ covers them."""
+    """Errors of every window of every test trajectory, by protocol."""
     data, lever = open_once(DATA), _lever_model(model)
     split = lever_split(data, fold, seed, edges_left_out)
     view = lever.view if lever else "full" if model == "lstm_seker2019" else "near"
@@ -162,7 +161,7 @@ def extrapolate(
 
 
 def _errors(network: EffectNetwork | str, arrays: Any, protocol: str) -> dict[str, Any]:
-    """Errors (N, W, T) [cm] of a network's or baseline's windows, coverage of σ by channel."""
+    """Errors (N, W, T) [cm] of a network's or baseline's windows, to a micrometre, as lists."""
     starts = range(levers.n_windows(arrays) if protocol == "window" else 1)
     if isinstance(network, str):
         found = [extrapolate(network, arrays.effect, protocol, start) for start in starts]
@@ -172,16 +171,7 @@ def _errors(network: EffectNetwork | str, arrays: Any, protocol: str) -> dict[st
             seen = network.encode(arrays.image)
         found = [models.predict_steps(network, arrays, protocol, start, seen) for start in starts]
     errors = torch.stack([100 * models.errors_m(told, truth) for told, truth in found], dim=1)
-    values = [(told.effect_mean, told.effect_std, truth) for told, truth in found]
-    mean, std, truth = (torch.cat(v).flatten(0, 1) for v in zip(*values, strict=True))
-    covered = None
-    if std.min() > 0:
-        covered = {
-            channel: [round(coverage(truth[:, k], mean[:, k], std[:, k], v), 4) for v in LEVELS]
-            for k, channel in enumerate(levers.POSE_CHANNELS)
-        }
-    # Centimetres to a micrometre, as lists.
-    return {"error_cm": errors.double().numpy().round(4).tolist(), "coverage": covered}
+    return {"error_cm": errors.double().numpy().round(4).tolist()}
 
 
 SETTINGS: dict[str, tuple[dict[str, Any], float]] = {

@@ -24,7 +24,6 @@ import numpy as np
 
 from affordlib.commands import command, count_type, names_type, whole_type
 from affordlib.evaluation.metrics import error_row
-from affordlib.interactions.lever_up import POSE_CHANNELS
 from affordlib.models.lever_up import PROTOCOLS, TRAINED_FOR
 from affordlib.results import write_results
 from experiments import reported, runner, studies
@@ -43,8 +42,6 @@ from experiments.runner import FOLDER, Result, Rows, open_once, read
 
 NAME = "lever_up"
 OURS = "cnp_last_pose"
-RESTS_CM = 0.5
-"""An object rests in a window where it moves by less, from the last observed step to the end."""
 
 
 def sorted_results(folder: str | Path = FOLDER) -> list[Result]:
@@ -107,29 +104,6 @@ def unseen_rows(results: list[Result], edges: dict[int, int]) -> Rows:
     return rows
 
 
-def motion_rows(results: list[Result]) -> Rows:
-    """Windows in which the object moves on, and those in which it rests.
-
-    How far it moves is the error of persistence at the last step.
-    """
-    moved = {
-        about["fold"]: np.array(result["window"]["error_cm"])[..., -1]
-        for about, result in results
-        if about["model"] == "persistence" and about["edges_left_out"] is None
-    }
-    rows = []
-    for about, group, errors in _groups(results):
-        if about["protocol"] != "window":
-            continue
-        moves = np.concatenate([moved[of["fold"]] for of, _ in group]) >= RESTS_CM
-        for kind, which in (("moving", moves), ("resting", ~moves)):
-            for k in range(errors.shape[2] if which.any() else 0):
-                chosen = errors[which][:, k]
-                columns = {"n_windows": len(chosen), "mean_cm": float(chosen.mean())}
-                rows.append(about | {"windows": kind, "steps": k + 1} | columns)
-    return rows
-
-
 def paired_rows(results: list[Result], n_draws: int = 2000) -> Rows:
     """Ours minus each of the recurrent ones, object by object, with bootstrapped 95 % intervals.
 
@@ -157,20 +131,6 @@ def paired_rows(results: list[Result], n_draws: int = 2000) -> Rows:
     return rows
 
 
-def coverage_rows(results: list[Result]) -> Rows:
-    """How often the truth lies in the central 50 and 90 % intervals, by channel."""
-    rows = []
-    for about, group, _ in _groups(results):
-        covered = [result[about["protocol"]]["coverage"] for _, result in group]
-        if about["model"] == "lstm_seker2019" or None in covered:
-            continue
-        for channel in POSE_CHANNELS:
-            half, most = np.mean([c[channel] for c in covered], axis=0)
-            row = {"channel": channel, "coverage_50": float(half), "coverage_90": float(most)}
-            rows.append(about | row)
-    return rows
-
-
 def summary_rows(rows: Rows) -> Rows:
     """The windows in one row per model, as the paper's Table 1 has them."""
     summary: dict[tuple, dict[str, Any]] = {}
@@ -192,10 +152,8 @@ def write_tables(folder: str | Path = FOLDER, out_dir: str | Path = "data/result
     tables = {
         "lever_up": rows,
         "summary": [*reported.LEVER_UP_ROWS, *summary_rows(rows)],
-        "motion": motion_rows(results),
         "unseen_edges": unseen_rows(results, edges),
         "paired": paired_rows(results),
-        "coverage": coverage_rows(results),
     } | studies.tables(NAME, folder)
     return write_results(out_dir, NAME, {"jobs": len(results), "step_ms": 150}, tables)
 

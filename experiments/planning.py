@@ -403,35 +403,27 @@ VARIANTS = {
 """Planners with one thing changed, and without: compared goal by goal, on objects that stand."""
 
 
-def paired_rows(records: dict[str, Rows], than: str = "continuous", n_draws: int = 2000) -> Rows:
-    """How much farther each planner ends from the same goals than another: mean [m], interval.
+def variant_rows(records: dict[str, Rows], n_draws: int = 2000) -> Rows:
+    """How much farther each of `VARIANTS` ends from the same goals: mean [m], interval.
 
-    The interval holds 95 % of the means of goals drawn again with replacement.
+    On constructed goals of objects that stand. The interval holds 95 % of the means of goals drawn
+    again with replacement.
     """
     rows: Rows = []
-    rng = np.random.default_rng(0)
-    for name in records if than in records else ():
-        if name == than or CONFIGS[name].world != CONFIGS[than].world:
+    for name, than in VARIANTS.items():
+        if not {name, than} <= set(records):
             continue
         both = pd.merge(*(pd.DataFrame(records[key]) for key in (name, than)), on="task")
-        both["farther"] = both.distance_m_x - both.distance_m_y
-        for (source, mode), pairs in both.groupby(["goals_x", "mode_x"], sort=False):
-            farther = pairs.farther.to_numpy()
+        both = both[(both.goals_x == "constructed") & both.object_class_x.isin(STANDING)]
+        rng = np.random.default_rng(0)
+        for mode, pairs in both.groupby("mode_x", sort=False):
+            farther = (pairs.distance_m_x - pairs.distance_m_y).to_numpy()
             draws = rng.choice(farther, (n_draws, len(farther))).mean(axis=1)
             low, high = np.quantile(draws, [0.025, 0.975])
-            row = {"planner": name, "than": than, "goals": source, "mode": mode, "n": len(pairs)}
-            rows.append(row | {"difference_mean_m": farther.mean(), "low_m": low, "high_m": high})
+            row = {"planner": name, "than": than, "goals": "constructed", "mode": mode}
+            row |= {"n": len(pairs), "difference_mean_m": farther.mean()}
+            rows.append(row | {"low_m": low, "high_m": high})
     return rows
-
-
-def variant_rows(records: dict[str, Rows]) -> Rows:
-    """`paired_rows` of `VARIANTS`, on constructed goals of objects that stand."""
-    standing = {
-        name: [r for r in some if r["goals"] == "constructed" and r["object_class"] in STANDING]
-        for name, some in records.items()
-    }
-    pairs = [(k, v) for k, v in VARIANTS.items() if {k, v} <= set(records)]
-    return [r for pair in pairs for r in paired_rows({k: standing[k] for k in pair}, pair[1])]
 
 
 def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
@@ -443,7 +435,6 @@ def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
     return {
         "planning": rows,
         "summary": [*reported.PLANNING_ROWS, *summary_rows(rows)],
-        "paired": [r for than in ("continuous", "perturbed") for r in paired_rows(records, than)],
         "variants": variant_rows(records),
         "error_decomposition": decomposition_rows(rows),
     }

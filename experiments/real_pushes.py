@@ -166,14 +166,10 @@ def tables() -> dict[str, list[dict]]:
     pushes = every.groupby([*keys, "push"]).mean(numeric_only=True).reset_index()
     pushes["condition"] = np.array(CONDITIONS)[pushes["push"] // 50]
     found, others = {}, pushes[~pushes["condition"].isin(CHOSEN_ON)]
-    for name, by, part in (
-        ("errors", keys, pushes),
-        ("other_conditions", keys, others),
-        ("conditions", [*keys, "condition"], pushes),
-    ):
+    for name, part in (("errors", pushes), ("other_conditions", others)):
         found[name] = [
-            dict(zip(by, key, strict=True)) | {"seeds": int(seeds[key[:4]])} | summary(part)
-            for key, part in part.groupby(by)
+            dict(zip(keys, key, strict=True)) | {"seeds": int(seeds[key])} | summary(part)
+            for key, part in part.groupby(keys)
         ]
     found["differences"] = [
         {"protocol": protocol, "shots": shots} | row

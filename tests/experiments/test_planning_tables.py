@@ -45,9 +45,9 @@ def test_the_cost_of_execution_is_that_of_the_plain_oracle():
 
 
 def test_pairs_are_of_the_same_goals():
-    every = {"perturbed": records([0.001, *[0.002] * 4, 0.003])}
-    every["perturbed_oracle"] = records([0.011, 0.013], tasks=(0, 5))
-    (row,) = planning.paired_rows(every, "perturbed")
+    every = {"astar": records([0.001, *[0.002] * 4, 0.003])}
+    every["astar_disc"] = records([0.011, 0.013], tasks=(0, 5))
+    (row,) = planning.variant_rows(every)
     assert row["n"] == 2
     assert [row[f"{k}_m"] for k in ("difference_mean", "low", "high")] == pytest.approx([0.01] * 3)
 
