@@ -132,11 +132,8 @@ checkpoints: $(STAMP) ## Train the shipped models again (ONLY="film_500")
 notebooks: $(STAMP) ## Execute the committed notebooks in place and clean them (ONLY= FORCE=1)
 	@$(PY) -m affordlib.workbook --in-place --only "$$ONLY" $(if $(FORCE),--force)
 
-html: $(STAMP) ## Write the committed notebooks as web pages into runs/html (equations need the network)
-	@$(PY) -m nbconvert --to html --template book_html --TemplateExporter.extra_template_basedirs=notebooks \
-	  --embed-images --log-level=ERROR --output-dir runs/html \
-	  --NbConvertBase.display_data_priority="['text/html','image/svg+xml','image/png','text/markdown','text/plain']" \
-	  notebooks/*.ipynb notebooks/appendix/*.ipynb
+html: $(STAMP) ## Write the committed notebooks as web pages, to be read without a network, into runs/html
+	@$(PY) -m nbconvert --config notebooks/book_html/config.py notebooks/*.ipynb notebooks/appendix/*.ipynb
 	@sed -i -E -e 's#href="(\.\./|appendix/)?([0-9A-Za-z_]+)\.ipynb#href="\2.html#g' \
 	  -e 's#href="(\.\./)+((data/)?[A-Za-z]+\.md)#href="../../\2#g' -e 's#href="solutions/#href="../../notebooks/solutions/#g' runs/html/*.html
 

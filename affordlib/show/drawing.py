@@ -50,15 +50,19 @@ class WithPicture:
     """Before a class of ipywidgets: a saved notebook shows its picture where there is no kernel."""
 
     def picture(self) -> bytes | str:
-        """What is shown, as a PNG (bytes) or SVG (text); empty where there is nothing yet."""
+        """What is shown, as a PNG of twice as many pixels (bytes) or SVG (text); may be empty."""
         raise NotImplementedError
 
-    def _repr_mimebundle_(self, **kwargs: object) -> dict[str, object]:
+    def _repr_mimebundle_(self, **kwargs: object) -> tuple[dict[str, object], dict[str, object]]:
         bundle = super()._repr_mimebundle_(**kwargs) | {"text/plain": type(self).__name__}
         picture = self.picture()
         if isinstance(picture, str):
-            return bundle | {"image/svg+xml": picture}
-        return bundle | ({"image/png": base64.b64encode(picture).decode()} if picture else {})
+            return bundle | {"image/svg+xml": picture}, {}
+        if not picture:
+            return bundle, {}
+        width, height = (n // 2 for n in Image.open(io.BytesIO(picture)).size)
+        about = {"image/png": {"width": width, "height": height}}
+        return bundle | {"image/png": base64.b64encode(picture).decode()}, about
 
 
 class FigureWidget(WithPicture, widgets.VBox):
@@ -77,7 +81,7 @@ class FigureWidget(WithPicture, widgets.VBox):
         self._drawing.observe(self._dragged, names="wanted")
         self._handles: list[tuple[Axes, str, float, float | None]] = []
         self._words = widgets.HTML()
-        self._png = b""
+        self._figure: Figure | None = None
         self._waits = False
         for control in controls:
             control.observe(lambda _: self.refresh(), names="value")
@@ -124,16 +128,19 @@ class FigureWidget(WithPicture, widgets.VBox):
             canvas.draw()
             buffer = io.BytesIO()
             Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB").save(buffer, "png")
-            self._png = buffer.getvalue()
+            self._figure = figure
             with self._drawing.hold_sync():
                 self._drawing.scene = self._scene(*canvas.get_width_height())
-                url = base64.b64encode(self._png).decode()
+                url = base64.b64encode(buffer.getvalue()).decode()
                 self._drawing.picture = f"data:image/png;base64,{url}"
         self._words.value = f"<div role='status' aria-live='polite'>{words}</div>"
 
     def picture(self) -> bytes:
-        """What is shown, as a PNG."""
-        return self._png
+        """What is shown, as a PNG of twice as many pixels."""
+        buffer = io.BytesIO()
+        if self._figure:
+            self._figure.savefig(buffer, dpi=2 * DPI)
+        return buffer.getvalue()
 
     def _scene(self, width: int, height: int) -> dict[str, Any]:
         """The handles in pixels from the upper left corner, a hundred places over the phase."""

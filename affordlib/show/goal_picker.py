@@ -223,6 +223,14 @@ class GoalPicker(WithPicture, widgets.VBox):
         if not self._running:
             self._set_running(True)
             self._queue.submit(self._attempt, partial(self._run, self.seconds_per_action))
+            self._queue.submit(self._attempt, self._plan_after_run)
+
+    def _plan_after_run(self) -> None:
+        """Where the goal was moved, and the run did not follow it, show how to go on from here."""
+        if self._stale and self.outcome is not None:
+            came_of_it = self.controls.said
+            self._update_plan()
+            self.controls.say(f"{came_of_it} {self.controls.said}")
 
     def _follow(self, goal: Goal) -> None:
         """Set the goal; soon show a draft for it, and the plan if the hand rests there."""

@@ -12,9 +12,11 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+from IPython import get_ipython
 from IPython.display import Image as NotebookImage
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib_inline.config import InlineBackend
 from PIL import Image
 from torch import Tensor
 
@@ -60,6 +62,10 @@ plt.rcParams.update(
         "savefig.dpi": 120,
     }
 )
+
+
+if shell := get_ipython():  # twice as many pixels in notebooks, for sharp screens
+    InlineBackend.instance(parent=shell).figure_formats = {"retina"}
 
 
 def save_figure(figure: Figure, folder: Path, name: str) -> Path:
@@ -112,7 +118,7 @@ def _closed(xy: np.ndarray) -> np.ndarray:
 def _name(ax: Axes, text: str, at_cm: Sequence[float], offset: Sequence[float], **style) -> None:
     """Write the name of an action, so many points away from where it belongs."""
     plate = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 1}
-    style = {"fontsize": 8, "ha": "center", "va": "center"} | style
+    style = {"fontsize": 9, "ha": "center", "va": "center"} | style
     ax.annotate(text, at_cm, tuple(offset), textcoords="offset points", bbox=plate, **style)
 
 
@@ -211,7 +217,7 @@ def plot_closed_loop(
         x, y = path[-1] - path[0]
         aside = (-1) ** k * 14 * np.array([-y, x]) / max(math.hypot(x, y), 1e-6)
         middle = _cm(path[len(path) // 2 :].mean(axis=0))
-        _name(ax, f"{k + 1} {step.primitive.name}", middle, aside, fontsize=7)
+        _name(ax, f"{k + 1} {step.primitive.name}", middle, aside)
     if obj is not None:
         x, y, turned_rad = result.end_pose
         plot_footprint(ax, obj, (x, y), check_finite("yaw_rad", yaw_rad) + turned_rad, TRUTH)
@@ -305,7 +311,7 @@ class FrameRecorder:
         self.frames.append(frame)
 
     def encoded(self, kind: str = "GIF", frame_ms: int = 60, beside: Figure | None = None) -> bytes:
-        """The frames as an animated picture that loops and rests on its last frame.
+        """The frames as an animated picture that loops and begins with its last frame, at rest.
 
         kind: "GIF" or "PNG"; beside: a figure shown to the left of every frame.
         """
@@ -313,7 +319,7 @@ class FrameRecorder:
             raise RuntimeError(
                 "there are no frames; set world.on_step to the recorder before the robot moves"
             )
-        frames = self.frames
+        frames = [self.frames[-1], *self.frames[:-1]]
         if beside is not None:
             left = _drawn(beside, frames[0].shape[0])
             frames = [np.hstack([left, frame]) for frame in frames]
@@ -327,7 +333,7 @@ class FrameRecorder:
             for frame in frames
         ]
         buffer = io.BytesIO()
-        durations = [frame_ms] * (len(indexed) - 1) + [1500]
+        durations = [1500] + [frame_ms] * (len(indexed) - 1)
         indexed[0].save(
             buffer, kind, save_all=True, append_images=indexed[1:], duration=durations, loop=0
         )

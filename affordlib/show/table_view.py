@@ -169,7 +169,7 @@ class PickerControls(widgets.VBox):
         self.start_over = _button("Start over", "undo", "Put the object back")
         self.name = widgets.Text("plan.json", description="file", layout={"width": "14em"})
         self.save, self.load = _button("Save", "save"), _button("Load", "folder-open")
-        self.words = widgets.HTML()
+        self.words, self.said = widgets.HTML(), ""
         self.show(goal)
         for slider in self.sliders:
             slider.observe(lambda change: self._slid(change["owner"], on_goal), names="value")
@@ -216,6 +216,7 @@ class PickerControls(widgets.VBox):
 
     def say(self, text: str) -> None:
         """Show a text, as HTML, and have it read aloud where that is wanted."""
+        self.said = text
         style = "width: 27em; max-width: 100%; line-height: 1.4; white-space: normal"
         self.words.value = f"<div role='status' aria-live='polite' style='{style}'>{text}</div>"
 

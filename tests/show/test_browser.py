@@ -555,3 +555,28 @@ def test_no_request_leaves_the_machine(page, lab):
     assert hosts(page) == {urlparse(lab.address).netloc}
     assert any("ws" in urlparse(url).scheme for url in page.requests)
     assert page.locator("text=Would you like to get notified").count() == 0
+
+
+def test_the_web_pages_are_read_without_a_network(tmp_path):
+    """Equations are drawn, nothing is asked for elsewhere, and nothing is wider than a phone."""
+    from playwright.sync_api import sync_playwright
+
+    root, names = repo_root(), ("00_start_here", "03_affordance_cnp", "06_planning")
+    command = ["nbconvert", "--config", "notebooks/book_html/config.py", "--output-dir", tmp_path]
+    pages = [f"notebooks/{name}.ipynb" for name in names]
+    subprocess.run([sys.executable, "-m", *command, *pages], cwd=root, check=True)
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        page, requests = browser.new_page(viewport={"width": 400, "height": 800}), []
+        page.on("request", lambda request: requests.append(request.url))
+        for name in names:
+            page.goto(f"file://{tmp_path}/{name}.html")
+            assert page.locator("math").count() > 20
+            drawn = page.locator("math").evaluate_all("every => every.map(m => m.clientHeight)")
+            assert min(drawn) > 4
+            text = "".join(page.locator(".jp-RenderedMarkdown").all_inner_texts())
+            assert "$" not in text
+            assert "\\" not in text.replace("A\\*", "")
+            assert page.evaluate("document.documentElement.scrollWidth") <= 400
+            assert not page.locator("img:not([alt]), img[alt='']").count()
+    assert all(url.startswith(("file:", "data:")) for url in requests)

@@ -70,8 +70,9 @@ def test_with_nothing_observed_it_says_so(explorer):
 
 @pytest.mark.parametrize("name", ["slider", "explorer"])
 def test_saved_widgets_leave_their_pictures(name, request):
-    bundle = request.getfixturevalue(name)._repr_mimebundle_()
-    assert Image.open(io.BytesIO(base64.b64decode(bundle["image/png"]))).size[0] > 800
+    bundle, about = request.getfixturevalue(name)._repr_mimebundle_()
+    picture = Image.open(io.BytesIO(base64.b64decode(bundle["image/png"])))
+    assert picture.size[0] == 2 * about["image/png"]["width"] == 1800
 
 
 def test_what_can_be_dragged_is_where_it_is_drawn(explorer):
@@ -81,7 +82,7 @@ def test_what_can_be_dragged_is_where_it_is_drawn(explorer):
     assert [h[1] for h in explorer._handles] == points[:2] * 2 + points[2:] * 2
     pixels = np.asarray(Image.open(io.BytesIO(explorer.picture())).convert("L"))
     for handle in handles:
-        assert pixels[int(handle["y"]), int(handle["x"])] < 30  # black
+        assert pixels[int(2 * handle["y"]), int(2 * handle["x"])] < 30  # black
 
 
 def test_dragging_is_moving_a_slider(explorer, slider):

@@ -244,6 +244,21 @@ def test_a_run_can_be_watched(make_picker):
     assert picker.world.on_step is None
 
 
+def test_a_goal_picked_while_an_open_loop_runs_is_planned_for_when_it_ends(make_picker, world):
+    def executor(world, plan, planner, report):
+        want(picker, -0.05, 0.1, 1)
+        return open_loop(world, plan, planner, report)
+
+    picker = make_picker(executors={"open loop": executor})
+    picker._view._handle_custom_msg({"press": "run"}, [])
+    in_time(in_time(picker))
+    assert picker.plan.goal.xy_m == drawn_goal(picker) == (-0.05, 0.1)
+    assert picker.plan.start_xy_m == world.object_pose()[:2]
+    assert "mm</b> from the goal" in picker.controls.said
+    assert "Plan: push" in picker.controls.said
+    assert not shapes(picker, "busy")[0].text
+
+
 def test_a_disturbance_waits_for_the_end_of_the_action(make_picker, world):
     seen = []
 
@@ -342,7 +357,7 @@ def test_a_slider_moves_what_it_is_for_and_nothing_else(picker):
 
 
 def test_a_saved_picker_leaves_its_picture(picker):
-    drawn = ElementTree.fromstring(picker._repr_mimebundle_()["image/svg+xml"])
+    drawn = ElementTree.fromstring(picker._repr_mimebundle_()[0]["image/svg+xml"])
     named = {css for shape in drawn.iter() for css in shape.get("class", "").split()}
     assert {"reach", "object", "push", "prediction", "goal"} <= named
     assert ".prediction {" in "".join(drawn.itertext())
