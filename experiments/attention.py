@@ -17,11 +17,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from affordlib import checked
-from affordlib.interactions.dataset import Scaler
-from affordlib.models.base import EffectNetwork, NetworkConfig, he_initialise, with_time
+from affordlib.models.base import NetworkConfig, he_initialise, with_time
 from affordlib.models.checkpoint import NETWORKS
-from affordlib.models.domain import TrainingDomain
-from affordlib.models.harmonics import CircularHarmonics, dense, waves
+from affordlib.models.harmonics import CircularHarmonics, HarmonicsNetwork, dense, waves
 from affordlib.types import Observations
 
 
@@ -72,16 +70,14 @@ class CrossAttention(nn.Module):
         return x + self.mlp(x)
 
 
-class AttentiveCNP(EffectNetwork):
+class AttentiveCNP(HarmonicsNetwork):
     """Relates object image, action and effect; satisfies `EffectModel`."""
 
-    def __init__(
-        self, config: AttentionConfig, scaler: Scaler, domain: TrainingDomain | None = None
-    ) -> None:
-        super().__init__(config, scaler, domain)
+    def make_layers(self, config: AttentionConfig) -> None:
+        """Tokens, the attention to them, and a decoder; the image's features are its harmonics."""
         c, w = config, config.width
         n_a, n_e = len(c.action_channels), len(c.effect_channels)
-        self.harmonics = CircularHarmonics(c.rings, c.orders)
+        self.harmonics, self.image_encoder = CircularHarmonics(c.rings, c.orders), nn.Identity()
         n = self.harmonics.n_features
         self.place = nn.Parameter(0.02 * torch.randn(c.rings, w))
         self.image_token = nn.Linear(n // c.rings, w)
@@ -91,20 +87,6 @@ class AttentiveCNP(EffectNetwork):
         self.ask = nn.Linear(2 * c.waves + 1, w)
         self.blocks = nn.ModuleList(CrossAttention(w, c.heads) for _ in range(c.blocks))
         self.last = nn.Sequential(nn.LayerNorm(w), *dense(w, w, 2 * (n_a + n_e)))
-
-    def features(self, scaled_image: Float[Tensor, "b 2 48 48"]) -> Float[Tensor, "b f"]:
-        """The circular harmonics of standardised depth and mask."""
-        return self.harmonics(scaled_image)
-
-    def unoriented_features(self, image: Float[Tensor, "b 2 48 48"]) -> Float[Tensor, "b f"]:
-        """The circular harmonics (B, F) of images."""
-        return self.harmonics(self._scaled(image))
-
-    def oriented_features(
-        self, unoriented: Float[Tensor, "#b f"], rotation: Float[Tensor, "b 2"]
-    ) -> Float[Tensor, "b f"]:
-        """The harmonics of the rotated images, of those of the images."""
-        return self.harmonics.rotated(unoriented, rotation)
 
     def outputs(
         self, features: Tensor, observations: Observations, t_target: Tensor

@@ -49,7 +49,7 @@ from affordlib.planning.grasp_rotate import GRIPPER_YAWS_RAD
 from affordlib.planning.skills import CHECKPOINTS
 from affordlib.primitives import Drag, Grasp, Push
 from affordlib.results import write_results
-from affordlib.types import TABLE_X_M, TABLE_Y_M, Goal
+from affordlib.types import TABLE_X_M, TABLE_Y_M, Goal, check_choice
 from affordlib.world import (
     Tabletop,
     TabletopObject,
@@ -133,8 +133,7 @@ def sample_trial(table: str, index: int, seed: int = 0, world: str = "clean") ->
 
 
 def _clean_trial(table: str, index: int, seed: int) -> Trial:
-    if table not in N_TRIALS:
-        raise ValueError(f"table must be one of {sorted(N_TRIALS)}, got {table!r}")
+    check_choice("table", table, N_TRIALS)
     key = (100 + list(N_TRIALS).index(table), index)
     rng = np.random.default_rng(np.random.SeedSequence(2_000_003 + seed, spawn_key=key))
     categories = CATEGORIES.get(table, FOUR_CATEGORIES)

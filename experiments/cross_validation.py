@@ -32,10 +32,11 @@ from affordlib.models.film import FiLMConfig
 from affordlib.models.protocol import EffectModel, condition_on_final_effect
 from affordlib.models.training import train_model
 from affordlib.primitives import Push
+from affordlib.types import check_choice, check_count
 from affordlib.world import Tabletop
 from experiments.attention import AttentionConfig
 from experiments.ensemble import Ensemble
-from experiments.runner import Job, one_of, open_once
+from experiments.runner import Job, open_once
 from experiments.shipped import CHECKPOINT_SPECS, GRASP_SYMMETRIES, HALF_TURNS
 
 VERSION = 2
@@ -124,9 +125,9 @@ def network_and_training(model: str, data: str, n: int | str = "all") -> tuple[A
 
 def job(model: str, data: str, n: int | str = "all", fold: int = 0, seed: int = 0) -> Job:
     """One training and its tests; n counts the interactions of which ten folds are made."""
-    one_of("model", model, MODELS)
-    one_of("data", data, SETS)
-    one_of("fold", fold, range(N_FOLDS))
+    check_choice("model", model, MODELS)
+    check_choice("data", data, SETS)
+    check_count("fold", fold, 0, N_FOLDS - 1)
     if n != "all" and (not isinstance(n, int) or n < N_FOLDS):
         raise ValueError(f'n must be "all" or at least {N_FOLDS}, got {n!r}')
     task, settings = task_of(data), ()

@@ -27,10 +27,10 @@ from affordlib.models import lever_up as models
 from affordlib.models.base import EffectNetwork
 from affordlib.models.domain import TrainingDomain
 from affordlib.models.lever_up import LEVER_MODELS, PROTOCOLS, LeverModel
-from affordlib.types import Prediction
+from affordlib.types import Prediction, check_choice, check_count
 from experiments import lstm_seker2019
 from experiments.lstm_seker2019 import SekerConfig, SekerLSTM, train_seker
-from experiments.runner import Job, one_of, open_once, study
+from experiments.runner import Job, open_once, study
 from experiments.shipped import shipped_lever_model
 
 DATA, N_FOLDS = "lever_up", 5
@@ -56,11 +56,12 @@ def job(
 
     epochs: of `lstm_seker2019` alone.
     """
-    one_of("model", model, MODELS)
+    check_choice("model", model, MODELS)
     each = model in (SINGLE, *RECURRENT)
-    one_of(f"trained_for of {model!r}", trained_for, [*TESTED][1:] if each else ["all"])
-    one_of("fold", fold, range(N_FOLDS))
-    one_of("edges_left_out", edges_left_out, (None, *range(3, 9)))
+    check_choice(f"trained_for of {model!r}", trained_for, [*TESTED][1:] if each else ["all"])
+    check_count("fold", fold, 0, N_FOLDS - 1)
+    if edges_left_out is not None:
+        check_count("edges_left_out", edges_left_out, 3, 8)
     published = model == "lstm_seker2019"
     if (epochs is not None) != published:
         raise ValueError(f"epochs belong to 'lstm_seker2019', got {epochs!r} for {model!r}")

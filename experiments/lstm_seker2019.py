@@ -24,12 +24,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from affordlib import checked
-from affordlib.interactions import Scaler
 from affordlib.interactions.dataset import InteractionTensors
 from affordlib.interactions.lever_up import N_OBSERVED
 from affordlib.models.base import EffectNetwork, NetworkConfig, with_time
 from affordlib.models.checkpoint import load_state, save_state
-from affordlib.models.domain import TrainingDomain
 from affordlib.models.lever_up import from_start_errors_m, window_errors_m
 from affordlib.models.lstm import Known, on_grid
 from affordlib.types import LEVER_IMAGE_PIXELS, Observations
@@ -57,10 +55,8 @@ class SekerConfig(NetworkConfig):
 class SekerLSTM(EffectNetwork):
     """CNN and LSTM, step by step; σ is not predicted and is the floor."""
 
-    def __init__(
-        self, config: SekerConfig, scaler: Scaler, domain: TrainingDomain | None = None
-    ) -> None:
-        super().__init__(config, scaler, domain)
+    def make_layers(self, config: SekerConfig) -> None:
+        """Convolutions, a recurrent cell, and the pose that follows."""
         n_a, n_e = len(config.action_channels), len(config.effect_channels)
         layers: list[nn.Module] = []
         for n_in, n_out in pairwise((2, *CONVOLUTION_WIDTHS)):

@@ -171,12 +171,6 @@ def frame(results: Iterable[Result], part: str) -> pd.DataFrame:
     return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
 
 
-def one_of(name: str, value: Any, known: Iterable[Any]) -> None:
-    """ValueError unless an argument has one of the known values."""
-    if value not in (known := tuple(known)):
-        raise ValueError(f"{name} must be one of {known}, got {value!r}")
-
-
 def parser(table: str, description: str | None) -> argparse.ArgumentParser:
     """A parser of the options that the commands of all tables share."""
     shared = argparse.ArgumentParser(prog=f"python -m experiments.{table}", description=description)

@@ -22,6 +22,7 @@ import numpy as np
 import pandas as pd
 import torch
 
+from affordlib.evaluation.metrics import error_row
 from affordlib.evaluation.predictions import network_predictions
 from affordlib.interactions import InteractionTensors, Scaler, split_interactions
 from affordlib.interactions.dataset import Symmetry, augment_by_symmetry
@@ -163,21 +164,13 @@ def _pair(
 def _rows(table: pd.DataFrame, column: str, about: dict[str, Any], unit: str) -> Rows:
     """A row of each model's errors, and by how much the shared network's exceed the others'."""
     error = {model: group[column].to_numpy() for model, group in table.groupby("model")}
-    rows = []
+    more, rows = error_row(error[SHARED] - error[SEPARATE]), []
     for model in (SHARED, SEPARATE):
-        more = error[SHARED] - error[SEPARATE] if model == SHARED else None
-        columns = {
-            "error_mean": error[model].mean(),
-            "error_sem": _sem(error[model]),
-            "error_median": np.median(error[model]),
-            "error_p95": np.quantile(error[model], 0.95),
-            "more_mean": None if more is None else more.mean(),
-            "more_sem": None if more is None else _sem(more),
-        }
-        row: dict[str, Any] = {"model": model} | about | {"n": len(error[model])}
-        for u in ("m", "rad"):
-            row |= {f"{k}_{u}": None if u != unit or v is None else float(v)
-                    for k, v in columns.items()}  # fmt: skip
+        spread = error_row(error[model])
+        told = {f"error_{k}": spread[f"{k}_m"] for k in ("mean", "sem", "median", "p95")}
+        told |= {f"more_{k}": more[f"{k}_m"] if model == SHARED else None for k in ("mean", "sem")}
+        row: dict[str, Any] = {"model": model} | about | {"n": spread["n"]}
+        row |= {f"{k}_{u}": v if u == unit else None for u in ("m", "rad") for k, v in told.items()}
         right = None
         if about["primitive"] == "grasp":
             of_model = table[table["model"] == model]
@@ -185,7 +178,3 @@ def _rows(table: pd.DataFrame, column: str, about: dict[str, Any], unit: str) ->
             right = 100 * float(np.equal(*lifts).mean())
         rows.append(row | {"success_right_percent": right})
     return rows
-
-
-def _sem(values: np.ndarray) -> float:
-    return float(values.std(ddof=1) / np.sqrt(len(values)))

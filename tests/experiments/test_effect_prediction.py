@@ -38,7 +38,7 @@ FEW = [job("constant", "grasp", fold=fold) for fold in range(3)]
         ({"model": "lstm"}, "model must be one of.*'lstm'"),
         ({"data": "lever_up"}, "data must be one of"),
         ({"n": 5}, 'n must be "all" or at least 10, got 5'),
-        ({"fold": 10}, "fold must be one of .*9.*, got 10"),
+        ({"fold": 10}, "fold must be .*9.*, got 10"),
         ({"model": "logistic"}, "grasps, not 'push'"),
         ({"model": "film_table_frame", "data": "grasp"}, "has no direction"),
     ],
