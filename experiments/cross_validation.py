@@ -10,6 +10,7 @@ runs jobs and makes the tables.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -200,6 +201,16 @@ def add_errors(table: pd.DataFrame, primitive: str) -> None:
         table["final_error"] = abs(off.get(TASKS[primitive].effect_channels[0], np.nan))
     if "yaw" in off:
         table["yaw_error"] = abs((off["yaw"] + np.pi) % (2 * np.pi) - np.pi)
+
+
+def by_model(table: pd.DataFrame) -> Iterator[tuple[dict[str, Any], pd.DataFrame]]:
+    """The rows of each model and size of set, with the columns that say which they are."""
+    if table.empty:
+        return
+    for (_, model, n), group in table.groupby(["data", "model", "n"], sort=False):
+        about = {"model": model, "n_interactions": int(n)}
+        counts = {f"{key}s": group[key].nunique() for key in ("fold", "seed")}
+        yield about | counts, group
 
 
 def _train(

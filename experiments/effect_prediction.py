@@ -13,10 +13,9 @@ predictions, of each object by each training.
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -34,6 +33,7 @@ from experiments.cross_validation import (
     SETS,
     TASKS,
     add_errors,
+    by_model,
     job,
 )
 from experiments.grasps import grasp_rows, roc_rows, threshold_rows
@@ -74,16 +74,6 @@ def predictions_of(results: Iterable[Result], primitive: str, part: str) -> pd.D
     if part == "fold_test" and len(table):
         add_errors(table, primitive)
     return table
-
-
-def by_model(table: pd.DataFrame) -> Iterator[tuple[dict[str, Any], pd.DataFrame]]:
-    """The rows of each model and size of set, with the columns that say which they are."""
-    if table.empty:
-        return
-    for (_, model, n), group in table.groupby(["data", "model", "n"], sort=False):
-        about = {"model": model, "n_interactions": int(n)}
-        counts = {f"{key}s": group[key].nunique() for key in ("fold", "seed")}
-        yield about | counts, group
 
 
 def mean_sem(group: pd.DataFrame, column: str) -> tuple[float, float]:

@@ -16,6 +16,7 @@ import pandas as pd
 from scipy import stats
 
 from affordlib.primitives import Grasp
+from experiments.cross_validation import by_model
 from experiments.runner import Rows
 
 GOAL_TP, GOAL_TN = 0.90, 0.95
@@ -52,16 +53,14 @@ def _held_out(grasps: pd.DataFrame) -> Iterator[tuple[dict[str, Any], bool, pd.D
     """
     if grasps.empty:
         return
-    grasps = grasps[grasps["seed"] == grasps["seed"].min()]
-    for (_, model, n), group in grasps.groupby(["data", "model", "n"], sort=False):
-        about = {"model": model, "n_interactions": int(n), "folds": group["fold"].nunique()}
-        if model == "logistic":
+    for about, group in by_model(grasps[grasps["seed"] == grasps["seed"].min()]):
+        if about["model"] == "logistic":
             score = group["probability"]
         else:
             score = success_probability(group["mean_z"], group["std_z"])
         group = group.assign(score=score, lifted=group["truth_z"] > Grasp.success_m)
         for rollable, some in group.groupby("rollable"):
-            yield about | {"seeds": 1}, bool(rollable), some
+            yield about, bool(rollable), some
 
 
 def grasp_rows(grasps: pd.DataFrame) -> Rows:
