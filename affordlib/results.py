@@ -34,7 +34,7 @@ import psutil
 import affordlib
 from affordlib.commands import command
 from affordlib.paths import from_root, resolve_out_dir
-from affordlib.primitives import Primitive, primitive_named
+from affordlib.primitives import Primitive, PushAt, primitive_named
 from affordlib.types import Goal, Plan, Step
 
 # unit in the column's name: (unit shown, factor, digits); lengths are stored in metres
@@ -218,7 +218,8 @@ def _steps(steps: list[dict[str, Any]]) -> tuple[Step, ...]:
 
 def _step(**data: Any) -> Step:
     arguments = dict(data["primitive"])
-    data["primitive"] = primitive_named(arguments.pop("name"))(**arguments)
+    name = arguments.pop("name")
+    data["primitive"] = (PushAt if name == PushAt.name else primitive_named(name))(**arguments)
     data["predicted_end_xy_m"] = tuple(data["predicted_end_xy_m"])
     data["std_m"] = math.nan if data["std_m"] is None else float(data["std_m"])
     for name in ("predicted_path_xy_m", "path_xy_m"):

@@ -349,7 +349,7 @@ class Plan:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What carrying out a plan gave, as the robot measured it.
+    """What carrying out a plan gave, as the robot recorded it; a `Tabletop` records the truth.
 
     distance_m: between the goal and the object at rest; object_paths_xy_m: one (n, 2) path of the
     object per executed step, in the frame of the table; end_pose: (x, y, yaw); words: on the end.

@@ -56,7 +56,7 @@ class NetworkConfig:
         if not 0 < self.sigma_floor < 10:
             raise ValueError(f"sigma_floor must lie in (0, 10), got {self.sigma_floor!r}")
         scale = tuple(self.sigma_scale) or (1.0,) * len(self.effect_channels)
-        if len(scale) != len(self.effect_channels) or not min(scale) > 0:
+        if len(scale) != len(self.effect_channels) or not all(0 < s < math.inf for s in scale):
             raise ValueError(
                 f"sigma_scale must hold {len(self.effect_channels)} positive numbers, one per "
                 f"effect channel, got {self.sigma_scale!r}"
@@ -211,12 +211,13 @@ class EffectNetwork(nn.Module, ABC):
         effect: Tensor,
         beta: float = 0.0,
     ) -> Tensor:
-        """Negative log-likelihood (Section 3.2) of the targets (B, T, C), per value.
+        """Negative log-likelihood (Section 3.2) of the targets (B, T, C).
 
-        The likelihood is of the standardised values, in the network's frame. beta weighs each value
-        by σ^(2 beta), so that what is hard to predict is not given up for a large σ: with 0 it is
-        the likelihood, with 1 means learn as from the squared error (Seitzer et al., On the
-        pitfalls of heteroscedastic uncertainty estimation, ICLR 2022).
+        Half the mean over the action's values and half that over the effect's, standardised, in the
+        network's frame. beta weighs each value by σ^(2 beta), so that what is hard to predict is
+        not given up for a large σ: with 0 it is the likelihood, with 1 means learn as from the
+        squared error (Seitzer et al., On the pitfalls of heteroscedastic uncertainty estimation,
+        ICLR 2022).
         """
         encoded = self.encode(image, check=False)
         (mu_a, sigma_a, mu_e, sigma_e), direction = self._decode(encoded, observations, t_target)

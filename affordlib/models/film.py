@@ -18,8 +18,8 @@ visual reasoning with a general conditioning layer, AAAI 2018.
 A mean of codes, as in equations (2) and (3) of the paper, does not keep where exactly the object
 was a moment ago; here that is an input, with the velocity ḋ_l between the last two observations,
 which lasts for a while, s(t) = (t - t_l) exp(-|t - t_l| / 0.2); the network predicts what else
-changes from there on; n rises from 0 at t_l to 1. Any t is predicted directly, not by a rollout.
-With nothing observed d_l is that of t = 0, where a displacement is zero.
+changes from there on; n rises from 0 at t_l towards 1. Any t is predicted directly, without a
+rollout. With nothing observed d_l is that of t = 0, where a displacement is zero.
 """
 
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ from affordlib.models.base import with_time
 from affordlib.models.harmonics import HarmonicsConfig, HarmonicsNetwork, dense, waves
 from affordlib.types import Observations
 
-FEW_ROTATIONS = 32
+BASIS_FROM_ROTATIONS = 32
 """From this many rotations of one image on, its basis is faster."""
 
 _NEAR_PHASE = 0.1
@@ -91,7 +91,7 @@ class FiLMNetwork(HarmonicsNetwork):
 
         Of one image in many rotations the first layer, linear, is computed of its basis alone.
         """
-        if len(unoriented) > 1 or len(rotation) < FEW_ROTATIONS:
+        if len(unoriented) > 1 or len(rotation) < BASIS_FROM_ROTATIONS:
             return super().oriented_features(unoriented, rotation)
         first = self.image_encoder[0]
         angle = torch.atan2(rotation[:, 1], rotation[:, 0])[:, None]

@@ -60,7 +60,7 @@ def inverse(rotation: Tensor) -> Tensor:
 
 
 def rotate_image(image: Float[Tensor, "#b 2 n n"], rotation: Tensor) -> Float[Tensor, "b 2 n n"]:
-    """Images (B or 1, 2, n, n) rotated (B, 2), bilinearly; beyond the edge, table."""
+    """Images (B or 1, 2, n, n) rotated (B, 2), bilinearly; the rim's pixels go on outside."""
     cos, sin = rotation.unbind(-1)
     # From coordinates of the rotated image to those of the image; rows run along -y.
     rows = [torch.stack([cos, -sin], -1), torch.stack([sin, cos], -1)]

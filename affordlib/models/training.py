@@ -42,9 +42,10 @@ Score = Callable[[EffectNetwork, InteractionTensors], torch.Tensor]
 class TrainingConfig:
     """How to train: steps and sizes; the σ floor falls from the model's to `final_sigma_floor`.
 
-    beta: see `EffectNetwork.loss`. augment: each batch is rotated and mirrored in all eight ways.
-    ema: decay of the exponential moving average of the weights, which is then validated and kept.
-    patience counts validations without improvement. device: as of torch, or "auto".
+    beta: see `EffectNetwork.loss`. augment: an eighth of each batch is rotated and mirrored in each
+    of eight ways; not where the hand would not turn with the object, as in a grasp. ema: decay
+    of the exponential moving average of the weights, which is then validated and kept. patience
+    counts validations without improvement. device: as of torch, or "auto".
     """
 
     steps: int = 3000
@@ -211,6 +212,11 @@ def train(
         if run.seconds > 60 * config.max_minutes:
             break
     bar.close()
+    if run.best[0] == math.inf:
+        raise ValueError(
+            f"learning_rate {config.learning_rate:g}: no validation error was finite; lower it, or "
+            "look for values in the data that are not"
+        )
     _, weights, model.sigma_floor = run.best
     model.load_state_dict(weights)
     model.cpu().eval()
@@ -231,7 +237,7 @@ def _to(batch: Any, device: torch.device) -> Any:
 
 
 def _augmented(tensors: InteractionTensors) -> InteractionTensors:
-    """The interactions rotated and mirrored in all eight ways, in turn."""
+    """The interactions, an eighth of them rotated and mirrored in each of eight ways."""
     eighths = torch.arange(len(tensors)).tensor_split(8)
     parts = [
         tensors.select(rows).rotated_and_mirrored(k // 2, mirror=k % 2 == 1)

@@ -66,7 +66,6 @@ MAX_RENEWALS = 3
 
 MAX_LIFTS = 2
 HEIGHT_TOLERANCE_M = 0.003
-STATUSES = ("reached", "unreachable", "gave_up", "lost")
 
 
 def execute_plan(
@@ -77,7 +76,7 @@ def execute_plan(
 ) -> Outcome:
     """Execute a plan's steps as planned, each action relative to where the object then stands.
 
-    The outcome is what the robot measured. Raises UnreachableError when the arm cannot follow a
+    The outcome is what the robot recorded. Raises UnreachableError when the arm cannot follow a
     step; it has the outcome of those before. corrections: after the last step, unless it holds the
     object, at most so many single actions, each the first of a plan that `replan` makes from a new
     image, and each only if it is expected to bring the object nearer.
@@ -85,12 +84,16 @@ def execute_plan(
     if corrections and replan is None:
         raise ValueError(f"corrections = {corrections} need a planner; give replan as well")
     done: list[Execution] = []
-    for step in plan.steps:
+
+    def execute(step: Step) -> None:
         try:
             done.append(robot.execute(step))
         except UnreachableError as error:
             error.outcome = _outcome(robot, plan, done)
             raise
+
+    for step in plan.steps:
+        execute(step)
     held = bool(plan.steps) and plan.steps[-1].primitive.holds
     for _ in range(0 if held else corrections):
         try:
@@ -107,7 +110,7 @@ def execute_plan(
             break
         if not robot.can_reach(steps[0].primitive, steps[0].stop_phase):
             break
-        done.append(robot.execute(steps[0]))
+        execute(steps[0])
     return _outcome(robot, plan, done)
 
 
@@ -160,12 +163,12 @@ class ClosedLoopConfig:
 class ClosedLoopResult:
     """What came of a closed loop, as the robot observed it.
 
-    status: one of `STATUSES`; goal: as it was in the end; end_pose: (x, y, turn since the start) of
-    the object, and turn_std_rad; reckoned: which of "position" and "orientation" was not seen in
-    the end, but follows from what the hand did; turn_error_rad, height_error_m: None where the goal
-    does not ask; steps: the actions taken, and executions, what was recorded of them; plans: all
-    that were made; seen_xy_m: before every decision; vetoes: planned actions that the arm's
-    kinematics refused.
+    status: "reached", "unreachable", "gave_up" or "lost"; goal: as it was in the end; end_pose: (x,
+    y, turn since the start) of the object, and turn_std_rad; reckoned: which of "position" and
+    "orientation" was not seen in the end, but follows from what the hand did; turn_error_rad,
+    height_error_m: None where the goal does not ask; steps: the actions taken, and executions, what
+    was recorded of them; plans: all that were made; seen_xy_m: before every decision; vetoes:
+    planned actions that the arm's kinematics refused.
     """
 
     goal: Goal
@@ -230,6 +233,8 @@ class _ClosedLoop:
         config: ClosedLoopConfig,
     ) -> None:
         self.robot, self.goal_now, self.skills, self.config = robot, goal_now, skills, config
+        self.goal = goal_now()  # as it was when last asked: before each action, and after a lift
+        self.acted_for: Goal | None = None
         self.moves = MovePlanner(robot, skills, planner, PlanMode(config.horizon, partial=True))
         self.steps: list[Step] = []
         self.executions: list[Execution] = []
@@ -237,7 +242,6 @@ class _ClosedLoop:
         self.seen_xy_m: list[tuple[float, float]] = []
         self.plan: Plan | None = None  # that is followed
         self.queue: list[Step] = []  # what is left of it
-        self.acted_for: Goal | None = None
         self.renewals, self.turn_allowed = MAX_RENEWALS, False
         self.lifted_m, self.held = 0.0, False
         seen = self._mean_of_images()
@@ -245,10 +249,6 @@ class _ClosedLoop:
         self.seen = self.first = replace(seen, yaw_rad=yaw_rad, yaw_std_rad=std_rad)
         self.start_yaw_rad = self.expected_rad = self.reckoned_rad = yaw_rad
         self.limit = self._limit_from(self.seen.xy_m)
-
-    @property
-    def goal(self) -> Goal:
-        return self.goal_now()
 
     def run(self) -> ClosedLoopResult:
         """Position, orientation, height, again until all hold or one cannot be had."""
@@ -294,6 +294,7 @@ class _ClosedLoop:
         self.seen_xy_m.append(self.seen.xy_m)
         if not _is_seen_on_table(self.seen):
             return Ending("lost", f"the object is no longer on the table, after {self._count()}")
+        self.goal = self.goal_now()
         goal_moved = self.acted_for is not None and self.acted_for != self.goal
         displaced = DISPLACED_M < off_m < math.inf and self.renewals > 0
         if goal_moved or displaced:
@@ -360,8 +361,10 @@ class _ClosedLoop:
         tool = self.executions[-1].tool
         self.held = bool(tool[-1, 4] > EMPTY_M)
         self.lifted_m = float(tool[-1, 2] - tool[:, 2].min()) if self.held else 0.0
+        self.goal = self.goal_now()
         turn_rad, height_m = self._turn_left() or 0.0, self._height_left()
-        if abs(turn_rad) <= TURN_TOLERANCE_RAD and abs(height_m) <= HEIGHT_TOLERANCE_M:
+        lifted = height_m is not None and abs(height_m) <= HEIGHT_TOLERANCE_M
+        if lifted and abs(turn_rad) <= TURN_TOLERANCE_RAD:
             if self.goal.distance_m(self.seen.xy_m) <= self.goal.tolerance_m:
                 return Ending("reached", self._where())
             if last:
@@ -374,10 +377,10 @@ class _ClosedLoop:
         """Carry out what is chosen, if the arm agrees and there may be another action."""
         if len(self.steps) >= self.limit:
             return self._give_up(part)
+        self.acted_for = self.goal
         step = choose()
         if isinstance(step, Ending):
             return step
-        self.acted_for = self.goal
         try:
             execution = self.robot.execute(step)
         except UnreachableError as error:  # of what it sees now, a hair off what it agreed to

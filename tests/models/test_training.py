@@ -50,6 +50,16 @@ def test_the_literal_loop_learns(some):
     assert set(counts) == set(range(1, 11))
 
 
+def test_a_training_that_never_validates_says_so(some):
+    config = TrainingConfig(steps=20, validate_every=10, learning_rate=0.5)
+
+    def never(model, tensors):
+        return torch.full((len(tensors),), math.nan)
+
+    with pytest.raises(ValueError, match=r"learning_rate 0\.5: no validation error was finite"):
+        train(fresh(some), some, some, config, score=never)
+
+
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
 def test_a_gpu_trains_and_any_score_validates(some):
     def score(model, tensors):

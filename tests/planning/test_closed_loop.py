@@ -242,6 +242,20 @@ def test_what_is_held_aside_of_its_goal_is_put_down_and_lifted_there(shifts_m, l
     assert abs(went.height_error_m) < 0.003
 
 
+def test_a_height_that_is_no_longer_wanted_is_let_go():
+    goal = Goal((0.06, 0.0), EXACT_M, height_m=0.1)
+
+    def drop_height(plan, n):
+        nonlocal goal
+        if plan.steps[-1].primitive.name == "grasp":
+            goal = replace(goal, height_m=None)
+
+    went = loop(PointRobot(), lambda: goal, on_action=drop_height)
+    assert went.reached
+    assert went.height_error_m is None
+    assert sum(isinstance(step.primitive, Grasp) for step in went.steps) == 1
+
+
 @pytest.mark.parametrize("sees_yaw", [True, False])
 def test_a_turn_that_nobody_sees_is_reckoned_by_the_hand_and_said_to_be(sees_yaw):
     """Of a disc no image tells it."""
@@ -302,6 +316,10 @@ def test_what_was_done_before_the_arm_refused_is_kept():
     assert len(outcome.object_paths_xy_m) == 2
     assert outcome.end_pose[:2] == robot.xy_m == pytest.approx((0.189, 0.0))
     assert outcome.distance_m == plan.goal.distance_m(robot.xy_m)
+    near = replace(plan, steps=(can,))
+    with pytest.raises(UnreachableError) as refused:
+        execute_plan(robot, near, 1, lambda *_: replace(plan, steps=(cannot,)))
+    assert len(refused.value.outcome.object_paths_xy_m) == 1
     robot.refuses = lambda *_: False  # it agrees to what it then cannot do
     went = loop(robot, Goal(robot.xy_m, height_m=0.1))
     assert (went.status, went.message) == ("unreachable", "the height: out of reach")

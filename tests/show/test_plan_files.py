@@ -4,7 +4,7 @@ import math
 import numpy as np
 import pytest
 
-from affordlib.primitives import Drag, Push, Rotate
+from affordlib.primitives import Drag, Push, PushAt, Rotate
 from affordlib.results import load_plan, save_plan
 from affordlib.types import Goal, Plan, Step
 
@@ -17,7 +17,9 @@ def saved(tmp_path, primitive=Push(0.0)):  # noqa: B008
     return save_plan(tmp_path / "new" / "plan.json", plan)
 
 
-@pytest.mark.parametrize("primitive", [Push(0.3, length=0.02), Drag(1.0), Rotate()])
+@pytest.mark.parametrize(
+    "primitive", [Push(0.3, length=0.02), Drag(1.0), Rotate(), PushAt((0.02, 0.01), 2.0)]
+)
 def test_any_primitive_and_a_decoded_path_come_back(primitive, tmp_path):
     file = saved(tmp_path, primitive)
     (back,) = load_plan(file).steps
