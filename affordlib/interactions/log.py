@@ -260,8 +260,8 @@ def _growing(where: str, name: str, times: Any) -> np.ndarray:
     if (stuck := np.flatnonzero(np.diff(t) <= 0)).size:
         row = int(stuck[0]) + 1
         raise ValueError(
-            f"{where}: {name} must grow, but row {row} is {t[row]!r} after {t[row - 1]!r}; leave "
-            "out repeated rows"
+            f"{where}: {name} must grow, but row {row} is {t[row].item()!r} after "
+            f"{t[row - 1].item()!r}; leave out repeated rows, and check that no column is missing"
         )
     return t
 

@@ -1,6 +1,7 @@
 """The page of a log of one's own: its thirty lines run, and lead to a table and a plan."""
 
 import json
+import lzma
 import re
 
 import numpy as np
@@ -54,11 +55,29 @@ def test_the_script_of_thirty_lines(script):
     assert abs(plan.steps[-1].predicted_turn_rad - 0.25) < 0.1
 
 
+def reading(script, folder):
+    """The log that the script reads of a folder."""
+    names = {"logs": folder, "outline": ((0, 0), (130, 0), (30, 110)), "tool_radius": 1.5}
+    exec(re.split(r"^one = ", script, flags=re.MULTILINE)[0], names)
+    return names["data"]
+
+
+def test_other_conditions_are_read(script, tmp_path):
+    """Of any name, compressed or not, of any number of pushes; one cut short says where."""
+    packed = (repo_root() / "data" / "own_log" / "felt_mid.txt.xz").read_bytes()
+    (tmp_path / "ice.txt.xz").write_bytes(packed)
+    assert reading(script, tmp_path).context["surface"].tolist() == ["ice"] * 50
+    (tmp_path / "ice.txt.xz").unlink()
+    text = lzma.decompress(packed)
+    (tmp_path / "steel_patch_2.txt").write_bytes(b"12" + text[2:])
+    assert reading(script, tmp_path).context["support"].tolist() == ["patch_2"] * 12
+    (tmp_path / "steel_patch_2.txt").write_bytes(text[:-4000])
+    with pytest.raises(ValueError, match=r"interaction \d+ \(group 'steel_patch_2'\): tool_"):
+        reading(script, tmp_path)
+
+
 def test_plans_want_one_group(script):
-    read = re.split(r"^one = ", script, flags=re.MULTILINE)[0]
-    names = {"logs": "data/own_log", "outline": ((0, 0), (130, 0), (30, 110)), "tool_radius": 1.5}
-    exec(read, names)
-    data = names["data"]
+    data = reading(script, "data/own_log")
     assert len(data) == 250
     assert np.degrees(np.arccos((data.normal * data.direction).sum(axis=1))).max() < 52
     with pytest.raises(ValueError, match="log must hold one group"):
