@@ -41,11 +41,14 @@ from affordlib.planning import (
     plan_continuous,
     plan_gradient,
 )
+from affordlib.planning.closed_loop import ENOUGH_M
+from affordlib.planning.problem import MODES
 from affordlib.primitives import Push
 from affordlib.results import write_results
 from affordlib.types import Outcome, Plan, Step
 from affordlib.world import Tabletop, UnreachableError
 from experiments import reported, runner
+from experiments.field_baselines import plan_astar_continuous, plan_cem
 from experiments.oracle import oracle_effects
 from experiments.runner import FOLDER, Job, Rows
 
@@ -68,6 +71,7 @@ def _whole(planner: Callable[..., Plan]) -> Callable[..., Plan]:
 
 plan_astar_full = _whole(plan_astar)
 plan_continuous_full = _whole(plan_continuous)
+plan_gradient_full = _whole(plan_gradient)
 
 
 def plan_astar_fine(problem: PlanningProblem, heuristic: str = "goal") -> Plan:
@@ -141,7 +145,7 @@ class PlannerConfig:
             "world": self.world,
             "samples": self.arguments.get("samples", samples.get(self.planner)),
             "placed_by": placed,
-            "closed_loop": self.execution.get("corrections", 0) > 0,
+            "closed_loop": bool({"corrections", "receding"} & set(self.execution)),
             "perturbed_start": self.execution.get("perturbed_start", False),
         }
 
@@ -163,6 +167,7 @@ class PlannerConfig:
 
 ALL = {"sources": goals.GOAL_SOURCES}
 CORRECTED, BY_PLAN = {"execution": {"corrections": 2}}, {"execution": {"by_plan": True}}
+RECEDING = {"execution": {"receding": True}}
 LITERAL, ON_RING = {"samples": 100}, {"samples": 100, "starts": 4, "direction_only": True}
 DISC = {"heuristic": "disc"}
 PERTURBED = {"model": "film_5000_perturbed", "world": "perturbed"}
@@ -189,10 +194,16 @@ CONFIGS: dict[str, PlannerConfig] = {
     "gradient_300": PlannerConfig(plan_gradient, "cnp_500", {"samples": 300}),
     "gradient_snapped": PlannerConfig(plan_gradient, "cnp_500", {"samples": 100, "snap": True}),
     "gradient_direction": PlannerConfig(plan_gradient, "cnp_500", ON_RING, **ALL),
-    "gradient_corrected": PlannerConfig(plan_gradient, "cnp_500", ON_RING, **CORRECTED),
+    "gradient_direction_corrected": PlannerConfig(plan_gradient, "cnp_500", ON_RING, **CORRECTED),
     # Without partial actions.
     "continuous_full": PlannerConfig(plan_continuous_full, **ALL),
     "astar_full": PlannerConfig(plan_astar_full, standing=True),
+    "gradient_direction_full": PlannerConfig(plan_gradient_full, "cnp_500", ON_RING),
+    # Planners of the field.
+    "astar_continuous": PlannerConfig(plan_astar_continuous, standing=True),
+    "cem": PlannerConfig(plan_cem, standing=True),
+    "mpc_cem": PlannerConfig(plan_cem, **RECEDING, standing=True),
+    "mpc_continuous": PlannerConfig(plan_continuous, **RECEDING, standing=True),
     # What each idea is worth, and what a small error of the object's pose does.
     "continuous_cnp_500": PlannerConfig(plan_continuous, "cnp_500", **ALL),
     "continuous_film_500": PlannerConfig(plan_continuous, "film_500", **ALL),
@@ -234,6 +245,7 @@ def attempt(
     perturbed_start: bool = False,
     n_averaged_images: int = 1,
     by_plan: bool = False,
+    receding: bool = False,
 ) -> Outcome:
     """Plan and execute one task, correcting the final position by up to so many single actions.
 
@@ -242,6 +254,8 @@ def attempt(
     perturbed_start: when the plan is executed, the object is off its estimated pose by
     `POSITION_ERROR_M` and `YAW_ERROR_RAD`. n_averaged_images: whose mean each observation is.
     by_plan: each action is placed where the plan has the object, instead of where it is observed.
+    receding: after each action of those that are allowed, a new plan is made of those that remain
+    (model-predictive control).
     """
     world.place(task.obj, (0.0, 0.0), task.yaw_rad, config=task.config)
     world.n_averaged_images = n_averaged_images
@@ -262,8 +276,18 @@ def attempt(
 
     same = {name: getattr(world, name) for name in ("observe", "can_reach", "park", "settle")}
     robot = SimpleNamespace(execute=execute, **same) if by_plan else world
+    now = replace(plan, steps=plan.steps[:1]) if receding else plan
     try:
-        outcome = execute_plan(robot, plan, corrections, lambda *query: planner(*query, once))
+        outcome = execute_plan(robot, now, corrections, lambda *query: planner(*query, once))
+        mode = MODES[task.mode]
+        for left in range(mode.max_steps - 1, 0, -1) if receding else ():
+            seen = world.observe()
+            if task.goal.distance_m(seen.xy_m) <= ENOUGH_M:
+                break
+            again = planner(seen.image, seen.xy_m, task.goal, replace(mode, max_steps=left))
+            more = execute_plan(world, replace(again, steps=again.steps[:1]))
+            paths = outcome.object_paths_xy_m + more.object_paths_xy_m
+            outcome = replace(more, plan=plan, object_paths_xy_m=paths)
     except UnreachableError as refused:
         outcome = refused.outcome
     finally:
@@ -389,16 +413,20 @@ def decomposition_rows(rows: Rows) -> Rows:
 
 
 VARIANTS = {
+    name: name.removesuffix(change)
+    for change in ("_full", "_by_plan", "_corrected")
+    for name in CONFIGS
+    if name.removesuffix(change) in {*CONFIGS} - {name}
+} | {
     "astar_disc": "astar",
     "astar_disc_cnp_500": "astar_cnp_500",
-    "astar_full": "astar",
-    "continuous_full": "continuous",
-    "continuous_by_plan": "continuous",
-    "astar_by_plan": "astar",
-    "astar_corrected": "astar",
-    "astar_disc_corrected": "astar_disc",
-    "gradient_corrected": "gradient_direction",
-    "continuous_corrected": "continuous",
+    "astar_continuous": "continuous",
+    "gradient_300": "gradient_100",
+    "cem": "continuous",
+    "mpc_continuous": "continuous",
+    "mpc_cem": "mpc_continuous",
+    "continuous_cnp_500": "continuous_film_500",
+    "continuous_film_500": "continuous",
 }
 """Planners with one thing changed, and without: compared goal by goal, on objects that stand."""
 

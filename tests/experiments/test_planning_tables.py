@@ -116,6 +116,42 @@ def test_actions_are_placed_by_the_plan(world):
     assert once.distance_m < 0.003
 
 
+def test_with_a_receding_horizon_each_plan_has_one_action_less(world):
+    task = next(t for t in frozen_tasks() if t.mode == "multi_partial" and not t.obj.rollable)
+    planner, seen = CONFIGS["mpc_continuous"].make(world), []
+
+    def watched(image, xy_m, goal, mode):
+        seen.append((xy_m, MODES[mode].max_steps if isinstance(mode, str) else mode.max_steps))
+        plan = planner(image, xy_m, goal, mode)
+        # One that stops half way leaves something to do.
+        steps = tuple(replace(s, stop_phase=0.8) for s in plan.steps) if len(seen) < 3 else ()
+        return replace(plan, steps=steps)
+
+    outcome = attempt(world, task, watched, receding=True)
+    assert [n for _, n in seen] == [3, 2, 1]
+    assert len({xy for xy, _ in seen}) == 3
+    assert len(outcome.object_paths_xy_m) == 2
+    assert outcome.distance_m == task.goal.distance_m(world.object_pose()[:2])
+
+
+def test_planners_of_the_field_keep_to_their_actions_and_improve_on_their_start(world):
+    tasks = [t for t in frozen_tasks() if t.goals == "constructed" and not t.obj.rollable]
+    names = ("astar", "astar_continuous", "cem")
+    planners, ends = {name: CONFIGS[name].make(world) for name in names}, []
+    for task in tasks[::12]:
+        world.place(task.obj, (0.0, 0.0), task.yaw_rad, config=task.config)
+        about = world.depth_image(), (0.0, 0.0), task.goal, task.mode
+        plans = [planners[name](*about) for name in names]
+        for plan in plans:
+            assert len(plan.steps) <= MODES[task.mode].max_steps
+            assert MODES[task.mode].partial or all(s.stop_phase == 1 for s in plan.steps)
+        ends.append([plan.predicted_distance_m for plan in plans])
+    searched, refined, drawn = np.array(ends).T
+    assert (refined < searched + 1e-4).all()
+    assert np.median(refined) < 0.1 * np.median(searched)
+    assert np.median(drawn) < 0.001
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("rollable", [False, True])
 def test_with_the_simulator_as_model_hardly_anything_remains(world, rollable):
