@@ -29,7 +29,7 @@ def _row(question: str, n: int, factor: float, reported: float | None, paper: fl
 
 
 def rows() -> list[dict[str, Any]]:
-    """A row a question: n trials, the paper's figure, both networks under equal conditions."""
+    """A row a question: n trials, the paper's figure, both networks on the same data."""
     effects = _table("effect_prediction", "push_test").query("object_class == 'all'")
     pushes = effects[effects.n_interactions == 500].set_index("model")
     means = pushes.final_error_mean_m
