@@ -2,21 +2,24 @@
 
     python -m experiments.real_pushes --logs FOLDER
 
-makes `data/results/real_pushes.json`. FOLDER holds the logs of seven conditions, as published (or
-compressed by xz): github.com/robinzhoucmu/Pushing, icra_data_proc/SensorLogs (Apache License 2.0;
-Zhou, Paolini, Bagnell and Mason, A convex polynomial force-motion model for planar sliding, ICRA
-2016).
+makes `data/results/real_pushes.json`; with `--tune` as well how steps and rates of tuning to few
+pushes do on inner folds of the two conditions for choosing. FOLDER holds the logs of seven
+conditions, as published (or compressed by xz): github.com/robinzhoucmu/Pushing,
+icra_data_proc/SensorLogs (Apache License 2.0; Zhou, Paolini, Bagnell and Mason, A convex polynomial
+force-motion model for planar sliding, ICRA 2016).
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import lzma
 import math
 from collections.abc import Sequence
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pandas as pd
@@ -25,7 +28,7 @@ from scipy.stats import bootstrap
 from affordlib.commands import command, names_type, whole_type
 from affordlib.evaluation.cross_validate import BASELINES, errors_of, forecast_errors, summary
 from affordlib.interactions.log import Log, PushLog
-from affordlib.models.fit import EFFORT, MODELS, fit, folds_of
+from affordlib.models.fit import EFFORT, MODELS, fit, folds_of, gyration_radius_m
 from affordlib.models.neural_process import PRETRAINED
 from affordlib.results import write_results
 from experiments.runner import Job, frame, read, run
@@ -155,6 +158,46 @@ def job(protocol: str, predictor: str, told: bool, seed: int, fold: int, logs: s
     return Job(partial(measure, logs), arguments, settings, checkpoints=checkpoints, version=2)
 
 
+TUNING = "real_pushes_tuning"
+STEPS, RATES, INNER_FOLDS = (50, 100, 200), (1e-4, 3e-4), 5
+
+
+def tune(logs: str, steps: int, rate: float, condition: str, fold: int) -> dict:
+    """Errors per push of one way of tuning to few pushes, of an inner fold of a condition.
+
+    The pushes that the tables test first (fold 0 of seed 0) take no part.
+    """
+    data = read_logs(logs, told=False)
+    data = data.select((data.groups == condition) & (folds_of(data.groups, 5, 0) > 0))
+    tested = folds_of(data.groups, INNER_FOLDS, 1) == fold
+    with mock.patch.dict(EFFORT, few=(steps, rate, EFFORT["few"][2])):
+        errors = errors_of(data, ~tested, tested, ("np",))
+    errors["both_m"] = errors["position_m"] + gyration_radius_m(data.outline_m) * errors["yaw_rad"]
+    return {"errors": errors[["push", "position_m", "yaw_rad", "both_m"]].to_dict("list")}
+
+
+def tuning_job(steps: int, rate: float, condition: str, fold: int, logs: str = "") -> Job:
+    """One way of tuning to few pushes, on a fold of a condition."""
+    arguments = {"steps": steps, "rate": rate, "condition": condition, "fold": fold}
+    return Job(partial(tune, logs), arguments, EFFORT["few"][2], checkpoints=(PRETRAINED,))
+
+
+def tuning_rows() -> list[dict[str, Any]]:
+    """Ways of tuning to few pushes, and push by push how much worse each is than that of `fit`.
+
+    both: the error of position and that of the turn on the radius of gyration; it decides.
+    """
+    found, rows = frame(read(TUNING, tuning_job), "errors"), []
+    pushes = found.set_index(["steps", "rate", "condition", "push"]).sort_index()
+    for way, part in pushes.groupby(["steps", "rate"]):
+        row = dict(zip(("steps", "rate"), way, strict=True)) | {"n": len(part)}
+        for name, unit in (("position", "m"), ("yaw", "rad"), ("both", "m")):
+            row[f"{name}_mean_{unit}"] = part[f"{name}_{unit}"].mean()
+        worse = part["both_m"].to_numpy() - pushes.loc[EFFORT["few"][:2], "both_m"]
+        rows.append(row | interval(worse, "difference", "m"))
+    return rows
+
+
 def tables() -> dict[str, list[dict]]:
     """Errors by protocol, model and what was told; beside the best baseline, push by push.
 
@@ -178,7 +221,7 @@ def tables() -> dict[str, list[dict]]:
     ]
     for row in (row for rows in found.values() for row in rows):
         row["shots"] = int(row["shots"]) if row["shots"] >= 0 else None
-    return found
+    return found | {"tuning": tuning_rows()}
 
 
 def differences(errors: pd.DataFrame) -> list[dict[str, Any]]:
@@ -195,12 +238,16 @@ def differences(errors: pd.DataFrame) -> list[dict[str, Any]]:
             row = {"told": told, "baseline": best, "baseline_told": baseline_told, "n": len(errors)}
             for column, unit in (("position", "m"), ("yaw", "rad")):
                 each = errors[f"{column}_{unit}"]
-                off = (each["np", told] - each[best, baseline_told]).to_numpy()
-                ends = bootstrap((off,), np.mean, method="percentile", rng=0).confidence_interval
-                for what, value in (("mean", off.mean()), ("low", ends.low), ("high", ends.high)):
-                    row[f"{column}_{what}_{unit}"] = value
+                row |= interval(each["np", told] - each[best, baseline_told], column, unit)
             rows.append(row)
     return rows
+
+
+def interval(off: pd.Series, name: str, unit: str) -> dict[str, float]:
+    """Mean of differences and its 95 % interval, by a bootstrap over pushes."""
+    ends = bootstrap((off.to_numpy(),), np.mean, method="percentile", rng=0).confidence_interval
+    values = {"mean": off.mean(), "low": ends.low, "high": ends.high}
+    return {f"{name}_{what}_{unit}": value for what, value in values.items()}
 
 
 @command(OSError, ValueError)
@@ -211,8 +258,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--predictors", type=names_type(NAMES), default=list(NAMES))
     parser.add_argument("--seeds", type=whole_type(1, 100), default=3)
     parser.add_argument("--protocols", type=names_type(PROTOCOLS), default=list(PROTOCOLS))
+    parser.add_argument("--tune", action="store_true", help="settings of tuning to few pushes")
     options = parser.parse_args(argv)
-    if options.logs:
+    if options.logs and options.tune:
+        ways = itertools.product(STEPS, RATES, CHOSEN_ON, range(INNER_FOLDS))
+        run([tuning_job(*way, options.logs) for way in ways], TUNING)
+    elif options.logs:
         jobs = [
             job(protocol, predictor, told, seed, fold, options.logs)
             for seed in range(options.seeds)
