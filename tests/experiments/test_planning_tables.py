@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from affordlib.evaluation.tasks import FROZEN, ROLLABLE, STANDING, PlanningTask, frozen_tasks
+from affordlib.geometry import rotated
 from affordlib.planning import MODES
 from affordlib.primitives import Drag
 from experiments import planning, shipped
+from experiments.adaptation import Camera
 from experiments.planning import CONFIGS, attempt, planning_rows, tasks_sha256
 
 
@@ -19,6 +21,19 @@ def records(distances, object_class="cuboid", tasks=None):
     tasks = range(len(distances)) if tasks is None else tasks
     errors = [{"task": k, "distance_m": d} for k, d in zip(tasks, distances, strict=True)]
     return [about | row | {"prediction_error_m": row["distance_m"]} for row in errors]
+
+
+def test_pushes_show_how_far_beside_the_camera_sees():
+    """An object that is seen too far ahead of the gripper goes as far beyond; two sides tell."""
+    error_m, camera = np.array([0.001, -0.002]), Camera((0.0, 0.0005), sd_m=0.001, noise_m=1e-5)
+    pushes = [
+        {"angle": angle, "std_m": (0.001, std_m), "beyond_m": rotated(error_m, -angle)}
+        for angle, std_m in ((0.3, 1.0), (2.0, 1.0), (2.5, 0.001))
+    ]
+    assert camera.error_m([]).tolist() == [0.0, 0.0005]
+    assert rotated(camera.error_m(pushes[:1]) - error_m, -0.3)[0] == pytest.approx(0, abs=1e-6)
+    np.testing.assert_allclose(camera.error_m(pushes[:2]), error_m, atol=1e-6)
+    np.testing.assert_allclose(camera.error_m(pushes[2:]), error_m, atol=1e-6)
 
 
 def test_rows_are_of_all_of_groups_and_of_categories():

@@ -7,6 +7,7 @@ from dask.distributed import Client
 
 from affordlib.results import read_results, write_results
 from experiments import (
+    adaptation,
     closed_loop,
     effect_prediction,
     headline,
@@ -129,6 +130,7 @@ WRITE = {
     "closed_loop": closed_loop.write_tables,
     "open_loop_pose_goals": closed_loop.write_open_loop,
     "real_pushes": drawn("real_pushes", real_pushes.tables),
+    "adaptation": drawn("adaptation", adaptation.tables),
     "headline": drawn("headline", lambda: {"main": headline.rows()}),
 }
 

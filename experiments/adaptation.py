@@ -1,0 +1,171 @@
+"""Does a robot predict and plan better after a few pushes of an object? In the perturbed world.
+
+    python -m experiments.adaptation
+
+What is hidden there is the same in all pushes of an object. Of it, pushes show how far beside the
+object the camera sees it: it goes where the gripper goes, so by about this error farther than was
+predicted. The robot takes the error that it expects off what it sees.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
+from typing import Any, Self
+
+import numpy as np
+import pandas as pd
+import torch
+
+from affordlib.commands import command, count_type
+from affordlib.evaluation.tasks import EARLIEST_STOP, STANDING, frozen_tasks
+from affordlib.geometry import rotated
+from affordlib.interactions.recipes import Variation
+from affordlib.models.checkpoint import load_checkpoint
+from affordlib.planning import EffectMap
+from affordlib.primitives import Push
+from affordlib.results import write_results
+from affordlib.world import Tabletop, TabletopObject, WorldConfig, category_named
+from experiments import runner
+from experiments.planning import CONFIGS, attempt, tasks_sha256
+from experiments.real_pushes import interval
+from experiments.runner import Job, Rows, frame
+
+TABLE, PLANS = "adaptation", CONFIGS["perturbed_corrected"]
+N_OTHERS, N_TESTS, SHOTS = 40, 2, (0, 2, 5, 10)
+
+
+@lru_cache(maxsize=1)
+def robot() -> tuple[Tabletop, Any, Any]:
+    """A simulated world, a planner for it, and the planner's network."""
+    torch.set_num_threads(1)
+    world = Tabletop()
+    return world, PLANS.make(world), load_checkpoint(PLANS.model)[0]
+
+
+def push_often(obj: TabletopObject, config: WorldConfig, rng: np.random.Generator) -> Rows:
+    """Pushes of an object in any directions, each from the table's centre.
+
+    error_m: of the camera; beyond_m: how much farther than predicted the object was seen to go,
+    ahead and to the left; truly_m: the same in truth; std_m: the network's σ.
+    """
+    (world, _, model), rows = robot(), []
+    for _ in range(max(SHOTS) + N_TESTS):
+        angle, stop = rng.uniform(-math.pi, math.pi), rng.uniform(EARLIEST_STOP, 1.0)
+        config = replace(config, noise_seed=int(rng.integers(2**31)))
+        world.place(obj, (0.0, 0.0), rng.uniform(-math.pi, math.pi), config=config)
+        done = world.execute_primitive(Push.towards(angle), stop)
+        action = torch.tensor([angle]).double(), torch.tensor([stop]).double()
+        mean, std = (v[0, :2].numpy() for v in EffectMap(model, done.image)(*action))
+        seen = np.subtract(world.observe().xy_m, done.estimated_xy_m)
+        row = {"angle": angle, "error_m": done.estimated_xy_m, "std_m": std}
+        for name, moved in (("beyond_m", seen), ("truly_m", done.rest_effect[:2])):
+            row[name] = rotated(moved, -angle) - mean
+        rows.append({name: np.asarray(value).tolist() for name, value in row.items()})
+    return rows
+
+
+@dataclass(frozen=True)
+class Camera:
+    """What is known of its error before any push, mean_m (x, y) and sd_m, and what pushes show.
+
+    The network's σ² holds the variance of the error; the rest of it, and the noise of two looks,
+    noise_m, hide how much farther an object went because of the error.
+    """
+
+    mean_m: tuple[float, float]
+    sd_m: float
+    noise_m: float
+
+    @classmethod
+    def fit(cls, others: Sequence[dict[str, Rows]]) -> Self:
+        """From looks at many objects at known positions."""
+        errors = np.array([[push["error_m"] for push in other["pushes"]] for other in others])
+        of_object, noise_m = errors.mean(axis=1), math.sqrt(2) * errors.std(axis=1).mean()
+        sd_m = float(of_object.std(axis=0).mean())
+        return cls(tuple(of_object.mean(axis=0).tolist()), sd_m, float(noise_m))
+
+    def error_m(self, pushes: Rows) -> np.ndarray:
+        """The expected error (2,) after some pushes, by Bayes' rule."""
+        precision, weighted = np.eye(2) / self.sd_m**2, np.array(self.mean_m) / self.sd_m**2
+        for push in pushes:
+            variance = np.maximum(np.square(push["std_m"]) - self.sd_m**2, 0) + self.noise_m**2
+            axes = rotated(np.eye(2), push["angle"])  # ahead and to the left
+            precision += axes.T / variance @ axes
+            weighted += axes.T / variance @ push["beyond_m"]
+        return np.linalg.solve(precision, weighted)
+
+
+def known(camera: Camera, pushes: Rows) -> dict[str, np.ndarray]:
+    """The camera's error (2,) as it is expected after some pushes, as it is, and taken for none."""
+    after = {f"{n} pushes": camera.error_m(pushes[:n]) for n in SHOTS}
+    true = np.mean([push["error_m"] for push in pushes], axis=0)
+    return {"nothing": np.zeros(2)} | after | {"the error": true}
+
+
+def measure(camera: Camera | None, kind: str, number: int) -> dict[str, Rows]:
+    """Pushes of another object; or errors at a goal, by what is known of the camera's error."""
+    rng = np.random.default_rng([2_000_029, number])
+    if kind == "other":
+        obj = category_named(STANDING[number % len(STANDING)]).sample(rng)
+        return {"pushes": push_often(obj, Variation().sample(obj, rng), rng)}
+    task, (world, planner, _), errors = frozen_tasks("perturbed")[number], robot(), []
+    for name, error_m in known(camera, push_often(task.obj, task.config, rng)).items():
+        config = replace(task.config, bias_m=tuple(task.config.bias_m - error_m))
+        done = attempt(world, replace(task, config=config), planner, **PLANS.execution)
+        planned = done.object_paths_xy_m[: len(done.plan.steps)]
+        plan_m = task.goal.distance_m(planned[-1][-1]) if planned else done.distance_m
+        for of, error in (("plan", plan_m), ("corrected plan", done.distance_m)):
+            errors.append({"of": of, "known": name, "error_m": error})
+    return {"errors": errors}
+
+
+def job(kind: str, number: int, camera: Camera | None = None) -> Job:
+    """Pushes of another object, or a goal; these others decide the camera."""
+    settings = [PLANS, tasks_sha256("perturbed"), SHOTS, N_TESTS]
+    arguments = {"kind": kind, "number": number}
+    return Job(partial(measure, camera), arguments, settings, checkpoints=(PLANS.model,))
+
+
+def tables() -> dict[str, Rows]:
+    """What is known of the camera, and errors by what is known; differences case by case.
+
+    Predictions are of the last pushes of the other objects.
+    """
+    results, errors, rows = runner.read(TABLE, job), [], []
+    others = [result for about, result in results if about["kind"] == "other"]
+    camera = Camera.fit(others)
+    for k, pushes in enumerate(other["pushes"] for other in others):
+        for name, error_m in known(camera, pushes).items():
+            off = [p["truly_m"] - rotated(error_m, -p["angle"]) for p in pushes[max(SHOTS) :]]
+            error = {"of": "prediction", "error_m": np.linalg.norm(off, axis=1).mean()}
+            errors.append({"number": k, "known": name} | error)
+    every = pd.concat([pd.DataFrame(errors), frame(results, "errors")])
+    for (of, name), some in every.groupby(["of", "known"], sort=False):
+        nothing = every[(every["of"] == of) & (every["known"] == "nothing")]
+        error, without = (table.set_index("number")["error_m"] for table in (some, nothing))
+        row = {"of": of, "known": name, "n": len(some), "mean_m": error.mean()}
+        row |= {"sem_m": error.sem(), "median_m": error.median()}
+        rows.append(row | interval(error - without, "difference", "m"))
+    return {"camera": [vars(camera)], "errors": rows}
+
+
+@command(OSError, ValueError)
+def main(argv: Sequence[str] | None = None) -> int:
+    """Push, plan, and make the table; what is there is not made again."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("--goals", type=count_type, default=40, help="so many of 80")
+    n = parser.parse_args(argv).goals
+    others = runner.run([job("other", k) for k in range(N_OTHERS)], TABLE)
+    camera = Camera.fit(others)
+    numbers = [k for k, t in enumerate(frozen_tasks("perturbed")) if t.mode == "multi_partial"]
+    runner.run([job("goal", k, camera) for k in sorted(numbers, key=lambda k: k % 2)[:n]], TABLE)
+    print(write_results("data/results", TABLE, {}, tables()))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
