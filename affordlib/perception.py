@@ -7,13 +7,15 @@ table, as a map is read.
 
 import math
 from dataclasses import replace
+from operator import itemgetter
 
 import numpy as np
+from contourpy import contour_generator
 from matplotlib.path import Path
 from scipy import ndimage
 from scipy.spatial import ConvexHull
 
-from affordlib.geometry import wrap_angle
+from affordlib.geometry import cross, wrap_angle
 from affordlib.primitives import Drag, Grasp, Primitive
 from affordlib.types import CROP_WIDTH_M, IMAGE_PIXELS, check_array, check_pair, check_within
 
@@ -227,9 +229,42 @@ def outline_image(
 
 
 def outline_of(image: np.ndarray, width_m: float = CROP_WIDTH_M) -> np.ndarray:
-    """Corners (k, 2) [m] of the convex outline of an image's object, around the image's middle."""
-    rows, columns = np.nonzero(image[1] > 0.5)
-    n = len(image[1])
-    corners = [(columns + dx, n - rows - dy) for dx in (0, 1) for dy in (0, 1)]
-    points = np.concatenate([np.stack(c, axis=1) for c in corners])
-    return (points[ConvexHull(points).vertices] / n - 0.5) * width_m
+    """Corners (k, 2) [m] of the convex outline of an image's object, around the image's middle.
+
+    The rim is where half of the object's height is seen. Its hull loses edges that are short, or
+    hardly cut a corner off; to the rim along each edge left a line is fitted.
+    """
+    near, n = ndimage.binary_dilation(image[1] > 0.5), len(image[1])
+    cover = np.where(near, CAMERA_HEIGHT_M - image[0], 0.0) / object_height_m(image)
+    rims = contour_generator(z=np.pad(np.clip(cover, 0, 1), 1)).lines(0.5)
+    rim = (max(rims, key=len)[:-1] - (n + 1) / 2) * [1, -1]  # in pixels
+    hull = rim[ConvexHull(rim).vertices]
+    while len(hull) > 3:
+        off, fewer = min((_without_edge(hull, k) for k in range(len(hull))), key=itemgetter(0))
+        if off > 1.0 and len(hull) <= 12:
+            break
+        hull = fewer
+    lines = []
+    for start, edge in zip(hull, np.roll(hull, -1, axis=0) - hull, strict=True):
+        along, across = (rim - start) @ edge / (edge @ edge), cross(edge, rim - start)
+        near = (np.abs(along - 0.5) < 0.4) & (np.abs(across) < 1.5 * np.linalg.norm(edge))
+        on = rim[near] if near.sum() > 3 else np.array([start, start + edge])
+        normal = np.linalg.svd(on - on.mean(axis=0))[2][1]
+        lines.append([*normal, normal @ on.mean(axis=0)])
+    pairs = np.stack([np.roll(lines, 1, axis=0), lines], axis=1)
+    met = np.linalg.solve(pairs[..., :2], pairs[..., 2:])[..., 0]
+    is_near = np.linalg.norm(met - hull, axis=1, keepdims=True) < 1.5
+    return np.where(is_near, met, hull) * width_m / n
+
+
+def _without_edge(hull: np.ndarray, k: int) -> tuple[float, np.ndarray]:
+    """A polygon whose edges beside edge k go on to meet, and how far off, or half k's length."""
+    a, b, c, d = (hull[(k + j) % len(hull)] for j in (-1, 0, 1, 2))
+    turn, length = cross(b - a, d - c), np.linalg.norm(c - b)
+    if turn < 1e-6:
+        return math.inf, hull
+    longer = (b - a) * cross(c - b, d - c) / turn
+    fewer = hull.copy()
+    fewer[k] = b + longer
+    off = abs(float(cross(c - b, longer))) / length
+    return min(off, length / 2), np.delete(fewer, (k + 1) % len(hull), axis=0)

@@ -15,19 +15,18 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 
 from affordlib.commands import command
-from affordlib.geometry import rotated, unit_vector, wrap_angle
+from affordlib.geometry import rotated, unit_vector
 from affordlib.interactions.log import Log, PushLog
-from affordlib.models.fit import PushModel, fit
+from affordlib.models.fit import fit
 from affordlib.paths import repo_root
-from affordlib.planning.push_at import plan_push_at
 from affordlib.primitives import PushAt
 from affordlib.results import write_results
-from affordlib.types import Goal, UnreachableError
+from affordlib.types import UnreachableError
 from affordlib.world import Prism, Tabletop, WorldConfig
 from affordlib.world.robot import ROD_WIDTH_M
+from experiments.pose_goals import Remembered, attempt, summary
 
 FOLDER = repo_root() / "data" / "own_log"
 N_PUSHES, N_GOALS = 50, 50
@@ -37,8 +36,6 @@ HEIGHT_M = 0.02
 SUPPORTS = {"mid": (0.0, 0.0), "left": (-0.02, -0.005), "right": (0.022, -0.01)}
 SURFACES = {"felt": 0.9, "steel": 0.35}
 CONDITIONS = ("felt_mid", "felt_left", "steel_mid", "steel_right", "steel_left")
-TURN_M = 0.03
-"""So many metres a radian counts."""
 NOISE_M, NOISE_RAD = 0.0003, 0.003
 """Of the tracked poses."""
 
@@ -121,47 +118,9 @@ def collect(condition: str, seed: int) -> str:
     return "\n".join([str(n), *lines]) + "\n"
 
 
-def pursue(world: Tabletop, model: PushModel, log: PushLog, goal: tuple, corrected: bool) -> dict:
-    """What is left to a goal (x, y, turn) of the object at the origin, and pushes that it took.
-
-    corrected: look after each push and plan anew, up to six pushes, until a plan does not help.
-    """
-    yaw, pushes = world.object_pose()[2], 0
-    while pushes < (6 if corrected else 1):
-        pose = world.object_pose()
-        left = wrap_angle(yaw + goal[2] - pose[2])
-        now = math.hypot(math.dist(pose[:2], goal[:2]), TURN_M * left)
-        plan = plan_push_at(model, log, pose, Goal(goal[:2], 0.001, left))
-        end = plan.steps[-1]
-        there = TURN_M * wrap_angle(end.predicted_turn_rad - left)
-        if math.hypot(plan.predicted_distance_m, there) + end.std_m > now:
-            break
-        for step in plan.steps[: 1 if corrected else 3]:
-            world.execute_primitive(step.primitive)
-            pushes += 1
-        if not corrected:
-            break
-    end = world.object_pose()
-    turn = abs(wrap_angle(end[2] - yaw - goal[2]))
-    return {"position_m": math.dist(end[:2], goal[:2]), "yaw_rad": turn, "pushes": pushes}
-
-
-class Remembered:
-    """A model that predicts the candidates of plans once, for they are the same for one seed."""
-
-    def __init__(self, model: PushModel) -> None:
-        self.model, self.known = model, None
-
-    def predict(self, pushes: PushLog) -> tuple[np.ndarray, np.ndarray]:
-        """As the model predicted the first pushes."""
-        if self.known is None:
-            self.known = self.model.predict(pushes)
-        return self.known
-
-
 def goals(n: int = N_GOALS) -> list[dict]:
-    """Errors of executed plans, by whether they are corrected between pushes."""
-    log, found = read_log(), {False: [], True: []}
+    """Errors of executed plans, and of what corrections leave of them."""
+    log, found = read_log(), []
     prism, rng = Prism(TRIANGLE_M, HEIGHT_M), np.random.default_rng(1)
     for condition in CONDITIONS:
         of_one = log.select(log.groups == condition)
@@ -169,20 +128,9 @@ def goals(n: int = N_GOALS) -> list[dict]:
         with Tabletop(world_config(condition)) as world:
             for _ in range(n // len(CONDITIONS)):
                 xy = rng.uniform(0.008, 0.03) * unit_vector(rng.uniform(-math.pi, math.pi))
-                goal = *xy, rng.uniform(-0.35, 0.35)
-                for corrected, errors in found.items():
-                    world.place(prism, (0.0, 0.0), 0.0, tool="rod")
-                    errors.append(pursue(world, model, of_one, goal, corrected))
-    tables = {corrected: pd.DataFrame(errors) for corrected, errors in found.items()}
-    return [
-        {"corrected": corrected, "n": len(table), "pushes": table["pushes"].mean()}
-        | {
-            f"{column}_{statistic}_{unit}": table[f"{column}_{unit}"].agg(statistic)
-            for column, unit in (("position", "m"), ("yaw", "rad"))
-            for statistic in ("mean", "sem", "median")
-        }
-        for corrected, table in tables.items()
-    ]
+                world.place(prism, (0.0, 0.0), 0.0, tool="rod")
+                found += attempt(world, model, (*xy, rng.uniform(-0.35, 0.35)), of_one)
+    return summary(found, ["corrected"])
 
 
 @command(OSError, ValueError)

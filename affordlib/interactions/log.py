@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from affordlib.geometry import rotated
+from affordlib.geometry import cross, rotated
 from affordlib.interactions.dataset import InteractionTensors
 from affordlib.perception import outline_image
 from affordlib.types import CROP_WIDTH_M, check_array, check_within
@@ -53,13 +53,14 @@ class PushLog:
     effect: np.ndarray
     outline_m: np.ndarray
     crop_width_m: float = CROP_WIDTH_M
+    tool_radius_m: float = 0.0
 
     def __len__(self) -> int:
         return len(self.contact_m)
 
     def select(self, rows: np.ndarray) -> PushLog:
         """The pushes with these numbers, or where a mask (n,) is true."""
-        taken = {f.name: getattr(self, f.name) for f in fields(self)[:-2]}
+        taken = {f.name: getattr(self, f.name) for f in fields(self)[:-3]}
         taken["context"] = {name: values[rows] for name, values in self.context.items()}
         return replace(self, **{n: v if n == "context" else v[rows] for n, v in taken.items()})
 
@@ -105,7 +106,7 @@ class Log:
         self._metres, self._radians = UNITS_M[unit], UNITS_RAD[angle_unit]
         self._angle_unit = angle_unit
         corners = check_array("outline", outline, 2) * self._metres
-        self.origin_m, self.outline_m = _centred(corners)
+        self.origin_m, self.outline_m = centred(corners)
         wide = 2 * float(np.linalg.norm(self.outline_m, axis=1).max())
         if wide > 2 * LARGEST_M:
             raise ValueError(f"outline is {wide:.3g} m wide; is it in {unit}?")
@@ -185,7 +186,8 @@ class Log:
         by_name["context"] = {
             n: np.array([p["context"][n] for p in self._pushes]) for n in self._pushes[0]["context"]
         }
-        return PushLog(**by_name, outline_m=self.outline_m, crop_width_m=self.crop_width_m)
+        of_all = {"crop_width_m": self.crop_width_m, "tool_radius_m": self._radius_m}
+        return PushLog(**by_name, outline_m=self.outline_m, **of_all)
 
     def _tool(self, where: str, tool_t: Any, tool_xy: Any) -> tuple[np.ndarray, np.ndarray]:
         t = _growing(where, "tool_t", tool_t)
@@ -266,11 +268,7 @@ def _growing(where: str, name: str, times: Any) -> np.ndarray:
     return t
 
 
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray | np.floating:
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-
-
-def _centred(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def centred(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The centroid (2,) of a polygon, and its corners (k, 2) around it, counter-clockwise."""
     if corners.ndim != 2 or len(corners) < 3:
         raise ValueError(f"outline must be at least three corners (k, 2), got {corners.shape}")
@@ -279,7 +277,7 @@ def _centred(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     for i in range(k):
         for j in range(i + 2, k - (i == 0)):
             sides = [
-                np.sign(_cross(following[a] - corners[a], p - corners[a]))
+                np.sign(cross(following[a] - corners[a], p - corners[a]))
                 for a, b in ((i, j), (j, i))
                 for p in (corners[b], following[b])
             ]
@@ -288,7 +286,7 @@ def _centred(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
                     f"outline crosses itself: its edges from corner {i} and from corner {j} meet; "
                     "give the corners in order around it, each once"
                 )
-    doubled = _cross(corners, following)
+    doubled = cross(corners, following)
     if abs(doubled.sum()) < 1e-9:
         raise ValueError("outline has no area; give its corners in order around it")
     centroid = ((corners + following) * doubled[:, None]).sum(axis=0) / (3 * doubled.sum())
@@ -298,7 +296,7 @@ def _centred(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _inradius_m(outline_m: np.ndarray) -> float:
     """Distance [m] of the nearest edge from the centroid."""
     edges = np.roll(outline_m, -1, axis=0) - outline_m
-    return float(np.abs(_cross(edges, outline_m) / np.linalg.norm(edges, axis=1)).min())
+    return float(np.abs(cross(edges, outline_m) / np.linalg.norm(edges, axis=1)).min())
 
 
 def _contact(where: str, outline_m: np.ndarray, tool: np.ndarray, radius_m: float) -> dict:

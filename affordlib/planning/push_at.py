@@ -17,12 +17,14 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from affordlib.geometry import rotated
-from affordlib.interactions.log import PushLog
+from affordlib.interactions.log import N_PHASES, PushLog, centred
 from affordlib.models.fit import PushModel, gyration_radius_m
 from affordlib.primitives import PushAt
 from affordlib.types import Goal, Plan, Step, check_array, check_count, check_on_table
 
 N_CANDIDATES = 600
+LENGTHS_M = 0.002, 0.045
+"""Of pushes of an object that was only seen."""
 MOST_INCIDENCE_RAD = math.radians(50)
 CORNER_SHARE = 0.08
 """So much of an edge is left out at either end."""
@@ -37,11 +39,14 @@ def plan_push_at(
     goal: Goal,
     n_pushes: int = 3,
     seed: int = 0,
+    turn_m: float | None = None,
 ) -> Plan:
     """Plan off-centre pushes from a pose (x, y, yaw) to a goal; its turn counts if it has one.
 
-    log: what the model was fitted to, of one group; the object, its context and the longest push
-    are taken from it. Raises ValueError where a group is not alone.
+    log: what the model was fitted to, of one group, or `pushes_around` the outline of an object
+    that was only seen; the object, its context and the lengths of pushes are taken from it.
+    turn_m: so many metres a radian counts (default: the radius of gyration). Raises ValueError
+    where a group is not alone.
     """
     began = time.perf_counter()
     x, y, yaw = check_array("pose", pose, 3)
@@ -51,7 +56,7 @@ def plan_push_at(
         raise ValueError(f"log must hold one group, got {names.tolist()}; select(...) one")
     pushes = _candidates(log, np.random.default_rng(check_count("seed", seed, least=0)))
     effect, std = model.predict(pushes)
-    turn_m = gyration_radius_m(log.outline_m)
+    turn_m = turn_m or gyration_radius_m(log.outline_m)
     weights = np.array([1.0, 1.0, turn_m if goal.turn_rad is not None else 1e-6])
     risk = (weights * std) ** 2
     target = np.array([*rotated(np.subtract(goal.xy_m, (x, y)), -yaw), goal.turn_rad or 0.0])
@@ -77,10 +82,7 @@ def plan_push_at(
     steps, end = [], np.zeros((1, 3))
     for k in chain:
         heading = yaw + end[0, 2]
-        direction = math.atan2(pushes.direction[k, 1], pushes.direction[k, 0]) + heading
-        primitive = PushAt(
-            rotated(pushes.contact_m[k], heading), direction, float(pushes.length_m[k])
-        )
+        primitive = primitive_of(pushes, int(k), heading)
         path = [np.add((x, y), rotated(end[0, :2], yaw))]
         end = _after(end, effect[k : k + 1])
         path.append(np.add((x, y), rotated(end[0, :2], yaw)))
@@ -90,6 +92,13 @@ def plan_push_at(
     reaches = goal.distance_m(steps[-1].predicted_end_xy_m) <= goal.tolerance_m
     took_s = time.perf_counter() - began
     return Plan(goal, (x, y), tuple(steps), "push_at", reaches, n, took_s)
+
+
+def primitive_of(pushes: PushLog, k: int, heading_rad: float) -> PushAt:
+    """Push k as the middle of the tool does it on the object turned by a heading."""
+    middle = pushes.contact_m[k] - pushes.tool_radius_m * pushes.normal[k]
+    direction = math.atan2(pushes.direction[k, 1], pushes.direction[k, 0]) + heading_rad
+    return PushAt(tuple(rotated(middle, heading_rad)), direction, float(pushes.length_m[k]))
 
 
 def _turned(xy: np.ndarray, angle: np.ndarray) -> np.ndarray:
@@ -105,28 +114,39 @@ def _after(pose: np.ndarray, effect: np.ndarray) -> np.ndarray:
     )
 
 
+def pushes_around(
+    outline_m: np.ndarray,
+    tool_radius_m: float = 0.0,
+    n: int = N_CANDIDATES,
+    lengths_m: tuple[float, float] = LENGTHS_M,
+    seed: int | np.random.Generator = 0,
+) -> PushLog:
+    """Pushes drawn all around an outline (k, 2) [m], as a log whose effects are zero.
+
+    Its corners are told as feet of equal weight, which is all that the outline tells of them.
+    """
+    rng, outline_m = np.random.default_rng(seed), centred(outline_m)[1]
+    edges = np.roll(outline_m, -1, axis=0) - outline_m
+    sizes = np.linalg.norm(edges, axis=1)
+    edge = rng.choice(len(edges), n, p=sizes / sizes.sum())
+    share = rng.uniform(CORNER_SHARE, 1 - CORNER_SHARE, (n, 1))
+    contact = outline_m[edge] + share * edges[edge]
+    normal = np.stack([-edges[:, 1], edges[:, 0]], axis=1)[edge] / sizes[edge, None]
+    direction = _turned(normal, rng.uniform(-MOST_INCIDENCE_RAD, MOST_INCIDENCE_RAD, n))
+    length = np.exp(rng.uniform(*np.log(lengths_m), n))
+    t = np.linspace(0, length, N_PHASES).T[..., None]
+    feet = np.column_stack([outline_m, np.full(len(edges), 1 / len(edges))])
+    still = np.zeros((n, 2)), np.zeros(n)
+    known = np.full(n, "seen"), {"feet": np.repeat(feet[None], n, axis=0)}
+    paths = contact[:, None] + t * direction[:, None], np.zeros((n, N_PHASES, 3))
+    drawn = contact, normal, direction, length, *still, *known, *paths, outline_m
+    return PushLog(*drawn, tool_radius_m=tool_radius_m)
+
+
 def _candidates(log: PushLog, rng: np.random.Generator) -> PushLog:
-    """Pushes drawn all around the outline, up to the longest of the log; their effects are zero."""
-    edges = np.roll(log.outline_m, -1, axis=0) - log.outline_m
-    lengths = np.linalg.norm(edges, axis=1)
-    edge = rng.choice(len(edges), N_CANDIDATES, p=lengths / lengths.sum())
-    share = rng.uniform(CORNER_SHARE, 1 - CORNER_SHARE, (N_CANDIDATES, 1))
-    contact = log.outline_m[edge] + share * edges[edge]
-    normal = np.stack([-edges[:, 1], edges[:, 0]], axis=1)[edge] / lengths[edge, None]
-    incidence = rng.uniform(-MOST_INCIDENCE_RAD, MOST_INCIDENCE_RAD, N_CANDIDATES)
-    direction = _turned(normal, incidence)
-    length = log.length_m.max() * rng.uniform(SHORTEST_SHARE, 1, N_CANDIDATES)
-    ends = contact + length[:, None] * direction
-    t = np.linspace(0, 1, log.action.shape[1])[None, :, None]
-    taken = log.select(np.zeros(N_CANDIDATES, dtype=int))
-    return replace(
-        taken,
-        contact_m=contact,
-        normal=normal,
-        direction=direction,
-        length_m=length,
-        displacement_m=np.zeros((N_CANDIDATES, 2)),
-        turn_rad=np.zeros(N_CANDIDATES),
-        action=contact[:, None] + t * (ends - contact)[:, None],
-        effect=np.zeros((N_CANDIDATES, *log.effect.shape[1:])),
-    )
+    """Pushes around the object of a log, as long as its own or somewhat shorter, told as much."""
+    longest = log.length_m.max()
+    lengths = min(log.length_m.min(), SHORTEST_SHARE * longest), longest
+    drawn = pushes_around(log.outline_m, log.tool_radius_m, lengths_m=lengths, seed=rng)
+    taken = log.select(np.zeros(len(drawn), dtype=int))
+    return replace(drawn, groups=taken.groups, context=taken.context, crop_width_m=log.crop_width_m)

@@ -15,7 +15,7 @@ from pybullet_utils.bullet_client import BulletClient
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from affordlib.geometry import rotated
+from affordlib.geometry import cross, rotated
 from affordlib.types import (
     TABLE_X_M,
     TABLE_Y_M,
@@ -85,10 +85,6 @@ class TabletopObject(ABC):
     def rolls(self, upward: np.ndarray) -> bool:
         """Whether it can roll as it lies now."""
         return self.rollable
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
 
 def _circle(diameter: float) -> np.ndarray:
@@ -204,7 +200,7 @@ class Prism(TabletopObject):
             raise ValueError(f"prism corners must be 3 to 8 points (x, y), got {corners.shape}")
         following = np.roll(corners, -1, axis=0)
         edges = following - corners
-        turns = _cross(edges, np.roll(edges, -1, axis=0))
+        turns = cross(edges, np.roll(edges, -1, axis=0))
         inner = np.sum(edges * np.roll(edges, -1, axis=0), axis=1)
         rounds = np.arctan2(turns, inner).sum() / (2 * math.pi)  # a star goes around twice
         if (turns <= 0).any() or rounds > 1.5 or np.abs(corners).max() > LARGEST_M:
@@ -212,7 +208,7 @@ class Prism(TabletopObject):
                 "prism corners must go counter-clockwise around a convex polygon of at most "
                 f"{LARGEST_M:g} m, got {self.corners!r}"
             )
-        doubled = _cross(corners, following)
+        doubled = cross(corners, following)
         centroid = ((corners + following) * doubled[:, None]).sum(axis=0) / (3 * doubled.sum())
         centred = tuple((float(x), float(y)) for x, y in corners - centroid)
         object.__setattr__(self, "corners", centred)

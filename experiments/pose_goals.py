@@ -1,0 +1,227 @@
+"""Pose goals by pushing alone: position and yaw of objects that are only seen.
+
+    python -m experiments.pose_goals [--only model|goals]
+
+`model` tunes the pretrained neural process to off-centre pushes of drawn cuboids and prisms in the
+simulated world, told by their outlines: about 5 minutes of a core. `goals` plans and executes with
+it on other objects, with the ideal camera and with the Kinect: about 5 minutes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import torch
+from torch import Tensor
+
+from affordlib.commands import command
+from affordlib.geometry import rotated, wrap_angle
+from affordlib.interactions.log import PushLog
+from affordlib.models.fit import SEEN, PretrainedNeuralProcess, PushModel, push_rows, told_feet
+from affordlib.models.neural_process import (
+    load_neural_process,
+    save_neural_process,
+    train_neural_process,
+)
+from affordlib.paths import repo_root
+from affordlib.perception import outline_of, turn_between
+from affordlib.planning.push_at import plan_push_at, primitive_of, pushes_around
+from affordlib.results import write_results
+from affordlib.types import Goal, Observation, Step, UnreachableError
+from affordlib.world import Cuboid, Prism, Tabletop, TabletopObject, WorldConfig
+from affordlib.world.execution import execute
+from affordlib.world.robot import ROD_WIDTH_M
+from affordlib.world.trajectory import Command
+
+N_PARTS, N_OBJECTS, N_PUSHES, TRAINING = 2, 40, 12, (1500, 5e-4, 32)
+HEIGHTS_M = 0.04, 0.06
+FIRST_GOAL, N_GOALS, GOAL_PUSHES, GOAL_LENGTHS_M = 10_000, 50, 2, (0.015, 0.045)
+CORRECTIONS = 4
+TURN_M = 0.04
+"""So many metres a radian counts: 2 mm for 3°."""
+N_IMAGES = {"ideal": 1, "kinect": 8}
+"""Of which an observation is the mean."""
+WITHIN_M, WITHIN_RAD = 0.005, math.radians(5)
+
+
+def drawn_object(rng: np.random.Generator) -> TabletopObject:
+    """A cuboid or a prism, 4 to 8 cm wide and 4 to 6 cm tall: so much of the rod is free."""
+    return (Cuboid, Prism)[int(rng.integers(2))].sample(rng, height_range_m=HEIGHTS_M)
+
+
+def collect(n_objects: int, seed: int) -> tuple[Tensor, Tensor]:
+    """Pushes (n, 12, 10) of drawn objects as the neural process takes them, and feet (n, 12, 3)."""
+    rng, rows, feet = np.random.default_rng(seed), [], []
+    with Tabletop() as world:
+        while len(rows) < n_objects:
+            obj, done = drawn_object(rng), {}
+            drawn = pushes_around(obj.footprint_m, ROD_WIDTH_M / 2, 2 * N_PUSHES, seed=rng)
+            yaw = rng.uniform(-math.pi, math.pi)
+            for k in range(2 * N_PUSHES):
+                world.place(obj, (0.0, 0.0), yaw, tool="rod")
+                try:
+                    effect = world.execute_primitive(primitive_of(drawn, k, yaw))
+                except UnreachableError:
+                    continue
+                if not (effect.faults or effect.fell):
+                    done[k] = *rotated(effect.rest_effect[:2], -yaw), effect.rest_effect[3]
+                if len(done) == N_PUSHES:
+                    break
+            if len(done) == N_PUSHES:
+                effect = np.array([*done.values()])
+                of_one = drawn.select(np.array([*done]))
+                of_one = replace(of_one, displacement_m=effect[:, :2], turn_rad=effect[:, 2])
+                rows.append(push_rows(of_one))
+                feet.append(told_feet(of_one)[0])
+    return torch.stack(rows), torch.stack(feet)
+
+
+class Remembered:
+    """A model that predicts the candidates of plans once, for they are the same for one seed."""
+
+    def __init__(self, model: PushModel) -> None:
+        self.model, self.known = model, None
+
+    def predict(self, pushes: PushLog) -> tuple[np.ndarray, np.ndarray]:
+        """As the model predicted the first pushes."""
+        if self.known is None:
+            self.known = self.model.predict(pushes)
+        return self.known
+
+
+def observed(world: Tabletop) -> Observation:
+    """What the robot sees of the object, the mean of some images of the Kinect."""
+    views = [world.observe() for _ in range(N_IMAGES[world.config.camera])]
+    x, y = np.mean([view.xy_m for view in views], axis=0).tolist()
+    return Observation((x, y), np.mean([view.image for view in views], axis=0))
+
+
+def act(world: Tabletop, step: Step, seen: Observation) -> None:
+    """Execute a step where the plan has the object, whether it is there or not."""
+    command = Command.of(step.primitive, 1.0, True)
+    seen = replace(seen, xy_m=tuple(step.predicted_path_xy_m[0].tolist()))
+    execute(world.arm, world.placed, command, seen, 0.0, approach=False)
+
+
+def pursue(
+    world: Tabletop, model: PushModel, goal: tuple[float, float, float], log: PushLog | None = None
+) -> Iterator[int]:
+    """Push an object to a goal (x, y, turn); nothing is known but what is observed.
+
+    A plan of up to three pushes is executed as it is, from one observation. Then up to four times
+    the robot looks and does the first push of a new plan, until none is expected to help. log: of
+    an object that stands as it did there; others are known by their image. Yields how many pushes
+    were made, after the plan and after the corrections.
+    """
+    first = seen = observed(world)
+    log = log or pushes_around(outline_of(first.image), ROD_WIDTH_M / 2)
+    turned, pushes = 0.0, 0
+    for n in (3, *(min(3, k) for k in range(CORRECTIONS, 0, -1))):
+        wanted = Goal(goal[:2], 0.001, wrap_angle(goal[2] - turned))
+        plan = plan_push_at(model, log, (*seen.xy_m, turned), wanted, n, turn_m=TURN_M)
+        end = plan.steps[-1]
+        turn = TURN_M * wrap_angle(end.predicted_turn_rad - wanted.turn_rad)
+        expected = math.hypot(plan.predicted_distance_m, turn, end.std_m)
+        now = math.hypot(wanted.distance_m(seen.xy_m), TURN_M * wanted.turn_rad)
+        if pushes and expected >= now:
+            break
+        steps = plan.steps[: 1 if pushes else 3]
+        for step in steps:
+            act(world, step, seen)
+        if not pushes:
+            yield len(steps)
+        pushes += len(steps)
+        seen = observed(world)
+        turned += steps[-1].predicted_turn_rad
+        told = turn_between(first.image, seen.image, turned)
+        turned = told[0] if told else turned
+    yield pushes
+
+
+def attempt(world: Tabletop, *arguments) -> list[dict]:
+    """What a pursuit leaves to its goal, of plan and corrections, by the simulator."""
+    (*_, start), rows = world.object_pose(), []
+    goal = arguments[1]
+    for pushes in pursue(world, *arguments):
+        *xy, yaw = world.object_pose()
+        left = abs(wrap_angle(yaw - start - goal[2]))
+        rows.append({"corrected": bool(rows), "pushes": pushes})
+        rows[-1] |= {"position_m": math.dist(xy, goal[:2]), "yaw_rad": left}
+    return rows
+
+
+def task(world: Tabletop, rng: np.random.Generator) -> tuple[TabletopObject, list, list]:
+    """An object, a pose (x, y, yaw), and another one where random pushes took it from there."""
+    while True:
+        obj, start = drawn_object(rng), [*rng.uniform(-0.1, 0.1, 2), rng.uniform(-math.pi, math.pi)]
+        world.place(obj, tuple(start[:2]), start[2], tool="rod")
+        for _ in range(GOAL_PUSHES):
+            drawn = pushes_around(obj.footprint_m, ROD_WIDTH_M / 2, 1, GOAL_LENGTHS_M, rng)
+            world.execute_primitive(primitive_of(drawn, 0, world.object_pose()[2]))
+        if not world.object_fell():
+            return obj, start, [*world.object_pose()]
+
+
+def summary(rows: list[dict], by: list[str]) -> list[dict]:
+    """Statistics of what trials leave."""
+    table = pd.DataFrame(rows)
+    near = (table["position_m"] <= WITHIN_M) & (table["yaw_rad"] <= WITHIN_RAD)
+    table["within_percent"] = 100.0 * near
+    return [
+        dict(zip(by, key, strict=True))
+        | {"n": len(part), "pushes": part["pushes"].mean()}
+        | {
+            f"{column}_{statistic}_{unit}": part[f"{column}_{unit}"].agg(statistic)
+            for column, unit in (("position", "m"), ("yaw", "rad"))
+            for statistic in ("median", "mean", "sem")
+        }
+        | {"within_percent": part["within_percent"].mean()}
+        for key, part in table.groupby(by)
+    ]
+
+
+def goals(n: int = N_GOALS) -> dict[str, list[dict]]:
+    """The table, and the trials that it is made of."""
+    model, rows = PretrainedNeuralProcess(), []
+    for camera in N_IMAGES:
+        with Tabletop(WorldConfig(camera=camera)) as world:
+            for seed in range(FIRST_GOAL, FIRST_GOAL + n):
+                obj, (*at, yaw), (*xy, end) = task(world, np.random.default_rng(seed))
+                seen_by = replace(world.config, noise_seed=seed)
+                world.place(obj, tuple(at), yaw, tool="rod", config=seen_by)
+                goal = *xy, wrap_angle(end - yaw)
+                about = {"camera": camera, "object_class": obj.category, "seed": seed}
+                about |= {"goal_m": math.dist(at, xy), "goal_rad": goal[2]}
+                rows += [about | row for row in attempt(world, Remembered(model), goal)]
+    return {"goals": summary(rows, ["camera", "corrected"]), "trials": rows}
+
+
+def tune() -> None:
+    """Collect, train and write the checkpoint."""
+    model, parts = load_neural_process(), [collect(N_OBJECTS, seed) for seed in range(N_PARTS)]
+    rows, feet = (torch.cat(part) for part in zip(*parts, strict=True))
+    train_neural_process(model, rows, feet, TRAINING, torch.Generator().manual_seed(0))
+    about = {"objects": len(rows), "pushes": N_PUSHES, "steps": TRAINING[0]}
+    save_neural_process(model, repo_root() / f"data/checkpoints/{SEEN}.safetensors", about)
+
+
+@command(OSError, ValueError)
+def main(argv: Sequence[str] | None = None) -> int:
+    """Tune the model, pursue the goals, or both."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only", choices=("model", "goals"))
+    only = parser.parse_args(argv).only
+    if only != "goals":
+        tune()
+    if only != "model":
+        write_results(repo_root() / "data/results", "pose_goals", {"n_goals": N_GOALS}, goals())
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
