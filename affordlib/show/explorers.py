@@ -35,7 +35,7 @@ class ConditioningExplorer(FigureWidget):
     sliders, set the phases of the observations, a tick takes one away; the band is mean ± 2 σ.
     """
 
-    figsize = (10.0, 4.6)
+    figsize = (10.0, 5.2)
 
     def __init__(self, model: EffectModel, seen: Interaction) -> None:
         self.model, self.seen = model, seen
@@ -110,18 +110,18 @@ class ConditioningExplorer(FigureWidget):
         axes = figure.subplots(2, 2, sharex=True, sharey="row")
         points = {"action": ("first action", "second action"), "effect": ("effect",)}
         for row, of in zip(axes, CHANNELS, strict=True):
-            row[0].set_ylabel("cm")
+            row[0].set_ylabel(f"{of} [cm]")
             channels = getattr(self.model, f"{of}_channels")
             for ax, name in zip(row, ("x", "y"), strict=True):
                 c = channels.index(name)
                 mean = 100 * getattr(seen, f"{of}_mean")[0, :, c]
                 std = 100 * getattr(seen, f"{of}_std")[0, :, c]
                 truth = 100 * self._truth(of, name)
-                ax.plot(self.seen.phase, truth, "--", color=TRUTH, lw=2, label="truth")
+                ax.plot(self.seen.phase, truth, "--", color=TRUTH, lw=2, label="ground truth")
                 ax.plot(t, mean, color=PREDICTION, lw=2, label="prediction")
                 band = {"color": PREDICTION, "alpha": 0.2, "lw": 0, "label": "± 2 σ"}
                 ax.fill_between(t, mean - 2 * std, mean + 2 * std, **band)
-                ax.set_title(f"{of} {name}")
+                ax.set_title(f"{of}, {name}")
                 if getattr(given, f"{of}_mask").any():
                     at = getattr(given, f"{of}_t")[0].numpy()
                     value = 100 * getattr(given, of)[0, :, c].numpy()
@@ -130,7 +130,8 @@ class ConditioningExplorer(FigureWidget):
                         self.add_handle(ax, point, *map(float, place))
         for ax in axes[1]:
             ax.set_xlabel("phase t")
-        figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside right upper")
+        handles = axes[0, 0].get_legend_handles_labels()
+        figure.legend(*handles, loc="outside lower center", ncols=4)
         columns = [self.model.effect_channels.index(name) for name in ("x", "y")]
         end = seen.effect_mean[0, -1, columns].numpy()
         error_mm = 1000 * np.hypot(*(end - self.seen.effect[-1, :2]))
@@ -186,13 +187,15 @@ class PhaseSlider(FigureWidget):
         above, over_time = figure.subplots(1, 2, width_ratios=(1, 1.9))
         t, obj, now = self.phase, self.world.obj, self.expected(self.phase)
         x, y, yaw = self._pose
-        plot_table(above, around_m=(x, y), half_width_m=0.24)
-        path = 100 * (self.full.action[:, :2] + (x, y))
-        above.plot(*path.T, ":", color=NEUTRAL, lw=1)
-        above.plot(*path[self.full.phase <= t].T, color="black", lw=2, label="gripper")
+        path = self.full.action[:, :2] + (x, y)
+        seen = np.vstack([path, self.full.effect[:, :2] + (x, y)])
+        low, high = seen.min(axis=0), seen.max(axis=0)
+        plot_table(above, (low + high) / 2, 0.05 + float(max(high - low)) / 2)
+        above.plot(*100 * path.T, ":", color=NEUTRAL, lw=1)
+        above.plot(*100 * path[self.full.phase <= t].T, color="black", lw=2, label="gripper")
         plot_footprint(above, obj, (x, y), yaw, label="start")
         moved = 100 * np.hypot(*self.full.effect[:, :2].T)
-        over_time.plot(self.full.phase, moved, color=PREDICTION, label="during the full action")
+        over_time.plot(self.full.phase, moved, color="black", label="during the full action")
         over_time.axvline(t, color=NEUTRAL, ls=":")
         self.add_handle(over_time, "phase", t)
         rest_cm = [100 * np.hypot(rest[0] - x, rest[1] - y) for rest in self.rest.values()]
@@ -207,7 +210,7 @@ class PhaseSlider(FigureWidget):
             off_mm = 1000 * np.hypot(rest[0] - now[0], rest[1] - now[1])
             words += f" Stopped there, it rests <b>{off_mm:.2f} mm</b> from where it was then."
         label = "full action at t"  # drawn over what rests
-        plot_footprint(above, obj, now[:2], now[2], PREDICTION, label, style="--")
-        above.legend(loc="upper left", fontsize=8)
+        plot_footprint(above, obj, now[:2], now[2], "black", label, style="--")
+        figure.legend(*above.get_legend_handles_labels(), loc="outside lower left", ncols=4)
         over_time.legend(loc="upper left")
         return words

@@ -215,7 +215,7 @@ def plot_closed_loop(
             _name_in_place(ax, f"{k + 1}", step, goal, row)
             continue
         x, y = path[-1] - path[0]
-        aside = (-1) ** k * 14 * np.array([-y, x]) / max(math.hypot(x, y), 1e-6)
+        aside = (-1) ** k * np.array([-24 * y, 14 * x]) / max(math.hypot(x, y), 1e-6)
         middle = _cm(path[len(path) // 2 :].mean(axis=0))
         _name(ax, f"{k + 1} {step.primitive.name}", middle, aside)
     if obj is not None:
@@ -310,7 +310,9 @@ class FrameRecorder:
             )
         self.frames.append(frame)
 
-    def encoded(self, kind: str = "GIF", frame_ms: int = 60, beside: Figure | None = None) -> bytes:
+    def encoded(
+        self, kind: str = "GIF", frame_ms: int = 100, beside: Figure | None = None
+    ) -> bytes:
         """The frames as an animated picture that loops and begins with its last frame, at rest.
 
         kind: "GIF" or "PNG"; beside: a figure shown to the left of every frame.
@@ -326,7 +328,7 @@ class FrameRecorder:
         # One palette for all frames, drawn from a few of them, or colours flicker.
         few = [frames[round(k * (len(frames) - 1) / 3)] for k in range(4)]
         palette = Image.fromarray(np.vstack(few)).quantize(
-            255, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE
+            255, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE
         )
         indexed = [
             Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE)
