@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parents[1]
 LINES = {"affordlib": 13_146, "experiments": 6166, "tests": 9353}
 """What is there, rounded up: lower it with every cut. The aim is 9,500, 3,500 and 6,500."""
 
-FILES, CODE = 75, 9013
+FILES, CODE = 75, 9018
 """Of affordlib: files of all kinds, and lines of Python without docstrings, comments and blanks.
 
 The aim is 6,800 of the latter."""
