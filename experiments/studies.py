@@ -19,7 +19,7 @@ from affordlib.commands import command
 from experiments.runner import FOLDER, STUDIES, Job, Rows, read, run
 
 NAME = "studies"
-MODULES = ("ablation", "representation", "uncertainty", "shared_network", "limits")
+MODULES = ("ablation", "representation", "uncertainty", "shared_network", "limits", "literal")
 for module in (*MODULES, "lever_cross_validation"):
     importlib.import_module(f"experiments.{module}")
 

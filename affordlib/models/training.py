@@ -8,7 +8,7 @@ for comparison. `train_model` does all: data set and split in, calibrated networ
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -230,18 +230,16 @@ def _copy(model: EffectNetwork) -> dict[str, torch.Tensor]:
 def _to(batch: Any, device: torch.device) -> Any:
     """The same batch or observations on a device."""
     moved = {}
-    for field in fields(batch):
-        value = getattr(batch, field.name)
-        moved[field.name] = value.to(device) if torch.is_tensor(value) else _to(value, device)
+    for name, value in vars(batch).items():
+        moved[name] = value.to(device) if torch.is_tensor(value) else _to(value, device)
     return replace(batch, **moved)
 
 
 def _augmented(tensors: InteractionTensors) -> InteractionTensors:
     """The interactions, an eighth of them rotated and mirrored in each of eight ways."""
-    eighths = torch.arange(len(tensors)).tensor_split(8)
     parts = [
         tensors.select(rows).rotated_and_mirrored(k // 2, mirror=k % 2 == 1)
-        for k, rows in enumerate(eighths)
+        for k, rows in enumerate(torch.arange(len(tensors)).tensor_split(8))
     ]
     return parts[0].joined(*parts[1:])
 
@@ -259,10 +257,11 @@ def train_literal(
     obs_max: int = 10,
     learning_rate: float = 1e-4,
     seed: int = 0,
+    after: Callable[[int], object] = bool,
 ) -> list[float]:
     """The paper's loop (Section 3.2), in place: one trajectory and one target an iteration, Adam.
 
-    Returns the losses. A million iterations, as in the paper, take hours.
+    Returns the losses. A million iterations, as in the paper, take hours. after: gets each number.
     """
     check_count("iterations", iterations)
     check_count("obs_max", obs_max, 1, 100_000)
@@ -270,12 +269,13 @@ def train_literal(
     generator = torch.Generator().manual_seed(check_count("seed", seed, 0, 2**63 - 1))
     optimiser = torch.optim.Adam(model.parameters(), lr=learning_rate)
     losses = []
-    for _ in range(iterations):
+    for iteration in range(1, iterations + 1):
         loss = batch_loss(model, sample_literal(training, obs_max, generator))
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
         losses.append(loss.item())
+        after(iteration)
     return losses
 
 

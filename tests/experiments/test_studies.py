@@ -248,7 +248,7 @@ def test_reach_as_learned_agrees_with_the_kinematics(monkeypatch):
 
 
 def test_what_decides_a_study_is_the_same_in_every_process():
-    code = "from experiments.studies import *; print([job(name).made_of() for name in STUDIES])"
-    here = str([studies.job(name).made_of() for name in studies.STUDIES])
+    code = "from experiments.studies import *; print([job(k).made_of() for k in sorted(STUDIES)])"
+    here = str([studies.job(name).made_of() for name in sorted(studies.STUDIES)])
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, text=True)
     assert run.stdout.strip() == here

@@ -40,8 +40,9 @@ def mean_length_error_m(training, test):
 
 
 def test_the_literal_loop_learns(some):
-    network = fresh(some)
-    losses = train_literal(network, some, 150, learning_rate=1e-3)
+    network, numbers = fresh(some), []
+    losses = train_literal(network, some, 150, learning_rate=1e-3, after=numbers.append)
+    assert numbers == [*range(1, 151)]
     assert np.mean(losses[-30:]) < np.mean(losses[:30]) - 0.3
     generator = torch.Generator().manual_seed(0)
     counts = [
