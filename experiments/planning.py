@@ -28,6 +28,7 @@ from affordlib.evaluation import tasks as goals
 from affordlib.evaluation.metrics import error_row
 from affordlib.evaluation.tasks import ROLLABLE, STANDING, PlanningTask, frozen_tasks
 from affordlib.models.checkpoint import load_checkpoint
+from affordlib.models.protocol import EffectModel
 from affordlib.paths import repo_root
 from affordlib.planning import (
     EffectMap,
@@ -49,6 +50,8 @@ from affordlib.types import Outcome, Plan, Step
 from affordlib.world import Tabletop, UnreachableError
 from experiments import reported, runner
 from experiments.field_baselines import plan_astar_continuous, plan_cem
+from experiments.limit_surface import LimitSurface
+from experiments.literal import SPEC
 from experiments.oracle import oracle_effects
 from experiments.runner import FOLDER, Job, Rows
 
@@ -86,6 +89,11 @@ def plan_continuous_with(problem: PlanningProblem, **constants: Any) -> Plan:
         return plan_continuous(problem)
 
 
+MADE: dict[str, Callable[[], EffectModel]] = {
+    "limit_surface": LimitSurface.fitted,
+}
+"""Models that are no checkpoints: the job itself fits them to pushes of `push`."""
+
 Planner = Callable[..., Plan]
 """A planner as (image, start_xy_m, goal, mode) → Plan."""
 
@@ -99,9 +107,9 @@ class PlannerConfig:
     """A row of Table 3: a planner, its model, and the goals that it is asked for.
 
     planner: a function of a `PlanningProblem`; arguments: its others; execution: those of
-    `attempt`. model: a checkpoint of pushes, or "simulator"; oracle: then the arguments of
-    `oracle_effects`. world: whose frozen goals; sources: which of them; stride: every so-many-th;
-    standing: no objects that roll.
+    `attempt`. model: a checkpoint of pushes, one of `MADE`, or "simulator"; oracle: then the
+    arguments of `oracle_effects`. world: whose frozen goals; sources: which of them; stride: every
+    so-many-th; standing: no objects that roll.
     """
 
     planner: Callable[..., Plan]
@@ -117,7 +125,7 @@ class PlannerConfig:
     @property
     def checkpoints(self) -> dict[str, str]:
         """Of its model by primitive; one of drags beside our network of pushes, if it needs one."""
-        if self.model == "simulator":
+        if self.model in ("simulator", *MADE):
             return {}
         drags = self.model in ("film_500", "film_5000") and self.world == "clean"
         return {"push": self.model} | ({"drag": "drag_film_500"} if drags else {})
@@ -152,6 +160,8 @@ class PlannerConfig:
     def make(self, world: Tabletop) -> Planner:
         """The planner for a world, which nothing but the simulator as a model looks into."""
         models = {kind: load_checkpoint(name)[0] for kind, name in self.checkpoints.items()}
+        if self.model in MADE:
+            models["push"] = MADE[self.model]()
         skills, imagined = Skills(models), None if models else Tabletop()
 
         def plan(image, start_xy_m, goal, mode) -> Plan:
@@ -195,15 +205,17 @@ CONFIGS: dict[str, PlannerConfig] = {
     "gradient_snapped": PlannerConfig(plan_gradient, "cnp_500", {"samples": 100, "snap": True}),
     "gradient_direction": PlannerConfig(plan_gradient, "cnp_500", ON_RING, **ALL),
     "gradient_direction_corrected": PlannerConfig(plan_gradient, "cnp_500", ON_RING, **CORRECTED),
+    "gradient_direction_by_plan": PlannerConfig(plan_gradient, "cnp_500", ON_RING, **BY_PLAN),
     # Without partial actions.
     "continuous_full": PlannerConfig(plan_continuous_full, **ALL),
     "astar_full": PlannerConfig(plan_astar_full, standing=True),
     "gradient_direction_full": PlannerConfig(plan_gradient_full, "cnp_500", ON_RING),
-    # Planners of the field.
+    # Planners and a model of the field.
     "astar_continuous": PlannerConfig(plan_astar_continuous, standing=True),
     "cem": PlannerConfig(plan_cem, standing=True),
     "mpc_cem": PlannerConfig(plan_cem, **RECEDING, standing=True),
     "mpc_continuous": PlannerConfig(plan_continuous, **RECEDING, standing=True),
+    "continuous_limit_surface": PlannerConfig(plan_continuous, "limit_surface"),
     # What each idea is worth, and what a small error of the object's pose does.
     "continuous_cnp_500": PlannerConfig(plan_continuous, "cnp_500", **ALL),
     "continuous_film_500": PlannerConfig(plan_continuous, "film_500", **ALL),
@@ -346,8 +358,10 @@ def job(config: str) -> Job:
     """The measurement of one planner."""
     about = CONFIGS[config]
     settings, files = [about, tasks_sha256(about.world)], tuple(about.checkpoints.values())
-    version = VERSIONS.get(about.planner, 1)
-    return Job(run_config, {"config": config}, settings, (), files, version)
+    version, data = VERSIONS.get(about.planner, 1), ()
+    if about.model in MADE:
+        settings, data = [*settings, SPEC.network, SPEC.training], ("push",)
+    return Job(run_config, {"config": config}, settings, data, files, version)
 
 
 def planning_rows(records: Rows, **columns: Any) -> Rows:
@@ -427,6 +441,7 @@ VARIANTS = {
     "mpc_cem": "mpc_continuous",
     "continuous_cnp_500": "continuous_film_500",
     "continuous_film_500": "continuous",
+    "continuous_limit_surface": "continuous_film_500",
 }
 """Planners with one thing changed, and without: compared goal by goal, on objects that stand."""
 

@@ -1,17 +1,21 @@
 """Table 3: its rows, its planners, and that the committed one belongs to what is shipped."""
 
 import json
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from affordlib.evaluation.tasks import FROZEN, ROLLABLE, STANDING, PlanningTask, frozen_tasks
 from affordlib.geometry import rotated
-from affordlib.planning import MODES
-from affordlib.primitives import Drag
+from affordlib.planning import MODES, EffectMap
+from affordlib.primitives import PUSH_GAP_M, Drag, Push
+from affordlib.world import Cuboid, UprightCylinder
 from experiments import planning, shipped
 from experiments.adaptation import Camera
+from experiments.limit_surface import FINGER_AHEAD_M, LimitSurface
 from experiments.planning import CONFIGS, attempt, planning_rows, tasks_sha256
 
 
@@ -165,6 +169,23 @@ def test_planners_of_the_field_keep_to_their_actions_and_improve_on_their_start(
     assert (refined < searched + 1e-4).all()
     assert np.median(refined) < 0.1 * np.median(searched)
     assert np.median(drawn) < 0.001
+
+
+def test_by_physics_the_fingers_carry_a_cylinder_to_where_they_stop(world):
+    """It lies in the gap between them, whatever friction and limit surface; and all is mirrored."""
+    radius = 0.03
+    world.place(UprightCylinder(2 * radius, 0.05))
+    effects = EffectMap(LimitSurface(0.3, 0.9), world.depth_image(), n_directions=8)
+    ahead, left, _ = effects.grid[0][:, -1].T
+    ends = Push.length + FINGER_AHEAD_M + math.sqrt(radius**2 - (PUSH_GAP_M / 2) ** 2)
+    np.testing.assert_allclose(ahead, ends, atol=0.0015)
+    np.testing.assert_allclose(left, 0, atol=0.0015)
+    world.place(Cuboid(0.07, 0.04, 0.05))
+    effects = EffectMap(LimitSurface(0.3, 0.9), world.depth_image(), n_directions=8)
+    there, back = effects.grid[0][1, -1], effects.grid[0][7, -1]
+    assert abs(there[2]) > 0.1
+    np.testing.assert_allclose(there[:2], back[:2] * torch.tensor([1, -1]), atol=5e-4)
+    assert float(there[2]) == pytest.approx(-float(back[2]), abs=0.02)
 
 
 @pytest.mark.slow
