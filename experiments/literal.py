@@ -1,14 +1,25 @@
-"""Study: the paper's network trained by the paper's recipe, one trajectory and target at a time."""
+"""The paper's network trained by the paper's recipe, and on trajectories of fewer samples."""
 
 from __future__ import annotations
 
+import numpy as np
+
 from affordlib.interactions import InteractionTensors, split_interactions
-from affordlib.models.training import final_errors_m, train_literal, untrained
+from affordlib.models import EffectNetwork
+from affordlib.models.training import final_errors_m, train_literal, train_model, untrained
 from experiments.runner import Rows, open_once, study
 from experiments.shipped import CHECKPOINT_SPECS
 
 SPEC = CHECKPOINT_SPECS["cnp_500"]
 ITERATIONS, VALIDATE_EVERY = 100_000, 2500
+
+
+def trained_on(n_samples: int) -> EffectNetwork:
+    """The same network, trained in batches as it is shipped, on so many samples a trajectory."""
+    data = open_once(SPEC.data)
+    split = split_interactions(data.sizes["interaction"])
+    samples = np.linspace(0, data.sizes["sample"] - 1, n_samples).round().astype(int)
+    return train_model(data.isel(sample=samples), split, SPEC.training, SPEC.network)[0]
 
 
 @study("push", settings=(SPEC.network, ITERATIONS, VALIDATE_EVERY))

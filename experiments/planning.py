@@ -13,6 +13,7 @@ import math
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -51,7 +52,7 @@ from affordlib.world import Tabletop, UnreachableError
 from experiments import reported, runner
 from experiments.field_baselines import plan_astar_continuous, plan_cem
 from experiments.limit_surface import LimitSurface
-from experiments.literal import SPEC
+from experiments.literal import SPEC, trained_on
 from experiments.oracle import oracle_effects
 from experiments.runner import FOLDER, Job, Rows
 
@@ -90,9 +91,10 @@ def plan_continuous_with(problem: PlanningProblem, **constants: Any) -> Plan:
 
 
 MADE: dict[str, Callable[[], EffectModel]] = {
+    "cnp_500_of_100_samples": partial(trained_on, 100),
     "limit_surface": LimitSurface.fitted,
 }
-"""Models that are no checkpoints: the job itself fits them to pushes of `push`."""
+"""Models that are no checkpoints: the job itself trains (ten minutes) or fits them on `push`."""
 
 Planner = Callable[..., Plan]
 """A planner as (image, start_xy_m, goal, mode) → Plan."""
@@ -206,6 +208,8 @@ CONFIGS: dict[str, PlannerConfig] = {
     "gradient_direction": PlannerConfig(plan_gradient, "cnp_500", ON_RING, **ALL),
     "gradient_direction_corrected": PlannerConfig(plan_gradient, "cnp_500", ON_RING, **CORRECTED),
     "gradient_direction_by_plan": PlannerConfig(plan_gradient, "cnp_500", ON_RING, **BY_PLAN),
+    # With the network trained on trajectories of 100 samples, instead of 301.
+    "gradient_100_trained": PlannerConfig(plan_gradient, "cnp_500_of_100_samples", LITERAL),
     # Without partial actions.
     "continuous_full": PlannerConfig(plan_continuous_full, **ALL),
     "astar_full": PlannerConfig(plan_astar_full, standing=True),
@@ -436,6 +440,7 @@ VARIANTS = {
     "astar_disc_cnp_500": "astar_cnp_500",
     "astar_continuous": "continuous",
     "gradient_300": "gradient_100",
+    "gradient_100_trained": "gradient_100",
     "cem": "continuous",
     "mpc_continuous": "continuous",
     "mpc_cem": "mpc_continuous",
