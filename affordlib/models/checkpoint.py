@@ -9,6 +9,7 @@ import io
 import json
 import pickle
 import zipfile
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from typing import Any
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
+from torch import nn
 
 from affordlib.interactions.dataset import Scaler
 from affordlib.models.base import EffectNetwork, NetworkConfig
@@ -103,26 +105,37 @@ def load_checkpoint(name_or_path: str | Path) -> tuple[EffectNetwork, dict[str, 
 
     Raises FileNotFoundError, or ValueError when the files are damaged or of another model.
     """
-    path = resolve_checkpoint(name_or_path)
-    tensors, description = read_weights(path, _REMEDY)
-    try:
+
+    def make(description):
         if description["format"] != FORMAT:
             raise ValueError(f"its format is {description['format']!r}, not {FORMAT!r}")
         kind, config_class = NETWORKS[description["model"]]
-        model = kind(
-            config_class(**_with_tuples(description["config"])),
-            Scaler(**_with_tuples(description["scaler"])),
-            TrainingDomain(**_with_tuples(description["domain"])),
-        )
-        about, own = description["about"], model.state_dict()
+        parts = {"config": config_class, "scaler": Scaler, "domain": TrainingDomain}
+        return kind(*(part(**_with_tuples(description[name])) for name, part in parts.items()))
+
+    model, description = restored(resolve_checkpoint(name_or_path), _REMEDY, make)
+    return model, description["about"]
+
+
+def restored(
+    path: Path, remedy: str, make: Callable[[dict[str, Any]], nn.Module]
+) -> tuple[Any, dict[str, Any]]:
+    """The module that `make` gives for a file's description, with the file's weights, and that.
+
+    Raises FileNotFoundError, or ValueError when the file is damaged or of something else.
+    """
+    tensors, description = read_weights(path, remedy)
+    try:
+        model = make(description)
+        own = model.state_dict()
         if other := [k for k in own if k not in tensors or tensors[k].dtype != own[k].dtype]:
             raise ValueError(f"{other[0]} is missing or of another type")
         model.load_state_dict(tensors)
     except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
         raise ValueError(
-            f"checkpoint {path} does not describe a model of this package ({error}); {_REMEDY}"
+            f"{path} does not describe a model of this package ({error}); {remedy}"
         ) from error
-    return model.eval(), about
+    return model.eval(), description
 
 
 _KEY = "affordlib"

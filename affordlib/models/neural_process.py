@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import huber_loss, scaled_dot_product_attention, softplus
 
-from affordlib.models.checkpoint import read_weights, resolve_checkpoint, write_weights
+from affordlib.models.checkpoint import resolve_checkpoint, restored, write_weights
 from affordlib.models.quasi_static import cross, quarter_turn
 
 WIDTH, BLOCKS, HEADS = 64, 4, 4
@@ -193,10 +193,5 @@ def save_neural_process(model: NeuralProcess, path: str | Path, about: dict[str,
 
 def load_neural_process(name_or_path: str | Path = PRETRAINED) -> NeuralProcess:
     """A model that `save_neural_process` wrote; ValueError when the file is damaged or foreign."""
-    path = resolve_checkpoint(name_or_path)
-    tensors, description = read_weights(path, "train it: python -m experiments.pretrain_np")
-    if description.get("model") != "np":
-        raise ValueError(f"{path} holds no neural process but a {description.get('model')!r}")
-    model = NeuralProcess()
-    model.load_state_dict(tensors)
-    return model.eval()
+    remedy = "train it: python -m experiments.pretrain_np"
+    return restored(resolve_checkpoint(name_or_path), remedy, lambda _: NeuralProcess())[0]

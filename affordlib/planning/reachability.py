@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from affordlib.models.checkpoint import read_weights, write_weights
+from affordlib.models.checkpoint import restored, write_weights
 from affordlib.paths import repo_root
 from affordlib.primitives import primitive_named
 
@@ -46,17 +46,7 @@ class Reachability(nn.Module):
         Raises FileNotFoundError, or ValueError when the file is damaged or of another network.
         """
         path = Path(path or repo_root() / SHIPPED)
-        tensors, description = read_weights(path, _REMEDY)
-        try:
-            if description.get("format") != _FORMAT:
-                raise ValueError(f"it describes {description}")
-            model = cls(description["primitives"])
-            model.load_state_dict(tensors)
-        except (RuntimeError, ValueError, KeyError, TypeError) as error:
-            raise ValueError(
-                f"{path} does not hold a reachability of this package ({error}); {_REMEDY}"
-            ) from error
-        return model.eval()
+        return restored(path, _REMEDY, lambda described: cls(described["primitives"]))[0]
 
     def save(self, path: str | Path) -> Path:
         """Write the weights to a file that `load` reads, whole or not at all; returns its path."""
