@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -26,6 +27,11 @@ def rotated(xy: np.ndarray, angle_rad: float) -> np.ndarray:
     """Points (..., 2) rotated about the origin, counter-clockwise."""
     c, s = math.cos(angle_rad), math.sin(angle_rad)
     return xy @ np.array([[c, s], [-s, c]])
+
+
+def cross(a: Any, b: Any) -> Any:
+    """The z component of the product of vectors (..., 2): arrays or tensors."""
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
 def xy_columns(channels: tuple[str, ...]) -> list[int]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 import lzma
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +27,7 @@ from affordlib.types import UnreachableError
 from affordlib.world import Prism, Tabletop, WorldConfig
 from affordlib.world.robot import ROD_WIDTH_M
 from experiments.pose_goals import Remembered, attempt, summary
+from experiments.real_pushes import pushes_of
 
 FOLDER = repo_root() / "data" / "own_log"
 N_PUSHES, N_GOALS = 50, 50
@@ -50,27 +51,13 @@ def world_config(condition: str) -> WorldConfig:
     return WorldConfig(**inside, **friction)
 
 
-def _pushes(text: str) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Poses (2, 3) before and after, times and positions of the tool, of each push of a file."""
-    numbers = iter(text.split())
-
-    def table(columns, rows=None):
-        rows = int(next(numbers)) if rows is None else rows
-        return np.array([[float(next(numbers)) for _ in range(columns)] for _ in range(rows)])
-
-    for _ in range(int(next(numbers))):
-        poses, _forces, tool = table(7, rows=2), table(3), table(8)
-        yaw = 2 * np.arctan2(poses[:, 6], poses[:, 3])
-        yield np.column_stack([poses[:, :2], yaw]), tool[:, 0], tool[:, 1:3]
-
-
 def read_log(folder: Path = FOLDER) -> PushLog:
     """The embedded log."""
     log = Log("mm", np.array(TRIANGLE_M) * 1e3, 0.24, tool_radius=500 * ROD_WIDTH_M)
     for path in sorted(folder.glob("*.txt.xz")):
         name = path.name.removesuffix(".txt.xz")
         told = dict(zip(("surface", "support"), name.split("_"), strict=True))
-        for (start, end), t, xy in _pushes(lzma.decompress(path.read_bytes()).decode()):
+        for start, end, t, xy in pushes_of(path):
             log.add(start, t, xy, end, context=told, group=name)
     return log.tensors()
 

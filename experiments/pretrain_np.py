@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from affordlib.commands import command, whole_type
+from affordlib.geometry import cross
 from affordlib.models.neural_process import (
     FEET,
     PRETRAINED,
@@ -28,7 +29,7 @@ from affordlib.models.neural_process import (
     train_neural_process,
     transformed,
 )
-from affordlib.models.quasi_static import cross, quarter_turn, quasi_static_push
+from affordlib.models.quasi_static import quarter_turn, quasi_static_push
 from affordlib.paths import repo_root
 
 PUSHES, CHUNK = 48, 64

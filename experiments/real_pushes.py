@@ -15,7 +15,7 @@ import argparse
 import itertools
 import lzma
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,7 @@ from affordlib.results import write_results
 from experiments.runner import Job, frame, read, run
 
 TABLE = "real_pushes"
+Pose = tuple[float, float, float]
 CHOSEN_ON = ("hardboard_3points1", "plywood_3points3")
 """Steps and rates of tuning were chosen on these; the other five decide whether they were luck."""
 SHOTS = (0, 5, 10)
@@ -66,26 +67,23 @@ def feet_of(support: str) -> np.ndarray:
     return feet * (1e-3, 1e-3, 1)
 
 
-def read_condition(log: Log, path: Path, told: bool) -> None:
-    """Add the pushes of one condition to a log; told: with where the object is supported."""
+def pushes_of(path: Path) -> Iterator[tuple[Pose, Pose, np.ndarray, np.ndarray]]:
+    """Poses before and after, times and positions of the tool, of each push of a file."""
     packed = path.read_bytes()
     text = (lzma.decompress(packed) if path.suffix == ".xz" else packed).decode()
     values = iter([float(word) for word in text.split()])
 
-    def take(*shape: int) -> np.ndarray:
-        return np.array([next(values) for _ in range(math.prod(shape))]).reshape(shape)
+    def take(columns: int, rows: int | None = None) -> np.ndarray:
+        rows = int(next(values)) if rows is None else rows
+        return np.array([next(values) for _ in range(rows * columns)]).reshape(rows, columns)
 
-    def pose(row: np.ndarray) -> tuple[float, float, float]:
+    def pose(row: np.ndarray) -> Pose:
         x, y, _, w, i, j, k = row
         return x, y, math.atan2(2 * (w * k + i * j), 1 - 2 * (j * j + k * k))
 
-    group = path.name.split(".")[0]
-    context = {"feet": feet_of(group.split("_")[1])} if told else {}
-    for _ in range(int(take(1)[0])):
-        start, end = pose(take(7)), pose(take(7))
-        take(int(take(1)[0]), 3)  # forces
-        tool = take(int(take(1)[0]), 8)
-        log.add(start, tool[:, 0], tool[:, 1:3], end=end, context=context, group=group)
+    for _ in range(int(next(values))):
+        poses, _forces, tool = take(7, rows=2), take(3), take(8)
+        yield pose(poses[0]), pose(poses[1]), tool[:, 0], tool[:, 1:3]
 
 
 @lru_cache
@@ -96,7 +94,9 @@ def read_logs(folder: str | Path, told: bool = True) -> PushLog:
         found = sorted(Path(folder).glob(f"{name}.txt*"))
         if not found:
             raise FileNotFoundError(f"there is no {name}.txt or {name}.txt.xz in {folder}")
-        read_condition(log, found[0], told)
+        context = {"feet": feet_of(name.split("_")[1])} if told else {}
+        for start, end, t, xy in pushes_of(found[0]):
+            log.add(start, t, xy, end=end, context=context, group=name)
     return log.tensors()
 
 

@@ -18,7 +18,7 @@ import torch
 from affordlib.geometry import cross, rotated
 from affordlib.interactions.dataset import InteractionTensors
 from affordlib.perception import outline_image
-from affordlib.types import CROP_WIDTH_M, check_array, check_within
+from affordlib.types import CROP_WIDTH_M, check_array, check_choice, check_within
 
 UNITS_M = {"mm": 1e-3, "m": 1.0}
 UNITS_RAD = {"deg": math.pi / 180, "rad": 1.0}
@@ -97,13 +97,8 @@ class Log:
         angle_unit: str = "rad",
         tool_radius: float = 0.0,
     ) -> None:
-        for name, value, known in (
-            ("unit", unit, UNITS_M),
-            ("angle_unit", angle_unit, UNITS_RAD),
-        ):
-            if value not in known:
-                raise ValueError(f"{name} must be one of {sorted(known)}, got {value!r}")
-        self._metres, self._radians = UNITS_M[unit], UNITS_RAD[angle_unit]
+        self._metres = UNITS_M[check_choice("unit", unit, UNITS_M)]
+        self._radians = UNITS_RAD[check_choice("angle_unit", angle_unit, UNITS_RAD)]
         self._angle_unit = angle_unit
         corners = check_array("outline", outline, 2) * self._metres
         self.origin_m, self.outline_m = centred(corners)

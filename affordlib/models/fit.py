@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from affordlib.geometry import cross
 from affordlib.interactions.dataset import InteractionTensors, Scaler
 from affordlib.interactions.log import PushLog
 from affordlib.interactions.sampling import sample_forward
@@ -34,7 +35,7 @@ from affordlib.models.neural_process import (
 )
 from affordlib.models.quasi_static import quarter_turn
 from affordlib.models.training import TrainingConfig, train
-from affordlib.types import check_count
+from affordlib.types import check_choice, check_count
 
 SEEN = "np_seen_objects"
 INNER_FOLDS = 3
@@ -65,7 +66,7 @@ class PushModel(Protocol):
 def gyration_radius_m(outline_m: np.ndarray) -> float:
     """Radius of gyration [m] of a polygon (k, 2) about its centroid, the origin."""
     following = np.roll(outline_m, -1, axis=0)
-    area = outline_m[:, 0] * following[:, 1] - outline_m[:, 1] * following[:, 0]
+    area = cross(outline_m, following)
     squares = (outline_m**2 + outline_m * following + following**2).sum(axis=1)
     return math.sqrt((area * squares).sum() / (6 * area.sum()))
 
@@ -275,8 +276,7 @@ def fit(data: PushLog, model: str = "np", seed: int = 0) -> PushModel:
     "np" is the pretrained neural process, tuned to it; the others are the book's own networks.
     Raises ValueError for an unknown name, and for fewer than eight pushes in all.
     """
-    if model not in MODELS:
-        raise ValueError(f"model must be one of {sorted(MODELS)}, got {model!r}")
+    check_choice("model", model, MODELS)
     if len(data) < 8:
         raise ValueError(f"data must hold at least 8 interactions to learn from, got {len(data)}")
     return MODELS[model](data, check_count("seed", seed, 0, 2**31))

@@ -20,8 +20,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import huber_loss, scaled_dot_product_attention, softplus
 
+from affordlib.geometry import cross
 from affordlib.models.checkpoint import resolve_checkpoint, restored, write_weights
-from affordlib.models.quasi_static import cross, quarter_turn
+from affordlib.models.quasi_static import quarter_turn
 
 WIDTH, BLOCKS, HEADS = 64, 4, 4
 FEET = 12

@@ -25,11 +25,6 @@ ELLIPSOID = 100.0
 """A smoothing with which |v_i| becomes its square: the ellipsoidal limit surface."""
 
 
-def cross(a: Tensor, b: Tensor) -> Tensor:
-    """The z component of the product of vectors (..., 2)."""
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-
-
 def quarter_turn(a: Tensor) -> Tensor:
     """Vectors (..., 2) turned by +90°."""
     return torch.stack([-a[..., 1], a[..., 0]], -1)

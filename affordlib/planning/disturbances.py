@@ -19,6 +19,7 @@ from affordlib.types import (
     Goal,
     Observation,
     Step,
+    check_choice,
     check_count,
     check_field,
 )
@@ -51,8 +52,7 @@ class Disturbance:
     at_s: float | None = None
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise ValueError(f"kind must be one of {KINDS}, got {self.kind!r}")
+        check_choice("kind", self.kind, KINDS)
         check_count("action", self.action, least=0)
         for name in ("x", "y", "turn"):
             check_field(self, name)
