@@ -18,7 +18,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
-from itertools import islice
+from itertools import islice, product
 from pathlib import Path
 from typing import Any
 
@@ -436,17 +436,12 @@ def tables(name: str, seed: int = 0, folder: str | Path = FOLDER) -> dict[str, R
     found = sorted(found, key=lambda record: record["index"])
     found = [record for record in found if record.get("seed", seed) == seed]
     made: dict[str, Rows] = {}
-    for table in rows:
-        some = [record for record in found if record["table"] == table]
-        if name != "closed_loop":
-            made[table] = rows[table](some)
-            continue
-        for world in WORLDS:
-            run = [r for r in some if r.get("world", "clean") == world]
-            if run:
-                new = [{"world": world} | row for row in rows[table](run)]
-                made[table] = made.get(table, []) + new
-    return {table: some for table, some in made.items() if some}
+    for table, world in product(rows, WORLDS):
+        some = [r for r in found if (r["table"], r.get("world", "clean")) == (table, world)]
+        about = {"world": world} if name == "closed_loop" else {}
+        if some:
+            made[table] = made.get(table, []) + [about | row for row in rows[table](some)]
+    return made
 
 
 def write_tables(

@@ -204,18 +204,13 @@ def _prediction_rows(model: models.EffectNetwork, image: torch.Tensor, threads: 
             model.predict(known, seen, t.expand(len(seen.weight), -1))
 
     # What is compared, and how many of the slow calls stand for all.
-    ends, together = partial(query, end, *each), partial(query, phases, every, features=encoded)
+    ends, at_once = partial(query, end, *each), partial(query, end, every)
+    known, together = (partial(query, t, every, features=encoded) for t in (end, phases))
     name = type(model).__name__ + (f" on {threads} cores" if threads > 1 else "")
     rows = []
     for what, slow, fast, share, goal in (
-        ("final positions", ends, partial(query, end, every), 1, 100),
-        (
-            "final positions, image encoded before",
-            ends,
-            partial(query, end, every, features=encoded),
-            1,
-            100,
-        ),
+        ("final positions", ends, at_once, 1, 100),
+        ("final positions, image encoded before", ends, known, 1, 100),
         ("trajectories, a call a push", partial(query, phases, *each[::10]), together, 10, 30),
         ("trajectories, a call a step", partial(query, end, *each[::10]), together, 250, 30),
     ):
