@@ -24,7 +24,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pandas as pd
 from filelock import FileLock
@@ -39,9 +39,6 @@ from affordlib.paths import repo_root, resolve_out_dir
 from affordlib.planning.reachability import SHIPPED as REACHABILITY
 from affordlib.results import write_atomically
 from affordlib.workers import dask_client
-
-if TYPE_CHECKING:
-    from dask.distributed import Client
 
 FOLDER = "data/results/raw"
 WRITE_EVERY_S = 30
@@ -108,7 +105,7 @@ def study(*data: str, **decides: Any) -> Callable[[Callable[..., Any]], Callable
 def run(
     jobs: Sequence[Job],
     table: str,
-    client: Client | None = None,
+    client: dask.distributed.Client | None = None,
     folder: str | Path = FOLDER,
     progress: bool = True,
 ) -> list[Any]:
@@ -191,7 +188,9 @@ def make(
     return 0
 
 
-def _made(tasks: list[tuple[Job, Path]], client: Client | None) -> Iterator[dict[str, Any]]:
+def _made(
+    tasks: list[tuple[Job, Path]], client: dask.distributed.Client | None
+) -> Iterator[dict[str, Any]]:
     if client is None:
         yield from (job.record(path) for job, path in tasks)
         return

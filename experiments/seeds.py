@@ -15,7 +15,7 @@ import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pandas as pd
 from matplotlib.figure import Figure
@@ -26,16 +26,15 @@ from affordlib.paths import repo_root
 from affordlib.workbook import WorkbookError, run_name
 from affordlib.workers import dask_client
 
-if TYPE_CHECKING:
-    from dask.distributed import Client
-
 PANELS = 4
 """Columns that are drawn at most."""
 
 Table = Sequence[Mapping[str, Any]]
 
 
-def run_all(commands: Mapping[int, Sequence[str]], client: Client | None = None) -> None:
+def run_all(
+    commands: Mapping[int, Sequence[str]], client: dask.distributed.Client | None = None
+) -> None:
     """Run the command of each seed, one after another or by a client, and say what they print.
 
     Raises WorkbookError, after all have ended, with what the failed ones printed.

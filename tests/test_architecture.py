@@ -31,17 +31,9 @@ def name_of(path):
 
 
 def imported(path):
-    """The modules and names that a module imports when it runs."""
-    typing_only = {
-        id(node)
-        for block in ast.walk(TREES[path])
-        if isinstance(block, ast.If) and ast.unparse(block.test) == "TYPE_CHECKING"
-        for node in ast.walk(block)
-    }
+    """The modules and names that a module imports."""
     names = set()
     for node in ast.walk(TREES[path]):
-        if id(node) in typing_only:
-            continue
         if isinstance(node, ast.ImportFrom):
             each = {f"{node.module}.{alias.name}" for alias in node.names}
             names |= each if each <= set(map(name_of, TREES)) else each | {node.module}
