@@ -26,6 +26,7 @@ from affordlib.primitives import Drag, Grasp, LeverUp, Push, PushAt, Rotate, pri
 from affordlib.results import load_plan, read_results, results_table, save_plan, write_results
 from affordlib.types import Goal, Outcome, Plan, Step, UnreachableError
 from exercises import check
+from tests.problems import Still
 
 LIMIT_S = 5.0
 NUMBERS = (math.nan, math.inf, -math.inf, 10**400, -1, 0, 1, 2.5, 1e300, 1e-300, -0.0, 10**6, True)
@@ -96,13 +97,6 @@ ClosedLoopResult DisturbanceSchedule EffectModel Execution Robot
 EffectNetwork NetworkConfig PushLog TabletopObject open_loop
 """
 NAMES = sorted({*CALLABLES, *OF_THE_WORLD.split(), "kind_for"} - {*MADE_BY_DRIVEN_ONES.split()})
-
-
-class Still:
-    """A model of pushes that move nothing."""
-
-    def predict(self, pushes):
-        return np.zeros((len(pushes), 3)), np.ones((len(pushes), 3))
 
 
 def log_of_eight():

@@ -13,9 +13,8 @@ from affordlib.evaluation.predictions import (
     network_predictions,
     yaw_error,
 )
-from affordlib.interactions import (
-    InteractionTensors,
-)
+from affordlib.interactions import InteractionTensors
+from affordlib.models.training import final_errors_m
 
 # Answers
 
@@ -23,8 +22,6 @@ from affordlib.interactions import (
 def test_answers_are_those_of_the_model_itself(trained, held_out_pushes):
     some = np.arange(5)
     told = network_predictions(trained, held_out_pushes, some)
-    from affordlib.models.training import final_errors_m
-
     arrays = InteractionTensors.from_dataset(held_out_pushes, some)
     torch.testing.assert_close(
         torch.tensor(final_error(told)).float(), final_errors_m(trained, arrays)

@@ -25,6 +25,7 @@ from experiments.grasps import (
     threshold_rows,
     wilson,
 )
+from experiments.lever_cross_validation import job as lever_job
 from experiments.runner import read, run
 
 FEW = [job("constant", "grasp", fold=fold) for fold in range(3)]
@@ -33,19 +34,26 @@ FEW = [job("constant", "grasp", fold=fold) for fold in range(3)]
 
 
 @pytest.mark.parametrize(
-    ("arguments", "reason"),
+    ("make", "arguments", "reason"),
     [
-        ({"model": "lstm"}, "model must be one of.*'lstm'"),
-        ({"data": "lever_up"}, "data must be one of"),
-        ({"n": 5}, 'n must be "all" or at least 10, got 5'),
-        ({"fold": 10}, "fold must be .*9.*, got 10"),
-        ({"model": "logistic"}, "grasps, not 'push'"),
-        ({"model": "film_table_frame", "data": "grasp"}, "has no direction"),
+        (job, {"model": "lstm", "data": "push"}, "model must be one of.*'lstm'"),
+        (job, {"model": "film", "data": "lever_up"}, "data must be one of"),
+        (job, {"model": "film", "data": "push", "n": 5}, 'n must be "all" or at least 10, got 5'),
+        (job, {"model": "film", "data": "push", "fold": 10}, "fold must be .*9.*, got 10"),
+        (job, {"model": "logistic", "data": "push"}, "grasps, not 'push'"),
+        (job, {"model": "film_table_frame", "data": "grasp"}, "has no direction"),
+        (lever_job, {"model": "gru"}, "model must be one of"),
+        (lever_job, {"model": "cnp_last_pose", "fold": 5}, "fold must be .*4.*, got 5"),
+        (lever_job, {"model": "lstm_tuned"}, "must be one of .*window.*, got 'all'"),
+        (lever_job, {"model": "cnp_last_pose_single"}, "must be one of .*window.*, got 'all'"),
+        (lever_job, {"model": "cnp", "trained_for": "window"}, "must be .*all.*, got 'window'"),
+        (lever_job, {"model": "cnp_last_pose", "edges_left_out": 9}, "edges_left_out must be .* 8"),
+        (lever_job, {"model": "cnp_last_pose", "epochs": 2}, "epochs belong to 'lstm_seker2019'"),
     ],
 )
-def test_jobs_that_cannot_be_are_refused(arguments, reason):
+def test_jobs_that_cannot_be_are_refused(make, arguments, reason):
     with pytest.raises(ValueError, match=reason):
-        job(**({"model": "film", "data": "push"} | arguments))
+        make(**arguments)
 
 
 @pytest.fixture

@@ -40,23 +40,6 @@ def test_baselines_are_right_about_what_they_assume():
     assert truth.shape[1] == 25
 
 
-@pytest.mark.parametrize(
-    ("arguments", "reason"),
-    [
-        ({"model": "gru"}, "model must be one of"),
-        ({"model": "cnp_last_pose", "fold": 5}, "fold must be .*4.*, got 5"),
-        ({"model": "lstm_tuned"}, "must be one of .*window.*, got 'all'"),
-        ({"model": "cnp_last_pose_single"}, "must be one of .*window.*, got 'all'"),
-        ({"model": "cnp", "trained_for": "window"}, "must be one of .*all.*, got 'window'"),
-        ({"model": "cnp_last_pose", "edges_left_out": 9}, "edges_left_out must be .* 8"),
-        ({"model": "cnp_last_pose", "epochs": 2}, "epochs belong to 'lstm_seker2019'"),
-    ],
-)
-def test_jobs_that_cannot_be_are_refused(arguments, reason):
-    with pytest.raises(ValueError, match=reason):
-        job(**arguments)
-
-
 @pytest.mark.slow
 def test_folds_test_every_object_at_most_once():
     whole = open_interactions("lever_up")

@@ -10,6 +10,7 @@ import pytest
 from affordlib.paths import repo_root
 from affordlib.planning import plan_push_at
 from affordlib.types import Goal
+from tests.problems import Still
 
 IMPORTS = """
 import lzma, numpy as np
@@ -29,11 +30,6 @@ def script():
     cells = json.loads(path.read_text())["cells"]
     (cell,) = [c for c in cells if "script" in c["metadata"].get("tags", [])]
     return IMPORTS + "".join(cell["source"])
-
-
-class Still:
-    def predict(self, pushes):
-        return np.zeros((len(pushes), 3)), np.ones((len(pushes), 3))
 
 
 @pytest.mark.slow
