@@ -57,7 +57,9 @@ def read_log(folder: Path = FOLDER) -> PushLog:
     for path in sorted(folder.glob("*.txt.xz")):
         name = path.name.removesuffix(".txt.xz")
         told = dict(zip(("surface", "support"), name.split("_"), strict=True))
-        for start, end, t, xy in pushes_of(path):
+        for poses, t, xy in pushes_of(path):
+            yaw = 2 * np.arctan2(poses[:, 6], poses[:, 3])
+            start, end = np.column_stack([poses[:, :2], yaw])
             log.add(start, t, xy, end, context=told, group=name)
     return log.tensors()
 

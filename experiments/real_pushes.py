@@ -34,7 +34,6 @@ from affordlib.results import write_results
 from experiments.runner import Job, frame, read, run
 
 TABLE = "real_pushes"
-Pose = tuple[float, float, float]
 CHOSEN_ON = ("hardboard_3points1", "plywood_3points3")
 """Steps and rates of tuning were chosen on these; the other five decide whether they were luck."""
 SHOTS = (0, 5, 10)
@@ -67,8 +66,11 @@ def feet_of(support: str) -> np.ndarray:
     return feet * (1e-3, 1e-3, 1)
 
 
-def pushes_of(path: Path) -> Iterator[tuple[Pose, Pose, np.ndarray, np.ndarray]]:
-    """Poses before and after, times and positions of the tool, of each push of a file."""
+def pushes_of(path: Path) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Of each push of a file: poses (2, 7) before and after, times and positions of the tool.
+
+    A pose is x, y, z and a quaternion w, i, j, k.
+    """
     packed = path.read_bytes()
     text = (lzma.decompress(packed) if path.suffix == ".xz" else packed).decode()
     values = iter([float(word) for word in text.split()])
@@ -77,13 +79,15 @@ def pushes_of(path: Path) -> Iterator[tuple[Pose, Pose, np.ndarray, np.ndarray]]
         rows = int(next(values)) if rows is None else rows
         return np.array([next(values) for _ in range(rows * columns)]).reshape(rows, columns)
 
-    def pose(row: np.ndarray) -> Pose:
-        x, y, _, w, i, j, k = row
-        return x, y, math.atan2(2 * (w * k + i * j), 1 - 2 * (j * j + k * k))
-
     for _ in range(int(next(values))):
         poses, _forces, tool = take(7, rows=2), take(3), take(8)
-        yield pose(poses[0]), pose(poses[1]), tool[:, 0], tool[:, 1:3]
+        yield poses, tool[:, 0], tool[:, 1:3]
+
+
+def planar(pose: np.ndarray) -> tuple[float, float, float]:
+    """x, y and yaw of a pose (7,)."""
+    x, y, _, w, i, j, k = pose
+    return x, y, math.atan2(2 * (w * k + i * j), 1 - 2 * (j * j + k * k))
 
 
 @lru_cache
@@ -95,8 +99,8 @@ def read_logs(folder: str | Path, told: bool = True) -> PushLog:
         if not found:
             raise FileNotFoundError(f"there is no {name}.txt or {name}.txt.xz in {folder}")
         context = {"feet": feet_of(name.split("_")[1])} if told else {}
-        for start, end, t, xy in pushes_of(found[0]):
-            log.add(start, t, xy, end=end, context=context, group=name)
+        for (start, end), t, xy in pushes_of(found[0]):
+            log.add(planar(start), t, xy, end=planar(end), context=context, group=name)
     return log.tensors()
 
 
