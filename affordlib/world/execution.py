@@ -6,6 +6,7 @@ The arm follows waypoints of its joints, and measures what it can feel.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 import pybullet
@@ -83,7 +84,7 @@ class JointController:
         targets = [*angles_rad, gap_m / 2, gap_m / 2]
         for joint, angle in zip(self.joints, targets, strict=True):
             self.client.resetJointState(self.robot, joint, angle, 0.0)
-        self._set_motors(targetPositions=targets)
+        self._motors()(targetPositions=targets)
         self.angles_rad, self.gap_m = np.array(angles_rad, dtype=float), gap_m
         self.raised_m = 0.0
 
@@ -119,6 +120,8 @@ class JointController:
         n_steps = whole if segment is None or segment.n_steps is None else segment.n_steps
         guarded = segment is not None and segment.guarded
         drive = {"forces": self.forces, "positionGains": self.gains}
+        # Looked up once: a client finds each of its functions anew.
+        set_motors, simulate = partial(self._motors(), **drive), client.stepSimulation
         now, frozen_at = (targets[0].tolist(), [0.0] * 8), None
         for step in range(n_steps):
             if recording is not None and step % RECORD_EVERY == 0:
@@ -129,24 +132,24 @@ class JointController:
                 now = commands[step], velocities[step]
                 if guarded and self._force_N(recording.body) > GUARD_FORCE_N:
                     frozen_at, now = step, (commands[step], [0.0] * 8)
-            self._set_motors(targetPositions=now[0], targetVelocities=now[1], **drive)
-            client.stepSimulation()
+            set_motors(targetPositions=now[0], targetVelocities=now[1])
+            simulate()
             self.after_step()
         self.angles_rad, self.gap_m = np.array(now[0][:6]), 2 * now[0][6]
         if n_steps < whole:  # stand still where it was last sent
-            still = [*self.angles_rad, self.gap_m / 2, self.gap_m / 2]
-            self._set_motors(targetPositions=still, **drive)
+            set_motors(targetPositions=[*self.angles_rad, self.gap_m / 2, self.gap_m / 2])
         return 1.0 if frozen_at is None else frozen_at / whole
 
-    def _set_motors(self, **targets: list[float]) -> None:
-        self.client.setJointMotorControlArray(
-            self.robot, self.joints, pybullet.POSITION_CONTROL, **targets
-        )
+    def _motors(self) -> Callable[..., None]:
+        """A function that sends the joints of arm and fingers to targets."""
+        control = self.client.setJointMotorControlArray
+        return partial(control, self.robot, self.joints, pybullet.POSITION_CONTROL)
 
     def wait(self, n_steps: int) -> None:
         """Let the simulation run with the arm held where it is."""
+        simulate = self.client.stepSimulation
         for _ in range(n_steps):
-            self.client.stepSimulation()
+            simulate()
             self.after_step()
 
     def record(
