@@ -16,15 +16,9 @@ import numpy as np
 
 from affordlib.geometry import wrap_angle
 from affordlib.perception import adapt_to_object, looks_fallen, turn_between
+from affordlib.planning import grasp_rotate
 from affordlib.planning.continuous import plan_continuous
-from affordlib.planning.grasp_rotate import (
-    GRIPPER_YAWS_RAD,
-    TURN_TOLERANCE_RAD,
-    aligned_gripper_yaws,
-    candidate_lifts,
-    candidate_turns,
-    predict_trajectories,
-)
+from affordlib.planning.grasp_rotate import GRIPPER_YAWS_RAD, TURN_TOLERANCE_RAD
 from affordlib.planning.move_planner import Ending, MovePlanner
 from affordlib.planning.problem import PlanMode, PlanningProblem, is_on_table
 from affordlib.planning.robot import Execution, Robot
@@ -426,9 +420,9 @@ class _ClosedLoop:
     def _turn(self) -> Step | Ending:
         turn_rad = self._turn_left()
         model = self.skills.model(Rotate)
-        predicted = predict_trajectories(model, self.seen.image, Rotate(), "yaw")
+        predicted = grasp_rotate.predict_trajectories(model, self.seen.image, Rotate(), "yaw")
         return self._first_possible(
-            candidate_turns(predicted, self.seen.xy_m, turn_rad),
+            grasp_rotate.candidate_turns(predicted, self.seen.xy_m, turn_rad),
             f"the orientation: {math.degrees(turn_rad):.0f}° more",
             "no rotation is predicted to turn the object",
         )
@@ -437,11 +431,11 @@ class _ClosedLoop:
         yaws, height_m, grip_yaw = GRIPPER_YAWS_RAD, self.goal.height_m, self._grip_yaw()
         if grip_yaw is not None:
             # A grasp takes an object as the rotation left it, or it would turn it back.
-            yaws = aligned_gripper_yaws(grip_yaw)
+            yaws = grasp_rotate.aligned_gripper_yaws(grip_yaw)
         model = self.skills.model(Grasp)
-        predicted = predict_trajectories(model, self.seen.image, Grasp(), "z", yaws)
+        predicted = grasp_rotate.predict_trajectories(model, self.seen.image, Grasp(), "z", yaws)
         return self._first_possible(
-            candidate_lifts(predicted, self.seen.xy_m, height_m),
+            grasp_rotate.candidate_lifts(predicted, self.seen.xy_m, height_m),
             f"the height: {100 * height_m:.1f} cm",
             "no grasp is predicted to lift it so high",
         )
