@@ -18,11 +18,6 @@ def unit_vector(angle_rad: float) -> np.ndarray:
     return np.array([math.cos(angle_rad), math.sin(angle_rad)])
 
 
-def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray | np.floating:
-    """The z component of the product of vectors (..., 2)."""
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-
-
 def rotated(xy: np.ndarray, angle_rad: float) -> np.ndarray:
     """Points (..., 2) rotated about the origin, counter-clockwise."""
     c, s = math.cos(angle_rad), math.sin(angle_rad)

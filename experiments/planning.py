@@ -108,8 +108,8 @@ VERSIONS: dict[Planner, int] = {plan_astar: 2, plan_astar_fine: 2}
 class PlannerConfig:
     """A row of Table 3: a planner, its model, and the goals that it is asked for.
 
-    planner: a function of a `PlanningProblem`; arguments: its others; execution: those of
-    `attempt`. model: a checkpoint of pushes, one of `MADE`, or "simulator"; oracle: then the
+    planner: a function of a `PlanningProblem`; arguments: its others; execution: fields of
+    `Attempt`. model: a checkpoint of pushes, one of `MADE`, or "simulator"; oracle: then the
     arguments of `oracle_effects`. world: whose frozen goals; sources: which of them; stride: every
     so-many-th; standing: no objects that roll.
     """
@@ -253,31 +253,37 @@ CONFIGS: dict[str, PlannerConfig] = {
 }
 
 
-def attempt(
-    world: Tabletop,
-    task: PlanningTask,
-    planner: Planner,
-    corrections: int = 0,
-    perturbed_start: bool = False,
-    n_averaged_images: int = 1,
-    by_plan: bool = False,
-    receding: bool = False,
-) -> Outcome:
-    """Plan and execute one task, correcting the final position by up to so many single actions.
+@dataclass(frozen=True)
+class Attempt:
+    """How a plan is executed.
+
+    corrections: of the final position, by up to so many single actions. perturbed_start: when the
+    plan is executed, the object is off its estimated pose by `POSITION_ERROR_M` and
+    `YAW_ERROR_RAD`. n_averaged_images: whose mean each observation is. by_plan: each action is
+    placed where the plan has the object, instead of where it is observed. receding: after each
+    action of those that are allowed, a new plan is made of those that remain (model-predictive
+    control).
+    """
+
+    corrections: int = 0
+    perturbed_start: bool = False
+    n_averaged_images: int = 1
+    by_plan: bool = False
+    receding: bool = False
+
+
+def attempt(world: Tabletop, task: PlanningTask, planner: Planner, **options: Any) -> Outcome:
+    """Plan and execute one task; options: fields of `Attempt`.
 
     The distance is measured in the world, not by the robot. A plan that the arm cannot follow
     counts with the distance at which it left the object.
-    perturbed_start: when the plan is executed, the object is off its estimated pose by
-    `POSITION_ERROR_M` and `YAW_ERROR_RAD`. n_averaged_images: whose mean each observation is.
-    by_plan: each action is placed where the plan has the object, instead of where it is observed.
-    receding: after each action of those that are allowed, a new plan is made of those that remain
-    (model-predictive control).
     """
+    how = Attempt(**options)
     world.place(task.obj, (0.0, 0.0), task.yaw_rad, config=task.config)
-    world.n_averaged_images = n_averaged_images
+    world.n_averaged_images = how.n_averaged_images
     seen = world.observe()
     plan = planner(seen.image, seen.xy_m, task.goal, task.mode)
-    if perturbed_start:
+    if how.perturbed_start:
         side = POSITION_ERROR_M * np.array([math.cos(task.yaw_rad), math.sin(task.yaw_rad)])
         config = replace(task.config, bias_m=tuple(side))
         world.place(task.obj, (0.0, 0.0), task.yaw_rad + YAW_ERROR_RAD, config=config)
@@ -291,12 +297,12 @@ def attempt(
         return world.execute(step)
 
     same = {name: getattr(world, name) for name in ("observe", "can_reach", "park", "settle")}
-    robot = SimpleNamespace(execute=execute, **same) if by_plan else world
-    now = replace(plan, steps=plan.steps[:1]) if receding else plan
+    robot = SimpleNamespace(execute=execute, **same) if how.by_plan else world
+    now = replace(plan, steps=plan.steps[:1]) if how.receding else plan
     try:
-        outcome = execute_plan(robot, now, corrections, lambda *query: planner(*query, once))
+        outcome = execute_plan(robot, now, how.corrections, lambda *query: planner(*query, once))
         mode = MODES[task.mode]
-        for left in range(mode.max_steps - 1, 0, -1) if receding else ():
+        for left in range(mode.max_steps - 1, 0, -1) if how.receding else ():
             seen = world.observe()
             if task.goal.distance_m(seen.xy_m) <= ENOUGH_M:
                 break

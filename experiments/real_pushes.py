@@ -229,7 +229,7 @@ def tables() -> dict[str, list[dict]]:
 
 
 def differences(errors: pd.DataFrame) -> list[dict[str, Any]]:
-    """The neural process minus the best baseline, over the same pushes.
+    """The neural process minus the best baseline, over the pushes of which both have an error.
 
     errors: (pushes, columns of each model and what it was told). Best has the least mean position
     error, of those told the feet and of the others. The 95 % intervals are a bootstrap's over
@@ -239,10 +239,11 @@ def differences(errors: pd.DataFrame) -> list[dict[str, Any]]:
     for _, told in (key for key in mean.index if key[0] == "np"):
         for baseline_told in sorted(set(mean[list(BASELINES)].index.get_level_values("told"))):
             best = mean[list(BASELINES)].xs(baseline_told, level="told").idxmin()
-            row = {"told": told, "baseline": best, "baseline_told": baseline_told, "n": len(errors)}
+            row = {"told": told, "baseline": best, "baseline_told": baseline_told}
             for column, unit in (("position", "m"), ("yaw", "rad")):
                 each = errors[f"{column}_{unit}"]
-                row |= interval(each["np", told] - each[best, baseline_told], column, unit)
+                off = (each["np", told] - each[best, baseline_told]).dropna()
+                row |= {"n": len(off)} | interval(off, column, unit)
             rows.append(row)
     return rows
 

@@ -79,7 +79,7 @@ def execute_plan(
         raise ValueError(f"corrections = {corrections} need a planner; give replan as well")
     done: list[Execution] = []
 
-    def execute(step: Step) -> None:
+    def execute(step):
         try:
             done.append(robot.execute(step))
         except UnreachableError as error:
