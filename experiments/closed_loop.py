@@ -367,6 +367,7 @@ def reachability_rows(records: Rows) -> Rows:
             yes, no = group[group.feasible], group[~group.feasible]
             row["right_percent"] = _percent(group.right)
             row["feasible_reached_percent"] = _percent(yes.right)
+            row["within_percent"] = _percent(yes.distance_m <= WITHIN_M)
             row["infeasible_refused_percent"] = _percent(no.right)
             row["moved_for_nothing_percent"] = _percent(no.actions > 0)
             row["ik_rejections_mean"] = _mean(group.ik_rejections)
