@@ -319,17 +319,13 @@ class Step:
 
 @dataclass(frozen=True)
 class Plan:
-    """A chain of steps from a start (x, y) [m] towards a goal, and what finding it cost.
-
-    evaluations counts expanded nodes (A*) or gradient iterations; plan_s is wall time.
-    """
+    """A chain of steps from a start (x, y) [m] towards a goal, found in plan_s seconds."""
 
     goal: Goal
     start_xy_m: tuple[float, float]
     steps: tuple[Step, ...]
     planner: str
     reaches_goal: bool
-    evaluations: int
     plan_s: float
 
     def __post_init__(self) -> None:

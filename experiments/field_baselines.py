@@ -44,7 +44,7 @@ def plan_astar_continuous(problem: PlanningProblem) -> Plan:
     chain = [(s.primitive.direction_rad, s.stop_phase) for s in first]
     chain = torch.tensor([*chain, (float(better[0, 0]) + turned, float(better[0, 1]))]).double()
     steps = make_steps(effects, start, chain)
-    return problem.plan(steps, "astar_continuous", plan.reaches_goal, plan.evaluations, began)
+    return problem.plan_of(steps, "astar_continuous", plan.reaches_goal, began)
 
 
 def plan_cem(problem: PlanningProblem, seed: int = 0) -> Plan:
@@ -74,4 +74,4 @@ def plan_cem(problem: PlanningProblem, seed: int = 0) -> Plan:
     steps = make_steps(effects, problem.start_xy_m, best[moved > MOVES_M])
     end = steps[-1].predicted_end_xy_m if steps else problem.start_xy_m
     reaches = problem.goal.distance_m(end) <= problem.goal.tolerance_m
-    return problem.plan(steps, "cem", reaches, N_CHAINS * ROUNDS, began)
+    return problem.plan_of(steps, "cem", reaches, began)

@@ -41,7 +41,7 @@ from affordlib.models.lever_up import LEVER_MODELS, predict_steps
 from affordlib.models.training import batch_loss, final_errors_m
 from affordlib.paths import repo_root
 from affordlib.planning import EffectMap, PlanningProblem, plan_astar, plan_continuous
-from affordlib.planning.astar import N_DIRECTIONS, STOP_PHASES
+from affordlib.planning.astar import N_DIRECTIONS, STOP_PHASES, BranchTable, search
 from affordlib.planning.continuous import DIRECTION_SPREAD_RAD, MIN_STOP_PHASE, N_REFINED
 from affordlib.primitives import PRIMITIVES, Push
 from affordlib.results import read_results, write_results
@@ -299,14 +299,15 @@ def planning(n_goals: int = 15, seed: int = 300) -> Rows:
             measure(lambda e=effects: e.spline, "map")
             problem = PlanningProblem(world.object_pose()[:2], task.goal, effects, mode)
             effects.fine_grid  # noqa: B018, made once an object
-            evaluations = astar(problem).evaluations
+            phases, expanded = STOP_PHASES if problem.mode.partial else (1.0,), []
+            search(problem, BranchTable(effects, N_DIRECTIONS, phases), expanded, "disc")
             for name, planner in planners.items():
                 measure(partial(planner, problem), name, mode)
                 measure(partial(whole, planner, problem), name, mode, "whole")
             if len(times[NAIVE[0][0], mode]) % 5 == 1:
                 rng, naive = np.random.default_rng(seed), partial(_naive_descent, problem)
                 branches = partial(_naive_branches, film, image)
-                measure(branches, NAIVE[0][0], mode, NAIVE[0][1], times_as_much=evaluations)
+                measure(branches, NAIVE[0][0], mode, NAIVE[0][1], times_as_much=len(expanded))
                 measure(naive, "continuous", mode, NAIVE[1][1])
                 each = [seconds(partial(naive, rng)) for _ in range(N_REFINED)]
                 times["continuous", mode, NAIVE[2][1]].append(1000 * sum(each))

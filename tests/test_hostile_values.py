@@ -130,7 +130,7 @@ def shop(one_world, skills, pushes, tmp_path_factory):
     few = models.TrainingConfig(steps=1, batch_size=2, n_targets=2, device="cpu")
     network = models.build(config, scaler, domain)
     step = Step(Push(0.0), 0.5, (0.02, 0.0), path)
-    plan = Plan(goal, AT, (step,), "by hand", True, 1, 0.0)
+    plan = Plan(goal, AT, (step,), "by hand", True, 0.0)
     problem = planning.PlanningProblem(AT, goal, planning.EffectMap(model, image), "single_partial")
     once = planning.ClosedLoopConfig(max_actions=1, horizon=1)
     pursuit = planning.run_closed_loop(one_world, goal, skills, config=once)

@@ -11,7 +11,6 @@ import itertools
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -30,14 +29,8 @@ _SAME_PLACE_M = 1e-4
 MAX_EXPANSIONS = 20_000
 
 
-@dataclass(frozen=True)
-class Branches:
-    """The actions (n,) of a search, their effects (2, n) along the table's axes, and turns (n,)."""
-
-    direction: np.ndarray
-    stop_phase: np.ndarray
-    effect_m: np.ndarray
-    turn_rad: np.ndarray
+Branches = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+"""Of a node: directions (n,), phases (n,), effects (2, n) along the table's axes, turns (n,)."""
 
 
 class BranchTable:
@@ -80,7 +73,7 @@ class BranchTable:
             direction = self._direction[moves]
             c, s = np.cos(direction), np.sin(direction)
             effect_m = np.stack([c * ahead - s * left, s * ahead + c * left])
-            self._kept[key] = Branches(direction, self._phase[moves], effect_m, turn)
+            self._kept[key] = direction, self._phase[moves], effect_m, turn
         return self._kept[key]
 
 
@@ -89,10 +82,10 @@ def search(
     table: BranchTable,
     trace: list[tuple[np.ndarray, np.ndarray]] | None = None,
     heuristic: str = "goal",
-) -> tuple[list[tuple[float, float]], bool, int]:
+) -> tuple[list[tuple[float, float]], bool]:
     """The best chain of (direction, phase) into the goal's disc, or the one that ends nearest.
 
-    Also whether it gets there, and how many nodes were expanded. The best is the shortest way to
+    Also whether it gets there. The best is the shortest way to
     the goal (heuristic "goal": what the chain leaves counts) or to its disc ("disc": it does not).
     Ties go to fewer actions. A node from which the object cannot be turned and lifted as the goal
     asks is none of the goal's. trace, if given, receives each expanded position (2,) with those of
@@ -123,9 +116,9 @@ def search(
         if depth == max_steps or (depth, *cell) in expanded:
             continue
         expanded.add((depth, *cell))
-        branches = table.at(turned)
+        direction, stop_phase, effect_m, turn_rad = table.at(turned)
         depth += 1
-        places = branches.effect_m.T + np.array([x, y])
+        places = effect_m.T + np.array([x, y])
         away = np.hypot(*(places - goal.xy_m).T)
         if depth == max_steps:
             rows = np.flatnonzero(away < max(nearest_m, tolerance + 1e-12))
@@ -134,7 +127,7 @@ def search(
             rows = np.flatnonzero(away <= within_m)
         rows = rows[is_on_table(places[rows], effects.radius_m)]
         here = np.broadcast_to((x, y), (len(rows), 2))
-        rows = rows[problem.reachable(here, branches.direction[rows])]
+        rows = rows[problem.reachable(here, direction[rows])]
         if trace is not None:
             trace.append((np.array((x, y)), places[rows]))
         if depth == max_steps and len(rows):
@@ -142,14 +135,13 @@ def search(
             ends = away[rows] <= tolerance
             ends[away[rows].argmin()] = True
             rows = rows[ends]
-        way = way_m + np.hypot(*branches.effect_m[:, rows])
+        way = way_m + np.hypot(*effect_m[:, rows])
         f = np.round(way + np.maximum(0.0, away[rows] - radius), 12)
-        turns = turned + branches.turn_rad[rows]
-        actions = branches.direction[rows], branches.stop_phase[rows]
+        turns, actions = turned + turn_rad[rows], (direction[rows], stop_phase[rows])
         for row in np.column_stack([f, places[rows], turns, way, away[rows], *actions]).tolist():
             node = (*row[1:6], (*chain, tuple(row[6:])))
             heapq.heappush(frontier, (row[0], depth, next(number), node))
-    return list(nearest), reached, len(expanded)
+    return list(nearest), reached
 
 
 def plan_astar(
@@ -162,7 +154,7 @@ def plan_astar(
     began = time.perf_counter()
     stops = tuple(stop_phases) if problem.mode.partial else (1.0,)
     table = BranchTable(problem.effects, n_directions, stops)
-    chain, reached, expansions = search(problem, table, heuristic=heuristic)
+    chain, reached = search(problem, table, heuristic=heuristic)
     chain = torch.tensor(chain, dtype=torch.float64).reshape(-1, 2)
     steps = make_steps(problem.effects, problem.start_xy_m, chain)
-    return problem.plan(steps, "astar", reached, expansions, began)
+    return problem.plan_of(steps, "astar", reached, began)

@@ -448,7 +448,7 @@ class _ClosedLoop:
         for step in candidates:
             primitive = adapt_to_object(step.primitive, self.seen.image)
             if self.robot.can_reach(primitive, step.stop_phase, at):
-                self._follow(Plan(self.goal, at, (step,), primitive.name, False, 0, 0.0))
+                self._follow(Plan(self.goal, at, (step,), primitive.name, False, 0.0))
                 return step
             self.moves.vetoes += 1
             hopeless = f"the arm cannot {primitive.name} at ({at[0]:.3f}, {at[1]:.3f}) m"

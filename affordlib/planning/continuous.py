@@ -178,11 +178,10 @@ def plan_continuous(
     rng = np.random.default_rng(check_count("seed", seed, least=0))
     target = torch.from_numpy(np.subtract(goal.xy_m, start))
     fewest = max(1, math.ceil(float(target.norm()) / max(effects.reach_m, 1e-4)))
-    candidates, iterations = [], 0
+    candidates = []
     if float(target.norm()) > 1e-4:
         for n_actions in range(min(fewest, mode.max_steps), mode.max_steps + 1):
             candidates += _best_chain(problem, target, n_actions, rng, draft, trace)
-            iterations += 0 if draft else ITERATIONS
             if candidates and n_actions >= fewest + (not draft):
                 break
     steps = ()
@@ -196,7 +195,7 @@ def plan_continuous(
             steps = ()  # where nothing brings it nearer, the object stays
     end = steps[-1].predicted_end_xy_m if steps else start
     reaches = goal.distance_m(end) <= goal.tolerance_m
-    return problem.plan(steps, "continuous", reaches, iterations, began)
+    return problem.plan_of(steps, "continuous", reaches, began)
 
 
 def _allowed(problem: PlanningProblem, positions: Tensor, direction: Tensor) -> Tensor:

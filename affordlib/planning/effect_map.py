@@ -88,7 +88,7 @@ class EffectMap:
         """Effects and σ (D, T, 3) at the grid's directions and phases."""
         angles = np.arange(self.n_directions) * (2 * math.pi / self.n_directions)
         t_target = phases_of(self.kind, self.n_phases).float().expand(self.n_directions, -1)
-        effect, std = self._query(angles, t_target)
+        effect, std = self.query(angles, t_target)
         # What a model predicts at the time before contact is no displacement.
         return effect - effect[:, :1], std
 
@@ -147,12 +147,15 @@ class EffectMap:
         """As the map, for (n,) directions and phases, from the model itself: (n, 3)."""
         first = torch.full_like(phase, self.kind.acts_from)
         t_target = torch.stack([first, phase.clamp_min(self.kind.acts_from)], dim=1).float()
-        effect, _ = self._query(direction_rad.numpy(), t_target)
+        effect, _ = self.query(direction_rad.numpy(), t_target)
         return effect[:, 1] - effect[:, 0]
 
     @torch.no_grad()
-    def _query(self, direction_rad: np.ndarray, t_target: Tensor) -> tuple[Tensor, Tensor]:
-        """Effects and σ (n, T, 3), ahead, left and turn, of actions in n directions."""
+    def query(self, direction_rad: np.ndarray, t_target: Tensor) -> tuple[Tensor, Tensor]:
+        """Effects and σ (n, T, 3), ahead, left and turn, of actions in n directions, by the model.
+
+        t_target: (n, T).
+        """
         pushes = [self.kind.towards(float(angle)) for angle in direction_rad]
         observed = condition_on_primitives(self.model, pushes)
         prediction = self.model.predict(self.features, observed, t_target)

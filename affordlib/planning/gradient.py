@@ -19,11 +19,7 @@ import torch
 
 from affordlib.geometry import xy_columns
 from affordlib.models.domain import OutOfRangeWarning
-from affordlib.models.protocol import (
-    EffectModel,
-    condition_on_final_effect,
-    condition_on_primitives,
-)
+from affordlib.models.protocol import EffectModel, condition_on_final_effect
 from affordlib.planning.effect_map import EffectMap
 from affordlib.planning.problem import PlanningProblem
 from affordlib.planning.rollout import PATH_SAMPLES
@@ -46,18 +42,21 @@ def descend(
     starts: int = 1,
     direction_only: bool = False,
     trace: list[tuple[np.ndarray, np.ndarray]] | None = None,
-) -> tuple[torch.Tensor, int]:
+) -> torch.Tensor:
     """Effect inputs (starts, C_e) whose predicted effect at t = 1 is near the target (2,).
 
     Descends the gradient of the mean square error with Adam, on the input alone, from some random
     starts side by side; the best is the first. direction_only keeps the input on the circle of
     effects that full pushes have. trace, if given, receives each iteration's inputs (starts, 2)
-    [m] and losses (starts,) [m²]. Also returns the number of iterations. To the letter it begins,
-    and may end, with effects that no push has; nobody is warned of each.
+    [m] and losses (starts,) [m²]. To the letter it begins, and may end, with effects that no
+    push has; nobody is warned of each.
     """
     model, features = effects.model, effects.features
     columns = xy_columns(model.effect_channels)
-    radius = _effect_radius_m(effects) if direction_only else START_RADIUS_M
+    radius = START_RADIUS_M
+    if direction_only:
+        full, _ = effects.query(np.arange(12) * (math.pi / 6), torch.ones(12, 1))
+        radius = float(full[..., :2].norm(dim=-1).mean())
     angle = torch.as_tensor(generator.uniform(0, 2 * math.pi, size=starts), dtype=torch.float32)
     circle = radius * torch.stack([angle.cos(), angle.sin()], dim=1)
     sought = (angle if direction_only else circle).requires_grad_()
@@ -65,9 +64,8 @@ def descend(
     target = torch.as_tensor(target_xy_m, dtype=torch.float32)
     at_end = torch.ones(starts, 1)
     before = circle.detach()
-    iterations = still = 0
-    while iterations < MAX_ITERATIONS:
-        iterations += 1
+    still = 0
+    for _ in range(MAX_ITERATIONS):
         xy = radius * torch.stack([sought.cos(), sought.sin()], dim=1) if direction_only else sought
         effect = torch.zeros(starts, len(model.effect_channels))
         effect[:, columns] = xy
@@ -82,7 +80,7 @@ def descend(
         before = xy.detach().clone()
         (sought.grad,) = torch.autograd.grad(losses.sum(), [sought])
         optimiser.step()
-    return effect.detach()[losses.detach().argsort(stable=True)], iterations
+    return effect.detach()[losses.detach().argsort(stable=True)]
 
 
 def _predict(
@@ -90,18 +88,6 @@ def _predict(
 ) -> Prediction:
     with warnings.catch_warnings(action="ignore", category=OutOfRangeWarning):
         return model.predict(features, condition_on_final_effect(model, effect), t)
-
-
-@torch.no_grad()
-def _effect_radius_m(effects: EffectMap) -> float:
-    """Mean length [m] of the effects of full actions on this object."""
-    model, towards = effects.model, effects.kind.towards
-    actions = [towards(angle) for angle in np.arange(12) * (math.pi / 6)]
-    observed = condition_on_primitives(model, actions)
-    prediction = model.predict(effects.features, observed, torch.ones(12, 1))
-    return float(
-        prediction.effect_mean[:, 0, xy_columns(model.effect_channels)].norm(dim=-1).mean()
-    )
 
 
 def plan_gradient(
@@ -128,19 +114,15 @@ def plan_gradient(
     goal, mode = problem.goal, problem.mode
     columns = xy_columns(model.effect_channels)
     a_columns = [model.action_channels.index(name) for name in ("x", "y")]
-    with torch.no_grad():  # a model of other actions refuses one
-        model.predict(
-            effects.features, condition_on_primitives(model, [kind.towards(0.0)]), torch.ones(1, 1)
-        )
+    effects.query(np.zeros(1), torch.ones(1, 1))  # a model of other actions refuses one
     generator = np.random.default_rng(check_count("seed", seed, least=0))
     xy, target = np.asarray(problem.start_xy_m), np.asarray(goal.xy_m)
     steps: list[Step] = []
-    iterations, turned = 0, 0.0
+    turned = 0.0
     t = torch.linspace(0, 1, samples)
     while len(steps) < mode.max_steps and np.hypot(*(target - xy)) > SUCCESS_M:
-        found, n = descend(effects, target - xy, generator, starts, direction_only)
-        iterations += n
-        for effect in found:  # the best that is in reach
+        # Of the starts the best that is in reach.
+        for effect in descend(effects, target - xy, generator, starts, direction_only):
             with torch.no_grad():
                 prediction = _predict(model, effects.features, effect[None], t[None])
             action = prediction.action_mean[0, :, a_columns].numpy().astype(float)
@@ -178,4 +160,4 @@ def plan_gradient(
             break
     reached = bool(np.hypot(*(target - xy)) <= goal.tolerance_m)
     name = "gradient" + "_direction" * direction_only + "_snapped" * snap
-    return problem.plan(tuple(steps), name, reached, iterations, began)
+    return problem.plan_of(tuple(steps), name, reached, began)

@@ -85,13 +85,8 @@ class PlanningProblem:
             object.__setattr__(self, "mode", MODES[check_choice("mode", self.mode, MODES)])
         check_has_room(self.goal, self.effects.radius_m)
 
-    def plan(
-        self,
-        steps: tuple[Step, ...],
-        planner: str,
-        reaches_goal: bool,
-        evaluations: int,
-        began_s: float,
+    def plan_of(
+        self, steps: tuple[Step, ...], planner: str, reaches_goal: bool, began_s: float
     ) -> Plan:
         """The plan of some steps, with what turns and lifts the object at their end, and its time.
 
@@ -103,4 +98,4 @@ class PlanningProblem:
             end = self.pose_planner and self.pose_planner(goal, end_xy_m, turned, std_m)
             steps, reaches_goal = steps + (end or ()), end is not None
         seconds = time.perf_counter() - began_s
-        return Plan(goal, self.start_xy_m, steps, planner, reaches_goal, evaluations, seconds)
+        return Plan(goal, self.start_xy_m, steps, planner, reaches_goal, seconds)

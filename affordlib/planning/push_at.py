@@ -91,7 +91,7 @@ def plan_push_at(
         steps.append(Step(primitive, 1.0, tuple(path[1]), np.array(path), None, std_m, turn))
     reaches = goal.distance_m(steps[-1].predicted_end_xy_m) <= goal.tolerance_m
     took_s = time.perf_counter() - began
-    return Plan(goal, (x, y), tuple(steps), "push_at", reaches, n, took_s)
+    return Plan(goal, (x, y), tuple(steps), "push_at", reaches, took_s)
 
 
 def primitive_of(pushes: PushLog, k: int, heading_rad: float) -> PushAt:

@@ -128,7 +128,7 @@ def test_an_object_that_always_escapes_ends_the_loop():
 
 def test_a_planner_that_does_nothing_is_given_up():
     def lazy(problem):
-        return Plan(problem.goal, problem.start_xy_m, (), "lazy", False, 0, 0.0)
+        return Plan(problem.goal, problem.start_xy_m, (), "lazy", False, 0.0)
 
     went = loop(PointRobot(), Goal((0.1, 0.0), EXACT_M), planner=lazy)
     assert (went.status, went.steps) == ("gave_up", ())
@@ -292,7 +292,7 @@ def test_corrections_bring_it_nearer_and_stop_where_enough():
     assert closed.distance_m == goal.distance_m(robot.xy_m) < 0.5 * open_loop.distance_m
     assert len(plan.steps) < len(closed.object_paths_xy_m) <= len(plan.steps) + 2
     assert set(asked) == {0.0003}
-    none = Plan(goal, goal.xy_m, (), "none", True, 0, 0.0)
+    none = Plan(goal, goal.xy_m, (), "none", True, 0.0)
     assert execute_plan(PointRobot(plan.goal.xy_m), none, 2, replan).object_paths_xy_m == ()
     with pytest.raises(ValueError, match="need a planner"):
         execute_plan(robot, plan, 1)
@@ -309,7 +309,7 @@ def test_what_was_done_before_the_arm_refused_is_kept():
 
     robot, path = Refuses(), np.zeros((2, 2))
     can, cannot = Step(Push(math.pi), 1.0, (0.09, 0.0), path), Step(Grasp(), 1.0, (0.0, 0.0), path)
-    plan = Plan(Goal((0.1, 0.0)), (0.0, 0.0), (can, can, cannot), "by hand", True, 0, 0.0)
+    plan = Plan(Goal((0.1, 0.0)), (0.0, 0.0), (can, can, cannot), "by hand", True, 0.0)
     with pytest.raises(UnreachableError) as refused:
         execute_plan(robot, plan)
     outcome = refused.value.outcome

@@ -93,12 +93,12 @@ class RandomTable(BranchTable):
 
     def at(self, turned: float) -> Branches:
         # The number of a branch stands in for its direction.
-        return Branches(np.arange(self.n), np.ones(self.n), rotated(self.xy, turned).T, self.turn)
+        return np.arange(self.n), np.ones(self.n), rotated(self.xy, turned).T, self.turn
 
     def follow(self, chain) -> tuple[np.ndarray, float]:
         xy, turned, length = np.zeros(2), 0.0, 0.0
         for k in chain:
-            step = self.at(turned).effect_m[:, k]
+            step = self.at(turned)[2][:, k]
             xy, turned, length = xy + step, turned + self.turn[k], length + math.hypot(*step)
         return xy, length
 
@@ -119,7 +119,7 @@ def test_astar_finds_what_exhaustive_search_finds(seed, heuristic):
             nearest = min(nearest, goal.distance_m(end))
             if goal.distance_m(end) <= goal.tolerance_m:
                 best = min(best, way_to(end, length))
-    chain, reached, _ = search(problem, table, heuristic=heuristic)
+    chain, reached = search(problem, table, heuristic=heuristic)
     end, length = table.follow([int(k) for k, _ in chain])
     assert reached == math.isfinite(best)
     if reached:
@@ -130,14 +130,14 @@ def test_astar_finds_what_exhaustive_search_finds(seed, heuristic):
 
 
 def test_branches_are_the_papers_180():
-    branches = BranchTable(EffectMap(MODEL, IMAGE)).at(0.0)
+    direction, stop_phase, effect_m, _ = BranchTable(EffectMap(MODEL, IMAGE)).at(0.0)
     # Those that stop before contact do nothing and are pruned: 36 x {80, 100 %} remain.
-    assert len(branches.direction) == 72
-    assert set(np.round(branches.stop_phase, 3)) == {0.8, 1.0}
-    full = branches.stop_phase == 1.0
-    direction = branches.direction[full]
+    assert len(direction) == 72
+    assert set(np.round(stop_phase, 3)) == {0.8, 1.0}
+    full = stop_phase == 1.0
+    direction = direction[full]
     expected = REACH_M * np.stack([np.cos(direction), np.sin(direction)])
-    np.testing.assert_allclose(branches.effect_m[:, full], expected, atol=1e-4)
+    np.testing.assert_allclose(effect_m[:, full], expected, atol=1e-4)
     for wrong in ({"n_directions": 0}, {"stop_phases": ()}, {"heuristic": "far"}):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             plan_astar(known((0.1, 0.0)), **wrong)
@@ -170,7 +170,7 @@ def test_a_search_goes_on_where_the_end_cannot_be_had(film, cuboid_image):
     two = PlanMode(2, partial=True)
     problem = problem_of(film, cuboid_image, (0.0, 0.0), goal, two, pose_planner=only_beyond)
     table = BranchTable(problem.effects)
-    chain, reached, _ = search(problem, table)
+    chain, reached = search(problem, table)
     assert reached
     assert len(asked) > 1
     assert asked[-1][0] > 0.085

@@ -13,7 +13,7 @@ PATH = np.array([[0.0, 0.1], [1 / 3, 0.2]])
 
 def saved(tmp_path, primitive=Push(0.0)):  # noqa: B008
     step = Step(primitive, 0.7, (0.1, 0.2), PATH, path_xy_m=PATH / 7)
-    plan = Plan(Goal((0.1, 0.2), 0.005), (0.0, 0.0), (step,), "any", False, 3, 0.1)
+    plan = Plan(Goal((0.1, 0.2), 0.005), (0.0, 0.0), (step,), "any", False, 0.1)
     return save_plan(tmp_path / "new" / "plan.json", plan)
 
 
