@@ -9,7 +9,6 @@ predicted. The robot takes the error that it expects off what it sees.
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,19 +19,18 @@ import numpy as np
 import pandas as pd
 import torch
 
-from affordlib.commands import command, count_type
+from affordlib.commands import command
 from affordlib.evaluation.tasks import EARLIEST_STOP, STANDING, frozen_tasks
 from affordlib.geometry import rotated
 from affordlib.interactions.recipes import Variation
 from affordlib.models.checkpoint import load_checkpoint
 from affordlib.planning import EffectMap
 from affordlib.primitives import Push
-from affordlib.results import write_results
 from affordlib.world import Tabletop, TabletopObject, WorldConfig, category_named
 from experiments import runner
 from experiments.planning import CONFIGS, attempt, tasks_sha256
-from experiments.real_pushes import interval
-from experiments.runner import Job, Rows, frame
+from experiments.real_pushes import named
+from experiments.runner import FOLDER, Job, Rows, frame, interval
 
 TABLE, PLANS = "adaptation", CONFIGS["perturbed_corrected"]
 N_OTHERS, N_TESTS, SHOTS = 40, 2, (0, 2, 5, 10)
@@ -130,12 +128,12 @@ def job(kind: str, number: int, camera: Camera | None = None) -> Job:
     return Job(partial(measure, camera), arguments, settings, checkpoints=(PLANS.model,))
 
 
-def tables() -> dict[str, Rows]:
+def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
     """What is known of the camera, and errors by what is known; differences case by case.
 
     Predictions are of the last pushes of the other objects.
     """
-    results, errors, rows = runner.read(TABLE, job), [], []
+    results, errors, rows = runner.read(TABLE, job, folder), [], []
     others = [result for about, result in results if about["kind"] == "other"]
     camera = Camera.fit(others)
     for k, pushes in enumerate(other["pushes"] for other in others):
@@ -149,22 +147,20 @@ def tables() -> dict[str, Rows]:
         error, without = (table.set_index("number")["error_m"] for table in (some, nothing))
         row = {"of": of, "known": name, "n": len(some), "mean_m": error.mean()}
         row |= {"sem_m": error.sem(), "median_m": error.median()}
-        rows.append(row | interval(error - without, "difference", "m"))
+        off = interval(error - without)
+        rows.append(row | dict(zip(named("difference", "m"), off, strict=True)))
     return {"camera": [vars(camera)], "errors": rows}
 
 
 @command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
     """Push, plan, and make the table; what is there is not made again."""
-    parser = argparse.ArgumentParser(description=main.__doc__)
-    parser.add_argument("--goals", type=count_type, default=40, help="so many of 80")
-    n = parser.parse_args(argv).goals
-    others = runner.run([job("other", k) for k in range(N_OTHERS)], TABLE)
-    camera = Camera.fit(others)
+    options = runner.parser(TABLE, main.__doc__).parse_args(argv)
+    others = [job("other", k) for k in range(N_OTHERS)]
+    camera = Camera.fit(runner.run(others, TABLE, folder=options.raw))
     numbers = [k for k, t in enumerate(frozen_tasks("perturbed")) if t.mode == "multi_partial"]
-    runner.run([job("goal", k, camera) for k in sorted(numbers, key=lambda k: k % 2)[:n]], TABLE)
-    print(write_results("data/results", TABLE, {}, tables()))
-    return 0
+    goals = [job("goal", k, camera) for k in numbers if k % 2 == 0]
+    return runner.make(goals, TABLE, options, tables)
 
 
 if __name__ == "__main__":

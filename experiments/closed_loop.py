@@ -1,14 +1,12 @@
 """The closed loop, measured: height, orientation, disturbances, reachability of random goals.
 
-    python -m experiments.closed_loop --tables height,orientation
+    python -m experiments.closed_loop --only table=height,orientation world=clean
 
 Trial i of a table is a function of the seed and i: object, start, goal and disturbances are drawn
 before anything plans, on objects that no model has seen. Each is run in the clean world with the
 ideal camera, and in a perturbed one (`Variation`) with the Kinect. Errors are measured in the
-simulator, where the robot does not look. Whether a goal is feasible is judged by
-the arm's kinematics (position) and by whole grasps (height), never by the planner under test. The
-goals of `height` and `orientation` are also planned open loop: each from one image, executed
-without observing again (`open_loop_pose_goals`).
+simulator, where the robot does not look. Whether a goal is feasible is judged by the arm's
+kinematics (position) and by whole grasps (height), never by the planner under test.
 """
 
 from __future__ import annotations
@@ -26,8 +24,7 @@ import numpy as np
 import pandas as pd
 from scipy.spatial import ConvexHull
 
-from affordlib.commands import command, count_type, names_type, seed_type
-from affordlib.evaluation.metrics import error_row
+from affordlib.commands import command
 from affordlib.geometry import wrap_angle
 from affordlib.interactions.recipes import Variation
 from affordlib.models import load_checkpoint
@@ -38,9 +35,6 @@ from affordlib.planning import (
     DisturbanceSchedule,
     Robot,
     Skills,
-    execute_plan,
-    plan_astar,
-    plan_continuous,
     run_closed_loop,
     sample_disturbances,
 )
@@ -48,20 +42,17 @@ from affordlib.planning.disturbances import KINDS
 from affordlib.planning.grasp_rotate import GRIPPER_YAWS_RAD
 from affordlib.planning.skills import CHECKPOINTS
 from affordlib.primitives import Drag, Grasp, Push
-from affordlib.results import write_results
 from affordlib.types import TABLE_X_M, TABLE_Y_M, Goal, check_choice
 from affordlib.world import (
     Tabletop,
     TabletopObject,
-    UnreachableError,
     WorldConfig,
     category_named,
 )
 from experiments import runner
 from experiments.feasibility import half_width_m, is_feasible, on_the_rim
-from experiments.runner import FOLDER, Job
+from experiments.runner import FOLDER, Job, Rows, plain
 
-Rows = list[dict[str, Any]]
 N_TRIALS = {
     "height": 50,
     "orientation": 50,
@@ -69,8 +60,9 @@ N_TRIALS = {
     "reachability": 1000,
     "orientation_unseen": 50,
 }
+FEWER = {("reachability", "perturbed"): 82}
+"""So many of them, where not all were run."""
 VERSIONS = dict.fromkeys(N_TRIALS, 1) | dict.fromkeys(("height", "orientation"), 2)
-VERSIONS["open_loop_pose_goals"] = 2
 """Raise one when the code changes and the table's numbers do."""
 
 POSE_PRIMITIVES = {"height": "grasp", "orientation": "rotate", "orientation_unseen": "rotate"}
@@ -89,7 +81,6 @@ SMALLEST_M2 = 0.001
 """Smaller footprints, of a prism, are drawn again: models refuse what is much smaller than what
 they were trained on."""
 
-PLANNERS = {"astar": plan_astar, "continuous": plan_continuous}
 TOLERANCE_M = dict.fromkeys(POSE_PRIMITIVES, 0.004)
 """Of the position, where it is not 2 mm; gripping shifts objects."""
 
@@ -163,7 +154,7 @@ def _clean_trial(table: str, index: int, seed: int) -> Trial:
 
 
 @cache
-def _tabletop_and_skills(world: str = "clean") -> tuple[Tabletop, Skills]:
+def tabletop_and_skills(world: str = "clean") -> tuple[Tabletop, Skills]:
     """One of each for a process."""
     skills = Skills.load()
     if world == "perturbed":
@@ -174,7 +165,7 @@ def _tabletop_and_skills(world: str = "clean") -> tuple[Tabletop, Skills]:
 
 def run_trial(table: str, index: int, seed: int = 0, world: str = "clean") -> dict[str, Any]:
     """The record of a trial: how it ended, and whether it could be done."""
-    tabletop, skills = _tabletop_and_skills(world)
+    tabletop, skills = tabletop_and_skills(world)
     trial = sample_trial(table, index, seed, world)
     robot = DisturbanceSchedule(tabletop, trial.goal, trial.disturbances)
 
@@ -219,7 +210,6 @@ def _measured(world: Tabletop, result: ClosedLoopResult, yaw: float, z: float) -
         "distance_m": goal.distance_m(pose[:2]),
         "actions": len(result.steps),
         "plans": len(result.plans),
-        "ik_rejections": result.vetoes,
         "turn_error_rad": turn_error,
         "height_error_m": height_error,
         "orientation_reckoned": "orientation" in result.reckoned,
@@ -260,56 +250,13 @@ def _stays_feasible(
     return all(is_feasible(kind, half, xy, result.goal.xy_m) for xy in seen)
 
 
-def run_open_loop(table: str, index: int, planner: str) -> dict[str, Any]:
-    """The record of one plan of a whole pose, tried even where the planner predicts to fail.
-
-    pose_error: what is missing of the turn [rad] or of the height [m].
-    """
-    world, skills = _tabletop_and_skills()
-    trial = sample_trial(table, index)
-    world.place(trial.obj, trial.start_xy_m, trial.yaw_rad)
-    image = world.depth_image()
-    plan = skills.planner(PLANNERS[planner])(image, trial.start_xy_m, trial.goal)
-    yaw, z = world.object_pose()[2], world.object_state()[2]
-    refused = False
-    try:
-        execute_plan(world, plan)
-    except UnreachableError:
-        refused = True
-    pose = world.object_pose()
-    if table == "orientation":
-        pose_error = wrap_angle(trial.goal.turn_rad - (pose[2] - yaw))
-    else:
-        pose_error = trial.goal.height_m - (world.object_state()[2] - z)
-    world.park()
-    return {
-        "object_class": trial.obj.category,
-        "predicted_reached": plan.reaches_goal,
-        "actions": len(plan.steps),
-        "arm_refused": refused,
-        "distance_m": trial.goal.distance_m(pose[:2]),
-        "pose_error": abs(pose_error),
-    }
-
-
 def _groups(table: pd.DataFrame, *by: str) -> Iterator[tuple[dict[str, Any], pd.DataFrame]]:
     """All records, and those of each value of some columns, with the columns that all have."""
     groups = [({}, table)]
     groups += [({k: value}, some) for k in by for value, some in table.groupby(k, sort=False)]
     for about, some in groups:
-        row = dict.fromkeys(by, "all") | about | {"n": len(some)}
-        if "status" in some:
-            row["feasible"] = int(some.feasible.sum())
-            row |= {name: int((some.status == name).sum()) for name in STATUSES}
-        yield row, some
-
-
-def _percent(good: pd.Series) -> float | None:
-    return 100 * float(good.mean()) if len(good) else None
-
-
-def _mean(values: pd.Series) -> float | None:
-    return float(values.mean()) if len(values) else None
+        row = dict.fromkeys(by, "all") | about | {"n": len(some), "feasible": some.feasible.sum()}
+        yield row | {name: (some.status == name).sum() for name in STATUSES}, some
 
 
 def pose_rows(records: Rows, column: str, within: float, unit: str) -> Rows:
@@ -322,19 +269,18 @@ def pose_rows(records: Rows, column: str, within: float, unit: str) -> Rows:
     for row, some in _groups(pd.DataFrame(records), "object_class"):
         feasible = some[some.feasible]
         reached = feasible[feasible.status == "reached"]
-        hit = (feasible.distance_m <= WITHIN_M) & (feasible[column].abs() <= within)
-        spread = error_row(reached[column].abs().to_numpy(float)) if len(reached) else {}
-        row["within_percent"] = _percent(hit)
-        for name in ("mean", "sem", "median", "p95"):
-            row[f"pose_error_{unit}_{name}"] = spread.get(f"{name}_m")
-        row["distance_m_mean"] = _mean(reached.distance_m)
-        row["reckoned"] = int(some.orientation_reckoned.sum())
-        rows.append(row | {"actions_mean": _mean(reached.actions)})
-    return rows
+        hit, error = feasible[column].abs() <= within, reached[column].abs()
+        row["within_percent"] = 100 * (hit & (feasible.distance_m <= WITHIN_M)).mean()
+        row[f"pose_error_{unit}_mean"] = error.mean()
+        row[f"pose_error_{unit}_p95"] = error.quantile(0.95)
+        row["distance_m_mean"] = reached.distance_m.mean()
+        row["reckoned"] = some.orientation_reckoned.sum()
+        rows.append(row | {"actions_mean": reached.actions.mean()})
+    return plain(rows)
 
 
 def disturbance_rows(records: Rows) -> Rows:
-    """Rows of `disturbances`: how trials ended, and errors with and without disturbance, paired.
+    """Rows of `disturbances`: how trials ended, and errors with and without disturbance.
 
     The means are of all feasible trials, those that did not arrive among them.
     """
@@ -342,15 +288,12 @@ def disturbance_rows(records: Rows) -> Rows:
     table = pd.json_normalize(list(records), sep="_")
     for row, some in _groups(table, "kind", "object_class"):
         feasible = some[some.feasible]
-        apart = feasible.distance_m - feasible.undisturbed_distance_m
-        row["within_percent"] = _percent(feasible.distance_m <= WITHIN_M)
-        row["disturbed_mean_m"] = _mean(feasible.distance_m)
-        row["undisturbed_mean_m"] = _mean(feasible.undisturbed_distance_m)
-        row["apart_mean_m"] = _mean(apart)
-        row["apart_sem_m"] = float(apart.sem()) if len(apart) > 1 else None
-        row["actions_mean"] = _mean(feasible.actions)
-        rows.append(row | {"undisturbed_actions_mean": _mean(feasible.undisturbed_actions)})
-    return rows
+        row["within_percent"] = 100 * (feasible.distance_m <= WITHIN_M).mean()
+        row["disturbed_mean_m"] = feasible.distance_m.mean()
+        row["undisturbed_mean_m"] = feasible.undisturbed_distance_m.mean()
+        row["actions_mean"] = feasible.actions.mean()
+        rows.append(row | {"undisturbed_actions_mean": feasible.undisturbed_actions.mean()})
+    return plain(rows)
 
 
 def reachability_rows(records: Rows) -> Rows:
@@ -364,34 +307,13 @@ def reachability_rows(records: Rows) -> Rows:
     for goals, some in {"all": table, "off the rim": table[~rim], "on the rim": table[rim]}.items():
         groups = _groups(some, "object_class")
         for row, group in groups if goals == "all" else islice(groups, min(1, len(some))):
-            yes, no = group[group.feasible], group[~group.feasible]
-            row["right_percent"] = _percent(group.right)
-            row["feasible_reached_percent"] = _percent(yes.right)
-            row["within_percent"] = _percent(yes.distance_m <= WITHIN_M)
-            row["infeasible_refused_percent"] = _percent(no.right)
-            row["moved_for_nothing_percent"] = _percent(no.actions > 0)
-            row["ik_rejections_mean"] = _mean(group.ik_rejections)
-            rows.append({"goals": goals} | row | {"actions_mean": _mean(yes.actions) or 0.0})
-    return rows
-
-
-def open_loop_rows(records: Rows, within: float, unit: str) -> Rows:
-    """Rows of plans that are executed open loop: for each planner, all categories and each.
-
-    Hit is within 5 mm of the position as well; of the height or turn alone, *pose within*.
-    """
-    rows = []
-    for planner, of_planner in pd.DataFrame(records).groupby("planner", sort=False):
-        for row, some in _groups(of_planner, "object_class"):
-            good, spread = some.pose_error <= within, error_row(some.distance_m.to_numpy())
-            row |= {k: int(some[k].sum()) for k in ("predicted_reached", "arm_refused")}
-            row["within_percent"] = _percent(good & (some.distance_m <= WITHIN_M))
-            row["pose_within_percent"] = _percent(good)
-            row[f"pose_error_{unit}_median"] = float(some.pose_error.median())
-            for name in ("mean", "sem", "median", "p95"):
-                row[f"distance_m_{name}"] = spread[f"{name}_m"]
-            rows.append({"planner": planner} | row | {"actions_mean": _mean(some.actions)})
-    return rows
+            feasible = group.feasible
+            row["right_percent"] = 100 * group.right.mean()
+            row["feasible_reached_percent"] = 100 * group.right[feasible].mean()
+            row["within_percent"] = 100 * (group.distance_m[feasible] <= WITHIN_M).mean()
+            row["infeasible_refused_percent"] = 100 * group.right[~feasible].mean()
+            rows.append({"goals": goals} | row)
+    return plain(rows)
 
 
 _TURNS = partial(pose_rows, column="turn_error_rad", within=WITHIN_TURN_RAD, unit="rad")
@@ -401,10 +323,6 @@ ROWS: dict[str, Callable[[Rows], Rows]] = {
     "orientation_unseen": _TURNS,
     "disturbances": disturbance_rows,
     "reachability": reachability_rows,
-}
-OPEN_LOOP_ROWS: dict[str, Callable[[Rows], Rows]] = {
-    "orientation": partial(open_loop_rows, within=WITHIN_TURN_RAD, unit="rad"),
-    "height": partial(open_loop_rows, within=WITHIN_HEIGHT_M, unit="m"),
 }
 
 
@@ -419,67 +337,31 @@ def job(table: str, index: int, seed: int, world: str = "clean") -> Job:
     return Job(run_trial, arguments, reach, (), files, VERSIONS[table])
 
 
-def open_loop_job(table: str, index: int, planner: str) -> Job:
-    """One plan of a whole pose."""
-    arguments = {"table": table, "index": index, "planner": planner}
-    files, version = tuple(CHECKPOINTS.values()), VERSIONS["open_loop_pose_goals"]
-    return Job(run_open_loop, arguments, (), (), files, version)
-
-
-FILES = {"closed_loop": (job, ROWS), "open_loop_pose_goals": (open_loop_job, OPEN_LOOP_ROWS)}
-"""The job of each file of tables, and how its rows are made."""
-
-
-def tables(name: str, seed: int = 0, folder: str | Path = FOLDER) -> dict[str, Rows]:
-    """The tables of a file, of the trials that were run; of closed loops, those of a seed."""
-    make, rows = FILES[name]
-    found = [about | record for about, record in runner.read(name, make, folder)]
-    found = sorted(found, key=lambda record: record["index"])
-    found = [record for record in found if record.get("seed", seed) == seed]
+def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
+    """The tables of the trials that were run; those of other seeds than 0 are in none."""
+    found = [about | record for about, record in runner.read("closed_loop", job, folder)]
     made: dict[str, Rows] = {}
-    for table, world in product(rows, WORLDS):
-        some = [r for r in found if (r["table"], r.get("world", "clean")) == (table, world)]
-        about = {"world": world} if name == "closed_loop" else {}
+    for table, world in product(ROWS, WORLDS):
+        mine = {"table": table, "seed": 0, "world": world}
+        some = [r for r in found if mine.items() <= ({"world": "clean"} | r).items()]
         if some:
-            made[table] = made.get(table, []) + [about | row for row in rows[table](some)]
+            rows = ROWS[table](sorted(some, key=lambda record: record["index"]))
+            made[table] = made.get(table, []) + [{"world": world} | row for row in rows]
     return made
 
 
-def write_tables(
-    folder: str | Path = FOLDER, out_dir: str | Path = "data/results", seed: int = 0
-) -> Path:
-    """Write `closed_loop.json`, of another seed than 0 with its number."""
-    name = f"closed_loop_seed{seed}" if seed else "closed_loop"
-    return write_results(out_dir, name, {"seed": seed}, tables("closed_loop", seed, folder))
-
-
-def write_open_loop(folder: str | Path = FOLDER, out_dir: str | Path = "data/results") -> Path:
-    """Write `open_loop_pose_goals.json`."""
-    name = "open_loop_pose_goals"
-    return write_results(out_dir, name, {}, tables(name, folder=folder))
+JOBS = [
+    job(table, index, 0, world)
+    for table, world in product(ROWS, WORLDS)
+    for index in range(N_TRIALS[table] if (table, world) not in FEWER else FEWER[table, world])
+]
 
 
 @command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the trials that are missing, and write the tables of all that were run."""
-    parser = runner.parser("closed_loop", main.__doc__)
-    parser.add_argument("--tables", type=names_type(VERSIONS), default=list(VERSIONS))
-    parser.add_argument("--n", type=count_type, default=1000, help="trials of each table")
-    parser.add_argument("--seed", type=seed_type, default=0)
-    parser.add_argument("--worlds", type=names_type(WORLDS), default=list(WORLDS))
-    options = parser.parse_args(argv)
-    asked = {table: range(min(options.n, n)) for table, n in N_TRIALS.items()}
-    trials = [
-        job(t, i, options.seed, world)
-        for t in ROWS
-        for world in options.worlds
-        for i in asked[t]
-        if t in options.tables
-    ]
-    plans = [open_loop_job(t, i, p) for t in OPEN_LOOP_ROWS for i in asked[t] for p in PLANNERS]
-    runner.make(trials, "closed_loop", options, partial(write_tables, seed=options.seed))
-    some = plans if "open_loop_pose_goals" in options.tables else []
-    return runner.make(some, "open_loop_pose_goals", options, write_open_loop)
+    options = runner.parser("closed_loop", main.__doc__).parse_args(argv)
+    return runner.make(JOBS, "closed_loop", options, tables)
 
 
 if __name__ == "__main__":

@@ -176,8 +176,6 @@ def cross_validate(
         other = open_once(task.test_set)
         found = predicted(other, np.arange(other.sizes["interaction"]))
         errors = summary(found)
-        calibrated = errors.pop("calibration")
-        result["fixed_calibration"] = [{"n_values": row.pop("n")} | row for row in calibrated]
         about = {"interaction": found["interaction"], "category": errors.pop("family")}
         result["fixed_test"] = about | {k: v for k, v in errors.items() if v is not None}
     return result

@@ -1,9 +1,9 @@
 """`data/results/effect_prediction.json`: how well effects are predicted, cross-validated.
 
-    python -m experiments.effect_prediction --models film,cnp --sets push --folds 3
+    python -m experiments.effect_prediction --only model=film,cnp data=push
 
-runs the jobs that are missing, then makes the tables from all results, and from the studies of
-`experiments.studies`; without options it makes the tables alone.
+runs these jobs if they are missing, then makes the tables from all results, and from the studies of
+`experiments.studies`. What is missing of the sets of ten times the size needs these collected.
 
 Means and standard errors are over objects, an object's errors by several trainings averaged first;
 `all` is the mean over categories with equal weights. Medians and 95th percentiles are over all
@@ -20,17 +20,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from affordlib.commands import command, count_type, names_type, whole_type
-from affordlib.evaluation.predictions import calibration
-from affordlib.results import write_results
+from affordlib.commands import command
 from experiments import reported, runner, studies
 from experiments.cross_validation import (
     LARGE,
     MODELS,
-    N_FOLDS,
-    NETWORKS,
     PLANE,
-    SETS,
     TASKS,
     add_errors,
     by_model,
@@ -43,8 +38,6 @@ NAME = "effect_prediction"
 SAME_TRUTH = 1e-6
 """Results of one data set may differ by so much [m or rad] in the effects that were recorded: a set
 collected again, by another processor, has another hash, but the same effects."""
-
-CALIBRATION = ["coverage_50", "coverage_90", "std_mean", "nll"]
 
 
 def sorted_results(folder: str | Path = FOLDER) -> list[Result]:
@@ -102,8 +95,6 @@ def error_rows(table: pd.DataFrame, primitive: str) -> Rows:
             if "theta_error" in some:
                 row["theta_error_mean_rad"] = mean_sem(some, "theta_error")[0]
             else:
-                each = [mean_sem(v, "final_error")[0] for _, v in some.groupby(["seed", "fold"])]
-                row[f"trainings_sd_{unit}"] = float(np.std(each, ddof=1)) if each[1:] else None
                 for key in ("trajectory_error", "after_contact_error"):
                     row[f"{key}_mean_{unit}"] = mean_sem(some, key)[0]
             if primitive == "push":
@@ -113,65 +104,29 @@ def error_rows(table: pd.DataFrame, primitive: str) -> Rows:
     return rows
 
 
-def calibration_rows(results: list[Result]) -> Rows:
-    """Coverage and likelihood at t = 1 by channel: folds together, and on the fixed test set."""
-    rows = []
-    for primitive in TASKS:
-        table = predictions_of(results, primitive, "fixed_calibration")
-        fixed = {tuple(about.values()): group for about, group in by_model(table)}
-        for about, group in by_model(predictions_of(results, primitive, "fold_test")):
-            channels = [c[4:] for c in group.filter(like="std_") if group[c].notna().all()]
-            together = {k: {c: group[f"{k}_{c}"].tolist() for c in channels}
-                        for k in ("truth", "mean", "std")}  # fmt: skip
-            columns = {"data": primitive, **about}
-            rows += [columns | {"test": "folds"} | row for row in calibration(together)]
-            if (trainings := fixed.get(tuple(about.values()))) is not None:
-                for channel, some in trainings.groupby("channel", sort=False):
-                    test = {
-                        "test": "push_test",
-                        "channel": channel,
-                        "n": int(some["n_values"].max()),
-                    }
-                    rows.append(columns | test | some[CALIBRATION].mean().to_dict())
-    return rows
-
-
 FRAMES = {
     "cnp": {"network": "cnp", "frame": "table"},
+    "film": {"network": "film", "frame": "push"},
     "cnp_push_frame": {"network": "cnp", "frame": "push"},
     "film_table_frame": {"network": "film", "frame": "table"},
-    "film": {"network": "film", "frame": "push"},
 }
-
-
-def of_shared_folds(results: list[Result], models: Iterable[str], part: str) -> pd.DataFrame:
-    """Tests of some models of all pushes, of the folds and seeds that all of them have."""
-    folds: dict[str, dict[tuple[int, int], Result]] = {m: {} for m in MODELS if m in models}
-    for about, result in results:
-        if about["model"] in folds and (about["data"], about["n"]) == ("push", "all"):
-            folds[about["model"]][about["fold"], about["seed"]] = about, result
-    shared = set.intersection(*map(set, folds.values()))
-    every = [of[key] for of in folds.values() for key in of if key in shared]
-    return predictions_of(every, "push", part)
 
 
 def frame_rows(results: list[Result]) -> Rows:
     """Two networks in two frames, from the same folds of the same pushes, on the fixed test set."""
-    rows = error_rows(of_shared_folds(results, FRAMES, "fixed_test"), "push")
+    of = {
+        (about["model"], about["fold"], about["seed"]): (about, result)
+        for about, result in results
+        if about["model"] in FRAMES and (about["data"], about["n"]) == ("push", "all")
+    }
+    shared = set.intersection(*({key[1:] for key in of if key[0] == m} for m in FRAMES))
+    every = [of[model, *key] for model in FRAMES for key in sorted(shared)]
+    rows = error_rows(predictions_of(every, "push", "fixed_test"), "push")
     return [FRAMES[row["model"]] | row for row in rows]
 
 
-def ensemble_rows(results: list[Result]) -> Rows:
-    """One network and several as one, on the fixed test set: errors, and calibration of (x, y)."""
-    both = "film", "ensemble"
-    plane = of_shared_folds(results, both, "fixed_calibration").query("channel in ('x', 'y')")
-    calibrated = plane.groupby("model")[["coverage_50", "coverage_90", "nll"]].mean()
-    rows = error_rows(of_shared_folds(results, both, "fixed_test"), "push")
-    return [row | calibrated.loc[row["model"]].to_dict() for row in rows]
-
-
-def write_tables(folder: str | Path = FOLDER, out_dir: str | Path = "data/results") -> Path:
-    """Write `effect_prediction.json` from the results of a folder and the studies beside them."""
+def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
+    """All tables, of the results of a folder and the studies beside them."""
     results = sorted_results(folder)
     if not results:
         raise FileNotFoundError(f"folder: there are no results in {folder}; run some jobs first")
@@ -181,7 +136,7 @@ def write_tables(folder: str | Path = FOLDER, out_dir: str | Path = "data/result
 
     grasps = predictions_of(results, "grasp", "fold_test")
     grasp = grasp_rows(grasps)
-    tables = {
+    return {
         "push": errors("push", "fold_test"),
         "push_test": errors("push", "fixed_test"),
         "drag": errors("drag", "fold_test"),
@@ -190,28 +145,37 @@ def write_tables(folder: str | Path = FOLDER, out_dir: str | Path = "data/result
         "grasp_roc": roc_rows(grasps),
         "rotate": errors("rotate", "fold_test"),
         "inverse": errors("push", "inverse"),
-        "calibration": calibration_rows(results),
+        "frames": frame_rows(results),
+        **studies.tables(NAME, folder),
     }
-    tables["frames"], tables["ensemble"] = frame_rows(results), ensemble_rows(results)
-    tables |= studies.tables(NAME, folder)
-    trained = sum(about["model"] in NETWORKS for about, _ in results)
-    return write_results(out_dir, NAME, {"jobs": len(results), "trained": trained}, tables)
+
+
+NEED_NO_NETWORK = ("constant", "nearest", "gaussian_process")
+ASKED = (
+    (("film", "cnp", *NEED_NO_NETWORK), TASKS, range(10)),
+    (("logistic",), ["grasp"], range(10)),
+    (("attention", "film_table_frame"), ["push"], range(10)),
+    (("cnp_push_frame",), ["push"], range(8)),
+    (("ensemble",), ["push"], range(3)),
+    (("film", "cnp", "logistic", *NEED_NO_NETWORK), ["grasp_x10"], range(10)),
+    (NEED_NO_NETWORK, ["rotate_x10"], range(10)),
+    (("film",), ["rotate_x10"], range(3)),
+)
+"""Models, sets and folds of the tables."""
+
+JOBS = [job(model, data, fold=fold) for asked in ASKED for model, data, fold in product(*asked)]
+JOBS += [
+    job(model, data, seed=seed)
+    for model in ("film", "cnp", "constant", "nearest")
+    for data, seed in product(("push_x10", "drag_x10"), range(3))
+]
+JOBS += [job(model, "push_x10", 1500) for model in ("constant", "nearest")]
 
 
 @command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
     """Train and test models in folds, and make the tables; what is there is not made again."""
-    parser = runner.parser(NAME, main.__doc__)
-    models, sets = (f"of {','.join(known)}" for known in (MODELS, SETS))
-    parser.add_argument("--models", type=names_type(MODELS), default=[], help=models)
-    parser.add_argument("--sets", type=names_type(SETS), default="push", help=sets)
-    parser.add_argument("--n", type=count_type, help="interactions that are used (default: all)")
-    parser.add_argument("--folds", type=whole_type(1, N_FOLDS), default=N_FOLDS, help="of the ten")
-    parser.add_argument("--seeds", type=count_type, default=1)
-    options = parser.parse_args(argv)
-    chosen = product(options.sets, range(options.seeds), range(options.folds), options.models)
-    jobs = [job(model, data, options.n or "all", fold, seed) for data, seed, fold, model in chosen]
-    return runner.make(jobs, NAME, options, write_tables)
+    return runner.make(JOBS, NAME, runner.parser(NAME, main.__doc__).parse_args(argv), tables)
 
 
 if __name__ == "__main__":

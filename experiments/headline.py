@@ -28,7 +28,7 @@ def _row(question: str, n: int, factor: float, reported: float | None, paper: fl
     return {"mean error in mm": question, "n": int(n)} | shown
 
 
-def rows() -> list[dict[str, Any]]:
+def tables() -> dict[str, list[dict[str, Any]]]:
     """A row a question: n trials, the paper's figure, both networks on the same data."""
     effects = _table("effect_prediction", "push_test").query("object_class == 'all'")
     pushes = effects[effects.n_interactions == 500].set_index("model")
@@ -47,8 +47,8 @@ def rows() -> list[dict[str, Any]]:
         planners = ["reported_gradient_300", "continuous_cnp_500", "continuous_film_500"]
         means = summary[f"{mode}_mean_m"][planners]
         found.append(_row(question, each.set_index("mode").n[mode], 1000, *means))
-    return found
+    return {"main": found}
 
 
 if __name__ == "__main__":
-    print(write_results("data/results", "headline", {}, {"main": rows()}))
+    print(write_results("data/results", "headline", {}, tables()))

@@ -1,12 +1,10 @@
 """`data/results/lever_up.json`: lever-ups against recurrent networks (Table 1 of the paper).
 
-    python -m experiments.lever_up --models cnp_last_pose,cnp_last_pose_single,lstm_tuned,cnp
-    python -m experiments.lever_up --models lstm_seker2019 --folds 3
+    python -m experiments.lever_up --only model=lstm_seker2019
 
-run the jobs that are missing, then make the tables from all results; without options only these.
-The second takes an hour of one core for each of its two trainings a fold. glibc returns its large
-arrays after every step; with `MALLOC_MMAP_MAX_=0 MALLOC_TRIM_THRESHOLD_=60000000000` before the
-command, a quarter less.
+runs these jobs if they are missing, then makes the tables from all results. They take an hour of
+one core for each of two trainings a fold. glibc returns their large arrays after every step; with
+`MALLOC_MMAP_MAX_=0 MALLOC_TRIM_THRESHOLD_=60000000000` before the command, a quarter less.
 
 An object's errors are averaged over its windows; means, standard errors and intervals are over
 objects.
@@ -15,30 +13,29 @@ objects.
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
-from affordlib.commands import command, count_type, names_type, whole_type
-from affordlib.evaluation.metrics import error_row
-from affordlib.models.lever_up import PROTOCOLS, TRAINED_FOR
-from affordlib.results import write_results
+from affordlib.commands import command
+from affordlib.models.lever_up import PROTOCOLS
 from experiments import reported, runner, studies
 from experiments.lever_cross_validation import (
-    BASELINES,
     DATA,
     MODELS,
     N_FOLDS,
     RECURRENT,
     SINGLE,
+    TESTED,
     edges_of,
     job,
 )
 from experiments.lstm_seker2019 import EPOCHS
-from experiments.runner import FOLDER, Result, Rows, open_once, read
+from experiments.runner import FOLDER, Job, Result, Rows, interval, open_once, plain, read
 
 NAME = "lever_up"
 OURS = "cnp_last_pose"
@@ -55,18 +52,21 @@ def sorted_results(folder: str | Path = FOLDER) -> list[Result]:
     return sorted(read(NAME, job, folder), key=order)
 
 
-def _groups(
-    results: list[Result], edges_left_out: int | None = None
-) -> Iterator[tuple[dict[str, Any], list[Result], np.ndarray]]:
-    """Columns, results and errors (N, W, T) [cm] of each protocol, model and length of training."""
-    for protocol, model in product(PROTOCOLS, MODELS):
-        wanted = {"model": model, "edges_left_out": edges_left_out}
-        mine = [r for r in results if wanted.items() <= r[0].items() and protocol in r[1]]
-        for epochs in sorted({about["epochs"] for about, _ in mine}, key=str):
-            same = [r for r in mine if r[0]["epochs"] == epochs]
-            columns = {"model": model, "protocol": protocol}
-            columns |= {"folds": len({about["fold"] for about, _ in same}), "epochs": epochs}
-            yield columns, same, np.concatenate([r[protocol]["error_cm"] for _, r in same])
+def _errors(results: list[Result], edges_left_out: int | None = None) -> pd.DataFrame:
+    """Errors [cm] after each step of each tested object, its windows averaged; a row each."""
+    parts = []
+    for about, result in results:
+        for protocol in PROTOCOLS if about["edges_left_out"] == edges_left_out else ():
+            if protocol in result:
+                means = pd.DataFrame(np.mean(result[protocol]["error_cm"], axis=1))
+                means.columns += 1
+                means = means.assign(interaction=result["interaction"], protocol=protocol, **about)
+                names = [*about, "protocol", "interaction"]
+                parts.append(means.melt(names, var_name="steps", value_name="error_cm"))
+    table = pd.concat(parts)
+    for name, order in (("protocol", PROTOCOLS), ("model", MODELS)):
+        table[name] = pd.Categorical(table[name], order)
+    return table
 
 
 def error_rows(results: list[Result], edges_left_out: int | None = None) -> Rows:
@@ -74,13 +74,17 @@ def error_rows(results: list[Result], edges_left_out: int | None = None) -> Rows
 
     edges_left_out: of the trainings without polygons with so many edges, on those.
     """
-    rows = []
-    for about, _, errors in _groups(results, edges_left_out):
-        for k, error in enumerate(errors.mean(axis=1).T):
-            # Copied, as the last digit of a sum depends on how it lies in memory.
-            row = error_row(error.copy(), **about, steps=k + 1)
-            rows.append({name.replace("_m", "_cm"): value for name, value in row.items()})
-    return rows
+    keys, error = ["protocol", "model", "epochs", "steps"], "error_cm"
+    groups = _errors(results, edges_left_out).groupby(keys, observed=True, dropna=False)
+    rows = groups.agg(
+        folds=("fold", "nunique"),
+        n=(error, "size"),
+        mean_cm=(error, "mean"),
+        sem_cm=(error, "sem"),
+        median_cm=(error, "median"),
+        p95_cm=(error, lambda each: each.quantile(0.95)),
+    )
+    return plain(rows.reset_index())
 
 
 def unseen_rows(results: list[Result], edges: dict[int, int]) -> Rows:
@@ -89,45 +93,36 @@ def unseen_rows(results: list[Result], edges: dict[int, int]) -> Rows:
     edges: of each interaction, by its number. The second are those of the folds, on the polygons of
     that kind in their tests (*known*).
     """
-    rows = []
-    for left_out in sorted({a["edges_left_out"] for a, _ in results} - {None}):
-        known = {}
-        for about, group, errors in _groups(results):
-            alike = [edges[i] == left_out for _, result in group for i in result["interaction"]]
-            some = errors.mean(axis=1)[alike]
-            for k in range(some.shape[1]):
-                columns = {"known_n": len(some), "known_mean_cm": float(some[:, k].mean())}
-                known[about["model"], about["protocol"], k + 1] = columns
-        for row in error_rows(results, left_out):
-            same = known.get((row["model"], row["protocol"], row["steps"]), {})
-            rows.append({"edges": left_out} | row | same)
-    return rows
+    known = _errors(results)
+    keys = [known["interaction"].map(edges).rename("edges"), "model", "protocol", "steps"]
+    known = known.groupby(keys, observed=True)["error_cm"].agg(known_n="size", known_mean_cm="mean")
+    left_out = sorted({about["edges_left_out"] for about, _ in results} - {None})
+    rows = [pd.DataFrame(error_rows(results, number)).assign(edges=number) for number in left_out]
+    return plain(pd.concat(rows).join(known, on=known.index.names))
 
 
-def paired_rows(results: list[Result], n_draws: int = 2000) -> Rows:
+def paired_rows(results: list[Result]) -> Rows:
     """Ours minus each of the recurrent ones, object by object, with bootstrapped 95 % intervals.
 
     Ours as it is, and trained for one protocol at a time; objects of the folds that both were
     trained on, the windows of an object averaged.
     """
-    rng, rows, found = np.random.default_rng(0), [], {}
-    for about, group, errors in _groups(results):
-        objects = [(of["fold"], i) for of, result in group for i in result["interaction"]]
-        means = dict(zip(objects, (error.mean(axis=0) for error in errors), strict=True))
-        found.setdefault((about["model"], about["protocol"]), {}).update(means)
+    rng, rows = np.random.default_rng(0), []
+    errors = {
+        key: of_one.pivot(index=["fold", "interaction"], columns="steps", values="error_cm")
+        for key, of_one in _errors(results).groupby(["model", "protocol"], observed=True)
+    }
     for ours, rival, protocol in product((OURS, SINGLE), RECURRENT, PROTOCOLS):
-        one, other = (found.get((model, protocol), {}) for model in (ours, rival))
-        if not (both := sorted(one.keys() & other.keys())):
+        if not {(ours, protocol), (rival, protocol)} <= errors.keys():
             continue
-        gap = np.array([one[key] - other[key] for key in both])
-        means = gap[rng.integers(0, len(gap), (n_draws, len(gap)))].mean(axis=1)
-        low, high = np.quantile(means, [0.025, 0.975], axis=0)
+        gap = (errors[ours, protocol] - errors[rival, protocol]).dropna()
+        mean, low, high = interval(gap, 2000, rng)
+        table = pd.DataFrame({"difference_cm": mean, "low_cm": low, "high_cm": high}, gap.columns)
+        table["ours_better_percent"] = 100 * (gap < 0).mean()
+        table.insert(0, "n", len(gap))
+        about = {"ours": ours, "rival": rival, "protocol": protocol}
         stride = 1 if protocol == "window" else 5
-        for k in range(stride - 1, gap.shape[1], stride):
-            row = {"ours": ours, "rival": rival, "protocol": protocol, "steps": k + 1}
-            row |= {"n": len(gap), "difference_cm": float(gap[:, k].mean())}
-            row |= {"low_cm": float(low[k]), "high_cm": float(high[k])}
-            rows.append(row | {"ours_better_percent": float(100 * (gap[:, k] < 0).mean())})
+        rows += [about | row for row in plain(table[stride - 1 :: stride].reset_index())]
     return rows
 
 
@@ -142,43 +137,43 @@ def summary_rows(rows: Rows) -> Rows:
     return list(summary.values())
 
 
-def write_tables(folder: str | Path = FOLDER, out_dir: str | Path = "data/results") -> Path:
-    """Write `lever_up.json` from the results of a folder and the study of tuning."""
+def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
+    """All tables, of the results of a folder and the study of tuning."""
     results = sorted_results(folder)
-    if not any(about["model"] == "persistence" for about, _ in results):
-        raise FileNotFoundError(f"folder: no results of the baselines in {folder}; run them first")
+    if not results:
+        raise FileNotFoundError(f"folder: there are no results in {folder}; run some jobs first")
     data, rows = open_once(DATA), error_rows(results)
     edges = dict(zip(data["interaction"].values.tolist(), edges_of(data).tolist(), strict=True))
-    tables = {
+    return {
         "lever_up": rows,
         "summary": [*reported.LEVER_UP_ROWS, *summary_rows(rows)],
         "unseen_edges": unseen_rows(results, edges),
         "paired": paired_rows(results),
-    } | studies.tables(NAME, folder)
-    return write_results(out_dir, NAME, {"jobs": len(results), "step_ms": 150}, tables)
+        **studies.tables(NAME, folder),
+    }
+
+
+def _jobs(model: str, fold: int, edges: int | None = None, **more: int) -> list[Job]:
+    kinds = [*TESTED][1:] if model in (SINGLE, *RECURRENT) else ["all"]
+    return [job(model, kind, fold, edges, **more) for kind in kinds]
+
+
+ALL = [model for model in MODELS if model != "lstm_seker2019"]
+JOBS = [
+    *(each for model, fold in product(ALL, range(N_FOLDS)) for each in _jobs(model, fold)),
+    *(each for fold in range(3) for each in _jobs("lstm_seker2019", fold, epochs=EPOCHS)),
+    *(
+        each
+        for model, edges in product((OURS, "lstm_tuned", "cnp"), (3, 5, 8))
+        for each in _jobs(model, 0, edges)
+    ),
+]
 
 
 @command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
     """Train and test models in folds, and make the tables; what is there is not made again."""
-    parser = runner.parser(NAME, main.__doc__)
-    parser.add_argument("--models", type=names_type(MODELS), default=[], help=",".join(MODELS))
-    parser.add_argument("--folds", type=whole_type(1, N_FOLDS), default=N_FOLDS, help="of the five")
-    edges = "leave polygons with so many edges out instead"
-    parser.add_argument("--no-edges", type=whole_type(3, 8), help=edges)
-    kinds = "to train for, one at a time, what is not trained for all"
-    known, usual = names_type(TRAINED_FOR), "window,first_step"
-    parser.add_argument("--protocols", type=known, default=usual, help=kinds)
-    parser.add_argument("--epochs", type=count_type, default=EPOCHS, help="of lstm_seker2019")
-    options = parser.parse_args(argv)
-    jobs = []
-    folds = range(options.folds) if options.no_edges is None else [0]
-    models = dict.fromkeys([*BASELINES, *options.models] if options.models else [])
-    for fold, model in product(folds, models):
-        epochs = options.epochs if model == "lstm_seker2019" else None
-        kinds = options.protocols if model in (SINGLE, *RECURRENT) else ["all"]
-        jobs += [job(model, kind, fold, options.no_edges, epochs=epochs) for kind in kinds]
-    return runner.make(jobs, NAME, options, write_tables)
+    return runner.make(JOBS, NAME, runner.parser(NAME, main.__doc__).parse_args(argv), tables)
 
 
 if __name__ == "__main__":

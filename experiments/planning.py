@@ -3,7 +3,7 @@
 Each row is a `PlannerConfig`. Its outcomes on the frozen goals are kept by the runner; the tables
 are drawn from all that are there.
 
-    python -m experiments.planning --configs continuous,astar
+    python -m experiments.planning --only config=continuous,astar
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import pandas as pd
 import torch
 from tqdm.auto import tqdm
 
-from affordlib.commands import command, names_type
+from affordlib.commands import command
 from affordlib.evaluation import tasks as goals
 from affordlib.evaluation.metrics import error_row
 from affordlib.evaluation.tasks import ROLLABLE, STANDING, PlanningTask, frozen_tasks
@@ -46,7 +46,6 @@ from affordlib.planning import (
 from affordlib.planning.closed_loop import ENOUGH_M
 from affordlib.planning.problem import MODES
 from affordlib.primitives import Push
-from affordlib.results import write_results
 from affordlib.types import Outcome, Plan, Step
 from affordlib.world import Tabletop, UnreachableError
 from experiments import reported, runner
@@ -54,7 +53,7 @@ from experiments.field_baselines import plan_astar_continuous, plan_cem
 from experiments.limit_surface import LimitSurface
 from experiments.literal import SPEC, trained_on
 from experiments.oracle import oracle_effects
-from experiments.runner import FOLDER, Job, Rows
+from experiments.runner import FOLDER, Job, Rows, interval, plain
 
 POSITION_ERROR_M, YAW_ERROR_RAD = 0.001, math.radians(1.0)
 GROUPS = {"all": STANDING + ROLLABLE, "standing": STANDING, "rollable": ROLLABLE} | {
@@ -144,20 +143,9 @@ class PlannerConfig:
         asked = [t.goals in self.sources and t.obj.category in self.classes for t in tasks]
         return np.flatnonzero(asked)[:: self.stride].tolist()
 
-    def columns(self) -> dict[str, Any]:
+    def columns(self) -> dict[str, str]:
         """What a row of the table says of it."""
-        fine = len(FINE_PHASES)
-        samples = {plan_astar: 5, plan_astar_full: 1, plan_astar_fine: fine}
-        placed = "plan" if self.execution.get("by_plan") else "observation"
-        return {
-            "algorithm": self.planner.__name__.removeprefix("plan_"),
-            "model": self.model,
-            "world": self.world,
-            "samples": self.arguments.get("samples", samples.get(self.planner)),
-            "placed_by": placed,
-            "closed_loop": bool({"corrections", "receding"} & set(self.execution)),
-            "perturbed_start": self.execution.get("perturbed_start", False),
-        }
+        return {"model": self.model, "world": self.world}
 
     def make(self, world: Tabletop) -> Planner:
         """The planner for a world, which nothing but the simulator as a model looks into."""
@@ -349,6 +337,7 @@ def measure(
 
 def run_config(config: str) -> list[dict[str, Any]]:
     """Outcome records of a planner on the frozen goals that it is asked, with their numbers."""
+    torch.set_num_threads(1)
     about, records = CONFIGS[config], []
     tasks = frozen_tasks(about.world)
     with Tabletop() as world:
@@ -387,25 +376,21 @@ def planning_rows(records: Rows, **columns: Any) -> Rows:
                 continue
             about = {"goals": source, "object_class": group, "mode": mode}
             row = error_row(chosen.distance_m.to_numpy(), **columns, **about)
-            row["plan_ms_median"] = 1000 * chosen.plan_s.median()
-            for name in ("predicted_m", "prediction_error_m", "std_m", "steps", "actions"):
-                unit = "_m" * name.endswith("_m")
-                row[f"{name.removesuffix('_m')}_mean{unit}"] = chosen[name].mean()
-            rows.append(row)
+            row["predicted_mean_m"] = chosen.predicted_m.mean()
+            row["prediction_error_mean_m"] = chosen.prediction_error_m.mean()
+            rows.append(row | {"actions_mean": chosen.actions.mean()})
     return rows
 
 
 def summary_rows(rows: Rows) -> Rows:
     """One row per planner on constructed goals: mean, standard error and median of each mode."""
-    names = ("planner", "model", "world", "samples", "placed_by", "closed_loop", "object_class")
     summary: dict[tuple[str, str], dict[str, Any]] = {}
     for row in rows:
         if row["goals"] == "constructed" and row["object_class"] not in STANDING + ROLLABLE:
-            new = {name: row[name] for name in names}
+            new = {name: row[name] for name in ("planner", "model", "world", "object_class")}
             one = summary.setdefault((row["planner"], row["object_class"]), new)
             for statistic in ("mean", "sem", "median"):
                 one[f"{row['mode']}_{statistic}_m"] = row[f"{statistic}_m"]
-            one[f"{row['mode']}_plan_ms"] = row["plan_ms_median"]
             one["n"] = f"{one['n']}, {row['n']}" if "n" in one else str(row["n"])
     return list(summary.values())
 
@@ -415,25 +400,18 @@ def decomposition_rows(rows: Rows) -> Rows:
 
     search: the distance from the goal that the planner predicted; model: from its predicted
     position; execution: what remains with the simulator as the model, which has no σ to prefer
-    low-variance plans by; perturbed_start: of `continuous`, where the object's pose has a small
-    error. Planners for stable objects only have no row of all.
+    low-variance plans by.
     """
     place = ["world", "mode", "object_class"]
     table = pd.DataFrame(rows).query("goals == 'constructed'")
-    oracle = table.planner.isin(["oracle", "perturbed_oracle"])
-    for some, name in ((oracle, "execution"), (table.perturbed_start, "perturbed_start")):
-        error = table[some].set_index(place).mean_m.rename(f"{name}_mean_m")
-        table = table.join(error, on=place)
-    for_all = table.planner.map(lambda name: CONFIGS[name].classes != STANDING)
-    groups = table.object_class.isin(["standing", "rollable"])
-    table = table[groups | (table.object_class == "all") & for_all]
-    table = table[~(table.closed_loop | table.perturbed_start)].rename(
-        columns={"predicted_mean_m": "search_mean_m", "prediction_error_mean_m": "model_mean_m"}
-    )
-    table["total_mean_m"] = table.pop("mean_m")
-    parts = ("search", "model", "execution", "perturbed_start", "total")
-    table = table[["planner", *place, "n", *(f"{part}_mean_m" for part in parts)]]
-    return table.astype(object).where(table.notna(), None).to_dict("records")
+    oracle = table[table.planner.isin(["oracle", "perturbed_oracle"])].set_index(place).mean_m
+    table = table.join(oracle.rename("execution"), on=place)
+    open_loop = [name for name, about in CONFIGS.items() if {*about.execution} <= {"by_plan"}]
+    table = table[table.object_class.isin(["standing", "rollable"]) & table.planner.isin(open_loop)]
+    parts = {"predicted_mean_m": "search", "prediction_error_mean_m": "model"}
+    parts |= {"execution": "execution", "mean_m": "total"}
+    names = {column: f"{part}_mean_m" for column, part in parts.items()}
+    return plain(table[["planner", *place, "n", *parts]].rename(columns=names))
 
 
 VARIANTS = {
@@ -457,11 +435,10 @@ VARIANTS = {
 """Planners with one thing changed, and without: compared goal by goal, on objects that stand."""
 
 
-def variant_rows(records: dict[str, Rows], n_draws: int = 2000) -> Rows:
+def variant_rows(records: dict[str, Rows]) -> Rows:
     """How much farther each of `VARIANTS` ends from the same goals: mean [m], interval.
 
-    On constructed goals of objects that stand. The interval holds 95 % of the means of goals drawn
-    again with replacement.
+    On constructed goals of objects that stand.
     """
     rows: Rows = []
     for name, than in VARIANTS.items():
@@ -471,11 +448,9 @@ def variant_rows(records: dict[str, Rows], n_draws: int = 2000) -> Rows:
         both = both[(both.goals_x == "constructed") & both.object_class_x.isin(STANDING)]
         rng = np.random.default_rng(0)
         for mode, pairs in both.groupby("mode_x", sort=False):
-            farther = (pairs.distance_m_x - pairs.distance_m_y).to_numpy()
-            draws = rng.choice(farther, (n_draws, len(farther))).mean(axis=1)
-            low, high = np.quantile(draws, [0.025, 0.975])
+            mean, low, high = interval(pairs.distance_m_x - pairs.distance_m_y, 2000, rng)
             row = {"planner": name, "than": than, "goals": "constructed", "mode": mode}
-            row |= {"n": len(pairs), "difference_mean_m": farther.mean()}
+            row |= {"n": len(pairs), "difference_mean_m": mean}
             rows.append(row | {"low_m": low, "high_m": high})
     return rows
 
@@ -494,21 +469,11 @@ def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
     }
 
 
-def write_tables(folder: str | Path = FOLDER, out_dir: str | Path = "data/results") -> Path:
-    """Write `planning.json` from the results of a folder."""
-    hashes = {world: tasks_sha256(world) for world in goals.FROZEN}
-    return write_results(out_dir, "planning", {"goals_sha256": hashes}, tables(folder))
-
-
 @command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
     """Measure planners on the frozen goals and draw the tables from all that were measured."""
-    parser = runner.parser("planning", main.__doc__)
-    parser.add_argument("--configs", type=names_type(CONFIGS), default=list(CONFIGS))
-    options = parser.parse_args(argv)
-    torch.set_num_threads(1)
-    jobs = [job(name) for name in options.configs]
-    return runner.make(jobs, "planning", options, write_tables)
+    options = runner.parser("planning", main.__doc__).parse_args(argv)
+    return runner.make([job(name) for name in CONFIGS], "planning", options, tables)
 
 
 if __name__ == "__main__":

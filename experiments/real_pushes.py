@@ -11,27 +11,24 @@ force-motion model for planar sliding, ICRA 2016).
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import lzma
 import math
 from collections.abc import Iterator, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
 from unittest import mock
 
 import numpy as np
 import pandas as pd
-from scipy.stats import bootstrap
 
-from affordlib.commands import command, names_type, whole_type
+from affordlib.commands import command
 from affordlib.evaluation.cross_validate import BASELINES, errors_of, forecast_errors, summary
 from affordlib.interactions.log import Log, PushLog
 from affordlib.models.fit import EFFORT, MODELS, fit, folds_of, gyration_radius_m
 from affordlib.models.neural_process import PRETRAINED
-from affordlib.results import write_results
-from experiments.runner import Job, frame, read, run
+from experiments import runner
+from experiments.runner import FOLDER, Job, Rows, frame, interval, read, run
 
 TABLE = "real_pushes"
 CHOSEN_ON = ("hardboard_3points1", "plywood_3points3")
@@ -186,28 +183,28 @@ def tuning_job(steps: int, rate: float, condition: str, fold: int, logs: str = "
     return Job(partial(tune, logs), arguments, EFFORT["few"][2], checkpoints=(PRETRAINED,))
 
 
-def tuning_rows() -> list[dict[str, Any]]:
+def tuning_rows(folder: str | Path = FOLDER) -> Rows:
     """Ways of tuning to few pushes, and push by push how much worse each is than that of `fit`.
 
     both: the error of position and that of the turn on the radius of gyration; it decides.
     """
-    found, rows = frame(read(TUNING, tuning_job), "errors"), []
+    found, rows = frame(read(TUNING, tuning_job, folder), "errors"), []
     pushes = found.set_index(["steps", "rate", "condition", "push"]).sort_index()
     for way, part in pushes.groupby(["steps", "rate"]):
         row = dict(zip(("steps", "rate"), way, strict=True)) | {"n": len(part)}
         for name, unit in (("position", "m"), ("yaw", "rad"), ("both", "m")):
             row[f"{name}_mean_{unit}"] = part[f"{name}_{unit}"].mean()
         worse = part["both_m"].to_numpy() - pushes.loc[EFFORT["few"][:2], "both_m"]
-        rows.append(row | interval(worse, "difference", "m"))
+        rows.append(row | dict(zip(named("difference", "m"), interval(worse), strict=True)))
     return rows
 
 
-def tables() -> dict[str, list[dict]]:
+def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
     """Errors by protocol, model and what was told; beside the best baseline, push by push.
 
     A push's error is the mean over seeds, so that each push counts once.
     """
-    every = frame(read(TABLE, job), "errors").drop(columns=["fold", "predictor"])
+    every = frame(read(TABLE, job, folder), "errors").drop(columns=["fold", "predictor"])
     keys = ["protocol", "told", "shots", "model"]
     seeds = every.groupby(keys)["seed"].nunique()
     pushes = every.groupby([*keys, "push"]).mean(numeric_only=True).reset_index()
@@ -225,10 +222,10 @@ def tables() -> dict[str, list[dict]]:
     ]
     for row in (row for rows in found.values() for row in rows):
         row["shots"] = int(row["shots"]) if row["shots"] >= 0 else None
-    return found | {"tuning": tuning_rows()}
+    return found | {"tuning": tuning_rows(folder)}
 
 
-def differences(errors: pd.DataFrame) -> list[dict[str, Any]]:
+def differences(errors: pd.DataFrame) -> Rows:
     """The neural process minus the best baseline, over the pushes of which both have an error.
 
     errors: (pushes, columns of each model and what it was told). Best has the least mean position
@@ -243,45 +240,35 @@ def differences(errors: pd.DataFrame) -> list[dict[str, Any]]:
             for column, unit in (("position", "m"), ("yaw", "rad")):
                 each = errors[f"{column}_{unit}"]
                 off = (each["np", told] - each[best, baseline_told]).dropna()
-                row |= {"n": len(off)} | interval(off, column, unit)
+                row |= {"n": len(off)} | dict(zip(named(column, unit), interval(off), strict=True))
             rows.append(row)
     return rows
 
 
-def interval(off: pd.Series, name: str, unit: str) -> dict[str, float]:
-    """Mean of differences and its 95 % interval, by a bootstrap over pushes."""
-    ends = bootstrap((off.to_numpy(),), np.mean, method="percentile", rng=0).confidence_interval
-    values = {"mean": off.mean(), "low": ends.low, "high": ends.high}
-    return {f"{name}_{what}_{unit}": value for what, value in values.items()}
+def named(name: str, unit: str) -> list[str]:
+    """The columns of a mean of differences and its interval."""
+    return [f"{name}_{what}_{unit}" for what in ("mean", "low", "high")]
 
 
 @command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
     """Run what is missing, and make the tables."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = runner.parser(TABLE, __doc__.splitlines()[0])
     parser.add_argument("--logs", help="folder of the published logs; without it, tables alone")
-    parser.add_argument("--predictors", type=names_type(NAMES), default=list(NAMES))
-    parser.add_argument("--seeds", type=whole_type(1, 100), default=3)
-    parser.add_argument("--protocols", type=names_type(PROTOCOLS), default=list(PROTOCOLS))
     parser.add_argument("--tune", action="store_true", help="settings of tuning to few pushes")
     options = parser.parse_args(argv)
-    if options.logs and options.tune:
-        ways = itertools.product(STEPS, RATES, CHOSEN_ON, range(INNER_FOLDS))
-        run([tuning_job(*way, options.logs) for way in ways], TUNING)
-    elif options.logs:
-        jobs = [
-            job(protocol, predictor, told, seed, fold, options.logs)
-            for seed in range(options.seeds)
-            for protocol in options.protocols
-            for predictor in options.predictors
-            for told in (False, True)
-            for fold in range(PROTOCOLS[protocol][1])
-            # Of one condition all are told the same.
-            if predictor == "baselines" or not told or protocol != "from_40"
-        ]
-        run(jobs, TABLE)
-    write_results("data/results", TABLE, {"conditions": list(CONDITIONS)}, tables())
-    return 0
+    ways = itertools.product(STEPS, RATES, CHOSEN_ON, range(INNER_FOLDS)) if options.tune else ()
+    tunings = [tuning_job(*way, options.logs) for way in ways]
+    run(tunings if options.logs else [], TUNING, folder=options.raw)
+    jobs = [
+        job(protocol, predictor, told, seed, fold, options.logs)
+        for protocol, (_, folds) in PROTOCOLS.items()
+        for predictor, told in itertools.product(NAMES, (False, True))
+        for seed, fold in itertools.product(range(3 if predictor == "np" else 1), range(folds))
+        # Of one condition all are told the same.
+        if predictor == "baselines" or not told or protocol != "from_40"
+    ]
+    return runner.make(jobs if options.logs and not tunings else [], TABLE, options, tables)
 
 
 if __name__ == "__main__":

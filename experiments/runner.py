@@ -26,8 +26,10 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 from filelock import FileLock
+from scipy.stats import bootstrap
 from tqdm.auto import tqdm
 
 from affordlib.commands import count_type
@@ -37,7 +39,7 @@ from affordlib.interactions.store import stored_sha256
 from affordlib.models.checkpoint import checkpoint_sha256, weights_bytes
 from affordlib.paths import repo_root, resolve_out_dir
 from affordlib.planning.reachability import SHIPPED as REACHABILITY
-from affordlib.results import write_atomically
+from affordlib.results import write_atomically, write_results
 from affordlib.workers import dask_client
 
 FOLDER = "data/results/raw"
@@ -168,23 +170,51 @@ def frame(results: Iterable[Result], part: str) -> pd.DataFrame:
     return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
 
 
+def plain(table: pd.DataFrame | Rows) -> Rows:
+    """The rows of a table as plain values, None for what is missing."""
+    table = pd.DataFrame(table)
+    return table.astype(object).where(table.notna(), None).to_dict("records")
+
+
+def interval(
+    off: Sequence[float] | np.ndarray, draws: int = 9999, rng: int | np.random.Generator = 0
+) -> tuple[Any, Any, Any]:
+    """Mean of differences (n, ...), and the ends of its bootstrapped 95 % interval."""
+    off = np.asarray(off)
+    how = {"axis": 0, "n_resamples": draws, "method": "percentile", "rng": rng}
+    return off.mean(axis=0), *bootstrap((off,), np.mean, **how).confidence_interval
+
+
 def parser(table: str, description: str | None) -> argparse.ArgumentParser:
     """A parser of the options that the commands of all tables share."""
     shared = argparse.ArgumentParser(prog=f"python -m experiments.{table}", description=description)
     shared.add_argument("--raw", default=FOLDER, help="the folder of the jobs' results")
     shared.add_argument("--out", default="data/results")
+    only = "the jobs with these arguments alone, such as fold=0,1"
+    shared.add_argument("--only", nargs="+", default=[], metavar="NAME=VALUE,…", help=only)
     shared.add_argument("--scheduler", help="address of a Dask scheduler")
     shared.add_argument("--workers", type=count_type, default=1, help="processes of this machine")
     return shared
 
 
 def make(
-    jobs: Sequence[Job], table: str, options: argparse.Namespace, write: Callable[..., Path]
+    jobs: Sequence[Job],
+    table: str,
+    options: argparse.Namespace,
+    tables: Callable[[str], dict[str, Rows]] | None = None,
 ) -> int:
-    """Run the jobs of a command, then write its tables."""
+    """Run the jobs of a command that are missing or stale, then write its tables."""
+    for only in options.only:
+        name, _, values = only.partition("=")
+        values, known = values.split(","), {str(job.arguments.get(name)) for job in jobs}
+        if unknown := sorted({*values} - known):
+            there = ", ".join(sorted(known))
+            raise ValueError(f"--only: no job has {name} = {unknown[0]!r:.40}, but {there}")
+        jobs = [job for job in jobs if str(job.arguments.get(name)) in values]
     with dask_client(options.workers, options.scheduler) as client:
         run(jobs, table, client, options.raw)
-    print(write(options.raw, options.out))
+    if tables is not None:
+        print(write_results(options.out, table, {}, tables(options.raw)))
     return 0
 
 

@@ -25,6 +25,7 @@ from affordlib.commands import command, count_type, seed_type
 from affordlib.paths import repo_root
 from affordlib.workbook import WorkbookError, run_name
 from affordlib.workers import dask_client
+from experiments.runner import plain
 
 PANELS = 4
 """Columns that are drawn at most."""
@@ -73,8 +74,7 @@ def over_seeds(tables: Sequence[Table]) -> tuple[list[dict[str, Any]], bytes | N
     for c in numbers:
         columns |= {c: (c, "mean"), f"sd_{c}": (c, "std")} if c in differ else {c: (c, "first")}
     table = same.agg(**columns).reset_index().drop(columns="place")
-    rows = table.astype(object).where(table.notna(), None).to_dict("records")
-    return rows, _picture(every.assign(row=same.ngroup()), words, differ[:PANELS])
+    return plain(table), _picture(every.assign(row=same.ngroup()), words, differ[:PANELS])
 
 
 def _picture(every: pd.DataFrame, words: list[str], columns: list[str]) -> bytes | None:

@@ -1,14 +1,13 @@
 """Studies beside the cross-validation: what each part of a network is worth, and what it knows.
 
-    python -m experiments.studies --only latent rollability
+    python -m experiments.studies --only study=latent,rollability
 
 makes what is missing or stale of `data/results/raw/studies.jsonl.gz`; the tables are put beside
-those of `experiments.effect_prediction` and `experiments.lever_up` by these; `--help` lists all.
+those of `experiments.effect_prediction` and `experiments.lever_up` by these.
 """
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import inspect
 import sys
@@ -16,7 +15,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from affordlib.commands import command
-from experiments.runner import FOLDER, STUDIES, Job, Rows, read, run
+from experiments import runner
+from experiments.runner import FOLDER, STUDIES, Job, Rows, read
 
 NAME = "studies"
 MODULES = ("ablation", "representation", "uncertainty", "shared_network", "limits", "literal")
@@ -45,17 +45,8 @@ def tables(table: str, folder: str | Path = FOLDER) -> dict[str, Rows]:
 @command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
     """Make studies that are missing or stale."""
-    every = [f"{name}: {rows.__doc__.splitlines()[0]}" for name, (rows, _) in STUDIES.items()]
-    parser = argparse.ArgumentParser(
-        prog="python -m experiments.studies",
-        description="\n".join([main.__doc__, *every]),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("--only", nargs="+", choices=sorted(STUDIES), default=list(STUDIES))
-    parser.add_argument("--raw", default=FOLDER, help="the folder of the results")
-    options = parser.parse_args(argv)
-    run([job(name) for name in options.only], NAME, folder=options.raw)
-    return 0
+    options = runner.parser(NAME, main.__doc__).parse_args(argv)
+    return runner.make([job(name) for name in STUDIES], NAME, options)
 
 
 if __name__ == "__main__":

@@ -25,13 +25,7 @@ def main_of(name):
 @pytest.mark.parametrize(
     ("line", "named"),
     [
-        ("experiments.effect_prediction --models film,flim", "--models: 'flim' is unknown; choose"),
-        ("experiments.effect_prediction --folds 11", "--folds: must be .* from 1 to 10, got"),
         ("experiments.effect_prediction --workers -2", "--workers: must be .* from 1"),
-        ("experiments.effect_prediction --n many", "--n: must be a whole number from 1"),
-        ("experiments.closed_loop --tables nope", "--tables: 'nope' is unknown"),
-        ("experiments.closed_loop --seed -1", "--seed: must be a whole number from 0"),
-        ("experiments.lever_up --no-edges 2", "--no-edges: must be .* from 3 to 8"),
         ("experiments.shipped data --only", "--only: expected at least one argument"),
         ("experiments.shipped data --only nope", "--only: invalid choice: 'nope'"),
         (f"experiments.shipped data --workers {'1' * 5000}", "--workers: must be .*'1{5,40}$"),
@@ -51,9 +45,9 @@ def test_unknown_names_and_impossible_numbers_are_refused(capsys, line, named):
 @pytest.mark.parametrize(
     "line",
     [
-        "experiments.effect_prediction --models constant --raw {}",
-        "experiments.lever_up --raw {}",
-        "experiments.studies --only latent --raw {}",
+        "experiments.effect_prediction --only model=constant data=drag fold=1 --raw {}",
+        "experiments.lever_up --only model=persistence --raw {}",
+        "experiments.studies --only study=latent --raw {}",
         "experiments.shipped data --only grasp --workers 1 --to {}",
     ],
 )
@@ -66,6 +60,19 @@ def test_a_file_in_place_of_a_folder_is_named(tmp_path, capsys, line):
     assert last.startswith(f"{name.rpartition('.')[2]}: ")
     assert str(file) in last
     assert file.read_bytes() == b""
+
+
+@pytest.mark.parametrize(
+    ("only", "named"),
+    [
+        ("model=film,flim", "no job has model = 'flim', but attention, cnp, .*, nearest$"),
+        ("fold=11", "no job has fold = '11', but 0, 1,"),
+        ("modle=film", "no job has modle = 'film', but None$"),
+    ],
+)
+def test_jobs_that_are_not_of_a_table_are_refused(capsys, only, named):
+    assert main_of("experiments.effect_prediction")(["--only", only]) == 1
+    assert re.search(rf"^effect_prediction: --only: {named}", capsys.readouterr().err, re.MULTILINE)
 
 
 def test_every_command_line_ends_in_this_way():

@@ -8,7 +8,7 @@ import torch
 from affordlib.geometry import xy_columns
 from affordlib.interactions import InteractionTensors
 from affordlib.interactions.dataset import valid_interactions
-from affordlib.models.calibration import calibration_row, effects_at
+from affordlib.models.calibration import effects_at
 from affordlib.models.protocol import EffectModel
 
 EVERY = 12
@@ -94,23 +94,13 @@ def _residuals(record: dict[str, Any]) -> dict[str, np.ndarray]:
     return {name: np.subtract(mean[name], truth[name]) for name in mean}
 
 
-def calibration(record: dict[str, Any]) -> list[dict[str, Any]]:
-    """Per effect channel at t = 1: n, coverage of the central intervals, mean σ and NLL."""
-    rows = []
-    for channel, values in record["std"].items():
-        given = record["truth"][channel], record["mean"][channel], values
-        row = calibration_row(*(torch.tensor(v, dtype=torch.float64) for v in given))
-        rows.append({"channel": channel, **row})
-    return rows
-
-
 def summary(record: dict[str, Any]) -> dict[str, Any]:
-    """Errors and calibration alone, for a large test set."""
+    """Errors alone, for a large test set."""
     yaw = yaw_error(record)
     errors = {"final_error": final_error(record), "yaw_error": yaw}
     errors |= {k: np.array(record[k]) for k in ("trajectory_error", "after_contact_error")}
     plain = {k: None if v is None else [float(f"{e:.4g}") for e in v] for k, v in errors.items()}
-    return {"family": record["family"], **plain, "calibration": calibration(record)}
+    return {"family": record["family"], **plain}
 
 
 def rounded(value: Any) -> Any:

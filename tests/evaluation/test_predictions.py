@@ -7,13 +7,9 @@ import pytest
 import torch
 
 from affordlib.evaluation.baselines import constant, gaussian_process, logistic, nearest
-from affordlib.evaluation.predictions import (
-    calibration,
-    final_error,
-    network_predictions,
-    yaw_error,
-)
+from affordlib.evaluation.predictions import final_error, network_predictions, yaw_error
 from affordlib.interactions import InteractionTensors
+from affordlib.models.calibration import calibration_row
 from affordlib.models.training import final_errors_m
 
 # Answers
@@ -37,9 +33,8 @@ def test_a_turn_is_measured_the_short_way_round():
 
 
 def test_calibration_of_a_true_gaussian_is_right():
-    truth = np.random.default_rng(0).normal(0, 2.0, 20_000).tolist()
-    zeros, twos = [0.0] * 20_000, [2.0] * 20_000
-    (row,) = calibration({"truth": {"z": truth}, "mean": {"z": zeros}, "std": {"z": twos}})
+    truth = 2 * torch.randn(20_000, generator=torch.Generator().manual_seed(0)).double()
+    row = calibration_row(truth, torch.zeros_like(truth), torch.full_like(truth, 2.0))
     assert row["coverage_50"] == pytest.approx(0.5, abs=0.01)
     assert row["coverage_90"] == pytest.approx(0.9, abs=0.01)
     assert row["nll"] == pytest.approx(math.log(2) + 0.5 * math.log(2 * math.pi * math.e), abs=0.02)

@@ -155,8 +155,8 @@ def test_a_fold_may_lack_a_category():
 
     folds = [result(k, categories) for k, categories in enumerate(("aab", "aab", "aa"))]
     rows = tables.error_rows(tables.predictions_of(folds, "drag", "fixed_test"), "drag")
-    assert [row["trainings_sd_m"] for row in rows[1:]] == pytest.approx([0, 0])
-    assert rows[0]["trainings_sd_m"] == pytest.approx(np.std([2.25, 2.25, 1.5], ddof=1) / 1000)
+    means = [row["final_error_mean_m"] for row in rows]
+    assert means == pytest.approx([0.00225, 0.0015, 0.003])
 
 
 def test_a_second_cross_validation_counts_no_grasp_twice(tmp_path):

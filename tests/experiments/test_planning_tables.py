@@ -46,21 +46,20 @@ def test_rows_are_of_all_of_groups_and_of_categories():
     means = {name: row["mean_m"] for name, row in rows.items()}
     each = {"all": 0.003, "standing": 0.002, "rollable": 0.005, "cuboid": 0.002, "sphere": 0.005}
     assert means == pytest.approx(each)
-    assert (rows["standing"]["n"], rows["cuboid"]["plan_ms_median"]) == (2, pytest.approx(20.0))
+    assert rows["standing"]["n"] == 2
 
 
 def test_the_cost_of_execution_is_that_of_the_plain_oracle():
-    """Not of the one with a σ; and planners for stable objects only have no row of all."""
+    """Not of the one with a σ."""
     rows, both = [], {"continuous": 1e-3, "oracle": 2e-3, "oracle_risk_averse": 3e-3}
     for name, distance in (both | {"astar_cnp_500": 9e-3}).items():
         some = records([distance]) + (records([distance], "sphere") if name in both else [])
         rows += planning_rows(some, planner=name, **CONFIGS[name].columns())
     found = planning.decomposition_rows(rows)
     cost = {(r["planner"], r["object_class"]): r["execution_mean_m"] for r in found}
-    assert cost["continuous", "standing"] == cost["continuous", "all"] == pytest.approx(2e-3)
+    assert cost["continuous", "standing"] == pytest.approx(2e-3)
+    assert cost["continuous", "rollable"] == pytest.approx(2e-3)
     assert ("astar_cnp_500", "standing") in cost
-    assert ("astar_cnp_500", "all") not in cost
-    assert {row["perturbed_start_mean_m"] for row in found} == {None}
 
 
 def test_pairs_are_of_the_same_goals():

@@ -1,0 +1,102 @@
+"""Whole poses planned open loop: the goals of `closed_loop`, each from one image, executed blind.
+
+python -m experiments.open_loop_pose_goals
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from contextlib import suppress
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from affordlib.commands import command
+from affordlib.geometry import wrap_angle
+from affordlib.planning import execute_plan, plan_astar, plan_continuous
+from affordlib.planning.skills import CHECKPOINTS
+from affordlib.types import UnreachableError
+from experiments import runner
+from experiments.closed_loop import (
+    N_TRIALS,
+    WITHIN_HEIGHT_M,
+    WITHIN_M,
+    WITHIN_TURN_RAD,
+    sample_trial,
+    tabletop_and_skills,
+)
+from experiments.runner import FOLDER, Job, Rows, plain
+
+NAME = "open_loop_pose_goals"
+PLANNERS = {"astar": plan_astar, "continuous": plan_continuous}
+WITHIN = {"orientation": WITHIN_TURN_RAD, "height": WITHIN_HEIGHT_M}
+
+
+def run_open_loop(table: str, index: int, planner: str) -> dict[str, Any]:
+    """The record of one plan of a whole pose, tried even where the planner predicts to fail.
+
+    pose_error: what is missing of the turn [rad] or of the height [m].
+    """
+    world, skills = tabletop_and_skills()
+    trial = sample_trial(table, index)
+    world.place(trial.obj, trial.start_xy_m, trial.yaw_rad)
+    image = world.depth_image()
+    plan = skills.planner(PLANNERS[planner])(image, trial.start_xy_m, trial.goal)
+    yaw, z = world.object_pose()[2], world.object_state()[2]
+    with suppress(UnreachableError):
+        execute_plan(world, plan)
+    pose = world.object_pose()
+    if table == "orientation":
+        pose_error = wrap_angle(trial.goal.turn_rad - (pose[2] - yaw))
+    else:
+        pose_error = trial.goal.height_m - (world.object_state()[2] - z)
+    world.park()
+    return {
+        "object_class": trial.obj.category,
+        "actions": len(plan.steps),
+        "distance_m": trial.goal.distance_m(pose[:2]),
+        "pose_error": abs(pose_error),
+    }
+
+
+def open_loop_rows(records: Rows, within: float) -> Rows:
+    """Rows of plans that are executed open loop, for each planner; hit as in `pose_rows`."""
+    table = pd.DataFrame(records)
+    hit = (table.pose_error <= within) & (table.distance_m <= WITHIN_M)
+    groups = table.assign(within_percent=100 * hit).groupby("planner", sort=False)
+    means = groups[["within_percent", "distance_m", "actions"]].mean()
+    means.columns = ["within_percent", "distance_m_mean", "actions_mean"]
+    means.insert(0, "n", groups.size())
+    means.insert(0, "object_class", "all")
+    return plain(means.reset_index())
+
+
+def job(table: str, index: int, planner: str) -> Job:
+    """One plan of a whole pose."""
+    arguments = {"table": table, "index": index, "planner": planner}
+    return Job(run_open_loop, arguments, checkpoints=tuple(CHECKPOINTS.values()), version=2)
+
+
+def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
+    """The tables of the plans that were made."""
+    found = [about | record for about, record in runner.read(NAME, job, folder)]
+    return {
+        table: open_loop_rows([record for record in found if record["table"] == table], within)
+        for table, within in WITHIN.items()
+    }
+
+
+JOBS = [job(t, i, planner) for t, planner in product(WITHIN, PLANNERS) for i in range(N_TRIALS[t])]
+
+
+@command(OSError, ValueError)
+def main(argv: Sequence[str] | None = None) -> int:
+    """Make and execute the plans that are missing, and write the tables."""
+    return runner.make(JOBS, NAME, runner.parser(NAME, main.__doc__).parse_args(argv), tables)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
