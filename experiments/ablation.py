@@ -148,22 +148,12 @@ def incremental_ablation() -> Rows:
 def _errors(changes: Sequence[str]) -> dict[str, Any]:
     box = open_interactions("push_test")["family"].values == 0
     each_seed = [ablated(changes, STEPS, seed) for seed in range(SEEDS)]
-    errors, starts = zip(*each_seed, strict=True)
-    mean = np.mean(errors, axis=0)
-    each = [(e[box].mean() + e[~box].mean()) / 2 for e in errors]
-    return {
-        "steps": STEPS,
-        "seeds": SEEDS,
-        "n": len(mean),
-        "final_error_mean_m": float(np.mean(each)),
-        "final_error_min_m": float(np.min(each)),
-        "final_error_max_m": float(np.max(each)),
-        "cuboid_mean_m": float(mean[box].mean()),
-        "final_error_p95_m": float(np.quantile(np.concatenate(errors), 0.95)),
-        "action_start_mean_m": float(np.mean(starts)),
-        "action_start_min_m": float(min(start.mean() for start in starts)),
-        "action_start_max_m": float(max(start.mean() for start in starts)),
-    }
+    ends = [(error[box].mean() + error[~box].mean()) / 2 for error, _ in each_seed]
+    row: dict[str, Any] = {"steps": STEPS, "seeds": SEEDS, "n": len(box)}
+    for name, each in (("final_error", ends), ("action_start", [s.mean() for _, s in each_seed])):
+        for statistic in (np.mean, np.min, np.max):
+            row[f"{name}_{statistic.__name__}_m"] = float(statistic(each))
+    return row
 
 
 def ablated(changes: Sequence[str], steps: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

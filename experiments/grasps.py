@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from scipy import stats
+from scipy.special import erf
 
 from affordlib.primitives import Grasp
 from experiments.cross_validation import by_model
@@ -42,8 +43,7 @@ def auc(score: np.ndarray, truth: np.ndarray, fold: np.ndarray) -> float | None:
 
 def success_probability(mean_z: np.ndarray, std_z: np.ndarray) -> np.ndarray:
     """P(z > 0.1 m) (N,) of Gaussians; above one half exactly where their mean is above 0.1 m."""
-    standard = (np.asarray(mean_z) - Grasp.success_m) / (np.asarray(std_z) * math.sqrt(2))
-    return np.array([(1 + math.erf(v)) / 2 for v in standard])
+    return (1 + erf(np.subtract(mean_z, Grasp.success_m) / (math.sqrt(2) * np.asarray(std_z)))) / 2
 
 
 def _held_out(grasps: pd.DataFrame) -> Iterator[tuple[dict[str, Any], bool, pd.DataFrame]]:
@@ -69,13 +69,10 @@ def grasp_rows(grasps: pd.DataFrame) -> Rows:
     for about, rollable, some in _held_out(grasps):
         score, lifted = some["score"].to_numpy(), some["lifted"].to_numpy()
         known = about["model"] != "logistic"
-        error = some["final_error"].to_numpy()
         row = about | {"rollable": rollable, "n": len(some)}
-        row["error_mean_m"] = float(error.mean()) if known else None
-        row["error_median_m"] = float(np.median(error)) if known else None
+        row["error_mean_m"] = float(some["final_error"].mean()) if known else None
         row |= confusion_columns(score > 0.5, lifted)
-        row["auc"] = auc(score, lifted, some["fold"].to_numpy())
-        rows.append(row | {"brier": float(np.square(score - lifted).mean())})
+        rows.append(row | {"auc": auc(score, lifted, some["fold"].to_numpy())})
     return rows
 
 
@@ -106,7 +103,6 @@ def threshold_rows(grasps: pd.DataFrame) -> Rows:
         score, lifted, fold = (some[name].to_numpy() for name in ("score", "lifted", "fold"))
         chosen = {k: best_threshold(score[fold != k], lifted[fold != k]) for k in np.unique(fold)}
         row = about | {"rollable": rollable, "n": len(some)}
-        row["threshold_median"] = float(np.median(list(chosen.values())))
         rows.append(row | confusion_columns(score > [chosen[k] for k in fold], lifted))
     return rows
 
@@ -130,15 +126,11 @@ def roc_rows(grasps: pd.DataFrame, n_points: int = 51) -> Rows:
 
 
 def confusion_columns(predicted: np.ndarray, lifted: np.ndarray) -> dict[str, Any]:
-    """TP and FN in per cent of the successes, TN and FP of the failures; intervals."""
+    """TP in per cent of the successes, TN of the failures, with intervals; None of nothing."""
     columns: dict[str, Any] = {}
-    for right, wrong, those in (("tp", "fn", lifted), ("tn", "fp", ~lifted)):
+    for rate, those in (("tp", lifted), ("tn", ~lifted)):
         n, k = int(those.sum()), int((predicted == lifted)[those].sum())
-        low, high = wilson(k, n) if n else (None, None)
-        columns |= {
-            f"{right}_percent": 100 * k / n if n else None,
-            f"{right}_low_percent": None if low is None else 100 * low,
-            f"{right}_high_percent": None if high is None else 100 * high,
-            f"{wrong}_percent": 100 * (n - k) / n if n else None,
-        }
+        shares = (k / n, *wilson(k, n)) if n else (None,) * 3
+        for end, share in zip(("", "_low", "_high"), shares, strict=True):
+            columns[f"{rate}{end}_percent"] = share and 100 * share
     return columns | {"n_success": int(lifted.sum()), "n_failure": int((~lifted).sum())}

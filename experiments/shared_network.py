@@ -32,9 +32,8 @@ from affordlib.models.checkpoint import build
 from affordlib.models.domain import TrainingDomain
 from affordlib.models.film import FiLMConfig
 from affordlib.models.training import train
-from affordlib.primitives import Grasp
 from experiments.cross_validation import TASKS, add_errors, job, prediction_columns
-from experiments.runner import Rows, open_once, run, study
+from experiments.runner import Rows, open_once, plain, run, study
 from experiments.shipped import CHECKPOINT_SPECS
 
 PRIMITIVES = ("push", "drag", "grasp", "rotate")
@@ -144,7 +143,7 @@ def shared_network(resume_checkpoint: Path) -> Rows:
         rows += _rows(table, "final_error", about, unit)
         if name == "push":
             rows += _rows(table, "yaw_error", about | {"effect": "yaw"}, "rad")
-    return rows
+    return plain(rows)
 
 
 def _pair(
@@ -164,17 +163,11 @@ def _pair(
 def _rows(table: pd.DataFrame, column: str, about: dict[str, Any], unit: str) -> Rows:
     """A row of each model's errors, and by how much the shared network's exceed the others'."""
     error = {model: group[column].to_numpy() for model, group in table.groupby("model")}
-    more, rows = error_row(error[SHARED] - error[SEPARATE]), []
-    for model in (SHARED, SEPARATE):
-        spread = error_row(error[model])
-        told = {f"error_{k}": spread[f"{k}_m"] for k in ("mean", "sem", "median", "p95")}
-        told |= {f"more_{k}": more[f"{k}_m"] if model == SHARED else None for k in ("mean", "sem")}
-        row: dict[str, Any] = {"model": model} | about | {"n": spread["n"]}
-        row |= {f"{k}_{u}": v if u == unit else None for u in ("m", "rad") for k, v in told.items()}
-        right = None
-        if about["primitive"] == "grasp":
-            of_model = table[table["model"] == model]
-            lifts = (of_model[f"{kind}_z"] > Grasp.success_m for kind in ("truth", "mean"))
-            right = 100 * float(np.equal(*lifts).mean())
-        rows.append(row | {"success_right_percent": right})
+    more = error_row(error[SHARED] - error[SEPARATE])
+    about |= {"n": more["n"]}
+    rows = [
+        {"model": model, **about, f"error_mean_{unit}": float(error[model].mean())}
+        for model in (SHARED, SEPARATE)
+    ]
+    rows[0] |= {f"more_{name}_{unit}": more[f"{name}_m"] for name in ("mean", "sem")}
     return rows

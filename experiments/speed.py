@@ -1,8 +1,8 @@
 """How long things take: `make bench`, or `python -m experiments.speed --only planning --keep`.
 
-Each function measures one thing and returns the rows of a table; `--keep` writes them, with the
-load of this machine, to `data/results/speed.json`. What is compared runs in turn, so that a load
-that comes and goes meets both sides.
+Each function measures one thing and returns the rows of a table; `--keep` writes them to
+`data/results/speed.json`. What is compared runs in turn, so that a load that comes and goes meets
+both sides.
 """
 
 from __future__ import annotations
@@ -371,13 +371,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     torch.set_num_threads(1)
     for name in options.only:
         rows = MEASUREMENTS[name]()
-        machine = {"load": os.getloadavg()[0], "cores": os.cpu_count()}
-        print(f"{name}: {machine}\n{pd.DataFrame(rows).to_string(index=False)}", flush=True)
+        load = f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"
+        print(f"{name}: {load}\n{pd.DataFrame(rows).to_string(index=False)}", flush=True)
         if options.keep:
             path = repo_root() / RESULTS
             tables = read_results(path)["tables"] if path.is_file() else {}
-            tables |= {name: rows, f"{name}_machine": [machine]}
-            write_results(path.parent, path.stem, {}, dict(sorted(tables.items())))
+            write_results(path.parent, path.stem, {}, dict(sorted((tables | {name: rows}).items())))
     return 0
 
 

@@ -10,7 +10,7 @@ import tokenize
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-LINES = {"affordlib": 13_146, "experiments": 6236, "tests": 9304}
+LINES = {"affordlib": 13_146, "experiments": 6179, "tests": 9301}
 """What is there, rounded up: lower it with every cut. The aim is 9,500, 3,500 and 6,500."""
 
 FILES, CODE = 75, 9018
