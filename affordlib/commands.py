@@ -5,7 +5,7 @@ import functools
 import inspect
 import signal
 import sys
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -27,20 +27,6 @@ def whole_type(least: int, most: int) -> Callable[[str], int]:
 
 count_type = whole_type(1, 10**9)
 seed_type = whole_type(0, 2**32 - 1)
-
-
-def names_type(known: Collection[str]) -> Callable[[str], list[str]]:
-    """An argparse `type`: known names, with commas between them."""
-
-    def parse(text: str) -> list[str]:
-        for name in text.split(","):
-            if name not in known:
-                raise argparse.ArgumentTypeError(
-                    f"{name!r:.40} is unknown; choose from {', '.join(known)}"
-                )
-        return text.split(",")
-
-    return parse
 
 
 class _Terminated(KeyboardInterrupt):

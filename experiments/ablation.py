@@ -15,12 +15,13 @@ from affordlib.interactions import (
     open_interactions,
     split_interactions,
 )
-from affordlib.interactions.sampling import Batch, sample_literal, sample_mixed
+from affordlib.interactions.sampling import Batch, sample_mixed
 from affordlib.models.checkpoint import build
 from affordlib.models.film import FiLMNetwork
 from affordlib.models.protocol import condition_on_final_effect
 from affordlib.models.training import final_errors_m, train
 from affordlib.types import Observations
+from experiments.literal import sample_literal
 from experiments.runner import Rows, study
 from experiments.shipped import CHECKPOINT_SPECS
 

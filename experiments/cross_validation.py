@@ -19,9 +19,12 @@ import numpy as np
 import pandas as pd
 import torch
 import xarray as xr
+from sklearn.linear_model import LogisticRegression
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
 
-from affordlib.evaluation.baselines import BASELINES, baseline_predictions, logistic_predictions
-from affordlib.evaluation.predictions import network_predictions, summary
+from affordlib.evaluation.baselines import BASELINES, baseline_predictions
+from affordlib.evaluation.predictions import about_objects, final_error, network_predictions
 from affordlib.geometry import wrap_angle
 from affordlib.interactions import InteractionTensors, Split, split_interactions
 from affordlib.interactions.dataset import Symmetry, valid_interactions
@@ -32,7 +35,7 @@ from affordlib.models.cnp import CNPConfig
 from affordlib.models.film import FiLMConfig
 from affordlib.models.protocol import EffectModel, condition_on_final_effect
 from affordlib.models.training import train_model
-from affordlib.primitives import Push
+from affordlib.primitives import Grasp, Push
 from affordlib.types import check_choice, check_count
 from affordlib.world import Tabletop
 from experiments.attention import AttentionConfig
@@ -179,6 +182,41 @@ def cross_validate(
         about = {"interaction": found["interaction"], "category": errors.pop("family")}
         result["fixed_test"] = about | {k: v for k, v in errors.items() if v is not None}
     return result
+
+
+def yaw_error(record: dict[str, Any]) -> np.ndarray | None:
+    """Distance (N,) [rad] between the predicted and the true rotation; None if it predicts none."""
+    mean, truth = record["mean"], record["truth"]
+    if "yaw" not in mean:
+        return None
+    return np.abs((np.subtract(mean["yaw"], truth["yaw"]) + np.pi) % (2 * np.pi) - np.pi)
+
+
+def summary(record: dict[str, Any]) -> dict[str, Any]:
+    """Errors alone, for a large test set."""
+    yaw = yaw_error(record)
+    errors = {"final_error": final_error(record), "yaw_error": yaw}
+    errors |= {k: np.array(record[k]) for k in ("trajectory_error", "after_contact_error")}
+    plain = {k: None if v is None else [float(f"{e:.4g}") for e in v] for k, v in errors.items()}
+    return {"family": record["family"], **plain}
+
+
+def logistic_predictions(
+    data: xarray.Dataset, train_on: np.ndarray, other: xarray.Dataset, queried: np.ndarray
+) -> dict[str, Any]:
+    """The probability of a grasp's success, from the object's size alone, and the true heights."""
+    known, kept = valid_interactions(data, train_on), valid_interactions(other, queried)
+    lifted = data["effect"].values[known, -1, 2] > Grasp.success_m
+    probability = logistic(data["size"].values[known], lifted, other["size"].values[kept])
+    height = other["effect"].values[kept, -1, 2].tolist()
+    record = about_objects(other, kept) | {"truth": {"z": height}}
+    return record | {"probability": probability.tolist()}
+
+
+def logistic(size: np.ndarray, success: np.ndarray, queried: np.ndarray) -> np.ndarray:
+    """P(success) (M,) by logistic regression on sizes (N, 3), with a weak ridge."""
+    regression = make_pipeline(StandardScaler(), LogisticRegression())
+    return regression.fit(size, success).predict_proba(queried)[:, 1]
 
 
 def prediction_columns(predictions: dict[str, Any]) -> dict[str, Any]:

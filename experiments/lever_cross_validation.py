@@ -31,7 +31,7 @@ from affordlib.types import Prediction, check_choice, check_count
 from experiments import lstm_seker2019
 from experiments.lstm_seker2019 import SekerConfig, SekerLSTM, train_seker
 from experiments.runner import Job, open_once, study
-from experiments.shipped import shipped_lever_model
+from experiments.shipped import shipped_lever_model, train_lever_model
 
 DATA, N_FOLDS = "lever_up", 5
 BASELINES = ("persistence", "constant_velocity")
@@ -128,7 +128,7 @@ def cross_validate(
 def _train(
     lever: LeverModel, data: xr.Dataset, split: Split, trained_for: str, path: Path
 ) -> tuple[EffectNetwork, dict[str, Any]]:
-    network, history = models.train_lever_model(lever, data, split, trained_for, path)
+    network, history = train_lever_model(lever, data, split, trained_for, path)
     best = min(record.validation_error for record in history)
     told = {"steps": history[-1].step, "seconds": history[-1].seconds}
     return network, told | {"validation_error": best}

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
+import torch
 
 from affordlib.interactions import InteractionTensors, split_interactions
+from affordlib.interactions.sampling import Batch
 from affordlib.models import EffectNetwork
-from affordlib.models.training import final_errors_m, train_literal, train_model, untrained
+from affordlib.models.training import batch_loss, final_errors_m, train_model, untrained
+from affordlib.types import Observations, check_count, check_within
 from experiments.runner import Rows, open_once, study
 from experiments.shipped import CHECKPOINT_SPECS
 
@@ -20,6 +25,52 @@ def trained_on(n_samples: int) -> EffectNetwork:
     split = split_interactions(data.sizes["interaction"])
     samples = np.linspace(0, data.sizes["sample"] - 1, n_samples).round().astype(int)
     return train_model(data.isel(sample=samples), split, SPEC.training, SPEC.network)[0]
+
+
+def sample_literal(tensors: InteractionTensors, obs_max: int, generator: torch.Generator) -> Batch:
+    """As in the paper: one trajectory, k observations, k uniform in 1 … obs_max, one target.
+
+    Action and effect are observed at the same times; w₁ is 1, 0 or uniform between, one in three.
+    """
+
+    def draw(high, n=1):
+        return torch.randint(high, (n,), generator=generator)
+
+    part, last = tensors.select(draw(len(tensors))), len(tensors.phase)
+    at, target_at = draw(last, 1 + int(draw(obs_max))), draw(last)
+    kind, weight = int(draw(3)), torch.rand(1, generator=generator)
+    weight = weight if kind == 2 else torch.tensor([float(kind)])
+    observed = Observations.of(part, part.action_at(at), part.effect_at(at), weight)
+    return Batch.of(part, observed, target_at)
+
+
+def train_literal(
+    model: EffectNetwork,
+    training: InteractionTensors,
+    iterations: int = 1_000_000,
+    obs_max: int = 10,
+    learning_rate: float = 1e-4,
+    seed: int = 0,
+    after: Callable[[int], object] = bool,
+) -> list[float]:
+    """The paper's loop (Section 3.2), in place: one trajectory and one target an iteration, Adam.
+
+    Returns the losses. A million iterations, as in the paper, take hours. after: gets each number.
+    """
+    check_count("iterations", iterations)
+    check_count("obs_max", obs_max, 1, 100_000)
+    check_within("learning_rate", learning_rate, 1e-7, 1.0)
+    generator = torch.Generator().manual_seed(check_count("seed", seed, 0, 2**63 - 1))
+    optimiser = torch.optim.Adam(model.parameters(), lr=learning_rate)
+    losses = []
+    for iteration in range(1, iterations + 1):
+        loss = batch_loss(model, sample_literal(training, obs_max, generator))
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        losses.append(loss.item())
+        after(iteration)
+    return losses
 
 
 @study("push", settings=(SPEC.network, ITERATIONS, VALIDATE_EVERY))

@@ -12,6 +12,7 @@ import hashlib
 import math
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -36,6 +37,7 @@ from affordlib.planning import (
     Execution,
     PlanMode,
     PlanningProblem,
+    Robot,
     Skills,
     continuous,
     execute_plan,
@@ -43,10 +45,10 @@ from affordlib.planning import (
     plan_continuous,
     plan_gradient,
 )
-from affordlib.planning.closed_loop import ENOUGH_M
+from affordlib.planning.closed_loop import is_seen_on_table
 from affordlib.planning.problem import MODES
 from affordlib.primitives import Push
-from affordlib.types import Outcome, Plan, Step
+from affordlib.types import NothingSeenError, Outcome, Plan, Step
 from affordlib.world import Tabletop, UnreachableError
 from experiments import reported, runner
 from experiments.field_baselines import plan_astar_continuous, plan_cem
@@ -54,6 +56,9 @@ from experiments.limit_surface import LimitSurface
 from experiments.literal import SPEC, trained_on
 from experiments.oracle import oracle_effects
 from experiments.runner import FOLDER, Job, Rows, interval, plain
+
+ENOUGH_M = 0.0003
+"""What a corrective action leaves anyway; nearer to the goal than this, none is tried."""
 
 POSITION_ERROR_M, YAW_ERROR_RAD = 0.001, math.radians(1.0)
 GROUPS = {"all": STANDING + ROLLABLE, "standing": STANDING, "rollable": ROLLABLE} | {
@@ -260,6 +265,39 @@ class Attempt:
     receding: bool = False
 
 
+def corrected(
+    robot: Robot, done: Outcome, replan: Callable[..., Plan], corrections: int
+) -> Outcome:
+    """What comes of a plan that was executed, after at most so many single actions.
+
+    Each is the first of a plan that `replan` makes from a new image, and is carried out only if it
+    is expected to bring the object nearer.
+    """
+    goal = done.plan.goal
+    # A planner content within the goal's tolerance would have nothing to correct.
+    exactly = replace(goal, tolerance_m=min(goal.tolerance_m, ENOUGH_M))
+    with suppress(NothingSeenError, UnreachableError):
+        for _ in range(corrections):
+            seen = robot.observe()
+            distance_m = goal.distance_m(seen.xy_m)
+            if distance_m <= ENOUGH_M or not is_seen_on_table(seen):
+                break
+            plan = replan(seen.image, seen.xy_m, exactly)
+            first = replace(plan, goal=goal, steps=plan.steps[:1])
+            if not plan.steps or goal.distance_m(first.predicted_end_xy_m) >= distance_m:
+                break
+            if not robot.can_reach(first.steps[0].primitive, first.steps[0].stop_phase):
+                break
+            done = _joined(done, execute_plan(robot, first))
+    return done
+
+
+def _joined(done: Outcome, more: Outcome) -> Outcome:
+    """The outcome of a plan and of what was executed after it."""
+    paths = done.object_paths_xy_m + more.object_paths_xy_m
+    return replace(more, plan=done.plan, object_paths_xy_m=paths)
+
+
 def attempt(world: Tabletop, task: PlanningTask, planner: Planner, **options: Any) -> Outcome:
     """Plan and execute one task; options: fields of `Attempt`.
 
@@ -288,7 +326,8 @@ def attempt(world: Tabletop, task: PlanningTask, planner: Planner, **options: An
     robot = SimpleNamespace(execute=execute, **same) if how.by_plan else world
     now = replace(plan, steps=plan.steps[:1]) if how.receding else plan
     try:
-        outcome = execute_plan(robot, now, how.corrections, lambda *query: planner(*query, once))
+        outcome = execute_plan(robot, now)
+        outcome = corrected(robot, outcome, lambda *query: planner(*query, once), how.corrections)
         mode = MODES[task.mode]
         for left in range(mode.max_steps - 1, 0, -1) if how.receding else ():
             seen = world.observe()
@@ -296,8 +335,7 @@ def attempt(world: Tabletop, task: PlanningTask, planner: Planner, **options: An
                 break
             again = planner(seen.image, seen.xy_m, task.goal, replace(mode, max_steps=left))
             more = execute_plan(world, replace(again, steps=again.steps[:1]))
-            paths = outcome.object_paths_xy_m + more.object_paths_xy_m
-            outcome = replace(more, plan=plan, object_paths_xy_m=paths)
+            outcome = replace(_joined(outcome, more), plan=plan)
     except UnreachableError as refused:
         outcome = refused.outcome
     finally:

@@ -33,7 +33,6 @@ from scipy.stats import bootstrap
 from tqdm.auto import tqdm
 
 from affordlib.commands import count_type
-from affordlib.evaluation.predictions import rounded
 from affordlib.interactions import open_interactions
 from affordlib.interactions.store import stored_sha256
 from affordlib.models.checkpoint import checkpoint_sha256, weights_bytes
@@ -86,8 +85,17 @@ class Job:
         """Call the function; a line of the table."""
         takes = inspect.signature(self.function).parameters
         more = {k: v for k, v in {"resume_checkpoint": resume_checkpoint}.items() if k in takes}
-        result = rounded(self.function(**self.arguments, **more))
+        result = _rounded(self.function(**self.arguments, **more))
         return {"arguments": self.arguments, "made_of": self.made_of(), "result": result}
+
+
+def _rounded(value: Any) -> Any:
+    """The same, with six significant digits of every float."""
+    if isinstance(value, dict):
+        return {k: _rounded(v) for k, v in value.items()}
+    if isinstance(value, list):
+        return [_rounded(v) for v in value]
+    return float(f"{value:.6g}") if isinstance(value, float) else value
 
 
 STUDIES: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {}

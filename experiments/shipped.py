@@ -14,9 +14,12 @@ import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
+import torch
 import xarray as xr
+from torch import nn
 
 from affordlib.commands import command, count_type
 from affordlib.evaluation.tasks import (
@@ -27,21 +30,34 @@ from affordlib.evaluation.tasks import (
     constructed_tasks,
     uniform_tasks,
 )
-from affordlib.interactions import Scaler, Split, open_interactions, split_interactions
+from affordlib.interactions import (
+    InteractionTensors,
+    Scaler,
+    Split,
+    open_interactions,
+    split_interactions,
+)
 from affordlib.interactions.collect import collect
-from affordlib.interactions.dataset import Symmetry
+from affordlib.interactions.dataset import Symmetry, augment_by_symmetry
+from affordlib.interactions.lever_up import MIRRORED, lever_up_tensors
 from affordlib.interactions.recipes import RECIPES, SHIPPED, Variation
 from affordlib.interactions.sampling import sample_forward, sample_mixed
 from affordlib.interactions.store import SUFFIX as DATA_SUFFIX
 from affordlib.interactions.store import dataset_sha256
 from affordlib.models import CNPConfig, EffectNetwork, FiLMConfig, NetworkConfig, TrainingDomain
 from affordlib.models.checkpoint import SUFFIX, load_checkpoint, save_checkpoint
-from affordlib.models.lever_up import LEVER_MODELS, LeverModel, lever_training, train_lever_model
+from affordlib.models.lever_up import LEVER_MODELS, LeverModel, fit_lever_model
 from affordlib.models.lstm import LSTMConfig
-from affordlib.models.training import Sampler, TrainingConfig, about_training, train_model
+from affordlib.models.training import (
+    Sampler,
+    TrainingConfig,
+    TrainingRecord,
+    about_training,
+    train_model,
+)
 from affordlib.paths import repo_root
 from affordlib.planning.reachability import SHIPPED as REACHABILITY
-from affordlib.planning.reachability import learn_reachability
+from affordlib.planning.reachability import Reachability, reach_features
 from affordlib.results import write_atomically
 from affordlib.workers import dask_client
 from affordlib.world import Tabletop
@@ -104,6 +120,8 @@ N_GOALS = {"single_full": 50, "single_partial": 100, "multi_partial": 80}
 VALIDATION_GOALS = {"multi_partial": 40}
 """Goals of each mode, as in Table 3 of the paper."""
 
+REACH_STEPS, REACH_RATE = 1500, 1e-2
+
 TOLERANCE_M = 0.00005
 """Median distance between the final positions of two collections that still are the same set.
 
@@ -154,6 +172,24 @@ def about_checkpoint(
 ) -> dict[str, object]:
     """What a shipped checkpoint says of its training, and of lever-ups more."""
     return about_training(data, np.concatenate([split.train, split.validation]), training) | more
+
+
+def lever_training(lever: LeverModel, data: xarray.Dataset, split: Split) -> InteractionTensors:
+    """What a network learns from: a split's training part and its mirror image."""
+    return augment_by_symmetry(lever_up_tensors(data, split.train, lever.view), MIRRORED)
+
+
+def train_lever_model(
+    lever: LeverModel,
+    data: xarray.Dataset,
+    split: Split,
+    trained_for: str = "all",
+    resume_checkpoint: Path | None = None,
+) -> tuple[EffectNetwork, list[TrainingRecord]]:
+    """`fit_lever_model` on a split's training part and its mirror image."""
+    training = lever_training(lever, data, split)
+    validation = lever_up_tensors(data, split.validation, lever.view)
+    return fit_lever_model(lever, training, validation, trained_for, resume_checkpoint)
 
 
 def shipped_lever_model(
@@ -214,6 +250,34 @@ def train_checkpoints(options: argparse.Namespace) -> bool:
             f"Collect it: .venv/bin/python -m experiments.shipped data --only {data} --to data"
         )
     return complete
+
+
+def learn_reachability(data: xarray.Dataset, seed: int = 0) -> Reachability:
+    """Train on a set of interactions with objects all over the table; seconds on one core.
+
+    The arm stands on the table's x axis, so every interaction is seen mirrored as well.
+    """
+    number = data["primitive"].values
+    xy_m = data["believed_xy"].values
+    names = data["primitive"].attrs["flag_meanings"].split()
+    direction = data["theta"].values + np.where(number == names.index("push"), np.pi, 0.0)
+    kind = np.eye(len(names))[number]
+    reached = torch.from_numpy(data["reached"].values).float()
+    inputs = torch.cat(
+        [reach_features(kind, xy_m, direction), reach_features(kind, xy_m * [1, -1], -direction)]
+    )
+    torch.manual_seed(seed)
+    model = Reachability(names)
+    optimiser = torch.optim.AdamW(model.parameters(), REACH_RATE)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, REACH_RATE, REACH_STEPS)
+    for _ in range(REACH_STEPS):
+        logits = model.layers(inputs).squeeze(-1)
+        loss = nn.functional.binary_cross_entropy_with_logits(logits, reached.repeat(2))
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        schedule.step()
+    return model.eval()
 
 
 def train_reachability(_: argparse.Namespace) -> bool:

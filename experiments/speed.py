@@ -26,7 +26,7 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from affordlib import models
-from affordlib.commands import command, names_type
+from affordlib.commands import command
 from affordlib.evaluation.tasks import STANDING, uniform_tasks
 from affordlib.interactions import (
     InteractionTensors,
@@ -48,6 +48,7 @@ from affordlib.results import read_results, write_results
 from affordlib.types import Observations
 from affordlib.world import Tabletop
 from experiments import lstm_seker2019
+from experiments.literal import sample_literal, train_literal
 from experiments.runner import Rows
 
 RESULTS = "data/results/speed.json"
@@ -142,7 +143,7 @@ def training(
         return models.build(models.CNPConfig(), Scaler.fit(pushes))
 
     def one() -> torch.Tensor:
-        return batch_loss(model, sampling.sample_literal(pushes, 10, generator))
+        return batch_loss(model, sample_literal(pushes, 10, generator))
 
     def many() -> torch.Tensor:
         some = pushes.select(torch.randint(len(pushes), (size,), generator=generator))
@@ -162,7 +163,7 @@ def training(
         shares.append(counter.get_total_flops() / many_s / products_per_s)
 
     model, began = network(), time.perf_counter()
-    models.train_literal(model, pushes, iterations)
+    train_literal(model, pushes, iterations)
     literal_s = time.perf_counter() - began
     error = float(final_errors_m(model.eval(), validation).mean())
     # In small batches: while errors are large, many steps gain more than accurate ones.
@@ -364,8 +365,8 @@ MEASUREMENTS = {f.__name__: f for f in (lever_up, planning, prediction, primitiv
 def main(argv: Sequence[str] | None = None) -> int:
     """Measure what is named, or all but `training`, which takes a quarter of an hour."""
     parser = argparse.ArgumentParser(prog="python -m experiments.speed", description=main.__doc__)
-    names = ",".join(list(MEASUREMENTS)[:-1])
-    parser.add_argument("--only", type=names_type(MEASUREMENTS), default=names)
+    names = list(MEASUREMENTS)
+    parser.add_argument("--only", nargs="+", choices=names, default=names[:-1])
     parser.add_argument("--keep", action="store_true", help=f"write the rows to {RESULTS}")
     options = parser.parse_args(argv)
     torch.set_num_threads(1)

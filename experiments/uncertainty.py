@@ -21,7 +21,7 @@ from scipy import optimize, stats
 from affordlib.evaluation.metrics import refuse_seen
 from affordlib.geometry import xy_columns
 from affordlib.interactions import InteractionTensors, open_interactions, split_interactions
-from affordlib.models.calibration import AFTER_CONTACT, LEVELS, calibration_rows, effects_at
+from affordlib.models.calibration import AFTER_CONTACT, LEVELS, calibration_row, effects_at
 from affordlib.models.checkpoint import load_checkpoint
 from affordlib.models.training import final_errors_m, train_model
 from experiments.representation import TRAINING
@@ -31,6 +31,26 @@ from experiments.shipped import CHECKPOINT_SPECS
 PERTURBED_FOLDS = 3
 NETWORK = CHECKPOINT_SPECS["film_500"].network
 _ABOUT = (TRAINING, NETWORK, PERTURBED_FOLDS)
+
+
+def calibration_rows(
+    model: EffectModel,
+    tensors: InteractionTensors,
+    /,
+    phases: Sequence[float] = AFTER_CONTACT,
+    **columns: Any,
+) -> list[dict[str, Any]]:
+    """One row per phase and effect channel: n, coverage at 50 and 90 %, mean σ and NLL.
+
+    The likelihood is a density of metres or radians; it compares models, not channels.
+    """
+    truth, mean, std = effects_at(model, tensors, phases)
+    rows = []
+    for i, phase in enumerate(phases):
+        for k, channel in enumerate(model.effect_channels):
+            row = calibration_row(truth[:, i, k], mean[:, i, k], std[:, i, k])
+            rows.append({**columns, "phase": phase, "channel": channel, **row})
+    return rows
 
 
 @study("push_varied", checkpoints=("film_5000_perturbed",), settings=_ABOUT)

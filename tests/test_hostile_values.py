@@ -220,16 +220,13 @@ def shop(one_world, skills, pushes, tmp_path_factory):
         | {"n_pushes": 1},
         "FiLMNetwork": {"config": models.FiLMConfig()},
         "train": {"model": network, "config": few},
-        "train_literal": {"model": network, "obs_max": 2},
         "train_model": {"config": few, "model_config": config},
-        "calibration_rows": {"model": network, "phases": (0.8, 1.0)},
         "fit_sigma_scale": {"model": network, "phases": (0.8, 1.0)},
         "condition_on_primitives": {"model": network},
         "save_checkpoint": {"model": network, "path": folder / "net.safetensors", "about": {}},
         "save_plan": {"path": folder / "p.json"},
         "load_plan": {"path": save_plan(folder / "plan.json", plan)},
         "Disturbance": {"kind": "knock", "action": 0, "at_s": 1.0},
-        "sample_disturbances": {"n": 1, "kinds": ("knock",)},
         "Skills": {"models": {"push": model}},
         "EffectMap": {"n_directions": 8, "n_phases": 5},
         "plan_astar": {"stop_phases": (0.5, 1.0)},
@@ -248,7 +245,6 @@ def shop(one_world, skills, pushes, tmp_path_factory):
 
 NOT_DRIVEN = {
     "collect": {"client": None, "workers": 1},
-    "train_literal": {"iterations": 1},
 }
 
 

@@ -4,7 +4,6 @@
     nearest           the object's true size and yaw: the trajectory of the most similar object
     gaussian_process  the same, with a Gaussian process of exact inference (Rasmussen and Williams,
                       Gaussian processes for machine learning, 2006, algorithm 2.1)
-    logistic          of a grasp: its success from the three true sizes alone
 
 Networks must read size and yaw from the image; nearest and gaussian_process are given them. All
 work in the frame of the action, which networks in the frame of the table do not.
@@ -19,18 +18,14 @@ import torch
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
-from sklearn.linear_model import LogisticRegression
 from sklearn.neighbors import NearestNeighbors
-from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import StandardScaler
 from torch import Tensor
 
-from affordlib.evaluation.predictions import about_objects, prediction_record, steps_of
+from affordlib.evaluation.predictions import prediction_record, steps_of
 from affordlib.geometry import rotate_channels, xy_columns
 from affordlib.interactions.dataset import InteractionTensors, valid_interactions
 from affordlib.interactions.sampling import condition_on_recorded_action
 from affordlib.models.push_frame import inverse, push_direction, rotate_prediction
-from affordlib.primitives import Grasp
 from affordlib.types import Prediction
 
 Forecast = tuple[Tensor, Tensor]
@@ -58,18 +53,6 @@ def baseline_predictions(
         training, arrays, at, train_features, features(other.isel(interaction=kept))
     )
     return prediction_record(other, kept, arrays, mean, std)
-
-
-def logistic_predictions(
-    data: "xarray.Dataset", train_on: np.ndarray, other: "xarray.Dataset", queried: np.ndarray
-) -> dict[str, Any]:
-    """The probability of a grasp's success, from the object's size alone, and the true heights."""
-    known, kept = valid_interactions(data, train_on), valid_interactions(other, queried)
-    lifted = data["effect"].values[known, -1, 2] > Grasp.success_m
-    probability = logistic(data["size"].values[known], lifted, other["size"].values[kept])
-    height = other["effect"].values[kept, -1, 2].tolist()
-    record = about_objects(other, kept) | {"truth": {"z": height}}
-    return record | {"probability": probability.tolist()}
 
 
 def features(data: "xarray.Dataset") -> Tensor:
@@ -144,12 +127,6 @@ def gaussian_process(
         both = process.predict(queried, return_std=True)  # without its axis T where T is 1
         mean[..., c], std[..., c] = (torch.from_numpy(v).reshape(mean.shape[:2]) for v in both)
     return _in_table_frame(test, at, (centre + scale * mean).float(), (scale * std).float())
-
-
-def logistic(size: np.ndarray, success: np.ndarray, queried: np.ndarray) -> np.ndarray:
-    """P(success) (M,) by logistic regression on sizes (N, 3), with a weak ridge."""
-    regression = make_pipeline(StandardScaler(), LogisticRegression())
-    return regression.fit(size, success).predict_proba(queried)[:, 1]
 
 
 def _has_direction(arrays: InteractionTensors) -> bool:

@@ -77,36 +77,8 @@ def prediction_record(
 
 def final_error(record: dict[str, Any]) -> np.ndarray:
     """Distance (N,) of predicted and true effect at t = 1: of (x, y) [m], or of z or yaw alone."""
-    residual = _residuals(record)
-    if "x" in residual:
-        return np.hypot(residual["x"], residual["y"])
-    return np.abs(next(iter(residual.values())))
-
-
-def yaw_error(record: dict[str, Any]) -> np.ndarray | None:
-    """Distance (N,) [rad] between the predicted and the true rotation; None if it predicts none."""
-    residual = _residuals(record)
-    return np.abs((residual["yaw"] + np.pi) % (2 * np.pi) - np.pi) if "yaw" in residual else None
-
-
-def _residuals(record: dict[str, Any]) -> dict[str, np.ndarray]:
     mean, truth = record["mean"], record["truth"]
-    return {name: np.subtract(mean[name], truth[name]) for name in mean}
-
-
-def summary(record: dict[str, Any]) -> dict[str, Any]:
-    """Errors alone, for a large test set."""
-    yaw = yaw_error(record)
-    errors = {"final_error": final_error(record), "yaw_error": yaw}
-    errors |= {k: np.array(record[k]) for k in ("trajectory_error", "after_contact_error")}
-    plain = {k: None if v is None else [float(f"{e:.4g}") for e in v] for k, v in errors.items()}
-    return {"family": record["family"], **plain}
-
-
-def rounded(value: Any) -> Any:
-    """The same, with six significant digits of every float."""
-    if isinstance(value, dict):
-        return {k: rounded(v) for k, v in value.items()}
-    if isinstance(value, list):
-        return [rounded(v) for v in value]
-    return float(f"{value:.6g}") if isinstance(value, float) else value
+    if "x" in mean:
+        return np.hypot(*(np.subtract(mean[name], truth[name]) for name in "xy"))
+    name = next(iter(mean))
+    return np.abs(np.subtract(mean[name], truth[name]))

@@ -117,20 +117,3 @@ def sample_from_start(
     start = torch.zeros(len(tensors), dtype=torch.long)
     target_at = torch.arange(1, len(tensors.phase))
     return Batch.of(tensors, condition_on_poses(tensors, start, n_poses), target_at)
-
-
-def sample_literal(tensors: InteractionTensors, obs_max: int, generator: torch.Generator) -> Batch:
-    """As in the paper: one trajectory, k observations, k uniform in 1 … obs_max, one target.
-
-    Action and effect are observed at the same times; w₁ is 1, 0 or uniform between, one in three.
-    """
-
-    def draw(high, n=1):
-        return torch.randint(high, (n,), generator=generator)
-
-    part, last = tensors.select(draw(len(tensors))), len(tensors.phase)
-    at, target_at = draw(last, 1 + int(draw(obs_max))), draw(last)
-    kind, weight = int(draw(3)), torch.rand(1, generator=generator)
-    weight = weight if kind == 2 else torch.tensor([float(kind)])
-    observed = Observations.of(part, part.action_at(at), part.effect_at(at), weight)
-    return Batch.of(part, observed, target_at)

@@ -70,26 +70,6 @@ def fit_sigma_scale(
     return model.sigma_scale
 
 
-def calibration_rows(
-    model: EffectModel,
-    tensors: InteractionTensors,
-    /,
-    phases: Sequence[float] = AFTER_CONTACT,
-    **columns: Any,
-) -> list[dict[str, Any]]:
-    """One row per phase and effect channel: n, coverage at 50 and 90 %, mean σ and NLL.
-
-    The likelihood is a density of metres or radians; it compares models, not channels.
-    """
-    truth, mean, std = effects_at(model, tensors, phases)
-    rows = []
-    for i, phase in enumerate(phases):
-        for k, channel in enumerate(model.effect_channels):
-            row = calibration_row(truth[:, i, k], mean[:, i, k], std[:, i, k])
-            rows.append({**columns, "phase": phase, "channel": channel, **row})
-    return rows
-
-
 def calibration_row(truth: Tensor, mean: Tensor, std: Tensor) -> dict[str, Any]:
     """n, coverage of the central intervals, mean σ and NLL of values (N,)."""
     row = {f"coverage_{v:.0%}"[:-1]: coverage(truth, mean, std, v) for v in LEVELS}

@@ -17,14 +17,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from affordlib.interactions.dataset import InteractionTensors, Split, augment_by_symmetry
+from affordlib.interactions.dataset import InteractionTensors
 from affordlib.interactions.lever_up import (
     LEVER_ACTION_CHANNELS,
-    MIRRORED,
     N_OBSERVED,
     N_PREDICTED,
     POSE_CHANNELS,
-    lever_up_tensors,
     n_windows,
 )
 from affordlib.interactions.sampling import (
@@ -134,24 +132,6 @@ TRAINED_FOR = {
     "first_step": (sample_from_start, from_start_errors_m),
 }
 """Sampler and score of each training; `first_step` stands for `image_only` as well, see above."""
-
-
-def lever_training(lever: LeverModel, data: "xarray.Dataset", split: Split) -> InteractionTensors:
-    """What a network learns from: a split's training part and its mirror image."""
-    return augment_by_symmetry(lever_up_tensors(data, split.train, lever.view), MIRRORED)
-
-
-def train_lever_model(
-    lever: LeverModel,
-    data: "xarray.Dataset",
-    split: Split,
-    trained_for: str = "all",
-    resume_checkpoint: Path | None = None,
-) -> tuple[EffectNetwork, list[TrainingRecord]]:
-    """`fit_lever_model` on a split's training part and its mirror image."""
-    training = lever_training(lever, data, split)
-    validation = lever_up_tensors(data, split.validation, lever.view)
-    return fit_lever_model(lever, training, validation, trained_for, resume_checkpoint)
 
 
 def fit_lever_model(

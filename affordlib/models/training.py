@@ -1,8 +1,8 @@
 """Training: one plain loop over batches of trajectories, with early stopping (Section 3.2).
 
 The paper draws one trajectory and one target an iteration; here many trajectories, each with many
-targets, share a step, some 200 times as many targets a second. `train_literal` is the paper's loop,
-for comparison. `train_model` does all: data set and split in, calibrated network out.
+targets, share a step, some 200 times as many targets a second; the paper's loop, for comparison, is
+among the experiments. `train_model` does all: data set and split in, calibrated network out.
 """
 
 import math
@@ -25,14 +25,14 @@ from affordlib.interactions.dataset import (
     Symmetry,
     augment_by_symmetry,
 )
-from affordlib.interactions.sampling import Batch, sample_literal, sample_mixed
+from affordlib.interactions.sampling import Batch, sample_mixed
 from affordlib.models.base import EffectNetwork, NetworkConfig
 from affordlib.models.calibration import effects_at, fit_sigma_scale
 from affordlib.models.checkpoint import build, load_state, save_state
 from affordlib.models.cnp import CNPConfig
 from affordlib.models.domain import TrainingDomain
 from affordlib.models.lstm import LSTMNetwork, effects_at_steps
-from affordlib.types import check_count, check_field, check_within
+from affordlib.types import check_count, check_field
 
 Sampler = Callable[[InteractionTensors, int, int, torch.Generator], Batch]
 Score = Callable[[EffectNetwork, InteractionTensors], torch.Tensor]
@@ -248,35 +248,6 @@ def batch_loss(model: EffectNetwork, batch: Batch, beta: float = 0.0) -> torch.T
     """Mean negative log-likelihood of a batch's targets; for beta see `EffectNetwork.loss`."""
     b = batch
     return model.loss(b.image, b.observations, b.t_target, b.action, b.effect, beta)
-
-
-def train_literal(
-    model: EffectNetwork,
-    training: InteractionTensors,
-    iterations: int = 1_000_000,
-    obs_max: int = 10,
-    learning_rate: float = 1e-4,
-    seed: int = 0,
-    after: Callable[[int], object] = bool,
-) -> list[float]:
-    """The paper's loop (Section 3.2), in place: one trajectory and one target an iteration, Adam.
-
-    Returns the losses. A million iterations, as in the paper, take hours. after: gets each number.
-    """
-    check_count("iterations", iterations)
-    check_count("obs_max", obs_max, 1, 100_000)
-    check_within("learning_rate", learning_rate, 1e-7, 1.0)
-    generator = torch.Generator().manual_seed(check_count("seed", seed, 0, 2**63 - 1))
-    optimiser = torch.optim.Adam(model.parameters(), lr=learning_rate)
-    losses = []
-    for iteration in range(1, iterations + 1):
-        loss = batch_loss(model, sample_literal(training, obs_max, generator))
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-        losses.append(loss.item())
-        after(iteration)
-    return losses
 
 
 def untrained(config: NetworkConfig, training: InteractionTensors, seed: int) -> EffectNetwork:

@@ -9,7 +9,7 @@ from affordlib.planning.closed_loop import (
     run_closed_loop,
 )
 from affordlib.planning.continuous import plan_continuous
-from affordlib.planning.disturbances import Disturbance, DisturbanceSchedule, sample_disturbances
+from affordlib.planning.disturbances import Disturbance, DisturbanceSchedule
 from affordlib.planning.effect_map import EffectMap
 from affordlib.planning.gradient import plan_gradient
 from affordlib.planning.problem import MODES, PlanMode, PlanningProblem

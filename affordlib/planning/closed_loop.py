@@ -36,12 +36,6 @@ from affordlib.types import (
     check_within,
 )
 
-Replan = Callable[[np.ndarray, tuple[float, float], Goal], Plan]
-"""A planner as (image, start_xy_m, goal) → Plan."""
-
-ENOUGH_M = 0.0003
-"""What a corrective action leaves anyway; nearer to the goal than this, none is tried."""
-
 SURPRISE_M = 0.002
 """An object that is farther than this from its predicted position makes the plan worthless."""
 
@@ -62,49 +56,19 @@ MAX_LIFTS = 2
 HEIGHT_TOLERANCE_M = 0.003
 
 
-def execute_plan(
-    robot: Robot,
-    plan: Plan,
-    corrections: int = 0,
-    replan: Replan | None = None,
-) -> Outcome:
+def execute_plan(robot: Robot, plan: Plan) -> Outcome:
     """Execute a plan's steps as planned, each action relative to where the object then stands.
 
     The outcome is what the robot recorded. Raises UnreachableError when the arm cannot follow a
-    step; it has the outcome of those before. corrections: after the last step, unless it holds the
-    object, at most so many single actions, each the first of a plan that `replan` makes from a new
-    image, and each only if it is expected to bring the object nearer.
+    step; it has the outcome of those before.
     """
-    if corrections and replan is None:
-        raise ValueError(f"corrections = {corrections} need a planner; give replan as well")
     done: list[Execution] = []
-
-    def execute(step):
-        try:
+    try:
+        for step in plan.steps:
             done.append(robot.execute(step))
-        except UnreachableError as error:
-            error.outcome = _outcome(robot, plan, done)
-            raise
-
-    for step in plan.steps:
-        execute(step)
-    held = bool(plan.steps) and plan.steps[-1].primitive.holds
-    for _ in range(0 if held else corrections):
-        try:
-            seen = robot.observe()
-        except NothingSeenError:
-            break
-        distance_m = plan.goal.distance_m(seen.xy_m)
-        if distance_m <= ENOUGH_M or not _is_seen_on_table(seen):
-            break
-        # A planner content within the goal's tolerance would have nothing to correct.
-        exactly = replace(plan.goal, tolerance_m=min(plan.goal.tolerance_m, ENOUGH_M))
-        steps = replan(seen.image, seen.xy_m, exactly).steps[:1]
-        if not steps or plan.goal.distance_m(steps[0].predicted_end_xy_m) >= distance_m:
-            break
-        if not robot.can_reach(steps[0].primitive, steps[0].stop_phase):
-            break
-        execute(steps[0])
+    except UnreachableError as error:
+        error.outcome = _outcome(robot, plan, done)
+        raise
     return _outcome(robot, plan, done)
 
 
@@ -125,7 +89,8 @@ def _outcome(robot: Robot, plan: Plan, done: Sequence[Execution]) -> Outcome:
     )
 
 
-def _is_seen_on_table(seen: Observation) -> bool:
+def is_seen_on_table(seen: Observation) -> bool:
+    """Whether the image shows an object, and on the table."""
     return bool(seen.image[1].any() and is_on_table(np.array([seen.xy_m]))[0])
 
 
@@ -286,7 +251,7 @@ class _ClosedLoop:
             off_m, fell = surprise()
         self.seen = self._with_yaw(seen, fell, DISPLACED_M < off_m < math.inf)
         self.seen_xy_m.append(self.seen.xy_m)
-        if not _is_seen_on_table(self.seen):
+        if not is_seen_on_table(self.seen):
             return Ending("lost", f"the object is no longer on the table, after {self._count()}")
         self.goal = self.goal_now()
         goal_moved = self.acted_for is not None and self.acted_for != self.goal

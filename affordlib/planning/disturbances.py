@@ -10,8 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
 from affordlib.planning.robot import Execution
 from affordlib.types import (
     TABLE_X_M,
@@ -137,31 +135,3 @@ class DisturbanceSchedule:
     def __getattr__(self, name: str) -> Any:
         """All else as the tabletop does."""
         return getattr(self.world, name)
-
-
-def sample_disturbances(
-    seed: int, n: int = 1, n_actions: int = 2, kinds: Sequence[str] = KINDS
-) -> tuple[Disturbance, ...]:
-    """A schedule of n disturbances, a function of the seed alone.
-
-    Each comes in the middle of one of n_actions actions, or (never before the first) between two:
-    shoves of 3 to 10 cm and up to half a turn, knocks of 0.2 to 0.5 m/s, goals that move by 3 to
-    10 cm.
-    """
-    if not kinds or not set(map(str, kinds)) <= set(KINDS):
-        raise ValueError(f"kinds must be at least one of {KINDS}, got {kinds!r:.100}")
-    check_count("n", n, 0, 1000)
-    check_count("n_actions", n_actions, 1, 1000)
-    rng = np.random.default_rng(check_count("seed", seed, least=0))
-    drawn = []
-    for _ in range(n):
-        kind = str(rng.choice(list(kinds)))
-        action, angle = int(rng.integers(n_actions)), rng.uniform(-math.pi, math.pi)
-        low, high = (0.2, 0.5) if kind == "knock" else (0.03, 0.1)
-        size = rng.uniform(low, high)
-        turn = rng.uniform(-math.pi, math.pi) if kind == "shove" else 0.0
-        middle = kind == "knock" or (kind != "shove" and rng.random() < 0.5)
-        at_s = float(rng.uniform(2.0, 5.5)) if middle else None
-        xy = float(size * math.cos(angle)), float(size * math.sin(angle))
-        drawn.append(Disturbance(kind, action + (not middle), *xy, float(turn), at_s))
-    return tuple(drawn)

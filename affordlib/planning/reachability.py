@@ -16,7 +16,7 @@ from affordlib.models.checkpoint import restored, write_weights
 from affordlib.paths import repo_root
 from affordlib.primitives import primitive_named
 
-_HIDDEN, _STEPS, _RATE = 64, 1500, 1e-2
+_HIDDEN = 64
 SHIPPED = "data/checkpoints/reachability.safetensors"
 _FORMAT = "affordlib reachability 1"
 _REMEDY = "learn it again with python -m experiments.shipped reachability"
@@ -70,40 +70,12 @@ class Reachability(nn.Module):
         turn = np.nan if direction_rad is None else direction_rad
         turn = np.broadcast_to(np.asarray(turn, dtype=float), len(xy_m))
         number = np.full(len(xy_m), self.primitives.index(primitive))
-        features = _features(np.eye(len(self.primitives))[number], xy_m, turn)
+        features = reach_features(np.eye(len(self.primitives))[number], xy_m, turn)
         return torch.sigmoid(self.layers(features)).squeeze(-1).numpy()
 
 
-def _features(kind: np.ndarray, xy_m: np.ndarray, direction_rad: np.ndarray) -> torch.Tensor:
+def reach_features(kind: np.ndarray, xy_m: np.ndarray, direction_rad: np.ndarray) -> torch.Tensor:
     """(n, 4 + primitives): place, direction (zero where there is none), which primitive."""
     ahead = np.column_stack([np.cos(direction_rad), np.sin(direction_rad)])
     ahead[np.isnan(direction_rad)] = 0.0
     return torch.from_numpy(np.hstack([2 * xy_m, ahead, kind])).float()
-
-
-def learn_reachability(data: "xarray.Dataset", seed: int = 0) -> Reachability:
-    """Train on a set of interactions with objects all over the table; seconds on one core.
-
-    The arm stands on the table's x axis, so every interaction is seen mirrored as well.
-    """
-    number = data["primitive"].values
-    xy_m = data["believed_xy"].values
-    names = data["primitive"].attrs["flag_meanings"].split()
-    direction = data["theta"].values + np.where(number == names.index("push"), np.pi, 0.0)
-    kind = np.eye(len(names))[number]
-    reached = torch.from_numpy(data["reached"].values).float()
-    inputs = torch.cat(
-        [_features(kind, xy_m, direction), _features(kind, xy_m * [1, -1], -direction)]
-    )
-    torch.manual_seed(seed)
-    model = Reachability(names)
-    optimiser = torch.optim.AdamW(model.parameters(), _RATE)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, _RATE, _STEPS)
-    for _ in range(_STEPS):
-        logits = model.layers(inputs).squeeze(-1)
-        loss = nn.functional.binary_cross_entropy_with_logits(logits, reached.repeat(2))
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-        schedule.step()
-    return model.eval()

@@ -17,7 +17,6 @@ from affordlib.models import (
     OutOfRangeWarning,
     TrainingDomain,
     build,
-    calibration_rows,
     condition_on_primitives,
     coverage,
     fit_sigma_scale,
@@ -34,6 +33,7 @@ from affordlib.types import Observations
 from affordlib.world import Cuboid, UprightCylinder
 from experiments.attention import AttentionConfig
 from experiments.lstm_seker2019 import SekerConfig
+from experiments.uncertainty import calibration_rows
 
 YAW = {"action_channels": ("x", "y", "yaw"), "effect_channels": ("x", "y", "yaw")}
 SMALL = {"width": 32, "blocks": 2, "rings": 3, "orders": 4}

@@ -10,7 +10,7 @@ import torch
 
 from affordlib.evaluation.baselines import constant
 from affordlib.interactions import InteractionTensors, Scaler, split_interactions
-from affordlib.interactions.sampling import condition_on_recorded_action, sample_literal
+from affordlib.interactions.sampling import condition_on_recorded_action
 from affordlib.models import (
     CNPConfig,
     FiLMConfig,
@@ -18,10 +18,10 @@ from affordlib.models import (
     build,
     load_checkpoint,
     train,
-    train_literal,
 )
 from affordlib.models.training import batch_loss, final_errors_m
 from affordlib.types import Observations
+from experiments.literal import sample_literal, train_literal
 
 
 def fresh(arrays):

@@ -21,7 +21,6 @@ from affordlib.planning import (
     plan_continuous,
     plan_gradient,
     run_closed_loop,
-    sample_disturbances,
 )
 from affordlib.planning.closed_loop import DISPLACED_M
 from affordlib.planning.grasp_rotate import GRIPPER_YAWS_RAD
@@ -38,7 +37,8 @@ from affordlib.world import (
 )
 from affordlib.world.execution import put_down
 from affordlib.world.objects import PlacedObject
-from experiments.closed_loop import Trial, _stays_feasible
+from experiments.closed_loop import Trial, _stays_feasible, sample_disturbances
+from experiments.planning import corrected
 from tests.planning.point_robot import PointRobot, point_skills
 from tests.problems import problem_of
 
@@ -288,16 +288,14 @@ def test_corrections_bring_it_nearer_and_stop_where_enough():
 
     robot = PointRobot()
     plan = plan_astar(problem_of(point_skills().model(Push), robot.observe().image, (0, 0), goal))
-    open_loop, closed = execute_plan(PointRobot(), plan), execute_plan(robot, plan, 2, replan)
+    open_loop = execute_plan(PointRobot(), plan)
+    closed = corrected(robot, execute_plan(robot, plan), replan, 2)
     assert closed.distance_m == goal.distance_m(robot.xy_m) < 0.5 * open_loop.distance_m
     assert len(plan.steps) < len(closed.object_paths_xy_m) <= len(plan.steps) + 2
     assert set(asked) == {0.0003}
     none = Plan(goal, goal.xy_m, (), "none", True, 0.0)
-    assert execute_plan(PointRobot(plan.goal.xy_m), none, 2, replan).object_paths_xy_m == ()
-    with pytest.raises(ValueError, match="need a planner"):
-        execute_plan(robot, plan, 1)
-    held = replace(plan, steps=(Step(Grasp(), 1.0, (0.0, 0.0), np.zeros((2, 2))),))
-    assert len(execute_plan(PointRobot(), held, 2, replan).object_paths_xy_m) == 1
+    there = PointRobot(plan.goal.xy_m)
+    assert corrected(there, execute_plan(there, none), replan, 2).object_paths_xy_m == ()
 
 
 def test_what_was_done_before_the_arm_refused_is_kept():
@@ -316,10 +314,8 @@ def test_what_was_done_before_the_arm_refused_is_kept():
     assert len(outcome.object_paths_xy_m) == 2
     assert outcome.end_pose[:2] == robot.xy_m == pytest.approx((0.189, 0.0))
     assert outcome.distance_m == plan.goal.distance_m(robot.xy_m)
-    near = replace(plan, steps=(can,))
-    with pytest.raises(UnreachableError) as refused:
-        execute_plan(robot, near, 1, lambda *_: replace(plan, steps=(cannot,)))
-    assert len(refused.value.outcome.object_paths_xy_m) == 1
+    once = execute_plan(robot, replace(plan, steps=(can,)))
+    assert corrected(robot, once, lambda *_: replace(plan, steps=(cannot,)), 1) is once
     robot.refuses = lambda *_: False  # it agrees to what it then cannot do
     went = loop(robot, Goal(robot.xy_m, height_m=0.1))
     assert (went.status, went.message) == ("unreachable", "the height: out of reach")

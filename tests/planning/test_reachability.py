@@ -7,9 +7,10 @@ import pytest
 
 from affordlib import primitives
 from affordlib.interactions import open_interactions
-from affordlib.planning.reachability import Reachability, learn_reachability
+from affordlib.planning.reachability import Reachability
 from affordlib.primitives import Drag, Grasp, Push, Rotate
 from affordlib.world import UnreachableError, robot
+from experiments.shipped import learn_reachability
 
 KINDS = {
     "push": lambda angle: Push.towards(angle),
