@@ -138,7 +138,7 @@ html: $(STAMP) ## Write the committed notebooks as web pages, to be read without
 	  -e 's#href="(\.\./)+((data/)?[A-Za-z]+\.md)#href="../../\2#g' -e 's#href="solutions/#href="../../notebooks/solutions/#g' runs/html/*.html
 
 tables: $(STAMP) ## Draw the tables of README, RESULTS and data card from data/results
-	@$(PY) -m affordlib.results README.md RESULTS.md data/README.md
+	@$(PY) -m experiments.tables README.md RESULTS.md data/README.md
 
 constraints: $(STAMP) ## Write constraints.txt from what is installed
 	@{ sed -n '/^#/p;/^[^#]/q' constraints.txt; \

@@ -1,20 +1,13 @@
-"""Results are data: the tables that a notebook writes, and the tables drawn from them.
+"""Results are data: the tables that a notebook writes, and plans.
 
 A notebook writes `<out_dir>/<notebook>.json`, which is
 `{"notebook", "parameters", "versions", "tables": {name: [flat rows]}}`. Columns carry their units
-(`mean_m`, `plan_ms_median`, `tp_percent`). A page in Markdown holds
-
-    <!-- table: data/results/06_planning.json#planning columns=planner,mode,mean_m -->
-    <!-- /table -->
-
-and `python -m affordlib.results README.md` fills it; `--check` fails if that would change it.
-Any other option, such as `mode=multi_partial`, keeps the rows that have that value.
+(`mean_m`, `plan_ms_median`, `tp_percent`). `python -m experiments.tables` draws pages from them.
 
 Plans, with their goals, are JSON files too, that can be kept, sent, and executed later. Numbers
 come back to the last bit; a σ that the planner did not give is null in the file.
 """
 
-import argparse
 import glob
 import importlib.metadata
 import json
@@ -22,7 +15,6 @@ import math
 import os
 import platform
 import re
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -32,7 +24,6 @@ import numpy as np
 import psutil
 
 import affordlib
-from affordlib.commands import command
 from affordlib.paths import from_root, resolve_out_dir
 from affordlib.primitives import Primitive, PushAt, primitive_named
 from affordlib.types import Goal, Plan, Step
@@ -51,13 +42,6 @@ UNITS = {
 _MARK, _PLAN_MARK = b'{\n "notebook"', b'{\n "goal"'
 _STATISTIC = "_(?:mean|median|sem|std|min|max|p5|p95)"
 _WITH_UNIT = re.compile(f"(.+?)_({'|'.join(UNITS)})((?:{_STATISTIC})*)")
-MARKUP = str.maketrans({"&": "&amp;", "<": "&lt;", ">": "&gt;", "[": "&#91;", "|": "\\|"})
-"""For `str.translate`: keeps what a text of results holds from being markup in Markdown or HTML."""
-
-BLOCK = re.compile(
-    r"(?P<open>^<!-- table: (?P<what>.*?) -->\n)(?P<body>.*?)(?P<close>^<!-- /table -->$)",
-    re.DOTALL | re.MULTILINE,
-)
 
 
 def versions() -> dict[str, str]:
@@ -239,20 +223,9 @@ def results_table(
     """
     import pandas  # here, for it takes as long to import as all else
 
-    names = _columns(rows, columns)
+    names = columns_of(rows, columns)
     cells = [[cell(name, row.get(name)) for name in names] for row in rows]
     return pandas.DataFrame(cells, columns=[heading(n) for n in names], index=[""] * len(cells))
-
-
-def markdown_table(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = None) -> str:
-    """Return rows as a Markdown table with the headings and digits of `results_table`."""
-    frame, lines = results_table(rows, columns), []
-    for name in _columns(rows, columns):
-        values = {type(v) for row in rows if (v := row.get(name)) is not None}
-        lines.append("---:" if values and values <= {int, float} else "---")
-    lines = [list(frame.columns), lines, *frame.values.tolist()]
-    lines = [" | ".join(text.translate(MARKUP) for text in line) for line in lines]
-    return "".join(f"| {line} |\n" for line in lines)
 
 
 def heading(column: str) -> str:
@@ -283,66 +256,16 @@ def cell(column: str, value: object) -> str:
     return " ".join(str(value).splitlines())
 
 
-def fill_tables(text: str) -> str:
-    """Return a Markdown page with each of its table blocks drawn anew from its results file."""
-
-    def fill(block):
-        source, *options = block["what"].split()
-        path, _, name = source.partition("#")
-        tables = read_results(path)["tables"]
-        if name not in tables:
-            raise ValueError(f"table: {path} has no table {name!r}, only {', '.join(tables)}")
-        rows, columns = tables[name], None
-        for option in options:
-            key, _, value = option.partition("=")
-            if key == "columns":
-                columns = value.split(",")
-            else:
-                _columns(rows, [key])
-                rows = [row for row in rows if str(row.get(key)) in value.split(",")]
-                if not rows:
-                    raise ValueError(f"table: no row of {source} has {option}")
-        return f"{block['open']}{markdown_table(rows, columns)}{block['close']}"
-
-    filled, count = BLOCK.subn(fill, text)
-    if count != text.count("<!-- table:") or count != text.count("<!-- /table -->"):
-        raise ValueError("table: a block is not closed; each ends with the line <!-- /table -->")
-    return filled
-
-
-@command(OSError, ValueError)
-def main(argv: Sequence[str] | None = None) -> int:
-    """Fill the tables of Markdown pages, or with `--check` say which pages are out of date."""
-    parser = argparse.ArgumentParser(prog="python -m affordlib.results", description=main.__doc__)
-    parser.add_argument("pages", nargs="+", type=Path)
-    parser.add_argument("--check", action="store_true", help="change nothing, fail if one would")
-    options = parser.parse_args(argv)
-    stale = False
-    for page in options.pages:
-        text = page.read_text(encoding="utf-8")
-        if (filled := fill_tables(text)) == text:
-            continue
-        if options.check:
-            print(f"out of date; run: python -m affordlib.results {page}", file=sys.stderr)
-            stale = True
-        else:
-            write_atomically(page, filled)
-    return int(stale)
-
-
 def _split_unit(column: str) -> tuple[str, str | None]:
     """A column's name without its unit, the last word or the last before a statistic, and that."""
     found = _WITH_UNIT.fullmatch(column)
     return (found[1] + found[3], found[2]) if found else (column, None)
 
 
-def _columns(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None) -> list[str]:
+def columns_of(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None) -> list[str]:
+    """The names of the columns of rows, or those of them that are given."""
     there = list(dict.fromkeys(name for row in rows for name in row))
     for name in columns or ():
         if rows and name not in there:
             raise ValueError(f"columns: {name!r} is not in the table; it has {', '.join(there)}")
     return there if columns is None else list(columns)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

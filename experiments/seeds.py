@@ -26,6 +26,7 @@ from affordlib.paths import repo_root
 from affordlib.workbook import WorkbookError, run_name
 from affordlib.workers import dask_client
 from experiments.runner import plain
+from experiments.tables import MARKUP, markdown_table
 
 PANELS = 4
 """Columns that are drawn at most."""
@@ -112,8 +113,8 @@ def gather(folders: Mapping[int, Path], into: Path) -> Path:
         page.append(f"## {name}")
         for number, table in enumerate(dict.fromkeys(table for run in runs for table in run)):
             together[table], picture = over_seeds([run.get(table, []) for run in runs])
-            page.append(f"### {table.replace('_', ' ').translate(results.MARKUP)}")
-            page.append(results.markdown_table(together[table]) if together[table] else "Empty.")
+            page.append(f"### {table.replace('_', ' ').translate(MARKUP)}")
+            page.append(markdown_table(together[table]) if together[table] else "Empty.")
             if picture:
                 results.write_atomically(into / f"{name}-{number}.png", picture)
                 page.append(f"![each seed]({name}-{number}.png)")

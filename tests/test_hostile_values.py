@@ -132,7 +132,7 @@ def shop(one_world, skills, pushes, tmp_path_factory):
     step = Step(Push(0.0), 0.5, (0.02, 0.0), path)
     plan = Plan(goal, AT, (step,), "by hand", True, 0.0)
     problem = planning.PlanningProblem(AT, goal, planning.EffectMap(model, image), "single_partial")
-    once = planning.ClosedLoopConfig(max_actions=1, horizon=1)
+    once = planning.ClosedLoopConfig(max_actions=1)
     pursuit = planning.run_closed_loop(one_world, goal, skills, config=once)
     figure, (_, ax) = plt.figure(), plt.subplots()
     rows = read_results("data/results/planning.json")["tables"]["summary"][:3]

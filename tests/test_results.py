@@ -15,7 +15,9 @@ import pytest
 from nbconvert.filters.markdown_mistune import markdown2html_mistune
 
 from affordlib import paths, results
-from affordlib.results import fill_tables, markdown_table, read_results, write_results
+from affordlib.results import read_results, write_results
+from experiments import tables
+from experiments.tables import fill_tables, markdown_table
 
 ROWS = [
     {"planner": "astar", "n": 30, "mean_m": 0.00441, "plan_ms_median": 12.345, "tp_percent": 80.0},
@@ -185,12 +187,12 @@ def test_pages_are_filled_and_checked(tmp_path, capsys):
     page = tmp_path / "page.md"
     opened = f"<!-- table: {source}#planning -->\n"
     page.write_text(f"# Title\n\n{opened}stale\n<!-- /table -->\n\nend\n")
-    assert results.main(["--check", str(page)]) == 1
-    assert "python -m affordlib.results" in capsys.readouterr().err
+    assert tables.main(["--check", str(page)]) == 1
+    assert "python -m experiments.tables" in capsys.readouterr().err
     assert "stale" in page.read_text()
-    assert results.main([str(page)]) == 0
+    assert tables.main([str(page)]) == 0
     assert page.read_text() == f"# Title\n\n{opened}{MARKDOWN}<!-- /table -->\n\nend\n"
-    assert results.main(["--check", str(page)]) == 0
+    assert tables.main(["--check", str(page)]) == 0
 
 
 def test_blocks_choose_rows_and_columns(tmp_path):
@@ -211,7 +213,7 @@ def test_the_pages_and_the_shipped_results_agree_and_carry_no_path():
     pages = [
         str(paths.repo_root() / name) for name in ("README.md", "RESULTS.md", "data/README.md")
     ]
-    assert results.main(["--check", *pages]) == 0
+    assert tables.main(["--check", *pages]) == 0
     for path in (paths.repo_root() / "data" / "results").glob("*.json"):
         assert read_results(path)["notebook"] == path.stem
         given = json.loads(path.read_text())["parameters"].values()

@@ -20,7 +20,7 @@ from affordlib.planning import grasp_rotate
 from affordlib.planning.continuous import plan_continuous
 from affordlib.planning.grasp_rotate import GRIPPER_YAWS_RAD, TURN_TOLERANCE_RAD
 from affordlib.planning.move_planner import Ending, MovePlanner
-from affordlib.planning.problem import PlanMode, PlanningProblem, is_on_table
+from affordlib.planning.problem import MODES, PlanningProblem, is_on_table
 from affordlib.planning.robot import Execution, Robot
 from affordlib.planning.skills import Skills
 from affordlib.primitives import EMPTY_M, Drag, Grasp, Rotate
@@ -99,20 +99,17 @@ class ClosedLoopConfig:
     """With how many actions a goal is to be met, and who is told of them.
 
     max_actions: default `action_limit` of the distance, renewed when the goal moves or somebody
-    displaces the object. horizon: the longest chain the planner may return. n_images: of which an
-    observation is the mean; with eight of the Kinect a turn is seen to a degree. on_action: called
-    with the plan and the number of actions taken, after each; on_plan: with a plan before its
-    first.
+    displaces the object. n_images: of which an observation is the mean; with eight of the Kinect a
+    turn is seen to a degree. on_action: called with the plan and the number of actions taken, after
+    each; on_plan: with a plan before its first.
     """
 
     max_actions: int | None = None
-    horizon: int = 3
     n_images: int = 1
     on_action: Callable[[Plan, int], None] = lambda *_: None
     on_plan: Callable[[Plan], None] = lambda *_: None
 
     def __post_init__(self) -> None:
-        check_count("horizon", self.horizon, 1, 10)
         check_count("n_images", self.n_images, 1, 100)
         if self.max_actions is not None:
             check_count("max_actions", self.max_actions, least=0)
@@ -194,7 +191,7 @@ class _ClosedLoop:
         self.robot, self.goal_now, self.skills, self.config = robot, goal_now, skills, config
         self.goal = goal_now()  # as it was when last asked: before each action, and after a lift
         self.acted_for: Goal | None = None
-        self.moves = MovePlanner(robot, skills, planner, PlanMode(config.horizon, partial=True))
+        self.moves = MovePlanner(robot, skills, planner, MODES["multi_partial"])
         self.steps: list[Step] = []
         self.executions: list[Execution] = []
         self.plans: list[Plan] = []
