@@ -18,11 +18,14 @@ import importlib.metadata
 import json
 import logging
 import math
+import multiprocessing
 import os
 import platform
 import re
+import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Sequence
 from contextlib import nullcontext, suppress
@@ -39,7 +42,7 @@ from filelock import FileLock, Timeout
 from jupyter_client.kernelspec import KernelSpec
 from jupyter_client.manager import AsyncKernelManager
 
-from affordlib.commands import command, seed_type
+from affordlib.commands import command, count_type, seed_type
 from affordlib.paths import repo_root, resolve_out_dir
 from affordlib.results import read_results, write_atomically
 
@@ -269,10 +272,11 @@ def is_complete(job: Job, mark: str) -> bool:
 
 
 def run(
-    jobs: Sequence[Job], environment: str, only: Sequence[str], force: bool, dry_run: bool
+    jobs: Sequence[Job], environment: str, only: Sequence[str], options: argparse.Namespace
 ) -> None:
     """Execute what is not complete, in order; raises WorkbookError at the first failure."""
     before: list[str | None] = []  # the hash of each earlier notebook; None if this run lacks it
+    left = []
     for number, job in enumerate(jobs, 1):
         cells = [[c.cell_type, c.source, c.metadata.get("tags", [])] for c in job.notebook.cells]
         inputs = json.dumps([job.parameters, cells, environment, before], sort_keys=True)
@@ -281,17 +285,33 @@ def run(
         before.append(mark if complete or wanted else None)
         if not wanted:
             continue
-        print(f"[{number}/{len(jobs)}] {job.name}: ", end="", flush=True)
-        if complete and not force:
-            print("skipped: complete", flush=True)
-        elif dry_run:
-            print(f"would run with {job.parameters}", flush=True)
+        place = f"[{number}/{len(jobs)}] {job.name}"
+        if complete and not options.force:
+            print(f"{place}: skipped: complete", flush=True)
+        elif options.dry_run:
+            print(f"{place}: would run with {job.parameters}", flush=True)
         else:
-            print(f"{execute(job, mark):.1f} s", flush=True)
+            left.append((place, job, mark))
+    if options.workers == 1:
+        for each in left:
+            execute(*each)
+        return
+    with multiprocessing.Pool(options.workers, end_with_parent) as pool:
+        for done in [pool.apply_async(execute, each) for each in left]:
+            done.get()
 
 
-def execute(job: Job, mark: str) -> float:
-    """Execute one notebook, check what it wrote, mark it as complete; return the seconds."""
+def end_with_parent() -> None:
+    """Have this process, and so its kernel, end as soon as its parent ends or stops it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    parent = multiprocessing.parent_process()
+    threading.Thread(target=lambda: (parent.join(), os._exit(1)), daemon=True).start()
+
+
+def execute(place: str, job: Job, mark: str) -> None:
+    """Execute one notebook, check what it wrote, mark it as complete; say how long it took."""
+    print(f"{place} …", flush=True)
     start = time.monotonic()
     job.results.unlink(missing_ok=True)
     try:
@@ -313,14 +333,14 @@ def execute(job: Job, mark: str) -> float:
         logging.getLogger("asyncio").setLevel(logging.CRITICAL)
         raise
     except Exception as error:
-        print("failed", flush=True)
+        print(f"{place}: failed", flush=True)
         raise WorkbookError(explained(job, error)) from None
     notebook = read_notebook(job.copy)
     if job.in_place:
         write_atomically(job.path, cleaned(copy.deepcopy(notebook)))
     notebook.metadata["complete"] = mark
     write_atomically(job.copy, nbformat.writes(notebook))
-    return time.monotonic() - start
+    print(f"{place}: {time.monotonic() - start:.1f} s", flush=True)
 
 
 def explained(job: Job, error: Exception) -> str:
@@ -350,6 +370,7 @@ def main(argv: Sequence[str] | None = None, root: Path | None = None) -> int:
         "--out", default="", metavar="NAME", help="folder under runs/; default: the profile"
     )
     parser.add_argument("--only", default="", metavar="'03 06'", help="run only these notebooks")
+    parser.add_argument("--workers", type=count_type, default=1, help="notebooks side by side")
     parser.add_argument("--force", action="store_true", help="run also what is complete")
     parser.add_argument("--dry-run", action="store_true", help="say what would run")
     parser.add_argument(
@@ -369,7 +390,7 @@ def main(argv: Sequence[str] | None = None, root: Path | None = None) -> int:
         lock = FileLock(resolve_out_dir(folder) / ".lock", timeout=0)
     try:
         with lock:
-            run(jobs, environment_hash(root), only, options.force, options.dry_run)
+            run(jobs, environment_hash(root), only, options)
     except Timeout:
         raise WorkbookError(
             f"another runner is writing {os.path.relpath(folder)}; wait for it, or choose another "

@@ -101,8 +101,9 @@ def finished(tmp_path_factory):
 def test_a_run_leaves_copies_and_results_with_their_parameters(finished):
     book, done = finished
     assert (done.returncode, done.stderr) == (0, "")
-    said = r"\[1/2\] 01_first: \d+\.\d s\n\[2/2\] 02_second: \d+\.\d s\n"
-    assert re.fullmatch(said, done.stdout)
+    said = re.sub(r"\d+\.\d s", "1.0 s", done.stdout).splitlines()
+    places = "[1/2] 01_first", "[2/2] 02_second"
+    assert said == [f"{place}{end}" for place in places for end in (" …", ": 1.0 s")]
     run = book.runs / RUN
     files = {f"{name}.{end}" for name in ("01_first", "02_second") for end in ("ipynb", "json")}
     assert {path.name for path in run.iterdir()} == {*files, ".lock", "log.txt"}
@@ -201,8 +202,24 @@ def test_a_failing_notebook_stops_the_batch_and_a_rerun_goes_on(book, capsys, co
 
 
 @pytest.mark.slow
+def test_two_notebooks_run_side_by_side(book):
+    names = "01_first", "02_second"
+    for mine, other in (names, names[::-1]):  # each waits for the other to begin
+        touch = f"import pathlib, time\npathlib.Path({str(book.root)!r}, {mine!r}).touch()"
+        wait = f"while not pathlib.Path({str(book.root)!r}, {other!r}).exists(): time.sleep(0.05)"
+        book.add(mine, touch, wait)
+    book.add("03_third", "1 / 0")
+    done = subprocess.run(book.command("--workers", "2"), capture_output=True, text=True)
+    assert done.returncode == 1
+    assert "[3/3] 03_third: failed" in done.stdout
+    assert done.stderr.startswith("workbook: 03_third failed in cell 3")
+    assert sorted(book.log()) == [*names]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [1, 2])
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
-def test_a_killed_run_counts_as_nothing_and_is_taken_up_again(book, capsys, how):
+def test_a_killed_run_counts_as_nothing_and_is_taken_up_again(book, capsys, how, workers):
     pid, go = book.root / "pid", book.root / "go"
     wait = (
         "import os, pathlib, time\n"
@@ -214,9 +231,11 @@ def test_a_killed_run_counts_as_nothing_and_is_taken_up_again(book, capsys, how)
     book.add("02_second", wait)
     # A job in the background ignores SIGINT, and its children would, too.
     heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
-    process = subprocess.Popen(book.command(), stderr=subprocess.PIPE, text=True, preexec_fn=heed)
+    command, first = book.command("--workers", str(workers)), book.runs / "reader/01_first.ipynb"
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, preexec_fn=heed)
     try:
         wait_until(lambda: pid.exists() and pid.read_text() and process.poll() is None)
+        wait_until(lambda: first.exists() and '"complete"' in first.read_text())
     finally:
         process.send_signal(how)
         _, err = process.communicate(timeout=60)
