@@ -13,6 +13,7 @@ import argparse
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -22,7 +23,7 @@ from torch import Tensor
 from affordlib.commands import command
 from affordlib.geometry import rotated, wrap_angle
 from affordlib.interactions.log import PushLog
-from affordlib.models.fit import SEEN, PretrainedNeuralProcess, PushModel, push_rows, told_feet
+from affordlib.models.fit import PushModel, in_object_frame, push_rows, told_feet
 from affordlib.models.neural_process import (
     load_neural_process,
     save_neural_process,
@@ -47,6 +48,22 @@ TURN_M = 0.04
 N_IMAGES = {"ideal": 1, "kinect": 8}
 """Of which an observation is the mean."""
 WITHIN_M, WITHIN_RAD = 0.005, math.radians(5)
+
+
+SEEN = "np_seen_objects"
+
+
+class PretrainedNeuralProcess:
+    """A neural process for objects that were only seen: what it conditions on are told feet."""
+
+    def __init__(self, name_or_path: str | Path = SEEN) -> None:
+        self.network = load_neural_process(name_or_path)
+
+    def predict(self, pushes: PushLog) -> tuple[np.ndarray, np.ndarray]:
+        """Mean and σ (n, 3) of displacement [m] and turn [rad], in the object's frame."""
+        rows = push_rows(pushes)
+        feet = told_feet(pushes)[0]
+        return in_object_frame(pushes, *self.network.predict(rows[:, :7], rows[:0], feet))
 
 
 def drawn_object(rng: np.random.Generator) -> TabletopObject:

@@ -35,7 +35,7 @@ from tqdm.auto import tqdm
 from affordlib.commands import count_type
 from affordlib.interactions import open_interactions
 from affordlib.interactions.store import stored_sha256
-from affordlib.models.checkpoint import checkpoint_sha256, weights_bytes
+from affordlib.models.checkpoint import read_weights, resolve_checkpoint, weights_sha256
 from affordlib.paths import repo_root, resolve_out_dir
 from affordlib.planning.reachability import SHIPPED as REACHABILITY
 from affordlib.results import write_atomically, write_results
@@ -273,13 +273,20 @@ def _stale(record: dict[str, Any], job: Job) -> str | None:
 def hash_of(name: str, kind: str) -> str | None:
     """Of what is shipped: a kind "data" or "checkpoint" by its name; None where it is not here."""
     if name == "reachability":  # a checkpoint of another kind, which has no description
-        return hashlib.sha256(weights_bytes(repo_root() / REACHABILITY)).hexdigest()
+        return weights_sha256(read_weights(repo_root() / REACHABILITY, "learn it again")[0], "")
     if kind == "checkpoint":
         return checkpoint_sha256(name)
     try:
         return stored_sha256(name)
     except FileNotFoundError:
         return None
+
+
+def checkpoint_sha256(name_or_path: str | Path) -> str:
+    """Hash of all that decides a checkpoint's answers: weights, configuration, scales, domain."""
+    tensors, description = read_weights(resolve_checkpoint(name_or_path), "train it again")
+    decisive = {key: description[key] for key in ("model", "config", "scaler", "domain")}
+    return weights_sha256(tensors, json.dumps(decisive))
 
 
 def _values(settings: Any) -> Any:

@@ -10,10 +10,10 @@ import tokenize
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-LINES = {"affordlib": 12_764, "experiments": 6518, "tests": 9316}
+LINES = {"affordlib": 12_723, "experiments": 6542, "tests": 9316}
 """What is there, rounded up: lower it with every cut. The aim is 9,500, 3,500 and 6,500."""
 
-FILES, CODE = 75, 8733
+FILES, CODE = 75, 8708
 """Of affordlib: files of all kinds, and lines of Python without docstrings, comments and blanks.
 
 The aim is 6,800 of the latter."""

@@ -268,19 +268,17 @@ def centred(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     if corners.ndim != 2 or len(corners) < 3:
         raise ValueError(f"outline must be at least three corners (k, 2), got {corners.shape}")
     following = np.roll(corners, -1, axis=0)
-    k = len(corners)
-    for i in range(k):
-        for j in range(i + 2, k - (i == 0)):
-            sides = [
-                np.sign(cross(following[a] - corners[a], p - corners[a]))
-                for a, b in ((i, j), (j, i))
-                for p in (corners[b], following[b])
-            ]
-            if sides[0] * sides[1] <= 0 and sides[2] * sides[3] <= 0:
-                raise ValueError(
-                    f"outline crosses itself: its edges from corner {i} and from corner {j} meet; "
-                    "give the corners in order around it, each once"
-                )
+    # On which side of each edge each corner is; edges meet that part each other's corners.
+    side = np.sign(cross((following - corners)[:, None], corners - corners[:, None]))
+    parts = side * np.roll(side, -1, axis=1) <= 0
+    meet = np.triu(parts & parts.T, 2)
+    meet[0, -1] = False  # they are neighbours
+    if meet.any():
+        i, j = np.argwhere(meet)[0]
+        raise ValueError(
+            f"outline crosses itself: its edges from corner {i} and from corner {j} meet; "
+            "give the corners in order around it, each once"
+        )
     doubled = cross(corners, following)
     if abs(doubled.sum()) < 1e-9:
         raise ValueError("outline has no area; give its corners in order around it")

@@ -89,13 +89,6 @@ def resolve_checkpoint(name_or_path: str | Path) -> Path:
     return path
 
 
-def checkpoint_sha256(name_or_path: str | Path) -> str:
-    """Hash of all that decides a checkpoint's answers: weights, configuration, scales, domain."""
-    tensors, description = read_weights(resolve_checkpoint(name_or_path), _REMEDY)
-    decisive = {key: description[key] for key in ("model", "config", "scaler", "domain")}
-    return _sha256(tensors, json.dumps(decisive))
-
-
 def _with_tuples(fields: dict[str, Any]) -> dict[str, Any]:
     return {name: tuple(v) if isinstance(v, list) else v for name, v in fields.items()}
 
@@ -141,7 +134,8 @@ def restored(
 _KEY = "affordlib"
 
 
-def _sha256(tensors: dict[str, torch.Tensor], text: str) -> str:
+def weights_sha256(tensors: dict[str, torch.Tensor], text: str) -> str:
+    """Hash of weights and what is said of them."""
     return hashlib.sha256(save(tensors) + text.encode()).hexdigest()
 
 
@@ -151,7 +145,7 @@ def write_weights(
     """Write tensors and a description of plain JSON values as one file; returns its path."""
     tensors = {name: value.contiguous() for name, value in tensors.items()}
     text = json.dumps(description, allow_nan=False)
-    content = json.dumps({"sha256": _sha256(tensors, text), "description": text})
+    content = json.dumps({"sha256": weights_sha256(tensors, text), "description": text})
     path = Path(path)
     write_atomically(path, save(tensors, {_KEY: content}), mark=f'"{_KEY}"'.encode())
     return path
@@ -164,7 +158,7 @@ def read_weights(path: str | Path, remedy: str) -> tuple[dict[str, torch.Tensor]
             content = json.loads((file.metadata() or {})[_KEY])
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         text = content["description"]
-        if content["sha256"] != _sha256(tensors, text):
+        if content["sha256"] != weights_sha256(tensors, text):
             raise ValueError("its hash is another: it was changed after it was written")
         for name, value in tensors.items():
             if value.is_floating_point() and not value.isfinite().all():
@@ -174,11 +168,6 @@ def read_weights(path: str | Path, remedy: str) -> tuple[dict[str, torch.Tensor]
         raise ValueError(f"{path} is no file of weights with a description; {remedy}") from error
     except (SafetensorError, ValueError, TypeError, RecursionError) as error:
         raise ValueError(f"{path} is damaged, or no file of weights ({error}); {remedy}") from error
-
-
-def weights_bytes(path: str | Path) -> bytes:
-    """The weights of a file alone, as safetensors stores them without a description."""
-    return save(read_weights(path, "write it again")[0])
 
 
 def save_state(path: str | Path, state: dict[str, Any]) -> None:

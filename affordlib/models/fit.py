@@ -10,7 +10,6 @@ import copy
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -37,7 +36,6 @@ from affordlib.models.quasi_static import quarter_turn
 from affordlib.models.training import TrainingConfig, train
 from affordlib.types import check_choice, check_count
 
-SEEN = "np_seen_objects"
 INNER_FOLDS = 3
 FEW, MOST_CONTEXT = 100, 64
 EFFORT = {"few": (100, 1e-4, 8), "many": (600, 3e-4, 8)}
@@ -160,19 +158,6 @@ class FittedNeuralProcess:
         more.rows = torch.cat([self.rows, push_rows(pushes)])
         more.groups = np.concatenate([self.groups, pushes.groups])
         return more
-
-
-class PretrainedNeuralProcess:
-    """A neural process for objects that were only seen: what it conditions on are told feet."""
-
-    def __init__(self, name_or_path: str | Path = SEEN) -> None:
-        self.network = load_neural_process(name_or_path)
-
-    def predict(self, pushes: PushLog) -> tuple[np.ndarray, np.ndarray]:
-        """Mean and σ (n, 3) of displacement [m] and turn [rad], in the object's frame."""
-        rows = push_rows(pushes)
-        feet = told_feet(pushes)[0]
-        return in_object_frame(pushes, *self.network.predict(rows[:, :7], rows[:0], feet))
 
 
 class FittedNetwork:

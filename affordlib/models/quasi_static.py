@@ -30,6 +30,11 @@ def quarter_turn(a: Tensor) -> Tensor:
     return torch.stack([-a[..., 1], a[..., 0]], -1)
 
 
+def rotate(a: Tensor, angle_rad: Tensor) -> Tensor:
+    """Vectors (..., 2) rotated by angles (...), counter-clockwise."""
+    return angle_rad.cos()[..., None] * a + angle_rad.sin()[..., None] * quarter_turn(a)
+
+
 def quasi_static_push(
     push: Tensor, feet: Tensor, friction: Tensor, smoothing: float = 0.05, steps: int = STEPS
 ) -> Tensor:
@@ -42,17 +47,13 @@ def quasi_static_push(
     turn, moved = torch.zeros_like(friction), torch.zeros_like(contact)
     tangent, state = quarter_turn(normal), torch.zeros(3, *friction.shape)
     for _ in range(steps):
-        step = _rotated(direction, -turn) * travel / steps
+        step = rotate(direction, -turn) * travel / steps
         at_contact, spin, state = _motion(contact, normal, step, feet, (friction, smoothing), state)
         at_centroid = at_contact - spin[:, None] * quarter_turn(contact)
-        moved = moved + _rotated(at_centroid, turn + spin / 2)
+        moved = moved + rotate(at_centroid, turn + spin / 2)
         contact = contact + ((step - at_contact) * tangent).sum(-1, keepdim=True) * tangent
         turn = turn + spin
     return torch.cat([moved, turn[:, None]], -1)
-
-
-def _rotated(a: Tensor, angle: Tensor) -> Tensor:
-    return angle.cos()[:, None] * a + angle.sin()[:, None] * quarter_turn(a)
 
 
 def _motion(

@@ -65,9 +65,9 @@ class Disturbance:
             to = _inside(x + self.x, y + self.y)
             world.shove(to[0] - x, to[1] - y, self.turn)
         elif self.kind == "knock":
-            world.knock(self.x, self.y, self.turn)
+            world.placed.knock(self.x, self.y, self.turn)
         elif not world.object_rolls():
-            world.topple(math.atan2(self.y, self.x))
+            world.placed.topple(math.atan2(self.y, self.x))
         return goal
 
 

@@ -22,6 +22,7 @@ from torch import Tensor
 from affordlib.geometry import xy_columns
 from affordlib.models.protocol import EffectModel, condition_on_primitives
 from affordlib.models.push_frame import rotate_prediction
+from affordlib.models.quasi_static import rotate
 from affordlib.perception import radius_m
 from affordlib.primitives import Drag, Push
 from affordlib.types import IMAGE_CHANNELS, IMAGE_PIXELS, Prediction, check_array, check_count
@@ -38,13 +39,6 @@ def checked_image(image: np.ndarray) -> torch.Tensor:
             f"Tabletop.depth_image() gives, got {image.shape}"
         )
     return torch.from_numpy(image)[None]
-
-
-def rotate(vector: Tensor, angle_rad: Tensor) -> Tensor:
-    """Vectors (..., 2) rotated by angles (...), counter-clockwise."""
-    c, s = angle_rad.cos(), angle_rad.sin()
-    x, y = vector.unbind(-1)
-    return torch.stack([c * x - s * y, s * x + c * y], dim=-1)
 
 
 @dataclass(frozen=True, eq=False)

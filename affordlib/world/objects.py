@@ -415,7 +415,7 @@ class PlacedObject:
             (turn * Rotation.from_quat(quaternion)).as_quat(),
         )
 
-    def knock(self, dx_m_s: float, dy_m_s: float, spin_rad_s: float) -> None:
+    def knock(self, dx_m_s: float, dy_m_s: float, spin_rad_s: float = 0.0) -> None:
         """Change its velocity [m/s] and its spin about the vertical at once."""
         speeds = (("dx_m_s", dx_m_s), ("dy_m_s", dy_m_s))
         change = [*(check_within(name, v, -10.0, 10.0, "m/s") for name, v in speeds), 0.0]

@@ -180,14 +180,6 @@ class Tabletop(AbstractContextManager):
         self.placed.displace(dx_m, dy_m, dyaw_rad)
         self.settle()
 
-    def knock(self, dx_m_s: float, dy_m_s: float, spin_rad_s: float = 0.0) -> None:
-        """Change the object's velocity [m/s] and its spin about the vertical at once."""
-        self.placed.knock(dx_m_s, dy_m_s, spin_rad_s)
-
-    def topple(self, direction_rad: float) -> None:
-        """Begin to tip the object over an edge of its base; raises ValueError for what rolls."""
-        self.placed.topple(direction_rad)
-
     def settle(self, seconds: float = 0.5) -> None:
         """Let the world run while the arm holds what it holds and the table brakes what rolls."""
         steps = round(check_within("seconds", seconds, 0.0, 60.0, "s") / STEP_S)

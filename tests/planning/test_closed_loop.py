@@ -413,7 +413,7 @@ def test_an_object_that_no_camera_sees_is_lost(world, skills):
 def test_a_knock_in_the_middle_of_an_action_follows_mechanics(world):
     """It slides v²/(2 μ g) and stops; under the fingers it stays on the table."""
     world.place(BOX, (0.0, 0.0), 0.0)
-    world.knock(0.5, 0.0)
+    world.placed.knock(0.5, 0.0)
     world.settle(1.0)
     assert world.object_pose()[0] == pytest.approx(0.5**2 / (2 * 0.25 * 9.81), rel=0.05)
     # The clock counts from where the arm sets out; the push touches after 4 s.

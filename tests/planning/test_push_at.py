@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from affordlib.geometry import cross, wrap_angle
-from affordlib.models.fit import PretrainedNeuralProcess
 from affordlib.planning.push_at import plan_push_at, primitive_of, pushes_around
 from affordlib.types import Goal
 from affordlib.world import Cuboid
-from experiments.pose_goals import pursue
+from experiments.pose_goals import PretrainedNeuralProcess, pursue
 
 OUTLINE_M = np.array([[0.03, -0.02], [0.03, 0.02], [-0.03, 0.02], [-0.03, -0.02]])
 TOOL_M = 0.0015

@@ -142,7 +142,7 @@ def test_what_lies_can_be_toppled_again(world):
     world.place(Cuboid(0.04, 0.04, 0.08))
     for _ in range(2):
         x = world.object_pose()[0]
-        world.topple(0.0)
+        world.placed.topple(0.0)
         world.settle(2.0)
         assert world.object_pose()[0] > x + 0.05
 
@@ -184,7 +184,7 @@ def test_what_rolls_on_a_level_table_comes_to_rest(world, yaw_rad):
     roll_on = []
     for braked in (True, False):
         world.place(LyingCylinder(0.08, 0.05), yaw_rad=yaw_rad)
-        world.knock(-0.1 * math.sin(yaw_rad), 0.1 * math.cos(yaw_rad))
+        world.placed.knock(-0.1 * math.sin(yaw_rad), 0.1 * math.cos(yaw_rad))
         world.settle(2.0) if braked else world.arm.wait(480)
         before = world.object_pose()[:2]
         world.arm.wait(120)
