@@ -24,11 +24,6 @@ GOAL_TP, GOAL_TN = 0.90, 0.95
 """Shares of the successes and failures that we would like to be predicted."""
 
 
-def wilson(k: int, n: int) -> tuple[float, float]:
-    """Wilson's 95 % interval of a share of which k of n were seen (JASA 22, 1927)."""
-    return tuple(stats.binomtest(k, n).proportion_ci(method="wilson"))
-
-
 def auc(score: np.ndarray, truth: np.ndarray, fold: np.ndarray) -> float | None:
     """The share of (success, failure) pairs that the score puts in order; None without pairs.
 
@@ -130,7 +125,8 @@ def confusion_columns(predicted: np.ndarray, lifted: np.ndarray) -> dict[str, An
     columns: dict[str, Any] = {}
     for rate, those in (("tp", lifted), ("tn", ~lifted)):
         n, k = int(those.sum()), int((predicted == lifted)[those].sum())
-        shares = (k / n, *wilson(k, n)) if n else (None,) * 3
+        interval = stats.binomtest(k, n).proportion_ci(method="wilson") if n else (None, None)
+        shares = (k / n if n else None, *interval)
         for end, share in zip(("", "_low", "_high"), shares, strict=True):
             columns[f"{rate}{end}_percent"] = share and 100 * share
     return columns | {"n_success": int(lifted.sum()), "n_failure": int((~lifted).sum())}

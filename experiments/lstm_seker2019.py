@@ -162,15 +162,14 @@ def train_seker(
     n = N_OBSERVED if trained_for == "window" else len(training.phase) - 1
     score = window_errors_m if trained_for == "window" else from_start_errors_m
     best, best_state, epoch, seconds = math.inf, model.state_dict(), 0, 0.0
+    parts = {"model": model, "optimiser": optimiser, "plateau": plateau}
     if checkpoint is not None and checkpoint.exists():
         state = load_state(checkpoint)
-        model.load_state_dict(state["model"])
-        optimiser.load_state_dict(state["optimiser"])
-        plateau.load_state_dict(state["plateau"])
+        for name, part in parts.items():
+            part.load_state_dict(state[name])
         generator.set_state(state["generator"])
         torch.set_rng_state(state["torch"])
-        best, best_state = state["best"], state["best_state"]
-        epoch, seconds = state["epoch"], state["seconds"]
+        best, best_state, epoch, seconds = state["progress"]
     while epoch < epochs:
         began = time.process_time()
         model.train()
@@ -190,13 +189,10 @@ def train_seker(
         if error < best:
             best, best_state = error, {k: v.clone() for k, v in model.state_dict().items()}
         if checkpoint is not None and (epoch == epochs or epoch % SAVE_EVERY == 0):
-            state = {
-                "model": model.state_dict(), "optimiser": optimiser.state_dict(),
-                "plateau": plateau.state_dict(), "generator": generator.get_state(),
-                "torch": torch.get_rng_state(), "best": best, "best_state": best_state,
-                "epoch": epoch, "seconds": seconds, "about": trained_for,
-            }  # fmt: skip
-            save_state(checkpoint, state)
+            state = {name: part.state_dict() for name, part in parts.items()}
+            state |= {"generator": generator.get_state(), "torch": torch.get_rng_state()}
+            progress = best, best_state, epoch, seconds
+            save_state(checkpoint, state | {"progress": progress, "about": trained_for})
     model.load_state_dict(best_state)
     model.eval()
     return {"epochs": epoch, "seconds": seconds, "validation_error": best}

@@ -36,7 +36,7 @@ from affordlib.interactions import (
     split_interactions,
 )
 from affordlib.interactions.lever_up import N_OBSERVED, N_PREDICTED, lever_up_tensors
-from affordlib.interactions.recipes import RECIPES, Recipe, interact
+from affordlib.interactions.recipes import RECIPES, interact
 from affordlib.models.lever_up import LEVER_MODELS, predict_steps
 from affordlib.models.training import batch_loss, final_errors_m
 from affordlib.paths import repo_root
@@ -73,39 +73,19 @@ def ratio_row(what: str, ratios: Sequence[float], goal: float) -> dict[str, Any]
 def primitives(n: int = 24) -> Rows:
     """Interactions a second on one core, and the ratio of the whole to the physics alone."""
     rows = []
-    for name in (name for name in PRIMITIVES if name in RECIPES):
-        whole_s, bare_s = _costs(RECIPES[name], n)
-        low, median, high = np.quantile(whole_s / bare_s, [0.05, 0.5, 0.95])
-        row = {"primitive": name, "per_second": 1 / whole_s.mean(), "n": n}
-        rows.append(row | {"ratio_p5": low, "ratio_median": median, "ratio_p95": high})
-    return rows
-
-
-def _costs(recipe: Recipe, n: int) -> np.ndarray:
-    """Seconds (2, n) of whole interactions, and of their simulation steps alone.
-
-    Each is run twice, as it is and with a clock inside. RuntimeError unless both give the same
-    bits.
-    """
-    whole_s, bare_s = costs = np.zeros((2, n))
     with Tabletop() as world:
-        step_simulation = world.client.stepSimulation
-        interact(recipe, 0, world)
-        for index in range(n):
-
-            def timed_step(index: int = index) -> None:
-                began = time.perf_counter()
-                step_simulation()
-                bare_s[index] += time.perf_counter() - began
-
-            began = time.perf_counter()
-            _, once = interact(recipe, index, world)
-            whole_s[index] = time.perf_counter() - began
-            with mock.patch.object(pybullet, "stepSimulation", timed_step):
-                _, again = interact(recipe, index, world)
-            if once.effect.tobytes() != again.effect.tobytes():
-                raise RuntimeError(f"interaction {index} came out differently the second time")
-    return costs
+        step_simulation, whole_s, bare_s = world.client.stepSimulation, np.empty(n), np.empty(n)
+        for name in (name for name in PRIMITIVES if name in RECIPES):
+            interact(RECIPES[name], 0, world)
+            for index in range(n):
+                steps_s: list[float] = []
+                timed = partial(lambda into: into.append(seconds(step_simulation)), steps_s)
+                with mock.patch.object(pybullet, "stepSimulation", timed):
+                    whole_s[index] = seconds(partial(interact, RECIPES[name], index, world))
+                bare_s[index] = sum(steps_s)
+            row = {"primitive": name, "per_second": 1 / whole_s.mean(), "n": n}
+            rows.append(row | {"ratio_median": float(np.median(whole_s / bare_s))})
+    return rows
 
 
 def _pushes() -> list[InteractionTensors]:

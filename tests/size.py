@@ -10,7 +10,7 @@ import tokenize
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-LINES = {"affordlib": 12_723, "experiments": 6542, "tests": 9316}
+LINES = {"affordlib": 12_723, "experiments": 6504, "tests": 9293}
 """What is there, rounded up: lower it with every cut. The aim is 9,500, 3,500 and 6,500."""
 
 FILES, CODE = 75, 8708
