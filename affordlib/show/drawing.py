@@ -98,7 +98,7 @@ class FigureWidget(WithPicture, widgets.VBox):
         raise NotImplementedError
 
     def add_handle(self, ax: Axes, name: str, phase: float, y: float | None = None) -> None:
-        """Offer to the hand a point of axes over the phase, or with y None a vertical line."""
+        """Let the reader drag a point of axes over the phase, or with y None a vertical line."""
         self._handles.append((ax, name, phase, y))
 
     def set_controls(self, values: dict[widgets.Widget, Any]) -> None:

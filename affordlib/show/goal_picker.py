@@ -115,7 +115,7 @@ class GoalPicker(WithPicture, widgets.VBox):
         self._update_plan()
 
     def set_pose(self, turn_deg: float = 0.0, height_cm: float = 0.0) -> None:
-        """Ask for a turn and a height beside the position; 0 asks for none. Replans."""
+        """Set the turn and the height of the goal, 0 for none, and replan."""
         turn, height = math.radians(turn_deg) or None, height_cm / 100 or None
         self._set_goal(replace(self.goal, turn_rad=turn, height_m=height))
         self._update_plan()
@@ -204,7 +204,7 @@ class GoalPicker(WithPicture, widgets.VBox):
             button.on_click(lambda _, action=action: self._soon(action))
 
     def _soon(self, action: Callable[[], None]) -> None:
-        """Do it in the background, after what was asked before; while the robot works, now."""
+        """Do it in the background, after all earlier actions; while the robot moves, at once."""
         if self._running:
             self._attempt(action)
         else:

@@ -1,4 +1,4 @@
-"""Figures of one look: fixed, colour-blind-safe colours for goal, prediction and truth.
+"""Figures in one style: fixed, colour-blind-safe colours for goal, prediction and truth.
 
 What plots draws into the `ax` that it is given and returns it. Positions are in centimetres. Small
 animations of the robot at work are recorded frames, encoded as a GIF or PNG by Pillow.

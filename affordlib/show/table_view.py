@@ -161,7 +161,7 @@ class PickerControls(widgets.VBox):
         self.x, self.y, self.turn, self.height = self.sliders
         self.planner = widgets.Dropdown(options=list(planners), description="planner")
         self.executor = widgets.Dropdown(options=list(executors), description="carry out")
-        self.run = _button("Run", "play", "Carry the plan out", button_style="primary")
+        self.run = _button("Run", "play", "Execute the plan", button_style="primary")
         self.stop = _button("Stop", "stop", "Stop after this action", disabled=True)
         self.progress = widgets.IntProgress(max=1, layout={"width": "9em"})
         self.shove = _button("Shove it", "hand-o-right", "Disturb: shove the object")
@@ -253,10 +253,10 @@ def outcome_in_words(outcome: Outcome, goal: Goal, how: str, done: int) -> str:
     posed = ""
     if goal.turn_rad is not None:
         off = math.degrees(abs(wrap_angle(goal.turn_rad - outcome.turned_rad)))
-        posed += f" The turn is off by {off:.1f}°."
+        posed += f" The turn has an error of {off:.1f}°."
     if goal.height_m is not None:
         off = 1000 * abs(goal.height_m - outcome.lifted_m)
-        posed += f" The height is off by {off:.1f} mm."
+        posed += f" The height has an error of {off:.1f} mm."
     return (
         f"{how} {done} action{'s' * (done != 1)}: the object rests "
         f"<b>{1000 * outcome.distance_m:.1f} mm</b> from the goal, {within} the tolerance of "

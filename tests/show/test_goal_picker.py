@@ -409,8 +409,8 @@ def test_turn_and_lift_are_planned_and_done(posed, world, executor, within_deg):
     assert "wanted" in posed.picture()
     posed.run()
     said = posed.controls.words.value
-    assert "The turn is off by" in said
-    assert "The height is off by" in said
+    assert "The turn has an error of" in said
+    assert "The height has an error of" in said
     assert posed.outcome.lifted_m == pytest.approx(0.06, abs=0.005), said
     assert world.object_state()[2] == pytest.approx(0.025 + 0.06, abs=0.005), said
     assert math.degrees(world.object_pose()[2]) == pytest.approx(25.0, abs=within_deg), said
