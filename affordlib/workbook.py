@@ -14,13 +14,11 @@ import ast
 import copy
 import difflib
 import hashlib
-import importlib.metadata
 import json
 import logging
 import math
 import multiprocessing
 import os
-import platform
 import re
 import signal
 import subprocess
@@ -44,7 +42,7 @@ from jupyter_client.manager import AsyncKernelManager
 
 from affordlib.commands import command, count_type, seed_type
 from affordlib.paths import repo_root, resolve_out_dir
-from affordlib.results import read_results, write_atomically
+from affordlib.results import read_results, versions, write_atomically
 
 WIDGET = "application/vnd.jupyter.widget-view+json"
 INJECTED = {"injected-parameters", "papermill-error-cell-tag"}
@@ -252,8 +250,7 @@ class OwnKernelManager(AsyncKernelManager):
 
 def environment_hash(root: Path) -> str:
     """Return a hash of all that results depend on beside the notebooks: `INPUTS`, and versions."""
-    versions = [importlib.metadata.version(name) for name in ("torch", "numpy", "pybullet")]
-    digest = hashlib.sha256(repr([platform.python_version(), *versions]).encode())
+    digest = hashlib.sha256(repr(versions()).encode())
     for path in sorted(path for folder in INPUTS for path in (root / folder).rglob("*")):
         name = path.relative_to(root).as_posix()
         if path.is_file() and not NO_INPUT.search(name):

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import sys
 from collections.abc import Sequence
@@ -24,11 +25,14 @@ from torch import nn
 from affordlib.commands import command, count_type
 from affordlib.evaluation.tasks import (
     FROZEN,
+    MIN_DISTANCE_M,
+    REACH_M,
     ROLLABLE,
     STANDING,
     PlanningTask,
     constructed_tasks,
-    uniform_tasks,
+    drawn_object,
+    off_grid,
 )
 from affordlib.interactions import (
     InteractionTensors,
@@ -56,9 +60,12 @@ from affordlib.models.training import (
     train_model,
 )
 from affordlib.paths import repo_root
+from affordlib.planning import MODES
 from affordlib.planning.reachability import SHIPPED as REACHABILITY
 from affordlib.planning.reachability import Reachability, reach_features
+from affordlib.primitives import Drag, Push
 from affordlib.results import write_atomically
+from affordlib.types import Goal
 from affordlib.workers import dask_client
 from affordlib.world import Tabletop
 from experiments.attention import AttentionConfig
@@ -285,6 +292,21 @@ def train_reachability(_: argparse.Namespace) -> bool:
     learn_reachability(open_interactions("reach")).save(repo_root() / REACHABILITY)
     print(REACHABILITY)
     return True
+
+
+def uniform_tasks(
+    mode: str, n: int, seed: int = 0, classes: Sequence[str] = STANDING
+) -> list[PlanningTask]:
+    """Tasks whose goal is drawn evenly from the ring between 2 cm and the mode's reach."""
+    tasks = []
+    for index in range(n):
+        obj, yaw, rng = drawn_object(mode, "uniform", seed, index, classes)
+        reach = MODES[mode].max_steps * REACH_M[Drag if obj.rollable else Push]
+        r = math.sqrt(rng.uniform(MIN_DISTANCE_M**2, reach**2))
+        angle = off_grid(rng, 0.0, math.pi)
+        goal = Goal((r * math.cos(angle), r * math.sin(angle)))
+        tasks.append(PlanningTask(obj, yaw, goal, mode, "uniform"))
+    return tasks
 
 
 def draw_goals(_: argparse.Namespace) -> bool:

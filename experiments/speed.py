@@ -27,7 +27,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from affordlib import models
 from affordlib.commands import command
-from affordlib.evaluation.tasks import STANDING, uniform_tasks
+from affordlib.evaluation.tasks import STANDING
 from affordlib.interactions import (
     InteractionTensors,
     Scaler,
@@ -50,6 +50,7 @@ from affordlib.world import Tabletop
 from experiments import lstm_seker2019
 from experiments.literal import sample_literal, train_literal
 from experiments.runner import Rows
+from experiments.shipped import uniform_tasks
 
 RESULTS = "data/results/speed.json"
 

@@ -73,14 +73,15 @@ class PlanningTask:
         return cls(obj, plain["yaw_rad"], goal, plain["mode"], plain["goals"], config)
 
 
-def _objects(mode: str, goals: str, seed: int, index: int, classes: Sequence[str]) -> tuple:
+def drawn_object(mode: str, goals: str, seed: int, index: int, classes: Sequence[str]) -> tuple:
+    """The object of a task, its yaw [rad], and the generator to draw the goal from."""
     key = (list(MODES).index(check_choice("mode", mode, MODES)), GOAL_SOURCES.index(goals), index)
     rng = np.random.default_rng(np.random.SeedSequence(2_000_003 + seed, spawn_key=key))
     obj = category_named(classes[index % len(classes)]).sample(rng)
     return obj, float(rng.uniform(-math.pi, math.pi)), rng
 
 
-def _off_grid(rng: np.random.Generator, around: float, spread: float) -> float:
+def off_grid(rng: np.random.Generator, around: float, spread: float) -> float:
     """An angle within `spread` of `around`, at least 1° off the 10° grid."""
     while True:
         angle = around + rng.uniform(-spread, spread)
@@ -103,7 +104,7 @@ def constructed_tasks(
     """
     tasks = []
     for index in range(n):
-        obj, yaw, rng = _objects(mode, "constructed", seed, index, classes)
+        obj, yaw, rng = drawn_object(mode, "constructed", seed, index, classes)
         kind = Drag if obj.rollable else Push
         config = variation.sample(obj, rng) if variation else WorldConfig()
         while True:
@@ -112,28 +113,13 @@ def constructed_tasks(
             valid = True
             for _ in range(rng.integers(2, MODES[mode].max_steps + 1) if mode[0] == "m" else 1):
                 stop = rng.uniform(EARLIEST_STOP, 1.0) if MODES[mode].partial else 1.0
-                action = kind.towards(_off_grid(rng, direction, math.pi / 4))
+                action = kind.towards(off_grid(rng, direction, math.pi / 4))
                 seen = world.execute_primitive(action, stop, approach=True)
                 valid &= not (seen.faults or seen.fell or seen.left_table)
             x, y, _ = world.object_pose()
             if math.hypot(x, y) > MIN_DISTANCE_M and valid:
                 break
         tasks.append(PlanningTask(obj, yaw, Goal((x, y)), mode, "constructed", config))
-    return tasks
-
-
-def uniform_tasks(
-    mode: str, n: int, seed: int = 0, classes: Sequence[str] = STANDING
-) -> list[PlanningTask]:
-    """Tasks whose goal is drawn evenly from the ring between 2 cm and the mode's reach."""
-    tasks = []
-    for index in range(n):
-        obj, yaw, rng = _objects(mode, "uniform", seed, index, classes)
-        reach = MODES[mode].max_steps * REACH_M[Drag if obj.rollable else Push]
-        r = math.sqrt(rng.uniform(MIN_DISTANCE_M**2, reach**2))
-        angle = _off_grid(rng, 0.0, math.pi)
-        goal = Goal((r * math.cos(angle), r * math.sin(angle)))
-        tasks.append(PlanningTask(obj, yaw, goal, mode, "uniform"))
     return tasks
 
 

@@ -9,7 +9,6 @@ collected it, in whatever order.
 
 import os
 import shutil
-import threading
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import fields
@@ -44,8 +43,6 @@ from affordlib.world.trajectory import N_SAMPLES
 
 CHUNK = 50
 """Interactions that are made, sent and kept together."""
-
-_ONE_WORLD = threading.Lock()
 
 GRAIN = 2.0**-20
 """About 1 µm or 1 µrad: what is smaller in a float32 is not kept."""
@@ -182,8 +179,7 @@ def _make(recipe: Recipe, attrs: dict[str, str], rows: range) -> xr.Dataset:
             f"this worker would make another set than the collector described: it has {here}, "
             f"not {attrs}; give both the same packages"
         )
-    with _ONE_WORLD:  # threads of one worker take turns: the simulator gains nothing by them
-        return collect_chunk(recipe, rows)
+    return collect_chunk(recipe, rows)
 
 
 def _made(

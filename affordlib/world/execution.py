@@ -229,7 +229,8 @@ def execute(
     start = poses(np.array([placed.state()]))[0]
     offset = np.array([*seen.xy_m, tip_offset_m, 0.0, 0.0])
     motion = plan_motion(primitive, command.segments, offset, approach)
-    gaps = motion.gaps
+    over_start, down, poses_W, paths, out = motion
+    gaps = [primitive.opening_m * segment.poses[:, 4] for segment in command.segments]
 
     closes = any(np.ptp(gap) > 0 for gap in gaps)
     arm.set_fingers(primitive.force_N, closes)
@@ -237,17 +238,15 @@ def execute(
         arm.tie_fingers()
     if approach:
         placed.brake(True)
-        over = joint_move(arm.angles_rad, motion.over_start, 1.0)
+        over = joint_move(arm.angles_rad, over_start, 1.0)
         arm.follow(over, np.linspace(arm.gap_m, gaps[0][0], 2))
-        arm.follow(motion.down, gaps[0][[0, 0]])
+        arm.follow(down, gaps[0][[0, 0]])
     else:
-        arm.put(motion.paths[0][0], gaps[0][0])
+        arm.put(paths[0][0], gaps[0][0])
     placed.brake(False)
 
     recording, floor = Recording(placed.body), -math.inf
-    for segment, one, path, gap in zip(
-        command.segments, motion.poses_W, motion.paths, gaps, strict=True
-    ):
+    for segment, one, path, gap in zip(command.segments, poses_W, paths, gaps, strict=True):
         if one[:, 2].min() < floor:
             one = one.copy()
             one[:, 2] = np.maximum(one[:, 2], floor)
@@ -268,7 +267,7 @@ def execute(
         release = np.array([arm.gap_m, primitive.opening_m if closes else arm.gap_m])
         if release[1] > release[0]:
             arm.follow(np.repeat(arm.angles_rad[None], 13, axis=0), np.linspace(*release, 13))
-        arm.follow(motion.out, release[[1, 1]])
+        arm.follow(out, release[[1, 1]])
         if approach:
             arm.follow(joint_move(arm.angles_rad, _HOME, 1.0), release[[1, 1]])
     arm.wait(SETTLE_STEPS)

@@ -139,28 +139,13 @@ def line(start_W: np.ndarray, end_W: np.ndarray, near: np.ndarray, seconds: floa
     return robot.joint_path(joint_move(start_W, end_W, seconds), near, tool)
 
 
-@dataclass(frozen=True)
-class Motion:
-    """All joint waypoints (n, 6) of an action, found before anything moves.
-
-    over_start: (6,) above the start; down: from there to it; poses_W: (n, 5) of the tool at the
-    waypoints `paths`, and gaps of the fingers (n,) there, of each segment; out: back and up.
-    """
-
-    over_start: np.ndarray
-    down: np.ndarray
-    poses_W: list[np.ndarray]
-    paths: list[np.ndarray]
-    gaps: list[np.ndarray]
-    out: np.ndarray
-
-
 def plan_motion(
     primitive: Primitive, segments: list[TrajectorySegment], offset: np.ndarray, approach: bool
-) -> Motion:
-    """The arm's motion along segments; offset (5,) is added to their poses.
+) -> tuple[np.ndarray, np.ndarray, list[np.ndarray], list[np.ndarray], np.ndarray]:
+    """Joint waypoints (n, 6) of the arm along segments; offset (5,) is added to their poses.
 
-    Raises UnreachableError where any of it is out of reach.
+    They are: above the start (6,); from there to it; of each segment, behind the poses (n, 5) of
+    the tool there; back and up. Raises UnreachableError where any of it is out of reach.
     """
     home, tool = np.array(robot.HOME), primitive.tool
     # A gripper is symmetric: of its two equal yaws, take the one that turns the wrist less.
@@ -198,5 +183,4 @@ def plan_motion(
     down = over_start[None]
     if approach:
         down = line(poses_W[0][0] + up, poses_W[0][0], over_start, 1.0, tool)
-    gaps = [primitive.opening_m * s.poses[:, 4] for s in segments]
-    return Motion(over_start, down, poses_W, paths, gaps, np.concatenate([retreat, lift[1:]]))
+    return over_start, down, poses_W, paths, np.concatenate([retreat, lift[1:]])

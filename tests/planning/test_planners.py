@@ -14,7 +14,6 @@ from affordlib.evaluation.tasks import (
     STANDING,
     constructed_tasks,
     frozen_tasks,
-    uniform_tasks,
 )
 from affordlib.geometry import rotated
 from affordlib.models import EffectModel, load_checkpoint
@@ -33,6 +32,7 @@ from affordlib.primitives import Drag, Push
 from affordlib.types import Goal, Prediction
 from affordlib.world import Cuboid
 from experiments.planning import attempt
+from experiments.shipped import uniform_tasks
 from tests.planning.point_robot import REACH_M, STARTS, KnownDynamics, moved_m
 from tests.problems import problem_of
 
