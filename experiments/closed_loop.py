@@ -80,6 +80,9 @@ SMALLEST_M2 = 0.001
 """Smaller footprints, of a prism, are drawn again: models refuse what is much smaller than what
 they were trained on."""
 
+REACH_BY = ("both", "learned", "kinematics")
+"""Who says where the arm can act; of `reachability` the first hundred goals, all goals by both."""
+N_REACH_BY = 100
 TOLERANCE_M = dict.fromkeys(POSE_PRIMITIVES, 0.004)
 """Of the position, where it is not 2 mm; gripping shifts objects."""
 
@@ -181,20 +184,26 @@ def sample_disturbances(
 
 
 @cache
-def tabletop_and_skills(world: str = "clean") -> tuple[Tabletop, Skills]:
+def tabletop_and_skills(world: str = "clean", reach_by: str = "both") -> tuple[Tabletop, Skills]:
     """One of each for a process."""
     skills = Skills.load()
     if world == "perturbed":
         push = load_checkpoint(PERTURBED_PUSHES)[0]
         skills = replace(skills, models=skills.models | {"push": push})
+    if reach_by == "kinematics":
+        skills = replace(skills, reachability=None)
     return Tabletop(), skills
 
 
-def run_trial(table: str, index: int, seed: int = 0, world: str = "clean") -> dict[str, Any]:
+def run_trial(
+    table: str, index: int, seed: int = 0, world: str = "clean", reach_by: str = "both"
+) -> dict[str, Any]:
     """The record of a trial: how it ended, and whether it could be done."""
-    tabletop, skills = tabletop_and_skills(world)
+    tabletop, skills = tabletop_and_skills(world, reach_by)
     trial = sample_trial(table, index, seed, world)
     robot = DisturbanceSchedule(tabletop, trial.goal, trial.disturbances)
+    if reach_by == "learned":
+        robot.can_reach = lambda *_: True
 
     def pursue(goal: Goal | Callable[[], Goal], robot: Robot) -> tuple[ClosedLoopResult, dict]:
         trial.place(tabletop)
@@ -353,10 +362,11 @@ ROWS: dict[str, Callable[[Rows], Rows]] = {
 }
 
 
-def job(table: str, index: int, seed: int, world: str = "clean") -> Job:
+def job(table: str, index: int, seed: int, world: str = "clean", reach_by: str = "both") -> Job:
     """One trial of the closed loop."""
     arguments: dict[str, Any] = {"table": table, "index": index, "seed": seed}
     arguments |= {"world": world} if world != "clean" else {}
+    arguments |= {"reach_by": reach_by} if reach_by != "both" else {}
     used = ("push", "drag", POSE_PRIMITIVES.get(table))
     models = CHECKPOINTS | ({"push": PERTURBED_PUSHES} if world == "perturbed" else {})
     files = tuple(file for kind, file in models.items() if kind in used)
@@ -366,14 +376,21 @@ def job(table: str, index: int, seed: int, world: str = "clean") -> Job:
 
 def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
     """The tables of the trials that were run; those of other seeds than 0 are in none."""
-    found = [about | record for about, record in runner.read("closed_loop", job, folder)]
+    usual = {"world": "clean", "reach_by": "both"}
+    found = [usual | about | record for about, record in runner.read("closed_loop", job, folder)]
+    found.sort(key=lambda record: record["index"])
     made: dict[str, Rows] = {}
     for table, world in product(ROWS, WORLDS):
-        mine = {"table": table, "seed": 0, "world": world}
-        some = [r for r in found if mine.items() <= ({"world": "clean"} | r).items()]
+        mine = {"table": table, "seed": 0, "world": world, "reach_by": "both"}
+        if some := [r for r in found if mine.items() <= r.items()]:
+            rows = [{"world": world} | row for row in ROWS[table](some)]
+            made[table] = made.get(table, []) + rows
+    for by in REACH_BY:
+        mine = usual | {"table": "reachability", "seed": 0, "reach_by": by}
+        some = [r for r in found if mine.items() <= r.items() and r["index"] < N_REACH_BY]
         if some:
-            rows = ROWS[table](sorted(some, key=lambda record: record["index"]))
-            made[table] = made.get(table, []) + [{"world": world} | row for row in rows]
+            row = {"reach_by": by} | reachability_rows(some)[0]
+            made["reachability_by"] = [*made.get("reachability_by", []), row]
     return made
 
 
@@ -381,6 +398,9 @@ JOBS = [
     job(table, index, 0, world)
     for table, world in product(ROWS, WORLDS)
     for index in range(N_TRIALS[table] if (table, world) not in FEWER else FEWER[table, world])
+] + [
+    job("reachability", index, 0, reach_by=by)
+    for by, index in product(REACH_BY[1:], range(N_REACH_BY))
 ]
 
 
