@@ -24,7 +24,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
 from affordlib.evaluation.baselines import BASELINES, baseline_predictions
-from affordlib.evaluation.predictions import about_objects, final_error, network_predictions
+from affordlib.evaluation.predictions import about_objects, network_predictions
 from affordlib.geometry import wrap_angle
 from affordlib.interactions import InteractionTensors, Split, split_interactions
 from affordlib.interactions.dataset import Symmetry, valid_interactions
@@ -177,28 +177,12 @@ def cross_validate(
             theta = decode(network if model in NETWORKS else None, interactions, rows)
             result["inverse"] = executed_columns(interactions, rows, theta)
         other = open_once(task.test_set)
-        found = predicted(other, np.arange(other.sizes["interaction"]))
-        errors = summary(found)
-        about = {"interaction": found["interaction"], "category": errors.pop("family")}
-        result["fixed_test"] = about | {k: v for k, v in errors.items() if v is not None}
+        found = prediction_columns(predicted(other, np.arange(other.sizes["interaction"])))
+        add_errors(table := pd.DataFrame(found), data.removesuffix(LARGE))
+        errors = table.filter(like="_error").to_dict("list").items()
+        errors = {name: [float(f"{e:.4g}") for e in each] for name, each in errors}
+        result["fixed_test"] = {key: found[key] for key in ("interaction", "category")} | errors
     return result
-
-
-def yaw_error(record: dict[str, Any]) -> np.ndarray | None:
-    """Distance (N,) [rad] between the predicted and the true rotation; None if it predicts none."""
-    mean, truth = record["mean"], record["truth"]
-    if "yaw" not in mean:
-        return None
-    return np.abs((np.subtract(mean["yaw"], truth["yaw"]) + np.pi) % (2 * np.pi) - np.pi)
-
-
-def summary(record: dict[str, Any]) -> dict[str, Any]:
-    """Errors alone, for a large test set."""
-    yaw = yaw_error(record)
-    errors = {"final_error": final_error(record), "yaw_error": yaw}
-    errors |= {k: np.array(record[k]) for k in ("trajectory_error", "after_contact_error")}
-    plain = {k: None if v is None else [float(f"{e:.4g}") for e in v] for k, v in errors.items()}
-    return {"family": record["family"], **plain}
 
 
 def logistic_predictions(
@@ -306,10 +290,9 @@ def executed_columns(
             effects.append(done.effect[-1])
     off = np.array(effects) - data["effect"].values[rows, -1]
     theta_off = theta_rad - data["theta"].values[rows]
-    names = data["family"].attrs["flag_meanings"].split()
     return {
         "interaction": data["interaction"].values[rows].tolist(),
-        "category": [names[k] for k in data["family"].values[rows]],
+        "category": about_objects(data, rows)["family"],
         "final_error": np.hypot(*off[:, :2].T).tolist(),
         "yaw_error": [abs(wrap_angle(d)) for d in off[:, 3].tolist()],
         "theta_error": [abs(wrap_angle(d)) for d in theta_off.tolist()],

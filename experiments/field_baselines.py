@@ -1,7 +1,8 @@
-"""Planners of the field, beside ours in Table 3.
+"""Planners and a model of the field, beside ours in Table 3.
 
 plan_astar_continuous: A*, with the direction and stop of its last action refined continuously.
 plan_cem: the cross-entropy method on the effect map, with our planner's objective.
+LimitSurface: a quasi-static pusher in the place of a network.
 """
 
 from __future__ import annotations
@@ -11,11 +12,20 @@ import time
 
 import numpy as np
 import torch
+from scipy import ndimage
+from scipy.optimize import minimize
+from torch import Tensor
+from torch.nn.functional import grid_sample
 
+from affordlib.interactions import InteractionTensors, split_interactions
+from affordlib.models.protocol import condition_on_primitives
+from affordlib.models.quasi_static import ELLIPSOID, quarter_turn, quasi_static_push
 from affordlib.planning import PlanningProblem, continuous, plan_astar
 from affordlib.planning.effect_map import rotate
 from affordlib.planning.rollout import make_steps, roll_out
-from affordlib.types import Plan
+from affordlib.primitives import PUSH_GAP_M, Push, min_jerk
+from affordlib.types import CROP_WIDTH_M, Observations, Plan, Prediction
+from experiments.runner import open_once
 
 N_CHAINS, ROUNDS, N_ELITE = 218, 16, 22
 """Of the cross-entropy method: chains drawn in a round, rounds, and the best, which are fitted.
@@ -75,3 +85,93 @@ def plan_cem(problem: PlanningProblem, seed: int = 0) -> Plan:
     end = steps[-1].predicted_end_xy_m if steps else problem.start_xy_m
     reaches = problem.goal.distance_m(end) <= problem.goal.tolerance_m
     return problem.plan_of(steps, "cem", reaches, began)
+
+
+STEP_M, N_FITTED = 0.001, 100
+"""Of the quasi-static pusher: a step of the gripper, and training pushes that it is fitted to."""
+
+FINGER_AHEAD_M, FINGER_WIDTH_M = 0.01, 0.012
+"""How far the fingers' front lies before the tool's point, and how wide each is."""
+
+
+class LimitSurface:
+    """An `EffectModel` of pushes by physics: an ellipsoidal limit surface and Coulomb friction.
+
+    The footprint is the image's mask, the centre of mass the image's middle. The fronts of both
+    fingers advance in small steps; where one is deepest inside, the object gives way. It has two
+    numbers, friction and the ratio of torque to force in radii of gyration, and no σ.
+    """
+
+    action_channels, effect_channels = ("x", "y"), ("x", "y", "yaw")
+
+    def __init__(self, friction: float, size: float) -> None:
+        self.friction, self.size = friction, size
+
+    def encode(self, image: Tensor) -> Tensor:
+        """The smoothed masks (B, 1, 48, 48)."""
+        return torch.from_numpy(ndimage.gaussian_filter(image[:, 1:].numpy(), (0, 0, 1, 1)))
+
+    def predict(self, features: Tensor, observations: Observations, t_target: Tensor) -> Prediction:
+        """As of any model; the action must be observed at t = 0 and t = 1."""
+        travel = observations.action[:, -1] - observations.action[:, 0]
+        length_m = travel.norm(dim=-1, keepdim=True)
+        poses = self._poses(features.expand(len(travel), -1, -1, -1), travel / length_m)
+        at = torch.from_numpy(min_jerk(t_target.numpy())).float() * (len(poses) - 1)
+        before = at.long().clamp_max(len(poses) - 2)
+        row = torch.arange(len(travel))[:, None]
+        mean = torch.lerp(poses[before, row], poses[before + 1, row], (at - before)[..., None])
+        action = observations.action[:, -1:].expand(-1, mean.shape[1], -1)
+        return Prediction(action, torch.full_like(action, 1e-5), mean, torch.full_like(mean, 1e-5))
+
+    @torch.no_grad()
+    def _poses(self, mask: Tensor, ahead: Tensor) -> Tensor:
+        """Poses (S + 1, B, 3) of objects after each step of whole pushes in directions (B, 2)."""
+        n, push = len(ahead), Push(0.0)
+        axis = (torch.arange(mask.shape[-1]) + 0.5) / mask.shape[-1] - 0.5
+        square = (axis[:, None] ** 2 + axis**2) * CROP_WIDTH_M**2
+        radius = (torch.einsum("bchw,hw->b", mask, square) / mask.sum((1, 2, 3))).sqrt()[:, None]
+        angle = torch.arange(3) * (2 * math.pi / 3)
+        ring = [self.size * angle.cos(), self.size * angle.sin(), torch.full((3,), 1 / 3)]
+        feet, friction = torch.stack(ring, -1).expand(n, -1, -1), torch.full((n,), self.friction)
+        side = PUSH_GAP_M / 2 + FINGER_WIDTH_M * torch.linspace(0, 1, 4)
+        tips = torch.cat([side, -side])[:, None] * quarter_turn(ahead)[:, None]
+        near = 1e-3 * torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+        free = round((push.radius - FINGER_AHEAD_M - CROP_WIDTH_M / 2) / STEP_M)
+        pose, poses = torch.zeros(n, 3), [torch.zeros(n, 3)] * free
+        for k in range(free, round((push.radius + push.length) / STEP_M) + 1):
+            front = (k * STEP_M - push.radius + FINGER_AHEAD_M) * ahead
+            turned = -pose[:, 2:].expand(-1, len(side) * 2)
+            local = rotate(front[:, None] + tips - pose[:, None, :2], turned)
+            at = (local[:, :, None] + near) * (2 / CROP_WIDTH_M) * torch.tensor([1.0, -1.0])
+            share = grid_sample(mask, at, align_corners=False)[:, 0]  # (B, tips, 3)
+            deepest = torch.arange(n), share[..., 0].argmax(1)
+            share, contact = share[deepest], local[deepest]
+            slope = (share[:, 1:] - share[:, :1]) / 1e-3
+            normal = slope / slope.norm(dim=-1, keepdim=True).clamp_min(1e-9)
+            direction = rotate(ahead, -pose[:, 2])
+            inside = share[:, :1] - 0.5
+            depth = inside / (slope * direction).sum(-1, keepdim=True).clamp_min(1e-9)
+            travel = depth.clamp(1e-7, 2 * STEP_M)
+            rows = torch.cat([contact / radius, normal, direction, travel / radius], -1)
+            moved = quasi_static_push(rows, feet, friction, ELLIPSOID, 1)
+            shift = torch.cat([rotate(moved[:, :2] * radius, pose[:, 2]), moved[:, 2:]], -1)
+            pose = pose + torch.where(inside > 0, shift, 0.0)
+            poses.append(pose)
+        return torch.stack(poses)
+
+    @classmethod
+    def fitted(cls) -> LimitSurface:
+        """With the two numbers that predict training pushes best."""
+        data = open_once("push")
+        rows = split_interactions(data.sizes["interaction"]).train[:N_FITTED]
+        pushes = InteractionTensors.from_dataset(data, rows)
+        seen = condition_on_primitives(cls, [Push(float(t)) for t in data["theta"].values[rows]])
+        end = torch.ones(len(pushes), 1)
+
+        def error(logs: np.ndarray) -> float:
+            model = cls(*np.exp(logs).tolist())
+            mean = model.predict(model.encode(pushes.image), seen, end).effect_mean[:, 0, :2]
+            return float((mean - pushes.effect[:, -1]).norm(dim=-1).mean())
+
+        found = minimize(error, np.log([0.3, 0.8]), method="Nelder-Mead", options={"maxfev": 40})
+        return cls(*np.exp(found.x).tolist())

@@ -15,6 +15,7 @@ from itertools import pairwise
 import numpy as np
 import torch
 
+from affordlib.evaluation.predictions import about_objects
 from affordlib.interactions import open_interactions
 from affordlib.interactions.recipes import Recipe, sample_scene, sample_world
 from affordlib.models.checkpoint import load_checkpoint
@@ -58,8 +59,7 @@ def pose_sensitivity() -> Rows:
                 ).effect[-1]
                 moved[k, r] = math.dist(done[:2], recorded[:2])
                 ended[k, r] = math.dist(done[:2], recorded[:2] + bias)
-    names = np.array(data["family"].attrs["flag_meanings"].split())
-    rows, kinds = [], names[data["family"].values[:N_PUSHES]]
+    rows, kinds = [], np.array(about_objects(data, np.arange(N_PUSHES))["family"])
     for name in sorted(set(kinds)):
         row = {"object_class": str(name), "n": int((kinds == name).sum()), "repeats": REPEATS}
         for what, error in (("displacement", moved), ("end", ended)):

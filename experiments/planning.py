@@ -51,8 +51,7 @@ from affordlib.primitives import Push
 from affordlib.types import NothingSeenError, Outcome, Plan, Step
 from affordlib.world import Tabletop, UnreachableError
 from experiments import reported, runner
-from experiments.field_baselines import plan_astar_continuous, plan_cem
-from experiments.limit_surface import LimitSurface
+from experiments.field_baselines import LimitSurface, plan_astar_continuous, plan_cem
 from experiments.literal import SPEC, trained_on
 from experiments.oracle import oracle_effects
 from experiments.runner import FOLDER, Job, Rows, interval, plain

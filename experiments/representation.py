@@ -18,6 +18,7 @@ import xarray as xr
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from affordlib.evaluation.predictions import about_objects
 from affordlib.interactions import InteractionTensors, open_interactions, split_interactions
 from affordlib.interactions.dataset import valid_interactions
 from affordlib.models.checkpoint import load_checkpoint
@@ -174,8 +175,7 @@ def rollability() -> Rows:
         with torch.no_grad():
             learned = model(torch.from_numpy(images)).numpy() > 0.5
         rule = np.array([looks_rollable(image) for image in images])
-        names = np.array(data["family"].attrs["flag_meanings"].split())
-        category = names[data["family"].values[chosen]]
+        category = np.array(about_objects(data, chosen)["family"])
         for kind in ("all", *np.unique(category)):
             of = (category == kind) | (kind == "all")
             rows.append(
@@ -200,41 +200,31 @@ def push_and_drag_model() -> Rows:
     data, other = open_interactions("mixed"), open_interactions("partial")
     split = split_interactions(data.sizes["interaction"])
     model, _ = train_model(data, split, TRAINING, FiLMConfig())
-    arrays = InteractionTensors.from_dataset(data, split.train)
-    rolls = data["rollable"].values[valid_interactions(data, split.train)]
+    arrays, rolls = _seen_and_rolls(data, split.train)
     length = arrays.effect[:, -1].norm(dim=-1)
     usual_m = [float(length[torch.from_numpy(rolls == kind)].median()) for kind in (True, False)]
-    test = InteractionTensors.from_dataset(data, split.test)
+    test, forward = _seen_and_rolls(data, split.test)
     errors = final_errors_m(model, test).numpy()
-    forward = data["rollable"].values[valid_interactions(data, split.test)]
-    new = InteractionTensors.from_dataset(other)
-    rolls = other["rollable"].values[
-        valid_interactions(other, np.arange(other.sizes["interaction"]))
-    ]
-    rows = []
+    new, rolls = _seen_and_rolls(other, np.arange(other.sizes["interaction"]))
+    features, start, rows = model.encode(new.image), torch.zeros(len(new), 1), []
     for wanted_m in usual_m:
-        wanted = wanted_m * _unit_vectors(len(new))
+        wanted = condition_on_final_effect(model, wanted_m * _unit_vectors(len(new)))
         with torch.no_grad():
-            decoded = model.predict(
-                model.encode(new.image),
-                condition_on_final_effect(model, wanted),
-                torch.zeros(len(new), 1),
-            )
-        radius = decoded.action_mean[:, 0].norm(dim=-1).numpy()
+            action = model.predict(features, wanted, start).action_mean[:, 0]
+        pushes = (action.norm(dim=-1) > PUSH_START_MIN_RADIUS_M).numpy()
         for kind in (False, True):
-            rows.append(
-                {
-                    "rollable": kind,
-                    "n": int((rolls == kind).sum()),
-                    "wanted_mean_m": wanted_m,
-                    "behaviour_right_percent": 100
-                    * float(((radius > PUSH_START_MIN_RADIUS_M) != kind)[rolls == kind].mean()),
-                    "start_radius_median_m": float(np.median(radius[rolls == kind])),
-                    "n_forward": int((forward == kind).sum()),
-                    "final_error_mean_m": float(errors[forward == kind].mean()),
-                }
-            )
+            row = {"rollable": kind, "n": int((rolls == kind).sum()), "wanted_mean_m": wanted_m}
+            row["behaviour_right_percent"] = 100 * float((pushes != kind)[rolls == kind].mean())
+            row["n_forward"] = int((forward == kind).sum())
+            row["final_error_mean_m"] = float(errors[forward == kind].mean())
+            rows.append(row)
     return rows
+
+
+def _seen_and_rolls(data: xr.Dataset, rows: np.ndarray) -> tuple[InteractionTensors, np.ndarray]:
+    """Valid interactions, and whether their objects roll."""
+    rolls = data["rollable"].values[valid_interactions(data, rows)]
+    return InteractionTensors.from_dataset(data, rows), rolls
 
 
 def _unit_vectors(n: int) -> torch.Tensor:

@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 
@@ -11,7 +12,7 @@ from affordlib.evaluation.predictions import final_error, network_predictions
 from affordlib.interactions import InteractionTensors
 from affordlib.models.calibration import calibration_row
 from affordlib.models.training import final_errors_m
-from experiments.cross_validation import logistic, yaw_error
+from experiments.cross_validation import add_errors, logistic
 
 # Answers
 
@@ -29,8 +30,9 @@ def test_answers_are_those_of_the_model_itself(trained, held_out_pushes):
 
 
 def test_a_turn_is_measured_the_short_way_round():
-    told = {"truth": {"yaw": [3.1, 0.2]}, "mean": {"yaw": [-3.1, 0.1]}}
-    np.testing.assert_allclose(yaw_error(told), [2 * math.pi - 6.2, 0.1])
+    told = pd.DataFrame({"truth_yaw": [3.1, 0.2], "mean_yaw": [-3.1, 0.1]})
+    add_errors(told, "rotate")
+    np.testing.assert_allclose(told["yaw_error"], [2 * math.pi - 6.2, 0.1])
 
 
 def test_calibration_of_a_true_gaussian_is_right():

@@ -15,7 +15,7 @@ from affordlib.primitives import PUSH_GAP_M, Drag, Push
 from affordlib.world import Cuboid, UprightCylinder
 from experiments import planning, shipped
 from experiments.adaptation import Camera
-from experiments.limit_surface import FINGER_AHEAD_M, LimitSurface
+from experiments.field_baselines import FINGER_AHEAD_M, LimitSurface
 from experiments.planning import CONFIGS, attempt, planning_rows, tasks_sha256
 
 
