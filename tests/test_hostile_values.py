@@ -253,7 +253,7 @@ def driven(name, shop):
     by_name, by_callable = shop
     w, fixed = by_name["world"], NOT_DRIVEN.get(name, {})
     act = by_name["skills"].kind_for if name == "kind_for" else CALLABLES.get(name)
-    act = act or getattr(w, name)
+    act = act or getattr(w, name, None) or getattr(w.placed, name)
     given = by_name | by_callable.get(name, {})
     parameters = inspect.signature(act).parameters.values()
     valid = {
