@@ -74,6 +74,8 @@ def error_rows(results: list[Result], edges_left_out: int | None = None) -> Rows
 
     edges_left_out: of the trainings without polygons with so many edges, on those.
     """
+    if not results:
+        return []
     keys, error = ["protocol", "model", "epochs", "steps"], "error_cm"
     groups = _errors(results, edges_left_out).groupby(keys, observed=True, dropna=False)
     rows = groups.agg(
