@@ -53,60 +53,47 @@ def cka(a: torch.Tensor, b: torch.Tensor) -> float | None:
     return float((a.T @ b).square().sum() / ((a.T @ a).norm() * (b.T @ b).norm()))
 
 
-def _seen_by(arrays: InteractionTensors, action: bool, effect: bool, weight: float) -> Observations:
+def _seen_by(arrays: InteractionTensors, observed: str, weight: float) -> Observations:
     """The action at t = 0 and 1, the effect at t = 0.8 and 1, or both, blended by w₁."""
     last = len(arrays.phase) - 1
     ends, late = torch.tensor([0, last]), torch.tensor([round(0.8 * last), last])
-    return Observations.of(
-        arrays,
-        arrays.action_at(ends) if action else None,
-        arrays.effect_at(late) if effect else None,
-        torch.full((len(arrays),), weight),
-    )
+    action = None if observed == "effect" else arrays.action_at(ends)
+    effect = None if observed == "action" else arrays.effect_at(late)
+    return Observations.of(arrays, action, effect, torch.full((len(arrays),), weight))
+
+
+def _code(model: Any, observed: Observations) -> Tensor:
+    """What a model makes of observations (B, D), in its frame."""
+    channels = model.action_channels, model.effect_channels
+    if model.config.frame == "push":
+        back = inverse(push_direction(observed, *channels))
+        observed = rotate_observations(observed, back, *channels)
+    return model.represent(observed)
 
 
 @study("push_test", checkpoints=LATENT_MODELS, settings=WEIGHTS)
 @torch.no_grad()
 def latent() -> Rows:
     """Alignment of the codes r of `push_test`, and the errors of what is decoded from them."""
-    data = open_interactions("push_test")
-    rows = []
+    data, rows = open_interactions("push_test"), []
     for name in LATENT_MODELS:
         model, _ = load_checkpoint(name)
-        channels = model.action_channels, model.effect_channels
-        arrays = InteractionTensors.from_dataset(data, None, *channels)
-
-        def code(observed: Observations, model: Any = model, channels: Any = channels) -> Any:
-            if model.config.frame == "push":
-                back = inverse(push_direction(observed, *channels))
-                observed = rotate_observations(observed, back, *channels)
-            return model.represent(observed)
-
-        r_a, r_e = code(_seen_by(arrays, True, False, 1.0)), code(_seen_by(arrays, False, True, 0))
-        features, t_target = model.encode(arrays.image), torch.tensor([[0.0, 1.0]])
-        for action, effect, weights in (
-            (True, False, (1.0,)),
-            (False, True, (0.0,)),
-            (True, True, WEIGHTS),
-        ):
-            for weight in weights:
-                observed = _seen_by(arrays, action, effect, weight)
-                predicted = model.predict(features, observed, t_target.expand(len(arrays), -1))
-                start = (predicted.action_mean[:, 0, :2] - arrays.action[:, 0, :2]).norm(dim=-1)
-                end = (predicted.effect_mean[:, 1, :2] - arrays.effect[:, -1, :2]).norm(dim=-1)
-                cosine = torch.cosine_similarity(code(observed), r_a).mean()
-                rows.append(
-                    {
-                        "model": name,
-                        "observed": "both" if action and effect else "action" * action or "effect",
-                        "w_1": weight,
-                        "n": len(arrays),
-                        "cosine_to_action": float(cosine),
-                        "cka_action_effect": cka(r_a, r_e),
-                        "action_start_mean_m": float(start.mean()),
-                        "final_error_mean_m": float(end.mean()),
-                    }
-                )
+        arrays = InteractionTensors.from_dataset(
+            data, None, model.action_channels, model.effect_channels
+        )
+        features, ends = model.encode(arrays.image), torch.tensor([[0.0, 1.0]] * len(arrays))
+        r_a, r_e = (_code(model, _seen_by(arrays, *one)) for one in (("action", 1), ("effect", 0)))
+        for what, weight in (("action", 1.0), ("effect", 0.0), *(("both", w) for w in WEIGHTS)):
+            observed = _seen_by(arrays, what, weight)
+            predicted = model.predict(features, observed, ends)
+            start = predicted.action_mean[:, 0, :2] - arrays.action[:, 0, :2]
+            end = predicted.effect_mean[:, 1, :2] - arrays.effect[:, -1, :2]
+            row = {"model": name, "observed": what, "w_1": weight, "n": len(arrays)}
+            alike = torch.cosine_similarity(_code(model, observed), r_a)
+            row["cosine_to_action"] = float(alike.mean())
+            row["cka_action_effect"] = cka(r_a, r_e)
+            row["action_start_mean_m"] = float(start.norm(dim=-1).mean())
+            rows.append(row | {"final_error_mean_m": float(end.norm(dim=-1).mean())})
     return rows
 
 

@@ -24,14 +24,12 @@ import torch
 
 from affordlib.evaluation.metrics import error_row
 from affordlib.evaluation.predictions import network_predictions
-from affordlib.interactions import InteractionTensors, Scaler, split_interactions
+from affordlib.interactions import InteractionTensors, split_interactions
 from affordlib.interactions.dataset import Symmetry, augment_by_symmetry
-from affordlib.interactions.sampling import condition_on_recorded_action
 from affordlib.models.base import EffectNetwork
-from affordlib.models.checkpoint import build
-from affordlib.models.domain import TrainingDomain
+from affordlib.models.calibration import effects_at
 from affordlib.models.film import FiLMConfig
-from affordlib.models.training import train
+from affordlib.models.training import train, untrained
 from experiments.cross_validation import TASKS, add_errors, job, prediction_columns
 from experiments.runner import Rows, open_once, plain, run, study
 from experiments.shipped import CHECKPOINT_SPECS
@@ -85,12 +83,8 @@ def shares(
         relative = []
         for primitive, arrays in validation.items():
             kept = [NETWORK.effect_channels.index(c) for c in TASKS[primitive].effect_channels]
-            end = torch.ones(len(arrays), 1)
-            mean = model.predict(
-                model.encode(arrays.image), condition_on_recorded_action(arrays), end
-            )
-            truth = arrays.effect[:, -1, kept]
-            error = (mean.effect_mean[:, 0, kept] - truth).norm(dim=-1).mean()
+            truth, mean, _ = (v[:, 0, kept] for v in effects_at(model, arrays, (1.0,)))
+            error = (mean - truth).norm(dim=-1).mean()
             relative.append(error / truth.norm(dim=-1).square().mean().sqrt())
         model.train()
         return torch.stack(relative).log().mean(dim=0, keepdim=True).exp()
@@ -103,8 +97,7 @@ def train_shared(fold: int, resume_checkpoint: Path | None = None) -> EffectNetw
     copies = [with_copies(_part(name, fold, "train"), name) for name in PRIMITIVES]
     validation = {name: _part(name, fold, "validation") for name in PRIMITIVES}
     training = copies[0].joined(*copies[1:])
-    torch.manual_seed(TRAINING.seed)
-    model = build(NETWORK, Scaler.fit(training), TrainingDomain.fit(training))
+    model = untrained(NETWORK, training, TRAINING.seed)
     first, *others = validation.values()
     everything = first.joined(*others)
     train(model, training, everything, TRAINING, resume_checkpoint, score=shares(validation))
