@@ -279,7 +279,7 @@ def _stays_feasible(
         return True
     disturbance = happened[0]
     first = disturbance.action + (disturbance.at_s is not None)
-    if result.status == "lost" and len(result.seen_xy_m) == first + 1:
+    if result.status == "lost" and len(result.seen_xy_m) <= first + 1:  # off the table, or unseen
         return disturbance.kind == "goal"
     kind = Drag if world.object_rolls() else Push
     seen = result.seen_xy_m[first:][:1]
