@@ -21,7 +21,7 @@ from affordlib.interactions.recipes import Recipe, sample_scene, sample_world
 from affordlib.models.checkpoint import load_checkpoint
 from affordlib.models.protocol import condition_on_primitives
 from affordlib.planning.reachability import Reachability
-from affordlib.primitives import PRIMITIVES, Drag, Grasp, Push, Rotate
+from affordlib.primitives import Drag, Grasp, Push, Rotate
 from affordlib.world import Tabletop
 from experiments.planning import POSITION_ERROR_M, YAW_ERROR_RAD
 from experiments.runner import Rows, study
@@ -74,7 +74,8 @@ def pose_sensitivity() -> Rows:
 def partial_execution() -> Rows:
     """Errors of networks that learned from whole actions alone, on partial actions."""
     data = open_interactions("partial")
-    kinds = np.array(list(PRIMITIVES))[data["primitive"].values]
+    names = data["primitive"].attrs["flag_meanings"].split()
+    kinds = np.array(names)[data["primitive"].values]
     phase = data["stop_phase"].values
     whole, rest = (data[name].values for name in ("full_effect", "rest_effect"))
     slid = np.hypot(*(rest - whole)[:, :2].T)

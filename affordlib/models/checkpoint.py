@@ -81,7 +81,9 @@ def resolve_checkpoint(name_or_path: str | Path) -> Path:
     folder = repo_root() / "data" / "checkpoints"
     path = path if path.suffix == SUFFIX else folder / f"{name_or_path}{SUFFIX}"
     if not path.is_file():
-        shipped = sorted(p.stem for p in folder.glob(f"*{SUFFIX}") if p.stem != "reachability")
+        others = ("np_", "reachability")  # which are read by functions of their own
+        shipped = [p.stem for p in sorted(folder.glob(f"*{SUFFIX}"))]
+        shipped = [name for name in shipped if not name.startswith(others)]
         raise FileNotFoundError(
             f"checkpoint {str(name_or_path)!r}: there is no file {path}; give one of the "
             f"shipped names {shipped} or the path of a {SUFFIX} file"

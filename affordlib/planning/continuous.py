@@ -125,7 +125,7 @@ def correct(
     ends, turns = _predicted(effects, direction, phase)
     for _ in range(corrections):
         off = target - ends[-1]
-        if float(off.norm()) < 2e-5:
+        if float(off.norm()) < 2e-5:  # [m], less than any table shows
             break
         slopes = _slopes(lambda *near: roll_out(effects, *near)[0][:, -1], direction, phase)
         by_direction, by_phase = (one[0].T for one in slopes)
@@ -134,6 +134,8 @@ def correct(
         # A radian moves as far as about half a phase does; weighed so, steps stay small in both.
         scale = torch.cat([torch.ones_like(direction[0]), 0.5 * torch.ones_like(phase[0])])
         slopes = torch.cat([by_direction, by_phase], dim=1) * scale
+        # Where the end hardly moves, by a twentieth of the most, a step would have to be long; and
+        # beyond 0.3 rad, or 0.3 of the phase, the slopes no longer hold.
         step = scale * (torch.linalg.pinv(slopes, rtol=0.05) @ off)
         step = step * min(1.0, 0.3 / max(float(step.abs().max()), 1e-9))
         for _ in range(HALVINGS):

@@ -1,7 +1,7 @@
 """All that touches PyBullet: the tabletop, its objects, the arm and the camera."""
 
 import affordlib.world._quiet_pybullet  # must come first
-from affordlib.types import NothingSeenError, UnreachableError
+from affordlib.types import UnreachableError
 from affordlib.world.objects import (
     CATEGORIES,
     Cuboid,
