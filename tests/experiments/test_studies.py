@@ -153,8 +153,7 @@ def test_copies_keep_the_symmetries_of_each_primitive(of_all):
 def test_shares_are_of_the_usual_effect(of_all):
     class Knowing(torch.nn.Module):
         known = 1.0
-        action_channels = shared_network.NETWORK.action_channels
-        effect_channels = shared_network.NETWORK.effect_channels
+        action_channels = effect_channels = shared_network.NETWORK.effect_channels
 
         def encode(self, image):
             return image
