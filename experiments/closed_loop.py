@@ -1,6 +1,6 @@
 """The closed loop, measured: height, orientation, disturbances, reachability of random goals.
 
-    python -m experiments.closed_loop --only table=height,orientation world=clean
+    python -m experiments.closed_loop --only table=height,orientation
 
 Trial i of a table is a function of the seed and i: object, start, goal and disturbances are drawn
 before anything plans, on objects that no model has seen. Each is run in the clean world with the
