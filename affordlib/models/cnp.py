@@ -72,7 +72,13 @@ class AffordanceCNP(EffectNetwork):
         last = config.leaky_output
         self.action_decoder = _dense((MERGE_WIDTH, *DECODER_WIDTHS, 2 * n_a), last)
         self.effect_decoder = _dense((MERGE_WIDTH, *DECODER_WIDTHS, 2 * n_e), last)
+        self._folds: dict[nn.Linear, tuple] = {}
         self.apply(he_initialise)
+
+    def train(self, mode: bool = True) -> "AffordanceCNP":
+        """As of torch; folded weights are dropped: fused optimisers do not raise their version."""
+        self._folds.clear()
+        return super().train(mode)
 
     def features(self, scaled_image: Float[Tensor, "b 2 48 48"]) -> Float[Tensor, "b 16"]:
         """f(γ_o): features (B, 16) of standardised depth and mask (B, 2, 48, 48)."""
@@ -97,8 +103,7 @@ class AffordanceCNP(EffectNetwork):
         for decoder in (self.action_decoder, self.effect_decoder):
             first = decoder[0]
             if folds:
-                weight = first.weight @ self.merge.weight
-                bias = first.weight @ self.merge.bias + first.bias
+                weight, bias = self._folded(first)
                 base = F.linear(known, weight[:, :-1], bias)
                 hidden = base[:, None] + t_target[..., None] * weight[:, -1]
             else:
@@ -107,6 +112,21 @@ class AffordanceCNP(EffectNetwork):
             mean, raw = decoder[1:](hidden).chunk(2, dim=-1)
             outputs += [mean, self.sigma_floor + F.softplus(raw)]
         return tuple(outputs)
+
+    def _folded(self, first: nn.Linear) -> tuple[Tensor, Tensor]:
+        """Weight and bias of the merge layer and a decoder's first layer in one.
+
+        Without training and gradients they are kept until one of the weights changes.
+        """
+        merge = self.merge
+        if self.training or torch.is_grad_enabled() or first.weight.is_inference():
+            return first.weight @ merge.weight, first.weight @ merge.bias + first.bias
+        weights = (*first.parameters(), *merge.parameters())
+        stamp = tuple((w.data_ptr(), w._version) for w in weights)
+        if self._folds.get(first, (None,))[0] != stamp:
+            weight = first.weight @ merge.weight
+            self._folds[first] = stamp, weight, first.weight @ merge.bias + first.bias
+        return self._folds[first][1:]
 
     def outputs(
         self, features: Tensor, observations: Observations, t_target: Tensor
