@@ -319,7 +319,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Plan:
-    """A chain of steps from a start (x, y) [m] towards a goal, found in plan_s seconds."""
+    """Steps from (x, y) [m] to a goal, found in plan_s seconds; warning: a sentence, or empty."""
 
     goal: Goal
     start_xy_m: tuple[float, float]
@@ -327,6 +327,7 @@ class Plan:
     planner: str
     reaches_goal: bool
     plan_s: float
+    warning: str = ""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "start_xy_m", check_on_table("start_xy_m", self.start_xy_m))

@@ -35,7 +35,7 @@ from tqdm.auto import tqdm
 from affordlib.commands import count_type
 from affordlib.interactions import open_interactions
 from affordlib.interactions.store import stored_sha256
-from affordlib.models.checkpoint import read_weights, resolve_checkpoint, weights_sha256
+from affordlib.models.checkpoint import NOVELTY, read_weights, resolve_checkpoint, weights_sha256
 from affordlib.paths import repo_root, resolve_out_dir
 from affordlib.planning.reachability import SHIPPED as REACHABILITY
 from affordlib.results import write_atomically, write_results
@@ -285,6 +285,7 @@ def hash_of(name: str, kind: str) -> str | None:
 def checkpoint_sha256(name_or_path: str | Path) -> str:
     """Hash of all that decides a checkpoint's answers: weights, configuration, scales, domain."""
     tensors, description = read_weights(resolve_checkpoint(name_or_path), "train it again")
+    tensors.pop(NOVELTY, None)  # does not change what it answers
     decisive = {key: description[key] for key in ("model", "config", "scaler", "domain")}
     return weights_sha256(tensors, json.dumps(decisive))
 

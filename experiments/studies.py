@@ -20,6 +20,7 @@ from experiments.runner import FOLDER, STUDIES, Job, Rows, read
 
 NAME = "studies"
 MODULES = ("ablation", "representation", "uncertainty", "shared_network", "limits", "literal")
+MODULES += ("novelty",)
 for module in (*MODULES, "lever_cross_validation"):
     importlib.import_module(f"experiments.{module}")
 

@@ -65,7 +65,7 @@ class NetworkConfig:
 
 
 class EffectNetwork(nn.Module, ABC):
-    """A network that satisfies `EffectModel`.
+    """A network that satisfies `EffectModel`; novelty: of images, see `calibration.py`.
 
     Inputs and outputs are in metres and radians, in the frame of the table; standardisation and
     rotation into the network's frame happen inside. A subclass gives `features` and
@@ -81,6 +81,7 @@ class EffectNetwork(nn.Module, ABC):
         self.action_channels = config.action_channels
         self.effect_channels = config.effect_channels
         self.sigma_floor, self.sigma_scale = config.sigma_floor, config.sigma_scale
+        self.novelty: Any = None
         for kind in ("action", "effect"):
             width = len(getattr(config, f"{kind}_channels"))
             if len(getattr(scaler, f"{kind}_scale")) != width:

@@ -21,6 +21,7 @@ from torch import nn
 
 from affordlib.interactions.dataset import Scaler
 from affordlib.models.base import EffectNetwork, NetworkConfig
+from affordlib.models.calibration import Novelty
 from affordlib.models.cnp import AffordanceCNP, CNPConfig
 from affordlib.models.domain import TrainingDomain
 from affordlib.models.film import FiLMConfig, FiLMNetwork, LastPoseCNP, LastPoseConfig
@@ -30,6 +31,7 @@ from affordlib.results import write_atomically
 
 FORMAT = "affordlib checkpoint 3"
 SUFFIX = ".safetensors"
+NOVELTY = "novelty"
 _REMEDY = "give another checkpoint, or train it again with notebook 03"
 NETWORKS: dict[str, tuple[type[EffectNetwork], type[NetworkConfig]]] = {
     "cnp": (AffordanceCNP, CNPConfig),
@@ -72,7 +74,8 @@ def save_checkpoint(model: EffectNetwork, path: str | Path, about: dict[str, Any
         "domain": asdict(model.domain),
         "about": about,
     }
-    return write_weights(path, model.state_dict(), description)
+    known = {} if model.novelty is None else {NOVELTY: model.novelty.references}
+    return write_weights(path, model.state_dict() | known, description)
 
 
 def resolve_checkpoint(name_or_path: str | Path) -> Path:
@@ -120,12 +123,14 @@ def restored(
     Raises FileNotFoundError, or ValueError when the file is damaged or of something else.
     """
     tensors, description = read_weights(path, remedy)
+    references = tensors.pop(NOVELTY, None)
     try:
         model = make(description)
         own = model.state_dict()
         if other := [k for k in own if k not in tensors or tensors[k].dtype != own[k].dtype]:
             raise ValueError(f"{other[0]} is missing or of another type")
         model.load_state_dict(tensors)
+        model.novelty = None if references is None else Novelty(references)
     except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
         raise ValueError(
             f"{path} does not describe a model of this package ({error}); {remedy}"

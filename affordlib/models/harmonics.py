@@ -46,6 +46,10 @@ class CircularHarmonics(nn.Module):
         """(B, F), by image channel, cosine or sine, ring and order."""
         return (image.reshape(2 * len(image), -1) @ self.templates.T).reshape(len(image), -1)
 
+    def spectrum(self, image: Float[Tensor, "b 2 n n"]) -> Float[Tensor, "b s"]:
+        """Lengths of the pairs of cosine and sine, which no rotation of the image changes."""
+        return self(image).reshape(-1, *self.layout).norm(dim=2).flatten(1)
+
     def rotated(
         self, values: Float[Tensor, "#b f"], rotation: Float[Tensor, "b 2"]
     ) -> Float[Tensor, "b f"]:

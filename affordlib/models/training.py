@@ -27,12 +27,12 @@ from affordlib.interactions.dataset import (
 )
 from affordlib.interactions.sampling import Batch, sample_mixed
 from affordlib.models.base import EffectNetwork, NetworkConfig
-from affordlib.models.calibration import effects_at, fit_sigma_scale
+from affordlib.models.calibration import Novelty, effects_at, fit_sigma_scale
 from affordlib.models.checkpoint import build, load_state, save_state
 from affordlib.models.cnp import CNPConfig
 from affordlib.models.domain import TrainingDomain
 from affordlib.models.lstm import LSTMNetwork, effects_at_steps
-from affordlib.types import check_count, check_field
+from affordlib.types import IMAGE_PIXELS, check_count, check_field
 
 Sampler = Callable[[InteractionTensors, int, int, torch.Generator], Batch]
 Score = Callable[[EffectNetwork, InteractionTensors], torch.Tensor]
@@ -251,9 +251,12 @@ def batch_loss(model: EffectNetwork, batch: Batch, beta: float = 0.0) -> torch.T
 
 
 def untrained(config: NetworkConfig, training: InteractionTensors, seed: int) -> EffectNetwork:
-    """A network of seeded weights, with scales and domain of training data."""
+    """A network of seeded weights, with scales, domain and `Novelty` of training data."""
     torch.manual_seed(seed)
-    return build(config, Scaler.fit(training), TrainingDomain.fit(training))
+    model = build(config, Scaler.fit(training), TrainingDomain.fit(training))
+    if training.image.shape[-1] == IMAGE_PIXELS:
+        model.novelty = Novelty.fit(training.image)
+    return model
 
 
 def train_model(

@@ -73,6 +73,14 @@ class EffectMap:
         return self.model.encode(checked_image(self.image))
 
     @cached_property
+    def warning(self) -> str:
+        """A sentence where the object is unlike all that the model was trained on."""
+        novelty = getattr(self.model, "novelty", None)
+        if novelty is None or novelty(checked_image(self.image)) <= 1:
+            return ""
+        return "The model was trained on no such object: errors may be far larger than predicted."
+
+    @cached_property
     def radius_m(self) -> float:
         """How far the object reaches from its middle."""
         return radius_m(self.image)

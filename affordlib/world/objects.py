@@ -76,7 +76,7 @@ class TabletopObject(ABC):
 
     @abstractmethod
     def shape(self) -> dict[str, Any]:
-        """PyBullet's arguments for it; `frame` turns it, `seen` are corners only for drawing."""
+        """PyBullet's arguments for it; `frame` turns it, `seen`: corners of parts to draw."""
 
     def fallen(self, upward: np.ndarray) -> bool:
         """Whether it lies otherwise than placed; upward: (3,) how far x, y and z axes point up."""
@@ -246,7 +246,7 @@ class Prism(TabletopObject):
 
     def shape(self) -> dict[str, Any]:
         felt = self._vertices(_HULL_MARGIN_M).tolist()
-        return {"shapeType": pybullet.GEOM_MESH, "vertices": felt, "seen": self._vertices()}
+        return {"shapeType": pybullet.GEOM_MESH, "vertices": felt, "seen": [self._vertices()]}
 
 
 CATEGORIES: dict[str, type[TabletopObject]] = {
@@ -459,7 +459,7 @@ class PlacedObject:
         outline = check_within("scale", scale, 0.1, 10.0) * self.obj.footprint_m
         rgb = [check_within("rgb", share, 0.0, 1.0) for share in check_array("rgb", rgb, 3)]
         # Larger sheets lie lower, so that one on another shows as a frame around it.
-        sheet = np.vstack([np.insert(outline, 2, z, axis=1) for z in (-0.005, 0.001 / scale)])
+        sheet = [np.vstack([np.insert(outline, 2, z, axis=1) for z in (-0.005, 0.001 / scale)])]
         self.client.createMultiBody(
             baseVisualShapeIndex=self.client.createVisualShape(**_mesh(sheet), rgbaColor=(*rgb, 1)),
             basePosition=(*xy_m, 0.0),
@@ -472,11 +472,11 @@ class PlacedObject:
         self.client.resetBaseVelocity(self.body, *changed)
 
 
-def _mesh(vertices: np.ndarray) -> dict[str, Any]:
-    """The convex hull of vertices (n, 3) as triangles with flat faces, for the renderer."""
-    hull = ConvexHull(vertices)
-    triangles = vertices[hull.simplices]
-    normals = hull.equations[:, :3]
+def _mesh(parts: list[np.ndarray]) -> dict[str, Any]:
+    """Convex hulls of the corners (n, 3) of parts as flat triangles, for the renderer."""
+    hulls = [ConvexHull(part) for part in parts]
+    triangles = np.concatenate([hull.points[hull.simplices] for hull in hulls])
+    normals = np.concatenate([hull.equations[:, :3] for hull in hulls])
     facing = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     inward = (facing * normals).sum(axis=1) < 0
     triangles[inward] = triangles[inward, ::-1]
