@@ -200,9 +200,12 @@ CONFIGS: dict[str, PlannerConfig] = {
     "gradient_direction": PlannerConfig(plan_gradient, "cnp_500", ON_RING, **ALL),
     "gradient_direction_corrected": PlannerConfig(plan_gradient, "cnp_500", ON_RING, **CORRECTED),
     "gradient_direction_by_plan": PlannerConfig(plan_gradient, "cnp_500", ON_RING, **BY_PLAN),
+    "gradient_100_corrected": PlannerConfig(plan_gradient, "cnp_500", LITERAL, **CORRECTED),
+    "gradient_100_by_plan": PlannerConfig(plan_gradient, "cnp_500", LITERAL, **BY_PLAN),
     # With the network trained on trajectories of 100 samples, instead of 301.
     "gradient_100_trained": PlannerConfig(plan_gradient, "cnp_500_of_100_samples", LITERAL),
     # Without partial actions.
+    "gradient_100_full": PlannerConfig(plan_gradient_full, "cnp_500", LITERAL),
     "continuous_full": PlannerConfig(plan_continuous_full, **ALL),
     "astar_full": PlannerConfig(plan_astar_full, standing=True),
     "gradient_direction_full": PlannerConfig(plan_gradient_full, "cnp_500", ON_RING),
