@@ -60,7 +60,8 @@ def check_within(name: str, value: Any, low: float, high: float, unit: str = "")
     """Return `value` as a float, or raise naming the argument outside [low, high]."""
     number = check_finite(name, value)
     if not low <= number <= high:
-        raise ValueError(f"{name} must lie in [{low:g}, {high:g}] {unit}, got {number:g}".strip())
+        within = f"[{low:g}, {high:g}] {unit}".strip()
+        raise ValueError(f"{name} must lie in {within}, got {number:g}")
     return number
 
 

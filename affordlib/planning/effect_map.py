@@ -59,6 +59,7 @@ class EffectMap:
         check_count("n_directions", self.n_directions, 8, 720)
         check_count("n_phases", self.n_phases, 5, 500)
         checked_image(self.image)
+        object.__setattr__(self, "image", self.image.copy())  # the caller may write into his
         for channels in (self.model.action_channels, self.model.effect_channels):
             if not xy_columns(channels):
                 raise ValueError(

@@ -21,6 +21,7 @@ from affordlib.types import (
     TABLE_X_M,
     TABLE_Y_M,
     Interaction,
+    NothingSeenError,
     Observation,
     Step,
     UnreachableError,
@@ -146,9 +147,9 @@ class Tabletop(AbstractContextManager):
 
     @property
     def placed(self) -> PlacedObject:
-        """The object on the table; raises RuntimeError when there is none."""
+        """The object on the table; raises NothingSeenError when there is none."""
         if self._placed is None:
-            raise RuntimeError("there is no object on the table; call place(...) first")
+            raise NothingSeenError("there is no object on the table; call place(...) first")
         return self._placed
 
     @property

@@ -179,3 +179,7 @@ def test_predictions_are_kept_while_only_the_goal_moves(skills, cuboid_image):
         assert plan.predicted_end_xy_m == again.predicted_end_xy_m
     assert skills.effects(np.array(cuboid_image)) is first
     assert skills.effects(np.roll(cuboid_image, 1)) is not first
+    written, before = np.array(cuboid_image), skills.effects(cuboid_image).image.copy()
+    kept = skills.effects(written)
+    written[0] = 1.0
+    np.testing.assert_array_equal(kept.image, before)

@@ -7,7 +7,7 @@ import pytest
 from pybullet_utils.bullet_client import BulletClient
 
 from affordlib.primitives import Drag, Grasp, LeverUp, Push, primitive_named
-from affordlib.types import CROP_WIDTH_M, IMAGE_PIXELS, Goal
+from affordlib.types import CROP_WIDTH_M, IMAGE_PIXELS, Goal, NothingSeenError
 from affordlib.world import (
     Cuboid,
     LyingCylinder,
@@ -122,6 +122,12 @@ def test_bad_input_is_named(world, act, words):
     world.place(OBJECTS[0])
     with pytest.raises((RuntimeError, TypeError, ValueError), match=words):
         act(world)
+
+
+def test_nothing_is_seen_on_an_empty_table(world):
+    world.reset()
+    with pytest.raises(NothingSeenError):
+        world.observe()
 
 
 def test_a_shoved_object_moves_turns_and_rests(world):
