@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 import psutil
 
-import affordlib
 from affordlib.paths import from_root, resolve_out_dir
 from affordlib.primitives import Primitive, PushAt, primitive_named
 from affordlib.types import Goal, Plan, Step
@@ -46,10 +45,10 @@ _WITH_UNIT = re.compile(f"(.+?)_({'|'.join(UNITS)})((?:{_STATISTIC})*)")
 
 def versions() -> dict[str, str]:
     """Return the versions that decide a number: Python, the package, the libraries, the machine."""
+    packages = ("affordlib", "torch", "pybullet", "numpy")
     return {
         "python": platform.python_version(),
-        "affordlib": affordlib.__version__,
-        **{name: importlib.metadata.version(name) for name in ("torch", "pybullet", "numpy")},
+        **{name: importlib.metadata.version(name) for name in packages},
         "platform": f"{platform.system()} {platform.machine()}",
     }
 
