@@ -29,7 +29,8 @@ def test_what_is_shipped_knows_the_objects_of_training_and_tests(
     pushes, held_out_pushes, film, house
 ):
     training = InteractionTensors.from_dataset(pushes, split_interactions(500).train).image
-    assert torch.equal(Novelty.fit(training).references, film.novelty.references)
+    again = Novelty.fit(training).references  # processors add in other orders
+    torch.testing.assert_close(again, film.novelty.references, rtol=1e-4, atol=1e-5)
     assert (film.novelty(training) < 1e-3).all()
     tests = film.novelty(InteractionTensors.from_dataset(held_out_pushes).image)
     assert 0.96 < (tests < 1).double().mean() < 0.999
