@@ -9,8 +9,6 @@ from beartype import BeartypeConf, FrozenDict, beartype
 from beartype.claw import beartype_packages
 from beartype.vale import Is
 
-__version__ = "0.1.0"
-
 # What a user calls is called with the types that it names: a number is no text and no truth value.
 _NO_BOOL = Is[lambda value: not isinstance(value, bool)]
 _NUMBER = Annotated[Real, _NO_BOOL]

@@ -83,10 +83,10 @@ def search(
     trace: list[tuple[np.ndarray, np.ndarray]] | None = None,
     heuristic: str = "goal",
 ) -> tuple[list[tuple[float, float]], bool]:
-    """The best chain of (direction, phase) into the goal's disc, or the one that ends nearest.
+    """The best chain of (direction, phase) into the goal's disc, or else the one that ends nearest.
 
-    Also whether it gets there. The best is the shortest way to
-    the goal (heuristic "goal": what the chain leaves counts) or to its disc ("disc": it does not).
+    Returns the chain, and whether it ends in the disc. The best is the shortest way to the goal
+    (heuristic "goal": what the chain leaves counts) or to its disc ("disc": it does not).
     Ties go to fewer actions. A node from which the object cannot be turned and lifted as the goal
     asks is none of the goal's. trace, if given, receives each expanded position (2,) with those of
     its children (n, 2).
