@@ -76,7 +76,7 @@ class TabletopObject(ABC):
 
     @abstractmethod
     def shape(self) -> dict[str, Any]:
-        """PyBullet's arguments for it; `frame` turns it, `seen`: corners of parts to draw."""
+        """PyBullet's arguments; `frame` turns it, `seen`: corners of parts, if other than felt."""
 
     def fallen(self, upward: np.ndarray) -> bool:
         """Whether it lies otherwise than placed; upward: (3,) how far x, y and z axes point up."""
@@ -339,8 +339,8 @@ class PlacedObject:
         self.client, self.obj = client, obj
         self._centre_of_mass_m = np.array(config.com_offset_m)
         shape = obj.shape()
-        frame, seen = shape.pop("frame", (0, 0, 0, 1)), shape.pop("seen", None)
-        visual = dict(shape) if seen is None else _mesh(seen)
+        frame, felt = shape.pop("frame", (0, 0, 0, 1)), shape.get("vertices")
+        visual = _mesh(shape.pop("seen", [felt])) if felt or "seen" in shape else dict(shape)
         if "height" in visual:
             visual["length"] = visual.pop("height")
         self.body = client.createMultiBody(
