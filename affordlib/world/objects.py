@@ -472,7 +472,7 @@ class PlacedObject:
         self.client.resetBaseVelocity(self.body, *changed)
 
 
-def _mesh(parts: list[np.ndarray]) -> dict[str, Any]:
+def _mesh(parts: list) -> dict[str, Any]:
     """Convex hulls of the corners (n, 3) of parts as flat triangles, for the renderer."""
     hulls = [ConvexHull(part) for part in parts]
     triangles = np.concatenate([hull.points[hull.simplices] for hull in hulls])
