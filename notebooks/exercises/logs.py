@@ -1,4 +1,4 @@
-"""Exercises of notebook 09: frames, and mirrored pushes."""
+"""Exercises of notebook 09: the effect of a push, and mirrored pushes."""
 
 from __future__ import annotations
 
@@ -11,13 +11,17 @@ from affordlib.geometry import rotated, unit_vector
 from exercises.checking import Exercise, asked
 
 
-def _frame_error_mm(to_object: Callable[..., Any]) -> float:
-    """How far [mm] points come to lie from where they are in the object's frame, at worst."""
+def _effect_error(effect: Callable[..., Any]) -> float:
+    """How far [mm or mrad] effects are from those that were moved into the world, at worst."""
     rng, worst = np.random.default_rng(0), 0.0
     for _ in range(20):
-        point, (x, y, yaw) = rng.normal(size=2), rng.normal(size=3)
-        world = np.add(rotated(point, yaw), (x, y))
-        worst = max(worst, float(np.abs(asked(to_object, (x, y, yaw), world) - point).max()))
+        heading, yaw, turn = rng.uniform(-np.pi, np.pi, 3)
+        xy, centroid, moved = rng.normal(scale=0.1, size=(3, 2))
+        middle = xy + rotated(centroid, yaw) + rotated(moved, heading)
+        end_yaw = (yaw + turn + np.pi) % (2 * np.pi) - np.pi
+        end = middle - rotated(centroid, end_yaw)
+        got = asked(effect, (*xy, yaw), (*end, end_yaw), centroid, heading)
+        worst = max(worst, float(np.abs(got - (*moved, turn)).max()))
     return 1000 * worst
 
 
@@ -35,11 +39,11 @@ def _mirror_error(mirrored: Callable[..., Any]) -> float:
 
 LOGS: dict[str, Exercise] = {
     "09.1": Exercise(
-        "Write to_object(pose, point): a point of the world in the frame of an object.",
-        _frame_error_mm,
+        "Write effect(before, after, centroid, heading): ahead, left and turn of a push.",
+        _effect_error,
         expected=0.0,
         within=0.1,
-        unit="mm, largest error",
+        unit="mm or mrad, largest error",
     ),
     "09.2": Exercise(
         "Write mirrored(contact, direction, displacement, turn): seven numbers, mirrored at x.",
