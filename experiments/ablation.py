@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
 import torch
+import xarray as xr
 
 from affordlib.interactions import (
     InteractionTensors,
@@ -15,7 +17,9 @@ from affordlib.interactions import (
     open_interactions,
     split_interactions,
 )
+from affordlib.interactions.dataset import valid_interactions
 from affordlib.interactions.sampling import Batch, sample_mixed
+from affordlib.models import EffectNetwork
 from affordlib.models.checkpoint import build
 from affordlib.models.film import FiLMNetwork
 from affordlib.models.protocol import condition_on_final_effect
@@ -130,42 +134,74 @@ SHIPPED = CHECKPOINT_SPECS["film_500"]
 _ABOUT = (SHIPPED.network, SHIPPED.training, STEPS, SEEDS)
 
 
-@study("push", "push_test", settings=(_ABOUT, CHANGES))
+@study("push", "push_test", settings=(_ABOUT, CHANGES), version=2)
 def ablation() -> Rows:
-    """Errors on `push_test` of short trainings, each without one thing; means over seeds."""
-    return [{"change": change} | _errors([change]) for change in CHANGES]
+    """Errors after short trainings, each without one thing; of the whole network also on the test.
+
+    Means over seeds of `errors_m`, each on the 50 objects that validated its training.
+    """
+    rows = [{"change": change} | _row([change]) for change in CHANGES]
+    return [*rows, {"change": "nothing"} | _row(["nothing"], test=True)]
 
 
-@study("push", "push_test", settings=(_ABOUT, [CHANGES[change] for change in LADDER.values()]))
+@study("push", settings=(_ABOUT, [CHANGES[change] for change in LADDER.values()]), version=2)
 def incremental_ablation() -> Rows:
     """The same of trainings that gain one thing after another, from none of `LADDER` to all."""
-    names, changes = list(LADDER), list(LADDER.values())
-    return [
-        {"added": "nothing" if k == 0 else names[k - 1]} | _errors(changes[k:])
-        for k in range(len(names) + 1)
-    ]
+    names, changes = ["nothing", *LADDER], list(LADDER.values())
+    return [{"added": name} | _row(changes[k:] or ["nothing"]) for k, name in enumerate(names)]
 
 
-def _errors(changes: Sequence[str]) -> dict[str, Any]:
-    box = open_interactions("push_test")["family"].values == 0
-    each_seed = [ablated(changes, STEPS, seed) for seed in range(SEEDS)]
-    ends = [(error[box].mean() + error[~box].mean()) / 2 for error, _ in each_seed]
-    row: dict[str, Any] = {"steps": STEPS, "seeds": SEEDS, "n": len(box)}
-    for name, each in (("final_error", ends), ("action_start", [s.mean() for _, s in each_seed])):
+def _row(changes: Sequence[str], test: bool = False) -> dict[str, Any]:
+    each_seed = [errors_m(tuple(changes), STEPS, seed, test) for seed in range(SEEDS)]
+    n = each_seed[0]["n"] if test else sum(errors["n"] for errors in each_seed)
+    row = {"scored_on": "test" if test else "validation", "steps": STEPS, "seeds": SEEDS, "n": n}
+    for name in ("final_error", "action_start"):
         for statistic in (np.mean, np.min, np.max):
-            row[f"{name}_{statistic.__name__}_m"] = float(statistic(each))
+            over_seeds = statistic([errors[name] for errors in each_seed])
+            row[f"{name}_{statistic.__name__}_m"] = float(over_seeds)
     return row
 
 
-def ablated(changes: Sequence[str], steps: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Errors on `push_test` after a training on fold 0 of `push` with some of `CHANGES`.
+def errors_m(
+    changes: tuple[str, ...], steps: int, seed: int, test: bool = False
+) -> dict[str, float]:
+    """Mean errors [m] of the network of `ablated`, where boxes and cylinders weigh the same.
 
-    Where two of them sample contexts, the first does. Final errors (N,) [m] of effects predicted
-    from actions; and distances (N,) [m] between the start of the recorded push and of the push that
-    is decoded from its final effect.
+    On the pushes that validated the training, or on `push_test`, `n` in number. `final_error`: of
+    effects predicted from actions; `action_start`: between the start of the recorded push and of
+    the push that is decoded from its final effect.
+    """
+    data = open_interactions("push_test" if test else SHIPPED.data)
+    n = data.sizes["interaction"]
+    rows = np.arange(n) if test else split_interactions(n, fold=seed).validation
+    rows = valid_interactions(data, rows)
+    model, arrays = ablated(changes, steps, seed), _tensors(data, rows, changes)
+    with torch.no_grad():
+        observed = condition_on_final_effect(model, arrays.effect[:, -1])
+        decoded = model.predict(model.encode(arrays.image), observed, torch.zeros(len(rows), 1))
+    start = (decoded.action_mean[:, 0, :2] - arrays.action[:, 0, :2]).norm(dim=-1)
+    box = torch.from_numpy(data["family"].values[rows] == 0)
+    errors = {"final_error": final_errors_m(model, arrays), "action_start": start}
+    means = {k: float(e[box].mean() + e[~box].mean()) / 2 for k, e in errors.items()}
+    return means | {"n": len(rows)}
+
+
+def _tensors(data: xr.Dataset, rows: np.ndarray, changes: Sequence[str]) -> InteractionTensors:
+    """Pushes with the channels of our network; with an empty image, if that is a change."""
+    channels = SHIPPED.network.action_channels, SHIPPED.network.effect_channels
+    arrays = InteractionTensors.from_dataset(data, rows, *channels)
+    if all(CHANGES[change].get("image", True) for change in changes):
+        return arrays
+    return replace(arrays, image=torch.zeros_like(arrays.image))
+
+
+@cache
+def ablated(changes: tuple[str, ...], steps: int, seed: int = 0) -> EffectNetwork:
+    """Our network after a training on `push` with some of `CHANGES`; the seed is also the fold.
+
+    Where two of them sample contexts, the first does.
     """
     each = [CHANGES[change] for change in changes]
-    image = all(how.get("image", True) for how in each)
     scales = next((how["scales"] for how in each if "scales" in how), lambda same: same)
     draw = next((how["draw"] for how in each if "draw" in how), sample_mixed)
     options: dict[str, dict[str, Any]] = {
@@ -174,27 +210,12 @@ def ablated(changes: Sequence[str], steps: int, seed: int = 0) -> tuple[np.ndarr
     }
     config = replace(SHIPPED.training, steps=steps, seed=seed, **options["training"])
     network = replace(SHIPPED.network, **options["network"])
-    channels = network.action_channels, network.effect_channels
-    data, test_data = open_interactions("push"), open_interactions("push_test")
-    split = split_interactions(data.sizes["interaction"])
-    parts = (data, split.train), (data, split.validation), (test_data, None)
-    training, validation, test = (
-        InteractionTensors.from_dataset(d, rows, *channels) for d, rows in parts
-    )
-    scaler = Scaler.fit(training)
-    if not image:
-        blank = training.image.mean(dim=0, keepdim=True)
-        training, validation, test = (
-            replace(a, image=blank.expand(len(a), -1, -1, -1)) for a in (training, validation, test)
-        )
-        scaler = replace(scaler, mask_share=None)
+    data = open_interactions(SHIPPED.data)
+    split = split_interactions(data.sizes["interaction"], fold=seed)
+    training, validation = (_tensors(data, r, changes) for r in (split.train, split.validation))
     torch.manual_seed(seed)
-    model = build(network, scales(scaler))
+    model = build(network, scales(Scaler.fit(training)))
     for how in each:
         how.get("start", lambda _: None)(model)
     train(model, training, validation, config, sampler=draw)
-    with torch.no_grad():
-        observed = condition_on_final_effect(model, test.effect[:, -1])
-        decoded = model.predict(model.encode(test.image), observed, torch.zeros(len(test), 1))
-    start = (decoded.action_mean[:, 0, :2] - test.action[:, 0, :2]).norm(dim=-1)
-    return final_errors_m(model, test).numpy(), start.numpy()
+    return model
