@@ -95,6 +95,7 @@ def plan_continuous_with(problem: PlanningProblem, **constants: Any) -> Plan:
 
 MADE: dict[str, Callable[[], EffectModel]] = {
     "cnp_500_of_100_samples": partial(trained_on, 100),
+    "cnp_500_of_300_samples": partial(trained_on, 300),
     "limit_surface": LimitSurface.fitted,
 }
 """Models that are no checkpoints: the job itself trains (ten minutes) or fits them on `push`."""
@@ -172,7 +173,8 @@ class PlannerConfig:
 ALL = {"sources": goals.GOAL_SOURCES}
 CORRECTED, BY_PLAN = {"execution": {"corrections": 2}}, {"execution": {"by_plan": True}}
 RECEDING = {"execution": {"receding": True}}
-LITERAL, ON_RING = {"samples": 100}, {"samples": 100, "starts": 4, "direction_only": True}
+LITERAL, FINER = {"samples": 100}, {"samples": 300}
+ON_RING = LITERAL | {"starts": 4, "direction_only": True}
 DISC = {"heuristic": "disc"}
 PERTURBED = {"model": "film_5000_perturbed", "world": "perturbed"}
 ORACLE = {"model": "simulator"}
@@ -195,15 +197,16 @@ CONFIGS: dict[str, PlannerConfig] = {
     "astar_disc_cnp_500": PlannerConfig(plan_astar, "cnp_500", DISC, **ALL),
     "gradient_25": PlannerConfig(plan_gradient, "cnp_500", {"samples": 25}),
     "gradient_100": PlannerConfig(plan_gradient, "cnp_500", LITERAL, **ALL),
-    "gradient_300": PlannerConfig(plan_gradient, "cnp_500", {"samples": 300}),
+    "gradient_300": PlannerConfig(plan_gradient, "cnp_500", FINER),
     "gradient_snapped": PlannerConfig(plan_gradient, "cnp_500", {"samples": 100, "snap": True}),
     "gradient_direction": PlannerConfig(plan_gradient, "cnp_500", ON_RING, **ALL),
     "gradient_direction_corrected": PlannerConfig(plan_gradient, "cnp_500", ON_RING, **CORRECTED),
     "gradient_direction_by_plan": PlannerConfig(plan_gradient, "cnp_500", ON_RING, **BY_PLAN),
     "gradient_100_corrected": PlannerConfig(plan_gradient, "cnp_500", LITERAL, **CORRECTED),
     "gradient_100_by_plan": PlannerConfig(plan_gradient, "cnp_500", LITERAL, **BY_PLAN),
-    # With the network trained on trajectories of 100 samples, instead of 301.
+    # With the network trained on trajectories of as many samples, instead of 301.
     "gradient_100_trained": PlannerConfig(plan_gradient, "cnp_500_of_100_samples", LITERAL),
+    "gradient_300_trained": PlannerConfig(plan_gradient, "cnp_500_of_300_samples", FINER),
     # Without partial actions.
     "gradient_100_full": PlannerConfig(plan_gradient_full, "cnp_500", LITERAL),
     "continuous_full": PlannerConfig(plan_continuous_full, **ALL),
@@ -465,6 +468,7 @@ VARIANTS = {
     "astar_continuous": "continuous",
     "gradient_300": "gradient_100",
     "gradient_100_trained": "gradient_100",
+    "gradient_300_trained": "gradient_100_trained",
     "cem": "continuous",
     "mpc_continuous": "continuous",
     "mpc_cem": "mpc_continuous",
