@@ -67,11 +67,15 @@ def check_within(name: str, value: Any, low: float, high: float, unit: str = "")
 
 def check_array(name: str, values: Any, *shape: int) -> np.ndarray:
     """Return finite numbers as an array, or raise naming the argument; shape: how its ends."""
-    array = np.asarray(values)
+    try:
+        array = np.asarray(values)
+    except (TypeError, ValueError, RuntimeError):  # rows of different lengths, a tensor's gradients
+        array = np.empty(0)
     known = array.dtype.kind in "iuf" and array.size and np.isfinite(array).all()
     if not known or array.shape[array.ndim - len(shape) :] != shape:
         wanted = f" of shape (…, {', '.join(map(str, shape))})" if shape else ""
-        raise ValueError(f"{name} must be finite numbers{wanted}, got {values!r:.200}")
+        got = " ".join(f"{values!r:.200}".split())
+        raise ValueError(f"{name} must be finite numbers{wanted}, got {got}")
     return array.astype(float)
 
 
@@ -131,9 +135,9 @@ class Observation:
     """What the robot sees of the object at rest, its arm parked.
 
     xy_m: estimated position (x, y) [m] in the frame of the table; image: (2, 48, 48), depth [m]
-    from a plane 1 m above the table and the object's mask, centred there; std_m: σ of the
-    position, where it is known. yaw_rad: how the object is turned, where the robot can tell, and
-    yaw_std_rad: its σ; None where it was not seen but reckoned.
+    from a plane 1 m above the table and the object's mask, centred there to some millimetres;
+    std_m: σ of the position, where it is known. yaw_rad: how the object is turned, where the robot
+    can tell, and yaw_std_rad: its σ; None where it was not seen but reckoned.
     """
 
     xy_m: tuple[float, float]

@@ -66,19 +66,22 @@ def feet_of(support: str) -> np.ndarray:
 def pushes_of(path: Path) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Of each push of a file: poses (2, 7) before and after, times and positions of the tool.
 
-    A pose is x, y, z and a quaternion w, i, j, k.
+    A pose is x, y, z and a quaternion w, i, j, k. Raises ValueError for a file that is damaged.
     """
-    packed = path.read_bytes()
-    text = (lzma.decompress(packed) if path.suffix == ".xz" else packed).decode()
-    values = iter([float(word) for word in text.split()])
 
     def take(columns: int, rows: int | None = None) -> np.ndarray:
         rows = int(next(values)) if rows is None else rows
         return np.array([next(values) for _ in range(rows * columns)]).reshape(rows, columns)
 
-    for _ in range(int(next(values))):
-        poses, _forces, tool = take(7, rows=2), take(3), take(8)
-        yield poses, tool[:, 0], tool[:, 1:3]
+    packed = path.read_bytes()
+    try:
+        text = (lzma.decompress(packed) if path.suffix == ".xz" else packed).decode()
+        values = iter([float(word) for word in text.split()])
+        for _ in range(int(next(values))):
+            poses, _forces, tool = take(7, rows=2), take(3), take(8)
+            yield poses, tool[:, 0], tool[:, 1:3]
+    except (lzma.LZMAError, StopIteration, ValueError) as error:
+        raise ValueError(f"{path} is damaged, or no log of pushes: {error!r}") from error
 
 
 def planar(pose: np.ndarray) -> tuple[float, float, float]:

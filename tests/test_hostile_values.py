@@ -24,7 +24,7 @@ from affordlib.paths import repo_root
 from affordlib.perception import crop_from_depth
 from affordlib.primitives import Drag, Grasp, LeverUp, Push, PushAt, Rotate, primitive_named
 from affordlib.results import load_plan, read_results, results_table, save_plan, write_results
-from affordlib.types import Goal, Outcome, Plan, Step, UnreachableError
+from affordlib.types import Goal, Outcome, Plan, Step, UnreachableError, check_array
 from exercises import check
 from tests.problems import Still
 
@@ -37,6 +37,7 @@ HEAPS = (
     set(),
     (),
     [[]],
+    [[0.1], [0.1, 0.2]],
     {"x": 1},
     (0.1,),
     (0.1, "0.2"),
@@ -329,3 +330,10 @@ def test_a_hostile_value_is_refused_by_name_or_does_no_harm(shop, name, tmp_path
     plt.close("all")
     assert not found, "\n".join(found)
     assert not list(repo_root().glob("*/x.json"))
+
+
+def test_what_holds_no_numbers_is_named():
+    learned = torch.ones(1, 2, requires_grad=True)
+    for wrong in ([[1.0], [1.0, 2.0]], [1j, 2.0], ["a", "b"], [None, 1.0], learned):
+        with pytest.raises(ValueError, match="outline must be finite numbers of shape"):
+            check_array("outline", wrong, 2)

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from affordlib.geometry import rotate_channels
-from affordlib.types import check_array, check_count, check_finite
+from affordlib.types import HasChannels, check_array, check_count, check_finite
 
 
 def valid_interactions(data: "xarray.Dataset", interactions: np.ndarray) -> np.ndarray:
@@ -22,6 +22,14 @@ def check_numbers(name: str, interactions: np.ndarray) -> None:
     """Raise, naming the argument, unless these are the numbers (n,) of interactions, n ≥ 1."""
     if interactions.ndim != 1 or interactions.dtype.kind not in "iu" or not len(interactions):
         raise ValueError(f"{name} must be numbers (n,) of interactions, got {interactions!r:.80}")
+
+
+def check_channels(name: str, tensors: HasChannels, model: HasChannels) -> None:
+    """Raise, naming the argument, unless tensors have the channels of a model, in its order."""
+    for kind in ("action_channels", "effect_channels"):
+        own, wanted = getattr(tensors, kind), getattr(model, kind)
+        if own != wanted:
+            raise ValueError(f"{name} has the {kind} {own}, the model needs {wanted}")
 
 
 @dataclass(frozen=True)
@@ -96,6 +104,7 @@ _BY_INTERACTION = ("image", "action", "effect", "stop_phase")
 class InteractionTensors:
     """Interactions as tensors: image (N, 2, 48, 48), phase (S,), action and effect (N, S, C).
 
+    How wide the images are is not stored: give a model those of the width it was trained on.
     stop_phase: (N,), by which `phase` is multiplied: below 1 where an action was truncated.
     """
 

@@ -40,15 +40,15 @@ def read_log(folder: str | Path, n_samples: int = 101) -> InteractionTensors:
             f"folder: there is no {path}; expected are {TABLE} with the columns interaction, t, "
             f"action_x, …, effect_x, …, and {IMAGES}/NAME.png for each interaction"
         )
-    # Only an empty entry is missing: "NA" is a name as good as others.
-    table = pd.read_csv(path, dtype={"interaction": str}, keep_default_na=False, na_values=[""])
+    try:  # only an empty entry is missing: "NA" is a name as good as others
+        table = pd.read_csv(path, dtype={"interaction": str}, keep_default_na=False, na_values=[""])
+    except ValueError as error:
+        raise ValueError(f"{path} is no table of comma-separated values: {error}") from error
     actions, effects = _columns(path, table)
     yaws = [name.endswith("yaw") for name in actions + effects]
     trajectories, images = [], []
     for name, rows in table.groupby("interaction", sort=False):
         t, values = rows["t"].to_numpy(float), rows[actions + effects].to_numpy(float)
-        if not (np.isfinite(values).all() and np.isfinite(t).all()):
-            raise ValueError(f"{path}: interaction {name!r} has an entry that is not a number")
         if len(t) < 2 or t[0] != 0 or t[-1] != 1 or (np.diff(t) <= 0).any():
             raise ValueError(f"{path}: t of interaction {name!r} must grow from 0 to 1")
         values[:, yaws] = np.unwrap(values[:, yaws], axis=0)
@@ -86,21 +86,28 @@ def write_log(folder: str | Path, tensors: InteractionTensors) -> Path:
 
 
 def _columns(path: Path, table: pd.DataFrame) -> list[list[str]]:
-    """The table's columns of actions and of effects; raises ValueError for what is wrong."""
+    """The table's columns of actions and of effects, in the order of the channels.
+
+    Raises ValueError for what is wrong.
+    """
     for name in ("interaction", "t"):
         if name not in table:
             raise ValueError(f"{path}: the column {name!r} is missing")
     found = []
     for kind, channels in (("action", ACTION_CHANNELS), ("effect", EFFECT_CHANNELS)):
         known = [f"{kind}_{channel}" for channel in channels]
-        found.append([name for name in table if name.startswith(f"{kind}_")])
-        if not found[-1] or not {*found[-1]} <= {*known}:
-            raise ValueError(
-                f"{path}: the columns of the {kind} are {found[-1]}; choose from {known}"
-            )
+        there = [name for name in table if name.startswith(f"{kind}_")]
+        if not there or not {*there} <= {*known}:
+            raise ValueError(f"{path}: the columns of the {kind} are {there}; choose from {known}")
+        found.append(sorted(there, key=known.index))
     for name in ("t", *found[0], *found[1]):
-        if not pd.api.types.is_numeric_dtype(table[name]):
-            raise ValueError(f"{path}: the column {name!r} must hold numbers only")
+        wrong = ~np.isfinite(pd.to_numeric(table[name], errors="coerce"))
+        if wrong.any():
+            row = int(wrong.argmax())
+            raise ValueError(
+                f"{path}: the column {name!r} must hold numbers only, line {row + 2} has "
+                f"'{table[name][row]}'"
+            )
     if (empty := table["interaction"].isna()).any():
         row = 2 + int(empty.argmax())
         raise ValueError(f"{path}: line {row} has no entry in the column 'interaction'")
@@ -112,8 +119,11 @@ def _pixels(path: Path) -> np.ndarray:
     n = IMAGE_PIXELS
     if not path.is_file():
         raise FileNotFoundError(f"there is no image {path} of the interaction of that name")
-    with Image.open(path) as file:
-        values = np.asarray(file)
+    try:
+        with Image.open(path) as file:
+            values = np.asarray(file)
+    except (OSError, SyntaxError, ValueError) as error:
+        raise ValueError(f"{path} is damaged, or no image: {error}") from error
     if values.shape != (n, n):
         raise ValueError(f"{path} must be a gray image of {n}×{n} pixels, got {values.shape}")
     return values

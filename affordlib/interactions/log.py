@@ -72,7 +72,10 @@ class PushLog:
         return outline_image(self.outline_m, self.crop_width_m)
 
     def interaction_tensors(self) -> InteractionTensors:
-        """The same as the book's networks take them, at the phases where all effects are known."""
+        """The same as the book's networks take them, at the phases where all effects are known.
+
+        Shipped models read images as `CROP_WIDTH_M` wide, and notice no other `crop_width_m`.
+        """
         known = np.flatnonzero(np.isfinite(self.effect).all(axis=(0, 2)))
         image = torch.from_numpy(self.image()).expand(len(self), -1, -1, -1)
         phase = torch.linspace(0, 1, self.action.shape[1])[known]
@@ -237,11 +240,7 @@ class Log:
 
 
 def _array(where: str, name: str, values: Any) -> np.ndarray:
-    try:
-        array = check_array(name, values)
-    except (TypeError, ValueError):
-        got = " ".join(f"{values!r:.80}".split())
-        raise ValueError(f"{where}: {name} must be finite numbers, got {got}") from None
+    array = check_array(f"{where}: {name}", values)
     if len(array) > MOST_ROWS:
         raise ValueError(
             f"{where}: {name} has {len(array)} rows, expected are those of one push, at most "

@@ -20,7 +20,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from affordlib.geometry import xy_columns
-from affordlib.interactions.dataset import InteractionTensors
+from affordlib.interactions.dataset import InteractionTensors, check_channels
 from affordlib.interactions.sampling import condition_on_recorded_action
 from affordlib.models.base import EffectNetwork, gaussian_nll
 from affordlib.models.harmonics import CircularHarmonics
@@ -53,6 +53,7 @@ def effects_at(
     phases = [check_within("phases", phase, 0.0, 1.0) for phase in phases]
     if not phases:
         raise ValueError("phases must hold at least one phase in [0, 1], got none")
+    check_channels("tensors", tensors, model)
     at = (torch.tensor(phases) * (len(tensors.phase) - 1)).round().long()
     t_target = tensors.phases(at)
     predicted = model.predict(

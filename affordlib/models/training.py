@@ -24,6 +24,7 @@ from affordlib.interactions.dataset import (
     Split,
     Symmetry,
     augment_by_symmetry,
+    check_channels,
 )
 from affordlib.interactions.sampling import Batch, sample_mixed
 from affordlib.models.base import EffectNetwork, NetworkConfig
@@ -31,7 +32,7 @@ from affordlib.models.calibration import Novelty, effects_at, fit_sigma_scale
 from affordlib.models.checkpoint import build, load_state, save_state
 from affordlib.models.cnp import CNPConfig
 from affordlib.models.domain import TrainingDomain
-from affordlib.models.lstm import LSTMNetwork, effects_at_steps
+from affordlib.models.lstm import effects_at_steps
 from affordlib.types import IMAGE_PIXELS, check_count, check_field
 
 Sampler = Callable[[InteractionTensors, int, int, torch.Generator], Batch]
@@ -137,6 +138,7 @@ def train(
     for name, tensors in (("training", training), ("validation", validation)):
         if len(tensors) == 0:
             raise ValueError(f"{name} holds no interactions")
+        check_channels(name, tensors, model)
     device = device_named(config.device)
     model.to(device).train()
     first_floor = model.config.sigma_floor
@@ -280,7 +282,7 @@ def train_model(
     if symmetries:
         training = augment_by_symmetry(training, symmetries)
     model = untrained(model_config, training, config.seed)
-    if isinstance(model, LSTMNetwork):
+    if hasattr(model, "mean_trajectory"):
         model.mean_trajectory.fit(effects_at_steps(model, training), model.effect_scale)
     history = train(model, training, validation, config, resume_checkpoint, sampler)
     fit_sigma_scale(model, validation)

@@ -6,8 +6,9 @@
     query the whole action and effect trajectory; stop at the phase of least distance to the target
 
 In the printed pseudo-code `index` never grows and the object's pose never advances; here they do.
-The decoded action trajectory is what the robot executes; `snap` replaces it by the push in the same
-direction.
+As there, only the position counts: each action is predicted for the object as its image shows it,
+although the ones before may turn it (`predicted_turn_rad` says how far). The decoded action
+trajectory is what the robot executes; `snap` replaces it by the push in the same direction.
 """
 
 import math

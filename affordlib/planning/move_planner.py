@@ -166,6 +166,8 @@ class MovePlanner:
     def _first_refused(self, actions: Iterable[tuple[Primitive, float, Point]]) -> int | None:
         """The number of the first action that the kinematics refuses, and is not to be planned
         again; actions: with the phase at which each stops, and where the object is before it.
+
+        It is asked about the bare primitives, not about a decoded path or the grip of a drag.
         """
         for k, (action, stop_phase, at) in enumerate(actions):
             if not self.robot.can_reach(action, stop_phase, at):

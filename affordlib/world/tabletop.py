@@ -198,6 +198,7 @@ class Tabletop(AbstractContextManager):
         """The object's estimated position and its image; the arm must be parked.
 
         The position is the mean over `n_averaged_images` images, the image is the first of them.
+        A Kinect's image is centred where the object is seen in it, whatever the mean and `bias_m`.
         """
         x, y, _ = self.object_pose()
         views = []
@@ -211,7 +212,9 @@ class Tabletop(AbstractContextManager):
 
     def _observe_edge(self, lever: LeverUp) -> Observation:
         """The image (2, 128, 128) around a lever-up's contact, its direction to the right."""
-        x, y, _ = self.object_pose()
+        if self.config.camera != "ideal":
+            raise ValueError(f'camera must be "ideal" for a lever-up, got {self.config.camera!r}')
+        x, y = np.add(self.object_pose()[:2], self.config.bias_m).tolist()
         window = (x + lever.contact_x, y + lever.contact_y), LEVER_IMAGE_PIXELS, LEVER_CROP_WIDTH_M
         return Observation((x, y), camera.depth_crop(self.client, *window, lever.theta, samples=1))
 

@@ -1,6 +1,7 @@
 """Studies: what an ablation leaves out, what rolls, residuals, what limits a prediction."""
 
 import dataclasses
+import lzma
 import subprocess
 import sys
 
@@ -12,10 +13,12 @@ from scipy import integrate, stats
 from affordlib.interactions import InteractionTensors, open_interactions, split_interactions
 from affordlib.interactions.sampling import condition_on_recorded_action, sample_mixed
 from affordlib.models.push_frame import push_direction
+from affordlib.paths import repo_root
 from affordlib.types import Prediction
 from affordlib.world import LyingCylinder, UprightCylinder
 from experiments import ablation, limits, shared_network, studies
 from experiments.ablation import actions_only, half_blend, random_contexts
+from experiments.real_pushes import pushes_of
 from experiments.representation import cka, learn_rollability
 from experiments.uncertainty import Fit, coverage_columns, crps, fits
 
@@ -153,7 +156,8 @@ def test_copies_keep_the_symmetries_of_each_primitive(of_all):
 def test_shares_are_of_the_usual_effect(of_all):
     class Knowing(torch.nn.Module):
         known = 1.0
-        action_channels = effect_channels = shared_network.NETWORK.effect_channels
+        action_channels = shared_network.NETWORK.action_channels
+        effect_channels = shared_network.NETWORK.effect_channels
 
         def encode(self, image):
             return image
@@ -243,6 +247,23 @@ def test_reach_as_learned_agrees_with_the_kinematics(monkeypatch):
     rows = {row["primitive"]: row for row in limits.reachability_accuracy()}
     assert rows["all"]["agree_percent"] >= 97
     assert min(row["agree_percent"] for row in rows.values()) > 92
+
+
+def test_a_damaged_log_of_pushes_is_named(tmp_path):
+    packed = (repo_root() / "data" / "own_log" / "felt_mid.txt.xz").read_bytes()
+    text = lzma.decompress(packed)
+    for name, content in (
+        ("a.txt.xz", packed[:-100]),
+        ("b.txt.xz", text),
+        ("c.txt", text[:-4000]),
+        ("d.txt", text.replace(b".", b",", 1)),
+        ("e.txt", packed),
+        ("f.txt", b""),
+    ):
+        path = tmp_path / name
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=f"{name} is damaged, or no log of pushes"):
+            list(pushes_of(path))
 
 
 def test_what_decides_a_study_is_the_same_in_every_process():

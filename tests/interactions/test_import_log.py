@@ -35,6 +35,9 @@ def test_what_was_written_is_read_again(some, folder):
 
 
 def test_a_network_predicts_the_same_from_the_folder(film, some, folder):
+    """In whatever order its columns stand."""
+    table = pd.read_csv(folder / TABLE, dtype={"interaction": str})
+    table[sorted(table, reverse=True)].to_csv(folder / TABLE, index=False)
     ours, theirs = (final_errors_m(film, a) for a in (some, read_log(folder, 301)))
     torch.testing.assert_close(ours, theirs, atol=2e-4, rtol=0)
 
@@ -70,7 +73,11 @@ def _replace(folder, old, new):
         ),
         (lambda f: _replace(f, "interaction", "object"), r"column 'interaction' is missing"),
         (lambda f: _replace(f, "0001,0.0,", "0001,0.5,"), r"t of interaction '0001' must grow"),
-        (lambda f: _replace(f, "0000,0.0,", "0000,zero,"), r"column 't' must hold numbers"),
+        (lambda f: _replace(f, "0000,0.0,", "0000,zero,"), r"\.csv: .* 't' .* line 2 has 'zero'"),
+        (lambda f: _replace(f, "0001,0.0,", "0001,,"), r"column 't' .* line 303 has 'nan'"),
+        (lambda f: _replace(f, "0001,0.0,", "0001,0.0,0,"), r"\.csv is no table .* line 303,"),
+        (lambda f: (f / TABLE).write_text(""), r"\.csv is no table"),
+        (lambda f: (f / "images/0001.png").write_bytes(b"\x89PNG"), r"0001\.png is damaged"),
         (
             lambda f: Image.fromarray(np.zeros((48, 48), np.uint8)).save(f / "images" / "0002.png"),
             r"0002\.png must hold depth in 16 bits",

@@ -18,7 +18,9 @@ from affordlib.models import (
     build,
     load_checkpoint,
     train,
+    train_model,
 )
+from affordlib.models.film import LastPoseConfig
 from affordlib.models.training import batch_loss, final_errors_m
 from affordlib.types import Observations
 from experiments.literal import sample_literal, train_literal
@@ -59,6 +61,24 @@ def test_a_training_that_never_validates_says_so(some):
 
     with pytest.raises(ValueError, match=r"learning_rate 0\.5: no validation error was finite"):
         train(fresh(some), some, some, config, score=never)
+
+
+def test_channels_in_another_order_are_refused(some):
+    other = dataclasses.replace(some, effect_channels=("yaw", "x", "y"))
+    for act in (
+        lambda: final_errors_m(fresh(some), other),
+        lambda: train(fresh(some), some, other),
+    ):
+        with pytest.raises(ValueError, match=r"has the effect_channels .* the model needs"):
+            act()
+
+
+def test_a_mean_trajectory_is_that_of_the_training(pushes):
+    config = TrainingConfig(steps=1, batch_size=4, validate_every=1)
+    push_frame = LastPoseConfig(frame="push", width=16, blocks=1, rings=3, orders=4)
+    model, _ = train_model(pushes, split_interactions(60), config, push_frame)
+    ahead_m = float((model.mean_trajectory.values * model.effect_scale)[-1, 0])
+    assert 0.03 < ahead_m < 0.12
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")

@@ -192,6 +192,19 @@ def test_a_biased_estimate_moves_the_action(world):
     assert 0.002 < seen.rest_effect[1] < 0.006
 
 
+def test_a_lever_up_is_seen_where_the_robot_believes_it_or_not_at_all(world):
+    slab, lever, columns = Cuboid(0.16, 0.16, 0.04), LeverUp(-0.08, 0.0, 0.0, 0.16), []
+    for bias_m in ((0.0, 0.0), (0.014, 0.0)):
+        world.place(slab, tool="screwdriver", config=WorldConfig(bias_m=bias_m))
+        seen = world.execute_primitive(lever, 0.0)
+        assert seen.estimated_xy_m == pytest.approx(bias_m)
+        columns.append(int(seen.image[1].any(axis=0).argmax()))
+    assert columns[0] - columns[1] == pytest.approx(0.014 / 0.56 * 128, abs=1)
+    world.place(slab, tool="screwdriver", config=WorldConfig(camera="kinect"))
+    with pytest.raises(ValueError, match='camera must be "ideal" for a lever-up'):
+        world.execute_primitive(lever, 0.0)
+
+
 def test_worlds_vary_within_their_ranges():
     recipe = RECIPES["push_varied"]
     rng = np.random.default_rng(0)
