@@ -97,5 +97,7 @@ class PlanningProblem:
             turned, std_m = (steps[-1].predicted_turn_rad, steps[-1].std_m) if steps else (0.0, 0.0)
             end = self.pose_planner and self.pose_planner(goal, end_xy_m, turned, std_m)
             steps, reaches_goal = steps + (end or ()), end is not None
+        # A search that rounds may have been a hair nearer to the goal than its plan.
+        reaches_goal &= goal.distance_m(end_xy_m) <= goal.tolerance_m
         seconds, about = time.perf_counter() - began_s, self.effects.warning
         return Plan(goal, self.start_xy_m, steps, planner, reaches_goal, seconds, about)

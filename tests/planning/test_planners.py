@@ -180,6 +180,16 @@ def test_a_search_goes_on_where_the_end_cannot_be_had(film, cuboid_image):
     assert len(chain) >= 1
 
 
+def test_a_plan_reaches_the_goal_only_where_it_says_that_it_ends_there(film, cuboid_image):
+    """The search, which rounds turns to a degree, is a hair off."""
+    for angle in range(8):
+        xy = 0.15 * math.cos(angle), 0.15 * math.sin(angle)
+        ends = plan_astar(problem_of(film, cuboid_image, (0.0, 0.0), Goal(xy)))
+        near = Goal(xy, ends.predicted_distance_m - 1e-6)
+        plan = plan_astar(problem_of(film, cuboid_image, (0.0, 0.0), near))
+        assert plan.reaches_goal == (plan.predicted_distance_m <= near.tolerance_m)
+
+
 # The continuous planner
 
 
