@@ -199,7 +199,7 @@ class _ClosedLoop:
         self.plan: Plan | None = None  # that is followed
         self.queue: list[Step] = []  # what is left of it
         self.renewals, self.turn_allowed = MAX_RENEWALS, False
-        self.lifted_m, self.held = 0.0, False
+        self.lifted_m, self.held, self.disturbed = 0.0, False, False
         seen = self._mean_of_images()
         yaw_rad, std_rad = seen.yaw_rad or 0.0, seen.yaw_std_rad or 0.0
         self.seen = self.first = replace(seen, yaw_rad=yaw_rad, yaw_std_rad=std_rad)
@@ -246,14 +246,15 @@ class _ClosedLoop:
         if DISPLACED_M < off_m < math.inf or fell:
             seen = self._wait(seen)
             off_m, fell = surprise()
-        self.seen = self._with_yaw(seen, fell, DISPLACED_M < off_m < math.inf)
+        was_displaced = DISPLACED_M < off_m < math.inf
+        self.disturbed = was_displaced or fell
+        self.seen = self._with_yaw(seen, fell, was_displaced)
         self.seen_xy_m.append(self.seen.xy_m)
         if not is_seen_on_table(self.seen):
             return Ending("lost", f"the object is no longer on the table, after {self._count()}")
         self.goal = self.goal_now()
         goal_moved = self.acted_for is not None and self.acted_for != self.goal
-        displaced = DISPLACED_M < off_m < math.inf and self.renewals > 0
-        if goal_moved or displaced:
+        if goal_moved or (was_displaced and self.renewals > 0):
             self.renewals -= not goal_moved
             self.turn_allowed &= not goal_moved  # the goal may ask for a whole round again
             self.limit = max(self.limit, len(self.steps) + self._limit_from(self.seen.xy_m))
@@ -368,12 +369,12 @@ class _ClosedLoop:
         return self.queue.pop(0)
 
     def _grip_yaw(self) -> float | None:
-        """Of the hand that has just let go of a rotated object.
+        """Of the hand that has just let go of a rotated object, if it still is as it was left.
 
         Closed again at this yaw, it turns nothing: so the object is carried to its position.
         """
         last = self.steps[-1] if self.steps else None
-        if last is None or not isinstance(last.primitive, Rotate | Drag):
+        if last is None or self.disturbed or not isinstance(last.primitive, Rotate | Drag):
             return None
         if last.primitive.grip_yaw is None:  # as it saw the object before it moved it
             return None

@@ -271,6 +271,21 @@ def test_a_turn_that_nobody_sees_is_reckoned_by_the_hand_and_said_to_be(sees_yaw
     assert lifted.reckoned == ("position", "orientation")
 
 
+@pytest.mark.parametrize(("shove_m", "kept"), [(0.0, True), (0.05, False)])
+def test_the_grip_is_kept_unless_somebody_displaces_the_object(shove_m, kept):
+    """Here the goal moves along with it."""
+    robot, goal = PointRobot(), Goal((0.0, 0.0), EXACT_M, turn_rad=0.5, height_m=0.1)
+
+    def displace(plan, n):
+        nonlocal goal
+        if n == 1:
+            goal, robot.xy_m = replace(goal, xy_m=(shove_m, 0.0)), (shove_m, 0.0)
+
+    rotate, grasp = loop(robot, lambda: goal, on_action=displace).steps
+    hand_rad = rotate.primitive.path(rotate.stop_phase)[0, 3]
+    assert grasp.primitive.grip_yaw == (pytest.approx(hand_rad) if kept else GRIPPER_YAWS_RAD[0])
+
+
 @pytest.mark.parametrize(("slips", "status"), [(1, "reached"), (2, "gave_up")])
 def test_a_slip_is_noticed_by_the_fingers(slips, status):
     went = loop(PointRobot(slips=slips), Goal((0.0, 0.0), height_m=0.1))
