@@ -118,13 +118,9 @@ class Tabletop(AbstractContextManager):
             basePosition=(sum(TABLE_X_M) / 2, sum(TABLE_Y_M) / 2, -0.05),
         )
         world = weakref.proxy(self)  # no circle of references: it would keep the client connected
-        self.arm = JointController(client, tool, lambda: world._stepped())
+        self.arm = JointController(client, tool, lambda: world.on_step and world.on_step(world))
         self._n_placed = 0
         self._fresh = client.saveState()
-
-    def _stepped(self) -> None:
-        if self.on_step is not None:
-            self.on_step(self)
 
     def place(
         self,
