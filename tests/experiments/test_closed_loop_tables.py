@@ -9,9 +9,9 @@ import pytest
 from affordlib.primitives import Drag, Push
 from affordlib.world import Cuboid, WorldConfig
 from experiments import open_loop_pose_goals
-from experiments.closed_loop import N_TRIALS, ROWS, sample_trial
+from experiments.closed_loop import N_TRIALS, sample_trial
 from experiments.feasibility import is_feasible, on_the_rim, possible
-from experiments.open_loop_pose_goals import open_loop_rows, run_open_loop
+from experiments.open_loop_pose_goals import run_open_loop
 
 
 def test_the_kinematic_oracle_is_the_kinematics(world):
@@ -49,51 +49,6 @@ def test_trials_are_a_function_of_seed_and_number():
         assert replace(perturbed, config=WorldConfig()) == sample_trial(name, 5, 3)
     with pytest.raises(ValueError, match="table must be one of"):
         sample_trial("speed", 0)
-
-
-def record(feasible, status, distance_m=0.001, object_class="sphere"):
-    about = {"object_class": object_class, "feasible": feasible, "status": status}
-    about |= {"distance_m": distance_m, "height_error_m": -distance_m, "on_the_rim": False}
-    about["orientation_reckoned"] = object_class == "sphere"
-    return about | {"actions": 0 if status == "unreachable" else 3}
-
-
-def test_rows_have_statuses_and_both_rates():
-    records = [record(True, "reached")] * 6 + [record(True, "gave_up", 0.1)] * 2
-    records += [record(False, "unreachable")] * 3 + [record(False, "gave_up", 0.1)]
-    rows = ROWS["reachability"](records)
-    groups = [("all", "all"), ("all", "sphere"), ("off the rim", "all")]
-    assert [(r["goals"], r["object_class"]) for r in rows] == groups
-    rates = ("feasible_reached", "infeasible_refused", "right", "within")
-    assert [rows[0][f"{rate}_percent"] for rate in rates] == [75.0, 75.0, 75.0, 75.0]
-    lost = [record(True, "lost", object_class="cuboid")] * 2
-    every, _, cuboid = ROWS["height"](records + lost)
-    assert (every["feasible"], every["within_percent"]) == (10, 80.0)
-    assert every["pose_error_m_mean"] == pytest.approx(0.001)
-    assert (cuboid["lost"], cuboid["pose_error_m_mean"]) == (2, None)
-    aside = [record(True, "reached") | {"distance_m": 0.02}] * 2  # as high, but not there
-    assert ROWS["height"](records + aside)[0]["within_percent"] == 60.0
-
-
-def test_the_means_of_disturbed_trials_have_those_that_did_not_arrive():
-    arrived, lost = record(True, "reached", 0.001), record(True, "lost", 0.5)
-    records = [r | {"kind": "knock", "undisturbed": arrived} for r in (arrived, lost)]
-    row = ROWS["disturbances"](records)[0]
-    means = [row[f"{name}_mean_m"] for name in ("disturbed", "undisturbed")]
-    assert means == pytest.approx([0.2505, 0.001])
-
-
-def test_rows_of_open_loop_plans_are_of_each_planner():
-    errors = {"astar": (0.002, 0.02), "continuous": (0.0002, 0.002)}
-    records = [
-        {"planner": planner, "pose_error": error, "distance_m": 10 * error, "actions": 3}
-        for planner, both in errors.items()
-        for error in both
-    ]
-    astar, ours = open_loop_rows(records, 0.005)
-    assert (astar["planner"], astar["n"]) == ("astar", 2)
-    assert [astar["within_percent"], ours["within_percent"]] == [0.0, 50.0]  # 20 mm at the best
-    assert astar["distance_m_mean"] == pytest.approx(0.11)
 
 
 def test_an_open_loop_trial_measures_what_is_missing(monkeypatch):

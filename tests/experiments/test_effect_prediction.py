@@ -1,6 +1,5 @@
 """Cross-validation trains what it says, and its tables are what its results say."""
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -20,8 +19,6 @@ from experiments.grasps import (
     auc,
     confusion_columns,
     grasp_rows,
-    rates,
-    success_probability,
     threshold_rows,
 )
 from experiments.lever_cross_validation import job as lever_job
@@ -135,15 +132,6 @@ def test_results_must_agree_about_what_happened(tmp_path):
 # Tables
 
 
-def test_all_weighs_categories_equally_and_trainings_are_no_further_objects():
-    def mean_sem(errors, objects, categories):
-        columns = {"error": errors, "interaction": objects, "category": list(categories)}
-        return tables.mean_sem(pd.DataFrame(columns), "error")
-
-    assert mean_sem([1, 1, 1, 3, 5], [0, 1, 2, 3, 3], "aaabb") == (2.5, 0.0)
-    assert mean_sem([0, 2, 0, 4], range(4), "aabb") == (1.5, pytest.approx(math.hypot(1, 2) / 2))
-
-
 def test_a_fold_may_lack_a_category():
     def result(fold, categories):
         errors = [0.001 * (k + 1) for k in range(len(categories))]
@@ -205,27 +193,6 @@ def test_shares_are_of_the_true_successes_and_failures():
     assert none["tn_percent"] is none["tn_low_percent"] is None
 
 
-def test_grasps_by_the_rule_of_a_tenth_of_a_metre():
-    about = {"model": "film", "data": "grasp", "n": 100, "fold": 0, "seed": 0}
-    columns = {
-        "rollable": [False, False, True],
-        "truth_z": [0.25, 0.0, 0.25],
-        "mean_z": [0.12, 0.11, 0.05],
-        "std_z": [0.1, 0.1, 0.1],
-        "category": ["a"] * 3,
-        "interaction": range(3),
-    }
-    table = tables.predictions_of(
-        [(about, {"n_interactions": 100, "fold_test": columns})], "grasp", "fold_test"
-    )
-    stands, rolls = grasp_rows(table)
-    assert (stands["tp_percent"], stands["tn_percent"], rolls["tp_percent"]) == (100, 0, 0)
-    assert stands["error_mean_m"] == pytest.approx((0.13 + 0.11) / 2)
-    assert stands["auc"] == 1.0
-    probability = success_probability(table["mean_z"], table["std_z"])
-    assert (probability > 0.5).tolist() == [True, True, False]
-
-
 def _folds_of_grasps(scores):
     frames = [
         pd.DataFrame(
@@ -249,9 +216,3 @@ def test_a_folds_own_grasps_never_decide_its_threshold():
     assert stands["tp_percent"] < 100  # fold 2
     same, _ = threshold_rows(_folds_of_grasps([scores[0]] * 3))
     assert (same["tp_percent"], same["tn_percent"]) == (100, 100)
-
-
-def test_rates_at_the_ends_are_all_and_nothing():
-    score, lifted = np.array([0.1, 0.4, 0.6, 0.9]), np.array([False, True, False, True])
-    tp, tn = rates(score, lifted, np.array([-np.inf, 0.5, 0.9]))
-    assert (tp.tolist(), tn.tolist()) == ([1, 0.5, 0], [0, 0.5, 1])

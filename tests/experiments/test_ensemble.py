@@ -4,14 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from affordlib.geometry import wrap_angle
 from affordlib.interactions import InteractionTensors
 from affordlib.models import EffectModel, condition_on_primitives, load_checkpoint
-from affordlib.planning import plan_astar, plan_continuous
 from affordlib.primitives import Push
-from affordlib.types import Goal
 from experiments.ensemble import Ensemble
-from tests.problems import problem_of
 
 NAMES = ("film_500", "film_5000")
 
@@ -68,13 +64,3 @@ def test_members_must_agree_on_channels(members):
         Ensemble([members[0], load_checkpoint("cnp_500")[0]])
     with pytest.raises(ValueError, match="at least one network"):
         Ensemble([])
-
-
-@pytest.mark.parametrize("plan", [plan_continuous, plan_astar])
-def test_planners_work_with_it(members, plan, cuboid_image):
-    goal = Goal((0.05, 0.03))
-    about = cuboid_image, (0.0, 0.0), goal, "single_partial"
-    (step,) = plan(problem_of(Ensemble(members), *about)).steps
-    alone = plan(problem_of(members[1], *about)).steps[0]
-    assert abs(wrap_angle(step.primitive.theta - alone.primitive.theta)) < 0.15
-    assert abs(step.stop_phase - alone.stop_phase) < 0.1

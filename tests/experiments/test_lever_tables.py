@@ -1,7 +1,5 @@
 """Lever-ups: baselines, jobs, tables drawn from their results, and what is shipped."""
 
-import math
-
 import numpy as np
 import pytest
 import torch
@@ -16,7 +14,6 @@ from affordlib.models.lever_up import (
     window_errors_m,
 )
 from affordlib.paths import repo_root
-from experiments import lever_up
 from experiments.lever_cross_validation import (
     edges_of,
     extrapolate,
@@ -68,49 +65,6 @@ def test_a_job_gives_the_committed_errors_again(tmp_path):
 
 def flattened(nested):
     return [x for part in nested for x in flattened(part)] if isinstance(nested, list) else [nested]
-
-
-def _result(errors_cm, model="cnp_last_pose", trained_for="all", fold=0, left_out=None, **more):
-    tests = {p: {"error_cm": [[[e] * 5] * 7 for e in errors_cm]} for p in PROTOCOLS}
-    one = job(model, trained_for, fold, left_out, **more)
-    return one.arguments, {"interaction": list(range(len(errors_cm)))} | tests
-
-
-def test_differences_are_paired_by_object():
-    ours = _result([0.1, 0.5, 1.0])
-    rival = _result([0.2, 0.6, 1.1], "lstm_tuned", "window")
-    (row, *_) = lever_up.paired_rows([ours, rival])
-    assert row["difference_cm"] == pytest.approx(-0.1)
-    assert row["low_cm"] == pytest.approx(row["high_cm"])  # the same for all objects
-    assert row["ours_better_percent"] == 100
-    seker = _result([0.1, 0.5, 1.0], "lstm_seker2019", "window", fold=1, epochs=100)
-    ours_too = _result([0.3, 0.7, 1.2], fold=1)
-    rows = lever_up.paired_rows([ours, ours_too, rival, seker])
-    apart = {(r["rival"], r["n"]): r["difference_cm"] for r in rows if r["steps"] == 5}
-    assert apart == {  # of each rival the folds that it has
-        ("lstm_tuned", 3): pytest.approx(-0.1),
-        ("lstm_seker2019", 3): pytest.approx(0.2),
-    }
-    first = lever_up.error_rows([ours])[0]
-    assert first["mean_cm"] == pytest.approx(1.6 / 3)
-    assert first["sem_cm"] == pytest.approx(np.std([0.1, 0.5, 1.0], ddof=1) / math.sqrt(3))
-
-
-def test_trainings_of_other_lengths_are_not_pooled():
-    results = [
-        _result([e], "lstm_seker2019", "window", epochs=n) for n, e in ((20, 2.0), (100, 1.0))
-    ]
-    rows = lever_up.error_rows(results)
-    assert {(r["epochs"], r["n"], r["mean_cm"]) for r in rows} == {(20, 1, 2.0), (100, 1, 1.0)}
-
-
-def test_shapes_never_seen_stand_beside_the_same_shapes_when_they_are_known():
-    known, unseen = _result([0.1, 0.5, 1.0]), _result([0.4, 0.6], left_out=3)
-    rows = lever_up.unseen_rows([known, unseen], {0: 3, 1: 4, 2: 3})
-    assert {row["edges"] for row in rows} == {3}
-    assert (rows[0]["n"], rows[0]["mean_cm"]) == (2, pytest.approx(0.5))
-    assert (rows[0]["known_n"], rows[0]["known_mean_cm"]) == (2, pytest.approx(0.55))
-    assert {row["n"] for row in lever_up.error_rows([known, unseen])} == {3}  # the folds only
 
 
 def test_the_shipped_network_stands_for_its_own_training_only():

@@ -16,15 +16,7 @@ from affordlib.world import Cuboid, UprightCylinder
 from experiments import planning, shipped
 from experiments.adaptation import Camera
 from experiments.field_baselines import FINGER_AHEAD_M, LimitSurface
-from experiments.planning import CONFIGS, attempt, planning_rows, tasks_sha256
-
-
-def records(distances, object_class="cuboid", tasks=None):
-    about = {"goals": "constructed", "mode": "single_full", "object_class": object_class}
-    about |= {"predicted_m": 0.0, "std_m": 0.001, "steps": 1, "actions": 1, "plan_s": 0.02}
-    tasks = range(len(distances)) if tasks is None else tasks
-    errors = [{"task": k, "distance_m": d} for k, d in zip(tasks, distances, strict=True)]
-    return [about | row | {"prediction_error_m": row["distance_m"]} for row in errors]
+from experiments.planning import CONFIGS, attempt, tasks_sha256
 
 
 def test_pushes_show_how_far_beside_the_camera_sees():
@@ -38,36 +30,6 @@ def test_pushes_show_how_far_beside_the_camera_sees():
     assert rotated(camera.error_m(pushes[:1]) - error_m, -0.3)[0] == pytest.approx(0, abs=1e-6)
     np.testing.assert_allclose(camera.error_m(pushes[:2]), error_m, atol=1e-6)
     np.testing.assert_allclose(camera.error_m(pushes[2:]), error_m, atol=1e-6)
-
-
-def test_rows_are_of_all_of_groups_and_of_categories():
-    some = records([0.001, 0.003]) + records([0.005], "sphere")
-    rows = {r["object_class"]: r for r in planning_rows(some, planner="p")}
-    means = {name: row["mean_m"] for name, row in rows.items()}
-    each = {"all": 0.003, "standing": 0.002, "rollable": 0.005, "cuboid": 0.002, "sphere": 0.005}
-    assert means == pytest.approx(each)
-    assert rows["standing"]["n"] == 2
-
-
-def test_the_cost_of_execution_is_that_of_the_plain_oracle():
-    """Not of the one with a σ."""
-    rows, both = [], {"continuous": 1e-3, "oracle": 2e-3, "oracle_risk_averse": 3e-3}
-    for name, distance in (both | {"astar_cnp_500": 9e-3}).items():
-        some = records([distance]) + (records([distance], "sphere") if name in both else [])
-        rows += planning_rows(some, planner=name, **CONFIGS[name].columns())
-    found = planning.decomposition_rows(rows)
-    cost = {(r["planner"], r["object_class"]): r["execution_mean_m"] for r in found}
-    assert cost["continuous", "standing"] == pytest.approx(2e-3)
-    assert cost["continuous", "rollable"] == pytest.approx(2e-3)
-    assert ("astar_cnp_500", "standing") in cost
-
-
-def test_pairs_are_of_the_same_goals():
-    every = {"astar": records([0.001, *[0.002] * 4, 0.003])}
-    every["astar_disc"] = records([0.011, 0.013], tasks=(0, 5))
-    (row,) = planning.variant_rows(every)
-    assert row["n"] == 2
-    assert [row[f"{k}_m"] for k in ("difference_mean", "low", "high")] == pytest.approx([0.01] * 3)
 
 
 def test_goals_survive_the_file_which_is_never_written_over(capsys):

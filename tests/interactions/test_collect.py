@@ -8,12 +8,12 @@ import subprocess
 import sys
 import threading
 import time
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import psutil
 import pytest
+from dask.distributed import Client
 
 import affordlib
 from affordlib.interactions import collect
@@ -244,56 +244,33 @@ def both(cluster):
     return cluster
 
 
-@contextmanager
-def poisoned(client, log, how):
-    """Make all workers, also those started later, fail in the chunk that begins with 4.
+def test_a_chunk_that_cannot_be_made_is_named(tmp_path, made, monkeypatch):
+    make = collect.collect_chunk
 
-    log: a file that gets a letter for each time that they do.
-    """
-    from dask.distributed import WorkerPlugin
+    def fails(recipe, numbers):
+        return [].pop() if numbers.start == 4 else make(recipe, numbers)
 
-    class Poison(WorkerPlugin):
-        name = "poison"
-
-        def setup(self, worker):
-            from affordlib.interactions import collect
-
-            self.unharmed = unharmed = collect.collect_chunk
-
-            def deadly(recipe, numbers):
-                if numbers.start == 4:
-                    with open(log, "a") as file:
-                        file.write("x")
-                    os._exit(9) if how == "kill" else [].pop()
-                return unharmed(recipe, numbers)
-
-            collect.collect_chunk = deadly
-
-        def teardown(self, worker):
-            from affordlib.interactions import collect
-
-            collect.collect_chunk = self.unharmed
-
-    client.register_plugin(Poison())
-    try:
-        yield
-    finally:
-        client.wait_for_workers(2, timeout=60)
-        client.unregister_worker_plugin("poison")
+    monkeypatch.setattr(collect, "collect_chunk", fails)
+    said = r"interactions 4 to 5 could not be collected: IndexError: pop"
+    with (
+        Client(processes=False, dashboard_address=None) as client,
+        pytest.raises(RuntimeError, match=said),
+    ):
+        collect_set(SMALL, tmp_path / "set.zarr.zip", client, progress=False)
+    assert not (tmp_path / "set.zarr.zip").exists()
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("how", "reason"), [("raise", "IndexError: pop"), ("kill", "KilledWorker")]
-)
-def test_a_chunk_that_cannot_be_made_is_named(both, undisturbed, tmp_path, how, reason):
-    path, log = tmp_path / "set.zarr.zip", tmp_path / "log"
-    said = rf"interactions \d+ to \d+ could not be collected: {reason}"
-    with poisoned(both, log, how), pytest.raises(RuntimeError, match=said) as failure:
-        collect_set(SMALL, path, both, progress=False)
-    assert how == "kill" or "interactions 4 to 5" in str(failure.value)
-    assert log.exists()
-    assert not path.exists()
+def test_workers_that_die_again_and_again_are_no_loss(both, undisturbed, tmp_path):
+    path, here = tmp_path / "set.zarr.zip", os.getpid()
+
+    class Deadly(Recipe):
+        def to_json(self):
+            return super().to_json() if os.getpid() == here else os._exit(9)
+
+    with pytest.raises(RuntimeError, match=r"interactions \d+ to \d+ could not .*: KilledWorker"):
+        collect_set(Deadly(**vars(SMALL)), path, both, progress=False)
+    both.wait_for_workers(2, timeout=60)
     collect_set(SMALL, path, both, progress=False)
     assert path.read_bytes() == undisturbed(SMALL).read_bytes()
 

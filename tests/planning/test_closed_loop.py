@@ -107,8 +107,6 @@ def test_no_more_actions_than_were_allowed(pose):
         went = loop(PointRobot(), Goal((far, 0.0), EXACT_M, **pose), max_actions=limit)
         assert (went.status, len(went.steps)) == ("gave_up", limit), went.message
     assert "after 1 action:" in went.message
-    with pytest.raises(TypeError, match=r"max_actions=1\.5"):
-        loop(PointRobot(), Goal((0.0, 0.0)), max_actions=1.5)
 
 
 def test_the_limit_is_the_distance_over_5_cm_rounded_up_and_3():
@@ -444,8 +442,6 @@ def test_disturbances_are_a_function_of_the_seed():
     assert all(d.action >= 1 for d in drawn if d.at_s is None)
     with pytest.raises(ValueError, match="a shove happens between actions"):
         Disturbance("shove", 1, 0.1, 0.0, at_s=1.0)
-    with pytest.raises(ValueError, match="kind must be one of"):
-        Disturbance("kick", 1, 0.1, 0.0)
 
 
 def test_the_disturbance_and_not_the_robot_makes_a_goal_infeasible(world):
@@ -537,16 +533,6 @@ def test_no_task_needs_the_state_of_the_simulator(world, skills, monkeypatch, ca
     if goal.height_m is not None:
         assert world.object_state()[2] - obj.height_m / 2 == pytest.approx(0.1, abs=0.006)
     assert ("orientation" in went.reckoned) == (obj in (BALL, TUBE) or goal.height_m is not None)
-
-
-def test_what_was_lifted_is_put_down_by_what_the_hand_knows(world):
-    world.place(BOX, (0.0, 0.0), 0.0)
-    z = world.object_state()[2]
-    world.execute(Step(Grasp(), 0.9, (0.0, 0.0), np.zeros((2, 2))))
-    assert world.object_state()[2] > z + 0.1
-    world.park()
-    assert world.object_state()[2] == pytest.approx(z, abs=0.001)
-    assert not world.object_fell()
 
 
 @pytest.mark.slow

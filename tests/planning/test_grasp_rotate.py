@@ -48,14 +48,6 @@ def test_crossings_are_where_the_trajectory_has_the_value():
     assert len({round(math.degrees(yaw)) % 180 for yaw in GRIPPER_YAWS_RAD}) == 12
 
 
-@pytest.mark.parametrize("height", [0.03, 0.12])
-def test_a_partial_grasp_ends_holding_at_the_height(world, skills, height):
-    world.place(BOX)
-    step = plan_lift(skills.model(Grasp), world.depth_image(), AT, height)
-    assert 0 < step.stop_phase < 1
-    assert world.execute(step).rest_effect[2] == pytest.approx(height, abs=0.003)
-
-
 @pytest.mark.parametrize(
     ("obj", "degrees"), [(TUBE, 35), (BOX, -25), (BOX, 30), (BOX, 75)], ids=lambda v: str(v)[:6]
 )

@@ -205,12 +205,6 @@ def assert_same_goal(page, table, x_m, y_m, within_m=0.0011):
     np.testing.assert_allclose(drawn, planned, atol=2e-4)
 
 
-def hosts(page):
-    """Where the page has asked anything."""
-    asked = (url for url in page.requests if not url.startswith(("data:", "blob:")))
-    return {urlparse(url).netloc for url in asked}
-
-
 def saved_outputs(page, lab):
     """The notebook is saved as a reader saves it: all outputs that are then in its file."""
     page.evaluate("window.jupyterapp.commands.execute('docmanager:save')")
@@ -289,11 +283,6 @@ def test_it_opens_with_a_plan(page, table):
     picture(page, "1_open")
 
 
-def test_click(page, table):
-    page.mouse.click(*table.at(0.08, -0.11))
-    assert_same_goal(page, table, 0.08, -0.11)
-
-
 def test_the_first_click_after_scrolling_lands_where_the_mouse_is(page, table):
     table.svg.evaluate(
         """svg => {
@@ -363,10 +352,6 @@ def test_run(page, table):
     page.mouse.click(*table.at(0.12, 0.12))
     assert_same_goal(page, table, 0.12, 0.12)
     before = table.points(".object").mean(axis=0)
-    std_m = ask(page, "[step.std_m for step in picker.plan.steps]")
-    radii = page.locator(".plan .sigma").evaluate_all("all => all.map((e) => e.r.baseVal.value)")
-    assert radii == pytest.approx([20 * 1000 * s for s in std_m], abs=0.02)
-    assert min(radii) > 3  # which the dot at its centre is
     button(page, "Run").click()
     wait_for_words(page, "from the goal, ")
     outcome = ask(page, "[*picker.outcome.end_pose, picker.outcome.distance_m]")
@@ -550,7 +535,8 @@ def test_a_saved_notebook_keeps_a_picture(page, lab):
 
 
 def test_no_request_leaves_the_machine(page, lab):
-    assert hosts(page) == {urlparse(lab.address).netloc}
+    asked = [url for url in page.requests if not url.startswith(("data:", "blob:"))]
+    assert {urlparse(url).netloc for url in asked} == {urlparse(lab.address).netloc}
     assert any("ws" in urlparse(url).scheme for url in page.requests)
     assert page.locator("text=Would you like to get notified").count() == 0
 

@@ -6,7 +6,7 @@ import pybullet
 import pytest
 from pybullet_utils.bullet_client import BulletClient
 
-from affordlib.primitives import Drag, Grasp, LeverUp, Push, primitive_named
+from affordlib.primitives import Drag, Grasp, LeverUp, Push
 from affordlib.types import CROP_WIDTH_M, IMAGE_PIXELS, Goal, NothingSeenError
 from affordlib.world import (
     Cuboid,
@@ -17,7 +17,6 @@ from affordlib.world import (
     UnreachableError,
     UprightCylinder,
     WorldConfig,
-    category_named,
     robot,
     tabletop,
 )
@@ -87,32 +86,21 @@ def test_camera_measures_the_object(world, obj, xy):
     assert ((mask > 0) & (mask < 1)).sum() > 20
 
 
-def test_a_quarter_turn_of_the_table_is_a_quarter_turn_of_the_image(world):
-    world.place(OBJECTS[0], (0.0, 0.0), 0.35)
-    image = world.depth_image()
-    world.place(OBJECTS[0], (0.0, 0.0), 0.35 + math.pi / 2)
-    assert np.abs(np.rot90(image[1]) - world.depth_image()[1]).mean() < 0.002
-
-
 def test_unreachable_raises_or_is_recorded_and_moves_nothing(world):
     world.place(OBJECTS[0], (0.45, 0.5), 0.0)
     before = world.object_state()
     with pytest.raises(UnreachableError, match="cannot reach"):
         world.execute_primitive(Push(math.pi / 4), approach=True)
-    assert not world.execute_primitive(Push(math.pi / 4), record_unreachable=True).reached
+    seen = world.execute_primitive(Push(math.pi / 4), record_unreachable=True)
+    assert not seen.reached
+    assert not seen.effect.any()
     assert world.object_state() == before
 
 
 @pytest.mark.parametrize(
     ("act", "words"),
     [
-        (lambda w: Push(0.0, radius=1.0), "radius .* 1"),
-        (lambda w: primitive_named("kick"), "must be one of .'drag', 'grasp'.* got 'kick'"),
-        (lambda w: category_named("cone"), "object category must be one of .* got 'cone'"),
-        (lambda w: UprightCylinder(0.05, 5.0), "Cylinder.height .* 5"),
         (lambda w: Goal((0.9, 0.0)), r"goal xy_m = \(0\.9, 0\) m lies off the table; choose x in"),
-        (lambda w: w.place(OBJECTS[0], (0.0, 2.0)), "xy_m = .* off the table"),
-        (lambda w: w.place(OBJECTS[0], tool="hammer"), "tool must be one of .* got 'hammer'"),
         (lambda w: w.execute_primitive(LEVER), r"'lever_up' needs the tool 'screwdriver'.*place\("),
         (lambda w: w.reset() or w.execute_primitive(Push(0.0)), r"call place\(\.\.\.\) first"),
         (lambda w: Prism(STAR, 0.05), "convex polygon"),
