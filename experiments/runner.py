@@ -46,8 +46,12 @@ WRITE_EVERY_S = 30
 NOT_DECISIVE = ("device", "max_minutes", "sigma_scale")
 """Options of trainings and networks that belong to the machine, or are fitted afterwards."""
 
-open_once = lru_cache(maxsize=4)(open_interactions)
-"""A data set by its name, kept open from job to job."""
+
+@lru_cache(maxsize=4)
+def open_once(name: str) -> xarray.Dataset:
+    """A data set by its name, kept open from job to job; workers import it by its own name."""
+    return open_interactions(name)
+
 
 Rows = list[dict[str, Any]]
 Result = tuple[dict[str, Any], Any]

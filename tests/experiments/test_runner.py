@@ -1,6 +1,7 @@
 """Jobs: what is there is not made again, what is stale is refused, a kill costs little."""
 
 import importlib
+import pickle
 from dataclasses import dataclass, replace
 
 import pandas as pd
@@ -10,7 +11,7 @@ from pandas.testing import assert_frame_equal
 
 from affordlib.results import read_results, write_results
 from experiments import runner
-from experiments.runner import Job, frame, read, run
+from experiments.runner import Job, frame, open_once, read, run
 
 CALLS = []
 
@@ -115,6 +116,10 @@ def test_workers_make_the_same_bytes(tmp_path):
 
 TABLES = ("effect_prediction", "lever_up", "planning", "closed_loop", "open_loop_pose_goals")
 TABLES += ("real_pushes", "adaptation", "headline")
+
+
+def test_what_jobs_share_is_imported_by_workers():
+    assert pickle.loads(pickle.dumps(open_once)) is open_once
 
 
 @pytest.mark.parametrize("name", TABLES)
