@@ -133,12 +133,14 @@ class PlannerConfig:
         """Of its model by primitive; one of drags beside our network of pushes, if it needs one."""
         if self.model in ("simulator", *MADE):
             return {}
-        drags = self.model in ("film_500", "film_5000") and self.world == "clean"
+        drags = self.model.startswith("film") and self.world in ("clean", "perturbed_rollable")
         return {"push": self.model} | ({"drag": "drag_film_500"} if drags else {})
 
     @property
     def classes(self) -> tuple[str, ...]:
         """The categories of objects that it is asked about."""
+        if self.world == "perturbed_rollable":
+            return ROLLABLE
         drags = "drag" in self.checkpoints or self.model == "simulator"
         drags &= self.world == "clean" and not self.standing
         return STANDING + ROLLABLE if drags else STANDING
@@ -177,6 +179,7 @@ LITERAL, FINER = {"samples": 100}, {"samples": 300}
 ON_RING = LITERAL | {"starts": 4, "direction_only": True}
 DISC = {"heuristic": "disc"}
 PERTURBED = {"model": "film_5000_perturbed", "world": "perturbed"}
+ROLLING, OUTSIDE = (PERTURBED | {"world": world} for world in ("perturbed_rollable", "outside"))
 ORACLE = {"model": "simulator"}
 RISK_WEIGHTS = (0.0, 1.0, 10.0, 30.0)
 """Of the continuous planner, tried on the validation goals."""
@@ -237,6 +240,10 @@ CONFIGS: dict[str, PlannerConfig] = {
         plan_continuous, **PERTURBED, execution={"corrections": 2, "n_averaged_images": 8}
     ),
     "perturbed_film_5000": PlannerConfig(plan_continuous, world="perturbed"),
+    "perturbed_rollable": PlannerConfig(plan_continuous, **ROLLING),
+    "perturbed_rollable_corrected": PlannerConfig(plan_continuous, **ROLLING, **CORRECTED),
+    "outside": PlannerConfig(plan_continuous, **OUTSIDE),
+    "outside_corrected": PlannerConfig(plan_continuous, **OUTSIDE, **CORRECTED),
     "perturbed_oracle": PlannerConfig(plan_continuous, **ORACLE, world="perturbed", stride=5),
     "perturbed_oracle_nominal": PlannerConfig(
         plan_continuous, **ORACLE, oracle={"nominal_physics": True}, world="perturbed", stride=5

@@ -309,6 +309,17 @@ def uniform_tasks(
     return tasks
 
 
+VARIATIONS = {
+    "perturbed": Variation(),
+    "perturbed_rollable": Variation(),
+    "outside": Variation(
+        table_friction=(0.65, 1.0), density_kg_m3=(1200.0, 2400.0), com_offset=0.3, bias_sd_m=0.002
+    ),
+}
+"""Of the worlds of frozen goals. `outside` lies beyond what the networks were trained on: rougher
+tables and denser objects than any of theirs, other errors and offsets up to twice as large."""
+
+
 def draw_goals(_: argparse.Namespace) -> bool:
     """Draw the goals of Table 3, and 40 to choose constants on, into files that are frozen."""
     missing = [world for world, path in FROZEN.items() if not (repo_root() / path).exists()]
@@ -318,8 +329,9 @@ def draw_goals(_: argparse.Namespace) -> bool:
         with Tabletop() as world:
             for mode, n in counts.items():
                 if name != "clean":
-                    variation = Variation() if name == "perturbed" else None
-                    tasks += constructed_tasks(world, mode, n, seed, STANDING, variation)
+                    classes = ROLLABLE if name == "perturbed_rollable" else STANDING
+                    variation = VARIATIONS.get(name)
+                    tasks += constructed_tasks(world, mode, n, seed, classes, variation)
                     continue
                 tasks += constructed_tasks(world, mode, n, 0, STANDING + ROLLABLE)
                 tasks += uniform_tasks(mode, n, 0, STANDING + ROLLABLE)

@@ -10,6 +10,7 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, astuple, dataclass, field
+from itertools import count
 from typing import Any, Self
 
 import numpy as np
@@ -24,6 +25,8 @@ from affordlib.world import Tabletop, TabletopObject, WorldConfig, category_name
 FROZEN = {
     "clean": "data/goals/planning.json",
     "perturbed": "data/goals/planning_perturbed.json",
+    "perturbed_rollable": "data/goals/planning_perturbed_rollable.json",
+    "outside": "data/goals/planning_outside.json",
     "validation": "data/goals/planning_validation.json",
 }
 GOAL_SOURCES = ("constructed", "uniform")
@@ -31,6 +34,8 @@ GOAL_SOURCES = ("constructed", "uniform")
 MIN_DISTANCE_M = 0.02
 EARLIEST_STOP = 0.55
 """Before this phase hardly any action has moved its object."""
+
+ATTEMPTS = 30
 
 STANDING = ("cuboid", "upright_cylinder")
 ROLLABLE = ("lying_cylinder", "sphere")
@@ -100,31 +105,34 @@ def constructed_tasks(
 ) -> list[PlanningTask]:
     """Tasks whose goal is where random actions of the mode's kind really took the object.
 
-    variation: draws each task a world of its own.
+    variation: draws each task a world of its own. An object that no one of `ATTEMPTS` leaves on the
+    table, upright and without a fault, is replaced by another of its category.
     """
-    tasks = []
-    for index in range(n):
+
+    def drawn(index: int) -> PlanningTask | None:
         obj, yaw, rng = drawn_object(mode, "constructed", seed, index, classes)
         kind = Drag if obj.rollable else Push
         config = variation.sample(obj, rng) if variation else WorldConfig()
-        while True:
-            direction = rng.uniform(-math.pi, math.pi)
+        for _ in range(ATTEMPTS):
+            direction, valid = rng.uniform(-math.pi, math.pi), True
             world.place(obj, (0.0, 0.0), yaw, config=config)
-            valid = True
             for _ in range(rng.integers(2, MODES[mode].max_steps + 1) if mode[0] == "m" else 1):
                 stop = rng.uniform(EARLIEST_STOP, 1.0) if MODES[mode].partial else 1.0
                 action = kind.towards(off_grid(rng, direction, math.pi / 4))
-                seen = world.execute_primitive(action, stop, approach=True)
-                valid &= not (seen.faults or seen.fell or seen.left_table)
+                if valid:
+                    seen = world.execute_primitive(action, stop, approach=True)
+                    valid = not (seen.faults or seen.fell or seen.left_table)
             x, y, _ = world.object_pose()
             if math.hypot(x, y) > MIN_DISTANCE_M and valid:
-                break
-        tasks.append(PlanningTask(obj, yaw, Goal((x, y)), mode, "constructed", config))
-    return tasks
+                return PlanningTask(obj, yaw, Goal((x, y)), mode, "constructed", config)
+        return None
+
+    of_place = [map(drawn, count(index, 1000 * len(classes))) for index in range(n)]
+    return [next(filter(None, candidates)) for candidates in of_place]
 
 
 def frozen_tasks(world: str = "clean") -> list[PlanningTask]:
-    """The tasks of the tables in the clean or the perturbed world, or those for choices."""
+    """The tasks of the tables in one of the worlds, or those for choices."""
     path = repo_root() / FROZEN[check_choice("world", world, FROZEN)]
     if not path.is_file():
         raise FileNotFoundError(

@@ -13,6 +13,7 @@ from affordlib.evaluation.tasks import (
     ROLLABLE,
     STANDING,
     constructed_tasks,
+    drawn_object,
     frozen_tasks,
 )
 from affordlib.geometry import rotated
@@ -366,6 +367,25 @@ def test_the_frozen_goals_are_those_that_are_drawn(world):
         assert task.obj == again.obj
         assert task.goal.distance_m(again.goal.xy_m) < 0.002
     assert all(math.hypot(*task.goal.xy_m) > 0.02 for task in frozen)
+
+
+def test_an_object_that_never_stays_is_replaced_by_another_of_its_category(world, monkeypatch):
+    first, *_ = drawn_object("multi_partial", "constructed", 0, 0, ROLLABLE)
+    placed, executed = [], []
+
+    def execute_primitive(action, stop, approach):
+        executed.append(placed[-1])
+        return SimpleNamespace(faults=(), fell=False, left_table=placed[-1] == first)
+
+    monkeypatch.setattr(world, "place", lambda obj, *_, config: placed.append(obj))
+    monkeypatch.setattr(world, "execute_primitive", execute_primitive)
+    monkeypatch.setattr(world, "object_pose", lambda: (0.05, 0.0, 0.0))
+    tasks = constructed_tasks(world, "multi_partial", 2, 0, ROLLABLE)
+    assert [task.obj.category for task in tasks] == list(ROLLABLE)
+    assert [task.obj for task in tasks] == placed[-2:]
+    assert first not in placed[-2:]
+    assert placed.count(first) == executed.count(first)  # nothing after it left the table
+    assert 1 < placed.count(first) == len(placed) - 2
 
 
 def test_an_attempt_averages_as_many_images_as_it_is_told(world, film):
