@@ -34,8 +34,8 @@ GOAL_SOURCES = ("constructed", "uniform")
 MIN_DISTANCE_M = 0.02
 EARLIEST_STOP = 0.55
 """Before this phase hardly any action has moved its object."""
-
 ATTEMPTS = 30
+"""So many random episodes are tried with an object before another takes its place."""
 
 STANDING = ("cuboid", "upright_cylinder")
 ROLLABLE = ("lying_cylinder", "sphere")
@@ -105,8 +105,8 @@ def constructed_tasks(
 ) -> list[PlanningTask]:
     """Tasks whose goal is where random actions of the mode's kind really took the object.
 
-    variation: draws each task a world of its own. An object that no one of `ATTEMPTS` leaves on the
-    table, upright and without a fault, is replaced by another of its category.
+    variation: draws each task a world of its own. An object that in none of `ATTEMPTS` episodes
+    stays on the table, upright and without a fault, is replaced by another of its category.
     """
 
     def drawn(index: int) -> PlanningTask | None:
