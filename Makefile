@@ -89,7 +89,7 @@ lab: $(STAMP) ## Open the book in JupyterLab, on this machine only
 test test-fast test-plain: export OMP_NUM_THREADS := 1
 
 test: $(STAMP) ## Run all tests, notebooks included (JOBS=2 side by side)
-	@$(PY) -m pytest -n "$(JOBS)" --dist loadfile --durations=15
+	@$(PY) -m pytest -n "$(JOBS)" --dist loadfile --no-loadscope-reorder --durations=15
 
 test-fast: $(STAMP) ## Run the tests that take seconds, without the notebooks
 	@$(PY) -m pytest -n "$(JOBS)" --dist worksteal -m "not slow"

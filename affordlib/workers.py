@@ -24,7 +24,9 @@ def dask_client(workers: int = 1, scheduler: str | None = None) -> "Iterator[Cli
             yield client
         return
     quiet = logging.CRITICAL  # what a task raises is raised here as well
-    options = {"worker_kwargs": _LOOPBACK | {"nthreads": 1, "silence_logs": quiet}}
+    # A worker that finds no scheduler for this long ends: its collector was killed.
+    more = {"nthreads": 1, "silence_logs": quiet, "death_timeout": "30 s"}
+    options = {"worker_kwargs": _LOOPBACK | more}
     with (
         SpecCluster(
             {k: {"cls": SubprocessWorker, "options": options} for k in range(workers)},

@@ -1,5 +1,6 @@
-"""Shared fixtures."""
+"""Shared fixtures, and which files come first."""
 
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,12 @@ from affordlib.models import AffordanceCNP, CNPConfig, load_checkpoint
 from affordlib.models.lever_up import LEVER_MODELS
 from affordlib.planning import Skills
 from affordlib.world import Cuboid, Tabletop, WorldConfig
+
+
+def pytest_collection_modifyitems(items):
+    """Start with the files of many slow tests: none of them should be last, on one core."""
+    slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
+    items.sort(key=lambda item: -slow[item.path])
 
 
 @pytest.fixture(scope="session")

@@ -164,7 +164,7 @@ def test_a_collector_killed_at_any_moment_is_no_loss(undisturbed, tmp_path, seed
     time.sleep(random.Random(seed).uniform(0, 3))
     family = psutil.Process(process.pid).children(recursive=True)
     process.kill()
-    process.communicate()
+    process.communicate(timeout=180)  # its workers write into the same pipes
     assert not psutil.wait_procs(family, timeout=60)[1]  # it leaves no workers
     collect_set(SMALL, path, progress=False)
     assert path.read_bytes() == undisturbed(SMALL).read_bytes()
