@@ -12,7 +12,7 @@ import pandas as pd
 from affordlib.results import read_results, write_results
 
 PLANS = {
-    "single_full": "plan one whole push, execute it",
+    "single_full": "plan one full push, execute it",
     "single_partial": "plan one partial push, execute it",
     "multi_partial": "plan up to three partial pushes, execute them",
 }
