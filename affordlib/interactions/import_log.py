@@ -26,7 +26,7 @@ TABLE_DEPTH_M = 1.0
 _HIGHER_M = 0.002
 
 
-def read_log(folder: str | Path, n_samples: int = 101) -> InteractionTensors:
+def read_folder(folder: str | Path, n_samples: int = 101) -> InteractionTensors:
     """The interactions of a folder, in the order of its table, at n_samples phases each.
 
     Between the rows of the table trajectories are interpolated. Raises FileNotFoundError or
@@ -65,8 +65,8 @@ def read_log(folder: str | Path, n_samples: int = 101) -> InteractionTensors:
     )
 
 
-def write_log(folder: str | Path, tensors: InteractionTensors) -> Path:
-    """Write interactions as `read_log` reads them; returns the folder."""
+def write_folder(folder: str | Path, tensors: InteractionTensors) -> Path:
+    """Write interactions as `read_folder` reads them; returns the folder."""
     folder = Path(folder)
     (folder / IMAGES).mkdir(parents=True, exist_ok=True)
     columns = [f"action_{c}" for c in tensors.action_channels]

@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 
 from affordlib.interactions import InteractionTensors
-from affordlib.interactions.import_log import TABLE, read_log, write_log
+from affordlib.interactions.import_log import TABLE, read_folder, write_folder
 from affordlib.models.training import final_errors_m
 
 CHANNELS = ("x", "y"), ("x", "y", "yaw")
@@ -22,11 +22,11 @@ def some(pushes):
 
 @pytest.fixture
 def folder(some, tmp_path):
-    return write_log(tmp_path / "mine", some)
+    return write_folder(tmp_path / "mine", some)
 
 
 def test_what_was_written_is_read_again(some, folder):
-    back = read_log(folder, n_samples=301)
+    back = read_folder(folder, n_samples=301)
     assert (back.action_channels, back.effect_channels) == CHANNELS
     torch.testing.assert_close(back.effect, some.effect, atol=1e-6, rtol=0)
     torch.testing.assert_close(back.action, some.action, atol=1e-6, rtol=0)
@@ -38,7 +38,7 @@ def test_a_network_predicts_the_same_from_the_folder(film, some, folder):
     """In whatever order its columns stand."""
     table = pd.read_csv(folder / TABLE, dtype={"interaction": str})
     table[sorted(table, reverse=True)].to_csv(folder / TABLE, index=False)
-    ours, theirs = (final_errors_m(film, a) for a in (some, read_log(folder, 301)))
+    ours, theirs = (final_errors_m(film, a) for a in (some, read_folder(folder, 301)))
     torch.testing.assert_close(ours, theirs, atol=2e-4, rtol=0)
 
 
@@ -46,13 +46,13 @@ def test_trajectories_of_any_length_are_brought_to_the_same_phases(folder):
     rows = (folder / TABLE).read_text().splitlines()
     thinned = rows[:1] + [r for k, r in enumerate(rows[1:]) if k % 301 in (0, 150, 300)]
     (folder / TABLE).write_text("\n".join(thinned))
-    assert read_log(folder, n_samples=21).effect.shape == (3, 21, 3)
+    assert read_folder(folder, n_samples=21).effect.shape == (3, 21, 3)
 
 
 def test_without_a_mask_what_is_high_is_the_object(some, folder):
     for path in (folder / "images").glob("*_mask.png"):
         path.unlink()
-    mask = read_log(folder).image[:, 1]
+    mask = read_folder(folder).image[:, 1]
     assert ((mask > 0.5) == (some.image[:, 1] > 0.5)).float().mean() > 0.98
 
 
@@ -95,7 +95,7 @@ def _replace(folder, old, new):
 def test_errors_say_what_and_where(folder, spoil, says):
     spoil(folder)
     with pytest.raises((ValueError, FileNotFoundError), match=says):
-        read_log(folder)
+        read_folder(folder)
 
 
 def test_names_are_names_and_angles_go_around(some, folder):
@@ -103,11 +103,11 @@ def test_names_are_names_and_angles_go_around(some, folder):
     (folder / TABLE).write_text(re.sub("^0001,", "NA,", text, flags=re.MULTILINE))
     for kind in ("", "_mask"):
         (folder / "images" / f"0001{kind}.png").rename(folder / "images" / f"NA{kind}.png")
-    assert len(read_log(folder)) == 3
+    assert len(read_folder(folder)) == 3
     table = pd.read_csv(folder / TABLE, keep_default_na=False)
     turned = table["effect_yaw"] + np.pi - 0.01  # over the seam, as atan2 tells it
     table["effect_yaw"] = np.arctan2(np.sin(turned), np.cos(turned))
     table.to_csv(folder / TABLE, index=False)
-    yaw = read_log(folder, n_samples=301).effect[..., 2]
+    yaw = read_folder(folder, n_samples=301).effect[..., 2]
     expected = some.effect[..., 2] + np.pi - 0.01
     torch.testing.assert_close(yaw, expected, atol=1e-5, rtol=0)
