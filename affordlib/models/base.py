@@ -1,4 +1,4 @@
-"""What all networks share: scales, domain, frame and loss; subclasses are the architectures."""
+"""Base class of all networks: standardisation, training domain, frame and loss."""
 
 import math
 from abc import ABC, abstractmethod
@@ -31,8 +31,8 @@ class NetworkConfig:
     """Channels and frame of a network.
 
     frame: "table", or "push" to rotate everything into the direction of the push, see
-    `push_frame.py`. sigma_floor is in standardised units. sigma_scale multiplies σ of each effect
-    channel (none given: by 1), see `calibration.py`.
+    `push_frame.py`. sigma_floor: lower bound of σ, in standardised units. sigma_scale: factors
+    (C_e,) by which σ of the effect channels is multiplied (empty: 1 each), see `calibration.py`.
     """
 
     action_channels: tuple[str, ...] = ("x", "y")
@@ -65,11 +65,11 @@ class NetworkConfig:
 
 
 class EffectNetwork(nn.Module, ABC):
-    """A network that satisfies `EffectModel`; novelty: of images, see `calibration.py`.
+    """A network that satisfies `EffectModel`; `novelty` holds a `Novelty`, see `calibration.py`.
 
     Inputs and outputs are in metres and radians, in the frame of the table; standardisation and
-    rotation into the network's frame happen inside. A subclass gives `features` and
-    `outputs`, which know nothing of frames and units, and makes its layers in `make_layers`.
+    rotation into the network's frame happen inside. A subclass implements `features` and `outputs`,
+    which work in standardised units, and creates its layers in `make_layers`.
     """
 
     @checked
@@ -94,11 +94,11 @@ class EffectNetwork(nn.Module, ABC):
         self.make_layers(config)
 
     def make_layers(self, config: Any) -> None:
-        """Make the layers that the configuration describes."""
+        """Create the layers that the configuration describes."""
 
     @abstractmethod
     def features(self, scaled_image: Float[Tensor, "b 2 n n"]) -> Float[Tensor, "b f"]:
-        """f(γ_o): what the network reads from a standardised image."""
+        """Image features f(γ_o) of a standardised image."""
 
     @abstractmethod
     def outputs(
@@ -112,10 +112,10 @@ class EffectNetwork(nn.Module, ABC):
     def represent(
         self, observations: Observations, effects: Tensor | None = None
     ) -> Float[Tensor, "b w"]:
-        """r: (B, W), equations (2) and (3), the means taken over what is observed.
+        """Representation r (B, W), equations (2) and (3); the means run over the observed values.
 
-        Of networks with an `action_encoder` and an `effect_encoder`; effects: what the latter gets,
-        by default the standardised effects with their phases.
+        Requires an `action_encoder` and an `effect_encoder`. effects: input of the latter, by
+        default the standardised effects with their phases.
         """
         o = observations
         actions = with_time(o.action / self.action_scale, o.action_t)
@@ -127,7 +127,7 @@ class EffectNetwork(nn.Module, ABC):
         return w_1 * r_a + (1 - w_1) * r_e
 
     def split_outputs(self, y: Float[Tensor, "b t _"]) -> tuple[Float[Tensor, "b t _"], ...]:
-        """(μ_a, σ_a, μ_e, σ_e) of a last layer's values (B, T, 2 C_a + 2 C_e)."""
+        """Split the last layer's values (B, T, 2 C_a + 2 C_e) into (μ_a, σ_a, μ_e, σ_e)."""
         n_a, n_e = len(self.action_channels), len(self.effect_channels)
         mu_a, raw_a, mu_e, raw_e = y.split([n_a, n_a, n_e, n_e], dim=-1)
         return (
@@ -146,21 +146,21 @@ class EffectNetwork(nn.Module, ABC):
         return (image - mean) / std
 
     def unoriented_features(self, image: Float[Tensor, "b 2 n n"]) -> Float[Tensor, "b f"]:
-        """What can be read of an image before the direction is known: here, the image itself."""
+        """What is computed from an image before the direction is known: here, the image itself."""
         return image.flatten(1)
 
     def oriented_features(
         self, unoriented: Float[Tensor, "#b f"], rotation: Float[Tensor, "b 2"]
     ) -> Float[Tensor, "b f"]:
-        """Features of the rotated images, of their `unoriented_features`."""
+        """Features of the rotated images, computed from their `unoriented_features`."""
         pixels = math.isqrt(unoriented.shape[1] // 2)
         image = rotate_image(unoriented.reshape(-1, 2, pixels, pixels), rotation)
         return self.features(self._scaled(image))
 
     def encode(self, image: Float[Tensor, "b 2 n n"], check: bool = True) -> Float[Tensor, "b f"]:
-        """Features (B, F) of depth and mask (B, 2, 48, 48), unoriented in the frame of the push.
+        """Features (B, F) of depth and mask (B, 2, 48, 48); in the push frame, unoriented features.
 
-        Raises ValueError where the object is unlike those the network was trained on.
+        Raises ValueError, if `check`, for an object outside the training domain.
         """
         if check:
             self.domain.check_image(image)
@@ -171,9 +171,9 @@ class EffectNetwork(nn.Module, ABC):
     def predict(self, features: Tensor, observations: Observations, t_target: Tensor) -> Prediction:
         """Mean and σ (B, T, C) at t_target (B, T); features (B, F), or (1, F) for all.
 
-        Raises ValueError for phases outside [0, 1], and for actions that start or end elsewhere
-        than those trained on. Warns (`OutOfRangeWarning`) of effects at t = 1 that are farther or
-        less far than those trained on: a planner may pass there on its way.
+        Raises ValueError for phases outside [0, 1], and for actions whose start or end lies outside
+        the training domain. Only warns (`OutOfRangeWarning`) of such effects at t = 1, since a
+        planner may pass through them during its search.
         """
         self.domain.check_query(observations, t_target, *self._channels)
         (mu_a, sigma_a, mu_e, sigma_e), direction = self._decode(features, observations, t_target)
@@ -194,7 +194,7 @@ class EffectNetwork(nn.Module, ABC):
     def _decode(
         self, encoded: Tensor, observations: Observations, t_target: Tensor
     ) -> tuple[tuple[Tensor, ...], Tensor | None]:
-        """`outputs` for encoded images, and the direction (B, 2) of the network's frame, if any."""
+        """`outputs` for encoded images, and the direction (B, 2) of the push frame, if used."""
         if self.config.frame == "table":
             return self.outputs(encoded, observations, t_target), None
         direction = push_direction(observations, *self._channels)
@@ -214,11 +214,11 @@ class EffectNetwork(nn.Module, ABC):
     ) -> Tensor:
         """Negative log-likelihood (Section 3.2) of the targets (B, T, C).
 
-        Half the mean over the action's values and half that over the effect's, standardised, in the
-        network's frame. beta weighs each value by σ^(2 beta), so that what is hard to predict is
-        not given up for a large σ: with 0 it is the likelihood, with 1 means learn as from the
-        squared error (Seitzer et al., On the pitfalls of heteroscedastic uncertainty estimation,
-        ICLR 2022).
+        The mean over the action's values and the mean over the effect's count half each, both
+        standardised and in the network's frame. beta weights each value by σ^(2 beta), so that the
+        network does not ignore values that are hard to predict by raising σ: 0 is the likelihood, 1
+        trains the means as the squared error does (Seitzer et al., On the pitfalls of
+        heteroscedastic uncertainty estimation, ICLR 2022).
         """
         encoded = self.encode(image, check=False)
         (mu_a, sigma_a, mu_e, sigma_e), direction = self._decode(encoded, observations, t_target)
@@ -235,12 +235,12 @@ class EffectNetwork(nn.Module, ABC):
 
 
 def with_time(values: Tensor, t: Tensor) -> Tensor:
-    """Values (..., C) and their phases (...): (..., C + 1)."""
+    """Append phases (...) to values (..., C): (..., C + 1)."""
     return torch.cat([values, t[..., None]], dim=-1)
 
 
 def masked_mean(h: Float[Tensor, "b n c"], mask: Bool[Tensor, "b n"]) -> Float[Tensor, "b c"]:
-    """Mean (B, H) over the observed of (B, n, H); zero where nothing is observed."""
+    """Mean (B, H) of the observed values of (B, n, H); zero where none is observed."""
     seen = mask[..., None].to(h.dtype)
     return (h * seen).sum(dim=1) / seen.sum(dim=1).clamp_min(1)
 
@@ -248,9 +248,9 @@ def masked_mean(h: Float[Tensor, "b n c"], mask: Bool[Tensor, "b n"]) -> Float[T
 def mean_code(
     encoder: nn.Module, seen: Float[Tensor, "b n c"], mask: Bool[Tensor, "b n"]
 ) -> Float[Tensor, "b h"]:
-    """Mean (B, H) of the codes of the observed of (B, n, C), each with its phase; zero of none.
+    """Mean (B, H) of encoded observations (B, n, C) with phases; zero where there are none.
 
-    Without gradients, what no query observes is not encoded: planners observe no effects.
+    Without gradients, a batch that observes nothing is not encoded: planners observe no effects.
     """
     if not torch.is_grad_enabled() and not mask.any():
         seen, mask = seen[:, :0], mask[:, :0]
@@ -263,7 +263,7 @@ def gaussian_nll(y: Tensor, mean: Tensor, std: Tensor) -> Tensor:
 
 
 def he_initialise(module: nn.Module) -> None:
-    """He initialisation for leaky layers; PyTorch's default never learns a push's direction."""
+    """He initialisation for LeakyReLU; PyTorch's default does not learn the direction of a push."""
     if isinstance(module, nn.Linear | nn.Conv2d):
         nn.init.kaiming_normal_(module.weight, a=0.01, nonlinearity="leaky_relu")
         nn.init.zeros_(module.bias)

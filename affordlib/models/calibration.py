@@ -1,13 +1,13 @@
-"""Is σ right? Coverage of the central intervals, negative log-likelihood, and variance scaling.
+"""Calibration of σ: coverage of central intervals, negative log-likelihood, variance scaling.
 
 With a calibrated Gaussian half of the ground truth lies in the central 50 % interval μ ± 0.674 σ.
-Variance scaling multiplies σ of an effect channel by s; that of greatest likelihood is
-s² = mean ((e - μ) / σ)² (a temperature: Guo et al., On calibration of modern neural networks, ICML
-2017).
+Variance scaling multiplies σ of an effect channel by s; the maximum-likelihood value is s² = mean
+((e - μ) / σ)² (a temperature: Guo et al., On calibration of modern neural networks, ICML 2017).
 
-σ knows the noise of what was learned, not how unlike it an object is. `Novelty` is the distance of
-an image to the nearest of the training (Sun et al., Out-of-distribution detection with deep nearest
-neighbors, ICML 2022) in circular harmonics: features that were learned keep only what mattered.
+σ covers the noise in the training data, not the novelty of an object. `Novelty` is the distance of
+an image to its nearest training image (Sun et al., Out-of-distribution detection with deep nearest
+neighbors, ICML 2022) in circular harmonics, since learned features discard what training did not
+need.
 """
 
 import math
@@ -49,7 +49,7 @@ def coverage(
 def effects_at(
     model: EffectModel, tensors: InteractionTensors, phases: Sequence[float]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Truth, mean and σ of the effects, (N, T, C) each, given image and action."""
+    """Ground truth, mean and σ of the effects, (N, T, C) each, given image and action."""
     phases = [check_within("phases", phase, 0.0, 1.0) for phase in phases]
     if not phases:
         raise ValueError("phases must hold at least one phase in [0, 1], got none")
@@ -67,7 +67,7 @@ def fit_sigma_scale(
     validation: InteractionTensors,
     phases: Sequence[float] = AFTER_CONTACT,
 ) -> tuple[float, ...]:
-    """Set, and return, the sigma_scale (C_e,) of greatest likelihood; x and y share one."""
+    """Set and return the maximum-likelihood sigma_scale (C_e,); x and y share one factor."""
     model.sigma_scale = (1.0,) * len(model.effect_channels)
     truth, mean, std = effects_at(model, validation, phases)
     squared = ((truth - mean) / std).square().mean(dim=(0, 1))
@@ -88,22 +88,22 @@ NOVELTY_GAIN = 0.0167  # c of `NoveltyAware`, chosen in `experiments/novelty.py`
 
 
 class Novelty:
-    """Distance (N,) of images from the nearest of a training, in units of the limit of the known.
+    """Distance (N,) of images to their nearest training image, in units of `limit`.
 
-    references: (n, f) spectra of the harmonics of training images, which no rotation changes. 99 %
-    of them have their nearest other within the limit.
+    references: (n, f) spectra of the circular harmonics of training images, which are invariant to
+    rotation. limit: 99 % of the references are closer than this to their nearest other reference.
     """
 
     def __init__(self, references: Float[Tensor, "n f"]) -> None:
         self.references, self.harmonics = references, CircularHarmonics()
         spread = references.std(dim=0).reshape(2, -1)
-        # What varies by less than 1 % of the largest of its image channel is noise of pixels.
+        # A spread below 1 % of the largest spread of its image channel is pixel noise.
         self.spread = spread.maximum(0.01 * spread.amax(dim=1, keepdim=True)).flatten()
         self.limit = self.distances(references, 2)[:, 1].quantile(0.99)
 
     @classmethod
     def fit(cls, image: Float[Tensor, "n 2 48 48"]) -> "Novelty":
-        """With up to 500 training images."""
+        """Create it from at most the first 500 training images."""
         return cls(CircularHarmonics().spectrum(image[:500]))
 
     def distances(self, spectra: Tensor, n: int = 1) -> Tensor:
@@ -120,8 +120,8 @@ class Novelty:
 class NoveltyAware:
     """A model of pushes whose σ grows with an object's novelty; satisfies `EffectModel`.
 
-    σ² grows by (c m s)² n; n: how far the object is beyond the limit of the known, for which n = 0;
-    m: how far it is predicted to move, in scales of x and y; s: the scale of the channel.
+    σ² grows by (c m s)² n. n: novelty in excess of 1 (0 for known objects); m: predicted distance
+    moved, in scales of x and y; s: the scale of the channel; c: `NOVELTY_GAIN`.
     """
 
     def __init__(self, model: EffectNetwork) -> None:
@@ -136,7 +136,7 @@ class NoveltyAware:
         return torch.cat([self.model.encode(image), root[:, None]], dim=1)
 
     def predict(self, features: Tensor, observations: Observations, t_target: Tensor) -> Prediction:
-        """As the model's, with σ of the effect that grows with novelty."""
+        """The model's prediction, with σ of the effect increased by novelty."""
         p = self.model.predict(features[:, :-1], observations, t_target)
         plane, scale = xy_columns(self.effect_channels), self.model.effect_scale
         moved = (p.effect_mean[..., plane] / scale[plane]).norm(dim=-1, keepdim=True)

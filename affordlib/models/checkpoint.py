@@ -1,7 +1,7 @@
-"""Checkpoints: the weights of a model, and all else that it is, in one file of safetensors.
+"""Checkpoints: weights, configuration and description of a model in one safetensors file.
 
-One file is replaced in one step, with a hash inside of weights and description. The state of a
-training that can be resumed is a zip of PyTorch's, read without running any code in it.
+Files are replaced atomically and hold a hash of weights and description. The state of a training
+that can be resumed is a PyTorch zip file, which is read without running any code in it.
 """
 
 import hashlib
@@ -39,13 +39,13 @@ NETWORKS: dict[str, tuple[type[EffectNetwork], type[NetworkConfig]]] = {
     "cnp_last_pose": (LastPoseCNP, LastPoseConfig),
     "lstm": (LSTMNetwork, LSTMConfig),
 }
-"""By the name that checkpoints have for them; other packages may add theirs."""
+"""Network and configuration by the name that checkpoints store; other packages may add theirs."""
 
 
 def build(
     config: NetworkConfig, scaler: Scaler, domain: TrainingDomain | None = None
 ) -> EffectNetwork:
-    """An untrained network of the architecture that the configuration belongs to."""
+    """Create an untrained network of the architecture that the configuration belongs to."""
     for network, config_class in NETWORKS.values():
         if type(config) is config_class:
             return network(config, scaler, domain)
@@ -54,10 +54,10 @@ def build(
 
 
 def save_checkpoint(model: EffectNetwork, path: str | Path, about: dict[str, Any]) -> Path:
-    """Write a model to `path` (ending in .safetensors), whole or not at all; returns the path.
+    """Write a model to `path` (ending in .safetensors) atomically, and return the path.
 
-    about: what the reader of the checkpoint should know, such as the data set and the interactions
-    that the model was trained on; plain JSON values.
+    about: facts for users of the checkpoint, such as the data set and the interactions that the
+    model was trained on; plain JSON values.
     """
     path = Path(path)
     if path.suffix != SUFFIX:
@@ -79,12 +79,12 @@ def save_checkpoint(model: EffectNetwork, path: str | Path, about: dict[str, Any
 
 
 def resolve_checkpoint(name_or_path: str | Path) -> Path:
-    """The file of a shipped checkpoint's name, or of a path; raises when there is none."""
+    """Return the file of a shipped checkpoint's name or of a path; FileNotFoundError if none."""
     path = Path(name_or_path)
     folder = repo_root() / "data" / "checkpoints"
     path = path if path.suffix == SUFFIX else folder / f"{name_or_path}{SUFFIX}"
     if not path.is_file():
-        others = ("np_", "reachability")  # which are read by functions of their own
+        others = ("np_", "reachability")  # these have their own load functions
         shipped = [p.stem for p in sorted(folder.glob(f"*{SUFFIX}"))]
         shipped = [name for name in shipped if not name.startswith(others)]
         raise FileNotFoundError(
@@ -99,9 +99,9 @@ def _with_tuples(fields: dict[str, Any]) -> dict[str, Any]:
 
 
 def load_checkpoint(name_or_path: str | Path) -> tuple[EffectNetwork, dict[str, Any]]:
-    """A model, ready to predict, and what its checkpoint says about it.
+    """Load a model, ready to predict, and the `about` of its checkpoint.
 
-    Raises FileNotFoundError, or ValueError when the files are damaged or of another model.
+    Raises FileNotFoundError, or ValueError when the file is damaged or holds another model.
     """
 
     def make(description):
@@ -118,9 +118,9 @@ def load_checkpoint(name_or_path: str | Path) -> tuple[EffectNetwork, dict[str, 
 def restored(
     path: Path, remedy: str, make: Callable[[dict[str, Any]], nn.Module]
 ) -> tuple[Any, dict[str, Any]]:
-    """The module that `make` gives for a file's description, with the file's weights, and that.
+    """Load a file into the module that `make` creates from its description; return both.
 
-    Raises FileNotFoundError, or ValueError when the file is damaged or of something else.
+    Raises FileNotFoundError, or ValueError when the file is damaged or of another kind.
     """
     tensors, description = read_weights(path, remedy)
     references = tensors.pop(NOVELTY, None)
@@ -128,7 +128,7 @@ def restored(
         model = make(description)
         own = model.state_dict()
         if other := [k for k in own if k not in tensors or tensors[k].dtype != own[k].dtype]:
-            raise ValueError(f"{other[0]} is missing or of another type")
+            raise ValueError(f"{other[0]} is missing or has another type")
         model.load_state_dict(tensors)
         model.novelty = None if references is None else Novelty(references)
     except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
@@ -142,7 +142,7 @@ _KEY = "affordlib"
 
 
 def weights_sha256(tensors: dict[str, torch.Tensor], text: str) -> str:
-    """Hash of weights and what is said of them."""
+    """SHA-256 hash of weights and description."""
     return hashlib.sha256(save(tensors) + text.encode()).hexdigest()
 
 
@@ -159,33 +159,33 @@ def write_weights(
 
 
 def read_weights(path: str | Path, remedy: str) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-    """Tensors and description of a file of `write_weights`; ValueError, if damaged, with remedy."""
+    """Read what `write_weights` wrote; ValueError, which ends with the remedy, if it is damaged."""
     try:
         with safe_open(path, "pt") as file:
             content = json.loads((file.metadata() or {})[_KEY])
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         text = content["description"]
         if content["sha256"] != weights_sha256(tensors, text):
-            raise ValueError("its hash is another: it was changed after it was written")
+            raise ValueError("its hash differs: the file was changed after it was written")
         for name, value in tensors.items():
             if value.is_floating_point() and not value.isfinite().all():
                 raise ValueError(f"{name} holds numbers that are not finite")
         return tensors, json.loads(text)
     except KeyError as error:
-        raise ValueError(f"{path} is no file of weights with a description; {remedy}") from error
+        raise ValueError(f"{path} holds no weights with a description; {remedy}") from error
     except (SafetensorError, ValueError, TypeError, RecursionError) as error:
-        raise ValueError(f"{path} is damaged, or no file of weights ({error}); {remedy}") from error
+        raise ValueError(f"{path} is damaged, or holds no weights ({error}); {remedy}") from error
 
 
 def save_state(path: str | Path, state: dict[str, Any]) -> None:
-    """Write the state of a training to a file that `load_state` reads, whole or not at all."""
+    """Write a training state, which `load_state` reads, to a file atomically."""
     buffer = io.BytesIO()
     torch.save(state, buffer)
     write_atomically(Path(path), buffer.getvalue(), mark=b"/data.pkl")
 
 
 def load_state(path: str | Path, device: torch.device | str = "cpu") -> dict[str, Any]:
-    """The state that `save_state` wrote; raises ValueError when the file is damaged or foreign."""
+    """Load what `save_state` wrote; ValueError when the file is damaged or of another kind."""
     try:
         with zipfile.ZipFile(path) as archive:
             damaged = archive.testzip()
@@ -194,7 +194,7 @@ def load_state(path: str | Path, device: torch.device | str = "cpu") -> dict[str
         state = None
     if not isinstance(state, dict) or "about" not in state:
         raise ValueError(
-            f"resume_checkpoint {str(path)!r} is damaged, or not the state of a training; delete "
-            "it to begin again, or give another path"
+            f"resume_checkpoint {str(path)!r} is damaged or holds no training state; delete it "
+            "to start training again, or give another path"
         ) from None
     return state

@@ -33,9 +33,9 @@ FOLD_FROM_TARGETS = 100
 @checked
 @dataclass(frozen=True)
 class CNPConfig(NetworkConfig):
-    """leaky_output: a LeakyReLU on the decoders' last layer, as the appendix literally has it.
+    """leaky_output: end the decoders with a LeakyReLU, as the paper's appendix prints.
 
-    It keeps means from becoming negative easily.
+    It makes negative means hard to reach.
     """
 
     leaky_output: bool = False
@@ -51,19 +51,19 @@ def _dense(widths: tuple[int, ...], activate_last: bool) -> nn.Sequential:
 
 
 def image_encoder() -> nn.Sequential:
-    """f: (B, 2, 48, 48) → (B, 16), five convolutions, each halving the image."""
+    """Image encoder f: (B, 2, 48, 48) → (B, 16); five convolutions, each halving the image."""
     layers: list[nn.Module] = []
     for n_in, n_out in zip((2, *CONVOLUTION_WIDTHS[:-1]), CONVOLUTION_WIDTHS, strict=True):
-        # The paper activates before it pools, which gives the same of four times as many values.
+        # The paper activates before pooling: the same result at four times the computation.
         layers += [nn.Conv2d(n_in, n_out, 3, padding="same"), nn.MaxPool2d(2), nn.LeakyReLU()]
     return nn.Sequential(*layers, nn.Flatten(), nn.Linear(CONVOLUTION_WIDTHS[-1], IMAGE_FEATURES))
 
 
 class AffordanceCNP(EffectNetwork):
-    """Relates object image, action and effect; satisfies `EffectModel`."""
+    """The paper's network, relating object image, action and effect; satisfies `EffectModel`."""
 
     def make_layers(self, config: CNPConfig) -> None:
-        """Encoders and decoders as described above."""
+        """Create the encoders and decoders described above."""
         n_a, n_e = len(config.action_channels), len(config.effect_channels)
         self.image_encoder = image_encoder()
         self.action_encoder = _dense((n_a + 1, *ENCODER_WIDTHS), activate_last=True)
@@ -76,7 +76,7 @@ class AffordanceCNP(EffectNetwork):
         self.apply(he_initialise)
 
     def train(self, mode: bool = True) -> "AffordanceCNP":
-        """As of torch; folded weights are dropped: fused optimisers do not raise their version."""
+        """Set the mode as in torch and drop folded weights: fused optimisers skip `_version`."""
         self._folds.clear()
         return super().train(mode)
 
@@ -91,11 +91,11 @@ class AffordanceCNP(EffectNetwork):
         features: Float[Tensor, "#b 16"],
         t_target: Float[Tensor, "b t"],
     ) -> tuple[Float[Tensor, "b t _"], ...]:
-        """(μ_a, σ_a, μ_e, σ_e), each (B, T, C) and standardised, of r (B, 128) at t_target (B, T).
+        """Decode r (B, 128) at t_target (B, T) into (μ_a, σ_a, μ_e, σ_e), (B, T, C), standardised.
 
         The merge layer has no activation, so it folds exactly into each decoder's first layer, and
-        of the sum only the column of t differs between the targets of one query. Folding is faster
-        for many targets.
+        only the column of t differs between the targets of one query. Folding is faster from
+        `FOLD_FROM_TARGETS` targets on.
         """
         known = torch.cat([r, features.expand(len(r), -1)], dim=1)
         folds = t_target.numel() >= FOLD_FROM_TARGETS
@@ -114,9 +114,9 @@ class AffordanceCNP(EffectNetwork):
         return tuple(outputs)
 
     def _folded(self, first: nn.Linear) -> tuple[Tensor, Tensor]:
-        """Weight and bias of the merge layer and a decoder's first layer in one.
+        """Weight and bias of the merge layer and a decoder's first layer combined.
 
-        Without training and gradients they are kept until one of the weights changes.
+        In evaluation without gradients they are cached until one of the weights changes.
         """
         merge = self.merge
         if self.training or torch.is_grad_enabled() or first.weight.is_inference():

@@ -1,4 +1,4 @@
-"""The domain of a trained model: images, actions and effects of which it has learned something."""
+"""The domain of a trained model: the ranges of its training images, actions and effects."""
 
 import warnings
 from dataclasses import dataclass
@@ -18,16 +18,16 @@ _END_PHASE = 1e-3
 
 
 class OutOfRangeWarning(UserWarning):
-    """A network is queried outside of what it was trained on, and extrapolates."""
+    """A network is queried outside its training domain, and extrapolates."""
 
 
 @dataclass(frozen=True)
 class TrainingDomain:
-    """Ranges of the training data, None where not known.
+    """Ranges of the training data, None where unknown.
 
     start_radius_m, end_radius_m: distance [m] of the action from the object's centre at t = 0 and
-    at t = 1; mask_share: part of the image that the object covers; touches_border: whether objects
-    reach the image's edge; effect_radius_m: distance [m] that objects have moved at t = 1.
+    at t = 1; mask_share: fraction of the image that the object covers; touches_border: whether
+    objects reach the image's edge; effect_radius_m: distance [m] that objects have moved at t = 1.
     """
 
     start_radius_m: Range | None = None
@@ -43,7 +43,7 @@ class TrainingDomain:
 
     @classmethod
     def fit(cls, tensors: InteractionTensors) -> Self:
-        """The ranges of training data."""
+        """Determine the ranges of training data."""
         start = end = moved = None
         if plane := xy_columns(tensors.action_channels):
             start, end = (_range(tensors.action[:, k][:, plane].norm(dim=-1)) for k in (0, -1))
@@ -63,13 +63,13 @@ class TrainingDomain:
         if outside.any():
             raise ValueError(
                 f"image {int(outside.nonzero()[0])}: the object covers "
-                f"{float(share[outside][0]):.1%} of it, those trained on {low:.1%} to {high:.1%}; "
+                f"{float(share[outside][0]):.1%} of it, trained on {low:.1%} to {high:.1%}; "
                 "train on such objects first"
             )
         if not self.touches_border and at_border.any():
             raise ValueError(
-                f"image {int(at_border.nonzero()[0])}: the object reaches its edge, none trained "
-                "on does; centre the crop on the object, or train on such objects first"
+                f"image {int(at_border.nonzero()[0])}: the object reaches its edge, unlike the "
+                "training objects; centre the crop on the object, or train on such objects first"
             )
 
     def check_query(
@@ -81,7 +81,7 @@ class TrainingDomain:
     ) -> None:
         """Raise ValueError where a phase or an observed action is out of range.
 
-        Warn (`OutOfRangeWarning`) where an observed final effect is.
+        Warn (`OutOfRangeWarning`) where an observed final effect is out of range.
         """
         low, high = t_target.detach().aminmax()
         if not (low > -PHASE_TOLERANCE and high < 1 + PHASE_TOLERANCE):
@@ -98,12 +98,12 @@ class TrainingDomain:
                 raise ValueError(f"an observed action {name} {off}; train on such actions first")
         seen = (1 - o.effect_t < _END_PHASE) & o.effect_mask
         if off := _outside(o.effect, effect_channels, seen, self.effect_radius_m):
-            words = f"an observed effect ends {off}; what is predicted from it is an extrapolation"
+            words = f"an observed effect ends {off}; predictions from it are extrapolations"
             warnings.warn(words, OutOfRangeWarning, stacklevel=3)
 
 
 def touches_border(mask: Tensor) -> Tensor:
-    """Which of the masks (N, n, n) reach the edge of their image, not just by a corner: (N,)."""
+    """Whether each of the masks (N, n, n) meets its image's edge by more than a corner: (N,)."""
     rim = torch.cat([mask[:, (0, -1)].flatten(1), mask[:, :, (0, -1)].flatten(1)], dim=1)
     return (rim > 0.5).sum(dim=1) > 2
 
@@ -113,11 +113,11 @@ def _range(values: Tensor) -> Range:
 
 
 def _outside(values: Tensor, channels: tuple[str, ...], seen: Tensor, known: Range | None) -> str:
-    """How far from the object's centre the first of what is seen is that is out of range."""
+    """Describe the distance of the first observed value out of range; empty if there is none."""
     plane = xy_columns(channels)
     if known is None or not plane or not seen.any():
         return ""
     radius, (low, high) = values.detach()[..., plane].norm(dim=-1), known
     near = (radius > low - RADIUS_TOLERANCE_M) & (radius < high + RADIUS_TOLERANCE_M)
     far = radius[seen & ~near].tolist()
-    return f"{far[0]:.3f} m away, those trained on {low:.3f} to {high:.3f} m" if far else ""
+    return f"{far[0]:.3f} m away, trained on {low:.3f} to {high:.3f} m" if far else ""

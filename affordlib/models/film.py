@@ -1,25 +1,25 @@
-"""Our networks: the features of the image modulate residual blocks (FiLM).
+"""Our networks: image features modulate residual blocks by feature-wise linear modulation (FiLM).
 
     r      = w₁ mean h_a(a_i) + w₂ mean h_e(e_i)             as in the paper, equations (2) and (3)
     x_0    = W {r, f(γ_o), φ(t_target)}
     x_k+1  = x_k + W₂ ς(γ_k ∘ W₁ n(x_k) + β_k),  (γ_k - 1, β_k) = V_k f(γ_o)
     g(x_K) = (μ_a, σ_a, μ_e, σ_e)
 
-f: a small network on the image's circular harmonics, which rotate exactly into the push frame;
-ς: SiLU; n: layer normalisation; φ: t with its first sines and cosines. Source: Perez et al., FiLM:
+f: a small network on the image's circular harmonics, which rotate exactly into the push frame; ς:
+SiLU; n: layer normalisation; φ: t with its first sines and cosines. Source: Perez et al., FiLM:
 visual reasoning with a general conditioning layer, AAAI 2018.
 
-`LastPoseCNP`, for lever-ups, is one in the frame of the last observed pose:
+`LastPoseCNP`, for lever-ups, works in the frame of the last observed pose:
 
     d(t)  = e(t) - m(t)                              m: mean of the training trajectories
     r     = w₁ mean h_a(a_i, t_i) + w₂ mean h_e(d_i - d_l, t_i - t_l, t_i),  l the last observed
     μ(t)  = m(t) + d_l + ḋ_l s(t) + n(t) g(r, ḋ_l, d_l, f(γ_o), t - t_l, t),    σ(t) from g
 
-A mean of codes, as in equations (2) and (3) of the paper, does not keep where exactly the object
-was a moment ago; here that is an input, with the velocity ḋ_l between the last two observations,
-which lasts for a while, s(t) = (t - t_l) exp(-|t - t_l| / 0.2); the network predicts what else
-changes from there on; n rises from 0 at t_l towards 1. Any t is predicted directly, without a
-rollout. With nothing observed d_l is that of t = 0, where a displacement is zero.
+A mean of codes, as in equations (2) and (3) of the paper, loses the exact pose of the last
+observation. Here that pose is an input, with the velocity ḋ_l between the last two observations,
+whose influence s(t) = (t - t_l) exp(-|t - t_l| / 0.2) decays. The network predicts the remaining
+change; n rises from 0 at t_l towards 1. Any t is predicted directly, without a rollout. With no
+observation d_l is the one at t = 0, where a displacement is zero.
 """
 
 from dataclasses import dataclass
@@ -35,7 +35,7 @@ from affordlib.models.harmonics import HarmonicsConfig, HarmonicsNetwork, dense,
 from affordlib.types import Observations
 
 BASIS_FROM_ROTATIONS = 32
-"""From this many rotations of one image on, its basis is faster."""
+"""Number of rotations of one image from which on using its basis is faster."""
 
 _NEAR_PHASE = 0.1
 _VELOCITY_PHASE = 0.2
@@ -44,7 +44,7 @@ _VELOCITY_PHASE = 0.2
 @checked
 @dataclass(frozen=True)
 class FiLMConfig(HarmonicsConfig):
-    """Width and number of the residual blocks; by default in the push frame."""
+    """Width and number of the residual blocks; the default frame is the push frame."""
 
     frame: str = "push"
     width: int = 128
@@ -52,7 +52,7 @@ class FiLMConfig(HarmonicsConfig):
 
 
 class FiLMBlock(nn.Module):
-    """x + W₂ ς(γ ∘ W₁ n(x) + β), γ and β linear in the condition."""
+    """Residual block x + W₂ ς(γ ∘ W₁ n(x) + β), with γ and β linear in the condition."""
 
     def __init__(self, width: int, condition: int) -> None:
         super().__init__()
@@ -70,10 +70,10 @@ class FiLMBlock(nn.Module):
 
 
 class FiLMNetwork(HarmonicsNetwork):
-    """Relates object image, action and effect; satisfies `EffectModel`."""
+    """FiLM network relating object image, action and effect; satisfies `EffectModel`."""
 
     def make_layers(self, config: FiLMConfig) -> None:
-        """Encoders and decoders as described above."""
+        """Create the encoders and decoders described above."""
         super().make_layers(config)
         c, w = config, config.width
         n_a, n_e = len(c.action_channels), len(c.effect_channels)
@@ -87,9 +87,9 @@ class FiLMNetwork(HarmonicsNetwork):
     def oriented_features(
         self, unoriented: Float[Tensor, "#b f"], rotation: Float[Tensor, "b 2"]
     ) -> Float[Tensor, "b f"]:
-        """f(γ_o) of the rotated images, of the harmonics of the images.
+        """f(γ_o) of the rotated images, computed from the harmonics of the images.
 
-        Of one image in many rotations the first layer, linear, is computed of its basis alone.
+        For many rotations of one image, the linear first layer is applied only to its `basis`.
         """
         if len(unoriented) > 1 or len(rotation) < BASIS_FROM_ROTATIONS:
             return super().oriented_features(unoriented, rotation)
@@ -106,7 +106,7 @@ class FiLMNetwork(HarmonicsNetwork):
         """(μ_a, σ_a, μ_e, σ_e), each (B, T, C) and standardised."""
         r = self.represent(observations)
         known = torch.cat([r, features.expand(len(r), -1)], dim=1)
-        # Only the phase differs between the targets of a query, so the rest is merged once.
+        # Only the phase differs between the targets of a query; the rest is merged once.
         split = known.shape[1]
         base = F.linear(known, self.merge.weight[:, :split], self.merge.bias)
         phase = waves(t_target, self.config.waves)
@@ -114,7 +114,7 @@ class FiLMNetwork(HarmonicsNetwork):
         return self.decode(x, features)
 
     def decode(self, x: Float[Tensor, "b t w"], features: Tensor) -> tuple[Tensor, ...]:
-        """(μ_a, σ_a, μ_e, σ_e) of x_0."""
+        """(μ_a, σ_a, μ_e, σ_e) decoded from x_0."""
         for block in self.blocks:
             x = block(x, features)
         return self.split_outputs(self.last(self.head(x)))
@@ -123,14 +123,14 @@ class FiLMNetwork(HarmonicsNetwork):
 @checked
 @dataclass(frozen=True)
 class LastPoseConfig(FiLMConfig):
-    """Sizes as of `FiLMConfig`; steps: into how many m(t) divides the phase."""
+    """Sizes as in `FiLMConfig`; steps: number of linear segments of m(t)."""
 
     frame: str = "table"
     steps: int = 25
 
 
 def between(values: Float[Tensor, "b n c"], at: Float[Tensor, "b t"]) -> Float[Tensor, "b t c"]:
-    """Values at places between steps, linearly."""
+    """Interpolate values (B, n, C) linearly at fractional indices (B, T)."""
     below = at.detach().floor().long().clamp(0, values.shape[1] - 2)
     share = (at - below)[..., None]
 
@@ -141,14 +141,14 @@ def between(values: Float[Tensor, "b n c"], at: Float[Tensor, "b t"]) -> Float[T
 
 
 class MeanTrajectory(nn.Module):
-    """m(t): the mean effect over the phase, linear between steps, in standardised units."""
+    """Mean effect m(t) over the phase, linear between steps, in standardised units."""
 
     def __init__(self, steps: int, channels: int) -> None:
         super().__init__()
         self.register_buffer("values", torch.zeros(steps + 1, channels))
 
     def fit(self, effect: Float[Tensor, "n s c"], scale: Float[Tensor, " c"]) -> None:
-        """Take it from effects of training trajectories [m, rad], at the same number of steps."""
+        """Set m from effects of training trajectories [m, rad], whose steps must be m's."""
         if effect.shape[1:] != self.values.shape:
             raise ValueError(
                 f"effect must have (steps, channels) = {tuple(self.values.shape)}, "
@@ -165,7 +165,7 @@ class LastPoseCNP(FiLMNetwork):
     """Predicts a trajectory from any observed part of it; satisfies `EffectModel`."""
 
     def make_layers(self, config: LastPoseConfig) -> None:
-        """Encoders and decoders as described above."""
+        """Create the encoders and decoders described above."""
         super().make_layers(config)
         c, w = config, config.width
         n_e = len(c.effect_channels)
@@ -191,7 +191,7 @@ class LastPoseCNP(FiLMNetwork):
         times = torch.cat([waves(t_target, n), waves(ahead, n)], dim=-1)
         x = self.merge(torch.cat([known[:, None].expand(-1, times.shape[1], -1), times], dim=-1))
         mu_a, sigma_a, change, sigma_e = self.decode(x, features)
-        # Nothing has changed at the last pose; the velocity lasts for a while.
+        # The change is zero at the last pose; the influence of the velocity decays.
         near = ahead.abs()[..., None] / (ahead.abs()[..., None] + _NEAR_PHASE)
         lasting = (10 * ahead * (-ahead.abs() / _VELOCITY_PHASE).exp())[..., None]
         moving = velocity[:, None] * lasting
@@ -204,7 +204,7 @@ def _last(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Value (B, C) and phase (B, 1) of the last observation, and its velocity per tenth of phase.
 
-    All are zero where nothing is observed; the velocity also where only one is.
+    All are zero where nothing is observed; the velocity also where there is one observation.
     """
     order = t.masked_fill(~seen, -1.0).argsort(dim=1)[:, -2:]
     rows = torch.arange(len(d), device=d.device)

@@ -1,7 +1,7 @@
-"""Models of a log of one's own: `fit` gives one that predicts where pushes take the object.
+"""Fit a model to a user's own log: `fit` returns one that predicts where pushes move the object.
 
-Recipes that work from some 35 pushes on. What is called an outcome here has three columns:
-displacement x, y [m] and turn [rad], in the object's frame at the start.
+The recipes work from some 35 pushes on. An outcome has three columns: displacement x, y [m] and
+rotation [rad], in the object's frame at the start.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from affordlib.types import check_choice, check_count
 INNER_FOLDS = 3
 FEW, MOST_CONTEXT = 100, 64
 EFFORT = {"few": (100, 1e-4, 8), "many": (600, 3e-4, 8)}
-"""Of tuning to fewer than `FEW` pushes or more: steps, learning rate, tasks a step."""
+"""Fine-tuning on fewer than `FEW` pushes or on more: steps, learning rate, tasks per step."""
 NETWORK_TRAINING = TrainingConfig(
     steps=600,
     batch_size=32,
@@ -54,10 +54,10 @@ _PRIOR = 20.0
 
 @runtime_checkable
 class PushModel(Protocol):
-    """What predicts the outcomes of pushes."""
+    """A model that predicts the outcomes of pushes."""
 
     def predict(self, pushes: PushLog) -> tuple[np.ndarray, np.ndarray]:
-        """Mean and σ (n, 3) of displacement [m] and turn [rad], in the object's frame."""
+        """Mean and σ (n, 3) of displacement [m] and rotation [rad], in the object's frame."""
         ...
 
 
@@ -70,7 +70,7 @@ def gyration_radius_m(outline_m: np.ndarray) -> float:
 
 
 def push_rows(pushes: PushLog) -> Tensor:
-    """Pushes (n, 10) as `neural_process` and `quasi_static` take them, the outcome last."""
+    """Pushes (n, 10) as rows for `neural_process` and `quasi_static`, the outcome last."""
     scale = gyration_radius_m(pushes.outline_m)
     lengths = (pushes.contact_m / scale, pushes.length_m[:, None] / scale)
     outcome = (pushes.displacement_m / scale, pushes.turn_rad[:, None])
@@ -79,9 +79,9 @@ def push_rows(pushes: PushLog) -> Tensor:
 
 
 def told_feet(pushes: PushLog) -> Tensor:
-    """Feet (n, 12, 3) in units of the radius of gyration; (n, 0, 3) where none are told.
+    """Known feet (n, 12, 3) in units of the radius of gyration; (n, 0, 3) where none are known.
 
-    They are told by `context["feet"]`, (n, k, 3): x, y [m] and share of the weight; k at most 12.
+    They come from `context["feet"]`, (n, k, 3): x, y [m] and share of the weight; k at most 12.
     """
     feet = torch.zeros(len(pushes), FEET if "feet" in pushes.context else 0, 3)
     if feet.shape[1]:
@@ -94,11 +94,11 @@ def told_feet(pushes: PushLog) -> Tensor:
 
 
 class FittedNeuralProcess:
-    """The pretrained neural process, tuned to a log; the log itself is its context.
+    """The pretrained neural process, fine-tuned on a log, which is also its context.
 
-    Other pushes of a query's group are the context; a group that the log does not have has none.
-    Of the log a few copies learn, each from all but a fold of it: their mean predicts, and how far
-    each is off on its own fold scales σ.
+    The context of a query are the log's pushes of the same group; an unknown group has none. Each
+    of `INNER_FOLDS` copies is fine-tuned on all but one fold of the log. Predictions are the mean
+    over the copies; their residuals on the held-out folds scale σ.
     """
 
     def __init__(self, data: PushLog, seed: int = 0) -> None:
@@ -109,7 +109,7 @@ class FittedNeuralProcess:
         self.sigma_scale = sigma_scale(torch.cat(off))
 
     def _tuned(self, data: PushLog, fold: int, seed: int) -> NeuralProcess:
-        """A copy of the pretrained network, tuned to all but a fold."""
+        """A copy of the pretrained network, fine-tuned on all folds but one."""
         kept = self.fold != fold
         names = [g for g in np.unique(self.groups) if (kept & (self.groups == g)).sum() > 1]
         model = copy.deepcopy(load_neural_process())
@@ -132,7 +132,7 @@ class FittedNeuralProcess:
     def _predicted(
         self, pushes: PushLog, model: NeuralProcess, kept: np.ndarray
     ) -> tuple[Tensor, Tensor]:
-        """Mean and σ (n, 3) in the frames of the contacts, given what is kept of the log."""
+        """Mean and σ (n, 3) in the contact frames, given the kept part of the log as context."""
         rows, feet = push_rows(pushes), told_feet(pushes)
         mean, std = torch.zeros(len(rows), 3), torch.zeros(len(rows), 3)
         for group in np.unique(pushes.groups):
@@ -145,7 +145,7 @@ class FittedNeuralProcess:
         return mean, std
 
     def predict(self, pushes: PushLog) -> tuple[np.ndarray, np.ndarray]:
-        """Mean and σ (n, 3) of displacement [m] and turn [rad], in the object's frame."""
+        """Mean and σ (n, 3) of displacement [m] and rotation [rad], in the object's frame."""
         every = np.ones(len(self.rows), dtype=bool)
         means, stds = zip(*(self._predicted(pushes, m, every) for m in self.members), strict=True)
         mean = torch.stack(means).mean(0)
@@ -153,7 +153,7 @@ class FittedNeuralProcess:
         return in_object_frame(pushes, mean, std)
 
     def given(self, pushes: PushLog) -> FittedNeuralProcess:
-        """The same model with more pushes to condition on, of an object like that of the log."""
+        """The same model with more pushes as context, of an object like that of the log."""
         more = copy.copy(self)
         more.rows = torch.cat([self.rows, push_rows(pushes)])
         more.groups = np.concatenate([self.groups, pushes.groups])
@@ -161,11 +161,11 @@ class FittedNeuralProcess:
 
 
 class FittedNetwork:
-    """One of the book's networks, trained on a log from nothing: FiLM in the push frame, or CNP.
+    """One of the book's networks trained from scratch on a log: FiLM in the push frame, or CNP.
 
-    It sees the image of the outline and the tool's way; what `context` tells stands beside as
-    further channels of the action. Turned and mirrored copies are learned where nothing is told,
-    for what is told need not be symmetric. A fifth of the pushes validates and scales σ.
+    Inputs are the image of the outline, the tool's path and, as further action channels, what
+    `context` holds. Rotation and reflection augmentation is used only without `context`, whose
+    values need not be symmetric. A fifth of the pushes serves for validation and for scaling σ.
     """
 
     def __init__(self, data: PushLog, name: str, seed: int = 0) -> None:
@@ -184,11 +184,11 @@ class FittedNetwork:
         fit_sigma_scale(self.network, validate_on, (1.0,))
 
     def _tensors(self, pushes: PushLog) -> InteractionTensors:
-        """The log as the networks read it, its context by further channels of the action."""
+        """The log as tensors for the networks, its context as further channels of the action."""
         if pushes.crop_width_m != self.crop_width_m:
             raise ValueError(
                 f"crop_width_m is {pushes.crop_width_m:g} m, the model was trained on images of "
-                f"{self.crop_width_m:g} m; make the log with that width"
+                f"{self.crop_width_m:g} m; create the log with that width"
             )
         arrays, columns = pushes.interaction_tensors(), []
         for name, known in self.like.context.items():
@@ -207,13 +207,13 @@ class FittedNetwork:
 
     @torch.no_grad()
     def predict(self, pushes: PushLog) -> tuple[np.ndarray, np.ndarray]:
-        """Mean and σ (n, 3) of displacement [m] and turn [rad], in the object's frame."""
+        """Mean and σ (n, 3) of displacement [m] and rotation [rad], in the object's frame."""
         _, mean, std = effects_at(self.network, self._tensors(pushes), (1.0,))
         return mean[:, 0].double().numpy(), std[:, 0].double().numpy()
 
 
 def _relative_errors(radius_m: float) -> Callable[[EffectNetwork, InteractionTensors], Tensor]:
-    """A score for early stopping in which a turn counts as the way it moves the outline."""
+    """Score for early stopping [m]: position error plus rotation error times the radius."""
 
     def score(network, tensors):
         truth, mean, _ = effects_at(network, tensors, (1.0,))
@@ -224,7 +224,7 @@ def _relative_errors(radius_m: float) -> Callable[[EffectNetwork, InteractionTen
 
 
 def in_object_frame(pushes: PushLog, mean: Tensor, std: Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """Outcomes (n, 3) of unit lengths in the frames of the contacts, in metres in the object's."""
+    """Convert outcomes (n, 3) from contact frames and unit lengths to object frame and metres."""
     normal = torch.from_numpy(pushes.normal).float()
     axes = torch.stack([normal, quarter_turn(normal)], 1)
     metres = gyration_radius_m(pushes.outline_m)
@@ -235,9 +235,9 @@ def in_object_frame(pushes: PushLog, mean: Tensor, std: Tensor) -> tuple[np.ndar
 
 
 def sigma_scale(off: Tensor) -> Tensor:
-    """Factors (3,) with which residuals (n, 3), in units of σ, fill its 50 and 90 % intervals.
+    """Factors (3,) on σ that match the 50 and 90 % intervals of residuals (n, 3), in units of σ.
 
-    x and y share one. Shrunk towards 1 as by 20 residuals, so that few are no lottery.
+    x and y share one factor. Factors are shrunk towards 1 with the weight of 20 residuals.
     """
     factors = []
     for z in (off[:, :2].abs().flatten(), off[:, 2].abs()):
@@ -247,7 +247,7 @@ def sigma_scale(off: Tensor) -> Tensor:
 
 
 def folds_of(groups: np.ndarray, k: int, seed: int) -> np.ndarray:
-    """The fold (n,) of each push, drawn within its group."""
+    """Fold (n,) of each push, drawn at random within its group."""
     rng, fold = np.random.default_rng(seed), np.zeros(len(groups), dtype=int)
     for group in np.unique(groups):
         of_group = groups == group
@@ -256,9 +256,9 @@ def folds_of(groups: np.ndarray, k: int, seed: int) -> np.ndarray:
 
 
 def fit(data: PushLog, model: str = "np", seed: int = 0) -> PushModel:
-    """A model of a log: "np", "film" or "cnp", from 40 pushes in 6 to 20 s of a core.
+    """Fit a model to a log: "np", "film" or "cnp"; 40 pushes take 6 to 20 s on one core.
 
-    "np" is the pretrained neural process, tuned to it; the others are the book's own networks.
+    "np" is the pretrained neural process, fine-tuned; the others are the book's own networks.
     Raises ValueError for an unknown name, and for fewer than eight pushes in all.
     """
     check_choice("model", model, MODELS)

@@ -1,4 +1,4 @@
-"""Circular harmonics of an image, which rotate exactly, and what networks that read them share."""
+"""Circular harmonics of an image, which rotate exactly, and the base of networks that use them."""
 
 import math
 from dataclasses import dataclass
@@ -32,10 +32,10 @@ class CircularHarmonics(nn.Module):
         m = torch.arange(orders + 1)[:, None, None]
         ring = torch.exp(-(((r - centre) * rings / reach) ** 2)) * (r < 1)
         cosines, sines = ring * (m * phi).cos(), ring * (m * phi).sin()
-        # On a grid of pixels cosines do not quite sum to zero; an empty table would have angles.
+        # On a pixel grid cosines do not quite sum to zero; a uniform image would have an angle.
         leak = cosines.sum(dim=(2, 3), keepdim=True) / ring.sum(dim=(2, 3), keepdim=True)
         cosines = cosines - torch.where(m > 0, leak, 0.0) * ring
-        # Unit length (both of a pair by the same), and a gain that brings the sums near unit size.
+        # Unit norm (one factor for both of a pair), and a gain that makes the sums about 1.
         gain = 0.3 / cosines.flatten(2).norm(dim=2)[..., None, None]
         templates = torch.stack([gain * cosines, gain * sines]).flatten(0, 2).flatten(1)
         self.register_buffer("templates", templates, persistent=False)
@@ -43,17 +43,17 @@ class CircularHarmonics(nn.Module):
         self.n_features = math.prod(self.layout)
 
     def forward(self, image: Float[Tensor, "b 2 n n"]) -> Float[Tensor, "b f"]:
-        """(B, F), by image channel, cosine or sine, ring and order."""
+        """Harmonics (B, F), ordered by image channel, cosine or sine, ring and order."""
         return (image.reshape(2 * len(image), -1) @ self.templates.T).reshape(len(image), -1)
 
     def spectrum(self, image: Float[Tensor, "b 2 n n"]) -> Float[Tensor, "b s"]:
-        """Lengths of the pairs of cosine and sine, which no rotation of the image changes."""
+        """Norms of the pairs of cosine and sine, which are invariant to rotation of the image."""
         return self(image).reshape(-1, *self.layout).norm(dim=2).flatten(1)
 
     def rotated(
         self, values: Float[Tensor, "#b f"], rotation: Float[Tensor, "b 2"]
     ) -> Float[Tensor, "b f"]:
-        """The harmonics of the images rotated by (cos α, sin α)."""
+        """Harmonics of the images rotated by (cos α, sin α), computed from those of the images."""
         cosines, sines = values.reshape(-1, *self.layout).unbind(dim=2)
         step = torch.complex(*rotation.unbind(dim=-1))
         powers = [torch.ones_like(step)]
@@ -63,7 +63,7 @@ class CircularHarmonics(nn.Module):
         return torch.stack([rotated.real, rotated.imag], dim=2).flatten(1)
 
     def basis(self, values: Float[Tensor, "1 f"]) -> Float[Tensor, "w f"]:
-        """Harmonics (2 orders + 2, F) of one image of which any rotation by α is a weighted sum.
+        """Harmonics (2 orders + 2, F) of one image whose weighted sums give every rotation by α.
 
         The weights are cos mα of all orders m, then sin mα.
         """
@@ -76,7 +76,7 @@ class CircularHarmonics(nn.Module):
 @checked
 @dataclass(frozen=True)
 class HarmonicsConfig(NetworkConfig):
-    """Sizes: of f(γ_o); rings and orders of the harmonics; waves of the phase, see `waves`."""
+    """Sizes: features f(γ_o); rings and orders of the harmonics; waves of the phase (`waves`)."""
 
     image_features: int = 64
     rings: int = 7
@@ -88,34 +88,34 @@ class HarmonicsNetwork(EffectNetwork):
     """A network whose image encoder reads the circular harmonics of the image."""
 
     def make_layers(self, config: HarmonicsConfig) -> None:
-        """The harmonics, and the encoder of the image that reads them."""
+        """Create the harmonics, and the image encoder that reads them."""
         self.harmonics, n = CircularHarmonics(config.rings, config.orders), config.image_features
         self.image_encoder = nn.Sequential(*dense(self.harmonics.n_features, 4 * n, 2 * n, n))
         self.image_encoder.apply(he_initialise)
 
     def features(self, scaled_image: Float[Tensor, "b 2 48 48"]) -> Float[Tensor, "b f"]:
-        """f(γ_o): (B, F) of standardised depth and mask."""
+        """Image features f(γ_o) (B, F) of standardised depth and mask."""
         return self.image_encoder(self.harmonics(scaled_image))
 
     def unoriented_features(self, image: Float[Tensor, "b 2 48 48"]) -> Float[Tensor, "b f"]:
-        """The circular harmonics (B, F) of images."""
+        """Circular harmonics (B, F) of images."""
         return self.harmonics(self._scaled(image))
 
     def oriented_features(
         self, unoriented: Float[Tensor, "#b f"], rotation: Float[Tensor, "b 2"]
     ) -> Float[Tensor, "b f"]:
-        """f(γ_o) of the rotated images, of the harmonics of the images."""
+        """f(γ_o) of the rotated images, computed from the harmonics of the images."""
         return self.image_encoder(self.harmonics.rotated(unoriented, rotation))
 
 
 def waves(t: Float[Tensor, "b t"], n: int) -> Float[Tensor, "b t w"]:
-    """t with n sines and cosines of π k t: (B, T, 2n + 1)."""
+    """Append sines and cosines of π k t, k = 1 … n, to t: (B, T, 2n + 1)."""
     angle = t[..., None] * (math.pi * torch.arange(1, n + 1, device=t.device))
     return torch.cat([t[..., None], angle.sin(), angle.cos()], dim=-1)
 
 
 def dense(*widths: int) -> list[nn.Module]:
-    """Linear layers of the given widths, SiLU between them."""
+    """Linear layers of the given widths, with SiLU between them."""
     layers: list[nn.Module] = []
     for n_in, n_out in pairwise(widths):
         layers += [nn.Linear(n_in, n_out), nn.SiLU()]

@@ -1,13 +1,13 @@
-"""Lever-ups: what is predicted in Section 4.1 and Table 1, and how models are trained for it.
+"""Lever-ups: the prediction protocols of Section 4.1 and Table 1, and training for them.
 
     window      15 poses observed, anywhere in the trajectory; the next 1 to 5 steps predicted
     first_step  the first pose observed; all later steps predicted
     image_only  no pose observed
 
 All models observe the image and the commanded action at t = 0 and t = 1. A pose is the change since
-the start, so the first one is zero for all, and first_step contains no more than image_only does; a
-network trained for the one is trained for the other. A conditional network is trained once, for
-all protocols together; a recurrent one for each alone.
+the start, so the first pose is always zero. Therefore first_step contains no more information than
+image_only, and one trained network serves both. A conditional network is trained once for all
+protocols, a recurrent one separately for each.
 """
 
 from dataclasses import dataclass, replace
@@ -49,7 +49,7 @@ TRAINING = TrainingConfig(
 
 @dataclass(frozen=True)
 class LeverModel:
-    """A network, how it is trained, and which part of the image it sees (`lever_up_tensors`)."""
+    """A network, its training, and which part of the image it sees (see `lever_up_tensors`)."""
 
     network: NetworkConfig
     training: TrainingConfig = TRAINING
@@ -66,10 +66,10 @@ LEVER_MODELS: dict[str, LeverModel] = {
         LSTMConfig(**_CHANNELS, **_IMAGE), replace(TRAINING, learning_rate=2e-3)
     ),
 }
-"""Ours, the paper's (its image scaled to the 48×48 of the appendix), and the recurrent one.
+"""Our network, the paper's (on 48×48 images as in its appendix) and the tuned recurrent network.
 
-All get as many steps, although one of the paper's network costs three times as much. The rates of
-the first and the last are chosen by validation error (`experiments/lever_cross_validation.py`)."""
+All train for the same number of steps; those of the paper's network cost three times as much. The
+other learning rates minimise validation error (`experiments/lever_cross_validation.py`)."""
 
 
 @torch.no_grad()
@@ -80,9 +80,9 @@ def predict_steps(
     start: int = 0,
     features: Tensor | None = None,
 ) -> tuple[Prediction, Float[Tensor, "n t c"]]:
-    """Prediction and ground truth of the steps that a protocol queries; start: of the window.
+    """Prediction and ground truth at the steps that a protocol queries; start: of the window.
 
-    features: of the images, where they are encoded already.
+    features: of the images, if already encoded.
     """
     check_choice("protocol", protocol, PROTOCOLS)
     n, last = len(tensors), len(tensors.phase)
@@ -109,7 +109,7 @@ def window_errors_m(model: EffectNetwork, tensors: InteractionTensors) -> Float[
 
 
 def from_start_errors_m(model: EffectNetwork, tensors: InteractionTensors) -> Float[Tensor, "n t"]:
-    """Errors [m] at all steps after the first, of the image alone."""
+    """Errors [m] at all steps after the first, given only the image and the action."""
     return errors_m(*predict_steps(model, tensors, "image_only"))
 
 
@@ -121,7 +121,7 @@ def _sample_all(
 
 
 def _all_errors_m(model: EffectNetwork, tensors: InteractionTensors) -> Tensor:
-    """About equal weights: errors from the start are three times as large."""
+    """Window and start errors at about equal weight: the latter are three times as large."""
     window, start = window_errors_m(model, tensors), from_start_errors_m(model, tensors)
     return window.mean(dim=(1, 2)) + start.mean(dim=1) / 3
 
@@ -131,7 +131,7 @@ TRAINED_FOR = {
     "window": (sample_windows, window_errors_m),
     "first_step": (sample_from_start, from_start_errors_m),
 }
-"""Sampler and score of each training; `first_step` stands for `image_only` as well, see above."""
+"""Sampler and score of each training; `first_step` also serves `image_only` (see above)."""
 
 
 def fit_lever_model(
@@ -141,9 +141,9 @@ def fit_lever_model(
     trained_for: str = "all",
     resume_checkpoint: Path | None = None,
 ) -> tuple[EffectNetwork, list[TrainingRecord]]:
-    """A network with as many steps as a trajectory has, trained for some or all protocols.
+    """Train a network, with as many steps as a trajectory has, for one protocol or all of them.
 
-    The validation errors of what it is trained for choose its weights.
+    Early stopping uses the validation errors of the protocols that it is trained for.
     """
     trained_for = TRAINED_FOR[check_choice("trained_for", trained_for, TRAINED_FOR)]
     network = lever.network

@@ -2,12 +2,12 @@
 
     x_k = {d_k, d_k - d_{k-1}, t_k, observed?, f(γ_o), h_a}      d = e - m, m the mean trajectory
     (h_k+1, c_k+1) = LSTM(x_k, h_k, c_k)
-    d_k+1 = d_k + (d_k - d_{k-1}) + g(h_k+1)                 observed where it is, else predicted
+    d_k+1 = d_k + (d_k - d_{k-1}) + g(h_k+1)                 observed value if any, else predicted
 
-`LSTMNetwork` is the tuned one, of about a million parameters: it predicts the change of the
-increment, in standardised units, and is trained through its own rollouts. The one of the earlier
-study (Seker, Tekden and Ugur, Deep effect trajectory prediction in robot manipulation, Robotics and
-Autonomous Systems, 2019) is among the experiments.
+`LSTMNetwork`, tuned and of about a million parameters, predicts the change of the increment in
+standardised units and is trained through its own rollouts. The network of the earlier study (Seker,
+Tekden and Ugur, Deep effect trajectory prediction in robot manipulation, Robotics and Autonomous
+Systems, 2019) is in `experiments/`.
 """
 
 from dataclasses import dataclass
@@ -27,13 +27,13 @@ from affordlib.models.push_frame import inverse, push_direction
 from affordlib.types import Observations
 
 _CERTAIN = -6.0
-"""Raw σ of what is observed: a softplus of nearly zero."""
+"""Raw σ of observed values: its softplus is nearly zero."""
 
 
 @checked
 @dataclass(frozen=True)
 class LSTMConfig(HarmonicsConfig):
-    """Width of the network; steps: into how many it divides the phase."""
+    """Width of the network; steps: number of steps into which it divides the phase."""
 
     steps: int = 25
     width: int = 192
@@ -41,7 +41,7 @@ class LSTMConfig(HarmonicsConfig):
 
 @dataclass(frozen=True)
 class Known:
-    """Observed effects on a grid of steps: d (B, K, C), where (B, K), the first step (B,)."""
+    """Observed effects on a grid of steps: d (B, K, C), their mask (B, K), first step (B,)."""
 
     d: Tensor
     where: Tensor
@@ -49,9 +49,9 @@ class Known:
 
 
 def on_grid(effect: Tensor, t: Tensor, seen: Tensor, steps: int) -> Known:
-    """Observed effects (B, m, C) at t (B, m) on a grid of steps + 1 phases; else zero at t = 0."""
+    """Put observed effects (B, m, C) at t (B, m) on steps + 1 phases; zero at t = 0 if none."""
     b, n, c = len(effect), steps + 1, effect.shape[-1]
-    # What is not observed goes to a column of its own, which is cut off.
+    # Unobserved values go to an extra column, which is then removed.
     at = torch.where(seen, (t * steps).round().long(), n)
     d = effect.new_zeros(b, n + 1, c)
     d = d.scatter(1, at[..., None].expand(-1, -1, c), effect)[:, :n]
@@ -62,13 +62,13 @@ def on_grid(effect: Tensor, t: Tensor, seen: Tensor, steps: int) -> Known:
 
 
 class LSTMNetwork(HarmonicsNetwork):
-    """Rolls a trajectory out step by step from what is observed; satisfies `EffectModel`.
+    """Predicts a trajectory step by step from the observed part of it; satisfies `EffectModel`.
 
-    Between two steps it is linear, so that any phase can be queried, with gradients.
+    It interpolates linearly between steps, so any phase can be queried, with gradients.
     """
 
     def make_layers(self, config: LSTMConfig) -> None:
-        """Encoders and decoders as described above."""
+        """Create the encoders and decoders described above."""
         super().make_layers(config)
         c, w = config, config.width
         n_a, n_e = len(c.action_channels), len(c.effect_channels)
@@ -80,7 +80,7 @@ class LSTMNetwork(HarmonicsNetwork):
         self.last = nn.Sequential(nn.LayerNorm(w), *dense(w, w, 2 * n_e))
         nn.init.zeros_(self.last[-1].weight)
         nn.init.zeros_(self.last[-1].bias)
-        # The commanded action is given, not predicted; this completes it at other phases.
+        # The commanded action is given at t = 0 and 1; this predicts it at other phases.
         self.action_decoder = nn.Sequential(*dense(static + 2 * c.waves + 1, w, w, 2 * n_a))
 
     def outputs(
@@ -104,10 +104,10 @@ class LSTMNetwork(HarmonicsNetwork):
         return mu_a, self.sigma_floor + F.softplus(raw_a), mu_e, sigma_e
 
     def roll(self, known: Known, static: Tensor, n: int) -> tuple[Tensor, Tensor]:
-        """d and raw σ (B, n + 1, C) of n steps from the first observed one on.
+        """d and raw σ (B, n + 1, C) over n steps from the first observed one on.
 
-        What the gates get of the static inputs is computed once; a step that is observed is not
-        predicted, whatever other rows have observed.
+        The static inputs' contribution to the gates is computed once. Observed steps are not
+        predicted, independent of the other rows of the batch.
         """
         rows, last = torch.arange(len(static), device=static.device), self.config.steps
         h, c = self.begin(static).tanh().chunk(2, dim=-1)
@@ -144,7 +144,7 @@ class LSTMNetwork(HarmonicsNetwork):
 
 
 def effects_at_steps(model: LSTMNetwork, tensors: InteractionTensors) -> Tensor:
-    """Effects (2N, steps + 1, C) and their mirror images, in the frame and at the steps of it."""
+    """Effects (2N, steps + 1, C) and their mirror images, at the model's steps and in its frame."""
     both = tensors.joined(tensors.rotated_and_mirrored(0, mirror=True))
     at = torch.linspace(0, len(both.phase) - 1, model.config.steps + 1).round().long()
     if model.config.frame == "table":

@@ -1,12 +1,12 @@
-"""A neural process for pushes of one object: other pushes of it are what it conditions on.
+"""A neural process for pushes of one object, conditioned on other pushes of the same object.
 
-What no camera sees, where an object is supported and how it rubs, shows in what pushes did. The
-context is a set of such pushes; where the feet are known they can be told as well. A transformer
-(Nguyen and Grover, Transformer Neural Processes, ICML 2022) whose queries attend to feet and
-context alone: predictions do not depend on the order of either, nor on each other.
+An object's support and friction are invisible to a camera but show in the outcomes of pushes. The
+context is a set of such pushes and, where known, the feet. The network is a transformer (Nguyen and
+Grover, Transformer Neural Processes, ICML 2022) whose queries attend to feet and context only:
+predictions depend neither on the order of these, nor on other queries.
 
 Pushes and feet are rows as in `quasi_static.py`, in units of the object's radius of gyration, in
-its frame; a push whose outcome is known has three more values: displacement and turn.
+its frame; pushes with known outcome have three more values: displacement and rotation.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from affordlib.models.quasi_static import quarter_turn
 
 WIDTH, BLOCKS, HEADS = 64, 4, 4
 FEET = 12
-"""At most; where fewer are known the others have weight zero."""
+"""Maximum number of feet; if fewer are known, the others have weight zero."""
 PRETRAINED = "np_simulated_pushes"
 _CONTEXT = 32
 _OUTCOME_SCALE = 0.12
 
 
 def transformed(rows: Tensor, matrix: Tensor) -> Tensor:
-    """Pushes (B, N, 7 or 10) or feet (B, N, 3) turned or mirrored by orthogonal (B, 2, 2)."""
+    """Rotate or mirror pushes (B, N, 7 or 10) or feet (B, N, 3) by orthogonal (B, 2, 2)."""
     if rows.shape[-1] == 3:
         return torch.cat([rows[..., :2] @ matrix, rows[..., 2:]], -1)
     vectors = rows[..., :6].unflatten(-1, (3, 2)) @ matrix[:, None]
@@ -44,14 +44,14 @@ def transformed(rows: Tensor, matrix: Tensor) -> Tensor:
 
 
 def rotation(angle: Tensor, mirrored: Tensor) -> Tensor:
-    """Matrices (B, 2, 2) for `transformed`: a rotation by angles (B,), first mirrored where so."""
+    """Matrices (B, 2, 2) for `transformed`: mirror where `mirrored`, then rotate by angles (B,)."""
     c, s = angle.cos(), angle.sin()
     flip = 1 - 2 * mirrored.float()
     return torch.stack([torch.stack([c, s], -1), torch.stack([-s * flip, c * flip], -1)], -2)
 
 
 def in_contact_frame(push: Tensor, outcome: Tensor) -> Tensor:
-    """Outcomes (..., 3) along the normal and the tangent of their contacts, and the turn."""
+    """Outcomes (..., 3) along the normal and the tangent of their contacts, and the rotation."""
     normal, xy = push[..., 2:4], outcome[..., :2]
     tangent = quarter_turn(normal)
     return torch.stack([(xy * normal).sum(-1), (xy * tangent).sum(-1), outcome[..., 2]], -1)
@@ -83,7 +83,7 @@ class _Block(nn.Module):
 
 
 class NeuralProcess(nn.Module):
-    """Outcomes of pushes, given other pushes of the same object and its feet where known."""
+    """Predicts outcomes of pushes from other pushes of the object and from its feet, if known."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -99,10 +99,10 @@ class NeuralProcess(nn.Module):
     def forward(
         self, query: Tensor, context: Tensor, feet: Tensor, seen: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Mean and σ (B, Q, 3) in the frames of the contacts.
+        """Mean and σ (B, Q, 3) in the contact frames.
 
-        query: (B, Q, 7 or more); context: (B, C, 10), of which `seen` (B, C) count (all, if not
-        given); feet: (B, F, 3), of which those of positive weight count.
+        query: (B, Q, 7 or more); context: (B, C, 10); seen: (B, C), which of the context to use
+        (default: all); feet: (B, F, 3), of which those of positive weight are used.
         """
         known = torch.cat([_features(context), 8 * in_contact_frame(context, context[..., 7:])], -1)
         tokens = [self.feet(feet * feet.new_tensor([1, 1, 4])), self.context(known)]
@@ -119,10 +119,10 @@ class NeuralProcess(nn.Module):
 
     @torch.no_grad()
     def predict(self, query: Tensor, context: Tensor, feet: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and σ (Q, 3) in the frames of the contacts; query (Q, 7), context (C, 10).
+        """Mean and σ (Q, 3) in the contact frames; query (Q, 7), context (C, 10).
 
-        The mean over the eight images under quarter turns and mirroring, so that it does not depend
-        on these.
+        Averages over quarter rotations and reflections (8 in all), which makes it invariant to
+        them.
         """
         mirrored = torch.arange(8) % 2 == 1
         matrix = rotation(torch.arange(8) // 2 * (math.pi / 2), mirrored)
@@ -142,9 +142,9 @@ def train_neural_process(
 ) -> None:
     """Train in place on tasks, each (n, 10), the pushes of one object, n > 1.
 
-    feet: (tasks, F, 3), told in half of the draws. effort: steps, largest learning rate, tasks a
-    step. In each step of each task drawn some pushes are context and others queries, turned by any
-    angle and mirrored at random. report: called after each step with its number and loss.
+    feet: (tasks, F, 3), given to the model in half of the draws. effort: steps, maximum learning
+    rate, tasks per step. Each task drawn is split into context and queries, and rotated and
+    mirrored at random. report: called after each step with its number and loss.
     """
     steps, rate, batch = effort
     queries = 16 if max(len(task) for task in tasks) > 40 else 8
@@ -171,7 +171,7 @@ def train_neural_process(
 
 
 def _split(task: Tensor, queries: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Rows of a task, context first, then queries, repeated where there are few; what is seen."""
+    """Rows of a task, context first, then queries (repeated if few); mask of the context."""
     order = torch.randperm(len(task), generator=generator)
     n = min(_CONTEXT, max(len(task) // 2, len(task) - 8))
     share = min(1.0, 1.5 * float(torch.rand(1, generator=generator)))
@@ -181,18 +181,18 @@ def _split(task: Tensor, queries: int, generator: torch.Generator) -> tuple[Tens
 
 
 def _loss(mean: Tensor, std: Tensor, truth: Tensor) -> Tensor:
-    """Huber's, from 2 % of the radius on linear; σ by its likelihood, the mean held."""
+    """Huber loss, linear beyond 2 % of the radius, and likelihood of σ with a detached mean."""
     off = (truth - mean.detach()) / std
     return huber_loss(50 * mean, 50 * truth) + 0.05 * (std.log() + off.clamp(-4, 4) ** 2 / 2).mean()
 
 
 def save_neural_process(model: NeuralProcess, path: str | Path, about: dict[str, Any]) -> Path:
-    """Write a model to a file of safetensors; about: plain JSON values on how it was made."""
+    """Write a model to a safetensors file; about: plain JSON values on how it was made."""
     description = {"model": "np", "config": {}, "scaler": {}, "domain": {}, "about": about}
     return write_weights(path, model.state_dict(), description)
 
 
 def load_neural_process(name_or_path: str | Path = PRETRAINED) -> NeuralProcess:
-    """A model that `save_neural_process` wrote; ValueError when the file is damaged or foreign."""
+    """Load what `save_neural_process` wrote; ValueError if it is damaged or of another kind."""
     remedy = "train it: python -m experiments.pretrain_np"
     return restored(resolve_checkpoint(name_or_path), remedy, lambda _: NeuralProcess())[0]

@@ -1,4 +1,4 @@
-"""What every model offers and planners see: encode an object once, predict many queries at once."""
+"""The interface of models for planners: encode an object once, predict many queries per call."""
 
 from collections.abc import Sequence
 from typing import Protocol, runtime_checkable
@@ -12,7 +12,7 @@ from affordlib.types import ACTION_CHANNELS, HasChannels, Observations, Predicti
 
 @runtime_checkable
 class EffectModel(HasChannels, Protocol):
-    """A model of what actions do; everything in and out is in metres, radians and phase.
+    """A model of the effects of actions; inputs and outputs are in metres, radians and phase.
 
     Both methods are differentiable in their inputs.
     """
@@ -29,7 +29,7 @@ class EffectModel(HasChannels, Protocol):
 
 
 def condition_on_primitives(model: EffectModel, actions: Sequence[Primitive]) -> Observations:
-    """Each commanded action at t = 0 and t = 1, and no effect: B = len(actions)."""
+    """Observe each commanded action at t = 0 and t = 1, and no effect: B = len(actions)."""
     if not actions:
         raise ValueError("actions must hold at least one action, got none")
     columns = [ACTION_CHANNELS.index(name) for name in model.action_channels]
@@ -39,5 +39,5 @@ def condition_on_primitives(model: EffectModel, actions: Sequence[Primitive]) ->
 
 
 def condition_on_final_effect(model: EffectModel, effect: torch.Tensor) -> Observations:
-    """The effect (B, C_e) at t = 1 and no action (w₁ = 0), differentiable in the effect."""
+    """Observe the effect (B, C_e) at t = 1 and no action (w₁ = 0); differentiable in the effect."""
     return Observations.of(model, effect=(effect.new_ones(len(effect), 1), effect[:, None]))

@@ -1,8 +1,8 @@
-"""The push-aligned frame: everything is rotated so that the direction of the push is always 0.
+"""The push-aligned frame: everything is rotated so that the push direction is always angle 0.
 
-The table is the same in all directions, so a model that sees every push from behind need not learn
-what a rotation does. Image, action and effect are rotated into the frame, predictions are rotated
-back. A rotation is given by (cos α, sin α), one per query.
+Pushing works the same in all directions on the table, so a model in this frame need not learn
+rotations. Image, action and effect are rotated into the frame, predictions are rotated back. A
+rotation is given by (cos α, sin α), one per query.
 """
 
 from dataclasses import replace
@@ -26,10 +26,10 @@ def push_direction(
 ) -> Float[Tensor, "b 2"]:
     """Directions (B, 2), as unit vectors, of the observed pushes; differentiable.
 
-    Of the action: from its first to its last observation, or else from its first observation
-    through the object's centre. Where no action is observed (the inverse query) it is the direction
-    of the last observed effect. Vectors below 1 mm have no direction; where none is longer, the
-    frame is the table's.
+    An action's direction is from its first to its last observation, or else from its first
+    observation through the object's centre. Without an observed action (the inverse query) it is
+    the direction of the last observed effect. Vectors below 1 mm have no direction; if all are
+    shorter, the frame is the table's.
     """
     o = observations
     action = o.action[..., xy_columns(action_channels)]
@@ -48,21 +48,21 @@ def push_direction(
 def _extreme(
     values: Float[Tensor, "b n 2"], order: Float[Tensor, "b n"], seen: Bool[Tensor, "b n"]
 ) -> Float[Tensor, "b 2"]:
-    """Of what is seen, the value of greatest order; zero where nothing is."""
+    """The observed value of greatest order; zero where nothing is observed."""
     at = order.masked_fill(~seen, -torch.inf).argmax(dim=1)
     value = values[torch.arange(len(values), device=values.device), at]
     return torch.where(seen.any(dim=1, keepdim=True), value, 0.0)
 
 
 def inverse(rotation: Tensor) -> Tensor:
-    """The rotations (B, 2) back."""
+    """Inverse rotations (B, 2)."""
     return torch.stack([rotation[..., 0], -rotation[..., 1]], dim=-1)
 
 
 def rotate_image(image: Float[Tensor, "#b 2 n n"], rotation: Tensor) -> Float[Tensor, "b 2 n n"]:
-    """Images (B or 1, 2, n, n) rotated (B, 2), bilinearly; the rim's pixels go on outside."""
+    """Rotate images (B or 1, 2, n, n) by (B, 2), bilinearly; border pixels are repeated outside."""
     cos, sin = rotation.unbind(-1)
-    # From coordinates of the rotated image to those of the image; rows run along -y.
+    # This maps coordinates of the rotated image to those of the image; rows run along -y.
     rows = [torch.stack([cos, -sin], -1), torch.stack([sin, cos], -1)]
     matrix = F.pad(torch.stack(rows, dim=1), (0, 1))
     image = image.expand(len(rotation), -1, -1, -1)
@@ -76,7 +76,7 @@ def rotate_observations(
     action_channels: Channels,
     effect_channels: Channels,
 ) -> Observations:
-    """Observations rotated (B, 2)."""
+    """Rotate observations by (B, 2)."""
     r = rotation[:, None]
     return replace(
         observations,
@@ -88,7 +88,7 @@ def rotate_observations(
 def rotate_prediction(
     prediction: Prediction, rotation: Tensor, action_channels: Channels, effect_channels: Channels
 ) -> Prediction:
-    """A prediction rotated (B, 2); the correlation that rotation gives σ of x and y is dropped."""
+    """Rotate a prediction by (B, 2); the correlation of x and y that this introduces is dropped."""
     p, r = prediction, rotation[:, None]
     return Prediction(
         rotate_channels(p.action_mean, action_channels, r, absolute_yaw=True),

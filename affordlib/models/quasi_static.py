@@ -1,14 +1,14 @@
-"""Quasi-static pushes of an object on point feet, in batches: what a planar push does by physics.
+"""Quasi-static pushes of an object on point feet, in batches: physics of planar pushing.
 
 A pusher moves slowly with Coulomb friction at one point of the object's edge; the feet rub on the
-table. While the pusher sticks, the object turns so that Σ w_i |v_i| is least, w_i the weight on
-foot i and v_i its velocity; if the force that this takes lies outside of the friction cone, the
-pusher slides with its force on the cone's edge (Peshkin and Sanderson, The motion of a pushed,
+table. While the pusher sticks, the object rotates so as to minimise Σ w_i |v_i|, with w_i the
+weight on foot i and v_i its velocity. If the required force lies outside the friction cone, the
+pusher slides, with its force on the cone's edge (Peshkin and Sanderson, The motion of a pushed,
 sliding workpiece, IEEE J. Robotics and Automation 1988). Solved by reweighted least squares.
 
 Lengths are in units of the object's radius of gyration, vectors in its frame at the start, from its
-centroid. A push is a row of 7: contact point, inward normal and direction of the pusher (two each),
-and the pusher's travel from contact on. Feet are rows of 3: x, y and weight (in all 1).
+centroid. A push is a row of 7: contact point, inward normal and direction of the pusher (2 each),
+and the pusher's travel after contact. Feet are rows of 3: x, y and weight (sum 1).
 """
 
 from __future__ import annotations
@@ -20,28 +20,28 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 STEPS = 6
-"""Of a push; then the mean error is 0.1 % of the radius of gyration, against 40 steps."""
+"""Integration steps of a push; the mean error is 0.1 % of the radius, compared with 40 steps."""
 ELLIPSOID = 100.0
-"""A smoothing with which |v_i| becomes its square: the ellipsoidal limit surface."""
+"""Smoothing so large that |v_i| becomes quadratic: the ellipsoidal limit surface."""
 
 
 def quarter_turn(a: Tensor) -> Tensor:
-    """Vectors (..., 2) turned by +90°."""
+    """Rotate vectors (..., 2) by +90°."""
     return torch.stack([-a[..., 1], a[..., 0]], -1)
 
 
 def rotate(a: Tensor, angle_rad: Tensor) -> Tensor:
-    """Vectors (..., 2) rotated by angles (...), counter-clockwise."""
+    """Rotate vectors (..., 2) by angles (...), counter-clockwise."""
     return angle_rad.cos()[..., None] * a + angle_rad.sin()[..., None] * quarter_turn(a)
 
 
 def quasi_static_push(
     push: Tensor, feet: Tensor, friction: Tensor, smoothing: float = 0.05, steps: int = STEPS
 ) -> Tensor:
-    """Displacement of the centroid and turn (B, 3), in the object's frame at the start.
+    """Displacement of the centroid and rotation (B, 3), in the object's frame at the start.
 
-    push: (B, 7); feet: (B, F, 3); friction: (B,), of pusher and edge. smoothing: below this share
-    of the pusher's velocity a foot's friction falls linearly, instead of jumping at rest.
+    push: (B, 7); feet: (B, F, 3); friction: (B,), between pusher and edge. smoothing: fraction of
+    the pusher's velocity below which a foot's friction decreases linearly to zero.
     """
     contact, normal, direction, travel = push.split([2, 2, 2, 1], dim=-1)
     turn, moved = torch.zeros_like(friction), torch.zeros_like(contact)
@@ -64,7 +64,7 @@ def _motion(
     friction_smoothing: tuple[Tensor, float],
     state: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """How the object's point at the contact moves (B, 2), its turn (B,), and where to go on."""
+    """Motion of the object's point at the contact (B, 2), rotation (B,), and the solver's state."""
     friction, smoothing = friction_smoothing
     size = step.norm(dim=-1, keepdim=True)
     u = step / size
@@ -103,14 +103,14 @@ def _motion(
 
 
 class AnalyticPusher:
-    """Physics with two numbers fitted to pushes: friction, and size or smoothing of the support.
+    """Quasi-static model with two fitted numbers: friction, and size or smoothing of the support.
 
     Without feet the limit surface is an ellipsoid and the size its ratio of torque to force, in
     radii of gyration; with known feet (F, 3) it is their smoothing.
     """
 
     def __init__(self, push: Tensor, outcome: Tensor, feet: Tensor | None = None) -> None:
-        """push: (N, 7); outcome: (N, 3), displacement and turn. Raises ValueError for none."""
+        """Fit to push (N, 7), outcome (N, 3): displacement, rotation; ValueError for N = 0."""
         if not len(push):
             raise ValueError("push must hold at least one push, got none")
         self.feet = feet
@@ -127,7 +127,7 @@ class AnalyticPusher:
 
     @torch.no_grad()
     def predict(self, push: Tensor) -> Tensor:
-        """Displacement and turn (N, 3) of pushes (N, 7)."""
+        """Displacement and rotation (N, 3) of pushes (N, 7)."""
         feet, smoothing = self.feet, self.size
         if feet is None:
             angle = torch.arange(3) * (2 * math.pi / 3)

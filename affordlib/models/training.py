@@ -1,8 +1,8 @@
 """Training: one plain loop over batches of trajectories, with early stopping (Section 3.2).
 
-The paper draws one trajectory and one target an iteration; here many trajectories, each with many
-targets, share a step, some 200 times as many targets a second; the paper's loop, for comparison, is
-among the experiments. `train_model` does all: data set and split in, calibrated network out.
+The paper uses one trajectory and one target per iteration. Here a step uses many trajectories with
+many targets each, some 200 times as many targets per second; the paper's loop is in `experiments/`
+for comparison. `train_model` goes from data set and split to a calibrated network.
 """
 
 import math
@@ -41,12 +41,12 @@ Score = Callable[[EffectNetwork, InteractionTensors], torch.Tensor]
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """How to train: steps and sizes; the σ floor falls from the model's to `final_sigma_floor`.
+    """Settings of training; the σ floor decreases from the model's to `final_sigma_floor`.
 
-    beta: see `EffectNetwork.loss`. augment: an eighth of each batch is rotated and mirrored in each
-    of eight ways; not where the hand would not turn with the object, as in a grasp. ema: decay
-    of the exponential moving average of the weights, which is then validated and kept. patience
-    counts validations without improvement. device: as of torch, or "auto".
+    beta: see `EffectNetwork.loss`. augment: rotate and mirror each batch in eight ways, an eighth
+    of it each; wrong where the hand does not turn with the object, as in a grasp. ema: decay of the
+    exponential moving average (EMA) of the weights, which is then validated and kept. patience:
+    validations without improvement before stopping. device: as in torch, or "auto".
     """
 
     steps: int = 3000
@@ -81,19 +81,19 @@ class TrainingConfig:
             raise ValueError(f"max_minutes must be positive, got {self.max_minutes!r}")
 
     def rate(self, step: int) -> float:
-        """The learning rate at a step: it rises for a tenth of them, then falls as a cosine."""
+        """Learning rate at a step: linear rise over a tenth of the steps, then cosine decay."""
         share = (step - 0.5) / self.steps
         falling = (1 + math.cos(math.pi * (share - 0.1) / 0.9)) / 2
         return self.learning_rate * (share / 0.1 if share < 0.1 else falling)
 
     def sigma_floor(self, step: int, first: float) -> float:
-        """The floor at a step, falling geometrically from `first`."""
+        """σ floor at a step, decreasing geometrically from `first`."""
         return first * (self.final_sigma_floor / first) ** (step / self.steps)
 
 
 @dataclass(frozen=True)
 class TrainingRecord:
-    """One line of a training's history; the error is the mean score, in the score's own unit."""
+    """One validation in a training's history; validation_error: mean score, in the score's unit."""
 
     step: int
     seconds: float
@@ -102,16 +102,16 @@ class TrainingRecord:
 
 
 def device_named(name: str) -> torch.device:
-    """The torch device of a name; "auto" is a GPU where there is one, or else the processor."""
+    """Return the torch device of a name; "auto" is the GPU if there is one, else the CPU."""
     auto = "cuda" if torch.cuda.is_available() else "cpu"
     try:
         return torch.device(auto if name == "auto" else name)
     except RuntimeError:
-        raise ValueError(f'device must be "auto" or as "cpu" or "cuda", got {name!r}') from None
+        raise ValueError(f'device must be "auto", "cpu", "cuda" or alike, got {name!r}') from None
 
 
 def final_errors_m(model: EffectNetwork, tensors: InteractionTensors) -> torch.Tensor:
-    """Distance (N,) [m] between predicted and true (x, y), else all channels, at t = 1."""
+    """Distance (N,) [m] of predicted and true (x, y) at t = 1; without x, y, of all channels."""
     was_training = model.training
     truth, mean, _ = effects_at(model.eval(), tensors, (1.0,))
     model.train(was_training)
@@ -128,11 +128,11 @@ def train(
     sampler: Sampler = sample_mixed,
     score: Score = final_errors_m,
 ) -> list[TrainingRecord]:
-    """Train a model in place and return its history; it ends with the best validated weights.
+    """Train a model in place and return its history; the model keeps the best validated weights.
 
-    sampler: makes a batch of context and targets. Early stopping watches the mean of score (N,) on
+    sampler: draws a batch of contexts and targets. Early stopping uses the mean of score (N,) on
     the validation interactions. resume_checkpoint: a file, written at every validation, from which
-    the same call continues to the same bits.
+    the same call continues to bit-identical results.
     """
     config = config or TrainingConfig()
     for name, tensors in (("training", training), ("validation", validation)):
@@ -166,7 +166,7 @@ def train(
         if differ := [k for k, v in run.about.items() if state["about"].get(k) != v]:
             raise ValueError(
                 f"resume_checkpoint is of a training with other {', '.join(differ)}; delete it, "
-                "or train as it was begun"
+                "or use the settings of that training"
             )
         model.load_state_dict(state.pop("model"))
         optimiser.load_state_dict(state.pop("optimiser"))
@@ -198,7 +198,7 @@ def train(
         weights = _copy(model)
         candidate = {k: v.clone() for k, v in run.average.items()} if config.ema else weights
         model.load_state_dict(candidate)
-        # Scores need not know of devices: as the data, the model is on the processor meanwhile.
+        # The model is scored on the CPU, where the data are, so scores can ignore devices.
         error = float(score(model.cpu(), validation).mean())
         model.to(device)
         model.load_state_dict(weights)
@@ -217,7 +217,7 @@ def train(
     if run.best[0] == math.inf:
         raise ValueError(
             f"learning_rate {config.learning_rate:g}: no validation error was finite; lower it, or "
-            "look for values in the data that are not"
+            "look for values in the data that are not finite"
         )
     _, weights, model.sigma_floor = run.best
     model.load_state_dict(weights)
@@ -230,7 +230,7 @@ def _copy(model: EffectNetwork) -> dict[str, torch.Tensor]:
 
 
 def _to(batch: Any, device: torch.device) -> Any:
-    """The same batch or observations on a device."""
+    """Copy a batch or observations to a device."""
     moved = {}
     for name, value in vars(batch).items():
         moved[name] = value.to(device) if torch.is_tensor(value) else _to(value, device)
@@ -238,7 +238,7 @@ def _to(batch: Any, device: torch.device) -> Any:
 
 
 def _augmented(tensors: InteractionTensors) -> InteractionTensors:
-    """The interactions, an eighth of them rotated and mirrored in each of eight ways."""
+    """Rotate and mirror the interactions in eight ways, an eighth of them each."""
     parts = [
         tensors.select(rows).rotated_and_mirrored(k // 2, mirror=k % 2 == 1)
         for k, rows in enumerate(torch.arange(len(tensors)).tensor_split(8))
@@ -247,13 +247,13 @@ def _augmented(tensors: InteractionTensors) -> InteractionTensors:
 
 
 def batch_loss(model: EffectNetwork, batch: Batch, beta: float = 0.0) -> torch.Tensor:
-    """Mean negative log-likelihood of a batch's targets; for beta see `EffectNetwork.loss`."""
+    """Mean negative log-likelihood of a batch's targets; beta: see `EffectNetwork.loss`."""
     b = batch
     return model.loss(b.image, b.observations, b.t_target, b.action, b.effect, beta)
 
 
 def untrained(config: NetworkConfig, training: InteractionTensors, seed: int) -> EffectNetwork:
-    """A network of seeded weights, with scales, domain and `Novelty` of training data."""
+    """Create a network with seeded weights, and scales, domain and `Novelty` from the data."""
     torch.manual_seed(seed)
     model = build(config, Scaler.fit(training), TrainingDomain.fit(training))
     if training.image.shape[-1] == IMAGE_PIXELS:
@@ -270,10 +270,10 @@ def train_model(
     resume_checkpoint: str | Path | None = None,
     sampler: Sampler = sample_mixed,
 ) -> tuple[EffectNetwork, list[TrainingRecord]]:
-    """A network (default: the paper's), trained on a split's training part.
+    """Train a network (default: the paper's) on the training part of a split.
 
-    Its validation part stops the training and calibrates σ. symmetries: see `augment_by_symmetry`;
-    resume_checkpoint, sampler: see `train`.
+    The validation part is used for early stopping and to calibrate σ. symmetries: see
+    `augment_by_symmetry`; resume_checkpoint, sampler: see `train`.
     """
     model_config = model_config or CNPConfig()
     channels = model_config.action_channels, model_config.effect_channels
@@ -292,7 +292,7 @@ def train_model(
 def about_training(
     data: "xarray.Dataset", seen: np.ndarray, config: TrainingConfig
 ) -> dict[str, object]:
-    """What a checkpoint says of its training: data set, interactions seen, settings."""
+    """The record of a training for its checkpoint: data set, interactions seen, settings."""
     settings = {k: v for k, v in vars(config).items() if k != "max_minutes"}
     return {
         "recipe": data.attrs["recipe"],

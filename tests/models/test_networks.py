@@ -267,7 +267,7 @@ def test_what_is_out_of_range_is_refused(some):
     with pytest.raises(ValueError, match="starts nan m"):
         network.predict(features, nowhere, one)
     far = condition_on_final_effect(network, torch.tensor([[0.2, 0.0, 0.0]]))
-    with pytest.warns(OutOfRangeWarning, match=r"ends 0\.200 m away, those trained on 0\.0\d+ to"):
+    with pytest.warns(OutOfRangeWarning, match=r"ends 0\.200 m away, trained on 0\.0\d+ to"):
         network.predict(features, far, one)
     empty = some.image[:2].clone()
     empty[1, 1] = 0

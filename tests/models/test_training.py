@@ -137,7 +137,7 @@ def test_a_foreign_or_damaged_state_of_a_training_is_named(some, tmp_path):
     for content in (bytes(whole), whole[:-9], b"", b"notes", pickle.dumps({"about": 1})):
         file.write_bytes(content)
         with pytest.raises(
-            ValueError, match=r"training\.pt' is damaged, or not the state"
+            ValueError, match=r"training\.pt' is damaged or holds no training state"
         ) as caught:
             train(fresh(some), some, some, config, resume_checkpoint=file)
         assert "weights_only" not in str(caught.value)
