@@ -9,7 +9,7 @@ from beartype import BeartypeConf, FrozenDict, beartype
 from beartype.claw import beartype_packages
 from beartype.vale import Is
 
-# What a user calls is called with the types that it names: a number is no text and no truth value.
+# Public functions check their arguments' types; a number may be neither a string nor a bool.
 _NO_BOOL = Is[lambda value: not isinstance(value, bool)]
 _NUMBER = Annotated[Real, _NO_BOOL]
 _NO_TEXT = Is[lambda value: not isinstance(value, str)]
@@ -43,4 +43,4 @@ _CONF = BeartypeConf(
 )
 beartype_packages(tuple(f"affordlib.{name}" for name in _CHECKED.split()), conf=_CONF)
 checked = beartype(conf=_CONF)
-"""Decorates what is checked of a module that is not checked as a whole."""
+"""Decorator that checks argument types of a class or function in a module not listed above."""

@@ -1,4 +1,4 @@
-"""What command lines share: the kinds of their arguments, and how they end."""
+"""Argument types and exit handling that all command lines share."""
 
 import argparse
 import functools
@@ -12,7 +12,7 @@ from typing import Any
 
 
 def whole_type(least: int, most: int) -> Callable[[str], int]:
-    """An argparse `type`: whole numbers within limits."""
+    """Return an argparse `type` that accepts whole numbers in [least, most]."""
 
     def parse(text: str) -> int:
         with suppress(ValueError):
@@ -30,7 +30,7 @@ seed_type = whole_type(0, 2**32 - 1)
 
 
 class _Terminated(KeyboardInterrupt):
-    """SIGTERM, after which a command cleans up as it does after Ctrl-C."""
+    """Raised on SIGTERM, so that a command cleans up as it does after Ctrl-C."""
 
 
 def _terminate(*_: object) -> None:
@@ -40,7 +40,7 @@ def _terminate(*_: object) -> None:
 def command(*errors: type[Exception]) -> Callable[[Callable[..., int]], Callable[..., int]]:
     """Decorate a command's `main`, which returns its exit status.
 
-    One of these errors, Ctrl-C or SIGTERM ends it with one line and the status 1, 130 or 143.
+    `errors`, Ctrl-C and SIGTERM end the command with a one-line message and status 1, 130 or 143.
     """
 
     def decorate(main: Callable[..., int]) -> Callable[..., int]:
@@ -53,7 +53,7 @@ def command(*errors: type[Exception]) -> Callable[[Callable[..., int]], Callable
                 return main(*arguments)
             except KeyboardInterrupt as interrupt:
                 print(file=sys.stderr)  # ends a progress bar
-                why, code = "interrupted; what is finished is kept, the same command goes on", 130
+                why, code = "interrupted; finished work is kept; run it again to continue", 130
                 code += 13 * isinstance(interrupt, _Terminated)
             except errors as error:
                 why, code = str(error), 1

@@ -1,4 +1,4 @@
-"""Angles, and rotations in the plane of the table, of points and of values by channel."""
+"""Angles and rotations in the plane of the table, for points and for arrays of channels."""
 
 from __future__ import annotations
 
@@ -9,39 +9,39 @@ import numpy as np
 
 
 def wrap_angle(angle_rad: float) -> float:
-    """The same angle in [-π, π)."""
+    """Return the same angle [rad] in [-π, π)."""
     return (angle_rad + math.pi) % (2 * math.pi) - math.pi
 
 
 def unit_vector(angle_rad: float) -> np.ndarray:
-    """The direction (2,) at an angle [rad]."""
+    """Return the unit vector (2,) at an angle [rad]."""
     return np.array([math.cos(angle_rad), math.sin(angle_rad)])
 
 
 def rotated(xy: np.ndarray, angle_rad: float) -> np.ndarray:
-    """Points (..., 2) rotated about the origin, counter-clockwise."""
+    """Rotate points (..., 2) about the origin, counter-clockwise, by an angle [rad]."""
     c, s = math.cos(angle_rad), math.sin(angle_rad)
     return xy @ np.array([[c, s], [-s, c]])
 
 
 def cross(a: Any, b: Any) -> Any:
-    """The z component of the product of vectors (..., 2): arrays or tensors."""
+    """Return the z component (...) of the cross product of vectors (..., 2), arrays or tensors."""
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
 def xy_columns(channels: tuple[str, ...]) -> list[int]:
-    """Where x and y are among the channels; empty if they are not both there."""
+    """Return the indices of the channels x and y, or an empty list unless both exist."""
     return [channels.index(name) for name in "xy"] if {"x", "y"} <= {*channels} else []
 
 
 def rotate_channels(
     values: torch.Tensor, channels: tuple[str, ...], heading: torch.Tensor, absolute_yaw: bool
 ) -> torch.Tensor:
-    """Values (..., C) rotated by the angles whose (cos, sin) are `heading` (..., 2).
+    """Rotate values (..., C) by the angles whose (cos, sin) are `heading` (..., 2).
 
-    A yaw that is an orientation rotates along; one that is a change, as an effect's, stays.
+    An absolute yaw (of an action) is rotated too; a relative one (of an effect) is unchanged.
     """
-    import torch  # here, for what simulates only need not wait for it
+    import torch  # imported here because code that only simulates does not need it
 
     cos, sin = heading.unbind(-1)
     columns = list(values.unbind(-1))

@@ -1,11 +1,11 @@
-"""Where things lie: the repository, its shipped data, and the folders that runs write to."""
+"""Locations of files: the repository, its shipped data, and the folders that runs write to."""
 
 import os
 from pathlib import Path
 
 
 def repo_root() -> Path:
-    """Return the checkout that the package belongs to.
+    """Return the root folder of the checkout that contains the package.
 
     Raises FileNotFoundError if the package was installed apart from its checkout.
     """
@@ -19,15 +19,15 @@ def repo_root() -> Path:
 
 
 def from_root(path: str | os.PathLike[str]) -> Path:
-    """Return a path; a relative one starts at the repository."""
+    """Return an absolute path; a relative one is resolved against the root of the repository."""
     path = Path(os.path.expanduser(path))
     return path if path.is_absolute() else repo_root() / path
 
 
 def resolve_out_dir(out_dir: str | os.PathLike[str]) -> Path:
-    """Return the folder for results, made if missing; a relative one starts at the repository.
+    """Return the folder for results, and create it if missing.
 
-    Raises NotADirectoryError if something else has that name.
+    A relative path starts at the repository. Raises NotADirectoryError if a file has that name.
     """
     if not isinstance(out_dir, str | os.PathLike) or not os.fspath(out_dir):
         raise ValueError(f"out_dir must name a folder, such as 'runs/lab', got {out_dir!r}")

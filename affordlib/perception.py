@@ -1,8 +1,8 @@
-"""What the robot can tell about an object from its depth image alone.
+"""Estimates of an object's properties from its depth image alone.
 
 Images are (2, 48, 48): depth [m] from a plane 1 m above the table, and the mask of the object
-(at its rim the share of a pixel that it covers). Rows run along -y and columns along +x of the
-table, as a map is read.
+(at its edge, the covered share of the pixel). Rows run along -y and columns along +x of the table,
+as on a map.
 """
 
 import math
@@ -26,32 +26,32 @@ _FALL_M = 0.01
 
 _N_ANGLES = 360
 _UNROUND = 0.01
-"""How much better the turned image of an object must fit than the mean over all angles, as a share
-of its squared heights, for the turn to be seen. Of round objects it is at most 0.007 (one image of
-the ideal camera, the mean of eight of the Kinect), of nearly all prisms 0.012 and more."""
+"""A rotation is detected if the best angle fits better than the mean over all angles by more than
+this share of the squared heights. Round objects reach at most 0.007 (one image of the ideal camera,
+or the mean of eight of the Kinect); nearly all prisms reach 0.012 or more."""
 _ALIKE = 0.1
-"""Angles fit alike that are worse than the best by less than this share of the mean. Half a round
-of a cuboid is at most 0.05 worse, a wrong corner of a prism mostly 0.2 and more."""
+"""Angles whose fit is worse than the best by less than this share of the contrast are ambiguous. A
+cuboid turned by π is at most 0.05 worse, a wrong corner of a prism mostly 0.2 or more."""
 _NEIGHBOURS = 2.3
-"""Errors are so many times those of independent pixels: noise reaches over several. The three were
-chosen on 120 objects that no table has, each seen at two places by both cameras."""
+"""Factor on the σ of independent pixels, as noise is correlated over several of them. These three
+constants were chosen on 120 objects that occur in no table, seen at two places by both cameras."""
 
 
 def heights_m(image: np.ndarray) -> np.ndarray:
-    """Height [m] above the table, zero outside the mask; (48, 48)."""
+    """Return the heights (48, 48) [m] above the table, zero outside the mask."""
     return np.where(image[1] > 0.5, CAMERA_HEIGHT_M - image[0], 0.0)
 
 
 def object_height_m(image: np.ndarray) -> float:
-    """Height of the object [m]: of all but the highest 2 % of its pixels."""
+    """Return the object's height [m]: the 98 % quantile over its pixels."""
     inside = heights_m(image)[image[1] > 0.5]
     return float(np.quantile(inside, 0.98)) if inside.size else 0.0
 
 
 def _curvature(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Principal curvatures (2,) [1/m] of the top, weakest first, and their directions (2, 2).
+    """Return the principal curvatures (2,) [1/m] of the top, weakest first, and directions (2, 2).
 
-    Of a paraboloid fitted to the heights away from the rim, which noise hardly moves.
+    They are those of a paraboloid fitted to the heights away from the edge, where noise is small.
     """
     mask = image[1] > 0.5
     for rim in (3, 2, 1):
@@ -71,27 +71,27 @@ def _curvature(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def looks_rollable(image: np.ndarray) -> bool:
-    """Whether the top is curved like that of something round which lies on the table."""
+    """Return whether the top is curved like that of a sphere or a lying cylinder."""
     radius = min(object_height_m(image), CROP_WIDTH_M * math.sqrt((image[1] > 0.5).mean())) / 2
     return bool(-_curvature(image)[0][1] * radius > _ROUND)
 
 
 def long_axis_rad(image: np.ndarray) -> float:
-    """Direction [rad], in [-π/2, π/2), along which the top bends least: a lying cylinder's axis."""
+    """Return the direction of least curvature [rad] in [-π/2, π/2): a lying cylinder's axis."""
     x, y = _curvature(image)[1][0]
     return (math.atan2(y, x) + math.pi / 2) % math.pi - math.pi / 2
 
 
 def looks_fallen(before: np.ndarray, after: np.ndarray) -> bool:
-    """Whether an object lies differently than before: other height or other kind of top."""
+    """Return whether an object fell over: its height or its top (round or not) changed."""
     change = abs(object_height_m(after) - object_height_m(before))
     return bool(change > _FALL_M or looks_rollable(before) != looks_rollable(after))
 
 
 def _heights_around(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Heights [m] around the centre of an object's top, and the areas [pixels] they stand for.
+    """Return heights [m] in polar coordinates around the centre of an object's top, and areas.
 
-    Both are (radii, angles); the latter (radii, 1).
+    Heights are (radii, angles); the areas [pixels] that each of them represents are (radii, 1).
     """
     near = ndimage.binary_dilation(image[1] > 0.5)
     height = np.where(near, CAMERA_HEIGHT_M - image[0].astype(float), 0.0)
@@ -106,11 +106,11 @@ def _heights_around(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def turn_between(
     before: np.ndarray, after: np.ndarray, expected_rad: float | None = None
 ) -> tuple[float, float] | None:
-    """How far an object has turned between two images (2, n, n), in [-π, π), and its σ [rad].
+    """Estimate an object's rotation between two images (2, n, n), in [-π, π), and its σ [rad].
 
-    The heights around its centre are laid over each other at every angle, and the best is refined
-    by a parabola. Of angles that fit alike, as of a cuboid half a round apart, it is the nearest to
-    expected_rad. None where all look alike: of spheres and upright cylinders.
+    The heights around its centre are compared at every relative angle, and the best match is
+    refined with a parabola. If several angles match (a cuboid turned by π), the one nearest to
+    expected_rad is returned; None if all angles match (spheres and upright cylinders).
     """
     (then, area), (now, _) = _heights_around(before), _heights_around(after)
     overlap = np.fft.rfft(now, axis=1) * np.fft.rfft(then, axis=1).conj()
@@ -131,7 +131,7 @@ def turn_between(
 
 
 def radius_m(image: np.ndarray) -> float:
-    """How far the object reaches from the middle of the image [m], seen from above."""
+    """Return the largest distance [m] of the object's pixels from the middle of the image."""
     rows, columns = np.nonzero(image[1] > 0.5)
     if not len(rows):
         return 0.0
@@ -141,7 +141,7 @@ def radius_m(image: np.ndarray) -> float:
 
 
 def largest_blob(mask: np.ndarray) -> np.ndarray:
-    """The largest connected part of a mask, its holes filled."""
+    """Return the largest connected component of a mask, with its holes filled."""
     labels, n = ndimage.label(mask)
     if n == 0:
         return np.zeros_like(mask, dtype=bool)
@@ -150,16 +150,16 @@ def largest_blob(mask: np.ndarray) -> np.ndarray:
 
 
 def centre_m(mask: np.ndarray) -> tuple[float, float]:
-    """Centroid (x, y) [m] of a mask (n, n), `CROP_WIDTH_M` wide, relative to the image's middle."""
+    """Return the centroid (x, y) [m] of a mask (n, n), `CROP_WIDTH_M` wide, from its middle."""
     rows, columns = np.nonzero(mask)
     middle, pixel = (len(mask) - 1) / 2, CROP_WIDTH_M / len(mask)
     return float((columns.mean() - middle) * pixel), float((middle - rows.mean()) * pixel)
 
 
 def adapt_to_object(primitive: Primitive, image: np.ndarray) -> Primitive:
-    """The primitive as it suits the object in the image; what was given is kept.
+    """Set those parameters of a primitive that are None from the image of the object.
 
-    A drag closes its fingers across the axis, a grasp goes by the height.
+    A drag closes its fingers across the object's axis; a grasp is lowered to the object's height.
     """
     if isinstance(primitive, Drag) and primitive.grip_yaw is None:
         return replace(primitive, grip_yaw=long_axis_rad(image))
@@ -171,7 +171,7 @@ def adapt_to_object(primitive: Primitive, image: np.ndarray) -> Primitive:
 def height_map(
     points: np.ndarray, centre_m: tuple[float, float], width_m: float = CROP_WIDTH_M
 ) -> np.ndarray:
-    """Mean height [m] of points (n, 3) in each pixel of a crop, seen from above; gaps are table."""
+    """Return the mean height [m] of points (n, 3) in each pixel of a crop, 0 where empty."""
     pixel = width_m / IMAGE_PIXELS
     at = np.floor((points[:, :2] - np.array(centre_m)) / pixel + IMAGE_PIXELS / 2)
     inside = ((at >= 0) & (at < IMAGE_PIXELS)).all(axis=1)
@@ -190,12 +190,12 @@ def crop_from_depth(
     width_m: float = CROP_WIDTH_M,
     noise_m: float = 0.004,
 ) -> np.ndarray:
-    """Depth [m] and mask (2, 48, 48) of an object, seen by a camera of one's own.
+    """Convert a depth image of any camera to depth [m] and mask (2, 48, 48) of an object.
 
-    depth: (rows, columns) [m] along the optical axis, zero where not known; intrinsics: focal
-    lengths and principal point fx, fy, cx, cy [px]; camera_pose: (4, 4), to the world, whose z is
-    up and 0 on the table, from the camera, whose z looks ahead and y down; centre: (x, y) [m] of
-    the crop; noise_m: what is higher than this is the object.
+    depth: (rows, columns) [m] along the optical axis, zero where unknown; intrinsics: focal lengths
+    and principal point fx, fy, cx, cy [px]; camera_pose: (4, 4) transform from the camera (z ahead,
+    y down) to the world (z up, zero on the table); centre: (x, y) [m] of the crop; noise_m: points
+    higher than this belong to the object.
     """
     depth, pose = check_array("depth", depth), check_array("camera_pose", camera_pose, 4, 4)
     focal_and_middle = check_array("intrinsics", intrinsics, 4)
@@ -215,9 +215,9 @@ def crop_from_depth(
 def outline_image(
     outline_m: np.ndarray, width_m: float = CROP_WIDTH_M, height_m: float = 0.05
 ) -> np.ndarray:
-    """Depth [m] and mask (2, 48, 48) of a prism with corners (k, 2) [m] around the image's middle.
+    """Render depth [m] and mask (2, 48, 48) of a prism with corners (k, 2) [m] from the middle.
 
-    A pixel is the mean of 3 x 3 rays, as of the ideal camera.
+    Each pixel is the mean of 3 x 3 rays, as for the ideal camera.
     """
     rays = 3
     n = rays * IMAGE_PIXELS
@@ -229,10 +229,10 @@ def outline_image(
 
 
 def outline_of(image: np.ndarray, width_m: float = CROP_WIDTH_M) -> np.ndarray:
-    """Corners (k, 2) [m] of the convex outline of an image's object, around the image's middle.
+    """Return the corners (k, 2) [m] of the object's convex outline, from the image's middle.
 
-    The rim is where half of the object's height is seen. Its hull loses edges that are short, or
-    hardly cut a corner off; to the rim along each edge left a line is fitted.
+    The rim is the contour at half of the object's height. Edges of its convex hull that are short
+    or hardly change the shape are removed, and a line is fitted to the rim along each other edge.
     """
     near, n = ndimage.binary_dilation(image[1] > 0.5), len(image[1])
     cover = np.where(near, CAMERA_HEIGHT_M - image[0], 0.0) / object_height_m(image)
@@ -258,7 +258,7 @@ def outline_of(image: np.ndarray, width_m: float = CROP_WIDTH_M) -> np.ndarray:
 
 
 def _without_edge(hull: np.ndarray, k: int) -> tuple[float, np.ndarray]:
-    """A polygon whose edges beside edge k go on to meet, and how far off, or half k's length."""
+    """Remove edge k of a polygon by extending its neighbours; also return the change [pixels]."""
     a, b, c, d = (hull[(k + j) % len(hull)] for j in (-1, 0, 1, 2))
     turn, length = cross(b - a, d - c), np.linalg.norm(c - b)
     if turn < 1e-6:

@@ -1,7 +1,7 @@
-"""What an action is, as a path in phase; no physics here (Section 3.3 and Figure 2 of the paper).
+"""Action primitives as gripper paths over phase, without physics (Section 3.3, Figure 2).
 
-A primitive is a chain of segments, each with minimum-jerk timing: the commanded path of the gripper
-over the phase t in [0, 1], relative to where the object stood at the start.
+A primitive is a chain of segments with minimum-jerk timing. It defines the commanded gripper path
+over the phase t in [0, 1], relative to the object's initial position.
 """
 
 import math
@@ -23,36 +23,36 @@ from affordlib.types import (
 )
 
 DURATION_S = 3.75
-"""Of every primitive: 25 recorded samples, one every 3 steps of 50 ms (Section 4.2)."""
+"""Duration [s] of every primitive: 25 samples, one every 3 steps of 50 ms (Section 4.2)."""
 
 PUSH_GAP_M = 0.03
-"""Distance between the fingers while pushing: they cradle the object's near face."""
+"""Gap [m] between the fingers during a push, where both touch the object's near face."""
 
 EMPTY_M = 0.005
-"""Fingers that have closed to less than this hold nothing."""
+"""Gap [m] between closed fingers below which the hand is empty."""
 
 TIP_HEIGHT_M = 0.01
 HOVER_M = 0.16
-"""Height of the finger tips before they are lowered over an object."""
+"""Height [m] of the finger tips before they are lowered over an object."""
 
 ROD_GAP_M = 0.006
-"""So far before the contact a push with the rod begins."""
+"""Distance [m] before the contact at which a push with the rod starts."""
 
 BLADE_HEIGHT_M = 0.0015
 
 
 def min_jerk(t: np.ndarray | Sequence[float] | float) -> np.ndarray:
-    """Share of the path covered at phase t under minimum-jerk timing: 10t³ - 15t⁴ + 6t⁵."""
+    """Return the share of the path covered at phase t, minimum-jerk timing: 10t³ - 15t⁴ + 6t⁵."""
     t = np.clip(t, 0.0, 1.0)
     return np.asarray(t**3 * (10.0 - 15.0 * t + 6.0 * t**2))
 
 
 @dataclass(frozen=True)
 class Segment:
-    """A part of a primitive: seconds, and poses (6,) at its start and end.
+    """A straight part of a primitive: its duration [s] and the poses (6,) at its start and end.
 
     Poses are x, y, z [m], yaw [rad], gripper (1 open, 0 closed) and pitch [rad, nose down].
-    A guarded segment stops when the robot feels the object.
+    A guarded segment stops when the robot feels contact with the object.
     """
 
     seconds: float
@@ -61,17 +61,17 @@ class Segment:
     guarded: bool = False
 
     def at(self, share: np.ndarray) -> np.ndarray:
-        """Poses (n, 6) where the shares (n,) of the segment are covered."""
+        """Return the poses (n, 6) at the shares (n,) of the segment's length, in [0, 1]."""
         return self.start + np.asarray(share)[:, None] * (self.end - self.start)
 
 
 @dataclass(frozen=True)
 class Primitive:
-    """An action with its parameters; `segments` says how the gripper moves.
+    """An action with its parameters; `segments` define how the gripper moves.
 
-    opening_m is the gap between the fingers where the gripper channel is 1, force_N what each
-    finger can press with, `holds` whether the object stays in the hand at the end. With its
-    default parameters it touches nothing before the phase `acts_from`.
+    opening_m is the gap between the fingers where the gripper channel is 1, force_N the maximum
+    force of each finger, `holds` whether the object remains in the hand at the end. With default
+    parameters the gripper touches nothing before the phase `acts_from`.
     """
 
     name: ClassVar[str]
@@ -81,7 +81,7 @@ class Primitive:
     tool: ClassVar[str] = "gripper"
     acts_from: ClassVar[float] = 0.0
     lengths_m: ClassVar[dict[str, tuple[float, float]]] = {}
-    """Where those of its parameters that are no angles must lie."""
+    """Valid range [m] of each parameter that is a length."""
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -101,12 +101,12 @@ class Primitive:
 
     @cached_property
     def segment_phases(self) -> np.ndarray:
-        """Phases at which the segments begin, and 1: (m + 1,)."""
+        """Phases (m + 1,) at which the m segments start, and 1."""
         seconds = np.cumsum([0.0, *(segment.seconds for segment in self.segments)])
         return seconds / seconds[-1]
 
     def path(self, phase: np.ndarray | Sequence[float] | float) -> np.ndarray:
-        """The commanded action a_t: (n, 5) at the phases (n,), channels `ACTION_CHANNELS`."""
+        """Return the commanded action a_t (n, 5) at phases (n,), channels `ACTION_CHANNELS`."""
         phase = np.clip(np.atleast_1d(check_array("phase", phase)), 0.0, 1.0)
         if phase.ndim > 1:
             raise ValueError(f"phase must be numbers (n,), got an array {phase.shape}")
@@ -120,17 +120,17 @@ class Primitive:
         return action
 
     def ends(self) -> np.ndarray:
-        """The commanded action at t = 0 and t = 1: (2, 5), as `path` tells it, in less time."""
+        """Return the commanded action (2, 5) at t = 0 and t = 1, faster than with `path`."""
         first, last = self.segments[0].at(np.zeros(1)), self.segments[-1].at(np.ones(1))
         return np.concatenate([first, last])[:, :5]
 
     def succeeded(self, effect: np.ndarray) -> bool:
-        """Whether a final effect (5,) is what the primitive is for: here, moved by over 1 cm."""
+        """Return whether a final effect (5,) is a success: here, a displacement above 1 cm."""
         return bool(np.hypot(effect[0], effect[1]) > 0.01)
 
 
 def _caged(grip_yaw: float, end: tuple[float, float, float]) -> tuple[Segment, ...]:
-    """Lower the open gripper over the object, close it, move to an end (x, y, yaw), and open it."""
+    """Lower the open gripper over the object, close it, move it to `end` (x, y, yaw), open it."""
     x, y, yaw = end
     return _segments(
         (0.0, (0.0, 0.0, HOVER_M, grip_yaw, 1.0)),
@@ -142,7 +142,7 @@ def _caged(grip_yaw: float, end: tuple[float, float, float]) -> tuple[Segment, .
 
 
 def _segments(*stops: tuple[float, tuple[float, ...]], guarded: int = -1) -> tuple[Segment, ...]:
-    """Segments through poses (x, y, z, yaw, gripper), each with the seconds that lead to it."""
+    """Connect poses (x, y, z, yaw, gripper), each with the seconds to reach it, with segments."""
     poses = [np.array([*pose, 0.0]) for _, pose in stops]
     return tuple(
         Segment(seconds, poses[k], poses[k + 1], guarded == k)
@@ -151,18 +151,18 @@ def _segments(*stops: tuple[float, tuple[float, ...]], guarded: int = -1) -> tup
 
 
 class _Move(Primitive):
-    """What moves an object in a straight line, in a direction that depends on theta."""
+    """A primitive that moves an object in a straight line, in a direction given by theta."""
 
     ahead_rad: ClassVar[float] = 0.0
 
     @classmethod
     def towards(cls, direction_rad: float, **kwargs: float) -> Self:
-        """The action that moves an object towards the given direction [rad]."""
+        """Return the action that moves an object in the given direction [rad]."""
         return cls(check_finite("direction_rad", direction_rad) + cls.ahead_rad, **kwargs)
 
     @property
     def direction_rad(self) -> float:
-        """The direction in which the object is moved, in [-π, π)."""
+        """Direction [rad] in which the object is moved, in [-π, π)."""
         return wrap_angle(self.theta + self.ahead_rad)
 
 
@@ -170,9 +170,9 @@ class _Move(Primitive):
 class Push(_Move):
     """A straight push through the object's centre (Section 3.3).
 
-    The gripper starts on a circle around the object at the angle theta [rad], travels through
-    the centre and stops `length` [m] beyond it; so the object moves towards theta + π.
-    `radius` [m] is the circle's.
+    The gripper starts on a circle of `radius` [m] around the object at the angle theta [rad],
+    moves through the centre and stops `length` [m] beyond it. The object therefore moves in the
+    direction theta + π.
     """
 
     theta: float
@@ -196,10 +196,10 @@ class Push(_Move):
 
 @dataclass(frozen=True)
 class PushAt(Primitive):
-    """A straight push with a thin rod, off the centre: at any point and in any direction.
+    """A straight push with a thin rod at any contact point and in any direction.
 
-    The rod comes in `direction` [rad], meets the object at `contact` (x, y) [m], relative to its
-    centre in the table's axes, and moves on by `length` [m].
+    The rod moves in `direction` [rad], meets the object at `contact` (x, y) [m], relative to its
+    centre in the table's axes, and continues by `length` [m].
     """
 
     contact: tuple[float, float]
@@ -227,11 +227,11 @@ class PushAt(Primitive):
 
 @dataclass(frozen=True)
 class Drag(_Move):
-    """The paper's push for objects that roll: cage the object, take it along, let it go.
+    """The paper's push for rollable objects: cage the object, move it, release it.
 
-    The open gripper is lowered over the object's centre, closed, moved by `length` [m] towards
-    theta [rad], and opened. grip_yaw [rad]: of the gripper, whose fingers close across this
-    direction; None means along the axis that the robot sees.
+    The open gripper is lowered over the object's centre, closed, moved by `length` [m] in the
+    direction theta [rad], and opened. grip_yaw [rad] is the gripper's yaw, and the fingers close
+    perpendicular to it; None means the object's axis, estimated from the image.
     """
 
     theta: float
@@ -252,10 +252,10 @@ class Drag(_Move):
 
 @dataclass(frozen=True)
 class Grasp(Primitive):
-    """Lower the open gripper until it feels the object, close it, lift: no parameters in the paper.
+    """Lower the open gripper until it feels the object, close it, lift; no parameters in the paper.
 
-    seen_height [m] is the object's: the tips aim at 30 mm below its top. None means as the robot
-    sees it. grip_yaw [rad]: of the gripper, which turns what it closes on into line with itself.
+    seen_height [m] is the object's height; the finger tips aim 30 mm below its top. None means
+    the height in the image. grip_yaw [rad] is the gripper's yaw; closing aligns the object with it.
     """
 
     seen_height: float | None = None
@@ -282,16 +282,16 @@ class Grasp(Primitive):
         )
 
     def succeeded(self, effect: np.ndarray) -> bool:
-        """Whether the object is more than 0.1 m up (Section 4.3)."""
+        """Return whether the object was lifted by more than 0.1 m (Section 4.3)."""
         return bool(effect[2] > self.success_m)
 
 
 @dataclass(frozen=True)
 class Rotate(Primitive):
-    """Lower the open gripper over the object, close it, turn, open: no parameters in the paper.
+    """Lower the open gripper over the object, close it, turn, open; no parameters in the paper.
 
-    The sweep is fixed: a smaller angle is a rotation stopped at an earlier phase. grip_yaw [rad]:
-    at which the gripper closes; what it closes on is turned into line with it.
+    The sweep is fixed; a smaller angle is a rotation stopped at an earlier phase. grip_yaw [rad]
+    is the yaw at which the gripper closes, which aligns the object with it.
     """
 
     grip_yaw: float = 0.0
@@ -306,13 +306,13 @@ class Rotate(Primitive):
         return _caged(self.grip_yaw, (0.0, 0.0, self.grip_yaw + self.sweep_rad))
 
     def succeeded(self, effect: np.ndarray) -> bool:
-        """Whether the object has turned by more than half the sweep."""
+        """Return whether the object turned by more than half the sweep."""
         return bool(effect[3] > self.sweep_rad / 2)
 
 
 @dataclass(frozen=True)
 class _Arc(Segment):
-    """The lifting segment: the blade turns by an angle φ about an edge `radius_m` ahead of it."""
+    """The lifting segment: the blade turns by `angle_rad` about an edge `radius_m` ahead of it."""
 
     radius_m: float = 0.16
     angle_rad: float = 0.0
@@ -334,8 +334,8 @@ class LeverUp(Primitive):
     """Slide a blade under an object's edge and lever it up (Section 4.1).
 
     contact_x, contact_y [m]: a point on the edge, relative to the object's centre; theta [rad]:
-    the direction in which the blade goes under it; reach [m]: from the contact to the far edge on
-    which the object will turn. The tip follows r(1 - cos φ), r sin φ up to φ = 65°.
+    the direction in which the blade moves under it; reach r [m]: distance from the contact to the
+    far edge about which the object turns. The tip follows r(1 - cos φ), r sin φ up to φ = 65°.
     """
 
     contact_x: float
@@ -355,11 +355,11 @@ class LeverUp(Primitive):
 
     @classmethod
     def at_edge(cls, outline_m: np.ndarray, edge: int, share: float = 0.5) -> Self:
-        """The lever-up from a point on an edge of an outline (n, 2) [m], counter-clockwise.
+        """Return the lever-up at a point on an edge of an outline (n, 2) [m], counter-clockwise.
 
-        share: how far along it. The object turns about the edge that needs the least force, weight
-        · distance to the centroid / distance to the contact; the blade goes midway between that
-        edge's normal and its own edge's.
+        share: position of the point along the edge, in [0, 1]. The object turns about the edge of
+        least force (weight · distance to the centroid / distance to the contact). The blade's
+        direction bisects the normals of that edge and of the edge it moves under.
         """
         following = np.roll(outline_m, -1, axis=0)
         along = following - outline_m
@@ -375,7 +375,7 @@ class LeverUp(Primitive):
         return cls(float(contact[0]), float(contact[1]), theta, max(0.05, float(to_contact[pivot])))
 
     def obliqueness_rad(self, outline_m: np.ndarray, edge: int) -> float:
-        """How far the blade's direction is off the inward normal of the edge it goes under."""
+        """Return the angle [rad] between the blade and the inward normal of the contact's edge."""
         along = outline_m[(edge + 1) % len(outline_m)] - outline_m[edge]
         return abs(wrap_angle(self.theta - math.atan2(along[0], -along[1])))
 
@@ -390,7 +390,7 @@ class LeverUp(Primitive):
         return Segment(1.0, *poses), arc
 
     def succeeded(self, effect: np.ndarray) -> bool:
-        """Whether the object has been tilted by more than half the lever's angle."""
+        """Return whether the object was tilted by more than half the lever's angle."""
         return bool(effect[4] > self.angle_rad / 2)
 
 
@@ -400,5 +400,5 @@ PRIMITIVES: dict[str, type[Primitive]] = {
 
 
 def primitive_named(name: str) -> type[Primitive]:
-    """The class of the primitive called `name`; raises naming the known ones."""
+    """Return the class of the primitive `name`; raises ValueError with the known names."""
     return PRIMITIVES[check_choice("primitive", name, PRIMITIVES)]

@@ -1,11 +1,11 @@
-"""Results are data: the tables that a notebook writes, and plans.
+"""Files of results: the tables that a notebook writes, and plans.
 
-A notebook writes `<out_dir>/<notebook>.json`, which is
-`{"notebook", "parameters", "versions", "tables": {name: [flat rows]}}`. Columns carry their units
-(`mean_m`, `plan_ms_median`, `tp_percent`). `python -m experiments.tables` draws pages from them.
+A notebook writes `<out_dir>/<notebook>.json`, which contains
+`{"notebook", "parameters", "versions", "tables": {name: [flat rows]}}`. Column names carry units
+(`mean_m`, `plan_ms_median`, `tp_percent`). `python -m experiments.tables` fills pages from them.
 
-Plans, with their goals, are JSON files too, that can be kept, sent, and executed later. Numbers
-come back to the last bit; a σ that the planner did not give is null in the file.
+Plans, with their goals, are JSON files as well, and can be executed later. Numbers are restored to
+the last bit; a σ that the planner did not provide is null in the file.
 """
 
 import glob
@@ -27,7 +27,7 @@ from affordlib.paths import from_root, resolve_out_dir
 from affordlib.primitives import Primitive, PushAt, primitive_named
 from affordlib.types import Goal, Plan, Step
 
-# unit in the column's name: (unit shown, factor, digits); lengths are stored in metres
+# unit in the column's name: (displayed unit, factor, decimals); lengths are stored in metres
 UNITS = {
     "m": ("mm", 1000.0, 2),
     "mm": ("mm", 1.0, 2),
@@ -44,7 +44,7 @@ _WITH_UNIT = re.compile(f"(.+?)_({'|'.join(UNITS)})((?:{_STATISTIC})*)")
 
 
 def versions() -> dict[str, str]:
-    """Return the versions that decide a number: Python, the package, the libraries, the machine."""
+    """Return the versions that affect numbers: Python, the package, the libraries, the platform."""
     packages = ("affordlib", "torch", "pybullet", "numpy")
     return {
         "python": platform.python_version(),
@@ -59,16 +59,16 @@ def write_results(
     parameters: Mapping[str, Any],
     tables: Mapping[str, Any],
 ) -> Path:
-    """Write a notebook's numbers to `<out_dir>/<notebook>.json`, whole or not at all.
+    """Write a notebook's results to `<out_dir>/<notebook>.json` atomically and return the path.
 
-    `tables` maps a name to rows, each a flat mapping from column to number, text, truth or None.
-    A relative `out_dir` starts at the repository. Returns the path. Raises TypeError or ValueError,
-    before anything is written, for what is not plain, finite data.
+    `tables` maps a name to rows, each a flat mapping from column to number, text, bool or None.
+    A relative `out_dir` starts at the repository. Raises TypeError or ValueError, before anything
+    is written, for values of other types or numbers that are not finite.
     """
     if not re.fullmatch(r"\w[\w.-]*", notebook) or notebook.endswith((".json", ".ipynb")):
         raise ValueError(
             f"notebook must be a plain name such as '06_planning', got {notebook!r}; "
-            "leave out folder and ending"
+            "leave out the folder and the file extension"
         )
     about = {"notebook": notebook, "parameters": _plain(parameters, "parameters")}
     lines = [f" {_dump(k)}: {_dump(v)},\n" for k, v in (about | {"versions": versions()}).items()]
@@ -77,7 +77,7 @@ def write_results(
         if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
             kind = type(rows).__name__
             raise TypeError(f"tables[{name!r}] must be a list of rows, each a dict, got {kind}")
-        # One line a row: a changed number is one changed line.
+        # One line per row, so that a changed number changes one line of the file.
         body = ",\n".join(f"   {_dump(row)}" for row in rows)
         blocks.append(f"  {_dump(name)}: [\n{body}\n  ]")
     text = "".join(["{\n", *lines, ' "tables": {\n', ",\n".join(blocks), "\n }\n}\n"])
@@ -91,7 +91,7 @@ def _dump(value: Any) -> str:
 
 
 def _plain(value: Any, where: str) -> Any:
-    """Data as JSON knows them, NumPy's scalars converted; raises naming the place of others."""
+    """Convert data to JSON's types; raises TypeError or ValueError that names the invalid entry."""
     value = value.item() if isinstance(value, np.generic) else value
     if isinstance(value, float) and not math.isfinite(value):
         raise ValueError(f"{where} is {value}; write None for a number that does not exist")
@@ -110,9 +110,9 @@ def _plain(value: Any, where: str) -> Any:
 
 
 def read_results(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read what `write_results` wrote; a relative path starts at the repository.
+    """Read a file that `write_results` wrote; a relative path starts at the repository.
 
-    Raises FileNotFoundError if it is missing and ValueError if it is not such a file.
+    Raises FileNotFoundError if it is missing and ValueError if it is not a file of results.
     """
     path = from_root(path)
     if not path.is_file():
@@ -129,10 +129,10 @@ def read_results(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def write_atomically(path: Path, content: bytes | str, mark: bytes = b"") -> None:
-    """Replace a file by `content` in one step: a reader, or a crash, meets the old or the new.
+    """Replace a file with `content` atomically; a crash leaves the old file or the new one.
 
-    mark: bytes that the beginning of every file of this kind holds; a file without them, a folder
-    or a link to nothing raises FileExistsError and stays. Missing folders are made.
+    mark: bytes near the start of every file of this type. Raises FileExistsError, and changes
+    nothing, for a file without them, a folder or a broken link. Missing folders are created.
     """
     if path.is_symlink() or path.exists():
         head = b""
@@ -141,11 +141,11 @@ def write_atomically(path: Path, content: bytes | str, mark: bytes = b"") -> Non
                 head = file.read(64) or mark
         if not path.is_file() or mark not in head:
             raise FileExistsError(
-                f"{path} is there and is not a file that this call may replace; delete it, or "
+                f"{path} exists and is not a file that this call may replace; delete it, or "
                 "choose another path"
             )
     path.parent.mkdir(parents=True, exist_ok=True)
-    for left in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):  # by a killed process
+    for left in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):  # of killed processes
         pid = left.name.split(".")[-2]
         if pid.isdigit() and not psutil.pid_exists(int(pid)):
             left.unlink(missing_ok=True)
@@ -170,12 +170,12 @@ def save_plan(path: str | os.PathLike[str], plan: Plan) -> Path:
 
 
 def load_plan(path: str | os.PathLike[str]) -> Plan:
-    """Return the plan that `save_plan` wrote.
+    """Load a plan that `save_plan` wrote.
 
-    Raises FileNotFoundError, or ValueError naming the file and what is wrong in it.
+    Raises FileNotFoundError, or ValueError that names the file and its fault.
     """
     if not Path(path).is_file():
-        raise FileNotFoundError(f"there is no plan {path}")
+        raise FileNotFoundError(f"there is no plan at {path}; choose another path")
     try:
         data = json.loads(Path(path).read_text(encoding="utf-8"))
         return Plan(**data | {"goal": Goal(**data["goal"]), "steps": _steps(data["steps"])})
@@ -216,11 +216,11 @@ def _step(**data: Any) -> Step:
 def results_table(
     rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = None
 ) -> "pandas.DataFrame":
-    """Return rows as a table to look at: text cells, lengths in mm, angles in degrees, few digits.
+    """Return rows as a table for display: text cells, lengths in mm, angles in degrees, few digits.
 
-    `columns` chooses and orders. To compute, use the rows.
+    `columns` selects and orders the columns. For calculations use the rows themselves.
     """
-    import pandas  # here, for it takes as long to import as all else
+    import pandas  # imported here because its import takes as long as all others together
 
     names = columns_of(rows, columns)
     cells = [[cell(name, row.get(name)) for name in names] for row in rows]
@@ -234,13 +234,13 @@ def heading(column: str) -> str:
 
 
 def factor(column: str) -> float:
-    """Return what a column's numbers are multiplied by to be in the unit of its heading."""
+    """Return the factor that converts a column's numbers to the unit of its heading."""
     _, unit = _split_unit(column)
     return UNITS[unit][1] if unit else 1.0
 
 
 def cell(column: str, value: object) -> str:
-    """Return a value as shown under its column, in the unit and with the digits of the heading."""
+    """Return a value as text in the unit, and with the decimals, of its column's heading."""
     value = value.item() if isinstance(value, np.generic) else value
     if value is None:
         return "–"
@@ -256,13 +256,13 @@ def cell(column: str, value: object) -> str:
 
 
 def _split_unit(column: str) -> tuple[str, str | None]:
-    """A column's name without its unit, the last word or the last before a statistic, and that."""
+    """Split a column's name into name and unit: its last word, or the last before a statistic."""
     found = _WITH_UNIT.fullmatch(column)
     return (found[1] + found[3], found[2]) if found else (column, None)
 
 
 def columns_of(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None) -> list[str]:
-    """The names of the columns of rows, or those of them that are given."""
+    """Return all column names of the rows, or `columns`; raises ValueError for an unknown one."""
     there = list(dict.fromkeys(name for row in rows for name in row))
     for name in columns or ():
         if rows and name not in there:

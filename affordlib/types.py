@@ -1,8 +1,8 @@
-"""The narrow waist: the few frozen dataclasses, and errors, that pass between the package's parts.
+"""Data types shared by all parts of the package: frozen dataclasses, errors and argument checks.
 
-Phase t in [0, 1] is the normalised time of a full primitive, everywhere. Positions are metres,
-angles radians. Actions and effects are relative to where the object stood at the start
-(Section 3.1 of the paper, D_d = {a_t, e_t, o, t}); their axes are the table's.
+Phase t in [0, 1] is always the normalised time of a full primitive. Positions are in metres, angles
+in radians. Actions and effects are relative to the object's initial position, in the table's axes
+(Section 3.1 of the paper, D_d = {a_t, e_t, o, t}).
 """
 
 from __future__ import annotations
@@ -22,30 +22,30 @@ IMAGE_PIXELS = 48
 CROP_WIDTH_M = 0.16
 LEVER_IMAGE_PIXELS = 128
 LEVER_CROP_WIDTH_M = 0.56
-"""Of a lever-up: around the contact point, turned so that the lever's direction is to the right."""
+"""Width [m] of a lever-up's image: centred on the contact, the lever's direction to the right."""
 
 FAULT_LIMIT_M = 0.002
-"""An episode off its path, or with bodies inside each other, by more than this is not believed."""
+"""Tracking error or penetration of bodies [m] above which an interaction is invalid."""
 
 TABLE_X_M = (-0.5, 0.7)
 TABLE_Y_M = (-0.7, 0.7)
 
 
 class UnreachableError(ValueError):
-    """The arm cannot take the tool to a pose.
+    """Raised when the arm cannot move the tool to a pose.
 
-    outcome: where a plan was being carried out, what its actions up to that one gave.
+    outcome: during the execution of a plan, the result of the actions before this one.
     """
 
     outcome: Outcome | None = None
 
 
 class NothingSeenError(RuntimeError):
-    """The camera sees no object on the table."""
+    """Raised when the camera sees no object on the table."""
 
 
 def check_finite(name: str, value: Any) -> float:
-    """Return `value` as a float, or raise naming the argument that is not a finite number."""
+    """Return `value` as a float; raises ValueError unless it is a finite number."""
     try:
         known = isinstance(value, Real) and not isinstance(value, bool)
         number = float(value) if known else math.nan
@@ -57,7 +57,7 @@ def check_finite(name: str, value: Any) -> float:
 
 
 def check_within(name: str, value: Any, low: float, high: float, unit: str = "") -> float:
-    """Return `value` as a float, or raise naming the argument outside [low, high]."""
+    """Return `value` as a float; raises ValueError unless it lies in [low, high]."""
     number = check_finite(name, value)
     if not low <= number <= high:
         within = f"[{low:g}, {high:g}] {unit}".strip()
@@ -66,10 +66,10 @@ def check_within(name: str, value: Any, low: float, high: float, unit: str = "")
 
 
 def check_array(name: str, values: Any, *shape: int) -> np.ndarray:
-    """Return finite numbers as an array, or raise naming the argument; shape: how its ends."""
+    """Return finite numbers as an array with last axes `shape`; raises ValueError otherwise."""
     try:
         array = np.asarray(values)
-    except (TypeError, ValueError, RuntimeError):  # rows of different lengths, a tensor's gradients
+    except (TypeError, ValueError, RuntimeError):  # rows of unequal length, tensors with gradients
         array = np.empty(0)
     known = array.dtype.kind in "iuf" and array.size and np.isfinite(array).all()
     if not known or array.shape[array.ndim - len(shape) :] != shape:
@@ -80,7 +80,7 @@ def check_array(name: str, values: Any, *shape: int) -> np.ndarray:
 
 
 def check_count(name: str, value: Any, least: int = 1, most: float = math.inf) -> int:
-    """Return `value`, or raise naming the argument that is no whole number in [least, most]."""
+    """Return `value`; raises ValueError unless it is a whole number in [least, most]."""
     if isinstance(value, bool) or not isinstance(value, Integral) or not least <= value <= most:
         span = f"of at least {least}" if most == math.inf else f"in [{least}, {most:g}]"
         raise ValueError(f"{name} must be a whole number {span}, got {value!r}")
@@ -88,7 +88,7 @@ def check_count(name: str, value: Any, least: int = 1, most: float = math.inf) -
 
 
 def check_choice(name: str, value: Any, known: Collection[Any]) -> Any:
-    """Return `value`, or raise naming the argument that is none of what is known."""
+    """Return `value`; raises ValueError unless it is one of `known`."""
     if value not in known:
         raise ValueError(f"{name} must be one of {sorted(known)}, got {value!r}")
     return value
@@ -97,13 +97,13 @@ def check_choice(name: str, value: Any, known: Collection[Any]) -> Any:
 def check_field(
     owner: Any, name: str, low: float = -math.inf, high: float = math.inf, unit: str = ""
 ) -> None:
-    """Check a number of a frozen dataclass, and keep it as a float; raises naming the field."""
+    """Check a number of a frozen dataclass and store it as a float; raises ValueError."""
     checked = check_within(f"{type(owner).__name__}.{name}", getattr(owner, name), low, high, unit)
     object.__setattr__(owner, name, checked)
 
 
 def check_pair(name: str, pair: Any, what: str = "(x, y) [m]") -> tuple[float, float]:
-    """Return two finite numbers as floats, or raise naming the argument that is something else."""
+    """Return two numbers as floats; raises ValueError unless `pair` is two finite numbers."""
     try:
         one, other = (check_finite(name, value) for value in pair)
     except (TypeError, ValueError):
@@ -112,7 +112,7 @@ def check_pair(name: str, pair: Any, what: str = "(x, y) [m]") -> tuple[float, f
 
 
 def check_range(name: str, pair: Any, low: float, high: float) -> tuple[float, float]:
-    """Return a range (first, last) inside [low, high], or raise naming the argument."""
+    """Return a range (first, last); raises ValueError unless it lies inside [low, high]."""
     first, last = check_pair(name, pair, "(low, high)")
     if not low <= first <= last <= high:
         raise ValueError(f"{name} must be a range inside [{low:g}, {high:g}], got {pair!r}")
@@ -120,7 +120,7 @@ def check_range(name: str, pair: Any, low: float, high: float) -> tuple[float, f
 
 
 def check_on_table(name: str, xy_m: Any) -> tuple[float, float]:
-    """Return (x, y) [m] in the frame of the table, or raise when it is not a point on it."""
+    """Return (x, y) [m] in the table's frame; raises ValueError unless it is on the table."""
     x, y = check_pair(name, xy_m)
     if not (TABLE_X_M[0] <= x <= TABLE_X_M[1] and TABLE_Y_M[0] <= y <= TABLE_Y_M[1]):
         raise ValueError(
@@ -132,12 +132,12 @@ def check_on_table(name: str, xy_m: Any) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Observation:
-    """What the robot sees of the object at rest, its arm parked.
+    """An observation of the object at rest, with the arm parked.
 
-    xy_m: estimated position (x, y) [m] in the frame of the table; image: (2, 48, 48), depth [m]
-    from a plane 1 m above the table and the object's mask, centred there to some millimetres;
-    std_m: σ of the position, where it is known. yaw_rad: how the object is turned, where the robot
-    can tell, and yaw_std_rad: its σ; None where it was not seen but reckoned.
+    xy_m: estimated position (x, y) [m] in the table's frame; image: (2, 48, 48), depth [m] from a
+    plane 1 m above the table and the object's mask, centred at xy_m to within a few millimetres;
+    std_m: σ of the position [m], if known; yaw_rad: the object's yaw [rad], if the robot can
+    estimate it; yaw_std_rad: its σ [rad], None if the yaw was not seen but dead-reckoned.
     """
 
     xy_m: tuple[float, float]
@@ -149,19 +149,19 @@ class Observation:
 
 @dataclass(frozen=True)
 class Interaction:
-    """What happened when a primitive was executed on one object.
+    """The record of one primitive executed on one object.
 
     phase: (n,); action: (n, 5) commanded, channels `ACTION_CHANNELS`; effect: (n, 5), channels
-    `EFFECT_CHANNELS` (metres and radians; gripper is 1 open, 0 closed); rest_effect: (5,) where
-    the object rests after the gripper has retreated; image: (2, 48, 48), depth [m] and mask, of a
-    lever-up (2, 128, 128) from the contact point in the lever's direction;
-    start_pose: (x, y, yaw) of the object in the frame of the table; estimated_xy_m: where the
-    robot measured it, and placed its action; tool: (26, 5) measured x, y, z [m], yaw [rad] of the
-    tool and gap of the fingers [m], every 3 steps of 50 ms as in the paper.
+    `EFFECT_CHANNELS` (metres and radians; gripper is 1 open, 0 closed); rest_effect: (5,) effect
+    once the gripper has retreated and the object is at rest; image: (2, 48, 48), depth [m] and
+    mask, for a lever-up (2, 128, 128) around the contact point in the lever's direction;
+    start_pose: (x, y, yaw) of the object in the table's frame; estimated_xy_m: its measured
+    position, to which the action is relative; tool: (26, 5) measured x, y, z [m], yaw [rad] of the
+    tool and gap between the fingers [m], every 3 steps of 50 ms as in the paper.
 
-    Of the execution: whether the object can roll as it lies now; how far the tool was off its path
-    and how deep bodies sank into each other, at most [m]; whether the object left the table, and
-    fell over; whether the arm could reach at all (if not, nothing happened).
+    rolls: whether the object can roll in its final pose; tracking_error_m, penetration_m: largest
+    tracking error of the tool and largest penetration of two bodies [m]; left_table, fell: whether
+    the object left the table or fell over; reached: False if the arm could not move there.
     """
 
     primitive: affordlib.primitives.Primitive
@@ -183,26 +183,26 @@ class Interaction:
 
     @property
     def faults(self) -> tuple[str, ...]:
-        """Why the episode must not be believed; empty when nothing is wrong with it."""
+        """Reasons why the interaction is invalid; empty if there are none."""
         found = {"off_path": self.tracking_error_m, "penetration": self.penetration_m}
         return tuple(name for name, by_m in found.items() if by_m > FAULT_LIMIT_M)
 
     @property
     def object_path(self) -> np.ndarray:
-        """(n + 2, 4) x, y [m], height above the start [m], yaw [rad], until the object rests."""
+        """Path (n + 2, 4) of the object until it rests: x, y, height above the start [m], yaw."""
         moved = np.vstack([np.zeros(5), self.effect, self.rest_effect])[:, :4]
         x, y, yaw = self.start_pose
         return moved + np.array([x, y, 0.0, yaw])
 
     @property
     def success(self) -> bool:
-        """Whether the primitive did what it is for."""
+        """Whether the final effect meets the primitive's success criterion."""
         return self.primitive.succeeded(self.effect[-1])
 
 
 @runtime_checkable
 class HasChannels(Protocol):
-    """A model, or interactions, with these channels of actions and effects."""
+    """A model or data set that names its channels of actions and effects."""
 
     action_channels: tuple[str, ...]
     effect_channels: tuple[str, ...]
@@ -210,11 +210,11 @@ class HasChannels(Protocol):
 
 @dataclass(frozen=True)
 class Observations:
-    """What a model is conditioned on: action and effect at any times, in metres and radians.
+    """The context of a model: actions and effects at any phases, in metres and radians.
 
-    action: (B, n, C_a) at action_t: (B, n), those with action_mask: (B, n) counting; likewise
-    effect: (B, m, C_e). weight: (B,), the blend w₁ of the action in equation (2), w₂ = 1 - w₁;
-    it is 1 where only actions, 0 where only effects are observed.
+    action: (B, n, C_a) at action_t: (B, n), ignored where action_mask (B, n) is False; likewise
+    effect: (B, m, C_e). weight: (B,), the weight w₁ of the action in equation (2), w₂ = 1 - w₁;
+    it is 1 where only actions and 0 where only effects are observed.
     """
 
     action: torch.Tensor
@@ -233,14 +233,14 @@ class Observations:
         effect: tuple[torch.Tensor, torch.Tensor] | None = None,
         weight: torch.Tensor | None = None,
     ) -> Observations:
-        """What is observed, for a model: action and effect as times (B, n) and values (B, n, C).
+        """Build a model's context from action and effect, each as phases (B, n), values (B, n, C).
 
-        At least one of the two. weight: (B,), by default 1 without an effect, 0 without an action,
-        a half with both.
+        At least one of them must be given. weight: (B,), by default 1 without an effect, 0 without
+        an action, 0.5 with both.
         """
         observed = action or effect
         if observed is None:
-            raise ValueError("action or effect must be given; nothing would be observed")
+            raise ValueError("action or effect must be given, got None for both")
         values = observed[1]
         b = len(values)
 
@@ -258,7 +258,7 @@ class Observations:
 
 @dataclass(frozen=True)
 class Prediction:
-    """Mean and σ of action and effect at the targets: (B, T, C) each, in metres and radians."""
+    """Predicted mean and σ of action and effect at targets: (B, T, C) each, metres and radians."""
 
     action_mean: torch.Tensor
     action_std: torch.Tensor
@@ -268,10 +268,10 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Goal:
-    """Where the object shall be: a position (x, y) [m] on the table and a tolerance [m].
+    """The desired position (x, y) [m] of the object on the table and its tolerance [m].
 
-    turn_rad: how far it shall be turned from how it stands, None if that does not matter;
-    height_m: how far it shall be lifted above where it stands, None to leave it on the table.
+    turn_rad: desired rotation [rad] from its current orientation, None for any;
+    height_m: desired lift [m] above its current height, None to leave it on the table.
     """
 
     xy_m: tuple[float, float]
@@ -288,20 +288,20 @@ class Goal:
             check_field(self, "height_m", 0.0, 0.5, "m")
 
     def distance_m(self, xy_m: Sequence[float]) -> float:
-        """Distance [m] between the goal and a point (x, y) [m] of the table."""
+        """Return the distance [m] between the goal and a point (x, y) [m] on the table."""
         return float(np.hypot(xy_m[0] - self.xy_m[0], xy_m[1] - self.xy_m[1]))
 
 
 @dataclass(frozen=True)
 class Step:
-    """One (partial) action of a plan and where the model expects the object to end.
+    """One (partial) action of a plan and its predicted effect.
 
-    primitive: the action; stop_phase: the phase at which it stops; predicted_end_xy_m: (x, y)
-    in the frame of the table; predicted_path_xy_m: (n, 2), the object's way there;
-    path_xy_m: (m, 2) or None, a decoded end-effector path relative to the object, executed
-    instead of the primitive's own where a planner gives one; std_m: the model's σ of the end;
-    predicted_turn_rad: how far it expects the object to have turned since the plan's start;
-    predicted_height_m: how far it expects it to be lifted.
+    primitive: the action; stop_phase: the phase at which it stops; predicted_end_xy_m: predicted
+    final position (x, y) in the table's frame; predicted_path_xy_m: (n, 2), the path to it;
+    path_xy_m: (m, 2), a decoded end-effector path relative to the object that is executed instead
+    of the primitive's own, or None; std_m: the model's σ [m] of the final position;
+    predicted_turn_rad: predicted rotation of the object since the start of the plan;
+    predicted_height_m: predicted lift of the object.
     """
 
     primitive: affordlib.primitives.Primitive
@@ -324,7 +324,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Plan:
-    """Steps from (x, y) [m] to a goal, found in plan_s seconds; warning: a sentence, or empty."""
+    """Steps from (x, y) [m] to a goal, computed in plan_s seconds; warning: text, may be empty."""
 
     goal: Goal
     start_xy_m: tuple[float, float]
@@ -340,21 +340,21 @@ class Plan:
 
     @property
     def predicted_end_xy_m(self) -> tuple[float, float]:
-        """Where the model expects the object after the last step."""
+        """Predicted final position (x, y) [m] of the object after the last step."""
         return self.steps[-1].predicted_end_xy_m if self.steps else self.start_xy_m
 
     @property
     def predicted_distance_m(self) -> float:
-        """Distance [m] that the model expects to remain."""
+        """Predicted final distance [m] to the goal."""
         return self.goal.distance_m(self.predicted_end_xy_m)
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What carrying out a plan gave, as the robot recorded it; a `Tabletop` records the truth.
+    """The result of executing a plan, as the robot measured it (a `Tabletop`: the ground truth).
 
-    distance_m: between the goal and the object at rest; object_paths_xy_m: one (n, 2) path of the
-    object per executed step, in the frame of the table; end_pose: (x, y, yaw); words: on the end.
+    distance_m: final distance to the goal [m]; object_paths_xy_m: one path (n, 2) of the object per
+    executed step, in the table's frame; end_pose: final (x, y, yaw); words: a text on the result.
     """
 
     plan: Plan
@@ -366,5 +366,5 @@ class Outcome:
     words: str = ""
 
     def with_goal(self, goal: Goal) -> Outcome:
-        """The same outcome, measured against another goal."""
+        """Return the outcome with its distance measured to another goal."""
         return replace(self, distance_m=goal.distance_m(self.end_pose[:2]))

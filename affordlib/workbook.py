@@ -1,12 +1,12 @@
-"""Run the workbook: every notebook, in order, with papermill, into `runs/<name>/`.
+"""Run the workbook: execute every notebook in order with papermill, into `runs/<name>/`.
 
     python -m affordlib.workbook --profile reader --seed 0 06_planning.n_goals=20
 
 A notebook's parameters are its own defaults, overridden by `notebooks/profiles/<profile>.yaml`,
-then by the command line, then by the seed and the folder of the run; names and types are checked
-before anything runs (papermill itself only logs an unknown name). A notebook is complete when its
-results exist and its executed copy holds the hash of all that they depend on, written last. A rerun
-skips what is complete and goes on from there.
+then by the command line, then by the seed and the folder of the run. Names and types are checked
+before anything runs (papermill only logs an unknown name). A notebook is complete when its results
+exist and its executed copy contains the hash of all their inputs, which is written last. A rerun
+skips complete notebooks and continues with the others.
 """
 
 import argparse
@@ -52,16 +52,16 @@ INPUTS = ("affordlib", "experiments", "notebooks/exercises", "data")
 """Folders that results depend on."""
 
 NO_INPUT = re.compile(r"/(\.|__pycache__)|^data/results/\d\d_")
-"""Caches in these folders, and what the notebooks themselves have written, copied there."""
+"""Files in these folders that are no inputs: caches, and copies of the notebooks' own results."""
 
 
 class WorkbookError(Exception):
-    """A batch that cannot start, or a notebook that failed; the text is for the reader."""
+    """Raised when a batch cannot start or a notebook fails; the message is shown to the user."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """One notebook of a batch: where it comes from, what it is run with, where its copy goes."""
+    """One notebook of a batch: its path, its parameters and the path of its executed copy."""
 
     name: str
     path: Path
@@ -73,19 +73,19 @@ class Job:
 
     @property
     def results(self) -> Path:
-        """The results that the notebook has to write."""
+        """Path of the results file that the notebook has to write."""
         return repo_root() / self.parameters["out_dir"] / f"{self.name}.json"
 
 
 def notebook_paths(root: Path) -> dict[str, Path]:
-    """Return the notebooks of the book in a checkout, by name, in order, the appendix last."""
+    """Return the paths of a checkout's notebooks by name, in order, with the appendix last."""
     pages = sorted(root.glob("notebooks/[0-9][0-9]_*.ipynb"))
     appendix = sorted(root.glob("notebooks/appendix/A[0-9]_*.ipynb"))
     return {path.stem: path for path in pages + appendix}
 
 
 def read_notebook(path: Path) -> nbformat.NotebookNode:
-    """Read a notebook; raises WorkbookError if it is none."""
+    """Read a notebook; raises WorkbookError if the file is not a readable notebook."""
     try:
         return nbformat.read(path, as_version=4)
     except Exception as error:
@@ -101,16 +101,16 @@ def default_parameters(notebook: nbformat.NotebookNode, name: str) -> dict[str, 
         defaults = {t.id: ast.literal_eval(x.value) for t, x in zip(targets, lines, strict=True)}
     except (SyntaxError, ValueError, AttributeError, TypeError) as error:
         raise WorkbookError(
-            f"{name} needs one cell tagged 'parameters', with plain literals, one `name = value` "
-            f"each ({error})"
+            f"{name} needs one cell tagged 'parameters' with one `name = value` per line, where "
+            f"the values are plain literals ({error})"
         ) from None
     if missing := {"seed", "out_dir"} - defaults.keys():
-        raise WorkbookError(f"{name} has no parameter {min(missing)!r}; every notebook takes it")
+        raise WorkbookError(f"{name} has no parameter {min(missing)!r}; every notebook needs it")
     return defaults
 
 
 def read_profile(root: Path, profile: str) -> list[tuple[str, str, Any]]:
-    """Return the (notebook, parameter, value) of `notebooks/profiles/<profile>.yaml`."""
+    """Return all (notebook, parameter, value) in `notebooks/profiles/<profile>.yaml`."""
     paths = {path.stem: path for path in sorted(root.glob("notebooks/profiles/*.yaml"))}
     choose("profile", profile, list(paths))
     try:
@@ -134,7 +134,7 @@ def choose(kind: str, given: str, known: Sequence[str]) -> str:
 
 
 def fitting(where: str, value: object, default: object) -> Any:
-    """Return a value as the type of its default; raises WorkbookError for one of another type."""
+    """Return a value in the type of its default; raises WorkbookError if the types differ."""
     if isinstance(default, float) and type(value) is int:
         return float(value)
     if isinstance(default, list | tuple) and isinstance(value, list | tuple):
@@ -152,9 +152,9 @@ def fitting(where: str, value: object, default: object) -> Any:
 
 
 def literal(text: str, default: object) -> Any:
-    """Return the value that a command line means; text needs no quotes."""
+    """Parse a value given on the command line; strings need no quotes."""
     value: object = text
-    for parse in (yaml.safe_load, ast.literal_eval):  # what neither can read is text
+    for parse in (yaml.safe_load, ast.literal_eval):  # if neither can parse it, it is a string
         with suppress(Exception):
             value = parse(text)
     return text if isinstance(default, str) and not isinstance(value, str) else value
@@ -163,7 +163,7 @@ def literal(text: str, default: object) -> Any:
 def make_jobs(
     root: Path, profile: str | None, settings: Sequence[str] = (), seed: int = 0, out: str = ""
 ) -> list[Job]:
-    """Every notebook with its parameters, checked; profile None: defaults, executed in place."""
+    """Return a job per notebook, parameters checked; profile None: defaults, executed in place."""
     paths = notebook_paths(root)
     if not paths:
         raise WorkbookError(f"there is no notebook NN_title.ipynb in {root / 'notebooks'}")
@@ -179,13 +179,13 @@ def make_jobs(
     for setting in settings:
         match = re.fullmatch(r"(\w+)\.(\w+)=(.*)", setting)
         if not match:
-            raise WorkbookError(f"{setting!r} is no setting; write it like 06_planning.n_goals=20")
+            raise WorkbookError(f"{setting!r} is not valid; write it like 06_planning.n_goals=20")
         given.append(("settings", *match.groups()))
     for source, notebook, parameter, value in given:
         name = choose(f"{source}: notebook", notebook, list(paths))
         where = choose(f"{source}: parameter of {name}", parameter, list(defaults[name]))
         if where in common:
-            raise WorkbookError(f"{source}: {name}.{where} is set for all; use --seed and --out")
+            raise WorkbookError(f"{source}: {name}.{where} is common to all; use --seed and --out")
         default = defaults[name][where]
         value = literal(value, default) if source == "settings" else value
         overrides[name][where] = fitting(f"{source}: {name}.{where}", value, default)
@@ -203,21 +203,21 @@ def run_name(profile: str, seed: int, name: str) -> str:
     if not re.fullmatch(r"\w[\w.-]*", name) or name in ("lab", "html"):
         raise WorkbookError(
             f"OUT (--out) must be a plain folder name under runs/, and neither lab nor html, "
-            f"which belong to other commands, got {name!r}"
+            f"which other commands use, got {name!r}"
         )
     return name
 
 
 def own_cells(notebook: nbformat.NotebookNode) -> list[nbformat.NotebookNode]:
-    """The cells without those that papermill adds."""
+    """Return the cells of a notebook without those that papermill added."""
     return [c for c in notebook.cells if not INJECTED & set(c.metadata.get("tags", []))]
 
 
 def cleaned(notebook: nbformat.NotebookNode) -> str:
-    """Return an executed notebook as it is committed: outputs and tags kept, the rest dropped.
+    """Return the text of an executed notebook to commit: outputs and tags, no other metadata.
 
-    Of a widget its picture is kept: without its kernel JupyterLab would show an error in its place.
-    The caption in the cell below is the alternative text of a picture.
+    A widget is replaced by its picture, as JupyterLab shows an error for a widget without a kernel.
+    The caption in the cell below a picture becomes the picture's alternative text.
     """
     cells = own_cells(notebook)
     for cell, below in zip(cells, cells[1:] + cells[-1:], strict=True):
@@ -234,7 +234,7 @@ def cleaned(notebook: nbformat.NotebookNode) -> str:
 
 
 class OwnKernelManager(AsyncKernelManager):
-    """Starts the running interpreter as kernel, whatever kernels are registered on the machine."""
+    """Starts kernels with the running interpreter, independent of the registered kernels."""
 
     kernel_spec = KernelSpec(
         env={"MPLBACKEND": "module://matplotlib_inline.backend_inline"},
@@ -242,14 +242,14 @@ class OwnKernelManager(AsyncKernelManager):
     )
 
     async def start_kernel(self, **options: Any) -> None:
-        """Start the kernel, encrypted if possible; what it prints outside its cells stays off."""
+        """Start the kernel, encrypted if possible, and discard its output outside of cells."""
         options |= {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
         encryption = "auto" if zmq.has("curve") else "disabled"
         await super().start_kernel(transport_encryption=encryption, **options)
 
 
 def environment_hash(root: Path) -> str:
-    """Return a hash of all that results depend on beside the notebooks: `INPUTS`, and versions."""
+    """Return a hash of the inputs of results other than the notebooks: `INPUTS` and versions."""
     digest = hashlib.sha256(repr(versions()).encode())
     for path in sorted(path for folder in INPUTS for path in (root / folder).rglob("*")):
         name = path.relative_to(root).as_posix()
@@ -259,7 +259,7 @@ def environment_hash(root: Path) -> str:
 
 
 def is_complete(job: Job, mark: str) -> bool:
-    """Whether the results and the copy of a notebook are there, with the hash of its inputs."""
+    """Return whether a notebook's results and copy exist, the copy with the hash `mark`."""
     with suppress(OSError, ValueError, WorkbookError):
         read_results(job.results)
         done = read_notebook(job.copy)
@@ -271,8 +271,8 @@ def is_complete(job: Job, mark: str) -> bool:
 def run(
     jobs: Sequence[Job], environment: str, only: Sequence[str], options: argparse.Namespace
 ) -> None:
-    """Execute what is not complete, in order; raises WorkbookError at the first failure."""
-    before: list[str | None] = []  # the hash of each earlier notebook; None if this run lacks it
+    """Execute incomplete notebooks in order; raises WorkbookError at the first failure."""
+    before: list[str | None] = []  # hash of each earlier notebook, None if not part of this run
     left = []
     for number, job in enumerate(jobs, 1):
         cells = [[c.cell_type, c.source, c.metadata.get("tags", [])] for c in job.notebook.cells]
@@ -299,15 +299,15 @@ def run(
 
 
 def end_with_parent() -> None:
-    """Have this process, and so its kernel, end as soon as its parent ends or stops it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent
+    """Make this process, and thereby its kernel, end when its parent ends or terminates it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     parent = multiprocessing.parent_process()
     threading.Thread(target=lambda: (parent.join(), os._exit(1)), daemon=True).start()
 
 
 def execute(place: str, job: Job, mark: str) -> None:
-    """Execute one notebook, check what it wrote, mark it as complete; say how long it took."""
+    """Execute one notebook, check its results, mark it as complete and print the run time."""
     print(f"{place} …", flush=True)
     start = time.monotonic()
     job.results.unlink(missing_ok=True)
@@ -326,7 +326,7 @@ def execute(place: str, job: Job, mark: str) -> None:
         )
         read_results(job.results)
     except KeyboardInterrupt:
-        # nbclient's task outlives the interrupt, and would log the kernel's end as an error.
+        # nbclient's task survives the interrupt and would log the kernel's end as an error.
         logging.getLogger("asyncio").setLevel(logging.CRITICAL)
         raise
     except Exception as error:
@@ -341,7 +341,7 @@ def execute(place: str, job: Job, mark: str) -> None:
 
 
 def explained(job: Job, error: Exception) -> str:
-    """What failed: notebook, cell as numbered in the committed notebook, and error."""
+    """Describe a failure: notebook, cell number in the committed notebook, and error."""
     reason, where = f"{type(error).__name__}: {error}", ""
     if isinstance(error, papermill.PapermillExecutionError):
         reason = f"{error.ename}: {error.evalue}"
@@ -352,13 +352,13 @@ def explained(job: Job, error: Exception) -> str:
                 where = f" in cell {number}, which begins `{line}`"
     return (
         f"{job.name} failed{where}\n{reason}\nThe executed copy is {os.path.relpath(job.copy)}. "
-        "The same command goes on from this notebook once it is fixed."
+        "Fix it and run the same command again: it continues with this notebook."
     )
 
 
 @command(OSError, WorkbookError)
 def main(argv: Sequence[str] | None = None, root: Path | None = None) -> int:
-    """Execute the notebooks of the book in order, skipping what is complete."""
+    """Execute the notebooks of the book in order, skipping complete ones."""
     parser = argparse.ArgumentParser(prog="python -m affordlib.workbook", description=main.__doc__)
     parser.add_argument("settings", nargs="*", metavar="NN_title.parameter=value")
     parser.add_argument("--profile", default="reader", help="smoke, reader (default) or full")
@@ -367,9 +367,9 @@ def main(argv: Sequence[str] | None = None, root: Path | None = None) -> int:
         "--out", default="", metavar="NAME", help="folder under runs/; default: the profile"
     )
     parser.add_argument("--only", default="", metavar="'03 06'", help="run only these notebooks")
-    parser.add_argument("--workers", type=count_type, default=1, help="notebooks side by side")
-    parser.add_argument("--force", action="store_true", help="run also what is complete")
-    parser.add_argument("--dry-run", action="store_true", help="say what would run")
+    parser.add_argument("--workers", type=count_type, default=1, help="notebooks run in parallel")
+    parser.add_argument("--force", action="store_true", help="also run complete notebooks")
+    parser.add_argument("--dry-run", action="store_true", help="only print what would be run")
     parser.add_argument(
         "--in-place", action="store_true", help="execute the committed notebooks at their defaults"
     )
@@ -377,20 +377,20 @@ def main(argv: Sequence[str] | None = None, root: Path | None = None) -> int:
     root = root or repo_root()
     logging.getLogger("papermill").setLevel(logging.CRITICAL)
     if options.in_place and (options.settings or options.seed or options.out):
-        raise WorkbookError("--in-place takes the notebooks' own defaults, no settings")
+        raise WorkbookError("--in-place takes the notebooks' own defaults; leave out the settings")
     profile = None if options.in_place else options.profile
     jobs = make_jobs(root, profile, options.settings, options.seed, options.out)
     names = [job.name for job in jobs]
     only = [choose("ONLY: notebook", name, names) for name in re.findall(r"[^\s,]+", options.only)]
     folder, lock = jobs[0].copy.parent, nullcontext()
-    if not options.dry_run:  # the lock dies with its process, so a kill leaves none behind
+    if not options.dry_run:  # the lock ends with its process, so a killed run leaves none behind
         lock = FileLock(resolve_out_dir(folder) / ".lock", timeout=0)
     try:
         with lock:
             run(jobs, environment_hash(root), only, options)
     except Timeout:
         raise WorkbookError(
-            f"another runner is writing {os.path.relpath(folder)}; wait for it, or choose another "
+            f"another run is writing to {os.path.relpath(folder)}; wait for it, or choose another "
             "name with OUT= (--out)"
         ) from None
     return 0

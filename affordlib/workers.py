@@ -1,4 +1,4 @@
-"""Processes that share work: those of a Dask scheduler, or some of this machine."""
+"""Worker processes: those of a Dask scheduler, or new ones on this machine."""
 
 import logging
 from collections.abc import Iterator
@@ -9,9 +9,9 @@ _LOOPBACK = {"host": "127.0.0.1", "dashboard": False, "dashboard_address": "127.
 
 @contextmanager
 def dask_client(workers: int = 1, scheduler: str | None = None) -> "Iterator[Client | None]":
-    """A client of the scheduler at an address, or else of `workers` new processes of this machine.
+    """Connect to the Dask scheduler at an address, or start `workers` processes on this machine.
 
-    None for one worker, which is this process. The new processes listen on this machine only.
+    Yields the client, or None for one worker (this process). New processes listen on this machine.
     """
     if scheduler is None and workers == 1:
         yield None
@@ -23,8 +23,8 @@ def dask_client(workers: int = 1, scheduler: str | None = None) -> "Iterator[Cli
         with Client(scheduler) as client:
             yield client
         return
-    quiet = logging.CRITICAL  # what a task raises is raised here as well
-    # A worker that finds no scheduler for this long ends: its collector was killed.
+    quiet = logging.CRITICAL  # a task's exception is raised in this process as well
+    # A worker ends if it cannot reach its scheduler for this long, as after a kill.
     more = {"nthreads": 1, "silence_logs": quiet, "death_timeout": "30 s"}
     options = {"worker_kwargs": _LOOPBACK | more}
     with (

@@ -98,7 +98,7 @@ def test_a_command_ends_with_a_status_and_one_line(capsys, how, code):
     finally:
         signal.signal(signal.SIGINT, ignored)
     assert signal.getsignal(signal.SIGTERM) is before
-    line = "interrupted; what is finished is kept, the same command goes on"
+    line = "interrupted; finished work is kept; run it again to continue"
     expected = {1: "test_commands: no room\n", 7: ""}
     assert capsys.readouterr().err == expected.get(code, f"\ntest_commands: {line}\n")
 

@@ -243,7 +243,7 @@ def test_a_killed_run_counts_as_nothing_and_is_taken_up_again(book, capsys, how,
         assert process.returncode == -how
     else:
         assert process.returncode == 128 + how
-        assert re.fullmatch("workbook: interrupted; .*the same command goes on", err.strip())
+        assert re.fullmatch("workbook: interrupted; .*run it again to continue", err.strip())
     wait_until(lambda: not psutil.pid_exists(int(pid.read_text())))  # no kernel outlives its runner
     go.touch()
     assert book.run() == 0
@@ -256,7 +256,7 @@ def test_a_second_runner_or_a_file_in_place_of_the_folder_is_refused(book, capsy
     book.runs.joinpath("reader").mkdir(parents=True)
     with FileLock(book.runs / "reader" / ".lock"):
         assert book.run() == 1
-        assert "another runner is writing" in capsys.readouterr().err
+        assert "another run is writing" in capsys.readouterr().err
         assert book.run("--out", "other", "--dry-run") == 0
     (book.runs / "mine").touch()
     assert book.run("--out", "mine") == 1

@@ -220,7 +220,7 @@ def test_make_data_is_ended_with_one_line(tmp_path):
     _, err = process.communicate(timeout=60)
     assert process.returncode == 128 + signal.SIGTERM
     assert err.splitlines()[-1] == (
-        "shipped: interrupted; what is finished is kept, the same command goes on"
+        "shipped: interrupted; finished work is kept; run it again to continue"
     )
     for noise in ("Traceback", "distributed", "leaked"):
         assert noise not in err

@@ -94,7 +94,7 @@ def test_what_is_no_checkpoint_is_not_replaced(untrained, tmp_path):
     (tmp_path / "f.safetensors").mkdir()
     (tmp_path / "l.safetensors").symlink_to(tmp_path / "nowhere")
     for name in "mfl":
-        with pytest.raises(FileExistsError, match=f"{name}.safetensors is there and is not"):
+        with pytest.raises(FileExistsError, match=f"{name}.safetensors exists and is not"):
             save_checkpoint(untrained, tmp_path / f"{name}.safetensors", {})
     assert (tmp_path / "m.safetensors").read_text() == "notes"
 
