@@ -1,4 +1,4 @@
-"""Planning with (partial) actions on any `EffectModel`, and carrying plans out."""
+"""Planning with (partial) actions on any `EffectModel`, and executing the plans."""
 
 from affordlib.planning.astar import plan_astar
 from affordlib.planning.closed_loop import (

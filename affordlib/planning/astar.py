@@ -1,9 +1,9 @@
 """A* over (partial) actions (Section 3.4): 36 directions x 20, 40, 60, 80, 100 % of the phase.
 
-An edge costs the distance that the object travels. The heuristic is the Euclidean distance to the
-goal, as in the paper, or to the goal's disc, which never overestimates. The search ends at the
-first node within the tolerance (2 cm in the paper). A push turns the object as well, so its effects
-are looked up relative to the yaw that the model predicts; they are kept by degrees and used again.
+The cost of an edge is the distance that the object travels. The heuristic is the Euclidean distance
+to the goal, as in the paper, or to the goal's disc, which never overestimates. The search ends at
+the first node within the tolerance (2 cm in the paper). A push also rotates the object, so effects
+are looked up relative to the predicted yaw, in a table with one entry per degree.
 """
 
 import heapq
@@ -30,14 +30,14 @@ MAX_EXPANSIONS = 20_000
 
 
 Branches = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-"""Of a node: directions (n,), phases (n,), effects (2, n) along the table's axes, turns (n,)."""
+"""One node's directions (n,), phases (n,), effects (2, n) in the table's frame, rotations (n,)."""
 
 
 class BranchTable:
-    """The branches of an object by how far it has turned since its image was taken.
+    """The branches of an object, by its rotation since its image was taken.
 
-    It turns in steps of at most a degree that divide those between the directions, so the map is
-    queried once: for the effects in every direction relative to the object.
+    Rotation is rounded to steps of at most one degree that divide the angle between directions. So
+    one query of the map gives the effects in every direction relative to the object.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class BranchTable:
         self._kept: dict[int, Branches] = {}
 
     def at(self, turned_rad: float) -> Branches:
-        """The branches of the object turned by an angle; those that do nothing are left out."""
+        """The branches of the object rotated by an angle, without those that do not move it."""
         key = round(turned_rad / self._step_rad) % len(self._effects)
         if key not in self._kept:
             rows = (self._first - key) % len(self._effects)
@@ -83,21 +83,21 @@ def search(
     trace: list[tuple[np.ndarray, np.ndarray]] | None = None,
     heuristic: str = "goal",
 ) -> tuple[list[tuple[float, float]], bool]:
-    """The best chain of (direction, phase) into the goal's disc, or else the one that ends nearest.
+    """Find the best chain of (direction, phase) into the goal's disc, or else the nearest to it.
 
-    Returns the chain, and whether it ends in the disc. The best is the shortest way to the goal
-    (heuristic "goal": what the chain leaves counts) or to its disc ("disc": it does not).
-    Ties go to fewer actions. A node from which the object cannot be turned and lifted as the goal
-    asks is none of the goal's. trace, if given, receives each expanded position (2,) with those of
-    its children (n, 2).
+    Returns the chain, and whether it ends in the disc. The best is the shortest path to the goal
+    (heuristic "goal": the remaining distance counts) or to its disc ("disc": it does not). Ties go
+    to fewer actions. A node reaches the goal only if `pose_planner` can rotate and lift the object
+    there as required. trace, if given, receives each expanded position (2,) with those of its
+    children (n, 2).
     """
     check_choice("heuristic", heuristic, HEURISTICS)
     goal, pose_planner, effects = problem.goal, problem.pose_planner, table.effects
     max_steps, tolerance = problem.mode.max_steps, goal.tolerance_m
     radius = tolerance if heuristic == "disc" else 0.0
     nearest, nearest_m = (), goal.distance_m(problem.start_xy_m)
-    # The running number tells nodes of the same f and depth apart, so nothing after it is compared;
-    # f is rounded, lest the last digits of a sum choose between two orders of the same actions.
+    # The running number breaks ties of f and depth, so the node itself is never compared. f is
+    # rounded, so that rounding errors do not choose between two orders of the same actions.
     number = itertools.count()
     root = *problem.start_xy_m, 0.0, 0.0, nearest_m, ()
     frontier = [(max(0.0, nearest_m - radius), 0, next(number), root)]
@@ -131,7 +131,7 @@ def search(
         if trace is not None:
             trace.append((np.array((x, y)), places[rows]))
         if depth == max_steps and len(rows):
-            # From there nothing goes on: outside the goal's disc only the nearest counts.
+            # At the last depth, only the nearest node outside the goal's disc is kept.
             ends = away[rows] <= tolerance
             ends[away[rows].argmin()] = True
             rows = rows[ends]

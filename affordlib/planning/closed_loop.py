@@ -1,9 +1,9 @@
-"""Carrying plans out; the only part of planning that acts, and knows only a `Robot`.
+"""Execution of plans, open or closed loop, on anything that implements `Robot`.
 
-`execute_plan` trusts a plan. `run_closed_loop` observes after every action (Section 3.4 of the
-paper): is the object where it was predicted to be, has the goal changed, has the object fallen? If
-so it plans again, from a new image. How far the object has turned it tells from two images, how
-high it is lifted from the hand; what shows in neither is reckoned from what was done.
+`execute_plan` executes a plan without observing. `run_closed_loop` observes after every action
+(Section 3.4 of the paper): is the object where it was predicted to be, has the goal changed, has
+the object fallen? If so, it plans again from a new image. Rotation is estimated from two images,
+height from the hand; what neither shows is computed from the executed actions (dead reckoning).
 """
 
 from __future__ import annotations
@@ -37,30 +37,30 @@ from affordlib.types import (
 )
 
 SURPRISE_M = 0.002
-"""An object that is farther than this from its predicted position makes the plan worthless."""
+"""Distance of the object from its predicted position above which it plans again [m]."""
 
 DISPLACED_M = 0.03
-"""An object that is farther than this from its predicted position was moved by somebody else."""
+"""Distance from the predicted position above which the object counts as displaced by others [m]."""
 
 AT_REST_M, OBSERVE_EVERY_S, MAX_OBSERVATIONS = 0.001, 0.25, 20
-"""An object rests that is within a millimetre a quarter of a second later; after 5 s none is waited
-for."""
+"""An object is at rest if it moves less than 1 mm in 0.25 s; the loop waits for this for 20
+observations (5 s) at most."""
 
 MOVE_M, SPARE_ACTIONS = 0.05, 3
-"""An action is allowed for every 5 cm of distance, and three more."""
+"""The action limit is one action per 5 cm of distance, and three more."""
 
 MAX_RENEWALS = 3
-"""So many times more actions are allowed because somebody displaced the object."""
+"""How many times the action limit is renewed because the object was displaced."""
 
 MAX_LIFTS = 2
 HEIGHT_TOLERANCE_M = 0.003
 
 
 def execute_plan(robot: Robot, plan: Plan) -> Outcome:
-    """Execute a plan's steps as planned, each action relative to where the object then stands.
+    """Execute a plan's steps as planned, each action relative to the object's current position.
 
     The outcome is what the robot recorded. Raises UnreachableError when the arm cannot follow a
-    step; it has the outcome of those before.
+    step; its `outcome` holds that of the steps before.
     """
     done: list[Execution] = []
     try:
@@ -90,18 +90,18 @@ def _outcome(robot: Robot, plan: Plan, done: Sequence[Execution]) -> Outcome:
 
 
 def is_seen_on_table(seen: Observation) -> bool:
-    """Whether the image shows an object, and on the table."""
+    """Whether the image shows an object and its position is on the table."""
     return bool(seen.image[1].any() and is_on_table(np.array([seen.xy_m]))[0])
 
 
 @dataclass(frozen=True)
 class ClosedLoopConfig:
-    """With how many actions a goal is to be met, and who is told of them.
+    """Action limit, number of images per observation, and callbacks of a closed loop.
 
     max_actions: default `action_limit` of the distance, renewed when the goal moves or somebody
-    displaces the object. n_images: of which an observation is the mean; with eight of the Kinect a
-    turn is seen to a degree. on_action: called with the plan and the number of actions taken, after
-    each; on_plan: with a plan before its first.
+    displaces the object. n_images: number of images averaged per observation; eight of the Kinect
+    give the rotation to one degree. on_action: called after each action with the plan and the
+    number of actions so far; on_plan: called with a plan before its first action.
     """
 
     max_actions: int | None = None
@@ -117,14 +117,14 @@ class ClosedLoopConfig:
 
 @dataclass(frozen=True)
 class ClosedLoopResult:
-    """What came of a closed loop, as the robot observed it.
+    """The result of a closed loop, as the robot observed it.
 
-    status: "reached", "unreachable", "gave_up" or "lost"; goal: as it was in the end; end_pose: (x,
-    y, turn since the start) of the object, and turn_std_rad; reckoned: which of "position" and
-    "orientation" was not seen in the end, but follows from what the hand did; turn_error_rad,
-    height_error_m: None where the goal does not ask; steps: the actions taken, and executions, what
-    was recorded of them; plans: all that were made; seen_xy_m: before every decision; vetoes:
-    planned actions that the arm's kinematics refused.
+    status: "reached", "unreachable", "gave_up" or "lost"; goal: the final one; end_pose: (x, y,
+    rotation since the start) of the object, and turn_std_rad; reckoned: which of "position" and
+    "orientation" were not observed at the end but computed from the motion of the hand;
+    turn_error_rad, height_error_m: None if not part of the goal; steps: the executed actions, and
+    executions, their recordings; plans: all that were made; seen_xy_m: before every decision;
+    vetoes: planned actions that the arm's kinematics refused.
     """
 
     goal: Goal
@@ -144,17 +144,17 @@ class ClosedLoopResult:
 
     @property
     def reached(self) -> bool:
-        """Whether the object was seen where, and as, the goal wants it."""
+        """Whether the object was observed as the goal requires."""
         return self.status == "reached"
 
     @property
     def object_paths_xy_m(self) -> tuple[np.ndarray, ...]:
-        """The path (n, 2) of the object in each action, as it was recorded."""
+        """Recorded path (n, 2) of the object in each action."""
         return tuple(execution.object_path[:, :2] for execution in self.executions)
 
 
 def action_limit(distance_m: float) -> int:
-    """How many actions a distance is worth: one for every 5 cm, rounded up, and 3 more."""
+    """Number of actions allowed for a distance: one per 5 cm, rounded up, and 3 more."""
     distance_m = check_within("distance_m", distance_m, 0.0, 10.0, "m")
     return math.ceil(distance_m / MOVE_M - 1e-9) + SPARE_ACTIONS
 
@@ -166,10 +166,10 @@ def run_closed_loop(
     planner: Callable[[PlanningProblem], Plan] = plan_continuous,
     config: ClosedLoopConfig | None = None,
 ) -> ClosedLoopResult:
-    """Bring the object to a goal, whatever happens on the way: position, orientation, height.
+    """Bring the object to a goal (position, orientation, height) despite errors and disturbances.
 
-    goal: or a function that returns it, where it may move. planner: such as plan_astar. Raises
-    NothingSeenError where no object is seen to begin with.
+    goal: a `Goal`, or a function that returns the current one. planner: such as plan_astar. Raises
+    NothingSeenError where no object is seen at the start.
     """
     goal_now = (lambda: goal) if isinstance(goal, Goal) else goal
     if not isinstance(goal_now(), Goal):
@@ -178,7 +178,7 @@ def run_closed_loop(
 
 
 class _ClosedLoop:
-    """A closed loop while it lasts: observe, judge whether the plan holds, plan again, act."""
+    """State of a running closed loop: observe, check the plan, plan again if necessary, act."""
 
     def __init__(
         self,
@@ -189,15 +189,15 @@ class _ClosedLoop:
         config: ClosedLoopConfig,
     ) -> None:
         self.robot, self.goal_now, self.skills, self.config = robot, goal_now, skills, config
-        self.goal = goal_now()  # as it was when last asked: before each action, and after a lift
+        self.goal = goal_now()  # updated before each action and after a lift
         self.acted_for: Goal | None = None
         self.moves = MovePlanner(robot, skills, planner, MODES["multi_partial"])
         self.steps: list[Step] = []
         self.executions: list[Execution] = []
         self.plans: list[Plan] = []
         self.seen_xy_m: list[tuple[float, float]] = []
-        self.plan: Plan | None = None  # that is followed
-        self.queue: list[Step] = []  # what is left of it
+        self.plan: Plan | None = None  # the current one
+        self.queue: list[Step] = []  # its remaining steps
         self.renewals, self.turn_allowed = MAX_RENEWALS, False
         self.lifted_m, self.held, self.disturbed = 0.0, False, False
         seen = self._mean_of_images()
@@ -207,7 +207,7 @@ class _ClosedLoop:
         self.limit = self._limit_from(self.seen.xy_m)
 
     def run(self) -> ClosedLoopResult:
-        """Position, orientation, height, again until all hold or one cannot be had."""
+        """Correct position, orientation, height in turn until all are reached or one cannot be."""
         ending = None
         while ending is None:
             try:
@@ -233,7 +233,7 @@ class _ClosedLoop:
         )
 
     def _observe(self) -> Ending | None:
-        """Observe, and judge whether the plan still holds."""
+        """Observe, and check whether the plan is still valid."""
         before, seen = self.seen, self._mean_of_images()
         expected = self.steps[-1].predicted_end_xy_m if self.steps else None
 
@@ -256,14 +256,14 @@ class _ClosedLoop:
         goal_moved = self.acted_for is not None and self.acted_for != self.goal
         if goal_moved or (was_displaced and self.renewals > 0):
             self.renewals -= not goal_moved
-            self.turn_allowed &= not goal_moved  # the goal may ask for a whole round again
+            self.turn_allowed &= not goal_moved  # a new goal may need a full rotation again
             self.limit = max(self.limit, len(self.steps) + self._limit_from(self.seen.xy_m))
         if off_m > SURPRISE_M or goal_moved or fell:
             self.queue = []
         return None
 
     def _wait(self, seen: Observation) -> Observation:
-        """Observe until what somebody has set in motion rests."""
+        """Observe until an object that somebody has set in motion is at rest."""
         for _ in range(MAX_OBSERVATIONS):
             self.robot.settle(OBSERVE_EVERY_S)
             before, seen = seen, self._mean_of_images()
@@ -278,9 +278,9 @@ class _ClosedLoop:
         return replace(views[-1], xy_m=(x, y), image=image)
 
     def _with_yaw(self, seen: Observation, fell: bool, displaced: bool) -> Observation:
-        """What is seen, with its yaw: by the robot, by the images since the first, or reckoned.
+        """Add the yaw to an observation: from the robot, from images since the first, or reckoned.
 
-        A hand that turns what looks alike from all sides turns it by as much.
+        An object that looks the same at every yaw is assumed to rotate with the hand.
         """
         if seen.yaw_rad is None:
             expected = None if displaced else self.expected_rad - self.first.yaw_rad
@@ -292,14 +292,14 @@ class _ClosedLoop:
         return seen
 
     def _decide_and_act(self) -> Ending | None:
-        """One action towards what is not yet as the goal wants it; an ending where all is, or
-        nothing helps.
+        """Act towards the first unreached part of the goal; return an `Ending` if all are reached
+        or nothing helps.
         """
         turn_rad = self._turn_left()
         turns = turn_rad is not None and abs(turn_rad) > TURN_TOLERANCE_RAD
-        if turns and not self.turn_allowed:  # as far as a whole round, in sweeps of 60°
+        if turns and not self.turn_allowed:  # up to a full rotation, in sweeps of 60°
             sweeps = math.ceil((turn_rad % (2 * math.pi)) / Rotate.sweep_rad)
-            self._allow(2 * sweeps + SPARE_ACTIONS)  # each may shift it off its position
+            self._allow(2 * sweeps + SPARE_ACTIONS)  # each may move it from its position
             self.turn_allowed = True
         if self.goal.distance_m(self.seen.xy_m) > self.goal.tolerance_m:
             return self._act("position", self._move)
@@ -314,7 +314,7 @@ class _ClosedLoop:
         return self._act("height", self._lift) or self._judge_lift(last=lifts + 1 == MAX_LIFTS)
 
     def _judge_lift(self, last: bool) -> Ending | None:
-        """Whether what is held is where it should be; otherwise it is put down."""
+        """Check whether the held object is as the goal requires; otherwise put it down."""
         tool = self.executions[-1].tool
         self.held = bool(tool[-1, 4] > EMPTY_M)
         self.lifted_m = float(tool[-1, 2] - tool[:, 2].min()) if self.held else 0.0
@@ -331,7 +331,7 @@ class _ClosedLoop:
         return None
 
     def _act(self, part: str, choose: Callable[[], Step | Ending]) -> Ending | None:
-        """Carry out what is chosen, if the arm agrees and there may be another action."""
+        """Execute the chosen step, if the action limit and the arm allow it."""
         if len(self.steps) >= self.limit:
             return self._give_up(part)
         self.acted_for = self.goal
@@ -340,7 +340,7 @@ class _ClosedLoop:
             return step
         try:
             execution = self.robot.execute(step)
-        except UnreachableError as error:  # of what it sees now, a hair off what it agreed to
+        except UnreachableError as error:  # the object is now seen at a slightly other position
             return Ending("unreachable", f"the {part}: {error}")
         self.steps.append(step)
         self.executions.append(execution)
@@ -349,7 +349,7 @@ class _ClosedLoop:
         return None
 
     def _reckon(self, step: Step, tool: np.ndarray) -> None:
-        """How the object should be turned now, by the model, and by the hand if that turned it."""
+        """Update the expected yaw by the model and, after a rotation, by the motion of the hand."""
         by_rad = step.predicted_turn_rad - self.turned_by_plan_rad
         self.turned_by_plan_rad = step.predicted_turn_rad
         self.expected_rad = self.reckoned_rad = self.seen.yaw_rad + by_rad
@@ -369,14 +369,14 @@ class _ClosedLoop:
         return self.queue.pop(0)
 
     def _grip_yaw(self) -> float | None:
-        """Of the hand that has just let go of a rotated object, if it still is as it was left.
+        """Yaw of the hand that has just released a rotated object, if nothing has moved it since.
 
-        Closed again at this yaw, it turns nothing: so the object is carried to its position.
+        Closing again at this yaw does not rotate the object, so it can be dragged to its position.
         """
         last = self.steps[-1] if self.steps else None
         if last is None or self.disturbed or not isinstance(last.primitive, Rotate | Drag):
             return None
-        if last.primitive.grip_yaw is None:  # as it saw the object before it moved it
+        if last.primitive.grip_yaw is None:  # chosen from an image before the object moved
             return None
         return float(last.primitive.path(last.stop_phase)[0, 3])
 
@@ -393,7 +393,7 @@ class _ClosedLoop:
     def _lift(self) -> Step | Ending:
         yaws, height_m, grip_yaw = GRIPPER_YAWS_RAD, self.goal.height_m, self._grip_yaw()
         if grip_yaw is not None:
-            # A grasp takes an object as the rotation left it, or it would turn it back.
+            # The grasp has the yaw of the rotation's grip; another would rotate the object.
             yaws = grasp_rotate.aligned_gripper_yaws(grip_yaw)
         model = self.skills.model(Grasp)
         predicted = grasp_rotate.predict_trajectories(model, self.seen.image, Grasp(), "z", yaws)
@@ -406,7 +406,7 @@ class _ClosedLoop:
     def _first_possible(
         self, candidates: Iterable[Step], wanted: str, hopeless: str
     ) -> Step | Ending:
-        """The first of some steps, each with another gripper yaw, to which the arm agrees."""
+        """Return the first of some steps, each with another gripper yaw, that the arm can reach."""
         at = self.seen.xy_m
         for step in candidates:
             primitive = adapt_to_object(step.primitive, self.seen.image)
@@ -427,7 +427,7 @@ class _ClosedLoop:
         return action_limit(self.goal.distance_m(xy_m))
 
     def _allow(self, further: int) -> None:
-        """More actions than the distance is worth, unless it was said how many there may be."""
+        """Raise the action limit, unless the configuration sets it."""
         if self.config.max_actions is None:
             self.limit += further
 
@@ -456,4 +456,4 @@ class _ClosedLoop:
         return f"{', '.join(parts)} from the goal after {self._count()}"
 
     def _give_up(self, part: str) -> Ending:
-        return Ending("gave_up", f"{self._where()}: the {part} is not what it should be")
+        return Ending("gave_up", f"{self._where()}: the {part} is not reached")

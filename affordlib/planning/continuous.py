@@ -1,14 +1,14 @@
-"""Our continuous planner: directions and phases of all actions of a chain, found together.
+"""Our continuous planner: joint optimisation of the directions and phases of all actions.
 
     p_k+1 = p_k + R(φ_k) e(φ_k - ψ_k, t_k),   ψ_k+1 = ψ_k + e_ψ(φ_k - ψ_k, t_k)
     minimise |p_K - goal|² + λ tr Cov p_K   over φ_1, t_1, …, φ_K, t_K
 
-e is the object's effect map, p and ψ its position and how far it has turned; with λ = 1 it would be
-the expected squared distance, and `RISK_WEIGHT` weighs the variance more. The covariance is
-carried along the chain, so that of two plans that end at the goal the one with the lower variance
-is taken: a model knows which pushes it predicts well. Many chains are started together, the last
-action of each looked up in the map; the best descend the gradient, and the one that remains is
-corrected against the model itself until its predicted end is the goal.
+e is the object's effect map, p and ψ are its position and rotation. λ = 1 gives the expected
+squared distance; λ = `RISK_WEIGHT` weights the variance more. The covariance is propagated along
+the chain, so that of two plans ending at the goal the one of lower variance is chosen: the model's
+uncertainty differs between pushes. Many chains are started together, the last action of each looked
+up in the map. The best follow the gradient; the best of all is corrected by queries of the model
+itself until its predicted final position is the goal.
 """
 
 import math
@@ -25,20 +25,20 @@ from affordlib.planning.rollout import make_steps, roll_out
 from affordlib.types import Plan, check_count
 
 N_STARTS, N_REFINED = 192, 16
-"""Chains that are started, and of them those that descend the gradient."""
+"""Number of initial chains, and of the best of them that are refined by gradient descent."""
 
 DIRECTION_SPREAD_RAD, MIN_STOP_PHASE = 1.2, 0.5
-"""First actions are drawn within this angle of the goal, and stop from this phase on."""
+"""First actions are drawn within this angle of the goal direction, with at least this phase."""
 
 ITERATIONS = 15
 DIFFERENCE = 1e-6
 CORRECTIONS, HALVINGS = 5, 4
 RISK_WEIGHT = 10.0
-"""Weight of the variance beside the squared distance. Chosen on 40 validation goals: without it
-three-step plans end at 0.66 mm, with 1 at 0.62, with 10 at 0.37, with 30 at 0.48 mm."""
+"""Weight λ of the variance. Chosen on 40 validation goals: three-step plans end 0.66 mm from the
+goal with λ = 0, 0.62 mm with 1, 0.37 mm with 10 and 0.48 mm with 30."""
 
 ACTION_COST_M = 0.0005
-"""A plan with one more action must lower the square root of the objective by this much."""
+"""Cost per action [m], added to the square root of the objective."""
 
 Chains = tuple[Tensor, Tensor]
 """Directions [rad] and phases (B, K) of B chains of K actions."""
@@ -47,7 +47,7 @@ Chains = tuple[Tensor, Tensor]
 def _starts(
     effects: EffectMap, target: Tensor, n_actions: int, partial: bool, rng: np.random.Generator
 ) -> Chains:
-    """Chains whose last action is the one in the map that brings them nearest."""
+    """Draw chains; the last action of each is the one in the map ending nearest to the target."""
     n = N_STARTS if n_actions > 1 else 1
     bearing, spread = math.atan2(float(target[1]), float(target[0])), DIRECTION_SPREAD_RAD
     shape = (n, n_actions - 1)
@@ -67,18 +67,18 @@ def _starts(
 
 
 def _objective(effects: EffectMap, target: Tensor, *chains: Tensor) -> tuple[Tensor, Tensor]:
-    """The objective (B,) [m²], and the positions (B, K, 2) after each action."""
+    """Objective (B,) [m²] and positions (B, K, 2) after each action."""
     positions, _, variances = roll_out(effects, *chains)
     squared = (positions[:, -1] - target).square().sum(dim=-1)
     return squared + RISK_WEIGHT * variances[:, -1], positions
 
 
 def _slopes(value: Callable[..., Tensor], direction: Tensor, phase: Tensor) -> Chains:
-    """Derivatives (B, K, ...) by direction and by phase of a value (B, ...) of chains.
+    """Derivatives (B, K, ...) of a value (B, ...) of chains by direction and by phase.
 
-    The surfaces are smooth and in double precision, so finite differences give six digits; all
-    1 + 2K neighbours are queried together. A phase is changed towards its inside, so that a whole
-    action has a slope too.
+    The surfaces are smooth and in double precision, so finite differences have six correct digits;
+    all 1 + 2K neighbours are queried together. The difference in phase is backward, since a phase
+    of 1 cannot grow.
     """
     n, k = direction.shape
     one = DIFFERENCE * torch.eye(k, dtype=direction.dtype)
@@ -93,7 +93,7 @@ def _slopes(value: Callable[..., Tensor], direction: Tensor, phase: Tensor) -> C
 
 @torch.no_grad()
 def _descend(effects: EffectMap, target: Tensor, chains: Chains, partial: bool) -> Chains:
-    """The chains after some steps of Adam on the objective."""
+    """The chains after `ITERATIONS` steps of Adam on the objective."""
     direction, phase = (v.clone() for v in chains)
     sought = [direction, phase] if partial else [direction]
     optimiser = torch.optim.Adam(
@@ -116,26 +116,26 @@ def correct(
     partial: bool,
     corrections: int = CORRECTIONS,
 ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
-    """One chain (B = 1), brought to the target as the model predicts it, by Newton's method.
+    """Correct one chain (B = 1) by Newton's method until its end by the model is the target.
 
-    The map's slopes serve for the model's. Returns the chain (K, 2), and the positions (K, 2) and
-    turns (K,) that the model predicts.
+    The derivatives are the map's. Returns the chain (K, 2), and the positions (K, 2) and rotations
+    (K,) that the model predicts.
     """
     (direction, phase), k = chain, chain[0].shape[1]
     ends, turns = _predicted(effects, direction, phase)
     for _ in range(corrections):
         off = target - ends[-1]
-        if float(off.norm()) < 2e-5:  # [m], less than any table shows
+        if float(off.norm()) < 2e-5:  # [m], below the precision of all tables
             break
         slopes = _slopes(lambda *near: roll_out(effects, *near)[0][:, -1], direction, phase)
         by_direction, by_phase = (one[0].T for one in slopes)
         free = (phase[0] < 1) | (off @ by_phase < 0)
         by_phase = by_phase * (free & partial)
-        # A radian moves as far as about half a phase does; weighed so, steps stay small in both.
+        # One radian moves the end about as far as half the phase does; this scales the two alike.
         scale = torch.cat([torch.ones_like(direction[0]), 0.5 * torch.ones_like(phase[0])])
         slopes = torch.cat([by_direction, by_phase], dim=1) * scale
-        # Where the end hardly moves, by a twentieth of the most, a step would have to be long; and
-        # beyond 0.3 rad, or 0.3 of the phase, the slopes no longer hold.
+        # Singular values below 5 % of the largest are dropped, as their steps would be long; beyond
+        # 0.3 rad, or 0.3 of the phase, the linearisation is invalid.
         step = scale * (torch.linalg.pinv(slopes, rtol=0.05) @ off)
         step = step * min(1.0, 0.3 / max(float(step.abs().max()), 1e-9))
         for _ in range(HALVINGS):
@@ -151,10 +151,10 @@ def correct(
 
 
 def _predicted(effects: EffectMap, direction: Tensor, phase: Tensor) -> tuple[Tensor, Tensor]:
-    """Positions (K, 2) and turns (K,) after each action of a chain (1, K), by the model itself.
+    """Positions (K, 2) and rotations (K,) after each action of a chain (1, K), by the model.
 
-    An action's effect depends on the turns before it; the map's are near enough to query all of
-    them together, and the model's then take their place.
+    An action's effect depends on the rotations before it. The map's rotations are accurate enough
+    to query all actions together; the model's are returned.
     """
     _, turns, _ = roll_out(effects, direction, phase)
     before = torch.cat([turns.new_zeros(1), turns[0, :-1]])
@@ -168,12 +168,12 @@ def plan_continuous(
     draft: bool = False,
     trace: list[tuple[Tensor, Tensor, Tensor]] | None = None,
 ) -> Plan:
-    """Plan over directions and phases together.
+    """Plan by optimising directions and phases together.
 
-    Where no chain comes near the goal, the plan is the one that comes nearest. draft: a first plan,
-    of as few actions as the distance allows and without the descent; of three in a quarter of the
-    time. trace, if given, receives for each number of actions K the directions and phases (B, K) of
-    the chains that remain, and their costs (B,) [m].
+    Where no chain comes near the goal, the plan is the one that comes nearest. draft: compute a
+    first plan with as few actions as the distance allows, without gradient descent; with three
+    actions it takes a quarter of the time. trace, if given, receives for each number of actions K
+    the directions and phases (B, K) of the remaining chains, and their costs (B,) [m].
     """
     began = time.perf_counter()
     effects, start, goal, mode = problem.effects, problem.start_xy_m, problem.goal, problem.mode
@@ -194,14 +194,14 @@ def plan_continuous(
             chain, predicted = torch.cat(best).T, None
         steps = make_steps(effects, start, chain, predicted)
         if goal.distance_m(steps[-1].predicted_end_xy_m) >= goal.distance_m(start):
-            steps = ()  # where nothing brings it nearer, the object stays
+            steps = ()  # the empty plan, if no plan ends nearer to the goal
     end = steps[-1].predicted_end_xy_m if steps else start
     reaches = goal.distance_m(end) <= goal.tolerance_m
     return problem.plan_of(steps, "continuous", reaches, began)
 
 
 def _allowed(problem: PlanningProblem, positions: Tensor, direction: Tensor) -> Tensor:
-    """Which chains (B,) act within reach and keep the object on the table; positions: (B, K, 2)."""
+    """Whether chains (B,) are reachable and keep the object on the table; positions: (B, K, 2)."""
     xy = np.array(problem.start_xy_m)
     ends = xy + positions.numpy()
     begins = np.concatenate([np.broadcast_to(xy, ends[:, :1].shape), ends[:, :-1]], axis=1)
@@ -218,7 +218,7 @@ def _best_chain(
     draft: bool,
     trace: list[tuple[Tensor, Tensor, Tensor]] | None,
 ) -> list[tuple[float, Tensor, Tensor]]:
-    """The cost [m] and the actions (1, K) of the best chain of so many actions, if there is one."""
+    """Cost [m] and actions (1, K) of the best chain of n_actions; empty if there is none."""
     effects, partial = problem.effects, problem.mode.partial
 
     def costs(direction, phase):
@@ -232,7 +232,7 @@ def _best_chain(
     if not len(order):
         return []
     direction, phase, cost = direction[order], phase[order], cost[order]
-    # One action has nothing left to choose once it ends at the goal.
+    # A single action that ends at the goal has no free parameter left to optimise.
     if n_actions > 1 and not draft:
         after = _descend(effects, target, (direction, phase), partial)
         cost = torch.cat([cost, costs(*after)])

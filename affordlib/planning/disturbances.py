@@ -1,6 +1,6 @@
-"""A seeded schedule of what goes wrong: the object shoved, knocked or toppled, the goal moved.
+"""Seeded schedules of disturbances: the object is shoved, knocked or toppled, or the goal moves.
 
-Between actions, or in the middle of one, by the world's callback at every simulation step.
+They happen between actions, or during one through the world's callback per simulation step.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ KINDS = ("shove", "knock", "topple", "goal")
 STEPS_PER_S = 240
 TIPPING_S = 1.0
 EDGE_M = 0.15
-"""Of the table, where nothing is shoved to and no goal is put; what is there is moved away."""
+"""Margin at the table's edge [m] into which disturbances move neither object nor goal."""
 
 
 @dataclass(frozen=True)
 class Disturbance:
-    """One thing that happens: before an action, or at_s seconds after it began to move.
+    """One disturbance: before an action, or at_s seconds after the action began.
 
-    kind: "shove" displaces the object by (x, y) [m] and turns it [rad], only between actions;
-    "knock" changes its velocity by (x, y) [m/s] and turn [rad/s]; "topple" tips it over towards
-    (x, y); "goal" displaces the goal by (x, y) [m]. action: counted from 0; what should happen in
-    the middle of an action that has ended by then happens at its end.
+    kind: "shove" displaces the object by (x, y) [m] and rotates it [rad], only between actions;
+    "knock" changes its velocity by (x, y) [m/s] and turn [rad/s]; "topple" tips it over towards (x,
+    y); "goal" displaces the goal by (x, y) [m]. action: counted from 0. If the action ends before
+    at_s, the disturbance happens at its end.
     """
 
     kind: str
@@ -54,10 +54,10 @@ class Disturbance:
         if self.at_s is not None:
             check_field(self, "at_s", 0.0, 60.0, "s")
             if self.kind == "shove":
-                raise ValueError("a shove happens between actions; give no at_s, or take a knock")
+                raise ValueError("a shove happens between actions; omit at_s, or use a knock")
 
     def apply(self, world: affordlib.world.Tabletop, goal: Goal) -> Goal:
-        """Let it happen, and return the goal as it is then."""
+        """Apply the disturbance to the world, and return the goal after it."""
         if self.kind == "goal":
             return replace(goal, xy_m=_inside(goal.xy_m[0] + self.x, goal.xy_m[1] + self.y))
         if self.kind == "shove":
@@ -72,16 +72,16 @@ class Disturbance:
 
 
 def _inside(x: float, y: float) -> tuple[float, float]:
-    """The nearest place that is not at the table's edge."""
+    """The nearest position outside the margin at the table's edge."""
     (x0, x1), (y0, y1) = TABLE_X_M, TABLE_Y_M
     return min(max(x, x0 + EDGE_M), x1 - EDGE_M), min(max(y, y0 + EDGE_M), y1 - EDGE_M)
 
 
 class DisturbanceSchedule:
-    """A `Robot` at a tabletop where disturbances happen, each once, without the robot's knowledge.
+    """A `Robot` that wraps a tabletop and applies disturbances, each once, unknown to the robot.
 
-    goal: as it has become (for `run_closed_loop` give `schedule.current_goal`); happened: the
-    disturbances up to now, in order.
+    goal: the current one (for `run_closed_loop` give `schedule.current_goal`); happened: the
+    disturbances applied so far, in order.
     """
 
     def __init__(
@@ -93,16 +93,16 @@ class DisturbanceSchedule:
         self._n_actions = 0
 
     def current_goal(self) -> Goal:
-        """The goal as it is now."""
+        """Return the current goal."""
         return self.goal
 
     def observe(self) -> Observation:
-        """As the tabletop does, after what comes before the next action has happened."""
+        """Apply the disturbances due before the next action, then observe as the tabletop does."""
         self._apply([d for d in self._waiting if d.action <= self._n_actions and d.at_s is None])
         return self.world.observe()
 
     def execute(self, step: Step) -> Execution:
-        """As the tabletop does; what comes in the middle of the action happens when it is due."""
+        """Execute as the tabletop does, and apply the disturbances due during the action."""
         world, n_steps, on_step = self.world, 0, self.world.on_step
         due = [d for d in self._waiting if d.action <= self._n_actions and d.at_s is not None]
 
@@ -133,5 +133,5 @@ class DisturbanceSchedule:
                 self.world.settle(TIPPING_S)
 
     def __getattr__(self, name: str) -> Any:
-        """All else as the tabletop does."""
+        """Forward everything else to the tabletop."""
         return getattr(self.world, name)

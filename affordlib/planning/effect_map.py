@@ -1,10 +1,10 @@
-"""What actions of one primitive do to one object, over all directions and phases, smooth between.
+"""Effects of a primitive on one object for all directions and phases, by spline interpolation.
 
-Effects are relative to the object, so all that a primitive does to it is a surface over two
-numbers: the direction of the action relative to the object, and the phase at which it stops. The
-model is queried once, on a grid; cubic B-splines fill the rest. No phase is queried before the
-action can touch an object: nothing has happened there. When the object turns, the surface turns
-with it, so one map serves every step of a plan and every node of a search.
+Effects are relative to the object, so they are a surface over two variables: the direction of the
+action relative to the object, and the phase at which it stops. The model is queried once, on a
+grid, and cubic B-splines interpolate. Phases before the action can touch an object are not queried,
+as their effect is zero. When the object rotates, the surface rotates with it, so one map serves
+every step of a plan and every node of a search.
 """
 
 import math
@@ -31,7 +31,7 @@ FINE_DIRECTIONS, FINE_PHASES = 180, 31
 
 
 def checked_image(image: np.ndarray) -> torch.Tensor:
-    """One depth image (2, 48, 48) as (1, 2, 48, 48); raises ValueError where it is none."""
+    """Convert one depth image (2, 48, 48) to (1, 2, 48, 48); ValueError for any other shape."""
     image = check_array("image", image).astype(np.float32)
     if image.shape != (len(IMAGE_CHANNELS), IMAGE_PIXELS, IMAGE_PIXELS):
         raise ValueError(
@@ -43,10 +43,10 @@ def checked_image(image: np.ndarray) -> torch.Tensor:
 
 @dataclass(frozen=True, eq=False)
 class EffectMap:
-    """Effects of `kind` on the object in an image: ahead, to the left [m] and turn [rad], with σ.
+    """Effects and σ of `kind` on an image's object: ahead [m], to the left [m], rotation [rad].
 
-    image: (2, 48, 48). The model is queried when the map is first used, once for all plans, on a
-    grid of n_directions × n_phases. One that predicts no yaw is taken to predict none, with σ = 0.
+    image: (2, 48, 48). The model is queried on first use, once for all plans, on a grid of
+    n_directions × n_phases. If the model predicts no yaw, the rotation is 0 with σ = 0.
     """
 
     model: EffectModel
@@ -59,7 +59,7 @@ class EffectMap:
         check_count("n_directions", self.n_directions, 8, 720)
         check_count("n_phases", self.n_phases, 5, 500)
         checked_image(self.image)
-        object.__setattr__(self, "image", self.image.copy())  # the caller may write into his
+        object.__setattr__(self, "image", self.image.copy())  # the caller may change the original
         for channels in (self.model.action_channels, self.model.effect_channels):
             if not xy_columns(channels):
                 raise ValueError(
@@ -70,12 +70,12 @@ class EffectMap:
     @cached_property
     @torch.no_grad()
     def features(self) -> Tensor:
-        """What the model computes from the image, (1, F)."""
+        """Image features (1, F) of the model."""
         return self.model.encode(checked_image(self.image))
 
     @cached_property
     def warning(self) -> str:
-        """A sentence where the object is unlike all that the model was trained on."""
+        """A warning if the object is unlike the model's training objects, else empty."""
         novelty = getattr(self.model, "novelty", None)
         if novelty is None or novelty(checked_image(self.image)) <= 1:
             return ""
@@ -83,7 +83,7 @@ class EffectMap:
 
     @cached_property
     def radius_m(self) -> float:
-        """How far the object reaches from its middle."""
+        """Largest distance [m] of the object's outline from the image's centre."""
         return radius_m(self.image)
 
     @cached_property
@@ -92,29 +92,29 @@ class EffectMap:
         angles = np.arange(self.n_directions) * (2 * math.pi / self.n_directions)
         t_target = phases_of(self.kind, self.n_phases).float().expand(self.n_directions, -1)
         effect, std = self.query(angles, t_target)
-        # What a model predicts at the time before contact is no displacement.
+        # Before contact the true effect is zero: the model's prediction there is an offset.
         return effect - effect[:, :1], std
 
     @cached_property
     def reach_m(self) -> float:
-        """How far an action takes the object at most."""
+        """Largest distance [m] by which one action moves the object."""
         return float(self.grid[0][..., :2].norm(dim=-1).max())
 
     @cached_property
     def spline(self) -> NdBSpline:
-        """Effects and σ (6,) over the direction relative to the object as its image shows it, and
-        over the phase from `kind.acts_from` on, both counted in cells of the grid.
+        """Spline of effects and σ (6,) over the direction relative to the object in the image and
+        the phase from `kind.acts_from` on, both in units of grid cells.
         """
         smooth = torch.cat(self.grid, dim=-1).numpy()
         smooth = ndimage.spline_filter1d(smooth, axis=0, mode="grid-wrap")
         smooth = ndimage.spline_filter1d(smooth, axis=1, mode="mirror")
         smooth = np.pad(smooth, ((1, 2), (0, 0), (0, 0)), mode="wrap")
         smooth = np.pad(smooth, ((0, 0), (1, 2), (0, 0)), mode="reflect")
-        # Coefficient number k belongs to the grid's point k - 1, where its B-spline is centred.
+        # Coefficient k belongs to grid point k - 1, where its B-spline is centred.
         return NdBSpline(tuple(np.arange(n + 4) - 3.0 for n in smooth.shape[:2]), smooth, 3)
 
     def __call__(self, direction_rad: Tensor, phase: Tensor) -> tuple[Tensor, Tensor]:
-        """Effects and σ (..., 3) in the frame of the action, directions relative to the object."""
+        """Effects and σ (..., 3) in the action's frame, for directions relative to the object."""
         first = self.kind.acts_from
         row = torch.remainder(direction_rad, 2 * math.pi) * (self.n_directions / (2 * math.pi))
         column = (phase.clamp(first, 1) - first) * ((self.n_phases - 1) / (1 - first))
@@ -123,7 +123,7 @@ class EffectMap:
 
     @cached_property
     def fine_grid(self) -> tuple[Tensor, Tensor, dict[bool, cKDTree]]:
-        """A fine grid of directions and phases, and trees of where its actions bring the object."""
+        """A fine grid's directions and phases, and k-d trees of the positions that result."""
         angles = torch.arange(FINE_DIRECTIONS, dtype=torch.float64) * (
             2 * math.pi / FINE_DIRECTIONS
         )
@@ -136,9 +136,9 @@ class EffectMap:
         )
 
     def nearest(self, wanted_xy_m: Tensor, n: int, partial: bool) -> tuple[Tensor, Tensor]:
-        """Directions and phases (B, n) of the actions that bring it nearest to wanted (B, 2) [m].
+        """Directions and phases (B, n) of the n actions ending nearest to wanted_xy_m (B, 2).
 
-        partial: whether they may stop before the end.
+        partial: whether actions may stop before phase 1.
         """
         direction, phase, trees = self.fine_grid
         rows = torch.from_numpy(trees[partial].query(wanted_xy_m.numpy(), n)[1]).reshape(-1, n)
@@ -147,7 +147,7 @@ class EffectMap:
         return direction[rows], phase[rows]
 
     def query_model(self, direction_rad: Tensor, phase: Tensor) -> Tensor:
-        """As the map, for (n,) directions and phases, from the model itself: (n, 3)."""
+        """Effects (n, 3) for (n,) directions and phases, from the model instead of the spline."""
         first = torch.full_like(phase, self.kind.acts_from)
         t_target = torch.stack([first, phase.clamp_min(self.kind.acts_from)], dim=1).float()
         effect, _ = self.query(direction_rad.numpy(), t_target)
@@ -155,7 +155,7 @@ class EffectMap:
 
     @torch.no_grad()
     def query(self, direction_rad: np.ndarray, t_target: Tensor) -> tuple[Tensor, Tensor]:
-        """Effects and σ (n, T, 3), ahead, left and turn, of actions in n directions, by the model.
+        """Effects and σ (n, T, 3) of actions in n directions, by the model: ahead, left, turn.
 
         t_target: (n, T).
         """
@@ -173,5 +173,5 @@ class EffectMap:
 
 
 def phases_of(kind: type[Push] | type[Drag], n_phases: int) -> Tensor:
-    """The phases (T,) of a map's grid."""
+    """Phases (T,) of a map's grid."""
     return torch.linspace(kind.acts_from, 1, n_phases, dtype=torch.float64)

@@ -1,14 +1,14 @@
-"""The paper's continuous planner (Section 3.4, Algorithm 1), its two slips fixed.
+"""The paper's continuous planner (Section 3.4, Algorithm 1), with two errors corrected.
 
     direction ← random point on the circle of radius 0.2 m
     repeat    loss ← mean square of (target - predicted effect at t = 1 | e_1 = direction)
               direction ← direction - gradient step              until it no longer changes
     query the whole action and effect trajectory; stop at the phase of least distance to the target
 
-In the printed pseudo-code `index` never grows and the object's pose never advances; here they do.
-As there, only the position counts: each action is predicted for the object as its image shows it,
-although the ones before may turn it (`predicted_turn_rad` says how far). The decoded action
-trajectory is what the robot executes; `snap` replaces it by the push in the same direction.
+In the printed pseudo-code `index` and the object's pose are never updated; here they are. As in the
+paper, only the position counts: each action is predicted for the object as its image shows it,
+although earlier actions may rotate it (`predicted_turn_rad` is the rotation). The robot executes
+the decoded action trajectory; `snap` replaces it by the push in the same direction.
 """
 
 import math
@@ -44,13 +44,13 @@ def descend(
     direction_only: bool = False,
     trace: list[tuple[np.ndarray, np.ndarray]] | None = None,
 ) -> torch.Tensor:
-    """Effect inputs (starts, C_e) whose predicted effect at t = 1 is near the target (2,).
+    """Find effect inputs (starts, C_e) whose predicted effect at t = 1 is near the target (2,).
 
-    Descends the gradient of the mean square error with Adam, on the input alone, from some random
-    starts side by side; the best is the first. direction_only keeps the input on the circle of
-    effects that full pushes have. trace, if given, receives each iteration's inputs (starts, 2)
-    [m] and losses (starts,) [m²]. To the letter it begins, and may end, with effects that no
-    push has; nobody is warned of each.
+    Descends the gradient of the mean square error with Adam, on the input alone, from several
+    random starts in parallel; returns the best first. direction_only keeps the input on the circle
+    of effects that full pushes have. trace, if given, receives each iteration's inputs (starts, 2)
+    [m] and losses (starts,) [m²]. Without direction_only, as published, inputs may be effects that
+    no push has; `OutOfRangeWarning` is suppressed.
     """
     model, features = effects.model, effects.features
     columns = xy_columns(model.effect_channels)
@@ -99,14 +99,14 @@ def plan_gradient(
     seed: int = 0,
     snap: bool = False,
 ) -> Plan:
-    """Plan by gradient, as the paper does.
+    """Plan by gradient descent, as in the paper.
 
-    samples: phases at which the trajectory is queried; they bound how finely an action can be cut.
-    starts: random starts of the descent; the paper has one, lost where it lies opposite the goal.
-    direction_only: ours; search on the circle of effects that actions have, not in the whole plane,
-    where the network can be made to predict anything. snap: execute the primitive in the decoded
-    direction instead of the decoded action trajectory, as drags always are. Of the starts the best
-    that is in reach is taken; where none is, the plan ends.
+    samples: phases at which the trajectory is queried, which limit the resolution of the stop
+    phase. starts: random starts of the descent; the paper has one, which fails if it lies opposite
+    the goal. direction_only (ours): search on the circle of effects that actions have instead of
+    the whole plane, where the network can be made to predict anything. snap: execute the primitive
+    in the decoded direction instead of the decoded trajectory, as drags always are. The best start
+    whose action is reachable is used; without one, the plan ends.
     """
     began = time.perf_counter()
     check_count("samples", samples, 2, 10_000)
@@ -115,14 +115,14 @@ def plan_gradient(
     goal, mode = problem.goal, problem.mode
     columns = xy_columns(model.effect_channels)
     a_columns = [model.action_channels.index(name) for name in ("x", "y")]
-    effects.query(np.zeros(1), torch.ones(1, 1))  # a model of other actions refuses one
+    effects.query(np.zeros(1), torch.ones(1, 1))  # raises if the model is of other actions
     generator = np.random.default_rng(check_count("seed", seed, least=0))
     xy, target = np.asarray(problem.start_xy_m), np.asarray(goal.xy_m)
     steps: list[Step] = []
     turned = 0.0
     t = torch.linspace(0, 1, samples)
     while len(steps) < mode.max_steps and np.hypot(*(target - xy)) > SUCCESS_M:
-        # Of the starts the best that is in reach.
+        # Use the best start whose action is reachable.
         for effect in descend(effects, target - xy, generator, starts, direction_only):
             with torch.no_grad():
                 prediction = _predict(model, effects.features, effect[None], t[None])
@@ -139,7 +139,7 @@ def plan_gradient(
             distance = np.hypot(*(xy + path - target).T)
             stop = int(np.argmin(distance))
             if distance[stop] > SUCCESS_M and distance[-1] - distance[stop] < NEARER_M:
-                stop = samples - 1  # the path only jitters at its end: the goal lies beyond it
+                stop = samples - 1  # only noise at the path's end: the goal lies beyond it
         if stop == 0:
             break
         xy_before, xy = xy, xy + path[stop]

@@ -1,15 +1,14 @@
-"""Orientation and height: one partial action each, stopped where the model predicts what is wanted.
+"""Orientation and height: one partial action each, stopped at the phase of the desired effect.
 
-Grasp and rotate have no parameters (Section 3.3), so a model of them knows only one gripper yaw.
-But grasping with the hand rotated by α is equivalent to grasping the object rotated by -α: the
-model is shown the image rotated back, and predicts the effect for every yaw of the gripper. The yaw
-is chosen, and the phase at which to stop is looked up on the predicted trajectory yaw(t) or z(t); t
-is continuous.
+Grasp and rotate have no parameters (Section 3.3), so a model of them covers only one gripper yaw.
+But grasping with the hand rotated by α is equivalent to grasping the object rotated by -α: given
+the image rotated back, the model predicts the effect for every gripper yaw. The planner chooses the
+yaw, and interpolates the stop phase on the predicted trajectory yaw(t) or z(t).
 
-The paper adds grasp and rotate to the branches of the search when the goal asks for them (Section
-3.4). They leave the position as it is and nothing can follow a grasp, so `PosePlanner` puts them
-after the actions that bring the object to its position. One image serves all of it: a hand at an
-object that a push has rotated is, in the frame of the image taken before, a hand rotated back.
+The paper adds grasp and rotate to the branches of the search when the goal requires them (Section
+3.4). They do not change the position and nothing can follow a grasp, so `PosePlanner` puts them
+after the actions that bring the object to its position. One image is enough: acting on an object
+that a push has rotated is equivalent to rotating the hand back in the image taken before.
 """
 
 import math
@@ -29,23 +28,23 @@ from affordlib.types import Goal, Step, check_finite, check_pair, check_within
 
 N_PHASES = 301
 Z_90 = 1.28
-"""One-sided 90 % quantile of a Gaussian: a height more σ above the predicted one is ruled out."""
+"""One-sided 90 % quantile of a Gaussian; heights above mean + Z_90 σ count as unreachable."""
 
 FULL_ROTATION_SHARE = 0.9
-"""Of the hand's sweep: a whole rotation that turns the object by less has slipped."""
+"""Fraction of the hand's sweep; a full rotation that turns the object by less has slipped."""
 
 GRIPPER_YAWS_RAD = tuple(np.radians([0, 15, -15, 30, -30, 45, -45, 60, -60, 75, -75, 90]).tolist())
-"""Yaws of the gripper to choose from, the smallest first: the fingers are alike, so 180° in all."""
+"""Candidate gripper yaws, by magnitude; they cover 180°, since the two fingers are identical."""
 
 
 def aligned_gripper_yaws(yaw_rad: float) -> tuple[float, ...]:
-    """Yaws at which a gripper takes an object as one at another yaw has left it, unturned."""
+    """Gripper yaws that grasp, without rotating it, an object released at another gripper yaw."""
     return tuple(wrap_angle(yaw_rad + k * math.pi / 2) for k in (0, 1, -1))
 
 
 @dataclass(frozen=True)
 class PredictedTrajectories:
-    """One channel of the effect over the phase (n,): mean and std (m, n), for m gripper yaws.
+    """Trajectories of one effect channel over phase (n,): mean and std (m, n) for m gripper yaws.
 
     The effect is zero at the first phase.
     """
@@ -64,7 +63,7 @@ def predict_trajectories(
     channel: str,
     gripper_yaws_rad: Sequence[float] = GRIPPER_YAWS_RAD,
 ) -> PredictedTrajectories:
-    """What a model predicts of a primitive for each yaw of the gripper [rad].
+    """Predict the effect of a primitive for each gripper yaw [rad].
 
     Raises ValueError where the model has no such channel.
     """
@@ -89,7 +88,7 @@ def predict_trajectories(
 
 
 def crossings(phase: np.ndarray, values: np.ndarray, wanted: float) -> np.ndarray:
-    """Phases at which a trajectory, straight between its samples, has the wanted value."""
+    """Phases at which a trajectory, linear between its samples, crosses the wanted value."""
     below = values < wanted
     at = np.flatnonzero(below[1:] != below[:-1])
     share = (wanted - values[at]) / (values[at + 1] - values[at])
@@ -99,13 +98,13 @@ def crossings(phase: np.ndarray, values: np.ndarray, wanted: float) -> np.ndarra
 def candidate_turns(
     predicted: PredictedTrajectories, xy_m: Sequence[float], turn_rad: float
 ) -> Iterator[Step]:
-    """Rotations that turn an object at (x, y) by an angle, each with another gripper yaw, best
-    first.
+    """Candidate steps that rotate an object at (x, y) by an angle, best first; each has another
+    gripper yaw.
 
-    Closing, the fingers align a cuboid; then the hand turns counter-clockwise, so an angle far
-    behind is reached by going on around. The best is the one with the least σ of those predicted to
-    have the object turned as wanted while it is held. Where none has, it is the whole rotation with
-    the least σ of those that turn it by most of their sweep, and another has to follow.
+    The closing fingers align a cuboid; then the hand rotates counter-clockwise, so negative angles
+    take a rotation of up to 360°. The best step has the lowest σ of those predicted to reach the
+    angle while the object is held. If there is none, it is the full rotation of lowest σ that turns
+    the object by most of its sweep, and another step has to follow.
     """
     wanted = wrap_angle(check_finite("turn_rad", turn_rad))
     place, phase = check_pair("xy_m", xy_m), predicted.phase
@@ -136,10 +135,10 @@ def candidate_turns(
 def candidate_lifts(
     predicted: PredictedTrajectories, xy_m: Sequence[float], height_m: float
 ) -> Iterator[Step]:
-    """Grasps that hold an object from (x, y) at a height [m], each with another gripper yaw, best
-    first.
+    """Candidate grasps that hold an object from (x, y) at a height [m], best first; each has
+    another gripper yaw.
 
-    The best is sure (mean less σ) to lift it highest, of equals (to a centimetre) the first.
+    The best has the highest mean - σ of the height; ties, to a centimetre, go to the first.
     """
     height = check_within("height_m", height_m, 0.0, 0.5, "m")
     place, phase = check_pair("xy_m", xy_m), predicted.phase
@@ -149,7 +148,7 @@ def candidate_lifts(
         primitive = Grasp(grip_yaw=predicted.gripper_yaws_rad[k])
         closed = phase >= primitive.segment_phases[-2]
         if mean.max() < height <= mean[-1] + Z_90 * std[-1]:
-            # It may slip, or not; if it does not, it goes where the hand goes.
+            # The object may slip; if it does not, it moves with the hand.
             hand = primitive.path(phase)[:, 2]
             mean = np.maximum(hand - hand[closed][0], 0.0)
         stops = crossings(phase[closed], mean[closed], height)
@@ -161,21 +160,21 @@ def candidate_lifts(
 def _step_at(
     place: tuple[float, float], primitive: Grasp | Rotate, stop_phase: float, **predicted: float
 ) -> Step:
-    """A step that leaves the object at its place."""
+    """A step that does not change the object's position."""
     return Step(primitive, stop_phase, place, np.array([place, place]), std_m=0.0, **predicted)
 
 
 TURN_TOLERANCE_RAD = math.radians(2)
 MAX_TURNS = 7
-"""A whole round in sweeps of 60°, and one more for what aligning may turn back."""
+"""Maximum number of rotations: 360° in sweeps of 60°, and one more for the error of aligning."""
 
 
 @dataclass(frozen=True)
 class PosePlanner:
-    """The steps that turn and lift an object as a goal wants it, from one image (2, 48, 48) of it.
+    """Plans the steps that rotate and lift an object as a goal requires, from one image of it.
 
-    rotate, grasp: the models; can_act: whether the arm can act, by primitive and position [m].
-    Predictions are kept, so that a search can ask at every node.
+    image: (2, 48, 48); rotate, grasp: the models; can_act: whether the arm can act, by primitive
+    and position [m]. Predictions are cached, so that a search can query every node.
     """
 
     image: np.ndarray
@@ -187,9 +186,9 @@ class PosePlanner:
     def __call__(
         self, goal: Goal, xy_m: Sequence[float], turned_rad: float = 0.0, std_m: float = 0.0
     ) -> tuple[Step, ...] | None:
-        """The steps for an object at (x, y) that has turned since its image was taken.
+        """Plan for an object at (x, y) that has rotated by turned_rad since its image was taken.
 
-        std_m: σ of that position. None where the goal's orientation or height cannot be had.
+        std_m: σ of that position. None where the goal's orientation or height is unreachable.
         """
         steps: list[Step] = []
         turned, lift_yaws = turned_rad, GRIPPER_YAWS_RAD
@@ -204,7 +203,7 @@ class PosePlanner:
             primitive = Rotate(_smallest_yaw(step.primitive.grip_yaw + turned))
             turned += step.predicted_turn_rad
             steps.append(replace(step, primitive=primitive, predicted_turn_rad=turned))
-            # A grasp takes the object as the rotation left it, or it would turn it back.
+            # The grasp has the yaw of the rotation's grip; another would rotate the object.
             hand_rad = float(primitive.path(step.stop_phase)[0, 3])
             lift_yaws = aligned_gripper_yaws(hand_rad - turned)
         if goal.height_m is not None:
@@ -219,7 +218,7 @@ class PosePlanner:
     def _predicted(
         self, kind: type[Grasp] | type[Rotate], channel: str, yaws: tuple[float, ...]
     ) -> PredictedTrajectories:
-        """Predictions for gripper yaws relative to the image, to half a degree."""
+        """Cached predictions for gripper yaws relative to the image, rounded to half a degree."""
         key = kind, tuple(round(2 * math.degrees(yaw)) / 2 for yaw in yaws)
         if key not in self._kept:
             model, near = self.rotate if kind is Rotate else self.grasp, np.radians(key[1])
@@ -228,5 +227,5 @@ class PosePlanner:
 
 
 def _smallest_yaw(yaw_rad: float) -> float:
-    """The same hand, its fingers being alike, turned as little as can be."""
+    """The equivalent yaw of smallest magnitude, the two fingers being identical."""
     return (yaw_rad + math.pi / 2) % math.pi - math.pi / 2

@@ -1,4 +1,4 @@
-"""Plans of moves that the arm can follow: the learned model proposes, the kinematics vetoes."""
+"""Plans of pushes and drags that the arm can follow: a model proposes, the kinematics vetoes."""
 
 import math
 from collections import defaultdict
@@ -21,26 +21,26 @@ from affordlib.types import Goal, Observation, Plan
 Point = tuple[float, float]
 
 MAX_VETOED_PLANS = 12
-"""Of plans to one place; then another route is looked for."""
+"""Maximum number of vetoed plans to one position before another route is tried."""
 
 MAX_VETOED_ROUTES = 150
 REFUSED_WITHIN_M, REFUSED_WITHIN_RAD = 0.01, math.radians(6)
-"""How near to a refused action, in place and direction, none is planned again."""
+"""Actions this near to a refused action, in position [m] and direction [rad], are excluded."""
 
 WAYPOINT_TOLERANCE_M = 0.01
 
 
 class Ending(NamedTuple):
-    """How a closed loop ends: one of `closed_loop.STATUSES`, and the same in words."""
+    """How a closed loop ends: one of `closed_loop.STATUSES`, and a message."""
 
     status: str
     message: str
 
 
 class MovePlanner:
-    """Finds plans to a position; remembers which actions the kinematics has refused.
+    """Plans to a position; remembers which actions the kinematics has refused.
 
-    vetoes: how many those are.
+    vetoes: number of refused actions.
     """
 
     def __init__(
@@ -56,9 +56,9 @@ class MovePlanner:
         self._blocked: dict[type[Primitive], set[tuple[int, int]]] = defaultdict(set)
 
     def plan(self, seen: Observation, goal: Goal, grip_yaw: float | None = None) -> Plan | Ending:
-        """A plan that the arm can follow, from where the object is seen, or why there is none.
+        """A plan that the arm can follow from the object's observed position, or an `Ending`.
 
-        grip_yaw: of a hand that carries the object, where it can, whatever suits its image.
+        grip_yaw: drag with the hand at this yaw if possible, even if the image suggests a push.
         """
         if grip_yaw is not None and Drag.name in self.skills.models:
             plan = self._plan(seen, goal, Drag)
@@ -92,7 +92,7 @@ class MovePlanner:
     def _plan_along(
         self, effects: EffectMap, start: Point, goal: Goal, route: list[Point]
     ) -> Plan | None:
-        """A plan that goes as far along a route as it can, straight ahead if a route leads on."""
+        """Plan as far along a route as possible; straight towards the goal if a route continues."""
         farthest_m = 0.98 * self.mode.max_steps * effects.reach_m
         ahead = np.subtract(goal.xy_m, start)
         distance_m = float(np.hypot(*ahead))
@@ -115,7 +115,7 @@ class MovePlanner:
     def _plan_to(
         self, effects: EffectMap, start: Point, goal: Goal, within_m: float
     ) -> Plan | None:
-        """A plan that ends within a distance of a goal and that the kinematics lets pass."""
+        """A plan that ends within a distance of a goal and passes the kinematic check."""
         for _ in range(MAX_VETOED_PLANS):
             allowed = self._allowed(effects.kind)
             plan = self.planner(PlanningProblem(start, goal, effects, self.mode, allowed))
@@ -130,7 +130,7 @@ class MovePlanner:
     def _feasible_route(
         self, effects: EffectMap, start: Point, goal_xy_m: Point
     ) -> list[Point] | None:
-        """Places on the way to a goal, every action of it checked by the kinematics."""
+        """Places on a route to the goal, each action of which passes the kinematic check."""
         for _ in range(MAX_VETOED_ROUTES):
             route = self._route(effects, start, goal_xy_m)
             if route is None:
@@ -149,7 +149,7 @@ class MovePlanner:
         return find_route(routes, start, goal_xy_m, allowed, self._blocked[kind], effects.radius_m)
 
     def _allowed(self, kind: type[Primitive]) -> Feasible:
-        """Where the arm can act: what was learned, less what its kinematics has refused."""
+        """Where the arm can act: learned reachability, without the actions refused so far."""
         learned = self.skills.reachable(kind)
         refused = [(xy, angle) for name, xy, angle in self._refused if name == kind.name]
 
@@ -164,10 +164,10 @@ class MovePlanner:
         return allowed
 
     def _first_refused(self, actions: Iterable[tuple[Primitive, float, Point]]) -> int | None:
-        """The number of the first action that the kinematics refuses, and is not to be planned
-        again; actions: with the phase at which each stops, and where the object is before it.
+        """Index of the first action that the kinematics refuses, which is then excluded; else None.
 
-        It is asked about the bare primitives, not about a decoded path or the grip of a drag.
+        actions: primitive, phase at which it stops, and position of the object before it. The
+        primitives are checked, not a decoded trajectory or the grip of a drag.
         """
         for k, (action, stop_phase, at) in enumerate(actions):
             if not self.robot.can_reach(action, stop_phase, at):
@@ -178,7 +178,7 @@ class MovePlanner:
 
 
 def _straight_action(effects: EffectMap, start: Point, end: Point) -> tuple[Primitive, float]:
-    """The action straight from a place to another, and the phase at which it has gone so far."""
+    """The action straight from one place to another, and the phase at which it arrives."""
     move = np.subtract(end, start)
     angle = math.atan2(move[1], move[0])
     phase = torch.linspace(0, 1, 101, dtype=torch.float64)

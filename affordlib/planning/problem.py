@@ -1,4 +1,4 @@
-"""What every planner solves, and the three settings of Table 3."""
+"""The planning problem that every planner solves, and the three settings of Table 3."""
 
 import time
 from collections.abc import Callable
@@ -19,17 +19,17 @@ from affordlib.types import (
 )
 
 Reachable = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""Which of the positions (n, 2) and directions (n,) the arm can act at."""
+"""Function of positions (n, 2) and directions (n,): whether the arm can act there, (n,)."""
 
 
 def everywhere(xy_m: np.ndarray, *_: np.ndarray) -> np.ndarray:
-    """The arm can act at all positions (n, 2), in all directions."""
+    """Say that the arm can act at all positions (n, 2), in all directions."""
     return np.ones(len(xy_m), bool)
 
 
 @dataclass(frozen=True)
 class PlanMode:
-    """How many actions a plan may have, and whether they may stop before the end."""
+    """Maximum number of actions of a plan, and whether they may stop before phase 1."""
 
     max_steps: int
     partial: bool
@@ -46,19 +46,19 @@ MODES: dict[str, PlanMode] = {
 
 
 def is_on_table(xy_m: np.ndarray, radius_m: float = 0.0) -> np.ndarray:
-    """Which of the points (n, 2) lie on the table, farther than a radius [m] from its rim."""
+    """Whether points (n, 2) lie on the table and farther than a radius [m] from its rim: (n,)."""
     (x0, x1), (y0, y1) = TABLE_X_M, TABLE_Y_M
     inside = np.array(xy_m) - (x0 + radius_m, y0 + radius_m)
     return ((inside >= 0) & (inside <= (x1 - x0 - 2 * radius_m, y1 - y0 - 2 * radius_m))).all(-1)
 
 
 def check_has_room(goal: Goal, radius_m: float) -> None:
-    """Raise ValueError where an object of a radius [m] would not stand on the table as a whole."""
+    """Raise ValueError where an object of a radius [m] would extend beyond the table's rim."""
     if not is_on_table(np.array([goal.xy_m]), radius_m)[0]:
         x, y = goal.xy_m
         raise ValueError(
-            f"goal xy_m = ({x:g}, {y:g}) m is too near the rim of the table for an object that "
-            f"reaches {100 * radius_m:.1f} cm from its middle"
+            f"goal xy_m = ({x:g}, {y:g}) m is too near the rim of the table for an object with a "
+            f"radius of {100 * radius_m:.1f} cm; move the goal inwards"
         )
 
 
@@ -66,10 +66,10 @@ def check_has_room(goal: Goal, radius_m: float) -> None:
 class PlanningProblem:
     """Bring an object from a start [m] to a goal, by actions with known effects.
 
-    mode: a `PlanMode`, or its name in `MODES`. reachable: a function of positions (n, 2) and
-    directions (n,) that says where the arm can act (default: everywhere). pose_planner: what turns
-    and lifts the object at the end, without which a plan cannot reach a goal that asks for it.
-    Raises ValueError where the object would not stand on the table as a whole.
+    mode: a `PlanMode`, or its name in `MODES`. reachable: function of positions (n, 2) and
+    directions (n,): whether the arm can act there (default: everywhere). pose_planner: plans the
+    final rotation and lift, without which a plan cannot reach a goal that requires them. Raises
+    ValueError where the object would extend beyond the table's rim.
     """
 
     start_xy_m: tuple[float, float]
@@ -88,7 +88,7 @@ class PlanningProblem:
     def plan_of(
         self, steps: tuple[Step, ...], planner: str, reaches_goal: bool, began_s: float
     ) -> Plan:
-        """The plan of some steps, with what turns and lifts the object at their end, and its time.
+        """Make a `Plan` of some steps: append those that rotate and lift, and record the time.
 
         began_s: when planning began, by `time.perf_counter`.
         """
@@ -97,7 +97,7 @@ class PlanningProblem:
             turned, std_m = (steps[-1].predicted_turn_rad, steps[-1].std_m) if steps else (0.0, 0.0)
             end = self.pose_planner and self.pose_planner(goal, end_xy_m, turned, std_m)
             steps, reaches_goal = steps + (end or ()), end is not None
-        # A search that rounds may have been a hair nearer to the goal than its plan.
+        # A search with rounded values may end slightly nearer to the goal than its plan.
         reaches_goal &= goal.distance_m(end_xy_m) <= goal.tolerance_m
         seconds, about = time.perf_counter() - began_s, self.effects.warning
         return Plan(goal, self.start_xy_m, steps, planner, reaches_goal, seconds, about)

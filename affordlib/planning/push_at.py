@@ -1,10 +1,10 @@
-"""Planning with off-centre pushes: where one pushes steers position and yaw.
+"""Planning with off-centre pushes: the contact point determines displacement and rotation.
 
-What a push does in the object's frame does not depend on where the object is. So a library of
-pushes (contact on the outline, direction, length) is predicted once, by any model of a log, and
-chains of one to three are looked up in it: all pairs are a tree in (x, y, ρ yaw), in which what a
-first push leaves is sought. Of the chains found the one with the least expected squared distance
-to the goal is taken; ρ, the object's radius of gyration, makes a length of a turn.
+The effect of a push in the object's frame does not depend on the object's pose. So the effects of a
+library of pushes (contact on the outline, direction, length) are predicted once, by any model of a
+log. Chains of one to three pushes are searched in it: all pairs form a k-d tree in (x, y, ρ yaw),
+queried for what remains after each first push. The chain with the least expected squared distance
+to the goal is chosen; ρ, the object's radius of gyration, converts rotations to lengths.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from affordlib.types import Goal, Plan, Step, check_array, check_count, check_on
 
 N_CANDIDATES = 600
 LENGTHS_M = 0.002, 0.045
-"""Of pushes of an object that was only seen."""
+"""Range of push lengths for an object without a log of pushes."""
 MOST_INCIDENCE_RAD = math.radians(50)
 CORNER_SHARE = 0.08
-"""So much of an edge is left out at either end."""
+"""Fraction of an edge excluded from contacts at each end."""
 SHORTEST_SHARE = 0.3
 _NEIGHBOURS = 30
 
@@ -41,12 +41,12 @@ def plan_push_at(
     seed: int = 0,
     turn_m: float | None = None,
 ) -> Plan:
-    """Plan off-centre pushes from a pose (x, y, yaw) to a goal; its turn counts if it has one.
+    """Plan off-centre pushes from a pose (x, y, yaw) to a goal, with its rotation if it has one.
 
-    log: what the model was fitted to, of one group, or `pushes_around` the outline of an object
-    that was only seen; the object, its context and the lengths of pushes are taken from it.
-    turn_m: so many metres a radian counts (default: the radius of gyration). Raises ValueError
-    where a group is not alone.
+    log: the log that the model was fitted to, with one group only, or `pushes_around` the outline
+    of an object that was only seen; it determines the object, its context and the lengths of
+    pushes. turn_m: metres per radian in the distance to the goal (default: the radius of gyration).
+    Raises ValueError for more than one group.
     """
     began = time.perf_counter()
     x, y, yaw = check_array("pose", pose, 3)
@@ -95,20 +95,20 @@ def plan_push_at(
 
 
 def primitive_of(pushes: PushLog, k: int, heading_rad: float) -> PushAt:
-    """Push k as the middle of the tool does it on the object turned by a heading."""
+    """Push k as a motion of the tool's centre, for an object rotated by a heading."""
     middle = pushes.contact_m[k] - pushes.tool_radius_m * pushes.normal[k]
     direction = math.atan2(pushes.direction[k, 1], pushes.direction[k, 0]) + heading_rad
     return PushAt(tuple(rotated(middle, heading_rad)), direction, float(pushes.length_m[k]))
 
 
 def _turned(xy: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """Points (n, 2), each turned by an angle (n,)."""
+    """Rotate points (n, 2), each by its angle (n,)."""
     c, s = np.cos(angle), np.sin(angle)
     return np.column_stack([c * xy[:, 0] - s * xy[:, 1], s * xy[:, 0] + c * xy[:, 1]])
 
 
 def _after(pose: np.ndarray, effect: np.ndarray) -> np.ndarray:
-    """Poses (n, 3) after effects (n, 3) in the frame of each."""
+    """Poses (n, 3) after effects (n, 3), each in the frame of its pose."""
     return np.column_stack(
         [pose[:, :2] + _turned(effect[:, :2], pose[:, 2]), pose[:, 2] + effect[:, 2]]
     )
@@ -121,9 +121,9 @@ def pushes_around(
     lengths_m: tuple[float, float] = LENGTHS_M,
     seed: int | np.random.Generator = 0,
 ) -> PushLog:
-    """Pushes drawn all around an outline (k, 2) [m], as a log whose effects are zero.
+    """Draw pushes all around an outline (k, 2) [m]; returns a log whose effects are zero.
 
-    Its corners are told as feet of equal weight, which is all that the outline tells of them.
+    Its corners are given as feet of equal weight, in the absence of other information.
     """
     rng, outline_m = np.random.default_rng(seed), centred(outline_m)[1]
     edges = np.roll(outline_m, -1, axis=0) - outline_m
@@ -144,7 +144,7 @@ def pushes_around(
 
 
 def _candidates(log: PushLog, rng: np.random.Generator) -> PushLog:
-    """Pushes around the object of a log, as long as its own or somewhat shorter, told as much."""
+    """Draw pushes around the object of a log, with its context, as long as its own or shorter."""
     longest = log.length_m.max()
     lengths = min(log.length_m.min(), SHORTEST_SHARE * longest), longest
     drawn = pushes_around(log.outline_m, log.tool_radius_m, lengths_m=lengths, seed=rng)

@@ -1,7 +1,7 @@
-"""Where the arm can act: learned from what it could and could not do (Section 3.4 of the paper).
+"""Reachability: where the arm can act, learned from its attempts (Section 3.4 of the paper).
 
-A small network answers for a primitive, a place on the table and a direction. It is trained on
-recorded interactions alone; the kinematics stays unknown.
+A small network predicts it from primitive, position on the table and direction. It is trained on
+recorded interactions alone, without the arm's kinematics.
 """
 
 from collections.abc import Sequence
@@ -23,9 +23,9 @@ _REMEDY = "learn it again with python -m experiments.shipped reachability"
 
 
 class Reachability(nn.Module):
-    """The probability that the arm can carry out a primitive at a place.
+    """Predicts the probability that the arm can execute a primitive at a position.
 
-    primitives: names of those that it learns, or has learned.
+    primitives: names of those that it is trained on.
     """
 
     def __init__(self, primitives: Sequence[str]) -> None:
@@ -41,7 +41,7 @@ class Reachability(nn.Module):
 
     @classmethod
     def load(cls, path: str | Path | None = None) -> Self:
-        """What was learned and saved; default: the shipped one, of the set `reach`.
+        """Load a saved network; default: the shipped one, trained on the set `reach`.
 
         Raises FileNotFoundError, or ValueError when the file is damaged or of another network.
         """
@@ -49,7 +49,7 @@ class Reachability(nn.Module):
         return restored(path, _REMEDY, lambda described: cls(described["primitives"]))[0]
 
     def save(self, path: str | Path) -> Path:
-        """Write the weights to a file that `load` reads, whole or not at all; returns its path."""
+        """Write the weights to a file, which `load` reads, atomically; returns its path."""
         return write_weights(
             path, self.state_dict(), {"format": _FORMAT, "primitives": [*self.primitives]}
         )
@@ -58,10 +58,10 @@ class Reachability(nn.Module):
     def probability(
         self, primitive: str, xy_m: np.ndarray, direction_rad: np.ndarray | float | None = None
     ) -> np.ndarray:
-        """Probability (n,) that `primitive` is in reach of objects at xy_m: (n, 2).
+        """Probability (n,) that `primitive` can be executed on objects at xy_m: (n, 2).
 
-        It is 1 for a primitive that was not learned: then the arm's kinematics alone decides.
-        direction_rad: (n,) or one number, in which a push or drag moves; None for the others.
+        It is 1 for a primitive that was not learned, where only the kinematics decides.
+        direction_rad: (n,) or one number, the direction of a push or drag; None for the others.
         """
         primitive_named(primitive)
         xy_m = np.atleast_2d(np.asarray(xy_m, dtype=float))
@@ -75,7 +75,7 @@ class Reachability(nn.Module):
 
 
 def reach_features(kind: np.ndarray, xy_m: np.ndarray, direction_rad: np.ndarray) -> torch.Tensor:
-    """(n, 4 + primitives): place, direction (zero where there is none), which primitive."""
+    """Network inputs (n, 4 + primitives): position, direction (zero if none), one-hot primitive."""
     ahead = np.column_stack([np.cos(direction_rad), np.sin(direction_rad)])
     ahead[np.isnan(direction_rad)] = 0.0
     return torch.from_numpy(np.hstack([2 * xy_m, ahead, kind])).float()

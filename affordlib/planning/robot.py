@@ -1,6 +1,6 @@
-"""What planning needs of a robot, and nothing more: no simulator's truth reaches a planner.
+"""The interface of a robot for planning; planners get no ground truth of a simulator.
 
-`affordlib.world.Tabletop` is one; a real arm, or another simulator, is one behind these methods.
+`affordlib.world.Tabletop` implements it; so can a real arm or another simulator.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from affordlib.types import Observation, Step
 
 @runtime_checkable
 class Execution(Protocol):
-    """What the robot itself measured while it carried out an action.
+    """What the robot measured while it executed an action.
 
     tool: (n, 5) x, y, z [m] and yaw [rad] of the tool, gap of the fingers [m], evenly over the
     phases from 0 to where the action stopped.
@@ -26,33 +26,33 @@ class Execution(Protocol):
 
     @property
     def object_path(self) -> np.ndarray:
-        """(m, 4) of the object, from before the action until it rests or is held after it.
+        """Path (m, 4) of the object, from before the action until it is at rest or held.
 
-        x, y [m] and yaw [rad] in the frame of the table, height [m] above where it stood before:
-        (x, y, height, yaw). It is recorded for figures and tables; the closed loop never reads it.
+        x, y [m] in the frame of the table, height [m] above the start, yaw [rad]: (x, y, height,
+        yaw). It is recorded for figures and tables; the closed loop never reads it.
         """
 
 
 @runtime_checkable
 class Robot(Protocol):
-    """Looks at one object on a table, and acts on it."""
+    """A robot that observes one object on a table and acts on it."""
 
     def observe(self) -> Observation:
-        """Look at the object; raises NothingSeenError where there is none to be seen."""
+        """Observe the object; raises NothingSeenError if no object is visible."""
 
     def execute(self, step: Step) -> Execution:
-        """Carry out an action of a plan; raises UnreachableError before any motion."""
+        """Execute an action of a plan; raises UnreachableError before any motion."""
 
     def can_reach(
         self, primitive: Primitive, stop_phase: float = 1.0, at_xy_m: Sequence[float] | None = None
     ) -> bool:
         """Whether the arm's kinematics allows an action on an object at (x, y) [m].
 
-        at_xy_m: default: where the object is seen.
+        at_xy_m: default: the observed position.
         """
 
     def park(self) -> None:
-        """Put down what the hand holds, and move the arm out of the camera's sight."""
+        """Put down a held object, and move the arm out of the camera's view."""
 
     def settle(self, seconds: float = 0.5) -> None:
-        """Wait, the arm standing still."""
+        """Wait without moving the arm."""

@@ -1,4 +1,4 @@
-"""Chains of actions on an effect map: where they lead, with σ, and as steps of a plan."""
+"""Chains of actions on an effect map: predicted poses with σ, and conversion to a plan's steps."""
 
 import math
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from affordlib.planning.effect_map import EffectMap, rotate
 from affordlib.types import Step
 
 PATH_SAMPLES = 25
-"""Points of the predicted path that a step carries, as in Section 4.3."""
+"""Number of points of a step's predicted path, as in Section 4.3."""
 
 
 def roll_out(
@@ -21,8 +21,8 @@ def roll_out(
     """Positions (B, K, 2) [m], turns (B, K) [rad] and variances (B, K) [m²] after each action.
 
     direction_rad, phase: (B, K), of chains that start at the origin. The variance is the trace of
-    the covariance of the position: what each action adds, and what the variance of the turn makes
-    of the actions that follow.
+    the position's covariance: the variance of each action, and the effect of the rotation's
+    variance on later actions.
     """
     n, k_max = direction_rad.shape
     position, turned = direction_rad.new_zeros(n, 2), direction_rad.new_zeros(n)
@@ -34,7 +34,7 @@ def roll_out(
     for k in range(k_max):
         angle = direction_rad[:, k]
         effect, std = effects((angle - turned)[:, None] + nearby, phase[:, k, None].expand(n, 3))
-        slope = (effect[:, 1] - effect[:, 2]) / (nearby[2] - nearby[1])  # by the turn before it
+        slope = (effect[:, 1] - effect[:, 2]) / (nearby[2] - nearby[1])  # d effect / d turned
         effect, added = effect[:, 0], std[:, 0].square()
         swing = rotate(slope[:, :2], angle)
         trace = (
@@ -59,10 +59,10 @@ def make_steps(
     chain: Tensor,
     predicted: tuple[Tensor, Tensor] | None = None,
 ) -> tuple[Step, ...]:
-    """The steps of a chain (K, 2) of directions [rad] and phases, from a start (x, y) [m].
+    """Make steps of a chain (K, 2) of directions [rad] and phases, from a start (x, y) [m].
 
-    predicted: positions (K, 2) and turns (K,) after each action, relative to the start, where they
-    are known better than from the map.
+    predicted: positions (K, 2) and rotations (K,) after each action, relative to the start, if more
+    accurate ones than the map's are known.
     """
     if not len(chain):
         return ()

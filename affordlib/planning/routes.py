@@ -1,8 +1,8 @@
-"""Routes to far goals: over a grid of places, by actions that are in reach.
+"""Routes to distant goals: shortest paths over a grid of places, by reachable actions.
 
-A planner of a few actions sees 25 cm far. Whether an object can be brought across the table at all,
-and by which route, is a question of where the arm can act; Dijkstra's algorithm from the goal
-answers it for all places at once. The fine planner then goes from waypoint to waypoint.
+A planner of a few actions covers about 25 cm. Whether an object can be brought across the table,
+and by which route, depends on where the arm can act. Dijkstra's algorithm from the goal answers
+this for all places at once; the planner then goes from waypoint to waypoint.
 """
 
 import math
@@ -19,25 +19,25 @@ from affordlib.primitives import Drag, Push
 from affordlib.types import TABLE_X_M, TABLE_Y_M
 
 Feasible = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
-"""Which actions from positions (n, 2), in directions (n,), of lengths (n,) [m] are possible."""
+"""Function of positions (n, 2), directions (n,), lengths (n,) [m]: which actions are possible."""
 
 CELL_M = 0.02
 _X_M, _Y_M = (np.arange(low + CELL_M / 2, high, CELL_M) for low, high in (TABLE_X_M, TABLE_Y_M))
 PLACES_XY_M = np.stack(np.meshgrid(_X_M, _Y_M, indexing="ij"), axis=-1).reshape(-1, 2)
 REACH_M = {Push: 0.075, Drag: 0.045}
-"""How far one action takes nearly any object: a little less than the whole action mostly does."""
+"""Distance [m] that one action moves nearly any object, a little less than most full actions."""
 
 
 def place_at(xy_m: Sequence[float]) -> int:
-    """The number of the place of the grid that is nearest to a point (x, y) [m]."""
+    """Index of the grid's place that is nearest to a point (x, y) [m]."""
     return int(np.hypot(*(PLACES_XY_M - xy_m).T).argmin())
 
 
 @dataclass(frozen=True)
 class RouteMap:
-    """Which places one action of at most `reach_m` can bring an object to from which.
+    """Pairs of places between which one action of at most `reach_m` can move an object.
 
-    origin, end: (E,), numbers of places, by origin and then by end; length_m: (E,).
+    origin, end: (E,), indices of places, sorted by origin and then by end; length_m: (E,).
     """
 
     reach_m: float
@@ -47,7 +47,7 @@ class RouteMap:
 
     @classmethod
     def of(cls, reach_m: float, feasible: Feasible) -> Self:
-        """The map of an arm that can carry out some actions."""
+        """Make the map for actions that are feasible."""
         n, shape = math.floor(reach_m / CELL_M), np.array([len(_X_M), len(_Y_M)])
         moves = np.mgrid[-n : n + 1, -n : n + 1].reshape(2, -1).T
         length_m = CELL_M * np.hypot(*moves.T)
@@ -71,13 +71,13 @@ def find_route(
 ) -> list[tuple[float, float]] | None:
     """Places (x, y) [m] after each action of the shortest route, the goal last; None without one.
 
-    feasible: of the first and the last action. blocked: moves from place to place that must not be
-    used; radius_m: no place on the route is nearer to the rim of the table than this.
+    feasible: used for the first and the last action. blocked: moves between places that must not be
+    used; radius_m: minimum distance of the route's places from the rim of the table.
     """
     start, goal = np.asarray(start_xy_m, dtype=float), np.asarray(goal_xy_m, dtype=float)
 
     def one_action(origins: np.ndarray, ends: np.ndarray) -> np.ndarray:
-        """Lengths of single actions between points (n, 2), inf where they are not possible."""
+        """Lengths of single actions between points (n, 2), inf where not possible."""
         origins, ends = np.broadcast_arrays(origins, ends)
         way = ends - origins
         length_m = np.hypot(*way.T)
@@ -95,7 +95,7 @@ def find_route(
     barred = [n * origin + end for origin, end in blocked]
     usable = inside[routes.origin] & ~np.isin(n * routes.origin + routes.end, barred)
     origin, end, length_m = (v[usable] for v in (routes.origin, routes.end, routes.length_m))
-    # Backwards, from the goal, which is number n.
+    # The graph is reversed, to search from the goal, which has index n.
     lasts = np.flatnonzero(np.isfinite(last_m))
     backwards = (
         np.concatenate([length_m, last_m[lasts]]),

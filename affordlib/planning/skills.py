@@ -1,4 +1,4 @@
-"""What the robot can do: a model for each primitive, and where its arm can act."""
+"""The skills of a robot: a model for each primitive, and where its arm can act."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -33,8 +33,8 @@ _KEPT = {"default_factory": dict, "init": False, "repr": False, "compare": False
 class Skills:
     """Models by the name of their primitive, and the probability that the arm can act.
 
-    reachability: None means that it can act everywhere; threshold: from which probability on an
-    action is tried. It is low, since the arm's kinematics has the last word.
+    reachability: None means that the arm can act everywhere. threshold: minimum probability of an
+    action to be planned; it is low, since the arm's kinematics is checked afterwards.
     """
 
     models: dict[str, EffectModel]
@@ -50,12 +50,12 @@ class Skills:
 
     @classmethod
     def load(cls) -> Self:
-        """The shipped models, and reachability as it was learned from the shipped interactions."""
+        """Load the shipped models, and the reachability learned from the shipped interactions."""
         models = {primitive: load_checkpoint(name)[0] for primitive, name in CHECKPOINTS.items()}
         return cls(models, Reachability.load())
 
     def model(self, primitive: type[Primitive]) -> EffectModel:
-        """The model of a primitive; raises KeyError naming those that are there."""
+        """Return the model of a primitive; KeyError, with the names of those present, if none."""
         if primitive.name not in self.models:
             raise KeyError(
                 f"primitive {primitive.name!r} has no model here, only {sorted(self.models)} have"
@@ -64,7 +64,7 @@ class Skills:
 
     @staticmethod
     def kind_for(image: np.ndarray) -> type[Push] | type[Drag]:
-        """How an object is moved, by its image: what would roll away is caged and dragged."""
+        """Primitive that moves the object in an image: drag for one that would roll, else push."""
         return Drag if looks_rollable(checked_image(image)[0].numpy()) else Push
 
     def problem(
@@ -74,9 +74,9 @@ class Skills:
         goal: Goal,
         mode: str | PlanMode = "multi_partial",
     ) -> PlanningProblem:
-        """The problem of bringing the object in an image (2, 48, 48) from (x, y) [m] to a goal.
+        """Pose the problem of moving the object in an image (2, 48, 48) from (x, y) [m] to a goal.
 
-        What the models predict is kept for the last image.
+        The models' predictions are cached for the last image.
         """
         effects, poses = self._predictions(image)
         reachable = self.reachable(effects.kind)
@@ -85,13 +85,13 @@ class Skills:
     def planner(
         self, plan: Callable[..., Plan], mode: str | PlanMode = "multi_partial", **settings: Any
     ) -> "SkillPlanner":
-        """A planner with settings, such as `plan_astar`, as (image, start_xy_m, goal) → Plan."""
+        """Make a planner (image, start_xy_m, goal) → Plan from a function such as `plan_astar`."""
         return SkillPlanner(self, partial(plan, **settings), mode)
 
     def effects(self, image: np.ndarray, kind: type[Push] | type[Drag] | None = None) -> EffectMap:
-        """What moving the object in an image (2, 48, 48) does; kept for the last image.
+        """Effect map of the object in an image (2, 48, 48); cached for the last image.
 
-        kind: how it is moved (default: `kind_for` the image).
+        kind: the primitive (default: `kind_for` the image).
         """
         if kind in (None, self.kind_for(image)):
             return self._predictions(image)[0]
@@ -112,7 +112,7 @@ class Skills:
         return bool(self.reachable(primitive_named(name))(np.array([xy_m]), None)[0])
 
     def reachable(self, kind: type[Primitive]) -> Reachable:
-        """Where the arm can act with a primitive."""
+        """Function that says where the arm can act with a primitive."""
         if self.reachability is None:
             return everywhere
 
@@ -122,7 +122,7 @@ class Skills:
         return reachable
 
     def routes(self, kind: type[Push] | type[Drag]) -> RouteMap:
-        """Where the arm can take an object from where, all over the table; made once."""
+        """Moves that the arm can make between places all over the table; computed once."""
         if kind not in self._routes:
             self._routes[kind] = RouteMap.of(REACH_M[kind], self.reachable(kind))
         return self._routes[kind]
