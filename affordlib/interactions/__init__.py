@@ -1,4 +1,4 @@
-"""The robot's experience: collecting it, storing it, and cutting it into training batches."""
+"""Interactions of the robot with objects: collection, storage and batches for training."""
 
 from affordlib.interactions.dataset import InteractionTensors, Scaler, Split, split_interactions
 from affordlib.interactions.log import Log, PushLog

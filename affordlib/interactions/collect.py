@@ -1,10 +1,10 @@
-"""Collecting experience: seeded, resumable, in this process or on a Dask cluster.
+"""Collection of data sets: seeded, resumable, in this process or on a Dask cluster.
 
-What an interaction leaves in a data set is here too: its arrays, dimensions, units and provenance.
+This module also defines the variables of a data set: arrays, dimensions, units and provenance.
 
-Workers send back chunks of interactions, which are kept in a hidden folder beside the file until
-all are there; a rerun makes only what is missing. The finished set is the same bits whoever
-collected it, in whatever order.
+Workers return chunks of interactions, which are stored in a hidden folder beside the file until
+all are complete; a rerun collects only missing chunks. The finished set is bit-identical for any
+number of workers and any order of chunks.
 """
 
 import os
@@ -42,10 +42,10 @@ from affordlib.world.execution import RECORDED_SAMPLES
 from affordlib.world.trajectory import N_SAMPLES
 
 CHUNK = 50
-"""Interactions that are made, sent and kept together."""
+"""Number of interactions per chunk, the unit that a worker collects, returns and stores."""
 
 GRAIN = 2.0**-20
-"""About 1 µm or 1 µrad: what is smaller in a float32 is not kept."""
+"""Resolution of stored float32 values, about 1 µm or 1 µrad, to which they are rounded."""
 
 _VARIABLES = {
     "interaction": ("int64", ""),
@@ -77,7 +77,7 @@ _VARIABLES = {
     "left_table": ("bool", ""),
     "fault": ("bool", "", "", "not to be believed: exclude"),
 }
-"""Type, dimensions after the interaction, unit and meaning of what every set holds."""
+"""Type, dimensions after `interaction`, unit and meaning of the variables of every set."""
 
 _PARAMETER = ("float64", "", "m or rad", "parameter of the primitive")
 _FULL_EFFECT = "the state of the full execution at stop_phase"
@@ -95,12 +95,12 @@ def collect(
     progress: bool = True,
     replace: bool = False,
 ) -> str | Path:
-    """Collect a recipe into a local file and return its path, which ends in .zarr.zip.
+    """Collect a recipe's data set into a local file and return its path, which ends in .zarr.zip.
 
-    client: of Dask; None means `workers` processes of this machine, at most 256. A rerun makes what
-    is missing; a whole file is made again only with `replace`. Raises ValueError for a path where
-    anything else is, RuntimeError while another process collects into it, and when a chunk cannot
-    be made.
+    client: a Dask client; None uses `workers` processes on this machine, at most 256. A rerun
+    collects missing chunks; a complete file is replaced only with `replace`. Raises ValueError if
+    the path holds anything else, RuntimeError if another process is collecting into it or if a
+    chunk cannot be collected.
     """
     if not str(path).endswith(SUFFIX):
         raise ValueError(f"path must end in {SUFFIX!r}, got {str(path)!r}")
@@ -121,16 +121,16 @@ def collect(
             shutil.rmtree(parts, ignore_errors=True)
     except Timeout:
         raise RuntimeError(
-            f"another process is collecting into {file}; wait for it or choose another path"
+            f"another process is collecting into {file}; wait for it, or choose another path"
         ) from None
     except (KeyboardInterrupt, OSError) as error:
-        error.add_note("finished chunks are kept; collect into the same path to go on")
+        error.add_note("finished chunks are kept; collect into the same path to continue")
         raise
     return path
 
 
 def _attributes(file: Path) -> dict[str, str] | None:
-    """The attributes of a set that is there, whole."""
+    """Return the attributes of a complete set, or None if there is none."""
     try:
         return open_interactions(file).attrs
     except (CorruptedDataError, OSError):
@@ -138,10 +138,10 @@ def _attributes(file: Path) -> dict[str, str] | None:
 
 
 def _is_there(file: Path, attrs: dict[str, str], replace: bool) -> bool:
-    """Whether this very set is there, and is to stay; ValueError if anything else is."""
+    """Return whether the file is this set and is kept; raises ValueError for any other content."""
     found = None if replace else _attributes(file)
     if found != attrs and (file.is_dir() or (os.path.lexists(file) and not replace)):
-        what = "a set of another recipe, or of other package versions" if found else "no whole set"
+        what = "a set of another recipe, or of other package versions" if found else "incomplete"
         raise ValueError(
             f"path {file} is {what}; choose another path, delete it, or pass replace=True"
         )
@@ -155,7 +155,7 @@ def _collected(
     client: "dask.distributed.Client | None",
     progress: bool,
 ) -> xr.Dataset:
-    """The whole set; chunks that are missing among the parts are made."""
+    """Collect the chunks that are missing in `parts` and return the complete set."""
     n = recipe.n_interactions
     rows = [range(k, min(k + CHUNK, n)) for k in range(0, n, CHUNK)]
     kept = {r: parts / f"{r.start:08d}-{r.stop:08d}{SUFFIX}" for r in rows}
@@ -165,19 +165,19 @@ def _collected(
     bar = tqdm(total=n, initial=there, unit=" interactions", disable=disable)
     with closing(made), bar:
         for r, chunk in made:
-            write_interactions(chunk, kept[r], level=1)  # read once: speed counts
+            write_interactions(chunk, kept[r], level=1)  # temporary, so speed matters
             bar.update(len(r))
     chunks = [open_interactions(path) for path in kept.values()]
     return xr.concat(chunks, "interaction", data_vars="minimal", combine_attrs="override")
 
 
 def _make(recipe: Recipe, attrs: dict[str, str], rows: range) -> xr.Dataset:
-    """A chunk of a set that has these attributes; what a worker is sent."""
+    """Collect one chunk on a worker; raises RuntimeError if its set would have other attributes."""
     here = attributes_for(recipe)
     if here != attrs:
         raise RuntimeError(
-            f"this worker would make another set than the collector described: it has {here}, "
-            f"not {attrs}; give both the same packages"
+            f"this worker would make another set than the collector expects: it has {here}, "
+            f"not {attrs}; install the same package versions on both"
         )
     return collect_chunk(recipe, rows)
 
@@ -185,7 +185,7 @@ def _make(recipe: Recipe, attrs: dict[str, str], rows: range) -> xr.Dataset:
 def _made(
     make: partial, missing: list[range], client: "dask.distributed.Client | None"
 ) -> Iterator[tuple[range, xr.Dataset]]:
-    """Yield the rows and the data of each chunk as it is made, here or by the client's workers."""
+    """Yield rows and data of each chunk once it is collected, here or by the client's workers."""
     futures = {}
     if client is None:
         results = ((rows, partial(make, rows)) for rows in missing)
@@ -201,8 +201,8 @@ def _made(
             except Exception as error:
                 raise RuntimeError(
                     f"interactions {rows.start} to {rows.stop - 1} could not be collected: "
-                    f"{type(error).__name__}: {error}; finished chunks are kept, collect again "
-                    "into the same path when the cause is fixed"
+                    f"{type(error).__name__}: {error}; finished chunks are kept; fix the cause and "
+                    "collect into the same path again"
                 ) from error
             yield rows, chunk
     finally:
@@ -211,11 +211,11 @@ def _made(
 
 
 def attributes_for(recipe: Recipe) -> dict[str, str]:
-    """The attributes of a recipe's data set, known before it is collected."""
+    """Return the attributes of a recipe's data set, which are known before it is collected."""
     if LeverUp.name in recipe.primitives and set(recipe.primitives) != {LeverUp.name}:
         raise ValueError(
             f"primitives {recipe.primitives} have images of different sizes; collect lever_up "
-            "in a set of its own"
+            "in a separate set"
         )
     packages = ("affordlib", "numpy", "pybullet", "example-robot-data", "ur-analytic-ik")
     return {
@@ -229,8 +229,8 @@ def attributes_for(recipe: Recipe) -> dict[str, str]:
 
 
 def collect_chunk(recipe: Recipe, numbers: range) -> xr.Dataset:
-    """The interactions of a recipe with the given numbers."""
-    # Read when a set is made: a reader may have added categories and primitives.
+    """Collect the interactions of a recipe with the given numbers."""
+    # Evaluated at run time, because a user may have added categories and primitives.
     flags = {"primitive": " ".join(PRIMITIVES), "family": " ".join(CATEGORIES)}
     variables = _VARIABLES | dict.fromkeys(flags, ("int8", ""))
     kinds = [primitive_named(name) for name in recipe.primitives]
@@ -254,14 +254,14 @@ def collect_chunk(recipe: Recipe, numbers: range) -> xr.Dataset:
         known = zip(("units", "long_name"), about, strict=False)
         attrs = {"flag_meanings": flags[name]} if name in flags else {k: v for k, v in known if v}
         values = np.stack([row[name] for row in rows])
-        if dtype == "float32":  # noise would take space
+        if dtype == "float32":  # digits below the resolution compress badly
             values = np.round(values.astype(np.float64) / GRAIN) * GRAIN
         data[name] = (("interaction", *dims.split()), values.astype(dtype), attrs)
     return xr.Dataset(data, attrs=attributes_for(recipe))
 
 
 def _row(obj: TabletopObject, done: Interaction, config: WorldConfig) -> dict[str, object]:
-    """The values of an interaction by the names of variables, and others that are not stored."""
+    """Return an interaction's values by variable name, including some that are not stored."""
     primitive = done.primitive
     parameters = {name: getattr(primitive, name) for name in _field_names(type(primitive))}
     return (

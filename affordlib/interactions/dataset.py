@@ -1,6 +1,6 @@
-"""From a data set to tensors: which interactions train, validate and test, and their scales.
+"""Tensors of a data set, their split into training, validation and test, and their scaling.
 
-Section 4.3 of the paper: 80/10/10 inside each of 10 folds.
+The split is 80/10/10 inside each of 10 folds (Section 4.3 of the paper).
 """
 
 from dataclasses import dataclass, replace
@@ -14,18 +14,18 @@ from affordlib.types import HasChannels, check_array, check_count, check_finite
 
 
 def valid_interactions(data: "xarray.Dataset", interactions: np.ndarray) -> np.ndarray:
-    """Those of the interactions that the arm could reach, without faults of the simulator."""
+    """Select the interactions that the arm could reach and that have no simulator faults."""
     return interactions[(data["reached"].values & ~data["fault"].values)[interactions]]
 
 
 def check_numbers(name: str, interactions: np.ndarray) -> None:
-    """Raise, naming the argument, unless these are the numbers (n,) of interactions, n ≥ 1."""
+    """Raise ValueError unless these are the numbers (n,) of interactions, n ≥ 1."""
     if interactions.ndim != 1 or interactions.dtype.kind not in "iu" or not len(interactions):
         raise ValueError(f"{name} must be numbers (n,) of interactions, got {interactions!r:.80}")
 
 
 def check_channels(name: str, tensors: HasChannels, model: HasChannels) -> None:
-    """Raise, naming the argument, unless tensors have the channels of a model, in its order."""
+    """Raise ValueError unless tensors have the channels of a model, in its order."""
     for kind in ("action_channels", "effect_channels"):
         own, wanted = getattr(tensors, kind), getattr(model, kind)
         if own != wanted:
@@ -46,9 +46,9 @@ class Split:
 
 
 def split_interactions(n: int, seed: int = 0, fold: int = 0, n_folds: int = 10) -> Split:
-    """Shuffle interactions 0 … n-1 into `n_folds` blocks: one tests, the next validates.
+    """Shuffle interactions 0 … n-1 into `n_folds` blocks: one for test, the next for validation.
 
-    Each interaction has an object of its own, so this splits by object.
+    Each interaction has its own object, so the split is by object.
     """
     check_count("n", n, 3, 10_000_000)
     check_count("n_folds", n_folds, 3, n)
@@ -62,9 +62,9 @@ def split_interactions(n: int, seed: int = 0, fold: int = 0, n_folds: int = 10) 
 
 @dataclass(frozen=True)
 class Scaler:
-    """Scales that bring channels near unit size; x and y share one, and zero stays zero.
+    """Scales that normalise channels to unit RMS without an offset; x and y share one scale.
 
-    image_mean, image_std: of depth and mask.
+    image_mean, image_std: mean and standard deviation of depth and mask.
     """
 
     action_scale: tuple[float, ...]
@@ -80,7 +80,7 @@ class Scaler:
 
     @classmethod
     def fit(cls, tensors: "InteractionTensors") -> Self:
-        """Scales of training data: root mean square of the channels, mean and std of the image."""
+        """Compute the scales of training data: RMS of the channels, mean and std of the image."""
         image = tensors.image.double()
         return cls(
             _scales(tensors.action, tensors.action_channels),
@@ -104,8 +104,8 @@ _BY_INTERACTION = ("image", "action", "effect", "stop_phase")
 class InteractionTensors:
     """Interactions as tensors: image (N, 2, 48, 48), phase (S,), action and effect (N, S, C).
 
-    How wide the images are is not stored: give a model those of the width it was trained on.
-    stop_phase: (N,), by which `phase` is multiplied: below 1 where an action was truncated.
+    stop_phase: (N,), factor on `phase`, below 1 for partial actions. The images' width [m] is not
+    stored; it must be the width that a model was trained on.
     """
 
     image: torch.Tensor
@@ -128,7 +128,7 @@ class InteractionTensors:
         action_channels: tuple[str, ...] = ("x", "y"),
         effect_channels: tuple[str, ...] = ("x", "y"),
     ) -> Self:
-        """The chosen (default: all) interactions that are valid, and channels."""
+        """Build tensors of the valid ones of the given interactions (default: all)."""
         chosen = np.arange(data.sizes["interaction"]) if interactions is None else interactions
         check_numbers("interactions", chosen)
         part = data.isel(interaction=valid_interactions(data, chosen))
@@ -152,26 +152,26 @@ class InteractionTensors:
         )
 
     def phases(self, at: torch.Tensor) -> torch.Tensor:
-        """Phases (N, k) of the samples with numbers (N, k), or (k,) of all interactions."""
+        """Return phases (N, k) of the samples with numbers (N, k), or (k,) for all interactions."""
         return self.phase[at] * self.stop_phase[:, None]
 
     def action_at(self, at: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Phases (N, k) and actions (N, k, C) of samples, numbered as in `phases`."""
+        """Return phases (N, k) and actions (N, k, C) of samples, numbered as in `phases`."""
         return self.phases(at), self.action[torch.arange(len(self))[:, None], at]
 
     def effect_at(self, at: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Phases (N, k) and effects (N, k, C) of samples, numbered as in `phases`."""
+        """Return phases (N, k) and effects (N, k, C) of samples, numbered as in `phases`."""
         return self.phases(at), self.effect[torch.arange(len(self))[:, None], at]
 
     def __len__(self) -> int:
         return len(self.image)
 
     def select(self, rows: torch.Tensor | slice) -> Self:
-        """The interactions with the given row numbers."""
+        """Return the interactions with the given row numbers."""
         return replace(self, **{n: getattr(self, n)[rows] for n in _BY_INTERACTION})
 
     def joined(self, *others: "InteractionTensors") -> Self:
-        """These interactions and those of others of the same phases and channels, in order."""
+        """Concatenate these interactions with others that have the same phases and channels."""
         parts = (self, *others)
         if len({(p.action_channels, p.effect_channels) for p in parts}) > 1:
             raise ValueError("action_channels and effect_channels of others must be the same")
@@ -180,7 +180,7 @@ class InteractionTensors:
         )
 
     def rotated_and_mirrored(self, quarters: int, mirror: bool = False) -> Self:
-        """The same interactions on a table mirrored in y, then turned by quarter turns."""
+        """Return the interactions mirrored in y, if `mirror`, then rotated by quarters · π/2."""
         heading = torch.tensor([(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)][quarters % 4])
         image, action, effect = self.image, self.action, self.effect
         if mirror:
@@ -196,15 +196,15 @@ class InteractionTensors:
 
 
 Symmetry = tuple[int, bool]
-"""A number of quarter turns, and whether the table is mirrored before."""
+"""The number of rotations by π/2, and whether y is mirrored first."""
 
 
 def augment_by_symmetry(
     arrays: InteractionTensors, symmetries: tuple[Symmetry, ...]
 ) -> InteractionTensors:
-    """Interactions of a primitive without a direction, and what they would be under symmetries.
+    """Augment interactions of a primitive without direction parameters by rotation and reflection.
 
-    Image and effect are turned and mirrored; the commanded action stays, as it does in the world.
+    Image and effect are rotated and mirrored; the commanded action is unchanged.
     """
     parts = [replace(arrays.rotated_and_mirrored(*s), action=arrays.action) for s in symmetries]
     return parts[0].joined(*parts[1:])

@@ -1,13 +1,13 @@
-"""Interactions of one's own: a folder with a table and images, as any robot's log can be written.
+"""Import and export of interactions as a folder with a table and images, for any robot's log.
 
-trajectories.csv     one row per interaction and moment: interaction, t, action_x, action_y, …,
+trajectories.csv     one row per interaction and time: interaction, t, action_x, action_y, …,
                      effect_x, effect_y, …; t from 0 to 1, lengths in m, angles in rad, relative
-                     to the object as it stood at t = 0
-images/NAME.png      NAME is the entry in the column interaction: depth seen from above before
-                     the action, 48×48 pixels, 16 cm wide, rows along -y, 16 bits of 0.1 mm from
-                     a plane 1 m above the table (so the table is 10000)
-images/NAME_mask.png the object, 8 bits, white where it fills the pixel; where there is none,
-                     all that is higher than 2 mm is taken for the object
+                     to the object's pose at t = 0
+images/NAME.png      NAME is the value in the column interaction: depth image from above, taken
+                     before the action, 48×48 pixels, 16 cm wide, rows along -y, 16 bits in units
+                     of 0.1 mm from a plane 1 m above the table (so the table is 10000)
+images/NAME_mask.png mask of the object (optional), 8 bits, white where the object fills the pixel;
+                     without it, all points higher than 2 mm belong to the object
 """
 
 from pathlib import Path
@@ -27,35 +27,35 @@ _HIGHER_M = 0.002
 
 
 def read_folder(folder: str | Path, n_samples: int = 101) -> InteractionTensors:
-    """The interactions of a folder, in the order of its table, at n_samples phases each.
+    """Read the interactions of a folder, in the order of its table, at n_samples phases each.
 
-    Between the rows of the table trajectories are interpolated. Raises FileNotFoundError or
-    ValueError that says which file, which row and what is expected.
+    Trajectories are interpolated between the rows of the table. Raises FileNotFoundError or
+    ValueError that names the file, the row and the expected content.
     """
     check_count("n_samples", n_samples, least=2)
     folder, phase = Path(folder), np.linspace(0, 1, n_samples)
     path = folder / TABLE
     if not path.is_file():
         raise FileNotFoundError(
-            f"folder: there is no {path}; expected are {TABLE} with the columns interaction, t, "
+            f"folder: there is no {path}; write a {TABLE} with the columns interaction, t, "
             f"action_x, …, effect_x, …, and {IMAGES}/NAME.png for each interaction"
         )
-    try:  # only an empty entry is missing: "NA" is a name as good as others
+    try:  # only an empty entry counts as missing; "NA" is a valid name
         table = pd.read_csv(path, dtype={"interaction": str}, keep_default_na=False, na_values=[""])
     except ValueError as error:
-        raise ValueError(f"{path} is no table of comma-separated values: {error}") from error
+        raise ValueError(f"{path} is not a table of comma-separated values: {error}") from error
     actions, effects = _columns(path, table)
     yaws = [name.endswith("yaw") for name in actions + effects]
     trajectories, images = [], []
     for name, rows in table.groupby("interaction", sort=False):
         t, values = rows["t"].to_numpy(float), rows[actions + effects].to_numpy(float)
         if len(t) < 2 or t[0] != 0 or t[-1] != 1 or (np.diff(t) <= 0).any():
-            raise ValueError(f"{path}: t of interaction {name!r} must grow from 0 to 1")
+            raise ValueError(f"{path}: t of interaction {name!r} must increase from 0 to 1")
         values[:, yaws] = np.unwrap(values[:, yaws], axis=0)
         trajectories.append(np.column_stack([np.interp(phase, t, column) for column in values.T]))
         images.append(_read_depth(folder / IMAGES / f"{name}.png"))
     if not trajectories:
-        raise ValueError(f"{path}: there are no rows")
+        raise ValueError(f"{path} has no rows; write one per interaction and time")
     both = torch.from_numpy(np.stack(trajectories)).float()
     return InteractionTensors(
         torch.from_numpy(np.stack(images)),
@@ -66,7 +66,7 @@ def read_folder(folder: str | Path, n_samples: int = 101) -> InteractionTensors:
 
 
 def write_folder(folder: str | Path, tensors: InteractionTensors) -> Path:
-    """Write interactions as `read_folder` reads them; returns the folder."""
+    """Write interactions in the format of `read_folder` and return the folder."""
     folder = Path(folder)
     (folder / IMAGES).mkdir(parents=True, exist_ok=True)
     columns = [f"action_{c}" for c in tensors.action_channels]
@@ -86,9 +86,9 @@ def write_folder(folder: str | Path, tensors: InteractionTensors) -> Path:
 
 
 def _columns(path: Path, table: pd.DataFrame) -> list[list[str]]:
-    """The table's columns of actions and of effects, in the order of the channels.
+    """Return the names of the table's action and effect columns, in the order of the channels.
 
-    Raises ValueError for what is wrong.
+    Raises ValueError if columns are missing or unknown, or entries are not numbers.
     """
     for name in ("interaction", "t"):
         if name not in table:
@@ -105,7 +105,7 @@ def _columns(path: Path, table: pd.DataFrame) -> list[list[str]]:
         if wrong.any():
             row = int(wrong.argmax())
             raise ValueError(
-                f"{path}: the column {name!r} must hold numbers only, line {row + 2} has "
+                f"{path}: the column {name!r} must hold only numbers, but line {row + 2} has "
                 f"'{table[name][row]}'"
             )
     if (empty := table["interaction"].isna()).any():
@@ -115,22 +115,22 @@ def _columns(path: Path, table: pd.DataFrame) -> list[list[str]]:
 
 
 def _pixels(path: Path) -> np.ndarray:
-    """The values (48, 48) of an image."""
+    """Read the values (48, 48) of an image."""
     n = IMAGE_PIXELS
     if not path.is_file():
-        raise FileNotFoundError(f"there is no image {path} of the interaction of that name")
+        raise FileNotFoundError(f"there is no image {path} for the interaction of that name")
     try:
         with Image.open(path) as file:
             values = np.asarray(file)
     except (OSError, SyntaxError, ValueError) as error:
-        raise ValueError(f"{path} is damaged, or no image: {error}") from error
+        raise ValueError(f"{path} is damaged, or is not an image: {error}") from error
     if values.shape != (n, n):
         raise ValueError(f"{path} must be a gray image of {n}×{n} pixels, got {values.shape}")
     return values
 
 
 def _read_depth(path: Path) -> np.ndarray:
-    """Depth [m] and mask (2, 48, 48)."""
+    """Read depth [m] and mask (2, 48, 48) of an image."""
     units, mask_path = _pixels(path), path.with_name(f"{path.stem}_mask.png")
     if not np.issubdtype(units.dtype, np.integer) or units.max() <= 255:
         got = f"{units.dtype}, at most {units.max()}"

@@ -1,11 +1,11 @@
-"""Lever-ups as trajectories of poses in the frame of the lever (Section 4.1 and Table 1).
+"""Lever-ups as trajectories of poses in the lever's frame (Section 4.1 and Table 1).
 
-The origin is the contact point, x the direction of the lever, as in the image, which was taken so.
-A step is 150 ms, every twelfth sample: 26 poses, the first of them zero, since a pose is the
-object's change since the start: x, y, z [m] and the tilt [rad] of its upright axis. The stored yaw
-is left out: it is the heading of an axis of the object that no image shows, and says little of a
-body that is tilted by 65°. Of the commanded action x and z change, relative to the contact (the
-blade slides in, then lifts along its arc).
+The origin is the contact point and x the direction of the lever, as in the image.
+A step is 150 ms, every 12th sample, which gives 26 poses. A pose is the object's change since the
+start: x, y, z [m] and the tilt [rad] of its vertical axis. The stored yaw is omitted, because it is
+the heading of a body axis that the image does not show, and has little meaning for a body tilted by
+65°. The commanded action is x and z relative to the contact (the blade slides in, then lifts along
+its arc); its other channels are constant.
 """
 
 from dataclasses import replace
@@ -21,13 +21,13 @@ from affordlib.types import check_choice
 LEVER_ACTION_CHANNELS = ("x", "z")
 POSE_CHANNELS = ("x", "y", "z", "tilt")
 EVERY = 12
-"""Every twelfth of the 301 samples: 150 ms, the paper's step."""
+"""Stride over the 301 samples: every 12th is a step of 150 ms, as in the paper."""
 
 N_OBSERVED, N_PREDICTED = 15, 5
-"""Steps of a window that are observed, and those to predict (Table 1)."""
+"""Numbers of observed and of predicted steps in a window (Table 1)."""
 
 MIRRORED: tuple[Symmetry, ...] = ((0, False), (0, True))
-"""A lever-up, and the same seen in a mirror along the lever: see `augment_by_symmetry`."""
+"""Reflection augmentation: a lever-up and its mirror image in y (see `augment_by_symmetry`)."""
 
 _NEAR = slice(16, 112), slice(32, 128)
 
@@ -35,10 +35,10 @@ _NEAR = slice(16, 112), slice(32, 128)
 def lever_up_tensors(
     data: "xarray.Dataset", interactions: np.ndarray | None = None, view: str = "near"
 ) -> InteractionTensors:
-    """Lever-ups as 26 steps of poses and commanded actions, in the frame of the lever.
+    """Return lever-ups as 26 steps of poses and commanded actions, in the lever's frame.
 
-    view: "near", the 42 cm of the image that objects reach into, 48×48 (means of four pixels);
-    "wide", all of its 56 cm, 48×48; "full", as taken, 128×128. Faults are left out.
+    view: "near", the 42 cm of the image that contain the object, 48×48 (means of four pixels);
+    "wide", all of its 56 cm, 48×48; "full", as recorded, 128×128. Faulty ones are excluded.
     """
     xyz = ("x", "y", "z")
     on_table = InteractionTensors.from_dataset(data, interactions, xyz, POSE_CHANNELS)
@@ -59,7 +59,7 @@ def lever_up_tensors(
 
 
 def select_view(image: torch.Tensor, view: str) -> torch.Tensor:
-    """Images (N, C, 128, 128) as `lever_up_tensors` shows them to a model."""
+    """Crop and scale images (N, C, 128, 128) to a view of `lever_up_tensors`."""
     if check_choice("view", view, ("near", "wide", "full")) == "full":
         return image
     if view == "near":
@@ -68,5 +68,5 @@ def select_view(image: torch.Tensor, view: str) -> torch.Tensor:
 
 
 def n_windows(tensors: InteractionTensors) -> int:
-    """How many windows of 15 + 5 steps a trajectory has."""
+    """Return the number of windows of 15 + 5 steps in a trajectory."""
     return len(tensors.phase) - N_OBSERVED - N_PREDICTED + 1

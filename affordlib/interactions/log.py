@@ -1,8 +1,8 @@
-"""A log of one's own: pushes of one object as a robot recorded them, checked and made comparable.
+"""Logs of a robot's own pushes of one object: checks and conversion to a common frame.
 
-`Log` takes raw numbers, in millimetres or metres and in the frame of the world; `Log.tensors` gives
-a `PushLog`, in metres and radians and in the object's frame as it stood before each push: its
-origin is the centroid of the outline, its axes are those of the recorded pose.
+`Log` accepts raw numbers, in millimetres or metres and in the world frame. `Log.tensors` returns a
+`PushLog` in metres and radians, in the object's frame before each push: the origin is the centroid
+of the outline, the axes are those of the recorded pose.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ N_PHASES = 51
 MOST_ROWS = 20_000
 LARGEST_M = 1.0
 SLACK_M = 0.03
-"""So much farther than its tool an object may have moved."""
+"""Distance [m] by which an object may move farther than the tool."""
 
 
 @dataclass(frozen=True)
 class PushLog:
-    """n pushes of one object, each in the object's frame as it stood before; metres and radians.
+    """n pushes of one object, each in the object's frame before the push; metres and radians.
 
-    contact_m: (n, 2) where the tool first touches the outline; normal: (n, 2) unit, inward, there;
-    direction: (n, 2) unit and length_m: (n,), from there to where the tool ends;
-    displacement_m: (n, 2) of the centroid and turn_rad: (n,), at the end; outline_m: (k, 2)
-    counter-clockwise; groups: (n,); context: what else is known of each, by name (n,); action:
-    (n, T, 2) of the tool and effect: (n, T, 3) x, y, yaw at equally spaced phases in [0, 1], NaN
-    where not known; crop_width_m: of images of the object.
+    contact_m: (n, 2), where the tool first touches the outline; normal: (n, 2), inward unit normal
+    there; direction: (n, 2), unit vector, and length_m: (n,), from there to the tool's final
+    position; displacement_m: (n, 2), of the centroid, and turn_rad: (n,), in total; groups: (n,);
+    context: further known values of each push by name, (n,); action: (n, T, 2) of the tool and
+    effect: (n, T, 3) x, y, yaw at equally spaced phases in [0, 1], NaN where unknown; outline_m:
+    (k, 2), counter-clockwise; crop_width_m: width of the object's images.
     """
 
     contact_m: np.ndarray
@@ -59,22 +59,22 @@ class PushLog:
         return len(self.contact_m)
 
     def select(self, rows: np.ndarray) -> PushLog:
-        """The pushes with these numbers, or where a mask (n,) is true."""
+        """Return the pushes with these row numbers, or where a mask (n,) is True."""
         taken = {f.name: getattr(self, f.name) for f in fields(self)[:-3]}
         taken["context"] = {name: values[rows] for name, values in self.context.items()}
         return replace(self, **{n: v if n == "context" else v[rows] for n, v in taken.items()})
 
     def image(self) -> np.ndarray:
-        """Depth [m] and mask (2, 48, 48) of the object in its own axes, rendered from the outline.
+        """Render depth [m] and mask (2, 48, 48) of the object in its own frame from the outline.
 
-        Its height is not known; 5 cm are drawn.
+        The height is unknown and set to 5 cm.
         """
         return outline_image(self.outline_m, self.crop_width_m)
 
     def interaction_tensors(self) -> InteractionTensors:
-        """The same as the book's networks take them, at the phases where all effects are known.
+        """Return the pushes as tensors for the networks, at the phases where all effects are known.
 
-        Shipped models read images as `CROP_WIDTH_M` wide, and notice no other `crop_width_m`.
+        Shipped models assume images of width `CROP_WIDTH_M`; another `crop_width_m` is no error.
         """
         known = np.flatnonzero(np.isfinite(self.effect).all(axis=(0, 2)))
         image = torch.from_numpy(self.image()).expand(len(self), -1, -1, -1)
@@ -84,12 +84,12 @@ class PushLog:
 
 
 class Log:
-    """Pushes of one object, added one by one; wrong numbers are refused where they are added.
+    """Pushes of one object, added one by one; invalid numbers are rejected when they are added.
 
     unit: of all lengths, "mm" or "m"; angle_unit: of yaws, "rad" or "deg"; outline: corners (x, y)
-    in the frame whose pose is recorded, without crossing itself (of an image: `outline_of`);
-    crop_width_m: of images of the object, which must fit in; tool_radius: of a tool whose middle is
-    recorded.
+    of a simple polygon in the frame whose pose is recorded (from an image: `outline_of`);
+    crop_width_m: width [m] of the object's images, which must contain it; tool_radius: radius of a
+    round tool whose centre is recorded.
     """
 
     def __init__(
@@ -125,13 +125,13 @@ class Log:
         context: Mapping[str, Any] | None = None,
         group: str = "all",
     ) -> None:
-        """Add one push, in the frame of the world.
+        """Add one push, in the world frame.
 
         start, end: pose (x, y, yaw) of the object before and after; poses: times (k,) and poses
-        (k, 3) instead of `end` where they are known in between, on the clock of the tool; tool_t:
-        (m,) growing; tool_xy: (m, 2) of the tool; context: what else is known, numbers or words;
-        group: of pushes that belong together. Raises ValueError that names the push, what it holds
-        and what is expected; nothing is added then.
+        (k, 3) instead of `end`, if the motion was recorded, with the same clock as the tool;
+        tool_t: (m,), increasing times; tool_xy: (m, 2), positions of the tool; context: further
+        known values, numbers or text; group: name of the pushes that belong together. Raises
+        ValueError, and adds nothing, with the push, its value and the expected value.
         """
         where = f"interaction {len(self)} (group {group!r})"
         t, xy = self._tool(where, tool_t, tool_xy)
@@ -149,7 +149,7 @@ class Log:
             if not np.allclose(known[0], first, atol=1e-3):
                 raise ValueError(
                     f"{where}: the first of poses is {np.round(known[0] - first, 4)} (m, rad) away "
-                    "from start; expected is the same, for effects begin at zero"
+                    "from start; it must be the same, because effects start at zero"
                 )
         centre = known[:, :2] + np.stack([rotated(self.origin_m, yaw) for yaw in known[:, 2]])
         centre, tool = (rotated(p - centre[0], -first[2]) for p in (centre, xy))
@@ -177,7 +177,7 @@ class Log:
         )
 
     def tensors(self) -> PushLog:
-        """All pushes that were added; raises ValueError where there are none."""
+        """Return all added pushes; raises ValueError if there are none."""
         if not self._pushes:
             raise ValueError("the log is empty; add(...) interactions first")
         by_name = {n: np.array([p[n] for p in self._pushes]) for n in self._pushes[0]}
@@ -198,30 +198,30 @@ class Log:
         return t, xy
 
     def _poses(self, where: str, name: str, values: Any) -> np.ndarray:
-        """Poses (..., 3) in metres and radians."""
+        """Convert poses (..., 3) to metres and radians; raises ValueError."""
         poses = _array(where, name, values)
         if poses.shape[-1:] != (3,):
             raise ValueError(f"{where}: {name} must be x, y and yaw, got {values!r:.80}")
         poses = poses * [self._metres, self._metres, self._radians]
         if (most := float(np.abs(poses[..., 2]).max())) > 2 * math.pi:
             raise ValueError(
-                f"{where}: {name} has a yaw of {most:.3g} rad, expected is at most 2π; angles are "
-                f"taken in {self._angle_unit}, see Log(angle_unit=...)"
+                f"{where}: {name} has a yaw of {most:.3g} rad, but at most 2π is expected; angles "
+                f"are read in {self._angle_unit}, see Log(angle_unit=...)"
             )
         return poses
 
     def _refuse_jumps(self, where: str, name: str, moved: np.ndarray, length_m: float) -> None:
-        """Raise where the object moves (k, 3) farther than the tool can take it.
+        """Raise ValueError if the object's motion (k, 3) exceeds what the tool can cause.
 
-        It turns about a point that is hardly nearer to the tool than the inscribed circle's radius.
+        The lever arm of the rotation is taken to be at least the inscribed circle's radius.
         """
         most_m = length_m + SLACK_M
         most_rad = min(most_m / _inradius_m(self.outline_m), math.pi)
         for row, (x, y, turn) in enumerate(moved.tolist()):
             if abs(turn) > most_rad:
                 raise ValueError(
-                    f"{where}: pose {row} of start and {name} is turned by {turn:.3g} rad, "
-                    f"expected are at most {most_rad:.2g}; yaws are taken in {self._angle_unit}"
+                    f"{where}: pose {row} of start and {name} is turned by {turn:.3g} rad, but at "
+                    f"most {most_rad:.2g} is expected; yaws are read in {self._angle_unit}"
                 )
             if math.hypot(x, y) > most_m:
                 raise ValueError(
@@ -233,8 +233,8 @@ class Log:
         expected = self._pushes[0]["context"] if self._pushes else context
         if set(context) != set(expected):
             raise ValueError(
-                f"{where}: context names {sorted(context)}, that of interaction 0 "
-                f"{sorted(expected)}; give all of them the same names"
+                f"{where}: context names {sorted(context)}, but that of interaction 0 "
+                f"{sorted(expected)}; use the same names in all interactions"
             )
         return dict(context)
 
@@ -243,8 +243,8 @@ def _array(where: str, name: str, values: Any) -> np.ndarray:
     array = check_array(f"{where}: {name}", values)
     if len(array) > MOST_ROWS:
         raise ValueError(
-            f"{where}: {name} has {len(array)} rows, expected are those of one push, at most "
-            f"{MOST_ROWS}; cut the recording at each push, or thin it"
+            f"{where}: {name} has {len(array)} rows, but one push may have at most {MOST_ROWS}; "
+            "split the recording at each push, or subsample it"
         )
     return array
 
@@ -256,18 +256,18 @@ def _growing(where: str, name: str, times: Any) -> np.ndarray:
     if (stuck := np.flatnonzero(np.diff(t) <= 0)).size:
         row = int(stuck[0]) + 1
         raise ValueError(
-            f"{where}: {name} must grow, but row {row} is {t[row].item()!r} after "
-            f"{t[row - 1].item()!r}; leave out repeated rows, and check that no column is missing"
+            f"{where}: {name} must increase, but row {row} is {t[row].item()!r} after "
+            f"{t[row - 1].item()!r}; remove repeated rows, and check that no column is missing"
         )
     return t
 
 
 def centred(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The centroid (2,) of a polygon, and its corners (k, 2) around it, counter-clockwise."""
+    """Return a polygon's centroid (2,) and its corners (k, 2) relative to it, counter-clockwise."""
     if corners.ndim != 2 or len(corners) < 3:
         raise ValueError(f"outline must be at least three corners (k, 2), got {corners.shape}")
     following = np.roll(corners, -1, axis=0)
-    # On which side of each edge each corner is; edges meet that part each other's corners.
+    # On which side of each edge each corner lies: crossing edges separate each other's corners.
     side = np.sign(cross((following - corners)[:, None], corners - corners[:, None]))
     parts = side * np.roll(side, -1, axis=1) <= 0
     meet = np.triu(parts & parts.T, 2)
@@ -286,13 +286,13 @@ def centred(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _inradius_m(outline_m: np.ndarray) -> float:
-    """Distance [m] of the nearest edge from the centroid."""
+    """Return the distance [m] from the centroid to the nearest edge."""
     edges = np.roll(outline_m, -1, axis=0) - outline_m
     return float(np.abs(cross(edges, outline_m) / np.linalg.norm(edges, axis=1)).min())
 
 
 def _contact(where: str, outline_m: np.ndarray, tool: np.ndarray, radius_m: float) -> dict:
-    """Where and how the path (m, 2) of a tool with a radius first enters the outline."""
+    """Find the contact where the path (m, 2) of a tool with a radius first enters the outline."""
     edges = np.roll(outline_m, -1, axis=0) - outline_m
     inward = np.stack([-edges[:, 1], edges[:, 0]], axis=1) / np.linalg.norm(edges, axis=1)[:, None]
     off = tool[:, None] - outline_m
@@ -305,16 +305,16 @@ def _contact(where: str, outline_m: np.ndarray, tool: np.ndarray, radius_m: floa
         on = np.clip((off * edges).sum(axis=-1) / (edges**2).sum(axis=-1), 0, 1)
         gap = np.linalg.norm(off - on[..., None] * edges, axis=-1).min() - radius_m
         raise ValueError(
-            f"{where}: tool_xy never enters the outline from outside, it comes within {gap:.3g} m; "
-            "start and tool_xy must be in one frame and unit, and a thick tool needs tool_radius"
+            f"{where}: tool_xy never enters the outline from outside (smallest gap {gap:.3g} m); "
+            "start and tool_xy must share a frame and unit, and a thick tool needs tool_radius"
         )
     step, edge = np.argwhere(enters)[0]
     travelled = tool[-1] + radius_m * inward[edge] - at[step, edge]
     length = float(np.linalg.norm(travelled))
     if not 1e-4 < length < LARGEST_M:
         raise ValueError(
-            f"{where}: tool_xy goes on for {length:.3g} m after contact, expected are 0.1 mm to "
-            f"{LARGEST_M:g} m; check the unit of lengths"
+            f"{where}: tool_xy continues for {length:.3g} m after contact, but 0.1 mm to "
+            f"{LARGEST_M:g} m are expected; check the unit of lengths"
         )
     return {
         "contact_m": at[step, edge],

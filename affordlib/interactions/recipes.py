@@ -1,4 +1,4 @@
-"""A recipe says how a data set is made; interaction i is a pure function of (recipe, i)."""
+"""Recipes define how data sets are collected; interaction i is a pure function of (recipe, i)."""
 
 import json
 import math
@@ -19,11 +19,11 @@ _OBLIQUE_RAD = 0.18
 
 @dataclass(frozen=True)
 class Variation:
-    """What differs from episode to episode in a perturbed world.
+    """Parameters of a perturbed world, which are sampled anew for every interaction.
 
-    Frictions, density and how much higher the gripper moves are drawn uniformly from ranges;
-    com_offset: the centre of mass lies off the centre by up to this share of the half extents;
-    bias_sd_m: of the estimated position of the object, beside the camera's own error.
+    Frictions, density and the gripper's height error are sampled uniformly from ranges; com_offset:
+    largest offset of the centre of mass as a share of the half extents; bias_sd_m: standard
+    deviation of the error of the object's estimated position, in addition to the camera's.
     """
 
     table_friction: tuple[float, float] = (0.35, 0.65)
@@ -42,7 +42,7 @@ class Variation:
         check_field(self, "bias_sd_m", 0.0, 0.02, "m")
 
     def sample(self, obj: TabletopObject, rng: np.random.Generator) -> WorldConfig:
-        """One world: what an episode with this object is like."""
+        """Sample the world parameters for one interaction with this object."""
         drawn = {name: float(rng.uniform(*getattr(self, name))) for name in _RANGES}
         half = np.array([*np.ptp(obj.footprint_m, axis=0), obj.height_m]) / 2
         offset = self.com_offset * half * rng.uniform(-1, 1, size=3)
@@ -66,11 +66,11 @@ _RANGES = {
 
 @dataclass(frozen=True)
 class Recipe:
-    """What is collected: primitives on objects of some categories, in a world, from a seed.
+    """The definition of a data set: primitives, object categories, world and seed.
 
-    Of several primitives one is drawn that suits the object. height_range_m defaults to the sizes.
-    anywhere: objects lie all over the table, within reach or not, instead of at its centre.
-    partial: the action is truncated at a random phase. variation: worlds drawn episode by episode.
+    Each interaction uses one of the primitives that suit its object. height_range_m defaults to
+    size_range_m. anywhere: objects lie all over the table, within reach or not, not at its centre.
+    partial: actions stop at a random phase. variation: a new world for each interaction.
     """
 
     primitives: tuple[str, ...] = ("push",)
@@ -98,14 +98,14 @@ class Recipe:
         check_count("seed", self.seed, least=0)
 
     def to_json(self) -> str:
-        """The recipe as JSON with sorted keys, in which categories are called families."""
+        """Return the recipe as JSON with sorted keys; categories are called families there."""
         fields = asdict(self)
         fields["families"] = fields.pop("categories")
         return json.dumps(fields, sort_keys=True)
 
     @classmethod
     def from_json(cls, text: str) -> Self:
-        """The recipe that `to_json` wrote."""
+        """Return the recipe from the text that `to_json` returned."""
         fields = json.loads(text)
         fields["categories"] = fields.pop("families")
         fields["world"] = WorldConfig(**fields["world"])
@@ -163,9 +163,9 @@ _FIRM = replace(_TEN_TIMES["grasp_x10"], seed=18, world=WorldConfig())
 
 SHIPPED = tuple(_SHIPPED)
 RECIPES: dict[str, Recipe] = _SHIPPED | _TEN_TIMES | {"grasp_firm_x10": _FIRM}
-"""The paper's sets; a fixed test set no model trains on; partial executions, for testing only; a
-perturbed world; objects all over the table, within reach or not; sets of ten times as many; and
-grasps in the world in which objects are pushed, where they are less slippery."""
+"""Recipes by name: the paper's sets; a test set for no model's training; partial executions, for
+tests only; a perturbed world; objects all over the table, within reach or not; sets of ten times
+the size (_x10); and grasps with the friction of the pushes, with which objects slip less."""
 
 
 def _generator(recipe: Recipe, index: int, *part: int) -> np.random.Generator:
@@ -173,7 +173,7 @@ def _generator(recipe: Recipe, index: int, *part: int) -> np.random.Generator:
 
 
 def sample_scene(recipe: Recipe, index: int) -> tuple[TabletopObject, float, np.random.Generator]:
-    """Object and yaw [rad] of interaction `index`, and the generator to draw its action from."""
+    """Sample object and yaw [rad] of interaction `index`; return them and the random generator."""
     rng = _generator(recipe, index)
     category = category_named(recipe.categories[rng.integers(len(recipe.categories))])
     obj = category.sample(rng, recipe.size_range_m, recipe.height_range_m)
@@ -181,7 +181,7 @@ def sample_scene(recipe: Recipe, index: int) -> tuple[TabletopObject, float, np.
 
 
 def sample_world(recipe: Recipe, index: int, obj: TabletopObject) -> WorldConfig:
-    """The world in which interaction `index` takes place."""
+    """Return the world parameters of interaction `index`."""
     if recipe.variation is None:
         return recipe.world
     return recipe.variation.sample(obj, _generator(recipe, index, 3))
@@ -190,7 +190,7 @@ def sample_world(recipe: Recipe, index: int, obj: TabletopObject) -> WorldConfig
 def _sample_action(
     recipe: Recipe, obj: TabletopObject, yaw: float, rng: np.random.Generator
 ) -> Primitive:
-    """A primitive that suits the object, with parameters drawn at random."""
+    """Sample a primitive that suits the object, and its parameters."""
     unsuited = "push" if obj.rollable else "drag"
     names = [name for name in recipe.primitives if name != unsuited] or list(recipe.primitives)
     kind = primitive_named(names[rng.integers(len(names))] if len(names) > 1 else names[0])
@@ -206,7 +206,7 @@ def _sample_action(
         levers.append((lever.obliqueness_rad(outline, edge), lever))
         if levers[-1][0] < _OBLIQUE_RAD:
             break
-    # A blade that goes far askew under its edge slips; of the draws, the straightest is taken.
+    # A blade that enters obliquely slips, so the sample most normal to its edge is used.
     _, lever = min(levers, key=lambda drawn: drawn[0])
     return replace(lever, theta=lever.theta + rng.uniform(-0.1, 0.1))
 
@@ -214,9 +214,9 @@ def _sample_action(
 def interact(
     recipe: Recipe, index: int, world: Tabletop, stop_phase: float | None = None
 ) -> tuple[TabletopObject, Interaction]:
-    """Carry out interaction `index` of a recipe: the same bits in every process and order.
+    """Execute interaction `index` of a recipe; bit-identical in every process and order.
 
-    stop_phase: where to truncate it, if not where the recipe says.
+    stop_phase: phase at which the action stops (default: the recipe's).
     """
     obj, yaw, rng = sample_scene(recipe, index)
     action = _sample_action(recipe, obj, yaw, rng)

@@ -1,8 +1,8 @@
-"""Training batches: which context a model observes, and at which phases it has to predict.
+"""Samplers of training batches: the context that a model observes and its target phases.
 
-Section 3.2 of the paper: k observations, k uniform in 1 … obs_max, at random phases of a random
-trajectory. A sampler takes the interactions of a batch, n_targets, obs_max and a generator, and
-returns a `Batch`.
+In Section 3.2 of the paper, k observations, k uniform in 1 … obs_max, are taken at random phases
+of a random trajectory. A sampler takes the interactions of a batch, n_targets, obs_max and a
+generator, and returns a `Batch`.
 """
 
 from dataclasses import dataclass, replace
@@ -16,7 +16,7 @@ from affordlib.types import Observations
 
 @dataclass(frozen=True)
 class Batch:
-    """Images, observations and the targets (B, T, C) at t_target (B, T) they should predict."""
+    """Images, context, and targets (B, T, C) of action and effect at phases t_target (B, T)."""
 
     image: torch.Tensor
     observations: Observations
@@ -28,23 +28,23 @@ class Batch:
     def of(
         cls, tensors: InteractionTensors, observations: Observations, target_at: torch.Tensor
     ) -> Self:
-        """A batch of whole tensors whose targets are the samples with numbers (B, T), or (T,)."""
+        """Build a batch whose targets are the samples with numbers (B, T), or (T,) for all."""
         t_target, action = tensors.action_at(target_at)
         effect = tensors.effect_at(target_at)[1]
         return cls(tensors.image, observations, t_target, action, effect)
 
 
 def condition_on_recorded_action(tensors: InteractionTensors) -> Observations:
-    """Only the commanded action, at t = 0 and t = 1 (w₁ = 1)."""
+    """Return a context of only the commanded action, at t = 0 and t = 1 (w₁ = 1)."""
     return Observations.of(tensors, action=tensors.action_at(torch.tensor([0, -1])))
 
 
 def condition_on_poses(
     tensors: InteractionTensors, start: torch.Tensor, n_poses: int
 ) -> Observations:
-    """The commanded action at t = 0 and 1, and n_poses effects from the samples `start` (N,) on.
+    """Return a context of the action at t = 0 and 1, and n_poses effects from sample `start` (N,).
 
-    Without a pose only the action is observed (w₁ = 1), else both (w₁ = 1/2).
+    With n_poses = 0 only the action is observed (w₁ = 1), otherwise both (w₁ = 1/2).
     """
     at = start[:, None] + torch.arange(n_poses)
     effect = tensors.effect_at(at) if n_poses else None
@@ -54,7 +54,7 @@ def condition_on_poses(
 def sample_mixed(
     tensors: InteractionTensors, n_targets: int, obs_max: int, generator: torch.Generator
 ) -> Batch:
-    """Action, effect or both are observed, half of the time as in later queries."""
+    """Sample contexts of action (50 %), effect (25 %) or both, half at the phases used to plan."""
     b, last = len(tensors), len(tensors.phase) - 1
 
     def uniform(*shape):
@@ -92,7 +92,7 @@ def sample_mixed(
 def sample_forward(
     tensors: InteractionTensors, n_targets: int, obs_max: int, generator: torch.Generator
 ) -> Batch:
-    """Only the action at t = 0 and 1 is observed; obs_max is not used."""
+    """Sample targets for a context of only the action at t = 0 and 1; obs_max is not used."""
     last = len(tensors.phase) - 1
     target_at = torch.randint(0, last + 1, (len(tensors), n_targets), generator=generator)
     target_at[:, 0] = last
@@ -102,7 +102,7 @@ def sample_forward(
 def sample_windows(
     tensors: InteractionTensors, n_targets: int, obs_max: int, generator: torch.Generator
 ) -> Batch:
-    """Windows anywhere: obs_max samples are observed, the n_targets after them are targets."""
+    """Sample windows of obs_max observed samples followed by n_targets targets."""
     latest = len(tensors.phase) - obs_max - n_targets
     start = torch.randint(0, latest + 1, (len(tensors),), generator=generator)
     target_at = start[:, None] + obs_max + torch.arange(n_targets)
@@ -112,7 +112,7 @@ def sample_windows(
 def sample_from_start(
     tensors: InteractionTensors, n_targets: int, obs_max: int, generator: torch.Generator
 ) -> Batch:
-    """All later samples are targets; the first pose is observed in every other batch."""
+    """Use all samples after the first as targets; observe the first pose in half of the batches."""
     n_poses = int(torch.randint(0, 2, (1,), generator=generator))
     start = torch.zeros(len(tensors), dtype=torch.long)
     target_at = torch.arange(1, len(tensors.phase))

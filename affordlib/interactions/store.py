@@ -1,7 +1,7 @@
-"""Data sets of interactions: one zip of Zarr v3, written at once and checked whole when opened.
+"""Storage of data sets: one zip file of Zarr v3, written atomically and verified when opened.
 
-`manifest.json` in it holds the hash of every file, so that nothing missing is read as fill values,
-and of every array, so that sets can be compared without reading them.
+`manifest.json` in it contains the hash of every file, so that missing chunks are not read as fill
+values, and of every array, so that sets can be compared without reading them.
 """
 
 import hashlib
@@ -24,11 +24,11 @@ _REMEDY = "fetch it again, or collect it again (the shipped sets with `make data
 
 
 class CorruptedDataError(ValueError):
-    """A data set is damaged: what was read is not what was written."""
+    """Raised when a stored data set is damaged."""
 
 
 def _hashes(data: "xarray.Dataset") -> dict[str, str]:
-    """Hashes of the type, shape and bytes of each array."""
+    """Return a hash of the type, shape and bytes of each array."""
     found = {}
     for name in data.variables:
         array = data[name].values
@@ -43,14 +43,14 @@ def _hash_of(hashes: dict[str, str]) -> str:
 
 
 def dataset_sha256(data: "xarray.Dataset") -> str:
-    """One hash for all arrays of a data set; it depends neither on workers nor on the file."""
+    """Return one hash of all arrays of a data set, independent of workers and file."""
     return _hash_of(_hashes(data))
 
 
 def write_interactions(data: "xarray.Dataset", path: Path, level: int = 9) -> None:
-    """Write a set as one file, whole or not at all; equal sets give equal bytes.
+    """Write a set as one file, atomically; equal sets give identical bytes.
 
-    level: how hard to compress, from 0 to 9.
+    level: compression level from 0 to 9.
     """
     from zarr.codecs import BloscCodec
     from zarr.storage import MemoryStore
@@ -76,7 +76,7 @@ def write_interactions(data: "xarray.Dataset", path: Path, level: int = 9) -> No
 
 
 def _url_of(name_or_path: str | Path) -> str:
-    """The path or URL of a set; raises FileNotFoundError where there is none."""
+    """Return the path or URL of a set; raises FileNotFoundError if it does not exist."""
     url = os.fspath(name_or_path)
     if not url.endswith(SUFFIX):
         url = str(repo_root() / "data" / f"{url}{SUFFIX}")
@@ -87,13 +87,13 @@ def _url_of(name_or_path: str | Path) -> str:
         )
         raise FileNotFoundError(
             f"interactions {str(name_or_path)!r}: there is no file {url}; give one of the shipped "
-            f"names {shipped} or the path of a {SUFFIX} file, or make them again with `make data`"
+            f"names {shipped} or the path of a {SUFFIX} file, or collect them with `make data`"
         )
     return url
 
 
 def _read(url: str, only: str | None = None) -> tuple[dict[str, dict[str, str]], dict[str, bytes]]:
-    """The manifest of a set, and the files of its zip (all, or only one) by name."""
+    """Read the manifest of a set, and the files of its zip (all, or only one) by name."""
     found, name = {}, "its directory"
     try:
         with fsspec.open(url, "rb") as file, zipfile.ZipFile(file) as archive:
@@ -109,15 +109,15 @@ def _read(url: str, only: str | None = None) -> tuple[dict[str, dict[str, str]],
 
 
 def stored_sha256(name_or_path: str | Path) -> str:
-    """The `dataset_sha256` of a stored set, from its manifest, without reading the arrays."""
+    """Return the `dataset_sha256` of a stored set from its manifest, without reading arrays."""
     url = _url_of(name_or_path)
     return _hash_of(_read(url, MANIFEST)[0]["arrays"])
 
 
 def open_interactions(name_or_path: str | Path) -> "xarray.Dataset":
-    """Read a data set, whole and checked, given a shipped name (`"push"`), a path or an fsspec URL.
+    """Read and verify a data set, given a shipped name (`"push"`), a path or an fsspec URL.
 
-    Raises FileNotFoundError, or CorruptedDataError naming what is damaged.
+    Raises FileNotFoundError, or CorruptedDataError that names the damaged part.
     """
     import xarray
     from zarr.buffer.cpu import Buffer
@@ -133,4 +133,4 @@ def open_interactions(name_or_path: str | Path) -> "xarray.Dataset":
         with xarray.open_zarr(store, consolidated=False, zarr_format=3) as data:
             return data[sorted(data.data_vars)].load()
     except Exception as error:
-        raise CorruptedDataError(f"{url} holds no data set ({error}); {_REMEDY}") from error
+        raise CorruptedDataError(f"{url} is not a data set ({error}); {_REMEDY}") from error

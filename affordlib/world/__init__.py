@@ -1,4 +1,4 @@
-"""All that touches PyBullet: the tabletop, its objects, the arm and the camera."""
+"""The simulated world in PyBullet: the tabletop, its objects, the arm and the camera."""
 
 import affordlib.world._quiet_pybullet  # must come first
 from affordlib.types import UnreachableError

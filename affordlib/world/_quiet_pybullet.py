@@ -1,4 +1,4 @@
-"""Import PyBullet without the line with its build time, which every notebook would show."""
+"""Import PyBullet without printing its build time, which would appear in every notebook."""
 
 import os
 

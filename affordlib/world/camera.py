@@ -1,7 +1,7 @@
-"""What the robot sees: a top-down depth image of the object, and pictures for people.
+"""Cameras: top-down depth images of the object for the robot, and colour pictures for people.
 
-The ideal camera hangs above the object, with parallel rays; the Kinect has a perspective, noise,
-and must find the object itself. The mask is read from the depth: what stands above the table.
+The ideal camera looks straight down on the object with parallel rays. The Kinect has a perspective
+and noise, and has to find the object. The mask is thresholded depth: all points above the table.
 """
 
 import math
@@ -17,8 +17,8 @@ _NEAR_M, _FAR_M = 0.5, 1.1
 _MASK_HEIGHT_M = 0.004
 
 RAYS_PER_SIDE = 3
-"""Of a pixel of the ideal camera. With one ray, 500 pushes teach FiLM to 1.09 mm, with 4 rays to
-0.87 mm, with 16 to 0.83 mm."""
+"""Rays per side of a pixel of the ideal camera. FiLM trained on 500 pushes has an error of 1.09 mm
+with one ray per pixel, 0.87 mm with 4, 0.83 mm with 16."""
 
 KINECT_HEIGHT_M = 1.3
 _KINECT_XY_M = (sum(TABLE_X_M) / 2, sum(TABLE_Y_M) / 2)
@@ -28,9 +28,9 @@ _KINECT_MASK_HEIGHT_M = 0.012
 
 
 def _orthographic(half_width_m: float, pixels: int) -> np.ndarray:
-    """The 4x4 projection of parallel rays, shifted by half a pixel.
+    """Return the 4x4 orthographic projection matrix, shifted by half a pixel.
 
-    TinyRenderer samples pixels at their corners; the shift makes it their centres.
+    TinyRenderer samples pixels at their corners; the shift moves the samples to their centres.
     """
     depth_range = _FAR_M - _NEAR_M
     projection = np.diag([1 / half_width_m, 1 / half_width_m, -2 / depth_range, 1.0])
@@ -45,9 +45,9 @@ _RENDERER = {"renderer": pybullet.ER_TINY_RENDERER, "flags": pybullet.ER_NO_SEGM
 def _distance_m(
     client: BulletClient, view: tuple, projection: np.ndarray, shape: tuple
 ) -> np.ndarray:
-    """Distance from the camera's plane [m], (rows, columns).
+    """Render the distance [m] from the camera's plane, (rows, columns).
 
-    TinyRenderer warps every depth buffer as if the projection were a perspective one.
+    TinyRenderer encodes every depth buffer as if the projection were a perspective one.
     """
     rows, columns = shape
     matrix = projection.T.ravel().tolist()
@@ -66,10 +66,10 @@ def depth_crop(
     turn_rad: float = 0.0,
     samples: int = RAYS_PER_SIDE,
 ) -> np.ndarray:
-    """Depth [m] and mask (2, n, n) of the square around (x, y), as float32.
+    """Render depth [m] and mask (2, n, n) of the square around (x, y), as float32.
 
-    Columns run along the direction turn_rad of the table, rows a quarter turn to its right. A pixel
-    is the mean of samples x samples rays: at the object's rim the mask is the share it covers.
+    Columns run along the direction turn_rad of the table, rows at π/2 clockwise from it. A pixel is
+    the mean of samples x samples rays, so at the object's edge the mask is the covered share.
     """
     x, y = xy_m
     up = (-math.sin(turn_rad), math.cos(turn_rad), 0)
@@ -85,10 +85,10 @@ def depth_crop(
 def _kinect_points(
     client: BulletClient, centre_m: tuple, width_m: tuple, step: int, noise: np.random.Generator
 ) -> np.ndarray:
-    """Points (n, 3) [m] that a Kinect above the table's centre measures around a place.
+    """Simulate the points (n, 3) [m] that a Kinect above the table's centre measures in a window.
 
-    Of its image only the window is rendered, every `step`-th pixel. Depth has noise that grows
-    with distance, is rounded to steps of disparity, and edges are frayed by about a pixel.
+    Only the window of its image is rendered, every `step`-th pixel. Depth has noise that grows with
+    distance and is quantised in disparity; pixels are displaced at random by about one pixel.
     """
     pitch = step / KINECT_FOCAL_PX
     columns, rows = (math.ceil(w / KINECT_HEIGHT_M / pitch) for w in width_m)
@@ -98,7 +98,7 @@ def _kinect_points(
     near, far = 0.8, 1.4
     projection = np.zeros((4, 4))
     projection[0, 0], projection[1, 1] = 1 / half
-    # Half a pixel's shift, as above, turned into one of the tangent.
+    # The shift by half a pixel, as above, expressed as a shift of the tangent.
     projection[:2, 2] = tangent / half + 1 / np.array([columns, rows])
     projection[2, 2:] = -(far + near) / (far - near), -2 * far * near / (far - near)
     projection[3, 2] = -1
@@ -120,9 +120,9 @@ def _kinect_points(
 def kinect_view(
     client: BulletClient, noise: np.random.Generator
 ) -> tuple[tuple[float, float], np.ndarray]:
-    """Where a Kinect above the table sees the object, (x, y) [m], and a crop (2, 48, 48) of it.
+    """Return the object's position (x, y) [m] measured with a Kinect, and a crop (2, 48, 48) of it.
 
-    The points of its image are seen from straight above. Raises NothingSeenError when there is
+    The points of the Kinect's image are projected vertically. Raises NothingSeenError if there is
     nothing on the table.
     """
     table = (TABLE_X_M[1] - TABLE_X_M[0], TABLE_Y_M[1] - TABLE_Y_M[0])
@@ -136,8 +136,8 @@ def kinect_view(
         height = height_map(points, xy)
         mask = largest_blob(height > _KINECT_MASK_HEIGHT_M)
         if mask.any():
-            # Of the walls it sees only those that face it, which draws the mean towards it;
-            # above 45 % of the height (measured) the centre is hardly biased.
+            # Only walls that face the camera are visible, which biases the centroid towards it;
+            # for points above 45 % of the height (measured) the bias is negligible.
             dx, dy = centre_m(mask & (height > 0.45 * np.quantile(height[mask], 0.9)))
             xy = (float(xy[0] + dx), float(xy[1] + dy))
     height = height_map(points, xy)
@@ -146,13 +146,13 @@ def kinect_view(
 
 
 def picture(client: BulletClient, width: int = 320, height: int = 240) -> np.ndarray:
-    """A colour picture (height, width, 3), uint8, of the robot at work, for people."""
+    """Render a colour picture (height, width, 3), uint8, of the robot and the table."""
     view = pybullet.computeViewMatrixFromYawPitchRoll(
         (-0.05, 0.0, 0.06), distance=1.0, yaw=62, pitch=-33, roll=0, upAxisIndex=2
     )
     projection = pybullet.computeProjectionMatrixFOV(45, width / height, 0.1, 4.0)
     light = {"lightDirection": (0.6, -0.7, 1.6), "lightDistance": 3.0, "shadow": 1}
-    # Twice the size, halved: TinyRenderer has jagged edges.
+    # Rendered at twice the size and averaged, since TinyRenderer does no anti-aliasing.
     _, _, rgba, _, _ = client.getCameraImage(
         *(2 * width, 2 * height, view, projection), **light, **_RENDERER
     )

@@ -1,6 +1,6 @@
-"""Executing one command on the object, from the arm's approach to the object at rest.
+"""Execution of one command on the object, from the arm's approach to the object at rest.
 
-The arm follows waypoints of its joints, and measures what it can feel.
+The arm follows joint waypoints and measures its own pose and contact forces.
 """
 
 import math
@@ -32,28 +32,28 @@ from affordlib.world.trajectory import (
 
 SETTLE_STEPS = 120
 PUT_DOWN_M = 0.002
-"""From this height an object that is put down is let go."""
+"""Height [m] above its support from which an object is released when it is put down."""
 RECORDED_SAMPLES = 26
-"""Of the measured tool: one every 3 steps of 50 ms, as in the paper: t = 0 and 25 more."""
+"""Number of recorded tool poses: at t = 0 and 25 more, every 3 steps of 50 ms (as in the paper)."""
 
 _HOME = np.array(robot.HOME)
 
 GUARD_FORCE_N = 30.0
-"""A guarded segment freezes when the object presses on the robot with more than this."""
+"""Contact force [N] between object and robot above which a guarded segment stops."""
 
 ARM_FORCES_N_M = (330.0, 330.0, 150.0, 54.0, 54.0, 54.0)
 _ARM_GAINS = [0.3] * 6
 _STILL_FINGERS, _MOVING_FINGERS = [0.3] * 2, [0.02] * 2
-"""Light fingers pulled hard to a far target would leap where a contact is lost for a step."""
+"""Position gains of the fingers: with high ones, closing fingers jump when contact is lost."""
 
 
 @dataclass
 class Recording:
-    """What is measured while the arm acts on a body of the client.
+    """Measurements while the arm acts on a body of the client.
 
     states: (n, 7) of the body every `RECORD_EVERY` steps; tool: (m, 5) measured x, y, z, yaw and
-    finger gap every waypoint; how far the tool was off its path, and how deep bodies sank into
-    each other, at most [m].
+    finger gap at every waypoint; off_path_m, penetration_m: largest tracking error of the tool and
+    largest penetration of two bodies [m].
     """
 
     body: int
@@ -64,11 +64,11 @@ class Recording:
 
 
 class JointController:
-    """Drives the joints of an arm that it loads, holding a tool, into a client.
+    """Loads an arm with a tool into a client and controls its joints.
 
     after_step: called after every step of the simulation; angles_rad: (6,) joint angles and gap_m:
-    distance of the fingers [m] where they were last sent; raised_m: how high the hand has lifted
-    what it has closed on.
+    gap between the fingers [m], both as last commanded; raised_m: height [m] by which the hand
+    has lifted the object that it closed on.
     """
 
     def __init__(self, client: BulletClient, tool: str, after_step: Callable[[], None]) -> None:
@@ -80,7 +80,7 @@ class JointController:
         self.palm = self.links["palm"]
 
     def put(self, angles_rad: np.ndarray, gap_m: float) -> None:
-        """Place the arm (without motion) at joint angles (6,) with the fingers a gap [m] apart."""
+        """Set the joint angles (6,) [rad] and the gap of the fingers [m] without motion."""
         targets = [*angles_rad, gap_m / 2, gap_m / 2]
         for joint, angle in zip(self.joints, targets, strict=True):
             self.client.resetJointState(self.robot, joint, angle, 0.0)
@@ -89,7 +89,7 @@ class JointController:
         self.raised_m = 0.0
 
     def set_fingers(self, force_N: float, closing: bool) -> None:
-        """How hard each finger can press from now on, and whether it moves lightly, to close."""
+        """Set the maximum force [N] of each finger, and low position gains if they will close."""
         self.gains = _ARM_GAINS + (_MOVING_FINGERS if closing else _STILL_FINGERS)
         self.forces = [*ARM_FORCES_N_M, force_N, force_N]
 
@@ -101,10 +101,10 @@ class JointController:
         segment: TrajectorySegment | None = None,
         poses_W: np.ndarray | None = None,
     ) -> float:
-        """Move through joint waypoints (n, 6) with finger gaps (n,); returns the share covered.
+        """Move through joint waypoints (n, 6) with finger gaps (n,); return the share completed.
 
-        recording: where to write, if this is recorded, what happens on this segment, whose poses
-        (n, 3+) the tool should pass.
+        recording: object that receives the measurements, None for no recording; segment: the
+        segment that is executed; poses_W: (n, 3+), the tool's poses at its waypoints.
         """
         client = self.client
         whole = (len(joints) - 1) * STEPS_PER_WAYPOINT
@@ -115,12 +115,12 @@ class JointController:
             targets[:, :6] = CubicSpline(np.arange(len(joints)), joints, bc_type="clamped")(grid)
         targets[:, 6:] = (np.interp(grid, np.arange(len(gaps_m)), gaps_m) / 2)[:, None]
         velocities = (np.diff(targets, axis=0) / STEP_S).tolist()
-        # With the velocity fed forward, the target of the next step would put the arm ahead.
+        # Velocity is fed forward, so the target must be this step's; the next one's would lead.
         commands = targets[:-1].tolist()
         n_steps = whole if segment is None or segment.n_steps is None else segment.n_steps
         guarded = segment is not None and segment.guarded
         drive = {"forces": self.forces, "positionGains": self.gains}
-        # Looked up once: a client finds each of its functions anew.
+        # Looked up once, because a client looks up its functions at every access.
         set_motors, simulate = partial(self._motors(), **drive), client.stepSimulation
         now, frozen_at = (targets[0].tolist(), [0.0] * 8), None
         for step in range(n_steps):
@@ -136,17 +136,17 @@ class JointController:
             simulate()
             self.after_step()
         self.angles_rad, self.gap_m = np.array(now[0][:6]), 2 * now[0][6]
-        if n_steps < whole:  # stand still where it was last sent
+        if n_steps < whole:  # hold the last commanded position
             set_motors(targetPositions=[*self.angles_rad, self.gap_m / 2, self.gap_m / 2])
         return 1.0 if frozen_at is None else frozen_at / whole
 
     def _motors(self) -> Callable[..., None]:
-        """A function that sends the joints of arm and fingers to targets."""
+        """Return a function that commands targets to the joints of arm and fingers."""
         control = self.client.setJointMotorControlArray
         return partial(control, self.robot, self.joints, pybullet.POSITION_CONTROL)
 
     def wait(self, n_steps: int) -> None:
-        """Let the simulation run with the arm held where it is."""
+        """Simulate n_steps steps while the arm holds its position."""
         simulate = self.client.stepSimulation
         for _ in range(n_steps):
             simulate()
@@ -155,7 +155,7 @@ class JointController:
     def record(
         self, recording: Recording, with_tool: bool = True, wanted_W: np.ndarray | None = None
     ) -> None:
-        """Write down the body's state, the tool's against where it is wanted, and the contacts."""
+        """Record the body's state and, with_tool, the tool's pose, its error and penetrations."""
         state = self.client.getBasePositionAndOrientation(recording.body)
         recording.states.append((*state[0], *state[1]))
         if not with_tool:
@@ -171,7 +171,7 @@ class JointController:
         return sum(contact[9] for contact in self.client.getContactPoints(self.robot, body))
 
     def tool_pose(self) -> np.ndarray:
-        """Measured x, y, z [m] of the tool's point, its yaw [rad], the gap of the fingers [m]."""
+        """Measure x, y, z [m] of the tool's tip, its yaw [rad] and the gap of the fingers [m]."""
         state = self.client.getLinkState(self.robot, self.palm, computeForwardKinematics=1)
         axes = np.array(pybullet.getMatrixFromQuaternion(state[5])).reshape(3, 3)
         along, below = robot.TOOL_OFFSETS_M[self.tool]
@@ -181,7 +181,7 @@ class JointController:
         return np.array([*tip, yaw, fingers[0][0] + fingers[1][0]])
 
     def tie_fingers(self) -> None:
-        """Tie the two fingers by a gear: between two motors alone a held object wanders."""
+        """Couple the two fingers with a gear; between two separate motors a held object drifts."""
         self.untie()
         left, right = self.fingers
         links, axis, origin = (self.robot, left, self.robot, right), (0, 1, 0), (0, 0, 0)
@@ -189,13 +189,13 @@ class JointController:
         self.client.changeConstraint(gear, gearRatio=-1, maxForce=300, erp=0.5)
 
     def untie(self) -> None:
-        """Let go: take away the gear between the fingers, and what ties an object to them."""
+        """Remove the gear between the fingers and the joint that fixes an object to the hand."""
         client = self.client
         for k in reversed(range(client.getNumConstraints())):
             client.removeConstraint(client.getConstraintUniqueId(k))
 
     def tie_held(self, body: int) -> None:
-        """Fix what both tied fingers hold to the hand: friction creeps by 0.3 mm a second."""
+        """Fix an object held by both coupled fingers to the hand, since it creeps by 0.3 mm/s."""
         client = self.client
         contacts = client.getContactPoints(self.robot, body)
         touching = {contact[3] for contact in contacts}
@@ -219,11 +219,11 @@ def execute(
     tip_offset_m: float,
     approach: bool,
 ) -> Interaction:
-    """Execute a command where the object was seen, the tool higher by an offset [m].
+    """Execute a command at the object's observed position, with the tool raised by an offset [m].
 
-    approach: the arm moves there through the air and back home, and the table brakes what rolls
-    before and after what is recorded; otherwise it is placed at the start, and home in the end.
-    Raises UnreachableError, and moves nothing, when the arm cannot follow.
+    approach: the arm moves there through the air and back home, and rollable objects are braked
+    before and after the recording; otherwise the arm is placed at the start and, finally, at home.
+    Raises UnreachableError, without moving, if the arm cannot follow the command.
     """
     primitive = command.primitive
     start = poses(np.array([placed.state()]))[0]
@@ -252,7 +252,7 @@ def execute(
             one[:, 2] = np.maximum(one[:, 2], floor)
             try:
                 path = robot.joint_path(one, arm.angles_rad, primitive.tool)
-            except UnreachableError:  # it stays where it felt the object, off its path
+            except UnreachableError:  # the arm stays where it felt the object, off its path
                 path = np.repeat(arm.angles_rad[None], len(one), axis=0)
         covered = arm.follow(path, gap, recording, segment, one)
         if segment.guarded and covered < 1.0:
@@ -287,11 +287,11 @@ def _interaction(
     start: np.ndarray,
     offset: np.ndarray,
 ) -> Interaction:
-    """What was recorded, interpolated at the command's phases."""
+    """Build the interaction from the recording, interpolated at the command's phases."""
     phase = command.phase
     recorded = poses(placed.states_of_centre(np.array(recording.states)))
     rest = poses(np.array([placed.state()]))[0]
-    # The yaw nearest to the last recorded one, which is unwrapped.
+    # Choose the multiple of 2π nearest to the last recorded yaw, which is unwrapped.
     rest[3] = recorded[-1, 3] + (rest[3] - recorded[-1, 3] + math.pi) % (2 * math.pi) - math.pi
     origin = np.array([*start[:3], recorded[0, 3], 0.0])
     at_sample, at_waypoint = recorded_phases(command.segments)
@@ -314,7 +314,7 @@ def _interaction(
 
 
 def unreached(command: Command, placed: PlacedObject, seen: Observation) -> Interaction:
-    """The interaction that was out of the arm's reach: commanded, but nothing moved."""
+    """Return the interaction for a command out of the arm's reach, in which nothing moved."""
     return Interaction(
         primitive=command.primitive,
         stop_phase=float(command.phase[-1]),
@@ -332,7 +332,7 @@ def unreached(command: Command, placed: PlacedObject, seen: Observation) -> Inte
 
 
 def put_down(arm: JointController) -> None:
-    """Lower what the hand holds to where it was taken, open the fingers, rise and go home."""
+    """Lower the held object to its height before the lift, open the fingers, rise and go home."""
     *pose, gap_m = arm.tool_pose()
     here, below_m = np.array([*pose, 0.0]), arm.raised_m if gap_m > EMPTY_M else 0.0
     down = np.repeat(arm.angles_rad[None], 2, axis=0)

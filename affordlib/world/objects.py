@@ -76,7 +76,7 @@ class TabletopObject(ABC):
 
     @abstractmethod
     def shape(self) -> dict[str, Any]:
-        """PyBullet's arguments; `frame` turns it, `seen`: corners of parts, if other than felt."""
+        """Arguments for PyBullet; `frame`: rotation, `seen`: corners of parts for rendering."""
 
     def fallen(self, upward: np.ndarray) -> bool:
         """Whether it lies otherwise than placed; upward: (3,) how far x, y and z axes point up."""

@@ -1,10 +1,10 @@
 """The UR10 with a parallel gripper: its model for PyBullet and its analytic kinematics.
 
-Its description comes from the package `example-robot-data`; the gripper, two box fingers on
-prismatic joints, is merged into it, because one held by a constraint slips. The screwdriver is a
-shaft straight down with a flat blade along x, the rod a thin one. W is the frame of the table's
-centre, T of the tool: between the finger tips or at the tip of blade or rod, z down and y along the
-opening.
+Its description comes from the package `example-robot-data`. The gripper, two box fingers on
+prismatic joints, is part of the URDF because a gripper attached by a constraint slips. The
+screwdriver is a vertical shaft with a flat blade along x, the rod a thin vertical shaft. Frame W is
+at the table's centre, frame T between the finger tips or at the tip of blade or rod, with z down
+and y along the opening.
 """
 
 import math
@@ -32,10 +32,10 @@ TOOL_OFFSETS_M = {
     "screwdriver": (BLADE_LENGTH_M, SHAFT_LENGTH_M),
     "rod": (0.0, SHAFT_LENGTH_M),
 }
-"""How far the tool's point lies from the flange along the tool's x and z axes."""
+"""Offset [m] of the tool's tip from the flange along the tool's x and z axes."""
 REACH_M = (0.17, 1.26)
-"""How near to its base and how far from it a hanging tool gets, up to hovering height; the wrist
-turns freely, so neither yaw nor azimuth matters."""
+"""Smallest and largest distance [m] from the base that a vertical tool reaches at all heights up to
+`HOVER_M`; neither yaw nor azimuth matters, as the wrist turns freely."""
 ARM_JOINTS = tuple(range(6))
 HOME = (0.0, -1.9, 1.6, -1.27, -np.pi / 2, 0.0)
 """Joint angles [rad] of the arm parked above its base, out of the camera's view of the table."""
@@ -54,7 +54,7 @@ def _description_folder() -> Path:
 def _box(
     name: str, size: str, centre: str, mass_kg: float, rgba: str, *joint: str, axis: str = ""
 ) -> str:
-    """A box in URDF, held by a joint (parent, xyz, rpy), which slides along an axis if given."""
+    """Return the URDF of a box on a joint (parent, xyz, rpy), prismatic if an axis is given."""
     parent, xyz, rpy = joint
     shape = f'<origin xyz="{centre}"/><geometry><box size="{size}"/></geometry>'
     limit = f'<limit lower="0" upper="{FINGER_TRAVEL_M}" effort="200" velocity="0.5"/>'
@@ -74,7 +74,7 @@ def _box(
 
 
 def _gripper(tool: str) -> str:
-    """Palm and fingers in URDF, and the screwdriver if it is the tool."""
+    """Return the URDF of palm and fingers, and of the screwdriver or the rod if it is the tool."""
     flange, none = ("wrist_3_link", "0 0.0922 0", f"{-np.pi / 2} 0 0"), "0 0 0"
     boxes = [_box("palm", "0.05 0.17 0.06", "0 0 0.04", 0.8, _DARK, *flange)]
     for side, y in (("left", 1), ("right", -1)):
@@ -95,9 +95,9 @@ def _gripper(tool: str) -> str:
 
 @cache
 def robot_description(tool: str = "gripper") -> str:
-    """The URDF text of arm and tool, with the collision meshes alone, which load ten times faster.
+    """Return the URDF text of arm and tool with collision meshes only, which load 10 times faster.
 
-    Mass-less frames are dropped: PyBullet would give each a mass of 1 kg.
+    Massless frames are removed, because PyBullet would give each of them a mass of 1 kg.
     """
     folder = _description_folder()
     root = ET.parse(folder / "ur_description" / "urdf" / "ur10_robot.urdf").getroot()
@@ -126,7 +126,7 @@ def load_robot(client: BulletClient, tool: str = "gripper") -> int:
 
 
 def links(client: BulletClient, robot: int) -> dict[str, int]:
-    """Index of each link, and of the joint that moves it, by the link's name."""
+    """Return the index of each link, which is also its joint's, by the link's name."""
     count = range(client.getNumJoints(robot))
     return {client.getJointInfo(robot, k)[12].decode(): k for k in count}
 
@@ -139,7 +139,7 @@ def _flange_pose(
     x_axis = np.array([c * cp, s * cp, -sp])
     z_axis = np.array([-c * sp, -s * sp, -cp])
     x, y, z = xyz_W - offsets_m[0] * x_axis - offsets_m[1] * z_axis
-    # The analytic solver's base is turned by 180° about z against the URDF's.
+    # The base frame of the analytic solver is rotated by 180° about z relative to the URDF's.
     turned = np.column_stack([x_axis, (s, -c, 0.0), z_axis, (x - BASE_X_M, y, z)])
     return np.vstack([turned * [[-1.0], [-1.0], [1.0]], (0.0, 0.0, 0.0, 1.0)])
 
@@ -151,12 +151,12 @@ def inverse_kinematics(
     pitch_rad: float = 0.0,
     tool: str = "gripper",
 ) -> np.ndarray:
-    """Joint angles (6,) [rad] that put the tool at a pose.
+    """Compute the joint angles (6,) [rad] that move the tool to a pose.
 
-    xyz_W: the tool's point on the table [m]; yaw_rad, pitch_rad: direction of its x axis, and how
-    far it dips; near: joint angles (6,) whose turn (of 2π) is kept. Taken is a posture with the
-    elbow up, wrist forward where the tool hangs, else the nearest: a path never flips.
-    Raises UnreachableError when the arm cannot get there.
+    xyz_W: position of the tool's tip [m]; yaw_rad, pitch_rad: direction of its x axis, and its
+    angle below the horizontal; near: joint angles (6,) to which the solution is nearest modulo 2π.
+    The elbow is up. The wrist points forward for a vertical tool; otherwise the solution nearest to
+    `near` is used, so that a path never flips. Raises UnreachableError if there is no solution.
     """
     best, least = None, 1.0
     hanging = pitch_rad == 0.0
@@ -175,15 +175,15 @@ def inverse_kinematics(
         return best
     x, y, z = (round(float(v), 3) for v in xyz_W)
     raise UnreachableError(
-        f"the arm cannot reach tool position ({x}, {y}, {z}) m; choose a place nearer to its "
+        f"the arm cannot reach tool position ({x}, {y}, {z}) m; choose a position nearer to its "
         f"base at ({BASE_X_M}, 0) or another direction"
     )
 
 
 def joint_path(poses_W: np.ndarray, near: np.ndarray, tool: str = "gripper") -> np.ndarray:
-    """Joint angles (n, 6) along poses (n, 5) of the tool, x, y, z, yaw and pitch, without a jump.
+    """Compute continuous joint angles (n, 6) along tool poses (n, 5): x, y, z, yaw, pitch.
 
-    Raises UnreachableError when a pose is out of reach.
+    Raises UnreachableError if a pose is out of reach.
     """
     joints = np.empty((len(poses_W), 6))
     last = None

@@ -1,7 +1,7 @@
 """The tabletop: one PyBullet client with a table, the UR10, one object and the depth camera.
 
-Use it as a context manager; everything in it is deterministic. Settings were measured: against a
-four times finer step with twice the solver's iterations a push ends within 0.02 mm (median).
+Use it as a context manager. The simulation is deterministic. With a four times finer time step and
+twice the solver iterations, the final position of a push changes by 0.02 mm (median).
 """
 
 import os
@@ -38,11 +38,11 @@ from affordlib.world.objects import PlacedObject, TabletopObject, WorldConfig, s
 from affordlib.world.trajectory import STEP_S, Command, plan_motion, segments_until
 
 OBJECTS_PER_BUILD = 256
-"""After so many objects the client is built again: Bullet keeps 5 kB of each that is removed."""
+"""Number of objects after which the client is rebuilt; Bullet leaks 5 kB per removed object."""
 
 
 class _Client(BulletClient):
-    """PyBullet with a client's number, connected without options, which Bullet would print."""
+    """A PyBullet client connected without options, because Bullet would print them."""
 
     def __init__(self) -> None:
         self._pid = os.getpid()
@@ -50,10 +50,10 @@ class _Client(BulletClient):
 
 
 class Tabletop(AbstractContextManager):
-    """A table, an arm and at most one object, in a PyBullet client of its own.
+    """A table, an arm and at most one object, in a separate PyBullet client.
 
-    n_averaged_images: over how many noisy images an observation averages; on_step: called with the
-    world after every step of the simulation.
+    n_averaged_images: number of noisy images over which an observation averages; on_step: called
+    with the world after every step of the simulation.
     """
 
     def __init__(self, config: WorldConfig | None = None) -> None:
@@ -68,24 +68,24 @@ class Tabletop(AbstractContextManager):
         self.close()
 
     def close(self) -> None:
-        """Disconnect from PyBullet, as happens to a world that nothing refers to any more."""
+        """Disconnect from PyBullet; this also happens when the world is garbage-collected."""
         if self._client is not None:
             self._client.disconnect()
             self._client = None
 
     @property
     def client(self) -> BulletClient:
-        """PyBullet with this world's number; raises RuntimeError when it is closed."""
+        """The PyBullet client of this world; raises RuntimeError if the world is closed."""
         if self._client is None:
             raise RuntimeError("this world is closed; make a new Tabletop()")
         return self._client
 
     def reset(self, tool: str = "gripper") -> None:
-        """Clear the table and park the arm with a tool: the same world, bit for bit, every time."""
+        """Clear the table and park the arm with a tool; the state is bit-identical every time."""
         client = self.client
         if self.arm is None or tool != self.arm.tool or self._n_placed >= OBJECTS_PER_BUILD:
             self._build(tool)
-        else:  # exactly as when built, without loading table and arm again
+        else:  # same state as after building, without loading table and arm again
             self.arm.untie()
             for body in [client.getBodyUniqueId(k) for k in range(client.getNumBodies())]:
                 if body not in (self._table, self.arm.robot):
@@ -117,7 +117,7 @@ class Tabletop(AbstractContextManager):
             baseVisualShapeIndex=client.createVisualShape(**shape, rgbaColor=(0.93, 0.90, 0.85, 1)),
             basePosition=(sum(TABLE_X_M) / 2, sum(TABLE_Y_M) / 2, -0.05),
         )
-        world = weakref.proxy(self)  # no circle of references: it would keep the client connected
+        world = weakref.proxy(self)  # a reference cycle would keep the client connected
         self.arm = JointController(client, tool, lambda: world.on_step and world.on_step(world))
         self._n_placed = 0
         self._fresh = client.saveState()
@@ -131,9 +131,9 @@ class Tabletop(AbstractContextManager):
         tool: str = "gripper",
         config: WorldConfig | None = None,
     ) -> None:
-        """Clear the table, park the arm and stand an object at (x, y) [m], turned by a yaw.
+        """Clear the table, park the arm and place an object at (x, y) [m] with a yaw [rad].
 
-        tool: "gripper", "screwdriver" or "rod"; config: from now on (default: as it is).
+        tool: "gripper", "screwdriver" or "rod"; config: new parameters (default: unchanged).
         """
         xy_m, yaw_rad = check_on_table("xy_m", xy_m), check_finite("yaw_rad", yaw_rad)
         self.config = config or self.config
@@ -143,42 +143,42 @@ class Tabletop(AbstractContextManager):
 
     @property
     def placed(self) -> PlacedObject:
-        """The object on the table; raises NothingSeenError when there is none."""
+        """The object on the table; raises NothingSeenError if there is none."""
         if self._placed is None:
             raise NothingSeenError("there is no object on the table; call place(...) first")
         return self._placed
 
     @property
     def obj(self) -> TabletopObject:
-        """The object on the table: its category and dimensions."""
+        """Category and dimensions of the object on the table."""
         return self.placed.obj
 
     def object_state(self) -> tuple[float, ...]:
-        """Position (x, y, z) [m] and quaternion (x, y, z, w) of the object, seven numbers."""
+        """Return position (x, y, z) [m] and quaternion (x, y, z, w) of the object, 7 numbers."""
         return self.placed.state()
 
     def object_pose(self) -> tuple[float, float, float]:
-        """The object's (x, y) [m] and yaw [rad] in the frame of the table."""
+        """Return the object's (x, y) [m] and yaw [rad] in the table's frame."""
         return self.placed.pose()
 
     def object_fell(self) -> bool:
-        """Whether the object lies differently than it was placed."""
+        """Return whether the object fell over since it was placed."""
         return self.placed.fell()
 
     def object_rolls(self) -> bool:
-        """Whether the object can roll as it lies now: a cylinder on its side, not upright."""
+        """Return whether the object can roll in its current orientation, as a lying cylinder."""
         return self.placed.rolls()
 
     def shove(self, dx_m: float, dy_m: float, dyaw_rad: float = 0.0) -> None:
-        """Displace the object by (dx, dy) [m], turn it by a yaw [rad], and let it settle.
+        """Displace the object by (dx, dy) [m], rotate it by dyaw_rad, and let it settle.
 
-        Raises ValueError, and moves nothing, when its centre would leave the table.
+        Raises ValueError, without moving it, if its centre would leave the table.
         """
         self.placed.displace(dx_m, dy_m, dyaw_rad)
         self.settle()
 
     def settle(self, seconds: float = 0.5) -> None:
-        """Let the world run while the arm holds what it holds and the table brakes what rolls."""
+        """Simulate `seconds` while the arm keeps its hold and a rolling object is braked."""
         steps = round(check_within("seconds", seconds, 0.0, 60.0, "s") / STEP_S)
         if self._placed is not None:
             self.placed.brake(True)
@@ -186,15 +186,15 @@ class Tabletop(AbstractContextManager):
         self.arm.wait(steps)
 
     def park(self) -> None:
-        """Put down what the hand holds, open the fingers and take the arm home."""
+        """Put down the held object, if any, open the fingers and move the arm home."""
         put_down(self.arm)
         self.settle()
 
     def observe(self) -> Observation:
-        """The object's estimated position and its image; the arm must be parked.
+        """Return the object's estimated position and its image; the arm must be parked.
 
-        The position is the mean over `n_averaged_images` images, the image is the first of them.
-        A Kinect's image is centred where the object is seen in it, whatever the mean and `bias_m`.
+        The position is the mean over `n_averaged_images` images; the image is the first of them.
+        A Kinect's image is centred on the object as seen in it, independent of mean and `bias_m`.
         """
         x, y, _ = self.object_pose()
         views = []
@@ -207,7 +207,7 @@ class Tabletop(AbstractContextManager):
         return Observation(xy, image)
 
     def _observe_edge(self, lever: LeverUp) -> Observation:
-        """The image (2, 128, 128) around a lever-up's contact, its direction to the right."""
+        """Return the image (2, 128, 128) around a lever-up's contact, the lever pointing right."""
         if self.config.camera != "ideal":
             raise ValueError(f'camera must be "ideal" for a lever-up, got {self.config.camera!r}')
         x, y = np.add(self.object_pose()[:2], self.config.bias_m).tolist()
@@ -215,11 +215,11 @@ class Tabletop(AbstractContextManager):
         return Observation((x, y), camera.depth_crop(self.client, *window, lever.theta, samples=1))
 
     def depth_image(self) -> np.ndarray:
-        """Depth [m] and mask (2, 48, 48) of the table around the object, the arm parked."""
+        """Return depth [m] and mask (2, 48, 48) around the object; the arm must be parked."""
         return self.observe().image
 
     def picture(self, width: int = 320, height: int = 240) -> np.ndarray:
-        """A colour picture (height, width, 3), uint8, of the robot at work, for people."""
+        """Render a colour picture (height, width, 3), uint8, of the robot and the table."""
         for name, pixels in (("width", width), ("height", height)):
             check_count(name, pixels, 16, 2048)
         return camera.picture(self.client, width, height)
@@ -231,15 +231,15 @@ class Tabletop(AbstractContextManager):
         yaw_rad: float = 0.0,
         scale: float = 1.0,
     ) -> None:
-        """Show the object's footprint at (x, y) [m] on the table, in a colour; only seen."""
+        """Draw the object's footprint at (x, y) [m] on the table in a colour, without a body."""
         self.placed.draw_outline(xy_m, rgb, yaw_rad, scale)
 
     def can_reach(
         self, primitive: Primitive, stop_phase: float = 1.0, at_xy_m: Sequence[float] | None = None
     ) -> bool:
-        """Whether the arm can execute an action, with approach and way out; nothing moves.
+        """Return whether the arm can execute an action with approach and retreat; nothing moves.
 
-        at_xy_m: where the object is (default: where it is observed, and the action adapted to it).
+        at_xy_m: position of the object (default: observed, and the action is adapted to the image).
         """
         stop_phase = check_within("stop_phase", stop_phase, 0.0, 1.0)
         if at_xy_m is None:
@@ -253,7 +253,7 @@ class Tabletop(AbstractContextManager):
         return True
 
     def execute(self, step: Step) -> Interaction:
-        """Execute a step of a plan, with approach: its decoded path if it has one."""
+        """Execute a step of a plan, with approach, along its decoded path if it has one."""
         if step.path_xy_m is None:
             return self.execute_primitive(step.primitive, step.stop_phase, approach=True)
         return self.execute_path(step.path_xy_m, step.primitive, step.stop_phase)
@@ -267,13 +267,13 @@ class Tabletop(AbstractContextManager):
         smooth: bool = True,
         record_unreachable: bool = False,
     ) -> Interaction:
-        """Execute a primitive on the object up to a phase, and record what happens.
+        """Execute a primitive on the object up to a phase, and record the effect.
 
-        approach: the arm moves there and back home through the air, and the table brakes what
-        rolls before and after; otherwise it is put at the start of the path, and away in the end.
-        The effect is recorded at 301 phases in [0, stop_phase]. A partial action is the prefix of
-        the path, re-timed to its own smooth stop, or with smooth=False stopped abruptly.
-        Raises UnreachableError out of the arm's reach, or returns, with record_unreachable=True,
+        approach: the arm moves there and back home through the air, and rollable objects are braked
+        before and after; otherwise it is placed at the start of the path, and finally at home.
+        The effect is recorded at 301 phases in [0, stop_phase]. A partial action is a prefix of
+        the path, re-timed to a smooth stop, or stopped abruptly with smooth=False.
+        If the arm cannot reach, raises UnreachableError, or with record_unreachable=True returns
         an interaction in which nothing moved (`reached` is False).
         """
         stop_phase = check_within("stop_phase", stop_phase, 0.0, 1.0)
@@ -290,10 +290,10 @@ class Tabletop(AbstractContextManager):
     def execute_path(
         self, path_xy_m: np.ndarray, primitive: Push | None = None, stop_phase: float = 1.0
     ) -> Interaction:
-        """Move the gripper along a path (n, 2) [m] relative to the object, and record.
+        """Move the gripper along a path (n, 2) [m] relative to the object, and record the effect.
 
-        Height and timing are those of the primitive (default: a push), up to stop_phase; the
-        fingers face where the path leads.
+        Height and timing are those of the primitive (default: a push) up to stop_phase. The
+        gripper's yaw is the direction from the first to the last point.
         """
         stop_phase = check_within("stop_phase", stop_phase, 0.0, 1.0)
         primitive = primitive or Push(0.0)
@@ -305,6 +305,6 @@ class Tabletop(AbstractContextManager):
     def _require_tool(self, primitive: Primitive) -> None:
         if primitive.tool != self.arm.tool:
             raise ValueError(
-                f"primitive {primitive.name!r} needs the tool {primitive.tool!r}, and the arm "
+                f"primitive {primitive.name!r} needs the tool {primitive.tool!r}, but the arm "
                 f"holds the {self.arm.tool}; call place(..., tool={primitive.tool!r})"
             )

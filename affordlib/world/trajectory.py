@@ -1,6 +1,6 @@
-"""From a primitive to waypoints of the arm's joints, found before anything moves.
+"""Trajectory planning: a primitive is converted to joint waypoints before the arm moves.
 
-Inverse kinematics runs at 20 Hz, with a spline in between (its error is a few µm).
+Inverse kinematics is solved at 20 Hz and interpolated with a spline (its error is a few µm).
 """
 
 import math
@@ -15,25 +15,25 @@ from affordlib.world import robot
 STEP_S = 1 / 240
 STEPS_PER_WAYPOINT = 12
 RECORD_EVERY = 3
-"""Simulation steps from one recorded state of the object to the next."""
+"""Simulation steps between two recorded states of the object."""
 
 N_SAMPLES = 301
-"""Recorded samples over the phase: one every 3 simulation steps of a full primitive."""
+"""Number of recorded samples over the phase, one every 3 simulation steps of a full primitive."""
 
 RETREAT_M = 0.02
-"""How far the gripper moves back along its path after an action that does not cage the object."""
+"""Distance [m] the gripper moves back along its path, except after actions that cage the object."""
 
 _WAYPOINT_S = STEPS_PER_WAYPOINT * STEP_S
 UP = np.array([0.0, 0.0, 1.0, 0.0, 0.0])
-"""The direction up in poses (x, y, z, yaw, pitch)."""
+"""Unit vector upwards in poses (x, y, z, yaw, pitch)."""
 
 
 @dataclass(frozen=True)
 class TrajectorySegment:
-    """Waypoints 50 ms apart: poses (n, 6) as in `Segment`, phases (n,) at which they are passed.
+    """Waypoints at intervals of 50 ms: poses (n, 6) as in `Segment`, and their phases (n,).
 
-    n_steps: how many simulation steps of it are taken before the arm is stopped abruptly (default:
-    all). A guarded segment freezes when the robot presses on the object.
+    n_steps: number of simulation steps before the arm is stopped abruptly (default: all).
+    A guarded segment stops when the robot presses on the object.
     """
 
     poses: np.ndarray
@@ -44,9 +44,9 @@ class TrajectorySegment:
 
 @dataclass(frozen=True)
 class Command:
-    """An action as the arm is to execute it, relative to where the robot measured the object.
+    """An action for the arm to execute, relative to the object's measured position.
 
-    phase: (n,) and action: (n, 5), as they are recorded; segments: the trajectory.
+    phase: (n,) and action: (n, 5), as recorded; segments: the trajectory.
     """
 
     primitive: Primitive
@@ -56,14 +56,14 @@ class Command:
 
     @classmethod
     def of(cls, primitive: Primitive, stop_phase: float, smooth: bool = True) -> Self:
-        """A primitive up to a phase."""
+        """Return the command for a primitive up to a phase."""
         phase = np.linspace(0.0, 1.0, N_SAMPLES) * stop_phase
         segments = segments_until(primitive, stop_phase, smooth)
         return cls(primitive, phase, primitive.path(phase), segments)
 
     @classmethod
     def along(cls, path_xy_m: np.ndarray, primitive: Primitive, stop_phase: float) -> Self:
-        """Points (n, 2) [m], n ≥ 2, with the heights of a primitive; the fingers face their end."""
+        """Return the command along points (n, 2) [m], n ≥ 2, at the heights of a primitive."""
         if path_xy_m.ndim != 2 or len(path_xy_m) < 2:
             raise ValueError(f"path_xy_m must be points (n, 2), n ≥ 2, got {path_xy_m.shape}")
         phase = np.linspace(0.0, 1.0, len(path_xy_m)) * stop_phase
@@ -78,7 +78,7 @@ class Command:
 def segments_until(
     primitive: Primitive, stop_phase: float, smooth: bool = True
 ) -> list[TrajectorySegment]:
-    """The trajectory of a primitive up to a phase, with a minimum-jerk stop or an abrupt one."""
+    """Return a primitive's trajectory up to a phase, with a minimum-jerk or an abrupt stop."""
     segments = []
     phases = primitive.segment_phases
     for segment, begin, end in zip(primitive.segments, phases[:-1], phases[1:], strict=True):
@@ -101,9 +101,9 @@ def segments_until(
 
 
 def _segment_along(action: np.ndarray, phase: np.ndarray) -> TrajectorySegment:
-    """An action (n, 5) at phases (n,), followed along its length with a smooth stop."""
+    """Return the segment for an action (n, 5) at phases (n,), re-timed to a smooth stop."""
     n = max(2, math.ceil(DURATION_S * float(min_jerk(phase[-1])) / _WAYPOINT_S - 1e-9))
-    # Along its length, a minimum-jerk path is the same path whatever its speed.
+    # Parametrised by arc length, a minimum-jerk path does not depend on its speed.
     length = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(action[:, :2], axis=0).T))])
     if length[-1] < 1e-9:
         return TrajectorySegment(np.repeat([[*action[0], 0.0]], n + 1, axis=0), np.zeros(n + 1))
@@ -114,7 +114,7 @@ def _segment_along(action: np.ndarray, phase: np.ndarray) -> TrajectorySegment:
 
 
 def recorded_phases(segments: list[TrajectorySegment]) -> tuple[np.ndarray, np.ndarray]:
-    """Phases at which states of the object, and poses of the tool, are recorded, in order."""
+    """Return the phases at which object states and tool poses are recorded, in this order."""
     per = STEPS_PER_WAYPOINT // RECORD_EVERY
     at_sample, at_waypoint = [], []
     for segment in segments:
@@ -129,26 +129,26 @@ def recorded_phases(segments: list[TrajectorySegment]) -> tuple[np.ndarray, np.n
 
 
 def joint_move(start: np.ndarray, end: np.ndarray, seconds: float) -> np.ndarray:
-    """Joint waypoints (n, 6) of a smooth move between two postures."""
+    """Return joint waypoints (n, 6) of a minimum-jerk motion between two configurations."""
     n = max(2, math.ceil(seconds / _WAYPOINT_S))
     return start + min_jerk(np.linspace(0, 1, n + 1))[:, None] * (end - start)
 
 
 def line(start_W: np.ndarray, end_W: np.ndarray, near: np.ndarray, seconds: float, tool: str):
-    """Joint waypoints (n, 6) of a smooth straight line between two poses (x, y, z, yaw, pitch)."""
+    """Return joint waypoints (n, 6) of a straight line between poses (x, y, z, yaw, pitch)."""
     return robot.joint_path(joint_move(start_W, end_W, seconds), near, tool)
 
 
 def plan_motion(
     primitive: Primitive, segments: list[TrajectorySegment], offset: np.ndarray, approach: bool
 ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray], list[np.ndarray], np.ndarray]:
-    """Joint waypoints (n, 6) of the arm along segments; offset (5,) is added to their poses.
+    """Plan the arm's motion along segments, whose poses are shifted by offset (5,).
 
-    They are: above the start (6,); from there to it; of each segment, behind the poses (n, 5) of
-    the tool there; back and up. Raises UnreachableError where any of it is out of reach.
+    Returns joint angles (6,) above the start; waypoints (n, 6) down to the start; tool poses (n, 5)
+    and waypoints of each segment; waypoints back and up. Raises UnreachableError.
     """
     home, tool = np.array(robot.HOME), primitive.tool
-    # A gripper is symmetric: of its two equal yaws, take the one that turns the wrist less.
+    # A gripper is symmetric: of its two equivalent yaws, use the one with less wrist rotation.
     turns = (0.0, math.pi) if tool == "gripper" else (0.0,)
     options = [
         [s.poses[:, [0, 1, 2, 3, 5]] + offset + np.array([0, 0, 0, turn, 0]) for s in segments]
@@ -164,7 +164,7 @@ def plan_motion(
         paths.append(robot.joint_path(one, near, tool))
         near = paths[-1][-1]
 
-    # The way out: back along the path, then up; only up where the fingers cage the object.
+    # Retreat: back along the path, then up; only up if the fingers cage the object.
     n_steps, at = segments[-1].n_steps, np.arange(len(paths[-1]))
     stop = at[-1] if n_steps is None else n_steps / STEPS_PER_WAYPOINT
     end = np.array([np.interp(stop, at, column) for column in poses_W[-1].T])

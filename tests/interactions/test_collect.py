@@ -78,7 +78,7 @@ def test_what_a_full_disk_has_left_out_or_damaged_is_made_again(tmp_path, made, 
         with pytest.raises(OSError, match="No space left") as failure:
             collect_set(SMALL, path, progress=False)
     assert failure.value.__notes__ == [
-        "finished chunks are kept; collect into the same path to go on"
+        "finished chunks are kept; collect into the same path to continue"
     ]
     with pytest.raises(FileNotFoundError, match="no file"):
         open_interactions(path)
@@ -205,7 +205,7 @@ def test_ctrl_c_ends_collecting_with_one_error(tmp_path):
     assert err.count("Traceback") == 1
     assert err.splitlines()[-2:] == [
         "KeyboardInterrupt",
-        "finished chunks are kept; collect into the same path to go on",
+        "finished chunks are kept; collect into the same path to continue",
     ]
 
 

@@ -65,18 +65,18 @@ def _replace(folder, old, new):
 @pytest.mark.parametrize(
     ("spoil", "says"),
     [
-        (lambda f: (f / TABLE).unlink(), r"there is no .*trajectories\.csv; expected"),
+        (lambda f: (f / TABLE).unlink(), r"there is no .*trajectories\.csv; write a"),
         (lambda f: (f / "images" / "0001.png").unlink(), r"no image .*0001\.png"),
         (
             lambda f: _replace(f, "action_x", "action_q"),
             r"action are \['action_q', 'action_y'\]; choose from",
         ),
         (lambda f: _replace(f, "interaction", "object"), r"column 'interaction' is missing"),
-        (lambda f: _replace(f, "0001,0.0,", "0001,0.5,"), r"t of interaction '0001' must grow"),
+        (lambda f: _replace(f, "0001,0.0,", "0001,0.5,"), r"t of interaction '0001' must increase"),
         (lambda f: _replace(f, "0000,0.0,", "0000,zero,"), r"\.csv: .* 't' .* line 2 has 'zero'"),
         (lambda f: _replace(f, "0001,0.0,", "0001,,"), r"column 't' .* line 303 has 'nan'"),
-        (lambda f: _replace(f, "0001,0.0,", "0001,0.0,0,"), r"\.csv is no table .* line 303,"),
-        (lambda f: (f / TABLE).write_text(""), r"\.csv is no table"),
+        (lambda f: _replace(f, "0001,0.0,", "0001,0.0,0,"), r"\.csv is not a table .* line 303,"),
+        (lambda f: (f / TABLE).write_text(""), r"\.csv is not a table"),
         (lambda f: (f / "images/0001.png").write_bytes(b"\x89PNG"), r"0001\.png is damaged"),
         (
             lambda f: Image.fromarray(np.zeros((48, 48), np.uint8)).save(f / "images" / "0002.png"),

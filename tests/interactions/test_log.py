@@ -78,7 +78,7 @@ BAD = {
     "another outline's unit": (
         {},
         {"unit": "m", "outline": np.array(TRIANGLE_MM) / 1e3},
-        r"interaction 0 .*tool_xy never enters .*one frame and unit",
+        r"interaction 0 .*tool_xy never enters .*share a frame and unit",
     ),
     "degrees as radians": (
         {"start": (600.0, -20.0, 17.2)},
@@ -88,12 +88,12 @@ BAD = {
     "degrees of the end alone": (
         {"end": (605.0, -14.0, 4.5)},
         {},
-        r"interaction 0 .*end is turned by .* rad, expected .*rad",
+        r"interaction 0 .*end is turned by .* rad, but .*rad",
     ),
     "absolute tool, relative object": (
         {"start": (0.0, 0.0, 0.0)},
         {},
-        r"interaction 0 .*tool_xy never enters the outline .*one frame",
+        r"interaction 0 .*tool_xy never enters the outline .*share a frame",
     ),
     "a pose of another push": (
         {"end": (700.0, -14.0, 0.38)},
@@ -113,7 +113,7 @@ BAD = {
     "repeated times": (
         {"tool_t": np.array([0, 1, 2, 3, 4, 5, 5, 7, 8, 9, 10, 11.0])},
         {},
-        r"interaction 0 .*tool_t must grow, but row 6 .*leave out",
+        r"interaction 0 .*tool_t must increase, but row 6 .*remove",
     ),
     "a gap": (
         {"tool_xy": np.vstack([tool()[:-1], [[np.nan, 0]]])},
@@ -123,12 +123,12 @@ BAD = {
     "effects that do not begin at zero": (
         {"end": None, "poses": (np.array([0, 6.6]), np.array([(610, -20, 0.3), PUSH["end"]]))},
         {},
-        r"interaction 0 .*first of poses is .*effects begin at zero",
+        r"interaction 0 .*first of poses is .*effects start at zero",
     ),
     "a whole session": (
         {"tool_t": np.arange(1e5), "tool_xy": np.zeros((100_000, 2))},
         {},
-        r"interaction 0 .*tool_t has 100000 rows, .*cut the recording",
+        r"interaction 0 .*tool_t has 100000 rows, .*split the recording",
     ),
     "an outline that crosses itself": (
         {},
