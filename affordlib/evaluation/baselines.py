@@ -1,12 +1,12 @@
-"""Predictors without a network, to see what the network adds; each says what it knows.
+"""Baselines without a network, to show what the network adds, and the information they get.
 
     constant          the action's direction, and the mean trajectory of all training interactions
     nearest           the object's true size and yaw: the trajectory of the most similar object
     gaussian_process  the same, with a Gaussian process of exact inference (Rasmussen and Williams,
                       Gaussian processes for machine learning, 2006, algorithm 2.1)
 
-Networks must read size and yaw from the image; nearest and gaussian_process are given them. All
-work in the frame of the action, which networks in the frame of the table do not.
+Networks must infer size and yaw from the image; nearest and gaussian_process get the true values.
+All work in the frame of the action, unlike networks in the frame of the table.
 """
 
 import warnings
@@ -32,7 +32,7 @@ Forecast = tuple[Tensor, Tensor]
 """Mean and σ (N, T, C) of the effect at some samples."""
 
 _CATEGORY_GAP = 3.0
-"""Distance between the features of two categories; other features spread by about 1."""
+"""Feature distance between two categories; the other features have a spread of about 1."""
 
 
 def baseline_predictions(
@@ -43,7 +43,7 @@ def baseline_predictions(
     other: "xarray.Dataset",
     queried: np.ndarray,
 ) -> dict[str, Any]:
-    """What a baseline, fitted to interactions of `data`, predicts of those `queried` of `other`."""
+    """Fit a baseline to interactions of `data`; predict those `queried` of `other`."""
     known, kept = valid_interactions(data, train_on), valid_interactions(other, queried)
     training = InteractionTensors.from_dataset(data, known, *channels)
     arrays = InteractionTensors.from_dataset(other, kept, *channels)
@@ -56,11 +56,11 @@ def baseline_predictions(
 
 
 def features(data: "xarray.Dataset") -> Tensor:
-    """What is known of objects, near unit size: (N, 3 + 2 + categories) sizes, yaw, category.
+    """Features of objects, scaled to about 1: (N, 3 + 2 + categories) sizes, yaw, category.
 
-    Yaw is that of the object against the action (against the table where the action has no
-    direction), as cosine and sine of twice the angle, since half a turn changes nothing; round
-    objects have none.
+    Yaw is the object's yaw relative to the action (to the table if the action has no direction), as
+    cosine and sine of twice the angle, since objects are symmetric under 180°; round objects have
+    none.
     """
     size = torch.from_numpy(data["size"].values).float()
     yaw = torch.from_numpy(data["start_pose"].values[:, 2].copy())
@@ -84,7 +84,7 @@ def features(data: "xarray.Dataset") -> Tensor:
 def constant(
     train: InteractionTensors, test: InteractionTensors, at: Tensor, *_: Tensor
 ) -> Forecast:
-    """The mean trajectory in the direction of the action; σ is the spread about it."""
+    """Predict the mean trajectory in the direction of the action; σ is the spread about it."""
     effect = _in_action_frame(train, at)
     mean = effect.mean(dim=0)
     if _has_direction(train):
@@ -96,7 +96,7 @@ def constant(
 def nearest(
     train: InteractionTensors, test: InteractionTensors, at: Tensor, known: Tensor, queried: Tensor
 ) -> Forecast:
-    """The training trajectory of the most similar object; σ from leaving one out."""
+    """Predict the training trajectory of the most similar object; σ is the leave-one-out error."""
     effect, neighbours = _in_action_frame(train, at), NearestNeighbors(n_neighbors=1).fit(known)
     left_out, found = (
         neighbours.kneighbors(x, return_distance=False)[:, 0] for x in (None, queried)
@@ -108,10 +108,10 @@ def nearest(
 def gaussian_process(
     train: InteractionTensors, test: InteractionTensors, at: Tensor, known: Tensor, queried: Tensor
 ) -> Forecast:
-    """One exact Gaussian process per effect channel.
+    """Predict by one exact Gaussian process per effect channel.
 
     k(x, x') = s² exp(-½ Σ (x - x')² / l²) + noise; s, l and noise maximise the likelihood of the
-    last sample, and serve all.
+    last sample, and are used for all samples.
     """
     effect = _in_action_frame(train, at).double()
     centre, scale = effect.mean(dim=0), _floor(effect.std(dim=0))
@@ -120,7 +120,7 @@ def gaussian_process(
     prior += WhiteKernel(0.1, (1e-9, 1e3))
     mean, std = torch.empty(2, len(queried), *target.shape[1:], dtype=torch.double)
     for c in range(target.shape[-1]):
-        with warnings.catch_warnings():  # the length of a feature that does not matter is bounded
+        with warnings.catch_warnings():  # the length scale of an irrelevant feature hits its bound
             warnings.simplefilter("ignore", ConvergenceWarning)
             kernel = GaussianProcessRegressor(prior).fit(known, target[:, -1, c]).kernel_
         process = GaussianProcessRegressor(kernel, optimizer=None).fit(known, target[..., c])
@@ -143,7 +143,7 @@ def _in_action_frame(arrays: InteractionTensors, at: Tensor) -> Tensor:
 
 
 def _in_table_frame(arrays: InteractionTensors, at: Tensor, mean: Tensor, std: Tensor) -> Forecast:
-    """What was predicted in the frame of the action, in the table's."""
+    """Rotate predictions from the frame of the action to the table's."""
     std = std.expand_as(mean)
     if not _has_direction(arrays):
         return mean, std

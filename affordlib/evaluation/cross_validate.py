@@ -1,14 +1,14 @@
-"""Cross-validation of models on a log of one's own, always beside predictors without a network.
+"""Cross-validation of models on a user's own log, always with baselines for comparison.
 
-constant          the mean effect, in the direction of the push
-nearest           the effect of the training push with the nearest contact point and direction
-ridge             quadratic in contact point and direction
-gaussian_process  of contact point and direction, and of mirrored copies where the outline allows
-physics           a quasi-static push with two fitted numbers (`AnalyticPusher`); physics_feet:
-                  with the support that `context["feet"]` tells
-physics_gp        the same, and a Gaussian process of what it leaves; physics_feet_gp
+    constant          the mean effect, in the direction of the push
+    nearest           the effect of the training push with the nearest contact point and direction
+    ridge             quadratic in contact point and direction
+    gaussian_process  of contact point and direction, with reflections if the outline is symmetric
+    physics           a quasi-static push with two fitted numbers (`AnalyticPusher`); physics_feet:
+                      with the support from `context["feet"]`
+    physics_gp        the same, and a Gaussian process of its residuals; physics_feet_gp
 
-What `context` tells is told to all that can take it, where it differs among the training pushes.
+All baselines that can use `context` get it, if it differs among the training pushes.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from affordlib.models.quasi_static import AnalyticPusher
 from affordlib.types import check_count
 
 MOST_PUSHES = 3000
-"""Time of a Gaussian process grows as the cube of the number."""
+"""Maximum number of pushes: the time of a Gaussian process grows with its cube."""
 WITHIN = ("group", "all", "others")
 
 Forecast = tuple[np.ndarray, np.ndarray]
-"""Mean and σ (n, 3) of displacement and turn, in the object's frame."""
+"""Mean and σ (n, 3) of displacement [m] and rotation [rad], in the object's frame."""
 
 
 def cross_validate(
@@ -43,13 +43,13 @@ def cross_validate(
     within: str = "group",
     seed: int = 0,
 ) -> pd.DataFrame:
-    """Errors and coverage of models, and of all baselines, by group and of all pushes.
+    """Errors and coverage of models and of all baselines, by group and over all pushes.
 
-    models: names for `fit`; folds: of each group, each tested once; within: "group" trains on the
-    other folds of the same group, "all" on those of all groups, "others" on the other groups. A
-    row per model and group, and group "all": n_train, n, mean, standard error and median of the
-    position error [m], mean and standard error of the yaw error [rad], and the share of x, y and
-    yaw inside the 50 and 90 % intervals.
+    models: names for `fit`; folds: number of folds of each group, each tested once; within: "group"
+    trains on the other folds of the same group, "all" on those of all groups, "others" on the other
+    groups. Returns one row per model and group, and group "all": n_train, n, mean, standard error
+    and median of the position error [m], mean and standard error of the yaw error [rad], and the
+    share of x, y and yaw inside the 50 and 90 % intervals.
     """
     errors = push_errors(data, models, folds, within, seed)
     parts = [*errors.groupby(["model", "group"], sort=False)]
@@ -63,7 +63,7 @@ def cross_validate(
 def push_errors(
     data: PushLog, models: Sequence[str], folds: int = 5, within: str = "group", seed: int = 0
 ) -> pd.DataFrame:
-    """A row per model and push, with its number: what `cross_validate` is the summary of."""
+    """One row per model and push, with the push's index; `cross_validate` summarises it."""
     check_count("folds", folds, 2)
     check_count("seed", seed, least=0)
     if unknown := set(models) - set(MODELS):
@@ -95,7 +95,7 @@ def push_errors(
 
 
 def summary(errors: pd.DataFrame) -> dict[str, float]:
-    """The numbers of a row of a table of errors per push."""
+    """Summarise errors per push as one row of `cross_validate`."""
     position, yaw = errors["position_m"], errors["yaw_rad"]
     return {
         "n": len(errors),
@@ -112,7 +112,7 @@ def summary(errors: pd.DataFrame) -> dict[str, float]:
 def errors_of(
     data: PushLog, trained: np.ndarray, tested: np.ndarray, names: Sequence[str], seed: int = 0
 ) -> pd.DataFrame:
-    """A row per predictor and push tested (n,), after those trained on (n,); both are masks."""
+    """One row per predictor and tested push, after training; trained, tested: masks (n,)."""
     torch.set_num_threads(1)
     train, test = data.select(trained), data.select(tested)
     scale, frames = [*[gyration_radius_m(data.outline_m)] * 2, 1.0], []
@@ -129,7 +129,7 @@ def errors_of(
 
 
 def forecast_errors(forecast: Forecast, test: PushLog) -> pd.DataFrame:
-    """A row per push: errors, and the shares of x, y and yaw in the 50 and 90 % intervals."""
+    """One row per push: errors, and the shares of x, y and yaw in the 50 and 90 % intervals."""
     mean, std = forecast
     off = np.abs(mean - np.column_stack([test.displacement_m, test.turn_rad]))
     inside = {f"inside_{p}": (off < norm.ppf(0.5 + p / 200) * std).mean(axis=1) for p in (50, 90)}
@@ -138,7 +138,7 @@ def forecast_errors(forecast: Forecast, test: PushLog) -> pd.DataFrame:
 
 
 def mirrors(outline_m: np.ndarray) -> list[np.ndarray]:
-    """Matrices (2, 2) of the reflections that take an outline (k, 2) to itself."""
+    """Matrices (2, 2) of the reflections that map an outline (k, 2) to itself."""
     corners = outline_m @ np.array([1, 1j])
     found = []
     for corner in corners:
@@ -150,7 +150,7 @@ def mirrors(outline_m: np.ndarray) -> list[np.ndarray]:
 
 
 def _features(log: PushLog, like: PushLog) -> np.ndarray:
-    """Contact point and direction (n, 4 + c), length and context where they differ in `like`."""
+    """Contact point and direction (n, 4 + c), and length and context if they differ in `like`."""
     columns = [push_rows(log)[:, [0, 1, 4, 5]].double().numpy()]
     if like.length_m.std() > 0.05 * like.length_m.mean():
         columns.append(log.length_m[:, None] / gyration_radius_m(log.outline_m))
@@ -175,7 +175,7 @@ def _constant(train: PushLog, test: PushLog) -> Forecast:
 
 
 def _turned(direction: np.ndarray, outcome: np.ndarray) -> np.ndarray:
-    """Outcomes (n, 3) whose x axis becomes the directions (n, 2)."""
+    """Rotate outcomes (n, 3) so that their x axis becomes the directions (n, 2)."""
     (c, s), (x, y, turn) = direction.T, outcome.T
     return np.column_stack([c * x - s * y, s * x + c * y, turn])
 
@@ -200,7 +200,7 @@ def _ridge(train: PushLog, test: PushLog) -> Forecast:
 
 
 def _gaussian_process(train: PushLog, test: PushLog, target: np.ndarray | None = None) -> Forecast:
-    """target: (n, 3), the outcome if not given."""
+    """Fit to target (n, 3), by default the outcome."""
     from sklearn.exceptions import ConvergenceWarning
     from sklearn.gaussian_process import GaussianProcessRegressor
     from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
@@ -215,7 +215,7 @@ def _gaussian_process(train: PushLog, test: PushLog, target: np.ndarray | None =
         target.append(copy[:, 7:])
     known, target = np.vstack(known), np.vstack(target)
     prior = ConstantKernel() * RBF([1.0] * known.shape[1], (1e-2, 1e4)) + WhiteKernel(0.1)
-    with warnings.catch_warnings():  # the length of a feature that does not matter is bounded
+    with warnings.catch_warnings():  # the length scale of an irrelevant feature hits its bound
         warnings.simplefilter("ignore", ConvergenceWarning)
         both = [
             GaussianProcessRegressor(prior, normalize_y=True)
@@ -228,7 +228,7 @@ def _gaussian_process(train: PushLog, test: PushLog, target: np.ndarray | None =
 
 
 def _physics(feet: bool, process: bool) -> Callable[[PushLog, PushLog], Forecast]:
-    """A quasi-static pusher of each group, or of all where a group is not among the training."""
+    """A quasi-static pusher fitted to each group, or to all pushes for a group not in training."""
 
     def predicted(train, test):
         means = [np.zeros((len(log), 3)) for log in (train, test)]

@@ -1,4 +1,4 @@
-"""Rows of error statistics, and the guard against testing a model on what it was trained on."""
+"""Rows of error statistics, and the check that a model is not tested on its training data."""
 
 from typing import Any
 
@@ -31,16 +31,16 @@ def error_row(errors_m: np.ndarray, **columns: Any) -> dict[str, Any]:
 
 
 def refuse_seen(about: dict[str, Any], data: "xarray.Dataset", interactions: np.ndarray) -> None:
-    """Raise if a checkpoint was, or may have been, trained on objects of these interactions.
+    """Raise ValueError if a checkpoint was trained on these interactions, or does not say so.
 
-    about: what `load_checkpoint` returned beside the model.
+    about: the second value that `load_checkpoint` returns.
     """
     try:
         recipes = [Recipe.from_json(text) for text in (about["recipe"], data.attrs["recipe"])]
         trained_on = {int(number) for number in about["seen_interactions"]}
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(
-            f"about: it does not say which interactions the model was trained on ({error!r}); "
+            f"about does not say which interactions the model was trained on ({error!r}); "
             "save the checkpoint with the recipe and seen_interactions of its training"
         ) from error
     check_numbers("interactions", interactions)

@@ -1,4 +1,4 @@
-"""Predictions from image and commanded action beside what happened, as plain lists."""
+"""Predictions from image and commanded action with the ground truth, as plain lists."""
 
 from typing import Any
 
@@ -15,18 +15,18 @@ EVERY = 12
 """Every twelfth sample is one of the paper's 25 steps of 150 ms."""
 
 CONTACT_M = 0.001
-"""From where on an object counts as touched: moved by this much (or turned by as many rad)."""
+"""Displacement [m] (or rotation [rad]) from which on an object counts as touched."""
 
 
 def steps_of(arrays: InteractionTensors) -> torch.Tensor:
-    """Sample numbers of the 25 steps, the last of them t = 1."""
+    """Sample numbers of the 25 steps, the last of which is t = 1."""
     return torch.arange(EVERY, len(arrays.phase), EVERY)
 
 
 def network_predictions(
     model: EffectModel, data: "xarray.Dataset", interactions: np.ndarray
 ) -> dict[str, Any]:
-    """What a network predicts of interactions: see `prediction_record`."""
+    """Predictions of a network for interactions: see `prediction_record`."""
     kept = valid_interactions(data, interactions)
     arrays = InteractionTensors.from_dataset(
         data, kept, model.action_channels, model.effect_channels
@@ -36,7 +36,7 @@ def network_predictions(
 
 
 def about_objects(data: "xarray.Dataset", kept: np.ndarray) -> dict[str, Any]:
-    """Number of each interaction, and its object's category and whether it rolls."""
+    """Number of each interaction, category of its object, and whether the object rolls."""
     names = data["family"].attrs["flag_meanings"].split()
     return {
         "interaction": data["interaction"].values[kept].tolist(),
@@ -76,7 +76,7 @@ def prediction_record(
 
 
 def final_error(record: dict[str, Any]) -> np.ndarray:
-    """Distance (N,) of predicted and true effect at t = 1: of (x, y) [m], or of z or yaw alone."""
+    """Error (N,) of the predicted effect at t = 1: of (x, y) [m], or else of z or yaw alone."""
     mean, truth = record["mean"], record["truth"]
     if "x" in mean:
         return np.hypot(*(np.subtract(mean[name], truth[name]) for name in "xy"))

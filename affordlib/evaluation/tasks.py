@@ -1,8 +1,8 @@
-"""Where objects shall be brought: goals drawn by seed, before anything plans (Table 3).
+"""Planning tasks: objects and goals drawn with a seed, independent of any planner (Table 3).
 
-Objects are ones that no model has seen; goals are more than 2 cm from the start. *Constructed* ones
-are where executed actions really ended, so they can be reached; *uniform* ones are drawn evenly
-over the area in reach; both off the 10° grid of A*. Those of the tables are frozen in files, which
+No model has seen the objects; goals are more than 2 cm from the start. *Constructed* goals are
+final positions of executed actions, so they can be reached; *uniform* ones are drawn uniformly over
+the reachable area. Both avoid the 10° grid of A*. The tables' tasks are stored in files that
 `python -m experiments.shipped goals` wrote.
 """
 
@@ -33,21 +33,21 @@ GOAL_SOURCES = ("constructed", "uniform")
 
 MIN_DISTANCE_M = 0.02
 EARLIEST_STOP = 0.55
-"""Before this phase hardly any action has moved its object."""
+"""Earliest stop phase of constructed tasks; before it hardly any action has moved its object."""
 ATTEMPTS = 30
-"""So many random episodes are tried with an object before another takes its place."""
+"""Number of random episodes tried with an object before it is replaced."""
 
 STANDING = ("cuboid", "upright_cylinder")
 ROLLABLE = ("lying_cylinder", "sphere")
 REACH_M = {Push: 0.07, Drag: 0.05}
-"""How far one full action takes an object, at least (a push) or about (a drag)."""
+"""Distance [m] of one full action: the minimum (push) or the approximate one (drag)."""
 
 
 @dataclass(frozen=True)
 class PlanningTask:
-    """An object at the table's centre, turned by a yaw [rad], and where it should go.
+    """An object at the table's centre, rotated by a yaw [rad], and its goal.
 
-    config: the world it is in, which no planner knows.
+    config: the world, which is unknown to the planners.
     """
 
     obj: TabletopObject
@@ -58,7 +58,7 @@ class PlanningTask:
     config: WorldConfig = field(default_factory=WorldConfig)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values, from which `from_json` makes the same task."""
+        """Convert to plain values, from which `from_json` makes the same task."""
         plain = {
             "object_class": self.obj.category,
             "size_m": list(astuple(self.obj)),
@@ -71,7 +71,7 @@ class PlanningTask:
 
     @classmethod
     def from_json(cls, plain: dict[str, Any]) -> Self:
-        """The task that `to_json` wrote."""
+        """Make the task from values of `to_json`."""
         obj = category_named(plain["object_class"])(*plain["size_m"])
         goal = Goal(tuple(plain["goal_xy_m"]))
         config = WorldConfig(**plain.get("world", {}))
@@ -79,7 +79,7 @@ class PlanningTask:
 
 
 def drawn_object(mode: str, goals: str, seed: int, index: int, classes: Sequence[str]) -> tuple:
-    """The object of a task, its yaw [rad], and the generator to draw the goal from."""
+    """Draw the object of a task, its yaw [rad], and the generator to draw the goal from."""
     key = (list(MODES).index(check_choice("mode", mode, MODES)), GOAL_SOURCES.index(goals), index)
     rng = np.random.default_rng(np.random.SeedSequence(2_000_003 + seed, spawn_key=key))
     obj = category_named(classes[index % len(classes)]).sample(rng)
@@ -87,7 +87,7 @@ def drawn_object(mode: str, goals: str, seed: int, index: int, classes: Sequence
 
 
 def off_grid(rng: np.random.Generator, around: float, spread: float) -> float:
-    """An angle within `spread` of `around`, at least 1° off the 10° grid."""
+    """Draw an angle within `spread` of `around`, at least 1° off the 10° grid."""
     while True:
         angle = around + rng.uniform(-spread, spread)
         off = math.degrees(angle) % 10
@@ -103,10 +103,10 @@ def constructed_tasks(
     classes: Sequence[str] = STANDING,
     variation: Variation | None = None,
 ) -> list[PlanningTask]:
-    """Tasks whose goal is where random actions of the mode's kind really took the object.
+    """Draw tasks whose goal is the final position of random actions of the mode's kind.
 
-    variation: draws each task a world of its own. An object that in none of `ATTEMPTS` episodes
-    stays on the table, upright and without a fault, is replaced by another of its category.
+    variation: draws a separate world for each task. An object is replaced by another of its
+    category if in none of `ATTEMPTS` episodes it stays upright and on the table without a fault.
     """
 
     def drawn(index: int) -> PlanningTask | None:
@@ -132,10 +132,10 @@ def constructed_tasks(
 
 
 def frozen_tasks(world: str = "clean") -> list[PlanningTask]:
-    """The tasks of the tables in one of the worlds, or those for choices."""
+    """Load the tasks of the tables in one of the worlds, or the validation tasks."""
     path = repo_root() / FROZEN[check_choice("world", world, FROZEN)]
     if not path.is_file():
         raise FileNotFoundError(
-            f"there are no goals at {path}; run python -m experiments.shipped goals"
+            f"there are no goals at {path}; make them with python -m experiments.shipped goals"
         )
     return [PlanningTask.from_json(plain) for plain in json.loads(path.read_text())["tasks"]]

@@ -1,4 +1,4 @@
-"""Pictures for people: figures, animations, and widgets to try things by hand."""
+"""Pictures for people: figures, animations, and interactive widgets."""
 
 from affordlib.show.executors import closed_loop, open_loop
 from affordlib.show.explorers import ConditioningExplorer, PhaseSlider

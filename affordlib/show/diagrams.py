@@ -1,4 +1,4 @@
-"""Drawings of what flows where: boxes and arrows."""
+"""Data-flow diagrams: boxes and arrows."""
 
 from collections.abc import Mapping, Sequence
 
@@ -10,7 +10,7 @@ from affordlib.show.plots import NEUTRAL
 def plot_flow(
     ax: Axes, boxes: Mapping[str, tuple[float, float, str]], arrows: Sequence[tuple[str, str]]
 ) -> Axes:
-    """Texts in boxes at (x, y), coloured by their third entry, and arrows between them by name."""
+    """Draw texts in boxes at (x, y), coloured by their third entry, and arrows between them."""
     drawn = {}
     for text, (x, y, color) in boxes.items():
         style = {"boxstyle": "round,pad=0.4", "fc": "white", "ec": color, "lw": 1.5}

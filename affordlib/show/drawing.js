@@ -1,9 +1,9 @@
 // A picture and, over it, an SVG drawing with handles that are dragged. A drag, or on a drawing with
-// `keyboard` an arrow key, sets `wanted` = [name, x, y, number]; the number tells equal places apart.
-// The handle follows the hand at once, everything else when Python has answered.
+// `keyboard` an arrow key, sets `wanted` = [name, x, y, number]; the number identifies the request.
+// The handle follows the pointer immediately, everything else when Python has answered.
 
 const KEYS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
-const NEAR = 30; // how far from a handle it can still be grabbed
+const NEAR = 30; // largest distance from a handle at which it can be grabbed
 
 const between = (low, value, high) => Math.max(low, Math.min(high, value));
 
@@ -15,13 +15,13 @@ function render({ model, el }) {
   svg.setAttribute("aria-label", model.get("label"));
   svg.setAttribute("role", model.get("keyboard") ? "application" : "img");
   if (model.get("keyboard")) svg.setAttribute("tabindex", 0);
-  // JupyterLab's own shortcuts (arrow keys move between cells) stay off while this has the focus.
+  // JupyterLab's own shortcuts (arrow keys move between cells) are disabled while this has focus.
   el.dataset.lmSuppressShortcuts = "true";
   el.classList.add("affordlib-drawing");
   el.append(image, svg);
 
   let held = null; // the handle that is being dragged
-  let hand = null; // where a handle has been put, until Python has answered
+  let hand = null; // the position of a moved handle, until Python has answered
   let number = 0;
   let playing = null;
   let timer = null;
@@ -88,7 +88,7 @@ function render({ model, el }) {
     number = Math.max(number, model.get("wanted")[3]) + 1;
     svg.dataset.asked = number;
     model.set("wanted", [name, x, y, number]);
-    model.save_changes(); // ipywidgets sends the next one when this one has been dealt with
+    model.save_changes(); // ipywidgets sends the next one when this one has been processed
   }
 
   function pointer(event) {
@@ -113,7 +113,7 @@ function render({ model, el }) {
   }
 
   svg.addEventListener("pointerdown", (event) => {
-    const at = pointer(event); // before the focus may scroll the drawing into view
+    const at = pointer(event); // before focusing, which may scroll the drawing into view
     held = event.button === 0 ? nearest(at) : null;
     if (!held) return;
     svg.setPointerCapture(event.pointerId);
@@ -124,7 +124,7 @@ function render({ model, el }) {
   svg.addEventListener("pointermove", (event) => {
     const { x, y } = pointer(event);
     if (!held) svg.style.cursor = nearest({ x, y }) ? "" : "default";
-    // A browser may tell of a move where nothing has moved, after a change of layout for one.
+    // Browsers may send a move event without a motion, for example after a layout change.
     else if (Math.abs(x - now(held).x) + Math.abs(y - now(held).y) > held.step) ask(held, x, y);
   });
   svg.addEventListener("pointerup", drop);
@@ -143,12 +143,12 @@ function render({ model, el }) {
     event.stopPropagation();
   });
 
-  // Sliders beside a drawing have no names of their own for those who hear the page.
+  // Sliders beside a drawing have no names for screen readers.
   const nameSliders = () =>
     el.closest(".widget-vbox")?.querySelectorAll("[role=slider]").forEach((handle) => {
       handle.ariaLabel = handle.closest(".widget-slider").querySelector(".widget-label").textContent;
     });
-  new ResizeObserver(() => setTimeout(nameSliders, 500)).observe(el); // when all is in the page
+  new ResizeObserver(() => setTimeout(nameSliders, 500)).observe(el); // after the page is complete
   const listeners = { scene: draw, picture: drawPicture, playback: play };
   for (const [name, heard] of Object.entries(listeners)) model.on(`change:${name}`, heard);
   drawPicture();

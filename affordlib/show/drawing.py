@@ -1,6 +1,6 @@
-"""What the widgets are made of: a drawing with handles, and figures with controls and handles.
+"""Building blocks of the widgets: a drawing with handles, and figures with controls and handles.
 
-Everything they need is in this package; nothing is fetched from anywhere.
+All code is in this package; nothing is fetched from the network.
 """
 
 import base64
@@ -24,16 +24,16 @@ _HERE = Path(__file__).parent
 
 
 class Drawing(anywidget.AnyWidget):
-    """Shows a picture and over it an SVG drawing whose handles can be dragged.
+    """Shows a picture and, over it, an SVG drawing whose handles can be dragged.
 
-    picture: a data URL, or empty. scene: {"inside": what is in the SVG; "box": its viewBox;
-    "handles": of each the name of the element (`data-handle`) that it moves, x and y (None: any),
-    the range left, right, top, bottom and the step of its places, and if it can be grabbed
-    anywhere; "answered": the number of the last place that this takes account of; "running":
-    whether a movement is played on; "draft", "planning": whether a better one follows, is made}.
-    playback: {"poses": [[x, y, degrees], …], "seconds"} of the element .object, played when set.
-    wanted: [name, x, y, number], the number growing, where a handle is wanted. keyboard: whether
-    arrow keys move the first handle, and Enter and Escape send {"press": "run"} and "stop".
+    picture: a data URL, or empty. scene: {"inside": contents of the SVG; "box": its viewBox;
+    "handles": for each the name of the element (`data-handle`) that it moves, x and y (None: any),
+    its range left, right, top, bottom and step, and whether it can be grabbed anywhere; "answered":
+    number of the last request that this scene includes; "running": whether playback continues;
+    "draft", "planning": whether a better plan follows, is being made}. playback: {"poses": [[x, y,
+    degrees], …], "seconds"} of the element .object, played when set. wanted: [name, x, y, number],
+    the requested position of a handle; the number grows. keyboard: whether arrow keys move the
+    first handle, and Enter and Escape send {"press": "run"} and "stop".
     """
 
     _esm = _HERE / "drawing.js"
@@ -47,10 +47,10 @@ class Drawing(anywidget.AnyWidget):
 
 
 class WithPicture:
-    """Before a class of ipywidgets: a saved notebook shows its picture where there is no kernel."""
+    """Mixin, before a class of ipywidgets: without a kernel, a notebook shows its saved picture."""
 
     def picture(self) -> bytes | str:
-        """What is shown, as a PNG of twice as many pixels (bytes) or SVG (text); may be empty."""
+        """The shown picture, as PNG at twice the resolution (bytes) or SVG (text); may be empty."""
         raise NotImplementedError
 
     def _repr_mimebundle_(self, **kwargs: object) -> tuple[dict[str, object], dict[str, object]]:
@@ -66,16 +66,16 @@ class WithPicture:
 
 
 class FigureWidget(WithPicture, widgets.VBox):
-    """Controls above a figure and a line of words below; errors are shown in that line.
+    """Controls above a figure and a line of text below, which also shows errors.
 
-    A subclass draws in `draw(figure)`, which returns the words (HTML), and calls `add_handle` for
-    what can be moved by hand; `drag(name, phase)` then does what a control does.
+    A subclass draws in `draw(figure)`, which returns the text (HTML), and calls `add_handle` for
+    what can be dragged; `drag(name, phase)` then does what a control does.
     """
 
     figsize = (10.0, 3.6)
 
     def __init__(self, controls: Sequence[widgets.Widget]) -> None:
-        label = "Drag what is marked in the figure, or move the controls above it."
+        label = "Drag the marked points in the figure, or use the controls above it."
         layout = {"width": f"{DPI * self.figsize[0]:.0f}px", "max_width": "100%"}
         self._drawing = Drawing(label=label, layout=layout)
         self._drawing.observe(self._dragged, names="wanted")
@@ -90,7 +90,7 @@ class FigureWidget(WithPicture, widgets.VBox):
         self.refresh()
 
     def draw(self, figure: Figure) -> str:
-        """Draw what the controls say into an empty figure; return it in words."""
+        """Draw the controls' settings into an empty figure; return a description."""
         raise NotImplementedError
 
     def drag(self, name: str, phase: float) -> None:
@@ -98,11 +98,11 @@ class FigureWidget(WithPicture, widgets.VBox):
         raise NotImplementedError
 
     def add_handle(self, ax: Axes, name: str, phase: float, y: float | None = None) -> None:
-        """Let the reader drag a point of axes over the phase, or with y None a vertical line."""
+        """Make a point of the axes draggable over the phase; a vertical line if y is None."""
         self._handles.append((ax, name, phase, y))
 
     def set_controls(self, values: dict[widgets.Widget, Any]) -> None:
-        """Set the values of controls, and draw once."""
+        """Set the values of several controls, and draw once."""
         self._waits = True
         try:
             for control, value in values.items():
@@ -115,7 +115,7 @@ class FigureWidget(WithPicture, widgets.VBox):
         """Draw the figure again."""
         if self._waits:
             return
-        # A figure of its own, outside pyplot: no window, nothing to close.
+        # Made without pyplot, the figure opens no window and need not be closed.
         figure = Figure(figsize=self.figsize, dpi=DPI, layout="constrained")
         canvas = FigureCanvasAgg(figure)
         self._handles.clear()
@@ -124,7 +124,7 @@ class FigureWidget(WithPicture, widgets.VBox):
         except Exception as error:
             words = f"<b>{type(error).__name__}</b>: {html.escape(str(error))}"
         else:
-            # `savefig` would draw everything twice, once for the layout.
+            # `savefig` would draw twice, once for the layout.
             canvas.draw()
             buffer = io.BytesIO()
             Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB").save(buffer, "png")
@@ -136,14 +136,14 @@ class FigureWidget(WithPicture, widgets.VBox):
         self._words.value = f"<div role='status' aria-live='polite'>{words}</div>"
 
     def picture(self) -> bytes:
-        """What is shown, as a PNG of twice as many pixels."""
+        """The shown picture, as a PNG at twice the resolution."""
         buffer = io.BytesIO()
         if self._figure:
             self._figure.savefig(buffer, dpi=2 * DPI)
         return buffer.getvalue()
 
     def _scene(self, width: int, height: int) -> dict[str, Any]:
-        """The handles in pixels from the upper left corner, a hundred places over the phase."""
+        """The handles in pixels from the upper left corner, with 100 steps over the phase."""
         handles, rings = [], ""
         for k, (ax, _, phase, y) in enumerate(self._handles):
             x, left, right = ax.transData.transform([(t, y or 0) for t in (phase, 0, 1)])

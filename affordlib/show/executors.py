@@ -1,4 +1,4 @@
-"""How a plan is executed while somebody watches, who may stop it, disturb it, or move its goal."""
+"""Execution of a plan in a widget, where a user can stop it, disturb it, or move its goal."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -17,25 +17,25 @@ from affordlib.types import Goal, Outcome, Plan
 from affordlib.world import Tabletop
 
 Planner = Callable[[np.ndarray, tuple[float, float], Goal], Plan]
-"""From an image, the position (x, y) [m] of the object, and a goal to a plan."""
+"""Function of an image, the object's position (x, y) [m] and a goal that returns a plan."""
 
 Report = Callable[..., Goal]
-"""`report()` after an action, `report(plan)` when a new plan is followed from now on.
+"""Callback: `report()` after an action, `report(plan)` when a new plan replaces the current one.
 
-After an action it lets the disturbances that are waiting happen. Returns the goal as it is by then,
-and raises `Stopped` when nothing more shall be executed.
+After an action it applies pending disturbances. Returns the current goal; raises `Stopped` when
+execution must end.
 """
 
 Executor = Callable[[Tabletop, Plan, Planner, Report], Outcome]
-"""How far the object was turned and lifted is measured by the caller."""
+"""Function that executes a plan; the caller measures the object's rotation and height."""
 
 
 class Stopped(Exception):
-    """The reader has pressed Stop."""
+    """The user has pressed Stop."""
 
 
 def open_loop(world: Tabletop, plan: Plan, planner: Planner, report: Report) -> Outcome:
-    """Execute a plan as it was made, action by action, and measure where the object rests."""
+    """Execute a plan as it is, action by action, and measure where the object comes to rest."""
     paths: tuple[np.ndarray, ...] = ()
     for step in plan.steps:
         paths += execute_plan(world, replace(plan, steps=(step,))).object_paths_xy_m
@@ -46,16 +46,16 @@ def open_loop(world: Tabletop, plan: Plan, planner: Planner, report: Report) -> 
 def measured(
     world: Tabletop, plan: Plan, paths_xy_m: tuple[np.ndarray, ...] = (), words: str = ""
 ) -> Outcome:
-    """The outcome of a plan by where the object really is now."""
+    """The outcome of a plan, measured from the object's true pose."""
     pose = world.object_pose()
     return Outcome(plan, plan.goal.distance_m(pose[:2]), pose, paths_xy_m, words=words)
 
 
 def closed_loop(skills: Skills, tolerance_m: float = 0.002) -> Executor:
-    """An executor that observes after every action and replans until the goal is this near [m].
+    """Make an executor that observes after every action and replans to this tolerance [m].
 
-    It replans with the chosen planner where that is of `Skills.planner`. Any other does not know
-    where the arm can act; then it replans with `plan_continuous` and these skills, and says so.
+    It replans with the chosen planner if `Skills.planner` made it. Other planners do not know where
+    the arm can act; then it replans with `plan_continuous` and these skills, and says so.
     """
 
     def execute(world, plan, planner, report):

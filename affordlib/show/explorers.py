@@ -1,4 +1,4 @@
-"""Two widgets: what a model predicts from what it is given, and where a partial action ends."""
+"""Two widgets: predictions from chosen observations, and final positions of partial actions."""
 
 from collections.abc import Sequence
 
@@ -27,12 +27,12 @@ _PHASES = {"min": 0, "max": 1, "step": 0.01, "layout": {"width": "24em"}}
 
 
 class ConditioningExplorer(FigureWidget):
-    """When action and effect are observed and how they are blended; below, the prediction.
+    """Choose when action and effect are observed and how they are blended; see the prediction.
 
     Equation (2) of the paper: the representation is w₁ r_action + w₂ r_effect, w₂ = 1 - w₁.
 
-    seen: a full interaction, the ground truth, which gives what is observed. The black points, or
-    sliders, set the phases of the observations, a tick takes one away; the band is mean ± 2 σ.
+    seen: a full interaction, the ground truth, from which observations are taken. The black points,
+    or sliders, set the phases of the observations, a tick removes one; the band is mean ± 2 σ.
     """
 
     figsize = (10.0, 5.2)
@@ -60,7 +60,7 @@ class ConditioningExplorer(FigureWidget):
         effect_t: float | None = None,
         weight: float = 1.0,
     ) -> None:
-        """Set what is observed and how it is blended, as the sliders do; None: not observed."""
+        """Set what is observed and how it is blended, like the sliders; None: not observed."""
         values = {
             self._has_action: action_t is not None,
             self._has_effect: effect_t is not None,
@@ -73,7 +73,7 @@ class ConditioningExplorer(FigureWidget):
         self.set_controls(values)
 
     def drag(self, name: str, phase: float) -> None:
-        """Observe the action (its first or second point) or the effect at another phase."""
+        """Set the phase at which the action (first or second point) or the effect is observed."""
         first, second = self._action_t.value
         if name == "effect":
             self._effect_t.value = phase
@@ -83,7 +83,7 @@ class ConditioningExplorer(FigureWidget):
             self._action_t.value = first, max(first, phase)
 
     def observations(self) -> Observations:
-        """What the model is given now; the weight is 1 or 0 where one modality is missing."""
+        """Current input of the model; the weight is 1 or 0 where one modality is missing."""
         has_action, has_effect = self._has_action.value, self._has_effect.value
         if not (has_action or has_effect):
             raise ValueError("nothing is observed; tick the action, the effect, or both")
@@ -93,7 +93,7 @@ class ConditioningExplorer(FigureWidget):
         return Observations.of(self.model, action, effect, weight)
 
     def _at(self, t: Sequence[float], of: str) -> tuple[torch.Tensor, torch.Tensor]:
-        """Times (1, n) and the values (1, n, C) then of the action or of the effect."""
+        """Phases (1, n), and the values (1, n, C) of the action or the effect at them."""
         columns = [self._truth(of, name) for name in getattr(self.model, f"{of}_channels")]
         at = np.stack([np.interp(t, self.seen.phase, column) for column in columns], axis=-1)
         return torch.tensor([t], dtype=torch.float32), torch.as_tensor(at).float()[None]
@@ -102,7 +102,7 @@ class ConditioningExplorer(FigureWidget):
         return getattr(self.seen, of)[:, CHANNELS[of].index(name)]
 
     def draw(self, figure: Figure) -> str:
-        """Action and effect over the phase, x and y: truth, what is observed, mean ± 2 σ."""
+        """Draw x and y of action and effect over phase: truth, observations, mean ± 2 σ."""
         given = self.observations()
         t = torch.linspace(0, 1, N_TARGETS)
         with torch.no_grad():
@@ -145,8 +145,8 @@ class ConditioningExplorer(FigureWidget):
 class PhaseSlider(FigureWidget):
     """A slider, or a dotted line, at the phase t at which an action on the object is stopped.
 
-    The figure shows where the full action had the object at t; `stop_here()`, the button, executes
-    it up to t. `rest` maps the phases that were tried to the poses (x, y, yaw) at rest.
+    The figure shows where the object was at t in the full action; `stop_here()`, the button,
+    executes it up to t. `rest` maps the phases tried so far to the poses (x, y, yaw) at rest.
     """
 
     def __init__(self, world: Tabletop, action: Primitive, phase: float = 0.8) -> None:
@@ -162,11 +162,11 @@ class PhaseSlider(FigureWidget):
 
     @property
     def phase(self) -> float:
-        """Where the slider stands."""
+        """Phase at which the slider stands."""
         return round(self._phase.value, 2)
 
     def expected(self, phase: float) -> np.ndarray:
-        """Where the full action had the object at a phase: (x, y, yaw) on the table."""
+        """Pose (x, y, yaw) of the object on the table at a phase of the full action."""
         effect = [np.interp(phase, self.full.phase, self.full.effect[:, c]) for c in (0, 1, 3)]
         return np.array(self._pose) + effect
 
@@ -183,7 +183,7 @@ class PhaseSlider(FigureWidget):
         self._phase.value = phase
 
     def draw(self, figure: Figure) -> str:
-        """Left the table from above, right how far the object has moved over the phase."""
+        """Draw the table from above (left) and the object's displacement over the phase (right)."""
         above, over_time = figure.subplots(1, 2, width_ratios=(1, 1.9))
         t, obj, now = self.phase, self.world.obj, self.expected(self.phase)
         x, y, yaw = self._pose
@@ -209,7 +209,7 @@ class PhaseSlider(FigureWidget):
             plot_footprint(above, obj, rest[:2], rest[2], TRUTH, "at rest")
             off_mm = 1000 * np.hypot(rest[0] - now[0], rest[1] - now[1])
             words += f" Stopped there, it rests <b>{off_mm:.2f} mm</b> from where it was then."
-        label = "full action at t"  # drawn over what rests
+        label = "full action at t"  # drawn over the object at rest
         plot_footprint(above, obj, now[:2], now[2], "black", label, style="--")
         figure.legend(*above.get_legend_handles_labels(), loc="outside lower left", ncols=4)
         over_time.legend(loc="upper left")

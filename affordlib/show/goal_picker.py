@@ -1,6 +1,6 @@
-"""Pick a goal by hand, see the plan redrawn, run it in the world, disturb it.
+"""A widget to pick a goal, see the plan, execute it in the world, and disturb it.
 
-A view on plain objects: everything it does can be done with a planner, `execute_plan` and
+It is a view on plain objects: everything it does can be done with a planner, `execute_plan` and
 `Tabletop.shove`.
 """
 
@@ -40,10 +40,10 @@ from affordlib.types import Goal, Outcome, Plan, check_count, check_on_table
 from affordlib.world import Tabletop
 
 REST_S = 0.05
-"""A hand that has not moved the goal for so long has come to rest."""
+"""Time [s] without motion of the goal after which a drag counts as finished."""
 
 POSE_EVERY = 12
-"""Simulation steps (1/240 s) between two poses of the movement that is played."""
+"""Simulation steps (1/240 s) between two poses of the animated motion."""
 
 _MOVED = 1e-4
 _LAYOUT = {"width": "480px", "max_width": "100%"}
@@ -58,12 +58,12 @@ class GoalPicker(WithPicture, widgets.VBox):
 
     planners: name → function (image, start_xy_m, goal) → Plan. executors: name → function (world,
     plan, planner, report) → Outcome that executes a plan, or replans with the planner that made it;
-    see `executors.Report`. The default is `open_loop` alone. draft: a quick planner whose plan is
-    shown while the hand moves the goal; that of the chosen one takes its place when the hand rests.
-    seed: of the disturbances. folder: where plans are saved.
+    see `executors.Report`. The default is `open_loop` alone. draft: a fast planner whose plan is
+    shown while the goal is dragged; the chosen planner's plan replaces it afterwards. seed: of the
+    disturbances. folder: where plans are saved.
 
-    `goal`, `plan` and `outcome` are what is shown. Methods do what mouse and buttons do, and return
-    when it is done; mouse and buttons queue it in the background, *Run* with `seconds_per_action`.
+    `goal`, `plan` and `outcome` are those shown. Methods do what mouse and buttons do, and return
+    when done; mouse and buttons queue it in the background, *Run* with `seconds_per_action`.
     """
 
     seconds_per_action = 1.2
@@ -84,14 +84,14 @@ class GoalPicker(WithPicture, widgets.VBox):
         self.outcome: Outcome | None = None
         self._rng = np.random.default_rng(check_count("seed", seed, least=0))
         self._first_pose = self._pose = self._plan_pose = world.object_pose()
-        self._turn_from = self._pose[2]  # the yaw from which a wanted turn is counted
+        self._turn_from = self._pose[2]  # the yaw to which the goal's rotation is relative
         self._running = self._lifted = False
-        self._stale = True  # what is shown is not the chosen planner's plan for the goal
-        self._answered = 0  # the number of the last goal of the page that there is a plan for
-        self._alone = threading.RLock()  # held by what plans, or moves something in the world
+        self._stale = True  # the shown plan is not the chosen planner's for the shown goal
+        self._answered = 0  # the number of the last goal from the page with a plan
+        self._alone = threading.RLock()  # held while planning or moving something in the world
         self._queue = ThreadPoolExecutor(1)
         self._goal_moved, self._stop = threading.Event(), threading.Event()
-        self._disturbances: list[Callable[[], None]] = []  # that wait for the end of the action
+        self._disturbances: list[Callable[[], None]] = []  # pending until the action ends
         self._poses: list[tuple[float, ...]] = []  # of the object since the last action
         self._paths: list[np.ndarray] = []  # of the object since the plan was made
         self._view = Drawing(label=_HELP, keyboard=True, layout=_LAYOUT)
@@ -106,40 +106,40 @@ class GoalPicker(WithPicture, widgets.VBox):
 
     @property
     def goal(self) -> Goal:
-        """The goal that is shown."""
+        """The shown goal."""
         return self.controls.goal
 
     def pick(self, x_m: float, y_m: float) -> None:
-        """Set the goal [m], to the nearest millimetre, and replan."""
+        """Set the goal [m], rounded to millimetres, and replan."""
         self._set_goal(replace(self.goal, xy_m=_whole_mm((x_m, y_m))))
         self._update_plan()
 
     def set_pose(self, turn_deg: float = 0.0, height_cm: float = 0.0) -> None:
-        """Set the turn and the height of the goal, 0 for none, and replan."""
+        """Set rotation and height of the goal (0: not part of the goal), and replan."""
         turn, height = math.radians(turn_deg) or None, height_cm / 100 or None
         self._set_goal(replace(self.goal, turn_rad=turn, height_m=height))
         self._update_plan()
 
     def run(self) -> None:
-        """Execute the plan and show what came of it; the next plan starts from there."""
+        """Execute the plan and show the outcome; the next plan starts from there."""
         self._refuse_while_running()
         self._set_running(True)
         self._run(seconds_per_action=0.0)
 
     def stop(self) -> None:
-        """Let the action that is under way end, and execute nothing more."""
+        """Stop after the current action."""
         self._stop.set()
 
     def shove_object(self) -> None:
-        """Disturb: shove the object 2 to 4 cm to some side; while running, after this action."""
+        """Shove the object 2 to 4 cm in a random direction; during a run, after this action."""
         self._disturb(self._shove)
 
     def move_goal(self) -> None:
-        """Disturb: move the goal 4 to 8 cm to some side; while running, after this action."""
+        """Move the goal 4 to 8 cm in a random direction; during a run, after this action."""
         self._disturb(self._move_goal)
 
     def start_over(self) -> None:
-        """Put the object back where it stood when the picker was made."""
+        """Put the object back where it was when the picker was created."""
         self._refuse_while_running()
         with self._alone:
             x, y, yaw = self._first_pose
@@ -151,12 +151,12 @@ class GoalPicker(WithPicture, widgets.VBox):
         path = self._file(name)
         self._update_plan()
         if self.plan is None:
-            raise RuntimeError("there is no plan to save; pick a goal that can be planned for")
+            raise RuntimeError("there is no plan to save; pick another goal first")
         save_plan(path, self.plan)
         self.controls.say(f"Saved the plan as {html.escape(f'{self.folder}/{name}')}.")
 
     def load(self, name: str = "plan.json") -> None:
-        """Show a saved plan with its goal, to be run as it is."""
+        """Show a saved plan with its goal, ready to be executed."""
         self._refuse_while_running()
         plan = load_plan(self._file(name))
         with self._alone:
@@ -164,13 +164,13 @@ class GoalPicker(WithPicture, widgets.VBox):
             self._put_down()
             self._begin(plan)
             away_m = math.dist(plan.start_xy_m, self._pose[:2])
-            note = f" The object is {1000 * away_m:.0f} mm from where this plan starts."
+            note = f" The object is {1000 * away_m:.0f} mm from the start of this plan."
             self.controls.say(f"Loaded. {plan_in_words(plan)}{note if away_m > 0.002 else ''}")
             self._stale = False
             self._show()
 
     def picture(self) -> str:
-        """What is shown, as an SVG."""
+        """The shown drawing, as an SVG."""
         scene = self._view.scene
         return (
             f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="{scene["box"]}" width="480" '
@@ -179,7 +179,7 @@ class GoalPicker(WithPicture, widgets.VBox):
             f'<g class="affordlib-table">{scene["inside"]}</g></svg>'
         )
 
-    # What the page asks for
+    # Requests from the page
 
     def _listen(self) -> None:
         controls = self.controls
@@ -204,37 +204,37 @@ class GoalPicker(WithPicture, widgets.VBox):
             button.on_click(lambda _, action=action: self._soon(action))
 
     def _soon(self, action: Callable[[], None]) -> None:
-        """Do it in the background, after all earlier actions; while the robot moves, at once."""
+        """Run an action in the background, after all earlier ones; during a run, immediately."""
         if self._running:
             self._attempt(action)
         else:
             self._queue.submit(self._attempt, action)
 
     def _attempt(self, action: Callable[[], None]) -> None:
-        """Do it, and say what did not work."""
+        """Run an action, and show an error as text."""
         try:
             action()
         except Exception as error:
             why = html.escape(str(error) or type(error).__name__)
-            self.controls.say(f"<b>This did not work:</b> {why}")
+            self.controls.say(f"<b>Error:</b> {why}")
 
     def _run_in_background(self) -> None:
-        """Run the plan of the goal that is shown, when it is made; a second press does nothing."""
+        """Execute the plan of the shown goal when it is ready; a second press is ignored."""
         if not self._running:
             self._set_running(True)
             self._queue.submit(self._attempt, partial(self._run, self.seconds_per_action))
             self._queue.submit(self._attempt, self._plan_after_run)
 
     def _plan_after_run(self) -> None:
-        """Where the goal was moved, and the run did not follow it, show how to go on from here."""
+        """Show a plan from here if the goal was moved and the run did not follow it."""
         if self._stale and self.outcome is not None:
             came_of_it = self.controls.said
             self._update_plan()
             self.controls.say(f"{came_of_it} {self.controls.said}")
 
     def _follow(self, goal: Goal) -> None:
-        """Set the goal; soon show a draft for it, and the plan if the hand rests there."""
-        goal = replace(goal)  # a new object, by which this move of the hand is known
+        """Set the goal; soon show a draft for it, and the full plan when the drag is finished."""
+        goal = replace(goal)  # a new object, which identifies this request
         self._set_goal(goal)
 
         def plan():
@@ -253,17 +253,17 @@ class GoalPicker(WithPicture, widgets.VBox):
     # Goals and plans
 
     def _set_goal(self, goal: Goal) -> None:
-        """Show a goal for which there is no plan yet."""
+        """Show a goal that has no plan yet."""
         self.controls.show(goal)
         self._stale = True
         self._goal_moved.set()
-        if self._running:  # the executor learns of it after this action
+        if self._running:  # the executor gets it after this action
             self._answered = self._view.wanted[3]
         if self._running or self.draft is None:
             self._show(planning=not self._running)
 
     def _update_plan(self) -> None:
-        """Plan for the goal that is shown, if there is no plan yet and the robot is idle."""
+        """Plan for the shown goal, if it has no plan yet and the robot is idle."""
         if self._stale and not self._running:
             self._make_plan()
 
@@ -290,7 +290,7 @@ class GoalPicker(WithPicture, widgets.VBox):
         self._pose = self.world.object_pose()
 
     def _begin(self, plan: Plan | None) -> None:
-        """Show a plan that begins with the object as it is."""
+        """Show a plan that starts at the object's current pose."""
         self.plan, self.outcome = plan, None
         self._poses.clear()
         self._paths.clear()
@@ -303,7 +303,7 @@ class GoalPicker(WithPicture, widgets.VBox):
 
     def _refuse_while_running(self) -> None:
         if self._running:
-            raise RuntimeError("the robot is still at work; press Stop or wait")
+            raise RuntimeError("the robot is still moving; press Stop or wait")
 
     def _set_running(self, running: bool) -> None:
         self._running = running
@@ -311,7 +311,7 @@ class GoalPicker(WithPicture, widgets.VBox):
         self.controls.set_running(running)
 
     def _run(self, seconds_per_action: float) -> None:
-        """Execute the plan; a new one first, if that which is shown is not for here and now."""
+        """Execute the plan, after making a new one if the shown one is outdated."""
         done = 0
 
         def report(plan=None):
@@ -350,10 +350,10 @@ class GoalPicker(WithPicture, widgets.VBox):
                 outcome = replace(outcome.with_goal(self.goal), turned_rad=turned, lifted_m=lifted)
                 self.outcome, self._lifted = outcome, bool(self.goal.height_m)
                 if self.plan.goal == self.goal or outcome.distance_m <= self.goal.tolerance_m:
-                    self._stale = False  # it has followed a goal that was moved
+                    self._stale = False  # the run has followed the goal
                 self.controls.say(outcome_in_words(outcome, self.goal, how, done))
             except Exception:
-                self.plan = None  # the next run plans from where this one ended
+                self.plan = None  # the next run plans from the current pose
                 raise
             finally:
                 self.world.on_step = on_step
@@ -364,18 +364,18 @@ class GoalPicker(WithPicture, widgets.VBox):
                 self._show()
 
     def _replace_plan(self, plan: Plan, done: int) -> None:
-        """Show a plan that was made on the way, after so many actions."""
+        """Show a plan that was made during a run, after `done` actions."""
         arrives = self.goal.distance_m(plan.predicted_end_xy_m) <= self.goal.tolerance_m
         self.plan = plan = replace(plan, goal=self.goal, reaches_goal=arrives)
         self._pose = self.world.object_pose()
         self._plan_pose = (*plan.start_xy_m, self._pose[2])
         self.controls.show_progress(done, done + len(plan.steps))
-        so_far = f"On the way, after {done} action{'s' * (done != 1)}."
+        so_far = f"New plan after {done} action{'s' * (done != 1)}."
         self.controls.say(f"{so_far} {plan_in_words(plan)}")
         self._show()
 
     def _pose_log(self, also: Callable[[Tabletop], None] | None) -> Callable[[Tabletop], None]:
-        """A callback for the world's steps that logs the object's poses, beside another."""
+        """Make a callback for the world's steps that logs the object's poses and calls another."""
         steps = itertools.count()
 
         def log(world):
@@ -387,7 +387,7 @@ class GoalPicker(WithPicture, widgets.VBox):
         return log
 
     def _play(self, seconds: float) -> None:
-        """Play what was logged since the last time, from the first move to the last."""
+        """Animate the poses logged since the last call, from the first motion to the last."""
         poses = np.array(self._poses).reshape(-1, 3)
         self._poses.clear()
         moves = np.flatnonzero(np.abs(np.diff(poses, axis=0)).max(axis=1, initial=0.0) > _MOVED)
@@ -423,12 +423,12 @@ class GoalPicker(WithPicture, widgets.VBox):
         self.controls.say(f"The goal was moved by {1000 * np.hypot(*by):.0f} mm.")
 
     def _displacement(self, xy_m: tuple[float, float], least_m: float, most_m: float) -> np.ndarray:
-        """A random displacement (2,) [m], to the middle where it would lead out of sight."""
+        """A random displacement (2,) [m], reversed where it would leave the shown area."""
         by = self._rng.uniform(least_m, most_m) * unit_vector(self._rng.uniform(0, 2 * np.pi))
         inside = np.abs(np.add(xy_m, by)) < LIMIT_M
         return np.where(inside, by, -np.copysign(by, xy_m))
 
-    # What is seen
+    # Drawing
 
     def _show(self, draft: bool = False, planning: bool = False) -> None:
         obj, edge = self.world.obj, 1000 * HALF_WIDTH_M
@@ -455,13 +455,13 @@ class GoalPicker(WithPicture, widgets.VBox):
         }
 
     def _file(self, name: str) -> Path:
-        """The file of a plan's name in the folder; raises ValueError for a name that leads out."""
+        """Path of a plan in the folder; ValueError for a name that is not a plain file name."""
         if not name or name in (".", "..") or Path(name).name != name or "\\" in name:
             raise ValueError(f"name must be a plain file name such as plan.json, got {name!r}")
         return resolve_out_dir(self.folder) / name
 
 
 def _whole_mm(xy_m: Any) -> tuple[float, float]:
-    """A position [m] to the nearest millimetre."""
+    """Round a position [m] to whole millimetres."""
     x, y = np.round(xy_m, 3).tolist()
     return x, y

@@ -1,7 +1,7 @@
-"""Figures in one style: fixed, colour-blind-safe colours for goal, prediction and truth.
+"""Figures in one style: fixed, colour-blind-safe colours for goal, prediction and ground truth.
 
-What plots draws into the `ax` that it is given and returns it. Positions are in centimetres. Small
-animations of the robot at work are recorded frames, encoded as a GIF or PNG by Pillow.
+Plot functions draw into the `ax` that they get and return it. Positions are in centimetres. Small
+animations of the robot are recorded frames, encoded as a GIF or PNG by Pillow.
 """
 
 import io
@@ -45,7 +45,7 @@ from affordlib.world import Tabletop, TabletopObject
 GOAL, PREDICTION, TRUTH, NEUTRAL = "#0072B2", "#D55E00", "#009E73", "#777777"
 
 ENLARGED = 20
-"""A disc at the end of a predicted path has this many σ for its radius: one is too small to see."""
+"""Radius, in σ, of the disc at the end of a predicted path: a disc of one σ is too small to see."""
 
 plt.rcParams.update(
     {
@@ -64,7 +64,7 @@ plt.rcParams.update(
 )
 
 
-if shell := get_ipython():  # twice as many pixels in notebooks, for sharp screens
+if shell := get_ipython():  # twice the resolution in notebooks, for high-density screens
     InlineBackend.instance(parent=shell).figure_formats = {"retina"}
 
 
@@ -78,7 +78,7 @@ def save_figure(figure: Figure, folder: Path, name: str) -> Path:
 
 
 def plot_table(ax: Axes, around_m: Sequence[float] = (0.0, 0.0), half_width_m: float = 0.3) -> Axes:
-    """An empty top-down view of the table around a point."""
+    """Draw an empty top-down view of the table around a point."""
     x, y = (100 * check_within("around_m", v, -10, 10, "m") for v in check_pair("around", around_m))
     half = 100 * check_within("half_width_m", half_width_m, 0.01, 10.0, "m")
     corners = np.array([(u, v) for u in TABLE_X_M for v in TABLE_Y_M])[[0, 1, 3, 2, 0]]
@@ -97,7 +97,7 @@ def plot_footprint(
     label: str | None = None,
     style: str = "filled",
 ) -> Axes:
-    """The outline of an object's base at a pose, filled or with a style of line such as "--"."""
+    """Draw the outline of an object's base at a pose, filled or with a line style such as "--"."""
     outline = rotated(obj.footprint_m, check_finite("yaw_rad", yaw_rad))
     outline = _cm(outline + check_pair("xy_m", xy_m))
     filled = style == "filled"
@@ -107,7 +107,7 @@ def plot_footprint(
 
 
 def _cm(xy_m: Any) -> np.ndarray:
-    """Points (n, 2) or one (2,) in metres as x and y in centimetres."""
+    """Convert points (n, 2) or one (2,) from metres to x and y in centimetres."""
     return 100 * np.asarray(xy_m, dtype=float).T
 
 
@@ -116,14 +116,14 @@ def _closed(xy: np.ndarray) -> np.ndarray:
 
 
 def _name(ax: Axes, text: str, at_cm: Sequence[float], offset: Sequence[float], **style) -> None:
-    """Write the name of an action, so many points away from where it belongs."""
+    """Write the name of an action, offset from its position in points."""
     plate = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 1}
     style = {"fontsize": 9, "ha": "center", "va": "center"} | style
     ax.annotate(text, at_cm, tuple(offset), textcoords="offset points", bbox=plate, **style)
 
 
 def _name_in_place(ax: Axes, text: str, step: Step, goal: Goal, row: int) -> None:
-    """Name an action that does not move the object: to the right of it, one below the other."""
+    """Label an action that does not move the object, to its right, one label below the other."""
     x, y = _cm(step.predicted_end_xy_m)
     at = x + 100 * goal.tolerance_m, y
     _name(ax, f"{text} {step.primitive.name}", at, (8, -11 * row), ha="left", va="baseline")
@@ -140,10 +140,10 @@ def plot_plan(
     obj: TabletopObject | None = None,
     yaw_rad: float = 0.0,
 ) -> Axes:
-    """A plan as predicted: the object's path, where each step stops and σ there, and the goal.
+    """Draw a plan as predicted: the object's path, final position and σ of each step, and the goal.
 
-    sigma: draw a disc at each step's end, with twenty times σ for its radius.
-    obj: drawn dotted as each later push is predicted to find it, yaw_rad being how it stands now.
+    sigma: draw a disc at each step's end, with a radius of twenty σ. obj: drawn dotted at its
+    predicted pose before each later push; yaw_rad: its current yaw.
     """
     goal, first, turn, row = plan.goal, np.array(plan.start_xy_m), 0.0, 0
     radius = 100 * goal.tolerance_m
@@ -165,7 +165,7 @@ def plot_plan(
         arrow = {"arrowstyle": "-|>", "color": NEUTRAL, "lw": 1.5}
         ax.annotate("", tip, tail, arrowprops=arrow, zorder=4)
         aside = direction[::-1] * (1, -1)
-        aside *= 22 if aside @ (start - first) >= 0 else -22  # away from where the object stood
+        aside *= 22 if aside @ (start - first) >= 0 else -22  # away from the object's start
         _name(ax, text, tail, -10 * direction if k == 0 else aside)
         label = "prediction" if k == 0 else None
         ax.plot(*_cm(step.predicted_path_xy_m), color=PREDICTION, lw=2, label=label)
@@ -178,7 +178,7 @@ def plot_plan(
 
 
 def plot_outcome(ax: Axes, outcome: Outcome) -> Axes:
-    """The object's real path when a plan was executed, over the plan (see `plot_plan`)."""
+    """Draw the object's true path in an executed plan over the plan (see `plot_plan`)."""
     plot_plan(ax, outcome.plan, sigma=False)
     for k, path in enumerate(outcome.object_paths_xy_m):
         ax.plot(*_cm(path), color=TRUTH, lw=2, ls="--", label="executed" if k == 0 else None)
@@ -190,10 +190,10 @@ def plot_outcome(ax: Axes, outcome: Outcome) -> Axes:
 def plot_closed_loop(
     ax: Axes, result: ClosedLoopResult, obj: TabletopObject | None = None, yaw_rad: float = 0.0
 ) -> Axes:
-    """A closed loop from above: where each action took the object, and where others moved it.
+    """Draw a closed loop from above: the object's path in each action, and disturbances.
 
-    Dots are where the object was predicted after each action; dotted lines what nobody planned.
-    obj: drawn as it stands in the end, if given; yaw_rad: how it stood at the start.
+    Dots are predicted positions after each action; dotted lines are motions between actions. obj:
+    drawn at its final pose, if given; yaw_rad: its yaw at the start.
     """
     goal = result.goal
     first = result.plans[0].goal if result.plans else goal
@@ -227,7 +227,7 @@ def plot_closed_loop(
 
 
 def plot_depth(ax: Axes, image: np.ndarray, title: str = "") -> Axes:
-    """The depth channel of an image (2, 48, 48), as height above the table in centimetres."""
+    """Draw the depth channel of an image (2, 48, 48), as height above the table in centimetres."""
     height_cm = 100 * (CAMERA_HEIGHT_M - checked_image(image)[0, 0].numpy())
     half, top = 50 * CROP_WIDTH_M, max(8.0, float(height_cm.max()))
     extent = (-half, half, -half, half)
@@ -258,10 +258,10 @@ def plot_levered(
     color: str,
     label: str | None = None,
 ) -> Axes:
-    """A prism after a change of pose (x, y, z [m], tilt [rad]) from its start.
+    """Draw a prism after a change of pose (x, y, z [m], tilt [rad]) from its start.
 
-    outline_m: (n, 2), as of `outline_in_lever_frame`. It is tilted about an axis across the lever,
-    which for the real one is only roughly so. Across is drawn obliquely; units are centimetres.
+    outline_m: (n, 2), from `outline_in_lever_frame`. The prism is tilted about an axis across the
+    lever, an approximation of the true axis. The direction across is drawn obliquely; units are cm.
     """
     pose, height_m = check_array("pose", pose, 4), check_finite("height_m", height_m)
     outline_m = check_array("outline_m", outline_m, 2)
@@ -282,7 +282,7 @@ def plot_levered(
 
 
 class FrameRecorder:
-    """Takes a picture every `every` simulation steps (1/240 s); give it to `world.on_step`.
+    """Records a picture every `every` simulation steps (1/240 s), as the `world.on_step` callback.
 
     Figures can be added as frames as well, with `add`.
     """
@@ -300,7 +300,7 @@ class FrameRecorder:
         self._steps += 1
 
     def add(self, figure: Figure) -> None:
-        """Add a picture of a figure, in the recorder's height; all frames must be as wide."""
+        """Add a figure as a frame, in the recorder's height; all frames must be of one width."""
         frame = _drawn(figure, self.height)
         if self.frames and frame.shape != self.frames[0].shape:
             sizes = [f"{f.shape[1]}×{f.shape[0]}" for f in (frame, self.frames[0])]
@@ -313,7 +313,7 @@ class FrameRecorder:
     def encoded(
         self, kind: str = "GIF", frame_ms: int = 100, beside: Figure | None = None
     ) -> bytes:
-        """The frames as an animated picture that loops and begins with its last frame, at rest.
+        """The frames as an animation that loops and starts with its last frame, shown longer.
 
         kind: "GIF" or "PNG"; beside: a figure shown to the left of every frame.
         """
@@ -325,7 +325,7 @@ class FrameRecorder:
         if beside is not None:
             left = _drawn(beside, frames[0].shape[0])
             frames = [np.hstack([left, frame]) for frame in frames]
-        # One palette for all frames, drawn from a few of them, or colours flicker.
+        # One palette for all frames, made from a few of them, prevents flickering colours.
         few = [frames[round(k * (len(frames) - 1) / 3)] for k in range(4)]
         palette = Image.fromarray(np.vstack(few)).quantize(
             255, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE
@@ -343,7 +343,7 @@ class FrameRecorder:
 
 
 def _drawn(figure: Figure, height: int) -> np.ndarray:
-    """A figure as pixels (height, width, 3)."""
+    """Render a figure as pixels (height, width, 3)."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=2 * height / figure.get_figheight())
     picture = Image.open(buffer).convert("RGB")
@@ -354,11 +354,11 @@ def _drawn(figure: Figure, height: int) -> np.ndarray:
 def show_animation(
     recorder: FrameRecorder, path: str | Path | None = None, beside: Figure | None = None
 ) -> NotebookImage:
-    """The frames as an animation that a notebook displays; saved to `path` as a GIF too, if given.
+    """The frames as an animation for a notebook; if `path` is given, also saved as a GIF.
 
     beside: a figure shown to the left of every frame.
     """
     if path is not None:
         write_atomically(Path(path), recorder.encoded("GIF", beside=beside), b"GIF8")
-    # A PNG: pages made from a notebook leave GIFs out, and it is a third smaller.
+    # A PNG, since web pages made from a notebook drop GIFs; it is also a third smaller.
     return NotebookImage(recorder.encoded("PNG", beside=beside), format="png")

@@ -1,6 +1,6 @@
-"""What a goal picker is made of: the table from above, and menus, sliders, buttons and words.
+"""Parts of the goal picker: the table from above, and menus, sliders, buttons and text.
 
-The table is drawn as SVG: millimetres from its middle, y downwards.
+The table is drawn as SVG: millimetres from its centre, y downwards.
 """
 
 import html
@@ -18,22 +18,22 @@ from affordlib.types import Goal, Outcome, Plan, Step
 from affordlib.world import BASE_X_M, REACH_M, TabletopObject
 
 HALF_WIDTH_M, LIMIT_M = 0.40, 0.35
-"""What is seen of the table, and how far from its middle a goal can be put by hand [m]."""
+"""Half width of the visible area, and the largest goal coordinate that can be picked [m]."""
 
 PUSH_RUN_UP_M = 0.2
-"""A push begins at most so far from the object; the shaded ring is where any push is in reach."""
+"""Largest distance [m] of a push's start from the object; it bounds the shaded reachable ring."""
 
 _ARROW = '<path class="push" d="M-80 0H-38"/><path class="push-head" d="M-32 0L-46 7V-7Z"/>'
 _STAR = "0,-17 4,-5.5 16.2,-5.3 6.5,2.1 10,13.8 0,6.8 -10,13.8 -6.5,2.1 -16.2,-5.3 -4,-5.5"
 
 
 def step_in_words(step: Step) -> str:
-    """Which primitive, and to which share of its phase."""
+    """Name the primitive and its stop phase in percent."""
     return f"{step.primitive.name.replace('_', ' ')} to {100 * step.stop_phase:.0f} %"
 
 
 def draw_ground() -> str:
-    """Where the arm can push, with a line every 10 cm."""
+    """Draw where the arm can push, with a line every 10 cm."""
     middle = {"cx": 1000 * BASE_X_M, "cy": 0}
     shapes = [
         _shape("circle", "reach", **middle, r=1000 * (REACH_M[1] - PUSH_RUN_UP_M)),
@@ -52,17 +52,17 @@ def draw_ground() -> str:
 
 
 def draw_object(obj: TabletopObject, pose: Sequence[float], css: str = "object") -> str:
-    """The outline of an object's base at (x, y, yaw)."""
+    """Draw the outline of an object's base at (x, y, yaw)."""
     return _shape("polygon", css, points=_points(obj.footprint_m), transform=_at(*pose))
 
 
 def draw_path(path_xy_m: np.ndarray, css: str) -> str:
-    """A path (n, 2) [m]."""
+    """Draw a path (n, 2) [m]."""
     return _shape("polyline", css, points=_points(path_xy_m))
 
 
 def draw_goal(obj: TabletopObject, goal: Goal, from_yaw_rad: float) -> str:
-    """The goal around the origin: star, tolerance, and the outline if a turn is wanted."""
+    """Draw the goal around the origin: star, tolerance, and the outline if it has a rotation."""
     outline = ""
     if goal.turn_rad is not None:
         outline = draw_object(obj, (0, 0, from_yaw_rad + goal.turn_rad), "tolerance wanted")
@@ -71,10 +71,10 @@ def draw_goal(obj: TabletopObject, goal: Goal, from_yaw_rad: float) -> str:
 
 
 def draw_plan(obj: TabletopObject, steps: Sequence[Step], start: Sequence[float]) -> str:
-    """The steps from (x, y, yaw) on as predicted: arrow, path, σ and name; the object at the end.
+    """Draw predicted steps from (x, y, yaw): arrow, path, σ and label; the object's final pose.
 
-    Names stand beside the end of a step, where neither the next push comes from nor its object
-    goes; below the last move's are those of turns and lifts of what is then in its place.
+    A label is beside the end of its step, away from the next push and its motion; the labels of
+    rotations and lifts are below that of the last move.
     """
     moves = [step for step in steps if hasattr(step.primitive, "direction_rad")]
     shapes, at, right, y_label = [], start, True, 0.0
@@ -103,7 +103,7 @@ def draw_plan(obj: TabletopObject, steps: Sequence[Step], start: Sequence[float]
             x, y_label = x + 28, y + 6
         else:
             y_label += 24
-        # A name, of 10 mm a letter, that would be cut off at the rim of the drawing moves inwards.
+        # A label (10 mm per letter) that would extend beyond the drawing's rim is moved inwards.
         room = 1000 * HALF_WIDTH_M - 10 * len(label)
         x_label, anchor = (min(x, room), "start") if right else (max(x, -room), "end")
         shapes.append(_shape("text", "step", label, x=x_label, y=y_label, text_anchor=anchor))
@@ -114,7 +114,7 @@ def draw_plan(obj: TabletopObject, steps: Sequence[Step], start: Sequence[float]
 
 
 def to_mm(xy_m: Sequence[float]) -> tuple[float, float]:
-    """A position [m] on the table in the drawing."""
+    """Convert a position [m] on the table to the drawing's millimetres."""
     return round(1000 * float(xy_m[0]), 2), round(-1000 * float(xy_m[1]), 2)
 
 
@@ -143,10 +143,10 @@ _SCALES = (100, 100, math.degrees(1), 100)
 
 
 class PickerControls(widgets.VBox):
-    """The controls, which do nothing alone; lengths in cm, turns in degrees, 0 for no matter.
+    """Controls of a goal picker; lengths in cm, rotations in degrees, 0 if not part of the goal.
 
-    goal: shown first; planners, executors: the names to choose from; on_goal: is called with the
-    goal that a moved slider asks for.
+    goal: the initial one; planners, executors: the names to choose from; on_goal: called with the
+    new goal when a slider is moved.
     """
 
     def __init__(
@@ -186,7 +186,7 @@ class PickerControls(widgets.VBox):
         super().__init__([widgets.HBox(row) for row in rows])
 
     def show(self, goal: Goal) -> None:
-        """Set the sliders to a goal, as near as they can show it."""
+        """Set the sliders to a goal, as accurately as they can show it."""
         self.goal = goal
         for slider, value in zip(self.sliders, self._shown(goal), strict=True):
             slider.value = value
@@ -196,7 +196,7 @@ class PickerControls(widgets.VBox):
         return [round(min(max(scale * v, s.min), s.max), 1) for s, scale, v in each]
 
     def _slid(self, slider: widgets.FloatSlider, on_goal: Callable[[Goal], None]) -> None:
-        """Change that of the goal which the slider is for, unless it only shows what is so."""
+        """Change the goal's value that belongs to a slider, unless the slider follows the goal."""
         k, numbers = self.sliders.index(slider), _numbers(self.goal)
         if slider.value != self._shown(self.goal)[k]:
             numbers[k] = round(slider.value / _SCALES[k], 12)
@@ -205,24 +205,24 @@ class PickerControls(widgets.VBox):
             on_goal(replace(self.goal, xy_m=(x, y), **wanted))
 
     def set_running(self, running: bool) -> None:
-        """While the robot is at work, only what it listens to can be pressed."""
+        """Disable the controls that have no effect during a run."""
         for control in (self.run, self.start_over, self.planner, self.executor, self.load):
             control.disabled = running
         self.stop.disabled = not running
 
     def show_progress(self, done: int, of: int | None = None) -> None:
-        """So many actions are done, of so many if that is new."""
+        """Show the number of actions done, and the total if given."""
         self.progress.value, self.progress.max = done, of or self.progress.max
 
     def say(self, text: str) -> None:
-        """Show a text, as HTML, and have it read aloud where that is wanted."""
+        """Show a text, as HTML, and announce it to screen readers."""
         self.said = text
         style = "width: 27em; max-width: 100%; line-height: 1.4; white-space: normal"
         self.words.value = f"<div role='status' aria-live='polite' style='{style}'>{text}</div>"
 
 
 def _numbers(goal: Goal) -> list[float]:
-    """What the sliders show of a goal, in m and rad."""
+    """The values of a goal that the sliders show, in m and rad."""
     return [*goal.xy_m, goal.turn_rad or 0.0, goal.height_m or 0.0]
 
 
@@ -234,11 +234,11 @@ def _button(name: str, icon: str, tooltip: str = "", **kwargs: Any) -> widgets.B
 
 
 def plan_in_words(plan: Plan) -> str:
-    """The actions, how near they are expected to lead, and what finding them took."""
-    steps = ", then ".join(step_in_words(step) for step in plan.steps) or "stay"
-    arrives = "" if plan.reaches_goal else " It does not arrive."
+    """Describe a plan: its actions, predicted distance to the goal, and planning time."""
+    steps = ", then ".join(step_in_words(step) for step in plan.steps) or "no action"
+    arrives = "" if plan.reaches_goal else " It does not reach the goal."
     if not plan.reaches_goal and plan.predicted_distance_m <= plan.goal.tolerance_m:
-        arrives = " It arrives, but is not predicted to be turned or lifted as the goal asks."
+        arrives = " It reaches the goal's position, but not its turn or height."
     std_m = plan.steps[-1].std_m if plan.steps else math.nan
     unsure = "" if math.isnan(std_m) else f" (σ of the last step {1000 * std_m:.1f} mm)"
     return (
@@ -248,7 +248,7 @@ def plan_in_words(plan: Plan) -> str:
 
 
 def outcome_in_words(outcome: Outcome, goal: Goal, how: str, done: int) -> str:
-    """Where the object rests (HTML); how: "Done," or "Stopped after", done: how many actions."""
+    """Describe an outcome (HTML); how: "Done," or "Stopped after"; done: number of actions."""
     within = "within" if outcome.distance_m <= goal.tolerance_m else "outside"
     posed = ""
     if goal.turn_rad is not None:

@@ -183,7 +183,7 @@ def test_run_waits_for_the_plan_of_the_goal_that_is_shown(make_picker, trained):
 
 def test_the_picker_shows_its_errors(picker, tmp_path):
     picker.controls.planner.value = "broken"
-    assert "did not work:</b> no &lt;plan&gt; today" in in_time(picker).controls.words.value
+    assert "Error:</b> no &lt;plan&gt; today" in in_time(picker).controls.words.value
     assert shapes(picker, "step") == []
     with pytest.raises(ValueError, match="off the table"):
         picker.pick(5.0, 0.0)
@@ -216,7 +216,7 @@ def test_stop_lets_an_action_end_and_begins_no_other(make_picker, world):
     wait_until(lambda: picker.controls.progress.value == 1)
     assert picker.controls.stop.disabled is False
     assert picker.controls.run.disabled
-    with pytest.raises(RuntimeError, match="still at work"):
+    with pytest.raises(RuntimeError, match="still moving"):
         picker.run()
     picker.shove_object()
     picker.controls.stop.click()
@@ -369,7 +369,7 @@ def test_a_plan_comes_back_from_its_file(posed):
     posed.run()
     assert posed.world.object_state()[2] > 0.04
     posed.load("mine.json")
-    assert "from where this plan starts" in posed.controls.words.value
+    assert "from the start of this plan" in posed.controls.words.value
     assert posed.world.object_state()[2] < 0.04  # put down before it begins again
 
 
@@ -402,7 +402,7 @@ def test_turn_and_lift_are_planned_and_done(posed, world, executor, within_deg):
 
 def test_what_cannot_be_lifted_so_high_is_said_before_anything_moves(posed):
     posed._follow(Goal((0.04, 0.03), height_m=0.45))
-    assert "not predicted to be turned or lifted" in in_time(posed).controls.words.value
+    assert "but not its turn or height" in in_time(posed).controls.words.value
 
 
 def test_the_ring_is_where_the_arm_can_push_from(world):
