@@ -453,16 +453,16 @@ class PlacedObject:
         x, y, yaw = self.pose()
         return np.add(rotated(self.obj.footprint_m, yaw), (x, y))
 
-    def draw_outline(self, xy_m: tuple, rgb: tuple, yaw_rad: float, scale: float) -> None:
-        """Show its footprint at (x, y) [m] on the table, in a colour, `scale` times as large."""
+    def draw_outline(self, xy_m: tuple, rgb: tuple, yaw_rad: float, scale: float) -> int:
+        """A body that shows its footprint at (x, y) [m], for now 1 m below the table."""
         xy_m, yaw_rad = check_on_table("xy_m", xy_m), check_finite("yaw_rad", yaw_rad)
         outline = check_within("scale", scale, 0.1, 10.0) * self.obj.footprint_m
         rgb = [check_within("rgb", share, 0.0, 1.0) for share in check_array("rgb", rgb, 3)]
         # Larger sheets lie lower, so that one on another shows as a frame around it.
         sheet = [np.vstack([np.insert(outline, 2, z, axis=1) for z in (-0.005, 0.001 / scale)])]
-        self.client.createMultiBody(
+        return self.client.createMultiBody(
             baseVisualShapeIndex=self.client.createVisualShape(**_mesh(sheet), rgbaColor=(*rgb, 1)),
-            basePosition=(*xy_m, 0.0),
+            basePosition=(*xy_m, -1.0),
             baseOrientation=pybullet.getQuaternionFromEuler((0, 0, yaw_rad)),
         )
 

@@ -92,6 +92,7 @@ class Tabletop(AbstractContextManager):
                     client.removeBody(body)
             client.restoreState(stateId=self._fresh)
         self._placed: PlacedObject | None = None
+        self._marks: list[int] = []
         self.noise = np.random.default_rng(self.config.noise_seed)
         set_friction(client, self._table, -1, self.config.table_friction)
         for name in ("left_finger", "right_finger", "blade", "rod"):
@@ -222,7 +223,10 @@ class Tabletop(AbstractContextManager):
         """Render a colour picture (height, width, 3), uint8, of the robot and the table."""
         for name, pixels in (("width", width), ("height", height)):
             check_count(name, pixels, 16, 2048)
-        return camera.picture(self.client, width, height)
+        self._move_marks(1.0)
+        picture = camera.picture(self.client, width, height)
+        self._move_marks(-1.0)
+        return picture
 
     def mark(
         self,
@@ -231,8 +235,13 @@ class Tabletop(AbstractContextManager):
         yaw_rad: float = 0.0,
         scale: float = 1.0,
     ) -> None:
-        """Draw the object's footprint at (x, y) [m] on the table in a colour, without a body."""
-        self.placed.draw_outline(xy_m, rgb, yaw_rad, scale)
+        """Draw the object's footprint at (x, y) [m], in a colour; the robot's camera sees none."""
+        self._marks.append(self.placed.draw_outline(xy_m, rgb, yaw_rad, scale))
+
+    def _move_marks(self, up_m: float) -> None:
+        for body in self._marks:
+            (x, y, z), turn = self.client.getBasePositionAndOrientation(body)
+            self.client.resetBasePositionAndOrientation(body, (x, y, z + up_m), turn)
 
     def can_reach(
         self, primitive: Primitive, stop_phase: float = 1.0, at_xy_m: Sequence[float] | None = None

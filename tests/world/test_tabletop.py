@@ -86,6 +86,14 @@ def test_camera_measures_the_object(world, obj, xy):
     assert ((mask > 0) & (mask < 1)).sum() > 20
 
 
+def test_a_mark_is_in_pictures_only(world):
+    world.place(OBJECTS[0])
+    seen, picture = world.depth_image(), world.picture()
+    world.mark((0.05, 0.0), (0.0, 0.45, 0.7), scale=1.3)
+    assert (world.picture() != picture).any()
+    np.testing.assert_array_equal(world.depth_image(), seen)
+
+
 def test_unreachable_raises_or_is_recorded_and_moves_nothing(world):
     world.place(OBJECTS[0], (0.45, 0.5), 0.0)
     before = world.object_state()
