@@ -1,4 +1,4 @@
-"""The README's picture: `python -m experiments.front_picture` films one push twice.
+"""The README's picture: `python -m experiments.front_picture` records one push twice.
 
 Executed whole it passes the goal; stopped where the plan says it ends there.
 """
@@ -27,9 +27,9 @@ GOAL_RGB = (0.0, 0.45, 0.70)
 PICTURE = repo_root() / "figures" / "partial_push.gif"
 
 
-def filmed(title: str, stop: bool) -> list[np.ndarray]:
+def recorded(title: str, stop: bool) -> list[np.ndarray]:
     """Frames (h, w, 3) of one planned push, stopped where the plan says or executed whole."""
-    film = FrameRecorder(FRAME_STEPS, *LARGE)
+    animation = FrameRecorder(FRAME_STEPS, *LARGE)
     with Tabletop() as world:
         world.place(BOX, (0.0, 0.0), 0.3)
         planner = Skills.load().planner(plan_continuous, mode="single_partial")
@@ -38,11 +38,11 @@ def filmed(title: str, stop: bool) -> list[np.ndarray]:
         if not stop:
             plan = replace(plan, steps=(replace(plan.steps[0], stop_phase=1.0),))
         world.mark(GOAL.xy_m, GOAL_RGB, turned, scale=1.3)
-        world.on_step = film
+        world.on_step = animation
         outcome = execute_plan(world, plan)
-    titles = [title.format(plan.steps[0].stop_phase)] * len(film.frames)
+    titles = [title.format(plan.steps[0].stop_phase)] * len(animation.frames)
     titles[-8:] = [f"{titles[0]}: {1000 * outcome.distance_m:.1f} mm from the goal"] * 8
-    return [_titled(*pair) for pair in zip(film.frames, titles, strict=True)]
+    return [_titled(*pair) for pair in zip(animation.frames, titles, strict=True)]
 
 
 def _titled(picture: np.ndarray, title: str) -> np.ndarray:
@@ -55,12 +55,12 @@ def _titled(picture: np.ndarray, title: str) -> np.ndarray:
 
 
 def main() -> None:
-    """Film the push, whole and stopped, and write both side by side."""
-    both = filmed("The whole push", stop=False), filmed("Stopped at {:.0%} of it", stop=True)
-    film = FrameRecorder()
+    """Record the push, whole and stopped, and write both side by side."""
+    both = recorded("The whole push", stop=False), recorded("Stopped at {:.0%} of it", stop=True)
+    animation = FrameRecorder()
     for k in range(max(map(len, both))):
-        film.frames.append(np.hstack([side[min(k, len(side) - 1)] for side in both]))
-    write_atomically(PICTURE, film.encoded("GIF", frame_ms=80))
+        animation.frames.append(np.hstack([side[min(k, len(side) - 1)] for side in both]))
+    write_atomically(PICTURE, animation.encoded("GIF", frame_ms=80))
 
 
 if __name__ == "__main__":

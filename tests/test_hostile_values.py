@@ -123,8 +123,8 @@ def shop(one_world, skills, pushes, tmp_path_factory):
     one_world.config = world.WorldConfig()
     one_world.place(BOX, AT, 0.3)
     image, model, goal = one_world.depth_image(), skills.model(Push), Goal((0.05, 0.02))
-    seen, film = one_world.execute_primitive(Push(0.0)), show.FrameRecorder(1, 16, 16)
-    film(one_world)
+    seen, animation = one_world.execute_primitive(Push(0.0)), show.FrameRecorder(1, 16, 16)
+    animation(one_world)
     arrays = interactions.InteractionTensors.from_dataset(pushes, np.arange(12))
     scaler, domain = interactions.Scaler.fit(arrays), models.TrainingDomain.fit(arrays)
     config, test = models.CNPConfig(), interactions.open_interactions("push_test")
@@ -185,7 +185,7 @@ def shop(one_world, skills, pushes, tmp_path_factory):
         "seen": seen,
         "ax": ax,
         "figure": figure,
-        "recorder": film,
+        "recorder": animation,
         "folder out_dir": folder,
         "notebook": "x",
         "parameters tables": {},
@@ -239,7 +239,7 @@ def shop(one_world, skills, pushes, tmp_path_factory):
         "Push": {"radius": 0.2},
         "PushAt": {"length": 0.01},
         "plot_levered": {"pose": np.zeros(4)},
-        "show_animation": {"path": folder / "film.gif", "beside": figure},
+        "show_animation": {"path": folder / "animation.gif", "beside": figure},
     }
     return {k: v for names, v in by_name.items() for k in names.split()}, by_callable
 

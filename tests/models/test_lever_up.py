@@ -119,6 +119,6 @@ def test_a_levered_prism_is_drawn_where_it_is():
     upended = plot_levered(Figure().subplots(), square, 0.04, pose, "k")
     top = max(line.get_ydata().max() for line in upended.lines)
     assert top == pytest.approx(100 * (0.2 + 0.3 * 0.1))
-    film = FrameRecorder(height=100)
-    film.add(figure)
-    assert film.frames[0].shape[0] == 100
+    animation = FrameRecorder(height=100)
+    animation.add(figure)
+    assert animation.frames[0].shape[0] == 100

@@ -184,7 +184,7 @@ def test_the_shipped_model_on_the_held_out_pushes(trained, held_out_pushes, push
     ("name", "n", "all_mm", "cuboid_mm", "p95_mm", "yaw_deg"),
     [("film_500", 500, 1.0, 1.5, 4.0, 3.0), ("film_5000", 5000, 0.5, 0.8, 2.5, 1.5)],
 )
-def test_the_shipped_films_reach_their_goals(
+def test_the_shipped_networks_reach_their_goals(
     name, n, all_mm, cuboid_mm, p95_mm, yaw_deg, held_out_pushes
 ):
     model, about = load_checkpoint(name)

@@ -238,7 +238,7 @@ slider""",
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory):
     folder = tmp_path_factory.mktemp("lab")
-    with serve(folder, "00_start_here", EXPLORERS, film_every=240) as lab:
+    with serve(folder, "00_start_here", EXPLORERS, frame_every=240) as lab:
         yield lab
 
 

@@ -20,20 +20,20 @@ from affordlib.world import Cuboid
 from tests.problems import problem_of
 
 
-def test_a_film_shows_the_robot_move(world, tmp_path):
+def test_an_animation_shows_the_robot_move(world, tmp_path):
     world.place(Cuboid(0.06, 0.05, 0.05))
-    film = FrameRecorder(every=240, width=80, height=60)
+    animation = FrameRecorder(every=240, width=80, height=60)
     with pytest.raises(RuntimeError, match="there are no frames"):
-        film.encoded()
-    world.on_step = film
+        animation.encoded()
+    world.on_step = animation
     try:
         world.execute_primitive(Push(1.0))
     finally:
         world.on_step = None
-    assert len(film.frames) == 5
-    assert np.abs(film.frames[0].astype(int) - film.frames[-1]).max() > 50
+    assert len(animation.frames) == 5
+    assert np.abs(animation.frames[0].astype(int) - animation.frames[-1]).max() > 50
     figure, _ = plt.subplots(figsize=(2, 2))
-    shown = show_animation(film, tmp_path / "push.gif", beside=figure)
+    shown = show_animation(animation, tmp_path / "push.gif", beside=figure)
     plt.close(figure)
     for kind, picture in (("GIF", tmp_path / "push.gif"), ("PNG", io.BytesIO(shown.data))):
         saved = Image.open(picture)
@@ -56,8 +56,8 @@ def test_a_footprint_is_drawn_where_the_object_is(world, trained):
     plt.close(figure)
 
 
-def test_all_frames_of_a_film_have_one_size():
-    film = FrameRecorder(width=320, height=240)
-    film.add(Figure(figsize=(4, 3)))
+def test_all_frames_of_an_animation_have_one_size():
+    animation = FrameRecorder(width=320, height=240)
+    animation.add(Figure(figsize=(4, 3)))
     with pytest.raises(ValueError, match="480×240 pixels, the others have 320×240"):
-        film.add(Figure(figsize=(6, 3)))
+        animation.add(Figure(figsize=(6, 3)))
