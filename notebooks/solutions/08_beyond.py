@@ -18,7 +18,7 @@ def strangeness(image):
     return np.abs(mask - mask[::-1, ::-1]).mean()
 
 
-def surest_half_mm():
+def lower_half_mm():
     """Half of the pushes, chosen by σ alone, have a fraction of the error of all of them."""
     pushes = open_interactions("push_test")
     model, _ = load_checkpoint("film_5000")
@@ -27,7 +27,7 @@ def surest_half_mm():
     return 1000 * float(final_error(answers)[sigma <= np.median(sigma)].mean())
 
 
-VERDICTS = [check("08.1", strangeness), check("08.2", surest_half_mm())]
+VERDICTS = [check("08.1", strangeness), check("08.2", lower_half_mm())]
 
 if __name__ == "__main__":
     print(*VERDICTS, sep="\n")
