@@ -1,4 +1,4 @@
-"""How long and how readable the book is, page by page, and what its style does not allow.
+"""Measure length and readability of each page of the book, and check its style.
 
 python -m tests.book_check
 """
@@ -16,12 +16,12 @@ from affordlib.workbook import notebook_paths
 
 ROOT = repo_root()
 TEXTS = {"README.md": 800, "RESULTS.md": 2000, "CONTRIBUTING.md": 2000, "data/README.md": 2000}
-"""Pages of text, and how many words they may have."""
+"""Pages of text, and their maximum number of words."""
 
 LIMITS = {"minutes": 60, "words": 2000, "cells": 40, "tables": 3, "rows": 8}
 LIMITS |= {"code": 30, "px": 915, "no alt": 0, "private": 0}
 NOT_YET: dict[str, dict[str, int]] = {}
-"""A ratchet: what is higher on pages that are not there yet. Lower it with every page."""
+"""A ratchet: higher limits for unfinished pages. Lower them with every page."""
 
 PRIVATE = re.compile(
     r"\b(fores(ee\w*|aw)|promised|courses?|told|err(s|ed)|guess(es)?|yardsticks?|off by|wary|eyes?"
@@ -30,13 +30,13 @@ PRIVATE = re.compile(
     r"|things?|famil(y|ies)|pursuits?|(turned|mirrored) copies|frame of the push|forecasters?)\b",
     re.IGNORECASE,
 )
-"""Words for which the field has another; where one is meant, as a name, it stands in `code`."""
+"""Words to replace by the field's terms; where one is meant as a name, write it as `code`."""
 
 ABBREVIATION = re.compile(r"\b(CNP|LSTM|CNN|NLL|CKA|CRPS|AUC|ROC|EMA|MLP|FiLM|sem|TP|TN|PCA|MSE)\b")
 
 
 def prose(text: str) -> str:
-    """What is read as text in Markdown: no code, equations, tables or comments."""
+    """The text of a Markdown page without code, equations, tables and comments."""
     text = re.sub(r"```.*?```|\$\$.*?\$\$|<!--.*?-->", " ", text, flags=re.DOTALL)
     text = re.sub(r"^\|.*$", " ", text, flags=re.MULTILINE)
     return re.sub(r"`[^`]*`|\$[^$]*\$|\]\([^)]*\)", " ", text)
@@ -51,7 +51,7 @@ def markdown(notebook: nbformat.NotebookNode) -> str:
 
 
 def measure(notebook: nbformat.NotebookNode) -> dict[str, int]:
-    """What a reader meets on a page: what is folded is not read."""
+    """Measure what a reader sees of a page: folded parts do not count."""
     text = re.sub("<details>.*?</details>", "", markdown(notebook), flags=re.DOTALL)
     code = [c for c in notebook.cells if c.cell_type == "code"]
     shown = [c.source for c in code if "hide-input" not in c.metadata.get("tags", [])]
@@ -87,7 +87,7 @@ def measure(notebook: nbformat.NotebookNode) -> dict[str, int]:
 
 
 def anchors(path: Path) -> set[str]:
-    """What a link to a page may name after #, as JupyterLab or GitHub calls its headings."""
+    """Anchors that links to a page may use after #, as JupyterLab or GitHub names its headings."""
     if path.suffix == ".ipynb":
         heads = re.findall(r"^#+ (.+)$", markdown(nbformat.read(path, 4)), re.MULTILINE)
         return {head.replace(" ", "-") for head in heads}
@@ -96,7 +96,7 @@ def anchors(path: Path) -> set[str]:
 
 
 def faults(path: Path, text: str) -> list[str]:
-    """Dead links, private words and abbreviations that are not expanded, of a page's text."""
+    """List dead links, private words and unexpanded abbreviations in a page's text."""
     wrong = [
         f"{match.group()!r} is not a word of the field" for match in PRIVATE.finditer(prose(text))
     ]
@@ -112,7 +112,7 @@ def faults(path: Path, text: str) -> list[str]:
 
 
 def check() -> tuple[dict[str, dict[str, int]], list[str]]:
-    """The measures of every page, and what is wrong."""
+    """Measure every page and list the faults."""
     measures, wrong = {}, []
     for name, path in notebook_paths(ROOT).items():
         notebook = nbformat.read(path, as_version=4)
@@ -134,7 +134,7 @@ def check() -> tuple[dict[str, dict[str, int]], list[str]]:
 
 
 def main() -> int:
-    """Print the measures, and what is wrong."""
+    """Print the measures and the faults."""
     measures, wrong = check()
     names = list(measures["00_start_here"])
     print(f"{'':22}", *(f"{name:>8}" for name in names))

@@ -1,4 +1,4 @@
-"""Shared fixtures, and which files come first."""
+"""Shared fixtures, and the order of the test files."""
 
 from collections import Counter
 from dataclasses import replace
@@ -17,7 +17,7 @@ from affordlib.world import Cuboid, Tabletop, WorldConfig
 
 
 def pytest_collection_modifyitems(items):
-    """Start with the files of many slow tests: none of them should be last, on one core."""
+    """Start with the files of many slow tests, so that none of them runs last on one core."""
     slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
     items.sort(key=lambda item: -slow[item.path])
 
@@ -30,7 +30,7 @@ def one_world():
 
 @pytest.fixture
 def world(one_world):
-    """The session's world, whatever the test before has made of its frictions and senses."""
+    """The session's world, with frictions and perception reset before each test."""
     one_world.config, one_world.n_averaged_images, one_world.on_step = WorldConfig(), 1, None
     one_world.reset()
     return one_world
@@ -94,7 +94,7 @@ def levered(levers):
 
 @pytest.fixture(scope="session")
 def short():
-    """A function from the name of a lever-up model to it with a training of a few steps."""
+    """A function that trains a lever-up model, given by name, for a few steps."""
 
     def short(name, **change):
         few = {"steps": 4, "batch_size": 8, "validate_every": 2} | change

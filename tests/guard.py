@@ -1,12 +1,12 @@
-"""What must not move while the code is rearranged: data, predictions, plans, tables.
+"""Check that refactoring changes no data, predictions, plans or tables.
 
-Write it down at one commit and compare at another, on the same machine (bits differ between
-processors):
+Write a file at one commit and compare it with another, on the same machine (results are not
+bit-identical across processors):
 
     python -m tests.guard write guard.json
     python -m tests.guard compare guard.json
 
-The comparison names what moved and by how much, and exits with 1 if anything did.
+The comparison lists what changed and by how much, and exits with 1 if anything did.
 """
 
 import argparse
@@ -43,7 +43,7 @@ N_INTERACTIONS, N_GOALS = 3, 20
 
 
 def collected() -> dict[str, list[float]]:
-    """Effects of a few interactions of every recipe that ships."""
+    """Effects of a few interactions of every shipped recipe."""
     found = {}
     with Tabletop() as world:
         for name in ("push", "drag", "grasp", "rotate", "lever_up", "push_varied", "partial"):
@@ -90,7 +90,7 @@ def predicted() -> dict[str, list[float]]:
 
 
 def planned() -> dict[str, list[float]]:
-    """Plans of all planners on the first frozen goals of each mode."""
+    """Plans of all planners for the first frozen goals of each mode."""
     skills, found = Skills.load(), {}
     tasks = [t for t in frozen_tasks() if t.goals == "constructed"]
     some = [[t for t in tasks if t.mode == mode][: N_GOALS // 2] for mode in MODES]
@@ -111,7 +111,7 @@ def planned() -> dict[str, list[float]]:
 
 
 def tabled() -> dict[str, list[float]]:
-    """Every number of the committed results, whatever it is called."""
+    """Every number of the committed results, under any key."""
     found = {}
     for path in sorted((repo_root() / "data" / "results").glob("*.json")):
         numbers = []
@@ -131,7 +131,7 @@ def tabled() -> dict[str, list[float]]:
 
 
 def compare(before: dict[str, list[float]], now: dict[str, list[float]]) -> list[str]:
-    """A sentence for each entry that is gone, new, or not the same to the last bit."""
+    """One sentence for each entry that is missing, new, or not bit-identical."""
     moved = [f"{name}: gone" for name in before if name not in now]
     moved += [f"{name}: new" for name in now if name not in before]
     for name in before.keys() & now.keys():
@@ -144,7 +144,7 @@ def compare(before: dict[str, list[float]], now: dict[str, list[float]]) -> list
 
 
 def main() -> int:
-    """Write down what is, or compare it with what was written."""
+    """Write the current state, or compare it with a file."""
     parser = argparse.ArgumentParser(prog="python -m tests.guard", description=main.__doc__)
     parser.add_argument("action", choices=("write", "compare"))
     parser.add_argument("file", type=Path)

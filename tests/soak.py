@@ -1,10 +1,10 @@
-"""Look, plan and execute 3,000 times: the memory stays, and the same task gives the same bits.
+"""Observe, plan and execute 3,000 times: memory stays constant and results are bit-identical.
 
     make soak
 
-Each round has an object, a start and a goal of its own, and A* and the continuous planner take
-turns. Every hundred rounds two fixed tasks are done again. Exits with 1 when memory grew by more
-than 2 MB after the first thousand rounds, or a fixed task ended differently. A quarter of an hour.
+Each round has a different object, start and goal; A* and the continuous planner alternate. Every
+hundred rounds two fixed tasks are repeated. Exits with 1 when memory grew by more than 2 MB after
+the first thousand rounds, or a fixed task ended differently. It takes 15 minutes.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ CATEGORIES = (Cuboid, UprightCylinder, LyingCylinder)
 
 
 def one_round(world: Tabletop, planner, obj, start, goal: Goal) -> str:
-    """Look, plan and execute; the hash of the object's path."""
+    """Observe, plan and execute; return the hash of the object's path."""
     world.place(obj, start)
     seen = world.observe()
     try:
@@ -41,13 +41,13 @@ def one_round(world: Tabletop, planner, obj, start, goal: Goal) -> str:
 
 
 def memory_mb() -> float:
-    """Memory that no file backs, swapped out or not [MB]; pages of files are shared with others."""
+    """Anonymous memory [MB], swapped out or not; memory backed by files is shared with others."""
     gc.collect()
     return sum(part.anonymous + part.swap for part in psutil.Process().memory_maps()) / 2**20
 
 
 def main() -> int:
-    """Run it, and tell."""
+    """Run all rounds, and report."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
     parser.add_argument("--rounds", type=int, default=3000)
     rounds = parser.parse_args().rounds

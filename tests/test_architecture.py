@@ -1,4 +1,4 @@
-"""Imports point one way, and the promises of the layout hold."""
+"""Imports point in one direction, and the layout follows its rules."""
 
 import ast
 import graphlib
@@ -26,12 +26,12 @@ MOST_PARAMETERS = 7
 
 
 def name_of(path):
-    """A module as it is imported."""
+    """Import name of a module."""
     return ".".join(path.with_suffix("").parts).removesuffix(".__init__")
 
 
 def imported(path):
-    """The modules and names that a module imports."""
+    """Modules and names that a module imports."""
     names = set()
     for node in ast.walk(TREES[path]):
         if isinstance(node, ast.ImportFrom):
@@ -82,7 +82,7 @@ def test_only_the_world_knows_pybullet():
 
 
 def test_functions_in_functions_are_not_decorated_again_and_again():
-    """What beartype checks it decorates where it is defined: a closure, every time."""
+    """beartype decorates a function when it is defined, so a closure on every call."""
     for path in MODULES:
         if name_of(path).removeprefix("affordlib.") not in CHECKED:
             continue
@@ -118,7 +118,7 @@ print(torch_s, took_s)
 @pytest.mark.slow
 @pytest.mark.parametrize("part", UP)
 def test_importing_is_quick_and_changes_nothing(part, tmp_path):
-    """On an idle machine it takes a second; here less than three times what PyTorch takes."""
+    """Importing takes a second on an idle machine; the limit is three times the time of PyTorch."""
     code = IMPORT.format(part=part)
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True

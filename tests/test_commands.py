@@ -1,4 +1,4 @@
-"""Command lines refuse what is no use, and end with one line."""
+"""Command lines refuse invalid input, and end with a one-line message."""
 
 import importlib
 import os

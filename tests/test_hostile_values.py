@@ -1,4 +1,4 @@
-"""Whatever a public callable is given: an error that names the argument, or a sane result."""
+"""Public callables with any input: an error that names the argument, or a sane result."""
 
 import dataclasses
 import decimal
@@ -109,7 +109,7 @@ def log_of_eight():
 
 
 def fields_of(*made):
-    """The arguments that give instances of dataclasses, by the class."""
+    """Arguments that give instances of dataclasses, by class."""
     return {
         type(one).__name__: {f.name: getattr(one, f.name) for f in dataclasses.fields(one)}
         for one in made
@@ -118,7 +118,7 @@ def fields_of(*made):
 
 @pytest.fixture(scope="module")
 def shop(one_world, skills, pushes, tmp_path_factory):
-    """A value for each parameter by its name; and by the callable, where it wants another."""
+    """A valid value for each parameter by name, or by callable where that needs another."""
     folder, path, log = tmp_path_factory.mktemp("hostile"), np.zeros((3, 2)), log_of_eight()
     one_world.config = world.WorldConfig()
     one_world.place(BOX, AT, 0.3)
@@ -250,7 +250,7 @@ NOT_DRIVEN = {
 
 
 def driven(name, shop):
-    """A callable, and a value with which it works for each of its parameters."""
+    """A callable, with a valid value for each of its parameters."""
     by_name, by_callable = shop
     w, fixed = by_name["world"], NOT_DRIVEN.get(name, {})
     act = by_name["skills"].kind_for if name == "kind_for" else CALLABLES.get(name)
@@ -277,7 +277,7 @@ def driven(name, shop):
 
 
 def silent_nans(result):
-    """Fields of a result that are not numbers, though they should be."""
+    """Fields of a result that are NaN but should be numbers."""
     if dataclasses.is_dataclass(result) and not isinstance(result, type):
         fields = {f.name: getattr(result, f.name) for f in dataclasses.fields(result)}
         return [n for n, v in fields.items() if n != "std_m" and silent_nans(v)]

@@ -1,4 +1,4 @@
-"""`make setup`, with a Python that only pretends to install: when it makes .venv, and when not."""
+"""`make setup` with a Python that only pretends to install: when it creates .venv, and when not."""
 
 import os
 import shutil
@@ -33,7 +33,7 @@ pytestmark = pytest.mark.skipif(shutil.which("make") is None, reason="make is no
 
 @pytest.fixture
 def project(tmp_path):
-    """A folder with the Makefile: `setup()` runs make and gives status, words and what ran."""
+    """A folder with the Makefile: `setup()` runs make; returns status, output and commands."""
     here = tmp_path / "a project"  # with a blank in its name
     here.mkdir()
     shutil.copy(repo_root() / "Makefile", here)

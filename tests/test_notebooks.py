@@ -1,4 +1,4 @@
-"""Every notebook: as it is committed, and run once with the values of the smoke profile."""
+"""Every notebook: as committed, and executed once with the values of the smoke profile."""
 
 import ast
 import base64
@@ -25,7 +25,7 @@ PATHS = notebook_paths(ROOT)
 RESULTS = ROOT / "data" / "results"
 PROFILES = ("smoke", "reader", "full")
 BROKEN = ROOT / "tests" / "broken.ipynb"
-# A folder of some machine: a slash that begins a word, and a name that systems use at the root.
+# A machine-specific path: a slash at the start of a word, and a folder name common at the root.
 ABSOLUTE = re.compile(
     r"(?<![\w.~/:-])/(?:home|root|tmp|work|usr|var|opt|mnt|media|Users|private)/\w|\b[A-Z]:\\\w"
 )
@@ -77,7 +77,7 @@ def test_every_picture_has_its_caption(name):
 
 
 class WithoutNotes(ast.NodeTransformer):
-    """Code without what it only notes down in `parameters`."""
+    """Code without values that are only recorded in `parameters`."""
 
     def visit_Assign(self, node):
         target = (getattr(node, "targets", None) or [node.target])[0]
@@ -89,7 +89,7 @@ class WithoutNotes(ast.NodeTransformer):
 
 @each_notebook
 def test_every_parameter_is_used(name):
-    """By some cell that does more than note it down."""
+    """At least one cell does more than record it."""
     cells = code_of(read(name))
     at = next(i for i, c in enumerate(cells) if "parameters" in c.metadata.get("tags", []))
     code = [TransformerManager().transform_cell(cell.source) for cell in cells[at + 1 :]]
@@ -127,7 +127,7 @@ STORED = [
 
 
 def last_value(source, space):
-    """Execute a cell and return what its last line shows; None where it needs what is not there."""
+    """Execute a cell and return its last line's value; None if it needs undefined names."""
     tree = ast.parse(source)
     last = tree.body.pop() if isinstance(tree.body[-1], ast.Expr) else None
     try:
@@ -159,7 +159,7 @@ def test_stored_results_are_shown_as_they_are_now(name):
 
 @each_notebook
 def test_closing_cells(name):
-    """What we learned, and the ways on."""
+    """What we learned, and links to continue."""
     text = [cell.source for cell in read(name).cells if cell.cell_type == "markdown"]
     if name != "00_start_here":
         assert re.search(r"^## What we learned$", "\n".join(text[-4:]), re.MULTILINE)
@@ -177,7 +177,7 @@ def test_small_and_clean(name):
 
 
 def test_of_a_widget_its_picture_is_kept():
-    """JupyterLab without the kernel shows it; of a widget alone it would show an error."""
+    """JupyterLab shows the picture without a kernel; without it, a widget would show an error."""
     shown = {WIDGET: {"model_id": "1"}, "text/plain": "a widget"}
     both = [nbformat.v4.new_output("display_data", shown | {"image/png": "iVBORw0="})]
     alone = [nbformat.v4.new_output("display_data", shown)]
@@ -189,7 +189,7 @@ def test_of_a_widget_its_picture_is_kept():
 
 @each_notebook
 def test_everything_shown_shows_on_the_web(name):
-    """Pages made from a notebook know no GIFs, and print the name of the object instead."""
+    """Web pages made from a notebook drop GIFs, and print the object's name instead."""
     known = {"image/png", "image/svg+xml", "image/jpeg", "text/html", "text/markdown"}
     for number, cell in enumerate(read(name).cells, 1):
         for output in cell.get("outputs", []):
@@ -246,7 +246,7 @@ def test_what_the_style_does_not_allow_is_found():
 
 
 def prepare(path, parameters, folder):
-    """Put a copy with these parameters into a folder, ready to run."""
+    """Write a copy with these parameters into a folder, ready to run."""
     copy = folder / path.name
     papermill.execute_notebook(
         path, copy, parameters, prepare_only=True, kernel_name="python3", language="python"
@@ -255,7 +255,7 @@ def prepare(path, parameters, folder):
 
 
 def append_solutions(copy):
-    """Put the solutions of a notebook's exercises at its end, if it has any, and ask for a pass."""
+    """Append the solutions of a notebook's exercises, if any, and require them to pass."""
     solutions = ROOT / "notebooks" / "solutions" / f"{copy.stem}.py"
     if solutions.is_file():
         notebook = nbformat.read(copy, as_version=4)
@@ -266,7 +266,7 @@ def append_solutions(copy):
 
 
 def run_with_nbval(copy):
-    """Run a prepared notebook in a pytest of its own: asserts, and outputs marked to be checked."""
+    """Run a prepared notebook in a separate pytest: asserts, and outputs marked for checking."""
     command = [sys.executable, "-m", "pytest", "--nbval-lax", "--nbval-current-env"]
     command += ["--nbval-cell-timeout=600", "-p", "no:cacheprovider", "--rootdir", copy.parent]
     environment = {k: v for k, v in os.environ.items() if k not in ("PYTEST_ADDOPTS", "MPLBACKEND")}
@@ -277,7 +277,7 @@ def run_with_nbval(copy):
 
 @pytest.fixture(scope="module")
 def smoke(tmp_path_factory):
-    """The folder of one run, shared: later notebooks may read what earlier ones wrote."""
+    """The folder of one shared run: later notebooks may read files of earlier ones."""
     folder = tmp_path_factory.mktemp("smoke")
     return folder, {job.name: job for job in make_jobs(ROOT, "smoke", seed=1)}
 
@@ -295,7 +295,7 @@ def test_run(name, smoke):
     assert f"{len(code_of(nbformat.read(copy, as_version=4)))} passed" in done.stdout
     document = read_results(folder / f"{name}.json")
     assert document["notebook"] == name
-    # What a run writes it has measured itself: it is none of the tables that the page only shows.
+    # A run writes what it has measured itself, not the tables that the page only shows.
     others = [path for path in RESULTS.glob("*.json") if path.stem != name]
     committed = [read_results(path)["tables"].values() for path in others]
     assert not [t for t, rows in document["tables"].items() if any(rows in of for of in committed)]

@@ -1,4 +1,4 @@
-"""What a notebook writes comes back the same, whole or not at all, and tables are drawn from it."""
+"""Results are read back unchanged, written completely or not at all; tables are made from them."""
 
 import errno
 import html
@@ -99,7 +99,7 @@ def test_a_kill_leaves_no_half_file_and_the_next_writer_no_leftovers(tmp_path):
         assert [row["n"] for row in read_results(path)["tables"]["t"]] == list(range(2000))
     assert left == [f".a.json.{process.pid}.tmp"]
     living = tmp_path / f".a.json.{os.getppid()}.tmp"
-    living.touch()  # of a writer that is still at work
+    living.touch()  # of a writer that is still running
     write_results(tmp_path, "a", {}, {})
     assert sorted(tmp_path.iterdir()) == [living, path]
 

@@ -1,4 +1,4 @@
-"""The batch runner on tiny books: what runs, what is skipped, what is refused, what survives."""
+"""The batch runner on tiny books: what is executed, skipped or refused, and what is kept."""
 
 import json
 import os
@@ -34,7 +34,7 @@ print(n * rate)"""
 
 
 class Book:
-    """A small workbook in a temporary folder, and how the tests look at it."""
+    """A small workbook in a temporary folder, with the functions to inspect it."""
 
     def __init__(self, root):
         self.root, self.runs, self.data = root, root / "runs", root / "data"
@@ -82,7 +82,7 @@ def book(tmp_path):
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    """A book of two notebooks, run once; on a machine where another kernel has our name."""
+    """A book of two notebooks, run once, on a machine where another kernel has our name."""
     root = tmp_path_factory.mktemp("finished")
     book = Book(root)
     book.add("01_first")
@@ -120,7 +120,7 @@ def test_a_run_leaves_copies_and_results_with_their_parameters(finished):
 
 @pytest.fixture
 def changeable(finished, tmp_path):
-    """The finished book, put back as it was after the test."""
+    """The finished book, restored after the test."""
     book, _ = finished
     shutil.copytree(book.root, tmp_path / "backup")
     yield book
@@ -129,7 +129,7 @@ def changeable(finished, tmp_path):
 
 
 def copy_of_results(book, name):
-    """What is done with the results of a full run that are to be committed."""
+    """Copy the results of a full run, as for a commit."""
     (book.data / "results").mkdir()
     shutil.copy(book.runs / RUN / "01_first.json", book.data / "results" / name)
 
@@ -291,7 +291,7 @@ def test_a_second_runner_or_a_file_in_place_of_the_folder_is_refused(book, capsy
     ],
 )
 def test_what_does_not_fit_is_refused_before_anything_runs(book, capsys, arguments, named):
-    """On the command line, or in the profile."""
+    """Invalid values on the command line or in the profile."""
     book.add("01_first")
     book.add("02_second")
     if isinstance(arguments, str):

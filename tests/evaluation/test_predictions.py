@@ -1,4 +1,4 @@
-"""What is made of answers: errors, calibration, baselines beside them, the rows of tables."""
+"""Evaluation of predictions: errors, calibration, baselines, table rows."""
 
 import math
 
@@ -26,7 +26,7 @@ def test_answers_are_those_of_the_model_itself(trained, held_out_pushes):
     )
     assert told["interaction"] == some.tolist()
     after, whole = (np.array(told[k]) for k in ("after_contact_error", "trajectory_error"))
-    assert (after > whole).all()  # before contact nothing moves, which dilutes the mean
+    assert (after > whole).all()  # before contact nothing moves, which lowers the mean
 
 
 def test_a_turn_is_measured_the_short_way_round():

@@ -1,4 +1,4 @@
-"""The tables of the closed loop: trials by seed, the kinematic oracle, what rows say."""
+"""Tables of the closed loop: trials by seed, the kinematic oracle, row contents."""
 
 import math
 from dataclasses import replace
@@ -15,7 +15,7 @@ from experiments.open_loop_pose_goals import run_open_loop
 
 
 def test_the_kinematic_oracle_is_the_kinematics(world):
-    """Its circles around the base answer as the inverse kinematics of whole actions does."""
+    """Its circles around the base agree with the inverse kinematics of whole actions."""
     rng = np.random.default_rng(11)
     world.place(Cuboid(0.06, 0.05, 0.05), (0.0, 0.0))
     no = 0
@@ -54,7 +54,7 @@ def test_trials_are_a_function_of_seed_and_number():
 def test_an_open_loop_trial_measures_what_is_missing(monkeypatch):
     found, trial = run_open_loop("height", 0, "continuous"), sample_trial("height", 0)
     assert max(found["pose_error"], found["distance_m"]) < 0.005
-    # A plan that does nothing leaves the whole height missing, and the object where it stood.
+    # An empty plan has the whole height as its error, and does not move the object.
     monkeypatch.setattr(open_loop_pose_goals, "execute_plan", lambda *_: None)
     idle = run_open_loop("height", 0, "astar")
     assert idle["pose_error"] == pytest.approx(trial.goal.height_m, abs=1e-4)

@@ -1,4 +1,4 @@
-"""Cross-validation trains what it says, and its tables are what its results say."""
+"""Cross-validation trains the models of its jobs, and tables agree with their results."""
 
 from dataclasses import replace
 
@@ -54,7 +54,7 @@ def test_jobs_that_cannot_be_are_refused(make, arguments, reason):
 
 @pytest.fixture
 def short(monkeypatch):
-    """Trainings on 100 grasps that take a few steps."""
+    """Training on 100 grasps for a few steps."""
     monkeypatch.setattr(cross_validation, "STEPS_ON_100", 6)
     specs = cross_validation.CHECKPOINT_SPECS
     training = replace(specs["film_500"].training, validate_every=2, batch_size=8, ema=0.0)
@@ -89,7 +89,7 @@ def test_a_training_that_was_killed_resumes_to_the_same_result(
     assert again["fold_test"] == whole["fold_test"]
     assert not list(tmp_path.glob(".table-*.pt*"))
     assert trained == 2 * seeds
-    assert len(seen) < 2 * 6 * len(seeds)  # what was done was not done again
+    assert len(seen) < 2 * 6 * len(seeds)  # finished work is not repeated
 
 
 def test_what_decides_a_training_decides_whether_its_result_is_stale(monkeypatch):
@@ -209,7 +209,7 @@ def _folds_of_grasps(scores):
 
 
 def test_a_folds_own_grasps_never_decide_its_threshold():
-    # Folds 0 and 1 part near 0.8, fold 2 at 0.2: by its own all right, by theirs all lost.
+    # Folds 0 and 1 separate near 0.8, fold 2 at 0.2: right by its own threshold, wrong by theirs.
     scores = [[0.9, 0.85, 0.7, 0.6], [0.95, 0.82, 0.78, 0.1], [0.4, 0.3, 0.1, 0.05]]
     stands, _ = threshold_rows(_folds_of_grasps(scores))
     assert (stands["n_success"], stands["n_failure"], stands["folds"]) == (6, 6, 3)

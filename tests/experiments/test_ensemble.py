@@ -1,4 +1,4 @@
-"""Several networks as one: the moments of their mixture, and that planners can work with it."""
+"""Ensembles of networks: moments of their mixture, and use by planners."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def test_mean_and_sigma_are_those_of_the_mixture(members, asked):
     each = [m.predict(m.encode(images), observed, t_target) for m in ensemble.members]
     mean = torch.stack([p.effect_mean for p in each]).double()
     torch.testing.assert_close(told.effect_mean.double(), mean.mean(dim=0), atol=1e-8, rtol=1e-5)
-    # The variance of each about the mean of all, in doubles: nothing cancels.
+    # The variance of each about the mean of all, in double precision to avoid cancellation.
     std = torch.stack([p.effect_std for p in each]).double()
     variance = (std**2 + (mean - mean.mean(dim=0)) ** 2).mean(dim=0)
     torch.testing.assert_close(told.effect_std.double(), variance.sqrt(), atol=0, rtol=1e-5)

@@ -1,4 +1,4 @@
-"""Lever-ups: baselines, jobs, tables drawn from their results, and what is shipped."""
+"""Lever-ups: baselines, jobs, tables made from their results, and shipped files."""
 
 import numpy as np
 import pytest
@@ -58,7 +58,7 @@ def test_a_job_gives_the_committed_errors_again(tmp_path):
     (again,) = run([one], "lever_up", folder=tmp_path, progress=False)
     (committed,) = run([one], "lever_up", progress=False)
     assert again["interaction"] == committed["interaction"]
-    for name in PROTOCOLS:  # rounded to 1e-4 cm, and the last digit is another processor's
+    for name in PROTOCOLS:  # rounded to 1e-4 cm; the last digit depends on the processor
         errors = again[name]["error_cm"], committed[name]["error_cm"]
         assert all(abs(a - b) < 5e-4 for a, b in zip(*map(flattened, errors), strict=True))
 

@@ -1,4 +1,4 @@
-"""Table 3: its rows, its planners, and that the committed one belongs to what is shipped."""
+"""Table 3: its rows, its planners, and agreement of the committed one with shipped files."""
 
 import json
 import math
@@ -20,7 +20,7 @@ from experiments.planning import CONFIGS, attempt, tasks_sha256
 
 
 def test_pushes_show_how_far_beside_the_camera_sees():
-    """An object that is seen too far ahead of the gripper goes as far beyond; two sides tell."""
+    """The error of an estimate along a push equals that of its end; two directions suffice."""
     error_m, camera = np.array([0.001, -0.002]), Camera((0.0, 0.0005), sd_m=0.001, noise_m=1e-5)
     pushes = [
         {"angle": angle, "std_m": (0.001, std_m), "beyond_m": rotated(error_m, -angle)}
@@ -92,7 +92,7 @@ def test_actions_are_placed_by_the_plan(world):
     again, once = (attempt(world, task, watched, by_plan=by_plan) for by_plan in (False, True))
     assert len(seen) == 2
     assert again.distance_m != once.distance_m
-    # Where the object stands in the world does not matter, only where the plan has it.
+    # Only the object's position in the plan matters, not that in the world.
     assert once.distance_m < 0.003
 
 
@@ -103,7 +103,7 @@ def test_with_a_receding_horizon_each_plan_has_one_action_less(world):
     def watched(image, xy_m, goal, mode):
         seen.append((xy_m, MODES[mode].max_steps if isinstance(mode, str) else mode.max_steps))
         plan = planner(image, xy_m, goal, mode)
-        # One that stops half way leaves something to do.
+        # A plan that stops half way has a remaining distance.
         steps = tuple(replace(s, stop_phase=0.8) for s in plan.steps) if len(seen) < 3 else ()
         return replace(plan, steps=steps)
 
@@ -133,7 +133,7 @@ def test_planners_of_the_field_keep_to_their_actions_and_improve_on_their_start(
 
 
 def test_by_physics_the_fingers_carry_a_cylinder_to_where_they_stop(world):
-    """It lies in the gap between them, whatever friction and limit surface; and all is mirrored."""
+    """It lies in the gap between them for any friction and limit surface; mirroring holds."""
     radius = 0.03
     world.place(UprightCylinder(2 * radius, 0.05))
     effects = EffectMap(LimitSurface(0.3, 0.9), world.depth_image(), n_directions=8)

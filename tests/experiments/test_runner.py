@@ -1,4 +1,4 @@
-"""Jobs: what is there is not made again, what is stale is refused, a kill costs little."""
+"""Jobs: existing results are kept, stale ones refused, and a kill loses little."""
 
 import importlib
 import pickle
@@ -17,7 +17,7 @@ CALLS = []
 
 
 def squares(n, resume_checkpoint=None):
-    """Rows of squares; killed once between its two halves, where `n` is among the deadly."""
+    """Rows of squares; killed once between its two halves if `n` is among the deadly."""
     CALLS.append(n)
     if n in DEADLY and not resume_checkpoint.exists():
         resume_checkpoint.write_text("half")
@@ -132,7 +132,7 @@ def test_the_committed_tables_are_drawn_from_the_committed_results(tmp_path, nam
         assert {runner._key(one.arguments) for one in module.JOBS} <= results
     assert made.keys() == committed.keys()
     for table, rows in made.items():
-        # Processors add in other orders: the last digits of a sum are not the table's.
+        # The order of summation depends on the processor, so last digits differ from the table's.
         assert_frame_equal(
             pd.DataFrame(rows), pd.DataFrame(committed[table]), rtol=1e-9, atol=1e-15
         )

@@ -32,7 +32,7 @@ def test_rows_that_agree_in_words_become_one_with_mean_and_deviation():
     ]
     assert (table[0]["sd_mean_m"], table[3]["sd_mean_m"]) == (pytest.approx(math.sqrt(7.0)), None)
     assert "sd_n" not in table[0]
-    # Numbers that only some seeds have are averaged over those.
+    # Numbers that only some seeds have are averaged over these seeds.
     one, other = {"m": "a", "x": 1.0, "auc": 0.5}, {"m": "a", "x": 2.0, "auc": None, "late": 3.0}
     ((row,), _) = over_seeds([[one], [other]])
     assert row == {"m": "a", "seeds": 2, "x": 1.5, "sd_x": row["sd_x"], "auc": 0.5, "late": 3.0}
@@ -99,7 +99,7 @@ def test_texts_of_results_are_no_markup(tmp_path):
     for seed in (1, 2):
         rows = [{bad: bad, "x": 1.0 * seed}]
         write_results(tmp_path / str(seed), "00_start_here", {"seed": seed}, {bad: rows})
-        (tmp_path / str(seed) / "plan.json").write_text("{}")  # nothing of a notebook
+        (tmp_path / str(seed) / "plan.json").write_text("{}")  # not a notebook's result
     page = gather({seed: tmp_path / str(seed) for seed in (1, 2)}, tmp_path / "both")
     assert page.read_text().count("&lt;img src=x onerror=alert(1)&gt;") == 3
     assert "<img" not in page.read_text()

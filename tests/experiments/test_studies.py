@@ -1,4 +1,4 @@
-"""Studies: what an ablation leaves out, what rolls, residuals, what limits a prediction."""
+"""Studies: ablations, rolling objects, residuals, and limits of prediction."""
 
 import dataclasses
 import lzma
@@ -221,7 +221,7 @@ def test_an_object_that_is_not_where_it_is_believed_is_moved_otherwise(monkeypat
     monkeypatch.setattr(limits, "REPEATS", 2)
     rows = {row["object_class"]: row for row in limits.pose_sensitivity()}
     assert sum(row["n"] for row in rows.values()) == 8
-    # A cylinder goes where the gripper goes: its way changes by what the eye erred, its end hardly.
+    # A cylinder moves with the gripper: a localization error changes its path, hardly its end.
     round_one = rows["upright_cylinder"]
     assert round_one["displacement_median_m"] == pytest.approx(limits.POSITION_ERROR_M, rel=0.1)
     assert round_one["end_median_m"] < 0.3 * limits.POSITION_ERROR_M
@@ -239,7 +239,7 @@ def test_networks_of_whole_actions_foresee_what_broken_off_ones_do():
     assert max(row["whole_median_m"] for row in late) < 0.001
     assert all(row["slid_mean_m"] > 0 for row in late)
     before = [row["whole_mean_m"] for row in rows if row["from_phase"] == 0.0]
-    assert max(before) < 1e-4  # nothing is touched yet
+    assert max(before) < 1e-4  # before contact
 
 
 def test_reach_as_learned_agrees_with_the_kinematics(monkeypatch):

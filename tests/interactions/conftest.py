@@ -1,4 +1,4 @@
-"""Small sets to collect, some of which cost nothing."""
+"""Small sets to collect, some of which need no simulation."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ def small_chunks(monkeypatch):
 
 @pytest.fixture(scope="session")
 def undisturbed(tmp_path_factory):
-    """A function from a recipe to its file, collected in this process without any disturbance."""
+    """A function that collects a recipe in this process, uninterrupted, and returns its file."""
     made = {}
 
     def make(recipe):
@@ -28,7 +28,7 @@ def undisturbed(tmp_path_factory):
 
 @pytest.fixture
 def made(monkeypatch):
-    """Lets interactions cost nothing; the first numbers of the chunks that are made."""
+    """Replace interactions by cheap ones; list the first numbers of the chunks that are made."""
     made = []
 
     def attributes(recipe):

@@ -1,4 +1,4 @@
-"""Collecting: the same bits whatever is killed, interrupted or shared."""
+"""Collecting gives bit-identical files after kills and interrupts, and with several workers."""
 
 import errno
 import os
@@ -144,7 +144,7 @@ collect.collect(recipe, sys.argv[1], workers=int(sys.argv[3]), progress=False)
 
 
 def start(*arguments, **options):
-    """Start Python so that Ctrl-C reaches it, though jobs in the background ignore that."""
+    """Start Python so that it receives Ctrl-C, which background jobs ignore."""
 
     def heed():
         os.setsid()
@@ -164,7 +164,7 @@ def test_a_collector_killed_at_any_moment_is_no_loss(undisturbed, tmp_path, seed
     time.sleep(random.Random(seed).uniform(0, 3))
     family = psutil.Process(process.pid).children(recursive=True)
     process.kill()
-    process.communicate(timeout=180)  # its workers write into the same pipes
+    process.communicate(timeout=180)  # its workers write to the same pipes
     assert not psutil.wait_procs(family, timeout=60)[1]  # it leaves no workers
     collect_set(SMALL, path, progress=False)
     assert path.read_bytes() == undisturbed(SMALL).read_bytes()
@@ -239,7 +239,7 @@ def cluster():
 
 @pytest.fixture
 def both(cluster):
-    """A client while both workers of its scheduler are there."""
+    """A client connected while both workers of its scheduler are present."""
     cluster.wait_for_workers(2, timeout=60)
     return cluster
 
@@ -294,7 +294,7 @@ def test_workers_killed_at_any_moment_are_no_loss(both, undisturbed, tmp_path, m
 
 @pytest.mark.slow
 def test_make_data_compares_with_what_was_there(both, undisturbed, tmp_path, monkeypatch, capsys):
-    """With a scheduler; its status tells whether the sets agree."""
+    """With a scheduler; the exit status says whether the sets agree."""
     monkeypatch.setattr(shipped, "RECIPES", {"push": SMALL})
     where = ["--to", str(tmp_path), "--scheduler", both.scheduler.address]
     arguments = ["data", "--only", "push", *where]
@@ -318,5 +318,5 @@ def test_how_far_apart_two_sets_are_is_said(undisturbed):
         assert f"{gap_m * 1000:.3f} mm in the median (tolerance 0.05 mm)" in sentence
     assert not shipped.compare(old, old.isel(interaction=slice(3)))[0]
     one = old.copy(deep=True)
-    one["rest_effect"][0, 0] += 0.05  # one object that tipped over the other way
+    one["rest_effect"][0, 0] += 0.05  # one object that tipped over in the other direction
     assert shipped.compare(old, one)[0]

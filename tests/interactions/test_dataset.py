@@ -1,4 +1,4 @@
-"""Data sets as they are shipped, refused where damaged, split, scaled and sampled."""
+"""Data sets: shipped files, refusal of damaged ones, splits, scaling and sampling."""
 
 import zipfile
 
@@ -35,7 +35,7 @@ def test_the_shipped_sets_are_what_their_recipes_say(shipped, world):
     for index in (0, 77):
         obj, seen = interact(recipe, index, world)
         stored = data.isel(interaction=index)
-        # Bits are promised on one machine; elsewhere processors round differently.
+        # Results are bit-identical on one machine only; other processors round differently.
         gap = np.abs(stored["effect"].values[:, :2] - seen.effect[:, :2]).max()
         assert gap < 0.001
         assert stored["size"].values[2] == pytest.approx(obj.height_m, abs=2e-6)
@@ -73,7 +73,7 @@ def test_full_executions_train_and_partial_ones_are_a_set_of_their_own(shipped):
 
 
 def test_the_tool_was_where_the_action_says(shipped):
-    """Every 150 ms, as in the paper, measured; a guarded hand may have stopped above its target."""
+    """Measured every 150 ms, as in the paper; a guarded hand may have stopped above its target."""
     name, data = shipped
     ok = data["reached"].values & ~data["fault"].values
     commanded = data["action"].values[ok][:, ::12, :3]
@@ -84,7 +84,7 @@ def test_the_tool_was_where_the_action_says(shipped):
     if name == "grasp":
         assert off[..., 2].max() > 0.01
         off[..., 2] = np.minimum(off[..., 2], 0)
-    # The few waypoints of a very short action are further apart than its samples.
+    # The waypoints of a very short action are further apart than its samples.
     assert np.linalg.norm(off, axis=-1).max() < (0.003 if name == "partial" else 0.002)
 
 
@@ -97,7 +97,7 @@ def test_grasping_is_a_problem_worth_learning():
 
 def test_shipped_files_are_small_and_complete(pushes):
     data = repo_root() / "data"
-    larger = set(data.glob("*_x10.zarr.zip"))  # collected by whoever wants them
+    larger = set(data.glob("*_x10.zarr.zip"))  # collected on demand
     sets = set(data.glob("*.zarr.zip")) - larger
     assert {p.name for p in sets} == {f"{n}.zarr.zip" for n in SHIPPED}
     assert sum(p.stat().st_size for p in sets) < 40e6
@@ -158,7 +158,7 @@ def test_splits_and_folds():
 
 @pytest.mark.parametrize(("quarters", "mirror"), [(1, False), (2, False), (1, True), (3, True)])
 def test_image_action_and_effect_rotate_alike(pushes, quarters, mirror):
-    """A mark drawn at the final position of the object stays there."""
+    """A mark drawn at the object's final position keeps its place in the rotated image."""
     arrays = InteractionTensors.from_dataset(pushes, np.arange(4))
     arrays.image.zero_()
     arrays.effect[:, -1] = torch.tensor([0.05, 0.02])

@@ -1,4 +1,4 @@
-"""Interactions of one's own, from a folder of a table and of images."""
+"""Import of a user's own interactions, from a folder with a table and images."""
 
 import re
 
@@ -35,7 +35,7 @@ def test_what_was_written_is_read_again(some, folder):
 
 
 def test_a_network_predicts_the_same_from_the_folder(film, some, folder):
-    """In whatever order its columns stand."""
+    """The order of columns does not matter."""
     table = pd.read_csv(folder / TABLE, dtype={"interaction": str})
     table[sorted(table, reverse=True)].to_csv(folder / TABLE, index=False)
     ours, theirs = (final_errors_m(film, a) for a in (some, read_folder(folder, 301)))
@@ -105,7 +105,7 @@ def test_names_are_names_and_angles_go_around(some, folder):
         (folder / "images" / f"0001{kind}.png").rename(folder / "images" / f"NA{kind}.png")
     assert len(read_folder(folder)) == 3
     table = pd.read_csv(folder / TABLE, keep_default_na=False)
-    turned = table["effect_yaw"] + np.pi - 0.01  # over the seam, as atan2 tells it
+    turned = table["effect_yaw"] + np.pi - 0.01  # beyond ±π, as from atan2
     table["effect_yaw"] = np.arctan2(np.sin(turned), np.cos(turned))
     table.to_csv(folder / TABLE, index=False)
     yaw = read_folder(folder, n_samples=301).effect[..., 2]

@@ -1,4 +1,4 @@
-"""Lever-ups as tensors in the frame of the lever, and what is sampled from them."""
+"""Lever-ups as tensors in the frame of the lever, and sampling from them."""
 
 import math
 
@@ -20,7 +20,7 @@ from affordlib.interactions.sampling import sample_from_start, sample_windows
 def test_arrays_are_in_the_frame_of_the_lever(levers, levered):
     assert levered.effect.shape == (len(levered), 26, 4)
     assert levered.effect[:, 0].abs().max() == 0
-    # Turning changes no length, and objects go where the lever points.
+    # Rotation preserves lengths, and objects move in the direction of the lever.
     kept = ~levers["fault"].values
     raw = levers["effect"].values[kept][:, ::12]
     np.testing.assert_allclose(

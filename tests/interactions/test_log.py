@@ -1,4 +1,4 @@
-"""A log of one's own: what is wrong is said in a sentence, what is right is the same anywhere."""
+"""A user's own log: errors are reported in one sentence, and results do not depend on the frame."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def tool(angle=0.3, at=(600.0, -20.0)):
 
 
 def one(**changed):
-    """Arguments of a good push, some of them changed."""
+    """Arguments of a valid push, some of them changed."""
     return PUSH | {"tool_xy": tool()} | changed
 
 
@@ -178,7 +178,7 @@ def test_outlines_are_drawn_as_the_camera_sees_them(one_world):
 
 
 def test_a_camera_of_ones_own_is_rectified():
-    """A box of 6 cm, 5 cm high, seen from 1 m above at 30 cm to the side of it."""
+    """A box of 6 cm, 5 cm high, seen from 1 m above and 30 cm to its side."""
     rows, columns = np.mgrid[:480, :640]
     depth = np.ones((480, 640))
     top = 0.95 * np.stack([(columns - 320) / 500, (240 - rows) / 500])

@@ -1,4 +1,4 @@
-"""The page of a log of one's own: its thirty lines run, and lead to a table and a plan."""
+"""The page on a user's own log: its thirty lines run, and give a table and a plan."""
 
 import json
 import lzma
@@ -25,7 +25,7 @@ from affordlib.types import Goal
 
 @pytest.fixture(scope="module")
 def script():
-    """What the page does in thirty lines, run on one condition, with quick models."""
+    """The page's thirty lines, run on one condition, with quick models."""
     path = repo_root() / "notebooks" / "09_a_log_of_your_own.ipynb"
     cells = json.loads(path.read_text())["cells"]
     (cell,) = [c for c in cells if "script" in c["metadata"].get("tags", [])]
@@ -52,14 +52,14 @@ def test_the_script_of_thirty_lines(script):
 
 
 def reading(script, folder):
-    """The log that the script reads of a folder."""
+    """The log that the script reads from a folder."""
     names = {"logs": folder, "outline": ((0, 0), (130, 0), (30, 110)), "tool_radius": 1.5}
     exec(re.split(r"^one = ", script, flags=re.MULTILINE)[0], names)
     return names["data"]
 
 
 def test_other_conditions_are_read(script, tmp_path):
-    """Of any name, compressed or not, of any number of pushes; one cut short says where."""
+    """Any name, compressed or not, any number of pushes; the error of a truncated one says so."""
     packed = (repo_root() / "data" / "own_log" / "felt_mid.txt.xz").read_bytes()
     (tmp_path / "ice.txt.xz").write_bytes(packed)
     assert reading(script, tmp_path).context["surface"].tolist() == ["ice"] * 50

@@ -1,4 +1,4 @@
-"""Checkpoints: the same model again, or a refusal; and what a model has seen is known."""
+"""Checkpoints: they restore the same model or raise, and they record what a model has seen."""
 
 import dataclasses
 import json
@@ -110,7 +110,7 @@ def test_what_cannot_be_loaded_is_not_saved(untrained, tmp_path):
 
 
 def test_a_model_is_not_judged_on_what_it_saw(pushes, held_out_pushes):
-    """Nor in doubt: sets of any size of a recipe, or of one with fewer fields, are the same."""
+    """Subsets of a recipe, and recipes written with fewer fields, also count as seen."""
     _, about = load_checkpoint("cnp_500")
     split = split_interactions(500)
     refuse_seen(about, pushes, split.test)

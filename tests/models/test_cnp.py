@@ -1,4 +1,4 @@
-"""The paper's network: its layers, its equations, its likelihood."""
+"""The paper's network: layers, equations and likelihood."""
 
 import pytest
 import torch
@@ -79,7 +79,7 @@ def test_folded_decoding_equals_the_layers_one_by_one(untrained):
 
 
 def test_folded_weights_follow_the_optimiser(untrained):
-    """A fused optimiser changes weights without raising their version."""
+    """A fused optimiser changes weights without incrementing their version."""
     model, t_target = untrained, torch.linspace(0, 1, 120)[None]
     observed, features = condition_on_primitives(model, [Push(0.3)]), torch.zeros(1, 16)
 
@@ -94,7 +94,7 @@ def test_folded_weights_follow_the_optimiser(untrained):
         optimiser.step()
     after = predicted()
     assert (after - before).abs().max() > 1e-4
-    torch.testing.assert_close(after[:, :1], predicted(t_target[:, :1]))  # too few to fold
+    torch.testing.assert_close(after[:, :1], predicted(t_target[:, :1]))  # below the folding limit
 
 
 @pytest.mark.parametrize("beta", [0.0, 0.5])

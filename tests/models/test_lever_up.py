@@ -1,4 +1,4 @@
-"""Lever-ups: arrays in the frame of the lever, what models may know, pictures."""
+"""Lever-ups: tensors in the frame of the lever, information available to models, pictures."""
 
 import math
 from dataclasses import replace
@@ -37,7 +37,7 @@ def untrained(request, levered):
 
 
 def test_no_model_sees_what_it_has_to_foresee(untrained, levered):
-    """Whatever happens after the observed steps, predictions stay."""
+    """Changes after the observed steps do not affect predictions."""
     for protocol, last in zip(PROTOCOLS, (N_OBSERVED - 1, 0, 0), strict=True):
         later = levered.effect.clone()
         later[:, last + 1 :] += 0.05
@@ -114,7 +114,7 @@ def test_a_levered_prism_is_drawn_where_it_is():
     low, high = (100 * np.array(v) for v in (0.0 - 0.3 * 0.1, 0.04 + 0.3 * 0.1))
     drawn = np.concatenate([line.get_xydata() for line in ax.lines])
     assert (drawn[:, 1].min(), drawn[:, 1].max()) == (pytest.approx(low), pytest.approx(high))
-    # Upended: as high as it was long.
+    # On end, the object is as high as it was long.
     pose = np.array([0.0, 0.0, 0.1 - 0.02, math.pi / 2])
     upended = plot_levered(Figure().subplots(), square, 0.04, pose, "k")
     top = max(line.get_ydata().max() for line in upended.lines)

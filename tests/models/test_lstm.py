@@ -1,4 +1,4 @@
-"""Recurrent networks: of pushes, and the older study's, as published."""
+"""Recurrent networks: for pushes, and the earlier study's as published."""
 
 import numpy as np
 import pytest

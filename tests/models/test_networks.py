@@ -1,4 +1,4 @@
-"""What holds for every network and both frames: equivariance, gradients, ranges, loss."""
+"""Properties of every network in both frames: equivariance, gradients, ranges, loss."""
 
 import dataclasses
 import itertools
@@ -57,21 +57,21 @@ def network(request, some):
 def made(name, arrays):
     torch.manual_seed(0)
     network = build(CONFIGS[name], Scaler.fit(arrays), TrainingDomain.fit(arrays)).eval()
-    with torch.no_grad():  # the last layers of blocks begin at zero
+    with torch.no_grad():  # the last layers of blocks are initialised to zero
         for parameter in network.parameters():
             parameter.add_(0.02 * torch.randn_like(parameter))
     return network
 
 
 def batch_of(arrays, seed=0, n_targets=5):
-    """A batch of all kinds of contexts for all interactions, at the paper's samples."""
+    """A batch with all kinds of contexts for all interactions, at the paper's samples."""
     every = {"phase": arrays.phase[::12], "action": arrays.action[:, ::12]}
     arrays = dataclasses.replace(arrays, **every, effect=arrays.effect[:, ::12])
     return sample_mixed(arrays, n_targets, 4, torch.Generator().manual_seed(seed))
 
 
 def predictions(network, batch, observations=None):
-    """Means and σ of action and effect for a batch, or for other observations of it."""
+    """Means and σ of action and effect for a batch, optionally with other observations."""
     features = network.encode(batch.image)
     made = network.predict(features, observations or batch.observations, batch.t_target)
     return [getattr(made, f.name) for f in dataclasses.fields(made)]
@@ -79,7 +79,7 @@ def predictions(network, batch, observations=None):
 
 @torch.no_grad()
 def test_order_and_what_is_masked_have_no_effect(network, some, tmp_path):
-    """Nor have saving and loading."""
+    """Saving and loading have no effect either."""
     assert isinstance(network, EffectModel)
     batch = batch_of(some)
     predicted = predictions(network, batch)
@@ -108,7 +108,7 @@ def test_order_and_what_is_masked_have_no_effect(network, some, tmp_path):
 
 
 def row_of(observations, row):
-    """What one row has observed; of what is not, one value under its mask."""
+    """The observations of one row; unobserved ones become a single masked value."""
     one = {f.name: getattr(observations, f.name)[[row]] for f in dataclasses.fields(observations)}
     for kind in ("action", "effect"):
         seen = one[f"{kind}_mask"][0]
@@ -129,7 +129,7 @@ def test_a_row_alone_is_predicted_as_in_a_batch(network, some):
 
 
 def test_the_literal_loop_and_the_batch_agree(network, some):
-    """On the same draw: the mean over single targets has the loss and gradients of the batch."""
+    """On the same draw, the mean over single targets has the batch's loss and gradients."""
     batch = batch_of(some.select(torch.arange(6)), n_targets=3)
     batch_loss(network, batch).backward()
     together = [p.grad.clone() for p in network.parameters() if p.grad is not None]
@@ -155,13 +155,13 @@ def test_a_quarter_turn_of_the_table_turns_the_prediction(name, quarters, some):
     network = made(name, some)
     turned = some.rotated_and_mirrored(quarters)
     a, b = batch_of(some), batch_of(turned)
-    # Predictions are rotated as data are, by the data's own rotation.
+    # Predictions are rotated by the function that rotates data.
     mean_a, std_a, mean_e, std_e = predictions(network, a)
     t_mean_a, t_std_a, t_mean_e, t_std_e = predictions(network, b)
     predicted = dataclasses.replace(some, action=mean_a, effect=mean_e).rotated_and_mirrored(
         quarters
     )
-    # Without a direction, as of an effect before contact, the frame is the table's.
+    # Without a direction, such as for an effect before contact, the frame is the table's.
     o = a.observations
     seen_e = o.effect_mask & (o.effect[..., :2].norm(dim=-1) > 1e-3)
     directed = o.action_mask.any(1) | (seen_e & (o.weight < 1)[:, None]).any(1)
@@ -198,7 +198,7 @@ def test_any_turn_of_a_real_object_turns_the_prediction_of_the_trained_model(nam
         straight = effect if straight is None else straight
         errors.append((effect - straight).norm(dim=-1))
     assert errors.pop().max() < 1e-5  # a quarter turn
-    # Exact at quarter turns; between them the pixels of an edge fall differently at each angle.
+    # Exact for multiples of 90°; otherwise pixels at the edges differ.
     error = torch.cat(errors[1:])
     assert error.mean() < 0.00015
     assert error.quantile(0.95) < 0.00032
@@ -226,7 +226,7 @@ def test_many_queries_at_once_equal_each_alone(name, some):
 
 @pytest.mark.parametrize("name", IN_PUSH_FRAME)
 def test_gradients_in_effect_and_action(name, some):
-    """Planners descend them; compare with finite differences, in double precision."""
+    """Planners use them; compared with finite differences in double precision."""
     network = made(name, some).double()
     features = network.encode(some.image[:1].double())
     one = torch.ones(1, 1, dtype=torch.float64)
@@ -293,7 +293,7 @@ def test_coverage_and_variance_scaling(some):
     assert len(rows) == 9
     best = sum(row["nll"] for row in scaled)
     assert best < sum(row["nll"] for row in rows)
-    for factor in (0.9, 1.1):  # it is the likeliest one
+    for factor in (0.9, 1.1):  # the fitted scale maximises the likelihood
         network.sigma_scale = tuple(factor * t for t in scale)
         assert best < sum(row["nll"] for row in calibration_rows(network, some))
     with pytest.raises(ValueError, match=r"level .* 1\.5"):

@@ -1,4 +1,4 @@
-"""Physics of a quasi-static push, and the neural process that is pretrained on it."""
+"""Physics of a quasi-static push, and the neural process pretrained on it."""
 
 import math
 
@@ -34,7 +34,7 @@ def shipped():
 
 
 def log_of(rows, context=None, crop_width_m=0.24):
-    """Simulated pushes (n, 10) of a triangle as a log; only the ends are known."""
+    """Simulated pushes (n, 10) of a triangle as a log with start and end poses only."""
     rows = rows.double().numpy() * [0.05, 0.05, 1, 1, 1, 1, 0.05, 0.05, 0.05, 1]
     n, ends = len(rows), np.zeros((len(rows), 2, 3))
     ends[:, 1] = rows[:, 7:]
@@ -80,7 +80,7 @@ def test_sticking_pusher_with_an_ellipsoid_turns_as_the_closed_form_says():
 
 
 def test_frictionless_pusher_moves_the_contact_along_the_normal_force_only():
-    # The force is the normal, and an ellipsoid answers it: v_y = 0 at the centroid.
+    # The force is along the normal; with an ellipsoidal limit surface, v_y = 0 at the centroid.
     angle = torch.arange(3) * (2 * math.pi / 3)
     feet = torch.stack([angle.cos(), angle.sin(), torch.full((3,), 1 / 3)], -1)[None]
     push = torch.tensor([[-0.7, 0.3, 1.0, 0.0, math.cos(0.6), math.sin(0.6), 1e-3]])
@@ -160,7 +160,7 @@ def test_checkpoint_gives_back_the_same_bits(shipped, simulated, tmp_path):
 
 
 def test_tuning_lowers_the_error_where_the_world_is_another():
-    # A world in which everything goes 15 % less far than in the one pretrained on.
+    # A world in which pushes move objects 15 % less than in pretraining.
     rows = simulate(1, torch.Generator().manual_seed(8))[0][0]
     rows[:, 7:] *= 0.85
     train, test = log_of(rows[:40]), log_of(rows[40:])
@@ -192,7 +192,7 @@ def test_untrained_network_has_the_stated_size():
 
 @pytest.mark.parametrize("name", ["film", "cnp"])
 def test_networks_learn_from_a_log_what_context_tells(name):
-    # The same pushes with opposite outcomes, as a word of the context says.
+    # The same pushes with opposite outcomes, distinguished by a word in the context.
     rows = simulate(1, torch.Generator().manual_seed(8))[0][0]
     rows = torch.cat([rows, rows])
     rows[48:, 7:] *= -1

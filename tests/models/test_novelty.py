@@ -1,4 +1,4 @@
-"""What a model has seen: unlike objects are noticed, plans for them warn, and σ grows."""
+"""Novelty: unfamiliar objects are detected, plans for them warn, and σ grows."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def test_what_is_shipped_knows_the_objects_of_training_and_tests(
     pushes, held_out_pushes, film, house
 ):
     training = InteractionTensors.from_dataset(pushes, split_interactions(500).train).image
-    again = Novelty.fit(training).references  # processors add in other orders
+    again = Novelty.fit(training).references  # the order of summation depends on the processor
     torch.testing.assert_close(again, film.novelty.references, rtol=1e-4, atol=1e-5)
     assert (film.novelty(training) < 1e-3).all()
     tests = film.novelty(InteractionTensors.from_dataset(held_out_pushes).image)

@@ -1,4 +1,4 @@
-"""Rotations: images, harmonics and whole data sets; the direction of a push."""
+"""Rotation of images, harmonics and data sets, and the direction of a push."""
 
 import math
 
@@ -36,7 +36,7 @@ def test_harmonics_turn_as_their_image_does(some):
             torch.rot90(some.image, 1, (-2, -1)) if exact else rotate_image(some.image, towards)
         )
         off = harmonics.rotated(known, towards) - harmonics(turned)
-        # An interpolated image is not quite the turned one; the harmonics themselves are.
+        # An interpolated image differs slightly from a rotated one; rotated harmonics are exact.
         assert off.abs().max() < (1e-4 if exact else 0.03 * known.abs().max())
         assert (harmonics(turned) - known).abs().max() > 0.2 * known.abs().max()
     back = harmonics.rotated(harmonics.rotated(known, towards), inverse(towards))
@@ -44,7 +44,7 @@ def test_harmonics_turn_as_their_image_does(some):
 
 
 def test_turned_data_are_those_of_the_turned_push(some):
-    """Yaw turns along where it is an orientation, and mirrors where it is a change."""
+    """Orientations are rotated and changes of yaw are not; both are mirrored."""
     turned = some.rotated_and_mirrored(1, mirror=True)
     push = math.pi / 2 - torch.atan2(some.action[:, 0, 1], some.action[:, 0, 0])
     for k in range(5):
@@ -63,7 +63,7 @@ def test_the_direction_is_that_of_the_push(some):
         observed = Observations.of(some, some.action_at(torch.tensor(samples)))
         direction = push_direction(observed, *channels)
         torch.testing.assert_close(direction, expected, atol=1e-4, rtol=0)
-    # Of the inverse query it is the direction of the effect; of no effect, the table's.
+    # For the inverse query it is the effect's direction; for a zero effect, the table's x axis.
     end = torch.tensor([[0.03, -0.04, 0.1], [0.0, 0.0, 0.0]])
     observed = Observations.of(some, effect=(torch.ones(2, 1), end[:, None]))
     direction = push_direction(observed, *channels)

@@ -1,4 +1,4 @@
-"""Training: the paper's loop, the batched one, resumed to the same bits, to its goals."""
+"""Training: the paper's loop, the batched loop, bit-identical resuming, target errors."""
 
 import dataclasses
 import math
@@ -27,7 +27,7 @@ from experiments.literal import sample_literal, train_literal
 
 
 def fresh(arrays):
-    """A small network that has learned nothing."""
+    """An untrained small network."""
     torch.manual_seed(0)
     small = FiLMConfig(
         arrays.action_channels, arrays.effect_channels, width=32, blocks=2, rings=3, orders=4
@@ -36,7 +36,7 @@ def fresh(arrays):
 
 
 def mean_length_error_m(training, test):
-    """Of knowing only the direction and the mean length."""
+    """Error of predicting the mean length in the direction of the push."""
     mean, _ = constant(training, test, torch.tensor([-1]))
     return (mean[:, 0] - test.effect[:, -1]).norm(dim=-1).mean()
 
@@ -146,7 +146,7 @@ def test_a_foreign_or_damaged_state_of_a_training_is_named(some, tmp_path):
 
 @pytest.mark.slow
 def test_a_minute_of_training_beats_the_mean_length(pushes):
-    """An eighth of the shipped training already learns something from the image."""
+    """An eighth of the shipped training already uses the image."""
     split = split_interactions(500)
     training = InteractionTensors.from_dataset(pushes, split.train)
     validation = InteractionTensors.from_dataset(pushes, split.validation)
@@ -163,14 +163,14 @@ def test_a_minute_of_training_beats_the_mean_length(pushes):
 
 @pytest.mark.slow
 def test_the_shipped_model_on_the_held_out_pushes(trained, held_out_pushes, pushes):
-    """Under 4 mm, and clearly better than a direction and a mean length."""
+    """The error is below 4 mm, and well below that of direction and mean length."""
     test = InteractionTensors.from_dataset(held_out_pushes)
     training = InteractionTensors.from_dataset(pushes, split_interactions(500).train)
     errors = final_errors_m(trained, test)
     assert len(errors) == 1000
     assert errors.mean() < 0.004  # 2.7 mm
     assert errors.mean() < 0.75 * mean_length_error_m(training, test)
-    # Conditioned on the effect instead, it finds the action that gives it.
+    # Conditioned on the effect instead, it predicts the action that causes it.
     seen = Observations.of(test, effect=test.effect_at(torch.tensor([-1])))
     t = torch.zeros(len(test), 1)
     action = trained.predict(trained.encode(test.image), seen, t).action_mean

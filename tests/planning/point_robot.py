@@ -1,4 +1,4 @@
-"""A robot in pure Python, and models that know what it does: no simulator, no network."""
+"""A robot in pure Python, and models with known dynamics: no simulator, no network."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -16,15 +16,15 @@ STARTS = 0.6
 
 
 def moved_m(phase):
-    """How far a push that stops at a phase moves the object [m]."""
+    """Distance [m] by which a push that stops at a phase moves the object."""
     return REACH_M * (np.clip(phase - STARTS, 0, 1 - STARTS) / (1 - STARTS)) ** 2
 
 
 class KnownDynamics:
-    """An `EffectModel` of pushes of which everything is known.
+    """An `EffectModel` of pushes with known dynamics.
 
-    The object moves away from where the gripper starts, from t = 0.6 on, by 9 cm in all; queried by
-    a final effect, it answers with the nearest push.
+    The object moves away from the gripper's start, from t = 0.6 on, by 9 cm in all; queried by a
+    final effect, it predicts the nearest push.
     """
 
     action_channels = effect_channels = ("x", "y")
@@ -46,7 +46,7 @@ class KnownDynamics:
 
 
 class FollowsTheHand:
-    """An `EffectModel` of a held object: from closing to opening it goes where the hand goes."""
+    """An `EffectModel` of a held object: it moves with the hand from closing to opening."""
 
     def __init__(self, kind, channel):
         self.kind, self.action_channels, self.effect_channels = kind, (channel,), (channel,)
@@ -63,7 +63,7 @@ class FollowsTheHand:
 
 
 def hand_moves(primitive, phase):
-    """How the hand moves (n, 5) while it is closed."""
+    """Motion (n, 5) of the hand while it is closed."""
     closed, opens = primitive.segment_phases[2], primitive.segment_phases[-2]
     if primitive.holds:
         opens = 1.0
@@ -71,13 +71,13 @@ def hand_moves(primitive, phase):
 
 
 def point_skills():
-    """What the robot can do, and everywhere."""
+    """Skills of the robot, without limits of reach."""
     grasp, rotate = FollowsTheHand(Grasp, "z"), FollowsTheHand(Rotate, "yaw")
     return Skills({"push": KnownDynamics(), "grasp": grasp, "rotate": rotate})
 
 
 def disc_image(height_m=0.05, radius_m=0.02):
-    """What a camera sees of an upright cylinder."""
+    """Camera image of an upright cylinder."""
     pixel_m = 0.16 / 48
     at = (np.arange(48) - 23.5) * pixel_m
     mask = np.clip((radius_m - np.hypot(at, at[:, None])) / pixel_m + 0.5, 0, 1)
@@ -86,11 +86,11 @@ def disc_image(height_m=0.05, radius_m=0.02):
 
 @dataclass
 class PointRobot:
-    """A `Robot` that pushes, turns and lifts a disc; pushes go a share too far.
+    """A `Robot` that pushes, turns and lifts a disc; pushes overshoot by a fraction.
 
-    refuses: which actions at which places its arm cannot do. before: called before it observes,
-    with the robot. sees_yaw: whether it measures the yaw, as by a marker. slips: how many lifts
-    the object slips out of the hand. velocity: of the object [m/s], which half a second brakes.
+    refuses: which actions the arm cannot execute where. before: called with the robot before it
+    observes. sees_yaw: whether it measures the yaw, as from a marker. slips: number of lifts in
+    which the object slips out of the hand. velocity: of the object [m/s], zero after half a second.
     """
 
     xy_m: tuple[float, float] = (0.0, 0.0)

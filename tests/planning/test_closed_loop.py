@@ -1,4 +1,4 @@
-"""The closed loop and execution: every ending provoked, no endless loop, a veto before motion."""
+"""Closed loop and execution: all endings, termination, and vetoes before motion."""
 
 import math
 import subprocess
@@ -47,7 +47,7 @@ BOX, TUBE, BALL = Cuboid(0.06, 0.05, 0.05), UprightCylinder(0.05, 0.07), Sphere(
 
 
 def loop(robot, goal, skills=None, planner=plan_continuous, **config):
-    """A closed loop, which by default knows what a `PointRobot` does but for its inaccuracy."""
+    """Run a closed loop, by default with models of a `PointRobot` without its overshoot."""
     skills = skills or point_skills()
     return run_closed_loop(robot, goal, skills, planner, config=ClosedLoopConfig(**config))
 
@@ -75,7 +75,7 @@ def test_every_planner_brings_a_pose_about(planner):
     assert abs(went.height_error_m) < 0.003
     assert "from the goal after" in went.message
     assert len(went.steps) == len(went.object_paths_xy_m) <= action_limit(0.22) + 6
-    # Where the goal already is, nothing moves.
+    # If the object is at the goal, nothing moves.
     assert loop(robot, Goal(robot.xy_m, EXACT_M)).steps == ()
 
 
@@ -224,7 +224,7 @@ def test_a_far_goal_is_reached_round_what_the_arm_cannot_do():
     [((0.0,), 1, "reached"), ((0.02,), 2, "reached"), ((0.02, 0.02), 2, "gave_up")],
 )
 def test_what_is_held_aside_of_its_goal_is_put_down_and_lifted_there(shifts_m, lifts, status):
-    """The goal moves by so much after each lift."""
+    """The goal moves by this much after each lift."""
     goal, left = Goal((0.06, 0.0), EXACT_M, height_m=0.1), list(shifts_m)
 
     def move_goal(plan, n):
@@ -256,7 +256,7 @@ def test_a_height_that_is_no_longer_wanted_is_let_go():
 
 @pytest.mark.parametrize("sees_yaw", [True, False])
 def test_a_turn_that_nobody_sees_is_reckoned_by_the_hand_and_said_to_be(sees_yaw):
-    """Of a disc no image tells it."""
+    """The image of a disc does not show its rotation."""
     robot = PointRobot(sees_yaw=sees_yaw)
     went = loop(robot, Goal((0.1, 0.0), EXACT_M, turn_rad=1.7))
     assert went.reached, went.message
@@ -271,7 +271,7 @@ def test_a_turn_that_nobody_sees_is_reckoned_by_the_hand_and_said_to_be(sees_yaw
 
 @pytest.mark.parametrize(("shove_m", "kept"), [(0.0, True), (0.05, False)])
 def test_the_grip_is_kept_unless_somebody_displaces_the_object(shove_m, kept):
-    """Here the goal moves along with it."""
+    """Here the goal moves as well."""
     robot, goal = PointRobot(), Goal((0.0, 0.0), EXACT_M, turn_rad=0.5, height_m=0.1)
 
     def displace(plan, n):
@@ -329,7 +329,7 @@ def test_what_was_done_before_the_arm_refused_is_kept():
     assert outcome.distance_m == plan.goal.distance_m(robot.xy_m)
     once = execute_plan(robot, replace(plan, steps=(can,)))
     assert corrected(robot, once, lambda *_: replace(plan, steps=(cannot,)), 1) is once
-    robot.refuses = lambda *_: False  # it agrees to what it then cannot do
+    robot.refuses = lambda *_: False  # can_reach says yes, but execute fails
     went = loop(robot, Goal(robot.xy_m, height_m=0.1))
     assert (went.status, went.message) == ("unreachable", "the height: out of reach")
 
@@ -344,7 +344,7 @@ def test_a_plan_is_executed(world, trained):
     outcome = execute_plan(world, plan)
     assert outcome.end_pose == pytest.approx(world.object_pose())
     assert outcome.distance_m == pytest.approx(goal.distance_m(world.object_pose()[:2]))
-    assert outcome.distance_m < goal.tolerance_m + 0.005  # 15 mm: A* is content within 2 cm
+    assert outcome.distance_m < goal.tolerance_m + 0.005  # 15 mm: A* stops within 2 cm
     assert len(outcome.object_paths_xy_m) == len(outcome.plan.steps) == 2
     first, second = outcome.object_paths_xy_m
     np.testing.assert_allclose(first[-1], second[0], atol=1e-9)
@@ -371,7 +371,7 @@ def test_the_kinematics_agrees_with_what_execution_refuses(world):
 
 
 def test_the_arm_is_asked_about_the_grasp_that_it_will_execute(world, skills):
-    """At the rim of its reach a hand's height decides, and that goes by the object's."""
+    """At the limit of its reach the hand's height matters, which depends on the object's."""
     for x, status in ((0.52, "reached"), (0.526, "unreachable")):
         world.place(Cuboid(0.05, 0.05, 0.08), (x, 0.0))
         went = run_closed_loop(world, Goal((x, 0.0), EXACT_M, height_m=0.24), skills)
@@ -380,7 +380,7 @@ def test_the_arm_is_asked_about_the_grasp_that_it_will_execute(world, skills):
 
 
 def test_a_toppled_cylinder_is_dragged(world, skills):
-    """Pushed while it stands; lying it would roll away, so it is caged, as its image shows."""
+    """It is pushed while standing, and dragged when its image shows that it would roll."""
     world.place(TUBE, (0.0, 0.0), 0.0)
     falls = Disturbance("topple", 1, 0.0, 1.0)
     went, schedule = disturbed(world, Goal((0.2, 0.0), EXACT_M), skills, falls)
@@ -414,7 +414,7 @@ def test_a_knock_in_the_middle_of_an_action_follows_mechanics(world):
     world.placed.knock(0.5, 0.0)
     world.settle(1.0)
     assert world.object_pose()[0] == pytest.approx(0.5**2 / (2 * 0.25 * 9.81), rel=0.05)
-    # The clock counts from where the arm sets out; the push touches after 4 s.
+    # Time counts from the start of the arm's motion; the push makes contact after 4 s.
     world.place(BOX, (0.0, 0.0), 0.0)
     knock = Disturbance("knock", 0, 0.0, 0.4, at_s=2.0)
     schedule = DisturbanceSchedule(world, Goal((0.1, 0.0), EXACT_M), [knock])
@@ -445,7 +445,7 @@ def test_disturbances_are_a_function_of_the_seed():
 
 
 def test_the_disturbance_and_not_the_robot_makes_a_goal_infeasible(world):
-    """Judged where the object was first seen after it."""
+    """Feasibility is judged at the first observation after the disturbance."""
     goal, off_table = Goal((0.1, 0.0), EXACT_M), (0.9, 0.0)
     knock = Disturbance("knock", 0, 0.1, 0.3, at_s=2.0)
     moved = Disturbance("goal", 1, 0.05, 0.0)
@@ -459,14 +459,14 @@ def test_the_disturbance_and_not_the_robot_makes_a_goal_infeasible(world):
     at, near = (0.0, 0.0), (0.05, 0.0)
     assert feasible("reached", (at, near), knock)
     assert not any(feasible("lost", seen, knock) for seen in ((at, off_table), (at,)))  # or unseen
-    assert feasible("lost", (at, near, off_table), knock)  # it was there to be had
-    assert feasible("lost", (at, off_table), moved)  # nobody has touched it but the robot
+    assert feasible("lost", (at, near, off_table), knock)  # it was reachable
+    assert feasible("lost", (at, off_table), moved)  # only the robot has touched it
 
 
 def knowing_only_what_it_measures(world, monkeypatch):
-    """A tabletop as a `Robot`, whose simulator's state nobody may ask for but itself as it acts.
+    """A tabletop as a `Robot` that reads the simulator's state only while it acts.
 
-    It parks without, and what it recorded of the object is no number.
+    Parking does not read the state, and the recorded object path is NaN.
     """
     acts = []
 
@@ -511,7 +511,7 @@ def knowing_only_what_it_measures(world, monkeypatch):
     ],
 )
 def test_no_task_needs_the_state_of_the_simulator(world, skills, monkeypatch, camera, obj, pose):
-    """Errors seen are at most 0.5° and 1 mm (ideal), 1.8° and 2.3 mm (Kinect, mean of eight)."""
+    """Observation errors are at most 0.5° and 1 mm (ideal), 1.8° and 2.3 mm (Kinect, mean of 8)."""
     world.place(obj, (0.0, 0.0), 0.3, config=WorldConfig(camera=camera))
     goal = Goal((0.06, -0.03), 0.004, **pose)
     with monkeypatch.context() as patched:
@@ -525,7 +525,7 @@ def test_no_task_needs_the_state_of_the_simulator(world, skills, monkeypatch, ca
         assert went.end_pose[:2] == (x, y)
         assert went.distance_m == goal.distance_m((x, y))
         assert {type(step.primitive) for step in went.steps} == {Drag if obj is BALL else Push}
-        if obj is BOX:  # five times the spread of what is seen of cuboids
+        if obj is BOX:  # five times the spread of observed cuboids
             assert went.end_pose[2] == pytest.approx(yaw - 0.3, abs=math.radians(1))
     if goal.turn_rad is not None:
         off = math.remainder(yaw - 0.3 - goal.turn_rad, 2 * math.pi)
@@ -550,7 +550,7 @@ def test_a_goal_across_the_table_is_reached_in_the_limit_or_refused(world, skill
 
 @pytest.mark.slow
 def test_the_mean_of_many_images_is_more_exact(world):
-    """Of eight the mean scatters by a factor of √8 less."""
+    """The mean of eight images has a standard deviation lower by √8."""
     scatter = []
     for world.n_averaged_images in (1, 8):
         world.place(BOX, (0.1, 0.1), 0.4, config=WorldConfig(camera="kinect"))

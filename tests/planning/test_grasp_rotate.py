@@ -1,4 +1,4 @@
-"""Orientation and height: where to stop, at which gripper yaw, and at the end of whole plans."""
+"""Orientation and height: stop phase, gripper yaw, and their place at the end of plans."""
 
 import math
 from dataclasses import replace
@@ -21,7 +21,7 @@ from tests.problems import problem_of
 
 BOX, TUBE, LOG = Cuboid(0.06, 0.05, 0.05), UprightCylinder(0.05, 0.07), LyingCylinder(0.08, 0.05)
 DISC = LyingCylinder(0.05, 0.10)
-"""On its rim, and as wide as the hand can open: only its faces can be taken."""
+"""Lying on its rim, and as wide as the hand can open: only its faces can be grasped."""
 
 PLANNERS = pytest.mark.parametrize("plan", [plan_astar, plan_continuous])
 AT = (0.0, 0.0)
@@ -123,7 +123,7 @@ def test_a_turn_backwards_goes_round_in_several_rotations(world, skills):
 
 
 def test_predictions_turn_with_the_object(world, skills):
-    """After a push that turns the box, or from an image of the box turned: the same end."""
+    """A push that turns the box, and an image of the box turned, lead to the same final pose."""
     turned = 0.35
     world.place(BOX, yaw_rad=0.2)
     poses = skills.problem(world.depth_image(), AT, Goal(AT)).pose_planner
@@ -135,7 +135,7 @@ def test_predictions_turn_with_the_object(world, skills):
     for a, b in zip(before, after, strict=True):
         assert a.predicted_turn_rad - turned == pytest.approx(b.predicted_turn_rad, abs=0.04)
     assert max(abs(step.primitive.grip_yaw) for step in before) <= math.pi / 2 + 1e-9
-    # A grasp takes the object as the rotation left it.
+    # The grasp has the gripper yaw of the rotation.
     turn, lift = after
     left_at = turn.primitive.path(turn.stop_phase)[0, 3]
     off = (lift.primitive.grip_yaw - left_at) / (math.pi / 2)
@@ -149,13 +149,13 @@ def test_a_plan_that_cannot_turn_or_lift_says_so(world, skills, plan):
     assert planner(image, AT, Goal((0.05, 0.0))).reaches_goal
     high = planner(image, AT, Goal((0.05, 0.0), height_m=0.45))
     assert not high.reaches_goal
-    assert high.steps  # as far as it goes
+    assert high.steps  # as far as possible
     poses, goal = (
         skills.problem(image, AT, Goal(AT)).pose_planner,
         Goal(AT, turn_rad=0.5, height_m=0.05),
     )
     assert poses(goal, AT) is not None
-    assert poses(goal, (0.7, 0.7)) is None  # beyond the arm's reach, as it has learned
+    assert poses(goal, (0.7, 0.7)) is None  # beyond the learned reach
     assert poses(Goal(AT), (0.7, 0.7)) == ()
 
 

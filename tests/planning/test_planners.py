@@ -1,4 +1,4 @@
-"""The planners against exhaustive search, known dynamics and execution; the frozen goals."""
+"""Planners against exhaustive search, known dynamics and execution; the frozen goals."""
 
 import itertools
 import math
@@ -43,7 +43,7 @@ PLANNERS = (plan_astar, plan_continuous, plan_gradient)
 
 
 def known(goal_xy, mode="multi_partial", tolerance_m=0.02, model=MODEL, **more):
-    """A problem of known dynamics, from the middle of the table."""
+    """A problem with known dynamics, from the middle of the table."""
     return problem_of(model, IMAGE, (0.0, 0.0), Goal(goal_xy, tolerance_m), mode, **more)
 
 
@@ -60,7 +60,7 @@ def test_an_effect_map_says_what_the_model_says(world, film, kind):
     phase = torch.from_numpy(rng.uniform(0.3, 1, 40))
     effect, std = effects(direction, phase)
     off = (effect - effects.query_model(direction, phase))[:, :2].norm(dim=-1)
-    assert off.median() < 6e-4  # what the splines leave: 0.2 mm of the push, less of the drag
+    assert off.median() < 6e-4  # interpolation error: 0.2 mm for the push, less for the drag
     at_first = torch.full_like(phase, kind.acts_from)
     assert effects.query_model(direction, at_first).abs().max() < 1e-6
     assert (std > 0).all()
@@ -68,7 +68,7 @@ def test_an_effect_map_says_what_the_model_says(world, film, kind):
 
 
 def test_a_chain_turns_with_the_object(world, film):
-    """Rolling out two pushes together is querying the second of the turned object."""
+    """Rolling out two pushes equals querying the second for the rotated object."""
     world.place(Cuboid(0.07, 0.05, 0.05), (0.0, 0.0), 0.4)
     effects = EffectMap(film, world.depth_image())
     direction, phase = torch.tensor([[0.3, 1.2]]).double(), torch.tensor([[1.0, 0.9]]).double()
@@ -85,7 +85,7 @@ def test_a_chain_turns_with_the_object(world, film):
 
 
 class RandomTable(BranchTable):
-    """A few branches that also turn the object, and then lead elsewhere."""
+    """A few branches that also turn the object, which changes the later branches."""
 
     def __init__(self, seed: int, n: int = 6) -> None:
         rng = np.random.default_rng(seed)
@@ -93,7 +93,7 @@ class RandomTable(BranchTable):
         self.effects = SimpleNamespace(radius_m=0.0, reach_m=np.hypot(*self.xy.T).max())
 
     def at(self, turned: float) -> Branches:
-        # The number of a branch stands in for its direction.
+        # The index of a branch is used as its direction.
         return np.arange(self.n), np.ones(self.n), rotated(self.xy, turned).T, self.turn
 
     def follow(self, chain) -> tuple[np.ndarray, float]:
@@ -132,7 +132,7 @@ def test_astar_finds_what_exhaustive_search_finds(seed, heuristic):
 
 def test_branches_are_the_papers_180():
     direction, stop_phase, effect_m, _ = BranchTable(EffectMap(MODEL, IMAGE)).at(0.0)
-    # Those that stop before contact do nothing and are pruned: 36 x {80, 100 %} remain.
+    # Actions that stop before contact are pruned: 36 x {80, 100 %} remain.
     assert len(direction) == 72
     assert set(np.round(stop_phase, 3)) == {0.8, 1.0}
     full = stop_phase == 1.0
@@ -158,7 +158,7 @@ def test_astar_plans():
 
 
 def test_a_search_goes_on_where_the_end_cannot_be_had(film, cuboid_image):
-    """A node within the tolerance from which the turn cannot be had is none of the goal's."""
+    """A node within the tolerance does not count if the goal's turn is unreachable there."""
     goal, asked = Goal((0.08, 0.0), turn_rad=0.1), []
 
     def only_beyond(goal, xy_m, turned_rad):
@@ -179,7 +179,7 @@ def test_a_search_goes_on_where_the_end_cannot_be_had(film, cuboid_image):
 
 
 def test_a_plan_reaches_the_goal_only_where_it_says_that_it_ends_there(film, cuboid_image):
-    """The search, which rounds turns to a degree, is a hair off."""
+    """The search, which rounds turns to a degree, has a small error."""
     for angle in range(8):
         xy = 0.15 * math.cos(angle), 0.15 * math.sin(angle)
         ends = plan_astar(problem_of(film, cuboid_image, (0.0, 0.0), Goal(xy)))
@@ -267,7 +267,7 @@ def test_modes_bind_the_gradient_planner():
 
 
 def test_a_decoded_path_is_followed(world):
-    """A decoded path that is the push's own gives what the push gives."""
+    """A decoded path equal to the push's has the push's effect."""
     obj, push, stop = Cuboid(0.06, 0.05, 0.05), Push(2.2), 0.85
     world.place(obj, (0.0, 0.0), 0.3)
     own = world.execute_primitive(push, stop, approach=True)
@@ -293,7 +293,7 @@ def test_planners_keep_to_mode_reach_and_table(plan):
     nowhere = plan(known((0.2, 0.0), reachable=lambda xy_m, _: xy_m[:, 0] > 9))
     assert (nowhere.steps, nowhere.reaches_goal) == ((), False)
     posed = replace(known((0.05, 0.05)), goal=Goal((0.05, 0.05), height_m=0.1))
-    assert not plan(posed).reaches_goal  # nothing is known of how to lift
+    assert not plan(posed).reaches_goal  # there is no model for lifting
 
 
 @pytest.mark.parametrize("xy", [(0.0, 0.7), (-0.5, 0.0), (-0.48, -0.68), (0.68, 0.0)])
@@ -320,7 +320,7 @@ def test_a_route_is_the_shortest_and_keeps_the_whole_object_on_the_table():
     route = np.array([start, *find_route(routes, start, goal, gap)])
     lengths = np.hypot(*np.diff(route, axis=0).T)
     assert lengths.max() <= 0.075
-    round_it = np.hypot(0.4, 0.2) * 2 + 0.2  # by way of the gap's corners
+    round_it = np.hypot(0.4, 0.2) * 2 + 0.2  # via the gap's corners
     assert 0.95 * round_it < lengths.sum() < 1.05 * round_it
     assert gap(route[:-1], None, None).all()
     wall = RouteMap.of(0.075, lambda xy_m, *_: np.abs(xy_m[:, 1]) > 0.1)
@@ -338,7 +338,7 @@ def test_a_route_is_the_shortest_and_keeps_the_whole_object_on_the_table():
 
 @pytest.mark.slow
 def test_plans_come_within_what_their_planner_promises(world, trained, film):
-    """A floor, not the table: A* is content within 2 cm, the continuous planner is not."""
+    """A lower bound, not the table: A* stops within 2 cm, the continuous planner does not."""
     tasks = constructed_tasks(world, "single_partial", 4, seed=7)
     tasks += uniform_tasks("multi_partial", 4, seed=7)
     assert constructed_tasks(world, "single_partial", 2, seed=7) == tasks[:2]

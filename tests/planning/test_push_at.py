@@ -36,7 +36,7 @@ def test_a_turned_object_is_pushed_alike():
 
 
 def test_pursuit_knows_only_what_it_observes(world, monkeypatch):
-    """Where the simulator would lie about yaw, the object still gets to its goal."""
+    """If the simulator reports a wrong yaw, the object still reaches its goal."""
     world.place(Cuboid(0.06, 0.05, 0.05), (0.02, 0.0), 0.4, tool="rod")
     truth = world.object_pose
 

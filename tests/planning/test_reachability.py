@@ -1,4 +1,4 @@
-"""Learned reachability against the arm's kinematics, which it was never told."""
+"""Learned reachability compared with the arm's kinematics, which it does not use."""
 
 import math
 
@@ -40,7 +40,7 @@ def test_it_agrees_with_kinematics_on_places_it_has_not_seen(learned, world):
 
 
 def test_the_shipped_one_was_learned_so(learned, tmp_path):
-    """On another processor sums end in other digits; nothing that matters hangs on them."""
+    """Rounding differs between processors, without consequences."""
     shipped = Reachability.load()
     rng = np.random.default_rng(6)
     places = rng.uniform([-0.42, -0.62], [0.62, 0.62], (4000, 2))

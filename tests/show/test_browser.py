@@ -1,6 +1,6 @@
-"""Notebook 00, and the two explorers, in a real browser: mouse, keyboard, buttons, requests.
+"""Notebook 00 and the two explorers in a real browser: mouse, keyboard, buttons, requests.
 
-JupyterLab runs on this machine, in headless Chromium. Pictures and measured times are left in
+JupyterLab runs on this machine, in headless Chromium. Pictures and measured times are stored in
 `runs/browser/`.
 """
 
@@ -46,9 +46,9 @@ def free_port():
 
 @contextmanager
 def serve(folder, name, more_cells=(), **parameters):
-    """A JupyterLab with settings, workspaces and run-time files of its own, and one notebook.
+    """Start a JupyterLab with separate settings, workspaces and run-time files, and one notebook.
 
-    more_cells: code that is added after the goal picker; what is far off is not in the page.
+    more_cells: code added after the goal picker; the page omits cells that are far out of view.
     """
     book = folder / "book"
     book.mkdir()
@@ -96,7 +96,7 @@ def serve(folder, name, more_cells=(), **parameters):
 
 
 def answers(url):
-    """Whether a server is there."""
+    """Whether a server responds."""
     try:
         urllib.request.urlopen(url, timeout=5).close()
     except OSError:
@@ -105,7 +105,7 @@ def answers(url):
 
 
 def ask(page, expression):
-    """What the notebook's kernel says an expression is, as JSON."""
+    """Value of an expression in the notebook's kernel, as JSON."""
     reply = page.evaluate(
         """async (code) => {
             const {kernel} = window.jupyterapp.shell.currentWidget.sessionContext.session;
@@ -126,7 +126,7 @@ def goal_of(page):
 
 
 class Table:
-    """The table in the page: where its points are on the screen, and what is drawn on it."""
+    """The table in the page: screen positions of its points, and what is drawn on it."""
 
     def __init__(self, page):
         self.page, self.svg = page, page.locator(".affordlib-table svg")
@@ -145,7 +145,7 @@ class Table:
         )
 
     def points(self, selector):
-        """(n, 2) [m]: the corners of all that is drawn with a class."""
+        """Corners (n, 2) [m] of everything drawn with a class."""
         corners = self.svg.locator(selector).evaluate_all(
             """all => all.flatMap((shape) => {
                 const screen = shape.ownerSVGElement.getScreenCTM().inverse();
@@ -191,7 +191,7 @@ def wait_for_words(page, text, seconds=40):
 
 
 def assert_same_goal(page, table, x_m, y_m, within_m=0.0011):
-    """What Python plans for, what the sliders say and what is drawn agree."""
+    """Check that Python's goal, the sliders and the drawing agree."""
     table.wait_for_answer()
     asked = goal_of(page)
     assert asked == pytest.approx((x_m, y_m), abs=within_m)
@@ -206,7 +206,7 @@ def assert_same_goal(page, table, x_m, y_m, within_m=0.0011):
 
 
 def saved_outputs(page, lab):
-    """The notebook is saved as a reader saves it: all outputs that are then in its file."""
+    """Save the notebook as a reader would, and return all outputs in its file."""
     page.evaluate("window.jupyterapp.commands.execute('docmanager:save')")
     outputs = []
 
@@ -252,7 +252,7 @@ def browser():
 
 @pytest.fixture(scope="module")
 def page(lab, browser):
-    """The notebook, all its cells run, and `requests`: every address that was asked for."""
+    """The notebook with all cells run, and `requests`: every requested address."""
     page = browser.new_page(viewport={"width": 1280, "height": 1000})
     page.set_default_timeout(25_000)
     page.requests = []
@@ -416,14 +416,14 @@ def test_everything_can_be_pressed_without_a_mouse(page, table):
 
 
 QUIET_S = 0.04
-"""What the sum below takes on a machine of two cores with nothing else to do."""
+"""Time [s] of the sum below on an idle machine with two cores."""
 
 SHARED = 2
-"""How much longer an answer may take while other tests use the same cores."""
+"""Factor by which answers may be slower while other tests use the same cores."""
 
 
 def how_much_slower():
-    """How much slower than a quiet machine this one is now, at least 1."""
+    """Current slowdown compared with an idle machine, at least 1."""
     times = []
     for _ in range(9):
         began = time.perf_counter()
@@ -433,7 +433,7 @@ def how_much_slower():
 
 
 def test_the_plan_follows_the_hand(page, table):
-    """From the event to the redrawn first plan, and to the one refined, seen inside the page."""
+    """Time from the event to the redrawn first plan, and to the refined one, seen in the page."""
     button(page, "Start over").click()
     choose(page, "continuous")
     table.wait_for_answer()
@@ -475,14 +475,14 @@ def test_the_plan_follows_the_hand(page, table):
         slower *= SHARED
     told = measured | {"slower": slower}
     (PICTURES / "times.json").write_text(json.dumps(told, indent=1) + "\n")
-    # Twice what is aimed at, since how busy the machine is cannot be known to better.
+    # Twice the target, since the machine's load is known only roughly.
     for name, most_ms in (("first_median", 200), ("first_p95", 500), ("refined_median", 800)):
         assert measured[f"{name}_ms"] < most_ms * slower, told
     assert_same_goal(page, table, *goal_of(page))
 
 
 def handle_of(page, widget, name):
-    """A handle in a figure, in shares of its width and height, and the phase where it is."""
+    """Position of a handle in a figure, as fractions of width and height, and its phase."""
     names = f"[name for _, name, *_ in {widget}._handles]"
     wait_until(lambda: name in ask(page, names))  # not while the figure is being drawn
     k = ask(page, names).index(name)
@@ -542,7 +542,7 @@ def test_no_request_leaves_the_machine(page, lab):
 
 
 def test_the_web_pages_are_read_without_a_network(tmp_path, browser):
-    """Equations are drawn, nothing is asked for elsewhere, and nothing is wider than a phone."""
+    """Equations are drawn, no request leaves, and nothing is wider than a phone."""
     root, names = repo_root(), ("00_start_here", "03_affordance_cnp", "06_planning")
     command = ["nbconvert", "--config", "notebooks/book_html/config.py", "--output-dir", tmp_path]
     pages = [f"notebooks/{name}.ipynb" for name in names]

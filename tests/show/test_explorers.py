@@ -52,7 +52,7 @@ def test_what_is_observed_decides_what_is_predicted(explorer, trained, push):
         plain = trained.predict(trained.encode(torch.tensor(push.image)[None]), told, t)
     torch.testing.assert_close(alone, plain.effect_mean, atol=1e-5, rtol=1e-4)
     explorer._has_effect.value = True
-    torch.testing.assert_close(explorer.prediction.effect_mean, alone)  # w₁ = 1: not listened to
+    torch.testing.assert_close(explorer.prediction.effect_mean, alone)  # w₁ = 1: effect ignored
     explorer._weight.value = 0.5
     assert (explorer.prediction.effect_mean - alone).abs().max() > 1e-4
     explorer.observe_at(action_t=None, effect_t=1.0, weight=1.0)

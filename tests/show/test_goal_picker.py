@@ -19,7 +19,7 @@ from tests.waiting import wait_until
 
 @pytest.fixture
 def planned_for():
-    """Positions of the goals that A* has planned for."""
+    """Goal positions for which A* has planned."""
     return []
 
 
@@ -58,24 +58,24 @@ def posed(make_picker, skills):
 
 
 def want(picker, x_m, y_m, number):
-    """The hand puts the goal somewhere."""
+    """Move the goal as by hand."""
     picker._view.wanted = ["goal", 1000 * x_m, -1000 * y_m, number]
 
 
 def in_time(picker):
-    """What is done when all that was asked for before is done."""
+    """Wait until all earlier requests are done."""
     picker._queue.submit(int).result(60)
     return picker
 
 
 def shapes(picker, css):
-    """All that is drawn with a class."""
+    """Everything drawn with a class."""
     drawing = ElementTree.fromstring(f"<svg>{picker._view.scene['inside']}</svg>")
     return [e for e in drawing.iter() if css in e.get("class", "").split()]
 
 
 def corners(picker, css):
-    """(n, 2) [m]: the corners of all that is drawn with a class."""
+    """Corners (n, 2) [m] of everything drawn with a class."""
     pairs = [p.split(",") for e in shapes(picker, css) for p in e.get("points").split()]
     return np.array(pairs, dtype=float).reshape(-1, 2) * [1e-3, -1e-3]
 
@@ -107,7 +107,7 @@ def test_a_picked_goal_is_planned_for_drawn_and_reached(picker, world):
     np.testing.assert_allclose(corners(picker, "truth")[-1], world.object_pose()[:2], atol=1e-3)
     picker.start_over()
     assert world.object_pose() == pytest.approx((0, 0, 0), abs=1e-12)
-    plain = execute_plan(world, plan)  # gives what the picker gave
+    plain = execute_plan(world, plan)  # has the picker's outcome
     assert outcome.end_pose == pytest.approx(plain.end_pose, abs=1e-12)
     for a, b in zip(outcome.object_paths_xy_m, plain.object_paths_xy_m, strict=True):
         np.testing.assert_array_equal(a, b)
@@ -119,7 +119,7 @@ def test_what_the_hand_wants_is_planned_for_once(picker, planned_for):
         want(picker, *xy, number)
         assert in_time(picker)._view.scene["answered"] == number
     wanted = [(0.081, 0.033), (0.081, 0.033), (-0.05, 0.123)]
-    assert planned_for[before:] == wanted  # once each: no slider has echoed
+    assert planned_for[before:] == wanted  # once each: the sliders cause no second plan
     assert (picker.controls.x.value, picker.controls.y.value) == (-5.0, 12.3)
     picker.controls.x.value = 7.7
     assert in_time(picker).plan.goal.xy_m == drawn_goal(picker) == (0.077, 0.123)
@@ -138,7 +138,7 @@ def test_a_draft_until_the_hand_rests(make_picker, planned_for, trained, monkeyp
         assert picker._view.scene["draft"]
 
     picker = make_picker(draft=draft)
-    assert picker.plan.planner == "astar"  # nobody is in a hurry
+    assert picker.plan.planner == "astar"  # the draft is replaced
     planned_for.clear()
     for number, x in enumerate((0.08, 0.09, 0.10), 1):
         show_a_draft(x, number)
@@ -154,11 +154,11 @@ def test_a_draft_until_the_hand_rests(make_picker, planned_for, trained, monkeyp
     assert load_plan(f"{picker.folder}/plan.json").planner == "astar"
     show_a_draft(0.09, 6)
     picker.load()
-    assert in_time(picker).goal.xy_m[0] == 0.08  # no plan for a goal that was left comes late
+    assert in_time(picker).goal.xy_m[0] == 0.08  # no late plan for an abandoned goal
 
 
 def test_run_waits_for_the_plan_of_the_goal_that_is_shown(make_picker, trained):
-    """Two clicks and Run, faster than the planner: what runs is the plan of the second."""
+    """Two clicks and Run, faster than the planner: the plan of the second click is executed."""
     began = []
 
     def slow(*query):
@@ -223,7 +223,7 @@ def test_stop_lets_an_action_end_and_begins_no_other(make_picker, world):
     assert "Stopped after 1 action:" in in_time(picker).controls.words.value
     assert math.dist(world.object_pose()[:2], first) < 0.03
     assert not picker.controls.run.disabled
-    # What waited when the robot stopped does not wait for the next run.
+    # Disturbances pending at a stop are not applied in the next run.
     picker.pick(*(0.05 + v for v in world.object_pose()[:2]))
     picker.run()
     assert picker.outcome.distance_m < 0.03, picker.controls.words.value
@@ -302,7 +302,7 @@ def test_a_closed_loop_replans_with_the_chosen_planner_for_a_goal_that_moves(mak
     picker.planners["A*"] = skills.planner(plan_astar)
     picker.pick(0.2, 0.0)
     picker._view.observe(lambda change: shown.append(change["new"]), names="scene")
-    picker._disturbances += [picker._move_goal, picker._shove]  # as if asked for meanwhile
+    picker._disturbances += [picker._move_goal, picker._shove]  # as if requested meanwhile
     picker.run()
     goal, handles = picker.goal, [scene["handles"][0] for scene in shown]
     assert goal.xy_m in [(at["x"] / 1000, -at["y"] / 1000) for at in handles]
@@ -339,7 +339,7 @@ def test_a_slider_moves_what_it_is_for_and_nothing_else(picker):
     picker.controls.y.value = 12.0
     assert in_time(picker).goal.xy_m == (0.45, 0.12)
     picker.set_pose(turn_deg=120)
-    assert picker.controls.turn.value == 90  # all that it can show
+    assert picker.controls.turn.value == 90  # the slider's maximum
     picker.controls.height.value = 3.0
     assert math.degrees(in_time(picker).goal.turn_rad) == pytest.approx(120)
     assert picker.goal.height_m == pytest.approx(0.03)
@@ -370,7 +370,7 @@ def test_a_plan_comes_back_from_its_file(posed):
     assert posed.world.object_state()[2] > 0.04
     posed.load("mine.json")
     assert "from the start of this plan" in posed.controls.words.value
-    assert posed.world.object_state()[2] < 0.04  # put down before it begins again
+    assert posed.world.object_state()[2] < 0.04  # put down before the next run
 
 
 @pytest.mark.parametrize(("executor", "within_deg"), [("open loop", 3.0), ("closed loop", 2.0)])
@@ -397,7 +397,7 @@ def test_turn_and_lift_are_planned_and_done(posed, world, executor, within_deg):
     posed.set_pose()
     assert (posed.plan.goal.turn_rad, posed.plan.goal.height_m) == (None, None)
     assert (posed.controls.turn.value, posed.controls.height.value) == (0.0, 0.0)
-    assert world.object_state()[2] < 0.05  # let go, to be seen and planned for
+    assert world.object_state()[2] < 0.05  # released, to be observed and planned for
 
 
 def test_what_cannot_be_lifted_so_high_is_said_before_anything_moves(posed):

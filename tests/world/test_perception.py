@@ -1,4 +1,4 @@
-"""What the robot tells from a depth image, against what the world knows."""
+"""Estimates from depth images compared with the simulator's ground truth."""
 
 import math
 
@@ -90,9 +90,9 @@ def test_a_kinect_finds_the_object_anywhere(world, obj):
 )
 @pytest.mark.parametrize("category", ["cuboid", "lying_cylinder", "prism"])
 def test_turns_are_seen_between_two_images(world, category, camera, n_images, spread_deg):
-    """To five times the measured spread; of prisms 0.5 and 1.2°, worst of those with many edges.
+    """Within five times the measured spread; for prisms 0.5° (ideal) and 1.2° (Kinect).
 
-    Alike every half round, a cuboid is taken for turned as is expected to some 30°.
+    A cuboid, symmetric under 180°, is assumed to have turned within some 30° of what is expected.
     """
     rng, spread_deg = np.random.default_rng(17), spread_deg * (2.2 if category == "prism" else 1)
     for _ in range(6):

@@ -1,4 +1,4 @@
-"""Drag, grasp, rotate and lever-up, the arm's reach, and a world that varies."""
+"""Drag, grasp, rotate and lever-up, the arm's reach, and worlds that vary."""
 
 import math
 import subprocess
@@ -61,7 +61,7 @@ def test_nothing_is_touched_before_an_action_says_so(name):
 
 
 def test_the_lever_turns_about_the_far_edge():
-    """The blade's tip keeps its distance from the far edge, where the object turns."""
+    """The blade's tip keeps its distance from the far edge, about which the object turns."""
     lever = LeverUp(-0.08, 0.0, 0.0, 0.16)
     path = lever.path(np.linspace(lever.segment_phases[1], 1, 50))
     edge = np.array([path[0, 0] + 0.16, 0, path[0, 2]])
@@ -112,7 +112,7 @@ def test_grasps_lift_what_fits_and_leave_what_does_not(world):
     assert small.rest_effect[2] == pytest.approx(Grasp.lift_m, abs=0.01)
     assert not large.success
     assert not large.faults
-    # The fingers felt its top and went no further.
+    # The fingers stopped when they felt the object's top.
     assert large.tool[:14, 2].min() > 0.06 - 0.003
 
 
@@ -145,7 +145,7 @@ def test_the_image_of_a_lever_up_turns_with_its_direction(world):
         images.append(world.execute_primitive(lever, 0.0).image)
         assert images[-1].shape == (2, 128, 128)
     assert (images[0][1] != images[1][1]).mean() < 0.01
-    # The contact is in the middle: the object begins there and lies to the right.
+    # The contact point is the origin; the object lies to the right of it.
     row = images[0][1, 63:65].max(axis=0)
     assert row[66:80].all()
     assert not row[:62].any()
@@ -166,7 +166,7 @@ def test_stopped_anywhere_it_rests_where_the_full_one_was(world, name, smooth):
     assert len(held) >= 4
     assert np.median(held) < 0.001
     assert max(held) < 0.003
-    # What has slipped from the fingers may still be rolling when the arm stops.
+    # An object that slipped from the fingers may still roll when the arm stops.
     assert max(slipped, default=0) < 0.015
 
 
@@ -240,7 +240,7 @@ def bits(world, name, index):
 
 @pytest.mark.slow
 def test_no_episode_knows_of_the_one_before(world):
-    """In a process or a world of its own, or after any others: the same bits, no more memory."""
+    """In another process or world, or after other episodes: the same bits, no memory leak."""
     space = {}
     exec(BITS, space)
     bits = space["bits"]

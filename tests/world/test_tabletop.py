@@ -166,7 +166,7 @@ def test_the_fingers_are_tied_only_while_they_close_or_hold(world):
 
 @pytest.mark.parametrize("obj", [*OBJECTS, LyingCylinder(0.05, 0.07), Sphere(0.06)])
 def test_what_is_held_stays_in_the_hand_and_is_put_down(world, obj):
-    """Held by friction alone it slips by up to 3 mm in 10 s."""
+    """Held by friction alone, it slips by up to 3 mm in 10 s."""
     world.place(obj, (0.05, 0.1))
     world.execute_primitive(Grasp(), 0.7, approach=True)
     held, heights = world.object_state(), []
@@ -182,7 +182,7 @@ def test_what_is_held_stays_in_the_hand_and_is_put_down(world, obj):
 
 @pytest.mark.parametrize("yaw_rad", [0.0, math.pi / 4])
 def test_what_rolls_on_a_level_table_comes_to_rest(world, yaw_rad):
-    """Unbraked, Bullet's cylinders gain speed."""
+    """Without rolling friction, Bullet's cylinders gain speed."""
     roll_on = []
     for braked in (True, False):
         world.place(LyingCylinder(0.08, 0.05), yaw_rad=yaw_rad)
@@ -203,7 +203,7 @@ def test_what_rolls_on_a_level_table_comes_to_rest(world, yaw_rad):
     ],
 )
 def test_a_log_that_was_dragged_and_let_go_stays(world, length, yaw_rad, drags):
-    """Unbraked, these roll on by 9 cm to 2 m."""
+    """Without rolling friction, these roll on by 9 cm to 2 m."""
     world.place(LyingCylinder(length, 0.07 if length < 0.06 else 0.05), yaw_rad=yaw_rad)
     for theta, stop in drags:
         world.execute_primitive(Drag(theta), stop, approach=True)
@@ -238,8 +238,8 @@ def test_a_world_is_built_anew_before_bullet_has_kept_too_much(world, monkeypatc
 
 
 def test_an_arm_that_cannot_go_on_from_where_it_feels_the_object_stays_there(world, monkeypatch):
-    """What has begun is recorded, and not said to have been out of reach."""
-    world.place(Cuboid(0.12, 0.12, 0.05))  # too wide: the fingers come down on its top
+    """The started action is recorded, and not reported as out of reach."""
+    world.place(Cuboid(0.12, 0.12, 0.05))  # too wide: the fingers land on its top
     begun = []
     put = JointController.put
     monkeypatch.setattr(JointController, "put", lambda *args: (begun.append(1), put(*args)))
