@@ -54,7 +54,7 @@ def test_the_script_of_thirty_lines(script):
 def reading(script, folder):
     """The log that the script reads from a folder."""
     names = {"logs": folder, "outline": ((0, 0), (130, 0), (30, 110)), "tool_radius": 1.5}
-    exec(re.split(r"^one = ", script, flags=re.MULTILINE)[0], names)
+    exec(re.split(r"^pushes = ", script, flags=re.MULTILINE)[0], names)
     return names["data"]
 
 
