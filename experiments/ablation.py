@@ -1,4 +1,4 @@
-"""Studies: what each part of our network is worth, left out alone, and added one after another."""
+"""Ablation studies of our network: parts removed one at a time, and added one after another."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from experiments.shipped import CHECKPOINT_SPECS
 def random_contexts(
     arrays: InteractionTensors, n_targets: int, obs_max: int, g: torch.Generator
 ) -> Batch:
-    """As `sample_mixed`, but no context is at a phase that will be queried: all are random."""
+    """As `sample_mixed`, but all context phases are random: none is set to those used to plan."""
     batch = sample_mixed(arrays, n_targets, obs_max, g)
     o, n = batch.observations, len(arrays.phase)
     action_at, effect_at = (torch.randint(n, m.shape, generator=g) for m in (o.action_mask,) * 2)
@@ -44,7 +44,7 @@ def random_contexts(
 
 
 def half_blend(arrays: InteractionTensors, *sizes: Any) -> Batch:
-    """As `sample_mixed`, but w₁ = ½ wherever both are observed."""
+    """As `sample_mixed`, but w₁ = ½ wherever action and effect are both observed."""
     batch = sample_mixed(arrays, *sizes)
     o = batch.observations
     both = (o.weight > 0) & (o.weight < 1)
@@ -52,7 +52,7 @@ def half_blend(arrays: InteractionTensors, *sizes: Any) -> Batch:
 
 
 def actions_only(arrays: InteractionTensors, *sizes: Any) -> Batch:
-    """As `sample_mixed`, but only actions are observed: nothing is inferred from effects."""
+    """As `sample_mixed`, but only actions are observed, never effects."""
     batch = sample_mixed(arrays, *sizes)
     o = batch.observations
     first = torch.arange(o.action_mask.shape[1]) == 0
@@ -68,20 +68,20 @@ def actions_only(arrays: InteractionTensors, *sizes: Any) -> Batch:
 def one_at_a_time(
     arrays: InteractionTensors, n_targets: int, obs_max: int, g: torch.Generator
 ) -> Batch:
-    """As in the paper: one trajectory, one target."""
-    row = torch.randint(len(arrays), (1,), generator=g)  # any of the batch, rotated or not
+    """Sample one trajectory and one target per step, as in the paper."""
+    row = torch.randint(len(arrays), (1,), generator=g)  # any of the batch, augmented or not
     return sample_literal(arrays.select(row), obs_max, g)
 
 
 def _plain_start(model: FiLMNetwork) -> None:
-    """PyTorch's default initialisation instead of He's."""
+    """Initialise the image encoder with PyTorch's default instead of He initialisation."""
     for module in model.image_encoder:
         if isinstance(module, torch.nn.Linear):
             module.reset_parameters()
 
 
 def _no_modulation(model: FiLMNetwork) -> None:
-    """Blocks that the image does not modulate; it still enters by the merge layer."""
+    """Disable the image's modulation of the blocks; the image still enters by the merge layer."""
     for block in model.blocks:
         for parameter in block.modulation.parameters():
             torch.nn.init.zeros_(parameter)
@@ -89,7 +89,7 @@ def _no_modulation(model: FiLMNetwork) -> None:
 
 
 def _raw(scaler: Scaler) -> Scaler:
-    """Metres and radians as they are, images too."""
+    """Return scales of one: actions, effects and images are not standardised."""
     return replace(
         scaler,
         action_scale=(1.0,) * len(scaler.action_scale),
@@ -114,7 +114,7 @@ CHANGES: dict[str, dict[str, Any]] = {
     "w₁ = ½": {"draw": half_blend},
     "actions only": {"draw": actions_only},
 }
-"""What is left out or changed, by name."""
+"""Changes to network or training by name."""
 
 LADDER = {
     "channels of unit size": "metres, not standardised",
@@ -127,7 +127,7 @@ LADDER = {
     "β": "plain likelihood (β = 0)",
     "EMA of the weights": "no EMA of the weights",
 }
-"""What is added to the published training until it is ours, and the change it undoes."""
+"""Parts that are added in turn to the published training, each with the change it reverts."""
 
 STEPS, SEEDS = 500, 3
 SHIPPED = CHECKPOINT_SPECS["film_500"]
@@ -136,9 +136,9 @@ _ABOUT = (SHIPPED.network, SHIPPED.training, STEPS, SEEDS)
 
 @study("push", "push_test", settings=(_ABOUT, CHANGES), version=2)
 def ablation() -> Rows:
-    """Errors after short trainings, each without one thing; of the whole network also on the test.
+    """Return errors after short trainings with one change each, on validation data.
 
-    Means over seeds of `errors_m`, each on the 50 objects that validated its training.
+    They are means of `errors_m` over seeds. The unchanged network is also evaluated on the test.
     """
     rows = [{"change": change} | _row([change]) for change in CHANGES]
     return [*rows, {"change": "nothing"} | _row(["nothing"], test=True)]
@@ -146,7 +146,7 @@ def ablation() -> Rows:
 
 @study("push", settings=(_ABOUT, [CHANGES[change] for change in LADDER.values()]), version=2)
 def incremental_ablation() -> Rows:
-    """The same of trainings that gain one thing after another, from none of `LADDER` to all."""
+    """Return the same for trainings to which the parts of `LADDER` are added one after another."""
     names, changes = ["nothing", *LADDER], list(LADDER.values())
     return [{"added": name} | _row(changes[k:] or ["nothing"]) for k, name in enumerate(names)]
 
@@ -165,11 +165,11 @@ def _row(changes: Sequence[str], test: bool = False) -> dict[str, Any]:
 def errors_m(
     changes: tuple[str, ...], steps: int, seed: int, test: bool = False
 ) -> dict[str, float]:
-    """Mean errors [m] of the network of `ablated`, where boxes and cylinders weigh the same.
+    """Return mean errors [m] of the network of `ablated`, with equal weights for both categories.
 
-    On the pushes that validated the training, or on `push_test`, `n` in number. `final_error`: of
-    effects predicted from actions; `action_start`: between the start of the recorded push and of
-    the push that is decoded from its final effect.
+    They are over `n` pushes of its validation data, or of `push_test`. `final_error`: error of
+    effects predicted from actions; `action_start`: distance between the start of the recorded push
+    and that of the push decoded from its final effect.
     """
     data = open_interactions("push_test" if test else SHIPPED.data)
     n = data.sizes["interaction"]
@@ -187,7 +187,7 @@ def errors_m(
 
 
 def _tensors(data: xr.Dataset, rows: np.ndarray, changes: Sequence[str]) -> InteractionTensors:
-    """Pushes with the channels of our network; with an empty image, if that is a change."""
+    """Return pushes with the channels of our network, and zero images if that is a change."""
     channels = SHIPPED.network.action_channels, SHIPPED.network.effect_channels
     arrays = InteractionTensors.from_dataset(data, rows, *channels)
     if all(CHANGES[change].get("image", True) for change in changes):
@@ -197,9 +197,9 @@ def _tensors(data: xr.Dataset, rows: np.ndarray, changes: Sequence[str]) -> Inte
 
 @cache
 def ablated(changes: tuple[str, ...], steps: int, seed: int = 0) -> EffectNetwork:
-    """Our network after a training on `push` with some of `CHANGES`; the seed is also the fold.
+    """Train our network on `push` with some of `CHANGES`; the seed is also the fold.
 
-    Where two of them sample contexts, the first does.
+    If several of them change the sampler of contexts, the first one is used.
     """
     each = [CHANGES[change] for change in changes]
     scales = next((how["scales"] for how in each if "scales" in how), lambda same: same)

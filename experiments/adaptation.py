@@ -1,10 +1,10 @@
-"""Does a robot predict and plan better after a few pushes of an object? In the perturbed world.
+"""Adaptation in the perturbed world: do predictions and plans improve after a few pushes?
 
     python -m experiments.adaptation
 
-What is hidden there is the same in all pushes of an object. Of it, pushes show how far beside the
-object the camera sees it: it goes where the gripper goes, so by about this error farther than was
-predicted. The robot takes the error that it expects off what it sees.
+The hidden parameters are the same in all pushes of an object. Pushes reveal one of them, the
+camera's position error: the object ends where the gripper stops, so its measured displacement
+differs from the prediction by about this error. The robot subtracts its estimate of the error.
 """
 
 from __future__ import annotations
@@ -38,17 +38,17 @@ N_OTHERS, N_TESTS, SHOTS = 40, 2, (0, 2, 5, 10)
 
 @lru_cache(maxsize=1)
 def robot() -> tuple[Tabletop, Any, Any]:
-    """A simulated world, a planner for it, and the planner's network."""
+    """Return a simulated world, a planner for it, and the planner's network."""
     torch.set_num_threads(1)
     world = Tabletop()
     return world, PLANS.make(world), load_checkpoint(PLANS.model)[0]
 
 
 def push_often(obj: TabletopObject, config: WorldConfig, rng: np.random.Generator) -> Rows:
-    """Pushes of an object in any directions, each from the table's centre.
+    """Push an object repeatedly in random directions, each time from the table's centre.
 
-    error_m: of the camera; beyond_m: how much farther than predicted the object was seen to go,
-    ahead and to the left; truly_m: the same in truth; std_m: the network's σ.
+    error_m: error of the camera; beyond_m: measured minus predicted displacement, along the push
+    and to its left; truly_m: the same with the ground truth; std_m: the network's σ.
     """
     (world, _, model), rows = robot(), []
     for _ in range(max(SHOTS) + N_TESTS):
@@ -68,10 +68,10 @@ def push_often(obj: TabletopObject, config: WorldConfig, rng: np.random.Generato
 
 @dataclass(frozen=True)
 class Camera:
-    """What is known of its error before any push, mean_m (x, y) and sd_m, and what pushes show.
+    """Gaussian prior of the camera's error, mean_m (x, y) and sd_m, and its update from pushes.
 
-    The network's σ² holds the variance of the error; the rest of it, and the noise of two looks,
-    noise_m, hide how much farther an object went because of the error.
+    The network's σ² includes the variance of this error. The rest of σ² and noise_m, the noise of
+    two observations, are the measurement noise of the update.
     """
 
     mean_m: tuple[float, float]
@@ -80,14 +80,14 @@ class Camera:
 
     @classmethod
     def fit(cls, others: Sequence[dict[str, Rows]]) -> Self:
-        """From looks at many objects at known positions."""
+        """Estimate the prior from observations of many objects at known positions."""
         errors = np.array([[push["error_m"] for push in other["pushes"]] for other in others])
         of_object, noise_m = errors.mean(axis=1), math.sqrt(2) * errors.std(axis=1).mean()
         sd_m = float(of_object.std(axis=0).mean())
         return cls(tuple(of_object.mean(axis=0).tolist()), sd_m, float(noise_m))
 
     def error_m(self, pushes: Rows) -> np.ndarray:
-        """The expected error (2,) after some pushes, by Bayes' rule."""
+        """Return the posterior mean (2,) [m] of the error after some pushes."""
         precision, weighted = np.eye(2) / self.sd_m**2, np.array(self.mean_m) / self.sd_m**2
         for push in pushes:
             variance = np.maximum(np.square(push["std_m"]) - self.sd_m**2, 0) + self.noise_m**2
@@ -98,14 +98,14 @@ class Camera:
 
 
 def known(camera: Camera, pushes: Rows) -> dict[str, np.ndarray]:
-    """The camera's error (2,) as it is expected after some pushes, as it is, and taken for none."""
+    """Return estimates (2,) of the camera's error: zero, after pushes, ground truth."""
     after = {f"{n} pushes": camera.error_m(pushes[:n]) for n in SHOTS}
     true = np.mean([push["error_m"] for push in pushes], axis=0)
     return {"nothing": np.zeros(2)} | after | {"the error": true}
 
 
 def measure(camera: Camera | None, kind: str, number: int) -> dict[str, Rows]:
-    """Pushes of another object; or errors at a goal, by what is known of the camera's error."""
+    """Return pushes of another object, or errors at a goal per estimate of the camera error."""
     rng = np.random.default_rng([2_000_029, number])
     if kind == "other":
         obj = category_named(STANDING[number % len(STANDING)]).sample(rng)
@@ -122,16 +122,16 @@ def measure(camera: Camera | None, kind: str, number: int) -> dict[str, Rows]:
 
 
 def job(kind: str, number: int, camera: Camera | None = None) -> Job:
-    """Pushes of another object, or a goal; these others decide the camera."""
+    """Return the job for pushes of another object, which are used to fit the camera, or a goal."""
     settings = [PLANS, tasks_sha256("perturbed"), SHOTS, N_TESTS]
     arguments = {"kind": kind, "number": number}
     return Job(partial(measure, camera), arguments, settings, checkpoints=(PLANS.model,))
 
 
 def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
-    """What is known of the camera, and errors by what is known; differences case by case.
+    """Return the camera's prior, and errors by estimate with paired differences.
 
-    Predictions are of the last pushes of the other objects.
+    Prediction errors are for the last pushes of the other objects.
     """
     results, errors, rows = runner.read(TABLE, job, folder), [], []
     others = [result for about, result in results if about["kind"] == "other"]
@@ -154,7 +154,7 @@ def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
 
 @command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
-    """Push, plan, and make the table; what is there is not made again."""
+    """Push, plan and make the table; only missing results are computed."""
     options = runner.parser(TABLE, main.__doc__).parse_args(argv)
     others = [job("other", k) for k in range(N_OTHERS)]
     camera = Camera.fit(runner.run(others, TABLE, folder=options.raw))

@@ -1,8 +1,8 @@
-"""A conditional neural process with cross-attention: what the paper names as future work.
+"""A conditional neural process with cross-attention, which the paper names as future work.
 
-Each observation is a token, each ring of the image's circular harmonics another. A target asks with
-its phase and a summary of the image and attends to them, in a few blocks; instead of the mean of
-equation (3), each target weighs what is observed for itself. The blend w₁ of equation (2) enters as
+Each observation is a token, and so is each ring of the image's circular harmonics. A target's query
+is its phase and a summary of the image, and attends to the tokens in several blocks. This replaces
+the mean of equation (3) by weights for each target. The weights w₁, w₂ of equation (2) enter as
 log w₁ and log w₂, added to the attention's logits. Source: Kim et al., Attentive neural processes,
 ICLR 2019.
 """
@@ -26,7 +26,7 @@ from affordlib.types import Observations
 @checked
 @dataclass(frozen=True)
 class AttentionConfig(NetworkConfig):
-    """Sizes of the network; width must be a multiple of heads. See `FiLMConfig`."""
+    """Sizes of the network; width must be a multiple of heads (see `FiLMConfig`)."""
 
     frame: str = "push"
     width: int = 128
@@ -43,7 +43,7 @@ class AttentionConfig(NetworkConfig):
 
 
 class CrossAttention(nn.Module):
-    """x + attention of x to the tokens, then x + a small network of it, normalised before each."""
+    """Pre-norm transformer block: x + cross-attention of x to the tokens, then x + MLP(x)."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
@@ -71,10 +71,10 @@ class CrossAttention(nn.Module):
 
 
 class AttentiveCNP(HarmonicsNetwork):
-    """Relates object image, action and effect; satisfies `EffectModel`."""
+    """An `EffectModel` that relates object image, action and effect by cross-attention."""
 
     def make_layers(self, config: AttentionConfig) -> None:
-        """Tokens, the attention to them, and a decoder; the image's features are its harmonics."""
+        """Make token encoders, attention blocks and decoder; image features are its harmonics."""
         c, w = config, config.width
         n_a, n_e = len(c.action_channels), len(c.effect_channels)
         self.harmonics, self.image_encoder = CircularHarmonics(c.rings, c.orders), nn.Identity()
@@ -91,7 +91,7 @@ class AttentiveCNP(HarmonicsNetwork):
     def outputs(
         self, features: Tensor, observations: Observations, t_target: Tensor
     ) -> tuple[Tensor, ...]:
-        """(μ_a, σ_a, μ_e, σ_e), each (B, T, C) and standardised."""
+        """Return (μ_a, σ_a, μ_e, σ_e), each (B, T, C) and standardised."""
         o = observations
         b = len(o.weight)
         rings = features.reshape(-1, *self.harmonics.layout).movedim(3, 1).flatten(2)

@@ -1,12 +1,12 @@
-"""The closed loop, measured: height, orientation, disturbances, reachability of random goals.
+"""Evaluation of the closed loop: height, orientation, disturbances, reachability of random goals.
 
     python -m experiments.closed_loop --only table=height,orientation
 
-Trial i of a table is a function of the seed and i: object, start, goal and disturbances are drawn
-before anything plans, on objects that no model has seen. Each is run in the clean world with the
-ideal camera, and in a perturbed one (`Variation`) with the Kinect. Errors are measured in the
-simulator, where the robot does not look. Whether a goal is feasible is judged by the arm's
-kinematics (position) and by whole grasps (height), never by the planner under test.
+Trial i of a table is a function of the seed and i: object, start, goal and disturbances are sampled
+before planning, with objects that no model has seen. Each trial is run in the clean world with the
+ideal camera, and in a perturbed one (`Variation`) with the Kinect. Errors are ground truth of the
+simulator, which the robot does not know. Whether a goal is feasible is determined by the arm's
+kinematics (position) and by full grasps (height), never by the planner under test.
 """
 
 from __future__ import annotations
@@ -60,41 +60,41 @@ N_TRIALS = {
     "orientation_unseen": 50,
 }
 FEWER = {("reachability", "perturbed"): 82}
-"""So many of them, where not all were run."""
+"""Number of trials where not all were run."""
 VERSIONS = dict.fromkeys(N_TRIALS, 1) | dict.fromkeys(("height", "orientation"), 2)
-"""Raise one when the code changes and the table's numbers do."""
+"""Version of each table's jobs; raise it when a change of code changes the table's numbers."""
 
 POSE_PRIMITIVES = {"height": "grasp", "orientation": "rotate", "orientation_unseen": "rotate"}
 TURN_SHOWS, TURN_IS_HIDDEN = ("cuboid", "lying_cylinder", "prism"), ("upright_cylinder", "sphere")
 CATEGORIES = {"orientation": TURN_SHOWS, "orientation_unseen": TURN_IS_HIDDEN}
-"""Of a table; of others the four below."""
+"""Object categories of a table; the other tables use the four below."""
 FOUR_CATEGORIES = ("cuboid", "upright_cylinder", "lying_cylinder", "sphere")
 
 WORLDS = {"clean": 1, "perturbed": 8}
-"""And of how many images an observation is the mean there."""
+"""Worlds, and the number of images over which an observation averages in each."""
 PERTURBED_PUSHES = "film_5000_perturbed"
 AT_REST_S = 3.0
-"""After so long even an unbalanced ball lies still, before the trial begins."""
+"""Time [s] before a trial starts, after which even an unbalanced ball is at rest."""
 
 SMALLEST_M2 = 0.001
-"""Smaller footprints, of a prism, are drawn again: models refuse what is much smaller than what
-they were trained on."""
+"""Prisms with a smaller footprint [m²] are sampled again, because models reject objects that are
+much smaller than those they were trained on."""
 
 REACH_BY = ("both", "learned", "kinematics")
-"""Who says where the arm can act; of `reachability` the first hundred goals, all goals by both."""
+"""Tests of reachability: "both" is used for all goals, the others for the first `N_REACH_BY`."""
 N_REACH_BY = 100
 TOLERANCE_M = dict.fromkeys(POSE_PRIMITIVES, 0.004)
-"""Of the position, where it is not 2 mm; gripping shifts objects."""
+"""Position tolerance [m] if not 2 mm; it is larger here because gripping shifts objects."""
 
 WITHIN_M, WITHIN_HEIGHT_M, WITHIN_TURN_RAD = 0.005, 0.005, math.radians(3)
 STATUSES = ("reached", "unreachable", "gave_up", "lost")
 EDGE_M = 0.05
-"""Goals of `reachability` are at least this far from the table's edge."""
+"""Smallest distance [m] of a goal of `reachability` from the table's edge."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """An object at a place, turned by a yaw [rad], where it should go, and what will go wrong."""
+    """One task: object, start position and yaw, goal, disturbances and world parameters."""
 
     obj: TabletopObject
     start_xy_m: tuple[float, float]
@@ -105,18 +105,18 @@ class Trial:
 
     @property
     def kind(self) -> type[Push] | type[Drag]:
-        """How its object is moved."""
+        """The primitive that moves the object."""
         return Drag if self.obj.rollable else Push
 
     def place(self, world: Tabletop) -> None:
-        """Put its object on the table, and let it come to rest."""
+        """Place the object on the table and wait until it is at rest."""
         world.place(self.obj, self.start_xy_m, self.yaw_rad, config=self.config)
         if self.config != WorldConfig():
             world.settle(AT_REST_S)
 
 
 def sample_trial(table: str, index: int, seed: int = 0, world: str = "clean") -> Trial:
-    """Trial number `index` of a table, a function of its arguments alone; alike in each world."""
+    """Sample trial `index` of a table, a pure function of its arguments, equal in each world."""
     trial = _clean_trial(table, index, seed)
     if world == "clean":
         return trial
@@ -158,10 +158,10 @@ def _clean_trial(table: str, index: int, seed: int) -> Trial:
 def sample_disturbances(
     seed: int, n: int = 1, n_actions: int = 2, kinds: Sequence[str] = KINDS
 ) -> tuple[Disturbance, ...]:
-    """A schedule of n disturbances, a function of the seed alone.
+    """Sample a schedule of n disturbances, a pure function of the seed.
 
-    Each comes in the middle of one of n_actions actions, or (never before the first) between two:
-    shoves of 3 to 10 cm and up to half a turn, knocks of 0.2 to 0.5 m/s, goals that move by 3 to
+    Each occurs during one of n_actions actions, or between two of them (never before the first):
+    shoves by 3 to 10 cm and up to half a turn, knocks of 0.2 to 0.5 m/s, goals that move by 3 to
     10 cm.
     """
     if not kinds or not set(map(str, kinds)) <= set(KINDS):
@@ -185,7 +185,7 @@ def sample_disturbances(
 
 @cache
 def tabletop_and_skills(world: str = "clean", reach_by: str = "both") -> tuple[Tabletop, Skills]:
-    """One of each for a process."""
+    """Create the world and the skills once per process."""
     skills = Skills.load()
     if world == "perturbed":
         push = load_checkpoint(PERTURBED_PUSHES)[0]
@@ -198,7 +198,7 @@ def tabletop_and_skills(world: str = "clean", reach_by: str = "both") -> tuple[T
 def run_trial(
     table: str, index: int, seed: int = 0, world: str = "clean", reach_by: str = "both"
 ) -> dict[str, Any]:
-    """The record of a trial: how it ended, and whether it could be done."""
+    """Run a trial and return its record: result, errors and whether the goal was feasible."""
     tabletop, skills = tabletop_and_skills(world, reach_by)
     trial = sample_trial(table, index, seed, world)
     robot = DisturbanceSchedule(tabletop, trial.goal, trial.disturbances)
@@ -230,9 +230,9 @@ def run_trial(
 
 
 def _measured(world: Tabletop, result: ClosedLoopResult, yaw: float, z: float) -> dict[str, Any]:
-    """What the tables need of a closed loop; the errors are the ground truth.
+    """Return the columns that describe a run of the closed loop; errors are the ground truth.
 
-    yaw, z: of the object at the start.
+    yaw, z: initial yaw [rad] and height [m] of the object.
     """
     goal, pose = result.goal, world.object_pose()
     turn_error = height_error = None
@@ -253,7 +253,7 @@ def _measured(world: Tabletop, result: ClosedLoopResult, yaw: float, z: float) -
 
 
 def _can_be_lifted(world: Tabletop, trial: Trial, result: ClosedLoopResult) -> bool:
-    """Whether the object was lifted as high, or a whole grasp at the goal does so, by any hand."""
+    """Return whether the object was lifted, or a full grasp at the goal lifts it, at any yaw."""
     high, yaw_rad = trial.goal.height_m - WITHIN_HEIGHT_M, world.object_pose()[2]
 
     def lifts(grip_yaw: float) -> bool:
@@ -267,10 +267,10 @@ def _can_be_lifted(world: Tabletop, trial: Trial, result: ClosedLoopResult) -> b
 def _stays_feasible(
     world: Tabletop, trial: Trial, result: ClosedLoopResult, happened: Sequence[Disturbance]
 ) -> bool:
-    """Whether the kinematics allows a way from the start, and from where the disturbance has left
-    the object, as it was first seen after it.
+    """Return whether a feasible route exists from the start and from the disturbed position.
 
-    What happens later is up to the robot.
+    The disturbed position is the first one observed after the disturbance. Later failures are due
+    to the robot.
     """
     half, start = half_width_m(trial.obj.footprint_m), trial.start_xy_m
     if not is_feasible(trial.kind, half, start, trial.goal.xy_m):
@@ -287,7 +287,7 @@ def _stays_feasible(
 
 
 def _groups(table: pd.DataFrame, *by: str) -> Iterator[tuple[dict[str, Any], pd.DataFrame]]:
-    """All records, and those of each value of some columns, with the columns that all have."""
+    """Yield all records and those of each value of some columns, with the common columns."""
     groups = [({}, table)]
     groups += [({k: value}, some) for k in by for value, some in table.groupby(k, sort=False)]
     for about, some in groups:
@@ -296,10 +296,10 @@ def _groups(table: pd.DataFrame, *by: str) -> Iterator[tuple[dict[str, Any], pd.
 
 
 def pose_rows(records: Rows, column: str, within: float, unit: str) -> Rows:
-    """Rows of `height` or `orientation`: how many feasible goals are hit, and with what error.
+    """Return the rows of `height` or `orientation`: success rates and errors at feasible goals.
 
-    Hit is within 5 mm of the position, and also within so much of the height [m] or turn [rad]; the
-    errors are of those that say they reached it.
+    A success is within 5 mm of the position and within `within` of the height [m] or rotation
+    [rad]; errors are over trials with the status "reached".
     """
     rows = []
     for row, some in _groups(pd.DataFrame(records), "object_class"):
@@ -316,9 +316,9 @@ def pose_rows(records: Rows, column: str, within: float, unit: str) -> Rows:
 
 
 def disturbance_rows(records: Rows) -> Rows:
-    """Rows of `disturbances`: how trials ended, and errors with and without disturbance.
+    """Return the rows of `disturbances`: results and errors with and without disturbance.
 
-    The means are of all feasible trials, those that did not arrive among them.
+    Means are over all feasible trials, including those that did not reach the goal.
     """
     rows = []
     table = pd.json_normalize(list(records), sep="_")
@@ -333,9 +333,9 @@ def disturbance_rows(records: Rows) -> Rows:
 
 
 def reachability_rows(records: Rows) -> Rows:
-    """Rows of `reachability`: both rates, goals on the rim of what can be reached apart.
+    """Return the rows of `reachability`: rates for all goals, and without or with those on the rim.
 
-    Right is a plan that was carried out, or 'unreachable' where the kinematics agrees.
+    A result is right if the goal was reached, or is 'unreachable' according to the kinematics too.
     """
     table, rows = pd.DataFrame(records), []
     table["right"] = table.status == table.feasible.map({True: "reached", False: "unreachable"})
@@ -363,7 +363,7 @@ ROWS: dict[str, Callable[[Rows], Rows]] = {
 
 
 def job(table: str, index: int, seed: int, world: str = "clean", reach_by: str = "both") -> Job:
-    """One trial of the closed loop."""
+    """Return the job that runs one trial of the closed loop."""
     arguments: dict[str, Any] = {"table": table, "index": index, "seed": seed}
     arguments |= {"world": world} if world != "clean" else {}
     arguments |= {"reach_by": reach_by} if reach_by != "both" else {}
@@ -375,7 +375,7 @@ def job(table: str, index: int, seed: int, world: str = "clean", reach_by: str =
 
 
 def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
-    """The tables of the trials that were run; those of other seeds than 0 are in none."""
+    """Return the tables of the trials in a folder; trials with seeds other than 0 are ignored."""
     usual = {"world": "clean", "reach_by": "both"}
     found = [usual | about | record for about, record in runner.read("closed_loop", job, folder)]
     found.sort(key=lambda record: record["index"])
@@ -406,7 +406,7 @@ JOBS = [
 
 @command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the trials that are missing, and write the tables of all that were run."""
+    """Run the missing trials and write the tables of all trials."""
     options = runner.parser("closed_loop", main.__doc__).parse_args(argv)
     return runner.make(JOBS, "closed_loop", options, tables)
 

@@ -1,10 +1,10 @@
-"""Cross-validation of effect prediction: jobs that train on a fold's training part and test.
+"""Cross-validation of effect prediction: jobs that train and test on one fold.
 
 A job is a model, a data set, its size, a fold and a seed. It trains on the training part, stops
 early on the validation part, and predicts the effects of the test part from the image and the
-commanded action at t = 0 and t = 1. Networks of pushes also decode the push that should have the
-effect of each test interaction, which is executed on its object. `experiments.effect_prediction`
-runs jobs and makes the tables.
+commanded action at t = 0 and t = 1. Networks of pushes also solve the inverse problem: a push is
+decoded from the effect of each test interaction and executed on its object.
+`experiments.effect_prediction` runs the jobs and makes the tables.
 """
 
 from __future__ import annotations
@@ -46,19 +46,19 @@ from experiments.shipped import CHECKPOINT_SPECS, GRASP_SYMMETRIES, HALF_TURNS
 VERSION = 2
 N_FOLDS = 10
 STEPS_ON_100 = 800
-"""Training steps on the sets of 100 interactions."""
+"""Number of training steps on the sets of 100 interactions."""
 
 LARGE = "_x10"
-"""What the names of sets of ten times the size end in. They are collected, not shipped."""
+"""Suffix of the names of sets of ten times the size, which are not shipped."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """What is predicted of a primitive's effects, and from which channels of the action.
+    """Channels of action and effect with which models of a primitive are compared.
 
-    all_effects: predicted by all models but the paper's network.
-    symmetries: (quarter turns, mirrored) under which the primitive stays itself; None for those
-    with a direction, whose training rotates and mirrors by itself. test_set: a second test set.
+    all_effects: effect channels of all models except the paper's network.
+    symmetries: (quarter turns, mirrored) under which the primitive is invariant; None for those
+    with a direction, whose training augments the data itself. test_set: a second test set.
     """
 
     action_channels: tuple[str, ...]
@@ -75,7 +75,7 @@ TASKS: dict[str, Task] = {
     "rotate": Task(("yaw", "gripper"), ("yaw",), ("yaw",), HALF_TURNS),
 }
 PLANE = ("push", "drag")
-"""Primitives whose effect is a displacement in the plane of the table."""
+"""Primitives whose effect is a displacement in the table's plane."""
 
 CHANNELS = ("x", "y", "z", "yaw")
 SETS = (*TASKS, *(f"{name}{LARGE}" for name in TASKS))
@@ -83,7 +83,7 @@ SETS = (*TASKS, *(f"{name}{LARGE}" for name in TASKS))
 
 @dataclass(frozen=True)
 class Network:
-    """A network to compare: its kind, the shipped checkpoint whose training it has, its frame."""
+    """A network to compare: its type, the shipped checkpoint with its training, its frame."""
 
     config: type[NetworkConfig]
     checkpoint: str
@@ -103,15 +103,15 @@ MODELS = (*NETWORKS, *BASELINES, "logistic")
 
 
 def task_of(data: str) -> Task:
-    """The task of a set or of the one that is ten times as large."""
+    """Return the task of a data set of either size."""
     return TASKS[data.removesuffix(LARGE)]
 
 
 def network_and_training(model: str, data: str, n: int | str = "all") -> tuple[Any, ...]:
-    """The configurations of a network and of its training: those of the shipped checkpoints.
+    """Return the configurations of a network and its training, those of a shipped checkpoint.
 
-    FiLM has those of the checkpoint that learns from this very set, if there is one; the sets of
-    100 grasps and rotations get fewer steps.
+    FiLM uses the checkpoint trained on the same set, if there is one; the sets of 100 grasps and
+    100 rotations use fewer steps.
     """
     task, network = task_of(data), NETWORKS[model]
     training = CHECKPOINT_SPECS[network.checkpoint].training
@@ -128,7 +128,7 @@ def network_and_training(model: str, data: str, n: int | str = "all") -> tuple[A
 
 
 def job(model: str, data: str, n: int | str = "all", fold: int = 0, seed: int = 0) -> Job:
-    """One training and its tests; n counts the interactions of which ten folds are made."""
+    """Return the job of one training and its tests; n interactions are split into ten folds."""
     check_choice("model", model, MODELS)
     check_choice("data", data, SETS)
     check_count("fold", fold, 0, N_FOLDS - 1)
@@ -138,7 +138,7 @@ def job(model: str, data: str, n: int | str = "all", fold: int = 0, seed: int = 
     if model == "logistic" and not data.startswith("grasp"):
         raise ValueError(f"model 'logistic' predicts the success of grasps, not {data!r}")
     if task.symmetries is not None and model.endswith("_frame"):
-        raise ValueError(f"data {data!r} has no direction, so no use for model {model!r}")
+        raise ValueError(f"data {data!r} has no direction, which model {model!r} requires")
     if model in NETWORKS:
         settings = (network_and_training(model, data, n), NETWORKS[model].members)
     arguments = {"model": model, "data": data, "n": n, "fold": fold, "seed": seed}
@@ -149,7 +149,7 @@ def job(model: str, data: str, n: int | str = "all", fold: int = 0, seed: int = 
 def cross_validate(
     model: str, data: str, n: int | str, fold: int, seed: int, resume_checkpoint: Path
 ) -> dict[str, Any]:
-    """Predictions of the test part as columns; errors on the second test set; inverse problems."""
+    """Return columns of predictions on the test part, errors on test_set, inverse problems."""
     interactions, task = open_once(data), task_of(data)
     available = interactions.sizes["interaction"]
     size = available if n == "all" else int(n)
@@ -188,7 +188,7 @@ def cross_validate(
 def logistic_predictions(
     data: xarray.Dataset, train_on: np.ndarray, other: xarray.Dataset, queried: np.ndarray
 ) -> dict[str, Any]:
-    """The probability of a grasp's success, from the object's size alone, and the true heights."""
+    """Return a grasp's probability of success by object size, and the ground-truth heights."""
     known, kept = valid_interactions(data, train_on), valid_interactions(other, queried)
     lifted = data["effect"].values[known, -1, 2] > Grasp.success_m
     probability = logistic(data["size"].values[known], lifted, other["size"].values[kept])
@@ -198,13 +198,13 @@ def logistic_predictions(
 
 
 def logistic(size: np.ndarray, success: np.ndarray, queried: np.ndarray) -> np.ndarray:
-    """P(success) (M,) by logistic regression on sizes (N, 3), with a weak ridge."""
+    """Return P(success) (M,) of a logistic regression on sizes (N, 3) with L2 regularisation."""
     regression = make_pipeline(StandardScaler(), LogisticRegression())
     return regression.fit(size, success).predict_proba(queried)[:, 1]
 
 
 def prediction_columns(predictions: dict[str, Any]) -> dict[str, Any]:
-    """Predictions as the columns of a table: `truth_x`, `mean_x`, `std_x`, … and errors."""
+    """Convert predictions to the columns of a table: `truth_x`, `mean_x`, `std_x`, … and errors."""
     columns = {"category" if k == "family" else k: v for k, v in predictions.items()}
     for kind in ("truth", "mean", "std"):
         by_channel = columns.pop(kind, {})
@@ -213,7 +213,7 @@ def prediction_columns(predictions: dict[str, Any]) -> dict[str, Any]:
 
 
 def add_errors(table: pd.DataFrame, primitive: str) -> None:
-    """Add the errors at t = 1 to a table of predictions: in (x, y) [m], in z or yaw; and in yaw."""
+    """Add columns of errors at t = 1 to a table: in (x, y) [m], or in z or yaw; and in yaw."""
     off = {c: table[f"mean_{c}"] - table[f"truth_{c}"] for c in CHANNELS if f"mean_{c}" in table}
     if primitive in PLANE:
         table["final_error"] = np.hypot(off["x"], off["y"])
@@ -224,7 +224,7 @@ def add_errors(table: pd.DataFrame, primitive: str) -> None:
 
 
 def by_model(table: pd.DataFrame) -> Iterator[tuple[dict[str, Any], pd.DataFrame]]:
-    """The rows of each model and size of set, with the columns that say which they are."""
+    """Yield the rows of each model and set size, with the columns that identify them."""
     if table.empty:
         return
     for (_, model, n), group in table.groupby(["data", "model", "n"], sort=False):
@@ -236,7 +236,7 @@ def by_model(table: pd.DataFrame) -> Iterator[tuple[dict[str, Any], pd.DataFrame
 def _train(
     model: str, data: str, n: int | str, seed: int, split: Split, resume_checkpoint: Path
 ) -> tuple[EffectNetwork | Ensemble, dict[str, Any]]:
-    """A trained network, or an ensemble whose members differ by their seeds."""
+    """Train a network, or an ensemble whose members differ in their seeds; also return records."""
     network, training = network_and_training(model, data, n)
     interactions, members = open_once(data), NETWORKS[model].members
     symmetries, trained, records = task_of(data).symmetries or (), [], []
@@ -258,10 +258,10 @@ def _train(
 
 @torch.no_grad()
 def decoded_theta_rad(model: EffectModel, data: xr.Dataset, rows: np.ndarray) -> np.ndarray:
-    """Angles θ (N,) of the pushes that should have the effects of interactions, as decoded.
+    """Solve the inverse problem: return angles θ (N,) of pushes decoded from given effects.
 
-    The inverse problem: the model observes the effect at t = 1 alone (w₁ = 0); the first point of
-    the action that it decodes says from where to push.
+    The model observes only the effect at t = 1 (w₁ = 0); θ is the direction of the first point of
+    the decoded action.
     """
     channels = model.action_channels, model.effect_channels
     arrays = InteractionTensors.from_dataset(data, rows, *channels)
@@ -272,7 +272,7 @@ def decoded_theta_rad(model: EffectModel, data: xr.Dataset, rows: np.ndarray) ->
 
 
 def theta_along_effect(_: None, data: xr.Dataset, rows: np.ndarray) -> np.ndarray:
-    """The baseline: push in the direction of the wanted effect, θ (N,)."""
+    """Return θ (N,) of the baseline: push in the direction of the desired effect."""
     x, y = data["effect"].values[rows, -1, :2].T
     return np.arctan2(y, x) + math.pi
 
@@ -280,7 +280,7 @@ def theta_along_effect(_: None, data: xr.Dataset, rows: np.ndarray) -> np.ndarra
 def executed_columns(
     data: xr.Dataset, rows: np.ndarray, theta_rad: np.ndarray
 ) -> dict[str, list[Any]]:
-    """Errors of executing pushes θ (N,) that should have the effects of interactions, by column."""
+    """Execute pushes θ (N,) and return errors from the interactions' effects, by column."""
     recipe, effects = Recipe.from_json(data.attrs["recipe"]), []
     with Tabletop(recipe.world) as world:
         for index, theta in zip(data["interaction"].values[rows].tolist(), theta_rad, strict=True):

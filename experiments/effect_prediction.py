@@ -1,13 +1,12 @@
-"""`data/results/effect_prediction.json`: how well effects are predicted, cross-validated.
+"""Cross-validated errors of effect prediction: makes `data/results/effect_prediction.json`.
 
     python -m experiments.effect_prediction --only model=film,cnp data=push
 
-runs these jobs if they are missing, then makes the tables from all results, and from the studies of
-`experiments.studies`. What is missing of the sets of ten times the size needs these collected.
-
-Means and standard errors are over objects, an object's errors by several trainings averaged first;
-`all` is the mean over categories with equal weights. Medians and 95th percentiles are over all
-predictions, of each object by each training.
+runs these jobs if they are missing, then makes the tables from all results and from the studies of
+`experiments.studies`. Missing jobs on sets of ten times the size require these sets, which are not
+shipped. Means and standard errors are over objects, after averaging each object's errors over
+trainings; `all` is the mean over categories with equal weights. Medians and 95th percentiles are
+over all predictions.
 """
 
 from __future__ import annotations
@@ -36,14 +35,14 @@ from experiments.runner import FOLDER, Result, Rows, frame, read
 
 NAME = "effect_prediction"
 SAME_TRUTH = 1e-6
-"""Results of one data set may differ by so much [m or rad] in the effects that were recorded: a set
-collected again, by another processor, has another hash, but the same effects."""
+"""Largest difference [m or rad] in recorded effects between results of one data set: a set that is
+collected again on another processor has another hash, but nearly the same effects."""
 
 
 def sorted_results(folder: str | Path = FOLDER) -> list[Result]:
-    """All results in the order of sets, models, sizes, seeds and folds.
+    """Return all results in the order of sets, models, sizes, seeds and folds.
 
-    ValueError if results are stale, or do not agree about the effects of an interaction.
+    Raises ValueError if results are stale, or differ in the recorded effect of an interaction.
     """
     results = read(NAME, job, folder)
     results.sort(key=lambda r: (r[0]["data"], MODELS.index(r[0]["model"]),
@@ -60,7 +59,7 @@ def sorted_results(folder: str | Path = FOLDER) -> list[Result]:
 
 
 def predictions_of(results: Iterable[Result], primitive: str, part: str) -> pd.DataFrame:
-    """Test interactions of a primitive, a row each; part: `fold_test`, `fixed_test`, `inverse`."""
+    """Return a row per test interaction; part: `fold_test`, `fixed_test` or `inverse`."""
     results = [(about | {"n": result["n_interactions"]}, result) for about, result in results
                if about["data"].removesuffix(LARGE) == primitive]  # fmt: skip
     table = frame(results, part)
@@ -70,7 +69,7 @@ def predictions_of(results: Iterable[Result], primitive: str, part: str) -> pd.D
 
 
 def mean_sem(group: pd.DataFrame, column: str) -> tuple[float, float]:
-    """Mean and standard error over objects; categories have equal weights."""
+    """Return mean and standard error over objects, with equal weights for all categories."""
     objects = group.groupby(["category", "interaction"])[column].mean()
     each = objects.groupby("category")
     sems = each.sem().fillna(0)
@@ -78,9 +77,9 @@ def mean_sem(group: pd.DataFrame, column: str) -> tuple[float, float]:
 
 
 def error_rows(table: pd.DataFrame, primitive: str) -> Rows:
-    """Rows of errors by model and category; the yaw only of cuboids, which others have not.
+    """Return rows of errors by model and category; yaw only for cuboids, where it is defined.
 
-    table: of predictions, or of decoded pushes that were executed, which have an error in θ.
+    table: predictions, or executed pushes that were decoded, which have an error in θ.
     """
     unit, name = ("m", "final_error") if primitive in PLANE else ("rad", "error")
     rows = []
@@ -113,7 +112,7 @@ FRAMES = {
 
 
 def frame_rows(results: list[Result]) -> Rows:
-    """Two networks in two frames, from the same folds of the same pushes, on the fixed test set."""
+    """Return rows of two networks in two frames, trained on the same folds, on the fixed test."""
     of = {
         (about["model"], about["fold"], about["seed"]): (about, result)
         for about, result in results
@@ -126,7 +125,7 @@ def frame_rows(results: list[Result]) -> Rows:
 
 
 def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
-    """All tables, of the results of a folder and the studies beside them."""
+    """Return all tables from the results in a folder and the studies beside them."""
     results = sorted_results(folder)
     if not results:
         raise FileNotFoundError(f"folder: there are no results in {folder}; run some jobs first")
@@ -161,7 +160,7 @@ ASKED = (
     (NEED_NO_NETWORK, ["rotate_x10"], range(10)),
     (("film",), ["rotate_x10"], range(3)),
 )
-"""Models, sets and folds of the tables."""
+"""Models, data sets and folds of the tables."""
 
 JOBS = [job(model, data, fold=fold) for asked in ASKED for model, data, fold in product(*asked)]
 JOBS += [
@@ -174,7 +173,7 @@ JOBS += [job(model, "push_x10", 1500) for model in ("constant", "nearest")]
 
 @command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
-    """Train and test models in folds, and make the tables; what is there is not made again."""
+    """Train and test models in folds and make the tables; only missing results are computed."""
     return runner.make(JOBS, NAME, runner.parser(NAME, main.__doc__).parse_args(argv), tables)
 
 

@@ -1,10 +1,10 @@
-"""Several networks that differ in nothing but their seed, queried as one.
+"""Deep ensembles: several networks that differ only in their seed, used as one model.
 
     μ = mean_k μ_k        σ² = mean_k σ_k² + mean_k (μ_k - μ)²
 
-the first two moments of the even mixture (Lakshminarayanan, Pritzel and Blundell, Simple and
-scalable predictive uncertainty estimation using deep ensembles, NeurIPS 2017). The second term, how
-far the members disagree, is what a single network cannot know of itself.
+are the first two moments of the uniform mixture (Lakshminarayanan, Pritzel and Blundell, Simple and
+scalable predictive uncertainty estimation using deep ensembles, NeurIPS 2017). The second term, the
+disagreement of the members, is the epistemic uncertainty, which a single network does not estimate.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from affordlib.types import Observations, Prediction
 
 
 class Ensemble:
-    """Trained networks of the same channels as one `EffectModel`; sigma_scale: of the mixture's σ.
+    """Combines trained networks with equal channels to one `EffectModel`.
 
-    It holds copies of the members, with their weights, whose own sigma_scale is one.
+    sigma_scale: factor on the mixture's σ. Members are copied, and their own sigma_scale is one.
     """
 
     def __init__(self, members: Sequence[EffectNetwork]) -> None:
@@ -43,11 +43,11 @@ class Ensemble:
             member.sigma_scale = self.sigma_scale
 
     def encode(self, image: Tensor) -> Tensor:
-        """Features (B, K F) of images (B, 2, 48, 48): those of the K members side by side."""
+        """Return the concatenated features (B, K F) of K members for images (B, 2, 48, 48)."""
         return torch.cat([member.encode(image) for member in self.members], dim=-1)
 
     def predict(self, features: Tensor, observations: Observations, t_target: Tensor) -> Prediction:
-        """Mean and σ (B, T, C) of the mixture at t_target (B, T); features (B, K F) or (1, K F)."""
+        """Predict the mixture (B, T, C) at t_target (B, T); features are (B, K F) or (1, K F)."""
         each = features.chunk(len(self.members), dim=-1)
         predicted = [
             member.predict(mine.contiguous(), observations, t_target)
@@ -59,7 +59,7 @@ class Ensemble:
 
 
 def _moments(means: list[Tensor], stds: list[Tensor]) -> tuple[Tensor, Tensor]:
-    """Mean and σ of the even mixture of Gaussians."""
+    """Return mean and σ of the uniform mixture of Gaussians."""
     every = torch.stack(means)
     mean = every.mean(dim=0)
     variance = torch.stack(stds).square().mean(dim=0) + (every - mean).square().mean(dim=0)

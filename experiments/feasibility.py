@@ -1,8 +1,8 @@
-"""The kinematic oracle: can the arm bring an object from one place to another at all?
+"""A kinematic oracle: can the arm move an object from one position to another at all?
 
-It knows the arm's kinematics and the object, and asks no model and no planner. An action is
-possible if the tool gets to all of it; a place can be reached if a chain of possible actions leads
-there. Turning the wrist costs nothing, so all that counts is how far the tool is from the base.
+It knows the arm's kinematics and the object, and uses neither models nor planners. An action is
+possible if the tool reaches all its poses; a position is reachable if a chain of possible actions
+leads to it. The wrist turns freely, so only the tool's distance from the base matters.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from affordlib.world import UnreachableError, robot
 from affordlib.world.trajectory import RETREAT_M
 
 BAND_M = 0.01
-"""How near to the rim of what can be reached a goal is not judged, but reported apart."""
+"""Distance [m] from the limit of the reach within which goals are reported separately."""
 
 
 @lru_cache
 def tool_reach_m(height_m: float) -> tuple[float, float]:
-    """How near to the base and how far from it the hanging tool gets at a height."""
+    """Return the smallest and largest distance [m] from the base of a vertical tool at a height."""
 
     def there(radius: float) -> bool:
         at = np.array([robot.BASE_X_M + radius, 0.0, height_m])
@@ -46,10 +46,10 @@ def tool_reach_m(height_m: float) -> tuple[float, float]:
 def possible(
     kind: type[Push] | type[Drag], half_m: float, slack_m: float = 0.0
 ) -> Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
-    """Which actions the arm can do, of positions (n, 2), directions (n,) and lengths (n,) [m].
+    """Return a test of which actions are possible: positions (n, 2), directions and lengths (n,).
 
-    half_m: of the object, behind whose centre the fingers of a push stop; slack_m: by how much
-    the arm is taken to reach farther than it does.
+    half_m: half the object's width, by which the fingers of a push stop behind its centre [m];
+    slack_m: distance [m] added to the arm's reach.
     """
     low, up = tool_reach_m(TIP_HEIGHT_M), tool_reach_m(HOVER_M + TIP_HEIGHT_M)
     caging = tool_reach_m(HOVER_M)
@@ -66,7 +66,7 @@ def possible(
             return within(0.0, caging) & within(length_m, caging)
         end = length_m - half_m
         ok = within(-Push(0.0).radius, up) & within(end, low) & within(end - RETREAT_M, up)
-        # On its way it may come too near to the base.
+        # The path between start and end may pass too near to the base.
         for share in (0.25, 0.5, 0.75):
             ok &= within(-Push(0.0).radius * (1 - share) + share * end, low)
         return ok
@@ -88,7 +88,7 @@ def is_feasible(
     goal_xy_m: Sequence[float],
     slack_m: float = 0.0,
 ) -> bool:
-    """Whether a chain of pushes or drags, all within the arm's reach, leads to the goal."""
+    """Return whether a chain of pushes or drags within the arm's reach leads to the goal."""
     half_mm = 5 * round(200 * half_m)
     routes = _routes(kind, half_mm, slack_m)
     judge = possible(kind, half_mm / 1000, slack_m)
@@ -101,13 +101,13 @@ def on_the_rim(
     start_xy_m: Sequence[float],
     goal_xy_m: Sequence[float],
 ) -> bool:
-    """Whether a centimetre of reach more or less would change the answer."""
+    """Return whether feasibility changes if the reach is longer or shorter by `BAND_M`."""
     answers = [is_feasible(kind, half_m, start_xy_m, goal_xy_m, s) for s in (-BAND_M, BAND_M)]
     return answers[0] != answers[1]
 
 
 def half_width_m(footprint_m: np.ndarray) -> float:
-    """Half the mean width of an outline (n, 2)."""
+    """Return the radius [m] of the circle that has the area of an outline (n, 2)."""
     x, y = footprint_m.T
     area = 0.5 * abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1)))
     return math.sqrt(area / math.pi)

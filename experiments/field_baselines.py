@@ -1,8 +1,8 @@
-"""Planners and a model of the field, beside ours in Table 3.
+"""Standard planners and a physics-based model, compared with ours in Table 3.
 
-plan_astar_continuous: A*, with the direction and stop of its last action refined continuously.
+plan_astar_continuous: A*, with direction and stop phase of its last action optimised.
 plan_cem: the cross-entropy method on the effect map, with our planner's objective.
-LimitSurface: a quasi-static pusher in the place of a network.
+LimitSurface: a quasi-static model of pushing in place of a network.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from affordlib.types import CROP_WIDTH_M, Observations, Plan, Prediction
 from experiments.runner import open_once
 
 N_CHAINS, ROUNDS, N_ELITE = 218, 16, 22
-"""Of the cross-entropy method: chains drawn in a round, rounds, and the best, which are fitted.
+"""Cross-entropy method: chains sampled per round, rounds, and number of elite chains.
 
-Together 3,488: our planner tries about as many for a goal of three actions."""
+In total 3,488 chains, about as many as our planner evaluates for a goal of three actions."""
 
 MOVES_M = 0.001
-"""An action that moves the object by less is left out of a plan."""
+"""Actions that move the object by less than this [m] are removed from a plan."""
 
 
 def plan_astar_continuous(problem: PlanningProblem) -> Plan:
-    """A*'s plan; its last action is then corrected until it is predicted to end at the goal."""
+    """Plan with A*, then optimise the last action so that its predicted end is the goal."""
     began = time.perf_counter()
     plan = plan_astar(problem)
     if not plan.steps:
@@ -45,7 +45,7 @@ def plan_astar_continuous(problem: PlanningProblem) -> Plan:
     effects, (*first, last) = problem.effects, plan.steps
     start, turned = problem.start_xy_m, first[-1].predicted_turn_rad if first else 0.0
     left = np.subtract(problem.goal.xy_m, first[-1].predicted_end_xy_m if first else start)
-    # The last action as one alone, on the object and with the table turned back.
+    # The last action as a single one, in a frame rotated back by the object's predicted turn.
     back = torch.tensor(-turned, dtype=torch.float64)
     action = [last.primitive.direction_rad - turned, last.stop_phase]
     angle, stop = torch.tensor(action, dtype=torch.float64)[:, None, None]
@@ -58,10 +58,10 @@ def plan_astar_continuous(problem: PlanningProblem) -> Plan:
 
 
 def plan_cem(problem: PlanningProblem, seed: int = 0) -> Plan:
-    """Draw chains of as many actions as are allowed, fit a normal distribution to the best, repeat.
+    """Plan with the cross-entropy method: sample chains, fit a Gaussian to the elite, repeat.
 
-    Directions begin around that of the goal and stops around three quarters, spread as in our
-    planner. The best chain of all is the plan, without the actions that move nothing.
+    Initial means are the goal's direction and a stop phase of 0.75, with the same spread as in our
+    planner. The plan is the best of all chains, without actions that move nothing.
     """
     began = time.perf_counter()
     effects, mode, rng = problem.effects, problem.mode, np.random.default_rng(seed)
@@ -88,18 +88,18 @@ def plan_cem(problem: PlanningProblem, seed: int = 0) -> Plan:
 
 
 STEP_M, N_FITTED = 0.001, 100
-"""Of the quasi-static pusher: a step of the gripper, and training pushes that it is fitted to."""
+"""Quasi-static model: step of the gripper [m], and number of training pushes for its fit."""
 
 FINGER_AHEAD_M, FINGER_WIDTH_M = 0.01, 0.012
-"""How far the fingers' front lies before the tool's point, and how wide each is."""
+"""Distance [m] of the fingers' front from the tool's tip, and width [m] of each finger."""
 
 
 class LimitSurface:
-    """An `EffectModel` of pushes by physics: an ellipsoidal limit surface and Coulomb friction.
+    """A physics-based `EffectModel` of pushes: ellipsoidal limit surface and Coulomb friction.
 
     The footprint is the image's mask, the centre of mass the image's middle. The fronts of both
-    fingers advance in small steps; where one is deepest inside, the object gives way. It has two
-    numbers, friction and the ratio of torque to force in radii of gyration, and no σ.
+    fingers advance in small steps, and the contact is the deepest point inside the object. It has
+    two parameters, friction and the ratio of torque to force in radii of gyration, and no σ.
     """
 
     action_channels, effect_channels = ("x", "y"), ("x", "y", "yaw")
@@ -108,11 +108,11 @@ class LimitSurface:
         self.friction, self.size = friction, size
 
     def encode(self, image: Tensor) -> Tensor:
-        """The smoothed masks (B, 1, 48, 48)."""
+        """Return the smoothed masks (B, 1, 48, 48)."""
         return torch.from_numpy(ndimage.gaussian_filter(image[:, 1:].numpy(), (0, 0, 1, 1)))
 
     def predict(self, features: Tensor, observations: Observations, t_target: Tensor) -> Prediction:
-        """As of any model; the action must be observed at t = 0 and t = 1."""
+        """Predict as any model does; the action must be observed at t = 0 and t = 1."""
         travel = observations.action[:, -1] - observations.action[:, 0]
         length_m = travel.norm(dim=-1, keepdim=True)
         poses = self._poses(features.expand(len(travel), -1, -1, -1), travel / length_m)
@@ -125,7 +125,7 @@ class LimitSurface:
 
     @torch.no_grad()
     def _poses(self, mask: Tensor, ahead: Tensor) -> Tensor:
-        """Poses (S + 1, B, 3) of objects after each step of whole pushes in directions (B, 2)."""
+        """Return poses (S + 1, B, 3) after each step of full pushes in directions (B, 2)."""
         n, push = len(ahead), Push(0.0)
         axis = (torch.arange(mask.shape[-1]) + 0.5) / mask.shape[-1] - 0.5
         square = (axis[:, None] ** 2 + axis**2) * CROP_WIDTH_M**2
@@ -161,7 +161,7 @@ class LimitSurface:
 
     @classmethod
     def fitted(cls) -> LimitSurface:
-        """With the two numbers that predict training pushes best."""
+        """Fit the two parameters to training pushes."""
         data = open_once("push")
         rows = split_interactions(data.sizes["interaction"]).train[:N_FITTED]
         pushes = InteractionTensors.from_dataset(data, rows)

@@ -1,6 +1,6 @@
-"""The README's picture: `python -m experiments.front_picture` records one push twice.
+"""Make the README's animation of one push, twice: `python -m experiments.front_picture`.
 
-Executed whole it passes the goal; stopped where the plan says it ends there.
+The full push overshoots the goal; the partial push, stopped at the planned phase, ends there.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ BOX = Cuboid(0.05, 0.045, 0.05)
 GOAL = Goal((0.0, 0.028))
 FRAME_STEPS = 48
 LARGE, LEFT, TOP, WIDTH, HEIGHT = (960, 720), 275, 185, 420, 330
-"""Pictures are taken large, and this part of them is shown [pixels]."""
+"""Size of the rendered pictures and the part of them that is shown [pixels]."""
 GOAL_RGB = (0.0, 0.45, 0.70)
 PICTURE = repo_root() / "figures" / "partial_push.gif"
 
 
 def recorded(title: str, stop: bool) -> list[np.ndarray]:
-    """Frames (h, w, 3) of one planned push, stopped where the plan says or executed whole."""
+    """Return frames (h, w, 3) of one planned push, stopped as planned or executed in full."""
     animation = FrameRecorder(FRAME_STEPS, *LARGE)
     with Tabletop() as world:
         world.place(BOX, (0.0, 0.0), 0.3)
@@ -46,7 +46,7 @@ def recorded(title: str, stop: bool) -> list[np.ndarray]:
 
 
 def _titled(picture: np.ndarray, title: str) -> np.ndarray:
-    """The part of a picture that matters, under a line of text."""
+    """Return the shown part of a picture under a line of text."""
     image = Image.new("RGB", (WIDTH, HEIGHT + 30), "white")
     image.paste(Image.fromarray(picture[TOP : TOP + HEIGHT, LEFT : LEFT + WIDTH]), (0, 30))
     font = ImageFont.truetype(font_manager.findfont("DejaVu Sans"), 14)
@@ -55,7 +55,7 @@ def _titled(picture: np.ndarray, title: str) -> np.ndarray:
 
 
 def main() -> None:
-    """Record the push, whole and stopped, and write both side by side."""
+    """Record the full and the partial push, and write them side by side."""
     both = recorded("The whole push", stop=False), recorded("Stopped at {:.0%} of it", stop=True)
     animation = FrameRecorder()
     for k in range(max(map(len, both))):

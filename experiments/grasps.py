@@ -1,8 +1,8 @@
-"""Will a grasp lift its object? Table 2 of the paper, and other thresholds than its own.
+"""Prediction of grasp success: Table 2 of the paper, and other thresholds than the paper's.
 
-Success is a gain in height above 0.1 m. The paper predicts it where μ_z(1) > 0.1 m, which is where
-P(z > 0.1 m) > ½. TP is the share of the successes that are predicted, TN that of the failures, with
-Wilson's 95 % intervals, folds together.
+Success is a gain in height above 0.1 m. The paper predicts success if μ_z(1) > 0.1 m, i.e. if
+P(z > 0.1 m) > ½. TP is the sensitivity (share of successes that are predicted), TN the specificity
+(share of failures that are predicted), with Wilson's 95 % intervals over all folds.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from experiments.cross_validation import by_model
 from experiments.runner import Rows
 
 GOAL_TP, GOAL_TN = 0.90, 0.95
-"""Shares of the successes and failures that we would like to be predicted."""
+"""Target sensitivity and specificity."""
 
 
 def auc(score: np.ndarray, truth: np.ndarray, fold: np.ndarray) -> float | None:
-    """The share of (success, failure) pairs that the score puts in order; None without pairs.
+    """Return the area under the ROC curve, None if there are no (success, failure) pairs.
 
-    Pairs are of one fold each: models of different folds are not on one scale.
+    Pairs are taken within folds, because scores of different folds' models are not comparable.
     """
     pairs = truth[:, None] & ~truth & (fold[:, None] == fold)
     if not pairs.any():
@@ -37,14 +37,14 @@ def auc(score: np.ndarray, truth: np.ndarray, fold: np.ndarray) -> float | None:
 
 
 def success_probability(mean_z: np.ndarray, std_z: np.ndarray) -> np.ndarray:
-    """P(z > 0.1 m) (N,) of Gaussians; above one half exactly where their mean is above 0.1 m."""
+    """Return P(z > 0.1 m) (N,) of Gaussians, which exceeds ½ exactly if the mean exceeds 0.1 m."""
     return (1 + erf(np.subtract(mean_z, Grasp.success_m) / (math.sqrt(2) * np.asarray(std_z)))) / 2
 
 
 def _held_out(grasps: pd.DataFrame) -> Iterator[tuple[dict[str, Any], bool, pd.DataFrame]]:
-    """Held-out grasps of each model, what can roll and what cannot, with `score` and `lifted`.
+    """Yield held-out grasps by model and rollability, with columns `score` and `lifted`.
 
-    Of the first seed alone: another cross-validation tests the same grasps again.
+    Only the first seed is used, because cross-validations with other seeds test the same grasps.
     """
     if grasps.empty:
         return
@@ -59,7 +59,7 @@ def _held_out(grasps: pd.DataFrame) -> Iterator[tuple[dict[str, Any], bool, pd.D
 
 
 def grasp_rows(grasps: pd.DataFrame) -> Rows:
-    """The paper's Table 2, by its rule; grasps: predictions with the jobs' arguments as columns."""
+    """Return the paper's Table 2; grasps: predictions with the jobs' arguments as columns."""
     rows = []
     for about, rollable, some in _held_out(grasps):
         score, lifted = some["score"].to_numpy(), some["lifted"].to_numpy()
@@ -72,14 +72,14 @@ def grasp_rows(grasps: pd.DataFrame) -> Rows:
 
 
 def rates(score: np.ndarray, lifted: np.ndarray, thresholds: np.ndarray) -> tuple[np.ndarray, ...]:
-    """True positive and true negative rates (T,) of a score (N,) above thresholds (T,)."""
+    """Return TP and TN rates (T,) when scores (N,) above thresholds (T,) predict success."""
     success, failure = np.sort(score[lifted]), np.sort(score[~lifted])
     tp = 1 - np.searchsorted(success, thresholds, side="right") / len(success)
     return tp, np.searchsorted(failure, thresholds, side="right") / len(failure)
 
 
 def best_threshold(score: np.ndarray, lifted: np.ndarray) -> float:
-    """The threshold at which the lesser margin of TP and TN over their goals is largest."""
+    """Return the threshold that maximises the smaller margin of TP and TN over their targets."""
     known = np.unique(score)
     between = (known[1:] + known[:-1]) / 2
     tp, tn = rates(score, lifted, between)
@@ -87,9 +87,9 @@ def best_threshold(score: np.ndarray, lifted: np.ndarray) -> float:
 
 
 def threshold_rows(grasps: pd.DataFrame) -> Rows:
-    """Table 2 again, with the threshold that suits the other folds' held-out grasps best.
+    """Return Table 2 with thresholds chosen on the held-out grasps of the other folds.
 
-    Predictions of a fold decide nothing about its own threshold.
+    Predictions of a fold are not used for its own threshold.
     """
     rows = []
     for about, rollable, some in _held_out(grasps):
@@ -103,9 +103,9 @@ def threshold_rows(grasps: pd.DataFrame) -> Rows:
 
 
 def roc_rows(grasps: pd.DataFrame, n_points: int = 51) -> Rows:
-    """The receiver operating characteristic: TP and TN over the whole range of thresholds.
+    """Return the receiver operating characteristic: TP and TN over all thresholds.
 
-    Only from sets of 1,000 grasps; with 100, a curve has only a few steps.
+    Only sets of 1,000 grasps are used, since a curve of 100 has only a few steps.
     """
     rows = []
     for about, rollable, some in _held_out(grasps):
@@ -121,7 +121,7 @@ def roc_rows(grasps: pd.DataFrame, n_points: int = 51) -> Rows:
 
 
 def confusion_columns(predicted: np.ndarray, lifted: np.ndarray) -> dict[str, Any]:
-    """TP in per cent of the successes, TN of the failures, with intervals; None of nothing."""
+    """Return TP and TN in per cent with intervals, None without successes or failures."""
     columns: dict[str, Any] = {}
     for rate, those in (("tp", lifted), ("tn", ~lifted)):
         n, k = int(those.sum()), int((predicted == lifted)[those].sum())

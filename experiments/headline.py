@@ -1,6 +1,6 @@
-"""The README's table of main results: `python -m experiments.headline` gathers it.
+"""Make the README's table of main results: `python -m experiments.headline`.
 
-Every figure stands in a larger table of `data/results`, made by the command of that table.
+Each number is taken from a larger table in `data/results`, which has its own command.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def _row(question: str, n: int, factor: float, reported: float | None, paper: fl
 
 
 def tables() -> dict[str, list[dict[str, Any]]]:
-    """A row a question: n trials, the paper's figure, both networks on the same data."""
+    """Return a row per question: number of trials, the paper's value, both networks' values."""
     effects = _table("effect_prediction", "push_test").query("object_class == 'all'")
     pushes = effects[effects.n_interactions == 500].set_index("model")
     means = pushes.final_error_mean_m
