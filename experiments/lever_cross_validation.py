@@ -1,10 +1,10 @@
 """Cross-validation of lever-ups against recurrent networks (Table 1): jobs that train and test.
 
-Five folds, 80/10/10, by object (each interaction has an object of its own, so the random split of
-Seker et al. 2019 is the same); or all objects with some number of edges left out of training. A job
-is one training, or one baseline, tested in every protocol that it is trained for. Errors are
-distances between predicted and true positions [cm], after steps of 150 ms. `experiments.lever_up`
-runs jobs and makes the tables; `tuning` is a study (`experiments.studies`).
+The split is by object into five folds, 80/10/10 (each interaction has its own object, so it equals
+the random split of Seker et al. 2019), or leaves out all objects with a given number of edges. A
+job is one training, or one baseline, tested in all protocols that it is trained for. Errors are
+distances [cm] between predicted and ground-truth positions, after steps of 150 ms.
+`experiments.lever_up` runs the jobs and makes the tables; `tuning` is one of `experiments.studies`.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ DATA, N_FOLDS = "lever_up", 5
 BASELINES = ("persistence", "constant_velocity")
 RECURRENT = ("lstm_tuned", "lstm_seker2019")
 SINGLE = "cnp_last_pose_single"
-"""`cnp_last_pose`, trained for one protocol at a time, as the recurrent networks are."""
+"""Name of `cnp_last_pose` trained for one protocol at a time, like the recurrent networks."""
 
 MODELS = ("cnp", "cnp_last_pose", SINGLE, "lstm_seker2019", "lstm_tuned", *BASELINES)
 TESTED = {"all": PROTOCOLS, "window": PROTOCOLS[:1], "first_step": PROTOCOLS[1:]}
-"""The protocols in which a training is tested, by what it is trained for."""
+"""Protocols in which a network is tested, by the protocol that it is trained for."""
 
 
 def job(
@@ -52,9 +52,9 @@ def job(
     seed: int = 0,
     epochs: int | None = None,
 ) -> Job:
-    """One training and its tests; edges_left_out: polygons with so many are only in the test.
+    """Return the job of one training and its tests.
 
-    epochs: of `lstm_seker2019` alone.
+    edges_left_out: polygons with this number of edges are only tested; epochs: `lstm_seker2019`'s.
     """
     check_choice("model", model, MODELS)
     each = model in (SINGLE, *RECURRENT)
@@ -64,7 +64,7 @@ def job(
         check_count("edges_left_out", edges_left_out, 3, 8)
     published = model == "lstm_seker2019"
     if (epochs is not None) != published:
-        raise ValueError(f"epochs belong to 'lstm_seker2019', got {epochs!r} for {model!r}")
+        raise ValueError(f"epochs are only for 'lstm_seker2019', got {epochs!r} for {model!r}")
     settings = (SekerConfig(), lstm_seker2019.TRAINING) if published else _lever_model(model)
     arguments = {"model": model, "trained_for": trained_for, "fold": fold}
     arguments |= {"edges_left_out": edges_left_out, "seed": seed, "epochs": epochs}
@@ -76,7 +76,7 @@ def _lever_model(model: str) -> LeverModel | None:
 
 
 def edges_of(data: xr.Dataset) -> np.ndarray:
-    """How many edges the polygon of each interaction has (n,)."""
+    """Return the number of edges (n,) of each interaction's polygon."""
     recipe, numbers = Recipe.from_json(data.attrs["recipe"]), data["interaction"].values
     return np.array([len(sample_scene(recipe, int(i))[0].footprint_m) for i in numbers])
 
@@ -84,7 +84,7 @@ def edges_of(data: xr.Dataset) -> np.ndarray:
 def lever_split(
     data: xr.Dataset, fold: int = 0, seed: int = 0, edges_left_out: int | None = None
 ) -> Split:
-    """80/10/10 in five folds whose test parts do not overlap, or all but some edges."""
+    """Split 80/10/10 in five folds with disjoint test parts, or leave out a number of edges."""
     split = split_interactions(data.sizes["interaction"], seed, 2 * fold, 2 * N_FOLDS)
     if edges_left_out is None:
         return split
@@ -106,7 +106,7 @@ def cross_validate(
     epochs: int | None,
     resume_checkpoint: Path,
 ) -> dict[str, Any]:
-    """Errors of every window of every test trajectory, by protocol."""
+    """Train and return the errors in all windows of all test trajectories, by protocol."""
     data, lever = open_once(DATA), _lever_model(model)
     split = lever_split(data, fold, seed, edges_left_out)
     view = lever.view if lever else "full" if model == "lstm_seker2019" else "near"
@@ -148,9 +148,9 @@ def _train_seker(
 def extrapolate(
     baseline: str, effect: Tensor, protocol: str, start: int = 0
 ) -> tuple[Tensor, Tensor]:
-    """Persistence's or constant velocity's prediction of poses (N, S, C), and the truth (N, T, C).
+    """Return a baseline's prediction of poses from effects (N, S, C), and ground truth (N, T, C).
 
-    From the first step alone the velocity is unknown; then both predict that nothing moves.
+    With only the first step the velocity is unknown, and both baselines predict no motion.
     """
     window = protocol == "window"
     last = start + levers.N_OBSERVED - 1 if window else 0
@@ -162,7 +162,7 @@ def extrapolate(
 
 
 def _errors(network: EffectNetwork | str, arrays: Any, protocol: str) -> dict[str, Any]:
-    """Errors (N, W, T) [cm] of a network's or baseline's windows, to a micrometre, as lists."""
+    """Return the errors (N, W, T) [cm] of a network or baseline, rounded to 1 µm, as lists."""
     starts = range(levers.n_windows(arrays) if protocol == "window" else 1)
     if isinstance(network, str):
         found = [extrapolate(network, arrays.effect, protocol, start) for start in starts]
@@ -185,14 +185,14 @@ SETTINGS: dict[str, tuple[dict[str, Any], float]] = {
     "rate 0.001, no weight decay": ({"weight_decay": 0.0}, 1.0),
     "rate 0.001, plain likelihood": ({"beta": 0.0}, 1.0),
 }
-"""By name: what is changed in `TRAINING`, where both networks began, and the share of the width."""
+"""By name: changes of the initial `TRAINING` of both networks, and factor on the width."""
 
 TUNED = (("cnp_last_pose", "all"), ("lstm_tuned", "window"), ("lstm_tuned", "first_step"))
 _TUNING = (SETTINGS, TUNED, [LEVER_MODELS[name].network for name, _ in TUNED], models.TRAINING)
 
 
 def changed(lever: LeverModel, setting: str) -> LeverModel:
-    """A network with one of `SETTINGS`."""
+    """Return a network with one of `SETTINGS`."""
     training, share = SETTINGS[setting]
     network = replace(lever.network, width=round(share * lever.network.width))
     return replace(lever, network=network, training=replace(models.TRAINING, **training))
@@ -200,12 +200,12 @@ def changed(lever: LeverModel, setting: str) -> LeverModel:
 
 @study(DATA, settings=_TUNING)
 def tuning() -> list[dict[str, Any]]:
-    """The same budget of tuning for ours and for the recurrent network (Section 4.1).
+    """Tune our network and the recurrent one with the same budget (Section 4.1).
 
-    Mean validation errors [m], of windows and of whole beginnings, of every setting, trained on the
-    training part of fold 0 as long as the shipped network. `LEVER_MODELS` has one learning rate for
-    each network: the best, or within a thousandth of the best where the two trainings of the
-    recurrent one differ. No test data are used.
+    Returns mean validation errors [m] of all settings, for windows and from the first step, trained
+    on the training part of fold 0 for as many steps as the shipped network. `LEVER_MODELS` has one
+    learning rate per network: the best, or, as the recurrent one has two trainings, one within a
+    thousandth of the best. No test data are used.
     """
     data, rows = open_once(DATA), []
     split = lever_split(data)

@@ -1,10 +1,10 @@
-"""`data/results/lever_up.json`: lever-ups against recurrent networks (Table 1 of the paper).
+"""Lever-ups against recurrent networks (Table 1 of the paper): makes `data/results/lever_up.json`.
 
     python -m experiments.lever_up --only model=lstm_seker2019
 
-runs these jobs if they are missing, then makes the tables from all results. They take an hour of
-one core for each of two trainings a fold. glibc returns their large arrays after every step; with
-`MALLOC_MMAP_MAX_=0 MALLOC_TRIM_THRESHOLD_=60000000000` before the command, a quarter less.
+runs these jobs if they are missing, then makes the tables from all results. Each of the two
+trainings per fold takes an hour on one core. glibc releases large arrays after every step;
+`MALLOC_MMAP_MAX_=0 MALLOC_TRIM_THRESHOLD_=60000000000` before the command saves a quarter of it.
 
 An object's errors are averaged over its windows; means, standard errors and intervals are over
 objects.
@@ -42,7 +42,7 @@ OURS = "cnp_last_pose"
 
 
 def sorted_results(folder: str | Path = FOLDER) -> list[Result]:
-    """All results in the order of models and folds."""
+    """Return all results in the order of models and folds."""
 
     def order(result: Result) -> list[Any]:
         about = {name: value or 0 for name, value in result[0].items()}
@@ -53,7 +53,7 @@ def sorted_results(folder: str | Path = FOLDER) -> list[Result]:
 
 
 def _errors(results: list[Result], edges_left_out: int | None = None) -> pd.DataFrame:
-    """Errors [cm] after each step of each tested object, its windows averaged; a row each."""
+    """Return a row per tested object and step with the error [cm], averaged over windows."""
     parts = []
     for about, result in results:
         for protocol in PROTOCOLS if about["edges_left_out"] == edges_left_out else ():
@@ -90,10 +90,10 @@ def error_rows(results: list[Result], edges_left_out: int | None = None) -> Rows
 
 
 def unseen_rows(results: list[Result], edges: dict[int, int]) -> Rows:
-    """Polygons with a number of edges that a network has never seen, beside networks that have.
+    """Return errors on polygons with a number of edges left out of training, and those if known.
 
-    edges: of each interaction, by its number. The second are those of the folds, on the polygons of
-    that kind in their tests (*known*).
+    edges: number of edges by interaction number. The columns `known_…` are the errors of the
+    networks of the folds on test polygons with the same number of edges.
     """
     known = _errors(results)
     keys = [known["interaction"].map(edges).rename("edges"), "model", "protocol", "steps"]
@@ -104,10 +104,10 @@ def unseen_rows(results: list[Result], edges: dict[int, int]) -> Rows:
 
 
 def paired_rows(results: list[Result]) -> Rows:
-    """Ours minus each of the recurrent ones, object by object, with bootstrapped 95 % intervals.
+    """Return paired differences, ours minus a recurrent network, with bootstrap 95 % intervals.
 
-    Ours as it is, and trained for one protocol at a time; objects of the folds that both were
-    trained on, the windows of an object averaged.
+    Ours is trained for all protocols, or for one at a time. Pairs are test objects of folds that
+    both networks have, with errors averaged over windows.
     """
     rng, rows = np.random.default_rng(0), []
     errors = {
@@ -129,7 +129,7 @@ def paired_rows(results: list[Result]) -> Rows:
 
 
 def summary_rows(rows: Rows) -> Rows:
-    """The windows in one row per model, as the paper's Table 1 has them."""
+    """Return one row per model for the window protocol, as in the paper's Table 1."""
     summary: dict[tuple, dict[str, Any]] = {}
     for row in rows:
         if row["protocol"] == "window":
@@ -140,7 +140,7 @@ def summary_rows(rows: Rows) -> Rows:
 
 
 def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
-    """All tables, of the results of a folder and the study of tuning."""
+    """Return all tables from the results in a folder and the tuning study."""
     results = sorted_results(folder)
     if not results:
         raise FileNotFoundError(f"folder: there are no results in {folder}; run some jobs first")
@@ -174,7 +174,7 @@ JOBS = [
 
 @command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
-    """Train and test models in folds, and make the tables; what is there is not made again."""
+    """Train and test models in folds and make the tables; only missing results are computed."""
     return runner.make(JOBS, NAME, runner.parser(NAME, main.__doc__).parse_args(argv), tables)
 
 

@@ -1,9 +1,9 @@
-"""Studies of what limits a prediction: where the object is, where an action stops, the arm.
+"""Studies of the limits of prediction: errors of the object's pose, partial actions, reachability.
 
-pose_sensitivity: the same push of an object that is a millimetre and a degree from where the robot
-believes it. partial_execution: models of whole actions on actions that stop at a phase t, compared
-with the state at t of the whole action and with where the object comes to rest.
-reachability_accuracy: the learned reachability against the arm's kinematics, at new places.
+pose_sensitivity: repeats pushes with an error of 1 mm and 1° in the object's estimated pose.
+partial_execution: tests models of full actions on partial actions that stop at phase t, against
+the state of the full action at t and against the object's rest position.
+reachability_accuracy: compares learned reachability with the arm's kinematics at new positions.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ from experiments.runner import Rows, study
 N_PUSHES, REPEATS = 200, 3
 WHOLE_ACTION_MODELS = ("film_500", "film_5000", "drag_film_500")
 PHASES = (0.0, 0.55, 0.65, 0.75, 1.0)
-"""Edges of the bins of phases; nothing is touched before 0.5."""
+"""Edges of the phase bins; the gripper touches nothing before 0.5."""
 
 N_PLACES = 1000
 NEAR_THE_LIMIT = (0.2, 0.8)
-"""Learned probabilities between these are of places near the limit of the arm's reach."""
+"""Range of learned probabilities at positions near the limit of the arm's reach."""
 
 
 @study("push_test", settings=(N_PUSHES, REPEATS, POSITION_ERROR_M, YAW_ERROR_RAD))
 def pose_sensitivity() -> Rows:
-    """Change of displacement and final position when an object is not where believed."""
+    """Measure the change of displacement and final position due to errors of the object's pose."""
     data = open_interactions("push_test")
     recipe = Recipe.from_json(data.attrs["recipe"])
     rng = np.random.default_rng(0)
@@ -72,7 +72,7 @@ def pose_sensitivity() -> Rows:
 @study("partial", checkpoints=WHOLE_ACTION_MODELS, settings=PHASES)
 @torch.no_grad()
 def partial_execution() -> Rows:
-    """Errors of networks that learned from whole actions alone, on partial actions."""
+    """Measure the errors on partial actions of networks trained only on full actions."""
     data = open_interactions("partial")
     names = data["primitive"].attrs["flag_meanings"].split()
     kinds = np.array(names)[data["primitive"].values]
@@ -103,7 +103,7 @@ def partial_execution() -> Rows:
 
 @study(checkpoints=("reachability",), settings=(N_PLACES, NEAR_THE_LIMIT))
 def reachability_accuracy() -> Rows:
-    """Agreement of the learned reachability, at a threshold of one half, with the kinematics."""
+    """Measure the agreement of learned reachability, with threshold ½, with the kinematics."""
     model, rng = Reachability.load(), np.random.default_rng(0)
     rows = []
     with Tabletop() as world:

@@ -1,4 +1,4 @@
-"""The paper's network trained by the paper's recipe, and on trajectories of fewer samples."""
+"""The paper's network trained as published, and on trajectories of fewer samples."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ITERATIONS, VALIDATE_EVERY = 100_000, 2500
 
 
 def trained_on(n_samples: int) -> EffectNetwork:
-    """The same network, trained in batches as it is shipped, on so many samples a trajectory."""
+    """Train the shipped network in batches, with n_samples per trajectory instead of all."""
     data = open_once(SPEC.data)
     split = split_interactions(data.sizes["interaction"])
     samples = np.linspace(0, data.sizes["sample"] - 1, n_samples).round().astype(int)
@@ -28,9 +28,9 @@ def trained_on(n_samples: int) -> EffectNetwork:
 
 
 def sample_literal(tensors: InteractionTensors, obs_max: int, generator: torch.Generator) -> Batch:
-    """As in the paper: one trajectory, k observations, k uniform in 1 … obs_max, one target.
+    """Sample as in the paper: one trajectory, k observations, k uniform in 1 … obs_max, one target.
 
-    Action and effect are observed at the same times; w₁ is 1, 0 or uniform between, one in three.
+    Action and effect are observed at the same phases; w₁ is 1, 0 or uniform in [0, 1] (1/3 each).
     """
 
     def draw(high, n=1):
@@ -53,9 +53,9 @@ def train_literal(
     seed: int = 0,
     after: Callable[[int], object] = bool,
 ) -> list[float]:
-    """The paper's loop (Section 3.2), in place: one trajectory and one target an iteration, Adam.
+    """Train in place with the paper's loop (Section 3.2) and return the losses.
 
-    Returns the losses. A million iterations, as in the paper, take hours. after: gets each number.
+    An iteration is one trajectory and one target; a million take hours. after: gets its number.
     """
     check_count("iterations", iterations)
     check_count("obs_max", obs_max, 1, 100_000)
@@ -75,7 +75,7 @@ def train_literal(
 
 @study("push", settings=(SPEC.network, ITERATIONS, VALIDATE_EVERY))
 def literal_training() -> Rows:
-    """Validation errors of the paper's network and loop, at a rate of 1e-4, on one fold."""
+    """Return validation errors of the paper's network and loop, learning rate 1e-4, on one fold."""
     data = open_once(SPEC.data)
     split = split_interactions(data.sizes["interaction"])
     training = InteractionTensors.from_dataset(data, split.train)

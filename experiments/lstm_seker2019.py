@@ -1,13 +1,13 @@
 """The recurrent network of Seker, Tekden and Ugur (2019) for lever-ups (Table 1).
 
-Four convolutions 3×3 (32, 64, 128, 256), each with ReLU and 2×2 max-pooling, a dense layer of 4096
-with dropout 0.5; these features are repeated over a window of 15 poses and concatenated with them;
-LSTM(256); a dense layer per step gives the next pose. 72 million parameters. Mean squared error,
-Adam at 5e-4, batches of 32, 100 epochs of one random window per trajectory, the learning rate times
-0.8 when the validation loss rests.
+Four 3×3 convolutions (32, 64, 128, 256), each with ReLU and 2×2 max-pooling, precede a dense layer
+of 4096 with dropout 0.5. These features are concatenated with each pose of a window of 15 poses; an
+LSTM(256) and a dense layer output the next pose at each step. It has 72 million parameters and is
+trained with mean squared error, Adam at 5e-4, batches of 32, 100 epochs of one random window per
+trajectory, and a learning rate that is multiplied by 0.8 when the validation loss stagnates.
 
-Added here, for equal context with the other models: phase and commanded action of each step beside
-its pose, and poses scaled to unit size. Predicted poses are its next inputs.
+Added here for the same inputs as the other models: phase and commanded action at each step, and
+poses scaled to unit RMS. Predictions are fed back as the next inputs (autoregressive rollout).
 """
 
 from __future__ import annotations
@@ -38,29 +38,29 @@ BATCH, LEARNING_RATE, DECAY, EPOCHS = 32, 5e-4, 0.8, 100
 TRAINING = (CONVOLUTION_WIDTHS, DENSE, HIDDEN, BATCH, LEARNING_RATE, DECAY)
 SAVE_EVERY = 10
 NEGLIGIBLE = 1e-30
-"""Averaged gradients below this are set to zero. Those of units that no longer learn halve every
-seven steps, for ever, and subnormal numbers cost a processor many times as much."""
+"""Adam's averaged gradients below this are set to zero. Those of inactive units are halved every
+seven steps until they are subnormal numbers, with which processors are many times slower."""
 State = tuple[Tensor, Tensor]
 
 
 @checked
 @dataclass(frozen=True)
 class SekerConfig(NetworkConfig):
-    """Channels, and the number of steps that the phase has."""
+    """Channels, number of steps of the phase, and patience of the learning rate's schedule."""
 
     steps: int = 25
     patience: int = 5
 
 
 class SekerLSTM(EffectNetwork):
-    """CNN and LSTM, step by step; σ is not predicted and is the floor."""
+    """CNN and LSTM, applied step by step; σ is not predicted and equals the floor."""
 
     def make_layers(self, config: SekerConfig) -> None:
-        """Convolutions, a recurrent cell, and the pose that follows."""
+        """Make the convolutions, the recurrent cell and the output layer for the next pose."""
         n_a, n_e = len(config.action_channels), len(config.effect_channels)
         layers: list[nn.Module] = []
         for n_in, n_out in pairwise((2, *CONVOLUTION_WIDTHS)):
-            # Pooling before ReLU is the same, on a quarter of the values.
+            # Pooling before ReLU gives the same result with a quarter of the operations.
             layers += [nn.Conv2d(n_in, n_out, 3, padding="same"), nn.MaxPool2d(2), nn.ReLU()]
         side = LEVER_IMAGE_PIXELS // 2 ** len(CONVOLUTION_WIDTHS)
         flat = CONVOLUTION_WIDTHS[-1] * side**2
@@ -71,15 +71,15 @@ class SekerLSTM(EffectNetwork):
         self.next_pose = nn.Linear(HIDDEN, n_e)
 
     def features(self, scaled_image: Float[Tensor, "b 2 128 128"]) -> Float[Tensor, "b f"]:
-        """4096 numbers of standardised depth and mask."""
+        """Return 4096 features of standardised depth and mask."""
         return self.cnn(scaled_image.contiguous(memory_format=torch.channels_last))
 
     def outputs(
         self, features: Tensor, observations: Observations, t_target: Tensor
     ) -> tuple[Tensor, ...]:
-        """(μ_a, σ_a, μ_e, σ_e) at steps of the phase, each (B, T, C) and standardised.
+        """Return (μ_a, σ_a, μ_e, σ_e) at steps of the phase, each (B, T, C) and standardised.
 
-        The action is not predicted: μ_a is zero.
+        The action is not predicted, and μ_a is zero.
         """
         o = observations
         known = on_grid(o.effect / self.effect_scale, o.effect_t, o.effect_mask, self.config.steps)
@@ -91,13 +91,13 @@ class SekerLSTM(EffectNetwork):
         return mu_a, mu_a + self.sigma_floor, mu_e, torch.full_like(mu_e, self.sigma_floor)
 
     def roll(self, features: Tensor, known: Known, o: Observations, n: int) -> Tensor:
-        """Poses (B, n + 1, C) from the first observed step on."""
+        """Roll out poses (B, n + 1, C) from the first observed step."""
         action = (o.action / self.action_scale).flatten(1)[:, None]
         k = torch.arange(max(n, 1), device=features.device) + known.first[:, None]
         k = k.clamp_max(self.config.steps)
         rows = torch.arange(len(features), device=features.device)[:, None]
         given, seen = known.d[rows, k], known.where[rows, k]
-        n_given = int(seen.all(dim=0).cumprod(dim=0).sum())  # by all rows
+        n_given = int(seen.all(dim=0).cumprod(dim=0).sum())  # in all rows
         gates = self._share_of_image(features)
         out, state = self._steps(gates, given[:, :n_given], k[:, :n_given], action)
         path = [given[:, :1], self.next_pose(out)]
@@ -108,14 +108,14 @@ class SekerLSTM(EffectNetwork):
         return torch.cat(path, dim=1)
 
     def _share_of_image(self, features: Tensor) -> Tensor:
-        """What the features give the gates (B, 4H): the same at every step, so computed once."""
+        """Return the features' contribution to the gates (B, 4H), which is equal at all steps."""
         cell = self.lstm
         return F.linear(features, cell.weight_ih[:, :DENSE], cell.bias_ih + cell.bias_hh)
 
     def _steps(
         self, gates: Tensor, pose: Tensor, k: Tensor, action: Tensor, state: State | None = None
     ) -> tuple[Tensor, State]:
-        """The hidden states (B, K, H) after each of K given poses, and the last state."""
+        """Return the hidden states (B, K, H) after each of K given poses, and the last state."""
         given = torch.cat([pose, action.expand(-1, pose.shape[1], -1)], dim=-1)
         given = with_time(given, k / self.config.steps)
         given = gates[:, None] + F.linear(given, self.lstm.weight_ih[:, DENSE:])
@@ -129,7 +129,7 @@ class SekerLSTM(EffectNetwork):
         return torch.stack(hidden, dim=1), (h, c)
 
     def next_step_loss(self, arrays: InteractionTensors, start: Tensor, n: int) -> Tensor:
-        """Mean squared error of the next pose at each of n observed steps from `start` (N,) on."""
+        """Return the mean squared error of the next pose over n steps from `start` (N,)."""
         rows = torch.arange(len(arrays))[:, None]
         k = start[:, None] + torch.arange(n)
         pose = arrays.effect / self.effect_scale
@@ -149,10 +149,10 @@ def train_seker(
     seed: int = 0,
     checkpoint: Path | None = None,
 ) -> dict[str, float]:
-    """Train in place, to the weights of the best validation error; what it took.
+    """Train in place and keep the weights of the best validation error; return epochs and time.
 
-    An epoch is one window of each trajectory ("first_step": the whole trajectory). checkpoint: a
-    file, written after every tenth epoch (1.2 GB), from which the same training resumes.
+    An epoch is one window of each trajectory ("first_step": the full trajectory). checkpoint: a
+    file (1.2 GB), written every ten epochs, from which an interrupted training resumes.
     """
     optimiser = torch.optim.Adam(model.parameters(), LEARNING_RATE, fused=True)
     plateau = torch.optim.lr_scheduler.ReduceLROnPlateau(

@@ -1,12 +1,12 @@
-"""Our networks beside the `neuralprocesses` package, on its own ground: curves of one dimension.
+"""Comparison with the `neuralprocesses` package on its standard task: one-dimensional regression.
 
-Curves are drawn from a Gaussian process (squared exponential, length 0.25 of the range 2, noise
-0.05), observed at 1 to 10 points and queried at 50. Each pair has about as many parameters, sees
-the same batches for the same number of steps with the same optimiser, and is judged on the same
-curves: log-likelihood per target (mean ± standard error). Beside them stands the Gaussian process
-itself, the best that any network can do.
+Curves are sampled from a Gaussian process (squared exponential, length scale 0.25 on a range of 2,
+noise 0.05), observed at 1 to 10 points and queried at 50. The networks of a pair have about the
+same number of parameters, and are trained with the same batches, steps and optimiser. They are
+compared by log-likelihood per target on the same curves (mean ± standard error), together with the
+Gaussian process itself, which is the upper bound.
 
-The package is no dependency; without it this says so and ends:
+The package is not a dependency and has to be installed first:
     .venv/bin/python -m pip install neuralprocesses==0.2.7
     .venv/bin/python -m experiments.neural_processes --steps 2000
 """
@@ -41,13 +41,13 @@ Likelihood = Callable[..., torch.Tensor]
 
 
 def covariances(t: torch.Tensor) -> torch.Tensor:
-    """Of the values at phases t (n, m), with noise: (n, m, m)."""
+    """Return the covariances (n, m, m) of noisy values at phases t (n, m)."""
     distance = (t[:, :, None] - t[:, None]) * RANGE / LENGTH
     return (-distance.square() / 2).exp() + NOISE**2 * torch.eye(t.shape[1])
 
 
 def curves(n: int, generator: torch.Generator) -> tuple[torch.Tensor, ...]:
-    """Phases and values: context (n, k) for some k up to MAX_OBSERVED, and target (n, TARGETS)."""
+    """Sample phases and values of context (n, k), k ≤ MAX_OBSERVED, and targets (n, TARGETS)."""
     t = torch.rand(n, MAX_OBSERVED + TARGETS, generator=generator, dtype=torch.float64)
     covariance = covariances(t)
     white = torch.randn(n, t.shape[1], 1, generator=generator, dtype=torch.float64)
@@ -58,7 +58,7 @@ def curves(n: int, generator: torch.Generator) -> tuple[torch.Tensor, ...]:
 
 
 def process_likelihood(t_seen, y_seen, t, y):
-    """Under the Gaussian process itself."""
+    """Return the log-likelihood under the Gaussian process itself."""
     k = t_seen.shape[1]
     covariance = covariances(torch.cat([t_seen, t], dim=1).double())
     across = covariance[:, :k, k:]
@@ -69,7 +69,7 @@ def process_likelihood(t_seen, y_seen, t, y):
 
 
 def ours(config: NetworkConfig) -> tuple[torch.nn.Module, Likelihood]:
-    """Our network as a regression: y is the effect at phase t; no action, an empty image."""
+    """Return our network as a regression of the effect y at phase t, with an empty image."""
     model = build(config, NO_SCALES)
 
     def likelihood(t_seen, y_seen, t, y):
@@ -81,7 +81,7 @@ def ours(config: NetworkConfig) -> tuple[torch.nn.Module, Likelihood]:
 
 
 def theirs(attention: bool, **sizes: int) -> tuple[torch.nn.Module, Likelihood]:
-    """The package's network with a Gaussian a target."""
+    """Return the package's network with an independent Gaussian for each target."""
     import neuralprocesses.torch as nps
 
     make = nps.construct_agnp if attention else nps.construct_gnp
@@ -92,12 +92,12 @@ def theirs(attention: bool, **sizes: int) -> tuple[torch.nn.Module, Likelihood]:
         predicted = model(x_seen, y_seen[:, None], x)
         return -gaussian_nll(y, predicted.mean[:, 0], predicted.var[:, 0].sqrt())
 
-    likelihood(*curves(2, torch.Generator().manual_seed(0)))  # its layers learn their sizes
+    likelihood(*curves(2, torch.Generator().manual_seed(0)))  # initialises lazy layers
     return model, likelihood
 
 
 def train(model: torch.nn.Module, likelihood: Likelihood, steps: int, rate: float) -> None:
-    """Train in place."""
+    """Train a network in place by maximum likelihood."""
     optimiser = torch.optim.AdamW(model.parameters(), rate, weight_decay=0.0, fused=True)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
     generator = torch.Generator().manual_seed(1)
@@ -111,7 +111,7 @@ def train(model: torch.nn.Module, likelihood: Likelihood, steps: int, rate: floa
 
 @torch.no_grad()
 def _log_likelihood(likelihood: Likelihood) -> dict[str, float]:
-    """The log-likelihood per target of the JUDGED curves, mean and standard error over curves."""
+    """Return log-likelihood per target of JUDGED curves, mean and standard error over curves."""
     generator = torch.Generator().manual_seed(2)
     each = [likelihood(*curves(BATCH, generator)).mean(dim=1) for _ in range(JUDGED // BATCH)]
     values = torch.cat(each).double().numpy()
@@ -120,14 +120,14 @@ def _log_likelihood(likelihood: Likelihood) -> dict[str, float]:
 
 @command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
-    """Train both kinds of networks side by side; write `neural_processes.json`."""
+    """Train and compare both types of networks; write `neural_processes.json`."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=count_type, default=3000)
     parser.add_argument("--rate", type=float, default=5e-4)
     parser.add_argument("--out", default="data/results")
     options = parser.parse_args(argv)
     if importlib.util.find_spec("neuralprocesses") is None:
-        print("neuralprocesses is not installed; see the head of this file")
+        print("neuralprocesses is not installed; install it as the help (-h) says")
         return 1
     torch.set_num_threads(1)
     makers = {

@@ -1,7 +1,7 @@
-"""Does a model know which objects are unlike those that it was trained on?
+"""Novelty detection: does a model recognise objects that are unlike its training objects?
 
-Categories that no model has seen: with some of them the score and the growth of σ were chosen, by
-the others, which no choice saw, they are judged. Their pushes are collected into runs/strangers.
+Object categories that no model has seen are used: some to choose the novelty score and the growth
+of σ, the others only to test them. Their pushes are collected into runs/strangers.
 """
 
 from __future__ import annotations
@@ -36,24 +36,24 @@ FOLDER = "runs/strangers"
 
 
 def solid(outline: Any, low: float = 0, high: float = 1, top: Any = None) -> np.ndarray:
-    """Corners of a convex solid over an outline (n, 2), with another outline on top if given."""
+    """Return corners of a convex solid over an outline (n, 2), with another one as top if given."""
     levels = (outline, low), (outline if top is None else top, high)
     return np.vstack([np.insert(np.array(points, float), 2, z, axis=1) for points, z in levels])
 
 
 def box(x0: float, x1: float, y0: float, y1: float) -> list[tuple[float, float]]:
-    """Corners of a rectangle."""
+    """Return the corners of a rectangle."""
     return [(x, y) for x in (x0, x1) for y in (y0, y1)]
 
 
 def ring(radii: Any, turns: Any) -> np.ndarray:
-    """Points around the centre; turns: their angles in full turns."""
+    """Return points (n, 2) around the centre at angles given in full turns."""
     angle = 2 * math.pi * np.array(turns)
     return (radii * np.stack([np.cos(angle), np.sin(angle)])).T
 
 
 def boxes(*each: tuple[float, float, float, float]) -> list[np.ndarray]:
-    """Boxes of full height over rectangles."""
+    """Return boxes of full height over rectangles."""
     return [solid(box(*edges)) for edges in each]
 
 
@@ -78,20 +78,20 @@ PARTS = {
     "roof": [solid(SQUARE, top=box(-0.05, 0.05, -0.5, 0.5))],
     "dumbbell": boxes((-0.5, -0.2, -0.5, 0.5), (-0.2, 0.2, -0.15, 0.15), (0.2, 0.5, -0.5, 0.5)),
 }
-"""Convex parts of categories, to be stretched to length, width and height."""
+"""Convex parts of each category, which are scaled to length, width and height."""
 CHOOSE = ("house", "t_shape", "wedge", "prism")
 FIRST = ("l_shape", "cross", "star", "mug", "step", "pyramid")
 SECOND = ("u_shape", "z_shape", "arrow", "cone", "roof", "dumbbell")
 ROLL = ("lying_cylinder", "sphere")
-"""With the first the score and the growth of σ are chosen; the next judged the first growth chosen,
-the others the second, which was chosen after that. The last roll, which no distance foretells."""
+"""CHOOSE: to choose the score and the growth of σ; FIRST: to test the first choice of growth;
+SECOND: to test the second, later choice; ROLL: rollable ones, whose rolling no score predicts."""
 FIRST_GAIN = 2.44e-03
-"""By which σ grew with the distance."""
+"""Gain of the first choice, with which σ grows linearly with the distance."""
 
 
 @dataclass(frozen=True)
 class Stranger(TabletopObject):
-    """An object of convex parts that move as one; its origin is above its centre of mass."""
+    """A rigid object of convex parts; its origin is on the vertical through its centre of mass."""
 
     length: float
     width: float
@@ -100,7 +100,7 @@ class Stranger(TabletopObject):
     parts: ClassVar[list[np.ndarray]]
 
     def solids(self, inset_m: float = 0.0) -> tuple[list[np.ndarray], float]:
-        """Corners of the parts, their faces inset, and the volume of all [m³]."""
+        """Return the corners of the parts, with faces inset, and their total volume [m³]."""
         parts = [part * (self.length, self.width, self.height) for part in self.parts]
         corners = np.concatenate([part[Delaunay(part).simplices] for part in parts])
         volumes = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])) / 6
@@ -115,7 +115,7 @@ class Stranger(TabletopObject):
     footprint_m = property(lambda self: np.vstack(self.solids()[0])[:, :2])
 
     def shape(self) -> dict[str, Any]:
-        """Bullet makes one body of the parts of a file."""
+        """Write the parts to one file, of which Bullet makes one body."""
         lines, n = [], 1
         for part in self.solids(0.001)[0]:
             lines += ["o part", *(f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in part)]
@@ -135,12 +135,12 @@ SETTINGS = (N_PUSHES, *CHOOSE, *ROLL, *FIRST, *SECOND)
 
 
 def tensors(data: Any, model: Any, rows: Any = None) -> InteractionTensors:
-    """Those of a model; rows: all by default."""
+    """Return tensors with a model's channels; rows: all by default."""
     return InteractionTensors.from_dataset(data, rows, model.action_channels, model.effect_channels)
 
 
 def strangers(category: str, model: Any) -> InteractionTensors:
-    """Pushes of a category of PARTS, or of the package's, but of those too small for a model."""
+    """Collect pushes of a category, without objects that are too small for a model."""
     if category not in CATEGORIES:
         about = {"category": category, "parts": PARTS[category]}
         CATEGORIES[category] = type(category, (Stranger,), about)
@@ -151,14 +151,14 @@ def strangers(category: str, model: Any) -> InteractionTensors:
 
 
 def auc(known: Any, unknown: Any) -> float:
-    """Probability that an unknown object has a higher score than a known one, of scores (N,)."""
+    """Return the probability that an unknown object's score exceeds a known one's, scores (N,)."""
     return float((np.asarray(known)[:, None] < np.asarray(unknown)).mean())
 
 
 @study("push", settings=SETTINGS, checkpoints=MODELS[:3])
 @torch.no_grad()
 def novelty_choice() -> Rows:
-    """AUC of validation objects against the categories to choose with, by score."""
+    """Return the AUC of validation objects against the categories of CHOOSE, by score."""
     film, more, cnp = (load_checkpoint(name)[0] for name in MODELS[:3])
     data, split = open_interactions("push"), split_interactions(500)
     training, validation = (tensors(data, film, p).image for p in (split.train, split.validation))
@@ -189,20 +189,20 @@ def novelty_choice() -> Rows:
 
 
 def final(model: Any, pushes: InteractionTensors) -> tuple[Tensor, Tensor, Tensor]:
-    """Ground truth, mean and σ (N, 2) of x and y at t = 1."""
+    """Return ground truth, mean and σ (N, 2) of x and y at t = 1."""
     return tuple(value[:, 0, :2] for value in c.effects_at(model, pushes, (1.0,)))
 
 
 def beyond_percent(truth: Tensor, mean: Tensor, std: Tensor) -> float:
-    """Share of the errors beyond 2σ, in per cent."""
+    """Return the share of errors beyond 2σ, in per cent."""
     return 100 * float(((mean - truth).norm(dim=1) > 2 * std.norm(dim=1)).double().mean())
 
 
 @study("push", settings=SETTINGS, checkpoints=MODELS[:3])
 def novelty_gain() -> Rows:
-    """For ways in which σ may grow, the gain that leaves 5 or 1 % of every category beyond 2σ.
+    """Fit the gain of each growth of σ so that at most 5 or 1 % of any category are beyond 2σ.
 
-    other: each category with the gain that the others need. Shares are the largest of a category.
+    Columns `other_…` use the gain fitted to the other categories. Shares are the worst category's.
     """
     found = []
     for name, category in product(MODELS[:3], CHOOSE):
@@ -232,7 +232,7 @@ def novelty_gain() -> Rows:
 
 @study("push_test", settings=(*SETTINGS, c.NOVELTY_GAIN), checkpoints=MODELS)
 def novelty_judged() -> Rows:
-    """Known test objects, and categories that no choice saw: σ as it is, and grown in two ways."""
+    """Evaluate σ, unchanged and grown in two ways, on known objects and on unused categories."""
     rows, parts = [], {"first_six": FIRST, "second_six": SECOND}
     parts = {k: (k,) for k in ("known", *FIRST, *SECOND, *ROLL)} | parts
     for name in MODELS:

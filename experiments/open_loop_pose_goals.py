@@ -1,4 +1,4 @@
-"""Whole poses planned open loop: the goals of `closed_loop`, each from one image, executed blind.
+"""Open-loop plans for pose goals: the goals of `closed_loop`, planned once from a single image.
 
 python -m experiments.open_loop_pose_goals
 """
@@ -36,9 +36,9 @@ WITHIN = {"orientation": WITHIN_TURN_RAD, "height": WITHIN_HEIGHT_M}
 
 
 def run_open_loop(table: str, index: int, planner: str) -> dict[str, Any]:
-    """The record of one plan of a whole pose, tried even where the planner predicts to fail.
+    """Plan and execute one pose goal, even if the planner predicts a failure; return its record.
 
-    pose_error: what is missing of the turn [rad] or of the height [m].
+    pose_error: remaining rotation [rad] or height [m].
     """
     world, skills = tabletop_and_skills()
     trial = sample_trial(table, index)
@@ -63,7 +63,7 @@ def run_open_loop(table: str, index: int, planner: str) -> dict[str, Any]:
 
 
 def open_loop_rows(records: Rows, within: float) -> Rows:
-    """Rows of plans that are executed open loop, for each planner; hit as in `pose_rows`."""
+    """Return a row of open-loop results per planner, with the criterion of `pose_rows`."""
     table = pd.DataFrame(records)
     hit = (table.pose_error <= within) & (table.distance_m <= WITHIN_M)
     groups = table.assign(within_percent=100 * hit).groupby("planner", sort=False)
@@ -75,13 +75,13 @@ def open_loop_rows(records: Rows, within: float) -> Rows:
 
 
 def job(table: str, index: int, planner: str) -> Job:
-    """One plan of a whole pose."""
+    """Return the job of one open-loop plan."""
     arguments = {"table": table, "index": index, "planner": planner}
     return Job(run_open_loop, arguments, checkpoints=tuple(CHECKPOINTS.values()), version=2)
 
 
 def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
-    """The tables of the plans that were made."""
+    """Return the tables of all executed plans."""
     found = [about | record for about, record in runner.read(NAME, job, folder)]
     return {
         table: open_loop_rows([record for record in found if record["table"] == table], within)
@@ -94,7 +94,7 @@ JOBS = [job(t, i, planner) for t, planner in product(WITHIN, PLANNERS) for i in 
 
 @command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
-    """Make and execute the plans that are missing, and write the tables."""
+    """Make and execute missing plans, and write the tables."""
     return runner.make(JOBS, NAME, runner.parser(NAME, main.__doc__).parse_args(argv), tables)
 
 

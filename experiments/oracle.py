@@ -1,4 +1,4 @@
-"""The simulator itself as the model: what a planner could do if it predicted everything."""
+"""The simulator as the model: the performance of a planner with perfect predictions."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from affordlib.world import Tabletop, TabletopObject, WorldConfig
 N_DIRECTIONS, PHASE_STEP = 36, 0.025
 STD_M = 1e-5
 YAW_ERROR_RAD = math.radians(1.0)
-"""The error of the object's yaw that the risk-averse oracle allows for."""
+"""Error [rad] of the object's yaw that the risk-averse oracle assumes."""
 
 
 @dataclass
 class SimulatorModel:
-    """An `EffectModel` that executes the action in a world of its own.
+    """An `EffectModel` that executes the action in a separate simulated world.
 
-    It knows the object, its pose and the physics; a learned model only sees an image.
+    It knows the object, its pose and the physics, whereas a learned model only sees an image.
     """
 
     world: Tabletop
@@ -37,20 +37,20 @@ class SimulatorModel:
     effect_channels = ("x", "y", "yaw")
 
     def encode(self, image: torch.Tensor) -> torch.Tensor:
-        """Nothing is read from the image."""
+        """Return empty features, because the image is not used."""
         return torch.zeros(len(image), 1)
 
     def predict(
         self, features: torch.Tensor, observations: Observations, t_target: torch.Tensor
     ) -> Prediction:
-        """As of any model; the action must be observed at t = 0 and t = 1."""
+        """Predict as any model does; the action must be observed at t = 0 and t = 1."""
         travel = observations.action[:, -1] - observations.action[:, 0]
         effects = []
         for (x, y), t in zip(travel.tolist(), t_target.numpy(), strict=True):
             self.world.place(self.obj, (0.0, 0.0), self.yaw_rad, config=self.config)
             action = self.kind.towards(math.atan2(y, x))
             if len(t) == 1:
-                # A partial action is re-timed to its own stop, so it is executed as such.
+                # A partial action is re-timed to its stop, so it has to be executed itself.
                 rest = self.world.execute_primitive(action, float(t[0])).rest_effect
                 effects.append(rest[None, [0, 1, 3]])
             else:
@@ -70,11 +70,11 @@ def oracle_effects(
     nominal_physics: bool = False,
     risk_averse: bool = False,
 ) -> EffectMap:
-    """The effect map of the object in a world, from actions executed in an imagined world.
+    """Return the effect map of the object in a world, from actions executed in an imagined world.
 
-    nominal_physics: the imagined world has the mean frictions, masses and heights instead of this
-    world's; its camera has no error. risk_averse: σ, otherwise next to nothing, is the sensitivity
-    of the effect to `YAW_ERROR_RAD`.
+    nominal_physics: the imagined world has the mean parameters of all worlds instead of this
+    world's; its camera has no error. risk_averse: σ is the sensitivity of the effect to
+    `YAW_ERROR_RAD`, and not negligible as otherwise.
     """
     kind = Drag if world.object_rolls() else Push
     physics = WorldConfig() if nominal_physics else world.config
@@ -86,11 +86,11 @@ def oracle_effects(
 
 
 class SensitivityMap(EffectMap):
-    """A map whose σ is how much the effects change with `YAW_ERROR_RAD`."""
+    """An effect map whose σ is the change of the effects due to `YAW_ERROR_RAD`."""
 
     @cached_property
     def grid(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Effects and σ (D, T, 3) at the grid's directions and phases."""
+        """Return effects and σ (D, T, 3) at the grid's directions and phases."""
         mean, _ = super().grid
         slope = (mean.roll(-1, 0) - mean.roll(1, 0)) / (4 * math.pi / self.n_directions)
         return mean, YAW_ERROR_RAD * slope.abs() + STD_M

@@ -1,9 +1,9 @@
-"""The embedded log of page 09, and plans with off-centre pushes, executed.
+"""The embedded log of page 09, and the execution of plans with off-centre pushes.
 
 `python -m experiments.own_log` collects `data/own_log/SURFACE_SUPPORT.txt.xz` in the simulated
-world, in the text format of Zhou et al.: 50 pushes of one drawn triangle with a thin rod for each
-of five drawn surfaces (friction) and supports (where its weight rests); then it plans and executes
-50 goals on the fitted models. `--only log` or `--only goals` does one of the two.
+world, in the text format of Zhou et al.: 50 pushes of one triangle with a thin rod for each of five
+combinations of surface (friction) and support (centre of mass). Then it plans and executes 50
+goals with the fitted models. `--only log` or `--only goals` does one of the two.
 """
 
 from __future__ import annotations
@@ -32,27 +32,27 @@ from experiments.real_pushes import pushes_of
 FOLDER = repo_root() / "data" / "own_log"
 N_PUSHES, N_GOALS = 50, 50
 TRIANGLE_M = ((0.0, 0.0), (0.13, 0.0), (0.03, 0.11))
-"""Corners in the recorded frame, drawn once (scalene: it has no mirror image of its own)."""
+"""Corners [m] of the triangle in the recorded frame; it is scalene, so it has no symmetry."""
 HEIGHT_M = 0.02
 SUPPORTS = {"mid": (0.0, 0.0), "left": (-0.02, -0.005), "right": (0.022, -0.01)}
 SURFACES = {"felt": 0.9, "steel": 0.35}
 CONDITIONS = ("felt_mid", "felt_left", "steel_mid", "steel_right", "steel_left")
 NOISE_M, NOISE_RAD = 0.0003, 0.003
-"""Of the tracked poses."""
+"""Standard deviation of the noise of the tracked poses [m] and [rad]."""
 
 
 def world_config(condition: str) -> WorldConfig:
-    """The world of a condition."""
+    """Return the world parameters of a condition."""
     surface, support = condition.split("_")
     x, y = SUPPORTS[support]
-    # The centre of mass lies low, so that the triangle does not tip.
+    # The centre of mass is low, so that the triangle does not tip over.
     inside = {"com_offset_m": (x, y, -0.3 * HEIGHT_M)}
     friction = {"table_friction": SURFACES[surface], "finger_friction": SURFACES[surface]}
     return WorldConfig(**inside, **friction)
 
 
 def read_log(folder: Path = FOLDER) -> PushLog:
-    """The embedded log."""
+    """Read the embedded log."""
     log = Log("mm", np.array(TRIANGLE_M) * 1e3, 0.24, tool_radius=500 * ROD_WIDTH_M)
     for path in sorted(folder.glob("*.txt.xz")):
         name = path.name.removesuffix(".txt.xz")
@@ -65,7 +65,7 @@ def read_log(folder: Path = FOLDER) -> PushLog:
 
 
 def drawn_push(outline_m: np.ndarray, yaw: float, rng: np.random.Generator) -> PushAt:
-    """A push anywhere on the outline, up to 50° off the normal."""
+    """Sample a push anywhere on the outline, up to 50° from the normal."""
     edges = np.roll(outline_m, -1, axis=0) - outline_m
     sizes = np.linalg.norm(edges, axis=1)
     k = rng.choice(len(edges), p=sizes / sizes.sum())
@@ -76,7 +76,7 @@ def drawn_push(outline_m: np.ndarray, yaw: float, rng: np.random.Generator) -> P
 
 
 def collect(condition: str, seed: int) -> str:
-    """The text of a condition's log."""
+    """Collect the pushes of a condition and return the text of its log."""
     rng = np.random.default_rng(seed)
     prism = Prism(TRIANGLE_M, HEIGHT_M)
     corner = np.array(prism.corners[0])
@@ -108,7 +108,7 @@ def collect(condition: str, seed: int) -> str:
 
 
 def goals(n: int = N_GOALS) -> list[dict]:
-    """Errors of executed plans, and of what corrections leave of them."""
+    """Return errors of executed plans, without and with corrections."""
     log, found = read_log(), []
     prism, rng = Prism(TRIANGLE_M, HEIGHT_M), np.random.default_rng(1)
     for condition in CONDITIONS:
@@ -124,7 +124,7 @@ def goals(n: int = N_GOALS) -> list[dict]:
 
 @command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
-    """Collect the log, execute plans, or both."""
+    """Collect the log, execute the plans, or both."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", choices=("log", "goals"))
     only = parser.parse_args(argv).only

@@ -1,7 +1,7 @@
-"""Table 3: plan to goals, execute the plans, measure the distance that remains.
+"""Table 3: plan to goals, execute the plans, and measure the final distance to the goal.
 
-Each row is a `PlannerConfig`. Its outcomes on the frozen goals are kept by the runner; the tables
-are drawn from all that are there.
+Each row is a `PlannerConfig`. Its outcomes on the frozen goals are stored by the runner; the tables
+are made from all stored outcomes.
 
     python -m experiments.planning --only config=continuous,astar
 """
@@ -57,7 +57,7 @@ from experiments.oracle import oracle_effects
 from experiments.runner import FOLDER, Job, Rows, interval, plain
 
 ENOUGH_M = 0.0003
-"""What a corrective action leaves anyway; nearer to the goal than this, none is tried."""
+"""Distance [m] from the goal below which no corrective action is tried, as none would help."""
 
 POSITION_ERROR_M, YAW_ERROR_RAD = 0.001, math.radians(1.0)
 GROUPS = {"all": STANDING + ROLLABLE, "standing": STANDING, "rollable": ROLLABLE} | {
@@ -67,7 +67,7 @@ FINE_PHASES = tuple(round(0.5 + 0.05 * k, 2) for k in range(1, 11))
 
 
 def _whole(planner: Callable[..., Plan]) -> Callable[..., Plan]:
-    """A planner without partial actions."""
+    """Return a planner that uses no partial actions."""
 
     def plan(problem: PlanningProblem, **arguments: Any) -> Plan:
         return planner(replace(problem, mode=replace(problem.mode, partial=False)), **arguments)
@@ -82,7 +82,7 @@ plan_gradient_full = _whole(plan_gradient)
 
 
 def plan_astar_fine(problem: PlanningProblem, heuristic: str = "goal") -> Plan:
-    """A* with twice as many directions and stop phases, content within 5 mm instead of 20."""
+    """A* with twice as many directions and stop phases, and a tolerance of 5 mm instead of 20."""
     problem = replace(problem, goal=replace(problem.goal, tolerance_m=0.005))
     return plan_astar(problem, 72, FINE_PHASES, heuristic)
 
@@ -98,24 +98,24 @@ MADE: dict[str, Callable[[], EffectModel]] = {
     "cnp_500_of_300_samples": partial(trained_on, 300),
     "limit_surface": LimitSurface.fitted,
 }
-"""Models that are no checkpoints: the job itself trains (ten minutes) or fits them on `push`."""
+"""Models without a checkpoint, which the job trains (ten minutes) or fits on `push`."""
 
 Planner = Callable[..., Plan]
 """A planner as (image, start_xy_m, goal, mode) → Plan."""
 
 
 VERSIONS: dict[Planner, int] = {plan_astar: 2, plan_astar_fine: 2}
-"""Of planners, 1 unless one changed, or how its plans are executed, and with it its numbers."""
+"""Versions of planners (default 1); raise one when a change of code changes its numbers."""
 
 
 @dataclass(frozen=True)
 class PlannerConfig:
-    """A row of Table 3: a planner, its model, and the goals that it is asked for.
+    """A row of Table 3: a planner, its model, and its goals.
 
-    planner: a function of a `PlanningProblem`; arguments: its others; execution: fields of
-    `Attempt`. model: a checkpoint of pushes, one of `MADE`, or "simulator"; oracle: then the
-    arguments of `oracle_effects`. world: whose frozen goals; sources: which of them; stride: every
-    so-many-th; standing: no objects that roll.
+    planner: a function of a `PlanningProblem`; arguments: its further arguments; execution: fields
+    of `Attempt`. model: a checkpoint of pushes, one of `MADE`, or "simulator"; oracle: arguments of
+    `oracle_effects` for "simulator". world, sources: of the frozen goals; stride: use every
+    stride-th goal; standing: exclude rollable objects.
     """
 
     planner: Callable[..., Plan]
@@ -130,7 +130,7 @@ class PlannerConfig:
 
     @property
     def checkpoints(self) -> dict[str, str]:
-        """Of its model by primitive; one of drags beside our network of pushes, if it needs one."""
+        """Checkpoints by primitive: the model's, and one for drags if rollable objects occur."""
         if self.model in ("simulator", *MADE):
             return {}
         drags = self.model.startswith("film") and self.world in ("clean", "perturbed_rollable")
@@ -138,7 +138,7 @@ class PlannerConfig:
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """The categories of objects that it is asked about."""
+        """The object categories of its goals."""
         if self.world == "perturbed_rollable":
             return ROLLABLE
         drags = "drag" in self.checkpoints or self.model == "simulator"
@@ -146,16 +146,16 @@ class PlannerConfig:
         return STANDING + ROLLABLE if drags else STANDING
 
     def chosen(self, tasks: Sequence[PlanningTask]) -> list[int]:
-        """Which of some tasks it is asked, by number."""
+        """Return the numbers of the tasks that this row uses."""
         asked = [t.goals in self.sources and t.obj.category in self.classes for t in tasks]
         return np.flatnonzero(asked)[:: self.stride].tolist()
 
     def columns(self) -> dict[str, str]:
-        """What a row of the table says of it."""
+        """Return the columns of the table that describe this row."""
         return {"model": self.model, "world": self.world}
 
     def make(self, world: Tabletop) -> Planner:
-        """The planner for a world, which nothing but the simulator as a model looks into."""
+        """Return the planner for a world; only the model "simulator" accesses the world's state."""
         models = {kind: load_checkpoint(name)[0] for kind, name in self.checkpoints.items()}
         if self.model in MADE:
             models["push"] = MADE[self.model]()
@@ -182,7 +182,7 @@ PERTURBED = {"model": "film_5000_perturbed", "world": "perturbed"}
 ROLLING, OUTSIDE = (PERTURBED | {"world": world} for world in ("perturbed_rollable", "outside"))
 ORACLE = {"model": "simulator"}
 RISK_WEIGHTS = (0.0, 1.0, 10.0, 30.0)
-"""Of the continuous planner, tried on the validation goals."""
+"""Risk weights of the continuous planner that are tried on the validation goals."""
 
 CONFIGS: dict[str, PlannerConfig] = {
     # Our planner and A* on our best model.
@@ -207,7 +207,7 @@ CONFIGS: dict[str, PlannerConfig] = {
     "gradient_direction_by_plan": PlannerConfig(plan_gradient, "cnp_500", ON_RING, **BY_PLAN),
     "gradient_100_corrected": PlannerConfig(plan_gradient, "cnp_500", LITERAL, **CORRECTED),
     "gradient_100_by_plan": PlannerConfig(plan_gradient, "cnp_500", LITERAL, **BY_PLAN),
-    # With the network trained on trajectories of as many samples, instead of 301.
+    # With the network trained on trajectories of 100 or 300 samples instead of 301.
     "gradient_100_trained": PlannerConfig(plan_gradient, "cnp_500_of_100_samples", LITERAL),
     "gradient_300_trained": PlannerConfig(plan_gradient, "cnp_500_of_300_samples", FINER),
     # Without partial actions.
@@ -215,22 +215,22 @@ CONFIGS: dict[str, PlannerConfig] = {
     "continuous_full": PlannerConfig(plan_continuous_full, **ALL),
     "astar_full": PlannerConfig(plan_astar_full, standing=True),
     "gradient_direction_full": PlannerConfig(plan_gradient_full, "cnp_500", ON_RING),
-    # Planners and a model of the field.
+    # Standard planners and a physics-based model.
     "astar_continuous": PlannerConfig(plan_astar_continuous, standing=True),
     "cem": PlannerConfig(plan_cem, standing=True),
     "mpc_cem": PlannerConfig(plan_cem, **RECEDING, standing=True),
     "mpc_continuous": PlannerConfig(plan_continuous, **RECEDING, standing=True),
     "continuous_limit_surface": PlannerConfig(plan_continuous, "limit_surface"),
-    # What each idea is worth, and what a small error of the object's pose does.
+    # Other networks, and a small error of the object's pose.
     "continuous_cnp_500": PlannerConfig(plan_continuous, "cnp_500", **ALL),
     "continuous_film_500": PlannerConfig(plan_continuous, "film_500", **ALL),
     "continuous_perturbed_start": PlannerConfig(
         plan_continuous, execution={"perturbed_start": True}
     ),
-    # A recurrent network under the same planners.
+    # A recurrent network with the same planners.
     "astar_disc_lstm_500": PlannerConfig(plan_astar, "lstm_500", DISC),
     "continuous_lstm_500": PlannerConfig(plan_continuous, "lstm_500"),
-    # The simulator itself in the place of a model.
+    # The simulator in place of a model.
     "oracle": PlannerConfig(plan_continuous, **ORACLE),
     "oracle_risk_averse": PlannerConfig(plan_continuous, **ORACLE, oracle={"risk_averse": True}),
     # The perturbed world with a noisy camera.
@@ -248,7 +248,7 @@ CONFIGS: dict[str, PlannerConfig] = {
     "perturbed_oracle_nominal": PlannerConfig(
         plan_continuous, **ORACLE, oracle={"nominal_physics": True}, world="perturbed", stride=5
     ),
-    # A constant, on the validation goals.
+    # A constant of the planner, on the validation goals.
     **{
         f"RISK_WEIGHT={weight:g}": PlannerConfig(
             plan_continuous_with, arguments={"RISK_WEIGHT": weight}, world="validation"
@@ -262,11 +262,11 @@ CONFIGS: dict[str, PlannerConfig] = {
 class Attempt:
     """How a plan is executed.
 
-    corrections: of the final position, by up to so many single actions. perturbed_start: when the
-    plan is executed, the object is off its estimated pose by `POSITION_ERROR_M` and
-    `YAW_ERROR_RAD`. n_averaged_images: whose mean each observation is. by_plan: each action is
-    placed where the plan has the object, instead of where it is observed. receding: after each
-    action of those that are allowed, a new plan is made of those that remain (model-predictive
+    corrections: largest number of single actions that correct the final position. perturbed_start:
+    at execution, the object's estimated pose has an error of `POSITION_ERROR_M` and
+    `YAW_ERROR_RAD`. n_averaged_images: number of images that an observation averages. by_plan: each
+    action is relative to the object's predicted position instead of the observed one. receding:
+    after each action, a new plan is made for the remaining number of actions (model-predictive
     control).
     """
 
@@ -280,13 +280,13 @@ class Attempt:
 def corrected(
     robot: Robot, done: Outcome, replan: Callable[..., Plan], corrections: int
 ) -> Outcome:
-    """What comes of a plan that was executed, after at most so many single actions.
+    """Return the outcome of an executed plan after at most `corrections` single actions.
 
-    Each is the first of a plan that `replan` makes from a new image, and is carried out only if it
-    is expected to bring the object nearer.
+    Each of them is the first action of a plan that `replan` makes from a new image, and is executed
+    only if it is predicted to bring the object nearer to the goal.
     """
     goal = done.plan.goal
-    # A planner content within the goal's tolerance would have nothing to correct.
+    # With the goal's own tolerance, a planner would find nothing to correct.
     exactly = replace(goal, tolerance_m=min(goal.tolerance_m, ENOUGH_M))
     with suppress(NothingSeenError, UnreachableError):
         for _ in range(corrections):
@@ -305,7 +305,7 @@ def corrected(
 
 
 def _joined(done: Outcome, more: Outcome) -> Outcome:
-    """The outcome of a plan and of what was executed after it."""
+    """Return the outcome of a plan and of further actions executed after it."""
     paths = done.object_paths_xy_m + more.object_paths_xy_m
     return replace(more, plan=done.plan, object_paths_xy_m=paths)
 
@@ -313,8 +313,8 @@ def _joined(done: Outcome, more: Outcome) -> Outcome:
 def attempt(world: Tabletop, task: PlanningTask, planner: Planner, **options: Any) -> Outcome:
     """Plan and execute one task; options: fields of `Attempt`.
 
-    The distance is measured in the world, not by the robot. A plan that the arm cannot follow
-    counts with the distance at which it left the object.
+    The distance is the world's ground truth. If the arm cannot follow a plan, the distance after
+    its last executed action counts.
     """
     how = Attempt(**options)
     world.place(task.obj, (0.0, 0.0), task.yaw_rad, config=task.config)
@@ -357,10 +357,10 @@ def attempt(world: Tabletop, task: PlanningTask, planner: Planner, **options: An
 
 
 def outcome_record(task: PlanningTask, outcome: Outcome) -> dict[str, Any]:
-    """What the tables need of one outcome.
+    """Return the columns of the tables for one outcome.
 
-    predicted_m: the distance from the goal that the planner predicted; prediction_error_m: how far
-    from its predicted position the object ended.
+    predicted_m: the predicted final distance from the goal; prediction_error_m: the distance
+    between the object's predicted and actual final positions.
     """
     plan = outcome.plan
     error = np.hypot(*np.subtract(plan.predicted_end_xy_m, outcome.end_pose[:2]))
@@ -381,12 +381,12 @@ def outcome_record(task: PlanningTask, outcome: Outcome) -> dict[str, Any]:
 def measure(
     world: Tabletop, tasks: Sequence[PlanningTask], planner: Planner, **execution: Any
 ) -> list[Outcome]:
-    """Outcomes of tasks with one planner, in order; execution: options of `attempt`."""
+    """Return the outcomes of tasks with one planner, in order; execution: options of `attempt`."""
     return [attempt(world, task, planner, **execution) for task in tasks]
 
 
 def run_config(config: str) -> list[dict[str, Any]]:
-    """Outcome records of a planner on the frozen goals that it is asked, with their numbers."""
+    """Return records of a planner's outcomes on its frozen goals, with the goals' numbers."""
     torch.set_num_threads(1)
     about, records = CONFIGS[config], []
     tasks = frozen_tasks(about.world)
@@ -399,12 +399,12 @@ def run_config(config: str) -> list[dict[str, Any]]:
 
 
 def tasks_sha256(world: str = "clean") -> str:
-    """Hash of the frozen goals of a world."""
+    """Return the hash of a world's frozen goals."""
     return hashlib.sha256((repo_root() / goals.FROZEN[world]).read_bytes()).hexdigest()
 
 
 def job(config: str) -> Job:
-    """The measurement of one planner."""
+    """Return the job that evaluates one planner."""
     about = CONFIGS[config]
     settings, files = [about, tasks_sha256(about.world)], tuple(about.checkpoints.values())
     version, data = VERSIONS.get(about.planner, 1), ()
@@ -414,9 +414,9 @@ def job(config: str) -> Job:
 
 
 def planning_rows(records: Rows, **columns: Any) -> Rows:
-    """Rows of the table `planning`: per source of goals and mode, all objects and each category.
+    """Return rows of `planning`: per source of goals and mode, for all objects and each category.
 
-    columns: what else the rows say, such as `PlannerConfig.columns`.
+    columns: further columns of the rows, such as `PlannerConfig.columns`.
     """
     rows = []
     for (source, mode), some in pd.DataFrame(records).groupby(["goals", "mode"], sort=False):
@@ -433,7 +433,7 @@ def planning_rows(records: Rows, **columns: Any) -> Rows:
 
 
 def summary_rows(rows: Rows) -> Rows:
-    """One row per planner on constructed goals: mean, standard error and median of each mode."""
+    """Return one row per planner on constructed goals: mean, SEM and median of each mode."""
     summary: dict[tuple[str, str], dict[str, Any]] = {}
     for row in rows:
         if row["goals"] == "constructed" and row["object_class"] not in STANDING + ROLLABLE:
@@ -446,11 +446,11 @@ def summary_rows(rows: Rows) -> Rows:
 
 
 def decomposition_rows(rows: Rows) -> Rows:
-    """Where the open-loop error on constructed goals comes from, by planner, mode and group.
+    """Return the parts of the open-loop error on constructed goals, by planner, mode and group.
 
-    search: the distance from the goal that the planner predicted; model: from its predicted
-    position; execution: what remains with the simulator as the model, which has no σ to prefer
-    low-variance plans by.
+    search: predicted distance from the goal; model: distance between predicted and actual
+    positions; execution: total error with the simulator as the model, which has no σ and thus no
+    preference for low-variance plans.
     """
     place = ["world", "mode", "object_class"]
     table = pd.DataFrame(rows).query("goals == 'constructed'")
@@ -483,13 +483,13 @@ VARIANTS = {
     "continuous_film_500": "continuous",
     "continuous_limit_surface": "continuous_film_500",
 }
-"""Planners with one thing changed, and without: compared goal by goal, on objects that stand."""
+"""Planners with one change, each with the planner without it, for paired comparisons."""
 
 
 def variant_rows(records: dict[str, Rows]) -> Rows:
-    """How much farther each of `VARIANTS` ends from the same goals: mean [m], interval.
+    """Return paired differences of final distance for `VARIANTS`: mean [m] and interval.
 
-    On constructed goals of objects that stand.
+    They are on constructed goals of stable objects.
     """
     rows: Rows = []
     for name, than in VARIANTS.items():
@@ -507,7 +507,7 @@ def variant_rows(records: dict[str, Rows]) -> Rows:
 
 
 def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
-    """All tables, of the planners that were measured."""
+    """Return all tables of the evaluated planners."""
     found = {about["config"]: result for about, result in runner.read("planning", job, folder)}
     records, rows = {name: found[name] for name in CONFIGS if name in found}, []
     for name, some in records.items():
@@ -522,7 +522,7 @@ def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
 
 @command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
-    """Measure planners on the frozen goals and draw the tables from all that were measured."""
+    """Evaluate planners on the frozen goals and make the tables of all evaluated planners."""
     options = runner.parser("planning", main.__doc__).parse_args(argv)
     return runner.make([job(name) for name in CONFIGS], "planning", options, tables)
 

@@ -1,10 +1,10 @@
-"""Pose goals by pushing alone: position and yaw of objects that are only seen.
+"""Pose goals by pushing only: position and yaw of objects that are known only from their image.
 
     python -m experiments.pose_goals [--only model|goals]
 
-`model` tunes the pretrained neural process to off-centre pushes of drawn cuboids and prisms in the
-simulated world, told by their outlines: about 5 minutes of a core. `goals` plans and executes with
-it on other objects, with the ideal camera and with the Kinect: about 5 minutes.
+`model` fine-tunes the pretrained neural process on off-centre pushes of random cuboids and prisms,
+given their outlines, in the simulated world (about 5 minutes on one core). `goals` plans and
+executes with it on other objects, with both cameras (about 5 minutes).
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ HEIGHTS_M = 0.04, 0.06
 FIRST_GOAL, N_GOALS, GOAL_PUSHES, GOAL_LENGTHS_M = 10_000, 50, 2, (0.015, 0.045)
 CORRECTIONS = 4
 TURN_M = 0.04
-"""So many metres a radian counts: 2 mm for 3°."""
+"""Weight of yaw errors [m/rad] relative to position errors: 3° count as 2 mm."""
 N_IMAGES = {"ideal": 1, "kinect": 8}
-"""Of which an observation is the mean."""
+"""Number of images over which an observation averages, by camera."""
 WITHIN_M, WITHIN_RAD = 0.005, math.radians(5)
 
 
@@ -54,25 +54,25 @@ SEEN = "np_seen_objects"
 
 
 class PretrainedNeuralProcess:
-    """A neural process for objects that were only seen: what it conditions on are told feet."""
+    """A neural process for objects known only from their image, given feet from their outline."""
 
     def __init__(self, name_or_path: str | Path = SEEN) -> None:
         self.network = load_neural_process(name_or_path)
 
     def predict(self, pushes: PushLog) -> tuple[np.ndarray, np.ndarray]:
-        """Mean and σ (n, 3) of displacement [m] and turn [rad], in the object's frame."""
+        """Predict mean and σ (n, 3) of displacement [m] and turn [rad], in the object's frame."""
         rows = push_rows(pushes)
         feet = told_feet(pushes)[0]
         return in_object_frame(pushes, *self.network.predict(rows[:, :7], rows[:0], feet))
 
 
 def drawn_object(rng: np.random.Generator) -> TabletopObject:
-    """A cuboid or a prism, 4 to 8 cm wide and 4 to 6 cm tall: so much of the rod is free."""
+    """Sample a cuboid or a prism, 4 to 8 cm wide and 4 to 6 cm tall, as the rod is short."""
     return (Cuboid, Prism)[int(rng.integers(2))].sample(rng, height_range_m=HEIGHTS_M)
 
 
 def collect(n_objects: int, seed: int) -> tuple[Tensor, Tensor]:
-    """Pushes (n, 12, 10) of drawn objects as the neural process takes them, and feet (n, 12, 3)."""
+    """Collect pushes (n, 12, 10) of random objects for the neural process, and feet (n, 12, 3)."""
     rng, rows, feet = np.random.default_rng(seed), [], []
     with Tabletop() as world:
         while len(rows) < n_objects:
@@ -99,27 +99,27 @@ def collect(n_objects: int, seed: int) -> tuple[Tensor, Tensor]:
 
 
 class Remembered:
-    """A model that predicts the candidates of plans once, for they are the same for one seed."""
+    """Caches a model's prediction for candidate pushes, which are the same for one seed."""
 
     def __init__(self, model: PushModel) -> None:
         self.model, self.known = model, None
 
     def predict(self, pushes: PushLog) -> tuple[np.ndarray, np.ndarray]:
-        """As the model predicted the first pushes."""
+        """Return the model's prediction for the first pushes."""
         if self.known is None:
             self.known = self.model.predict(pushes)
         return self.known
 
 
 def observed(world: Tabletop) -> Observation:
-    """What the robot sees of the object, the mean of some images of the Kinect."""
+    """Observe the object; position and image are means over several images of the Kinect."""
     views = [world.observe() for _ in range(N_IMAGES[world.config.camera])]
     x, y = np.mean([view.xy_m for view in views], axis=0).tolist()
     return Observation((x, y), np.mean([view.image for view in views], axis=0))
 
 
 def act(world: Tabletop, step: Step, seen: Observation) -> None:
-    """Execute a step where the plan has the object, whether it is there or not."""
+    """Execute a step at the object's position in the plan, whether it is there or not."""
     command = Command.of(step.primitive, 1.0, True)
     seen = replace(seen, xy_m=tuple(step.predicted_path_xy_m[0].tolist()))
     execute(world.arm, world.placed, command, seen, 0.0, approach=False)
@@ -128,12 +128,12 @@ def act(world: Tabletop, step: Step, seen: Observation) -> None:
 def pursue(
     world: Tabletop, model: PushModel, goal: tuple[float, float, float], log: PushLog | None = None
 ) -> Iterator[int]:
-    """Push an object to a goal (x, y, turn); nothing is known but what is observed.
+    """Push an object to a goal (x, y, turn), using only observations.
 
-    A plan of up to three pushes is executed as it is, from one observation. Then up to four times
-    the robot looks and does the first push of a new plan, until none is expected to help. log: of
-    an object that stands as it did there; others are known by their image. Yields how many pushes
-    were made, after the plan and after the corrections.
+    A plan of up to three pushes is executed open loop from one observation. Then, up to four times,
+    the robot observes the object and executes the first push of a new plan, unless no improvement
+    is predicted. log: pushes of this object, in its current pose; None uses the image's outline.
+    Yields the number of pushes after the plan, and after the corrections.
     """
     first = seen = observed(world)
     log = log or pushes_around(outline_of(first.image), ROD_WIDTH_M / 2)
@@ -161,7 +161,7 @@ def pursue(
 
 
 def attempt(world: Tabletop, *arguments) -> list[dict]:
-    """What a pursuit leaves to its goal, of plan and corrections, by the simulator."""
+    """Return the errors (ground truth) after the plan and after the corrections of `pursue`."""
     (*_, start), rows = world.object_pose(), []
     goal = arguments[1]
     for pushes in pursue(world, *arguments):
@@ -173,7 +173,7 @@ def attempt(world: Tabletop, *arguments) -> list[dict]:
 
 
 def task(world: Tabletop, rng: np.random.Generator) -> tuple[TabletopObject, list, list]:
-    """An object, a pose (x, y, yaw), and another one where random pushes took it from there."""
+    """Sample an object, a start pose (x, y, yaw), and a goal pose reached by random pushes."""
     while True:
         obj, start = drawn_object(rng), [*rng.uniform(-0.1, 0.1, 2), rng.uniform(-math.pi, math.pi)]
         world.place(obj, tuple(start[:2]), start[2], tool="rod")
@@ -185,7 +185,7 @@ def task(world: Tabletop, rng: np.random.Generator) -> tuple[TabletopObject, lis
 
 
 def summary(rows: list[dict], by: list[str]) -> list[dict]:
-    """Statistics of what trials leave."""
+    """Return statistics of the trials' errors, grouped by some columns."""
     table = pd.DataFrame(rows)
     near = (table["position_m"] <= WITHIN_M) & (table["yaw_rad"] <= WITHIN_RAD)
     table["within_percent"] = 100.0 * near
@@ -203,7 +203,7 @@ def summary(rows: list[dict], by: list[str]) -> list[dict]:
 
 
 def goals(n: int = N_GOALS) -> dict[str, list[dict]]:
-    """The table, and the trials that it is made of."""
+    """Return the table of goals and its trials."""
     model, rows = PretrainedNeuralProcess(), []
     for camera in N_IMAGES:
         with Tabletop(WorldConfig(camera=camera)) as world:
@@ -219,7 +219,7 @@ def goals(n: int = N_GOALS) -> dict[str, list[dict]]:
 
 
 def tune() -> None:
-    """Collect, train and write the checkpoint."""
+    """Collect data, fine-tune the model and write the checkpoint."""
     model, parts = load_neural_process(), [collect(N_OBJECTS, seed) for seed in range(N_PARTS)]
     rows, feet = (torch.cat(part) for part in zip(*parts, strict=True))
     train_neural_process(model, rows, feet, TRAINING, torch.Generator().manual_seed(0))
@@ -229,7 +229,7 @@ def tune() -> None:
 
 @command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
-    """Tune the model, pursue the goals, or both."""
+    """Fine-tune the model, execute the goals, or both."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", choices=("model", "goals"))
     only = parser.parse_args(argv).only

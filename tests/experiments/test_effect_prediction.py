@@ -44,7 +44,7 @@ FEW = [job("constant", "grasp", fold=fold) for fold in range(3)]
         (lever_job, {"model": "cnp_last_pose_single"}, "must be one of .*window.*, got 'all'"),
         (lever_job, {"model": "cnp", "trained_for": "window"}, "must be .*all.*, got 'window'"),
         (lever_job, {"model": "cnp_last_pose", "edges_left_out": 9}, "edges_left_out must be .* 8"),
-        (lever_job, {"model": "cnp_last_pose", "epochs": 2}, "epochs belong to 'lstm_seker2019'"),
+        (lever_job, {"model": "cnp_last_pose", "epochs": 2}, "epochs are only for 'lstm_seker"),
     ],
 )
 def test_jobs_that_cannot_be_are_refused(make, arguments, reason):
