@@ -45,8 +45,8 @@ setup: $(STAMP) ## Make .venv and install everything into it (PYTHON=python3.11)
 	@echo "The environment is ready: .venv"
 
 # The stamp is written last and holds the folder. Without it (never finished) or with another
-# folder in it (moved) the environment is made anew; otherwise pip brings it up to date. A second
-# make waits for the first, and finds it done.
+# folder in it (moved) the environment is made again; otherwise pip brings it up to date. A second
+# make waits for the first, and then has nothing to do.
 ifneq ($(shell cat $(STAMP) 2>/dev/null),$(CURDIR))
 .PHONY: $(STAMP)
 endif
@@ -70,12 +70,12 @@ $(STAMP): $(INPUTS)
 	 echo '$(QUIET)' > .venv/share/jupyter/lab/settings/overrides.json; \
 	 printf '%s' "$(CURDIR)" > $@
 
-# Two notebooks of one thread each finish sooner than one after the other with two.
-workbook: $(STAMP) ## Run all notebooks into runs/, two side by side (PROFILE=smoke|reader|full WORKERS= SEED= OUT= ONLY= ARGS= DRY_RUN=1)
+# Two notebooks in parallel with one thread each finish earlier than in sequence with two threads.
+workbook: $(STAMP) ## Run all notebooks into runs/, two in parallel (PROFILE=smoke|reader|full WORKERS= SEED= OUT= ONLY= ARGS= DRY_RUN=1)
 	@set -f; $(if $(filter-out 1,$(WORKERS)),OMP_NUM_THREADS=1) $(PY) -m affordlib.workbook --workers "$$WORKERS" --profile "$${PROFILE:-reader}" --seed "$${SEED:-0}" \
 	  --out "$$OUT" --only "$$ONLY" $(if $(FORCE),--force) $(if $(DRY_RUN),--dry-run) -- $$ARGS
 
-seeds: $(STAMP) ## Run them for several seeds, and write tables over seeds (SEEDS="0 1 2" WORKERS=2 …)
+seeds: $(STAMP) ## Run all notebooks for several seeds, and write tables over seeds (SEEDS="0 1 2" WORKERS=2 …)
 	@set -f; $(PY) -m experiments.seeds $$SEEDS --workers "$$WORKERS" \
 	  --profile "$${PROFILE:-reader}" --out "$$OUT" --only "$$ONLY" $(if $(FORCE),--force) $(if $(DRY_RUN),--dry-run) \
 	  --settings $$ARGS
@@ -85,31 +85,31 @@ lab: $(STAMP) ## Open the book in JupyterLab, on this machine only
 	  JUPYTER_PREFER_ENV_PATH=1 $(PY) -m jupyterlab --ip=127.0.0.1 $$root \
 	  --ServerApp.root_dir="$(CURDIR)" --LabApp.default_url=/lab/tree/notebooks/00_start_here.ipynb
 
-# On one thread: tests are many small sums, and share their machine with browsers and clusters.
+# One thread, because tests compute many small operations and share the machine with a browser.
 test test-fast test-plain: export OMP_NUM_THREADS := 1
 
-test: $(STAMP) ## Run all tests, notebooks included (JOBS=2 side by side)
+test: $(STAMP) ## Run all tests, including the notebooks (JOBS=2 in parallel)
 	@$(PY) -m pytest -n "$(JOBS)" --dist loadfile --no-loadscope-reorder --durations=15
 
-test-fast: $(STAMP) ## Run the tests that take seconds, without the notebooks
+test-fast: $(STAMP) ## Run only the fast tests, without the notebooks
 	@$(PY) -m pytest -n "$(JOBS)" --dist worksteal -m "not slow"
 
-test-plain: $(STAMP) ## The same without the processor's vector instructions, as another processor sums
+test-plain: $(STAMP) ## Run the fast tests without vector instructions, as on another processor
 	@ATEN_CPU_CAPABILITY=default $(if $(filter x86_64,$(shell uname -m)),OPENBLAS_CORETYPE=Nehalem) \
 	  NPY_DISABLE_CPU_FEATURES="$$($(PY) -c 'import numpy._core._multiarray_umath as m; print(*(f for f in m.__cpu_dispatch__ if m.__cpu_features__[f]))')" \
 	  $(PY) -m pytest -n "$(JOBS)" --dist worksteal -m "not slow"
 
-test-slow: $(STAMP) ## Run every notebook and solution as the reader does; the log is runs/test-slow.log
+test-slow: $(STAMP) ## Run every notebook and solution as a reader does; the log is runs/test-slow.log
 	@mkdir -p runs; { $(PY) -m affordlib.workbook --profile reader --out test-slow --force; \
 	  $(PY) -m pytest tests/test_exercises.py tests/show/test_browser*.py; } 2>&1 | tee runs/test-slow.log
 
-soak: $(STAMP) ## Plan and execute 3,000 times: memory must stay, and the same task end the same (15 min)
+soak: $(STAMP) ## Plan and execute 3,000 times; check that memory and results stay the same (15 min)
 	@OMP_NUM_THREADS=1 $(PY) -m tests.soak
 
-size: $(STAMP) ## Count lines and files, and fail above the budgets
+size: $(STAMP) ## Count lines and files, and fail if they exceed the budgets
 	@$(PY) -m tests.size
 
-book-check: $(STAMP) ## Measure every page of the book, and fail on what its style does not allow
+book-check: $(STAMP) ## Measure every page of the book, and fail if one violates the style
 	@$(PY) -m tests.book_check
 
 lint: $(STAMP) ## Check style and formatting
@@ -120,33 +120,33 @@ format: $(STAMP) ## Format the code, notebooks included
 	@$(PY) -m ruff check --fix
 	@$(PY) -m ruff format
 
-bench: $(STAMP) ## Run the benchmarks (KEEP=1 puts the times into data/results/speed.json)
+bench: $(STAMP) ## Run the benchmarks (KEEP=1 writes the times to data/results/speed.json)
 	@$(PY) -m experiments.speed $(if $(KEEP),--keep)
 
-data: $(STAMP) ## Collect the shipped data sets again and compare
+data: $(STAMP) ## Collect the shipped data sets again and compare them with the existing ones them with the existing ones
 	@$(PY) -m experiments.shipped data
 
 checkpoints: $(STAMP) ## Train the shipped models again (ONLY="film_500")
 	@$(if $(ONLY),,$(PY) -m experiments.shipped reachability)
 	@$(PY) -m experiments.shipped checkpoints $(if $(ONLY),--only $(ONLY))
 
-notebooks: $(STAMP) ## Execute the committed notebooks in place and clean them (ONLY= FORCE=1)
+notebooks: $(STAMP) ## Execute the committed notebooks in place and clean their metadata (ONLY= FORCE=1)
 	@$(PY) -m affordlib.workbook --in-place --only "$$ONLY" $(if $(FORCE),--force)
 
-html: $(STAMP) ## Write the committed notebooks as web pages, to be read without a network, into runs/html
+html: $(STAMP) ## Write the committed notebooks as web pages into runs/html, readable offline
 	@$(PY) -m nbconvert --config notebooks/book_html/config.py notebooks/*.ipynb notebooks/appendix/*.ipynb
 	@sed -i -E -e 's#href="(\.\./|appendix/)?([0-9A-Za-z_]+)\.ipynb#href="\2.html#g' \
 	  -e 's#href="(\.\./)+((data/)?[A-Za-z]+\.md)#href="../../\2#g' -e 's#href="solutions/#href="../../notebooks/solutions/#g' runs/html/*.html
 
-tables: $(STAMP) ## Draw the tables of README, RESULTS and data card from data/results
+tables: $(STAMP) ## Fill the tables of README, RESULTS and data card from data/results
 	@$(PY) -m experiments.tables README.md RESULTS.md data/README.md
 
-constraints: $(STAMP) ## Write constraints.txt from what is installed
+constraints: $(STAMP) ## Write constraints.txt from the installed packages
 	@{ sed -n '/^#/p;/^[^#]/q' constraints.txt; \
 	   $(PY) -m pip freeze --all --exclude pip --exclude affordlib -r requirements.txt \
 	     | sed -e '1,/^## The following/d' -e 's/+[^ ]*$$//'; } > constraints.txt.tmp
 	@mv constraints.txt.tmp constraints.txt
 
-clean: ## Remove runs/, caches and build leftovers; .venv stays
+clean: ## Remove runs/, caches and build files, but not .venv
 	@rm -rf runs build dist *.egg-info .pytest_cache .ruff_cache .hypothesis notebooks/.ipynb_checkpoints
 	@find affordlib tests experiments -name __pycache__ -type d -prune -exec rm -rf {} +

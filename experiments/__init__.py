@@ -1,1 +1,1 @@
-"""What made the tables, the shipped data and the shipped checkpoints."""
+"""Experiments that make the tables, the shipped data and the shipped checkpoints."""

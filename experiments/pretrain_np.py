@@ -1,10 +1,10 @@
-"""Pretrain the neural process on simulated pushes of drawn objects; about half an hour of a core.
+"""Pretrain the neural process on simulated pushes of random objects (half an hour on one core).
 
     python -m experiments.pretrain_np [--objects 12288] [--steps 7000] [--to PATH]
 
-Objects are convex outlines with three or four corners, on drawn feet and frictions; a push is
-`quasi_static_push` between poses that are measured with some scatter. Held-out objects are scored
-without that scatter, with 0, 5 and 32 pushes as context, told the feet or not.
+Objects are convex outlines with three or four corners and random feet and frictions; a push is
+`quasi_static_push` with measurement noise on the poses before and after. Errors on held-out objects
+are computed without this noise, with 0, 5 and 32 pushes as context, and with feet known or unknown.
 """
 
 from __future__ import annotations
@@ -37,19 +37,19 @@ _SHORT, _LONG = 0.12, 0.9
 
 
 def between(low: float, high: float, shape: tuple[int, ...], g: torch.Generator) -> Tensor:
-    """Uniform numbers."""
+    """Sample numbers uniformly from [low, high)."""
     return low + (high - low) * torch.rand(shape, generator=g)
 
 
 def log_between(low: float, high: float, shape: tuple[int, ...], g: torch.Generator) -> Tensor:
-    """Numbers whose logarithm is uniform."""
+    """Sample numbers from [low, high) with uniform logarithm."""
     return between(math.log(low), math.log(high), shape, g).exp()
 
 
 def outlines(n: int, g: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Corners (n, 4, 2), triangles with one twice, and the shares (n, 4) of the area at each edge.
+    """Sample outlines: corners (n, 4, 2), and shares (n, 4) of the area at each edge.
 
-    Counter-clockwise; centroid at 0, radius of gyration 1.
+    Corners are counter-clockwise (triangles repeat one); centroid 0, radius of gyration 1.
     """
     angle = (between(0.15, 0.85, (n, 4), g) + torch.arange(4)) * (math.pi / 2)
     of_three = (between(0.2, 0.8, (n, 3), g) + torch.arange(3)) * (2 * math.pi / 3)
@@ -72,7 +72,7 @@ def outlines(n: int, g: torch.Generator) -> tuple[Tensor, Tensor]:
 
 
 def points_inside(corners: Tensor, area: Tensor, k: int, g: torch.Generator) -> Tensor:
-    """k uniform points in each outline (n, k, 2)."""
+    """Sample k uniform points (n, k, 2) inside each outline."""
     edge = torch.multinomial(area.clamp_min(1e-9), k, replacement=True, generator=g)[..., None]
     a, b = (c.gather(1, edge.expand(-1, -1, 2)) for c in (corners, corners.roll(-1, 1)))
     out = torch.rand(len(corners), k, 1, generator=g).sqrt()
@@ -81,7 +81,7 @@ def points_inside(corners: Tensor, area: Tensor, k: int, g: torch.Generator) -> 
 
 
 def weights_of_three(feet: Tensor) -> Tensor:
-    """The share (n, 3) that each of three feet (n, 3, 2) carries of a weight at the origin."""
+    """Return the shares (n, 3) of a weight at the origin that three feet (n, 3, 2) carry."""
     rows = torch.cat([feet.transpose(1, 2), torch.ones(len(feet), 1, 3)], 1)
     flat = torch.linalg.det(rows).abs() < 1e-2
     rows = torch.where(flat[:, None, None], torch.eye(3), rows)
@@ -90,7 +90,7 @@ def weights_of_three(feet: Tensor) -> Tensor:
 
 
 def supports(corners: Tensor, area: Tensor, g: torch.Generator) -> Tensor:
-    """Feet (n, 12, 3): three that carry the object, twelve of drawn weights, or a whole face."""
+    """Sample feet (n, 12, 3): three that carry the object, twelve of random weight, or a face."""
     n, kind = len(corners), torch.rand(len(corners), generator=g)
     three = points_inside(corners, area, 3, g)
     for _ in range(60):
@@ -110,7 +110,7 @@ def supports(corners: Tensor, area: Tensor, g: torch.Generator) -> Tensor:
 
 
 def simulate(n: int, g: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
-    """Pushes of n objects (n, 48, 10) as measured, feet (n, 12, 3), true outcomes (n, 48, 3)."""
+    """Simulate measured pushes (n, 48, 10), feet (n, 12, 3) and ground truth (n, 48, 3)."""
     shape = (n, PUSHES)
     corners, area = outlines(n, g)
     feet = supports(corners, area, g)
@@ -138,7 +138,7 @@ def simulate(n: int, g: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
     truth = quasi_static_push(
         push.flatten(0, 1), each.flatten(0, 1), friction.flatten(), smoothing
     ).unflatten(0, shape)
-    # The poses before and after are measured off; the contact computed still lies on the edge.
+    # Poses before and after have measurement noise; the computed contact stays on the edge.
     scatter = log_between(0.002, 0.012, (n, 1, 1), g)
     before, after = (scatter * torch.randn(*shape, 3, generator=g) for _ in range(2))
     turn = rotation(-before[..., 2].flatten(), torch.zeros(n * PUSHES) > 0).unflatten(0, shape)
@@ -157,7 +157,7 @@ def simulate(n: int, g: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def simulate_many(n: int, seed: int) -> list[Tensor]:
-    """As `simulate`, in chunks, each with a smoothing of its own."""
+    """Simulate in chunks, each with its own smoothing."""
     g = torch.Generator().manual_seed(seed)
     chunks = [simulate(CHUNK, g) for _ in range(math.ceil(n / CHUNK))]
     return [torch.cat(part) for part in zip(*chunks, strict=True)]
@@ -165,7 +165,7 @@ def simulate_many(n: int, seed: int) -> list[Tensor]:
 
 @torch.no_grad()
 def held_out_errors(model: NeuralProcess, held_out: list[Tensor]) -> dict[str, list[float]]:
-    """Mean distance and turn, in percent of the radius and degrees, by what the model is given."""
+    """Return mean errors of position [% of the gyration radius] and turn [deg] by given inputs."""
     rows, feet, truth = held_out
     truth = in_contact_frame(rows, truth)[:, 32:]
     errors = {}
@@ -179,7 +179,7 @@ def held_out_errors(model: NeuralProcess, held_out: list[Tensor]) -> dict[str, l
 
 @command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
-    """Simulate, train, and write the checkpoint with its held-out errors."""
+    """Simulate, train, and write the checkpoint with its errors on held-out objects."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--objects", type=whole_type(64, 10**6), default=12288)
     parser.add_argument("--steps", type=whole_type(1, 10**7), default=7000)

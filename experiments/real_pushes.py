@@ -1,10 +1,10 @@
-"""Real pushes of one object: who predicts them best, from how few, told what.
+"""Real pushes of one object: errors of models by number of training pushes and known context.
 
     python -m experiments.real_pushes --logs FOLDER
 
-makes `data/results/real_pushes.json`; with `--tune` as well how steps and rates of tuning to few
-pushes do on inner folds of the two conditions for choosing. FOLDER holds the logs of seven
-conditions, as published (or compressed by xz): github.com/robinzhoucmu/Pushing,
+makes `data/results/real_pushes.json`; `--tune` also compares steps and learning rates of tuning to
+few pushes on inner folds of the two conditions CHOSEN_ON. FOLDER contains the logs of seven
+conditions, as published (or compressed with xz): github.com/robinzhoucmu/Pushing,
 icra_data_proc/SensorLogs (Apache License 2.0; Zhou, Paolini, Bagnell and Mason, A convex polynomial
 force-motion model for planar sliding, ICRA 2016).
 """
@@ -32,7 +32,7 @@ from experiments.runner import FOLDER, Job, Rows, frame, interval, read, run
 
 TABLE = "real_pushes"
 CHOSEN_ON = ("hardboard_3points1", "plywood_3points3")
-"""Steps and rates of tuning were chosen on these; the other five decide whether they were luck."""
+"""Conditions on which steps and rates of tuning were chosen; the other five are for testing."""
 SHOTS = (0, 5, 10)
 CORNERS_MM = ((0, 0), (150, 0), (0, 150))
 SUPPORTS_MM = {
@@ -49,7 +49,7 @@ CONDITIONS = (
 
 
 def feet_of(support: str) -> np.ndarray:
-    """Feet (12, 3) from the centroid: x, y [m], share of the weight; a face by points all over."""
+    """Return feet (12, 3): x, y [m] from the centroid, share of weight; a face has 12 points."""
     feet = np.zeros((12, 3))
     if SUPPORTS_MM[support] is None:
         cells = [(i + 1 / 3, j + 1 / 3) for i in range(4) for j in range(4 - i)]
@@ -64,9 +64,9 @@ def feet_of(support: str) -> np.ndarray:
 
 
 def pushes_of(path: Path) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Of each push of a file: poses (2, 7) before and after, times and positions of the tool.
+    """Yield for each push of a file: poses (2, 7) before and after, times, positions of the tool.
 
-    A pose is x, y, z and a quaternion w, i, j, k. Raises ValueError for a file that is damaged.
+    A pose is x, y, z and a quaternion w, i, j, k. Raises ValueError if the file is damaged.
     """
 
     def take(columns: int, rows: int | None = None) -> np.ndarray:
@@ -85,19 +85,19 @@ def pushes_of(path: Path) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]
 
 
 def planar(pose: np.ndarray) -> tuple[float, float, float]:
-    """x, y and yaw of a pose (7,)."""
+    """Return x, y and yaw of a pose (7,)."""
     x, y, _, w, i, j, k = pose
     return x, y, math.atan2(2 * (w * k + i * j), 1 - 2 * (j * j + k * k))
 
 
 @lru_cache
 def read_logs(folder: str | Path, told: bool = True) -> PushLog:
-    """All pushes of the seven conditions."""
+    """Read all pushes of the seven conditions; told: include the feet as context."""
     log = Log(unit="mm", outline=CORNERS_MM, crop_width_m=0.24)
     for name in CONDITIONS:
         found = sorted(Path(folder).glob(f"{name}.txt*"))
         if not found:
-            raise FileNotFoundError(f"there is no {name}.txt or {name}.txt.xz in {folder}")
+            raise FileNotFoundError(f"--logs: there is no {name}.txt or {name}.txt.xz in {folder}")
         context = {"feet": feet_of(name.split("_")[1])} if told else {}
         for (start, end), t, xy in pushes_of(found[0]):
             log.add(planar(start), t, xy, end=planar(end), context=context, group=name)
@@ -105,7 +105,7 @@ def read_logs(folder: str | Path, told: bool = True) -> PushLog:
 
 
 def from_40(data: PushLog, names: tuple[str, ...], seed: int, fold: int) -> pd.DataFrame:
-    """Of each condition, trained on its other folds alone."""
+    """Return errors on a fold of each condition, trained on the condition's other folds."""
     tested, parts = folds_of(data.groups, 5, seed) == fold, []
     for name in CONDITIONS:
         of_group = data.groups == name
@@ -114,15 +114,15 @@ def from_40(data: PushLog, names: tuple[str, ...], seed: int, fold: int) -> pd.D
 
 
 def pooled(data: PushLog, names: tuple[str, ...], seed: int, fold: int) -> pd.DataFrame:
-    """Trained on the other folds of all conditions."""
+    """Return errors on a fold of all conditions, trained on the other folds of all conditions."""
     tested = folds_of(data.groups, 5, seed) == fold
     return errors_of(data, ~tested, tested, names, seed)
 
 
 def unseen(data: PushLog, names: tuple[str, ...], seed: int, fold: int) -> pd.DataFrame:
-    """Of a condition, trained on the six others and the first 0, 5 and 10 pushes of it.
+    """Return errors on a condition, trained on the six others and its first 0, 5 and 10 pushes.
 
-    The neural process learns of the others alone: the first pushes are only its context.
+    The neural process is trained on the others only and uses the first pushes as context.
     """
     of_group = data.groups == CONDITIONS[fold]
     order = np.random.default_rng(seed).permutation(np.flatnonzero(of_group))
@@ -146,16 +146,16 @@ COLUMNS = ["model", "shots", "push", "position_m", "yaw_rad", "inside_50", "insi
 
 
 def measure(logs: str, protocol: str, predictor: str, told: bool, seed: int, fold: int) -> dict:
-    """The errors per push of one fold."""
+    """Return the errors per push of one fold."""
     names = (predictor,)
-    if predictor == "baselines":  # only these can be told feet
+    if predictor == "baselines":  # only physics_feet… use known feet
         names = tuple(name for name in BASELINES if name.startswith("physics_feet") == told)
     errors = PROTOCOLS[protocol][0](read_logs(logs, told), names, seed, fold)
     return {"errors": errors.reindex(columns=COLUMNS).fillna({"shots": -1}).to_dict("list")}
 
 
 def job(protocol: str, predictor: str, told: bool, seed: int, fold: int, logs: str = "") -> Job:
-    """One fold of a protocol; where the logs lie decides nothing."""
+    """Return the job of one fold of a protocol; the path of the logs is not part of its key."""
     arguments = {"protocol": protocol, "predictor": predictor, "told": told}
     arguments |= {"seed": seed, "fold": fold}
     settings, checkpoints = (EFFORT, (PRETRAINED,)) if predictor == "np" else ((), ())
@@ -167,9 +167,9 @@ STEPS, RATES, INNER_FOLDS = (50, 100, 200), (1e-4, 3e-4), 5
 
 
 def tune(logs: str, steps: int, rate: float, condition: str, fold: int) -> dict:
-    """Errors per push of one way of tuning to few pushes, of an inner fold of a condition.
+    """Return errors per push on an inner fold of a condition, with given settings of tuning.
 
-    The pushes that the tables test first (fold 0 of seed 0) take no part.
+    The test pushes of fold 0 of seed 0 are excluded.
     """
     data = read_logs(logs, told=False)
     data = data.select((data.groups == condition) & (folds_of(data.groups, 5, 0) > 0))
@@ -181,15 +181,15 @@ def tune(logs: str, steps: int, rate: float, condition: str, fold: int) -> dict:
 
 
 def tuning_job(steps: int, rate: float, condition: str, fold: int, logs: str = "") -> Job:
-    """One way of tuning to few pushes, on a fold of a condition."""
+    """Return the job of one setting of tuning to few pushes, on a fold of a condition."""
     arguments = {"steps": steps, "rate": rate, "condition": condition, "fold": fold}
     return Job(partial(tune, logs), arguments, EFFORT["few"][2], checkpoints=(PRETRAINED,))
 
 
 def tuning_rows(folder: str | Path = FOLDER) -> Rows:
-    """Ways of tuning to few pushes, and push by push how much worse each is than that of `fit`.
+    """Return errors by settings of tuning, and paired differences to the settings of `fit`.
 
-    both: the error of position and that of the turn on the radius of gyration; it decides.
+    both: the position error plus the yaw error times the radius of gyration, used to choose.
     """
     found, rows = frame(read(TUNING, tuning_job, folder), "errors"), []
     pushes = found.set_index(["steps", "rate", "condition", "push"]).sort_index()
@@ -203,9 +203,9 @@ def tuning_rows(folder: str | Path = FOLDER) -> Rows:
 
 
 def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
-    """Errors by protocol, model and what was told; beside the best baseline, push by push.
+    """Return errors by protocol, model and context, and paired differences to the best baseline.
 
-    A push's error is the mean over seeds, so that each push counts once.
+    A push's error is its mean over seeds, so that each push counts once.
     """
     every = frame(read(TABLE, job, folder), "errors").drop(columns=["fold", "predictor"])
     keys = ["protocol", "told", "shots", "model"]
@@ -229,11 +229,11 @@ def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
 
 
 def differences(errors: pd.DataFrame) -> Rows:
-    """The neural process minus the best baseline, over the pushes of which both have an error.
+    """Return differences, neural process minus best baseline, over pushes predicted by both.
 
-    errors: (pushes, columns of each model and what it was told). Best has the least mean position
-    error, of those told the feet and of the others. The 95 % intervals are a bootstrap's over
-    pushes, not over seeds.
+    errors: (pushes, columns of each model and its context). The best baseline has the smallest mean
+    position error, among those with and those without known feet. The 95 % intervals are from a
+    bootstrap over pushes, not over seeds.
     """
     mean, rows = errors["position_m"].mean(), []
     for _, told in (key for key in mean.index if key[0] == "np"):
@@ -249,16 +249,16 @@ def differences(errors: pd.DataFrame) -> Rows:
 
 
 def named(name: str, unit: str) -> list[str]:
-    """The columns of a mean of differences and its interval."""
+    """Return the names of the columns of a mean difference and its interval."""
     return [f"{name}_{what}_{unit}" for what in ("mean", "low", "high")]
 
 
 @command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run what is missing, and make the tables."""
+    """Run missing jobs and make the tables."""
     parser = runner.parser(TABLE, __doc__.splitlines()[0])
-    parser.add_argument("--logs", help="folder of the published logs; without it, tables alone")
-    parser.add_argument("--tune", action="store_true", help="settings of tuning to few pushes")
+    parser.add_argument("--logs", help="folder of the published logs; without it, only tables")
+    parser.add_argument("--tune", action="store_true", help="compare settings of tuning")
     options = parser.parse_args(argv)
     ways = itertools.product(STEPS, RATES, CHOSEN_ON, range(INNER_FOLDS)) if options.tune else ()
     tunings = [tuning_job(*way, options.logs) for way in ways]
@@ -268,7 +268,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         for protocol, (_, folds) in PROTOCOLS.items()
         for predictor, told in itertools.product(NAMES, (False, True))
         for seed, fold in itertools.product(range(3 if predictor == "np" else 1), range(folds))
-        # Of one condition all are told the same.
+        # Within one condition, the feet are the same for all pushes.
         if predictor == "baselines" or not told or protocol != "from_40"
     ]
     return runner.make(jobs if options.logs and not tunings else [], TABLE, options, tables)

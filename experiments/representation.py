@@ -1,9 +1,9 @@
-"""Studies of what networks represent: the latent space, rollability, and which behaviour to use.
+"""Studies of learned representations: the latent space, rollability, and the choice of a primitive.
 
-latent: how similar the code r of an action and that of its effect are, and what w₁ changes.
-rollability: whether an object rolls, learned from its depth image alone, beside the rule by
-curvature. push_and_drag_model: the paper's single model of pushes and drags, which decodes from the
-wanted effect which of the two an object needs.
+latent: similarity of the codes r of an action and of its effect, and the influence of w₁.
+rollability: predicts from the depth image whether an object rolls, with a learned model and with a
+rule on curvature. push_and_drag_model: the paper's single model of pushes and drags, which decodes
+from the desired effect which of the two an object needs.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ from experiments.runner import Rows, study
 from experiments.shipped import CHECKPOINT_SPECS
 
 TRAINING = replace(CHECKPOINT_SPECS["film_500"].training, steps=1500)
-"""Of `push_and_drag_model` and `perturbed_world`; shorter than that of the shipped networks."""
+"""Training of `push_and_drag_model` and `perturbed_world`, shorter than for shipped networks."""
 
 LATENT_MODELS = ("cnp_500", "film_500")
 WEIGHTS = (0.25, 0.5, 0.75)
 PUSH_START_MIN_RADIUS_M = 0.1
-"""A decoded action that starts farther from the object is a push, else a drag."""
+"""Distance [m] of a decoded action's start from the object above which it is a push, not a drag."""
 
 
 def cka(a: torch.Tensor, b: torch.Tensor) -> float | None:
-    """Linear centred kernel alignment of codes (N, D) and (N, E), 1 for equal up to a turn.
+    """Return the linear centred kernel alignment (CKA) of codes (N, D) and (N, E).
 
-    None where codes are all the same, as those of actions in the frame of the push. Kornblith et
-    al., Similarity of neural network representations revisited, ICML 2019.
+    It is 1 for codes that are equal up to rotation, None if all codes are equal, as for actions in
+    the push frame. Kornblith et al., Similarity of neural network representations revisited, 2019.
     """
     if min(v.std(dim=0).norm() / v.mean(dim=0).norm() for v in (a, b)) < 1e-3:
         return None
@@ -54,7 +54,7 @@ def cka(a: torch.Tensor, b: torch.Tensor) -> float | None:
 
 
 def _seen_by(arrays: InteractionTensors, observed: str, weight: float) -> Observations:
-    """The action at t = 0 and 1, the effect at t = 0.8 and 1, or both, blended by w₁."""
+    """Return a context of the action at t = 0 and 1, the effect at t = 0.8 and 1, or both."""
     last = len(arrays.phase) - 1
     ends, late = torch.tensor([0, last]), torch.tensor([round(0.8 * last), last])
     action = None if observed == "effect" else arrays.action_at(ends)
@@ -63,7 +63,7 @@ def _seen_by(arrays: InteractionTensors, observed: str, weight: float) -> Observ
 
 
 def _code(model: Any, observed: Observations) -> Tensor:
-    """What a model makes of observations (B, D), in its frame."""
+    """Return a model's code (B, D) of observations, in its frame."""
     channels = model.action_channels, model.effect_channels
     if model.config.frame == "push":
         back = inverse(push_direction(observed, *channels))
@@ -74,7 +74,7 @@ def _code(model: Any, observed: Observations) -> Tensor:
 @study("push_test", checkpoints=LATENT_MODELS, settings=WEIGHTS)
 @torch.no_grad()
 def latent() -> Rows:
-    """Alignment of the codes r of `push_test`, and the errors of what is decoded from them."""
+    """Measure the alignment of the codes r on `push_test`, and errors of predictions from them."""
     data, rows = open_interactions("push_test"), []
     for name in LATENT_MODELS:
         model, _ = load_checkpoint(name)
@@ -98,7 +98,7 @@ def latent() -> Rows:
 
 
 class Rollability(nn.Module):
-    """P(rolls) of the object in an image (B, 2, 48, 48); see `learn_rollability`."""
+    """Predicts P(rolls) for the object in an image (B, 2, 48, 48); see `learn_rollability`."""
 
     def __init__(self, image_mean: Tensor, image_std: Tensor, width: int = 32) -> None:
         super().__init__()
@@ -108,23 +108,23 @@ class Rollability(nn.Module):
         self.head = nn.Sequential(*dense(self.harmonics.n_features, width, width, 1))
 
     def image_features(self, image: Float[Tensor, "b 2 48 48"]) -> Float[Tensor, "b f"]:
-        """The circular harmonics (B, F) of standardised depth and mask."""
+        """Return the circular harmonics (B, F) of standardised depth and mask."""
         mean, std = (v[:, None, None] for v in (self.image_mean, self.image_std))
         return self.harmonics((image - mean) / std)
 
     def forward(self, image: Float[Tensor, "b 2 48 48"]) -> Float[Tensor, " b"]:
-        """P(rolls) (B,)."""
+        """Return P(rolls) (B,)."""
         return torch.sigmoid(self.head(self.image_features(image)).squeeze(1))
 
 
 def learn_rollability(
     data: xr.Dataset, interactions: np.ndarray, steps: int = 400, seed: int = 0
 ) -> Rollability:
-    """Learn from the images of interactions and whether their objects rolled, in a few seconds."""
+    """Train on the images of interactions and whether their objects are rollable (in seconds)."""
     images = torch.from_numpy(data["image"].values[interactions])
     rolls = torch.from_numpy(data["rollable"].values[interactions].astype(np.float32))
     if not 0 < rolls.mean() < 1:
-        raise ValueError("interactions must be of objects that roll and of such that do not")
+        raise ValueError("interactions must be of objects that roll and of objects that do not")
     torch.manual_seed(seed)
     generator = torch.Generator().manual_seed(seed)
     std = images.std(dim=(0, 2, 3)).clamp_min(1e-6)
@@ -150,7 +150,7 @@ ROLLING = ("mixed", "partial", "push_test", "drag", "reach")
 
 @study(*ROLLING)
 def rollability() -> Rows:
-    """Accuracy of rollability: learned from 400 images of `mixed`, and by curvature."""
+    """Measure the accuracy of rollability, learned from 400 images of `mixed` and by curvature."""
     mixed = open_interactions("mixed")
     split = split_interactions(mixed.sizes["interaction"])
     model = learn_rollability(mixed, split.train)
@@ -179,10 +179,10 @@ def rollability() -> Rows:
 
 @study("mixed", "partial", settings=(TRAINING, FiLMConfig(), PUSH_START_MIN_RADIUS_M))
 def push_and_drag_model() -> Rows:
-    """One model of pushes and drags decodes, from the wanted effect alone, which of them to use.
+    """Measure how often a model of pushes and drags decodes the right one from a desired effect.
 
-    Objects of `partial` are to be moved in random directions by the median effect of drags, and by
-    that of pushes; the model was trained on none of these objects, and gets no switch.
+    The desired effects are random directions with the median length of drags or pushes, for objects
+    of `partial`, on which the model was not trained. The primitive is not an input.
     """
     data, other = open_interactions("mixed"), open_interactions("partial")
     split = split_interactions(data.sizes["interaction"])
@@ -209,7 +209,7 @@ def push_and_drag_model() -> Rows:
 
 
 def _seen_and_rolls(data: xr.Dataset, rows: np.ndarray) -> tuple[InteractionTensors, np.ndarray]:
-    """Valid interactions, and whether their objects roll."""
+    """Return valid interactions, and whether their objects are rollable."""
     rolls = data["rollable"].values[valid_interactions(data, rows)]
     return InteractionTensors.from_dataset(data, rows), rolls
 

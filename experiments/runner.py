@@ -1,9 +1,9 @@
-"""One way to run experiments: jobs whose results are kept, resumed, and refused when stale.
+"""The runner of all experiments: jobs whose results are stored, resumed, and rejected when stale.
 
-A job is a call of a function. Its result, plain values, is a line of
-`data/results/raw/<table>.jsonl.gz`, beside its arguments and what else decides it. What is there is
-not made again, what was made of something else is refused; a kill costs the jobs under way and half
-a minute. Equal results give equal bytes.
+A job is a call of a function. Its result, plain values, is stored as a line of
+`data/results/raw/<table>.jsonl.gz`, with its arguments and hashes of its other inputs. Stored
+results are not computed again, and results of other inputs are rejected. A killed run loses the
+running jobs and at most half a minute. Equal results give identical bytes.
 
     def job(model: str, fold: int) -> Job:
         return Job(cross_validate, {"model": model, "fold": fold}, data=("push",), version=2)
@@ -44,29 +44,29 @@ from affordlib.workers import dask_client
 FOLDER = "data/results/raw"
 WRITE_EVERY_S = 30
 NOT_DECISIVE = ("device", "max_minutes", "sigma_scale")
-"""Options of trainings and networks that belong to the machine, or are fitted afterwards."""
+"""Options without influence on results: those of the machine, and those fitted afterwards."""
 
 
 @lru_cache(maxsize=4)
 def open_once(name: str) -> xarray.Dataset:
-    """A data set by its name, kept open from job to job; workers import it by its own name."""
+    """Open a data set by name and cache it between jobs."""
     return open_interactions(name)
 
 
 Rows = list[dict[str, Any]]
 Result = tuple[dict[str, Any], Any]
-"""The arguments of a job, and what its function returned."""
+"""The arguments of a job and the value that its function returned."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """A call of a function of a module, and what decides its result beside the arguments.
+    """A call of a module's function, and all further inputs that influence its result.
 
-    function: returns plain values. If it has an argument `resume_checkpoint`, it gets a path there,
-    which it may write while it works and from which it resumes after a kill.
-    settings: what is decided elsewhere: plain values, dataclasses and functions, nested; names of
-    fields do not count. data, checkpoints: names of what is read. version: raise it when the code
-    changes a result and nothing else tells so.
+    function: returns plain values. If it has an argument `resume_checkpoint`, it gets a path that
+    it may write to while it runs, and from which it resumes after a kill.
+    settings: further inputs: nested plain values, dataclasses and functions; names of fields do not
+    matter. data, checkpoints: names of data sets and checkpoints that it reads. version: raise it
+    when a change of code changes the result and no other input shows it.
     """
 
     function: Callable[..., Any]
@@ -77,7 +77,7 @@ class Job:
     version: int = 1
 
     def made_of(self) -> dict[str, Any]:
-        """What decides the result; the hash of a data set that is not here is None."""
+        """Return version and hashes of all inputs; the hash of a missing data set is None."""
         return {
             "version": self.version,
             "settings": _sha256(_values(self.settings)),
@@ -86,7 +86,7 @@ class Job:
         }
 
     def record(self, resume_checkpoint: Path) -> dict[str, Any]:
-        """Call the function; a line of the table."""
+        """Call the function and return a line of the table."""
         takes = inspect.signature(self.function).parameters
         more = {k: v for k, v in {"resume_checkpoint": resume_checkpoint}.items() if k in takes}
         result = _rounded(self.function(**self.arguments, **more))
@@ -94,7 +94,7 @@ class Job:
 
 
 def _rounded(value: Any) -> Any:
-    """The same, with six significant digits of every float."""
+    """Round all floats in nested values to six significant digits."""
     if isinstance(value, dict):
         return {k: _rounded(v) for k, v in value.items()}
     if isinstance(value, list):
@@ -103,11 +103,11 @@ def _rounded(value: Any) -> Any:
 
 
 STUDIES: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {}
-"""Functions of rows by name, and what decides them; `experiments.studies` imports all."""
+"""Functions that return rows by name, and fields of their `Job`; `experiments.studies` has all."""
 
 
 def study(*data: str, **decides: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Make a study of the function below: the data that it reads, and more fields of its `Job`."""
+    """Register a function as a study, with the data that it reads and more fields of its `Job`."""
 
     def register(rows: Callable[..., Any]) -> Callable[..., Any]:
         STUDIES[rows.__name__] = rows, {"data": data} | decides
@@ -123,7 +123,7 @@ def run(
     folder: str | Path = FOLDER,
     progress: bool = True,
 ) -> list[Any]:
-    """The results of jobs, in order; what is missing or stale is made, here or by a Dask client."""
+    """Return the results of jobs, in order; compute missing or stale ones, here or with Dask."""
     folder = resolve_out_dir(folder)
     records, keys = _records(table, folder), [_key(job.arguments) for job in jobs]
     tasks = {
@@ -154,10 +154,10 @@ def run(
 def read(
     table: str, job: Callable[..., Job], folder: str | Path = FOLDER, accept: bool = False
 ) -> list[Result]:
-    """All results of a table; ValueError names one that `job(**arguments)` would not give now.
+    """Return all results of a table; raises ValueError for one whose `job` has other inputs now.
 
-    accept: take the results for those of the jobs as they are now, after a change that changed no
-    number, such as another name in a checkpoint.
+    accept: store the results as those of the current jobs, after a change that changed no number,
+    such as another name in a checkpoint.
     """
     folder = resolve_out_dir(folder)
     records = _records(table, folder)
@@ -177,13 +177,13 @@ def read(
 
 
 def frame(results: Iterable[Result], part: str) -> pd.DataFrame:
-    """A part of many results, a dict of columns or a list of rows; arguments become columns."""
+    """Concatenate a part of all results (columns or rows), with the arguments as columns."""
     tables = [pd.DataFrame(r[part]).assign(**about) for about, r in results if r.get(part)]
     return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
 
 
 def plain(table: pd.DataFrame | Rows) -> Rows:
-    """The rows of a table as plain values, None for what is missing."""
+    """Return the rows of a table as plain values, None for missing ones."""
     table = pd.DataFrame(table)
     return table.astype(object).where(table.notna(), None).to_dict("records")
 
@@ -191,21 +191,21 @@ def plain(table: pd.DataFrame | Rows) -> Rows:
 def interval(
     off: Sequence[float] | np.ndarray, draws: int = 9999, rng: int | np.random.Generator = 0
 ) -> tuple[Any, Any, Any]:
-    """Mean of differences (n, ...), and the ends of its bootstrapped 95 % interval."""
+    """Return the mean of differences (n, ...) and the ends of its bootstrap 95 % interval."""
     off = np.asarray(off)
     how = {"axis": 0, "n_resamples": draws, "method": "percentile", "rng": rng}
     return off.mean(axis=0), *bootstrap((off,), np.mean, **how).confidence_interval
 
 
 def parser(table: str, description: str | None) -> argparse.ArgumentParser:
-    """A parser of the options that the commands of all tables share."""
+    """Return a parser with the options that the commands of all tables share."""
     shared = argparse.ArgumentParser(prog=f"python -m experiments.{table}", description=description)
     shared.add_argument("--raw", default=FOLDER, help="the folder of the jobs' results")
     shared.add_argument("--out", default="data/results")
-    only = "the jobs with these arguments alone, such as fold=0,1"
+    only = "run only jobs with these arguments, such as fold=0,1"
     shared.add_argument("--only", nargs="+", default=[], metavar="NAME=VALUE,…", help=only)
     shared.add_argument("--scheduler", help="address of a Dask scheduler")
-    shared.add_argument("--workers", type=count_type, default=1, help="processes of this machine")
+    shared.add_argument("--workers", type=count_type, default=1, help="processes on this machine")
     return shared
 
 
@@ -215,7 +215,7 @@ def make(
     options: argparse.Namespace,
     tables: Callable[[str], dict[str, Rows]] | None = None,
 ) -> int:
-    """Run the jobs of a command that are missing or stale, then write its tables."""
+    """Run the missing or stale jobs of a command, then write its tables."""
     for only in options.only:
         name, _, values = only.partition("=")
         values, known = values.split(","), {str(job.arguments.get(name)) for job in jobs}
@@ -250,7 +250,7 @@ def _key(arguments: dict[str, Any]) -> str:
 
 
 def _records(table: str, folder: Path) -> dict[str, dict[str, Any]]:
-    """The lines of a table by their arguments."""
+    """Return the lines of a table by their arguments."""
     hash_of.cache_clear()
     path = folder / f"{table}.jsonl.gz"
     lines = gzip.decompress(path.read_bytes()).splitlines() if path.is_file() else []
@@ -266,7 +266,7 @@ def _add(new: dict[str, dict[str, Any]], table: str, folder: Path) -> None:
 
 
 def _stale(record: dict[str, Any], job: Job) -> str | None:
-    """What a result was made of that its job is not; data that are not here are not compared."""
+    """Return the name of an input that differs from the job's; missing data are not compared."""
     then, now = record["made_of"], job.made_of()
     if None in now["data"]:
         then = then | {"data": now["data"]}
@@ -275,8 +275,8 @@ def _stale(record: dict[str, Any], job: Job) -> str | None:
 
 @lru_cache
 def hash_of(name: str, kind: str) -> str | None:
-    """Of what is shipped: a kind "data" or "checkpoint" by its name; None where it is not here."""
-    if name == "reachability":  # a checkpoint of another kind, which has no description
+    """Return the hash of a shipped file of kind "data" or "checkpoint", None for missing data."""
+    if name == "reachability":  # a checkpoint without a description
         return weights_sha256(read_weights(repo_root() / REACHABILITY, "learn it again")[0], "")
     if kind == "checkpoint":
         return checkpoint_sha256(name)
@@ -287,9 +287,9 @@ def hash_of(name: str, kind: str) -> str | None:
 
 
 def checkpoint_sha256(name_or_path: str | Path) -> str:
-    """Hash of all that decides a checkpoint's answers: weights, configuration, scales, domain."""
+    """Return a hash of a checkpoint's weights, configuration, scales and domain."""
     tensors, description = read_weights(resolve_checkpoint(name_or_path), "train it again")
-    tensors.pop(NOVELTY, None)  # does not change what it answers
+    tensors.pop(NOVELTY, None)  # does not change predictions
     decisive = {key: description[key] for key in ("model", "config", "scaler", "domain")}
     return weights_sha256(tensors, json.dumps(decisive))
 

@@ -1,10 +1,10 @@
-"""The notebooks for several seeds, side by side, and what they say together: tables over seeds.
+"""Run the notebooks for several seeds in parallel, and make tables over seeds.
 
     python -m experiments.seeds 0 1 2 --profile smoke --only 06 --workers 2
 
-Every seed is a run of `affordlib.workbook` into `runs/<name>-seed<k>`. In `runs/<name>-seeds/`
-stand the tables over seeds, as JSON and, with a picture of what differs, in `index.md`: the mean of
-every number, and its standard deviation between seeds (sd) where they differ.
+Every seed is a run of `affordlib.workbook` into `runs/<name>-seed<k>`. The tables over seeds are
+written to `runs/<name>-seeds/`, as JSON and as `index.md` with plots of differing columns: the mean
+of every number, and its standard deviation between seeds (sd) if they differ.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from experiments.runner import plain
 from experiments.tables import MARKUP, markdown_table
 
 PANELS = 4
-"""Columns that are drawn at most."""
+"""Largest number of plotted columns."""
 
 Table = Sequence[Mapping[str, Any]]
 
@@ -37,12 +37,12 @@ Table = Sequence[Mapping[str, Any]]
 def run_all(
     commands: Mapping[int, Sequence[str]], client: dask.distributed.Client | None = None
 ) -> None:
-    """Run the command of each seed, one after another or by a client, and say what they print.
+    """Run the command of each seed, in sequence or with a Dask client, and print its output.
 
-    Raises WorkbookError, after all have ended, with what the failed ones printed.
+    Raises WorkbookError, after all have ended, with the output of those that failed.
     """
     lines, failed = list(commands.values()), []
-    # A batch skips by itself what is complete: it is given out even if it was run before.
+    # Not pure, because a batch must run again; it skips complete notebooks itself.
     some = client.map(_run, lines, pure=False) if client else []
     done = (future.result() for future in some) if client else map(_run, lines)
     for seed, (code, printed) in zip(commands, done, strict=True):
@@ -58,10 +58,10 @@ def _run(line: Sequence[str]) -> tuple[int, str]:
 
 
 def over_seeds(tables: Sequence[Table]) -> tuple[list[dict[str, Any]], bytes | None]:
-    """One table of the same table of several seeds, and a picture of what differs, as a PNG.
+    """Combine a table of several seeds to one, and plot the columns that differ (PNG).
 
-    Rows of several seeds are one if they agree in all that is no number, and in their place among
-    such rows: `seeds` counts them, numbers are their means, sd_… their standard deviations.
+    Rows are combined if all their non-numeric values agree, and their order among such rows:
+    `seeds` is their number; numbers become means, with standard deviations in columns sd_….
     """
     every = pd.DataFrame([{**row, "seed": k} for k, rows in enumerate(tables) for row in rows])
     if every.empty:
@@ -79,7 +79,7 @@ def over_seeds(tables: Sequence[Table]) -> tuple[list[dict[str, Any]], bytes | N
 
 
 def _picture(every: pd.DataFrame, words: list[str], columns: list[str]) -> bytes | None:
-    """A dot for the number of every seed, a bar for the mean; None without columns that differ."""
+    """Plot a dot per seed and a bar for the mean; return None if no columns differ."""
     if not columns:
         return None
     names = every.drop_duplicates("row").sort_values("row")[words].astype(str)
@@ -101,11 +101,11 @@ def _picture(every: pd.DataFrame, words: list[str], columns: list[str]) -> bytes
 
 
 def gather(folders: Mapping[int, Path], into: Path) -> Path:
-    """Write the tables over seeds, as JSON, and as Markdown with pictures; returns the latter."""
+    """Write the tables over seeds as JSON and as Markdown with plots; return the latter's path."""
     into.mkdir(parents=True, exist_ok=True)
     page = [f"# Over {len(folders)} seeds", f"Seeds {', '.join(map(str, folders))}."]
     page.append("Means over seeds; *sd* is the standard deviation of one seed among them.")
-    # Only results of notebooks: beside them lie plans that were saved.
+    # Only results of notebooks; the folders may also contain saved plans.
     paths = [path for folder in folders.values() for path in folder.glob("[0-9][0-9]_*.json")]
     for name in sorted({path.stem for path in paths}):
         runs = [results.read_results(path)["tables"] for path in paths if path.stem == name]
@@ -125,16 +125,16 @@ def gather(folders: Mapping[int, Path], into: Path) -> Path:
 
 @command(OSError, ValueError, WorkbookError)
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the notebooks for several seeds and gather what they wrote."""
+    """Run the notebooks for several seeds and combine their results."""
     parser = argparse.ArgumentParser(prog="python -m experiments.seeds", description=main.__doc__)
     parser.add_argument("seeds", type=seed_type, nargs="+")
     parser.add_argument("--profile", default="reader")
     parser.add_argument("--out", default="", metavar="NAME", help="default: the profile")
     parser.add_argument("--only", default="", metavar="'03 06'")
     parser.add_argument("--settings", nargs="*", default=[], metavar="NN_title.parameter=value")
-    parser.add_argument("--workers", type=count_type, default=2, help="seeds side by side here")
-    parser.add_argument("--force", action="store_true", help="run also what is complete")
-    parser.add_argument("--dry-run", action="store_true", help="say what would run")
+    parser.add_argument("--workers", type=count_type, default=2, help="seeds run in parallel here")
+    parser.add_argument("--force", action="store_true", help="also run complete notebooks")
+    parser.add_argument("--dry-run", action="store_true", help="only print what would be run")
     parser.add_argument("--scheduler", help="a Dask scheduler whose workers share the checkout")
     options = parser.parse_args(argv)
     if len(set(options.seeds)) < len(options.seeds):

@@ -1,14 +1,14 @@
-"""A study: one network for push, drag, grasp and rotate, beside a network for each of them.
+"""A study: one shared network for push, drag, grasp and rotate, compared with one network each.
 
-The shared network observes all five action channels and predicts x, y, z and yaw. Which primitive
-is meant follows from the commanded action: a push starts beside the object, a drag ends beside it,
-a grasp ends high above it and a rotation ends rotated. It works in the push frame, which for an
-action without a direction is the table's.
+The shared network observes all five action channels and predicts x, y, z and yaw. The commanded
+action identifies the primitive: a push starts beside the object, a drag ends beside it, a grasp
+ends high above it and a rotation ends rotated. The network works in the push frame, which is the
+table's frame for actions without a direction.
 
-Both learn from the same training parts of the same folds and are tested on the same test parts; the
-shared one is trained for about as many steps as the four together. Its early stopping watches the
-geometric mean of the final errors, each as a share of its primitive's usual effect: to halve any of
-them counts the same. (An arithmetic mean is that of the ten grasps that a validation part holds.)
+Both are trained on the same training parts of the same folds and tested on the same test parts; the
+shared one is trained for about as many steps as the four together. Its early stopping uses the
+geometric mean of the final errors, each divided by its primitive's RMS effect, so that halving any
+of them counts the same (an arithmetic mean is dominated by the validation part's ten grasps).
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ NETWORK = FiLMConfig(
 )
 TRAINING = replace(CHECKPOINT_SPECS["film_500"].training, steps=9600, augment=False)
 MIRRORED: tuple[Symmetry, ...] = ((0, False), (0, True))
-"""Symmetries of pushes and drags; rotating them is nothing new in the push frame."""
+"""Symmetries of pushes and drags; rotations add no new data in the push frame."""
 
 FOLDS = 3
 SEPARATE_JOBS = {
@@ -50,10 +50,10 @@ SHARED, SEPARATE = "shared network", "separate networks"
 
 
 def with_copies(arrays: InteractionTensors, primitive: str) -> InteractionTensors:
-    """Interactions and what they would be under the symmetries of their primitive.
+    """Augment interactions by the symmetries of their primitive.
 
-    A push and a drag are mirrored with their action; the action of a primitive without a direction
-    stays, see `augment_by_symmetry`.
+    Pushes and drags are mirrored with their actions; the action of a primitive without a direction
+    is unchanged (see `augment_by_symmetry`).
     """
     symmetries = TASKS[primitive].symmetries
     if symmetries is not None:
@@ -73,9 +73,7 @@ def _part(primitive: str, fold: int, part: str) -> InteractionTensors:
 def shares(
     validation: dict[str, InteractionTensors],
 ) -> Callable[[EffectNetwork, InteractionTensors], torch.Tensor]:
-    """A score for `train`: the geometric mean of the primitives' final errors, each as a share of
-    its usual effect.
-    """
+    """Return a score for `train`: geometric mean of errors relative to a primitive's RMS effect."""
 
     @torch.no_grad()
     def score(model: EffectNetwork, _: InteractionTensors) -> torch.Tensor:
@@ -93,7 +91,7 @@ def shares(
 
 
 def train_shared(fold: int, resume_checkpoint: Path | None = None) -> EffectNetwork:
-    """The shared network, trained on a fold of all four sets."""
+    """Train the shared network on a fold of all four sets."""
     copies = [with_copies(_part(name, fold, "train"), name) for name in PRIMITIVES]
     validation = {name: _part(name, fold, "validation") for name in PRIMITIVES}
     training = copies[0].joined(*copies[1:])
@@ -109,7 +107,7 @@ _SEPARATE = [j.settings for jobs in SEPARATE_JOBS.values() for j in jobs]
 
 @study(*PRIMITIVES, "push_test", settings=(NETWORK, TRAINING, _SEPARATE))
 def shared_network(resume_checkpoint: Path) -> Rows:
-    """Errors by primitive and effect; the separate networks are jobs of `cross_validation`."""
+    """Return errors by primitive and effect; separate networks are jobs of `cross_validation`."""
     tests: dict[tuple[str, str], list[pd.DataFrame]] = {}
     for fold in range(FOLDS):
         path = resume_checkpoint.with_name(f"{resume_checkpoint.name}{fold}")
@@ -128,7 +126,7 @@ def shared_network(resume_checkpoint: Path) -> Rows:
     rows = []
     for (name, test), pairs in tests.items():
         table = pd.concat(pairs)
-        if test != "folds":  # an object has one error: the mean over the networks of the folds
+        if test != "folds":  # an object's error is the mean over the networks of the folds
             table = table.groupby(["model", "interaction"], sort=False).mean(numeric_only=True)
             table = table.reset_index()
         effect, unit = {"grasp": ("z", "m"), "rotate": ("yaw", "rad")}.get(name, ("x, y", "m"))
@@ -142,7 +140,7 @@ def shared_network(resume_checkpoint: Path) -> Rows:
 def _pair(
     model: EffectNetwork, primitive: str, data: Any, rows: np.ndarray, separate: dict[str, Any]
 ) -> pd.DataFrame:
-    """Errors of both on the same interactions, in two blocks of rows."""
+    """Return errors of both networks on the same interactions, in two blocks of rows."""
     shared = pd.DataFrame(prediction_columns(network_predictions(model, data, rows)))
     add_errors(shared, primitive)
     alone = pd.DataFrame(separate)
@@ -154,7 +152,7 @@ def _pair(
 
 
 def _rows(table: pd.DataFrame, column: str, about: dict[str, Any], unit: str) -> Rows:
-    """A row of each model's errors, and by how much the shared network's exceed the others'."""
+    """Return a row of errors per model, with the difference of the shared network to the others."""
     error = {model: group[column].to_numpy() for model, group in table.groupby("model")}
     more = error_row(error[SHARED] - error[SEPARATE])
     about |= {"n": more["n"]}

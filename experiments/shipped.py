@@ -1,4 +1,4 @@
-"""The shipped data sets, checkpoints and reachability, made again: `make data`, `make checkpoints`.
+"""Make the shipped data sets, checkpoints and reachability: `make data`, `make checkpoints`.
 
 python -m experiments.shipped data --only push_x10 --to data
 python -m experiments.shipped checkpoints --only film_500
@@ -73,7 +73,7 @@ from experiments.attention import AttentionConfig
 
 @dataclass(frozen=True)
 class CheckpointSpec:
-    """A shipped checkpoint: the data set it learns from, its network, and its training.
+    """The definition of a shipped checkpoint: its data set, network and training.
 
     symmetries: see `augment_by_symmetry`; sampler: see `train`.
     """
@@ -97,7 +97,7 @@ _TURN = FiLMConfig(frame="table", action_channels=("yaw", "gripper"), effect_cha
 _LSTM = LSTMConfig(effect_channels=_YAW.effect_channels, frame="push", width=128)
 HALF_TURNS: tuple[Symmetry, ...] = ((0, False), (2, False))
 GRASP_SYMMETRIES: tuple[Symmetry, ...] = (*HALF_TURNS, (0, True), (2, True))
-"""Under which rotations and grasps, which have no direction, stay themselves."""
+"""Symmetries of rotations and grasps, which have no direction."""
 
 CHECKPOINT_SPECS: dict[str, CheckpointSpec] = {
     "cnp_500": CheckpointSpec("push", CNPConfig(), TrainingConfig(steps=5000, patience=20)),
@@ -113,32 +113,32 @@ CHECKPOINT_SPECS: dict[str, CheckpointSpec] = {
     "rotate_film_1000": CheckpointSpec("rotate_x10", _TURN, _TABLE_FRAME, HALF_TURNS),
     "lstm_500": CheckpointSpec("push", _LSTM, _PUSH_FRAME, sampler=sample_forward),
 }
-"""Minutes of one core: ten for `cnp_500`, five for `lstm_500` and the two of 5,000 pushes, one or
-two for others. Five learn from sets of ten times the size, which are not shipped."""
+"""Definitions by name. On one core, training takes ten minutes for `cnp_500`, five for `lstm_500`
+and for 5,000 pushes, one or two for others. Five use `_x10` sets, which are not shipped."""
 
 LEVER_CHECKPOINTS: dict[str, tuple[str, str]] = {
     "lever_up_last_pose_1800": ("cnp_last_pose", "all"),
     "lever_up_lstm_1800_window": ("lstm_tuned", "window"),
     "lever_up_lstm_1800_first_step": ("lstm_tuned", "first_step"),
 }
-"""Of lever-ups: which of `LEVER_MODELS`, and the protocol that it was trained for."""
+"""Checkpoints of lever-ups: the name in `LEVER_MODELS`, and the protocol it is trained for."""
 
 N_GOALS = {"single_full": 50, "single_partial": 100, "multi_partial": 80}
 VALIDATION_GOALS = {"multi_partial": 40}
-"""Goals of each mode, as in Table 3 of the paper."""
+"""Number of goals of each mode (N_GOALS: as in Table 3 of the paper)."""
 
 REACH_STEPS, REACH_RATE = 1500, 1e-2
 
 TOLERANCE_M = 0.00005
-"""Median distance between the final positions of two collections that still are the same set.
+"""Largest median distance [m] between the final positions of two collections of the same set.
 
-On the machine that made them they agree bit for bit. With NumPy's vector instructions turned off,
-as on another processor, 150 pushes ended 0.0005 mm from where they had in the median: now and then
-an object tips over the other way."""
+On the machine that made the sets, collections agree bit for bit. Without NumPy's vector
+instructions, as on another processor, the final positions of 150 pushes differed by 0.0005 mm
+(median), and a few objects tipped over in another direction."""
 
 
 def compare(old: xr.Dataset, new: xr.Dataset) -> tuple[bool, str]:
-    """Whether two collections of a recipe agree, and a sentence on how well."""
+    """Return whether two collections of a recipe agree, and a sentence with the difference."""
     if dataset_sha256(old) == dataset_sha256(new):
         return True, "the same, bit for bit"
     before, after = (data["rest_effect"].values[:, :2] for data in (old, new))
@@ -155,7 +155,7 @@ def compare(old: xr.Dataset, new: xr.Dataset) -> tuple[bool, str]:
 
 
 def collect_sets(options: argparse.Namespace) -> bool:
-    """Collect data sets; whether each agrees with the one that was there."""
+    """Collect data sets; return whether each agrees with the existing one."""
     agree = True
     with dask_client(options.workers, options.scheduler) as client:
         for name in options.only or SHIPPED:
@@ -163,7 +163,7 @@ def collect_sets(options: argparse.Namespace) -> bool:
                 old = open_interactions(name)
             except (FileNotFoundError, ValueError) as error:
                 old = None
-                print(f"{name}: no former data set to compare with ({error})")
+                print(f"{name}: there is no existing data set to compare with ({error})")
             target = f"{options.to}/{name}{DATA_SUFFIX}"
             new = open_interactions(collect(RECIPES[name], target, client, replace=True))
             print(f"{name}: {new.sizes['interaction']} interactions, sha256 {dataset_sha256(new)}")
@@ -177,12 +177,12 @@ def collect_sets(options: argparse.Namespace) -> bool:
 def about_checkpoint(
     data: xr.Dataset, split: Split, training: TrainingConfig, **more: str
 ) -> dict[str, object]:
-    """What a shipped checkpoint says of its training, and of lever-ups more."""
+    """Return the description of a shipped checkpoint's training, with further entries `more`."""
     return about_training(data, np.concatenate([split.train, split.validation]), training) | more
 
 
 def lever_training(lever: LeverModel, data: xarray.Dataset, split: Split) -> InteractionTensors:
-    """What a network learns from: a split's training part and its mirror image."""
+    """Return the training data of a lever-up network: the training part and its mirror image."""
     return augment_by_symmetry(lever_up_tensors(data, split.train, lever.view), MIRRORED)
 
 
@@ -193,7 +193,7 @@ def train_lever_model(
     trained_for: str = "all",
     resume_checkpoint: Path | None = None,
 ) -> tuple[EffectNetwork, list[TrainingRecord]]:
-    """`fit_lever_model` on a split's training part and its mirror image."""
+    """Train a lever-up network on a split's training part and its mirror image."""
     training = lever_training(lever, data, split)
     validation = lever_up_tensors(data, split.validation, lever.view)
     return fit_lever_model(lever, training, validation, trained_for, resume_checkpoint)
@@ -202,7 +202,7 @@ def train_lever_model(
 def shipped_lever_model(
     name: str, trained_for: str, lever: LeverModel, data: xr.Dataset, split: Split
 ) -> tuple[EffectNetwork, dict[str, object]] | None:
-    """The shipped checkpoint that this very training gave, if there is one, and its name."""
+    """Return the shipped checkpoint of exactly this training and its name, or None."""
     names = {key: checkpoint for checkpoint, key in LEVER_CHECKPOINTS.items()}
     try:
         checkpoint = names[name, trained_for]
@@ -219,12 +219,12 @@ def shipped_lever_model(
 
 
 def data_of(checkpoint: str) -> str:
-    """The name of the data set that a shipped checkpoint learns from."""
+    """Return the name of a shipped checkpoint's data set."""
     return CHECKPOINT_SPECS[checkpoint].data if checkpoint in CHECKPOINT_SPECS else "lever_up"
 
 
 def train_checkpoint(name: str) -> None:
-    """Train a shipped model on fold 0 of its data and write it to data/checkpoints."""
+    """Train a shipped model on fold 0 of its data set and write it to data/checkpoints."""
     data = open_interactions(data_of(name))
     split = split_interactions(data.sizes["interaction"])
     if name in LEVER_CHECKPOINTS:
@@ -244,7 +244,7 @@ def train_checkpoint(name: str) -> None:
 
 
 def train_checkpoints(options: argparse.Namespace) -> bool:
-    """Train checkpoints; whether the data of all were there, others are left as they are."""
+    """Train the checkpoints whose data exist; return whether these are all."""
     complete = True
     for name in options.only or [*CHECKPOINT_SPECS, *LEVER_CHECKPOINTS]:
         data = data_of(name)
@@ -253,16 +253,16 @@ def train_checkpoints(options: argparse.Namespace) -> bool:
             continue
         complete = False
         print(
-            f"{name}: left as it is; it learns from {data}, which is not shipped and not here. "
+            f"{name}: unchanged, because its data set {data} is neither shipped nor here. "
             f"Collect it: .venv/bin/python -m experiments.shipped data --only {data} --to data"
         )
     return complete
 
 
 def learn_reachability(data: xarray.Dataset, seed: int = 0) -> Reachability:
-    """Train on a set of interactions with objects all over the table; seconds on one core.
+    """Train reachability on interactions with objects all over the table (seconds on one core).
 
-    The arm stands on the table's x axis, so every interaction is seen mirrored as well.
+    The arm's base is on the table's x axis, so mirror images of all interactions are added.
     """
     number = data["primitive"].values
     xy_m = data["believed_xy"].values
@@ -288,7 +288,7 @@ def learn_reachability(data: xarray.Dataset, seed: int = 0) -> Reachability:
 
 
 def train_reachability(_: argparse.Namespace) -> bool:
-    """Learn the shipped reachability from the shipped set `reach`."""
+    """Train the shipped reachability on the shipped set `reach`."""
     learn_reachability(open_interactions("reach")).save(repo_root() / REACHABILITY)
     print(REACHABILITY)
     return True
@@ -297,7 +297,7 @@ def train_reachability(_: argparse.Namespace) -> bool:
 def uniform_tasks(
     mode: str, n: int, seed: int = 0, classes: Sequence[str] = STANDING
 ) -> list[PlanningTask]:
-    """Tasks whose goal is drawn evenly from the ring between 2 cm and the mode's reach."""
+    """Sample tasks with goals uniform on the ring between 2 cm and the mode's reach."""
     tasks = []
     for index in range(n):
         obj, yaw, rng = drawn_object(mode, "uniform", seed, index, classes)
@@ -316,12 +316,12 @@ VARIATIONS = {
         table_friction=(0.65, 1.0), density_kg_m3=(1200.0, 2400.0), com_offset=0.3, bias_sd_m=0.002
     ),
 }
-"""Of the worlds of frozen goals. `outside` lies beyond what the networks were trained on: rougher
-tables and denser objects than any of theirs, other errors and offsets up to twice as large."""
+"""Variations of the worlds with frozen goals. `outside` is out of distribution for the networks:
+rougher tables, denser objects, and other errors and offsets up to twice as large as in training."""
 
 
 def draw_goals(_: argparse.Namespace) -> bool:
-    """Draw the goals of Table 3, and 40 to choose constants on, into files that are frozen."""
+    """Sample the goals of Table 3 and 40 validation goals, and write files that stay frozen."""
     missing = [world for world, path in FROZEN.items() if not (repo_root() / path).exists()]
     for name in missing:
         tasks: list[PlanningTask] = []
@@ -338,7 +338,7 @@ def draw_goals(_: argparse.Namespace) -> bool:
         rows = ",\n".join(json.dumps(task.to_json()) for task in tasks)
         text = f'{{"seed": {seed}, "tasks": [\n{rows}\n]}}\n'
         write_atomically(repo_root() / FROZEN[name], text)
-    print(f"goals drawn of the worlds: {', '.join(missing) or 'none, all are there'}")
+    print(f"goals sampled for the worlds: {', '.join(missing) or 'none, all files exist'}")
     return True
 
 
@@ -352,18 +352,18 @@ COMMANDS = {
 
 @command(OSError, ValueError, RuntimeError)
 def main(argv: Sequence[str] | None = None) -> int:
-    """Make what is shipped again; returns 1 where sets differ or data are missing, else 0."""
+    """Make shipped files again; exit with 1 if data sets differ or are missing, else with 0."""
     parser = argparse.ArgumentParser(prog="python -m experiments.shipped", description=main.__doc__)
     kinds, commands = parser.add_subparsers(required=True), {}
     for name, make in COMMANDS.items():
         commands[name] = kinds.add_parser(name, help=make.__doc__)
         commands[name].set_defaults(make=make)
     data, checkpoints = commands["data"], commands["checkpoints"]
-    data.add_argument("--only", nargs="+", choices=sorted(RECIPES), help="default: the shipped")
-    data.add_argument("--to", default=str(repo_root() / "data"), help="a folder")
+    data.add_argument("--only", nargs="+", choices=sorted(RECIPES), help="default: shipped sets")
+    data.add_argument("--to", default=str(repo_root() / "data"), help="output folder")
     cores = os.cpu_count() or 1
-    data.add_argument("--workers", type=count_type, default=cores, help="processes here")
-    data.add_argument("--scheduler", help="a Dask scheduler in their place: tcp://…")
+    data.add_argument("--workers", type=count_type, default=cores, help="local processes")
+    data.add_argument("--scheduler", help="address of a Dask scheduler to use instead: tcp://…")
     names = sorted([*CHECKPOINT_SPECS, *LEVER_CHECKPOINTS])
     checkpoints.add_argument("--only", nargs="+", choices=names, help="default: all")
     options = parser.parse_args(argv)

@@ -1,8 +1,8 @@
-"""How long things take: `make bench`, or `python -m experiments.speed --only planning --keep`.
+"""Benchmarks of speed: `make bench`, or `python -m experiments.speed --only planning --keep`.
 
-Each function measures one thing and returns the rows of a table; `--keep` writes them to
-`data/results/speed.json`. What is compared runs in turn, so that a load that comes and goes meets
-both sides.
+Each function measures one topic and returns the rows of a table; `--keep` writes them to
+`data/results/speed.json`. Compared variants run alternately, so that a varying load of the machine
+affects both.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ RESULTS = "data/results/speed.json"
 
 
 def seconds(work: Callable[[], object], repeats: int = 1) -> float:
-    """Mean time of a call [s]: of the processor on one thread, so that other programs take none."""
+    """Return the mean time of a call [s]; on one thread CPU time, which excludes other programs."""
     clock = time.process_time if torch.get_num_threads() == 1 else time.perf_counter
     began = clock()
     for _ in range(repeats):
@@ -65,14 +65,14 @@ def seconds(work: Callable[[], object], repeats: int = 1) -> float:
 
 
 def ratio_row(what: str, ratios: Sequence[float], goal: float) -> dict[str, Any]:
-    """The median and range of the ratios of slow to fast; of one run no range."""
+    """Return a row with median and range of the ratios of slow to fast; one ratio has no range."""
     low, high = (min(ratios), max(ratios)) if len(ratios) > 1 else (None, None)
     row = {"what": what, "ratio_median": float(np.median(ratios)), "ratio_min": low}
     return row | {"ratio_max": high, "goal": goal}
 
 
 def primitives(n: int = 24) -> Rows:
-    """Interactions a second on one core, and the ratio of the whole to the physics alone."""
+    """Measure interactions per second on one core, and the ratio of total time to physics only."""
     rows = []
     with Tabletop() as world:
         step_simulation, whole_s, bare_s = world.client.stepSimulation, np.empty(n), np.empty(n)
@@ -90,14 +90,14 @@ def primitives(n: int = 24) -> Rows:
 
 
 def _pushes() -> list[InteractionTensors]:
-    """Those of training, and those of validation."""
+    """Return training and validation pushes."""
     data = open_interactions("push")
     split = split_interactions(data.sizes["interaction"])
     return [InteractionTensors.from_dataset(data, part) for part in (split.train, split.validation)]
 
 
 def _step(network: models.EffectNetwork, loss: Callable, fused: bool | None) -> Callable[[], None]:
-    """A step of training on what `loss` draws."""
+    """Return a function that makes one training step on the loss that `loss` returns."""
     optimiser = torch.optim.Adam(network.parameters(), 1e-4, fused=fused)
 
     def step() -> None:
@@ -111,10 +111,10 @@ def _step(network: models.EffectNetwork, loss: Callable, fused: bool | None) -> 
 def training(
     size: int = 64, n_targets: int = 32, rounds: int = 5, iterations: int = 20_000
 ) -> Rows:
-    """Target points a second in batches, beside the paper's loop of one trajectory and one target.
+    """Measure targets per second in batches, relative to the paper's loop with one per iteration.
 
-    Also the share of this machine's rate of matrix products that a batch reaches, and the time to
-    the error that the paper's loop has after so many iterations (a quarter of an hour).
+    Also measures a batch's share of this machine's rate of matrix products, and the time to the
+    error of the paper's loop after `iterations` (which takes a quarter of an hour).
     """
     pushes, validation = _pushes()
     generator = torch.Generator().manual_seed(0)
@@ -147,7 +147,7 @@ def training(
     train_literal(model, pushes, iterations)
     literal_s = time.perf_counter() - began
     error = float(final_errors_m(model.eval(), validation).mean())
-    # In small batches: while errors are large, many steps gain more than accurate ones.
+    # Small batches, because as long as errors are large, many steps help more than accurate ones.
     small = {"steps": 600, "validate_every": 10, "patience": 99, "batch_size": 8, "n_targets": 8}
     history = models.train(network(), pushes, validation, models.TrainingConfig(**small))
     reached = next((h.seconds for h in history if h.validation_error <= error), np.inf)
@@ -159,9 +159,9 @@ def training(
 
 
 def prediction() -> Rows:
-    """One call for 180 pushes, beside one call each, which encodes the image each time.
+    """Compare one call for 180 pushes with one call for each, which encodes the image each time.
 
-    First on one core, then on all, for a machine that has nothing else to do.
+    It is measured on one core, and then on all cores, for an otherwise idle machine.
     """
     rows, (pushes, _) = [], _pushes()
     configs = (models.CNPConfig(), models.FiLMConfig())
@@ -185,7 +185,7 @@ def _prediction_rows(model: models.EffectNetwork, image: torch.Tensor, threads: 
             known = model.encode(image) if features is None else features
             model.predict(known, seen, t.expand(len(seen.weight), -1))
 
-    # What is compared, and how many of the slow calls stand for all.
+    # The compared calls, and the factor from the measured slow calls to all of them.
     ends, at_once = partial(query, end, *each), partial(query, end, every)
     known, together = (partial(query, t, every, features=encoded) for t in (end, phases))
     name = type(model).__name__ + (f" on {threads} cores" if threads > 1 else "")
@@ -205,10 +205,10 @@ def _prediction_rows(model: models.EffectNetwork, image: torch.Tensor, threads: 
 
 
 def lever_up(n: int = 256, epoch: int = 1440) -> Rows:
-    """Training and prediction of lever-ups, of conditional and recurrent networks.
+    """Measure training and prediction of lever-ups for conditional and recurrent networks.
 
-    An epoch is as many windows as there are training trajectories. Prediction: the five next steps
-    of a window, and all 25 from the image alone, of one object and of 64 at once.
+    An epoch has as many windows as there are training trajectories. Predictions are the next five
+    steps of a window, and all 25 steps from the image only, for one object and for 64 at once.
     """
     data, rows = open_interactions("lever_up").isel(interaction=slice(0, n + 8)), []
     for name, lever in [*LEVER_MODELS.items(), ("lstm_seker2019", None)]:
@@ -254,11 +254,11 @@ NAIVE = (
 
 
 def planning(n_goals: int = 15, seed: int = 300) -> Rows:
-    """Milliseconds a plan, beside its naive form; `whole` with the map of an unseen object.
+    """Measure milliseconds per plan, and the ratio to naive planners.
 
-    Naive A* queries the network again for each branch, image and all. The naive continuous planner
-    descends through the whole network in every iteration, until it expects to end within a
-    millimetre: from one start, and from as many, one after the other, as ours refines at once.
+    `whole` includes the effect map of a new object. Naive A* evaluates the network for each branch,
+    including the image. The naive continuous planner differentiates through the whole network until
+    the predicted error is below 1 mm, from one start, or from as many in turn as ours uses at once.
     """
     film = models.load_checkpoint("film_5000")[0]
     modes = {"single_partial": "one action", "multi_partial": "up to three actions"}
@@ -280,7 +280,7 @@ def planning(n_goals: int = 15, seed: int = 300) -> Rows:
             effects = EffectMap(film, image)
             measure(lambda e=effects: e.spline, "map")
             problem = PlanningProblem(world.object_pose()[:2], task.goal, effects, mode)
-            effects.fine_grid  # noqa: B018, made once an object
+            effects.fine_grid  # noqa: B018, computed once per object
             phases, expanded = STOP_PHASES if problem.mode.partial else (1.0,), []
             search(problem, BranchTable(effects, N_DIRECTIONS, phases), expanded, "disc")
             for name, planner in planners.items():
@@ -312,7 +312,7 @@ def _naive_branches(model: models.EffectNetwork, image: np.ndarray) -> None:
 
 
 def _naive_descent(problem: PlanningProblem, rng: np.random.Generator | None = None) -> None:
-    """From straight at the goal, or with a generator from where one of our many starts might be."""
+    """Optimise from the goal's direction, or with a generator from a random start like ours."""
     model, image = problem.effects.model, problem.effects.image
     target = torch.tensor(np.subtract(problem.goal.xy_m, problem.start_xy_m), dtype=torch.float32)
     n = 1 if problem.mode.max_steps == 1 else max(1, int(np.ceil(float(target.norm()) / 0.09)))
@@ -344,7 +344,7 @@ MEASUREMENTS = {f.__name__: f for f in (lever_up, planning, prediction, primitiv
 
 @command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
-    """Measure what is named, or all but `training`, which takes a quarter of an hour."""
+    """Run the named benchmarks, or all but `training`, which takes a quarter of an hour."""
     parser = argparse.ArgumentParser(prog="python -m experiments.speed", description=main.__doc__)
     names = list(MEASUREMENTS)
     parser.add_argument("--only", nargs="+", choices=names, default=names[:-1])

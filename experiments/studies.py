@@ -1,9 +1,9 @@
-"""Studies beside the cross-validation: what each part of a network is worth, and what it knows.
+"""Studies in addition to the cross-validation: ablations, representations, uncertainty, limits.
 
     python -m experiments.studies --only study=latent,rollability
 
-makes what is missing or stale of `data/results/raw/studies.jsonl.gz`; the tables are put beside
-those of `experiments.effect_prediction` and `experiments.lever_up` by these.
+computes missing or stale results in `data/results/raw/studies.jsonl.gz`. The tables are written by
+`experiments.effect_prediction` and `experiments.lever_up`.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ for module in (*MODULES, "lever_cross_validation"):
 
 
 def job(study: str) -> Job:
-    """The job that makes the rows of a study."""
+    """Return the job that makes the rows of a study."""
     return Job(make_rows, {"study": study}, **STUDIES[study][1])
 
 
 def make_rows(study: str, resume_checkpoint: Path) -> Rows:
-    """The rows of a study."""
+    """Make the rows of a study."""
     rows, _ = STUDIES[study]
     return rows(resume_checkpoint) if inspect.signature(rows).parameters else rows()
 
 
 def tables(table: str, folder: str | Path = FOLDER) -> dict[str, Rows]:
-    """The rows of the studies that stand beside a table; stale ones raise ValueError."""
+    """Return the rows of the studies that belong to a table; raises ValueError for stale ones."""
     made = {arguments["study"]: rows for arguments, rows in read(NAME, job, folder)}
     here = [name for name in STUDIES if (name == "tuning") == (table == "lever_up")]
     return {name: made[name] for name in here if name in made}
@@ -45,7 +45,7 @@ def tables(table: str, folder: str | Path = FOLDER) -> dict[str, Rows]:
 
 @command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
-    """Make studies that are missing or stale."""
+    """Run missing or stale studies."""
     options = runner.parser(NAME, main.__doc__).parse_args(argv)
     return runner.make([job(name) for name in STUDIES], NAME, options)
 

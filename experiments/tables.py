@@ -1,6 +1,6 @@
-"""Tables in Markdown, and pages that hold them, drawn from the results.
+"""Tables in Markdown, made from the results, and pages that contain them.
 
-A page holds
+A page contains
 
     <!-- table: data/results/06_planning.json#planning columns=planner,mode,mean_m -->
     <!-- /table -->
@@ -20,7 +20,7 @@ from affordlib.commands import command
 from affordlib.results import columns_of, read_results, results_table, write_atomically
 
 MARKUP = str.maketrans({"&": "&amp;", "<": "&lt;", ">": "&gt;", "[": "&#91;", "|": "\\|"})
-"""For `str.translate`: keeps what a text of results holds from being markup in Markdown or HTML."""
+"""For `str.translate`: escapes characters that are markup in Markdown or HTML."""
 
 BLOCK = re.compile(
     r"(?P<open>^<!-- table: (?P<what>.*?) -->\n)(?P<body>.*?)(?P<close>^<!-- /table -->$)",
@@ -29,7 +29,7 @@ BLOCK = re.compile(
 
 
 def markdown_table(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = None) -> str:
-    """Return rows as a Markdown table with the headings and digits of `results_table`."""
+    """Return rows as a Markdown table with the headings and decimals of `results_table`."""
     frame, lines = results_table(rows, columns), []
     for name in columns_of(rows, columns):
         values = {type(v) for row in rows if (v := row.get(name)) is not None}
@@ -40,7 +40,7 @@ def markdown_table(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | N
 
 
 def fill_tables(text: str) -> str:
-    """Return a Markdown page with each of its table blocks drawn anew from its results file."""
+    """Return a Markdown page with each of its table blocks filled from its results file."""
 
     def fill(block):
         source, *options = block["what"].split()
@@ -68,10 +68,10 @@ def fill_tables(text: str) -> str:
 
 @command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
-    """Fill the tables of Markdown pages, or with `--check` say which pages are out of date."""
+    """Fill the tables of Markdown pages, or with `--check` print which pages are out of date."""
     parser = argparse.ArgumentParser(prog="python -m experiments.tables", description=main.__doc__)
     parser.add_argument("pages", nargs="+", type=Path)
-    parser.add_argument("--check", action="store_true", help="change nothing, fail if one would")
+    parser.add_argument("--check", action="store_true", help="only fail if a page is out of date")
     options = parser.parse_args(argv)
     stale = False
     for page in options.pages:

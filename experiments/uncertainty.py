@@ -1,12 +1,12 @@
-"""Studies of σ: in a perturbed world, and why it is too wide for most pushes.
+"""Studies of σ: in a perturbed world, and the reason why it is too wide for most pushes.
 
-A few pushes have large errors: the tails are heavy.
+A few pushes have large errors, so the residuals have heavy tails.
 
-Three distributions are fitted to the residuals (e - μ) / σ of validation data, each with one scale
-a channel: a Gaussian of maximum likelihood (the variance scaling of the checkpoints), which the few
-decide; a Gaussian of minimum CRPS (the continuous ranked probability score, Gneiting and Raftery,
-JASA 2007), which they decide less; and Student's t of maximum likelihood, whose degrees of freedom
-say how heavy the tails are. Their central 50 and 90 % intervals are then evaluated.
+Three distributions are fitted to the residuals (e - μ) / σ of validation data, each with one scale:
+a Gaussian by maximum likelihood (the variance scaling of the checkpoints), which is sensitive to
+outliers; a Gaussian by minimum CRPS (continuous ranked probability score, Gneiting and Raftery,
+JASA 2007), which is less so; and Student's t by maximum likelihood, whose degrees of freedom
+measure the weight of the tails. Their central 50 and 90 % intervals are then evaluated.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ def calibration_rows(
     phases: Sequence[float] = AFTER_CONTACT,
     **columns: Any,
 ) -> list[dict[str, Any]]:
-    """One row per phase and effect channel: n, coverage at 50 and 90 %, mean σ and NLL.
+    """Return one row per phase and effect channel: n, coverage at 50 and 90 %, mean σ and NLL.
 
-    The likelihood is a density of metres or radians; it compares models, not channels.
+    The likelihood is a density per metre or radian; it compares models, not channels.
     """
     truth, mean, std = effects_at(model, tensors, phases)
     rows = []
@@ -55,10 +55,10 @@ def calibration_rows(
 
 @study("push_varied", checkpoints=("film_5000_perturbed",), settings=_ABOUT)
 def perturbed_world() -> Rows:
-    """Errors and calibration in a perturbed world with camera noise.
+    """Measure errors and calibration in a perturbed world with camera noise.
 
-    Folds of 500 pushes together; and all of these, predicted by the network that learned from 4,000
-    others.
+    Test folds of 500 pushes are evaluated together; then all of these pushes with the network
+    trained on 4,000 others.
     """
     data = open_interactions("push_varied")
     channels = NETWORK.action_channels, NETWORK.effect_channels
@@ -103,18 +103,18 @@ class Fit:
 
     @property
     def distribution(self) -> Any:
-        """As of `scipy.stats`."""
+        """The distribution in `scipy.stats`."""
         gaussian = math.isinf(self.freedom)
         return stats.norm(0, self.scale) if gaussian else stats.t(self.freedom, 0, self.scale)
 
 
 def crps(z: np.ndarray) -> np.ndarray:
-    """Continuous ranked probability score of a standard Gaussian, where the observation is z."""
+    """Return the continuous ranked probability score of a standard Gaussian for observations z."""
     return z * (2 * stats.norm.cdf(z) - 1) + 2 * stats.norm.pdf(z) - 1 / math.sqrt(math.pi)
 
 
 def fits(residual: np.ndarray, std: np.ndarray) -> list[Fit]:
-    """The three fits to standardised residuals (N,) with σ (N,), which weighs the CRPS."""
+    """Return the three fits to standardised residuals (N,); σ (N,) are weights of the CRPS."""
 
     def score(log_scale: float) -> float:
         scale = math.exp(log_scale)
@@ -130,7 +130,7 @@ def fits(residual: np.ndarray, std: np.ndarray) -> list[Fit]:
 
 
 def _residuals(model: Any, arrays: InteractionTensors) -> tuple[np.ndarray, np.ndarray]:
-    """Standardised residuals of x and y after contact, and their σ."""
+    """Return standardised residuals of x and y after contact, and their σ."""
     plane = xy_columns(model.effect_channels)
     truth, mean, std = (
         v[..., plane].double().flatten().numpy() for v in effects_at(model, arrays, AFTER_CONTACT)
@@ -140,7 +140,7 @@ def _residuals(model: Any, arrays: InteractionTensors) -> tuple[np.ndarray, np.n
 
 @study("push", "push_test", checkpoints=("film_500",))
 def residual_distribution() -> Rows:
-    """Coverage and likelihood on `push_test` of each fit to the validation data of `film_500`."""
+    """Evaluate coverage and likelihood on `push_test` of fits to validation data of `film_500`."""
     model, _ = load_checkpoint("film_500")
     model.sigma_scale = (1.0,) * len(model.effect_channels)
     channels, data = (model.action_channels, model.effect_channels), open_interactions("push")
@@ -153,7 +153,7 @@ def residual_distribution() -> Rows:
 
 
 def coverage_columns(fit: Fit, residual: np.ndarray, std: np.ndarray) -> dict[str, Any]:
-    """Coverage of the central intervals, and NLL per value."""
+    """Return coverage of the central intervals, and NLL per value."""
     distribution = fit.distribution
     row = {"fit": fit.name}
     row["degrees_of_freedom"] = None if math.isinf(fit.freedom) else fit.freedom

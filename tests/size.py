@@ -10,7 +10,7 @@ import tokenize
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-LINES = {"affordlib": 12_845, "experiments": 6810, "tests": 9130}
+LINES = {"affordlib": 12_845, "experiments": 6807, "tests": 9130}
 """Maximum number of lines: lower it with every cut. The aim is 9,500, 3,500 and 6,500."""
 
 FILES, CODE = 75, 8778

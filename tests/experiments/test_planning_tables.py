@@ -41,7 +41,7 @@ def test_goals_survive_the_file_which_is_never_written_over(capsys):
     with pytest.raises(ValueError, match=r"world must be one of .*'noisy'"):
         frozen_tasks("noisy")
     assert shipped.main(["goals"]) == 0
-    assert "all are there" in capsys.readouterr().out
+    assert "all files exist" in capsys.readouterr().out
     assert [tasks_sha256(which) for which in FROZEN] == before
 
 

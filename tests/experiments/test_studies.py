@@ -52,7 +52,7 @@ def test_both_poses_of_a_cylinder_are_told_apart(rolls, world):
 
 
 def test_rollability_wants_both_kinds(pushes):
-    with pytest.raises(ValueError, match="objects that roll and of such that do not"):
+    with pytest.raises(ValueError, match="objects that roll and of objects that do not"):
         learn_rollability(pushes, np.arange(10))
 
 
