@@ -123,7 +123,7 @@ format: $(STAMP) ## Format the code, notebooks included
 bench: $(STAMP) ## Run the benchmarks (KEEP=1 writes the times to data/results/speed.json)
 	@$(PY) -m experiments.speed $(if $(KEEP),--keep)
 
-data: $(STAMP) ## Collect the shipped data sets again and compare them with the existing ones them with the existing ones
+data: $(STAMP) ## Collect the shipped data sets again and compare them with the existing ones
 	@$(PY) -m experiments.shipped data
 
 checkpoints: $(STAMP) ## Train the shipped models again (ONLY="film_500")

@@ -1,7 +1,7 @@
-"""Objects on the table, one class per category; their bodies, and what the world is like.
+"""Objects on the table, one class per category; their PyBullet bodies; the world's parameters.
 
-A category is a frozen dataclass with its dimensions. The frame of a body has its origin in the
-centre and z upwards as the object is placed; the x axis of a lying cylinder is its own axis.
+A category is a frozen dataclass of dimensions. The frame of a body has its origin in the object's
+centre and z upwards when the object is placed; the x axis of a lying cylinder is its own axis.
 """
 
 import math
@@ -32,10 +32,10 @@ SIZE_RANGE_M = (0.04, 0.08)
 LARGEST_M = 0.3
 N_EDGES = (3, 8)
 CHAMFER_M = (0.006, 0.004)
-"""Width and height of the chamfer around a prism's base, where a blade can get hold."""
+"""Width and height [m] of the chamfer around a prism's base, under which a blade can slide."""
 
 _HULL_MARGIN_M = 0.001
-"""PyBullet feels a convex hull this far outside its corners."""
+"""Margin [m] by which PyBullet's collision shape of a convex hull exceeds its corners."""
 
 _UPRIGHT = math.cos(math.radians(45))
 
@@ -44,8 +44,8 @@ _UPRIGHT = math.cos(math.radians(45))
 class TabletopObject(ABC):
     """An object on the table; all its fields are lengths [m].
 
-    rollable: whether it can roll as it is placed; footprint_m: corners (n, 2) of its outline seen
-    from above, around its centre, before turning.
+    rollable: whether it can roll as it is placed; footprint_m: corners (n, 2) [m] of its outline
+    seen from above, relative to its centre, at yaw 0.
     """
 
     category: ClassVar[str]
@@ -64,7 +64,7 @@ class TabletopObject(ABC):
         size_range_m: tuple[float, float] = SIZE_RANGE_M,
         height_range_m: tuple[float, float] | None = None,
     ) -> Self:
-        """An object with dimensions drawn uniformly from a range, heights from another if given."""
+        """Sample dimensions uniformly in size_range_m, heights in height_range_m if given."""
         sizes = rng.uniform(*size_range_m, size=len(fields(cls)))
         if height_range_m is not None:
             low, high = size_range_m
@@ -79,11 +79,11 @@ class TabletopObject(ABC):
         """Arguments for PyBullet; `frame`: rotation, `seen`: corners of parts for rendering."""
 
     def fallen(self, upward: np.ndarray) -> bool:
-        """Whether it lies otherwise than placed; upward: (3,) how far x, y and z axes point up."""
+        """Return whether it fell over; upward: (3,), vertical components of its x, y, z axes."""
         return bool(upward[2] < _UPRIGHT)
 
     def rolls(self, upward: np.ndarray) -> bool:
-        """Whether it can roll as it lies now."""
+        """Return whether it can roll in its current orientation."""
         return self.rollable
 
 
@@ -185,7 +185,7 @@ class Sphere(TabletopObject):
 class Prism(TabletopObject):
     """An extruded convex polygon: `corners` (x, y) [m] counter-clockwise, and a `height` [m].
 
-    Its centroid becomes the origin; the base is chamfered all around.
+    Corners are shifted so that their centroid is the origin; all edges of the base are chamfered.
     """
 
     corners: tuple[tuple[float, float], ...]
@@ -202,7 +202,7 @@ class Prism(TabletopObject):
         edges = following - corners
         turns = cross(edges, np.roll(edges, -1, axis=0))
         inner = np.sum(edges * np.roll(edges, -1, axis=0), axis=1)
-        rounds = np.arctan2(turns, inner).sum() / (2 * math.pi)  # a star goes around twice
+        rounds = np.arctan2(turns, inner).sum() / (2 * math.pi)  # 1 for convex, 2 for a star
         if (turns <= 0).any() or rounds > 1.5 or np.abs(corners).max() > LARGEST_M:
             raise ValueError(
                 "prism corners must go counter-clockwise around a convex polygon of at most "
@@ -220,7 +220,7 @@ class Prism(TabletopObject):
         size_range_m: tuple[float, float] = SIZE_RANGE_M,
         height_range_m: tuple[float, float] | None = None,
     ) -> Self:
-        """A polygon of 3 to 8 edges whose corners lie on a circle as wide as the drawn size."""
+        """Sample a polygon of 3 to 8 edges with corners on a circle of the sampled diameter."""
         n = int(rng.integers(N_EDGES[0], N_EDGES[1] + 1))
         angle = (np.arange(n) + rng.uniform(-0.3, 0.3, size=n)) * 2 * math.pi / n
         radius = rng.uniform(*size_range_m) / 2
@@ -232,9 +232,9 @@ class Prism(TabletopObject):
     footprint_m = property(lambda self: np.array(self.corners))
 
     def _vertices(self, inset_m: float = 0.0) -> np.ndarray:
-        """Corners (3n, 3) of the solid: of its top, of the chamfer's upper rim, of its base.
+        """Return the corners (3n, 3) [m] of top, upper rim of the chamfer and base.
 
-        inset_m: how far its faces lie inside, nearly.
+        inset_m: approximate distance by which all faces are moved inwards.
         """
         inradius = -ConvexHull(self.footprint_m).equations[:, 2].max()
         width, rise = np.minimum(CHAMFER_M, self.height / 3)
@@ -255,7 +255,7 @@ CATEGORIES: dict[str, type[TabletopObject]] = {
 
 
 def category_named(name: str) -> type[TabletopObject]:
-    """The class of the object category called `name`; raises naming the known ones."""
+    """Return the class of the object category `name`; raises ValueError with the known names."""
     return CATEGORIES[check_choice("object category", name, CATEGORIES)]
 
 
@@ -264,11 +264,11 @@ CAMERAS = ("ideal", "kinect")
 
 @dataclass(frozen=True)
 class WorldConfig:
-    """Friction coefficients (Bullet multiplies the two bodies'), the object's inside, the senses.
+    """Physical parameters and sensor model of the world; Bullet multiplies two bodies' frictions.
 
-    com_offset_m: the centre of mass in the object's frame; tip_offset_m: how much higher than
-    commanded the gripper moves; bias_m: added to where the robot believes the object to be.
-    camera: "ideal" tells where it is, "kinect" measures it, with noise drawn from noise_seed.
+    com_offset_m: centre of mass in the object's frame; tip_offset_m: error of the gripper's height,
+    positive upwards; bias_m: error added to the object's estimated position. camera: "ideal"
+    returns the exact position, "kinect" measures it with noise generated from noise_seed.
     """
 
     table_friction: float = 0.5
@@ -295,19 +295,19 @@ class WorldConfig:
 
 
 ROLLING_M, BRAKED_ROLLING_M = 1e-4, 1e-3
-"""Rolling friction [m] of all bodies, and of a round object that is left alone.
+"""Rolling friction [m] of all bodies, and of a rollable object while no action is executed.
 
-Bullet multiplies each by the lateral friction of the other body: 0.1 and 0.55 mm in all.
+Bullet multiplies each by the other body's lateral friction, which gives 0.1 and 0.55 mm in total.
 """
 
 _TOPPLING = 1.5
-"""Times the energy that brings an object onto its edge: some of it is lost in sliding."""
+"""Factor on the energy that tips an object onto its edge, since sliding dissipates some of it."""
 
 
 def poses(states: np.ndarray) -> np.ndarray:
-    """(n, 5) channels `EFFECT_CHANNELS` (absolute) of states (n, 7), position and quaternion.
+    """Convert states (n, 7), position and quaternion, to absolute `EFFECT_CHANNELS` (n, 5).
 
-    Yaw is the heading of the body's x axis (of its y axis where x points up), unwrapped.
+    Yaw is the heading of the body's x axis (of its y axis where x is vertical), unwrapped.
     """
     x, y, z, w = states[:, 3:].T
     ax = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + z * w)], axis=1)
@@ -320,13 +320,13 @@ def poses(states: np.ndarray) -> np.ndarray:
 
 
 def set_friction(client: BulletClient, body: int, link: int, lateral: float, **more: float) -> None:
-    """Give a link of a body a lateral friction, and what all bodies have in common."""
+    """Set a link's lateral friction, and the contact parameters common to all bodies."""
     common = {"spinningFriction": 1e-3, "rollingFriction": ROLLING_M, "restitution": 0.0}
     client.changeDynamics(body, link, lateralFriction=lateral, **common, **more)
 
 
 class PlacedObject:
-    """An object that stands on the table of a client, at (x, y) [m], turned by a yaw."""
+    """An object placed on the table of a client, at (x, y) [m] and a yaw [rad]."""
 
     def __init__(
         self,
@@ -361,19 +361,19 @@ class PlacedObject:
         client.resetBasePositionAndOrientation(self.body, position, orientation)
 
     def states_of_centre(self, states: np.ndarray) -> np.ndarray:
-        """States (n, 7) of the object's centre, given those of its centre of mass."""
+        """Convert states (n, 7) of the centre of mass to those of the object's centre."""
         if not self._centre_of_mass_m.any():
             return states
         shift = Rotation.from_quat(states[:, 3:]).apply(self._centre_of_mass_m)
         return np.column_stack([states[:, :3] - shift, states[:, 3:]])
 
     def state(self) -> tuple[float, ...]:
-        """Position (x, y, z) [m] of the centre and quaternion (x, y, z, w)."""
+        """Return position (x, y, z) [m] of the centre and quaternion (x, y, z, w)."""
         position, quaternion = self.client.getBasePositionAndOrientation(self.body)
         return tuple(self.states_of_centre(np.array([[*position, *quaternion]]))[0])
 
     def pose(self) -> tuple[float, float, float]:
-        """(x, y) [m] and yaw [rad] in the frame of the table."""
+        """Return (x, y) [m] and yaw [rad] in the table's frame."""
         x, y, _, yaw, _ = poses(np.array([self.state()]))[0]
         return float(x), float(y), float(yaw)
 
@@ -381,28 +381,28 @@ class PlacedObject:
         return Rotation.from_quat(self.state()[3:]).as_matrix()[2]
 
     def fell(self) -> bool:
-        """Whether it lies differently than it was placed."""
+        """Return whether the object fell over since it was placed."""
         return self.obj.fallen(self._upward())
 
     def rolls(self) -> bool:
-        """Whether it can roll as it lies now."""
+        """Return whether the object can roll in its current orientation."""
         return self.obj.rolls(self._upward())
 
     def left_table(self) -> bool:
-        """Whether its centre is no longer above the table."""
+        """Return whether the object's centre is no longer above the table."""
         x, y, z = self.state()[:3]
         inside = TABLE_X_M[0] <= x <= TABLE_X_M[1] and TABLE_Y_M[0] <= y <= TABLE_Y_M[1]
         return not (z > 0 and inside)
 
     def brake(self, brakes: bool) -> None:
-        """Let the table brake what can roll as it lies (Bullet's gain speed), or no longer."""
+        """Set high rolling friction if the object can roll (Bullet accelerates it), or reset it."""
         rolling = BRAKED_ROLLING_M if brakes and self.rolls() else ROLLING_M
         self.client.changeDynamics(self.body, -1, rollingFriction=rolling)
 
     def displace(self, dx_m: float, dy_m: float, dyaw_rad: float) -> None:
-        """Move it by (dx, dy) [m] and turn it by a yaw [rad], at its height and as it lies.
+        """Translate the object by (dx, dy) [m] and rotate it about the vertical by dyaw_rad.
 
-        Raises ValueError, and moves nothing, when its centre would leave the table.
+        Raises ValueError, without moving it, if its centre would leave the table.
         """
         x, y, *_ = centre = np.array(self.state()[:3])
         dx, dy = check_finite("dx_m", dx_m), check_finite("dy_m", dy_m)
@@ -416,16 +416,16 @@ class PlacedObject:
         )
 
     def knock(self, dx_m_s: float, dy_m_s: float, spin_rad_s: float = 0.0) -> None:
-        """Change its velocity [m/s] and its spin about the vertical at once."""
+        """Add to the object's velocity [m/s] and to its spin [rad/s] about the vertical."""
         speeds = (("dx_m_s", dx_m_s), ("dy_m_s", dy_m_s))
         change = [*(check_within(name, v, -10.0, 10.0, "m/s") for name, v in speeds), 0.0]
         spin = [0.0, 0.0, check_within("spin_rad_s", spin_rad_s, -100.0, 100.0, "rad/s")]
         self._change_velocity(np.array(change), np.array(spin))
 
     def topple(self, direction_rad: float) -> None:
-        """Give it the spin that tips it over the edge of its base in a direction [rad].
+        """Give the object the spin that tips it over the edge of its base in a direction [rad].
 
-        Raises ValueError for what cannot fall.
+        Raises ValueError if the object can roll and thus has no such edge.
         """
         c, s = math.cos(angle := check_finite("direction_rad", direction_rad)), math.sin(angle)
         if self.rolls():
@@ -436,7 +436,7 @@ class PlacedObject:
         corners = self._corners_m() - (x, y)
         out, up = float((corners @ (c, s)).max()), z - low[2]
         width, height = 2 * out, high[2] - low[2]
-        # Of a box about its lower edge: inertia per mass, and how high its centre must rise.
+        # For a box about its lower edge: inertia per mass, and the rise of its centre.
         inertia = (width**2 + height**2) / 3
         rise = math.hypot(out, up) - up
         rate = math.sqrt(2 * 9.81 * rise * _TOPPLING / inertia)
@@ -444,7 +444,7 @@ class PlacedObject:
         self._change_velocity(np.cross(spin, [-out * c, -out * s, up]), spin)
 
     def _corners_m(self) -> np.ndarray:
-        """The outline (n, 2) [m] on the table as it stands or lies."""
+        """Return the outline (n, 2) [m] on the table in the object's current pose."""
         if self.fell():
             outline, half = self.obj.footprint_m, self.obj.height_m / 2
             ends = np.concatenate([np.insert(outline, 2, z, axis=1) for z in (-half, half)])
@@ -454,11 +454,11 @@ class PlacedObject:
         return np.add(rotated(self.obj.footprint_m, yaw), (x, y))
 
     def draw_outline(self, xy_m: tuple, rgb: tuple, yaw_rad: float, scale: float) -> int:
-        """A body that shows its footprint at (x, y) [m], for now 1 m below the table."""
+        """Create a coloured body that shows the footprint at (x, y) [m], 1 m below the table."""
         xy_m, yaw_rad = check_on_table("xy_m", xy_m), check_finite("yaw_rad", yaw_rad)
         outline = check_within("scale", scale, 0.1, 10.0) * self.obj.footprint_m
         rgb = [check_within("rgb", share, 0.0, 1.0) for share in check_array("rgb", rgb, 3)]
-        # Larger sheets lie lower, so that one on another shows as a frame around it.
+        # Larger sheets lie lower, so that a larger one appears as a frame around a smaller one.
         sheet = [np.vstack([np.insert(outline, 2, z, axis=1) for z in (-0.005, 0.001 / scale)])]
         return self.client.createMultiBody(
             baseVisualShapeIndex=self.client.createVisualShape(**_mesh(sheet), rgbaColor=(*rgb, 1)),
@@ -473,7 +473,7 @@ class PlacedObject:
 
 
 def _mesh(parts: list) -> dict[str, Any]:
-    """Convex hulls of the corners (n, 3) of parts as flat triangles, for the renderer."""
+    """Return the convex hulls of the corners (n, 3) of parts as triangles for the renderer."""
     hulls = [ConvexHull(part) for part in parts]
     triangles = np.concatenate([hull.points[hull.simplices] for hull in hulls])
     normals = np.concatenate([hull.equations[:, :3] for hull in hulls])

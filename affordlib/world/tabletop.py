@@ -235,7 +235,7 @@ class Tabletop(AbstractContextManager):
         yaw_rad: float = 0.0,
         scale: float = 1.0,
     ) -> None:
-        """Draw the object's footprint at (x, y) [m], in a colour; the robot's camera sees none."""
+        """Draw the object's footprint at (x, y) [m], in a colour, unseen by the robot's camera."""
         self._marks.append(self.placed.draw_outline(xy_m, rgb, yaw_rad, scale))
 
     def _move_marks(self, up_m: float) -> None:
