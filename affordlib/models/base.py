@@ -86,7 +86,7 @@ class EffectNetwork(nn.Module, ABC):
             width = len(getattr(config, f"{kind}_channels"))
             if len(getattr(scaler, f"{kind}_scale")) != width:
                 raise ValueError(
-                    f"scaler {kind}_scale must have {width} channels as the config does"
+                    f"scaler {kind}_scale must have {width} values, one per channel of the config"
                 )
         for name in ("action_scale", "effect_scale", "image_mean", "image_std"):
             values = torch.tensor(getattr(scaler, name), dtype=torch.float32)
@@ -146,7 +146,7 @@ class EffectNetwork(nn.Module, ABC):
         return (image - mean) / std
 
     def unoriented_features(self, image: Float[Tensor, "b 2 n n"]) -> Float[Tensor, "b f"]:
-        """What is computed from an image before the direction is known: here, the image itself."""
+        """Features computed before the push direction is known: here, the image itself."""
         return image.flatten(1)
 
     def oriented_features(

@@ -126,7 +126,7 @@ class NoveltyAware:
 
     def __init__(self, model: EffectNetwork) -> None:
         if model.novelty is None:
-            raise ValueError("model has no novelty; set Novelty.fit of its training images")
+            raise ValueError("model has no novelty; set it to Novelty.fit(training images)")
         self.model, self.novelty = model, model.novelty
         self.action_channels, self.effect_channels = model.action_channels, model.effect_channels
 

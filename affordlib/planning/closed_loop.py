@@ -386,7 +386,7 @@ class _ClosedLoop:
         predicted = grasp_rotate.predict_trajectories(model, self.seen.image, Rotate(), "yaw")
         return self._first_possible(
             grasp_rotate.candidate_turns(predicted, self.seen.xy_m, turn_rad),
-            f"the orientation: {math.degrees(turn_rad):.0f}° more",
+            f"the orientation, with {math.degrees(turn_rad):.0f}° left",
             "no rotation is predicted to turn the object",
         )
 
@@ -399,8 +399,8 @@ class _ClosedLoop:
         predicted = grasp_rotate.predict_trajectories(model, self.seen.image, Grasp(), "z", yaws)
         return self._first_possible(
             grasp_rotate.candidate_lifts(predicted, self.seen.xy_m, height_m),
-            f"the height: {100 * height_m:.1f} cm",
-            "no grasp is predicted to lift it so high",
+            f"the height of {100 * height_m:.1f} cm",
+            "no grasp is predicted to lift the object that high",
         )
 
     def _first_possible(

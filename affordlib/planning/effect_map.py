@@ -63,8 +63,8 @@ class EffectMap:
         for channels in (self.model.action_channels, self.model.effect_channels):
             if not xy_columns(channels):
                 raise ValueError(
-                    "model: a planner of positions needs one of actions and effects in x and y; "
-                    f"this one has {self.model.action_channels} and {self.model.effect_channels}"
+                    "model must have x and y in its action and effect channels to plan positions, "
+                    f"got {self.model.action_channels} and {self.model.effect_channels}"
                 )
 
     @cached_property

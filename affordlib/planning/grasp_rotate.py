@@ -73,7 +73,7 @@ def predict_trajectories(
     if channel not in model.effect_channels:
         raise ValueError(
             f"channel {channel!r} is not among the effects {model.effect_channels} of the model; "
-            f"give the model of {primitive.name}"
+            f"use the model of {primitive.name}"
         )
     turn = torch.tensor([[math.cos(yaw), -math.sin(yaw)] for yaw in yaws])
     features = model.encode(rotate_image(checked_image(image), turn))

@@ -53,7 +53,7 @@ def plan_push_at(
     check_on_table("pose", (x, y))
     check_count("n_pushes", n_pushes, 1, 3)
     if len(names := np.unique(log.groups)) > 1:
-        raise ValueError(f"log must hold one group, got {names.tolist()}; select(...) one")
+        raise ValueError(f"log must hold one group, got {names.tolist()}; select one of them")
     pushes = _candidates(log, np.random.default_rng(check_count("seed", seed, least=0)))
     effect, std = model.predict(pushes)
     turn_m = turn_m or gyration_radius_m(log.outline_m)

@@ -58,7 +58,7 @@ class Skills:
         """Return the model of a primitive; KeyError, with the names of those present, if none."""
         if primitive.name not in self.models:
             raise KeyError(
-                f"primitive {primitive.name!r} has no model here, only {sorted(self.models)} have"
+                f"there is no model of primitive {primitive.name!r}, only of {sorted(self.models)}"
             )
         return self.models[primitive.name]
 

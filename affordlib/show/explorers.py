@@ -208,7 +208,7 @@ class PhaseSlider(FigureWidget):
             rest = self.rest[t]
             plot_footprint(above, obj, rest[:2], rest[2], TRUTH, "at rest")
             off_mm = 1000 * np.hypot(rest[0] - now[0], rest[1] - now[1])
-            words += f" Stopped there, it rests <b>{off_mm:.2f} mm</b> from where it was then."
+            words += f" Stopped there, it rests <b>{off_mm:.2f} mm</b> from that position."
         label = "full action at t"  # drawn over the object at rest
         plot_footprint(above, obj, now[:2], now[2], "black", label, style="--")
         figure.legend(*above.get_legend_handles_labels(), loc="outside lower left", ncols=4)

@@ -242,7 +242,7 @@ def plan_in_words(plan: Plan) -> str:
     std_m = plan.steps[-1].std_m if plan.steps else math.nan
     unsure = "" if math.isnan(std_m) else f" (σ of the last step {1000 * std_m:.1f} mm)"
     return (
-        f"Plan: {steps}. Expected to end {1000 * plan.predicted_distance_m:.1f} mm from the goal"
+        f"Plan: {steps}. Predicted to end {1000 * plan.predicted_distance_m:.1f} mm from the goal"
         f"{unsure}.{arrives} Found in {1000 * plan.plan_s:.0f} ms. {plan.warning}".strip()
     )
 

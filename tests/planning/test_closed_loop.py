@@ -199,7 +199,7 @@ def test_what_the_arm_cannot_do_is_refused_before_any_motion():
     hands = PointRobot(refuses=lambda primitive, at: primitive.name != "push")
     went = loop(hands, Goal((0.0, 0.0), height_m=0.1))
     assert (went.status, went.steps, went.vetoes) == ("unreachable", (), len(GRIPPER_YAWS_RAD))
-    assert "the height: 10.0 cm: the arm cannot grasp at (0.000, 0.000) m" in went.message
+    assert "the height of 10.0 cm: the arm cannot grasp at (0.000, 0.000) m" in went.message
     asked = []
     hands.refuses = lambda primitive, at: asked.append(primitive.grip_yaw) or len(asked) < 3
     went = loop(hands, Goal((0.0, 0.0), turn_rad=0.5))
