@@ -359,7 +359,7 @@ class LeverUp(Primitive):
 
         share: position of the point along the edge, in [0, 1]. The object turns about the edge of
         least force (weight · distance to the centroid / distance to the contact). The blade's
-        direction bisects the normals of that edge and of the edge it moves under.
+        direction bisects the outward normal of that edge and the inward normal of its own edge.
         """
         following = np.roll(outline_m, -1, axis=0)
         along = following - outline_m

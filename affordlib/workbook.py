@@ -93,7 +93,7 @@ def read_notebook(path: Path) -> nbformat.NotebookNode:
 
 
 def default_parameters(notebook: nbformat.NotebookNode, name: str) -> dict[str, Any]:
-    """Return the parameters of a notebook: the plain literals of its cell tagged `parameters`."""
+    """Return a notebook's parameters: the plain literals in its cell tagged `parameters`."""
     try:
         (cell,) = (c for c in notebook.cells if "parameters" in c.metadata.get("tags", []))
         lines = ast.parse(cell.source).body
@@ -123,7 +123,7 @@ def read_profile(root: Path, profile: str) -> list[tuple[str, str, Any]]:
 
 
 def choose(kind: str, given: str, known: Sequence[str]) -> str:
-    """The known name, or number of a notebook, that is meant; WorkbookError names near ones."""
+    """Return the known name for a name or number; raises WorkbookError with similar names."""
     number = re.fullmatch(r"A?\d+", given)
     matches = [n for n in known if n == given or (number and n.startswith(f"{given}_"))]
     if len(matches) == 1:
@@ -185,7 +185,7 @@ def make_jobs(
         name = choose(f"{source}: notebook", notebook, list(paths))
         where = choose(f"{source}: parameter of {name}", parameter, list(defaults[name]))
         if where in common:
-            raise WorkbookError(f"{source}: {name}.{where} is common to all; use --seed and --out")
+            raise WorkbookError(f"{source}: {name}.{where} cannot be set; use --seed and --out")
         default = defaults[name][where]
         value = literal(value, default) if source == "settings" else value
         overrides[name][where] = fitting(f"{source}: {name}.{where}", value, default)

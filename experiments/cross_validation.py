@@ -136,7 +136,7 @@ def job(model: str, data: str, n: int | str = "all", fold: int = 0, seed: int = 
         raise ValueError(f'n must be "all" or at least {N_FOLDS}, got {n!r}')
     task, settings = task_of(data), ()
     if model == "logistic" and not data.startswith("grasp"):
-        raise ValueError(f"model 'logistic' predicts the success of grasps, not {data!r}")
+        raise ValueError(f"model 'logistic' needs a data set of grasps, got {data!r}")
     if task.symmetries is not None and model.endswith("_frame"):
         raise ValueError(f"data {data!r} has no direction, which model {model!r} requires")
     if model in NETWORKS:
@@ -154,7 +154,7 @@ def cross_validate(
     available = interactions.sizes["interaction"]
     size = available if n == "all" else int(n)
     if size > available:
-        raise ValueError(f"n = {n}, but {data!r} has {available} interactions")
+        raise ValueError(f"n must be at most {available}, the size of {data!r}, got {n}")
     split = split_interactions(size, seed, fold, N_FOLDS)
     result: dict[str, Any] = {"n_interactions": size}
     known = interactions, split.train

@@ -70,9 +70,9 @@ def _errors(results: list[Result], edges_left_out: int | None = None) -> pd.Data
 
 
 def error_rows(results: list[Result], edges_left_out: int | None = None) -> Rows:
-    """Table 1: an object's errors are averaged over its windows.
+    """Return the rows of Table 1; an object's errors are averaged over its windows.
 
-    edges_left_out: of the trainings without polygons with so many edges, on those.
+    edges_left_out: use trainings without polygons that have this number of edges, tested on them.
     """
     if not results:
         return []

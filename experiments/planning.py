@@ -88,7 +88,7 @@ def plan_astar_fine(problem: PlanningProblem, heuristic: str = "goal") -> Plan:
 
 
 def plan_continuous_with(problem: PlanningProblem, **constants: Any) -> Plan:
-    """The continuous planner with other values of its module's constants."""
+    """Plan with the continuous planner, with other values of its module's constants."""
     with mock.patch.multiple(continuous, **constants):
         return plan_continuous(problem)
 

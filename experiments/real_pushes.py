@@ -81,7 +81,7 @@ def pushes_of(path: Path) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]
             poses, _forces, tool = take(7, rows=2), take(3), take(8)
             yield poses, tool[:, 0], tool[:, 1:3]
     except (lzma.LZMAError, StopIteration, ValueError) as error:
-        raise ValueError(f"{path} is damaged, or no log of pushes: {error!r}") from error
+        raise ValueError(f"{path} is damaged, or is not a log of pushes: {error!r}") from error
 
 
 def planar(pose: np.ndarray) -> tuple[float, float, float]:

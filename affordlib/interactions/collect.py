@@ -141,7 +141,7 @@ def _is_there(file: Path, attrs: dict[str, str], replace: bool) -> bool:
     """Return whether the file is this set and is kept; raises ValueError for any other content."""
     found = None if replace else _attributes(file)
     if found != attrs and (file.is_dir() or (os.path.lexists(file) and not replace)):
-        what = "a set of another recipe, or of other package versions" if found else "incomplete"
+        what = "a set of another recipe or of other package versions" if found else "not a full set"
         raise ValueError(
             f"path {file} is {what}; choose another path, delete it, or pass replace=True"
         )

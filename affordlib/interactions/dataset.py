@@ -29,7 +29,7 @@ def check_channels(name: str, tensors: HasChannels, model: HasChannels) -> None:
     for kind in ("action_channels", "effect_channels"):
         own, wanted = getattr(tensors, kind), getattr(model, kind)
         if own != wanted:
-            raise ValueError(f"{name} has the {kind} {own}, the model needs {wanted}")
+            raise ValueError(f"{name} has the {kind} {own}, but the model needs {wanted}")
 
 
 @dataclass(frozen=True)
@@ -174,7 +174,7 @@ class InteractionTensors:
         """Concatenate these interactions with others that have the same phases and channels."""
         parts = (self, *others)
         if len({(p.action_channels, p.effect_channels) for p in parts}) > 1:
-            raise ValueError("action_channels and effect_channels of others must be the same")
+            raise ValueError("others must have the same action_channels and effect_channels")
         return replace(
             self, **{n: torch.cat([getattr(p, n) for p in parts]) for n in _BY_INTERACTION}
         )

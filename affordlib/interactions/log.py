@@ -137,7 +137,7 @@ class Log:
         t, xy = self._tool(where, tool_t, tool_xy)
         first = self._poses(where, "start", start)
         if (end is None) == (poses is None):
-            raise ValueError(f"{where}: give either end or poses")
+            raise ValueError(f"{where}: give either end or poses, and not both")
         at, known = t[[0, -1]], np.stack([first, first])
         if end is not None:
             known[1] = self._poses(where, "end", end)
@@ -271,7 +271,7 @@ def centred(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     side = np.sign(cross((following - corners)[:, None], corners - corners[:, None]))
     parts = side * np.roll(side, -1, axis=1) <= 0
     meet = np.triu(parts & parts.T, 2)
-    meet[0, -1] = False  # they are neighbours
+    meet[0, -1] = False  # these two are neighbours
     if meet.any():
         i, j = np.argwhere(meet)[0]
         raise ValueError(

@@ -1,6 +1,6 @@
 """The simulated world in PyBullet: the tabletop, its objects, the arm and the camera."""
 
-import affordlib.world._quiet_pybullet  # must come first
+import affordlib.world._quiet_pybullet  # must be imported first
 from affordlib.types import UnreachableError
 from affordlib.world.objects import (
     CATEGORIES,

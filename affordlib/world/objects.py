@@ -430,7 +430,7 @@ class PlacedObject:
         c, s = math.cos(angle := check_finite("direction_rad", direction_rad)), math.sin(angle)
         if self.rolls():
             kind = self.obj.category
-            raise ValueError(f"a {kind} that can roll as it lies has no edge to fall over")
+            raise ValueError(f"a {kind} that can roll has no edge to topple over; use another")
         low, high = self.client.getAABB(self.body)
         x, y, z = self.state()[:3]
         corners = self._corners_m() - (x, y)

@@ -36,7 +36,7 @@ FEW = [job("constant", "grasp", fold=fold) for fold in range(3)]
         (job, {"model": "film", "data": "lever_up"}, "data must be one of"),
         (job, {"model": "film", "data": "push", "n": 5}, 'n must be "all" or at least 10, got 5'),
         (job, {"model": "film", "data": "push", "fold": 10}, "fold must be .*9.*, got 10"),
-        (job, {"model": "logistic", "data": "push"}, "grasps, not 'push'"),
+        (job, {"model": "logistic", "data": "push"}, "grasps, got 'push'"),
         (job, {"model": "film_table_frame", "data": "grasp"}, "has no direction"),
         (lever_job, {"model": "gru"}, "model must be one of"),
         (lever_job, {"model": "cnp_last_pose", "fold": 5}, "fold must be .*4.*, got 5"),

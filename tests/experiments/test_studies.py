@@ -262,7 +262,7 @@ def test_a_damaged_log_of_pushes_is_named(tmp_path):
     ):
         path = tmp_path / name
         path.write_bytes(content)
-        with pytest.raises(ValueError, match=f"{name} is damaged, or no log of pushes"):
+        with pytest.raises(ValueError, match=f"{name} is damaged, or is not a log of pushes"):
             list(pushes_of(path))
 
 
