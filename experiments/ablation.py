@@ -138,7 +138,7 @@ _ABOUT = (SHIPPED.network, SHIPPED.training, STEPS, SEEDS)
 def ablation() -> Rows:
     """Return errors after short trainings with one change each, on validation data.
 
-    They are means of `errors_m` over seeds. The unchanged network is also evaluated on the test.
+    They are means of `errors_m` over seeds. The unchanged network is also tested on `push_test`.
     """
     rows = [{"change": change} | _row([change]) for change in CHANGES]
     return [*rows, {"change": "nothing"} | _row(["nothing"], test=True)]

@@ -112,7 +112,7 @@ FRAMES = {
 
 
 def frame_rows(results: list[Result]) -> Rows:
-    """Return rows of two networks in two frames, trained on the same folds, on the fixed test."""
+    """Return errors on the fixed test set of two networks in two frames, on the same folds."""
     of = {
         (about["model"], about["fold"], about["seed"]): (about, result)
         for about, result in results

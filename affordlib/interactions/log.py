@@ -74,7 +74,7 @@ class PushLog:
     def interaction_tensors(self) -> InteractionTensors:
         """Return the pushes as tensors for the networks, at the phases where all effects are known.
 
-        Shipped models assume images of width `CROP_WIDTH_M`; another `crop_width_m` is no error.
+        Shipped models assume images of width `CROP_WIDTH_M`, but do not check `crop_width_m`.
         """
         known = np.flatnonzero(np.isfinite(self.effect).all(axis=(0, 2)))
         image = torch.from_numpy(self.image()).expand(len(self), -1, -1, -1)

@@ -19,7 +19,7 @@ _OBLIQUE_RAD = 0.18
 
 @dataclass(frozen=True)
 class Variation:
-    """Parameters of a perturbed world, which are sampled anew for every interaction.
+    """Parameters of a perturbed world, which are sampled separately for every interaction.
 
     Frictions, density and the gripper's height error are sampled uniformly from ranges; com_offset:
     largest offset of the centre of mass as a share of the half extents; bias_sd_m: standard

@@ -63,7 +63,7 @@ class Command:
 
     @classmethod
     def along(cls, path_xy_m: np.ndarray, primitive: Primitive, stop_phase: float) -> Self:
-        """Return the command along points (n, 2) [m], n ≥ 2, at the heights of a primitive."""
+        """Return the command along points (n, 2) [m] at a primitive's heights, facing their end."""
         if path_xy_m.ndim != 2 or len(path_xy_m) < 2:
             raise ValueError(f"path_xy_m must be points (n, 2), n ≥ 2, got {path_xy_m.shape}")
         phase = np.linspace(0.0, 1.0, len(path_xy_m)) * stop_phase
