@@ -22,8 +22,9 @@ class Variation:
     """Parameters of a perturbed world, which are sampled separately for every interaction.
 
     Frictions, density and the gripper's height error are sampled uniformly from ranges; com_offset:
-    largest offset of the centre of mass as a share of the half extents; bias_sd_m: standard
-    deviation of the error of the object's estimated position, in addition to the camera's.
+    largest offset of the centre of mass as a share of the half extents (that of a round object is
+    turned downwards: there it lies at rest); bias_sd_m: standard deviation of the error of the
+    object's estimated position, in addition to the camera's.
     """
 
     table_friction: tuple[float, float] = (0.35, 0.65)
@@ -46,6 +47,10 @@ class Variation:
         drawn = {name: float(rng.uniform(*getattr(self, name))) for name in _RANGES}
         half = np.array([*np.ptp(obj.footprint_m, axis=0), obj.height_m]) / 2
         offset = self.com_offset * half * rng.uniform(-1, 1, size=3)
+        if obj.rollable:
+            # Placed with its centre of mass higher, it would roll before anything touches it.
+            along = np.array([offset[0] if obj.category == "lying_cylinder" else 0.0, 0.0, 0.0])
+            offset = along - (0.0, 0.0, np.linalg.norm(offset - along))
         return WorldConfig(
             **drawn,
             com_offset_m=tuple(float(v) for v in offset),

@@ -38,6 +38,8 @@ def test_goals_survive_the_file_which_is_never_written_over(capsys):
         assert PlanningTask.from_json(json.loads(json.dumps(task.to_json()))) == task
     assert len({t.config.table_friction for t in tasks}) == len(tasks)
     assert all(t.config.camera == "kinect" for t in tasks)
+    inside = [t.config.com_offset_m for t in frozen_tasks("perturbed_rollable")]
+    assert all(y == 0 >= z for _, y, z in inside)  # round objects lie on their heavy side
     with pytest.raises(ValueError, match=r"world must be one of .*'noisy'"):
         frozen_tasks("noisy")
     assert shipped.main(["goals"]) == 0

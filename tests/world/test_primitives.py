@@ -219,6 +219,18 @@ def test_worlds_vary_within_their_ranges():
         Variation(density_kg_m3=(2.0, 1.0))
 
 
+@pytest.mark.parametrize("category", ["lying_cylinder", "sphere"])
+def test_an_unbalanced_round_object_lies_on_its_heavy_side(world, category):
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        obj = CATEGORIES[category].sample(rng)
+        config = Variation().sample(obj, rng)
+        world.place(obj, config=config)
+        world.settle(3.0)
+        assert math.hypot(*world.object_pose()[:2]) < 2e-4
+    assert np.linalg.norm(config.com_offset_m) > 0.001
+
+
 def test_a_push_over_the_edge_is_an_outcome_and_no_fault(world):
     world.place(Cuboid(0.06, 0.06, 0.06), (0.1, 0.66))
     seen = world.execute_primitive(Push.towards(math.pi / 2))
