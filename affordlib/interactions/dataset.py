@@ -64,6 +64,8 @@ def split_interactions(n: int, seed: int = 0, fold: int = 0, n_folds: int = 10) 
 class Scaler:
     """Scales that normalise channels to unit RMS without an offset; x and y share one scale.
 
+    An action channel that is always zero keeps its unit: a query may have another value there.
+
     image_mean, image_std: mean and standard deviation of depth and mask.
     """
 
@@ -83,18 +85,18 @@ class Scaler:
         """Compute the scales of training data: RMS of the channels, mean and std of the image."""
         image = tensors.image.double()
         return cls(
-            _scales(tensors.action, tensors.action_channels),
-            _scales(tensors.effect, tensors.effect_channels),
+            _scales(tensors.action, tensors.action_channels, if_zero=1.0),
+            _scales(tensors.effect, tensors.effect_channels, if_zero=1e-6),
             tuple(image.mean(dim=(0, 2, 3)).tolist()),
             tuple(image.std(dim=(0, 2, 3)).clamp_min(1e-6).tolist()),
         )
 
 
-def _scales(values: torch.Tensor, channels: tuple[str, ...]) -> tuple[float, ...]:
-    rms = values.double().square().mean(dim=(0, 1)).sqrt().clamp_min(1e-6)
+def _scales(values: torch.Tensor, channels: tuple[str, ...], if_zero: float) -> tuple[float, ...]:
+    rms = values.double().square().mean(dim=(0, 1)).sqrt()
     plane = [k for k, name in enumerate(channels) if name in ("x", "y")]
     rms[plane] = rms[plane].square().mean().sqrt()
-    return tuple(rms.tolist())
+    return tuple(torch.where(rms > 1e-6, rms, if_zero).tolist())
 
 
 _BY_INTERACTION = ("image", "action", "effect", "stop_phase")

@@ -1,10 +1,12 @@
 """Data sets: shipped files, refusal of damaged ones, splits, scaling and sampling."""
 
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from torch.nn.functional import pad
 
 from affordlib.interactions import (
     CorruptedDataError,
@@ -182,6 +184,9 @@ def test_scaler_keeps_zero_and_gives_unit_size(pushes):
     assert scaler.effect_scale[0] == scaler.effect_scale[1]
     scaled = arrays.effect / torch.tensor(scaler.effect_scale)
     assert scaled.square().mean().sqrt() == pytest.approx(1.0, abs=1e-4)
+    channels = (*arrays.action_channels, "always_zero")
+    wider = replace(arrays, action=pad(arrays.action, (0, 1)), action_channels=channels)
+    assert Scaler.fit(wider).action_scale == (*scaler.action_scale, 1.0)
 
 
 def test_batches_hold_what_the_trajectories_hold(pushes):
