@@ -17,12 +17,14 @@ from __future__ import annotations
 import argparse
 import gzip
 import hashlib
+import importlib
 import inspect
 import json
+import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, fields, is_dataclass
-from functools import lru_cache
+from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -238,11 +240,22 @@ def _made(
         return
     from dask.distributed import as_completed
 
-    futures = [client.submit(Job.record, *task, pure=False) for task in tasks]
+    sent = [(replace(job, function=_importable(job.function)), path) for job, path in tasks]
+    futures = [client.submit(Job.record, *task, pure=False) for task in sent]
     try:
         yield from (future.result() for future in as_completed(futures))
     finally:
         client.cancel(futures)
+
+
+def _importable(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the same function of the imported module; a worker has another `__main__`."""
+    if isinstance(function, partial):
+        return partial(_importable(function.func), *function.args, **function.keywords)
+    spec = sys.modules["__main__"].__spec__
+    if function.__module__ != "__main__" or spec is None:
+        return function
+    return getattr(importlib.import_module(spec.name), function.__name__)
 
 
 def _key(arguments: dict[str, Any]) -> str:

@@ -1,7 +1,8 @@
 """Jobs: existing results are kept, stale ones refused, and a kill loses little."""
 
 import importlib
-import pickle
+import subprocess
+import sys
 from dataclasses import dataclass, replace
 
 import pandas as pd
@@ -9,9 +10,10 @@ import pytest
 from dask.distributed import Client
 from pandas.testing import assert_frame_equal
 
+from affordlib.paths import repo_root
 from affordlib.results import read_results, write_results
 from experiments import runner
-from experiments.runner import Job, frame, open_once, read, run
+from experiments.runner import Job, frame, read, run
 
 CALLS = []
 
@@ -118,8 +120,15 @@ TABLES = ("effect_prediction", "lever_up", "planning", "closed_loop", "open_loop
 TABLES += ("real_pushes", "adaptation", "headline")
 
 
-def test_what_jobs_share_is_imported_by_workers():
-    assert pickle.loads(pickle.dumps(open_once)) is open_once
+@pytest.mark.slow
+def test_workers_run_the_jobs_of_a_command(tmp_path):
+    """The robot of the closed loop is kept from job to job, in a function of the command."""
+    which = ["table=height", "world=perturbed", "index=0,1"]
+    where = ["--raw", str(tmp_path), "--out", str(tmp_path), "--workers", "2"]
+    command = [sys.executable, "-m", "experiments.closed_loop", "--only", *which, *where]
+    subprocess.run(command, cwd=repo_root(), check=True, timeout=300)
+    rows = read_results(tmp_path / "closed_loop.json")["tables"]["height"]
+    assert rows[0]["n"] == 2
 
 
 @pytest.mark.parametrize("name", TABLES)
