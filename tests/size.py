@@ -10,7 +10,7 @@ import tokenize
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-LINES = {"affordlib": 12_852, "experiments": 6832, "tests": 9162}
+LINES = {"affordlib": 12_852, "experiments": 6830, "tests": 9162}
 """Maximum number of lines: lower it with every cut. The aim is 9,500, 3,500 and 6,500."""
 
 FILES, CODE = 75, 8781
