@@ -56,7 +56,7 @@ def _titled(picture: np.ndarray, title: str) -> np.ndarray:
 
 def main() -> None:
     """Record the full and the partial push, and write them side by side."""
-    both = recorded("The whole push", stop=False), recorded("Stopped at {:.0%} of it", stop=True)
+    both = recorded("The full push", stop=False), recorded("Stopped at {:.0%} of it", stop=True)
     animation = FrameRecorder()
     for k in range(max(map(len, both))):
         animation.frames.append(np.hstack([side[min(k, len(side) - 1)] for side in both]))
