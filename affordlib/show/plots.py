@@ -261,7 +261,7 @@ def plot_levered(
     """Draw a prism after a change of pose (x, y, z [m], tilt [rad]) from its start.
 
     outline_m: (n, 2), from `outline_in_lever_frame`. The prism is tilted about an axis across the
-    lever, an approximation of the true axis. The direction across is drawn obliquely; units are cm.
+    blade, an approximation of the true axis. The direction across is drawn obliquely; units are cm.
     """
     pose, height_m = check_array("pose", pose, 4), check_finite("height_m", height_m)
     outline_m = check_array("outline_m", outline_m, 2)
@@ -277,7 +277,7 @@ def plot_levered(
         ax.plot(*_closed(face), color=color, lw=1.2, label=label)
         label = None
     ax.plot(*np.stack(faces, axis=1), color=color, lw=0.8)
-    ax.set(xlabel="along the lever [cm]", ylabel="height [cm]", aspect="equal")
+    ax.set(xlabel="along the blade [cm]", ylabel="height [cm]", aspect="equal")
     return ax
 
 
