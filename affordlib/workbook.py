@@ -216,6 +216,7 @@ def own_cells(notebook: nbformat.NotebookNode) -> list[nbformat.NotebookNode]:
 def cleaned(notebook: nbformat.NotebookNode) -> str:
     """Return the text of an executed notebook to commit: outputs and tags, no other metadata.
 
+    JupyterLab does not know the tag `hide-input`; it folds a cell whose source is hidden.
     A widget is replaced by its picture, as JupyterLab shows an error for a widget without a kernel.
     The caption in the cell below a picture becomes the picture's alternative text.
     """
@@ -227,7 +228,9 @@ def cleaned(notebook: nbformat.NotebookNode) -> str:
                 output.data.pop(WIDGET, None)
                 if caption:
                     output.metadata.setdefault(kind, {})["alt"] = caption[1]
-        cell.metadata = {k: cell.metadata[k] for k in ("tags", "jupyter") if cell.metadata.get(k)}
+        tags = cell.metadata.get("tags")
+        folded = {"jupyter": {"source_hidden": True}} if "hide-input" in (tags or []) else {}
+        cell.metadata = {"tags": tags} | folded if tags else {}
     kernel = {"display_name": "Python 3", "language": "python", "name": "python3"}
     metadata = {"kernelspec": kernel, "language_info": {"name": "python"}}
     return nbformat.writes(nbformat.v4.new_notebook(cells=cells, metadata=metadata)) + "\n"

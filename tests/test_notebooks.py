@@ -176,6 +176,13 @@ def test_small_and_clean(name):
     assert text == cleaned(read(name)), "metadata is not clean; run `make notebooks`"
 
 
+@each_notebook
+def test_the_cells_folded_on_the_web_are_folded_in_jupyterlab(name):
+    for number, cell in enumerate(read(name).cells, 1):
+        tagged = "hide-input" in cell.metadata.get("tags", [])
+        assert tagged == cell.metadata.get("jupyter", {}).get("source_hidden", False), number
+
+
 def test_of_a_widget_its_picture_is_kept():
     """JupyterLab shows the picture without a kernel; without it, a widget would show an error."""
     shown = {WIDGET: {"model_id": "1"}, "text/plain": "a widget"}
