@@ -2,25 +2,42 @@
 
 A page contains
 
-    <!-- table: data/results/06_planning.json#planning columns=planner,mode,mean_m -->
+    <!-- table: data/results/06_planning.json#planning columns=planner,mean_m±sem_m -->
     <!-- /table -->
 
-and `python -m experiments.tables README.md` fills it; `--check` fails if that would change it. Any
-other option, such as `mode=multi_partial`, keeps the rows that have that value.
+and `python -m experiments.tables README.md` fills it; `--check` fails if that would change it.
+Options: `columns` (`a±b` shows two columns in one, `a(b..c)` a value and its interval, and
+`title:a` gives a column another title);
+`by=mode values=mean_m` gives each mode its own column of values; any other, such as
+`mode=multi_partial,single_full`, keeps the rows that have these values, in this order.
 """
 
 import argparse
 import re
+import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
 from affordlib.commands import command
-from affordlib.results import columns_of, read_results, results_table, write_atomically
+from affordlib.results import (
+    cell,
+    columns_of,
+    heading,
+    read_results,
+    results_table,
+    write_atomically,
+)
 
 MARKUP = str.maketrans({"&": "&amp;", "<": "&lt;", ">": "&gt;", "[": "&#91;", "|": "\\|"})
 """For `str.translate`: escapes characters that are markup in Markdown or HTML."""
+
+COLUMN = re.compile(r"(?:(\w+):)?(\w+)(?:±(\w+)|\((\w+)\.\.(\w+)\))?")
+SHOWN = {1: "{}", 2: "{} ± {}", 3: "{} ({} to {})"}
+"""How the parts of a column are shown, by their number."""
 
 BLOCK = re.compile(
     r"(?P<open>^<!-- table: (?P<what>.*?) -->\n)(?P<body>.*?)(?P<close>^<!-- /table -->$)",
@@ -28,13 +45,41 @@ BLOCK = re.compile(
 )
 
 
-def markdown_table(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = None) -> str:
+def markdown_table(
+    rows: Sequence[Mapping[str, Any]],
+    columns: Sequence[str] | None = None,
+    by: str | None = None,
+    values: Sequence[str] = (),
+) -> str:
     """Return rows as a Markdown table with the headings and decimals of `results_table`."""
-    frame, lines = results_table(rows, columns), []
-    for name in columns_of(rows, columns):
-        values = {type(v) for row in rows if (v := row.get(name)) is not None}
-        lines.append("---:" if values and values <= {int, float} else "---")
-    lines = [list(frame.columns), lines, *frame.values.tolist()]
+    columns = columns_of(rows, None) if columns is None else columns
+    series, numbers = [], set()
+    for column in [*columns, *values]:
+        found = COLUMN.fullmatch(column)
+        name, *names = [part for part in found.groups() if part] if found else [column]
+        if found and found[1]:
+            head, (name, *names) = found[1].replace("_", " "), names
+            head += heading(name).removeprefix(heading(name).rpartition(",")[0] or heading(name))
+        else:
+            head = heading(name.replace("_mean", "") if names else name)
+        cells = results_table(rows, [name, *names]).to_numpy()
+        shown = SHOWN[len(names) + 1]
+        texts = [shown.format(*c) if c[0] != "–" else "–" for c in cells]
+        series.append(pd.Series(texts, name=head, dtype=object))
+        types = {type(v) for row in rows if (v := row.get(name)) is not None}
+        numbers |= {head} if types and types <= {int, float} else set()
+    frame = pd.concat(series, axis=1)
+    if by is not None:
+        heads = list(frame.columns[len(columns) :])
+        frame[by] = [cell(by, row.get(by)) for row in rows]
+        keys = [*frame.columns[: len(columns)], by]
+        wide = frame.set_index(keys)[heads].unstack(by, fill_value="–", sort=False)
+        of = {b: f"{by} {b}" if b.isdigit() else b.replace("_", " ") for _, b in wide.columns}
+        wide.columns = [f"{of[b]}: {head}" for head, b in wide.columns]
+        numbers |= {*wide.columns}
+        frame = wide.reset_index()
+    lines = ["---:" if name in numbers else "---" for name in frame.columns]
+    lines = [list(frame.columns), lines, *frame.to_numpy().tolist()]
     lines = [" | ".join(text.translate(MARKUP) for text in line) for line in lines]
     return "".join(f"| {line} |\n" for line in lines)
 
@@ -43,22 +88,24 @@ def fill_tables(text: str) -> str:
     """Return a Markdown page with each of its table blocks filled from its results file."""
 
     def fill(block):
-        source, *options = block["what"].split()
+        source, *options = shlex.split(block["what"])
         path, _, name = source.partition("#")
         tables = read_results(path)["tables"]
         if name not in tables:
             raise ValueError(f"table: {path} has no table {name!r}, only {', '.join(tables)}")
-        rows, columns = tables[name], None
+        rows, shape = tables[name], {}
         for option in options:
             key, _, value = option.partition("=")
-            if key == "columns":
-                columns = value.split(",")
+            if key in ("columns", "values"):
+                shape[key] = value.split(",")
+            elif key == "by":
+                shape[key] = value
             else:
                 columns_of(rows, [key])
-                rows = [row for row in rows if str(row.get(key)) in value.split(",")]
+                rows = [row for one in value.split(",") for row in rows if str(row.get(key)) == one]
                 if not rows:
                     raise ValueError(f"table: no row of {source} has {option}")
-        return f"{block['open']}{markdown_table(rows, columns)}{block['close']}"
+        return f"{block['open']}{markdown_table(rows, **shape)}{block['close']}"
 
     filled, count = BLOCK.subn(fill, text)
     if count != text.count("<!-- table:") or count != text.count("<!-- /table -->"):
