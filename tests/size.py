@@ -10,10 +10,10 @@ import tokenize
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-LINES = {"affordlib": 12_855, "experiments": 6877, "tests": 9185}
+LINES = {"affordlib": 12_854, "experiments": 6877, "tests": 9185}
 """Maximum number of lines: lower it with every cut. The aim is 9,500, 3,500 and 6,500."""
 
-FILES, CODE = 75, 8783
+FILES, CODE = 75, 8782
 """Maxima for affordlib: all files, and lines of Python without docstrings, comments and blanks.
 
 The aim is 6,800 of the latter."""

@@ -166,7 +166,7 @@ def plot_plan(
         ax.annotate("", tip, tail, arrowprops=arrow, zorder=4)
         aside = direction[::-1] * (1, -1)
         aside *= 22 if aside @ (start - first) >= 0 else -22  # away from the object's start
-        _name(ax, text, tail, -10 * direction if k == 0 else aside)
+        _name(ax, text, tail, -direction * (23, 10) if k == 0 else aside)
         label = "prediction" if k == 0 else None
         ax.plot(*_cm(step.predicted_path_xy_m), color=PREDICTION, lw=2, label=label)
         ax.plot(*_cm(end), "o", color=PREDICTION, ms=3)
@@ -182,7 +182,7 @@ def plot_outcome(ax: Axes, outcome: Outcome) -> Axes:
     plot_plan(ax, outcome.plan, sigma=False)
     for k, path in enumerate(outcome.object_paths_xy_m):
         ax.plot(*_cm(path), color=TRUTH, lw=2, ls="--", label="executed" if k == 0 else None)
-    ax.plot(*_cm(outcome.end_pose[:2]), "s", color=TRUTH, ms=6)
+    ax.plot(*_cm(outcome.end_pose[:2]), "s", color=TRUTH, ms=6, zorder=6)
     ax.set_title(f"{outcome.plan.planner}: {1000 * outcome.distance_m:.1f} mm from the goal")
     return ax
 
@@ -192,16 +192,16 @@ def plot_closed_loop(
 ) -> Axes:
     """Draw a closed loop from above: the object's path in each action, and disturbances.
 
-    Dots are predicted positions after each action; dotted lines are motions between actions. obj:
-    drawn at its final pose, if given; yaw_rad: its yaw at the start.
+    Dots are predicted positions after each action, numbers count the actions, and dotted lines are
+    motions between actions. obj: drawn at its final pose, if given; yaw_rad: its yaw at the start.
     """
     goal = result.goal
     first = result.plans[0].goal if result.plans else goal
     if first.xy_m != goal.xy_m:
-        ax.plot(*_cm(first.xy_m), "*", color=GOAL, ms=11, mfc="none", zorder=5)
+        ax.plot(*_cm(first.xy_m), "*", color=GOAL, ms=11, mfc="none", label="first goal", zorder=5)
     ax.plot(*_cm(goal.xy_m), "*", color=GOAL, ms=13, label="goal", zorder=5)
     at, row, others = np.array(result.seen_xy_m[0]), 0, "moved by others"
-    ax.plot(*_cm(at), "o", color=NEUTRAL, ms=5)
+    ax.plot(*_cm(at), "o", color=NEUTRAL, ms=5, label="start")
     for k, (step, path) in enumerate(zip(result.steps, result.object_paths_xy_m, strict=True)):
         if math.dist(path[0], at) > 0.003:
             ax.plot(*_cm([at, path[0]]), ":", color="black", lw=1.2, label=others)
@@ -214,10 +214,9 @@ def plot_closed_loop(
             row += 1
             _name_in_place(ax, f"{k + 1}", step, goal, row)
             continue
-        x, y = path[-1] - path[0]
-        aside = (-1) ** k * np.array([-24 * y, 14 * x]) / max(math.hypot(x, y), 1e-6)
-        middle = _cm(path[len(path) // 2 :].mean(axis=0))
-        _name(ax, f"{k + 1} {step.primitive.name}", middle, aside)
+        moved = np.hypot(*np.diff(path, axis=0, prepend=path[:1]).T).cumsum()
+        middle = [np.interp(moved[-1] / 2, moved, path[:, c]) for c in (0, 1)]
+        _name(ax, f"{k + 1}", _cm(middle), (0, 0))
     if obj is not None:
         x, y, turned_rad = result.end_pose
         plot_footprint(ax, obj, (x, y), check_finite("yaw_rad", yaw_rad) + turned_rad, TRUTH)
