@@ -10,7 +10,7 @@ import tokenize
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-LINES = {"affordlib": 12_854, "experiments": 6877, "tests": 9185}
+LINES = {"affordlib": 12_854, "experiments": 6773, "tests": 9185}
 """Maximum number of lines: lower it with every cut. The aim is 9,500, 3,500 and 6,500."""
 
 FILES, CODE = 75, 8782
