@@ -200,7 +200,8 @@ def shop(one_world, skills, pushes, tmp_path_factory):
         **fields_of(interactions.split_interactions(20)),
         "place": {"config": None},
         "Tabletop": {"config": world.WorldConfig()},
-        "picture": {"width": 32, "height": 32},
+        "picture": {"width": 32, "height": 32, "at_m": (0.0, 0.0, 0.1), "distance_m": 1.0}
+        | {"yaw_deg": 62.0, "pitch_deg": -33.0, "field_deg": 45.0},
         "FrameRecorder": {"width": 32, "height": 32},
         "settle": {"seconds": 0.1},
         "primitive_named": {"name": "push"},

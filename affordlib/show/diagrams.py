@@ -16,7 +16,7 @@ def plot_flow(
         style = {"boxstyle": "round,pad=0.4", "fc": "white", "ec": color, "lw": 1.5}
         drawn[text] = ax.text(x, y, text, ha="center", va="center", bbox=style)
     for tail, tip in arrows:
-        arrow = {"arrowstyle": "-|>", "color": NEUTRAL}
+        arrow = {"arrowstyle": "-|>", "color": NEUTRAL, "lw": 1.5}
         arrow |= {"patchA": drawn[tail].get_bbox_patch(), "patchB": drawn[tip].get_bbox_patch()}
         ax.annotate("", boxes[tip][:2], boxes[tail][:2], arrowprops=arrow)
     ax.axis("off")

@@ -64,7 +64,8 @@ plt.rcParams.update(
 )
 
 
-if shell := get_ipython():  # twice the resolution in notebooks, for high-density screens
+if shell := get_ipython():  # in notebooks figures have their own size, and twice the resolution
+    InlineBackend.instance(parent=shell).print_figure_kwargs = {"bbox_inches": None}
     InlineBackend.instance(parent=shell).figure_formats = {"retina"}
 
 
@@ -180,6 +181,9 @@ def plot_plan(
 def plot_outcome(ax: Axes, outcome: Outcome) -> Axes:
     """Draw the object's true path in an executed plan over the plan (see `plot_plan`)."""
     plot_plan(ax, outcome.plan, sigma=False)
+    for line in ax.lines:
+        if line.get_color() == PREDICTION:
+            line.set(lw=5, alpha=0.4)  # wide, so that it is seen below the executed path
     for k, path in enumerate(outcome.object_paths_xy_m):
         ax.plot(*_cm(path), color=TRUTH, lw=2, ls="--", label="executed" if k == 0 else None)
     ax.plot(*_cm(outcome.end_pose[:2]), "s", color=TRUTH, ms=6, zorder=6)
@@ -226,14 +230,12 @@ def plot_closed_loop(
 
 
 def plot_depth(ax: Axes, image: np.ndarray, title: str = "") -> Axes:
-    """Draw the depth channel of an image (2, 48, 48), as height above the table in centimetres."""
-    height_cm = 100 * (CAMERA_HEIGHT_M - checked_image(image)[0, 0].numpy())
-    half, top = 50 * CROP_WIDTH_M, max(8.0, float(height_cm.max()))
-    extent = (-half, half, -half, half)
-    drawn = ax.imshow(height_cm, extent=extent, cmap="cividis", vmin=0, vmax=top)
+    """Draw the depth channel of an image (2, 48, 48): the higher above the table, the brighter."""
+    height_m = CAMERA_HEIGHT_M - checked_image(image)[0, 0]
+    half = 50 * CROP_WIDTH_M
+    ax.imshow(height_m, extent=(-half, half, -half, half), cmap="cividis", vmin=0)
     ax.grid(False)
-    ax.set(title=title, xlabel="x [cm]", ylabel="y [cm]")
-    ax.figure.colorbar(drawn, ax=ax, label="height [cm]", shrink=0.8)
+    ax.set(title=title, xlabel="x [cm]", ylabel="y [cm]", xticks=(-5, 0, 5), yticks=(-5, 0, 5))
     return ax
 
 
@@ -283,19 +285,20 @@ def plot_levered(
 class FrameRecorder:
     """Records a picture every `every` simulation steps (1/240 s), as the `world.on_step` callback.
 
-    Figures can be added as frames as well, with `add`.
+    Figures can be added as frames as well, with `add`. view: options of `Tabletop.picture`.
     """
 
-    def __init__(self, every: int = 30, width: int = 320, height: int = 240) -> None:
+    def __init__(self, every: int = 30, width: int = 320, height: int = 240, **view: Any) -> None:
         self.every = check_count("every", every, 1, 100_000)
         self.width = check_count("width", width, 16, 2048)
         self.height = check_count("height", height, 16, 2048)
+        self.view = view
         self.frames: list[np.ndarray] = []
         self._steps = 0
 
     def __call__(self, world: Tabletop) -> None:
         if self._steps % self.every == 0:
-            self.frames.append(world.picture(self.width, self.height))
+            self.frames.append(world.picture(self.width, self.height, **self.view))
         self._steps += 1
 
     def add(self, figure: Figure) -> None:
@@ -355,9 +358,10 @@ def show_animation(
 ) -> NotebookImage:
     """The frames as an animation for a notebook; if `path` is given, also saved as a GIF.
 
-    beside: a figure shown to the left of every frame.
+    beside: a figure shown to the left of every frame. More than 900 pixels are shown at half width.
     """
     if path is not None:
         write_atomically(Path(path), recorder.encoded("GIF", beside=beside), b"GIF8")
     # A PNG, since web pages made from a notebook drop GIFs; it is also a third smaller.
-    return NotebookImage(recorder.encoded("PNG", beside=beside), format="png")
+    data = recorder.encoded("PNG", beside=beside)
+    return NotebookImage(data, format="png", retina=Image.open(io.BytesIO(data)).width > 900)

@@ -145,12 +145,21 @@ def kinect_view(
     return xy, np.stack([CAMERA_HEIGHT_M - height, mask]).astype(np.float32)
 
 
-def picture(client: BulletClient, width: int = 320, height: int = 240) -> np.ndarray:
-    """Render a colour picture (height, width, 3), uint8, of the robot and the table."""
+def picture(
+    client: BulletClient,
+    size: tuple[int, int],
+    at_m: list[float],
+    distance_m: float,
+    yaw_deg: float,
+    pitch_deg: float,
+    field_deg: float,
+) -> np.ndarray:
+    """Render a colour picture (height, width, 3), uint8; see `Tabletop.picture`."""
     view = pybullet.computeViewMatrixFromYawPitchRoll(
-        (-0.05, 0.0, 0.06), distance=1.0, yaw=62, pitch=-33, roll=0, upAxisIndex=2
+        at_m, distance_m, yaw_deg, pitch_deg, roll=0, upAxisIndex=2
     )
-    projection = pybullet.computeProjectionMatrixFOV(45, width / height, 0.1, 4.0)
+    width, height = size
+    projection = pybullet.computeProjectionMatrixFOV(field_deg, width / height, 0.1, 4.0)
     light = {"lightDirection": (0.6, -0.7, 1.6), "lightDistance": 3.0, "shadow": 1}
     # Rendered at twice the size and averaged, since TinyRenderer does no anti-aliasing.
     _, _, rgba, _, _ = client.getCameraImage(

@@ -219,12 +219,33 @@ class Tabletop(AbstractContextManager):
         """Return depth [m] and mask (2, 48, 48) around the object; the arm must be parked."""
         return self.observe().image
 
-    def picture(self, width: int = 320, height: int = 240) -> np.ndarray:
-        """Render a colour picture (height, width, 3), uint8, of the robot and the table."""
+    def picture(
+        self,
+        width: int = 320,
+        height: int = 240,
+        at_m: Sequence[float] = (-0.05, 0.0, 0.06),
+        distance_m: float = 1.0,
+        yaw_deg: float = 62.0,
+        pitch_deg: float = -33.0,
+        field_deg: float = 45.0,
+    ) -> np.ndarray:
+        """Render a colour picture (height, width, 3), uint8, of the robot and the table.
+
+        The camera looks at a point `at_m` (x, y, z) from a distance, with a vertical field of view;
+        with the yaw 0 it looks along y, with the pitch -90 straight down.
+        """
         for name, pixels in (("width", width), ("height", height)):
             check_count(name, pixels, 16, 2048)
+        view = (
+            check_within("distance_m", distance_m, 0.2, 3.0, "m"),
+            check_within("yaw_deg", yaw_deg, -360.0, 360.0, "°"),
+            check_within("pitch_deg", pitch_deg, -90.0, 0.0, "°"),
+            check_within("field_deg", field_deg, 1.0, 120.0, "°"),
+        )
+        (at_m,) = check_array("at_m", [at_m], 1, 3)
+        at_m = [check_within("at_m", value, -2.0, 2.0, "m") for value in at_m]
         self._move_marks(1.0)
-        picture = camera.picture(self.client, width, height)
+        picture = camera.picture(self.client, (width, height), at_m, *view)
         self._move_marks(-1.0)
         return picture
 

@@ -1,4 +1,4 @@
-"""Exercises of notebooks 06 to 08: chains and stops, the closed loop, and new objects."""
+"""Exercises of notebooks 00 and 06 to 08: stops and chains, the closed loop, and new objects."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from affordlib.primitives import Grasp, Push
 from affordlib.types import Goal, Observation, Plan, Step
 from affordlib.world import Cuboid, Prism, Tabletop, UprightCylinder
 from exercises.checking import Exercise, answered, asked
+from exercises.world import rest_cm
 
 BOX = Cuboid(length=0.07, width=0.05, height=0.05)
 YAW_RAD = 0.3
@@ -25,10 +26,25 @@ YAW_RAD = 0.3
 
 @cache
 def _box_effects() -> EffectMap:
-    """The effect map of the box of notebooks 06 and 07."""
+    """The effect map of the box of notebooks 00, 06 and 07."""
     with Tabletop() as world:
         world.place(BOX, yaw_rad=YAW_RAD)
         return EffectMap(load_checkpoint("film_5000")[0], world.depth_image())
+
+
+# 00 Start here
+
+
+def _right_percent(reaches: Callable[[np.ndarray], bool]) -> float:
+    """Share [%] of 500 goals up to 15 cm away for which the answer is right."""
+    rng = np.random.default_rng(0)
+    far, bearing = 0.15 * np.sqrt(rng.uniform(size=500)), rng.uniform(0, 2 * math.pi, 500)
+    goals = np.column_stack([far * np.cos(bearing), far * np.sin(bearing)])
+    *_, ends = _box_effects().fine_grid
+    true = ends[False].query(goals)[0] < Goal((0.0, 0.0)).tolerance_m
+    return 100 * float(
+        np.mean([bool(asked(reaches, g)) == t for g, t in zip(goals, true, strict=True)])
+    )
 
 
 # 06 Planning
@@ -133,6 +149,23 @@ def _told_apart_percent(strangeness: Callable[..., Any]) -> float:
     more = np.subtract.outer(houses, known)
     return 100 * float((more > 0).mean() + 0.5 * (more == 0).mean())
 
+
+START: dict[str, Exercise] = {
+    "00.1": Exercise(
+        "Find the phase at which the push must stop for the box to rest 5 cm from its start.",
+        lambda phase: rest_cm(phase, YAW_RAD),
+        expected=5.0,
+        within=0.15,
+        unit="cm",
+    ),
+    "00.2": Exercise(
+        "Write reaches(goal_xy_m): whether one full push brings the box within 2 cm of the goal.",
+        _right_percent,
+        expected=100.0,
+        within=8.0,
+        unit="% of the answers right",
+    ),
+}
 
 PLANS: dict[str, Exercise] = {
     "06.1": Exercise(

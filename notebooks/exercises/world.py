@@ -23,10 +23,10 @@ def _worst_speed_error(speed_m_s: Callable[[float], float]) -> float:
     return 1000 * max(abs(asked(speed_m_s, float(k)) - v) for k, v in zip(t, true, strict=True))
 
 
-def _rest_cm(phase: float) -> float:
+def rest_cm(phase: float, yaw_rad: float = 0.4) -> float:
     """How far [cm] the box of notebook 01 has moved, pushed towards 0.6 rad up to a phase."""
     with Tabletop() as world:
-        world.place(Cuboid(length=0.07, width=0.05, height=0.05), yaw_rad=0.4)
+        world.place(Cuboid(length=0.07, width=0.05, height=0.05), yaw_rad=yaw_rad)
         return 100 * float(
             np.hypot(*world.execute_primitive(Push.towards(0.6), phase).rest_effect[:2])
         )
@@ -61,7 +61,7 @@ WORLD: dict[str, Exercise] = {
     ),
     "01.2": Exercise(
         "Find the phase at which the push must stop for the box to rest 5 cm from its start.",
-        _rest_cm,
+        rest_cm,
         expected=5.0,
         within=0.05,
         unit="cm",

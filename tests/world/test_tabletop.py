@@ -94,6 +94,15 @@ def test_a_mark_is_in_pictures_only(world):
     np.testing.assert_array_equal(world.depth_image(), seen)
 
 
+def test_a_picture_from_twice_as_far_shows_the_object_half_as_large(world):
+    world.place(OBJECTS[0], (-0.05, 0.0))
+    near, far = (world.picture(320, 240, distance_m=d).astype(int) for d in (1.0, 2.0))
+    green = [int((p[..., 1] > 2 * p[..., 0]).sum()) for p in (near, far)]
+    assert green[0] == pytest.approx(4 * green[1], rel=0.15)
+    with pytest.raises(ValueError, match=r"distance_m must lie in .*, got 5"):
+        world.picture(distance_m=5.0)
+
+
 def test_unreachable_raises_or_is_recorded_and_moves_nothing(world):
     world.place(OBJECTS[0], (0.45, 0.5), 0.0)
     before = world.object_state()
