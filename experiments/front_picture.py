@@ -20,16 +20,18 @@ from affordlib.world import Cuboid, Tabletop
 
 BOX = Cuboid(0.05, 0.045, 0.05)
 GOAL = Goal((0.0, 0.028))
-FRAME_STEPS = 48
-LARGE, LEFT, TOP, WIDTH, HEIGHT = (960, 720), 275, 185, 420, 330
-"""Size of the rendered pictures and the part of them that is shown [pixels]."""
+FRAME_STEPS, LEAVES = 48, 6
+"""Simulation steps between two frames; frames at the end in which the arm leaves the picture."""
+WIDTH, HEIGHT = 840, 660
+"""Size of one of the two pictures, below its title [pixels]; pages show it at half of that."""
+VIEW = {"at_m": (-0.05, 0.0, 0.08), "distance_m": 1.15, "field_deg": 25.0}
 GOAL_RGB = (0.0, 0.45, 0.70)
 PICTURE = repo_root() / "figures" / "partial_push.gif"
 
 
 def recorded(title: str, stop: bool) -> list[np.ndarray]:
     """Return frames (h, w, 3) of one planned push, stopped as planned or executed in full."""
-    animation = FrameRecorder(FRAME_STEPS, *LARGE)
+    animation = FrameRecorder(FRAME_STEPS, WIDTH, HEIGHT, **VIEW)
     with Tabletop() as world:
         world.place(BOX, (0.0, 0.0), 0.3)
         planner = Skills.load().planner(plan_continuous, mode="single_partial")
@@ -40,17 +42,18 @@ def recorded(title: str, stop: bool) -> list[np.ndarray]:
         world.mark(GOAL.xy_m, GOAL_RGB, turned, scale=1.3)
         world.on_step = animation
         outcome = execute_plan(world, plan)
+    del animation.frames[-LEAVES:]
     titles = [title.format(plan.steps[0].stop_phase)] * len(animation.frames)
     titles[-8:] = [f"{titles[0]}: {1000 * outcome.distance_m:.1f} mm from the goal"] * 8
     return [_titled(*pair) for pair in zip(animation.frames, titles, strict=True)]
 
 
 def _titled(picture: np.ndarray, title: str) -> np.ndarray:
-    """Return the shown part of a picture under a line of text."""
-    image = Image.new("RGB", (WIDTH, HEIGHT + 30), "white")
-    image.paste(Image.fromarray(picture[TOP : TOP + HEIGHT, LEFT : LEFT + WIDTH]), (0, 30))
-    font = ImageFont.truetype(font_manager.findfont("DejaVu Sans"), 14)
-    ImageDraw.Draw(image).text((WIDTH / 2, 8), title, "black", font, anchor="ma")
+    """Return a picture under a line of text."""
+    image = Image.new("RGB", (WIDTH, HEIGHT + 60), "white")
+    image.paste(Image.fromarray(picture), (0, 60))
+    font = ImageFont.truetype(font_manager.findfont("DejaVu Sans"), 28)
+    ImageDraw.Draw(image).text((WIDTH / 2, 16), title, "black", font, anchor="ma")
     return np.asarray(image)
 
 
