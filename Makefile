@@ -136,7 +136,7 @@ notebooks: $(STAMP) ## Execute the committed notebooks in place and clean their 
 html: $(STAMP) ## Write the committed notebooks as web pages into runs/html, readable offline
 	@$(PY) -m nbconvert --config notebooks/book_html/config.py notebooks/*.ipynb notebooks/appendix/*.ipynb
 	@sed -i -E -e 's#href="(\.\./|appendix/)?([0-9A-Za-z_]+)\.ipynb#href="\2.html#g' \
-	  -e 's#href="(\.\./)+((data/)?[A-Za-z]+\.md)#href="../../\2#g' -e 's#href="solutions/#href="../../notebooks/solutions/#g' runs/html/*.html
+	  -e 's#href="(\.\./)+((data/)?[A-Za-z]+\.md)#href="../../\2#g' -e 's#href="(\.\./)?solutions/#href="../../notebooks/solutions/#g' runs/html/*.html
 
 tables: $(STAMP) ## Fill the tables of README, RESULTS and data card from data/results
 	@$(PY) -m experiments.tables README.md RESULTS.md data/README.md

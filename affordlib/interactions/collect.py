@@ -4,7 +4,7 @@ This module also defines the variables of a data set: arrays, dimensions, units 
 
 Workers return chunks of interactions, which are stored in a hidden folder beside the file until
 all are complete; a rerun collects only missing chunks. The finished set is bit-identical for any
-number of workers and any order of chunks.
+number of workers and any size and order of chunks.
 """
 
 import os
@@ -42,7 +42,7 @@ from affordlib.world.execution import RECORDED_SAMPLES
 from affordlib.world.trajectory import N_SAMPLES
 
 CHUNK = 50
-"""Number of interactions per chunk, the unit that a worker collects, returns and stores."""
+"""Usual number of interactions per chunk, the unit that a worker collects, returns and stores."""
 
 GRAIN = 2.0**-20
 """Resolution of stored float32 values, about 1 µm or 1 µrad, to which they are rounded."""
@@ -94,20 +94,22 @@ def collect(
     workers: int = 1,
     progress: bool = True,
     replace: bool = False,
+    chunk: int | None = None,
 ) -> str | Path:
     """Collect a recipe's data set into a local file and return its path, which ends in .zarr.zip.
 
     client: a Dask client; None uses `workers` processes on this machine, at most 256. A rerun
-    collects missing chunks; a complete file is replaced only with `replace`. Raises ValueError if
-    the path holds anything else, RuntimeError if another process is collecting into it or if a
-    chunk cannot be collected.
+    collects missing chunks; a complete file is replaced only with `replace`. chunk: interactions
+    per chunk, 50 by default. Raises ValueError if the path holds anything else, RuntimeError if
+    another process is collecting into it or if a chunk cannot be collected.
     """
     if not str(path).endswith(SUFFIX):
         raise ValueError(f"path must end in {SUFFIX!r}, got {str(path)!r}")
     check_count("workers", workers, 1, 256)
+    size = check_count("chunk", CHUNK if chunk is None else chunk)
     if client is None and workers > 1:
         with dask_client(workers) as local:
-            return collect(recipe, path, local, progress=progress, replace=replace)
+            return collect(recipe, path, local, 1, progress, replace, chunk)
 
     attrs, file = attributes_for(recipe), Path(path).absolute()
     is_there = _is_there(file, attrs, replace)
@@ -116,7 +118,7 @@ def collect(
     try:
         with FileLock(parts / "lock", timeout=0):
             if not is_there:
-                whole = _collected(recipe, attrs, parts, client, progress)
+                whole = _collected(recipe, attrs, parts, size, client, progress)
                 write_interactions(whole, file)
             shutil.rmtree(parts, ignore_errors=True)
     except Timeout:
@@ -152,12 +154,13 @@ def _collected(
     recipe: Recipe,
     attrs: dict[str, str],
     parts: Path,
+    size: int,
     client: "dask.distributed.Client | None",
     progress: bool,
 ) -> xr.Dataset:
     """Collect the chunks that are missing in `parts` and return the complete set."""
     n = recipe.n_interactions
-    rows = [range(k, min(k + CHUNK, n)) for k in range(0, n, CHUNK)]
+    rows = [range(k, min(k + size, n)) for k in range(0, n, size)]
     kept = {r: parts / f"{r.start:08d}-{r.stop:08d}{SUFFIX}" for r in rows}
     missing = [r for r in rows if _attributes(kept[r]) != attrs]
     made = _made(partial(_make, recipe, attrs), missing, client)

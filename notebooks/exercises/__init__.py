@@ -2,7 +2,8 @@
 
 An exercise asks for a number or a function. `check("01.1", mine)` measures what it is worth and
 shows that figure beside the expected one. The exercises stand by the parts of the book: the world
-(01, 02), the models (03 to 05), planning and beyond (00, 06 to 08), a log of one's own (09).
+(01, 02), the models (03 to 05), planning and beyond (00, 06 to 08), a log of one's own (09),
+storage (A5).
 """
 
 from __future__ import annotations
@@ -14,11 +15,12 @@ from exercises.checking import Exercise, Verdict, judge
 from exercises.logs import LOGS
 from exercises.models import MODELS
 from exercises.plans import PLANS, START
+from exercises.storage import STORAGE
 from exercises.world import WORLD
 
 __all__ = ["EXERCISES", "Exercise", "Verdict", "check"]
 
-EXERCISES: dict[str, Exercise] = START | WORLD | MODELS | PLANS | LOGS
+EXERCISES: dict[str, Exercise] = START | WORLD | MODELS | PLANS | LOGS | STORAGE
 
 
 @checked
