@@ -133,10 +133,11 @@ checkpoints: $(STAMP) ## Train the shipped models again (ONLY="film_500")
 notebooks: $(STAMP) ## Execute the committed notebooks in place and clean their metadata (ONLY= FORCE=1)
 	@$(PY) -m affordlib.workbook --in-place --only "$$ONLY" $(if $(FORCE),--force)
 
-html: $(STAMP) ## Write the committed notebooks as web pages into runs/html, readable offline
-	@$(PY) -m nbconvert --config notebooks/book_html/config.py notebooks/*.ipynb notebooks/appendix/*.ipynb
-	@sed -i -E -e 's#href="(\.\./|appendix/)?([0-9A-Za-z_]+)\.ipynb#href="\2.html#g' \
-	  -e 's#href="(\.\./)+((data/)?[A-Za-z]+\.md)#href="../../\2#g' -e 's#href="(\.\./)?solutions/#href="../../notebooks/solutions/#g' runs/html/*.html
+html: $(STAMP) ## Write the book as web pages into runs/html, readable offline: open index.html
+	@rm -rf runs/html runs/jupyter_execute
+	@$(PY) -m sphinx -q -c notebooks/book_html -d runs/jupyter_execute/doctrees . runs/html
+	@rm -rf runs/jupyter_execute
+	@echo "Open runs/html/index.html"
 
 tables: $(STAMP) ## Fill the tables of README, RESULTS and data card from data/results
 	@$(PY) -m experiments.tables README.md RESULTS.md data/README.md

@@ -1,4 +1,4 @@
-"""Notebook 00 and the two explorers in a real browser: mouse, keyboard, buttons, requests.
+"""Notebook 00, the two explorers and the web pages in a real browser.
 
 JupyterLab runs on this machine, in headless Chromium. Pictures and measured times are stored in
 `runs/browser/`.
@@ -6,6 +6,7 @@ JupyterLab runs on this machine, in headless Chromium. Pictures and measured tim
 
 import json
 import os
+import re
 import secrets
 import shutil
 import socket
@@ -15,12 +16,13 @@ import time
 import urllib.request
 from contextlib import contextmanager
 from types import SimpleNamespace
-from urllib.parse import urlparse
+from urllib.parse import unquote, urlparse
 
 import nbformat
 import numpy as np
 import papermill
 import pytest
+from bs4 import BeautifulSoup
 
 from affordlib.paths import repo_root
 from affordlib.workbook import WIDGET
@@ -545,22 +547,97 @@ def test_no_request_leaves_the_machine(page, lab):
     assert page.locator("text=Would you like to get notified").count() == 0
 
 
-def test_the_web_pages_are_read_without_a_network(tmp_path, browser):
-    """Equations are drawn, no request leaves, and nothing is wider than a phone."""
-    root, names = repo_root(), ("00_start_here", "03_affordance_cnp", "06_planning")
-    command = ["nbconvert", "--config", "notebooks/book_html/config.py", "--output-dir", tmp_path]
-    pages = [f"notebooks/{name}.ipynb" for name in names]
-    subprocess.run([sys.executable, "-m", *command, *pages], cwd=root, check=True)
-    page, requests = browser.new_page(viewport={"width": 400, "height": 800}), []
+@pytest.fixture(scope="module")
+def web(tmp_path_factory):
+    """The folder of the web pages and, of each page, its path and its parsed text."""
+    made = tmp_path_factory.mktemp("web")
+    options = ["-q", "-W", "--keep-going", "-c", "notebooks/book_html", "-d", made / "doctrees"]
+    command = [sys.executable, "-m", "sphinx", *options, ".", made / "html"]
+    subprocess.run(command, cwd=repo_root(), check=True)
+    files = sorted((made / "html").rglob("*.html"))
+    return made / "html", {p: BeautifulSoup(p.read_text(), "html.parser") for p in files}
+
+
+def chapters(web):
+    """The pages in reading order, without index (a copy of the first) and search."""
+    folder, pages = web
+    first = folder / "README.html"
+    names = [link["href"] for link in pages[first].select(".sidebar-tree a.internal")]
+    return [first, *(folder / name for name in names)]
+
+
+def test_every_link_of_the_web_pages_leads_somewhere(web):
+    folder, pages = web
+    written = {f"{path.stem}.html" for path in (repo_root() / "notebooks").rglob("[0-9A]*.ipynb")}
+    assert written <= {path.name for path in chapters(web)} <= {path.name for path in pages}
+    named = {path: {tag["id"] for tag in page.select("[id]")} for path, page in pages.items()}
+    for path, page in pages.items():
+        for tag in page.select("[href], [src]"):
+            link = tag.get("href") or tag["src"]
+            url = urlparse(link)
+            if url.scheme in ("http", "https"):
+                assert tag.name == "a", f"{path} loads {link}"
+                continue
+            file = (path.parent / unquote(url.path)).resolve() if url.path else path
+            assert file.is_file(), f"{path}: {link}"
+            assert file.is_relative_to(folder), f"{path}: {link}"
+            assert not url.fragment or unquote(url.fragment) in named[file], f"{path}: {link}"
+        assert all(image.get("alt") for image in page.select("img")), path
+    assert sum(file.stat().st_size for file in folder.rglob("*") if file.is_file()) < 20e6
+
+
+def test_the_web_pages_are_read_on_a_phone_without_a_network(web, browser):
+    """Equations are drawn, nothing is wider than the window, and nothing is requested outside."""
+    order = chapters(web)
+    page = browser.new_page(viewport={"width": 400, "height": 800})
+    requests, complaints, scrolled = [], [], 0
     page.on("request", lambda request: requests.append(request.url))
-    for name in names:
-        page.goto(f"file://{tmp_path}/{name}.html")
-        assert page.locator("math").count() > 20
+    page.on("console", lambda message: complaints.append(message.text))
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    for path, before, after in zip(order, [None, *order], [*order[1:], None], strict=False):
+        page.goto(path.as_uri())
+        assert page.evaluate("document.documentElement.scrollWidth") <= 400, path
+        for way, neighbour in (("prev", before), ("next", after)):
+            links = page.locator(f".related-pages .{way}-page").evaluate_all("a => a.map(String)")
+            assert links == ([neighbour.as_uri()] if neighbour else []), path
         drawn = page.locator("math").evaluate_all("every => every.map(m => m.clientHeight)")
-        assert min(drawn) > 4
-        text = "".join(page.locator(".jp-RenderedMarkdown").all_inner_texts())
-        assert "$" not in text
-        assert "\\" not in text.replace("A\\*", "")
-        assert page.evaluate("document.documentElement.scrollWidth") <= 400
-        assert not page.locator("img:not([alt]), img[alt='']").count()
+        assert min(drawn, default=9) > 4, path
+        text = page.locator("article").evaluate(
+            """article => {
+                const copy = article.cloneNode(true);
+                copy.querySelectorAll("pre, code, math").forEach((e) => e.remove());
+                return copy.textContent;
+            }"""
+        )
+        assert not {"$", "\\"} & set(text), path
+        scrolled += page.locator("pre").evaluate_all(
+            """all => all.filter((e) => e.scrollWidth > e.clientWidth
+                && getComputedStyle(e).overflowX === "auto").length"""
+        )
+        assert page.locator("img").evaluate_all("all => all.every((e) => e.naturalWidth)"), path
+    assert scrolled > 50
     assert all(url.startswith(("file:", "data:")) for url in requests)
+    assert not complaints
+
+
+def test_the_web_pages_are_found_by_a_word_and_darken(web, browser):
+    folder, _ = web
+    page = browser.new_page(viewport={"width": 1280, "height": 900})
+    page.goto((folder / "index.html").as_uri())
+    page.locator("input.sidebar-search").fill("Newton")
+    page.keyboard.press("Enter")
+    found = page.locator("#search-results li a")
+    found.first.wait_for()
+    found.first.click()
+    assert "Newton" in page.locator("article").inner_text()
+    page.goto((folder / "notebooks" / "06_planning.html").as_uri())
+
+    def shades():
+        seen = "e => getComputedStyle(e)"
+        back = page.locator("body").evaluate(f"({seen})(document.body).backgroundColor")
+        return back, page.locator(".dataframe td").first.evaluate(f"e => ({seen})(e).color")
+
+    bright = shades()
+    page.emulate_media(color_scheme="dark")
+    assert [sum(map(int, re.findall(r"\d+", shade))) > 380 for shade in bright] == [True, False]
+    assert [sum(map(int, re.findall(r"\d+", shade))) > 380 for shade in shades()] == [False, True]

@@ -1,0 +1,78 @@
+"""How notebooks, README and RESULTS become web pages: `make html` (Sphinx with MyST-NB).
+
+Equations become MathML, which browsers draw without a script or a network.
+"""
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+from docutils import nodes
+from latex2mathml.converter import convert
+from myst_parser.slugs import github_slugify
+
+project = html_title = "Planning with partial actions"
+root_doc = "README"
+extensions = ["myst_nb"]
+include_patterns = ["*.md", "data/*.md", "notebooks/*.ipynb", "notebooks/appendix/*.ipynb"]
+exclude_patterns = [".*", "runs", "build", "**/.*"]
+
+nb_execution_mode = "off"
+nb_ipywidgets_js = {}
+myst_enable_extensions = ["dollarmath"]
+myst_heading_anchors = 4
+
+html_theme = "furo"
+html_theme_options = {"dark_css_variables": {"figure-filter": "brightness(0.9)"}}
+html_math_renderer = "mathml"
+html_static_path = html_css_files = ["style.css"]
+html_show_search_summary = False  # would be fetched, which browsers refuse from disk
+html_copy_source = html_show_copyright = html_use_index = False
+
+
+def describe(cell: dict) -> None:
+    """Give a picture its alternative text, and a folded cell a name."""
+    about = cell["metadata"]["mystnb"] = {}
+    kinds = {"write_results(": "results", "import": "imports"}
+    named = [name for word, name in kinds.items() if word in "".join(cell["source"])]
+    for output in cell["outputs"]:
+        for shown in output.get("metadata", {}).values():
+            about["image"], named = {"alt": shown["alt"]}, ["figure"]
+    about["code_prompt_show"] = about["code_prompt_hide"] = ": ".join(["Code", *named[:1]])
+
+
+def prepare(app, docname: str, source: list[str]) -> None:
+    """Write anchors as GitHub does; describe the cells; add the contents to the first page."""
+    link, text = r"(\]\([^)\s]*#)([^)]+)\)", source[0]
+    text = re.sub(link, lambda m: f"{m[1]}{github_slugify(m[2])})", text)
+    if app.env.doc2path(docname).suffix == ".ipynb":
+        notebook = json.loads(text)
+        for cell in notebook["cells"]:
+            if cell["cell_type"] == "code":
+                describe(cell)
+        text = json.dumps(notebook)
+    elif docname == root_doc:  # GitHub draws Mermaid and lists folders; a page on disk cannot
+        flow = "![The data flow, from the robot to the planner and back.](figures/data_flow.svg)"
+        text = re.sub(r"```mermaid.*?```", flow, text, flags=re.DOTALL)
+        text = text.replace("notebooks/appendix)", "notebooks/appendix/A1_effect_prediction.ipynb)")
+        text += Path(__file__).with_name("contents.md").read_text()
+    source[0] = text
+
+
+def write_math(self, node) -> None:
+    """Write an equation; its number, which MathML does not know, stands behind it."""
+    body = re.sub(r"\\tag\{(.*?)\}", r"\\qquad\\text{(\1)}", node.astext())
+    if isinstance(node, nodes.math_block):
+        self.body.append(f'<div class="equation">{convert(body, display="block")}</div>')
+    else:
+        self.body.append(convert(body))
+    raise nodes.SkipNode
+
+
+def setup(app) -> None:
+    """Register the above; when all is written, the first page is copied to index.html."""
+    app.connect("source-read", prepare)
+    app.add_html_math_renderer("mathml", (write_math, None), (write_math, None))
+    first, index = (Path(app.outdir, f"{name}.html") for name in (root_doc, "index"))
+    app.connect("build-finished", lambda app, error: error or shutil.copy(first, index))
