@@ -52,9 +52,7 @@ def prepare(app, docname: str, source: list[str]) -> None:
             if cell["cell_type"] == "code":
                 describe(cell)
         text = json.dumps(notebook)
-    elif docname == root_doc:  # GitHub draws Mermaid and lists folders; a page on disk cannot
-        flow = "![The data flow, from the robot to the planner and back.](figures/data_flow.svg)"
-        text = re.sub(r"```mermaid.*?```", flow, text, flags=re.DOTALL)
+    elif docname == root_doc:  # GitHub lists folders; a page on disk cannot
         text = text.replace("notebooks/appendix)", "notebooks/appendix/A1_effect_prediction.ipynb)")
         text += Path(__file__).with_name("contents.md").read_text()
     source[0] = text
