@@ -140,10 +140,11 @@ def fitting(where: str, value: object, default: object) -> Any:
     if isinstance(default, list | tuple) and isinstance(value, list | tuple):
         return [fitting(f"{where}[{i}]", v, (*default, v)[0]) for i, v in enumerate(value)]
     fits = default is None or type(value) is type(default)
+    least = 1 if type(default) is int and default else 0
     if fits and isinstance(value, int | float):
-        fits = math.isfinite(value) and (isinstance(value, float) or value >= 0)
+        fits = math.isfinite(value) and (isinstance(value, float) or value >= least)
     if not fits:
-        limit = {int: " from 0", float: ", finite"}.get(type(default), "")
+        limit = {int: f" from {least}", float: ", finite"}.get(type(default), "")
         raise WorkbookError(
             f"{where} must be {type(default).__name__}{limit}, like its default {default!r}, "
             f"got {type(value).__name__} {value!r:.60}"

@@ -269,7 +269,7 @@ def test_a_second_runner_or_a_file_in_place_of_the_folder_is_refused(book, capsy
     [
         (["02_secnod.n=1"], r"notebook '02_secnod' is unknown; did you mean 02_second"),
         (["02_second.m=1"], r"parameter of 02_second 'm' is unknown; .*\bn\b"),
-        (["02_second.n=-3"], r"02_second.n must be int from 0, .* got int -3"),
+        (["02_second.n=0"], r"02_second.n must be int from 1, .* got int 0"),
         (["02_second.rate=.nan"], r"02_second.rate must be float, finite, .* got float nan"),
         (["02_second.n=1.5"], r"02_second.n must be int .* got float 1.5"),
         (["02_second.n=true"], r"02_second.n must be int .* got bool True"),

@@ -12,7 +12,6 @@ function render({ model, el }) {
   const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg");
   image.hidden = true;
   image.alt = "";
-  svg.setAttribute("aria-label", model.get("label"));
   svg.setAttribute("role", model.get("keyboard") ? "application" : "img");
   if (model.get("keyboard")) svg.setAttribute("tabindex", 0);
   // JupyterLab's own shortcuts (arrow keys move between cells) are disabled while this has focus.
@@ -44,6 +43,7 @@ function render({ model, el }) {
     if (!box) return;
     svg.innerHTML = inside;
     svg.setAttribute("viewBox", box);
+    svg.setAttribute("aria-label", model.get("label"));
     svg.setAttribute("aria-busy", Boolean(planning));
     Object.assign(svg.dataset, { answered, draft, planning });
     if (answered >= number) hand = null;
@@ -145,7 +145,7 @@ function render({ model, el }) {
 
   // Sliders beside a drawing have no names for screen readers.
   const nameSliders = () =>
-    el.closest(".widget-vbox")?.querySelectorAll("[role=slider]").forEach((handle) => {
+    el.closest(".affordlib-picker, .affordlib-figure")?.querySelectorAll("[role=slider]").forEach((handle) => {
       handle.ariaLabel = handle.closest(".widget-slider").querySelector(".widget-label").textContent;
     });
   new ResizeObserver(() => setTimeout(nameSliders, 500)).observe(el); // after the page is complete

@@ -87,6 +87,7 @@ class FigureWidget(WithPicture, widgets.VBox):
             control.observe(lambda _: self.refresh(), names="value")
         row = widgets.HBox(list(controls), layout={"flex_flow": "row wrap"})
         super().__init__([row, self._drawing, self._words])
+        self.add_class("affordlib-figure")
         self.refresh()
 
     def draw(self, figure: Figure) -> str:

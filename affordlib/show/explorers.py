@@ -23,7 +23,7 @@ from affordlib.world import Tabletop
 
 CHANNELS = {"action": ACTION_CHANNELS, "effect": EFFECT_CHANNELS}
 N_TARGETS = 101
-_PHASES = {"min": 0, "max": 1, "step": 0.01, "layout": {"width": "24em"}}
+_PHASES = {"min": 0, "max": 1, "step": 0.01, "layout": {"width": "24em", "max_width": "100%"}}
 
 
 class ConditioningExplorer(FigureWidget):
@@ -42,7 +42,7 @@ class ConditioningExplorer(FigureWidget):
         self.prediction: Prediction | None = None
         with torch.no_grad():
             self._features = model.encode(torch.as_tensor(seen.image, dtype=torch.float32)[None])
-        look = _PHASES | {"style": {"description_width": "9em"}}
+        look = _PHASES | {"style": {"description_width": "8em"}}
         tick = {"indent": False, "layout": {"width": "6em"}}
         self._action_t = widgets.FloatRangeSlider(
             value=(0.0, 1.0), description="action seen at t", **look

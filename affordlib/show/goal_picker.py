@@ -46,14 +46,14 @@ POSE_EVERY = 12
 """Simulation steps (1/240 s) between two poses of the animated motion."""
 
 _MOVED = 1e-4
-_LAYOUT = {"width": "480px", "max_width": "100%"}
-_HELP = (
-    "Table from above. Arrow keys move the goal by 1 cm, with Shift by 1 mm; Enter runs the plan, "
-    "Escape stops it."
+_LABEL = (
+    "Table from above. The goal is at x = {:.1f}, y = {:.1f} cm, the object at x = {:.1f}, y = "
+    "{:.1f} cm. Arrow keys move the goal by 1 cm, with Shift by 1 mm; Enter runs the plan, Escape "
+    "stops it."
 )
 
 
-class GoalPicker(WithPicture, widgets.VBox):
+class GoalPicker(WithPicture, widgets.HBox):
     """The table from above, where a goal is picked by mouse, keyboard or sliders.
 
     planners: name → function (image, start_xy_m, goal) → Plan. executors: name → function (world,
@@ -94,15 +94,19 @@ class GoalPicker(WithPicture, widgets.VBox):
         self._disturbances: list[Callable[[], None]] = []  # pending until the action ends
         self._poses: list[tuple[float, ...]] = []  # of the object since the last action
         self._paths: list[np.ndarray] = []  # of the object since the plan was made
-        self._view = Drawing(label=_HELP, keyboard=True, layout=_LAYOUT)
+        self._news = ""  # of disturbances, until the next action or plan
+        self._view = Drawing(keyboard=True)
         self._view.add_class("affordlib-table")
         goal = Goal(_whole_mm(check_on_table("goal_xy_m", goal_xy_m)))
         self.controls = PickerControls(goal, list(planners), list(self.executors), self._follow)
         self._listen()
+        below = [self._view, self.controls.progress, self.controls.words]
+        table = widgets.VBox(below, layout={"flex": "1 1 300px", "max_width": "480px"})
         layout = {"flex_flow": "row wrap", "grid_gap": "12px"}
-        super().__init__([widgets.HBox([self._view, self.controls], layout=layout)])
+        super().__init__([table, self.controls], layout=layout)
         self.add_class("affordlib-picker")
-        self._attempt(self._make_plan)
+        for _ in range(2):  # what is slow only once is then not part of the time shown
+            self._attempt(self._make_plan)
 
     @property
     def goal(self) -> Goal:
@@ -228,9 +232,8 @@ class GoalPicker(WithPicture, widgets.VBox):
     def _plan_after_run(self) -> None:
         """Show a plan from here if the goal was moved and the run did not follow it."""
         if self._stale and self.outcome is not None:
-            came_of_it = self.controls.said
+            self._news = self.controls.said
             self._update_plan()
-            self.controls.say(f"{came_of_it} {self.controls.said}")
 
     def _follow(self, goal: Goal) -> None:
         """Set the goal; soon show a draft for it, and the full plan when the drag is finished."""
@@ -269,6 +272,8 @@ class GoalPicker(WithPicture, widgets.VBox):
 
     def _make_plan(self, draft: bool = False) -> None:
         with self._alone:
+            chosen = html.escape(self.controls.planner.value)
+            self.controls.say(f"{self._news} Planning with {chosen} …")
             if not draft:
                 self._show(planning=True)
             planner = self.draft if draft else self._planner()
@@ -276,7 +281,9 @@ class GoalPicker(WithPicture, widgets.VBox):
             self._put_down()
             try:
                 plan = planner(self.world.depth_image(), self._pose[:2], goal)
-                self.controls.say(plan_in_words(plan))
+                if not draft:  # whose words belong to another planner
+                    self.controls.say(f"{self._news} {plan_in_words(plan)}")
+                    self._news = ""
             finally:
                 self._begin(plan)
                 self._answered = number
@@ -284,6 +291,8 @@ class GoalPicker(WithPicture, widgets.VBox):
                 self._show(draft, planning=goal is not self.goal)
 
     def _put_down(self) -> None:
+        """Prepare the table for a new plan."""
+        self.controls.show_progress(0)
         if self._lifted:
             self.world.park()
             self._lifted = False
@@ -312,15 +321,19 @@ class GoalPicker(WithPicture, widgets.VBox):
 
     def _run(self, seconds_per_action: float) -> None:
         """Execute the plan, after making a new one if the shown one is outdated."""
-        done = 0
+        done, left = 0, []
 
         def report(plan=None):
             nonlocal done
             if plan is not None:
+                left[:] = plan.steps
                 self._replace_plan(plan, done)
                 return self.goal
             done += 1
-            self.controls.show_progress(done)
+            name, of = left.pop(0).primitive.name if left else "action", done + len(left)
+            self.controls.show_progress(done, of)
+            self.controls.say(f"{name.replace('_', ' ').capitalize()} {done} of {of}.{self._news}")
+            self._news = ""
             self._play(seconds_per_action)
             while self._disturbances and not self._stop.is_set():
                 self._disturbances.pop(0)()
@@ -333,7 +346,7 @@ class GoalPicker(WithPicture, widgets.VBox):
             try:
                 if self._stale or self.plan is None or self.outcome is not None:
                     self._make_plan()
-                self.controls.show_progress(0, max(1, len(self.plan.steps)))
+                left[:], self._news = self.plan.steps, ""
                 yaw, z = self.world.object_pose()[2], self.world.object_state()[2]
                 self.world.on_step = self._pose_log(on_step)
                 try:
@@ -342,7 +355,7 @@ class GoalPicker(WithPicture, widgets.VBox):
                     execute = self.executors[self.controls.executor.value]
                     outcome = execute(self.world, self.plan, self._planner(), report)
                     how = "Done,"
-                    self.controls.show_progress(done, max(1, done))
+                    self.controls.show_progress(1)
                 except Stopped:
                     outcome, how = measured(self.world, self.plan), "Stopped after"
                 turned = wrap_angle(self.world.object_pose()[2] - yaw)
@@ -369,9 +382,7 @@ class GoalPicker(WithPicture, widgets.VBox):
         self.plan = plan = replace(plan, goal=self.goal, reaches_goal=arrives)
         self._pose = self.world.object_pose()
         self._plan_pose = (*plan.start_xy_m, self._pose[2])
-        self.controls.show_progress(done, done + len(plan.steps))
-        so_far = f"New plan after {done} action{'s' * (done != 1)}."
-        self.controls.say(f"{so_far} {plan_in_words(plan)}")
+        self._news += " New plan." * (done > 0)
         self._show()
 
     def _pose_log(self, also: Callable[[Tabletop], None] | None) -> Callable[[Tabletop], None]:
@@ -415,12 +426,12 @@ class GoalPicker(WithPicture, widgets.VBox):
         self._pose = self.world.object_pose()
         self._poses.clear()
         self._show()
-        self.controls.say(f"The object was shoved by {1000 * np.hypot(dx, dy):.0f} mm.")
+        self._news += f" The object was shoved by {1000 * np.hypot(dx, dy):.0f} mm."
 
     def _move_goal(self) -> None:
         by = self._displacement(self.goal.xy_m, 0.04, 0.08)
         self._set_goal(replace(self.goal, xy_m=_whole_mm(self.goal.xy_m + by)))
-        self.controls.say(f"The goal was moved by {1000 * np.hypot(*by):.0f} mm.")
+        self._news += f" The goal was moved by {1000 * np.hypot(*by):.0f} mm."
 
     def _displacement(self, xy_m: tuple[float, float], least_m: float, most_m: float) -> np.ndarray:
         """A random displacement (2,) [m], reversed where it would leave the shown area."""
@@ -435,15 +446,18 @@ class GoalPicker(WithPicture, widgets.VBox):
         x, y = to_mm(self.goal.xy_m)
         limits = {"left": -1000 * LIMIT_M, "right": 1000 * LIMIT_M}
         limits |= {"top": limits["left"], "bottom": limits["right"], "step": 1}
+        steps = self.plan.steps if self.plan else ()
+        plan, labels = draw_plan(obj, steps, self._plan_pose, self.goal)
         drawing = [
             draw_ground(),
             draw_object(obj, self._pose),
-            draw_plan(obj, self.plan.steps if self.plan else (), self._plan_pose),
+            plan,
             *(draw_path(path, "truth") for path in self._paths),
             f'<polyline class="trail"/><g data-handle="goal" transform="translate({x} {y})">',
             draw_goal(obj, self.goal, self._turn_from),
-            f'</g><text class="busy" y="{40 - edge}">{"planning …" * planning}</text>',
+            f'</g>{labels}<text class="busy" y="{40 - edge}">{"planning …" * planning}</text>',
         ]
+        self._view.label = _LABEL.format(*np.multiply(100, (*self.goal.xy_m, *self._pose[:2])))
         self._view.scene = {
             "inside": "".join(drawing),
             "box": f"{-edge} {-edge} {2 * edge} {2 * edge}",

@@ -12,7 +12,7 @@ from typing import Any
 import ipywidgets as widgets
 import numpy as np
 
-from affordlib.geometry import wrap_angle
+from affordlib.geometry import rotated, unit_vector, wrap_angle
 from affordlib.show.plots import ENLARGED
 from affordlib.types import Goal, Outcome, Plan, Step
 from affordlib.world import BASE_X_M, REACH_M, TabletopObject
@@ -25,6 +25,10 @@ PUSH_RUN_UP_M = 0.2
 
 _ARROW = '<path class="push" d="M-80 0H-38"/><path class="push-head" d="M-32 0L-46 7V-7Z"/>'
 _STAR = "0,-17 4,-5.5 16.2,-5.3 6.5,2.1 10,13.8 0,6.8 -10,13.8 -6.5,2.1 -16.2,-5.3 -4,-5.5"
+
+_AROUND = np.array([(1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1), (0, 1), (0, -1)])
+_GAPS_MM = np.array([8, 25, 50, 80, 120, 170])[:, None, None]
+"""Directions and gaps at which the place of a label is looked for, from its step's end."""
 
 
 def step_in_words(step: Step) -> str:
@@ -70,47 +74,60 @@ def draw_goal(obj: TabletopObject, goal: Goal, from_yaw_rad: float) -> str:
     return outline + circle + _shape("polygon", "goal", points=_STAR)
 
 
-def draw_plan(obj: TabletopObject, steps: Sequence[Step], start: Sequence[float]) -> str:
-    """Draw predicted steps from (x, y, yaw): arrow, path, σ and label; the object's final pose.
-
-    A label is beside the end of its step, away from the next push and its motion; the labels of
-    rotations and lifts are below that of the last move.
-    """
-    moves = [step for step in steps if hasattr(step.primitive, "direction_rad")]
-    shapes, at, right, y_label = [], start, True, 0.0
-    x, y = to_mm(at)
+def draw_plan(
+    obj: TabletopObject, steps: Sequence[Step], start: Sequence[float], goal: Goal
+) -> tuple[str, str]:
+    """Draw predicted steps from (x, y, yaw): arrows, paths, σ and poses; and, apart, labels."""
+    shapes, at = [], start
+    taken = [(*to_mm(goal.xy_m), 1000 * goal.tolerance_m), *_cover(obj, start)]
     for k, step in enumerate(steps):
-        label = f"{k + 1}: {step_in_words(step).removeprefix('push to ')}"
-        if k < len(moves):
+        x, y = to_mm(step.predicted_end_xy_m)
+        if hasattr(step.primitive, "direction_rad"):
             arrow = _at(*at[:2], step.primitive.direction_rad)
             shapes.append(_shape("g", "arrow", _ARROW, transform=arrow))
-            at = step.predicted_end_xy_m
-            x, y = to_mm(at)
+            tail = np.outer((-0.08, -0.06, -0.04), unit_vector(step.primitive.direction_rad))
             if not math.isnan(step.std_m):
                 radius = round(1000 * ENLARGED * step.std_m, 2)
                 shapes.append(_shape("circle", "sigma", cx=x, cy=y, r=radius))
+                taken.append((x, y, radius))
             shapes.append(draw_path(step.predicted_path_xy_m, "prediction"))
             shapes.append(_shape("circle", "prediction-end", cx=x, cy=y, r=3))
-            last = k == len(moves) - 1
-            ahead = moves[k if last else k + 1].primitive.direction_rad
-            right, up = math.cos(ahead) >= 0, math.sin(ahead) > (0.5 if k % 2 else -0.5)
-            x += (28 if last else 12) * (1 if right else -1)
-            if last:
-                y_label = y + 6 - 24 * (len(steps) - len(moves)) * (math.sin(ahead) > 0)
-            else:
-                y_label = y + (26 if up else -14)
-        elif k == 0:
-            x, y_label = x + 28, y + 6
-        else:
-            y_label += 24
-        # A label (10 mm per letter) that would extend beyond the drawing's rim is moved inwards.
-        room = 1000 * HALF_WIDTH_M - 10 * len(label)
-        x_label, anchor = (min(x, room), "start") if right else (max(x, -room), "end")
-        shapes.append(_shape("text", "step", label, x=x_label, y=y_label, text_anchor=anchor))
-    if steps:
-        end = (*steps[-1].predicted_end_xy_m, start[2] + steps[-1].predicted_turn_rad)
-        shapes.append(draw_object(obj, end, "predicted"))
-    return _shape("g", "plan", "".join(shapes))
+            taken += [(*to_mm(xy), 6) for xy in (*(at[:2] + tail), *step.predicted_path_xy_m)]
+        at = (*step.predicted_end_xy_m, start[2] + step.predicted_turn_rad)
+        shapes.append(draw_object(obj, at, "predicted" if k == len(steps) - 1 else "ghost"))
+        taken += _cover(obj, at)
+    return _shape("g", "plan", "".join(shapes)), _shape("g", "plan", _draw_labels(steps, taken))
+
+
+def _draw_labels(steps: Sequence[Step], taken: list[tuple[float, ...]]) -> str:
+    """Label steps, each at the place around its end that is the first to meet none of the circles.
+
+    taken: circles (x, y, radius) [mm]. If they meet every place, the one with most room is used.
+    """
+    edge, shapes = 1000 * HALF_WIDTH_M, []
+    for k, step in enumerate(steps):
+        label = f"{k + 1}: {step_in_words(step).removeprefix('push to ')}"
+        half = np.array([5 * len(label), 9])  # 10 mm per letter
+        end = to_mm(step.predicted_end_xy_m)
+        places = (end + _AROUND * (half + _GAPS_MM)).reshape(-1, 2)
+        places = np.clip(places, half - edge, edge - half)
+        circles = np.array(taken)
+        away = np.maximum(np.abs(places[:, None] - circles[:, :2]) - half, 0)
+        room = (np.linalg.norm(away, axis=-1) - circles[:, 2]).min(axis=1)
+        x, y = places[np.argmax(np.minimum(room, 2))].round(2).tolist()
+        taken += [(x + dx, y, 9) for dx in range(9 - 5 * len(label), 5 * len(label), 9)]
+        rim = np.add((x, y), np.clip(np.subtract(end, (x, y)), -half, half))
+        if math.dist(rim, end) > 60:
+            shapes.append(_shape("path", "leader", d="M{} {}L{} {}".format(*rim, *end)))
+        shapes.append(_shape("text", "step", label, x=x, y=y + 6, text_anchor="middle"))
+    return "".join(shapes)
+
+
+def _cover(obj: TabletopObject, pose: Sequence[float]) -> list[tuple[float, ...]]:
+    """Circles (x, y, radius) [mm] that cover the outline of an object at (x, y, yaw)."""
+    corners = rotated(obj.footprint_m, pose[2])
+    rim = np.linspace(corners, np.roll(corners, 1, axis=0), 6).reshape(-1, 2)
+    return [(*to_mm(xy), 5) for xy in np.vstack([rim, rim / 2]) + pose[:2]]
 
 
 def to_mm(xy_m: Sequence[float]) -> tuple[float, float]:
@@ -146,7 +163,7 @@ class PickerControls(widgets.VBox):
     """Controls of a goal picker; lengths in cm, rotations in degrees, 0 if not part of the goal.
 
     goal: the initial one; planners, executors: the names to choose from; on_goal: called with the
-    new goal when a slider is moved.
+    new goal when a slider is moved. `words` and `progress` are placed by the picker.
     """
 
     def __init__(
@@ -163,13 +180,13 @@ class PickerControls(widgets.VBox):
         self.executor = widgets.Dropdown(options=list(executors), description="carry out")
         self.run = _button("Run", "play", "Execute the plan", button_style="primary")
         self.stop = _button("Stop", "stop", "Stop after this action", disabled=True)
-        self.progress = widgets.IntProgress(max=1, layout={"width": "9em"})
         self.shove = _button("Shove it", "hand-o-right", "Disturb: shove the object")
         self.move_goal = _button("Move goal", "random", "Disturb: move the goal")
         self.start_over = _button("Start over", "undo", "Put the object back")
-        self.name = widgets.Text("plan.json", description="file", layout={"width": "14em"})
+        narrow = {"style": {"description_width": "auto"}, "layout": {"flex": "1", "min_width": "0"}}
+        self.name = widgets.Text("plan.json", description="file", **narrow)
         self.save, self.load = _button("Save", "save"), _button("Load", "folder-open")
-        self.words, self.said = widgets.HTML(), ""
+        self.words, self.said, self.progress = widgets.HTML(), "", widgets.HTML()
         self.show(goal)
         for slider in self.sliders:
             slider.observe(lambda change: self._slid(change["owner"], on_goal), names="value")
@@ -177,13 +194,11 @@ class PickerControls(widgets.VBox):
             [self.planner],
             [self.executor],
             *([slider] for slider in self.sliders),
-            [self.run, self.stop, self.progress],
+            [self.run, self.stop, self.start_over],
             [widgets.Label("disturb"), self.shove, self.move_goal],
-            [self.start_over],
             [self.name, self.save, self.load],
-            [self.words],
         ]
-        super().__init__([widgets.HBox(row) for row in rows])
+        super().__init__([widgets.HBox(row) for row in rows], layout={"flex": "0 1 300px"})
 
     def show(self, goal: Goal) -> None:
         """Set the sliders to a goal, as accurately as they can show it."""
@@ -210,15 +225,14 @@ class PickerControls(widgets.VBox):
             control.disabled = running
         self.stop.disabled = not running
 
-    def show_progress(self, done: int, of: int | None = None) -> None:
-        """Show the number of actions done, and the total if given."""
-        self.progress.value, self.progress.max = done, of or self.progress.max
+    def show_progress(self, done: int, of: int = 1) -> None:
+        """Show the number of actions done, of a total."""
+        self.progress.value = f"<progress aria-label='actions done' value={done} max={of}>"
 
     def say(self, text: str) -> None:
         """Show a text, as HTML, and announce it to screen readers."""
         self.said = text
-        style = "width: 27em; max-width: 100%; line-height: 1.4; white-space: normal"
-        self.words.value = f"<div role='status' aria-live='polite' style='{style}'>{text}</div>"
+        self.words.value = f"<div role='status' aria-live='polite'>{text}</div>"
 
 
 def _numbers(goal: Goal) -> list[float]:
@@ -227,7 +241,7 @@ def _numbers(goal: Goal) -> list[float]:
 
 
 def _button(name: str, icon: str, tooltip: str = "", **kwargs: Any) -> widgets.Button:
-    layout = {"width": "auto"}
+    layout = {"width": "auto", "flex": "none"}
     return widgets.Button(
         description=name, icon=icon, tooltip=tooltip or name, layout=layout, **kwargs
     )
@@ -236,7 +250,8 @@ def _button(name: str, icon: str, tooltip: str = "", **kwargs: Any) -> widgets.B
 def plan_in_words(plan: Plan) -> str:
     """Describe a plan: its actions, predicted distance to the goal, and planning time."""
     steps = ", then ".join(step_in_words(step) for step in plan.steps) or "no action"
-    arrives = "" if plan.reaches_goal else " It does not reach the goal."
+    missed = " Up to three pushes or drags do not reach the goal; a closed loop then plans again."
+    arrives = "" if plan.reaches_goal else missed
     if not plan.reaches_goal and plan.predicted_distance_m <= plan.goal.tolerance_m:
         arrives = " It reaches the goal's position, but not its turn or height."
     std_m = plan.steps[-1].std_m if plan.steps else math.nan
@@ -248,7 +263,7 @@ def plan_in_words(plan: Plan) -> str:
 
 
 def outcome_in_words(outcome: Outcome, goal: Goal, how: str, done: int) -> str:
-    """Describe an outcome (HTML); how: "Done," or "Stopped after"; done: number of actions."""
+    """Describe an outcome as a block of HTML; how: "Done," or "Stopped after"; done: actions."""
     within = "within" if outcome.distance_m <= goal.tolerance_m else "outside"
     posed = ""
     if goal.turn_rad is not None:
@@ -258,7 +273,7 @@ def outcome_in_words(outcome: Outcome, goal: Goal, how: str, done: int) -> str:
         off = 1000 * abs(goal.height_m - outcome.lifted_m)
         posed += f" The height has an error of {off:.1f} mm."
     return (
-        f"{how} {done} action{'s' * (done != 1)}: the object rests "
+        f"<div class='outcome {within}'>{how} {done} action{'s' * (done != 1)}: the object rests "
         f"<b>{1000 * outcome.distance_m:.1f} mm</b> from the goal, {within} the tolerance of "
-        f"{1000 * goal.tolerance_m:.0f} mm.{posed} {outcome.words}".rstrip()
+        f"{1000 * goal.tolerance_m:.0f} mm.{posed} {outcome.words}</div>"
     )

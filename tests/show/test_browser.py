@@ -400,6 +400,40 @@ def test_a_closed_loop_follows_a_goal_that_moves(page, table):
     choose(page, "open loop")
 
 
+@pytest.mark.parametrize("width", [1280, 1000, 700, 400])
+def test_it_fits_its_window(page, table, width):
+    """Table and controls are side by side from 1,000 px on, the words are below the table."""
+    page.set_viewport_size({"width": width, "height": 1000})
+    parts = (table.svg, page.locator(".affordlib-picker [role=status]"), button(page, "Run"))
+
+    def arranged():
+        top, said, run = (part.bounding_box() for part in parts)
+        beside = run["x"] > top["x"] + top["width"] and run["y"] < top["y"] + top["height"]
+        below = 0 < said["y"] - top["y"] - top["height"] < 30
+        within = top["x"] - 1 < said["x"] < said["x"] + said["width"] < top["x"] + top["width"] + 1
+        return below and within and beside == (width >= 1000)
+
+    wait_until(arranged)
+    cut = """all => all.filter((part) => part.getClientRects().length).filter((part) => {
+        const {left, right} = part.closest('.jp-OutputArea-output').getBoundingClientRect();
+        const own = part.getBoundingClientRect();
+        const hides = getComputedStyle(part).overflowX !== 'visible' && part.clientWidth;
+        return own.left < left - 1 || own.right > right + 1
+            || hides && part.scrollWidth > part.clientWidth + 1;
+    }).map((part) => part.outerHTML)"""
+    for widget in ("picker", "figure"):
+        assert page.locator(f".affordlib-{widget} :not(svg *, option)").evaluate_all(cut) == []
+    picture(page, f"8_width_{width}")
+    page.set_viewport_size({"width": 1280, "height": 1000})
+
+
+def test_it_has_names_for_screen_readers(page, table):
+    x, y = goal_of(page)
+    at = f"The goal is at x = {100 * x:.1f}, y = {100 * y:.1f} cm, the object at x = "
+    assert page.get_by_role("application", name=at).count() == 1
+    assert page.get_by_role("progressbar", name="actions done").count() == 1
+
+
 def test_everything_can_be_pressed_without_a_mouse(page, table):
     button(page, "Start over").click()
     wait_for_words(page, "Plan:")

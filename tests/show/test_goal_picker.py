@@ -1,15 +1,19 @@
 import math
+import re
 import time
 from dataclasses import replace
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from matplotlib.path import Path
 
+from affordlib.geometry import rotated
 from affordlib.interactions import open_interactions
 from affordlib.planning import Skills, execute_plan, plan_astar, plan_continuous
 from affordlib.results import load_plan
 from affordlib.show import GoalPicker, goal_picker
+from affordlib.show.drawing import Drawing
 from affordlib.show.executors import closed_loop, open_loop
 from affordlib.types import Goal
 from affordlib.world import BASE_X_M, REACH_M, Cuboid
@@ -113,6 +117,65 @@ def test_a_picked_goal_is_planned_for_drawn_and_reached(picker, world):
         np.testing.assert_array_equal(a, b)
 
 
+def outline(shape):
+    """Outline of a drawn object [mm]."""
+    x, y, degrees = map(float, re.findall(r"-?[\d.]+", shape.get("transform")))
+    points = [list(map(float, pair.split(","))) for pair in shape.get("points").split()]
+    return Path(np.add(rotated(np.array(points), math.radians(degrees)), (x, y)))
+
+
+@pytest.mark.parametrize("xy", [(0.34, 0), (0.34, -0.34), (0.02, 0.01), (0.18, 0.12), (-0.3, 0.2)])
+def test_labels_meet_neither_goal_nor_outlines_nor_discs_nor_each_other(posed, xy):
+    posed.pick(*xy)
+    ends = [outline(e) for css in ("ghost", "predicted") for e in shapes(posed, css)]
+    places = [(1000 * x, -1000 * y) for x, y in (s.predicted_end_xy_m for s in posed.plan.steps)]
+    np.testing.assert_allclose([end.vertices.mean(axis=0) for end in ends], places, atol=0.01)
+    discs = [[float(e.get(k)) for k in ("cx", "cy", "r")] for e in shapes(posed, "sigma")]
+    discs.append([1000 * xy[0], -1000 * xy[1], 20])  # the goal
+    across, up = np.meshgrid(np.linspace(-1, 1, 17), np.linspace(-1, 1, 5))
+    boxes = []
+    for label in shapes(posed, "step"):
+        x, y, half = float(label.get("x")), float(label.get("y")) - 6, 5 * len(label.text)
+        points = np.column_stack([x + half * across.ravel(), y + 9 * up.ravel()])
+        assert np.abs(points).max() <= 400
+        for shape in (outline(shapes(posed, "object")[0]), *ends):
+            assert not shape.contains_points(points).any()
+        assert all(np.hypot(*(points - disc[:2]).T).min() > disc[2] for disc in discs)
+        assert all(abs(x - u) > half + v or abs(y - w) > 18 for u, w, v in boxes)
+        boxes.append((x, y, half))
+    inside = posed._view.scene["inside"]
+    assert inside.index("data-handle") < inside.index('class="step"')
+
+
+def test_the_first_time_that_is_shown_is_that_of_a_planner_at_work(make_picker, trained):
+    times = iter([7.0, 0.05])
+
+    def planner(*query):
+        return replace(plan_astar(problem_of(trained, *query)), plan_s=next(times))
+
+    assert "Found in 50 ms" in make_picker(planners={"mine": planner}).controls.said
+
+
+def luminance(colour):
+    values = np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)]) / 255
+    values = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+    return float(values @ (0.2126, 0.7152, 0.0722))
+
+
+def test_lines_and_words_stand_out_from_the_table():
+    rules = dict(re.findall(r"-table (?::is\()?\.([\w-]+)[ ,][^{]*\{(.*)\}", str(Drawing._css)))
+
+    def colour(css, of):
+        return re.search(rf"{of}: (#\w{{6}})", rules[css])[1]
+
+    lines = ("reach", "object", "push", "prediction", "predicted", "sigma", "truth", "tolerance")
+    wanted = [(colour(css, "stroke"), 3) for css in lines] + [(colour("goal", "fill"), 3)]
+    wanted += [(colour(css, "fill"), 4.5) for css in ("tick", "step", "busy")]
+    for drawn, least in wanted:
+        for ground in (colour("reach", "fill"), "#ffffff"):
+            assert (luminance(ground) + 0.05) / (luminance(drawn) + 0.05) > least, drawn
+
+
 def test_what_the_hand_wants_is_planned_for_once(picker, planned_for):
     before = len(planned_for)
     for number, xy in enumerate([(0.081, 0.033), (0.081, 0.033), (-0.05, 0.1234)], 1):
@@ -136,6 +199,7 @@ def test_a_draft_until_the_hand_rests(make_picker, planned_for, trained, monkeyp
         wait_until(lambda: picker._view.scene["answered"] == number)
         assert picker.plan.planner == "draft"
         assert picker._view.scene["draft"]
+        assert picker.controls.said == " Planning with A* …"
 
     picker = make_picker(draft=draft)
     assert picker.plan.planner == "astar"  # the draft is replaced
@@ -179,6 +243,8 @@ def test_run_waits_for_the_plan_of_the_goal_that_is_shown(make_picker, trained):
     assert picker.outcome.distance_m == picker.goal.distance_m(picker.world.object_pose()[:2])
     assert "rests" in picker.controls.words.value
     assert not picker._view.scene["planning"]
+    picker.start_over()
+    assert "value=0 " in picker.controls.progress.value
 
 
 def test_the_picker_shows_its_errors(picker, tmp_path):
@@ -213,7 +279,7 @@ def test_stop_lets_an_action_end_and_begins_no_other(make_picker, world):
     assert len(picker.plan.steps) > 1
     first = picker.plan.steps[0].predicted_end_xy_m
     picker.controls.run.click()
-    wait_until(lambda: picker.controls.progress.value == 1)
+    wait_until(lambda: "value=1 " in picker.controls.progress.value)
     assert picker.controls.stop.disabled is False
     assert picker.controls.run.disabled
     with pytest.raises(RuntimeError, match="still moving"):
@@ -231,11 +297,19 @@ def test_stop_lets_an_action_end_and_begins_no_other(make_picker, world):
 
 def test_a_run_can_be_watched(make_picker):
     picker = make_picker(seconds_per_action=0.2)
-    played = []
+    played, said, done = [], [], []
+    picker.pick(0.24, 0.0)
+    picker.controls.words.observe(lambda change: said.append(change["new"]), names="value")
+    picker.controls.progress.observe(lambda change: done.append(change["new"]), names="value")
     picker._view.observe(lambda change: played.append(change["new"]), names="playback")
     picker._view._handle_custom_msg({"press": "run"}, [])
     in_time(picker)
-    assert [movement["seconds"] for movement in played] == [0.2] * len(picker.plan.steps)
+    n = len(picker.plan.steps)
+    assert [movement["seconds"] for movement in played] == [0.2] * n
+    assert [f"Push {k} of {n}." in words for k, words in enumerate(said[:-1], 1)] == [True] * n
+    assert [f"value={k} max={n}" in bar for k, bar in enumerate(done[:n], 1)] == [True] * n
+    within = "within" if picker.outcome.distance_m <= 0.02 else "outside"
+    assert f"<div class='outcome {within}'>Done, {n} actions" in said[-1]
     poses = np.vstack([movement["poses"] for movement in played]) / (1000, -1000, -180 / np.pi)
     assert len(poses) > 20
     assert np.hypot(*np.diff(poses[:, :2], axis=0).T).max() < 0.03
