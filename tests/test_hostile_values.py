@@ -239,7 +239,6 @@ def shop(one_world, skills, pushes, tmp_path_factory):
         "Grasp": {"seen_height": 0.05},
         "Push": {"radius": 0.2},
         "PushAt": {"length": 0.01},
-        "plot_levered": {"pose": np.zeros(4)},
         "show_animation": {"path": folder / "animation.gif", "beside": figure},
     }
     return {k: v for names, v in by_name.items() for k in names.split()}, by_callable

@@ -18,7 +18,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib_inline.config import InlineBackend
 from PIL import Image
-from torch import Tensor
 
 from affordlib.geometry import rotated
 from affordlib.perception import CAMERA_HEIGHT_M
@@ -34,7 +33,6 @@ from affordlib.types import (
     Outcome,
     Plan,
     Step,
-    check_array,
     check_count,
     check_finite,
     check_pair,
@@ -236,49 +234,6 @@ def plot_depth(ax: Axes, image: np.ndarray, title: str = "") -> Axes:
     ax.imshow(height_m, extent=(-half, half, -half, half), cmap="cividis", vmin=0)
     ax.grid(False)
     ax.set(title=title, xlabel="x [cm]", ylabel="y [cm]", xticks=(-5, 0, 5), yticks=(-5, 0, 5))
-    return ax
-
-
-_ALONG, _UP = 0.45, 0.3
-
-
-def outline_in_lever_frame(
-    obj: TabletopObject, yaw_rad: float, contact_xy_m: np.ndarray, theta_rad: float
-) -> np.ndarray:
-    """The base (n, 2) [m] of an object at its start, from the contact point, lever to the right."""
-    outline = rotated(obj.footprint_m, check_finite("yaw_rad", yaw_rad))
-    outline = outline - check_pair("contact_xy_m", contact_xy_m)
-    return rotated(outline, -check_finite("theta_rad", theta_rad))
-
-
-def plot_levered(
-    ax: Axes,
-    outline_m: np.ndarray,
-    height_m: float,
-    pose: np.ndarray | Tensor,
-    color: str,
-    label: str | None = None,
-) -> Axes:
-    """Draw a prism after a change of pose (x, y, z [m], tilt [rad]) from its start.
-
-    outline_m: (n, 2), from `outline_in_lever_frame`. The prism is tilted about an axis across the
-    blade, an approximation of the true axis. The direction across is drawn obliquely; units are cm.
-    """
-    pose, height_m = check_array("pose", pose, 4), check_finite("height_m", height_m)
-    outline_m = check_array("outline_m", outline_m, 2)
-    across = outline_m[:, 1] + pose[1]
-    along = outline_m[:, 0] - outline_m[:, 0].mean()
-    centre = np.array([outline_m[:, 0].mean() + pose[0], height_m / 2 + pose[2]])
-    faces = []
-    for z in (-height_m / 2, height_m / 2):
-        side = rotated(np.column_stack([along, np.full(len(along), z)]), -pose[3]) + centre
-        faces.append(_cm(side + across[:, None] * (_ALONG, _UP)))
-    for face in faces:
-        ax.fill(*face, facecolor=color, alpha=0.15, lw=0)
-        ax.plot(*_closed(face), color=color, lw=1.2, label=label)
-        label = None
-    ax.plot(*np.stack(faces, axis=1), color=color, lw=0.8)
-    ax.set(xlabel="along the blade [cm]", ylabel="height [cm]", aspect="equal")
     return ax
 
 
