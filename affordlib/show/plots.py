@@ -163,9 +163,11 @@ def plot_plan(
         tail, tip = _cm(start - 0.075 * direction), _cm(start - 0.035 * direction)
         arrow = {"arrowstyle": "-|>", "color": NEUTRAL, "lw": 1.5}
         ax.annotate("", tip, tail, arrowprops=arrow, zorder=4)
-        aside = direction[::-1] * (1, -1)
-        aside *= 22 if aside @ (start - first) >= 0 else -22  # away from the object's start
-        _name(ax, text, tail, -direction * (23, 10) if k == 0 else aside)
+        aside = -direction if k == 0 else direction[::-1] * (1, -1)
+        if aside @ (start - first) < 0:
+            aside = -aside  # away from the object's start
+        clear = 6 + np.min((20, 6) / np.maximum(np.abs(aside), 1e-6))  # half a label, and a gap
+        _name(ax, text, tail, clear * aside)
         label = "prediction" if k == 0 else None
         ax.plot(*_cm(step.predicted_path_xy_m), color=PREDICTION, lw=2, label=label)
         ax.plot(*_cm(end), "o", color=PREDICTION, ms=3)
