@@ -90,6 +90,7 @@ CALLABLES |= {each.__name__: each for each in of_modules}
 CALLABLES |= {"Push.towards": Push.towards, "Push.path": Push(0.0).path}
 CALLABLES["from_dataset"] = interactions.InteractionTensors.from_dataset
 CALLABLES["Log.add"] = interactions.Log("m", CORNERS).add
+CALLABLES["Log.centroid_pose"] = interactions.Log("m", CORNERS).centroid_pose
 OF_THE_WORLD = """
 place execute_primitive execute execute_path can_reach picture mark shove knock topple settle
 """
@@ -216,6 +217,7 @@ def shop(one_world, skills, pushes, tmp_path_factory):
         | {"progress": False},
         "Log.add": {"start": (0.0,) * 3, "tool_t": (0.0, 1.0), "tool_xy": ((-0.1, 0.0), AT)}
         | {"end": (0.02, 0.0, 0.0), "context": {"support": "felt"}},
+        "Log.centroid_pose": {"pose": (0.0,) * 3},
         "fit": {"data": log, "model": "np"},
         "cross_validate": {"data": log, "models": (), "folds": 2},
         "plan_push_at": {"model": Still(), "pose": (0.0,) * 3, "goal": Goal((0.01, 0.0))}

@@ -52,7 +52,8 @@ def cross_validate(
     share of x, y and yaw inside the 50 and 90 % intervals.
     """
     errors = push_errors(data, models, folds, within, seed)
-    parts = [*errors.groupby(["model", "group"], sort=False)]
+    named = errors[errors["group"] != "all"]  # the default name means all pushes
+    parts = [*named.groupby(["model", "group"], sort=False)]
     parts += [((name, "all"), part) for name, part in errors.groupby("model", sort=False)]
     return pd.DataFrame(
         {"model": model, "group": group, "n_train": round(part["n_train"].mean())} | summary(part)

@@ -27,6 +27,8 @@ MOST_ROWS = 20_000
 LARGEST_M = 1.0
 SLACK_M = 0.03
 """Distance [m] by which an object may move farther than the tool."""
+OFF_M, OFF_SHARE = 0.002, 0.2
+"""How far the tool may go back or aside: a length [m], and a share of its greatest depth."""
 
 
 @dataclass(frozen=True)
@@ -129,9 +131,10 @@ class Log:
 
         start, end: pose (x, y, yaw) of the object before and after; poses: times (k,) and poses
         (k, 3) instead of `end`, if the motion was recorded, with the same clock as the tool;
-        tool_t: (m,), increasing times; tool_xy: (m, 2), positions of the tool; context: further
-        known values, numbers or text; group: name of the pushes that belong together. Raises
-        ValueError, and adds nothing, with the push, its value and the expected value.
+        tool_t: (m,), increasing times; tool_xy: (m, 2), nearly straight path of the tool, which
+        begins outside the object and ends where the push ends; context: further known values,
+        numbers or text; group: name of the pushes that belong together. Raises ValueError, and adds
+        nothing, with the push, its value and the expected value.
         """
         where = f"interaction {len(self)} (group {group!r})"
         t, xy = self._tool(where, tool_t, tool_xy)
@@ -175,6 +178,11 @@ class Log:
                 "effect": effect,
             }
         )
+
+    def centroid_pose(self, pose: Sequence[float]) -> tuple[float, float, float]:
+        """Convert a recorded pose (x, y, yaw) to that of the centroid, in metres and radians."""
+        *xy, yaw = self._poses("centroid_pose", "pose", pose).tolist()
+        return (*np.add(xy, rotated(self.origin_m, yaw)).tolist(), yaw)
 
     def tensors(self) -> PushLog:
         """Return all added pushes; raises ValueError if there are none."""
@@ -309,12 +317,24 @@ def _contact(where: str, outline_m: np.ndarray, tool: np.ndarray, radius_m: floa
             "start and tool_xy must share a frame and unit, and a thick tool needs tool_radius"
         )
     step, edge = np.argwhere(enters)[0]
-    travelled = tool[-1] + radius_m * inward[edge] - at[step, edge]
+    inside, path = depth[step + 1 :, edge], tool[step + 1 :] + radius_m * inward[edge]
+    deepest, final = inside.max().item(), inside[-1].item()
+    if deepest - final > (most := OFF_M + OFF_SHARE * deepest):
+        raise ValueError(
+            f"{where}: the tool goes back: it is {deepest:.3g} m inside the outline at most, "
+            f"but {final:.3g} m at the end; cut tool_xy where the push ends"
+        )
+    travelled = path[-1] - at[step, edge]
     length = float(np.linalg.norm(travelled))
     if not 1e-4 < length < LARGEST_M:
         raise ValueError(
             f"{where}: tool_xy continues for {length:.3g} m after contact, but 0.1 mm to "
             f"{LARGEST_M:g} m are expected; check the unit of lengths"
+        )
+    if (off := np.abs(cross(travelled, path - at[step, edge])).max() / length) > most:
+        raise ValueError(
+            f"{where}: the push is not straight: tool_xy is {off:.3g} m from the line from contact "
+            f"to end, but at most {most:.3g} m is expected; cut tool_xy where the push ends"
         )
     return {
         "contact_m": at[step, edge],

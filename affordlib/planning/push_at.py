@@ -43,10 +43,12 @@ def plan_push_at(
 ) -> Plan:
     """Plan off-centre pushes from a pose (x, y, yaw) to a goal, with its rotation if it has one.
 
-    log: the log that the model was fitted to, with one group only, or `pushes_around` the outline
-    of an object that was only seen; it determines the object, its context and the lengths of
-    pushes. turn_m: metres per radian in the distance to the goal (default: the radius of gyration).
-    Raises ValueError for more than one group.
+    pose: of the object's centroid, in metres and radians (`Log.centroid_pose`); goal: a position of
+    the centroid in the same frame, within the table's limits, and a turn relative to the present
+    yaw; log: the log that the model was fitted to, with one group only, or `pushes_around` the
+    outline of an object that was only seen; it determines the object, its context and the lengths
+    of pushes; turn_m: metres per radian in the distance to the goal (default: the radius of
+    gyration). Raises ValueError for more than one group.
     """
     began = time.perf_counter()
     x, y, yaw = check_array("pose", pose, 3)

@@ -7,9 +7,11 @@ from affordlib.evaluation import cross_validate
 from affordlib.evaluation.cross_validate import mirrors
 from affordlib.geometry import rotated
 from affordlib.interactions import Log
+from affordlib.paths import repo_root
 from affordlib.perception import crop_from_depth, outline_image, outline_of
 from affordlib.world import Prism
 from affordlib.world.camera import depth_crop
+from experiments.real_pushes import planar, pushes_of
 
 TRIANGLE_MM = ((0, 0), (150, 0), (0, 150))
 CENTRE_MM = np.array([50.0, 50.0])
@@ -73,6 +75,16 @@ def test_units_frames_and_poses_in_between_change_nothing():
     assert np.isfinite(between.tensors().effect).all()
 
 
+def test_the_pose_of_the_centroid_is_that_of_the_logged_effects():
+    log = Log("mm", TRIANGLE_MM, 0.24)
+    log.add(**one())
+    before, after = (np.array(log.centroid_pose(PUSH[name])) for name in ("start", "end"))
+    np.testing.assert_allclose(before, (*np.add(rotated(CENTRE_MM, 0.3), (600, -20)) / 1e3, 0.3))
+    data = log.tensors()
+    np.testing.assert_allclose(rotated((after - before)[:2], -0.3), data.displacement_m[0])
+    assert after[2] - before[2] == pytest.approx(data.turn_rad[0])
+
+
 BAD = {
     "millimetres as metres": ({}, {"unit": "m"}, r"outline is \d+ m wide; is it in m\?"),
     "another outline's unit": (
@@ -130,6 +142,16 @@ BAD = {
         {},
         r"interaction 0 .*tool_t has 100000 rows, .*split the recording",
     ),
+    "the way back": (
+        {"tool_t": np.arange(13.0), "tool_xy": np.vstack([tool(), tool()[:1]])},
+        {},
+        r"interaction 0 .*goes back: it is 0.014 m .* but -0.002 m at the end; cut tool_xy",
+    ),
+    "a way aside": (
+        {"tool_t": np.arange(13.0), "tool_xy": np.vstack([tool(), np.add(tool()[-1:], (30, 10))])},
+        {},
+        r"interaction 0 .*not straight: .* at most 0.0\d+ m is expected; cut tool_xy",
+    ),
     "an outline that crosses itself": (
         {},
         {"outline": ((0, 0), (150, 150), (150, 0), (0, 150))},
@@ -154,6 +176,21 @@ def test_what_is_wrong_is_said_in_a_sentence_and_not_added(name):
     assert not any(map(len, logs))
 
 
+def test_whatever_follows_a_recorded_push_is_noticed():
+    """All shipped pushes are accepted, and none with a way back or aside; half of it suffices."""
+    condition = repo_root() / "data" / "own_log" / "felt_left.txt.xz"
+    outline = ((0, 0), (130, 0), (30, 110))
+    log = Log("mm", outline, 0.24, tool_radius=1.5)
+    for poses, t, xy in pushes_of(condition):
+        start, end = map(planar, poses)
+        across = np.array([xy[0, 1] - xy[-1, 1], xy[-1, 0] - xy[0, 0]])
+        for then in (xy[0], (xy[0] + xy[-1]) / 2, 20 * xy[0] - 19 * xy[-1], xy[-1] + 2 * across):
+            with pytest.raises(ValueError, match=r"goes back|not straight"):
+                log.add(start, np.append(t, t[-1] + 1), np.vstack([xy, then]), end)
+        log.add(start, t, xy, end)
+    assert len(log) == 50
+
+
 def test_one_interaction_is_too_few():
     log = Log("mm", TRIANGLE_MM, 0.24)
     with pytest.raises(ValueError, match="log is empty"):
@@ -163,6 +200,15 @@ def test_one_interaction_is_too_few():
         cross_validate(log.tensors())
     with pytest.raises(ValueError, match=r"context names .*'load'.*that of interaction 0"):
         log.add(**one(context={"load": 1.0}))
+
+
+def test_pushes_without_a_group_are_summarised_once():
+    log = Log("mm", TRIANGLE_MM, 0.24)
+    for _ in range(8):
+        log.add(**one(group="all"))
+    table = cross_validate(log.tensors(), models=(), folds=2)
+    assert table["group"].unique().tolist() == ["all"]
+    assert table["model"].is_unique
 
 
 def test_outlines_are_drawn_as_the_camera_sees_them(one_world):
