@@ -198,7 +198,8 @@ class PickerControls(widgets.VBox):
             [widgets.Label("disturb"), self.shove, self.move_goal],
             [self.name, self.save, self.load],
         ]
-        super().__init__([widgets.HBox(row) for row in rows], layout={"flex": "0 1 300px"})
+        layout = {"flex": "1 1 250px", "max_width": "300px"}
+        super().__init__([widgets.HBox(row) for row in rows], layout=layout)
 
     def show(self, goal: Goal) -> None:
         """Set the sliders to a goal, as accurately as they can show it."""
