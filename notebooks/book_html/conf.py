@@ -52,8 +52,7 @@ def prepare(app, docname: str, source: list[str]) -> None:
             if cell["cell_type"] == "code":
                 describe(cell)
         text = json.dumps(notebook)
-    elif docname == root_doc:  # GitHub lists a folder; pages on disk cannot
-        text = text.replace("notebooks/appendix)", "notebooks/appendix/A1_effect_prediction.ipynb)")
+    elif docname == root_doc:
         text += Path(__file__).with_name("contents.md").read_text()
     source[0] = text
 
