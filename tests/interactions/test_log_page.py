@@ -1,79 +1,102 @@
-"""The page on a user's own log: its thirty lines run, and give a table and a plan."""
+"""The page on a user's own log: its cells run on any log, and give a table, a model and a plan."""
 
 import json
 import lzma
-import re
 
 import numpy as np
 import pytest
 
+from affordlib.models import fit
 from affordlib.paths import repo_root
 from affordlib.planning import plan_push_at
 from affordlib.types import Goal
 from tests.problems import Still
 
-IMPORTS = """
-import lzma, numpy as np
-from affordlib.evaluation import cross_validate
-from affordlib.interactions import Log
-from affordlib.models import fit
-from affordlib.paths import repo_root
-from affordlib.planning import plan_push_at
-from affordlib.types import Goal
-"""
+TRIANGLE_MM = [[0, 0], [130, 0], [30, 110]]
 
 
 @pytest.fixture(scope="module")
-def script():
-    """The page's thirty lines, run on one condition, with quick models."""
+def cells():
+    """The source of the page's cells by id."""
     path = repo_root() / "notebooks" / "09_a_log_of_your_own.ipynb"
-    cells = json.loads(path.read_text())["cells"]
-    (cell,) = [c for c in cells if "script" in c["metadata"].get("tags", [])]
-    return IMPORTS + "".join(cell["source"])
+    return {c["id"]: "".join(c["source"]) for c in json.loads(path.read_text())["cells"]}
+
+
+def run(cells, ids, folder, logs="data/own_log", **known):
+    """Execute some cells; returns their names."""
+    names = {"seed": 0, "folds": 2, "out_dir": str(folder), "logs": str(logs)}
+    names |= {"outline": TRIANGLE_MM, "tool_radius": 1.5} | known
+    for each in ids.split():
+        exec(cells[each], names)
+    return names
 
 
 @pytest.mark.slow
-def test_the_script_of_thirty_lines(script):
-    lines = [line for line in script.splitlines() if line.strip()]
-    assert len(lines) <= 30 + 1
-    outline = ((0, 0), (130, 0), (30, 110))
-    names = {"logs": "data/own_log", "outline": outline, "tool_radius": 1.5, "folds": 2, "seed": 0}
-    exec(script, names)
-    table, plan = names["table"], names["plan"]
+def test_from_a_csv_to_a_model_and_a_plan(cells, tmp_path):
+    visible = "c05 fit plan"
+    assert sum(bool(line.strip()) for n in visible.split() for line in cells[n].splitlines()) <= 45
+    names = run(cells, "c03 csv c05 fit predict plan", tmp_path)
+    table, plan, log, pushes = (names[name] for name in ("table", "plan", "log", "pushes"))
     assert table.columns.tolist() == [
         *("model", "group", "n_train", "n", "position_mean_m", "position_sem_m"),
         *("position_median_m", "yaw_mean_rad", "yaw_sem_rad", "coverage_50", "coverage_90"),
     ]
-    error = table[table["group"] == "all"].set_index("model")["position_mean_m"]
+    error = table.set_index("model")["position_mean_m"]
     assert error["physics_gp"] < error["gaussian_process"] < error["constant"]
     assert error["np"] < error["constant"]
     assert plan.predicted_distance_m < 0.003
-    assert abs(plan.steps[-1].predicted_turn_rad - 0.25) < 0.1
+    turn = names["wanted"][2] - names["now"][2]
+    assert abs(plan.steps[-1].predicted_turn_rad - turn) < 0.1
+
+    # The page goes on with a model read from a file: it predicts as the fitted one does.
+    fitted = fit(pushes, "np", seed=0)
+    for one, other in zip(fitted.predict(pushes), names["model"].predict(pushes), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-6)
+
+    # The first push, in the robot's frame and unit, is a push of the log: recorded, it reads alike.
+    contact, end = names["contact_mm"], names["end_mm"]
+    path = np.array([contact - 0.5 * (end - contact), end])
+    log.add(names["now"], (0, 1), path, names["now"])
+    read, push = log.tensors().select(np.array([-1])), plan.steps[0].primitive
+    assert read.length_m[0] == pytest.approx(push.length, abs=1e-6)
+    ahead = np.arctan2(*read.direction[0, ::-1]) + names["now"][2]
+    assert np.cos(ahead - push.direction) == pytest.approx(1)
 
 
-def reading(script, folder):
-    """The log that the script reads from a folder."""
-    names = {"logs": folder, "outline": ((0, 0), (130, 0), (30, 110)), "tool_radius": 1.5}
-    exec(re.split(r"^pushes = ", script, flags=re.MULTILINE)[0], names)
-    return names["data"]
-
-
-def test_other_conditions_are_read(script, tmp_path):
+def test_other_conditions_are_read(cells, tmp_path):
     """Any name, compressed or not, any number of pushes; the error of a truncated one says so."""
+    needed, folder = "c03 csv c05 conditions", tmp_path / "logs"
+    folder.mkdir()
     packed = (repo_root() / "data" / "own_log" / "felt_mid.txt.xz").read_bytes()
-    (tmp_path / "ice.txt.xz").write_bytes(packed)
-    assert reading(script, tmp_path).context["surface"].tolist() == ["ice"] * 50
-    (tmp_path / "ice.txt.xz").unlink()
+    (folder / "ice.txt.xz").write_bytes(packed)
+    data = run(cells, needed, tmp_path, folder)["data"]
+    assert data.context["surface"].tolist() == ["ice"] * 50
+    (folder / "ice.txt.xz").unlink()
     text = lzma.decompress(packed)
-    (tmp_path / "steel_patch_2.txt").write_bytes(b"12" + text[2:])
-    assert reading(script, tmp_path).context["support"].tolist() == ["patch_2"] * 12
-    (tmp_path / "steel_patch_2.txt").write_bytes(text[:-4000])
-    with pytest.raises(ValueError, match=r"interaction \d+ \(group 'steel_patch_2'\): tool_"):
-        reading(script, tmp_path)
+    (folder / "steel_patch_2.txt").write_bytes(b"12" + text[2:])
+    data = run(cells, needed, tmp_path, folder)["data"]
+    assert data.context["support"].tolist() == ["patch_2"] * 12
+    (folder / "steel_patch_2.txt").write_bytes(text[:-4000])
+    with pytest.raises(ValueError, match=r"steel_patch_2.txt is damaged"):
+        run(cells, needed, tmp_path, folder)
 
 
-def test_plans_want_one_group(script):
-    data = reading(script, "data/own_log")
+def test_a_csv_may_hold_the_motion_and_other_clocks(cells, tmp_path):
+    """Rows of poses alone, between those of the tool, change nothing but the first and the last."""
+    names = run(cells, "c03 csv c05", tmp_path)
+    table = names["pd"].read_csv(names["csv"])
+    known = table.dropna()
+    between = known.groupby("push").mean().reset_index()[["push", "t", "x", "y", "yaw"]]
+    more = names["pd"].concat([table, between]).sort_values(["push", "t"])
+    more.to_csv(tmp_path / "more.csv", index=False)
+    other = run(cells, "c05", tmp_path, **names | {"csv": tmp_path / "more.csv"})
+    for name in ("contact_m", "direction", "displacement_m", "turn_rad"):
+        one, two = (getattr(each["pushes"], name) for each in (names, other))
+        np.testing.assert_array_equal(one, two)
+
+
+def test_plans_want_one_group(cells, tmp_path):
+    data = run(cells, "c03 csv c05 conditions", tmp_path)["data"]
     assert len(data) == 250
     assert np.degrees(np.arccos((data.normal * data.direction).sum(axis=1))).max() < 52
     with pytest.raises(ValueError, match="log must hold one group"):
