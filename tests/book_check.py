@@ -19,7 +19,7 @@ TEXTS = {"README.md": 800, "RESULTS.md": 2300, "CONTRIBUTING.md": 2000, "data/RE
 """Pages of text, and their maximum number of words."""
 
 LIMITS = {"minutes": 60, "words": 2000, "cells": 40, "tables": 3, "rows": 8}
-LIMITS |= {"code": 30, "px": 915, "no alt": 0, "private": 0}
+LIMITS |= {"code": 30, "px": 900, "no alt": 0, "private": 0}
 NOT_YET: dict[str, dict[str, int]] = {}
 """A ratchet: higher limits for unfinished pages. Lower them with every page."""
 
