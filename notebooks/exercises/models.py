@@ -93,7 +93,7 @@ def _half_inside_percent(factor: float) -> float:
 
 MODELS: dict[str, Exercise] = {
     "03.1": Exercise(
-        "Measure how far [mm] the mean passes from an effect that was observed at t = 0.8.",
+        "Measure how far [mm] the predicted mean is from an effect observed at t = 0.8.",
         lambda mine: mine,
         expected=1.38,
         within=0.04,
@@ -107,7 +107,8 @@ MODELS: dict[str, Exercise] = {
         unit="times the real length",
     ),
     "04.1": Exercise(
-        "Write lopsided_m(model, arrays): how far an end moves when the table is turned by 90°.",
+        "Write lopsided_m(model, arrays): the mean distance between final positions predicted on "
+        "the rotated table, and final positions predicted first and rotated then.",
         _lopsided_mm,
         expected=1.86,
         within=0.05,
