@@ -9,7 +9,7 @@ import numpy as np
 
 from affordlib.interactions import open_interactions
 from affordlib.primitives import DURATION_S, Push
-from affordlib.world import CATEGORIES, Cuboid, Tabletop
+from affordlib.world import CATEGORIES, Cuboid, Prism, Tabletop, UprightCylinder
 from exercises.checking import Exercise, asked
 
 # 01 The tabletop
@@ -23,13 +23,34 @@ def _worst_speed_error(speed_m_s: Callable[[float], float]) -> float:
     return 1000 * max(abs(asked(speed_m_s, float(k)) - v) for k, v in zip(t, true, strict=True))
 
 
-def rest_cm(phase: float, yaw_rad: float = 0.4) -> float:
-    """How far [cm] the box of notebook 01 has moved, pushed towards 0.6 rad up to a phase."""
+def rest_cm(phase: float, yaw_rad: float) -> float:
+    """How far [cm] a box has moved, pushed towards 0.6 rad up to a phase."""
     with Tabletop() as world:
         world.place(Cuboid(length=0.07, width=0.05, height=0.05), yaw_rad=yaw_rad)
         return 100 * float(
             np.hypot(*world.execute_primitive(Push.towards(0.6), phase).rest_effect[:2])
         )
+
+
+@cache
+def _standing() -> tuple[list[np.ndarray], list[float]]:
+    """Images of twelve boxes, upright cylinders and prisms, and their volumes [cm³]."""
+    rng = np.random.default_rng(0)
+    images, volumes_cm3 = [], []
+    with Tabletop() as world:
+        for category in 4 * (Cuboid, UprightCylinder, Prism):
+            obj = category.sample(rng)
+            world.place(obj, yaw_rad=rng.uniform(0, np.pi))
+            images.append(world.depth_image())
+            volumes_cm3.append(1e6 * obj.volume_m3)
+    return images, volumes_cm3
+
+
+def _volume_error_percent(volume_cm3: Callable[[np.ndarray], float]) -> float:
+    images, true = _standing()
+    return 100 * float(
+        np.mean([abs(asked(volume_cm3, i) / v - 1) for i, v in zip(images, true, strict=True)])
+    )
 
 
 # 02 Interactions
@@ -60,11 +81,11 @@ WORLD: dict[str, Exercise] = {
         unit="mm/s, largest error",
     ),
     "01.2": Exercise(
-        "Find the phase at which the push must stop for the box to rest 5 cm from its start.",
-        rest_cm,
-        expected=5.0,
-        within=0.05,
-        unit="cm",
+        "Write volume_cm3(image), the volume of an object from its image.",
+        _volume_error_percent,
+        expected=0.0,
+        within=5.0,
+        unit="%, mean error",
     ),
     "02.1": Exercise(
         "Compute the mean distance [mm] of the drags' ends from where the mean drag ends.",
