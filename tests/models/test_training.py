@@ -12,7 +12,6 @@ from affordlib.evaluation.baselines import constant
 from affordlib.interactions import InteractionTensors, Scaler, split_interactions
 from affordlib.interactions.sampling import condition_on_recorded_action
 from affordlib.models import (
-    CNPConfig,
     FiLMConfig,
     TrainingConfig,
     build,
@@ -145,20 +144,20 @@ def test_a_foreign_or_damaged_state_of_a_training_is_named(some, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_minute_of_training_beats_the_mean_length(pushes):
-    """An eighth of the shipped training already uses the image."""
+def test_a_short_training_beats_the_mean_length(pushes):
+    """600 steps, a quarter of a minute, already use the image."""
     split = split_interactions(500)
     training = InteractionTensors.from_dataset(pushes, split.train)
     validation = InteractionTensors.from_dataset(pushes, split.validation)
     torch.manual_seed(0)
-    model = build(CNPConfig(), Scaler.fit(training))
+    model = build(FiLMConfig(), Scaler.fit(training))
     config = TrainingConfig(steps=600, n_targets=8, batch_size=48, validate_every=200)
     history = train(model, training, validation, config)
     assert history[-1].loss < history[0].loss
     errors = final_errors_m(model, validation)
     # Early stopping keeps the best weights, not the last.
     assert errors.mean() == pytest.approx(min(h.validation_error for h in history), rel=1e-4)
-    assert errors.mean() < mean_length_error_m(training, validation)
+    assert errors.mean() < 0.5 * mean_length_error_m(training, validation)  # 1.3 of 7 mm
 
 
 @pytest.mark.slow
