@@ -35,7 +35,7 @@ from affordlib.results import (
 MARKUP = str.maketrans({"&": "&amp;", "<": "&lt;", ">": "&gt;", "[": "&#91;", "|": "\\|"})
 """For `str.translate`: escapes characters that are markup in Markdown or HTML."""
 
-COLUMN = re.compile(r"(?:(\w+):)?(\w+)(?:±(\w+)|\((\w+)\.\.(\w+)\))?")
+COLUMN = re.compile(r"(?:(?P<title>\w+):)?(\w+)(?:±(\w+)|\((\w+)\.\.(\w+)\))?")
 SHOWN = {1: "{}", 2: "{} ± {}", 3: "{} ({} to {})"}
 """How the parts of a column are shown, by their number."""
 
@@ -56,17 +56,15 @@ def markdown_table(
     series, numbers = [], set()
     for column in [*columns, *values]:
         found = COLUMN.fullmatch(column)
-        name, *names = [part for part in found.groups() if part] if found else [column]
-        if found and found[1]:
-            head, (name, *names) = found[1].replace("_", " "), names
-            head += heading(name).removeprefix(heading(name).rpartition(",")[0] or heading(name))
-        else:
-            head = heading(name.replace("_mean", "") if names else name)
-        cells = results_table(rows, [name, *names]).to_numpy()
-        shown = SHOWN[len(names) + 1]
-        texts = [shown.format(*c) if c[0] != "–" else "–" for c in cells]
+        names = [name for name in found.groups()[1:] if name] if found else [column]
+        head = heading(names[0].replace("_mean", "") if len(names) > 1 else names[0])
+        if found and found["title"]:
+            _, comma, unit = head.rpartition(", ")
+            head = found["title"].replace("_", " ") + (comma and comma + unit)
+        cells = results_table(rows, names).to_numpy()
+        texts = [SHOWN[len(names)].format(*c) if c[0] != "–" else "–" for c in cells]
         series.append(pd.Series(texts, name=head, dtype=object))
-        types = {type(v) for row in rows if (v := row.get(name)) is not None}
+        types = {type(v) for row in rows if (v := row.get(names[0])) is not None}
         numbers |= {head} if types and types <= {int, float} else set()
     frame = pd.concat(series, axis=1)
     if by is not None:

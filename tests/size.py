@@ -10,7 +10,7 @@ import tokenize
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-LINES = {"affordlib": 12_909, "experiments": 6815, "tests": 9433}
+LINES = {"affordlib": 12_909, "experiments": 6813, "tests": 9433}
 """Maximum number of lines: lower it with every cut. The aim is 9,500, 3,500 and 6,500."""
 
 FILES, CODE = 75, 8824
