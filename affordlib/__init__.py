@@ -15,7 +15,7 @@ _NUMBER = Annotated[Real, _NO_BOOL]
 _NO_TEXT = Is[lambda value: not isinstance(value, str)]
 _NUMBERS = Annotated[Sequence[_NUMBER], _NO_TEXT] | np.ndarray
 _CHECKED = """
-types geometry primitives perception results world.objects
+types geometry primitives perception results weights world.objects
 world.tabletop planning.astar planning.closed_loop planning.continuous planning.disturbances
 planning.effect_map planning.gradient planning.grasp_rotate
 planning.problem planning.reachability planning.skills interactions.dataset

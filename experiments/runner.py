@@ -37,10 +37,11 @@ from tqdm.auto import tqdm
 from affordlib.commands import count_type
 from affordlib.interactions import open_interactions
 from affordlib.interactions.store import stored_sha256
-from affordlib.models.checkpoint import NOVELTY, read_weights, resolve_checkpoint, weights_sha256
+from affordlib.models.checkpoint import NOVELTY
 from affordlib.paths import repo_root, resolve_out_dir
 from affordlib.planning.reachability import SHIPPED as REACHABILITY
 from affordlib.results import write_atomically, write_results
+from affordlib.weights import read_weights, resolve_checkpoint, weights_sha256
 from affordlib.workers import dask_client
 
 FOLDER = "data/results/raw"

@@ -4,9 +4,7 @@ Files are replaced atomically and hold a hash of weights and description. The st
 that can be resumed is a PyTorch zip file, which is read without running any code in it.
 """
 
-import hashlib
 import io
-import json
 import pickle
 import zipfile
 from collections.abc import Callable
@@ -15,8 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import nn
 
 from affordlib.interactions.dataset import Scaler
@@ -26,11 +22,10 @@ from affordlib.models.cnp import AffordanceCNP, CNPConfig
 from affordlib.models.domain import TrainingDomain
 from affordlib.models.film import FiLMConfig, FiLMNetwork, LastPoseCNP, LastPoseConfig
 from affordlib.models.lstm import LSTMConfig, LSTMNetwork
-from affordlib.paths import repo_root
 from affordlib.results import write_atomically
+from affordlib.weights import SUFFIX, read_weights, resolve_checkpoint, write_weights
 
 FORMAT = "affordlib checkpoint 3"
-SUFFIX = ".safetensors"
 NOVELTY = "novelty"
 _REMEDY = "give another checkpoint, or train it again with notebook 03"
 NETWORKS: dict[str, tuple[type[EffectNetwork], type[NetworkConfig]]] = {
@@ -78,22 +73,6 @@ def save_checkpoint(model: EffectNetwork, path: str | Path, about: dict[str, Any
     return write_weights(path, model.state_dict() | known, description)
 
 
-def resolve_checkpoint(name_or_path: str | Path) -> Path:
-    """Return the file of a shipped checkpoint's name or of a path; FileNotFoundError if none."""
-    path = Path(name_or_path)
-    folder = repo_root() / "data" / "checkpoints"
-    path = path if path.suffix == SUFFIX else folder / f"{name_or_path}{SUFFIX}"
-    if not path.is_file():
-        others = ("np_", "reachability")  # these have their own load functions
-        shipped = [p.stem for p in sorted(folder.glob(f"*{SUFFIX}"))]
-        shipped = [name for name in shipped if not name.startswith(others)]
-        raise FileNotFoundError(
-            f"checkpoint {str(name_or_path)!r}: there is no file {path}; give one of the "
-            f"shipped names {shipped} or the path of a {SUFFIX} file"
-        )
-    return path
-
-
 def _with_tuples(fields: dict[str, Any]) -> dict[str, Any]:
     return {name: tuple(v) if isinstance(v, list) else v for name, v in fields.items()}
 
@@ -136,45 +115,6 @@ def restored(
             f"{path} does not describe a model of this package ({error}); {remedy}"
         ) from error
     return model.eval(), description
-
-
-_KEY = "affordlib"
-
-
-def weights_sha256(tensors: dict[str, torch.Tensor], text: str) -> str:
-    """SHA-256 hash of weights and description."""
-    return hashlib.sha256(save(tensors) + text.encode()).hexdigest()
-
-
-def write_weights(
-    path: str | Path, tensors: dict[str, torch.Tensor], description: dict[str, Any]
-) -> Path:
-    """Write tensors and a description of plain JSON values as one file; returns its path."""
-    tensors = {name: value.contiguous() for name, value in tensors.items()}
-    text = json.dumps(description, allow_nan=False)
-    content = json.dumps({"sha256": weights_sha256(tensors, text), "description": text})
-    path = Path(path)
-    write_atomically(path, save(tensors, {_KEY: content}), mark=f'"{_KEY}"'.encode())
-    return path
-
-
-def read_weights(path: str | Path, remedy: str) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-    """Read what `write_weights` wrote; ValueError, which ends with the remedy, if it is damaged."""
-    try:
-        with safe_open(path, "pt") as file:
-            content = json.loads((file.metadata() or {})[_KEY])
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        text = content["description"]
-        if content["sha256"] != weights_sha256(tensors, text):
-            raise ValueError("its hash differs: the file was changed after it was written")
-        for name, value in tensors.items():
-            if value.is_floating_point() and not value.isfinite().all():
-                raise ValueError(f"{name} holds numbers that are not finite")
-        return tensors, json.loads(text)
-    except KeyError as error:
-        raise ValueError(f"{path} holds no weights with a description; {remedy}") from error
-    except (SafetensorError, ValueError, TypeError, RecursionError) as error:
-        raise ValueError(f"{path} is damaged, or holds no weights ({error}); {remedy}") from error
 
 
 def save_state(path: str | Path, state: dict[str, Any]) -> None:

@@ -21,8 +21,9 @@ from torch import Tensor, nn
 from torch.nn.functional import huber_loss, scaled_dot_product_attention, softplus
 
 from affordlib.geometry import cross
-from affordlib.models.checkpoint import resolve_checkpoint, restored, write_weights
+from affordlib.models.checkpoint import restored
 from affordlib.models.quasi_static import quarter_turn
+from affordlib.weights import resolve_checkpoint, write_weights
 
 WIDTH, BLOCKS, HEADS = 64, 4, 4
 FEET = 12

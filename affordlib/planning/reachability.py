@@ -12,9 +12,10 @@ import numpy as np
 import torch
 from torch import nn
 
-from affordlib.models.checkpoint import restored, write_weights
+from affordlib.models.checkpoint import restored
 from affordlib.paths import repo_root
 from affordlib.primitives import primitive_named
+from affordlib.weights import write_weights
 
 _HIDDEN = 64
 SHIPPED = "data/checkpoints/reachability.safetensors"
