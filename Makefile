@@ -134,9 +134,9 @@ notebooks: $(STAMP) ## Execute the committed notebooks in place and clean their 
 	@$(PY) -m affordlib.workbook --in-place --only "$$ONLY" $(if $(FORCE),--force)
 
 html: $(STAMP) ## Write the book as web pages into runs/html, readable offline: open index.html
-	@rm -rf runs/html runs/jupyter_execute
-	@$(PY) -m sphinx -q -c notebooks/book_html -d runs/jupyter_execute/doctrees . runs/html
-	@rm -rf runs/jupyter_execute
+	@rm -rf runs/html.new runs/jupyter_execute
+	@$(PY) -m sphinx -q -c notebooks/book_html -d runs/jupyter_execute/doctrees . runs/html.new
+	@rm -rf runs/html runs/jupyter_execute && mv runs/html.new runs/html
 	@echo "Open runs/html/index.html"
 
 tables: $(STAMP) ## Fill the tables of README, RESULTS and data card from data/results

@@ -20,6 +20,7 @@ function render({ model, el }) {
   el.append(image, svg);
 
   let held = null; // the handle that is being dragged
+  let tapped = null; // the handle that a tap, if it is one, will move
   let hand = null; // the position of a moved handle, until Python has answered
   let number = 0;
   let playing = null;
@@ -115,6 +116,10 @@ function render({ model, el }) {
   svg.addEventListener("pointerdown", (event) => {
     const at = pointer(event); // before focusing, which may scroll the drawing into view
     held = event.button === 0 ? nearest(at) : null;
+    tapped = null;
+    if (held?.anywhere && event.pointerType === "touch" && !event.target.closest("[data-handle]")) {
+      [tapped, held] = [held, null]; // a swipe scrolls the page, a tap moves the handle
+    }
     if (!held) return;
     svg.setPointerCapture(event.pointerId);
     ask(held, at.x, at.y);
@@ -127,8 +132,16 @@ function render({ model, el }) {
     // Browsers may send a move event without a motion, for example after a layout change.
     else if (Math.abs(x - now(held).x) + Math.abs(y - now(held).y) > held.step) ask(held, x, y);
   });
-  svg.addEventListener("pointerup", drop);
-  svg.addEventListener("pointercancel", drop);
+  svg.addEventListener("pointerup", (event) => {
+    const { x, y } = pointer(event);
+    if (tapped) ask(tapped, x, y);
+    tapped = null;
+    drop();
+  });
+  svg.addEventListener("pointercancel", () => {
+    tapped = null;
+    drop();
+  });
   svg.addEventListener("keydown", (event) => {
     if (!model.get("keyboard")) return;
     const [goal] = model.get("scene").handles;

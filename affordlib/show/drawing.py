@@ -6,6 +6,7 @@ All code is in this package; nothing is fetched from the network.
 import base64
 import html
 import io
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -46,6 +47,12 @@ class Drawing(anywidget.AnyWidget):
     wanted = traitlets.List(["", 0.0, 0.0, 0]).tag(sync=True)
 
 
+def words_as_html(text: str, css: str = "") -> str:
+    """A text that screen readers announce, as HTML; only what stands in **stars** is bold."""
+    text = re.sub(r"\*\*(.*?)\*\*", r"<b>\1</b>", html.escape(text))
+    return f"<div role='status' aria-live='polite'><div class='{css}'>{text}</div></div>"
+
+
 class WithPicture:
     """Mixin, before a class of ipywidgets: without a kernel, a notebook shows its saved picture."""
 
@@ -68,7 +75,7 @@ class WithPicture:
 class FigureWidget(WithPicture, widgets.VBox):
     """Controls above a figure and a line of text below, which also shows errors.
 
-    A subclass draws in `draw(figure)`, which returns the text (HTML), and calls `add_handle` for
+    A subclass draws in `draw(figure)`, which returns the text, and calls `add_handle` for
     what can be dragged; `drag(name, phase)` then does what a control does.
     """
 
@@ -119,11 +126,11 @@ class FigureWidget(WithPicture, widgets.VBox):
         # Made without pyplot, the figure opens no window and need not be closed.
         figure = Figure(figsize=self.figsize, dpi=DPI, layout="constrained")
         canvas = FigureCanvasAgg(figure)
-        self._handles.clear()
+        shown, self._handles = self._handles, []
         try:
             words = self.draw(figure)
         except Exception as error:
-            words = f"<b>{type(error).__name__}</b>: {html.escape(str(error))}"
+            words, self._handles = str(error) or type(error).__name__, shown
         else:
             # `savefig` would draw twice, once for the layout.
             canvas.draw()
@@ -134,7 +141,7 @@ class FigureWidget(WithPicture, widgets.VBox):
                 self._drawing.scene = self._scene(*canvas.get_width_height())
                 url = base64.b64encode(buffer.getvalue()).decode()
                 self._drawing.picture = f"data:image/png;base64,{url}"
-        self._words.value = f"<div role='status' aria-live='polite'>{words}</div>"
+        self._words.value = words_as_html(words)
 
     def picture(self) -> bytes:
         """The shown picture, as a PNG at twice the resolution."""
@@ -159,6 +166,8 @@ class FigureWidget(WithPicture, widgets.VBox):
 
     def _dragged(self, change: dict[str, Any]) -> None:
         k, x, _, _ = change["new"]
+        if not 0 <= int(k) < len(self._handles):  # of an earlier picture
+            return
         handle = self._drawing.scene["handles"][int(k)]
         phase = (x - handle["left"]) / (handle["right"] - handle["left"])
         self.drag(self._handles[int(k)][1], round(phase, 2))

@@ -103,6 +103,9 @@ class ConditioningExplorer(FigureWidget):
 
     def draw(self, figure: Figure) -> str:
         """Draw x and y of action and effect over phase: truth, observations, mean ± 2 σ."""
+        if not (self._has_action.value or self._has_effect.value):
+            self.prediction = None
+            return "Nothing is observed: tick the action, the effect, or both."
         given = self.observations()
         t = torch.linspace(0, 1, N_TARGETS)
         with torch.no_grad():
@@ -130,15 +133,18 @@ class ConditioningExplorer(FigureWidget):
                         self.add_handle(ax, point, *map(float, place))
         for ax in axes[1]:
             ax.set_xlabel("phase t")
-        handles = axes[0, 0].get_legend_handles_labels()
-        figure.legend(*handles, loc="outside lower center", ncols=4)
+        shown = [ax.get_legend_handles_labels() for ax in axes[:, 0]]
+        named = {
+            name: line for lines, names in shown for line, name in zip(lines, names, strict=True)
+        }
+        figure.legend(named.values(), named, loc="outside lower center", ncols=4)
         columns = [self.model.effect_channels.index(name) for name in ("x", "y")]
         end = seen.effect_mean[0, -1, columns].numpy()
         error_mm = 1000 * np.hypot(*(end - self.seen.effect[-1, :2]))
         std_mm = 1000 * float(seen.effect_std[0, -1, columns].norm())
         return (
             f"w₁ = {float(given.weight[0]):.2f}. The predicted final position is "
-            f"<b>{error_mm:.1f} mm</b> from the true one, with σ = {std_mm:.1f} mm."
+            f"**{error_mm:.1f} mm** from the true one, with σ = {std_mm:.1f} mm."
         )
 
 
@@ -208,7 +214,7 @@ class PhaseSlider(FigureWidget):
             rest = self.rest[t]
             plot_footprint(above, obj, rest[:2], rest[2], TRUTH, "at rest")
             off_mm = 1000 * np.hypot(rest[0] - now[0], rest[1] - now[1])
-            words += f" Stopped there, it rests <b>{off_mm:.2f} mm</b> from that position."
+            words += f" Stopped there, it rests **{off_mm:.2f} mm** from that position."
         label = "full action at t"  # drawn over the object at rest
         plot_footprint(above, obj, now[:2], now[2], "black", label, style="--")
         figure.legend(*above.get_legend_handles_labels(), loc="outside lower left", ncols=4)

@@ -4,7 +4,6 @@ It is a view on plain objects: everything it does can be done with a planner, `e
 `Tabletop.shove`.
 """
 
-import html
 import itertools
 import math
 import threading
@@ -157,7 +156,7 @@ class GoalPicker(WithPicture, widgets.HBox):
         if self.plan is None:
             raise RuntimeError("there is no plan to save; pick another goal first")
         save_plan(path, self.plan)
-        self.controls.say(f"Saved the plan as {html.escape(f'{self.folder}/{name}')}.")
+        self.controls.say(f"Saved the plan as {self.folder}/{name}.")
 
     def load(self, name: str = "plan.json") -> None:
         """Show a saved plan with its goal, ready to be executed."""
@@ -219,8 +218,7 @@ class GoalPicker(WithPicture, widgets.HBox):
         try:
             action()
         except Exception as error:
-            why = html.escape(str(error) or type(error).__name__)
-            self.controls.say(f"<b>Error:</b> {why}")
+            self.controls.say(f"**Error:** {str(error) or type(error).__name__}")
 
     def _run_in_background(self) -> None:
         """Execute the plan of the shown goal when it is ready; a second press is ignored."""
@@ -272,8 +270,7 @@ class GoalPicker(WithPicture, widgets.HBox):
 
     def _make_plan(self, draft: bool = False) -> None:
         with self._alone:
-            chosen = html.escape(self.controls.planner.value)
-            self.controls.say(f"{self._news} Planning with {chosen} …")
+            self.controls.say(f"{self._news} Planning with {self.controls.planner.value} …")
             if not draft:
                 self._show(planning=True)
             planner = self.draft if draft else self._planner()
@@ -364,7 +361,7 @@ class GoalPicker(WithPicture, widgets.HBox):
                 self.outcome, self._lifted = outcome, bool(self.goal.height_m)
                 if self.plan.goal == self.goal or outcome.distance_m <= self.goal.tolerance_m:
                     self._stale = False  # the run has followed the goal
-                self.controls.say(outcome_in_words(outcome, self.goal, how, done))
+                self.controls.say(*outcome_in_words(outcome, self.goal, how, done))
             except Exception:
                 self.plan = None  # the next run plans from the current pose
                 raise

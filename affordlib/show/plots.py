@@ -45,7 +45,9 @@ GOAL, PREDICTION, TRUTH, NEUTRAL = "#0072B2", "#D55E00", "#009E73", "#777777"
 ENLARGED = 20
 """Radius, in σ, of the disc at the end of a predicted path: a disc of one σ is too small to see."""
 
-plt.rcParams.update(
+# From matplotlib's defaults, so that a reader's own configuration changes no figure of the book.
+_STYLE = [
+    "default",
     {
         "axes.spines.top": False,
         "axes.spines.right": False,
@@ -58,8 +60,9 @@ plt.rcParams.update(
         "grid.alpha": 0.3,
         "legend.frameon": False,
         "savefig.dpi": 120,
-    }
-)
+    },
+]
+plt.style.use(_STYLE)
 
 
 if shell := get_ipython():  # in notebooks figures have their own size, and twice the resolution

@@ -13,6 +13,7 @@ import ipywidgets as widgets
 import numpy as np
 
 from affordlib.geometry import rotated, unit_vector, wrap_angle
+from affordlib.show.drawing import words_as_html
 from affordlib.show.plots import ENLARGED
 from affordlib.types import Goal, Outcome, Plan, Step
 from affordlib.world import BASE_X_M, REACH_M, TabletopObject
@@ -71,7 +72,8 @@ def draw_goal(obj: TabletopObject, goal: Goal, from_yaw_rad: float) -> str:
     if goal.turn_rad is not None:
         outline = draw_object(obj, (0, 0, from_yaw_rad + goal.turn_rad), "tolerance wanted")
     circle = _shape("circle", "tolerance", r=1000 * goal.tolerance_m)
-    return outline + circle + _shape("polygon", "goal", points=_STAR)
+    grip = _shape("circle", "grip", r=45)
+    return outline + circle + grip + _shape("polygon", "goal", points=_STAR)
 
 
 def draw_plan(
@@ -230,10 +232,9 @@ class PickerControls(widgets.VBox):
         """Show the number of actions done, of a total."""
         self.progress.value = f"<progress aria-label='actions done' value={done} max={of}>"
 
-    def say(self, text: str) -> None:
-        """Show a text, as HTML, and announce it to screen readers."""
-        self.said = text
-        self.words.value = f"<div role='status' aria-live='polite'>{text}</div>"
+    def say(self, text: str, css: str = "") -> None:
+        """Show a text, and announce it to screen readers."""
+        self.said, self.words.value = text, words_as_html(text, css)
 
 
 def _numbers(goal: Goal) -> list[float]:
@@ -263,8 +264,8 @@ def plan_in_words(plan: Plan) -> str:
     )
 
 
-def outcome_in_words(outcome: Outcome, goal: Goal, how: str, done: int) -> str:
-    """Describe an outcome as a block of HTML; how: "Done," or "Stopped after"; done: actions."""
+def outcome_in_words(outcome: Outcome, goal: Goal, how: str, done: int) -> tuple[str, str]:
+    """Describe an outcome, and name its look; how: "Done," or "Stopped after"; done: actions."""
     within = "within" if outcome.distance_m <= goal.tolerance_m else "outside"
     posed = ""
     if goal.turn_rad is not None:
@@ -273,8 +274,9 @@ def outcome_in_words(outcome: Outcome, goal: Goal, how: str, done: int) -> str:
     if goal.height_m is not None:
         off = 1000 * abs(goal.height_m - outcome.lifted_m)
         posed += f" The height has an error of {off:.1f} mm."
-    return (
-        f"<div class='outcome {within}'>{how} {done} action{'s' * (done != 1)}: the object rests "
-        f"<b>{1000 * outcome.distance_m:.1f} mm</b> from the goal, {within} the tolerance of "
-        f"{1000 * goal.tolerance_m:.0f} mm.{posed} {outcome.words}</div>"
+    words = (
+        f"{how} {done} action{'s' * (done != 1)}: the object rests "
+        f"**{1000 * outcome.distance_m:.1f} mm** from the goal, {within} the tolerance of "
+        f"{1000 * goal.tolerance_m:.0f} mm.{posed} {outcome.words}"
     )
+    return words, f"outcome {within}"

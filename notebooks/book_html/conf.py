@@ -3,6 +3,7 @@
 Equations become MathML, which browsers draw without a script or a network.
 """
 
+import html
 import json
 import re
 import shutil
@@ -31,14 +32,27 @@ html_show_search_summary = False  # would be fetched, which browsers refuse from
 html_copy_source = html_show_copyright = html_use_index = False
 
 
-def describe(cell: dict) -> None:
-    """Give a picture its alternative text, and a folded cell a name."""
+def plain(text: str) -> str:
+    """Markdown as a text to be read aloud: equations in letters, no marks, links by their names."""
+
+    def letters(equation: re.Match) -> str:
+        return html.unescape(re.sub(r"<.*?>", "", convert(equation[1])))
+
+    text = re.sub(r"\$(.+?)\$", letters, text)
+    text = re.sub(r"\[(.*?)\]\(.*?\)", r"\1", text).replace("`", "")
+    return re.sub(r"(?<!\w)\*+(\S.*?)\*+", r"\1", text)  # not the star of A*
+
+
+def describe(cell: dict, below: str) -> None:
+    """Give a picture its alternative text, the caption in the cell below; name a folded cell."""
     about = cell["metadata"]["mystnb"] = {}
+    caption = re.match(r"\*\*Figure .*?\*\* (.*)", below)
     kinds = {"write_results(": "results", "import": "imports"}
     named = [name for word, name in kinds.items() if word in "".join(cell["source"])]
     for output in cell["outputs"]:
-        for shown in output.get("metadata", {}).values():
-            about["image"], named = {"alt": shown["alt"]}, ["figure"]
+        if {"image/png", "image/svg+xml"} & output.get("data", {}).keys():
+            alt = plain(caption[1]) if caption else "A picture that the cell above draws"
+            about["image"], named = {"alt": alt}, ["figure"]
     about["code_prompt_show"] = about["code_prompt_hide"] = ": ".join(["Code", *named[:1]])
 
 
@@ -48,9 +62,10 @@ def prepare(app, docname: str, source: list[str]) -> None:
     text = re.sub(link, lambda m: f"{m[1]}{github_slugify(m[2])})", text)
     if app.env.doc2path(docname).suffix == ".ipynb":
         notebook = json.loads(text)
-        for cell in notebook["cells"]:
+        cells = notebook["cells"]
+        for cell, below in zip(cells, [*cells[1:], {"source": ""}], strict=True):
             if cell["cell_type"] == "code":
-                describe(cell)
+                describe(cell, "".join(below["source"]))
         text = json.dumps(notebook)
     elif docname == root_doc:
         text += Path(__file__).with_name("contents.md").read_text()

@@ -62,10 +62,19 @@ def test_what_is_observed_decides_what_is_predicted(explorer, trained, push):
 
 
 def test_with_nothing_observed_it_says_so(explorer):
-    before = explorer.picture()
+    seen, before = explorer._drawing.scene["handles"][0], explorer._drawing.picture
     explorer._has_action.value = False
-    assert "<b>ValueError</b>: nothing is observed" in explorer._words.value
-    assert explorer.picture() == before
+    assert "Nothing is observed" in explorer._words.value
+    assert explorer._drawing.scene["handles"] == []
+    assert explorer._drawing.picture != before
+    explorer._drawing.wanted = ["0", seen["right"], seen["top"], 1]  # a drag that began before
+    explorer._has_effect.value = True
+    (legend,) = explorer._figure.legends
+    assert "observed" in [text.get_text() for text in legend.get_texts()]
+    explorer.draw = lambda _: 1 / 0
+    explorer.refresh()
+    assert "division by zero" in explorer._words.value
+    assert len(explorer._handles) == len(explorer._drawing.scene["handles"]) == 2
 
 
 @pytest.mark.parametrize("name", ["slider", "explorer"])

@@ -1,3 +1,4 @@
+import json
 import math
 import re
 import time
@@ -266,6 +267,38 @@ def test_the_picker_shows_its_errors(picker, tmp_path):
     assert shapes(picker, "step")
 
 
+def texts(value, at=()):
+    """Places of all texts in a JSON value."""
+    if isinstance(value, str):
+        return [at]
+    if not isinstance(value, dict | list):
+        return []
+    inner = value.items() if isinstance(value, dict) else enumerate(value)
+    return [place for key, v in inner for place in texts(v, (*at, key))]
+
+
+def test_no_text_of_a_file_is_shown_as_html(picker, tmp_path):
+    """Every text of a plan's file is refused, or shown as what it is."""
+    hostile = "<img src=x onerror=alert(1)>'\"</div><script>"
+    picker.save("plan.json")
+    whole = json.loads((tmp_path / "plan.json").read_text())
+    whole["warning"] = "a warning"
+    shown = 0
+    for place in texts(whole):
+        inner = data = json.loads(json.dumps(whole))
+        for key in place[:-1]:
+            inner = inner[key]
+        inner[place[-1]] = hostile
+        (tmp_path / "hostile.json").write_text(json.dumps(data))
+        picker.controls.name.value = "hostile.json"
+        picker.controls.load.click()
+        words = in_time(picker).controls.words.value
+        shown += "&lt;img" in words
+        assert not {"<img", "<script"} & set(re.findall(r"<\w+", words + picker.picture())), place
+        ElementTree.fromstring(words)  # one element, well formed
+    assert shown
+
+
 @pytest.mark.parametrize("name", ["../x.json", "/tmp/x.json", "sub/y.json", "", ".", "..\\x"])
 def test_plans_stay_in_their_folder(picker, name):
     for act in (picker.save, picker.load):
@@ -327,7 +360,7 @@ def test_a_goal_picked_while_an_open_loop_runs_is_planned_for_when_it_ends(make_
     in_time(in_time(picker))
     assert picker.plan.goal.xy_m == drawn_goal(picker) == (-0.05, 0.1)
     assert picker.plan.start_xy_m == world.object_pose()[:2]
-    assert "mm</b> from the goal" in picker.controls.said
+    assert "mm** from the goal" in picker.controls.said
     assert "Plan: push" in picker.controls.said
     assert not shapes(picker, "busy")[0].text
 

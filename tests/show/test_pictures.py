@@ -1,4 +1,7 @@
 import io
+import os
+import subprocess
+import sys
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -61,3 +64,22 @@ def test_all_frames_of_an_animation_have_one_size():
     animation.add(Figure(figsize=(4, 3)))
     with pytest.raises(ValueError, match="480×240 pixels, the others have 320×240"):
         animation.add(Figure(figsize=(6, 3)))
+
+
+def test_the_configuration_of_a_reader_changes_no_figure(tmp_path):
+    (tmp_path / "matplotlibrc").write_text(
+        "text.usetex: True\nfont.family: fantasy\naxes.grid: False\nfigure.figsize: 2, 2\n"
+        "axes.facecolor: black\nsavefig.bbox: tight\naxes.prop_cycle: cycler('color', ['red'])\n"
+    )
+    code = (
+        "import matplotlib.pyplot as plt\nfrom affordlib.show import save_figure, plot_table\n"
+        "from pathlib import Path\nfigure, ax = plt.subplots()\nplot_table(ax).set_title('50 % of $x_1$')\nax.plot([1, 2])\n"
+        "print(save_figure(figure, Path('{}'), 'one'))"
+    )
+    drawn = []
+    for name, own in (("own", {"MATPLOTLIBRC": str(tmp_path)}), ("plain", {})):
+        command = [sys.executable, "-c", code.format(tmp_path / name)]
+        environment = os.environ | {"MPLBACKEND": "agg"} | own
+        done = subprocess.run(command, env=environment, capture_output=True, check=True)
+        drawn.append(np.asarray(Image.open(done.stdout.decode().strip())))
+    np.testing.assert_array_equal(*drawn)

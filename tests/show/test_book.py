@@ -1,0 +1,52 @@
+"""How `make html` prepares the pages, and what it leaves of an older book where it fails."""
+
+import itertools
+import json
+import runpy
+import shutil
+import subprocess
+
+import pytest
+
+from affordlib.paths import repo_root
+
+CONF = repo_root() / "notebooks" / "book_html" / "conf.py"
+
+
+@pytest.fixture(scope="module")
+def conf():
+    return runpy.run_path(str(CONF))
+
+
+def test_a_picture_is_described_by_its_caption_also_after_jupyterlab_has_saved_the_page(conf):
+    picture = {"data": {"image/png": "…"}, "metadata": {"image/png": {"width": 900}}}
+    cell = {"cell_type": "code", "source": ["plot()"], "metadata": {}, "outputs": [picture]}
+    caption = "**Figure 1.2.** Turn $\\varphi_1$ of *aligned* pushes by `A*` ([why](06.ipynb))."
+    conf["describe"](cell, caption)
+    assert cell["metadata"]["mystnb"]["image"]["alt"] == "Turn φ1 of aligned pushes by A* (why)."
+    conf["describe"](cell, "Text.")
+    assert cell["metadata"]["mystnb"]["image"]["alt"]
+
+
+def test_no_alternative_text_of_the_book_has_marks(conf):
+    for path in (repo_root() / "notebooks").rglob("[0-9A]*.ipynb"):
+        cells = json.loads(path.read_text())["cells"]
+        for cell, below in itertools.pairwise(cells):
+            if cell["cell_type"] == "code":
+                conf["describe"](cell, "".join(below["source"]))
+                alt = cell["metadata"]["mystnb"].get("image", {}).get("alt", "")
+                assert not {"$", "\\", "`"} & set(alt), (path, alt)
+                assert "*" not in alt.replace("A*", ""), (path, alt)
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
+def test_a_book_that_cannot_be_written_leaves_the_old_one(tmp_path):
+    shutil.copy(repo_root() / "Makefile", tmp_path)
+    for name in ("requirements.txt", "constraints.txt", "pyproject.toml"):
+        (tmp_path / name).touch()
+    for path in (tmp_path / ".venv" / ".installed", tmp_path / "runs" / "html" / "index.html"):
+        path.parent.mkdir(parents=True)
+        path.touch()
+    command = ["make", "html", "PY=false"]
+    assert subprocess.run(command, cwd=tmp_path, capture_output=True, timeout=60).returncode
+    assert (tmp_path / "runs" / "html" / "index.html").exists()
