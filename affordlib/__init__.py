@@ -21,7 +21,7 @@ planning.effect_map planning.gradient planning.grasp_rotate
 planning.problem planning.reachability planning.skills interactions.dataset
 interactions.sampling interactions.collect interactions.import_log interactions.lever_up
 interactions.log interactions.recipes interactions.store models.calibration models.checkpoint
-models.domain models.fit models.lever_up models.protocol models.training evaluation.metrics
+models.domain models.fit models.lever_up models.predictions models.protocol models.training
 evaluation.cross_validate planning.push_at show.executors show.explorers
 show.goal_picker show.plots
 """

@@ -20,7 +20,6 @@ import pandas as pd
 import torch
 
 from affordlib.commands import command
-from affordlib.evaluation.tasks import EARLIEST_STOP, STANDING, frozen_tasks
 from affordlib.geometry import rotated
 from affordlib.interactions.recipes import Variation
 from affordlib.models.checkpoint import load_checkpoint
@@ -31,6 +30,7 @@ from experiments import runner
 from experiments.planning import CONFIGS, attempt, tasks_sha256
 from experiments.real_pushes import named
 from experiments.runner import FOLDER, Job, Rows, frame, interval
+from experiments.tasks import EARLIEST_STOP, STANDING, frozen_tasks
 
 TABLE, PLANS = "adaptation", CONFIGS["perturbed_corrected"]
 N_OTHERS, N_TESTS, SHOTS = 40, 2, (0, 2, 5, 10)

@@ -25,7 +25,6 @@ import pandas as pd
 from scipy.spatial import ConvexHull
 
 from affordlib.commands import command
-from affordlib.evaluation.tasks import ROLLABLE
 from affordlib.geometry import wrap_angle
 from affordlib.interactions.recipes import Variation
 from affordlib.models import load_checkpoint
@@ -52,6 +51,7 @@ from affordlib.world import (
 from experiments import runner
 from experiments.feasibility import half_width_m, is_feasible, on_the_rim
 from experiments.runner import FOLDER, Job, Rows, plain
+from experiments.tasks import ROLLABLE
 
 N_TRIALS = {
     "height": 50,

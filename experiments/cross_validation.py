@@ -23,8 +23,6 @@ from sklearn.linear_model import LogisticRegression
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
-from affordlib.evaluation.baselines import BASELINES, baseline_predictions
-from affordlib.evaluation.predictions import about_objects, network_predictions
 from affordlib.geometry import wrap_angle
 from affordlib.interactions import InteractionTensors, Split, split_interactions
 from affordlib.interactions.dataset import Symmetry, valid_interactions
@@ -33,12 +31,14 @@ from affordlib.models.base import EffectNetwork, NetworkConfig
 from affordlib.models.calibration import fit_sigma_scale
 from affordlib.models.cnp import CNPConfig
 from affordlib.models.film import FiLMConfig
+from affordlib.models.predictions import about_objects, network_predictions
 from affordlib.models.protocol import EffectModel, condition_on_final_effect
 from affordlib.models.training import train_model
 from affordlib.primitives import Grasp, Push
 from affordlib.types import check_choice, check_count
 from affordlib.world import Tabletop
 from experiments.attention import AttentionConfig
+from experiments.baselines import BASELINES, baseline_predictions
 from experiments.ensemble import Ensemble
 from experiments.runner import Job, open_once
 from experiments.shipped import CHECKPOINT_SPECS, GRASP_SYMMETRIES, HALF_TURNS

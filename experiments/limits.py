@@ -15,10 +15,10 @@ from itertools import pairwise
 import numpy as np
 import torch
 
-from affordlib.evaluation.predictions import about_objects
 from affordlib.interactions import open_interactions
 from affordlib.interactions.recipes import Recipe, sample_scene, sample_world
 from affordlib.models.checkpoint import load_checkpoint
+from affordlib.models.predictions import about_objects
 from affordlib.models.protocol import condition_on_primitives
 from affordlib.planning.reachability import Reachability
 from affordlib.primitives import Drag, Grasp, Push, Rotate

@@ -26,10 +26,8 @@ import torch
 from tqdm.auto import tqdm
 
 from affordlib.commands import command
-from affordlib.evaluation import tasks as goals
-from affordlib.evaluation.metrics import error_row
-from affordlib.evaluation.tasks import ROLLABLE, STANDING, PlanningTask, frozen_tasks
 from affordlib.models.checkpoint import load_checkpoint
+from affordlib.models.predictions import error_row
 from affordlib.models.protocol import EffectModel
 from affordlib.paths import repo_root
 from affordlib.planning import (
@@ -51,10 +49,12 @@ from affordlib.primitives import Push
 from affordlib.types import NothingSeenError, Outcome, Plan, Step
 from affordlib.world import Tabletop, UnreachableError
 from experiments import reported, runner
+from experiments import tasks as goals
 from experiments.field_baselines import LimitSurface, plan_astar_continuous, plan_cem
 from experiments.literal import SPEC, trained_on
 from experiments.oracle import oracle_effects
 from experiments.runner import FOLDER, Job, Rows, interval, plain
+from experiments.tasks import ROLLABLE, STANDING, PlanningTask, frozen_tasks
 
 ENOUGH_M = 0.0003
 """Distance [m] from the goal below which no corrective action is tried, as none would help."""

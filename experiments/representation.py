@@ -18,12 +18,12 @@ import xarray as xr
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from affordlib.evaluation.predictions import about_objects
 from affordlib.interactions import InteractionTensors, open_interactions, split_interactions
 from affordlib.interactions.dataset import valid_interactions
 from affordlib.models.checkpoint import load_checkpoint
 from affordlib.models.film import FiLMConfig
 from affordlib.models.harmonics import CircularHarmonics, dense
+from affordlib.models.predictions import about_objects
 from affordlib.models.protocol import condition_on_final_effect
 from affordlib.models.push_frame import inverse, push_direction, rotate_observations
 from affordlib.models.training import final_errors_m, train_model

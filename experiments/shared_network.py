@@ -22,13 +22,12 @@ import numpy as np
 import pandas as pd
 import torch
 
-from affordlib.evaluation.metrics import error_row
-from affordlib.evaluation.predictions import network_predictions
 from affordlib.interactions import InteractionTensors, split_interactions
 from affordlib.interactions.dataset import Symmetry, augment_by_symmetry
 from affordlib.models.base import EffectNetwork
 from affordlib.models.calibration import effects_at
 from affordlib.models.film import FiLMConfig
+from affordlib.models.predictions import error_row, network_predictions
 from affordlib.models.training import train, untrained
 from experiments.cross_validation import TASKS, add_errors, job, prediction_columns
 from experiments.runner import Rows, open_once, plain, run, study

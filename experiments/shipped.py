@@ -23,17 +23,6 @@ import xarray as xr
 from torch import nn
 
 from affordlib.commands import command, count_type
-from affordlib.evaluation.tasks import (
-    FROZEN,
-    MIN_DISTANCE_M,
-    REACH_M,
-    ROLLABLE,
-    STANDING,
-    PlanningTask,
-    constructed_tasks,
-    drawn_object,
-    off_grid,
-)
 from affordlib.interactions import (
     InteractionTensors,
     Scaler,
@@ -69,6 +58,17 @@ from affordlib.types import Goal
 from affordlib.workers import dask_client
 from affordlib.world import Tabletop
 from experiments.attention import AttentionConfig
+from experiments.tasks import (
+    FROZEN,
+    MIN_DISTANCE_M,
+    REACH_M,
+    ROLLABLE,
+    STANDING,
+    PlanningTask,
+    constructed_tasks,
+    drawn_object,
+    off_grid,
+)
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,6 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from affordlib import models
 from affordlib.commands import command
-from affordlib.evaluation.tasks import STANDING
 from affordlib.interactions import (
     InteractionTensors,
     Scaler,
@@ -46,6 +45,7 @@ from affordlib.world import Tabletop
 from experiments.literal import sample_literal, train_literal
 from experiments.runner import Rows
 from experiments.shipped import uniform_tasks
+from experiments.tasks import STANDING
 
 RESULTS = "data/results/speed.json"
 

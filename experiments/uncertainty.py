@@ -18,11 +18,11 @@ from typing import Any
 import numpy as np
 from scipy import optimize, stats
 
-from affordlib.evaluation.metrics import refuse_seen
 from affordlib.geometry import xy_columns
 from affordlib.interactions import InteractionTensors, open_interactions, split_interactions
 from affordlib.models.calibration import AFTER_CONTACT, LEVELS, calibration_row, effects_at
 from affordlib.models.checkpoint import load_checkpoint
+from affordlib.models.predictions import refuse_seen
 from affordlib.models.training import final_errors_m, train_model
 from experiments.representation import TRAINING
 from experiments.runner import Rows, study

@@ -20,7 +20,6 @@ import numpy as np
 import torch
 
 import experiments.attention  # noqa: F401, whose network a checkpoint is of
-from affordlib.evaluation.tasks import frozen_tasks
 from affordlib.interactions import InteractionTensors, open_interactions
 from affordlib.interactions.lever_up import lever_up_tensors
 from affordlib.interactions.recipes import RECIPES, interact
@@ -38,6 +37,7 @@ from affordlib.planning import (
 from affordlib.planning.reachability import Reachability
 from affordlib.types import Observations
 from affordlib.world import Tabletop
+from experiments.tasks import frozen_tasks
 
 N_INTERACTIONS, N_GOALS = 3, 20
 

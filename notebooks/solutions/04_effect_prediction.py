@@ -3,10 +3,10 @@
 import numpy as np
 import torch
 
-from affordlib.evaluation.predictions import network_predictions
 from affordlib.interactions import open_interactions
 from affordlib.interactions.sampling import condition_on_recorded_action
 from affordlib.models import load_checkpoint
+from affordlib.models.predictions import network_predictions
 from exercises import check
 
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from affordlib.evaluation.predictions import final_error, network_predictions
 from affordlib.interactions import open_interactions
 from affordlib.models import load_checkpoint
+from affordlib.models.predictions import final_error, network_predictions
 from exercises import check
 
 

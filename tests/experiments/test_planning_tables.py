@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from affordlib.evaluation.tasks import FROZEN, ROLLABLE, STANDING, PlanningTask, frozen_tasks
 from affordlib.geometry import rotated
 from affordlib.planning import MODES, EffectMap
 from affordlib.primitives import PUSH_GAP_M, Drag, Push
@@ -17,6 +16,7 @@ from experiments import planning, shipped
 from experiments.adaptation import Camera
 from experiments.field_baselines import FINGER_AHEAD_M, LimitSurface
 from experiments.planning import CONFIGS, attempt, tasks_sha256
+from experiments.tasks import FROZEN, ROLLABLE, STANDING, PlanningTask, frozen_tasks
 
 
 def test_pushes_show_how_far_beside_the_camera_sees():

@@ -10,9 +10,9 @@ import pytest
 import torch
 from safetensors.torch import save
 
-from affordlib.evaluation import refuse_seen
 from affordlib.interactions import split_interactions
 from affordlib.models import load_checkpoint, save_checkpoint
+from affordlib.models.predictions import refuse_seen
 from affordlib.planning.reachability import Reachability
 from affordlib.weights import read_weights, write_weights
 from experiments.runner import checkpoint_sha256

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from affordlib.evaluation.baselines import constant
 from affordlib.interactions import InteractionTensors, Scaler, split_interactions
 from affordlib.interactions.sampling import condition_on_recorded_action
 from affordlib.models import (
@@ -22,6 +21,7 @@ from affordlib.models import (
 from affordlib.models.film import LastPoseConfig
 from affordlib.models.training import batch_loss, final_errors_m
 from affordlib.types import Observations
+from experiments.baselines import constant
 from experiments.literal import sample_literal, train_literal
 
 

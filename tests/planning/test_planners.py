@@ -9,13 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from affordlib.evaluation.tasks import (
-    ROLLABLE,
-    STANDING,
-    constructed_tasks,
-    drawn_object,
-    frozen_tasks,
-)
 from affordlib.geometry import rotated
 from affordlib.models import load_checkpoint
 from affordlib.planning import (
@@ -34,6 +27,13 @@ from affordlib.types import Goal, Prediction
 from affordlib.world import Cuboid
 from experiments.planning import attempt
 from experiments.shipped import uniform_tasks
+from experiments.tasks import (
+    ROLLABLE,
+    STANDING,
+    constructed_tasks,
+    drawn_object,
+    frozen_tasks,
+)
 from tests.planning.point_robot import REACH_M, STARTS, KnownDynamics, moved_m
 from tests.problems import problem_of
 

@@ -21,10 +21,10 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 from sklearn.neighbors import NearestNeighbors
 from torch import Tensor
 
-from affordlib.evaluation.predictions import prediction_record, steps_of
 from affordlib.geometry import rotate_channels, xy_columns
 from affordlib.interactions.dataset import InteractionTensors, valid_interactions
 from affordlib.interactions.sampling import condition_on_recorded_action
+from affordlib.models.predictions import prediction_record, steps_of
 from affordlib.models.push_frame import inverse, push_direction, rotate_prediction
 from affordlib.types import Prediction
 

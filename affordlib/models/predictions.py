@@ -1,5 +1,6 @@
-"""Predictions from image and commanded action with the ground truth, as plain lists."""
+"""Predictions from image and commanded action with the ground truth, and rows of their errors."""
 
+import json
 from typing import Any
 
 import numpy as np
@@ -7,15 +8,19 @@ import torch
 
 from affordlib.geometry import xy_columns
 from affordlib.interactions import InteractionTensors
-from affordlib.interactions.dataset import valid_interactions
+from affordlib.interactions.dataset import check_numbers, valid_interactions
 from affordlib.models.calibration import effects_at
 from affordlib.models.protocol import EffectModel
+from affordlib.types import check_array
 
 EVERY = 12
 """Every twelfth sample is one of the paper's 25 steps of 150 ms."""
 
 CONTACT_M = 0.001
 """Displacement [m] (or rotation [rad]) from which on an object counts as touched."""
+
+_DECIDE_OBJECTS = ("seed", "families", "size_range_m", "height_range_m")
+"""The fields of a stored recipe that decide its objects."""
 
 
 def steps_of(arrays: InteractionTensors) -> torch.Tensor:
@@ -63,7 +68,7 @@ def prediction_record(
     touched = truth[..., columns].norm(dim=-1) > CONTACT_M
     after = (error * touched).sum(dim=1) / touched.sum(dim=1).clamp_min(1)
 
-    def last(values: torch.Tensor) -> dict[str, list[float]]:
+    def last(values):
         return {name: values[:, -1, k].tolist() for k, name in enumerate(names)}
 
     return about_objects(data, kept) | {
@@ -82,3 +87,48 @@ def final_error(record: dict[str, Any]) -> np.ndarray:
         return np.hypot(*(np.subtract(mean[name], truth[name]) for name in "xy"))
     name = next(iter(mean))
     return np.abs(np.subtract(mean[name], truth[name]))
+
+
+def error_row(errors_m: np.ndarray, **columns: Any) -> dict[str, Any]:
+    """One row of a table: the given columns, then n, mean, standard error, median, 95th percentile.
+
+    errors_m: (n,) distances [m], one per independent object.
+    """
+    errors = check_array("errors_m", errors_m)
+    if errors.ndim != 1:
+        raise ValueError(
+            f"errors_m must be finite distances of shape (n,), n ≥ 1, got shape {errors.shape}"
+        )
+    sem = float(errors.std(ddof=1) / np.sqrt(len(errors))) if len(errors) > 1 else 0.0
+    return {
+        **columns,
+        "n": len(errors),
+        "mean_m": float(errors.mean()),
+        "sem_m": sem,
+        "median_m": float(np.median(errors)),
+        "p95_m": float(np.quantile(errors, 0.95)),
+    }
+
+
+def refuse_seen(about: dict[str, Any], data: "xarray.Dataset", interactions: np.ndarray) -> None:
+    """Raise ValueError if a checkpoint was trained on these interactions, or does not say so.
+
+    about: the second value that `load_checkpoint` returns.
+    """
+    try:
+        recipes = [json.loads(text) for text in (about["recipe"], data.attrs["recipe"])]
+        objects = [[recipe[name] for name in _DECIDE_OBJECTS] for recipe in recipes]
+        trained_on = {int(number) for number in about["seen_interactions"]}
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"about does not say which interactions the model was trained on ({error!r}); "
+            "save the checkpoint with the recipe and seen_interactions of its training"
+        ) from error
+    check_numbers("interactions", interactions)
+    numbers = data["interaction"].values[interactions]
+    seen = sorted(trained_on & {int(i) for i in numbers})
+    if objects[0] == objects[1] and seen:
+        raise ValueError(
+            f"interactions: the model was trained or tuned on {len(seen)} of them (such as "
+            f"{seen[:5]}); evaluate it on the test part of its split or on another data set"
+        )

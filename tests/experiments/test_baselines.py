@@ -7,11 +7,11 @@ import pandas as pd
 import pytest
 import torch
 
-from affordlib.evaluation.baselines import constant, gaussian_process, nearest
-from affordlib.evaluation.predictions import final_error, network_predictions
 from affordlib.interactions import InteractionTensors
 from affordlib.models.calibration import calibration_row
+from affordlib.models.predictions import final_error, network_predictions
 from affordlib.models.training import final_errors_m
+from experiments.baselines import constant, gaussian_process, nearest
 from experiments.cross_validation import add_errors, logistic
 
 # Answers
