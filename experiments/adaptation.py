@@ -38,10 +38,10 @@ N_OTHERS, N_TESTS, SHOTS = 40, 2, (0, 2, 5, 10)
 
 @lru_cache(maxsize=1)
 def robot() -> tuple[Tabletop, Any, Any]:
-    """Return a simulated world, a planner for it, and the planner's network."""
+    """Return a simulated world, what poses problems in it, and the planner's network."""
     torch.set_num_threads(1)
     world = Tabletop()
-    return world, PLANS.make(world), load_checkpoint(PLANS.model)[0]
+    return world, PLANS.pose(world), load_checkpoint(PLANS.model)[0]
 
 
 def push_often(obj: TabletopObject, config: WorldConfig, rng: np.random.Generator) -> Rows:
@@ -110,10 +110,10 @@ def measure(camera: Camera | None, kind: str, number: int) -> dict[str, Rows]:
     if kind == "other":
         obj = category_named(STANDING[number % len(STANDING)]).sample(rng)
         return {"pushes": push_often(obj, Variation().sample(obj, rng), rng)}
-    task, (world, planner, _), errors = frozen_tasks("perturbed")[number], robot(), []
+    task, (world, pose, _), errors = frozen_tasks("perturbed")[number], robot(), []
     for name, error_m in known(camera, push_often(task.obj, task.config, rng)).items():
         config = replace(task.config, bias_m=tuple(task.config.bias_m - error_m))
-        done = attempt(world, replace(task, config=config), planner, **PLANS.execution)
+        done = attempt(world, replace(task, config=config), pose, PLANS.plan, **PLANS.execution)
         planned = done.object_paths_xy_m[: len(done.plan.steps)]
         plan_m = task.goal.distance_m(planned[-1][-1]) if planned else done.distance_m
         for of, error in (("plan", plan_m), ("corrected plan", done.distance_m)):

@@ -40,8 +40,8 @@ def recorded(title: str, stop: bool) -> list[np.ndarray]:
     animation = FrameRecorder(FRAME_STEPS, WIDTH, HEIGHT, **VIEW)
     with Tabletop() as world:
         world.place(BOX, (0.0, 0.0), 0.3)
-        planner = Skills.load().planner(plan_continuous, mode="single_partial")
-        plan = planner(world.depth_image(), world.object_pose()[:2], GOAL)
+        query = world.depth_image(), world.object_pose()[:2], GOAL, "single_partial"
+        plan = plan_continuous(Skills.load().problem(*query))
         turned = 0.3 + plan.steps[0].predicted_turn_rad
         if not stop:
             plan = replace(plan, steps=(replace(plan.steps[0], stop_phase=1.0),))

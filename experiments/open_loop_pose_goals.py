@@ -43,8 +43,8 @@ def run_open_loop(table: str, index: int, planner: str) -> dict[str, Any]:
     world, skills = tabletop_and_skills()
     trial = sample_trial(table, index)
     world.place(trial.obj, trial.start_xy_m, trial.yaw_rad)
-    image = world.depth_image()
-    plan = skills.planner(PLANNERS[planner])(image, trial.start_xy_m, trial.goal)
+    problem = skills.problem(world.depth_image(), trial.start_xy_m, trial.goal)
+    plan = PLANNERS[planner](problem)
     yaw, z = world.object_pose()[2], world.object_state()[2]
     with suppress(UnreachableError):
         execute_plan(world, plan)

@@ -34,6 +34,7 @@ from affordlib.planning import (
     EffectMap,
     Execution,
     PlanMode,
+    Planner,
     PlanningProblem,
     Robot,
     Skills,
@@ -100,8 +101,8 @@ MADE: dict[str, Callable[[], EffectModel]] = {
 }
 """Models without a checkpoint, which the job trains (ten minutes) or fits on `push`."""
 
-Planner = Callable[..., Plan]
-"""A planner as (image, start_xy_m, goal, mode) → Plan."""
+Pose = Callable[..., PlanningProblem]
+"""Poses the problem of (image, start_xy_m, goal, mode), as `Skills.problem` does."""
 
 
 VERSIONS: dict[Planner, int] = {plan_astar: 2, plan_astar_fine: 2}
@@ -154,22 +155,26 @@ class PlannerConfig:
         """Return the columns of the table that describe this row."""
         return {"model": self.model, "world": self.world}
 
-    def make(self, world: Tabletop) -> Planner:
-        """Return the planner for a world; only the model "simulator" accesses the world's state."""
+    def plan(self, problem: PlanningProblem) -> Plan:
+        """Plan with this row's arguments."""
+        return self.planner(problem, **self.arguments)
+
+    def pose(self, world: Tabletop) -> Pose:
+        """Return what poses the problems; only the model "simulator" reads the world's state."""
         models = {kind: load_checkpoint(name)[0] for kind, name in self.checkpoints.items()}
         if self.model in MADE:
             models["push"] = MADE[self.model]()
         skills, imagined = Skills(models), None if models else Tabletop()
 
-        def plan(image, start_xy_m, goal, mode) -> Plan:
+        def pose(image, start_xy_m, goal, mode) -> PlanningProblem:
             if imagined:
                 effects = oracle_effects(imagined, world, image, **self.oracle)
             else:
                 kind = skills.kind_for(image) if "drag" in models else Push
                 effects = EffectMap(skills.model(kind), image, kind)
-            return self.planner(PlanningProblem(start_xy_m, goal, effects, mode), **self.arguments)
+            return PlanningProblem(start_xy_m, goal, effects, mode)
 
-        return plan
+        return pose
 
 
 ALL = {"sources": goals.GOAL_SOURCES}
@@ -310,7 +315,9 @@ def _joined(done: Outcome, more: Outcome) -> Outcome:
     return replace(more, plan=done.plan, object_paths_xy_m=paths)
 
 
-def attempt(world: Tabletop, task: PlanningTask, planner: Planner, **options: Any) -> Outcome:
+def attempt(
+    world: Tabletop, task: PlanningTask, pose: Pose, planner: Planner, **options: Any
+) -> Outcome:
     """Plan and execute one task; options: fields of `Attempt`.
 
     The distance is the world's ground truth. If the arm cannot follow a plan, the distance after
@@ -320,7 +327,7 @@ def attempt(world: Tabletop, task: PlanningTask, planner: Planner, **options: An
     world.place(task.obj, (0.0, 0.0), task.yaw_rad, config=task.config)
     world.n_averaged_images = how.n_averaged_images
     seen = world.observe()
-    plan = planner(seen.image, seen.xy_m, task.goal, task.mode)
+    plan = planner(pose(seen.image, seen.xy_m, task.goal, task.mode))
     if how.perturbed_start:
         side = POSITION_ERROR_M * np.array([math.cos(task.yaw_rad), math.sin(task.yaw_rad)])
         config = replace(task.config, bias_m=tuple(side))
@@ -339,21 +346,22 @@ def attempt(world: Tabletop, task: PlanningTask, planner: Planner, **options: An
     now = replace(plan, steps=plan.steps[:1]) if how.receding else plan
     try:
         outcome = execute_plan(robot, now)
-        outcome = corrected(robot, outcome, lambda *query: planner(*query, once), how.corrections)
+        outcome = corrected(robot, outcome, lambda *q: planner(pose(*q, once)), how.corrections)
         mode = MODES[task.mode]
         for left in range(mode.max_steps - 1, 0, -1) if how.receding else ():
             seen = world.observe()
             if task.goal.distance_m(seen.xy_m) <= ENOUGH_M:
                 break
-            again = planner(seen.image, seen.xy_m, task.goal, replace(mode, max_steps=left))
+            fewer = replace(mode, max_steps=left)
+            again = planner(pose(seen.image, seen.xy_m, task.goal, fewer))
             more = execute_plan(world, replace(again, steps=again.steps[:1]))
             outcome = replace(_joined(outcome, more), plan=plan)
     except UnreachableError as refused:
         outcome = refused.outcome
     finally:
         world.n_averaged_images = 1
-    pose = world.object_pose()
-    return replace(outcome, distance_m=task.goal.distance_m(pose[:2]), end_pose=pose)
+    end = world.object_pose()
+    return replace(outcome, distance_m=task.goal.distance_m(end[:2]), end_pose=end)
 
 
 def outcome_record(task: PlanningTask, outcome: Outcome) -> dict[str, Any]:
@@ -379,10 +387,10 @@ def outcome_record(task: PlanningTask, outcome: Outcome) -> dict[str, Any]:
 
 
 def measure(
-    world: Tabletop, tasks: Sequence[PlanningTask], planner: Planner, **execution: Any
+    world: Tabletop, tasks: Sequence[PlanningTask], pose: Pose, planner: Planner, **execution: Any
 ) -> list[Outcome]:
     """Return the outcomes of tasks with one planner, in order; execution: options of `attempt`."""
-    return [attempt(world, task, planner, **execution) for task in tasks]
+    return [attempt(world, task, pose, planner, **execution) for task in tasks]
 
 
 def run_config(config: str) -> list[dict[str, Any]]:
@@ -391,9 +399,9 @@ def run_config(config: str) -> list[dict[str, Any]]:
     about, records = CONFIGS[config], []
     tasks = frozen_tasks(about.world)
     with Tabletop() as world:
-        planner = about.make(world)
+        pose = about.pose(world)
         for k in tqdm(about.chosen(tasks), config, unit=" goals", leave=False):
-            outcome = attempt(world, tasks[k], planner, **about.execution)
+            outcome = attempt(world, tasks[k], pose, about.plan, **about.execution)
             records.append({"task": k} | outcome_record(tasks[k], outcome))
     return records
 

@@ -28,12 +28,12 @@ EVERY = 100
 CATEGORIES = (Cuboid, UprightCylinder, LyingCylinder)
 
 
-def one_round(world: Tabletop, planner, obj, start, goal: Goal) -> str:
+def one_round(world: Tabletop, pose, planner, obj, start, goal: Goal) -> str:
     """Observe, plan and execute; return the hash of the object's path."""
     world.place(obj, start)
     seen = world.observe()
     try:
-        outcome = execute_plan(world, planner(seen.image, seen.xy_m, goal))
+        outcome = execute_plan(world, planner(pose(seen.image, seen.xy_m, goal)))
     except UnreachableError:
         return "unreachable"
     told = [np.array(outcome.end_pose), *outcome.object_paths_xy_m]
@@ -52,8 +52,12 @@ def main() -> int:
     parser.add_argument("--rounds", type=int, default=3000)
     rounds = parser.parse_args().rounds
     rng = np.random.default_rng(0)
-    skills, mode = Skills.load(), PlanMode(2, partial=True)
-    planners = [skills.planner(plan, mode=mode) for plan in (plan_astar, plan_continuous)]
+    skills = Skills.load()
+
+    def pose(*query):
+        return skills.problem(*query, PlanMode(2, partial=True))
+
+    planners = [plan_astar, plan_continuous]
     fixed = [(Cuboid(0.06, 0.05, 0.07), (0.0, 0.0)), (UprightCylinder(0.06, 0.08), (0.1, 0.2))]
     first: list[str] = []
     begin = 0.0
@@ -62,10 +66,10 @@ def main() -> int:
             category = CATEGORIES[rng.integers(len(CATEGORIES))]
             start = rng.uniform((-0.1, -0.2), (0.2, 0.2))
             goal = Goal(tuple(start + rng.uniform(-0.1, 0.1, 2)), 0.005)
-            one_round(world, planner, category.sample(rng, (0.05, 0.08)), start, goal)
+            one_round(world, pose, planner, category.sample(rng, (0.05, 0.08)), start, goal)
             if number % EVERY == 0:
                 again = [
-                    one_round(world, plan, obj, at, Goal((at[0] + 0.08, at[1] + 0.06), 0.005))
+                    one_round(world, pose, plan, obj, at, Goal((at[0] + 0.08, at[1] + 0.06), 0.005))
                     for obj, at in fixed
                     for plan in planners
                 ]

@@ -163,7 +163,7 @@ def shop(one_world, skills, pushes, tmp_path_factory):
         "plan": plan,
         "goal": goal,
         "problem": problem,
-        "planners": {"A*": skills.planner(planning.plan_astar)},
+        "planners": {"A*": planning.plan_astar},
         "skills": skills,
         "robot world": one_world,
         "result": pursuit,

@@ -101,3 +101,7 @@ class PlanningProblem:
         reaches_goal &= goal.distance_m(end_xy_m) <= goal.tolerance_m
         seconds, about = time.perf_counter() - began_s, self.effects.warning
         return Plan(goal, self.start_xy_m, steps, planner, reaches_goal, seconds, about)
+
+
+Planner = Callable[[PlanningProblem], Plan]
+"""A planner, such as `plan_astar`, or one with settings: `partial(plan_continuous, seed=1)`."""

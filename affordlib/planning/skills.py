@@ -1,9 +1,8 @@
 """The skills of a robot: a model for each primitive, and where its arm can act."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import partial
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from affordlib.planning.problem import PlanMode, PlanningProblem, Reachable, eve
 from affordlib.planning.reachability import Reachability
 from affordlib.planning.routes import REACH_M, RouteMap
 from affordlib.primitives import Drag, Grasp, Primitive, Push, Rotate, primitive_named
-from affordlib.types import Goal, Plan, check_field
+from affordlib.types import Goal, check_field
 
 CHECKPOINTS = {
     "push": "film_5000",
@@ -82,12 +81,6 @@ class Skills:
         reachable = self.reachable(effects.kind)
         return PlanningProblem(start_xy_m, goal, effects, mode, reachable, poses)
 
-    def planner(
-        self, plan: Callable[..., Plan], mode: str | PlanMode = "multi_partial", **settings: Any
-    ) -> "SkillPlanner":
-        """Make a planner (image, start_xy_m, goal) → Plan from a function such as `plan_astar`."""
-        return SkillPlanner(self, partial(plan, **settings), mode)
-
     def effects(self, image: np.ndarray, kind: type[Push] | type[Drag] | None = None) -> EffectMap:
         """Effect map of the object in an image (2, 48, 48); cached for the last image.
 
@@ -126,15 +119,3 @@ class Skills:
         if kind not in self._routes:
             self._routes[kind] = RouteMap.of(REACH_M[kind], self.reachable(kind))
         return self._routes[kind]
-
-
-@dataclass(frozen=True)
-class SkillPlanner:
-    """Plans (image, start_xy_m, goal) → Plan with the models of some skills."""
-
-    skills: Skills
-    plan: Callable[[PlanningProblem], Plan]
-    mode: str | PlanMode = "multi_partial"
-
-    def __call__(self, image: np.ndarray, start_xy_m: Sequence[float], goal: Goal) -> Plan:
-        return self.plan(self.skills.problem(image, start_xy_m, goal, self.mode))

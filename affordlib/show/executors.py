@@ -7,17 +7,13 @@ import numpy as np
 
 from affordlib.planning import (
     ClosedLoopConfig,
+    Planner,
     Skills,
     execute_plan,
-    plan_continuous,
     run_closed_loop,
 )
-from affordlib.planning.skills import SkillPlanner
 from affordlib.types import Goal, Outcome, Plan
 from affordlib.world import Tabletop
-
-Planner = Callable[[np.ndarray, tuple[float, float], Goal], Plan]
-"""Function of an image, the object's position (x, y) [m] and a goal that returns a plan."""
 
 Report = Callable[..., Goal]
 """Callback: `report()` after an action, `report(plan)` when a new plan replaces the current one.
@@ -52,11 +48,7 @@ def measured(
 
 
 def closed_loop(skills: Skills, tolerance_m: float = 0.002) -> Executor:
-    """Make an executor that observes after every action and replans to this tolerance [m].
-
-    It replans with the chosen planner if `Skills.planner` made it. Other planners do not know where
-    the arm can act; then it replans with `plan_continuous` and these skills, and says so.
-    """
+    """Make an executor that observes after every action and replans to this tolerance [m]."""
 
     def execute(world, plan, planner, report):
         goal = plan.goal
@@ -68,13 +60,9 @@ def closed_loop(skills: Skills, tolerance_m: float = 0.002) -> Executor:
             nonlocal goal
             goal = report()
 
-        known = isinstance(planner, SkillPlanner)
-        search = (planner.skills, planner.plan) if known else (skills, plan_continuous)
         config = ClosedLoopConfig(on_action=on_action, on_plan=report)
-        done = run_closed_loop(world, exact_goal, *search, config)
+        done = run_closed_loop(world, exact_goal, skills, planner, config)
         words = "" if done.reached else f"The loop ended as {done.status}: {done.message}."
-        if not known:
-            words += " It replanned by continuous search."
-        return measured(world, plan, done.object_paths_xy_m, words.strip()).with_goal(goal)
+        return measured(world, plan, done.object_paths_xy_m, words).with_goal(goal)
 
     return execute

@@ -19,9 +19,10 @@ import numpy as np
 
 from affordlib.geometry import unit_vector, wrap_angle
 from affordlib.paths import resolve_out_dir
+from affordlib.planning import Planner, Skills
 from affordlib.results import load_plan, save_plan
 from affordlib.show.drawing import Drawing, WithPicture
-from affordlib.show.executors import Executor, Planner, Stopped, measured, open_loop
+from affordlib.show.executors import Executor, Stopped, closed_loop, measured, open_loop
 from affordlib.show.table_view import (
     HALF_WIDTH_M,
     LIMIT_M,
@@ -55,13 +56,13 @@ _LABEL = (
 class GoalPicker(WithPicture, widgets.HBox):
     """The table from above, where a goal is picked by mouse, keyboard or sliders.
 
-    planners: name → function (image, start_xy_m, goal) → Plan. executors: name → function (world,
-    plan, planner, report) → Outcome that executes a plan, or replans with the planner that made it;
-    see `executors.Report`. The default is `open_loop` alone. draft: a fast planner whose plan is
-    shown while the goal is dragged; the chosen planner's plan replaces it afterwards. seed: of the
-    disturbances. folder: where plans are saved.
+    skills: what the robot can do. planners: name → function of a `PlanningProblem` that returns a
+    plan. draft: a fast planner whose plan is shown while the goal is dragged; the chosen planner's
+    plan replaces it afterwards. seed: of the disturbances. folder: where plans are saved.
 
-    `goal`, `plan` and `outcome` are those shown. Methods do what mouse and buttons do, and return
+    `executors`: name → function (world, plan, planner, report) → Outcome that executes a plan, or
+    replans with the planner that made it; see `executors.Report`. `goal`, `plan` and `outcome` are
+    those shown. Methods do what mouse and buttons do, and return
     when done; mouse and buttons queue it in the background, *Run* with `seconds_per_action`.
     """
 
@@ -70,15 +71,19 @@ class GoalPicker(WithPicture, widgets.HBox):
     def __init__(
         self,
         world: Tabletop,
+        skills: Skills,
         planners: dict[str, Planner],
         goal_xy_m: tuple[float, float] = (0.12, 0.10),
-        executors: dict[str, Executor] | None = None,
         draft: Planner | None = None,
         seed: int = 0,
         folder: str = "runs/lab",
     ) -> None:
-        self.world, self.planners, self.draft, self.folder = world, planners, draft, folder
-        self.executors = executors or {"open loop": open_loop}
+        self.world, self.skills, self.planners = world, skills, planners
+        self.draft, self.folder = draft, folder
+        self.executors: dict[str, Executor] = {
+            "open loop": open_loop,
+            "closed loop": closed_loop(skills),
+        }
         self.plan: Plan | None = None
         self.outcome: Outcome | None = None
         self._rng = np.random.default_rng(check_count("seed", seed, least=0))
@@ -277,7 +282,7 @@ class GoalPicker(WithPicture, widgets.HBox):
             goal, number, plan = self.goal, self._view.wanted[3], None
             self._put_down()
             try:
-                plan = planner(self.world.depth_image(), self._pose[:2], goal)
+                plan = planner(self.skills.problem(self.world.depth_image(), self._pose[:2], goal))
                 if not draft:  # whose words belong to another planner
                     self.controls.say(f"{self._news} {plan_in_words(plan)}")
                     self._news = ""

@@ -74,9 +74,10 @@ def test_planners_differ_and_are_asked_about_all_their_categories_alike():
 
 def test_an_object_with_a_perturbed_start_is_missed_by_as_much(world):
     tasks = [t for t in frozen_tasks() if t.mode == "single_partial" and not t.obj.rollable][:4]
-    planner = CONFIGS["continuous"].make(world)
+    config = CONFIGS["continuous"]
+    how = config.pose(world), config.plan
     there, perturbed = (
-        np.mean([attempt(world, t, planner, perturbed_start=p).distance_m for t in tasks])
+        np.mean([attempt(world, t, *how, perturbed_start=p).distance_m for t in tasks])
         for p in (False, True)
     )
     assert there < 0.0005
@@ -85,13 +86,16 @@ def test_an_object_with_a_perturbed_start_is_missed_by_as_much(world):
 
 def test_actions_are_placed_by_the_plan(world):
     task = next(t for t in frozen_tasks() if t.mode == "multi_partial" and not t.obj.rollable)
-    planner, seen = CONFIGS["continuous"].make(world), []
+    config, seen = CONFIGS["continuous"], []
 
-    def watched(image, xy_m, *query):
-        seen.append(xy_m)
-        return planner(image, xy_m, *query)
+    def watched(problem):
+        seen.append(problem.start_xy_m)
+        return config.plan(problem)
 
-    again, once = (attempt(world, task, watched, by_plan=by_plan) for by_plan in (False, True))
+    again, once = (
+        attempt(world, task, config.pose(world), watched, by_plan=by_plan)
+        for by_plan in (False, True)
+    )
     assert len(seen) == 2
     assert again.distance_m != once.distance_m
     # Only the object's position in the plan matters, not that in the world.
@@ -100,16 +104,16 @@ def test_actions_are_placed_by_the_plan(world):
 
 def test_with_a_receding_horizon_each_plan_has_one_action_less(world):
     task = next(t for t in frozen_tasks() if t.mode == "multi_partial" and not t.obj.rollable)
-    planner, seen = CONFIGS["mpc_continuous"].make(world), []
+    config, seen = CONFIGS["mpc_continuous"], []
 
-    def watched(image, xy_m, goal, mode):
-        seen.append((xy_m, MODES[mode].max_steps if isinstance(mode, str) else mode.max_steps))
-        plan = planner(image, xy_m, goal, mode)
+    def watched(problem):
+        seen.append((problem.start_xy_m, problem.mode.max_steps))
+        plan = config.plan(problem)
         # A plan that stops half way has a remaining distance.
         steps = tuple(replace(s, stop_phase=0.8) for s in plan.steps) if len(seen) < 3 else ()
         return replace(plan, steps=steps)
 
-    outcome = attempt(world, task, watched, receding=True)
+    outcome = attempt(world, task, config.pose(world), watched, receding=True)
     assert [n for _, n in seen] == [3, 2, 1]
     assert len({xy for xy, _ in seen}) == 3
     assert len(outcome.object_paths_xy_m) == 2
@@ -119,11 +123,12 @@ def test_with_a_receding_horizon_each_plan_has_one_action_less(world):
 def test_planners_of_the_field_keep_to_their_actions_and_improve_on_their_start(world):
     tasks = [t for t in frozen_tasks() if t.goals == "constructed" and not t.obj.rollable]
     names = ("astar", "astar_continuous", "cem")
-    planners, ends = {name: CONFIGS[name].make(world) for name in names}, []
+    configs, ends = [CONFIGS[name] for name in names], []
+    poses = [config.pose(world) for config in configs]
     for task in tasks[::12]:
         world.place(task.obj, (0.0, 0.0), task.yaw_rad, config=task.config)
         about = world.depth_image(), (0.0, 0.0), task.goal, task.mode
-        plans = [planners[name](*about) for name in names]
+        plans = [c.plan(pose(*about)) for c, pose in zip(configs, poses, strict=True)]
         for plan in plans:
             assert len(plan.steps) <= MODES[task.mode].max_steps
             assert MODES[task.mode].partial or all(s.stop_phase == 1 for s in plan.steps)
@@ -156,7 +161,7 @@ def test_by_physics_the_fingers_carry_a_cylinder_to_where_they_stop(world):
 def test_with_the_simulator_as_model_hardly_anything_remains(world, rollable):
     single = [t for t in frozen_tasks() if t.mode == "single_partial"]
     task = next(t for t in single if t.obj.rollable == rollable)
-    outcome = attempt(world, task, CONFIGS["oracle"].make(world))
+    outcome = attempt(world, task, CONFIGS["oracle"].pose(world), CONFIGS["oracle"].plan)
     assert outcome.distance_m < 0.001
     assert isinstance(outcome.plan.steps[0].primitive, Drag) == rollable
 

@@ -8,7 +8,7 @@ from affordlib.interactions import InteractionTensors, split_interactions
 from affordlib.models import load_checkpoint, save_checkpoint
 from affordlib.models.calibration import NOVELTY_GAIN, Novelty, NoveltyAware
 from affordlib.models.protocol import EffectModel, condition_on_primitives
-from affordlib.planning import plan_continuous
+from affordlib.planning import Skills, plan_continuous
 from affordlib.primitives import Push
 from affordlib.show import GoalPicker
 from affordlib.types import Goal
@@ -67,15 +67,16 @@ def test_sigma_grows_with_novelty_and_with_nothing_else(name, pushes, house):
 
 
 def test_the_planner_and_the_picker_warn_of_unlike_objects(film, house, world, tmp_path):
-    def planner(model):
-        return lambda *query: plan_continuous(problem_of(model, *query[:3]))
-
     query = house[0].numpy(), (0.0, 0.0), Goal((0.1, 0.05))
-    plain, aware = (planner(model)(*query) for model in (film, NoveltyAware(film)))
+    plain, aware = (
+        plan_continuous(problem_of(model, *query)) for model in (film, NoveltyAware(film))
+    )
     assert "trained on no such object" in plain.warning
     assert aware.steps[-1].std_m > 1.5 * plain.steps[-1].std_m
     for obj, warning in ((Cuboid(0.06, 0.05, 0.05), ""), (HOUSE, plain.warning)):
         world.place(obj)
-        picker = GoalPicker(world, {"continuous": planner(film)}, folder=str(tmp_path))
+        picker = GoalPicker(
+            world, Skills({"push": film}), {"continuous": plan_continuous}, folder=str(tmp_path)
+        )
         assert picker.plan.warning == warning
         assert ("trained on no such" in picker.controls.words.value) == bool(warning)

@@ -95,7 +95,7 @@ def test_one_image_is_enough_for_position_turn_and_height(world, skills, plan, o
     world.place(obj, yaw_rad=0.3)
     z = world.object_state()[2]
     goal = Goal((0.07, 0.06), turn_rad=0.8, height_m=0.1)
-    found = skills.planner(plan)(world.depth_image(), AT, goal)
+    found = plan(skills.problem(world.depth_image(), AT, goal))
     assert found.reaches_goal
     kinds = [type(step.primitive) for step in found.steps]
     assert kinds[0] is (Drag if obj is LOG else Push)
@@ -112,7 +112,7 @@ def test_one_image_is_enough_for_position_turn_and_height(world, skills, plan, o
 def test_a_turn_backwards_goes_round_in_several_rotations(world, skills):
     world.place(TUBE)
     goal = Goal(AT, turn_rad=-2.5)
-    found = skills.planner(plan_astar)(world.depth_image(), AT, goal)
+    found = plan_astar(skills.problem(world.depth_image(), AT, goal))
     assert found.reaches_goal
     assert {type(step.primitive) for step in found.steps} == {Rotate}
     assert len(found.steps) >= 3
@@ -145,9 +145,9 @@ def test_predictions_turn_with_the_object(world, skills):
 @PLANNERS
 def test_a_plan_that_cannot_turn_or_lift_says_so(world, skills, plan):
     world.place(BOX)
-    planner, image = skills.planner(plan), world.depth_image()
-    assert planner(image, AT, Goal((0.05, 0.0))).reaches_goal
-    high = planner(image, AT, Goal((0.05, 0.0), height_m=0.45))
+    image = world.depth_image()
+    assert plan(skills.problem(image, AT, Goal((0.05, 0.0)))).reaches_goal
+    high = plan(skills.problem(image, AT, Goal((0.05, 0.0), height_m=0.45)))
     assert not high.reaches_goal
     assert high.steps  # as far as possible
     poses, goal = (
@@ -160,10 +160,10 @@ def test_a_plan_that_cannot_turn_or_lift_says_so(world, skills, plan):
 
 
 def test_predictions_are_kept_while_only_the_goal_moves(skills, cuboid_image):
-    planner = skills.planner(plan_continuous, seed=1, mode="single_partial")
     first = skills.effects(cuboid_image)
     for x in (0.03, 0.06):
-        plan = planner(cuboid_image, AT, Goal((x, 0.04)))
+        posed = skills.problem(cuboid_image, AT, Goal((x, 0.04)), "single_partial")
+        plan = plan_continuous(posed, seed=1)
         problem = problem_of(
             skills.model(Push), cuboid_image, AT, Goal((x, 0.04)), "single_partial"
         )

@@ -3,6 +3,7 @@
 import itertools
 import math
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -345,10 +346,8 @@ def test_plans_come_within_what_their_planner_promises(world, trained, film):
     assert all(math.hypot(*task.goal.xy_m) > 0.02 for task in tasks)
 
     def distances(plan, model, tasks, **how):
-        def planner(image, start, goal, mode):
-            return plan(problem_of(model, image, start, goal, mode))
-
-        return [attempt(world, task, planner, **how).distance_m for task in tasks]
+        pose = partial(problem_of, model)
+        return [attempt(world, task, pose, plan, **how).distance_m for task in tasks]
 
     assert np.mean(distances(plan_astar, trained, tasks)) < 0.03
     hard = [t for t in frozen_tasks() if (t.goals, t.mode) == ("constructed", "multi_partial")]
@@ -392,9 +391,9 @@ def test_an_attempt_averages_as_many_images_as_it_is_told(world, film):
     task = next(t for t in frozen_tasks("perturbed") if t.mode == "single_full")
     seen = []
 
-    def planner(image, xy, goal, mode):
+    def planner(problem):
         seen.append(world.n_averaged_images)
-        return plan_continuous(problem_of(film, image, xy, goal, mode))
+        return plan_continuous(problem)
 
-    attempt(world, task, planner, n_averaged_images=3)
+    attempt(world, task, partial(problem_of, film), planner, n_averaged_images=3)
     assert (seen, world.n_averaged_images) == ([3], 1)

@@ -15,10 +15,9 @@ from affordlib.planning import Skills, execute_plan, plan_astar, plan_continuous
 from affordlib.results import load_plan
 from affordlib.show import GoalPicker, goal_picker
 from affordlib.show.drawing import Drawing
-from affordlib.show.executors import closed_loop, open_loop
+from affordlib.show.executors import open_loop
 from affordlib.types import Goal
 from affordlib.world import BASE_X_M, REACH_M, Cuboid
-from tests.problems import problem_of
 from tests.waiting import wait_until
 
 
@@ -32,17 +31,20 @@ def planned_for():
 def make_picker(world, trained, planned_for, tmp_path):
     world.place(Cuboid(0.06, 0.05, 0.05))
 
-    def astar(*query):
-        planned_for.append(query[2].xy_m)
-        return plan_astar(problem_of(trained, *query))
+    def astar(problem):
+        planned_for.append(problem.goal.xy_m)
+        return plan_astar(problem)
 
     def broken(*_):
         raise ValueError("no <plan> today")
 
-    def make(seconds_per_action=0.0, **options):
+    def make(seconds_per_action=0.0, skills=None, executor=None, **options):
         planners = options.pop("planners", {"A*": astar, "broken": broken})
         goal = options.pop("goal_xy_m", (0.12, 0.0))
-        picker = GoalPicker(world, planners, goal, folder=str(tmp_path), **options)
+        skills = skills or Skills({"push": trained})
+        picker = GoalPicker(world, skills, planners, goal, folder=str(tmp_path), **options)
+        if executor is not None:
+            picker.executors["open loop"] = executor
         picker.seconds_per_action = seconds_per_action
         return picker
 
@@ -57,9 +59,7 @@ def picker(make_picker):
 @pytest.fixture
 def posed(make_picker, skills):
     """A picker whose plans turn and lift."""
-    planners = {"continuous": skills.planner(plan_continuous)}
-    executors = {"open loop": open_loop, "closed loop": closed_loop(skills)}
-    return make_picker(planners=planners, executors=executors)
+    return make_picker(skills=skills, planners={"continuous": plan_continuous})
 
 
 def want(picker, x_m, y_m, number):
@@ -151,8 +151,8 @@ def test_labels_meet_neither_goal_nor_outlines_nor_discs_nor_each_other(posed, x
 def test_the_first_time_that_is_shown_is_that_of_a_planner_at_work(make_picker, trained):
     times = iter([7.0, 0.05])
 
-    def planner(*query):
-        return replace(plan_astar(problem_of(trained, *query)), plan_s=next(times))
+    def planner(problem):
+        return replace(plan_astar(problem), plan_s=next(times))
 
     assert "Found in 50 ms" in make_picker(planners={"mine": planner}).controls.said
 
@@ -192,8 +192,8 @@ def test_what_the_hand_wants_is_planned_for_once(picker, planned_for):
 def test_a_draft_until_the_hand_rests(make_picker, planned_for, trained, monkeypatch):
     monkeypatch.setattr(goal_picker, "REST_S", 1.0)
 
-    def draft(*query):
-        return replace(plan_astar(problem_of(trained, *query)), planner="draft")
+    def draft(problem):
+        return replace(plan_astar(problem), planner="draft")
 
     def show_a_draft(x_m, number):
         want(picker, x_m, 0.03, number)
@@ -226,12 +226,12 @@ def test_run_waits_for_the_plan_of_the_goal_that_is_shown(make_picker, trained):
     """Two clicks and Run, faster than the planner: the plan of the second click is executed."""
     began = []
 
-    def slow(*query):
-        began.append(query[2].xy_m)
+    def slow(problem):
+        began.append(problem.goal.xy_m)
         time.sleep(0.3)
-        return plan_astar(problem_of(trained, *query))
+        return plan_astar(problem)
 
-    picker = make_picker(draft=lambda *query: plan_astar(problem_of(trained, *query)))
+    picker = make_picker(draft=plan_astar)
     picker.planners["A*"] = slow
     want(picker, 0.08, 0.03, 1)
     wait_until(lambda: began)
@@ -355,7 +355,7 @@ def test_a_goal_picked_while_an_open_loop_runs_is_planned_for_when_it_ends(make_
         want(picker, -0.05, 0.1, 1)
         return open_loop(world, plan, planner, report)
 
-    picker = make_picker(executors={"open loop": executor})
+    picker = make_picker(executor=executor)
     picker._view._handle_custom_msg({"press": "run"}, [])
     in_time(in_time(picker))
     assert picker.plan.goal.xy_m == drawn_goal(picker) == (-0.05, 0.1)
@@ -375,10 +375,10 @@ def test_a_disturbance_waits_for_the_end_of_the_action(make_picker, world):
         assert world.object_pose() == before
         goal = report()
         seen.append((before, world.object_pose(), goal))
-        plan = planner(world.depth_image(), world.object_pose()[:2], goal)
+        plan = planner(picker.skills.problem(world.depth_image(), world.object_pose()[:2], goal))
         return open_loop(world, plan, planner, report)
 
-    picker = make_picker(executors={"mine": executor}, seed=3)
+    picker = make_picker(executor=executor, seed=3)
     first_goal = picker.plan.goal
     picker.run()
     (before, after, goal) = seen[0]
@@ -403,10 +403,9 @@ def test_disturbances_are_seeded_and_planned_for(make_picker, world):
 
 
 @pytest.mark.slow
-def test_a_closed_loop_replans_with_the_chosen_planner_for_a_goal_that_moves(make_picker, trained):
-    skills, shown = Skills({"push": trained}), []
-    picker = make_picker(executors={"closed loop": closed_loop(skills)}, seed=5)
-    picker.planners["A*"] = skills.planner(plan_astar)
+def test_a_closed_loop_replans_with_the_chosen_planner_for_a_goal_that_moves(make_picker):
+    shown, picker = [], make_picker(seed=5)
+    picker.controls.executor.value = "closed loop"
     picker.pick(0.2, 0.0)
     picker._view.observe(lambda change: shown.append(change["new"]), names="scene")
     picker._disturbances += [picker._move_goal, picker._shove]  # as if requested meanwhile
@@ -419,19 +418,14 @@ def test_a_closed_loop_replans_with_the_chosen_planner_for_a_goal_that_moves(mak
     assert picker.outcome.distance_m == goal.distance_m(picker.world.object_pose()[:2]) < 0.01
 
 
-def test_a_planner_that_does_not_know_the_arm_gives_way_and_it_is_said(make_picker, trained):
-    picker = make_picker(executors={"closed loop": closed_loop(Skills({"push": trained}))})
-    picker.run()
-    assert picker.plan.planner == "continuous"
-    assert "replanned by continuous search" in picker.controls.words.value
-
-
 def test_after_a_failed_run_the_next_plan_is_from_where_it_ended(make_picker):
     def fails(world, plan, planner, report):
         execute_plan(world, replace(plan, steps=plan.steps[:1]))
         raise ValueError("the arm is stuck")
 
-    picker = make_picker(executors={"fails": fails, "open loop": open_loop})
+    picker = make_picker()
+    picker.executors["closed loop"] = fails
+    picker.controls.executor.value = "closed loop"
     picker.pick(0.2, 0.0)
     with pytest.raises(ValueError, match="stuck"):
         picker.run()
