@@ -1,5 +1,6 @@
 # Everything runs with the Python of .venv, whatever else is active or registered.
 # Options are given on the command line (make workbook PROFILE=smoke), never by the environment.
+# For those that say yes or no, 0 means no.
 
 PYTHON  = python3.11
 PROFILE = reader
@@ -13,6 +14,7 @@ DRY_RUN =
 SEEDS   = 0 1 2
 WORKERS = 2
 JOBS    = 2
+INDEX   =
 
 PY     := .venv/bin/python
 STAMP  := .venv/.installed
@@ -25,13 +27,22 @@ SHELL         := /bin/bash
 .SHELLFLAGS   := -eu -o pipefail -c
 .DEFAULT_GOAL := help
 MAKEFLAGS     += --no-print-directory
+# What seems to come from the future (unpacked in another time zone) would never be older.
+$(shell find Makefile $(INPUTS) affordlib experiments notebooks data -newermt now -exec touch -c {} + 2>/dev/null)
 .SUFFIXES:
 
-export PROFILE SEED SEEDS WORKERS OUT ONLY ARGS
+yes = $(filter-out 0 no false,$(1))
+
+export PROFILE SEED SEEDS WORKERS OUT ONLY ARGS FORCE JOBS INDEX
+override FORCE   := $(call yes,$(FORCE))
+override KEEP    := $(call yes,$(KEEP))
+override DRY_RUN := $(call yes,$(DRY_RUN))
+export PYTHONUTF8 := 1
 # OpenMP's idle threads spin for milliseconds, which makes PyTorch seven times slower beside other
 # work. A tenth of that costs a fifth of the speed of a machine that has nothing else to do.
 export GOMP_SPINCOUNT := 20000
-unexport PYTHONPATH PYTHONHOME PYTHONSTARTUP VIRTUAL_ENV MPLBACKEND
+unexport PYTHONPATH PYTHONHOME PYTHONSTARTUP PYTHONIOENCODING PYTHONWARNINGS VIRTUAL_ENV
+unexport MPLBACKEND MATPLOTLIBRC
 unexport PIP_USER PIP_TARGET PIP_PREFIX PIP_REQUIREMENT PIP_CONSTRAINT
 unexport PYTEST_ADDOPTS JUPYTER_PATH JUPYTER_TOKEN
 
@@ -46,61 +57,86 @@ setup: $(STAMP) ## Make .venv and install everything into it (PYTHON=python3.11)
 
 # The stamp is written last and holds the folder. Without it (never finished) or with another
 # folder in it (moved) the environment is made again; otherwise pip brings it up to date. A second
-# make waits for the first, and then has nothing to do.
+# make waits for the first, and then has nothing to do. An environment that uv made, uv keeps.
 ifneq ($(shell cat $(STAMP) 2>/dev/null),$(CURDIR))
 .PHONY: $(STAMP)
 endif
 
 $(STAMP): $(INPUTS)
-	@[[ "$$("$(PYTHON)" -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null)" == 3.11 ]] \
-	  || { echo "This workbook needs Python 3.11, and '$(PYTHON)' is $$("$(PYTHON)" -c 'import sys; print("Python " + sys.version.split()[0])' 2>/dev/null || echo 'no Python that runs here')." \
-	            "Install it, or name it: make setup PYTHON=/path/to/python3.11" >&2; exit 1; }
+	@[[ "$$(uname -sm)" == "Linux x86_64" ]] \
+	  || { echo "This workbook needs Linux on x86-64: PyBullet has no wheel for $$(uname -sm). A container (Dockerfile) or, on Windows, WSL is one." >&2; exit 1; }
+	@grep -qs '^uv = ' .venv/pyvenv.cfg || [[ "$$("$(PYTHON)" -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null)" == 3.11 ]] \
+	  || { echo "This workbook needs Python 3.11, as PyBullet has no wheel for a later one, and '$(PYTHON)' is $$("$(PYTHON)" -c 'import sys; print("Python " + sys.version.split()[0])' 2>/dev/null || echo 'no Python that runs here')." \
+	            "Install it (your system's python3.11-venv, 'uv python install 3.11' or 'conda create -n py311 python=3.11'), or name it: make setup PYTHON=/path/to/python3.11" >&2; exit 1; }
 	@exec 9< Makefile; flock 9; \
-	 if [[ "$$(cat $@ 2>/dev/null)" != "$(CURDIR)" ]]; then \
-	   [[ ! -L .venv ]] || { echo "'.venv' is a link to $$(readlink .venv), which would be emptied; remove the link" >&2; exit 1; }; \
-	   echo "Making .venv (a few minutes, once)"; "$(PYTHON)" -m venv --clear .venv; \
-	 elif [[ -n "$$(find $(INPUTS) -newer $@)" ]]; then \
-	   echo "Bringing .venv up to date"; rm $@; \
+	 if [[ "$$(cat $@ 2>/dev/null)" == "$(CURDIR)" && -z "$$(find $(INPUTS) -newer $@)" ]]; then exit 0; fi; \
+	 quietly() { "$$@" > .venv/install.log 2>&1 || { tail -n 25 .venv/install.log >&2; exit 1; }; }; \
+	 if grep -qs '^uv = ' .venv/pyvenv.cfg; then \
+	   rm -f $@; uv sync $(if $(INDEX),--index "$$INDEX" --index-strategy unsafe-best-match); \
 	 else \
-	   exit 0; \
+	   if [[ "$$(cat $@ 2>/dev/null)" != "$(CURDIR)" ]]; then \
+	     [[ ! -L .venv ]] || { echo "'.venv' is a link to $$(readlink .venv), which would be emptied; remove the link" >&2; exit 1; }; \
+	     echo "Making .venv (a few minutes, once)"; "$(PYTHON)" -m venv --clear .venv; \
+	   else \
+	     echo "Bringing .venv up to date"; rm $@; \
+	   fi; \
+	   quietly $(PY) -m pip install --progress-bar off --disable-pip-version-check $(if $(INDEX),--extra-index-url "$$INDEX") -c constraints.txt -r requirements.txt; \
+	   quietly $(PY) -m pip install --disable-pip-version-check --no-deps --no-build-isolation -e .; \
 	 fi; \
-	 $(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -r requirements.txt; \
-	 $(PY) -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .; \
 	 mkdir -p .venv/share/jupyter/lab/settings; \
 	 echo '$(QUIET)' > .venv/share/jupyter/lab/settings/overrides.json; \
 	 printf '%s' "$(CURDIR)" > $@
 
-# Two notebooks in parallel with one thread each finish earlier than in sequence with two threads.
-workbook: $(STAMP) ## Run all notebooks into runs/, two in parallel (PROFILE=smoke|reader|full WORKERS= SEED= OUT= ONLY= ARGS= DRY_RUN=1)
-	@set -f; $(if $(filter-out 1,$(WORKERS)),OMP_NUM_THREADS=1) $(PY) -m affordlib.workbook --workers "$$WORKERS" --profile "$${PROFILE:-reader}" --seed "$${SEED:-0}" \
-	  --out "$$OUT" --only "$$ONLY" $(if $(FORCE),--force) $(if $(DRY_RUN),--dry-run) -- $$ARGS
+# One page for each goal below RUN. Several pages at a time, with one thread each, finish earlier
+# than one after the other with several threads. Whatever is killed ends what it has started.
+LEASH := setpriv --pdeathsig TERM
 
-seeds: $(STAMP) ## Run all notebooks for several seeds, and write tables over seeds (SEEDS="0 1 2" WORKERS=2 …)
-	@set -f; $(PY) -m experiments.seeds $$SEEDS --workers "$$WORKERS" \
-	  --profile "$${PROFILE:-reader}" --out "$$OUT" --only "$$ONLY" $(if $(FORCE),--force) $(if $(DRY_RUN),--dry-run) \
-	  --settings $$ARGS
+workbook: $(STAMP) ## Run all pages into runs/, two at a time (PROFILE=smoke|reader|full WORKERS= SEED= OUT= ONLY= ARGS= FORCE=1 DRY_RUN=1)
+notebooks: $(STAMP) ## Execute the committed pages in place and clean their metadata (ONLY= FORCE=1)
+notebooks: export IN_PLACE := 1
+workbook notebooks:
+	@set -f; goals=$$($(PY) notebooks/run.py); run=$${goals%% *}; \
+	 [[ "$$WORKERS" =~ ^[1-9][0-9]?$$ ]] || { echo "WORKERS must be a whole number from 1 to 99" >&2; exit 1; }; \
+	 $(if $(DRY_RUN),,mkdir -p "$$run"; exec 9>> "$$run/.lock"; flock -n 9 || { echo "Another run is writing to $$run; wait for it, or choose another name with OUT=" >&2; exit 1; };) \
+	 exec $(LEASH) $(MAKE) $(if $(DRY_RUN),-n) $(if $(findstring jobserver,$(MAKEFLAGS)),,-j"$$WORKERS") RUN="$$run" $${goals#* }
 
-lab: $(STAMP) ## Open the book in JupyterLab, on this machine only
-	@root=; [[ $$(id -u) == 0 ]] && root=--allow-root; \
+ifdef RUN
+# Copies of results are no input. A name with a blank, which make cannot express, is not ours.
+USED := $(STAMP) $(wildcard notebooks/*.py) $(shell find affordlib experiments notebooks/exercises data -type f \
+  ! -path '*/.*' ! -path '*/__pycache__/*' ! -path 'data/results/[0-9][0-9]_*' ! -path '* *')
+define PAGES
+$(RUN)/%.ipynb $(RUN)/%.json: $(1)/%.ipynb $(USED)
+	@$(if $(filter-out 1,$(WORKERS)),OMP_NUM_THREADS=1) exec $(LEASH) $(PY) notebooks/run.py "$$<" "$$(@D)/$$*.ipynb"
+endef
+$(foreach folder,notebooks notebooks/appendix,$(eval $(call PAGES,$(folder))))
+endif
+
+seeds: $(STAMP) ## Run all pages for several seeds, and write tables over seeds (SEEDS="0 1 2" …)
+	@set -f; name="$${OUT:-$$PROFILE}"; \
+	 for seed in $$SEEDS; do $(LEASH) $(MAKE) workbook SEED="$$seed" OUT="$$name-seed$$seed"; done; \
+	 $(if $(DRY_RUN),,exec $(LEASH) $(PY) -m experiments.seeds "runs/$$name" $$SEEDS)
+
+lab: $(STAMP) ## Open the book in JupyterLab, on this machine only (ARGS="--port 9999 --no-browser")
+	@set -f; root=; [[ $$(id -u) == 0 ]] && root=--allow-root; \
 	  JUPYTER_PREFER_ENV_PATH=1 $(PY) -m jupyterlab --ip=127.0.0.1 $$root \
-	  --ServerApp.root_dir="$(CURDIR)" --LabApp.default_url=/lab/tree/notebooks/00_start_here.ipynb
+	  --ServerApp.root_dir="$(CURDIR)" --LabApp.default_url=/lab/tree/notebooks/00_start_here.ipynb $$ARGS
 
 # One thread, because tests compute many small operations and share the machine with a browser.
 test test-fast test-plain: export OMP_NUM_THREADS := 1
 
 test: $(STAMP) ## Run all tests, including the notebooks (JOBS=2 in parallel)
-	@$(PY) -m pytest -n "$(JOBS)" --dist loadfile --no-loadscope-reorder --durations=15
+	@$(PY) -m pytest -n "$$JOBS" --dist loadfile --no-loadscope-reorder --durations=15
 
 test-fast: $(STAMP) ## Run only the fast tests, without the notebooks
-	@$(PY) -m pytest -n "$(JOBS)" --dist worksteal -m "not slow"
+	@$(PY) -m pytest -n "$$JOBS" --dist worksteal -m "not slow"
 
 test-plain: $(STAMP) ## Run the fast tests without vector instructions, as on another processor
 	@ATEN_CPU_CAPABILITY=default $(if $(filter x86_64,$(shell uname -m)),OPENBLAS_CORETYPE=Nehalem) \
 	  NPY_DISABLE_CPU_FEATURES="$$($(PY) -c 'import numpy._core._multiarray_umath as m; print(*(f for f in m.__cpu_dispatch__ if m.__cpu_features__[f]))')" \
-	  $(PY) -m pytest -n "$(JOBS)" --dist worksteal -m "not slow"
+	  $(PY) -m pytest -n "$$JOBS" --dist worksteal -m "not slow"
 
 test-slow: $(STAMP) ## Run every notebook and solution as a reader does; the log is runs/test-slow.log
-	@mkdir -p runs; { $(PY) -m affordlib.workbook --profile reader --out test-slow --force; \
+	@mkdir -p runs; { $(LEASH) $(MAKE) workbook PROFILE=reader OUT=test-slow FORCE=1; \
 	  $(PY) -m pytest tests/test_exercises.py tests/show/test_browser*.py; } 2>&1 | tee runs/test-slow.log
 
 soak: $(STAMP) ## Plan and execute 3,000 times; check that memory and results stay the same (15 min)
@@ -110,7 +146,7 @@ size: $(STAMP) ## Count lines and files, and fail if they exceed the budgets
 	@$(PY) -m tests.size
 
 book-check: $(STAMP) ## Measure every page of the book, and fail if one violates the style
-	@$(PY) -m tests.book_check
+	@PYTHONPATH=notebooks $(PY) -m tests.book_check
 
 lint: $(STAMP) ## Check style and formatting
 	@$(PY) -m ruff check
@@ -128,10 +164,7 @@ data: $(STAMP) ## Collect the shipped data sets again and compare them with the 
 
 checkpoints: $(STAMP) ## Train the shipped models again (ONLY="film_500")
 	@$(if $(ONLY),,$(PY) -m experiments.shipped reachability)
-	@$(PY) -m experiments.shipped checkpoints $(if $(ONLY),--only $(ONLY))
-
-notebooks: $(STAMP) ## Execute the committed notebooks in place and clean their metadata (ONLY= FORCE=1)
-	@$(PY) -m affordlib.workbook --in-place --only "$$ONLY" $(if $(FORCE),--force)
+	@set -f; $(PY) -m experiments.shipped checkpoints $(if $(ONLY),--only $$ONLY)
 
 html: $(STAMP) ## Write the book as web pages into runs/html, readable offline: open index.html
 	@rm -rf runs/html.new runs/jupyter_execute

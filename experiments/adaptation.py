@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 import torch
 
-from affordlib.commands import command
+from experiments.commands import command
 from affordlib.geometry import rotated
 from affordlib.interactions.recipes import Variation
 from affordlib.models.checkpoint import load_checkpoint

@@ -24,7 +24,7 @@ import numpy as np
 import pandas as pd
 from scipy.spatial import ConvexHull
 
-from affordlib.commands import command
+from experiments.commands import command
 from affordlib.geometry import wrap_angle
 from affordlib.interactions.recipes import Variation
 from affordlib.models import load_checkpoint

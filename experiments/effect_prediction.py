@@ -19,8 +19,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from affordlib.commands import command
 from experiments import reported, runner, studies
+from experiments.commands import command
 from experiments.cross_validation import (
     LARGE,
     MODELS,

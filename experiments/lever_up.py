@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from affordlib.commands import command
 from affordlib.models.lever_up import PROTOCOLS
 from experiments import reported, runner, studies
+from experiments.commands import command
 from experiments.lever_cross_validation import (
     DATA,
     MODELS,

@@ -23,13 +23,13 @@ import pandas as pd
 import torch
 from scipy.stats import sem
 
-from affordlib.commands import command, count_type
 from affordlib.interactions import Scaler
 from affordlib.models import CNPConfig, build
 from affordlib.models.base import NetworkConfig, gaussian_nll
 from affordlib.results import write_results
 from affordlib.types import Observations
 from experiments.attention import AttentionConfig
+from experiments.commands import command, count_type
 
 BATCH, MAX_OBSERVED, TARGETS, JUDGED = 16, 10, 50, 1600
 LENGTH, NOISE, RANGE = 0.25, 0.05, 2.0

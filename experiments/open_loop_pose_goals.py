@@ -14,7 +14,6 @@ from typing import Any
 
 import pandas as pd
 
-from affordlib.commands import command
 from affordlib.geometry import wrap_angle
 from affordlib.planning import execute_plan, plan_astar, plan_continuous
 from affordlib.planning.skills import CHECKPOINTS
@@ -28,6 +27,7 @@ from experiments.closed_loop import (
     sample_trial,
     tabletop_and_skills,
 )
+from experiments.commands import command
 from experiments.runner import FOLDER, Job, Rows, plain
 
 NAME = "open_loop_pose_goals"

@@ -16,7 +16,6 @@ from pathlib import Path
 
 import numpy as np
 
-from affordlib.commands import command
 from affordlib.geometry import rotated, unit_vector
 from affordlib.interactions.log import Log, PushLog
 from affordlib.models.fit import fit
@@ -26,6 +25,7 @@ from affordlib.results import write_results
 from affordlib.types import UnreachableError
 from affordlib.world import Prism, Tabletop, WorldConfig
 from affordlib.world.robot import ROD_WIDTH_M
+from experiments.commands import command
 from experiments.pose_goals import Remembered, attempt, summary
 from experiments.real_pushes import pushes_of
 

@@ -25,7 +25,7 @@ import pandas as pd
 import torch
 from tqdm.auto import tqdm
 
-from affordlib.commands import command
+from experiments.commands import command
 from affordlib.models.checkpoint import load_checkpoint
 from affordlib.models.predictions import error_row
 from affordlib.models.protocol import EffectModel

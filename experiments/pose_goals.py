@@ -20,7 +20,6 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from affordlib.commands import command
 from affordlib.geometry import rotated, wrap_angle
 from affordlib.interactions.log import PushLog
 from affordlib.models.fit import PushModel, in_object_frame, push_rows, told_feet
@@ -38,6 +37,7 @@ from affordlib.world import Cuboid, Prism, Tabletop, TabletopObject, WorldConfig
 from affordlib.world.execution import execute
 from affordlib.world.robot import ROD_WIDTH_M
 from affordlib.world.trajectory import Command
+from experiments.commands import command
 
 N_PARTS, N_OBJECTS, N_PUSHES, TRAINING = 2, 40, 12, (1500, 5e-4, 32)
 HEIGHTS_M = 0.04, 0.06

@@ -17,7 +17,6 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from affordlib.commands import command, whole_type
 from affordlib.geometry import cross
 from affordlib.models.neural_process import (
     FEET,
@@ -31,6 +30,7 @@ from affordlib.models.neural_process import (
 )
 from affordlib.models.quasi_static import quarter_turn, quasi_static_push
 from affordlib.paths import repo_root
+from experiments.commands import command, whole_type
 
 PUSHES, CHUNK = 48, 64
 _SHORT, _LONG = 0.12, 0.9

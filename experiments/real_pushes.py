@@ -22,12 +22,12 @@ from unittest import mock
 import numpy as np
 import pandas as pd
 
-from affordlib.commands import command
 from affordlib.evaluation.cross_validate import BASELINES, errors_of, forecast_errors, summary
 from affordlib.interactions.log import Log, PushLog
 from affordlib.models.fit import EFFORT, MODELS, fit, folds_of, gyration_radius_m
 from affordlib.models.neural_process import PRETRAINED
 from experiments import runner
+from experiments.commands import command
 from experiments.runner import FOLDER, Job, Rows, frame, interval, read, run
 
 TABLE = "real_pushes"

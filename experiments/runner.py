@@ -34,7 +34,6 @@ from filelock import FileLock
 from scipy.stats import bootstrap
 from tqdm.auto import tqdm
 
-from affordlib.commands import count_type
 from affordlib.interactions import open_interactions
 from affordlib.interactions.store import stored_sha256
 from affordlib.models.checkpoint import NOVELTY
@@ -43,6 +42,7 @@ from affordlib.planning.reachability import SHIPPED as REACHABILITY
 from affordlib.results import write_atomically, write_results
 from affordlib.weights import read_weights, resolve_checkpoint, weights_sha256
 from affordlib.workers import dask_client
+from experiments.commands import worker_type
 
 FOLDER = "data/results/raw"
 WRITE_EVERY_S = 30
@@ -208,7 +208,7 @@ def parser(table: str, description: str | None) -> argparse.ArgumentParser:
     only = "run only jobs with these arguments, such as fold=0,1"
     shared.add_argument("--only", nargs="+", default=[], metavar="NAME=VALUE,…", help=only)
     shared.add_argument("--scheduler", help="address of a Dask scheduler")
-    shared.add_argument("--workers", type=count_type, default=1, help="processes on this machine")
+    shared.add_argument("--workers", type=worker_type, default=1, help="processes on this machine")
     return shared
 
 
@@ -226,7 +226,8 @@ def make(
             there = ", ".join(sorted(known))
             raise ValueError(f"--only: no job has {name} = {unknown[0]!r:.40}, but {there}")
         jobs = [job for job in jobs if str(job.arguments.get(name)) in values]
-    with dask_client(options.workers, options.scheduler) as client:
+    workers = min(options.workers, max(1, len(jobs)))
+    with dask_client(workers, options.scheduler) as client:
         run(jobs, table, client, options.raw)
     if tables is not None:
         print(write_results(options.out, table, {}, tables(options.raw)))

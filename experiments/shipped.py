@@ -22,7 +22,7 @@ import torch
 import xarray as xr
 from torch import nn
 
-from affordlib.commands import command, count_type
+from experiments.commands import command, worker_type
 from affordlib.interactions import (
     InteractionTensors,
     Scaler,
@@ -361,8 +361,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     data, checkpoints = commands["data"], commands["checkpoints"]
     data.add_argument("--only", nargs="+", choices=sorted(RECIPES), help="default: shipped sets")
     data.add_argument("--to", default=str(repo_root() / "data"), help="output folder")
-    cores = os.cpu_count() or 1
-    data.add_argument("--workers", type=count_type, default=cores, help="local processes")
+    cores = min(os.cpu_count() or 1, 256)
+    data.add_argument("--workers", type=worker_type, default=cores, help="local processes")
     data.add_argument("--scheduler", help="address of a Dask scheduler to use instead: tcp://…")
     names = sorted([*CHECKPOINT_SPECS, *LEVER_CHECKPOINTS])
     checkpoints.add_argument("--only", nargs="+", choices=names, help="default: all")

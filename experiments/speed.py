@@ -26,7 +26,7 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from affordlib import models
-from affordlib.commands import command
+from experiments.commands import command
 from affordlib.interactions import (
     InteractionTensors,
     Scaler,

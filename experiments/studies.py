@@ -14,8 +14,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from affordlib.commands import command
 from experiments import runner
+from experiments.commands import command
 from experiments.runner import FOLDER, STUDIES, Job, Rows, read
 
 NAME = "studies"

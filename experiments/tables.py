@@ -22,7 +22,6 @@ from typing import Any
 
 import pandas as pd
 
-from affordlib.commands import command
 from affordlib.results import (
     cell,
     columns_of,
@@ -31,6 +30,7 @@ from affordlib.results import (
     results_table,
     write_atomically,
 )
+from experiments.commands import command
 
 MARKUP = str.maketrans({"&": "&amp;", "<": "&lt;", ">": "&gt;", "[": "&#91;", "|": "\\|"})
 """For `str.translate`: escapes characters that are markup in Markdown or HTML."""

@@ -10,9 +10,9 @@ import sys
 from pathlib import Path
 
 import nbformat
+from pages import PAGES
 
 from affordlib.paths import repo_root
-from affordlib.workbook import notebook_paths
 
 ROOT = repo_root()
 TEXTS = {"README.md": 800, "RESULTS.md": 2300, "CONTRIBUTING.md": 2000, "data/README.md": 2000}
@@ -114,7 +114,7 @@ def faults(path: Path, text: str) -> list[str]:
 def check() -> tuple[dict[str, dict[str, int]], list[str]]:
     """Measure every page and list the faults."""
     measures, wrong = {}, []
-    for name, path in notebook_paths(ROOT).items():
+    for name, path in PAGES.items():
         notebook = nbformat.read(path, as_version=4)
         found = measures[name] = measure(notebook)
         most = LIMITS | NOT_YET.get(name, {})

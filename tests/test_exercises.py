@@ -5,13 +5,12 @@ from dataclasses import replace
 import nbformat
 import numpy as np
 import pytest
+from pages import PAGES as PATHS
 
 from affordlib.paths import repo_root
-from affordlib.workbook import notebook_paths
 from exercises import EXERCISES, check
 
 NOTEBOOKS = repo_root() / "notebooks"
-PATHS = notebook_paths(repo_root())
 SOLUTIONS = sorted((NOTEBOOKS / "solutions").glob("*.py"))
 ASKED = {name[:2] for name in EXERCISES}
 

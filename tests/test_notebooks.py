@@ -13,15 +13,15 @@ import numpy as np
 import papermill
 import pytest
 from IPython.core.inputtransformer2 import TransformerManager
+from pages import PAGES as PATHS
+from pages import WIDGET, cleaned, parameters_of_pages
 
 from affordlib.paths import repo_root
 from affordlib.results import read_results, results_table
 from affordlib.show import GOAL, PREDICTION, TRUTH
-from affordlib.workbook import WIDGET, cleaned, default_parameters, make_jobs, notebook_paths
 from tests import book_check
 
 ROOT = repo_root()
-PATHS = notebook_paths(ROOT)
 RESULTS = ROOT / "data" / "results"
 PROFILES = ("smoke", "reader", "full")
 BROKEN = ROOT / "tests" / "broken.ipynb"
@@ -35,6 +35,16 @@ each_notebook = pytest.mark.parametrize("name", list(PATHS))
 
 def read(name):
     return nbformat.read(PATHS[name], as_version=4)
+
+
+def default_parameters(name):
+    told = papermill.inspect_notebook(str(PATHS[name])).items()
+    return {parameter: ast.literal_eval(one["default"]) for parameter, one in told}
+
+
+def parameters(profile, seed=0):
+    options = {"PROFILE": profile, "SEED": str(seed), "OUT": "", "ARGS": ""}
+    return parameters_of_pages(options)
 
 
 def code_of(notebook):
@@ -53,7 +63,7 @@ def test_title(name):
 
 @each_notebook
 def test_parameters(name):
-    defaults = default_parameters(read(name), name)
+    defaults = default_parameters(name)
     assert defaults["seed"] == 0
     assert defaults["out_dir"] == "runs/lab"
     told = papermill.inspect_notebook(str(PATHS[name])).values()
@@ -95,12 +105,12 @@ def test_every_parameter_is_used(name):
     code = [TransformerManager().transform_cell(cell.source) for cell in cells[at + 1 :]]
     nodes = [node for c in code for node in ast.walk(WithoutNotes().visit(ast.parse(c)))]
     names = {n.id for n in nodes if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Load)}
-    assert not default_parameters(read(name), name).keys() - names
+    assert not default_parameters(name).keys() - names
 
 
 @pytest.mark.parametrize("profile", PROFILES)
 def test_every_value_of_a_profile_is_a_parameter_of_its_type(profile):
-    assert [job.name for job in make_jobs(ROOT, profile)] == list(PATHS)
+    assert parameters(profile).keys() == PATHS.keys()
 
 
 @each_notebook
@@ -141,7 +151,7 @@ def last_value(source, space):
 def test_stored_results_are_shown_as_they_are_now(name):
     notebook = read(name)
     space = {"np": np, "read_results": read_results, "results_table": results_table}
-    space |= default_parameters(notebook, name)
+    space |= default_parameters(name)
     compared = 0
     for cell in code_of(notebook):
         if not ("results_table(" in cell.source or "read_results(" in cell.source):
@@ -286,16 +296,16 @@ def run_with_nbval(copy):
 def smoke(tmp_path_factory):
     """The folder of one shared run: later notebooks may read files of earlier ones."""
     folder = tmp_path_factory.mktemp("smoke")
-    return folder, {job.name: job for job in make_jobs(ROOT, "smoke", seed=1)}
+    return folder, parameters("smoke", seed=1)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
 @each_notebook
 def test_run(name, smoke):
-    folder, jobs = smoke
-    own = {"out_dir": str(folder)}
-    copy = prepare(PATHS[name], jobs[name].overrides | own, folder)
+    folder, chosen = smoke
+    given = chosen[name] | {"out_dir": str(folder)}
+    copy = prepare(PATHS[name], given, folder)
     append_solutions(copy)
     done = run_with_nbval(copy)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -306,7 +316,7 @@ def test_run(name, smoke):
     others = [path for path in RESULTS.glob("*.json") if path.stem != name]
     committed = [read_results(path)["tables"].values() for path in others]
     assert not [t for t, rows in document["tables"].items() if any(rows in of for of in committed)]
-    given = jobs[name].parameters | own
+    given = default_parameters(name) | given
     assert {k: v for k, v in document["parameters"].items() if k in given}.items() <= given.items()
 
 

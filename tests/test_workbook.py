@@ -1,4 +1,4 @@
-"""The batch runner on tiny books: what is executed, skipped or refused, and what is kept."""
+"""`make workbook` on tiny books: what is executed, refused or stopped, and what is kept."""
 
 import json
 import os
@@ -7,51 +7,58 @@ import shutil
 import signal
 import subprocess
 import sys
-from functools import partial
+import time
 
 import nbformat
 import psutil
 import pytest
-from filelock import FileLock
+from pages import cleaned, parameters_of_pages
 
-from affordlib.results import read_results, write_results
-from affordlib.workbook import WorkbookError, cleaned, default_parameters, fitting, literal, main
+from affordlib.paths import repo_root
+from affordlib.results import read_results
 from tests.waiting import wait_until
 
-PARAMETERS = "seed = 0\nout_dir = {lab!r}\nn = 2\nrate = 0.5\nmodes = ['full']"
-# A notebook of these books writes its results by hand, to spare the import of pandas.
+ROOT = repo_root()
+PARAMETERS = "seed: int = 0  # of all\nout_dir: str = 'runs/lab'  # for results\nn: int = 2  # a\n"
+# A page of these books writes its results by hand, to spare the import of pandas.
 WRITE = """\
 import json, os, pathlib, sys
-folder = pathlib.Path(out_dir)
+folder = pathlib.Path("..", out_dir)
 folder.mkdir(parents=True, exist_ok=True)
 with (folder / "log.txt").open("a") as log:
     log.write("{name}\\n")
-parameters = dict(n=n, rate=rate, seed=seed, python=sys.executable, cwd=os.getcwd())
+parameters = dict(n=n, seed=seed, python=sys.executable, cwd=os.getcwd())
 parameters["backend"] = os.environ["MPLBACKEND"]
 document = dict(notebook="{name}", parameters=parameters, versions={{}}, tables={{}})
 (folder / "{name}.json").write_text(json.dumps(document))
-print(n * rate)"""
+print(n / 2)"""
+
+pytestmark = pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
 
 
 class Book:
-    """A small workbook in a temporary folder, with the functions to inspect it."""
+    """A small workbook with an environment that is this one, in a folder with a blank."""
 
     def __init__(self, root):
-        self.root, self.runs, self.data = root, root / "runs", root / "data"
-        for folder in ("notebooks/profiles", "affordlib", "data"):
-            (root / folder).mkdir(parents=True)
-        (root / "affordlib" / "model.py").write_text("a = 1\n")
-        (self.data / "push.bin").write_bytes(b"\1\2")
-        self.profile("reader", "{}")
+        self.root = root / "a bücher"
+        for folder in ("notebooks/profiles", "notebooks/appendix", "affordlib", "data/results"):
+            (self.root / folder).mkdir(parents=True)
+        for name in ("Makefile", "notebooks/run.py", "notebooks/pages.py"):
+            shutil.copy(ROOT / name, self.root / name)
+        for name in ("requirements.txt", "constraints.txt", "pyproject.toml"):
+            (self.root / name).touch()
+        (self.root / "notebooks/profiles/reader.yaml").write_text("{}")
+        python = self.root / ".venv" / "bin" / "python"
+        python.parent.mkdir(parents=True)
+        python.write_text(f'#!/bin/sh\nPYTHONPATH="{ROOT}" exec "{sys.executable}" "$@"\n')
+        python.chmod(0o755)
+        (self.root / ".venv" / ".installed").write_text(str(self.root))
+        self.runs = self.root / "runs"
 
-    def profile(self, name, text):
-        (self.root / "notebooks" / "profiles" / f"{name}.yaml").write_text(text)
-
-    def add(self, name, *code, text="Some words."):
+    def add(self, name, *code):
         new = nbformat.v4
-        parameters = new.new_code_cell(PARAMETERS.format(lab=str(self.runs / "lab")))
-        parameters.metadata["tags"] = ["parameters"]
-        cells = [new.new_markdown_cell(f"# {name}\n\n{text}"), parameters]
+        parameters = new.new_code_cell(PARAMETERS, metadata={"tags": ["parameters"]})
+        cells = [new.new_markdown_cell(f"# {name}"), parameters]
         cells += [new.new_code_cell(source) for source in (*code, WRITE.format(name=name))]
         for number, cell in enumerate(cells):
             cell.id = f"cell-{number}"
@@ -60,19 +67,31 @@ class Book:
     def path(self, name):
         return self.root / "notebooks" / f"{name}.ipynb"
 
-    def run(self, *arguments):
-        return main([*map(str, arguments)], self.root)
+    def start(self, *options, target="workbook", **environment):
+        inherited = {k: v for k, v in os.environ.items() if "MAKE" not in k}
+        return subprocess.Popen(
+            ["make", target, *options],
+            cwd=self.root,
+            env=inherited | environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            start_new_session=True,
+        )
+
+    def make(self, *options, **more):
+        process = self.start(*options, **more)
+        said = process.communicate(timeout=300)[0]
+        return process.returncode, said
 
     def log(self, run="reader"):
         path = self.runs / run / "log.txt"
         return path.read_text().split() if path.exists() else []
 
-    def command(self, *arguments):
-        code = (
-            "import sys, pathlib; from affordlib.workbook import main; "
-            f"sys.exit(main({[*arguments]!r}, pathlib.Path({str(self.root)!r})))"
-        )
-        return [sys.executable, "-c", code]
+    def processes(self):
+        """Processes that work here: make, scripts and kernels."""
+        here = str(self.root)
+        return [p for p in psutil.process_iter(["cwd"]) if (p.info["cwd"] or "").startswith(here)]
 
 
 @pytest.fixture
@@ -82,95 +101,68 @@ def book(tmp_path):
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    """A book of two notebooks, run once, on a machine where another kernel has our name."""
-    root = tmp_path_factory.mktemp("finished")
-    book = Book(root)
+    """A book of two pages, run once, on a machine where another kernel has our name."""
+    book = Book(tmp_path_factory.mktemp("finished"))
     book.add("01_first")
     book.add("02_second")
-    kernel = root / "jupyter" / "kernels" / "python3"
+    kernel = book.root / "jupyter" / "kernels" / "python3"
     kernel.mkdir(parents=True)
     wrong = {"argv": ["/bin/false"], "display_name": "wrong", "language": "python"}
     (kernel / "kernel.json").write_text(json.dumps(wrong))
-    environment = os.environ | {"JUPYTER_PATH": str(root / "jupyter"), "MPLBACKEND": "Agg"}
-    command = book.command("--seed", "3", "02_second.n=7")
-    return book, subprocess.run(
-        command, env=environment, capture_output=True, text=True, cwd=root, check=False
-    )
+    more = {"JUPYTER_PATH": str(book.root / "jupyter"), "PYTHONIOENCODING": "ascii", "LC_ALL": "C"}
+    return book, book.make(*OPTIONS, HOME="/nowhere", **more)
+
+
+OPTIONS = "SEED=3", "ARGS=02_second.n=7"
+RUN = "reader-seed3"
 
 
 def test_a_run_leaves_copies_and_results_with_their_parameters(finished):
-    book, done = finished
-    assert (done.returncode, done.stderr) == (0, "")
-    said = re.sub(r"\d+\.\d s", "1.0 s", done.stdout).splitlines()
-    places = "[1/2] 01_first", "[2/2] 02_second"
-    assert said == [f"{place}{end}" for place in places for end in (" …", ": 1.0 s")]
+    book, (code, said) = finished
+    assert code == 0, said
+    assert re.search(r"01_first …(?s:.*)01_first: \d+\.\d s", said)
     run = book.runs / RUN
     files = {f"{name}.{end}" for name in ("01_first", "02_second") for end in ("ipynb", "json")}
     assert {path.name for path in run.iterdir()} == {*files, ".lock", "log.txt"}
     copy = nbformat.read(run / "02_second.ipynb", as_version=4)
-    assert "3.5\n" in [output.get("text") for output in copy.cells[-1].outputs]  # 7 * 0.5
-    assert not os.path.isabs(copy.metadata.papermill.output_path)
+    assert "3.5\n" in [output.get("text") for output in copy.cells[-1].outputs]  # 7 / 2
+    assert copy.metadata.papermill.output_path == f"runs/{RUN}/02_second.ipynb"
     told = [read_results(run / f"{n}.json")["parameters"] for n in ("01_first", "02_second")]
-    assert [(t["n"], t["rate"], t["seed"]) for t in told] == [(2, 0.5, 3), (7, 0.5, 3)]
+    assert [(t["n"], t["seed"]) for t in told] == [(2, 3), (7, 3)]
     # The kernel is this interpreter, in the notebooks' folder, whatever is registered.
     assert told[0]["python"] == sys.executable
     assert os.path.samefile(told[0]["cwd"], book.root / "notebooks")
     assert told[0]["backend"].endswith("inline")
 
 
-@pytest.fixture
-def changeable(finished, tmp_path):
-    """The finished book, restored after the test."""
-    book, _ = finished
-    shutil.copytree(book.root, tmp_path / "backup")
-    yield book
-    shutil.rmtree(book.root)
-    shutil.copytree(tmp_path / "backup", book.root)
-
-
-def copy_of_results(book, name):
-    """Copy the results of a full run, as for a commit."""
-    (book.data / "results").mkdir()
-    shutil.copy(book.runs / RUN / "01_first.json", book.data / "results" / name)
-
-
-RUN = "reader-seed3"
-DEEP = "[" * 100_000
-
-
 @pytest.mark.parametrize(
     ("change", "first", "second"),
     [
         (lambda book, run: None, False, False),
-        (lambda book, run: book.add("02_second", text="Other words."), False, True),
-        (lambda book, run: book.add("01_first", "extra = 1"), True, True),
-        (lambda book, run: (book.root / "affordlib" / "model.py").write_text("a = 2"), True, True),
-        (lambda book, run: (book.data / "push.bin").write_bytes(b"\1\3"), True, True),
-        (lambda book, run: copy_of_results(book, "01_first.json"), False, False),
-        (lambda book, run: copy_of_results(book, "planning.json"), True, True),
+        (lambda book, run: book.path("02_second").touch(), False, True),
+        (lambda book, run: (book.root / "affordlib" / "model.py").touch(), True, True),
+        (lambda book, run: (book.root / "data/results/01_first.json").touch(), False, False),
+        (lambda book, run: (book.root / "data/results/planning.json").touch(), True, True),
         (lambda book, run: (run / "01_first.json").unlink(), True, False),
-        (lambda book, run: (run / "02_second.json").write_text('{"note'), False, True),
         (lambda book, run: (run / "02_second.ipynb").unlink(), False, True),
-        (lambda book, run: (run / "01_first.ipynb").write_text(DEEP), True, False),
-        (lambda book, run: book.profile("reader", "02_second: {rate: 1}"), False, True),
-        (lambda book, run: book.profile("reader", "01_first: {n: 3}"), True, True),
-        (lambda book, run: book.profile("reader", "01_first: {n: 2, rate: 0.5}"), False, False),
+        (lambda book, run: (run / "01_first.ipynb").write_text("["), True, False),
+        (("SEED=3", "OUT=" + RUN), False, True),
+        ((*OPTIONS, "FORCE=1", "ONLY=02"), False, True),
+        ((*OPTIONS, "FORCE=0"), False, False),
     ],
 )
-def test_a_rerun_does_what_a_change_makes_necessary(changeable, capsys, change, first, second):
-    change(changeable, changeable.runs / RUN)
-    assert changeable.run("--seed", 3, "02_second.n=7", "--dry-run") == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert ["would run" in line for line in lines] == [first, second]
-    assert ["skipped: complete" in line for line in lines] == [not first, not second]
-    assert changeable.log(RUN) == ["01_first", "02_second"]
-
-
-def test_only_runs_what_is_asked_and_force_runs_it_again(changeable, capsys):
-    assert changeable.run("--seed", 3, "02_second.n=7", "--only", "02", "--force") == 0
-    assert changeable.log(RUN) == ["01_first", "02_second", "02_second"]
-    assert changeable.run("--seed", 3, "02_second.n=7", "--dry-run") == 0
-    assert capsys.readouterr().out.count("skipped: complete") == 2
+def test_a_rerun_does_what_a_change_makes_necessary(finished, tmp_path, change, first, second):
+    book, _ = finished
+    shutil.copytree(book.root, tmp_path / "backup")
+    options = change if isinstance(change, tuple) else OPTIONS
+    if callable(change):
+        change(book, book.runs / RUN)
+    said = [book.make(*options, "DRY_RUN=1")[1], book.make("-n", *options)[1]]
+    shutil.rmtree(book.root)
+    shutil.copytree(tmp_path / "backup", book.root)
+    for each in said:
+        found = [f"run.py notebooks/{name}.ipynb" in each for name in ("01_first", "02_second")]
+        assert found == [first, second], each
 
 
 @pytest.mark.slow
@@ -182,178 +174,130 @@ def test_only_runs_what_is_asked_and_force_runs_it_again(changeable, capsys):
         ("out_dir += '/other'", "run the notebook that writes them"),
     ],
 )
-def test_a_failing_notebook_stops_the_batch_and_a_rerun_goes_on(book, capsys, code, error):
+def test_a_failing_page_stops_the_batch_and_a_rerun_goes_on(book, code, error):
     book.add("01_first")
     book.add("02_second", "fine = 1", code)
     book.add("03_third")
-    write_results(book.runs / "reader", "02_second", {}, {})  # an earlier run's must not count
-    assert book.run() == 1
-    out, err = capsys.readouterr()
-    assert re.search(rf"(?s)02_second failed.*{error}", err)
-    assert out.splitlines()[-1] == "[2/3] 02_second: failed"
-    copy = nbformat.read(book.runs / "reader" / "02_second.ipynb", as_version=4)
+    status, said = book.make("WORKERS=1")
+    assert status == 2
+    assert re.search(rf"(?s)02_second failed.*{error}", said), said
+    copy = nbformat.read(book.runs / "reader" / "02_second.failed.ipynb", as_version=4)
     assert code in [cell.source for cell in copy.cells]
     before = book.log()
     assert before[0] == "01_first"
     book.add("02_second", "fine = 1")
-    assert book.run() == 0
-    assert book.log() == [*before, "02_second", "03_third"]
-    assert "[1/3] 01_first: skipped: complete" in capsys.readouterr().out
+    status, said = book.make()
+    assert status == 0, said
+    assert sorted(book.log()) == [*before, "02_second", "03_third"]
+    assert not list(book.runs.rglob("*failed*"))
 
 
 @pytest.mark.slow
-def test_two_notebooks_run_side_by_side(book):
+def test_two_pages_run_side_by_side_and_another_make_waits_outside(book):
     names = "01_first", "02_second"
     for mine, other in (names, names[::-1]):  # each waits for the other to begin
-        touch = f"import pathlib, time\npathlib.Path({str(book.root)!r}, {mine!r}).touch()"
-        wait = f"while not pathlib.Path({str(book.root)!r}, {other!r}).exists(): time.sleep(0.05)"
-        book.add(mine, touch, wait)
-    book.add("03_third", "1 / 0")
-    done = subprocess.run(book.command("--workers", "2"), capture_output=True, text=True)
-    assert done.returncode == 1
-    assert "[3/3] 03_third: failed" in done.stdout
-    assert done.stderr.startswith("workbook: 03_third failed in cell 3")
+        touch = f"import pathlib, time\npathlib.Path({mine!r}).touch()"
+        wait = f"while not (pathlib.Path({other!r}).exists() and pathlib.Path('go').exists()):\n"
+        book.add(mine, touch, wait + "    time.sleep(0.05)")
+    process = book.start()
+    begun = [book.root / "notebooks" / name for name in names]
+    wait_until(lambda: all(path.exists() for path in begun), process=process)
+    status, said = book.make()
+    assert (status, "Another run is writing to runs/reader" in said) == (2, True), said
+    assert book.make("OUT=other", "DRY_RUN=1")[0] == 0
+    (book.root / "notebooks" / "go").touch()
+    said = process.communicate(timeout=100)[0]
+    assert process.returncode == 0, said
     assert sorted(book.log()) == [*names]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("workers", [1, 2])
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
-def test_a_killed_run_counts_as_nothing_and_is_taken_up_again(book, capsys, how, workers):
-    pid, go = book.root / "pid", book.root / "go"
-    wait = (
-        "import os, pathlib, time\n"
-        f"pathlib.Path({str(pid)!r}).write_text(str(os.getpid()))\n"
-        f"while not pathlib.Path({str(go)!r}).exists():\n"
-        "    time.sleep(0.05)"
-    )
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
+def test_whatever_stops_make_leaves_no_process_and_is_taken_up_again(book, how):
+    child = "import subprocess, time\nsubprocess.Popen(['sleep', '600'])\ntime.sleep(1)"
     book.add("01_first")
-    book.add("02_second", wait)
-    # A job in the background ignores SIGINT, and its children would, too.
-    heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
-    command, first = book.command("--workers", str(workers)), book.runs / "reader/01_first.ipynb"
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, preexec_fn=heed)
-    try:
-        wait_until(lambda: pid.exists() and pid.read_text() and process.poll() is None)
-        wait_until(lambda: first.exists() and '"complete"' in first.read_text())
-    finally:
-        process.send_signal(how)
-        _, err = process.communicate(timeout=60)
-    if how == signal.SIGKILL:
-        assert process.returncode == -how
-    else:
-        assert process.returncode == 128 + how
-        assert re.fullmatch("workbook: interrupted; .*run it again to continue", err.strip())
-    wait_until(lambda: not psutil.pid_exists(int(pid.read_text())))  # no kernel outlives its runner
-    go.touch()
-    assert book.run() == 0
-    assert book.log() == ["01_first", "02_second"]
-    assert "[1/2] 01_first: skipped: complete" in capsys.readouterr().out
-
-
-def test_a_second_runner_or_a_file_in_place_of_the_folder_is_refused(book, capsys):
-    book.add("01_first")
-    book.runs.joinpath("reader").mkdir(parents=True)
-    with FileLock(book.runs / "reader" / ".lock"):
-        assert book.run() == 1
-        assert "another run is writing" in capsys.readouterr().err
-        assert book.run("--out", "other", "--dry-run") == 0
-    (book.runs / "mine").touch()
-    assert book.run("--out", "mine") == 1
-    assert "out_dir must be a folder" in capsys.readouterr().err
-    assert book.log() == []
-
-
-@pytest.mark.parametrize(
-    ("arguments", "named"),
-    [
-        (["02_secnod.n=1"], r"notebook '02_secnod' is unknown; did you mean 02_second"),
-        (["02_second.m=1"], r"parameter of 02_second 'm' is unknown; .*\bn\b"),
-        (["02_second.n=0"], r"02_second.n must be int from 1, .* got int 0"),
-        (["02_second.rate=.nan"], r"02_second.rate must be float, finite, .* got float nan"),
-        (["02_second.n=1.5"], r"02_second.n must be int .* got float 1.5"),
-        (["02_second.n=true"], r"02_second.n must be int .* got bool True"),
-        ([f"02_second.n={'1' * 5000}"], r"02_second.n must be int .* got str '1{50,60}\n"),
-        ([f"02_second.modes={DEEP}"], r"02_second.modes must be list, .* got str '\[{50,60}\n"),
-        (["02_second.modes=[1]"], r"02_second.modes\[0\] must be str"),
-        (["02_second.out_dir=x"], r"use --seed and --out"),
-        (["n=1"], r"write it like 06_planning.n_goals=20"),
-        (["--profile", "raeder"], r"profile 'raeder' is unknown; did you mean reader"),
-        (["--only", "07"], r"notebook '07' is unknown"),
-        (["--out", "../x"], r"must be a plain folder name"),
-        (["--out", "lab"], r"neither lab nor html"),
-        (["--in-place", "02_second.n=1"], r"takes the notebooks' own defaults"),
-        ("02_second: {goals: 3}", r"reader.yaml: parameter of 02_second 'goals' is unknown"),
-        ("03_third: {n: 1}", r"reader.yaml: notebook '03_third' is unknown"),
-        ("02_second: {n: three}", r"02_second.n must be int .* got str 'three'"),
-        ("[1, 2]", r"must map notebooks to their parameters"),
-        ("02_second: {n: [}", r"must map notebooks to their parameters"),
-    ],
-)
-def test_what_does_not_fit_is_refused_before_anything_runs(book, capsys, arguments, named):
-    """Invalid values on the command line or in the profile."""
-    book.add("01_first")
-    book.add("02_second")
-    if isinstance(arguments, str):
-        book.profile("reader", arguments)
-        arguments = ()
-    assert book.run(*arguments) == 1
-    assert re.search(named, capsys.readouterr().err)
-    assert not book.runs.exists()
+    book.add("02_second", child)
+    for delay in (0.5, 2.0, 3.5):
+        process = book.start()
+        time.sleep(delay)
+        if how == signal.SIGINT:  # Ctrl-C reaches all that the terminal has started
+            os.killpg(process.pid, how)
+        else:
+            process.send_signal(how)
+        wait_until(lambda: not book.processes(), seconds=5, otherwise="a process is left")
+        process.communicate(timeout=10)
+    assert not list(book.runs.rglob("*failed*"))
+    status, said = book.make()
+    assert status == 0, said
+    for name in ("01_first", "02_second"):
+        assert read_results(book.runs / "reader" / f"{name}.json")["parameters"]["n"] == 2
 
 
 @pytest.mark.slow
-def test_in_place_puts_clean_executed_notebooks_back(book, capsys):
+def test_in_place_puts_clean_executed_pages_back(book):
     book.add("01_first")
-    book.add("02_second")
-    before = nbformat.read(book.path("02_second"), as_version=4)
-    assert book.run("--in-place") == 0
-    text = book.path("02_second").read_text()
+    before = nbformat.read(book.path("01_first"), as_version=4)
+    status, said = book.make(target="notebooks")
+    assert status == 0, said
+    text = book.path("01_first").read_text()
     after = nbformat.reads(text, as_version=4)
     assert [(c.id, c.source) for c in after.cells] == [(c.id, c.source) for c in before.cells]
     assert [c.metadata for c in after.cells] == [{}, {"tags": ["parameters"]}, {}]
     assert after.cells[-1].outputs == [{"output_type": "stream", "name": "stdout", "text": "1.0\n"}]
     assert [c.execution_count for c in after.cells[1:]] == [1, 2]
     assert after.metadata.keys() == {"kernelspec", "language_info"}
-    assert book.run("--in-place", "--force") == 0
-    assert book.path("02_second").read_text() == text
-    capsys.readouterr()
-    assert book.run("--in-place", "--dry-run") == 0
-    assert capsys.readouterr().out.count("skipped: complete") == 2
-    book.path("02_second").write_text(cleaned(before))  # outputs lost by hand
-    assert book.run("--in-place", "--dry-run") == 0
-    assert "02_second: would run" in capsys.readouterr().out
+    assert "run.py" not in book.make("-n", target="notebooks")[1]
+    book.path("01_first").write_text(cleaned(before))  # outputs lost by hand
+    assert "run.py" in book.make("-n", target="notebooks")[1]
+
+
+READER = {"PROFILE": "reader", "SEED": "0", "OUT": "", "ONLY": "", "ARGS": ""}
 
 
 @pytest.mark.parametrize(
-    ("text", "default", "value"),
+    ("wrong", "named"),
     [
-        ("3", 1, 3),
-        ("1", 0.5, 1.0),
-        ("1e-3", 0.1, 0.001),
-        ("true", False, True),
-        ("12", "a", "12"),
-        ("[1]", [0.5], [1.0]),
-        ("[]", ["a"], []),
-        ("[astar, gradient]", [], ["astar", "gradient"]),
-        ("null", None, None),
-        ("x", None, "x"),
+        (
+            {"ARGS": "06_plannin.n_goals=1"},
+            "page '06_plannin' .* did you mean 06_planning",
+        ),
+        (
+            {"ARGS": "06.n_gaols=1"},
+            "parameter of 06_planning 'n_gaols' .* mean n_goals",
+        ),
+        ({"ARGS": "06.n_goals=1.5"}, "06_planning.n_goals must be int, got 1.5"),
+        ({"ARGS": "06.n_goals=true"}, "06_planning.n_goals must be int, got True"),
+        ({"ARGS": f"06.n_goals={'1' * 5000}"}, r"06_planning.n_goals must be int, got '1{50,60}$"),
+        ({"ARGS": f"06.modes={'[' * 100_000}"}, r"06_planning.modes must be list\[str\], got '\["),
+        ({"ARGS": "06.modes=[1]"}, r"06_planning.modes must be list\[str\], got \[1\]"),
+        ({"ARGS": "00.goal_x_m=near"}, "00_start_here.goal_x_m must be float, got 'near'"),
+        ({"ARGS": "06.out_dir=x"}, "parameter of 06_planning 'out_dir' is unknown"),
+        ({"ARGS": "n=1"}, "must look like 06_planning.n_goals=20"),
+        ({"PROFILE": "raeder"}, "PROFILE 'raeder' is unknown; did you mean reader"),
+        ({"SEED": "-1"}, "SEED must be a whole number, got '-1'"),
+        ({"OUT": "../x"}, "OUT must be a plain name"),
+        ({"OUT": "lab"}, "neither lab nor html"),
     ],
 )
-def test_the_command_line_needs_no_quotes_and_values_take_their_defaults_type(text, default, value):
-    fitted = fitting("p", literal(text, default), default)
-    assert repr(fitted) == repr(value)
+def test_what_does_not_fit_is_refused(wrong, named):
+    with pytest.raises(ValueError, match=named):
+        parameters_of_pages(READER | wrong)
 
 
-@pytest.mark.parametrize(
-    ("source", "named"),
-    [
-        ("seed = 0\nout_dir = 'x'\nn = 2 * seed", "plain literals"),
-        ("seed = 0\nimport os\nout_dir = 'x'", "plain literals"),
-        ("seed = 0", "has no parameter 'out_dir'"),
-    ],
-)
-def test_parameters_are_plain_literals(source, named):
-    cell = nbformat.v4.new_code_cell(source, metadata={"tags": ["parameters"]})
-    with pytest.raises(WorkbookError, match=named):
-        default_parameters(nbformat.v4.new_notebook(cells=[cell]), "01_first")
+def test_the_command_line_needs_no_quotes():
+    given = "06.modes=[astar,x] 00.goal_x_m=1 02.primitive=12 06.n_goals=3"
+    chosen = parameters_of_pages(READER | {"ARGS": given, "SEED": "7"})
+    common = {"seed": 7, "out_dir": "runs/reader-seed7"}
+    assert chosen["06_planning"] == {"modes": ["astar", "x"], "n_goals": 3} | common
+    assert repr(chosen["00_start_here"]["goal_x_m"]) == "1.0"
+    assert chosen["02_interactions"]["primitive"] == "12"
+
+
+def test_hostile_words_on_the_command_line_are_only_words(book):
+    book.add("01_first")
+    for option in ("ONLY", "PROFILE", "SEED", "OUT", "ARGS", "WORKERS"):
+        for text in ("x; touch here", "$$(touch here)", '"; touch here; "'):
+            status, said = book.make(f"{option}={text}", "DRY_RUN=1")
+            assert status == 2, said
+    assert not (book.root / "here").exists()
+    assert not book.runs.exists()

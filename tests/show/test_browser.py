@@ -23,9 +23,9 @@ import numpy as np
 import papermill
 import pytest
 from bs4 import BeautifulSoup
+from pages import WIDGET
 
 from affordlib.paths import repo_root
-from affordlib.workbook import WIDGET
 from tests.waiting import wait_until
 
 CHROMIUM = shutil.which("chromium")

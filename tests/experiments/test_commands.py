@@ -7,8 +7,8 @@ import signal
 
 import pytest
 
-from affordlib.commands import command
 from affordlib.paths import repo_root
+from experiments.commands import command
 
 ALL = {
     path.relative_to(repo_root()).with_suffix("").as_posix().replace("/", ".")

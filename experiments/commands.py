@@ -3,6 +3,7 @@
 import argparse
 import functools
 import inspect
+import io
 import signal
 import sys
 from collections.abc import Callable
@@ -26,7 +27,7 @@ def whole_type(least: int, most: int) -> Callable[[str], int]:
 
 
 count_type = whole_type(1, 10**9)
-seed_type = whole_type(0, 2**32 - 1)
+worker_type = whole_type(1, 256)
 
 
 class _Terminated(KeyboardInterrupt):
@@ -48,6 +49,9 @@ def command(*errors: type[Exception]) -> Callable[[Callable[..., int]], Callable
 
         @functools.wraps(main)
         def run(*arguments: Any) -> int:
+            for stream in (sys.stdout, sys.stderr):  # dots and dashes on a terminal without UTF-8
+                if isinstance(stream, io.TextIOWrapper):
+                    stream.reconfigure(errors="replace")
             before = signal.signal(signal.SIGTERM, _terminate)
             try:
                 return main(*arguments)
