@@ -1,0 +1,138 @@
+"""Execute one page of the book with papermill, or list what is out of date; make calls this.
+
+    python notebooks/run.py
+    python notebooks/run.py notebooks/06_planning.ipynb runs/smoke/06_planning.ipynb
+
+Options are variables of the environment: PROFILE, SEED, OUT, ONLY, ARGS, FORCE, IN_PLACE. The copy
+of a page is written last, so one that exists is complete.
+"""
+
+import json
+import os
+import re
+import shutil
+import signal
+import sys
+import tempfile
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import ipykernel.kernelspec
+import nbformat
+import papermill
+from jupyter_client.kernelspec import KernelSpec
+from jupyter_client.manager import AsyncKernelManager
+from pages import PAGES, ROOT, choose, cleaned, own_cells, parameters_of_pages, run_folder
+
+from affordlib.results import read_results, write_atomically
+
+
+def list_goals() -> None:
+    """Print the folder of the run, what to make in it, and pages whose parameters have changed."""
+    chosen, run = parameters_of_pages(), Path(run_folder())
+    only = re.findall(r"[^\s,]+", os.environ["ONLY"])
+    wanted = {choose("ONLY: page", page, PAGES) for page in only} or PAGES
+    goals = [str(run)]
+    for name, path in PAGES.items():
+        if name in wanted:
+            copy, made_with = run / path.name, None
+            with suppress(OSError, ValueError, KeyError):
+                document = json.loads(copy.read_text("utf-8"))
+                made_with = document["metadata"]["papermill"]["parameters"]
+            if os.environ.get("FORCE") or made_with != chosen[name]:
+                goals += ["-W", str(path.relative_to(ROOT))]
+            goals += [str(copy), str(copy.with_suffix(".json"))]
+    print(*goals)
+
+
+class OwnKernel(AsyncKernelManager):
+    """Kernels of the running interpreter, reached through files that only this user can open."""
+
+    kernel_spec = KernelSpec(
+        env={"MPLBACKEND": "module://matplotlib_inline.backend_inline"},
+        **ipykernel.kernelspec.get_kernel_dict(),
+    )
+
+    async def start_kernel(self, **options: Any) -> None:
+        """Start a kernel in its own process group, and keep what it prints outside of cells."""
+        folder = Path(os.environ["IPYTHONDIR"])
+        self.transport, self.connection_file = "ipc", str(folder / "kernel.json")
+        with (folder / "printed").open("wb") as printed:
+            await super().start_kernel(stdout=printed, stderr=printed, **options)
+        (folder / "group").write_text(str(self.provisioner.pgid))
+
+
+def execute(path: Path, copy: Path) -> None:
+    """Execute a page, check its results, and write its copy. What failed has another name."""
+    start, results = time.monotonic(), copy.with_suffix(".json")
+    failed = copy.with_suffix(".failed.ipynb")
+    folder = Path(tempfile.mkdtemp(prefix="page-"))
+    os.environ["IPYTHONDIR"] = str(folder)
+
+    def end(number: int, _: object = None) -> None:
+        """End the kernel with all processes that it has started; a signal ends this process too."""
+        with suppress(OSError):
+            os.killpg(int((folder / "group").read_text()), signal.SIGKILL)
+        shutil.rmtree(folder, ignore_errors=True)
+        if number:
+            failed.unlink(missing_ok=True)
+            print(f"{path.stem}: interrupted; the same command continues", flush=True)
+            os._exit(128 + number)
+
+    signal.signal(signal.SIGINT, end)
+    signal.signal(signal.SIGTERM, end)
+    results.unlink(missing_ok=True)
+    copy.unlink(missing_ok=True)
+    print(f"{path.stem} …", flush=True)
+    try:
+        notebook = papermill.execute_notebook(
+            path,
+            failed,
+            parameters_of_pages()[path.stem],
+            kernel_name="python3",
+            language="python",
+            progress_bar=False,
+            start_timeout=30,
+            cwd=path.parent,
+            kernel_manager_class=OwnKernel,
+            coalesce_streams=True,
+        )
+        read_results(results.resolve())
+    except Exception as error:
+        raise RuntimeError(explained(path, failed, error, folder / "printed")) from None
+    finally:
+        end(0)
+    notebook.metadata.papermill["output_path"] = str(copy)
+    if os.environ.get("IN_PLACE") and cleaned(notebook) != path.read_text("utf-8"):
+        write_atomically(path, cleaned(notebook))
+    os.utime(results)
+    write_atomically(copy, nbformat.writes(notebook))
+    failed.unlink()
+    print(f"{path.stem}: {time.monotonic() - start:.1f} s", flush=True)
+
+
+def explained(path: Path, copy: Path, error: Exception, printed: Path) -> str:
+    """Describe a failure: page, cell number in the committed page, and reason."""
+    reason, where = f"{type(error).__name__}: {error}", ""
+    if isinstance(error, papermill.PapermillExecutionError) and error.evalue:
+        reason = f"{error.ename}: {error.evalue}"
+    elif printed.is_file() and (said := printed.read_text(errors="replace").split("\n")):
+        reason = next((line for line in reversed(said) if line.strip()), reason)
+    with suppress(OSError):
+        for number, cell in enumerate(own_cells(nbformat.read(copy, as_version=4)), 1):
+            if cell.metadata.get("papermill", {}).get("start_time"):
+                line = cell.source.strip().partition("\n")[0]
+                where = f" in cell {number}, which begins `{line}`; the executed copy is {copy}"
+    return f"{path.stem} failed{where}\n{reason}"
+
+
+if __name__ == "__main__":
+    try:
+        if sys.argv[1:]:
+            execute(*map(Path, sys.argv[1:]))
+        else:
+            list_goals()
+    except (OSError, ValueError, RuntimeError) as problem:
+        sys.exit(str(problem))
