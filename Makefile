@@ -95,7 +95,7 @@ workbook: $(STAMP) ## Run all pages into runs/, two at a time (PROFILE=smoke|rea
 notebooks: $(STAMP) ## Execute the committed pages in place and clean their metadata (ONLY= FORCE=1)
 notebooks: export IN_PLACE := 1
 workbook notebooks:
-	@set -f; goals=$$($(PY) notebooks/run.py); run=$${goals%% *}; \
+	@set -f; goals=$$($(PY) notebooks/pages.py); run=$${goals%% *}; \
 	 [[ "$$WORKERS" =~ ^[1-9][0-9]?$$ ]] || { echo "WORKERS must be a whole number from 1 to 99" >&2; exit 1; }; \
 	 $(if $(DRY_RUN),,mkdir -p "$$run"; exec 9>> "$$run/.lock"; flock -n 9 || { echo "Another run is writing to $$run; wait for it, or choose another name with OUT=" >&2; exit 1; };) \
 	 exec $(LEASH) $(MAKE) $(if $(DRY_RUN),-n) $(if $(findstring jobserver,$(MAKEFLAGS)),,-j"$$WORKERS") RUN="$$run" $${goals#* }
@@ -103,10 +103,10 @@ workbook notebooks:
 ifdef RUN
 # Copies of results are no input. A name with a blank, which make cannot express, is not ours.
 USED := $(STAMP) $(wildcard notebooks/*.py) $(shell find affordlib experiments notebooks/exercises data -type f \
-  ! -path '*/.*' ! -path '*/__pycache__/*' ! -path 'data/results/[0-9][0-9]_*' ! -path '* *')
+  ! -path '*/.*' ! -path '*/__pycache__/*' ! -path 'data/results/[0-9][0-9]_*' ! -path '* *' 2>/dev/null)
 define PAGES
 $(RUN)/%.ipynb $(RUN)/%.json: $(1)/%.ipynb $(USED)
-	@$(if $(filter-out 1,$(WORKERS)),OMP_NUM_THREADS=1) exec $(LEASH) $(PY) notebooks/run.py "$$<" "$$(@D)/$$*.ipynb"
+	@$(if $(filter-out 1,$(WORKERS)),OMP_NUM_THREADS=1) exec $(LEASH) $(PY) notebooks/run.py $$< $$(@D)/$$*.ipynb
 endef
 $(foreach folder,notebooks notebooks/appendix,$(eval $(call PAGES,$(folder))))
 endif
@@ -175,11 +175,13 @@ html: $(STAMP) ## Write the book as web pages into runs/html, readable offline: 
 tables: $(STAMP) ## Fill the tables of README, RESULTS and data card from data/results
 	@$(PY) -m experiments.tables README.md RESULTS.md data/README.md
 
-constraints: $(STAMP) ## Write constraints.txt from the installed packages
-	@{ sed -n '/^#/p;/^[^#]/q' constraints.txt; \
+constraints: $(STAMP) ## Write constraints.txt, and its copy in pyproject.toml, from the installed packages
+	@{ sed '/^$$/q' constraints.txt; \
 	   $(PY) -m pip freeze --all --exclude pip --exclude affordlib -r requirements.txt \
-	     | sed -e '1,/^## The following/d' -e 's/+[^ ]*$$//'; } > constraints.txt.tmp
+	     | sed -e '1,/^## The following/d' -e 's/+[^ ]*$$//' -e '/^cuda-/d' -e '/^nvidia-/d' -e '/^triton=/d'; } > constraints.txt.tmp
 	@mv constraints.txt.tmp constraints.txt
+	@{ sed '/^constraint-dependencies/q' pyproject.toml; sed -n 's/^[^#].*/    "&",/p' constraints.txt; echo ']'; } > pyproject.toml.tmp
+	@mv pyproject.toml.tmp pyproject.toml
 
 clean: ## Remove runs/, caches and build files, but not .venv
 	@rm -rf runs build dist *.egg-info .pytest_cache .ruff_cache .hypothesis notebooks/.ipynb_checkpoints

@@ -1,15 +1,11 @@
-"""Execute one page of the book with papermill, or list what is out of date; make calls this.
+"""Execute one page of the book with papermill; make calls this.
 
-    python notebooks/run.py
     python notebooks/run.py notebooks/06_planning.ipynb runs/smoke/06_planning.ipynb
 
-Options are variables of the environment: PROFILE, SEED, OUT, ONLY, ARGS, FORCE, IN_PLACE. The copy
-of a page is written last, so one that exists is complete.
+The copy of a page is written last, so one that exists is complete.
 """
 
-import json
 import os
-import re
 import shutil
 import signal
 import sys
@@ -24,27 +20,9 @@ import nbformat
 import papermill
 from jupyter_client.kernelspec import KernelSpec
 from jupyter_client.manager import AsyncKernelManager
-from pages import PAGES, ROOT, choose, cleaned, own_cells, parameters_of_pages, run_folder
+from pages import cleaned, own_cells, parameters_of_pages
 
 from affordlib.results import read_results, write_atomically
-
-
-def list_goals() -> None:
-    """Print the folder of the run, what to make in it, and pages whose parameters have changed."""
-    chosen, run = parameters_of_pages(), Path(run_folder())
-    only = re.findall(r"[^\s,]+", os.environ["ONLY"])
-    wanted = {choose("ONLY: page", page, PAGES) for page in only} or PAGES
-    goals = [str(run)]
-    for name, path in PAGES.items():
-        if name in wanted:
-            copy, made_with = run / path.name, None
-            with suppress(OSError, ValueError, KeyError):
-                document = json.loads(copy.read_text("utf-8"))
-                made_with = document["metadata"]["papermill"]["parameters"]
-            if os.environ.get("FORCE") or made_with != chosen[name]:
-                goals += ["-W", str(path.relative_to(ROOT))]
-            goals += [str(copy), str(copy.with_suffix(".json"))]
-    print(*goals)
 
 
 class OwnKernel(AsyncKernelManager):
@@ -130,9 +108,6 @@ def explained(path: Path, copy: Path, error: Exception, printed: Path) -> str:
 
 if __name__ == "__main__":
     try:
-        if sys.argv[1:]:
-            execute(*map(Path, sys.argv[1:]))
-        else:
-            list_goals()
+        execute(*map(Path, sys.argv[1:]))
     except (OSError, ValueError, RuntimeError) as problem:
         sys.exit(str(problem))

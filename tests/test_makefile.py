@@ -1,12 +1,15 @@
-"""`make setup` with a Python that only pretends to install: when it creates .venv, and when not."""
+"""`make setup` with a Python that only pretends to install, and what the pinned packages need."""
 
+import importlib.metadata
 import os
 import shutil
 import subprocess
 import sys
+import tomllib
 from types import SimpleNamespace
 
 import pytest
+from packaging.specifiers import SpecifierSet
 
 from affordlib.paths import repo_root
 
@@ -15,7 +18,7 @@ PRETENDED = """\
 import pathlib, sys, time
 here = pathlib.Path({here!r})
 with open(here / "log", "a") as log:
-    log.write(" ".join(sys.argv[1:3]) + "\\n")
+    log.write(" ".join(sys.argv[1:{words}]) + "\\n")
 if sys.argv[1] == "-c":
     print({version!r})
 elif sys.argv[1:3] == ["-m", "venv"]:
@@ -25,7 +28,8 @@ elif sys.argv[1:3] == ["-m", "venv"]:
     python.write_text(pathlib.Path(__file__).read_text())
     python.chmod(0o755)
 elif (here / "no_network").exists():
-    sys.exit("no network")
+    print("The conflict is caused by: no network")
+    sys.exit("no")
 """
 INSTALLED = ["-m pip", "-m pip"]
 pytestmark = pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
@@ -33,21 +37,25 @@ pytestmark = pytest.mark.skipif(shutil.which("make") is None, reason="make is no
 
 @pytest.fixture
 def project(tmp_path):
-    """A folder with the Makefile: `setup()` runs make; returns status, output and commands."""
-    here = tmp_path / "a project"  # with a blank in its name
+    """A folder with the Makefile: `make()` returns whether it failed, its output and commands."""
+    here, commands = tmp_path / "a project", tmp_path / "bin"  # with a blank in its name
     here.mkdir()
+    commands.mkdir()
     shutil.copy(repo_root() / "Makefile", here)
     for name in ("requirements.txt", "constraints.txt", "pyproject.toml"):
         (here / name).touch()
 
-    def setup(version="3.11", python=None, copies=1):
+    def make(*options, version="3.11", copies=1, words=3):
         own = tmp_path / "python"
-        own.write_text(PRETENDED.format(python=sys.executable, here=str(here), version=version))
-        own.chmod(0o755)
+        text = PRETENDED.format(python=sys.executable, here=str(here), version=version, words=words)
+        own.write_text(text)
+        for path in (own, *commands.iterdir()):
+            path.chmod(0o755)
         environment = {name: value for name, value in os.environ.items() if "MAKE" not in name}
+        environment["PATH"] = f"{commands}:{environment['PATH']}"
         started = [
             subprocess.Popen(
-                ["make", "setup", f"PYTHON={python or own}"],
+                ["make", f"PYTHON={own}", *(options or ["setup"])],
                 cwd=here,
                 env=environment,
                 stdout=subprocess.PIPE,
@@ -63,29 +71,34 @@ def project(tmp_path):
         ran = [line for line in ran if not line.startswith("-c")]
         return any(process.returncode for process in started), "".join(said), ran
 
-    return SimpleNamespace(here=here, setup=setup)
+    return SimpleNamespace(here=here, make=make, commands=commands)
 
 
 def test_it_installs_once_even_when_two_begin_and_then_has_nothing_to_do(project):
-    failed, said, ran = project.setup(copies=2)
+    failed, said, ran = project.make(copies=2)
     assert (failed, ran) == (False, ["-m venv", *INSTALLED]), said
-    failed, said, ran = project.setup()
+    failed, said, ran = project.make()
     assert (failed, ran) == (False, [])
     assert "The environment is ready" in said
-    later = (project.here / ".venv" / ".installed").stat().st_mtime + 5
-    os.utime(project.here / "requirements.txt", (later, later))
-    failed, said, ran = project.setup()
+    stamp = project.here / ".venv" / ".installed"
+    os.utime(stamp, (stamp.stat().st_mtime - 5,) * 2)
+    # Files of tomorrow, unpacked in another time zone, are of now: pip runs once.
+    for name in ("requirements.txt", "Makefile"):
+        os.utime(project.here / name, (stamp.stat().st_mtime + 80_000,) * 2)
+    failed, said, ran = project.make()
     assert (failed, ran) == (False, INSTALLED), said  # into what is there
+    assert project.make()[::2] == (False, [])
+    assert "skew" not in said
 
 
-def test_an_installation_that_failed_is_made_anew(project):
+def test_an_installation_that_failed_is_made_anew_and_says_why(project):
     (project.here / "no_network").touch()
-    failed, said, _ = project.setup()
+    failed, said, _ = project.make()
     assert failed
-    assert "no network" in said
+    assert "The conflict is caused by: no network" in said
     (project.here / "no_network").unlink()
     shutil.rmtree(project.here / ".venv")  # as `venv --clear` does
-    assert project.setup()[::2] == (False, ["-m venv", *INSTALLED])
+    assert project.make()[::2] == (False, ["-m venv", *INSTALLED])
 
 
 def test_what_a_link_leads_to_is_not_emptied(project):
@@ -93,18 +106,64 @@ def test_what_a_link_leads_to_is_not_emptied(project):
     other.mkdir()
     (other / "kept").touch()
     (project.here / ".venv").symlink_to(other)
-    failed, said, ran = project.setup()
+    failed, said, ran = project.make()
     assert (failed, ran) == (True, [])
     assert "'.venv' is a link to" in said
     assert (other / "kept").exists()
 
 
 @pytest.mark.parametrize(
-    ("options", "why"),
-    [({"python": "/bin/false"}, "'/bin/false' is no Python"), ({"version": "3.9"}, "Python 3.11")],
+    ("system", "options", "why"),
+    [
+        ("Linux x86_64", {"version": "3.9"}, "needs Python 3.11, as PyBullet has no wheel for a"),
+        ("Linux aarch64", {}, "needs Linux on x86-64: PyBullet has no wheel for Linux aarch64"),
+        ("Darwin arm64", {}, "needs Linux on x86-64: PyBullet has no wheel for Darwin arm64"),
+    ],
 )
-def test_what_is_no_python_or_another_is_refused(project, options, why):
-    failed, said, ran = project.setup(**options)
+def test_another_python_or_system_is_refused(project, system, options, why):
+    (project.commands / "uname").write_text(f"#!/bin/sh\necho {system}\n")
+    failed, said, ran = project.make(**options)
     assert (failed, ran) == (True, [])
-    assert "This workbook needs Python 3.11" in said
     assert why in said
+    failed, said, ran = project.make("PYTHON=/bin/false", "setup")
+    assert (failed, ran) == (True, [])
+
+
+def test_an_environment_of_uv_stays_one(project):
+    project.make()
+    (project.here / ".venv" / ".installed").unlink()
+    (project.here / ".venv" / "pyvenv.cfg").write_text("home = /usr/bin\nuv = 0.9.1\n")
+    (project.commands / "uv").write_text('#!/bin/sh\necho "uv $*" >> log\n')
+    assert project.make()[::2] == (False, ["uv sync"])
+    assert project.make()[::2] == (False, [])
+
+
+def test_options_are_words_and_zero_means_no(project):
+    project.make()
+    for text in ('2"; touch here; "', "$$(touch here)", "x; touch here"):
+        for options in (("test-fast", f"JOBS={text}"), ("checkpoints", f"ONLY={text}")):
+            _, said, ran = project.make(*options)
+            assert len(ran) == 1, said
+    assert not (project.here / "here").exists()
+    shutil.rmtree(project.here / ".venv")
+    project.make(words=9)
+    assert project.make("bench", "KEEP=0", words=9)[2] == ["-m experiments.speed"]
+    assert project.make("bench", "KEEP=1", words=9)[2] == ["-m experiments.speed --keep"]
+    assert "--extra-index-url here" not in " ".join(project.make(words=9)[2])
+    shutil.rmtree(project.here / ".venv")
+    assert "--extra-index-url here" in " ".join(project.make("INDEX=here", "setup", words=9)[2])
+
+
+def test_all_packages_install_on_the_oldest_python_that_is_promised():
+    oldest = "3.11.2"  # of Debian 12, as README says
+    assert oldest in (repo_root() / "README.md").read_text("utf-8")
+    for package in importlib.metadata.distributions():
+        wanted = package.metadata["Requires-Python"] or ""
+        assert SpecifierSet(wanted).contains(oldest), f"{package.name} needs Python {wanted}"
+
+
+def test_uv_reads_the_same_constraints():
+    lines = (repo_root() / "constraints.txt").read_text("utf-8").splitlines()
+    held = [line for line in lines if line and not line.startswith("#")]
+    uv = tomllib.loads((repo_root() / "pyproject.toml").read_text("utf-8"))["tool"]["uv"]
+    assert uv["constraint-dependencies"] == held, "run `make constraints`"
