@@ -19,7 +19,6 @@ import numpy as np
 import pandas as pd
 import torch
 
-from experiments.commands import command
 from affordlib.geometry import rotated
 from affordlib.interactions.recipes import Variation
 from affordlib.models.checkpoint import load_checkpoint
@@ -27,6 +26,7 @@ from affordlib.planning import EffectMap
 from affordlib.primitives import Push
 from affordlib.world import Tabletop, TabletopObject, WorldConfig, category_named
 from experiments import runner
+from experiments.commands import command
 from experiments.planning import CONFIGS, attempt, tasks_sha256
 from experiments.real_pushes import named
 from experiments.runner import FOLDER, Job, Rows, frame, interval

@@ -24,7 +24,6 @@ import numpy as np
 import pandas as pd
 from scipy.spatial import ConvexHull
 
-from experiments.commands import command
 from affordlib.geometry import wrap_angle
 from affordlib.interactions.recipes import Variation
 from affordlib.models import load_checkpoint
@@ -49,6 +48,7 @@ from affordlib.world import (
     category_named,
 )
 from experiments import runner
+from experiments.commands import command
 from experiments.feasibility import half_width_m, is_feasible, on_the_rim
 from experiments.runner import FOLDER, Job, Rows, plain
 from experiments.tasks import ROLLABLE

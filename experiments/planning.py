@@ -25,7 +25,6 @@ import pandas as pd
 import torch
 from tqdm.auto import tqdm
 
-from experiments.commands import command
 from affordlib.models.checkpoint import load_checkpoint
 from affordlib.models.predictions import error_row
 from affordlib.models.protocol import EffectModel
@@ -51,6 +50,7 @@ from affordlib.types import NothingSeenError, Outcome, Plan, Step
 from affordlib.world import Tabletop, UnreachableError
 from experiments import reported, runner
 from experiments import tasks as goals
+from experiments.commands import command
 from experiments.field_baselines import LimitSurface, plan_astar_continuous, plan_cem
 from experiments.literal import SPEC, trained_on
 from experiments.oracle import oracle_effects

@@ -22,7 +22,6 @@ import torch
 import xarray as xr
 from torch import nn
 
-from experiments.commands import command, worker_type
 from affordlib.interactions import (
     InteractionTensors,
     Scaler,
@@ -58,6 +57,7 @@ from affordlib.types import Goal
 from affordlib.workers import dask_client
 from affordlib.world import Tabletop
 from experiments.attention import AttentionConfig
+from experiments.commands import command, worker_type
 from experiments.tasks import (
     FROZEN,
     MIN_DISTANCE_M,

@@ -26,7 +26,6 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from affordlib import models
-from experiments.commands import command
 from affordlib.interactions import (
     InteractionTensors,
     Scaler,
@@ -42,6 +41,7 @@ from affordlib.primitives import PRIMITIVES, Push
 from affordlib.results import read_results, write_results
 from affordlib.types import Observations
 from affordlib.world import Tabletop
+from experiments.commands import command
 from experiments.literal import sample_literal, train_literal
 from experiments.runner import Rows
 from experiments.shipped import uniform_tasks
