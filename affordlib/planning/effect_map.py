@@ -7,9 +7,11 @@ as their effect is zero. When the object rotates, the surface rotates with it, s
 every step of a plan and every node of a search.
 """
 
+import base64
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -112,6 +114,19 @@ class EffectMap:
         smooth = np.pad(smooth, ((0, 0), (1, 2), (0, 0)), mode="reflect")
         # Coefficient k belongs to grid point k - 1, where its B-spline is centred.
         return NdBSpline(tuple(np.arange(n + 4) - 3.0 for n in smooth.shape[:2]), smooth, 3)
+
+    def numbers(self) -> dict[str, Any]:
+        """What evaluates the spline elsewhere, in JSON's types: its coefficients are in 16 bits."""
+        inner = self.spline.c[1:-2, 1:-2]  # without the padding
+        scale = np.abs(inner).max(axis=(0, 1)).clip(1e-9) / 32767
+        whole = np.round(inner / scale).astype("<i2")
+        return {
+            "primitive": self.kind.name,
+            "from": self.kind.acts_from,
+            "shape": list(inner.shape[:2]),
+            "scale": scale.tolist(),
+            "coefficients": base64.b64encode(whole.tobytes()).decode(),
+        }
 
     def __call__(self, direction_rad: Tensor, phase: Tensor) -> tuple[Tensor, Tensor]:
         """Effects and σ (..., 3) in the action's frame, for directions relative to the object."""

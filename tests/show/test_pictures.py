@@ -73,7 +73,8 @@ def test_the_configuration_of_a_reader_changes_no_figure(tmp_path):
     )
     code = (
         "import matplotlib.pyplot as plt\nfrom affordlib.show import save_figure, plot_table\n"
-        "from pathlib import Path\nfigure, ax = plt.subplots()\nplot_table(ax).set_title('50 % of $x_1$')\nax.plot([1, 2])\n"
+        "from pathlib import Path\nfigure, ax = plt.subplots()\nplot_table(ax)\n"
+        "ax.set_title('50 % of $x_1$')\nax.plot([1, 2])\n"
         "print(save_figure(figure, Path('{}'), 'one'))"
     )
     drawn = []

@@ -1,0 +1,841 @@
+// The table from above: plans over an object's effect map, draws what is there and what is planned,
+// and lets pointer, touch and keys move goal, object and obstacles. With a kernel it is a widget of
+// Python's, without one a part of a page. Metres and radians; x to the right, y upwards.
+
+const TURN = 2 * Math.PI;
+const FINE_DIRECTIONS = 180;
+const FINE_PHASES = 31;
+const STARTS = 128; // chains from which a search begins
+const REFINED = 16; // the best of them, corrected until they end at the goal
+const CORRECTIONS = 6;
+const NEAR_ENOUGH = 0.0003; // [m]
+const SPREAD = 1.2; // of the first directions around the goal's [rad]
+const ACTION_COST = 0.0005; // [m]
+const LOYALTY = 0.001; // advantage of the plan that is shown, so that it does not jump [m]
+const PATH_SAMPLES = 25;
+const NEARBY = 0.02; // difference of directions for the slope of an effect [rad]
+const MARGIN = 0.01; // between object and obstacles [m]
+const HAND_RADIUS = 0.02;
+const ENLARGED = 20; // radius of the drawn disc, in σ
+const EXTENT = 0.4; // half width of the largest view [m]
+const LIMIT = 0.35; // largest coordinate of a goal [m]
+
+const between = (low, value, high) => Math.max(low, Math.min(high, value));
+const share = (a, b, t) => a + (b - a) * t;
+const rotated = ([x, y], angle) => {
+  const [c, s] = [Math.cos(angle), Math.sin(angle)];
+  return [c * x - s * y, s * x + c * y];
+};
+const placed = (outline, [x, y, yaw]) =>
+  outline.map((corner) => {
+    const [u, v] = rotated(corner, yaw);
+    return [x + u, y + v];
+  });
+
+function decoded(text, Type) {
+  const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+  return new Type(bytes.buffer);
+}
+
+// Effects of an action, ahead, to the left, turn, and their σ, over direction and phase: the cubic
+// B-spline of Python's EffectMap, from its numbers.
+export class EffectMap {
+  constructor({ primitive, shape: [rows, columns], from, scale, coefficients }) {
+    const whole = decoded(coefficients, Int16Array);
+    Object.assign(this, { primitive, rows, columns, from, stride: 6 * (columns + 3) });
+    this.padded = new Float64Array((rows + 3) * this.stride);
+    for (let i = 0; i < rows + 3; i++) {
+      for (let j = 0; j < columns + 3; j++) {
+        const row = (i - 1 + rows) % rows;
+        const column = columns - 1 - Math.abs(columns - 1 - Math.abs(j - 1)); // mirrored
+        for (let k = 0; k < 6; k++) {
+          this.padded[i * this.stride + 6 * j + k] = whole[6 * (row * columns + column) + k] * scale[k];
+        }
+      }
+    }
+    this.fine = new Float64Array(2 * FINE_DIRECTIONS * FINE_PHASES);
+    this.reach = 0;
+    const effect = new Float64Array(6);
+    for (let i = 0; i < FINE_DIRECTIONS * FINE_PHASES; i++) {
+      const [direction, phase] = this.action(i);
+      this.at(direction, phase, effect);
+      this.fine.set(rotated(effect, direction), 2 * i);
+      this.reach = Math.max(this.reach, Math.hypot(effect[0], effect[1]));
+    }
+    this.buckets = { true: this.sorted(0, 1), false: this.sorted(FINE_PHASES - 1, FINE_PHASES) };
+  }
+
+  // Actions by the square of the table, beside the object, in which they end.
+  sorted(first, step) {
+    const squares = new Map();
+    for (let i = first; i < FINE_DIRECTIONS * FINE_PHASES; i += step) {
+      const key = square(this.fine[2 * i]) * 1000 + square(this.fine[2 * i + 1]);
+      if (!squares.has(key)) squares.set(key, []);
+      squares.get(key).push(i);
+    }
+    return squares;
+  }
+
+  action(i) {
+    const phase = share(this.from, 1, (i % FINE_PHASES) / (FINE_PHASES - 1));
+    return [(Math.floor(i / FINE_PHASES) * TURN) / FINE_DIRECTIONS, phase];
+  }
+
+  at(direction, phase, out) {
+    const x = ((((direction % TURN) + TURN) % TURN) * this.rows) / TURN;
+    const y = ((between(this.from, phase, 1) - this.from) * (this.columns - 1)) / (1 - this.from);
+    const [i, j] = [Math.min(Math.floor(x), this.rows - 1), Math.min(Math.floor(y), this.columns - 1)];
+    weigh(x - i, ROW);
+    weigh(y - j, COLUMN);
+    out.fill(0);
+    for (let a = 0; a < 4; a++) {
+      for (let b = 0; b < 4; b++) {
+        const weight = ROW[a] * COLUMN[b];
+        const first = (i + a) * this.stride + 6 * (j + b);
+        for (let k = 0; k < 6; k++) out[k] += weight * this.padded[first + k];
+      }
+    }
+    for (let k = 3; k < 6; k++) out[k] = Math.max(out[k], 1e-6);
+    return out;
+  }
+
+  // The action that ends nearest to a place beside the object.
+  nearest(x, y, partial) {
+    const squares = this.buckets[Boolean(partial)];
+    // What lies beyond the reach is looked for from its edge, where what is nearest nearly is.
+    const inwards = Math.min(1, this.reach / Math.max(Math.hypot(x, y), 1e-9));
+    const [u, v] = [square(x * inwards), square(y * inwards)];
+    let [best, least] = [FINE_PHASES - 1, Infinity];
+    for (let ring = 0; ring * SQUARE < least + SQUARE && ring < 40; ring++) {
+      for (let i = -ring; i <= ring; i++) {
+        const step = Math.abs(i) === ring ? 1 : Math.max(1, 2 * ring);
+        for (let j = -ring; j <= ring; j += step) {
+          const there = squares.get((u + i) * 1000 + v + j) ?? [];
+          for (const one of there) {
+            const far = Math.hypot(this.fine[2 * one] - x, this.fine[2 * one + 1] - y);
+            if (far < least) [best, least] = [one, far];
+          }
+        }
+      }
+      if (inwards < 1 && least < Infinity && ring > 1) break;
+    }
+    return this.action(best);
+  }
+}
+
+const SQUARE = 0.01;
+const square = (value) => Math.floor(value / SQUARE);
+const ROW = new Float64Array(4);
+const COLUMN = new Float64Array(4);
+const EFFECT = new Float64Array(6);
+const BEFORE = new Float64Array(6);
+const AFTER = new Float64Array(6);
+
+function weigh(u, out) {
+  out[0] = (1 - u) ** 3 / 6;
+  out[1] = (3 * u ** 3 - 6 * u ** 2 + 4) / 6;
+  out[2] = (-3 * u ** 3 + 3 * u ** 2 + 3 * u + 1) / 6;
+  out[3] = u ** 3 / 6;
+}
+
+// Poses after each action of a chain [direction, phase, …] of an object at the origin, and, if asked
+// for, the variance of the position: that of each action, and that of turns on later actions.
+export function rollOut(map, chain, yaw = 0, uncertain = false) {
+  let [x, y, turn, trace, turnVariance, cx, cy] = [0, 0, yaw, 0, 0, 0, 0];
+  const poses = [];
+  for (let k = 0; k < chain.length; k += 2) {
+    const [direction, phase] = [chain[k], chain[k + 1]];
+    const effect = map.at(direction - turn, phase, EFFECT);
+    const [c, s] = [Math.cos(direction), Math.sin(direction)];
+    if (uncertain) {
+      map.at(direction - turn - NEARBY, phase, BEFORE);
+      map.at(direction - turn + NEARBY, phase, AFTER);
+      const [u, v, w] = [0, 1, 2].map((i) => (BEFORE[i] - AFTER[i]) / (2 * NEARBY));
+      const [sx, sy, kept] = [c * u - s * v, s * u + c * v, 1 + w];
+      trace += 2 * (cx * sx + cy * sy) + turnVariance * (sx * sx + sy * sy);
+      trace += effect[3] ** 2 + effect[4] ** 2;
+      [cx, cy] = [kept * (cx + turnVariance * sx), kept * (cy + turnVariance * sy)];
+      turnVariance = kept ** 2 * turnVariance + effect[5] ** 2;
+    }
+    x += c * effect[0] - s * effect[1];
+    y += s * effect[0] + c * effect[1];
+    turn += effect[2];
+    poses.push([x, y, turn, trace]);
+  }
+  return poses;
+}
+
+// The last pose alone.
+function endOf(map, chain, yaw) {
+  let [x, y, turn] = [0, 0, yaw];
+  for (let k = 0; k < chain.length; k += 2) {
+    map.at(chain[k] - turn, chain[k + 1], EFFECT);
+    const [c, s] = [Math.cos(chain[k]), Math.sin(chain[k])];
+    x += c * EFFECT[0] - s * EFFECT[1];
+    y += s * EFFECT[0] + c * EFFECT[1];
+    turn += EFFECT[2];
+  }
+  return [x, y, turn];
+}
+
+// Whether the arm can act at (x, y) in a direction: Python's network, from its numbers.
+export function reachability({ layers, primitives, threshold }, primitive) {
+  const kind = primitives.indexOf(primitive);
+  if (kind < 0) return () => true;
+  const read = layers.map(([inputs, text]) => [inputs, decoded(text, Float32Array)]);
+  const hot = primitives.map((_, k) => Number(k === kind));
+  return (x, y, direction) => {
+    let values = [2 * x, 2 * y, Math.cos(direction), Math.sin(direction), ...hot];
+    for (const [inputs, weights] of read) {
+      const outputs = weights.length / (inputs + 1);
+      const bias = inputs * outputs;
+      const next = new Array(outputs);
+      for (let o = 0; o < outputs; o++) {
+        let sum = weights[bias + o];
+        for (let i = 0; i < inputs; i++) sum += weights[o * inputs + i] * values[i];
+        next[o] = outputs > 1 ? Math.tanh(sum) : sum;
+      }
+      values = next;
+    }
+    return 1 / (1 + Math.exp(-values[0])) >= threshold;
+  };
+}
+
+function toEdge([px, py], [ax, ay], [bx, by]) {
+  const [dx, dy] = [bx - ax, by - ay];
+  const t = between(0, ((px - ax) * dx + (py - ay) * dy) / (dx * dx + dy * dy || 1), 1);
+  return Math.hypot(px - ax - t * dx, py - ay - t * dy);
+}
+
+// Distance of a point from a convex polygon (counter-clockwise), 0 inside.
+function toPolygon(point, corners) {
+  let [least, inside] = [Infinity, true];
+  corners.forEach((a, k) => {
+    const b = corners[(k + 1) % corners.length];
+    inside &&= (b[0] - a[0]) * (point[1] - a[1]) >= (b[1] - a[1]) * (point[0] - a[0]);
+    least = Math.min(least, toEdge(point, a, b));
+  });
+  return inside ? 0 : least;
+}
+
+// A lower bound of the distance between two convex polygons, from their edges' normals.
+function apart(one, other) {
+  let most = -Infinity;
+  for (const [these, those] of [[one, other], [other, one]]) {
+    these.forEach(([ax, ay], k) => {
+      const [bx, by] = these[(k + 1) % these.length];
+      const long = Math.hypot(bx - ax, by - ay) || 1;
+      const [nx, ny] = [(by - ay) / long, (ax - bx) / long]; // outwards
+      most = Math.max(most, Math.min(...those.map(([x, y]) => (x - ax) * nx + (y - ay) * ny)));
+    });
+  }
+  return most;
+}
+
+// obstacles: {discs: [[x, y, radius, height], …], polygons: [[corners, height], …]}, convex.
+export function isFree(corners, { discs = [], polygons = [] }, margin = MARGIN) {
+  return (
+    discs.every(([x, y, radius]) => toPolygon([x, y], corners) > radius + margin) &&
+    polygons.every(([others]) => apart(corners, others) > margin)
+  );
+}
+
+function handIsFree(point, { discs = [], polygons = [] }) {
+  return (
+    discs.every(([x, y, radius]) => Math.hypot(point[0] - x, point[1] - y) > radius + HAND_RADIUS) &&
+    polygons.every(([corners]) => toPolygon(point, corners) > HAND_RADIUS)
+  );
+}
+
+const noObstacles = ({ discs = [], polygons = [] } = {}) => !discs.length && !polygons.length;
+
+// Poses of the object along an action, from its pose before it.
+export function pathOf(map, [x, y, yaw], direction, stop, turned, samples = PATH_SAMPLES) {
+  return Array.from({ length: samples }, (_, k) => {
+    map.at(direction - turned, (stop * k) / (samples - 1), EFFECT);
+    const [dx, dy] = rotated(EFFECT, direction);
+    return [x + dx, y + dy, yaw + EFFECT[2]];
+  });
+}
+
+// Where the middle of the hand is at a phase, ahead of the object's place before the action.
+export function handAt(hand, phase) {
+  const at = between(0, phase, 1) * (hand.along.length - 1);
+  const k = Math.min(Math.floor(at), hand.along.length - 2);
+  const value = (values) => share(values[k], values[k + 1], at - k);
+  return { along: value(hand.along), gap: value(hand.gap) };
+}
+
+// problem: {object: {map, outline, hand, yaw (of the object in the map's image)}, pose [x, y, yaw],
+// goal [x, y], tolerance, most (actions), partial (may stop early), risk (weight of the variance),
+// obstacles, reachable, table [x0, x1, y0, y1], previous (a chain)}.
+export function plan(problem) {
+  const { object, pose, goal, most = 3, tolerance = 0.02 } = problem;
+  const target = [goal[0] - pose[0], goal[1] - pose[1]];
+  const far = Math.hypot(...target);
+  const fewest = Math.max(1, Math.ceil(far / Math.max(object.map.reach, 1e-4)));
+  let best = null;
+  for (let n = Math.min(fewest, most); n <= most && far > 1e-4; n++) {
+    const found = bestChain(problem, target, n);
+    if (found && !(best?.cost <= found.cost)) best = found;
+    if (best && n > fewest && best.distance < tolerance) break;
+  }
+  const chain = best && best.distance < far ? best.chain : [];
+  const steps = stepsOf(problem, chain);
+  const distance = chain.length ? best.distance : far;
+  return { chain, steps, distance, reached: distance <= tolerance };
+}
+
+export function stepsOf({ object, pose }, chain) {
+  const yaw = pose[2] - (object.yaw ?? 0);
+  const poses = rollOut(object.map, chain, yaw, true);
+  let [from, turned] = [pose, yaw];
+  return poses.map(([x, y, turn, trace], k) => {
+    const [direction, stop] = [chain[2 * k], chain[2 * k + 1]];
+    const path = pathOf(object.map, from, direction, stop, turned);
+    const step = { direction, stop, from, path, std: Math.sqrt(trace) };
+    [from, turned] = [[pose[0] + x, pose[1] + y, pose[2] + turn - yaw], turn];
+    return { ...step, end: from };
+  });
+}
+
+// Numbers in [0, 1) that fill it evenly.
+function halton(i, base) {
+  let [value, part] = [0, 1];
+  for (let k = i; k > 0; k = Math.floor(k / base)) value += (part /= base) * (k % base);
+  return value;
+}
+
+function startsOf({ object, pose, partial = true, obstacles }, target, n) {
+  const yaw = pose[2] - (object.yaw ?? 0);
+  const bearing = Math.atan2(target[1], target[0]);
+  const spread = noObstacles(obstacles) ? SPREAD : Math.PI / 2;
+  const starts = [];
+  for (let i = 1; i <= STARTS; i++) {
+    const chain = [];
+    for (let k = 0; k < n - 1; k++) {
+      const phase = partial ? 0.5 + 0.5 * halton(i, [3, 7][k % 2]) : 1;
+      chain.push(bearing + spread * (2 * halton(i, [2, 5][k % 2]) - 1), phase);
+    }
+    const [x, y, turn] = endOf(object.map, chain, yaw);
+    // A single action begins around the one that ends nearest.
+    const off = n > 1 ? [0, 0] : [0.02 * (halton(i, 2) - 0.5), 0.02 * (halton(i, 3) - 0.5)];
+    const left = rotated([target[0] - x + off[0], target[1] - y + off[1]], -turn);
+    const [direction, phase] = object.map.nearest(...left, partial);
+    starts.push([...chain, direction + turn, phase]);
+  }
+  return starts;
+}
+
+function bestChain(problem, target, n) {
+  const { object, pose, partial = true, risk = 10, previous } = problem;
+  const yaw = pose[2] - (object.yaw ?? 0);
+  const weighed = (chain) => {
+    const [x, y, , trace] = rollOut(object.map, chain, yaw, true).at(-1);
+    const distance = Math.hypot(target[0] - x, target[1] - y);
+    const cost = distance + Math.sqrt(distance ** 2 + risk * trace) + ACTION_COST * n;
+    return { chain, distance, cost };
+  };
+  const sorted = (chains) => chains.map(weighed).sort((a, b) => a.cost - b.cost);
+  const few = [];
+  for (const start of sorted(startsOf(problem, target, n))) {
+    if (few.length < REFINED && isAllowed(problem, start.chain)) few.push(start);
+  }
+  const corrected = few.map(({ chain }) => correct(object.map, target, chain, yaw, partial));
+  const options = sorted([...few.map(({ chain }) => chain), ...corrected]);
+  if (previous?.length === 2 * n && (partial || previous.every((v, k) => k % 2 === 0 || v === 1))) {
+    const kept = weighed(correct(object.map, target, previous, yaw, partial));
+    options.push({ ...kept, cost: kept.cost - LOYALTY });
+    options.sort((a, b) => a.cost - b.cost);
+  }
+  const best = options.find(({ chain }) => isAllowed(problem, chain));
+  if (!best || best.distance < NEAR_ENOUGH) return best;
+  const again = options.slice(0, REFINED).map(({ chain }) => correct(object.map, target, chain, yaw, partial, 40));
+  return sorted([best.chain, ...again]).find(({ chain }) => isAllowed(problem, chain));
+}
+
+// Newton's method on the end of a chain; of all solutions the smallest change.
+export function correct(map, target, start, yaw, partial, rounds = CORRECTIONS) {
+  let chain = start;
+  const off = (other) => {
+    const [x, y] = endOf(map, other, yaw);
+    return [target[0] - x, target[1] - y];
+  };
+  let left = off(chain);
+  for (let round = 0; round < rounds && Math.hypot(...left) > 1e-5; round++) {
+    const columns = chain.map((value, k) => {
+      if (k % 2 && !partial) return [0, 0];
+      const h = k % 2 ? -1e-6 : 1e-6; // a phase of 1 cannot grow
+      const moved = off(chain.with(k, value + h));
+      const scale = k % 2 ? 0.5 : 1; // half the phase moves the end about as far as a radian
+      const slope = [((left[0] - moved[0]) / h) * scale, ((left[1] - moved[1]) / h) * scale];
+      const blocked = k % 2 && value >= 1 && slope[0] * left[0] + slope[1] * left[1] > 0;
+      return blocked ? [0, 0] : slope;
+    });
+    let [a, b, d] = [1e-8, 0, 1e-8];
+    for (const [u, v] of columns) [a, b, d] = [a + u * u, b + u * v, d + v * v];
+    const det = a * d - b * b;
+    const [p, q] = [(d * left[0] - b * left[1]) / det, (a * left[1] - b * left[0]) / det];
+    let step = columns.map(([u, v], k) => (u * p + v * q) * (k % 2 ? 0.5 : 1));
+    const longest = Math.max(...step.map(Math.abs));
+    step = step.map((value) => value * Math.min(1, 0.3 / Math.max(longest, 1e-9)));
+    let better = null;
+    for (let half = 0; half < 4 && !better; half++, step = step.map((value) => value / 2)) {
+      const tried = chain.map((value, k) => (k % 2 ? between(0, value + step[k], 1) : value + step[k]));
+      const after = off(tried);
+      if (Math.hypot(...after) < Math.hypot(...left)) better = [tried, after];
+    }
+    if (!better) break;
+    [chain, left] = better;
+  }
+  return chain;
+}
+
+// Whether the arm can reach all actions, the object stays on the table and meets no obstacle.
+export function isAllowed({ object, pose, reachable, table, obstacles = {} }, chain) {
+  const yaw = pose[2] - (object.yaw ?? 0);
+  let [from, turned] = [pose, yaw];
+  const empty = noObstacles(obstacles);
+  return rollOut(object.map, chain, yaw).every(([x, y, turn], k) => {
+    const [direction, stop] = [chain[2 * k], chain[2 * k + 1]];
+    const to = [pose[0] + x, pose[1] + y, pose[2] + turn - yaw];
+    if (reachable && !reachable(from[0], from[1], direction)) return false;
+    if (table) {
+      const radius = Math.max(...object.outline.map((corner) => Math.hypot(...corner)));
+      const [x0, x1, y0, y1] = table;
+      if (to[0] < x0 + radius || to[0] > x1 - radius) return false;
+      if (to[1] < y0 + radius || to[1] > y1 - radius) return false;
+    }
+    if (!empty) {
+      const path = pathOf(object.map, from, direction, stop, turned, 13);
+      if (!path.every((at) => isFree(placed(object.outline, at), obstacles))) return false;
+      for (let i = 0; object.hand && i <= 10; i++) {
+        const [dx, dy] = rotated([handAt(object.hand, (stop * i) / 10).along, 0], direction);
+        if (!handIsFree([from[0] + dx, from[1] + dy], obstacles)) return false;
+      }
+    }
+    [from, turned] = [to, turn];
+    return true;
+  });
+}
+
+// From here on: the drawing.
+
+const STAR = [...Array(10)].map((_, k) => {
+  const radius = k % 2 ? 0.4 : 1;
+  return [radius * Math.sin((k * Math.PI) / 5), radius * Math.cos((k * Math.PI) / 5)];
+});
+const KEYS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
+const AROUND = [[1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, 1], [1, -1], [-1, -1]];
+const APPROACH = 0.45; // seconds that the hand takes to come down, and to leave
+const LETTER = 7.5; // width of a letter of a label [px]
+
+const still = () => window.matchMedia("(prefers-reduced-motion: reduce)").matches;
+const escaped = (text) =>
+  String(text).replace(/[&<>"']/g, (letter) => `&#${letter.charCodeAt(0)};`);
+
+// Convex hull of points, counter-clockwise.
+function hull(points) {
+  const sorted = [...points].sort((a, b) => a[0] - b[0] || a[1] - b[1]);
+  const half = (those) => {
+    const kept = [];
+    for (const c of those) {
+      for (let [a, b] = kept.slice(-2); kept.length > 1; [a, b] = kept.slice(-2)) {
+        if ((b[0] - a[0]) * (c[1] - a[1]) > (b[1] - a[1]) * (c[0] - a[0])) break;
+        kept.pop();
+      }
+      kept.push(c);
+    }
+    return kept.slice(0, -1);
+  };
+  return [...half(sorted), ...half(sorted.reverse())];
+}
+
+function shape(tag, css, attributes, inside = "") {
+  const said = Object.entries(attributes).map(([name, value]) => ` ${name}="${escaped(value)}"`);
+  return `<${tag} class="${css}"${said.join("")}>${inside}</${tag}>`;
+}
+
+// state: {object, pose, goal {xy, turn, tolerance}, steps, obstacles, ring, trail, sigma, swept, other
+// (steps drawn thin), note (text in a corner), movable (object and obstacles can be moved)}.
+// heard: {goal(xy, final), pose(pose, final), obstacle(k, xy), press(key)}.
+export class Table {
+  constructor(el, heard) {
+    this.heard = heard;
+    this.state = { pose: [0, 0, 0], goal: { xy: [0, 0], tolerance: 0.02 }, steps: [], obstacles: {} };
+    this.camera = null; // [x, y, half of the shown height]
+    this.held = this.tapped = this.clock = null;
+    this.grip = [0, 0]; // from the pointer to the middle of what it holds
+    this.svg = document.createElementNS("http://www.w3.org/2000/svg", "svg");
+    this.svg.setAttribute("role", "application");
+    this.svg.setAttribute("tabindex", 0);
+    el.classList.add("affordlib-table");
+    el.dataset.lmSuppressShortcuts = "true"; // JupyterLab's own, while this has the focus
+    el.append(this.svg);
+    const listen = (name, act) => this.svg.addEventListener(name, act.bind(this));
+    listen("pointerdown", this.pressed);
+    listen("pointermove", this.moved);
+    listen("pointerup", (event) => this.released(event, false));
+    listen("pointercancel", (event) => this.released(event, true));
+    listen("keydown", this.typed);
+    this.watch = new ResizeObserver(() => this.draw());
+    this.watch.observe(this.svg);
+  }
+
+  set(changes) {
+    Object.assign(this.state, changes);
+    if (changes.steps || changes.pose) this.clock = null;
+    this.frame();
+  }
+
+  // Let the view follow what is to be seen; a hand that drags moves it only outwards.
+  frame() {
+    const { pose, goal, steps, object, trail = [] } = this.state;
+    if (!object) return;
+    const radius = Math.max(...object.outline.map((corner) => Math.hypot(...corner)));
+    const seen = [pose, goal.xy, ...trail, ...steps.flatMap(({ from, end, direction }) => {
+      const [dx, dy] = rotated([-0.07, 0], direction);
+      return [end, [from[0] + dx, from[1] + dy]];
+    })];
+    const [xs, ys] = [0, 1].map((axis) => seen.map((point) => point[axis]));
+    const room = this.held ? 0.015 : radius + 0.035;
+    let box = [Math.min(...xs) - room, Math.max(...xs) + room, Math.min(...ys) - room, Math.max(...ys) + room];
+    if (this.held && this.camera) {
+      const [x, y, half] = this.camera;
+      const [width, height] = this.size();
+      const [w, h] = [(half * width) / height, half];
+      if (box[0] > x - w && box[1] < x + w && box[2] > y - h && box[3] < y + h) return this.draw();
+      box = [Math.min(box[0], x - w), Math.max(box[1], x + w), Math.min(box[2], y - h), Math.max(box[3], y + h)];
+    }
+    const [width, height] = this.size();
+    const tall = Math.max(box[3] - box[2], ((box[1] - box[0]) * height) / width) / 2;
+    const half = between(0.11, tall, EXTENT);
+    const wanted = [(box[0] + box[1]) / 2, (box[2] + box[3]) / 2].map((v) => between(half - EXTENT, v, EXTENT - half));
+    this.glide([...wanted, half]);
+  }
+
+  glide(wanted) {
+    cancelAnimationFrame(this.gliding);
+    const from = this.camera;
+    if (!from || still()) {
+      this.camera = wanted;
+      return this.draw();
+    }
+    const began = performance.now();
+    const step = (now) => {
+      const t = between(0, (now - began) / 250, 1);
+      const eased = 1 - (1 - t) ** 3;
+      this.camera = from.map((value, k) => share(value, wanted[k], eased));
+      this.draw();
+      if (t < 1) this.gliding = requestAnimationFrame(step);
+    };
+    step(began);
+  }
+
+  size() {
+    return [this.svg.clientWidth || 480, this.svg.clientHeight || 480];
+  }
+
+  get scale() {
+    return this.size()[1] / (2 * this.camera[2]);
+  }
+
+  // Pixels of a place on the table, and back.
+  at([x, y]) {
+    const [width, height] = this.size();
+    const [cx, cy] = this.camera;
+    return [width / 2 + (x - cx) * this.scale, height / 2 - (y - cy) * this.scale];
+  }
+
+  place(event) {
+    const box = this.svg.getBoundingClientRect();
+    const [width, height] = this.size();
+    const [cx, cy] = this.camera;
+    return [
+      cx + (event.clientX - box.left - this.svg.clientLeft - width / 2) / this.scale,
+      cy - (event.clientY - box.top - this.svg.clientTop - height / 2) / this.scale,
+    ];
+  }
+
+  // The object's pose and the hand at a time of the execution as it is predicted.
+  moment(time) {
+    const { steps, object } = this.state;
+    let left = time;
+    for (const [k, { direction, stop, from, path }] of steps.entries()) {
+      const begins = Math.min(0.9 * object.map.from, stop);
+      const seconds = (stop - begins) * object.seconds;
+      if (left < seconds + 2 * APPROACH || k === steps.length - 1) {
+        const phase = begins + (stop - begins) * between(0, (left - APPROACH) / seconds, 1);
+        const at = between(0, phase / stop, 1) * (path.length - 1);
+        const [a, b] = [path[Math.floor(at)], path[Math.ceil(at)]];
+        const pose = a.map((value, axis) => share(value, b[axis], at % 1));
+        const near = between(0, Math.min(left, seconds + 2 * APPROACH - left) / APPROACH, 1);
+        return { pose, hand: { ...handAt(object.hand, phase), direction, from, near }, k };
+      }
+      left -= seconds + 2 * APPROACH;
+    }
+    return null;
+  }
+
+  get seconds() {
+    const { steps, object } = this.state;
+    const each = steps.map(({ stop }) => Math.max(0, stop - Math.min(0.9 * object.map.from, stop)) * object.seconds);
+    return each.reduce((sum, value) => sum + value + 2 * APPROACH, 0);
+  }
+
+  points(corners) {
+    return corners.map((corner) => this.at(corner).map((v) => v.toFixed(1)).join()).join(" ");
+  }
+
+  outline(pose, css, more = {}) {
+    return shape("polygon", css, { points: this.points(placed(this.state.object.outline, pose)), ...more });
+  }
+
+  disc([x, y], css, radius, more = {}) {
+    const [cx, cy] = this.at([x, y]).map((v) => v.toFixed(1));
+    return shape("circle", css, { cx, cy, r: (radius * this.scale).toFixed(1), ...more });
+  }
+
+  line(points, css) {
+    return shape("polyline", css, { points: this.points(points) });
+  }
+
+  draw() {
+    const { state, scale } = { state: this.state, scale: this.camera ? this.scale : 1 };
+    if (!state.object || !this.camera) return;
+    const { pose, goal, steps, obstacles, trail, other = [], sigma, swept, movable, object } = state;
+    const [width, height] = this.size();
+    const now = this.clock === null ? null : this.moment(this.clock);
+    const end = steps.at(-1)?.end ?? pose;
+    const shapes = [this.ground()];
+    (obstacles.polygons ?? []).forEach(([corners], k) =>
+      shapes.push(shape("polygon", "obstacle", { points: this.points(corners), "data-handle": `polygon ${k}` })));
+    (obstacles.discs ?? []).forEach(([x, y, radius], k) =>
+      shapes.push(this.disc([x, y], "obstacle", radius, { "data-handle": `disc ${k}` })));
+    if (swept && steps.length) {
+      const all = steps.flatMap(({ path }) => path.slice(1).map((at, k) => {
+        const both = hull([...placed(object.outline, path[k]), ...placed(object.outline, at)]);
+        return `M${this.points(both)}Z`;
+      }));
+      shapes.push(shape("path", "swept", { d: all.join("") }));
+    }
+    for (const step of other) shapes.push(this.line(step.path, "other"));
+    if (other.length) shapes.push(this.outline(other.at(-1).end, "other"));
+    steps.forEach((step, k) => {
+      if (sigma) shapes.push(this.disc(step.end, "sigma", ENLARGED * step.std));
+      shapes.push(this.line(step.path, "prediction"));
+      shapes.push(this.outline(step.end, k === steps.length - 1 ? "predicted" : "ghost"));
+    });
+    if (trail?.length) shapes.push(this.line(trail, "truth"));
+    const short = Math.hypot(end[0] - goal.xy[0], end[1] - goal.xy[1]);
+    const missed = short > goal.tolerance && !this.state.planning;
+    if (missed) shapes.push(this.line([end, goal.xy], "short"));
+    shapes.push(this.goal(end, missed));
+    const standing = now?.pose ?? pose;
+    shapes.push(this.outline(standing, "object", { "data-handle": movable ? "object" : "none" }));
+    shapes.push(this.line([standing, this.ahead(standing, 0.5)], "heading"));
+    if (movable && !now) shapes.push(this.knob(pose));
+    if (now) shapes.push(this.hand(now.hand));
+    else if (steps.length && !this.held) shapes.push(...steps.map((step) => this.arrow(step)));
+    shapes.push(shape("g", "labels", {}, this.labels(missed ? short : 0)));
+    shapes.push(this.ruler(width, height, scale));
+    this.svg.innerHTML = shapes.join("");
+    this.svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
+    const said = [...goal.xy, pose[0], pose[1]].map((value) => (100 * value).toFixed(1));
+    this.svg.setAttribute(
+      "aria-label",
+      `Table from above. The goal is at x = ${said[0]}, y = ${said[1]} cm, the object at x = ${said[2]}, ` +
+        `y = ${said[3]} cm. Arrow keys move the goal by 1 cm, with Shift by 1 mm; Enter runs the plan, ` +
+        "Escape stops it.",
+    );
+    Object.assign(this.svg.dataset, { view: this.camera.map((v) => v.toFixed(5)).join(" ") });
+  }
+
+  ground() {
+    const { ring } = this.state;
+    const shapes = [];
+    if (ring) {
+      const [x, inner, outer] = ring;
+      const rims = [outer, inner].map((r) => this.disc([x, 0], r === inner ? "reach inner" : "reach", r));
+      shapes.push(...rims);
+    }
+    const [cx, cy, half] = this.camera;
+    const [width, height] = this.size();
+    const [w, step] = [(half * width) / height, 0.05];
+    for (let x = Math.ceil((cx - w) / step) * step; x < cx + w; x += step) {
+      for (let y = Math.ceil((cy - half) / step) * step; y < cy + half; y += step) {
+        const [u, v] = this.at([x, y]);
+        shapes.push(shape("circle", "dot", { cx: u.toFixed(1), cy: v.toFixed(1), r: 1 }));
+      }
+    }
+    return shapes.join("");
+  }
+
+  goal(end, missed) {
+    const { goal, pose } = this.state;
+    const [u, v] = this.at(goal.xy);
+    const yaw = goal.turn == null ? end[2] : pose[2] + goal.turn;
+    const size = between(9, 0.012 * this.scale, 15);
+    const star = STAR.map(([x, y]) => `${(u + size * x).toFixed(1)},${(v - size * y).toFixed(1)}`);
+    return shape("g", "wanted", { "data-handle": "goal" }, [
+      shape("circle", "grip", { cx: u, cy: v, r: 28 }),
+      this.outline([...goal.xy, yaw], goal.turn == null ? "place" : "place turned"),
+      this.disc(goal.xy, "tolerance", goal.tolerance),
+      shape("polygon", missed ? "goal missed" : "goal", { points: star.join(" ") }),
+    ].join(""));
+  }
+
+  ahead(pose, part) {
+    const long = part * Math.max(...this.state.object.outline.map((corner) => Math.hypot(...corner)));
+    const [dx, dy] = rotated([long, 0], pose[2]);
+    return [pose[0] + dx, pose[1] + dy];
+  }
+
+  knob(pose) {
+    const [a, b] = [this.at(pose), this.at(this.ahead(pose, 1.25))];
+    const more = 10 / Math.hypot(b[0] - a[0], b[1] - a[1]);
+    const [x, y] = b.map((value, k) => (value + (value - a[k]) * more).toFixed(1));
+    return shape("g", "knob", { "data-handle": "yaw" },
+      shape("circle", "grip", { cx: x, cy: y, r: 22 }) + shape("circle", "turner", { cx: x, cy: y, r: 6 }));
+  }
+
+  hand({ along, gap, direction, from, near }) {
+    const wide = Math.max(gap / 2, 0.006);
+    const [x, y] = this.at([from[0] + along * Math.cos(direction), from[1] + along * Math.sin(direction)]);
+    const s = this.scale * share(1.25, 1, near);
+    const finger = (side) => shape("rect", "finger", {
+      x: -0.022 * s, y: (side * wide - 0.009) * s, width: 0.022 * s, height: 0.018 * s, rx: 0.004 * s });
+    const palm = shape("rect", "palm", {
+      x: -0.05 * s, y: -(wide + 0.02) * s, width: 0.032 * s, height: 2 * (wide + 0.02) * s, rx: 0.008 * s });
+    const turn = `translate(${x} ${y}) rotate(${(-direction * 360) / TURN})`;
+    return shape("g", "hand", { transform: turn, opacity: near.toFixed(2) }, palm + finger(-1) + finger(1));
+  }
+
+  // Where an action begins to push, outside the object.
+  arrow({ direction, from }) {
+    const turned = this.state.object.outline.map((corner) => rotated(corner, from[2] - direction)[0]);
+    const [x, y] = this.at(from);
+    const back = -Math.min(...turned) * this.scale + 4;
+    const turn = `translate(${x} ${y}) rotate(${(-direction * 360) / TURN})`;
+    const line = shape("path", "push", { d: `M${-back - 34} 0H${-back - 9}` });
+    return shape("g", "arrow", { transform: turn }, line + shape("path", "push-head", { d: `M${-back} 0l-12 6v-12z` }));
+  }
+
+  labels(short) {
+    const { steps, goal, pose, object, sigma } = this.state;
+    const taken = placed(object.outline, pose).map((at) => [...this.at(at), 6]);
+    if (this.state.movable) taken.push([...this.at(this.ahead(pose, 1.5)), 14]);
+    taken.push([...this.at(goal.xy), Math.max(18, goal.tolerance * this.scale)], [...this.at(pose), 14]);
+    for (const { path, end, from, direction } of steps) {
+      for (const at of [...path, ...placed(object.outline, end)]) taken.push([...this.at(at), 5]);
+      for (const back of [-0.05, -0.07, -0.09]) {
+        const [dx, dy] = rotated([back, 0], direction);
+        taken.push([...this.at([from[0] + dx, from[1] + dy]), 8]);
+      }
+    }
+    const texts = steps.map(({ stop, end }, k) => [`${k + 1}: ${Math.round(100 * stop)} %`, end, "step"]);
+    const last = steps.at(-1);
+    if (short) texts.push([`${(100 * short).toFixed(short < 0.01 ? 1 : 0)} cm short`, goal.xy, "step short-by"]);
+    if (sigma && last?.std) {
+      texts.push([`σ ${(1000 * last.std).toFixed(1)} mm (× ${ENLARGED})`, last.end, "step small"]);
+    }
+    return texts.map(([text, at, css]) => this.label(text, this.at(at), css, taken)).join("");
+  }
+
+  label(text, [u, v], css, taken) {
+    const [width, height] = this.size();
+    const [w, h] = [(LETTER * text.length + 14) / 2, 11];
+    let [best, room] = [null, -Infinity];
+    for (const gap of [12, 28, 48, 75, 110]) {
+      for (const [i, j] of AROUND) {
+        const x = between(w + 3, u + i * (w + gap), width - w - 3);
+        const y = between(h + 3, v + j * (h + gap), height - h - 3);
+        const away = Math.min(...taken.map(([a, b, r]) =>
+          Math.hypot(Math.max(Math.abs(a - x) - w, 0), Math.max(Math.abs(b - y) - h, 0)) - r));
+        if (Math.min(away, 3) > room) [best, room] = [[x, y], Math.min(away, 3)];
+      }
+    }
+    const [x, y] = best;
+    for (let dx = -w; dx <= w; dx += h) taken.push([x + dx, y, h]);
+    const rim = [between(x - w, u, x + w), between(y - h, v, y + h)];
+    const leader = Math.hypot(rim[0] - u, rim[1] - v) > 45
+      ? shape("path", "leader", { d: `M${rim.join(" ")}L${u} ${v}` }) : "";
+    const plate = shape("rect", "plate", { x: x - w, y: y - h, width: 2 * w, height: 2 * h, rx: h });
+    return leader + shape("g", css, {}, plate + shape("text", "", { x, y: y + 4.5 }, escaped(text)));
+  }
+
+  ruler(width, height, scale) {
+    const cm = [10, 5, 2].find((value) => (value / 100) * scale < width / 3) ?? 2;
+    const long = (cm / 100) * scale;
+    const d = `M12 ${height - 20}v6h${long.toFixed(1)}v-6`;
+    const note = shape("text", "note", { x: width - 12, y: 22 }, escaped(this.state.note ?? ""));
+    return shape("path", "ruler", { d }) + note +
+      shape("text", "tick", { x: 12 + long / 2, y: height - 22 }, `${cm} cm`);
+  }
+
+  // What a pointer grabs. By touch only what is marked, since a swipe elsewhere scrolls the page.
+  pressed(event) {
+    if (event.button || !this.camera) return;
+    const at = this.place(event); // before focusing, which may scroll the drawing into view
+    const name = event.target.closest("[data-handle]")?.dataset.handle ?? "none";
+    this.tapped = event.pointerType === "touch" && name === "none";
+    if (this.tapped) return;
+    this.held = name === "none" ? "goal" : name;
+    const { pose } = this.state;
+    this.grip = this.held === "object" ? [pose[0] - at[0], pose[1] - at[1]] : [0, 0];
+    this.clock = null;
+    this.svg.setPointerCapture(event.pointerId);
+    this.svg.classList.add("by-pointer"); // focused so, it needs no frame
+    this.svg.focus({ preventScroll: true });
+    event.preventDefault();
+    this.move(at, false);
+  }
+
+  moved(event) {
+    if (this.held) this.move(this.place(event), false);
+  }
+
+  released(event, cancelled) {
+    const { held, tapped } = this;
+    this.held = this.tapped = null;
+    if (cancelled) return;
+    this.held = tapped ? "goal" : held;
+    if (this.held) this.move(tapped ? this.place(event) : this.last, true); // the view may have moved
+    this.held = null;
+    this.frame();
+  }
+
+  move(at, final) {
+    this.last = at;
+    const { pose, goal } = this.state;
+    const [x, y] = at.map((value, k) => between(-LIMIT, value + this.grip[k], LIMIT));
+    const [name, k] = this.held.split(" ");
+    if (name === "goal") {
+      const xy = [x, y].map((value) => Math.round(1000 * value) / 1000);
+      if (!final && xy[0] === goal.xy[0] && xy[1] === goal.xy[1]) return;
+      this.heard.goal?.(xy, final);
+    } else if (name === "object") this.heard.pose?.([x, y, pose[2]], final);
+    else if (name === "yaw") this.heard.pose?.([pose[0], pose[1], Math.atan2(at[1] - pose[1], at[0] - pose[0])], final);
+    else this.heard.obstacle?.(name, Number(k), [x, y], final);
+  }
+
+  typed(event) {
+    this.svg.classList.remove("by-pointer");
+    const { goal, pose, movable } = this.state;
+    const step = event.shiftKey ? 0.001 : 0.01;
+    if (event.key in KEYS) {
+      const xy = KEYS[event.key].map((way, k) => between(-LIMIT, goal.xy[k] + way * step, LIMIT));
+      this.heard.goal?.(xy.map((value) => Math.round(1000 * value) / 1000), true);
+    } else if (movable && (event.key === "q" || event.key === "e")) {
+      this.heard.pose?.([pose[0], pose[1], pose[2] + (event.key === "q" ? 1 : -1) * 0.0873], true);
+    } else if (event.key === "Enter" || event.key === "Escape") this.heard.press?.(event.key);
+    else return;
+    event.preventDefault();
+    event.stopPropagation();
+  }
+
+  destroy() {
+    this.watch.disconnect();
+    cancelAnimationFrame(this.gliding);
+  }
+}

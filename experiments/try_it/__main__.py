@@ -1,0 +1,5 @@
+"""`python -m experiments.try_it`."""
+
+from experiments.try_it import main
+
+main()
