@@ -79,7 +79,7 @@ def test_the_browser_predicts_what_the_effect_map_predicts(ask, seen, skills, na
         chain = torch.tensor(plan["chain"], dtype=torch.float64).reshape(-1, 2)
         direction, phase = chain.T[:, None]
         ends, turns, variances = roll_out(effects, direction - 0.7, phase)
-        ends = rotated(ends[0].numpy(), 0.7) + (0.01, -0.02)
+        ends = np.array((0.01, -0.02)) + rotated(ends[0].numpy(), 0.7)
         poses = np.array([step["end"] for step in plan["steps"]]).reshape(-1, 3)
         np.testing.assert_allclose(poses[:, :2], ends, atol=5e-5)
         np.testing.assert_allclose(poses[:, 2] - 0.7, turns[0], atol=1e-3)
@@ -130,7 +130,7 @@ def test_no_plan_meets_an_obstacle(ask, seen):
     for one, plan in zip(asked, found, strict=True):
         moved += bool(plan["steps"])
         for x, y, yaw in (pose for step in plan["steps"] for pose in step["path"]):
-            points = rotated(rim, yaw) + (x, y)
+            points = np.array((x, y)) + rotated(rim, yaw)
             for u, v, radius, _ in one["obstacles"]["discs"]:
                 assert np.hypot(*(points - (u, v)).T).min() > radius + 0.008
             for corners, _ in one["obstacles"]["polygons"]:
