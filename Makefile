@@ -23,8 +23,10 @@ INPUTS := requirements.txt constraints.txt pyproject.toml
 # JupyterLab asks nobody outside for news or updates.
 QUIET  := {"@jupyterlab/apputils-extension:notification": {"fetchNews": "false", "checkForUpdates": false}}
 
-SHELL         := /bin/bash
-.SHELLFLAGS   := -eu -o pipefail -c
+# Where Linux has its setpriv, a command ends with the make that has started it, even a killed one.
+LEASH         := $(if $(shell command -v setpriv),setpriv --pdeathsig TERM)
+SHELL         := $(firstword $(LEASH) /bin/bash)
+.SHELLFLAGS   := $(wordlist 2,9,$(LEASH) /bin/bash -eu -o pipefail -c)
 .DEFAULT_GOAL := help
 MAKEFLAGS     += --no-print-directory
 # What seems to come from the future (unpacked in another time zone) would never be older.
@@ -87,9 +89,8 @@ $(STAMP): $(INPUTS)
 	 echo '$(QUIET)' > .venv/share/jupyter/lab/settings/overrides.json; \
 	 printf '%s' "$(CURDIR)" > $@
 
-# One page for each goal below RUN. Several pages at a time, with one thread each, finish earlier
-# than one after the other with several threads. Whatever is killed ends what it has started.
-LEASH := setpriv --pdeathsig TERM
+# Make calls itself, with RUN and the pages as goals. Several pages at a time, with one thread each,
+# finish earlier than one after the other with several threads.
 
 workbook: $(STAMP) ## Run all pages into runs/, two at a time (PROFILE=smoke|reader|full WORKERS= SEED= OUT= ONLY= ARGS= FORCE=1 DRY_RUN=1)
 notebooks: $(STAMP) ## Execute the committed pages in place and clean their metadata (ONLY= FORCE=1)
@@ -98,7 +99,7 @@ workbook notebooks:
 	@set -f; goals=$$($(PY) notebooks/pages.py); run=$${goals%% *}; \
 	 [[ "$$WORKERS" =~ ^[1-9][0-9]?$$ ]] || { echo "WORKERS must be a whole number from 1 to 99" >&2; exit 1; }; \
 	 $(if $(DRY_RUN),,mkdir -p "$$run"; exec 9>> "$$run/.lock"; flock -n 9 || { echo "Another run is writing to $$run; wait for it, or choose another name with OUT=" >&2; exit 1; };) \
-	 exec $(LEASH) $(MAKE) $(if $(DRY_RUN),-n) $(if $(findstring jobserver,$(MAKEFLAGS)),,-j"$$WORKERS") RUN="$$run" $${goals#* }
+	 exec $(MAKE) $(if $(DRY_RUN),-n) $(if $(findstring jobserver,$(MAKEFLAGS)),,-j"$$WORKERS") RUN="$$run" $${goals#* }
 
 ifdef RUN
 # Copies of results are no input. A name with a blank, which make cannot express, is not ours.
@@ -106,7 +107,7 @@ USED := $(STAMP) $(wildcard notebooks/*.py) $(shell find affordlib experiments n
   ! -path '*/.*' ! -path '*/__pycache__/*' ! -path 'data/results/[0-9][0-9]_*' ! -path '* *' 2>/dev/null)
 define PAGES
 $(RUN)/%.ipynb $(RUN)/%.json: $(1)/%.ipynb $(USED)
-	@$(if $(filter-out 1,$(WORKERS)),OMP_NUM_THREADS=1) exec $(LEASH) $(PY) notebooks/run.py $$< $$(@D)/$$*.ipynb
+	@$(if $(filter-out 1,$(WORKERS)),OMP_NUM_THREADS=1) exec $(PY) notebooks/run.py $$< $$(@D)/$$*.ipynb
 endef
 $(foreach folder,notebooks notebooks/appendix,$(eval $(call PAGES,$(folder))))
 endif
@@ -114,11 +115,11 @@ endif
 seeds: $(STAMP) ## Run all pages for several seeds, and write tables over seeds (SEEDS="0 1 2" …)
 	@set -f; name="$${OUT:-$$PROFILE}"; \
 	 for seed in $$SEEDS; do $(LEASH) $(MAKE) workbook SEED="$$seed" OUT="$$name-seed$$seed"; done; \
-	 $(if $(DRY_RUN),,exec $(LEASH) $(PY) -m experiments.seeds "runs/$$name" $$SEEDS)
+	 $(if $(DRY_RUN),,exec $(PY) -m experiments.seeds "runs/$$name" $$SEEDS)
 
 lab: $(STAMP) ## Open the book in JupyterLab, on this machine only (ARGS="--port 9999 --no-browser")
 	@set -f; root=; [[ $$(id -u) == 0 ]] && root=--allow-root; \
-	  JUPYTER_PREFER_ENV_PATH=1 $(PY) -m jupyterlab --ip=127.0.0.1 $$root \
+	  JUPYTER_PREFER_ENV_PATH=1 exec $(PY) -m jupyterlab --ip=127.0.0.1 $$root \
 	  --ServerApp.root_dir="$(CURDIR)" --LabApp.default_url=/lab/tree/notebooks/00_start_here.ipynb $$ARGS
 
 # One thread, because tests compute many small operations and share the machine with a browser.
