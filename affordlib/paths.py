@@ -1,14 +1,11 @@
-"""Locations of files: the repository, its shipped data, and the folders that runs write to."""
+"""Locations of files: a relative path starts at the repository, wherever a program runs."""
 
 import os
 from pathlib import Path
 
 
 def repo_root() -> Path:
-    """Return the root folder of the checkout that contains the package.
-
-    Raises FileNotFoundError if the package was installed apart from its checkout.
-    """
+    """Return the root folder of the checkout; FileNotFoundError if the package is apart from it."""
     root = Path(__file__).resolve().parents[1]
     if not (root / "pyproject.toml").is_file():
         raise FileNotFoundError(
@@ -20,17 +17,25 @@ def repo_root() -> Path:
 
 def from_root(path: str | os.PathLike[str]) -> Path:
     """Return an absolute path; a relative one is resolved against the root of the repository."""
-    path = Path(os.path.expanduser(path))
+    path = Path(path).expanduser()
     return path if path.is_absolute() else repo_root() / path
 
 
-def resolve_out_dir(out_dir: str | os.PathLike[str]) -> Path:
-    """Return the folder for results, and create it if missing.
+def file_at(path: str | os.PathLike[str]) -> Path:
+    """Return the absolute path of a file to read, resolved as in `from_root`.
 
-    A relative path starts at the repository. Raises NotADirectoryError if a file has that name.
+    Raises FileNotFoundError unless it is a regular file: a pipe or a device might never end.
     """
-    if not isinstance(out_dir, str | os.PathLike) or not os.fspath(out_dir):
-        raise ValueError(f"out_dir must name a folder, such as 'runs/lab', got {out_dir!r}")
+    path = from_root(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no file {path}")
+    return path
+
+
+def resolve_out_dir(out_dir: str | os.PathLike[str]) -> Path:
+    """Return the folder for results, resolved as in `from_root`; it is created if missing."""
+    if not os.fspath(out_dir):
+        raise ValueError("out_dir must name a folder, such as 'runs/lab', got ''")
     path = from_root(out_dir)
     try:
         path.mkdir(parents=True, exist_ok=True)

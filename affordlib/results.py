@@ -15,6 +15,7 @@ import math
 import os
 import platform
 import re
+import secrets
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -23,7 +24,7 @@ from typing import Any
 import numpy as np
 import psutil
 
-from affordlib.paths import from_root, resolve_out_dir
+from affordlib.paths import file_at, from_root, resolve_out_dir
 from affordlib.primitives import Primitive, PushAt, primitive_named
 from affordlib.types import Goal, Plan, Step
 
@@ -114,11 +115,10 @@ def read_results(path: str | os.PathLike[str]) -> dict[str, Any]:
 
     Raises FileNotFoundError if it is missing and ValueError if it is not a file of results.
     """
-    path = from_root(path)
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"path: there are no results at {path}; run the notebook that writes them"
-        )
+    try:
+        path = file_at(path)
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"path: {error}; run the notebook that writes it") from None
     try:
         document = _plain(json.loads(path.read_text(encoding="utf-8")), "it")
         return {key: document[key] for key in ("notebook", "parameters", "versions", "tables")}
@@ -132,9 +132,10 @@ def write_atomically(path: Path, content: bytes | str, mark: bytes = b"") -> Non
     """Replace a file with `content` atomically; a crash leaves the old file or the new one.
 
     mark: bytes near the start of every file of this type. Raises FileExistsError, and changes
-    nothing, for a file without them, a folder or a broken link. Missing folders are created.
+    nothing, for a file without them, a folder or a broken link; OSError that names the file if it
+    cannot be written. Missing folders are created, the file's mode is kept, a link is replaced.
     """
-    if path.is_symlink() or path.exists():
+    if os.path.lexists(path):
         head = b""
         if path.is_file():
             with path.open("rb") as file:
@@ -146,24 +147,28 @@ def write_atomically(path: Path, content: bytes | str, mark: bytes = b"") -> Non
             )
     path.parent.mkdir(parents=True, exist_ok=True)
     for left in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):  # of killed processes
-        pid = left.name.split(".")[-2]
+        pid = left.name.split(".")[-3]
         if pid.isdigit() and not psutil.pid_exists(int(pid)):
             left.unlink(missing_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(8)}.tmp")
     try:
-        with temporary.open("wb") as file:
+        with temporary.open("xb") as file:  # x: nothing that has this name is opened
             file.write(content.encode() if isinstance(content, str) else content)
             file.flush()
             os.fsync(file.fileno())
+            if path.exists():
+                os.fchmod(file.fileno(), path.stat().st_mode & 0o777)
         os.replace(temporary, path)
-    except BaseException:
+    except BaseException as error:
         temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename is None:
+            error.filename = str(path)
         raise
 
 
 def save_plan(path: str | os.PathLike[str], plan: Plan) -> Path:
     """Write a plan and its goal to a JSON file and return its path."""
-    path = Path(path)
+    path = from_root(path)
     text = json.dumps(plan, default=_as_data, indent=1, allow_nan=False)
     write_atomically(path, text + "\n", _PLAN_MARK)
     return path
@@ -174,11 +179,11 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
 
     Raises FileNotFoundError, or ValueError that names the file and its fault.
     """
-    if not Path(path).is_file():
-        raise FileNotFoundError(f"there is no plan at {path}; choose another path")
+    path = file_at(path)
     try:
-        data = json.loads(Path(path).read_text(encoding="utf-8"))
-        return Plan(**data | {"goal": Goal(**data["goal"]), "steps": _steps(data["steps"])})
+        data = json.loads(path.read_text(encoding="utf-8"))
+        steps = tuple(_step(**step) for step in data["steps"])
+        return Plan(**data | {"goal": Goal(**data["goal"]), "steps": steps})
     except Exception as error:
         what = f"{error.args[0]!r} is missing" if isinstance(error, KeyError) else str(error)
         raise ValueError(f"path: {path} holds no plan: {what}") from None
@@ -188,15 +193,9 @@ def _as_data(value: Any) -> Any:
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     data = {field.name: getattr(value, field.name) for field in fields(value)}
-    if isinstance(value, Primitive):
-        return {"name": value.name} | data
     if isinstance(value, Step) and math.isnan(value.std_m):
         data["std_m"] = None
-    return data
-
-
-def _steps(steps: list[dict[str, Any]]) -> tuple[Step, ...]:
-    return tuple(_step(**step) for step in steps)
+    return {"name": value.name} | data if isinstance(value, Primitive) else data
 
 
 def _step(**data: Any) -> Step:

@@ -14,7 +14,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
-from affordlib.paths import repo_root
+from affordlib.paths import file_at, from_root
 from affordlib.results import write_atomically
 
 SUFFIX = ".safetensors"
@@ -24,17 +24,17 @@ _KEY = "affordlib"
 def resolve_checkpoint(name_or_path: str | Path) -> Path:
     """Return the file of a shipped checkpoint's name or of a path; FileNotFoundError if none."""
     path = Path(name_or_path)
-    folder = repo_root() / "data" / "checkpoints"
-    path = path if path.suffix == SUFFIX else folder / f"{name_or_path}{SUFFIX}"
-    if not path.is_file():
+    path = path if path.suffix == SUFFIX else Path(f"data/checkpoints/{name_or_path}{SUFFIX}")
+    try:
+        return file_at(path)
+    except FileNotFoundError as error:
         others = ("np_", "reachability")  # these have their own load functions
-        shipped = [p.stem for p in sorted(folder.glob(f"*{SUFFIX}"))]
+        shipped = [p.stem for p in sorted(from_root("data/checkpoints").glob(f"*{SUFFIX}"))]
         shipped = [name for name in shipped if not name.startswith(others)]
         raise FileNotFoundError(
-            f"checkpoint {str(name_or_path)!r}: there is no file {path}; give one of the "
-            f"shipped names {shipped} or the path of a {SUFFIX} file"
-        )
-    return path
+            f"checkpoint {str(name_or_path)!r}: {error}; give one of the shipped names {shipped} "
+            f"or the path of a {SUFFIX} file"
+        ) from None
 
 
 def weights_sha256(tensors: dict[str, torch.Tensor], text: str) -> str:
@@ -49,13 +49,14 @@ def write_weights(
     tensors = {name: value.contiguous() for name, value in tensors.items()}
     text = json.dumps(description, allow_nan=False)
     content = json.dumps({"sha256": weights_sha256(tensors, text), "description": text})
-    path = Path(path)
+    path = from_root(path)
     write_atomically(path, save(tensors, {_KEY: content}), mark=f'"{_KEY}"'.encode())
     return path
 
 
 def read_weights(path: str | Path, remedy: str) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
     """Read what `write_weights` wrote; ValueError, which ends with the remedy, if it is damaged."""
+    path = file_at(path)
     try:
         with safe_open(path, "pt") as file:
             content = json.loads((file.metadata() or {})[_KEY])

@@ -1,38 +1,73 @@
-"""Worker processes: those of a Dask scheduler, or new ones on this machine."""
+"""Work in several processes of this machine, or wherever joblib is told to."""
 
-import logging
-from collections.abc import Iterator
-from contextlib import contextmanager
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, nullcontext
+from typing import Any
 
-_LOOPBACK = {"host": "127.0.0.1", "dashboard": False, "dashboard_address": "127.0.0.1:0"}
+from joblib import Parallel, delayed, parallel_config
+
+MOST_WORKERS = 256
 
 
-@contextmanager
-def dask_client(workers: int = 1, scheduler: str | None = None) -> "Iterator[Client | None]":
-    """Connect to the Dask scheduler at an address, or start `workers` processes on this machine.
+def spread(
+    function: Callable[[Any], Any], tasks: Mapping[str, Any], workers: int = 1
+) -> Iterator[tuple[str, Any]]:
+    """Yield the name of each task and function(task) as soon as it is computed.
 
-    Yields the client, or None for one worker (this process). New processes listen on this machine.
+    In this process for one worker, unless joblib.parallel_config says otherwise; else in new
+    processes, which end with this one. Raises RuntimeError that names a task that fails, or those
+    that were running when a process died.
     """
-    if scheduler is None and workers == 1:
-        yield None
-        return
-    from dask.distributed import Client, Scheduler, SpecCluster
-    from distributed.deploy.subprocess import SubprocessWorker
+    running = []
 
-    if scheduler is not None:
-        with Client(scheduler) as client:
-            yield client
-        return
-    quiet = logging.CRITICAL  # a task's exception is raised in this process as well
-    # A worker ends if it cannot reach its scheduler for this long, as after a kill.
-    more = {"nthreads": 1, "silence_logs": quiet, "death_timeout": "30 s"}
-    options = {"worker_kwargs": _LOOPBACK | more}
-    with (
-        SpecCluster(
-            {k: {"cls": SubprocessWorker, "options": options} for k in range(workers)},
-            {"cls": Scheduler, "options": _LOOPBACK | {"port": 0}},
-            silence_logs=quiet,
-        ) as cluster,
-        Client(cluster) as client,
-    ):
-        yield client
+    def calls():
+        for name, task in tasks.items():
+            running.append(name)
+            yield delayed(_attempt)(function, name, task)
+
+    new = parallel_config("loky", inner_max_num_threads=1, initializer=_end_with_parent)
+    with new if workers > 1 else nullcontext():
+        parallel = Parallel(
+            max(1, min(workers, len(tasks))) if workers > 1 else None,
+            return_as="generator_unordered",
+            batch_size=1,
+            pre_dispatch="n_jobs",
+        )
+    with closing(parallel(calls())) as results:
+        try:
+            for name, result, error in results:
+                running.remove(name)
+                if error is not None:
+                    break
+                yield name, result
+            else:
+                return
+        except Exception as lost:
+            name, error = " or ".join(running), lost
+    raise RuntimeError(f"{name} failed: {type(error).__name__}: {error}") from error
+
+
+def _attempt(
+    function: Callable[[Any], Any], name: str, task: Any
+) -> tuple[str, Any, Exception | None]:
+    try:
+        return name, function(task), None
+    except Exception as error:
+        return name, None, error
+
+
+def _end_with_parent() -> None:
+    """Leave Ctrl-C to the parent process, and end this one within a second of its end."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = os.getppid()
+
+    def watch():
+        while os.getppid() == parent:
+            time.sleep(0.5)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

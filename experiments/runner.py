@@ -15,14 +15,18 @@ running jobs and at most half a minute. Equal results give identical bytes.
 from __future__ import annotations
 
 import argparse
+import asyncio
 import gzip
 import hashlib
 import importlib
 import inspect
 import json
+import os
 import sys
 import time
+import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -31,21 +35,22 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from filelock import FileLock
+from joblib import parallel_config
 from scipy.stats import bootstrap
 from tqdm.auto import tqdm
 
 from affordlib.interactions import open_interactions
 from affordlib.interactions.store import stored_sha256
 from affordlib.models.checkpoint import NOVELTY
-from affordlib.paths import repo_root, resolve_out_dir
+from affordlib.paths import file_at, repo_root, resolve_out_dir
 from affordlib.planning.reachability import SHIPPED as REACHABILITY
 from affordlib.results import write_atomically, write_results
 from affordlib.weights import read_weights, resolve_checkpoint, weights_sha256
-from affordlib.workers import dask_client
+from affordlib.workers import spread
 from experiments.commands import worker_type
 
 FOLDER = "data/results/raw"
-WRITE_EVERY_S = 30
+WRITE_EVERY_S, ANSWER_S = 30, 30
 NOT_DECISIVE = ("device", "max_minutes", "sigma_scale")
 """Options without influence on results: those of the machine, and those fitted afterwards."""
 
@@ -88,6 +93,10 @@ class Job:
             "checkpoints": [hash_of(name, "checkpoint") for name in self.checkpoints],
         }
 
+    def importable(self) -> Job:
+        """Return the job with the function of the imported module, for a worker's `__main__`."""
+        return replace(self, function=_importable(self.function))
+
     def record(self, resume_checkpoint: Path) -> dict[str, Any]:
         """Call the function and return a line of the table."""
         takes = inspect.signature(self.function).parameters
@@ -122,29 +131,29 @@ def study(*data: str, **decides: Any) -> Callable[[Callable[..., Any]], Callable
 def run(
     jobs: Sequence[Job],
     table: str,
-    client: dask.distributed.Client | None = None,
     folder: str | Path = FOLDER,
+    workers: int = 1,
     progress: bool = True,
 ) -> list[Any]:
-    """Return the results of jobs, in order; compute missing or stale ones, here or with Dask."""
+    """Return the results of jobs, in order; compute missing or stale ones as `spread` does."""
     folder = resolve_out_dir(folder)
     records, keys = _records(table, folder), [_key(job.arguments) for job in jobs]
     tasks = {
-        key: (job, folder / f".{table}-{_sha256([key, job.made_of()])}.pt")
+        key: (job.importable(), folder / f".{table}-{_sha256([key, job.made_of()])}.pt")
         for key, job in zip(keys, jobs, strict=True)
         if key not in records or _stale(records[key], job)
     }
-    made, last = (
-        tqdm(_made([*tasks.values()], client), table, len(tasks), disable=not (progress and tasks)),
-        0.0,
-    )
     new: dict[str, dict[str, Any]] = {}
+    made, last = spread(_record, tasks, workers), 0.0
+    bar = tqdm(total=len(tasks), desc=table, disable=not (progress and tasks))
     try:
-        for record in made:
-            new[_key(record["arguments"])] = record
-            if time.monotonic() - last > WRITE_EVERY_S:
-                _add(new, table, folder)
-                last = time.monotonic()
+        with closing(made), bar:
+            for key, record in made:
+                new[key] = record
+                bar.update()
+                if time.monotonic() - last > WRITE_EVERY_S:
+                    _add(new, table, folder)
+                    last = time.monotonic()
     finally:
         if new:
             _add(new, table, folder)
@@ -152,6 +161,11 @@ def run(
             for path in folder.glob(f"{tasks[key][1].name}*"):
                 path.unlink()
     return [(records | new)[key]["result"] for key in keys]
+
+
+def _record(task: tuple[Job, Path]) -> dict[str, Any]:
+    job, resume_checkpoint = task
+    return job.record(resume_checkpoint)
 
 
 def read(
@@ -212,6 +226,32 @@ def parser(table: str, description: str | None) -> argparse.ArgumentParser:
     return shared
 
 
+@contextmanager
+def cluster(scheduler: str | None) -> Iterator[None]:
+    """Let the workers of a Dask scheduler, if an address is given, run what `spread` runs.
+
+    Raises OSError if it does not answer within `ANSWER_S`.
+    """
+    if scheduler is None:
+        yield
+        return
+    from dask.distributed import Client, Security
+    from distributed.core import rpc
+
+    async def answer() -> None:
+        async with rpc(scheduler, connection_args=Security().get_connection_args("client")) as it:
+            await it.identity()
+
+    try:
+        asyncio.run(asyncio.wait_for(answer(), ANSWER_S))
+    except OSError as error:
+        raise OSError(
+            f"--scheduler: there is no Dask scheduler at {scheduler}: no answer in {ANSWER_S} s"
+        ) from error
+    with Client(scheduler), parallel_config("dask"):
+        yield
+
+
 def make(
     jobs: Sequence[Job],
     table: str,
@@ -226,28 +266,11 @@ def make(
             there = ", ".join(sorted(known))
             raise ValueError(f"--only: no job has {name} = {unknown[0]!r:.40}, but {there}")
         jobs = [job for job in jobs if str(job.arguments.get(name)) in values]
-    workers = min(options.workers, max(1, len(jobs)))
-    with dask_client(workers, options.scheduler) as client:
-        run(jobs, table, client, options.raw)
+    with cluster(options.scheduler):
+        run(jobs, table, options.raw, options.workers)
     if tables is not None:
         print(write_results(options.out, table, {}, tables(options.raw)))
     return 0
-
-
-def _made(
-    tasks: list[tuple[Job, Path]], client: dask.distributed.Client | None
-) -> Iterator[dict[str, Any]]:
-    if client is None:
-        yield from (job.record(path) for job, path in tasks)
-        return
-    from dask.distributed import as_completed
-
-    sent = [(replace(job, function=_importable(job.function)), path) for job, path in tasks]
-    futures = [client.submit(Job.record, *task, pure=False) for task in sent]
-    try:
-        yield from (future.result() for future in as_completed(futures))
-    finally:
-        client.cancel(futures)
 
 
 def _importable(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -268,8 +291,17 @@ def _records(table: str, folder: Path) -> dict[str, dict[str, Any]]:
     """Return the lines of a table by their arguments."""
     hash_of.cache_clear()
     path = folder / f"{table}.jsonl.gz"
-    lines = gzip.decompress(path.read_bytes()).splitlines() if path.is_file() else []
-    return {_key(record["arguments"]): record for record in map(json.loads, lines)}
+    if not os.path.lexists(path):
+        return {}
+    try:
+        content = file_at(path).read_bytes()
+        lines = gzip.decompress(content or b"?").splitlines()  # nothing would be no results
+        return {_key(record["arguments"]): record for record in map(json.loads, lines)}
+    except (OSError, EOFError, zlib.error, ValueError, KeyError, TypeError) as error:
+        raise ValueError(
+            f"{path} is damaged, or holds no results ({error!r}); fetch it again, or delete it to "
+            "run its jobs again"
+        ) from error
 
 
 def _add(new: dict[str, dict[str, Any]], table: str, folder: Path) -> None:

@@ -54,10 +54,10 @@ from affordlib.planning.reachability import Reachability, reach_features
 from affordlib.primitives import Drag, Push
 from affordlib.results import write_atomically
 from affordlib.types import Goal
-from affordlib.workers import dask_client
 from affordlib.world import Tabletop
 from experiments.attention import AttentionConfig
 from experiments.commands import command, worker_type
+from experiments.runner import cluster
 from experiments.tasks import (
     FROZEN,
     MIN_DISTANCE_M,
@@ -156,8 +156,8 @@ def compare(old: xr.Dataset, new: xr.Dataset) -> tuple[bool, str]:
 
 def collect_sets(options: argparse.Namespace) -> bool:
     """Collect data sets; return whether each agrees with the existing one."""
-    agree = True
-    with dask_client(options.workers, options.scheduler) as client:
+    agree, workers = True, 1 if options.scheduler else options.workers
+    with cluster(options.scheduler):
         for name in options.only or SHIPPED:
             try:
                 old = open_interactions(name)
@@ -165,7 +165,7 @@ def collect_sets(options: argparse.Namespace) -> bool:
                 old = None
                 print(f"{name}: there is no existing data set to compare with ({error})")
             target = f"{options.to}/{name}{DATA_SUFFIX}"
-            new = open_interactions(collect(RECIPES[name], target, client, replace=True))
+            new = open_interactions(collect(RECIPES[name], target, workers, replace=True))
             print(f"{name}: {new.sizes['interaction']} interactions, sha256 {dataset_sha256(new)}")
             if old is not None:
                 same, sentence = compare(old, new)

@@ -1,16 +1,18 @@
-"""Collection of data sets: seeded, resumable, in this process or on a Dask cluster.
+"""Collection of data sets: seeded, resumable, in one or many processes, or on a Dask cluster.
 
 This module also defines the variables of a data set: arrays, dimensions, units and provenance.
 
 Workers return chunks of interactions, which are stored in a hidden folder beside the file until
 all are complete; a rerun collects only missing chunks. The finished set is bit-identical for any
-number of workers and any size and order of chunks.
+number of workers and any size and order of chunks. On a cluster:
+
+    with Client("tcp://HOST:8786"), joblib.parallel_config("dask"):
+        collect(recipe, path)
 """
 
 import os
 import shutil
-from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import fields
 from functools import partial
 from importlib import metadata
@@ -28,6 +30,7 @@ from affordlib.interactions.store import (
     open_interactions,
     write_interactions,
 )
+from affordlib.paths import from_root
 from affordlib.primitives import PRIMITIVES, LeverUp, primitive_named
 from affordlib.types import (
     ACTION_CHANNELS,
@@ -36,7 +39,7 @@ from affordlib.types import (
     Interaction,
     check_count,
 )
-from affordlib.workers import dask_client
+from affordlib.workers import MOST_WORKERS, spread
 from affordlib.world import CATEGORIES, Tabletop, TabletopObject, WorldConfig
 from affordlib.world.execution import RECORDED_SAMPLES
 from affordlib.world.trajectory import N_SAMPLES
@@ -90,45 +93,46 @@ _PHASE = {
 def collect(
     recipe: Recipe,
     path: str | Path,
-    client: "dask.distributed.Client | None" = None,
     workers: int = 1,
     progress: bool = True,
     replace: bool = False,
     chunk: int | None = None,
-) -> str | Path:
+) -> Path:
     """Collect a recipe's data set into a local file and return its path, which ends in .zarr.zip.
 
-    client: a Dask client; None uses `workers` processes on this machine, at most 256. A rerun
-    collects missing chunks; a complete file is replaced only with `replace`. chunk: interactions
-    per chunk, 50 by default. Raises ValueError if the path holds anything else, RuntimeError if
-    another process is collecting into it or if a chunk cannot be collected.
+    A rerun collects missing chunks; a complete file is replaced only with `replace`. workers: see
+    `workers.spread`. chunk: interactions per chunk, 50 by default. Raises ValueError if the path holds
+    anything else, RuntimeError if another process is collecting into it or if a chunk cannot be
+    collected.
     """
     if not str(path).endswith(SUFFIX):
         raise ValueError(f"path must end in {SUFFIX!r}, got {str(path)!r}")
-    check_count("workers", workers, 1, 256)
+    check_count("workers", workers, 1, MOST_WORKERS)
     size = check_count("chunk", CHUNK if chunk is None else chunk)
-    if client is None and workers > 1:
-        with dask_client(workers) as local:
-            return collect(recipe, path, local, 1, progress, replace, chunk)
-
-    attrs, file = attributes_for(recipe), Path(path).absolute()
-    is_there = _is_there(file, attrs, replace)
+    attrs, file = attributes_for(recipe), from_root(path)
     parts = file.with_name(f".{file.name}.parts")
+    if _is_there(file, attrs, replace):
+        with suppress(OSError):  # parts are left if a process was killed at its very end
+            if parts.is_dir():
+                with FileLock(parts / "lock", timeout=0):
+                    shutil.rmtree(parts)
+        return file
     parts.mkdir(parents=True, exist_ok=True)
     try:
         with FileLock(parts / "lock", timeout=0):
-            if not is_there:
-                whole = _collected(recipe, attrs, parts, size, client, progress)
-                write_interactions(whole, file)
+            if not _is_there(file, attrs, replace):  # another process may have completed it
+                n = recipe.n_interactions
+                rows = [range(k, min(k + size, n)) for k in range(0, n, size)]
+                write_interactions(_collected(recipe, attrs, parts, rows, workers, progress), file)
             shutil.rmtree(parts, ignore_errors=True)
     except Timeout:
         raise RuntimeError(
             f"another process is collecting into {file}; wait for it, or choose another path"
         ) from None
-    except (KeyboardInterrupt, OSError) as error:
+    except (KeyboardInterrupt, OSError, RuntimeError) as error:
         error.add_note("finished chunks are kept; collect into the same path to continue")
         raise
-    return path
+    return file
 
 
 def _attributes(file: Path) -> dict[str, str] | None:
@@ -154,22 +158,20 @@ def _collected(
     recipe: Recipe,
     attrs: dict[str, str],
     parts: Path,
-    size: int,
-    client: "dask.distributed.Client | None",
+    rows: list[range],
+    workers: int,
     progress: bool,
 ) -> xr.Dataset:
     """Collect the chunks that are missing in `parts` and return the complete set."""
-    n = recipe.n_interactions
-    rows = [range(k, min(k + size, n)) for k in range(0, n, size)]
     kept = {r: parts / f"{r.start:08d}-{r.stop:08d}{SUFFIX}" for r in rows}
-    missing = [r for r in rows if _attributes(kept[r]) != attrs]
-    made = _made(partial(_make, recipe, attrs), missing, client)
-    there, disable = n - sum(map(len, missing)), not progress
-    bar = tqdm(total=n, initial=there, unit=" interactions", disable=disable)
-    with closing(made), bar:
-        for r, chunk in made:
-            write_interactions(chunk, kept[r], level=1)  # temporary, so speed matters
-            bar.update(len(r))
+    left = [r for r in rows if _attributes(kept[r]) != attrs]
+    missing = {f"interactions {r.start} to {r[-1]}": r for r in left}
+    n, there = recipe.n_interactions, recipe.n_interactions - sum(map(len, left))
+    bar = tqdm(total=n, initial=there, unit=" interactions", disable=not progress)
+    with closing(spread(partial(_make, recipe, attrs), missing, workers)) as made, bar:
+        for name, chunk in made:
+            write_interactions(chunk, kept[missing[name]], level=1)  # temporary, so speed matters
+            bar.update(len(missing[name]))
     chunks = [open_interactions(path) for path in kept.values()]
     return xr.concat(chunks, "interaction", data_vars="minimal", combine_attrs="override")
 
@@ -183,34 +185,6 @@ def _make(recipe: Recipe, attrs: dict[str, str], rows: range) -> xr.Dataset:
             f"not {attrs}; install the same package versions on both"
         )
     return collect_chunk(recipe, rows)
-
-
-def _made(
-    make: partial, missing: list[range], client: "dask.distributed.Client | None"
-) -> Iterator[tuple[range, xr.Dataset]]:
-    """Yield rows and data of each chunk once it is collected, here or by the client's workers."""
-    futures = {}
-    if client is None:
-        results = ((rows, partial(make, rows)) for rows in missing)
-    else:
-        from dask.distributed import as_completed
-
-        futures = {client.submit(make, rows, pure=False): rows for rows in missing}
-        results = ((futures.pop(f), f.result) for f in as_completed(list(futures)))
-    try:
-        for rows, result in results:
-            try:
-                chunk = result()
-            except Exception as error:
-                raise RuntimeError(
-                    f"interactions {rows.start} to {rows.stop - 1} could not be collected: "
-                    f"{type(error).__name__}: {error}; finished chunks are kept; fix the cause and "
-                    "collect into the same path again"
-                ) from error
-            yield rows, chunk
-    finally:
-        if futures:
-            client.cancel(list(futures))
 
 
 def attributes_for(recipe: Recipe) -> dict[str, str]:

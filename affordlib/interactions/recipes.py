@@ -3,6 +3,7 @@
 import json
 import math
 from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import Self
 
 import numpy as np
@@ -112,53 +113,17 @@ class Recipe:
     def from_json(cls, text: str) -> Self:
         """Return the recipe from the text that `to_json` returned."""
         fields = json.loads(text)
-        fields["categories"] = fields.pop("families")
-        fields["world"] = WorldConfig(**fields["world"])
-        if fields["variation"] is not None:
-            fields["variation"] = Variation(**fields["variation"])
+        if "families" in fields:
+            fields["categories"] = fields.pop("families")
+        for name, kind in (("world", WorldConfig), ("variation", Variation)):
+            if fields.get(name) is not None:
+                fields[name] = kind(**fields[name])
         return cls(**fields)
 
 
-_ROLLABLE = ("lying_cylinder", "sphere")
-_STABLE = ("cuboid", "upright_cylinder")
-_PUSH = Recipe()
-_MIXED = Recipe(primitives=("push", "drag"), categories=_STABLE + _ROLLABLE, seed=2)
-
-_SHIPPED = {
-    "push": _PUSH,
-    "drag": Recipe(primitives=("drag",), categories=_ROLLABLE, seed=1),
-    "mixed": _MIXED,
-    "grasp": Recipe(
-        primitives=("grasp",),
-        n_interactions=100,
-        seed=3,
-        categories=_STABLE + _ROLLABLE,
-        size_range_m=(0.03, 0.12),
-        world=WorldConfig(object_friction=0.25),
-    ),
-    "rotate": Recipe(
-        primitives=("rotate",), n_interactions=100, seed=4, categories=(*_STABLE, "prism")
-    ),
-    "lever_up": Recipe(
-        primitives=("lever_up",),
-        n_interactions=1800,
-        seed=5,
-        categories=("prism",),
-        size_range_m=(0.15, 0.24),
-        height_range_m=(0.03, 0.06),
-        world=WorldConfig(table_friction=1.0, object_friction=0.8, finger_friction=1.2),
-    ),
-    "push_test": replace(_PUSH, n_interactions=1000, seed=1_000_003),
-    "partial": replace(_MIXED, n_interactions=300, seed=1_000_004, partial=True),
-    "push_varied": replace(_PUSH, seed=6, categories=(*_STABLE, "prism"), variation=Variation()),
-    "reach": Recipe(
-        primitives=("push", "drag", "grasp", "rotate"),
-        n_interactions=1000,
-        seed=7,
-        categories=(*_STABLE, *_ROLLABLE, "prism"),
-        anywhere=True,
-    ),
-}
+_FILE = Path(__file__).with_name("recipes.json")
+_PLAIN = json.loads(_FILE.read_text(encoding="utf-8"))
+_SHIPPED = {name: Recipe.from_json(json.dumps(fields)) for name, fields in _PLAIN.items()}
 _TEN_TIMES = {
     f"{name}_x10": replace(recipe, n_interactions=10 * recipe.n_interactions, seed=recipe.seed + 10)
     for name, recipe in _SHIPPED.items()

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import fsspec
 import numpy as np
-from fsspec.core import url_to_fs
+import psutil
 
-from affordlib.paths import repo_root
+from affordlib.paths import file_at, from_root
 from affordlib.results import write_atomically
 
 SUFFIX = ".zarr.zip"
@@ -78,30 +78,41 @@ def write_interactions(data: "xarray.Dataset", path: Path, level: int = 9) -> No
 def _url_of(name_or_path: str | Path) -> str:
     """Return the path or URL of a set; raises FileNotFoundError if it does not exist."""
     url = os.fspath(name_or_path)
-    if not url.endswith(SUFFIX):
-        url = str(repo_root() / "data" / f"{url}{SUFFIX}")
-    fs, path = url_to_fs(url)
-    if not fs.exists(path):
-        shipped = sorted(
-            p.name.removesuffix(SUFFIX) for p in (repo_root() / "data").glob(f"*{SUFFIX}")
-        )
-        raise FileNotFoundError(
-            f"interactions {str(name_or_path)!r}: there is no file {url}; give one of the shipped "
-            f"names {shipped} or the path of a {SUFFIX} file, or collect them with `make data`"
-        )
+    url = url if url.endswith(SUFFIX) else f"data/{url}{SUFFIX}"
+    if "://" not in url:
+        try:
+            return str(file_at(url))
+        except FileNotFoundError as error:
+            shipped = sorted(
+                p.name.removesuffix(SUFFIX) for p in from_root("data").glob(f"*{SUFFIX}")
+            )
+            raise FileNotFoundError(
+                f"interactions {str(name_or_path)!r}: {error}; give one of the shipped names "
+                f"{shipped} or the path of a {SUFFIX} file, or collect them with `make data`"
+            ) from None
     return url
 
 
-def _read(url: str, only: str | None = None) -> tuple[dict[str, dict[str, str]], dict[str, bytes]]:
-    """Read the manifest of a set, and the files of its zip (all, or only one) by name."""
-    found, name = {}, "its directory"
+def _read(url: str, arrays: bool = True) -> tuple[dict[str, str], dict[str, bytes]]:
+    """Read the hashes of a set's arrays and, if wanted, the verified files of its zip."""
+    found, names = {}, [MANIFEST]
+    name = "its directory"
     try:
         with fsspec.open(url, "rb") as file, zipfile.ZipFile(file) as archive:
-            for name in archive.namelist() if only is None else [only]:
+            room = file.seek(0, os.SEEK_END)  # nothing in it is compressed as a member of the zip
+            while names:
+                name = names.pop()
+                room -= archive.getinfo(name).file_size
+                if room < 0:
+                    raise ValueError("it is larger than the file")
                 found[name] = archive.read(name)
-            name = MANIFEST
-            manifest = json.loads(found[MANIFEST])
-            return {kind: dict(manifest[kind]) for kind in ("arrays", "files")}, found
+                if name == MANIFEST:
+                    plain = json.loads(found.pop(name))
+                    manifest = {kind: dict(plain[kind]) for kind in ("arrays", "files")}
+                    names = sorted(manifest["files"]) if arrays else []
+                elif hashlib.sha256(found[name]).hexdigest() != manifest["files"][name]:
+                    raise ValueError("its hash differs")
+        return manifest["arrays"], found
     except Exception as error:
         raise CorruptedDataError(
             f"{url} cannot be read: {name} is damaged or missing ({error!r}); {_REMEDY}"
@@ -110,8 +121,7 @@ def _read(url: str, only: str | None = None) -> tuple[dict[str, dict[str, str]],
 
 def stored_sha256(name_or_path: str | Path) -> str:
     """Return the `dataset_sha256` of a stored set from its manifest, without reading arrays."""
-    url = _url_of(name_or_path)
-    return _hash_of(_read(url, MANIFEST)[0]["arrays"])
+    return _hash_of(_read(_url_of(name_or_path), arrays=False)[0])
 
 
 def open_interactions(name_or_path: str | Path) -> "xarray.Dataset":
@@ -123,14 +133,18 @@ def open_interactions(name_or_path: str | Path) -> "xarray.Dataset":
     from zarr.buffer.cpu import Buffer
     from zarr.storage import MemoryStore
 
+    from affordlib.interactions.recipes import RECIPES
+
     url = _url_of(name_or_path)
-    manifest, files = _read(url)
-    for name, digest in manifest["files"].items():
-        if hashlib.sha256(files.get(name, b"")).hexdigest() != digest:
-            raise CorruptedDataError(f"{url}: {name} is missing or damaged; {_REMEDY}")
-    store = MemoryStore({n: Buffer.from_bytes(c) for n, c in files.items() if n != MANIFEST})
+    store = MemoryStore({n: Buffer.from_bytes(c) for n, c in _read(url)[1].items()})
     try:
         with xarray.open_zarr(store, consolidated=False, zarr_format=3) as data:
-            return data[sorted(data.data_vars)].load()
+            if data.nbytes > psutil.virtual_memory().total:
+                raise ValueError(f"its arrays of {data.nbytes / 1e9:.0f} GB exceed the memory")
+            data = data[sorted(data.data_vars)].load()
+            recipe = RECIPES.get(str(name_or_path))
+            if recipe is not None and data.attrs.get("recipe") != recipe.to_json():
+                raise ValueError(f"its recipe is not that of {name_or_path!r}")
+            return data
     except Exception as error:
         raise CorruptedDataError(f"{url} is not a data set ({error}); {_REMEDY}") from error

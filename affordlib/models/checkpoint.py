@@ -5,6 +5,7 @@ that can be resumed is a PyTorch zip file, which is read without running any cod
 """
 
 import io
+import json
 import pickle
 import zipfile
 from collections.abc import Callable
@@ -22,6 +23,7 @@ from affordlib.models.cnp import AffordanceCNP, CNPConfig
 from affordlib.models.domain import TrainingDomain
 from affordlib.models.film import FiLMConfig, FiLMNetwork, LastPoseCNP, LastPoseConfig
 from affordlib.models.lstm import LSTMConfig, LSTMNetwork
+from affordlib.paths import file_at, from_root
 from affordlib.results import write_atomically
 from affordlib.weights import SUFFIX, read_weights, resolve_checkpoint, write_weights
 
@@ -90,8 +92,17 @@ def load_checkpoint(name_or_path: str | Path) -> tuple[EffectNetwork, dict[str, 
         parts = {"config": config_class, "scaler": Scaler, "domain": TrainingDomain}
         return kind(*(part(**_with_tuples(description[name])) for name, part in parts.items()))
 
-    model, description = restored(resolve_checkpoint(name_or_path), _REMEDY, make)
-    return model, description["about"]
+    path = resolve_checkpoint(name_or_path)
+    model, description = restored(path, _REMEDY, make)
+    about, words = description["about"], {*path.stem.split("_")}
+    if not str(name_or_path).endswith(SUFFIX):  # such as film_500: network and size of the set
+        n = str(json.loads(about["recipe"])["n_interactions"])
+        if n not in words or not words & {*description["model"].split("_")}:
+            raise ValueError(
+                f"{path} holds a model {description['model']!r} trained on {n} interactions, "
+                f"not what its name says; {_REMEDY}"
+            )
+    return model, about
 
 
 def restored(
@@ -121,11 +132,12 @@ def save_state(path: str | Path, state: dict[str, Any]) -> None:
     """Write a training state, which `load_state` reads, to a file atomically."""
     buffer = io.BytesIO()
     torch.save(state, buffer)
-    write_atomically(Path(path), buffer.getvalue(), mark=b"/data.pkl")
+    write_atomically(from_root(path), buffer.getvalue(), mark=b"/data.pkl")
 
 
 def load_state(path: str | Path, device: torch.device | str = "cpu") -> dict[str, Any]:
     """Load what `save_state` wrote; ValueError when the file is damaged or of another kind."""
+    path = file_at(path)
     try:
         with zipfile.ZipFile(path) as archive:
             damaged = archive.testzip()

@@ -1,6 +1,8 @@
 """Jobs: existing results are kept, stale ones refused, and a kill loses little."""
 
+import gzip
 import importlib
+import socket
 import subprocess
 import sys
 from dataclasses import dataclass, replace
@@ -8,6 +10,7 @@ from dataclasses import dataclass, replace
 import pandas as pd
 import pytest
 from dask.distributed import Client
+from joblib import parallel_config
 from pandas.testing import assert_frame_equal
 
 from affordlib.paths import repo_root
@@ -110,10 +113,35 @@ def test_a_data_set_that_is_not_here_is_not_compared(tmp_path, monkeypatch):
 def test_workers_make_the_same_bytes(tmp_path):
     jobs = [job(n) for n in range(1, 5)]
     run(jobs, "table", folder=tmp_path / "here", progress=False)
-    with Client(processes=False, dashboard_address=None, n_workers=1) as client:
-        run(jobs[::-1], "table", client, tmp_path / "away", progress=False)
+    with (
+        Client(processes=False, n_workers=1, threads_per_worker=1, dashboard_address=None),
+        parallel_config("dask"),
+    ):
+        run(jobs[::-1], "table", tmp_path / "away", progress=False)
     here, away = (tmp_path / side / "table.jsonl.gz" for side in ("here", "away"))
     assert here.read_bytes() == away.read_bytes()
+
+
+def test_a_scheduler_that_does_not_answer_is_named(monkeypatch):
+    monkeypatch.setattr(runner, "ANSWER_S", 1)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        port = silent.getsockname()[1]
+        for address in (f"tcp://127.0.0.1:{port}", "tcp://127.0.0.1:1"):
+            said = f"no Dask scheduler at {address}: no answer in 1 s"
+            with pytest.raises(OSError, match=said), runner.cluster(address):
+                pass
+
+
+def test_damaged_results_are_named_and_none_are_no_results(tmp_path):
+    run([job(2)], "table", tmp_path, progress=False)
+    path = tmp_path / "table.jsonl.gz"
+    whole = path.read_bytes()
+    flipped = bytes([*whole[:-9], whole[-9] ^ 1, *whole[-8:]])
+    for content in (b"", whole[:-4], flipped, b"x" + whole[1:], gzip.compress(b"[1]")):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=r"table\.jsonl\.gz is damaged"):
+            run([job(2)], "table", tmp_path, progress=False)
+        assert path.read_bytes() == content
 
 
 TABLES = ("effect_prediction", "lever_up", "planning", "closed_loop", "open_loop_pose_goals")
