@@ -100,10 +100,9 @@ def collect(
 ) -> Path:
     """Collect a recipe's data set into a local file and return its path, which ends in .zarr.zip.
 
-    A rerun collects missing chunks; a complete file is replaced only with `replace`. workers: see
-    `workers.spread`. chunk: interactions per chunk, 50 by default. Raises ValueError if the path holds
-    anything else, RuntimeError if another process is collecting into it or if a chunk cannot be
-    collected.
+    A rerun collects missing chunks; a complete file is replaced only with `replace`. chunk:
+    interactions per chunk, 50 by default. Raises ValueError if the path holds anything else,
+    RuntimeError if another process is collecting into it or if a chunk cannot be collected.
     """
     if not str(path).endswith(SUFFIX):
         raise ValueError(f"path must end in {SUFFIX!r}, got {str(path)!r}")
