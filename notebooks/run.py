@@ -6,6 +6,7 @@ The copy of a page is written last, so one that exists is complete.
 """
 
 import os
+import re
 import shutil
 import signal
 import sys
@@ -93,16 +94,18 @@ def execute(path: Path, copy: Path) -> None:
 
 def explained(path: Path, copy: Path, error: Exception, printed: Path) -> str:
     """Describe a failure: page, cell number in the committed page, and reason."""
-    reason, where = f"{type(error).__name__}: {error}", ""
+    where, said = "", printed.read_text(errors="replace") if printed.is_file() else ""
+    cells = own_cells(nbformat.read(copy, as_version=4)) if copy.is_file() else []
+    for number, cell in enumerate(cells, 1):
+        if cell.metadata.get("papermill", {}).get("start_time"):
+            line = cell.source.strip().partition("\n")[0]
+            where = f" in cell {number}, which begins `{line}`; the executed copy is {copy}"
+            said = "".join(o.text for o in cell.get("outputs", []) if o.get("name") == "stderr")
+    reason = f"{type(error).__name__}: {error}"
     if isinstance(error, papermill.PapermillExecutionError) and error.evalue:
         reason = f"{error.ename}: {error.evalue}"
-    elif printed.is_file() and (said := printed.read_text(errors="replace").split("\n")):
-        reason = next((line for line in reversed(said) if line.strip()), reason)
-    with suppress(OSError):
-        for number, cell in enumerate(own_cells(nbformat.read(copy, as_version=4)), 1):
-            if cell.metadata.get("papermill", {}).get("start_time"):
-                line = cell.source.strip().partition("\n")[0]
-                where = f" in cell {number}, which begins `{line}`; the executed copy is {copy}"
+    elif found := re.search(r"^\w[\w.]*(Error|Exception)\b.*", said, re.MULTILINE):
+        reason = found[0]  # of a kernel without memory or files left to say it properly
     return f"{path.stem} failed{where}\n{reason}"
 
 
