@@ -29,6 +29,22 @@ def cross(a: Any, b: Any) -> Any:
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
+def is_convex(corners: np.ndarray) -> bool:
+    """Return whether corners (k, 2) go counter-clockwise around a convex polygon."""
+    edges = np.roll(corners, -1, axis=0) - corners
+    following = np.roll(edges, -1, axis=0)
+    turns, inner = cross(edges, following), (edges * following).sum(axis=1)
+    rounds = np.arctan2(turns, inner).sum() / (2 * math.pi)  # 1 for convex, 2 for a star
+    return len(corners) > 2 and bool((turns > 0).all()) and rounds < 1.5
+
+
+def centroid(corners: np.ndarray) -> np.ndarray:
+    """Return the centroid (2,) of a polygon with the given corners (k, 2)."""
+    following = np.roll(corners, -1, axis=0)
+    doubled = cross(corners, following)
+    return ((corners + following) * doubled[:, None]).sum(axis=0) / (3 * doubled.sum())
+
+
 def xy_columns(channels: tuple[str, ...]) -> list[int]:
     """Return the indices of the channels x and y, or an empty list unless both exist."""
     return [channels.index(name) for name in "xy"] if {"x", "y"} <= {*channels} else []

@@ -17,7 +17,7 @@ from scipy.spatial import ConvexHull
 
 from affordlib.geometry import cross, wrap_angle
 from affordlib.primitives import Drag, Grasp, Primitive
-from affordlib.types import CROP_WIDTH_M, IMAGE_PIXELS, check_array, check_pair, check_within
+from affordlib.types import CROP_WIDTH_M, IMAGE_PIXELS
 
 CAMERA_HEIGHT_M = 1.0
 _ROUND = 0.8
@@ -168,48 +168,16 @@ def adapt_to_object(primitive: Primitive, image: np.ndarray) -> Primitive:
     return primitive
 
 
-def height_map(
-    points: np.ndarray, centre_m: tuple[float, float], width_m: float = CROP_WIDTH_M
-) -> np.ndarray:
+def height_map(points: np.ndarray, centre_m: np.ndarray) -> np.ndarray:
     """Return the mean height [m] of points (n, 3) in each pixel of a crop, 0 where empty."""
-    pixel = width_m / IMAGE_PIXELS
-    at = np.floor((points[:, :2] - np.array(centre_m)) / pixel + IMAGE_PIXELS / 2)
+    pixel = CROP_WIDTH_M / IMAGE_PIXELS
+    at = np.floor((points[:, :2] - centre_m) / pixel + IMAGE_PIXELS / 2)
     inside = ((at >= 0) & (at < IMAGE_PIXELS)).all(axis=1)
     column, row = at[inside].astype(int).T
     cell = (IMAGE_PIXELS - 1 - row) * IMAGE_PIXELS + column
     count = np.bincount(cell, minlength=IMAGE_PIXELS**2)
     total = np.bincount(cell, weights=points[inside, 2], minlength=IMAGE_PIXELS**2)
     return (total / np.maximum(count, 1)).reshape(IMAGE_PIXELS, IMAGE_PIXELS)
-
-
-def crop_from_depth(
-    depth: np.ndarray,
-    intrinsics: tuple[float, float, float, float],
-    camera_pose: np.ndarray,
-    centre: tuple[float, float],
-    width_m: float = CROP_WIDTH_M,
-    noise_m: float = 0.004,
-) -> np.ndarray:
-    """Convert a depth image of any camera to depth [m] and mask (2, 48, 48) of an object.
-
-    depth: (rows, columns) [m] along the optical axis, zero where unknown; intrinsics: focal lengths
-    and principal point fx, fy, cx, cy [px]; camera_pose: (4, 4) transform from the camera (z ahead,
-    y down) to the world (z up, zero on the table); centre: (x, y) [m] of the crop; noise_m: points
-    higher than this belong to the object.
-    """
-    depth, pose = check_array("depth", depth), check_array("camera_pose", camera_pose, 4, 4)
-    focal_and_middle = check_array("intrinsics", intrinsics, 4)
-    if depth.ndim != 2 or pose.ndim != 2 or focal_and_middle.ndim != 1:
-        raise ValueError(f"depth must be an image (rows, columns), got {depth.shape}")
-    fx, fy, cx, cy = focal_and_middle
-    width_m = check_within("width_m", width_m, 0.01, 10.0, "m")
-    row, column = np.nonzero(depth > 0)
-    z = depth[row, column]
-    ray = np.stack([(column - cx) / fx, (row - cy) / fy, np.ones_like(z), 1 / z], axis=1)
-    points = (z[:, None] * ray) @ pose[:3].T
-    height = height_map(points, check_pair("centre", centre), width_m)
-    mask = largest_blob(height > check_within("noise_m", noise_m, 0.0, 0.1, "m"))
-    return np.stack([CAMERA_HEIGHT_M - height, mask]).astype(np.float32)
 
 
 def outline_image(

@@ -5,22 +5,15 @@ over the phase t in [0, 1], relative to the object's initial position.
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from functools import cached_property
-from typing import ClassVar, Self
+from collections.abc import Callable, Sequence
+from dataclasses import MISSING, dataclass, field, fields, replace
+from functools import cached_property, partial
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
 from affordlib.geometry import unit_vector, wrap_angle
-from affordlib.types import (
-    check_array,
-    check_choice,
-    check_field,
-    check_finite,
-    check_pair,
-    check_within,
-)
+from affordlib.types import check_array, check_choice, check_finite, check_pair, check_within
 
 DURATION_S = 3.75
 """Duration [s] of every primitive: 25 samples, one every 3 steps of 50 ms (Section 4.2)."""
@@ -47,11 +40,15 @@ def min_jerk(t: np.ndarray | Sequence[float] | float) -> np.ndarray:
     return np.asarray(t**3 * (10.0 - 15.0 * t + 6.0 * t**2))
 
 
+X, Y, Z, YAW, GRIPPER, PITCH = range(6)
+"""Columns of a pose of the tool: position [m], yaw [rad], gripper (1 open, 0 closed) and pitch
+[rad, nose down]. An action (5,) has all but the pitch."""
+
+
 @dataclass(frozen=True)
 class Segment:
     """A straight part of a primitive: its duration [s] and the poses (6,) at its start and end.
 
-    Poses are x, y, z [m], yaw [rad], gripper (1 open, 0 closed) and pitch [rad, nose down].
     A guarded segment stops when the robot feels contact with the object.
     """
 
@@ -65,35 +62,51 @@ class Segment:
         return self.start + np.asarray(share)[:, None] * (self.end - self.start)
 
 
+def parameter(check: Callable[[str, Any], Any], default: Any = MISSING) -> Any:
+    """Declare a primitive's parameter; check(name, value) returns its valid value or raises."""
+    return field(default=default, metadata={"check": check})
+
+
+def metres(low: float, high: float, default: Any = MISSING) -> Any:
+    """Declare a parameter that is a length in [low, high] m."""
+    return parameter(partial(check_within, low=low, high=high, unit="m"), default)
+
+
+def radians(default: Any = MISSING, first: float = -math.pi) -> Any:
+    """Declare a parameter that is an angle [rad], kept in the turn that begins with `first`."""
+    turn = 2 * math.pi
+    return parameter(lambda name, v: (check_finite(name, v) - first) % turn + first, default)
+
+
 @dataclass(frozen=True)
 class Primitive:
     """An action with its parameters; `segments` define how the gripper moves.
 
     opening_m is the gap between the fingers where the gripper channel is 1, force_N the maximum
-    force of each finger, `holds` whether the object remains in the hand at the end. With default
-    parameters the gripper touches nothing before the phase `acts_from`.
+    force of each finger, `holds` whether the object remains in the hand at the end, `rollable`
+    whether it is for objects that roll (True), that do not (False), or for both (None). With
+    default parameters the gripper touches nothing before the phase `acts_from`.
     """
 
     name: ClassVar[str]
     opening_m: ClassVar[float]
     force_N: ClassVar[float]
     holds: ClassVar[bool] = False
+    rollable: ClassVar[bool | None] = None
     tool: ClassVar[str] = "gripper"
     acts_from: ClassVar[float] = 0.0
-    lengths_m: ClassVar[dict[str, tuple[float, float]]] = {}
-    """Valid range [m] of each parameter that is a length."""
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            name, value = field.name, getattr(self, field.name)
-            if value is None and field.default is None:
-                continue
-            if name in self.lengths_m:
-                check_field(self, name, *self.lengths_m[name], "m")
-            elif name in ("theta", "grip_yaw", "direction"):
-                angle = check_finite(name, value)
-                angle = angle % (2 * math.pi) if name == "theta" else wrap_angle(angle)
-                object.__setattr__(self, name, angle)
+        for declared in fields(self):
+            check, value = declared.metadata.get("check"), getattr(self, declared.name)
+            if check and not (value is None and declared.default is None):
+                checked = check(f"{type(self).__name__}.{declared.name}", value)
+                object.__setattr__(self, declared.name, checked)
+
+    @classmethod
+    def sample(cls, outline_m: np.ndarray, rng: np.random.Generator) -> Self:
+        """Sample parameters for an object with an outline (n, 2) [m] about its centre."""
+        return cls()
 
     @cached_property
     def segments(self) -> tuple[Segment, ...]:
@@ -116,13 +129,13 @@ class Primitive:
         ):
             inside = (phase >= start) & (phase <= end)
             share = min_jerk((phase[inside] - start) / (end - start))
-            action[inside] = segment.at(share)[:, :5]
+            action[inside] = segment.at(share)[:, :PITCH]
         return action
 
     def ends(self) -> np.ndarray:
         """Return the commanded action (2, 5) at t = 0 and t = 1, faster than with `path`."""
         first, last = self.segments[0].at(np.zeros(1)), self.segments[-1].at(np.ones(1))
-        return np.concatenate([first, last])[:, :5]
+        return np.concatenate([first, last])[:, :PITCH]
 
     def succeeded(self, effect: np.ndarray) -> bool:
         """Return whether a final effect (5,) is a success: here, a displacement above 1 cm."""
@@ -150,10 +163,23 @@ def _segments(*stops: tuple[float, tuple[float, ...]], guarded: int = -1) -> tup
     )
 
 
-class _Move(Primitive):
-    """A primitive that moves an object in a straight line, in a direction given by theta."""
+@dataclass(frozen=True)
+class Move(Primitive):
+    """A primitive that moves an object in a straight line, in a direction given by theta [rad].
+
+    reach_m: distance [m] by which one full action moves nearly any object, for planning of routes.
+    """
+
+    theta: float = radians(first=0.0)
+    length: float = metres(0.0, 0.15, 0.05)
 
     ahead_rad: ClassVar[float] = 0.0
+    reach_m: ClassVar[float]
+
+    @classmethod
+    def sample(cls, outline_m: np.ndarray, rng: np.random.Generator) -> Self:
+        """Sample theta uniformly."""
+        return cls(float(rng.uniform(0, 2 * math.pi)))
 
     @classmethod
     def towards(cls, direction_rad: float, **kwargs: float) -> Self:
@@ -167,7 +193,7 @@ class _Move(Primitive):
 
 
 @dataclass(frozen=True)
-class Push(_Move):
+class Push(Move):
     """A straight push through the object's centre (Section 3.3).
 
     The gripper starts on a circle of `radius` [m] around the object at the angle theta [rad],
@@ -175,16 +201,15 @@ class Push(_Move):
     direction theta + π.
     """
 
-    theta: float
-    length: float = 0.05
-    radius: float = 0.2
+    radius: float = metres(0.1, 0.3, 0.2)
 
     name = "push"
     opening_m = PUSH_GAP_M
     force_N = 200.0
+    rollable = False
     acts_from = 0.4
     ahead_rad = math.pi
-    lengths_m: ClassVar = {"length": (0.0, 0.15), "radius": (0.1, 0.3)}
+    reach_m = 0.075
 
     @cached_property
     def segments(self) -> tuple[Segment, ...]:
@@ -192,6 +217,10 @@ class Push(_Move):
         start, end = (s * unit_vector(yaw) for s in (-self.radius, self.length))
         facing = TIP_HEIGHT_M, yaw, 1.0
         return _segments((0.0, (*start, *facing)), (DURATION_S, (*end, *facing)))
+
+
+def _near_centre(name: str, xy_m: Any) -> tuple[float, ...]:
+    return tuple(check_within(name, value, -0.3, 0.3, "m") for value in check_pair(name, xy_m))
 
 
 @dataclass(frozen=True)
@@ -202,21 +231,14 @@ class PushAt(Primitive):
     centre in the table's axes, and continues by `length` [m].
     """
 
-    contact: tuple[float, float]
-    direction: float
-    length: float = 0.016
+    contact: tuple[float, float] = parameter(_near_centre)
+    direction: float = radians()
+    length: float = metres(0.0, 0.15, 0.016)
 
     name = "push_at"
     opening_m = 0.0
     force_N = 200.0
     tool = "rod"
-    lengths_m: ClassVar = {"length": (0.0, 0.15)}
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        x, y = check_pair("contact", self.contact)
-        contact = tuple(check_within("contact", v, -0.3, 0.3, "m") for v in (x, y))
-        object.__setattr__(self, "contact", contact)
 
     @cached_property
     def segments(self) -> tuple[Segment, ...]:
@@ -226,7 +248,7 @@ class PushAt(Primitive):
 
 
 @dataclass(frozen=True)
-class Drag(_Move):
+class Drag(Move):
     """The paper's push for rollable objects: cage the object, move it, release it.
 
     The open gripper is lowered over the object's centre, closed, moved by `length` [m] in the
@@ -234,15 +256,14 @@ class Drag(_Move):
     perpendicular to it; None means the object's axis, estimated from the image.
     """
 
-    theta: float
-    length: float = 0.05
-    grip_yaw: float | None = None
+    grip_yaw: float | None = radians(None)
 
     name = "drag"
     opening_m = 0.14
     force_N = 10.0
+    rollable = True
     acts_from = 0.25
-    lengths_m: ClassVar = {"length": (0.0, 0.15)}
+    reach_m = 0.045
 
     @cached_property
     def segments(self) -> tuple[Segment, ...]:
@@ -258,8 +279,8 @@ class Grasp(Primitive):
     the height in the image. grip_yaw [rad] is the gripper's yaw; closing aligns the object with it.
     """
 
-    seen_height: float | None = None
-    grip_yaw: float = 0.0
+    seen_height: float | None = metres(0.0, 0.3, None)
+    grip_yaw: float = radians(0.0)
 
     name = "grasp"
     opening_m = 0.105
@@ -267,7 +288,6 @@ class Grasp(Primitive):
     holds = True
     lift_m: ClassVar[float] = 0.25
     success_m: ClassVar[float] = 0.1
-    lengths_m: ClassVar = {"seen_height": (0.0, 0.3)}
 
     @cached_property
     def segments(self) -> tuple[Segment, ...]:
@@ -294,7 +314,7 @@ class Rotate(Primitive):
     is the yaw at which the gripper closes, which aligns the object with it.
     """
 
-    grip_yaw: float = 0.0
+    grip_yaw: float = radians(0.0)
 
     name = "rotate"
     opening_m = 0.14
@@ -322,10 +342,10 @@ class _Arc(Segment):
         poses = np.repeat(self.start[None], len(share), axis=0)
         angle = np.asarray(share) * self.angle_rad
         ahead = self.radius_m * (1 - np.cos(angle))
-        poses[:, 0] += ahead * math.cos(self.start[3])
-        poses[:, 1] += ahead * math.sin(self.start[3])
-        poses[:, 2] += self.radius_m * np.sin(angle)
-        poses[:, 5] = self.pitch_share * angle
+        poses[:, X] += ahead * math.cos(self.start[YAW])
+        poses[:, Y] += ahead * math.sin(self.start[YAW])
+        poses[:, Z] += self.radius_m * np.sin(angle)
+        poses[:, PITCH] = self.pitch_share * angle
         return poses
 
 
@@ -338,10 +358,10 @@ class LeverUp(Primitive):
     far edge about which the object turns. The tip follows r(1 - cos φ), r sin φ up to φ = 65°.
     """
 
-    contact_x: float
-    contact_y: float
-    theta: float
-    reach: float
+    contact_x: float = metres(-0.2, 0.2)
+    contact_y: float = metres(-0.2, 0.2)
+    theta: float = radians(first=0.0)
+    reach: float = metres(0.05, 0.4)
 
     name = "lever_up"
     opening_m = 0.012
@@ -351,7 +371,19 @@ class LeverUp(Primitive):
     angle_rad: ClassVar[float] = math.radians(65)
     insertion_m: ClassVar[float] = 0.012
     run_up_m: ClassVar[float] = 0.03
-    lengths_m: ClassVar = {"contact_x": (-0.2, 0.2), "contact_y": (-0.2, 0.2), "reach": (0.05, 0.4)}
+
+    @classmethod
+    def sample(cls, outline_m: np.ndarray, rng: np.random.Generator) -> Self:
+        """Sample an edge and a point on it; a blade that enters obliquely slips."""
+        levers = []
+        for _ in range(20):
+            edge = int(rng.integers(len(outline_m)))
+            lever = cls.at_edge(outline_m, edge, rng.uniform(0.2, 0.8))
+            levers.append((lever.obliqueness_rad(outline_m, edge), lever))
+            if levers[-1][0] < 0.18:
+                break
+        _, lever = min(levers, key=lambda drawn: drawn[0])
+        return replace(lever, theta=lever.theta + rng.uniform(-0.1, 0.1))
 
     @classmethod
     def at_edge(cls, outline_m: np.ndarray, edge: int, share: float = 0.5) -> Self:
@@ -397,8 +429,17 @@ class LeverUp(Primitive):
 PRIMITIVES: dict[str, type[Primitive]] = {
     primitive.name: primitive for primitive in (Push, Drag, Grasp, Rotate, LeverUp)
 }
+"""The primitives of which data sets are collected; a set stores their positions here.
+
+`PushAt` is not among them: a data set holds only parameters that are single numbers."""
 
 
 def primitive_named(name: str) -> type[Primitive]:
     """Return the class of the primitive `name`; raises ValueError with the known names."""
-    return PRIMITIVES[check_choice("primitive", name, PRIMITIVES)]
+    known = PRIMITIVES | {PushAt.name: PushAt}
+    return known[check_choice("primitive", name, known)]
+
+
+def move_for(rollable: bool) -> type[Move]:
+    """Return the action that moves an object: a drag if the object can roll, otherwise a push."""
+    return Drag if rollable else Push

@@ -25,7 +25,7 @@ import numpy as np
 import psutil
 
 from affordlib.paths import file_at, from_root, resolve_out_dir
-from affordlib.primitives import Primitive, PushAt, primitive_named
+from affordlib.primitives import Primitive, primitive_named
 from affordlib.types import Goal, Plan, Step
 
 # unit in the column's name: (displayed unit, factor, decimals); lengths are stored in metres
@@ -201,7 +201,7 @@ def _as_data(value: Any) -> Any:
 def _step(**data: Any) -> Step:
     arguments = dict(data["primitive"])
     name = arguments.pop("name")
-    data["primitive"] = (PushAt if name == PushAt.name else primitive_named(name))(**arguments)
+    data["primitive"] = primitive_named(name)(**arguments)
     data["predicted_end_xy_m"] = tuple(data["predicted_end_xy_m"])
     data["std_m"] = math.nan if data["std_m"] is None else float(data["std_m"])
     for name in ("predicted_path_xy_m", "path_xy_m"):

@@ -15,6 +15,8 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
+from affordlib.geometry import is_convex, rotated
+
 ACTION_CHANNELS = ("x", "y", "z", "yaw", "gripper")
 EFFECT_CHANNELS = ("x", "y", "z", "yaw", "tilt")
 IMAGE_CHANNELS = ("depth", "mask")
@@ -131,18 +133,60 @@ def check_on_table(name: str, xy_m: Any) -> tuple[float, float]:
 
 
 @dataclass(frozen=True)
+class Obstacle:
+    """A fixed body on the table: a convex polygon or a disc, with a height [m].
+
+    corners_m: corners (x, y) [m] in the table's frame, counter-clockwise, at least three; for a
+    disc one point, its centre, and radius_m [m].
+    """
+
+    corners_m: tuple[tuple[float, float], ...]
+    radius_m: float = 0.0
+    height_m: float = 0.06
+
+    def __post_init__(self) -> None:
+        check_field(self, "height_m", 0.005, 0.3, "m")
+        corners = tuple(check_on_table("corners_m", corner) for corner in self.corners_m)
+        object.__setattr__(self, "corners_m", corners)
+        is_disc = len(corners) == 1
+        check_field(self, "radius_m", 0.005 * is_disc, 0.3 * is_disc, "m")
+        if not (is_disc or is_convex(np.array(corners))):
+            raise ValueError(
+                "corners_m must be one point (a disc) or go counter-clockwise around a convex "
+                f"polygon, got {corners}"
+            )
+
+    @classmethod
+    def disc(cls, xy_m: tuple[float, float], radius_m: float, height_m: float = 0.06) -> Obstacle:
+        """Return the disc with its centre at (x, y) [m]."""
+        return cls((xy_m,), radius_m, height_m)
+
+    @classmethod
+    def box(
+        cls,
+        xy_m: tuple[float, float],
+        size_m: tuple[float, float],
+        yaw_rad: float = 0.0,
+        height_m: float = 0.06,
+    ) -> Obstacle:
+        """Return the rectangle of length and width [m] with its centre at (x, y) [m]."""
+        signs, half = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]), np.array(size_m) / 2
+        corners = rotated(signs * half, check_finite("yaw_rad", yaw_rad)) + np.array(xy_m)
+        return cls(tuple((float(x), float(y)) for x, y in corners), 0.0, height_m)
+
+
+@dataclass(frozen=True)
 class Observation:
     """An observation of the object at rest, with the arm parked.
 
     xy_m: estimated position (x, y) [m] in the table's frame; image: (2, 48, 48), depth [m] from a
     plane 1 m above the table and the object's mask, centred at xy_m to within a few millimetres;
-    std_m: σ of the position [m], if known; yaw_rad: the object's yaw [rad], if the robot can
-    estimate it; yaw_std_rad: its σ [rad], None if the yaw was not seen but dead-reckoned.
+    yaw_rad: the object's yaw [rad], if the robot can estimate it; yaw_std_rad: its σ [rad], None if
+    the yaw was not seen but dead-reckoned.
     """
 
     xy_m: tuple[float, float]
     image: np.ndarray
-    std_m: float | None = None
     yaw_rad: float | None = None
     yaw_std_rad: float | None = None
 

@@ -24,13 +24,13 @@ from affordlib.interactions.recipes import Variation
 from affordlib.models.checkpoint import load_checkpoint
 from affordlib.planning import EffectMap
 from affordlib.primitives import Push
-from affordlib.world import Tabletop, TabletopObject, WorldConfig, category_named
+from affordlib.world import STANDING, Tabletop, TabletopObject, WorldConfig, category_named
 from experiments import runner
 from experiments.commands import command
 from experiments.planning import CONFIGS, attempt, tasks_sha256
 from experiments.real_pushes import named
 from experiments.runner import FOLDER, Job, Rows, frame, interval
-from experiments.tasks import EARLIEST_STOP, STANDING, frozen_tasks
+from experiments.tasks import EARLIEST_STOP, frozen_tasks
 
 TABLE, PLANS = "adaptation", CONFIGS["perturbed_corrected"]
 N_OTHERS, N_TESTS, SHOTS = 40, 2, (0, 2, 5, 10)

@@ -27,6 +27,7 @@ from affordlib.interactions.sampling import condition_on_recorded_action
 from affordlib.models.predictions import prediction_record, steps_of
 from affordlib.models.push_frame import inverse, push_direction, rotate_prediction
 from affordlib.types import Prediction
+from affordlib.world import category_named
 
 Forecast = tuple[Tensor, Tensor]
 """Mean and σ (N, T, C) of the effect at some samples."""
@@ -68,7 +69,7 @@ def features(data: "xarray.Dataset") -> Tensor:
         yaw = yaw - torch.from_numpy(data["theta"].values)
     names = data["family"].attrs["flag_meanings"].split()
     category = torch.from_numpy(data["family"].values).long()
-    has_yaw = torch.tensor([name in ("cuboid", "prism", "lying_cylinder") for name in names])
+    has_yaw = torch.tensor([category_named(name).has_yaw for name in names])
     angle = torch.stack([(2 * yaw).cos(), (2 * yaw).sin()], dim=-1).float()
     one_hot = torch.nn.functional.one_hot(category, len(names)).float()
     return torch.cat(

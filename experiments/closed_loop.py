@@ -39,9 +39,10 @@ from affordlib.planning import (
 from affordlib.planning.disturbances import KINDS
 from affordlib.planning.grasp_rotate import GRIPPER_YAWS_RAD
 from affordlib.planning.skills import CHECKPOINTS
-from affordlib.primitives import Drag, Grasp, Push
+from affordlib.primitives import Grasp, Move, move_for
 from affordlib.types import TABLE_X_M, TABLE_Y_M, Goal, check_choice, check_count
 from affordlib.world import (
+    ROLLABLE,
     Tabletop,
     TabletopObject,
     WorldConfig,
@@ -51,7 +52,6 @@ from experiments import runner
 from experiments.commands import command
 from experiments.feasibility import half_width_m, is_feasible, on_the_rim
 from experiments.runner import FOLDER, Job, Rows, plain
-from experiments.tasks import ROLLABLE
 
 N_TRIALS = {
     "height": 50,
@@ -106,9 +106,9 @@ class Trial:
     config: WorldConfig = field(default_factory=WorldConfig)
 
     @property
-    def kind(self) -> type[Push] | type[Drag]:
+    def kind(self) -> type[Move]:
         """The primitive that moves the object."""
-        return Drag if self.obj.rollable else Push
+        return move_for(self.obj.rollable)
 
     def place(self, world: Tabletop) -> None:
         """Place the object on the table and wait until it is at rest."""
@@ -288,7 +288,7 @@ def _stays_feasible(
     first = disturbance.action + (disturbance.at_s is not None)
     if result.status == "lost" and len(result.seen_xy_m) <= first + 1:  # off the table, or unseen
         return disturbance.kind == "goal"
-    kind = Drag if world.object_rolls() else Push
+    kind = move_for(world.placed.rolls())
     seen = result.seen_xy_m[first:][:1]
     return all(is_feasible(kind, half, xy, result.goal.xy_m) for xy in seen)
 

@@ -14,7 +14,7 @@ from functools import lru_cache
 import numpy as np
 
 from affordlib.planning.routes import RouteMap, find_route
-from affordlib.primitives import HOVER_M, TIP_HEIGHT_M, Drag, Push
+from affordlib.primitives import HOVER_M, TIP_HEIGHT_M, Drag, Move, Push
 from affordlib.world import UnreachableError, robot
 from affordlib.world.trajectory import RETREAT_M
 
@@ -44,7 +44,7 @@ def tool_reach_m(height_m: float) -> tuple[float, float]:
 
 
 def possible(
-    kind: type[Push] | type[Drag], half_m: float, slack_m: float = 0.0
+    kind: type[Move], half_m: float, slack_m: float = 0.0
 ) -> Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
     """Return a test of which actions are possible: positions (n, 2), directions and lengths (n,).
 
@@ -75,14 +75,14 @@ def possible(
 
 
 @lru_cache(maxsize=64)
-def _routes(kind: type[Push] | type[Drag], half_mm: int, slack_m: float) -> RouteMap:
+def _routes(kind: type[Move], half_mm: int, slack_m: float) -> RouteMap:
     half = half_mm / 1000
     reach = Drag(0.0).length if kind is Drag else Push(0.0).length + half
     return RouteMap.of(reach, possible(kind, half, slack_m))
 
 
 def is_feasible(
-    kind: type[Push] | type[Drag],
+    kind: type[Move],
     half_m: float,
     start_xy_m: Sequence[float],
     goal_xy_m: Sequence[float],
@@ -96,7 +96,7 @@ def is_feasible(
 
 
 def on_the_rim(
-    kind: type[Push] | type[Drag],
+    kind: type[Move],
     half_m: float,
     start_xy_m: Sequence[float],
     goal_xy_m: Sequence[float],

@@ -30,7 +30,7 @@ FRAME_STEPS, LEAVES = 48, 6
 """Simulation steps between two frames; frames at the end in which the arm leaves the picture."""
 WIDTH, HEIGHT = 840, 660
 """Size of one of the two pictures, below its title [pixels]; pages show it at half of that."""
-VIEW = {"at_m": (-0.05, 0.0, 0.08), "distance_m": 1.15, "field_deg": 25.0}
+VIEW = {"at_m": (-0.15, 0.0, 0.3), "distance_m": 1.6}
 GOAL_RGB = (0.0, 0.45, 0.70)
 FIGURES = repo_root() / "figures"
 

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from affordlib.planning.effect_map import EffectMap, phases_of
-from affordlib.primitives import Drag, Push
+from affordlib.primitives import Move, move_for
 from affordlib.types import Observations, Prediction
 from affordlib.world import Tabletop, TabletopObject, WorldConfig
 
@@ -30,7 +30,7 @@ class SimulatorModel:
     world: Tabletop
     obj: TabletopObject
     yaw_rad: float
-    kind: type[Push] | type[Drag]
+    kind: type[Move]
     config: WorldConfig
 
     action_channels = ("x", "y")
@@ -76,7 +76,7 @@ def oracle_effects(
     world's; its camera has no error. risk_averse: σ is the sensitivity of the effect to
     `YAW_ERROR_RAD`, and not negligible as otherwise.
     """
-    kind = Drag if world.object_rolls() else Push
+    kind = move_for(world.placed.rolls())
     physics = WorldConfig() if nominal_physics else world.config
     config = replace(physics, camera="ideal", bias_m=(0.0, 0.0))
     model = SimulatorModel(imagined, world.obj, world.object_pose()[2], kind, config)

@@ -46,8 +46,8 @@ from affordlib.planning import (
 from affordlib.planning.closed_loop import is_seen_on_table
 from affordlib.planning.problem import MODES
 from affordlib.primitives import Push
-from affordlib.types import NothingSeenError, Outcome, Plan, Step
-from affordlib.world import Tabletop, UnreachableError
+from affordlib.types import NothingSeenError, Observation, Outcome, Plan, Step
+from affordlib.world import ROLLABLE, STANDING, Tabletop, UnreachableError
 from experiments import reported, runner
 from experiments import tasks as goals
 from experiments.commands import command
@@ -55,7 +55,7 @@ from experiments.field_baselines import LimitSurface, plan_astar_continuous, pla
 from experiments.literal import SPEC, trained_on
 from experiments.oracle import oracle_effects
 from experiments.runner import FOLDER, Job, Rows, interval, plain
-from experiments.tasks import ROLLABLE, STANDING, PlanningTask, frozen_tasks
+from experiments.tasks import PlanningTask, frozen_tasks
 
 ENOUGH_M = 0.0003
 """Distance [m] from the goal below which no corrective action is tried, as none would help."""
@@ -269,10 +269,10 @@ class Attempt:
 
     corrections: largest number of single actions that correct the final position. perturbed_start:
     at execution, the object's estimated pose has an error of `POSITION_ERROR_M` and
-    `YAW_ERROR_RAD`. n_averaged_images: number of images that an observation averages. by_plan: each
-    action is relative to the object's predicted position instead of the observed one. receding:
-    after each action, a new plan is made for the remaining number of actions (model-predictive
-    control).
+    `YAW_ERROR_RAD`. n_averaged_images: number of images of which a position is the mean. by_plan:
+    each action is relative to the object's predicted position instead of the observed one.
+    receding: after each action, a new plan is made for the remaining number of actions
+    (model-predictive control).
     """
 
     corrections: int = 0
@@ -325,41 +325,43 @@ def attempt(
     """
     how = Attempt(**options)
     world.place(task.obj, (0.0, 0.0), task.yaw_rad, config=task.config)
-    world.n_averaged_images = how.n_averaged_images
-    seen = world.observe()
+    once, at_xy_m = PlanMode(1, partial=True), None
+
+    def observe() -> Observation:
+        views = [world.observe() for _ in range(how.n_averaged_images)]
+        return replace(views[0], xy_m=tuple(np.mean([v.xy_m for v in views], axis=0).tolist()))
+
+    def execute(step: Step) -> Execution:
+        nonlocal at_xy_m
+        seen = replace(observe(), xy_m=at_xy_m) if how.by_plan else observe()
+        at_xy_m = step.predicted_end_xy_m
+        return world.execute(step, seen)
+
+    robot = SimpleNamespace(observe=observe, execute=execute)
+    for name in ("can_reach", "park", "settle"):
+        setattr(robot, name, getattr(world, name))
+    seen = robot.observe()
     plan = planner(pose(seen.image, seen.xy_m, task.goal, task.mode))
     if how.perturbed_start:
         side = POSITION_ERROR_M * np.array([math.cos(task.yaw_rad), math.sin(task.yaw_rad)])
         config = replace(task.config, bias_m=tuple(side))
         world.place(task.obj, (0.0, 0.0), task.yaw_rad + YAW_ERROR_RAD, config=config)
-    once, at_xy_m = PlanMode(1, partial=True), seen.xy_m
-
-    def execute(step: Step) -> Execution:
-        nonlocal at_xy_m
-        bias_m = np.subtract(at_xy_m, world.object_pose()[:2])
-        world.config = replace(world.config, bias_m=tuple(bias_m.tolist()))
-        at_xy_m = step.predicted_end_xy_m
-        return world.execute(step)
-
-    same = {name: getattr(world, name) for name in ("observe", "can_reach", "park", "settle")}
-    robot = SimpleNamespace(execute=execute, **same) if how.by_plan else world
+    at_xy_m = seen.xy_m
     now = replace(plan, steps=plan.steps[:1]) if how.receding else plan
     try:
         outcome = execute_plan(robot, now)
         outcome = corrected(robot, outcome, lambda *q: planner(pose(*q, once)), how.corrections)
         mode = MODES[task.mode]
         for left in range(mode.max_steps - 1, 0, -1) if how.receding else ():
-            seen = world.observe()
+            seen = robot.observe()
             if task.goal.distance_m(seen.xy_m) <= ENOUGH_M:
                 break
             fewer = replace(mode, max_steps=left)
             again = planner(pose(seen.image, seen.xy_m, task.goal, fewer))
-            more = execute_plan(world, replace(again, steps=again.steps[:1]))
+            more = execute_plan(robot, replace(again, steps=again.steps[:1]))
             outcome = replace(_joined(outcome, more), plan=plan)
     except UnreachableError as refused:
         outcome = refused.outcome
-    finally:
-        world.n_averaged_images = 1
     end = world.object_pose()
     return replace(outcome, distance_m=task.goal.distance_m(end[:2]), end_pose=end)
 

@@ -34,9 +34,7 @@ from affordlib.planning.push_at import plan_push_at, primitive_of, pushes_around
 from affordlib.results import write_results
 from affordlib.types import Goal, Observation, Step, UnreachableError
 from affordlib.world import Cuboid, Prism, Tabletop, TabletopObject, WorldConfig
-from affordlib.world.execution import execute
 from affordlib.world.robot import ROD_WIDTH_M
-from affordlib.world.trajectory import Command
 from experiments.commands import command
 
 N_PARTS, N_OBJECTS, N_PUSHES, TRAINING = 2, 40, 12, (1500, 5e-4, 32)
@@ -120,9 +118,8 @@ def observed(world: Tabletop) -> Observation:
 
 def act(world: Tabletop, step: Step, seen: Observation) -> None:
     """Execute a step at the object's position in the plan, whether it is there or not."""
-    command = Command.of(step.primitive, 1.0, True)
     seen = replace(seen, xy_m=tuple(step.predicted_path_xy_m[0].tolist()))
-    execute(world.arm, world.placed, command, seen, 0.0, approach=False)
+    world.execute_primitive(step.primitive, seen=seen)
 
 
 def pursue(
@@ -180,7 +177,7 @@ def task(world: Tabletop, rng: np.random.Generator) -> tuple[TabletopObject, lis
         for _ in range(GOAL_PUSHES):
             drawn = pushes_around(obj.footprint_m, ROD_WIDTH_M / 2, 1, GOAL_LENGTHS_M, rng)
             world.execute_primitive(primitive_of(drawn, 0, world.object_pose()[2]))
-        if not world.object_fell():
+        if not world.placed.fell():
             return obj, start, [*world.object_pose()]
 
 

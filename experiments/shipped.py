@@ -51,10 +51,10 @@ from affordlib.paths import repo_root
 from affordlib.planning import MODES
 from affordlib.planning.reachability import SHIPPED as REACHABILITY
 from affordlib.planning.reachability import Reachability, reach_features
-from affordlib.primitives import Drag, Push
+from affordlib.primitives import move_for
 from affordlib.results import write_atomically
 from affordlib.types import Goal
-from affordlib.world import Tabletop
+from affordlib.world import ROLLABLE, STANDING, Tabletop
 from experiments.attention import AttentionConfig
 from experiments.commands import command, worker_type
 from experiments.runner import cluster
@@ -62,8 +62,6 @@ from experiments.tasks import (
     FROZEN,
     MIN_DISTANCE_M,
     REACH_M,
-    ROLLABLE,
-    STANDING,
     PlanningTask,
     constructed_tasks,
     drawn_object,
@@ -301,7 +299,7 @@ def uniform_tasks(
     tasks = []
     for index in range(n):
         obj, yaw, rng = drawn_object(mode, "uniform", seed, index, classes)
-        reach = MODES[mode].max_steps * REACH_M[Drag if obj.rollable else Push]
+        reach = MODES[mode].max_steps * REACH_M[move_for(obj.rollable)]
         r = math.sqrt(rng.uniform(MIN_DISTANCE_M**2, reach**2))
         angle = off_grid(rng, 0.0, math.pi)
         goal = Goal((r * math.cos(angle), r * math.sin(angle)))

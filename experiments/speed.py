@@ -40,12 +40,11 @@ from affordlib.planning import EffectMap, PlanningProblem, plan_astar, plan_cont
 from affordlib.primitives import PRIMITIVES, Push
 from affordlib.results import read_results, write_results
 from affordlib.types import Observations
-from affordlib.world import Tabletop
+from affordlib.world import STANDING, Tabletop
 from experiments.commands import command
 from experiments.literal import sample_literal, train_literal
 from experiments.runner import Rows
 from experiments.shipped import uniform_tasks
-from experiments.tasks import STANDING
 
 RESULTS = "data/results/speed.json"
 

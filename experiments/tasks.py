@@ -18,9 +18,9 @@ import numpy as np
 from affordlib.interactions.recipes import Variation
 from affordlib.paths import repo_root
 from affordlib.planning import MODES
-from affordlib.primitives import Drag, Push
+from affordlib.primitives import Drag, Push, move_for
 from affordlib.types import Goal, check_choice
-from affordlib.world import Tabletop, TabletopObject, WorldConfig, category_named
+from affordlib.world import STANDING, Tabletop, TabletopObject, WorldConfig, category_named
 
 FROZEN = {
     "clean": "data/goals/planning.json",
@@ -37,8 +37,6 @@ EARLIEST_STOP = 0.55
 ATTEMPTS = 30
 """Number of random episodes tried with an object before it is replaced."""
 
-STANDING = ("cuboid", "upright_cylinder")
-ROLLABLE = ("lying_cylinder", "sphere")
 REACH_M = {Push: 0.07, Drag: 0.05}
 """Distance [m] of one full action: the minimum (push) or the approximate one (drag)."""
 
@@ -111,7 +109,7 @@ def constructed_tasks(
 
     def drawn(index: int) -> PlanningTask | None:
         obj, yaw, rng = drawn_object(mode, "constructed", seed, index, classes)
-        kind = Drag if obj.rollable else Push
+        kind = move_for(obj.rollable)
         config = variation.sample(obj, rng) if variation else WorldConfig()
         for _ in range(ATTEMPTS):
             direction, valid = rng.uniform(-math.pi, math.pi), True

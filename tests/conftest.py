@@ -31,7 +31,7 @@ def one_world():
 @pytest.fixture
 def world(one_world):
     """The session's world, with frictions and perception reset before each test."""
-    one_world.config, one_world.n_averaged_images, one_world.on_step = WorldConfig(), 1, None
+    one_world.config, one_world.on_step = WorldConfig(), None
     one_world.reset()
     return one_world
 

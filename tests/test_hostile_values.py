@@ -21,10 +21,10 @@ from affordlib.interactions.collect import collect
 from affordlib.interactions.recipes import Recipe, Variation
 from affordlib.models.fit import EFFORT
 from affordlib.paths import repo_root
-from affordlib.perception import crop_from_depth
 from affordlib.primitives import Drag, Grasp, LeverUp, Push, PushAt, Rotate, primitive_named
 from affordlib.results import load_plan, read_results, results_table, save_plan, write_results
 from affordlib.types import Goal, Outcome, Plan, Step, UnreachableError, check_array
+from affordlib.world.camera import View
 from exercises import check
 from tests.problems import Still
 
@@ -84,15 +84,15 @@ CALLABLES = {
     if callable(value) and not name.endswith(("Error", "Warning"))
 }
 of_modules = (Goal, Step, Plan, Push, PushAt, Drag, Grasp, Rotate, LeverUp, primitive_named)
-of_modules += (Recipe, Variation, collect, crop_from_depth, save_plan, load_plan, check)
-of_modules += (read_results, results_table, write_results)
+of_modules += (Recipe, Variation, collect, save_plan, load_plan, check)
+of_modules += (View, read_results, results_table, write_results)
 CALLABLES |= {each.__name__: each for each in of_modules}
 CALLABLES |= {"Push.towards": Push.towards, "Push.path": Push(0.0).path}
 CALLABLES["from_dataset"] = interactions.InteractionTensors.from_dataset
 CALLABLES["Log.add"] = interactions.Log("m", CORNERS).add
 CALLABLES["Log.centroid_pose"] = interactions.Log("m", CORNERS).centroid_pose
 OF_THE_WORLD = """
-place execute_primitive execute execute_path can_reach picture mark shove knock topple settle
+place execute_primitive execute execute_path can_reach picture mark shove settle
 """
 MADE_BY_DRIVEN_ONES = """
 ClosedLoopResult DisturbanceSchedule EffectModel Execution Robot
@@ -169,9 +169,6 @@ def shop(one_world, skills, pushes, tmp_path_factory):
         "result": pursuit,
         "outcome": Outcome(plan, 0.01, (0.04, 0.02, 0.0), (path,)),
         "image": image,
-        "depth": np.full((4, 4), 0.9),
-        "intrinsics": (9.0, 9.0, 2.0, 2.0),
-        "camera_pose": np.diag([1.0, -1.0, -1.0, 1.0]),
         "data": pushes,
         "log": log,
         "interactions": np.arange(2),
@@ -197,12 +194,11 @@ def shop(one_world, skills, pushes, tmp_path_factory):
     }
     by_callable = {
         **fields_of(step, plan, problem, scaler, domain, arrays, Recipe(), Variation(), few),
-        **fields_of(world.WorldConfig(), config, models.FiLMConfig()),
+        **fields_of(world.WorldConfig(), View(), config, models.FiLMConfig()),
         **fields_of(interactions.split_interactions(20)),
         "place": {"config": None},
         "Tabletop": {"config": world.WorldConfig()},
-        "picture": {"width": 32, "height": 32, "at_m": (0.0, 0.0, 0.1), "distance_m": 1.0}
-        | {"yaw_deg": 62.0, "pitch_deg": -33.0, "field_deg": 45.0},
+        "picture": {"width": 32, "height": 32},
         "FrameRecorder": {"width": 32, "height": 32},
         "settle": {"seconds": 0.1},
         "primitive_named": {"name": "push"},

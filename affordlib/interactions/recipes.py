@@ -9,13 +9,17 @@ from typing import Self
 import numpy as np
 
 from affordlib.geometry import rotated
-from affordlib.primitives import PRIMITIVES, Drag, LeverUp, Primitive, Push, primitive_named
+from affordlib.primitives import PRIMITIVES, Primitive, primitive_named
 from affordlib.types import TABLE_X_M, TABLE_Y_M, Interaction, check_count, check_field, check_range
-from affordlib.world import CATEGORIES, Tabletop, TabletopObject, WorldConfig, category_named
+from affordlib.world import (
+    CATEGORIES,
+    Tabletop,
+    TabletopObject,
+    WorldConfig,
+    category_named,
+)
 
 _TABLE_MARGIN_M = 0.08
-_LEVER_DRAWS = 20
-_OBLIQUE_RAD = 0.18
 
 
 @dataclass(frozen=True)
@@ -38,19 +42,20 @@ class Variation:
     camera: str = "kinect"
 
     def __post_init__(self) -> None:
-        for name, (low, high) in _RANGES.items():
+        for name in _VARIED:
+            low, high, _ = WorldConfig.ranges[name]
             object.__setattr__(self, name, check_range(name, getattr(self, name), low, high))
         check_field(self, "com_offset", 0.0, 0.5)
         check_field(self, "bias_sd_m", 0.0, 0.02, "m")
 
     def sample(self, obj: TabletopObject, rng: np.random.Generator) -> WorldConfig:
         """Sample the world parameters for one interaction with this object."""
-        drawn = {name: float(rng.uniform(*getattr(self, name))) for name in _RANGES}
+        drawn = {name: float(rng.uniform(*getattr(self, name))) for name in _VARIED}
         half = np.array([*np.ptp(obj.footprint_m, axis=0), obj.height_m]) / 2
         offset = self.com_offset * half * rng.uniform(-1, 1, size=3)
         if obj.rollable:
             # Placed with its centre of mass higher, it would roll before anything touches it.
-            along = np.array([offset[0] if obj.category == "lying_cylinder" else 0.0, 0.0, 0.0])
+            along = np.array([offset[0] if obj.has_yaw else 0.0, 0.0, 0.0])
             offset = along - (0.0, 0.0, np.linalg.norm(offset - along))
         return WorldConfig(
             **drawn,
@@ -61,13 +66,7 @@ class Variation:
         )
 
 
-_RANGES = {
-    "table_friction": (0.01, 2.0),
-    "object_friction": (0.01, 2.0),
-    "finger_friction": (0.01, 2.0),
-    "density_kg_m3": (50.0, 10_000.0),
-    "tip_offset_m": (-0.008, 0.1),
-}
+_VARIED = ("table_friction", "object_friction", "finger_friction", "density_kg_m3", "tip_offset_m")
 
 
 @dataclass(frozen=True)
@@ -161,24 +160,10 @@ def _sample_action(
     recipe: Recipe, obj: TabletopObject, yaw: float, rng: np.random.Generator
 ) -> Primitive:
     """Sample a primitive that suits the object, and its parameters."""
-    unsuited = "push" if obj.rollable else "drag"
-    names = [name for name in recipe.primitives if name != unsuited] or list(recipe.primitives)
-    kind = primitive_named(names[rng.integers(len(names))] if len(names) > 1 else names[0])
-    if issubclass(kind, Push | Drag):
-        return kind(float(rng.uniform(0, 2 * math.pi)))
-    if not issubclass(kind, LeverUp):
-        return kind()
-    outline = rotated(obj.footprint_m, yaw)
-    levers = []
-    for _ in range(_LEVER_DRAWS):
-        edge = int(rng.integers(len(outline)))
-        lever = kind.at_edge(outline, edge, rng.uniform(0.2, 0.8))
-        levers.append((lever.obliqueness_rad(outline, edge), lever))
-        if levers[-1][0] < _OBLIQUE_RAD:
-            break
-    # A blade that enters obliquely slips, so the sample most normal to its edge is used.
-    _, lever = min(levers, key=lambda drawn: drawn[0])
-    return replace(lever, theta=lever.theta + rng.uniform(-0.1, 0.1))
+    kinds = [primitive_named(name) for name in recipe.primitives]
+    kinds = [kind for kind in kinds if kind.rollable in (None, obj.rollable)] or kinds
+    kind = kinds[rng.integers(len(kinds)) if len(kinds) > 1 else 0]
+    return kind.sample(rotated(obj.footprint_m, yaw), rng)
 
 
 def interact(

@@ -10,6 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+from scipy.spatial.transform import Rotation
+
 from affordlib.planning.robot import Execution
 from affordlib.types import (
     TABLE_X_M,
@@ -25,6 +28,8 @@ from affordlib.types import (
 KINDS = ("shove", "knock", "topple", "goal")
 STEPS_PER_S = 240
 TIPPING_S = 1.0
+TOPPLING = 1.5
+"""Factor on the energy that tips an object onto its edge, since sliding dissipates some of it."""
 EDGE_M = 0.15
 """Margin at the table's edge [m] into which disturbances move neither object nor goal."""
 
@@ -65,10 +70,34 @@ class Disturbance:
             to = _inside(x + self.x, y + self.y)
             world.shove(to[0] - x, to[1] - y, self.turn)
         elif self.kind == "knock":
-            world.placed.knock(self.x, self.y, self.turn)
-        elif not world.object_rolls():
-            world.placed.topple(math.atan2(self.y, self.x))
+            _set_in_motion(world, (self.x, self.y, 0.0), (0.0, 0.0, self.turn))
+        elif not world.placed.rolls():
+            _topple(world, math.atan2(self.y, self.x))
         return goal
+
+
+def _topple(world: affordlib.world.Tabletop, direction_rad: float) -> None:
+    """Give the object the spin that tips it over the edge of its base in a direction [rad]."""
+    c, s = math.cos(direction_rad), math.sin(direction_rad)
+    low, high = world.client.getAABB(world.placed.body)
+    *centre, i, j, k, w = world.placed.state()
+    outline, half = world.obj.footprint_m, world.obj.height_m / 2
+    ends = np.concatenate([np.insert(outline, 2, z, axis=1) for z in (-half, half)])
+    corners = Rotation.from_quat([i, j, k, w]).apply(ends)[:, :2]
+    out, up = float((corners @ (c, s)).max()), centre[2] - low[2]
+    # For a box about its lower edge: inertia per mass, and the rise of its centre.
+    inertia = ((2 * out) ** 2 + (high[2] - low[2]) ** 2) / 3
+    rise = math.hypot(out, up) - up
+    spin = math.sqrt(2 * 9.81 * rise * TOPPLING / inertia) * np.array([-s, c, 0.0])
+    _set_in_motion(world, np.cross(spin, [-out * c, -out * s, up]), spin)
+
+
+def _set_in_motion(
+    world: affordlib.world.Tabletop, linear: Sequence[float], angular: Sequence[float]
+) -> None:
+    """Add to the object's velocity [m/s] and to its spin [rad/s]."""
+    body, moving = world.placed.body, world.client.getBaseVelocity(world.placed.body)
+    world.client.resetBaseVelocity(body, *np.add(moving, (linear, angular)).tolist())
 
 
 def _inside(x: float, y: float) -> tuple[float, float]:

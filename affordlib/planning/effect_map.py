@@ -26,7 +26,7 @@ from affordlib.models.protocol import EffectModel, condition_on_primitives
 from affordlib.models.push_frame import rotate_prediction
 from affordlib.models.quasi_static import rotate
 from affordlib.perception import radius_m
-from affordlib.primitives import Drag, Push
+from affordlib.primitives import Move, Push
 from affordlib.types import IMAGE_CHANNELS, IMAGE_PIXELS, Prediction, check_array, check_count
 
 FINE_DIRECTIONS, FINE_PHASES = 180, 31
@@ -53,7 +53,7 @@ class EffectMap:
 
     model: EffectModel
     image: np.ndarray
-    kind: type[Push] | type[Drag] = Push
+    kind: type[Move] = Push
     n_directions: int = 48
     n_phases: int = 17
 
@@ -187,6 +187,6 @@ class EffectMap:
         return tuple(F.pad(value, (0, 3 - len(columns))) for value in (effect, std))
 
 
-def phases_of(kind: type[Push] | type[Drag], n_phases: int) -> Tensor:
+def phases_of(kind: type[Move], n_phases: int) -> Tensor:
     """Phases (T,) of a map's grid."""
     return torch.linspace(kind.acts_from, 1, n_phases, dtype=torch.float64)

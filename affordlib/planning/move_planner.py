@@ -15,7 +15,7 @@ from affordlib.planning.problem import PlanMode, PlanningProblem, check_has_room
 from affordlib.planning.robot import Robot
 from affordlib.planning.routes import Feasible, find_route, place_at
 from affordlib.planning.skills import Skills
-from affordlib.primitives import Drag, Primitive, Push
+from affordlib.primitives import Drag, Move, Primitive
 from affordlib.types import Goal, Observation, Plan
 
 Point = tuple[float, float]
@@ -68,9 +68,7 @@ class MovePlanner:
                 return replace(plan, steps=tuple(replace(s, primitive=grip) for s, grip in steps))
         return self._plan(seen, goal)
 
-    def _plan(
-        self, seen: Observation, goal: Goal, kind: type[Push] | type[Drag] | None = None
-    ) -> Plan | Ending:
+    def _plan(self, seen: Observation, goal: Goal, kind: type[Move] | None = None) -> Plan | Ending:
         effects = self.skills.effects(seen.image, kind)
         try:
             check_has_room(goal, effects.radius_m)

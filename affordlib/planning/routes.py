@@ -15,7 +15,6 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from affordlib.planning.problem import is_on_table
-from affordlib.primitives import Drag, Push
 from affordlib.types import TABLE_X_M, TABLE_Y_M
 
 Feasible = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
@@ -24,8 +23,6 @@ Feasible = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 CELL_M = 0.02
 _X_M, _Y_M = (np.arange(low + CELL_M / 2, high, CELL_M) for low, high in (TABLE_X_M, TABLE_Y_M))
 PLACES_XY_M = np.stack(np.meshgrid(_X_M, _Y_M, indexing="ij"), axis=-1).reshape(-1, 2)
-REACH_M = {Push: 0.075, Drag: 0.045}
-"""Distance [m] that one action moves nearly any object, a little less than most full actions."""
 
 
 def place_at(xy_m: Sequence[float]) -> int:

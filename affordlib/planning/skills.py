@@ -13,8 +13,8 @@ from affordlib.planning.effect_map import EffectMap, checked_image
 from affordlib.planning.grasp_rotate import PosePlanner
 from affordlib.planning.problem import PlanMode, PlanningProblem, Reachable, everywhere
 from affordlib.planning.reachability import Reachability
-from affordlib.planning.routes import REACH_M, RouteMap
-from affordlib.primitives import Drag, Grasp, Primitive, Push, Rotate, primitive_named
+from affordlib.planning.routes import RouteMap
+from affordlib.primitives import Grasp, Move, Primitive, Rotate, move_for, primitive_named
 from affordlib.types import Goal, check_field
 
 CHECKPOINTS = {
@@ -62,9 +62,9 @@ class Skills:
         return self.models[primitive.name]
 
     @staticmethod
-    def kind_for(image: np.ndarray) -> type[Push] | type[Drag]:
+    def kind_for(image: np.ndarray) -> type[Move]:
         """Primitive that moves the object in an image: drag for one that would roll, else push."""
-        return Drag if looks_rollable(checked_image(image)[0].numpy()) else Push
+        return move_for(looks_rollable(checked_image(image)[0].numpy()))
 
     def problem(
         self,
@@ -81,7 +81,7 @@ class Skills:
         reachable = self.reachable(effects.kind)
         return PlanningProblem(start_xy_m, goal, effects, mode, reachable, poses)
 
-    def effects(self, image: np.ndarray, kind: type[Push] | type[Drag] | None = None) -> EffectMap:
+    def effects(self, image: np.ndarray, kind: type[Move] | None = None) -> EffectMap:
         """Effect map of the object in an image (2, 48, 48); cached for the last image.
 
         kind: the primitive (default: `kind_for` the image).
@@ -114,8 +114,8 @@ class Skills:
 
         return reachable
 
-    def routes(self, kind: type[Push] | type[Drag]) -> RouteMap:
+    def routes(self, kind: type[Move]) -> RouteMap:
         """Moves that the arm can make between places all over the table; computed once."""
         if kind not in self._routes:
-            self._routes[kind] = RouteMap.of(REACH_M[kind], self.reachable(kind))
+            self._routes[kind] = RouteMap.of(kind.reach_m, self.reachable(kind))
         return self._routes[kind]

@@ -4,6 +4,8 @@ import affordlib.world._quiet_pybullet  # must be imported first
 from affordlib.types import UnreachableError
 from affordlib.world.objects import (
     CATEGORIES,
+    ROLLABLE,
+    STANDING,
     Cuboid,
     LyingCylinder,
     Prism,

@@ -1,17 +1,29 @@
 """Cameras: top-down depth images of the object for the robot, and colour pictures for people.
 
-The ideal camera looks straight down on the object with parallel rays. The Kinect has a perspective
-and noise, and has to find the object. The mask is thresholded depth: all points above the table.
+The mask of a depth image is thresholded depth: all points above the table.
 """
 
 import math
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import pybullet
 from pybullet_utils.bullet_client import BulletClient
 
 from affordlib.perception import CAMERA_HEIGHT_M, centre_m, height_map, largest_blob
-from affordlib.types import CROP_WIDTH_M, IMAGE_PIXELS, TABLE_X_M, TABLE_Y_M, NothingSeenError
+from affordlib.types import (
+    CROP_WIDTH_M,
+    IMAGE_PIXELS,
+    TABLE_X_M,
+    TABLE_Y_M,
+    NothingSeenError,
+    Observation,
+    check_array,
+    check_field,
+    check_within,
+)
+from affordlib.world.robot import BASE_X_M
 
 _NEAR_M, _FAR_M = 0.5, 1.1
 _MASK_HEIGHT_M = 0.004
@@ -20,24 +32,11 @@ RAYS_PER_SIDE = 3
 """Rays per side of a pixel of the ideal camera. FiLM trained on 500 pushes has an error of 1.09 mm
 with one ray per pixel, 0.87 mm with 4, 0.83 mm with 16."""
 
+_TABLE_XY_M = np.array([sum(TABLE_X_M), sum(TABLE_Y_M)]) / 2
 KINECT_HEIGHT_M = 1.3
-_KINECT_XY_M = (sum(TABLE_X_M) / 2, sum(TABLE_Y_M) / 2)
 KINECT_FOCAL_PX = 575.0
 KINECT_BASELINE_M = 0.075
 _KINECT_MASK_HEIGHT_M = 0.012
-
-
-def _orthographic(half_width_m: float, pixels: int) -> np.ndarray:
-    """Return the 4x4 orthographic projection matrix, shifted by half a pixel.
-
-    TinyRenderer samples pixels at their corners; the shift moves the samples to their centres.
-    """
-    depth_range = _FAR_M - _NEAR_M
-    projection = np.diag([1 / half_width_m, 1 / half_width_m, -2 / depth_range, 1.0])
-    projection[:2, 3] = -1 / pixels
-    projection[2, 3] = -(_FAR_M + _NEAR_M) / depth_range
-    return projection
-
 
 _RENDERER = {"renderer": pybullet.ER_TINY_RENDERER, "flags": pybullet.ER_NO_SEGMENTATION_MASK}
 
@@ -74,26 +73,70 @@ def depth_crop(
     x, y = xy_m
     up = (-math.sin(turn_rad), math.cos(turn_rad), 0)
     view = pybullet.computeViewMatrix((x, y, CAMERA_HEIGHT_M), (x, y, 0), up)
-    fine = pixels * samples
-    projection = _orthographic(width_m / 2, fine)
+    fine, depth_range = pixels * samples, _FAR_M - _NEAR_M
+    projection = np.diag([2 / width_m, 2 / width_m, -2 / depth_range, 1.0])
+    # TinyRenderer samples pixels at their corners; half a pixel moves the samples to their centres.
+    projection[:2, 3] = -1 / fine
+    projection[2, 3] = -(_FAR_M + _NEAR_M) / depth_range
     depth = _distance_m(client, view, projection, (fine, fine))
     rays = np.stack([depth, depth < CAMERA_HEIGHT_M - _MASK_HEIGHT_M])
     blocks = rays.reshape(2, pixels, samples, pixels, samples)
     return blocks.mean(axis=(2, 4)).astype(np.float32)
 
 
-def _kinect_points(
-    client: BulletClient, centre_m: tuple, width_m: tuple, step: int, noise: np.random.Generator
-) -> np.ndarray:
-    """Simulate the points (n, 3) [m] that a Kinect above the table's centre measures in a window.
+def ideal(
+    client: BulletClient, xy_m: np.ndarray, bias_m: tuple, rng: np.random.Generator
+) -> Observation:
+    """Observe the object at (x, y) [m] from straight above, with parallel rays and no noise."""
+    x, y = (xy_m + bias_m).tolist()
+    return Observation((x, y), depth_crop(client, (x, y)))
 
-    Only the window of its image is rendered, every `step`-th pixel. Depth has noise that grows with
-    distance and is quantised in disparity; pixels are displaced at random by about one pixel.
+
+def kinect(
+    client: BulletClient, xy_m: np.ndarray, bias_m: tuple, rng: np.random.Generator
+) -> Observation:
+    """Find the object with a noisy Kinect above the table's centre, whatever its xy_m.
+
+    The points of the Kinect's image are projected vertically, and the image is centred on the
+    object as seen. Raises NothingSeenError if there is nothing on the table.
+    """
+    table = TABLE_X_M[1] - TABLE_X_M[0], TABLE_Y_M[1] - TABLE_Y_M[0]
+    coarse = _kinect_points(client, _TABLE_XY_M, table, 4, rng)
+    high = coarse[coarse[:, 2] > _KINECT_MASK_HEIGHT_M]
+    if not len(high):
+        raise NothingSeenError("the camera sees no object on the table; call place(...) first")
+    xy = np.median(high[:, :2], axis=0)
+    for _ in range(2):
+        points = _kinect_points(client, xy, (1.5 * CROP_WIDTH_M, 1.5 * CROP_WIDTH_M), 1, rng)
+        height = height_map(points, xy)
+        mask = largest_blob(height > _KINECT_MASK_HEIGHT_M)
+        if mask.any():
+            # Only walls that face the camera are visible, which biases the centroid towards it;
+            # for points above 45 % of the height (measured) the bias is negligible.
+            xy = xy + centre_m(mask & (height > 0.45 * np.quantile(height[mask], 0.9)))
+    height = height_map(points, xy)
+    mask = largest_blob(height > _KINECT_MASK_HEIGHT_M)
+    image = np.stack([CAMERA_HEIGHT_M - height, mask]).astype(np.float32)
+    x, y = (xy + bias_m).tolist()
+    return Observation((x, y), image)
+
+
+CAMERAS: dict[str, Callable[..., Observation]] = {"ideal": ideal, "kinect": kinect}
+"""The robot's cameras by name. Each observes the object that lies at xy_m: (2,), in a client, with
+noise from a generator; bias_m: error (2,) that is added to the position."""
+
+
+def _kinect_points(
+    client: BulletClient, centre_m: np.ndarray, width_m: tuple, step: int, rng: np.random.Generator
+) -> np.ndarray:
+    """Simulate the points (n, 3) [m] that a Kinect measures in a window, every `step`-th pixel.
+
+    Depth has noise that grows with distance and is quantised in disparity; pixels are displaced at
+    random by about one pixel.
     """
     pitch = step / KINECT_FOCAL_PX
     columns, rows = (math.ceil(w / KINECT_HEIGHT_M / pitch) for w in width_m)
-    stand = np.array(_KINECT_XY_M)
-    tangent = (np.array(centre_m) - stand) / KINECT_HEIGHT_M
+    tangent = (centre_m - _TABLE_XY_M) / KINECT_HEIGHT_M
     half = np.array([columns, rows]) * pitch / 2
     near, far = 0.8, 1.4
     projection = np.zeros((4, 4))
@@ -102,14 +145,15 @@ def _kinect_points(
     projection[:2, 2] = tangent / half + 1 / np.array([columns, rows])
     projection[2, 2:] = -(far + near) / (far - near), -2 * far * near / (far - near)
     projection[3, 2] = -1
+    stand = _TABLE_XY_M.tolist()
     view = pybullet.computeViewMatrix((*stand, KINECT_HEIGHT_M), (*stand, 0), (0, 1, 0))
     distance = _distance_m(client, view, projection, (rows, columns))
 
-    jitter = noise.normal(0, 0.8 / step, size=(2, rows, columns)) + np.indices((rows, columns))
+    jitter = rng.normal(0, 0.8 / step, size=(2, rows, columns)) + np.indices((rows, columns))
     row, column = np.rint(jitter).astype(int)
     distance = distance[row.clip(0, rows - 1), column.clip(0, columns - 1)]
     deviation = 0.0012 + 0.0019 * (distance - 0.4) ** 2
-    distance = distance + noise.normal(size=distance.shape) * deviation
+    distance = distance + rng.normal(size=distance.shape) * deviation
     focal = KINECT_FOCAL_PX * KINECT_BASELINE_M
     distance = focal / (np.rint(8 * focal / distance) / 8)
     x = stand[0] + (tangent[0] - half[0] + pitch * (np.arange(columns) + 0.5))[None] * distance
@@ -117,54 +161,83 @@ def _kinect_points(
     return np.stack([x, y, KINECT_HEIGHT_M - distance], axis=-1).reshape(-1, 3)
 
 
-def kinect_view(
-    client: BulletClient, noise: np.random.Generator
-) -> tuple[tuple[float, float], np.ndarray]:
-    """Return the object's position (x, y) [m] measured with a Kinect, and a crop (2, 48, 48) of it.
+_FLOOR_M = -0.74
+HIDDEN_M = 1.0
+"""Depth [m] under their place at which bodies wait that are in pictures only, out of the range of
+the robot's cameras."""
 
-    The points of the Kinect's image are projected vertically. Raises NothingSeenError if there is
-    nothing on the table.
+_SCENERY = (
+    ((1.7, 1.7, 0.05), (0.0, 0.0, _FLOOR_M - 0.05), (0.86, 0.87, 0.88)),
+    ((0.1, 0.1, -_FLOOR_M / 2), (BASE_X_M, 0.0, _FLOOR_M / 2), (0.35, 0.37, 0.40)),
+    *(
+        ((0.03, 0.03, -_FLOOR_M / 2 - 0.05), (x, y, _FLOOR_M / 2 - 0.05), (0.45, 0.42, 0.40))
+        for x in (-0.45, 0.65)
+        for y in (-0.65, 0.65)
+    ),
+)
+"""Half extents, centre [m] and colour of boxes: a floor, the arm's pedestal, the table's legs."""
+
+
+def add_scenery(client: BulletClient) -> list[int]:
+    """Add hidden bodies on which arm and table stand in pictures; return their ids."""
+    bodies = []
+    for half, (x, y, z), rgb in _SCENERY:
+        box = {"shapeType": pybullet.GEOM_BOX, "halfExtents": half, "rgbaColor": (*rgb, 1)}
+        shape, at = client.createVisualShape(**box), (x, y, z - HIDDEN_M)
+        bodies.append(client.createMultiBody(baseVisualShapeIndex=shape, basePosition=at))
+    return bodies
+
+
+_VIEW_LIMITS = {
+    "distance_m": (0.2, 3.0, "m"),
+    "yaw_deg": (-360.0, 360.0, "°"),
+    "pitch_deg": (-90.0, 0.0, "°"),
+    "field_deg": (1.0, 120.0, "°"),
+}
+
+
+@dataclass(frozen=True)
+class View:
+    """The view of a picture: the camera looks at a point `at_m` (x, y, z) from a distance.
+
+    With the yaw 0 it looks along y, with the pitch -90 straight down; its field of view is the
+    vertical one.
     """
-    table = (TABLE_X_M[1] - TABLE_X_M[0], TABLE_Y_M[1] - TABLE_Y_M[0])
-    coarse = _kinect_points(client, _KINECT_XY_M, table, 4, noise)
-    high = coarse[coarse[:, 2] > _KINECT_MASK_HEIGHT_M]
-    if not len(high):
-        raise NothingSeenError("the camera sees no object on the table; call place(...) first")
-    xy = tuple(np.median(high[:, :2], axis=0))
-    for _ in range(2):
-        points = _kinect_points(client, xy, (1.5 * CROP_WIDTH_M, 1.5 * CROP_WIDTH_M), 1, noise)
-        height = height_map(points, xy)
-        mask = largest_blob(height > _KINECT_MASK_HEIGHT_M)
-        if mask.any():
-            # Only walls that face the camera are visible, which biases the centroid towards it;
-            # for points above 45 % of the height (measured) the bias is negligible.
-            dx, dy = centre_m(mask & (height > 0.45 * np.quantile(height[mask], 0.9)))
-            xy = (float(xy[0] + dx), float(xy[1] + dy))
-    height = height_map(points, xy)
-    mask = largest_blob(height > _KINECT_MASK_HEIGHT_M)
-    return xy, np.stack([CAMERA_HEIGHT_M - height, mask]).astype(np.float32)
+
+    at_m: tuple[float, float, float] = (-0.2, 0.0, 0.33)
+    distance_m: float = 1.7
+    yaw_deg: float = 28.0
+    pitch_deg: float = -24.0
+    field_deg: float = 45.0
+
+    def __post_init__(self) -> None:
+        for name, limits in _VIEW_LIMITS.items():
+            check_field(self, name, *limits)
+        (at_m,) = check_array("at_m", [self.at_m], 1, 3)
+        at_m = tuple(check_within("at_m", value, -2.0, 2.0, "m") for value in at_m)
+        object.__setattr__(self, "at_m", at_m)
+
+    def picture(
+        self, client: BulletClient, hidden: list[int], width: int, height: int
+    ) -> np.ndarray:
+        """Render a colour picture (height, width, 3), uint8, with the hidden bodies."""
+        view = pybullet.computeViewMatrixFromYawPitchRoll(
+            self.at_m, self.distance_m, self.yaw_deg, self.pitch_deg, roll=0, upAxisIndex=2
+        )
+        projection = pybullet.computeProjectionMatrixFOV(self.field_deg, width / height, 0.1, 4.0)
+        light = {"lightDirection": (0.6, -0.7, 1.6), "lightDistance": 3.0, "shadow": 1}
+        _raise(client, hidden, HIDDEN_M)
+        # Rendered at twice the size and averaged, since TinyRenderer does no anti-aliasing.
+        _, _, rgba, _, _ = client.getCameraImage(
+            *(2 * width, 2 * height, view, projection), **light, **_RENDERER
+        )
+        _raise(client, hidden, -HIDDEN_M)
+        rgb = np.asarray(rgba, dtype=np.uint16).reshape(2 * height, 2 * width, 4)[..., :3]
+        rows = rgb[::2] + rgb[1::2]
+        return ((rows[:, ::2] + rows[:, 1::2]) // 4).astype(np.uint8)
 
 
-def picture(
-    client: BulletClient,
-    size: tuple[int, int],
-    at_m: list[float],
-    distance_m: float,
-    yaw_deg: float,
-    pitch_deg: float,
-    field_deg: float,
-) -> np.ndarray:
-    """Render a colour picture (height, width, 3), uint8; see `Tabletop.picture`."""
-    view = pybullet.computeViewMatrixFromYawPitchRoll(
-        at_m, distance_m, yaw_deg, pitch_deg, roll=0, upAxisIndex=2
-    )
-    width, height = size
-    projection = pybullet.computeProjectionMatrixFOV(field_deg, width / height, 0.1, 4.0)
-    light = {"lightDirection": (0.6, -0.7, 1.6), "lightDistance": 3.0, "shadow": 1}
-    # Rendered at twice the size and averaged, since TinyRenderer does no anti-aliasing.
-    _, _, rgba, _, _ = client.getCameraImage(
-        *(2 * width, 2 * height, view, projection), **light, **_RENDERER
-    )
-    rgb = np.asarray(rgba, dtype=np.uint16).reshape(2 * height, 2 * width, 4)[..., :3]
-    rows = rgb[::2] + rgb[1::2]
-    return ((rows[:, ::2] + rows[:, 1::2]) // 4).astype(np.uint8)
+def _raise(client: BulletClient, bodies: list[int], up_m: float) -> None:
+    for body in bodies:
+        (x, y, z), turn = client.getBasePositionAndOrientation(body)
+        client.resetBasePositionAndOrientation(body, (x, y, z + up_m), turn)

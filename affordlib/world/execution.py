@@ -4,7 +4,7 @@ The arm follows joint waypoints and measures its own pose and contact forces.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -13,7 +13,7 @@ import pybullet
 from pybullet_utils.bullet_client import BulletClient
 from scipy.interpolate import CubicSpline
 
-from affordlib.primitives import EMPTY_M, Grasp
+from affordlib.primitives import EMPTY_M, GRIPPER, YAW, Grasp, Z
 from affordlib.types import Interaction, Observation, UnreachableError
 from affordlib.world import robot
 from affordlib.world.objects import PlacedObject, poses
@@ -78,6 +78,8 @@ class JointController:
         self.fingers = self.links["left_finger"], self.links["right_finger"]
         self.joints = (*robot.ARM_JOINTS, *self.fingers)
         self.palm = self.links["palm"]
+        self._gear: int | None = None
+        self._grip: int | None = None
 
     def put(self, angles_rad: np.ndarray, gap_m: float) -> None:
         """Set the joint angles (6,) [rad] and the gap of the fingers [m] without motion."""
@@ -185,30 +187,30 @@ class JointController:
         self.untie()
         left, right = self.fingers
         links, axis, origin = (self.robot, left, self.robot, right), (0, 1, 0), (0, 0, 0)
-        gear = self.client.createConstraint(*links, pybullet.JOINT_GEAR, axis, origin, origin)
-        self.client.changeConstraint(gear, gearRatio=-1, maxForce=300, erp=0.5)
+        self._gear = self.client.createConstraint(*links, pybullet.JOINT_GEAR, axis, origin, origin)
+        self.client.changeConstraint(self._gear, gearRatio=-1, maxForce=300, erp=0.5)
 
     def untie(self) -> None:
         """Remove the gear between the fingers and the joint that fixes an object to the hand."""
-        client = self.client
-        for k in reversed(range(client.getNumConstraints())):
-            client.removeConstraint(client.getConstraintUniqueId(k))
+        for joint in (self._grip, self._gear):
+            if joint is not None:
+                self.client.removeConstraint(joint)
+        self._grip = self._gear = None
 
     def tie_held(self, body: int) -> None:
         """Fix an object held by both coupled fingers to the hand, since it creeps by 0.3 mm/s."""
         client = self.client
-        contacts = client.getContactPoints(self.robot, body)
-        touching = {contact[3] for contact in contacts}
-        if client.getNumConstraints() != 1 or not touching.issuperset(self.fingers):
+        touching = {contact[3] for contact in client.getContactPoints(self.robot, body)}
+        if self._gear is None or self._grip is not None or not touching.issuperset(self.fingers):
             return
         hand = client.getLinkState(self.robot, self.palm)[:2]
         held = client.getBasePositionAndOrientation(body)
         position, orientation = pybullet.multiplyTransforms(*pybullet.invertTransform(*hand), *held)
         bodies = self.robot, self.palm, body, -1
-        joint = client.createConstraint(
+        self._grip = client.createConstraint(
             *bodies, pybullet.JOINT_FIXED, (0, 0, 0), position, (0, 0, 0), orientation
         )
-        client.changeConstraint(joint, maxForce=20)
+        client.changeConstraint(self._grip, maxForce=20)
 
 
 def execute(
@@ -227,10 +229,9 @@ def execute(
     """
     primitive = command.primitive
     start = poses(np.array([placed.state()]))[0]
-    offset = np.array([*seen.xy_m, tip_offset_m, 0.0, 0.0])
-    motion = plan_motion(primitive, command.segments, offset, approach)
-    over_start, down, poses_W, paths, out = motion
-    gaps = [primitive.opening_m * segment.poses[:, 4] for segment in command.segments]
+    origin_m = *seen.xy_m, tip_offset_m
+    motion = plan_motion(primitive, command.segments, origin_m, approach)
+    gaps = [primitive.opening_m * segment.poses[:, GRIPPER] for segment in command.segments]
 
     closes = any(np.ptp(gap) > 0 for gap in gaps)
     arm.set_fingers(primitive.force_N, closes)
@@ -238,42 +239,42 @@ def execute(
         arm.tie_fingers()
     if approach:
         placed.brake(True)
-        over = joint_move(arm.angles_rad, over_start, 1.0)
+        over = joint_move(arm.angles_rad, motion.above, 1.0)
         arm.follow(over, np.linspace(arm.gap_m, gaps[0][0], 2))
-        arm.follow(down, gaps[0][[0, 0]])
+        arm.follow(motion.down, gaps[0][[0, 0]])
     else:
-        arm.put(paths[0][0], gaps[0][0])
+        arm.put(motion.paths[0][0], gaps[0][0])
     placed.brake(False)
 
     recording, floor = Recording(placed.body), -math.inf
-    for segment, one, path, gap in zip(command.segments, poses_W, paths, gaps, strict=True):
-        if one[:, 2].min() < floor:
-            one = one.copy()
-            one[:, 2] = np.maximum(one[:, 2], floor)
+    parts = command.segments, motion.poses_W, motion.paths, gaps
+    for segment, one, path, gap in zip(*parts, strict=True):
+        if one[:, Z].min() < floor:
+            one[:, Z] = np.maximum(one[:, Z], floor)
             try:
                 path = robot.joint_path(one, arm.angles_rad, primitive.tool)
             except UnreachableError:  # the arm stays where it felt the object, off its path
                 path = np.repeat(arm.angles_rad[None], len(one), axis=0)
         covered = arm.follow(path, gap, recording, segment, one)
         if segment.guarded and covered < 1.0:
-            floor = float(np.interp(covered, np.linspace(0, 1, len(one)), one[:, 2]))
+            floor = float(np.interp(covered, np.linspace(0, 1, len(one)), one[:, Z]))
     arm.record(recording)
     placed.brake(approach)
 
     if primitive.holds and closes:
-        heights_m = np.array(recording.tool)[:, 2]
+        heights_m = np.array(recording.tool)[:, Z]
         arm.raised_m = float(heights_m[-1] - heights_m.min())
     if not primitive.holds:
         release = np.array([arm.gap_m, primitive.opening_m if closes else arm.gap_m])
         if release[1] > release[0]:
             arm.follow(np.repeat(arm.angles_rad[None], 13, axis=0), np.linspace(*release, 13))
-        arm.follow(out, release[[1, 1]])
+        arm.follow(motion.back, release[[1, 1]])
         if approach:
             arm.follow(joint_move(arm.angles_rad, _HOME, 1.0), release[[1, 1]])
     arm.wait(SETTLE_STEPS)
     if not primitive.holds:
         arm.untie()
-    interaction = _interaction(command, placed, recording, seen, start, offset)
+    interaction = _interaction(command, placed, recording, seen, start, origin_m)
     if not (approach or primitive.holds):
         arm.put(_HOME, arm.gap_m)
     return interaction
@@ -285,26 +286,27 @@ def _interaction(
     recording: Recording,
     seen: Observation,
     start: np.ndarray,
-    offset: np.ndarray,
+    origin_m: Sequence[float],
 ) -> Interaction:
     """Build the interaction from the recording, interpolated at the command's phases."""
     phase = command.phase
     recorded = poses(placed.states_of_centre(np.array(recording.states)))
     rest = poses(np.array([placed.state()]))[0]
     # Choose the multiple of 2π nearest to the last recorded yaw, which is unwrapped.
-    rest[3] = recorded[-1, 3] + (rest[3] - recorded[-1, 3] + math.pi) % (2 * math.pi) - math.pi
-    origin = np.array([*start[:3], recorded[0, 3], 0.0])
+    last = recorded[-1, YAW]
+    rest[YAW] = last + (rest[YAW] - last + math.pi) % (2 * math.pi) - math.pi
+    origin = np.array([*start[: Z + 1], recorded[0, YAW], 0.0])
     at_sample, at_waypoint = recorded_phases(command.segments)
     effect = recorded - origin
-    tool = np.array(recording.tool) - np.array([*offset[:3], 0.0, 0.0])
-    tool[:, 3] = np.unwrap(tool[:, 3])
+    tool = np.array(recording.tool) - [*origin_m, 0.0, 0.0]
+    tool[:, YAW] = np.unwrap(tool[:, YAW])
     seldom = np.linspace(0, phase[-1], RECORDED_SAMPLES)
     return replace(
         unreached(command, placed, seen),
         reached=True,
         effect=np.column_stack([np.interp(phase, at_sample, effect[:, c]) for c in range(5)]),
         rest_effect=rest - origin,
-        start_pose=(float(start[0]), float(start[1]), float(recorded[0, 3])),
+        start_pose=(float(start[0]), float(start[1]), float(recorded[0, YAW])),
         tracking_error_m=recording.off_path_m,
         tool=np.column_stack([np.interp(seldom, at_waypoint, tool[:, c]) for c in range(5)]),
         penetration_m=recording.penetration_m,
@@ -334,7 +336,7 @@ def unreached(command: Command, placed: PlacedObject, seen: Observation) -> Inte
 def put_down(arm: JointController) -> None:
     """Lower the held object to its height before the lift, open the fingers, rise and go home."""
     *pose, gap_m = arm.tool_pose()
-    here, below_m = np.array([*pose, 0.0]), arm.raised_m if gap_m > EMPTY_M else 0.0
+    here, below_m = np.array([*pose, 0.0, 0.0]), arm.raised_m if gap_m > EMPTY_M else 0.0
     down = np.repeat(arm.angles_rad[None], 2, axis=0)
     if below_m > PUT_DOWN_M:
         down = line(here, here - (below_m - PUT_DOWN_M) * UP, arm.angles_rad, 1.0, arm.tool)

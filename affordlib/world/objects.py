@@ -6,16 +6,18 @@ centre and z upwards when the object is placed; the x axis of a lying cylinder i
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar, Self
 
 import numpy as np
 import pybullet
+from numpy.random import Generator
 from pybullet_utils.bullet_client import BulletClient
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from affordlib.geometry import cross, rotated
+from affordlib.geometry import centroid, is_convex
 from affordlib.types import (
     TABLE_X_M,
     TABLE_Y_M,
@@ -26,15 +28,17 @@ from affordlib.types import (
     check_on_table,
     check_within,
 )
+from affordlib.world.camera import CAMERAS, HIDDEN_M
 
 DENSITY_KG_M3 = 600.0
+Range = tuple[float, float]
 SIZE_RANGE_M = (0.04, 0.08)
 LARGEST_M = 0.3
 N_EDGES = (3, 8)
 CHAMFER_M = (0.006, 0.004)
 """Width and height [m] of the chamfer around a prism's base, under which a blade can slide."""
 
-_HULL_MARGIN_M = 0.001
+HULL_MARGIN_M = 0.001
 """Margin [m] by which PyBullet's collision shape of a convex hull exceeds its corners."""
 
 _UPRIGHT = math.cos(math.radians(45))
@@ -44,14 +48,17 @@ _UPRIGHT = math.cos(math.radians(45))
 class TabletopObject(ABC):
     """An object on the table; all its fields are lengths [m].
 
-    rollable: whether it can roll as it is placed; footprint_m: corners (n, 2) [m] of its outline
-    seen from above, relative to its centre, at yaw 0.
+    rollable: whether it can roll as it is placed; stable: whether it stays upright when it is
+    pushed, whatever its dimensions; has_yaw: whether its yaw can be seen; footprint_m: corners
+    (n, 2) [m] of its outline seen from above, relative to its centre, at yaw 0.
     """
 
     category: ClassVar[str]
     rollable: ClassVar[bool] = False
-    volume_m3: ClassVar[float]
-    footprint_m: ClassVar[np.ndarray]
+    stable: ClassVar[bool] = False
+    has_yaw: ClassVar[bool] = True
+    volume_m3: ClassVar[property]
+    footprint_m: ClassVar[property]
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -59,10 +66,7 @@ class TabletopObject(ABC):
 
     @classmethod
     def sample(
-        cls,
-        rng: np.random.Generator,
-        size_range_m: tuple[float, float] = SIZE_RANGE_M,
-        height_range_m: tuple[float, float] | None = None,
+        cls, rng: Generator, size_range_m: Range = SIZE_RANGE_M, height_range_m: Range | None = None
     ) -> Self:
         """Sample dimensions uniformly in size_range_m, heights in height_range_m if given."""
         sizes = rng.uniform(*size_range_m, size=len(fields(cls)))
@@ -105,6 +109,7 @@ class Cuboid(TabletopObject):
     height: float
 
     category = "cuboid"
+    stable = True
     volume_m3 = property(lambda self: self.length * self.width * self.height)
     footprint_m = property(lambda self: _rectangle(self.length, self.width))
 
@@ -141,6 +146,8 @@ class UprightCylinder(_Cylinder):
     height: float
 
     category = "upright_cylinder"
+    stable = True
+    has_yaw = False
     axis = 2
     footprint_m = property(lambda self: _circle(self.diameter))
 
@@ -170,6 +177,7 @@ class Sphere(TabletopObject):
 
     category = "sphere"
     rollable = True
+    has_yaw = False
     height_m = property(lambda self: self.diameter)
     volume_m3 = property(lambda self: math.pi * self.diameter**3 / 6)
     footprint_m = property(lambda self: _circle(self.diameter))
@@ -198,27 +206,17 @@ class Prism(TabletopObject):
         corners = check_array("prism corners", self.corners, 2)
         if corners.ndim != 2 or not N_EDGES[0] <= len(corners) <= N_EDGES[1]:
             raise ValueError(f"prism corners must be 3 to 8 points (x, y), got {corners.shape}")
-        following = np.roll(corners, -1, axis=0)
-        edges = following - corners
-        turns = cross(edges, np.roll(edges, -1, axis=0))
-        inner = np.sum(edges * np.roll(edges, -1, axis=0), axis=1)
-        rounds = np.arctan2(turns, inner).sum() / (2 * math.pi)  # 1 for convex, 2 for a star
-        if (turns <= 0).any() or rounds > 1.5 or np.abs(corners).max() > LARGEST_M:
+        if not is_convex(corners) or np.abs(corners).max() > LARGEST_M:
             raise ValueError(
                 "prism corners must go counter-clockwise around a convex polygon of at most "
                 f"{LARGEST_M:g} m, got {self.corners!r}"
             )
-        doubled = cross(corners, following)
-        centroid = ((corners + following) * doubled[:, None]).sum(axis=0) / (3 * doubled.sum())
-        centred = tuple((float(x), float(y)) for x, y in corners - centroid)
+        centred = tuple((float(x), float(y)) for x, y in corners - centroid(corners))
         object.__setattr__(self, "corners", centred)
 
     @classmethod
     def sample(
-        cls,
-        rng: np.random.Generator,
-        size_range_m: tuple[float, float] = SIZE_RANGE_M,
-        height_range_m: tuple[float, float] | None = None,
+        cls, rng: Generator, size_range_m: Range = SIZE_RANGE_M, height_range_m: Range | None = None
     ) -> Self:
         """Sample a polygon of 3 to 8 edges with corners on a circle of the sampled diameter."""
         n = int(rng.integers(N_EDGES[0], N_EDGES[1] + 1))
@@ -245,7 +243,7 @@ class Prism(TabletopObject):
         return np.vstack([np.insert(points, 2, z, axis=1) for points, z in levels])
 
     def shape(self) -> dict[str, Any]:
-        felt = self._vertices(_HULL_MARGIN_M).tolist()
+        felt = self._vertices(HULL_MARGIN_M).tolist()
         return {"shapeType": pybullet.GEOM_MESH, "vertices": felt, "seen": [self._vertices()]}
 
 
@@ -253,13 +251,13 @@ CATEGORIES: dict[str, type[TabletopObject]] = {
     kind.category: kind for kind in (Cuboid, UprightCylinder, LyingCylinder, Sphere, Prism)
 }
 
+STANDING = tuple(name for name, kind in CATEGORIES.items() if kind.stable)
+ROLLABLE = tuple(name for name, kind in CATEGORIES.items() if kind.rollable)
+
 
 def category_named(name: str) -> type[TabletopObject]:
     """Return the class of the object category `name`; raises ValueError with the known names."""
     return CATEGORIES[check_choice("object category", name, CATEGORIES)]
-
-
-CAMERAS = ("ideal", "kinect")
 
 
 @dataclass(frozen=True)
@@ -267,8 +265,8 @@ class WorldConfig:
     """Physical parameters and sensor model of the world; Bullet multiplies two bodies' frictions.
 
     com_offset_m: centre of mass in the object's frame; tip_offset_m: error of the gripper's height,
-    positive upwards; bias_m: error added to the object's estimated position. camera: "ideal"
-    returns the exact position, "kinect" measures it with noise generated from noise_seed.
+    positive upwards; bias_m: error added to the object's estimated position. camera: name of one of
+    the `CAMERAS`, whose noise is generated from noise_seed.
     """
 
     table_friction: float = 0.5
@@ -281,11 +279,17 @@ class WorldConfig:
     bias_m: tuple[float, float] = (0.0, 0.0)
     noise_seed: int = 0
 
+    ranges: ClassVar[dict[str, tuple[float, float, str]]] = {
+        "table_friction": (0.01, 2.0, ""),
+        "object_friction": (0.01, 2.0, ""),
+        "finger_friction": (0.01, 2.0, ""),
+        "density_kg_m3": (50.0, 10_000.0, "kg/m³"),
+        "tip_offset_m": (-0.008, 0.1, "m"),
+    }
+
     def __post_init__(self) -> None:
-        for name in ("table_friction", "object_friction", "finger_friction"):
-            check_field(self, name, 0.01, 2.0)
-        check_field(self, "density_kg_m3", 50.0, 10_000.0, "kg/m³")
-        check_field(self, "tip_offset_m", -0.008, 0.1, "m")
+        for name, limits in self.ranges.items():
+            check_field(self, name, *limits)
         for name, size in (("com_offset_m", 3), ("bias_m", 2)):
             values = tuple(check_within(name, v, -0.1, 0.1, "m") for v in getattr(self, name))
             if len(values) != size:
@@ -299,9 +303,6 @@ ROLLING_M, BRAKED_ROLLING_M = 1e-4, 1e-3
 
 Bullet multiplies each by the other body's lateral friction, which gives 0.1 and 0.55 mm in total.
 """
-
-_TOPPLING = 1.5
-"""Factor on the energy that tips an object onto its edge, since sliding dissipates some of it."""
 
 
 def poses(states: np.ndarray) -> np.ndarray:
@@ -326,21 +327,17 @@ def set_friction(client: BulletClient, body: int, link: int, lateral: float, **m
 
 
 class PlacedObject:
-    """An object placed on the table of a client, at (x, y) [m] and a yaw [rad]."""
+    """An object placed on the table of a client at a pose: x, y [m] and a yaw [rad]."""
 
     def __init__(
-        self,
-        client: BulletClient,
-        obj: TabletopObject,
-        config: WorldConfig,
-        xy_m: tuple,
-        yaw_rad: float,
+        self, client: BulletClient, obj: TabletopObject, config: WorldConfig, pose: Sequence[float]
     ) -> None:
+        x_m, y_m, yaw_rad = pose
         self.client, self.obj = client, obj
         self._centre_of_mass_m = np.array(config.com_offset_m)
         shape = obj.shape()
         frame, felt = shape.pop("frame", (0, 0, 0, 1)), shape.get("vertices")
-        visual = _mesh(shape.pop("seen", [felt])) if felt or "seen" in shape else dict(shape)
+        visual = mesh(shape.pop("seen", [felt])) if felt or "seen" in shape else dict(shape)
         if "height" in visual:
             visual["length"] = visual.pop("height")
         self.body = client.createMultiBody(
@@ -356,7 +353,7 @@ class PlacedObject:
         undamped = {"linearDamping": 0.0, "angularDamping": 0.0}
         set_friction(client, self.body, -1, config.object_friction, **undamped)
         c, s, (x, y, z) = math.cos(yaw_rad), math.sin(yaw_rad), config.com_offset_m
-        position = (xy_m[0] + c * x - s * y, xy_m[1] + s * x + c * y, obj.height_m / 2 + z)
+        position = (x_m + c * x - s * y, y_m + s * x + c * y, obj.height_m / 2 + z)
         orientation = pybullet.getQuaternionFromEuler((0, 0, yaw_rad))
         client.resetBasePositionAndOrientation(self.body, position, orientation)
 
@@ -400,10 +397,7 @@ class PlacedObject:
         self.client.changeDynamics(self.body, -1, rollingFriction=rolling)
 
     def displace(self, dx_m: float, dy_m: float, dyaw_rad: float) -> None:
-        """Translate the object by (dx, dy) [m] and rotate it about the vertical by dyaw_rad.
-
-        Raises ValueError, without moving it, if its centre would leave the table.
-        """
+        """Translate the object by (dx, dy) [m] and rotate it about the vertical by dyaw_rad."""
         x, y, *_ = centre = np.array(self.state()[:3])
         dx, dy = check_finite("dx_m", dx_m), check_finite("dy_m", dy_m)
         turn = Rotation.from_euler("z", check_finite("dyaw_rad", dyaw_rad))
@@ -415,64 +409,23 @@ class PlacedObject:
             (turn * Rotation.from_quat(quaternion)).as_quat(),
         )
 
-    def knock(self, dx_m_s: float, dy_m_s: float, spin_rad_s: float = 0.0) -> None:
-        """Add to the object's velocity [m/s] and to its spin [rad/s] about the vertical."""
-        speeds = (("dx_m_s", dx_m_s), ("dy_m_s", dy_m_s))
-        change = [*(check_within(name, v, -10.0, 10.0, "m/s") for name, v in speeds), 0.0]
-        spin = [0.0, 0.0, check_within("spin_rad_s", spin_rad_s, -100.0, 100.0, "rad/s")]
-        self._change_velocity(np.array(change), np.array(spin))
-
-    def topple(self, direction_rad: float) -> None:
-        """Give the object the spin that tips it over the edge of its base in a direction [rad].
-
-        Raises ValueError if the object can roll and thus has no such edge.
-        """
-        c, s = math.cos(angle := check_finite("direction_rad", direction_rad)), math.sin(angle)
-        if self.rolls():
-            kind = self.obj.category
-            raise ValueError(f"a {kind} that can roll has no edge to topple over; use another")
-        low, high = self.client.getAABB(self.body)
-        x, y, z = self.state()[:3]
-        corners = self._corners_m() - (x, y)
-        out, up = float((corners @ (c, s)).max()), z - low[2]
-        width, height = 2 * out, high[2] - low[2]
-        # For a box about its lower edge: inertia per mass, and the rise of its centre.
-        inertia = (width**2 + height**2) / 3
-        rise = math.hypot(out, up) - up
-        rate = math.sqrt(2 * 9.81 * rise * _TOPPLING / inertia)
-        spin = rate * np.array([-s, c, 0.0])
-        self._change_velocity(np.cross(spin, [-out * c, -out * s, up]), spin)
-
-    def _corners_m(self) -> np.ndarray:
-        """Return the outline (n, 2) [m] on the table in the object's current pose."""
-        if self.fell():
-            outline, half = self.obj.footprint_m, self.obj.height_m / 2
-            ends = np.concatenate([np.insert(outline, 2, z, axis=1) for z in (-half, half)])
-            *centre, i, j, k, w = self.state()
-            return Rotation.from_quat([i, j, k, w]).apply(ends)[:, :2] + centre[:2]
-        x, y, yaw = self.pose()
-        return np.add(rotated(self.obj.footprint_m, yaw), (x, y))
-
-    def draw_outline(self, xy_m: tuple, rgb: tuple, yaw_rad: float, scale: float) -> int:
-        """Create a coloured body that shows the footprint at (x, y) [m], 1 m below the table."""
+    def draw_outline(
+        self, xy_m: Sequence[float], rgb: Sequence[float], yaw_rad: float, scale: float
+    ) -> int:
+        """Create a coloured body that shows the footprint at (x, y) [m], hidden from the robot."""
         xy_m, yaw_rad = check_on_table("xy_m", xy_m), check_finite("yaw_rad", yaw_rad)
         outline = check_within("scale", scale, 0.1, 10.0) * self.obj.footprint_m
         rgb = [check_within("rgb", share, 0.0, 1.0) for share in check_array("rgb", rgb, 3)]
         # Larger sheets lie lower, so that a larger one appears as a frame around a smaller one.
         sheet = [np.vstack([np.insert(outline, 2, z, axis=1) for z in (-0.005, 0.001 / scale)])]
         return self.client.createMultiBody(
-            baseVisualShapeIndex=self.client.createVisualShape(**_mesh(sheet), rgbaColor=(*rgb, 1)),
-            basePosition=(*xy_m, -1.0),
+            baseVisualShapeIndex=self.client.createVisualShape(**mesh(sheet), rgbaColor=(*rgb, 1)),
+            basePosition=(*xy_m, -HIDDEN_M),
             baseOrientation=pybullet.getQuaternionFromEuler((0, 0, yaw_rad)),
         )
 
-    def _change_velocity(self, linear: np.ndarray, angular: np.ndarray) -> None:
-        moving = self.client.getBaseVelocity(self.body)
-        changed = np.add(moving, (linear, angular)).tolist()
-        self.client.resetBaseVelocity(self.body, *changed)
 
-
-def _mesh(parts: list) -> dict[str, Any]:
+def mesh(parts: list) -> dict[str, Any]:
     """Return the convex hulls of the corners (n, 3) of parts as triangles for the renderer."""
     hulls = [ConvexHull(part) for part in parts]
     triangles = np.concatenate([hull.points[hull.simplices] for hull in hulls])

@@ -181,15 +181,16 @@ def inverse_kinematics(
 
 
 def joint_path(poses_W: np.ndarray, near: np.ndarray, tool: str = "gripper") -> np.ndarray:
-    """Compute continuous joint angles (n, 6) along tool poses (n, 5): x, y, z, yaw, pitch.
+    """Compute continuous joint angles (n, 6) along tool poses (n, 6), as those of `Segment`.
 
     Raises UnreachableError if a pose is out of reach.
     """
     joints = np.empty((len(poses_W), 6))
     last = None
     for i, pose in enumerate(poses_W.tolist()):
-        if pose != last:
-            x, y, z, yaw, pitch = last = pose
+        x, y, z, yaw, _, pitch = pose
+        if (x, y, z, yaw, pitch) != last:
+            last = x, y, z, yaw, pitch
             near = inverse_kinematics(np.array([x, y, z]), yaw, near, pitch, tool)
         joints[i] = near
     return joints

@@ -4,10 +4,12 @@ Use it as a context manager. The simulation is deterministic. With a four times 
 twice the solver iterations, the final position of a push changes by 0.02 mm (median).
 """
 
+import copy
 import os
 import weakref
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
+from typing import Any
 
 import numpy as np
 import pybullet
@@ -23,6 +25,7 @@ from affordlib.types import (
     Interaction,
     NothingSeenError,
     Observation,
+    Obstacle,
     Step,
     UnreachableError,
     check_array,
@@ -32,9 +35,11 @@ from affordlib.types import (
     check_on_table,
     check_within,
 )
-from affordlib.world import camera, robot
+from affordlib.world import robot
+from affordlib.world.camera import CAMERAS, View, add_scenery, depth_crop, ideal
 from affordlib.world.execution import JointController, execute, put_down, unreached
 from affordlib.world.objects import PlacedObject, TabletopObject, WorldConfig, set_friction
+from affordlib.world.obstacles import PlacedObstacles
 from affordlib.world.trajectory import STEP_S, Command, plan_motion, segments_until
 
 OBJECTS_PER_BUILD = 256
@@ -52,8 +57,8 @@ class _Client(BulletClient):
 class Tabletop(AbstractContextManager):
     """A table, an arm and at most one object, in a separate PyBullet client.
 
-    n_averaged_images: number of noisy images over which an observation averages; on_step: called
-    with the world after every step of the simulation.
+    on_step: called with the world after every step of the simulation; obstacles: those on the
+    table, and which of them were touched.
     """
 
     def __init__(self, config: WorldConfig | None = None) -> None:
@@ -61,7 +66,6 @@ class Tabletop(AbstractContextManager):
         self._client: BulletClient | None = _Client()
         self.arm: JointController | None = None
         self.on_step: Callable[[Tabletop], None] | None = None
-        self.n_averaged_images = 1
         self.reset()
 
     def __exit__(self, *_: object) -> None:
@@ -88,10 +92,11 @@ class Tabletop(AbstractContextManager):
         else:  # same state as after building, without loading table and arm again
             self.arm.untie()
             for body in [client.getBodyUniqueId(k) for k in range(client.getNumBodies())]:
-                if body not in (self._table, self.arm.robot):
+                if body not in (self._table, self.arm.robot, *self._scenery):
                     client.removeBody(body)
             client.restoreState(stateId=self._fresh)
         self._placed: PlacedObject | None = None
+        self.obstacles = PlacedObstacles(client, (), 0.0)
         self._marks: list[int] = []
         self.noise = np.random.default_rng(self.config.noise_seed)
         set_friction(client, self._table, -1, self.config.table_friction)
@@ -119,7 +124,8 @@ class Tabletop(AbstractContextManager):
             basePosition=(sum(TABLE_X_M) / 2, sum(TABLE_Y_M) / 2, -0.05),
         )
         world = weakref.proxy(self)  # a reference cycle would keep the client connected
-        self.arm = JointController(client, tool, lambda: world.on_step and world.on_step(world))
+        self.arm = JointController(client, tool, lambda: world._after_step())
+        self._scenery = add_scenery(client)
         self._n_placed = 0
         self._fresh = client.saveState()
 
@@ -131,6 +137,7 @@ class Tabletop(AbstractContextManager):
         *,
         tool: str = "gripper",
         config: WorldConfig | None = None,
+        obstacles: Sequence[Obstacle] = (),
     ) -> None:
         """Clear the table, park the arm and place an object at (x, y) [m] with a yaw [rad].
 
@@ -140,7 +147,26 @@ class Tabletop(AbstractContextManager):
         self.config = config or self.config
         self.reset(check_choice("tool", tool, robot.TOOL_OFFSETS_M))
         self._n_placed += 1
-        self._placed = PlacedObject(self.client, obj, self.config, xy_m, yaw_rad)
+        self._placed = PlacedObject(self.client, obj, self.config, (*xy_m, yaw_rad))
+
+        self.set_obstacles(obstacles)
+
+    def set_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
+        """Replace the obstacles on the table; raises ValueError if one lies on the object."""
+        new = PlacedObstacles(self.client, obstacles, self.config.table_friction)
+        if wrong := new.overlapping(self.placed.body):
+            new.remove()
+            x, y, _ = self.object_pose()
+            raise ValueError(f"obstacles[{wrong[0]}] lies on the object at ({x:.3f}, {y:.3f}) m")
+        self.obstacles.remove()
+        self.obstacles = new
+        self._n_placed += len(obstacles)
+
+    def _after_step(self) -> None:
+        if self.obstacles.all:
+            self.obstacles.feel(self.placed.body, self.arm.robot)
+        if self.on_step is not None:
+            self.on_step(self)
 
     @property
     def placed(self) -> PlacedObject:
@@ -161,14 +187,6 @@ class Tabletop(AbstractContextManager):
     def object_pose(self) -> tuple[float, float, float]:
         """Return the object's (x, y) [m] and yaw [rad] in the table's frame."""
         return self.placed.pose()
-
-    def object_fell(self) -> bool:
-        """Return whether the object fell over since it was placed."""
-        return self.placed.fell()
-
-    def object_rolls(self) -> bool:
-        """Return whether the object can roll in its current orientation, as a lying cylinder."""
-        return self.placed.rolls()
 
     def shove(self, dx_m: float, dy_m: float, dyaw_rad: float = 0.0) -> None:
         """Displace the object by (dx, dy) [m], rotate it by dyaw_rad, and let it settle.
@@ -192,77 +210,36 @@ class Tabletop(AbstractContextManager):
         self.settle()
 
     def observe(self) -> Observation:
-        """Return the object's estimated position and its image; the arm must be parked.
-
-        The position is the mean over `n_averaged_images` images; the image is the first of them.
-        A Kinect's image is centred on the object as seen in it, independent of mean and `bias_m`.
-        """
-        x, y, _ = self.object_pose()
-        views = []
-        if self.config.camera == "kinect":
-            images = range(self.n_averaged_images)
-            views = [camera.kinect_view(self.client, self.noise) for _ in images]
-            x, y = np.mean([xy for xy, _ in views], axis=0).tolist()
-        xy = x + self.config.bias_m[0], y + self.config.bias_m[1]
-        image = views[0][1] if views else camera.depth_crop(self.client, xy)
-        return Observation(xy, image)
+        """Return the object's estimated position and its image; the arm must be parked."""
+        xy_m, bias_m = np.array(self.object_pose()[:2]), self.config.bias_m
+        return CAMERAS[self.config.camera](self.client, xy_m, bias_m, self.noise)
 
     def _observe_edge(self, lever: LeverUp) -> Observation:
         """Return the image (2, 128, 128) around a lever-up's contact, the lever pointing right."""
-        if self.config.camera != "ideal":
+        if CAMERAS[self.config.camera] is not ideal:
             raise ValueError(f'camera must be "ideal" for a lever-up, got {self.config.camera!r}')
         x, y = np.add(self.object_pose()[:2], self.config.bias_m).tolist()
         window = (x + lever.contact_x, y + lever.contact_y), LEVER_IMAGE_PIXELS, LEVER_CROP_WIDTH_M
-        return Observation((x, y), camera.depth_crop(self.client, *window, lever.theta, samples=1))
+        return Observation((x, y), depth_crop(self.client, *window, lever.theta, samples=1))
 
     def depth_image(self) -> np.ndarray:
         """Return depth [m] and mask (2, 48, 48) around the object; the arm must be parked."""
         return self.observe().image
 
-    def picture(
-        self,
-        width: int = 320,
-        height: int = 240,
-        at_m: Sequence[float] = (-0.05, 0.0, 0.06),
-        distance_m: float = 1.0,
-        yaw_deg: float = 62.0,
-        pitch_deg: float = -33.0,
-        field_deg: float = 45.0,
-    ) -> np.ndarray:
+    def picture(self, width: int = 320, height: int = 240, **view: Any) -> np.ndarray:
         """Render a colour picture (height, width, 3), uint8, of the robot and the table.
 
-        The camera looks at a point `at_m` (x, y, z) from a distance, with a vertical field of view;
-        with the yaw 0 it looks along y, with the pitch -90 straight down.
+        view: fields of `affordlib.world.camera.View`; by default, the whole arm is in view.
         """
-        for name, pixels in (("width", width), ("height", height)):
-            check_count(name, pixels, 16, 2048)
-        view = (
-            check_within("distance_m", distance_m, 0.2, 3.0, "m"),
-            check_within("yaw_deg", yaw_deg, -360.0, 360.0, "°"),
-            check_within("pitch_deg", pitch_deg, -90.0, 0.0, "°"),
-            check_within("field_deg", field_deg, 1.0, 120.0, "°"),
-        )
-        (at_m,) = check_array("at_m", [at_m], 1, 3)
-        at_m = [check_within("at_m", value, -2.0, 2.0, "m") for value in at_m]
-        self._move_marks(1.0)
-        picture = camera.picture(self.client, (width, height), at_m, *view)
-        self._move_marks(-1.0)
-        return picture
+        hidden = [*self._scenery, *self.obstacles.shown, *self._marks]
+        size = check_count("width", width, 16, 2048), check_count("height", height, 16, 2048)
+        return View(**view).picture(self.client, hidden, *size)
 
     def mark(
-        self,
-        xy_m: tuple[float, float],
-        rgb: tuple[float, float, float],
-        yaw_rad: float = 0.0,
-        scale: float = 1.0,
+        self, xy_m: Sequence[float], rgb: Sequence[float], yaw_rad: float = 0.0, scale: float = 1.0
     ) -> None:
         """Draw the object's footprint at (x, y) [m], in a colour, unseen by the robot's camera."""
         self._marks.append(self.placed.draw_outline(xy_m, rgb, yaw_rad, scale))
-
-    def _move_marks(self, up_m: float) -> None:
-        for body in self._marks:
-            (x, y, z), turn = self.client.getBasePositionAndOrientation(body)
-            self.client.resetBasePositionAndOrientation(body, (x, y, z + up_m), turn)
 
     def can_reach(
         self, primitive: Primitive, stop_phase: float = 1.0, at_xy_m: Sequence[float] | None = None
@@ -273,20 +250,25 @@ class Tabletop(AbstractContextManager):
         """
         stop_phase = check_within("stop_phase", stop_phase, 0.0, 1.0)
         if at_xy_m is None:
-            seen = self.observe()
+            noise, self.noise = self.noise, copy.deepcopy(self.noise)  # the next image has its own
+            seen, self.noise = self.observe(), noise
             at_xy_m, primitive = seen.xy_m, adapt_to_object(primitive, seen.image)
-        offset = np.array([*check_on_table("at_xy_m", at_xy_m), self.config.tip_offset_m, 0.0, 0.0])
+        origin_m = *check_on_table("at_xy_m", at_xy_m), self.config.tip_offset_m
         try:
-            plan_motion(primitive, segments_until(primitive, stop_phase), offset, approach=True)
+            plan_motion(primitive, segments_until(primitive, stop_phase), origin_m, approach=True)
         except UnreachableError:
             return False
         return True
 
-    def execute(self, step: Step) -> Interaction:
-        """Execute a step of a plan, with approach, along its decoded path if it has one."""
+    def execute(self, step: Step, seen: Observation | None = None) -> Interaction:
+        """Execute a step of a plan, with approach, along its decoded path if it has one.
+
+        seen: an observation of the object, to which the action is relative (default: a new one).
+        """
+        primitive, stop = step.primitive, step.stop_phase
         if step.path_xy_m is None:
-            return self.execute_primitive(step.primitive, step.stop_phase, approach=True)
-        return self.execute_path(step.path_xy_m, step.primitive, step.stop_phase)
+            return self.execute_primitive(primitive, stop, approach=True, seen=seen)
+        return self.execute_path(step.path_xy_m, primitive, stop, seen)
 
     def execute_primitive(
         self,
@@ -296,6 +278,7 @@ class Tabletop(AbstractContextManager):
         approach: bool = False,
         smooth: bool = True,
         record_unreachable: bool = False,
+        seen: Observation | None = None,
     ) -> Interaction:
         """Execute a primitive on the object up to a phase, and record the effect.
 
@@ -304,11 +287,14 @@ class Tabletop(AbstractContextManager):
         The effect is recorded at 301 phases in [0, stop_phase]. A partial action is a prefix of
         the path, re-timed to a smooth stop, or stopped abruptly with smooth=False.
         If the arm cannot reach, raises UnreachableError, or with record_unreachable=True returns
-        an interaction in which nothing moved (`reached` is False).
+        an interaction in which nothing moved (`reached` is False). seen: an observation of the
+        object, to which the action is relative (default: a new one).
         """
         stop_phase = check_within("stop_phase", stop_phase, 0.0, 1.0)
         self._require_tool(primitive)
-        seen = self._observe_edge(primitive) if isinstance(primitive, LeverUp) else self.observe()
+        if seen is None:
+            is_lever = isinstance(primitive, LeverUp)
+            seen = self._observe_edge(primitive) if is_lever else self.observe()
         command = Command.of(adapt_to_object(primitive, seen.image), stop_phase, smooth)
         try:
             return execute(self.arm, self.placed, command, seen, self.config.tip_offset_m, approach)
@@ -318,7 +304,11 @@ class Tabletop(AbstractContextManager):
             return unreached(command, self.placed, seen)
 
     def execute_path(
-        self, path_xy_m: np.ndarray, primitive: Push | None = None, stop_phase: float = 1.0
+        self,
+        path_xy_m: np.ndarray,
+        primitive: Push | None = None,
+        stop_phase: float = 1.0,
+        seen: Observation | None = None,
     ) -> Interaction:
         """Move the gripper along a path (n, 2) [m] relative to the object, and record the effect.
 
@@ -329,7 +319,7 @@ class Tabletop(AbstractContextManager):
         primitive = primitive or Push(0.0)
         self._require_tool(primitive)
         command = Command.along(check_array("path_xy_m", path_xy_m, 2), primitive, stop_phase)
-        seen = self.observe()
+        seen = seen or self.observe()
         return execute(self.arm, self.placed, command, seen, self.config.tip_offset_m, True)
 
     def _require_tool(self, primitive: Primitive) -> None:

@@ -4,12 +4,21 @@ Inverse kinematics is solved at 20 Hz and interpolated with a spline (its error 
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 
-from affordlib.primitives import DURATION_S, HOVER_M, TIP_HEIGHT_M, Primitive, min_jerk
+from affordlib.primitives import (
+    DURATION_S,
+    HOVER_M,
+    TIP_HEIGHT_M,
+    YAW,
+    Primitive,
+    Z,
+    min_jerk,
+)
 from affordlib.world import robot
 
 STEP_S = 1 / 240
@@ -24,8 +33,8 @@ RETREAT_M = 0.02
 """Distance [m] the gripper moves back along its path, except after actions that cage the object."""
 
 _WAYPOINT_S = STEPS_PER_WAYPOINT * STEP_S
-UP = np.array([0.0, 0.0, 1.0, 0.0, 0.0])
-"""Unit vector upwards in poses (x, y, z, yaw, pitch)."""
+UP = np.eye(6)[Z]
+"""Unit vector upwards in poses (6,)."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +42,6 @@ class TrajectorySegment:
     """Waypoints at intervals of 50 ms: poses (n, 6) as in `Segment`, and their phases (n,).
 
     n_steps: number of simulation steps before the arm is stopped abruptly (default: all).
-    A guarded segment stops when the robot presses on the object.
     """
 
     poses: np.ndarray
@@ -71,7 +79,7 @@ class Command:
         action[:, :2] = path_xy_m
         heading = path_xy_m[-1] - path_xy_m[0]
         if np.hypot(*heading) > 1e-6:
-            action[:, 3] = math.atan2(heading[1], heading[0])
+            action[:, YAW] = math.atan2(heading[1], heading[0])
         return cls(primitive, phase, action, [_segment_along(action, phase)])
 
 
@@ -135,31 +143,40 @@ def joint_move(start: np.ndarray, end: np.ndarray, seconds: float) -> np.ndarray
 
 
 def line(start_W: np.ndarray, end_W: np.ndarray, near: np.ndarray, seconds: float, tool: str):
-    """Return joint waypoints (n, 6) of a straight line between poses (x, y, z, yaw, pitch)."""
+    """Return joint waypoints (n, 6) of a straight line between poses (6,)."""
     return robot.joint_path(joint_move(start_W, end_W, seconds), near, tool)
 
 
-def plan_motion(
-    primitive: Primitive, segments: list[TrajectorySegment], offset: np.ndarray, approach: bool
-) -> tuple[np.ndarray, np.ndarray, list[np.ndarray], list[np.ndarray], np.ndarray]:
-    """Plan the arm's motion along segments, whose poses are shifted by offset (5,).
+class Motion(NamedTuple):
+    """Planned joint waypoints (n, 6): down to the start, of each segment, and back and up again.
 
-    Returns joint angles (6,) above the start; waypoints (n, 6) down to the start; tool poses (n, 5)
-    and waypoints of each segment; waypoints back and up. Raises UnreachableError.
+    above: (6,) joint angles above the start; poses_W: the tool's poses (n, 6) of each segment.
     """
+
+    above: np.ndarray
+    down: np.ndarray
+    paths: list[np.ndarray]
+    back: np.ndarray
+    poses_W: list[np.ndarray]
+
+
+def plan_motion(
+    primitive: Primitive,
+    segments: list[TrajectorySegment],
+    origin_m: Sequence[float],
+    approach: bool,
+) -> Motion:
+    """Plan the arm's motion along segments about an origin (x, y, z); raises UnreachableError."""
     home, tool = np.array(robot.HOME), primitive.tool
+    rise = max(HOVER_M + TIP_HEIGHT_M - segments[0].poses[0, Z], 0.0) * UP
+    options = []
     # A gripper is symmetric: of its two equivalent yaws, use the one with less wrist rotation.
-    turns = (0.0, math.pi) if tool == "gripper" else (0.0,)
-    options = [
-        [s.poses[:, [0, 1, 2, 3, 5]] + offset + np.array([0, 0, 0, turn, 0]) for s in segments]
-        for turn in turns
-    ]
-    up = max(HOVER_M + TIP_HEIGHT_M - segments[0].poses[0, 2], 0.0) * UP
-    poses_W, over_start = min(
-        ((option, robot.joint_path(option[0][:1] + up, home, tool)[0]) for option in options),
-        key=lambda option: abs(option[1][5] - home[5]),
-    )
-    paths, near = [], over_start
+    for turn in (0.0, math.pi) if tool == "gripper" else (0.0,):
+        shift = np.array([*origin_m, turn, 0.0, 0.0])
+        poses_W = [s.poses + shift for s in segments]
+        options.append((robot.joint_path(poses_W[0][:1] + rise, home, tool)[0], poses_W))
+    above, poses_W = min(options, key=lambda option: abs(option[0][5] - home[5]))
+    paths, near = [], above
     for one in poses_W:
         paths.append(robot.joint_path(one, near, tool))
         near = paths[-1][-1]
@@ -169,18 +186,18 @@ def plan_motion(
     stop = at[-1] if n_steps is None else n_steps / STEPS_PER_WAYPOINT
     end = np.array([np.interp(stop, at, column) for column in poses_W[-1].T])
     near = np.array([np.interp(stop, at, column) for column in paths[-1].T])
-    caged = primitive.path(0.0)[0, 2] > TIP_HEIGHT_M
-    retreat, back = near[None], np.zeros(5)
+    caged = primitive.path(0.0)[0, Z] > TIP_HEIGHT_M
+    retreat, back = near[None], np.zeros(6)
     if not (caged or primitive.holds):
-        back[:3] = poses_W[0][0, :3] - end[:3]
+        back[: Z + 1] = poses_W[0][0, : Z + 1] - end[: Z + 1]
         back *= RETREAT_M / max(np.linalg.norm(back), RETREAT_M)
         retreat = line(end, end + back, near, 0.25, tool)
     lift = retreat[-1:]
     if (caged or approach) and not primitive.holds:
-        rise = max(HOVER_M - end[2], 0.0) if caged else HOVER_M
-        lift = line(end + back, end + back + rise * UP, retreat[-1], 0.5, tool)
+        lifted = end + back + (max(HOVER_M - end[Z], 0.0) if caged else HOVER_M) * UP
+        lift = line(end + back, lifted, retreat[-1], 0.5, tool)
 
-    down = over_start[None]
+    down = above[None]
     if approach:
-        down = line(poses_W[0][0] + up, poses_W[0][0], over_start, 1.0, tool)
-    return over_start, down, poses_W, paths, np.concatenate([retreat, lift[1:]])
+        down = line(poses_W[0][0] + rise, poses_W[0][0], above, 1.0, tool)
+    return Motion(above, down, paths, np.concatenate([retreat, lift[1:]]), poses_W)

@@ -11,12 +11,12 @@ import torch
 from affordlib.geometry import rotated
 from affordlib.planning import MODES, EffectMap
 from affordlib.primitives import PUSH_GAP_M, Drag, Push
-from affordlib.world import Cuboid, UprightCylinder
+from affordlib.world import ROLLABLE, STANDING, Cuboid, UprightCylinder
 from experiments import planning, shipped
 from experiments.adaptation import Camera
 from experiments.field_baselines import FINGER_AHEAD_M, LimitSurface
 from experiments.planning import CONFIGS, attempt, tasks_sha256
-from experiments.tasks import FROZEN, ROLLABLE, STANDING, PlanningTask, frozen_tasks
+from experiments.tasks import FROZEN, PlanningTask, frozen_tasks
 
 
 def test_pushes_show_how_far_beside_the_camera_sees():

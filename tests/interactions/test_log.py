@@ -8,7 +8,7 @@ from affordlib.evaluation.cross_validate import mirrors
 from affordlib.geometry import rotated
 from affordlib.interactions import Log
 from affordlib.paths import repo_root
-from affordlib.perception import crop_from_depth, outline_image, outline_of
+from affordlib.perception import outline_image, outline_of
 from affordlib.world import Prism
 from affordlib.world.camera import depth_crop
 from experiments.real_pushes import planar, pushes_of
@@ -221,19 +221,6 @@ def test_outlines_are_drawn_as_the_camera_sees_them(one_world):
         assert len(corners) == 3
         off = np.linalg.norm(corners[:, None] - prism.footprint_m, axis=2)
         assert off.min(axis=1).max() < 0.001
-
-
-def test_a_camera_of_ones_own_is_rectified():
-    """A box of 6 cm, 5 cm high, seen from 1 m above and 30 cm to its side."""
-    rows, columns = np.mgrid[:480, :640]
-    depth = np.ones((480, 640))
-    top = 0.95 * np.stack([(columns - 320) / 500, (240 - rows) / 500])
-    depth[(np.abs(top[0] - 0.3) < 0.03) & (np.abs(top[1]) < 0.03)] = 0.95
-    pose = np.diag([1.0, -1.0, -1.0, 1.0])
-    pose[2, 3] = 1.0
-    image = crop_from_depth(depth, (500, 500, 320, 240), pose, (0.3, 0.0), 0.12)
-    assert image[1].mean() == pytest.approx(0.25, abs=0.02)
-    assert np.median(image[0][image[1] > 0]) == pytest.approx(0.95, abs=1e-3)
 
 
 def test_the_mirrors_of_outlines():

@@ -3,7 +3,7 @@
 import math
 import subprocess
 import sys
-from dataclasses import make_dataclass
+from dataclasses import dataclass
 
 import numpy as np
 import psutil
@@ -12,7 +12,18 @@ import pytest
 from affordlib.geometry import rotated, unit_vector
 from affordlib.interactions import open_interactions
 from affordlib.interactions.recipes import RECIPES, Recipe, Variation, interact
-from affordlib.primitives import PRIMITIVES, Drag, Grasp, LeverUp, Push, Rotate, min_jerk
+from affordlib.planning import EffectMap
+from affordlib.primitives import (
+    PRIMITIVES,
+    Drag,
+    Grasp,
+    LeverUp,
+    Move,
+    Push,
+    Rotate,
+    min_jerk,
+    radians,
+)
 from affordlib.world import (
     CATEGORIES,
     Cuboid,
@@ -78,8 +89,8 @@ def test_objects_rest_where_they_are_placed(world, category):
         before = np.array(world.object_state())
         world.arm.wait(120)
         np.testing.assert_allclose(world.object_state()[:3], before[:3], atol=4e-4)
-        assert not world.object_fell()
-        assert world.object_rolls() == obj.rollable == (category in (LyingCylinder, Sphere))
+        assert not world.placed.fell()
+        assert world.placed.rolls() == obj.rollable == (category in (LyingCylinder, Sphere))
 
 
 def test_a_prism_is_an_extruded_polygon_about_its_centroid():
@@ -270,6 +281,18 @@ def test_no_episode_knows_of_the_one_before(world):
     assert psutil.Process().memory_info().rss - before < 20e6
 
 
-def test_a_field_of_its_own_is_no_angle():
-    timed = make_dataclass("Timed", [("seconds", float, 3.75)], bases=(Push,), frozen=True)
-    assert timed.towards(0.5, seconds=9.0).seconds == 9.0
+def test_a_primitive_is_one_class(film, cuboid_image):
+    """Its parameters say how they are checked; whatever moves an object can be planned with."""
+
+    @dataclass(frozen=True)
+    class Tap(Move):
+        grip: float = radians(0.0)
+        seconds: float = 3.75
+
+        name, reach_m, segments = "tap", 0.02, Push(0.0).segments
+
+    tap = Tap(-1.0, grip=4.0, seconds=9.0)
+    assert (tap.theta, tap.grip, tap.seconds) == (2 * math.pi - 1.0, 4.0 - 2 * math.pi, 9.0)
+    with pytest.raises(ValueError, match=r"Tap\.grip must be a finite number"):
+        Tap(0.0, grip=math.nan)
+    assert EffectMap(film, cuboid_image, Tap).kind is Tap

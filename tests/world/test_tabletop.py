@@ -7,7 +7,7 @@ import pytest
 from pybullet_utils.bullet_client import BulletClient
 
 from affordlib.primitives import Drag, Grasp, LeverUp, Push
-from affordlib.types import CROP_WIDTH_M, IMAGE_PIXELS, Goal, NothingSeenError
+from affordlib.types import CROP_WIDTH_M, IMAGE_PIXELS, Goal, NothingSeenError, Obstacle
 from affordlib.world import (
     Cuboid,
     LyingCylinder,
@@ -94,9 +94,29 @@ def test_a_mark_is_in_pictures_only(world):
     np.testing.assert_array_equal(world.depth_image(), seen)
 
 
+def test_obstacles_are_felt_and_in_pictures_only(world):
+    world.place(OBJECTS[0])
+    seen, picture = world.depth_image(), world.picture()
+    obstacles = Obstacle.box((0.14, 0.0), (0.02, 0.2)), Obstacle.disc((0.0, 0.15), 0.03)
+    world.set_obstacles(obstacles)
+    np.testing.assert_array_equal(world.depth_image(), seen)
+    assert (world.picture() != picture).any()
+    world.execute_primitive(Push.towards(0.0))
+    assert not world.obstacles.touched
+    world.execute_primitive(Push.towards(0.0))
+    assert world.obstacles.touched[0, "object"] > 1
+    assert not any(k == 1 for k, _ in world.obstacles.touched)
+    with pytest.raises(ValueError, match=r"obstacles\[0\] lies on the object"):
+        world.set_obstacles([Obstacle.disc(world.object_pose()[:2], 0.02)])
+    assert world.obstacles.all == obstacles
+    world.place(OBJECTS[0])
+    assert world.obstacles.all == ()
+
+
 def test_a_picture_from_twice_as_far_shows_the_object_half_as_large(world):
     world.place(OBJECTS[0], (-0.05, 0.0))
-    near, far = (world.picture(320, 240, distance_m=d).astype(int) for d in (1.0, 2.0))
+    at_m = (-0.05, 0.0, 0.06)
+    near, far = (world.picture(at_m=at_m, distance_m=d).astype(int) for d in (1.0, 2.0))
     green = [int((p[..., 1] > 2 * p[..., 0]).sum()) for p in (near, far)]
     assert green[0] == pytest.approx(4 * green[1], rel=0.15)
     with pytest.raises(ValueError, match=r"distance_m must lie in .*, got 5"):
@@ -121,6 +141,9 @@ def test_unreachable_raises_or_is_recorded_and_moves_nothing(world):
         (lambda w: w.execute_primitive(LEVER), r"'lever_up' needs the tool 'screwdriver'.*place\("),
         (lambda w: w.reset() or w.execute_primitive(Push(0.0)), r"call place\(\.\.\.\) first"),
         (lambda w: Prism(STAR, 0.05), "convex polygon"),
+        (lambda w: Obstacle(tuple(STAR)), "one point .a disc. or go counter-clockwise"),
+        (lambda w: Obstacle.disc((0.0, 0.0), 0.0), "Obstacle.radius_m must lie in"),
+        (lambda w: Obstacle.box((0.7, 0.0), (0.1, 0.1)), "lies off the table"),
     ],
 )
 def test_bad_input_is_named(world, act, words):
@@ -147,15 +170,6 @@ def test_a_shoved_object_moves_turns_and_rests(world):
     with pytest.raises(ValueError, match="dyaw_rad must be a finite number"):
         world.shove(0.0, 0.0, np.nan)
     np.testing.assert_allclose(world.object_pose(), (0.15, -0.03, 0.8), atol=5e-4)
-
-
-def test_what_lies_can_be_toppled_again(world):
-    world.place(Cuboid(0.04, 0.04, 0.08))
-    for _ in range(2):
-        x = world.object_pose()[0]
-        world.placed.topple(0.0)
-        world.settle(2.0)
-        assert world.object_pose()[0] > x + 0.05
 
 
 def test_the_fingers_are_tied_only_while_they_close_or_hold(world):
@@ -195,7 +209,8 @@ def test_what_rolls_on_a_level_table_comes_to_rest(world, yaw_rad):
     roll_on = []
     for braked in (True, False):
         world.place(LyingCylinder(0.08, 0.05), yaw_rad=yaw_rad)
-        world.placed.knock(-0.1 * math.sin(yaw_rad), 0.1 * math.cos(yaw_rad))
+        speed = -0.1 * math.sin(yaw_rad), 0.1 * math.cos(yaw_rad), 0.0
+        world.client.resetBaseVelocity(world.placed.body, speed)
         world.settle(2.0) if braked else world.arm.wait(480)
         before = world.object_pose()[:2]
         world.arm.wait(120)
