@@ -19,7 +19,7 @@ import secrets
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import psutil
@@ -27,6 +27,9 @@ import psutil
 from affordlib.paths import file_at, from_root, resolve_out_dir
 from affordlib.primitives import Primitive, primitive_named
 from affordlib.types import Goal, Plan, Step
+
+if TYPE_CHECKING:
+    import pandas
 
 # unit in the column's name: (displayed unit, factor, decimals); lengths are stored in metres
 UNITS = {

@@ -11,11 +11,16 @@ import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from numbers import Integral, Real
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from affordlib.geometry import is_convex, rotated
+
+if TYPE_CHECKING:
+    import torch
+
+    import affordlib.primitives
 
 ACTION_CHANNELS = ("x", "y", "z", "yaw", "gripper")
 EFFECT_CHANNELS = ("x", "y", "z", "yaw", "tilt")

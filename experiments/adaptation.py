@@ -13,6 +13,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
+from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -27,10 +28,10 @@ from affordlib.primitives import Push
 from affordlib.world import STANDING, Tabletop, TabletopObject, WorldConfig, category_named
 from experiments import runner
 from experiments.commands import command
-from experiments.planning import CONFIGS, attempt, tasks_sha256
+from experiments.planning import CONFIGS, attempt
 from experiments.real_pushes import named
 from experiments.runner import FOLDER, Job, Rows, frame, interval
-from experiments.tasks import EARLIEST_STOP, frozen_tasks
+from experiments.tasks import EARLIEST_STOP, frozen_tasks, tasks_sha256
 
 TABLE, PLANS = "adaptation", CONFIGS["perturbed_corrected"]
 N_OTHERS, N_TESTS, SHOTS = 40, 2, (0, 2, 5, 10)

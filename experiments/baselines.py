@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import xarray as xr
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
@@ -39,9 +40,9 @@ _CATEGORY_GAP = 3.0
 def baseline_predictions(
     baseline: Callable[..., Forecast],
     channels: tuple[tuple[str, ...], tuple[str, ...]],
-    data: "xarray.Dataset",
+    data: xr.Dataset,
     train_on: np.ndarray,
-    other: "xarray.Dataset",
+    other: xr.Dataset,
     queried: np.ndarray,
 ) -> dict[str, Any]:
     """Fit a baseline to interactions of `data`; predict those `queried` of `other`."""
@@ -56,7 +57,7 @@ def baseline_predictions(
     return prediction_record(other, kept, arrays, mean, std)
 
 
-def features(data: "xarray.Dataset") -> Tensor:
+def features(data: xr.Dataset) -> Tensor:
     """Features of objects, scaled to about 1: (N, 3 + 2 + categories) sizes, yaw, category.
 
     Yaw is the object's yaw relative to the action (to the table if the action has no direction), as

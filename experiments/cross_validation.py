@@ -186,7 +186,7 @@ def cross_validate(
 
 
 def logistic_predictions(
-    data: xarray.Dataset, train_on: np.ndarray, other: xarray.Dataset, queried: np.ndarray
+    data: xr.Dataset, train_on: np.ndarray, other: xr.Dataset, queried: np.ndarray
 ) -> dict[str, Any]:
     """Return a grasp's probability of success by object size, and the ground-truth heights."""
     known, kept = valid_interactions(data, train_on), valid_interactions(other, queried)

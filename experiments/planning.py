@@ -8,7 +8,6 @@ are made from all stored outcomes.
 
 from __future__ import annotations
 
-import hashlib
 import math
 import sys
 from collections.abc import Callable, Sequence
@@ -28,7 +27,6 @@ from tqdm.auto import tqdm
 from affordlib.models.checkpoint import load_checkpoint
 from affordlib.models.predictions import error_row
 from affordlib.models.protocol import EffectModel
-from affordlib.paths import repo_root
 from affordlib.planning import (
     EffectMap,
     Execution,
@@ -49,13 +47,12 @@ from affordlib.primitives import Push
 from affordlib.types import NothingSeenError, Observation, Outcome, Plan, Step
 from affordlib.world import ROLLABLE, STANDING, Tabletop, UnreachableError
 from experiments import reported, runner
-from experiments import tasks as goals
 from experiments.commands import command
 from experiments.field_baselines import LimitSurface, plan_astar_continuous, plan_cem
 from experiments.literal import SPEC, trained_on
 from experiments.oracle import oracle_effects
 from experiments.runner import FOLDER, Job, Rows, interval, plain
-from experiments.tasks import PlanningTask, frozen_tasks
+from experiments.tasks import GOAL_SOURCES, PlanningTask, frozen_tasks, tasks_sha256
 
 ENOUGH_M = 0.0003
 """Distance [m] from the goal below which no corrective action is tried, as none would help."""
@@ -177,7 +174,7 @@ class PlannerConfig:
         return pose
 
 
-ALL = {"sources": goals.GOAL_SOURCES}
+ALL = {"sources": GOAL_SOURCES}
 CORRECTED, BY_PLAN = {"execution": {"corrections": 2}}, {"execution": {"by_plan": True}}
 RECEDING = {"execution": {"receding": True}}
 LITERAL, FINER = {"samples": 100}, {"samples": 300}
@@ -406,11 +403,6 @@ def run_config(config: str) -> list[dict[str, Any]]:
             outcome = attempt(world, tasks[k], pose, about.plan, **about.execution)
             records.append({"task": k} | outcome_record(tasks[k], outcome))
     return records
-
-
-def tasks_sha256(world: str = "clean") -> str:
-    """Return the hash of a world's frozen goals."""
-    return hashlib.sha256((repo_root() / goals.FROZEN[world]).read_bytes()).hexdigest()
 
 
 def job(config: str) -> Job:

@@ -66,6 +66,7 @@ from experiments.tasks import (
     constructed_tasks,
     drawn_object,
     off_grid,
+    sealed,
 )
 
 
@@ -179,14 +180,14 @@ def about_checkpoint(
     return about_training(data, np.concatenate([split.train, split.validation]), training) | more
 
 
-def lever_training(lever: LeverModel, data: xarray.Dataset, split: Split) -> InteractionTensors:
+def lever_training(lever: LeverModel, data: xr.Dataset, split: Split) -> InteractionTensors:
     """Return the training data of a lever-up network: the training part and its mirror image."""
     return augment_by_symmetry(lever_up_tensors(data, split.train, lever.view), MIRRORED)
 
 
 def train_lever_model(
     lever: LeverModel,
-    data: xarray.Dataset,
+    data: xr.Dataset,
     split: Split,
     trained_for: str = "all",
     resume_checkpoint: Path | None = None,
@@ -257,7 +258,7 @@ def train_checkpoints(options: argparse.Namespace) -> bool:
     return complete
 
 
-def learn_reachability(data: xarray.Dataset, seed: int = 0) -> Reachability:
+def learn_reachability(data: xr.Dataset, seed: int = 0) -> Reachability:
     """Train reachability on interactions with objects all over the table (seconds on one core).
 
     The arm's base is on the table's x axis, so mirror images of all interactions are added.
@@ -335,7 +336,8 @@ def draw_goals(_: argparse.Namespace) -> bool:
                 tasks += uniform_tasks(mode, n, 0, STANDING + ROLLABLE)
         rows = ",\n".join(json.dumps(task.to_json()) for task in tasks)
         text = f'{{"seed": {seed}, "tasks": [\n{rows}\n]}}\n'
-        write_atomically(repo_root() / FROZEN[name], text)
+        path = repo_root() / FROZEN[name]
+        write_atomically(path, sealed(path.stem, text))
     print(f"goals sampled for the worlds: {', '.join(missing) or 'none, all files exist'}")
     return True
 

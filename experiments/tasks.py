@@ -6,6 +6,7 @@ the reachable area. Both avoid the 10° grid of A*. The tables' tasks are stored
 `python -m experiments.shipped goals` wrote.
 """
 
+import hashlib
 import json
 import math
 from collections.abc import Sequence
@@ -16,7 +17,7 @@ from typing import Any, Self
 import numpy as np
 
 from affordlib.interactions.recipes import Variation
-from affordlib.paths import repo_root
+from affordlib.paths import file_at
 from affordlib.planning import MODES
 from affordlib.primitives import Drag, Push, move_for
 from affordlib.types import Goal, check_choice
@@ -129,11 +130,35 @@ def constructed_tasks(
     return [next(filter(None, candidates)) for candidates in of_place]
 
 
+def sealed(name: str, text: str) -> str:
+    """Return the text of a goals file: JSON that begins with its name and the hash of the rest."""
+    digest = hashlib.sha256(text.encode()).hexdigest()
+    return f'{{"name": {json.dumps(name)}, "sha256": "{digest}",\n{text.removeprefix("{")}'
+
+
+def frozen_text(world: str = "clean") -> str:
+    """Read the goals of a world; ValueError if their file is damaged or another file's copy."""
+    name = check_choice("world", world, FROZEN)
+    remedy = "fetch it again, or draw goals with python -m experiments.shipped goals"
+    try:
+        path = file_at(FROZEN[name])
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"{error}; {remedy}") from None
+    try:
+        content = path.read_text(encoding="utf-8")
+        text = "{" + content.partition(",\n")[2]
+    except UnicodeDecodeError:
+        content, text = "damaged", ""
+    if content != sealed(path.stem, text):
+        raise ValueError(f"{path} is damaged, or is not the file of its name; {remedy}")
+    return text
+
+
+def tasks_sha256(world: str = "clean") -> str:
+    """Return the hash of a world's frozen goals."""
+    return hashlib.sha256(frozen_text(world).encode()).hexdigest()
+
+
 def frozen_tasks(world: str = "clean") -> list[PlanningTask]:
     """Load the tasks of the tables in one of the worlds, or the validation tasks."""
-    path = repo_root() / FROZEN[check_choice("world", world, FROZEN)]
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"there are no goals at {path}; make them with python -m experiments.shipped goals"
-        )
-    return [PlanningTask.from_json(plain) for plain in json.loads(path.read_text())["tasks"]]
+    return [PlanningTask.from_json(plain) for plain in json.loads(frozen_text(world))["tasks"]]

@@ -12,6 +12,7 @@ measure the weight of the tails. Their central 50 and 90 % intervals are then ev
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,6 +24,7 @@ from affordlib.interactions import InteractionTensors, open_interactions, split_
 from affordlib.models.calibration import AFTER_CONTACT, LEVELS, calibration_row, effects_at
 from affordlib.models.checkpoint import load_checkpoint
 from affordlib.models.predictions import refuse_seen
+from affordlib.models.protocol import EffectModel
 from affordlib.models.training import final_errors_m, train_model
 from experiments.representation import TRAINING
 from experiments.runner import Rows, study

@@ -33,7 +33,8 @@ def name_of(path):
 def imported(path):
     """Modules and names that a module imports."""
     names = set()
-    for node in ast.walk(TREES[path]):
+    tree = ast.Module([n for n in TREES[path].body if not isinstance(n, ast.If)], [])  # not types
+    for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom):
             each = {f"{node.module}.{alias.name}" for alias in node.names}
             names |= each if each <= set(map(name_of, TREES)) else each | {node.module}

@@ -9,6 +9,7 @@ import re
 import subprocess
 import sys
 import time
+from multiprocessing.pool import ThreadPool
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from nbconvert.filters.markdown_mistune import markdown2html_mistune
 
 from affordlib import paths, results
 from affordlib.results import read_results, write_results
+from affordlib.types import Goal, Plan
 from experiments import tables
 from experiments.tables import fill_tables, markdown_table
 
@@ -71,9 +73,21 @@ def test_a_full_disk_leaves_the_old_file(tmp_path, monkeypatch, step):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(os, step, fail)
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(OSError, match=r"No space left.*a\.json") as failure:
         write_results(tmp_path, "a", {}, {"t": [{"n": 2}]})
+    assert failure.value.filename == str(path)
     assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_threads_write_one_path_and_its_mode_is_kept(tmp_path):
+    path = tmp_path / "a.json"
+    write_results(tmp_path, "a", {}, {})
+    path.chmod(0o600)
+    with ThreadPool(4) as pool:
+        pool.map(lambda k: write_results(tmp_path, "a", {"k": k}, {}), range(40), chunksize=1)
+    assert read_results(path)["parameters"]["k"] in range(40)
+    assert path.stat().st_mode & 0o777 == 0o600
     assert list(tmp_path.iterdir()) == [path]
 
 
@@ -90,15 +104,16 @@ def test_a_kill_leaves_no_half_file_and_the_next_writer_no_leftovers(tmp_path):
     for how in ("fast", "slow"):  # killed somewhere, and before the file gets its name
         command = [sys.executable, "-c", code, str(tmp_path), how]
         with subprocess.Popen(command, stdin=subprocess.PIPE) as process:
-            while not list(tmp_path.glob("a.json" if how == "fast" else f".*.{process.pid}.tmp")):
+            while not list(tmp_path.glob("a.json" if how == "fast" else f".*.{process.pid}.*.tmp")):
                 assert process.poll() is None
                 time.sleep(0.01)
             time.sleep(0.3)
             process.kill()
         left = [p.name for p in tmp_path.iterdir() if p != path]
         assert [row["n"] for row in read_results(path)["tables"]["t"]] == list(range(2000))
-    assert left == [f".a.json.{process.pid}.tmp"]
-    living = tmp_path / f".a.json.{os.getppid()}.tmp"
+    assert len(left) == 1
+    assert left[0].startswith(f".a.json.{process.pid}.")
+    living = tmp_path / f".a.json.{os.getppid()}.0.tmp"
     living.touch()  # of a writer that is still running
     write_results(tmp_path, "a", {}, {})
     assert sorted(tmp_path.iterdir()) == [living, path]
@@ -128,6 +143,9 @@ def test_relative_folders_start_at_the_repository(tmp_path, monkeypatch):
     monkeypatch.setattr(paths, "repo_root", lambda: root)
     monkeypatch.chdir(tmp_path / "elsewhere")
     assert paths.resolve_out_dir("runs/lab") == root / "runs" / "lab"
+    plan = Plan(Goal((0.1, 0.0)), (0.0, 0.0), (), "none", False, 0.0)
+    assert results.save_plan("runs/plan.json", plan) == root / "runs" / "plan.json"
+    assert results.load_plan("runs/plan.json") == plan
     assert (root / "runs" / "lab").is_dir()
     (root / "file").write_text("")
     for bad in ("file", "file/under"):

@@ -4,13 +4,16 @@ The split is 80/10/10 inside each of 10 folds (Section 4.3 of the paper).
 """
 
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 import torch
 
 from affordlib.geometry import rotate_channels
 from affordlib.types import HasChannels, check_array, check_count, check_finite
+
+if TYPE_CHECKING:
+    import xarray
 
 
 def valid_interactions(data: "xarray.Dataset", interactions: np.ndarray) -> np.ndarray:
@@ -177,6 +180,8 @@ class InteractionTensors:
         parts = (self, *others)
         if len({(p.action_channels, p.effect_channels) for p in parts}) > 1:
             raise ValueError("others must have the same action_channels and effect_channels")
+        if not all(torch.equal(p.phase, self.phase) for p in others):
+            raise ValueError("others must have the same phases")
         return replace(
             self, **{n: torch.cat([getattr(p, n) for p in parts]) for n in _BY_INTERACTION}
         )

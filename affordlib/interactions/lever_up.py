@@ -9,6 +9,7 @@ its arc); its other channels are constant.
 """
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -17,6 +18,9 @@ import torch.nn.functional as F
 from affordlib.geometry import rotate_channels
 from affordlib.interactions.dataset import InteractionTensors, Symmetry, valid_interactions
 from affordlib.types import check_choice
+
+if TYPE_CHECKING:
+    import xarray
 
 LEVER_ACTION_CHANNELS = ("x", "z")
 POSE_CHANNELS = ("x", "y", "z", "tilt")

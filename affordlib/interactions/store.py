@@ -10,6 +10,7 @@ import json
 import os
 import zipfile
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import fsspec
 import numpy as np
@@ -17,6 +18,9 @@ import psutil
 
 from affordlib.paths import file_at, from_root
 from affordlib.results import write_atomically
+
+if TYPE_CHECKING:
+    import xarray
 
 SUFFIX = ".zarr.zip"
 MANIFEST = "manifest.json"

@@ -1,7 +1,7 @@
 """Predictions from image and commanded action with the ground truth, and rows of their errors."""
 
 import json
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -12,6 +12,9 @@ from affordlib.interactions.dataset import check_numbers, valid_interactions
 from affordlib.models.calibration import effects_at
 from affordlib.models.protocol import EffectModel
 from affordlib.types import check_array
+
+if TYPE_CHECKING:
+    import xarray
 
 EVERY = 12
 """Every twelfth sample is one of the paper's 25 steps of 150 ms."""

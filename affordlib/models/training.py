@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -34,6 +34,9 @@ from affordlib.models.cnp import CNPConfig
 from affordlib.models.domain import TrainingDomain
 from affordlib.models.lstm import effects_at_steps
 from affordlib.types import IMAGE_PIXELS, check_count, check_field
+
+if TYPE_CHECKING:
+    import xarray
 
 Sampler = Callable[[InteractionTensors, int, int, torch.Generator], Batch]
 Score = Callable[[EffectNetwork, InteractionTensors], torch.Tensor]

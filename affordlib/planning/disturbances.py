@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -24,6 +24,9 @@ from affordlib.types import (
     check_count,
     check_field,
 )
+
+if TYPE_CHECKING:
+    import affordlib.world
 
 KINDS = ("shove", "knock", "topple", "goal")
 STEPS_PER_S = 240

@@ -9,14 +9,15 @@ import pytest
 import torch
 
 from affordlib.geometry import rotated
+from affordlib.paths import repo_root
 from affordlib.planning import MODES, EffectMap
 from affordlib.primitives import PUSH_GAP_M, Drag, Push
 from affordlib.world import ROLLABLE, STANDING, Cuboid, UprightCylinder
-from experiments import planning, shipped
+from experiments import planning, shipped, tasks
 from experiments.adaptation import Camera
 from experiments.field_baselines import FINGER_AHEAD_M, LimitSurface
-from experiments.planning import CONFIGS, attempt, tasks_sha256
-from experiments.tasks import FROZEN, PlanningTask, frozen_tasks
+from experiments.planning import CONFIGS, attempt
+from experiments.tasks import FROZEN, PlanningTask, frozen_tasks, tasks_sha256
 
 
 def test_pushes_show_how_far_beside_the_camera_sees():
@@ -33,11 +34,11 @@ def test_pushes_show_how_far_beside_the_camera_sees():
 
 
 def test_goals_survive_the_file_which_is_never_written_over(capsys):
-    tasks, before = frozen_tasks("perturbed"), [tasks_sha256(which) for which in FROZEN]
-    for task in frozen_tasks()[:4] + tasks[:4]:
+    drawn, before = frozen_tasks("perturbed"), [tasks_sha256(which) for which in FROZEN]
+    for task in frozen_tasks()[:4] + drawn[:4]:
         assert PlanningTask.from_json(json.loads(json.dumps(task.to_json()))) == task
-    assert len({t.config.table_friction for t in tasks}) == len(tasks)
-    assert all(t.config.camera == "kinect" for t in tasks)
+    assert len({t.config.table_friction for t in drawn}) == len(drawn)
+    assert all(t.config.camera == "kinect" for t in drawn)
     inside = [t.config.com_offset_m for t in frozen_tasks("perturbed_rollable")]
     assert all(y == 0 >= z for _, y, z in inside)  # round objects lie on their heavy side
     with pytest.raises(ValueError, match=r"world must be one of .*'noisy'"):
@@ -45,6 +46,16 @@ def test_goals_survive_the_file_which_is_never_written_over(capsys):
     assert shipped.main(["goals"]) == 0
     assert "all files exist" in capsys.readouterr().out
     assert [tasks_sha256(which) for which in FROZEN] == before
+
+
+def test_goals_that_are_damaged_or_of_another_world_are_named(tmp_path, monkeypatch):
+    content = (repo_root() / FROZEN["clean"]).read_bytes()
+    monkeypatch.setattr(tasks, "FROZEN", {"clean": str(tmp_path / "planning.json")})
+    other = (repo_root() / FROZEN["outside"]).read_bytes()
+    for wrong in (b"", content[:-2], content.replace(b"7", b"8", 1), b"\xff" + content, other):
+        (tmp_path / "planning.json").write_bytes(wrong)
+        with pytest.raises(ValueError, match=r"planning\.json is damaged, or is not"):
+            frozen_tasks()
 
 
 def test_a_shipped_checkpoint_can_be_trained_again(monkeypatch, capsys):
