@@ -373,7 +373,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Plan:
-    """Steps from (x, y) [m] to a goal, computed in plan_s seconds; warning: text, may be empty."""
+    """Steps from (x, y) [m] to a goal, computed in plan_s seconds."""
 
     goal: Goal
     start_xy_m: tuple[float, float]
@@ -381,7 +381,6 @@ class Plan:
     planner: str
     reaches_goal: bool
     plan_s: float
-    warning: str = ""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "start_xy_m", check_on_table("start_xy_m", self.start_xy_m))

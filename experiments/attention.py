@@ -17,9 +17,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from affordlib import checked
-from affordlib.models.base import NetworkConfig, he_initialise, with_time
-from affordlib.models.checkpoint import NETWORKS
-from affordlib.models.harmonics import CircularHarmonics, HarmonicsNetwork, dense, waves
+from affordlib.models.base import NetworkConfig, he_initialise, network, with_time
+from affordlib.models.film import CircularHarmonics, HarmonicsNetwork, dense, waves
 from affordlib.types import Observations
 
 
@@ -70,6 +69,7 @@ class CrossAttention(nn.Module):
         return x + self.mlp(x)
 
 
+@network("attention", AttentionConfig)
 class AttentiveCNP(HarmonicsNetwork):
     """An `EffectModel` that relates object image, action and effect by cross-attention."""
 
@@ -111,6 +111,3 @@ class AttentiveCNP(HarmonicsNetwork):
         for block in self.blocks:
             x = block(x, tokens, bias)
         return self.split_outputs(self.last(x))
-
-
-NETWORKS["attention"] = (AttentiveCNP, AttentionConfig)

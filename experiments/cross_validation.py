@@ -246,7 +246,7 @@ def _train(
         one, history = train_model(interactions, split, config, network, symmetries, path)
         best = min(record.validation_error for record in history)
         steps = {"steps": history[-1].step, "seconds": history[-1].seconds}
-        records.append(steps | {"validation_error": best, "temperature": list(one.sigma_scale)})
+        records.append(steps | {"validation_error": best, "temperature": one.sigma_scale.tolist()})
         trained.append(one)
     if members == 1:
         return trained[0], records[0]

@@ -37,10 +37,10 @@ class Ensemble:
                     f"members must have the channels of the first, {self.action_channels} and "
                     f"{self.effect_channels}; member {k} has {channels[0]} and {channels[1]}"
                 )
-        self.members = tuple(copy.copy(member) for member in members)
-        self.sigma_scale = (1.0,) * len(self.effect_channels)
+        self.members = tuple(copy.deepcopy(member) for member in members)
+        self.sigma_scale = torch.ones(len(self.effect_channels))
         for member in self.members:
-            member.sigma_scale = self.sigma_scale
+            member.sigma_scale.fill_(1.0)
 
     def encode(self, image: Tensor) -> Tensor:
         """Return the concatenated features (B, K F) of K members for images (B, 2, 48, 48)."""
@@ -55,7 +55,7 @@ class Ensemble:
         ]
         action = _moments([p.action_mean for p in predicted], [p.action_std for p in predicted])
         mean, std = _moments([p.effect_mean for p in predicted], [p.effect_std for p in predicted])
-        return Prediction(*action, mean, std * std.new_tensor(self.sigma_scale))
+        return Prediction(*action, mean, std * self.sigma_scale)
 
 
 def _moments(means: list[Tensor], stds: list[Tensor]) -> tuple[Tensor, Tensor]:

@@ -4,7 +4,7 @@ The split is by object into five folds, 80/10/10 (each interaction has its own o
 the random split of Seker et al. 2019), or leaves out all objects with a given number of edges. A
 job is one training, or one baseline, tested in all protocols that it is trained for. Errors are
 distances [cm] between predicted and ground-truth positions, after steps of 150 ms.
-`experiments.lever_up` runs the jobs and makes the tables; `tuning` is one of `experiments.studies`.
+`experiments.lever_up` runs the jobs and makes the tables.
 """
 
 from __future__ import annotations
@@ -20,26 +20,34 @@ from torch import Tensor
 
 from affordlib.interactions import Scaler, Split, split_interactions
 from affordlib.interactions import lever_up as levers
-from affordlib.interactions.dataset import augment_by_symmetry, valid_interactions
+from affordlib.interactions.dataset import valid_interactions
 from affordlib.interactions.lever_up import lever_up_tensors
 from affordlib.interactions.recipes import Recipe, sample_scene
 from affordlib.models import lever_up as models
 from affordlib.models.base import EffectNetwork
 from affordlib.models.domain import TrainingDomain
-from affordlib.models.lever_up import LEVER_MODELS, PROTOCOLS, LeverModel
+from affordlib.models.lever_up import PROTOCOLS
 from affordlib.types import Prediction, check_choice, check_count
 from experiments import lstm_seker2019
+from experiments.lever_training import (
+    LEVER_MODELS,
+    LeverModel,
+    shipped_lever_model,
+    train_lever_model,
+)
 from experiments.lstm_seker2019 import SekerConfig, SekerLSTM, train_seker
-from experiments.runner import Job, open_once, study
-from experiments.shipped import shipped_lever_model, train_lever_model
+from experiments.runner import Job, open_once
 
 DATA, N_FOLDS = "lever_up", 5
 BASELINES = ("persistence", "constant_velocity")
 RECURRENT = ("lstm_tuned", "lstm_seker2019")
-SINGLE = "cnp_last_pose_single"
+EACH = ("cnp_mean", "cnp_last_pose_single", *RECURRENT)
+"""Networks that are trained for one protocol at a time."""
+
+SINGLE = EACH[1]
 """Name of `cnp_last_pose` trained for one protocol at a time, like the recurrent networks."""
 
-MODELS = ("cnp", "cnp_last_pose", SINGLE, "lstm_seker2019", "lstm_tuned", *BASELINES)
+MODELS = ("cnp", "cnp_mean", "cnp_last_pose", SINGLE, "lstm_seker2019", "lstm_tuned", *BASELINES)
 TESTED = {"all": PROTOCOLS, "window": PROTOCOLS[:1], "first_step": PROTOCOLS[1:]}
 """Protocols in which a network is tested, by the protocol that it is trained for."""
 
@@ -57,7 +65,7 @@ def job(
     edges_left_out: polygons with this number of edges are only tested; epochs: `lstm_seker2019`'s.
     """
     check_choice("model", model, MODELS)
-    each = model in (SINGLE, *RECURRENT)
+    each = model in EACH
     check_choice(f"trained_for of {model!r}", trained_for, [*TESTED][1:] if each else ["all"])
     check_count("fold", fold, 0, N_FOLDS - 1)
     if edges_left_out is not None:
@@ -163,7 +171,7 @@ def extrapolate(
 
 def _errors(network: EffectNetwork | str, arrays: Any, protocol: str) -> dict[str, Any]:
     """Return the errors (N, W, T) [cm] of a network or baseline, rounded to 1 µm, as lists."""
-    starts = range(levers.n_windows(arrays) if protocol == "window" else 1)
+    starts = range(models.n_windows(arrays) if protocol == "window" else 1)
     if isinstance(network, str):
         found = [extrapolate(network, arrays.effect, protocol, start) for start in starts]
         found = [(Prediction(mean, mean, mean, 0 * mean), truth) for mean, truth in found]
@@ -173,55 +181,3 @@ def _errors(network: EffectNetwork | str, arrays: Any, protocol: str) -> dict[st
         found = [models.predict_steps(network, arrays, protocol, start, seen) for start in starts]
     errors = torch.stack([100 * models.errors_m(told, truth) for told, truth in found], dim=1)
     return {"error_cm": errors.double().numpy().round(4).tolist()}
-
-
-SETTINGS: dict[str, tuple[dict[str, Any], float]] = {
-    "rate 0.001": ({}, 1.0),
-    "rate 0.0005": ({"learning_rate": 5e-4}, 1.0),
-    "rate 0.002": ({"learning_rate": 2e-3}, 1.0),
-    "rate 0.004": ({"learning_rate": 4e-3}, 1.0),
-    "rate 0.008": ({"learning_rate": 8e-3}, 1.0),
-    "rate 0.001, half the width": ({}, 0.5),
-    "rate 0.001, no weight decay": ({"weight_decay": 0.0}, 1.0),
-    "rate 0.001, plain likelihood": ({"beta": 0.0}, 1.0),
-}
-"""By name: changes of the initial `TRAINING` of both networks, and factor on the width."""
-
-TUNED = (("cnp_last_pose", "all"), ("lstm_tuned", "window"), ("lstm_tuned", "first_step"))
-_TUNING = (SETTINGS, TUNED, [LEVER_MODELS[name].network for name, _ in TUNED], models.TRAINING)
-
-
-def changed(lever: LeverModel, setting: str) -> LeverModel:
-    """Return a network with one of `SETTINGS`."""
-    training, share = SETTINGS[setting]
-    network = replace(lever.network, width=round(share * lever.network.width))
-    return replace(lever, network=network, training=replace(models.TRAINING, **training))
-
-
-@study(DATA, settings=_TUNING)
-def tuning() -> list[dict[str, Any]]:
-    """Tune our network and the recurrent one with the same budget (Section 4.1).
-
-    Returns mean validation errors [m] of all settings, for windows and from the first step, trained
-    on the training part of fold 0 for as many steps as the shipped network. `LEVER_MODELS` has one
-    learning rate per network: the best, or, as the recurrent one has two trainings, one within a
-    thousandth of the best. No test data are used.
-    """
-    data, rows = open_once(DATA), []
-    split = lever_split(data)
-    for name, trained_for in TUNED:
-        lever = LEVER_MODELS[name]
-        parts = [lever_up_tensors(data, p, lever.view) for p in (split.train, split.validation)]
-        parts[0] = augment_by_symmetry(parts[0], levers.MIRRORED)
-        for setting in SETTINGS:
-            one = changed(lever, setting)
-            network, history = models.fit_lever_model(one, *parts, trained_for)
-            row = {"model": name, "trained_for": trained_for, "setting": setting}
-            row |= {"taken": one == lever, "steps": history[-1].step, "n": len(parts[1])}
-            if trained_for != "first_step":
-                row["window_mean_m"] = float(models.window_errors_m(network, parts[1]).mean())
-            if trained_for != "window":
-                off = models.from_start_errors_m(network, parts[1])
-                row["beginning_mean_m"] = float(off.mean())
-            rows.append(row)
-    return rows

@@ -22,10 +22,11 @@ import numpy as np
 import pandas as pd
 
 from affordlib.models.lever_up import PROTOCOLS
-from experiments import reported, runner, studies
+from experiments import lever_tuning, reported, runner
 from experiments.commands import command
 from experiments.lever_cross_validation import (
     DATA,
+    EACH,
     MODELS,
     N_FOLDS,
     RECURRENT,
@@ -151,16 +152,16 @@ def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
         "summary": [*reported.LEVER_UP_ROWS, *summary_rows(rows)],
         "unseen_edges": unseen_rows(results, edges),
         "paired": paired_rows(results),
-        **studies.tables(NAME, folder),
+        "tuning": lever_tuning.rows(folder),
     }
 
 
 def _jobs(model: str, fold: int, edges: int | None = None, **more: int) -> list[Job]:
-    kinds = [*TESTED][1:] if model in (SINGLE, *RECURRENT) else ["all"]
+    kinds = [*TESTED][1:] if model in EACH else ["all"]
     return [job(model, kind, fold, edges, **more) for kind in kinds]
 
 
-ALL = [model for model in MODELS if model != "lstm_seker2019"]
+ALL = [model for model in MODELS if model not in ("lstm_seker2019", "cnp_mean")]
 JOBS = [
     *(each for model, fold in product(ALL, range(N_FOLDS)) for each in _jobs(model, fold)),
     *(each for fold in range(3) for each in _jobs("lstm_seker2019", fold, epochs=EPOCHS)),

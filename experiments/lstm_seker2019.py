@@ -29,8 +29,8 @@ from affordlib.interactions.lever_up import N_OBSERVED
 from affordlib.models.base import EffectNetwork, NetworkConfig, with_time
 from affordlib.models.checkpoint import load_state, save_state
 from affordlib.models.lever_up import from_start_errors_m, window_errors_m
-from affordlib.models.lstm import Known, on_grid
 from affordlib.types import LEVER_IMAGE_PIXELS, Observations
+from experiments.lstm import Known, on_grid
 
 CONVOLUTION_WIDTHS = (32, 64, 128, 256)
 DENSE, HIDDEN = 4096, 256
@@ -88,7 +88,7 @@ class SekerLSTM(EffectNetwork):
         index = at.clamp_min(0)[..., None].expand(-1, -1, path.shape[-1])
         mu_e = path.gather(1, index)
         mu_a = mu_e.new_zeros(*t_target.shape, len(self.action_channels))
-        return mu_a, mu_a + self.sigma_floor, mu_e, torch.full_like(mu_e, self.sigma_floor)
+        return mu_a, mu_a + self.sigma_floor, mu_e, torch.full_like(mu_e, float(self.sigma_floor))
 
     def roll(self, features: Tensor, known: Known, o: Observations, n: int) -> Tensor:
         """Roll out poses (B, n + 1, C) from the first observed step."""

@@ -1,5 +1,9 @@
 """Novelty detection: does a model recognise objects that are unlike its training objects?
 
+σ covers the noise in the training data, not the novelty of an object. `Novelty` is the distance of
+an image to its nearest training image (Sun et al., Out-of-distribution detection with deep nearest
+neighbors, ICML 2022) in circular harmonics, since learned features discard what training did not
+need.
 Object categories that no model has seen are used: some to choose the novelty score and the growth
 of σ, the others only to test them. Their pushes are collected into runs/strangers.
 """
@@ -8,7 +12,8 @@ from __future__ import annotations
 
 import hashlib
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 from typing import Any, ClassVar
 
@@ -19,17 +24,21 @@ from scipy.spatial import ConvexHull, Delaunay
 from sklearn.covariance import LedoitWolf
 from torch import Tensor
 
-import experiments.attention  # noqa: F401, whose network a checkpoint is of
+from affordlib.geometry import xy_columns
 from affordlib.interactions import InteractionTensors, open_interactions, split_interactions
 from affordlib.interactions.collect import collect
 from affordlib.interactions.recipes import Recipe
+from affordlib.models import EffectNetwork, condition_on_primitives, load_checkpoint
 from affordlib.models import calibration as c
-from affordlib.models import condition_on_primitives, load_checkpoint
+from affordlib.models.base import gaussian_nll
+from affordlib.models.film import CircularHarmonics
 from affordlib.paths import resolve_out_dir
 from affordlib.primitives import Push
 from affordlib.results import write_atomically
+from affordlib.types import Observations, Prediction
 from affordlib.world import CATEGORIES, TabletopObject
 from experiments.runner import Rows, study
+from experiments.shipped import data_of
 
 N_PUSHES = 150
 FOLDER = "runs/strangers"
@@ -128,6 +137,76 @@ class Stranger(TabletopObject):
         return felt | {"seen": self.solids()[0]}
 
 
+NOVELTY_GAIN = 0.0167  # c of `NoveltyAware`, chosen by `novelty_gain`
+
+
+def spectrum(harmonics: CircularHarmonics, image: Tensor) -> Tensor:
+    """Return norms (n, f) of the harmonics' pairs of cosine and sine, invariant to rotation."""
+    return harmonics(image).reshape(-1, *harmonics.layout).norm(dim=2).flatten(1)
+
+
+class Novelty:
+    """Distance (N,) of images to their nearest training image, in units of `limit`.
+
+    references: (n, f) spectra of the circular harmonics of training images, which are invariant to
+    rotation. limit: 99 % of the references are closer than this to their nearest other reference.
+    """
+
+    def __init__(self, references: Tensor) -> None:
+        self.references, self.harmonics = references, CircularHarmonics()
+        spread = references.std(dim=0).reshape(2, -1)
+        # A spread below 1 % of the largest spread of its image channel is pixel noise.
+        self.spread = spread.maximum(0.01 * spread.amax(dim=1, keepdim=True)).flatten()
+        self.limit = self.distances(references, 2)[:, 1].quantile(0.99)
+
+    @classmethod
+    def fit(cls, image: Tensor) -> Novelty:
+        """Create it from at most the first 500 training images."""
+        return cls(spectrum(CircularHarmonics(), image[:500]))
+
+    def distances(self, spectra: Tensor, n: int = 1) -> Tensor:
+        """Distances (N, n) to the nearest n references."""
+        a, b = spectra / self.spread, self.references / self.spread
+        exact = "donot_use_mm_for_euclid_dist"
+        return torch.cdist(a, b, compute_mode=exact).topk(n, largest=False).values
+
+    @torch.no_grad()
+    def __call__(self, image: Tensor) -> Tensor:
+        return self.distances(spectrum(self.harmonics, image))[:, 0] / self.limit
+
+
+class NoveltyAware:
+    """A model of pushes whose σ grows with an object's novelty; satisfies `EffectModel`.
+
+    σ² grows by (c m s)² n. n: novelty in excess of 1 (0 for known objects); m: predicted distance
+    moved, in scales of x and y; s: the scale of the channel; c: `NOVELTY_GAIN`.
+    """
+
+    def __init__(self, model: EffectNetwork, novelty: Novelty) -> None:
+        self.model, self.novelty = model, novelty
+        self.action_channels, self.effect_channels = model.action_channels, model.effect_channels
+
+    def encode(self, image: Tensor) -> Tensor:
+        """Features (B, F + 1) of images (B, 2, 48, 48): those of the model, and √n."""
+        root = (self.novelty(image) - 1).clamp_min(0).sqrt()
+        return torch.cat([self.model.encode(image), root[:, None]], dim=1)
+
+    def predict(self, features: Tensor, observations: Observations, t_target: Tensor) -> Prediction:
+        """The model's prediction, with σ of the effect increased by novelty."""
+        p = self.model.predict(features[:, :-1], observations, t_target)
+        plane, scale = xy_columns(self.effect_channels), self.model.effect_scale
+        moved = (p.effect_mean[..., plane] / scale[plane]).norm(dim=-1, keepdim=True)
+        more = NOVELTY_GAIN * features[:, -1:, None] * moved * scale
+        return replace(p, effect_std=torch.hypot(p.effect_std, more))
+
+
+def novelty_of(name: str) -> Novelty:
+    """Return the novelty for a shipped checkpoint, from the images that it was trained on."""
+    data = open_interactions(data_of(name))
+    split = split_interactions(data.sizes["interaction"])
+    return Novelty.fit(InteractionTensors.from_dataset(data, split.train).image)
+
+
 MODELS = ("film_500", "film_5000", "cnp_500", "lstm_500", "attention_500")
 GROWTH = {"distance": Tensor.clone, "root": Tensor.sqrt, "logarithm": Tensor.log1p}
 GROWTH["step"] = Tensor.sign
@@ -176,9 +255,9 @@ def novelty_choice() -> Rows:
     for name, encode in (
         ("features of the paper's network", lambda x: cnp.encode(x, False)),
         ("features of our network", in_push_frame),
-        ("spectrum of the harmonics", film.novelty.harmonics.spectrum),
+        ("spectrum of the harmonics", partial(spectrum, CircularHarmonics())),
     ):
-        gaussian, nearest = LedoitWolf().fit(encode(training)), c.Novelty(encode(training))
+        gaussian, nearest = LedoitWolf().fit(encode(training)), Novelty(encode(training))
         scores[f"{name}, Mahalanobis"] = lambda x, e=encode, g=gaussian: g.mahalanobis(e(x))
         scores[f"{name}, nearest"] = lambda x, e=encode, n=nearest: n.distances(e(x))[:, 0]
     unknown = {name: strangers(name, film).image for name in (*CHOOSE, ROLL[0])}
@@ -208,7 +287,7 @@ def novelty_gain() -> Rows:
     for name, category in product(MODELS[:3], CHOOSE):
         model = load_checkpoint(name)[0]
         pushes = strangers(category, model)
-        beyond = (model.novelty(pushes.image) - 1).clamp_min(0)
+        beyond = (novelty_of(name)(pushes.image) - 1).clamp_min(0)
         found.append((category, beyond[:, None], *final(model, pushes)))
     rows = []
     for (name, grow), percent in product(GROWTH.items(), (5, 1)):
@@ -224,25 +303,26 @@ def novelty_gain() -> Rows:
         row = {"growth": name, "percent": percent, "gain": max(needed.values())}
         for kind, gain in gains.items():
             each = [(t, m, torch.hypot(s, gain[k] * more)) for k, t, m, s, more in grown]
-            row[f"{kind}nll"] = float(np.mean([c.gaussian_nll(*values).mean() for values in each]))
+            row[f"{kind}nll"] = float(np.mean([gaussian_nll(*values).mean() for values in each]))
             row[f"{kind}beyond_2_sigma_percent"] = max(beyond_percent(*v) for v in each)
         rows.append(row)
     return rows
 
 
-@study("push_test", settings=(*SETTINGS, c.NOVELTY_GAIN), checkpoints=MODELS)
+@study("push_test", settings=(*SETTINGS, NOVELTY_GAIN), checkpoints=MODELS)
 def novelty_judged() -> Rows:
     """Evaluate σ, unchanged and grown in two ways, on known objects and on unused categories."""
     rows, parts = [], {"first_six": FIRST, "second_six": SECOND}
     parts = {k: (k,) for k in ("known", *FIRST, *SECOND, *ROLL)} | parts
     for name in MODELS:
-        model, found = load_checkpoint(name)[0], {}
+        model, novelty_by, found = load_checkpoint(name)[0], novelty_of(name), {}
         known = tensors(open_interactions("push_test"), model)
         for category in ("known", *FIRST, *SECOND, *ROLL):
             pushes = known if category == "known" else strangers(category, model)
-            novelty, (truth, mean, std) = model.novelty(pushes.image), final(model, pushes)
+            novelty, (truth, mean, std) = novelty_by(pushes.image), final(model, pushes)
             first = FIRST_GAIN * (novelty - 1).clamp_min(0) * mean.norm(dim=1)
-            grown = torch.hypot(std, first[:, None]), final(c.NoveltyAware(model), pushes)[2]
+            aware = final(NoveltyAware(model, novelty_by), pushes)[2]
+            grown = torch.hypot(std, first[:, None]), aware
             found[category] = novelty, truth, mean, std, *grown
         for objects, members in parts.items():
             every = zip(*(found[member] for member in members), strict=True)

@@ -21,8 +21,7 @@ from torch import Tensor, nn
 from affordlib.interactions import InteractionTensors, open_interactions, split_interactions
 from affordlib.interactions.dataset import valid_interactions
 from affordlib.models.checkpoint import load_checkpoint
-from affordlib.models.film import FiLMConfig
-from affordlib.models.harmonics import CircularHarmonics, dense
+from affordlib.models.film import CircularHarmonics, FiLMConfig, dense
 from affordlib.models.predictions import about_objects
 from affordlib.models.protocol import condition_on_final_effect
 from affordlib.models.push_frame import inverse, push_direction, rotate_observations

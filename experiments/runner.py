@@ -42,7 +42,6 @@ from tqdm.auto import tqdm
 
 from affordlib.interactions import open_interactions
 from affordlib.interactions.store import stored_sha256
-from affordlib.models.checkpoint import NOVELTY
 from affordlib.paths import file_at, repo_root, resolve_out_dir
 from affordlib.planning.reachability import SHIPPED as REACHABILITY
 from affordlib.results import write_atomically, write_results
@@ -52,8 +51,8 @@ from experiments.commands import worker_type
 
 FOLDER = "data/results/raw"
 WRITE_EVERY_S, ANSWER_S = 30, 30
-NOT_DECISIVE = ("device", "max_minutes", "sigma_scale")
-"""Options without influence on results: those of the machine, and those fitted afterwards."""
+NOT_DECISIVE = ("device", "max_minutes")
+"""Options without influence on results: those of the machine."""
 
 
 @lru_cache(maxsize=4)
@@ -347,7 +346,6 @@ def hash_of(name: str, kind: str) -> str | None:
 def checkpoint_sha256(name_or_path: str | Path) -> str:
     """Return a hash of a checkpoint's weights, configuration, scales and domain."""
     tensors, description = read_weights(resolve_checkpoint(name_or_path), "train it again")
-    tensors.pop(NOVELTY, None)  # does not change predictions
     decisive = {key: description[key] for key in ("model", "config", "scaler", "domain")}
     return weights_sha256(tensors, json.dumps(decisive))
 

@@ -15,7 +15,6 @@ import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -23,28 +22,20 @@ import xarray as xr
 from torch import nn
 
 from affordlib.interactions import (
-    InteractionTensors,
-    Scaler,
-    Split,
     open_interactions,
     split_interactions,
 )
 from affordlib.interactions.collect import collect
-from affordlib.interactions.dataset import Symmetry, augment_by_symmetry
-from affordlib.interactions.lever_up import MIRRORED, lever_up_tensors
+from affordlib.interactions.dataset import Symmetry
 from affordlib.interactions.recipes import RECIPES, SHIPPED, Variation
 from affordlib.interactions.sampling import sample_forward, sample_mixed
 from affordlib.interactions.store import SUFFIX as DATA_SUFFIX
 from affordlib.interactions.store import dataset_sha256
-from affordlib.models import CNPConfig, EffectNetwork, FiLMConfig, NetworkConfig, TrainingDomain
-from affordlib.models.checkpoint import SUFFIX, load_checkpoint, save_checkpoint
-from affordlib.models.lever_up import LEVER_MODELS, LeverModel, fit_lever_model
-from affordlib.models.lstm import LSTMConfig
+from affordlib.models import CNPConfig, FiLMConfig, NetworkConfig
+from affordlib.models.checkpoint import SUFFIX, save_checkpoint
 from affordlib.models.training import (
     Sampler,
     TrainingConfig,
-    TrainingRecord,
-    about_training,
     train_model,
 )
 from affordlib.paths import repo_root
@@ -57,6 +48,13 @@ from affordlib.types import Goal
 from affordlib.world import ROLLABLE, STANDING, Tabletop
 from experiments.attention import AttentionConfig
 from experiments.commands import command, worker_type
+from experiments.lever_training import (
+    LEVER_CHECKPOINTS,
+    LEVER_MODELS,
+    about_checkpoint,
+    train_lever_model,
+)
+from experiments.lstm import LSTMConfig
 from experiments.runner import cluster
 from experiments.tasks import (
     FROZEN,
@@ -115,13 +113,6 @@ CHECKPOINT_SPECS: dict[str, CheckpointSpec] = {
 """Definitions by name. On one core, training takes ten minutes for `cnp_500`, five for `lstm_500`
 and for 5,000 pushes, one or two for others. Five use `_x10` sets, which are not shipped."""
 
-LEVER_CHECKPOINTS: dict[str, tuple[str, str]] = {
-    "lever_up_last_pose_1800": ("cnp_last_pose", "all"),
-    "lever_up_lstm_1800_window": ("lstm_tuned", "window"),
-    "lever_up_lstm_1800_first_step": ("lstm_tuned", "first_step"),
-}
-"""Checkpoints of lever-ups: the name in `LEVER_MODELS`, and the protocol it is trained for."""
-
 N_GOALS = {"single_full": 50, "single_partial": 100, "multi_partial": 80}
 VALIDATION_GOALS = {"multi_partial": 40}
 """Number of goals of each mode (N_GOALS: as in Table 3 of the paper)."""
@@ -171,50 +162,6 @@ def collect_sets(options: argparse.Namespace) -> bool:
                 print(f"{name}: {sentence}")
                 agree &= same
     return agree
-
-
-def about_checkpoint(
-    data: xr.Dataset, split: Split, training: TrainingConfig, **more: str
-) -> dict[str, object]:
-    """Return the description of a shipped checkpoint's training, with further entries `more`."""
-    return about_training(data, np.concatenate([split.train, split.validation]), training) | more
-
-
-def lever_training(lever: LeverModel, data: xr.Dataset, split: Split) -> InteractionTensors:
-    """Return the training data of a lever-up network: the training part and its mirror image."""
-    return augment_by_symmetry(lever_up_tensors(data, split.train, lever.view), MIRRORED)
-
-
-def train_lever_model(
-    lever: LeverModel,
-    data: xr.Dataset,
-    split: Split,
-    trained_for: str = "all",
-    resume_checkpoint: Path | None = None,
-) -> tuple[EffectNetwork, list[TrainingRecord]]:
-    """Train a lever-up network on a split's training part and its mirror image."""
-    training = lever_training(lever, data, split)
-    validation = lever_up_tensors(data, split.validation, lever.view)
-    return fit_lever_model(lever, training, validation, trained_for, resume_checkpoint)
-
-
-def shipped_lever_model(
-    name: str, trained_for: str, lever: LeverModel, data: xr.Dataset, split: Split
-) -> tuple[EffectNetwork, dict[str, object]] | None:
-    """Return the shipped checkpoint of exactly this training and its name, or None."""
-    names = {key: checkpoint for checkpoint, key in LEVER_CHECKPOINTS.items()}
-    try:
-        checkpoint = names[name, trained_for]
-        model, about = load_checkpoint(checkpoint)
-    except (KeyError, FileNotFoundError, ValueError):
-        return None
-    more = {"trained_for": trained_for, "view": lever.view}
-    training = lever_training(lever, data, split)
-    network = replace(model.config, sigma_floor=lever.network.sigma_floor)
-    found = about, network, model.scaler, model.domain
-    same = about_checkpoint(data, split, lever.training, **more), lever.network
-    same += Scaler.fit(training), TrainingDomain.fit(training)
-    return (model, {"checkpoint": checkpoint}) if found == same else None
 
 
 def data_of(checkpoint: str) -> str:

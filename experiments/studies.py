@@ -3,7 +3,7 @@
     python -m experiments.studies --only study=latent,rollability
 
 computes missing or stale results in `data/results/raw/studies.jsonl.gz`. The tables are written by
-`experiments.effect_prediction` and `experiments.lever_up`.
+`experiments.effect_prediction`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from experiments.runner import FOLDER, STUDIES, Job, Rows, read
 NAME = "studies"
 MODULES = ("ablation", "representation", "uncertainty", "shared_network", "limits", "literal")
 MODULES += ("novelty",)
-for module in (*MODULES, "lever_cross_validation"):
+for module in MODULES:
     importlib.import_module(f"experiments.{module}")
 
 

@@ -144,7 +144,7 @@ def _residuals(model: Any, arrays: InteractionTensors) -> tuple[np.ndarray, np.n
 def residual_distribution() -> Rows:
     """Evaluate coverage and likelihood on `push_test` of fits to validation data of `film_500`."""
     model, _ = load_checkpoint("film_500")
-    model.sigma_scale = (1.0,) * len(model.effect_channels)
+    model.sigma_scale.fill_(1.0)
     channels, data = (model.action_channels, model.effect_channels), open_interactions("push")
     split = split_interactions(data.sizes["interaction"])
     known = InteractionTensors.from_dataset(data, split.validation, *channels)

@@ -19,7 +19,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-import experiments.attention  # noqa: F401, whose network a checkpoint is of
 from affordlib.interactions import InteractionTensors, open_interactions
 from affordlib.interactions.lever_up import lever_up_tensors
 from affordlib.interactions.recipes import RECIPES, interact

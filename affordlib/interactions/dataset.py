@@ -8,9 +8,18 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from affordlib.geometry import rotate_channels
-from affordlib.types import HasChannels, check_array, check_count, check_finite
+from affordlib.types import (
+    CROP_WIDTH_M,
+    LEVER_IMAGE_PIXELS,
+    HasChannels,
+    check_array,
+    check_count,
+    check_finite,
+)
 
 if TYPE_CHECKING:
     import xarray
@@ -27,12 +36,21 @@ def check_numbers(name: str, interactions: np.ndarray) -> None:
         raise ValueError(f"{name} must be numbers (n,) of interactions, got {interactions!r:.80}")
 
 
-def check_channels(name: str, tensors: HasChannels, model: HasChannels) -> None:
-    """Raise ValueError unless tensors have the channels of a model, in its order."""
+def check_fits(name: str, tensors: "InteractionTensors", model: HasChannels) -> None:
+    """Raise ValueError unless tensors have a model's channels, in its order, and image width."""
     for kind in ("action_channels", "effect_channels"):
         own, wanted = getattr(tensors, kind), getattr(model, kind)
         if own != wanted:
             raise ValueError(f"{name} has the {kind} {own}, but the model needs {wanted}")
+    if domain := getattr(model, "domain", None):
+        domain.check_width(name, tensors.image_width_m)
+
+
+def image_width_m(data: "xarray.Dataset") -> float:
+    """Return the width [m] of the images; sets that do not name it have 16, of lever-ups 56 cm."""
+    image = data["image"]
+    unnamed_m = 0.56 if image.shape[-1] == LEVER_IMAGE_PIXELS else 0.16
+    return float(image.attrs.get("width_m", unnamed_m))
 
 
 @dataclass(frozen=True)
@@ -107,19 +125,20 @@ _BY_INTERACTION = ("image", "action", "effect", "stop_phase")
 
 @dataclass(frozen=True)
 class InteractionTensors:
-    """Interactions as tensors: image (N, 2, 48, 48), phase (S,), action and effect (N, S, C).
+    """Interactions as tensors.
 
-    stop_phase: (N,), factor on `phase`, below 1 for partial actions. The images' width [m] is not
-    stored; it must be the width that a model was trained on.
+    stop_phase: factor on `phase`, below 1 for partial actions; default 1. image_width_m: of the
+    square that the images show.
     """
 
-    image: torch.Tensor
-    phase: torch.Tensor
-    action: torch.Tensor
-    effect: torch.Tensor
+    image: Float[Tensor, "n 2 h w"]
+    phase: Float[Tensor, " s"]
+    action: Float[Tensor, "n s a"]
+    effect: Float[Tensor, "n s e"]
     action_channels: tuple[str, ...]
     effect_channels: tuple[str, ...]
-    stop_phase: torch.Tensor | None = None
+    stop_phase: Float[Tensor, " n"] | None = None
+    image_width_m: float = CROP_WIDTH_M
 
     def __post_init__(self) -> None:
         if self.stop_phase is None:
@@ -154,6 +173,7 @@ class InteractionTensors:
             tuple(action_channels),
             tuple(effect_channels),
             torch.from_numpy(part["stop_phase"].values).float(),
+            image_width_m(data),
         )
 
     def phases(self, at: torch.Tensor) -> torch.Tensor:
@@ -178,8 +198,8 @@ class InteractionTensors:
     def joined(self, *others: "InteractionTensors") -> Self:
         """Concatenate these interactions with others that have the same phases and channels."""
         parts = (self, *others)
-        if len({(p.action_channels, p.effect_channels) for p in parts}) > 1:
-            raise ValueError("others must have the same action_channels and effect_channels")
+        if len({(p.action_channels, p.effect_channels, p.image_width_m) for p in parts}) > 1:
+            raise ValueError("others must have the same channels and image_width_m")
         if not all(torch.equal(p.phase, self.phase) for p in others):
             raise ValueError("others must have the same phases")
         return replace(

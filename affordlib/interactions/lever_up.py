@@ -16,7 +16,7 @@ import torch
 import torch.nn.functional as F
 
 from affordlib.geometry import rotate_channels
-from affordlib.interactions.dataset import InteractionTensors, Symmetry, valid_interactions
+from affordlib.interactions.dataset import InteractionTensors, valid_interactions
 from affordlib.types import check_choice
 
 if TYPE_CHECKING:
@@ -30,11 +30,6 @@ EVERY = 12
 N_OBSERVED, N_PREDICTED = 15, 5
 """Numbers of observed and of predicted steps in a window (Table 1)."""
 
-MIRRORED: tuple[Symmetry, ...] = ((0, False), (0, True))
-"""Reflection augmentation: a lever-up and its mirror image in y (see `augment_by_symmetry`)."""
-
-_NEAR = slice(16, 112), slice(32, 128)
-
 
 def lever_up_tensors(
     data: "xarray.Dataset", interactions: np.ndarray | None = None, view: str = "near"
@@ -44,6 +39,7 @@ def lever_up_tensors(
     view: "near", the 42 cm of the image that contain the object, 48×48 (means of four pixels);
     "wide", all of its 56 cm, 48×48; "full", as recorded, 128×128. Faulty ones are excluded.
     """
+    check_choice("view", view, ("near", "wide", "full"))
     xyz = ("x", "y", "z")
     on_table = InteractionTensors.from_dataset(data, interactions, xyz, POSE_CHANNELS)
     chosen = np.arange(data.sizes["interaction"]) if interactions is None else interactions
@@ -52,25 +48,17 @@ def lever_up_tensors(
     back = torch.stack([theta.cos(), -theta.sin()], dim=-1).float()[:, None]
     contact = np.stack([levers["contact_x"], levers["contact_y"], 0 * theta], axis=-1)
     action = on_table.action[:, ::EVERY] - torch.from_numpy(contact).float()[:, None]
+    image, width_m = on_table.image, on_table.image_width_m
+    if view == "near":
+        image, width_m = F.avg_pool2d(image[..., 16:112, 32:], 2), 96 / 128 * width_m
+    elif view == "wide":
+        image = F.interpolate(image, (48, 48), mode="bilinear", antialias=True)
     return replace(
         on_table,
-        image=select_view(on_table.image, view),
+        image=image,
+        image_width_m=width_m,
         phase=on_table.phase[::EVERY],
         action=rotate_channels(action, xyz, back, absolute_yaw=True)[..., [0, 2]],
         effect=rotate_channels(on_table.effect[:, ::EVERY], POSE_CHANNELS, back, False),
         action_channels=LEVER_ACTION_CHANNELS,
     )
-
-
-def select_view(image: torch.Tensor, view: str) -> torch.Tensor:
-    """Crop and scale images (N, C, 128, 128) to a view of `lever_up_tensors`."""
-    if check_choice("view", view, ("near", "wide", "full")) == "full":
-        return image
-    if view == "near":
-        return F.avg_pool2d(image[..., _NEAR[0], _NEAR[1]], 2)
-    return F.interpolate(image, (48, 48), mode="bilinear", antialias=True, align_corners=False)
-
-
-def n_windows(tensors: InteractionTensors) -> int:
-    """Return the number of windows of 15 + 5 steps in a trajectory."""
-    return len(tensors.phase) - N_OBSERVED - N_PREDICTED + 1

@@ -2,6 +2,7 @@
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -12,7 +13,7 @@ from torch import Tensor, nn
 
 from affordlib import checked
 from affordlib.geometry import rotate_channels, xy_columns
-from affordlib.interactions.dataset import Scaler
+from affordlib.interactions.dataset import InteractionTensors, Scaler
 from affordlib.models.domain import TrainingDomain
 from affordlib.models.push_frame import (
     FRAMES,
@@ -28,18 +29,12 @@ from affordlib.types import Observations, Prediction, check_choice, check_count,
 @checked
 @dataclass(frozen=True)
 class NetworkConfig:
-    """Channels and frame of a network.
-
-    frame: "table", or "push" to rotate everything into the direction of the push, see
-    `push_frame.py`. sigma_floor: lower bound of σ, in standardised units. sigma_scale: factors
-    (C_e,) by which σ of the effect channels is multiplied (empty: 1 each), see `calibration.py`.
-    """
+    """Channels and frame of a network."""
 
     action_channels: tuple[str, ...] = ("x", "y")
     effect_channels: tuple[str, ...] = ("x", "y")
-    sigma_floor: float = 0.1
-    frame: str = "table"
-    sigma_scale: tuple[float, ...] = ()
+    sigma_floor: float = 0.1  # initial lower bound of σ, in standardised units
+    frame: str = "table"  # "push" rotates everything into the push direction (`push_frame.py`)
 
     def __post_init__(self) -> None:
         check_choice("frame", self.frame, FRAMES)
@@ -55,21 +50,30 @@ class NetworkConfig:
                 check_within(size.name, check_count(size.name, getattr(self, size.name)), 1, 4096)
         if not 0 < self.sigma_floor < 10:
             raise ValueError(f"sigma_floor must lie in (0, 10), got {self.sigma_floor!r}")
-        scale = tuple(self.sigma_scale) or (1.0,) * len(self.effect_channels)
-        if len(scale) != len(self.effect_channels) or not all(0 < s < math.inf for s in scale):
-            raise ValueError(
-                f"sigma_scale must hold {len(self.effect_channels)} positive numbers, one per "
-                f"effect channel, got {self.sigma_scale!r}"
-            )
-        object.__setattr__(self, "sigma_scale", scale)
+
+
+NETWORKS: dict[str, tuple[type["EffectNetwork"], type[NetworkConfig]]] = {}
+"""Network and configuration by the name that checkpoints store."""
+
+
+def network(name: str, config: type[NetworkConfig]) -> Callable[[type], type]:
+    """Class decorator that registers a network and its configuration under a name."""
+
+    def register(made: type) -> type:
+        NETWORKS[name] = made, config
+        return made
+
+    return register
 
 
 class EffectNetwork(nn.Module, ABC):
-    """A network that satisfies `EffectModel`; `novelty` holds a `Novelty`, see `calibration.py`.
+    """A network that satisfies `EffectModel`.
 
     Inputs and outputs are in metres and radians, in the frame of the table; standardisation and
     rotation into the network's frame happen inside. A subclass implements `features` and `outputs`,
-    which work in standardised units, and creates its layers in `make_layers`.
+    which work in standardised units, creates its layers in `make_layers`, and is registered by the
+    decorator `network`. Buffers: sigma_floor, the lower bound of σ, which decreases in training;
+    sigma_scale (C_e,), factors on σ of the effect channels, see `calibration.py`.
     """
 
     @checked
@@ -80,8 +84,6 @@ class EffectNetwork(nn.Module, ABC):
         self.config, self.scaler, self.domain = config, scaler, domain or TrainingDomain()
         self.action_channels = config.action_channels
         self.effect_channels = config.effect_channels
-        self.sigma_floor, self.sigma_scale = config.sigma_floor, config.sigma_scale
-        self.novelty: Any = None
         for kind in ("action", "effect"):
             width = len(getattr(config, f"{kind}_channels"))
             if len(getattr(scaler, f"{kind}_scale")) != width:
@@ -91,10 +93,17 @@ class EffectNetwork(nn.Module, ABC):
         for name in ("action_scale", "effect_scale", "image_mean", "image_std"):
             values = torch.tensor(getattr(scaler, name), dtype=torch.float32)
             self.register_buffer(name, values, persistent=False)
+        # Double precision, so that a training continues from exactly the floor where it stopped.
+        floor = torch.tensor(config.sigma_floor, dtype=torch.float64)
+        self.register_buffer("sigma_floor", floor)
+        self.register_buffer("sigma_scale", torch.ones(len(config.effect_channels)))
         self.make_layers(config)
 
     def make_layers(self, config: Any) -> None:
         """Create the layers that the configuration describes."""
+
+    def prepare(self, training: InteractionTensors) -> None:
+        """Set what training data determine without an optimiser; by default nothing."""
 
     @abstractmethod
     def features(self, scaled_image: Float[Tensor, "b 2 n n"]) -> Float[Tensor, "b f"]:
@@ -121,8 +130,8 @@ class EffectNetwork(nn.Module, ABC):
         actions = with_time(o.action / self.action_scale, o.action_t)
         if effects is None:
             effects = with_time(o.effect / self.effect_scale, o.effect_t)
-        r_a = mean_code(self.action_encoder, actions, o.action_mask)
-        r_e = mean_code(self.effect_encoder, effects, o.effect_mask)
+        r_a = masked_mean(self.action_encoder(actions), o.action_mask)
+        r_e = masked_mean(self.effect_encoder(effects), o.effect_mask)
         w_1 = o.weight[:, None]
         return w_1 * r_a + (1 - w_1) * r_e
 
@@ -178,9 +187,7 @@ class EffectNetwork(nn.Module, ABC):
         self.domain.check_query(observations, t_target, *self._channels)
         (mu_a, sigma_a, mu_e, sigma_e), direction = self._decode(features, observations, t_target)
         a, e = self.action_scale, self.effect_scale
-        prediction = Prediction(
-            mu_a * a, sigma_a * a, mu_e * e, sigma_e * e * e.new_tensor(self.sigma_scale)
-        )
+        prediction = Prediction(mu_a * a, sigma_a * a, mu_e * e, sigma_e * e * self.sigma_scale)
         if direction is None:
             return prediction
         return rotate_prediction(prediction, direction, *self._channels)
@@ -243,18 +250,6 @@ def masked_mean(h: Float[Tensor, "b n c"], mask: Bool[Tensor, "b n"]) -> Float[T
     """Mean (B, H) of the observed values of (B, n, H); zero where none is observed."""
     seen = mask[..., None].to(h.dtype)
     return (h * seen).sum(dim=1) / seen.sum(dim=1).clamp_min(1)
-
-
-def mean_code(
-    encoder: nn.Module, seen: Float[Tensor, "b n c"], mask: Bool[Tensor, "b n"]
-) -> Float[Tensor, "b h"]:
-    """Mean (B, H) of encoded observations (B, n, C) with phases; zero where there are none.
-
-    Without gradients, a batch that observes nothing is not encoded: planners observe no effects.
-    """
-    if not torch.is_grad_enabled() and not mask.any():
-        seen, mask = seen[:, :0], mask[:, :0]
-    return masked_mean(encoder(seen), mask)
 
 
 def gaussian_nll(y: Tensor, mean: Tensor, std: Tensor) -> Tensor:

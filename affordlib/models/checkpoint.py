@@ -1,12 +1,13 @@
-"""Checkpoints: weights, configuration and description of a model in one safetensors file.
+"""Checkpoints: weights, configuration and description of a model in one file (`weights.py`).
 
-Files are replaced atomically and hold a hash of weights and description. The state of a training
-that can be resumed is a PyTorch zip file, which is read without running any code in it.
+The state of a training that can be resumed is a PyTorch zip file, which is read without running any
+code in it.
 """
 
+import importlib
 import io
-import json
 import pickle
+import re
 import zipfile
 from collections.abc import Callable
 from dataclasses import asdict
@@ -17,35 +18,25 @@ import torch
 from torch import nn
 
 from affordlib.interactions.dataset import Scaler
-from affordlib.models.base import EffectNetwork, NetworkConfig
-from affordlib.models.calibration import Novelty
-from affordlib.models.cnp import AffordanceCNP, CNPConfig
+from affordlib.models.base import NETWORKS, EffectNetwork, NetworkConfig
 from affordlib.models.domain import TrainingDomain
-from affordlib.models.film import FiLMConfig, FiLMNetwork, LastPoseCNP, LastPoseConfig
-from affordlib.models.lstm import LSTMConfig, LSTMNetwork
 from affordlib.paths import file_at, from_root
 from affordlib.results import write_atomically
 from affordlib.weights import SUFFIX, read_weights, resolve_checkpoint, write_weights
 
-FORMAT = "affordlib checkpoint 3"
-NOVELTY = "novelty"
+FORMAT = "affordlib checkpoint 4"
 _REMEDY = "give another checkpoint, or train it again with notebook 03"
-NETWORKS: dict[str, tuple[type[EffectNetwork], type[NetworkConfig]]] = {
-    "cnp": (AffordanceCNP, CNPConfig),
-    "film": (FiLMNetwork, FiLMConfig),
-    "cnp_last_pose": (LastPoseCNP, LastPoseConfig),
-    "lstm": (LSTMNetwork, LSTMConfig),
-}
-"""Network and configuration by the name that checkpoints store; other packages may add theirs."""
+_MODULES = re.compile(r"(affordlib\.models|experiments)\.\w+")
+"""Modules that a checkpoint may name: importing one registers its network."""
 
 
 def build(
     config: NetworkConfig, scaler: Scaler, domain: TrainingDomain | None = None
 ) -> EffectNetwork:
     """Create an untrained network of the architecture that the configuration belongs to."""
-    for network, config_class in NETWORKS.values():
+    for made, config_class in NETWORKS.values():
         if type(config) is config_class:
-            return network(config, scaler, domain)
+            return made(config, scaler, domain)
     known = [config_class.__name__ for _, config_class in NETWORKS.values()]
     raise TypeError(f"config must be one of {known}, got {config!r}")
 
@@ -59,20 +50,13 @@ def save_checkpoint(model: EffectNetwork, path: str | Path, about: dict[str, Any
     path = Path(path)
     if path.suffix != SUFFIX:
         raise ValueError(f"path must end in {SUFFIX!r}, got {str(path)!r}")
-    kind = next((name for name, (network, _) in NETWORKS.items() if network is type(model)), None)
+    kind = next((name for name, (made, _) in NETWORKS.items() if made is type(model)), None)
     if kind is None:
         raise TypeError(f"model must be one of {list(NETWORKS)}, got a {type(model).__name__}")
-    description = {
-        "format": FORMAT,
-        "model": kind,
-        "config": asdict(model.config)
-        | {"sigma_floor": model.sigma_floor, "sigma_scale": model.sigma_scale},
-        "scaler": asdict(model.scaler),
-        "domain": asdict(model.domain),
-        "about": about,
-    }
-    known = {} if model.novelty is None else {NOVELTY: model.novelty.references}
-    return write_weights(path, model.state_dict() | known, description)
+    names = {"name": path.stem, "module": type(model).__module__, "model": kind}
+    parts = {part: asdict(getattr(model, part)) for part in ("config", "scaler", "domain")}
+    description = {"format": FORMAT, **names, **parts, "about": about}
+    return write_weights(path, model.state_dict(), description)
 
 
 def _with_tuples(fields: dict[str, Any]) -> dict[str, Any]:
@@ -82,27 +66,25 @@ def _with_tuples(fields: dict[str, Any]) -> dict[str, Any]:
 def load_checkpoint(name_or_path: str | Path) -> tuple[EffectNetwork, dict[str, Any]]:
     """Load a model, ready to predict, and the `about` of its checkpoint.
 
-    Raises FileNotFoundError, or ValueError when the file is damaged or holds another model.
+    Raises FileNotFoundError, or ValueError when the file is damaged, holds another model, or is
+    another checkpoint than the shipped one of this name.
     """
+    path = resolve_checkpoint(name_or_path)
 
     def make(description):
         if description["format"] != FORMAT:
             raise ValueError(f"its format is {description['format']!r}, not {FORMAT!r}")
+        if Path(name_or_path).suffix != SUFFIX and description["name"] != path.stem:
+            raise ValueError(f"it is {description['name']!r}, renamed")
+        if not _MODULES.fullmatch(description["module"]):
+            raise ValueError(f"its network is in {description['module']!r:.80}")
+        importlib.import_module(description["module"])
         kind, config_class = NETWORKS[description["model"]]
         parts = {"config": config_class, "scaler": Scaler, "domain": TrainingDomain}
         return kind(*(part(**_with_tuples(description[name])) for name, part in parts.items()))
 
-    path = resolve_checkpoint(name_or_path)
     model, description = restored(path, _REMEDY, make)
-    about, words = description["about"], {*path.stem.split("_")}
-    if not str(name_or_path).endswith(SUFFIX):  # such as film_500: network and size of the set
-        n = str(json.loads(about["recipe"])["n_interactions"])
-        if n not in words or not words & {*description["model"].split("_")}:
-            raise ValueError(
-                f"{path} holds a model {description['model']!r} trained on {n} interactions, "
-                f"not what its name says; {_REMEDY}"
-            )
-    return model, about
+    return model, description["about"]
 
 
 def restored(
@@ -113,15 +95,13 @@ def restored(
     Raises FileNotFoundError, or ValueError when the file is damaged or of another kind.
     """
     tensors, description = read_weights(path, remedy)
-    references = tensors.pop(NOVELTY, None)
     try:
         model = make(description)
         own = model.state_dict()
         if other := [k for k in own if k not in tensors or tensors[k].dtype != own[k].dtype]:
             raise ValueError(f"{other[0]} is missing or has another type")
         model.load_state_dict(tensors)
-        model.novelty = None if references is None else Novelty(references)
-    except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, RuntimeError, ImportError) as error:
         raise ValueError(
             f"{path} does not describe a model of this package ({error}); {remedy}"
         ) from error

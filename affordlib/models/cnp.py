@@ -19,7 +19,13 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from affordlib import checked
-from affordlib.models.base import EffectNetwork, NetworkConfig, he_initialise, with_time
+from affordlib.models.base import (
+    EffectNetwork,
+    NetworkConfig,
+    he_initialise,
+    network,
+    with_time,
+)
 from affordlib.types import Observations
 
 ENCODER_WIDTHS = (32, 64, 64, 128, 128, 256, 128)
@@ -33,11 +39,10 @@ FOLD_FROM_TARGETS = 100
 @checked
 @dataclass(frozen=True)
 class CNPConfig(NetworkConfig):
-    """leaky_output: end the decoders with a LeakyReLU, as the paper's appendix prints.
+    """Channels and frame; the sizes are the paper's."""
 
-    It makes negative means hard to reach.
-    """
-
+    # End the decoders with a LeakyReLU, as the paper's appendix prints: negative means are then
+    # hard to reach.
     leaky_output: bool = False
 
 
@@ -59,6 +64,7 @@ def image_encoder() -> nn.Sequential:
     return nn.Sequential(*layers, nn.Flatten(), nn.Linear(CONVOLUTION_WIDTHS[-1], IMAGE_FEATURES))
 
 
+@network("cnp", CNPConfig)
 class AffordanceCNP(EffectNetwork):
     """The paper's network, relating object image, action and effect; satisfies `EffectModel`."""
 
@@ -72,13 +78,7 @@ class AffordanceCNP(EffectNetwork):
         last = config.leaky_output
         self.action_decoder = _dense((MERGE_WIDTH, *DECODER_WIDTHS, 2 * n_a), last)
         self.effect_decoder = _dense((MERGE_WIDTH, *DECODER_WIDTHS, 2 * n_e), last)
-        self._folds: dict[nn.Linear, tuple] = {}
         self.apply(he_initialise)
-
-    def train(self, mode: bool = True) -> "AffordanceCNP":
-        """Set the mode as in torch and drop folded weights: fused optimisers skip `_version`."""
-        self._folds.clear()
-        return super().train(mode)
 
     def features(self, scaled_image: Float[Tensor, "b 2 48 48"]) -> Float[Tensor, "b 16"]:
         """f(γ_o): features (B, 16) of standardised depth and mask (B, 2, 48, 48)."""
@@ -103,8 +103,8 @@ class AffordanceCNP(EffectNetwork):
         for decoder in (self.action_decoder, self.effect_decoder):
             first = decoder[0]
             if folds:
-                weight, bias = self._folded(first)
-                base = F.linear(known, weight[:, :-1], bias)
+                weight = first.weight @ self.merge.weight
+                base = F.linear(known, weight[:, :-1], first.weight @ self.merge.bias + first.bias)
                 hidden = base[:, None] + t_target[..., None] * weight[:, -1]
             else:
                 known_at_t = known[:, None].expand(-1, t_target.shape[1], -1)
@@ -112,21 +112,6 @@ class AffordanceCNP(EffectNetwork):
             mean, raw = decoder[1:](hidden).chunk(2, dim=-1)
             outputs += [mean, self.sigma_floor + F.softplus(raw)]
         return tuple(outputs)
-
-    def _folded(self, first: nn.Linear) -> tuple[Tensor, Tensor]:
-        """Weight and bias of the merge layer and a decoder's first layer combined.
-
-        In evaluation without gradients they are cached until one of the weights changes.
-        """
-        merge = self.merge
-        if self.training or torch.is_grad_enabled() or first.weight.is_inference():
-            return first.weight @ merge.weight, first.weight @ merge.bias + first.bias
-        weights = (*first.parameters(), *merge.parameters())
-        stamp = tuple((w.data_ptr(), w._version) for w in weights)
-        if self._folds.get(first, (None,))[0] != stamp:
-            weight = first.weight @ merge.weight
-            self._folds[first] = stamp, weight, first.weight @ merge.bias + first.bias
-        return self._folds[first][1:]
 
     def outputs(
         self, features: Tensor, observations: Observations, t_target: Tensor

@@ -1,10 +1,11 @@
-"""The domain of a trained model: the ranges of its training images, actions and effects."""
+"""The domain of a trained model: its images, and the ranges of its training actions and effects."""
 
 import warnings
 from dataclasses import dataclass
 from typing import Self
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from affordlib.geometry import xy_columns
@@ -23,18 +24,15 @@ class OutOfRangeWarning(UserWarning):
 
 @dataclass(frozen=True)
 class TrainingDomain:
-    """Ranges of the training data, None where unknown.
+    """What a model was trained on, None where unknown."""
 
-    start_radius_m, end_radius_m: distance [m] of the action from the object's centre at t = 0 and
-    at t = 1; mask_share: fraction of the image that the object covers; touches_border: whether
-    objects reach the image's edge; effect_radius_m: distance [m] that objects have moved at t = 1.
-    """
-
-    start_radius_m: Range | None = None
-    end_radius_m: Range | None = None
-    mask_share: Range | None = None
-    touches_border: bool = True
-    effect_radius_m: Range | None = None
+    start_radius_m: Range | None = None  # distance of the action from the object's centre at t = 0
+    end_radius_m: Range | None = None  # the same at t = 1
+    mask_share: Range | None = None  # fraction of the image that the object covers
+    touches_border: bool = True  # whether objects reach the image's edge
+    effect_radius_m: Range | None = None  # distance that objects have moved at t = 1
+    image_pixels: int | None = None  # along an edge of the square image
+    image_width_m: float | None = None
 
     def __post_init__(self) -> None:
         for name in ("start_radius_m", "end_radius_m", "mask_share", "effect_radius_m"):
@@ -43,7 +41,7 @@ class TrainingDomain:
 
     @classmethod
     def fit(cls, tensors: InteractionTensors) -> Self:
-        """Determine the ranges of training data."""
+        """Determine images and ranges of training data."""
         start = end = moved = None
         if plane := xy_columns(tensors.action_channels):
             start, end = (_range(tensors.action[:, k][:, plane].norm(dim=-1)) for k in (0, -1))
@@ -51,10 +49,24 @@ class TrainingDomain:
             moved = _range(tensors.effect[:, -1][:, plane].norm(dim=-1))
         mask = tensors.image[:, 1]
         share, border = _range(mask.mean(dim=(1, 2))), bool(touches_border(mask).any())
-        return cls(start, end, share, border, moved)
+        return cls(start, end, share, border, moved, mask.shape[-1], tensors.image_width_m)
 
-    def check_image(self, image: Tensor) -> None:
-        """Raise ValueError where an object's size in the image, or its place, is out of range."""
+    def check_width(self, name: str, width_m: float) -> None:
+        """Raise ValueError for images of another width [m] than those of the training."""
+        if self.image_width_m not in (None, width_m):
+            raise ValueError(
+                f"{name} has images {width_m} m wide, but the model was trained on images "
+                f"{self.image_width_m} m wide; crop them alike, or train on the new width"
+            )
+
+    def check_image(self, image: Float[Tensor, "b 2 h w"]) -> None:
+        """Raise ValueError for another number of pixels, or an object of another size or place."""
+        pixels = image.shape[-1]
+        if self.image_pixels not in (None, pixels):
+            raise ValueError(
+                f"image has {pixels}×{pixels} pixels, trained on {self.image_pixels}×"
+                f"{self.image_pixels}; scale it, or train on such images"
+            )
         if self.mask_share is None:
             return
         mask, (low, high) = image[:, 1], self.mask_share
@@ -75,7 +87,7 @@ class TrainingDomain:
     def check_query(
         self,
         observations: Observations,
-        t_target: Tensor,
+        t_target: Float[Tensor, "b t"],
         action_channels: tuple[str, ...],
         effect_channels: tuple[str, ...],
     ) -> None:
@@ -90,9 +102,11 @@ class TrainingDomain:
                 f"to {float(high):.3f}"
             )
         o = observations
-        known = {"starts": (self.start_radius_m, o.action_t)}
-        known["ends"] = self.end_radius_m, 1 - o.action_t
-        for name, (radius_m, t) in known.items():
+        ends = (
+            ("starts", self.start_radius_m, o.action_t),
+            ("ends", self.end_radius_m, 1 - o.action_t),
+        )
+        for name, radius_m, t in ends:
             seen = (t < _END_PHASE) & o.action_mask
             if off := _outside(o.action, action_channels, seen, radius_m):
                 raise ValueError(f"an observed action {name} {off}; train on such actions first")
@@ -102,8 +116,8 @@ class TrainingDomain:
             warnings.warn(words, OutOfRangeWarning, stacklevel=3)
 
 
-def touches_border(mask: Tensor) -> Tensor:
-    """Whether each of the masks (N, n, n) meets its image's edge by more than a corner: (N,)."""
+def touches_border(mask: Float[Tensor, "b n n"]) -> Bool[Tensor, " b"]:
+    """Whether each mask meets its image's edge by more than a corner."""
     rim = torch.cat([mask[:, (0, -1)].flatten(1), mask[:, :, (0, -1)].flatten(1)], dim=1)
     return (rim > 0.5).sum(dim=1) > 2
 

@@ -1,4 +1,4 @@
-"""Lever-ups: the prediction protocols of Section 4.1 and Table 1, and training for them.
+"""Lever-ups: the prediction protocols of Section 4.1 and Table 1, and our network for them.
 
     window      15 poses observed, anywhere in the trajectory; the next 1 to 5 steps predicted
     first_step  the first pose observed; all later steps predicted
@@ -7,69 +7,143 @@
 All models observe the image and the commanded action at t = 0 and t = 1. A pose is the change since
 the start, so the first pose is always zero. Therefore first_step contains no more information than
 image_only, and one trained network serves both. A conditional network is trained once for all
-protocols, a recurrent one separately for each.
+protocols, a recurrent one separately for each (`experiments/lever_training.py`).
+
+`LastPoseCNP`, for lever-ups, works in the frame of the last observed pose:
+
+    d(t)  = e(t) - m(t)                              m: mean of the training trajectories
+    r     = w₁ mean h_a(a_i, t_i) + w₂ mean h_e(d_i - d_l, t_i - t_l, t_i),  l the last observed
+    μ(t)  = m(t) + d_l + ḋ_l s(t) + n(t) g(r, ḋ_l, d_l, f(γ_o), t - t_l, t),    σ(t) from g
+
+A mean of codes, as in equations (2) and (3) of the paper, loses the exact pose of the last
+observation. Here that pose is an input, with the velocity ḋ_l between the last two observations,
+whose influence s(t) = (t - t_l) exp(-|t - t_l| / 0.2) decays. The network predicts the remaining
+change; n rises from 0 at t_l towards 1. Any t is predicted directly, without a rollout. With no
+observation d_l is the one at t = 0, where a displacement is zero.
 """
 
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
+from affordlib import checked
+from affordlib.geometry import rotate_channels
 from affordlib.interactions.dataset import InteractionTensors
-from affordlib.interactions.lever_up import (
-    LEVER_ACTION_CHANNELS,
-    N_OBSERVED,
-    N_PREDICTED,
-    POSE_CHANNELS,
-    n_windows,
-)
-from affordlib.interactions.sampling import (
-    Batch,
-    condition_on_poses,
-    sample_from_start,
-    sample_windows,
-)
-from affordlib.models.base import EffectNetwork, NetworkConfig
-from affordlib.models.cnp import CNPConfig
-from affordlib.models.film import LastPoseConfig
-from affordlib.models.lstm import LSTMConfig
-from affordlib.models.training import TrainingConfig, TrainingRecord, train, untrained
-from affordlib.types import Prediction, check_choice
+from affordlib.interactions.lever_up import N_OBSERVED, N_PREDICTED
+from affordlib.interactions.sampling import condition_on_poses, condition_on_recorded_action
+from affordlib.models.base import EffectNetwork, network, with_time
+from affordlib.models.film import FiLMConfig, FiLMNetwork, dense, waves
+from affordlib.models.push_frame import inverse, push_direction
+from affordlib.types import Observations, Prediction, check_choice
 
 PROTOCOLS = ("window", "first_step", "image_only")
 
-_CHANNELS = {"action_channels": LEVER_ACTION_CHANNELS, "effect_channels": POSE_CHANNELS}
-TRAINING = TrainingConfig(
-    steps=1000, n_targets=N_PREDICTED, obs_max=N_OBSERVED, patience=99, beta=0.5, weight_decay=0.1,
-    final_sigma_floor=0.005, ema=0.99, augment=False, validate_every=125,
-)  # fmt: skip
+_NEAR_PHASE = 0.1
+_VELOCITY_PHASE = 0.2
 
 
+@checked
 @dataclass(frozen=True)
-class LeverModel:
-    """A network, its training, and which part of the image it sees (see `lever_up_tensors`)."""
+class LastPoseConfig(FiLMConfig):
+    """Sizes as in `FiLMConfig`."""
 
-    network: NetworkConfig
-    training: TrainingConfig = TRAINING
-    view: str = "near"
+    frame: str = "table"
+    steps: int = 25  # linear segments of m(t)
 
 
-_IMAGE = {"rings": 10, "orders": 12}
-LEVER_MODELS: dict[str, LeverModel] = {
-    "cnp_last_pose": LeverModel(
-        LastPoseConfig(**_CHANNELS, **_IMAGE), replace(TRAINING, learning_rate=4e-3)
-    ),
-    "cnp": LeverModel(CNPConfig(**_CHANNELS), view="wide"),
-    "lstm_tuned": LeverModel(
-        LSTMConfig(**_CHANNELS, **_IMAGE), replace(TRAINING, learning_rate=2e-3)
-    ),
-}
-"""Our network, the paper's (on 48×48 images as in its appendix) and the tuned recurrent network.
+def between(values: Float[Tensor, "b n c"], at: Float[Tensor, "b t"]) -> Float[Tensor, "b t c"]:
+    """Interpolate values (B, n, C) linearly at fractional indices (B, T)."""
+    below = at.detach().floor().long().clamp(0, values.shape[1] - 2)
+    share = (at - below)[..., None]
 
-All train for the same number of steps; those of the paper's network cost three times as much. The
-other learning rates minimise validation error (`experiments/lever_cross_validation.py`)."""
+    def pick(index):
+        return values.gather(1, index[..., None].expand(-1, -1, values.shape[-1]))
+
+    return (1 - share) * pick(below) + share * pick(below + 1)
+
+
+class MeanTrajectory(nn.Module):
+    """Mean effect m(t) over the phase, linear between steps, in standardised units."""
+
+    def __init__(self, steps: int, channels: int) -> None:
+        super().__init__()
+        self.register_buffer("values", torch.zeros(steps + 1, channels))
+
+    def fit(self, training: InteractionTensors, frame: str, scale: Float[Tensor, " c"]) -> None:
+        """Set m to the mean effect of training trajectories and their mirror images, in a frame."""
+        both = training.joined(training.rotated_and_mirrored(0, mirror=True))
+        at = torch.linspace(0, len(both.phase) - 1, len(self.values)).round().long()
+        effect = both.effect[:, at]
+        if frame == "push":
+            channels = both.action_channels, both.effect_channels
+            back = inverse(push_direction(condition_on_recorded_action(both), *channels))[:, None]
+            effect = rotate_channels(effect, both.effect_channels, back, absolute_yaw=False)
+        self.values = effect.mean(dim=0) / scale
+
+    def forward(self, t: Float[Tensor, "b t"]) -> Float[Tensor, "b t c"]:
+        at = t.clamp(0, 1) * (len(self.values) - 1)
+        return between(self.values.expand(len(t), -1, -1), at)
+
+
+@network("cnp_last_pose", LastPoseConfig)
+class LastPoseCNP(FiLMNetwork):
+    """Predicts a trajectory from any observed part of it; satisfies `EffectModel`."""
+
+    def make_layers(self, config: LastPoseConfig) -> None:
+        """Create the encoders and decoders described above."""
+        super().make_layers(config)
+        c, w = config, config.width
+        n_e = len(c.effect_channels)
+        self.mean_trajectory = MeanTrajectory(c.steps, n_e)
+        self.effect_encoder = nn.Sequential(*dense(n_e + 2, w, w, w))
+        known = w + c.image_features + 2 * n_e + 2
+        self.merge = nn.Linear(known + 2 * (2 * c.waves + 1), w)
+
+    def prepare(self, training: InteractionTensors) -> None:
+        """Set the mean trajectory m."""
+        self.mean_trajectory.fit(training, self.config.frame, self.effect_scale)
+
+    def outputs(
+        self, features: Tensor, observations: Observations, t_target: Tensor
+    ) -> tuple[Tensor, ...]:
+        """(μ_a, σ_a, μ_e, σ_e), each (B, T, C) and standardised."""
+        o = observations
+        d = o.effect / self.effect_scale - self.mean_trajectory(o.effect_t)
+        d_last, t_last, velocity = _last(d, o.effect_t, o.effect_mask)
+        since = with_time(d - d_last[:, None], o.effect_t - t_last)
+        r = self.represent(o, with_time(since, o.effect_t))
+        seen = o.effect_mask.any(dim=1, keepdim=True).to(r.dtype)
+        image = features.expand(len(r), -1)
+        known = torch.cat([r, image, d_last, velocity, t_last, seen], dim=1)
+        ahead = t_target - t_last
+        n = self.config.waves
+        times = torch.cat([waves(t_target, n), waves(ahead, n)], dim=-1)
+        x = self.merge(torch.cat([known[:, None].expand(-1, times.shape[1], -1), times], dim=-1))
+        mu_a, sigma_a, change, sigma_e = self.decode(x, features)
+        # The change is zero at the last pose; the influence of the velocity decays.
+        near = ahead.abs()[..., None] / (ahead.abs()[..., None] + _NEAR_PHASE)
+        lasting = (10 * ahead * (-ahead.abs() / _VELOCITY_PHASE).exp())[..., None]
+        moving = velocity[:, None] * lasting
+        mu_e = self.mean_trajectory(t_target) + d_last[:, None] + moving + near * change
+        return mu_a, sigma_a, mu_e, sigma_e
+
+
+def _last(
+    d: Float[Tensor, "b m c"], t: Float[Tensor, "b m"], seen: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Value (B, C) and phase (B, 1) of the last observation, and its velocity per tenth of phase.
+
+    All are zero where nothing is observed; the velocity also where there is one observation.
+    """
+    order = t.masked_fill(~seen, -1.0).argsort(dim=1)[:, -2:]
+    rows = torch.arange(len(d), device=d.device)
+    late, early = order[:, -1], order[:, 0]
+    any_seen, two = seen.any(dim=1), seen.sum(dim=1) >= 2
+    gap = (t[rows, late] - t[rows, early]).clamp_min(1e-3)[:, None]
+    velocity = (d[rows, late] - d[rows, early]) * (0.1 / gap) * two[:, None]
+    return d[rows, late] * any_seen[:, None], (t[rows, late] * any_seen)[:, None], velocity
 
 
 @torch.no_grad()
@@ -94,6 +168,11 @@ def predict_steps(
     return model.predict(features, observed, tensors.phases(steps)), tensors.effect[:, steps]
 
 
+def n_windows(tensors: InteractionTensors) -> int:
+    """Return the number of windows of 15 + 5 steps in a trajectory."""
+    return len(tensors.phase) - N_OBSERVED - N_PREDICTED + 1
+
+
 def errors_m(prediction: Prediction, truth: Tensor) -> Float[Tensor, "n t"]:
     """Distances [m] between predicted and true positions."""
     return (prediction.effect_mean - truth)[..., :3].norm(dim=-1)
@@ -111,47 +190,3 @@ def window_errors_m(model: EffectNetwork, tensors: InteractionTensors) -> Float[
 def from_start_errors_m(model: EffectNetwork, tensors: InteractionTensors) -> Float[Tensor, "n t"]:
     """Errors [m] at all steps after the first, given only the image and the action."""
     return errors_m(*predict_steps(model, tensors, "image_only"))
-
-
-def _sample_all(
-    tensors: InteractionTensors, n_targets: int, obs_max: int, generator: torch.Generator
-) -> Batch:
-    kind = int(torch.randint(0, 2, (1,), generator=generator))
-    return (sample_windows, sample_from_start)[kind](tensors, n_targets, obs_max, generator)
-
-
-def _all_errors_m(model: EffectNetwork, tensors: InteractionTensors) -> Tensor:
-    """Window and start errors at about equal weight: the latter are three times as large."""
-    window, start = window_errors_m(model, tensors), from_start_errors_m(model, tensors)
-    return window.mean(dim=(1, 2)) + start.mean(dim=1) / 3
-
-
-TRAINED_FOR = {
-    "all": (_sample_all, _all_errors_m),
-    "window": (sample_windows, window_errors_m),
-    "first_step": (sample_from_start, from_start_errors_m),
-}
-"""Sampler and score of each training; `first_step` also serves `image_only` (see above)."""
-
-
-def fit_lever_model(
-    lever: LeverModel,
-    training: InteractionTensors,
-    validation: InteractionTensors,
-    trained_for: str = "all",
-    resume_checkpoint: Path | None = None,
-) -> tuple[EffectNetwork, list[TrainingRecord]]:
-    """Train a network, with as many steps as a trajectory has, for one protocol or all of them.
-
-    Early stopping uses the validation errors of the protocols that it is trained for.
-    """
-    trained_for = TRAINED_FOR[check_choice("trained_for", trained_for, TRAINED_FOR)]
-    network = lever.network
-    if hasattr(network, "steps"):
-        network = replace(network, steps=len(training.phase) - 1)
-    model = untrained(network, training, lever.training.seed)
-    if hasattr(model, "mean_trajectory"):
-        model.mean_trajectory.fit(training.effect, model.effect_scale)
-    return model, train(
-        model, training, validation, lever.training, resume_checkpoint, *trained_for
-    )

@@ -8,13 +8,14 @@ for comparison. `train_model` goes from data set and split to a calibrated netwo
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 from tqdm import tqdm
 
 from affordlib.geometry import xy_columns
@@ -24,49 +25,46 @@ from affordlib.interactions.dataset import (
     Split,
     Symmetry,
     augment_by_symmetry,
-    check_channels,
+    check_fits,
 )
 from affordlib.interactions.sampling import Batch, sample_mixed
 from affordlib.models.base import EffectNetwork, NetworkConfig
-from affordlib.models.calibration import Novelty, effects_at, fit_sigma_scale
+from affordlib.models.calibration import effects_at, fit_sigma_scale
 from affordlib.models.checkpoint import build, load_state, save_state
 from affordlib.models.cnp import CNPConfig
 from affordlib.models.domain import TrainingDomain
-from affordlib.models.lstm import effects_at_steps
-from affordlib.types import IMAGE_PIXELS, check_count, check_field
+from affordlib.types import check_count, check_field
 
 if TYPE_CHECKING:
     import xarray
 
 Sampler = Callable[[InteractionTensors, int, int, torch.Generator], Batch]
-Score = Callable[[EffectNetwork, InteractionTensors], torch.Tensor]
+Score = Callable[[EffectNetwork, InteractionTensors], Tensor]
+Weights = dict[str, Tensor]
 
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """Settings of training; the σ floor decreases from the model's to `final_sigma_floor`.
-
-    beta: see `EffectNetwork.loss`. augment: rotate and mirror each batch in eight ways, an eighth
-    of it each; wrong where the hand does not turn with the object, as in a grasp. ema: decay of the
-    exponential moving average (EMA) of the weights, which is then validated and kept. patience:
-    validations without improvement before stopping. device: as in torch, or "auto".
-    """
+    """Settings of training."""
 
     steps: int = 3000
-    batch_size: int = 64
-    n_targets: int = 16
-    obs_max: int = 10
-    learning_rate: float = 1e-3
-    weight_decay: float = 0.0
-    beta: float = 0.0
-    final_sigma_floor: float = 0.02
+    batch_size: int = 64  # trajectories per step
+    n_targets: int = 16  # target phases per trajectory
+    obs_max: int = 10  # largest number of observations of action, and of effect
+    learning_rate: float = 1e-3  # its peak, see `rate`
+    weight_decay: float = 0.0  # of AdamW
+    beta: float = 0.0  # see `EffectNetwork.loss`
+    final_sigma_floor: float = 0.02  # to which the model's σ floor decreases
+    # Rotate and mirror each batch in eight ways, an eighth of it each; wrong where the hand does
+    # not turn with the object, as in a grasp.
     augment: bool = True
+    # Decay of the exponential moving average of the weights, which is then validated and kept.
     ema: float = 0.0
-    validate_every: int = 100
-    patience: int = 10
+    validate_every: int = 100  # steps
+    patience: int = 10  # validations without improvement before stopping
     max_minutes: float = math.inf
-    device: str = "auto"
-    seed: int = 0
+    device: str = "auto"  # as in torch; "auto" is the GPU if there is one, else the CPU
+    seed: int = 0  # of batches and contexts, and of a new network's weights
 
     def __post_init__(self) -> None:
         for name in ("steps", "validate_every", "patience"):
@@ -90,8 +88,8 @@ class TrainingConfig:
         return self.learning_rate * (share / 0.1 if share < 0.1 else falling)
 
     def sigma_floor(self, step: int, first: float) -> float:
-        """σ floor at a step, decreasing geometrically from `first`."""
-        return first * (self.final_sigma_floor / first) ** (step / self.steps)
+        """σ floor at a step, decreasing geometrically from `first`; a lower `first` stays."""
+        return first * (min(self.final_sigma_floor, first) / first) ** (step / self.steps)
 
 
 @dataclass(frozen=True)
@@ -113,13 +111,64 @@ def device_named(name: str) -> torch.device:
         raise ValueError(f'device must be "auto", "cpu", "cuda" or alike, got {name!r}') from None
 
 
-def final_errors_m(model: EffectNetwork, tensors: InteractionTensors) -> torch.Tensor:
-    """Distance (N,) [m] of predicted and true (x, y) at t = 1; without x, y, of all channels."""
+def final_errors_m(model: EffectNetwork, tensors: InteractionTensors) -> Float[Tensor, " n"]:
+    """Distance [m] of predicted and true (x, y) at t = 1; without x, y, of all channels."""
     was_training = model.training
     truth, mean, _ = effects_at(model.eval(), tensors, (1.0,))
     model.train(was_training)
     columns = xy_columns(tensors.effect_channels) or list(range(len(tensors.effect_channels)))
     return (mean - truth)[:, 0, columns].norm(dim=-1)
+
+
+@dataclass
+class Progress:
+    """What changes in a training, apart from model, optimiser and generator."""
+
+    average: Weights  # exponential moving average of the parameters
+    best: Weights  # state of the best validation
+    first_floor: float  # σ floor at the start
+    best_error: float = math.inf
+    step: int = 0
+    seconds: float = 0.0
+    fruitless: int = 0  # validations without improvement
+    history: list[tuple[int, float, float, float]] = field(default_factory=list)
+
+
+class Checkpointer:
+    """Saves the state of a training to a file, if one is given, and resumes from it.
+
+    about: settings of the training, which must be equal to resume. parts: name → object with a
+    state_dict, or a generator.
+    """
+
+    def __init__(self, path: str | Path | None, about: dict[str, Any], parts: dict[str, Any]):
+        self.path, self.about, self.parts = path and Path(path), about, parts
+
+    def resume(self, progress: Progress, device: torch.device) -> None:
+        """Restore parts and progress, if the file exists; ValueError if it is of other settings."""
+        if not self.path or not self.path.exists():
+            return
+        state = load_state(self.path, device)
+        if differ := [k for k, v in self.about.items() if state["about"].get(k) != v]:
+            raise ValueError(
+                f"resume_checkpoint is of a training with other {', '.join(differ)}; delete it, "
+                "or use the settings of that training"
+            )
+        for name, part in self.parts.items():
+            if isinstance(part, torch.Generator):
+                part.set_state(state[name].cpu())
+            else:
+                part.load_state_dict(state[name])
+        vars(progress).update(state["progress"])
+
+    def save(self, progress: Progress) -> None:
+        """Write the state atomically."""
+        if self.path:
+            state = {
+                name: part.get_state() if isinstance(part, torch.Generator) else part.state_dict()
+                for name, part in self.parts.items()
+            }
+            save_state(self.path, state | {"about": self.about, "progress": vars(progress)})
 
 
 def train(
@@ -141,47 +190,24 @@ def train(
     for name, tensors in (("training", training), ("validation", validation)):
         if len(tensors) == 0:
             raise ValueError(f"{name} holds no interactions")
-        check_channels(name, tensors, model)
+        check_fits(name, tensors, model)
     device = device_named(config.device)
     model.to(device).train()
-    first_floor = model.config.sigma_floor
     generator = torch.Generator().manual_seed(config.seed)
     optimiser = torch.optim.AdamW(
         model.parameters(), config.learning_rate, weight_decay=config.weight_decay, fused=True
     )
-    sums = [
-        [len(t), *(float(v.double().sum()) for v in (t.image, t.action, t.effect))]
-        for t in (training, validation)
-    ]
-    names = [getattr(f, "__name__", type(f).__name__) for f in (sampler, score)]
-    about = {"model": repr(model.config), "data": sums, "sampler and score": names}
-    run = SimpleNamespace(
-        about=about | asdict(replace(config, max_minutes=math.inf, device="cpu")),
-        step=0,
-        seconds=0.0,
-        history=[],
-        average=_copy(model),
-        best=(math.inf, _copy(model), model.sigma_floor),
-        validations_without_improvement=0,
-    )
-    if resume_checkpoint is not None and Path(resume_checkpoint).exists():
-        state = load_state(resume_checkpoint, device)
-        if differ := [k for k, v in run.about.items() if state["about"].get(k) != v]:
-            raise ValueError(
-                f"resume_checkpoint is of a training with other {', '.join(differ)}; delete it, "
-                "or use the settings of that training"
-            )
-        model.load_state_dict(state.pop("model"))
-        optimiser.load_state_dict(state.pop("optimiser"))
-        generator.set_state(state.pop("generator").cpu())
-        vars(run).update(state)
+    run = Progress(_weights(model), _state(model), float(model.sigma_floor))
+    parts = {"model": model, "optimiser": optimiser, "generator": generator}
+    about = _about(model, (training, validation), config, (sampler, score))
+    file = Checkpointer(resume_checkpoint, about, parts)
+    file.resume(run, device)
     start = time.perf_counter() - run.seconds
     bar = tqdm(total=config.steps, initial=run.step, desc="training", unit=" steps", disable=None)
-    while run.step < config.steps and run.validations_without_improvement < config.patience:
+    while run.step < config.steps and run.fruitless < config.patience:
         run.step += 1
-        model.sigma_floor = config.sigma_floor(run.step, first_floor)
-        for group in optimiser.param_groups:
-            group["lr"] = config.rate(run.step)
+        model.sigma_floor.fill_(config.sigma_floor(run.step, run.first_floor))
+        optimiser.param_groups[0]["lr"] = config.rate(run.step)
         rows = torch.randint(0, len(training), (config.batch_size,), generator=generator)
         tensors = training.select(rows)
         tensors = _augmented(tensors) if config.augment else tensors
@@ -193,43 +219,66 @@ def train(
         optimiser.step()
         if config.ema:
             decay = min(config.ema, run.step / (run.step + 10))
-            for name, value in model.state_dict().items():
+            for name, value in _weights(model).items():
                 run.average[name].lerp_(value, 1 - decay)
         bar.update()
         if run.step % config.validate_every and run.step != config.steps:
             continue
-        weights = _copy(model)
-        candidate = {k: v.clone() for k, v in run.average.items()} if config.ema else weights
-        model.load_state_dict(candidate)
-        # The model is scored on the CPU, where the data are, so scores can ignore devices.
-        error = float(score(model.cpu(), validation).mean())
-        model.to(device)
-        model.load_state_dict(weights)
+        error, candidate = _validated(model, run.average if config.ema else {}, validation, score)
         run.seconds = time.perf_counter() - start
         run.history.append((run.step, run.seconds, loss.item(), error))
         bar.set_postfix_str(f"loss {loss.item():.2f}, validation {error:.3g}")
-        run.validations_without_improvement += 1
-        if error < run.best[0]:
-            run.best, run.validations_without_improvement = (error, candidate, model.sigma_floor), 0
-        if resume_checkpoint is not None:
-            parts = {"model": model.state_dict(), "optimiser": optimiser.state_dict()}
-            save_state(resume_checkpoint, vars(run) | parts | {"generator": generator.get_state()})
+        run.fruitless += 1
+        if error < run.best_error:
+            run.best_error, run.best, run.fruitless = error, candidate, 0
+        file.save(run)
         if run.seconds > 60 * config.max_minutes:
             break
     bar.close()
-    if run.best[0] == math.inf:
+    if run.best_error == math.inf:
         raise ValueError(
             f"learning_rate {config.learning_rate:g}: no validation error was finite; lower it, or "
             "look for values in the data that are not finite"
         )
-    _, weights, model.sigma_floor = run.best
-    model.load_state_dict(weights)
+    model.load_state_dict(run.best)
     model.cpu().eval()
     return [TrainingRecord(*record) for record in run.history]
 
 
-def _copy(model: EffectNetwork) -> dict[str, torch.Tensor]:
+def _about(
+    model: EffectNetwork,
+    data: tuple[InteractionTensors, ...],
+    config: TrainingConfig,
+    functions: tuple[Sampler, Score],
+) -> dict[str, Any]:
+    """All that decides a training's results, to compare before it is resumed."""
+    sums = [
+        [len(t), *(float(v.double().sum()) for v in (t.image, t.action, t.effect))] for t in data
+    ]
+    names = [getattr(f, "__name__", type(f).__name__) for f in functions]
+    about = {"model": repr(model.config), "data": sums, "sampler and score": names}
+    return about | asdict(replace(config, max_minutes=math.inf, device="cpu"))
+
+
+def _state(model: EffectNetwork) -> Weights:
     return {name: value.clone() for name, value in model.state_dict().items()}
+
+
+def _weights(model: EffectNetwork) -> Weights:
+    return {name: value.detach().clone() for name, value in model.named_parameters()}
+
+
+def _validated(
+    model: EffectNetwork, average: Weights, validation: InteractionTensors, score: Score
+) -> tuple[float, Weights]:
+    """Mean score of a model with averaged weights, if any, and its state."""
+    device, own = model.sigma_floor.device, _state(model)
+    candidate = own | {name: value.clone() for name, value in average.items()}
+    model.load_state_dict(candidate)
+    # The model is scored on the CPU, where the data are, so scores can ignore devices.
+    error = float(score(model.cpu(), validation).mean())
+    model.to(device).load_state_dict(own)
+    return error, candidate
 
 
 def _to(batch: Any, device: torch.device) -> Any:
@@ -249,18 +298,17 @@ def _augmented(tensors: InteractionTensors) -> InteractionTensors:
     return parts[0].joined(*parts[1:])
 
 
-def batch_loss(model: EffectNetwork, batch: Batch, beta: float = 0.0) -> torch.Tensor:
+def batch_loss(model: EffectNetwork, batch: Batch, beta: float = 0.0) -> Float[Tensor, ""]:
     """Mean negative log-likelihood of a batch's targets; beta: see `EffectNetwork.loss`."""
     b = batch
     return model.loss(b.image, b.observations, b.t_target, b.action, b.effect, beta)
 
 
 def untrained(config: NetworkConfig, training: InteractionTensors, seed: int) -> EffectNetwork:
-    """Create a network with seeded weights, and scales, domain and `Novelty` from the data."""
+    """Create a network with seeded weights, and scales and domain from the data."""
     torch.manual_seed(seed)
     model = build(config, Scaler.fit(training), TrainingDomain.fit(training))
-    if training.image.shape[-1] == IMAGE_PIXELS:
-        model.novelty = Novelty.fit(training.image)
+    model.prepare(training)
     return model
 
 
@@ -285,8 +333,6 @@ def train_model(
     if symmetries:
         training = augment_by_symmetry(training, symmetries)
     model = untrained(model_config, training, config.seed)
-    if hasattr(model, "mean_trajectory"):
-        model.mean_trajectory.fit(effects_at_steps(model, training), model.effect_scale)
     history = train(model, training, validation, config, resume_checkpoint, sampler)
     fit_sigma_scale(model, validation)
     return model, history

@@ -27,7 +27,14 @@ from affordlib.models.push_frame import rotate_prediction
 from affordlib.models.quasi_static import rotate
 from affordlib.perception import radius_m
 from affordlib.primitives import Move, Push
-from affordlib.types import IMAGE_CHANNELS, IMAGE_PIXELS, Prediction, check_array, check_count
+from affordlib.types import (
+    CROP_WIDTH_M,
+    IMAGE_CHANNELS,
+    IMAGE_PIXELS,
+    Prediction,
+    check_array,
+    check_count,
+)
 
 FINE_DIRECTIONS, FINE_PHASES = 180, 31
 
@@ -61,6 +68,8 @@ class EffectMap:
         check_count("n_directions", self.n_directions, 8, 720)
         check_count("n_phases", self.n_phases, 5, 500)
         checked_image(self.image)
+        if domain := getattr(self.model, "domain", None):
+            domain.check_width("image", CROP_WIDTH_M)
         object.__setattr__(self, "image", self.image.copy())  # the caller may change the original
         for channels in (self.model.action_channels, self.model.effect_channels):
             if not xy_columns(channels):
@@ -74,14 +83,6 @@ class EffectMap:
     def features(self) -> Tensor:
         """Image features (1, F) of the model."""
         return self.model.encode(checked_image(self.image))
-
-    @cached_property
-    def warning(self) -> str:
-        """A warning if the object is unlike the model's training objects, else empty."""
-        novelty = getattr(self.model, "novelty", None)
-        if novelty is None or novelty(checked_image(self.image)) <= 1:
-            return ""
-        return "The model was trained on no such object: errors may be far larger than predicted."
 
     @cached_property
     def radius_m(self) -> float:

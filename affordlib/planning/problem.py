@@ -99,8 +99,8 @@ class PlanningProblem:
             steps, reaches_goal = steps + (end or ()), end is not None
         # A search with rounded values may end slightly nearer to the goal than its plan.
         reaches_goal &= goal.distance_m(end_xy_m) <= goal.tolerance_m
-        seconds, about = time.perf_counter() - began_s, self.effects.warning
-        return Plan(goal, self.start_xy_m, steps, planner, reaches_goal, seconds, about)
+        seconds = time.perf_counter() - began_s
+        return Plan(goal, self.start_xy_m, steps, planner, reaches_goal, seconds)
 
 
 Planner = Callable[[PlanningProblem], Plan]

@@ -260,7 +260,7 @@ def plan_in_words(plan: Plan) -> str:
     unsure = "" if math.isnan(std_m) else f" (σ of the last step {1000 * std_m:.1f} mm)"
     return (
         f"Plan: {steps}. Predicted to end {1000 * plan.predicted_distance_m:.1f} mm from the goal"
-        f"{unsure}.{arrives} Found in {1000 * plan.plan_s:.0f} ms. {plan.warning}".strip()
+        f"{unsure}.{arrives} Found in {1000 * plan.plan_s:.0f} ms."
     )
 
 

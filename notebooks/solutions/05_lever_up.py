@@ -4,16 +4,15 @@ from dataclasses import replace
 
 import torch
 
-from affordlib.interactions import open_interactions
-from affordlib.interactions.lever_up import N_OBSERVED, N_PREDICTED, lever_up_tensors, n_windows
+from affordlib.interactions import open_interactions, split_interactions
+from affordlib.interactions.lever_up import N_OBSERVED, N_PREDICTED, lever_up_tensors
 from affordlib.interactions.sampling import condition_on_poses
 from affordlib.models import load_checkpoint
-from affordlib.models.lever_up import errors_m, window_errors_m
+from affordlib.models.lever_up import errors_m, n_windows, window_errors_m
 from exercises import check
-from experiments.lever_cross_validation import lever_split
 
 levers = open_interactions("lever_up")
-test = lever_up_tensors(levers, lever_split(levers).test)
+test = lever_up_tensors(levers, split_interactions(levers.sizes["interaction"]).test)
 conditional, _ = load_checkpoint("lever_up_last_pose_1800")
 recurrent, _ = load_checkpoint("lever_up_lstm_1800_window")
 

@@ -7,12 +7,7 @@ import torch
 from affordlib.interactions import open_interactions
 from affordlib.interactions.lever_up import lever_up_tensors
 from affordlib.models import load_checkpoint
-from affordlib.models.lever_up import (
-    LEVER_MODELS,
-    PROTOCOLS,
-    from_start_errors_m,
-    window_errors_m,
-)
+from affordlib.models.lever_up import PROTOCOLS, from_start_errors_m, window_errors_m
 from affordlib.paths import repo_root
 from experiments.lever_cross_validation import (
     edges_of,
@@ -20,8 +15,8 @@ from experiments.lever_cross_validation import (
     job,
     lever_split,
 )
+from experiments.lever_training import LEVER_MODELS, shipped_lever_model
 from experiments.runner import run
-from experiments.shipped import shipped_lever_model
 
 
 def test_baselines_are_right_about_what_they_assume():

@@ -7,14 +7,10 @@ import pytest
 import torch
 
 from affordlib.interactions.dataset import augment_by_symmetry
-from affordlib.interactions.lever_up import (
-    MIRRORED,
-    N_OBSERVED,
-    N_PREDICTED,
-    lever_up_tensors,
-    n_windows,
-)
+from affordlib.interactions.lever_up import N_OBSERVED, N_PREDICTED, lever_up_tensors
 from affordlib.interactions.sampling import sample_from_start, sample_windows
+from affordlib.models.lever_up import n_windows
+from experiments.lever_training import MIRRORED
 
 
 def test_arrays_are_in_the_frame_of_the_lever(levers, levered):

@@ -1,9 +1,10 @@
 """Checkpoints: they restore the same model or raise, and they record what a model has seen."""
 
-import dataclasses
 import json
 import math
 import pickle
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -13,20 +14,20 @@ from safetensors.torch import save
 from affordlib.interactions import split_interactions
 from affordlib.models import load_checkpoint, save_checkpoint
 from affordlib.models.predictions import refuse_seen
+from affordlib.paths import repo_root
 from affordlib.planning.reachability import Reachability
 from affordlib.weights import read_weights, write_weights
 from experiments.runner import checkpoint_sha256
 
 
 def test_round_trip(untrained, tmp_path):
-    untrained.sigma_floor, untrained.sigma_scale = 0.03, (1.7, 0.5)
+    untrained.sigma_floor.fill_(0.03)
+    untrained.sigma_scale.copy_(torch.tensor([1.7, 0.5]))
     path = save_checkpoint(untrained, tmp_path / "m.safetensors", {"note": "none"})
     again, about = load_checkpoint(path)
     assert about == {"note": "none"}
-    assert (again.scaler, again.domain) == (untrained.scaler, untrained.domain)
-    assert again.config == dataclasses.replace(
-        untrained.config, sigma_floor=0.03, sigma_scale=(1.7, 0.5)
-    )
+    for part in ("config", "scaler", "domain"):
+        assert getattr(again, part) == getattr(untrained, part)
     for name, value in untrained.state_dict().items():
         assert torch.equal(again.state_dict()[name], value)
     assert [p.name for p in tmp_path.iterdir()] == ["m.safetensors"]
@@ -38,7 +39,7 @@ def test_the_hash_is_of_all_that_decides_the_predictions(untrained, tmp_path):
 
     first = sha256({})
     assert sha256({"note": "another"}) == first
-    untrained.sigma_scale = (3.0, 3.0)
+    untrained.sigma_scale.fill_(3.0)
     assert sha256({}) != first
 
 
@@ -63,12 +64,29 @@ def test_a_bad_checkpoint_is_named(untrained, tmp_path):
         lambda: write_weights(path, half, description),
         lambda: described(model="lstm"),
         lambda: described(scaler=scaler),
-        lambda: described(config=description["config"] | {"sigma_scale": [1.0]}),
+        lambda: described(config=description["config"] | {"sigma_floor": 0}),
+        lambda: described(module="os.path"),
     ):
         path.unlink()
         spoil()
         with pytest.raises(ValueError, match=r"(?s)m\.safetensors.*train it again"):
             load_checkpoint(path)
+
+
+@pytest.mark.parametrize("name", ["attention_500", "lstm_500", "lever_up_lstm_1800_window"])
+def test_a_shipped_network_from_elsewhere_loads_in_a_fresh_process(name):
+    code = f"from affordlib.models import load_checkpoint as load; load({name!r})"
+    subprocess.run([sys.executable, "-c", code], cwd=repo_root(), check=True)
+
+
+def test_a_renamed_checkpoint_is_refused(monkeypatch, tmp_path):
+    (tmp_path / "data" / "checkpoints").mkdir(parents=True)
+    names = [f"data/checkpoints/{name}.safetensors" for name in ("cnp_500", "film_500")]
+    (tmp_path / names[1]).write_bytes((repo_root() / names[0]).read_bytes())
+    monkeypatch.setattr("affordlib.paths.repo_root", lambda: tmp_path)
+    with pytest.raises(ValueError, match=r"film_500\.safetensors .*it is 'cnp_500', renamed"):
+        load_checkpoint("film_500")
+    load_checkpoint(tmp_path / names[1])  # a path may have any name
 
 
 def test_no_flipped_bit_loads_as_another_model(untrained, tmp_path):

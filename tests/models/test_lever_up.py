@@ -13,24 +13,18 @@ from affordlib.interactions.lever_up import N_OBSERVED, lever_up_tensors
 from affordlib.interactions.recipes import Recipe, sample_scene
 from affordlib.interactions.sampling import condition_on_poses
 from affordlib.models import build
-from affordlib.models.lever_up import (
-    LEVER_MODELS,
-    PROTOCOLS,
-    fit_lever_model,
-    from_start_errors_m,
-    predict_steps,
-)
+from affordlib.models.lever_up import PROTOCOLS, from_start_errors_m, predict_steps
+from experiments.lever_training import LEVER_MODELS, fit_lever_model
 
 
 def made(name, levered):
     torch.manual_seed(0)
     model = build(LEVER_MODELS[name].network, Scaler.fit(levered)).eval()
-    if hasattr(model, "mean_trajectory"):
-        model.mean_trajectory.fit(levered.effect, model.effect_scale)
+    model.prepare(levered)
     return model
 
 
-@pytest.fixture(scope="module", params=["cnp_last_pose", "lstm_tuned", "cnp"])
+@pytest.fixture(scope="module", params=["cnp_last_pose", "lstm_tuned", "cnp", "cnp_mean"])
 def untrained(request, levered):
     return made(request.param, levered)
 

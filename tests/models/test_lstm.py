@@ -9,7 +9,7 @@ from affordlib.interactions.lever_up import N_OBSERVED
 from affordlib.interactions.sampling import condition_on_poses
 from affordlib.models import build
 from affordlib.models.lever_up import from_start_errors_m, window_errors_m
-from affordlib.models.lstm import LSTMConfig, effects_at_steps
+from experiments.lstm import LSTMConfig
 from experiments.lstm_seker2019 import SekerConfig, SekerLSTM, train_seker
 
 
@@ -87,7 +87,8 @@ def test_the_course_of_pushes_is_that_seen_from_behind(pushes):
     few = InteractionTensors.from_dataset(pushes, np.arange(60), ("x", "y"), ("x", "y", "yaw"))
     config = LSTMConfig(effect_channels=("x", "y", "yaw"), frame="push", width=16)
     model = build(config, Scaler.fit(few))
-    mean = effects_at_steps(model, few).mean(dim=0)
+    model.prepare(few)
+    mean = model.mean_trajectory.values * model.effect_scale
     assert mean.shape == (26, 3)
     torch.testing.assert_close(mean[:, 1:], torch.zeros(26, 2), atol=1e-6, rtol=0)
     length = float(few.effect[:, -1, :2].norm(dim=-1).mean())

@@ -18,7 +18,7 @@ from affordlib.models import (
     train,
     train_model,
 )
-from affordlib.models.film import LastPoseConfig
+from affordlib.models.lever_up import LastPoseConfig
 from affordlib.models.training import batch_loss, final_errors_m
 from affordlib.types import Observations
 from experiments.baselines import constant

@@ -7,8 +7,10 @@
 `LSTMNetwork`, tuned and of about a million parameters, predicts the change of the increment in
 standardised units and is trained through its own rollouts. The network of the earlier study (Seker,
 Tekden and Ugur, Deep effect trajectory prediction in robot manipulation, Robotics and Autonomous
-Systems, 2019) is in `experiments/`.
+Systems, 2019) is in `lstm_seker2019.py`.
 """
+
+from __future__ import annotations
 
 from dataclasses import dataclass
 
@@ -17,13 +19,10 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from affordlib import checked
-from affordlib.geometry import rotate_channels
 from affordlib.interactions.dataset import InteractionTensors
-from affordlib.interactions.sampling import condition_on_recorded_action
-from affordlib.models.base import masked_mean, with_time
-from affordlib.models.film import MeanTrajectory, between
-from affordlib.models.harmonics import HarmonicsConfig, HarmonicsNetwork, dense, waves
-from affordlib.models.push_frame import inverse, push_direction
+from affordlib.models.base import masked_mean, network, with_time
+from affordlib.models.film import HarmonicsConfig, HarmonicsNetwork, dense, waves
+from affordlib.models.lever_up import MeanTrajectory, between
 from affordlib.types import Observations
 
 _CERTAIN = -6.0
@@ -33,9 +32,9 @@ _CERTAIN = -6.0
 @checked
 @dataclass(frozen=True)
 class LSTMConfig(HarmonicsConfig):
-    """Width of the network; steps: number of steps into which it divides the phase."""
+    """Sizes of the network."""
 
-    steps: int = 25
+    steps: int = 25  # into which it divides the phase
     width: int = 192
 
 
@@ -61,6 +60,7 @@ def on_grid(effect: Tensor, t: Tensor, seen: Tensor, steps: int) -> Known:
     return Known(d, where, where.to(torch.uint8).argmax(dim=1))
 
 
+@network("lstm", LSTMConfig)
 class LSTMNetwork(HarmonicsNetwork):
     """Predicts a trajectory step by step from the observed part of it; satisfies `EffectModel`.
 
@@ -82,6 +82,10 @@ class LSTMNetwork(HarmonicsNetwork):
         nn.init.zeros_(self.last[-1].bias)
         # The commanded action is given at t = 0 and 1; this predicts it at other phases.
         self.action_decoder = nn.Sequential(*dense(static + 2 * c.waves + 1, w, w, 2 * n_a))
+
+    def prepare(self, training: InteractionTensors) -> None:
+        """Set the mean trajectory m."""
+        self.mean_trajectory.fit(training, self.config.frame, self.effect_scale)
 
     def outputs(
         self, features: Tensor, observations: Observations, t_target: Tensor
@@ -141,14 +145,3 @@ class LSTMNetwork(HarmonicsNetwork):
             path.append(predicted)
             sigmas.append(raw)
         return torch.stack(path, dim=1), torch.stack(sigmas, dim=1)
-
-
-def effects_at_steps(model: LSTMNetwork, tensors: InteractionTensors) -> Tensor:
-    """Effects (2N, steps + 1, C) and their mirror images, at the model's steps and in its frame."""
-    both = tensors.joined(tensors.rotated_and_mirrored(0, mirror=True))
-    at = torch.linspace(0, len(both.phase) - 1, model.config.steps + 1).round().long()
-    if model.config.frame == "table":
-        return both.effect[:, at]
-    channels = both.action_channels, both.effect_channels
-    back = inverse(push_direction(condition_on_recorded_action(both), *channels))[:, None]
-    return rotate_channels(both.effect[:, at], channels[1], back, absolute_yaw=False)

@@ -1,0 +1,208 @@
+"""Training of lever-up models for the protocols of Table 1, and the shipped ones.
+
+A conditional network is trained once for all protocols, a recurrent one separately for each. The
+paper's network is trained in both ways: as published, and tuned, with what the recurrent one has,
+the near view, the mean trajectory and its own training for each protocol.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+import xarray as xr
+from torch import Tensor
+
+from affordlib import checked
+from affordlib.interactions import InteractionTensors, Scaler, Split
+from affordlib.interactions.dataset import Symmetry, augment_by_symmetry
+from affordlib.interactions.lever_up import (
+    LEVER_ACTION_CHANNELS,
+    N_OBSERVED,
+    N_PREDICTED,
+    POSE_CHANNELS,
+    lever_up_tensors,
+)
+from affordlib.interactions.sampling import Batch, sample_from_start, sample_windows
+from affordlib.models import CNPConfig, EffectNetwork, NetworkConfig, TrainingDomain
+from affordlib.models.base import network, with_time
+from affordlib.models.checkpoint import load_checkpoint
+from affordlib.models.cnp import AffordanceCNP
+from affordlib.models.lever_up import (
+    LastPoseConfig,
+    MeanTrajectory,
+    from_start_errors_m,
+    window_errors_m,
+)
+from affordlib.models.training import (
+    TrainingConfig,
+    TrainingRecord,
+    about_training,
+    train,
+    untrained,
+)
+from affordlib.types import Observations, check_choice
+from experiments.lstm import LSTMConfig
+
+MIRRORED: tuple[Symmetry, ...] = ((0, False), (0, True))
+"""Reflection augmentation: a lever-up and its mirror image in y (see `augment_by_symmetry`)."""
+
+
+@checked
+@dataclass(frozen=True)
+class MeanCNPConfig(CNPConfig):
+    """Channels and frame, and the mean trajectory."""
+
+    steps: int = 25  # linear segments of m(t)
+
+
+@network("cnp_mean", MeanCNPConfig)
+class MeanCNP(AffordanceCNP):
+    """The paper's network on differences from the mean trajectory, d(t) = e(t) - m(t)."""
+
+    def make_layers(self, config: MeanCNPConfig) -> None:
+        """Create the paper's layers and the mean trajectory m."""
+        super().make_layers(config)
+        self.mean_trajectory = MeanTrajectory(config.steps, len(config.effect_channels))
+
+    def prepare(self, training: InteractionTensors) -> None:
+        """Set the mean trajectory m."""
+        self.mean_trajectory.fit(training, self.config.frame, self.effect_scale)
+
+    def outputs(
+        self, features: Tensor, observations: Observations, t_target: Tensor
+    ) -> tuple[Tensor, ...]:
+        """(μ_a, σ_a, μ_e, σ_e), each (B, T, C) and standardised."""
+        o = observations
+        d = o.effect / self.effect_scale - self.mean_trajectory(o.effect_t)
+        r = self.represent(o, with_time(d, o.effect_t))
+        mu_a, sigma_a, change, sigma_e = self.decode(r, features, t_target)
+        return mu_a, sigma_a, self.mean_trajectory(t_target) + change, sigma_e
+
+
+_CHANNELS = {"action_channels": LEVER_ACTION_CHANNELS, "effect_channels": POSE_CHANNELS}
+TRAINING = TrainingConfig(
+    steps=1000, n_targets=N_PREDICTED, obs_max=N_OBSERVED, patience=99, beta=0.5, weight_decay=0.1,
+    final_sigma_floor=0.005, ema=0.99, augment=False, validate_every=125,
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class LeverModel:
+    """A network, its training, and which part of the image it sees (see `lever_up_tensors`)."""
+
+    network: NetworkConfig
+    training: TrainingConfig = TRAINING
+    view: str = "near"
+
+
+_IMAGE = {"rings": 10, "orders": 12}
+LEVER_MODELS: dict[str, LeverModel] = {
+    "cnp_last_pose": LeverModel(
+        LastPoseConfig(**_CHANNELS, **_IMAGE), replace(TRAINING, learning_rate=4e-3)
+    ),
+    "cnp": LeverModel(CNPConfig(**_CHANNELS), view="wide"),
+    "cnp_mean": LeverModel(MeanCNPConfig(**_CHANNELS)),
+    "lstm_tuned": LeverModel(
+        LSTMConfig(**_CHANNELS, **_IMAGE), replace(TRAINING, learning_rate=2e-3)
+    ),
+}
+"""Our network, the paper's (on 48×48 images as in its appendix) and the tuned recurrent network.
+
+All train for the same number of steps; those of the paper's network cost three times as much. The
+other learning rates minimise validation error (`experiments/lever_cross_validation.py`)."""
+
+
+def _sample_all(
+    tensors: InteractionTensors, n_targets: int, obs_max: int, generator: torch.Generator
+) -> Batch:
+    kind = int(torch.randint(0, 2, (1,), generator=generator))
+    return (sample_windows, sample_from_start)[kind](tensors, n_targets, obs_max, generator)
+
+
+def _all_errors_m(model: EffectNetwork, tensors: InteractionTensors) -> Tensor:
+    """Window and start errors at about equal weight: the latter are three times as large."""
+    window, start = window_errors_m(model, tensors), from_start_errors_m(model, tensors)
+    return window.mean(dim=(1, 2)) + start.mean(dim=1) / 3
+
+
+TRAINED_FOR = {
+    "all": (_sample_all, _all_errors_m),
+    "window": (sample_windows, window_errors_m),
+    "first_step": (sample_from_start, from_start_errors_m),
+}
+"""Sampler and score of each training; `first_step` also serves `image_only` (see above)."""
+
+
+def fit_lever_model(
+    lever: LeverModel,
+    training: InteractionTensors,
+    validation: InteractionTensors,
+    trained_for: str = "all",
+    resume_checkpoint: Path | None = None,
+) -> tuple[EffectNetwork, list[TrainingRecord]]:
+    """Train a network, with as many steps as a trajectory has, for one protocol or all of them.
+
+    Early stopping uses the validation errors of the protocols that it is trained for.
+    """
+    trained_for = TRAINED_FOR[check_choice("trained_for", trained_for, TRAINED_FOR)]
+    network = lever.network
+    if hasattr(network, "steps"):
+        network = replace(network, steps=len(training.phase) - 1)
+    model = untrained(network, training, lever.training.seed)
+    return model, train(
+        model, training, validation, lever.training, resume_checkpoint, *trained_for
+    )
+
+
+LEVER_CHECKPOINTS: dict[str, tuple[str, str]] = {
+    "lever_up_last_pose_1800": ("cnp_last_pose", "all"),
+    "lever_up_lstm_1800_window": ("lstm_tuned", "window"),
+    "lever_up_lstm_1800_first_step": ("lstm_tuned", "first_step"),
+}
+"""Checkpoints of lever-ups: the name in `LEVER_MODELS`, and the protocol it is trained for."""
+
+
+def about_checkpoint(
+    data: xr.Dataset, split: Split, training: TrainingConfig, **more: str
+) -> dict[str, object]:
+    """Return the description of a shipped checkpoint's training, with further entries `more`."""
+    return about_training(data, np.concatenate([split.train, split.validation]), training) | more
+
+
+def lever_training(lever: LeverModel, data: xr.Dataset, split: Split) -> InteractionTensors:
+    """Return the training data of a lever-up network: the training part and its mirror image."""
+    return augment_by_symmetry(lever_up_tensors(data, split.train, lever.view), MIRRORED)
+
+
+def train_lever_model(
+    lever: LeverModel,
+    data: xr.Dataset,
+    split: Split,
+    trained_for: str = "all",
+    resume_checkpoint: Path | None = None,
+) -> tuple[EffectNetwork, list[TrainingRecord]]:
+    """Train a lever-up network on a split's training part and its mirror image."""
+    training = lever_training(lever, data, split)
+    validation = lever_up_tensors(data, split.validation, lever.view)
+    return fit_lever_model(lever, training, validation, trained_for, resume_checkpoint)
+
+
+def shipped_lever_model(
+    name: str, trained_for: str, lever: LeverModel, data: xr.Dataset, split: Split
+) -> tuple[EffectNetwork, dict[str, object]] | None:
+    """Return the shipped checkpoint of exactly this training and its name, or None."""
+    names = {key: checkpoint for checkpoint, key in LEVER_CHECKPOINTS.items()}
+    try:
+        checkpoint = names[name, trained_for]
+        model, about = load_checkpoint(checkpoint)
+    except (KeyError, FileNotFoundError, ValueError):
+        return None
+    more = {"trained_for": trained_for, "view": lever.view}
+    training = lever_training(lever, data, split)
+    found = about, model.config, model.scaler, model.domain
+    same = about_checkpoint(data, split, lever.training, **more), lever.network
+    same += Scaler.fit(training), TrainingDomain.fit(training)
+    return (model, {"checkpoint": checkpoint}) if found == same else None
