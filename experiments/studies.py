@@ -1,6 +1,6 @@
 """Studies in addition to the cross-validation: ablations, representations, uncertainty, limits.
 
-    python -m experiments.studies --only study=latent,rollability
+    python -m experiments.studies --only study=latent,ablation
 
 computes missing or stale results in `data/results/raw/studies.jsonl.gz`. The tables are written by
 `experiments.effect_prediction`.

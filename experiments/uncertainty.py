@@ -1,4 +1,4 @@
-"""Studies of σ: in a perturbed world, and the reason why it is too wide for most pushes.
+"""A study of σ: why it is too wide for most pushes.
 
 A few pushes have large errors, so the residuals have heavy tails.
 
@@ -23,16 +23,8 @@ from affordlib.geometry import xy_columns
 from affordlib.interactions import InteractionTensors, open_interactions, split_interactions
 from affordlib.models.calibration import AFTER_CONTACT, LEVELS, calibration_row, effects_at
 from affordlib.models.checkpoint import load_checkpoint
-from affordlib.models.predictions import refuse_seen
 from affordlib.models.protocol import EffectModel
-from affordlib.models.training import final_errors_m, train_model
-from experiments.representation import TRAINING
 from experiments.runner import Rows, study
-from experiments.shipped import CHECKPOINT_SPECS
-
-PERTURBED_FOLDS = 3
-NETWORK = CHECKPOINT_SPECS["film_500"].network
-_ABOUT = (TRAINING, NETWORK, PERTURBED_FOLDS)
 
 
 def calibration_rows(
@@ -52,46 +44,6 @@ def calibration_rows(
         for k, channel in enumerate(model.effect_channels):
             row = calibration_row(truth[:, i, k], mean[:, i, k], std[:, i, k])
             rows.append({**columns, "phase": phase, "channel": channel, **row})
-    return rows
-
-
-@study("push_varied", checkpoints=("film_5000_perturbed",), settings=_ABOUT)
-def perturbed_world() -> Rows:
-    """Measure errors and calibration in a perturbed world with camera noise.
-
-    Test folds of 500 pushes are evaluated together; then all of these pushes with the network
-    trained on 4,000 others.
-    """
-    data = open_interactions("push_varied")
-    channels = NETWORK.action_channels, NETWORK.effect_channels
-    errors, calibrated = [], []
-    for fold in range(PERTURBED_FOLDS):
-        split = split_interactions(data.sizes["interaction"], 0, fold)
-        model, _ = train_model(data, split, TRAINING, NETWORK)
-        test = InteractionTensors.from_dataset(data, split.test, *channels)
-        errors.append(final_errors_m(model, test).numpy())
-        calibrated.append(calibration_rows(model, test))
-    rows = _perturbed_rows(500, PERTURBED_FOLDS, np.concatenate(errors), calibrated)
-    model, about = load_checkpoint("film_5000_perturbed")
-    everything = np.arange(data.sizes["interaction"])
-    refuse_seen(about, data, everything)
-    test = InteractionTensors.from_dataset(data, everything, *channels)
-    error = final_errors_m(model, test).numpy()
-    return rows + _perturbed_rows(5000, 1, error, [calibration_rows(model, test)])
-
-
-def _perturbed_rows(
-    n_interactions: int, folds: int, error: np.ndarray, calibrated: list[Rows]
-) -> Rows:
-    about = {"n_interactions": n_interactions, "folds": folds, "n": len(error)}
-    about |= {"final_error_mean_m": float(error.mean())}
-    about |= {"final_error_median_m": float(np.median(error))}
-    rows = []
-    for same in zip(*calibrated, strict=True):
-        row = about | {key: same[0][key] for key in ("phase", "channel")}
-        for key in ("coverage_50", "coverage_90", "std_mean", "nll"):
-            row[key] = float(np.average([r[key] for r in same], weights=[r["n"] for r in same]))
-        rows.append(row)
     return rows
 
 

@@ -1,4 +1,4 @@
-"""Studies: ablations, rolling objects, residuals, and limits of prediction."""
+"""Studies: ablations, residuals, and limits of prediction."""
 
 import dataclasses
 import lzma
@@ -10,50 +10,16 @@ import pytest
 import torch
 from scipy import integrate, stats
 
-from affordlib.interactions import InteractionTensors, open_interactions, split_interactions
+from affordlib.interactions import InteractionTensors, open_interactions
 from affordlib.interactions.sampling import condition_on_recorded_action, sample_mixed
 from affordlib.models.push_frame import push_direction
 from affordlib.paths import repo_root
 from affordlib.types import Prediction
-from affordlib.world import LyingCylinder, UprightCylinder
 from experiments import ablation, limits, shared_network, studies
 from experiments.ablation import actions_only, half_blend, random_contexts
 from experiments.real_pushes import pushes_of
-from experiments.representation import cka, learn_rollability
+from experiments.representation import cka
 from experiments.uncertainty import Fit, coverage_columns, crps, fits
-
-
-@pytest.fixture(scope="module")
-def rolls():
-    mixed = open_interactions("mixed")
-    split = split_interactions(mixed.sizes["interaction"])
-    return learn_rollability(mixed, split.train), mixed, split
-
-
-@torch.no_grad()
-def test_what_rolls_is_learned_from_images(rolls):
-    model, mixed, split = rolls
-    right = []
-    for data, rows in ((mixed, split.test), (open_interactions("partial"), slice(None))):
-        told = model(torch.from_numpy(data["image"].values[rows])) > 0.5
-        right.append(told.numpy() == data["rollable"].values[rows])
-    assert np.concatenate(right).mean() >= 0.98
-
-
-@torch.no_grad()
-def test_both_poses_of_a_cylinder_are_told_apart(rolls, world):
-    model, *_ = rolls
-    for diameter, length in ((0.045, 0.07), (0.05, 0.08)):
-        told = []
-        for pose in (UprightCylinder(diameter, length), LyingCylinder(length, diameter)):
-            world.place(pose, (0.0, 0.0), 0.3)
-            told.append(float(model(torch.from_numpy(np.array(world.depth_image()))[None])))
-        assert told[0] < 0.5 < told[1]
-
-
-def test_rollability_wants_both_kinds(pushes):
-    with pytest.raises(ValueError, match="objects that roll and of objects that do not"):
-        learn_rollability(pushes, np.arange(10))
 
 
 def test_alignment_of_codes():
@@ -215,22 +181,6 @@ def test_intervals_of_a_standard_gaussian():
 # What limits a prediction
 
 
-@pytest.mark.slow
-def test_an_object_that_is_not_where_it_is_believed_is_moved_otherwise(monkeypatch):
-    monkeypatch.setattr(limits, "N_PUSHES", 8)
-    monkeypatch.setattr(limits, "REPEATS", 2)
-    rows = {row["object_class"]: row for row in limits.pose_sensitivity()}
-    assert sum(row["n"] for row in rows.values()) == 8
-    # A cylinder moves with the gripper: a localization error changes its path, hardly its end.
-    round_one = rows["upright_cylinder"]
-    assert round_one["displacement_median_m"] == pytest.approx(limits.POSITION_ERROR_M, rel=0.1)
-    assert round_one["end_median_m"] < 0.3 * limits.POSITION_ERROR_M
-    monkeypatch.setattr(limits, "POSITION_ERROR_M", 0.0)
-    monkeypatch.setattr(limits, "YAW_ERROR_RAD", 0.0)
-    exact = limits.pose_sensitivity()
-    assert max(max(row["displacement_mean_m"], row["end_mean_m"]) for row in exact) < 1e-4
-
-
 def test_networks_of_whole_actions_foresee_what_broken_off_ones_do():
     rows = limits.partial_execution()
     assert {row["model"] for row in rows} == set(limits.WHOLE_ACTION_MODELS)
@@ -240,13 +190,6 @@ def test_networks_of_whole_actions_foresee_what_broken_off_ones_do():
     assert all(row["slid_mean_m"] > 0 for row in late)
     before = [row["whole_mean_m"] for row in rows if row["from_phase"] == 0.0]
     assert max(before) < 1e-4  # before contact
-
-
-def test_reach_as_learned_agrees_with_the_kinematics(monkeypatch):
-    monkeypatch.setattr(limits, "N_PLACES", 120)
-    rows = {row["primitive"]: row for row in limits.reachability_accuracy()}
-    assert rows["all"]["agree_percent"] >= 97
-    assert min(row["agree_percent"] for row in rows.values()) > 92
 
 
 def test_a_damaged_log_of_pushes_is_named(tmp_path):
