@@ -180,7 +180,7 @@ def errors_m(
         observed = condition_on_final_effect(model, arrays.effect[:, -1])
         decoded = model.predict(model.encode(arrays.image), observed, torch.zeros(len(rows), 1))
     start = (decoded.action_mean[:, 0, :2] - arrays.action[:, 0, :2]).norm(dim=-1)
-    box = torch.from_numpy(data["family"].values[rows] == 0)
+    box = torch.from_numpy(data["category"].values[rows] == 0)
     errors = {"final_error": final_errors_m(model, arrays), "action_start": start}
     means = {k: float(e[box].mean() + e[~box].mean()) / 2 for k, e in errors.items()}
     return means | {"n": len(rows)}

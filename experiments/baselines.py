@@ -68,8 +68,8 @@ def features(data: xr.Dataset) -> Tensor:
     yaw = torch.from_numpy(data["start_pose"].values[:, 2].copy())
     if "theta" in data:
         yaw = yaw - torch.from_numpy(data["theta"].values)
-    names = data["family"].attrs["flag_meanings"].split()
-    category = torch.from_numpy(data["family"].values).long()
+    names = data["category"].attrs["flag_meanings"].split()
+    category = torch.from_numpy(data["category"].values).long()
     has_yaw = torch.tensor([category_named(name).has_yaw for name in names])
     angle = torch.stack([(2 * yaw).cos(), (2 * yaw).sin()], dim=-1).float()
     one_hot = torch.nn.functional.one_hot(category, len(names)).float()

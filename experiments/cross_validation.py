@@ -205,7 +205,7 @@ def logistic(size: np.ndarray, success: np.ndarray, queried: np.ndarray) -> np.n
 
 def prediction_columns(predictions: dict[str, Any]) -> dict[str, Any]:
     """Convert predictions to the columns of a table: `truth_x`, `mean_x`, `std_x`, … and errors."""
-    columns = {"category" if k == "family" else k: v for k, v in predictions.items()}
+    columns = dict(predictions)
     for kind in ("truth", "mean", "std"):
         by_channel = columns.pop(kind, {})
         columns |= {f"{kind}_{channel}": values for channel, values in by_channel.items()}
@@ -292,7 +292,7 @@ def executed_columns(
     theta_off = theta_rad - data["theta"].values[rows]
     return {
         "interaction": data["interaction"].values[rows].tolist(),
-        "category": about_objects(data, rows)["family"],
+        "category": about_objects(data, rows)["category"],
         "final_error": np.hypot(*off[:, :2].T).tolist(),
         "yaw_error": [abs(wrap_angle(d)) for d in off[:, 3].tolist()],
         "theta_error": [abs(wrap_angle(d)) for d in theta_off.tolist()],

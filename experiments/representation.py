@@ -9,12 +9,6 @@ from torch import Tensor
 
 from affordlib.interactions import InteractionTensors, open_interactions
 from affordlib.models.checkpoint import load_checkpoint
-<<<<<<< HEAD
-from affordlib.models.film import CircularHarmonics, FiLMConfig, dense
-from affordlib.models.predictions import about_objects
-from affordlib.models.protocol import condition_on_final_effect
-=======
->>>>>>> 1b1c084 (Studies that no page and no table of RESULTS shows are gone)
 from affordlib.models.push_frame import inverse, push_direction, rotate_observations
 from affordlib.types import Observations
 from experiments.runner import Rows, study

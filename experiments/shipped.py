@@ -211,7 +211,7 @@ def learn_reachability(data: xr.Dataset, seed: int = 0) -> Reachability:
     The arm's base is on the table's x axis, so mirror images of all interactions are added.
     """
     number = data["primitive"].values
-    xy_m = data["believed_xy"].values
+    xy_m = data["estimated_xy"].values
     names = data["primitive"].attrs["flag_meanings"].split()
     direction = data["theta"].values + np.where(number == names.index("push"), np.pi, 0.0)
     kind = np.eye(len(names))[number]

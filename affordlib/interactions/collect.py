@@ -69,7 +69,7 @@ _VARIABLES = {
     "friction": ("float32", "surface", "", "of table, object, fingers"),
     "tip_offset": ("float32", "", "m", "how much higher than commanded the tool moved"),
     "start_pose": ("float64", "pose_channel", "m, m, rad"),
-    "believed_xy": ("float64", "xy", "m", "where the robot took the object to be"),
+    "estimated_xy": ("float64", "xy", "m", "where the robot took the object to be"),
     "rollable": ("bool", "", "", "can roll as it was placed"),
     "rolls": ("bool", "", "", "can roll as it lies at the end"),
     "fell": ("bool", "", "", "lies differently than it was placed"),
@@ -207,7 +207,7 @@ def attributes_for(recipe: Recipe) -> dict[str, str]:
 def collect_chunk(recipe: Recipe, numbers: range) -> xr.Dataset:
     """Collect the interactions of a recipe with the given numbers."""
     # Evaluated at run time, because a user may have added categories and primitives.
-    flags = {"primitive": " ".join(PRIMITIVES), "family": " ".join(CATEGORIES)}
+    flags = {"primitive": " ".join(PRIMITIVES), "category": " ".join(CATEGORIES)}
     variables = _VARIABLES | dict.fromkeys(flags, ("int8", ""))
     kinds = [primitive_named(name) for name in recipe.primitives]
     parameters = sorted({name for kind in kinds for name in _field_names(kind)})
@@ -245,13 +245,13 @@ def _row(obj: TabletopObject, done: Interaction, config: WorldConfig) -> dict[st
         | parameters
         | {
             "primitive": list(PRIMITIVES).index(primitive.name),
-            "family": list(CATEGORIES).index(obj.category),
+            "category": list(CATEGORIES).index(obj.category),
             "size": [*np.ptp(obj.footprint_m, axis=0), obj.height_m],
             "mass": config.density_kg_m3 * obj.volume_m3,
             "com_offset": config.com_offset_m,
             "friction": (config.table_friction, config.object_friction, config.finger_friction),
             "tip_offset": config.tip_offset_m,
-            "believed_xy": done.estimated_xy_m,
+            "estimated_xy": done.estimated_xy_m,
             "rollable": obj.rollable,
             "success": done.success,
             "tracking_error": done.tracking_error_m,

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 SUFFIX = ".zarr.zip"
 MANIFEST = "manifest.json"
+STORED_AS = {"category": "family", "estimated_xy": "believed_xy"}
+"""Variables that have another name in the files."""
 _REMEDY = "fetch it again, or collect it again (the shipped sets with `make data`)"
 
 
@@ -38,7 +40,7 @@ def _hashes(data: "xarray.Dataset") -> dict[str, str]:
         array = data[name].values
         digest = hashlib.sha256(f"{array.dtype.str}{array.shape}".encode())
         digest.update(np.ascontiguousarray(array).reshape(-1).view(np.uint8))
-        found[str(name)] = digest.hexdigest()
+        found[STORED_AS.get(name, name)] = digest.hexdigest()
     return found
 
 
@@ -59,6 +61,7 @@ def write_interactions(data: "xarray.Dataset", path: Path, level: int = 9) -> No
     from zarr.codecs import BloscCodec
     from zarr.storage import MemoryStore
 
+    data = data.rename({name: there for name, there in STORED_AS.items() if name in data})
     codec = BloscCodec(cname="zstd", clevel=level, shuffle="shuffle")
     buffers = {}
     encoding = {
@@ -146,6 +149,7 @@ def open_interactions(name_or_path: str | Path) -> "xarray.Dataset":
             if data.nbytes > psutil.virtual_memory().total:
                 raise ValueError(f"its arrays of {data.nbytes / 1e9:.0f} GB exceed the memory")
             data = data[sorted(data.data_vars)].load()
+            data = data.rename({there: name for name, there in STORED_AS.items() if there in data})
             recipe = RECIPES.get(str(name_or_path))
             if recipe is not None and data.attrs.get("recipe") != recipe.to_json():
                 raise ValueError(f"its recipe is not that of {name_or_path!r}")

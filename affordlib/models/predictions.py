@@ -45,10 +45,10 @@ def network_predictions(
 
 def about_objects(data: "xarray.Dataset", kept: np.ndarray) -> dict[str, Any]:
     """Number of each interaction, category of its object, and whether the object rolls."""
-    names = data["family"].attrs["flag_meanings"].split()
+    names = data["category"].attrs["flag_meanings"].split()
     return {
         "interaction": data["interaction"].values[kept].tolist(),
-        "family": [names[k] for k in data["family"].values[kept]],
+        "category": [names[k] for k in data["category"].values[kept]],
         "rollable": data["rollable"].values[kept].tolist(),
     }
 

@@ -60,7 +60,7 @@ def _volume_error_percent(volume_cm3: Callable[[np.ndarray], float]) -> float:
 def _cylinders() -> tuple[np.ndarray, np.ndarray]:
     """Diameters [m] of the upright cylinders in `push`, and how far along they went [m]."""
     pushes = open_interactions("push")
-    standing = pushes["family"].values == list(CATEGORIES).index("upright_cylinder")
+    standing = pushes["category"].values == list(CATEGORIES).index("upright_cylinder")
     angle = pushes["theta"].values[standing] + np.pi
     x, y = pushes["effect"].values[standing, -1, :2].T
     return pushes["size"].values[standing, 0], np.cos(angle) * x + np.sin(angle) * y

@@ -164,7 +164,7 @@ def test_a_second_cross_validation_counts_no_grasp_twice(tmp_path):
 
 
 def test_the_same_push_has_the_same_effect(pushes):
-    some = np.flatnonzero(pushes["family"].values == 1)[:2]
+    some = np.flatnonzero(pushes["category"].values == 1)[:2]
     right = executed_columns(pushes, some, pushes["theta"].values[some])
     assert max(right["final_error"]) < 1e-5  # the same simulation again, stored to a micrometre
     baseline = executed_columns(pushes, some, theta_along_effect(None, pushes, some))

@@ -193,7 +193,7 @@ def test_the_shipped_networks_reach_their_goals(
         held_out_pushes, None, *(model.action_channels, model.effect_channels)
     )
     errors = 1000 * final_errors_m(model, test)
-    box = torch.from_numpy(held_out_pushes["family"].values == 0)
+    box = torch.from_numpy(held_out_pushes["category"].values == 0)
     assert (errors[box].mean() + errors[~box].mean()) / 2 < all_mm
     assert errors[box].mean() < cuboid_mm
     assert errors.quantile(0.95) < p95_mm

@@ -509,7 +509,7 @@ def test_what_cannot_be_lifted_so_high_is_said_before_anything_moves(posed):
 def test_the_ring_is_where_the_arm_can_push_from(world):
     data = open_interactions("reach")
     pushes = data["primitive"].values == 0
-    xy = data["believed_xy"].values[pushes]
+    xy = data["estimated_xy"].values[pushes]
     theta = data["theta"].values[pushes]
     along = np.linspace(0.2, -0.05, 6)[:, None, None]
     places = xy + along * np.column_stack([np.cos(theta), np.sin(theta)])
