@@ -7,6 +7,7 @@ The copy of a page is written last, so one that exists is complete.
 
 import os
 import re
+import resource
 import shutil
 import signal
 import sys
@@ -106,6 +107,8 @@ def explained(path: Path, copy: Path, error: Exception, printed: Path) -> str:
         reason = f"{error.ename}: {error.evalue}"
     elif found := re.search(r"^\w[\w.]*(Error|Exception)\b.*", said, re.MULTILINE):
         reason = found[0]  # of a kernel without memory or files left to say it properly
+    if 0 < (limit := resource.getrlimit(resource.RLIMIT_AS)[0]) < 8 << 30:
+        reason += f" (ulimit -v leaves {limit >> 20} MB of address space)"
     return f"{path.stem} failed{where}\n{reason}"
 
 
