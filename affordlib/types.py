@@ -261,18 +261,17 @@ class HasChannels(Protocol):
 class Observations:
     """The context of a model: actions and effects at any phases, in metres and radians.
 
-    action: (B, n, C_a) at action_t: (B, n), ignored where action_mask (B, n) is False; likewise
-    effect: (B, m, C_e). weight: (B,), the weight w₁ of the action in equation (2), w₂ = 1 - w₁;
-    it is 1 where only actions and 0 where only effects are observed.
+    What is False in a mask is ignored. weight: w₁ of the action in equation (2), w₂ = 1 - w₁; it is
+    1 where only actions and 0 where only effects are observed.
     """
 
-    action: torch.Tensor
-    action_t: torch.Tensor
-    action_mask: torch.Tensor
-    effect: torch.Tensor
-    effect_t: torch.Tensor
-    effect_mask: torch.Tensor
-    weight: torch.Tensor
+    action: torch.Tensor  # (B, n, C_a)
+    action_t: torch.Tensor  # (B, n)
+    action_mask: torch.Tensor  # (B, n)
+    effect: torch.Tensor  # (B, m, C_e)
+    effect_t: torch.Tensor  # (B, m)
+    effect_mask: torch.Tensor  # (B, m)
+    weight: torch.Tensor  # (B,)
 
     @classmethod
     def of(
@@ -307,12 +306,12 @@ class Observations:
 
 @dataclass(frozen=True)
 class Prediction:
-    """Predicted mean and σ of action and effect at targets: (B, T, C) each, metres and radians."""
+    """Predicted mean and σ of action and effect at targets, in metres and radians."""
 
-    action_mean: torch.Tensor
-    action_std: torch.Tensor
-    effect_mean: torch.Tensor
-    effect_std: torch.Tensor
+    action_mean: torch.Tensor  # (B, T, C_a)
+    action_std: torch.Tensor  # (B, T, C_a)
+    effect_mean: torch.Tensor  # (B, T, C_e)
+    effect_std: torch.Tensor  # (B, T, C_e)
 
 
 @dataclass(frozen=True)

@@ -34,8 +34,10 @@ from affordlib.paths import from_root
 from affordlib.primitives import PRIMITIVES, LeverUp, primitive_named
 from affordlib.types import (
     ACTION_CHANNELS,
+    CROP_WIDTH_M,
     EFFECT_CHANNELS,
     IMAGE_CHANNELS,
+    LEVER_CROP_WIDTH_M,
     Interaction,
     check_count,
 )
@@ -229,6 +231,8 @@ def collect_chunk(recipe: Recipe, numbers: range) -> xr.Dataset:
     for name, (dtype, dims, *about) in variables.items():
         known = zip(("units", "long_name"), about, strict=False)
         attrs = {"flag_meanings": flags[name]} if name in flags else {k: v for k, v in known if v}
+        if name == "image":
+            attrs["width_m"] = LEVER_CROP_WIDTH_M if LeverUp in kinds else CROP_WIDTH_M
         values = np.stack([row[name] for row in rows])
         if dtype == "float32":  # digits below the resolution compress badly
             values = np.round(values.astype(np.float64) / GRAIN) * GRAIN

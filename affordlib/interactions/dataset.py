@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from affordlib.geometry import rotate_channels
 from affordlib.types import (
@@ -125,20 +123,16 @@ _BY_INTERACTION = ("image", "action", "effect", "stop_phase")
 
 @dataclass(frozen=True)
 class InteractionTensors:
-    """Interactions as tensors.
+    """Interactions as tensors."""
 
-    stop_phase: factor on `phase`, below 1 for partial actions; default 1. image_width_m: of the
-    square that the images show.
-    """
-
-    image: Float[Tensor, "n 2 h w"]
-    phase: Float[Tensor, " s"]
-    action: Float[Tensor, "n s a"]
-    effect: Float[Tensor, "n s e"]
+    image: torch.Tensor  # (N, 2, 48, 48), depth [m] and mask
+    phase: torch.Tensor  # (S,)
+    action: torch.Tensor  # (N, S, C_a)
+    effect: torch.Tensor  # (N, S, C_e)
     action_channels: tuple[str, ...]
     effect_channels: tuple[str, ...]
-    stop_phase: Float[Tensor, " n"] | None = None
-    image_width_m: float = CROP_WIDTH_M
+    stop_phase: torch.Tensor | None = None  # (N,), factor on `phase`; default 1
+    image_width_m: float = CROP_WIDTH_M  # of the square that the images show
 
     def __post_init__(self) -> None:
         if self.stop_phase is None:

@@ -16,13 +16,13 @@ from affordlib.types import Observations
 
 @dataclass(frozen=True)
 class Batch:
-    """Images, context, and targets (B, T, C) of action and effect at phases t_target (B, T)."""
+    """Images, context, and targets of action and effect."""
 
-    image: torch.Tensor
+    image: torch.Tensor  # (B, 2, 48, 48)
     observations: Observations
-    t_target: torch.Tensor
-    action: torch.Tensor
-    effect: torch.Tensor
+    t_target: torch.Tensor  # (B, T)
+    action: torch.Tensor  # (B, T, C_a)
+    effect: torch.Tensor  # (B, T, C_e)
 
     @classmethod
     def of(

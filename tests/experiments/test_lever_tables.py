@@ -53,9 +53,9 @@ def test_a_job_gives_the_committed_errors_again(tmp_path):
     (again,) = run([one], "lever_up", folder=tmp_path, progress=False)
     (committed,) = run([one], "lever_up", progress=False)
     assert again["interaction"] == committed["interaction"]
-    for name in PROTOCOLS:  # rounded to 1e-4 cm; the last digit depends on the processor
+    for name in PROTOCOLS:  # rounded to 1e-4 cm, so that float32's 1e-6 cm may turn the last digit
         errors = again[name]["error_cm"], committed[name]["error_cm"]
-        assert all(abs(a - b) < 5e-4 for a, b in zip(*map(flattened, errors), strict=True))
+        assert all(abs(a - b) < 1.1e-4 for a, b in zip(*map(flattened, errors), strict=True))
 
 
 def flattened(nested):

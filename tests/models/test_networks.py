@@ -185,7 +185,7 @@ def test_a_quarter_turn_of_the_table_turns_the_prediction(name, quarters, some):
 def test_any_turn_of_a_real_object_turns_the_prediction_of_the_trained_model(name, obj, world):
     model, _ = load_checkpoint(name)
     straight, errors = None, []
-    for degrees in (0, 11, 33, 45, 62, 78, 90):
+    for degrees in (0, 11, 33, 45, 62, 78):
         turn_rad = math.radians(degrees)
         world.place(obj, (0.0, 0.0), 0.3 + turn_rad)
         image = torch.from_numpy(np.array(world.depth_image()))[None]
@@ -197,8 +197,7 @@ def test_any_turn_of_a_real_object_turns_the_prediction_of_the_trained_model(nam
         effect = effect @ torch.tensor([[c, -s], [s, c]])
         straight = effect if straight is None else straight
         errors.append((effect - straight).norm(dim=-1))
-    assert errors.pop().max() < 1e-5  # a quarter turn
-    # Exact for multiples of 90°; otherwise pixels at the edges differ.
+    # Pixels at the edges of a rotated object differ.
     error = torch.cat(errors[1:])
     assert error.mean() < 0.00015
     assert error.quantile(0.95) < 0.00032
@@ -207,21 +206,25 @@ def test_any_turn_of_a_real_object_turns_the_prediction_of_the_trained_model(nam
 
 @pytest.mark.parametrize("name", ["film_500", "cnp_500"])
 def test_many_queries_at_once_equal_each_alone(name, some):
-    model, _ = load_checkpoint(name)
+    model = load_checkpoint(name)[0].double()
     pushes = [Push(float(theta)) for theta in np.linspace(-3, 3, 40)]
-    features, t_target = model.encode(some.image[:1]), torch.linspace(0, 1, 6).expand(40, -1)
+    features = model.encode(some.image[:1].double())
+    t_target = torch.linspace(0, 1, 6, dtype=torch.float64).expand(40, -1)
     observed = condition_on_primitives(model, pushes)
+    observed = dataclasses.replace(
+        observed, action=observed.action.double(), action_t=observed.action_t.double(),
+        effect=observed.effect.double(), effect_t=observed.effect_t.double(),
+    )  # fmt: skip
     with torch.no_grad():
         together = model.predict(features, observed, t_target)
         each = [
-            model.predict(features, condition_on_primitives(model, [p]), t_target[:1])
-            for p in pushes
+            model.predict(features, row_of(observed, k), t_target[:1]) for k in range(len(pushes))
         ]
     apart = model.predict(features.expand(40, -1), observed, t_target)  # with gradients
     for field in dataclasses.fields(together):
         one_by_one = torch.cat([getattr(predicted, field.name) for predicted in each])
         for other in (one_by_one, getattr(apart, field.name)):
-            assert torch.allclose(getattr(together, field.name), other, atol=1e-6, rtol=0)
+            torch.testing.assert_close(getattr(together, field.name), other, atol=1e-12, rtol=0)
 
 
 @pytest.mark.parametrize("name", IN_PUSH_FRAME)

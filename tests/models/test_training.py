@@ -2,7 +2,10 @@
 
 import dataclasses
 import math
+import os
 import pickle
+import signal
+import time
 
 import numpy as np
 import pytest
@@ -13,13 +16,17 @@ from affordlib.interactions.sampling import condition_on_recorded_action
 from affordlib.models import (
     FiLMConfig,
     TrainingConfig,
+    TrainingDomain,
     build,
+    fit_sigma_scale,
     load_checkpoint,
+    save_checkpoint,
     train,
     train_model,
 )
 from affordlib.models.lever_up import LastPoseConfig
 from affordlib.models.training import batch_loss, final_errors_m
+from affordlib.planning import EffectMap
 from affordlib.types import Observations
 from experiments.baselines import constant
 from experiments.literal import sample_literal, train_literal
@@ -141,6 +148,60 @@ def test_a_foreign_or_damaged_state_of_a_training_is_named(some, tmp_path):
             train(fresh(some), some, some, config, resume_checkpoint=file)
         assert "weights_only" not in str(caught.value)
         assert caught.value.__suppress_context__
+
+
+def test_training_continues_from_a_loaded_model_as_from_the_one_in_memory(some, tmp_path):
+    """The σ floor goes on from where it stopped, and never rises."""
+    model = fresh(some)
+    train(model, some, some, TrainingConfig(steps=4, validate_every=2, final_sigma_floor=0.005))
+    fit_sigma_scale(model, some)
+    again, _ = load_checkpoint(save_checkpoint(model, tmp_path / "m.safetensors", {}))
+    for key, value in model.state_dict().items():
+        assert torch.equal(again.state_dict()[key], value)
+    assert again.config == model.config == fresh(some).config
+    floor = float(model.sigma_floor)
+    for one in (model, again):
+        train(one, some, some, TrainingConfig(steps=3, validate_every=1))
+        assert float(one.sigma_floor) == floor
+    for a, b in zip(model.parameters(), again.parameters(), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_images_of_another_width_or_size_are_refused(some, cuboid_image):
+    config = FiLMConfig(some.action_channels, some.effect_channels)
+    model = build(config, Scaler.fit(some), TrainingDomain.fit(some))
+    wider = dataclasses.replace(some, image_width_m=0.2)
+    with pytest.raises(ValueError, match=r"validation has images 0\.2 m wide, .* 0\.16 m wide"):
+        train(model, some, wider)
+    with pytest.raises(ValueError, match=r"image has 24×24 pixels, trained on 48×48"):
+        model.encode(some.image[..., ::2, ::2])
+    model.domain = dataclasses.replace(model.domain, image_width_m=0.2)
+    with pytest.raises(ValueError, match=r"image has images 0\.16 m wide, but .* 0\.2 m wide"):
+        EffectMap(model, cuboid_image)
+
+
+def test_a_training_that_is_killed_gives_the_same_bits_and_leaves_nothing(some, tmp_path):
+    config = TrainingConfig(steps=12, batch_size=16, validate_every=1, ema=0.9)
+
+    def run(folder):
+        model = fresh(some)
+        train(model, some, some, config, resume_checkpoint=folder / "training.pt")
+        return save_checkpoint(model, folder / "m.safetensors", {})
+
+    for after_s in np.linspace(0.05, 3, 60):
+        if (child := os.fork()) == 0:
+            run(tmp_path / "killed")
+            os._exit(0)
+        time.sleep(after_s)
+        os.kill(child, signal.SIGKILL)
+        if os.waitpid(child, 0)[1] == 0:  # it had finished
+            break
+    assert sorted(p.name for p in (tmp_path / "killed").iterdir()) == [
+        "m.safetensors",
+        "training.pt",
+    ]
+    whole = run(tmp_path / "whole").read_bytes()
+    assert whole == (tmp_path / "killed" / "m.safetensors").read_bytes()
 
 
 @pytest.mark.slow
