@@ -1,5 +1,7 @@
 """Data sets: shipped files, refusal of damaged ones, splits, scaling and sampling."""
 
+import os
+import shutil
 import zipfile
 from dataclasses import replace
 
@@ -8,6 +10,7 @@ import pytest
 import torch
 from torch.nn.functional import pad
 
+from affordlib import paths
 from affordlib.interactions import (
     CorruptedDataError,
     InteractionTensors,
@@ -18,7 +21,9 @@ from affordlib.interactions import (
 from affordlib.interactions.recipes import RECIPES, SHIPPED, Recipe, interact
 from affordlib.interactions.sampling import condition_on_recorded_action, sample_mixed
 from affordlib.interactions.store import dataset_sha256, stored_sha256, write_interactions
+from affordlib.models.checkpoint import load_state
 from affordlib.paths import repo_root
+from affordlib.results import load_plan, read_results
 
 
 @pytest.fixture(scope="module", params=SHIPPED)
@@ -148,6 +153,13 @@ def test_a_missing_set_names_the_shipped_ones(tmp_path):
         open_interactions(tmp_path / "x.zarr.zip")
 
 
+def test_sets_of_other_phases_are_not_joined(pushes):
+    one = InteractionTensors.from_dataset(pushes, np.arange(2))
+    other = replace(one, phase=one.phase / 2)
+    with pytest.raises(ValueError, match="same phases"):
+        one.joined(other)
+
+
 def test_splits_and_folds():
     folds = [split_interactions(500, seed=3, fold=k) for k in range(10)]
     assert sorted(np.concatenate([f.test for f in folds])) == list(range(500))
@@ -202,3 +214,29 @@ def test_batches_hold_what_the_trajectories_hold(pushes):
     assert (seen.weight[~seen.action_mask.any(1)] == 0).all()
     ends = condition_on_recorded_action(arrays)
     assert ends.action_t.unique().tolist() == [0.0, 1.0]
+
+
+def test_a_file_that_would_fill_the_memory_or_never_end_is_refused(tmp_path):
+    bomb, pipe = tmp_path / "bomb.zarr.zip", tmp_path / "pipe.zarr.zip"
+    undamaged = repo_root() / "data" / "rotate.zarr.zip"
+    with zipfile.ZipFile(undamaged) as whole, zipfile.ZipFile(bomb, "w") as archive:
+        for name in whole.namelist():
+            archive.writestr(name, whole.read(name))
+        archive.writestr("extra", bytes(10**7), zipfile.ZIP_DEFLATED)  # in no manifest: not read
+    assert open_interactions(bomb).equals(open_interactions(undamaged))
+    with zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("manifest.json", bytes(10**7))
+    with pytest.raises(CorruptedDataError, match=r"manifest\.json .* larger than the file"):
+        open_interactions(bomb)
+    os.mkfifo(pipe)
+    for read in (open_interactions, stored_sha256, load_state, load_plan, read_results):
+        with pytest.raises(FileNotFoundError, match=r"no file .*pipe\.zarr\.zip"):
+            read(pipe)
+
+
+def test_a_set_under_the_name_of_another_is_refused(tmp_path, monkeypatch):
+    (tmp_path / "data").mkdir()
+    shutil.copy(repo_root() / "data" / "grasp.zarr.zip", tmp_path / "data" / "rotate.zarr.zip")
+    monkeypatch.setattr(paths, "repo_root", lambda: tmp_path)
+    with pytest.raises(CorruptedDataError, match="its recipe is not that of 'rotate'"):
+        open_interactions("rotate")
