@@ -122,11 +122,12 @@ def final_errors_m(model: EffectNetwork, tensors: InteractionTensors) -> Float[T
 
 @dataclass
 class Progress:
-    """What changes in a training, apart from model, optimiser and generator."""
+    """What changes in a training, apart from model and optimiser."""
 
     average: Weights  # exponential moving average of the parameters
     best: Weights  # state of the best validation
     first_floor: float  # σ floor at the start
+    random: Tensor  # state of the generator
     best_error: float = math.inf
     step: int = 0
     seconds: float = 0.0
@@ -137,15 +138,14 @@ class Progress:
 class Checkpointer:
     """Saves the state of a training to a file, if one is given, and resumes from it.
 
-    about: settings of the training, which must be equal to resume. parts: name → object with a
-    state_dict, or a generator.
+    about: settings of the training, which must be equal to resume; parts: model and optimiser.
     """
 
-    def __init__(self, path: str | Path | None, about: dict[str, Any], parts: dict[str, Any]):
+    def __init__(self, path: str | Path | None, about: dict[str, Any], **parts: Any) -> None:
         self.path, self.about, self.parts = path and Path(path), about, parts
 
-    def resume(self, progress: Progress, device: torch.device) -> None:
-        """Restore parts and progress, if the file exists; ValueError if it is of other settings."""
+    def resume(self, run: Progress, device: torch.device) -> None:
+        """Restore the state, if the file exists; ValueError if it is of other settings."""
         if not self.path or not self.path.exists():
             return
         state = load_state(self.path, device)
@@ -155,20 +155,14 @@ class Checkpointer:
                 "or use the settings of that training"
             )
         for name, part in self.parts.items():
-            if isinstance(part, torch.Generator):
-                part.set_state(state[name].cpu())
-            else:
-                part.load_state_dict(state[name])
-        vars(progress).update(state["progress"])
+            part.load_state_dict(state[name])
+        vars(run).update(state["run"])
 
-    def save(self, progress: Progress) -> None:
+    def save(self, run: Progress) -> None:
         """Write the state atomically."""
         if self.path:
-            state = {
-                name: part.get_state() if isinstance(part, torch.Generator) else part.state_dict()
-                for name, part in self.parts.items()
-            }
-            save_state(self.path, state | {"about": self.about, "progress": vars(progress)})
+            parts = {name: part.state_dict() for name, part in self.parts.items()}
+            save_state(self.path, {"about": self.about, "run": vars(run)} | parts)
 
 
 def train(
@@ -197,22 +191,20 @@ def train(
     optimiser = torch.optim.AdamW(
         model.parameters(), config.learning_rate, weight_decay=config.weight_decay, fused=True
     )
-    run = Progress(_weights(model), _state(model), float(model.sigma_floor))
-    parts = {"model": model, "optimiser": optimiser, "generator": generator}
+    floor = float(model.sigma_floor)
+    run = Progress(_weights(model), _state(model), floor, generator.get_state())
     about = _about(model, (training, validation), config, (sampler, score))
-    file = Checkpointer(resume_checkpoint, about, parts)
+    file = Checkpointer(resume_checkpoint, about, model=model, optimiser=optimiser)
     file.resume(run, device)
+    generator.set_state(run.random.cpu())
     start = time.perf_counter() - run.seconds
     bar = tqdm(total=config.steps, initial=run.step, desc="training", unit=" steps", disable=None)
     while run.step < config.steps and run.fruitless < config.patience:
         run.step += 1
         model.sigma_floor.fill_(config.sigma_floor(run.step, run.first_floor))
         optimiser.param_groups[0]["lr"] = config.rate(run.step)
-        rows = torch.randint(0, len(training), (config.batch_size,), generator=generator)
-        tensors = training.select(rows)
-        tensors = _augmented(tensors) if config.augment else tensors
-        batch = sampler(tensors, config.n_targets, config.obs_max, generator)
-        loss = batch_loss(model, _to(batch, device), config.beta)
+        batch = _to(_sampled(training, config, sampler, generator), device)
+        loss = batch_loss(model, batch, config.beta)
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
@@ -231,6 +223,7 @@ def train(
         run.fruitless += 1
         if error < run.best_error:
             run.best_error, run.best, run.fruitless = error, candidate, 0
+        run.random = generator.get_state()
         file.save(run)
         if run.seconds > 60 * config.max_minutes:
             break
@@ -260,6 +253,24 @@ def _about(
     return about | asdict(replace(config, max_minutes=math.inf, device="cpu"))
 
 
+def _sampled(
+    training: InteractionTensors,
+    config: TrainingConfig,
+    sampler: Sampler,
+    generator: torch.Generator,
+) -> Batch:
+    """A batch of random interactions, rotated and mirrored if the configuration says so."""
+    rows = torch.randint(0, len(training), (config.batch_size,), generator=generator)
+    tensors = training.select(rows)
+    if config.augment:  # an eighth of them in each way
+        ways = enumerate(rows.tensor_split(8))
+        parts = [
+            training.select(few).rotated_and_mirrored(k // 2, mirror=k % 2 == 1) for k, few in ways
+        ]
+        tensors = parts[0].joined(*parts[1:])
+    return sampler(tensors, config.n_targets, config.obs_max, generator)
+
+
 def _state(model: EffectNetwork) -> Weights:
     return {name: value.clone() for name, value in model.state_dict().items()}
 
@@ -287,15 +298,6 @@ def _to(batch: Any, device: torch.device) -> Any:
     for name, value in vars(batch).items():
         moved[name] = value.to(device) if torch.is_tensor(value) else _to(value, device)
     return replace(batch, **moved)
-
-
-def _augmented(tensors: InteractionTensors) -> InteractionTensors:
-    """Rotate and mirror the interactions in eight ways, an eighth of them each."""
-    parts = [
-        tensors.select(rows).rotated_and_mirrored(k // 2, mirror=k % 2 == 1)
-        for k, rows in enumerate(torch.arange(len(tensors)).tensor_split(8))
-    ]
-    return parts[0].joined(*parts[1:])
 
 
 def batch_loss(model: EffectNetwork, batch: Batch, beta: float = 0.0) -> Float[Tensor, ""]:
