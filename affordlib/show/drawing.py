@@ -25,25 +25,19 @@ _HERE = Path(__file__).parent
 
 
 class Drawing(anywidget.AnyWidget):
-    """Shows a picture and, over it, an SVG drawing whose handles can be dragged.
+    """Shows a picture with handles that can be dragged.
 
-    picture: a data URL, or empty. scene: {"inside": contents of the SVG; "box": its viewBox;
+    picture: a data URL, or empty. scene: {"inside": contents of an SVG over it; "box": its viewBox;
     "handles": for each the name of the element (`data-handle`) that it moves, x and y (None: any),
-    its range left, right, top, bottom and step, and whether it can be grabbed anywhere; "answered":
-    number of the last request that this scene includes; "running": whether playback continues;
-    "draft", "planning": whether a better plan follows, is being made}. playback: {"poses": [[x, y,
-    degrees], …], "seconds"} of the element .object, played when set. wanted: [name, x, y, number],
-    the requested position of a handle; the number grows. keyboard: whether arrow keys move the
-    first handle, and Enter and Escape send {"press": "run"} and "stop".
+    its range left, right, top, bottom and step; "answered": number of the last request that this
+    scene includes}. wanted: [name, x, y, number], the requested position of a handle.
     """
 
     _esm = _HERE / "drawing.js"
     _css = _HERE / "drawing.css"
     label = traitlets.Unicode().tag(sync=True)
-    keyboard = traitlets.Bool(False).tag(sync=True)
     picture = traitlets.Unicode().tag(sync=True)
     scene = traitlets.Dict().tag(sync=True)
-    playback = traitlets.Dict().tag(sync=True)
     wanted = traitlets.List(["", 0.0, 0.0, 0]).tag(sync=True)
 
 
@@ -53,18 +47,23 @@ def words_as_html(text: str, css: str = "") -> str:
     return f"<div role='status' aria-live='polite'><div class='{css}'>{text}</div></div>"
 
 
-class WithPicture:
+class FigurePicture:
     """Mixin, before a class of ipywidgets: without a kernel, a notebook shows its saved picture."""
 
-    def picture(self) -> bytes | str:
-        """The shown picture, as PNG at twice the resolution (bytes) or SVG (text); may be empty."""
+    def figure(self) -> Figure | None:
+        """The figure that is shown without a kernel."""
         raise NotImplementedError
+
+    def picture(self) -> bytes:
+        """The shown picture, as a PNG at twice the resolution; empty if there is none."""
+        buffer, figure = io.BytesIO(), self.figure()
+        if figure is not None:
+            figure.savefig(buffer, dpi=2 * DPI)
+        return buffer.getvalue()
 
     def _repr_mimebundle_(self, **kwargs: object) -> tuple[dict[str, object], dict[str, object]]:
         bundle = super()._repr_mimebundle_(**kwargs) | {"text/plain": type(self).__name__}
         picture = self.picture()
-        if isinstance(picture, str):
-            return bundle | {"image/svg+xml": picture}, {}
         if not picture:
             return bundle, {}
         width, height = (n // 2 for n in Image.open(io.BytesIO(picture)).size)
@@ -72,7 +71,7 @@ class WithPicture:
         return bundle | {"image/png": base64.b64encode(picture).decode()}, about
 
 
-class FigureWidget(WithPicture, widgets.VBox):
+class FigureWidget(FigurePicture, widgets.VBox):
     """Controls above a figure and a line of text below, which also shows errors.
 
     A subclass draws in `draw(figure)`, which returns the text, and calls `add_handle` for
@@ -143,12 +142,9 @@ class FigureWidget(WithPicture, widgets.VBox):
                 self._drawing.picture = f"data:image/png;base64,{url}"
         self._words.value = words_as_html(words)
 
-    def picture(self) -> bytes:
-        """The shown picture, as a PNG at twice the resolution."""
-        buffer = io.BytesIO()
-        if self._figure:
-            self._figure.savefig(buffer, dpi=2 * DPI)
-        return buffer.getvalue()
+    def figure(self) -> Figure | None:
+        """The figure that is shown."""
+        return self._figure
 
     def _scene(self, width: int, height: int) -> dict[str, Any]:
         """The handles in pixels from the upper left corner, with 100 steps over the phase."""

@@ -7,6 +7,7 @@ It is a view on plain objects: everything it does can be done with a planner, `e
 import itertools
 import math
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -16,57 +17,39 @@ from typing import Any
 
 import ipywidgets as widgets
 import numpy as np
+from matplotlib.figure import Figure
 
 from affordlib.geometry import unit_vector, wrap_angle
 from affordlib.paths import resolve_out_dir
 from affordlib.planning import Planner, Skills
+from affordlib.planning.effect_map import EffectMap
 from affordlib.results import load_plan, save_plan
-from affordlib.show.drawing import Drawing, WithPicture
+from affordlib.show.drawing import FigurePicture
 from affordlib.show.executors import Executor, Stopped, closed_loop, measured, open_loop
-from affordlib.show.table_view import (
-    HALF_WIDTH_M,
-    LIMIT_M,
-    PickerControls,
-    draw_goal,
-    draw_ground,
-    draw_object,
-    draw_path,
-    draw_plan,
-    outcome_in_words,
-    plan_in_words,
-    to_mm,
-)
+from affordlib.show.picker_controls import LIMIT_M, PickerControls, outcome_in_words, plan_in_words
+from affordlib.show.plots import plot_footprint, plot_plan, plot_table
+from affordlib.show.table_data import TableView, object_data, plan_data, table_data
 from affordlib.types import Goal, Outcome, Plan, check_count, check_on_table
 from affordlib.world import Tabletop
 
-REST_S = 0.05
-"""Time [s] without motion of the goal after which a drag counts as finished."""
-
-POSE_EVERY = 12
-"""Simulation steps (1/240 s) between two poses of the animated motion."""
-
-_MOVED = 1e-4
-_LABEL = (
-    "Table from above. The goal is at x = {:.1f}, y = {:.1f} cm, the object at x = {:.1f}, y = "
-    "{:.1f} cm. Arrow keys move the goal by 1 cm, with Shift by 1 mm; Enter runs the plan, Escape "
-    "stops it."
-)
+POSE_EVERY, SENT_TOGETHER = 12, 5
+"""Simulation steps (1/240 s) between two poses of the shown motion, and poses in a message."""
 
 
-class GoalPicker(WithPicture, widgets.HBox):
+class GoalPicker(FigurePicture, widgets.HBox):
     """The table from above, where a goal is picked by mouse, keyboard or sliders.
 
     skills: what the robot can do. planners: name → function of a `PlanningProblem` that returns a
-    plan. draft: a fast planner whose plan is shown while the goal is dragged; the chosen planner's
-    plan replaces it afterwards. seed: of the disturbances. folder: where plans are saved.
+    plan. While a hand drags the goal, the browser plans over the effect map; when it lets go, the
+    chosen planner does. seed: of the disturbances. folder: where plans are saved.
 
     `executors`: name → function (world, plan, planner, report) → Outcome that executes a plan, or
     replans with the planner that made it; see `executors.Report`. `goal`, `plan` and `outcome` are
-    those shown. Methods do what mouse and buttons do, and return
-    when done; mouse and buttons queue it in the background, *Run* with `seconds_per_action`.
+    those shown. Methods do what mouse and buttons do, and return when done; mouse and buttons queue
+    it in the background, and *Run* then shows each pose for `pace_s`.
     """
 
-    seconds_per_action = 1.2
+    pace_s = 0.02
 
     def __init__(
         self,
@@ -74,12 +57,10 @@ class GoalPicker(WithPicture, widgets.HBox):
         skills: Skills,
         planners: dict[str, Planner],
         goal_xy_m: tuple[float, float] = (0.12, 0.10),
-        draft: Planner | None = None,
         seed: int = 0,
         folder: str = "runs/lab",
     ) -> None:
-        self.world, self.skills, self.planners = world, skills, planners
-        self.draft, self.folder = draft, folder
+        self.world, self.skills, self.planners, self.folder = world, skills, planners, folder
         self.executors: dict[str, Executor] = {
             "open loop": open_loop,
             "closed loop": closed_loop(skills),
@@ -94,18 +75,20 @@ class GoalPicker(WithPicture, widgets.HBox):
         self._answered = 0  # the number of the last goal from the page with a plan
         self._alone = threading.RLock()  # held while planning or moving something in the world
         self._queue = ThreadPoolExecutor(1)
-        self._goal_moved, self._stop = threading.Event(), threading.Event()
+        self._stop = threading.Event()
         self._disturbances: list[Callable[[], None]] = []  # pending until the action ends
-        self._poses: list[tuple[float, ...]] = []  # of the object since the last action
-        self._paths: list[np.ndarray] = []  # of the object since the plan was made
+        self._motions: list[list[float]] = []  # of object and hand, not yet sent
+        self._trail: list[tuple[float, float]] = []  # of the object since the plan was made
+        self._marks: list[list[Any]] = []  # moves of object and goal that were not planned
+        self._effects: object = None  # those that the page has
+        self._shown_until = 0.0
         self._news = ""  # of disturbances, until the next action or plan
-        self._view = Drawing(keyboard=True)
-        self._view.add_class("affordlib-table")
+        self._view = TableView(table=table_data(skills))
         goal = Goal(_whole_mm(check_on_table("goal_xy_m", goal_xy_m)))
         self.controls = PickerControls(goal, list(planners), list(self.executors), self._follow)
         self._listen()
         below = [self._view, self.controls.progress, self.controls.words]
-        table = widgets.VBox(below, layout={"flex": "1 1 300px", "max_width": "480px"})
+        table = widgets.VBox(below, layout={"flex": "1 1 320px", "max_width": "640px"})
         layout = {"flex_flow": "row wrap", "grid_gap": "12px"}
         super().__init__([table, self.controls], layout=layout)
         self.add_class("affordlib-picker")
@@ -132,7 +115,7 @@ class GoalPicker(WithPicture, widgets.HBox):
         """Execute the plan and show the outcome; the next plan starts from there."""
         self._refuse_while_running()
         self._set_running(True)
-        self._run(seconds_per_action=0.0)
+        self._run(pace_s=0.0)
 
     def stop(self) -> None:
         """Stop after the current action."""
@@ -177,15 +160,17 @@ class GoalPicker(WithPicture, widgets.HBox):
             self._stale = False
             self._show()
 
-    def picture(self) -> str:
-        """The shown drawing, as an SVG."""
-        scene = self._view.scene
-        return (
-            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="{scene["box"]}" width="480" '
-            'role="img" aria-label="The table from above, with goal and plan" '
-            f'style="background: white; font-family: sans-serif"><style>{Drawing._css}</style>'
-            f'<g class="affordlib-table">{scene["inside"]}</g></svg>'
+    def figure(self) -> Figure:
+        """The table, object, goal and plan as a figure."""
+        figure = Figure(figsize=(5.2, 5.2), layout="constrained")
+        plan = self.plan or Plan(self.goal, self._pose[:2], (), "none", False, 0.0)
+        points = np.array(
+            [self.goal.xy_m, *(s.predicted_end_xy_m for s in plan.steps), self._pose[:2]]
         )
+        low, high = points.min(axis=0), points.max(axis=0)
+        ax = plot_table(figure.subplots(), (low + high) / 2, 0.1 + float((high - low).max()) / 2)
+        plot_footprint(ax, self.world.obj, self._pose[:2], self._pose[2])
+        return plot_plan(ax, plan, obj=self.world.obj, yaw_rad=self._plan_pose[2]).figure
 
     # Requests from the page
 
@@ -193,8 +178,7 @@ class GoalPicker(WithPicture, widgets.HBox):
         controls = self.controls
 
         def place(change):
-            _, x, y, _ = change["new"]
-            self._follow(replace(self.goal, xy_m=_whole_mm((x / 1000, -y / 1000))))
+            self._follow(replace(self.goal, xy_m=_whole_mm(change["new"][:2])))
 
         self._view.observe(place, names="wanted")
         presses = {"run": self._run_in_background, "stop": self.stop}
@@ -229,7 +213,7 @@ class GoalPicker(WithPicture, widgets.HBox):
         """Execute the plan of the shown goal when it is ready; a second press is ignored."""
         if not self._running:
             self._set_running(True)
-            self._queue.submit(self._attempt, partial(self._run, self.seconds_per_action))
+            self._queue.submit(self._attempt, partial(self._run, self.pace_s))
             self._queue.submit(self._attempt, self._plan_after_run)
 
     def _plan_after_run(self) -> None:
@@ -239,19 +223,13 @@ class GoalPicker(WithPicture, widgets.HBox):
             self._update_plan()
 
     def _follow(self, goal: Goal) -> None:
-        """Set the goal; soon show a draft for it, and the full plan when the drag is finished."""
+        """Set the goal, and soon show a plan for it, unless another one follows."""
         goal = replace(goal)  # a new object, which identifies this request
         self._set_goal(goal)
 
         def plan():
-            self._goal_moved.clear()
-            if goal is not self.goal or self._running:
-                return
-            if self.draft is not None:
-                self._make_plan(draft=True)
-                if self._goal_moved.wait(REST_S):
-                    return
-            self._update_plan()
+            if goal is self.goal:
+                self._update_plan()
 
         if not self._running:
             self._soon(plan)
@@ -262,35 +240,38 @@ class GoalPicker(WithPicture, widgets.HBox):
         """Show a goal that has no plan yet."""
         self.controls.show(goal)
         self._stale = True
-        self._goal_moved.set()
         if self._running:  # the executor gets it after this action
-            self._answered = self._view.wanted[3]
-        if self._running or self.draft is None:
-            self._show(planning=not self._running)
+            self._answered = self._view.wanted[2]
+        self._show(planning=not self._running)
 
     def _update_plan(self) -> None:
         """Plan for the shown goal, if it has no plan yet and the robot is idle."""
         if self._stale and not self._running:
             self._make_plan()
 
-    def _make_plan(self, draft: bool = False) -> None:
+    def _make_plan(self) -> None:
         with self._alone:
             self.controls.say(f"{self._news} Planning with {self.controls.planner.value} …")
-            if not draft:
-                self._show(planning=True)
-            planner = self.draft if draft else self._planner()
-            goal, number, plan = self.goal, self._view.wanted[3], None
+            self._show(planning=True)
+            goal, number, plan = self.goal, self._view.wanted[2], None
             self._put_down()
             try:
-                plan = planner(self.skills.problem(self.world.depth_image(), self._pose[:2], goal))
-                if not draft:  # whose words belong to another planner
-                    self.controls.say(f"{self._news} {plan_in_words(plan)}")
-                    self._news = ""
+                problem = self.skills.problem(self.world.depth_image(), self._pose[:2], goal)
+                plan = self._planner()(problem)
+                self.controls.say(f"{self._news} {plan_in_words(plan)}")
+                self._news = ""
+                self._show_object(problem.effects)
             finally:
                 self._begin(plan)
                 self._answered = number
-                self._stale = draft or goal is not self.goal
-                self._show(draft, planning=goal is not self.goal)
+                self._stale = goal is not self.goal
+                self._show(planning=self._stale)
+
+    def _show_object(self, effects: EffectMap) -> None:
+        """Give the page the object's effect map, with which it plans."""
+        if effects is not self._effects:
+            self._view.object = object_data(self.world.obj, effects, self._pose[2])
+            self._effects = effects
 
     def _put_down(self) -> None:
         """Prepare the table for a new plan."""
@@ -303,8 +284,8 @@ class GoalPicker(WithPicture, widgets.HBox):
     def _begin(self, plan: Plan | None) -> None:
         """Show a plan that starts at the object's current pose."""
         self.plan, self.outcome = plan, None
-        self._poses.clear()
-        self._paths.clear()
+        self._trail.clear()
+        self._marks.clear()
         self._plan_pose, self._turn_from = self._pose, self._pose[2]
 
     def _planner(self) -> Planner:
@@ -321,7 +302,7 @@ class GoalPicker(WithPicture, widgets.HBox):
         self._stop.clear()
         self.controls.set_running(running)
 
-    def _run(self, seconds_per_action: float) -> None:
+    def _run(self, pace_s: float) -> None:
         """Execute the plan, after making a new one if the shown one is outdated."""
         done, left = 0, []
 
@@ -332,16 +313,21 @@ class GoalPicker(WithPicture, widgets.HBox):
                 self._replace_plan(plan, done)
                 return self.goal
             done += 1
-            name, of = left.pop(0).primitive.name if left else "action", done + len(left)
-            self.controls.show_progress(done, of)
-            self.controls.say(f"{name.replace('_', ' ').capitalize()} {done} of {of}.{self._news}")
-            self._news = ""
-            self._play(seconds_per_action)
+            left[:] = left[1:]
+            self.controls.show_progress(done, done + len(left))
+            self._wait_until_shown()
             while self._disturbances and not self._stop.is_set():
                 self._disturbances.pop(0)()
             if self._stop.is_set():
                 raise Stopped
+            begin()
             return self.goal
+
+        def begin():
+            if left:
+                name, of = left[0].primitive.name.replace("_", " "), done + len(left)
+                self.controls.say(f"{name.capitalize()} {done + 1} of {of} …{self._news}")
+                self._news = ""
 
         with self._alone:
             on_step = self.world.on_step
@@ -349,8 +335,9 @@ class GoalPicker(WithPicture, widgets.HBox):
                 if self._stale or self.plan is None or self.outcome is not None:
                     self._make_plan()
                 left[:], self._news = self.plan.steps, ""
+                begin()
                 yaw, z = self.world.object_pose()[2], self.world.object_state()[2]
-                self.world.on_step = self._pose_log(on_step)
+                self.world.on_step = self._motion_log(on_step, z, pace_s)
                 try:
                     if self._stop.is_set():
                         raise Stopped
@@ -373,7 +360,8 @@ class GoalPicker(WithPicture, widgets.HBox):
             finally:
                 self.world.on_step = on_step
                 self._disturbances.clear()
-                self._play(0.0)
+                self._send_motions()
+                self._wait_until_shown()
                 self._pose = self.world.object_pose()
                 self._set_running(False)
                 self._show()
@@ -387,30 +375,41 @@ class GoalPicker(WithPicture, widgets.HBox):
         self._news += " New plan." * (done > 0)
         self._show()
 
-    def _pose_log(self, also: Callable[[Tabletop], None] | None) -> Callable[[Tabletop], None]:
-        """Make a callback for the world's steps that logs the object's poses and calls another."""
-        steps = itertools.count()
+    def _motion_log(
+        self, also: Callable[[Tabletop], None] | None, z_m: float, pace_s: float
+    ) -> Callable[[Tabletop], None]:
+        """Make a callback for the world's steps that sends motions, and calls another.
+
+        z_m: the object's height on the table; pace_s: time for which each pose is shown.
+        """
+        steps, self._shown_until, self._pace_s = itertools.count(), time.monotonic(), pace_s
 
         def log(world):
             if also is not None:
                 also(world)
-            if next(steps) % POSE_EVERY == 0:
-                self._poses.append(world.object_pose())
+            number = next(steps)
+            if number % POSE_EVERY == 0:
+                pose, lift = world.object_pose(), world.object_state()[2] - z_m
+                motion = [*pose, lift, *world.arm.tool_pose()]
+                self._motions.append(np.round(motion, 4).tolist())
+                self._trail.append(pose[:2])
+            if number == 0 or len(self._motions) == SENT_TOGETHER:
+                self._send_motions(first=number == 0)
 
         return log
 
-    def _play(self, seconds: float) -> None:
-        """Animate the poses logged since the last call, from the first motion to the last."""
-        poses = np.array(self._poses).reshape(-1, 3)
-        self._poses.clear()
-        moves = np.flatnonzero(np.abs(np.diff(poses, axis=0)).max(axis=1, initial=0.0) > _MOVED)
-        if len(moves):
-            poses = poses[moves[0] : moves[-1] + 2]
-            drawn = (poses * (1000, -1000, -180 / np.pi)).round(2)
-            self._view.playback = {"poses": drawn.tolist(), "seconds": seconds}
-            self._stop.wait(seconds)
-            self._paths.append(poses[:, :2])
-            self._pose = tuple(poses[-1])
+    def _send_motions(self, first: bool = False) -> None:
+        """Send the motions logged since the last call, to be shown as they come."""
+        if self._motions:
+            self._view.send({"motions": self._motions, "first": first})
+            self._shown_until = max(self._shown_until, time.monotonic())
+            self._shown_until += self._pace_s * len(self._motions)
+            self._motions = []
+
+    def _wait_until_shown(self) -> None:
+        self._send_motions()
+        if not self._stop.wait(max(0.0, self._shown_until - time.monotonic())):
+            self._pose = self.world.object_pose()
 
     # Disturbances
 
@@ -424,15 +423,18 @@ class GoalPicker(WithPicture, widgets.HBox):
 
     def _shove(self) -> None:
         dx, dy = self._displacement(self.world.object_pose()[:2], 0.02, 0.04)
+        before = self.world.object_pose()[:2]
         self.world.shove(dx, dy, float(self._rng.uniform(-0.5, 0.5)))
         self._pose = self.world.object_pose()
-        self._poses.clear()
+        self._marks.append([before, self._pose[:2]])
         self._show()
         self._news += f" The object was shoved by {1000 * np.hypot(dx, dy):.0f} mm."
 
     def _move_goal(self) -> None:
         by = self._displacement(self.goal.xy_m, 0.04, 0.08)
-        self._set_goal(replace(self.goal, xy_m=_whole_mm(self.goal.xy_m + by)))
+        before = self.goal.xy_m
+        self._set_goal(replace(self.goal, xy_m=_whole_mm(before + by)))
+        self._marks.append([before, self.goal.xy_m])
         self._news += f" The goal was moved by {1000 * np.hypot(*by):.0f} mm."
 
     def _displacement(self, xy_m: tuple[float, float], least_m: float, most_m: float) -> np.ndarray:
@@ -443,31 +445,20 @@ class GoalPicker(WithPicture, widgets.HBox):
 
     # Drawing
 
-    def _show(self, draft: bool = False, planning: bool = False) -> None:
-        obj, edge = self.world.obj, 1000 * HALF_WIDTH_M
-        x, y = to_mm(self.goal.xy_m)
-        limits = {"left": -1000 * LIMIT_M, "right": 1000 * LIMIT_M}
-        limits |= {"top": limits["left"], "bottom": limits["right"], "step": 1}
-        steps = self.plan.steps if self.plan else ()
-        plan, labels = draw_plan(obj, steps, self._plan_pose, self.goal)
-        drawing = [
-            draw_ground(),
-            draw_object(obj, self._pose),
-            plan,
-            *(draw_path(path, "truth") for path in self._paths),
-            f'<polyline class="trail"/><g data-handle="goal" transform="translate({x} {y})">',
-            draw_goal(obj, self.goal, self._turn_from),
-            f'</g>{labels}<text class="busy" y="{40 - edge}">{"planning …" * planning}</text>',
-        ]
-        self._view.label = _LABEL.format(*np.multiply(100, (*self.goal.xy_m, *self._pose[:2])))
+    def _show(self, planning: bool = False) -> None:
+        goal = {"xy": self.goal.xy_m, "tolerance": self.goal.tolerance_m, "yaw": None}
+        if self.goal.turn_rad is not None:
+            goal["yaw"] = self._turn_from + self.goal.turn_rad
         self._view.scene = {
-            "inside": "".join(drawing),
-            "box": f"{-edge} {-edge} {2 * edge} {2 * edge}",
-            "handles": [{"name": "goal", "x": x, "y": y, "anywhere": True} | limits],
+            "pose": self._pose,
+            "goal": goal,
+            "steps": plan_data(self.plan, self._plan_pose[2]) if self.plan else [],
+            "trail": list(self._trail),
+            "marks": list(self._marks),
             "answered": self._answered,
             "running": self._running,
-            "draft": draft,
             "planning": planning,
+            "pace": self.pace_s,
         }
 
     def _file(self, name: str) -> Path:

@@ -430,6 +430,7 @@ const AROUND = [[1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, 1], [1, -1], [-1,
 const APPROACH = 0.45; // seconds that the hand takes to come down, and to leave
 const LETTER = 7.5; // width of a letter of a label [px]
 
+const moves = ({ direction }) => direction !== null;
 const still = () => window.matchMedia("(prefers-reduced-motion: reduce)").matches;
 const escaped = (text) =>
   String(text).replace(/[&<>"']/g, (letter) => `&#${letter.charCodeAt(0)};`);
@@ -456,8 +457,9 @@ function shape(tag, css, attributes, inside = "") {
   return `<${tag} class="${css}"${said.join("")}>${inside}</${tag}>`;
 }
 
-// state: {object, pose, goal {xy, turn, tolerance}, steps, obstacles, ring, trail, sigma, swept, other
-// (steps drawn thin), note (text in a corner), movable (object and obstacles can be moved)}.
+// state: {object, pose, goal {xy, yaw, tolerance}, steps, obstacles, ring, trail, marks (what moved by
+// itself: [from, to]), sigma, swept, note (text in a corner), movable (object and obstacles can be
+// moved), live (pose, hand and lift that are shown instead)}.
 // heard: {goal(xy, final), pose(pose, final), obstacle(k, xy), press(key)}.
 export class Table {
   constructor(el, heard) {
@@ -494,7 +496,7 @@ export class Table {
     if (!object) return;
     const radius = Math.max(...object.outline.map((corner) => Math.hypot(...corner)));
     const seen = [pose, goal.xy, ...trail, ...steps.flatMap(({ from, end, direction }) => {
-      const [dx, dy] = rotated([-0.07, 0], direction);
+      const [dx, dy] = rotated([-0.07, 0], direction ?? 0);
       return [end, [from[0] + dx, from[1] + dy]];
     })];
     const [xs, ys] = [0, 1].map((axis) => seen.map((point) => point[axis]));
@@ -509,7 +511,7 @@ export class Table {
     }
     const [width, height] = this.size();
     const tall = Math.max(box[3] - box[2], ((box[1] - box[0]) * height) / width) / 2;
-    const half = between(0.11, tall, EXTENT);
+    const half = between(0.13, tall, EXTENT);
     const wanted = [(box[0] + box[1]) / 2, (box[2] + box[3]) / 2].map((v) => between(half - EXTENT, v, EXTENT - half));
     this.glide([...wanted, half]);
   }
@@ -587,8 +589,9 @@ export class Table {
     return corners.map((corner) => this.at(corner).map((v) => v.toFixed(1)).join()).join(" ");
   }
 
-  outline(pose, css, more = {}) {
-    return shape("polygon", css, { points: this.points(placed(this.state.object.outline, pose)), ...more });
+  outline(pose, css, more = {}, size = 1) {
+    const corners = this.state.object.outline.map((corner) => corner.map((value) => size * value));
+    return shape("polygon", css, { points: this.points(placed(corners, pose)), ...more });
   }
 
   disc([x, y], css, radius, more = {}) {
@@ -603,9 +606,9 @@ export class Table {
   draw() {
     const { state, scale } = { state: this.state, scale: this.camera ? this.scale : 1 };
     if (!state.object || !this.camera) return;
-    const { pose, goal, steps, obstacles, trail, other = [], sigma, swept, movable, object } = state;
+    const { pose, goal, steps, obstacles, trail, marks = [], sigma, swept, movable, object } = state;
     const [width, height] = this.size();
-    const now = this.clock === null ? null : this.moment(this.clock);
+    const now = state.live ?? (this.clock === null ? null : this.moment(this.clock));
     const end = steps.at(-1)?.end ?? pose;
     const shapes = [this.ground()];
     (obstacles.polygons ?? []).forEach(([corners], k) =>
@@ -619,10 +622,9 @@ export class Table {
       }));
       shapes.push(shape("path", "swept", { d: all.join("") }));
     }
-    for (const step of other) shapes.push(this.line(step.path, "other"));
-    if (other.length) shapes.push(this.outline(other.at(-1).end, "other"));
+    for (const mark of marks) shapes.push(this.line(mark, "mark"));
     steps.forEach((step, k) => {
-      if (sigma) shapes.push(this.disc(step.end, "sigma", ENLARGED * step.std));
+      if (sigma && step.std) shapes.push(this.disc(step.end, "sigma", ENLARGED * step.std));
       shapes.push(this.line(step.path, "prediction"));
       shapes.push(this.outline(step.end, k === steps.length - 1 ? "predicted" : "ghost"));
     });
@@ -630,13 +632,13 @@ export class Table {
     const short = Math.hypot(end[0] - goal.xy[0], end[1] - goal.xy[1]);
     const missed = short > goal.tolerance && !this.state.planning;
     if (missed) shapes.push(this.line([end, goal.xy], "short"));
-    shapes.push(this.goal(end, missed));
     const standing = now?.pose ?? pose;
-    shapes.push(this.outline(standing, "object", { "data-handle": movable ? "object" : "none" }));
-    shapes.push(this.line([standing, this.ahead(standing, 0.5)], "heading"));
+    const lifted = now?.lift > 0.003 ? now.lift : 0;
+    shapes.push(this.outline(standing, lifted ? "object lifted" : "object", { "data-handle": movable ? "object" : "none" }, 1 + 3 * lifted));
+    shapes.push(this.line([standing, this.ahead(standing, 0.5)], "heading"), this.goal(end, missed));
     if (movable && !now) shapes.push(this.knob(pose));
     if (now) shapes.push(this.hand(now.hand));
-    else if (steps.length && !this.held) shapes.push(...steps.map((step) => this.arrow(step)));
+    else if (steps.length && !this.held) shapes.push(...steps.filter(moves).map((step) => this.arrow(step)));
     shapes.push(shape("g", "labels", {}, this.labels(missed ? short : 0)));
     shapes.push(this.ruler(width, height, scale));
     this.svg.innerHTML = shapes.join("");
@@ -672,14 +674,14 @@ export class Table {
   }
 
   goal(end, missed) {
-    const { goal, pose } = this.state;
+    const { goal } = this.state;
     const [u, v] = this.at(goal.xy);
-    const yaw = goal.turn == null ? end[2] : pose[2] + goal.turn;
+    const yaw = goal.yaw ?? end[2];
     const size = between(9, 0.012 * this.scale, 15);
     const star = STAR.map(([x, y]) => `${(u + size * x).toFixed(1)},${(v - size * y).toFixed(1)}`);
     return shape("g", "wanted", { "data-handle": "goal" }, [
       shape("circle", "grip", { cx: u, cy: v, r: 28 }),
-      this.outline([...goal.xy, yaw], goal.turn == null ? "place" : "place turned"),
+      this.outline([...goal.xy, yaw], goal.yaw == null ? "place" : "place turned"),
       this.disc(goal.xy, "tolerance", goal.tolerance),
       shape("polygon", missed ? "goal missed" : "goal", { points: star.join(" ") }),
     ].join(""));
@@ -728,12 +730,13 @@ export class Table {
     taken.push([...this.at(goal.xy), Math.max(18, goal.tolerance * this.scale)], [...this.at(pose), 14]);
     for (const { path, end, from, direction } of steps) {
       for (const at of [...path, ...placed(object.outline, end)]) taken.push([...this.at(at), 5]);
-      for (const back of [-0.05, -0.07, -0.09]) {
+      for (const back of direction === null ? [] : [-0.05, -0.07, -0.09]) {
         const [dx, dy] = rotated([back, 0], direction);
         taken.push([...this.at([from[0] + dx, from[1] + dy]), 8]);
       }
     }
-    const texts = steps.map(({ stop, end }, k) => [`${k + 1}: ${Math.round(100 * stop)} %`, end, "step"]);
+    const texts = steps.map(({ stop, end, name }, k) =>
+      [`${k + 1}: ${name ? `${name} to ` : ""}${Math.round(100 * stop)} %`, end, "step"]);
     const last = steps.at(-1);
     if (short) texts.push([`${(100 * short).toFixed(short < 0.01 ? 1 : 0)} cm short`, goal.xy, "step short-by"]);
     if (sigma && last?.std) {
@@ -839,3 +842,107 @@ export class Table {
     cancelAnimationFrame(this.gliding);
   }
 }
+
+// A view of Python's widget: while a hand drags, the browser plans; when it lets go, Python does.
+function render({ model, el }) {
+  let [number, chain, thing, reachable, recorded, began, timer] = [0, [], null, null, [], 0, null];
+  const scrub = document.createElement("input");
+  Object.assign(scrub, { type: "range", min: 0, max: 1, step: "any", hidden: true });
+  scrub.setAttribute("aria-label", "Time of the last run");
+
+  function draft(xy) {
+    const { pose, goal, running } = model.get("scene");
+    if (running || !thing?.map) return view.state.steps;
+    const { table } = model.get("table");
+    const planned = plan({ object: thing, pose, goal: xy, tolerance: goal.tolerance, reachable, table, previous: chain });
+    chain = planned.chain;
+    return planned.steps;
+  }
+
+  const view = new Table(el, {
+    goal(xy, final) {
+      number = Math.max(number, model.get("wanted")[2]) + 1;
+      view.svg.dataset.asked = number;
+      Object.assign(view.svg.dataset, { draft: true });
+      view.set({ goal: { ...view.state.goal, xy }, steps: draft(xy) });
+      if (!final) return;
+      model.set("wanted", [...xy, number]);
+      model.save_changes(); // ipywidgets sends the next one when this one has been processed
+    },
+    press: (key) => model.send({ press: key === "Enter" ? "run" : "stop" }),
+  });
+  el.append(scrub);
+
+  function look() {
+    const { map, ...about } = model.get("object");
+    thing = { ...about, map: map && new EffectMap(map) };
+    const { reach, ring, seconds } = model.get("table");
+    reachable = reach && map ? reachability(reach, map.primitive) : null;
+    chain = [];
+    view.set({ object: { ...thing, seconds }, ring });
+  }
+
+  function show() {
+    const { answered, running, planning, ...scene } = model.get("scene");
+    if (!scene.goal) return;
+    const late = answered < number || view.held; // the hand is ahead of Python
+    if (late) Object.assign(scene, { goal: { ...scene.goal, xy: view.state.goal.xy }, steps: view.state.steps });
+    else chain = [];
+    Object.assign(view.svg.dataset, { answered, planning, draft: Boolean(late) });
+    view.svg.setAttribute("aria-busy", planning);
+    if (!running && !timer) scene.live = null;
+    view.set({ ...scene, planning, sigma: true, swept: true, note: planning ? "planning …" : "" });
+  }
+
+  // Motions [x, y, yaw, lift, hand's x, y, z, yaw, gap], as they are simulated, and afterwards.
+  function at(place) {
+    const k = Math.min(Math.floor(place), recorded.length - 1);
+    const next = recorded[Math.min(k + 1, recorded.length - 1)];
+    const now = recorded[k].map((value, axis) => share(value, next[axis], place - k));
+    const [x, y, yaw, lift, ...tool] = now;
+    const near = between(0, 1.1 - 8 * tool[2], 1);
+    const hand = { along: 0, gap: tool[4], direction: recorded[k][7], from: tool, near };
+    view.state.live = { pose: [x, y, yaw], lift, hand };
+    view.state.trail = recorded.slice(0, k + 1);
+    scrub.value = place / Math.max(recorded.length - 1, 1);
+    view.draw();
+  }
+
+  function heard({ motions, first }) {
+    if (first) [recorded, began] = [[], performance.now()];
+    recorded.push(...motions);
+    scrub.hidden = false;
+    if (timer) return;
+    const frame = (now) => {
+      const last = recorded.length - 1;
+      const place = still() ? last : Math.min((now - began) / (1000 * model.get("scene").pace), last);
+      at(place);
+      const waits = place >= last;
+      if (waits) began = now - 1000 * model.get("scene").pace * last; // for what is simulated next
+      timer = waits && !model.get("scene").running ? null : requestAnimationFrame(frame);
+      if (!timer) show();
+    };
+    timer = requestAnimationFrame(frame);
+  }
+
+  scrub.addEventListener("input", () => !timer && at(Number(scrub.value) * (recorded.length - 1)));
+  // Sliders beside the table have no names for screen readers.
+  const nameSliders = () =>
+    el.closest(".affordlib-picker")?.querySelectorAll("[role=slider]").forEach((handle) => {
+      handle.ariaLabel = handle.closest(".widget-slider").querySelector(".widget-label").textContent;
+    });
+  const naming = new ResizeObserver(() => setTimeout(nameSliders, 500)); // after the page is complete
+  naming.observe(el);
+  const listeners = { "change:object": look, "change:scene": show, "msg:custom": heard };
+  for (const [name, act] of Object.entries(listeners)) model.on(name, act);
+  look();
+  show();
+  return () => {
+    cancelAnimationFrame(timer);
+    naming.disconnect();
+    view.destroy();
+    for (const [name, act] of Object.entries(listeners)) model.off(name, act);
+  };
+}
+
+export default { render };

@@ -1,21 +1,59 @@
-"""What `table.js` needs to plan and draw: an object, its effect map, where the arm can act."""
+"""The table in the browser, and what `table.js` needs to plan and draw, in JSON's types."""
 
 import base64
+import math
+from pathlib import Path
 from typing import Any
 
+import anywidget
 import numpy as np
+import traitlets
 from torch import nn
 
 from affordlib.planning import Skills
 from affordlib.planning.effect_map import EffectMap
 from affordlib.primitives import DURATION_S
-from affordlib.types import ACTION_CHANNELS, TABLE_X_M, TABLE_Y_M
+from affordlib.types import ACTION_CHANNELS, TABLE_X_M, TABLE_Y_M, Plan
 from affordlib.world import BASE_X_M, REACH_M, TabletopObject
 
 PUSH_RUN_UP_M = 0.2
 """Largest distance [m] of a push's start from the object; it bounds the shaded reachable ring."""
 
 HAND_SAMPLES = 26
+_HERE = Path(__file__).parent
+
+
+class TableView(anywidget.AnyWidget):
+    """The table from above, whose goal is dragged; see `table.js`.
+
+    table: what `table_data` returns; object: `object_data`'s; scene: pose, goal, steps, trail and
+    marks, and "answered", the number of the last request that it includes. wanted: x, y [m] and the
+    growing number of a request for a goal. It sends {"press": "run"} and "stop", and plays
+    {"motions": [x, y, yaw, lift, the hand's x, y, z, yaw, gap]} as they come.
+    """
+
+    _esm = _HERE / "table.js"
+    _css = _HERE / "table.css"
+    table = traitlets.Dict().tag(sync=True)
+    object = traitlets.Dict().tag(sync=True)
+    scene = traitlets.Dict().tag(sync=True)
+    wanted = traitlets.List([0.0, 0.0, 0]).tag(sync=True)
+
+
+def plan_data(plan: Plan, yaw_rad: float) -> list[dict[str, Any]]:
+    """A plan's steps; yaw_rad: the object's yaw at the start."""
+    steps, at = [], [*plan.start_xy_m, yaw_rad]
+    for step in plan.steps:
+        end = [*step.predicted_end_xy_m, yaw_rad + step.predicted_turn_rad]
+        yaws = np.linspace(at[2], end[2], len(step.predicted_path_xy_m))
+        path = np.column_stack([step.predicted_path_xy_m, yaws]).round(5)
+        moves = hasattr(step.primitive, "direction_rad")
+        about = {"from": at, "end": end, "path": path.tolist(), "stop": step.stop_phase}
+        about["direction"] = step.primitive.direction_rad if moves else None
+        about["name"] = step.primitive.name.replace("_", " ").removeprefix("push")
+        steps.append(about | {"std": None if math.isnan(step.std_m) or not moves else step.std_m})
+        at = end
+    return steps
 
 
 def object_data(obj: TabletopObject, effects: EffectMap, yaw_rad: float = 0.0) -> dict[str, Any]:

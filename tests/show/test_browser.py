@@ -12,7 +12,6 @@ import shutil
 import socket
 import subprocess
 import sys
-import time
 import urllib.request
 from contextlib import contextmanager
 from types import SimpleNamespace
@@ -133,32 +132,32 @@ class Table:
     def __init__(self, page):
         self.page, self.svg = page, page.locator(".affordlib-table svg")
         self.svg.scroll_into_view_if_needed()
+        page.wait_for_timeout(400)  # until the view stands
         box = self.svg.bounding_box()
         assert box["width"] > 300
         assert box["height"] == pytest.approx(box["width"], rel=0.01)
 
-    def at(self, x_m, y_m):
+    def view(self):
+        """Middle (2,) [pixels], what is there (2,) [m], and pixels per metre."""
         box = self.svg.bounding_box()
-        mm = float(self.svg.get_attribute("viewBox").split()[2])
-        pixels = (box["width"] - 2) / mm  # a border of one pixel
-        return (
-            box["x"] + box["width"] / 2 + 1000 * x_m * pixels,
-            box["y"] + box["height"] / 2 - 1000 * y_m * pixels,
-        )
+        x, y, half = map(float, self.svg.get_attribute("data-view").split())
+        middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+        return np.array(middle), np.array((x, y)), box["height"] / (2 * half)
+
+    def at(self, x_m, y_m):
+        middle, there, scale = self.view()
+        return tuple(middle + scale * ((x_m, y_m) - there) * (1, -1))
 
     def points(self, selector):
         """Corners (n, 2) [m] of everything drawn with a class."""
         corners = self.svg.locator(selector).evaluate_all(
-            """all => all.flatMap((shape) => {
-                const screen = shape.ownerSVGElement.getScreenCTM().inverse();
-                const inPicture = screen.multiply(shape.getScreenCTM());
-                return [...shape.points].map((corner) => {
-                    const {x, y} = corner.matrixTransform(inPicture);
-                    return [x, y];
-                });
-            })"""
+            """all => all.flatMap((shape) => [...shape.points].map((corner) => {
+                const {x, y} = corner.matrixTransform(shape.getScreenCTM());
+                return [x, y];
+            }))"""
         )
-        return np.array(corners, dtype=float).reshape(-1, 2) * [1e-3, -1e-3]
+        middle, there, scale = self.view()
+        return there + (np.array(corners, dtype=float).reshape(-1, 2) - middle) * (1, -1) / scale
 
     def goal(self):
         return self.points(".goal").mean(axis=0)
@@ -169,6 +168,7 @@ class Table:
             " && svg.dataset.draft === 'false' && svg.dataset.planning === 'false'",
             arg=self.svg.element_handle(),
         )
+        self.page.wait_for_timeout(400)  # until the view stands
 
 
 def picture(page, name):
@@ -197,7 +197,7 @@ def assert_same_goal(page, table, x_m, y_m, within_m=0.0011):
     table.wait_for_answer()
     asked = goal_of(page)
     assert asked == pytest.approx((x_m, y_m), abs=within_m)
-    np.testing.assert_allclose(table.goal(), asked, atol=1e-4)
+    np.testing.assert_allclose(table.goal(), asked, atol=3e-4)
     shown = page.locator(".affordlib-picker .widget-readout").all_inner_texts()[:2]
     assert [float(text.replace("−", "-")) for text in shown] == pytest.approx(
         [100 * v for v in asked]
@@ -205,8 +205,8 @@ def assert_same_goal(page, table, x_m, y_m, within_m=0.0011):
 
     def drawn_is_planned():  # a better plan may follow the first
         paths = ask(page, "[s.predicted_path_xy_m.tolist() for s in picker.plan.steps]")
-        drawn, planned = table.points(".plan .prediction"), np.vstack(paths)
-        return drawn.shape == planned.shape and np.abs(drawn - planned).max() < 2e-4
+        drawn, planned = table.points(".prediction"), np.vstack(paths)
+        return drawn.shape == planned.shape and np.abs(drawn - planned).max() < 5e-4
 
     wait_until(drawn_is_planned, otherwise="the drawn path is not that of the plan")
 
@@ -349,7 +349,7 @@ def test_sliders_by_keyboard(page, table):
     wait_until(lambda: ask(page, "[picker.goal.turn_rad, picker.goal.height_m]") == wanted)
     wait_for_words(page, "then grasp to")
     table.wait_for_answer()
-    np.testing.assert_allclose(table.points(".predicted"), table.points(".wanted"), atol=0.021)
+    np.testing.assert_allclose(table.points(".predicted"), table.points(".place"), atol=0.021)
     picture(page, "7_turn_and_lift")
     ask(page, "picker.set_pose()")
 
@@ -370,12 +370,12 @@ def test_run(page, table):
 
 def test_run_and_stop_by_keyboard(page, table):
     button(page, "Start over").click()
-    page.mouse.click(*table.at(0.2, -0.2))
+    ask(page, "picker.pick(0.2, -0.2)")
     assert_same_goal(page, table, 0.2, -0.2)
     assert ask(page, "len(picker.plan.steps)") > 1
     table.svg.focus()
     page.keyboard.press("Enter")
-    page.wait_for_function("() => document.querySelector('.trail')?.getAttribute('points')")
+    page.locator(".affordlib-table .hand").wait_for()
     picture(page, "4_running")
     page.keyboard.press("Escape")
     wait_for_words(page, "Stopped after 1 action:")
@@ -384,11 +384,11 @@ def test_run_and_stop_by_keyboard(page, table):
 
 def test_a_closed_loop_follows_a_goal_that_moves(page, table):
     button(page, "Start over").click()
-    page.mouse.click(*table.at(0.18, 0.0))
+    ask(page, "picker.pick(0.18, 0.0)")
     assert_same_goal(page, table, 0.18, 0.0)
     choose(page, "closed loop")
     button(page, "Run").click()
-    page.wait_for_function("() => document.querySelector('.trail')?.getAttribute('points')")
+    page.locator(".affordlib-table .hand").wait_for()
     page.mouse.click(*table.at(0.1, 0.16))
     button(page, "Shove it").click()
     wait_for_words(page, "from the goal, within")
@@ -455,70 +455,19 @@ def test_everything_can_be_pressed_without_a_mouse(page, table):
     wait_until(lambda: goal_of(page) != goal)
 
 
-QUIET_S = 0.04
-"""Time [s] of the sum below on an idle machine with two cores."""
-
-SHARED = 2
-"""Factor by which answers may be slower while other tests use the same cores."""
-
-
-def how_much_slower():
-    """Current slowdown compared with an idle machine, at least 1."""
-    times = []
-    for _ in range(9):
-        began = time.perf_counter()
-        sum(k * k for k in range(500_000))
-        times.append(time.perf_counter() - began)
-    return max(1.0, float(np.median(times)) / QUIET_S)
-
-
-def test_the_plan_follows_the_hand(page, table):
-    """Time from the event to the redrawn first plan, and to the refined one, seen in the page."""
+def test_the_browser_plans_while_the_hand_drags(page, table):
     button(page, "Start over").click()
-    choose(page, "continuous")
     table.wait_for_answer()
-    first_ms, refined_ms = page.evaluate(
-        """async () => {
-            const svg = document.querySelector('.affordlib-table svg');
-            svg.focus();
-            const until = (done) => new Promise((go) => {
-                const look = () => done() ? go() : requestAnimationFrame(look);
-                look();
-            });
-            const press = (k) => {
-                const key = ['ArrowLeft', 'ArrowUp', 'ArrowRight', 'ArrowDown'][(k >> 2) % 4];
-                svg.dispatchEvent(new KeyboardEvent('keydown', {key, bubbles: true}));
-                return Number(svg.dataset.asked);
-            };
-            const [first, refined] = [[], []];
-            for (let k = 0; k < 48; k++) {
-                const began = performance.now();
-                const number = press(k);
-                await until(() => Number(svg.dataset.answered) >= number);
-                first.push(performance.now() - began);
-                if (k % 4 == 3) {
-                    await until(() => svg.dataset.draft + svg.dataset.planning === 'falsefalse');
-                    refined.push(performance.now() - began);
-                }
-            }
-            return [first, refined];
-        }"""
-    )
-    measured = {
-        f"{name}_{told}_ms": float(np.quantile(times_ms, share))
-        for name, times_ms in (("first", first_ms), ("refined", refined_ms))
-        for told, share in (("median", 0.5), ("p95", 0.95))
-    }
-    measured["plan_ms"] = 1000 * ask(page, "picker.plan.plan_s")
-    slower = how_much_slower()
-    if int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", 1)) > 1:
-        slower *= SHARED
-    told = measured | {"slower": slower}
-    (PICTURES / "times.json").write_text(json.dumps(told, indent=1) + "\n")
-    # Twice the target, since the machine's load is known only roughly.
-    for name, most_ms in (("first_median", 200), ("first_p95", 500), ("refined_median", 800)):
-        assert measured[f"{name}_ms"] < most_ms * slower, told
-    assert_same_goal(page, table, *goal_of(page))
+    before = ask(page, "list(picker.plan.goal.xy_m)")
+    page.mouse.move(*table.at(*table.goal()))
+    page.mouse.down()
+    for share in np.linspace(0, 1, 6):
+        page.mouse.move(*table.at(0.05 + 0.02 * share, 0.09))
+        drawn = table.points(".prediction")
+        assert np.hypot(*(drawn[-1] - table.goal())) < 0.003
+        assert ask(page, "list(picker.plan.goal.xy_m)") == before  # not yet asked for
+    page.mouse.up()
+    assert_same_goal(page, table, *table.goal())
 
 
 def handle_of(page, widget, name):
@@ -569,7 +518,7 @@ def test_a_saved_notebook_keeps_a_picture(page, lab):
     outputs = saved_outputs(page, lab)
     widget = [o for o in outputs if WIDGET in o.get("data", ())]
     assert widget
-    assert all({"image/png", "image/svg+xml"} & output["data"].keys() for output in widget)
+    assert all("image/png" in output["data"] for output in widget)
     assert [o for o in outputs if o.output_type == "error"] == []
     assert (lab.out / "00_start_here.json").is_file()
 
@@ -579,6 +528,15 @@ def test_no_request_leaves_the_machine(page, lab):
     assert {urlparse(url).netloc for url in asked} == {urlparse(lab.address).netloc}
     assert any("ws" in urlparse(url).scheme for url in page.requests)
     assert page.locator("text=Would you like to get notified").count() == 0
+
+
+def test_after_a_restart_of_the_kernel_one_sentence_says_what_to_do(page):
+    page.evaluate("window.jupyterapp.shell.currentWidget.sessionContext.session.kernel.restart()")
+    said = "e => getComputedStyle(e, '::before').content"
+    picker = page.locator(".affordlib-picker")
+    wait_until(lambda: "run the cells above again" in picker.evaluate(said), 40)
+    assert button(page, "Run").evaluate(said) == "none"
+    picture(page, "9_restarted")
 
 
 @pytest.fixture(scope="module")

@@ -1,3 +1,5 @@
+import base64
+import io
 import json
 import math
 import re
@@ -7,15 +9,13 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from matplotlib.path import Path
+from PIL import Image
 
-from affordlib.geometry import rotated
 from affordlib.interactions import open_interactions
 from affordlib.planning import Skills, execute_plan, plan_astar, plan_continuous
-from affordlib.results import load_plan
-from affordlib.show import GoalPicker, goal_picker
-from affordlib.show.drawing import Drawing
+from affordlib.show import GoalPicker
 from affordlib.show.executors import open_loop
+from affordlib.show.table_data import TableView
 from affordlib.types import Goal
 from affordlib.world import BASE_X_M, REACH_M, Cuboid
 from tests.waiting import wait_until
@@ -38,14 +38,14 @@ def make_picker(world, trained, planned_for, tmp_path):
     def broken(*_):
         raise ValueError("no <plan> today")
 
-    def make(seconds_per_action=0.0, skills=None, executor=None, **options):
+    def make(pace_s=0.0, skills=None, executor=None, **options):
         planners = options.pop("planners", {"A*": astar, "broken": broken})
         goal = options.pop("goal_xy_m", (0.12, 0.0))
         skills = skills or Skills({"push": trained})
         picker = GoalPicker(world, skills, planners, goal, folder=str(tmp_path), **options)
         if executor is not None:
             picker.executors["open loop"] = executor
-        picker.seconds_per_action = seconds_per_action
+        picker.pace_s = pace_s
         return picker
 
     return make
@@ -64,7 +64,7 @@ def posed(make_picker, skills):
 
 def want(picker, x_m, y_m, number):
     """Move the goal as by hand."""
-    picker._view.wanted = ["goal", 1000 * x_m, -1000 * y_m, number]
+    picker._view.wanted = [x_m, y_m, number]
 
 
 def in_time(picker):
@@ -73,21 +73,13 @@ def in_time(picker):
     return picker
 
 
-def shapes(picker, css):
-    """Everything drawn with a class."""
-    drawing = ElementTree.fromstring(f"<svg>{picker._view.scene['inside']}</svg>")
-    return [e for e in drawing.iter() if css in e.get("class", "").split()]
-
-
-def corners(picker, css):
-    """Corners (n, 2) [m] of everything drawn with a class."""
-    pairs = [p.split(",") for e in shapes(picker, css) for p in e.get("points").split()]
-    return np.array(pairs, dtype=float).reshape(-1, 2) * [1e-3, -1e-3]
-
-
 def drawn_goal(picker):
-    (goal,) = picker._view.scene["handles"]
-    return goal["x"] / 1000, -goal["y"] / 1000
+    return tuple(picker._view.scene["goal"]["xy"])
+
+
+def drawn_path(picker):
+    """Path (n, 2) [m] of the drawn plan."""
+    return np.vstack([step["path"] for step in picker._view.scene["steps"]])[:, :2]
 
 
 def test_a_picked_goal_is_planned_for_drawn_and_reached(picker, world):
@@ -95,57 +87,23 @@ def test_a_picked_goal_is_planned_for_drawn_and_reached(picker, world):
     plan = picker.plan
     assert plan.goal.xy_m == drawn_goal(picker) == (0.05, 0.12)
     paths = np.vstack([step.predicted_path_xy_m for step in plan.steps])
-    np.testing.assert_allclose(corners(picker, "prediction"), paths, atol=1e-5)
-    for arrow, step in zip(shapes(picker, "arrow"), plan.steps, strict=True):
-        assert f"rotate({-math.degrees(step.primitive.direction_rad):.2f})" in arrow.get(
-            "transform"
-        )
-    said = [shape.text for shape in shapes(picker, "step")]
-    assert said == [f"{k}: {100 * s.stop_phase:.0f} %" for k, s in enumerate(plan.steps, 1)]
-    radii = [float(disc.get("r")) for disc in shapes(picker, "sigma")]
-    assert radii == pytest.approx([20_000 * step.std_m for step in plan.steps], abs=0.01)
+    np.testing.assert_allclose(drawn_path(picker), paths, atol=1e-5)
+    for drawn, step in zip(picker._view.scene["steps"], plan.steps, strict=True):
+        assert drawn["direction"] == step.primitive.direction_rad
+        assert (drawn["stop"], drawn["std"]) == (step.stop_phase, step.std_m)
+        assert tuple(drawn["end"][:2]) == step.predicted_end_xy_m
     picker.run()
     outcome = picker.outcome
     assert outcome.distance_m == plan.goal.distance_m(world.object_pose()[:2])
     assert "mm</b> from the goal" in picker.controls.words.value
     assert not picker.controls.run.disabled
-    np.testing.assert_allclose(corners(picker, "truth")[-1], world.object_pose()[:2], atol=1e-3)
+    np.testing.assert_allclose(picker._view.scene["trail"][-1], world.object_pose()[:2], atol=1e-3)
     picker.start_over()
     assert world.object_pose() == pytest.approx((0, 0, 0), abs=1e-12)
     plain = execute_plan(world, plan)  # has the picker's outcome
     assert outcome.end_pose == pytest.approx(plain.end_pose, abs=1e-12)
     for a, b in zip(outcome.object_paths_xy_m, plain.object_paths_xy_m, strict=True):
         np.testing.assert_array_equal(a, b)
-
-
-def outline(shape):
-    """Outline of a drawn object [mm]."""
-    x, y, degrees = map(float, re.findall(r"-?[\d.]+", shape.get("transform")))
-    points = [list(map(float, pair.split(","))) for pair in shape.get("points").split()]
-    return Path(np.add(rotated(np.array(points), math.radians(degrees)), (x, y)))
-
-
-@pytest.mark.parametrize("xy", [(0.34, 0), (0.34, -0.34), (0.02, 0.01), (0.18, 0.12), (-0.3, 0.2)])
-def test_labels_meet_neither_goal_nor_outlines_nor_discs_nor_each_other(posed, xy):
-    posed.pick(*xy)
-    ends = [outline(e) for css in ("ghost", "predicted") for e in shapes(posed, css)]
-    places = [(1000 * x, -1000 * y) for x, y in (s.predicted_end_xy_m for s in posed.plan.steps)]
-    np.testing.assert_allclose([end.vertices.mean(axis=0) for end in ends], places, atol=0.01)
-    discs = [[float(e.get(k)) for k in ("cx", "cy", "r")] for e in shapes(posed, "sigma")]
-    discs.append([1000 * xy[0], -1000 * xy[1], 20])  # the goal
-    across, up = np.meshgrid(np.linspace(-1, 1, 17), np.linspace(-1, 1, 5))
-    boxes = []
-    for label in shapes(posed, "step"):
-        x, y, half = float(label.get("x")), float(label.get("y")) - 6, 5 * len(label.text)
-        points = np.column_stack([x + half * across.ravel(), y + 9 * up.ravel()])
-        assert np.abs(points).max() <= 400
-        for shape in (outline(shapes(posed, "object")[0]), *ends):
-            assert not shape.contains_points(points).any()
-        assert all(np.hypot(*(points - disc[:2]).T).min() > disc[2] for disc in discs)
-        assert all(abs(x - u) > half + v or abs(y - w) > 18 for u, w, v in boxes)
-        boxes.append((x, y, half))
-    inside = posed._view.scene["inside"]
-    assert inside.index("data-handle") < inside.index('class="step"')
 
 
 def test_the_first_time_that_is_shown_is_that_of_a_planner_at_work(make_picker, trained):
@@ -164,17 +122,14 @@ def luminance(colour):
 
 
 def test_lines_and_words_stand_out_from_the_table():
-    rules = dict(re.findall(r"-table (?::is\()?\.([\w-]+)[ ,][^{]*\{(.*)\}", str(Drawing._css)))
-
-    def colour(css, of):
-        return re.search(rf"{of}: (#\w{{6}})", rules[css])[1]
-
-    lines = ("reach", "object", "push", "prediction", "predicted", "sigma", "truth", "tolerance")
-    wanted = [(colour(css, "stroke"), 3) for css in lines] + [(colour("goal", "fill"), 3)]
-    wanted += [(colour(css, "fill"), 4.5) for css in ("tick", "step", "busy")]
-    for drawn, least in wanted:
-        for ground in (colour("reach", "fill"), "#ffffff"):
-            assert (luminance(ground) + 0.05) / (luminance(drawn) + 0.05) > least, drawn
+    styles = str(TableView._css).split("@media")
+    for style in map(str, styles):
+        colour = dict(re.findall(r"--([\w-]+): (#\w{6})", style))
+        wanted = {"ink": 4.5, "goal": 3, "prediction": 3, "truth": 2.9, "thing-rim": 3, "rim": 3}
+        for name, least in wanted.items():
+            for ground in ("ground", "reach"):
+                pair = sorted(luminance(colour[one]) + 0.05 for one in (name, ground))
+                assert pair[1] / pair[0] > least, (name, ground)
 
 
 def test_what_the_hand_wants_is_planned_for_once(picker, planned_for):
@@ -189,39 +144,6 @@ def test_what_the_hand_wants_is_planned_for_once(picker, planned_for):
     assert in_time(picker).plan.goal.xy_m == drawn_goal(picker) == (0.077, 0.123)
 
 
-def test_a_draft_until_the_hand_rests(make_picker, planned_for, trained, monkeypatch):
-    monkeypatch.setattr(goal_picker, "REST_S", 1.0)
-
-    def draft(problem):
-        return replace(plan_astar(problem), planner="draft")
-
-    def show_a_draft(x_m, number):
-        want(picker, x_m, 0.03, number)
-        wait_until(lambda: picker._view.scene["answered"] == number)
-        assert picker.plan.planner == "draft"
-        assert picker._view.scene["draft"]
-        assert picker.controls.said == " Planning with A* …"
-
-    picker = make_picker(draft=draft)
-    assert picker.plan.planner == "astar"  # the draft is replaced
-    planned_for.clear()
-    for number, x in enumerate((0.08, 0.09, 0.10), 1):
-        show_a_draft(x, number)
-    assert planned_for == []
-    assert in_time(picker).plan.planner == "astar"
-    assert planned_for == [(0.10, 0.03)]  # once, where the hand came to rest
-    assert not picker._view.scene["draft"]
-    show_a_draft(0.07, 4)
-    picker.run()  # what is executed is the plan
-    assert picker.plan.planner == picker.outcome.plan.planner == "astar"
-    show_a_draft(0.08, 5)
-    picker.save()
-    assert load_plan(f"{picker.folder}/plan.json").planner == "astar"
-    show_a_draft(0.09, 6)
-    picker.load()
-    assert in_time(picker).goal.xy_m[0] == 0.08  # no late plan for an abandoned goal
-
-
 def test_run_waits_for_the_plan_of_the_goal_that_is_shown(make_picker, trained):
     """Two clicks and Run, faster than the planner: the plan of the second click is executed."""
     began = []
@@ -231,7 +153,7 @@ def test_run_waits_for_the_plan_of_the_goal_that_is_shown(make_picker, trained):
         time.sleep(0.3)
         return plan_astar(problem)
 
-    picker = make_picker(draft=plan_astar)
+    picker = make_picker()
     picker.planners["A*"] = slow
     want(picker, 0.08, 0.03, 1)
     wait_until(lambda: began)
@@ -251,7 +173,7 @@ def test_run_waits_for_the_plan_of_the_goal_that_is_shown(make_picker, trained):
 def test_the_picker_shows_its_errors(picker, tmp_path):
     picker.controls.planner.value = "broken"
     assert "Error:</b> no &lt;plan&gt; today" in in_time(picker).controls.words.value
-    assert shapes(picker, "step") == []
+    assert picker._view.scene["steps"] == []
     with pytest.raises(ValueError, match="off the table"):
         picker.pick(5.0, 0.0)
     with pytest.raises(RuntimeError, match="no plan to save"):
@@ -264,7 +186,7 @@ def test_the_picker_shows_its_errors(picker, tmp_path):
         picker.load("bad.json")
     picker.controls.planner.value = "A*"
     assert in_time(picker).controls.words.value.count("Plan: ") == 1
-    assert shapes(picker, "step")
+    assert picker._view.scene["steps"]
 
 
 def texts(value, at=()):
@@ -294,7 +216,7 @@ def test_no_text_of_a_file_is_shown_as_html(picker, tmp_path):
         picker.controls.load.click()
         words = in_time(picker).controls.words.value
         shown += "&lt;img" in words
-        assert not {"<img", "<script"} & set(re.findall(r"<\w+", words + picker.picture())), place
+        assert not {"<img", "<script"} & set(re.findall(r"<\w+", words)), place
         ElementTree.fromstring(words)  # one element, well formed
     assert shown
 
@@ -307,7 +229,7 @@ def test_plans_stay_in_their_folder(picker, name):
 
 
 def test_stop_lets_an_action_end_and_begins_no_other(make_picker, world):
-    picker = make_picker(seconds_per_action=30.0)
+    picker = make_picker(pace_s=1.0)
     picker.pick(0.24, 0.0)
     assert len(picker.plan.steps) > 1
     first = picker.plan.steps[0].predicted_end_xy_m
@@ -328,25 +250,31 @@ def test_stop_lets_an_action_end_and_begins_no_other(make_picker, world):
     assert picker.outcome.distance_m < 0.03, picker.controls.words.value
 
 
-def test_a_run_can_be_watched(make_picker):
-    picker = make_picker(seconds_per_action=0.2)
-    played, said, done = [], [], []
+def test_a_run_can_be_watched_while_it_is_simulated(make_picker, monkeypatch):
+    picker = make_picker(pace_s=0.001)
+    sent, said, done = [], [], []
     picker.pick(0.24, 0.0)
+    monkeypatch.setattr(picker._view, "send", lambda message: sent.append(message))
     picker.controls.words.observe(lambda change: said.append(change["new"]), names="value")
     picker.controls.progress.observe(lambda change: done.append(change["new"]), names="value")
-    picker._view.observe(lambda change: played.append(change["new"]), names="playback")
+    before = time.monotonic()
     picker._view._handle_custom_msg({"press": "run"}, [])
     in_time(picker)
     n = len(picker.plan.steps)
-    assert [movement["seconds"] for movement in played] == [0.2] * n
-    assert [f"Push {k} of {n}." in words for k, words in enumerate(said[:-1], 1)] == [True] * n
+    assert [f"Push {k} of {n} …" in words for k, words in enumerate(said[:-1], 1)] == [True] * n
     assert [f"value={k} max={n}" in bar for k, bar in enumerate(done[:n], 1)] == [True] * n
     within = "within" if picker.outcome.distance_m <= 0.02 else "outside"
     assert f"<div class='outcome {within}'>Done, {n} actions" in said[-1]
-    poses = np.vstack([movement["poses"] for movement in played]) / (1000, -1000, -180 / np.pi)
-    assert len(poses) > 20
-    assert np.hypot(*np.diff(poses[:, :2], axis=0).T).max() < 0.03
-    np.testing.assert_allclose(poses[-1], picker.outcome.end_pose, atol=2e-3)
+    motions = np.vstack([message["motions"] for message in sent])
+    assert [message["first"] for message in sent] == [True] + [False] * (len(sent) - 1)
+    assert len(sent) > 10 * n  # as they come
+    assert time.monotonic() - before >= 0.001 * len(motions)
+    assert np.hypot(*np.diff(motions[:, :2], axis=0).T).max() < 0.03
+    np.testing.assert_allclose(motions[-1, :3], picker.outcome.end_pose, atol=2e-3)
+    np.testing.assert_allclose(picker._view.scene["trail"], motions[:, :2], atol=1e-4)
+    tip = motions[:, 4:7]  # the hand comes from above, to where the object is
+    assert tip[:, 2].max() > 0.1
+    assert np.hypot(*(tip[:, :2] - motions[:, :2]).T).min() < 0.05
     assert picker.world.on_step is None
 
 
@@ -362,7 +290,7 @@ def test_a_goal_picked_while_an_open_loop_runs_is_planned_for_when_it_ends(make_
     assert picker.plan.start_xy_m == world.object_pose()[:2]
     assert "mm** from the goal" in picker.controls.said
     assert "Plan: push" in picker.controls.said
-    assert not shapes(picker, "busy")[0].text
+    assert not picker._view.scene["planning"]
 
 
 def test_a_disturbance_waits_for_the_end_of_the_action(make_picker, world):
@@ -410,11 +338,12 @@ def test_a_closed_loop_replans_with_the_chosen_planner_for_a_goal_that_moves(mak
     picker._view.observe(lambda change: shown.append(change["new"]), names="scene")
     picker._disturbances += [picker._move_goal, picker._shove]  # as if requested meanwhile
     picker.run()
-    goal, handles = picker.goal, [scene["handles"][0] for scene in shown]
-    assert goal.xy_m in [(at["x"] / 1000, -at["y"] / 1000) for at in handles]
+    goal = picker.goal
+    assert goal.xy_m in [scene["goal"]["xy"] for scene in shown]
+    assert any(len(scene["marks"]) == 2 for scene in shown)
     assert picker.plan.goal.xy_m == goal.xy_m != (0.2, 0.0)
     assert picker.plan.planner == "astar"
-    assert math.dist(corners(picker, "prediction")[-1], goal.xy_m) < 0.005
+    assert math.dist(drawn_path(picker)[-1], goal.xy_m) < 0.005
     assert picker.outcome.distance_m == goal.distance_m(picker.world.object_pose()[:2]) < 0.01
 
 
@@ -447,12 +376,12 @@ def test_a_slider_moves_what_it_is_for_and_nothing_else(picker):
 
 
 def test_a_saved_picker_leaves_its_picture(picker):
-    drawn = ElementTree.fromstring(picker._repr_mimebundle_()[0]["image/svg+xml"])
-    named = {css for shape in drawn.iter() for css in shape.get("class", "").split()}
-    assert {"reach", "object", "push", "prediction", "goal"} <= named
-    assert ".prediction {" in "".join(drawn.itertext())
-    (goal,) = (e for e in drawn.iter() if e.get("data-handle") == "goal")
-    assert goal.get("transform") == "translate(120.0 -0.0)"
+    bundle, about = picker._repr_mimebundle_()
+    picture = Image.open(io.BytesIO(base64.b64decode(bundle["image/png"])))
+    assert picture.size[0] == 2 * about["image/png"]["width"]
+    before = picker.picture()
+    picker.pick(-0.1, 0.05)
+    assert picker.picture() != before
 
 
 def test_a_plan_comes_back_from_its_file(posed):
@@ -484,10 +413,10 @@ def test_turn_and_lift_are_planned_and_done(posed, world, executor, within_deg):
     assert goal.xy_m == (0.04, 0.03)
     assert "then rotate to" in posed.controls.words.value
     assert "then grasp to" in posed.controls.words.value
-    (wanted,), (predicted,) = shapes(posed, "wanted"), shapes(posed, "predicted")
-    yaws = [float(e.get("transform").split("rotate(")[1].strip(")")) for e in (wanted, predicted)]
-    assert yaws == pytest.approx([-25.0, -25.0], abs=2.3)
-    assert "wanted" in posed.picture()
+    scene = posed._view.scene
+    assert math.degrees(scene["goal"]["yaw"]) == pytest.approx(25.0)
+    assert math.degrees(scene["steps"][-1]["end"][2]) == pytest.approx(25.0, abs=2.3)
+    assert [step["name"] for step in scene["steps"]][-2:] == ["rotate", "grasp"]
     posed.run()
     said = posed.controls.words.value
     assert "The turn has an error of" in said

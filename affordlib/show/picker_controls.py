@@ -1,0 +1,149 @@
+"""Controls of the goal picker: menus, sliders, buttons, and what it says."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import ipywidgets as widgets
+
+from affordlib.geometry import wrap_angle
+from affordlib.show.drawing import words_as_html
+from affordlib.types import Goal, Outcome, Plan, Step
+
+LIMIT_M = 0.35
+"""Largest goal coordinate that can be picked [m]."""
+
+_SLIDERS = {
+    "x [cm]": {"min": -100 * LIMIT_M, "max": 100 * LIMIT_M, "step": 0.1, "readout_format": ".1f"},
+    "y [cm]": {"min": -100 * LIMIT_M, "max": 100 * LIMIT_M, "step": 0.1, "readout_format": ".1f"},
+    "turn [°]": {"min": -90, "max": 90, "step": 5, "readout_format": ".0f"},
+    "lift [cm]": {"max": 20, "step": 0.5, "readout_format": ".1f"},
+}
+_SCALES = (100, 100, math.degrees(1), 100)
+
+
+class PickerControls(widgets.VBox):
+    """Controls of a goal picker; lengths in cm, rotations in degrees, 0 if not part of the goal.
+
+    goal: the initial one; planners, executors: the names to choose from; on_goal: called with the
+    new goal when a slider is moved. `words` and `progress` are placed by the picker.
+    """
+
+    def __init__(
+        self,
+        goal: Goal,
+        planners: Sequence[str],
+        executors: Sequence[str],
+        on_goal: Callable[[Goal], None],
+    ) -> None:
+        self.goal = goal
+        self.sliders = [widgets.FloatSlider(description=n, **s) for n, s in _SLIDERS.items()]
+        self.x, self.y, self.turn, self.height = self.sliders
+        self.planner = widgets.Dropdown(options=list(planners), description="planner")
+        self.executor = widgets.Dropdown(options=list(executors), description="carry out")
+        self.run = _button("Run", "play", "Execute the plan", button_style="primary")
+        self.stop = _button("Stop", "stop", "Stop after this action", disabled=True)
+        self.shove = _button("Shove it", "hand-o-right", "Disturb: shove the object")
+        self.move_goal = _button("Move goal", "random", "Disturb: move the goal")
+        self.start_over = _button("Start over", "undo", "Put the object back")
+        narrow = {"style": {"description_width": "auto"}, "layout": {"flex": "1", "min_width": "0"}}
+        self.name = widgets.Text("plan.json", description="file", **narrow)
+        self.save, self.load = _button("Save", "save"), _button("Load", "folder-open")
+        self.words, self.said, self.progress = widgets.HTML(), "", widgets.HTML()
+        self.show(goal)
+        for slider in self.sliders:
+            slider.observe(lambda change: self._slid(change["owner"], on_goal), names="value")
+        rows = [
+            [self.planner],
+            [self.executor],
+            *([slider] for slider in self.sliders),
+            [self.run, self.stop, self.start_over],
+            [widgets.Label("disturb"), self.shove, self.move_goal],
+            [self.name, self.save, self.load],
+        ]
+        layout = {"flex": "1 1 250px", "max_width": "300px"}
+        super().__init__([widgets.HBox(row) for row in rows], layout=layout)
+
+    def show(self, goal: Goal) -> None:
+        """Set the sliders to a goal, as accurately as they can show it."""
+        self.goal = goal
+        for slider, value in zip(self.sliders, self._shown(goal), strict=True):
+            slider.value = value
+
+    def _shown(self, goal: Goal) -> list[float]:
+        each = zip(self.sliders, _SCALES, _numbers(goal), strict=True)
+        return [round(min(max(scale * v, s.min), s.max), 1) for s, scale, v in each]
+
+    def _slid(self, slider: widgets.FloatSlider, on_goal: Callable[[Goal], None]) -> None:
+        """Change the goal's value that belongs to a slider, unless the slider follows the goal."""
+        k, numbers = self.sliders.index(slider), _numbers(self.goal)
+        if slider.value != self._shown(self.goal)[k]:
+            numbers[k] = round(slider.value / _SCALES[k], 12)
+            x, y, turn, height = numbers
+            wanted = {"turn_rad": turn or None, "height_m": height or None}
+            on_goal(replace(self.goal, xy_m=(x, y), **wanted))
+
+    def set_running(self, running: bool) -> None:
+        """Disable the controls that have no effect during a run."""
+        for control in (self.run, self.start_over, self.planner, self.executor, self.load):
+            control.disabled = running
+        self.stop.disabled = not running
+
+    def show_progress(self, done: int, of: int = 1) -> None:
+        """Show the number of actions done, of a total."""
+        self.progress.value = f"<progress aria-label='actions done' value={done} max={of}>"
+
+    def say(self, text: str, css: str = "") -> None:
+        """Show a text, and announce it to screen readers."""
+        self.said, self.words.value = text, words_as_html(text, css)
+
+
+def _numbers(goal: Goal) -> list[float]:
+    """The values of a goal that the sliders show, in m and rad."""
+    return [*goal.xy_m, goal.turn_rad or 0.0, goal.height_m or 0.0]
+
+
+def _button(name: str, icon: str, tooltip: str = "", **kwargs: Any) -> widgets.Button:
+    layout = {"width": "auto", "flex": "none"}
+    return widgets.Button(
+        description=name, icon=icon, tooltip=tooltip or name, layout=layout, **kwargs
+    )
+
+
+def plan_in_words(plan: Plan) -> str:
+    """Describe a plan: its actions, predicted distance to the goal, and planning time."""
+    steps = ", then ".join(step_in_words(step) for step in plan.steps) or "no action"
+    missed = " Up to three pushes or drags do not reach the goal; a closed loop then plans again."
+    arrives = "" if plan.reaches_goal else missed
+    if not plan.reaches_goal and plan.predicted_distance_m <= plan.goal.tolerance_m:
+        arrives = " It reaches the goal's position, but not its turn or height."
+    std_m = plan.steps[-1].std_m if plan.steps else math.nan
+    unsure = "" if math.isnan(std_m) else f" (σ of the last step {1000 * std_m:.1f} mm)"
+    return (
+        f"Plan: {steps}. Predicted to end {1000 * plan.predicted_distance_m:.1f} mm from the goal"
+        f"{unsure}.{arrives} Found in {1000 * plan.plan_s:.0f} ms."
+    )
+
+
+def outcome_in_words(outcome: Outcome, goal: Goal, how: str, done: int) -> tuple[str, str]:
+    """Describe an outcome, and name its look; how: "Done," or "Stopped after"; done: actions."""
+    within = "within" if outcome.distance_m <= goal.tolerance_m else "outside"
+    posed = ""
+    if goal.turn_rad is not None:
+        off = math.degrees(abs(wrap_angle(goal.turn_rad - outcome.turned_rad)))
+        posed += f" The turn has an error of {off:.1f}°."
+    if goal.height_m is not None:
+        off = 1000 * abs(goal.height_m - outcome.lifted_m)
+        posed += f" The height has an error of {off:.1f} mm."
+    words = (
+        f"{how} {done} action{'s' * (done != 1)}: the object rests "
+        f"**{1000 * outcome.distance_m:.1f} mm** from the goal, {within} the tolerance of "
+        f"{1000 * goal.tolerance_m:.0f} mm.{posed} {outcome.words}"
+    )
+    return words, f"outcome {within}"
+
+
+def step_in_words(step: Step) -> str:
+    """Name the primitive and its stop phase in percent."""
+    return f"{step.primitive.name.replace('_', ' ')} to {100 * step.stop_phase:.0f} %"
