@@ -336,6 +336,7 @@ class GoalPicker(FigurePicture, widgets.HBox):
                     self._make_plan()
                 left[:], self._news = self.plan.steps, ""
                 begin()
+                self._show()
                 yaw, z = self.world.object_pose()[2], self.world.object_state()[2]
                 self.world.on_step = self._motion_log(on_step, z, pace_s)
                 try:

@@ -70,7 +70,6 @@ def object_data(obj: TabletopObject, effects: EffectMap, yaw_rad: float = 0.0) -
         "yaw": yaw_rad,
         "hand": {"along": along.round(5).tolist(), "gap": opening.round(5).tolist()},
         "map": effects.numbers(),
-        "warning": effects.warning,
     }
 
 

@@ -25,7 +25,8 @@ OBJECTS = {
     "wedge": Prism(((-0.05, -0.02), (0.05, -0.02), (0.05, 0.0), (-0.05, 0.03)), 0.04),
     "slab": Cuboid(0.14, 0.03, 0.04),
 }
-"""Four known kinds of objects, and shapes that no network of ours was trained on."""
+UNKNOWN = {"triangle", "wedge", "slab"}
+"""Shapes that the network of pushes was not trained on."""
 
 
 def data() -> dict[str, object]:
@@ -34,7 +35,8 @@ def data() -> dict[str, object]:
     with Tabletop() as world:
         for name, obj in OBJECTS.items():
             world.place(obj, (0.0, 0.0), 0.0)
-            objects.append({"name": name} | object_data(obj, skills.effects(world.depth_image())))
+            about = {"name": name, "known": name not in UNKNOWN}
+            objects.append(about | object_data(obj, skills.effects(world.depth_image())))
     return table_data(skills) | {"objects": objects}
 
 

@@ -74,7 +74,8 @@ function tell(full) {
   if (steps.length) text += `Predicted to end ${(1000 * distance).toFixed(1)} mm from the goal, σ ${(1000 * steps.at(-1).std).toFixed(1)} mm. `;
   if (!reached && steps.length) text += "The star is farther than these actions reach. ";
   if (full && full.distance > distance + 0.001) text += `Without stopping early it would miss by ${(1000 * full.distance).toFixed(0)} mm. `;
-  one(".words").textContent = text + object.warning;
+  if (!object.known) text += "The network was trained on no such object: errors may be far larger than predicted.";
+  one(".words").textContent = text;
 }
 
 function stop() {
@@ -137,7 +138,7 @@ objects.forEach((thing, k) => {
   choice.type = "button";
   choice.setAttribute("role", "radio");
   choice.innerHTML = `<svg viewBox="0 0 44 36" aria-hidden="true"><polygon points="${points}"/></svg>${escaped(thing.name)}` +
-    `<small class="${thing.warning ? "new" : ""}">${thing.warning ? "never seen" : "known kind"}</small>`;
+    `<small class="${thing.known ? "" : "new"}">${thing.known ? "known kind" : "never seen"}</small>`;
   choice.addEventListener("click", () => {
     [object, chain] = [thing, []];
     choose();
