@@ -25,7 +25,7 @@ from affordlib.interactions.lever_up import (
     POSE_CHANNELS,
     lever_up_tensors,
 )
-from affordlib.interactions.sampling import Batch, sample_from_start, sample_windows
+from affordlib.interactions.sampling import Batch, condition_on_poses
 from affordlib.models import CNPConfig, EffectNetwork, NetworkConfig, TrainingDomain
 from affordlib.models.base import network, with_time
 from affordlib.models.checkpoint import load_checkpoint
@@ -113,6 +113,26 @@ LEVER_MODELS: dict[str, LeverModel] = {
 
 All train for the same number of steps; those of the paper's network cost three times as much. The
 other learning rates minimise validation error (`experiments/lever_cross_validation.py`)."""
+
+
+def sample_windows(
+    tensors: InteractionTensors, n_targets: int, obs_max: int, generator: torch.Generator
+) -> Batch:
+    """Sample windows of obs_max observed samples followed by n_targets targets."""
+    latest = len(tensors.phase) - obs_max - n_targets
+    start = torch.randint(0, latest + 1, (len(tensors),), generator=generator)
+    target_at = start[:, None] + obs_max + torch.arange(n_targets)
+    return Batch.of(tensors, condition_on_poses(tensors, start, obs_max), target_at)
+
+
+def sample_from_start(
+    tensors: InteractionTensors, n_targets: int, obs_max: int, generator: torch.Generator
+) -> Batch:
+    """Use all samples after the first as targets; observe the first pose in half of the batches."""
+    n_poses = int(torch.randint(0, 2, (1,), generator=generator))
+    start = torch.zeros(len(tensors), dtype=torch.long)
+    target_at = torch.arange(1, len(tensors.phase))
+    return Batch.of(tensors, condition_on_poses(tensors, start, n_poses), target_at)
 
 
 def _sample_all(

@@ -97,23 +97,3 @@ def sample_forward(
     target_at = torch.randint(0, last + 1, (len(tensors), n_targets), generator=generator)
     target_at[:, 0] = last
     return Batch.of(tensors, condition_on_recorded_action(tensors), target_at)
-
-
-def sample_windows(
-    tensors: InteractionTensors, n_targets: int, obs_max: int, generator: torch.Generator
-) -> Batch:
-    """Sample windows of obs_max observed samples followed by n_targets targets."""
-    latest = len(tensors.phase) - obs_max - n_targets
-    start = torch.randint(0, latest + 1, (len(tensors),), generator=generator)
-    target_at = start[:, None] + obs_max + torch.arange(n_targets)
-    return Batch.of(tensors, condition_on_poses(tensors, start, obs_max), target_at)
-
-
-def sample_from_start(
-    tensors: InteractionTensors, n_targets: int, obs_max: int, generator: torch.Generator
-) -> Batch:
-    """Use all samples after the first as targets; observe the first pose in half of the batches."""
-    n_poses = int(torch.randint(0, 2, (1,), generator=generator))
-    start = torch.zeros(len(tensors), dtype=torch.long)
-    target_at = torch.arange(1, len(tensors.phase))
-    return Batch.of(tensors, condition_on_poses(tensors, start, n_poses), target_at)

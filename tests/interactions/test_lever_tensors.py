@@ -8,9 +8,8 @@ import torch
 
 from affordlib.interactions.dataset import augment_by_symmetry
 from affordlib.interactions.lever_up import N_OBSERVED, N_PREDICTED, lever_up_tensors
-from affordlib.interactions.sampling import sample_from_start, sample_windows
 from affordlib.models.lever_up import n_windows
-from experiments.lever_training import MIRRORED
+from experiments.lever_training import MIRRORED, sample_from_start, sample_windows
 
 
 def test_arrays_are_in_the_frame_of_the_lever(levers, levered):
