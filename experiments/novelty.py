@@ -39,6 +39,7 @@ from affordlib.types import Observations, Prediction
 from affordlib.world import CATEGORIES, TabletopObject
 from experiments.runner import Rows, study
 from experiments.shipped import data_of
+from experiments.uncertainty import calibration_row
 
 N_PUSHES = 150
 FOLDER = "runs/strangers"
@@ -333,7 +334,7 @@ def novelty_judged() -> Rows:
             row["error_mean_m"] = float((mean - truth).norm(dim=1).mean())
             row["first_beyond_2_sigma_percent"] = beyond_percent(truth, mean, first)
             for kind, sigma in (("", std), ("aware_", aware)):
-                covered = c.calibration_row(truth, mean, sigma)
+                covered = calibration_row(truth, mean, sigma)
                 row[f"{kind}sigma_median_m"] = float(sigma.norm(dim=1).median())
                 row |= {f"{kind}coverage_{k}": covered[f"coverage_{k}"] for k in (50, 90)}
                 row[f"{kind}beyond_2_sigma_percent"] = beyond_percent(truth, mean, sigma)

@@ -18,13 +18,24 @@ from typing import Any
 
 import numpy as np
 from scipy import optimize, stats
+from torch import Tensor
 
 from affordlib.geometry import xy_columns
 from affordlib.interactions import InteractionTensors, open_interactions, split_interactions
-from affordlib.models.calibration import AFTER_CONTACT, LEVELS, calibration_row, effects_at
+from affordlib.models.base import gaussian_nll
+from affordlib.models.calibration import AFTER_CONTACT, coverage, effects_at
 from affordlib.models.checkpoint import load_checkpoint
 from affordlib.models.protocol import EffectModel
 from experiments.runner import Rows, study
+
+LEVELS = (0.5, 0.9)
+
+
+def calibration_row(truth: Tensor, mean: Tensor, std: Tensor) -> dict[str, Any]:
+    """n, coverage of the central intervals, mean σ and NLL of values (N,)."""
+    row = {f"coverage_{v:.0%}"[:-1]: coverage(truth, mean, std, v) for v in LEVELS}
+    nll = float(gaussian_nll(truth, mean, std).mean())
+    return {"n": len(truth), **row, "std_mean": float(std.mean()), "nll": nll}
 
 
 def calibration_rows(

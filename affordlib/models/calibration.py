@@ -9,7 +9,7 @@ Variance scaling multiplies σ of an effect channel by s; the maximum-likelihood
 
 import math
 from collections.abc import Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -18,11 +18,9 @@ from torch import Tensor
 from affordlib.geometry import xy_columns
 from affordlib.interactions.dataset import InteractionTensors, check_fits
 from affordlib.interactions.sampling import condition_on_recorded_action
-from affordlib.models.base import gaussian_nll
 from affordlib.models.protocol import EffectModel
 from affordlib.types import check_within
 
-LEVELS = (0.5, 0.9)
 AFTER_CONTACT = (0.8, 0.9, 1.0)
 """Phases at which every push has moved its object; before contact the effect is always zero."""
 
@@ -77,10 +75,3 @@ def fit_sigma_scale(
     squared[plane] = squared[plane].mean()
     model.sigma_scale.copy_(squared.clamp_min(1e-6).sqrt())
     return tuple(model.sigma_scale.tolist())
-
-
-def calibration_row(truth: Tensor, mean: Tensor, std: Tensor) -> dict[str, Any]:
-    """n, coverage of the central intervals, mean σ and NLL of values (N,)."""
-    row = {f"coverage_{v:.0%}"[:-1]: coverage(truth, mean, std, v) for v in LEVELS}
-    nll = float(gaussian_nll(truth, mean, std).mean())
-    return {"n": len(truth), **row, "std_mean": float(std.mean()), "nll": nll}

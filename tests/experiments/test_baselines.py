@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from affordlib.interactions import InteractionTensors
-from affordlib.models.calibration import calibration_row
 from affordlib.models.predictions import final_error, network_predictions
 from affordlib.models.training import final_errors_m
 from experiments.baselines import constant, gaussian_process, nearest
 from experiments.cross_validation import add_errors, logistic
+from experiments.uncertainty import calibration_row
 
 # Answers
 
