@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, nullcontext
+from functools import partial
 from typing import Any
 
 from joblib import Parallel, delayed, parallel_config
@@ -29,7 +30,8 @@ def spread(
             running.append(name)
             yield delayed(_attempt)(function, name, task)
 
-    new = parallel_config("loky", inner_max_num_threads=1, initializer=_end_with_parent)
+    start = partial(_end_with, os.getpid())
+    new = parallel_config("loky", inner_max_num_threads=1, initializer=start)
     with new if workers > 1 else nullcontext():
         parallel = Parallel(
             max(1, min(workers, len(tasks))) if workers > 1 else None,
@@ -60,10 +62,9 @@ def _attempt(
         return name, None, error
 
 
-def _end_with_parent() -> None:
+def _end_with(parent: int) -> None:
     """Leave Ctrl-C to the parent process, and end this one within a second of its end."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = os.getppid()
 
     def watch():
         while os.getppid() == parent:
