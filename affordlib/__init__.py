@@ -19,10 +19,10 @@ types geometry primitives perception results weights world.objects
 world.tabletop planning.astar planning.closed_loop planning.continuous planning.disturbances
 planning.effect_map planning.gradient planning.grasp_rotate
 planning.problem planning.reachability planning.skills interactions.dataset
-interactions.sampling interactions.collect interactions.import_log interactions.lever_up
-interactions.log interactions.recipes interactions.store models.calibration models.checkpoint
-models.domain models.fit models.lever_up models.predictions models.protocol models.training
-evaluation.cross_validate planning.push_at show.executors show.explorers
+interactions.sampling interactions.collect interactions.lever_up interactions.recipes
+interactions.store logs.cross_validate logs.fit logs.log logs.planning models.calibration
+models.checkpoint models.domain models.lever_up models.predictions models.protocol models.training
+show.executors show.explorers
 show.goal_picker show.plots
 """
 _CONF = BeartypeConf(

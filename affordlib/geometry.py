@@ -48,6 +48,18 @@ def centroid(corners: np.ndarray) -> np.ndarray:
     return ((corners + following) * doubled[:, None]).sum(axis=0) / (3 * doubled.sum())
 
 
+def quarter_turn(a: torch.Tensor) -> torch.Tensor:
+    """Rotate vectors (..., 2) by +90°."""
+    import torch  # imported here because code that only simulates does not need it
+
+    return torch.stack([-a[..., 1], a[..., 0]], -1)
+
+
+def rotate(a: torch.Tensor, angle_rad: torch.Tensor) -> torch.Tensor:
+    """Rotate vectors (..., 2) by angles (...), counter-clockwise."""
+    return angle_rad.cos()[..., None] * a + angle_rad.sin()[..., None] * quarter_turn(a)
+
+
 def xy_columns(channels: tuple[str, ...]) -> list[int]:
     """Return the indices of the channels x and y, or an empty list unless both exist."""
     return [channels.index(name) for name in "xy"] if {"x", "y"} <= {*channels} else []
@@ -60,7 +72,7 @@ def rotate_channels(
 
     An absolute yaw (of an action) is rotated too; a relative one (of an effect) is unchanged.
     """
-    import torch  # imported here because code that only simulates does not need it
+    import torch
 
     cos, sin = heading.unbind(-1)
     columns = list(values.unbind(-1))

@@ -17,8 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from affordlib.geometry import rotated, unit_vector
-from affordlib.interactions.log import Log, PushLog
-from affordlib.models.fit import fit
+from affordlib.logs import Log, LoggedPushes, PushedObject, fit
 from affordlib.paths import repo_root
 from affordlib.primitives import PushAt
 from affordlib.results import write_results
@@ -51,17 +50,16 @@ def world_config(condition: str) -> WorldConfig:
     return WorldConfig(**inside, **friction)
 
 
-def read_log(folder: Path = FOLDER) -> PushLog:
+def read_log(folder: Path = FOLDER) -> LoggedPushes:
     """Read the embedded log."""
-    log = Log("mm", np.array(TRIANGLE_M) * 1e3, 0.24, tool_radius=500 * ROD_WIDTH_M)
+    log = Log("mm", np.array(TRIANGLE_M) * 1e3, tool_radius=500 * ROD_WIDTH_M)
     for path in sorted(folder.glob("*.txt.xz")):
         name = path.name.removesuffix(".txt.xz")
         told = dict(zip(("surface", "support"), name.split("_"), strict=True))
         for poses, t, xy in pushes_of(path):
             yaw = 2 * np.arctan2(poses[:, 6], poses[:, 3])
-            start, end = np.column_stack([poses[:, :2], yaw])
-            log.add(start, t, xy, end, context=told, group=name)
-    return log.tensors()
+            log.add(t, xy, np.column_stack([poses[:, :2], yaw]), context=told, group=name)
+    return log.pushes()
 
 
 def drawn_push(outline_m: np.ndarray, yaw: float, rng: np.random.Generator) -> PushAt:
@@ -113,12 +111,12 @@ def goals(n: int = N_GOALS) -> list[dict]:
     prism, rng = Prism(TRIANGLE_M, HEIGHT_M), np.random.default_rng(1)
     for condition in CONDITIONS:
         of_one = log.select(log.groups == condition)
-        model = Remembered(fit(of_one, "np"))
+        model, triangle = Remembered(fit(of_one, "np")), PushedObject.of(of_one)
         with Tabletop(world_config(condition)) as world:
             for _ in range(n // len(CONDITIONS)):
                 xy = rng.uniform(0.008, 0.03) * unit_vector(rng.uniform(-math.pi, math.pi))
                 world.place(prism, (0.0, 0.0), 0.0, tool="rod")
-                found += attempt(world, model, (*xy, rng.uniform(-0.35, 0.35)), of_one)
+                found += attempt(world, model, (*xy, rng.uniform(-0.35, 0.35)), triangle)
     return summary(found, ["corrected"])
 
 

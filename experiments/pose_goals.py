@@ -21,21 +21,18 @@ import torch
 from torch import Tensor
 
 from affordlib.geometry import rotated, wrap_angle
-from affordlib.interactions.log import PushLog
-from affordlib.models.fit import PushModel, in_object_frame, push_rows, told_feet
-from affordlib.models.neural_process import (
-    load_neural_process,
-    save_neural_process,
-    train_neural_process,
-)
+from affordlib.logs import LoggedPushes, PushedObject, Pushes, plan_push_at
+from affordlib.logs.fit import Forecast, PushModel, in_object_frame, push_rows, told_feet
+from affordlib.logs.neural_process import load_neural_process, train_neural_process
+from affordlib.logs.planning import primitive_of
 from affordlib.paths import repo_root
 from affordlib.perception import outline_of, turn_between
-from affordlib.planning.push_at import plan_push_at, primitive_of, pushes_around
 from affordlib.results import write_results
 from affordlib.types import Goal, Observation, Step, UnreachableError
 from affordlib.world import Cuboid, Prism, Tabletop, TabletopObject, WorldConfig
 from affordlib.world.robot import ROD_WIDTH_M
 from experiments.commands import command
+from experiments.pretrain_np import save_neural_process
 
 N_PARTS, N_OBJECTS, N_PUSHES, TRAINING = 2, 40, 12, (1500, 5e-4, 32)
 HEIGHTS_M = 0.04, 0.06
@@ -57,11 +54,11 @@ class PretrainedNeuralProcess:
     def __init__(self, name_or_path: str | Path = SEEN) -> None:
         self.network = load_neural_process(name_or_path)
 
-    def predict(self, pushes: PushLog) -> tuple[np.ndarray, np.ndarray]:
+    def predict(self, pushes: Pushes) -> Forecast:
         """Predict mean and σ (n, 3) of displacement [m] and turn [rad], in the object's frame."""
-        rows = push_rows(pushes)
+        rows, none = push_rows(pushes), torch.zeros(0, 10)
         feet = told_feet(pushes)[0]
-        return in_object_frame(pushes, *self.network.predict(rows[:, :7], rows[:0], feet))
+        return in_object_frame(pushes, *self.network.predict(rows[:, :7], none, feet))
 
 
 def drawn_object(rng: np.random.Generator) -> TabletopObject:
@@ -75,7 +72,7 @@ def collect(n_objects: int, seed: int) -> tuple[Tensor, Tensor]:
     with Tabletop() as world:
         while len(rows) < n_objects:
             obj, done = drawn_object(rng), {}
-            drawn = pushes_around(obj.footprint_m, ROD_WIDTH_M / 2, 2 * N_PUSHES, seed=rng)
+            drawn = PushedObject(obj.footprint_m, ROD_WIDTH_M / 2).draw(2 * N_PUSHES, rng)
             yaw = rng.uniform(-math.pi, math.pi)
             for k in range(2 * N_PUSHES):
                 world.place(obj, (0.0, 0.0), yaw, tool="rod")
@@ -89,8 +86,9 @@ def collect(n_objects: int, seed: int) -> tuple[Tensor, Tensor]:
                     break
             if len(done) == N_PUSHES:
                 effect = np.array([*done.values()])
-                of_one = drawn.select(np.array([*done]))
-                of_one = replace(of_one, displacement_m=effect[:, :2], turn_rad=effect[:, 2])
+                of_one = vars(drawn.select(np.array([*done])))
+                effects = {"displacement_m": effect[:, :2], "turn_rad": effect[:, 2]}
+                of_one = LoggedPushes(**of_one, **effects)
                 rows.append(push_rows(of_one))
                 feet.append(told_feet(of_one)[0])
     return torch.stack(rows), torch.stack(feet)
@@ -102,7 +100,7 @@ class Remembered:
     def __init__(self, model: PushModel) -> None:
         self.model, self.known = model, None
 
-    def predict(self, pushes: PushLog) -> tuple[np.ndarray, np.ndarray]:
+    def predict(self, pushes: Pushes) -> Forecast:
         """Return the model's prediction for the first pushes."""
         if self.known is None:
             self.known = self.model.predict(pushes)
@@ -123,21 +121,24 @@ def act(world: Tabletop, step: Step, seen: Observation) -> None:
 
 
 def pursue(
-    world: Tabletop, model: PushModel, goal: tuple[float, float, float], log: PushLog | None = None
+    world: Tabletop,
+    model: PushModel,
+    goal: tuple[float, float, float],
+    obj: PushedObject | None = None,
 ) -> Iterator[int]:
     """Push an object to a goal (x, y, turn), using only observations.
 
     A plan of up to three pushes is executed open loop from one observation. Then, up to four times,
     the robot observes the object and executes the first push of a new plan, unless no improvement
-    is predicted. log: pushes of this object, in its current pose; None uses the image's outline.
+    is predicted. obj: the object; None uses the image's outline.
     Yields the number of pushes after the plan, and after the corrections.
     """
     first = seen = observed(world)
-    log = log or pushes_around(outline_of(first.image), ROD_WIDTH_M / 2)
+    obj = obj or PushedObject.of(PushedObject(outline_of(first.image), ROD_WIDTH_M / 2).draw())
     turned, pushes = 0.0, 0
     for n in (3, *(min(3, k) for k in range(CORRECTIONS, 0, -1))):
         wanted = Goal(goal[:2], 0.001, wrap_angle(goal[2] - turned))
-        plan = plan_push_at(model, log, (*seen.xy_m, turned), wanted, n, turn_m=TURN_M)
+        plan = plan_push_at(model, obj, (*seen.xy_m, turned), wanted, n, turn_m=TURN_M)
         end = plan.steps[-1]
         turn = TURN_M * wrap_angle(end.predicted_turn_rad - wanted.turn_rad)
         expected = math.hypot(plan.predicted_distance_m, turn, end.std_m)
@@ -175,7 +176,7 @@ def task(world: Tabletop, rng: np.random.Generator) -> tuple[TabletopObject, lis
         obj, start = drawn_object(rng), [*rng.uniform(-0.1, 0.1, 2), rng.uniform(-math.pi, math.pi)]
         world.place(obj, tuple(start[:2]), start[2], tool="rod")
         for _ in range(GOAL_PUSHES):
-            drawn = pushes_around(obj.footprint_m, ROD_WIDTH_M / 2, 1, GOAL_LENGTHS_M, rng)
+            drawn = PushedObject(obj.footprint_m, ROD_WIDTH_M / 2, GOAL_LENGTHS_M).draw(1, rng)
             world.execute_primitive(primitive_of(drawn, 0, world.object_pose()[2]))
         if not world.placed.fell():
             return obj, start, [*world.object_pose()]

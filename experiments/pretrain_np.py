@@ -13,23 +13,25 @@ import argparse
 import math
 import time
 from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from affordlib.geometry import cross
-from affordlib.models.neural_process import (
-    FEET,
+from affordlib.geometry import cross, quarter_turn
+from affordlib.logs.log import FEET
+from affordlib.logs.neural_process import (
     PRETRAINED,
     NeuralProcess,
     in_contact_frame,
     rotation,
-    save_neural_process,
     train_neural_process,
     transformed,
 )
-from affordlib.models.quasi_static import quarter_turn, quasi_static_push
+from affordlib.logs.physics import quasi_static_push
 from affordlib.paths import repo_root
+from affordlib.weights import write_weights
 from experiments.commands import command, whole_type
 
 PUSHES, CHUNK = 48, 64
@@ -154,6 +156,12 @@ def simulate(n: int, g: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
     turned = truth[..., 2:] + after[..., 2:] - before[..., 2:]
     rows = torch.cat([contact, normal, seen(direction), travel, moved, turned], -1)
     return rows, feet, truth
+
+
+def save_neural_process(model: NeuralProcess, path: str | Path, about: dict[str, Any]) -> Path:
+    """Write a model to a safetensors file; about: plain JSON values on how it was made."""
+    description = {"model": "np", "config": {}, "scaler": {}, "domain": {}, "about": about}
+    return write_weights(path, model.state_dict(), description)
 
 
 def simulate_many(n: int, seed: int) -> list[Tensor]:

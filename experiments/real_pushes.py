@@ -2,11 +2,10 @@
 
     python -m experiments.real_pushes --logs FOLDER
 
-makes `data/results/real_pushes.json`; `--tune` also compares steps and learning rates of tuning to
-few pushes on inner folds of the two conditions CHOSEN_ON. FOLDER contains the logs of seven
-conditions, as published (or compressed with xz): github.com/robinzhoucmu/Pushing,
-icra_data_proc/SensorLogs (Apache License 2.0; Zhou, Paolini, Bagnell and Mason, A convex polynomial
-force-motion model for planar sliding, ICRA 2016).
+makes `data/results/real_pushes.json`. FOLDER contains the logs of seven conditions, as published
+(or compressed with xz): github.com/robinzhoucmu/Pushing, icra_data_proc/SensorLogs (Apache License
+2.0; Zhou, Paolini, Bagnell and Mason, A convex polynomial force-motion model for planar sliding,
+ICRA 2016).
 """
 
 from __future__ import annotations
@@ -17,18 +16,17 @@ import math
 from collections.abc import Iterator, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
-from unittest import mock
 
 import numpy as np
 import pandas as pd
 
-from affordlib.evaluation.cross_validate import BASELINES, errors_of, forecast_errors, summary
-from affordlib.interactions.log import Log, PushLog
-from affordlib.models.fit import EFFORT, MODELS, fit, folds_of, gyration_radius_m
-from affordlib.models.neural_process import PRETRAINED
+from affordlib.logs import Log, LoggedPushes, fit
+from affordlib.logs.cross_validate import errors_of, forecast_errors, summary
+from affordlib.logs.fit import BASELINES, EFFORT, folds_of
+from affordlib.logs.neural_process import PRETRAINED
 from experiments import runner
 from experiments.commands import command
-from experiments.runner import FOLDER, Job, Rows, frame, interval, read, run
+from experiments.runner import FOLDER, Job, Rows, frame, interval, read
 
 TABLE = "real_pushes"
 CHOSEN_ON = ("hardboard_3points1", "plywood_3points3")
@@ -91,20 +89,20 @@ def planar(pose: np.ndarray) -> tuple[float, float, float]:
 
 
 @lru_cache
-def read_logs(folder: str | Path, told: bool = True) -> PushLog:
+def read_logs(folder: str | Path, told: bool = True) -> LoggedPushes:
     """Read all pushes of the seven conditions; told: include the feet as context."""
-    log = Log(unit="mm", outline=CORNERS_MM, crop_width_m=0.24)
+    log = Log(unit="mm", outline=CORNERS_MM)
     for name in CONDITIONS:
         found = sorted(Path(folder).glob(f"{name}.txt*"))
         if not found:
             raise FileNotFoundError(f"--logs: there is no {name}.txt or {name}.txt.xz in {folder}")
         context = {"feet": feet_of(name.split("_")[1])} if told else {}
-        for (start, end), t, xy in pushes_of(found[0]):
-            log.add(planar(start), t, xy, end=planar(end), context=context, group=name)
-    return log.tensors()
+        for poses, t, xy in pushes_of(found[0]):
+            log.add(t, xy, [*map(planar, poses)], context=context, group=name)
+    return log.pushes()
 
 
-def from_40(data: PushLog, names: tuple[str, ...], seed: int, fold: int) -> pd.DataFrame:
+def from_40(data: LoggedPushes, names: tuple[str, ...], seed: int, fold: int) -> pd.DataFrame:
     """Return errors on a fold of each condition, trained on the condition's other folds."""
     tested, parts = folds_of(data.groups, 5, seed) == fold, []
     for name in CONDITIONS:
@@ -113,13 +111,13 @@ def from_40(data: PushLog, names: tuple[str, ...], seed: int, fold: int) -> pd.D
     return pd.concat(parts)
 
 
-def pooled(data: PushLog, names: tuple[str, ...], seed: int, fold: int) -> pd.DataFrame:
+def pooled(data: LoggedPushes, names: tuple[str, ...], seed: int, fold: int) -> pd.DataFrame:
     """Return errors on a fold of all conditions, trained on the other folds of all conditions."""
     tested = folds_of(data.groups, 5, seed) == fold
     return errors_of(data, ~tested, tested, names, seed)
 
 
-def unseen(data: PushLog, names: tuple[str, ...], seed: int, fold: int) -> pd.DataFrame:
+def unseen(data: LoggedPushes, names: tuple[str, ...], seed: int, fold: int) -> pd.DataFrame:
     """Return errors on a condition, trained on the six others and its first 0, 5 and 10 pushes.
 
     The neural process is trained on the others only and uses the first pushes as context.
@@ -129,18 +127,19 @@ def unseen(data: PushLog, names: tuple[str, ...], seed: int, fold: int) -> pd.Da
     tested, parts = np.isin(np.arange(len(data)), order[max(SHOTS) :]), []
     fitted = fit(data.select(~of_group), "np", seed) if names == ("np",) else None
     for shots in SHOTS:
+        given = np.concatenate([np.flatnonzero(~of_group), order[:shots]])
         if fitted is None:
-            trained = ~of_group | np.isin(np.arange(len(data)), order[:shots])
+            trained = np.isin(np.arange(len(data)), given)
             errors = errors_of(data, trained, tested, names, seed)
         else:
-            given, test = fitted.given(data.select(order[:shots])), data.select(tested)
-            errors = forecast_errors(given.predict(test), test)
+            fitted.data, test = data.select(given), data.select(tested)
+            errors = forecast_errors(fitted, test)
             errors = errors.assign(model="np", push=np.flatnonzero(tested))
         parts.append(errors.assign(shots=shots))
     return pd.concat(parts)
 
 
-NAMES = ("baselines", *MODELS)
+NAMES = ("baselines", "np")
 PROTOCOLS = {"from_40": (from_40, 5), "pooled": (pooled, 5), "unseen": (unseen, len(CONDITIONS))}
 COLUMNS = ["model", "shots", "push", "position_m", "yaw_rad", "inside_50", "inside_90"]
 
@@ -162,46 +161,6 @@ def job(protocol: str, predictor: str, told: bool, seed: int, fold: int, logs: s
     return Job(partial(measure, logs), arguments, settings, checkpoints=checkpoints, version=2)
 
 
-TUNING = "real_pushes_tuning"
-STEPS, RATES, INNER_FOLDS = (50, 100, 200), (1e-4, 3e-4), 5
-
-
-def tune(logs: str, steps: int, rate: float, condition: str, fold: int) -> dict:
-    """Return errors per push on an inner fold of a condition, with given settings of tuning.
-
-    The test pushes of fold 0 of seed 0 are excluded.
-    """
-    data = read_logs(logs, told=False)
-    data = data.select((data.groups == condition) & (folds_of(data.groups, 5, 0) > 0))
-    tested = folds_of(data.groups, INNER_FOLDS, 1) == fold
-    with mock.patch.dict(EFFORT, few=(steps, rate, EFFORT["few"][2])):
-        errors = errors_of(data, ~tested, tested, ("np",))
-    errors["both_m"] = errors["position_m"] + gyration_radius_m(data.outline_m) * errors["yaw_rad"]
-    return {"errors": errors[["push", "position_m", "yaw_rad", "both_m"]].to_dict("list")}
-
-
-def tuning_job(steps: int, rate: float, condition: str, fold: int, logs: str = "") -> Job:
-    """Return the job of one setting of tuning to few pushes, on a fold of a condition."""
-    arguments = {"steps": steps, "rate": rate, "condition": condition, "fold": fold}
-    return Job(partial(tune, logs), arguments, EFFORT["few"][2], checkpoints=(PRETRAINED,))
-
-
-def tuning_rows(folder: str | Path = FOLDER) -> Rows:
-    """Return errors by settings of tuning, and paired differences to the settings of `fit`.
-
-    both: the position error plus the yaw error times the radius of gyration, used to choose.
-    """
-    found, rows = frame(read(TUNING, tuning_job, folder), "errors"), []
-    pushes = found.set_index(["steps", "rate", "condition", "push"]).sort_index()
-    for way, part in pushes.groupby(["steps", "rate"]):
-        row = dict(zip(("steps", "rate"), way, strict=True)) | {"n": len(part)}
-        for name, unit in (("position", "m"), ("yaw", "rad"), ("both", "m")):
-            row[f"{name}_mean_{unit}"] = part[f"{name}_{unit}"].mean()
-        worse = part["both_m"].to_numpy() - pushes.loc[EFFORT["few"][:2], "both_m"]
-        rows.append(row | dict(zip(named("difference", "m"), interval(worse), strict=True)))
-    return rows
-
-
 def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
     """Return errors by protocol, model and context, and paired differences to the best baseline.
 
@@ -214,10 +173,8 @@ def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
     pushes["condition"] = np.array(CONDITIONS)[pushes["push"] // 50]
     found, others = {}, pushes[~pushes["condition"].isin(CHOSEN_ON)]
     for name, part in (("errors", pushes), ("other_conditions", others)):
-        found[name] = [
-            dict(zip(keys, key, strict=True)) | {"seeds": int(seeds[key])} | summary(part)
-            for key, part in part.groupby(keys)
-        ]
+        rows = summary(part, keys)
+        found[name] = [row | {"seeds": int(seeds[*(row[key] for key in keys)])} for row in rows]
     found["differences"] = [
         {"protocol": protocol, "shots": shots} | row
         for (protocol, shots), part in pushes.groupby(["protocol", "shots"])
@@ -225,7 +182,7 @@ def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
     ]
     for row in (row for rows in found.values() for row in rows):
         row["shots"] = int(row["shots"]) if row["shots"] >= 0 else None
-    return found | {"tuning": tuning_rows(folder)}
+    return found
 
 
 def differences(errors: pd.DataFrame) -> Rows:
@@ -258,11 +215,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run missing jobs and make the tables."""
     parser = runner.parser(TABLE, __doc__.splitlines()[0])
     parser.add_argument("--logs", help="folder of the published logs; without it, only tables")
-    parser.add_argument("--tune", action="store_true", help="compare settings of tuning")
     options = parser.parse_args(argv)
-    ways = itertools.product(STEPS, RATES, CHOSEN_ON, range(INNER_FOLDS)) if options.tune else ()
-    tunings = [tuning_job(*way, options.logs) for way in ways]
-    run(tunings if options.logs else [], TUNING, folder=options.raw)
     jobs = [
         job(protocol, predictor, told, seed, fold, options.logs)
         for protocol, (_, folds) in PROTOCOLS.items()
@@ -271,7 +224,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         # Within one condition, the feet are the same for all pushes.
         if predictor == "baselines" or not told or protocol != "from_40"
     ]
-    return runner.make(jobs if options.logs and not tunings else [], TABLE, options, tables)
+    return runner.make(jobs if options.logs else [], TABLE, options, tables)
 
 
 if __name__ == "__main__":

@@ -16,10 +16,10 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from affordlib import evaluation, interactions, models, planning, show, world
+from affordlib import interactions, logs, models, planning, show, world
 from affordlib.interactions.collect import collect
 from affordlib.interactions.recipes import Recipe, Variation
-from affordlib.models.fit import EFFORT
+from affordlib.logs.fit import EFFORT
 from affordlib.paths import repo_root
 from affordlib.primitives import Drag, Grasp, LeverUp, Push, PushAt, Rotate, primitive_named
 from affordlib.results import load_plan, read_results, results_table, save_plan, write_results
@@ -79,7 +79,7 @@ AT, BOX = (0.0, 0.0), world.Cuboid(0.06, 0.05, 0.05)
 CORNERS = tuple((0.03 * math.cos(a), 0.03 * math.sin(a)) for a in (0.0, 2.0, 4.0))
 CALLABLES = {
     name: value
-    for package in (world, interactions, models, planning, show, evaluation)
+    for package in (world, interactions, models, planning, show, logs)
     for name, value in vars(package).items()
     if callable(value) and not name.endswith(("Error", "Warning"))
 }
@@ -89,24 +89,24 @@ of_modules += (View, read_results, results_table, write_results)
 CALLABLES |= {each.__name__: each for each in of_modules}
 CALLABLES |= {"Push.towards": Push.towards, "Push.path": Push(0.0).path}
 CALLABLES["from_dataset"] = interactions.InteractionTensors.from_dataset
-CALLABLES["Log.add"] = interactions.Log("m", CORNERS).add
-CALLABLES["Log.centroid_pose"] = interactions.Log("m", CORNERS).centroid_pose
+CALLABLES |= {f"Log.{n}": getattr(logs.Log("m", CORNERS), n) for n in ("add", "query")}
+CALLABLES["Log.centroid_pose"] = logs.Log("m", CORNERS).centroid_pose
 OF_THE_WORLD = """
 place execute_primitive execute execute_path can_reach picture mark shove settle
 """
 MADE_BY_DRIVEN_ONES = """
 ClosedLoopResult DisturbanceSchedule EffectModel Execution Robot
-EffectNetwork NetworkConfig PushLog TabletopObject open_loop
+EffectNetwork FittedModel LoggedPushes NetworkConfig Pushes TabletopObject open_loop
 """
 NAMES = sorted({*CALLABLES, *OF_THE_WORLD.split(), "kind_for"} - {*MADE_BY_DRIVEN_ONES.split()})
 
 
 def log_of_eight():
     """The same push eight times."""
-    log = interactions.Log("m", CORNERS)
+    log = logs.Log("m", CORNERS)
     for _ in range(8):
-        log.add((0, 0, 0), (0, 1), ((-0.1, 0), (0, 0)), end=(0.01, 0, 0))
-    return log.tensors()
+        log.add((0, 1), ((-0.1, 0), (0, 0)), ((0, 0, 0), (0.01, 0, 0)))
+    return log.pushes()
 
 
 def fields_of(*made):
@@ -129,6 +129,7 @@ def shop(one_world, skills, pushes, tmp_path_factory):
     arrays = interactions.InteractionTensors.from_dataset(pushes, np.arange(12))
     scaler, domain = interactions.Scaler.fit(arrays), models.TrainingDomain.fit(arrays)
     config, test = models.CNPConfig(), interactions.open_interactions("push_test")
+    still = logs.fit(log, "constant")
     few = models.TrainingConfig(steps=1, batch_size=2, n_targets=2, device="cpu")
     network = models.build(config, scaler, domain)
     step = Step(Push(0.0), 0.5, (0.02, 0.0), path)
@@ -211,13 +212,18 @@ def shop(one_world, skills, pushes, tmp_path_factory):
         "refuse_seen": {"data": test},
         "collect": {"recipe": Recipe(n_interactions=1), "path": folder / "one.zarr.zip"}
         | {"progress": False},
-        "Log.add": {"start": (0.0,) * 3, "tool_t": (0.0, 1.0), "tool_xy": ((-0.1, 0.0), AT)}
-        | {"end": (0.02, 0.0, 0.0), "context": {"support": "felt"}},
+        "Log.add": {"poses": ((0.0,) * 3, (0.02, 0.0, 0.0)), "poses_t": (0.0, 1.0)}
+        | {"tool_t": (0.0, 1.0), "tool_xy": ((-0.1, 0.0), AT), "context": {"support": "felt"}},
+        "Log.query": {"tool_xy": ((-0.1, 0.0), AT), "context": {}},
         "Log.centroid_pose": {"pose": (0.0,) * 3},
         "fit": {"data": log, "model": "np"},
         "cross_validate": {"data": log, "models": (), "folds": 2},
         "plan_push_at": {"model": Still(), "pose": (0.0,) * 3, "goal": Goal((0.01, 0.0))}
-        | {"n_pushes": 1},
+        | {"obj": logs.PushedObject(np.array(CORNERS)), "n_pushes": 1},
+        "PushedObject": {"lengths_m": (0.01, 0.02), "context": {}},
+        "save_model": {"model": still, "path": folder / "still.safetensors"},
+        "load_model": {"path": logs.save_model(still, folder / "constant.safetensors")},
+        "summary": {"errors": logs.cross_validate(log, (), 2), "by": ("model",)},
         "FiLMNetwork": {"config": models.FiLMConfig()},
         "train": {"model": network, "config": few},
         "train_model": {"config": few, "model_config": config},

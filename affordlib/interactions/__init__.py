@@ -1,5 +1,4 @@
 """Interactions of the robot with objects: collection, storage and batches for training."""
 
 from affordlib.interactions.dataset import InteractionTensors, Scaler, Split, split_interactions
-from affordlib.interactions.log import Log, PushLog
 from affordlib.interactions.store import CorruptedDataError, open_interactions

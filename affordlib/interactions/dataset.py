@@ -3,6 +3,8 @@
 The split is 80/10/10 inside each of 10 folds (Section 4.3 of the paper).
 """
 
+import copy
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Self
 
@@ -123,7 +125,11 @@ _BY_INTERACTION = ("image", "action", "effect", "stop_phase")
 
 @dataclass(frozen=True)
 class InteractionTensors:
-    """Interactions as tensors."""
+    """Interactions as tensors.
+
+    Raises ValueError for numbers that are not in metres and radians, relative to the object's pose
+    at the start.
+    """
 
     image: torch.Tensor  # (N, 2, 48, 48), depth [m] and mask
     phase: torch.Tensor  # (S,)
@@ -137,6 +143,38 @@ class InteractionTensors:
     def __post_init__(self) -> None:
         if self.stop_phase is None:
             object.__setattr__(self, "stop_phase", torch.ones(len(self)))
+        n, steps = len(self.image), len(self.phase)
+        shapes = {"image": (2, *self.image.shape[-1:] * 2), "stop_phase": ()}
+        shapes |= {"action": (steps, len(self.action_channels))}
+        shapes |= {"effect": (steps, len(self.effect_channels))}
+        for name, shape in shapes.items():
+            if (got := tuple(getattr(self, name).shape)) != (n, *shape):
+                raise ValueError(f"{name} must be {(n, *shape)}, got {got}")
+        if steps < 2 or self.phase[0] != 0 or self.phase[-1] != 1 or (self.phase.diff() <= 0).any():
+            raise ValueError(f"phase must increase from 0 to 1, got {self.phase.tolist()!r:.80}")
+        if n:
+            self._check_values()
+
+    def _check_values(self) -> None:
+        """Raise ValueError for numbers that are not in metres, radians or relative to the start."""
+        depth, mask = self.image.amax(dim=(0, 2, 3)).tolist()
+        # Depth is measured from a plane 1 m above the table; an image of zeros hides the object.
+        if not (depth == 0 or 0.5 < depth < 1.5) or not 0 <= mask <= 1:
+            raise ValueError(
+                "image must be depth in metres from a plane 1 m above the table, and the mask in "
+                f"[0, 1], but their maxima are {depth:.3g} and {mask:.3g}"
+            )
+        for kind in ("action", "effect"):
+            most = getattr(self, kind).abs().amax(dim=(0, 1)).tolist()
+            for channel, value in zip(getattr(self, f"{kind}_channels"), most, strict=True):
+                largest = 4 * math.pi if channel in ("yaw", "tilt", "pitch") else 2.0
+                if not value <= largest:
+                    raise ValueError(
+                        f"{kind} must be in metres and radians, relative to the object's pose at "
+                        f"the start, but {channel!r} is up to {value:.3g}"
+                    )
+        if (start := float(self.effect[:, 0].abs().max())) > 1e-3:
+            raise ValueError(f"effect must be 0 at phase 0, got {start:.3g}; subtract the start")
 
     @classmethod
     def from_dataset(
@@ -187,7 +225,10 @@ class InteractionTensors:
 
     def select(self, rows: torch.Tensor | slice) -> Self:
         """Return the interactions with the given row numbers."""
-        return replace(self, **{n: getattr(self, n)[rows] for n in _BY_INTERACTION})
+        part = copy.copy(self)  # a batch of what is checked already
+        for name in _BY_INTERACTION:
+            object.__setattr__(part, name, getattr(self, name)[rows])
+        return part
 
     def joined(self, *others: "InteractionTensors") -> Self:
         """Concatenate these interactions with others that have the same phases and channels."""

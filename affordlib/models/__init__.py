@@ -6,6 +6,5 @@ from affordlib.models.checkpoint import build, load_checkpoint, save_checkpoint
 from affordlib.models.cnp import AffordanceCNP, CNPConfig
 from affordlib.models.domain import OutOfRangeWarning, TrainingDomain
 from affordlib.models.film import FiLMConfig, FiLMNetwork
-from affordlib.models.fit import fit
 from affordlib.models.protocol import EffectModel, condition_on_primitives
 from affordlib.models.training import TrainingConfig, train, train_model

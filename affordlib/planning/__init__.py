@@ -13,6 +13,5 @@ from affordlib.planning.disturbances import Disturbance, DisturbanceSchedule
 from affordlib.planning.effect_map import EffectMap
 from affordlib.planning.gradient import plan_gradient
 from affordlib.planning.problem import MODES, PlanMode, Planner, PlanningProblem
-from affordlib.planning.push_at import plan_push_at
 from affordlib.planning.robot import Execution, Robot
 from affordlib.planning.skills import Skills

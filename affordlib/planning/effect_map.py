@@ -21,10 +21,9 @@ from scipy.interpolate import NdBSpline
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from affordlib.geometry import xy_columns
+from affordlib.geometry import rotate, xy_columns
 from affordlib.models.protocol import EffectModel, condition_on_primitives
 from affordlib.models.push_frame import rotate_prediction
-from affordlib.models.quasi_static import rotate
 from affordlib.perception import radius_m
 from affordlib.primitives import Move, Push
 from affordlib.types import (

@@ -5,7 +5,7 @@ context is a set of such pushes and, where known, the feet. The network is a tra
 Grover, Transformer Neural Processes, ICML 2022) whose queries attend to feet and context only:
 predictions depend neither on the order of these, nor on other queries.
 
-Pushes and feet are rows as in `quasi_static.py`, in units of the object's radius of gyration, in
+Pushes and feet are rows as in `physics.py`, in units of the object's radius of gyration, in
 its frame; pushes with known outcome have three more values: displacement and rotation.
 """
 
@@ -14,20 +14,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import huber_loss, scaled_dot_product_attention, softplus
 
-from affordlib.geometry import cross
-from affordlib.models.checkpoint import restored
-from affordlib.models.quasi_static import quarter_turn
-from affordlib.weights import resolve_checkpoint, write_weights
+from affordlib.geometry import cross, quarter_turn
+from affordlib.weights import read_weights, resolve_checkpoint
 
 WIDTH, BLOCKS, HEADS = 64, 4, 4
-FEET = 12
-"""Maximum number of feet; if fewer are known, the others have weight zero."""
 PRETRAINED = "np_simulated_pushes"
 _CONTEXT = 32
 _OUTCOME_SCALE = 0.12
@@ -187,13 +182,13 @@ def _loss(mean: Tensor, std: Tensor, truth: Tensor) -> Tensor:
     return huber_loss(50 * mean, 50 * truth) + 0.05 * (std.log() + off.clamp(-4, 4) ** 2 / 2).mean()
 
 
-def save_neural_process(model: NeuralProcess, path: str | Path, about: dict[str, Any]) -> Path:
-    """Write a model to a safetensors file; about: plain JSON values on how it was made."""
-    description = {"model": "np", "config": {}, "scaler": {}, "domain": {}, "about": about}
-    return write_weights(path, model.state_dict(), description)
-
-
 def load_neural_process(name_or_path: str | Path = PRETRAINED) -> NeuralProcess:
-    """Load what `save_neural_process` wrote; ValueError if it is damaged or of another kind."""
-    remedy = "train it: python -m experiments.pretrain_np"
-    return restored(resolve_checkpoint(name_or_path), remedy, lambda _: NeuralProcess())[0]
+    """Load a shipped or another checkpoint; ValueError if it is damaged or of another kind."""
+    path, remedy = resolve_checkpoint(name_or_path), "train it: python -m experiments.pretrain_np"
+    tensors, description = read_weights(path, remedy)
+    if description.get("model") != "np":
+        raise ValueError(f"{path} holds no neural process of pushes; {remedy}")
+    with torch.device("meta"):  # draws no random weights
+        model = NeuralProcess()
+    model.load_state_dict(tensors, assign=True)
+    return model.eval()

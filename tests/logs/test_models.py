@@ -7,18 +7,17 @@ import pytest
 import torch
 from scipy.optimize import minimize
 
-from affordlib.interactions.log import PushLog
-from affordlib.models.fit import fit, sigma_scale
-from affordlib.models.neural_process import (
+from affordlib.logs import LoggedPushes, cross_validate, fit, load_model, save_model
+from affordlib.logs.fit import MODELS, mirrors, sigma_scale
+from affordlib.logs.neural_process import (
     NeuralProcess,
     in_contact_frame,
     load_neural_process,
     rotation,
-    save_neural_process,
     transformed,
 )
-from affordlib.models.quasi_static import ELLIPSOID, AnalyticPusher, quasi_static_push
-from experiments.pretrain_np import simulate
+from affordlib.logs.physics import ELLIPSOID, AnalyticPusher, quasi_static_push
+from experiments.pretrain_np import save_neural_process, simulate
 
 TRIANGLE_M = np.array([(-0.05, -0.05), (0.1, -0.05), (-0.05, 0.1)])
 
@@ -33,27 +32,19 @@ def shipped():
     return load_neural_process()
 
 
-def log_of(rows, context=None, crop_width_m=0.24):
-    """Simulated pushes (n, 10) of a triangle as a log with start and end poses only."""
+def log_of(rows, context=None, outline_m=TRIANGLE_M):
+    """Simulated pushes (n, 10) of a triangle as a log."""
     rows = rows.double().numpy() * [0.05, 0.05, 1, 1, 1, 1, 0.05, 0.05, 0.05, 1]
-    n, ends = len(rows), np.zeros((len(rows), 2, 3))
-    ends[:, 1] = rows[:, 7:]
-    way = np.stack(
-        [rows[:, :2] - 0.01 * rows[:, 4:6], rows[:, :2] + rows[:, 6:7] * rows[:, 4:6]], 1
-    )
-    return PushLog(
-        rows[:, :2],
-        rows[:, 2:4],
-        rows[:, 4:6],
-        rows[:, 6],
-        rows[:, 7:9],
-        rows[:, 9],
-        np.array(["a"] * n),
-        context or {},
-        way,
-        ends,
-        TRIANGLE_M,
-        crop_width_m,
+    return LoggedPushes(
+        contact_m=rows[:, :2],
+        normal=rows[:, 2:4],
+        direction=rows[:, 4:6],
+        length_m=rows[:, 6],
+        displacement_m=rows[:, 7:9],
+        turn_rad=rows[:, 9],
+        groups=np.array(["a", "b"] * len(rows))[: len(rows)],
+        context=context or {},
+        outline_m=outline_m,
     )
 
 
@@ -102,9 +93,7 @@ def test_simulated_pushes_turn_and_mirror_with_the_object(simulated):
 
 def test_analytic_pusher_finds_the_numbers_that_made_the_pushes(simulated):
     push = simulated[0][0, :40, :7]
-    made = AnalyticPusher(push, torch.zeros(40, 3))
-    made.friction, made.size = 0.3, 0.6
-    found = AnalyticPusher(push, made.predict(push))
+    found = AnalyticPusher.fitted(push, AnalyticPusher(0.3, 0.6).predict(push))
     assert (found.friction, found.size) == pytest.approx((0.3, 0.6), rel=0.1)
 
 
@@ -166,8 +155,10 @@ def test_tuning_lowers_the_error_where_the_world_is_another():
     train, test = log_of(rows[:40]), log_of(rows[40:])
     model = fit(train, "np")
     truth = np.column_stack([test.displacement_m, test.turn_rad]) / [0.05, 0.05, 1]
-    untuned = fit(train, "np")
-    untuned.members = [load_neural_process()]  # with the log as context alone
+    untuned = fit(train, "np")  # with the log as context alone
+    for k in range(3):
+        for name, weights in load_neural_process().state_dict().items():
+            untuned.state[f"member {k}.{name}"] = weights.numpy()
     off = [np.abs(m.predict(test)[0] / [0.05, 0.05, 1] - truth).mean() for m in (model, untuned)]
     assert off[0] < off[1], off
 
@@ -182,26 +173,49 @@ def test_fit_refuses_what_it_does_not_know():
     rows = simulate(1, torch.Generator().manual_seed(8))[0][0]
     with pytest.raises(ValueError, match="model must be one of"):
         fit(log_of(rows), "x")
-    with pytest.raises(ValueError, match="at least 8"):
-        fit(log_of(rows[:7]))
+    for few, model in ((rows[:7], "np"), (rows, "physics_feet")):
+        with pytest.raises(ValueError, match=r"at least 8 pushes .*context\['feet'\]"):
+            fit(log_of(few), model)
+    narrow = log_of(rows, outline_m=0.9 * TRIANGLE_M)
+    with pytest.raises(ValueError, match="pushes: their outline_m or tool_radius_m"):
+        fit(log_of(rows), "constant").predict(narrow)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_model_predicts_the_same_after_it_was_saved(name, tmp_path):
+    rows, feet, _ = simulate(1, torch.Generator().manual_seed(8))
+    known = np.repeat(feet.double().numpy() * [0.05, 0.05, 1], 20, axis=0)
+    words, places = np.array(["felt", "steel"] * 10), np.arange(40.0).reshape(20, 2)
+    data = log_of(rows[0, :20], {"feet": known, "surface": words, "place": places})
+    model = fit(data, name, seed=3)
+    path = save_model(model, tmp_path / "model.safetensors")
+    for one, again in zip(model.predict(data), load_model(path).predict(data), strict=True):
+        np.testing.assert_array_equal(one, again)
+    path.write_bytes(path.read_bytes()[:-9])
+    with pytest.raises(ValueError, match=r"damaged.*fit the model to its log again"):
+        load_model(path)
+
+
+def test_other_files_hold_no_model_of_pushes(tmp_path):
+    with pytest.raises(ValueError, match="holds no model of pushes"):
+        load_model(save_neural_process(NeuralProcess(), tmp_path / "np.safetensors", {}))
+    with pytest.raises(FileNotFoundError, match="there is no model at"):
+        load_model(tmp_path / "missing.safetensors")
+
+
+def test_cross_validation_leaves_the_number_of_threads_alone(monkeypatch):
+    rows = simulate(1, torch.Generator().manual_seed(8))[0][0]
+    monkeypatch.setattr("joblib.cpu_count", lambda: 1)  # runs in this process
+    torch.set_num_threads(2)
+    cross_validate(log_of(rows[:16]), models=(), folds=2)
+    assert torch.get_num_threads() == 2
+
+
+def test_the_mirrors_of_outlines():
+    square = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * 0.03
+    assert len(mirrors(square)) == 4
+    assert not mirrors(np.array([[0.0, 0.05], [-0.04, -0.01], [0.04, -0.04]]))
 
 
 def test_untrained_network_has_the_stated_size():
     assert sum(p.numel() for p in NeuralProcess().parameters()) < 250_000
-
-
-@pytest.mark.parametrize("name", ["film", "cnp"])
-def test_networks_learn_from_a_log_what_context_tells(name):
-    # The same pushes with opposite outcomes, distinguished by a word in the context.
-    rows = simulate(1, torch.Generator().manual_seed(8))[0][0]
-    rows = torch.cat([rows, rows])
-    rows[48:, 7:] *= -1
-    words = np.repeat(["forth", "back"], 48)
-    log = log_of(rows, {"way": words})
-    fitted = fit(log, name)
-    mean, std = fitted.predict(log)
-    truth = np.column_stack([log.displacement_m, log.turn_rad])
-    assert np.abs(mean - truth).mean() < 0.6 * np.abs(truth).mean()
-    assert (std > 0).all()
-    with pytest.raises(ValueError, match="crop_width_m is"):
-        fitted.predict(log_of(rows, {"way": words}, 0.2))

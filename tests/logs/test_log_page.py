@@ -6,11 +6,8 @@ import lzma
 import numpy as np
 import pytest
 
-from affordlib.models import fit
+from affordlib.logs import PushedObject, fit
 from affordlib.paths import repo_root
-from affordlib.planning import plan_push_at
-from affordlib.types import Goal
-from tests.problems import Still
 
 TRIANGLE_MM = [[0, 0], [130, 0], [30, 110]]
 
@@ -38,12 +35,8 @@ def test_from_a_csv_to_a_model_and_a_plan(cells, tmp_path):
     written = run(cells, "c03 csv", tmp_path)  # what is folded; the rest brings its own imports
     known = {"csv": written["csv"], "out": tmp_path}
     names = run(cells, "c05 fit predict plan", tmp_path, **known)
-    table, plan, log, pushes = (names[name] for name in ("table", "plan", "log", "pushes"))
-    assert table.columns.tolist() == [
-        *("model", "group", "n_train", "n", "position_mean_m", "position_sem_m"),
-        *("position_median_m", "yaw_mean_rad", "yaw_sem_rad", "coverage_50", "coverage_90"),
-    ]
-    error = table.set_index("model")["position_mean_m"]
+    plan, log, pushes = (names[name] for name in ("plan", "log", "pushes"))
+    error = {row["model"]: row["position_mean_m"] for row in names["table"]}
     assert error["physics_gp"] < error["gaussian_process"] < error["constant"]
     assert error["np"] < error["constant"]
     assert plan.predicted_distance_m < 0.003
@@ -58,8 +51,8 @@ def test_from_a_csv_to_a_model_and_a_plan(cells, tmp_path):
     # The first push, in the robot's frame and unit, is a push of the log: recorded, it reads alike.
     contact, end = names["contact_mm"], names["end_mm"]
     path = np.array([contact - 0.5 * (end - contact), end])
-    log.add(names["now"], (0, 1), path, names["now"])
-    read, push = log.tensors().select(np.array([-1])), plan.steps[0].primitive
+    log.add((0, 1), path, (names["now"], names["now"]))
+    read, push = log.pushes().select(np.array([-1])), plan.steps[0].primitive
     assert read.length_m[0] == pytest.approx(push.length, abs=1e-6)
     ahead = np.arctan2(*read.direction[0, ::-1]) + names["now"][2]
     assert np.cos(ahead - push.direction) == pytest.approx(1)
@@ -101,5 +94,5 @@ def test_plans_want_one_group(cells, tmp_path):
     data = run(cells, "c03 csv c05 conditions", tmp_path)["data"]
     assert len(data) == 250
     assert np.degrees(np.arccos((data.normal * data.direction).sum(axis=1))).max() < 52
-    with pytest.raises(ValueError, match="log must hold one group"):
-        plan_push_at(Still(), data, (0.0, 0.0, 0.0), Goal((0.01, 0.0)))
+    with pytest.raises(ValueError, match="pushes must be of one group"):
+        PushedObject.of(data)

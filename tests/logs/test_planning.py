@@ -6,16 +6,20 @@ import numpy as np
 import pytest
 
 from affordlib.geometry import cross, wrap_angle
-from affordlib.planning.push_at import primitive_of, pushes_around
-from affordlib.world import Cuboid
+from affordlib.logs import PushedObject, plan_push_at
+from affordlib.logs.fit import told_feet
+from affordlib.logs.planning import primitive_of
+from affordlib.types import Goal
+from affordlib.world import Cuboid, UprightCylinder
 from experiments.pose_goals import PretrainedNeuralProcess, pursue
+from tests.problems import Still
 
 OUTLINE_M = np.array([[0.03, -0.02], [0.03, 0.02], [-0.03, 0.02], [-0.03, -0.02]])
 TOOL_M = 0.0015
 
 
 def test_the_middle_of_the_tool_stays_its_radius_outside():
-    pushes = pushes_around(OUTLINE_M + 0.01, TOOL_M, n=50)
+    pushes = PushedObject(OUTLINE_M + 0.01, TOOL_M).draw(50)
     np.testing.assert_allclose(pushes.outline_m, OUTLINE_M, atol=1e-12)
     for k in range(50):
         primitive = primitive_of(pushes, k, 0.0)
@@ -27,7 +31,7 @@ def test_the_middle_of_the_tool_stays_its_radius_outside():
 
 
 def test_a_turned_object_is_pushed_alike():
-    pushes, quarter = pushes_around(OUTLINE_M, TOOL_M, n=5), math.pi / 2
+    pushes, quarter = PushedObject(OUTLINE_M, TOOL_M).draw(5), math.pi / 2
     for k in range(5):
         as_is, turned = (primitive_of(pushes, k, heading) for heading in (0.0, quarter))
         x, y = as_is.contact
@@ -51,3 +55,32 @@ def test_pursuit_knows_only_what_it_observes(world, monkeypatch):
     assert n_pushes[1] <= n_pushes[0] + 4
     assert math.dist((x, y), (0.04, -0.01)) < 0.003
     assert abs(yaw - 0.6) < math.radians(3)
+
+
+def test_round_objects_have_no_more_feet_than_a_model_takes():
+    feet = told_feet(PushedObject(UprightCylinder(0.06, 0.05).footprint_m).draw(3))
+    assert feet.shape == (3, 12, 3)
+    assert feet[0, :, 2].sum() == pytest.approx(1)
+    assert feet[0, :, :2].mean(dim=0).abs().max() < 1e-5
+
+
+def test_a_plan_that_does_not_turn_misses_a_turn():
+    reaches = [
+        plan_push_at(Still(), PushedObject(OUTLINE_M), (0.3, 0.3, 0.0), goal, 1).reaches_goal
+        for goal in (Goal((0.3, 0.3)), Goal((0.3, 0.3), turn_rad=1.5))
+    ]
+    assert reaches == [True, False]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        ({"tool_radius_m": math.nan}, "tool_radius_m must be a finite"),
+        ({"lengths_m": (0.02, 0.01)}, "lengths_m must be a range"),
+    ],
+)
+def test_what_no_object_has_is_refused(wrong, says):
+    with pytest.raises(ValueError, match=says):
+        PushedObject(OUTLINE_M, **wrong)
+    with pytest.raises(ValueError, match="n must be a whole number in"):
+        PushedObject(OUTLINE_M).draw(10**9)

@@ -1,0 +1,9 @@
+"""A log of one's own: off-centre pushes of one object, models fitted to them, and plans.
+
+It stands on the package's ground, beside all other parts.
+"""
+
+from affordlib.logs.cross_validate import cross_validate, summary
+from affordlib.logs.fit import FittedModel, fit, load_model, save_model
+from affordlib.logs.log import Log, LoggedPushes, Pushes
+from affordlib.logs.planning import PushedObject, plan_push_at
