@@ -915,7 +915,8 @@ function render({ model, el }) {
     if (timer) return;
     const frame = (now) => {
       const last = recorded.length - 1;
-      const place = still() ? last : Math.min((now - began) / (1000 * model.get("scene").pace), last);
+      // A frame's time may lie a little before the message's.
+      const place = still() ? last : between(0, (now - began) / (1000 * model.get("scene").pace), last);
       at(place);
       const waits = place >= last;
       if (waits) began = now - 1000 * model.get("scene").pace * last; // for what is simulated next
