@@ -16,7 +16,7 @@ _NO_TEXT = Is[lambda value: not isinstance(value, str)]
 _NUMBERS = Annotated[Sequence[_NUMBER], _NO_TEXT] | np.ndarray
 _CHECKED = """
 types geometry primitives perception results weights world.objects
-world.tabletop planning.astar planning.closed_loop planning.continuous planning.disturbances
+world.tabletop planning.astar planning.closed_loop planning.continuous
 planning.effect_map planning.gradient planning.grasp_rotate
 planning.problem planning.reachability planning.skills interactions.dataset
 interactions.sampling interactions.collect interactions.lever_up interactions.recipes

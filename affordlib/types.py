@@ -11,11 +11,11 @@ import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from numbers import Integral, Real
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
-from affordlib.geometry import is_convex, rotated
+from affordlib.geometry import is_convex, rotated, wrap_angle
 
 if TYPE_CHECKING:
     import torch
@@ -187,13 +187,14 @@ class Observation:
     xy_m: estimated position (x, y) [m] in the table's frame; image: (2, 48, 48), depth [m] from a
     plane 1 m above the table and the object's mask, centred at xy_m to within a few millimetres;
     yaw_rad: the object's yaw [rad], if the robot can estimate it; yaw_std_rad: its σ [rad], None if
-    the yaw was not seen but dead-reckoned.
+    the yaw was not seen but dead-reckoned; std_m: σ of the position along an axis [m].
     """
 
     xy_m: tuple[float, float]
     image: np.ndarray
     yaw_rad: float | None = None
     yaw_std_rad: float | None = None
+    std_m: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -314,13 +315,28 @@ class Prediction:
     effect_std: torch.Tensor  # (B, T, C_e)
 
 
+class GoalError(NamedTuple):
+    """What is left to one part of a goal, and its tolerance, both in metres or in radians."""
+
+    left: float
+    tolerance: float
+    text: str
+
+    def is_met(self, std: float = 0.0) -> bool:
+        """Return whether it is within the tolerance, by twice the σ of its observation."""
+        return abs(self.left) + 2 * std <= self.tolerance
+
+
 @dataclass(frozen=True)
 class Goal:
-    """The desired position (x, y) [m] of the object on the table and its tolerance [m].
+    """The desired position (x, y) [m] of the object and its tolerance [m].
 
     turn_rad: desired rotation [rad] from its current orientation, None for any;
     height_m: desired lift [m] above its current height, None to leave it on the table.
     """
+
+    TURN_TOLERANCE_RAD: ClassVar[float] = math.radians(2)
+    HEIGHT_TOLERANCE_M: ClassVar[float] = 0.003
 
     xy_m: tuple[float, float]
     tolerance_m: float = 0.02
@@ -328,7 +344,7 @@ class Goal:
     height_m: float | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "xy_m", check_on_table("goal xy_m", self.xy_m))
+        object.__setattr__(self, "xy_m", check_pair("goal xy_m", self.xy_m))
         check_field(self, "tolerance_m", 0.0, 0.5, "m")
         if self.turn_rad is not None:
             check_field(self, "turn_rad", -math.pi, math.pi, "rad")
@@ -336,8 +352,26 @@ class Goal:
             check_field(self, "height_m", 0.0, 0.5, "m")
 
     def distance_m(self, xy_m: Sequence[float]) -> float:
-        """Return the distance [m] between the goal and a point (x, y) [m] on the table."""
+        """Return the distance [m] between the goal and a point (x, y) [m]."""
         return float(np.hypot(xy_m[0] - self.xy_m[0], xy_m[1] - self.xy_m[1]))
+
+    def errors(
+        self, xy_m: Sequence[float], turned_rad: float = 0.0, lifted_m: float = 0.0
+    ) -> dict[str, GoalError]:
+        """Return what is left to each part of the goal, in the order in which they are corrected.
+
+        xy_m: the object's position; turned_rad, lifted_m: how far it was rotated and lifted.
+        """
+        away_m = self.distance_m(xy_m)
+        found = {"position": GoalError(away_m, self.tolerance_m, f"{1000 * away_m:.1f} mm")}
+        if self.turn_rad is not None:
+            left, tolerance = wrap_angle(self.turn_rad - turned_rad), self.TURN_TOLERANCE_RAD
+            found["orientation"] = GoalError(left, tolerance, f"{math.degrees(abs(left)):.1f}°")
+        if self.height_m is not None:
+            left, text = self.height_m - lifted_m, "{:.1f} mm in height"
+            text = text.format(1000 * abs(left))
+            found["height"] = GoalError(left, self.HEIGHT_TOLERANCE_M, text)
+        return found
 
 
 @dataclass(frozen=True)
@@ -382,7 +416,7 @@ class Plan:
     plan_s: float
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "start_xy_m", check_on_table("start_xy_m", self.start_xy_m))
+        object.__setattr__(self, "start_xy_m", check_pair("start_xy_m", self.start_xy_m))
         check_field(self, "plan_s", 0.0)
 
     @property
@@ -411,6 +445,9 @@ class Outcome:
     turned_rad: float = 0.0
     lifted_m: float = 0.0
     words: str = ""
+
+    def __post_init__(self) -> None:
+        check_field(self, "distance_m", 0.0, unit="m")
 
     def with_goal(self, goal: Goal) -> Outcome:
         """Return the outcome with its distance measured to another goal."""

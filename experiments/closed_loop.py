@@ -24,19 +24,15 @@ import numpy as np
 import pandas as pd
 from scipy.spatial import ConvexHull
 
-from affordlib.geometry import wrap_angle
 from affordlib.interactions.recipes import Variation
 from affordlib.models import load_checkpoint
 from affordlib.planning import (
     ClosedLoopConfig,
     ClosedLoopResult,
-    Disturbance,
-    DisturbanceSchedule,
     Robot,
     Skills,
     run_closed_loop,
 )
-from affordlib.planning.disturbances import KINDS
 from affordlib.planning.grasp_rotate import GRIPPER_YAWS_RAD
 from affordlib.planning.skills import CHECKPOINTS
 from affordlib.primitives import Grasp, Move, move_for
@@ -50,6 +46,7 @@ from affordlib.world import (
 )
 from experiments import runner
 from experiments.commands import command
+from experiments.disturbances import KINDS, Disturbance, DisturbanceSchedule
 from experiments.feasibility import half_width_m, is_feasible, on_the_rim
 from experiments.runner import FOLDER, Job, Rows, plain
 
@@ -90,6 +87,8 @@ TOLERANCE_M = dict.fromkeys(POSE_PRIMITIVES, 0.004)
 
 WITHIN_M, WITHIN_HEIGHT_M, WITHIN_TURN_RAD = 0.005, 0.005, math.radians(3)
 STATUSES = ("reached", "unreachable", "gave_up", "lost")
+ARRIVED = ("reached", "unconfirmed")
+"""Statuses of a loop that count as reached here, where the simulator measures the errors."""
 EDGE_M = 0.05
 """Smallest distance [m] of a goal of `reachability` from the table's edge."""
 
@@ -241,20 +240,17 @@ def _measured(world: Tabletop, result: ClosedLoopResult, yaw: float, z: float) -
 
     yaw, z: initial yaw [rad] and height [m] of the object.
     """
-    goal, pose = result.goal, world.object_pose()
-    turn_error = height_error = None
-    if goal.turn_rad is not None:
-        turn_error = wrap_angle(goal.turn_rad - (pose[2] - yaw))
-    if goal.height_m is not None:
-        height_error = goal.height_m - (world.object_state()[2] - z)
+    pose = world.object_pose()
+    errors = result.goal.errors(pose[:2], pose[2] - yaw, world.object_state()[2] - z)
+    left = {name: error.left for name, error in errors.items()}
     return {
-        "status": result.status,
+        "status": "reached" if result.status in ARRIVED else result.status,
         "message": result.message,
-        "distance_m": goal.distance_m(pose[:2]),
+        "distance_m": left["position"],
         "actions": len(result.steps),
         "plans": len(result.plans),
-        "turn_error_rad": turn_error,
-        "height_error_m": height_error,
+        "turn_error_rad": left.get("orientation"),
+        "height_error_m": left.get("height"),
         "orientation_reckoned": "orientation" in result.reckoned,
     }
 
@@ -268,7 +264,7 @@ def _can_be_lifted(world: Tabletop, trial: Trial, result: ClosedLoopResult) -> b
         done = world.execute_primitive(Grasp(grip_yaw=grip_yaw), record_unreachable=True)
         return bool(done.effect[:, 2].max() >= high)
 
-    return result.reached or any(map(lifts, GRIPPER_YAWS_RAD))
+    return result.status in ARRIVED or any(map(lifts, GRIPPER_YAWS_RAD))
 
 
 def _stays_feasible(

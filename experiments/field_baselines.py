@@ -73,7 +73,7 @@ def plan_cem(problem: PlanningProblem, seed: int = 0) -> Plan:
         drawn = mean + std * rng.standard_normal((N_CHAINS, *mean.shape))
         drawn[..., 1] = drawn[..., 1].clip(effects.kind.acts_from, 1) if mode.partial else 1.0
         chains = torch.from_numpy(drawn)
-        cost, _ = continuous._objective(effects, torch.from_numpy(goal), *chains.unbind(-1))
+        cost, _ = continuous.objective(effects, torch.from_numpy(goal), chains.unbind(-1))
         order = cost.argsort()[:N_ELITE]
         elite = drawn[order]
         mean, std = elite.mean(axis=0), elite.std(axis=0)

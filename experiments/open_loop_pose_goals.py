@@ -14,7 +14,6 @@ from typing import Any
 
 import pandas as pd
 
-from affordlib.geometry import wrap_angle
 from affordlib.planning import execute_plan, plan_astar, plan_continuous
 from affordlib.planning.skills import CHECKPOINTS
 from affordlib.types import UnreachableError
@@ -49,16 +48,13 @@ def run_open_loop(table: str, index: int, planner: str) -> dict[str, Any]:
     with suppress(UnreachableError):
         execute_plan(world, plan)
     pose = world.object_pose()
-    if table == "orientation":
-        pose_error = wrap_angle(trial.goal.turn_rad - (pose[2] - yaw))
-    else:
-        pose_error = trial.goal.height_m - (world.object_state()[2] - z)
+    errors = trial.goal.errors(pose[:2], pose[2] - yaw, world.object_state()[2] - z)
     world.park()
     return {
         "object_class": trial.obj.category,
         "actions": len(plan.steps),
-        "distance_m": trial.goal.distance_m(pose[:2]),
-        "pose_error": abs(pose_error),
+        "distance_m": errors["position"].left,
+        "pose_error": abs(errors[table].left),
     }
 
 

@@ -17,7 +17,6 @@ from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
-from unittest import mock
 
 import numpy as np
 import pandas as pd
@@ -27,6 +26,7 @@ from tqdm.auto import tqdm
 from affordlib.models.checkpoint import load_checkpoint
 from affordlib.models.predictions import error_row
 from affordlib.models.protocol import EffectModel
+from affordlib.perception import adapt_to_object
 from affordlib.planning import (
     EffectMap,
     Execution,
@@ -35,14 +35,12 @@ from affordlib.planning import (
     PlanningProblem,
     Robot,
     Skills,
-    continuous,
     execute_plan,
     plan_astar,
     plan_continuous,
     plan_gradient,
 )
-from affordlib.planning.closed_loop import is_seen_on_table
-from affordlib.planning.problem import MODES
+from affordlib.planning.problem import MODES, OUR_TABLE
 from affordlib.primitives import Push
 from affordlib.types import NothingSeenError, Observation, Outcome, Plan, Step
 from affordlib.world import ROLLABLE, STANDING, Tabletop, UnreachableError
@@ -85,10 +83,9 @@ def plan_astar_fine(problem: PlanningProblem, heuristic: str = "goal") -> Plan:
     return plan_astar(problem, 72, FINE_PHASES, heuristic)
 
 
-def plan_continuous_with(problem: PlanningProblem, **constants: Any) -> Plan:
-    """Plan with the continuous planner, with other values of its module's constants."""
-    with mock.patch.multiple(continuous, **constants):
-        return plan_continuous(problem)
+def plan_continuous_with(problem: PlanningProblem, **settings: Any) -> Plan:
+    """Plan with the continuous planner, with other values of its arguments, in capitals."""
+    return plan_continuous(problem, **{name.lower(): value for name, value in settings.items()})
 
 
 MADE: dict[str, Callable[[], EffectModel]] = {
@@ -294,13 +291,15 @@ def corrected(
         for _ in range(corrections):
             seen = robot.observe()
             distance_m = goal.distance_m(seen.xy_m)
-            if distance_m <= ENOUGH_M or not is_seen_on_table(seen):
+            if distance_m <= ENOUGH_M or not OUR_TABLE.holds(np.array([seen.xy_m]))[0]:
                 break
             plan = replan(seen.image, seen.xy_m, exactly)
             first = replace(plan, goal=goal, steps=plan.steps[:1])
             if not plan.steps or goal.distance_m(first.predicted_end_xy_m) >= distance_m:
                 break
-            if not robot.can_reach(first.steps[0].primitive, first.steps[0].stop_phase):
+            again, step = robot.observe(), first.steps[0]
+            action = adapt_to_object(step.primitive, again.image)
+            if not robot.can_reach(action, step.stop_phase, again.xy_m):
                 break
             done = _joined(done, execute_plan(robot, first))
     return done

@@ -95,7 +95,7 @@ OF_THE_WORLD = """
 place execute_primitive execute execute_path can_reach picture mark shove settle
 """
 MADE_BY_DRIVEN_ONES = """
-ClosedLoopResult DisturbanceSchedule EffectModel Execution Robot
+ClosedLoopResult EffectModel Execution Planner Robot
 EffectNetwork FittedModel LoggedPushes NetworkConfig Pushes TabletopObject open_loop
 """
 NAMES = sorted({*CALLABLES, *OF_THE_WORLD.split(), "kind_for"} - {*MADE_BY_DRIVEN_ONES.split()})
@@ -232,7 +232,6 @@ def shop(one_world, skills, pushes, tmp_path_factory):
         "save_checkpoint": {"model": network, "path": folder / "net.safetensors", "about": {}},
         "save_plan": {"path": folder / "p.json"},
         "load_plan": {"path": save_plan(folder / "plan.json", plan)},
-        "Disturbance": {"kind": "knock", "action": 0, "at_s": 1.0},
         "Skills": {"models": {"push": model}},
         "EffectMap": {"n_directions": 8, "n_phases": 5},
         "plan_astar": {"stop_phases": (0.5, 1.0)},

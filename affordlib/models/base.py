@@ -177,9 +177,13 @@ class EffectNetwork(nn.Module, ABC):
             return self.unoriented_features(image)
         return self.features(self._scaled(image))
 
-    def predict(self, features: Tensor, observations: Observations, t_target: Tensor) -> Prediction:
+    def predict(
+        self, features: Tensor, observations: Observations, t_target: Tensor, frame: str = "table"
+    ) -> Prediction:
         """Mean and σ (B, T, C) at t_target (B, T); features (B, F), or (1, F) for all.
 
+        frame: axes of the prediction, those of the "table" or of each "push". In the axes of
+        another frame than the network's, σ lacks the correlation of x and y.
         Raises ValueError for phases outside [0, 1], and for actions whose start or end lies outside
         the training domain. Only warns (`OutOfRangeWarning`) of such effects at t = 1, since a
         planner may pass through them during its search.
@@ -188,8 +192,10 @@ class EffectNetwork(nn.Module, ABC):
         (mu_a, sigma_a, mu_e, sigma_e), direction = self._decode(features, observations, t_target)
         a, e = self.action_scale, self.effect_scale
         prediction = Prediction(mu_a * a, sigma_a * a, mu_e * e, sigma_e * e * self.sigma_scale)
-        if direction is None:
+        if frame == self.config.frame:
             return prediction
+        if direction is None:
+            direction = inverse(push_direction(observations, *self._channels))
         return rotate_prediction(prediction, direction, *self._channels)
 
     def forward(

@@ -4,14 +4,12 @@ from affordlib.planning.astar import plan_astar
 from affordlib.planning.closed_loop import (
     ClosedLoopConfig,
     ClosedLoopResult,
-    action_limit,
     execute_plan,
     run_closed_loop,
 )
 from affordlib.planning.continuous import plan_continuous
-from affordlib.planning.disturbances import Disturbance, DisturbanceSchedule
 from affordlib.planning.effect_map import EffectMap
 from affordlib.planning.gradient import plan_gradient
-from affordlib.planning.problem import MODES, PlanMode, Planner, PlanningProblem
+from affordlib.planning.problem import MODES, PlanMode, Planner, PlanningProblem, Table
 from affordlib.planning.robot import Execution, Robot
 from affordlib.planning.skills import Skills

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from affordlib.planning.effect_map import EffectMap
-from affordlib.planning.problem import PlanningProblem, is_on_table
+from affordlib.planning.problem import PlanningProblem
 from affordlib.planning.rollout import make_steps
 from affordlib.types import Plan, check_choice, check_count, check_within
 
@@ -125,7 +125,7 @@ def search(
         else:
             within_m = tolerance + (max_steps - depth) * effects.reach_m + nearest_m
             rows = np.flatnonzero(away <= within_m)
-        rows = rows[is_on_table(places[rows], effects.radius_m)]
+        rows = rows[problem.table.holds(places[rows], effects.radius_m)]
         here = np.broadcast_to((x, y), (len(rows), 2))
         rows = rows[problem.reachable(here, direction[rows])]
         if trace is not None:

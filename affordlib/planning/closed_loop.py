@@ -9,23 +9,24 @@ height from the hand; what neither shows is computed from the executed actions (
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
 from affordlib.geometry import wrap_angle
 from affordlib.perception import adapt_to_object, looks_fallen, turn_between
-from affordlib.planning import grasp_rotate
 from affordlib.planning.continuous import plan_continuous
-from affordlib.planning.grasp_rotate import GRIPPER_YAWS_RAD, TURN_TOLERANCE_RAD
+from affordlib.planning.grasp_rotate import released_yaw
 from affordlib.planning.move_planner import Ending, MovePlanner
-from affordlib.planning.problem import MODES, PlanningProblem, is_on_table
+from affordlib.planning.problem import PlanMode, Planner
 from affordlib.planning.robot import Execution, Robot
 from affordlib.planning.skills import Skills
 from affordlib.primitives import EMPTY_M, Drag, Grasp, Rotate
 from affordlib.types import (
     Goal,
+    GoalError,
     NothingSeenError,
     Observation,
     Outcome,
@@ -33,27 +34,9 @@ from affordlib.types import (
     Step,
     UnreachableError,
     check_count,
+    check_field,
     check_within,
 )
-
-SURPRISE_M = 0.002
-"""Distance of the object from its predicted position above which it plans again [m]."""
-
-DISPLACED_M = 0.03
-"""Distance from the predicted position above which the object counts as displaced by others [m]."""
-
-AT_REST_M, OBSERVE_EVERY_S, MAX_OBSERVATIONS = 0.001, 0.25, 20
-"""An object is at rest if it moves less than 1 mm in 0.25 s; the loop waits for this for 20
-observations (5 s) at most."""
-
-MOVE_M, SPARE_ACTIONS = 0.05, 3
-"""The action limit is one action per 5 cm of distance, and three more."""
-
-MAX_RENEWALS = 3
-"""How many times the action limit is renewed because the object was displaced."""
-
-MAX_LIFTS = 2
-HEIGHT_TOLERANCE_M = 0.003
 
 
 def execute_plan(robot: Robot, plan: Plan) -> Outcome:
@@ -89,48 +72,74 @@ def _outcome(robot: Robot, plan: Plan, done: Sequence[Execution]) -> Outcome:
     )
 
 
-def is_seen_on_table(seen: Observation) -> bool:
-    """Whether the image shows an object and its position is on the table."""
-    return bool(seen.image[1].any() and is_on_table(np.array([seen.xy_m]))[0])
-
-
 @dataclass(frozen=True)
 class ClosedLoopConfig:
-    """Action limit, number of images per observation, and callbacks of a closed loop.
+    """Patience, thresholds and callbacks of a closed loop.
 
-    max_actions: default `action_limit` of the distance, renewed when the goal moves or somebody
-    displaces the object. n_images: number of images averaged per observation; eight of the Kinect
-    give the rotation to one degree. on_action: called after each action with the plan and the
-    number of actions so far; on_plan: called with a plan before its first action.
+    mode: of its plans. max_actions: default `action_limit` of the distance, renewed when the goal
+    moves or, up to max_renewals times, when somebody displaces the object; max_lifts: of grasps.
+    max_plans, max_routes: see `MovePlanner`. n_images: number of images averaged per observation;
+    eight of the Kinect give the rotation to one degree.
+
+    surprise_m: distance of the object from its predicted position above which it plans again;
+    displaced_m: that above which others have displaced it. Then the loop waits until it moves less
+    than at_rest_m between two observations, at most max_observations, observe_every_s apart.
+
+    on_action: called after each action with the plan and the number of actions so far; on_plan:
+    called with a plan before its first action.
     """
 
+    mode: str | PlanMode = "multi_partial"
     max_actions: int | None = None
+    max_renewals: int = 3
+    max_lifts: int = 2
+    max_plans: int = 12
+    max_routes: int = 150
     n_images: int = 1
+    surprise_m: float = 0.002
+    displaced_m: float = 0.03
+    at_rest_m: float = 0.001
+    observe_every_s: float = 0.25
+    max_observations: int = 20
+    move_m: float = 0.05
+    spare_actions: int = 3
     on_action: Callable[[Plan, int], None] = lambda *_: None
     on_plan: Callable[[Plan], None] = lambda *_: None
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "mode", PlanMode.of(self.mode))
         check_count("n_images", self.n_images, 1, 100)
+        for field in fields(self):
+            if isinstance(field.default, float):
+                check_field(self, field.name, 1e-6, 10.0)
+            elif getattr(self, field.name) is not None and str(field.type).startswith("int"):
+                check_count(field.name, getattr(self, field.name), least=0)
+
+    def action_limit(self, distance_m: float) -> int:
+        """Number of actions for a distance: by default one per `move_m`, and `spare_actions`."""
+        distance_m = check_within("distance_m", distance_m, 0.0, math.inf, "m")
         if self.max_actions is not None:
-            check_count("max_actions", self.max_actions, least=0)
+            return self.max_actions
+        return math.ceil(distance_m / self.move_m - 1e-9) + self.spare_actions
 
 
 @dataclass(frozen=True)
 class ClosedLoopResult:
     """The result of a closed loop, as the robot observed it.
 
-    status: "reached", "unreachable", "gave_up" or "lost"; goal: the final one; end_pose: (x, y,
-    rotation since the start) of the object, and turn_std_rad; reckoned: which of "position" and
-    "orientation" were not observed at the end but computed from the motion of the hand;
-    turn_error_rad, height_error_m: None if not part of the goal; steps: the executed actions, and
-    executions, their recordings; plans: all that were made; seen_xy_m: before every decision;
-    vetoes: planned actions that the arm's kinematics refused.
+    status: "reached"; "unconfirmed", where all is within its tolerance by what the robot knows, but
+    was not observed so exactly; "unreachable", "gave_up" or "lost". goal: the final one; errors:
+    what is left of it. end_pose: (x, y, rotation since the start) of the object, and turn_std_rad;
+    reckoned: which of "position" and "orientation" were not observed at the end but computed from
+    the motion of the hand. steps: the executed actions, and executions, their recordings; plans:
+    all that were made to positions; seen_xy_m: before every decision; vetoes: planned actions that
+    the arm's kinematics refused.
     """
 
     goal: Goal
     status: str
     message: str
-    distance_m: float
+    errors: dict[str, GoalError]
     steps: tuple[Step, ...]
     executions: tuple[Execution, ...]
     plans: tuple[Plan, ...]
@@ -139,8 +148,6 @@ class ClosedLoopResult:
     turn_std_rad: float | None
     reckoned: tuple[str, ...]
     vetoes: int = 0
-    turn_error_rad: float | None = None
-    height_error_m: float | None = None
 
     @property
     def reached(self) -> bool:
@@ -148,22 +155,21 @@ class ClosedLoopResult:
         return self.status == "reached"
 
     @property
+    def distance_m(self) -> float:
+        """Distance [m] of the object from the goal."""
+        return self.errors["position"].left
+
+    @property
     def object_paths_xy_m(self) -> tuple[np.ndarray, ...]:
         """Recorded path (n, 2) of the object in each action."""
         return tuple(execution.object_path[:, :2] for execution in self.executions)
-
-
-def action_limit(distance_m: float) -> int:
-    """Number of actions allowed for a distance: one per 5 cm, rounded up, and 3 more."""
-    distance_m = check_within("distance_m", distance_m, 0.0, 10.0, "m")
-    return math.ceil(distance_m / MOVE_M - 1e-9) + SPARE_ACTIONS
 
 
 def run_closed_loop(
     robot: Robot,
     goal: Goal | Callable[[], Goal],
     skills: Skills,
-    planner: Callable[[PlanningProblem], Plan] = plan_continuous,
+    planner: Planner = plan_continuous,
     config: ClosedLoopConfig | None = None,
 ) -> ClosedLoopResult:
     """Bring the object to a goal (position, orientation, height) despite errors and disturbances.
@@ -185,20 +191,21 @@ class _ClosedLoop:
         robot: Robot,
         goal_now: Callable[[], Goal],
         skills: Skills,
-        planner: Callable[[PlanningProblem], Plan],
+        planner: Planner,
         config: ClosedLoopConfig,
     ) -> None:
         self.robot, self.goal_now, self.skills, self.config = robot, goal_now, skills, config
-        self.goal = goal_now()  # updated before each action and after a lift
-        self.acted_for: Goal | None = None
-        self.moves = MovePlanner(robot, skills, planner, MODES["multi_partial"])
+        patience = config.mode, config.max_plans, config.max_routes
+        self.moves = MovePlanner(robot, skills, planner, *patience)
+        self.goal = self.acted_for = goal_now()  # updated before each action and after a lift
         self.steps: list[Step] = []
         self.executions: list[Execution] = []
         self.plans: list[Plan] = []
         self.seen_xy_m: list[tuple[float, float]] = []
         self.plan: Plan | None = None  # the current one
         self.queue: list[Step] = []  # its remaining steps
-        self.renewals, self.turn_allowed = MAX_RENEWALS, False
+        self.turned_by_plan_rad = 0.0
+        self.renewals, self.turn_allowed = config.max_renewals, False
         self.lifted_m, self.held, self.disturbed = 0.0, False, False
         seen = self._mean_of_images()
         yaw_rad, std_rad = seen.yaw_rad or 0.0, seen.yaw_std_rad or 0.0
@@ -214,60 +221,57 @@ class _ClosedLoop:
                 ending = self._observe() or self._decide_and_act()
             except NothingSeenError:
                 ending = Ending("lost", f"no object is seen on the table, after {self._count()}")
-        goal, seen = self.goal, self.seen
         return ClosedLoopResult(
-            goal=goal,
+            goal=self.goal,
             status=ending.status,
             message=ending.message,
-            distance_m=goal.distance_m(seen.xy_m),
+            errors=self._errors(),
             steps=tuple(self.steps),
             executions=tuple(self.executions),
             plans=tuple(self.plans),
             seen_xy_m=tuple(self.seen_xy_m),
-            end_pose=(*seen.xy_m, wrap_angle(seen.yaw_rad - self.start_yaw_rad)),
-            turn_std_rad=seen.yaw_std_rad,
+            end_pose=(*self.seen.xy_m, self._turned_rad()),
+            turn_std_rad=self.seen.yaw_std_rad,
             reckoned=self._reckoned(),
             vetoes=self.moves.vetoes,
-            turn_error_rad=self._turn_left(),
-            height_error_m=self._height_left(),
         )
 
     def _observe(self) -> Ending | None:
         """Observe, and check whether the plan is still valid."""
-        before, seen = self.seen, self._mean_of_images()
-        expected = self.steps[-1].predicted_end_xy_m if self.steps else None
-
-        def surprise():
-            off_m = math.inf if expected is None else math.dist(expected, seen.xy_m)
-            fell = expected is not None and looks_fallen(before.image, seen.image)
-            return off_m, fell
-
-        off_m, fell = surprise()
-        if DISPLACED_M < off_m < math.inf or fell:
+        seen, displaced_m = self._mean_of_images(), self.config.displaced_m
+        off_m, fell = self._surprise(seen)
+        if off_m > displaced_m or fell:
             seen = self._wait(seen)
-            off_m, fell = surprise()
-        was_displaced = DISPLACED_M < off_m < math.inf
+            off_m, fell = self._surprise(seen)
+        was_displaced = off_m > displaced_m
         self.disturbed = was_displaced or fell
         self.seen = self._with_yaw(seen, fell, was_displaced)
-        self.seen_xy_m.append(self.seen.xy_m)
-        if not is_seen_on_table(self.seen):
+        self.seen_xy_m.append(seen.xy_m)
+        if not (seen.image[1].any() and self.skills.table.holds(np.array([seen.xy_m]))[0]):
             return Ending("lost", f"the object is no longer on the table, after {self._count()}")
         self.goal = self.goal_now()
-        goal_moved = self.acted_for is not None and self.acted_for != self.goal
+        goal_moved = self.acted_for != self.goal
         if goal_moved or (was_displaced and self.renewals > 0):
             self.renewals -= not goal_moved
             self.turn_allowed &= not goal_moved  # a new goal may need a full rotation again
-            self.limit = max(self.limit, len(self.steps) + self._limit_from(self.seen.xy_m))
-        if off_m > SURPRISE_M or goal_moved or fell:
+            self.limit = max(self.limit, len(self.steps) + self._limit_from(seen.xy_m))
+        if off_m > self.config.surprise_m or goal_moved or fell:
             self.queue = []
         return None
 
+    def _surprise(self, seen: Observation) -> tuple[float, bool]:
+        """Distance [m] of the object from where it was predicted, and whether it has fallen."""
+        if not self.steps:
+            return 0.0, False
+        off_m = math.dist(self.steps[-1].predicted_end_xy_m, seen.xy_m)
+        return off_m, looks_fallen(self.seen.image, seen.image)
+
     def _wait(self, seen: Observation) -> Observation:
         """Observe until an object that somebody has set in motion is at rest."""
-        for _ in range(MAX_OBSERVATIONS):
-            self.robot.settle(OBSERVE_EVERY_S)
+        for _ in range(self.config.max_observations):
+            self.robot.settle(self.config.observe_every_s)
             before, seen = seen, self._mean_of_images()
-            if math.dist(before.xy_m, seen.xy_m) < AT_REST_M:
+            if math.dist(before.xy_m, seen.xy_m) < self.config.at_rest_m:
                 break
         return seen
 
@@ -292,26 +296,26 @@ class _ClosedLoop:
         return seen
 
     def _decide_and_act(self) -> Ending | None:
-        """Act towards the first unreached part of the goal; return an `Ending` if all are reached
-        or nothing helps.
+        """Act towards the first part of the goal that is not met; an `Ending` if all are, or
+        nothing helps.
         """
-        turn_rad = self._turn_left()
-        turns = turn_rad is not None and abs(turn_rad) > TURN_TOLERANCE_RAD
-        if turns and not self.turn_allowed:  # up to a full rotation, in sweeps of 60°
-            sweeps = math.ceil((turn_rad % (2 * math.pi)) / Rotate.sweep_rad)
-            self._allow(2 * sweeps + SPARE_ACTIONS)  # each may move it from its position
+        errors = self._errors()
+        turn = errors.get("orientation")
+        if turn and not turn.is_met() and not self.turn_allowed:
+            # Up to a full rotation, in sweeps of 60°, each of which may move it from its position.
+            sweeps = math.ceil((turn.left % (2 * math.pi)) / Rotate.sweep_rad)
+            self._allow(2 * sweeps + self.config.spare_actions)
             self.turn_allowed = True
-        if self.goal.distance_m(self.seen.xy_m) > self.goal.tolerance_m:
-            return self._act("position", self._move)
-        if turns:
-            return self._act("orientation", self._turn)
-        if self.goal.height_m is None:
-            return Ending("reached", self._where())
+        part = next((name for name, error in errors.items() if not error.is_met()), None)
+        if part is None:
+            return self._arrived()
+        if part != "height":
+            return self._act(part)
         lifts = sum(isinstance(step.primitive, Grasp) for step in self.steps)
-        if lifts == MAX_LIFTS:
+        if lifts >= self.config.max_lifts:
             return self._give_up("height")
         self._allow(1)
-        return self._act("height", self._lift) or self._judge_lift(last=lifts + 1 == MAX_LIFTS)
+        return self._act("height") or self._judge_lift(last=lifts + 1 == self.config.max_lifts)
 
     def _judge_lift(self, last: bool) -> Ending | None:
         """Check whether the held object is as the goal requires; otherwise put it down."""
@@ -319,25 +323,29 @@ class _ClosedLoop:
         self.held = bool(tool[-1, 4] > EMPTY_M)
         self.lifted_m = float(tool[-1, 2] - tool[:, 2].min()) if self.held else 0.0
         self.goal = self.goal_now()
-        turn_rad, height_m = self._turn_left() or 0.0, self._height_left()
-        lifted = height_m is not None and abs(height_m) <= HEIGHT_TOLERANCE_M
-        if lifted and abs(turn_rad) <= TURN_TOLERANCE_RAD:
-            if self.goal.distance_m(self.seen.xy_m) <= self.goal.tolerance_m:
-                return Ending("reached", self._where())
-            if last:
-                return self._give_up("position")
+        errors = self._errors()
+        missed = [name for name, error in errors.items() if not error.is_met()]
+        if "height" in errors and missed == []:
+            return self._arrived()
+        if "height" in errors and missed == ["position"] and last:
+            return self._give_up("position")
         self.robot.park()
         self.lifted_m, self.held = 0.0, False
         return None
 
-    def _act(self, part: str, choose: Callable[[], Step | Ending]) -> Ending | None:
-        """Execute the chosen step, if the action limit and the arm allow it."""
+    def _act(self, part: str) -> Ending | None:
+        """Execute the next step towards a part of the goal, if limit and arm allow it."""
         if len(self.steps) >= self.limit:
             return self._give_up(part)
         self.acted_for = self.goal
-        step = choose()
-        if isinstance(step, Ending):
-            return step
+        if part != "position" or not self.queue:
+            plan = self._plan_move() if part == "position" else self._plan_pose(part)
+            if isinstance(plan, Ending):
+                return plan
+            self.plan, self.turned_by_plan_rad = plan, 0.0
+            self.queue = list(plan.steps)
+            self.config.on_plan(plan)
+        step = self.queue.pop(0)
         try:
             execution = self.robot.execute(step)
         except UnreachableError as error:  # the object is now seen at a slightly other position
@@ -358,15 +366,37 @@ class _ClosedLoop:
             closed_rad = np.interp(step.primitive.segment_phases[2], phase, hand_rad)
             self.reckoned_rad = self.seen.yaw_rad + float(hand_rad[-1] - closed_rad)
 
-    def _move(self) -> Step | Ending:
-        if not self.queue:
-            plan = self.moves.plan(self.seen, self.goal, self._grip_yaw())
-            if isinstance(plan, Ending):
-                return plan
+    def _plan_move(self) -> Plan | Ending:
+        plan = self.moves.plan(self.seen, self.goal, self._grip_yaw())
+        if isinstance(plan, Plan):
             self.plans.append(plan)
-            self.queue = list(plan.steps)
-            self._follow(plan)
-        return self.queue.pop(0)
+        return plan
+
+    def _plan_pose(self, part: str) -> Plan | Ending:
+        """Plan the next rotation, or the lift, with a yaw of the hand that the arm can reach."""
+        began, (x, y) = time.perf_counter(), self.seen.xy_m
+        error, refused = self._errors()[part], set()
+
+        def can_act(step):
+            primitive = adapt_to_object(step.primitive, self.seen.image)
+            can = self.robot.can_reach(primitive, step.stop_phase, self.seen.xy_m)
+            if not can:
+                self.moves.vetoes += 1
+                refused.add(primitive.name)
+            return can
+
+        poses = self.skills.pose_planner(self.seen.image, can_act)
+        if part == "orientation":
+            step = poses.turn(error.left, (x, y))
+        else:
+            step = poses.lift(error.left, (x, y), grip_yaw=self._grip_yaw())
+        if step:
+            seconds = time.perf_counter() - began
+            return Plan(self.goal, (x, y), (step,), "pose", True, seconds)
+        why = "no action is predicted to have this effect"
+        if refused:
+            why = f"the arm cannot {' or '.join(sorted(refused))} at ({x:.3f}, {y:.3f}) m"
+        return Ending("unreachable", f"the {part}, with {error.text} left: {why}")
 
     def _grip_yaw(self) -> float | None:
         """Yaw of the hand that has just released a rotated object, if nothing has moved it since.
@@ -378,66 +408,21 @@ class _ClosedLoop:
             return None
         if last.primitive.grip_yaw is None:  # chosen from an image before the object moved
             return None
-        return float(last.primitive.path(last.stop_phase)[0, 3])
-
-    def _turn(self) -> Step | Ending:
-        turn_rad = self._turn_left()
-        model = self.skills.model(Rotate)
-        predicted = grasp_rotate.predict_trajectories(model, self.seen.image, Rotate(), "yaw")
-        return self._first_possible(
-            grasp_rotate.candidate_turns(predicted, self.seen.xy_m, turn_rad),
-            f"the orientation, with {math.degrees(turn_rad):.0f}° left",
-            "no rotation is predicted to turn the object",
-        )
-
-    def _lift(self) -> Step | Ending:
-        yaws, height_m, grip_yaw = GRIPPER_YAWS_RAD, self.goal.height_m, self._grip_yaw()
-        if grip_yaw is not None:
-            # The grasp has the yaw of the rotation's grip; another would rotate the object.
-            yaws = grasp_rotate.aligned_gripper_yaws(grip_yaw)
-        model = self.skills.model(Grasp)
-        predicted = grasp_rotate.predict_trajectories(model, self.seen.image, Grasp(), "z", yaws)
-        return self._first_possible(
-            grasp_rotate.candidate_lifts(predicted, self.seen.xy_m, height_m),
-            f"the height of {100 * height_m:.1f} cm",
-            "no grasp is predicted to lift the object that high",
-        )
-
-    def _first_possible(
-        self, candidates: Iterable[Step], wanted: str, hopeless: str
-    ) -> Step | Ending:
-        """Return the first of some steps, each with another gripper yaw, that the arm can reach."""
-        at = self.seen.xy_m
-        for step in candidates:
-            primitive = adapt_to_object(step.primitive, self.seen.image)
-            if self.robot.can_reach(primitive, step.stop_phase, at):
-                self._follow(Plan(self.goal, at, (step,), primitive.name, False, 0.0))
-                return step
-            self.moves.vetoes += 1
-            hopeless = f"the arm cannot {primitive.name} at ({at[0]:.3f}, {at[1]:.3f}) m"
-        return Ending("unreachable", f"{wanted}: {hopeless}")
-
-    def _follow(self, plan: Plan) -> None:
-        self.plan, self.turned_by_plan_rad = plan, 0.0
-        self.config.on_plan(plan)
+        return released_yaw(last)
 
     def _limit_from(self, xy_m: Sequence[float]) -> int:
-        if self.config.max_actions is not None:
-            return self.config.max_actions
-        return action_limit(self.goal.distance_m(xy_m))
+        return self.config.action_limit(self.goal.distance_m(xy_m))
 
     def _allow(self, further: int) -> None:
         """Raise the action limit, unless the configuration sets it."""
         if self.config.max_actions is None:
             self.limit += further
 
-    def _turn_left(self) -> float | None:
-        if self.goal.turn_rad is None:
-            return None
-        return wrap_angle(self.goal.turn_rad - (self.seen.yaw_rad - self.start_yaw_rad))
+    def _turned_rad(self) -> float:
+        return wrap_angle(self.seen.yaw_rad - self.start_yaw_rad)
 
-    def _height_left(self) -> float | None:
-        return None if self.goal.height_m is None else self.goal.height_m - self.lifted_m
+    def _errors(self) -> dict[str, GoalError]:
+        return self.goal.errors(self.seen.xy_m, self._turned_rad(), self.lifted_m)
 
     def _reckoned(self) -> tuple[str, ...]:
         hidden = {"position": self.held, "orientation": self.held or self.seen.yaw_std_rad is None}
@@ -448,12 +433,22 @@ class _ClosedLoop:
         return f"{n} action{'s' * (n != 1)}"
 
     def _where(self) -> str:
-        parts = [f"{1000 * self.goal.distance_m(self.seen.xy_m):.1f} mm"]
-        if self.goal.turn_rad is not None:
-            parts.append(f"{math.degrees(abs(self._turn_left())):.1f}°")
-        if self.goal.height_m is not None:
-            parts.append(f"{1000 * abs(self._height_left()):.1f} mm in height")
-        return f"{', '.join(parts)} from the goal after {self._count()}"
+        texts = [error.text for error in self._errors().values()]
+        return f"{', '.join(texts)} from the goal after {self._count()}"
+
+    def _arrived(self) -> Ending:
+        """All parts are met; those are named that were not observed, or not exactly enough."""
+        std = {"position": self.seen.std_m, "orientation": self.seen.yaw_std_rad or 0.0}
+        whys: dict[str, list[str]] = {}
+        for name, error in self._errors().items():
+            if name in self._reckoned():
+                whys.setdefault("computed, not observed", []).append(name)
+            elif not error.is_met(std.get(name, 0.0)):
+                whys.setdefault("observed less exactly than required", []).append(name)
+        if whys:
+            told = [f"the {' and '.join(names)} {why}" for why, names in whys.items()]
+            return Ending("unconfirmed", f"{self._where()}: {'; '.join(told)}")
+        return Ending("reached", self._where())
 
     def _give_up(self, part: str) -> Ending:
         return Ending("gave_up", f"{self._where()}: the {part} is not reached")

@@ -4,25 +4,27 @@
     minimise |p_K - goal|² + λ tr Cov p_K   over φ_1, t_1, …, φ_K, t_K
 
 e is the object's effect map, p and ψ are its position and rotation. λ = 1 gives the expected
-squared distance; λ = `RISK_WEIGHT` weights the variance more. The covariance is propagated along
-the chain, so that of two plans ending at the goal the one of lower variance is chosen: the model's
-uncertainty differs between pushes. Many chains are started together, the last action of each looked
-up in the map. The best follow the gradient; the best of all is corrected by queries of the model
-itself until its predicted final position is the goal.
+squared distance; a larger λ, the risk weight, weights the variance more. The covariance is
+propagated along the chain, so that of two plans ending at the goal the one of lower variance is
+chosen: the model's uncertainty differs between pushes. Many chains are started together, the last
+action of each looked up in the map. The best follow the gradient; the best of all is corrected by
+queries of the model itself until its predicted final position is the goal.
 """
 
 import math
 import time
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from affordlib.planning.effect_map import EffectMap, rotate
-from affordlib.planning.problem import PlanningProblem, is_on_table
+from affordlib.geometry import rotate
+from affordlib.planning.effect_map import EffectMap
+from affordlib.planning.problem import PlanningProblem
 from affordlib.planning.rollout import make_steps, roll_out
-from affordlib.types import Plan, check_count
+from affordlib.types import Plan, check_count, check_within
 
 N_STARTS, N_REFINED = 192, 16
 """Number of initial chains, and of the best of them that are refined by gradient descent."""
@@ -34,8 +36,8 @@ ITERATIONS = 15
 DIFFERENCE = 1e-6
 CORRECTIONS, HALVINGS = 5, 4
 RISK_WEIGHT = 10.0
-"""Weight λ of the variance. Chosen on 40 validation goals: three-step plans end 0.66 mm from the
-goal with λ = 0, 0.62 mm with 1, 0.37 mm with 10 and 0.48 mm with 30."""
+"""Default weight λ. Chosen on 40 validation goals: three-step plans end 0.66 mm from the goal with
+λ = 0, 0.62 mm with 1, 0.37 mm with 10 and 0.48 mm with 30."""
 
 ACTION_COST_M = 0.0005
 """Cost per action [m], added to the square root of the objective."""
@@ -43,22 +45,27 @@ ACTION_COST_M = 0.0005
 Chains = tuple[Tensor, Tensor]
 """Directions [rad] and phases (B, K) of B chains of K actions."""
 
+Objective = Callable[[Chains], tuple[Tensor, Tensor]]
+"""Function of chains that returns their objective (B,) [m²] and positions (B, K, 2)."""
+
 
 def _starts(
-    effects: EffectMap, target: Tensor, n_actions: int, partial: bool, rng: np.random.Generator
+    effects: EffectMap, target: Tensor, n_actions: int, stops_early: bool, rng: np.random.Generator
 ) -> Chains:
     """Draw chains; the last action of each is the one in the map ending nearest to the target."""
     n = N_STARTS if n_actions > 1 else 1
     bearing, spread = math.atan2(float(target[1]), float(target[0])), DIRECTION_SPREAD_RAD
     shape = (n, n_actions - 1)
     direction = torch.from_numpy(bearing + rng.uniform(-spread, spread, shape))
-    phase = torch.from_numpy(rng.uniform(MIN_STOP_PHASE, 1.0, shape) if partial else np.ones(shape))
+    phase = torch.from_numpy(
+        rng.uniform(MIN_STOP_PHASE, 1.0, shape) if stops_early else np.ones(shape)
+    )
     left, turned = target.expand(n, 2), target.new_zeros(n)
     if n_actions > 1:
         positions, turns, _ = roll_out(effects, direction, phase)
         left, turned = target - positions[:, -1], turns[:, -1]
     many = 2 if n_actions > 1 else 2 * N_REFINED
-    last_direction, last_phase = effects.nearest(rotate(left, -turned), many, partial)
+    last_direction, last_phase = effects.nearest(rotate(left, -turned), many, stops_early)
     last_direction = last_direction + turned[:, None]
     return (
         torch.cat([direction.repeat_interleave(many, 0), last_direction.reshape(-1, 1)], dim=1),
@@ -66,11 +73,13 @@ def _starts(
     )
 
 
-def _objective(effects: EffectMap, target: Tensor, *chains: Tensor) -> tuple[Tensor, Tensor]:
+def objective(
+    effects: EffectMap, target: Tensor, chains: Chains, risk_weight: float = RISK_WEIGHT
+) -> tuple[Tensor, Tensor]:
     """Objective (B,) [m²] and positions (B, K, 2) after each action."""
     positions, _, variances = roll_out(effects, *chains)
     squared = (positions[:, -1] - target).square().sum(dim=-1)
-    return squared + RISK_WEIGHT * variances[:, -1], positions
+    return squared + risk_weight * variances[:, -1], positions
 
 
 def _slopes(value: Callable[..., Tensor], direction: Tensor, phase: Tensor) -> Chains:
@@ -92,16 +101,16 @@ def _slopes(value: Callable[..., Tensor], direction: Tensor, phase: Tensor) -> C
 
 
 @torch.no_grad()
-def _descend(effects: EffectMap, target: Tensor, chains: Chains, partial: bool) -> Chains:
+def _descend(value: Objective, chains: Chains, stops_early: bool) -> Chains:
     """The chains after `ITERATIONS` steps of Adam on the objective."""
     direction, phase = (v.clone() for v in chains)
-    sought = [direction, phase] if partial else [direction]
+    sought = [direction, phase] if stops_early else [direction]
     optimiser = torch.optim.Adam(
         [{"params": [p], "lr": rate} for p, rate in zip(sought, (0.02, 0.01), strict=False)],
         betas=(0.8, 0.95),
     )
     for _ in range(ITERATIONS):
-        slopes = _slopes(lambda *near: _objective(effects, target, *near)[0], direction, phase)
+        slopes = _slopes(lambda *near: value(near)[0], direction, phase)
         for p, slope in zip(sought, slopes, strict=False):
             p.grad = slope
         optimiser.step()
@@ -113,7 +122,7 @@ def correct(
     effects: EffectMap,
     target: Tensor,
     chain: Chains,
-    partial: bool,
+    stops_early: bool,
     corrections: int = CORRECTIONS,
 ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
     """Correct one chain (B = 1) by Newton's method until its end by the model is the target.
@@ -130,7 +139,7 @@ def correct(
         slopes = _slopes(lambda *near: roll_out(effects, *near)[0][:, -1], direction, phase)
         by_direction, by_phase = (one[0].T for one in slopes)
         free = (phase[0] < 1) | (off @ by_phase < 0)
-        by_phase = by_phase * (free & partial)
+        by_phase = by_phase * (free & stops_early)
         # One radian moves the end about as far as half the phase does; this scales the two alike.
         scale = torch.cat([torch.ones_like(direction[0]), 0.5 * torch.ones_like(phase[0])])
         slopes = torch.cat([by_direction, by_phase], dim=1) * scale
@@ -167,6 +176,7 @@ def plan_continuous(
     seed: int = 0,
     draft: bool = False,
     trace: list[tuple[Tensor, Tensor, Tensor]] | None = None,
+    risk_weight: float = RISK_WEIGHT,
 ) -> Plan:
     """Plan by optimising directions and phases together.
 
@@ -174,16 +184,19 @@ def plan_continuous(
     first plan with as few actions as the distance allows, without gradient descent; with three
     actions it takes a quarter of the time. trace, if given, receives for each number of actions K
     the directions and phases (B, K) of the remaining chains, and their costs (B,) [m].
+    risk_weight: λ.
     """
     began = time.perf_counter()
     effects, start, goal, mode = problem.effects, problem.start_xy_m, problem.goal, problem.mode
     rng = np.random.default_rng(check_count("seed", seed, least=0))
     target = torch.from_numpy(np.subtract(goal.xy_m, start))
     fewest = max(1, math.ceil(float(target.norm()) / max(effects.reach_m, 1e-4)))
+    check_within("risk_weight", risk_weight, 0.0, 1e6)
+    value = partial(objective, effects, target, risk_weight=risk_weight)
     candidates = []
     if float(target.norm()) > 1e-4:
         for n_actions in range(min(fewest, mode.max_steps), mode.max_steps + 1):
-            candidates += _best_chain(problem, target, n_actions, rng, draft, trace)
+            candidates += _best_chain(problem, value, target, n_actions, rng, draft, trace)
             if candidates and n_actions >= fewest + (not draft):
                 break
     steps = ()
@@ -206,12 +219,13 @@ def _allowed(problem: PlanningProblem, positions: Tensor, direction: Tensor) -> 
     ends = xy + positions.numpy()
     begins = np.concatenate([np.broadcast_to(xy, ends[:, :1].shape), ends[:, :-1]], axis=1)
     within = problem.reachable(begins.reshape(-1, 2), direction.reshape(-1).numpy())
-    inside = is_on_table(ends, problem.effects.radius_m)
+    inside = problem.table.holds(ends, problem.effects.radius_m)
     return torch.from_numpy((inside & within.reshape(direction.shape)).all(axis=1))
 
 
 def _best_chain(
     problem: PlanningProblem,
+    value: Objective,
     target: Tensor,
     n_actions: int,
     rng: np.random.Generator,
@@ -219,14 +233,14 @@ def _best_chain(
     trace: list[tuple[Tensor, Tensor, Tensor]] | None,
 ) -> list[tuple[float, Tensor, Tensor]]:
     """Cost [m] and actions (1, K) of the best chain of n_actions; empty if there is none."""
-    effects, partial = problem.effects, problem.mode.partial
+    stops_early = problem.mode.partial
 
     def costs(direction, phase):
-        expected, positions = _objective(effects, target, direction, phase)
+        expected, positions = value((direction, phase))
         cost = expected.sqrt() + ACTION_COST_M * n_actions
         return torch.where(_allowed(problem, positions, direction), cost, torch.inf)
 
-    direction, phase = _starts(effects, target, n_actions, partial, rng)
+    direction, phase = _starts(problem.effects, target, n_actions, stops_early, rng)
     cost = costs(direction, phase)
     order = cost.argsort()[: min(N_REFINED, int(cost.isfinite().sum()))]
     if not len(order):
@@ -234,7 +248,7 @@ def _best_chain(
     direction, phase, cost = direction[order], phase[order], cost[order]
     # A single action that ends at the goal has no free parameter left to optimise.
     if n_actions > 1 and not draft:
-        after = _descend(effects, target, (direction, phase), partial)
+        after = _descend(value, (direction, phase), stops_early)
         cost = torch.cat([cost, costs(*after)])
         direction, phase = torch.cat([direction, after[0]]), torch.cat([phase, after[1]])
     if trace is not None:

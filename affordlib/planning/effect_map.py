@@ -22,6 +22,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from affordlib.geometry import rotate, xy_columns
+from affordlib.models.base import EffectNetwork
 from affordlib.models.protocol import EffectModel, condition_on_primitives
 from affordlib.models.push_frame import rotate_prediction
 from affordlib.perception import radius_m
@@ -176,15 +177,18 @@ class EffectMap:
         """
         pushes = [self.kind.towards(float(angle)) for angle in direction_rad]
         observed = condition_on_primitives(self.model, pushes)
-        prediction = self.model.predict(self.features, observed, t_target)
-        prediction = Prediction(*(value.double() for value in vars(prediction).values()))
-        angle = torch.as_tensor(direction_rad)
-        back = torch.stack([angle.cos(), -angle.sin()], dim=-1)
-        actions, effects = self.model.action_channels, self.model.effect_channels
-        ahead = rotate_prediction(prediction, back, actions, effects)
-        columns = [effects.index(name) for name in ("x", "y", "yaw") if name in effects]
-        effect, std = ahead.effect_mean[..., columns], ahead.effect_std[..., columns]
-        return tuple(F.pad(value, (0, 3 - len(columns))) for value in (effect, std))
+        channels = self.model.action_channels, self.model.effect_channels
+        if isinstance(self.model, EffectNetwork):
+            found = self.model.predict(self.features, observed, t_target, frame="push")
+        else:
+            found = self.model.predict(self.features, observed, t_target)
+            found = Prediction(*(value.double() for value in vars(found).values()))
+            angle = torch.as_tensor(direction_rad)
+            back = torch.stack([angle.cos(), -angle.sin()], dim=-1)
+            found = rotate_prediction(found, back, *channels)
+        columns = [channels[1].index(name) for name in ("x", "y", "yaw") if name in channels[1]]
+        both = found.effect_mean[..., columns], found.effect_std[..., columns]
+        return tuple(F.pad(value.double(), (0, 3 - len(columns))) for value in both)
 
 
 def phases_of(kind: type[Move], n_phases: int) -> Tensor:

@@ -23,7 +23,7 @@ from affordlib.models.protocol import EffectModel, condition_on_primitives
 from affordlib.models.push_frame import rotate_image
 from affordlib.perception import adapt_to_object
 from affordlib.planning.effect_map import checked_image
-from affordlib.primitives import Grasp, Rotate
+from affordlib.primitives import Grasp, Primitive, Rotate
 from affordlib.types import Goal, Step, check_finite, check_pair, check_within
 
 N_PHASES = 301
@@ -164,7 +164,6 @@ def _step_at(
     return Step(primitive, stop_phase, place, np.array([place, place]), std_m=0.0, **predicted)
 
 
-TURN_TOLERANCE_RAD = math.radians(2)
 MAX_TURNS = 7
 """Maximum number of rotations: 360° in sweeps of 60°, and one more for the error of aligning."""
 
@@ -173,15 +172,16 @@ MAX_TURNS = 7
 class PosePlanner:
     """Plans the steps that rotate and lift an object as a goal requires, from one image of it.
 
-    image: (2, 48, 48); rotate, grasp: the models; can_act: whether the arm can act, by primitive
-    and position [m]. Predictions are cached, so that a search can query every node.
+    image: (2, 48, 48); model: returns the model of a primitive; can_act: whether the arm can
+    execute a step. Predictions are cached, so that a search can query every node.
     """
 
     image: np.ndarray
-    rotate: EffectModel
-    grasp: EffectModel
-    can_act: Callable[[str, Sequence[float]], bool] = lambda *_: True
-    _kept: dict[tuple[type, tuple[float, ...]], PredictedTrajectories] = field(default_factory=dict)
+    model: Callable[[type[Primitive]], EffectModel]
+    can_act: Callable[[Step], bool] = lambda _: True
+    _kept: dict[tuple[type, tuple[float, ...]], PredictedTrajectories] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
 
     def __call__(
         self, goal: Goal, xy_m: Sequence[float], turned_rad: float = 0.0, std_m: float = 0.0
@@ -190,30 +190,54 @@ class PosePlanner:
 
         std_m: σ of that position. None where the goal's orientation or height is unreachable.
         """
-        steps: list[Step] = []
-        turned, lift_yaws = turned_rad, GRIPPER_YAWS_RAD
-        while goal.turn_rad is not None:
-            left_rad = wrap_angle(goal.turn_rad - turned)
-            if abs(left_rad) <= TURN_TOLERANCE_RAD:
-                break
-            predicted = self._predicted(Rotate, "yaw", GRIPPER_YAWS_RAD)
-            step = next(candidate_turns(predicted, xy_m, left_rad), None)
-            if step is None or len(steps) == MAX_TURNS or not self.can_act("rotate", xy_m):
+        steps: list[Step | None] = []
+        turned, grip_yaw = turned_rad, None
+        while (error := goal.errors(xy_m, turned).get("orientation")) and not error.is_met():
+            step = self.turn(error.left, xy_m, turned)
+            if step is None or len(steps) == MAX_TURNS:
                 return None
-            primitive = Rotate(_smallest_yaw(step.primitive.grip_yaw + turned))
-            turned += step.predicted_turn_rad
-            steps.append(replace(step, primitive=primitive, predicted_turn_rad=turned))
-            # The grasp has the yaw of the rotation's grip; another would rotate the object.
-            hand_rad = float(primitive.path(step.stop_phase)[0, 3])
-            lift_yaws = aligned_gripper_yaws(hand_rad - turned)
+            steps.append(step)
+            turned, grip_yaw = step.predicted_turn_rad, released_yaw(step)
         if goal.height_m is not None:
-            predicted = self._predicted(Grasp, "z", lift_yaws)
-            step = next(candidate_lifts(predicted, xy_m, goal.height_m), None)
-            if step is None or not self.can_act("grasp", xy_m):
-                return None
-            primitive = Grasp(grip_yaw=_smallest_yaw(step.primitive.grip_yaw + turned))
-            steps.append(replace(step, primitive=primitive, predicted_turn_rad=turned))
-        return tuple(replace(step, std_m=std_m) for step in steps)
+            steps.append(self.lift(goal.height_m, xy_m, turned, grip_yaw))
+        return None if None in steps else tuple(replace(step, std_m=std_m) for step in steps)
+
+    def turn(self, turn_rad: float, xy_m: Sequence[float], turned_rad: float = 0.0) -> Step | None:
+        """The best step that the arm can execute to rotate the object by an angle, or towards it.
+
+        turned_rad: its rotation since the image was taken.
+        """
+        predicted = self._predicted(Rotate, "yaw", GRIPPER_YAWS_RAD)
+        return self._first(candidate_turns(predicted, xy_m, turn_rad), turned_rad)
+
+    def lift(
+        self,
+        height_m: float,
+        xy_m: Sequence[float],
+        turned_rad: float = 0.0,
+        grip_yaw: float | None = None,
+    ) -> Step | None:
+        """The best step that the arm can execute to lift the object to a height.
+
+        grip_yaw: that of a hand that has just released it: the grasp has the same, since another
+        would rotate the object.
+        """
+        yaws = GRIPPER_YAWS_RAD if grip_yaw is None else aligned_gripper_yaws(grip_yaw - turned_rad)
+        predicted = self._predicted(Grasp, "z", yaws)
+        return self._first(candidate_lifts(predicted, xy_m, height_m), turned_rad)
+
+    def _first(self, candidates: Iterator[Step], turned_rad: float) -> Step | None:
+        """The first candidate that the arm can execute, for an object that has rotated."""
+        for step in candidates:
+            yaw = _smallest_yaw(step.primitive.grip_yaw + turned_rad)
+            step = replace(
+                step,
+                primitive=replace(step.primitive, grip_yaw=yaw),
+                predicted_turn_rad=turned_rad + step.predicted_turn_rad,
+            )
+            if self.can_act(step):
+                return step
+        return None
 
     def _predicted(
         self, kind: type[Grasp] | type[Rotate], channel: str, yaws: tuple[float, ...]
@@ -221,9 +245,14 @@ class PosePlanner:
         """Cached predictions for gripper yaws relative to the image, rounded to half a degree."""
         key = kind, tuple(round(2 * math.degrees(yaw)) / 2 for yaw in yaws)
         if key not in self._kept:
-            model, near = self.rotate if kind is Rotate else self.grasp, np.radians(key[1])
+            model, near = self.model(kind), np.radians(key[1])
             self._kept[key] = predict_trajectories(model, self.image, kind(), channel, near)
         return replace(self._kept[key], gripper_yaws_rad=yaws)
+
+
+def released_yaw(step: Step) -> float:
+    """Yaw [rad] of the hand at the end of a step."""
+    return float(step.primitive.path(step.stop_phase)[0, 3])
 
 
 def _smallest_yaw(yaw_rad: float) -> float:

@@ -2,7 +2,7 @@
 
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
@@ -11,19 +11,15 @@ import numpy as np
 import torch
 
 from affordlib.planning.effect_map import EffectMap
-from affordlib.planning.problem import PlanMode, PlanningProblem, check_has_room, is_on_table
+from affordlib.planning.problem import PlanMode, Planner, PlanningProblem
 from affordlib.planning.robot import Robot
-from affordlib.planning.routes import Feasible, find_route, place_at
+from affordlib.planning.routes import Feasible, find_route
 from affordlib.planning.skills import Skills
 from affordlib.primitives import Drag, Move, Primitive
 from affordlib.types import Goal, Observation, Plan
 
 Point = tuple[float, float]
 
-MAX_VETOED_PLANS = 12
-"""Maximum number of vetoed plans to one position before another route is tried."""
-
-MAX_VETOED_ROUTES = 150
 REFUSED_WITHIN_M, REFUSED_WITHIN_RAD = 0.01, math.radians(6)
 """Actions this near to a refused action, in position [m] and direction [rad], are excluded."""
 
@@ -31,7 +27,7 @@ WAYPOINT_TOLERANCE_M = 0.01
 
 
 class Ending(NamedTuple):
-    """How a closed loop ends: one of `closed_loop.STATUSES`, and a message."""
+    """How a closed loop ends: the `status` and `message` of its `ClosedLoopResult`."""
 
     status: str
     message: str
@@ -40,18 +36,23 @@ class Ending(NamedTuple):
 class MovePlanner:
     """Plans to a position; remembers which actions the kinematics has refused.
 
-    vetoes: number of refused actions.
+    max_plans: vetoed plans to one position before another route is tried; max_routes: vetoed routes
+    before none is left. vetoes: number of refused actions.
     """
 
     def __init__(
         self,
         robot: Robot,
         skills: Skills,
-        planner: Callable[[PlanningProblem], Plan],
+        planner: Planner,
         mode: PlanMode,
+        max_plans: int = 12,
+        max_routes: int = 150,
     ) -> None:
         self.robot, self.skills, self.planner, self.mode = robot, skills, planner, mode
+        self.max_plans, self.max_routes = max_plans, max_routes
         self.vetoes = 0
+        self._goal_xy_m, self._ends_m = (0.0, 0.0), [math.inf]  # of the current goal and its plans
         self._refused: list[tuple[str, np.ndarray, float]] = []
         self._blocked: dict[type[Primitive], set[tuple[int, int]]] = defaultdict(set)
 
@@ -71,11 +72,11 @@ class MovePlanner:
     def _plan(self, seen: Observation, goal: Goal, kind: type[Move] | None = None) -> Plan | Ending:
         effects = self.skills.effects(seen.image, kind)
         try:
-            check_has_room(goal, effects.radius_m)
+            self.skills.table.check("goal xy_m", goal.xy_m, effects.radius_m)
         except ValueError as error:
             return Ending("unreachable", f"the position: {error}")
         distance_m = goal.distance_m(seen.xy_m)
-        plan = None
+        plan, self._goal_xy_m, self._ends_m = None, goal.xy_m, [distance_m]
         if distance_m <= self.mode.max_steps * effects.reach_m:
             plan = self._plan_to(effects, seen.xy_m, goal, goal.tolerance_m)
         if plan is None:
@@ -84,8 +85,12 @@ class MovePlanner:
                 at = "({:.3f}, {:.3f}) m".format(*goal.xy_m)
                 return Ending("unreachable", f"the position {at}: the arm cannot bring it there")
             plan = self._plan_along(effects, seen.xy_m, goal, route)
-        nearest = f"no action is predicted to bring it nearer than {1000 * distance_m:.1f} mm"
-        return plan or Ending("gave_up", nearest)
+        return plan or Ending(
+            "gave_up",
+            f"{1000 * distance_m:.1f} mm from the goal, the planner finds no plan that the arm can "
+            f"follow; the best ends {1000 * min(self._ends_m):.1f} mm from it, and planning again "
+            "from the same place gives the same",
+        )
 
     def _plan_along(
         self, effects: EffectMap, start: Point, goal: Goal, route: list[Point]
@@ -97,9 +102,8 @@ class MovePlanner:
         stops = [place for place in route if math.dist(start, place) <= farthest_m]
         if distance_m > farthest_m:
             straight = tuple((np.array(start) + farthest_m / distance_m * ahead).tolist())
-            if is_on_table(np.array([straight]), effects.radius_m)[0] and self._route(
-                effects, straight, goal.xy_m
-            ):
+            on_table = self.skills.table.holds(np.array([straight]), effects.radius_m)[0]
+            if on_table and self._route(effects, straight, goal.xy_m):
                 stops.append(straight)
         for stop in reversed(stops):
             within_m = WAYPOINT_TOLERANCE_M
@@ -114,9 +118,12 @@ class MovePlanner:
         self, effects: EffectMap, start: Point, goal: Goal, within_m: float
     ) -> Plan | None:
         """A plan that ends within a distance of a goal and passes the kinematic check."""
-        for _ in range(MAX_VETOED_PLANS):
-            allowed = self._allowed(effects.kind)
-            plan = self.planner(PlanningProblem(start, goal, effects, self.mode, allowed))
+        for _ in range(self.max_plans):
+            allowed, table = self._allowed(effects.kind), self.skills.table
+            plan = self.planner(
+                PlanningProblem(start, goal, effects, self.mode, allowed, table=table)
+            )
+            self._ends_m.append(math.dist(plan.predicted_end_xy_m, self._goal_xy_m))
             if not plan.steps or plan.predicted_distance_m > within_m:
                 return None
             starts = [start, *(step.predicted_end_xy_m for step in plan.steps)]
@@ -129,7 +136,7 @@ class MovePlanner:
         self, effects: EffectMap, start: Point, goal_xy_m: Point
     ) -> list[Point] | None:
         """Places on a route to the goal, each action of which passes the kinematic check."""
-        for _ in range(MAX_VETOED_ROUTES):
+        for _ in range(self.max_routes):
             route = self._route(effects, start, goal_xy_m)
             if route is None:
                 return None
@@ -138,6 +145,7 @@ class MovePlanner:
             if k is None:
                 return route
             if 0 < k < len(moves) - 1:
+                place_at = self.skills.routes(effects.kind).place_at
                 self._blocked[effects.kind].add((place_at(moves[k][0]), place_at(moves[k][1])))
         return None
 

@@ -15,7 +15,8 @@ from affordlib.types import (
     Step,
     check_choice,
     check_count,
-    check_on_table,
+    check_pair,
+    check_range,
 )
 
 Reachable = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -37,6 +38,11 @@ class PlanMode:
     def __post_init__(self) -> None:
         check_count("max_steps", self.max_steps, 1, 10)
 
+    @classmethod
+    def of(cls, mode: "str | PlanMode") -> "PlanMode":
+        """Return a mode, or that of a name in `MODES`; raises ValueError for other names."""
+        return mode if isinstance(mode, PlanMode) else MODES[check_choice("mode", mode, MODES)]
+
 
 MODES: dict[str, PlanMode] = {
     "single_full": PlanMode(1, partial=False),
@@ -45,21 +51,35 @@ MODES: dict[str, PlanMode] = {
 }
 
 
-def is_on_table(xy_m: np.ndarray, radius_m: float = 0.0) -> np.ndarray:
-    """Whether points (n, 2) lie on the table and farther than a radius [m] from its rim: (n,)."""
-    (x0, x1), (y0, y1) = TABLE_X_M, TABLE_Y_M
-    inside = np.array(xy_m) - (x0 + radius_m, y0 + radius_m)
-    return ((inside >= 0) & (inside <= (x1 - x0 - 2 * radius_m, y1 - y0 - 2 * radius_m))).all(-1)
+@dataclass(frozen=True)
+class Table:
+    """A rectangle on which objects may lie: its ranges of x and y [m]; default: our table."""
+
+    x_m: tuple[float, float] = TABLE_X_M
+    y_m: tuple[float, float] = TABLE_Y_M
+
+    def __post_init__(self) -> None:
+        for name in ("x_m", "y_m"):
+            object.__setattr__(self, name, check_range(name, getattr(self, name), -100.0, 100.0))
+
+    def holds(self, xy_m: np.ndarray, radius_m: float = 0.0) -> np.ndarray:
+        """Whether points (n, 2) lie on it and farther than a radius [m] from its rim: (n,)."""
+        (x0, x1), (y0, y1) = self.x_m, self.y_m
+        inside = np.array(xy_m) - (x0 + radius_m, y0 + radius_m)
+        size = x1 - x0 - 2 * radius_m, y1 - y0 - 2 * radius_m
+        return ((inside >= 0) & (inside <= size)).all(-1)
+
+    def check(self, name: str, xy_m: tuple[float, float], radius_m: float = 0.0) -> None:
+        """Raise ValueError where an object of a radius [m] would extend beyond the rim."""
+        if not self.holds(np.array([xy_m]), radius_m)[0]:
+            x, y = xy_m
+            raise ValueError(
+                f"{name} = ({x:g}, {y:g}) m is off the table, or too near the rim of the table for "
+                f"an object with a radius of {100 * radius_m:.1f} cm; move it inwards"
+            )
 
 
-def check_has_room(goal: Goal, radius_m: float) -> None:
-    """Raise ValueError where an object of a radius [m] would extend beyond the table's rim."""
-    if not is_on_table(np.array([goal.xy_m]), radius_m)[0]:
-        x, y = goal.xy_m
-        raise ValueError(
-            f"goal xy_m = ({x:g}, {y:g}) m is too near the rim of the table for an object with a "
-            f"radius of {100 * radius_m:.1f} cm; move the goal inwards"
-        )
+OUR_TABLE = Table()
 
 
 @dataclass(frozen=True)
@@ -68,8 +88,8 @@ class PlanningProblem:
 
     mode: a `PlanMode`, or its name in `MODES`. reachable: function of positions (n, 2) and
     directions (n,): whether the arm can act there (default: everywhere). pose_planner: plans the
-    final rotation and lift, without which a plan cannot reach a goal that requires them. Raises
-    ValueError where the object would extend beyond the table's rim.
+    final rotation and lift, without which a plan cannot reach a goal that requires them. table: on
+    which the object has to stay. Raises ValueError where it would extend beyond the rim.
     """
 
     start_xy_m: tuple[float, float]
@@ -78,12 +98,13 @@ class PlanningProblem:
     mode: str | PlanMode = "multi_partial"
     reachable: Reachable = everywhere
     pose_planner: Callable[..., tuple[Step, ...] | None] | None = None
+    table: Table = OUR_TABLE
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "start_xy_m", check_on_table("start_xy_m", self.start_xy_m))
-        if not isinstance(self.mode, PlanMode):
-            object.__setattr__(self, "mode", MODES[check_choice("mode", self.mode, MODES)])
-        check_has_room(self.goal, self.effects.radius_m)
+        object.__setattr__(self, "start_xy_m", check_pair("start_xy_m", self.start_xy_m))
+        self.table.check("start_xy_m", self.start_xy_m)
+        object.__setattr__(self, "mode", PlanMode.of(self.mode))
+        self.table.check("goal xy_m", self.goal.xy_m, self.effects.radius_m)
 
     def plan_of(
         self, steps: tuple[Step, ...], planner: str, reaches_goal: bool, began_s: float
@@ -93,7 +114,7 @@ class PlanningProblem:
         began_s: when planning began, by `time.perf_counter`.
         """
         goal, end_xy_m = self.goal, steps[-1].predicted_end_xy_m if steps else self.start_xy_m
-        if reaches_goal and (goal.turn_rad is not None or goal.height_m is not None):
+        if reaches_goal and len(goal.errors(end_xy_m)) > 1:
             turned, std_m = (steps[-1].predicted_turn_rad, steps[-1].std_m) if steps else (0.0, 0.0)
             end = self.pose_planner and self.pose_planner(goal, end_xy_m, turned, std_m)
             steps, reaches_goal = steps + (end or ()), end is not None

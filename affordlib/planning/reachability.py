@@ -68,8 +68,10 @@ class Reachability(nn.Module):
         xy_m = np.atleast_2d(np.asarray(xy_m, dtype=float))
         if primitive not in self.primitives:
             return np.ones(len(xy_m))
-        turn = np.nan if direction_rad is None else direction_rad
-        turn = np.broadcast_to(np.asarray(turn, dtype=float), len(xy_m))
+        turn = np.asarray(np.nan if direction_rad is None else direction_rad, dtype=float)
+        if not (np.isfinite(xy_m).all() and (direction_rad is None or np.isfinite(turn).all())):
+            raise ValueError("xy_m and direction_rad must be finite numbers")
+        turn = np.broadcast_to(turn, len(xy_m))
         number = np.full(len(xy_m), self.primitives.index(primitive))
         features = reach_features(np.eye(len(self.primitives))[number], xy_m, turn)
         return torch.sigmoid(self.layers(features)).squeeze(-1).numpy()

@@ -43,13 +43,8 @@ class Robot(Protocol):
     def execute(self, step: Step) -> Execution:
         """Execute an action of a plan; raises UnreachableError before any motion."""
 
-    def can_reach(
-        self, primitive: Primitive, stop_phase: float = 1.0, at_xy_m: Sequence[float] | None = None
-    ) -> bool:
-        """Whether the arm's kinematics allows an action on an object at (x, y) [m].
-
-        at_xy_m: default: the observed position.
-        """
+    def can_reach(self, primitive: Primitive, stop_phase: float, at_xy_m: Sequence[float]) -> bool:
+        """Whether the arm's kinematics allows an action on an object at (x, y) [m]."""
 
     def park(self) -> None:
         """Put down a held object, and move the arm out of the camera's view."""

@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from affordlib.geometry import rotated
-from affordlib.planning.effect_map import EffectMap, rotate
+from affordlib.geometry import rotate, rotated
+from affordlib.planning.effect_map import EffectMap
 from affordlib.types import Step
 
 PATH_SAMPLES = 25

@@ -14,38 +14,35 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from affordlib.planning.problem import is_on_table
-from affordlib.types import TABLE_X_M, TABLE_Y_M
+from affordlib.planning.problem import OUR_TABLE, Table
 
 Feasible = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 """Function of positions (n, 2), directions (n,), lengths (n,) [m]: which actions are possible."""
 
 CELL_M = 0.02
-_X_M, _Y_M = (np.arange(low + CELL_M / 2, high, CELL_M) for low, high in (TABLE_X_M, TABLE_Y_M))
-PLACES_XY_M = np.stack(np.meshgrid(_X_M, _Y_M, indexing="ij"), axis=-1).reshape(-1, 2)
-
-
-def place_at(xy_m: Sequence[float]) -> int:
-    """Index of the grid's place that is nearest to a point (x, y) [m]."""
-    return int(np.hypot(*(PLACES_XY_M - xy_m).T).argmin())
 
 
 @dataclass(frozen=True)
 class RouteMap:
     """Pairs of places between which one action of at most `reach_m` can move an object.
 
-    origin, end: (E,), indices of places, sorted by origin and then by end; length_m: (E,).
+    places_xy_m: (n, 2), a grid on the table; origin, end: (E,), indices of places, sorted by origin
+    and then by end; length_m: (E,).
     """
 
     reach_m: float
+    table: Table
+    places_xy_m: np.ndarray
     origin: np.ndarray
     end: np.ndarray
     length_m: np.ndarray
 
     @classmethod
-    def of(cls, reach_m: float, feasible: Feasible) -> Self:
+    def of(cls, reach_m: float, feasible: Feasible, table: Table = OUR_TABLE) -> Self:
         """Make the map for actions that are feasible."""
-        n, shape = math.floor(reach_m / CELL_M), np.array([len(_X_M), len(_Y_M)])
+        x, y = (np.arange(low + CELL_M / 2, high, CELL_M) for low, high in (table.x_m, table.y_m))
+        places = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+        n, shape = math.floor(reach_m / CELL_M), np.array([len(x), len(y)])
         moves = np.mgrid[-n : n + 1, -n : n + 1].reshape(2, -1).T
         length_m = CELL_M * np.hypot(*moves.T)
         keep = (length_m > 0) & (length_m <= reach_m)
@@ -54,8 +51,12 @@ class RouteMap:
         origin, move = np.nonzero(((ends >= 0) & (ends < shape)).all(axis=-1))
         end = np.ravel_multi_index(tuple(ends[origin, move].T), shape)
         angle, length_m = np.arctan2(moves[:, 1], moves[:, 0])[move], length_m[move]
-        ok = feasible(PLACES_XY_M[origin], angle, length_m)
-        return cls(reach_m, origin[ok], end[ok], length_m[ok])
+        ok = feasible(places[origin], angle, length_m)
+        return cls(reach_m, table, places, origin[ok], end[ok], length_m[ok])
+
+    def place_at(self, xy_m: Sequence[float]) -> int:
+        """Index of the place that is nearest to a point (x, y) [m]."""
+        return int(np.hypot(*(self.places_xy_m - xy_m).T).argmin())
 
 
 def find_route(
@@ -87,8 +88,9 @@ def find_route(
 
     if np.isfinite(one_action(start, goal[None])[0]):
         return [tuple(goal.tolist())]
-    n, inside = len(PLACES_XY_M), is_on_table(PLACES_XY_M, radius_m)
-    last_m = np.where(inside, one_action(PLACES_XY_M, goal), np.inf)
+    places = routes.places_xy_m
+    n, inside = len(places), routes.table.holds(places, radius_m)
+    last_m = np.where(inside, one_action(places, goal), np.inf)
     barred = [n * origin + end for origin, end in blocked]
     usable = inside[routes.origin] & ~np.isin(n * routes.origin + routes.end, barred)
     origin, end, length_m = (v[usable] for v in (routes.origin, routes.end, routes.length_m))
@@ -99,7 +101,7 @@ def find_route(
         (np.append(end, np.full(len(lasts), n)), np.append(origin, lasts)),
     )
     to_go_m = dijkstra(csr_array(backwards, shape=(n + 1, n + 1)), indices=n)[:n]
-    first_m = one_action(start, PLACES_XY_M) + to_go_m
+    first_m = one_action(start, places) + to_go_m
     if not np.isfinite(first_m).any():
         return None
     at = int(first_m.argmin())
@@ -108,4 +110,4 @@ def find_route(
         here = slice(*np.searchsorted(origin, [at, at + 1]))
         at = int(end[here][(length_m[here] + to_go_m[end[here]]).argmin()])
         route.append(at)
-    return [tuple(PLACES_XY_M[k].tolist()) for k in route] + [tuple(goal.tolist())]
+    return [tuple(places[k].tolist()) for k in route] + [tuple(goal.tolist())]

@@ -1,6 +1,6 @@
 """The skills of a robot: a model for each primitive, and where its arm can act."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Self
 
@@ -11,11 +11,18 @@ from affordlib.models.protocol import EffectModel
 from affordlib.perception import looks_rollable
 from affordlib.planning.effect_map import EffectMap, checked_image
 from affordlib.planning.grasp_rotate import PosePlanner
-from affordlib.planning.problem import PlanMode, PlanningProblem, Reachable, everywhere
+from affordlib.planning.problem import (
+    OUR_TABLE,
+    PlanMode,
+    PlanningProblem,
+    Reachable,
+    Table,
+    everywhere,
+)
 from affordlib.planning.reachability import Reachability
 from affordlib.planning.routes import RouteMap
 from affordlib.primitives import Grasp, Move, Primitive, Rotate, move_for, primitive_named
-from affordlib.types import Goal, check_field
+from affordlib.types import Goal, Step, check_field
 
 CHECKPOINTS = {
     "push": "film_5000",
@@ -33,12 +40,14 @@ class Skills:
     """Models by the name of their primitive, and the probability that the arm can act.
 
     reachability: None means that the arm can act everywhere. threshold: minimum probability of an
-    action to be planned; it is low, since the arm's kinematics is checked afterwards.
+    action to be planned; it is low, since the arm's kinematics is checked afterwards. table: where
+    objects may lie.
     """
 
     models: dict[str, EffectModel]
     reachability: Reachability | None = None
     threshold: float = 0.2
+    table: Table = OUR_TABLE
     _last: dict[bytes, tuple[EffectMap, PosePlanner | None]] = field(**_KEPT)
     _routes: dict[type[Primitive], RouteMap] = field(**_KEPT)
 
@@ -79,7 +88,7 @@ class Skills:
         """
         effects, poses = self._predictions(image)
         reachable = self.reachable(effects.kind)
-        return PlanningProblem(start_xy_m, goal, effects, mode, reachable, poses)
+        return PlanningProblem(start_xy_m, goal, effects, mode, reachable, poses, self.table)
 
     def effects(self, image: np.ndarray, kind: type[Move] | None = None) -> EffectMap:
         """Effect map of the object in an image (2, 48, 48); cached for the last image.
@@ -93,16 +102,24 @@ class Skills:
     def _predictions(self, image: np.ndarray) -> tuple[EffectMap, PosePlanner | None]:
         key = np.ascontiguousarray(image).tobytes()
         if key not in self._last:
-            kind, poses = self.kind_for(image), None
-            if {Rotate.name, Grasp.name} <= set(self.models):
-                models = self.model(Rotate), self.model(Grasp)
-                poses = PosePlanner(image, *models, self._can_act)
+            kind, both = self.kind_for(image), {Rotate.name, Grasp.name} <= set(self.models)
+            poses = self.pose_planner(image) if both else None
             self._last.clear()
             self._last[key] = EffectMap(self.model(kind), image, kind), poses
         return self._last[key]
 
-    def _can_act(self, name: str, xy_m: Sequence[float]) -> bool:
-        return bool(self.reachable(primitive_named(name))(np.array([xy_m]), None)[0])
+    def pose_planner(
+        self, image: np.ndarray, can_act: Callable[[Step], bool] | None = None
+    ) -> PosePlanner:
+        """Planner of rotations and lifts of the object in an image (2, 48, 48).
+
+        can_act: whether the arm can execute a step (default: by the learned reachability).
+        """
+        return PosePlanner(image, self.model, can_act or self._can_act)
+
+    def _can_act(self, step: Step) -> bool:
+        at = np.array([step.predicted_end_xy_m])
+        return bool(self.reachable(type(step.primitive))(at, None)[0])
 
     def reachable(self, kind: type[Primitive]) -> Reachable:
         """Function that says where the arm can act with a primitive."""
@@ -117,5 +134,5 @@ class Skills:
     def routes(self, kind: type[Move]) -> RouteMap:
         """Moves that the arm can make between places all over the table; computed once."""
         if kind not in self._routes:
-            self._routes[kind] = RouteMap.of(kind.reach_m, self.reachable(kind))
+            self._routes[kind] = RouteMap.of(kind.reach_m, self.reachable(kind), self.table)
         return self._routes[kind]

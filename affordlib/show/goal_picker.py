@@ -102,6 +102,7 @@ class GoalPicker(FigurePicture, widgets.HBox):
 
     def pick(self, x_m: float, y_m: float) -> None:
         """Set the goal [m], rounded to millimetres, and replan."""
+        check_on_table("goal", (x_m, y_m))
         self._set_goal(replace(self.goal, xy_m=_whole_mm((x_m, y_m))))
         self._update_plan()
 

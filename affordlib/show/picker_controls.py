@@ -7,7 +7,6 @@ from typing import Any
 
 import ipywidgets as widgets
 
-from affordlib.geometry import wrap_angle
 from affordlib.show.drawing import words_as_html
 from affordlib.types import Goal, Outcome, Plan, Step
 
@@ -129,17 +128,12 @@ def plan_in_words(plan: Plan) -> str:
 def outcome_in_words(outcome: Outcome, goal: Goal, how: str, done: int) -> tuple[str, str]:
     """Describe an outcome, and name its look; how: "Done," or "Stopped after"; done: actions."""
     within = "within" if outcome.distance_m <= goal.tolerance_m else "outside"
-    posed = ""
-    if goal.turn_rad is not None:
-        off = math.degrees(abs(wrap_angle(goal.turn_rad - outcome.turned_rad)))
-        posed += f" The turn has an error of {off:.1f}°."
-    if goal.height_m is not None:
-        off = 1000 * abs(goal.height_m - outcome.lifted_m)
-        posed += f" The height has an error of {off:.1f} mm."
+    errors = goal.errors(outcome.end_pose[:2], outcome.turned_rad, outcome.lifted_m)
+    posed = [f" The {name} has an error of {error.text}." for name, error in errors.items()][1:]
     words = (
         f"{how} {done} action{'s' * (done != 1)}: the object rests "
         f"**{1000 * outcome.distance_m:.1f} mm** from the goal, {within} the tolerance of "
-        f"{1000 * goal.tolerance_m:.0f} mm.{posed} {outcome.words}"
+        f"{1000 * goal.tolerance_m:.0f} mm.{''.join(posed)} {outcome.words}"
     )
     return words, f"outcome {within}"
 

@@ -110,7 +110,7 @@ class PointRobot:
         if not self.visible:
             raise NothingSeenError("nothing is seen")
         seen = Observation(self.xy_m, disc_image(self.height_m))
-        return replace(seen, yaw_rad=self.yaw_rad, yaw_std_rad=0.01) if self.sees_yaw else seen
+        return replace(seen, yaw_rad=self.yaw_rad, yaw_std_rad=0.001) if self.sees_yaw else seen
 
     def execute(self, step):
         primitive, (x, y) = step.primitive, self.xy_m
@@ -129,8 +129,8 @@ class PointRobot:
         path = np.array([[x, y, 0.0, yaw], [*self.xy_m, holds * height, self.yaw_rad]])
         return SimpleNamespace(tool=tool, object_path=path)
 
-    def can_reach(self, primitive, stop_phase=1.0, at_xy_m=None):
-        return not self.refuses(primitive, at_xy_m or self.xy_m)
+    def can_reach(self, primitive, stop_phase, at_xy_m):
+        return not self.refuses(primitive, at_xy_m)
 
     def park(self):
         pass

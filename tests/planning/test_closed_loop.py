@@ -10,19 +10,18 @@ import numpy as np
 import pytest
 
 from affordlib.paths import repo_root
+from affordlib.perception import adapt_to_object
 from affordlib.planning import (
+    MODES,
     ClosedLoopConfig,
-    Disturbance,
-    DisturbanceSchedule,
     Robot,
-    action_limit,
+    Table,
     execute_plan,
     plan_astar,
     plan_continuous,
     plan_gradient,
     run_closed_loop,
 )
-from affordlib.planning.closed_loop import DISPLACED_M
 from affordlib.planning.grasp_rotate import GRIPPER_YAWS_RAD
 from affordlib.planning.reachability import Reachability
 from affordlib.primitives import Drag, Grasp, Push, Rotate
@@ -38,11 +37,13 @@ from affordlib.world import (
 from affordlib.world.execution import put_down
 from affordlib.world.objects import PlacedObject
 from experiments.closed_loop import Trial, _stays_feasible, sample_disturbances
+from experiments.disturbances import Disturbance, DisturbanceSchedule
 from experiments.planning import corrected
 from tests.planning.point_robot import PointRobot, point_skills
 from tests.problems import problem_of
 
 EXACT_M = 0.002
+DISPLACED_M, action_limit = ClosedLoopConfig().displaced_m, ClosedLoopConfig().action_limit
 BOX, TUBE, BALL = Cuboid(0.06, 0.05, 0.05), UprightCylinder(0.05, 0.07), Sphere(0.06)
 
 
@@ -64,18 +65,22 @@ def disturbed(world, goal, skills, *disturbances):
 def test_every_planner_brings_a_pose_about(planner):
     robot, goal = PointRobot(), Goal((0.21, -0.06), 0.01, turn_rad=1.3, height_m=0.1)
     went = loop(robot, goal, planner=planner)
-    assert went.reached, went.message
+    assert went.status == "unconfirmed", went.message  # what the hand holds is not seen
+    assert went.message.endswith("the position and orientation computed, not observed")
     kinds = [type(step.primitive) for step in went.steps]
     assert kinds == [Push] * (len(kinds) - 3) + [Rotate, Rotate, Grasp]  # in sweeps of 60°
     assert robot.executed == list(went.steps)
     assert went.distance_m == goal.distance_m(robot.xy_m) <= 0.01
-    assert went.turn_error_rad == pytest.approx(1.5 - robot.yaw_rad)
+    assert went.errors["orientation"].left == pytest.approx(1.5 - robot.yaw_rad)
     assert went.end_pose[2] == pytest.approx(robot.yaw_rad - 0.2)
-    assert abs(went.turn_error_rad) < math.radians(2)
-    assert abs(went.height_error_m) < 0.003
+    assert abs(went.errors["orientation"].left) < math.radians(2)
+    assert abs(went.errors["height"].left) < 0.003
     assert "from the goal after" in went.message
     assert len(went.steps) == len(went.object_paths_xy_m) <= action_limit(0.22) + 6
-    # If the object is at the goal, nothing moves.
+    assert [action_limit(d) for d in (0.0, 0.01, 0.05, 0.051, 0.25)] == [3, 4, 4, 5, 8]
+    # It goes as near as the goal asks; if the object is at the goal, nothing moves.
+    for within_m, n_pushes in ((0.01, 1), (0.001, 2)):
+        assert len(loop(PointRobot(), Goal((0.08, 0.0), within_m)).steps) == n_pushes
     assert loop(robot, Goal(robot.xy_m, EXACT_M)).steps == ()
 
 
@@ -91,13 +96,8 @@ print(went.status)
 """
     run = [sys.executable, "-c", code]
     done = subprocess.run(run, capture_output=True, text=True, cwd=repo_root(), check=False)
-    assert done.stdout == "reached\n", done.stderr
+    assert done.stdout == "unconfirmed\n", done.stderr
     assert isinstance(PointRobot(), Robot)
-
-
-def test_the_loop_goes_as_near_as_the_goal_asks():
-    assert len(loop(PointRobot(), Goal((0.08, 0.0), 0.01)).steps) == 1
-    assert len(loop(PointRobot(), Goal((0.08, 0.0), 0.001)).steps) == 2
 
 
 @pytest.mark.parametrize("pose", [{}, {"turn_rad": -0.5}, {"height_m": 0.1}])
@@ -107,10 +107,6 @@ def test_no_more_actions_than_were_allowed(pose):
         went = loop(PointRobot(), Goal((far, 0.0), EXACT_M, **pose), max_actions=limit)
         assert (went.status, len(went.steps)) == ("gave_up", limit), went.message
     assert "after 1 action:" in went.message
-
-
-def test_the_limit_is_the_distance_over_5_cm_rounded_up_and_3():
-    assert [action_limit(d) for d in (0.0, 0.01, 0.05, 0.051, 0.25)] == [3, 4, 4, 5, 8]
 
 
 def test_an_object_that_always_escapes_ends_the_loop():
@@ -124,12 +120,46 @@ def test_an_object_that_always_escapes_ends_the_loop():
     assert 5 < len(went.steps) <= 4 * action_limit(0.06)
 
 
-def test_a_planner_that_does_nothing_is_given_up():
-    def lazy(problem):
-        return Plan(problem.goal, problem.start_xy_m, (), "lazy", False, 0.0)
+@pytest.mark.parametrize(("n_steps", "ends_mm"), [(0, "100.0"), (1, "99.9")])
+def test_a_planner_that_does_not_help_is_given_up_and_it_is_said_why(n_steps, ends_mm):
+    def planner(problem):
+        step = Step(Push(math.pi), 0.6, (0.0001, 0.0), np.zeros((2, 2)))
+        return Plan(problem.goal, problem.start_xy_m, (step,) * n_steps, "lazy", False, 0.0)
 
-    went = loop(PointRobot(), Goal((0.1, 0.0), EXACT_M), planner=lazy)
+    went = loop(PointRobot(), Goal((0.1, 0.0), EXACT_M), planner=planner)
     assert (went.status, went.steps) == ("gave_up", ())
+    assert f"the best ends {ends_mm} mm from it, and planning again" in went.message
+
+
+def test_the_loop_plans_in_its_mode():
+    modes = set()
+
+    def planner(problem):
+        modes.add(problem.mode)
+        return plan_continuous(problem)
+
+    goal = Goal((0.15, 0.0), EXACT_M)
+    assert loop(PointRobot(), goal, planner=planner, mode="single_partial").reached
+    assert modes == {MODES["single_partial"]}
+
+
+def test_goals_of_another_robot_lie_on_its_table():
+    skills = replace(point_skills(), table=Table((2.0, 3.0), (-1.0, 1.0)))
+    went = loop(PointRobot((2.5, 0.2)), Goal((2.6, 0.8), EXACT_M), skills)
+    assert went.reached, went.message
+    here = loop(PointRobot((2.5, 0.2)), Goal((0.1, 0.0)), skills)
+    assert (here.status, here.steps) == ("unreachable", ())
+
+
+def test_nothing_is_reached_that_the_camera_cannot_tell():
+    class Blurred(PointRobot):
+        def observe(self):
+            return replace(super().observe(), std_m=0.0005)
+
+    went = loop(Blurred(), Goal((0.08, 0.0), 0.0005))
+    assert went.status == "unconfirmed", went.message
+    assert went.message.endswith("the position observed less exactly than required")
+    assert loop(Blurred(), Goal((0.08, 0.0), 0.02)).reached
 
 
 @pytest.mark.parametrize("change", [{"xy_m": (0.75, 0.0)}, {"visible": False}])
@@ -199,7 +229,7 @@ def test_what_the_arm_cannot_do_is_refused_before_any_motion():
     hands = PointRobot(refuses=lambda primitive, at: primitive.name != "push")
     went = loop(hands, Goal((0.0, 0.0), height_m=0.1))
     assert (went.status, went.steps, went.vetoes) == ("unreachable", (), len(GRIPPER_YAWS_RAD))
-    assert "the height of 10.0 cm: the arm cannot grasp at (0.000, 0.000) m" in went.message
+    assert went.message.endswith("left: the arm cannot grasp at (0.000, 0.000) m")
     asked = []
     hands.refuses = lambda primitive, at: asked.append(primitive.grip_yaw) or len(asked) < 3
     went = loop(hands, Goal((0.0, 0.0), turn_rad=0.5))
@@ -221,37 +251,31 @@ def test_a_far_goal_is_reached_round_what_the_arm_cannot_do():
 
 @pytest.mark.parametrize(
     ("shifts_m", "lifts", "status"),
-    [((0.0,), 1, "reached"), ((0.02,), 2, "reached"), ((0.02, 0.02), 2, "gave_up")],
+    [
+        ((0.0,), 1, "unconfirmed"),
+        ((0.02,), 2, "unconfirmed"),
+        ((0.02, 0.02), 2, "gave_up"),
+        ((None,), 1, "reached"),
+    ],
 )
 def test_what_is_held_aside_of_its_goal_is_put_down_and_lifted_there(shifts_m, lifts, status):
-    """The goal moves by this much after each lift."""
+    """The goal moves by this much after each lift, or requires no height any longer (None)."""
     goal, left = Goal((0.06, 0.0), EXACT_M, height_m=0.1), list(shifts_m)
 
     def move_goal(plan, n):
         nonlocal goal
         if plan.steps[-1].primitive.name == "grasp" and left:
-            goal = replace(goal, xy_m=(goal.xy_m[0] + left.pop(0), 0.0))
+            by_m = left.pop(0)
+            new = {"height_m": None} if by_m is None else {"xy_m": (goal.xy_m[0] + by_m, 0.0)}
+            goal = replace(goal, **new)
 
     went = loop(PointRobot(), lambda: goal, on_action=move_goal)
     assert went.status == status, went.message
     assert sum(isinstance(step.primitive, Grasp) for step in went.steps) == lifts
-    aside_m = 0.0 if status == "reached" else shifts_m[-1]
+    aside_m = shifts_m[-1] if status == "gave_up" else 0.0
     assert went.distance_m == pytest.approx(aside_m, abs=0.005)
-    assert abs(went.height_error_m) < 0.003
-
-
-def test_a_height_that_is_no_longer_wanted_is_let_go():
-    goal = Goal((0.06, 0.0), EXACT_M, height_m=0.1)
-
-    def drop_height(plan, n):
-        nonlocal goal
-        if plan.steps[-1].primitive.name == "grasp":
-            goal = replace(goal, height_m=None)
-
-    went = loop(PointRobot(), lambda: goal, on_action=drop_height)
-    assert went.reached
-    assert went.height_error_m is None
-    assert sum(isinstance(step.primitive, Grasp) for step in went.steps) == 1
+    assert ("height" in went.errors) == (status != "reached")
+    assert status == "reached" or went.errors["height"].is_met()
 
 
 @pytest.mark.parametrize("sees_yaw", [True, False])
@@ -259,13 +283,13 @@ def test_a_turn_that_nobody_sees_is_reckoned_by_the_hand_and_said_to_be(sees_yaw
     """The image of a disc does not show its rotation."""
     robot = PointRobot(sees_yaw=sees_yaw)
     went = loop(robot, Goal((0.1, 0.0), EXACT_M, turn_rad=1.7))
-    assert went.reached, went.message
+    assert went.status == ("reached" if sees_yaw else "unconfirmed"), went.message
     assert robot.yaw_rad == pytest.approx(0.2 + 1.7, abs=math.radians(2))
     assert went.end_pose[2] == pytest.approx(robot.yaw_rad - 0.2, abs=math.radians(0.2))
     assert went.reckoned == (() if sees_yaw else ("orientation",))
-    assert went.turn_std_rad == (0.01 if sees_yaw else None)
+    assert went.turn_std_rad == (0.001 if sees_yaw else None)
     lifted = loop(robot, Goal(robot.xy_m, height_m=0.1))
-    assert lifted.reached
+    assert lifted.status == "unconfirmed"
     assert lifted.reckoned == ("position", "orientation")
 
 
@@ -284,12 +308,14 @@ def test_the_grip_is_kept_unless_somebody_displaces_the_object(shove_m, kept):
     assert grasp.primitive.grip_yaw == (pytest.approx(hand_rad) if kept else GRIPPER_YAWS_RAD[0])
 
 
-@pytest.mark.parametrize(("slips", "status"), [(1, "reached"), (2, "gave_up")])
+@pytest.mark.parametrize(("slips", "status"), [(1, "unconfirmed"), (2, "gave_up")])
 def test_a_slip_is_noticed_by_the_fingers(slips, status):
     went = loop(PointRobot(slips=slips), Goal((0.0, 0.0), height_m=0.1))
     assert went.status == status, went.message
     assert [step.primitive.name for step in went.steps] == ["grasp"] * 2
-    assert went.height_error_m == pytest.approx(0.0 if status == "reached" else 0.1, abs=0.003)
+    assert went.errors["height"].left == pytest.approx(
+        0.0 if status == "unconfirmed" else 0.1, abs=0.003
+    )
 
 
 def test_corrections_bring_it_nearer_and_stop_where_enough():
@@ -359,7 +385,8 @@ def test_the_kinematics_agrees_with_what_execution_refuses(world):
         action = (Push.towards(angle), Drag.towards(angle), Grasp(), Rotate())[rng.integers(4)]
         stop = rng.uniform(0.3, 1.0)
         world.place(BOX, tuple(xy))
-        if not world.can_reach(action, stop):
+        adapted = adapt_to_object(action, world.depth_image())
+        if not world.can_reach(adapted, stop, tuple(xy)):
             world.on_step = steps.append
             with pytest.raises(UnreachableError):
                 world.execute_primitive(action, stop, approach=True)
@@ -372,7 +399,7 @@ def test_the_kinematics_agrees_with_what_execution_refuses(world):
 
 def test_the_arm_is_asked_about_the_grasp_that_it_will_execute(world, skills):
     """At the limit of its reach the hand's height matters, which depends on the object's."""
-    for x, status in ((0.52, "reached"), (0.526, "unreachable")):
+    for x, status in ((0.52, "unconfirmed"), (0.526, "unreachable")):
         world.place(Cuboid(0.05, 0.05, 0.08), (x, 0.0))
         went = run_closed_loop(world, Goal((x, 0.0), EXACT_M, height_m=0.24), skills)
         assert went.status == status, went.message
@@ -527,7 +554,9 @@ def test_no_task_needs_the_state_of_the_simulator(world, skills, monkeypatch, ca
         robot = knowing_only_what_it_measures(world, patched)
         config = ClosedLoopConfig(n_images=1 if camera == "ideal" else 8)
         went = run_closed_loop(robot, goal, skills, config=config)
-    assert went.reached, went.message
+    seen = goal.height_m is None and (goal.turn_rad is None or obj is not BALL)
+    assert went.status in ("reached", "unconfirmed"), went.message
+    assert went.reached or not (seen and camera == "ideal")
     x, y, yaw = world.object_pose()
     assert math.dist(went.goal.xy_m, (x, y)) < 0.01
     if camera == "ideal" and not pose:

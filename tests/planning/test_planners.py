@@ -10,22 +10,24 @@ import numpy as np
 import pytest
 import torch
 
+from affordlib import primitives
 from affordlib.geometry import rotated
 from affordlib.models import load_checkpoint
 from affordlib.planning import (
     EffectMap,
     PlanMode,
+    Skills,
     plan_astar,
     plan_continuous,
     plan_gradient,
 )
 from affordlib.planning.astar import HEURISTICS, Branches, BranchTable, search
-from affordlib.planning.problem import is_on_table
+from affordlib.planning.problem import Table
 from affordlib.planning.rollout import roll_out
-from affordlib.planning.routes import RouteMap, find_route, place_at
-from affordlib.primitives import Drag, Push
+from affordlib.planning.routes import RouteMap, find_route
+from affordlib.primitives import Drag, Move, Push
 from affordlib.types import Goal, Prediction
-from affordlib.world import ROLLABLE, STANDING, Cuboid
+from affordlib.world import ROLLABLE, STANDING, Cuboid, UprightCylinder
 from experiments.planning import attempt
 from experiments.shipped import uniform_tasks
 from experiments.tasks import (
@@ -64,6 +66,33 @@ def test_an_effect_map_says_what_the_model_says(world, film, kind):
     assert effects.query_model(direction, at_first).abs().max() < 1e-6
     assert (std > 0).all()
     torch.testing.assert_close(effects(direction + 2 * math.pi, phase)[0], effect)
+
+
+def test_a_new_moving_primitive_has_a_map_and_routes(monkeypatch):
+    class Nudge(Move):
+        """A push of the known dynamics, which is no subclass of `Push`."""
+
+        name, acts_from, reach_m = "nudge", Push.acts_from, 0.05
+
+        def __init__(self, theta):
+            object.__setattr__(self, "push", Push(theta + math.pi))
+
+        def ends(self):
+            return self.push.ends()
+
+    monkeypatch.setitem(primitives.PRIMITIVES, "nudge", Nudge)
+    skills = Skills({"nudge": MODEL})
+    assert skills.effects(IMAGE, Nudge).reach_m == pytest.approx(REACH_M, abs=1e-4)
+    assert skills.routes(Nudge).length_m.max() <= 0.05
+
+
+def test_sigma_is_that_of_the_push_frame(world, film):
+    """A disc looks the same from all directions, so ahead and left have the same σ in all."""
+    world.place(UprightCylinder(0.06, 0.06))
+    effects = EffectMap(film, world.depth_image())
+    std = effects.grid[1][:, -1, :2]
+    assert (std.std(dim=0) < 0.015 * std.mean(dim=0)).all()
+    assert (std[:, 1] > 1.05 * std[:, 0]).all()  # also at 45°
 
 
 def test_a_chain_turns_with_the_object(world, film):
@@ -325,10 +354,10 @@ def test_a_route_is_the_shortest_and_keeps_the_whole_object_on_the_table():
     wall = RouteMap.of(0.075, lambda xy_m, *_: np.abs(xy_m[:, 1]) > 0.1)
     assert find_route(wall, start, goal, gap) is None
     inside = np.array(find_route(routes, (0.2, 0.65), (0.62, 0.65), gap, radius_m=0.045))
-    assert is_on_table(inside, 0.045).all()
-    move = tuple(place_at(xy) for xy in route[3:5])
+    assert Table().holds(inside, 0.045).all()
+    move = tuple(routes.place_at(xy) for xy in route[3:5])
     around = np.array([start, *find_route(routes, start, goal, gap, {move})])
-    assert move not in itertools.pairwise(place_at(xy) for xy in around)
+    assert move not in itertools.pairwise(routes.place_at(xy) for xy in around)
     assert np.hypot(*np.diff(around, axis=0).T).sum() >= lengths.sum()
 
 

@@ -30,7 +30,7 @@ def test_it_agrees_with_kinematics_on_places_it_has_not_seen(learned, world):
     for name, make in KINDS.items():
         for _ in range(250):
             xy, angle = rng.uniform([-0.42, -0.62], [0.62, 0.62]), rng.uniform(-math.pi, math.pi)
-            truth = world.can_reach(make(angle), at_xy_m=xy)
+            truth = world.can_reach(make(angle), 1.0, xy)
             direction = angle if name in ("push", "drag") else None
             said = learned.probability(name, xy, direction)[0] > 0.5
             right[truth].append(said == truth)

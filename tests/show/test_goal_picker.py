@@ -417,7 +417,7 @@ def test_turn_and_lift_are_planned_and_done(posed, world, executor, within_deg):
     assert [step["name"] for step in scene["steps"]][-2:] == ["rotate", "grasp"]
     posed.run()
     said = posed.controls.words.value
-    assert "The turn has an error of" in said
+    assert "The orientation has an error of" in said
     assert "The height has an error of" in said
     assert posed.outcome.lifted_m == pytest.approx(0.06, abs=0.005), said
     assert world.object_state()[2] == pytest.approx(0.025 + 0.06, abs=0.005), said
