@@ -2,29 +2,54 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from dataclasses import replace
+from pathlib import Path
 
-import numpy as np
 import torch
 
 from affordlib.interactions import InteractionTensors, split_interactions
 from affordlib.interactions.sampling import Batch
-from affordlib.models import EffectNetwork
-from affordlib.models.training import batch_loss, final_errors_m, train_model, untrained
-from affordlib.types import Observations, check_count, check_within
+from affordlib.models import CNPConfig, EffectNetwork
+from affordlib.models.checkpoint import load_state, save_state
+from affordlib.models.training import (
+    Score,
+    TrainingConfig,
+    batch_loss,
+    final_errors_m,
+    train_model,
+    untrained,
+)
+from affordlib.paths import resolve_out_dir
+from affordlib.types import Observations
 from experiments.runner import Rows, open_once, study
 from experiments.shipped import CHECKPOINT_SPECS
 
 SPEC = CHECKPOINT_SPECS["cnp_500"]
-ITERATIONS, VALIDATE_EVERY = 100_000, 2500
+ITERATIONS, SAVE_EVERY = 100_000, 10_000
+LITERAL = TrainingConfig(
+    steps=1_000_000, learning_rate=1e-4, validate_every=2500, patience=40, augment=False
+)
+"""The paper's recipe; it stops early, 100,000 steps after its best validation, as we read it."""
+
+_MIXED = replace(SPEC, data="mixed")
+OTHER_SEEDS = ("_seed_1", "_seed_2")
+OTHER_TRAININGS = {
+    f"cnp_mixed_500{name}": replace(_MIXED, training=replace(SPEC.training, seed=seed))
+    for seed, name in enumerate(OTHER_SEEDS, 1)
+} | {
+    "cnp_yaw_mixed_500": replace(_MIXED, network=CNPConfig(effect_channels=("x", "y", "yaw"))),
+}
+"""Trainings of the paper's network, of pushes and drags, beside the shipped `cnp_mixed_500`."""
 
 
-def trained_on(n_samples: int) -> EffectNetwork:
-    """Train the shipped network in batches, with n_samples per trajectory instead of all."""
-    data = open_once(SPEC.data)
+def trained(name: str) -> EffectNetwork:
+    """Train one of `OTHER_TRAININGS`, once: its finished state is kept in the folder `runs`."""
+    spec = OTHER_TRAININGS[name]
+    data = open_once(spec.data)
     split = split_interactions(data.sizes["interaction"])
-    samples = np.linspace(0, data.sizes["sample"] - 1, n_samples).round().astype(int)
-    return train_model(data.isel(sample=samples), split, SPEC.training, SPEC.network)[0]
+    state = resolve_out_dir("runs/trainings") / f"{name}.state"
+    return train_model(data, split, spec.training, spec.network, resume_checkpoint=state)[0]
 
 
 def sample_literal(tensors: InteractionTensors, obs_max: int, generator: torch.Generator) -> Batch:
@@ -47,45 +72,59 @@ def sample_literal(tensors: InteractionTensors, obs_max: int, generator: torch.G
 def train_literal(
     model: EffectNetwork,
     training: InteractionTensors,
-    iterations: int = 1_000_000,
-    obs_max: int = 10,
-    learning_rate: float = 1e-4,
-    seed: int = 0,
-    after: Callable[[int], object] = bool,
-) -> list[float]:
-    """Train in place with the paper's loop (Section 3.2) and return the losses.
+    validation: InteractionTensors,
+    config: TrainingConfig = LITERAL,
+    state: str | Path | None = None,
+    score: Score = final_errors_m,
+) -> Rows:
+    """Train in place with the paper's loop (Section 3.2) and early stopping; return its history.
 
-    An iteration is one trajectory and one target; a million take hours. after: gets its number.
+    A step is one trajectory and one target; a million take hours. The model keeps the weights of
+    the best validation. Of config, the numbers of steps, observations, validations and patience,
+    the rate and the seed count. state: a file, written every `SAVE_EVERY` steps and at the end,
+    from which the same call continues.
     """
-    check_count("iterations", iterations)
-    check_count("obs_max", obs_max, 1, 100_000)
-    check_within("learning_rate", learning_rate, 1e-7, 1.0)
-    generator = torch.Generator().manual_seed(check_count("seed", seed, 0, 2**63 - 1))
-    optimiser = torch.optim.Adam(model.parameters(), lr=learning_rate)
-    losses = []
-    for iteration in range(1, iterations + 1):
-        loss = batch_loss(model, sample_literal(training, obs_max, generator))
+    generator = torch.Generator().manual_seed(config.seed)
+    optimiser = torch.optim.Adam(model.parameters(), config.learning_rate, fused=True)
+    about = [repr(model.config), len(training), config.obs_max, config.learning_rate, config.seed]
+    done, history, best = 0, [], {"error": math.inf, "step": 0, "weights": model.state_dict()}
+    if state is not None and Path(state).exists():
+        saved = load_state(state)
+        if saved["about"] != about:
+            raise ValueError(f"state {str(state)!r} is of another training; delete it")
+        model.load_state_dict(saved["model"])
+        optimiser.load_state_dict(saved["optimiser"])
+        generator.set_state(saved["generator"])
+        done, history, best = (saved[name] for name in ("done", "history", "best"))
+    for step in range(done + 1, config.steps + 1):
+        if step > best["step"] + config.patience * config.validate_every:
+            break
         optimiser.zero_grad()
+        loss = batch_loss(model, sample_literal(training, config.obs_max, generator))
         loss.backward()
         optimiser.step()
-        losses.append(loss.item())
-        after(iteration)
-    return losses
+        if step % config.validate_every == 0 or step == config.steps:
+            error = float(score(model, validation).mean())
+            history.append({"step": step, "validation_error_m": error})
+            if error < best["error"]:
+                weights = {name: value.clone() for name, value in model.state_dict().items()}
+                best = {"error": error, "step": step, "weights": weights}
+        if state is not None and (step % SAVE_EVERY == 0 or step == config.steps):
+            parts = {"about": about, "model": model.state_dict(), "done": step, "best": best}
+            parts |= {"optimiser": optimiser.state_dict(), "generator": generator.get_state()}
+            save_state(state, parts | {"history": history})
+    model.load_state_dict(best["weights"])
+    model.eval()
+    return history
 
 
-@study("push", settings=(SPEC.network, ITERATIONS, VALIDATE_EVERY))
+@study("push", settings=(SPEC.network, ITERATIONS, LITERAL.validate_every))
 def literal_training() -> Rows:
     """Return validation errors of the paper's network and loop, learning rate 1e-4, on one fold."""
     data = open_once(SPEC.data)
     split = split_interactions(data.sizes["interaction"])
     training = InteractionTensors.from_dataset(data, split.train)
     validation = InteractionTensors.from_dataset(data, split.validation)
-    model, rows = untrained(SPEC.network, training, 0).train(), []
-
-    def validate(iteration: int) -> None:
-        if iteration % VALIDATE_EVERY == 0:
-            error = float(final_errors_m(model, validation).mean())
-            rows.append({"recipe": "literal", "step": iteration, "validation_error_m": error})
-
-    train_literal(model, training, ITERATIONS, after=validate)
-    return rows
+    model = untrained(SPEC.network, training, 0).train()
+    history = train_literal(model, training, validation, replace(LITERAL, steps=ITERATIONS))
+    return [{"recipe": "literal"} | row for row in history]

@@ -1,7 +1,8 @@
 """Table 3: plan to goals, execute the plans, and measure the final distance to the goal.
 
-Each row is a `PlannerConfig`. Its outcomes on the frozen goals are stored by the runner; the tables
-are made from all stored outcomes.
+Each config is a `PlannerConfig`. Its outcomes on the frozen goals are stored by the runner; the
+tables are made from all stored outcomes. A row of a table has the outcomes of all trainings of its
+network.
 
     python -m experiments.planning --only config=continuous,astar
 """
@@ -14,6 +15,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -25,7 +27,7 @@ from tqdm.auto import tqdm
 
 from affordlib.models.checkpoint import load_checkpoint
 from affordlib.models.predictions import error_row
-from affordlib.models.protocol import EffectModel
+from affordlib.models.protocol import EffectModel, condition_on_final_effect
 from affordlib.perception import adapt_to_object
 from affordlib.planning import (
     EffectMap,
@@ -40,14 +42,17 @@ from affordlib.planning import (
     plan_continuous,
     plan_gradient,
 )
+from affordlib.planning.astar import STOP_PHASES
+from affordlib.planning.effect_map import checked_image
+from affordlib.planning.gradient import Reading
 from affordlib.planning.problem import MODES, OUR_TABLE
-from affordlib.primitives import Push
+from affordlib.primitives import Drag, Push
 from affordlib.types import NothingSeenError, Observation, Outcome, Plan, Step
 from affordlib.world import ROLLABLE, STANDING, Tabletop, UnreachableError
 from experiments import reported, runner
 from experiments.commands import command
 from experiments.field_baselines import LimitSurface, plan_astar_continuous, plan_cem
-from experiments.literal import SPEC, trained_on
+from experiments.literal import OTHER_SEEDS, OTHER_TRAININGS, trained
 from experiments.oracle import oracle_effects
 from experiments.runner import FOLDER, Job, Rows, interval, plain
 from experiments.tasks import GOAL_SOURCES, PlanningTask, frozen_tasks, tasks_sha256
@@ -62,19 +67,32 @@ GROUPS = {"all": STANDING + ROLLABLE, "standing": STANDING, "rollable": ROLLABLE
 FINE_PHASES = tuple(round(0.5 + 0.05 * k, 2) for k in range(1, 11))
 
 
-def _whole(planner: Callable[..., Plan]) -> Callable[..., Plan]:
-    """Return a planner that uses no partial actions."""
-
-    def plan(problem: PlanningProblem, **arguments: Any) -> Plan:
-        return planner(replace(problem, mode=replace(problem.mode, partial=False)), **arguments)
-
-    plan.__name__ = f"{planner.__name__}_full"
-    return plan
+def plan_astar_full(problem: PlanningProblem) -> Plan:
+    """A* without partial actions."""
+    return plan_astar(problem, stop_phases=(1.0,))
 
 
-plan_astar_full = _whole(plan_astar)
-plan_continuous_full = _whole(plan_continuous)
-plan_gradient_full = _whole(plan_gradient)
+def plan_continuous_full(problem: PlanningProblem) -> Plan:
+    """Plan with the continuous planner, without partial actions."""
+    return plan_continuous(replace(problem, mode=replace(problem.mode, partial=False)))
+
+
+def plan_astar_recorded(problem: PlanningProblem) -> Plan:
+    """A* with the segments 20, 40, … 100 % of what the paper records.
+
+    It records "the parts of the interaction where the object is potentially going to be displaced".
+    Our phase begins with the approach, in which the first segments would end.
+    """
+    return plan_astar(problem, stop_phases=phases_of_way(problem.effects, STOP_PHASES))
+
+
+def phases_of_way(effects: EffectMap, shares: Sequence[float]) -> list[float]:
+    """Phases at which full actions have moved the object by shares of its way, in the mean."""
+    phase = torch.linspace(effects.kind.acts_from, 1, 201, dtype=torch.float64)
+    direction = torch.arange(36, dtype=torch.float64) * (math.pi / 18)
+    moved, _ = effects(*torch.meshgrid(direction, phase, indexing="ij"))
+    way_m = np.maximum.accumulate(moved[..., :2].norm(dim=-1).mean(dim=0).numpy())
+    return np.interp(np.multiply(shares, way_m[-1]), way_m, phase).tolist()
 
 
 def plan_astar_fine(problem: PlanningProblem, heuristic: str = "goal") -> Plan:
@@ -88,12 +106,25 @@ def plan_continuous_with(problem: PlanningProblem, **settings: Any) -> Plan:
     return plan_continuous(problem, **{name.lower(): value for name, value in settings.items()})
 
 
+def decoded_kind(model: EffectModel, image: np.ndarray) -> type[Push] | type[Drag]:
+    """Return the action that the paper's one network decodes for the object: push or drag.
+
+    It is asked for the effects of full drags, which only few pushes have, in 36 directions. A drag
+    starts above the object, a push 20 cm away.
+    """
+    angle = torch.arange(36) * (math.pi / 18)
+    effect = torch.zeros(36, len(model.effect_channels))
+    effect[:, :2] = Drag.length * torch.stack([angle.cos(), angle.sin()], dim=1)
+    features = model.encode(checked_image(image))
+    found = model.predict(features, condition_on_final_effect(model, effect), torch.zeros(36, 1))
+    return Push if found.action_mean[..., :2].norm(dim=-1).median() > Push.radius / 2 else Drag
+
+
 MADE: dict[str, Callable[[], EffectModel]] = {
-    "cnp_500_of_100_samples": partial(trained_on, 100),
-    "cnp_500_of_300_samples": partial(trained_on, 300),
+    **{name: partial(trained, name) for name in OTHER_TRAININGS},
     "limit_surface": LimitSurface.fitted,
 }
-"""Models without a checkpoint, which the job trains (ten minutes) or fits on `push`."""
+"""Models without a checkpoint, which the job trains (ten minutes, once) or fits on `push`."""
 
 Pose = Callable[..., PlanningProblem]
 """Poses the problem of (image, start_xy_m, goal, mode), as `Skills.problem` does."""
@@ -105,11 +136,11 @@ VERSIONS: dict[Planner, int] = {plan_astar: 2, plan_astar_fine: 2}
 
 @dataclass(frozen=True)
 class PlannerConfig:
-    """A row of Table 3: a planner, its model, and its goals.
+    """A planner, its model, and its goals.
 
     planner: a function of a `PlanningProblem`; arguments: its further arguments; execution: fields
-    of `Attempt`. model: a checkpoint of pushes, one of `MADE`, or "simulator"; oracle: arguments of
-    `oracle_effects` for "simulator". world, sources: of the frozen goals; stride: use every
+    of `Attempt`. model: a checkpoint, one of `MADE`, or "simulator"; oracle: arguments of
+    `oracle_effects` for "simulator". world, sources, modes: of the frozen goals; stride: use every
     stride-th goal; standing: exclude rollable objects.
     """
 
@@ -122,13 +153,19 @@ class PlannerConfig:
     sources: tuple[str, ...] = ("constructed",)
     stride: int = 1
     standing: bool = False
+    modes: tuple[str, ...] = tuple(MODES)
+
+    @property
+    def for_all(self) -> bool:
+        """Whether the model is one network of pushes and drags, as in the paper."""
+        return "mixed" in self.model
 
     @property
     def checkpoints(self) -> dict[str, str]:
         """Checkpoints by primitive: the model's, and one for drags if rollable objects occur."""
         if self.model in ("simulator", *MADE):
             return {}
-        drags = self.model.startswith("film") and self.world in ("clean", "perturbed_rollable")
+        drags = self.model.startswith("film") and self.world not in ("perturbed", "outside")
         return {"push": self.model} | ({"drag": "drag_film_500"} if drags else {})
 
     @property
@@ -136,17 +173,20 @@ class PlannerConfig:
         """The object categories of its goals."""
         if self.world == "perturbed_rollable":
             return ROLLABLE
-        drags = "drag" in self.checkpoints or self.model == "simulator"
-        drags &= self.world == "clean" and not self.standing
+        drags = "drag" in self.checkpoints or self.model == "simulator" or self.for_all
+        drags &= self.world in ("clean", "fresh") and not self.standing
         return STANDING + ROLLABLE if drags else STANDING
 
     def chosen(self, tasks: Sequence[PlanningTask]) -> list[int]:
-        """Return the numbers of the tasks that this row uses."""
-        asked = [t.goals in self.sources and t.obj.category in self.classes for t in tasks]
+        """Return the numbers of the tasks that it is evaluated on."""
+        asked = [
+            (t.goals in self.sources and t.mode in self.modes and t.obj.category in self.classes)
+            for t in tasks
+        ]
         return np.flatnonzero(asked)[:: self.stride].tolist()
 
     def columns(self) -> dict[str, str]:
-        """Return the columns of the table that describe this row."""
+        """Return the columns of the table that describe it."""
         return {"model": self.model, "world": self.world}
 
     def plan(self, problem: PlanningProblem) -> Plan:
@@ -163,6 +203,8 @@ class PlannerConfig:
         def pose(image, start_xy_m, goal, mode) -> PlanningProblem:
             if imagined:
                 effects = oracle_effects(imagined, world, image, **self.oracle)
+            elif self.for_all:
+                effects = EffectMap(models["push"], image, decoded_kind(models["push"], image))
             else:
                 kind = skills.kind_for(image) if "drag" in models else Push
                 effects = EffectMap(skills.model(kind), image, kind)
@@ -174,61 +216,79 @@ class PlannerConfig:
 ALL = {"sources": GOAL_SOURCES}
 CORRECTED, BY_PLAN = {"execution": {"corrections": 2}}, {"execution": {"by_plan": True}}
 RECEDING = {"execution": {"receding": True}}
-LITERAL, FINER = {"samples": 100}, {"samples": 300}
-ON_RING = LITERAL | {"starts": 4, "direction_only": True}
 DISC = {"heuristic": "disc"}
 PERTURBED = {"model": "film_5000_perturbed", "world": "perturbed"}
 ROLLING, OUTSIDE = (PERTURBED | {"world": world} for world in ("perturbed_rollable", "outside"))
 ORACLE = {"model": "simulator"}
+FRESH = {"world": "fresh"}
+PAPERS = "cnp_mixed_500"
 RISK_WEIGHTS = (0.0, 1.0, 10.0, 30.0)
-"""Risk weights of the continuous planner that are tried on the validation goals."""
+RATES = {"gradient": (0.1, 0.3, 1.0), "gradient_adam": (0.002, 0.005, 0.01)}
+"""Risk weights of the continuous planner, and rates of the gradient planner's descents, that are
+tried on the validation goals."""
+
+READINGS = {
+    "gradient": Reading(),
+    "gradient_starts": Reading(starts=4),
+    "gradient_adam": Reading("adam", "circle", "point"),
+}
+"""Readings of the paper's planner: as printed, the best of four starts, Adam from 20 cm."""
+
+
+def papers_configs(prefix: str, readings: Sequence[str], world: str) -> dict[str, PlannerConfig]:
+    """Return configs of readings of the paper's planner, with its network.
+
+    The network has three trainings (`_seed_1`, `_seed_2`) and one on pushes only (`_pushes`). Plans
+    are executed as in the paper, each action placed by the plan; `_recentred`, placed at the object
+    as it is then observed, which differs for several actions only.
+    """
+    models = {"": PAPERS, "_pushes": "cnp_500"} | {seed: PAPERS + seed for seed in OTHER_SEEDS}
+    found = {}
+    for reading, samples, (end, model) in product(readings, (100, 300), models.items()):
+        how = {"samples": samples, "reading": READINGS[reading]}
+        one = PlannerConfig(plan_gradient, model, how, **BY_PLAN, world=world)
+        found[f"{prefix}{reading}_{samples}{end}"] = one
+        if world == "clean":
+            again = replace(one, execution={}, modes=("multi_partial",))
+            found[f"{reading}_{samples}_recentred{end}"] = again
+    return found
+
 
 CONFIGS: dict[str, PlannerConfig] = {
+    # The paper's planners on its own network.
+    **papers_configs("", READINGS, "clean"),
+    "astar_paper": PlannerConfig(plan_astar, PAPERS, **ALL),
+    "astar_paper_recorded": PlannerConfig(plan_astar_recorded, PAPERS, **ALL),
+    "astar_paper_pushes": PlannerConfig(plan_astar, "cnp_500", **ALL),
+    "astar_paper_recorded_pushes": PlannerConfig(plan_astar_recorded, "cnp_500", **ALL),
+    "continuous_paper": PlannerConfig(plan_continuous, PAPERS, **ALL),
+    "gradient_100_yaw": PlannerConfig(plan_gradient, "cnp_yaw_mixed_500", **BY_PLAN),
+    "continuous_paper_yaw": PlannerConfig(plan_continuous, "cnp_yaw_mixed_500"),
     # Our planner and A* on our best model.
     "continuous": PlannerConfig(plan_continuous, **ALL),
     "continuous_corrected": PlannerConfig(plan_continuous, **CORRECTED, **ALL),
     "continuous_by_plan": PlannerConfig(plan_continuous, **BY_PLAN, standing=True),
+    "continuous_full": PlannerConfig(plan_continuous_full, **ALL),
     "astar": PlannerConfig(plan_astar, standing=True),
     "astar_corrected": PlannerConfig(plan_astar, **CORRECTED, standing=True),
     "astar_by_plan": PlannerConfig(plan_astar, **BY_PLAN, standing=True),
+    "astar_full": PlannerConfig(plan_astar_full, standing=True),
     "astar_disc": PlannerConfig(plan_astar, arguments=DISC, **ALL),
     "astar_disc_corrected": PlannerConfig(plan_astar, arguments=DISC, **CORRECTED, **ALL),
     "astar_disc_fine": PlannerConfig(plan_astar_fine, arguments=DISC, **ALL),
-    # The paper's planners on its own network.
-    "astar_cnp_500": PlannerConfig(plan_astar, "cnp_500"),
-    "astar_disc_cnp_500": PlannerConfig(plan_astar, "cnp_500", DISC, **ALL),
-    "gradient_25": PlannerConfig(plan_gradient, "cnp_500", {"samples": 25}),
-    "gradient_100": PlannerConfig(plan_gradient, "cnp_500", LITERAL, **ALL),
-    "gradient_300": PlannerConfig(plan_gradient, "cnp_500", FINER),
-    "gradient_snapped": PlannerConfig(plan_gradient, "cnp_500", {"samples": 100, "snap": True}),
-    "gradient_direction": PlannerConfig(plan_gradient, "cnp_500", ON_RING, **ALL),
-    "gradient_direction_corrected": PlannerConfig(plan_gradient, "cnp_500", ON_RING, **CORRECTED),
-    "gradient_direction_by_plan": PlannerConfig(plan_gradient, "cnp_500", ON_RING, **BY_PLAN),
-    "gradient_100_corrected": PlannerConfig(plan_gradient, "cnp_500", LITERAL, **CORRECTED),
-    "gradient_100_by_plan": PlannerConfig(plan_gradient, "cnp_500", LITERAL, **BY_PLAN),
-    # With the network trained on trajectories of 100 or 300 samples instead of 301.
-    "gradient_100_trained": PlannerConfig(plan_gradient, "cnp_500_of_100_samples", LITERAL),
-    "gradient_300_trained": PlannerConfig(plan_gradient, "cnp_500_of_300_samples", FINER),
-    # Without partial actions.
-    "gradient_100_full": PlannerConfig(plan_gradient_full, "cnp_500", LITERAL),
-    "continuous_full": PlannerConfig(plan_continuous_full, **ALL),
-    "astar_full": PlannerConfig(plan_astar_full, standing=True),
-    "gradient_direction_full": PlannerConfig(plan_gradient_full, "cnp_500", ON_RING),
     # Standard planners and a physics-based model.
     "astar_continuous": PlannerConfig(plan_astar_continuous, standing=True),
     "cem": PlannerConfig(plan_cem, standing=True),
     "mpc_cem": PlannerConfig(plan_cem, **RECEDING, standing=True),
     "mpc_continuous": PlannerConfig(plan_continuous, **RECEDING, standing=True),
     "continuous_limit_surface": PlannerConfig(plan_continuous, "limit_surface"),
-    # Other networks, and a small error of the object's pose.
+    # Other networks, one of them recurrent, and a small error of the object's pose.
     "continuous_cnp_500": PlannerConfig(plan_continuous, "cnp_500", **ALL),
     "continuous_film_500": PlannerConfig(plan_continuous, "film_500", **ALL),
+    "continuous_lstm_500": PlannerConfig(plan_continuous, "lstm_500"),
     "continuous_perturbed_start": PlannerConfig(
         plan_continuous, execution={"perturbed_start": True}
     ),
-    # A recurrent network with the same planners.
-    "astar_disc_lstm_500": PlannerConfig(plan_astar, "lstm_500", DISC),
-    "continuous_lstm_500": PlannerConfig(plan_continuous, "lstm_500"),
     # The simulator in place of a model.
     "oracle": PlannerConfig(plan_continuous, **ORACLE),
     "oracle_risk_averse": PlannerConfig(plan_continuous, **ORACLE, oracle={"risk_averse": True}),
@@ -247,13 +307,31 @@ CONFIGS: dict[str, PlannerConfig] = {
     "perturbed_oracle_nominal": PlannerConfig(
         plan_continuous, **ORACLE, oracle={"nominal_physics": True}, world="perturbed", stride=5
     ),
-    # A constant of the planner, on the validation goals.
+    # Constants of the planners, on the validation goals.
     **{
         f"RISK_WEIGHT={weight:g}": PlannerConfig(
             plan_continuous_with, arguments={"RISK_WEIGHT": weight}, world="validation"
         )
         for weight in RISK_WEIGHTS
     },
+    **{
+        f"{reading} rate={rate:g}": PlannerConfig(
+            plan_gradient,
+            "cnp_500",
+            {"reading": replace(READINGS[reading], rate=rate)},
+            **BY_PLAN,
+            world="validation",
+        )
+        for reading, rates in RATES.items()
+        for rate in rates
+    },
+    # Once, at the end, on goals that no choice has seen.
+    **papers_configs("fresh_", ("gradient",), "fresh"),
+    "fresh_astar_paper": PlannerConfig(plan_astar, PAPERS, **FRESH),
+    "fresh_astar_paper_recorded": PlannerConfig(plan_astar_recorded, PAPERS, **FRESH),
+    "fresh_continuous_paper": PlannerConfig(plan_continuous, PAPERS, **FRESH),
+    "fresh_continuous_film_500": PlannerConfig(plan_continuous, "film_500", **FRESH),
+    "fresh_continuous": PlannerConfig(plan_continuous, **FRESH),
 }
 
 
@@ -409,38 +487,49 @@ def job(config: str) -> Job:
     about = CONFIGS[config]
     settings, files = [about, tasks_sha256(about.world)], tuple(about.checkpoints.values())
     version, data = VERSIONS.get(about.planner, 1), ()
-    if about.model in MADE:
-        settings, data = [*settings, SPEC.network, SPEC.training], ("push",)
+    if spec := OTHER_TRAININGS.get(about.model):
+        settings, data = [*settings, spec.network, spec.training], (spec.data,)
+    elif about.model in MADE:
+        data = ("push",)
     return Job(run_config, {"config": config}, settings, data, files, version)
 
 
 def planning_rows(records: Rows, **columns: Any) -> Rows:
     """Return rows of `planning`: per source of goals and mode, for all objects and each category.
 
+    Mean and standard error are over goals, after averaging each goal's distances over trainings;
+    median and 95th percentile are over all; low and high are the means of single trainings.
     columns: further columns of the rows, such as `PlannerConfig.columns`.
     """
     rows = []
-    for (source, mode), some in pd.DataFrame(records).groupby(["goals", "mode"], sort=False):
+    table = pd.DataFrame(records)
+    table = pd.DataFrame({"task": table.index, "training": 0}).assign(**table)
+    for (source, mode), some in table.groupby(["goals", "mode"], sort=False):
         for group, classes in GROUPS.items():
             chosen = some[some.object_class.isin(classes)]
             if chosen.empty:
                 continue
             about = {"goals": source, "object_class": group, "mode": mode}
-            row = error_row(chosen.distance_m.to_numpy(), **columns, **about)
+            by_goal = chosen.groupby("task").distance_m.mean()
+            row = error_row(by_goal.to_numpy(), **columns, **about)
+            row["median_m"], row["p95_m"] = chosen.distance_m.quantile([0.5, 0.95])
+            means = chosen.groupby("training").distance_m.mean()
+            row |= {"trainings": len(means), "low_m": means.min(), "high_m": means.max()}
             row["predicted_mean_m"] = chosen.predicted_m.mean()
             row["prediction_error_mean_m"] = chosen.prediction_error_m.mean()
             rows.append(row | {"actions_mean": chosen.actions.mean()})
     return rows
 
 
-def summary_rows(rows: Rows) -> Rows:
-    """Return one row per planner on constructed goals: mean, SEM and median of each mode."""
+def summary_rows(rows: Rows, source: str = "constructed") -> Rows:
+    """Return one row per planner and group on one source of goals: statistics of each mode."""
     summary: dict[tuple[str, str], dict[str, Any]] = {}
     for row in rows:
-        if row["goals"] == "constructed" and row["object_class"] not in STANDING + ROLLABLE:
-            new = {name: row[name] for name in ("planner", "model", "world", "object_class")}
+        if row["goals"] == source and row["object_class"] not in STANDING + ROLLABLE:
+            names = ("planner", "model", "world", "object_class", "trainings")
+            new = {name: row[name] for name in names}
             one = summary.setdefault((row["planner"], row["object_class"]), new)
-            for statistic in ("mean", "sem", "median"):
+            for statistic in ("mean", "sem", "median", "low", "high"):
                 one[f"{row['mode']}_{statistic}_m"] = row[f"{statistic}_m"]
             one["n"] = f"{one['n']}, {row['n']}" if "n" in one else str(row["n"])
     return list(summary.values())
@@ -467,19 +556,19 @@ def decomposition_rows(rows: Rows) -> Rows:
 
 VARIANTS = {
     name: name.removesuffix(change)
-    for change in ("_full", "_by_plan", "_corrected")
+    for change in ("_full", "_by_plan", "_corrected", "_recentred", "_yaw", "_recorded")
     for name in CONFIGS
     if name.removesuffix(change) in {*CONFIGS} - {name}
 } | {
     "astar_disc": "astar",
-    "astar_disc_cnp_500": "astar_cnp_500",
     "astar_continuous": "continuous",
     "gradient_300": "gradient_100",
-    "gradient_100_trained": "gradient_100",
-    "gradient_300_trained": "gradient_100_trained",
+    "gradient_starts_100": "gradient_100",
+    "gradient_adam_100": "gradient_100",
     "cem": "continuous",
     "mpc_continuous": "continuous",
     "mpc_cem": "mpc_continuous",
+    "continuous_paper": "continuous_film_500",
     "continuous_cnp_500": "continuous_film_500",
     "continuous_film_500": "continuous",
     "continuous_limit_surface": "continuous_film_500",
@@ -490,32 +579,46 @@ VARIANTS = {
 def variant_rows(records: dict[str, Rows]) -> Rows:
     """Return paired differences of final distance for `VARIANTS`: mean [m] and interval.
 
-    They are on constructed goals of stable objects.
+    They are on constructed goals, of stable objects and of all that both rows have.
     """
     rows: Rows = []
     for name, than in VARIANTS.items():
         if not {name, than} <= set(records):
             continue
-        both = pd.merge(*(pd.DataFrame(records[key]) for key in (name, than)), on="task")
-        both = both[(both.goals_x == "constructed") & both.object_class_x.isin(STANDING)]
-        rng = np.random.default_rng(0)
-        for mode, pairs in both.groupby("mode_x", sort=False):
-            mean, low, high = interval(pairs.distance_m_x - pairs.distance_m_y, 2000, rng)
-            row = {"planner": name, "than": than, "goals": "constructed", "mode": mode}
-            row |= {"n": len(pairs), "difference_mean_m": mean}
-            rows.append(row | {"low_m": low, "high_m": high})
+        tables = [
+            pd.DataFrame(records[key]).query("goals == 'constructed'") for key in (name, than)
+        ]
+        both = pd.merge(*tables, on=["task", "training", "mode", "object_class"])
+        both["by_m"] = both.distance_m_x - both.distance_m_y
+        for group in ("standing", "all"):
+            some = both[both.object_class.isin(GROUPS[group])]
+            for mode, pairs in some.groupby("mode", sort=False):
+                by_goal = pairs.groupby("task").by_m.mean()
+                mean, low, high = interval(by_goal, 2000, np.random.default_rng(0))
+                row = {"planner": name, "than": than, "object_class": group, "mode": mode}
+                row |= {"n": len(by_goal), "difference_mean_m": mean}
+                rows.append(row | {"low_m": low, "high_m": high})
     return rows
 
 
 def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
     """Return all tables of the evaluated planners."""
     found = {about["config"]: result for about, result in runner.read("planning", job, folder)}
-    records, rows = {name: found[name] for name in CONFIGS if name in found}, []
-    for name, some in records.items():
-        rows += planning_rows(some, planner=name, **CONFIGS[name].columns())
+    records: dict[str, Rows] = {}
+    for name in CONFIGS:
+        if name in found:
+            row, _, seed = name.partition("_seed_")
+            training = {"training": int(seed or 0)}
+            records.setdefault(row, []).extend(one | training for one in found[name])
+    rows = [
+        one
+        for row, some in records.items()
+        for one in planning_rows(some, planner=row, **CONFIGS[row].columns())
+    ]
     return {
         "planning": rows,
         "summary": [*reported.PLANNING_ROWS, *summary_rows(rows)],
+        "summary_uniform": summary_rows(rows, "uniform"),
         "variants": variant_rows(records),
         "error_decomposition": decomposition_rows(rows),
     }

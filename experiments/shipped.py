@@ -271,11 +271,13 @@ def draw_goals(_: argparse.Namespace) -> bool:
     missing = [world for world, path in FROZEN.items() if not (repo_root() / path).exists()]
     for name in missing:
         tasks: list[PlanningTask] = []
-        seed, counts = (1, VALIDATION_GOALS) if name == "validation" else (0, N_GOALS)
+        seed = {"validation": 1, "fresh": 2}.get(name, 0)  # the first objects of a seed are alike
+        counts = VALIDATION_GOALS if name == "validation" else N_GOALS
         with Tabletop() as world:
             for mode, n in counts.items():
                 if name != "clean":
                     classes = ROLLABLE if name == "perturbed_rollable" else STANDING
+                    classes = STANDING + ROLLABLE if name == "fresh" else classes
                     variation = VARIATIONS.get(name)
                     tasks += constructed_tasks(world, mode, n, seed, classes, variation)
                     continue

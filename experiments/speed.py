@@ -42,7 +42,7 @@ from affordlib.results import read_results, write_results
 from affordlib.types import Observations
 from affordlib.world import STANDING, Tabletop
 from experiments.commands import command
-from experiments.literal import sample_literal, train_literal
+from experiments.literal import LITERAL, sample_literal, train_literal
 from experiments.runner import Rows
 from experiments.shipped import uniform_tasks
 
@@ -138,7 +138,7 @@ def training(
         shares.append(counter.get_total_flops() / many_s / products_per_s)
 
     model, began = network(), time.perf_counter()
-    train_literal(model, pushes, iterations)
+    train_literal(model, pushes, validation, replace(LITERAL, steps=iterations))
     literal_s = time.perf_counter() - began
     error = float(final_errors_m(model.eval(), validation).mean())
     # Small batches, because as long as errors are large, many steps help more than accurate ones.

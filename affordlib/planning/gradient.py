@@ -1,164 +1,161 @@
 """The paper's continuous planner (Section 3.4, Algorithm 1), with two errors corrected.
 
-    direction ← random point on the circle of radius 0.2 m
+    direction ← random point on a circle
     repeat    loss ← mean square of (target - predicted effect at t = 1 | e_1 = direction)
-              direction ← direction - gradient step              until it no longer changes
-    query the whole action and effect trajectory; stop at the phase of least distance to the target
+              direction ← direction - rate · gradient         until the direction is still
+    query the action and effect trajectory in that direction; stop where it is nearest the target
 
-In the printed pseudo-code `index` and the object's pose are never updated; here they are. As in the
-paper, only the position counts: each action is predicted for the object as its image shows it,
-although earlier actions may rotate it (`predicted_turn_rad` is the rotation). The robot executes
-the decoded action trajectory; `snap` replaces it by the push in the same direction.
+The pseudo-code never updates `index` and the object's pose; this does. As in the paper, actions are
+predicted for the object as its image shows it, and executed as decoded (drags as primitives).
 """
 
 import math
 import time
 import warnings
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
+from torch.nn.functional import normalize
 
 from affordlib.geometry import xy_columns
 from affordlib.models.domain import OutOfRangeWarning
-from affordlib.models.protocol import EffectModel, condition_on_final_effect
+from affordlib.models.protocol import condition_on_final_effect
 from affordlib.planning.effect_map import EffectMap
 from affordlib.planning.problem import PlanningProblem
-from affordlib.planning.rollout import PATH_SAMPLES
 from affordlib.primitives import Drag
-from affordlib.types import Plan, Prediction, Step, check_count
+from affordlib.types import Plan, Step, check_choice, check_count
 
-START_RADIUS_M = 0.2
-LEARNING_RATE_M = 0.005
-CONVERGED_M = 1e-4
-STILL_ITERATIONS = 10
-MAX_ITERATIONS = 300
-SUCCESS_M = 0.002
-NEARER_M = 0.0005
+DESCENTS = {"gradient": (torch.optim.SGD, 0.3), "adam": (torch.optim.Adam, 0.005)}
+"""Optimiser and its usual rate, chosen on the validation goals (`experiments/planning.py`)."""
+
+STILL = {"direction": 1e-3, "point": 1e-4}
+"""Change per iteration, of the direction [rad] or the point [m], below which it is still."""
+
+STILL_ITERATIONS, MAX_ITERATIONS, MAX_DRAWS = 10, 300, 5
+CIRCLE_M, SUCCESS_M, NEARER_M = 0.2, 0.002, 0.0005
+
+
+@dataclass(frozen=True)
+class Reading:
+    """A reading of Algorithm 1; the defaults are the paper's words.
+
+    descent: by the "gradient" or by "adam"; rate: its rate. start: on the "ring" of effects that
+    full actions have, or on the "circle" of 0.2 m where pushes start. finds: the "direction" in
+    which the trajectory is then queried, or the "point" itself. starts: random starts; the best
+    that is reachable and leads nearer to the goal is used.
+    """
+
+    descent: str = "gradient"
+    start: str = "ring"
+    finds: str = "direction"
+    rate: float | None = None
+    starts: int = 1
+
+    def __post_init__(self) -> None:
+        check_choice("descent", self.descent, DESCENTS)
+        check_choice("start", self.start, ("ring", "circle"))
+        check_choice("finds", self.finds, STILL)
+        check_count("starts", self.starts, 1, 100)
 
 
 def descend(
     effects: EffectMap,
     target_xy_m: np.ndarray,
     generator: np.random.Generator,
-    starts: int = 1,
-    direction_only: bool = False,
+    reading: Reading = Reading(),
     trace: list[tuple[np.ndarray, np.ndarray]] | None = None,
 ) -> torch.Tensor:
-    """Find effect inputs (starts, C_e) whose predicted effect at t = 1 is near the target (2,).
+    """Effects (starts, 2) that, given to the model, are predicted nearest a target: best first.
 
-    Descends the gradient of the mean square error with Adam, on the input alone, from several
-    random starts in parallel; returns the best first. direction_only keeps the input on the circle
-    of effects that full pushes have. trace, if given, receives each iteration's inputs (starts, 2)
-    [m] and losses (starts,) [m²]. Without direction_only, as published, inputs may be effects that
-    no push has; `OutOfRangeWarning` is suppressed.
+    trace, if given, receives each iteration's inputs (starts, 2) [m] and losses (starts,) [m²].
     """
-    model, features = effects.model, effects.features
-    columns = xy_columns(model.effect_channels)
-    radius = START_RADIUS_M
-    if direction_only:
-        full, _ = effects.query(np.arange(12) * (math.pi / 6), torch.ones(12, 1))
-        radius = float(full[..., :2].norm(dim=-1).mean())
-    angle = torch.as_tensor(generator.uniform(0, 2 * math.pi, size=starts), dtype=torch.float32)
-    circle = radius * torch.stack([angle.cos(), angle.sin()], dim=1)
-    sought = (angle if direction_only else circle).requires_grad_()
-    optimiser = torch.optim.Adam([sought], lr=LEARNING_RATE_M / (radius if direction_only else 1))
-    target = torch.as_tensor(target_xy_m, dtype=torch.float32)
-    at_end = torch.ones(starts, 1)
-    before = circle.detach()
-    still = 0
+    ring_m = float(effects.grid[0][:, -1, :2].norm(dim=-1).mean())
+    angle = torch.tensor(generator.uniform(0, 2 * math.pi, reading.starts), dtype=torch.float32)
+    xy = torch.stack([angle.cos(), angle.sin()], dim=1)
+    xy *= ring_m if reading.start == "ring" else CIRCLE_M
+    method, usual_rate = DESCENTS[reading.descent]
+    optimiser = method([xy], lr=reading.rate or usual_rate)
+    target, still = torch.as_tensor(target_xy_m, dtype=torch.float32), 0
+    frame = normalize if reading.finds == "direction" else torch.clone
     for _ in range(MAX_ITERATIONS):
-        xy = radius * torch.stack([sought.cos(), sought.sin()], dim=1) if direction_only else sought
-        effect = torch.zeros(starts, len(model.effect_channels))
-        effect[:, columns] = xy
-        prediction = _predict(model, features, effect, at_end)
-        losses = (prediction.effect_mean[:, 0, columns] - target).square().mean(dim=-1)
+        xy.requires_grad_()
+        losses = (_predict(effects, xy, torch.ones(1))[1][:, 0] - target).square().mean(dim=-1)
+        (xy.grad,) = torch.autograd.grad(losses.sum(), [xy])
+        before, now = xy.detach().clone(), xy.detach()
         if trace is not None:
-            trace.append((xy.detach().numpy().copy(), losses.detach().numpy().copy()))
-        change = float((xy.detach() - before).norm(dim=-1).max())
-        still = still + 1 if change < CONVERGED_M else 0
+            trace.append((before.numpy(), losses.detach().numpy()))
+        optimiser.step()
+        change = (frame(now) - frame(before)).norm(dim=-1).max()
+        still = still + 1 if float(change) < STILL[reading.finds] else 0
         if still == STILL_ITERATIONS:
             break
-        before = xy.detach().clone()
-        (sought.grad,) = torch.autograd.grad(losses.sum(), [sought])
-        optimiser.step()
-    return effect.detach()[losses.detach().argsort(stable=True)]
+    found = ring_m * normalize(now) if reading.finds == "direction" else now
+    return found[losses.detach().argsort(stable=True)]
 
 
-def _predict(
-    model: EffectModel, features: torch.Tensor, effect: torch.Tensor, t: torch.Tensor
-) -> Prediction:
-    with warnings.catch_warnings(action="ignore", category=OutOfRangeWarning):
-        return model.predict(features, condition_on_final_effect(model, effect), t)
+def _predict(effects: EffectMap, xy: torch.Tensor, t: torch.Tensor) -> tuple[Any, ...]:
+    """Prediction at phases (T,), with its x and y of effect and action, from effects (n, 2)."""
+    model, columns = effects.model, xy_columns(effects.model.effect_channels)
+    effect = torch.zeros(len(xy), len(model.effect_channels))
+    effect[:, columns] = xy
+    observed = condition_on_final_effect(model, effect)
+    with warnings.catch_warnings(action="ignore", category=OutOfRangeWarning):  # a descent passes
+        found = model.predict(effects.features, observed, t.expand(len(xy), -1))
+    action = found.action_mean[..., xy_columns(model.action_channels)]
+    return found, found.effect_mean[..., columns], action
 
 
 def plan_gradient(
-    problem: PlanningProblem,
-    samples: int = 100,
-    starts: int = 1,
-    direction_only: bool = False,
-    seed: int = 0,
-    snap: bool = False,
+    problem: PlanningProblem, samples: int = 100, seed: int = 0, reading: Reading = Reading()
 ) -> Plan:
-    """Plan by gradient descent, as in the paper.
+    """Plan by gradient descent; a trajectory is queried at a number of samples.
 
-    samples: phases at which the trajectory is queried, which limit the resolution of the stop
-    phase. starts: random starts of the descent; the paper has one, which fails if it lies opposite
-    the goal. direction_only (ours): search on the circle of effects that actions have instead of
-    the whole plane, where the network can be made to predict anything. snap: execute the primitive
-    in the decoded direction instead of the decoded trajectory, as drags always are. The best start
-    whose action is reachable is used; without one, the plan ends.
+    Where no start leads nearer to the goal, they are drawn again, `MAX_DRAWS` times in a plan.
     """
     began = time.perf_counter()
     check_count("samples", samples, 2, 10_000)
-    check_count("starts", starts, 1, 100)
-    effects, (model, kind) = problem.effects, (problem.effects.model, problem.effects.kind)
-    goal, mode = problem.goal, problem.mode
-    columns = xy_columns(model.effect_channels)
-    a_columns = [model.action_channels.index(name) for name in ("x", "y")]
-    effects.query(np.zeros(1), torch.ones(1, 1))  # raises if the model is of other actions
     generator = np.random.default_rng(check_count("seed", seed, least=0))
-    xy, target = np.asarray(problem.start_xy_m), np.asarray(goal.xy_m)
-    steps: list[Step] = []
-    turned = 0.0
+    goal, steps = problem.goal, []
+    here, draws = np.array(problem.start_xy_m), 0
+    while len(steps) < problem.mode.max_steps and goal.distance_m(here) > SUCCESS_M:
+        found = descend(problem.effects, goal.xy_m - here, generator, reading)
+        turned = steps[-1].predicted_turn_rad if steps else 0.0
+        every = (_step(problem, xy, here, turned, samples) for xy in found)
+        if step := next(filter(None, every), None):
+            steps.append(step)
+            here = np.array(step.predicted_end_xy_m)
+        draws += step is None
+        if draws == MAX_DRAWS or (step and step.stop_phase < 1):
+            break
+    reached = goal.distance_m(here) <= goal.tolerance_m
+    if draws == MAX_DRAWS:
+        n = reading.starts * MAX_DRAWS
+        warnings.warn(f"none of {n} random starts led nearer to the goal", stacklevel=2)
+    return problem.plan_of(tuple(steps), "gradient", reached, began)
+
+
+def _step(
+    problem: PlanningProblem, xy: torch.Tensor, here: np.ndarray, turned: float, samples: int
+) -> Step | None:
+    """Decode the action for an effect (2,); None if it is out of reach or leads no nearer."""
+    effects, channels = problem.effects, problem.effects.model.effect_channels
     t = torch.linspace(0, 1, samples)
-    while len(steps) < mode.max_steps and np.hypot(*(target - xy)) > SUCCESS_M:
-        # Use the best start whose action is reachable.
-        for effect in descend(effects, target - xy, generator, starts, direction_only):
-            with torch.no_grad():
-                prediction = _predict(model, effects.features, effect[None], t[None])
-            action = prediction.action_mean[0, :, a_columns].numpy().astype(float)
-            angle = math.atan2(*(action[-1] - action[0])[::-1])
-            if problem.reachable(xy[None], np.array([angle]))[0]:
-                break
-        else:
-            break
-        path = prediction.effect_mean[0, :, columns].numpy().astype(float)
-        std = prediction.effect_std[0, :, columns].norm(dim=-1).numpy()
-        stop = samples - 1
-        if mode.partial:
-            distance = np.hypot(*(xy + path - target).T)
-            stop = int(np.argmin(distance))
-            if distance[stop] > SUCCESS_M and distance[-1] - distance[stop] < NEARER_M:
-                stop = samples - 1  # only noise at the path's end: the goal lies beyond it
-        if stop == 0:
-            break
-        xy_before, xy = xy, xy + path[stop]
-        if "yaw" in model.effect_channels:
-            turned += float(prediction.effect_mean[0, stop, model.effect_channels.index("yaw")])
-        shown = np.linspace(0, stop, min(PATH_SAMPLES, stop + 1)).round().astype(int)
-        steps.append(
-            Step(
-                kind.towards(angle),
-                float(t[stop]),
-                tuple(xy.tolist()),
-                xy_before + path[shown],
-                None if snap or kind is Drag else action[: stop + 1],
-                float(std[stop]),
-                turned,
-            )
-        )
-        if stop < samples - 1:
-            break
-    reached = bool(np.hypot(*(target - xy)) <= goal.tolerance_m)
-    name = "gradient" + "_direction" * direction_only + "_snapped" * snap
-    return problem.plan_of(tuple(steps), name, reached, began)
+    with torch.no_grad():
+        found, path, action = _predict(effects, xy[None], t)
+    path, action = here + path[0].numpy().astype(float), action[0].numpy().astype(float)
+    angle = math.atan2(*(action[-1] - action[0])[::-1])
+    away = np.hypot(*(path - problem.goal.xy_m).T)
+    stop = int(np.argmin(away)) if problem.mode.partial else samples - 1
+    if away[stop] > SUCCESS_M and away[-1] - away[stop] < NEARER_M:
+        stop = samples - 1  # only noise makes an earlier sample nearer
+    nearer = away[stop] < problem.goal.distance_m(here) - NEARER_M
+    if not (nearer and problem.reachable(here[None], np.array([angle]))[0]):
+        return None
+    if "yaw" in channels:
+        turned += float(found.effect_mean[0, stop, channels.index("yaw")])
+    decoded = None if effects.kind is Drag else action[: stop + 1]
+    std_m = float(found.effect_std[0, stop, xy_columns(channels)].norm())
+    primitive, end = effects.kind.towards(angle), tuple(path[stop].tolist())
+    return Step(primitive, float(t[stop]), end, path[: stop + 1], decoded, std_m, turned)

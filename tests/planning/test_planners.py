@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import warnings
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
@@ -22,13 +23,14 @@ from affordlib.planning import (
     plan_gradient,
 )
 from affordlib.planning.astar import HEURISTICS, Branches, BranchTable, search
+from affordlib.planning.gradient import Reading, descend
 from affordlib.planning.problem import Table
 from affordlib.planning.rollout import roll_out
 from affordlib.planning.routes import RouteMap, find_route
 from affordlib.primitives import Drag, Move, Push
 from affordlib.types import Goal, Prediction
 from affordlib.world import ROLLABLE, STANDING, Cuboid, UprightCylinder
-from experiments.planning import attempt
+from experiments.planning import attempt, phases_of_way
 from experiments.shipped import uniform_tasks
 from experiments.tasks import (
     constructed_tasks,
@@ -169,6 +171,16 @@ def test_branches_are_the_papers_180():
     np.testing.assert_allclose(effect_m[:, full], expected, atol=1e-4)
 
 
+def test_segments_of_the_recorded_part_are_the_papers_180_branches():
+    shares = np.array([0.2, 0.4, 0.6, 0.8, 1.0])
+    effects = EffectMap(MODEL, IMAGE)
+    stops = phases_of_way(effects, shares)
+    np.testing.assert_allclose(stops, STARTS + (1 - STARTS) * np.sqrt(shares), atol=0.005)
+    _, _, effect_m, _ = BranchTable(effects, stop_phases=stops).at(0.0)
+    ends_m = np.hypot(*effect_m).reshape(36, 5)
+    np.testing.assert_allclose(ends_m, np.tile(REACH_M * shares, (36, 1)), atol=1e-3)
+
+
 def test_astar_plans():
     plan = plan_astar(known((0.18, 0.06)))
     assert plan.reaches_goal
@@ -262,16 +274,81 @@ def test_of_two_plans_that_of_lower_variance_is_taken():
 # The paper's gradient planner
 
 
-@pytest.mark.parametrize("seed", range(3))
+class Turned(KnownDynamics):
+    """Known dynamics whose predicted effect is turned by a constant angle from the observed one."""
+
+    by_rad = 0.4
+
+    def predict(self, features, observations, t_target):
+        found = super().predict(features, observations, t_target)
+        if not observations.effect_mask.any():
+            return found
+        c, s = math.cos(self.by_rad), math.sin(self.by_rad)
+        turn = torch.tensor([[c, s], [-s, c]])
+        return replace(found, effect_mean=found.effect_mean @ turn)
+
+
+READINGS = [
+    Reading(),
+    Reading(starts=4),
+    Reading(finds="point"),
+    Reading("adam", "circle"),
+    Reading("adam", "circle", "point"),
+]
+
+
+@pytest.mark.parametrize("reading", READINGS, ids=str)
 @pytest.mark.parametrize("goal_xy", [(0.05, 0.02), (-0.03, 0.06), (0.13, -0.11)])
-def test_the_gradient_planner_finds_direction_and_phase(goal_xy, seed):
-    plan = plan_gradient(known(goal_xy), samples=300, seed=seed)
+def test_each_reading_finds_the_direction_whose_effect_points_at_the_goal(goal_xy, reading):
+    """Every input is predicted at 9 cm, 0.4 rad to its left: the best points 0.4 rad to the right.
+
+    For a goal g and an input of angle a, the loss is (r² + |g|² - 2 r |g| cos(a + 0.4 - φ)) / 2.
+    """
+    problem = known(goal_xy, model=Turned())
+    expected = math.atan2(goal_xy[1], goal_xy[0]) - Turned.by_rad
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        found = descend(problem.effects, np.array(goal_xy), rng, reading)[0]
+        off = math.remainder(math.atan2(found[1], found[0]) - expected, 2 * math.pi)
+        assert abs(off) < math.radians(2)
+        if reading.finds == "direction":
+            assert float(found.norm()) == pytest.approx(REACH_M, abs=1e-3)
+
+
+@pytest.mark.parametrize("reading", READINGS[::4], ids=str)
+@pytest.mark.parametrize("goal_xy", [(0.05, 0.02), (-0.03, 0.06), (0.13, -0.11)])
+def test_the_gradient_planner_finds_direction_and_phase(goal_xy, reading):
+    plan = plan_gradient(known(goal_xy), 300, reading=reading)
     assert len(plan.steps) == math.ceil(math.hypot(*goal_xy) / REACH_M)
     # Between two of 300 samples the object moves 0.75 mm; the direction converges.
     assert plan.predicted_distance_m < 0.001
     decoded = plan.steps[0].path_xy_m
     heading = math.atan2(*(decoded[-1] - decoded[0])[::-1])
     assert heading == pytest.approx(math.atan2(goal_xy[1], goal_xy[0]), abs=0.02)
+
+
+class Deaf(KnownDynamics):
+    """Known dynamics through which no gradient flows, so that a descent stays at its start."""
+
+    def predict(self, features, observations, t_target):
+        found = super().predict(features, observations, t_target)
+        return replace(
+            found, effect_mean=found.effect_mean.detach() + 0 * observations.effect.sum()
+        )
+
+
+def test_a_start_that_leads_away_is_drawn_again_and_the_planner_says_if_all_do():
+    ends_m = []
+    for seed in range(12):
+        with warnings.catch_warnings(record=True, action="always") as said:
+            plan = plan_gradient(known((0.05, 0.0), model=Deaf()), seed=seed)
+        assert bool(plan.steps) != any("none of 5 random starts" in str(w.message) for w in said)
+        ends_m += [plan.predicted_distance_m] * bool(plan.steps)
+    assert len(ends_m) >= 10
+    assert max(ends_m) < 0.05
+    nowhere = known((0.05, 0.0), reachable=lambda xy, *_: np.zeros(len(xy), bool))
+    with pytest.warns(UserWarning, match="none of 10 random starts led nearer to the goal"):
+        plan_gradient(nowhere, reading=Reading(starts=2))
 
 
 @pytest.mark.slow
@@ -289,9 +366,9 @@ def test_modes_bind_the_gradient_planner():
     expected = STARTS + (1 - STARTS) * math.sqrt(0.04 / REACH_M)
     assert partial.steps[0].stop_phase == pytest.approx(expected, abs=0.01)
     assert np.array_equal(again.steps[0].path_xy_m, partial.steps[0].path_xy_m)
-    snapped = plan_gradient(known((0.04, 0.0)), snap=True)
-    assert snapped.steps[0].path_xy_m is None
-    assert snapped.steps[0].primitive.direction_rad == pytest.approx(0.0, abs=0.01)
+    drag = plan_gradient(replace(known((0.04, 0.0)), effects=EffectMap(MODEL, IMAGE, Drag)))
+    assert drag.steps[0].path_xy_m is None
+    assert drag.steps[0].primitive.direction_rad == pytest.approx(0.0, abs=0.01)
 
 
 def test_a_decoded_path_is_followed(world):
@@ -309,6 +386,7 @@ def test_a_decoded_path_is_followed(world):
 # All of them
 
 
+@pytest.mark.filterwarnings("ignore:none of 5 random starts")
 @pytest.mark.parametrize("plan", PLANNERS)
 def test_planners_keep_to_mode_reach_and_table(plan):
     full = plan(known((0.07, 0.03), "single_full"))
