@@ -592,9 +592,10 @@ def variant_rows(records: dict[str, Rows]) -> Rows:
         both["by_m"] = both.distance_m_x - both.distance_m_y
         for group in ("standing", "all"):
             some = both[both.object_class.isin(GROUPS[group])]
+            rng = np.random.default_rng(0)
             for mode, pairs in some.groupby("mode", sort=False):
                 by_goal = pairs.groupby("task").by_m.mean()
-                mean, low, high = interval(by_goal, 2000, np.random.default_rng(0))
+                mean, low, high = interval(by_goal, 2000, rng)
                 row = {"planner": name, "than": than, "object_class": group, "mode": mode}
                 row |= {"n": len(by_goal), "difference_mean_m": mean}
                 rows.append(row | {"low_m": low, "high_m": high})
