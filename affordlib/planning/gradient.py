@@ -150,7 +150,7 @@ def _step(
     stop = int(np.argmin(away)) if problem.mode.partial else samples - 1
     if away[stop] > SUCCESS_M and away[-1] - away[stop] < NEARER_M:
         stop = samples - 1  # only noise makes an earlier sample nearer
-    nearer = away[stop] < problem.goal.distance_m(here) - NEARER_M
+    nearer = stop > 0 and away[stop] < problem.goal.distance_m(here) - NEARER_M
     if not (nearer and problem.reachable(here[None], np.array([angle]))[0]):
         return None
     if "yaw" in channels:

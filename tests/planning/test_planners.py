@@ -351,6 +351,20 @@ def test_a_start_that_leads_away_is_drawn_again_and_the_planner_says_if_all_do()
         plan_gradient(nowhere, reading=Reading(starts=2))
 
 
+def test_a_push_that_would_stop_before_it_begins_is_none():
+    """A network predicts a few millimetres of effect at t = 0, where nothing has happened."""
+
+    class Offset(Deaf):
+        def predict(self, features, observations, t_target):
+            found = super().predict(features, observations, t_target)
+            return replace(found, effect_mean=found.effect_mean + torch.tensor([0.01, 0.0]))
+
+    for seed in range(6):
+        with warnings.catch_warnings(action="ignore", category=UserWarning):
+            plan = plan_gradient(known((0.03, 0.0), model=Offset()), seed=seed)
+        assert all(step.stop_phase > 0 for step in plan.steps)
+
+
 @pytest.mark.slow
 def test_finer_samples_stop_nearer():
     errors = []
