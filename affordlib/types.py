@@ -187,7 +187,7 @@ class Observation:
     xy_m: estimated position (x, y) [m] in the table's frame; image: (2, 48, 48), depth [m] from a
     plane 1 m above the table and the object's mask, centred at xy_m to within a few millimetres;
     yaw_rad: the object's yaw [rad], if the robot can estimate it; yaw_std_rad: its σ [rad], None if
-    the yaw was not seen but dead-reckoned; std_m: σ of the position along an axis [m].
+    the yaw was not seen but dead-reckoned; std_m: σ of the position [m].
     """
 
     xy_m: tuple[float, float]

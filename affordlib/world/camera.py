@@ -36,8 +36,9 @@ _TABLE_XY_M = np.array([sum(TABLE_X_M), sum(TABLE_Y_M)]) / 2
 KINECT_HEIGHT_M = 1.3
 KINECT_FOCAL_PX = 575.0
 KINECT_BASELINE_M = 0.075
-KINECT_STD_M = 0.0005
-"""σ of an object's position along an axis; measured: 0.3 mm bias and 0.4 mm noise of an image."""
+KINECT_STD_M = 0.0008
+"""σ of an object's position [m]: measured for spheres, 0.4 mm of bias and 0.4 mm of noise along
+each axis; for cuboids 0.6 mm."""
 _KINECT_MASK_HEIGHT_M = 0.012
 
 _RENDERER = {"renderer": pybullet.ER_TINY_RENDERER, "flags": pybullet.ER_NO_SEGMENTATION_MASK}
