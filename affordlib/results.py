@@ -185,6 +185,8 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
     path = file_at(path)
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(data["steps"], list):
+            raise ValueError(f"steps must be a list, got {data['steps']!r:.40}")
         steps = tuple(_step(**step) for step in data["steps"])
         return Plan(**data | {"goal": Goal(**data["goal"]), "steps": steps})
     except Exception as error:

@@ -19,8 +19,7 @@ from experiments.commands import command
 from experiments.runner import FOLDER, STUDIES, Job, Rows, read
 
 NAME = "studies"
-MODULES = ("ablation", "representation", "uncertainty", "shared_network", "limits", "literal")
-MODULES += ("novelty",)
+MODULES = ("ablation", "representation", "uncertainty", "limits", "literal", "novelty")
 for module in MODULES:
     importlib.import_module(f"experiments.{module}")
 

@@ -18,6 +18,7 @@ from affordlib.types import (
     HasChannels,
     check_array,
     check_count,
+    check_field,
     check_finite,
 )
 
@@ -143,7 +144,11 @@ class InteractionTensors:
     def __post_init__(self) -> None:
         if self.stop_phase is None:
             object.__setattr__(self, "stop_phase", torch.ones(len(self)))
+        check_field(self, "image_width_m", 0.01, 10.0, "m")
         n, steps = len(self.image), len(self.phase)
+        for name in ("action_channels", "effect_channels"):
+            if not getattr(self, name):
+                raise ValueError(f"{name} must name at least one channel")
         shapes = {"image": (2, *self.image.shape[-1:] * 2), "stop_phase": ()}
         shapes |= {"action": (steps, len(self.action_channels))}
         shapes |= {"effect": (steps, len(self.effect_channels))}

@@ -59,6 +59,8 @@ def summary(errors: pd.DataFrame, by: Sequence[str] = ("model",)) -> list[dict[s
 
     The number of pushes, mean, standard error (sem) and median of the errors, and coverage.
     """
+    if not by or not set(by) <= set(errors.columns):
+        raise ValueError(f"by must be columns of errors ({', '.join(errors)}), got {by!r}")
     rows = []
     for key, part in errors.groupby([*by], sort=False):
         row = dict(zip(by, key, strict=True)) | {"n": len(part)}

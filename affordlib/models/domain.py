@@ -10,7 +10,7 @@ from torch import Tensor
 
 from affordlib.geometry import xy_columns
 from affordlib.interactions.dataset import InteractionTensors
-from affordlib.types import Observations, check_pair
+from affordlib.types import Observations, check_field, check_pair
 
 Range = tuple[float, float]
 PHASE_TOLERANCE = 1e-5
@@ -38,6 +38,8 @@ class TrainingDomain:
         for name in ("start_radius_m", "end_radius_m", "mask_share", "effect_radius_m"):
             if getattr(self, name) is not None:
                 check_pair(name, getattr(self, name), "(low, high)")
+        if self.image_width_m is not None:
+            check_field(self, "image_width_m", 0.01, 10.0, "m")
 
     @classmethod
     def fit(cls, tensors: InteractionTensors) -> Self:

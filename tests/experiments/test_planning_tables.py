@@ -8,29 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from affordlib.geometry import rotated
 from affordlib.paths import repo_root
 from affordlib.planning import MODES, EffectMap
 from affordlib.primitives import PUSH_GAP_M, Drag, Push
 from affordlib.world import ROLLABLE, STANDING, Cuboid, UprightCylinder
 from experiments import planning, shipped, tasks
-from experiments.adaptation import Camera
 from experiments.field_baselines import FINGER_AHEAD_M, LimitSurface
 from experiments.planning import CONFIGS, attempt
 from experiments.tasks import FROZEN, PlanningTask, frozen_tasks, tasks_sha256
-
-
-def test_pushes_show_how_far_beside_the_camera_sees():
-    """The error of an estimate along a push equals that of its end; two directions suffice."""
-    error_m, camera = np.array([0.001, -0.002]), Camera((0.0, 0.0005), sd_m=0.001, noise_m=1e-5)
-    pushes = [
-        {"angle": angle, "std_m": (0.001, std_m), "beyond_m": rotated(error_m, -angle)}
-        for angle, std_m in ((0.3, 1.0), (2.0, 1.0), (2.5, 0.001))
-    ]
-    assert camera.error_m([]).tolist() == [0.0, 0.0005]
-    assert rotated(camera.error_m(pushes[:1]) - error_m, -0.3)[0] == pytest.approx(0, abs=1e-6)
-    np.testing.assert_allclose(camera.error_m(pushes[:2]), error_m, atol=1e-6)
-    np.testing.assert_allclose(camera.error_m(pushes[2:]), error_m, atol=1e-6)
 
 
 def test_goals_survive_the_file_which_is_never_written_over(capsys):

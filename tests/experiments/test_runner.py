@@ -145,7 +145,7 @@ def test_damaged_results_are_named_and_none_are_no_results(tmp_path):
 
 
 TABLES = ("effect_prediction", "lever_up", "planning", "closed_loop", "open_loop_pose_goals")
-TABLES += ("real_pushes", "adaptation", "headline")
+TABLES += ("real_pushes", "headline")
 
 
 @pytest.mark.slow

@@ -10,12 +10,10 @@ import pytest
 import torch
 from scipy import integrate, stats
 
-from affordlib.interactions import InteractionTensors, open_interactions
-from affordlib.interactions.sampling import condition_on_recorded_action, sample_mixed
-from affordlib.models.push_frame import push_direction
+from affordlib.interactions import InteractionTensors
+from affordlib.interactions.sampling import sample_mixed
 from affordlib.paths import repo_root
-from affordlib.types import Prediction
-from experiments import ablation, limits, shared_network, studies
+from experiments import ablation, limits, studies
 from experiments.ablation import actions_only, half_blend, random_contexts
 from experiments.real_pushes import pushes_of
 from experiments.representation import cka
@@ -80,64 +78,6 @@ def test_changes_of_an_ablation_add_up(monkeypatch):
     assert ours.scaler.action_scale < (0.5, 0.5)
     first = [next(m for m in net.image_encoder if hasattr(m, "weight")) for net in (bare, ours)]
     assert not torch.equal(first[0].weight, first[1].weight)
-
-
-@pytest.fixture(scope="module")
-def of_all():
-    """The first interactions of each primitive, with all channels."""
-    channels = shared_network.NETWORK.action_channels, shared_network.NETWORK.effect_channels
-    return {
-        name: InteractionTensors.from_dataset(open_interactions(name), np.arange(30), *channels)
-        for name in shared_network.PRIMITIVES
-    }
-
-
-def test_the_commanded_action_tells_the_primitive(of_all):
-    told = {}
-    for name, arrays in of_all.items():
-        start, end = arrays.action[:, 0], arrays.action[:, -1]
-        beside = (start[:, :2].norm(dim=1) > 0.1, end[:, :2].norm(dim=1) > 0.01)
-        told[name] = torch.stack([*beside, end[:, 2] > 0.1, end[:, 4] < 0.5], dim=1).int()
-        assert (told[name] == told[name][0]).all()
-        towards = push_direction(
-            condition_on_recorded_action(arrays), arrays.action_channels, arrays.effect_channels
-        )
-        of_table = torch.tensor([1.0, 0.0]).expand(len(arrays), -1)
-        assert torch.equal(towards, of_table) == (name in ("grasp", "rotate"))
-    assert len({tuple(rows[0].tolist()) for rows in told.values()}) == 4
-
-
-def test_copies_keep_the_symmetries_of_each_primitive(of_all):
-    for name, arrays in of_all.items():
-        copies = shared_network.with_copies(arrays, name)
-        n, each = len(arrays), copies.action.reshape(-1, *arrays.action.shape)
-        assert torch.equal(copies.image[:n], arrays.image)
-        if name in ("grasp", "rotate"):
-            assert all(torch.equal(action, arrays.action) for action in each)
-        else:
-            assert torch.equal(each[1][..., :2], arrays.action[..., :2] * torch.tensor([1.0, -1.0]))
-            assert torch.equal(copies.effect[n:, :, 1], -arrays.effect[..., 1])
-
-
-def test_shares_are_of_the_usual_effect(of_all):
-    class Knowing(torch.nn.Module):
-        known = 1.0
-        action_channels = shared_network.NETWORK.action_channels
-        effect_channels = shared_network.NETWORK.effect_channels
-
-        def encode(self, image):
-            return image
-
-        def predict(self, image, observations, t_target):
-            same = [a for a in of_all.values() if torch.equal(a.image, image)]
-            end = self.known * same[0].effect[:, -1:]
-            return Prediction(end, end, end, end)
-
-    model = Knowing()
-    assert shared_network.shares(of_all)(model, None).tolist() == [0]
-    model.known = 0.5
-    (told,) = shared_network.shares(of_all)(model, None)
-    assert 0.25 < told <= 0.5
 
 
 # Residuals

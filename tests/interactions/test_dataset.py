@@ -155,7 +155,7 @@ def test_a_missing_set_names_the_shipped_ones(tmp_path):
 
 def test_sets_of_other_phases_are_not_joined(pushes):
     one = InteractionTensors.from_dataset(pushes, np.arange(2))
-    other = replace(one, phase=one.phase / 2)
+    other = replace(one, phase=one.phase**2)
     with pytest.raises(ValueError, match="same phases"):
         one.joined(other)
 

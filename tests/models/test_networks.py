@@ -158,9 +158,11 @@ def test_a_quarter_turn_of_the_table_turns_the_prediction(name, quarters, some):
     # Predictions are rotated by the function that rotates data.
     mean_a, std_a, mean_e, std_e = predictions(network, a)
     t_mean_a, t_std_a, t_mean_e, t_std_e = predictions(network, b)
-    predicted = dataclasses.replace(some, action=mean_a, effect=mean_e).rotated_and_mirrored(
-        quarters
-    )
+    start = torch.zeros(len(some), 1, 3)
+    both = {"action": torch.cat([start, mean_a], 1), "effect": torch.cat([start, mean_e], 1)}
+    phase = torch.linspace(0, 1, 6)
+    predicted = dataclasses.replace(some, phase=phase, **both).rotated_and_mirrored(quarters)
+    rotated_a, rotated_e = predicted.action[:, 1:], predicted.effect[:, 1:]
     # Without a direction, such as for an effect before contact, the frame is the table's.
     o = a.observations
     seen_e = o.effect_mask & (o.effect[..., :2].norm(dim=-1) > 1e-3)
@@ -168,11 +170,11 @@ def test_a_quarter_turn_of_the_table_turns_the_prediction(name, quarters, some):
     directed &= push_direction(o, *YAW.values())[:, 1] != 0
     assert directed.sum() > 20
     for mine, theirs in (
-        (predicted.effect, t_mean_e),
-        (predicted.action[..., :2], t_mean_a[..., :2]),
+        (rotated_e, t_mean_e),
+        (rotated_a[..., :2], t_mean_a[..., :2]),
     ):
         torch.testing.assert_close(mine[directed], theirs[directed], rtol=0, atol=2e-5)
-    by = (predicted.action[..., 2] - t_mean_a[..., 2])[directed]
+    by = (rotated_a[..., 2] - t_mean_a[..., 2])[directed]
     assert torch.remainder(by + math.pi, 2 * math.pi).sub(math.pi).abs().max() < 1e-4
     for mine, theirs in ((std_a, t_std_a), (std_e, t_std_e)):
         swapped = mine[..., [1, 0, 2]] if quarters % 2 else mine

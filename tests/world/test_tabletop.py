@@ -7,7 +7,7 @@ import pytest
 from pybullet_utils.bullet_client import BulletClient
 
 from affordlib.primitives import Drag, Grasp, LeverUp, Push
-from affordlib.types import CROP_WIDTH_M, IMAGE_PIXELS, Goal, Obstacle
+from affordlib.types import CROP_WIDTH_M, IMAGE_PIXELS, Obstacle
 from affordlib.world import (
     Cuboid,
     LyingCylinder,
@@ -137,7 +137,6 @@ def test_unreachable_raises_or_is_recorded_and_moves_nothing(world):
 @pytest.mark.parametrize(
     ("act", "words"),
     [
-        (lambda w: Goal((0.9, 0.0)), r"goal xy_m = \(0\.9, 0\) m lies off the table; choose x in"),
         (lambda w: w.execute_primitive(LEVER), r"'lever_up' needs the tool 'screwdriver'.*place\("),
         (lambda w: w.reset() or w.observe(), r"call place\(\.\.\.\) first"),
         (lambda w: Prism(STAR, 0.05), "convex polygon"),
