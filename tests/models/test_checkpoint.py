@@ -75,8 +75,10 @@ def test_a_bad_checkpoint_is_named(untrained, tmp_path):
 
 @pytest.mark.parametrize("name", ["attention_500", "lstm_500", "lever_up_lstm_1800_window"])
 def test_a_shipped_network_from_elsewhere_loads_in_a_fresh_process(name):
-    code = f"from affordlib.models import load_checkpoint as load; load({name!r})"
-    subprocess.run([sys.executable, "-c", code], cwd=repo_root(), check=True)
+    code = f"from affordlib.models import load_checkpoint as load; print(*load({name!r})[1])"
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, cwd=repo_root(), capture_output=True, text=True)
+    assert "seen_interactions" in done.stdout, done.stderr
 
 
 def test_a_renamed_checkpoint_is_refused(monkeypatch, tmp_path):
