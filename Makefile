@@ -99,7 +99,7 @@ workbook notebooks:
 	@set -f; goals=$$($(PY) notebooks/pages.py); run=$${goals%% *}; \
 	 [[ "$$WORKERS" =~ ^[1-9][0-9]?$$ ]] || { echo "WORKERS must be a whole number from 1 to 99" >&2; exit 1; }; \
 	 $(if $(DRY_RUN),,mkdir -p "$$run"; exec 9>> "$$run/.lock"; flock -n 9 || { echo "Another run is writing to $$run; wait for it, or choose another name with OUT=" >&2; exit 1; };) \
-	 exec $(MAKE) $(if $(DRY_RUN),-n) $(if $(findstring jobserver,$(MAKEFLAGS)),,-j"$$WORKERS") RUN="$$run" $${goals#* }
+	 exec $(MAKE) $(if $(DRY_RUN),-n,-s) $(if $(findstring jobserver,$(MAKEFLAGS)),,-j"$$WORKERS") RUN="$$run" $${goals#* }
 
 ifdef RUN
 # Copies of results are no input. A name with a blank, which make cannot express, is not ours.

@@ -170,7 +170,7 @@ def test_a_rerun_does_what_a_change_makes_necessary(finished, tmp_path, change, 
     [
         ("# divide\nn / 0", "in cell 4, which begins `# divide`.*ZeroDivisionError: division by"),
         ("import ctypes\nctypes.string_at(0)", "in cell 4.*DeadKernelError: Kernel died"),
-        ("out_dir += '/other'", "run the notebook that writes them"),
+        ("out_dir += '/other'", "run the notebook that writes it"),
     ],
 )
 def test_a_failing_page_stops_the_batch_and_a_rerun_goes_on(book, code, error):

@@ -44,7 +44,7 @@ def recurrent_over_conditional(noise_m=0.001):
     assert abs(100 * float(clean) - fifth_step_cm(conditional, test)) < 1e-3
     effect = test.effect.clone()
     noise = torch.randn(effect[..., :3].shape, generator=torch.Generator().manual_seed(0))
-    effect[..., :3] += noise_m * noise
+    effect[:, 1:, :3] += noise_m * noise[:, 1:]  # effects are relative to the first pose
     noisy = replace(test, effect=effect)
     return fifth_step_cm(recurrent, noisy) / fifth_step_cm(conditional, noisy)
 
