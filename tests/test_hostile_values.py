@@ -240,7 +240,7 @@ def shop(one_world, skills, pushes, tmp_path_factory):
         "plan_continuous": {"draft": True},
         "run_closed_loop": {"config": once, "goal": Goal(AT, 0.05)},
         "GoalPicker": {"folder": str(folder)},
-        "ConditioningExplorer": {"seen": executed},
+        "conditioning_explorer": {"seen": executed},
         "Grasp": {"seen_height": 0.05},
         "Push": {"radius": 0.2},
         "PushAt": {"length": 0.01},

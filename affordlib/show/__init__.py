@@ -1,7 +1,7 @@
 """Pictures for people: figures, animations, and interactive widgets."""
 
 from affordlib.show.executors import closed_loop, open_loop
-from affordlib.show.explorers import ConditioningExplorer, PhaseSlider
+from affordlib.show.explorers import conditioning_explorer, phase_explorer
 from affordlib.show.goal_picker import GoalPicker
 from affordlib.show.plots import (
     GOAL,

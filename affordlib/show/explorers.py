@@ -1,222 +1,240 @@
-"""Two widgets: predictions from chosen observations, and final positions of partial actions."""
+"""Two explorers: figures that sliders change, drawn by the browser from a table of numbers.
 
+Everything is computed beforehand, so they work without a kernel, too: in a saved page and in the
+web book. Where scripts do not run, a still picture stands in their place.
+"""
+
+import base64
+import io
+import itertools
+import json
 from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
 
-import ipywidgets as widgets
 import numpy as np
 import torch
 from matplotlib.figure import Figure
 
+from affordlib.geometry import rotated
 from affordlib.models.protocol import EffectModel
 from affordlib.primitives import Primitive
-from affordlib.show.drawing import FigureWidget
-from affordlib.show.plots import NEUTRAL, PREDICTION, TRUTH, plot_footprint, plot_table
+from affordlib.show.plots import NEUTRAL, PREDICTION, TRUTH
 from affordlib.types import (
     ACTION_CHANNELS,
     EFFECT_CHANNELS,
     Interaction,
     Observations,
-    Prediction,
     check_within,
 )
 from affordlib.world import Tabletop
 
 CHANNELS = {"action": ACTION_CHANNELS, "effect": EFFECT_CHANNELS}
-N_TARGETS = 101
-_PHASES = {"min": 0, "max": 1, "step": 0.01, "layout": {"width": "24em", "max_width": "100%"}}
+N_TARGETS = 31
+BLACK = "#222222"
+_SCRIPT = Path(__file__).with_name("explorer.js")
 
 
-class ConditioningExplorer(FigureWidget):
-    """Choose when action and effect are observed and how they are blended; see the prediction.
+class Line(NamedTuple):
+    """What a panel shows: x and y (n,), or (S, n) for each of S states of the sliders.
 
-    Equation (2) of the paper: the representation is w₁ r_action + w₂ r_effect, w₂ = 1 - w₁.
-
-    seen: a full interaction, the ground truth, from which observations are taken. The black points,
-    or sliders, set the phases of the observations, a tick removes one; the band is mean ± 2 σ.
+    style: "-", "--", ":" or "o"; band: half the height (S, n) of a band around it.
     """
 
-    figsize = (10.0, 5.2)
+    name: str
+    color: str
+    x: np.ndarray
+    y: np.ndarray
+    style: str = "-"
+    band: np.ndarray | None = None
 
-    def __init__(self, model: EffectModel, seen: Interaction) -> None:
-        self.model, self.seen = model, seen
-        self.prediction: Prediction | None = None
-        with torch.no_grad():
-            self._features = model.encode(torch.as_tensor(seen.image, dtype=torch.float32)[None])
-        look = _PHASES | {"style": {"description_width": "8em"}}
-        tick = {"indent": False, "layout": {"width": "6em"}}
-        self._action_t = widgets.FloatRangeSlider(
-            value=(0.0, 1.0), description="action seen at t", **look
-        )
-        self._effect_t = widgets.FloatSlider(value=0.7, description="effect seen at t", **look)
-        self._weight = widgets.FloatSlider(value=1.0, description="w₁ (action)", **look)
-        self._has_action = widgets.Checkbox(True, description="action", **tick)
-        self._has_effect = widgets.Checkbox(False, description="effect", **tick)
-        controls = [self._action_t, self._has_action, self._effect_t, self._has_effect]
-        super().__init__([*controls, self._weight])
 
-    def observe_at(
+class Explorer:
+    """Panels of lines that depend on sliders.
+
+    sliders: name → values; the states are all their combinations, the last slider changing fastest.
+    start: the first value of each slider. panels: title → lines; square: the panel
+    whose axes have the same scale. words: a sentence for each state, in which <b> is bold.
+    """
+
+    def __init__(
         self,
-        action_t: Sequence[float] | None = (0.0, 1.0),
-        effect_t: float | None = None,
-        weight: float = 1.0,
+        sliders: dict[str, Sequence[float]],
+        start: Sequence[float],
+        panels: dict[str, list[Line]],
+        words: list[str],
+        square: str = "",
     ) -> None:
-        """Set what is observed and how it is blended, like the sliders; None: not observed."""
-        values = {
-            self._has_action: action_t is not None,
-            self._has_effect: effect_t is not None,
-            self._weight: weight,
-        }
-        if action_t is not None:
-            values[self._action_t] = tuple(action_t)
-        if effect_t is not None:
-            values[self._effect_t] = effect_t
-        self.set_controls(values)
-
-    def drag(self, name: str, phase: float) -> None:
-        """Set the phase at which the action (first or second point) or the effect is observed."""
-        first, second = self._action_t.value
-        if name == "effect":
-            self._effect_t.value = phase
-        elif name == "first action":
-            self._action_t.value = min(phase, second), second
-        else:
-            self._action_t.value = first, max(first, phase)
-
-    def observations(self) -> Observations:
-        """Current input of the model; the weight is 1 or 0 where one modality is missing."""
-        has_action, has_effect = self._has_action.value, self._has_effect.value
-        if not (has_action or has_effect):
-            raise ValueError("nothing is observed; tick the action, the effect, or both")
-        weight = torch.tensor([self._weight.value]) if has_action and has_effect else None
-        action = self._at(self._action_t.value, "action") if has_action else None
-        effect = self._at((self._effect_t.value,), "effect") if has_effect else None
-        return Observations.of(self.model, action, effect, weight)
-
-    def _at(self, t: Sequence[float], of: str) -> tuple[torch.Tensor, torch.Tensor]:
-        """Phases (1, n), and the values (1, n, C) of the action or the effect at them."""
-        columns = [self._truth(of, name) for name in getattr(self.model, f"{of}_channels")]
-        at = np.stack([np.interp(t, self.seen.phase, column) for column in columns], axis=-1)
-        return torch.tensor([t], dtype=torch.float32), torch.as_tensor(at).float()[None]
-
-    def _truth(self, of: str, name: str) -> np.ndarray:
-        return getattr(self.seen, of)[:, CHANNELS[of].index(name)]
-
-    def draw(self, figure: Figure) -> str:
-        """Draw x and y of action and effect over phase: truth, observations, mean ± 2 σ."""
-        if not (self._has_action.value or self._has_effect.value):
-            self.prediction = None
-            return "Nothing is observed: tick the action, the effect, or both."
-        given = self.observations()
-        t = torch.linspace(0, 1, N_TARGETS)
-        with torch.no_grad():
-            self.prediction = seen = self.model.predict(self._features, given, t[None])
-        axes = figure.subplots(2, 2, sharex=True, sharey="row")
-        points = {"action": ("first action", "second action"), "effect": ("effect",)}
-        for row, of in zip(axes, CHANNELS, strict=True):
-            row[0].set_ylabel(f"{of} [cm]")
-            channels = getattr(self.model, f"{of}_channels")
-            for ax, name in zip(row, ("x", "y"), strict=True):
-                c = channels.index(name)
-                mean = 100 * getattr(seen, f"{of}_mean")[0, :, c]
-                std = 100 * getattr(seen, f"{of}_std")[0, :, c]
-                truth = 100 * self._truth(of, name)
-                ax.plot(self.seen.phase, truth, "--", color=TRUTH, lw=2, label="ground truth")
-                ax.plot(t, mean, color=PREDICTION, lw=2, label="prediction")
-                band = {"color": PREDICTION, "alpha": 0.2, "lw": 0, "label": "± 2 σ"}
-                ax.fill_between(t, mean - 2 * std, mean + 2 * std, **band)
-                ax.set_title(f"{of}, {name}")
-                if getattr(given, f"{of}_mask").any():
-                    at = getattr(given, f"{of}_t")[0].numpy()
-                    value = 100 * getattr(given, of)[0, :, c].numpy()
-                    ax.plot(at, value, "o", color="black", label="observed", zorder=5)
-                    for point, *place in zip(points[of], at, value, strict=True):
-                        self.add_handle(ax, point, *map(float, place))
-        for ax in axes[1]:
-            ax.set_xlabel("phase t")
-        shown = [ax.get_legend_handles_labels() for ax in axes[:, 0]]
-        named = {
-            name: line for lines, names in shown for line, name in zip(lines, names, strict=True)
-        }
-        figure.legend(named.values(), named, loc="outside lower center", ncols=4)
-        columns = [self.model.effect_channels.index(name) for name in ("x", "y")]
-        end = seen.effect_mean[0, -1, columns].numpy()
-        error_mm = 1000 * np.hypot(*(end - self.seen.effect[-1, :2]))
-        std_mm = 1000 * float(seen.effect_std[0, -1, columns].norm())
-        return (
-            f"w₁ = {float(given.weight[0]):.2f}. The predicted final position is "
-            f"**{error_mm:.1f} mm** from the true one, with σ = {std_mm:.1f} mm."
-        )
-
-
-class PhaseSlider(FigureWidget):
-    """A slider, or a dotted line, at the phase t at which an action on the object is stopped.
-
-    The figure shows where the object was at t in the full action; `stop_here()`, the button,
-    executes it up to t. `rest` maps the phases tried so far to the poses (x, y, yaw) at rest.
-    """
-
-    def __init__(self, world: Tabletop, action: Primitive, phase: float = 0.8) -> None:
-        self.world, self.action = world, action
-        self._pose = world.object_pose()
-        self.full = world.execute_primitive(action)
-        self.rest: dict[float, tuple[float, float, float]] = {}
-        phase = check_within("phase", phase, 0.0, 1.0)
-        self._phase = widgets.FloatSlider(value=phase, description="phase t", **_PHASES)
-        self._stop = widgets.Button(description="Stop it here", icon="stop")
-        self._stop.on_click(lambda _: self.stop_here())
-        super().__init__([self._phase, self._stop])
+        self.sliders, self.panels, self.words = sliders, panels, words
+        self.square = square
+        pairs = zip(sliders.values(), start, strict=True)
+        self.at = [int(np.abs(np.subtract(values, wanted)).argmin()) for values, wanted in pairs]
 
     @property
-    def phase(self) -> float:
-        """Phase at which the slider stands."""
-        return round(self._phase.value, 2)
+    def state(self) -> int:
+        """Number of the state at which it starts."""
+        return int(np.ravel_multi_index(self.at, [len(v) for v in self.sliders.values()]))
 
-    def expected(self, phase: float) -> np.ndarray:
-        """Pose (x, y, yaw) of the object on the table at a phase of the full action."""
-        effect = [np.interp(phase, self.full.phase, self.full.effect[:, c]) for c in (0, 1, 3)]
-        return np.array(self._pose) + effect
+    def figure(self) -> Figure:
+        """The first state as a figure."""
+        figure = Figure(figsize=(10, 2.6 * ((len(self.panels) + 1) // 2)), layout="constrained")
+        axes = figure.subplots((len(self.panels) + 1) // 2, 2, squeeze=False)
+        for ax, (title, lines) in zip(axes.flat, self.panels.items(), strict=True):
+            for line in lines:
+                x, y, band = (_of(value, self.state) for value in (line.x, line.y, line.band))
+                ax.plot(x, y, line.style, color=line.color, label=line.name)
+                if band is not None:
+                    ax.fill_between(x, y - band, y + band, color=line.color, alpha=0.2, lw=0)
+            ax.set(title=title, aspect="equal" if title == self.square else "auto")
+        handles = {name: line for ax in axes.flat for line, name in _legend(ax)}
+        figure.legend(handles.values(), handles, loc="outside lower center", ncols=5)
+        return figure
 
-    def stop_here(self) -> None:
-        """Put the object back, execute the action up to t, and show where the object rests."""
-        x, y, yaw = self._pose
-        self.world.place(self.world.obj, (x, y), yaw, tool=self.action.tool)
-        self.world.execute_primitive(self.action, self.phase)
-        self.rest[self.phase] = self.world.object_pose()
-        self.refresh()
+    def _repr_mimebundle_(self, **kwargs: object) -> dict[str, str]:
+        """What a notebook shows: numbers and script, and a picture until the script has run."""
+        panels = [
+            {
+                "title": title,
+                "square": title == self.square,
+                "lines": [_packed(one) for one in all_],
+            }
+            for title, all_ in self.panels.items()
+        ]
+        sliders = [{"name": k, "values": list(v)} for k, v in self.sliders.items()]
+        data = {"sliders": sliders, "at": self.at, "panels": panels, "words": self.words}
+        text = json.dumps(data).replace("<", "\\u003c")
+        buffer = io.BytesIO()
+        self.figure().savefig(buffer, dpi=90)
+        picture = base64.b64encode(buffer.getvalue()).decode()
+        inside = f'<img alt="{self.words[self.state]}" src="data:image/png;base64,{picture}">'
+        script = f"<script>{_SCRIPT.read_text()}(document.currentScript.parentElement, {text})"
+        html = f'<div class="affordlib-explorer">{inside}{script}</script></div>'
+        return {"text/html": html, "text/plain": type(self).__name__}
 
-    def drag(self, name: str, phase: float) -> None:
-        """Move the slider to a phase."""
-        self._phase.value = phase
 
-    def draw(self, figure: Figure) -> str:
-        """Draw the table from above (left) and the object's displacement over the phase (right)."""
-        above, over_time = figure.subplots(1, 2, width_ratios=(1, 1.9))
-        t, obj, now = self.phase, self.world.obj, self.expected(self.phase)
-        x, y, yaw = self._pose
-        path = self.full.action[:, :2] + (x, y)
-        seen = np.vstack([path, self.full.effect[:, :2] + (x, y)])
-        low, high = seen.min(axis=0), seen.max(axis=0)
-        plot_table(above, (low + high) / 2, 0.05 + float(max(high - low)) / 2)
-        above.plot(*100 * path.T, ":", color=NEUTRAL, lw=1)
-        above.plot(*100 * path[self.full.phase <= t].T, color="black", lw=2, label="gripper")
-        plot_footprint(above, obj, (x, y), yaw, label="start")
-        moved = 100 * np.hypot(*self.full.effect[:, :2].T)
-        over_time.plot(self.full.phase, moved, color="black", label="during the full action")
-        over_time.axvline(t, color=NEUTRAL, ls=":")
-        self.add_handle(over_time, "phase", t)
-        rest_cm = [100 * np.hypot(rest[0] - x, rest[1] - y) for rest in self.rest.values()]
-        label = "at rest, stopped there"
-        over_time.plot(list(self.rest), rest_cm, "o", color=TRUTH, label=label)
-        over_time.set(xlabel="phase t", ylabel="object has moved [cm]", xlim=(0, 1.02))
-        moved_cm = np.interp(t, self.full.phase, moved)
-        words = f"At t = {t:.2f} the object has moved {moved_cm:.1f} cm."
-        if t in self.rest:
-            rest = self.rest[t]
-            plot_footprint(above, obj, rest[:2], rest[2], TRUTH, "at rest")
-            off_mm = 1000 * np.hypot(rest[0] - now[0], rest[1] - now[1])
-            words += f" Stopped there, it rests **{off_mm:.2f} mm** from that position."
-        label = "full action at t"  # drawn over the object at rest
-        plot_footprint(above, obj, now[:2], now[2], "black", label, style="--")
-        figure.legend(*above.get_legend_handles_labels(), loc="outside lower left", ncols=4)
-        over_time.legend(loc="upper left")
-        return words
+def _of(values: np.ndarray | None, state: int) -> np.ndarray | None:
+    return values if values is None or values.ndim == 1 else values[state]
+
+
+def _legend(ax: Any) -> zip:
+    return zip(*ax.get_legend_handles_labels(), strict=True)
+
+
+def _packed(line: Line) -> dict[str, Any]:
+    """A line in JSON's types: its numbers in 16 bits."""
+    packed = {"name": line.name, "color": line.color, "style": line.style}
+    for name in ("x", "y", "band"):
+        if (values := getattr(line, name)) is not None:
+            scale = float(np.abs(values).max() or 1.0) / 32767
+            numbers = base64.b64encode(np.round(values / scale).astype("<i2").tobytes()).decode()
+            packed[name] = {"n": values.shape[-1], "scale": scale, "numbers": numbers}
+    return packed
+
+
+def conditioning_explorer(
+    model: EffectModel, seen: Interaction, effect_t: float = 0.7, weight: float = 1.0
+) -> Explorer:
+    """Make an explorer of predictions from chosen observations of an interaction.
+
+    Equation (2) of the paper: the representation is w₁ r_action + w₂ r_effect, w₂ = 1 - w₁. The
+    action is observed at 0 and at a second phase, the effect at one; with w₁ = 1 the effect is not
+    observed, with w₁ = 0 the action is not. The band is mean ± 2 σ. seen: a full interaction, the
+    ground truth; effect_t, weight: the first phase of the effect, and w₁.
+    """
+    first = 1.0, check_within("effect_t", effect_t, 0, 1), check_within("weight", weight, 0, 1)
+    phases, quarters = np.linspace(0, 1, 11).round(2), np.linspace(0, 1, 5)
+    sliders = {"action also seen at t": quarters, "effect seen at t": phases, "w₁": quarters}
+    states = np.array(list(itertools.product(*sliders.values())))
+    context = {"action": np.insert(states[:, :1], 0, 0.0, axis=1), "effect": states[:, 1:2]}
+    channels = {of: getattr(model, f"{of}_channels") for of in CHANNELS}
+    truth = {of: _columns(seen, of, names) for of, names in channels.items()}
+
+    def values(of, t):
+        return np.stack([np.interp(t, seen.phase, column) for column in truth[of].T], axis=-1)
+
+    given = [tuple(map(_tensor, (t, values(of, t)))) for of, t in context.items()]
+    observed = Observations.of(model, *given, _tensor(states[:, 2]))
+    t = np.linspace(0, 1, N_TARGETS)
+    with torch.no_grad():
+        features = model.encode(_tensor(seen.image)[None]).expand(len(states), -1)
+        found = model.predict(features, observed, _tensor(t).expand(len(states), -1))
+    panels, shown = {}, {"action": states[:, 2] > 0, "effect": states[:, 2] < 1}
+    for of, name in itertools.product(CHANNELS, ("x", "y")):
+        c = channels[of].index(name)
+        mean, std = (100 * getattr(found, f"{of}_{m}")[..., c].numpy() for m in ("mean", "std"))
+        dots = 100 * np.where(shown[of][:, None], values(of, context[of])[..., c], np.inf)
+        dots = np.where(np.isinf(dots), mean.min() - 99, dots)  # out of sight
+        panels[f"{of}, {name} [cm], over phase"] = [
+            Line("ground truth", TRUTH, seen.phase[::10], 100 * truth[of][::10, c], "--"),
+            Line("prediction ± 2 σ", PREDICTION, t, mean, "-", 2 * std),
+            Line("observed", BLACK, context[of], dots, "o"),
+        ]
+    c = [channels["effect"].index(name) for name in ("x", "y")]
+    error_mm = 1000 * np.hypot(*(found.effect_mean[:, -1, c].numpy() - truth["effect"][-1, c]).T)
+    std_mm = 1000 * found.effect_std[:, -1, c].norm(dim=-1)
+    words = [
+        f"The predicted final position is <b>{error:.1f} mm</b> from the true one, "
+        f"with σ = {std:.1f} mm."
+        for error, std in zip(error_mm, std_mm, strict=True)
+    ]
+    return Explorer(sliders, first, panels, words)
+
+
+def _tensor(values: Any) -> torch.Tensor:
+    return torch.as_tensor(values, dtype=torch.float32)
+
+
+def _columns(seen: Interaction, of: str, names: Sequence[str]) -> np.ndarray:
+    return getattr(seen, of)[:, [CHANNELS[of].index(name) for name in names]]
+
+
+def phase_explorer(world: Tabletop, action: Primitive, phase: float = 0.8) -> Explorer:
+    """Make an explorer of where an action on the world's object, stopped at a phase, leaves it.
+
+    The action is executed in full, and stopped at 13 phases. phase: the first one that is shown.
+    """
+    phase = check_within("phase", phase, 0.0, 1.0)
+    start, obj = np.array(world.object_pose()), world.obj
+    full, stops = world.execute_primitive(action), np.linspace(0.4, 1, 13).round(2)
+    rest = []
+    for stop in stops:
+        world.place(obj, tuple(start[:2]), start[2], tool=action.tool)
+        world.execute_primitive(action, stop)
+        rest.append(world.object_pose())
+    along = np.linspace(0, 1, 101)
+    effect = np.array([np.interp(along, full.phase, full.effect[:, c]) for c in (0, 1, 3)]).T
+    during = start + [effect[round(100 * stop)] for stop in stops]
+    hand = (
+        np.array([np.interp(along, full.phase, full.action[:, c]) for c in (0, 1)])
+        + start[:2, None]
+    )
+    until = np.minimum(along, stops[:, None])
+    gripper = [100 * np.interp(until, along, column) for column in hand]
+
+    def outline(poses):
+        corners = np.array(
+            [rotated(obj.footprint_m, pose[2]) + pose[:2] for pose in np.array(poses)]
+        )
+        return np.moveaxis(100 * np.concatenate([corners, corners[:, :1]], axis=1), -1, 0)
+
+    moved = 100 * np.hypot(*effect[:, :2].T)
+    rest_cm = 100 * np.hypot(*(np.array(rest) - start).T[:2])[:, None]
+    panels = {
+        "from above [cm]": [
+            Line("start", NEUTRAL, *outline([start])[:, 0]),
+            Line("gripper", BLACK, *gripper, ":"),
+            Line("at rest, stopped at t", TRUTH, *outline(rest)),
+            Line("full action at t", BLACK, *outline(during), "--"),
+        ],
+        "object has moved [cm], over phase": [
+            Line("during the full action", BLACK, along, moved),
+            Line("at rest, stopped at t", TRUTH, stops[:, None], rest_cm, "o"),
+        ],
+    }
+    off_mm = 1000 * np.hypot(*(np.array(rest) - during).T[:2])
+    words = [
+        f"At t = {t:.2f} the object has moved {cm:.1f} cm. Stopped there, it rests "
+        f"<b>{mm:.2f} mm</b> from that position."
+        for t, cm, mm in zip(stops, moved[(100 * stops).round().astype(int)], off_mm, strict=True)
+    ]
+    return Explorer({"phase t": stops}, (phase,), panels, words, "from above [cm]")

@@ -4,6 +4,8 @@ It is a view on plain objects: everything it does can be done with a planner, `e
 `Tabletop.shove`.
 """
 
+import base64
+import io
 import itertools
 import math
 import threading
@@ -24,7 +26,6 @@ from affordlib.paths import resolve_out_dir
 from affordlib.planning import Planner, Skills
 from affordlib.planning.effect_map import EffectMap
 from affordlib.results import load_plan, save_plan
-from affordlib.show.drawing import FigurePicture
 from affordlib.show.executors import Executor, Stopped, closed_loop, measured, open_loop
 from affordlib.show.picker_controls import LIMIT_M, PickerControls, outcome_in_words, plan_in_words
 from affordlib.show.plots import plot_footprint, plot_plan, plot_table
@@ -32,11 +33,12 @@ from affordlib.show.table_data import TableView, object_data, plan_data, table_d
 from affordlib.types import Goal, Outcome, Plan, check_count, check_on_table
 from affordlib.world import Tabletop
 
+DPI = 90
 POSE_EVERY, SENT_TOGETHER = 12, 5
 """Simulation steps (1/240 s) between two poses of the shown motion, and poses in a message."""
 
 
-class GoalPicker(FigurePicture, widgets.HBox):
+class GoalPicker(widgets.HBox):
     """The table from above, where a goal is picked by mouse, keyboard or sliders.
 
     skills: what the robot can do. planners: name → function of a `PlanningProblem` that returns a
@@ -172,6 +174,15 @@ class GoalPicker(FigurePicture, widgets.HBox):
         ax = plot_table(figure.subplots(), (low + high) / 2, 0.1 + float((high - low).max()) / 2)
         plot_footprint(ax, self.world.obj, self._pose[:2], self._pose[2])
         return plot_plan(ax, plan, obj=self.world.obj, yaw_rad=self._plan_pose[2]).figure
+
+    def _repr_mimebundle_(self, **kwargs: object) -> tuple[dict[str, object], dict[str, object]]:
+        """The widget, and for a page without a kernel a picture at twice the resolution."""
+        buffer, figure = io.BytesIO(), self.figure()
+        figure.savefig(buffer, dpi=2 * DPI)
+        bundle = super()._repr_mimebundle_(**kwargs) | {"text/plain": type(self).__name__}
+        picture = {"image/png": base64.b64encode(buffer.getvalue()).decode()}
+        width, height = (round(DPI * inches) for inches in figure.get_size_inches())
+        return bundle | picture, {"image/png": {"width": width, "height": height}}
 
     # Requests from the page
 

@@ -1,13 +1,14 @@
 """Controls of the goal picker: menus, sliders, buttons, and what it says."""
 
+import html
 import math
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import ipywidgets as widgets
 
-from affordlib.show.drawing import words_as_html
 from affordlib.types import Goal, Outcome, Plan, Step
 
 LIMIT_M = 0.35
@@ -96,6 +97,12 @@ class PickerControls(widgets.VBox):
     def say(self, text: str, css: str = "") -> None:
         """Show a text, and announce it to screen readers."""
         self.said, self.words.value = text, words_as_html(text, css)
+
+
+def words_as_html(text: str, css: str = "") -> str:
+    """A text that screen readers announce, as HTML; only what stands in **stars** is bold."""
+    text = re.sub(r"\*\*(.*?)\*\*", r"<b>\1</b>", html.escape(text))
+    return f"<div role='status' aria-live='polite'><div class='{css}'>{text}</div></div>"
 
 
 def _numbers(goal: Goal) -> list[float]:

@@ -225,26 +225,19 @@ def saved_outputs(page, lab):
     return outputs
 
 
-EXPLORERS = [
-    """from affordlib.primitives import Push
-from affordlib.show import ConditioningExplorer, PhaseSlider
+EXPLORER = """from affordlib.primitives import Push
+from affordlib.show import phase_explorer
 
-table = Tabletop()
-table.place(Cuboid(0.07, 0.05, 0.05), (0.02, -0.01), 0.4)
-seen = table.execute_primitive(Push.towards(0.6))
-explorer = ConditioningExplorer(load_checkpoint("film_500")[0], seen)
-explorer.observe_at((0.1, 0.9), 0.7, 0.5)
-explorer""",
-    """table.place(Cuboid(0.07, 0.05, 0.05), (0.02, -0.01), 0.4)
-slider = PhaseSlider(table, Push.towards(0.6), phase=0.8)
-slider""",
-]
+with Tabletop() as other:
+    other.place(Cuboid(0.07, 0.05, 0.05), (0.02, -0.01), 0.4)
+    explorer = phase_explorer(other, Push.towards(0.6))
+explorer"""
 
 
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory):
     folder = tmp_path_factory.mktemp("lab")
-    with serve(folder, "00_start_here", EXPLORERS, frame_every=240) as lab:
+    with serve(folder, "00_start_here", [EXPLORER], frame_every=240) as lab:
         yield lab
 
 
@@ -421,7 +414,7 @@ def test_it_fits_its_window(page, table, width):
         return own.left < left - 1 || own.right > right + 1
             || hides && part.scrollWidth > part.clientWidth + 1;
     }).map((part) => part.outerHTML)"""
-    for widget in ("picker", "figure"):
+    for widget in ("picker", "explorer"):
         assert page.locator(f".affordlib-{widget} :not(svg *, option)").evaluate_all(cut) == []
     picture(page, f"8_width_{width}")
     page.set_viewport_size({"width": 1280, "height": 1000})
@@ -470,48 +463,17 @@ def test_the_browser_plans_while_the_hand_drags(page, table):
     assert_same_goal(page, table, 0.07, 0.09)
 
 
-def handle_of(page, widget, name):
-    """Position of a handle in a figure, as fractions of width and height, and its phase."""
-    names = f"[name for _, name, *_ in {widget}._handles]"
-    wait_until(lambda: name in ask(page, names))  # not while the figure is being drawn
-    k = ask(page, names).index(name)
-    scene = ask(page, f"{widget}._drawing.scene")
-    width, height = map(float, scene["box"].split()[2:])
-    at = scene["handles"][k]
-    y = (at["top"] + at["bottom"]) / 2 if at["y"] is None else at["y"]
-    phase = (at["x"] - at["left"]) / (at["right"] - at["left"])
-    return at["left"] / width, at["right"] / width, y / height, phase
-
-
-@pytest.mark.parametrize(
-    ("widget", "name", "phase", "control"),
-    [
-        ("explorer", "first action", 0.3, "explorer._action_t.value[0]"),
-        ("explorer", "second action", 0.6, "explorer._action_t.value[1]"),
-        ("explorer", "effect", 0.95, "explorer._effect_t.value"),
-        ("slider", "phase", 0.65, "slider.phase"),
-    ],
-)
-def test_what_is_marked_in_a_figure_is_dragged(page, widget, name, phase, control):
-    figure = page.locator(".affordlib-drawing img:not([hidden])").nth(int(widget == "slider"))
-    figure.scroll_into_view_if_needed()
-    before, box = figure.get_attribute("src"), figure.bounding_box()
-    left, right, y, now = handle_of(page, widget, name)
-    x0, x1 = (box["x"] + (left + at * (right - left)) * box["width"] for at in (now, phase))
-    page.mouse.move(x0, box["y"] + y * box["height"])
-    page.mouse.down()
-    page.mouse.move(x1, box["y"] + y * box["height"], steps=6)
-    picture(page, f"figure_{name.replace(' ', '_')}")
-    page.mouse.up()
-    there = pytest.approx(phase, abs=0.011)
-    wait_until(lambda: ask(page, control) == there == handle_of(page, widget, name)[3])
-    wait_until(lambda: figure.get_attribute("src") != before)
-    wanted = ask(page, f"{widget}._drawing.wanted")
-    page.mouse.move(box["x"] + 5, box["y"] + 5)  # where no handle is
-    page.mouse.down()
-    page.mouse.move(box["x"] + 200, box["y"] + 50, steps=4)
-    page.mouse.up()
-    assert ask(page, f"{widget}._drawing.wanted") == wanted
+def test_a_slider_of_an_explorer_changes_its_figure_without_the_kernel(page):
+    explorer = page.locator(".affordlib-explorer")
+    explorer.scroll_into_view_if_needed()
+    slider, words = explorer.locator("input"), explorer.locator("[role=status]")
+    assert "At t = 0.80" in words.inner_text()
+    assert explorer.locator("img").count() == 0  # that of pages without scripts
+    before = explorer.locator("circle").get_attribute("cx")
+    slider.press("ArrowLeft")
+    assert "At t = 0.75" in words.inner_text()
+    assert float(explorer.locator("circle").get_attribute("cx")) < float(before)
+    picture(page, "explorer")
 
 
 def test_a_saved_notebook_keeps_a_picture(page, lab):
