@@ -30,8 +30,8 @@ def cross_validate(
 
     models: names of `MODELS`; folds: number of folds of each group, each tested once; within:
     "group" trains on the other folds of the same group, "all" on those of all groups. Columns:
-    model, group, number of the push, n_train, position_m and yaw_rad, the errors, and the shares of
-    x, y and yaw inside the 50 and 90 % intervals.
+    model, group, number of the push, n_train, position_m and yaw_rad, the errors, the shares of x,
+    y and yaw inside the 50 and 90 % intervals, and the largest of their errors over σ.
     """
     check_count("folds", folds, 2)
     check_choice("within", within, ("group", "all"))
@@ -71,6 +71,20 @@ def summary(errors: pd.DataFrame, by: Sequence[str] = ("model",)) -> list[dict[s
     return rows
 
 
+def worst(
+    errors: pd.DataFrame, names: Sequence[str] = (), model: str = "physics_gp", n: int = 5
+) -> pd.DataFrame:
+    """The n pushes of `cross_validate` that fit a model worst, by their errors over σ.
+
+    Look at them before you trust a log: poses that jump, and rows of another push, come first.
+    names: of the pushes (`Log.names`), instead of their numbers.
+    """
+    check_choice("model", model, set(errors["model"]))
+    known = errors[errors["model"] == model].nlargest(n, "error_over_std")
+    known = known.assign(push=[names[k] if len(names) else k for k in known["push"]])
+    return known[["push", "group", "position_m", "yaw_rad", "error_over_std"]]
+
+
 def errors_of(
     data: LoggedPushes, trained: np.ndarray, tested: np.ndarray, names: Sequence[str], seed: int = 0
 ) -> pd.DataFrame:
@@ -92,4 +106,5 @@ def forecast_errors(model: PushModel, test: LoggedPushes) -> pd.DataFrame:
     off = np.abs(mean - np.column_stack([test.displacement_m, test.turn_rad]))
     inside = {f"inside_{p}": (off < norm.ppf(0.5 + p / 200) * std).mean(axis=1) for p in (50, 90)}
     errors = {"position_m": np.hypot(off[:, 0], off[:, 1]), "yaw_rad": off[:, 2]}
+    inside["error_over_std"] = (off / std).max(axis=1)
     return pd.DataFrame({"group": test.groups} | errors | inside)

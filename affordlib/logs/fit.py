@@ -4,6 +4,8 @@
     nearest           the effect of the logged push with the nearest contact point and direction
     ridge             quadratic in contact point and direction
     gaussian_process  of contact point and direction, with reflections if the outline is symmetric
+    rate_gp           of contact point, normal, direction and length: the effect per length; for
+                      outlines with corners and many pushes
     physics           a quasi-static push with two fitted numbers (`AnalyticPusher`); physics_feet:
                       with the support from `context["feet"]`
     physics_gp        the same, and a Gaussian process of its residuals; physics_feet_gp
@@ -15,11 +17,11 @@ The baselines that can use `context` get it, if it differs among the logged push
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -39,6 +41,10 @@ from affordlib.types import check_choice, check_count
 from affordlib.weights import read_weights, write_weights
 
 INNER_FOLDS, FEW, MOST_CONTEXT = 3, 100, 64
+MOST_FITTED = 500
+"""Number of pushes, of those of `rate_gp`, from which its kernel is learned."""
+FAR = 1.2
+"""Length of a push, as a multiple of the log's longest, beyond which σ is widened."""
 EFFORT = {"few": (100, 1e-4, 8), "many": (600, 3e-4, 8)}
 """Fine-tuning on fewer than `FEW` pushes or on more: steps, learning rate, tasks per step."""
 FORMAT = "affordlib model of pushes 1"
@@ -106,7 +112,15 @@ class FittedModel:
         own, other = (np.append(p.outline_m, p.tool_radius_m) for p in (self.data, pushes))
         if own.shape != other.shape or not np.allclose(own, other, atol=1e-6):
             raise ValueError("pushes: their outline_m or tool_radius_m is not that of the log")
-        return MODELS[self.name](self.data, pushes, self.state)
+        mean, std = MODELS[self.name](self.data, pushes, self.state)
+        far = pushes.length_m / (FAR * self.data.length_m.max())
+        if far.max() > 1:
+            warnings.warn(
+                f"pushes of {pushes.length_m.max():.3g} m are much longer than those of the log, "
+                f"at most {self.data.length_m.max():.3g} m; their σ is widened",
+                stacklevel=2,
+            )
+        return mean, std * np.maximum(1, far)[:, None]
 
 
 def _in_metres(pushes: Pushes, mean: np.ndarray, std: np.ndarray) -> Forecast:
@@ -114,9 +128,9 @@ def _in_metres(pushes: Pushes, mean: np.ndarray, std: np.ndarray) -> Forecast:
     return mean * scale, np.broadcast_to(std, mean.shape) * scale
 
 
-def _features(pushes: Pushes, like: Pushes) -> np.ndarray:
+def _features(pushes: Pushes, like: Pushes, of_rows: Sequence[int] = (0, 1, 4, 5)) -> np.ndarray:
     """Contact point and direction (n, 4 + c), and length and context if they differ in `like`."""
-    columns = [push_rows(pushes)[:, [0, 1, 4, 5]].double().numpy()]
+    columns = [push_rows(pushes)[:, list(of_rows)].double().numpy()]
     if like.length_m.std() > 0.05 * like.length_m.mean():
         columns.append(pushes.length_m[:, None] / gyration_radius_m(pushes.outline_m))
     for name in sorted(like.context.keys() - {"feet"}):
@@ -179,38 +193,59 @@ def mirrors(outline_m: np.ndarray) -> list[np.ndarray]:
     return found
 
 
-def _processes(
-    data: LoggedPushes, target: np.ndarray, pushes: Pushes, state: State
-) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and σ (n, 3) of Gaussian processes of a target, learned from mirrored pushes as well."""
-    from sklearn.exceptions import ConvergenceWarning
+@lru_cache(maxsize=6)
+def _process(known: bytes, target: bytes, theta: tuple[float, ...] = (), rate: bool = False) -> Any:
+    """A Gaussian process of a target (n,) on inputs (n, c); theta: its parameters, if known."""
     from sklearn.gaussian_process import GaussianProcessRegressor
-    from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
+    from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteKernel
 
-    rows, known = push_rows(data), [_features(data, data)]
+    each = np.frombuffer(target)
+    inputs = np.frombuffer(known).reshape(len(each), -1)
+    widths = [1.0] * inputs.shape[1], (1e-2, 1e4)
+    smooth = Matern(*widths, nu=2.5) if rate else RBF(*widths)
+    noise = WhiteKernel(0.01, (1e-8, 1.0)) if rate else WhiteKernel(0.1)
+    prior, about = ConstantKernel() * smooth + noise, {"normalize_y": True}
+    if theta:
+        prior, about = prior.clone_with_theta(np.array(theta)), about | {"optimizer": None}
+    return GaussianProcessRegressor(prior, **about).fit(inputs, each)
+
+
+def _processes(
+    data: LoggedPushes, target: np.ndarray, pushes: Pushes, state: State, rate: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and σ (n, 3) of Gaussian processes of a target, learned from mirrored pushes as well.
+
+    rate: of the target per length, with a rougher kernel, and of the normal too.
+    """
+    from sklearn.exceptions import ConvergenceWarning
+
+    columns = [0, 1, 2, 3, 4, 5] if rate else [0, 1, 4, 5]
+    rows, known = push_rows(data), [_features(data, data, columns)]
     rows[:, 7:], targets = torch.from_numpy(target), [target]
     for mirror in mirrors(data.outline_m):
         image = transformed(rows[None], torch.from_numpy(mirror)[None].float())[0].double()
-        known.append(np.hstack([image[:, [0, 1, 4, 5]].numpy(), known[0][:, 4:]]))
+        known.append(np.hstack([image[:, columns].numpy(), known[0][:, len(columns) :]]))
         targets.append(image[:, 7:].numpy())
-    known, targets = np.vstack(known), np.vstack(targets).T
-    prior = ConstantKernel() * RBF([1.0] * known.shape[1], (1e-2, 1e4)) + WhiteKernel(0.1)
+    per = [push_rows(p)[:, 6:7].double().numpy() if rate else 1.0 for p in (data, pushes)]
+    known, targets = np.vstack(known), np.vstack([each / per[0] for each in targets]).T
     if "theta" not in state:
-        free = GaussianProcessRegressor(prior, normalize_y=True)
+        some = slice(None, None, 1 + len(known) // MOST_FITTED if rate else 1)
         with warnings.catch_warnings():  # the length scale of an irrelevant feature hits its bound
             warnings.simplefilter("ignore", ConvergenceWarning)
-            state["theta"] = np.stack([free.fit(known, each).kernel_.theta for each in targets])
-    queried, found = _features(pushes, data), []
+            free = [_process(known[some].tobytes(), t[some].tobytes(), (), rate) for t in targets]
+        state["theta"] = np.stack([process.kernel_.theta for process in free])
+    queried, found = _features(pushes, data, columns), []
     for theta, each in zip(state["theta"], targets, strict=True):
-        fixed = {"kernel": prior.clone_with_theta(theta), "optimizer": None, "normalize_y": True}
-        process = GaussianProcessRegressor(**fixed).fit(known, each)
+        process = _process(known.tobytes(), each.tobytes(), tuple(theta.tolist()), rate)
         found.append(process.predict(queried, return_std=True))
     mean, std = (np.column_stack(v) for v in zip(*found, strict=True))
-    return mean, std
+    return mean * per[1], std * per[1]
 
 
-def _gaussian_process(data: LoggedPushes, pushes: Pushes, state: State) -> Forecast:
-    return _in_metres(pushes, *_processes(data, _outcome(data), pushes, state))
+def _gaussian_process(
+    data: LoggedPushes, pushes: Pushes, state: State, rate: bool = False
+) -> Forecast:
+    return _in_metres(pushes, *_processes(data, _outcome(data), pushes, state, rate))
 
 
 def _physics(
@@ -312,13 +347,14 @@ MODELS: dict[str, Callable[[LoggedPushes, Pushes, State], Forecast]] = {
     "nearest": _nearest,
     "ridge": _ridge,
     "gaussian_process": _gaussian_process,
+    "rate_gp": partial(_gaussian_process, rate=True),
     "physics": _physics,
     "physics_gp": partial(_physics, process=True),
     "physics_feet": partial(_physics, feet=True),
     "physics_feet_gp": partial(_physics, feet=True, process=True),
     "np": _neural_process,
 }
-BASELINES = tuple(MODELS)[:-1]
+BASELINES = tuple(name for name in MODELS if name not in ("rate_gp", "np"))
 
 
 def fit(data: LoggedPushes, model: str = "np", seed: int = 0) -> FittedModel:

@@ -1,14 +1,15 @@
 """Logs of a robot's own pushes of one object: checks and conversion to a common frame.
 
-`Log` accepts raw numbers, in millimetres or metres and in the world frame. `Log.pushes` returns
-them in metres and radians, in the object's frame before each push: the origin is the centroid of
-the outline, the axes are those of the recorded pose.
+`Log` accepts raw numbers, in its own unit and in the world frame. `Log.pushes` returns them in
+metres and radians, in the object's frame before each push: the origin is the centroid of the
+outline, the axes are those of the recorded pose. `planar` reads positions and quaternions in space.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from typing import Any, Self
 
@@ -18,7 +19,7 @@ from scipy.optimize import brentq
 from affordlib.geometry import cross, rotated
 from affordlib.types import check_array, check_choice, check_within
 
-UNITS_M = {"mm": 1e-3, "m": 1.0}
+UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 UNITS_RAD = {"deg": math.pi / 180, "rad": 1.0}
 MOST_ROWS, MOST_CORNERS = 20_000, 1000
 FEET = 12
@@ -32,6 +33,20 @@ LATE_SHARE = 0.05
 """Share of a push's duration by which its poses may begin late or end early; two frames at most."""
 SAMPLES = 500
 """Number of points of a path, at least, at which contact is looked for."""
+DEEP_M = 0.003
+"""How deep [m] the tool may be inside the outline in the first row and at the final pose."""
+BACK_M = 0.01
+"""How far [m] the path of a tool that touches in the first row is extended backwards."""
+APART_M, TOUCH_M = 0.003, 0.001
+"""In a session: gaps [m] at which a push may begin, and below which the tool touches."""
+MOST_TILT_RAD = math.radians(20)
+ORDERS = {"xyzw": [0, 1, 2, 3], "wxyz": [1, 2, 3, 0]}
+UPS = {"z": 0, "y": 1, "x": -1}
+"""How far x, y, z must be shifted so that the axis that points up comes last."""
+CAUSES = (
+    "likely causes: sign, unit or axis of the yaw, or order of the quaternion; a pose that was "
+    "held, or seen before the push ended; another push's pose; a marker off the outline's origin"
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,12 +86,41 @@ class LoggedPushes(Pushes):
     turn_rad: np.ndarray
 
 
+def planar(values: Any, order: str = "xyzw", up: str = "z") -> np.ndarray:
+    """Positions (n, 3) as x, y (n, 2), or with quaternions (n, 7) as x, y and yaw [rad] (n, 3).
+
+    order: of the quaternion, "xyzw" or "wxyz"; up: the axis of the world that points up, "z", "y"
+    or "x"; the plane's x and y are the two that follow it, for "y" these are z and x. Raises
+    ValueError if the object's own axis of this name does not point up.
+    """
+    check_choice("order", order, ORDERS)
+    shift = UPS[check_choice("up", up, UPS)]
+    rows = _rows("values", values, 3 if np.shape(values)[-1:] == (3,) else 7, least=1)
+    xy = np.roll(rows[:, :3], shift, axis=1)[:, :2]
+    if rows.shape[1] == 3:
+        return xy
+    quaternions = rows[:, 3:][:, ORDERS[order]]
+    size = np.linalg.norm(quaternions, axis=1)
+    if (row := int(np.abs(size - 1).argmax())) >= 0 and abs(size[row] - 1) > 0.05:
+        raise ValueError(f"quaternions must have length 1, but that of row {row} has {size[row]:g}")
+    i, j, k = np.roll(quaternions[:, :3], shift, axis=1).T
+    w, tilt = quaternions[:, 3], np.arccos(np.clip(1 - 2 * (i * i + j * j), -1, 1))
+    if (row := int(tilt.argmax())) >= 0 and tilt[row] > MOST_TILT_RAD:
+        raise ValueError(
+            f"the object's {up} axis must point up, but in row {row} it is tilted by "
+            f"{math.degrees(tilt[row]):.0f}°; choose another order ({order}) or up ({up}), or turn "
+            "the frame fixed to the object"
+        )
+    return np.column_stack([xy, np.arctan2(2 * (w * k + i * j), 1 - 2 * (j * j + k * k))])
+
+
 class Log:
     """Pushes of one object, added one by one; invalid numbers are rejected when they are added.
 
-    unit: of all lengths, "mm" or "m"; angle_unit: of yaws, "rad" or "deg"; outline: corners (x, y)
-    of a simple polygon in the frame whose pose is recorded (from an image: `outline_of`);
-    tool_radius: radius of a round tool whose centre is recorded.
+    unit: of all lengths, "mm", "cm" or "m"; angle_unit: of yaws, "rad" or "deg"; outline: corners
+    (x, y) of a simple polygon in the frame whose pose is recorded (from an image: `outline_of`);
+    tool_radius: radius of a round tool whose centre is recorded. names: of the added pushes;
+    refused: why others were not added, by name.
     """
 
     def __init__(
@@ -91,7 +135,8 @@ class Log:
         check_within(f"the radius of outline, in {unit},", radius_m, 0.0, LARGEST_M, "m")
         self._radius_m = check_within("tool_radius", tool_radius, 0.0, 1e3) * self._metres
         self._pushes: list[dict[str, Any]] = []
-        self._tried = 0
+        self.names: list[str] = []
+        self.refused: dict[str, str] = {}
 
     def __len__(self) -> int:
         return len(self._pushes)
@@ -104,17 +149,18 @@ class Log:
         poses_t: Any = None,
         context: Mapping[str, Any] | None = None,
         group: str = "all",
+        name: str | None = None,
     ) -> None:
         """Add one push, in the world frame.
 
         tool_t: (m,), increasing times; tool_xy: (m, 2), nearly straight path of the tool, which
-        begins outside the object and ends where the push ends; poses: (k, 3), x, y and yaw of the
-        object, at the times poses_t (k,) of the tool's clock, or without times two poses, before
-        and after the push; context: further known values, numbers or text; group: name of the
-        pushes that belong together. Raises ValueError, and adds nothing, with the number of the
-        push (of all calls, from 0), the value and what is expected.
+        begins outside the object, or touches it, and ends where the push ends; poses: (k, 3), x, y
+        and yaw of the object, at the times poses_t (k,) of the tool's clock, or without times two
+        poses, before and after the push; context: further known values, numbers or text; group:
+        name of the pushes that belong together; name: of this push (default: the number of the
+        call, from 0). Raises ValueError, and adds nothing, with name, value and what is expected.
         """
-        number, self._tried = self._tried, self._tried + 1
+        name = str(len(self.names) + len(self.refused)) if name is None else str(name)
         try:
             tool = _rows("tool_xy", tool_xy, 2) * self._metres
             t = _growing("tool_t", tool_t, len(tool))
@@ -123,11 +169,68 @@ class Log:
             centre, tool = (rotated(p - centre[0], -ends[0, 2]) for p in (centre, tool))
             push = _contact(self.outline_m, tool, self._radius_m)
             push |= {"displacement_m": centre[1], "turn_rad": ends[1, 2] - ends[0, 2]}
-            self._refuse_jumps(**push)
+            self._refuse_jumps(tool[-1:], **push)
             push |= {"groups": group, "context": self._context(context or {})}
         except ValueError as error:
-            raise ValueError(f"push {number} (group {group!r}): {error}") from None
+            self.refused[name] = str(error)
+            raise ValueError(f"push {name} (group {group!r}): {error}") from None
         self._pushes.append(push)
+        self.names.append(name)
+
+    def add_all(self, pushes: Iterable[Mapping[str, Any]]) -> dict[str, str]:
+        """Add pushes, each the arguments of `add`; returns why some were refused, by name."""
+        before = {*self.refused}
+        for each in pushes:
+            with suppress(ValueError):
+                self.add(**each)
+        return {name: why for name, why in self.refused.items() if name not in before}
+
+    def from_contact(self, contact: Any, direction: Any, length: float, pose: Any) -> dict:
+        """Times and path of a tool that was not recorded, as arguments of `add`.
+
+        contact: (2,), on the outline, direction: (2,), of the tool's motion, and length of the
+        motion after contact, all in the world frame; pose: (3,), x, y and yaw before the push.
+        """
+        x, y, yaw = self.centroid_pose(pose)
+        point, ahead = check_array("contact", contact, 2), check_array("direction", direction, 2)
+        point, ahead = point * self._metres, ahead / max(1e-12, np.linalg.norm(ahead))
+        off, edge, on = _nearest(self.outline_m, rotated(point - (x, y), -yaw)[None])
+        within = "the distance of contact from the outline at pose"
+        check_within(within, abs(off.item()), 0.0, DEEP_M, "m")
+        normal = np.array([-edge[0, 1], edge[0, 0]]) / np.linalg.norm(edge)
+        middle = rotated(on[0] - self._radius_m * normal, yaw) + np.array([x, y])
+        end = ahead * check_within("length", length, 0.0, 1e3) * self._metres
+        path = np.stack([middle - BACK_M * ahead, middle + end]) / self._metres
+        return {"tool_t": np.array([0.0, 1.0]), "tool_xy": path}
+
+    def split(self, tool_t: Any, tool_xy: Any, poses: Any, poses_t: Any) -> list[dict[str, Any]]:
+        """Find the pushes in the recording of a session; returns arguments of `add`, one each.
+
+        The object must be seen throughout, as in `add`. A push begins outside the outline, or at
+        the first row, and ends where the tool is farthest from where it touched.
+        """
+        tool = _rows("tool_xy", tool_xy, 2, math.inf) * self._metres
+        t = _growing("tool_t", tool_t, len(tool))
+        known = self._poses("poses", poses, math.inf)
+        at = _growing("poses_t", poses_t, len(known))
+        known[:, 2] = np.unwrap(known[:, 2])
+        seen = np.column_stack([np.interp(t, at, column) for column in known.T])
+        c, s = np.cos(seen[:, 2]), np.sin(seen[:, 2])
+        x, y = (tool - seen[:, :2]).T
+        inside = np.column_stack([c * x + s * y, c * y - s * x]) - self.origin_m
+        gap, found, done = _nearest(self.outline_m, inside)[0] - self._radius_m, [], 0
+        while (touch := np.flatnonzero(gap[done:] < TOUCH_M)).size:
+            first = done + int(touch[0])
+            apart = np.flatnonzero(gap[first:] > APART_M)
+            last = first + int(apart[0]) if apart.size else len(t)
+            end = first + int(np.linalg.norm(tool[first:last] - tool[first], axis=1).argmax())
+            away = np.flatnonzero(gap[done:first] > APART_M)
+            rows, done = slice(done + int(away[-1]) if away.size else done, end + 1), last
+            if end > first:
+                push = {"tool_t": t[rows], "tool_xy": tool[rows] / self._metres}
+                push["poses"] = seen[rows] / [self._metres, self._metres, self._radians]
+                found.append(push | {"poses_t": t[rows]})
+        return found
 
     def query(
         self, tool_xy: Any, context: Mapping[str, Any] | None = None, group: str = "all"
@@ -159,11 +262,15 @@ class Log:
         of_all = {"outline_m": self.outline_m, "tool_radius_m": self._radius_m}
         return kind(**arrays, context=context, **of_all)
 
-    def _poses(self, name: str, values: Any) -> np.ndarray:
+    def _poses(self, name: str, values: Any, most: float = MOST_ROWS) -> np.ndarray:
         """Convert poses (k, 3) to metres and radians; raises ValueError."""
-        poses = _rows(name, values, 3) * [self._metres, self._metres, self._radians]
-        most = float(np.abs(poses[:, 2]).max())
-        check_within(f"yaws of {name}, in {self._angle_unit},", most, 0.0, 2 * math.pi, "rad")
+        poses = _rows(name, values, 3, most) * [self._metres, self._metres, self._radians]
+        if np.abs(poses[:, 2]).max() > 2 * math.pi:
+            raise ValueError(
+                f"yaws of {name}, in {self._angle_unit}, must lie within one turn, got "
+                f"{poses[np.abs(poses[:, 2]).argmax(), 2] / self._radians:g}; angle_unit is "
+                f"{self._angle_unit!r}, and whole turns that were counted must be taken away"
+            )
         return poses
 
     def _ends(self, t: np.ndarray, poses: Any, poses_t: Any) -> np.ndarray:
@@ -177,17 +284,23 @@ class Log:
             raise ValueError(
                 f"poses_t are from {at[0]:g} to {at[-1]:g}, but the tool moves from {t[0]:g} to "
                 f"{t[-1]:g}: the object must be seen before it moves and when the tool has "
-                "stopped, by the same clock"
+                "stopped, by the same clock, in the same unit"
             )
         known[:, 2] = np.unwrap(known[:, 2])
-        return np.stack([known[0], [np.interp(t[-1], at, column) for column in known.T]])
+        return np.column_stack([np.interp(t[[0, -1]], at, column) for column in known.T])
 
     def _refuse_jumps(
-        self, length_m: float, displacement_m: np.ndarray, turn_rad: float, **_: Any
+        self,
+        tool: np.ndarray,
+        length_m: float,
+        displacement_m: np.ndarray,
+        turn_rad: float,
+        **_: Any,
     ) -> None:
-        """Raise ValueError if the object's motion exceeds what the tool can cause.
+        """Raise ValueError if the object's motion exceeds what the tool can cause, or falls short.
 
-        The lever arm of the rotation is taken to be at least the distance to the nearest edge.
+        The lever arm of the rotation is taken to be at least the distance to the nearest edge. At
+        the final pose the tool (1, 2) touches the outline or has slipped off, but is not inside.
         """
         of = f"poses after {length_m:.3g} m of contact (are they another push's?)"
         most_m = length_m + SLACK_M
@@ -195,6 +308,13 @@ class Log:
         turn, most_rad = f"the turn, in {self._angle_unit}, of {of}", min(most_m / lever_m, math.pi)
         check_within(turn, abs(turn_rad), 0.0, most_rad, "rad")
         check_within(f"the motion of {of}", math.hypot(*displacement_m), 0.0, most_m, "m")
+        at_end = rotated(tool - displacement_m, -turn_rad)
+        deep = self._radius_m - _nearest(self.outline_m, at_end)[0].item()
+        if deep > DEEP_M:
+            raise ValueError(
+                f"the tool is {1e3 * deep:.1f} mm inside the outline at the last of the poses, "
+                f"more than {1e3 * DEEP_M:g} mm; {CAUSES}"
+            )
 
     def _context(self, context: Mapping[str, Any]) -> dict[str, np.ndarray]:
         """Values as arrays of finite numbers or text, alike in all pushes; raises ValueError."""
@@ -217,18 +337,30 @@ def check_feet(feet: np.ndarray) -> None:
         raise ValueError(f"context feet must be (…, up to {FEET}, 3), got {feet.shape}")
 
 
-def _rows(name: str, values: Any, columns: int) -> np.ndarray:
-    """Finite numbers (m, columns), m at least 2; raises ValueError."""
-    array = check_array(name, values)
-    if array.ndim != 2 or array.shape[1] != columns or not 2 <= len(array) <= MOST_ROWS:
+def _rows(
+    name: str, values: Any, columns: int, most: float = MOST_ROWS, least: int = 2
+) -> np.ndarray:
+    """Finite numbers (m, columns), least ≤ m ≤ most; raises ValueError."""
+    try:
+        array = np.ma.asarray(values, dtype=float).filled(np.nan)
+    except (TypeError, ValueError, RuntimeError):
+        array = check_array(name, values)
+    if array.ndim != 2 or array.shape[1] != columns or not least <= len(array) <= most:
         raise ValueError(
-            f"{name} must have 2 to {MOST_ROWS} rows of {columns} numbers, got {array.shape}; "
-            "split the recording at each push"
+            f"{name} must have {least} to {most} rows of {columns} numbers, got {array.shape}; "
+            "split a session (Log.split), and read positions and quaternions in space by planar"
+        )
+    if (lost := np.flatnonzero(~np.isfinite(array).all(axis=1))).size:
+        raise ValueError(
+            f"{name} must be finite, but {lost.size} of {len(array)} rows are not, the first is "
+            f"row {lost[0]}; drop them: the motion between the others is interpolated"
         )
     return array
 
 
 def _growing(name: str, times: Any, n: int) -> np.ndarray:
+    if getattr(times, "dtype", np.dtype(float)).kind == "M":  # dates, as nanoseconds
+        times = np.asarray(times, "datetime64[ns]").astype(np.int64)
     t = check_array(name, times)
     if t.shape != (n,):
         raise ValueError(f"{name} must be {n} times, one for each row, got {t.shape}")
@@ -236,7 +368,8 @@ def _growing(name: str, times: Any, n: int) -> np.ndarray:
         row = int(stuck[0]) + 1
         raise ValueError(
             f"{name} must increase, but row {row} is {t[row].item()!r} after "
-            f"{t[row - 1].item()!r}; remove repeated rows, and check that no column is missing"
+            f"{t[row - 1].item()!r}; remove repeated rows, check that no column is missing, and "
+            "store times since 1970 with 64 bits"
         )
     return t
 
@@ -311,13 +444,19 @@ def _contact(outline_m: np.ndarray, tool: np.ndarray, radius_m: float) -> dict[s
     def at(rows):  # fractions of rows are points between them
         return np.column_stack([np.interp(rows, np.arange(len(tool)), xy) for xy in tool.T])
 
+    first = _nearest(outline_m, tool[:1])[0].item() - radius_m
+    if -DEEP_M <= first < 0:  # recorded from the contact on
+        moved = tool - tool[0]
+        way = moved[(np.linalg.norm(moved, axis=1) > OFF_M / 2).argmax()]
+        tool = np.vstack([tool[0] - BACK_M * way / max(1e-12, np.linalg.norm(way)), tool])
     rows = np.linspace(0, len(tool) - 1, max(len(tool), SAMPLES))
     gaps = _nearest(outline_m, at(rows))[0] - radius_m
     if gaps[0] < 0 or gaps.min() > 0:
+        inside = f"is already {-1e3 * first:.1f} mm inside the outline in its first row"
+        never = f"never touches the outline; it comes within {1e3 * gaps.min():.1f} mm of it"
         raise ValueError(
-            f"tool_xy {'begins inside' if gaps[0] < 0 else 'never touches'} the outline: the gap "
-            f"is {gaps[0]:.3g} m at first, {gaps.min():.3g} m at least; poses and tool_xy must "
-            "share a frame and unit, and a thick tool needs tool_radius"
+            f"tool_xy {inside if gaps[0] < 0 else never}: poses and tool_xy must share a frame, "
+            "unit and clock, and a thick tool needs tool_radius"
         )
     row, k = 0.0, int((gaps <= 0).argmax())
     if k > 0:
@@ -335,6 +474,7 @@ def _contact(outline_m: np.ndarray, tool: np.ndarray, radius_m: float) -> dict[s
     length = float(np.linalg.norm(travelled))
     check_within("the length of tool_xy after contact", length, 1e-4, LARGEST_M, "m")
     aside = float(np.abs(cross(travelled, path - contact)).max() / length)
-    check_within("tool_xy's way aside (cut it where the push ends)", aside, 0, most, "m")
+    curved = "tool_xy's way aside (a push is straight: cut a curved one into pieces)"
+    check_within(curved, aside, 0, most, "m")
     known = {"contact_m": contact, "normal": normal}
     return known | {"direction": travelled / length, "length_m": length}

@@ -51,7 +51,8 @@ def test_from_a_csv_to_a_model_and_a_plan(cells, tmp_path):
     # The first push, in the robot's frame and unit, is a push of the log: recorded, it reads alike.
     contact, end = names["contact_mm"], names["end_mm"]
     path = np.array([contact - 0.5 * (end - contact), end])
-    log.add((0, 1), path, (names["now"], names["now"]))
+    after = np.add(names["now"], (*(end - contact), 0.0))
+    log.add((0, 1), path, (names["now"], after))
     read, push = log.pushes().select(np.array([-1])), plan.steps[0].primitive
     assert read.length_m[0] == pytest.approx(push.length, abs=1e-6)
     ahead = np.arctan2(*read.direction[0, ::-1]) + names["now"][2]
