@@ -1,11 +1,9 @@
-"""Files of results: the tables that a notebook writes, and plans.
+"""Files: their locations, atomic writing, and the tables of results that a notebook writes.
 
-A notebook writes `<out_dir>/<notebook>.json`, which contains
+A relative path starts at the repository, wherever a program runs. A notebook writes
+`<out_dir>/<notebook>.json`, which contains
 `{"notebook", "parameters", "versions", "tables": {name: [flat rows]}}`. Column names carry units
 (`mean_m`, `plan_ms_median`, `tp_percent`). `python -m experiments.tables` fills pages from them.
-
-Plans, with their goals, are JSON files as well, and can be executed later. Numbers are restored to
-the last bit; a σ that the planner did not provide is null in the file.
 """
 
 import glob
@@ -17,16 +15,11 @@ import platform
 import re
 import secrets
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import psutil
-
-from affordlib.paths import file_at, from_root, resolve_out_dir
-from affordlib.primitives import Primitive, primitive_named
-from affordlib.types import Goal, Plan, Step
 
 if TYPE_CHECKING:
     import pandas
@@ -42,9 +35,51 @@ UNITS = {
     "rad": ("°", 180 / math.pi, 1),
     "deg": ("°", 1.0, 1),
 }
-_MARK, _PLAN_MARK = b'{\n "notebook"', b'{\n "goal"'
+_MARK = b'{\n "notebook"'
 _STATISTIC = "_(?:mean|median|sem|std|min|max|p5|p95)"
 _WITH_UNIT = re.compile(f"(.+?)_({'|'.join(UNITS)})((?:{_STATISTIC})*)")
+
+
+def repo_root() -> Path:
+    """Return the root folder of the checkout; FileNotFoundError if the package is apart from it."""
+    root = Path(__file__).resolve().parents[1]
+    if not (root / "pyproject.toml").is_file():
+        raise FileNotFoundError(
+            f"affordlib is installed in {root}, apart from its notebooks and data; run "
+            "`make setup` in the checkout, which installs it in place"
+        )
+    return root
+
+
+def from_root(path: str | os.PathLike[str]) -> Path:
+    """Return an absolute path; a relative one is resolved against the root of the repository."""
+    path = Path(path).expanduser()
+    return path if path.is_absolute() else repo_root() / path
+
+
+def file_at(path: str | os.PathLike[str]) -> Path:
+    """Return the absolute path of a file to read, resolved as in `from_root`.
+
+    Raises FileNotFoundError unless it is a regular file: a pipe or a device might never end.
+    """
+    path = from_root(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no file {path}")
+    return path
+
+
+def resolve_out_dir(out_dir: str | os.PathLike[str]) -> Path:
+    """Return the folder for results, resolved as in `from_root`; it is created if missing."""
+    if not os.fspath(out_dir):
+        raise ValueError("out_dir must name a folder, such as 'runs/lab', got ''")
+    path = from_root(out_dir)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError):
+        raise NotADirectoryError(
+            f"out_dir must be a folder, but {path} is, or lies under, a file; choose another"
+        ) from None
+    return path
 
 
 def versions() -> dict[str, str]:
@@ -167,54 +202,6 @@ def write_atomically(path: Path, content: bytes | str, mark: bytes = b"") -> Non
         if isinstance(error, OSError) and error.filename is None:
             error.filename = str(path)
         raise
-
-
-def save_plan(path: str | os.PathLike[str], plan: Plan) -> Path:
-    """Write a plan and its goal to a JSON file and return its path."""
-    path = from_root(path)
-    text = json.dumps(plan, default=_as_data, indent=1, allow_nan=False)
-    write_atomically(path, text + "\n", _PLAN_MARK)
-    return path
-
-
-def load_plan(path: str | os.PathLike[str]) -> Plan:
-    """Load a plan that `save_plan` wrote.
-
-    Raises FileNotFoundError, or ValueError that names the file and its fault.
-    """
-    path = file_at(path)
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-        if not isinstance(data["steps"], list):
-            raise ValueError(f"steps must be a list, got {data['steps']!r:.40}")
-        steps = tuple(_step(**step) for step in data["steps"])
-        return Plan(**data | {"goal": Goal(**data["goal"]), "steps": steps})
-    except Exception as error:
-        what = f"{error.args[0]!r} is missing" if isinstance(error, KeyError) else str(error)
-        raise ValueError(f"path: {path} holds no plan: {what}") from None
-
-
-def _as_data(value: Any) -> Any:
-    if isinstance(value, np.ndarray | np.generic):
-        return value.tolist()
-    data = {field.name: getattr(value, field.name) for field in fields(value)}
-    if isinstance(value, Step) and math.isnan(value.std_m):
-        data["std_m"] = None
-    return {"name": value.name} | data if isinstance(value, Primitive) else data
-
-
-def _step(**data: Any) -> Step:
-    arguments = dict(data["primitive"])
-    name = arguments.pop("name")
-    data["primitive"] = primitive_named(name)(**arguments)
-    data["predicted_end_xy_m"] = tuple(data["predicted_end_xy_m"])
-    data["std_m"] = math.nan if data["std_m"] is None else float(data["std_m"])
-    for name in ("predicted_path_xy_m", "path_xy_m"):
-        if data[name] is not None:
-            data[name] = np.array(data[name], dtype=float)
-            if data[name].ndim != 2:
-                raise ValueError(f"{name} must be points (n, 2), got {data[name].shape}")
-    return Step(**data)
 
 
 def results_table(

@@ -14,8 +14,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
-from affordlib.paths import file_at, from_root
-from affordlib.results import write_atomically
+from affordlib.results import file_at, from_root, write_atomically
 
 SUFFIX = ".safetensors"
 _KEY = "affordlib"

@@ -20,10 +20,11 @@ from affordlib.interactions import (
 from affordlib.interactions.dataset import valid_interactions
 from affordlib.interactions.sampling import Batch, sample_mixed
 from affordlib.models import EffectNetwork
+from affordlib.models.base import condition_on_final_effect
 from affordlib.models.checkpoint import build
+from affordlib.models.evaluation import final_errors_m
 from affordlib.models.film import FiLMNetwork
-from affordlib.models.protocol import condition_on_final_effect
-from affordlib.models.training import final_errors_m, train
+from affordlib.models.training import train
 from affordlib.types import Observations
 from experiments.literal import sample_literal
 from experiments.runner import Rows, study

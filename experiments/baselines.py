@@ -25,7 +25,7 @@ from torch import Tensor
 from affordlib.geometry import rotate_channels, xy_columns
 from affordlib.interactions.dataset import InteractionTensors, valid_interactions
 from affordlib.interactions.sampling import condition_on_recorded_action
-from affordlib.models.predictions import prediction_record, steps_of
+from affordlib.models.evaluation import prediction_record, steps_of
 from affordlib.models.push_frame import inverse, push_direction, rotate_prediction
 from affordlib.types import Prediction
 from affordlib.world import category_named

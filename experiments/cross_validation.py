@@ -27,12 +27,15 @@ from affordlib.geometry import wrap_angle
 from affordlib.interactions import InteractionTensors, Split, split_interactions
 from affordlib.interactions.dataset import Symmetry, valid_interactions
 from affordlib.interactions.recipes import Recipe, sample_scene, sample_world
-from affordlib.models.base import EffectNetwork, NetworkConfig
-from affordlib.models.calibration import fit_sigma_scale
+from affordlib.models.base import (
+    EffectModel,
+    EffectNetwork,
+    NetworkConfig,
+    condition_on_final_effect,
+)
 from affordlib.models.cnp import CNPConfig
+from affordlib.models.evaluation import about_objects, fit_sigma_scale, network_predictions
 from affordlib.models.film import FiLMConfig
-from affordlib.models.predictions import about_objects, network_predictions
-from affordlib.models.protocol import EffectModel, condition_on_final_effect
 from affordlib.models.training import train_model
 from affordlib.primitives import Grasp, Push
 from affordlib.types import check_choice, check_count

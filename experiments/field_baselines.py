@@ -20,7 +20,7 @@ from torch.nn.functional import grid_sample
 from affordlib.geometry import quarter_turn, rotate
 from affordlib.interactions import InteractionTensors, split_interactions
 from affordlib.logs.physics import ELLIPSOID, quasi_static_push
-from affordlib.models.protocol import condition_on_primitives
+from affordlib.models.base import condition_on_primitives
 from affordlib.planning import PlanningProblem, continuous, plan_astar
 from affordlib.planning.rollout import make_steps, roll_out
 from affordlib.primitives import PUSH_GAP_M, Push, min_jerk

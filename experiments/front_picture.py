@@ -14,9 +14,8 @@ import numpy as np
 from matplotlib import font_manager
 from PIL import Image, ImageDraw, ImageFont
 
-from affordlib.paths import repo_root
 from affordlib.planning import Skills, execute_plan, plan_continuous
-from affordlib.results import write_atomically
+from affordlib.results import repo_root, write_atomically
 from affordlib.show import FrameRecorder
 from affordlib.show.diagrams import plot_flow
 from affordlib.show.plots import GOAL as GOAL_COLOR

@@ -19,14 +19,12 @@ import xarray as xr
 from torch import Tensor
 
 from affordlib.interactions import Scaler, Split, split_interactions
-from affordlib.interactions import lever_up as levers
 from affordlib.interactions.dataset import valid_interactions
-from affordlib.interactions.lever_up import lever_up_tensors
 from affordlib.interactions.recipes import Recipe, sample_scene
 from affordlib.models import lever_up as models
 from affordlib.models.base import EffectNetwork
 from affordlib.models.domain import TrainingDomain
-from affordlib.models.lever_up import PROTOCOLS
+from affordlib.models.lever_up import PROTOCOLS, lever_up_tensors
 from affordlib.types import Prediction, check_choice, check_count
 from experiments import lstm_seker2019
 from experiments.lever_training import (
@@ -161,8 +159,8 @@ def extrapolate(
     With only the first step the velocity is unknown, and both baselines predict no motion.
     """
     window = protocol == "window"
-    last = start + levers.N_OBSERVED - 1 if window else 0
-    ahead = torch.arange(1, (levers.N_PREDICTED if window else effect.shape[1] - 1) + 1)
+    last = start + models.N_OBSERVED - 1 if window else 0
+    ahead = torch.arange(1, (models.N_PREDICTED if window else effect.shape[1] - 1) + 1)
     velocity = torch.zeros_like(effect[:, last])
     if window and baseline == "constant_velocity":
         velocity = effect[:, last] - effect[:, last - 1]

@@ -18,22 +18,21 @@ from torch import Tensor
 from affordlib import checked
 from affordlib.interactions import InteractionTensors, Scaler, Split
 from affordlib.interactions.dataset import Symmetry, augment_by_symmetry
-from affordlib.interactions.lever_up import (
-    LEVER_ACTION_CHANNELS,
-    N_OBSERVED,
-    N_PREDICTED,
-    POSE_CHANNELS,
-    lever_up_tensors,
-)
 from affordlib.interactions.sampling import Batch, condition_on_poses
 from affordlib.models import CNPConfig, EffectNetwork, NetworkConfig, TrainingDomain
 from affordlib.models.base import network, with_time
 from affordlib.models.checkpoint import load_checkpoint
 from affordlib.models.cnp import AffordanceCNP
 from affordlib.models.lever_up import (
+    LEVER_ACTION_CHANNELS,
+    N_OBSERVED,
+    N_PREDICTED,
+    POSE_CHANNELS,
+    AroundMean,
     LastPoseConfig,
     MeanTrajectory,
     from_start_errors_m,
+    lever_up_tensors,
     window_errors_m,
 )
 from affordlib.models.training import (
@@ -59,17 +58,13 @@ class MeanCNPConfig(CNPConfig):
 
 
 @network("cnp_mean", MeanCNPConfig)
-class MeanCNP(AffordanceCNP):
+class MeanCNP(AroundMean, AffordanceCNP):
     """The paper's network on differences from the mean trajectory, d(t) = e(t) - m(t)."""
 
     def make_layers(self, config: MeanCNPConfig) -> None:
         """Create the paper's layers and the mean trajectory m."""
         super().make_layers(config)
         self.mean_trajectory = MeanTrajectory(config.steps, len(config.effect_channels))
-
-    def prepare(self, training: InteractionTensors) -> None:
-        """Set the mean trajectory m."""
-        self.mean_trajectory.fit(training, self.config.frame, self.effect_scale)
 
     def outputs(
         self, features: Tensor, observations: Observations, t_target: Tensor

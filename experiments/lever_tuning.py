@@ -16,8 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from affordlib.interactions.lever_up import lever_up_tensors
-from affordlib.models.lever_up import from_start_errors_m, window_errors_m
+from affordlib.models.lever_up import from_start_errors_m, lever_up_tensors, window_errors_m
 from affordlib.types import check_choice
 from experiments import runner
 from experiments.commands import command

@@ -12,8 +12,8 @@ import numpy as np
 import torch
 
 from affordlib.interactions import open_interactions
+from affordlib.models.base import condition_on_primitives
 from affordlib.models.checkpoint import load_checkpoint
-from affordlib.models.protocol import condition_on_primitives
 from affordlib.primitives import Drag, Push
 from experiments.runner import Rows, study
 

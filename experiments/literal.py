@@ -12,15 +12,9 @@ from affordlib.interactions import InteractionTensors, split_interactions
 from affordlib.interactions.sampling import Batch
 from affordlib.models import CNPConfig, EffectNetwork
 from affordlib.models.checkpoint import load_state, save_state
-from affordlib.models.training import (
-    Score,
-    TrainingConfig,
-    batch_loss,
-    final_errors_m,
-    train_model,
-    untrained,
-)
-from affordlib.paths import resolve_out_dir
+from affordlib.models.evaluation import final_errors_m
+from affordlib.models.training import Score, TrainingConfig, train_model, untrained
+from affordlib.results import resolve_out_dir
 from affordlib.types import Observations
 from experiments.runner import Rows, open_once, study
 from experiments.shipped import CHECKPOINT_SPECS
@@ -100,7 +94,7 @@ def train_literal(
         if step > best["step"] + config.patience * config.validate_every:
             break
         optimiser.zero_grad()
-        loss = batch_loss(model, sample_literal(training, config.obs_max, generator))
+        loss = model.loss(sample_literal(training, config.obs_max, generator))
         loss.backward()
         optimiser.step()
         if step % config.validate_every == 0 or step == config.steps:

@@ -19,10 +19,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from affordlib import checked
-from affordlib.interactions.dataset import InteractionTensors
 from affordlib.models.base import masked_mean, network, with_time
 from affordlib.models.film import HarmonicsConfig, HarmonicsNetwork, dense, waves
-from affordlib.models.lever_up import MeanTrajectory, between
+from affordlib.models.lever_up import AroundMean, MeanTrajectory, between
 from affordlib.types import Observations
 
 _CERTAIN = -6.0
@@ -61,7 +60,7 @@ def on_grid(effect: Tensor, t: Tensor, seen: Tensor, steps: int) -> Known:
 
 
 @network("lstm", LSTMConfig)
-class LSTMNetwork(HarmonicsNetwork):
+class LSTMNetwork(AroundMean, HarmonicsNetwork):
     """Predicts a trajectory step by step from the observed part of it; satisfies `EffectModel`.
 
     It interpolates linearly between steps, so any phase can be queried, with gradients.
@@ -82,10 +81,6 @@ class LSTMNetwork(HarmonicsNetwork):
         nn.init.zeros_(self.last[-1].bias)
         # The commanded action is given at t = 0 and 1; this predicts it at other phases.
         self.action_decoder = nn.Sequential(*dense(static + 2 * c.waves + 1, w, w, 2 * n_a))
-
-    def prepare(self, training: InteractionTensors) -> None:
-        """Set the mean trajectory m."""
-        self.mean_trajectory.fit(training, self.config.frame, self.effect_scale)
 
     def outputs(
         self, features: Tensor, observations: Observations, t_target: Tensor

@@ -25,10 +25,9 @@ from torch import Tensor, nn
 
 from affordlib import checked
 from affordlib.interactions.dataset import InteractionTensors
-from affordlib.interactions.lever_up import N_OBSERVED
 from affordlib.models.base import EffectNetwork, NetworkConfig, with_time
 from affordlib.models.checkpoint import load_state, save_state
-from affordlib.models.lever_up import from_start_errors_m, window_errors_m
+from affordlib.models.lever_up import N_OBSERVED, from_start_errors_m, window_errors_m
 from affordlib.types import LEVER_IMAGE_PIXELS, Observations
 from experiments.lstm import Known, on_grid
 

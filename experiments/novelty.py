@@ -29,12 +29,11 @@ from affordlib.interactions import InteractionTensors, open_interactions, split_
 from affordlib.interactions.collect import collect
 from affordlib.interactions.recipes import Recipe
 from affordlib.models import EffectNetwork, condition_on_primitives, load_checkpoint
-from affordlib.models import calibration as c
+from affordlib.models import evaluation as c
 from affordlib.models.base import gaussian_nll
 from affordlib.models.film import CircularHarmonics
-from affordlib.paths import resolve_out_dir
 from affordlib.primitives import Push
-from affordlib.results import write_atomically
+from affordlib.results import resolve_out_dir, write_atomically
 from affordlib.types import Observations, Prediction
 from affordlib.world import CATEGORIES, TabletopObject
 from experiments.runner import Rows, study

@@ -18,9 +18,8 @@ import numpy as np
 
 from affordlib.geometry import rotated, unit_vector
 from affordlib.logs import Log, LoggedPushes, PushedObject, fit
-from affordlib.paths import repo_root
 from affordlib.primitives import PushAt
-from affordlib.results import write_results
+from affordlib.results import repo_root, write_results
 from affordlib.types import UnreachableError
 from affordlib.world import Prism, Tabletop, WorldConfig
 from affordlib.world.robot import ROD_WIDTH_M

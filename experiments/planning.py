@@ -25,9 +25,9 @@ import pandas as pd
 import torch
 from tqdm.auto import tqdm
 
+from affordlib.models.base import EffectModel, condition_on_final_effect
 from affordlib.models.checkpoint import load_checkpoint
-from affordlib.models.predictions import error_row
-from affordlib.models.protocol import EffectModel, condition_on_final_effect
+from affordlib.models.evaluation import error_row
 from affordlib.perception import adapt_to_object
 from affordlib.planning import (
     EffectMap,

@@ -25,9 +25,8 @@ from affordlib.logs import LoggedPushes, PushedObject, Pushes, plan_push_at
 from affordlib.logs.fit import Forecast, PushModel, in_object_frame, push_rows, told_feet
 from affordlib.logs.neural_process import load_neural_process, train_neural_process
 from affordlib.logs.planning import primitive_of
-from affordlib.paths import repo_root
 from affordlib.perception import outline_of, turn_between
-from affordlib.results import write_results
+from affordlib.results import repo_root, write_results
 from affordlib.types import Goal, Observation, Step, UnreachableError
 from affordlib.world import Cuboid, Prism, Tabletop, TabletopObject, WorldConfig
 from affordlib.world.robot import ROD_WIDTH_M

@@ -30,7 +30,7 @@ from affordlib.logs.neural_process import (
     transformed,
 )
 from affordlib.logs.physics import quasi_static_push
-from affordlib.paths import repo_root
+from affordlib.results import repo_root
 from affordlib.weights import write_weights
 from experiments.commands import command, whole_type
 

@@ -42,16 +42,15 @@ from tqdm.auto import tqdm
 
 from affordlib.interactions import open_interactions
 from affordlib.interactions.store import stored_sha256
-from affordlib.paths import file_at, repo_root, resolve_out_dir
 from affordlib.planning.reachability import SHIPPED as REACHABILITY
-from affordlib.results import write_atomically, write_results
+from affordlib.results import file_at, repo_root, resolve_out_dir, write_atomically, write_results
 from affordlib.weights import read_weights, resolve_checkpoint, weights_sha256
 from affordlib.workers import spread
 from experiments.commands import worker_type
 
 FOLDER = "data/results/raw"
 WRITE_EVERY_S, ANSWER_S = 30, 30
-NOT_DECISIVE = ("device", "max_minutes")
+NOT_DECISIVE = ("device",)
 """Options without influence on results: those of the machine."""
 
 

@@ -38,12 +38,11 @@ from affordlib.models.training import (
     TrainingConfig,
     train_model,
 )
-from affordlib.paths import repo_root
 from affordlib.planning import MODES
 from affordlib.planning.reachability import SHIPPED as REACHABILITY
 from affordlib.planning.reachability import Reachability, reach_features
 from affordlib.primitives import move_for
-from affordlib.results import write_atomically
+from affordlib.results import repo_root, write_atomically
 from affordlib.types import Goal
 from affordlib.world import ROLLABLE, STANDING, Tabletop
 from experiments.attention import AttentionConfig

@@ -34,11 +34,10 @@ from affordlib.interactions import (
     split_interactions,
 )
 from affordlib.interactions.recipes import RECIPES, interact
-from affordlib.models.training import batch_loss, final_errors_m
-from affordlib.paths import repo_root
+from affordlib.models.evaluation import final_errors_m
 from affordlib.planning import EffectMap, PlanningProblem, plan_astar, plan_continuous
 from affordlib.primitives import PRIMITIVES, Push
-from affordlib.results import read_results, write_results
+from affordlib.results import read_results, repo_root, write_results
 from affordlib.types import Observations
 from affordlib.world import STANDING, Tabletop
 from experiments.commands import command
@@ -118,11 +117,11 @@ def training(
         return models.build(models.CNPConfig(), Scaler.fit(pushes))
 
     def one() -> torch.Tensor:
-        return batch_loss(model, sample_literal(pushes, 10, generator))
+        return model.loss(sample_literal(pushes, 10, generator))
 
     def many() -> torch.Tensor:
         some = pushes.select(torch.randint(len(pushes), (size,), generator=generator))
-        return batch_loss(model, sampling.sample_mixed(some, n_targets, 10, generator))
+        return model.loss(sampling.sample_mixed(some, n_targets, 10, generator))
 
     model = network().train()
     literal, batched = _step(model, one, None), _step(model, many, True)

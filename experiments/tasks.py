@@ -17,9 +17,9 @@ from typing import Any, Self
 import numpy as np
 
 from affordlib.interactions.recipes import Variation
-from affordlib.paths import file_at
 from affordlib.planning import MODES
 from affordlib.primitives import Drag, Push, move_for
+from affordlib.results import file_at
 from affordlib.types import Goal, check_choice
 from affordlib.world import STANDING, Tabletop, TabletopObject, WorldConfig, category_named
 

@@ -22,10 +22,9 @@ from torch import Tensor
 
 from affordlib.geometry import xy_columns
 from affordlib.interactions import InteractionTensors, open_interactions, split_interactions
-from affordlib.models.base import gaussian_nll
-from affordlib.models.calibration import AFTER_CONTACT, coverage, effects_at
+from affordlib.models.base import EffectModel, gaussian_nll
 from affordlib.models.checkpoint import load_checkpoint
-from affordlib.models.protocol import EffectModel
+from affordlib.models.evaluation import AFTER_CONTACT, coverage, effects_at
 from experiments.runner import Rows, study
 
 LEVELS = (0.5, 0.9)

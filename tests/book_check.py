@@ -12,7 +12,7 @@ from pathlib import Path
 import nbformat
 from pages import PAGES
 
-from affordlib.paths import repo_root
+from affordlib.results import repo_root
 
 ROOT = repo_root()
 TEXTS = {"README.md": 800, "RESULTS.md": 2300, "CONTRIBUTING.md": 2000, "data/README.md": 2000}

@@ -9,8 +9,8 @@ import torch
 
 from affordlib.interactions import InteractionTensors, open_interactions
 from affordlib.interactions.dataset import Scaler
-from affordlib.interactions.lever_up import lever_up_tensors
 from affordlib.models import AffordanceCNP, CNPConfig, load_checkpoint
+from affordlib.models.lever_up import lever_up_tensors
 from affordlib.planning import Skills
 from affordlib.world import Cuboid, Tabletop, WorldConfig
 from experiments.lever_training import LEVER_MODELS

@@ -20,10 +20,9 @@ import numpy as np
 import torch
 
 from affordlib.interactions import InteractionTensors, open_interactions
-from affordlib.interactions.lever_up import lever_up_tensors
 from affordlib.interactions.recipes import RECIPES, interact
 from affordlib.models import load_checkpoint
-from affordlib.paths import repo_root
+from affordlib.models.lever_up import lever_up_tensors
 from affordlib.planning import (
     MODES,
     EffectMap,
@@ -34,6 +33,7 @@ from affordlib.planning import (
     plan_gradient,
 )
 from affordlib.planning.reachability import Reachability
+from affordlib.results import repo_root
 from affordlib.types import Observations
 from affordlib.world import Tabletop
 from experiments.tasks import frozen_tasks

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pages import PAGES as PATHS
 
-from affordlib.paths import repo_root
+from affordlib.results import repo_root
 from exercises import EXERCISES, check
 
 NOTEBOOKS = repo_root() / "notebooks"

@@ -20,9 +20,13 @@ from affordlib import interactions, logs, models, planning, show, world
 from affordlib.interactions.collect import collect
 from affordlib.interactions.recipes import Recipe, Variation
 from affordlib.logs.fit import EFFORT
-from affordlib.paths import repo_root
 from affordlib.primitives import Drag, Grasp, LeverUp, Push, PushAt, Rotate, primitive_named
-from affordlib.results import load_plan, read_results, results_table, save_plan, write_results
+from affordlib.results import (
+    read_results,
+    repo_root,
+    results_table,
+    write_results,
+)
 from affordlib.types import Goal, Outcome, Plan, Step, UnreachableError, check_array
 from affordlib.world.camera import View
 from exercises import check
@@ -84,7 +88,7 @@ CALLABLES = {
     if callable(value) and not name.endswith(("Error", "Warning"))
 }
 of_modules = (Goal, Step, Plan, Push, PushAt, Drag, Grasp, Rotate, LeverUp, primitive_named)
-of_modules += (Recipe, Variation, collect, save_plan, load_plan, check)
+of_modules += (Recipe, Variation, collect, check)
 of_modules += (View, read_results, results_table, write_results)
 CALLABLES |= {each.__name__: each for each in of_modules}
 CALLABLES |= {"Push.towards": Push.towards, "Push.path": Push(0.0).path}
@@ -231,8 +235,6 @@ def shop(one_world, skills, pushes, tmp_path_factory):
         "fit_sigma_scale": {"model": network, "phases": (0.8, 1.0)},
         "condition_on_primitives": {"model": network},
         "save_checkpoint": {"model": network, "path": folder / "net.safetensors", "about": {}},
-        "save_plan": {"path": folder / "p.json"},
-        "load_plan": {"path": save_plan(folder / "plan.json", plan)},
         "Skills": {"models": {"push": model}},
         "EffectMap": {"n_directions": 8, "n_phases": 5},
         "plan_astar": {"stop_phases": (0.5, 1.0)},
@@ -249,7 +251,7 @@ def shop(one_world, skills, pushes, tmp_path_factory):
     return {k: v for names, v in by_name.items() for k in names.split()}, by_callable
 
 
-WRITERS = ("write_results", "collect", "save_plan", "save_checkpoint", "save_model")
+WRITERS = ("write_results", "collect", "save_checkpoint", "save_model")
 NOT_DRIVEN = {
     "collect": {"workers": 1},
 }
@@ -300,7 +302,7 @@ def test_a_hostile_value_is_refused_by_name_or_does_no_harm(shop, name, tmp_path
     call, valid = driven(name, shop)
     call(**valid)
     if name in WRITERS or name.startswith("train"):  # a relative path starts in the checkout
-        monkeypatch.setattr("affordlib.paths.repo_root", lambda: tmp_path)
+        monkeypatch.setattr("affordlib.results.repo_root", lambda: tmp_path)
     found = []
 
     @settings(

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import pytest
 from packaging.specifiers import SpecifierSet
 
-from affordlib.paths import repo_root
+from affordlib.results import repo_root
 
 PRETENDED = """\
 #!{python}

@@ -16,8 +16,7 @@ from IPython.core.inputtransformer2 import TransformerManager
 from pages import PAGES as PATHS
 from pages import WIDGET, cleaned, parameters_of_pages
 
-from affordlib.paths import repo_root
-from affordlib.results import read_results, results_table
+from affordlib.results import read_results, repo_root, results_table
 from affordlib.show import GOAL, PREDICTION, TRUTH
 from tests import book_check
 

@@ -15,9 +15,8 @@ import numpy as np
 import pytest
 from nbconvert.filters.markdown_mistune import markdown2html_mistune
 
-from affordlib import paths, results
+from affordlib import results
 from affordlib.results import read_results, write_results
-from affordlib.types import Goal, Plan
 from experiments import tables
 from experiments.tables import fill_tables, markdown_table
 
@@ -140,24 +139,21 @@ def test_damaged_or_missing_results_are_named(tmp_path, text, reason):
 def test_relative_folders_start_at_the_repository(tmp_path, monkeypatch):
     root = tmp_path / "checkout"
     (tmp_path / "elsewhere").mkdir()
-    monkeypatch.setattr(paths, "repo_root", lambda: root)
+    monkeypatch.setattr(results, "repo_root", lambda: root)
     monkeypatch.chdir(tmp_path / "elsewhere")
-    assert paths.resolve_out_dir("runs/lab") == root / "runs" / "lab"
-    plan = Plan(Goal((0.1, 0.0)), (0.0, 0.0), (), "none", False, 0.0)
-    assert results.save_plan("runs/plan.json", plan) == root / "runs" / "plan.json"
-    assert results.load_plan("runs/plan.json") == plan
+    assert results.resolve_out_dir("runs/lab") == root / "runs" / "lab"
     assert (root / "runs" / "lab").is_dir()
     (root / "file").write_text("")
     for bad in ("file", "file/under"):
         with pytest.raises(NotADirectoryError, match="out_dir must be a folder"):
-            paths.resolve_out_dir(bad)
+            results.resolve_out_dir(bad)
 
 
 def test_what_is_named_by_an_absolute_path_needs_no_checkout(tmp_path, monkeypatch):
     def apart():
         raise FileNotFoundError("installed apart from its notebooks")
 
-    monkeypatch.setattr(paths, "repo_root", apart)
+    monkeypatch.setattr(results, "repo_root", apart)
     path = write_results(tmp_path, "x", {}, {"t": [{"a": 1}]})
     assert read_results(path)["tables"] == {"t": [{"a": 1}]}
     with pytest.raises(FileNotFoundError, match="installed apart"):
@@ -245,10 +241,10 @@ def test_blocks_join_columns_and_turn_rows_into_columns(tmp_path):
 
 def test_the_pages_and_the_shipped_results_agree_and_carry_no_path():
     pages = [
-        str(paths.repo_root() / name) for name in ("README.md", "RESULTS.md", "data/README.md")
+        str(results.repo_root() / name) for name in ("README.md", "RESULTS.md", "data/README.md")
     ]
     assert tables.main(["--check", *pages]) == 0
-    for path in (paths.repo_root() / "data" / "results").glob("*.json"):
+    for path in (results.repo_root() / "data" / "results").glob("*.json"):
         assert read_results(path)["notebook"] == path.stem
         given = json.loads(path.read_text())["parameters"].values()
         assert not [v for v in given if isinstance(v, str) and os.path.isabs(v)]

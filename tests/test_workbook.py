@@ -14,8 +14,7 @@ import psutil
 import pytest
 from pages import cleaned, parameters_of_pages
 
-from affordlib.paths import repo_root
-from affordlib.results import read_results
+from affordlib.results import read_results, repo_root
 from tests.waiting import wait_until
 
 ROOT = repo_root()

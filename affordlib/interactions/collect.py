@@ -30,8 +30,8 @@ from affordlib.interactions.store import (
     open_interactions,
     write_interactions,
 )
-from affordlib.paths import from_root
 from affordlib.primitives import PRIMITIVES, LeverUp, primitive_named
+from affordlib.results import from_root
 from affordlib.types import (
     ACTION_CHANNELS,
     CROP_WIDTH_M,

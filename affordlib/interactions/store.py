@@ -16,8 +16,7 @@ import fsspec
 import numpy as np
 import psutil
 
-from affordlib.paths import file_at, from_root
-from affordlib.results import write_atomically
+from affordlib.results import file_at, from_root, write_atomically
 
 if TYPE_CHECKING:
     import xarray

@@ -1,10 +1,23 @@
 """Models that relate an object's image, an action and its effect."""
 
-from affordlib.models.base import EffectNetwork, NetworkConfig
-from affordlib.models.calibration import coverage, fit_sigma_scale
+from affordlib.models.base import (
+    EffectModel,
+    EffectNetwork,
+    NetworkConfig,
+    condition_on_final_effect,
+    condition_on_primitives,
+)
 from affordlib.models.checkpoint import build, load_checkpoint, save_checkpoint
 from affordlib.models.cnp import AffordanceCNP, CNPConfig
 from affordlib.models.domain import OutOfRangeWarning, TrainingDomain
+from affordlib.models.evaluation import (
+    coverage,
+    error_row,
+    final_error,
+    final_errors_m,
+    fit_sigma_scale,
+    network_predictions,
+    refuse_seen,
+)
 from affordlib.models.film import FiLMConfig, FiLMNetwork
-from affordlib.models.protocol import EffectModel, condition_on_primitives
-from affordlib.models.training import TrainingConfig, train, train_model
+from affordlib.models.training import TrainingConfig, about_training, train, train_model

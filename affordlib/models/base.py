@@ -1,11 +1,15 @@
-"""Base class of all networks: standardisation, training domain, frame and loss."""
+"""Models of the effects of actions: the interface that planners see, and networks' base class.
+
+A network standardises, checks the training domain, rotates into its frame, and has the loss.
+"""
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
@@ -14,6 +18,7 @@ from torch import Tensor, nn
 from affordlib import checked
 from affordlib.geometry import rotate_channels, xy_columns
 from affordlib.interactions.dataset import InteractionTensors, Scaler
+from affordlib.interactions.sampling import Batch
 from affordlib.models.domain import TrainingDomain
 from affordlib.models.push_frame import (
     FRAMES,
@@ -23,7 +28,48 @@ from affordlib.models.push_frame import (
     rotate_observations,
     rotate_prediction,
 )
-from affordlib.types import Observations, Prediction, check_choice, check_count, check_within
+from affordlib.primitives import Primitive
+from affordlib.types import (
+    ACTION_CHANNELS,
+    HasChannels,
+    Observations,
+    Prediction,
+    check_choice,
+    check_count,
+)
+
+
+@runtime_checkable
+class EffectModel(HasChannels, Protocol):
+    """A model of the effects of actions; inputs and outputs are in metres, radians and phase.
+
+    Both methods are differentiable in their inputs.
+    """
+
+    def encode(self, image: Tensor) -> Tensor:
+        """Features (B, F) of images (B, 2, 48, 48)."""
+        ...
+
+    def predict(self, features: Tensor, observations: Observations, t_target: Tensor) -> Prediction:
+        """Mean and σ (B, T, C) at t_target (B, T) for B queries; features (B, F) or (1, F)."""
+        ...
+
+
+@checked
+def condition_on_primitives(model: EffectModel, actions: Sequence[Primitive]) -> Observations:
+    """Observe each commanded action at t = 0 and t = 1, and no effect: B = len(actions)."""
+    if not actions:
+        raise ValueError("actions must hold at least one action, got none")
+    columns = [ACTION_CHANNELS.index(name) for name in model.action_channels]
+    action = np.stack([one.ends() for one in actions])[..., columns]
+    t = torch.tensor([0.0, 1.0]).expand(len(actions), 2)
+    return Observations.of(model, action=(t, torch.as_tensor(action, dtype=torch.float32)))
+
+
+@checked
+def condition_on_final_effect(model: EffectModel, effect: Tensor) -> Observations:
+    """Observe the effect (B, C_e) at t = 1 and no action (w₁ = 0); differentiable in the effect."""
+    return Observations.of(model, effect=(effect.new_ones(len(effect), 1), effect[:, None]))
 
 
 @checked
@@ -47,7 +93,7 @@ class NetworkConfig:
             object.__setattr__(self, name, channels)
         for size in fields(self):
             if type(size.default) is int:
-                check_within(size.name, check_count(size.name, getattr(self, size.name)), 1, 4096)
+                check_count(size.name, getattr(self, size.name), 1, 4096)
         if not 0 < self.sigma_floor < 10:
             raise ValueError(f"sigma_floor must lie in (0, 10), got {self.sigma_floor!r}")
 
@@ -216,16 +262,8 @@ class EffectNetwork(nn.Module, ABC):
         features = self.oriented_features(encoded, back)
         return self.outputs(features, aligned, t_target), direction
 
-    def loss(
-        self,
-        image: Tensor,
-        observations: Observations,
-        t_target: Tensor,
-        action: Tensor,
-        effect: Tensor,
-        beta: float = 0.0,
-    ) -> Tensor:
-        """Negative log-likelihood (Section 3.2) of the targets (B, T, C).
+    def loss(self, batch: Batch, beta: float = 0.0) -> Float[Tensor, ""]:
+        """Negative log-likelihood (Section 3.2) of a batch's targets.
 
         The mean over the action's values and the mean over the effect's count half each, both
         standardised and in the network's frame. beta weights each value by σ^(2 beta), so that the
@@ -233,8 +271,9 @@ class EffectNetwork(nn.Module, ABC):
         trains the means as the squared error does (Seitzer et al., On the pitfalls of
         heteroscedastic uncertainty estimation, ICLR 2022).
         """
-        encoded = self.encode(image, check=False)
-        (mu_a, sigma_a, mu_e, sigma_e), direction = self._decode(encoded, observations, t_target)
+        encoded, action, effect = self.encode(batch.image, check=False), batch.action, batch.effect
+        outputs, direction = self._decode(encoded, batch.observations, batch.t_target)
+        mu_a, sigma_a, mu_e, sigma_e = outputs
         if direction is not None:
             back = inverse(direction)[:, None]
             action = rotate_channels(action, self.action_channels, back, absolute_yaw=True)

@@ -20,8 +20,7 @@ from torch import nn
 from affordlib.interactions.dataset import Scaler
 from affordlib.models.base import NETWORKS, EffectNetwork, NetworkConfig
 from affordlib.models.domain import TrainingDomain
-from affordlib.paths import file_at, from_root
-from affordlib.results import write_atomically
+from affordlib.results import file_at, from_root, write_atomically
 from affordlib.weights import SUFFIX, read_weights, resolve_checkpoint, write_weights
 
 FORMAT = "affordlib checkpoint 4"

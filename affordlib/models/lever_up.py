@@ -1,4 +1,11 @@
-"""Lever-ups: the prediction protocols of Section 4.1 and Table 1, and our network for them.
+"""Lever-ups: tensors, the prediction protocols of Section 4.1 and Table 1, and our network.
+
+Trajectories are in the lever's frame: the origin is the contact point and x the direction of the
+lever, as in the image. A step is 150 ms, which gives 26 poses. A pose is the object's change since
+the start: x, y, z [m] and the tilt [rad] of its vertical axis. The stored yaw is omitted, because
+it is the heading of a body axis that the image does not show, and has little meaning for a body
+tilted by 65°. The commanded action is x and z relative to the contact (the blade slides in, then
+lifts along its arc); its other channels are constant.
 
     window      15 poses observed, anywhere in the trajectory; the next 1 to 5 steps predicted
     first_step  the first pose observed; all later steps predicted
@@ -22,26 +29,70 @@ change; n rises from 0 at t_l towards 1. Any t is predicted directly, without a 
 observation d_l is the one at t = 0, where a displacement is zero.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from affordlib import checked
 from affordlib.geometry import rotate_channels
-from affordlib.interactions.dataset import InteractionTensors
-from affordlib.interactions.lever_up import N_OBSERVED, N_PREDICTED
+from affordlib.interactions.dataset import InteractionTensors, valid_interactions
 from affordlib.interactions.sampling import condition_on_poses, condition_on_recorded_action
 from affordlib.models.base import EffectNetwork, network, with_time
+from affordlib.models.evaluation import EVERY
 from affordlib.models.film import FiLMConfig, FiLMNetwork, dense, waves
 from affordlib.models.push_frame import inverse, push_direction
 from affordlib.types import Observations, Prediction, check_choice
+
+if TYPE_CHECKING:
+    import xarray
+
+LEVER_ACTION_CHANNELS = ("x", "z")
+POSE_CHANNELS = ("x", "y", "z", "tilt")
+N_OBSERVED, N_PREDICTED = 15, 5
+"""Numbers of observed and of predicted steps in a window (Table 1)."""
 
 PROTOCOLS = ("window", "first_step", "image_only")
 
 _NEAR_PHASE = 0.1
 _VELOCITY_PHASE = 0.2
+
+
+def lever_up_tensors(
+    data: "xarray.Dataset", interactions: np.ndarray | None = None, view: str = "near"
+) -> InteractionTensors:
+    """Return lever-ups as 26 steps of poses and commanded actions, in the lever's frame.
+
+    view: "near", the 42 cm of the image that contain the object, 48×48 (means of four pixels);
+    "wide", all of its 56 cm, 48×48; "full", as recorded, 128×128. Faulty ones are excluded.
+    """
+    check_choice("view", view, ("near", "wide", "full"))
+    xyz = ("x", "y", "z")
+    on_table = InteractionTensors.from_dataset(data, interactions, xyz, POSE_CHANNELS)
+    chosen = np.arange(data.sizes["interaction"]) if interactions is None else interactions
+    levers = data.isel(interaction=valid_interactions(data, chosen))
+    theta = torch.from_numpy(levers["theta"].values)
+    back = torch.stack([theta.cos(), -theta.sin()], dim=-1).float()[:, None]
+    contact = np.stack([levers["contact_x"], levers["contact_y"], 0 * theta], axis=-1)
+    action = on_table.action[:, ::EVERY] - torch.from_numpy(contact).float()[:, None]
+    image, width_m = on_table.image, on_table.image_width_m
+    if view == "near":
+        image, width_m = F.avg_pool2d(image[..., 16:112, 32:], 2), 96 / 128 * width_m
+    elif view == "wide":
+        image = F.interpolate(image, (48, 48), mode="bilinear", antialias=True)
+    return replace(
+        on_table,
+        image=image,
+        image_width_m=width_m,
+        phase=on_table.phase[::EVERY],
+        action=rotate_channels(action, xyz, back, absolute_yaw=True)[..., [0, 2]],
+        effect=rotate_channels(on_table.effect[:, ::EVERY], POSE_CHANNELS, back, False),
+        action_channels=LEVER_ACTION_CHANNELS,
+    )
 
 
 @checked
@@ -87,8 +138,16 @@ class MeanTrajectory(nn.Module):
         return between(self.values.expand(len(t), -1, -1), at)
 
 
+class AroundMean:
+    """A part of networks that predict differences from a `mean_trajectory` of their training."""
+
+    def prepare(self, training: InteractionTensors) -> None:
+        """Set the mean trajectory m."""
+        self.mean_trajectory.fit(training, self.config.frame, self.effect_scale)
+
+
 @network("cnp_last_pose", LastPoseConfig)
-class LastPoseCNP(FiLMNetwork):
+class LastPoseCNP(AroundMean, FiLMNetwork):
     """Predicts a trajectory from any observed part of it; satisfies `EffectModel`."""
 
     def make_layers(self, config: LastPoseConfig) -> None:
@@ -100,10 +159,6 @@ class LastPoseCNP(FiLMNetwork):
         self.effect_encoder = nn.Sequential(*dense(n_e + 2, w, w, w))
         known = w + c.image_features + 2 * n_e + 2
         self.merge = nn.Linear(known + 2 * (2 * c.waves + 1), w)
-
-    def prepare(self, training: InteractionTensors) -> None:
-        """Set the mean trajectory m."""
-        self.mean_trajectory.fit(training, self.config.frame, self.effect_scale)
 
     def outputs(
         self, features: Tensor, observations: Observations, t_target: Tensor

@@ -8,17 +8,15 @@ for comparison. `train_model` goes from data set and split to a calibrated netwo
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor
 from tqdm import tqdm
 
-from affordlib.geometry import xy_columns
 from affordlib.interactions.dataset import (
     InteractionTensors,
     Scaler,
@@ -29,10 +27,11 @@ from affordlib.interactions.dataset import (
 )
 from affordlib.interactions.sampling import Batch, sample_mixed
 from affordlib.models.base import EffectNetwork, NetworkConfig
-from affordlib.models.calibration import effects_at, fit_sigma_scale
 from affordlib.models.checkpoint import build, load_state, save_state
 from affordlib.models.cnp import CNPConfig
 from affordlib.models.domain import TrainingDomain
+from affordlib.models.evaluation import final_errors_m, fit_sigma_scale
+from affordlib.results import from_root
 from affordlib.types import check_count, check_field
 
 if TYPE_CHECKING:
@@ -40,7 +39,6 @@ if TYPE_CHECKING:
 
 Sampler = Callable[[InteractionTensors, int, int, torch.Generator], Batch]
 Score = Callable[[EffectNetwork, InteractionTensors], Tensor]
-Weights = dict[str, Tensor]
 
 
 @dataclass(frozen=True)
@@ -62,7 +60,6 @@ class TrainingConfig:
     ema: float = 0.0
     validate_every: int = 100  # steps
     patience: int = 10  # validations without improvement before stopping
-    max_minutes: float = math.inf
     device: str = "auto"  # as in torch; "auto" is the GPU if there is one, else the CPU
     seed: int = 0  # of batches and contexts, and of a new network's weights
 
@@ -78,8 +75,6 @@ class TrainingConfig:
         check_field(self, "final_sigma_floor", 1e-6, 10.0)
         check_field(self, "ema", 0.0, 0.99999)
         device_named(self.device)
-        if not self.max_minutes > 0:
-            raise ValueError(f"max_minutes must be positive, got {self.max_minutes!r}")
 
     def rate(self, step: int) -> float:
         """Learning rate at a step: linear rise over a tenth of the steps, then cosine decay."""
@@ -111,60 +106,6 @@ def device_named(name: str) -> torch.device:
         raise ValueError(f'device must be "auto", "cpu", "cuda" or alike, got {name!r}') from None
 
 
-def final_errors_m(model: EffectNetwork, tensors: InteractionTensors) -> Float[Tensor, " n"]:
-    """Distance [m] of predicted and true (x, y) at t = 1; without x, y, of all channels."""
-    was_training = model.training
-    truth, mean, _ = effects_at(model.eval(), tensors, (1.0,))
-    model.train(was_training)
-    columns = xy_columns(tensors.effect_channels) or list(range(len(tensors.effect_channels)))
-    return (mean - truth)[:, 0, columns].norm(dim=-1)
-
-
-@dataclass
-class Progress:
-    """What changes in a training, apart from model and optimiser."""
-
-    average: Weights  # exponential moving average of the parameters
-    best: Weights  # state of the best validation
-    first_floor: float  # σ floor at the start
-    random: Tensor  # state of the generator
-    best_error: float = math.inf
-    step: int = 0
-    seconds: float = 0.0
-    fruitless: int = 0  # validations without improvement
-    history: list[tuple[int, float, float, float]] = field(default_factory=list)
-
-
-class Checkpointer:
-    """Saves the state of a training to a file, if one is given, and resumes from it.
-
-    about: settings of the training, which must be equal to resume; parts: model and optimiser.
-    """
-
-    def __init__(self, path: str | Path | None, about: dict[str, Any], **parts: Any) -> None:
-        self.path, self.about, self.parts = path and Path(path), about, parts
-
-    def resume(self, run: Progress, device: torch.device) -> None:
-        """Restore the state, if the file exists; ValueError if it is of other settings."""
-        if not self.path or not self.path.exists():
-            return
-        state = load_state(self.path, device)
-        if differ := [k for k, v in self.about.items() if state["about"].get(k) != v]:
-            raise ValueError(
-                f"resume_checkpoint is of a training with other {', '.join(differ)}; delete it, "
-                "or use the settings of that training"
-            )
-        for name, part in self.parts.items():
-            part.load_state_dict(state[name])
-        vars(run).update(state["run"])
-
-    def save(self, run: Progress) -> None:
-        """Write the state atomically."""
-        if self.path:
-            parts = {name: part.state_dict() for name, part in self.parts.items()}
-            save_state(self.path, {"about": self.about, "run": vars(run)} | parts)
-
-
 def train(
     model: EffectNetwork,
     training: InteractionTensors,
@@ -191,51 +132,65 @@ def train(
     optimiser = torch.optim.AdamW(
         model.parameters(), config.learning_rate, weight_decay=config.weight_decay, fused=True
     )
-    floor = float(model.sigma_floor)
-    run = Progress(_weights(model), _state(model), floor, generator.get_state())
+    floor, average = float(model.sigma_floor), _copies(dict(model.named_parameters()))
+    best, best_error, step, fruitless, seconds, history = {}, math.inf, 0, 0, 0.0, []
     about = _about(model, (training, validation), config, (sampler, score))
-    file = Checkpointer(resume_checkpoint, about, model=model, optimiser=optimiser)
-    file.resume(run, device)
-    generator.set_state(run.random.cpu())
-    start = time.perf_counter() - run.seconds
-    bar = tqdm(total=config.steps, initial=run.step, desc="training", unit=" steps", disable=None)
-    while run.step < config.steps and run.fruitless < config.patience:
-        run.step += 1
-        model.sigma_floor.fill_(config.sigma_floor(run.step, run.first_floor))
-        optimiser.param_groups[0]["lr"] = config.rate(run.step)
-        batch = _to(_sampled(training, config, sampler, generator), device)
-        loss = batch_loss(model, batch, config.beta)
+    if resume_checkpoint and from_root(resume_checkpoint).exists():
+        state = load_state(resume_checkpoint, device)
+        if differ := [k for k, v in about.items() if state["about"].get(k) != v]:
+            raise ValueError(
+                f"resume_checkpoint is of a training with other {', '.join(differ)}; delete it, "
+                "or use the settings of that training"
+            )
+        model.load_state_dict(state["model"])
+        optimiser.load_state_dict(state["optimiser"])
+        generator.set_state(state["random"].cpu())
+        floor, average, best, best_error, step, fruitless, seconds, history = state["run"]
+    start = time.perf_counter() - seconds
+    bar = tqdm(total=config.steps, initial=step, desc="training", unit=" steps", disable=None)
+    while step < config.steps and fruitless < config.patience:
+        step += 1
+        model.sigma_floor.fill_(config.sigma_floor(step, floor))
+        optimiser.param_groups[0]["lr"] = config.rate(step)
+        loss = model.loss(_to(_sampled(training, config, sampler, generator), device), config.beta)
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
         optimiser.step()
-        if config.ema:
-            decay = min(config.ema, run.step / (run.step + 10))
-            for name, value in _weights(model).items():
-                run.average[name].lerp_(value, 1 - decay)
+        decay = min(config.ema, step / (step + 10)) if config.ema else 0.0
+        for name, value in model.named_parameters():
+            average[name].lerp_(value.detach(), 1 - decay)
         bar.update()
-        if run.step % config.validate_every and run.step != config.steps:
+        if step % config.validate_every and step != config.steps:
             continue
-        error, candidate = _validated(model, run.average if config.ema else {}, validation, score)
-        run.seconds = time.perf_counter() - start
-        run.history.append((run.step, run.seconds, loss.item(), error))
+        own = _copies(model.state_dict())
+        model.load_state_dict(own | average)
+        # The model is scored on the CPU, where the data are, so scores can ignore devices.
+        error = float(score(model.cpu().eval(), validation).mean())
+        fruitless += 1
+        if error < best_error:
+            best, best_error, fruitless = _copies(model.state_dict()), error, 0
+        model.to(device).train().load_state_dict(own)
+        seconds = time.perf_counter() - start
+        history.append((step, seconds, loss.item(), error))
         bar.set_postfix_str(f"loss {loss.item():.2f}, validation {error:.3g}")
-        run.fruitless += 1
-        if error < run.best_error:
-            run.best_error, run.best, run.fruitless = error, candidate, 0
-        run.random = generator.get_state()
-        file.save(run)
-        if run.seconds > 60 * config.max_minutes:
-            break
+        if resume_checkpoint:
+            run = floor, average, best, best_error, step, fruitless, seconds, history
+            state = {"about": about, "model": own, "optimiser": optimiser.state_dict()}
+            save_state(resume_checkpoint, state | {"random": generator.get_state(), "run": run})
     bar.close()
-    if run.best_error == math.inf:
+    if not best:
         raise ValueError(
             f"learning_rate {config.learning_rate:g}: no validation error was finite; lower it, or "
             "look for values in the data that are not finite"
         )
-    model.load_state_dict(run.best)
+    model.load_state_dict(best)
     model.cpu().eval()
-    return [TrainingRecord(*record) for record in run.history]
+    return [TrainingRecord(*record) for record in history]
+
+
+def _copies(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {name: value.detach().clone() for name, value in tensors.items()}
 
 
 def _about(
@@ -250,7 +205,7 @@ def _about(
     ]
     names = [getattr(f, "__name__", type(f).__name__) for f in functions]
     about = {"model": repr(model.config), "data": sums, "sampler and score": names}
-    return about | asdict(replace(config, max_minutes=math.inf, device="cpu"))
+    return about | asdict(replace(config, device="cpu"))
 
 
 def _sampled(
@@ -271,39 +226,12 @@ def _sampled(
     return sampler(tensors, config.n_targets, config.obs_max, generator)
 
 
-def _state(model: EffectNetwork) -> Weights:
-    return {name: value.clone() for name, value in model.state_dict().items()}
-
-
-def _weights(model: EffectNetwork) -> Weights:
-    return {name: value.detach().clone() for name, value in model.named_parameters()}
-
-
-def _validated(
-    model: EffectNetwork, average: Weights, validation: InteractionTensors, score: Score
-) -> tuple[float, Weights]:
-    """Mean score of a model with averaged weights, if any, and its state."""
-    device, own = model.sigma_floor.device, _state(model)
-    candidate = own | {name: value.clone() for name, value in average.items()}
-    model.load_state_dict(candidate)
-    # The model is scored on the CPU, where the data are, so scores can ignore devices.
-    error = float(score(model.cpu(), validation).mean())
-    model.to(device).load_state_dict(own)
-    return error, candidate
-
-
 def _to(batch: Any, device: torch.device) -> Any:
     """Copy a batch or observations to a device."""
     moved = {}
     for name, value in vars(batch).items():
         moved[name] = value.to(device) if torch.is_tensor(value) else _to(value, device)
     return replace(batch, **moved)
-
-
-def batch_loss(model: EffectNetwork, batch: Batch, beta: float = 0.0) -> Float[Tensor, ""]:
-    """Mean negative log-likelihood of a batch's targets; beta: see `EffectNetwork.loss`."""
-    b = batch
-    return model.loss(b.image, b.observations, b.t_target, b.action, b.effect, beta)
 
 
 def untrained(config: NetworkConfig, training: InteractionTensors, seed: int) -> EffectNetwork:
@@ -344,9 +272,8 @@ def about_training(
     data: "xarray.Dataset", seen: np.ndarray, config: TrainingConfig
 ) -> dict[str, object]:
     """The record of a training for its checkpoint: data set, interactions seen, settings."""
-    settings = {k: v for k, v in vars(config).items() if k != "max_minutes"}
     return {
         "recipe": data.attrs["recipe"],
         "seen_interactions": sorted(int(i) for i in data["interaction"].values[seen]),
-        "training": settings,
+        "training": dict(vars(config)),
     }

@@ -22,8 +22,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from affordlib.geometry import rotate, xy_columns
-from affordlib.models.base import EffectNetwork
-from affordlib.models.protocol import EffectModel, condition_on_primitives
+from affordlib.models.base import EffectModel, EffectNetwork, condition_on_primitives
 from affordlib.models.push_frame import rotate_prediction
 from affordlib.perception import radius_m
 from affordlib.primitives import Move, Push

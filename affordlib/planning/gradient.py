@@ -20,8 +20,8 @@ import torch
 from torch.nn.functional import normalize
 
 from affordlib.geometry import xy_columns
+from affordlib.models.base import condition_on_final_effect
 from affordlib.models.domain import OutOfRangeWarning
-from affordlib.models.protocol import condition_on_final_effect
 from affordlib.planning.effect_map import EffectMap
 from affordlib.planning.problem import PlanningProblem
 from affordlib.primitives import Drag

@@ -13,8 +13,8 @@ import torch
 from torch import nn
 
 from affordlib.models.checkpoint import restored
-from affordlib.paths import repo_root
 from affordlib.primitives import primitive_named
+from affordlib.results import repo_root
 from affordlib.weights import write_weights
 
 _HIDDEN = 64

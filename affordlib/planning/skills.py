@@ -6,8 +6,8 @@ from typing import Self
 
 import numpy as np
 
+from affordlib.models.base import EffectModel
 from affordlib.models.checkpoint import load_checkpoint
-from affordlib.models.protocol import EffectModel
 from affordlib.perception import looks_rollable
 from affordlib.planning.effect_map import EffectMap, checked_image
 from affordlib.planning.grasp_rotate import PosePlanner

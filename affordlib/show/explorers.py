@@ -17,7 +17,7 @@ import torch
 from matplotlib.figure import Figure
 
 from affordlib.geometry import rotated
-from affordlib.models.protocol import EffectModel
+from affordlib.models.base import EffectModel
 from affordlib.primitives import Primitive
 from affordlib.show.plots import NEUTRAL, PREDICTION, TRUTH
 from affordlib.types import (

@@ -14,7 +14,6 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import ipywidgets as widgets
@@ -22,10 +21,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from affordlib.geometry import unit_vector, wrap_angle
-from affordlib.paths import resolve_out_dir
 from affordlib.planning import Planner, Skills
 from affordlib.planning.effect_map import EffectMap
-from affordlib.results import load_plan, save_plan
 from affordlib.show.executors import Executor, Stopped, closed_loop, measured, open_loop
 from affordlib.show.picker_controls import LIMIT_M, PickerControls, outcome_in_words, plan_in_words
 from affordlib.show.plots import plot_footprint, plot_plan, plot_table
@@ -43,7 +40,7 @@ class GoalPicker(widgets.HBox):
 
     skills: what the robot can do. planners: name → function of a `PlanningProblem` that returns a
     plan. While a hand drags the goal, the browser plans over the effect map; when it lets go, the
-    chosen planner does. seed: of the disturbances. folder: where plans are saved.
+    chosen planner does. seed: of the disturbances.
 
     `executors`: name → function (world, plan, planner, report) → Outcome that executes a plan, or
     replans with the planner that made it; see `executors.Report`. `goal`, `plan` and `outcome` are
@@ -60,9 +57,8 @@ class GoalPicker(widgets.HBox):
         planners: dict[str, Planner],
         goal_xy_m: tuple[float, float] = (0.12, 0.10),
         seed: int = 0,
-        folder: str = "runs/lab",
     ) -> None:
-        self.world, self.skills, self.planners, self.folder = world, skills, planners, folder
+        self.world, self.skills, self.planners = world, skills, planners
         self.executors: dict[str, Executor] = {
             "open loop": open_loop,
             "closed loop": closed_loop(skills),
@@ -140,29 +136,6 @@ class GoalPicker(widgets.HBox):
             self.world.place(self.world.obj, (x, y), yaw)
             self._make_plan()
 
-    def save(self, name: str = "plan.json") -> None:
-        """Save the plan and its goal as JSON in the picker's folder."""
-        path = self._file(name)
-        self._update_plan()
-        if self.plan is None:
-            raise RuntimeError("there is no plan to save; pick another goal first")
-        save_plan(path, self.plan)
-        self.controls.say(f"Saved the plan as {self.folder}/{name}.")
-
-    def load(self, name: str = "plan.json") -> None:
-        """Show a saved plan with its goal, ready to be executed."""
-        self._refuse_while_running()
-        plan = load_plan(self._file(name))
-        with self._alone:
-            self._set_goal(plan.goal)
-            self._put_down()
-            self._begin(plan)
-            away_m = math.dist(plan.start_xy_m, self._pose[:2])
-            note = f" The object is {1000 * away_m:.0f} mm from the start of this plan."
-            self.controls.say(f"Loaded. {plan_in_words(plan)}{note if away_m > 0.002 else ''}")
-            self._stale = False
-            self._show()
-
     def figure(self) -> Figure:
         """The table, object, goal and plan as a figure."""
         figure = Figure(figsize=(5.2, 5.2), layout="constrained")
@@ -202,8 +175,6 @@ class GoalPicker(widgets.HBox):
             controls.shove: self.shove_object,
             controls.move_goal: self.move_goal,
             controls.start_over: self.start_over,
-            controls.save: lambda: self.save(controls.name.value),
-            controls.load: lambda: self.load(controls.name.value),
         }.items():
             button.on_click(lambda _, action=action: self._soon(action))
 
@@ -473,12 +444,6 @@ class GoalPicker(widgets.HBox):
             "planning": planning,
             "pace": self.pace_s,
         }
-
-    def _file(self, name: str) -> Path:
-        """Path of a plan in the folder; ValueError for a name that is not a plain file name."""
-        if not name or name in (".", "..") or Path(name).name != name or "\\" in name:
-            raise ValueError(f"name must be a plain file name such as plan.json, got {name!r}")
-        return resolve_out_dir(self.folder) / name
 
 
 def _whole_mm(xy_m: Any) -> tuple[float, float]:

@@ -47,9 +47,6 @@ class PickerControls(widgets.VBox):
         self.shove = _button("Shove it", "hand-o-right", "Disturb: shove the object")
         self.move_goal = _button("Move goal", "random", "Disturb: move the goal")
         self.start_over = _button("Start over", "undo", "Put the object back")
-        narrow = {"style": {"description_width": "auto"}, "layout": {"flex": "1", "min_width": "0"}}
-        self.name = widgets.Text("plan.json", description="file", **narrow)
-        self.save, self.load = _button("Save", "save"), _button("Load", "folder-open")
         self.words, self.said, self.progress = widgets.HTML(), "", widgets.HTML()
         self.show(goal)
         for slider in self.sliders:
@@ -60,7 +57,6 @@ class PickerControls(widgets.VBox):
             *([slider] for slider in self.sliders),
             [self.run, self.stop, self.start_over],
             [widgets.Label("disturb"), self.shove, self.move_goal],
-            [self.name, self.save, self.load],
         ]
         layout = {"flex": "1 1 250px", "max_width": "300px"}
         super().__init__([widgets.HBox(row) for row in rows], layout=layout)
@@ -86,7 +82,7 @@ class PickerControls(widgets.VBox):
 
     def set_running(self, running: bool) -> None:
         """Disable the controls that have no effect during a run."""
-        for control in (self.run, self.start_over, self.planner, self.executor, self.load):
+        for control in (self.run, self.start_over, self.planner, self.executor):
             control.disabled = running
         self.stop.disabled = not running
 

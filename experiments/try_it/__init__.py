@@ -8,9 +8,8 @@ import json
 from pathlib import Path
 
 from affordlib import show
-from affordlib.paths import repo_root
 from affordlib.planning import Skills
-from affordlib.results import write_atomically
+from affordlib.results import repo_root, write_atomically
 from affordlib.show.table_data import object_data, table_data
 from affordlib.world import Cuboid, LyingCylinder, Prism, Sphere, Tabletop, UprightCylinder
 

@@ -11,7 +11,7 @@ import torch
 from affordlib.interactions import InteractionTensors, open_interactions, split_interactions
 from affordlib.interactions.sampling import condition_on_recorded_action
 from affordlib.models import coverage, load_checkpoint
-from affordlib.models.predictions import network_predictions
+from affordlib.models.evaluation import network_predictions
 from exercises.checking import Exercise, asked
 
 # 03 The affordance network

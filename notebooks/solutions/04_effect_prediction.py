@@ -6,7 +6,7 @@ import torch
 from affordlib.interactions import open_interactions
 from affordlib.interactions.sampling import condition_on_recorded_action
 from affordlib.models import load_checkpoint
-from affordlib.models.predictions import network_predictions
+from affordlib.models.evaluation import network_predictions
 from exercises import check
 
 

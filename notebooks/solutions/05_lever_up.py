@@ -5,10 +5,16 @@ from dataclasses import replace
 import torch
 
 from affordlib.interactions import open_interactions, split_interactions
-from affordlib.interactions.lever_up import N_OBSERVED, N_PREDICTED, lever_up_tensors
 from affordlib.interactions.sampling import condition_on_poses
 from affordlib.models import load_checkpoint
-from affordlib.models.lever_up import errors_m, n_windows, window_errors_m
+from affordlib.models.lever_up import (
+    N_OBSERVED,
+    N_PREDICTED,
+    errors_m,
+    lever_up_tensors,
+    n_windows,
+    window_errors_m,
+)
 from exercises import check
 
 levers = open_interactions("lever_up")

@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from affordlib.interactions import InteractionTensors
-from affordlib.models.predictions import final_error, network_predictions
-from affordlib.models.training import final_errors_m
+from affordlib.models.evaluation import final_error, final_errors_m, network_predictions
 from experiments.baselines import constant, gaussian_process, nearest
 from experiments.cross_validation import add_errors, logistic
 from experiments.uncertainty import calibration_row

@@ -7,7 +7,7 @@ import signal
 
 import pytest
 
-from affordlib.paths import repo_root
+from affordlib.results import repo_root
 from experiments.commands import command
 
 ALL = {

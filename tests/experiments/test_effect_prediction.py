@@ -102,7 +102,7 @@ def test_what_decides_a_training_decides_whether_its_result_is_stale(monkeypatch
             cross_validation, "network_and_training", lambda *_, change=change: change
         )
         assert made_of() != before
-    same = network, replace(training, max_minutes=3.0)
+    same = network, replace(training, device="cpu")
     monkeypatch.setattr(cross_validation, "network_and_training", lambda *_: same)
     assert made_of() == before
 

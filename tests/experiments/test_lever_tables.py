@@ -5,10 +5,14 @@ import pytest
 import torch
 
 from affordlib.interactions import open_interactions
-from affordlib.interactions.lever_up import lever_up_tensors
 from affordlib.models import load_checkpoint
-from affordlib.models.lever_up import PROTOCOLS, from_start_errors_m, window_errors_m
-from affordlib.paths import repo_root
+from affordlib.models.lever_up import (
+    PROTOCOLS,
+    from_start_errors_m,
+    lever_up_tensors,
+    window_errors_m,
+)
+from affordlib.results import repo_root
 from experiments.lever_cross_validation import (
     edges_of,
     extrapolate,

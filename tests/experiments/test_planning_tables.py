@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from affordlib.paths import repo_root
 from affordlib.planning import MODES, EffectMap
 from affordlib.primitives import PUSH_GAP_M, Drag, Push
+from affordlib.results import repo_root
 from affordlib.world import ROLLABLE, STANDING, Cuboid, UprightCylinder
 from experiments import planning, shipped, tasks
 from experiments.field_baselines import FINGER_AHEAD_M, LimitSurface

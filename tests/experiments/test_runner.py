@@ -13,8 +13,7 @@ from dask.distributed import Client
 from joblib import parallel_config
 from pandas.testing import assert_frame_equal
 
-from affordlib.paths import repo_root
-from affordlib.results import read_results, write_results
+from affordlib.results import read_results, repo_root, write_results
 from experiments import runner
 from experiments.runner import Job, frame, read, run
 

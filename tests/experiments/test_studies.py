@@ -12,7 +12,7 @@ from scipy import integrate, stats
 
 from affordlib.interactions import InteractionTensors
 from affordlib.interactions.sampling import sample_mixed
-from affordlib.paths import repo_root
+from affordlib.results import repo_root
 from experiments import ablation, limits, studies
 from experiments.ablation import actions_only, half_blend, random_contexts
 from experiments.real_pushes import pushes_of

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch.nn.functional import pad
 
-from affordlib import paths
+from affordlib import results
 from affordlib.interactions import (
     CorruptedDataError,
     InteractionTensors,
@@ -22,8 +22,7 @@ from affordlib.interactions.recipes import RECIPES, SHIPPED, Recipe, interact
 from affordlib.interactions.sampling import condition_on_recorded_action, sample_mixed
 from affordlib.interactions.store import dataset_sha256, stored_sha256, write_interactions
 from affordlib.models.checkpoint import load_state
-from affordlib.paths import repo_root
-from affordlib.results import load_plan, read_results
+from affordlib.results import read_results, repo_root
 
 
 @pytest.fixture(scope="module", params=SHIPPED)
@@ -229,7 +228,7 @@ def test_a_file_that_would_fill_the_memory_or_never_end_is_refused(tmp_path):
     with pytest.raises(CorruptedDataError, match=r"manifest\.json .* larger than the file"):
         open_interactions(bomb)
     os.mkfifo(pipe)
-    for read in (open_interactions, stored_sha256, load_state, load_plan, read_results):
+    for read in (open_interactions, stored_sha256, load_state, read_results):
         with pytest.raises(FileNotFoundError, match=r"no file .*pipe\.zarr\.zip"):
             read(pipe)
 
@@ -237,6 +236,6 @@ def test_a_file_that_would_fill_the_memory_or_never_end_is_refused(tmp_path):
 def test_a_set_under_the_name_of_another_is_refused(tmp_path, monkeypatch):
     (tmp_path / "data").mkdir()
     shutil.copy(repo_root() / "data" / "grasp.zarr.zip", tmp_path / "data" / "rotate.zarr.zip")
-    monkeypatch.setattr(paths, "repo_root", lambda: tmp_path)
+    monkeypatch.setattr(results, "repo_root", lambda: tmp_path)
     with pytest.raises(CorruptedDataError, match="its recipe is not that of 'rotate'"):
         open_interactions("rotate")

@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from affordlib.interactions.dataset import augment_by_symmetry
-from affordlib.interactions.lever_up import N_OBSERVED, N_PREDICTED, lever_up_tensors
-from affordlib.models.lever_up import n_windows
+from affordlib.models.lever_up import N_OBSERVED, N_PREDICTED, lever_up_tensors, n_windows
 from experiments.lever_training import MIRRORED, sample_from_start, sample_windows
 
 

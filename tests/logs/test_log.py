@@ -8,7 +8,7 @@ import pytest
 
 from affordlib.geometry import rotated
 from affordlib.logs import Log, cross_validate, planar, summary, worst
-from affordlib.paths import repo_root
+from affordlib.results import repo_root
 from experiments.real_pushes import pushes_of
 
 TRIANGLE_MM = ((0, 0), (150, 0), (0, 150))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from affordlib.logs import PushedObject, fit
-from affordlib.paths import repo_root
+from affordlib.results import repo_root
 
 TRIANGLE_MM = [[0, 0], [130, 0], [30, 110]]
 

@@ -13,9 +13,9 @@ from safetensors.torch import save
 
 from affordlib.interactions import split_interactions
 from affordlib.models import load_checkpoint, save_checkpoint
-from affordlib.models.predictions import refuse_seen
-from affordlib.paths import repo_root
+from affordlib.models.evaluation import refuse_seen
 from affordlib.planning.reachability import Reachability
+from affordlib.results import repo_root
 from affordlib.weights import read_weights, write_weights
 from experiments.runner import checkpoint_sha256
 
@@ -85,7 +85,7 @@ def test_a_renamed_checkpoint_is_refused(monkeypatch, tmp_path):
     (tmp_path / "data" / "checkpoints").mkdir(parents=True)
     names = [f"data/checkpoints/{name}.safetensors" for name in ("cnp_500", "film_500")]
     (tmp_path / names[1]).write_bytes((repo_root() / names[0]).read_bytes())
-    monkeypatch.setattr("affordlib.paths.repo_root", lambda: tmp_path)
+    monkeypatch.setattr("affordlib.results.repo_root", lambda: tmp_path)
     with pytest.raises(ValueError, match=r"film_500\.safetensors .*it is 'cnp_500', renamed"):
         load_checkpoint("film_500")
     load_checkpoint(tmp_path / names[1])  # a path may have any name

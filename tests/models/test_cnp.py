@@ -4,6 +4,7 @@ import pytest
 import torch
 from torch import nn
 
+from affordlib.interactions.sampling import Batch
 from affordlib.models import CNPConfig, condition_on_primitives
 from affordlib.primitives import Push
 from affordlib.types import Observations
@@ -104,5 +105,5 @@ def test_loss_is_the_gaussian_log_likelihood(untrained, beta):
     mu_a, sigma_a, mu_e, sigma_e = untrained(image, seen, t)
     a = torch.distributions.Normal(mu_a, sigma_a).log_prob(action / 0.1) * sigma_a ** (2 * beta)
     e = torch.distributions.Normal(mu_e, sigma_e).log_prob(effect / 0.03) * sigma_e ** (2 * beta)
-    loss = untrained.loss(image, seen, t, action, effect, beta)
+    loss = untrained.loss(Batch(image, seen, t, action, effect), beta)
     torch.testing.assert_close(loss, -(a.mean() + e.mean()) / 2)

@@ -9,11 +9,16 @@ from matplotlib.path import Path as Outline
 
 from affordlib.geometry import rotated
 from affordlib.interactions import Scaler
-from affordlib.interactions.lever_up import N_OBSERVED, lever_up_tensors
 from affordlib.interactions.recipes import Recipe, sample_scene
 from affordlib.interactions.sampling import condition_on_poses
 from affordlib.models import build
-from affordlib.models.lever_up import PROTOCOLS, from_start_errors_m, predict_steps
+from affordlib.models.lever_up import (
+    N_OBSERVED,
+    PROTOCOLS,
+    from_start_errors_m,
+    lever_up_tensors,
+    predict_steps,
+)
 from experiments.lever_training import LEVER_MODELS, fit_lever_model
 
 

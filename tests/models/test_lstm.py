@@ -5,10 +5,9 @@ import pytest
 import torch
 
 from affordlib.interactions import InteractionTensors, Scaler
-from affordlib.interactions.lever_up import N_OBSERVED
 from affordlib.interactions.sampling import condition_on_poses
 from affordlib.models import build
-from affordlib.models.lever_up import from_start_errors_m, window_errors_m
+from affordlib.models.lever_up import N_OBSERVED, from_start_errors_m, window_errors_m
 from experiments.lstm import LSTMConfig
 from experiments.lstm_seker2019 import SekerConfig, SekerLSTM, train_seker
 

@@ -23,10 +23,9 @@ from affordlib.models import (
     load_checkpoint,
     save_checkpoint,
 )
+from affordlib.models.base import condition_on_final_effect
 from affordlib.models.lever_up import LastPoseConfig
-from affordlib.models.protocol import condition_on_final_effect
 from affordlib.models.push_frame import push_direction
-from affordlib.models.training import batch_loss
 from affordlib.primitives import Drag, Push
 from affordlib.types import Observations
 from affordlib.world import Cuboid, UprightCylinder
@@ -131,7 +130,7 @@ def test_a_row_alone_is_predicted_as_in_a_batch(network, some):
 def test_the_literal_loop_and_the_batch_agree(network, some):
     """On the same draw, the mean over single targets has the batch's loss and gradients."""
     batch = batch_of(some.select(torch.arange(6)), n_targets=3)
-    batch_loss(network, batch).backward()
+    network.loss(batch).backward()
     together = [p.grad.clone() for p in network.parameters() if p.grad is not None]
     network.zero_grad()
     losses = []
@@ -140,10 +139,10 @@ def test_the_literal_loop_and_the_batch_agree(network, some):
         target = {name: getattr(batch, name)[[b], j : j + 1] for name in names}
         seen = row_of(batch.observations, b)
         one = dataclasses.replace(batch, image=batch.image[[b]], observations=seen, **target)
-        losses.append(batch_loss(network, one) / 18)
+        losses.append(network.loss(one) / 18)
         losses[-1].backward()
     apart = [p.grad for p in network.parameters() if p.grad is not None]
-    torch.testing.assert_close(sum(losses), batch_loss(network, batch), rtol=1e-5, atol=0)
+    torch.testing.assert_close(sum(losses), network.loss(batch), rtol=1e-5, atol=0)
     for a, b in zip(together, apart, strict=True):
         assert (a - b).norm() <= 1e-4 * a.norm() + 1e-5
 
@@ -315,7 +314,7 @@ def test_coverage_and_variance_scaling(some):
         (lambda: SekerConfig(patience=0), "patience .* 0"),
         (lambda: CNPConfig(sigma_floor=0.0), r"sigma_floor .* 0\.0"),
         (lambda: AttentionConfig(width=30), "width must be a multiple of heads, got 30"),
-        (lambda: FiLMConfig(blocks=10**7), r"blocks must lie in \[1, 4096\]"),
+        (lambda: FiLMConfig(blocks=10**7), r"blocks must be a whole number in \[1, 4096\]"),
     ],
 )
 def test_bad_settings_are_named(make, words):

@@ -15,6 +15,7 @@ from affordlib.interactions import InteractionTensors, Scaler, split_interaction
 from affordlib.interactions.sampling import condition_on_recorded_action
 from affordlib.models import (
     FiLMConfig,
+    FiLMNetwork,
     TrainingConfig,
     TrainingDomain,
     build,
@@ -24,8 +25,8 @@ from affordlib.models import (
     train,
     train_model,
 )
+from affordlib.models.evaluation import final_errors_m
 from affordlib.models.lever_up import LastPoseConfig
-from affordlib.models.training import batch_loss, final_errors_m
 from affordlib.planning import EffectMap
 from affordlib.types import Observations
 from experiments.baselines import constant
@@ -121,17 +122,17 @@ def test_training_resumes_to_the_same_bits(some, tmp_path, monkeypatch):
     whole = fresh(some)
     history = train(whole, some, some, config)
 
-    broken, calls = fresh(some), []
+    broken, calls, loss_of = fresh(some), [], FiLMNetwork.loss
 
     def stop(model, batch, beta):
         calls.append(0)
         if len(calls) == 6:
             raise Stopped
-        return batch_loss(model, batch, beta)
+        return loss_of(model, batch, beta)
 
     file = tmp_path / "run" / "training.pt"
     with monkeypatch.context() as patch:
-        patch.setattr("affordlib.models.training.batch_loss", stop)
+        patch.setattr(FiLMNetwork, "loss", stop)
         with pytest.raises(Stopped):
             train(broken, some, some, config, resume_checkpoint=file)
     again = fresh(some)

@@ -9,7 +9,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from affordlib.paths import repo_root
 from affordlib.perception import adapt_to_object
 from affordlib.planning import (
     MODES,
@@ -25,6 +24,7 @@ from affordlib.planning import (
 from affordlib.planning.grasp_rotate import GRIPPER_YAWS_RAD
 from affordlib.planning.reachability import Reachability
 from affordlib.primitives import Drag, Grasp, Push, Rotate
+from affordlib.results import repo_root
 from affordlib.types import Goal, Plan, Step
 from affordlib.world import (
     Cuboid,

@@ -8,7 +8,7 @@ import subprocess
 
 import pytest
 
-from affordlib.paths import repo_root
+from affordlib.results import repo_root
 
 CONF = repo_root() / "notebooks" / "book_html" / "conf.py"
 

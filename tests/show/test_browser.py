@@ -24,7 +24,7 @@ import pytest
 from bs4 import BeautifulSoup
 from pages import WIDGET
 
-from affordlib.paths import repo_root
+from affordlib.results import repo_root
 from tests.waiting import wait_until
 
 CHROMIUM = shutil.which("chromium")

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from affordlib.models.protocol import condition_on_primitives
+from affordlib.models.base import condition_on_primitives
 from affordlib.primitives import Push
 from affordlib.show import conditioning_explorer, phase_explorer
 from affordlib.world import Cuboid
