@@ -6,6 +6,7 @@ planned phase, ends there. And a drawing of the data flow.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from io import BytesIO
 
@@ -16,7 +17,6 @@ from PIL import Image, ImageDraw, ImageFont
 
 from affordlib.planning import Skills, execute_plan, plan_continuous
 from affordlib.results import repo_root, write_atomically
-from affordlib.show import FrameRecorder
 from affordlib.show.diagrams import plot_flow
 from affordlib.show.plots import GOAL as GOAL_COLOR
 from affordlib.show.plots import NEUTRAL, PREDICTION, TRUTH
@@ -25,18 +25,24 @@ from affordlib.world import Cuboid, Tabletop
 
 BOX = Cuboid(0.05, 0.045, 0.05)
 GOAL = Goal((0.0, 0.028))
-FRAME_STEPS, LEAVES = 48, 6
-"""Simulation steps between two frames; frames at the end in which the arm leaves the picture."""
+FRAME_STEPS, COMES, LEAVES, FRAME_MS = 16, 12, 24, 40
+"""Simulation steps between two frames; frames in which the arm comes, and leaves, that are not
+shown; time for which a frame is shown [ms]."""
 WIDTH, HEIGHT = 840, 660
 """Size of one of the two pictures, below its title [pixels]; pages show it at half of that."""
-VIEW = {"at_m": (-0.15, 0.0, 0.3), "distance_m": 1.6}
+VIEW = {"at_m": (-0.22, 0.0, 0.2), "distance_m": 1.55, "yaw_deg": 62.0, "pitch_deg": -28.0}
 GOAL_RGB = (0.0, 0.45, 0.70)
 FIGURES = repo_root() / "figures"
 
 
 def recorded(title: str, stop: bool) -> list[np.ndarray]:
     """Return frames (h, w, 3) of one planned push, stopped as planned or executed in full."""
-    animation = FrameRecorder(FRAME_STEPS, WIDTH, HEIGHT, **VIEW)
+    frames, steps = [], itertools.count()
+
+    def take(world):
+        if next(steps) % FRAME_STEPS == 0:
+            frames.append(world.picture(WIDTH, HEIGHT, **VIEW))
+
     with Tabletop() as world:
         world.place(BOX, (0.0, 0.0), 0.3)
         query = world.depth_image(), world.object_pose()[:2], GOAL, "single_partial"
@@ -45,12 +51,31 @@ def recorded(title: str, stop: bool) -> list[np.ndarray]:
         if not stop:
             plan = replace(plan, steps=(replace(plan.steps[0], stop_phase=1.0),))
         world.mark(GOAL.xy_m, GOAL_RGB, turned, scale=1.3)
-        world.on_step = animation
+        world.on_step = take
         outcome = execute_plan(world, plan)
-    del animation.frames[-LEAVES:]
-    titles = [title.format(plan.steps[0].stop_phase)] * len(animation.frames)
-    titles[-8:] = [f"{titles[0]}: {1000 * outcome.distance_m:.1f} mm from the goal"] * 8
-    return [_titled(*pair) for pair in zip(animation.frames, titles, strict=True)]
+    frames = frames[COMES:-LEAVES]
+    titles = [title.format(plan.steps[0].stop_phase)] * len(frames)
+    titles[-25:] = [f"{titles[0]}: {1000 * outcome.distance_m:.1f} mm from the goal"] * 25
+    return [_titled(*pair) for pair in zip(frames, titles, strict=True)]
+
+
+def animated(frames: list[np.ndarray]) -> bytes:
+    """Return frames as a GIF that starts with the last one, shown longer."""
+    frames = [frames[-1], *frames[:-1]]
+    # One palette for all frames, made from a few of them, prevents flickering colours.
+    few = np.vstack(frames[:: len(frames) // 3])
+    palette = Image.fromarray(few).quantize(
+        255, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE
+    )
+    first, *others = [
+        Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE)
+        for frame in frames
+    ]
+    buffer = BytesIO()
+    durations = [2000] + [FRAME_MS] * len(others)
+    options = {"save_all": True, "append_images": others, "duration": durations, "loop": 0}
+    first.save(buffer, "GIF", **options)
+    return buffer.getvalue()
 
 
 def _titled(picture: np.ndarray, title: str) -> np.ndarray:
@@ -98,10 +123,10 @@ def main() -> None:
     """Draw the data flow; record the full and the partial push, and write them side by side."""
     write_atomically(FIGURES / "data_flow.svg", data_flow())
     both = recorded("The full push", stop=False), recorded("Stopped at {:.0%} of it", stop=True)
-    animation = FrameRecorder()
-    for k in range(max(map(len, both))):
-        animation.frames.append(np.hstack([side[min(k, len(side) - 1)] for side in both]))
-    write_atomically(FIGURES / "partial_push.gif", animation.encoded("GIF", frame_ms=80))
+    longest = max(map(len, both))
+    sides = [side + side[-1:] * (longest - len(side)) for side in both]
+    frames = [np.hstack(pair) for pair in zip(*sides, strict=True)]
+    write_atomically(FIGURES / "partial_push.gif", animated(frames), b"GIF8")
 
 
 if __name__ == "__main__":

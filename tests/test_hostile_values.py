@@ -129,8 +129,6 @@ def shop(one_world, skills, pushes, tmp_path_factory):
     one_world.place(BOX, AT, 0.3)
     image, model, goal = one_world.depth_image(), skills.model(Push), Goal((0.05, 0.02))
     seen, executed = one_world.observe(), one_world.execute_primitive(Push(0.0))
-    animation = show.FrameRecorder(1, 16, 16)
-    animation(one_world)
     arrays = interactions.InteractionTensors.from_dataset(pushes, np.arange(12))
     scaler, domain = interactions.Scaler.fit(arrays), models.TrainingDomain.fit(arrays)
     config, test = models.CNPConfig(), interactions.open_interactions("push_test")
@@ -189,7 +187,6 @@ def shop(one_world, skills, pushes, tmp_path_factory):
         "seen": seen,
         "ax": ax,
         "figure": figure,
-        "recorder": animation,
         "folder out_dir": folder,
         "notebook": "x",
         "parameters tables": {},
@@ -205,7 +202,6 @@ def shop(one_world, skills, pushes, tmp_path_factory):
         "place": {"config": None},
         "Tabletop": {"config": world.WorldConfig()},
         "picture": {"width": 32, "height": 32},
-        "FrameRecorder": {"width": 32, "height": 32},
         "settle": {"seconds": 0.1},
         "primitive_named": {"name": "push"},
         "category_named": {"name": "cuboid"},
@@ -241,12 +237,11 @@ def shop(one_world, skills, pushes, tmp_path_factory):
         "plan_gradient": {"samples": 10},
         "plan_continuous": {"draft": True},
         "run_closed_loop": {"config": once, "goal": Goal(AT, 0.05)},
-        "GoalPicker": {"folder": str(folder)},
+        "GoalPicker": {"view": False},
         "conditioning_explorer": {"seen": executed},
         "Grasp": {"seen_height": 0.05},
         "Push": {"radius": 0.2},
         "PushAt": {"length": 0.01},
-        "show_animation": {"path": folder / "animation.gif", "beside": figure},
     }
     return {k: v for names, v in by_name.items() for k in names.split()}, by_callable
 

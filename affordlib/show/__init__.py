@@ -8,7 +8,6 @@ from affordlib.show.plots import (
     NEUTRAL,
     PREDICTION,
     TRUTH,
-    FrameRecorder,
     plot_closed_loop,
     plot_depth,
     plot_footprint,
@@ -16,5 +15,5 @@ from affordlib.show.plots import (
     plot_plan,
     plot_table,
     save_figure,
-    show_animation,
 )
+from affordlib.show.scene import Scene

@@ -14,21 +14,25 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, Self
 
 import ipywidgets as widgets
 import numpy as np
 from matplotlib.figure import Figure
 
 from affordlib.geometry import unit_vector, wrap_angle
-from affordlib.planning import Planner, Skills
+from affordlib.models import load_checkpoint
+from affordlib.planning import Planner, Skills, plan_astar, plan_continuous, plan_gradient
 from affordlib.planning.effect_map import EffectMap
+from affordlib.planning.gradient import Reading
 from affordlib.show.executors import Executor, Stopped, closed_loop, measured, open_loop
 from affordlib.show.picker_controls import LIMIT_M, PickerControls, outcome_in_words, plan_in_words
 from affordlib.show.plots import plot_footprint, plot_plan, plot_table
+from affordlib.show.scene import Scene
 from affordlib.show.table_data import TableView, object_data, plan_data, table_data
 from affordlib.types import Goal, Outcome, Plan, check_count, check_on_table
-from affordlib.world import Tabletop
+from affordlib.world import Cuboid, Tabletop
+from affordlib.world.trajectory import STEP_S
 
 DPI = 90
 POSE_EVERY, SENT_TOGETHER = 12, 5
@@ -40,7 +44,7 @@ class GoalPicker(widgets.HBox):
 
     skills: what the robot can do. planners: name → function of a `PlanningProblem` that returns a
     plan. While a hand drags the goal, the browser plans over the effect map; when it lets go, the
-    chosen planner does. seed: of the disturbances.
+    chosen planner does. seed: of the disturbances. view: whether the robot is shown in 3-D, too.
 
     `executors`: name → function (world, plan, planner, report) → Outcome that executes a plan, or
     replans with the planner that made it; see `executors.Report`. `goal`, `plan` and `outcome` are
@@ -48,7 +52,7 @@ class GoalPicker(widgets.HBox):
     it in the background, and *Run* then shows each pose for `pace_s`.
     """
 
-    pace_s = 0.02
+    pace_s = POSE_EVERY * STEP_S
 
     def __init__(
         self,
@@ -57,6 +61,7 @@ class GoalPicker(widgets.HBox):
         planners: dict[str, Planner],
         goal_xy_m: tuple[float, float] = (0.12, 0.10),
         seed: int = 0,
+        view: bool = True,
     ) -> None:
         self.world, self.skills, self.planners = world, skills, planners
         self.executors: dict[str, Executor] = {
@@ -82,16 +87,35 @@ class GoalPicker(widgets.HBox):
         self._shown_until = 0.0
         self._news = ""  # of disturbances, until the next action or plan
         self._view = TableView(table=table_data(skills))
+        self.scene = Scene(world) if view else None
+        self._played = 0  # frames of the scene
         goal = Goal(_whole_mm(check_on_table("goal_xy_m", goal_xy_m)))
         self.controls = PickerControls(goal, list(planners), list(self.executors), self._follow)
         self._listen()
         below = [self._view, self.controls.progress, self.controls.words]
         table = widgets.VBox(below, layout={"flex": "1 1 320px", "max_width": "640px"})
         layout = {"flex_flow": "row wrap", "grid_gap": "12px"}
-        super().__init__([table, self.controls], layout=layout)
+        beside = [self.scene] if view else []
+        super().__init__([table, self.controls, *beside], layout=layout)
         self.add_class("affordlib-picker")
         for _ in range(2):  # what is slow only once is then not part of the time shown
             self._attempt(self._make_plan)
+
+    @classmethod
+    def demo(cls, goal_xy_m: tuple[float, float] = (0.12, 0.08), seed: int = 0) -> Self:
+        """Make a picker for a box, with the shipped models and the three planners of page 06."""
+        skills, world = Skills.load(), Tabletop()
+        world.place(Cuboid(0.07, 0.05, 0.05), (0.0, 0.0), 0.3)
+        paper = skills.models | {"push": load_checkpoint("cnp_500")[0]}
+        published, reading = replace(skills, models=paper), Reading(starts=4)
+
+        def gradient(problem):  # the paper's planner, with the paper's network
+            known = replace(problem, effects=published.effects(problem.effects.image))
+            return plan_gradient(known, seed=seed, reading=reading)
+
+        continuous = partial(plan_continuous, seed=seed)
+        planners = {"continuous": continuous, "A*": plan_astar, "gradient": gradient}
+        return cls(world, skills, planners, goal_xy_m, seed)
 
     @property
     def goal(self) -> Goal:
@@ -134,6 +158,8 @@ class GoalPicker(widgets.HBox):
         with self._alone:
             x, y, yaw = self._first_pose
             self.world.place(self.world.obj, (x, y), yaw)
+            if self.scene is not None:
+                self.scene.place()
             self._make_plan()
 
     def figure(self) -> Figure:
@@ -269,6 +295,8 @@ class GoalPicker(widgets.HBox):
         self.plan, self.outcome = plan, None
         self._trail.clear()
         self._marks.clear()
+        if self.scene is not None:
+            self.scene.mark(self.goal, plan)
         self._plan_pose, self._turn_from = self._pose, self._pose[2]
 
     def _planner(self) -> Planner:
@@ -367,10 +395,14 @@ class GoalPicker(widgets.HBox):
         z_m: the object's height on the table; pace_s: time for which each pose is shown.
         """
         steps, self._shown_until, self._pace_s = itertools.count(), time.monotonic(), pace_s
+        if self.scene is not None:
+            self.scene.place()
+            self._played = 0
 
         def log(world):
-            if also is not None:
-                also(world)
+            for one in (also, self.scene):
+                if one is not None:
+                    one(world)
             number = next(steps)
             if number % POSE_EVERY == 0:
                 pose, lift = world.object_pose(), world.object_state()[2] - z_m
@@ -392,6 +424,8 @@ class GoalPicker(widgets.HBox):
 
     def _wait_until_shown(self) -> None:
         self._send_motions()
+        if self.scene is not None:
+            self._played = self.scene.play(self._played)
         if not self._stop.wait(max(0.0, self._shown_until - time.monotonic())):
             self._pose = self.world.object_pose()
 

@@ -1,7 +1,6 @@
 """Figures in one style: fixed, colour-blind-safe colours for goal, prediction and ground truth.
 
-Plot functions draw into the `ax` that they get and return it. Positions are in centimetres. Small
-animations of the robot are recorded frames, encoded as a GIF or PNG by Pillow.
+Plot functions draw into the `ax` that they get and return it. Positions are in centimetres.
 """
 
 import io
@@ -13,11 +12,9 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 from IPython import get_ipython
-from IPython.display import Image as NotebookImage
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib_inline.config import InlineBackend
-from PIL import Image
 
 from affordlib.geometry import rotated
 from affordlib.perception import CAMERA_HEIGHT_M
@@ -33,12 +30,11 @@ from affordlib.types import (
     Outcome,
     Plan,
     Step,
-    check_count,
     check_finite,
     check_pair,
     check_within,
 )
-from affordlib.world import Tabletop, TabletopObject
+from affordlib.world import TabletopObject
 
 GOAL, PREDICTION, TRUTH, NEUTRAL = "#0072B2", "#D55E00", "#009E73", "#777777"
 
@@ -240,88 +236,3 @@ def plot_depth(ax: Axes, image: np.ndarray, title: str = "") -> Axes:
     ax.grid(False)
     ax.set(title=title, xlabel="x [cm]", ylabel="y [cm]", xticks=(-5, 0, 5), yticks=(-5, 0, 5))
     return ax
-
-
-class FrameRecorder:
-    """Records a picture every `every` simulation steps (1/240 s), as the `world.on_step` callback.
-
-    Figures can be added as frames as well, with `add`. view: options of `Tabletop.picture`.
-    """
-
-    def __init__(self, every: int = 30, width: int = 320, height: int = 240, **view: Any) -> None:
-        self.every = check_count("every", every, 1, 100_000)
-        self.width = check_count("width", width, 16, 2048)
-        self.height = check_count("height", height, 16, 2048)
-        self.view = view
-        self.frames: list[np.ndarray] = []
-        self._steps = 0
-
-    def __call__(self, world: Tabletop) -> None:
-        if self._steps % self.every == 0:
-            self.frames.append(world.picture(self.width, self.height, **self.view))
-        self._steps += 1
-
-    def add(self, figure: Figure) -> None:
-        """Add a figure as a frame, in the recorder's height; all frames must be of one width."""
-        frame = _drawn(figure, self.height)
-        if self.frames and frame.shape != self.frames[0].shape:
-            sizes = [f"{f.shape[1]}×{f.shape[0]}" for f in (frame, self.frames[0])]
-            raise ValueError(
-                f"figure makes a frame of {sizes[0]} pixels, the others have {sizes[1]}; "
-                "give it their shape, or show it with beside="
-            )
-        self.frames.append(frame)
-
-    def encoded(
-        self, kind: str = "GIF", frame_ms: int = 100, beside: Figure | None = None
-    ) -> bytes:
-        """The frames as an animation that loops and starts with its last frame, shown longer.
-
-        kind: "GIF" or "PNG"; beside: a figure shown to the left of every frame.
-        """
-        if not self.frames:
-            raise RuntimeError(
-                "there are no frames; set world.on_step to the recorder before the robot moves"
-            )
-        frames = [self.frames[-1], *self.frames[:-1]]
-        if beside is not None:
-            left = _drawn(beside, frames[0].shape[0])
-            frames = [np.hstack([left, frame]) for frame in frames]
-        # One palette for all frames, made from a few of them, prevents flickering colours.
-        few = [frames[round(k * (len(frames) - 1) / 3)] for k in range(4)]
-        palette = Image.fromarray(np.vstack(few)).quantize(
-            255, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE
-        )
-        indexed = [
-            Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE)
-            for frame in frames
-        ]
-        buffer = io.BytesIO()
-        durations = [1500] + [frame_ms] * (len(indexed) - 1)
-        indexed[0].save(
-            buffer, kind, save_all=True, append_images=indexed[1:], duration=durations, loop=0
-        )
-        return buffer.getvalue()
-
-
-def _drawn(figure: Figure, height: int) -> np.ndarray:
-    """Render a figure as pixels (height, width, 3)."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=2 * height / figure.get_figheight())
-    picture = Image.open(buffer).convert("RGB")
-    size = (picture.width // 2, picture.height // 2)
-    return np.asarray(picture.resize(size, Image.Resampling.LANCZOS))
-
-
-def show_animation(
-    recorder: FrameRecorder, path: str | Path | None = None, beside: Figure | None = None
-) -> NotebookImage:
-    """The frames as an animation for a notebook; if `path` is given, also saved as a GIF.
-
-    beside: a figure shown to the left of every frame. More than 900 pixels are shown at half width.
-    """
-    if path is not None:
-        write_atomically(Path(path), recorder.encoded("GIF", beside=beside), b"GIF8")
-    # A PNG, since web pages made from a notebook drop GIFs; it is also a third smaller.
-    data = recorder.encoded("PNG", beside=beside)
-    return NotebookImage(data, format="png", retina=Image.open(io.BytesIO(data)).width > 900)

@@ -169,7 +169,7 @@ HIDDEN_M = 1.0
 """Depth [m] under their place at which bodies wait that are in pictures only, out of the range of
 the robot's cameras."""
 
-_SCENERY = (
+SCENERY = (
     ((1.7, 1.7, 0.05), (0.0, 0.0, _FLOOR_M - 0.05), (0.86, 0.87, 0.88)),
     ((0.1, 0.1, -_FLOOR_M / 2), (BASE_X_M, 0.0, _FLOOR_M / 2), (0.35, 0.37, 0.40)),
     *(
@@ -184,7 +184,7 @@ _SCENERY = (
 def add_scenery(client: BulletClient) -> list[int]:
     """Add hidden bodies on which arm and table stand in pictures; return their ids."""
     bodies = []
-    for half, (x, y, z), rgb in _SCENERY:
+    for half, (x, y, z), rgb in SCENERY:
         box = {"shapeType": pybullet.GEOM_BOX, "halfExtents": half, "rgbaColor": (*rgb, 1)}
         shape, at = client.createVisualShape(**box), (x, y, z - HIDDEN_M)
         bodies.append(client.createMultiBody(baseVisualShapeIndex=shape, basePosition=at))

@@ -9,6 +9,7 @@ import re
 import shutil
 from pathlib import Path
 
+import k3d
 from docutils import nodes
 from latex2mathml.converter import convert
 from myst_parser.slugs import github_slugify
@@ -82,8 +83,25 @@ def write_math(self, node) -> None:
     raise nodes.SkipNode
 
 
+def add_robot(app, page: str, template: str, context: dict, doctree) -> None:
+    """Give a page that shows the robot in 3-D the script that draws it."""
+    if "CreateK3DAndLoadBinarySnapshot" in context.get("body", ""):
+        app.add_js_file(None, body="globalThis.define = (n, d, make) => (globalThis.k3d = make());")
+        app.add_js_file("robot.js", priority=600)
+
+
+def copy_robot(app) -> None:
+    """Copy the script from the installed package, by a name that k3d does not look for."""
+    script = Path(k3d.__file__).parent / "static" / "standalone.js"
+    folder = Path(app.outdir, "_static")
+    folder.mkdir(parents=True, exist_ok=True)
+    shutil.copy(script, folder / "robot.js")
+
+
 def setup(app) -> None:
     """Register the above; when all is written, the first page is copied to index.html."""
+    app.connect("builder-inited", copy_robot)
+    app.connect("html-page-context", add_robot)
     app.connect("source-read", prepare)
     app.add_html_math_renderer("mathml", (write_math, None), (write_math, None))
     first, index = (Path(app.outdir, f"{name}.html") for name in (root_doc, "index"))

@@ -4,6 +4,7 @@ import math
 import re
 import time
 from dataclasses import replace
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -40,7 +41,7 @@ def make_picker(world, trained, planned_for):
         planners = options.pop("planners", {"A*": astar, "broken": broken})
         goal = options.pop("goal_xy_m", (0.12, 0.0))
         skills = skills or Skills({"push": trained})
-        picker = GoalPicker(world, skills, planners, goal, **options)
+        picker = GoalPicker(world, skills, planners, goal, **{"view": False, **options})
         if executor is not None:
             picker.executors["open loop"] = executor
         picker.pace_s = pace_s
@@ -177,6 +178,13 @@ def test_the_picker_shows_its_errors(picker):
     picker.controls.planner.value = "A*"
     assert in_time(picker).controls.words.value.count("Plan: ") == 1
     assert picker._view.scene["steps"]
+
+
+def test_no_text_is_shown_as_html(picker):
+    picker.controls.say("**<img src=x onerror=alert(1)>'\"</div><script>**")
+    words = picker.controls.words.value
+    assert set(re.findall(r"<\w+", words)) == {"<div", "<b"}
+    ElementTree.fromstring(words)  # one element, well formed
 
 
 def test_stop_lets_an_action_end_and_begins_no_other(make_picker, world):
@@ -330,9 +338,8 @@ def test_a_saved_picker_leaves_its_picture(picker):
     bundle, about = picker._repr_mimebundle_()
     picture = Image.open(io.BytesIO(base64.b64decode(bundle["image/png"])))
     assert picture.size[0] == 2 * about["image/png"]["width"]
-    before = picker.picture()
     picker.pick(-0.1, 0.05)
-    assert picker.picture() != before
+    assert picker._repr_mimebundle_()[0]["image/png"] != bundle["image/png"]
 
 
 @pytest.mark.parametrize(("executor", "within_deg"), [("open loop", 3.0), ("closed loop", 2.0)])
@@ -360,6 +367,24 @@ def test_turn_and_lift_are_planned_and_done(posed, world, executor, within_deg):
     assert (posed.plan.goal.turn_rad, posed.plan.goal.height_m) == (None, None)
     assert (posed.controls.turn.value, posed.controls.height.value) == (0.0, 0.0)
     assert world.object_state()[2] < 0.05  # released, to be observed and planned for
+
+
+def test_the_robot_is_shown_in_3d_as_it_moved(make_picker, world):
+    picker = make_picker(view=True)
+    picker.pick(0.1, 0.06)
+    picker.run()
+    scene, frames = picker.scene, np.array(picker.scene._frames)
+    assert scene.player.max == len(frames) - 1 > 100
+    np.testing.assert_allclose(frames[-1, -1, :3, 3], world.object_state()[:3], atol=1e-3)
+    assert np.ptp(frames[:, -1, :2, 3], axis=0).max() > 0.05  # the object
+    assert np.ptp(frames[:, 5, :3, 3], axis=0).min() > 0.02  # the wrist
+    tip = frames[:, 6, :3] @ (0, 0, 0.2, 1)  # between the fingers
+    assert np.linalg.norm(tip - frames[:, -1, :3, 3], axis=1).min() < 0.06
+    html = scene._repr_mimebundle_()["text/html"]
+    assert len(html) < 600_000
+    assert "<img alt=" in html
+    picker.start_over()
+    assert len(scene._frames) == 1
 
 
 def test_what_cannot_be_lifted_so_high_is_said_before_anything_moves(posed):

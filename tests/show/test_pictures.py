@@ -1,48 +1,16 @@
-import io
 import os
 import subprocess
 import sys
 
 import matplotlib.pyplot as plt
 import numpy as np
-import pytest
-from matplotlib.figure import Figure
 from PIL import Image
 
 from affordlib.planning import execute_plan, plan_astar
-from affordlib.primitives import Push
-from affordlib.show import (
-    FrameRecorder,
-    plot_footprint,
-    plot_outcome,
-    plot_table,
-    show_animation,
-)
+from affordlib.show import plot_footprint, plot_outcome, plot_table
 from affordlib.types import Goal
 from affordlib.world import Cuboid
 from tests.problems import problem_of
-
-
-def test_an_animation_shows_the_robot_move(world, tmp_path):
-    world.place(Cuboid(0.06, 0.05, 0.05))
-    animation = FrameRecorder(every=240, width=80, height=60)
-    with pytest.raises(RuntimeError, match="there are no frames"):
-        animation.encoded()
-    world.on_step = animation
-    try:
-        world.execute_primitive(Push(1.0))
-    finally:
-        world.on_step = None
-    assert len(animation.frames) == 5
-    assert np.abs(animation.frames[0].astype(int) - animation.frames[-1]).max() > 50
-    figure, _ = plt.subplots(figsize=(2, 2))
-    shown = show_animation(animation, tmp_path / "push.gif", beside=figure)
-    plt.close(figure)
-    for kind, picture in (("GIF", tmp_path / "push.gif"), ("PNG", io.BytesIO(shown.data))):
-        saved = Image.open(picture)
-        assert saved.format == kind
-        assert saved.n_frames >= 4
-        assert saved.size == (60 + 80, 60)
 
 
 def test_a_footprint_is_drawn_where_the_object_is(world, trained):
@@ -57,13 +25,6 @@ def test_a_footprint_is_drawn_where_the_object_is(world, trained):
     )
     assert "mm from the goal" in plot_outcome(ax, outcome).get_title(loc="left")
     plt.close(figure)
-
-
-def test_all_frames_of_an_animation_have_one_size():
-    animation = FrameRecorder(width=320, height=240)
-    animation.add(Figure(figsize=(4, 3)))
-    with pytest.raises(ValueError, match="480×240 pixels, the others have 320×240"):
-        animation.add(Figure(figsize=(6, 3)))
 
 
 def test_the_configuration_of_a_reader_changes_no_figure(tmp_path):

@@ -1,0 +1,205 @@
+"""The robot in 3-D, to turn and zoom: arm, hand, object, goal, prediction and obstacles, by k3d.
+
+A scene records its world's motion, and plays it: play, pause, scrub, slow motion. Without a kernel,
+a page does so by k3d's script, which `make html` takes from the environment.
+"""
+
+import base64
+import io
+import itertools
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import ipywidgets as widgets
+import numpy as np
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from affordlib.show.plots import GOAL, PREDICTION, TRUTH
+from affordlib.types import TABLE_X_M, TABLE_Y_M, Goal, Plan, check_count
+from affordlib.world import BASE_X_M, LyingCylinder, Sphere, Tabletop, TabletopObject
+from affordlib.world.camera import SCENERY
+from affordlib.world.objects import mesh
+from affordlib.world.trajectory import STEP_S
+
+EVERY = 8
+"""Simulation steps (1/240 s) between two recorded poses."""
+
+CAMERA = (0.72, -0.78, 0.52, -0.2, 0.02, 0.19, 0.0, 0.0, 1.0)
+"""Where the camera stands, what it looks at [m], and what is upwards."""
+
+_WOOD, _STONE = "#ede6d9", "#8c735f"
+_STL = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+_SCRIPT = Path(__file__).with_name("scene.js")
+
+
+class Scene(widgets.VBox):
+    """A view of a world and its object, drawn by k3d, `height` pixels high, with a time line.
+
+    As the world's `on_step` it records the motion; `play` shows what was recorded since `place`, in
+    real time. Call `place` when there is another object.
+    """
+
+    def __init__(self, world: Tabletop, height: int = 400) -> None:
+        import k3d  # a quarter of a second that only a scene needs
+
+        self.world, self._mesh = world, k3d.mesh
+        check_count("height", height, 100, 2000)
+        self.plot = k3d.plot(
+            height=height, grid_visible=False, camera_auto_fit=False, menu_visibility=False
+        )
+        self.plot.background_color, self.plot.camera = 0xF4F6F8, list(CAMERA)
+        self.plot.axes_helper, self.plot.lighting = 0.0, 1.8
+        table = [(x, y) for x in TABLE_X_M for y in TABLE_Y_M]
+        self._add(_between(np.array(table), -0.1, 0.0), _WOOD)
+        for half, at, rgb in SCENERY:
+            self._add(_box(2 * np.array(half)), _hex(rgb), _matrix(at, 0.0))
+        base, *links = _arm(world)
+        self._add(*base, _matrix((BASE_X_M, 0.0, 0.0), 0.0))
+        self._links = [self._add(*link) for link in links]
+        self._object: Any | None = None
+        self._marks: list[Any] = []
+        self.player = widgets.Play(interval=round(1000 * EVERY * STEP_S), max=0)
+        time = widgets.IntSlider(max=0, readout=False, layout={"flex": "1"})
+        speed = widgets.Dropdown(options={"1×": 1, "½×": 2, "¼×": 4}, layout={"width": "5em"})
+        for name in ("value", "max"):
+            widgets.jslink((self.player, name), (time, name))
+        widgets.jslink((self.player, "value"), (self.plot, "time"))
+        interval = self.player.interval
+        speed.observe(lambda c: setattr(self.player, "interval", interval * c["new"]), "value")
+        self.place()
+        below = widgets.HBox([self.player, time, speed])
+        super().__init__([self.plot, below], layout={"flex": "1 1 420px", "max_width": "700px"})
+
+    def place(self) -> None:
+        """Show the world's present object and obstacles, and forget what was recorded."""
+        if self._object is not None:
+            self.plot -= self._object
+        self._object = self._add(_solid(self.world.obj), TRUTH)
+        self._frames: list[np.ndarray] = [self._poses()]
+        self._steps = 0
+        self.mark()
+        self.play(0, playing=False)
+
+    def mark(self, goal: Goal | None = None, plan: Plan | None = None) -> None:
+        """Show obstacles, and goal and predicted final pose of a plan, in place of earlier ones."""
+        for old in self._marks:
+            self.plot -= old
+        obj, self._marks = self.world.obj, []
+        for one in self.world.obstacles.all:
+            corners = np.array(one.corners_m)
+            if one.radius_m:
+                corners = corners + _circle(one.radius_m)
+            self._marks.append(self._add(_between(corners, 0.0, one.height_m), _STONE))
+        start = yaw = self.world.object_pose()[2]
+        if plan is not None and plan.steps:
+            yaw += plan.steps[-1].predicted_turn_rad
+            at = (*plan.predicted_end_xy_m, obj.height_m / 2)
+            ghost = self._add(_solid(obj), PREDICTION, _matrix(at, yaw), opacity=0.4)
+            self._marks.append(ghost)
+        if goal is not None:
+            yaw = yaw if goal.turn_rad is None else start + goal.turn_rad
+            sheet = _between(1.3 * obj.footprint_m, 0.0, 0.003)
+            at = *goal.xy_m, goal.height_m or 0.0
+            self._marks.append(self._add(sheet, GOAL, _matrix(at, yaw)))
+
+    def __call__(self, world: Tabletop) -> None:
+        """Record the world's present poses, every few steps."""
+        self._steps += 1
+        if self._steps % EVERY == 0:
+            self._frames.append(self._poses())
+
+    def play(self, first: int = 0, playing: bool = True) -> int:
+        """Play what was recorded from a frame on, if there is any; return the number of frames."""
+        if first == len(self._frames):
+            return first
+        for k, part in enumerate([*self._links, self._object]):
+            part.model_matrix = {str(t): frame[k] for t, frame in enumerate(self._frames)}
+        self.player.max = len(self._frames) - 1
+        self.player.value = first
+        self.player.playing = playing
+        return len(self._frames)
+
+    def _poses(self) -> np.ndarray:
+        """Where the arm's parts and the object are (n, 4, 4), as float32."""
+        client, robot = self.world.client, self.world.arm.robot
+        states = client.getLinkStates(robot, list(range(len(self._links))))
+        poses = [(state[4], state[5]) for state in states]
+        state = self.world.object_state()
+        return np.array([_matrix(*pose) for pose in [*poses, (state[:3], state[3:])]])
+
+    def _add(self, points: Any, color: str, at: Any = None, opacity: float = 1.0) -> Any:
+        """Add a body: the convex hull of points (n, 3), or triangles (n, 3, 3)."""
+        points = np.asarray(points, dtype=float)
+        if points.ndim == 2:
+            points = np.array(mesh([points])["vertices"]).reshape(-1, 3, 3)
+        corners, indices = np.unique(points.reshape(-1, 3), axis=0, return_inverse=True)
+        at = np.eye(4, dtype=np.float32) if at is None else at
+        options = {"color": int(color[1:], 16), "opacity": opacity, "model_matrix": at}
+        body = self._mesh(np.float32(corners), np.uint32(indices).reshape(-1, 3), **options)
+        self.plot += body
+        return body
+
+    def _repr_mimebundle_(self, **kwargs: object) -> Any:
+        """The view, and for a page without a kernel what was recorded, drawn by k3d's script."""
+        bundle = super()._repr_mimebundle_(**kwargs)
+        data = base64.b64encode(self.plot.get_binary_snapshot()).decode()
+        asked = json.dumps({"frames": len(self._frames), "height": self.plot.height})
+        script = f"{_SCRIPT.read_text()}(document.currentScript.parentElement, {asked}, '{data}')"
+        picture = io.BytesIO()
+        Image.fromarray(self.world.picture(640, 400)).save(picture, "jpeg", quality=85)
+        still = base64.b64encode(picture.getvalue()).decode()
+        image = f'<img alt="The robot and its table" src="data:image/jpeg;base64,{still}">'
+        html = f"<div>{image}<script>{script}</script></div>"
+        return bundle | {"text/html": html, "text/plain": type(self).__name__}
+
+
+def _matrix(xyz: Any, turn: Any) -> np.ndarray:
+    """A pose (4, 4) from a position and a quaternion or a yaw."""
+    made = np.eye(4, dtype=np.float32)
+    still = np.ndim(turn) == 0
+    made[:3, :3] = (
+        Rotation.from_euler("z", turn) if still else Rotation.from_quat(turn)
+    ).as_matrix()
+    made[:3, 3] = xyz
+    return made
+
+
+def _arm(world: Tabletop) -> Iterator[tuple[np.ndarray, str]]:
+    """Points or triangles of the arm's base and of each link, and their colours."""
+    for _, _, _, size, file, at, _, rgba in world.client.getVisualShapeData(world.arm.robot):
+        if file:
+            yield np.frombuffer(Path(file.decode()).read_bytes()[84:], _STL)["corners"], _hex(rgba)
+        else:
+            yield _box(size) + at, _hex(rgba)
+
+
+def _hex(rgb: Sequence[float]) -> str:
+    return "#" + "".join(f"{round(255 * share):02x}" for share in rgb[:3])
+
+
+def _box(size_m: Sequence[float]) -> np.ndarray:
+    return np.array(list(itertools.product((-0.5, 0.5), repeat=3))) * size_m
+
+
+def _circle(radius_m: float, n: int = 48) -> np.ndarray:
+    angle = np.linspace(0, 2 * np.pi, n, endpoint=False)
+    return radius_m * np.column_stack([np.cos(angle), np.sin(angle)])
+
+
+def _between(outline: np.ndarray, low_m: float, high_m: float) -> np.ndarray:
+    """Corners (2n, 3) of what stands between two heights over an outline (n, 2)."""
+    return np.vstack([np.insert(outline, 2, z, axis=1) for z in (low_m, high_m)])
+
+
+def _solid(obj: TabletopObject) -> np.ndarray:
+    """Points (n, 3) whose convex hull is the object, around its centre."""
+    half = obj.height_m / 2
+    if isinstance(obj, Sphere):
+        levels = half * np.cos(np.linspace(0, np.pi, 17))
+        return np.vstack([_between(_circle(np.sqrt(half**2 - z**2)), z, z)[:48] for z in levels])
+    if isinstance(obj, LyingCylinder):
+        return _between(_circle(half), -obj.length / 2, obj.length / 2)[:, [2, 0, 1]]
+    return _between(obj.footprint_m, -half, half)
