@@ -187,7 +187,7 @@ class Observation:
     xy_m: estimated position (x, y) [m] in the table's frame; image: (2, 48, 48), depth [m] from a
     plane 1 m above the table and the object's mask, centred at xy_m to within a few millimetres;
     yaw_rad: the object's yaw [rad], if the robot can estimate it; yaw_std_rad: its σ [rad], None if
-    the yaw was not seen but dead-reckoned; std_m: σ of the position [m].
+    the yaw was not seen but dead-reckoned; std_m: σ of the position [m]; obstacles: where they are.
     """
 
     xy_m: tuple[float, float]
@@ -195,6 +195,7 @@ class Observation:
     yaw_rad: float | None = None
     yaw_std_rad: float | None = None
     std_m: float = 0.0
+    obstacles: tuple[Obstacle, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -74,11 +74,15 @@ def plan_cem(problem: PlanningProblem, seed: int = 0) -> Plan:
         drawn[..., 1] = drawn[..., 1].clip(effects.kind.acts_from, 1) if mode.partial else 1.0
         chains = torch.from_numpy(drawn)
         cost, _ = continuous.objective(effects, torch.from_numpy(goal), chains.unbind(-1))
+        if problem.obstacles:  # those that are not free are taken only where there are no others
+            cost = cost + 1.0 * ~continuous.free(problem, chains.unbind(-1))
         order = cost.argsort()[:N_ELITE]
         elite = drawn[order]
         mean, std = elite.mean(axis=0), elite.std(axis=0)
         if cost[order[0]] < least:
             best, least = chains[order[0]], float(cost[order[0]])
+    if problem.obstacles and least > 1.0:
+        return problem.plan_of((), "cem", False, began)
     positions, _, _ = roll_out(effects, *best.T[:, None])
     moved = positions[0].diff(dim=0, prepend=torch.zeros(1, 2)).norm(dim=-1)
     steps = make_steps(effects, problem.start_xy_m, best[moved > MOVES_M])

@@ -128,6 +128,10 @@ def search(
         rows = rows[problem.table.holds(places[rows], effects.radius_m)]
         here = np.broadcast_to((x, y), (len(rows), 2))
         rows = rows[problem.reachable(here, direction[rows])]
+        if problem.obstacles and len(rows):
+            begins = np.broadcast_to((x, y, turned), (len(rows), 3))
+            actions = map(torch.from_numpy, (direction[rows], stop_phase[rows]))
+            rows = rows[problem.spare_m(begins, *actions) >= 0]
         if trace is not None:
             trace.append((np.array((x, y)), places[rows]))
         if depth == max_steps and len(rows):

@@ -1,8 +1,8 @@
 """Execution of plans, open or closed loop, on anything that implements `Robot`.
 
 `execute_plan` executes a plan without observing. `run_closed_loop` observes after every action
-(Section 3.4 of the paper): is the object where it was predicted to be, has the goal changed, has
-the object fallen? If so, it plans again from a new image. Rotation is estimated from two images,
+(Section 3.4 of the paper): is the object where it was predicted to be, has it fallen, have goal or
+obstacles moved? If so, it plans again from a new image. Rotation is estimated from two images,
 height from the hand; what neither shows is computed from the executed actions (dead reckoning).
 """
 
@@ -18,6 +18,7 @@ import numpy as np
 from affordlib.geometry import wrap_angle
 from affordlib.perception import adapt_to_object, looks_fallen, turn_between
 from affordlib.planning.continuous import plan_continuous
+from affordlib.planning.free_space import FreeSpace
 from affordlib.planning.grasp_rotate import released_yaw
 from affordlib.planning.move_planner import Ending, MovePlanner
 from affordlib.planning.problem import PlanMode, Planner
@@ -245,6 +246,7 @@ class _ClosedLoop:
             off_m, fell = self._surprise(seen)
         was_displaced = off_m > displaced_m
         self.disturbed = was_displaced or fell
+        obstacle_moved = seen.obstacles != self.seen.obstacles
         self.seen = self._with_yaw(seen, fell, was_displaced)
         self.seen_xy_m.append(seen.xy_m)
         if not (seen.image[1].any() and self.skills.table.holds(np.array([seen.xy_m]))[0]):
@@ -255,7 +257,7 @@ class _ClosedLoop:
             self.renewals -= not goal_moved
             self.turn_allowed &= not goal_moved  # a new goal may need a full rotation again
             self.limit = max(self.limit, len(self.steps) + self._limit_from(seen.xy_m))
-        if off_m > self.config.surprise_m or goal_moved or fell:
+        if off_m > self.config.surprise_m or goal_moved or fell or obstacle_moved:
             self.queue = []
         return None
 
@@ -374,12 +376,14 @@ class _ClosedLoop:
 
     def _plan_pose(self, part: str) -> Plan | Ending:
         """Plan the next rotation, or the lift, with a yaw of the hand that the arm can reach."""
-        began, (x, y) = time.perf_counter(), self.seen.xy_m
+        began, (x, y), obstacles = time.perf_counter(), self.seen.xy_m, self.seen.obstacles
         error, refused = self._errors()[part], set()
+        space = FreeSpace(obstacles, self.seen.image, (x, y)) if obstacles else None
 
         def can_act(step):
             primitive = adapt_to_object(step.primitive, self.seen.image)
             can = self.robot.can_reach(primitive, step.stop_phase, self.seen.xy_m)
+            can &= space is None or space.is_free(step)
             if not can:
                 self.moves.vetoes += 1
                 refused.add(primitive.name)
@@ -396,6 +400,7 @@ class _ClosedLoop:
         why = "no action is predicted to have this effect"
         if refused:
             why = f"the arm cannot {' or '.join(sorted(refused))} at ({x:.3f}, {y:.3f}) m"
+            why += " beside the obstacles" * bool(obstacles)
         return Ending("unreachable", f"the {part}, with {error.text} left: {why}")
 
     def _grip_yaw(self) -> float | None:

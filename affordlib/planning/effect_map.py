@@ -24,7 +24,7 @@ from torch import Tensor
 from affordlib.geometry import rotate, xy_columns
 from affordlib.models.base import EffectModel, EffectNetwork, condition_on_primitives
 from affordlib.models.push_frame import rotate_prediction
-from affordlib.perception import radius_m
+from affordlib.perception import outline_of, radius_m
 from affordlib.primitives import Move, Push
 from affordlib.types import (
     CROP_WIDTH_M,
@@ -87,6 +87,11 @@ class EffectMap:
     def radius_m(self) -> float:
         """Largest distance [m] of the object's outline from the image's centre."""
         return radius_m(self.image)
+
+    @cached_property
+    def outline_m(self) -> np.ndarray:
+        """Corners (k, 2) [m] of the object's convex outline, from the image's centre."""
+        return outline_of(self.image)
 
     @cached_property
     def grid(self) -> tuple[Tensor, Tensor]:

@@ -23,6 +23,7 @@ from affordlib.geometry import xy_columns
 from affordlib.models.base import condition_on_final_effect
 from affordlib.models.domain import OutOfRangeWarning
 from affordlib.planning.effect_map import EffectMap
+from affordlib.planning.free_space import N_POSES
 from affordlib.planning.problem import PlanningProblem
 from affordlib.primitives import Drag
 from affordlib.types import Plan, Step, check_choice, check_count
@@ -153,9 +154,16 @@ def _step(
     nearer = stop > 0 and away[stop] < problem.goal.distance_m(here) - NEARER_M
     if not (nearer and problem.reachable(here[None], np.array([angle]))[0]):
         return None
+    turns = np.full(samples, turned)
     if "yaw" in channels:
-        turned += float(found.effect_mean[0, stop, channels.index("yaw")])
+        turns += found.effect_mean[0, :, channels.index("yaw")].double().numpy()
+    if problem.obstacles:
+        shown = np.linspace(0, stop, N_POSES).round().astype(int)
+        poses = np.column_stack([path, turns])[None, shown]
+        kind, at = effects.kind.towards(angle), np.array([t[stop].item()])
+        if problem.free_space.spare_m(kind, np.array([angle]), at, poses)[0] < 0:
+            return None
     decoded = None if effects.kind is Drag else action[: stop + 1]
     std_m = float(found.effect_std[0, stop, xy_columns(channels)].norm())
     primitive, end = effects.kind.towards(angle), tuple(path[stop].tolist())
-    return Step(primitive, float(t[stop]), end, path[: stop + 1], decoded, std_m, turned)
+    return Step(primitive, float(t[stop]), end, path[: stop + 1], decoded, std_m, turns[stop])

@@ -16,7 +16,7 @@ from affordlib.planning.robot import Robot
 from affordlib.planning.routes import Feasible, find_route
 from affordlib.planning.skills import Skills
 from affordlib.primitives import Drag, Move, Primitive
-from affordlib.types import Goal, Observation, Plan
+from affordlib.types import Goal, Observation, Obstacle, Plan
 
 Point = tuple[float, float]
 
@@ -53,6 +53,7 @@ class MovePlanner:
         self.max_plans, self.max_routes = max_plans, max_routes
         self.vetoes = 0
         self._goal_xy_m, self._ends_m = (0.0, 0.0), [math.inf]  # of the current goal and its plans
+        self._obstacles: tuple[Obstacle, ...] = ()
         self._refused: list[tuple[str, np.ndarray, float]] = []
         self._blocked: dict[type[Primitive], set[tuple[int, int]]] = defaultdict(set)
 
@@ -71,20 +72,28 @@ class MovePlanner:
 
     def _plan(self, seen: Observation, goal: Goal, kind: type[Move] | None = None) -> Plan | Ending:
         effects = self.skills.effects(seen.image, kind)
+        self._obstacles, distance_m = seen.obstacles, goal.distance_m(seen.xy_m)
         try:
-            self.skills.table.check("goal xy_m", goal.xy_m, effects.radius_m)
+            self._whole = self._problem(effects, seen.xy_m, goal)
         except ValueError as error:
             return Ending("unreachable", f"the position: {error}")
-        distance_m = goal.distance_m(seen.xy_m)
         plan, self._goal_xy_m, self._ends_m = None, goal.xy_m, [distance_m]
         if distance_m <= self.mode.max_steps * effects.reach_m:
             plan = self._plan_to(effects, seen.xy_m, goal, goal.tolerance_m)
         if plan is None:
             route = self._feasible_route(effects, seen.xy_m, goal.xy_m)
             if route is None:
-                at = "({:.3f}, {:.3f}) m".format(*goal.xy_m)
-                return Ending("unreachable", f"the position {at}: the arm cannot bring it there")
+                at, why = "({:.3f}, {:.3f}) m".format(*goal.xy_m), "the arm cannot bring it there"
+                why += " past the obstacles" * bool(seen.obstacles)
+                return Ending("unreachable", f"the position {at}: {why}")
             plan = self._plan_along(effects, seen.xy_m, goal, route)
+        if not plan and seen.obstacles:
+            best_mm = 1000 * min(self._ends_m)
+            return Ending(
+                "unreachable",
+                f"the position: no plan is found that the arm can follow past the obstacles; the "
+                f"best ends {best_mm:.1f} mm from the goal",
+            )
         return plan or Ending(
             "gave_up",
             f"{1000 * distance_m:.1f} mm from the goal, the planner finds no plan that the arm can "
@@ -119,10 +128,7 @@ class MovePlanner:
     ) -> Plan | None:
         """A plan that ends within a distance of a goal and passes the kinematic check."""
         for _ in range(self.max_plans):
-            allowed, table = self._allowed(effects.kind), self.skills.table
-            plan = self.planner(
-                PlanningProblem(start, goal, effects, self.mode, allowed, table=table)
-            )
+            plan = self.planner(self._problem(effects, start, goal))
             self._ends_m.append(math.dist(plan.predicted_end_xy_m, self._goal_xy_m))
             if not plan.steps or plan.predicted_distance_m > within_m:
                 return None
@@ -131,6 +137,11 @@ class MovePlanner:
             if self._first_refused((s.primitive, s.stop_phase, at) for s, at in moves) is None:
                 return plan
         return None
+
+    def _problem(self, effects: EffectMap, start: Point, goal: Goal) -> PlanningProblem:
+        allowed = self._allowed(effects.kind)
+        more = {"table": self.skills.table, "obstacles": self._obstacles}
+        return PlanningProblem(start, goal, effects, self.mode, allowed, **more)
 
     def _feasible_route(
         self, effects: EffectMap, start: Point, goal_xy_m: Point
@@ -152,6 +163,14 @@ class MovePlanner:
     def _route(self, effects: EffectMap, start: Point, goal_xy_m: Point) -> list[Point] | None:
         kind = effects.kind
         routes, allowed = self.skills.routes(kind), self._allowed(kind)
+        if self._obstacles:
+            arm_can, space, action = allowed, self._whole.free_space, kind.towards(0.0)
+
+            def allowed(xy_m, direction_rad, length_m):
+                free = space.is_free_line(action, xy_m, direction_rad, length_m)
+                return free & arm_can(xy_m, direction_rad)
+
+            routes = routes.only(allowed)
         return find_route(routes, start, goal_xy_m, allowed, self._blocked[kind], effects.radius_m)
 
     def _allowed(self, kind: type[Primitive]) -> Feasible:

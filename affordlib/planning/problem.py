@@ -3,14 +3,19 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+import torch
 
 from affordlib.planning.effect_map import EffectMap
+from affordlib.planning.free_space import N_POSES, FreeSpace
+from affordlib.planning.rollout import poses_along
 from affordlib.types import (
     TABLE_X_M,
     TABLE_Y_M,
     Goal,
+    Obstacle,
     Plan,
     Step,
     check_choice,
@@ -89,7 +94,8 @@ class PlanningProblem:
     mode: a `PlanMode`, or its name in `MODES`. reachable: function of positions (n, 2) and
     directions (n,): whether the arm can act there (default: everywhere). pose_planner: plans the
     final rotation and lift, without which a plan cannot reach a goal that requires them. table: on
-    which the object has to stay. Raises ValueError where it would extend beyond the rim.
+    which the object has to stay; obstacles: which neither object nor hand may touch. Raises
+    ValueError where the object would extend beyond the rim, or an obstacle lies on it or its goal.
     """
 
     start_xy_m: tuple[float, float]
@@ -99,12 +105,35 @@ class PlanningProblem:
     reachable: Reachable = everywhere
     pose_planner: Callable[..., tuple[Step, ...] | None] | None = None
     table: Table = OUR_TABLE
+    obstacles: tuple[Obstacle, ...] = ()
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "obstacles", tuple(self.obstacles))
         object.__setattr__(self, "start_xy_m", check_pair("start_xy_m", self.start_xy_m))
         self.table.check("start_xy_m", self.start_xy_m)
         object.__setattr__(self, "mode", PlanMode.of(self.mode))
         self.table.check("goal xy_m", self.goal.xy_m, self.effects.radius_m)
+        if self.obstacles:
+            self.free_space.check(self.goal.xy_m, self.table.holds)
+
+    @cached_property
+    def free_space(self) -> FreeSpace:
+        """The free-space check for the obstacles and the object."""
+        effects = self.effects
+        return FreeSpace(self.obstacles, effects.image, self.start_xy_m, effects.outline_m)
+
+    def spare_m(
+        self, begins: np.ndarray, direction_rad: torch.Tensor, phase: torch.Tensor
+    ) -> np.ndarray:
+        """Gap minus margin [m] (n,) of actions to the obstacles; negative where they are not free.
+
+        begins: (n, 3), x, y [m] and turn [rad] before them; direction_rad, phase: (n,).
+        """
+        if not self.obstacles:
+            return np.full(len(begins), np.inf)
+        poses = poses_along(self.effects, begins, direction_rad, phase, N_POSES)
+        angle, stop = direction_rad.numpy(), phase.numpy()
+        return self.free_space.spare_m(self.effects.kind.towards(0.0), angle, stop, poses)
 
     def plan_of(
         self, steps: tuple[Step, ...], planner: str, reaches_goal: bool, began_s: float

@@ -53,6 +53,21 @@ def roll_out(
     return positions, turns, variances
 
 
+def poses_along(
+    effects: EffectMap, begins: np.ndarray, direction_rad: Tensor, phase: Tensor, n_poses: int
+) -> np.ndarray:
+    """Poses (n, n_poses, 3) of the object during actions, from begins (n, 3): x, y [m], turn [rad].
+
+    direction_rad, phase: (n,).
+    """
+    first = effects.kind.acts_from
+    phases = first + (phase - first).clamp_min(0)[:, None] * torch.linspace(0, 1, n_poses)
+    begins = torch.tensor(begins)
+    effect = effects((direction_rad - begins[:, 2])[:, None].expand(phases.shape), phases)[0]
+    moved = rotate(effect[..., :2], direction_rad[:, None])
+    return (begins[:, None] + torch.cat([moved, effect[..., 2:]], dim=-1)).numpy()
+
+
 def make_steps(
     effects: EffectMap,
     start_xy_m: Sequence[float],

@@ -7,7 +7,7 @@ this for all places at once; the planner then goes from waypoint to waypoint.
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -53,6 +53,14 @@ class RouteMap:
         angle, length_m = np.arctan2(moves[:, 1], moves[:, 0])[move], length_m[move]
         ok = feasible(places[origin], angle, length_m)
         return cls(reach_m, table, places, origin[ok], end[ok], length_m[ok])
+
+    def only(self, feasible: Feasible) -> Self:
+        """Return the map of those moves that are feasible."""
+        way = self.places_xy_m[self.end] - self.places_xy_m[self.origin]
+        angle = np.arctan2(way[:, 1], way[:, 0])
+        ok = feasible(self.places_xy_m[self.origin], angle, self.length_m)
+        left = {name: getattr(self, name)[ok] for name in ("origin", "end", "length_m")}
+        return replace(self, **left)
 
     def place_at(self, xy_m: Sequence[float]) -> int:
         """Index of the place that is nearest to a point (x, y) [m]."""

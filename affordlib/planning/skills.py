@@ -10,6 +10,7 @@ from affordlib.models.base import EffectModel
 from affordlib.models.checkpoint import load_checkpoint
 from affordlib.perception import looks_rollable
 from affordlib.planning.effect_map import EffectMap, checked_image
+from affordlib.planning.free_space import FreeSpace
 from affordlib.planning.grasp_rotate import PosePlanner
 from affordlib.planning.problem import (
     OUR_TABLE,
@@ -22,7 +23,7 @@ from affordlib.planning.problem import (
 from affordlib.planning.reachability import Reachability
 from affordlib.planning.routes import RouteMap
 from affordlib.primitives import Grasp, Move, Primitive, Rotate, move_for, primitive_named
-from affordlib.types import Goal, Step, check_field
+from affordlib.types import Goal, Obstacle, Step, check_field
 
 CHECKPOINTS = {
     "push": "film_5000",
@@ -81,14 +82,18 @@ class Skills:
         start_xy_m: Sequence[float],
         goal: Goal,
         mode: str | PlanMode = "multi_partial",
+        obstacles: Sequence[Obstacle] = (),
     ) -> PlanningProblem:
         """Pose the problem of moving the object in an image (2, 48, 48) from (x, y) [m] to a goal.
 
-        The models' predictions are cached for the last image.
+        obstacles: not to be touched. The models' predictions are cached for the last image.
         """
         effects, poses = self._predictions(image)
-        reachable = self.reachable(effects.kind)
-        return PlanningProblem(start_xy_m, goal, effects, mode, reachable, poses, self.table)
+        if obstacles and poses:
+            space = FreeSpace(obstacles, image, start_xy_m, effects.outline_m)
+            poses = self.pose_planner(image, lambda s: self._can_act(s) and space.is_free(s))
+        more = self.reachable(effects.kind), poses, self.table, tuple(obstacles)
+        return PlanningProblem(start_xy_m, goal, effects, mode, *more)
 
     def effects(self, image: np.ndarray, kind: type[Move] | None = None) -> EffectMap:
         """Effect map of the object in an image (2, 48, 48); cached for the last image.

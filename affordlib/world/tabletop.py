@@ -9,6 +9,7 @@ import os
 import weakref
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -210,9 +211,10 @@ class Tabletop(AbstractContextManager):
         self.settle()
 
     def observe(self) -> Observation:
-        """Return the object's estimated position and its image; the arm must be parked."""
+        """Return the estimated position and image of the object; the arm must be parked."""
         xy_m, bias_m = np.array(self.object_pose()[:2]), self.config.bias_m
-        return CAMERAS[self.config.camera](self.client, xy_m, bias_m, self.noise)
+        seen = CAMERAS[self.config.camera](self.client, xy_m, bias_m, self.noise)
+        return replace(seen, obstacles=self.obstacles.all)
 
     def _observe_edge(self, lever: LeverUp) -> Observation:
         """Return the image (2, 128, 128) around a lever-up's contact, the lever pointing right."""

@@ -103,13 +103,14 @@ class PointRobot:
     velocity: tuple[float, float] = (0.0, 0.0)
     visible: bool = True
     height_m: float = 0.05
+    obstacles: tuple = ()
     executed: list = field(default_factory=list)
 
     def observe(self):
         self.before(self)
         if not self.visible:
             raise NothingSeenError("nothing is seen")
-        seen = Observation(self.xy_m, disc_image(self.height_m))
+        seen = Observation(self.xy_m, disc_image(self.height_m), obstacles=self.obstacles)
         return replace(seen, yaw_rad=self.yaw_rad, yaw_std_rad=0.001) if self.sees_yaw else seen
 
     def execute(self, step):

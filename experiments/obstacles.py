@@ -1,0 +1,514 @@
+"""A table with obstacles: what partial actions and each part of the free-space check are worth.
+
+Tasks are drawn with a seed, by an object's dimensions alone, before any planner runs. A task is
+*feasible* if a search finds a chain that has the simulator in place of the model, no margin, and
+four times as many chains as a planner. *Success*: at most 5 mm from the goal, and neither object
+nor arm has touched an obstacle, by the contact forces of every simulation step.
+
+    python -m experiments.obstacles --only row=continuous,continuous_full
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+
+from affordlib.interactions.recipes import Variation
+from affordlib.models import load_checkpoint
+from affordlib.planning import (
+    EffectMap,
+    PlanMode,
+    PlanningProblem,
+    Skills,
+    execute_plan,
+    plan_astar,
+    plan_continuous,
+    plan_gradient,
+)
+from affordlib.planning.continuous import free, starts
+from affordlib.planning.free_space import (
+    N_POSES,
+    FreeSpace,
+    corners_of,
+    gaps_m,
+    placed,
+    ring,
+)
+from affordlib.planning.rollout import poses_along, roll_out
+from affordlib.planning.skills import CHECKPOINTS
+from affordlib.primitives import Drag, Push
+from affordlib.types import Goal, Obstacle, UnreachableError
+from affordlib.world import Cuboid, Tabletop, TabletopObject, WorldConfig, category_named
+from experiments import runner
+from experiments.commands import command
+from experiments.field_baselines import plan_cem
+from experiments.oracle import oracle_effects
+from experiments.runner import FOLDER, Job, Rows, interval, plain
+
+NAME, SEED, VALIDATION_SEED = "obstacles", 40_001, 40_002
+FAMILIES = {"corridor": 30, "pocket": 30, "gate": 40, "bay": 20, "deep bay": 20, "clutter": 100}
+"""Tasks of each family; of the validation tasks there are a quarter."""
+
+MAX_STEPS, WITHIN_M, WALL_M = 4, 0.005, 0.02
+N_OBJECTS = 12
+"""Different objects, each with a yaw; tasks have them in turn."""
+
+CATEGORIES = "cuboid", "upright_cylinder", "bar", "sphere", "cuboid", "lying_cylinder"
+"""A bar is a cuboid of 8 × 4 cm, the longest within the sizes of the training objects."""
+
+N_SEARCHED = 4096
+"""Chains of each number of actions in the search with the simulator."""
+
+
+@dataclass(frozen=True)
+class ObstacleTask:
+    """An object at the origin with a yaw [rad], obstacles, and a goal to within 5 mm."""
+
+    family: str
+    number: int
+    obj: TabletopObject
+    yaw_rad: float
+    goal: Goal
+    obstacles: tuple[Obstacle, ...]
+
+
+def drawn_object(number: int) -> tuple[TabletopObject, float]:
+    """Draw an object and its yaw [rad]: in turn a cuboid, a cylinder, a bar, one that rolls."""
+    rng = np.random.default_rng([SEED, number])
+    category = CATEGORIES[number % len(CATEGORIES)]
+    obj = Cuboid(0.08, 0.04, 0.05) if category == "bar" else category_named(category).sample(rng)
+    return obj, float(rng.uniform(-math.pi, math.pi))
+
+
+def drawn_task(family: str, index: int, seed: int) -> ObstacleTask:
+    """Draw a task; those in narrow places have no objects that roll, as the open hand is wider."""
+    key = [seed, list(FAMILIES).index(family), index]
+    rng = np.random.default_rng(key)
+    while True:
+        number = int(rng.integers(N_OBJECTS))
+        obj, yaw = drawn_object(number)
+        if obj.rollable and family != "clutter":
+            continue
+        outline = placed(obj.footprint_m, np.array([0.0, 0.0, yaw]))
+        angle = rng.uniform(-math.pi, math.pi)
+        local = placed(outline, np.array([0.0, 0.0, -angle]))
+        goal, shapes = LAYOUTS[family](rng, local)
+        obstacles = tuple(_turned(shape, angle) for shape in shapes)
+        turned = placed(np.array([goal]), np.array([0.0, 0.0, angle]))[0]
+        task = ObstacleTask(
+            family, number, obj, yaw, Goal(tuple(turned.tolist()), WITHIN_M), obstacles
+        )
+        if _is_fair(task, outline):
+            return task
+
+
+def _turned(shape: tuple, angle_rad: float) -> Obstacle:
+    """An obstacle (x, y, length, width, yaw) or (x, y, radius) of a layout, turned with it."""
+    at = placed(np.array([shape[:2]]), np.array([0.0, 0.0, angle_rad]))[0]
+    at = tuple(at.tolist())
+    if len(shape) == 3:
+        return Obstacle.disc(at, shape[2])
+    return Obstacle.box(at, shape[2:4], shape[4] + angle_rad)
+
+
+def _is_fair(task: ObstacleTask, outline: np.ndarray) -> bool:
+    """Whether start and goal are free; in clutter, something must be near the straight way."""
+    polygons, goal = [corners_of(one) for one in task.obstacles], np.array(task.goal.xy_m)
+    here = np.zeros((1, 2, 3))
+    there = here + np.array([*goal, 0.0])
+    inner = ring(np.hypot(*outline.T).min())
+    narrow = task.family != "clutter"
+    free = gaps_m(polygons, placed(outline, here)).min() > (0.003 if narrow else 0.008)
+    free &= gaps_m(polygons, placed(inner if narrow else outline, there)).min() > 0.003
+    way = np.concatenate([here[:, :1], there[:, :1]], axis=1)
+    return bool(free and (narrow or gaps_m(polygons, placed(outline, way)).min() < 0.005))
+
+
+def _half_m(rng: np.random.Generator, local: np.ndarray) -> float:
+    """Half of the width between walls: of the object or the hand, and 6 to 14 mm."""
+    return max(float(np.abs(local[:, 1]).max()), 0.03) + rng.uniform(0.006, 0.014)
+
+
+def _corridor(rng: np.random.Generator, local: np.ndarray) -> tuple:
+    half, goal = _half_m(rng, local), (rng.uniform(0.03, 0.12), rng.uniform(-0.003, 0.003))
+    walls = [(0.03, s * (half + WALL_M / 2), 0.3, WALL_M, 0.0) for s in (-1, 1)]
+    return goal, walls
+
+
+def _pocket(rng: np.random.Generator, local: np.ndarray) -> tuple:
+    return _walled(rng, local, 0.0, rng.uniform(0.05, 0.08))
+
+
+def _bay(rng: np.random.Generator, local: np.ndarray) -> tuple:
+    return _walled(rng, local, rng.uniform(0.03, 0.08), rng.uniform(0.02, 0.04))
+
+
+def _deep_bay(rng: np.random.Generator, local: np.ndarray) -> tuple:
+    return _walled(rng, local, rng.uniform(0.10, 0.18), rng.uniform(0.05, 0.08))
+
+
+def _walled(rng: np.random.Generator, local: np.ndarray, before_m: float, deep_m: float) -> tuple:
+    """Two walls with a third behind them, before_m from the object; the goal is deep_m inside."""
+    half, radius = _half_m(rng, local), float(np.hypot(*local.T).max())
+    mouth = before_m + (radius + 0.01 if before_m else 0.0)
+    end = mouth + deep_m + radius + rng.uniform(0.006, 0.014)
+    aside = rng.uniform(-0.03, 0.03) if before_m else 0.0
+    walls = [
+        (*((mouth + end) / 2, aside + s * (half + WALL_M / 2)), end - mouth, WALL_M, 0.0)
+        for s in (-1, 1)
+    ]
+    back = end + WALL_M / 2, aside, WALL_M, 2 * half + 2 * WALL_M, 0.0
+    return (mouth + deep_m, aside), [*walls, back]
+
+
+def _gate(rng: np.random.Generator, local: np.ndarray) -> tuple:
+    half, far = _half_m(rng, local), float(np.hypot(*local.T).max())
+    x, y = far + rng.uniform(0.02, 0.06), rng.uniform(-0.04, 0.04)
+    walls = [(x, y + s * (half + 0.06), WALL_M, 0.12, 0.0) for s in (-1, 1)]
+    return (x + far + rng.uniform(0.01, 0.05), y + rng.uniform(-0.03, 0.03)), walls
+
+
+def _clutter(rng: np.random.Generator, local: np.ndarray) -> tuple:
+    goal, shapes = (rng.uniform(0.08, 0.18), 0.0), []
+    for _ in range(rng.integers(1, 6)):
+        at = rng.uniform(-0.08, goal[0] + 0.08), rng.uniform(-0.12, 0.12)
+        size = rng.uniform(0.02, 0.08, 2)
+        box = (*at, *size.tolist(), rng.uniform(0, math.pi))
+        shapes.append(box if rng.random() < 0.5 else (*at, size[0] / 2))
+    return goal, shapes
+
+
+LAYOUTS = {
+    "corridor": _corridor,
+    "pocket": _pocket,
+    "gate": _gate,
+    "bay": _bay,
+    "deep bay": _deep_bay,
+    "clutter": _clutter,
+}
+
+
+class WithoutMargin(FreeSpace):
+    """A free-space check that allows what just does not touch."""
+
+    def margin_m(self, xy_m):
+        """Return zeros (...) for positions (..., 2)."""
+        return np.zeros(xy_m.shape[:-1])
+
+
+@dataclass(frozen=True)
+class PartlyChecked(PlanningProblem):
+    """A problem of which only a part is checked.
+
+    check: "goal", the object's pose near the goal; "ends", its pose after each action, and the
+    hand; "line", the straight way between these poses, and the hand; "object", its whole way
+    without the hand; "exact", all without a margin.
+    """
+
+    check: str = "exact"
+
+    def spare_m(self, begins, direction_rad, phase):
+        """Return the gap of what is checked, minus the margin [m] (n,)."""
+        if not self.obstacles:
+            return np.full(len(begins), np.inf)
+        poses = poses_along(self.effects, begins, direction_rad, phase, N_POSES)
+        space, ends = self.free_space, poses[:, [-1, -1]]
+        action, angle = self.effects.kind.towards(0.0), direction_rad.numpy()
+        if self.check == "exact":
+            space = WithoutMargin(self.obstacles, space.image, self.start_xy_m, space.outline_m)
+            return space.spare_m(action, angle, phase.numpy(), poses)
+        if self.check == "line":
+            return space.spare_m(action, angle, phase.numpy(), poses[:, [0, -1]])
+        shown = poses if self.check == "object" else ends
+        spare = gaps_m(space.polygons, placed(space.outline_m, shown)).min(axis=1)
+        spare = spare - space.margin_m(poses[:, -1, :2])
+        if self.check == "goal":
+            away = np.linalg.norm(ends[:, 0, :2] - np.array(self.goal.xy_m), axis=-1)
+            return np.where(away < 0.02, spare, np.inf)
+        if self.check == "ends":  # the hand, with an object that is nowhere near
+            dot = 1e-4 * ring(1.0)
+            hand = FreeSpace(self.obstacles, space.image, self.start_xy_m, dot)
+            spare = np.minimum(spare, hand.spare_m(action, angle, phase.numpy(), poses))
+        return spare
+
+
+ROWS = {
+    "continuous": (plan_continuous, {}),
+    "continuous_full": (plan_continuous, {"partial": False}),
+    "astar": (plan_astar, {}),
+    "astar_full": (plan_astar, {"partial": False}),
+    "check_goal": (plan_continuous, {"check": "goal"}),
+    "check_ends": (plan_continuous, {"check": "ends"}),
+    "check_line": (plan_continuous, {"check": "line"}),
+    "check_object": (plan_continuous, {"check": "object"}),
+    "perturbed": (plan_continuous, {"world": "perturbed"}),
+    "perturbed_full": (plan_continuous, {"world": "perturbed", "partial": False}),
+    "cem": (plan_cem, {}),
+    "gradient": (plan_gradient, {}),
+}
+"""Planner of each row, and its settings: whether it may stop early, what is checked, the world."""
+
+
+@lru_cache(maxsize=2)
+def _skills(world: str) -> Skills:
+    skills = Skills.load()
+    if world == "perturbed":
+        push = load_checkpoint("film_5000_perturbed")[0]
+        skills = replace(skills, models=skills.models | {"push": push})
+    return skills
+
+
+@lru_cache(maxsize=1)
+def _tabletops() -> tuple[Tabletop, Tabletop]:
+    return Tabletop(), Tabletop()
+
+
+@lru_cache(maxsize=N_OBJECTS)
+def _oracle(number: int) -> EffectMap:
+    """The effect map by the simulator of an object."""
+    world, imagined = _tabletops()
+    obj, yaw = drawn_object(number)
+    world.place(obj, (0.0, 0.0), yaw)
+    return oracle_effects(imagined, world, world.depth_image())
+
+
+def find_feasible(family: str, index: int, seed: int) -> dict[str, Any]:
+    """Search for a chain with the simulator as the model; actions: the fewest that are enough."""
+    task = drawn_task(family, index, seed)
+    problem = PartlyChecked(
+        (0.0, 0.0), task.goal, _oracle(task.number), "multi_partial", obstacles=task.obstacles
+    )
+    found = {}
+    for partial in (True, False):
+        rng = np.random.default_rng(index)
+        posed = replace(problem, mode=PlanMode(MAX_STEPS, partial))
+        found["partial" if partial else "full"] = next(
+            (k for k in range(1, MAX_STEPS + 1) if _reaches(posed, k, rng)), None
+        )
+    return found
+
+
+def _reaches(problem: PlanningProblem, k: int, rng: np.random.Generator) -> bool:
+    """Whether any of `N_SEARCHED` chains of k actions is free and ends at the goal."""
+    target = torch.from_numpy(np.subtract(problem.goal.xy_m, problem.start_xy_m))
+    direction, phase = starts(problem, target, k, N_SEARCHED, rng)
+    if not len(direction):
+        return False
+    positions, _, _ = roll_out(problem.effects, direction, phase)
+    near = (positions[:, -1] - target).norm(dim=-1) <= WITHIN_M
+    return bool(near.any()) and bool(free(problem, (direction[near], phase[near])).any())
+
+
+def run_task(row: str, family: str, index: int, seed: int) -> dict[str, Any]:
+    """Plan and execute a task without observing; return what came of it."""
+    planner, settings = ROWS[row]
+    task, world = drawn_task(family, index, seed), _tabletops()[0]
+    where = settings.get("world", "clean")
+    rng = np.random.default_rng([seed, index])
+    config = Variation().sample(task.obj, rng) if where == "perturbed" else WorldConfig()
+    world.place(task.obj, (0.0, 0.0), task.yaw_rad, config=config, obstacles=task.obstacles)
+    if where == "perturbed":
+        world.settle(2.0)
+    seen = world.observe()
+    effects = _skills(where).effects(seen.image)
+    effects.spline  # noqa: B018 - computed before the time is taken, as by a loop that planned
+    mode = PlanMode(MAX_STEPS, settings.get("partial", True))
+    posed, more = PlanningProblem, {"obstacles": seen.obstacles}
+    if "check" in settings:
+        posed, more = PartlyChecked, more | {"check": settings["check"]}
+    began = time.perf_counter()
+    try:
+        plan = planner(posed(seen.xy_m, task.goal, effects, mode, **more))
+    except ValueError as error:
+        return {"planned": False, "why": str(error), "distance_m": math.hypot(*task.goal.xy_m)}
+    seconds, fault = time.perf_counter() - began, False
+    try:
+        execute_plan(world, plan)
+    except UnreachableError:
+        fault = True
+    x, y, _ = world.object_pose()
+    return {
+        "planned": plan.predicted_distance_m <= WITHIN_M,
+        "distance_m": task.goal.distance_m((x, y)),
+        "object_touched": any(what == "object" for _, what in world.obstacles.touched),
+        "arm_touched": any(what == "arm" for _, what in world.obstacles.touched),
+        "unreachable": fault,
+        "actions": len(plan.steps),
+        "plan_s": seconds,
+    }
+
+
+N_PUSHES, N_BESIDE = 20, 20
+"""Actions of a calibration job, and obstacles beside each of them."""
+
+
+def calibrate(kind: str, index: int) -> list[dict[str, float]]:
+    """Execute actions, and return by how much each comes nearer to obstacles than predicted.
+
+    The obstacles lie beside the object's predicted way, just without contact, and are not felt:
+    the gap to the recorded way, negative where it would touch, is the error. travel_m: predicted
+    distance of the object from its start, where it comes nearest.
+    """
+    world, found = _tabletops()[0], []
+    for k in range(N_PUSHES):
+        rng = np.random.default_rng([VALIDATION_SEED, index, k])
+        of_kind = (0, 1, 2) if kind == "push" else (3, 5)
+        number = int(rng.integers(1000)) * 6 + of_kind[k % len(of_kind)]
+        obj, yaw = drawn_object(number)
+        world.place(obj, (0.0, 0.0), yaw)
+        seen, angle = world.observe(), rng.uniform(-math.pi, math.pi)
+        effects = _skills("clean").effects(seen.image)
+        stop = rng.uniform(0.7, 1.0)
+        done = world.execute_primitive(effects.kind.towards(angle), stop, approach=True)
+        if done.fell or done.left_table or effects.kind is not (Push if kind == "push" else Drag):
+            continue
+        action = (torch.tensor([v], dtype=torch.float64) for v in (angle, stop))
+        poses = poses_along(effects, np.zeros((1, 3)), *action, N_POSES)
+        path = done.object_path[:, [0, 1, 3]][None]
+        for _ in range(N_BESIDE):
+            aim, away = poses[0, rng.integers(N_POSES), :2], rng.uniform(-math.pi, math.pi)
+            size = rng.uniform(0.02, 0.08, 2)
+            one = Obstacle.disc((0.0, 0.0), size[0] / 2)
+            if rng.random() < 0.5:
+                one = Obstacle.box((0.0, 0.0), tuple(size), rng.uniform(0, math.pi))
+            ahead = np.array([math.cos(away), math.sin(away)])
+            low, high = 0.0, 0.3
+            for _ in range(14):
+                middle = (low + high) / 2
+                polygon = corners_of(one) + aim + middle * ahead
+                gaps = gaps_m([polygon], placed(effects.outline_m, poses))[0]
+                low, high = (low, middle) if gaps.min() > 0 else (middle, high)
+            really = gaps_m([polygon], placed(obj.footprint_m, path)).min()
+            travel = float(np.hypot(*poses[0, gaps.argmin(), :2]))
+            found.append({"error_m": float(gaps.min() - really), "travel_m": travel})
+    return found
+
+
+def job(row: str, family: str = "", index: int = 0, seed: int = SEED) -> Job:
+    """Return the job of a row and a task; rows "feasible" and "margin" plan nothing."""
+    arguments = {"row": row, "family": family, "index": index, "seed": seed}
+    return Job(make, arguments, checkpoints=(*CHECKPOINTS.values(), "film_5000_perturbed"))
+
+
+def make(row: str, family: str, index: int, seed: int) -> Any:
+    """Make the result of a job."""
+    if row == "margin":
+        return calibrate(family, index)
+    if row == "feasible":
+        return find_feasible(family, index, seed)
+    return run_task(row, family, index, seed)
+
+
+def jobs_of(row: str, share: float = 1.0, seed: int = SEED) -> list[Job]:
+    """Return the jobs of a row, for a share of each family's tasks, one family after the other."""
+    n = {family: max(1, round(share * n)) for family, n in FAMILIES.items()}
+    return [job(row, family, k, seed) for family in n for k in range(n[family])]
+
+
+SHARE = 0.25
+"""Share of each family's tasks that are run; all rows have the same tasks."""
+
+JOBS = [
+    *(job("margin", kind, k) for kind, n in (("push", 3), ("drag", 1)) for k in range(n)),
+    *(one for row in ("feasible", *ROWS) for one in jobs_of(row, SHARE)),
+]
+
+
+def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
+    """Return the tables of all stored results."""
+    found = runner.read(NAME, job, folder)
+    errors = pd.DataFrame([e for a, r in found if a["row"] == "margin" for e in r])
+    records = pd.DataFrame([a | r for a, r in found if a["row"] in ROWS])
+    searched = ((a["family"], a["index"], r) for a, r in found if a["row"] == "feasible")
+    feasible = {(family, index): r for family, index, r in searched}
+    return {
+        "margin": margin_rows(errors),
+        "rows": rows_of(records, feasible),
+        "partial_and_full": paired_rows(records, feasible),
+    }
+
+
+def margin_rows(errors: pd.DataFrame) -> Rows:
+    """Return quantiles of the gap's error [m], by the predicted travel."""
+    spans = {"all": (0.0, 1.0), "under 2 mm": (0.0, 0.002), "over 2 cm": (0.02, 1.0)}
+    rows = []
+    for name, (low, high) in spans.items():
+        some = errors.error_m[(errors.travel_m >= low) & (errors.travel_m < high)]
+        rows.append({"travel": name, "n": len(some)})
+        rows[-1] |= {f"q{q}_m": float(some.quantile(q / 100)) for q in (50, 95, 99)}
+    return rows
+
+
+def judged(records: pd.DataFrame, feasible: dict) -> pd.DataFrame:
+    """Add success and contact to records, of which only those of feasible tasks are kept."""
+    keys = list(zip(records.family, records["index"], strict=True))
+    known = [key in feasible and any(feasible[key].values()) for key in keys]
+    left = records[known].fillna({"object_touched": False, "arm_touched": False})
+    contact = left.object_touched.astype(bool) | left.arm_touched.astype(bool)
+    return left.assign(contact=contact, success=(left.distance_m <= WITHIN_M) & ~contact)
+
+
+def rows_of(records: pd.DataFrame, feasible: dict) -> Rows:
+    """Return one row for each row of tasks and family, and all families together."""
+    rows, left = [], judged(records, feasible)
+    for row in ROWS:
+        of_row = left[left.row == row]
+        for family in (*FAMILIES, "all") if len(of_row) else ():
+            some = of_row[(of_row.family == family) | (family == "all")]
+            rows.append(
+                {
+                    "row": row,
+                    "family": family,
+                    "n": len(some),
+                    "success_percent": 100 * some.success.mean(),
+                    "contact_percent": 100 * some.contact.mean(),
+                    "planned_percent": 100 * some.planned.mean(),
+                    "distance_m_median": some.distance_m.median(),
+                    "actions_mean": some.actions.mean(),
+                    "plan_s_median": some.plan_s.median(),
+                    "plan_s_p95": some.plan_s.quantile(0.95),
+                }
+            )
+    return plain(rows)
+
+
+PAIRS = [(row, f"{row}_full") for row in ("continuous", "astar", "perturbed")]
+PAIRS += [("continuous", row) for row in ROWS if row.startswith("check")]
+
+
+def paired_rows(records: pd.DataFrame, feasible: dict) -> Rows:
+    """Return differences of success [%] on the same tasks, with their 95 % intervals."""
+    rows, left = [], judged(records, feasible)
+    for one, other in PAIRS:
+        both = left.pivot_table(index=["family", "index"], columns="row", values="success")
+        if not {one, other} <= {*both.columns}:
+            continue
+        both = both[[one, other]].dropna().astype(float)
+        for family in (*FAMILIES, "all"):
+            some = both if family == "all" else both[both.index.get_level_values(0) == family]
+            if len(some):
+                off = 100 * (some[one] - some[other])
+                mean, low, high = interval(off) if off.nunique() > 1 else [off.iloc[0]] * 3
+                rows.append({"row": one, "other": other, "family": family, "n": len(some)})
+                rows[-1] |= {"difference_percent": mean, "low": low, "high": high}
+    return plain(rows)
+
+
+@command(OSError, ValueError)
+def main(argv: Sequence[str] | None = None) -> int:
+    """Plan and execute missing tasks, and write the tables."""
+    return runner.make(JOBS, NAME, runner.parser(NAME, main.__doc__).parse_args(argv), tables)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
