@@ -228,13 +228,13 @@ def test_an_obstacle_that_moves_makes_the_loop_plan_again():
     assert not any(Path(corners_of(wall[0])).contains_points(path).any() for path in paths)
 
 
-def test_of_what_is_predicted_to_pass_little_touches(world, film):
+def test_of_what_is_predicted_to_pass_little_touches(world, skills):
     """Executed pushes beside an obstacle at the margin: a sample of `experiments.obstacles`."""
     rng, touched, n = np.random.default_rng(8), 0, 0
     for _ in range(12):
         obj = Cuboid.sample(rng)
         world.place(obj, (0.0, 0.0), rng.uniform(-3, 3))
-        effects = EffectMap(film, world.depth_image())
+        effects = EffectMap(skills.model(Push), world.depth_image())
         angle = rng.uniform(-3, 3)
         at = torch.tensor([angle]).double()
         poses = poses_along(effects, np.zeros((1, 3)), at, torch.ones(1).double(), N_POSES)
