@@ -27,7 +27,7 @@ from affordlib.models.film import FiLMNetwork
 from affordlib.models.training import train
 from affordlib.types import Observations
 from experiments.literal import sample_literal
-from experiments.runner import Rows, study
+from experiments.runner import Rows
 from experiments.shipped import CHECKPOINT_SPECS
 
 
@@ -42,28 +42,6 @@ def random_contexts(
     seen = Observations.of(arrays, action, effect, o.weight)
     masks = {"action_mask": o.action_mask, "effect_mask": o.effect_mask}
     return replace(batch, observations=replace(seen, **masks))
-
-
-def half_blend(arrays: InteractionTensors, *sizes: Any) -> Batch:
-    """As `sample_mixed`, but w₁ = ½ wherever action and effect are both observed."""
-    batch = sample_mixed(arrays, *sizes)
-    o = batch.observations
-    both = (o.weight > 0) & (o.weight < 1)
-    return replace(batch, observations=replace(o, weight=torch.where(both, 0.5, o.weight)))
-
-
-def actions_only(arrays: InteractionTensors, *sizes: Any) -> Batch:
-    """As `sample_mixed`, but only actions are observed, never effects."""
-    batch = sample_mixed(arrays, *sizes)
-    o = batch.observations
-    first = torch.arange(o.action_mask.shape[1]) == 0
-    seen = replace(
-        o,
-        action_mask=o.action_mask | ~o.action_mask.any(dim=1, keepdim=True) & first,
-        effect_mask=torch.zeros_like(o.effect_mask),
-        weight=torch.ones_like(o.weight),
-    )
-    return replace(batch, observations=seen)
 
 
 def one_at_a_time(
@@ -112,8 +90,6 @@ CHANGES: dict[str, dict[str, Any]] = {
     "PyTorch initialisation": {"start": _plain_start},
     "one trajectory, one target a step": {"draw": one_at_a_time},
     "random contexts only": {"draw": random_contexts},
-    "w₁ = ½": {"draw": half_blend},
-    "actions only": {"draw": actions_only},
 }
 """Changes to network or training by name."""
 
@@ -132,10 +108,9 @@ LADDER = {
 
 STEPS, SEEDS = 500, 3
 SHIPPED = CHECKPOINT_SPECS["film_500"]
-_ABOUT = (SHIPPED.network, SHIPPED.training, STEPS, SEEDS)
+ABOUT = (SHIPPED.network, SHIPPED.training, STEPS, SEEDS)
 
 
-@study("push", "push_test", settings=(_ABOUT, CHANGES), version=2)
 def ablation() -> Rows:
     """Return errors after short trainings with one change each, on validation data.
 
@@ -145,7 +120,6 @@ def ablation() -> Rows:
     return [*rows, {"change": "nothing"} | _row(["nothing"], test=True)]
 
 
-@study("push", settings=(_ABOUT, [CHANGES[change] for change in LADDER.values()]), version=2)
 def incremental_ablation() -> Rows:
     """Return the same for trainings to which the parts of `LADDER` are added one after another."""
     names, changes = ["nothing", *LADDER], list(LADDER.values())

@@ -4,7 +4,8 @@
 
 Trial i of a table is a function of the seed and i: object, start, goal and disturbances are sampled
 before planning, with objects that no model has seen. Each trial is run in the clean world with the
-ideal camera, and in a perturbed one (`Variation`) with the Kinect. Errors are ground truth of the
+ideal camera, and in a perturbed one (`Variation`) with the Kinect; `open_loop` trials execute a
+plan made from a single image in the clean world. Errors are ground truth of the
 simulator, which the robot does not know. Whether a goal is feasible is determined by the arm's
 kinematics (position) and by full grasps (height), never by the planner under test.
 """
@@ -14,6 +15,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from itertools import islice, product
@@ -31,12 +33,21 @@ from affordlib.planning import (
     ClosedLoopResult,
     Robot,
     Skills,
+    execute_plan,
+    plan_continuous,
     run_closed_loop,
 )
 from affordlib.planning.grasp_rotate import GRIPPER_YAWS_RAD
 from affordlib.planning.skills import CHECKPOINTS
 from affordlib.primitives import Grasp, Move, move_for
-from affordlib.types import TABLE_X_M, TABLE_Y_M, Goal, check_choice, check_count
+from affordlib.types import (
+    TABLE_X_M,
+    TABLE_Y_M,
+    Goal,
+    UnreachableError,
+    check_choice,
+    check_count,
+)
 from affordlib.world import (
     ROLLABLE,
     Tabletop,
@@ -71,6 +82,7 @@ FOUR_CATEGORIES = ("cuboid", "upright_cylinder", "lying_cylinder", "sphere")
 
 WORLDS = {"clean": 1, "perturbed": 8}
 """Worlds, and the number of images over which an observation averages in each."""
+OPEN_LOOP = "open_loop"
 PERTURBED_PUSHES = "film_5000_perturbed"
 AT_REST_S = 3.0
 """Time [s] in which an object of the perturbed world settles before a trial starts."""
@@ -79,9 +91,6 @@ SMALLEST_M2 = 0.001
 """Prisms with a smaller footprint [m²] are sampled again, because models reject objects that are
 much smaller than those they were trained on."""
 
-REACH_BY = ("both", "learned", "kinematics")
-"""Tests of reachability: "both" is used for all goals, the others for the first `N_REACH_BY`."""
-N_REACH_BY = 100
 TOLERANCE_M = dict.fromkeys(POSE_PRIMITIVES, 0.004)
 """Position tolerance [m] if not 2 mm; it is larger here because gripping shifts objects."""
 
@@ -119,7 +128,7 @@ class Trial:
 def sample_trial(table: str, index: int, seed: int = 0, world: str = "clean") -> Trial:
     """Sample trial `index` of a table, a pure function of its arguments, equal in each world."""
     trial = _clean_trial(table, index, seed)
-    if world == "clean":
+    if world != "perturbed":
         return trial
     key = (200 + list(N_TRIALS).index(table), index)
     rng = np.random.default_rng(np.random.SeedSequence(2_000_003 + seed, spawn_key=key))
@@ -190,33 +199,32 @@ def sample_disturbances(
 
 
 @cache
-def tabletop_and_skills(world: str = "clean", reach_by: str = "both") -> tuple[Tabletop, Skills]:
+def tabletop_and_skills(world: str = "clean") -> tuple[Tabletop, Skills]:
     """Create the world and the skills once per process."""
     skills = Skills.load()
     if world == "perturbed":
         push = load_checkpoint(PERTURBED_PUSHES)[0]
         skills = replace(skills, models=skills.models | {"push": push})
-    if reach_by == "kinematics":
-        skills = replace(skills, reachability=None)
     return Tabletop(), skills
 
 
-def run_trial(
-    table: str, index: int, seed: int = 0, world: str = "clean", reach_by: str = "both"
-) -> dict[str, Any]:
+def run_trial(table: str, index: int, seed: int = 0, world: str = "clean") -> dict[str, Any]:
     """Run a trial and return its record: result, errors and whether the goal was feasible."""
-    tabletop, skills = tabletop_and_skills(world, reach_by)
+    tabletop, skills = tabletop_and_skills(world)
     trial = sample_trial(table, index, seed, world)
+    if world == OPEN_LOOP:
+        return run_open_loop(tabletop, skills, trial)
     robot = DisturbanceSchedule(tabletop, trial.goal, trial.disturbances)
-    if reach_by == "learned":
-        robot.can_reach = lambda *_: True
 
     def pursue(goal: Goal | Callable[[], Goal], robot: Robot) -> tuple[ClosedLoopResult, dict]:
         trial.place(tabletop)
         yaw, z = tabletop.object_pose()[2], tabletop.object_state()[2]
         config = ClosedLoopConfig(n_images=WORLDS[world])
         result = run_closed_loop(robot, goal, skills, config=config)
-        return result, _measured(tabletop, result, yaw, z)
+        about = {"status": "reached" if result.status in ARRIVED else result.status}
+        about |= {"message": result.message, "actions": len(result.steps)}
+        about |= {"orientation_reckoned": "orientation" in result.reckoned}
+        return result, about | _errors(tabletop, result.goal, yaw, z)
 
     result, measured = pursue(robot.current_goal, robot)
     record = {"object_class": trial.obj.category, **measured}
@@ -235,23 +243,29 @@ def run_trial(
     return record
 
 
-def _measured(world: Tabletop, result: ClosedLoopResult, yaw: float, z: float) -> dict[str, Any]:
-    """Return the columns that describe a run of the closed loop; errors are the ground truth.
+def run_open_loop(world: Tabletop, skills: Skills, trial: Trial) -> dict[str, Any]:
+    """Plan and execute one pose goal, even if the planner predicts a failure; return its record."""
+    trial.place(world)
+    yaw, z = world.object_pose()[2], world.object_state()[2]
+    plan = plan_continuous(skills.problem(world.depth_image(), trial.start_xy_m, trial.goal))
+    with suppress(UnreachableError):
+        execute_plan(world, plan)
+    about = {"object_class": trial.obj.category, "status": "reached", "feasible": True}
+    about |= {"actions": len(plan.steps), "orientation_reckoned": False}
+    about |= _errors(world, trial.goal, yaw, z)
+    world.park()
+    return about
 
-    yaw, z: initial yaw [rad] and height [m] of the object.
-    """
+
+def _errors(world: Tabletop, goal: Goal, yaw: float, z: float) -> dict[str, float | None]:
+    """Return the true errors; yaw, z: initial yaw [rad] and height [m] of the object."""
     pose = world.object_pose()
-    errors = result.goal.errors(pose[:2], pose[2] - yaw, world.object_state()[2] - z)
+    errors = goal.errors(pose[:2], pose[2] - yaw, world.object_state()[2] - z)
     left = {name: error.left for name, error in errors.items()}
     return {
-        "status": "reached" if result.status in ARRIVED else result.status,
-        "message": result.message,
         "distance_m": left["position"],
-        "actions": len(result.steps),
-        "plans": len(result.plans),
         "turn_error_rad": left.get("orientation"),
         "height_error_m": left.get("height"),
-        "orientation_reckoned": "orientation" in result.reckoned,
     }
 
 
@@ -365,11 +379,10 @@ ROWS: dict[str, Callable[[Rows], Rows]] = {
 }
 
 
-def job(table: str, index: int, seed: int, world: str = "clean", reach_by: str = "both") -> Job:
+def job(table: str, index: int, seed: int, world: str = "clean") -> Job:
     """Return the job that runs one trial of the closed loop."""
     arguments: dict[str, Any] = {"table": table, "index": index, "seed": seed}
     arguments |= {"world": world} if world != "clean" else {}
-    arguments |= {"reach_by": reach_by} if reach_by != "both" else {}
     used = ("push", "drag", POSE_PRIMITIVES.get(table))
     models = CHECKPOINTS | ({"push": PERTURBED_PUSHES} if world == "perturbed" else {})
     files = tuple(file for kind, file in models.items() if kind in used)
@@ -382,31 +395,22 @@ def job(table: str, index: int, seed: int, world: str = "clean", reach_by: str =
 
 def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
     """Return the tables of the trials in a folder; trials with seeds other than 0 are ignored."""
-    usual = {"world": "clean", "reach_by": "both"}
-    found = [usual | about | record for about, record in runner.read("closed_loop", job, folder)]
+    read = runner.read("closed_loop", job, folder)
+    found = [{"world": "clean"} | about | record for about, record in read]
     found.sort(key=lambda record: record["index"])
     made: dict[str, Rows] = {}
-    for table, world in product(ROWS, WORLDS):
-        mine = {"table": table, "seed": 0, "world": world, "reach_by": "both"}
+    for table, world in product(ROWS, (*WORLDS, OPEN_LOOP)):
+        mine = {"table": table, "seed": 0, "world": world}
         if some := [r for r in found if mine.items() <= r.items()]:
             rows = [{"world": world} | row for row in ROWS[table](some)]
             made[table] = made.get(table, []) + rows
-    for by in REACH_BY:
-        mine = usual | {"table": "reachability", "seed": 0, "reach_by": by}
-        some = [r for r in found if mine.items() <= r.items() and r["index"] < N_REACH_BY]
-        if some:
-            row = {"reach_by": by} | reachability_rows(some)[0]
-            made["reachability_by"] = [*made.get("reachability_by", []), row]
     return made
 
 
 JOBS = [
     job(table, index, 0, world)
-    for table, world in product(ROWS, WORLDS)
+    for table, world in [*product(ROWS, WORLDS), ("height", OPEN_LOOP), ("orientation", OPEN_LOOP)]
     for index in range(N_TRIALS[table])
-] + [
-    job("reachability", index, 0, reach_by=by)
-    for by, index in product(REACH_BY[1:], range(N_REACH_BY))
 ]
 
 

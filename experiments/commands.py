@@ -26,7 +26,6 @@ def whole_type(least: int, most: int) -> Callable[[str], int]:
     return parse
 
 
-count_type = whole_type(1, 10**9)
 worker_type = whole_type(1, 256)
 
 

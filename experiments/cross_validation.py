@@ -34,15 +34,13 @@ from affordlib.models.base import (
     condition_on_final_effect,
 )
 from affordlib.models.cnp import CNPConfig
-from affordlib.models.evaluation import about_objects, fit_sigma_scale, network_predictions
+from affordlib.models.evaluation import about_objects, network_predictions
 from affordlib.models.film import FiLMConfig
 from affordlib.models.training import train_model
 from affordlib.primitives import Grasp, Push
 from affordlib.types import check_choice, check_count
 from affordlib.world import Tabletop
-from experiments.attention import AttentionConfig
 from experiments.baselines import BASELINES, baseline_predictions
-from experiments.ensemble import Ensemble
 from experiments.runner import Job, open_once
 from experiments.shipped import CHECKPOINT_SPECS, GRASP_SYMMETRIES, HALF_TURNS
 
@@ -91,7 +89,6 @@ class Network:
     config: type[NetworkConfig]
     checkpoint: str
     push_frame: bool = True
-    members: int = 1
 
 
 NETWORKS = {
@@ -99,8 +96,6 @@ NETWORKS = {
     "film": Network(FiLMConfig, "film_500"),
     "cnp_push_frame": Network(CNPConfig, "cnp_500"),
     "film_table_frame": Network(FiLMConfig, "film_500", push_frame=False),
-    "attention": Network(AttentionConfig, "attention_500"),
-    "ensemble": Network(FiLMConfig, "film_500", members=5),
 }
 MODELS = (*NETWORKS, *BASELINES, "logistic")
 
@@ -143,7 +138,7 @@ def job(model: str, data: str, n: int | str = "all", fold: int = 0, seed: int = 
     if task.symmetries is not None and model.endswith("_frame"):
         raise ValueError(f"data {data!r} has no direction, which model {model!r} requires")
     if model in NETWORKS:
-        settings = (network_and_training(model, data, n), NETWORKS[model].members)
+        settings = network_and_training(model, data, n)
     arguments = {"model": model, "data": data, "n": n, "fold": fold, "seed": seed}
     sets = (data, task.test_set) if task.test_set else (data,)
     return Job(cross_validate, arguments, (task, settings), sets, version=VERSION)
@@ -238,25 +233,15 @@ def by_model(table: pd.DataFrame) -> Iterator[tuple[dict[str, Any], pd.DataFrame
 
 def _train(
     model: str, data: str, n: int | str, seed: int, split: Split, resume_checkpoint: Path
-) -> tuple[EffectNetwork | Ensemble, dict[str, Any]]:
-    """Train a network, or an ensemble whose members differ in their seeds; also return records."""
+) -> tuple[EffectNetwork, dict[str, Any]]:
+    """Train a network; also return a record of the training."""
     network, training = network_and_training(model, data, n)
-    interactions, members = open_once(data), NETWORKS[model].members
-    symmetries, trained, records = task_of(data).symmetries or (), [], []
-    for k in range(members):
-        config = replace(training, seed=members * seed + k)
-        path = resume_checkpoint.with_name(f"{resume_checkpoint.name}{k}")
-        one, history = train_model(interactions, split, config, network, symmetries, path)
-        best = min(record.validation_error for record in history)
-        steps = {"steps": history[-1].step, "seconds": history[-1].seconds}
-        records.append(steps | {"validation_error": best, "temperature": one.sigma_scale.tolist()})
-        trained.append(one)
-    if members == 1:
-        return trained[0], records[0]
-    ensemble = Ensemble(trained)
-    channels = network.action_channels, network.effect_channels
-    validation = InteractionTensors.from_dataset(interactions, split.validation, *channels)
-    return ensemble, {"members": records, "temperature": fit_sigma_scale(ensemble, validation)}
+    symmetries, config = task_of(data).symmetries or (), replace(training, seed=seed)
+    how = config, network, symmetries, resume_checkpoint
+    trained, history = train_model(open_once(data), split, *how)
+    best = min(record.validation_error for record in history)
+    steps = {"steps": history[-1].step, "seconds": history[-1].seconds}
+    return trained, steps | {"validation_error": best, "temperature": trained.sigma_scale.tolist()}
 
 
 @torch.no_grad()

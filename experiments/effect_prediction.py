@@ -145,7 +145,7 @@ def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
         "rotate": errors("rotate", "fold_test"),
         "inverse": errors("push", "inverse"),
         "frames": frame_rows(results),
-        **studies.tables(NAME, folder),
+        **studies.tables(folder),
     }
 
 
@@ -153,9 +153,8 @@ NEED_NO_NETWORK = ("constant", "nearest", "gaussian_process")
 ASKED = (
     (("film", "cnp", *NEED_NO_NETWORK), TASKS, range(10)),
     (("logistic",), ["grasp"], range(10)),
-    (("attention", "film_table_frame"), ["push"], range(10)),
+    (("film_table_frame",), ["push"], range(10)),
     (("cnp_push_frame",), ["push"], range(8)),
-    (("ensemble",), ["push"], range(3)),
     (("film", "cnp", "logistic", *NEED_NO_NETWORK), ["grasp_x10"], range(10)),
     (NEED_NO_NETWORK, ["rotate_x10"], range(10)),
     (("film",), ["rotate_x10"], range(3)),

@@ -1,8 +1,6 @@
-"""Training of lever-up models for the protocols of Table 1, and the shipped ones.
+"""Training of lever-up models for the protocols of Table 1.
 
-A conditional network is trained once for all protocols, a recurrent one separately for each. The
-paper's network is trained in both ways: as published, and tuned, with what the recurrent one has,
-the near view, the mean trajectory and its own training for each protocol.
+A conditional network is trained once for all protocols, a recurrent one separately for each.
 """
 
 from __future__ import annotations
@@ -10,27 +8,20 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import torch
 import xarray as xr
 from torch import Tensor
 
-from affordlib import checked
-from affordlib.interactions import InteractionTensors, Scaler, Split
+from affordlib.interactions import InteractionTensors, Split
 from affordlib.interactions.dataset import Symmetry, augment_by_symmetry
 from affordlib.interactions.sampling import Batch, condition_on_poses
-from affordlib.models import CNPConfig, EffectNetwork, NetworkConfig, TrainingDomain
-from affordlib.models.base import network, with_time
-from affordlib.models.checkpoint import load_checkpoint
-from affordlib.models.cnp import AffordanceCNP
+from affordlib.models import CNPConfig, EffectNetwork, NetworkConfig
 from affordlib.models.lever_up import (
     LEVER_ACTION_CHANNELS,
     N_OBSERVED,
     N_PREDICTED,
     POSE_CHANNELS,
-    AroundMean,
     LastPoseConfig,
-    MeanTrajectory,
     from_start_errors_m,
     lever_up_tensors,
     window_errors_m,
@@ -38,43 +29,14 @@ from affordlib.models.lever_up import (
 from affordlib.models.training import (
     TrainingConfig,
     TrainingRecord,
-    about_training,
     train,
     untrained,
 )
-from affordlib.types import Observations, check_choice
+from affordlib.types import check_choice
 from experiments.lstm import LSTMConfig
 
 MIRRORED: tuple[Symmetry, ...] = ((0, False), (0, True))
 """Reflection augmentation: a lever-up and its mirror image in y (see `augment_by_symmetry`)."""
-
-
-@checked
-@dataclass(frozen=True)
-class MeanCNPConfig(CNPConfig):
-    """Channels and frame, and the mean trajectory."""
-
-    steps: int = 25  # linear segments of m(t)
-
-
-@network("cnp_mean", MeanCNPConfig)
-class MeanCNP(AroundMean, AffordanceCNP):
-    """The paper's network on differences from the mean trajectory, d(t) = e(t) - m(t)."""
-
-    def make_layers(self, config: MeanCNPConfig) -> None:
-        """Create the paper's layers and the mean trajectory m."""
-        super().make_layers(config)
-        self.mean_trajectory = MeanTrajectory(config.steps, len(config.effect_channels))
-
-    def outputs(
-        self, features: Tensor, observations: Observations, t_target: Tensor
-    ) -> tuple[Tensor, ...]:
-        """(μ_a, σ_a, μ_e, σ_e), each (B, T, C) and standardised."""
-        o = observations
-        d = o.effect / self.effect_scale - self.mean_trajectory(o.effect_t)
-        r = self.represent(o, with_time(d, o.effect_t))
-        mu_a, sigma_a, change, sigma_e = self.decode(r, features, t_target)
-        return mu_a, sigma_a, self.mean_trajectory(t_target) + change, sigma_e
 
 
 _CHANNELS = {"action_channels": LEVER_ACTION_CHANNELS, "effect_channels": POSE_CHANNELS}
@@ -99,7 +61,6 @@ LEVER_MODELS: dict[str, LeverModel] = {
         LastPoseConfig(**_CHANNELS, **_IMAGE), replace(TRAINING, learning_rate=4e-3)
     ),
     "cnp": LeverModel(CNPConfig(**_CHANNELS), view="wide"),
-    "cnp_mean": LeverModel(MeanCNPConfig(**_CHANNELS)),
     "lstm_tuned": LeverModel(
         LSTMConfig(**_CHANNELS, **_IMAGE), replace(TRAINING, learning_rate=2e-3)
     ),
@@ -107,7 +68,7 @@ LEVER_MODELS: dict[str, LeverModel] = {
 """Our network, the paper's (on 48×48 images as in its appendix) and the tuned recurrent network.
 
 All train for the same number of steps; those of the paper's network cost three times as much. The
-other learning rates minimise validation error (`experiments/lever_cross_validation.py`)."""
+other learning rates minimise validation error (`SETTINGS` of `experiments/lever_up.py`)."""
 
 
 def sample_windows(
@@ -180,13 +141,6 @@ LEVER_CHECKPOINTS: dict[str, tuple[str, str]] = {
 """Checkpoints of lever-ups: the name in `LEVER_MODELS`, and the protocol it is trained for."""
 
 
-def about_checkpoint(
-    data: xr.Dataset, split: Split, training: TrainingConfig, **more: str
-) -> dict[str, object]:
-    """Return the description of a shipped checkpoint's training, with further entries `more`."""
-    return about_training(data, np.concatenate([split.train, split.validation]), training) | more
-
-
 def lever_training(lever: LeverModel, data: xr.Dataset, split: Split) -> InteractionTensors:
     """Return the training data of a lever-up network: the training part and its mirror image."""
     return augment_by_symmetry(lever_up_tensors(data, split.train, lever.view), MIRRORED)
@@ -203,28 +157,3 @@ def train_lever_model(
     training = lever_training(lever, data, split)
     validation = lever_up_tensors(data, split.validation, lever.view)
     return fit_lever_model(lever, training, validation, trained_for, resume_checkpoint)
-
-
-def shipped_lever_model(
-    name: str, trained_for: str, lever: LeverModel, data: xr.Dataset, split: Split
-) -> tuple[EffectNetwork, dict[str, object]] | None:
-    """Return the shipped checkpoint of exactly this training and its name, or None."""
-    names = {key: checkpoint for checkpoint, key in LEVER_CHECKPOINTS.items()}
-    try:
-        checkpoint = names[name, trained_for]
-        model, about = load_checkpoint(checkpoint)
-    except (KeyError, FileNotFoundError, ValueError):
-        return None
-    more = {"trained_for": trained_for, "view": lever.view}
-    training = lever_training(lever, data, split)
-    same = about == about_checkpoint(data, split, lever.training, **more)
-    same &= model.config == lever.network
-    same &= _alike(model.scaler, Scaler.fit(training))
-    same &= _alike(model.domain, TrainingDomain.fit(training))
-    return (model, {"checkpoint": checkpoint}) if same else None
-
-
-def _alike(stored: Scaler | TrainingDomain, fitted: Scaler | TrainingDomain) -> bool:
-    """Whether two are equal apart from rounding: the order of sums depends on the processor."""
-    pairs = zip(vars(stored).values(), vars(fitted).values(), strict=True)
-    return all(a == b or (None not in (a, b) and np.allclose(a, b, 1e-5, 0)) for a, b in pairs)

@@ -1,10 +1,12 @@
-"""Lever-ups against recurrent networks (Table 1 of the paper): makes `data/results/lever_up.json`.
+"""Lever-ups against a recurrent network (Table 1 of the paper): makes `data/results/lever_up.json`.
 
-    python -m experiments.lever_up --only model=lstm_seker2019
+    python -m experiments.lever_up --only model=lstm_tuned
 
-runs these jobs if they are missing, then makes the tables from all results. Each of the two
-trainings per fold takes an hour on one core. glibc releases large arrays after every step;
-`MALLOC_MMAP_MAX_=0 MALLOC_TRIM_THRESHOLD_=60000000000` before the command saves a quarter of it.
+runs these jobs if they are missing, then makes the tables from all results. The split is by object
+into five folds, 80/10/10 (each interaction has its own object), or leaves out all objects with a
+given number of edges. A job is one training, or one baseline, tested in all protocols that it is
+trained for; errors are distances [cm] between predicted and true positions, after steps of 150 ms.
+A job with a `setting` is tuning: it is scored on the validation part of fold 0.
 
 An object's errors are averaged over its windows; means, standard errors and intervals are over
 objects.
@@ -14,32 +16,177 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+import torch
+import xarray as xr
+from torch import Tensor
 
-from affordlib.models.lever_up import PROTOCOLS
-from experiments import lever_tuning, reported, runner
+from affordlib.interactions import Split, split_interactions
+from affordlib.interactions.dataset import InteractionTensors, valid_interactions
+from affordlib.interactions.recipes import Recipe, sample_scene
+from affordlib.models import lever_up as models
+from affordlib.models.base import EffectNetwork
+from affordlib.models.lever_up import N_OBSERVED, N_PREDICTED, PROTOCOLS, lever_up_tensors
+from affordlib.types import Prediction, check_choice, check_count
+from experiments import reported, runner
 from experiments.commands import command
-from experiments.lever_cross_validation import (
-    DATA,
-    EACH,
-    MODELS,
-    N_FOLDS,
-    RECURRENT,
-    SINGLE,
-    TESTED,
-    edges_of,
-    job,
-)
-from experiments.lstm_seker2019 import EPOCHS
+from experiments.lever_training import LEVER_MODELS, TRAINING, LeverModel, train_lever_model
 from experiments.runner import FOLDER, Job, Result, Rows, interval, open_once, plain, read
 
-NAME = "lever_up"
-OURS = "cnp_last_pose"
+NAME, DATA, N_FOLDS = "lever_up", "lever_up", 5
+OURS, SINGLE, RECURRENT = "cnp_last_pose", "cnp_last_pose_single", "lstm_tuned"
+"""Our network, the same trained for one protocol at a time, and the recurrent one."""
+
+BASELINES = ("persistence", "constant_velocity")
+MODELS = ("cnp", OURS, SINGLE, RECURRENT, *BASELINES)
+EACH = (SINGLE, RECURRENT)
+"""Networks that are trained for one protocol at a time."""
+
+TESTED = {"all": PROTOCOLS, "window": PROTOCOLS[:1], "first_step": PROTOCOLS[1:]}
+"""Protocols in which a network is tested, by the protocol that it is trained for."""
+
+SETTINGS: dict[str, dict[str, Any]] = {
+    **{f"rate {rate:g}": {"learning_rate": rate} for rate in (1e-3, 5e-4, 2e-3, 4e-3, 8e-3)},
+    "rate 0.001, half the width": {},
+    "rate 0.001, no weight decay": {"weight_decay": 0.0},
+    "rate 0.001, plain likelihood": {"beta": 0.0},
+}
+"""Changes of the initial `TRAINING` by name; one halves the network's width.
+
+`LEVER_MODELS` has one learning rate per network: the best, or, for the two trainings of the
+recurrent one, the rate whose two errors, each relative to the best of its protocol, have the least
+sum."""
+
+
+def lever_model(model: str, setting: str | None = None) -> LeverModel | None:
+    """Return a network of `LEVER_MODELS`, or with a setting; None for baselines."""
+    lever = LEVER_MODELS.get(OURS if model == SINGLE else model)
+    if lever is None or setting is None:
+        return lever
+    network = lever.network
+    if setting.endswith("half the width"):
+        network = replace(network, width=network.width // 2)
+    return replace(lever, network=network, training=replace(TRAINING, **SETTINGS[setting]))
+
+
+def job(
+    model: str,
+    trained_for: str = "all",
+    fold: int = 0,
+    edges_left_out: int | None = None,
+    setting: str | None = None,
+) -> Job:
+    """Return the job of one training and its tests.
+
+    edges_left_out: polygons with this number of edges are only tested.
+    """
+    check_choice("model", model, MODELS)
+    check_choice(
+        f"trained_for of {model!r}", trained_for, [*TESTED][1:] if model in EACH else ["all"]
+    )
+    check_count("fold", fold, 0, N_FOLDS - 1)
+    if edges_left_out is not None:
+        check_count("edges_left_out", edges_left_out, 3, 8)
+    if setting is not None:
+        check_choice("setting", setting, SETTINGS)
+    arguments = {"model": model, "trained_for": trained_for, "fold": fold}
+    arguments |= {"edges_left_out": edges_left_out, "setting": setting}
+    return Job(cross_validate, arguments, lever_model(model, setting), (DATA,))
+
+
+def edges_of(data: xr.Dataset) -> np.ndarray:
+    """Return the number of edges (n,) of each interaction's polygon."""
+    recipe, numbers = Recipe.from_json(data.attrs["recipe"]), data["interaction"].values
+    return np.array([len(sample_scene(recipe, int(i))[0].footprint_m) for i in numbers])
+
+
+def lever_split(data: xr.Dataset, fold: int = 0, edges_left_out: int | None = None) -> Split:
+    """Split 80/10/10 in five folds with disjoint test parts, or leave out a number of edges."""
+    split = split_interactions(data.sizes["interaction"], 0, 2 * fold, 2 * N_FOLDS)
+    if edges_left_out is None:
+        return split
+    edges = edges_of(data)
+    others = np.concatenate([split.train, split.test])
+    return Split(
+        np.sort(others[edges[others] != edges_left_out]),
+        split.validation[edges[split.validation] != edges_left_out],
+        np.flatnonzero(edges == edges_left_out),
+    )
+
+
+def cross_validate(
+    model: str,
+    trained_for: str,
+    fold: int,
+    edges_left_out: int | None,
+    setting: str | None,
+    resume_checkpoint: Path,
+) -> dict[str, Any]:
+    """Train and return the errors in all windows of all test trajectories, by protocol.
+
+    With a setting, return the mean errors on the validation part instead.
+    """
+    data, lever = open_once(DATA), lever_model(model, setting)
+    split = lever_split(data, fold, edges_left_out)
+    network, result = model, {}
+    if lever:
+        network, history = train_lever_model(lever, data, split, trained_for, resume_checkpoint)
+        best = min(record.validation_error for record in history)
+        told = {"steps": history[-1].step, "seconds": history[-1].seconds}
+        result["training"] = told | {"validation_error": best}
+    view = lever.view if lever else "near"
+    if setting is not None:
+        return _tuned(network, lever_up_tensors(data, split.validation, view), trained_for)
+    kept, test = valid_interactions(data, split.test), lever_up_tensors(data, split.test, view)
+    result["interaction"] = data["interaction"].values[kept].tolist()
+    return result | {protocol: _errors(network, test, protocol) for protocol in TESTED[trained_for]}
+
+
+def _tuned(network: EffectNetwork, validation: InteractionTensors, trained_for: str) -> dict:
+    row: dict[str, Any] = {"n": len(validation)}
+    if trained_for != "first_step":
+        row["window_mean_m"] = float(models.window_errors_m(network, validation).mean())
+    if trained_for != "window":
+        row["beginning_mean_m"] = float(models.from_start_errors_m(network, validation).mean())
+    return row
+
+
+def extrapolate(
+    baseline: str, effect: Tensor, protocol: str, start: int = 0
+) -> tuple[Tensor, Tensor]:
+    """Return a baseline's prediction of poses from effects (N, S, C), and ground truth (N, T, C).
+
+    With only the first step the velocity is unknown, and both baselines predict no motion.
+    """
+    window = protocol == "window"
+    last = start + N_OBSERVED - 1 if window else 0
+    ahead = torch.arange(1, (N_PREDICTED if window else effect.shape[1] - 1) + 1)
+    velocity = torch.zeros_like(effect[:, last])
+    if window and baseline == "constant_velocity":
+        velocity = effect[:, last] - effect[:, last - 1]
+    return effect[:, last, None] + ahead[:, None] * velocity[:, None], effect[:, last + ahead]
+
+
+def _errors(
+    network: EffectNetwork | str, arrays: InteractionTensors, protocol: str
+) -> dict[str, Any]:
+    """Return the errors (N, W, T) [cm] of a network or baseline, rounded to 1 µm, as lists."""
+    starts = range(models.n_windows(arrays) if protocol == "window" else 1)
+    if isinstance(network, str):
+        found = [extrapolate(network, arrays.effect, protocol, start) for start in starts]
+        found = [(Prediction(mean, mean, mean, 0 * mean), truth) for mean, truth in found]
+    else:
+        with torch.no_grad():
+            seen = network.encode(arrays.image)
+        found = [models.predict_steps(network, arrays, protocol, start, seen) for start in starts]
+    errors = torch.stack([100 * models.errors_m(told, truth) for told, truth in found], dim=1)
+    return {"error_cm": errors.double().numpy().round(4).tolist()}
 
 
 def sorted_results(folder: str | Path = FOLDER) -> list[Result]:
@@ -47,13 +194,14 @@ def sorted_results(folder: str | Path = FOLDER) -> list[Result]:
 
     def order(result: Result) -> list[Any]:
         about = {name: value or 0 for name, value in result[0].items()}
-        names = ("trained_for", "edges_left_out", "fold", "epochs", "seed")
-        return [MODELS.index(about["model"]), *(about[name] for name in names)]
+        tuned = [*SETTINGS].index(about["setting"]) if about["setting"] else -1
+        place = [about[name] for name in ("trained_for", "edges_left_out", "fold")]
+        return [MODELS.index(about["model"]), *place, tuned]
 
     return sorted(read(NAME, job, folder), key=order)
 
 
-def _errors(results: list[Result], edges_left_out: int | None = None) -> pd.DataFrame:
+def _error_table(results: list[Result], edges_left_out: int | None = None) -> pd.DataFrame:
     """Return a row per tested object and step with the error [cm], averaged over windows."""
     parts = []
     for about, result in results:
@@ -75,17 +223,10 @@ def error_rows(results: list[Result], edges_left_out: int | None = None) -> Rows
 
     edges_left_out: use trainings without polygons that have this number of edges, tested on them.
     """
-    if not results:
-        return []
-    keys, error = ["protocol", "model", "epochs", "steps"], "error_cm"
-    groups = _errors(results, edges_left_out).groupby(keys, observed=True, dropna=False)
+    keys, error = ["protocol", "model", "steps"], "error_cm"
+    groups = _error_table(results, edges_left_out).groupby(keys, observed=True)
     rows = groups.agg(
-        folds=("fold", "nunique"),
-        n=(error, "size"),
-        mean_cm=(error, "mean"),
-        sem_cm=(error, "sem"),
-        median_cm=(error, "median"),
-        p95_cm=(error, lambda each: each.quantile(0.95)),
+        folds=("fold", "nunique"), n=(error, "size"), mean_cm=(error, "mean"), sem_cm=(error, "sem")
     )
     return plain(rows.reset_index())
 
@@ -96,7 +237,7 @@ def unseen_rows(results: list[Result], edges: dict[int, int]) -> Rows:
     edges: number of edges by interaction number. The columns `known_…` are the errors of the
     networks of the folds on test polygons with the same number of edges.
     """
-    known = _errors(results)
+    known = _error_table(results)
     keys = [known["interaction"].map(edges).rename("edges"), "model", "protocol", "steps"]
     known = known.groupby(keys, observed=True)["error_cm"].agg(known_n="size", known_mean_cm="mean")
     left_out = sorted({about["edges_left_out"] for about, _ in results} - {None})
@@ -105,25 +246,22 @@ def unseen_rows(results: list[Result], edges: dict[int, int]) -> Rows:
 
 
 def paired_rows(results: list[Result]) -> Rows:
-    """Return paired differences, ours minus a recurrent network, with bootstrap 95 % intervals.
+    """Return paired differences, ours minus the recurrent network, with bootstrap 95 % intervals.
 
-    Ours is trained for all protocols, or for one at a time. Pairs are test objects of folds that
-    both networks have, with errors averaged over windows.
+    Ours is trained for all protocols, or for one at a time. Pairs are test objects, with errors
+    averaged over windows.
     """
-    rng, rows = np.random.default_rng(0), []
+    rows: Rows = []
     errors = {
         key: of_one.pivot(index=["fold", "interaction"], columns="steps", values="error_cm")
-        for key, of_one in _errors(results).groupby(["model", "protocol"], observed=True)
+        for key, of_one in _error_table(results).groupby(["model", "protocol"], observed=True)
     }
-    for ours, rival, protocol in product((OURS, SINGLE), RECURRENT, PROTOCOLS):
-        if not {(ours, protocol), (rival, protocol)} <= errors.keys():
-            continue
-        gap = (errors[ours, protocol] - errors[rival, protocol]).dropna()
-        mean, low, high = interval(gap, 2000, rng)
+    for ours, protocol in product((OURS, SINGLE), PROTOCOLS):
+        gap = errors[ours, protocol] - errors[RECURRENT, protocol]
+        mean, low, high = interval(gap, 2000)
         table = pd.DataFrame({"difference_cm": mean, "low_cm": low, "high_cm": high}, gap.columns)
-        table["ours_better_percent"] = 100 * (gap < 0).mean()
         table.insert(0, "n", len(gap))
-        about = {"ours": ours, "rival": rival, "protocol": protocol}
+        about = {"ours": ours, "rival": RECURRENT, "protocol": protocol}
         stride = 1 if protocol == "window" else 5
         rows += [about | row for row in plain(table[stride - 1 :: stride].reset_index())]
     return rows
@@ -131,18 +269,29 @@ def paired_rows(results: list[Result]) -> Rows:
 
 def summary_rows(rows: Rows) -> Rows:
     """Return one row per model for the window protocol, as in the paper's Table 1."""
-    summary: dict[tuple, dict[str, Any]] = {}
+    summary: dict[str, dict[str, Any]] = {}
     for row in rows:
         if row["protocol"] == "window":
-            columns = {name: row[name] for name in ("model", "folds", "epochs", "n")}
-            one = summary.setdefault((row["model"], row["epochs"]), columns)
+            columns = {name: row[name] for name in ("model", "folds", "n")}
+            one = summary.setdefault(row["model"], columns)
             one[f"step_{row['steps']}_mean_cm"] = row["mean_cm"]
     return list(summary.values())
 
 
+def tuning_rows(results: list[Result]) -> Rows:
+    """Return the validation errors of all settings; `taken` marks the setting of `LEVER_MODELS`."""
+    rows = []
+    for about, result in results:
+        taken = lever_model(about["model"], about["setting"]) == LEVER_MODELS[about["model"]]
+        names = ("model", "trained_for", "setting")
+        rows.append({name: about[name] for name in names} | {"taken": taken} | result)
+    return rows
+
+
 def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
-    """Return all tables from the results in a folder and the tuning study."""
-    results = sorted_results(folder)
+    """Return all tables from the results in a folder."""
+    every = sorted_results(folder)
+    results = [result for result in every if result[0]["setting"] is None]
     if not results:
         raise FileNotFoundError(f"folder: there are no results in {folder}; run some jobs first")
     data, rows = open_once(DATA), error_rows(results)
@@ -152,24 +301,18 @@ def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
         "summary": [*reported.LEVER_UP_ROWS, *summary_rows(rows)],
         "unseen_edges": unseen_rows(results, edges),
         "paired": paired_rows(results),
-        "tuning": lever_tuning.rows(folder),
+        "tuning": tuning_rows([result for result in every if result[0]["setting"]]),
     }
 
 
-def _jobs(model: str, fold: int, edges: int | None = None, **more: int) -> list[Job]:
-    kinds = [*TESTED][1:] if model in EACH else ["all"]
-    return [job(model, kind, fold, edges, **more) for kind in kinds]
+def _jobs(model: str, *how: Any) -> list[Job]:
+    return [job(model, kind, *how) for kind in ([*TESTED][1:] if model in EACH else ["all"])]
 
 
-ALL = [model for model in MODELS if model not in ("lstm_seker2019", "cnp_mean")]
 JOBS = [
-    *(each for model, fold in product(ALL, range(N_FOLDS)) for each in _jobs(model, fold)),
-    *(each for fold in range(3) for each in _jobs("lstm_seker2019", fold, epochs=EPOCHS)),
-    *(
-        each
-        for model, edges in product((OURS, "lstm_tuned", "cnp"), (3, 5, 8))
-        for each in _jobs(model, 0, edges)
-    ),
+    *(each for model, fold in product(MODELS, range(N_FOLDS)) for each in _jobs(model, fold)),
+    *(each for m, n in product((OURS, RECURRENT, "cnp"), (3, 5, 8)) for each in _jobs(m, 0, n)),
+    *(each for m, s in product((OURS, RECURRENT), SETTINGS) for each in _jobs(m, 0, None, s)),
 ]
 
 

@@ -1,13 +1,12 @@
-"""Recurrent networks: an autoregressive rollout, each prediction the input of the next step.
+"""A recurrent network: an autoregressive rollout, each prediction the input of the next step.
 
     x_k = {d_k, d_k - d_{k-1}, t_k, observed?, f(γ_o), h_a}      d = e - m, m the mean trajectory
     (h_k+1, c_k+1) = LSTM(x_k, h_k, c_k)
     d_k+1 = d_k + (d_k - d_{k-1}) + g(h_k+1)                 observed value if any, else predicted
 
-`LSTMNetwork`, tuned and of about a million parameters, predicts the change of the increment in
-standardised units and is trained through its own rollouts. The network of the earlier study (Seker,
-Tekden and Ugur, Deep effect trajectory prediction in robot manipulation, Robotics and Autonomous
-Systems, 2019) is in `lstm_seker2019.py`.
+It predicts the change of the increment in standardised units and is trained through its own
+rollouts. Source: Seker, Tekden and Ugur, Deep effect trajectory prediction in robot manipulation,
+Robotics and Autonomous Systems, 2019, with fewer parameters, which were tuned.
 """
 
 from __future__ import annotations

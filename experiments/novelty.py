@@ -13,7 +13,6 @@ from __future__ import annotations
 import hashlib
 import math
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import product
 from typing import Any, ClassVar
 
@@ -21,24 +20,20 @@ import numpy as np
 import pybullet
 import torch
 from scipy.spatial import ConvexHull, Delaunay
-from sklearn.covariance import LedoitWolf
 from torch import Tensor
 
 from affordlib.geometry import xy_columns
 from affordlib.interactions import InteractionTensors, open_interactions, split_interactions
 from affordlib.interactions.collect import collect
 from affordlib.interactions.recipes import Recipe
-from affordlib.models import EffectNetwork, condition_on_primitives, load_checkpoint
+from affordlib.models import EffectNetwork, load_checkpoint
 from affordlib.models import evaluation as c
-from affordlib.models.base import gaussian_nll
 from affordlib.models.film import CircularHarmonics
-from affordlib.primitives import Push
 from affordlib.results import resolve_out_dir, write_atomically
 from affordlib.types import Observations, Prediction
 from affordlib.world import CATEGORIES, TabletopObject
-from experiments.runner import Rows, study
+from experiments.runner import Rows
 from experiments.shipped import data_of
-from experiments.uncertainty import calibration_row
 
 N_PUSHES = 150
 FOLDER = "runs/strangers"
@@ -207,7 +202,7 @@ def novelty_of(name: str) -> Novelty:
     return Novelty.fit(InteractionTensors.from_dataset(data, split.train).image)
 
 
-MODELS = ("film_500", "film_5000", "cnp_500", "lstm_500", "attention_500")
+MODELS = ("film_500", "film_5000", "cnp_500", "lstm_500")
 GROWTH = {"distance": Tensor.clone, "root": Tensor.sqrt, "logarithm": Tensor.log1p}
 GROWTH["step"] = Tensor.sign
 SETTINGS = (N_PUSHES, *CHOOSE, *ROLL, *FIRST, *SECOND)
@@ -234,39 +229,6 @@ def auc(known: Any, unknown: Any) -> float:
     return float((np.asarray(known)[:, None] < np.asarray(unknown)).mean())
 
 
-@study("push", settings=SETTINGS, checkpoints=MODELS[:3])
-@torch.no_grad()
-def novelty_choice() -> Rows:
-    """Return the AUC of validation objects against the categories of CHOOSE, by score."""
-    film, more, cnp = (load_checkpoint(name)[0] for name in MODELS[:3])
-    data, split = open_interactions("push"), split_interactions(500)
-    training, validation = (tensors(data, film, p).image for p in (split.train, split.validation))
-
-    def in_push_frame(x):
-        return film.oriented_features(film.encode(x, False), torch.tensor([[1.0, 0.0]] * len(x)))
-
-    def disagreement(x):
-        pushes = condition_on_primitives(film, [Push.towards(0.0)] * len(x))
-        models, t = (film, more), torch.ones(len(x), 1)
-        ends = [m.predict(m.encode(x, False), pushes, t).effect_mean[:, 0] for m in models]
-        return (ends[0] - ends[1])[:, :2].norm(dim=1)
-
-    scores = {"disagreement of two networks": disagreement}
-    for name, encode in (
-        ("features of the paper's network", lambda x: cnp.encode(x, False)),
-        ("features of our network", in_push_frame),
-        ("spectrum of the harmonics", partial(spectrum, CircularHarmonics())),
-    ):
-        gaussian, nearest = LedoitWolf().fit(encode(training)), Novelty(encode(training))
-        scores[f"{name}, Mahalanobis"] = lambda x, e=encode, g=gaussian: g.mahalanobis(e(x))
-        scores[f"{name}, nearest"] = lambda x, e=encode, n=nearest: n.distances(e(x))[:, 0]
-    unknown = {name: strangers(name, film).image for name in (*CHOOSE, ROLL[0])}
-    return [
-        {"score": name} | {k: auc(score(validation), score(image)) for k, image in unknown.items()}
-        for name, score in scores.items()
-    ]
-
-
 def final(model: Any, pushes: InteractionTensors) -> tuple[Tensor, Tensor, Tensor]:
     """Return ground truth, mean and σ (N, 2) of x and y at t = 1."""
     return tuple(value[:, 0, :2] for value in c.effects_at(model, pushes, (1.0,)))
@@ -277,39 +239,23 @@ def beyond_percent(truth: Tensor, mean: Tensor, std: Tensor) -> float:
     return 100 * float(((mean - truth).norm(dim=1) > 2 * std.norm(dim=1)).double().mean())
 
 
-@study("push", settings=SETTINGS, checkpoints=MODELS[:3])
 def novelty_gain() -> Rows:
-    """Fit the gain of each growth of σ so that at most 5 or 1 % of any category are beyond 2σ.
-
-    Columns `other_…` use the gain fitted to the other categories. Shares are the worst category's.
-    """
-    found = []
+    """Fit the gain of each growth of σ so that at most 5 or 1 % of any category are beyond 2σ."""
+    needed: dict[tuple[str, int], float] = {}
     for name, category in product(MODELS[:3], CHOOSE):
         model = load_checkpoint(name)[0]
         pushes = strangers(category, model)
         beyond = (novelty_of(name)(pushes.image) - 1).clamp_min(0)
-        found.append((category, beyond[:, None], *final(model, pushes)))
-    rows = []
-    for (name, grow), percent in product(GROWTH.items(), (5, 1)):
-        needed, grown = dict.fromkeys(CHOOSE, 0.0), []
-        for category, beyond, truth, mean, std in found:
-            more = grow(beyond) * mean.norm(dim=1, keepdim=True)
-            lacking = (mean - truth).square().sum(dim=1) / 4 - std.square().sum(dim=1)
-            enough = ((lacking.clamp_min(0) / 2).sqrt() / more[:, 0]).quantile(1 - percent / 100)
-            needed[category] = max(needed[category], float(enough))
-            grown.append((category, truth, mean, std, more))
-        gains = {"": dict.fromkeys(CHOOSE, max(needed.values()))}
-        gains["other_"] = {k: max(needed[o] for o in CHOOSE if o != k) for k in CHOOSE}
-        row = {"growth": name, "percent": percent, "gain": max(needed.values())}
-        for kind, gain in gains.items():
-            each = [(t, m, torch.hypot(s, gain[k] * more)) for k, t, m, s, more in grown]
-            row[f"{kind}nll"] = float(np.mean([gaussian_nll(*values).mean() for values in each]))
-            row[f"{kind}beyond_2_sigma_percent"] = max(beyond_percent(*v) for v in each)
-        rows.append(row)
-    return rows
+        truth, mean, std = final(model, pushes)
+        lacking = (mean - truth).square().sum(dim=1) / 4 - std.square().sum(dim=1)
+        lacking = (lacking.clamp_min(0) / 2).sqrt()
+        for (growth, grow), percent in product(GROWTH.items(), (5, 1)):
+            each = lacking / (grow(beyond) * mean.norm(dim=1))
+            enough = float(each.quantile(1 - percent / 100))
+            needed[growth, percent] = max(needed.get((growth, percent), 0.0), enough)
+    return [{"growth": g, "percent": p, "gain": gain} for (g, p), gain in needed.items()]
 
 
-@study("push_test", settings=(*SETTINGS, NOVELTY_GAIN), checkpoints=MODELS)
 def novelty_judged() -> Rows:
     """Evaluate σ, unchanged and grown in two ways, on known objects and on unused categories."""
     rows, parts = [], {"first_six": FIRST, "second_six": SECOND}
@@ -333,9 +279,9 @@ def novelty_judged() -> Rows:
             row["error_mean_m"] = float((mean - truth).norm(dim=1).mean())
             row["first_beyond_2_sigma_percent"] = beyond_percent(truth, mean, first)
             for kind, sigma in (("", std), ("aware_", aware)):
-                covered = calibration_row(truth, mean, sigma)
                 row[f"{kind}sigma_median_m"] = float(sigma.norm(dim=1).median())
-                row |= {f"{kind}coverage_{k}": covered[f"coverage_{k}"] for k in (50, 90)}
+                for k in (50, 90):
+                    row[f"{kind}coverage_{k}"] = c.coverage(truth, mean, sigma, k / 100)
                 row[f"{kind}beyond_2_sigma_percent"] = beyond_percent(truth, mean, sigma)
             rows.append(row)
     return rows

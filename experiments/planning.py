@@ -1,8 +1,7 @@
 """Table 3: plan to goals, execute the plans, and measure the final distance to the goal.
 
 Each config is a `PlannerConfig`. Its outcomes on the frozen goals are stored by the runner; the
-tables are made from all stored outcomes. A row of a table has the outcomes of all trainings of its
-network.
+tables are made from all stored outcomes.
 
     python -m experiments.planning --only config=continuous,astar
 """
@@ -15,7 +14,6 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -25,9 +23,8 @@ import pandas as pd
 import torch
 from tqdm.auto import tqdm
 
-from affordlib.models.base import EffectModel, condition_on_final_effect
+from affordlib.models.base import EffectModel
 from affordlib.models.checkpoint import load_checkpoint
-from affordlib.models.evaluation import error_row
 from affordlib.perception import adapt_to_object
 from affordlib.planning import (
     EffectMap,
@@ -43,16 +40,14 @@ from affordlib.planning import (
     plan_gradient,
 )
 from affordlib.planning.astar import STOP_PHASES
-from affordlib.planning.effect_map import checked_image
 from affordlib.planning.gradient import Reading
 from affordlib.planning.problem import MODES, OUR_TABLE
-from affordlib.primitives import Drag, Push
+from affordlib.primitives import Push
 from affordlib.types import NothingSeenError, Observation, Outcome, Plan, Step
 from affordlib.world import ROLLABLE, STANDING, Tabletop, UnreachableError
 from experiments import reported, runner
 from experiments.commands import command
 from experiments.field_baselines import LimitSurface, plan_astar_continuous, plan_cem
-from experiments.literal import OTHER_SEEDS, OTHER_TRAININGS, trained
 from experiments.oracle import oracle_effects
 from experiments.runner import FOLDER, Job, Rows, interval, plain
 from experiments.tasks import GOAL_SOURCES, PlanningTask, frozen_tasks, tasks_sha256
@@ -61,15 +56,8 @@ ENOUGH_M = 0.0003
 """Distance [m] from the goal below which no corrective action is tried, as none would help."""
 
 POSITION_ERROR_M, YAW_ERROR_RAD = 0.001, math.radians(1.0)
-GROUPS = {"all": STANDING + ROLLABLE, "standing": STANDING, "rollable": ROLLABLE} | {
-    name: (name,) for name in STANDING + ROLLABLE
-}
+GROUPS = {"standing": STANDING, "rollable": ROLLABLE}
 FINE_PHASES = tuple(round(0.5 + 0.05 * k, 2) for k in range(1, 11))
-
-
-def plan_astar_full(problem: PlanningProblem) -> Plan:
-    """A* without partial actions."""
-    return plan_astar(problem, stop_phases=(1.0,))
 
 
 def plan_continuous_full(problem: PlanningProblem) -> Plan:
@@ -101,30 +89,8 @@ def plan_astar_fine(problem: PlanningProblem, heuristic: str = "goal") -> Plan:
     return plan_astar(problem, 72, FINE_PHASES, heuristic)
 
 
-def plan_continuous_with(problem: PlanningProblem, **settings: Any) -> Plan:
-    """Plan with the continuous planner, with other values of its arguments, in capitals."""
-    return plan_continuous(problem, **{name.lower(): value for name, value in settings.items()})
-
-
-def decoded_kind(model: EffectModel, image: np.ndarray) -> type[Push] | type[Drag]:
-    """Return the action that the paper's one network decodes for the object: push or drag.
-
-    It is asked for the effects of full drags, which only few pushes have, in 36 directions. A drag
-    starts above the object, a push 20 cm away.
-    """
-    angle = torch.arange(36) * (math.pi / 18)
-    effect = torch.zeros(36, len(model.effect_channels))
-    effect[:, :2] = Drag.length * torch.stack([angle.cos(), angle.sin()], dim=1)
-    features = model.encode(checked_image(image))
-    found = model.predict(features, condition_on_final_effect(model, effect), torch.zeros(36, 1))
-    return Push if found.action_mean[..., :2].norm(dim=-1).median() > Push.radius / 2 else Drag
-
-
-MADE: dict[str, Callable[[], EffectModel]] = {
-    **{name: partial(trained, name) for name in OTHER_TRAININGS},
-    "limit_surface": LimitSurface.fitted,
-}
-"""Models without a checkpoint, which the job trains (ten minutes, once) or fits on `push`."""
+MADE: dict[str, Callable[[], EffectModel]] = {"limit_surface": LimitSurface.fitted}
+"""Models without a checkpoint, which the job fits on `push`."""
 
 Pose = Callable[..., PlanningProblem]
 """Poses the problem of (image, start_xy_m, goal, mode), as `Skills.problem` does."""
@@ -156,11 +122,6 @@ class PlannerConfig:
     modes: tuple[str, ...] = tuple(MODES)
 
     @property
-    def for_all(self) -> bool:
-        """Whether the model is one network of pushes and drags, as in the paper."""
-        return "mixed" in self.model
-
-    @property
     def checkpoints(self) -> dict[str, str]:
         """Checkpoints by primitive: the model's, and one for drags if rollable objects occur."""
         if self.model in ("simulator", *MADE):
@@ -173,8 +134,8 @@ class PlannerConfig:
         """The object categories of its goals."""
         if self.world == "perturbed_rollable":
             return ROLLABLE
-        drags = "drag" in self.checkpoints or self.model == "simulator" or self.for_all
-        drags &= self.world in ("clean", "fresh") and not self.standing
+        drags = "drag" in self.checkpoints or self.model == "simulator"
+        drags &= self.world == "clean" and not self.standing
         return STANDING + ROLLABLE if drags else STANDING
 
     def chosen(self, tasks: Sequence[PlanningTask]) -> list[int]:
@@ -184,14 +145,6 @@ class PlannerConfig:
             for t in tasks
         ]
         return np.flatnonzero(asked)[:: self.stride].tolist()
-
-    def columns(self) -> dict[str, str]:
-        """Return the columns of the table that describe it."""
-        return {"model": self.model, "world": self.world}
-
-    def plan(self, problem: PlanningProblem) -> Plan:
-        """Plan with this row's arguments."""
-        return self.planner(problem, **self.arguments)
 
     def pose(self, world: Tabletop) -> Pose:
         """Return what poses the problems; only the model "simulator" reads the world's state."""
@@ -203,8 +156,6 @@ class PlannerConfig:
         def pose(image, start_xy_m, goal, mode) -> PlanningProblem:
             if imagined:
                 effects = oracle_effects(imagined, world, image, **self.oracle)
-            elif self.for_all:
-                effects = EffectMap(models["push"], image, decoded_kind(models["push"], image))
             else:
                 kind = skills.kind_for(image) if "drag" in models else Push
                 effects = EffectMap(skills.model(kind), image, kind)
@@ -220,50 +171,30 @@ DISC = {"heuristic": "disc"}
 PERTURBED = {"model": "film_5000_perturbed", "world": "perturbed"}
 ROLLING, OUTSIDE = (PERTURBED | {"world": world} for world in ("perturbed_rollable", "outside"))
 ORACLE = {"model": "simulator"}
-FRESH = {"world": "fresh"}
-PAPERS = "cnp_mixed_500"
 RISK_WEIGHTS = (0.0, 1.0, 10.0, 30.0)
-RATES = {"gradient": (0.1, 0.3, 1.0), "gradient_adam": (0.002, 0.005, 0.01)}
-"""Risk weights of the continuous planner, and rates of the gradient planner's descents, that are
-tried on the validation goals."""
+"""Risk weights of the continuous planner that are tried on the validation goals."""
 
 READINGS = {
-    "gradient": Reading(),
-    "gradient_starts": Reading(starts=4),
-    "gradient_adam": Reading("adam", "circle", "point"),
+    "gradient_100": {"samples": 100, "reading": Reading()},
+    "gradient_300": {"samples": 300, "reading": Reading()},
+    "gradient_starts_100": {"samples": 100, "reading": Reading(starts=4)},
+    "gradient_adam_100": {"samples": 100, "reading": Reading("adam", "circle", "point")},
 }
-"""Readings of the paper's planner: as printed, the best of four starts, Adam from 20 cm."""
-
-
-def papers_configs(prefix: str, readings: Sequence[str], world: str) -> dict[str, PlannerConfig]:
-    """Return configs of readings of the paper's planner, with its network.
-
-    The network has three trainings (`_seed_1`, `_seed_2`) and one on pushes only (`_pushes`). Plans
-    are executed as in the paper, each action placed by the plan; `_recentred`, placed at the object
-    as it is then observed, which differs for several actions only.
-    """
-    models = {"": PAPERS, "_pushes": "cnp_500"} | {seed: PAPERS + seed for seed in OTHER_SEEDS}
-    found = {}
-    for reading, samples, (end, model) in product(readings, (100, 300), models.items()):
-        how = {"samples": samples, "reading": READINGS[reading]}
-        one = PlannerConfig(plan_gradient, model, how, **BY_PLAN, world=world)
-        found[f"{prefix}{reading}_{samples}{end}"] = one
-        if world == "clean":
-            again = replace(one, execution={}, modes=("multi_partial",))
-            found[f"{reading}_{samples}_recentred{end}"] = again
-    return found
-
+"""Readings of the paper's planner: as printed with 100 and 300 phases, the best of four starts,
+Adam from 20 cm."""
 
 CONFIGS: dict[str, PlannerConfig] = {
-    # The paper's planners on its own network.
-    **papers_configs("", READINGS, "clean"),
-    "astar_paper": PlannerConfig(plan_astar, PAPERS, **ALL),
-    "astar_paper_recorded": PlannerConfig(plan_astar_recorded, PAPERS, **ALL),
+    # The paper's planners on its own network. Each action is placed by the plan, as in the paper;
+    # `_recentred`, at the object as it is then observed, which differs for several actions only.
+    **{
+        f"{name}_pushes": PlannerConfig(plan_gradient, "cnp_500", how, **BY_PLAN)
+        for name, how in READINGS.items()
+    },
+    "gradient_100_recentred_pushes": PlannerConfig(
+        plan_gradient, "cnp_500", READINGS["gradient_100"], modes=("multi_partial",)
+    ),
     "astar_paper_pushes": PlannerConfig(plan_astar, "cnp_500", **ALL),
     "astar_paper_recorded_pushes": PlannerConfig(plan_astar_recorded, "cnp_500", **ALL),
-    "continuous_paper": PlannerConfig(plan_continuous, PAPERS, **ALL),
-    "gradient_100_yaw": PlannerConfig(plan_gradient, "cnp_yaw_mixed_500", **BY_PLAN),
-    "continuous_paper_yaw": PlannerConfig(plan_continuous, "cnp_yaw_mixed_500"),
     # Our planner and A* on our best model.
     "continuous": PlannerConfig(plan_continuous, **ALL),
     "continuous_corrected": PlannerConfig(plan_continuous, **CORRECTED, **ALL),
@@ -272,7 +203,7 @@ CONFIGS: dict[str, PlannerConfig] = {
     "astar": PlannerConfig(plan_astar, standing=True),
     "astar_corrected": PlannerConfig(plan_astar, **CORRECTED, standing=True),
     "astar_by_plan": PlannerConfig(plan_astar, **BY_PLAN, standing=True),
-    "astar_full": PlannerConfig(plan_astar_full, standing=True),
+    "astar_full": PlannerConfig(plan_astar, arguments={"stop_phases": (1.0,)}, standing=True),
     "astar_disc": PlannerConfig(plan_astar, arguments=DISC, **ALL),
     "astar_disc_corrected": PlannerConfig(plan_astar, arguments=DISC, **CORRECTED, **ALL),
     "astar_disc_fine": PlannerConfig(plan_astar_fine, arguments=DISC, **ALL),
@@ -310,28 +241,10 @@ CONFIGS: dict[str, PlannerConfig] = {
     # Constants of the planners, on the validation goals.
     **{
         f"RISK_WEIGHT={weight:g}": PlannerConfig(
-            plan_continuous_with, arguments={"RISK_WEIGHT": weight}, world="validation"
+            plan_continuous, arguments={"risk_weight": weight}, world="validation"
         )
         for weight in RISK_WEIGHTS
     },
-    **{
-        f"{reading} rate={rate:g}": PlannerConfig(
-            plan_gradient,
-            "cnp_500",
-            {"reading": replace(READINGS[reading], rate=rate)},
-            **BY_PLAN,
-            world="validation",
-        )
-        for reading, rates in RATES.items()
-        for rate in rates
-    },
-    # Once, at the end, on goals that no choice has seen.
-    **papers_configs("fresh_", ("gradient",), "fresh"),
-    "fresh_astar_paper": PlannerConfig(plan_astar, PAPERS, **FRESH),
-    "fresh_astar_paper_recorded": PlannerConfig(plan_astar_recorded, PAPERS, **FRESH),
-    "fresh_continuous_paper": PlannerConfig(plan_continuous, PAPERS, **FRESH),
-    "fresh_continuous_film_500": PlannerConfig(plan_continuous, "film_500", **FRESH),
-    "fresh_continuous": PlannerConfig(plan_continuous, **FRESH),
 }
 
 
@@ -455,29 +368,20 @@ def outcome_record(task: PlanningTask, outcome: Outcome) -> dict[str, Any]:
         "distance_m": outcome.distance_m,
         "predicted_m": plan.predicted_distance_m,
         "prediction_error_m": float(error),
-        "std_m": plan.steps[-1].std_m if plan.steps else 0.0,
-        "steps": len(plan.steps),
         "actions": len(outcome.object_paths_xy_m),
         "plan_s": plan.plan_s,
     }
-
-
-def measure(
-    world: Tabletop, tasks: Sequence[PlanningTask], pose: Pose, planner: Planner, **execution: Any
-) -> list[Outcome]:
-    """Return the outcomes of tasks with one planner, in order; execution: options of `attempt`."""
-    return [attempt(world, task, pose, planner, **execution) for task in tasks]
 
 
 def run_config(config: str) -> list[dict[str, Any]]:
     """Return records of a planner's outcomes on its frozen goals, with the goals' numbers."""
     torch.set_num_threads(1)
     about, records = CONFIGS[config], []
-    tasks = frozen_tasks(about.world)
+    planner, tasks = partial(about.planner, **about.arguments), frozen_tasks(about.world)
     with Tabletop() as world:
         pose = about.pose(world)
         for k in tqdm(about.chosen(tasks), config, unit=" goals", leave=False):
-            outcome = attempt(world, tasks[k], pose, about.plan, **about.execution)
+            outcome = attempt(world, tasks[k], pose, planner, **about.execution)
             records.append({"task": k} | outcome_record(tasks[k], outcome))
     return records
 
@@ -486,89 +390,63 @@ def job(config: str) -> Job:
     """Return the job that evaluates one planner."""
     about = CONFIGS[config]
     settings, files = [about, tasks_sha256(about.world)], tuple(about.checkpoints.values())
-    version, data = VERSIONS.get(about.planner, 1), ()
-    if spec := OTHER_TRAININGS.get(about.model):
-        settings, data = [*settings, spec.network, spec.training], (spec.data,)
-    elif about.model in MADE:
-        data = ("push",)
+    version, data = VERSIONS.get(about.planner, 1), ("push",) if about.model in MADE else ()
     return Job(run_config, {"config": config}, settings, data, files, version)
 
 
-def planning_rows(records: Rows, **columns: Any) -> Rows:
-    """Return rows of `planning`: per source of goals and mode, for all objects and each category.
+def distances(records: dict[str, Rows]) -> pd.DataFrame:
+    """Return statistics of the final distance and its parts.
 
-    Mean and standard error are over goals, after averaging each goal's distances over trainings;
-    median and 95th percentile are over all; low and high are the means of single trainings.
-    columns: further columns of the rows, such as `PlannerConfig.columns`.
+    They are by planner, group of objects, source of goals and mode. search: predicted distance from
+    the goal; model: distance between predicted and actual positions.
     """
-    rows = []
-    table = pd.DataFrame(records)
-    table = pd.DataFrame({"task": table.index, "training": 0}).assign(**table)
-    for (source, mode), some in table.groupby(["goals", "mode"], sort=False):
-        for group, classes in GROUPS.items():
-            chosen = some[some.object_class.isin(classes)]
-            if chosen.empty:
-                continue
-            about = {"goals": source, "object_class": group, "mode": mode}
-            by_goal = chosen.groupby("task").distance_m.mean()
-            row = error_row(by_goal.to_numpy(), **columns, **about)
-            row["median_m"], row["p95_m"] = chosen.distance_m.quantile([0.5, 0.95])
-            means = chosen.groupby("training").distance_m.mean()
-            row |= {"trainings": len(means), "low_m": means.min(), "high_m": means.max()}
-            row["predicted_mean_m"] = chosen.predicted_m.mean()
-            row["prediction_error_mean_m"] = chosen.prediction_error_m.mean()
-            rows.append(row | {"actions_mean": chosen.actions.mean()})
-    return rows
+    table = pd.concat([pd.DataFrame(rows).assign(planner=name) for name, rows in records.items()])
+    group = {category: name for name, classes in GROUPS.items() for category in classes}
+    table["object_class"] = table["object_class"].map(group)
+    keys = ["planner", "object_class", "goals", "mode"]
+    return table.groupby(keys, sort=False).agg(
+        n=("distance_m", "size"),
+        mean_m=("distance_m", "mean"),
+        sem_m=("distance_m", "sem"),
+        median_m=("distance_m", "median"),
+        search_mean_m=("predicted_m", "mean"),
+        model_mean_m=("prediction_error_m", "mean"),
+    )
 
 
-def summary_rows(rows: Rows, source: str = "constructed") -> Rows:
+def summary_rows(table: pd.DataFrame, source: str = "constructed") -> Rows:
     """Return one row per planner and group on one source of goals: statistics of each mode."""
-    summary: dict[tuple[str, str], dict[str, Any]] = {}
-    for row in rows:
-        if row["goals"] == source and row["object_class"] not in STANDING + ROLLABLE:
-            names = ("planner", "model", "world", "object_class", "trainings")
-            new = {name: row[name] for name in names}
-            one = summary.setdefault((row["planner"], row["object_class"]), new)
-            for statistic in ("mean", "sem", "median", "low", "high"):
-                one[f"{row['mode']}_{statistic}_m"] = row[f"{statistic}_m"]
-            one["n"] = f"{one['n']}, {row['n']}" if "n" in one else str(row["n"])
-    return list(summary.values())
+    rows = []
+    of_source = table.xs(source, level="goals")
+    for (planner, group), some in of_source.groupby(level=["planner", "object_class"], sort=False):
+        about = CONFIGS[planner]
+        row = {"planner": planner, "model": about.model, "world": about.world}
+        row |= {"object_class": group, "n": ", ".join(map(str, some["n"]))}
+        for (*_, mode), values in some.iterrows():
+            row |= {f"{mode}_{name}": values[name] for name in ("mean_m", "sem_m", "median_m")}
+        rows.append(row)
+    return plain(rows)
 
 
-def decomposition_rows(rows: Rows) -> Rows:
-    """Return the parts of the open-loop error on constructed goals, by planner, mode and group.
-
-    search: predicted distance from the goal; model: distance between predicted and actual
-    positions; execution: total error with the simulator as the model, which has no σ and thus no
-    preference for low-variance plans.
-    """
-    place = ["world", "mode", "object_class"]
-    table = pd.DataFrame(rows).query("goals == 'constructed'")
-    oracle = table[table.planner.isin(["oracle", "perturbed_oracle"])].set_index(place).mean_m
-    table = table.join(oracle.rename("execution"), on=place)
+def decomposition_rows(table: pd.DataFrame) -> Rows:
+    """Return the parts of the open-loop error on constructed goals, by planner, mode and group."""
+    table = table.xs("constructed", level="goals").rename(columns={"mean_m": "total_mean_m"})
+    rows = table.drop(columns=["sem_m", "median_m"]).reset_index()
+    rows["world"] = [CONFIGS[planner].world for planner in rows["planner"]]
     open_loop = [name for name, about in CONFIGS.items() if {*about.execution} <= {"by_plan"}]
-    table = table[table.object_class.isin(["standing", "rollable"]) & table.planner.isin(open_loop)]
-    parts = {"predicted_mean_m": "search", "prediction_error_mean_m": "model"}
-    parts |= {"execution": "execution", "mean_m": "total"}
-    names = {column: f"{part}_mean_m" for column, part in parts.items()}
-    return plain(table[["planner", *place, "n", *parts]].rename(columns=names))
+    return plain(rows[rows["planner"].isin(open_loop)])
 
 
 VARIANTS = {
     name: name.removesuffix(change)
-    for change in ("_full", "_by_plan", "_corrected", "_recentred", "_yaw", "_recorded")
+    for change in ("_full", "_by_plan", "_corrected")
     for name in CONFIGS
     if name.removesuffix(change) in {*CONFIGS} - {name}
 } | {
-    "astar_disc": "astar",
     "astar_continuous": "continuous",
-    "gradient_300": "gradient_100",
-    "gradient_starts_100": "gradient_100",
-    "gradient_adam_100": "gradient_100",
     "cem": "continuous",
     "mpc_continuous": "continuous",
     "mpc_cem": "mpc_continuous",
-    "continuous_paper": "continuous_film_500",
     "continuous_cnp_500": "continuous_film_500",
     "continuous_film_500": "continuous",
     "continuous_limit_surface": "continuous_film_500",
@@ -579,49 +457,35 @@ VARIANTS = {
 def variant_rows(records: dict[str, Rows]) -> Rows:
     """Return paired differences of final distance for `VARIANTS`: mean [m] and interval.
 
-    They are on constructed goals, of stable objects and of all that both rows have.
+    They are on constructed goals and stable objects.
     """
     rows: Rows = []
     for name, than in VARIANTS.items():
         if not {name, than} <= set(records):
             continue
-        tables = [
-            pd.DataFrame(records[key]).query("goals == 'constructed'") for key in (name, than)
-        ]
-        both = pd.merge(*tables, on=["task", "training", "mode", "object_class"])
-        both["by_m"] = both.distance_m_x - both.distance_m_y
-        for group in ("standing", "all"):
-            some = both[both.object_class.isin(GROUPS[group])]
-            rng = np.random.default_rng(0)
-            for mode, pairs in some.groupby("mode", sort=False):
-                by_goal = pairs.groupby("task").by_m.mean()
-                mean, low, high = interval(by_goal, 2000, rng)
-                row = {"planner": name, "than": than, "object_class": group, "mode": mode}
-                row |= {"n": len(by_goal), "difference_mean_m": mean}
-                rows.append(row | {"low_m": low, "high_m": high})
+        both = pd.merge(*(pd.DataFrame(records[key]) for key in (name, than)), on="task")
+        both = both[both.object_class_x.isin(STANDING) & (both.goals_x == "constructed")]
+        rng = np.random.default_rng(0)
+        for mode, pairs in both.groupby("mode_x", sort=False):
+            by_m = pairs.distance_m_x - pairs.distance_m_y
+            mean, low, high = interval(by_m, 2000, rng)
+            about = {"planner": name, "than": than, "object_class": "standing", "mode": mode}
+            rows.append(
+                about | {"n": len(by_m), "difference_mean_m": mean, "low_m": low, "high_m": high}
+            )
     return rows
 
 
 def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
     """Return all tables of the evaluated planners."""
     found = {about["config"]: result for about, result in runner.read("planning", job, folder)}
-    records: dict[str, Rows] = {}
-    for name in CONFIGS:
-        if name in found:
-            row, _, seed = name.partition("_seed_")
-            training = {"training": int(seed or 0)}
-            records.setdefault(row, []).extend(one | training for one in found[name])
-    rows = [
-        one
-        for row, some in records.items()
-        for one in planning_rows(some, planner=row, **CONFIGS[row].columns())
-    ]
+    records = {name: found[name] for name in CONFIGS if name in found}
+    table = distances(records)
     return {
-        "planning": rows,
-        "summary": [*reported.PLANNING_ROWS, *summary_rows(rows)],
-        "summary_uniform": summary_rows(rows, "uniform"),
+        "summary": [*reported.PLANNING_ROWS, *summary_rows(table)],
+        "summary_uniform": summary_rows(table, "uniform"),
         "variants": variant_rows(records),
-        "error_decomposition": decomposition_rows(rows),
+        "error_decomposition": decomposition_rows(table),
     }
 
 

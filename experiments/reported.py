@@ -11,7 +11,7 @@ from typing import Any
 
 def _lever_up(model: str, *errors_cm: float) -> dict[str, Any]:
     steps = {f"step_{k}_mean_cm": error for k, error in enumerate(errors_cm, 1)}
-    return {"model": model, "folds": 5, "epochs": None, "n": None} | steps
+    return {"model": model, "folds": 5, "n": None} | steps
 
 
 LEVER_UP_ROWS = [

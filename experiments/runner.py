@@ -15,7 +15,6 @@ running jobs and at most half a minute. Equal results give identical bytes.
 from __future__ import annotations
 
 import argparse
-import asyncio
 import gzip
 import hashlib
 import importlib
@@ -25,8 +24,8 @@ import os
 import sys
 import time
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import closing
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -36,7 +35,6 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 from filelock import FileLock
-from joblib import parallel_config
 from scipy.stats import bootstrap
 from tqdm.auto import tqdm
 
@@ -49,7 +47,7 @@ from affordlib.workers import spread
 from experiments.commands import worker_type
 
 FOLDER = "data/results/raw"
-WRITE_EVERY_S, ANSWER_S = 30, 30
+WRITE_EVERY_S = 30
 NOT_DECISIVE = ("device",)
 """Options without influence on results: those of the machine."""
 
@@ -111,20 +109,6 @@ def _rounded(value: Any) -> Any:
     if isinstance(value, list):
         return [_rounded(v) for v in value]
     return float(f"{value:.6g}") if isinstance(value, float) else value
-
-
-STUDIES: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {}
-"""Functions that return rows by name, and fields of their `Job`; `experiments.studies` has all."""
-
-
-def study(*data: str, **decides: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Register a function as a study, with the data that it reads and more fields of its `Job`."""
-
-    def register(rows: Callable[..., Any]) -> Callable[..., Any]:
-        STUDIES[rows.__name__] = rows, {"data": data} | decides
-        return rows
-
-    return register
 
 
 def run(
@@ -220,35 +204,8 @@ def parser(table: str, description: str | None) -> argparse.ArgumentParser:
     shared.add_argument("--out", default="data/results")
     only = "run only jobs with these arguments, such as fold=0,1"
     shared.add_argument("--only", nargs="+", default=[], metavar="NAME=VALUE,…", help=only)
-    shared.add_argument("--scheduler", help="address of a Dask scheduler")
     shared.add_argument("--workers", type=worker_type, default=1, help="processes on this machine")
     return shared
-
-
-@contextmanager
-def cluster(scheduler: str | None) -> Iterator[None]:
-    """Let the workers of a Dask scheduler, if an address is given, run what `spread` runs.
-
-    Raises OSError if it does not answer within `ANSWER_S`.
-    """
-    if scheduler is None:
-        yield
-        return
-    from dask.distributed import Client, Security
-    from distributed.core import rpc
-
-    async def answer() -> None:
-        async with rpc(scheduler, connection_args=Security().get_connection_args("client")) as it:
-            await it.identity()
-
-    try:
-        asyncio.run(asyncio.wait_for(answer(), ANSWER_S))
-    except OSError as error:
-        raise OSError(
-            f"--scheduler: there is no Dask scheduler at {scheduler}: no answer in {ANSWER_S} s"
-        ) from error
-    with Client(scheduler), parallel_config("dask"):
-        yield
 
 
 def make(
@@ -266,8 +223,7 @@ def make(
             there = ", ".join(sorted(known))
             raise ValueError(f"--only: no job has {name} = {unknown[0]!r:.40}, but {there}")
         jobs = [job for job in jobs if str(job.arguments.get(name)) in values]
-    with cluster(options.scheduler):
-        run(jobs, table, options.raw, options.workers)
+    run(jobs, table, options.raw, options.workers)
     if tables is None:
         return 0
     try:

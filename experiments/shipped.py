@@ -22,6 +22,7 @@ import xarray as xr
 from torch import nn
 
 from affordlib.interactions import (
+    Split,
     open_interactions,
     split_interactions,
 )
@@ -36,6 +37,7 @@ from affordlib.models.checkpoint import SUFFIX, save_checkpoint
 from affordlib.models.training import (
     Sampler,
     TrainingConfig,
+    about_training,
     train_model,
 )
 from affordlib.planning import MODES
@@ -45,16 +47,13 @@ from affordlib.primitives import move_for
 from affordlib.results import repo_root, write_atomically
 from affordlib.types import Goal
 from affordlib.world import ROLLABLE, STANDING, Tabletop
-from experiments.attention import AttentionConfig
 from experiments.commands import command, worker_type
 from experiments.lever_training import (
     LEVER_CHECKPOINTS,
     LEVER_MODELS,
-    about_checkpoint,
     train_lever_model,
 )
 from experiments.lstm import LSTMConfig
-from experiments.runner import cluster
 from experiments.tasks import (
     FROZEN,
     MIN_DISTANCE_M,
@@ -97,9 +96,6 @@ GRASP_SYMMETRIES: tuple[Symmetry, ...] = (*HALF_TURNS, (0, True), (2, True))
 
 CHECKPOINT_SPECS: dict[str, CheckpointSpec] = {
     "cnp_500": CheckpointSpec("push", CNPConfig(), TrainingConfig(steps=5000, patience=20)),
-    "attention_500": CheckpointSpec(
-        "push", AttentionConfig(effect_channels=_YAW.effect_channels), _PUSH_FRAME
-    ),
     "film_500": CheckpointSpec("push", _YAW, _PUSH_FRAME),
     "film_5000": CheckpointSpec("push_x10", _YAW, _LONG),
     "film_5000_perturbed": CheckpointSpec("push_varied_x10", _YAW, _LONG),
@@ -145,27 +141,33 @@ def compare(old: xr.Dataset, new: xr.Dataset) -> tuple[bool, str]:
 
 def collect_sets(options: argparse.Namespace) -> bool:
     """Collect data sets; return whether each agrees with the existing one."""
-    agree, workers = True, 1 if options.scheduler else options.workers
-    with cluster(options.scheduler):
-        for name in options.only or SHIPPED:
-            try:
-                old = open_interactions(name)
-            except (FileNotFoundError, ValueError) as error:
-                old = None
-                print(f"{name}: there is no existing data set to compare with ({error})")
-            target = f"{options.to}/{name}{DATA_SUFFIX}"
-            new = open_interactions(collect(RECIPES[name], target, workers, replace=True))
-            print(f"{name}: {new.sizes['interaction']} interactions, sha256 {dataset_sha256(new)}")
-            if old is not None:
-                same, sentence = compare(old, new)
-                print(f"{name}: {sentence}")
-                agree &= same
+    agree = True
+    for name in options.only or SHIPPED:
+        try:
+            old = open_interactions(name)
+        except (FileNotFoundError, ValueError) as error:
+            old = None
+            print(f"{name}: there is no existing data set to compare with ({error})")
+        target = f"{options.to}/{name}{DATA_SUFFIX}"
+        new = open_interactions(collect(RECIPES[name], target, options.workers, replace=True))
+        print(f"{name}: {new.sizes['interaction']} interactions, sha256 {dataset_sha256(new)}")
+        if old is not None:
+            same, sentence = compare(old, new)
+            print(f"{name}: {sentence}")
+            agree &= same
     return agree
 
 
 def data_of(checkpoint: str) -> str:
     """Return the name of a shipped checkpoint's data set."""
     return CHECKPOINT_SPECS[checkpoint].data if checkpoint in CHECKPOINT_SPECS else "lever_up"
+
+
+def about_checkpoint(
+    data: xr.Dataset, split: Split, training: TrainingConfig, **more: str
+) -> dict[str, object]:
+    """Return the description of a shipped checkpoint's training, with further entries `more`."""
+    return about_training(data, np.concatenate([split.train, split.validation]), training) | more
 
 
 def train_checkpoint(name: str) -> None:
@@ -270,13 +272,12 @@ def draw_goals(_: argparse.Namespace) -> bool:
     missing = [world for world, path in FROZEN.items() if not (repo_root() / path).exists()]
     for name in missing:
         tasks: list[PlanningTask] = []
-        seed = {"validation": 1, "fresh": 2}.get(name, 0)  # the first objects of a seed are alike
+        seed = int(name == "validation")
         counts = VALIDATION_GOALS if name == "validation" else N_GOALS
         with Tabletop() as world:
             for mode, n in counts.items():
                 if name != "clean":
                     classes = ROLLABLE if name == "perturbed_rollable" else STANDING
-                    classes = STANDING + ROLLABLE if name == "fresh" else classes
                     variation = VARIATIONS.get(name)
                     tasks += constructed_tasks(world, mode, n, seed, classes, variation)
                     continue
@@ -311,7 +312,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     data.add_argument("--to", default=str(repo_root() / "data"), help="output folder")
     cores = min(os.cpu_count() or 1, 256)
     data.add_argument("--workers", type=worker_type, default=cores, help="local processes")
-    data.add_argument("--scheduler", help="address of a Dask scheduler to use instead: tcp://…")
     names = sorted([*CHECKPOINT_SPECS, *LEVER_CHECKPOINTS])
     checkpoints.add_argument("--only", nargs="+", choices=names, help="default: all")
     options = parser.parse_args(argv)

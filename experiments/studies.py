@@ -1,4 +1,4 @@
-"""Studies in addition to the cross-validation: ablations, representations, uncertainty, limits.
+"""Studies in addition to the cross-validation: ablations, novelty, codes, partial actions.
 
     python -m experiments.studies --only study=latent,ablation
 
@@ -8,45 +8,147 @@ computes missing or stale results in `data/results/raw/studies.jsonl.gz`. The ta
 
 from __future__ import annotations
 
-import importlib
-import inspect
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
-from experiments import runner
+import numpy as np
+import torch
+
+from affordlib.interactions import InteractionTensors, open_interactions
+from affordlib.models import condition_on_primitives, load_checkpoint
+from affordlib.primitives import Drag, Push
+from affordlib.types import Observations
+from experiments import ablation, literal, novelty, runner
 from experiments.commands import command
-from experiments.runner import FOLDER, STUDIES, Job, Rows, read
+from experiments.runner import FOLDER, Job, Rows, read
 
 NAME = "studies"
-MODULES = ("ablation", "representation", "uncertainty", "limits", "literal", "novelty")
-for module in MODULES:
-    importlib.import_module(f"experiments.{module}")
+WEIGHTS = (0.25, 0.5, 0.75)
+WHOLE_ACTION_MODELS = ("film_500", "film_5000", "drag_film_500")
+PHASES = (0.0, 0.55, 0.65, 0.75, 1.0)
+"""Edges of the phase bins; the gripper touches nothing before 0.5."""
+
+
+def _seen_by(arrays: InteractionTensors, observed: str, weight: float) -> Observations:
+    """Return a context of the action at t = 0 and 1, the effect at t = 0.8 and 1, or both."""
+    last = len(arrays.phase) - 1
+    ends, late = torch.tensor([0, last]), torch.tensor([round(0.8 * last), last])
+    action = None if observed == "effect" else arrays.action_at(ends)
+    effect = None if observed == "action" else arrays.effect_at(late)
+    return Observations.of(arrays, action, effect, torch.full((len(arrays),), weight))
+
+
+@torch.no_grad()
+def latent() -> Rows:
+    """Compare the codes r of action and effect of `push_test`, and predictions from them."""
+    model, _ = load_checkpoint("cnp_500")
+    arrays, rows = InteractionTensors.from_dataset(open_interactions("push_test")), []
+    features, ends = model.encode(arrays.image), torch.tensor([[0.0, 1.0]] * len(arrays))
+    of_action = model.represent(_seen_by(arrays, "action", 1.0))
+    for what, weight in (("action", 1.0), ("effect", 0.0), *(("both", w) for w in WEIGHTS)):
+        observed = _seen_by(arrays, what, weight)
+        predicted = model.predict(features, observed, ends)
+        start = predicted.action_mean[:, 0, :2] - arrays.action[:, 0, :2]
+        end = predicted.effect_mean[:, 1, :2] - arrays.effect[:, -1, :2]
+        row = {"model": "cnp_500", "observed": what, "w_1": weight, "n": len(arrays)}
+        alike = torch.cosine_similarity(model.represent(observed), of_action)
+        row["cosine_to_action"] = float(alike.mean())
+        row["action_start_mean_m"] = float(start.norm(dim=-1).mean())
+        rows.append(row | {"final_error_mean_m": float(end.norm(dim=-1).mean())})
+    return rows
+
+
+@torch.no_grad()
+def partial_execution() -> Rows:
+    """Measure the errors on partial actions of networks trained only on full actions.
+
+    Actions stop at phase t; the truth is the state of the full action at t, or the object's rest
+    position.
+    """
+    data, rows = open_interactions("partial"), []
+    names = data["primitive"].attrs["flag_meanings"].split()
+    kinds, phase = np.array(names)[data["primitive"].values], data["stop_phase"].values
+    whole, rest = (data[name].values for name in ("full_effect", "rest_effect"))
+    slid = np.hypot(*(rest - whole)[:, :2].T)
+    for name in WHOLE_ACTION_MODELS:
+        model, _ = load_checkpoint(name)
+        kind = Drag if name.startswith("drag") else Push
+        mine = np.flatnonzero((kinds == kind.name) & ~data["fault"].values)
+        actions = [kind(float(theta)) for theta in data["theta"].values[mine]]
+        features = model.encode(torch.from_numpy(data["image"].values[mine]))
+        at = torch.from_numpy(phase[mine]).float()[:, None]
+        predicted = model.predict(features, condition_on_primitives(model, actions), at)
+        columns = [model.effect_channels.index(c) for c in "xy"]
+        mean = predicted.effect_mean[:, 0, columns].numpy()
+        errors = [np.hypot(*(mean - truth[mine, :2]).T) for truth in (whole, rest)]
+        for low, high in pairwise(PHASES):
+            of = (phase[mine] > low) & (phase[mine] <= high)
+            row = {"model": name, "from_phase": low, "to_phase": high, "n": int(of.sum())}
+            for what, error in zip(("whole", "rest"), errors, strict=True):
+                row[f"{what}_mean_m"] = float(error[of].mean())
+                row[f"{what}_median_m"] = float(np.median(error[of]))
+            rows.append(row | {"slid_mean_m": float(slid[mine][of].mean())})
+    return rows
+
+
+STUDIES: dict[Callable[[], Rows], dict[str, Any]] = {
+    ablation.ablation: {
+        "data": ("push", "push_test"),
+        "settings": (ablation.ABOUT, ablation.CHANGES),
+        "version": 2,
+    },
+    ablation.incremental_ablation: {
+        "data": ("push",),
+        "settings": (ablation.ABOUT, [ablation.CHANGES[c] for c in ablation.LADDER.values()]),
+        "version": 2,
+    },
+    latent: {"data": ("push_test",), "checkpoints": ("cnp_500",), "settings": WEIGHTS},
+    literal.literal_training: {"data": ("push",), "settings": literal.DECISIVE},
+    novelty.novelty_gain: {
+        "data": ("push",),
+        "settings": novelty.SETTINGS,
+        "checkpoints": novelty.MODELS[:3],
+    },
+    novelty.novelty_judged: {
+        "data": ("push_test",),
+        "settings": (*novelty.SETTINGS, novelty.NOVELTY_GAIN),
+        "checkpoints": novelty.MODELS,
+    },
+    partial_execution: {
+        "data": ("partial",),
+        "checkpoints": WHOLE_ACTION_MODELS,
+        "settings": PHASES,
+    },
+}
+"""Functions that return the rows of a study, each with further fields of its `Job`."""
+
+BY_NAME = {study.__name__: study for study in STUDIES}
 
 
 def job(study: str) -> Job:
     """Return the job that makes the rows of a study."""
-    return Job(make_rows, {"study": study}, **STUDIES[study][1])
+    return Job(make_rows, {"study": study}, **STUDIES[BY_NAME[study]])
 
 
-def make_rows(study: str, resume_checkpoint: Path) -> Rows:
+def make_rows(study: str) -> Rows:
     """Make the rows of a study."""
-    rows, _ = STUDIES[study]
-    return rows(resume_checkpoint) if inspect.signature(rows).parameters else rows()
+    return BY_NAME[study]()
 
 
-def tables(table: str, folder: str | Path = FOLDER) -> dict[str, Rows]:
-    """Return the rows of the studies that belong to a table; raises ValueError for stale ones."""
+def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
+    """Return the rows of all finished studies; raises ValueError for stale ones."""
     made = {arguments["study"]: rows for arguments, rows in read(NAME, job, folder)}
-    here = [name for name in STUDIES if (name == "tuning") == (table == "lever_up")]
-    return {name: made[name] for name in here if name in made}
+    return {name: made[name] for name in BY_NAME if name in made}
 
 
 @command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
     """Run missing or stale studies."""
     options = runner.parser(NAME, main.__doc__).parse_args(argv)
-    return runner.make([job(name) for name in STUDIES], NAME, options)
+    return runner.make([job(name) for name in BY_NAME], NAME, options)
 
 
 if __name__ == "__main__":

@@ -8,10 +8,9 @@ import pytest
 
 from affordlib.primitives import Drag, Push
 from affordlib.world import Cuboid, WorldConfig
-from experiments import open_loop_pose_goals
-from experiments.closed_loop import N_TRIALS, sample_trial
+from experiments import closed_loop
+from experiments.closed_loop import N_TRIALS, run_trial, sample_trial
 from experiments.feasibility import is_feasible, on_the_rim, possible
-from experiments.open_loop_pose_goals import run_open_loop
 
 
 def test_the_kinematic_oracle_is_the_kinematics(world):
@@ -52,10 +51,10 @@ def test_trials_are_a_function_of_seed_and_number():
 
 
 def test_an_open_loop_trial_measures_what_is_missing(monkeypatch):
-    found, trial = run_open_loop("height", 0, "continuous"), sample_trial("height", 0)
-    assert max(found["pose_error"], found["distance_m"]) < 0.005
+    found, trial = run_trial("height", 0, world="open_loop"), sample_trial("height", 0)
+    assert max(abs(found["height_error_m"]), found["distance_m"]) < 0.005
     # An empty plan has the whole height as its error, and does not move the object.
-    monkeypatch.setattr(open_loop_pose_goals, "execute_plan", lambda *_: None)
-    idle = run_open_loop("height", 0, "astar")
-    assert idle["pose_error"] == pytest.approx(trial.goal.height_m, abs=1e-4)
+    monkeypatch.setattr(closed_loop, "execute_plan", lambda *_: None)
+    idle = run_trial("height", 0, world="open_loop")
+    assert abs(idle["height_error_m"]) == pytest.approx(trial.goal.height_m, abs=1e-4)
     assert idle["distance_m"] == pytest.approx(np.hypot(*trial.goal.xy_m), abs=1e-4)

@@ -63,7 +63,7 @@ def test_a_file_in_place_of_a_folder_is_named(tmp_path, capsys, line):
 @pytest.mark.parametrize(
     ("only", "named"),
     [
-        ("model=film,flim", "no job has model = 'flim', but attention, cnp, .*, nearest$"),
+        ("model=film,flim", "no job has model = 'flim', but cnp, .*, nearest$"),
         ("fold=11", "no job has fold = '11', but 0, 1,"),
         ("modle=film", "no job has modle = 'film', but None$"),
     ],

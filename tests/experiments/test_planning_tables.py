@@ -55,8 +55,6 @@ def test_a_shipped_checkpoint_can_be_trained_again(monkeypatch, capsys):
 
 def test_planners_differ_and_are_asked_about_all_their_categories_alike():
     assert CONFIGS["continuous"].classes == CONFIGS["oracle"].classes == STANDING + ROLLABLE
-    assert CONFIGS["gradient_100"].classes == CONFIGS["fresh_continuous"].classes
-    assert CONFIGS["gradient_100"].classes == STANDING + ROLLABLE
     assert CONFIGS["gradient_100_pushes"].classes == STANDING
     assert CONFIGS["perturbed_oracle"].classes == CONFIGS["outside"].classes == STANDING
     assert len({repr(config) for config in CONFIGS.values()}) == len(CONFIGS)
@@ -74,7 +72,7 @@ def test_planners_differ_and_are_asked_about_all_their_categories_alike():
 def test_an_object_with_a_perturbed_start_is_missed_by_as_much(world):
     tasks = [t for t in frozen_tasks() if t.mode == "single_partial" and not t.obj.rollable][:4]
     config = CONFIGS["continuous"]
-    how = config.pose(world), config.plan
+    how = config.pose(world), config.planner
     there, perturbed = (
         np.mean([attempt(world, t, *how, perturbed_start=p).distance_m for t in tasks])
         for p in (False, True)
@@ -89,7 +87,7 @@ def test_actions_are_placed_by_the_plan(world):
 
     def watched(problem):
         seen.append(problem.start_xy_m)
-        return config.plan(problem)
+        return config.planner(problem)
 
     again, once = (
         attempt(world, task, config.pose(world), watched, by_plan=by_plan)
@@ -107,7 +105,7 @@ def test_with_a_receding_horizon_each_plan_has_one_action_less(world):
 
     def watched(problem):
         seen.append((problem.start_xy_m, problem.mode.max_steps))
-        plan = config.plan(problem)
+        plan = config.planner(problem)
         # A plan that stops half way has a remaining distance.
         steps = tuple(replace(s, stop_phase=0.8) for s in plan.steps) if len(seen) < 3 else ()
         return replace(plan, steps=steps)
@@ -127,7 +125,7 @@ def test_planners_of_the_field_keep_to_their_actions_and_improve_on_their_start(
     for task in tasks[::12]:
         world.place(task.obj, (0.0, 0.0), task.yaw_rad, config=task.config)
         about = world.depth_image(), (0.0, 0.0), task.goal, task.mode
-        plans = [c.plan(pose(*about)) for c, pose in zip(configs, poses, strict=True)]
+        plans = [c.planner(pose(*about)) for c, pose in zip(configs, poses, strict=True)]
         for plan in plans:
             assert len(plan.steps) <= MODES[task.mode].max_steps
             assert MODES[task.mode].partial or all(s.stop_phase == 1 for s in plan.steps)
@@ -160,32 +158,25 @@ def test_by_physics_the_fingers_carry_a_cylinder_to_where_they_stop(world):
 def test_with_the_simulator_as_model_hardly_anything_remains(world, rollable):
     single = [t for t in frozen_tasks() if t.mode == "single_partial"]
     task = next(t for t in single if t.obj.rollable == rollable)
-    outcome = attempt(world, task, CONFIGS["oracle"].pose(world), CONFIGS["oracle"].plan)
+    outcome = attempt(world, task, CONFIGS["oracle"].pose(world), CONFIGS["oracle"].planner)
     assert outcome.distance_m < 0.001
     assert isinstance(outcome.plan.steps[0].primitive, Drag) == rollable
 
 
 def test_another_version_of_a_planner_makes_its_results_stale(monkeypatch):
-    rows = {name.partition("_seed_")[0] for name in CONFIGS}
-    assert {row["planner"] for row in planning.tables()["planning"]} <= rows
     monkeypatch.setitem(planning.VERSIONS, planning.plan_astar, 99)
     with pytest.raises(ValueError, match=r"'astar\w*'} was made of another version"):
         planning.tables()
 
 
-def test_a_row_has_the_mean_of_each_goal_over_trainings():
-    about = {"goals": "constructed", "mode": "single_full", "object_class": "sphere"}
-    more = {"predicted_m": 0.0, "prediction_error_m": 0.0, "actions": 1}
+def test_a_row_has_the_statistics_of_its_goals():
+    about = {"goals": "constructed", "mode": "single_full", "predicted_m": 0.0}
     records = [
-        {"task": task, "training": training, "distance_m": distance_m} | about | more
-        for (task, training), distance_m in zip(
-            [(0, 0), (1, 0), (0, 1), (1, 1)], (0.001, 0.003, 0.005, 0.007), strict=True
-        )
+        {"object_class": name, "distance_m": distance_m, "prediction_error_m": 0.002} | about
+        for name, distance_m in (("cuboid", 0.001), ("upright_cylinder", 0.003), ("sphere", 1.0))
     ]
-    row = planning.planning_rows(records, planner="p")[0]
-    assert (row["n"], row["trainings"]) == (2, 2)
-    assert (row["mean_m"], row["median_m"]) == pytest.approx((0.004, 0.004))
-    assert row["sem_m"] == pytest.approx(0.001)  # of the goals' means, 3 and 5 mm
-    assert (row["low_m"], row["high_m"]) == pytest.approx((0.002, 0.006))
-    whole = planning.planning_rows([{k: v for k, v in records[0].items() if k != "task"}])[0]
-    assert (whole["n"], whole["trainings"], whole["mean_m"]) == (1, 1, 0.001)
+    standing, rollable = planning.summary_rows(planning.distances({"continuous": records}))
+    assert (standing["n"], rollable["n"], standing["world"]) == ("2", "1", "clean")
+    found = [standing[f"single_full_{name}_m"] for name in ("mean", "sem", "median")]
+    assert found == pytest.approx([0.002, 0.001, 0.002])
+    assert rollable["single_full_sem_m"] is None

@@ -73,7 +73,7 @@ def test_a_bad_checkpoint_is_named(untrained, tmp_path):
             load_checkpoint(path)
 
 
-@pytest.mark.parametrize("name", ["attention_500", "lstm_500", "lever_up_lstm_1800_window"])
+@pytest.mark.parametrize("name", ["lstm_500", "lever_up_lstm_1800_window"])
 def test_a_shipped_network_from_elsewhere_loads_in_a_fresh_process(name):
     code = f"from affordlib.models import load_checkpoint as load; print(*load({name!r})[1])"
     command = [sys.executable, "-c", code]

@@ -29,7 +29,7 @@ def made(name, levered):
     return model
 
 
-@pytest.fixture(scope="module", params=["cnp_last_pose", "lstm_tuned", "cnp", "cnp_mean"])
+@pytest.fixture(scope="module", params=["cnp_last_pose", "lstm_tuned", "cnp"])
 def untrained(request, levered):
     return made(request.param, levered)
 
