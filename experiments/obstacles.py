@@ -37,7 +37,10 @@ from affordlib.planning import (
 )
 from affordlib.planning.continuous import free, starts
 from affordlib.planning.free_space import (
+    FULL_AT_M,
+    MARGIN_M,
     N_POSES,
+    START_M,
     FreeSpace,
     corners_of,
     gaps_m,
@@ -348,8 +351,8 @@ def run_task(row: str, family: str, index: int, seed: int) -> dict[str, Any]:
     }
 
 
-N_PUSHES, N_BESIDE = 20, 20
-"""Actions of a calibration job, and obstacles beside each of them."""
+N_PUSHES, N_BESIDE, WITHIN_GAP_M = 20, 20, 0.02
+"""Actions of a calibration job, obstacles beside each, and the gaps [m] that are counted."""
 
 
 def calibrate(kind: str, index: int) -> list[dict[str, float]]:
@@ -409,25 +412,30 @@ def make(row: str, family: str, index: int, seed: int) -> Any:
     return run_task(row, family, index, seed)
 
 
-def jobs_of(row: str, share: float = 1.0, seed: int = SEED) -> list[Job]:
-    """Return the jobs of a row, for a share of each family's tasks, one family after the other."""
-    n = {family: max(1, round(share * n)) for family, n in FAMILIES.items()}
-    return [job(row, family, k, seed) for family in n for k in range(n[family])]
-
-
 SHARE = 0.25
 """Share of each family's tasks that are run; all rows have the same tasks."""
 
+TASKS = sorted(
+    ((family, k) for family, n in FAMILIES.items() for k in range(round(SHARE * n))),
+    key=lambda task: (task[1] / FAMILIES[task[0]], task[0]),
+)
+GROUPS = (
+    ("continuous", "continuous_full", "feasible"),
+    ("astar", "astar_full"),
+    ("check_ends", "check_line", "check_object", "check_goal"),
+    ("perturbed", "perturbed_full"),
+    ("cem", "gradient"),
+)
 JOBS = [
     *(job("margin", kind, k) for kind, n in (("push", 3), ("drag", 1)) for k in range(n)),
-    *(one for row in ("feasible", *ROWS) for one in jobs_of(row, SHARE)),
+    *(job(row, *task) for rows in GROUPS for task in TASKS for row in rows),
 ]
 
 
 def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
     """Return the tables of all stored results."""
     found = runner.read(NAME, job, folder)
-    errors = pd.DataFrame([e for a, r in found if a["row"] == "margin" for e in r])
+    errors = pd.DataFrame([a | e for a, r in found if a["row"] == "margin" for e in r])
     records = pd.DataFrame([a | r for a, r in found if a["row"] in ROWS])
     searched = ((a["family"], a["index"], r) for a, r in found if a["row"] == "feasible")
     feasible = {(family, index): r for family, index, r in searched}
@@ -439,13 +447,20 @@ def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
 
 
 def margin_rows(errors: pd.DataFrame) -> Rows:
-    """Return quantiles of the gap's error [m], by the predicted travel."""
-    spans = {"all": (0.0, 1.0), "under 2 mm": (0.0, 0.002), "over 2 cm": (0.02, 1.0)}
+    """Return quantiles of the gap's error [m], and how many touch of what is predicted to pass.
+
+    at_margin_percent: of those that pass at the margin; within_percent: of those that pass by up to
+    `WITHIN_GAP_M` more, all gaps being equally frequent.
+    """
     rows = []
-    for name, (low, high) in spans.items():
-        some = errors.error_m[(errors.travel_m >= low) & (errors.travel_m < high)]
-        rows.append({"travel": name, "n": len(some)})
-        rows[-1] |= {f"q{q}_m": float(some.quantile(q / 100)) for q in (50, 95, 99)}
+    for kind, some in errors.groupby("family", sort=False):
+        grown = np.minimum(some.travel_m / FULL_AT_M, 1)
+        over = some.error_m - START_M - (MARGIN_M - START_M) * grown
+        row = {"primitive": kind, "n": len(some)}
+        row |= {f"q{q}_m": float(some.error_m.quantile(q / 100)) for q in (50, 95, 99)}
+        row["at_margin_percent"] = 100 * float((over > 0).mean())
+        row["within_percent"] = 100 * float((over / WITHIN_GAP_M).clip(0, 1).mean())
+        rows.append(row)
     return rows
 
 

@@ -79,7 +79,7 @@ class ClosedLoopConfig:
 
     mode: of its plans. max_actions: default `action_limit` of the distance, renewed when the goal
     moves or, up to max_renewals times, when somebody displaces the object; max_lifts: of grasps.
-    max_plans, max_routes: see `MovePlanner`. n_images: number of images averaged per observation;
+    max_plans: see `MovePlanner`. n_images: number of images averaged per observation;
     eight of the Kinect give the rotation to one degree.
 
     surprise_m: distance of the object from its predicted position above which it plans again;
@@ -95,7 +95,6 @@ class ClosedLoopConfig:
     max_renewals: int = 3
     max_lifts: int = 2
     max_plans: int = 12
-    max_routes: int = 150
     n_images: int = 1
     surprise_m: float = 0.002
     displaced_m: float = 0.03
@@ -196,7 +195,7 @@ class _ClosedLoop:
         config: ClosedLoopConfig,
     ) -> None:
         self.robot, self.goal_now, self.skills, self.config = robot, goal_now, skills, config
-        patience = config.mode, config.max_plans, config.max_routes
+        patience = config.mode, config.max_plans
         self.moves = MovePlanner(robot, skills, planner, *patience)
         self.goal = self.acted_for = goal_now()  # updated before each action and after a lift
         self.steps: list[Step] = []

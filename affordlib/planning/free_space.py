@@ -26,8 +26,8 @@ from affordlib.primitives import Primitive, Push, Rotate, min_jerk
 from affordlib.types import Obstacle, Step
 
 DISC_SIDES, N_POSES = 16, 7
-START_M, MARGIN_M, FULL_AT_M = 0.001, 0.004, 0.02
-"""By `experiments.obstacles`: of what is predicted to pass at this gap, at most 1 % touches."""
+START_M, MARGIN_M, FULL_AT_M = 0.002, 0.004, 0.02
+"""By `experiments.obstacles`: of what is predicted to pass by up to 2 cm more, 1 % may touch."""
 
 FINGER_M = (0.02, 0.012)
 """Length and width [m] of a finger, along the hand's yaw and across it."""

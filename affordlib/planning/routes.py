@@ -6,7 +6,7 @@ this for all places at once; the planner then goes from waypoint to waypoint.
 """
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -62,23 +62,18 @@ class RouteMap:
         left = {name: getattr(self, name)[ok] for name in ("origin", "end", "length_m")}
         return replace(self, **left)
 
-    def place_at(self, xy_m: Sequence[float]) -> int:
-        """Index of the place that is nearest to a point (x, y) [m]."""
-        return int(np.hypot(*(self.places_xy_m - xy_m).T).argmin())
-
 
 def find_route(
     routes: RouteMap,
     start_xy_m: Sequence[float],
     goal_xy_m: Sequence[float],
     feasible: Feasible,
-    blocked: Iterable[tuple[int, int]] = (),
     radius_m: float = 0.0,
-) -> list[tuple[float, float]] | None:
-    """Places (x, y) [m] after each action of the shortest route, the goal last; None without one.
+) -> list[tuple[float, float]]:
+    """Places (x, y) [m] after each action of the shortest route, the goal last; empty without one.
 
-    feasible: used for the first and the last action. blocked: moves between places that must not be
-    used; radius_m: minimum distance of the route's places from the rim of the table.
+    feasible: used for the first and the last action. radius_m: minimum distance of the route's
+    places from the rim of the table.
     """
     start, goal = np.asarray(start_xy_m, dtype=float), np.asarray(goal_xy_m, dtype=float)
 
@@ -99,8 +94,7 @@ def find_route(
     places = routes.places_xy_m
     n, inside = len(places), routes.table.holds(places, radius_m)
     last_m = np.where(inside, one_action(places, goal), np.inf)
-    barred = [n * origin + end for origin, end in blocked]
-    usable = inside[routes.origin] & ~np.isin(n * routes.origin + routes.end, barred)
+    usable = inside[routes.origin]
     origin, end, length_m = (v[usable] for v in (routes.origin, routes.end, routes.length_m))
     # The graph is reversed, to search from the goal, which has index n.
     lasts = np.flatnonzero(np.isfinite(last_m))
@@ -111,7 +105,7 @@ def find_route(
     to_go_m = dijkstra(csr_array(backwards, shape=(n + 1, n + 1)), indices=n)[:n]
     first_m = one_action(start, places) + to_go_m
     if not np.isfinite(first_m).any():
-        return None
+        return []
     at = int(first_m.argmin())
     route = [at]
     while to_go_m[at] < last_m[at] - 1e-12:

@@ -444,13 +444,9 @@ def test_a_route_is_the_shortest_and_keeps_the_whole_object_on_the_table():
     assert 0.95 * round_it < lengths.sum() < 1.05 * round_it
     assert gap(route[:-1], None, None).all()
     wall = RouteMap.of(0.075, lambda xy_m, *_: np.abs(xy_m[:, 1]) > 0.1)
-    assert find_route(wall, start, goal, gap) is None
+    assert find_route(wall, start, goal, gap) == []
     inside = np.array(find_route(routes, (0.2, 0.65), (0.62, 0.65), gap, radius_m=0.045))
     assert Table().holds(inside, 0.045).all()
-    move = tuple(routes.place_at(xy) for xy in route[3:5])
-    around = np.array([start, *find_route(routes, start, goal, gap, {move})])
-    assert move not in itertools.pairwise(routes.place_at(xy) for xy in around)
-    assert np.hypot(*np.diff(around, axis=0).T).sum() >= lengths.sum()
 
 
 # Goals, and plans that are executed
