@@ -11,7 +11,6 @@ ARGS    =
 FORCE   =
 KEEP    =
 DRY_RUN =
-SEEDS   = 0 1 2
 WORKERS = 2
 JOBS    = 2
 INDEX   =
@@ -35,7 +34,7 @@ $(shell find Makefile $(INPUTS) affordlib experiments notebooks data -newermt no
 
 yes = $(filter-out 0 no false,$(1))
 
-export PROFILE SEED SEEDS WORKERS OUT ONLY ARGS FORCE JOBS INDEX
+export PROFILE SEED WORKERS OUT ONLY ARGS FORCE JOBS INDEX
 override FORCE   := $(call yes,$(FORCE))
 override KEEP    := $(call yes,$(KEEP))
 override DRY_RUN := $(call yes,$(DRY_RUN))
@@ -48,7 +47,7 @@ unexport MPLBACKEND MATPLOTLIBRC
 unexport PIP_USER PIP_TARGET PIP_PREFIX PIP_REQUIREMENT PIP_CONSTRAINT
 unexport PYTEST_ADDOPTS JUPYTER_PATH JUPYTER_TOKEN
 
-.PHONY: help setup workbook seeds lab test test-fast test-plain test-slow soak size book-check lint format bench data checkpoints notebooks html tables \
+.PHONY: help setup workbook lab test test-fast test-plain test-slow soak size book-check lint format bench data checkpoints notebooks html tables \
         constraints clean
 
 help: ## List the targets
@@ -111,11 +110,6 @@ $(RUN)/%.ipynb $(RUN)/%.json: $(1)/%.ipynb $(USED)
 endef
 $(foreach folder,notebooks notebooks/appendix,$(eval $(call PAGES,$(folder))))
 endif
-
-seeds: $(STAMP) ## Run all pages for several seeds, and write tables over seeds (SEEDS="0 1 2" …)
-	@set -f; name="$${OUT:-$$PROFILE}"; \
-	 for seed in $$SEEDS; do $(LEASH) $(MAKE) workbook SEED="$$seed" OUT="$$name-seed$$seed"; done; \
-	 $(if $(DRY_RUN),,exec $(PY) -m experiments.seeds "runs/$$name" $$SEEDS)
 
 lab: $(STAMP) ## Open the book in JupyterLab, on this machine only (ARGS="--port 9999 --no-browser")
 	@set -f; root=; [[ $$(id -u) == 0 ]] && root=--allow-root; \

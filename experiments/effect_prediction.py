@@ -30,7 +30,7 @@ from experiments.cross_validation import (
     by_model,
     job,
 )
-from experiments.grasps import grasp_rows, roc_rows, threshold_rows
+from experiments.grasps import grasp_rows
 from experiments.runner import FOLDER, Result, Rows, frame, read
 
 NAME = "effect_prediction"
@@ -140,8 +140,6 @@ def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
         "push_test": errors("push", "fixed_test"),
         "drag": errors("drag", "fold_test"),
         "grasp": [*reported.grasp_rows(grasp[0]), *grasp] if grasp else [],
-        "grasp_threshold": threshold_rows(grasps),
-        "grasp_roc": roc_rows(grasps),
         "rotate": errors("rotate", "fold_test"),
         "inverse": errors("push", "inverse"),
         "frames": frame_rows(results),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 import torch
@@ -16,8 +15,6 @@ from affordlib.world import Tabletop, TabletopObject, WorldConfig
 
 N_DIRECTIONS, PHASE_STEP = 36, 0.025
 STD_M = 1e-5
-YAW_ERROR_RAD = math.radians(1.0)
-"""Error [rad] of the object's yaw that the risk-averse oracle assumes."""
 
 
 @dataclass
@@ -63,34 +60,13 @@ class SimulatorModel:
         return Prediction(action, torch.full_like(action, STD_M), mean, std)
 
 
-def oracle_effects(
-    imagined: Tabletop,
-    world: Tabletop,
-    image: np.ndarray,
-    nominal_physics: bool = False,
-    risk_averse: bool = False,
-) -> EffectMap:
+def oracle_effects(imagined: Tabletop, world: Tabletop, image: np.ndarray) -> EffectMap:
     """Return the effect map of the object in a world, from actions executed in an imagined world.
 
-    nominal_physics: the imagined world has the mean parameters of all worlds instead of this
-    world's; its camera has no error. risk_averse: σ is the sensitivity of the effect to
-    `YAW_ERROR_RAD`, and not negligible as otherwise.
+    The imagined world has this world's physics; its camera has no error.
     """
     kind = move_for(world.placed.rolls())
-    physics = WorldConfig() if nominal_physics else world.config
-    config = replace(physics, camera="ideal", bias_m=(0.0, 0.0))
+    config = replace(world.config, camera="ideal", bias_m=(0.0, 0.0))
     model = SimulatorModel(imagined, world.obj, world.object_pose()[2], kind, config)
     phases = phases_of(kind, round((1 - kind.acts_from) / PHASE_STEP) + 1)
-    effect_map = SensitivityMap if risk_averse else EffectMap
-    return effect_map(model, image, kind, N_DIRECTIONS, len(phases))
-
-
-class SensitivityMap(EffectMap):
-    """An effect map whose σ is the change of the effects due to `YAW_ERROR_RAD`."""
-
-    @cached_property
-    def grid(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return effects and σ (D, T, 3) at the grid's directions and phases."""
-        mean, _ = super().grid
-        slope = (mean.roll(-1, 0) - mean.roll(1, 0)) / (4 * math.pi / self.n_directions)
-        return mean, YAW_ERROR_RAD * slope.abs() + STD_M
+    return EffectMap(model, image, kind, N_DIRECTIONS, len(phases))

@@ -23,7 +23,6 @@ import pandas as pd
 import torch
 from tqdm.auto import tqdm
 
-from affordlib.models.base import EffectModel
 from affordlib.models.checkpoint import load_checkpoint
 from affordlib.perception import adapt_to_object
 from affordlib.planning import (
@@ -47,7 +46,7 @@ from affordlib.types import NothingSeenError, Observation, Outcome, Plan, Step
 from affordlib.world import ROLLABLE, STANDING, Tabletop, UnreachableError
 from experiments import reported, runner
 from experiments.commands import command
-from experiments.field_baselines import LimitSurface, plan_astar_continuous, plan_cem
+from experiments.field_baselines import plan_cem
 from experiments.oracle import oracle_effects
 from experiments.runner import FOLDER, Job, Rows, interval, plain
 from experiments.tasks import GOAL_SOURCES, PlanningTask, frozen_tasks, tasks_sha256
@@ -55,7 +54,6 @@ from experiments.tasks import GOAL_SOURCES, PlanningTask, frozen_tasks, tasks_sh
 ENOUGH_M = 0.0003
 """Distance [m] from the goal below which no corrective action is tried, as none would help."""
 
-POSITION_ERROR_M, YAW_ERROR_RAD = 0.001, math.radians(1.0)
 GROUPS = {"standing": STANDING, "rollable": ROLLABLE}
 FINE_PHASES = tuple(round(0.5 + 0.05 * k, 2) for k in range(1, 11))
 
@@ -89,9 +87,6 @@ def plan_astar_fine(problem: PlanningProblem, heuristic: str = "goal") -> Plan:
     return plan_astar(problem, 72, FINE_PHASES, heuristic)
 
 
-MADE: dict[str, Callable[[], EffectModel]] = {"limit_surface": LimitSurface.fitted}
-"""Models without a checkpoint, which the job fits on `push`."""
-
 Pose = Callable[..., PlanningProblem]
 """Poses the problem of (image, start_xy_m, goal, mode), as `Skills.problem` does."""
 
@@ -105,16 +100,14 @@ class PlannerConfig:
     """A planner, its model, and its goals.
 
     planner: a function of a `PlanningProblem`; arguments: its further arguments; execution: fields
-    of `Attempt`. model: a checkpoint, one of `MADE`, or "simulator"; oracle: arguments of
-    `oracle_effects` for "simulator". world, sources, modes: of the frozen goals; stride: use every
-    stride-th goal; standing: exclude rollable objects.
+    of `Attempt`. model: a checkpoint or "simulator". world, sources, modes: of the frozen goals;
+    stride: use every stride-th goal; standing: exclude rollable objects.
     """
 
     planner: Callable[..., Plan]
     model: str = "film_5000"
     arguments: dict[str, Any] = field(default_factory=dict)
     execution: dict[str, Any] = field(default_factory=dict)
-    oracle: dict[str, bool] = field(default_factory=dict)
     world: str = "clean"
     sources: tuple[str, ...] = ("constructed",)
     stride: int = 1
@@ -124,7 +117,7 @@ class PlannerConfig:
     @property
     def checkpoints(self) -> dict[str, str]:
         """Checkpoints by primitive: the model's, and one for drags if rollable objects occur."""
-        if self.model in ("simulator", *MADE):
+        if self.model == "simulator":
             return {}
         drags = self.model.startswith("film") and self.world not in ("perturbed", "outside")
         return {"push": self.model} | ({"drag": "drag_film_500"} if drags else {})
@@ -149,13 +142,11 @@ class PlannerConfig:
     def pose(self, world: Tabletop) -> Pose:
         """Return what poses the problems; only the model "simulator" reads the world's state."""
         models = {kind: load_checkpoint(name)[0] for kind, name in self.checkpoints.items()}
-        if self.model in MADE:
-            models["push"] = MADE[self.model]()
         skills, imagined = Skills(models), None if models else Tabletop()
 
         def pose(image, start_xy_m, goal, mode) -> PlanningProblem:
             if imagined:
-                effects = oracle_effects(imagined, world, image, **self.oracle)
+                effects = oracle_effects(imagined, world, image)
             else:
                 kind = skills.kind_for(image) if "drag" in models else Push
                 effects = EffectMap(skills.model(kind), image, kind)
@@ -207,22 +198,16 @@ CONFIGS: dict[str, PlannerConfig] = {
     "astar_disc": PlannerConfig(plan_astar, arguments=DISC, **ALL),
     "astar_disc_corrected": PlannerConfig(plan_astar, arguments=DISC, **CORRECTED, **ALL),
     "astar_disc_fine": PlannerConfig(plan_astar_fine, arguments=DISC, **ALL),
-    # Standard planners and a physics-based model.
-    "astar_continuous": PlannerConfig(plan_astar_continuous, standing=True),
+    # A standard planner.
     "cem": PlannerConfig(plan_cem, standing=True),
     "mpc_cem": PlannerConfig(plan_cem, **RECEDING, standing=True),
     "mpc_continuous": PlannerConfig(plan_continuous, **RECEDING, standing=True),
-    "continuous_limit_surface": PlannerConfig(plan_continuous, "limit_surface"),
-    # Other networks, one of them recurrent, and a small error of the object's pose.
+    # Other networks, one of them recurrent.
     "continuous_cnp_500": PlannerConfig(plan_continuous, "cnp_500", **ALL),
     "continuous_film_500": PlannerConfig(plan_continuous, "film_500", **ALL),
     "continuous_lstm_500": PlannerConfig(plan_continuous, "lstm_500"),
-    "continuous_perturbed_start": PlannerConfig(
-        plan_continuous, execution={"perturbed_start": True}
-    ),
     # The simulator in place of a model.
     "oracle": PlannerConfig(plan_continuous, **ORACLE),
-    "oracle_risk_averse": PlannerConfig(plan_continuous, **ORACLE, oracle={"risk_averse": True}),
     # The perturbed world with a noisy camera.
     "perturbed": PlannerConfig(plan_continuous, **PERTURBED),
     "perturbed_corrected": PlannerConfig(plan_continuous, **PERTURBED, **CORRECTED),
@@ -235,9 +220,6 @@ CONFIGS: dict[str, PlannerConfig] = {
     "outside": PlannerConfig(plan_continuous, **OUTSIDE),
     "outside_corrected": PlannerConfig(plan_continuous, **OUTSIDE, **CORRECTED),
     "perturbed_oracle": PlannerConfig(plan_continuous, **ORACLE, world="perturbed", stride=5),
-    "perturbed_oracle_nominal": PlannerConfig(
-        plan_continuous, **ORACLE, oracle={"nominal_physics": True}, world="perturbed", stride=5
-    ),
     # Constants of the planners, on the validation goals.
     **{
         f"RISK_WEIGHT={weight:g}": PlannerConfig(
@@ -252,16 +234,13 @@ CONFIGS: dict[str, PlannerConfig] = {
 class Attempt:
     """How a plan is executed.
 
-    corrections: largest number of single actions that correct the final position. perturbed_start:
-    at execution, the object's estimated pose has an error of `POSITION_ERROR_M` and
-    `YAW_ERROR_RAD`. n_averaged_images: number of images of which a position is the mean. by_plan:
-    each action is relative to the object's predicted position instead of the observed one.
-    receding: after each action, a new plan is made for the remaining number of actions
-    (model-predictive control).
+    corrections: largest number of single actions that correct the final position.
+    n_averaged_images: number of images of which a position is the mean. by_plan: each action is
+    relative to the object's predicted position instead of the observed one. receding: after each
+    action, a new plan is made for the remaining number of actions (model-predictive control).
     """
 
     corrections: int = 0
-    perturbed_start: bool = False
     n_averaged_images: int = 1
     by_plan: bool = False
     receding: bool = False
@@ -329,10 +308,6 @@ def attempt(
         setattr(robot, name, getattr(world, name))
     seen = robot.observe()
     plan = planner(pose(seen.image, seen.xy_m, task.goal, task.mode))
-    if how.perturbed_start:
-        side = POSITION_ERROR_M * np.array([math.cos(task.yaw_rad), math.sin(task.yaw_rad)])
-        config = replace(task.config, bias_m=tuple(side))
-        world.place(task.obj, (0.0, 0.0), task.yaw_rad + YAW_ERROR_RAD, config=config)
     at_xy_m = seen.xy_m
     now = replace(plan, steps=plan.steps[:1]) if how.receding else plan
     try:
@@ -390,8 +365,8 @@ def job(config: str) -> Job:
     """Return the job that evaluates one planner."""
     about = CONFIGS[config]
     settings, files = [about, tasks_sha256(about.world)], tuple(about.checkpoints.values())
-    version, data = VERSIONS.get(about.planner, 1), ("push",) if about.model in MADE else ()
-    return Job(run_config, {"config": config}, settings, data, files, version)
+    version = VERSIONS.get(about.planner, 1)
+    return Job(run_config, {"config": config}, settings, (), files, version)
 
 
 def distances(records: dict[str, Rows]) -> pd.DataFrame:
@@ -443,13 +418,11 @@ VARIANTS = {
     for name in CONFIGS
     if name.removesuffix(change) in {*CONFIGS} - {name}
 } | {
-    "astar_continuous": "continuous",
     "cem": "continuous",
     "mpc_continuous": "continuous",
     "mpc_cem": "mpc_continuous",
     "continuous_cnp_500": "continuous_film_500",
     "continuous_film_500": "continuous",
-    "continuous_limit_surface": "continuous_film_500",
 }
 """Planners with one change, each with the planner without it, for paired comparisons."""
 

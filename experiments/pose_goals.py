@@ -1,96 +1,24 @@
-"""Pose goals by pushing only: position and yaw of objects that are known only from their image.
-
-    python -m experiments.pose_goals [--only model|goals]
-
-`model` fine-tunes the pretrained neural process on off-centre pushes of random cuboids and prisms,
-given their outlines, in the simulated world (about 5 minutes on one core). `goals` plans and
-executes with it on other objects, with both cameras (about 5 minutes).
-"""
+"""Pursue a pose goal by off-centre pushes, using observations only, and measure what is missed."""
 
 from __future__ import annotations
 
-import argparse
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
-import numpy as np
 import pandas as pd
-import torch
-from torch import Tensor
 
-from affordlib.geometry import rotated, wrap_angle
-from affordlib.logs import LoggedPushes, PushedObject, Pushes, plan_push_at
-from affordlib.logs.fit import Forecast, PushModel, in_object_frame, push_rows, told_feet
-from affordlib.logs.neural_process import load_neural_process, train_neural_process
-from affordlib.logs.planning import primitive_of
-from affordlib.perception import outline_of, turn_between
-from affordlib.results import repo_root, write_results
-from affordlib.types import Goal, Observation, Step, UnreachableError
-from affordlib.world import Cuboid, Prism, Tabletop, TabletopObject, WorldConfig
-from affordlib.world.robot import ROD_WIDTH_M
-from experiments.commands import command
-from experiments.pretrain_np import save_neural_process
+from affordlib.geometry import wrap_angle
+from affordlib.logs import PushedObject, Pushes, plan_push_at
+from affordlib.logs.fit import Forecast, PushModel
+from affordlib.perception import turn_between
+from affordlib.types import Goal, Observation, Step
+from affordlib.world import Tabletop
 
-N_PARTS, N_OBJECTS, N_PUSHES, TRAINING = 2, 40, 12, (1500, 5e-4, 32)
-HEIGHTS_M = 0.04, 0.06
-FIRST_GOAL, N_GOALS, GOAL_PUSHES, GOAL_LENGTHS_M = 10_000, 50, 2, (0.015, 0.045)
 CORRECTIONS = 4
 TURN_M = 0.04
 """Weight of yaw errors [m/rad] relative to position errors: 3° count as 2 mm."""
-N_IMAGES = {"ideal": 1, "kinect": 8}
-"""Number of images over which an observation averages, by camera."""
 WITHIN_M, WITHIN_RAD = 0.005, math.radians(5)
-
-
-SEEN = "np_seen_objects"
-
-
-class PretrainedNeuralProcess:
-    """A neural process for objects known only from their image, given feet from their outline."""
-
-    def __init__(self, name_or_path: str | Path = SEEN) -> None:
-        self.network = load_neural_process(name_or_path)
-
-    def predict(self, pushes: Pushes) -> Forecast:
-        """Predict mean and σ (n, 3) of displacement [m] and turn [rad], in the object's frame."""
-        rows, none = push_rows(pushes), torch.zeros(0, 10)
-        feet = told_feet(pushes)[0]
-        return in_object_frame(pushes, *self.network.predict(rows[:, :7], none, feet))
-
-
-def drawn_object(rng: np.random.Generator) -> TabletopObject:
-    """Sample a cuboid or a prism, 4 to 8 cm wide and 4 to 6 cm tall, as the rod is short."""
-    return (Cuboid, Prism)[int(rng.integers(2))].sample(rng, height_range_m=HEIGHTS_M)
-
-
-def collect(n_objects: int, seed: int) -> tuple[Tensor, Tensor]:
-    """Collect pushes (n, 12, 10) of random objects for the neural process, and feet (n, 12, 3)."""
-    rng, rows, feet = np.random.default_rng(seed), [], []
-    with Tabletop() as world:
-        while len(rows) < n_objects:
-            obj, done = drawn_object(rng), {}
-            drawn = PushedObject(obj.footprint_m, ROD_WIDTH_M / 2).draw(2 * N_PUSHES, rng)
-            yaw = rng.uniform(-math.pi, math.pi)
-            for k in range(2 * N_PUSHES):
-                world.place(obj, (0.0, 0.0), yaw, tool="rod")
-                try:
-                    effect = world.execute_primitive(primitive_of(drawn, k, yaw))
-                except UnreachableError:
-                    continue
-                if not (effect.faults or effect.fell):
-                    done[k] = *rotated(effect.rest_effect[:2], -yaw), effect.rest_effect[3]
-                if len(done) == N_PUSHES:
-                    break
-            if len(done) == N_PUSHES:
-                effect = np.array([*done.values()])
-                of_one = vars(drawn.select(np.array([*done])))
-                effects = {"displacement_m": effect[:, :2], "turn_rad": effect[:, 2]}
-                of_one = LoggedPushes(**of_one, **effects)
-                rows.append(push_rows(of_one))
-                feet.append(told_feet(of_one)[0])
-    return torch.stack(rows), torch.stack(feet)
 
 
 class Remembered:
@@ -106,13 +34,6 @@ class Remembered:
         return self.known
 
 
-def observed(world: Tabletop) -> Observation:
-    """Observe the object; position and image are means over several images of the Kinect."""
-    views = [world.observe() for _ in range(N_IMAGES[world.config.camera])]
-    x, y = np.mean([view.xy_m for view in views], axis=0).tolist()
-    return Observation((x, y), np.mean([view.image for view in views], axis=0))
-
-
 def act(world: Tabletop, step: Step, seen: Observation) -> None:
     """Execute a step at the object's position in the plan, whether it is there or not."""
     seen = replace(seen, xy_m=tuple(step.predicted_path_xy_m[0].tolist()))
@@ -123,17 +44,16 @@ def pursue(
     world: Tabletop,
     model: PushModel,
     goal: tuple[float, float, float],
-    obj: PushedObject | None = None,
+    obj: PushedObject,
 ) -> Iterator[int]:
     """Push an object to a goal (x, y, turn), using only observations.
 
     A plan of up to three pushes is executed open loop from one observation. Then, up to four times,
     the robot observes the object and executes the first push of a new plan, unless no improvement
-    is predicted. obj: the object; None uses the image's outline.
+    is predicted.
     Yields the number of pushes after the plan, and after the corrections.
     """
-    first = seen = observed(world)
-    obj = obj or PushedObject.of(PushedObject(outline_of(first.image), ROD_WIDTH_M / 2).draw())
+    first = seen = world.observe()
     turned, pushes = 0.0, 0
     for n in (3, *(min(3, k) for k in range(CORRECTIONS, 0, -1))):
         wanted = Goal(goal[:2], 0.001, wrap_angle(goal[2] - turned))
@@ -150,7 +70,7 @@ def pursue(
         if not pushes:
             yield len(steps)
         pushes += len(steps)
-        seen = observed(world)
+        seen = world.observe()
         turned += steps[-1].predicted_turn_rad
         told = turn_between(first.image, seen.image, turned)
         turned = told[0] if told else turned
@@ -169,18 +89,6 @@ def attempt(world: Tabletop, *arguments) -> list[dict]:
     return rows
 
 
-def task(world: Tabletop, rng: np.random.Generator) -> tuple[TabletopObject, list, list]:
-    """Sample an object, a start pose (x, y, yaw), and a goal pose reached by random pushes."""
-    while True:
-        obj, start = drawn_object(rng), [*rng.uniform(-0.1, 0.1, 2), rng.uniform(-math.pi, math.pi)]
-        world.place(obj, tuple(start[:2]), start[2], tool="rod")
-        for _ in range(GOAL_PUSHES):
-            drawn = PushedObject(obj.footprint_m, ROD_WIDTH_M / 2, GOAL_LENGTHS_M).draw(1, rng)
-            world.execute_primitive(primitive_of(drawn, 0, world.object_pose()[2]))
-        if not world.placed.fell():
-            return obj, start, [*world.object_pose()]
-
-
 def summary(rows: list[dict], by: list[str]) -> list[dict]:
     """Return statistics of the trials' errors, grouped by some columns."""
     table = pd.DataFrame(rows)
@@ -197,45 +105,3 @@ def summary(rows: list[dict], by: list[str]) -> list[dict]:
         | {"within_percent": part["within_percent"].mean()}
         for key, part in table.groupby(by)
     ]
-
-
-def goals(n: int = N_GOALS) -> dict[str, list[dict]]:
-    """Return the table of goals and its trials."""
-    model, rows = PretrainedNeuralProcess(), []
-    for camera in N_IMAGES:
-        with Tabletop(WorldConfig(camera=camera)) as world:
-            for seed in range(FIRST_GOAL, FIRST_GOAL + n):
-                obj, (*at, yaw), (*xy, end) = task(world, np.random.default_rng(seed))
-                seen_by = replace(world.config, noise_seed=seed)
-                world.place(obj, tuple(at), yaw, tool="rod", config=seen_by)
-                goal = *xy, wrap_angle(end - yaw)
-                about = {"camera": camera, "object_class": obj.category, "seed": seed}
-                about |= {"goal_m": math.dist(at, xy), "goal_rad": goal[2]}
-                rows += [about | row for row in attempt(world, Remembered(model), goal)]
-    return {"goals": summary(rows, ["camera", "corrected"]), "trials": rows}
-
-
-def tune() -> None:
-    """Collect data, fine-tune the model and write the checkpoint."""
-    model, parts = load_neural_process(), [collect(N_OBJECTS, seed) for seed in range(N_PARTS)]
-    rows, feet = (torch.cat(part) for part in zip(*parts, strict=True))
-    train_neural_process(model, rows, feet, TRAINING, torch.Generator().manual_seed(0))
-    about = {"objects": len(rows), "pushes": N_PUSHES, "steps": TRAINING[0]}
-    save_neural_process(model, repo_root() / f"data/checkpoints/{SEEN}.safetensors", about)
-
-
-@command(OSError, ValueError)
-def main(argv: Sequence[str] | None = None) -> int:
-    """Fine-tune the model, execute the goals, or both."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", choices=("model", "goals"))
-    only = parser.parse_args(argv).only
-    if only != "goals":
-        tune()
-    if only != "model":
-        write_results(repo_root() / "data/results", "pose_goals", {"n_goals": N_GOALS}, goals())
-    return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

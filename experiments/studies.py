@@ -1,6 +1,6 @@
-"""Studies in addition to the cross-validation: ablations, novelty, codes, partial actions.
+"""Studies in addition to the cross-validation: ablations, novelty, partial actions.
 
-    python -m experiments.studies --only study=latent,ablation
+    python -m experiments.studies --only study=ablation
 
 computes missing or stale results in `data/results/raw/studies.jsonl.gz`. The tables are written by
 `experiments.effect_prediction`.
@@ -17,48 +17,17 @@ from typing import Any
 import numpy as np
 import torch
 
-from affordlib.interactions import InteractionTensors, open_interactions
+from affordlib.interactions import open_interactions
 from affordlib.models import condition_on_primitives, load_checkpoint
 from affordlib.primitives import Drag, Push
-from affordlib.types import Observations
-from experiments import ablation, literal, novelty, runner
+from experiments import ablation, novelty, runner
 from experiments.commands import command
 from experiments.runner import FOLDER, Job, Rows, read
 
 NAME = "studies"
-WEIGHTS = (0.25, 0.5, 0.75)
 WHOLE_ACTION_MODELS = ("film_500", "film_5000", "drag_film_500")
 PHASES = (0.0, 0.55, 0.65, 0.75, 1.0)
 """Edges of the phase bins; the gripper touches nothing before 0.5."""
-
-
-def _seen_by(arrays: InteractionTensors, observed: str, weight: float) -> Observations:
-    """Return a context of the action at t = 0 and 1, the effect at t = 0.8 and 1, or both."""
-    last = len(arrays.phase) - 1
-    ends, late = torch.tensor([0, last]), torch.tensor([round(0.8 * last), last])
-    action = None if observed == "effect" else arrays.action_at(ends)
-    effect = None if observed == "action" else arrays.effect_at(late)
-    return Observations.of(arrays, action, effect, torch.full((len(arrays),), weight))
-
-
-@torch.no_grad()
-def latent() -> Rows:
-    """Compare the codes r of action and effect of `push_test`, and predictions from them."""
-    model, _ = load_checkpoint("cnp_500")
-    arrays, rows = InteractionTensors.from_dataset(open_interactions("push_test")), []
-    features, ends = model.encode(arrays.image), torch.tensor([[0.0, 1.0]] * len(arrays))
-    of_action = model.represent(_seen_by(arrays, "action", 1.0))
-    for what, weight in (("action", 1.0), ("effect", 0.0), *(("both", w) for w in WEIGHTS)):
-        observed = _seen_by(arrays, what, weight)
-        predicted = model.predict(features, observed, ends)
-        start = predicted.action_mean[:, 0, :2] - arrays.action[:, 0, :2]
-        end = predicted.effect_mean[:, 1, :2] - arrays.effect[:, -1, :2]
-        row = {"model": "cnp_500", "observed": what, "w_1": weight, "n": len(arrays)}
-        alike = torch.cosine_similarity(model.represent(observed), of_action)
-        row["cosine_to_action"] = float(alike.mean())
-        row["action_start_mean_m"] = float(start.norm(dim=-1).mean())
-        rows.append(row | {"final_error_mean_m": float(end.norm(dim=-1).mean())})
-    return rows
 
 
 @torch.no_grad()
@@ -105,8 +74,6 @@ STUDIES: dict[Callable[[], Rows], dict[str, Any]] = {
         "settings": (ablation.ABOUT, [ablation.CHANGES[c] for c in ablation.LADDER.values()]),
         "version": 2,
     },
-    latent: {"data": ("push_test",), "checkpoints": ("cnp_500",), "settings": WEIGHTS},
-    literal.literal_training: {"data": ("push",), "settings": literal.DECISIVE},
     novelty.novelty_gain: {
         "data": ("push",),
         "settings": novelty.SETTINGS,

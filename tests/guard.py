@@ -63,7 +63,7 @@ def predicted() -> dict[str, list[float]]:
     found, rows = {}, np.arange(4)
     levers = lever_up_tensors(open_interactions("lever_up").isel(interaction=slice(0, 48)))
     for path in sorted((repo_root() / "data" / "checkpoints").glob("*.safetensors")):
-        if path.stem in ("reachability", "np_simulated_pushes", "np_seen_objects"):
+        if path.stem in ("reachability", "np_simulated_pushes"):
             continue
         model, data, kind = load_checkpoint(path)[0], levers, path.stem.split("_")[0]
         if kind != "lever":

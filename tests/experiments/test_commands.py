@@ -45,7 +45,7 @@ def test_unknown_names_and_impossible_numbers_are_refused(capsys, line, named):
     [
         "experiments.effect_prediction --only model=constant data=drag fold=1 --raw {}",
         "experiments.lever_up --only model=persistence --raw {}",
-        "experiments.studies --only study=latent --raw {}",
+        "experiments.studies --only study=partial_execution --raw {}",
         "experiments.shipped data --only grasp --workers 1 --to {}",
     ],
 )

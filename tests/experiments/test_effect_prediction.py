@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import pandas as pd
 import pytest
 import torch
 
@@ -19,7 +18,6 @@ from experiments.grasps import (
     auc,
     confusion_columns,
     grasp_rows,
-    threshold_rows,
 )
 from experiments.lever_up import job as lever_job
 from experiments.runner import read, run
@@ -185,28 +183,3 @@ def test_shares_are_of_the_true_successes_and_failures():
     assert ends == pytest.approx([49.02, 94.33], abs=0.01)  # Wilson's, of eight of ten
     none = confusion_columns(np.array([True]), np.array([True]))
     assert none["tn_percent"] is none["tn_low_percent"] is None
-
-
-def _folds_of_grasps(scores):
-    frames = [
-        pd.DataFrame(
-            {
-                "rollable": [False] * 4 + [True] * 4,
-                "truth_z": [0.25, 0.25, 0, 0] * 2,
-                "probability": [*score, *score],
-                "fold": fold,
-            }
-        )
-        for fold, score in enumerate(scores)
-    ]
-    return pd.concat(frames).assign(model="logistic", data="grasp", n=100, seed=0)
-
-
-def test_a_folds_own_grasps_never_decide_its_threshold():
-    # Folds 0 and 1 separate near 0.8, fold 2 at 0.2: right by its own threshold, wrong by theirs.
-    scores = [[0.9, 0.85, 0.7, 0.6], [0.95, 0.82, 0.78, 0.1], [0.4, 0.3, 0.1, 0.05]]
-    stands, _ = threshold_rows(_folds_of_grasps(scores))
-    assert (stands["n_success"], stands["n_failure"], stands["folds"]) == (6, 6, 3)
-    assert stands["tp_percent"] < 100  # fold 2
-    same, _ = threshold_rows(_folds_of_grasps([scores[0]] * 3))
-    assert (same["tp_percent"], same["tn_percent"]) == (100, 100)

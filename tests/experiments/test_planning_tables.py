@@ -1,19 +1,16 @@
 """Table 3: its rows, its planners, and agreement of the committed one with shipped files."""
 
 import json
-import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
-from affordlib.planning import MODES, EffectMap
-from affordlib.primitives import PUSH_GAP_M, Drag, Push
+from affordlib.planning import MODES
+from affordlib.primitives import Drag
 from affordlib.results import repo_root
-from affordlib.world import ROLLABLE, STANDING, Cuboid, UprightCylinder
+from affordlib.world import ROLLABLE, STANDING
 from experiments import planning, shipped, tasks
-from experiments.field_baselines import FINGER_AHEAD_M, LimitSurface
 from experiments.planning import CONFIGS, attempt
 from experiments.tasks import FROZEN, PlanningTask, frozen_tasks, tasks_sha256
 
@@ -69,18 +66,6 @@ def test_planners_differ_and_are_asked_about_all_their_categories_alike():
             assert max(counts) - min(counts) <= 1, name
 
 
-def test_an_object_with_a_perturbed_start_is_missed_by_as_much(world):
-    tasks = [t for t in frozen_tasks() if t.mode == "single_partial" and not t.obj.rollable][:4]
-    config = CONFIGS["continuous"]
-    how = config.pose(world), config.planner
-    there, perturbed = (
-        np.mean([attempt(world, t, *how, perturbed_start=p).distance_m for t in tasks])
-        for p in (False, True)
-    )
-    assert there < 0.0005
-    assert 0.0008 < perturbed < 0.02
-
-
 def test_actions_are_placed_by_the_plan(world):
     task = next(t for t in frozen_tasks() if t.mode == "multi_partial" and not t.obj.rollable)
     config, seen = CONFIGS["continuous"], []
@@ -117,40 +102,17 @@ def test_with_a_receding_horizon_each_plan_has_one_action_less(world):
     assert outcome.distance_m == task.goal.distance_m(world.object_pose()[:2])
 
 
-def test_planners_of_the_field_keep_to_their_actions_and_improve_on_their_start(world):
+def test_the_cross_entropy_method_keeps_to_its_actions_and_reaches_goals(world):
     tasks = [t for t in frozen_tasks() if t.goals == "constructed" and not t.obj.rollable]
-    names = ("astar", "astar_continuous", "cem")
-    configs, ends = [CONFIGS[name] for name in names], []
-    poses = [config.pose(world) for config in configs]
-    for task in tasks[::12]:
+    config, ends = CONFIGS["cem"], []
+    pose = config.pose(world)
+    for task in tasks[::24]:
         world.place(task.obj, (0.0, 0.0), task.yaw_rad, config=task.config)
-        about = world.depth_image(), (0.0, 0.0), task.goal, task.mode
-        plans = [c.planner(pose(*about)) for c, pose in zip(configs, poses, strict=True)]
-        for plan in plans:
-            assert len(plan.steps) <= MODES[task.mode].max_steps
-            assert MODES[task.mode].partial or all(s.stop_phase == 1 for s in plan.steps)
-        ends.append([plan.predicted_distance_m for plan in plans])
-    searched, refined, drawn = np.array(ends).T
-    assert (refined < searched + 1e-4).all()
-    assert np.median(refined) < 0.1 * np.median(searched)
-    assert np.median(drawn) < 0.001
-
-
-def test_by_physics_the_fingers_carry_a_cylinder_to_where_they_stop(world):
-    """It lies in the gap between them for any friction and limit surface; mirroring holds."""
-    radius = 0.03
-    world.place(UprightCylinder(2 * radius, 0.05))
-    effects = EffectMap(LimitSurface(0.3, 0.9), world.depth_image(), n_directions=8)
-    ahead, left, _ = effects.grid[0][:, -1].T
-    ends = Push.length + FINGER_AHEAD_M + math.sqrt(radius**2 - (PUSH_GAP_M / 2) ** 2)
-    np.testing.assert_allclose(ahead, ends, atol=0.0015)
-    np.testing.assert_allclose(left, 0, atol=0.0015)
-    world.place(Cuboid(0.07, 0.04, 0.05))
-    effects = EffectMap(LimitSurface(0.3, 0.9), world.depth_image(), n_directions=8)
-    there, back = effects.grid[0][1, -1], effects.grid[0][7, -1]
-    assert abs(there[2]) > 0.1
-    np.testing.assert_allclose(there[:2], back[:2] * torch.tensor([1, -1]), atol=5e-4)
-    assert float(there[2]) == pytest.approx(-float(back[2]), abs=0.02)
+        plan = config.planner(pose(world.depth_image(), (0.0, 0.0), task.goal, task.mode))
+        assert len(plan.steps) <= MODES[task.mode].max_steps
+        assert MODES[task.mode].partial or all(s.stop_phase == 1 for s in plan.steps)
+        ends.append(plan.predicted_distance_m)
+    assert np.median(ends) < 0.001
 
 
 @pytest.mark.slow

@@ -4,14 +4,17 @@ import math
 
 import numpy as np
 import pytest
+import torch
 
-from affordlib.geometry import cross, wrap_angle
+from affordlib.geometry import cross, rotated, wrap_angle
 from affordlib.logs import PushedObject, plan_push_at
-from affordlib.logs.fit import told_feet
+from affordlib.logs.fit import in_object_frame, push_rows, told_feet
+from affordlib.logs.neural_process import load_neural_process
 from affordlib.logs.planning import primitive_of
 from affordlib.types import Goal
 from affordlib.world import Cuboid, UprightCylinder
-from experiments.pose_goals import PretrainedNeuralProcess, pursue
+from affordlib.world.robot import ROD_WIDTH_M
+from experiments.pose_goals import pursue
 from tests.problems import Still
 
 OUTLINE_M = np.array([[0.03, -0.02], [0.03, 0.02], [-0.03, 0.02], [-0.03, -0.02]])
@@ -39,9 +42,22 @@ def test_a_turned_object_is_pushed_alike():
         assert wrap_angle(turned.direction - as_is.direction - quarter) == pytest.approx(0)
 
 
+class Pretrained:
+    """The neural process before it has seen any push of the object."""
+
+    network = load_neural_process()
+
+    def predict(self, pushes):
+        feet, none = told_feet(pushes)[0], torch.zeros(0, 10)
+        predicted = self.network.predict(push_rows(pushes)[:, :7], none, feet)
+        return in_object_frame(pushes, *predicted)
+
+
 def test_pursuit_knows_only_what_it_observes(world, monkeypatch):
     """If the simulator reports a wrong yaw, the object still reaches its goal."""
-    world.place(Cuboid(0.06, 0.05, 0.05), (0.02, 0.0), 0.4, tool="rod")
+    box = Cuboid(0.06, 0.05, 0.05)
+    world.place(box, (0.02, 0.0), 0.4, tool="rod")
+    outline = PushedObject(rotated(box.footprint_m, 0.4), ROD_WIDTH_M / 2)
     truth = world.object_pose
 
     def lies():
@@ -49,7 +65,7 @@ def test_pursuit_knows_only_what_it_observes(world, monkeypatch):
         return x, y, yaw + 1.0
 
     monkeypatch.setattr(world, "object_pose", lies)
-    n_pushes = list(pursue(world, PretrainedNeuralProcess(), (0.04, -0.01, 0.2)))
+    n_pushes = list(pursue(world, Pretrained(), (0.04, -0.01, 0.2), outline))
     x, y, yaw = truth()
     assert n_pushes[0] <= 3
     assert n_pushes[1] <= n_pushes[0] + 4

@@ -29,8 +29,8 @@ from affordlib.models.evaluation import final_errors_m
 from affordlib.models.lever_up import LastPoseConfig
 from affordlib.planning import EffectMap
 from affordlib.types import Observations
+from experiments.ablation import sample_literal
 from experiments.baselines import constant
-from experiments.literal import sample_literal, train_literal
 
 
 def fresh(arrays):
@@ -48,21 +48,9 @@ def mean_length_error_m(training, test):
     return (mean[:, 0] - test.effect[:, -1]).norm(dim=-1).mean()
 
 
-def test_the_literal_loop_learns(some):
-    whole = fresh(some)
-    before = float(final_errors_m(whole, some).mean())
-    config = TrainingConfig(steps=150, learning_rate=1e-3, validate_every=50)
-    history = train_literal(whole, some, some, config)
-    assert [row["step"] for row in history] == [50, 100, 150]
-    best = min(row["validation_error_m"] for row in history)
-    assert float(final_errors_m(whole, some).mean()) == pytest.approx(best)
-    assert best < 0.8 * before
-    hasty = dataclasses.replace(config, steps=300, validate_every=1, patience=1)
-    assert len(train_literal(fresh(some), some, some, hasty)) < 300
-    generator = torch.Generator().manual_seed(0)
-    counts = [
-        sample_literal(some, 10, generator).observations.action_t.shape[1] for _ in range(200)
-    ]
+def test_the_literal_loop_draws_up_to_all_observations(some):
+    g = torch.Generator().manual_seed(0)
+    counts = [sample_literal(some, 10, g).observations.action_t.shape[1] for _ in range(200)]
     assert set(counts) == set(range(1, 11))
 
 
