@@ -11,7 +11,6 @@ from operator import itemgetter
 
 import numpy as np
 from contourpy import contour_generator
-from matplotlib.path import Path
 from scipy import ndimage
 from scipy.spatial import ConvexHull
 
@@ -20,8 +19,7 @@ from affordlib.primitives import Drag, Grasp, Primitive
 from affordlib.types import CROP_WIDTH_M, IMAGE_PIXELS
 
 CAMERA_HEIGHT_M = 1.0
-_ROUND = 0.8
-"""Curvature times radius above which a top counts as round: 1 for a sphere, 0 for a box."""
+_ROUND = 0.8  # curvature times radius of a round top, at least: 1 for a sphere, 0 for a box
 _FALL_M = 0.01
 
 _N_ANGLES = 360
@@ -178,22 +176,6 @@ def height_map(points: np.ndarray, centre_m: np.ndarray) -> np.ndarray:
     count = np.bincount(cell, minlength=IMAGE_PIXELS**2)
     total = np.bincount(cell, weights=points[inside, 2], minlength=IMAGE_PIXELS**2)
     return (total / np.maximum(count, 1)).reshape(IMAGE_PIXELS, IMAGE_PIXELS)
-
-
-def outline_image(
-    outline_m: np.ndarray, width_m: float = CROP_WIDTH_M, height_m: float = 0.05
-) -> np.ndarray:
-    """Render depth [m] and mask (2, 48, 48) of a prism with corners (k, 2) [m] from the middle.
-
-    Each pixel is the mean of 3 x 3 rays, as for the ideal camera.
-    """
-    rays = 3
-    n = rays * IMAGE_PIXELS
-    at = width_m * ((np.arange(n) + 0.5) / n - 0.5)
-    x, y = np.meshgrid(at, -at)
-    inside = Path(outline_m).contains_points(np.column_stack([x.ravel(), y.ravel()]))
-    mask = inside.reshape(IMAGE_PIXELS, rays, IMAGE_PIXELS, rays).mean(axis=(1, 3))
-    return np.stack([CAMERA_HEIGHT_M - height_m * mask, mask]).astype(np.float32)
 
 
 def outline_of(image: np.ndarray, width_m: float = CROP_WIDTH_M) -> np.ndarray:

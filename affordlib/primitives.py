@@ -5,32 +5,31 @@ over the phase t in [0, 1], relative to the object's initial position.
 """
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import MISSING, dataclass, field, fields, replace
-from functools import cached_property, partial
+from collections.abc import Sequence
+from dataclasses import MISSING, dataclass, replace
+from functools import cached_property
 from typing import Any, ClassVar, Self
 
 import numpy as np
 
 from affordlib.geometry import unit_vector, wrap_angle
-from affordlib.types import check_array, check_choice, check_finite, check_pair, check_within
+from affordlib.types import (
+    Checked,
+    check_array,
+    check_choice,
+    check_finite,
+    check_pair,
+    check_within,
+    number,
+    parameter,
+)
 
-DURATION_S = 3.75
-"""Duration [s] of every primitive: 25 samples, one every 3 steps of 50 ms (Section 4.2)."""
-
-PUSH_GAP_M = 0.03
-"""Gap [m] between the fingers during a push, where both touch the object's near face."""
-
-EMPTY_M = 0.005
-"""Gap [m] between closed fingers below which the hand is empty."""
-
-TIP_HEIGHT_M = 0.01
-HOVER_M = 0.16
-"""Height [m] of the finger tips before they are lowered over an object."""
-
-ROD_GAP_M = 0.006
-"""Distance [m] before the contact at which a push with the rod starts."""
-
+DURATION_S = 3.75  # of every primitive: 25 samples, one every 3 steps of 50 ms (Section 4.2)
+PUSH_GAP_M = 0.03  # between the fingers during a push, where both touch the object's near face
+EMPTY_M = 0.005  # gap between closed fingers below which the hand is empty
+TIP_HEIGHT_M = 0.01  # of the fingers during an action
+HOVER_M = 0.16  # height of the finger tips before they are lowered over an object
+ROD_GAP_M = 0.006  # distance before the contact at which a push with the rod starts
 BLADE_HEIGHT_M = 0.0015
 
 
@@ -47,29 +46,21 @@ X, Y, Z, YAW, GRIPPER, PITCH = range(6)
 
 @dataclass(frozen=True)
 class Segment:
-    """A straight part of a primitive: its duration [s] and the poses (6,) at its start and end.
-
-    A guarded segment stops when the robot feels contact with the object.
-    """
+    """A straight part of a primitive."""
 
     seconds: float
-    start: np.ndarray
+    start: np.ndarray  # pose (6,)
     end: np.ndarray
-    guarded: bool = False
+    guarded: bool = False  # it stops when the robot feels contact with the object
 
     def at(self, share: np.ndarray) -> np.ndarray:
         """Return the poses (n, 6) at the shares (n,) of the segment's length, in [0, 1]."""
         return self.start + np.asarray(share)[:, None] * (self.end - self.start)
 
 
-def parameter(check: Callable[[str, Any], Any], default: Any = MISSING) -> Any:
-    """Declare a primitive's parameter; check(name, value) returns its valid value or raises."""
-    return field(default=default, metadata={"check": check})
-
-
 def metres(low: float, high: float, default: Any = MISSING) -> Any:
     """Declare a parameter that is a length in [low, high] m."""
-    return parameter(partial(check_within, low=low, high=high, unit="m"), default)
+    return number(low, high, "m", default)
 
 
 def radians(default: Any = MISSING, first: float = -math.pi) -> Any:
@@ -79,29 +70,16 @@ def radians(default: Any = MISSING, first: float = -math.pi) -> Any:
 
 
 @dataclass(frozen=True)
-class Primitive:
-    """An action with its parameters; `segments` define how the gripper moves.
-
-    opening_m is the gap between the fingers where the gripper channel is 1, force_N the maximum
-    force of each finger, `holds` whether the object remains in the hand at the end, `rollable`
-    whether it is for objects that roll (True), that do not (False), or for both (None). With
-    default parameters the gripper touches nothing before the phase `acts_from`.
-    """
+class Primitive(Checked):
+    """An action with its parameters; `segments` define how the gripper moves."""
 
     name: ClassVar[str]
-    opening_m: ClassVar[float]
-    force_N: ClassVar[float]
-    holds: ClassVar[bool] = False
-    rollable: ClassVar[bool | None] = None
+    opening_m: ClassVar[float]  # gap between the fingers where the gripper channel is 1
+    force_N: ClassVar[float]  # maximum force of each finger
+    holds: ClassVar[bool] = False  # whether the object remains in the hand at the end
+    rollable: ClassVar[bool | None] = None  # whether it is for objects that roll; None: for both
     tool: ClassVar[str] = "gripper"
-    acts_from: ClassVar[float] = 0.0
-
-    def __post_init__(self) -> None:
-        for declared in fields(self):
-            check, value = declared.metadata.get("check"), getattr(self, declared.name)
-            if check and not (value is None and declared.default is None):
-                checked = check(f"{type(self).__name__}.{declared.name}", value)
-                object.__setattr__(self, declared.name, checked)
+    acts_from: ClassVar[float] = 0.0  # phase before which, by default, it touches nothing
 
     @classmethod
     def sample(cls, outline_m: np.ndarray, rng: np.random.Generator) -> Self:
@@ -165,16 +143,13 @@ def _segments(*stops: tuple[float, tuple[float, ...]], guarded: int = -1) -> tup
 
 @dataclass(frozen=True)
 class Move(Primitive):
-    """A primitive that moves an object in a straight line, in a direction given by theta [rad].
-
-    reach_m: distance [m] by which one full action moves nearly any object, for planning of routes.
-    """
+    """A primitive that moves an object in a straight line, in a direction given by theta [rad]."""
 
     theta: float = radians(first=0.0)
     length: float = metres(0.0, 0.15, 0.05)
 
-    ahead_rad: ClassVar[float] = 0.0
-    reach_m: ClassVar[float]
+    ahead_rad: ClassVar[float] = 0.0  # from theta to the direction in which the object moves
+    reach_m: ClassVar[float]  # by which one full action moves nearly any object
 
     @classmethod
     def sample(cls, outline_m: np.ndarray, rng: np.random.Generator) -> Self:
@@ -336,7 +311,6 @@ class _Arc(Segment):
 
     radius_m: float = 0.16
     angle_rad: float = 0.0
-    pitch_share: float = 0.8
 
     def at(self, share: np.ndarray) -> np.ndarray:
         poses = np.repeat(self.start[None], len(share), axis=0)
@@ -345,7 +319,7 @@ class _Arc(Segment):
         poses[:, X] += ahead * math.cos(self.start[YAW])
         poses[:, Y] += ahead * math.sin(self.start[YAW])
         poses[:, Z] += self.radius_m * np.sin(angle)
-        poses[:, PITCH] = self.pitch_share * angle
+        poses[:, PITCH] = 0.8 * angle
         return poses
 
 
@@ -379,8 +353,9 @@ class LeverUp(Primitive):
         for _ in range(20):
             edge = int(rng.integers(len(outline_m)))
             lever = cls.at_edge(outline_m, edge, rng.uniform(0.2, 0.8))
-            levers.append((lever.obliqueness_rad(outline_m, edge), lever))
-            if levers[-1][0] < 0.18:
+            x, y = outline_m[(edge + 1) % len(outline_m)] - outline_m[edge]
+            levers.append((abs(wrap_angle(lever.theta - math.atan2(x, -y))), lever))
+            if levers[-1][0] < 0.18:  # rad, from the inward normal of the edge
                 break
         _, lever = min(levers, key=lambda drawn: drawn[0])
         return replace(lever, theta=lever.theta + rng.uniform(-0.1, 0.1))
@@ -405,11 +380,6 @@ class LeverUp(Primitive):
         middle = outward[pivot] - outward[edge]
         theta = math.atan2(middle[1], middle[0])
         return cls(float(contact[0]), float(contact[1]), theta, max(0.05, float(to_contact[pivot])))
-
-    def obliqueness_rad(self, outline_m: np.ndarray, edge: int) -> float:
-        """Return the angle [rad] between the blade and the inward normal of the contact's edge."""
-        along = outline_m[(edge + 1) % len(outline_m)] - outline_m[edge]
-        return abs(wrap_angle(self.theta - math.atan2(along[0], -along[1])))
 
     @cached_property
     def segments(self) -> tuple[Segment, ...]:

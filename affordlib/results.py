@@ -15,6 +15,7 @@ import platform
 import re
 import secrets
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -110,23 +111,19 @@ def write_results(
             "leave out the folder and the file extension"
         )
     about = {"notebook": notebook, "parameters": _plain(parameters, "parameters")}
-    lines = [f" {_dump(k)}: {_dump(v)},\n" for k, v in (about | {"versions": versions()}).items()]
-    blocks = []
+    blocks, dump = [], partial(json.dumps, ensure_ascii=False)
     for name, rows in _plain(tables, "tables").items():
         if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
             kind = type(rows).__name__
             raise TypeError(f"tables[{name!r}] must be a list of rows, each a dict, got {kind}")
         # One line per row, so that a changed number changes one line of the file.
-        body = ",\n".join(f"   {_dump(row)}" for row in rows)
-        blocks.append(f"  {_dump(name)}: [\n{body}\n  ]")
+        body = ",\n".join(f"   {dump(row)}" for row in rows)
+        blocks.append(f"  {dump(name)}: [\n{body}\n  ]")
+    lines = [f" {dump(k)}: {dump(v)},\n" for k, v in (about | {"versions": versions()}).items()]
     text = "".join(["{\n", *lines, ' "tables": {\n', ",\n".join(blocks), "\n }\n}\n"])
     path = resolve_out_dir(out_dir) / f"{notebook}.json"
     write_atomically(path, text, _MARK)
     return path
-
-
-def _dump(value: Any) -> str:
-    return json.dumps(value, ensure_ascii=False)
 
 
 def _plain(value: Any, where: str) -> Any:
@@ -221,13 +218,13 @@ def results_table(
 def heading(column: str) -> str:
     """Return the heading of a column: `plan_ms_median` becomes `plan median, ms`."""
     name, unit = _split_unit(column)
-    return name.replace("_", " ") + (f", {UNITS[unit][0]}" if unit else "")
+    return name.replace("_", " ") + (f", {unit[0]}" if unit else "")
 
 
 def factor(column: str) -> float:
     """Return the factor that converts a column's numbers to the unit of its heading."""
     _, unit = _split_unit(column)
-    return UNITS[unit][1] if unit else 1.0
+    return unit[1] if unit else 1.0
 
 
 def cell(column: str, value: object) -> str:
@@ -239,17 +236,16 @@ def cell(column: str, value: object) -> str:
         return "yes" if value else "no"
     _, unit = _split_unit(column)
     if unit and isinstance(value, int | float):
-        digits = UNITS[unit][2]
-        return f"{round(value * factor(column), digits) + 0.0:.{digits}f}"
+        return f"{round(value * unit[1], unit[2]) + 0.0:.{unit[2]}f}"
     if isinstance(value, float):
         return f"{value:.3g}" if abs(value) < 999.5 else f"{value:.0f}"
     return " ".join(str(value).splitlines())
 
 
-def _split_unit(column: str) -> tuple[str, str | None]:
+def _split_unit(column: str) -> tuple[str, tuple[str, float, int] | None]:
     """Split a column's name into name and unit: its last word, or the last before a statistic."""
     found = _WITH_UNIT.fullmatch(column)
-    return (found[1] + found[3], found[2]) if found else (column, None)
+    return (found[1] + found[3], UNITS[found[2]]) if found else (column, None)
 
 
 def columns_of(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None) -> list[str]:

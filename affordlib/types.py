@@ -8,8 +8,9 @@ in radians. Actions and effects are relative to the object's initial position, i
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import MISSING, dataclass, field, fields, replace
+from functools import partial
 from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
@@ -36,15 +37,13 @@ FAULT_LIMIT_M = 0.002
 
 TABLE_X_M = (-0.5, 0.7)
 TABLE_Y_M = (-0.7, 0.7)
+LARGEST = 1e300
 
 
 class UnreachableError(ValueError):
-    """Raised when the arm cannot move the tool to a pose.
+    """Raised when the arm cannot move the tool to a pose."""
 
-    outcome: during the execution of a plan, the result of the actions before this one.
-    """
-
-    outcome: Outcome | None = None
+    outcome: Outcome | None = None  # of the actions before this one, when a plan is executed
 
 
 class NothingSeenError(RuntimeError):
@@ -53,14 +52,10 @@ class NothingSeenError(RuntimeError):
 
 def check_finite(name: str, value: Any) -> float:
     """Return `value` as a float; raises ValueError unless it is a finite number."""
-    try:
-        known = isinstance(value, Real) and not isinstance(value, bool)
-        number = float(value) if known else math.nan
-    except OverflowError:
-        number = math.nan
-    if not math.isfinite(number):
+    known = isinstance(value, Real) and not isinstance(value, bool)
+    if not known or not -LARGEST < value < LARGEST:
         raise ValueError(f"{name} must be a finite number, got {value!r}")
-    return number
+    return float(value)
 
 
 def check_within(name: str, value: Any, low: float, high: float, unit: str = "") -> float:
@@ -107,6 +102,44 @@ def check_field(
     """Check a number of a frozen dataclass and store it as a float; raises ValueError."""
     checked = check_within(f"{type(owner).__name__}.{name}", getattr(owner, name), low, high, unit)
     object.__setattr__(owner, name, checked)
+
+
+class Checked:
+    """A frozen dataclass that checks its fields; None is valid where it is the default."""
+
+    def __post_init__(self) -> None:
+        for declared in fields(self):
+            check, value = declared.metadata.get("check"), getattr(self, declared.name)
+            if check and not (value is None and declared.default is None):
+                checked = check(f"{type(self).__name__}.{declared.name}", value)
+                object.__setattr__(self, declared.name, checked)
+
+
+def parameter(check: Callable[[str, Any], Any], default: Any = MISSING) -> Any:
+    """Declare a field of a `Checked`; check(name, value) returns its valid value or raises."""
+    return field(default=default, metadata={"check": check})
+
+
+def number(
+    low: float = -math.inf, high: float = math.inf, unit: str = "", default: Any = MISSING
+) -> Any:
+    """Declare a field that is a number in [low, high]."""
+    return parameter(partial(check_within, low=low, high=high, unit=unit), default)
+
+
+def count(default: int, least: int = 1, most: float = math.inf) -> Any:
+    """Declare a field that is a whole number in [least, most]."""
+    return parameter(partial(check_count, least=least, most=most), default)
+
+
+def point(size: int, most_m: float, default: tuple[float, ...]) -> Any:
+    """Declare a field that is a tuple of numbers in [-most_m, most_m] m."""
+
+    def check(name, value):
+        values = check_array(name, value, size).tolist()
+        return tuple(check_within(name, each, -most_m, most_m, "m") for each in values)
+
+    return parameter(check, default)
 
 
 def check_pair(name: str, pair: Any, what: str = "(x, y) [m]") -> tuple[float, float]:
@@ -182,55 +215,45 @@ class Obstacle:
 
 @dataclass(frozen=True)
 class Observation:
-    """An observation of the object at rest, with the arm parked.
+    """An observation of the object at rest, with the arm parked."""
 
-    xy_m: estimated position (x, y) [m] in the table's frame; image: (2, 48, 48), depth [m] from a
-    plane 1 m above the table and the object's mask, centred at xy_m to within a few millimetres;
-    yaw_rad: the object's yaw [rad], if the robot can estimate it; yaw_std_rad: its σ [rad], None if
-    the yaw was not seen but dead-reckoned; std_m: σ of the position [m]; obstacles: where they are.
-    """
-
-    xy_m: tuple[float, float]
+    xy_m: tuple[float, float]  # its estimated position in the table's frame
+    # (2, 48, 48): depth [m] from a plane 1 m above the table, and the object's mask, centred at
+    # xy_m to within a few millimetres
     image: np.ndarray
-    yaw_rad: float | None = None
-    yaw_std_rad: float | None = None
-    std_m: float = 0.0
-    obstacles: tuple[Obstacle, ...] = ()
+    yaw_rad: float | None = None  # if the robot can estimate it
+    yaw_std_rad: float | None = None  # its σ; None if it was not seen but dead-reckoned
+    std_m: float = 0.0  # σ of the position
+    obstacles: tuple[Obstacle, ...] = ()  # where they are
 
 
 @dataclass(frozen=True)
 class Interaction:
     """The record of one primitive executed on one object.
 
-    phase: (n,); action: (n, 5) commanded, channels `ACTION_CHANNELS`; effect: (n, 5), channels
-    `EFFECT_CHANNELS` (metres and radians; gripper is 1 open, 0 closed); rest_effect: (5,) effect
-    once the gripper has retreated and the object is at rest; image: (2, 48, 48), depth [m] and
-    mask, for a lever-up (2, 128, 128) around the contact point in the lever's direction;
-    start_pose: (x, y, yaw) of the object in the table's frame; estimated_xy_m: its measured
-    position, to which the action is relative; tool: (26, 5) measured x, y, z [m], yaw [rad] of the
-    tool and gap between the fingers [m], every 3 steps of 50 ms as in the paper.
-
-    rolls: whether the object can roll in its final pose; tracking_error_m, penetration_m: largest
-    tracking error of the tool and largest penetration of two bodies [m]; left_table, fell: whether
-    the object left the table or fell over; reached: False if the arm could not move there.
+    Channels of an action are `ACTION_CHANNELS` (gripper is 1 open, 0 closed), those of an effect
+    `EFFECT_CHANNELS`, in metres and radians.
     """
 
     primitive: affordlib.primitives.Primitive
     stop_phase: float
-    phase: np.ndarray
-    action: np.ndarray
-    effect: np.ndarray
-    rest_effect: np.ndarray
+    phase: np.ndarray  # (n,)
+    action: np.ndarray  # (n, 5), commanded
+    effect: np.ndarray  # (n, 5)
+    rest_effect: np.ndarray  # (5,), once the gripper has retreated and the object is at rest
+    # (2, 48, 48), as of an `Observation`; of a lever-up (2, 128, 128) around the contact point in
+    # the lever's direction
     image: np.ndarray
-    start_pose: tuple[float, float, float]
-    estimated_xy_m: tuple[float, float]
+    start_pose: tuple[float, float, float]  # of the object: x, y, yaw in the table's frame
+    estimated_xy_m: tuple[float, float]  # measured position, to which the action is relative
+    # (26, 5), every 3 steps of 50 ms: measured x, y, z, yaw of the tool and gap of the fingers
     tool: np.ndarray
-    rolls: bool
-    tracking_error_m: float = 0.0
-    penetration_m: float = 0.0
+    rolls: bool  # whether the object can roll in its final pose
+    tracking_error_m: float = 0.0  # largest one of the tool
+    penetration_m: float = 0.0  # largest one of two bodies
     left_table: bool = False
     fell: bool = False
-    reached: bool = True
+    reached: bool = True  # False if the arm could not move there
 
     @property
     def faults(self) -> tuple[str, ...]:
@@ -263,8 +286,7 @@ class HasChannels(Protocol):
 class Observations:
     """The context of a model: actions and effects at any phases, in metres and radians.
 
-    What is False in a mask is ignored. weight: w₁ of the action in equation (2), w₂ = 1 - w₁; it is
-    1 where only actions and 0 where only effects are observed.
+    What is False in a mask is ignored.
     """
 
     action: torch.Tensor  # (B, n, C_a)
@@ -273,7 +295,8 @@ class Observations:
     effect: torch.Tensor  # (B, m, C_e)
     effect_t: torch.Tensor  # (B, m)
     effect_mask: torch.Tensor  # (B, m)
-    weight: torch.Tensor  # (B,)
+    # (B,), w₁ of the action in equation (2), w₂ = 1 - w₁: 1 with only actions, 0 with only effects
+    weight: torch.Tensor
 
     @classmethod
     def of(
@@ -288,22 +311,16 @@ class Observations:
         At least one of them must be given. weight: (B,), by default 1 without an effect, 0 without
         an action, 0.5 with both.
         """
-        observed = action or effect
-        if observed is None:
+        if action is None and effect is None:
             raise ValueError("action or effect must be given, got None for both")
-        values = observed[1]
-        b = len(values)
-
-        def columns(what, channels):
-            if what is None:
-                t, empty = values.new_zeros(b, 1), values.new_zeros(b, 1, len(channels))
-                return empty, t, t.bool()
-            return what[1], what[0], what[0].new_ones(what[0].shape).bool()
-
+        t, columns = (action or effect)[0], []
+        for what, channels in ((action, model.action_channels), (effect, model.effect_channels)):
+            none = t.new_zeros(len(t), 1), t.new_zeros(len(t), 1, len(channels))
+            at, values = what or none
+            columns += [values, at, at.new_full(at.shape, what is not None).bool()]
         if weight is None:
-            weight = values.new_full((b,), (1 + (action is not None) - (effect is not None)) / 2)
-        of_action = columns(action, model.action_channels)
-        return cls(*of_action, *columns(effect, model.effect_channels), weight)
+            weight = t.new_full((len(t),), (1 + (action is not None) - (effect is not None)) / 2)
+        return cls(*columns, weight)
 
 
 @dataclass(frozen=True)
@@ -329,28 +346,18 @@ class GoalError(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Goal:
-    """The desired position (x, y) [m] of the object and its tolerance [m].
-
-    turn_rad: desired rotation [rad] from its current orientation, None for any;
-    height_m: desired lift [m] above its current height, None to leave it on the table.
-    """
+class Goal(Checked):
+    """The desired position of the object, and if wanted its rotation and lift."""
 
     TURN_TOLERANCE_RAD: ClassVar[float] = math.radians(2)
     HEIGHT_TOLERANCE_M: ClassVar[float] = 0.003
 
-    xy_m: tuple[float, float]
-    tolerance_m: float = 0.02
-    turn_rad: float | None = None
-    height_m: float | None = None
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "xy_m", check_pair("goal xy_m", self.xy_m))
-        check_field(self, "tolerance_m", 0.0, 0.5, "m")
-        if self.turn_rad is not None:
-            check_field(self, "turn_rad", -math.pi, math.pi, "rad")
-        if self.height_m is not None:
-            check_field(self, "height_m", 0.0, 0.5, "m")
+    xy_m: tuple[float, float] = parameter(check_pair)
+    tolerance_m: float = number(0.0, 0.5, "m", 0.02)  # of the position
+    # From its current orientation; None for any
+    turn_rad: float | None = number(-math.pi, math.pi, "rad", None)
+    # Above its current height; None leaves it on the table
+    height_m: float | None = number(0.0, 0.5, "m", None)
 
     def distance_m(self, xy_m: Sequence[float]) -> float:
         """Return the distance [m] between the goal and a point (x, y) [m]."""
@@ -369,56 +376,44 @@ class Goal:
             left, tolerance = wrap_angle(self.turn_rad - turned_rad), self.TURN_TOLERANCE_RAD
             found["orientation"] = GoalError(left, tolerance, f"{math.degrees(abs(left)):.1f}°")
         if self.height_m is not None:
-            left, text = self.height_m - lifted_m, "{:.1f} mm in height"
-            text = text.format(1000 * abs(left))
+            left = self.height_m - lifted_m
+            text = f"{1000 * abs(left):.1f} mm in height"
             found["height"] = GoalError(left, self.HEIGHT_TOLERANCE_M, text)
         return found
 
 
 @dataclass(frozen=True)
-class Step:
-    """One (partial) action of a plan and its predicted effect.
-
-    primitive: the action; stop_phase: the phase at which it stops; predicted_end_xy_m: predicted
-    final position (x, y) in the table's frame; predicted_path_xy_m: (n, 2), the path to it;
-    path_xy_m: (m, 2), a decoded end-effector path relative to the object that is executed instead
-    of the primitive's own, or None; std_m: the model's σ [m] of the final position;
-    predicted_turn_rad: predicted rotation of the object since the start of the plan;
-    predicted_height_m: predicted lift of the object.
-    """
+class Step(Checked):
+    """One (partial) action of a plan and its predicted effect, in the table's frame."""
 
     primitive: affordlib.primitives.Primitive
-    stop_phase: float
+    stop_phase: float = number(0.0, 1.0)
     predicted_end_xy_m: tuple[float, float]
-    predicted_path_xy_m: np.ndarray
+    predicted_path_xy_m: np.ndarray  # (n, 2), the object's path to it
+    # (m, 2), relative to the object: a decoded path of the end effector, executed instead of the
+    # primitive's own
     path_xy_m: np.ndarray | None = None
-    std_m: float = math.nan
-    predicted_turn_rad: float = 0.0
-    predicted_height_m: float = 0.0
+    std_m: float = math.nan  # the model's σ of the final position
+    predicted_turn_rad: float = number(default=0.0)  # since the start of the plan
+    predicted_height_m: float = number(default=0.0)
 
     def __post_init__(self) -> None:
-        check_field(self, "stop_phase", 0.0, 1.0)
-        check_field(self, "predicted_turn_rad")
-        check_field(self, "predicted_height_m")
+        super().__post_init__()
         for name in ("predicted_end_xy_m", "predicted_path_xy_m", "path_xy_m"):
             if getattr(self, name) is not None:
                 check_array(name, getattr(self, name), 2)
 
 
 @dataclass(frozen=True)
-class Plan:
+class Plan(Checked):
     """Steps from (x, y) [m] to a goal, computed in plan_s seconds."""
 
     goal: Goal
-    start_xy_m: tuple[float, float]
+    start_xy_m: tuple[float, float] = parameter(check_pair)
     steps: tuple[Step, ...]
     planner: str
     reaches_goal: bool
-    plan_s: float
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "start_xy_m", check_pair("start_xy_m", self.start_xy_m))
-        check_field(self, "plan_s", 0.0)
+    plan_s: float = number(0.0)
 
     @property
     def predicted_end_xy_m(self) -> tuple[float, float]:
@@ -432,23 +427,16 @@ class Plan:
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """The result of executing a plan, as the robot measured it (a `Tabletop`: the ground truth).
-
-    distance_m: final distance to the goal [m]; object_paths_xy_m: one path (n, 2) of the object per
-    executed step, in the table's frame; end_pose: final (x, y, yaw); words: a text on the result.
-    """
+class Outcome(Checked):
+    """The result of executing a plan, as the robot measured it (a `Tabletop`: the ground truth)."""
 
     plan: Plan
-    distance_m: float
-    end_pose: tuple[float, float, float]
-    object_paths_xy_m: tuple[np.ndarray, ...] = field(default=())
+    distance_m: float = number(0.0, unit="m")  # of the final position to the goal
+    end_pose: tuple[float, float, float]  # x, y, yaw
+    object_paths_xy_m: tuple[np.ndarray, ...] = ()  # (n, 2) each, one per executed step
     turned_rad: float = 0.0
     lifted_m: float = 0.0
-    words: str = ""
-
-    def __post_init__(self) -> None:
-        check_field(self, "distance_m", 0.0, unit="m")
+    words: str = ""  # a text on the result
 
     def with_goal(self, goal: Goal) -> Outcome:
         """Return the outcome with its distance measured to another goal."""

@@ -17,8 +17,7 @@ from affordlib.interactions import (
     open_interactions,
     split_interactions,
 )
-from affordlib.interactions.dataset import valid_interactions
-from affordlib.interactions.sampling import Batch, sample_mixed
+from affordlib.interactions.dataset import Batch, sample_mixed, valid_interactions
 from affordlib.models import EffectNetwork
 from affordlib.models.base import condition_on_final_effect
 from affordlib.models.checkpoint import build

@@ -23,18 +23,75 @@ from sklearn.neighbors import NearestNeighbors
 from torch import Tensor
 
 from affordlib.geometry import rotate_channels, xy_columns
-from affordlib.interactions.dataset import InteractionTensors, valid_interactions
-from affordlib.interactions.sampling import condition_on_recorded_action
-from affordlib.models.evaluation import prediction_record, steps_of
-from affordlib.models.push_frame import inverse, push_direction, rotate_prediction
+from affordlib.interactions.dataset import (
+    InteractionTensors,
+    condition_on_recorded_action,
+    valid_interactions,
+)
+from affordlib.models.base import EffectModel, inverse, push_direction, rotate_prediction
+from affordlib.models.evaluation import EVERY, effects_at
 from affordlib.types import Prediction
 from affordlib.world import category_named
 
 Forecast = tuple[Tensor, Tensor]
 """Mean and σ (N, T, C) of the effect at some samples."""
 
+CONTACT_M = 0.001  # displacement [m] (or rotation [rad]) from which on an object is touched
 _CATEGORY_GAP = 3.0
 """Feature distance between two categories; the other features have a spread of about 1."""
+
+
+def steps_of(arrays: InteractionTensors) -> Tensor:
+    """Sample numbers of the paper's 25 steps, the last of which is t = 1."""
+    return torch.arange(EVERY, len(arrays.phase), EVERY)
+
+
+def network_record(
+    model: EffectModel, data: xr.Dataset, interactions: np.ndarray
+) -> dict[str, Any]:
+    """Predictions of a network for interactions: see `prediction_record`."""
+    kept = valid_interactions(data, interactions)
+    arrays = InteractionTensors.from_dataset(
+        data, kept, model.action_channels, model.effect_channels
+    )
+    phases = (steps_of(arrays) / (len(arrays.phase) - 1)).tolist()
+    return prediction_record(data, kept, arrays, *effects_at(model, arrays, phases)[1:])
+
+
+def about_objects(data: xr.Dataset, kept: np.ndarray) -> dict[str, Any]:
+    """Number of each interaction, category of its object, and whether the object rolls."""
+    names = data["category"].attrs["flag_meanings"].split()
+    return {
+        "interaction": data["interaction"].values[kept].tolist(),
+        "category": [names[k] for k in data["category"].values[kept]],
+        "rollable": data["rollable"].values[kept].tolist(),
+    }
+
+
+def prediction_record(
+    data: xr.Dataset,
+    kept: np.ndarray,
+    arrays: InteractionTensors,
+    mean: Tensor,
+    std: Tensor,
+) -> dict[str, Any]:
+    """Ground truth, mean and σ at t = 1 by channel, and mean errors of the whole trajectory.
+
+    kept: the numbers (N,) in `data` of the interactions of `arrays`; mean, std: (N, 25, C), at
+    `steps_of(arrays)`.
+    """
+    truth, names = arrays.effect[:, steps_of(arrays)], arrays.effect_channels
+    columns = xy_columns(names) or [0]
+    error = (mean - truth)[..., columns].norm(dim=-1)
+    touched = truth[..., columns].norm(dim=-1) > CONTACT_M
+    after = (error * touched).sum(dim=1) / touched.sum(dim=1).clamp_min(1)
+    record = about_objects(data, kept)
+    for name, values in (("truth", truth), ("mean", mean), ("std", std)):
+        record[name] = {c: values[:, -1, k].tolist() for k, c in enumerate(names)}
+    return record | {
+        "trajectory_error": error.mean(dim=1).tolist(),
+        "after_contact_error": after.tolist(),
+    }
 
 
 def baseline_predictions(

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from sklearn.preprocessing import StandardScaler
 
 from affordlib.geometry import wrap_angle
 from affordlib.interactions import InteractionTensors, Split, split_interactions
-from affordlib.interactions.dataset import Symmetry, valid_interactions
+from affordlib.interactions.dataset import valid_interactions
 from affordlib.interactions.recipes import Recipe, sample_scene, sample_world
 from affordlib.models.base import (
     EffectModel,
@@ -34,13 +35,18 @@ from affordlib.models.base import (
     condition_on_final_effect,
 )
 from affordlib.models.cnp import CNPConfig
-from affordlib.models.evaluation import about_objects, network_predictions
 from affordlib.models.film import FiLMConfig
 from affordlib.models.training import train_model
 from affordlib.primitives import Grasp, Push
 from affordlib.types import check_choice, check_count
 from affordlib.world import Tabletop
-from experiments.baselines import BASELINES, baseline_predictions
+from experiments.baselines import (
+    BASELINES,
+    about_objects,
+    baseline_predictions,
+    network_record,
+)
+from experiments.lever_training import Symmetry, augment_by_symmetry
 from experiments.runner import Job, open_once
 from experiments.shipped import CHECKPOINT_SPECS, GRASP_SYMMETRIES, HALF_TURNS
 
@@ -161,7 +167,7 @@ def cross_validate(
 
     def predicted(test_set: xr.Dataset, rows: np.ndarray) -> dict[str, Any]:
         if model in NETWORKS:
-            return network_predictions(network, test_set, rows)
+            return network_record(network, test_set, rows)
         if model == "logistic":
             return logistic_predictions(*known, test_set, rows)
         channels = task.action_channels, task.all_effects
@@ -236,8 +242,8 @@ def _train(
 ) -> tuple[EffectNetwork, dict[str, Any]]:
     """Train a network; also return a record of the training."""
     network, training = network_and_training(model, data, n)
-    symmetries, config = task_of(data).symmetries or (), replace(training, seed=seed)
-    how = config, network, symmetries, resume_checkpoint
+    augment = partial(augment_by_symmetry, symmetries=task_of(data).symmetries or ())
+    how = replace(training, seed=seed), network, augment, resume_checkpoint
     trained, history = train_model(open_once(data), split, *how)
     best = min(record.validation_error for record in history)
     steps = {"steps": history[-1].step, "seconds": history[-1].seconds}

@@ -24,12 +24,13 @@ from affordlib.types import (
     check_count,
     check_field,
 )
+from affordlib.world.trajectory import STEP_S
 
 if TYPE_CHECKING:
     import affordlib.world
 
 KINDS = ("shove", "knock", "topple", "goal")
-STEPS_PER_S = 240
+STEPS_PER_S = round(1 / STEP_S)
 TIPPING_S = 1.0
 TOPPLING = 1.5
 """Factor on the energy that tips an object onto its edge, since sliding dissipates some of it."""

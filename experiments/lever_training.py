@@ -13,15 +13,13 @@ import xarray as xr
 from torch import Tensor
 
 from affordlib.interactions import InteractionTensors, Split
-from affordlib.interactions.dataset import Symmetry, augment_by_symmetry
-from affordlib.interactions.sampling import Batch, condition_on_poses
+from affordlib.interactions.dataset import Batch, condition_on_poses
 from affordlib.models import CNPConfig, EffectNetwork, NetworkConfig
 from affordlib.models.lever_up import (
     LEVER_ACTION_CHANNELS,
     N_OBSERVED,
     N_PREDICTED,
     POSE_CHANNELS,
-    LastPoseConfig,
     from_start_errors_m,
     lever_up_tensors,
     window_errors_m,
@@ -33,7 +31,23 @@ from affordlib.models.training import (
     untrained,
 )
 from affordlib.types import check_choice
+from experiments.last_pose import LastPoseConfig
 from experiments.lstm import LSTMConfig
+
+Symmetry = tuple[int, bool]
+"""The number of rotations by π/2, and whether y is mirrored first."""
+
+
+def augment_by_symmetry(
+    arrays: InteractionTensors, symmetries: tuple[Symmetry, ...]
+) -> InteractionTensors:
+    """Augment interactions of a primitive without direction parameters by rotation and reflection.
+
+    Image and effect are rotated and mirrored; the commanded action is unchanged.
+    """
+    parts = [replace(arrays.rotated_and_mirrored(*s), action=arrays.action) for s in symmetries]
+    return parts[0].joined(*parts[1:]) if parts else arrays
+
 
 MIRRORED: tuple[Symmetry, ...] = ((0, False), (0, True))
 """Reflection augmentation: a lever-up and its mirror image in y (see `augment_by_symmetry`)."""

@@ -20,8 +20,8 @@ from torch import Tensor, nn
 from affordlib import checked
 from affordlib.models.base import masked_mean, network, with_time
 from affordlib.models.film import HarmonicsConfig, HarmonicsNetwork, dense, waves
-from affordlib.models.lever_up import AroundMean, MeanTrajectory, between
 from affordlib.types import Observations
+from experiments.last_pose import AroundMean, MeanTrajectory, between
 
 _CERTAIN = -6.0
 """Raw σ of observed values: its softplus is nearly zero."""

@@ -15,6 +15,7 @@ import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -22,14 +23,17 @@ import xarray as xr
 from torch import nn
 
 from affordlib.interactions import (
+    Batch,
+    InteractionTensors,
     Split,
+    condition_on_recorded_action,
     open_interactions,
+    recipes,
+    sample_mixed,
     split_interactions,
 )
 from affordlib.interactions.collect import collect
-from affordlib.interactions.dataset import Symmetry
-from affordlib.interactions.recipes import RECIPES, SHIPPED, Variation
-from affordlib.interactions.sampling import sample_forward, sample_mixed
+from affordlib.interactions.recipes import Variation
 from affordlib.interactions.store import SUFFIX as DATA_SUFFIX
 from affordlib.interactions.store import dataset_sha256
 from affordlib.models import CNPConfig, FiLMConfig, NetworkConfig
@@ -46,11 +50,13 @@ from affordlib.planning.reachability import Reachability, reach_features
 from affordlib.primitives import move_for
 from affordlib.results import repo_root, write_atomically
 from affordlib.types import Goal
-from affordlib.world import ROLLABLE, STANDING, Tabletop
+from affordlib.world import ROLLABLE, STANDING, Tabletop, WorldConfig
 from experiments.commands import command, worker_type
 from experiments.lever_training import (
     LEVER_CHECKPOINTS,
     LEVER_MODELS,
+    Symmetry,
+    augment_by_symmetry,
     train_lever_model,
 )
 from experiments.lstm import LSTMConfig
@@ -64,6 +70,26 @@ from experiments.tasks import (
     off_grid,
     sealed,
 )
+
+_TEN_TIMES = {
+    f"{name}_x10": replace(recipe, n_interactions=10 * recipe.n_interactions, seed=recipe.seed + 10)
+    for name, recipe in recipes.RECIPES.items()
+    if name not in ("push_test", "partial", "reach")
+}
+_FIRM = replace(_TEN_TIMES["grasp_x10"], seed=18, world=WorldConfig())
+RECIPES = recipes.RECIPES | _TEN_TIMES | {"grasp_firm_x10": _FIRM}
+"""The shipped sets, sets of ten times the size, and grasps with the friction of the pushes, with
+which objects slip less."""
+
+
+def sample_forward(
+    tensors: InteractionTensors, n_targets: int, obs_max: int, generator: torch.Generator
+) -> Batch:
+    """Sample targets for a context of only the action at t = 0 and 1; obs_max is not used."""
+    last = len(tensors.phase) - 1
+    target_at = torch.randint(0, last + 1, (len(tensors), n_targets), generator=generator)
+    target_at[:, 0] = last
+    return Batch.of(tensors, condition_on_recorded_action(tensors), target_at)
 
 
 @dataclass(frozen=True)
@@ -142,7 +168,7 @@ def compare(old: xr.Dataset, new: xr.Dataset) -> tuple[bool, str]:
 def collect_sets(options: argparse.Namespace) -> bool:
     """Collect data sets; return whether each agrees with the existing one."""
     agree = True
-    for name in options.only or SHIPPED:
+    for name in options.only or recipes.RECIPES:
         try:
             old = open_interactions(name)
         except (FileNotFoundError, ValueError) as error:
@@ -181,7 +207,8 @@ def train_checkpoint(name: str) -> None:
         more = {"trained_for": trained_for, "view": spec.view}
     else:
         spec, more = CHECKPOINT_SPECS[name], {}
-        how = {"symmetries": spec.symmetries, "sampler": spec.sampler}
+        augment = partial(augment_by_symmetry, symmetries=spec.symmetries)
+        how = {"augment": augment, "sampler": spec.sampler}
         model, history = train_model(data, split, spec.training, spec.network, **how)
     path = repo_root() / "data" / "checkpoints" / f"{name}{SUFFIX}"
     save_checkpoint(model, path, about_checkpoint(data, split, spec.training, **more))

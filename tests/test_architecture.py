@@ -2,6 +2,8 @@
 
 import ast
 import graphlib
+import importlib
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -97,6 +99,23 @@ def test_functions_in_functions_are_not_decorated_again_and_again():
                     arguments = [*each.args.args, *each.args.kwonlyargs]
                     assert not each.returns, f"{path}: {each.name}"
                     assert not any(argument.annotation for argument in arguments)
+
+
+PAGES = sorted((ROOT / "notebooks").rglob("*.ipynb"))
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)
+def test_a_page_imports_from_few_modules(path):
+    """At most eight, and public names from the package that exports them."""
+    cells = json.loads(path.read_text())["cells"]
+    code = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
+    names = [n for text in code for n in ast.walk(ast.parse(text)) if isinstance(n, ast.ImportFrom)]
+    names = [n for n in names if n.module.startswith("affordlib.")]
+    assert len({n.module for n in names}) <= 8
+    for node in names:
+        package = ".".join(node.module.split(".")[:2])
+        exported = vars(importlib.import_module(package))
+        assert package == node.module or not {a.name for a in node.names} & exported.keys()
 
 
 IMPORT = """

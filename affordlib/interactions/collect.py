@@ -12,15 +12,20 @@ number of workers and any size and order of chunks. On a cluster:
 
 import os
 import shutil
-from contextlib import closing, suppress
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, nullcontext, suppress
 from dataclasses import fields
 from functools import partial
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
-from filelock import FileLock, Timeout
+from joblib import Parallel, delayed, parallel_config
 from tqdm.auto import tqdm
 
 from affordlib.interactions.recipes import Recipe, interact
@@ -41,11 +46,11 @@ from affordlib.types import (
     Interaction,
     check_count,
 )
-from affordlib.workers import MOST_WORKERS, spread
 from affordlib.world import CATEGORIES, Tabletop, TabletopObject, WorldConfig
 from affordlib.world.execution import RECORDED_SAMPLES
 from affordlib.world.trajectory import N_SAMPLES
 
+MOST_WORKERS = 256
 CHUNK = 50
 """Usual number of interactions per chunk, the unit that a worker collects, returns and stores."""
 
@@ -103,45 +108,42 @@ def collect(
     """Collect a recipe's data set into a local file and return its path, which ends in .zarr.zip.
 
     A rerun collects missing chunks; a complete file is replaced only with `replace`. chunk:
-    interactions per chunk, 50 by default. Raises ValueError if the path holds anything else,
-    RuntimeError if another process is collecting into it or if a chunk cannot be collected.
+    interactions per chunk, 50 by default. Raises ValueError if the path holds anything else, and
+    RuntimeError if a chunk cannot be collected.
     """
     if not str(path).endswith(SUFFIX):
         raise ValueError(f"path must end in {SUFFIX!r}, got {str(path)!r}")
     check_count("workers", workers, 1, MOST_WORKERS)
     size = check_count("chunk", CHUNK if chunk is None else chunk)
-    attrs, file = attributes_for(recipe), from_root(path)
-    parts = file.with_name(f".{file.name}.parts")
-    if _is_there(file, attrs, replace):
-        with suppress(OSError):  # parts are left if a process was killed at its very end
-            if parts.is_dir():
-                with FileLock(parts / "lock", timeout=0):
-                    shutil.rmtree(parts)
-        return file
-    parts.mkdir(parents=True, exist_ok=True)
-    try:
-        with FileLock(parts / "lock", timeout=0):
-            if not _is_there(file, attrs, replace):  # another process may have completed it
-                n = recipe.n_interactions
-                rows = [range(k, min(k + size, n)) for k in range(0, n, size)]
-                write_interactions(_collected(recipe, attrs, parts, rows, workers, progress), file)
-            shutil.rmtree(parts, ignore_errors=True)
-    except Timeout:
-        raise RuntimeError(
-            f"another process is collecting into {file}; wait for it, or choose another path"
-        ) from None
-    except (KeyboardInterrupt, OSError, RuntimeError) as error:
-        error.add_note("finished chunks are kept; collect into the same path to continue")
-        raise
+    attrs, file, n = attributes_for(recipe), from_root(path), recipe.n_interactions
+    parts, missing, files = file.with_name(f".{file.name}.parts"), {}, []
+    if not _is_there(file, attrs, replace):
+        for rows in (range(k, min(k + size, n)) for k in range(0, n, size)):
+            files.append(parts / f"{rows.start:08d}-{rows.stop:08d}{SUFFIX}")
+            if _attributes(files[-1]) != attrs:
+                missing[f"interactions {rows.start} to {rows[-1]}"] = rows, files[-1]
+        left = sum(len(rows) for rows, _ in missing.values())
+        bar = tqdm(total=n, initial=n - left, unit=" interactions", disable=not progress)
+        try:
+            with closing(spread(partial(_make, recipe, attrs), missing, workers)) as made, bar:
+                for name, data in made:
+                    write_interactions(data, missing[name][1], level=1)  # temporary, and fast
+                    bar.update(len(missing[name][0]))
+            chunks = [open_interactions(part) for part in files]
+            how = {"data_vars": "minimal", "combine_attrs": "override"}
+            write_interactions(xr.concat(chunks, "interaction", **how), file)
+        except (KeyboardInterrupt, OSError, RuntimeError) as error:
+            error.add_note("finished chunks are kept; collect into the same path to continue")
+            raise
+    shutil.rmtree(parts, ignore_errors=True)  # also of a process that was killed at its very end
     return file
 
 
 def _attributes(file: Path) -> dict[str, str] | None:
     """Return the attributes of a complete set, or None if there is none."""
-    try:
+    with suppress(CorruptedDataError, OSError):
         return open_interactions(file).attrs
-    except (CorruptedDataError, OSError):
-        return None
+    return None
 
 
 def _is_there(file: Path, attrs: dict[str, str], replace: bool) -> bool:
@@ -155,37 +157,53 @@ def _is_there(file: Path, attrs: dict[str, str], replace: bool) -> bool:
     return found == attrs
 
 
-def _collected(
-    recipe: Recipe,
-    attrs: dict[str, str],
-    parts: Path,
-    rows: list[range],
-    workers: int,
-    progress: bool,
-) -> xr.Dataset:
-    """Collect the chunks that are missing in `parts` and return the complete set."""
-    kept = {r: parts / f"{r.start:08d}-{r.stop:08d}{SUFFIX}" for r in rows}
-    left = [r for r in rows if _attributes(kept[r]) != attrs]
-    missing = {f"interactions {r.start} to {r[-1]}": r for r in left}
-    n, there = recipe.n_interactions, recipe.n_interactions - sum(map(len, left))
-    bar = tqdm(total=n, initial=there, unit=" interactions", disable=not progress)
-    with closing(spread(partial(_make, recipe, attrs), missing, workers)) as made, bar:
-        for name, chunk in made:
-            write_interactions(chunk, kept[missing[name]], level=1)  # temporary, so speed matters
-            bar.update(len(missing[name]))
-    chunks = [open_interactions(path) for path in kept.values()]
-    return xr.concat(chunks, "interaction", data_vars="minimal", combine_attrs="override")
-
-
-def _make(recipe: Recipe, attrs: dict[str, str], rows: range) -> xr.Dataset:
+def _make(recipe: Recipe, attrs: dict[str, str], task: tuple[range, Path]) -> xr.Dataset:
     """Collect one chunk on a worker; raises RuntimeError if its set would have other attributes."""
-    here = attributes_for(recipe)
-    if here != attrs:
+    if (here := attributes_for(recipe)) != attrs:
         raise RuntimeError(
             f"this worker would make another set than the collector expects: it has {here}, "
             f"not {attrs}; install the same package versions on both"
         )
-    return collect_chunk(recipe, rows)
+    return collect_chunk(recipe, task[0])
+
+
+def spread(
+    function: Callable[[Any], Any], tasks: Mapping[str, Any], workers: int = 1
+) -> Iterator[tuple[str, Any]]:
+    """Yield the name of each task and function(task) as soon as it is computed.
+
+    In this process for one worker, unless joblib.parallel_config says otherwise; else in new
+    processes, which end with this one. Raises RuntimeError that names a task that fails.
+    """
+    end = partial(_end_with, os.getpid())
+    new = parallel_config("loky", inner_max_num_threads=1, initializer=end)
+    with new if workers > 1 else nullcontext():
+        n_jobs = max(1, min(workers, len(tasks))) if workers > 1 else None
+        parallel = Parallel(
+            n_jobs, return_as="generator_unordered", batch_size=1, pre_dispatch="n_jobs"
+        )
+    calls = (delayed(_named)(function, name, task) for name, task in tasks.items())
+    with closing(parallel(calls)) as results:
+        yield from results
+
+
+def _named(function: Callable[[Any], Any], name: str, task: Any) -> tuple[str, Any]:
+    try:
+        return name, function(task)
+    except Exception as error:
+        raise RuntimeError(f"{name} failed: {type(error).__name__}: {error}") from error
+
+
+def _end_with(parent: int) -> None:
+    """Leave Ctrl-C to the parent process, and end this one within a second of its end."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    def watch():
+        while os.getppid() == parent:
+            time.sleep(0.5)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def attributes_for(recipe: Recipe) -> dict[str, str]:
@@ -212,7 +230,7 @@ def collect_chunk(recipe: Recipe, numbers: range) -> xr.Dataset:
     flags = {"primitive": " ".join(PRIMITIVES), "category": " ".join(CATEGORIES)}
     variables = _VARIABLES | dict.fromkeys(flags, ("int8", ""))
     kinds = [primitive_named(name) for name in recipe.primitives]
-    parameters = sorted({name for kind in kinds for name in _field_names(kind)})
+    parameters = sorted({field.name for kind in kinds for field in fields(kind)})
     variables |= dict.fromkeys(parameters, _PARAMETER)
     if recipe.partial:
         variables["full_effect"] = ("float32", "effect_channel", "m, rad", _FULL_EFFECT)
@@ -242,28 +260,21 @@ def collect_chunk(recipe: Recipe, numbers: range) -> xr.Dataset:
 
 def _row(obj: TabletopObject, done: Interaction, config: WorldConfig) -> dict[str, object]:
     """Return an interaction's values by variable name, including some that are not stored."""
-    primitive = done.primitive
-    parameters = {name: getattr(primitive, name) for name in _field_names(type(primitive))}
+    of_interaction = {name.removesuffix("_m"): value for name, value in vars(done).items()}
+    parameters = {f.name: getattr(done.primitive, f.name) for f in fields(done.primitive)}
     return (
-        vars(done)
+        of_interaction
         | parameters
         | {
-            "primitive": list(PRIMITIVES).index(primitive.name),
+            "primitive": list(PRIMITIVES).index(done.primitive.name),
             "category": list(CATEGORIES).index(obj.category),
             "size": [*np.ptp(obj.footprint_m, axis=0), obj.height_m],
             "mass": config.density_kg_m3 * obj.volume_m3,
             "com_offset": config.com_offset_m,
             "friction": (config.table_friction, config.object_friction, config.finger_friction),
             "tip_offset": config.tip_offset_m,
-            "estimated_xy": done.estimated_xy_m,
             "rollable": obj.rollable,
             "success": done.success,
-            "tracking_error": done.tracking_error_m,
-            "penetration": done.penetration_m,
             "fault": bool(done.faults),
         }
     )
-
-
-def _field_names(kind: type) -> list[str]:
-    return [field.name for field in fields(kind)]

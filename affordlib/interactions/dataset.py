@@ -1,6 +1,8 @@
-"""Tensors of a data set, their split into training, validation and test, and their scaling.
+"""Tensors of a data set, their split into training, validation and test, scaling, and batches.
 
-The split is 80/10/10 inside each of 10 folds (Section 4.3 of the paper).
+The split is 80/10/10 inside each of 10 folds (Section 4.3 of the paper). In its Section 3.2, k
+observations, k uniform in 1 … obs_max, are taken at random phases of a random trajectory. A sampler
+takes the interactions of a batch, n_targets, obs_max and a generator, and returns a `Batch`.
 """
 
 import copy
@@ -14,8 +16,8 @@ import torch
 from affordlib.geometry import rotate_channels
 from affordlib.types import (
     CROP_WIDTH_M,
-    LEVER_IMAGE_PIXELS,
     HasChannels,
+    Observations,
     check_array,
     check_count,
     check_field,
@@ -45,13 +47,6 @@ def check_fits(name: str, tensors: "InteractionTensors", model: HasChannels) -> 
             raise ValueError(f"{name} has the {kind} {own}, but the model needs {wanted}")
     if domain := getattr(model, "domain", None):
         domain.check_width(name, tensors.image_width_m)
-
-
-def image_width_m(data: "xarray.Dataset") -> float:
-    """Return the width [m] of the images; sets that do not name it have 16, of lever-ups 56 cm."""
-    image = data["image"]
-    unnamed_m = 0.56 if image.shape[-1] == LEVER_IMAGE_PIXELS else 0.16
-    return float(image.attrs.get("width_m", unnamed_m))
 
 
 @dataclass(frozen=True)
@@ -105,20 +100,15 @@ class Scaler:
     @classmethod
     def fit(cls, tensors: "InteractionTensors") -> Self:
         """Compute the scales of training data: RMS of the channels, mean and std of the image."""
-        image = tensors.image.double()
-        return cls(
-            _scales(tensors.action, tensors.action_channels, if_zero=1.0),
-            _scales(tensors.effect, tensors.effect_channels, if_zero=1e-6),
-            tuple(image.mean(dim=(0, 2, 3)).tolist()),
-            tuple(image.std(dim=(0, 2, 3)).clamp_min(1e-6).tolist()),
-        )
-
-
-def _scales(values: torch.Tensor, channels: tuple[str, ...], if_zero: float) -> tuple[float, ...]:
-    rms = values.double().square().mean(dim=(0, 1)).sqrt()
-    plane = [k for k, name in enumerate(channels) if name in ("x", "y")]
-    rms[plane] = rms[plane].square().mean().sqrt()
-    return tuple(torch.where(rms > 1e-6, rms, if_zero).tolist())
+        image, scales = tensors.image.double(), []
+        for kind, if_zero in (("action", 1.0), ("effect", 1e-6)):
+            rms = getattr(tensors, kind).double().square().mean(dim=(0, 1)).sqrt()
+            names = getattr(tensors, f"{kind}_channels")
+            plane = [k for k, name in enumerate(names) if name in ("x", "y")]
+            rms[plane] = rms[plane].square().mean().sqrt()
+            scales.append(torch.where(rms > 1e-6, rms, if_zero))
+        scales += [image.mean(dim=(0, 2, 3)), image.std(dim=(0, 2, 3)).clamp_min(1e-6)]
+        return cls(*(tuple(scale.tolist()) for scale in scales))
 
 
 _BY_INTERACTION = ("image", "action", "effect", "stop_phase")
@@ -146,12 +136,11 @@ class InteractionTensors:
             object.__setattr__(self, "stop_phase", torch.ones(len(self)))
         check_field(self, "image_width_m", 0.01, 10.0, "m")
         n, steps = len(self.image), len(self.phase)
-        for name in ("action_channels", "effect_channels"):
-            if not getattr(self, name):
-                raise ValueError(f"{name} must name at least one channel")
         shapes = {"image": (2, *self.image.shape[-1:] * 2), "stop_phase": ()}
-        shapes |= {"action": (steps, len(self.action_channels))}
-        shapes |= {"effect": (steps, len(self.effect_channels))}
+        for kind in ("action", "effect"):
+            shapes[kind] = steps, len(getattr(self, f"{kind}_channels"))
+            if not shapes[kind][1]:
+                raise ValueError(f"{kind}_channels must name at least one channel")
         for name, shape in shapes.items():
             if (got := tuple(getattr(self, name).shape)) != (n, *shape):
                 raise ValueError(f"{name} must be {(n, *shape)}, got {got}")
@@ -172,8 +161,7 @@ class InteractionTensors:
         for kind in ("action", "effect"):
             most = getattr(self, kind).abs().amax(dim=(0, 1)).tolist()
             for channel, value in zip(getattr(self, f"{kind}_channels"), most, strict=True):
-                largest = 4 * math.pi if channel in ("yaw", "tilt", "pitch") else 2.0
-                if not value <= largest:
+                if not value <= (4 * math.pi if channel in ("yaw", "tilt", "pitch") else 2.0):
                     raise ValueError(
                         f"{kind} must be in metres and radians, relative to the object's pose at "
                         f"the start, but {channel!r} is up to {value:.3g}"
@@ -189,28 +177,27 @@ class InteractionTensors:
         action_channels: tuple[str, ...] = ("x", "y"),
         effect_channels: tuple[str, ...] = ("x", "y"),
     ) -> Self:
-        """Build tensors of the valid ones of the given interactions (default: all)."""
+        """Build tensors of the valid ones of the given interactions (default: all).
+
+        Sets that do not name the width of their images have 16 cm, of lever-ups 56 cm.
+        """
         chosen = np.arange(data.sizes["interaction"]) if interactions is None else interactions
         check_numbers("interactions", chosen)
-        part = data.isel(interaction=valid_interactions(data, chosen))
-
-        def channels(kind, names):
+        part, values = data.isel(interaction=valid_interactions(data, chosen)), []
+        for kind, names in (("action", action_channels), ("effect", effect_channels)):
             known = data.attrs[f"{kind}_channels"].split()
-            unknown = [name for name in names if name not in known]
-            if unknown:
+            if unknown := [name for name in names if name not in known]:
                 raise ValueError(f"{kind}_channels {unknown} are not stored; choose from {known}")
-            values = part[kind].values[..., [known.index(name) for name in names]]
-            return torch.from_numpy(np.ascontiguousarray(values))
-
+            columns = part[kind].values[..., [known.index(name) for name in names]]
+            values.append(torch.from_numpy(np.ascontiguousarray(columns)))
         return cls(
             torch.from_numpy(part["image"].values),
             torch.from_numpy(part["phase"].values).float(),
-            channels("action", action_channels),
-            channels("effect", effect_channels),
+            *values,
             tuple(action_channels),
             tuple(effect_channels),
             torch.from_numpy(part["stop_phase"].values).float(),
-            image_width_m(data),
+            float(part["image"].attrs.get("width_m", 0.16 if part.sizes["row"] < 128 else 0.56)),
         )
 
     def phases(self, at: torch.Tensor) -> torch.Tensor:
@@ -249,33 +236,84 @@ class InteractionTensors:
     def rotated_and_mirrored(self, quarters: int, mirror: bool = False) -> Self:
         """Return the interactions mirrored in y, if `mirror`, then rotated by quarters · π/2."""
         heading = torch.tensor([(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)][quarters % 4])
-        image, action, effect = self.image, self.action, self.effect
-        if mirror:
-            image = torch.flip(image, (-2,))
-            action = _mirror(action, self.action_channels)
-            effect = _mirror(effect, self.effect_channels)
-        return replace(
-            self,
-            image=torch.rot90(image, quarters, (-2, -1)),
-            action=rotate_channels(action, self.action_channels, heading, absolute_yaw=True),
-            effect=rotate_channels(effect, self.effect_channels, heading, absolute_yaw=False),
-        )
+        image, turned = torch.flip(self.image, (-2,)) if mirror else self.image, {}
+        for kind in ("action", "effect"):
+            values, names = getattr(self, kind), getattr(self, f"{kind}_channels")
+            if mirror:
+                values = values * torch.tensor([-1.0 if c in ("y", "yaw") else 1.0 for c in names])
+            turned[kind] = rotate_channels(values, names, heading, absolute_yaw=kind == "action")
+        return replace(self, image=torch.rot90(image, quarters, (-2, -1)), **turned)
 
 
-Symmetry = tuple[int, bool]
-"""The number of rotations by π/2, and whether y is mirrored first."""
+@dataclass(frozen=True)
+class Batch:
+    """Images, context, and targets of action and effect."""
+
+    image: torch.Tensor  # (B, 2, 48, 48)
+    observations: Observations
+    t_target: torch.Tensor  # (B, T)
+    action: torch.Tensor  # (B, T, C_a)
+    effect: torch.Tensor  # (B, T, C_e)
+
+    @classmethod
+    def of(
+        cls, tensors: InteractionTensors, observations: Observations, target_at: torch.Tensor
+    ) -> Self:
+        """Build a batch whose targets are the samples with numbers (B, T), or (T,) for all."""
+        t_target, action = tensors.action_at(target_at)
+        effect = tensors.effect_at(target_at)[1]
+        return cls(tensors.image, observations, t_target, action, effect)
 
 
-def augment_by_symmetry(
-    arrays: InteractionTensors, symmetries: tuple[Symmetry, ...]
-) -> InteractionTensors:
-    """Augment interactions of a primitive without direction parameters by rotation and reflection.
+def condition_on_recorded_action(tensors: InteractionTensors) -> Observations:
+    """Return a context of only the commanded action, at t = 0 and t = 1 (w₁ = 1)."""
+    return Observations.of(tensors, action=tensors.action_at(torch.tensor([0, -1])))
 
-    Image and effect are rotated and mirrored; the commanded action is unchanged.
+
+def condition_on_poses(
+    tensors: InteractionTensors, start: torch.Tensor, n_poses: int
+) -> Observations:
+    """Return a context of the action at t = 0 and 1, and n_poses effects from sample `start` (N,).
+
+    With n_poses = 0 only the action is observed (w₁ = 1), otherwise both (w₁ = 1/2).
     """
-    parts = [replace(arrays.rotated_and_mirrored(*s), action=arrays.action) for s in symmetries]
-    return parts[0].joined(*parts[1:])
+    at = start[:, None] + torch.arange(n_poses)
+    effect = tensors.effect_at(at) if n_poses else None
+    return Observations.of(tensors, tensors.action_at(torch.tensor([0, -1])), effect)
 
 
-def _mirror(values: torch.Tensor, channels: tuple[str, ...]) -> torch.Tensor:
-    return values * torch.tensor([-1.0 if name in ("y", "yaw") else 1.0 for name in channels])
+def sample_mixed(
+    tensors: InteractionTensors, n_targets: int, obs_max: int, generator: torch.Generator
+) -> Batch:
+    """Sample contexts of action (50 %), effect (25 %) or both, half at the phases used to plan."""
+    b, last = len(tensors), len(tensors.phase) - 1
+
+    def uniform(*shape):
+        return torch.rand(*shape, generator=generator)
+
+    def integers(low, high, *shape):
+        return torch.randint(low, high + 1, shape, generator=generator)
+
+    def counts():
+        few, many = integers(1, min(2, obs_max), b, 1), integers(1, obs_max, b, 1)
+        return torch.where(uniform(b, 1) < 0.5, few, many)
+
+    action_at, effect_at = integers(0, last, b, obs_max), integers(0, last, b, obs_max)
+    as_queried = uniform(b) < 0.5
+    action_at[as_queried, 0] = 0
+    action_at[as_queried, min(1, obs_max - 1)] = last if obs_max > 1 else 0
+    effect_at[uniform(b) < 0.5, 0] = last
+
+    slot = torch.arange(obs_max)
+    kind = uniform(b, 1)
+    action_mask = (slot < counts()) & ((kind < 0.5) | (kind > 0.75))
+    effect_mask = (slot < counts()) & (kind >= 0.5)
+    weight = torch.where(kind > 0.75, uniform(b, 1), (kind < 0.5).float()).squeeze(1)
+
+    target_at = integers(0, last, b, n_targets)
+    target_at[:, 0] = last
+    observed = Observations.of(
+        tensors, tensors.action_at(action_at), tensors.effect_at(effect_at), weight
+    )
+    observed = replace(observed, action_mask=action_mask, effect_mask=effect_mask)
+    return Batch.of(tensors, observed, target_at)

@@ -61,18 +61,15 @@ def write_interactions(data: "xarray.Dataset", path: Path, level: int = 9) -> No
     from zarr.storage import MemoryStore
 
     data = data.rename({name: there for name, there in STORED_AS.items() if name in data})
-    codec = BloscCodec(cname="zstd", clevel=level, shuffle="shuffle")
-    buffers = {}
+    codec, buffers = BloscCodec(cname="zstd", clevel=level, shuffle="shuffle"), {}
     encoding = {
         name: {"compressors": [codec], "chunks": variable.shape, "_FillValue": None}
         for name, variable in data.variables.items()
     }
     data.to_zarr(MemoryStore(buffers), zarr_format=3, consolidated=False, encoding=encoding)
     files = {name: buffer.to_bytes() for name, buffer in buffers.items()}
-    manifest = {
-        "arrays": _hashes(data),
-        "files": {name: hashlib.sha256(content).hexdigest() for name, content in files.items()},
-    }
+    of_files = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
+    manifest = {"arrays": _hashes(data), "files": of_files}
     files[MANIFEST] = json.dumps(manifest, indent=1, sort_keys=True).encode()
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_STORED) as archive:
@@ -85,24 +82,20 @@ def _url_of(name_or_path: str | Path) -> str:
     """Return the path or URL of a set; raises FileNotFoundError if it does not exist."""
     url = os.fspath(name_or_path)
     url = url if url.endswith(SUFFIX) else f"data/{url}{SUFFIX}"
-    if "://" not in url:
-        try:
-            return str(file_at(url))
-        except FileNotFoundError as error:
-            shipped = sorted(
-                p.name.removesuffix(SUFFIX) for p in from_root("data").glob(f"*{SUFFIX}")
-            )
-            raise FileNotFoundError(
-                f"interactions {str(name_or_path)!r}: {error}; give one of the shipped names "
-                f"{shipped} or the path of a {SUFFIX} file, or collect them with `make data`"
-            ) from None
-    return url
+    try:
+        return url if "://" in url else str(file_at(url))
+    except FileNotFoundError as error:
+        files = from_root("data").glob(f"*{SUFFIX}")
+        shipped = sorted(path.name.removesuffix(SUFFIX) for path in files)
+        raise FileNotFoundError(
+            f"interactions {str(name_or_path)!r}: {error}; give one of the shipped names "
+            f"{shipped} or the path of a {SUFFIX} file, or collect them with `make data`"
+        ) from None
 
 
 def _read(url: str, arrays: bool = True) -> tuple[dict[str, str], dict[str, bytes]]:
     """Read the hashes of a set's arrays and, if wanted, the verified files of its zip."""
-    found, names = {}, [MANIFEST]
-    name = "its directory"
+    found, names, name = {}, [MANIFEST], "its directory"
     try:
         with fsspec.open(url, "rb") as file, zipfile.ZipFile(file) as archive:
             room = file.seek(0, os.SEEK_END)  # nothing in it is compressed as a member of the zip

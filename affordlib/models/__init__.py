@@ -12,12 +12,11 @@ from affordlib.models.cnp import AffordanceCNP, CNPConfig
 from affordlib.models.domain import OutOfRangeWarning, TrainingDomain
 from affordlib.models.evaluation import (
     coverage,
-    error_row,
     final_error,
     final_errors_m,
     fit_sigma_scale,
     network_predictions,
     refuse_seen,
 )
-from affordlib.models.film import FiLMConfig, FiLMNetwork
+from affordlib.models.film import CircularHarmonics, FiLMConfig, FiLMNetwork
 from affordlib.models.training import TrainingConfig, about_training, train, train_model

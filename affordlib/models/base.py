@@ -1,12 +1,17 @@
 """Models of the effects of actions: the interface that planners see, and networks' base class.
 
 A network standardises, checks the training domain, rotates into its frame, and has the loss.
+
+In the push-aligned frame, everything is rotated so that the push direction is always angle 0.
+Pushing works the same in all directions on the table, so a model in this frame need not learn
+rotations. Image, action and effect are rotated into the frame, predictions are rotated back. A
+rotation is given by (cos α, sin α), one per query.
 """
 
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -17,17 +22,8 @@ from torch import Tensor, nn
 
 from affordlib import checked
 from affordlib.geometry import rotate_channels, xy_columns
-from affordlib.interactions.dataset import InteractionTensors, Scaler
-from affordlib.interactions.sampling import Batch
+from affordlib.interactions.dataset import Batch, InteractionTensors, Scaler
 from affordlib.models.domain import TrainingDomain
-from affordlib.models.push_frame import (
-    FRAMES,
-    inverse,
-    push_direction,
-    rotate_image,
-    rotate_observations,
-    rotate_prediction,
-)
 from affordlib.primitives import Primitive
 from affordlib.types import (
     ACTION_CHANNELS,
@@ -37,6 +33,11 @@ from affordlib.types import (
     check_choice,
     check_count,
 )
+
+FRAMES = ("table", "push")
+_SHORTEST_M = 1e-3
+
+Channels = tuple[str, ...]
 
 
 @runtime_checkable
@@ -80,7 +81,7 @@ class NetworkConfig:
     action_channels: tuple[str, ...] = ("x", "y")
     effect_channels: tuple[str, ...] = ("x", "y")
     sigma_floor: float = 0.1  # initial lower bound of σ, in standardised units
-    frame: str = "table"  # "push" rotates everything into the push direction (`push_frame.py`)
+    frame: str = "table"  # or "push", the push-aligned frame
 
     def __post_init__(self) -> None:
         check_choice("frame", self.frame, FRAMES)
@@ -119,7 +120,7 @@ class EffectNetwork(nn.Module, ABC):
     rotation into the network's frame happen inside. A subclass implements `features` and `outputs`,
     which work in standardised units, creates its layers in `make_layers`, and is registered by the
     decorator `network`. Buffers: sigma_floor, the lower bound of σ, which decreases in training;
-    sigma_scale (C_e,), factors on σ of the effect channels, see `calibration.py`.
+    sigma_scale (C_e,), factors on σ of the effect channels, see `fit_sigma_scale`.
     """
 
     @checked
@@ -136,9 +137,8 @@ class EffectNetwork(nn.Module, ABC):
                 raise ValueError(
                     f"scaler {kind}_scale must have {width} values, one per channel of the config"
                 )
-        for name in ("action_scale", "effect_scale", "image_mean", "image_std"):
-            values = torch.tensor(getattr(scaler, name), dtype=torch.float32)
-            self.register_buffer(name, values, persistent=False)
+        for name, values in vars(scaler).items():
+            self.register_buffer(name, torch.tensor(values, dtype=torch.float32), persistent=False)
         # Double precision, so that a training continues from exactly the floor where it stopped.
         floor = torch.tensor(config.sigma_floor, dtype=torch.float64)
         self.register_buffer("sigma_floor", floor)
@@ -185,12 +185,8 @@ class EffectNetwork(nn.Module, ABC):
         """Split the last layer's values (B, T, 2 C_a + 2 C_e) into (μ_a, σ_a, μ_e, σ_e)."""
         n_a, n_e = len(self.action_channels), len(self.effect_channels)
         mu_a, raw_a, mu_e, raw_e = y.split([n_a, n_a, n_e, n_e], dim=-1)
-        return (
-            mu_a,
-            self.sigma_floor + F.softplus(raw_a),
-            mu_e,
-            self.sigma_floor + F.softplus(raw_e),
-        )
+        sigma_a, sigma_e = (self.sigma_floor + F.softplus(raw) for raw in (raw_a, raw_e))
+        return mu_a, sigma_a, mu_e, sigma_e
 
     @property
     def _channels(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -275,9 +271,7 @@ class EffectNetwork(nn.Module, ABC):
         outputs, direction = self._decode(encoded, batch.observations, batch.t_target)
         mu_a, sigma_a, mu_e, sigma_e = outputs
         if direction is not None:
-            back = inverse(direction)[:, None]
-            action = rotate_channels(action, self.action_channels, back, absolute_yaw=True)
-            effect = rotate_channels(effect, self.effect_channels, back, absolute_yaw=False)
+            action, effect = rotate_both(action, effect, inverse(direction), *self._channels)
         nll_a = gaussian_nll(action / self.action_scale, mu_a, sigma_a)
         nll_e = gaussian_nll(effect / self.effect_scale, mu_e, sigma_e)
         if beta:
@@ -307,3 +301,86 @@ def he_initialise(module: nn.Module) -> None:
     if isinstance(module, nn.Linear | nn.Conv2d):
         nn.init.kaiming_normal_(module.weight, a=0.01, nonlinearity="leaky_relu")
         nn.init.zeros_(module.bias)
+
+
+def push_direction(
+    observations: Observations, action_channels: Channels, effect_channels: Channels
+) -> Float[Tensor, "b 2"]:
+    """Directions (B, 2), as unit vectors, of the observed pushes; differentiable.
+
+    An action's direction is from its first to its last observation, or else from its first
+    observation through the object's centre. Without an observed action (the inverse query) it is
+    the direction of the last observed effect. Vectors below 1 mm have no direction; if all are
+    shorter, the frame is the table's.
+    """
+    o = observations
+    action = o.action[..., xy_columns(action_channels)]
+    effect = o.effect[..., xy_columns(effect_channels)]
+    acts = o.action_mask & (o.weight > 0)[:, None]
+    moves = o.effect_mask & (o.weight < 1)[:, None]
+    first, last = _extreme(action, -o.action_t, acts), _extreme(action, o.action_t, acts)
+    direction = torch.zeros_like(first)
+    direction[:, 0] = 1
+    for vector in (_extreme(effect, o.effect_t, moves), -first, last - first):
+        long = vector.detach().norm(dim=-1, keepdim=True) > _SHORTEST_M
+        direction = torch.where(long, vector, direction)
+    return direction / direction.norm(dim=-1, keepdim=True)
+
+
+def _extreme(
+    values: Float[Tensor, "b n 2"], order: Float[Tensor, "b n"], seen: Bool[Tensor, "b n"]
+) -> Float[Tensor, "b 2"]:
+    """The observed value of greatest order; zero where nothing is observed."""
+    at = order.masked_fill(~seen, -torch.inf).argmax(dim=1)
+    value = values[torch.arange(len(values), device=values.device), at]
+    return torch.where(seen.any(dim=1, keepdim=True), value, 0.0)
+
+
+def inverse(rotation: Tensor) -> Tensor:
+    """Inverse rotations (B, 2)."""
+    return torch.stack([rotation[..., 0], -rotation[..., 1]], dim=-1)
+
+
+def rotate_image(image: Float[Tensor, "#b 2 n n"], rotation: Tensor) -> Float[Tensor, "b 2 n n"]:
+    """Rotate images (B or 1, 2, n, n) by (B, 2), bilinearly; border pixels are repeated outside."""
+    cos, sin = rotation.unbind(-1)
+    # This maps coordinates of the rotated image to those of the image; rows run along -y.
+    rows = [torch.stack([cos, -sin], -1), torch.stack([sin, cos], -1)]
+    matrix = F.pad(torch.stack(rows, dim=1), (0, 1))
+    image = image.expand(len(rotation), -1, -1, -1)
+    grid = F.affine_grid(matrix, list(image.shape), align_corners=False)
+    return F.grid_sample(image, grid, padding_mode="border", align_corners=False)
+
+
+def rotate_both(
+    action: Tensor, effect: Tensor, rotation: Tensor, *channels: Channels
+) -> tuple[Tensor, Tensor]:
+    """Rotate actions and effects (B, n, C) by (B, 2)."""
+    r, (of_action, of_effect) = rotation[:, None], channels
+    action = rotate_channels(action, of_action, r, absolute_yaw=True)
+    return action, rotate_channels(effect, of_effect, r, absolute_yaw=False)
+
+
+def rotate_observations(o: Observations, rotation: Tensor, *channels: Channels) -> Observations:
+    """Rotate observations by (B, 2)."""
+    action, effect = rotate_both(o.action, o.effect, rotation, *channels)
+    return replace(o, action=action, effect=effect)
+
+
+def rotate_prediction(p: Prediction, rotation: Tensor, *channels: Channels) -> Prediction:
+    """Rotate a prediction by (B, 2); the correlation of x and y that this introduces is dropped."""
+    action, effect = rotate_both(p.action_mean, p.effect_mean, rotation, *channels)
+    stds = p.action_std, p.effect_std
+    action_std, effect_std = (
+        _rotate_std(std, each, rotation[:, None]) for std, each in zip(stds, channels, strict=True)
+    )
+    return Prediction(action, action_std, effect, effect_std)
+
+
+def _rotate_std(std: Tensor, channels: Channels, rotation: Tensor) -> Tensor:
+    cos2, sin2 = rotation.square().unbind(-1)
+    columns = list(std.unbind(-1))
+    i, j = xy_columns(channels)
+    u, v = columns[i].square(), columns[j].square()
+    columns[i], columns[j] = (cos2 * u + sin2 * v).sqrt(), (sin2 * u + cos2 * v).sqrt()
+    return torch.stack(columns, dim=-1)

@@ -58,10 +58,6 @@ def save_checkpoint(model: EffectNetwork, path: str | Path, about: dict[str, Any
     return write_weights(path, model.state_dict(), description)
 
 
-def _with_tuples(fields: dict[str, Any]) -> dict[str, Any]:
-    return {name: tuple(v) if isinstance(v, list) else v for name, v in fields.items()}
-
-
 def load_checkpoint(name_or_path: str | Path) -> tuple[EffectNetwork, dict[str, Any]]:
     """Load a model, ready to predict, and the `about` of its checkpoint.
 
@@ -79,8 +75,15 @@ def load_checkpoint(name_or_path: str | Path) -> tuple[EffectNetwork, dict[str, 
             raise ValueError(f"its network is in {description['module']!r:.80}")
         importlib.import_module(description["module"])
         kind, config_class = NETWORKS[description["model"]]
-        parts = {"config": config_class, "scaler": Scaler, "domain": TrainingDomain}
-        return kind(*(part(**_with_tuples(description[name])) for name, part in parts.items()))
+        parts = []
+        for name, part in (
+            ("config", config_class),
+            ("scaler", Scaler),
+            ("domain", TrainingDomain),
+        ):
+            items = description[name].items()
+            parts.append(part(**{k: tuple(v) if isinstance(v, list) else v for k, v in items}))
+        return kind(*parts)
 
     model, description = restored(path, _REMEDY, make)
     return model, description["about"]

@@ -94,15 +94,12 @@ class AffordanceCNP(EffectNetwork):
         """Decode r (B, 128) at t_target (B, T) into (μ_a, σ_a, μ_e, σ_e), (B, T, C), standardised.
 
         The merge layer has no activation, so it folds exactly into each decoder's first layer, and
-        only the column of t differs between the targets of one query. Folding is faster from
-        `FOLD_FROM_TARGETS` targets on.
+        only the column of t differs between the targets of one query, which is faster for many.
         """
-        known = torch.cat([r, features.expand(len(r), -1)], dim=1)
-        folds = t_target.numel() >= FOLD_FROM_TARGETS
-        outputs = []
+        known, outputs = torch.cat([r, features.expand(len(r), -1)], dim=1), []
         for decoder in (self.action_decoder, self.effect_decoder):
             first = decoder[0]
-            if folds:
+            if t_target.numel() >= FOLD_FROM_TARGETS:
                 weight = first.weight @ self.merge.weight
                 base = F.linear(known, weight[:, :-1], first.weight @ self.merge.bias + first.bias)
                 hidden = base[:, None] + t_target[..., None] * weight[:, -1]

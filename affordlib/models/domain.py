@@ -13,9 +13,8 @@ from affordlib.interactions.dataset import InteractionTensors
 from affordlib.types import Observations, check_field, check_pair
 
 Range = tuple[float, float]
-PHASE_TOLERANCE = 1e-5
+PHASE_TOLERANCE, END_PHASE = 1e-5, 1e-3
 RADIUS_TOLERANCE_M = 0.02
-_END_PHASE = 1e-3
 
 
 class OutOfRangeWarning(UserWarning):
@@ -63,24 +62,20 @@ class TrainingDomain:
 
     def check_image(self, image: Float[Tensor, "b 2 h w"]) -> None:
         """Raise ValueError for another number of pixels, or an object of another size or place."""
-        pixels = image.shape[-1]
+        pixels, mask = image.shape[-1], image[:, 1]
         if self.image_pixels not in (None, pixels):
             raise ValueError(
                 f"image has {pixels}×{pixels} pixels, trained on {self.image_pixels}×"
                 f"{self.image_pixels}; scale it, or train on such images"
             )
-        if self.mask_share is None:
-            return
-        mask, (low, high) = image[:, 1], self.mask_share
-        share, at_border = mask.mean(dim=(1, 2)), touches_border(mask)
-        outside = ~((share > low / 2) & (share < 1.5 * high))
-        if outside.any():
-            raise ValueError(
-                f"image {int(outside.nonzero()[0])}: the object covers "
-                f"{float(share[outside][0]):.1%} of it, trained on {low:.1%} to {high:.1%}; "
-                "train on such objects first"
-            )
-        if not self.touches_border and at_border.any():
+        low, high = self.mask_share or (0.0, 1.0)
+        for k, share in enumerate(mask.mean(dim=(1, 2)).tolist()):
+            if self.mask_share and not low / 2 < share < 1.5 * high:
+                raise ValueError(
+                    f"image {k}: the object covers {share:.1%} of it, trained on {low:.1%} to "
+                    f"{high:.1%}; train on such objects first"
+                )
+        if not self.touches_border and (at_border := touches_border(mask)).any():
             raise ValueError(
                 f"image {int(at_border.nonzero()[0])}: the object reaches its edge, unlike the "
                 "training objects; centre the crop on the object, or train on such objects first"
@@ -104,15 +99,14 @@ class TrainingDomain:
                 f"to {float(high):.3f}"
             )
         o = observations
-        ends = (
+        for name, known, t in (
             ("starts", self.start_radius_m, o.action_t),
             ("ends", self.end_radius_m, 1 - o.action_t),
-        )
-        for name, radius_m, t in ends:
-            seen = (t < _END_PHASE) & o.action_mask
-            if off := _outside(o.action, action_channels, seen, radius_m):
+        ):
+            seen = (t < END_PHASE) & o.action_mask
+            if off := _outside(o.action, action_channels, seen, known):
                 raise ValueError(f"an observed action {name} {off}; train on such actions first")
-        seen = (1 - o.effect_t < _END_PHASE) & o.effect_mask
+        seen = (1 - o.effect_t < END_PHASE) & o.effect_mask
         if off := _outside(o.effect, effect_channels, seen, self.effect_radius_m):
             words = f"an observed effect ends {off}; predictions from it are extrapolations"
             warnings.warn(words, OutOfRangeWarning, stacklevel=3)
@@ -133,7 +127,7 @@ def _outside(values: Tensor, channels: tuple[str, ...], seen: Tensor, known: Ran
     plane = xy_columns(channels)
     if known is None or not plane or not seen.any():
         return ""
-    radius, (low, high) = values.detach()[..., plane].norm(dim=-1), known
-    near = (radius > low - RADIUS_TOLERANCE_M) & (radius < high + RADIUS_TOLERANCE_M)
-    far = radius[seen & ~near].tolist()
+    radius, (low, high) = values.detach()[..., plane].norm(dim=-1)[seen], known
+    near = (radius - radius.clamp(low, high)).abs() < RADIUS_TOLERANCE_M  # False for nan
+    far = radius[~near].tolist()
     return f"{far[0]:.3f} m away, trained on {low:.3f} to {high:.3f} m" if far else ""

@@ -22,11 +22,11 @@ from affordlib.interactions.dataset import (
     InteractionTensors,
     check_fits,
     check_numbers,
+    condition_on_recorded_action,
     valid_interactions,
 )
-from affordlib.interactions.sampling import condition_on_recorded_action
 from affordlib.models.base import EffectModel
-from affordlib.types import check_array, check_within
+from affordlib.types import check_within
 
 if TYPE_CHECKING:
     import xarray
@@ -34,11 +34,7 @@ if TYPE_CHECKING:
 AFTER_CONTACT = (0.8, 0.9, 1.0)
 """Phases at which every push has moved its object; before contact the effect is always zero."""
 
-EVERY = 12
-"""Every twelfth sample is one of the paper's 25 steps of 150 ms."""
-
-CONTACT_M = 0.001
-"""Displacement [m] (or rotation [rad]) from which on an object counts as touched."""
+EVERY = 12  # samples: one of the paper's 25 steps of 150 ms
 
 
 @torch.no_grad()
@@ -99,57 +95,19 @@ def fit_sigma_scale(
     return tuple(model.sigma_scale.tolist())
 
 
-def steps_of(arrays: InteractionTensors) -> Tensor:
-    """Sample numbers of the 25 steps, the last of which is t = 1."""
-    return torch.arange(EVERY, len(arrays.phase), EVERY)
-
-
 def network_predictions(
     model: EffectModel, data: "xarray.Dataset", interactions: np.ndarray
 ) -> dict[str, Any]:
-    """Predictions of a network for interactions: see `prediction_record`."""
+    """Ground truth, mean and σ at t = 1 by channel, and category, of the valid interactions."""
     kept = valid_interactions(data, interactions)
-    arrays = InteractionTensors.from_dataset(
-        data, kept, model.action_channels, model.effect_channels
-    )
-    phases = (steps_of(arrays) / (len(arrays.phase) - 1)).tolist()
-    return prediction_record(data, kept, arrays, *effects_at(model, arrays, phases)[1:])
-
-
-def about_objects(data: "xarray.Dataset", kept: np.ndarray) -> dict[str, Any]:
-    """Number of each interaction, category of its object, and whether the object rolls."""
+    channels = model.action_channels, model.effect_channels
+    tensors = InteractionTensors.from_dataset(data, kept, *channels)
     names = data["category"].attrs["flag_meanings"].split()
-    return {
-        "interaction": data["interaction"].values[kept].tolist(),
-        "category": [names[k] for k in data["category"].values[kept]],
-        "rollable": data["rollable"].values[kept].tolist(),
-    }
-
-
-def prediction_record(
-    data: "xarray.Dataset",
-    kept: np.ndarray,
-    arrays: InteractionTensors,
-    mean: Tensor,
-    std: Tensor,
-) -> dict[str, Any]:
-    """Ground truth, mean and σ at t = 1 by channel, and mean errors of the whole trajectory.
-
-    kept: the numbers (N,) in `data` of the interactions of `arrays`; mean, std: (N, 25, C), at
-    `steps_of(arrays)`.
-    """
-    truth, names = arrays.effect[:, steps_of(arrays)], arrays.effect_channels
-    columns = xy_columns(names) or [0]
-    error = (mean - truth)[..., columns].norm(dim=-1)
-    touched = truth[..., columns].norm(dim=-1) > CONTACT_M
-    after = (error * touched).sum(dim=1) / touched.sum(dim=1).clamp_min(1)
-    record = about_objects(data, kept)
-    for name, values in (("truth", truth), ("mean", mean), ("std", std)):
-        record[name] = {c: values[:, -1, k].tolist() for k, c in enumerate(names)}
-    return record | {
-        "trajectory_error": error.mean(dim=1).tolist(),
-        "after_contact_error": after.tolist(),
-    }
+    record = {"category": [names[k] for k in data["category"].values[kept]]}
+    parts = "truth", "mean", "std"
+    for part, values in zip(parts, effects_at(model, tensors, (1.0,)), strict=True):
+        record[part] = {c: values[:, 0, k].tolist() for k, c in enumerate(channels[1])}
+    return record
 
 
 def final_error(record: dict[str, Any]) -> np.ndarray:
@@ -159,42 +117,17 @@ def final_error(record: dict[str, Any]) -> np.ndarray:
     return np.linalg.norm([np.subtract(mean[name], truth[name]) for name in names], axis=0)
 
 
-def error_row(errors_m: np.ndarray, **columns: Any) -> dict[str, Any]:
-    """One row of a table: the given columns, then n, mean, standard error, median, 95th percentile.
-
-    errors_m: (n,) distances [m], one per independent object.
-    """
-    errors = check_array("errors_m", errors_m, np.size(errors_m))
-    return {
-        **columns,
-        "n": len(errors),
-        "mean_m": float(errors.mean()),
-        "sem_m": float(errors.std(ddof=min(1, len(errors) - 1)) / math.sqrt(len(errors))),
-        "median_m": float(np.median(errors)),
-        "p95_m": float(np.quantile(errors, 0.95)),
-    }
-
-
 def refuse_seen(about: dict[str, Any], data: "xarray.Dataset", interactions: np.ndarray) -> None:
-    """Raise ValueError if a checkpoint was trained on these interactions, or does not say so.
+    """Raise ValueError if a checkpoint was trained on these interactions.
 
-    about: the second value that `load_checkpoint` returns.
+    about: the second value that `load_checkpoint` returns, from `about_training`.
     """
-    decisive = ("seed", "families", "size_range_m", "height_range_m")  # for the objects of a recipe
-    try:
-        recipes = [json.loads(text) for text in (about["recipe"], data.attrs["recipe"])]
-        objects = [[recipe[name] for name in decisive] for recipe in recipes]
-        trained_on = {int(number) for number in about["seen_interactions"]}
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(
-            f"about does not say which interactions the model was trained on ({error!r}); "
-            "save the checkpoint with the recipe and seen_interactions of its training"
-        ) from error
     check_numbers("interactions", interactions)
-    numbers = data["interaction"].values[interactions]
-    seen = sorted(trained_on & {int(i) for i in numbers})
-    if objects[0] == objects[1] and seen:
+    seen = {*about["seen_interactions"]} & {*data["interaction"].values[interactions].tolist()}
+    recipes = json.loads(about["recipe"]), json.loads(data.attrs["recipe"])
+    decisive = ("seed", "families", "size_range_m", "height_range_m")  # for a recipe's objects
+    if seen and all(recipes[0][name] == recipes[1][name] for name in decisive):
         raise ValueError(
             f"interactions: the model was trained or tuned on {len(seen)} of them (such as "
-            f"{seen[:5]}); evaluate it on the test part of its split or on another data set"
+            f"{sorted(seen)[:5]}); evaluate it on the test part of its split or on another data set"
         )

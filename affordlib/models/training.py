@@ -18,21 +18,20 @@ from torch import Tensor
 from tqdm import tqdm
 
 from affordlib.interactions.dataset import (
+    Batch,
     InteractionTensors,
     Scaler,
     Split,
-    Symmetry,
-    augment_by_symmetry,
     check_fits,
+    sample_mixed,
 )
-from affordlib.interactions.sampling import Batch, sample_mixed
 from affordlib.models.base import EffectNetwork, NetworkConfig
 from affordlib.models.checkpoint import build, load_state, save_state
 from affordlib.models.cnp import CNPConfig
 from affordlib.models.domain import TrainingDomain
 from affordlib.models.evaluation import final_errors_m, fit_sigma_scale
 from affordlib.results import from_root
-from affordlib.types import check_count, check_field
+from affordlib.types import Checked, count, number
 
 if TYPE_CHECKING:
     import xarray
@@ -42,38 +41,29 @@ Score = Callable[[EffectNetwork, InteractionTensors], Tensor]
 
 
 @dataclass(frozen=True)
-class TrainingConfig:
-    """Settings of training."""
+class TrainingConfig(Checked):
+    """Settings of training, with their ranges."""
 
-    steps: int = 3000
-    batch_size: int = 64  # trajectories per step
-    n_targets: int = 16  # target phases per trajectory
-    obs_max: int = 10  # largest number of observations of action, and of effect
-    learning_rate: float = 1e-3  # its peak, see `rate`
-    weight_decay: float = 0.0  # of AdamW
-    beta: float = 0.0  # see `EffectNetwork.loss`
-    final_sigma_floor: float = 0.02  # to which the model's σ floor decreases
+    steps: int = count(3000)
+    batch_size: int = count(64, 1, 100_000)  # trajectories per step
+    n_targets: int = count(16, 1, 100_000)  # target phases per trajectory
+    obs_max: int = count(10, 1, 100_000)  # largest number of observations of action, and of effect
+    learning_rate: float = number(1e-7, 1.0, default=1e-3)  # its peak, see `rate`
+    weight_decay: float = number(0.0, 10.0, default=0.0)  # of AdamW
+    beta: float = number(0.0, 1.0, default=0.0)  # see `EffectNetwork.loss`
+    final_sigma_floor: float = number(1e-6, 10.0, default=0.02)  # to which the model's decreases
     # Rotate and mirror each batch in eight ways, an eighth of it each; wrong where the hand does
     # not turn with the object, as in a grasp.
     augment: bool = True
     # Decay of the exponential moving average of the weights, which is then validated and kept.
-    ema: float = 0.0
-    validate_every: int = 100  # steps
-    patience: int = 10  # validations without improvement before stopping
+    ema: float = number(0.0, 0.99999, default=0.0)
+    validate_every: int = count(100)  # steps
+    patience: int = count(10)  # validations without improvement before stopping
     device: str = "auto"  # as in torch; "auto" is the GPU if there is one, else the CPU
-    seed: int = 0  # of batches and contexts, and of a new network's weights
+    seed: int = count(0, 0, 2**63 - 1)  # of batches and contexts, and of a new network's weights
 
     def __post_init__(self) -> None:
-        for name in ("steps", "validate_every", "patience"):
-            check_count(name, getattr(self, name))
-        for name in ("batch_size", "n_targets", "obs_max"):
-            check_count(name, getattr(self, name), 1, 100_000)
-        check_count("seed", self.seed, 0, 2**63 - 1)
-        check_field(self, "learning_rate", 1e-7, 1.0)
-        check_field(self, "weight_decay", 0.0, 10.0)
-        check_field(self, "beta", 0.0, 1.0)
-        check_field(self, "final_sigma_floor", 1e-6, 10.0)
-        check_field(self, "ema", 0.0, 0.99999)
+        super().__post_init__()
         device_named(self.device)
 
     def rate(self, step: int) -> float:
@@ -134,7 +124,14 @@ def train(
     )
     floor, average = float(model.sigma_floor), _copies(dict(model.named_parameters()))
     best, best_error, step, fruitless, seconds, history = {}, math.inf, 0, 0, 0.0, []
-    about = _about(model, (training, validation), config, (sampler, score))
+    about = asdict(replace(config, device="cpu")) | {  # all that decides the results
+        "model": repr(model.config),
+        "sampler and score": [getattr(f, "__name__", type(f).__name__) for f in (sampler, score)],
+        "data": [
+            [len(t), *(float(v.double().sum()) for v in (t.image, t.action, t.effect))]
+            for t in (training, validation)
+        ],
+    }
     if resume_checkpoint and from_root(resume_checkpoint).exists():
         state = load_state(resume_checkpoint, device)
         if differ := [k for k, v in about.items() if state["about"].get(k) != v]:
@@ -152,7 +149,14 @@ def train(
         step += 1
         model.sigma_floor.fill_(config.sigma_floor(step, floor))
         optimiser.param_groups[0]["lr"] = config.rate(step)
-        loss = model.loss(_to(_sampled(training, config, sampler, generator), device), config.beta)
+        rows = torch.randint(0, len(training), (config.batch_size,), generator=generator)
+        some = training.select(rows)
+        if config.augment:  # an eighth of them in each way
+            parts = enumerate(map(training.select, rows.tensor_split(8)))
+            some, *others = (p.rotated_and_mirrored(k // 2, k % 2 == 1) for k, p in parts)
+            some = some.joined(*others)
+        batch = sampler(some, config.n_targets, config.obs_max, generator)
+        loss = model.loss(_to(batch, device), config.beta)
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
@@ -193,39 +197,6 @@ def _copies(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     return {name: value.detach().clone() for name, value in tensors.items()}
 
 
-def _about(
-    model: EffectNetwork,
-    data: tuple[InteractionTensors, ...],
-    config: TrainingConfig,
-    functions: tuple[Sampler, Score],
-) -> dict[str, Any]:
-    """All that decides a training's results, to compare before it is resumed."""
-    sums = [
-        [len(t), *(float(v.double().sum()) for v in (t.image, t.action, t.effect))] for t in data
-    ]
-    names = [getattr(f, "__name__", type(f).__name__) for f in functions]
-    about = {"model": repr(model.config), "data": sums, "sampler and score": names}
-    return about | asdict(replace(config, device="cpu"))
-
-
-def _sampled(
-    training: InteractionTensors,
-    config: TrainingConfig,
-    sampler: Sampler,
-    generator: torch.Generator,
-) -> Batch:
-    """A batch of random interactions, rotated and mirrored if the configuration says so."""
-    rows = torch.randint(0, len(training), (config.batch_size,), generator=generator)
-    tensors = training.select(rows)
-    if config.augment:  # an eighth of them in each way
-        ways = enumerate(rows.tensor_split(8))
-        parts = [
-            training.select(few).rotated_and_mirrored(k // 2, mirror=k % 2 == 1) for k, few in ways
-        ]
-        tensors = parts[0].joined(*parts[1:])
-    return sampler(tensors, config.n_targets, config.obs_max, generator)
-
-
 def _to(batch: Any, device: torch.device) -> Any:
     """Copy a batch or observations to a device."""
     moved = {}
@@ -247,21 +218,19 @@ def train_model(
     split: Split,
     config: TrainingConfig,
     model_config: NetworkConfig | None = None,
-    symmetries: tuple[Symmetry, ...] = (),
+    augment: Callable[[InteractionTensors], InteractionTensors] = lambda training: training,
     resume_checkpoint: str | Path | None = None,
     sampler: Sampler = sample_mixed,
 ) -> tuple[EffectNetwork, list[TrainingRecord]]:
     """Train a network (default: the paper's) on the training part of a split.
 
-    The validation part is used for early stopping and to calibrate σ. symmetries: see
-    `augment_by_symmetry`; resume_checkpoint, sampler: see `train`.
+    The validation part is used for early stopping and to calibrate σ. augment: adds to the training
+    data; resume_checkpoint, sampler: see `train`.
     """
     model_config = model_config or CNPConfig()
     channels = model_config.action_channels, model_config.effect_channels
-    training = InteractionTensors.from_dataset(data, split.train, *channels)
+    training = augment(InteractionTensors.from_dataset(data, split.train, *channels))
     validation = InteractionTensors.from_dataset(data, split.validation, *channels)
-    if symmetries:
-        training = augment_by_symmetry(training, symmetries)
     model = untrained(model_config, training, config.seed)
     history = train(model, training, validation, config, resume_checkpoint, sampler)
     fit_sigma_scale(model, validation)

@@ -1,6 +1,6 @@
 """Planning with (partial) actions on any `EffectModel`, and executing the plans."""
 
-from affordlib.planning.astar import plan_astar
+from affordlib.planning.astar import BranchTable, plan_astar, search
 from affordlib.planning.closed_loop import (
     ClosedLoopConfig,
     ClosedLoopResult,
@@ -10,7 +10,8 @@ from affordlib.planning.closed_loop import (
 from affordlib.planning.continuous import plan_continuous
 from affordlib.planning.effect_map import EffectMap
 from affordlib.planning.free_space import FreeSpace
-from affordlib.planning.gradient import plan_gradient
+from affordlib.planning.gradient import Reading, descend, plan_gradient
 from affordlib.planning.problem import MODES, PlanMode, Planner, PlanningProblem, Table
 from affordlib.planning.robot import Execution, Robot
+from affordlib.planning.rollout import make_steps, roll_out
 from affordlib.planning.skills import Skills

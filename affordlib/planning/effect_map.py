@@ -22,8 +22,12 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from affordlib.geometry import rotate, xy_columns
-from affordlib.models.base import EffectModel, EffectNetwork, condition_on_primitives
-from affordlib.models.push_frame import rotate_prediction
+from affordlib.models.base import (
+    EffectModel,
+    EffectNetwork,
+    condition_on_primitives,
+    rotate_prediction,
+)
 from affordlib.perception import outline_of, radius_m
 from affordlib.primitives import Move, Push
 from affordlib.types import (

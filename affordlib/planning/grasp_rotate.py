@@ -19,8 +19,7 @@ import numpy as np
 import torch
 
 from affordlib.geometry import wrap_angle
-from affordlib.models.base import EffectModel, condition_on_primitives
-from affordlib.models.push_frame import rotate_image
+from affordlib.models.base import EffectModel, condition_on_primitives, rotate_image
 from affordlib.perception import adapt_to_object
 from affordlib.planning.effect_map import checked_image
 from affordlib.primitives import Grasp, Primitive, Rotate

@@ -1,5 +1,6 @@
 """Pictures for people: figures, animations, and interactive widgets."""
 
+from affordlib.show.diagrams import plot_flow
 from affordlib.show.executors import closed_loop, open_loop
 from affordlib.show.explorers import conditioning_explorer, phase_explorer
 from affordlib.show.goal_picker import GoalPicker

@@ -17,29 +17,26 @@ from affordlib.types import (
     IMAGE_PIXELS,
     TABLE_X_M,
     TABLE_Y_M,
+    Checked,
     NothingSeenError,
     Observation,
-    check_array,
-    check_field,
-    check_within,
+    number,
+    point,
 )
 from affordlib.world.robot import BASE_X_M
 
 _NEAR_M, _FAR_M = 0.5, 1.1
-_MASK_HEIGHT_M = 0.004
+_MASK_HEIGHT_M, _KINECT_MASK_HEIGHT_M = 0.004, 0.012
 
 RAYS_PER_SIDE = 3
 """Rays per side of a pixel of the ideal camera. FiLM trained on 500 pushes has an error of 1.09 mm
 with one ray per pixel, 0.87 mm with 4, 0.83 mm with 16."""
 
 _TABLE_XY_M = np.array([sum(TABLE_X_M), sum(TABLE_Y_M)]) / 2
-KINECT_HEIGHT_M = 1.3
-KINECT_FOCAL_PX = 575.0
-KINECT_BASELINE_M = 0.075
+KINECT_HEIGHT_M, KINECT_FOCAL_PX, KINECT_BASELINE_M = 1.3, 575.0, 0.075
 KINECT_STD_M = 0.0008
 """σ of an object's position [m]: measured for spheres, 0.4 mm of bias and 0.4 mm of noise along
 each axis; for cuboids 0.6 mm."""
-_KINECT_MASK_HEIGHT_M = 0.012
 
 _RENDERER = {"renderer": pybullet.ER_TINY_RENDERER, "flags": pybullet.ER_NO_SEGMENTATION_MASK}
 
@@ -191,34 +188,15 @@ def add_scenery(client: BulletClient) -> list[int]:
     return bodies
 
 
-_VIEW_LIMITS = {
-    "distance_m": (0.2, 3.0, "m"),
-    "yaw_deg": (-360.0, 360.0, "°"),
-    "pitch_deg": (-90.0, 0.0, "°"),
-    "field_deg": (1.0, 120.0, "°"),
-}
-
-
 @dataclass(frozen=True)
-class View:
-    """The view of a picture: the camera looks at a point `at_m` (x, y, z) from a distance.
+class View(Checked):
+    """The view of a picture: the camera looks at a point (x, y, z) from a distance."""
 
-    With the yaw 0 it looks along y, with the pitch -90 straight down; its field of view is the
-    vertical one.
-    """
-
-    at_m: tuple[float, float, float] = (-0.2, 0.0, 0.33)
-    distance_m: float = 1.7
-    yaw_deg: float = 28.0
-    pitch_deg: float = -24.0
-    field_deg: float = 45.0
-
-    def __post_init__(self) -> None:
-        for name, limits in _VIEW_LIMITS.items():
-            check_field(self, name, *limits)
-        (at_m,) = check_array("at_m", [self.at_m], 1, 3)
-        at_m = tuple(check_within("at_m", value, -2.0, 2.0, "m") for value in at_m)
-        object.__setattr__(self, "at_m", at_m)
+    at_m: tuple[float, float, float] = point(3, 2.0, (-0.2, 0.0, 0.33))
+    distance_m: float = number(0.2, 3.0, "m", 1.7)
+    yaw_deg: float = number(-360.0, 360.0, "°", 28.0)  # 0: along y
+    pitch_deg: float = number(-90.0, 0.0, "°", -24.0)  # -90: straight down
+    field_deg: float = number(1.0, 120.0, "°", 45.0)  # vertical field of view
 
     def picture(
         self, client: BulletClient, hidden: list[int], width: int, height: int

@@ -31,16 +31,10 @@ from affordlib.world.trajectory import (
 )
 
 SETTLE_STEPS = 120
-PUT_DOWN_M = 0.002
-"""Height [m] above its support from which an object is released when it is put down."""
-RECORDED_SAMPLES = 26
-"""Number of recorded tool poses: at t = 0 and 25 more, every 3 steps of 50 ms (as in the paper)."""
-
+PUT_DOWN_M = 0.002  # above its support, from where an object is released when it is put down
+RECORDED_SAMPLES = 26  # of the tool: at t = 0 and every 3 steps of 50 ms (as in the paper)
+GUARD_FORCE_N = 30.0  # between object and robot, above which a guarded segment stops
 _HOME = np.array(robot.HOME)
-
-GUARD_FORCE_N = 30.0
-"""Contact force [N] between object and robot above which a guarded segment stops."""
-
 ARM_FORCES_N_M = (330.0, 330.0, 150.0, 54.0, 54.0, 54.0)
 _ARM_GAINS = [0.3] * 6
 _STILL_FINGERS, _MOVING_FINGERS = [0.3] * 2, [0.02] * 2
@@ -49,18 +43,13 @@ _STILL_FINGERS, _MOVING_FINGERS = [0.3] * 2, [0.02] * 2
 
 @dataclass
 class Recording:
-    """Measurements while the arm acts on a body of the client.
-
-    states: (n, 7) of the body every `RECORD_EVERY` steps; tool: (m, 5) measured x, y, z, yaw and
-    finger gap at every waypoint; off_path_m, penetration_m: largest tracking error of the tool and
-    largest penetration of two bodies [m].
-    """
+    """Measurements while the arm acts on a body of the client."""
 
     body: int
-    states: list[tuple] = field(default_factory=list)
-    tool: list[np.ndarray] = field(default_factory=list)
-    off_path_m: float = 0.0
-    penetration_m: float = 0.0
+    states: list[tuple] = field(default_factory=list)  # (n, 7), every `RECORD_EVERY` steps
+    tool: list[np.ndarray] = field(default_factory=list)  # (m, 5), see `tool_pose`
+    off_path_m: float = 0.0  # largest tracking error of the tool
+    penetration_m: float = 0.0  # largest one of two bodies
 
 
 class JointController:
@@ -132,7 +121,8 @@ class JointController:
                 self.record(recording, at_waypoint, wanted)
             if frozen_at is None:
                 now = commands[step], velocities[step]
-                if guarded and self._force_N(recording.body) > GUARD_FORCE_N:
+                contacts = client.getContactPoints(self.robot, recording.body) if guarded else ()
+                if sum(contact[9] for contact in contacts) > GUARD_FORCE_N:
                     frozen_at, now = step, (commands[step], [0.0] * 8)
             set_motors(targetPositions=now[0], targetVelocities=now[1])
             simulate()
@@ -168,9 +158,6 @@ class JointController:
             recording.off_path_m = max(recording.off_path_m, off_m)
         for contact in self.client.getContactPoints(recording.body):
             recording.penetration_m = max(recording.penetration_m, -contact[8])
-
-    def _force_N(self, body: int) -> float:
-        return sum(contact[9] for contact in self.client.getContactPoints(self.robot, body))
 
     def tool_pose(self) -> np.ndarray:
         """Measure x, y, z [m] of the tool's tip, its yaw [rad] and the gap of the fingers [m]."""
@@ -228,6 +215,11 @@ def execute(
     Raises UnreachableError, without moving, if the arm cannot follow the command.
     """
     primitive = command.primitive
+    if primitive.tool != arm.tool:
+        raise ValueError(
+            f"primitive {primitive.name!r} needs the tool {primitive.tool!r}, but the arm "
+            f"holds the {arm.tool}; call place(..., tool={primitive.tool!r})"
+        )
     start = poses(np.array([placed.state()]))[0]
     origin_m = *seen.xy_m, tip_offset_m
     motion = plan_motion(primitive, command.segments, origin_m, approach)
@@ -289,30 +281,32 @@ def _interaction(
     origin_m: Sequence[float],
 ) -> Interaction:
     """Build the interaction from the recording, interpolated at the command's phases."""
-    phase = command.phase
     recorded = poses(placed.states_of_centre(np.array(recording.states)))
     rest = poses(np.array([placed.state()]))[0]
     # Choose the multiple of 2π nearest to the last recorded yaw, which is unwrapped.
     last = recorded[-1, YAW]
     rest[YAW] = last + (rest[YAW] - last + math.pi) % (2 * math.pi) - math.pi
     origin = np.array([*start[: Z + 1], recorded[0, YAW], 0.0])
-    at_sample, at_waypoint = recorded_phases(command.segments)
-    effect = recorded - origin
     tool = np.array(recording.tool) - [*origin_m, 0.0, 0.0]
     tool[:, YAW] = np.unwrap(tool[:, YAW])
-    seldom = np.linspace(0, phase[-1], RECORDED_SAMPLES)
+    at_sample, at_waypoint = recorded_phases(command.segments)
+    seldom = np.linspace(0, command.phase[-1], RECORDED_SAMPLES)
     return replace(
         unreached(command, placed, seen),
         reached=True,
-        effect=np.column_stack([np.interp(phase, at_sample, effect[:, c]) for c in range(5)]),
+        effect=_interpolated(command.phase, at_sample, recorded - origin),
         rest_effect=rest - origin,
         start_pose=(float(start[0]), float(start[1]), float(recorded[0, YAW])),
         tracking_error_m=recording.off_path_m,
-        tool=np.column_stack([np.interp(seldom, at_waypoint, tool[:, c]) for c in range(5)]),
+        tool=_interpolated(seldom, at_waypoint, tool),
         penetration_m=recording.penetration_m,
         left_table=placed.left_table(),
         fell=placed.fell(),
     )
+
+
+def _interpolated(phase: np.ndarray, at: np.ndarray, values: np.ndarray) -> np.ndarray:
+    return np.column_stack([np.interp(phase, at, column) for column in values.T])
 
 
 def unreached(command: Command, placed: PlacedObject, seen: Observation) -> Interaction:

@@ -8,6 +8,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -21,44 +22,35 @@ from affordlib.geometry import centroid, is_convex
 from affordlib.types import (
     TABLE_X_M,
     TABLE_Y_M,
+    Checked,
     check_array,
     check_choice,
     check_field,
-    check_finite,
-    check_on_table,
-    check_within,
+    number,
+    parameter,
+    point,
 )
-from affordlib.world.camera import CAMERAS, HIDDEN_M
+from affordlib.world.camera import CAMERAS
 
-DENSITY_KG_M3 = 600.0
 Range = tuple[float, float]
 SIZE_RANGE_M = (0.04, 0.08)
 LARGEST_M = 0.3
 N_EDGES = (3, 8)
-CHAMFER_M = (0.006, 0.004)
-"""Width and height [m] of the chamfer around a prism's base, under which a blade can slide."""
-
-HULL_MARGIN_M = 0.001
-"""Margin [m] by which PyBullet's collision shape of a convex hull exceeds its corners."""
-
+CHAMFER_M = (0.006, 0.004)  # width and height around a prism's base: a blade can slide under it
+HULL_MARGIN_M = 0.001  # by which PyBullet's collision shape of a convex hull exceeds its corners
 _UPRIGHT = math.cos(math.radians(45))
 
 
 @dataclass(frozen=True)
 class TabletopObject(ABC):
-    """An object on the table; all its fields are lengths [m].
-
-    rollable: whether it can roll as it is placed; stable: whether it stays upright when it is
-    pushed, whatever its dimensions; has_yaw: whether its yaw can be seen; footprint_m: corners
-    (n, 2) [m] of its outline seen from above, relative to its centre, at yaw 0.
-    """
+    """An object on the table; all its fields are lengths [m]."""
 
     category: ClassVar[str]
-    rollable: ClassVar[bool] = False
-    stable: ClassVar[bool] = False
-    has_yaw: ClassVar[bool] = True
+    rollable: ClassVar[bool] = False  # whether it can roll as it is placed
+    stable: ClassVar[bool] = False  # whether it stays upright when pushed, whatever its dimensions
+    has_yaw: ClassVar[bool] = True  # whether its yaw can be seen
     volume_m3: ClassVar[property]
-    footprint_m: ClassVar[property]
+    footprint_m: ClassVar[property]  # corners (n, 2) of its outline from above, at yaw 0
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -118,28 +110,12 @@ class Cuboid(TabletopObject):
         return {"shapeType": pybullet.GEOM_BOX, "halfExtents": half}
 
 
-class _Cylinder(TabletopObject):
-    """A cylinder about the x axis (0) or the z axis (2) of its body."""
-
-    axis: ClassVar[int]
-
-    _length_m = property(lambda self: self.length if self.axis == 0 else self.height)
-    volume_m3 = property(lambda self: math.pi * self.diameter**2 / 4 * self._length_m)
-
-    def shape(self) -> dict[str, Any]:
-        return {
-            "shapeType": pybullet.GEOM_CYLINDER,
-            "radius": self.diameter / 2,
-            "height": self._length_m,
-            "frame": pybullet.getQuaternionFromEuler((0, math.pi / 2 * (self.axis == 0), 0)),
-        }
-
-    def rolls(self, upward: np.ndarray) -> bool:
-        return bool(abs(upward[self.axis]) < _UPRIGHT)
+def _cylinder(diameter: float, length: float) -> dict[str, Any]:
+    return {"shapeType": pybullet.GEOM_CYLINDER, "radius": diameter / 2, "height": length}
 
 
 @dataclass(frozen=True)
-class UprightCylinder(_Cylinder):
+class UprightCylinder(TabletopObject):
     """A cylinder of the given `diameter` and `height` [m], standing on its round base."""
 
     diameter: float
@@ -148,12 +124,18 @@ class UprightCylinder(_Cylinder):
     category = "upright_cylinder"
     stable = True
     has_yaw = False
-    axis = 2
+    volume_m3 = property(lambda self: math.pi * self.diameter**2 / 4 * self.height)
     footprint_m = property(lambda self: _circle(self.diameter))
+
+    def shape(self) -> dict[str, Any]:
+        return _cylinder(self.diameter, self.height)
+
+    def rolls(self, upward: np.ndarray) -> bool:
+        return bool(abs(upward[2]) < _UPRIGHT)
 
 
 @dataclass(frozen=True)
-class LyingCylinder(_Cylinder):
+class LyingCylinder(TabletopObject):
     """A cylinder of the given `length` and `diameter` [m], lying on its side."""
 
     length: float
@@ -161,9 +143,16 @@ class LyingCylinder(_Cylinder):
 
     category = "lying_cylinder"
     rollable = True
-    axis = 0
     height_m = property(lambda self: self.diameter)
+    volume_m3 = property(lambda self: math.pi * self.diameter**2 / 4 * self.length)
     footprint_m = property(lambda self: _rectangle(self.length, self.diameter))
+
+    def shape(self) -> dict[str, Any]:
+        frame = pybullet.getQuaternionFromEuler((0, math.pi / 2, 0))
+        return _cylinder(self.diameter, self.length) | {"frame": frame}
+
+    def rolls(self, upward: np.ndarray) -> bool:
+        return bool(abs(upward[0]) < _UPRIGHT)
 
     def fallen(self, upward: np.ndarray) -> bool:
         return not self.rolls(upward)
@@ -211,7 +200,7 @@ class Prism(TabletopObject):
                 "prism corners must go counter-clockwise around a convex polygon of at most "
                 f"{LARGEST_M:g} m, got {self.corners!r}"
             )
-        centred = tuple((float(x), float(y)) for x, y in corners - centroid(corners))
+        centred = tuple(map(tuple, (corners - centroid(corners)).tolist()))
         object.__setattr__(self, "corners", centred)
 
     @classmethod
@@ -224,7 +213,7 @@ class Prism(TabletopObject):
         radius = rng.uniform(*size_range_m) / 2
         corners = radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
         height = rng.uniform(*(height_range_m or size_range_m))
-        return cls(tuple((float(x), float(y)) for x, y in corners), float(height))
+        return cls(tuple(map(tuple, corners.tolist())), float(height))
 
     volume_m3 = property(lambda self: float(ConvexHull(self._vertices()).volume))
     footprint_m = property(lambda self: np.array(self.corners))
@@ -261,41 +250,18 @@ def category_named(name: str) -> type[TabletopObject]:
 
 
 @dataclass(frozen=True)
-class WorldConfig:
-    """Physical parameters and sensor model of the world; Bullet multiplies two bodies' frictions.
+class WorldConfig(Checked):
+    """Physical parameters and sensor model; Bullet multiplies the frictions of two bodies."""
 
-    com_offset_m: centre of mass in the object's frame; tip_offset_m: error of the gripper's height,
-    positive upwards; bias_m: error added to the object's estimated position. camera: name of one of
-    the `CAMERAS`, whose noise is generated from noise_seed.
-    """
-
-    table_friction: float = 0.5
-    object_friction: float = 0.5
-    finger_friction: float = 0.9
-    density_kg_m3: float = DENSITY_KG_M3
-    com_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    tip_offset_m: float = 0.0
-    camera: str = "ideal"
-    bias_m: tuple[float, float] = (0.0, 0.0)
-    noise_seed: int = 0
-
-    ranges: ClassVar[dict[str, tuple[float, float, str]]] = {
-        "table_friction": (0.01, 2.0, ""),
-        "object_friction": (0.01, 2.0, ""),
-        "finger_friction": (0.01, 2.0, ""),
-        "density_kg_m3": (50.0, 10_000.0, "kg/m³"),
-        "tip_offset_m": (-0.008, 0.1, "m"),
-    }
-
-    def __post_init__(self) -> None:
-        for name, limits in self.ranges.items():
-            check_field(self, name, *limits)
-        for name, size in (("com_offset_m", 3), ("bias_m", 2)):
-            values = tuple(check_within(name, v, -0.1, 0.1, "m") for v in getattr(self, name))
-            if len(values) != size:
-                raise ValueError(f"{name} must be {size} numbers [m], got {values!r}")
-            object.__setattr__(self, name, values)
-        check_choice("camera", self.camera, CAMERAS)
+    table_friction: float = number(0.01, 2.0, default=0.5)
+    object_friction: float = number(0.01, 2.0, default=0.5)
+    finger_friction: float = number(0.01, 2.0, default=0.9)
+    density_kg_m3: float = number(50.0, 10_000.0, "kg/m³", 600.0)
+    com_offset_m: tuple[float, float, float] = point(3, 0.1, (0.0, 0.0, 0.0))  # of mass
+    tip_offset_m: float = number(-0.008, 0.1, "m", 0.0)  # of the gripper's height, upwards
+    camera: str = parameter(partial(check_choice, known=CAMERAS), "ideal")
+    bias_m: tuple[float, float] = point(2, 0.1, (0.0, 0.0))  # of the object's estimated position
+    noise_seed: int = 0  # of the camera
 
 
 ROLLING_M, BRAKED_ROLLING_M = 1e-4, 1e-3
@@ -371,8 +337,8 @@ class PlacedObject:
 
     def pose(self) -> tuple[float, float, float]:
         """Return (x, y) [m] and yaw [rad] in the table's frame."""
-        x, y, _, yaw, _ = poses(np.array([self.state()]))[0]
-        return float(x), float(y), float(yaw)
+        x, y, _, yaw, _ = poses(np.array([self.state()]))[0].tolist()
+        return x, y, yaw
 
     def _upward(self) -> np.ndarray:
         return Rotation.from_quat(self.state()[3:]).as_matrix()[2]
@@ -398,31 +364,11 @@ class PlacedObject:
 
     def displace(self, dx_m: float, dy_m: float, dyaw_rad: float) -> None:
         """Translate the object by (dx, dy) [m] and rotate it about the vertical by dyaw_rad."""
-        x, y, *_ = centre = np.array(self.state()[:3])
-        dx, dy = check_finite("dx_m", dx_m), check_finite("dy_m", dy_m)
-        turn = Rotation.from_euler("z", check_finite("dyaw_rad", dyaw_rad))
-        check_on_table("dx_m, dy_m: the shoved object's centre", (x + dx, y + dy))
+        centre, turn = np.array(self.state()[:3]), Rotation.from_euler("z", dyaw_rad)
         position, quaternion = self.client.getBasePositionAndOrientation(self.body)
-        self.client.resetBasePositionAndOrientation(
-            self.body,
-            turn.apply(position - centre) + np.add(centre, (dx, dy, 0.0)),
-            (turn * Rotation.from_quat(quaternion)).as_quat(),
-        )
-
-    def draw_outline(
-        self, xy_m: Sequence[float], rgb: Sequence[float], yaw_rad: float, scale: float
-    ) -> int:
-        """Create a coloured body that shows the footprint at (x, y) [m], hidden from the robot."""
-        xy_m, yaw_rad = check_on_table("xy_m", xy_m), check_finite("yaw_rad", yaw_rad)
-        outline = check_within("scale", scale, 0.1, 10.0) * self.obj.footprint_m
-        rgb = [check_within("rgb", share, 0.0, 1.0) for share in check_array("rgb", rgb, 3)]
-        # Larger sheets lie lower, so that a larger one appears as a frame around a smaller one.
-        sheet = [np.vstack([np.insert(outline, 2, z, axis=1) for z in (-0.005, 0.001 / scale)])]
-        return self.client.createMultiBody(
-            baseVisualShapeIndex=self.client.createVisualShape(**mesh(sheet), rgbaColor=(*rgb, 1)),
-            basePosition=(*xy_m, -HIDDEN_M),
-            baseOrientation=pybullet.getQuaternionFromEuler((0, 0, yaw_rad)),
-        )
+        position = turn.apply(position - centre) + np.add(centre, (dx_m, dy_m, 0.0))
+        orientation = (turn * Rotation.from_quat(quaternion)).as_quat()
+        self.client.resetBasePositionAndOrientation(self.body, position, orientation)
 
 
 def mesh(parts: list) -> dict[str, Any]:

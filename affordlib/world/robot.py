@@ -21,12 +21,8 @@ from ur_analytic_ik import ur10
 from affordlib.types import UnreachableError
 
 BASE_X_M = -0.7
-TOOL_LENGTH_M = 0.20
-FINGER_TRAVEL_M = 0.07
-SHAFT_LENGTH_M = 0.26
-BLADE_LENGTH_M = 0.05
-BLADE_THICKNESS_M = 0.002
-ROD_WIDTH_M = 0.003
+TOOL_LENGTH_M, FINGER_TRAVEL_M, SHAFT_LENGTH_M = 0.20, 0.07, 0.26
+BLADE_LENGTH_M, BLADE_THICKNESS_M, ROD_WIDTH_M = 0.05, 0.002, 0.003
 TOOL_OFFSETS_M = {
     "gripper": (0.0, TOOL_LENGTH_M),
     "screwdriver": (BLADE_LENGTH_M, SHAFT_LENGTH_M),
@@ -80,16 +76,13 @@ def _gripper(tool: str) -> str:
     for side, y in (("left", 1), ("right", -1)):
         finger = f"{side}_finger", "0.02 0.012 0.13", f"0 {0.006 * y} 0.135", 0.1, _DARK
         boxes.append(_box(*finger, "palm", none, none, axis=f"0 {y} 0"))
+    if tool != "gripper":
+        name, width = ("shaft", 0.01) if tool == "screwdriver" else ("rod", ROD_WIDTH_M)
+        shaft = f"{width} {width} {SHAFT_LENGTH_M - 0.1}", f"0 0 {(0.1 + SHAFT_LENGTH_M) / 2}"
+        boxes.append(_box(name, *shaft, 0.05, _RED, "palm", none, none))
     if tool == "screwdriver":
-        shaft = f"0.01 0.01 {SHAFT_LENGTH_M - 0.1}", f"0 0 {(0.1 + SHAFT_LENGTH_M) / 2}"
         blade = f"{BLADE_LENGTH_M} 0.012 {BLADE_THICKNESS_M}", f"{BLADE_LENGTH_M / 2} 0 0"
-        boxes.append(_box("shaft", *shaft, 0.05, _RED, "palm", none, none))
         boxes.append(_box("blade", *blade, 0.02, _RED, "shaft", f"0 0 {SHAFT_LENGTH_M}", none))
-    if tool == "rod":
-        rod = f"{ROD_WIDTH_M} {ROD_WIDTH_M} {SHAFT_LENGTH_M - 0.1}"
-        boxes.append(
-            _box("rod", rod, f"0 0 {(0.1 + SHAFT_LENGTH_M) / 2}", 0.05, _RED, "palm", none, none)
-        )
     return f"<robot>{''.join(boxes)}</robot>"
 
 
@@ -158,8 +151,7 @@ def inverse_kinematics(
     The elbow is up. The wrist points forward for a vertical tool; otherwise the solution nearest to
     `near` is used, so that a path never flips. Raises UnreachableError if there is no solution.
     """
-    best, least = None, 1.0
-    hanging = pitch_rad == 0.0
+    best, least, hanging = None, 1.0, pitch_rad == 0.0
     flange = _flange_pose(xyz_W, yaw_rad, pitch_rad, TOOL_OFFSETS_M[tool])
     for joints in ur10.inverse_kinematics(flange):
         if hanging and abs(math.remainder(joints[4] + math.pi / 2, 2 * math.pi)) >= 0.1:

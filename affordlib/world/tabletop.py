@@ -4,7 +4,6 @@ Use it as a context manager. The simulation is deterministic. With a four times 
 twice the solver iterations, the final position of a push changes by 0.02 mm (median).
 """
 
-import copy
 import os
 import weakref
 from collections.abc import Callable, Sequence
@@ -37,14 +36,19 @@ from affordlib.types import (
     check_within,
 )
 from affordlib.world import robot
-from affordlib.world.camera import CAMERAS, View, add_scenery, depth_crop, ideal
+from affordlib.world.camera import CAMERAS, HIDDEN_M, View, add_scenery, depth_crop
 from affordlib.world.execution import JointController, execute, put_down, unreached
-from affordlib.world.objects import PlacedObject, TabletopObject, WorldConfig, set_friction
+from affordlib.world.objects import (
+    PlacedObject,
+    TabletopObject,
+    WorldConfig,
+    mesh,
+    set_friction,
+)
 from affordlib.world.obstacles import PlacedObstacles
 from affordlib.world.trajectory import STEP_S, Command, plan_motion, segments_until
 
-OBJECTS_PER_BUILD = 256
-"""Number of objects after which the client is rebuilt; Bullet leaks 5 kB per removed object."""
+OBJECTS_PER_BUILD = 256  # after which the client is rebuilt: Bullet leaks 5 kB per removed object
 
 
 class _Client(BulletClient):
@@ -117,7 +121,7 @@ class Tabletop(AbstractContextManager):
             restitutionVelocityThreshold=0.0,
             deterministicOverlappingPairs=1,
         )
-        half = [(TABLE_X_M[1] - TABLE_X_M[0]) / 2, (TABLE_Y_M[1] - TABLE_Y_M[0]) / 2, 0.05]
+        half = [np.ptp(TABLE_X_M) / 2, np.ptp(TABLE_Y_M) / 2, 0.05]
         shape = {"shapeType": pybullet.GEOM_BOX, "halfExtents": half}
         self._table = client.createMultiBody(
             baseCollisionShapeIndex=client.createCollisionShape(**shape),
@@ -149,7 +153,6 @@ class Tabletop(AbstractContextManager):
         self.reset(check_choice("tool", tool, robot.TOOL_OFFSETS_M))
         self._n_placed += 1
         self._placed = PlacedObject(self.client, obj, self.config, (*xy_m, yaw_rad))
-
         self.set_obstacles(obstacles)
 
     def set_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
@@ -194,7 +197,10 @@ class Tabletop(AbstractContextManager):
 
         Raises ValueError, without moving it, if its centre would leave the table.
         """
-        self.placed.displace(dx_m, dy_m, dyaw_rad)
+        (x, y, _), turn = self.object_pose(), check_finite("dyaw_rad", dyaw_rad)
+        to = x + check_finite("dx_m", dx_m), y + check_finite("dy_m", dy_m)
+        check_on_table("dx_m, dy_m: the shoved object's centre", to)
+        self.placed.displace(dx_m, dy_m, turn)
         self.settle()
 
     def settle(self, seconds: float = 0.5) -> None:
@@ -210,17 +216,17 @@ class Tabletop(AbstractContextManager):
         put_down(self.arm)
         self.settle()
 
-    def observe(self) -> Observation:
-        """Return the estimated position and image of the object; the arm must be parked."""
-        xy_m, bias_m = np.array(self.object_pose()[:2]), self.config.bias_m
-        seen = CAMERAS[self.config.camera](self.client, xy_m, bias_m, self.noise)
-        return replace(seen, obstacles=self.obstacles.all)
+    def observe(self, lever: LeverUp | None = None) -> Observation:
+        """Return the estimated position and image of the object; the arm must be parked.
 
-    def _observe_edge(self, lever: LeverUp) -> Observation:
-        """Return the image (2, 128, 128) around a lever-up's contact, the lever pointing right."""
-        if CAMERAS[self.config.camera] is not ideal:
-            raise ValueError(f'camera must be "ideal" for a lever-up, got {self.config.camera!r}')
-        x, y = np.add(self.object_pose()[:2], self.config.bias_m).tolist()
+        lever: the image (2, 128, 128) is around its contact, and the lever points right.
+        """
+        xy_m, bias_m = np.array(self.object_pose()[:2]), self.config.bias_m
+        if lever is None:
+            seen = CAMERAS[self.config.camera](self.client, xy_m, bias_m, self.noise)
+            return replace(seen, obstacles=self.obstacles.all)
+        check_choice("camera of a lever-up", self.config.camera, ("ideal",))
+        x, y = (xy_m + bias_m).tolist()
         window = (x + lever.contact_x, y + lever.contact_y), LEVER_IMAGE_PIXELS, LEVER_CROP_WIDTH_M
         return Observation((x, y), depth_crop(self.client, *window, lever.theta, samples=1))
 
@@ -241,20 +247,19 @@ class Tabletop(AbstractContextManager):
         self, xy_m: Sequence[float], rgb: Sequence[float], yaw_rad: float = 0.0, scale: float = 1.0
     ) -> None:
         """Draw the object's footprint at (x, y) [m], in a colour, unseen by the robot's camera."""
-        self._marks.append(self.placed.draw_outline(xy_m, rgb, yaw_rad, scale))
+        xy_m, yaw_rad = check_on_table("xy_m", xy_m), check_finite("yaw_rad", yaw_rad)
+        outline = check_within("scale", scale, 0.1, 10.0) * self.obj.footprint_m
+        rgb = [check_within("rgb", share, 0.0, 1.0) for share in check_array("rgb", rgb, 3)]
+        # Larger sheets lie lower, so that a larger one appears as a frame around a smaller one.
+        sheet = [np.vstack([np.insert(outline, 2, z, axis=1) for z in (-0.005, 0.001 / scale)])]
+        shape = self.client.createVisualShape(**mesh(sheet), rgbaColor=(*rgb, 1))
+        turn = pybullet.getQuaternionFromEuler((0, 0, yaw_rad))
+        at = {"basePosition": (*xy_m, -HIDDEN_M), "baseOrientation": turn}
+        self._marks.append(self.client.createMultiBody(baseVisualShapeIndex=shape, **at))
 
-    def can_reach(
-        self, primitive: Primitive, stop_phase: float = 1.0, at_xy_m: Sequence[float] | None = None
-    ) -> bool:
-        """Return whether the arm can execute an action with approach and retreat; nothing moves.
-
-        at_xy_m: position of the object (default: observed, and the action is adapted to the image).
-        """
+    def can_reach(self, primitive: Primitive, stop_phase: float, at_xy_m: Sequence[float]) -> bool:
+        """Return whether the arm can execute an action at (x, y) [m], with approach and retreat."""
         stop_phase = check_within("stop_phase", stop_phase, 0.0, 1.0)
-        if at_xy_m is None:
-            noise, self.noise = self.noise, copy.deepcopy(self.noise)  # the next image has its own
-            seen, self.noise = self.observe(), noise
-            at_xy_m, primitive = seen.xy_m, adapt_to_object(primitive, seen.image)
         origin_m = *check_on_table("at_xy_m", at_xy_m), self.config.tip_offset_m
         try:
             plan_motion(primitive, segments_until(primitive, stop_phase), origin_m, approach=True)
@@ -267,10 +272,9 @@ class Tabletop(AbstractContextManager):
 
         seen: an observation of the object, to which the action is relative (default: a new one).
         """
-        primitive, stop = step.primitive, step.stop_phase
-        if step.path_xy_m is None:
-            return self.execute_primitive(primitive, stop, approach=True, seen=seen)
-        return self.execute_path(step.path_xy_m, primitive, stop, seen)
+        if step.path_xy_m is not None:
+            return self.execute_path(step.path_xy_m, step.primitive, step.stop_phase, seen)
+        return self.execute_primitive(step.primitive, step.stop_phase, approach=True, seen=seen)
 
     def execute_primitive(
         self,
@@ -282,21 +286,16 @@ class Tabletop(AbstractContextManager):
         record_unreachable: bool = False,
         seen: Observation | None = None,
     ) -> Interaction:
-        """Execute a primitive on the object up to a phase, and record the effect.
+        """Execute a primitive on the object up to a phase, and record the effect at 301 phases.
 
         approach: the arm moves there and back home through the air, and rollable objects are braked
         before and after; otherwise it is placed at the start of the path, and finally at home.
-        The effect is recorded at 301 phases in [0, stop_phase]. A partial action is a prefix of
-        the path, re-timed to a smooth stop, or stopped abruptly with smooth=False.
-        If the arm cannot reach, raises UnreachableError, or with record_unreachable=True returns
-        an interaction in which nothing moved (`reached` is False). seen: an observation of the
-        object, to which the action is relative (default: a new one).
+        smooth: a partial action, a prefix of the path, is re-timed to a smooth stop, or ends
+        abruptly. If the arm cannot reach, raises UnreachableError, or with record_unreachable
+        returns an interaction in which nothing moved. seen: as in `execute`.
         """
         stop_phase = check_within("stop_phase", stop_phase, 0.0, 1.0)
-        self._require_tool(primitive)
-        if seen is None:
-            is_lever = isinstance(primitive, LeverUp)
-            seen = self._observe_edge(primitive) if is_lever else self.observe()
+        seen = seen or self.observe(primitive if isinstance(primitive, LeverUp) else None)
         command = Command.of(adapt_to_object(primitive, seen.image), stop_phase, smooth)
         try:
             return execute(self.arm, self.placed, command, seen, self.config.tip_offset_m, approach)
@@ -318,15 +317,7 @@ class Tabletop(AbstractContextManager):
         gripper's yaw is the direction from the first to the last point.
         """
         stop_phase = check_within("stop_phase", stop_phase, 0.0, 1.0)
-        primitive = primitive or Push(0.0)
-        self._require_tool(primitive)
-        command = Command.along(check_array("path_xy_m", path_xy_m, 2), primitive, stop_phase)
+        path_xy_m = check_array("path_xy_m", path_xy_m, 2)
+        command = Command.along(path_xy_m, primitive or Push(0.0), stop_phase)
         seen = seen or self.observe()
         return execute(self.arm, self.placed, command, seen, self.config.tip_offset_m, True)
-
-    def _require_tool(self, primitive: Primitive) -> None:
-        if primitive.tool != self.arm.tool:
-            raise ValueError(
-                f"primitive {primitive.name!r} needs the tool {primitive.tool!r}, but the arm "
-                f"holds the {self.arm.tool}; call place(..., tool={primitive.tool!r})"
-            )

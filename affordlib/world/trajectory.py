@@ -23,15 +23,9 @@ from affordlib.world import robot
 
 STEP_S = 1 / 240
 STEPS_PER_WAYPOINT = 12
-RECORD_EVERY = 3
-"""Simulation steps between two recorded states of the object."""
-
-N_SAMPLES = 301
-"""Number of recorded samples over the phase, one every 3 simulation steps of a full primitive."""
-
-RETREAT_M = 0.02
-"""Distance [m] the gripper moves back along its path, except after actions that cage the object."""
-
+RECORD_EVERY = 3  # simulation steps between two recorded states of the object
+N_SAMPLES = 301  # over the phase, one every 3 simulation steps of a full primitive
+RETREAT_M = 0.02  # back along the path, except after actions that cage the object
 _WAYPOINT_S = STEPS_PER_WAYPOINT * STEP_S
 UP = np.eye(6)[Z]
 """Unit vector upwards in poses (6,)."""
@@ -39,28 +33,22 @@ UP = np.eye(6)[Z]
 
 @dataclass(frozen=True)
 class TrajectorySegment:
-    """Waypoints at intervals of 50 ms: poses (n, 6) as in `Segment`, and their phases (n,).
+    """Waypoints at intervals of 50 ms."""
 
-    n_steps: number of simulation steps before the arm is stopped abruptly (default: all).
-    """
-
-    poses: np.ndarray
-    phase: np.ndarray
+    poses: np.ndarray  # (n, 6) as in `Segment`
+    phase: np.ndarray  # (n,)
     guarded: bool = False
-    n_steps: int | None = None
+    n_steps: int | None = None  # of the simulation before the arm is stopped abruptly; None: all
 
 
 @dataclass(frozen=True)
 class Command:
-    """An action for the arm to execute, relative to the object's measured position.
-
-    phase: (n,) and action: (n, 5), as recorded; segments: the trajectory.
-    """
+    """An action for the arm to execute, relative to the object's measured position."""
 
     primitive: Primitive
-    phase: np.ndarray
-    action: np.ndarray
-    segments: list[TrajectorySegment]
+    phase: np.ndarray  # (n,), as recorded
+    action: np.ndarray  # (n, 5), as recorded
+    segments: list[TrajectorySegment]  # the trajectory
 
     @classmethod
     def of(cls, primitive: Primitive, stop_phase: float, smooth: bool = True) -> Self:
@@ -80,7 +68,17 @@ class Command:
         heading = path_xy_m[-1] - path_xy_m[0]
         if np.hypot(*heading) > 1e-6:
             action[:, YAW] = math.atan2(heading[1], heading[0])
-        return cls(primitive, phase, action, [_segment_along(action, phase)])
+        # Re-timed to a smooth stop: parametrised by arc length, a minimum-jerk path does not
+        # depend on its speed.
+        n = max(2, math.ceil(DURATION_S * float(min_jerk(phase[-1])) / _WAYPOINT_S - 1e-9))
+        length = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(action[:, :2], axis=0).T))])
+        poses, at_phase = np.repeat([[*action[0], 0.0]], n + 1, axis=0), np.zeros(n + 1)
+        if length[-1] > 1e-9:
+            wanted = min_jerk(np.linspace(0, 1, n + 1)) * length[-1]
+            at_phase = np.interp(wanted, length, phase)
+            for c in range(5):
+                poses[:, c] = np.interp(wanted, length, action[:, c])
+        return cls(primitive, phase, action, [TrajectorySegment(poses, at_phase)])
 
 
 def segments_until(
@@ -108,32 +106,17 @@ def segments_until(
     return segments
 
 
-def _segment_along(action: np.ndarray, phase: np.ndarray) -> TrajectorySegment:
-    """Return the segment for an action (n, 5) at phases (n,), re-timed to a smooth stop."""
-    n = max(2, math.ceil(DURATION_S * float(min_jerk(phase[-1])) / _WAYPOINT_S - 1e-9))
-    # Parametrised by arc length, a minimum-jerk path does not depend on its speed.
-    length = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(action[:, :2], axis=0).T))])
-    if length[-1] < 1e-9:
-        return TrajectorySegment(np.repeat([[*action[0], 0.0]], n + 1, axis=0), np.zeros(n + 1))
-    wanted = min_jerk(np.linspace(0, 1, n + 1)) * length[-1]
-    columns = [np.interp(wanted, length, action[:, c]) for c in range(5)]
-    poses = np.column_stack([*columns, np.zeros(n + 1)])
-    return TrajectorySegment(poses, np.interp(wanted, length, phase))
-
-
 def recorded_phases(segments: list[TrajectorySegment]) -> tuple[np.ndarray, np.ndarray]:
     """Return the phases at which object states and tool poses are recorded, in this order."""
     per = STEPS_PER_WAYPOINT // RECORD_EVERY
     at_sample, at_waypoint = [], []
     for segment in segments:
-        waypoints = np.arange(len(segment.phase))
-        steps = segment.n_steps
+        waypoints, steps = np.arange(len(segment.phase)), segment.n_steps
         records = waypoints[-1] * per if steps is None else steps // RECORD_EVERY
-        samples = np.interp(np.arange(records) / per, waypoints, segment.phase)
-        at_sample.append(samples)
-        at_waypoint.append(samples[::per])
-        end = np.interp(records / per, waypoints, segment.phase)
-    return np.concatenate([*at_sample, [end]]), np.concatenate([*at_waypoint, [end]])
+        *samples, end = np.interp(np.arange(records + 1) / per, waypoints, segment.phase)
+        at_sample += samples
+        at_waypoint += samples[::per]
+    return np.array([*at_sample, end]), np.array([*at_waypoint, end])
 
 
 def joint_move(start: np.ndarray, end: np.ndarray, seconds: float) -> np.ndarray:
@@ -148,16 +131,13 @@ def line(start_W: np.ndarray, end_W: np.ndarray, near: np.ndarray, seconds: floa
 
 
 class Motion(NamedTuple):
-    """Planned joint waypoints (n, 6): down to the start, of each segment, and back and up again.
+    """Planned joint waypoints (n, 6)."""
 
-    above: (6,) joint angles above the start; poses_W: the tool's poses (n, 6) of each segment.
-    """
-
-    above: np.ndarray
-    down: np.ndarray
-    paths: list[np.ndarray]
-    back: np.ndarray
-    poses_W: list[np.ndarray]
+    above: np.ndarray  # (6,), above the start
+    down: np.ndarray  # to the start
+    paths: list[np.ndarray]  # of each segment
+    back: np.ndarray  # and up again
+    poses_W: list[np.ndarray]  # the tool's poses (n, 6) of each segment
 
 
 def plan_motion(

@@ -8,10 +8,13 @@ from functools import cache
 import numpy as np
 import torch
 
-from affordlib.interactions import InteractionTensors, open_interactions, split_interactions
-from affordlib.interactions.sampling import condition_on_recorded_action
-from affordlib.models import coverage, load_checkpoint
-from affordlib.models.evaluation import network_predictions
+from affordlib.interactions import (
+    InteractionTensors,
+    condition_on_recorded_action,
+    open_interactions,
+    split_interactions,
+)
+from affordlib.models import coverage, load_checkpoint, network_predictions
 from exercises.checking import Exercise, asked
 
 # 03 The affordance network

@@ -11,9 +11,8 @@ import numpy as np
 import torch
 
 from affordlib.models import load_checkpoint
-from affordlib.planning import EffectMap, PlanningProblem, plan_continuous
+from affordlib.planning import EffectMap, PlanningProblem, plan_continuous, roll_out
 from affordlib.planning.grasp_rotate import predict_trajectories
-from affordlib.planning.rollout import roll_out
 from affordlib.primitives import Grasp, Push
 from affordlib.types import Goal, Observation, Plan, Step
 from affordlib.world import Cuboid, Prism, Tabletop, UprightCylinder

@@ -3,10 +3,8 @@
 import numpy as np
 import torch
 
-from affordlib.interactions import open_interactions
-from affordlib.interactions.sampling import condition_on_recorded_action
-from affordlib.models import load_checkpoint
-from affordlib.models.evaluation import network_predictions
+from affordlib.interactions import condition_on_recorded_action, open_interactions
+from affordlib.models import load_checkpoint, network_predictions
 from exercises import check
 
 

@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import torch
 
-from affordlib.interactions import open_interactions, split_interactions
-from affordlib.interactions.sampling import condition_on_poses
+from affordlib.interactions import condition_on_poses, open_interactions, split_interactions
 from affordlib.models import load_checkpoint
 from affordlib.models.lever_up import (
     N_OBSERVED,

@@ -3,8 +3,7 @@
 import numpy as np
 
 from affordlib.interactions import open_interactions
-from affordlib.models import load_checkpoint
-from affordlib.models.evaluation import final_error, network_predictions
+from affordlib.models import final_error, load_checkpoint, network_predictions
 from exercises import check
 
 

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from affordlib.interactions import open_interactions
-from affordlib.interactions.store import stored_sha256
+from affordlib.interactions import open_interactions, stored_sha256
 from exercises import check
 
 

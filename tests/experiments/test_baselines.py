@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from affordlib.interactions import InteractionTensors
-from affordlib.models.evaluation import final_error, final_errors_m, network_predictions
-from experiments.baselines import constant, gaussian_process, nearest
+from affordlib.models import final_error, final_errors_m, network_predictions
+from experiments.baselines import constant, gaussian_process, nearest, network_record
 from experiments.cross_validation import add_errors, logistic
 
 # Answers
@@ -17,11 +17,13 @@ from experiments.cross_validation import add_errors, logistic
 
 def test_answers_are_those_of_the_model_itself(trained, held_out_pushes):
     some = np.arange(5)
-    told = network_predictions(trained, held_out_pushes, some)
+    told = network_record(trained, held_out_pushes, some)
     arrays = InteractionTensors.from_dataset(held_out_pushes, some)
     torch.testing.assert_close(
         torch.tensor(final_error(told)).float(), final_errors_m(trained, arrays)
     )
+    short = network_predictions(trained, held_out_pushes, some)
+    np.testing.assert_allclose(final_error(short), final_error(told), atol=1e-7)
     assert told["interaction"] == some.tolist()
     after, whole = (np.array(told[k]) for k in ("after_contact_error", "trajectory_error"))
     assert (after > whole).all()  # before contact nothing moves, which lowers the mean

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from affordlib.interactions import InteractionTensors
-from affordlib.interactions.sampling import sample_mixed
+from affordlib.interactions.dataset import sample_mixed
 from affordlib.results import repo_root
 from experiments import ablation, studies
 from experiments.ablation import random_contexts

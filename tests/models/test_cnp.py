@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from affordlib.interactions.sampling import Batch
+from affordlib.interactions.dataset import Batch
 from affordlib.models import CNPConfig, condition_on_primitives
 from affordlib.primitives import Push
 from affordlib.types import Observations

@@ -9,8 +9,8 @@ from matplotlib.path import Path as Outline
 
 from affordlib.geometry import rotated
 from affordlib.interactions import Scaler
+from affordlib.interactions.dataset import condition_on_poses
 from affordlib.interactions.recipes import Recipe, sample_scene
-from affordlib.interactions.sampling import condition_on_poses
 from affordlib.models import build
 from affordlib.models.lever_up import (
     N_OBSERVED,

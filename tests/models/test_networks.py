@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from affordlib.interactions import Scaler
-from affordlib.interactions.sampling import sample_mixed
+from affordlib.interactions.dataset import sample_mixed
 from affordlib.models import (
     CNPConfig,
     EffectModel,
@@ -23,13 +23,12 @@ from affordlib.models import (
     load_checkpoint,
     save_checkpoint,
 )
-from affordlib.models.base import condition_on_final_effect, gaussian_nll
+from affordlib.models.base import condition_on_final_effect, gaussian_nll, push_direction
 from affordlib.models.evaluation import AFTER_CONTACT, effects_at
-from affordlib.models.lever_up import LastPoseConfig
-from affordlib.models.push_frame import push_direction
 from affordlib.primitives import Drag, Push
 from affordlib.types import Observations
 from affordlib.world import Cuboid, UprightCylinder
+from experiments.last_pose import LastPoseConfig
 from experiments.lstm import LSTMConfig
 
 YAW = {"action_channels": ("x", "y", "yaw"), "effect_channels": ("x", "y", "yaw")}

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import torch
 
+from affordlib.models.base import inverse, push_direction, rotate_image
 from affordlib.models.film import CircularHarmonics
-from affordlib.models.push_frame import inverse, push_direction, rotate_image
 from affordlib.primitives import Push
 from affordlib.types import Observations
 

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from affordlib.interactions import InteractionTensors, Scaler, split_interactions
-from affordlib.interactions.sampling import condition_on_recorded_action
+from affordlib.interactions.dataset import condition_on_recorded_action
 from affordlib.models import (
     FiLMConfig,
     FiLMNetwork,
@@ -26,11 +26,11 @@ from affordlib.models import (
     train_model,
 )
 from affordlib.models.evaluation import final_errors_m
-from affordlib.models.lever_up import LastPoseConfig
 from affordlib.planning import EffectMap
 from affordlib.types import Observations
 from experiments.ablation import sample_literal
 from experiments.baselines import constant
+from experiments.last_pose import LastPoseConfig
 
 
 def fresh(arrays):
