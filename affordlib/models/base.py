@@ -181,13 +181,6 @@ class EffectNetwork(nn.Module, ABC):
         w_1 = o.weight[:, None]
         return w_1 * r_a + (1 - w_1) * r_e
 
-    def split_outputs(self, y: Float[Tensor, "b t _"]) -> tuple[Float[Tensor, "b t _"], ...]:
-        """Split the last layer's values (B, T, 2 C_a + 2 C_e) into (μ_a, σ_a, μ_e, σ_e)."""
-        n_a, n_e = len(self.action_channels), len(self.effect_channels)
-        mu_a, raw_a, mu_e, raw_e = y.split([n_a, n_a, n_e, n_e], dim=-1)
-        sigma_a, sigma_e = (self.sigma_floor + F.softplus(raw) for raw in (raw_a, raw_e))
-        return mu_a, sigma_a, mu_e, sigma_e
-
     @property
     def _channels(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
         return self.action_channels, self.effect_channels

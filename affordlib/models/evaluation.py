@@ -10,7 +10,7 @@ Variance scaling multiplies σ of an effect channel by s; the maximum-likelihood
 import json
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -25,7 +25,7 @@ from affordlib.interactions.dataset import (
     condition_on_recorded_action,
     valid_interactions,
 )
-from affordlib.models.base import EffectModel
+from affordlib.models.base import EffectModel, EffectNetwork
 from affordlib.types import check_within
 
 if TYPE_CHECKING:
@@ -73,15 +73,8 @@ def coverage(
     return float(((truth - mean).abs() <= half * std).double().mean())
 
 
-@runtime_checkable
-class HasSigmaScale(EffectModel, Protocol):
-    """A model whose σ of the effect channels is multiplied by sigma_scale (C_e,)."""
-
-    sigma_scale: Tensor
-
-
 def fit_sigma_scale(
-    model: HasSigmaScale,
+    model: EffectNetwork,
     validation: InteractionTensors,
     phases: Sequence[float] = AFTER_CONTACT,
 ) -> tuple[float, ...]:

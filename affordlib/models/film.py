@@ -180,4 +180,7 @@ class FiLMNetwork(HarmonicsNetwork):
         """(μ_a, σ_a, μ_e, σ_e) decoded from x_0."""
         for block in self.blocks:
             x = block(x, features)
-        return self.split_outputs(self.last(self.head(x)))
+        widths = [len(channels) for channels in self._channels for _ in range(2)]
+        mu_a, raw_a, mu_e, raw_e = self.last(self.head(x)).split(widths, dim=-1)
+        sigma_a, sigma_e = (self.sigma_floor + F.softplus(raw) for raw in (raw_a, raw_e))
+        return mu_a, sigma_a, mu_e, sigma_e

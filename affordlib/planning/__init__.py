@@ -15,3 +15,4 @@ from affordlib.planning.problem import MODES, PlanMode, Planner, PlanningProblem
 from affordlib.planning.robot import Execution, Robot
 from affordlib.planning.rollout import make_steps, roll_out
 from affordlib.planning.skills import Skills
+from affordlib.types import Goal
