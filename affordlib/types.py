@@ -60,11 +60,11 @@ def check_finite(name: str, value: Any) -> float:
 
 def check_within(name: str, value: Any, low: float, high: float, unit: str = "") -> float:
     """Return `value` as a float; raises ValueError unless it lies in [low, high]."""
-    number = check_finite(name, value)
-    if not low <= number <= high:
+    checked = check_finite(name, value)
+    if not low <= checked <= high:
         within = f"[{low:g}, {high:g}] {unit}".strip()
-        raise ValueError(f"{name} must lie in {within}, got {number:g}")
-    return number
+        raise ValueError(f"{name} must lie in {within}, got {checked:g}")
+    return checked
 
 
 def check_array(name: str, values: Any, *shape: int) -> np.ndarray:

@@ -245,11 +245,11 @@ class EffectNetwork(nn.Module, ABC):
         """`outputs` for encoded images, and the direction (B, 2) of the push frame, if used."""
         if self.config.frame == "table":
             return self.outputs(encoded, observations, t_target), None
-        direction = push_direction(observations, *self._channels)
+        o, direction = observations, push_direction(observations, *self._channels)
         back = inverse(direction)
-        aligned = rotate_observations(observations, back, *self._channels)
-        features = self.oriented_features(encoded, back)
-        return self.outputs(features, aligned, t_target), direction
+        action, effect = rotate_both(o.action, o.effect, back, *self._channels)
+        aligned = replace(o, action=action, effect=effect)
+        return self.outputs(self.oriented_features(encoded, back), aligned, t_target), direction
 
     def loss(self, batch: Batch, beta: float = 0.0) -> Float[Tensor, ""]:
         """Negative log-likelihood (Section 3.2) of a batch's targets.
@@ -352,12 +352,6 @@ def rotate_both(
     r, (of_action, of_effect) = rotation[:, None], channels
     action = rotate_channels(action, of_action, r, absolute_yaw=True)
     return action, rotate_channels(effect, of_effect, r, absolute_yaw=False)
-
-
-def rotate_observations(o: Observations, rotation: Tensor, *channels: Channels) -> Observations:
-    """Rotate observations by (B, 2)."""
-    action, effect = rotate_both(o.action, o.effect, rotation, *channels)
-    return replace(o, action=action, effect=effect)
 
 
 def rotate_prediction(p: Prediction, rotation: Tensor, *channels: Channels) -> Prediction:
