@@ -41,7 +41,7 @@ from affordlib.types import check_choice, check_count
 from affordlib.weights import read_weights, write_weights
 
 INNER_FOLDS, FEW, MOST_CONTEXT = 3, 100, 64
-MOST_FITTED = 500
+MOST_FITTED = 250
 """Number of pushes, of those of `rate_gp`, from which its kernel is learned."""
 FAR = 1.2
 """Length of a push, as a multiple of the log's longest, beyond which σ is widened."""

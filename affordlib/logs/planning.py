@@ -4,7 +4,8 @@ The effect of a push in the object's frame does not depend on the object's pose.
 library of pushes (contact on the outline, direction, length) are predicted once, by any model.
 Chains of one to three pushes are searched in it: all pairs form a k-d tree in (x, y, ρ yaw),
 queried for what remains after each first push. The chain with the least expected squared distance
-to the goal is chosen; ρ, the object's radius of gyration, converts rotations to lengths.
+to the goal is chosen; ρ, the object's radius of gyration, converts rotations to lengths. If it is
+known where the tool is, the first push must be one to which the tool finds a way around the object.
 """
 
 from __future__ import annotations
@@ -15,13 +16,23 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
+from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
-from affordlib.geometry import rotated
+from affordlib.geometry import cross, rotated, unit_vector
 from affordlib.logs.fit import PushModel
-from affordlib.logs.log import FEET, LARGEST_M, Pushes, centred, gyration_radius_m
+from affordlib.logs.log import FEET, LARGEST_M, Pushes, _nearest, centred, gyration_radius_m
 from affordlib.primitives import PushAt
-from affordlib.types import Goal, Plan, Step, check_array, check_count, check_range, check_within
+from affordlib.types import (
+    Goal,
+    Plan,
+    Step,
+    UnreachableError,
+    check_array,
+    check_count,
+    check_range,
+    check_within,
+)
 
 N_CANDIDATES = 600
 LENGTHS_M = 0.002, 0.045
@@ -30,7 +41,16 @@ MOST_INCIDENCE_RAD = math.radians(50)
 CORNER_SHARE = 0.08
 """Fraction of an edge excluded from contacts at each end."""
 SHORTEST_SHARE = 0.3
+CLEAR_M = 0.004
+"""Distance [m] between tool and outline on the tool's way; half of it must remain."""
+TURN_PRICE_M = 0.03
+"""Length [m] that the tool rather goes than turn once more on its way."""
+KEPT = 4
+"""Number of chains of each length that are refined."""
 _NEIGHBOURS = 30
+_BEFORE = 1 / math.cos(MOST_INCIDENCE_RAD)
+"""Distance before the contact at which the tool stops, in `CLEAR_M`, even for an oblique push."""
+_SHIFT, _LARGEST_STEP, _DAMPING_M = 0.01, 0.5, 0.0003
 
 
 @dataclass(frozen=True)
@@ -69,24 +89,246 @@ class PushedObject:
         return cls(pushes.outline_m, pushes.tool_radius_m, lengths_m, str(names[0]), context)
 
     def draw(self, n: int = N_CANDIDATES, seed: int | np.random.Generator = 0) -> Pushes:
-        """Draw n pushes all around the outline."""
+        """Draw n pushes all around the outline, less those whose tool would overlap the object."""
+        return self.at(*self.drawn(n, seed))
+
+    def drawn(self, n: int, seed: int | np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """Edges (m,) and values (m, 3) of pushes: share of the edge, angle [rad], log of length."""
         rng, n = np.random.default_rng(seed), check_count("n", n, 1, 100_000)
-        edges = np.roll(self.outline_m, -1, axis=0) - self.outline_m
+        sizes = np.linalg.norm(np.roll(self.outline_m, -1, axis=0) - self.outline_m, axis=1)
+        edge, (low, high) = rng.choice(len(sizes), n, p=sizes / sizes.sum()), self.bounds.T
+        values = np.column_stack([rng.uniform(*ends, n) for ends in zip(low, high, strict=True)])
+        pushes = self.at(edge, values)
+        middle = pushes.contact_m - self.tool_radius_m * pushes.normal
+        fits = _nearest(self.outline_m, middle)[0] > self.tool_radius_m - 1e-6
+        return edge[fits], values[fits]
+
+    @property
+    def bounds(self) -> np.ndarray:
+        """Least and largest value of a push's share of the edge, angle and log of length (3, 2)."""
+        share, angle = (CORNER_SHARE, 1 - CORNER_SHARE), (-MOST_INCIDENCE_RAD, MOST_INCIDENCE_RAD)
+        return np.array([share, angle, np.log(self.lengths_m)])
+
+    def at(self, edge: np.ndarray, values: np.ndarray) -> Pushes:
+        """Pushes on edges (n,) with values (n, 3) as in `drawn`."""
+        edges, n = np.roll(self.outline_m, -1, axis=0) - self.outline_m, len(edge)
         sizes = np.linalg.norm(edges, axis=1)
-        edge = rng.choice(len(edges), n, p=sizes / sizes.sum())
-        share = rng.uniform(CORNER_SHARE, 1 - CORNER_SHARE, (n, 1))
         normal = np.stack([-edges[:, 1], edges[:, 0]], axis=1)[edge] / sizes[edge, None]
-        angle = rng.uniform(-MOST_INCIDENCE_RAD, MOST_INCIDENCE_RAD, n)
         return Pushes(
-            contact_m=self.outline_m[edge] + share * edges[edge],
+            contact_m=self.outline_m[edge] + values[:, :1] * edges[edge],
             normal=normal,
-            direction=_turned(normal, angle),
-            length_m=np.exp(rng.uniform(*np.log(self.lengths_m), n)),
+            direction=_turned(normal, values[:, 1]),
+            length_m=np.exp(values[:, 2]),
             groups=np.full(n, self.group),
             context={k: np.repeat(np.array(v)[None], n, 0) for k, v in self.context.items()},
             outline_m=self.outline_m,
             tool_radius_m=self.tool_radius_m,
         )
+
+
+@dataclass(frozen=True)
+class Ways:
+    """Ways of the tool around the object: to points (n,), where there is one."""
+
+    first_m: np.ndarray  # (9, 2), where it may turn; from the first it starts
+    before: np.ndarray  # (9,), the point before each of these
+    via: np.ndarray  # (n,), the last of these before each goal
+    length_m: np.ndarray  # (n,), infinite where there is no way
+
+
+@dataclass
+class PushPlanner:
+    """Plans pushes of one object; its library of pushes is drawn and predicted once.
+
+    turn_m: metres per radian in the distance to the goal (default: the radius of gyration); price:
+    by which share of the present distance each push of a chain must bring the object nearer;
+    rounds: of Gauss-Newton steps that refine contacts, directions and lengths of the best chains;
+    room_m: least and largest (x, y) that the tool's centre can reach.
+    """
+
+    model: PushModel
+    obj: PushedObject
+    seed: int = 0
+    turn_m: float | None = None
+    price: float = 0.0
+    rounds: int = 0
+    room_m: tuple[tuple[float, float], tuple[float, float]] | None = None
+
+    def __post_init__(self) -> None:
+        check_count("seed", self.seed, least=0)
+        radius_m = gyration_radius_m(self.obj.outline_m) if self.turn_m is None else self.turn_m
+        self._turn_m = check_within("turn_m", radius_m, 0.0, LARGEST_M, "m")
+        self._drawn = self.obj.drawn(N_CANDIDATES, self.seed)
+        self.library = self.obj.at(*self._drawn)
+        self._effect, self._std = self.model.predict(self.library)
+        each = np.arange(len(self.library))
+        self._pairs = np.stack(np.meshgrid(each, each), axis=-1).reshape(-1, 2)
+        self._ends = _after(*(self._effect[rows] for rows in self._pairs.T))
+        self._trees: dict[float, cKDTree] = {}
+
+    def plan(
+        self,
+        pose: tuple[float, float, float],
+        goal: Goal,
+        n_pushes: int = 3,
+        tool_xy_m: tuple[float, float] | None = None,
+    ) -> Plan:
+        """Plan up to three pushes as `plan_push_at`; the tool must find a way to the first one.
+
+        tool_xy_m: where the tool's centre is; None does not look for a way. Raises UnreachableError
+        if there is none to any push.
+        """
+        began = time.perf_counter()
+        x, y, yaw = check_array("pose", pose, 3).tolist()
+        check_within("yaw of pose", yaw, -2 * math.pi, 2 * math.pi, "rad")
+        check_count("n_pushes", n_pushes, 1, 3)
+        weights = np.array([1.0, 1.0, self._turn_m if goal.turn_rad is not None else 1e-6])
+        target = np.array([*rotated(np.subtract(goal.xy_m, (x, y)), -yaw), goal.turn_rad or 0.0])
+        shut = self.shut(pose, tool_xy_m)
+        risk, effect, n = (weights * self._std) ** 2, self._effect, len(self.library)
+
+        def best(chains, ends):
+            cost = ((weights * (ends - target)) ** 2).sum(axis=1) + risk[chains].sum(axis=(1, 2))
+            cost[shut[chains[:, 0]]] = np.inf
+            order = np.argpartition(cost, KEPT)[:KEPT] if self.rounds else [cost.argmin()]
+            return [(math.sqrt(cost[k]), *self._chain(chains[k])) for k in order]
+
+        found = best(np.arange(n)[:, None], effect)
+        if n_pushes > 1:
+            found += best(self._pairs, self._ends)
+        if n_pushes == 3:
+            if weights[2] not in self._trees:
+                self._trees[weights[2]] = cKDTree(weights * self._ends)
+            left = target - effect
+            left[:, :2] = _turned(left[:, :2], -effect[:, 2])
+            near = self._trees[weights[2]].query(weights * left, _NEIGHBOURS)[1].ravel()
+            chains = np.column_stack([np.repeat(np.arange(n), _NEIGHBOURS), self._pairs[near]])
+            found += best(chains, _after(effect[chains[:, 0]], self._ends[near]))
+        if self.rounds:
+            found += self._refined([chain[1] for chain in found], weights, target)
+            firsts = self.obj.at(*(np.array([c[1][k][0] for c in found]) for k in (0, 1)))
+            shut = self.shut(pose, tool_xy_m, firsts)
+            found = [chain for chain, is_shut in zip(found, shut, strict=True) if not is_shut]
+        price = self.price * np.linalg.norm(weights * target)
+        found = [chain for chain in found if math.isfinite(chain[0])]
+        if not found:
+            raise UnreachableError("tool_xy_m: the tool finds no way around the object to a push")
+        _, chosen, *predicted = min(found, key=lambda each: each[0] + price * len(each[2]))
+        plan = self._steps(pose, goal, self.obj.at(*chosen), *predicted)
+        off_m = goal.distance_m(plan[-1].predicted_end_xy_m)
+        turn_off = weights[2] * abs(plan[-1].predicted_turn_rad - target[2])
+        reaches, took_s = max(off_m, turn_off) <= goal.tolerance_m, time.perf_counter() - began
+        return Plan(goal, (x, y), plan, "push_at", bool(reaches), took_s)
+
+    def way(
+        self,
+        pose: tuple[float, float, float],
+        tool_xy_m: tuple[float, float],
+        primitive: PushAt,
+    ) -> np.ndarray:
+        """Points (n, 2) of the tool's way from where it is to the end of a push of `plan`.
+
+        It retreats from the outline, goes around the object, and comes to rest before the contact.
+        """
+        x, y, yaw = pose
+        contact, ahead = np.add(primitive.contact, (x, y)), unit_vector(primitive.direction)
+        before = contact - _BEFORE * CLEAR_M * ahead
+        ways = self._ways(pose, tool_xy_m, rotated(before - (x, y), -yaw)[None])
+        points, k = [], int(ways.via[0])
+        while k >= 0:
+            points.append(np.add((x, y), rotated(ways.first_m[k], yaw)))
+            k = int(ways.before[k])
+        return np.array([*points[::-1], before, contact + primitive.length * ahead])
+
+    def _chain(self, rows: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray]:
+        return tuple(part[rows] for part in self._drawn), self._effect[rows], self._std[rows]
+
+    def _steps(
+        self, pose: Any, goal: Goal, pushes: Pushes, effect: np.ndarray, std: np.ndarray
+    ) -> tuple[Step, ...]:
+        x, y, yaw = pose
+        steps, ends = [], np.zeros((1, 3))
+        for k in range(len(pushes)):
+            ends = np.vstack([ends, _after(ends[-1:], effect[k : k + 1])])
+            path = np.add((x, y), rotated(ends[-2:, :2], yaw))
+            primitive = primitive_of(pushes, k, yaw + ends[-2, 2])
+            std_m, turn = float(np.hypot(*std[k, :2])), float(ends[-1, 2])
+            steps.append(Step(primitive, 1.0, tuple(path[1].tolist()), path, None, std_m, turn))
+        return tuple(steps)
+
+    def _refined(
+        self, chains: list[tuple[np.ndarray, np.ndarray]], weights: np.ndarray, target: np.ndarray
+    ) -> list[tuple]:
+        """Gauss-Newton steps of least norm, of all chains (edges, values) side by side."""
+        best: list[tuple] = [(math.inf, chain) for chain in chains]
+        for _ in range(self.rounds):
+            shifted = [
+                v[None] + np.vstack([np.zeros(3), _SHIFT * np.eye(3)])[:, None] for _, v in chains
+            ]
+            edges = np.concatenate([np.tile(edge, 4) for edge, _ in chains])
+            flat = np.concatenate([values.reshape(-1, 3) for values in shifted])
+            both, at = self.model.predict(self.obj.at(edges, flat)), 0
+            for number, (edge, values) in enumerate(chains):
+                k = len(edge)
+                effect, std = (each[at : at + 4 * k].reshape(4, k, 3) for each in both)
+                at += 4 * k
+                every = np.tile(effect[0], (1 + 3 * k, 1, 1))
+                for push in range(k):
+                    every[1 + 3 * push : 4 + 3 * push, push] = effect[1:, push]
+                ends = np.zeros((1 + 3 * k, 3))
+                for push in range(k):
+                    ends = _after(ends, every[:, push])
+                off = weights * (ends[0] - target)
+                cost = math.sqrt((off**2).sum() + ((weights * std[0]) ** 2).sum())
+                if cost < best[number][0]:
+                    best[number] = cost, (edge, values), effect[0], std[0]
+                slope = weights * (ends[1:] - ends[0]) / _SHIFT
+                damped = slope.T @ slope + _DAMPING_M**2 * np.eye(3)
+                step = np.clip(-slope @ np.linalg.solve(damped, off), -_LARGEST_STEP, _LARGEST_STEP)
+                chains[number] = edge, np.clip(values + step.reshape(k, 3), *self.obj.bounds.T)
+        return [each for each in best if len(each) > 2]
+
+    def shut(self, pose: Any, tool_xy_m: Any, pushes: Pushes | None = None) -> np.ndarray:
+        """Which pushes (n,), by default of the library, the tool at tool_xy_m cannot make."""
+        pushes = self.library if pushes is None else pushes
+        if tool_xy_m is None:
+            return np.zeros(len(pushes), dtype=bool)
+        middle = pushes.contact_m - self.obj.tool_radius_m * pushes.normal
+        before = middle - _BEFORE * CLEAR_M * pushes.direction
+        shut = ~np.isfinite(self._ways(pose, tool_xy_m, before).length_m)
+        if self.room_m is not None:
+            ends = middle + pushes.length_m[:, None] * pushes.direction
+            for points in (before, ends):
+                world = rotated(points, pose[2]) + pose[:2]
+                shut |= ((world < self.room_m[0]) | (world > self.room_m[1])).any(axis=1)
+        return shut
+
+    def _ways(self, pose: Any, tool_xy_m: Any, goals_m: np.ndarray) -> Ways:
+        """Shortest ways in the object's frame, over eight points on a circle around the object."""
+        outline_m, radius_m = self.obj.outline_m, self.obj.tool_radius_m
+        start = rotated(np.subtract(tool_xy_m, pose[:2]), -pose[2])
+        angle = np.linspace(0, 2 * math.pi, 32, endpoint=False)
+        circle = np.column_stack([np.cos(angle), np.sin(angle)])
+        if (lacks := radius_m + CLEAR_M - _nearest(outline_m, start[None])[0].item()) > 0:
+            back = start + (lacks + 1e-4) * circle  # one of these is nearly along the normal
+            start = back[_nearest(outline_m, back)[0].argmax()]
+        far_m = np.linalg.norm(outline_m, axis=1).max() + radius_m + CLEAR_M
+        around = circle[::4] * far_m / math.cos(math.pi / 8)
+        if self.room_m is not None:
+            around = rotated(
+                np.clip(rotated(around, pose[2]) + pose[:2], *self.room_m) - pose[:2], -pose[2]
+            )
+        turns = np.vstack([start, around])
+        ends = np.vstack([turns, goals_m])
+        off = ends - turns[:, None]
+        length = np.linalg.norm(off, axis=-1) + TURN_PRICE_M
+        pairs = np.broadcast_to(turns[:, None], off.shape).reshape(-1, 2), np.tile(ends, (9, 1))
+        gap = _gaps(outline_m, *pairs).reshape(length.shape)
+        length[gap < radius_m + CLEAR_M / 2] = np.inf
+        from_start, before = dijkstra(length[:, :9], indices=0, return_predecessors=True)
+        total = from_start[:, None] + length[:, 9:]
+        via = total.argmin(axis=0)
+        return Ways(turns, before, via, total.min(axis=0))
 
 
 def plan_push_at(
@@ -103,48 +345,10 @@ def plan_push_at(
     pose: of the object's centroid, in metres and radians (`Log.centroid_pose`); goal: a position of
     the centroid in the same frame, and a turn relative to the present yaw; turn_m: metres per
     radian in the distance to the goal (default: the radius of gyration). The plan reaches the goal
-    if its tolerance covers the distance, and turn_m times what the turn is off.
+    if its tolerance covers the distance, and turn_m times what the turn is off. To plan often, and
+    with the tool's way, keep a `PushPlanner`.
     """
-    began = time.perf_counter()
-    x, y, yaw = check_array("pose", pose, 3).tolist()
-    check_within("yaw of pose", yaw, -2 * math.pi, 2 * math.pi, "rad")
-    check_count("n_pushes", n_pushes, 1, 3)
-    pushes = obj.draw(seed=check_count("seed", seed, least=0))
-    effect, std = model.predict(pushes)
-    turn_m = gyration_radius_m(obj.outline_m) if turn_m is None else turn_m
-    check_within("turn_m", turn_m, 0.0, LARGEST_M, "m")
-    weights = np.array([1.0, 1.0, turn_m if goal.turn_rad is not None else 1e-6])
-    risk = (weights * std) ** 2
-    target = np.array([*rotated(np.subtract(goal.xy_m, (x, y)), -yaw), goal.turn_rad or 0.0])
-
-    def best(chains):
-        ends = np.zeros((len(chains), 3))
-        for k in range(chains.shape[1]):
-            ends = _after(ends, effect[chains[:, k]])
-        cost = ((weights * (ends - target)) ** 2).sum(axis=1) + risk[chains].sum(axis=(1, 2))
-        return cost.min(), chains[cost.argmin()]
-
-    n = len(pushes)
-    pairs = np.stack(np.meshgrid(np.arange(n), np.arange(n)), axis=-1).reshape(-1, 2)
-    found = [best(chains) for chains in (np.arange(n)[:, None], pairs)[:n_pushes]]
-    if n_pushes == 3:
-        tree = cKDTree(weights * _after(effect[pairs[:, 0]], effect[pairs[:, 1]]))
-        left = target - effect
-        left[:, :2] = _turned(left[:, :2], -effect[:, 2])
-        near = tree.query(weights * left, _NEIGHBOURS)[1].ravel()
-        first = np.repeat(np.arange(n), _NEIGHBOURS)
-        found.append(best(np.column_stack([first, pairs[near]])))
-    chain = min(found, key=lambda each: each[0])[1]
-    steps, ends = [], np.zeros((1, 3))
-    for k in chain.tolist():
-        ends = np.vstack([ends, _after(ends[-1:], effect[k : k + 1])])
-        path = np.add((x, y), rotated(ends[-2:, :2], yaw))
-        primitive = primitive_of(pushes, k, yaw + ends[-2, 2])
-        std_m, turn = float(np.hypot(*std[k, :2])), float(ends[-1, 2])
-        steps.append(Step(primitive, 1.0, tuple(path[1].tolist()), path, None, std_m, turn))
-    off_m = goal.distance_m(steps[-1].predicted_end_xy_m), weights[2] * abs(ends[-1, 2] - target[2])
-    reaches, took_s = max(off_m) <= goal.tolerance_m, time.perf_counter() - began
-    return Plan(goal, (x, y), tuple(steps), "push_at", bool(reaches), took_s)
+    return PushPlanner(model, obj, seed, turn_m).plan(pose, goal, n_pushes)
 
 
 def primitive_of(pushes: Pushes, k: int, heading_rad: float) -> PushAt:
@@ -165,3 +369,17 @@ def _after(pose: np.ndarray, effect: np.ndarray) -> np.ndarray:
     return np.column_stack(
         [pose[:, :2] + _turned(effect[:, :2], pose[:, 2]), pose[:, 2] + effect[:, 2]]
     )
+
+
+def _gaps(outline_m: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Distances (n,) of segments from an outline, at most 0 where they touch or are inside."""
+    edges, along = np.roll(outline_m, -1, axis=0) - outline_m, end - start
+    gap = np.minimum(*(_nearest(outline_m, points)[0] for points in (start, end)))
+    off = outline_m - start[:, None]
+    share = (off * along[:, None]).sum(axis=-1) / np.maximum((along**2).sum(axis=1), 1e-18)[:, None]
+    beside = off - np.clip(share, 0, 1)[..., None] * along[:, None]
+    side = cross(along[:, None], off)
+    parts = side * np.roll(side, -1, axis=1) < 0
+    parts &= cross(edges, -off) * cross(edges, end[:, None] - outline_m) < 0
+    gap = np.minimum(gap, np.linalg.norm(beside, axis=-1).min(axis=1))
+    return np.where(parts.any(axis=1), 0.0, gap)

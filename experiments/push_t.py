@@ -1,0 +1,410 @@
+"""The T of the field (Push-T, `gym-pusht`), solved from a log of random pushes.
+
+    python -m experiments.push_t [--only row=gp_200 block=0,1]
+
+needs `requirements-pusht.txt`. The environment is used as published: targets of its agent, a disc,
+in [0, 512]², ten a second, 300 of them at most. One pixel counts as one millimetre.
+
+Protocol. 300 initial states: those of `reset(seed)` for 300 seeds from `FIRST_START`, of which none
+is solved. They are made in 15 blocks of 20; block b uses the training pushes of draw b mod 5. A
+state is solved (a) when the environment says so (coverage above 95 %), (b) when the T is within
+10 px and 10° of its goal, and has been at rest there for three steps. What was chosen (price,
+rounds, lengths, features of the Gaussian process) was chosen on the seeds from `FIRST_CHOICE`.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.special import expit
+from scipy.stats import binomtest
+
+from affordlib.geometry import rotated, unit_vector, wrap_angle
+from affordlib.logs import Log, LoggedPushes, PushedObject, Pushes, PushPlanner, fit
+from affordlib.logs.cross_validate import forecast_errors
+from affordlib.logs.fit import Forecast
+from affordlib.logs.log import _nearest, centred
+from affordlib.logs.neural_process import PRETRAINED
+from affordlib.logs.planning import primitive_of
+from affordlib.types import Goal, UnreachableError
+from experiments import runner
+from experiments.commands import command
+from experiments.runner import FOLDER, Job, Rows, frame, read
+
+TABLE = "push_t"
+T_PX = ((-60, 0), (60, 0), (60, 30), (15, 30), (15, 120), (-15, 120), (-15, 30), (-60, 30))
+AGENT_PX, GOAL = 15.0, (256.0, 256.0, math.pi / 4)
+ROOM_M = ((0.0, 0.0), (0.512, 0.512))
+MIDDLE_PX = 140, 372
+"""While pushes are collected, the T is put back when its centre leaves this range."""
+LENGTHS_M = 0.004, 0.06
+MOST_STEPS, LIMITS = 300, (100, 150, 300)
+FIRST_START, FIRST_CHOICE, FIRST_DRAW = 100_000, 200_000, 300_000
+BLOCKS, OF_BLOCK, DRAWS = 15, 20, 5
+PRICE, ROUNDS = 0.3, 3
+NEAR_PX, NEAR_RAD, REST_PX = 10.0, math.radians(10), 0.01
+
+
+def log_of_t() -> Log:
+    """Return an empty log of the T; a pixel counts as a millimetre."""
+    return Log("mm", T_PX, tool_radius=AGENT_PX)
+
+
+@lru_cache
+def motion() -> tuple[np.ndarray, np.ndarray]:
+    """Matrices of the agent's position and velocity after one step: A (2, 2) s + B (2,) target.
+
+    The environment's controller is v ← 0.8 v + (target - x), x ← x + 0.01 v, ten times a step.
+    """
+    a, b = np.eye(2), np.zeros(2)
+    once = np.array([[1 - 0.01, 0.8 * 0.01], [-1.0, 0.8]]), np.array([0.01, 1.0])
+    for _ in range(10):
+        a, b = once[0] @ a, once[0] @ b + once[1]
+    return a, b
+
+
+def targets_to(point: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Targets (n, 2) that bring the agent from rest at one point to rest at another, in a line.
+
+    Two suffice, if they lie inside the environment's range; with more, the least of them is chosen.
+    """
+    a, b = motion()
+    for n in range(2, 9):
+        effects = np.column_stack([np.linalg.matrix_power(a, n - 1 - k) @ b for k in range(n)])
+        shares = np.linalg.pinv(effects) @ np.array([1.0, 0.0])  # of the way, by each target
+        targets = at + shares[:, None] * (point - at)
+        # Targets are relative to a rest at `at`: A (at, 0) + B at = (at, 0).
+        if (targets >= 0).all() and (targets <= 512).all():
+            return targets
+    return np.tile(np.clip(point, 0, 512), (8, 1))
+
+
+class Table:
+    """The environment, and what a robot sees of it: the state, or only its 96 × 96 picture."""
+
+    def __init__(self, view: str = "state", **of_block: Any) -> None:
+        import gym_pusht  # noqa: F401 - registers the environment
+        import gymnasium
+
+        self.view = view
+        self.env = gymnasium.make(
+            "gym_pusht/PushT-v0", obs_type="state" if view == "state" else "pixels", **of_block
+        )
+
+    def reset(self, seed: int) -> None:
+        """Begin an episode, and wait until the T rests, should the agent begin inside it."""
+        self.seen, info = self.env.reset(seed=seed)
+        self.steps, self.rests, self.solved = 0, 0, dict.fromkeys("ab")
+        self.truth, self.done = info["block_pose"], False
+        self.agent = self.look()[0]
+        while self.steps < MOST_STEPS:
+            before = self.truth
+            self.act(self.agent)
+            if np.abs(self.truth - before).max() < REST_PX:
+                break
+
+    def look(self) -> tuple[np.ndarray, tuple[float, float, float]]:
+        """Return the agent's position (2,) and the pose of the T, in pixels and radians."""
+        if self.view == "state":
+            return self.seen[:2], (*self.seen[2:4].tolist(), wrap_angle(float(self.seen[4])))
+        return read_picture(self.seen)
+
+    def act(self, target: np.ndarray) -> None:
+        """Make one step of the environment, and note whether it is solved."""
+        self.seen, _, done, cut, info = self.env.step(np.clip(target, 0, 512))
+        self.steps += 1
+        off = info["block_pose"] - GOAL
+        near = math.hypot(*off[:2]) < NEAR_PX and abs(wrap_angle(off[2])) < NEAR_RAD
+        moved = np.abs(info["block_pose"] - self.truth).max()
+        self.rests = self.rests + 1 if near and moved < REST_PX else 0
+        self.truth = info["block_pose"]
+        for rule, met in (("a", done), ("b", self.rests >= 3)):
+            if met and self.solved[rule] is None:
+                self.solved[rule] = self.steps
+        self.done = cut or self.steps >= MOST_STEPS or None not in self.solved.values()
+
+    def go(self, points_px: np.ndarray) -> np.ndarray:
+        """Move the agent along points (n, 2), at rest in each; its path (m, 2) to the last one."""
+        for point in points_px:
+            path = [self.agent]
+            for target in targets_to(point, self.agent):
+                if self.done or self.solved["a"]:
+                    break
+                self.act(target)
+                path.append(self.seen[:2] if self.view == "state" else point)
+            self.agent = path[-1]
+        return np.array(path)
+
+
+class Nothing:
+    """A model for a robot that knows nothing yet."""
+
+    def predict(self, pushes: Pushes) -> Forecast:
+        """Predict that nothing moves."""
+        return np.zeros((len(pushes), 3)), np.ones((len(pushes), 3))
+
+
+def metres(log: Log, seen: tuple) -> tuple[tuple[float, float], tuple[float, float, float]]:
+    """Convert what is seen to the tool's position [m] and the pose of the T's centroid."""
+    return tuple((1e-3 * seen[0]).tolist()), log.centroid_pose(seen[1])
+
+
+def collect(n: int, draw: int, view: str = "state", **of_block: Any) -> Log:
+    """Return a log of n random pushes of the T; the agent goes around it in between."""
+    log, table = log_of_t(), Table(view, **of_block)
+    rng, seed = np.random.default_rng(FIRST_DRAW + draw), FIRST_DRAW + 1000 * draw
+    of_t = PushedObject(1e-3 * np.array(T_PX), 1e-3 * AGENT_PX, LENGTHS_M)
+    planner = PushPlanner(Nothing(), of_t, room_m=ROOM_M)
+    table.reset(seed)
+    while len(log) < n:
+        seen = table.look()
+        tool, pose = metres(log, seen)
+        middle = 1e3 * np.array(pose[:2])
+        table.agent = seen[0]
+        planner.library = of_t.draw(64, rng)
+        can = np.flatnonzero(~planner.shut(pose, tool))
+        away = (middle < MIDDLE_PX[0]).any() or (middle > MIDDLE_PX[1]).any()
+        if away or not len(can) or table.steps > MOST_STEPS - 40 or table.solved["a"]:
+            seed += 1
+            table.reset(seed)
+            continue
+        push = primitive_of(planner.library, can[0], pose[2])
+        way = 1e3 * planner.way(pose, tool, push)
+        table.go(way[:-1])
+        before = table.look()
+        table.agent = before[0]
+        path = table.go(way[-1:])
+        after = table.look()
+        log.add_all(
+            [{"tool_t": np.arange(len(path)), "tool_xy": path, "poses": (before[1], after[1])}]
+        )
+    return log
+
+
+def attempt(table: Table, planner: PushPlanner, n_pushes: int, seed: int) -> dict[str, Any]:
+    """Solve one initial state: plan, push, observe, plan again; what it took."""
+    log, took_s, pushes = log_of_t(), [], 0
+    table.reset(seed)
+    goal = log.centroid_pose(GOAL)
+    rng = np.random.default_rng(seed)
+    while not table.done:
+        if table.solved["a"]:
+            table.act(table.agent)
+            continue
+        seen = table.look()
+        table.agent = seen[0]
+        tool, pose = metres(log, seen)
+        wanted = Goal(goal[:2], turn_rad=wrap_angle(goal[2] - pose[2]))
+        began = time.process_time()
+        try:
+            if n_pushes:
+                push = planner.plan(pose, wanted, n_pushes, tool).steps[0].primitive
+            else:  # at random
+                can = np.flatnonzero(~planner.shut(pose, tool))
+                push = primitive_of(planner.library, int(rng.choice(can)), pose[2])
+        except (UnreachableError, ValueError):  # nowhere to go: step aside
+            table.go(np.clip(seen[0] + 20 * unit_vector(rng.uniform(0, 2 * math.pi)), 0, 512)[None])
+            continue
+        took_s.append(time.process_time() - began)
+        table.go(1e3 * planner.way(pose, tool, push))
+        pushes += 1
+    about = {"seed": seed, "pushes": pushes, "plan_s": float(np.mean(took_s or [0.0]))}
+    return about | {f"steps_{rule}": steps for rule, steps in table.solved.items()}
+
+
+PALETTE = {
+    "t": ((119, 136, 153), (143, 163, 184)),
+    "agent": ((65, 105, 225), (78, 126, 255)),
+    "other": ((255, 255, 255), (211, 211, 211), (144, 238, 144)),
+}
+"""Colours of the environment's picture; edge and face of T and agent."""
+EDGE_PX, SWELL_PX = 2.0, 0.5
+"""Width of the soft edge of a fitted shape, and by how much a drawn shape is larger, in pixels."""
+
+
+def read_picture(picture: np.ndarray) -> tuple[np.ndarray, tuple[float, float, float]]:
+    """Estimate the agent's position and the pose of the T from a picture (96, 96, 3).
+
+    Each pixel has the name of the nearest colour of the palette. A shape is fitted to the pixels of
+    its name by least squares, with a soft edge; the yaw is first searched in steps of 15°.
+    """
+    names = [name for name, colours in PALETTE.items() for _ in colours]
+    palette = np.array([colour for colours in PALETTE.values() for colour in colours])
+    off = np.linalg.norm(picture[:, :, None].astype(float) - palette, axis=-1)
+    nearest = np.array(names)[off.argmin(axis=-1)]
+    grid = (np.arange(96) + 0.5) * 512 / 96 - 0.5
+    points = np.stack(np.meshgrid(grid, grid), axis=-1)
+    found = {name: points[nearest == name].mean(axis=0) for name in ("t", "agent")}
+
+    def soft(distance: np.ndarray, name: str, at: np.ndarray) -> np.ndarray:
+        return expit((SWELL_PX - distance) / EDGE_PX) - (nearest == name)[at]
+
+    close = np.linalg.norm(points - found["agent"], axis=-1) < 2 * AGENT_PX
+    agent = least_squares(
+        lambda xy: soft(np.linalg.norm(points[close] - xy, axis=-1) - AGENT_PX, "agent", close),
+        found["agent"],
+    ).x
+    near = (np.linalg.norm(points - found["t"], axis=-1) < 110) & (nearest != "agent")
+    centre, outline = centred(np.array(T_PX, dtype=float))
+
+    def misfit(pose: np.ndarray) -> np.ndarray:
+        return soft(_nearest(outline, rotated(points[near] - pose[:2], -pose[2]))[0], "t", near)
+
+    first = [np.array([*found["t"], yaw]) for yaw in np.radians(np.arange(0, 360, 15))]
+    best = min(first, key=lambda pose: (misfit(pose) ** 2).sum())
+    x, y, yaw = least_squares(misfit, best, ftol=1e-4).x
+    return agent, (*(np.array([x, y]) - rotated(centre, yaw)).tolist(), wrap_angle(float(yaw)))
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row of the table: a model, from how many random pushes, and what it plans with."""
+
+    model: str
+    n: int
+    chain: int = 3
+    view: str = "state"
+    block_cog: tuple[float, float] | None = None
+
+
+ROWS = {
+    "nothing": Row("constant", 0, 0),
+    "random": Row("constant", 8, 0),
+    "gp_200": Row("rate_gp", 200),
+    "gp_50": Row("rate_gp", 50),
+    "gp_2000": Row("rate_gp", 2000),
+    "physics_200": Row("physics", 200),
+    "nearest_200": Row("nearest", 200),
+    "gp_200_one_push": Row("rate_gp", 200, 1),
+    "gp_200_picture": Row("rate_gp", 200, view="picture"),
+    "np_200": Row("np", 200),
+    "gp_200_other_t": Row("rate_gp", 200, block_cog=(0.0, 80.0)),
+    "physics_50": Row("physics", 50),
+    "nearest_2000": Row("nearest", 2000),
+}
+
+
+@lru_cache(maxsize=2)
+def pushes_of_draw(n: int, draw: int, row: Row) -> LoggedPushes:
+    """Return the first n random pushes of a draw, as this row sees them."""
+    return collect(n, draw, row.view, block_cog=row.block_cog).pushes()
+
+
+@lru_cache(maxsize=DRAWS)
+def planner_of(row: Row, draw: int) -> PushPlanner:
+    """Fit a row's model to a draw of pushes, and return its planner."""
+    data = pushes_of_draw(row.n, draw, replace(row, model="", n=0, chain=0))
+    obj = replace(PushedObject.of(data), lengths_m=LENGTHS_M)
+    return PushPlanner(fit(data, row.model), obj, price=PRICE, rounds=ROUNDS, room_m=ROOM_M)
+
+
+def solve(row: str, block: int) -> dict[str, Any]:
+    """Solve the initial states of a block."""
+    about, first = ROWS[row], FIRST_START + block * OF_BLOCK
+    table = Table(about.view, block_cog=about.block_cog)
+    if row == "nothing":
+        runs = []
+        for seed in range(first, first + OF_BLOCK):
+            table.reset(seed)
+            runs.append({"seed": seed, "pushes": 0, "plan_s": 0.0})
+            runs[-1] |= {f"steps_{rule}": steps for rule, steps in table.solved.items()}
+        return {"runs": runs}
+    planner = planner_of(about, block % DRAWS)
+    return {
+        "runs": [attempt(table, planner, about.chain, s) for s in range(first, first + OF_BLOCK)]
+    }
+
+
+def errors(row: str, draw: int) -> dict[str, Any]:
+    """Return the errors of a row's model at 400 new pushes of the next draw, and its times."""
+    about, began = ROWS[row], time.process_time()
+    pushes = collect(about.n, draw, about.view, block_cog=about.block_cog).pushes()
+    collected = time.process_time()
+    model = fit(pushes, about.model)
+    fitted, table = time.process_time(), Table(about.view, block_cog=about.block_cog)
+    obj = replace(PushedObject.of(pushes), lengths_m=LENGTHS_M)
+    planner = PushPlanner(model, obj, price=PRICE, rounds=ROUNDS, room_m=ROOM_M)
+    attempt(table, planner, about.chain, FIRST_CHOICE)
+    solved = time.process_time()
+    new = collect(400, DRAWS + draw, about.view, block_cog=about.block_cog).pushes()
+    found = forecast_errors(model, new)
+    spent = {"collect_s": collected - began, "fit_s": fitted - collected, "first_s": solved - began}
+    columns = ("position_m", "yaw_rad", "inside_50", "inside_90")
+    return {"errors": {name: found[name].tolist() for name in columns}, "spent": spent}
+
+
+def job(row: str, block: int | None = None, draw: int | None = None) -> Job:
+    """Return the job of a block of initial states, or of the errors for a draw of pushes."""
+    settings = ROWS[row], PRICE, ROUNDS, LENGTHS_M, FIRST_START, OF_BLOCK
+    checkpoints = (PRETRAINED,) if ROWS[row].model == "np" else ()
+    part = {"block": block} if draw is None else {"draw": draw}
+    function = solve if draw is None else errors
+    return Job(function, {"row": row} | part, settings, checkpoints=checkpoints)
+
+
+def tables(folder: str = FOLDER) -> dict[str, Rows]:
+    """Return the shares of solved states by row, rule and limit, and the models' errors."""
+    results = read(TABLE, job, folder)
+    runs = frame([(about, r) for about, r in results if "runs" in r], "runs")
+    solved, predicted = [], []
+    for row, part in runs.groupby("row"):
+        for rule in "ab":
+            steps = part[f"steps_{rule}"].astype(float).fillna(math.inf)
+            about = {
+                "row": row,
+                "rule": rule,
+                "n": len(part),
+                "draws": part["block"].mod(DRAWS).nunique(),
+            }
+            for limit in LIMITS:
+                k = int((steps <= limit).sum())
+                ends = binomtest(k, len(part)).proportion_ci(method="wilson")
+                shares = zip(
+                    ("share", "low", "high"), (k / len(part), ends.low, ends.high), strict=True
+                )
+                about |= {f"{name}_{limit}_percent": 100 * value for name, value in shares}
+            median = float(steps.median())
+            about["steps_median"] = median if math.isfinite(median) else None
+            solved.append(
+                about | {"pushes_mean": part["pushes"].mean(), "plan_mean_s": part["plan_s"].mean()}
+            )
+    spent = [about | r["spent"] for about, r in results if "spent" in r]
+    every = frame([(about, r) for about, r in results if "errors" in r], "errors")
+    for row, part in every.groupby("row") if len(every) else ():
+        about = {"row": row, "n": len(part), "draws": part["draw"].nunique()}
+        for name in ("position_m", "yaw_rad"):
+            what, unit = name.split("_")
+            about |= {
+                f"{what}_{q}_{unit}": part[name].quantile(at)
+                for q, at in (("median", 0.5), ("p95", 0.95))
+            }
+        about |= {f"coverage_{p}": part[f"inside_{p}"].mean() for p in (50, 90)}
+        of_row = [one for one in spent if one["row"] == row]
+        about |= {
+            f"{n}_mean_s": float(np.mean([one[f"{n}_s"] for one in of_row]))
+            for n in ("collect", "fit", "first")
+        }
+        predicted.append(about)
+    order = list(ROWS)
+    key = lambda each: order.index(each["row"])  # noqa: E731
+    return {"solved": sorted(solved, key=key), "errors": sorted(predicted, key=key)}
+
+
+@command(OSError, ValueError, ModuleNotFoundError)
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run missing jobs and make the tables."""
+    options = runner.parser(TABLE, __doc__.splitlines()[0]).parse_args(argv)
+    jobs = [job(row, block=block) for row in ROWS for block in range(BLOCKS)]
+    jobs += [job(row, draw=draw) for row in ROWS if ROWS[row].chain == 3 for draw in range(DRAWS)]
+    return runner.make(jobs, TABLE, options, tables)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
