@@ -45,9 +45,9 @@ CLEAR_M = 0.004
 """Distance [m] between tool and outline on the tool's way; half of it must remain."""
 TURN_PRICE_M = 0.03
 """Length [m] that the tool rather goes than turn once more on its way."""
-KEPT = 4
+KEPT = 3
 """Number of chains of each length that are refined."""
-_NEIGHBOURS = 30
+_NEIGHBOURS, _PAIRS = 30, 2000
 _BEFORE = 1 / math.cos(MOST_INCIDENCE_RAD)
 """Distance before the contact at which the tool stops, in `CLEAR_M`, even for an oblique push."""
 _SHIFT, _LARGEST_STEP, _DAMPING_M = 0.01, 0.5, 0.0003
@@ -194,14 +194,16 @@ class PushPlanner:
             return [(math.sqrt(cost[k]), *self._chain(chains[k])) for k in order]
 
         found = best(np.arange(n)[:, None], effect)
-        if n_pushes > 1:
-            found += best(self._pairs, self._ends)
+        if n_pushes > 1 and weights[2] not in self._trees:
+            self._trees[weights[2]] = cKDTree(weights * self._ends)
+        tree = self._trees.get(weights[2])
+        if n_pushes > 1:  # a chain that is refined need not be the very best
+            near = tree.query(weights * target, _PAIRS)[1] if self.rounds else slice(None)
+            found += best(self._pairs[near], self._ends[near])
         if n_pushes == 3:
-            if weights[2] not in self._trees:
-                self._trees[weights[2]] = cKDTree(weights * self._ends)
             left = target - effect
             left[:, :2] = _turned(left[:, :2], -effect[:, 2])
-            near = self._trees[weights[2]].query(weights * left, _NEIGHBOURS)[1].ravel()
+            near = tree.query(weights * left, _NEIGHBOURS)[1].ravel()
             chains = np.column_stack([np.repeat(np.arange(n), _NEIGHBOURS), self._pairs[near]])
             found += best(chains, _after(effect[chains[:, 0]], self._ends[near]))
         if self.rounds:
@@ -323,7 +325,8 @@ class PushPlanner:
         off = ends - turns[:, None]
         length = np.linalg.norm(off, axis=-1) + TURN_PRICE_M
         pairs = np.broadcast_to(turns[:, None], off.shape).reshape(-1, 2), np.tile(ends, (9, 1))
-        gap = _gaps(outline_m, *pairs).reshape(length.shape)
+        gap, nearest = _gaps(outline_m, *pairs).reshape(length.shape), _nearest(outline_m, ends)[0]
+        gap = np.minimum(gap, np.minimum(nearest, nearest[:9, None]))
         length[gap < radius_m + CLEAR_M / 2] = np.inf
         from_start, before = dijkstra(length[:, :9], indices=0, return_predecessors=True)
         total = from_start[:, None] + length[:, 9:]
@@ -372,14 +375,12 @@ def _after(pose: np.ndarray, effect: np.ndarray) -> np.ndarray:
 
 
 def _gaps(outline_m: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Distances (n,) of segments from an outline, at most 0 where they touch or are inside."""
+    """Distances (n,) of an outline's corners from segments; 0 where a segment crosses an edge."""
     edges, along = np.roll(outline_m, -1, axis=0) - outline_m, end - start
-    gap = np.minimum(*(_nearest(outline_m, points)[0] for points in (start, end)))
     off = outline_m - start[:, None]
     share = (off * along[:, None]).sum(axis=-1) / np.maximum((along**2).sum(axis=1), 1e-18)[:, None]
     beside = off - np.clip(share, 0, 1)[..., None] * along[:, None]
     side = cross(along[:, None], off)
     parts = side * np.roll(side, -1, axis=1) < 0
     parts &= cross(edges, -off) * cross(edges, end[:, None] - outline_m) < 0
-    gap = np.minimum(gap, np.linalg.norm(beside, axis=-1).min(axis=1))
-    return np.where(parts.any(axis=1), 0.0, gap)
+    return np.where(parts.any(axis=1), 0.0, np.linalg.norm(beside, axis=-1).min(axis=1))
