@@ -14,6 +14,7 @@ DRY_RUN =
 WORKERS = 2
 JOBS    = 2
 INDEX   =
+PUSHT   =
 
 PY     := .venv/bin/python
 STAMP  := .venv/.installed
@@ -38,6 +39,7 @@ export PROFILE SEED WORKERS OUT ONLY ARGS FORCE JOBS INDEX
 override FORCE   := $(call yes,$(FORCE))
 override KEEP    := $(call yes,$(KEEP))
 override DRY_RUN := $(call yes,$(DRY_RUN))
+override PUSHT   := $(call yes,$(PUSHT))
 export PYTHONUTF8 := 1
 # OpenMP's idle threads spin for milliseconds, which makes PyTorch seven times slower beside other
 # work. A tenth of that costs a fifth of the speed of a machine that has nothing else to do.
@@ -53,7 +55,8 @@ unexport PYTEST_ADDOPTS JUPYTER_PATH JUPYTER_TOKEN
 help: ## List the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
-setup: $(STAMP) ## Make .venv and install everything into it (PYTHON=python3.11)
+setup: $(STAMP) ## Make .venv and install everything into it (PYTHON=python3.11 PUSHT=1)
+	@$(if $(PUSHT),$(if $(shell grep -s '^uv = ' .venv/pyvenv.cfg),uv pip,$(PY) -m pip) install --quiet $(if $(INDEX),--extra-index-url "$$INDEX") -c constraints.txt -r requirements-pusht.txt)
 	@echo "The environment is ready: .venv"
 
 # The stamp is written last and holds the folder. Without it (never finished) or with another

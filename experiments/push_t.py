@@ -1,8 +1,9 @@
 """The T of the field (Push-T, `gym-pusht`), solved from a log of random pushes.
 
-    python -m experiments.push_t [--only row=gp_200 block=0,1]
+    python -m experiments.push_t [--only row=gp_200 block=0,1] [--stored]
 
-needs `requirements-pusht.txt`. The environment is used as published: targets of its agent, a disc,
+needs `requirements-pusht.txt`. `--stored` writes what page 10 shows: 200 pushes, one run, its film.
+The environment is used as published: targets of its agent, a disc,
 in [0, 512]², ten a second, 300 of them at most. One pixel counts as one millimetre.
 
 Protocol. 300 initial states: those of `reset(seed)` for 300 seeds from `FIRST_START`, of which none
@@ -14,14 +15,18 @@ rounds, lengths, features of the Gaussian process) was chosen on the seeds from 
 
 from __future__ import annotations
 
+import json
 import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
+from PIL import Image, ImageDraw
 from scipy.optimize import least_squares
 from scipy.special import expit
 from scipy.stats import binomtest
@@ -33,12 +38,16 @@ from affordlib.logs.fit import Forecast
 from affordlib.logs.log import _nearest, centred
 from affordlib.logs.neural_process import PRETRAINED
 from affordlib.logs.planning import primitive_of
+from affordlib.paths import repo_root
+from affordlib.results import write_atomically
+from affordlib.show import GOAL as GOAL_COLOUR
+from affordlib.show import NEUTRAL
 from affordlib.types import Goal, UnreachableError
 from experiments import runner
 from experiments.commands import command
 from experiments.runner import FOLDER, Job, Rows, frame, read
 
-TABLE = "push_t"
+TABLE, STORED = "push_t", repo_root() / "data" / "push_t"
 T_PX = ((-60, 0), (60, 0), (60, 30), (15, 30), (15, 120), (-15, 120), (-15, 30), (-60, 30))
 AGENT_PX, GOAL = 15.0, (256.0, 256.0, math.pi / 4)
 ROOM_M = ((0.0, 0.0), (0.512, 0.512))
@@ -73,14 +82,14 @@ def motion() -> tuple[np.ndarray, np.ndarray]:
 def targets_to(point: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Targets (n, 2) that bring the agent from rest at one point to rest at another, in a line.
 
-    Two suffice, if they lie inside the environment's range; with more, the least of them is chosen.
+    Two suffice, if they lie inside the environment's range. Where up to eight do not, the point is
+    the target eight times, and the agent comes to within 2 px of it.
     """
     a, b = motion()
     for n in range(2, 9):
         effects = np.column_stack([np.linalg.matrix_power(a, n - 1 - k) @ b for k in range(n)])
         shares = np.linalg.pinv(effects) @ np.array([1.0, 0.0])  # of the way, by each target
         targets = at + shares[:, None] * (point - at)
-        # Targets are relative to a rest at `at`: A (at, 0) + B at = (at, 0).
         if (targets >= 0).all() and (targets <= 512).all():
             return targets
     return np.tile(np.clip(point, 0, 512), (8, 1))
@@ -103,7 +112,8 @@ class Table:
         self.seen, info = self.env.reset(seed=seed)
         self.steps, self.rests, self.solved = 0, 0, dict.fromkeys("ab")
         self.truth, self.done = info["block_pose"], False
-        self.agent = self.look()[0]
+        self.history = [(info["pos_agent"].tolist(), self.truth.tolist())]
+        self.look()
         while self.steps < MOST_STEPS:
             before = self.truth
             self.act(self.agent)
@@ -113,8 +123,10 @@ class Table:
     def look(self) -> tuple[np.ndarray, tuple[float, float, float]]:
         """Return the agent's position (2,) and the pose of the T, in pixels and radians."""
         if self.view == "state":
-            return self.seen[:2], (*self.seen[2:4].tolist(), wrap_angle(float(self.seen[4])))
-        return read_picture(self.seen)
+            self.agent, pose = self.seen[:2], self.seen[2:].tolist()
+        else:
+            self.agent, pose = read_picture(self.seen)
+        return self.agent, (*pose[:2], wrap_angle(pose[2]))
 
     def act(self, target: np.ndarray) -> None:
         """Make one step of the environment, and note whether it is solved."""
@@ -125,6 +137,7 @@ class Table:
         moved = np.abs(info["block_pose"] - self.truth).max()
         self.rests = self.rests + 1 if near and moved < REST_PX else 0
         self.truth = info["block_pose"]
+        self.history.append((info["pos_agent"].tolist(), self.truth.tolist()))
         for rule, met in (("a", done), ("b", self.rests >= 3)):
             if met and self.solved[rule] is None:
                 self.solved[rule] = self.steps
@@ -156,18 +169,17 @@ def metres(log: Log, seen: tuple) -> tuple[tuple[float, float], tuple[float, flo
     return tuple((1e-3 * seen[0]).tolist()), log.centroid_pose(seen[1])
 
 
-def collect(n: int, draw: int, view: str = "state", **of_block: Any) -> Log:
-    """Return a log of n random pushes of the T; the agent goes around it in between."""
-    log, table = log_of_t(), Table(view, **of_block)
+def collect(n: int, draw: int, view: str = "state", **of_block: Any) -> list[dict[str, Any]]:
+    """Return n random pushes as arguments of `Log.add`; the agent goes around the T in between."""
+    log, table, found = log_of_t(), Table(view, **of_block), []
     rng, seed = np.random.default_rng(FIRST_DRAW + draw), FIRST_DRAW + 1000 * draw
     of_t = PushedObject(1e-3 * np.array(T_PX), 1e-3 * AGENT_PX, LENGTHS_M)
     planner = PushPlanner(Nothing(), of_t, room_m=ROOM_M)
     table.reset(seed)
-    while len(log) < n:
+    while len(found) < n:
         seen = table.look()
         tool, pose = metres(log, seen)
         middle = 1e3 * np.array(pose[:2])
-        table.agent = seen[0]
         planner.library = of_t.draw(64, rng)
         can = np.flatnonzero(~planner.shut(pose, tool))
         away = (middle < MIDDLE_PX[0]).any() or (middle > MIDDLE_PX[1]).any()
@@ -179,13 +191,18 @@ def collect(n: int, draw: int, view: str = "state", **of_block: Any) -> Log:
         way = 1e3 * planner.way(pose, tool, push)
         table.go(way[:-1])
         before = table.look()
-        table.agent = before[0]
         path = table.go(way[-1:])
         after = table.look()
-        log.add_all(
-            [{"tool_t": np.arange(len(path)), "tool_xy": path, "poses": (before[1], after[1])}]
-        )
-    return log
+        push = {"tool_t": np.arange(len(path)), "tool_xy": path, "poses": (before[1], after[1])}
+        found += [push] if not log.add_all([push]) else []
+    return found
+
+
+def logged(pushes: Sequence[dict[str, Any]]) -> LoggedPushes:
+    """Read pushes of the T through `Log`."""
+    log = log_of_t()
+    log.add_all(pushes)
+    return log.pushes()
 
 
 def attempt(table: Table, planner: PushPlanner, n_pushes: int, seed: int) -> dict[str, Any]:
@@ -199,7 +216,6 @@ def attempt(table: Table, planner: PushPlanner, n_pushes: int, seed: int) -> dic
             table.act(table.agent)
             continue
         seen = table.look()
-        table.agent = seen[0]
         tool, pose = metres(log, seen)
         wanted = Goal(goal[:2], turn_rad=wrap_angle(goal[2] - pose[2]))
         began = time.process_time()
@@ -294,7 +310,7 @@ ROWS = {
 @lru_cache(maxsize=2)
 def pushes_of_draw(n: int, draw: int, row: Row) -> LoggedPushes:
     """Return the first n random pushes of a draw, as this row sees them."""
-    return collect(n, draw, row.view, block_cog=row.block_cog).pushes()
+    return logged(collect(n, draw, row.view, block_cog=row.block_cog))
 
 
 @lru_cache(maxsize=DRAWS)
@@ -325,7 +341,7 @@ def solve(row: str, block: int) -> dict[str, Any]:
 def errors(row: str, draw: int) -> dict[str, Any]:
     """Return the errors of a row's model at 400 new pushes of the next draw, and its times."""
     about, began = ROWS[row], time.process_time()
-    pushes = collect(about.n, draw, about.view, block_cog=about.block_cog).pushes()
+    pushes = logged(collect(about.n, draw, about.view, block_cog=about.block_cog))
     collected = time.process_time()
     model = fit(pushes, about.model)
     fitted, table = time.process_time(), Table(about.view, block_cog=about.block_cog)
@@ -333,7 +349,7 @@ def errors(row: str, draw: int) -> dict[str, Any]:
     planner = PushPlanner(model, obj, price=PRICE, rounds=ROUNDS, room_m=ROOM_M)
     attempt(table, planner, about.chain, FIRST_CHOICE)
     solved = time.process_time()
-    new = collect(400, DRAWS + draw, about.view, block_cog=about.block_cog).pushes()
+    new = logged(collect(400, DRAWS + draw, about.view, block_cog=about.block_cog))
     found = forecast_errors(model, new)
     spent = {"collect_s": collected - began, "fit_s": fitted - collected, "first_s": solved - began}
     columns = ("position_m", "yaw_rad", "inside_50", "inside_90")
@@ -397,10 +413,52 @@ def tables(folder: str = FOLDER) -> dict[str, Rows]:
     return {"solved": sorted(solved, key=key), "errors": sorted(predicted, key=key)}
 
 
+def film(history: Sequence[Any], path: Path, size: int = 320) -> None:
+    """Write a run as an animation, ten frames a second as in the environment."""
+    frames, scale = [], 2 * size / 512
+    for agent, pose in [*history, *history[-1:] * 8]:
+        frame = Image.new("RGB", (2 * size, 2 * size), "white")
+        draw = ImageDraw.Draw(frame)
+        for at, colour in ((GOAL, GOAL_COLOUR), (pose, NEUTRAL)):
+            corners = scale * (rotated(np.array(T_PX, dtype=float), at[2]) + np.array(at[:2]))
+            draw.polygon(
+                [*map(tuple, corners)], fill=colour if at is pose else None, outline=colour, width=6
+            )
+        (x, y), radius = scale * np.array(agent), scale * AGENT_PX
+        draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill="black")
+        frames.append(frame.resize((size, size)).quantize(16))
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=100, loop=0)
+
+
+def store(n: int = 200) -> None:
+    """Write the pushes and the run of page 10, and the run's film."""
+    pushes, rows = collect(n, 0), []
+    for number, push in enumerate(pushes):
+        poses = np.full((len(push["tool_t"]), 3), np.nan)
+        poses[[0, -1]] = push["poses"]
+        each = np.column_stack([push["tool_t"] / 10, push["tool_xy"], poses])
+        table = pd.DataFrame(each, columns=["t", "tool_x", "tool_y", "x", "y", "yaw"])
+        rows.append(table.assign(push=number))
+    STORED.mkdir(exist_ok=True)
+    pd.concat(rows).round(4).to_csv(STORED / "pushes.csv.xz", index=False)
+    table = Table()
+    attempt(table, planner_of(ROWS["gp_200"], 0), 3, FIRST_CHOICE + 7)
+    history = [
+        [[round(v, 2) for v in agent], [round(v, 4) for v in pose]] for agent, pose in table.history
+    ]
+    write_atomically(STORED / "run.json", json.dumps({"steps": history, "solved": table.solved}))
+    film(history, repo_root() / "figures" / "push_t.gif")
+
+
 @command(OSError, ValueError, ModuleNotFoundError)
 def main(argv: Sequence[str] | None = None) -> int:
     """Run missing jobs and make the tables."""
-    options = runner.parser(TABLE, __doc__.splitlines()[0]).parse_args(argv)
+    parser = runner.parser(TABLE, __doc__.splitlines()[0])
+    parser.add_argument("--stored", action="store_true", help="write what page 10 shows")
+    options = parser.parse_args(argv)
+    if options.stored:
+        store()
+        return 0
     jobs = [job(row, block=block) for row in ROWS for block in range(BLOCKS)]
     jobs += [job(row, draw=draw) for row in ROWS if ROWS[row].chain == 3 for draw in range(DRAWS)]
     return runner.make(jobs, TABLE, options, tables)

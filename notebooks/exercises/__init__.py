@@ -2,7 +2,7 @@
 
 An exercise asks for a number or a function. `check("01.1", mine)` measures what it is worth and
 shows that figure beside the expected one. The exercises stand by the parts of the book: the world
-(01, 02), the models (03 to 05), planning and beyond (00, 06 to 08), a log of one's own (09),
+(01, 02), the models (03 to 05), planning and beyond (00, 06 to 08), a log of one's own (09, 10),
 storage (A5).
 """
 

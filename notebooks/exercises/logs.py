@@ -1,4 +1,4 @@
-"""Exercises of notebook 09: the effect of a push, and mirrored pushes."""
+"""Exercises of notebooks 09 and 10: the effect of a push, mirrored pushes, and where to begin."""
 
 from __future__ import annotations
 
@@ -37,6 +37,19 @@ def _mirror_error(mirrored: Callable[..., Any]) -> float:
     return worst
 
 
+def _standoff_error(standoff: Callable[..., Any]) -> float:
+    """How far [mm] from the right point, at worst: at the distance, and on the line of the push."""
+    rng, worst = np.random.default_rng(0), 0.0
+    for _ in range(20):
+        contact, facing, aside = rng.normal(scale=0.1, size=2), *rng.uniform(-1, 1, 2)
+        radius, clear = rng.uniform(0.001, 0.02, 2)
+        normal, direction = unit_vector(np.pi * facing), unit_vector(np.pi * facing + 0.8 * aside)
+        truth = contact - radius * normal - clear / (normal @ direction) * direction
+        got = asked(standoff, contact, normal, direction, radius, clear)
+        worst = max(worst, float(np.abs(got - truth).max()))
+    return 1000 * worst
+
+
 LOGS: dict[str, Exercise] = {
     "09.1": Exercise(
         "Write effect(before, after, centroid, heading): ahead, left and turn of a push.",
@@ -51,5 +64,12 @@ LOGS: dict[str, Exercise] = {
         expected=0.0,
         within=1e-6,
         unit="largest error",
+    ),
+    "10.1": Exercise(
+        "Write standoff(contact, normal, direction, radius, clear): the tool's centre, (x, y).",
+        _standoff_error,
+        expected=0.0,
+        within=0.001,
+        unit="mm, largest error",
     ),
 }

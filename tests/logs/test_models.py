@@ -1,6 +1,7 @@
 """Physics of a quasi-static push, and the neural process pretrained on it."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -209,6 +210,19 @@ def test_cross_validation_leaves_the_number_of_threads_alone(monkeypatch):
     torch.set_num_threads(2)
     cross_validate(log_of(rows[:16]), models=(), folds=2)
     assert torch.get_num_threads() == 2
+
+
+@pytest.mark.parametrize("name", ["gaussian_process", "rate_gp"])
+def test_sigma_grows_outside_the_log(name):
+    """Far contacts are unlike the log's; a push much longer than the log's is warned of."""
+    rows = simulate(1, torch.Generator().manual_seed(8))[0][0]
+    some = rows[rows[:, 0] > rows[:, 0].median()]
+    model = fit(log_of(some), name)
+    near, far = log_of(some), log_of(rows[rows[:, 0] < rows[:, 0].quantile(0.2)])
+    assert model.predict(far)[1].mean() > 1.5 * model.predict(near)[1].mean()
+    longer = replace(near, length_m=4 * near.length_m)
+    with pytest.warns(UserWarning, match=r"much longer than those of the log, at most .*widened"):
+        assert (model.predict(longer)[1] > 1.5 * model.predict(near)[1]).all()
 
 
 def test_the_mirrors_of_outlines():

@@ -1,5 +1,6 @@
 """Off-centre pushes of an object that is only seen."""
 
+import itertools
 import math
 
 import numpy as np
@@ -7,11 +8,12 @@ import pytest
 import torch
 
 from affordlib.geometry import cross, rotated, wrap_angle
-from affordlib.logs import PushedObject, plan_push_at
+from affordlib.logs import PushedObject, PushPlanner, plan_push_at
 from affordlib.logs.fit import in_object_frame, push_rows, told_feet
+from affordlib.logs.log import _nearest
 from affordlib.logs.neural_process import load_neural_process
 from affordlib.logs.planning import primitive_of
-from affordlib.types import Goal
+from affordlib.types import Goal, UnreachableError
 from affordlib.world import Cuboid, UprightCylinder
 from affordlib.world.robot import ROD_WIDTH_M
 from experiments.pose_goals import pursue
@@ -100,3 +102,81 @@ def test_what_no_object_has_is_refused(wrong, says):
         PushedObject(OUTLINE_M, **wrong)
     with pytest.raises(ValueError, match="n must be a whole number in"):
         PushedObject(OUTLINE_M).draw(10**9)
+
+
+T_M = 1e-3 * np.array(
+    [(-60, 0), (60, 0), (60, 30), (15, 30), (15, 120), (-15, 120), (-15, 30), (-60, 30)]
+)
+
+
+class Carried:
+    """The object moves as the tool does after contact, and turns a little."""
+
+    def predict(self, pushes):
+        moved = pushes.length_m[:, None] * pushes.direction
+        turn = 300 * cross(pushes.contact_m, moved)
+        return np.column_stack([moved, turn]), np.full((len(pushes), 3), 1e-4)
+
+
+def gap_m(points, pose, outline_m):
+    """The least distance of the tool's centre from an outline on a way (n, 2), finely sampled."""
+    fine = np.vstack([np.linspace(a, b, 60) for a, b in itertools.pairwise(points)])
+    return _nearest(outline_m, rotated(fine - pose[:2], -pose[2]))[0].min()
+
+
+def test_the_tool_goes_around_a_concave_object_without_contact():
+    obj, rng = PushedObject(T_M, 0.015), np.random.default_rng(0)
+    planner = PushPlanner(Carried(), obj, price=0.3, rounds=2)
+    for _ in range(20):
+        pose = (*rng.uniform(-0.1, 0.1, 2), rng.uniform(-3, 3))
+        angle = rng.uniform(-3, 3)
+        tool = tuple(np.add(pose[:2], 0.12 * np.array([math.cos(angle), math.sin(angle)])))
+        goal = Goal((0.0, 0.0), turn_rad=wrap_angle(-pose[2]))
+        push = planner.plan(pose, goal, 3, tool).steps[0].primitive
+        way = planner.way(pose, tool, push)
+        assert gap_m([tool, *way[:-1]], pose, obj.outline_m) > 0.015
+        at_contact = rotated(np.array([push.contact]), -pose[2])
+        assert _nearest(obj.outline_m, at_contact)[0] == pytest.approx(0.015, abs=1e-5)
+
+
+def test_the_tool_retreats_from_the_outline_first():
+    obj, pose = PushedObject(T_M, 0.015), (0.0, 0.0, 0.0)
+    planner = PushPlanner(Carried(), obj)
+    bar = obj.outline_m[:, 1].min()
+    touching = (0.02, bar - 0.015)
+    push = planner.plan(pose, Goal((0.0, 0.1)), 1, touching).steps[0].primitive
+    first = planner.way(pose, touching, push)[0]
+    assert first[1] < touching[1] - 0.0039
+    assert abs(first[0] - touching[0]) < 1e-3
+
+
+def test_no_candidate_overlaps_the_object_and_walls_shut_pushes():
+    obj = PushedObject(T_M, 0.015)
+    pushes = obj.draw(400)
+    assert 300 < len(pushes) < 400
+    middle = pushes.contact_m - 0.015 * pushes.normal
+    assert _nearest(obj.outline_m, middle)[0].min() > 0.015 - 1e-6
+    room = (-0.2, -0.055), (0.2, 0.2)  # the bar lies along the wall
+    planner = PushPlanner(Carried(), obj, room_m=room)
+    shut = planner.shut((0.0, 0.0, 0.0), (0.15, 0.0))
+    from_below = planner.library.normal[:, 1] > 0.9
+    below = planner.library.contact_m[:, 1] < -0.04
+    assert shut[from_below & below].all()
+    assert not shut.all()
+    walled = PushPlanner(Carried(), obj, room_m=((-0.01, -0.01), (0.01, 0.01)))
+    with pytest.raises(UnreachableError, match="finds no way"):
+        walled.plan((0.0, 0.0, 0.0), Goal((0.1, 0.0)), 1, (0.15, 0.0))
+
+
+def test_refinement_reaches_the_goal_and_a_price_saves_pushes():
+    obj, goal = PushedObject(OUTLINE_M, TOOL_M), Goal((0.05, 0.02), turn_rad=0.2)
+    off, steps = [], []
+    for price, rounds in ((0.0, 0), (0.0, 4), (0.9, 4)):
+        planner = PushPlanner(Carried(), obj, price=price, rounds=rounds)
+        plan = planner.plan((0.0, 0.0, 0.0), goal)
+        end = plan.steps[-1]
+        off.append(math.hypot(plan.predicted_distance_m, 0.02 * (end.predicted_turn_rad - 0.2)))
+        steps.append(len(plan.steps))
+    assert off[1] < 2e-4
+    assert off[1] <= off[0] + 1e-6
+    assert steps[2] < steps[1]
