@@ -38,8 +38,7 @@ from affordlib.logs.fit import Forecast
 from affordlib.logs.log import _nearest, centred
 from affordlib.logs.neural_process import PRETRAINED
 from affordlib.logs.planning import primitive_of
-from affordlib.paths import repo_root
-from affordlib.results import write_atomically
+from affordlib.results import repo_root, write_atomically
 from affordlib.show import GOAL as GOAL_COLOUR
 from affordlib.show import NEUTRAL
 from affordlib.types import Goal, UnreachableError

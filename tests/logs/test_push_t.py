@@ -8,7 +8,7 @@ import pytest
 
 from affordlib.geometry import cross, wrap_angle
 from affordlib.logs.cross_validate import errors_of
-from affordlib.paths import repo_root
+from affordlib.results import repo_root
 from experiments.push_t import (
     FIRST_CHOICE,
     MOST_STEPS,
