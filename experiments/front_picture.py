@@ -30,7 +30,7 @@ FRAME_STEPS, COMES, LEAVES, FRAME_MS = 16, 12, 24, 40
 shown; time for which a frame is shown [ms]."""
 WIDTH, HEIGHT = 840, 660
 """Size of one of the two pictures, below its title [pixels]; pages show it at half of that."""
-VIEW = {"at_m": (-0.22, 0.0, 0.2), "distance_m": 1.55, "yaw_deg": 62.0, "pitch_deg": -28.0}
+VIEW = {"at_m": (-0.22, 0.0, 0.3), "distance_m": 1.4, "yaw_deg": 118.0, "pitch_deg": -23.0}
 GOAL_RGB = (0.0, 0.45, 0.70)
 FIGURES = repo_root() / "figures"
 

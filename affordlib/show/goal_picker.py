@@ -10,7 +10,7 @@ import itertools
 import math
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -29,8 +29,15 @@ from affordlib.show.executors import Executor, Stopped, closed_loop, measured, o
 from affordlib.show.picker_controls import LIMIT_M, PickerControls, outcome_in_words, plan_in_words
 from affordlib.show.plots import plot_footprint, plot_plan, plot_table
 from affordlib.show.scene import Scene
-from affordlib.show.table_data import TableView, object_data, plan_data, table_data
-from affordlib.types import Goal, Outcome, Plan, check_count, check_on_table
+from affordlib.show.table_data import (
+    TableView,
+    object_data,
+    obstacle_data,
+    obstacle_of,
+    plan_data,
+    table_data,
+)
+from affordlib.types import Goal, Obstacle, Outcome, Plan, check_count, check_on_table
 from affordlib.world import Cuboid, Tabletop
 from affordlib.world.trajectory import STEP_S
 
@@ -157,10 +164,14 @@ class GoalPicker(widgets.HBox):
         self._refuse_while_running()
         with self._alone:
             x, y, yaw = self._first_pose
-            self.world.place(self.world.obj, (x, y), yaw)
+            self.world.place(self.world.obj, (x, y), yaw, obstacles=self.world.obstacles.all)
             if self.scene is not None:
                 self.scene.place()
             self._make_plan()
+
+    def set_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
+        """Replace the obstacles, and replan; during a run, after this action."""
+        self._disturb(partial(self._set_obstacles, obstacles))
 
     def figure(self) -> Figure:
         """The table, object, goal and plan as a figure."""
@@ -191,7 +202,11 @@ class GoalPicker(widgets.HBox):
         def place(change):
             self._follow(replace(self.goal, xy_m=_whole_mm(change["new"][:2])))
 
+        def change(change):
+            self._soon(partial(self.set_obstacles, [obstacle_of(one) for one in change["new"]]))
+
         self._view.observe(place, names="wanted")
+        self._view.observe(change, names="obstacles")
         presses = {"run": self._run_in_background, "stop": self.stop}
         self._view.on_msg(lambda _, message, __: presses[message["press"]]())
         controls.planner.observe(lambda _: self._follow(self.goal), names="value")
@@ -265,7 +280,8 @@ class GoalPicker(widgets.HBox):
             goal, number, plan = self.goal, self._view.wanted[2], None
             self._put_down()
             try:
-                problem = self.skills.problem(self.world.depth_image(), self._pose[:2], goal)
+                seen = self.world.depth_image(), self._pose[:2]
+                problem = self.skills.problem(*seen, goal, obstacles=self.world.obstacles.all)
                 plan = self._planner()(problem)
                 self.controls.say(f"{self._news} {plan_in_words(plan)}")
                 self._news = ""
@@ -454,6 +470,14 @@ class GoalPicker(widgets.HBox):
         self._set_goal(replace(self.goal, xy_m=_whole_mm(before + by)))
         self._marks.append([before, self.goal.xy_m])
         self._news += f" The goal was moved by {1000 * np.hypot(*by):.0f} mm."
+
+    def _set_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
+        try:
+            self.world.set_obstacles(obstacles)
+            self._stale = True
+        finally:
+            with self._view.hold_trait_notifications():
+                self._view.obstacles = [obstacle_data(one) for one in self.world.obstacles.all]
 
     def _displacement(self, xy_m: tuple[float, float], least_m: float, most_m: float) -> np.ndarray:
         """A random displacement (2,) [m], reversed where it would leave the shown area."""

@@ -12,10 +12,11 @@ const NEAR_ENOUGH = 0.0003; // [m]
 const SPREAD = 1.2; // of the first directions around the goal's [rad]
 const ACTION_COST = 0.0005; // [m]
 const LOYALTY = 0.001; // advantage of the plan that is shown, so that it does not jump [m]
-const PATH_SAMPLES = 25;
+const PATH_SAMPLES = 41;
 const NEARBY = 0.02; // difference of directions for the slope of an effect [rad]
-const MARGIN = 0.01; // between object and obstacles [m]
-const HAND_RADIUS = 0.02;
+const [START, MARGIN, FULL_AT] = [0.001, 0.004, 0.02]; // as in Python's FreeSpace [m]
+const POSES = 7; // for which the way is checked
+const FAR = 0.01; // gaps above this are not distinguished [m]
 const ENLARGED = 20; // radius of the drawn disc, in σ
 const EXTENT = 0.4; // half width of the largest view [m]
 const LIMIT = 0.35; // largest coordinate of a goal [m]
@@ -62,18 +63,6 @@ export class EffectMap {
       this.fine.set(rotated(effect, direction), 2 * i);
       this.reach = Math.max(this.reach, Math.hypot(effect[0], effect[1]));
     }
-    this.buckets = { true: this.sorted(0, 1), false: this.sorted(FINE_PHASES - 1, FINE_PHASES) };
-  }
-
-  // Actions by the square of the table, beside the object, in which they end.
-  sorted(first, step) {
-    const squares = new Map();
-    for (let i = first; i < FINE_DIRECTIONS * FINE_PHASES; i += step) {
-      const key = square(this.fine[2 * i]) * 1000 + square(this.fine[2 * i + 1]);
-      if (!squares.has(key)) squares.set(key, []);
-      squares.get(key).push(i);
-    }
-    return squares;
   }
 
   action(i) {
@@ -101,30 +90,16 @@ export class EffectMap {
 
   // The action that ends nearest to a place beside the object.
   nearest(x, y, partial) {
-    const squares = this.buckets[Boolean(partial)];
-    // What lies beyond the reach is looked for from its edge, where what is nearest nearly is.
-    const inwards = Math.min(1, this.reach / Math.max(Math.hypot(x, y), 1e-9));
-    const [u, v] = [square(x * inwards), square(y * inwards)];
-    let [best, least] = [FINE_PHASES - 1, Infinity];
-    for (let ring = 0; ring * SQUARE < least + SQUARE && ring < 40; ring++) {
-      for (let i = -ring; i <= ring; i++) {
-        const step = Math.abs(i) === ring ? 1 : Math.max(1, 2 * ring);
-        for (let j = -ring; j <= ring; j += step) {
-          const there = squares.get((u + i) * 1000 + v + j) ?? [];
-          for (const one of there) {
-            const far = Math.hypot(this.fine[2 * one] - x, this.fine[2 * one + 1] - y);
-            if (far < least) [best, least] = [one, far];
-          }
-        }
-      }
-      if (inwards < 1 && least < Infinity && ring > 1) break;
+    const [first, step] = partial ? [0, 1] : [FINE_PHASES - 1, FINE_PHASES];
+    let [best, least] = [first, Infinity];
+    for (let i = first; i < FINE_DIRECTIONS * FINE_PHASES; i += step) {
+      const far = (this.fine[2 * i] - x) ** 2 + (this.fine[2 * i + 1] - y) ** 2;
+      if (far < least) [best, least] = [i, far];
     }
     return this.action(best);
   }
 }
 
-const SQUARE = 0.01;
-const square = (value) => Math.floor(value / SQUARE);
 const ROW = new Float64Array(4);
 const COLUMN = new Float64Array(4);
 const EFFECT = new Float64Array(6);
@@ -201,58 +176,94 @@ export function reachability({ layers, primitives, threshold }, primitive) {
   };
 }
 
-function toEdge([px, py], [ax, ay], [bx, by]) {
-  const [dx, dy] = [bx - ax, by - ay];
-  const t = between(0, ((px - ax) * dx + (py - ay) * dy) / (dx * dx + dy * dy || 1), 1);
-  return Math.hypot(px - ax - t * dx, py - ay - t * dy);
-}
+// Corners of an obstacle {corners, radius, height}, a disc as the polygon around it.
+const cornersOf = ({ corners, radius }) =>
+  radius ? RING.map(([x, y]) => [corners[0][0] + radius * x, corners[0][1] + radius * y]) : corners;
 
-// Distance of a point from a convex polygon (counter-clockwise), 0 inside.
-function toPolygon(point, corners) {
-  let [least, inside] = [Infinity, true];
-  corners.forEach((a, k) => {
-    const b = corners[(k + 1) % corners.length];
-    inside &&= (b[0] - a[0]) * (point[1] - a[1]) >= (b[1] - a[1]) * (point[0] - a[0]);
-    least = Math.min(least, toEdge(point, a, b));
+const SIDES = 16;
+const RING = Array.from({ length: SIDES }, (_, k) => rotated([1 / Math.cos(Math.PI / SIDES), 0], (k * TURN) / SIDES));
+
+function normals(corners) {
+  return corners.map(([ax, ay], k) => {
+    const [bx, by] = corners[(k + 1) % corners.length];
+    const long = Math.hypot(bx - ax, by - ay) || 1;
+    return [(by - ay) / long, (ax - bx) / long];
   });
-  return inside ? 0 : least;
 }
 
-// A lower bound of the distance between two convex polygons, from their edges' normals.
-function apart(one, other) {
+// Gap between an obstacle and what a shape sweeps between two poses, as in Python's FreeSpace: the
+// largest separation along the normals of all; negative where they overlap, at most about FAR.
+function gap(obstacle, sides, one, other) {
   let most = -Infinity;
-  for (const [these, those] of [[one, other], [other, one]]) {
-    these.forEach(([ax, ay], k) => {
-      const [bx, by] = these[(k + 1) % these.length];
-      const long = Math.hypot(bx - ax, by - ay) || 1;
-      const [nx, ny] = [(by - ay) / long, (ax - bx) / long]; // outwards
-      most = Math.max(most, Math.min(...those.map(([x, y]) => (x - ax) * nx + (y - ay) * ny)));
-    });
+  const along = (x, y, these, those) => {
+    let [low, high] = [Infinity, -Infinity];
+    for (const [u, v] of those) low = Math.min(low, u * x + v * y);
+    for (const [u, v] of these) high = Math.max(high, u * x + v * y);
+    most = Math.max(most, low - high);
+    return most > FAR;
+  };
+  const hull = [...one, ...other];
+  let [dx, dy] = [0, 0];
+  for (let k = 0; k < one.length; k++) [dx, dy] = [dx + other[k][0] - one[k][0], dy + other[k][1] - one[k][1]];
+  const long = Math.hypot(dx, dy);
+  if (long > 1e-12 && along(-dy / long, dx / long, hull, obstacle)) return most;
+  if (long > 1e-12 && along(dy / long, -dx / long, hull, obstacle)) return most;
+  for (const [x, y] of sides) if (along(x, y, obstacle, hull)) return most;
+  for (const shape of [one, other]) {
+    for (const [x, y] of normals(shape)) if (along(x, y, hull, obstacle)) return most;
   }
   return most;
 }
 
-// obstacles: {discs: [[x, y, radius, height], …], polygons: [[corners, height], …]}, convex.
-export function isFree(corners, { discs = [], polygons = [] }, margin = MARGIN) {
-  return (
-    discs.every(([x, y, radius]) => toPolygon([x, y], corners) > radius + margin) &&
-    polygons.every(([others]) => apart(corners, others) > margin)
-  );
+// What all actions of a plan have in common: obstacles, outline, and the margin at its start.
+function spaceOf({ object, pose, obstacles }) {
+  const known = obstacles.map((one) => {
+    const corners = cornersOf(one);
+    const middle = middleOf({ corners });
+    return { corners, sides: normals(corners), middle, size: farthest(corners, middle) };
+  });
+  const outline = object.seen ?? object.outline;
+  const here = placed(outline, pose);
+  const least = Math.min(START, ...known.map((one) => gap(one.corners, one.sides, here, here)));
+  return { known, outline, least, size: farthest(outline, [0, 0]) };
 }
 
-function handIsFree(point, { discs = [], polygons = [] }) {
-  return (
-    discs.every(([x, y, radius]) => Math.hypot(point[0] - x, point[1] - y) > radius + HAND_RADIUS) &&
-    polygons.every(([corners]) => toPolygon(point, corners) > HAND_RADIUS)
-  );
-}
+const farthest = (corners, [x, y]) => Math.max(...corners.map(([u, v]) => Math.hypot(u - x, v - y)));
 
-const noObstacles = ({ discs = [], polygons = [] } = {}) => !discs.length && !polygons.length;
+// Smallest gap minus margin of an action; the margin grows with the distance from the plan's start.
+export function spare(problem, from, direction, stop, turned) {
+  const { object, pose } = problem;
+  const { known, outline, least, size: radius } = problem.space ?? spaceOf(problem);
+  const path = pathOf(object.map, from, direction, stop, turned, POSES);
+  const { size, grip } = object.hand;
+  const box = [[1, 1], [-1, 1], [-1, -1], [1, -1]].map(([x, y]) => [x * size[0], y * size[1]]);
+  const hands = grip === null
+    ? [0, stop].map((phase) => {
+        const [dx, dy] = rotated([handAt(object.hand, phase).along, 0], direction);
+        return [from[0] + dx, from[1] + dy, direction];
+      })
+    : [path[0], path[POSES - 1]].map(([x, y]) => [x, y, grip + turned]);
+  const sweeps = path.map((at, k) => [outline, radius, at, path[Math.min(k + 1, POSES - 1)], at]);
+  sweeps.unshift([box, Math.hypot(...size), ...hands, path[0]]);
+  let worst = Infinity;
+  for (const [shape, long, a, b, at] of sweeps) {
+    const margin = least + (MARGIN - least) * Math.min(Math.hypot(at[0] - pose[0], at[1] - pose[1]) / FULL_AT, 1);
+    const reach = long + Math.hypot(b[0] - a[0], b[1] - a[1]) / 2;
+    for (const { corners, sides, middle, size: other } of known) {
+      const away = Math.hypot((a[0] + b[0]) / 2 - middle[0], (a[1] + b[1]) / 2 - middle[1]) - reach - other;
+      const found = away > FAR ? FAR : gap(corners, sides, placed(shape, a), placed(shape, b));
+      worst = Math.min(worst, found - margin);
+    }
+    if (worst < 0 && problem.space) return worst; // no plan needs to know by how much
+  }
+  return worst;
+}
 
 // Poses of the object along an action, from its pose before it.
 export function pathOf(map, [x, y, yaw], direction, stop, turned, samples = PATH_SAMPLES) {
+  const first = Math.min(map.from, stop);
   return Array.from({ length: samples }, (_, k) => {
-    map.at(direction - turned, (stop * k) / (samples - 1), EFFECT);
+    map.at(direction - turned, share(first, stop, k / (samples - 1)), EFFECT);
     const [dx, dy] = rotated(EFFECT, direction);
     return [x + dx, y + dy, yaw + EFFECT[2]];
   });
@@ -269,7 +280,8 @@ export function handAt(hand, phase) {
 // problem: {object: {map, outline, hand, yaw (of the object in the map's image)}, pose [x, y, yaw],
 // goal [x, y], tolerance, most (actions), partial (may stop early), risk (weight of the variance),
 // obstacles, reachable, table [x0, x1, y0, y1], previous (a chain)}.
-export function plan(problem) {
+export function plan(asked) {
+  const problem = asked.obstacles?.length ? { ...asked, space: spaceOf(asked) } : asked;
   const { object, pose, goal, most = 3, tolerance = 0.02 } = problem;
   const target = [goal[0] - pose[0], goal[1] - pose[1]];
   const far = Math.hypot(...target);
@@ -306,12 +318,12 @@ function halton(i, base) {
   return value;
 }
 
-function startsOf({ object, pose, partial = true, obstacles }, target, n) {
+function startsOf({ object, pose, partial = true, obstacles = [] }, target, n) {
   const yaw = pose[2] - (object.yaw ?? 0);
   const bearing = Math.atan2(target[1], target[0]);
-  const spread = noObstacles(obstacles) ? SPREAD : Math.PI / 2;
   const starts = [];
-  for (let i = 1; i <= STARTS; i++) {
+  for (let i = 1; i <= (obstacles.length ? 3 : 1) * STARTS; i++) {
+    const spread = obstacles.length && i % 2 ? Math.PI : SPREAD; // half of them make a detour
     const chain = [];
     for (let k = 0; k < n - 1; k++) {
       const phase = partial ? 0.5 + 0.5 * halton(i, [3, 7][k % 2]) : 1;
@@ -392,10 +404,9 @@ export function correct(map, target, start, yaw, partial, rounds = CORRECTIONS) 
 }
 
 // Whether the arm can reach all actions, the object stays on the table and meets no obstacle.
-export function isAllowed({ object, pose, reachable, table, obstacles = {} }, chain) {
+function isAllowed({ object, pose, reachable, table, space }, chain) {
   const yaw = pose[2] - (object.yaw ?? 0);
   let [from, turned] = [pose, yaw];
-  const empty = noObstacles(obstacles);
   return rollOut(object.map, chain, yaw).every(([x, y, turn], k) => {
     const [direction, stop] = [chain[2 * k], chain[2 * k + 1]];
     const to = [pose[0] + x, pose[1] + y, pose[2] + turn - yaw];
@@ -406,14 +417,7 @@ export function isAllowed({ object, pose, reachable, table, obstacles = {} }, ch
       if (to[0] < x0 + radius || to[0] > x1 - radius) return false;
       if (to[1] < y0 + radius || to[1] > y1 - radius) return false;
     }
-    if (!empty) {
-      const path = pathOf(object.map, from, direction, stop, turned, 13);
-      if (!path.every((at) => isFree(placed(object.outline, at), obstacles))) return false;
-      for (let i = 0; object.hand && i <= 10; i++) {
-        const [dx, dy] = rotated([handAt(object.hand, (stop * i) / 10).along, 0], direction);
-        if (!handIsFree([from[0] + dx, from[1] + dy], obstacles)) return false;
-      }
-    }
+    if (space && spare({ object, pose, space }, from, direction, stop, turned) < 0) return false;
     [from, turned] = [to, turn];
     return true;
   });
@@ -435,21 +439,15 @@ const still = () => window.matchMedia("(prefers-reduced-motion: reduce)").matche
 const escaped = (text) =>
   String(text).replace(/[&<>"']/g, (letter) => `&#${letter.charCodeAt(0)};`);
 
-// Convex hull of points, counter-clockwise.
-function hull(points) {
-  const sorted = [...points].sort((a, b) => a[0] - b[0] || a[1] - b[1]);
-  const half = (those) => {
-    const kept = [];
-    for (const c of those) {
-      for (let [a, b] = kept.slice(-2); kept.length > 1; [a, b] = kept.slice(-2)) {
-        if ((b[0] - a[0]) * (c[1] - a[1]) > (b[1] - a[1]) * (c[0] - a[0])) break;
-        kept.pop();
-      }
-      kept.push(c);
-    }
-    return kept.slice(0, -1);
-  };
-  return [...half(sorted), ...half(sorted.reverse())];
+const BOX = [[-0.025, -0.02], [0.025, -0.02], [0.025, 0.02], [-0.025, 0.02]];
+const middleOf = ({ corners }) => [0, 1].map((axis) => corners.reduce((sum, at) => sum + at[axis], 0) / corners.length);
+const shifted = (one, by) => ({ ...one, corners: one.corners.map((at) => at.map((v, axis) => v + by[axis])) });
+const sizeKnob = (one) => cornersOf(one).reduce((best, at) => (at[0] + at[1] > best[0] + best[1] ? at : best));
+
+function resized(one, by) {
+  if (one.radius) return { ...one, radius: between(0.006, one.radius * by, 0.12) };
+  const middle = middleOf(one);
+  return { ...one, corners: one.corners.map((at) => at.map((v, axis) => middle[axis] + (v - middle[axis]) * by)) };
 }
 
 function shape(tag, css, attributes, inside = "") {
@@ -457,16 +455,16 @@ function shape(tag, css, attributes, inside = "") {
   return `<${tag} class="${css}"${said.join("")}>${inside}</${tag}>`;
 }
 
-// state: {object, pose, goal {xy, yaw, tolerance}, steps, obstacles, ring, trail, marks (what moved by
+// state: {object, pose, goal {xy, yaw, tolerance}, steps, other (steps to compare with), obstacles, ring, trail, marks (what moved by
 // itself: [from, to]), sigma, swept, note (text in a corner), movable (object and obstacles can be
 // moved), live (pose, hand and lift that are shown instead)}.
-// heard: {goal(xy, final), pose(pose, final), obstacle(k, xy), press(key)}.
+// heard: {goal(xy, final), pose(pose, final), obstacles(all, final), press(key)}.
 export class Table {
   constructor(el, heard) {
     this.heard = heard;
-    this.state = { pose: [0, 0, 0], goal: { xy: [0, 0], tolerance: 0.02 }, steps: [], obstacles: {} };
+    this.state = { pose: [0, 0, 0], goal: { xy: [0, 0], tolerance: 0.02 }, steps: [], obstacles: [] };
     this.camera = null; // [x, y, half of the shown height]
-    this.held = this.tapped = this.clock = null;
+    this.held = this.tapped = this.clock = this.chosen = null;
     this.grip = [0, 0]; // from the pointer to the middle of what it holds
     this.svg = document.createElementNS("http://www.w3.org/2000/svg", "svg");
     this.svg.setAttribute("role", "application");
@@ -474,6 +472,7 @@ export class Table {
     el.classList.add("affordlib-table");
     el.dataset.lmSuppressShortcuts = "true"; // JupyterLab's own, while this has the focus
     el.append(this.svg);
+    if (heard.obstacles) el.append(this.tools());
     const listen = (name, act) => this.svg.addEventListener(name, act.bind(this));
     listen("pointerdown", this.pressed);
     listen("pointermove", this.moved);
@@ -484,6 +483,47 @@ export class Table {
     this.watch.observe(this.svg);
   }
 
+  // Buttons that add, change and remove obstacles, for mouse, touch and keyboard.
+  tools() {
+    const row = document.createElement("div");
+    row.className = "tools";
+    const [disc, box] = [{ corners: [[0, 0]], radius: 0.02 }, { corners: BOX, radius: 0 }];
+    const names = { "+ disc": () => this.add(disc), "+ box": () => this.add(box), larger: () => this.resize(1.2),
+      smaller: () => this.resize(1 / 1.2), remove: () => this.change(this.chosen, null) };
+    for (const [name, act] of Object.entries(names)) {
+      const button = document.createElement("button");
+      Object.assign(button, { type: "button", textContent: name, onclick: act });
+      button.setAttribute("aria-label", `obstacle: ${name}`);
+      row.append(button);
+    }
+    return row;
+  }
+
+  add({ corners, radius }) {
+    const { obstacles, pose, goal } = this.state;
+    const [x, y] = [0, 1].map((axis) => (pose[axis] + goal.xy[axis]) / 2);
+    const [row, side] = [Math.floor(obstacles.length / 2), obstacles.length % 2 ? -1 : 1];
+    const ahead = Math.atan2(goal.xy[1] - pose[1], goal.xy[0] - pose[0]);
+    const aside = rotated([0.06 * row, 0.09 * side], ahead);
+    const one = shifted({ corners, radius, height: 0.06 }, [x + aside[0], y + aside[1]]);
+    this.chosen = obstacles.length;
+    this.heard.obstacles([...obstacles, one], true);
+  }
+
+  resize(by) {
+    const one = this.state.obstacles[this.chosen];
+    if (one) this.change(this.chosen, resized(one, by));
+  }
+
+  // Replace an obstacle, or remove it.
+  change(k, one, final = true) {
+    const all = [...this.state.obstacles];
+    if (!all[k]) return;
+    all.splice(k, 1, ...(one ? [one] : []));
+    if (!one) this.chosen = null;
+    this.heard.obstacles(all, final);
+  }
+
   set(changes) {
     Object.assign(this.state, changes);
     if (changes.steps || changes.pose) this.clock = null;
@@ -492,10 +532,10 @@ export class Table {
 
   // Let the view follow what is to be seen; a hand that drags moves it only outwards.
   frame() {
-    const { pose, goal, steps, object, trail = [] } = this.state;
+    const { pose, goal, steps, object, obstacles, trail = [] } = this.state;
     if (!object) return;
     const radius = Math.max(...object.outline.map((corner) => Math.hypot(...corner)));
-    const seen = [pose, goal.xy, ...trail, ...steps.flatMap(({ from, end, direction }) => {
+    const seen = [pose, goal.xy, ...trail, ...obstacles.flatMap(cornersOf), ...steps.flatMap(({ from, end, direction }) => {
       const [dx, dy] = rotated([-0.07, 0], direction ?? 0);
       return [end, [from[0] + dx, from[1] + dy]];
     })];
@@ -568,7 +608,8 @@ export class Table {
       const seconds = (stop - begins) * object.seconds;
       if (left < seconds + 2 * APPROACH || k === steps.length - 1) {
         const phase = begins + (stop - begins) * between(0, (left - APPROACH) / seconds, 1);
-        const at = between(0, phase / stop, 1) * (path.length - 1);
+        const first = Math.min(object.map.from, stop);
+        const at = between(0, (phase - first) / (stop - first || 1), 1) * (path.length - 1);
         const [a, b] = [path[Math.floor(at)], path[Math.ceil(at)]];
         const pose = a.map((value, axis) => share(value, b[axis], at % 1));
         const near = between(0, Math.min(left, seconds + 2 * APPROACH - left) / APPROACH, 1);
@@ -577,6 +618,19 @@ export class Table {
       left -= seconds + 2 * APPROACH;
     }
     return null;
+  }
+
+  // A moment of a motion as it was simulated: rows of [x, y, yaw, lift, hand's x, y, z, yaw, gap].
+  replay(rows, place) {
+    const k = Math.min(Math.floor(place), rows.length - 1);
+    const next = rows[Math.min(k + 1, rows.length - 1)];
+    const now = rows[k].map((value, axis) => share(value, next[axis], place - k));
+    const [x, y, yaw, lift, ...tool] = now;
+    const near = between(0, 1.1 - 8 * tool[2], 1);
+    const hand = { along: 0, gap: tool[4], direction: rows[k][7], from: tool, near };
+    this.state.live = { pose: [x, y, yaw], lift, hand };
+    this.state.trail = rows.slice(0, k + 1);
+    this.draw();
   }
 
   get seconds() {
@@ -606,22 +660,22 @@ export class Table {
   draw() {
     const { state, scale } = { state: this.state, scale: this.camera ? this.scale : 1 };
     if (!state.object || !this.camera) return;
-    const { pose, goal, steps, obstacles, trail, marks = [], sigma, swept, movable, object } = state;
+    const { pose, goal, steps, obstacles, trail, marks = [], sigma, swept, movable, object, other } = state;
     const [width, height] = this.size();
     const now = state.live ?? (this.clock === null ? null : this.moment(this.clock));
     const end = steps.at(-1)?.end ?? pose;
     const shapes = [this.ground()];
-    (obstacles.polygons ?? []).forEach(([corners], k) =>
-      shapes.push(shape("polygon", "obstacle", { points: this.points(corners), "data-handle": `polygon ${k}` })));
-    (obstacles.discs ?? []).forEach(([x, y, radius], k) =>
-      shapes.push(this.disc([x, y], "obstacle", radius, { "data-handle": `disc ${k}` })));
+    obstacles.forEach((one, k) => {
+      const css = k === this.chosen ? "obstacle chosen" : "obstacle";
+      shapes.push(shape("polygon", css, { points: this.points(cornersOf(one)), "data-handle": `obstacle ${k}` }));
+      if (k === this.chosen) shapes.push(this.disc(sizeKnob(one), "grip", 0.012, { "data-handle": `size ${k}` }));
+      if (k === this.chosen) shapes.push(this.disc(sizeKnob(one), "turner", 0.004, { "data-handle": `size ${k}` }));
+    });
     if (swept && steps.length) {
-      const all = steps.flatMap(({ path }) => path.slice(1).map((at, k) => {
-        const both = hull([...placed(object.outline, path[k]), ...placed(object.outline, at)]);
-        return `M${this.points(both)}Z`;
-      }));
+      const all = steps.flatMap(({ path }) => path.map((at) => `M${this.points(placed(object.outline, at))}Z`));
       shapes.push(shape("path", "swept", { d: all.join("") }));
     }
+    for (const step of other ?? []) shapes.push(this.line(step.path, "other"), this.outline(step.end, "other"));
     for (const mark of marks) shapes.push(this.line(mark, "mark"));
     steps.forEach((step, k) => {
       if (sigma && step.std) shapes.push(this.disc(step.end, "sigma", ENLARGED * step.std));
@@ -648,7 +702,7 @@ export class Table {
       "aria-label",
       `Table from above. The goal is at x = ${said[0]}, y = ${said[1]} cm, the object at x = ${said[2]}, ` +
         `y = ${said[3]} cm. Arrow keys move the goal by 1 cm, with Shift by 1 mm; Enter runs the plan, ` +
-        "Escape stops it.",
+        "Escape stops it. An obstacle that is chosen is moved by the arrow keys, resized by + and -, removed by Delete.",
     );
     Object.assign(this.svg.dataset, { view: this.camera.map((v) => v.toFixed(5)).join(" ") });
   }
@@ -725,7 +779,7 @@ export class Table {
 
   labels(short) {
     const { steps, goal, pose, object, sigma } = this.state;
-    const taken = placed(object.outline, pose).map((at) => [...this.at(at), 6]);
+    const taken = [...placed(object.outline, pose), ...this.state.obstacles.flatMap(cornersOf)].map((at) => [...this.at(at), 6]);
     if (this.state.movable) taken.push([...this.at(this.ahead(pose, 1.5)), 14]);
     taken.push([...this.at(goal.xy), Math.max(18, goal.tolerance * this.scale)], [...this.at(pose), 14]);
     for (const { path, end, from, direction } of steps) {
@@ -784,8 +838,11 @@ export class Table {
     this.tapped = event.pointerType === "touch" && name === "none";
     if (this.tapped) return;
     this.held = name === "none" ? "goal" : name;
-    const { pose } = this.state;
-    this.grip = this.held === "object" ? [pose[0] - at[0], pose[1] - at[1]] : [0, 0];
+    const { pose, obstacles } = this.state;
+    const [kind, number] = this.held.split(" ");
+    this.chosen = number ? Number(number) : null;
+    const middle = { object: pose, obstacle: number && middleOf(obstacles[number]) }[kind];
+    this.grip = middle ? [middle[0] - at[0], middle[1] - at[1]] : [0, 0];
     this.clock = null;
     this.svg.setPointerCapture(event.pointerId);
     this.svg.classList.add("by-pointer"); // focused so, it needs no frame
@@ -810,7 +867,7 @@ export class Table {
 
   move(at, final) {
     this.last = at;
-    const { pose, goal } = this.state;
+    const { pose, goal, obstacles } = this.state;
     const [x, y] = at.map((value, k) => between(-LIMIT, value + this.grip[k], LIMIT));
     const [name, k] = this.held.split(" ");
     if (name === "goal") {
@@ -819,14 +876,26 @@ export class Table {
       this.heard.goal?.(xy, final);
     } else if (name === "object") this.heard.pose?.([x, y, pose[2]], final);
     else if (name === "yaw") this.heard.pose?.([pose[0], pose[1], Math.atan2(at[1] - pose[1], at[0] - pose[0])], final);
-    else this.heard.obstacle?.(name, Number(k), [x, y], final);
+    else {
+      const [one, [u, v]] = [obstacles[k], middleOf(obstacles[k])];
+      const far = ([x, y]) => Math.hypot(x - u, y - v);
+      const by = name === "size" ? far([x, y]) / far(sizeKnob(one)) : 1;
+      this.change(Number(k), by === 1 ? shifted(one, [x - u, y - v]) : resized(one, by), final);
+    }
   }
 
   typed(event) {
     this.svg.classList.remove("by-pointer");
     const { goal, pose, movable } = this.state;
     const step = event.shiftKey ? 0.001 : 0.01;
-    if (event.key in KEYS) {
+    const one = this.state.obstacles[this.chosen];
+    if (one && event.key in KEYS) this.change(this.chosen, shifted(one, KEYS[event.key].map((way) => way * step)));
+    else if (one && event.key === "Delete") this.change(this.chosen, null);
+    else if (one && "+-".includes(event.key)) this.resize(event.key === "+" ? 1.2 : 1 / 1.2);
+    else if (one && event.key === "Escape") {
+      this.chosen = null;
+      this.draw();
+    } else if (event.key in KEYS) {
       const xy = KEYS[event.key].map((way, k) => between(-LIMIT, goal.xy[k] + way * step, LIMIT));
       this.heard.goal?.(xy.map((value) => Math.round(1000 * value) / 1000), true);
     } else if (movable && (event.key === "q" || event.key === "e")) {
@@ -850,11 +919,12 @@ function render({ model, el }) {
   Object.assign(scrub, { type: "range", min: 0, max: 1, step: "any", hidden: true });
   scrub.setAttribute("aria-label", "Time of the last run");
 
-  function draft(xy) {
+  function draft(xy, obstacles = view.state.obstacles) {
     const { pose, goal, running } = model.get("scene");
     if (running || !thing?.map) return view.state.steps;
     const { table } = model.get("table");
-    const planned = plan({ object: thing, pose, goal: xy, tolerance: goal.tolerance, reachable, table, previous: chain });
+    const asked = { object: thing, pose, goal: xy, tolerance: goal.tolerance, reachable, table, obstacles };
+    const planned = plan({ ...asked, previous: chain });
     chain = planned.chain;
     return planned.steps;
   }
@@ -868,6 +938,13 @@ function render({ model, el }) {
       if (!final) return;
       model.set("wanted", [...xy, number]);
       model.save_changes(); // ipywidgets sends the next one when this one has been processed
+    },
+    obstacles(all, final) {
+      const steps = draft(view.state.goal.xy, all);
+      view.set({ obstacles: all, steps });
+      if (!final) return;
+      model.set("obstacles", all);
+      model.save_changes();
     },
     press: (key) => model.send({ press: key === "Enter" ? "run" : "stop" }),
   });
@@ -891,21 +968,13 @@ function render({ model, el }) {
     Object.assign(view.svg.dataset, { answered, planning, draft: Boolean(late) });
     view.svg.setAttribute("aria-busy", planning);
     if (!running && !timer) scene.live = null;
+    if (!view.held) scene.obstacles = model.get("obstacles");
     view.set({ ...scene, planning, sigma: true, swept: true, note: planning ? "planning …" : "" });
   }
 
-  // Motions [x, y, yaw, lift, hand's x, y, z, yaw, gap], as they are simulated, and afterwards.
   function at(place) {
-    const k = Math.min(Math.floor(place), recorded.length - 1);
-    const next = recorded[Math.min(k + 1, recorded.length - 1)];
-    const now = recorded[k].map((value, axis) => share(value, next[axis], place - k));
-    const [x, y, yaw, lift, ...tool] = now;
-    const near = between(0, 1.1 - 8 * tool[2], 1);
-    const hand = { along: 0, gap: tool[4], direction: recorded[k][7], from: tool, near };
-    view.state.live = { pose: [x, y, yaw], lift, hand };
-    view.state.trail = recorded.slice(0, k + 1);
     scrub.value = place / Math.max(recorded.length - 1, 1);
-    view.draw();
+    view.replay(recorded, place);
   }
 
   function heard({ motions, first }) {
@@ -934,7 +1003,7 @@ function render({ model, el }) {
     });
   const naming = new ResizeObserver(() => setTimeout(nameSliders, 500)); // after the page is complete
   naming.observe(el);
-  const listeners = { "change:object": look, "change:scene": show, "msg:custom": heard };
+  const listeners = { "change:object": look, "change:scene": show, "change:obstacles": show, "msg:custom": heard };
   for (const [name, act] of Object.entries(listeners)) model.on(name, act);
   look();
   show();

@@ -10,10 +10,13 @@ import numpy as np
 import traitlets
 from torch import nn
 
+from affordlib.geometry import rotated
+from affordlib.perception import adapt_to_object
 from affordlib.planning import Skills
 from affordlib.planning.effect_map import EffectMap
-from affordlib.primitives import DURATION_S
-from affordlib.types import ACTION_CHANNELS, TABLE_X_M, TABLE_Y_M, Plan
+from affordlib.planning.free_space import hand_m
+from affordlib.primitives import DURATION_S, Push
+from affordlib.types import ACTION_CHANNELS, TABLE_X_M, TABLE_Y_M, Obstacle, Plan
 from affordlib.world import BASE_X_M, REACH_M, TabletopObject
 
 PUSH_RUN_UP_M = 0.2
@@ -27,8 +30,9 @@ class TableView(anywidget.AnyWidget):
     """The table from above, whose goal is dragged; see `table.js`.
 
     table: what `table_data` returns; object: `object_data`'s; scene: pose, goal, steps, trail and
-    marks, and "answered", the number of the last request that it includes. wanted: x, y [m] and the
-    growing number of a request for a goal. It sends {"press": "run"} and "stop", and plays
+    marks, and "answered", the number of the last request that it includes. obstacles: those on the
+    table, as `obstacle_data` writes them. wanted: x, y [m] and the growing number of a request for a
+    goal. It sends {"press": "run"} and "stop", and plays
     {"motions": [x, y, yaw, lift, the hand's x, y, z, yaw, gap]} as they come.
     """
 
@@ -37,7 +41,20 @@ class TableView(anywidget.AnyWidget):
     table = traitlets.Dict().tag(sync=True)
     object = traitlets.Dict().tag(sync=True)
     scene = traitlets.Dict().tag(sync=True)
+    obstacles = traitlets.List().tag(sync=True)
     wanted = traitlets.List([0.0, 0.0, 0]).tag(sync=True)
+
+
+def obstacle_data(obstacle: Obstacle) -> dict[str, Any]:
+    """An obstacle in JSON's types; its corners, radius and height [m] make it again."""
+    corners = [list(corner) for corner in obstacle.corners_m]
+    return {"corners": corners, "radius": obstacle.radius_m, "height": obstacle.height_m}
+
+
+def obstacle_of(data: dict[str, Any]) -> Obstacle:
+    """The obstacle that the page has described."""
+    corners = tuple((float(x), float(y)) for x, y in data["corners"])
+    return Obstacle(corners, float(data["radius"]), float(data["height"]))
 
 
 def plan_data(plan: Plan, yaw_rad: float) -> list[dict[str, Any]]:
@@ -57,18 +74,22 @@ def plan_data(plan: Plan, yaw_rad: float) -> list[dict[str, Any]]:
 
 
 def object_data(obj: TabletopObject, effects: EffectMap, yaw_rad: float = 0.0) -> dict[str, Any]:
-    """Outline, motion of the hand along an action, and effect map of an object, in JSON's types.
+    """Outline, true and as seen, hand during an action, and effect map of an object, for JSON.
 
     yaw_rad: the object's yaw in the map's image.
     """
-    action = effects.kind.towards(0.0)
+    action, seen = effects.kind.towards(0.0), rotated(effects.outline_m, -yaw_rad)
+    hand = {"size": hand_m(action).max(axis=0).tolist(), "grip": None}
+    if not isinstance(action, Push):
+        hand["grip"] = adapt_to_object(action, effects.image).grip_yaw
     path = action.path(np.linspace(0, 1, HAND_SAMPLES))
     along, opening = path[:, 0], path[:, ACTION_CHANNELS.index("gripper")] * action.opening_m
     return {
         "category": obj.category,
         "outline": obj.footprint_m.round(6).tolist(),
         "yaw": yaw_rad,
-        "hand": {"along": along.round(5).tolist(), "gap": opening.round(5).tolist()},
+        "seen": seen.round(6).tolist(),
+        "hand": hand | {"along": along.round(5).tolist(), "gap": opening.round(5).tolist()},
         "map": effects.numbers(),
     }
 

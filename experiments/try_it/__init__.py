@@ -4,14 +4,29 @@ The page holds everything that it needs, and opens by a double-click. Objects, t
 the arm's reachability come from the package; planning and drawing are `affordlib/show/table.js`.
 """
 
+import base64
+import itertools
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
+
 from affordlib import show
-from affordlib.planning import Skills
+from affordlib.planning import Skills, execute_plan, plan_continuous
 from affordlib.results import repo_root, write_atomically
 from affordlib.show.table_data import object_data, table_data
-from affordlib.world import Cuboid, LyingCylinder, Prism, Sphere, Tabletop, UprightCylinder
+from affordlib.types import Goal
+from affordlib.world import (
+    Cuboid,
+    LyingCylinder,
+    Prism,
+    Sphere,
+    Tabletop,
+    TabletopObject,
+    UprightCylinder,
+)
+from affordlib.world.trajectory import STEP_S
 
 PAGE = repo_root() / "figures" / "try_it.html"
 OBJECTS = {
@@ -27,16 +42,58 @@ OBJECTS = {
 UNKNOWN = {"triangle", "wedge", "slab"}
 """Shapes that the network of pushes was not trained on."""
 
+N_RUNS, EVERY, HIGH_M = 26, 24, 0.14
+"""Executions recorded of each object; simulation steps between two rows of a recorded motion;
+height [m] from which on the hand is not shown."""
 
-def data() -> dict[str, object]:
-    """Everything that the page knows, in JSON's types."""
+
+def data(n_runs: int = N_RUNS) -> dict[str, object]:
+    """Everything that the page knows, in JSON's types, with n_runs executions of each object."""
     skills, objects = Skills.load(), []
     with Tabletop() as world:
         for name, obj in OBJECTS.items():
             world.place(obj, (0.0, 0.0), 0.0)
             about = {"name": name, "known": name not in UNKNOWN}
-            objects.append(about | object_data(obj, skills.effects(world.depth_image())))
-    return table_data(skills) | {"objects": objects}
+            about |= object_data(obj, skills.effects(world.depth_image()))
+            goals = goals_of(name)
+            runs = [recorded(world, obj, skills, next(goals)) for _ in range(n_runs)]
+            objects.append(about | {"runs": runs})
+    return table_data(skills) | {"objects": objects, "every": EVERY * STEP_S}
+
+
+def goals_of(name: str) -> Iterator[Goal]:
+    """Goals around the table's centre, the same for an object whatever their number."""
+    rng = np.random.default_rng([len(name), *name.encode()])
+    while True:
+        far, bearing = rng.uniform(0.03, 0.22), rng.uniform(0, 2 * np.pi)
+        yield Goal((round(far * np.cos(bearing), 3), round(far * np.sin(bearing), 3)))
+
+
+def recorded(world: Tabletop, obj: TabletopObject, skills: Skills, goal: Goal) -> dict[str, object]:
+    """Plan for a goal, execute the plan in the simulation, and return the motion in JSON's types.
+
+    Rows of the motion: pose and height of the object, pose of the hand and gap of its fingers, in
+    units of 0.1 mm and 0.1 mrad, where the hand is near the table.
+    """
+    world.place(obj, (0.0, 0.0), 0.0)
+    plan = plan_continuous(skills.problem(world.depth_image(), (0.0, 0.0), goal))
+    rows, steps, z = [], itertools.count(), world.object_state()[2]
+
+    def note(world):
+        hand = world.arm.tool_pose()
+        if next(steps) % EVERY == 0 and hand[2] < HIGH_M:
+            rows.append([*world.object_pose(), world.object_state()[2] - z, *hand])
+
+    world.on_step = note
+    outcome = execute_plan(world, plan)
+    world.on_step = None
+    whole = np.round(10_000 * np.array(rows or [9 * [0.0]])).astype("<i2")
+    return {
+        "goal": goal.xy_m,
+        "chain": [v for s in plan.steps for v in (s.primitive.direction_rad, s.stop_phase)],
+        "motion": base64.b64encode(whole.tobytes()).decode(),
+        "distance": round(outcome.distance_m, 5),
+    }
 
 
 def page(known: dict[str, object]) -> str:

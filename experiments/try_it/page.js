@@ -1,24 +1,16 @@
 const data = JSON.parse(document.getElementById("data").textContent);
 const one = (selector) => document.querySelector(selector);
 const form = one(".switches");
-const OBSTACLES = { discs: [[0.03, 0.14, 0.02, 0.1]], polygons: [[[[0.1, -0.02], [0.15, -0.02], [0.15, 0.02], [0.1, 0.02]], 0.06]] };
 const FIRST = { pose: [0, 0, 0.3], goal: [0.13, 0.085] };
 const objects = data.objects.map((object) => ({ ...object, seconds: data.seconds }));
 const undone = [];
-let [object, pose, goal, obstacles] = [objects[0], FIRST.pose, FIRST.goal, structuredClone(OBSTACLES)];
-let [chain, shown, playing] = [[], null, 0];
+let [object, pose, goal, obstacles] = [objects[0], FIRST.pose, FIRST.goal, []];
+let [chain, shown, playing, motion] = [[], null, 0, null];
 
 const view = new Table(one(".table"), {
   goal: (xy, final) => change(() => (goal = xy), final),
   pose: (to, final) => change(() => (pose = to), final),
-  obstacle: (kind, k, [x, y], final) => change(() => {
-    if (kind === "disc") obstacles.discs[k] = [x, y, ...obstacles.discs[k].slice(2)];
-    else {
-      const [corners, height] = obstacles.polygons[k];
-      const middle = [0, 1].map((axis) => corners.reduce((sum, at) => sum + at[axis], 0) / corners.length);
-      obstacles.polygons[k] = [corners.map(([u, v]) => [u + x - middle[0], v + y - middle[1]]), height];
-    }
-  }, final),
+  obstacles: (all, final) => change(() => (obstacles = all), final),
   press: (key) => (key === "Enter" ? play() : end()),
 });
 
@@ -43,7 +35,7 @@ function problem() {
   const { most, partial, risk } = form.elements;
   return {
     object: mapOf(object), pose, goal, tolerance: 0.01, most: Number(most.value), partial: partial.checked,
-    risk: Number(risk.value), obstacles: form.elements.obstacles.checked ? obstacles : {},
+    risk: Number(risk.value), obstacles,
     reachable: object.reachable, table: data.table, previous: chain,
   };
 }
@@ -53,13 +45,15 @@ function replan() {
   const asked = problem();
   shown = plan(asked);
   chain = shown.chain;
-  const full = !view.held && asked.partial ? plan({ ...asked, partial: false, previous: null }) : null;
-  const { sigma, swept } = form.elements;
+  const { sigma, swept, compare } = form.elements;
+  const full = asked.partial && (compare.checked || !view.held) ? plan({ ...asked, partial: false, previous: null }) : null;
   view.set({
-    object, pose, goal: { xy: goal, tolerance: 0.01 }, steps: shown.steps, obstacles: asked.obstacles,
+    object, pose, goal: { xy: goal, tolerance: 0.01 }, steps: shown.steps, obstacles,
+    other: compare.checked && full ? full.steps : null,
     ring: data.ring, sigma: sigma.checked, swept: swept.checked, movable: true, note: "prediction",
   });
   tell(full);
+  offer();
   one(".play").disabled = one(".scrub").disabled = !shown.steps.length;
 }
 
@@ -73,40 +67,83 @@ function tell(full) {
     : "No action brings it nearer. ";
   if (steps.length) text += `Predicted to end ${(1000 * distance).toFixed(1)} mm from the goal, σ ${(1000 * steps.at(-1).std).toFixed(1)} mm. `;
   if (!reached && steps.length) text += "The star is farther than these actions reach. ";
-  if (full && full.distance > distance + 0.001) text += `Without stopping early it would miss by ${(1000 * full.distance).toFixed(0)} mm. `;
+  if (full && (form.elements.compare.checked || full.distance > distance + 0.001)) text += `Full pushes only would miss by ${(1000 * full.distance).toFixed(0)} mm. `;
   if (!object.known) text += "The network was trained on no such object: errors may be far larger than predicted.";
   one(".words").textContent = text;
+}
+
+// The recorded goal that is nearest, of those whose way was recorded beside no obstacle.
+function nearestRun() {
+  const there = object.runs.map((run) => ({ run, xy: placed([run.goal], pose)[0] }));
+  return there.reduce((best, one) => (apartOf(one.xy) < apartOf(best.xy) ? one : best));
+}
+
+const apartOf = (xy) => Math.hypot(xy[0] - goal[0], xy[1] - goal[1]);
+
+function offer(text) {
+  const { xy } = nearestRun();
+  one(".recorded span").textContent = text ??
+    `Recorded for the nearest of ${object.runs.length} goals, ${(100 * apartOf(xy)).toFixed(1)} cm from yours.`;
+}
+
+// Rows of a recorded motion, moved to where the object stands.
+function motionOf({ motion: text }) {
+  const all = Array.from(decoded(text, Int16Array), (value) => value / 10000);
+  return Array.from({ length: all.length / 9 }, (_, k) => {
+    const [x, y, yaw, lift, u, v, z, turn, gap] = all.slice(9 * k, 9 * k + 9);
+    const [[x1, y1], [u1, v1]] = placed([[x, y], [u, v]], pose);
+    return [x1, y1, yaw + pose[2], lift, u1, v1, z, turn + pose[2], gap];
+  });
+}
+
+function robot() {
+  const { run, xy } = nearestRun();
+  const from = pose;
+  stop();
+  const steps = stepsOf({ object: mapOf(object), pose: from }, run.chain.map((v, k) => (k % 2 ? v : v + from[2])));
+  view.set({ goal: { xy, tolerance: 0.01 }, steps, other: null, obstacles: [], note: "recorded in the simulation" });
+  offer(`The robot ended ${(1000 * run.distance).toFixed(1)} mm from this recorded goal (predicted: ${
+    (1000 * Math.hypot(...[0, 1].map((axis) => (steps.at(-1)?.end ?? from)[axis] - xy[axis]))).toFixed(1)} mm).`);
+  motion = motionOf(run);
+  play();
 }
 
 function stop() {
   cancelAnimationFrame(playing);
   playing = 0;
-  view.clock = null;
+  view.clock = view.state.live = motion = null;
+  view.state.trail = [];
   one(".play").textContent = "▶";
   one(".scrub").value = 0;
 }
 
 function end() {
+  const had = motion;
   stop();
-  view.draw();
+  if (had) replan();
+  else view.draw();
 }
 
+const seconds = () => (motion ? (motion.length - 1) * data.every : view.seconds);
+
 function at(time) {
-  view.clock = time;
-  one(".scrub").value = time / view.seconds;
-  view.draw();
+  one(".scrub").value = time / seconds();
+  view.clock = motion ? null : time;
+  if (motion) view.replay(motion, Math.min(time / data.every, motion.length - 1));
+  else view.draw();
 }
 
 function play() {
-  if (playing || !shown.steps.length) return end();
+  if (!motion && (playing || !shown.steps.length)) return end();
+  if (playing) return end();
   one(".play").textContent = "■";
   let [last, time] = [performance.now(), 0];
-  if (still()) return at(view.seconds);
+  if (still()) return at(seconds());
   const frame = (now) => {
     time += ((now - last) / 1000) * Number(one(".speed").value);
     last = now;
-    at(Math.min(time, view.seconds));
-    if (time < view.seconds) playing = requestAnimationFrame(frame);
+    at(Math.min(time, seconds()));
+    if (time < seconds()) playing = requestAnimationFrame(frame);
     else {
       playing = 0;
       one(".play").textContent = "▶";
@@ -116,10 +153,11 @@ function play() {
 }
 
 one(".play").addEventListener("click", play);
+one("[name=robot]").addEventListener("click", robot);
 one(".scrub").addEventListener("input", (event) => {
   cancelAnimationFrame(playing);
   playing = 0;
-  at(Number(event.target.value) * view.seconds);
+  at(Number(event.target.value) * seconds());
 });
 form.addEventListener("input", replan);
 form.addEventListener("submit", (event) => event.preventDefault());
@@ -128,7 +166,7 @@ form.elements.undo.addEventListener("click", () => {
   replan();
 });
 form.addEventListener("reset", () => setTimeout(() => {
-  [pose, goal, obstacles, chain] = [FIRST.pose, FIRST.goal, structuredClone(OBSTACLES), []];
+  [pose, goal, obstacles, chain] = [FIRST.pose, FIRST.goal, [], []];
   replan();
 }));
 

@@ -11,11 +11,11 @@ import pytest
 import torch
 
 from affordlib import show
-from affordlib.geometry import rotated
+from affordlib.geometry import rotated, unit_vector
 from affordlib.planning import plan_continuous
 from affordlib.planning.rollout import roll_out
-from affordlib.show.table_data import object_data, table_data
-from affordlib.types import Goal
+from affordlib.show.table_data import object_data, obstacle_data, table_data
+from affordlib.types import Goal, Obstacle
 from affordlib.world import Cuboid, LyingCylinder, Prism
 
 OBJECTS = {
@@ -25,11 +25,13 @@ OBJECTS = {
 }
 ASK = """
 import fs from "node:fs";
-import { EffectMap, plan, reachability } from "./table.mjs";
+import { EffectMap, plan, reachability, spare } from "./table.mjs";
 const { reach, object, asked } = JSON.parse(fs.readFileSync("asked.json"));
 object.map = new EffectMap(object.map);
 const reachable = reach && reachability(reach, object.map.primitive);
-console.log(JSON.stringify(asked.map((one) => plan({ object, reachable, ...one }))));
+const answer = ({ action, ...one }) =>
+  action ? spare({ object, ...one }, ...action) : plan({ object, reachable, ...one });
+console.log(JSON.stringify(asked.map(answer)));
 """
 
 
@@ -113,28 +115,52 @@ def test_fewer_and_full_pushes_are_fewer_and_full(ask, seen):
     assert {step["stop"] for plan in ask(data, asked) for step in plan["steps"]} == {1}
 
 
-def test_no_plan_meets_an_obstacle(ask, seen):
-    """Checked by points around the object's outline, all along its predicted path."""
-    _, _, data = seen["box"]
-    rng, asked = np.random.default_rng(4), []
-    for goal in goals(30, 5, 0.2):
-        xy = [at for at in rng.uniform(-0.2, 0.2, (4, 2)).tolist() if np.hypot(*at) > 0.1]
-        square = [[u, v] for u, v in ((-0.02, -0.02), (0.02, -0.02), (0.02, 0.02), (-0.02, 0.02))]
-        placed = [[(np.add(corner, at)).tolist() for corner in square] for at in xy[2:]]
-        obstacles = {"discs": [[*at, 0.02, 0.1] for at in xy[:2]]}
-        obstacles["polygons"] = [[corners, 0.1] for corners in placed]
-        asked.append({"pose": [0, 0, 0], "goal": goal, "obstacles": obstacles})
-    outline = np.array(data["outline"])
-    rim = np.linspace(outline, np.roll(outline, -1, axis=0), 12).reshape(-1, 2)
-    found, moved = ask(data, asked), 0
-    for one, plan in zip(asked, found, strict=True):
-        moved += bool(plan["steps"])
-        for x, y, yaw in (pose for step in plan["steps"] for pose in step["path"]):
-            points = np.array((x, y)) + rotated(rim, yaw)
-            for u, v, radius, _ in one["obstacles"]["discs"]:
-                assert np.hypot(*(points - (u, v)).T).min() > radius + 0.008
-            for corners, _ in one["obstacles"]["polygons"]:
-                middle = np.mean(corners, axis=0)
-                assert np.abs(points - middle).max(axis=1).min() > 0.02 + 0.005
-    assert moved > 15
-    assert found != ask(data, [one | {"obstacles": {}} for one in asked])
+def obstacles_of(rng, n, near=0.07, far=0.2):
+    """Discs and boxes around the origin."""
+    made = []
+    for k in range(n):
+        at = tuple((rng.uniform(near, far) * unit_vector(rng.uniform(0, 2 * np.pi))).tolist())
+        size = tuple(rng.uniform(0.02, 0.06, 2).tolist())
+        made.append(Obstacle.disc(at, 0.02) if k % 2 else Obstacle.box(at, size, rng.uniform(0, 3)))
+    return made
+
+
+@pytest.mark.parametrize("name", ["box", "roller", "wedge"])
+def test_the_free_space_check_is_that_of_python(ask, seen, skills, name):
+    image, _, data = seen[name]
+    rng = np.random.default_rng(7)
+    obstacles = obstacles_of(rng, 5)
+    problem = skills.problem(image, (0.0, 0.0), Goal((0.03, 0.03)), obstacles=obstacles)
+    begins = rng.uniform(-1, 1, (200, 3)) * (0.12, 0.12, 1.5)
+    direction, phase = rng.uniform(-3, 3, 200), rng.uniform(0.3, 1, 200)
+    expected = problem.spare_m(begins, *map(torch.from_numpy, (direction, phase)))
+    common = {"pose": [0, 0, 0], "obstacles": [obstacle_data(one) for one in obstacles]}
+    actions = zip(begins.tolist(), direction.tolist(), phase.tolist(), strict=True)
+    asked = [common | {"action": [at, to, stop, at[2]]} for at, to, stop in actions]
+    found = np.array(ask(data, asked))
+    near = expected < 0.005  # Python does not distinguish larger gaps
+    assert 30 < (expected < 0).sum() < 180
+    np.testing.assert_allclose(found[near], expected[near], atol=1e-4)
+    assert (found[~near] > 0.004).all()
+
+
+def test_no_plan_meets_an_obstacle(ask, seen, skills):
+    image, _, data = seen["box"]
+    rng, asked, problems = np.random.default_rng(4), [], []
+    while len(asked) < 30:
+        goal, obstacles = tuple(rng.uniform(-0.2, 0.2, 2).tolist()), obstacles_of(rng, 4)
+        try:
+            problem = skills.problem(image, (0.0, 0.0), Goal(goal), obstacles=obstacles)
+        except ValueError:  # an obstacle lies on the goal
+            continue
+        problems.append(problem)
+        near = [obstacle_data(one) for one in obstacles]
+        asked.append({"pose": [0, 0, 0], "goal": goal, "obstacles": near})
+    found, reached = ask(data, asked), 0
+    for problem, plan in zip(problems, found, strict=True):
+        steps = plan["steps"]
+        reached += bool(steps) and plan["distance"] < 0.01
+        begins = np.array([step["from"] for step in steps]).reshape(-1, 3)
+        actions = [torch.tensor([step[k] for step in steps]).double() for k in ("direction", "stop")]
+        assert (problem.spare_m(begins, *actions) > -1e-4).all()
+    assert reached > 15, reached
