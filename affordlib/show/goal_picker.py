@@ -202,11 +202,13 @@ class GoalPicker(widgets.HBox):
         def place(change):
             self._follow(replace(self.goal, xy_m=_whole_mm(change["new"][:2])))
 
-        def change(change):
-            self._soon(partial(self.set_obstacles, [obstacle_of(one) for one in change["new"]]))
+        def adopt():
+            wanted = tuple(map(obstacle_of, self._view.obstacles))
+            if wanted != self.world.obstacles.all:
+                self.set_obstacles(wanted)
 
         self._view.observe(place, names="wanted")
-        self._view.observe(change, names="obstacles")
+        self._view.observe(lambda _: self._soon(adopt), names="obstacles")
         presses = {"run": self._run_in_background, "stop": self.stop}
         self._view.on_msg(lambda _, message, __: presses[message["press"]]())
         controls.planner.observe(lambda _: self._follow(self.goal), names="value")
@@ -476,8 +478,7 @@ class GoalPicker(widgets.HBox):
             self.world.set_obstacles(obstacles)
             self._stale = True
         finally:
-            with self._view.hold_trait_notifications():
-                self._view.obstacles = [obstacle_data(one) for one in self.world.obstacles.all]
+            self._view.obstacles = [obstacle_data(one) for one in self.world.obstacles.all]
 
     def _displacement(self, xy_m: tuple[float, float], least_m: float, most_m: float) -> np.ndarray:
         """A random displacement (2,) [m], reversed where it would leave the shown area."""

@@ -14,7 +14,6 @@ const ACTION_COST = 0.0005; // [m]
 const LOYALTY = 0.001; // advantage of the plan that is shown, so that it does not jump [m]
 const PATH_SAMPLES = 41;
 const NEARBY = 0.02; // difference of directions for the slope of an effect [rad]
-const [START, MARGIN, FULL_AT] = [0.001, 0.004, 0.02]; // as in Python's FreeSpace [m]
 const POSES = 7; // for which the way is checked
 const FAR = 0.01; // gaps above this are not distinguished [m]
 const ENLARGED = 20; // radius of the drawn disc, in σ
@@ -224,16 +223,19 @@ function spaceOf({ object, pose, obstacles }) {
   });
   const outline = object.seen ?? object.outline;
   const here = placed(outline, pose);
-  const least = Math.min(START, ...known.map((one) => gap(one.corners, one.sides, here, here)));
-  return { known, outline, least, size: farthest(outline, [0, 0]) };
+  const [start, most, fullAt] = object.margins;
+  const least = Math.min(start, ...known.map((one) => gap(one.corners, one.sides, here, here)));
+  const margin = ([x, y]) =>
+    least + (most - least) * Math.min(Math.hypot(x - pose[0], y - pose[1]) / fullAt, 1);
+  return { known, outline, margin, size: farthest(outline, [0, 0]) };
 }
 
 const farthest = (corners, [x, y]) => Math.max(...corners.map(([u, v]) => Math.hypot(u - x, v - y)));
 
 // Smallest gap minus margin of an action; the margin grows with the distance from the plan's start.
 export function spare(problem, from, direction, stop, turned) {
-  const { object, pose } = problem;
-  const { known, outline, least, size: radius } = problem.space ?? spaceOf(problem);
+  const { object } = problem;
+  const { known, outline, margin, size: radius } = problem.space ?? spaceOf(problem);
   const path = pathOf(object.map, from, direction, stop, turned, POSES);
   const { size, grip } = object.hand;
   const box = [[1, 1], [-1, 1], [-1, -1], [1, -1]].map(([x, y]) => [x * size[0], y * size[1]]);
@@ -247,12 +249,11 @@ export function spare(problem, from, direction, stop, turned) {
   sweeps.unshift([box, Math.hypot(...size), ...hands, path[0]]);
   let worst = Infinity;
   for (const [shape, long, a, b, at] of sweeps) {
-    const margin = least + (MARGIN - least) * Math.min(Math.hypot(at[0] - pose[0], at[1] - pose[1]) / FULL_AT, 1);
     const reach = long + Math.hypot(b[0] - a[0], b[1] - a[1]) / 2;
     for (const { corners, sides, middle, size: other } of known) {
       const away = Math.hypot((a[0] + b[0]) / 2 - middle[0], (a[1] + b[1]) / 2 - middle[1]) - reach - other;
       const found = away > FAR ? FAR : gap(corners, sides, placed(shape, a), placed(shape, b));
-      worst = Math.min(worst, found - margin);
+      worst = Math.min(worst, found - margin(at));
     }
     if (worst < 0 && problem.space) return worst; // no plan needs to know by how much
   }

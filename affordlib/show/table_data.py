@@ -14,7 +14,7 @@ from affordlib.geometry import rotated
 from affordlib.perception import adapt_to_object
 from affordlib.planning import Skills
 from affordlib.planning.effect_map import EffectMap
-from affordlib.planning.free_space import hand_m
+from affordlib.planning.free_space import FULL_AT_M, MARGIN_M, START_M, hand_m
 from affordlib.primitives import DURATION_S, Push
 from affordlib.types import ACTION_CHANNELS, TABLE_X_M, TABLE_Y_M, Obstacle, Plan
 from affordlib.world import BASE_X_M, REACH_M, TabletopObject
@@ -31,9 +31,9 @@ class TableView(anywidget.AnyWidget):
 
     table: what `table_data` returns; object: `object_data`'s; scene: pose, goal, steps, trail and
     marks, and "answered", the number of the last request that it includes. obstacles: those on the
-    table, as `obstacle_data` writes them. wanted: x, y [m] and the growing number of a request for a
-    goal. It sends {"press": "run"} and "stop", and plays
-    {"motions": [x, y, yaw, lift, the hand's x, y, z, yaw, gap]} as they come.
+    table, as `obstacle_data` writes them. wanted: x, y [m] and the growing number of a request for
+    a goal. It sends {"press": "run"} and "stop", and plays {"motions": [x, y, yaw, lift, the hand's
+    x, y, z, yaw, gap]} as they come.
     """
 
     _esm = _HERE / "table.js"
@@ -90,6 +90,7 @@ def object_data(obj: TabletopObject, effects: EffectMap, yaw_rad: float = 0.0) -
         "yaw": yaw_rad,
         "seen": seen.round(6).tolist(),
         "hand": hand | {"along": along.round(5).tolist(), "gap": opening.round(5).tolist()},
+        "margins": [START_M, MARGIN_M, FULL_AT_M],
         "map": effects.numbers(),
     }
 

@@ -15,7 +15,7 @@ from affordlib.planning import Skills, execute_plan, plan_astar, plan_continuous
 from affordlib.show import GoalPicker
 from affordlib.show.executors import open_loop
 from affordlib.show.table_data import TableView
-from affordlib.types import Goal
+from affordlib.types import Goal, Obstacle
 from affordlib.world import BASE_X_M, REACH_M, Cuboid
 from tests.waiting import wait_until
 
@@ -367,6 +367,27 @@ def test_turn_and_lift_are_planned_and_done(posed, world, executor, within_deg):
     assert (posed.plan.goal.turn_rad, posed.plan.goal.height_m) == (None, None)
     assert (posed.controls.turn.value, posed.controls.height.value) == (0.0, 0.0)
     assert world.object_state()[2] < 0.05  # released, to be observed and planned for
+
+
+def test_obstacles_of_the_page_are_planned_around_and_stand_on_the_table(posed, world):
+    posed.pick(0.16, 0.0)
+    straight = drawn_path(posed)
+    block = {"corners": [[0.08, -0.02]], "radius": 0.02, "height": 0.06}
+    posed._view.obstacles = [block]
+    plan = in_time(posed).plan
+    assert world.obstacles.all == (Obstacle.disc((0.08, -0.02), 0.02),)
+    assert np.hypot(*(straight - (0.08, -0.02)).T).min() < 0.03
+    assert np.hypot(*(drawn_path(posed) - (0.08, -0.02)).T).min() > 0.045
+    assert plan.predicted_distance_m < 0.02
+    posed.run()
+    assert not world.obstacles.touched
+    posed.start_over()
+    assert len(world.obstacles.all) == 1
+    posed._view.obstacles = [block | {"corners": [[0.0, 0.0]]}]  # on the object: refused
+    assert "Error:</b> obstacles[0] lies on the object" in in_time(posed).controls.words.value
+    assert posed._view.obstacles == [block]
+    posed._view.obstacles = []
+    assert in_time(posed).world.obstacles.all == ()
 
 
 def test_the_robot_is_shown_in_3d_as_it_moved(make_picker, world):

@@ -161,6 +161,6 @@ def test_no_plan_meets_an_obstacle(ask, seen, skills):
         steps = plan["steps"]
         reached += bool(steps) and plan["distance"] < 0.01
         begins = np.array([step["from"] for step in steps]).reshape(-1, 3)
-        actions = [torch.tensor([step[k] for step in steps]).double() for k in ("direction", "stop")]
-        assert (problem.spare_m(begins, *actions) > -1e-4).all()
+        chain = torch.tensor(plan["chain"], dtype=torch.float64).reshape(-1, 2)
+        assert (problem.spare_m(begins, *chain.T) > -1e-4).all()
     assert reached > 15, reached
