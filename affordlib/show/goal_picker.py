@@ -169,10 +169,6 @@ class GoalPicker(widgets.HBox):
                 self.scene.place()
             self._make_plan()
 
-    def set_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
-        """Replace the obstacles, and replan; during a run, after this action."""
-        self._disturb(partial(self._set_obstacles, obstacles))
-
     def figure(self) -> Figure:
         """The table, object, goal and plan as a figure."""
         figure = Figure(figsize=(5.2, 5.2), layout="constrained")
@@ -205,7 +201,7 @@ class GoalPicker(widgets.HBox):
         def adopt():
             wanted = tuple(map(obstacle_of, self._view.obstacles))
             if wanted != self.world.obstacles.all:
-                self.set_obstacles(wanted)
+                self._disturb(partial(self._set_obstacles, wanted))
 
         self._view.observe(place, names="wanted")
         self._view.observe(lambda _: self._soon(adopt), names="obstacles")
@@ -214,12 +210,9 @@ class GoalPicker(widgets.HBox):
         controls.planner.observe(lambda _: self._follow(self.goal), names="value")
         controls.run.on_click(lambda _: self._run_in_background())
         controls.stop.on_click(lambda _: self.stop())
-        for button, action in {
-            controls.shove: self.shove_object,
-            controls.move_goal: self.move_goal,
-            controls.start_over: self.start_over,
-        }.items():
-            button.on_click(lambda _, action=action: self._soon(action))
+        controls.shove.on_click(lambda _: self._soon(self.shove_object))
+        controls.move_goal.on_click(lambda _: self._soon(self.move_goal))
+        controls.start_over.on_click(lambda _: self._soon(self.start_over))
 
     def _soon(self, action: Callable[[], None]) -> None:
         """Run an action in the background, after all earlier ones; during a run, immediately."""
@@ -260,8 +253,6 @@ class GoalPicker(widgets.HBox):
         if not self._running:
             self._soon(plan)
 
-    # Goals and plans
-
     def _set_goal(self, goal: Goal) -> None:
         """Show a goal that has no plan yet."""
         self.controls.show(goal)
@@ -284,7 +275,7 @@ class GoalPicker(widgets.HBox):
             try:
                 seen = self.world.depth_image(), self._pose[:2]
                 problem = self.skills.problem(*seen, goal, obstacles=self.world.obstacles.all)
-                plan = self._planner()(problem)
+                plan = self.planners[self.controls.planner.value](problem)
                 self.controls.say(f"{self._news} {plan_in_words(plan)}")
                 self._news = ""
                 self._show_object(problem.effects)
@@ -316,9 +307,6 @@ class GoalPicker(widgets.HBox):
         if self.scene is not None:
             self.scene.mark(self.goal, plan)
         self._plan_pose, self._turn_from = self._pose, self._pose[2]
-
-    def _planner(self) -> Planner:
-        return self.planners[self.controls.planner.value]
 
     # Execution
 
@@ -372,7 +360,8 @@ class GoalPicker(widgets.HBox):
                     if self._stop.is_set():
                         raise Stopped
                     execute = self.executors[self.controls.executor.value]
-                    outcome = execute(self.world, self.plan, self._planner(), report)
+                    planner = self.planners[self.controls.planner.value]
+                    outcome = execute(self.world, self.plan, planner, report)
                     how = "Done,"
                     self.controls.show_progress(1)
                 except Stopped:
@@ -390,7 +379,6 @@ class GoalPicker(widgets.HBox):
             finally:
                 self.world.on_step = on_step
                 self._disturbances.clear()
-                self._send_motions()
                 self._wait_until_shown()
                 self._pose = self.world.object_pose()
                 self._set_running(False)
@@ -414,7 +402,7 @@ class GoalPicker(widgets.HBox):
         """
         steps, self._shown_until, self._pace_s = itertools.count(), time.monotonic(), pace_s
         if self.scene is not None:
-            self.scene.place()
+            self.scene.place(self.goal, self.plan)
             self._played = 0
 
         def log(world):
@@ -485,8 +473,6 @@ class GoalPicker(widgets.HBox):
         by = self._rng.uniform(least_m, most_m) * unit_vector(self._rng.uniform(0, 2 * np.pi))
         inside = np.abs(np.add(xy_m, by)) < LIMIT_M
         return np.where(inside, by, -np.copysign(by, xy_m))
-
-    # Drawing
 
     def _show(self, planning: bool = False) -> None:
         goal = {"xy": self.goal.xy_m, "tolerance": self.goal.tolerance_m, "yaw": None}

@@ -73,14 +73,14 @@ class Scene(widgets.VBox):
         below = widgets.HBox([self.player, time, speed])
         super().__init__([self.plot, below], layout={"flex": "1 1 420px", "max_width": "700px"})
 
-    def place(self) -> None:
+    def place(self, goal: Goal | None = None, plan: Plan | None = None) -> None:
         """Show the world's present object and obstacles, and forget what was recorded."""
         if self._object is not None:
             self.plot -= self._object
         self._object = self._add(_solid(self.world.obj), TRUTH)
         self._frames: list[np.ndarray] = [self._poses()]
         self._steps = 0
-        self.mark()
+        self.mark(goal, plan)
         self.play(0, playing=False)
 
     def mark(self, goal: Goal | None = None, plan: Plan | None = None) -> None:
