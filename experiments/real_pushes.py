@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import itertools
 import lzma
-import math
 from collections.abc import Iterator, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
@@ -20,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from affordlib.logs import Log, LoggedPushes, fit
+from affordlib.logs import Log, LoggedPushes, fit, planar
 from affordlib.logs.cross_validate import errors_of, forecast_errors, summary
 from affordlib.logs.fit import BASELINES, EFFORT, folds_of
 from affordlib.logs.neural_process import PRETRAINED
@@ -82,12 +81,6 @@ def pushes_of(path: Path) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]
         raise ValueError(f"{path} is damaged, or is not a log of pushes: {error!r}") from error
 
 
-def planar(pose: np.ndarray) -> tuple[float, float, float]:
-    """Return x, y and yaw of a pose (7,)."""
-    x, y, _, w, i, j, k = pose
-    return x, y, math.atan2(2 * (w * k + i * j), 1 - 2 * (j * j + k * k))
-
-
 @lru_cache
 def read_logs(folder: str | Path, told: bool = True) -> LoggedPushes:
     """Read all pushes of the seven conditions; told: include the feet as context."""
@@ -98,7 +91,7 @@ def read_logs(folder: str | Path, told: bool = True) -> LoggedPushes:
             raise FileNotFoundError(f"--logs: there is no {name}.txt or {name}.txt.xz in {folder}")
         context = {"feet": feet_of(name.split("_")[1])} if told else {}
         for poses, t, xy in pushes_of(found[0]):
-            log.add(t, xy, [*map(planar, poses)], context=context, group=name)
+            log.add(t, xy, planar(poses, "wxyz"), context=context, group=name)
     return log.pushes()
 
 

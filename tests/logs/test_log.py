@@ -236,7 +236,7 @@ def test_whatever_follows_a_recorded_push_is_noticed():
     outline = ((0, 0), (130, 0), (30, 110))
     log = Log("mm", outline, tool_radius=1.5)
     for poses, t, xy in pushes_of(condition):
-        poses = [*map(read_pose, poses)]
+        poses = planar(poses, "wxyz")
         across = np.array([xy[0, 1] - xy[-1, 1], xy[-1, 0] - xy[0, 0]])
         for then in (xy[0], (xy[0] + xy[-1]) / 2, 20 * xy[0] - 19 * xy[-1], xy[-1] + 2 * across):
             with pytest.raises(ValueError, match=r"way back|way aside"):
@@ -292,13 +292,9 @@ def shipped(condition="felt_left"):
     """Arguments of `add` of the pushes of a shipped log."""
     path = repo_root() / "data" / "own_log" / f"{condition}.txt.xz"
     return [
-        {"tool_t": t, "tool_xy": xy, "poses": [*map(read_pose, poses)]}
+        {"tool_t": t, "tool_xy": xy, "poses": planar(poses, "wxyz")}
         for poses, t, xy in pushes_of(path)
     ]
-
-
-def read_pose(pose):
-    return planar(pose[None], "wxyz")[0]
 
 
 @pytest.mark.parametrize("late_mm", [0.0, 0.5, 1.5])
