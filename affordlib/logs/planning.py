@@ -126,21 +126,13 @@ class PushedObject:
         )
 
 
-@dataclass(frozen=True)
-class Ways:
-    """Ways of the tool around the object: to points (n,), where there is one."""
-
-    first_m: np.ndarray  # (9, 2), where it may turn; from the first it starts
-    before: np.ndarray  # (9,), the point before each of these
-    via: np.ndarray  # (n,), the last of these before each goal
-    length_m: np.ndarray  # (n,), infinite where there is no way
-
-
 @dataclass
 class PushPlanner:
     """Plans pushes of one object; its library of pushes is drawn and predicted once.
 
-    turn_m: metres per radian in the distance to the goal (default: the radius of gyration); price:
+    turn_m: metres per radian in the distance to the goal (default: the radius of gyration); a plan
+    reaches the goal if its tolerance covers the distance, and turn_m times what the turn is off;
+    price:
     by which share of the present distance each push of a chain must bring the object nearer;
     rounds: of Gauss-Newton steps that refine contacts, directions and lengths of the best chains;
     room_m: least and largest (x, y) that the tool's centre can reach.
@@ -235,11 +227,11 @@ class PushPlanner:
         x, y, yaw = pose
         contact, ahead = np.add(primitive.contact, (x, y)), unit_vector(primitive.direction)
         before = contact - _BEFORE * CLEAR_M * ahead
-        ways = self._ways(pose, tool_xy_m, rotated(before - (x, y), -yaw)[None])
-        points, k = [], int(ways.via[0])
+        turns, last, via, _ = self._ways(pose, tool_xy_m, rotated(before - (x, y), -yaw)[None])
+        points, k = [], int(via[0])
         while k >= 0:
-            points.append(np.add((x, y), rotated(ways.first_m[k], yaw)))
-            k = int(ways.before[k])
+            points.append(np.add((x, y), rotated(turns[k], yaw)))
+            k = int(last[k])
         return np.array([*points[::-1], before, contact + primitive.length * ahead])
 
     def _chain(self, rows: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray]:
@@ -297,7 +289,7 @@ class PushPlanner:
             return np.zeros(len(pushes), dtype=bool)
         middle = pushes.contact_m - self.obj.tool_radius_m * pushes.normal
         before = middle - _BEFORE * CLEAR_M * pushes.direction
-        shut = ~np.isfinite(self._ways(pose, tool_xy_m, before).length_m)
+        shut = ~np.isfinite(self._ways(pose, tool_xy_m, before)[3])
         if self.room_m is not None:
             ends = middle + pushes.length_m[:, None] * pushes.direction
             for points in (before, ends):
@@ -305,8 +297,12 @@ class PushPlanner:
                 shut |= ((world < self.room_m[0]) | (world > self.room_m[1])).any(axis=1)
         return shut
 
-    def _ways(self, pose: Any, tool_xy_m: Any, goals_m: np.ndarray) -> Ways:
-        """Shortest ways in the object's frame, over eight points on a circle around the object."""
+    def _ways(self, pose: Any, tool_xy_m: Any, goals_m: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Shortest ways to goals (n, 2) in the object's frame, over eight points on a circle.
+
+        Returns where the tool may turn (9, 2), from the first it starts; the turn before each (9,);
+        the last turn before each goal, and the length of the way (n,), infinite if there is none.
+        """
         outline_m, radius_m = self.obj.outline_m, self.obj.tool_radius_m
         start = rotated(np.subtract(tool_xy_m, pose[:2]), -pose[2])
         angle = np.linspace(0, 2 * math.pi, 32, endpoint=False)
@@ -331,7 +327,7 @@ class PushPlanner:
         from_start, before = dijkstra(length[:, :9], indices=0, return_predecessors=True)
         total = from_start[:, None] + length[:, 9:]
         via = total.argmin(axis=0)
-        return Ways(turns, before, via, total.min(axis=0))
+        return turns, before, via, total.min(axis=0)
 
 
 def plan_push_at(
@@ -346,10 +342,8 @@ def plan_push_at(
     """Plan off-centre pushes from a pose (x, y, yaw) to a goal, with its rotation if it has one.
 
     pose: of the object's centroid, in metres and radians (`Log.centroid_pose`); goal: a position of
-    the centroid in the same frame, and a turn relative to the present yaw; turn_m: metres per
-    radian in the distance to the goal (default: the radius of gyration). The plan reaches the goal
-    if its tolerance covers the distance, and turn_m times what the turn is off. To plan often, and
-    with the tool's way, keep a `PushPlanner`.
+    the centroid in the same frame, and a turn relative to the present yaw; turn_m: as in
+    `PushPlanner`, which plans often, and with the tool's way.
     """
     return PushPlanner(model, obj, seed, turn_m).plan(pose, goal, n_pushes)
 
