@@ -306,7 +306,7 @@ ROWS = {
 }
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=3 * DRAWS)
 def pushes_of_draw(n: int, draw: int, row: Row) -> LoggedPushes:
     """Return the first n random pushes of a draw, as this row sees them."""
     return logged(collect(n, draw, row.view, block_cog=row.block_cog))

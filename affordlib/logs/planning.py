@@ -132,10 +132,9 @@ class PushPlanner:
 
     turn_m: metres per radian in the distance to the goal (default: the radius of gyration); a plan
     reaches the goal if its tolerance covers the distance, and turn_m times what the turn is off;
-    price:
-    by which share of the present distance each push of a chain must bring the object nearer;
-    rounds: of Gauss-Newton steps that refine contacts, directions and lengths of the best chains;
-    room_m: least and largest (x, y) that the tool's centre can reach.
+    price: by which share of the present distance each push of a chain must bring the object nearer;
+    rounds: of predictions for the Gauss-Newton steps that refine contacts, directions and lengths
+    of the best chains; room_m: least and largest (x, y) that the tool's centre can reach.
     """
 
     model: PushModel
