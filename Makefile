@@ -49,7 +49,7 @@ unexport MPLBACKEND MATPLOTLIBRC
 unexport PIP_USER PIP_TARGET PIP_PREFIX PIP_REQUIREMENT PIP_CONSTRAINT
 unexport PYTEST_ADDOPTS JUPYTER_PATH JUPYTER_TOKEN
 
-.PHONY: help setup workbook lab test test-fast test-plain test-slow soak size book-check lint format bench data checkpoints notebooks html tables \
+.PHONY: help setup workbook nano lab test test-fast test-plain test-slow soak size book-check lint format bench data checkpoints notebooks html tables \
         constraints clean
 
 help: ## List the targets
@@ -113,6 +113,9 @@ $(RUN)/%.ipynb $(RUN)/%.json: $(1)/%.ipynb $(USED)
 endef
 $(foreach folder,notebooks notebooks/appendix,$(eval $(call PAGES,$(folder))))
 endif
+
+nano: $(STAMP) ## Gather, learn, plan and push: the whole idea on one page, in a minute
+	@$(MAKE) -s workbook ONLY=nano FORCE=1
 
 lab: $(STAMP) ## Open the book in JupyterLab, on this machine only (ARGS="--port 9999 --no-browser")
 	@set -f; root=; [[ $$(id -u) == 0 ]] && root=--allow-root; \

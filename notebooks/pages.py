@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     import nbformat
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = {path.stem: path for path in sorted(ROOT.glob("notebooks/[0-9][0-9]_*.ipynb"))}
+PAGES = {path.stem: path for path in ROOT.glob("notebooks/nano.ipynb")}
+PAGES |= {path.stem: path for path in sorted(ROOT.glob("notebooks/[0-9][0-9]_*.ipynb"))}
 PAGES |= {path.stem: path for path in sorted(ROOT.glob("notebooks/appendix/A[0-9]_*.ipynb"))}
 WIDGET = "application/vnd.jupyter.widget-view+json"
 ADDED = {"injected-parameters", "papermill-error-cell-tag"}

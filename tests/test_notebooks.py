@@ -57,7 +57,8 @@ def code_of(notebook):
 def test_title(name):
     first = read(name).cells[0]
     assert first.cell_type == "markdown"
-    assert re.match(rf"# {name[:2]} \S", first.source), f"{name} must begin '# {name[:2]} Title'"
+    number = "The" if name == "nano" else name[:2]
+    assert re.match(rf"# {number} \S", first.source), f"{name} must begin '# {number} Title'"
 
 
 @each_notebook
@@ -79,7 +80,7 @@ def test_every_picture_has_its_caption(name):
         kinds = {kind for output in cell.get("outputs", []) for kind in output.get("data", {})}
         if any(kind.startswith("image/") for kind in kinds):
             count += 1
-            page = name[:2].removeprefix("0")
+            page = "N" if name == "nano" else name[:2].removeprefix("0")
             caption = rf"\*\*Figure {page}\.{count}\.\*\* \S.{{20,}}\.$"
             assert re.match(caption, below.source, re.M), f"below it stands {below.source!r}"
     assert sum(c.source.startswith("**Figure ") for c in cells) == count > 0
@@ -317,6 +318,13 @@ def test_run(name, smoke):
     assert not [t for t, rows in document["tables"].items() if any(rows in of for of in committed)]
     given = default_parameters(name) | given
     assert {k: v for k, v in document["parameters"].items() if k in given}.items() <= given.items()
+
+
+@pytest.mark.slow
+def test_the_block_of_readme_runs(capsys):
+    (block,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    exec(block, {})
+    assert float(capsys.readouterr().out.removesuffix(" mm from the goal\n")) < 5
 
 
 @pytest.mark.slow

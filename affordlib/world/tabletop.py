@@ -244,18 +244,32 @@ class Tabletop(AbstractContextManager):
         return View(**view).picture(self.client, hidden, *size)
 
     def mark(
-        self, xy_m: Sequence[float], rgb: Sequence[float], yaw_rad: float = 0.0, scale: float = 1.0
+        self,
+        xy_m: Sequence[float],
+        rgb: Sequence[float],
+        yaw_rad: float = 0.0,
+        scale: float = 1.0,
+        height_m: float | None = None,
     ) -> None:
-        """Draw the object's footprint at (x, y) [m], in a colour, unseen by the robot's camera."""
+        """Draw the object's footprint at (x, y) [m], in a colour, unseen by the robot's camera.
+
+        height_m: extrude it to a body of this height; by default it lies flat on the table.
+        """
         xy_m, yaw_rad = check_on_table("xy_m", xy_m), check_finite("yaw_rad", yaw_rad)
         outline = check_within("scale", scale, 0.1, 10.0) * self.obj.footprint_m
         rgb = [check_within("rgb", share, 0.0, 1.0) for share in check_array("rgb", rgb, 3)]
         # Larger sheets lie lower, so that a larger one appears as a frame around a smaller one.
-        sheet = [np.vstack([np.insert(outline, 2, z, axis=1) for z in (-0.005, 0.001 / scale)])]
+        top = 0.001 / scale if height_m is None else check_within("height_m", height_m, 0.0, 1.0)
+        sheet = [np.vstack([np.insert(outline, 2, z, axis=1) for z in (-0.005, top)])]
         shape = self.client.createVisualShape(**mesh(sheet), rgbaColor=(*rgb, 1))
         turn = pybullet.getQuaternionFromEuler((0, 0, yaw_rad))
         at = {"basePosition": (*xy_m, -HIDDEN_M), "baseOrientation": turn}
         self._marks.append(self.client.createMultiBody(baseVisualShapeIndex=shape, **at))
+
+    def unmark(self) -> None:
+        """Remove all marks."""
+        while self._marks:
+            self.client.removeBody(self._marks.pop())
 
     def can_reach(self, primitive: Primitive, stop_phase: float, at_xy_m: Sequence[float]) -> bool:
         """Return whether the arm can execute an action at (x, y) [m], with approach and retreat."""
