@@ -27,7 +27,7 @@ from affordlib.world.trajectory import STEP_S
 EVERY = 8
 """Simulation steps (1/240 s) between two recorded poses."""
 
-CAMERA = (0.72, -0.78, 0.52, -0.2, 0.02, 0.19, 0.0, 0.0, 1.0)
+CAMERA = (0.84, -0.88, 0.62, -0.24, 0.02, 0.24, 0.0, 0.0, 1.0)
 """Where the camera stands, what it looks at [m], and what is upwards."""
 
 _WOOD, _STONE = "#ede6d9", "#8c735f"
