@@ -39,7 +39,7 @@ DEEPEST_M = 0.003
 """Overlap [m] of object and obstacle that may be an error of the image."""
 
 FAR_M = 0.01
-"""Gaps [m] above this are not distinguished."""
+"""Gaps [m] above this are not distinguished by planners."""
 
 
 def ring(radius_m: float) -> np.ndarray:
@@ -70,8 +70,8 @@ def _normals(corners: np.ndarray) -> np.ndarray:
     return outward / np.linalg.norm(outward, axis=-1, keepdims=True)
 
 
-def gaps_m(obstacles: Sequence[np.ndarray], shapes: np.ndarray) -> np.ndarray:
-    """Gaps [m] (n, s - 1), at most `FAR_M`, to what n shapes (n, s, k, 2) sweep between s poses.
+def gaps_m(obstacles: Sequence[np.ndarray], shapes: np.ndarray, far_m: float = FAR_M) -> np.ndarray:
+    """Gaps [m] (n, s - 1), at most far_m, to what n shapes (n, s, k, 2) sweep between s poses.
 
     obstacles: corners (m, 2) of each.
     """
@@ -79,8 +79,9 @@ def gaps_m(obstacles: Sequence[np.ndarray], shapes: np.ndarray) -> np.ndarray:
     if not n:
         return np.empty((0, s - 1))
     way = (shapes[:, 1:] - shapes[:, :-1]).mean(axis=2, keepdims=True)
-    angle = np.arctan2(-way[..., 0], way[..., 1])  # any, where nothing moves
-    across = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    across, long = np.stack([way[..., 1], -way[..., 0]], axis=-1), np.linalg.norm(way, axis=-1)
+    moves = long[..., None] > 1e-9
+    across = np.where(moves, across / np.maximum(long[..., None], 1e-9), sides[:, :-1, :1])
     # The hulls are the last axis of all arrays: corners (2, 2k, h), axes (2, a, h), middles (2, h).
     corners, axes = (
         np.concatenate(parts, axis=2).reshape(n * (s - 1), -1, 2).T
@@ -91,11 +92,11 @@ def gaps_m(obstacles: Sequence[np.ndarray], shapes: np.ndarray) -> np.ndarray:
     )
     middles = corners.mean(axis=1)
     radius = np.hypot(*(corners - middles[:, None])).max(axis=0)
-    gaps = np.full(len(radius), FAR_M)
+    gaps = np.full(len(radius), far_m)
     for polygon in obstacles:
         centre, outward = polygon.mean(axis=0), _normals(polygon)
         size = np.linalg.norm(polygon - centre, axis=-1).max()
-        near = np.flatnonzero(np.hypot(*(middles.T - centre).T) < radius + size + FAR_M)
+        near = np.flatnonzero(np.hypot(*(middles.T - centre).T) < radius + size + far_m)
         hull, along = corners[..., near], axes[..., near]
         beyond = _products(along, polygon.T[..., None]).min(axis=1)
         beyond = (beyond - _products(along, hull).max(axis=1)).max(axis=0)

@@ -20,6 +20,7 @@ from affordlib.geometry import rotated
 from affordlib.perception import CAMERA_HEIGHT_M
 from affordlib.planning import ClosedLoopResult
 from affordlib.planning.effect_map import checked_image
+from affordlib.planning.free_space import corners_of
 from affordlib.primitives import Grasp, Rotate
 from affordlib.results import write_atomically
 from affordlib.types import (
@@ -27,6 +28,7 @@ from affordlib.types import (
     TABLE_X_M,
     TABLE_Y_M,
     Goal,
+    Obstacle,
     Outcome,
     Plan,
     Step,
@@ -101,6 +103,13 @@ def plot_footprint(
     filled = style == "filled"
     ax.fill(*outline, facecolor=color if filled else "none", alpha=0.25 if filled else 1, lw=0)
     ax.plot(*_closed(outline), "-" if filled else style, color=color, lw=1.5, label=label)
+    return ax
+
+
+def plot_obstacles(ax: Axes, obstacles: Sequence[Obstacle]) -> Axes:
+    """Draw obstacles from above."""
+    for one in obstacles:
+        ax.fill(*_cm(corners_of(one)), color="#8c6d5a", alpha=0.8, lw=0)
     return ax
 
 

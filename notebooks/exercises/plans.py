@@ -11,10 +11,17 @@ import numpy as np
 import torch
 
 from affordlib.models import load_checkpoint
+<<<<<<< HEAD
 from affordlib.planning import EffectMap, PlanningProblem, plan_continuous, roll_out
 from affordlib.planning.grasp_rotate import predict_trajectories
+=======
+from affordlib.planning import EffectMap, PlanningProblem, plan_continuous
+from affordlib.planning.free_space import corners_of, gaps_m, placed, ring
+from affordlib.planning.grasp_rotate import predict_trajectories
+from affordlib.planning.rollout import poses_along, roll_out
+>>>>>>> 2f410e5 (Page 06: why to stop early, in a corridor; exercises on gaps and stops)
 from affordlib.primitives import Grasp, Push
-from affordlib.types import Goal, Observation, Plan, Step
+from affordlib.types import Goal, Observation, Obstacle, Plan, Step
 from affordlib.world import Cuboid, Prism, Tabletop, UprightCylinder
 from exercises.checking import Exercise, answered, asked
 from exercises.world import rest_cm
@@ -71,6 +78,39 @@ def _push_error_mm(choose: Callable[..., Any]) -> float:
             went = world.execute_primitive(Push.towards(float(direction)), float(phase))
             off.append(math.dist(goal, went.rest_effect[:2]))
     return 1000 * float(np.mean(off))
+
+
+def _gap_error_mm(gap_m: Callable[..., Any]) -> float:
+    """Largest error [mm] of the gaps of 50 pairs of random triangles and boxes."""
+    rng, off = np.random.default_rng(0), []
+    for _ in range(50):
+        triangle = ring(0.03)[np.sort(rng.choice(5, 3, replace=False)) * 3]
+        other = placed(BOX.footprint_m, rng.uniform(-0.07, 0.07, 3) * (1, 1, 40))
+        expected = gaps_m([other], triangle[None, None].repeat(2, axis=1), far_m=1.0)[0, 0]
+        off.append(abs(float(asked(gap_m, triangle, other)) - expected))
+    return 1000 * max(off)
+
+
+def _stop_error_mm(last_phase: Callable[..., Any]) -> float:
+    """Largest error [mm] of the gap to a wall ahead, where executed pushes have stopped."""
+    effects, off, margin_m = _box_effects(), [], 0.004
+    with Tabletop() as world:
+        for far_m in (0.06, 0.08):
+            wall = Obstacle.box((far_m + 0.05, 0.0), (0.02, 0.4))
+            world.place(BOX, yaw_rad=YAW_RAD, obstacles=[wall])
+
+            def gap_at(phase: float, wall: Obstacle = wall) -> float:
+                angle, stop = torch.zeros(1, dtype=torch.float64), torch.tensor([float(phase)])
+                poses = poses_along(effects, np.zeros((1, 3)), angle, stop.double(), 2)[:, [1, 1]]
+                shapes = placed(effects.outline_m, poses)
+                return float(gaps_m([corners_of(wall)], shapes, far_m=1.0)[0, 0])
+
+            stop = float(asked(last_phase, gap_at, margin_m))
+            world.execute_primitive(Push.towards(0.0), stop, approach=True)
+            end = np.array([[world.object_pose()] * 2])
+            gap = gaps_m([corners_of(wall)], placed(BOX.footprint_m, end), far_m=1.0)[0, 0]
+            off.append(abs(float(gap) - margin_m))
+    return 1000 * max(off)
 
 
 # 07 Closed loop
@@ -180,6 +220,20 @@ PLANS: dict[str, Exercise] = {
         expected=0.0,
         within=3.0,
         unit="mm from the goal on average",
+    ),
+    "06.3": Exercise(
+        "Write gap_m(corners, others): the gap between two convex polygons.",
+        _gap_error_mm,
+        expected=0.0,
+        within=0.001,
+        unit="mm, largest error",
+    ),
+    "06.4": Exercise(
+        "Write last_phase(gap_at, margin_m): where a push towards a wall must stop.",
+        _stop_error_mm,
+        expected=0.0,
+        within=2.0,
+        unit="mm from the margin, at most",
     ),
     "07.1": Exercise(
         "Write bring(look, plan, act): observe after every action, and plan again where needed.",

@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import torch
 
 from exercises import check
@@ -30,7 +31,31 @@ def choose(effects, goal_xy_m):
     return float(angle.flatten()[best]), float(stop.flatten()[best])
 
 
-VERDICTS = [check("06.1", chain_end), check("06.2", choose)]
+def gap_m(corners, others):
+    """The largest separation along the normals of the edges of either."""
+    found = []
+    for these, those in ((corners, others), (others, corners)):
+        edges = np.roll(these, -1, axis=0) - these
+        outward = np.column_stack([edges[:, 1], -edges[:, 0]])
+        outward = outward / np.linalg.norm(outward, axis=1, keepdims=True)
+        beyond = (those @ outward.T).min(axis=0) - (these * outward).sum(axis=1)
+        found.append(beyond.max())
+    return max(found)
+
+
+def last_phase(gap_at, margin_m):
+    """What is blocked at one phase is blocked at all later ones."""
+    phases = np.linspace(0, 1, 401)
+    blocked = np.array([gap_at(phase) < margin_m for phase in phases])
+    return float(phases[max(int(blocked.argmax()) - 1, 0)]) if blocked.any() else 1.0
+
+
+VERDICTS = [
+    check("06.1", chain_end),
+    check("06.2", choose),
+    check("06.3", gap_m),
+    check("06.4", last_phase),
+]
 
 if __name__ == "__main__":
     print(*VERDICTS, sep="\n")
