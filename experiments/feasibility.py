@@ -13,10 +13,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from affordlib.planning.routes import RouteMap, find_route
 from affordlib.primitives import HOVER_M, TIP_HEIGHT_M, Drag, Move, Push
 from affordlib.world import UnreachableError, robot
 from affordlib.world.trajectory import RETREAT_M
+from experiments.routes import RouteMap, find_route
 
 BAND_M = 0.01
 """Distance [m] from the limit of the reach within which goals are reported separately."""
@@ -92,7 +92,7 @@ def is_feasible(
     half_mm = 5 * round(200 * half_m)
     routes = _routes(kind, half_mm, slack_m)
     judge = possible(kind, half_mm / 1000, slack_m)
-    return find_route(routes, start_xy_m, goal_xy_m, judge) is not None
+    return bool(find_route(routes, start_xy_m, goal_xy_m, judge))
 
 
 def on_the_rim(

@@ -223,17 +223,14 @@ def _predicted(effects: EffectMap, direction: Tensor, phase: Tensor) -> tuple[Te
 def plan_continuous(
     problem: PlanningProblem,
     seed: int = 0,
-    draft: bool = False,
     trace: list[tuple[Tensor, Tensor, Tensor]] | None = None,
     risk_weight: float = RISK_WEIGHT,
 ) -> Plan:
     """Plan by optimising directions and phases together.
 
-    Where no chain comes near the goal, the plan is the one that comes nearest. draft: compute a
-    first plan with as few actions as the distance allows, without gradient descent; with three
-    actions it takes a quarter of the time. trace, if given, receives for each number of actions K
-    the directions and phases (B, K) of the remaining chains, and their costs (B,) [m].
-    risk_weight: λ.
+    Where no chain comes near the goal, the plan is the one that comes nearest. trace,
+    if given, receives for each number of actions K the directions and phases (B, K) of the
+    remaining chains, and their costs (B,) [m]. risk_weight: λ.
     """
     began = time.perf_counter()
     effects, start, goal, mode = problem.effects, problem.start_xy_m, problem.goal, problem.mode
@@ -247,9 +244,9 @@ def plan_continuous(
         if float(target.norm()) < 1e-4 or (candidates and candidates[0][0] < NEAR_M):
             break
         for n_actions in range(min(fewest, mode.max_steps), mode.max_steps + 1):
-            candidates += _best_chain(problem, value, target, (n, n_actions), rng, draft, trace)
+            candidates += _best_chain(problem, value, target, (n, n_actions), rng, trace)
             candidates.sort(key=lambda one: one[0])
-            enough = fewest + (not draft)
+            enough = fewest + 1
             if problem.obstacles:
                 enough = 1 if candidates and candidates[0][0] < NEAR_M else math.inf
             if candidates and n_actions >= enough:
@@ -258,7 +255,7 @@ def plan_continuous(
     near = [one for one in candidates[:N_REFINED] if problem.obstacles and one[0] < NEAR_M]
     for _, *best in near or candidates[:1]:
         best = tuple(best)
-        chain, predicted = correct(effects, target, best, mode.partial, 1 if draft else CORRECTIONS)
+        chain, predicted = correct(effects, target, best, mode.partial)
         ok = _allowed(problem, predicted[0][None], chain[None, :, 0]).all()
         if not (ok and (not problem.obstacles or free(problem, tuple(chain.T[:, None])).all())):
             chain, predicted = torch.cat(best).T, None
@@ -292,7 +289,6 @@ def _best_chain(
     target: Tensor,
     size: tuple[int, int],
     rng: np.random.Generator,
-    draft: bool,
     trace: list[tuple[Tensor, Tensor, Tensor]] | None,
 ) -> list[tuple[float, Tensor, Tensor]]:
     """Costs [m] and actions (1, K) of the best of n chains, best first; size: (n, K)."""
@@ -314,7 +310,7 @@ def _best_chain(
         return []
     direction, phase, cost = direction[order], phase[order], cost[order]
     # A single action that ends at the goal has no free parameter left to optimise.
-    if n_actions > 1 and not draft:
+    if n_actions > 1:
         after = _descend(value, (direction, phase), stops_early)
         lower = costs(*after)
         if problem.obstacles:

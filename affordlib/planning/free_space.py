@@ -193,18 +193,6 @@ class FreeSpace:
         by_hand = gaps_m(self.polygons, placed(hand_m(action), hand))[:, 0]
         return np.minimum(spare, by_hand - self.margin_m(poses[:, 0, :2]))
 
-    def is_free_line(
-        self, action: Primitive, xy_m: np.ndarray, direction_rad: np.ndarray, length_m: np.ndarray
-    ) -> np.ndarray:
-        """Return whether full actions (n,) from positions (n, 2), by lengths (n,) [m], are free.
-
-        It is an estimate for routes, with the object as its image shows it.
-        """
-        poses = np.zeros((len(xy_m), 2, 3))
-        ahead = np.stack([np.cos(direction_rad), np.sin(direction_rad)], axis=-1)
-        poses[:, 0, :2], poses[:, 1, :2] = xy_m, xy_m + length_m[:, None] * ahead
-        return self.spare_m(action, direction_rad, np.ones(len(xy_m)), poses) >= 0
-
     def is_free(self, step: Step) -> bool:
         """Return whether the hand can close around the object, at the end of a step, and turn."""
         turn_rad = Rotate.sweep_rad if isinstance(step.primitive, Rotate) else 0.0

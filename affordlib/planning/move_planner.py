@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from affordlib.geometry import unit_vector
 from affordlib.planning.effect_map import EffectMap
-from affordlib.planning.problem import PlanMode, Planner, PlanningProblem
+from affordlib.planning.problem import PlanMode, Planner, PlanningProblem, Reachable
 from affordlib.planning.robot import Robot
-from affordlib.planning.routes import Feasible, find_route
 from affordlib.planning.skills import Skills
 from affordlib.primitives import Drag, Move, Primitive
 from affordlib.types import Goal, Observation, Plan
@@ -20,6 +20,8 @@ REFUSED_WITHIN_M, REFUSED_WITHIN_RAD = 0.01, math.radians(6)
 """Actions this near to a refused action, in position [m] and direction [rad], are excluded."""
 
 WAYPOINT_TOLERANCE_M = 0.01
+ASIDE_RAD = (0.0, 0.6, -0.6, 1.2, -1.2)
+"""Directions of waypoints relative to the goal's, in the order in which they are tried."""
 
 
 class Ending(NamedTuple):
@@ -66,7 +68,7 @@ class MovePlanner:
         plan, self._ends_m = None, [distance_m]
         if distance_m <= self.mode.max_steps * effects.reach_m:
             plan = self._plan_to(whole, goal, goal.tolerance_m)
-        plan = plan or self._plan_along(whole, seen, self._route(whole))
+        plan = plan or self._plan_towards(whole, seen)
         if plan:
             return plan
         best = f"the best ends {1000 * min(self._ends_m):.1f} mm from it"
@@ -81,19 +83,24 @@ class MovePlanner:
             f"follow; {best}, and planning again from the same place gives the same",
         )
 
-    def _plan_along(
-        self, whole: PlanningProblem, seen: Observation, route: list[Point]
-    ) -> Plan | None:
-        """Plan as far along a route as possible."""
-        goal, farthest_m = whole.goal, 0.98 * self.mode.max_steps * whole.effects.reach_m
-        for stop in reversed(route):
-            within_m = WAYPOINT_TOLERANCE_M
-            if stop == goal.xy_m:
-                within_m = max(goal.tolerance_m, 0.5 * goal.distance_m(seen.xy_m))
-            if math.dist(seen.xy_m, stop) <= farthest_m:
-                problem = self._problem(whole.effects, seen, Goal(stop, goal.tolerance_m))
-                if plan := self._plan_to(problem, goal, within_m):
-                    return plan
+    def _plan_towards(self, whole: PlanningProblem, seen: Observation) -> Plan | None:
+        """Plan to a place as near to the goal as a plan can come, from where the arm can go on."""
+        goal, effects, here = whole.goal, whole.effects, np.array(seen.xy_m)
+        far_m = min(0.98 * self.mode.max_steps * effects.reach_m, goal.distance_m(here))
+        ahead = np.subtract(goal.xy_m, here)
+        for aside_rad in ASIDE_RAD:
+            stop = here + far_m * unit_vector(math.atan2(ahead[1], ahead[0]) + aside_rad)
+            left, within_m = np.subtract(goal.xy_m, stop), WAYPOINT_TOLERANCE_M
+            if np.hypot(*left) < 1e-6:  # the goal itself: half of the way is worth going
+                within_m = 0.0 if seen.obstacles else max(goal.tolerance_m, far_m / 2)
+            elif not whole.reachable(stop[None], np.array([math.atan2(left[1], left[0])]))[0]:
+                continue
+            try:
+                problem = self._problem(effects, seen, Goal(tuple(stop.tolist()), goal.tolerance_m))
+            except ValueError:  # off the table, or on an obstacle
+                continue
+            if plan := self._plan_to(problem, goal, within_m):
+                return plan
         return None
 
     def _plan_to(self, problem: PlanningProblem, goal: Goal, within_m: float) -> Plan | None:
@@ -113,21 +120,7 @@ class MovePlanner:
         more = {"table": self.skills.table, "obstacles": seen.obstacles}
         return PlanningProblem(seen.xy_m, goal, effects, self.mode, allowed, **more)
 
-    def _route(self, whole: PlanningProblem) -> list[Point]:
-        """Places on the shortest route to the goal; empty if there is none."""
-        effects, allowed = whole.effects, whole.reachable
-        routes = self.skills.routes(effects.kind)
-        if whole.obstacles:
-            action = effects.kind.towards(0.0)
-
-            def allowed(*move):
-                free = whole.free_space.is_free_line(action, *move)
-                return free & whole.reachable(*move)
-
-            routes = routes.only(allowed)
-        return find_route(routes, whole.start_xy_m, whole.goal.xy_m, allowed, effects.radius_m)
-
-    def _allowed(self, kind: type[Primitive]) -> Feasible:
+    def _allowed(self, kind: type[Primitive]) -> Reachable:
         """Where the arm can act: learned reachability, without the actions refused so far."""
         learned = self.skills.reachable(kind)
         refused = [(xy, angle) for name, xy, angle in self._refused if name == kind.name]

@@ -21,7 +21,6 @@ from affordlib.planning.problem import (
     everywhere,
 )
 from affordlib.planning.reachability import Reachability
-from affordlib.planning.routes import RouteMap
 from affordlib.primitives import Grasp, Move, Primitive, Rotate, move_for, primitive_named
 from affordlib.types import Goal, Obstacle, Step, check_field
 
@@ -50,7 +49,6 @@ class Skills:
     threshold: float = 0.2
     table: Table = OUR_TABLE
     _last: dict[bytes, tuple[EffectMap, PosePlanner | None]] = field(**_KEPT)
-    _routes: dict[type[Primitive], RouteMap] = field(**_KEPT)
 
     def __post_init__(self) -> None:
         for name in self.models:
@@ -135,9 +133,3 @@ class Skills:
             return self.reachability.probability(kind.name, xy_m, direction_rad) >= self.threshold
 
         return reachable
-
-    def routes(self, kind: type[Move]) -> RouteMap:
-        """Moves that the arm can make between places all over the table; computed once."""
-        if kind not in self._routes:
-            self._routes[kind] = RouteMap.of(kind.reach_m, self.reachable(kind), self.table)
-        return self._routes[kind]

@@ -12,6 +12,7 @@ from affordlib.show.plots import (
     plot_closed_loop,
     plot_depth,
     plot_footprint,
+    plot_obstacles,
     plot_outcome,
     plot_plan,
     plot_table,

@@ -1,13 +1,12 @@
 """Routes to distant goals: shortest paths over a grid of places, by reachable actions.
 
-A planner of a few actions covers about 25 cm. Whether an object can be brought across the table,
-and by which route, depends on where the arm can act. Dijkstra's algorithm from the goal answers
-this for all places at once; the planner then goes from waypoint to waypoint.
+Whether an object can be brought across the table depends on where the arm can act. Dijkstra's
+algorithm from the goal answers this for all places at once.
 """
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -53,14 +52,6 @@ class RouteMap:
         angle, length_m = np.arctan2(moves[:, 1], moves[:, 0])[move], length_m[move]
         ok = feasible(places[origin], angle, length_m)
         return cls(reach_m, table, places, origin[ok], end[ok], length_m[ok])
-
-    def only(self, feasible: Feasible) -> Self:
-        """Return the map of those moves that are feasible."""
-        way = self.places_xy_m[self.end] - self.places_xy_m[self.origin]
-        angle = np.arctan2(way[:, 1], way[:, 0])
-        ok = feasible(self.places_xy_m[self.origin], angle, self.length_m)
-        left = {name: getattr(self, name)[ok] for name in ("origin", "end", "length_m")}
-        return replace(self, **left)
 
 
 def find_route(
