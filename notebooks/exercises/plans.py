@@ -11,15 +11,18 @@ import numpy as np
 import torch
 
 from affordlib.models import load_checkpoint
-<<<<<<< HEAD
-from affordlib.planning import EffectMap, PlanningProblem, plan_continuous, roll_out
+from affordlib.planning import (
+    EffectMap,
+    PlanningProblem,
+    corners_of,
+    gaps_m,
+    placed,
+    plan_continuous,
+    roll_out,
+)
+from affordlib.planning.free_space import ring
 from affordlib.planning.grasp_rotate import predict_trajectories
-=======
-from affordlib.planning import EffectMap, PlanningProblem, plan_continuous
-from affordlib.planning.free_space import corners_of, gaps_m, placed, ring
-from affordlib.planning.grasp_rotate import predict_trajectories
-from affordlib.planning.rollout import poses_along, roll_out
->>>>>>> 2f410e5 (Page 06: why to stop early, in a corridor; exercises on gaps and stops)
+from affordlib.planning.rollout import poses_along
 from affordlib.primitives import Grasp, Push
 from affordlib.types import Goal, Observation, Obstacle, Plan, Step
 from affordlib.world import Cuboid, Prism, Tabletop, UprightCylinder
