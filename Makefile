@@ -49,7 +49,7 @@ unexport MPLBACKEND MATPLOTLIBRC
 unexport PIP_USER PIP_TARGET PIP_PREFIX PIP_REQUIREMENT PIP_CONSTRAINT
 unexport PYTEST_ADDOPTS JUPYTER_PATH JUPYTER_TOKEN
 
-.PHONY: help setup workbook nano lab test test-fast test-plain test-slow soak size book-check lint format bench data checkpoints notebooks html tables \
+.PHONY: help setup workbook nano lab test test-fast test-plain test-slow size book-check lint format bench data checkpoints notebooks html tables \
         constraints clean
 
 help: ## List the targets
@@ -139,9 +139,6 @@ test-plain: $(STAMP) ## Run the fast tests without vector instructions, as on an
 test-slow: $(STAMP) ## Run every notebook and solution as a reader does; the log is runs/test-slow.log
 	@mkdir -p runs; { $(LEASH) $(MAKE) workbook PROFILE=reader OUT=test-slow FORCE=1; \
 	  $(PY) -m pytest tests/test_exercises.py tests/show/test_browser*.py; } 2>&1 | tee runs/test-slow.log
-
-soak: $(STAMP) ## Plan and execute 3,000 times; check that memory and results stay the same (15 min)
-	@OMP_NUM_THREADS=1 $(PY) -m tests.soak
 
 size: $(STAMP) ## Count lines and files, and fail if they exceed the budgets
 	@$(PY) -m tests.size

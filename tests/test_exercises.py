@@ -1,5 +1,4 @@
 import re
-import runpy
 from dataclasses import replace
 
 import nbformat
@@ -19,16 +18,6 @@ def test_the_chapters_with_checks_have_two_exercises_and_solutions():
     assert {path.stem for path in SOLUTIONS} == {n for n in PATHS if n[:2] in ASKED}
     assert {name[:2] for name in PATHS if name[0] == "0"} | {"A5"} == ASKED
     assert all(sum(e[:2] == number for e in EXERCISES) >= 2 for number in ASKED)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("path", SOLUTIONS, ids=lambda path: path.stem)
-def test_every_solution_passes(path):
-    verdicts = runpy.run_path(str(path))["VERDICTS"]
-    assert [v.name for v in verdicts] == [n for n in EXERCISES if n[:2] == path.stem[:2]]
-    for verdict in verdicts:
-        assert verdict.passed, str(verdict)
-        assert "; expected" in str(verdict)
 
 
 @pytest.mark.parametrize("name", [n for n in PATHS if n[:2] in ASKED])
@@ -73,24 +62,16 @@ def trusting(plan, act):
     [
         ("01.1", lambda t: 0.0, "failed, 125 mm/s, largest error; expected 0 ± 0.1 mm/s"),
         ("01.1", lambda t: 1 / 0, "failed (ZeroDivisionError: division by zero); expected"),
-        ("01.1", 3.0, "failed (TypeError"),
         ("01.2", lambda image: 16**2 * image[1].mean() * 6, "failed, 20.7"),
-        ("01.2", 150.0, "failed (TypeError"),
         ("02.1", 7.5, "failed, 7.5 mm; expected 0.076 ± 0.005 mm"),
-        ("02.2", lambda d: 0.05 + d / 2, "failed, 5.2"),
-        ("03.1", 0.0, "failed, 0 mm; expected 1.38"),
         ("03.2", lambda mean, sigma, rng: mean, "failed (ValueError: the draws spread by 0.00 σ"),
-        ("03.2", lambda m, s, rng: m + s * rng.standard_normal(2), "failed, 1.0"),
         (
             "03.2",
             lambda m, s, rng: rng.normal(m, s)[1:],
             "failed (ValueError: a trajectory has",
         ),
-        ("04.1", lambda model, arrays: 0.0, "failed, 0 mm for the paper's network"),
         ("04.1", lambda model, arrays: 0.002, "failed (ValueError: ours rotates with"),
-        ("04.2", 1.0, "failed, 89"),
         ("05.1", 0.261, "failed, 0.261 cm"),
-        ("05.2", 1.09, "failed, 1.09 times"),
         ("06.1", straight, "failed, 16.8"),
         ("06.2", lambda effects, goal: (np.arctan2(goal[1], goal[0]), 1.0), "failed, 39"),
         ("07.1", lambda look, plan, act: trusting(plan(look()), act), "failed, 77"),
@@ -103,7 +84,6 @@ def trusting(plan, act):
         ),
         ("07.2", lambda height, phase, course: 1.0, "failed, 220"),
         ("08.1", lambda image: image[1].mean(), "failed, 31"),
-        ("08.2", 0.42, "failed, 0.42 mm"),
         ("A5.1", 0.6, "failed, 0.6 of the full action; expected 0.58"),
         ("A5.2", lambda a, b: a.read_bytes() == b.read_bytes(), "failed, 1 pairs"),
     ],

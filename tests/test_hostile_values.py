@@ -301,7 +301,7 @@ def test_a_hostile_value_is_refused_by_name_or_does_no_harm(shop, name, tmp_path
     found = []
 
     @settings(
-        max_examples=200,
+        max_examples=60,
         derandomize=True,
         deadline=None,
         database=None,

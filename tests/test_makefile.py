@@ -91,16 +91,6 @@ def test_it_installs_once_even_when_two_begin_and_then_has_nothing_to_do(project
     assert "skew" not in said
 
 
-def test_an_installation_that_failed_is_made_anew_and_says_why(project):
-    (project.here / "no_network").touch()
-    failed, said, _ = project.make()
-    assert failed
-    assert "The conflict is caused by: no network" in said
-    (project.here / "no_network").unlink()
-    shutil.rmtree(project.here / ".venv")  # as `venv --clear` does
-    assert project.make()[::2] == (False, ["-m venv", *INSTALLED])
-
-
 def test_what_a_link_leads_to_is_not_emptied(project):
     other = project.here.parent / "other"
     other.mkdir()

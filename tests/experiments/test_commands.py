@@ -41,26 +41,6 @@ def test_unknown_names_and_impossible_numbers_are_refused(capsys, line, named):
 
 
 @pytest.mark.parametrize(
-    "line",
-    [
-        "experiments.effect_prediction --only model=constant data=drag fold=1 --raw {}",
-        "experiments.lever_up --only model=persistence --raw {}",
-        "experiments.studies --only study=partial_execution --raw {}",
-        "experiments.shipped data --only grasp --workers 1 --to {}",
-    ],
-)
-def test_a_file_in_place_of_a_folder_is_named(tmp_path, capsys, line):
-    file = tmp_path / "file"
-    file.touch()
-    name, *arguments = line.format(file).split()
-    assert main_of(name)(arguments) == 1
-    last = capsys.readouterr().err.splitlines()[-1]
-    assert last.startswith(f"{name.rpartition('.')[2]}: ")
-    assert str(file) in last
-    assert file.read_bytes() == b""
-
-
-@pytest.mark.parametrize(
     ("only", "named"),
     [
         ("model=film,flim", "no job has model = 'flim', but cnp, .*, nearest$"),
@@ -99,8 +79,3 @@ def test_a_command_ends_with_a_status_and_one_line(capsys, how, code):
     line = "interrupted; finished work is kept; run it again to continue"
     expected = {1: "test_commands: no room\n", 7: ""}
     assert capsys.readouterr().err == expected.get(code, f"\ntest_commands: {line}\n")
-
-
-def test_other_errors_of_a_command_keep_their_traceback():
-    with pytest.raises(ZeroDivisionError):
-        command(OSError)(lambda: 1 / 0)()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from experiments import cross_validation, runner
+from experiments import cross_validation
 from experiments import effect_prediction as tables
 from experiments.cross_validation import (
     executed_columns,
@@ -17,10 +17,9 @@ from experiments.cross_validation import (
 from experiments.grasps import (
     auc,
     confusion_columns,
-    grasp_rows,
 )
 from experiments.lever_up import job as lever_job
-from experiments.runner import read, run
+from experiments.runner import run
 
 FEW = [job("constant", "grasp", fold=fold) for fold in range(3)]
 
@@ -106,21 +105,6 @@ def test_shipped_networks_are_those_of_the_tables():
         assert (cross_validation.task_of(spec.data).symmetries or ()) == spec.symmetries
 
 
-def test_results_must_agree_about_what_happened(tmp_path):
-    run([*FEW, job("nearest", "grasp")], tables.NAME, folder=tmp_path, progress=False)
-    assert len(tables.sorted_results(tmp_path)) == 4
-    records = runner._records(tables.NAME, tmp_path)
-    columns = records[runner._key(FEW[0].arguments)]["result"]["fold_test"]
-    for shift, same in ((5e-7, True), (1e-4, False)):
-        columns["truth_z"] = [z + shift for z in columns["truth_z"]]
-        runner._add(records, tables.NAME, tmp_path)
-        if same:
-            assert tables.sorted_results(tmp_path)
-        else:
-            with pytest.raises(ValueError, match=r"'grasp' differ in .* interaction \d+"):
-                tables.sorted_results(tmp_path)
-
-
 # Tables
 
 
@@ -136,20 +120,6 @@ def test_a_fold_may_lack_a_category():
     rows = tables.error_rows(tables.predictions_of(folds, "drag", "fixed_test"), "drag")
     means = [row["final_error_mean_m"] for row in rows]
     assert means == pytest.approx([0.00225, 0.0015, 0.003])
-
-
-def test_a_second_cross_validation_counts_no_grasp_twice(tmp_path):
-    def rows():
-        return grasp_rows(
-            tables.predictions_of(tables.sorted_results(tmp_path), "grasp", "fold_test")
-        )
-
-    run(FEW, tables.NAME, folder=tmp_path, progress=False)
-    one = rows()
-    again = [job("constant", "grasp", fold=fold, seed=1) for fold in range(3)]
-    run(again, tables.NAME, folder=tmp_path, progress=False)
-    assert len(read(tables.NAME, job, tmp_path)) == 6
-    assert rows() == one
 
 
 # The inverse problem

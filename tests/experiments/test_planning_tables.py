@@ -84,24 +84,6 @@ def test_actions_are_placed_by_the_plan(world):
     assert once.distance_m < 0.003
 
 
-def test_with_a_receding_horizon_each_plan_has_one_action_less(world):
-    task = next(t for t in frozen_tasks() if t.mode == "multi_partial" and not t.obj.rollable)
-    config, seen = CONFIGS["mpc_continuous"], []
-
-    def watched(problem):
-        seen.append((problem.start_xy_m, problem.mode.max_steps))
-        plan = config.planner(problem)
-        # A plan that stops half way has a remaining distance.
-        steps = tuple(replace(s, stop_phase=0.8) for s in plan.steps) if len(seen) < 3 else ()
-        return replace(plan, steps=steps)
-
-    outcome = attempt(world, task, config.pose(world), watched, receding=True)
-    assert [n for _, n in seen] == [3, 2, 1]
-    assert len({xy for xy, _ in seen}) == 3
-    assert len(outcome.object_paths_xy_m) == 2
-    assert outcome.distance_m == task.goal.distance_m(world.object_pose()[:2])
-
-
 def test_the_cross_entropy_method_keeps_to_its_actions_and_reaches_goals(world):
     tasks = [t for t in frozen_tasks() if t.goals == "constructed" and not t.obj.rollable]
     config, ends = CONFIGS["cem"], []

@@ -8,8 +8,6 @@ from dataclasses import dataclass, replace
 
 import pandas as pd
 import pytest
-from dask.distributed import Client
-from joblib import parallel_config
 from pandas.testing import assert_frame_equal
 
 from affordlib.results import read_results, repo_root, write_results
@@ -92,32 +90,6 @@ def test_what_was_made_of_something_else_is_refused_and_made_again(tmp_path, cha
     run([before(2)], "table", folder=tmp_path, progress=False)
     assert CALLS == [2, 2]
     assert read("table", lambda n: job(n, settings=Settings(device="cuda")), tmp_path)
-
-
-def test_a_data_set_that_is_not_here_is_not_compared(tmp_path, monkeypatch):
-    run([job(2)], "table", folder=tmp_path, progress=False)
-    whole = (tmp_path / "table.jsonl.gz").read_bytes()
-
-    def not_here(name):
-        raise FileNotFoundError(name)
-
-    with monkeypatch.context() as patched:
-        patched.setattr(runner, "stored_sha256", not_here)
-        assert read("table", job, tmp_path, accept=True)
-    assert (tmp_path / "table.jsonl.gz").read_bytes() == whole
-    assert read("table", job, tmp_path)
-
-
-def test_workers_make_the_same_bytes(tmp_path):
-    jobs = [job(n) for n in range(1, 5)]
-    run(jobs, "table", folder=tmp_path / "here", progress=False)
-    with (
-        Client(processes=False, n_workers=1, threads_per_worker=1, dashboard_address=None),
-        parallel_config("dask"),
-    ):
-        run(jobs[::-1], "table", tmp_path / "away", progress=False)
-    here, away = (tmp_path / side / "table.jsonl.gz" for side in ("here", "away"))
-    assert here.read_bytes() == away.read_bytes()
 
 
 def test_damaged_results_are_named_and_none_are_no_results(tmp_path):

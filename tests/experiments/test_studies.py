@@ -1,8 +1,6 @@
 """Studies: ablations, and predictions of partial actions."""
 
 import lzma
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -75,10 +73,3 @@ def test_a_damaged_log_of_pushes_is_named(tmp_path):
         path.write_bytes(content)
         with pytest.raises(ValueError, match=f"{name} is damaged, or is not a log of pushes"):
             list(pushes_of(path))
-
-
-def test_what_decides_a_study_is_the_same_in_every_process():
-    code = "from experiments.studies import *; print([job(k).made_of() for k in sorted(BY_NAME)])"
-    here = str([studies.job(name).made_of() for name in sorted(studies.BY_NAME)])
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, text=True)
-    assert run.stdout.strip() == here

@@ -10,7 +10,6 @@ import threading
 import time
 from contextlib import suppress
 from dataclasses import replace
-from multiprocessing.pool import ThreadPool
 from pathlib import Path
 
 import psutil
@@ -106,13 +105,6 @@ def test_paths_and_workers_that_cannot_be_are_named(tmp_path):
             collect_set(SMALL, tmp_path / "x.zarr.zip", workers=workers)
 
 
-def test_a_worker_with_other_packages_is_refused(tmp_path, made, monkeypatch):
-    numpys = iter(("2.4.6", "1.0"))
-    monkeypatch.setattr(collect, "attributes_for", lambda _: {"numpy": next(numpys)})
-    with pytest.raises(RuntimeError, match=r"another set .*1\.0.*, not .*2\.4\.6"):
-        collect_set(SMALL, tmp_path / "x.zarr.zip", progress=False)
-
-
 # Processes of this machine
 
 SCRIPT = """
@@ -140,12 +132,11 @@ def start(*arguments, **options):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(2))
-def test_a_collector_killed_at_any_moment_is_no_loss(undisturbed, tmp_path, seed):
+def test_a_collector_killed_at_any_moment_is_no_loss(undisturbed, tmp_path):
     path = tmp_path / "set.zarr.zip"
-    process = start("-c", SCRIPT, path, 6, 1 + seed % 2)
+    process = start("-c", SCRIPT, path, 6, 2)
     wait_until(lambda: list(tmp_path.glob(".set*.parts")) or process.poll() is not None, 120)
-    time.sleep(random.Random(seed).uniform(0, 3))
+    time.sleep(random.uniform(0, 3))
     family = psutil.Process(process.pid).children(recursive=True)
     process.kill()
     process.communicate(timeout=180)  # its workers write to the same pipes
@@ -153,16 +144,6 @@ def test_a_collector_killed_at_any_moment_is_no_loss(undisturbed, tmp_path, seed
     collect_set(SMALL, path, progress=False)
     assert path.read_bytes() == undisturbed(SMALL).read_bytes()
     assert names_in(tmp_path) == [path.name]
-
-
-@pytest.mark.slow
-def test_a_script_with_workers_needs_no_guard(undisturbed, tmp_path):
-    script, path = tmp_path / "script.py", tmp_path / "a.zarr.zip"
-    script.write_text(SCRIPT)
-    process = start(script, path, 6, 2)
-    assert (*process.communicate(timeout=120), process.returncode) == ("started\n", "", 0)
-    assert path.read_bytes() == undisturbed(SMALL).read_bytes()
-    assert set(names_in(tmp_path)) == {script.name, path.name}
 
 
 @pytest.mark.slow
@@ -177,25 +158,6 @@ def test_ctrl_c_ends_collecting_with_one_error(tmp_path):
         "KeyboardInterrupt",
         "finished chunks are kept; collect into the same path to continue",
     ]
-
-
-@pytest.mark.slow
-def test_make_data_is_ended_with_one_line(tmp_path):
-    arguments = ["data", "--only", "push", "--to", tmp_path, "--workers", "2"]
-    process = start("-m", "experiments.shipped", *arguments)
-    wait_until(lambda: psutil.Process(process.pid).children(), 120, process)
-    time.sleep(2)
-    family = psutil.Process(process.pid).children(recursive=True)
-    process.terminate()
-    _, err = process.communicate(timeout=60)
-    assert process.returncode == 128 + signal.SIGTERM
-    assert err.splitlines()[-1] == (
-        "shipped: interrupted; finished work is kept; run it again to continue"
-    )
-    for noise in ("Traceback", "distributed", "leaked"):
-        assert noise not in err
-    assert not psutil.wait_procs(family, timeout=20)[1]
-    assert not (tmp_path / "push.zarr.zip").exists()
 
 
 # Workers that fail
@@ -237,8 +199,7 @@ def test_a_worker_that_dies_says_so(undisturbed, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(2))
-def test_workers_killed_at_any_moment_are_no_loss(undisturbed, tmp_path, seed):
+def test_workers_killed_at_any_moment_are_no_loss(undisturbed, tmp_path):
     """They have no open port, and a rerun continues."""
     path, here = tmp_path / "set.zarr.zip", psutil.Process()
 
@@ -247,8 +208,8 @@ def test_workers_killed_at_any_moment_are_no_loss(undisturbed, tmp_path, seed):
         family = here.children(recursive=True)
         assert not [c for p in family for c in p.net_connections("inet")]
         workers = [p for p in family if "LokyProcess" in " ".join(p.cmdline())]
-        time.sleep(random.Random(seed).uniform(0, 0.6))
-        workers[seed].kill()
+        time.sleep(random.uniform(0, 0.6))
+        random.choice(workers).kill()
 
     killer = threading.Thread(target=kill)
     killer.start()
@@ -258,14 +219,6 @@ def test_workers_killed_at_any_moment_are_no_loss(undisturbed, tmp_path, seed):
     killer.join()
     collect_set(recipe, path, 2, progress=False)
     assert path.read_bytes() == undisturbed(recipe).read_bytes()
-    assert names_in(tmp_path) == [path.name]
-
-
-def test_a_complete_set_is_returned_to_all_who_ask_at_once(tmp_path, made):
-    path = collect_set(SMALL, tmp_path / "x.zarr.zip", progress=False)
-    with ThreadPool(4) as pool:
-        asked = [pool.apply_async(collect_set, (SMALL, path, 1, False)) for _ in range(80)]
-        assert {each.get() for each in asked} == {path}
     assert names_in(tmp_path) == [path.name]
 
 

@@ -3,18 +3,15 @@
 import os
 import shutil
 import zipfile
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from torch.nn.functional import pad
 
 from affordlib import results
 from affordlib.interactions import (
     CorruptedDataError,
     InteractionTensors,
-    Scaler,
     open_interactions,
     split_interactions,
 )
@@ -94,13 +91,6 @@ def test_the_tool_was_where_the_action_says(shipped):
     assert np.linalg.norm(off, axis=-1).max() < (0.003 if name == "partial" else 0.002)
 
 
-def test_grasping_is_a_problem_worth_learning():
-    data = open_interactions("grasp")
-    success, rollable = data["success"].values, data["rollable"].values
-    assert 0.55 < success[~rollable].mean() < 0.9
-    assert success[rollable].mean() < success[~rollable].mean()
-
-
 def test_shipped_files_are_small_and_complete(pushes):
     data = repo_root() / "data"
     larger = set(data.glob("*_x10.zarr.zip"))  # collected on demand
@@ -144,21 +134,6 @@ def test_whatever_is_damaged_or_missing_is_named(tmp_path):
     assert caught >= 30
 
 
-def test_a_missing_set_names_the_shipped_ones(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"'pull'.*\['drag', 'grasp'.*'push'"):
-        open_interactions("pull")
-    (tmp_path / "x.zarr.zip").write_text("not a zip")
-    with pytest.raises(CorruptedDataError, match=r"x\.zarr\.zip cannot be read"):
-        open_interactions(tmp_path / "x.zarr.zip")
-
-
-def test_sets_of_other_phases_are_not_joined(pushes):
-    one = InteractionTensors.from_dataset(pushes, np.arange(2))
-    other = replace(one, phase=one.phase**2)
-    with pytest.raises(ValueError, match="same phases"):
-        one.joined(other)
-
-
 def test_splits_and_folds():
     folds = [split_interactions(500, seed=3, fold=k) for k in range(10)]
     assert sorted(np.concatenate([f.test for f in folds])) == list(range(500))
@@ -187,17 +162,6 @@ def test_image_action_and_effect_rotate_alike(pushes, quarters, mirror):
     back = turned.rotated_and_mirrored(-quarters).rotated_and_mirrored(0, mirror)
     for name in ("image", "action", "effect"):
         torch.testing.assert_close(getattr(back, name), getattr(arrays, name))
-
-
-def test_scaler_keeps_zero_and_gives_unit_size(pushes):
-    arrays = InteractionTensors.from_dataset(pushes)
-    scaler = Scaler.fit(arrays)
-    assert scaler.effect_scale[0] == scaler.effect_scale[1]
-    scaled = arrays.effect / torch.tensor(scaler.effect_scale)
-    assert scaled.square().mean().sqrt() == pytest.approx(1.0, abs=1e-4)
-    channels = (*arrays.action_channels, "always_zero")
-    wider = replace(arrays, action=pad(arrays.action, (0, 1)), action_channels=channels)
-    assert Scaler.fit(wider).action_scale == (*scaler.action_scale, 1.0)
 
 
 def test_batches_hold_what_the_trajectories_hold(pushes):

@@ -8,8 +8,6 @@ import torch
 
 from affordlib.models.lever_up import N_OBSERVED, N_PREDICTED, lever_up_tensors, n_windows
 from experiments.lever_training import (
-    MIRRORED,
-    augment_by_symmetry,
     sample_from_start,
     sample_windows,
 )
@@ -40,15 +38,6 @@ def test_no_view_cuts_an_object_off(levers, levered):
     torch.testing.assert_close(wide[:, 1].mean(dim=(1, 2)), area, rtol=0.02, atol=0)
     with pytest.raises(ValueError, match="view must be one of"):
         lever_up_tensors(levers, view="far")
-
-
-def test_mirror_images_mirror_only_what_is_across(levered):
-    both = augment_by_symmetry(levered, MIRRORED)
-    n = len(levered)
-    sign = torch.tensor([1.0, -1.0, 1.0, 1.0])
-    torch.testing.assert_close(both.effect[n:], levered.effect * sign)
-    torch.testing.assert_close(both.image[n:], levered.image.flip(-2))
-    torch.testing.assert_close(both.action[n:], levered.action)
 
 
 def test_windows_are_fifteen_steps_and_the_next_five(levered):

@@ -73,9 +73,8 @@ def test_a_bad_checkpoint_is_named(untrained, tmp_path):
             load_checkpoint(path)
 
 
-@pytest.mark.parametrize("name", ["lstm_500", "lever_up_lstm_1800_window"])
-def test_a_shipped_network_from_elsewhere_loads_in_a_fresh_process(name):
-    code = f"from affordlib.models import load_checkpoint as load; print(*load({name!r})[1])"
+def test_a_shipped_network_from_elsewhere_loads_in_a_fresh_process():
+    code = "from affordlib.models import load_checkpoint as load; print(*load('lstm_500')[1])"
     command = [sys.executable, "-c", code]
     done = subprocess.run(command, cwd=repo_root(), capture_output=True, text=True)
     assert "seen_interactions" in done.stdout, done.stderr
@@ -117,16 +116,6 @@ def test_what_is_no_checkpoint_is_not_replaced(untrained, tmp_path):
         with pytest.raises(FileExistsError, match=f"{name}.safetensors exists and is not"):
             save_checkpoint(untrained, tmp_path / f"{name}.safetensors", {})
     assert (tmp_path / "m.safetensors").read_text() == "notes"
-
-
-def test_what_cannot_be_loaded_is_not_saved(untrained, tmp_path):
-    path = tmp_path / "m.safetensors"
-    with pytest.raises(ValueError, match="not JSON compliant"):
-        save_checkpoint(untrained, path, {"loss": math.nan})
-    untrained.__class__ = type("Mine", (type(untrained),), {})
-    with pytest.raises(TypeError, match=r"model must be one of .*film.*, got a Mine"):
-        save_checkpoint(untrained, path, {})
-    assert not list(tmp_path.iterdir())
 
 
 def test_a_model_is_not_judged_on_what_it_saw(pushes, held_out_pushes):

@@ -2,12 +2,10 @@
 
 import math
 
-import numpy as np
 import torch
 
 from affordlib.models.base import inverse, push_direction, rotate_image
 from affordlib.models.film import CircularHarmonics
-from affordlib.primitives import Push
 from affordlib.types import Observations
 
 
@@ -41,18 +39,6 @@ def test_harmonics_turn_as_their_image_does(some):
         assert (harmonics(turned) - known).abs().max() > 0.2 * known.abs().max()
     back = harmonics.rotated(harmonics.rotated(known, towards), inverse(towards))
     torch.testing.assert_close(back, known, atol=1e-5, rtol=1e-4)
-
-
-def test_turned_data_are_those_of_the_turned_push(some):
-    """Orientations are rotated and changes of yaw are not; both are mirrored."""
-    turned = some.rotated_and_mirrored(1, mirror=True)
-    push = math.pi / 2 - torch.atan2(some.action[:, 0, 1], some.action[:, 0, 0])
-    for k in range(5):
-        expected = Push(float(push[k])).path(np.array([0.0, 1.0]))[:, [0, 1, 3]]
-        now = turned.action[k, [0, -1]].numpy()
-        np.testing.assert_allclose(now[:, :2], expected[:, :2], atol=1e-5)
-        assert np.abs(np.exp(1j * now[:, 2]) - np.exp(1j * expected[:, 2])).max() < 1e-5
-    torch.testing.assert_close(turned.effect[..., 2], -some.effect[..., 2])
 
 
 def test_the_direction_is_that_of_the_push(some):

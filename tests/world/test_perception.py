@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from affordlib.perception import (
-    adapt_to_object,
     long_axis_rad,
     looks_fallen,
     looks_rollable,
@@ -14,7 +13,7 @@ from affordlib.perception import (
     outline_of,
     turn_between,
 )
-from affordlib.primitives import Drag, Grasp, Push
+from affordlib.primitives import Push
 from affordlib.world import (
     CATEGORIES,
     Cuboid,
@@ -65,14 +64,6 @@ def test_a_fallen_cylinder_is_known_to_roll(world):
     assert not looks_fallen(before, before)
 
 
-def test_actions_suit_what_is_seen(world):
-    image = _seen(world, LyingCylinder(0.07, 0.05), 0.6).image
-    assert adapt_to_object(Drag(1.0), image).grip_yaw == pytest.approx(0.6, abs=0.03)
-    assert adapt_to_object(Drag(1.0, grip_yaw=0.1), image).grip_yaw == pytest.approx(0.1)
-    assert adapt_to_object(Grasp(), image).seen_height == pytest.approx(0.05, abs=0.002)
-    assert adapt_to_object(Push(1.0), image) == Push(1.0)
-
-
 @pytest.mark.parametrize("obj", [Cuboid(0.06, 0.05, 0.05), Sphere(0.06), LyingCylinder(0.07, 0.05)])
 def test_a_kinect_finds_the_object_anywhere(world, obj):
     rng = np.random.default_rng(9)
@@ -97,7 +88,7 @@ def test_turns_are_seen_between_two_images(world, category, camera, n_images, sp
     A cuboid, symmetric under 180°, is assumed to have turned within some 30° of what is expected.
     """
     rng, spread_deg = np.random.default_rng(17), spread_deg * (2.2 if category == "prism" else 1)
-    for _ in range(6):
+    for _ in range(3):
         obj, turn = CATEGORIES[category].sample(rng), rng.uniform(-math.pi, math.pi)
         images = []
         for yaw in (0.4, 0.4 + turn):
@@ -116,20 +107,12 @@ def test_turns_are_seen_between_two_images(world, category, camera, n_images, sp
 @pytest.mark.parametrize(("camera", "n_images"), [("ideal", 1), ("kinect", 8)])
 def test_the_turn_of_what_is_round_is_not_seen(world, category, camera, n_images):
     rng = np.random.default_rng(18)
-    for k in range(6):
+    for k in range(3):
         _seen(world, CATEGORIES[category].sample(rng), 0.4, camera=camera, noise_seed=k)
         images = [
             np.mean([world.observe().image for _ in range(n_images)], axis=0) for _ in range(2)
         ]
         assert turn_between(*images, 0.0) is None
-
-
-def test_the_noise_of_an_image_is_drawn_from_its_seed(world):
-    box = Cuboid(0.06, 0.05, 0.05)
-    images = [_seen(world, box, camera="kinect", noise_seed=seed).image for seed in (1, 2)]
-    assert (images[0] != images[1]).any()
-    world.place(box, yaw_rad=0.3, config=WorldConfig(camera="kinect", noise_seed=1))
-    np.testing.assert_array_equal(images[0], world.depth_image())
 
 
 def test_an_outline_is_found_to_a_fraction_of_a_pixel(world):

@@ -6,7 +6,7 @@ import pybullet
 import pytest
 from pybullet_utils.bullet_client import BulletClient
 
-from affordlib.primitives import Drag, Grasp, LeverUp, Push
+from affordlib.primitives import Grasp, LeverUp, Push
 from affordlib.types import CROP_WIDTH_M, IMAGE_PIXELS, Obstacle
 from affordlib.world import (
     Cuboid,
@@ -18,9 +18,7 @@ from affordlib.world import (
     UprightCylinder,
     WorldConfig,
     robot,
-    tabletop,
 )
-from affordlib.world.execution import JointController
 
 OBJECTS = (Cuboid(0.05, 0.07, 0.06), UprightCylinder(0.06, 0.05))
 LEVER = LeverUp(-0.03, 0.0, 0.0, 0.06)
@@ -56,16 +54,6 @@ def test_a_push_ends_beyond_the_gripper(world, obj):
     assert abs(seen.effect[-1, 1]) < 0.004
     assert seen.tracking_error_m < 1e-3
     assert np.abs(seen.effect[: 301 // 2, :2]).max() < 1e-4  # nothing moves before contact
-
-
-def test_approach_changes_nothing_that_matters(world):
-    world.place(OBJECTS[0], (0.05, -0.1), 0.4)
-    put = world.execute_primitive(Push(2.0))
-    world.place(OBJECTS[0], (0.05, -0.1), 0.4)
-    moved = world.execute_primitive(Push(2.0), approach=True)
-    np.testing.assert_allclose(moved.rest_effect[:2], put.rest_effect[:2], atol=5e-4)
-    end = np.array(world.object_pose()[:2])
-    np.testing.assert_allclose(end, np.array([0.05, -0.1]) + moved.rest_effect[:2], atol=1e-5)
 
 
 @pytest.mark.parametrize("obj", OBJECTS)
@@ -113,16 +101,6 @@ def test_obstacles_are_felt_and_in_pictures_only(world):
     assert world.obstacles.all == ()
 
 
-def test_a_picture_from_twice_as_far_shows_the_object_half_as_large(world):
-    world.place(OBJECTS[0], (-0.05, 0.0))
-    at_m = (-0.05, 0.0, 0.06)
-    near, far = (world.picture(at_m=at_m, distance_m=d).astype(int) for d in (1.0, 2.0))
-    green = [int((p[..., 1] > 2 * p[..., 0]).sum()) for p in (near, far)]
-    assert green[0] == pytest.approx(4 * green[1], rel=0.15)
-    with pytest.raises(ValueError, match=r"distance_m must lie in .*, got 5"):
-        world.picture(distance_m=5.0)
-
-
 def test_unreachable_raises_or_is_recorded_and_moves_nothing(world):
     world.place(OBJECTS[0], (0.45, 0.5), 0.0)
     before = world.object_state()
@@ -165,21 +143,6 @@ def test_a_shoved_object_moves_turns_and_rests(world):
     np.testing.assert_allclose(world.object_pose(), (0.15, -0.03, 0.8), atol=5e-4)
 
 
-def test_the_fingers_are_tied_only_while_they_close_or_hold(world):
-    def gears():
-        return world.client.getNumConstraints()
-
-    world.place(LyingCylinder(0.08, 0.05))
-    for theta in (0.0, math.pi):
-        world.execute_primitive(Drag(theta), approach=True)
-        assert gears() == 0
-    for _ in range(2):
-        world.execute_primitive(Grasp(), approach=True)
-        assert gears() == 1
-        world.park()
-        assert gears() == 0
-
-
 @pytest.mark.parametrize("obj", [*OBJECTS, LyingCylinder(0.05, 0.07), Sphere(0.06)])
 def test_what_is_held_stays_in_the_hand_and_is_put_down(world, obj):
     """Held by friction alone, it slips by up to 3 mm in 10 s."""
@@ -212,23 +175,6 @@ def test_what_rolls_on_a_level_table_comes_to_rest(world, yaw_rad):
     assert roll_on[1] > 0.05
 
 
-@pytest.mark.parametrize(
-    ("length", "yaw_rad", "drags"),
-    [
-        (0.08, 0.3, [(0.698, 0.6), (0.524, 1.0), (1.745, 0.6)]),
-        (0.05, 0.0, [(math.pi / 2, 0.8), (0.0, 0.8)]),
-    ],
-)
-def test_a_log_that_was_dragged_and_let_go_stays(world, length, yaw_rad, drags):
-    """Without rolling friction, these roll on by 9 cm to 2 m."""
-    world.place(LyingCylinder(length, 0.07 if length < 0.06 else 0.05), yaw_rad=yaw_rad)
-    for theta, stop in drags:
-        world.execute_primitive(Drag(theta), stop, approach=True)
-    before = world.object_pose()[:2]
-    world.settle(10.0)
-    assert math.dist(before, world.object_pose()[:2]) < 5e-4
-
-
 def test_a_world_that_is_closed_or_forgotten_is_disconnected():
     one, other = Tabletop(), Tabletop()
     numbers = one.client._client, other.client._client
@@ -239,35 +185,3 @@ def test_a_world_that_is_closed_or_forgotten_is_disconnected():
     assert not any(pybullet.isConnected(number) for number in numbers)
     with pytest.raises(RuntimeError, match="this world is closed; make a new Tabletop"):
         one.place(Cuboid(0.06, 0.05, 0.05))
-
-
-def test_a_world_is_built_anew_before_bullet_has_kept_too_much(world, monkeypatch):
-    built, states = [], []
-    build = Tabletop._build
-    monkeypatch.setattr(Tabletop, "_build", lambda *args: (built.append(args), build(*args)))
-    monkeypatch.setattr(tabletop, "OBJECTS_PER_BUILD", world._n_placed + 2)
-    for _ in range(3):
-        world.place(UprightCylinder(0.05, 0.06), (0.1, 0.1))
-        world.execute_primitive(Push(0.3))
-        states.append(world.object_state())
-    assert len(built) == 1
-    assert states[0] == states[1] == states[2]
-
-
-def test_an_arm_that_cannot_go_on_from_where_it_feels_the_object_stays_there(world, monkeypatch):
-    """The started action is recorded, and not reported as out of reach."""
-    world.place(Cuboid(0.12, 0.12, 0.05))  # too wide: the fingers land on its top
-    begun = []
-    put = JointController.put
-    monkeypatch.setattr(JointController, "put", lambda *args: (begun.append(1), put(*args)))
-    path = robot.joint_path
-
-    def until_begun(*args):
-        if begun:
-            raise UnreachableError("out of reach")
-        return path(*args)
-
-    monkeypatch.setattr(robot, "joint_path", until_begun)
-    seen = world.execute_primitive(Grasp(seen_height=0.03), record_unreachable=True)
-    assert seen.reached
-    assert seen.faults == ("off_path",)
