@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -436,13 +436,13 @@ def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
     """Return the tables of all stored results."""
     found = runner.read(NAME, job, folder)
     errors = pd.DataFrame([a | e for a, r in found if a["row"] == "margin" for e in r])
-    records = pd.DataFrame([a | r for a, r in found if a["row"] in ROWS])
-    searched = ((a["family"], a["index"], r) for a, r in found if a["row"] == "feasible")
-    feasible = {(family, index): r for family, index, r in searched}
+    records = judged(pd.DataFrame([a | r for a, r in found if a["row"] in ROWS]))
+    searched = pd.DataFrame([a | r for a, r in found if a["row"] == "feasible"])
     return {
         "margin": margin_rows(errors),
-        "rows": rows_of(records, feasible),
-        "partial_and_full": paired_rows(records, feasible),
+        "rows": rows_of(records),
+        "partial_and_full": paired_rows(records),
+        "feasible": feasible_rows(searched),
     }
 
 
@@ -464,58 +464,73 @@ def margin_rows(errors: pd.DataFrame) -> Rows:
     return rows
 
 
-def judged(records: pd.DataFrame, feasible: dict) -> pd.DataFrame:
-    """Add success and contact to records, of which only those of feasible tasks are kept."""
-    keys = list(zip(records.family, records["index"], strict=True))
-    known = [key in feasible and any(feasible[key].values()) for key in keys]
-    left = records[known].fillna({"object_touched": False, "arm_touched": False})
+def judged(records: pd.DataFrame) -> pd.DataFrame:
+    """Add contact and success to the records of tasks."""
+    left = records.fillna({"object_touched": False, "arm_touched": False})
     contact = left.object_touched.astype(bool) | left.arm_touched.astype(bool)
     return left.assign(contact=contact, success=(left.distance_m <= WITHIN_M) & ~contact)
 
 
-def rows_of(records: pd.DataFrame, feasible: dict) -> Rows:
-    """Return one row for each row of tasks and family, and all families together."""
-    rows, left = [], judged(records, feasible)
-    for row in ROWS:
-        of_row = left[left.row == row]
-        for family in (*FAMILIES, "all") if len(of_row) else ():
-            some = of_row[(of_row.family == family) | (family == "all")]
-            rows.append(
-                {
-                    "row": row,
-                    "family": family,
-                    "n": len(some),
-                    "success_percent": 100 * some.success.mean(),
-                    "contact_percent": 100 * some.contact.mean(),
-                    "planned_percent": 100 * some.planned.mean(),
-                    "distance_m_median": some.distance_m.median(),
-                    "actions_mean": some.actions.mean(),
-                    "plan_s_median": some.plan_s.median(),
-                    "plan_s_p95": some.plan_s.quantile(0.95),
-                }
-            )
+def by_family(table: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
+    """Yield each family's part of a table, and the whole as "all"."""
+    for family in FAMILIES:
+        if (table.family == family).any():
+            yield family, table[table.family == family]
+    yield "all", table
+
+
+def rows_of(records: pd.DataFrame) -> Rows:
+    """Return a row of results for each row of tasks and family; n counts all tasks that were run.
+
+    A task that no planner can solve counts as a failure of all.
+    """
+    rows = []
+    for row, of_row in records.groupby("row", sort=False):
+        for family, some in by_family(of_row):
+            made = {"row": row, "family": family, "n": len(some)}
+            for name in ("success", "contact", "planned"):
+                made[f"{name}_percent"] = 100 * some[name].astype(float).mean()
+            made |= {"distance_m_median": some.distance_m.median()}
+            made["actions_mean"] = some.actions.mean()
+            rows.append(made)
     return plain(rows)
+
+
+def feasible_rows(searched: pd.DataFrame) -> Rows:
+    """Return how many of the tasks that were searched have a chain, and one of full actions."""
+    rows = []
+    for family, some in by_family(searched) if len(searched) else ():
+        row = {"family": family, "n": len(some)}
+        row["feasible"] = int(some[["partial", "full"]].notna().any(axis=1).sum())
+        rows.append(row | {"feasible_full": int(some.full.notna().sum())})
+    return rows
 
 
 PAIRS = [(row, f"{row}_full") for row in ("continuous", "astar", "perturbed")]
 PAIRS += [("continuous", row) for row in ROWS if row.startswith("check")]
 
 
-def paired_rows(records: pd.DataFrame, feasible: dict) -> Rows:
-    """Return differences of success [%] on the same tasks, with their 95 % intervals."""
-    rows, left = [], judged(records, feasible)
+def paired_rows(records: pd.DataFrame) -> Rows:
+    """Return differences of success [%] on the same tasks, with their 95 % intervals.
+
+    low, high: None where all differences are equal, as resampling would tell nothing.
+    """
+    rows, table = (
+        [],
+        records.pivot_table(
+            index=["family", "index"], columns="row", values="success", aggfunc="first"
+        ),
+    )
     for one, other in PAIRS:
-        both = left.pivot_table(index=["family", "index"], columns="row", values="success")
-        if not {one, other} <= {*both.columns}:
+        if not {one, other} <= {*table.columns}:
             continue
-        both = both[[one, other]].dropna().astype(float)
-        for family in (*FAMILIES, "all"):
-            some = both if family == "all" else both[both.index.get_level_values(0) == family]
-            if len(some):
-                off = 100 * (some[one] - some[other])
-                mean, low, high = interval(off) if off.nunique() > 1 else [off.iloc[0]] * 3
-                rows.append({"row": one, "other": other, "family": family, "n": len(some)})
-                rows[-1] |= {"difference_percent": mean, "low": low, "high": high}
+        both = table[[one, other]].dropna().astype(float).reset_index()
+        for family, some in by_family(both):
+            off = 100 * (some[one] - some[other])
+            mean, low, high = interval(off) if off.nunique() > 1 else (off.iloc[0], None, None)
+            row = {"row": one, "other": other, "family": family, "n": len(some)}
+            row |= {"successes": int(some[one].sum()), "other_successes": int(some[other].sum())}
+            rows.append(row | {"difference_percent": mean, "low": low, "high": high})
     return plain(rows)
 
 
