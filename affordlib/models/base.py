@@ -151,9 +151,15 @@ class EffectNetwork(nn.Module, ABC):
     def prepare(self, training: InteractionTensors) -> None:
         """Set what training data determine without an optimiser; by default nothing."""
 
+    def basis(self, image: Float[Tensor, "b 2 n n"]) -> Float[Tensor, "b f"]:
+        """What is computed of images before the push direction is known: here, themselves."""
+        return image.flatten(1)
+
     @abstractmethod
-    def features(self, scaled_image: Float[Tensor, "b 2 n n"]) -> Float[Tensor, "b f"]:
-        """Image features f(γ_o) of a standardised image."""
+    def features(
+        self, basis: Float[Tensor, "#b g"], rotation: Float[Tensor, "b 2"] | None = None
+    ) -> Float[Tensor, "b f"]:
+        """Image features f(γ_o) of images with a `basis`, rotated by (cos α, sin α) if given."""
 
     @abstractmethod
     def outputs(
@@ -189,28 +195,15 @@ class EffectNetwork(nn.Module, ABC):
         mean, std = (v[:, None, None] for v in (self.image_mean, self.image_std))
         return (image - mean) / std
 
-    def unoriented_features(self, image: Float[Tensor, "b 2 n n"]) -> Float[Tensor, "b f"]:
-        """Features computed before the push direction is known: here, the image itself."""
-        return image.flatten(1)
-
-    def oriented_features(
-        self, unoriented: Float[Tensor, "#b f"], rotation: Float[Tensor, "b 2"]
-    ) -> Float[Tensor, "b f"]:
-        """Features of the rotated images, computed from their `unoriented_features`."""
-        pixels = math.isqrt(unoriented.shape[1] // 2)
-        image = rotate_image(unoriented.reshape(-1, 2, pixels, pixels), rotation)
-        return self.features(self._scaled(image))
-
     def encode(self, image: Float[Tensor, "b 2 n n"], check: bool = True) -> Float[Tensor, "b f"]:
-        """Features (B, F) of depth and mask (B, 2, 48, 48); in the push frame, unoriented features.
+        """Features (B, F) of depth and mask (B, 2, 48, 48); in the push frame, their basis.
 
         Raises ValueError, if `check`, for an object outside the training domain.
         """
         if check:
             self.domain.check_image(image)
-        if self.config.frame == "push":
-            return self.unoriented_features(image)
-        return self.features(self._scaled(image))
+        basis = self.basis(image)
+        return basis if self.config.frame == "push" else self.features(basis)
 
     def predict(
         self, features: Tensor, observations: Observations, t_target: Tensor, frame: str = "table"
@@ -249,7 +242,7 @@ class EffectNetwork(nn.Module, ABC):
         back = inverse(direction)
         action, effect = rotate_both(o.action, o.effect, back, *self._channels)
         aligned = replace(o, action=action, effect=effect)
-        return self.outputs(self.oriented_features(encoded, back), aligned, t_target), direction
+        return self.outputs(self.features(encoded, back), aligned, t_target), direction
 
     def loss(self, batch: Batch, beta: float = 0.0) -> Float[Tensor, ""]:
         """Negative log-likelihood (Section 3.2) of a batch's targets.

@@ -24,6 +24,7 @@ from affordlib.models.base import (
     NetworkConfig,
     he_initialise,
     network,
+    rotate_image,
     with_time,
 )
 from affordlib.types import Observations
@@ -80,10 +81,14 @@ class AffordanceCNP(EffectNetwork):
         self.effect_decoder = _dense((MERGE_WIDTH, *DECODER_WIDTHS, 2 * n_e), last)
         self.apply(he_initialise)
 
-    def features(self, scaled_image: Float[Tensor, "b 2 48 48"]) -> Float[Tensor, "b 16"]:
-        """f(γ_o): features (B, 16) of standardised depth and mask (B, 2, 48, 48)."""
-        channels_last = scaled_image.contiguous(memory_format=torch.channels_last)  # twice as fast
-        return self.image_encoder(channels_last)
+    def features(
+        self, basis: Float[Tensor, "#b 4608"], rotation: Float[Tensor, "b 2"] | None = None
+    ) -> Float[Tensor, "b 16"]:
+        """f(γ_o): features (B, 16) of depth and mask (B, 2, 48, 48)."""
+        image = basis.reshape(-1, 2, 48, 48)
+        image = image if rotation is None else rotate_image(image, rotation)
+        channels_last = torch.channels_last  # twice as fast
+        return self.image_encoder(self._scaled(image).contiguous(memory_format=channels_last))
 
     def decode(
         self,

@@ -90,19 +90,16 @@ class HarmonicsNetwork(EffectNetwork):
         self.image_encoder = nn.Sequential(*dense(self.harmonics.n_features, 4 * n, 2 * n, n))
         self.image_encoder.apply(he_initialise)
 
-    def features(self, scaled_image: Float[Tensor, "b 2 48 48"]) -> Float[Tensor, "b f"]:
-        """Image features f(γ_o) (B, F) of standardised depth and mask."""
-        return self.image_encoder(self.harmonics(scaled_image))
-
-    def unoriented_features(self, image: Float[Tensor, "b 2 48 48"]) -> Float[Tensor, "b f"]:
-        """Circular harmonics (B, F) of images."""
+    def basis(self, image: Float[Tensor, "b 2 48 48"]) -> Float[Tensor, "b g"]:
+        """Circular harmonics (B, G) of standardised images."""
         return self.harmonics(self._scaled(image))
 
-    def oriented_features(
-        self, unoriented: Float[Tensor, "#b f"], rotation: Float[Tensor, "b 2"]
+    def features(
+        self, basis: Float[Tensor, "#b g"], rotation: Float[Tensor, "b 2"] | None = None
     ) -> Float[Tensor, "b f"]:
-        """f(γ_o) of the rotated images, computed from the harmonics of the images."""
-        return self.image_encoder(self.harmonics.rotated(unoriented, rotation))
+        """Image features f(γ_o) (B, F), of rotated images computed from the harmonics."""
+        rotated = basis if rotation is None else self.harmonics.rotated(basis, rotation)
+        return self.image_encoder(rotated)
 
 
 def waves(t: Float[Tensor, "b t"], n: int) -> Float[Tensor, "b t w"]:
