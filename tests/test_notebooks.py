@@ -270,8 +270,9 @@ def test_run(name, smoke):
 
 
 @pytest.mark.slow
-def test_the_block_of_readme_runs(capsys):
-    (block,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+@pytest.mark.parametrize("page", ["README.md", "notebooks/cheat_sheet.md"])
+def test_the_block_of_a_text_runs(page, capsys):
+    (block,) = re.findall(r"```python\n(.*?)```", (ROOT / page).read_text("utf-8"), re.DOTALL)
     exec(block, {})
     assert float(capsys.readouterr().out.removesuffix(" mm from the goal\n")) < 5
 
