@@ -50,6 +50,21 @@ def _standoff_error(standoff: Callable[..., Any]) -> float:
     return 1000 * worst
 
 
+def _choice_error(chosen: Callable[..., Any]) -> float:
+    """How often [%] another chain is chosen than the one of least cost and price."""
+    rng, wrong = np.random.default_rng(0), 0
+    for _ in range(50):
+        off_m, pushes, now_m = (
+            rng.exponential(0.02, 12),
+            rng.integers(1, 4, 12),
+            rng.uniform(0, 0.2),
+        )
+        price = rng.uniform(0, 0.5)
+        best = int((off_m + price * now_m * pushes).argmin())
+        wrong += int(asked(chosen, off_m, pushes, price, now_m).item() != best)
+    return 2.0 * wrong
+
+
 LOGS: dict[str, Exercise] = {
     "09.1": Exercise(
         "Write effect(before, after, centroid, heading): ahead, left and turn of a push.",
@@ -71,5 +86,12 @@ LOGS: dict[str, Exercise] = {
         expected=0.0,
         within=0.001,
         unit="mm, largest error",
+    ),
+    "10.2": Exercise(
+        "Write chosen(off_m, pushes, price, now_m): the number of the chain, from 0.",
+        _choice_error,
+        expected=0.0,
+        within=0.1,
+        unit="% wrong choices",
     ),
 }

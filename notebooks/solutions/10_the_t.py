@@ -1,4 +1,4 @@
-"""Solution to the exercise of notebook 10."""
+"""Solutions to the exercises of notebook 10."""
 
 import numpy as np
 
@@ -11,7 +11,12 @@ def standoff(contact, normal, direction, radius, clear):
     return centre - clear / np.dot(normal, direction) * np.asarray(direction)
 
 
-VERDICTS = [check("10.1", standoff)]
+def chosen(off_m, pushes, price, now_m):
+    """Each push costs the same share of the present distance."""
+    return int(np.argmin(np.asarray(off_m) + price * now_m * np.asarray(pushes)))
+
+
+VERDICTS = [check("10.1", standoff), check("10.2", chosen)]
 
 if __name__ == "__main__":
     print(*VERDICTS, sep="\n")
