@@ -28,8 +28,8 @@ GOAL = Goal((0.0, 0.028))
 FRAME_STEPS, COMES, LEAVES, FRAME_MS = 16, 12, 24, 40
 """Simulation steps between two frames; frames in which the arm comes, and leaves, that are not
 shown; time for which a frame is shown [ms]."""
-WIDTH, HEIGHT = 840, 660
-"""Size of one of the two pictures, below its title [pixels]; pages show it at half of that."""
+WIDTH, HEIGHT = 600, 470
+"""Size of one of the two pictures, below its title [pixels]; pages show it smaller."""
 VIEW = {"at_m": (-0.22, 0.0, 0.3), "distance_m": 1.4, "yaw_deg": 118.0, "pitch_deg": -23.0}
 GOAL_RGB = (0.0, 0.45, 0.70)
 FIGURES = repo_root() / "figures"
@@ -82,7 +82,7 @@ def _titled(picture: np.ndarray, title: str) -> np.ndarray:
     """Return a picture under a line of text."""
     image = Image.new("RGB", (WIDTH, HEIGHT + 60), "white")
     image.paste(Image.fromarray(picture), (0, 60))
-    font = ImageFont.truetype(font_manager.findfont("DejaVu Sans"), 28)
+    font = ImageFont.truetype(font_manager.findfont("DejaVu Sans"), 22)
     ImageDraw.Draw(image).text((WIDTH / 2, 16), title, "black", font, anchor="ma")
     return np.asarray(image)
 
