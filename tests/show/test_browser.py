@@ -578,12 +578,12 @@ def test_the_web_pages_are_found_by_a_word_and_darken(web, browser):
     folder, _ = web
     page = browser.new_page(viewport={"width": 1280, "height": 900})
     page.goto((folder / "index.html").as_uri())
-    page.locator("input.sidebar-search").fill("Newton")
+    page.locator("input.sidebar-search").fill("Garnelo")
     page.keyboard.press("Enter")
     found = page.locator("#search-results li a")
     found.first.wait_for()
     found.first.click()
-    assert "Newton" in page.locator("article").inner_text()
+    assert "Garnelo" in page.locator("article").inner_text()
     page.goto((folder / "notebooks" / "06_planning.html").as_uri())
 
     def shades():
