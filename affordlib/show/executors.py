@@ -5,22 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from affordlib.planning import (
-    ClosedLoopConfig,
-    Planner,
-    Skills,
-    execute_plan,
-    run_closed_loop,
-)
+from affordlib.planning import ClosedLoopConfig, Planner, Skills, execute_plan, run_closed_loop
 from affordlib.types import Goal, Outcome, Plan
 from affordlib.world import Tabletop
 
 Report = Callable[..., Goal]
-"""Callback: `report()` after an action, `report(plan)` when a new plan replaces the current one.
-
-After an action it applies pending disturbances. Returns the current goal; raises `Stopped` when
-execution must end.
-"""
+"""`report()` after an action applies pending disturbances, and raises `Stopped` when execution must
+end; `report(plan)` when a new plan replaces the current one. Both return the current goal."""
 
 Executor = Callable[[Tabletop, Plan, Planner, Report], Outcome]
 """Function that executes a plan; the caller measures the object's rotation and height."""
@@ -53,15 +44,14 @@ def closed_loop(skills: Skills, tolerance_m: float = 0.002) -> Executor:
     def execute(world, plan, planner, report):
         goal = plan.goal
 
-        def exact_goal():
-            return replace(goal, tolerance_m=tolerance_m)
-
         def on_action(*_):
             nonlocal goal
             goal = report()
 
         config = ClosedLoopConfig(on_action=on_action, on_plan=report)
-        done = run_closed_loop(world, exact_goal, skills, planner, config)
+        done = run_closed_loop(
+            world, lambda: replace(goal, tolerance_m=tolerance_m), skills, planner, config
+        )
         words = "" if done.reached else f"The loop ended as {done.status}: {done.message}."
         return measured(world, plan, done.object_paths_xy_m, words).with_goal(goal)
 

@@ -28,7 +28,7 @@ from affordlib.results import repo_root
 from tests.waiting import wait_until
 
 CHROMIUM = shutil.which("chromium")
-FLAGS = ["--no-sandbox", "--disable-dev-shm-usage", "--enable-unsafe-swiftshader"]
+FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"]
 PICTURES = repo_root() / "runs" / "browser"
 
 pytestmark = [
@@ -275,13 +275,6 @@ def table(page):
     return Table(page)
 
 
-def test_it_opens_with_a_plan(page, table):
-    assert goal_of(page) == (0.12, 0.08)
-    assert_same_goal(page, table, 0.12, 0.08)
-    assert "Plan: push to" in words(page)
-    picture(page, "1_open")
-
-
 def test_the_first_click_after_scrolling_lands_where_the_mouse_is(page, table):
     table.svg.evaluate(
         """svg => {
@@ -299,27 +292,6 @@ def test_the_first_click_after_scrolling_lands_where_the_mouse_is(page, table):
     page.mouse.click(*table.at(0.1, -0.1))
     assert_same_goal(page, table, 0.1, -0.1)
     assert abs(table.svg.bounding_box()["y"] - top) < 2
-
-
-def test_drag(page, table):
-    page.mouse.move(*table.at(0.08, -0.11))
-    page.mouse.down()
-    for share in np.linspace(0, 1, 12):
-        page.mouse.move(*table.at(0.08 - 0.2 * share, -0.11 + 0.2 * share))
-    page.mouse.up()
-    assert_same_goal(page, table, -0.12, 0.09)
-    page.mouse.move(*table.at(0.2, 0.2))  # let go: the star stays
-    assert_same_goal(page, table, -0.12, 0.09)
-    picture(page, "2_dragged")
-
-
-def test_arrow_keys(page, table):
-    before = goal_of(page)
-    table.svg.focus()
-    for key in ("ArrowRight", "ArrowRight", "ArrowUp", "Shift+ArrowLeft", "Shift+ArrowDown"):
-        page.keyboard.press(key)
-    assert_same_goal(page, table, before[0] + 0.019, before[1] + 0.009, within_m=1e-6)
-    assert page.evaluate("document.activeElement.closest('.affordlib-table') !== null")
 
 
 def test_sliders_by_keyboard(page, table):
@@ -359,20 +331,6 @@ def test_run(page, table):
     np.testing.assert_allclose(table.points(".object").mean(axis=0), outcome[:2], atol=1e-3)
     np.testing.assert_allclose(table.points(".truth")[-1], outcome[:2], atol=1e-3)
     picture(page, "3_run")
-
-
-def test_run_and_stop_by_keyboard(page, table):
-    button(page, "Start over").click()
-    ask(page, "picker.pick(0.2, -0.2)")
-    assert_same_goal(page, table, 0.2, -0.2)
-    assert ask(page, "len(picker.plan.steps)") > 1
-    table.svg.focus()
-    page.keyboard.press("Enter")
-    page.locator(".affordlib-table .hand").wait_for(state="attached")
-    picture(page, "4_running")
-    page.keyboard.press("Escape")
-    wait_for_words(page, "Stopped after 1 action:")
-    assert ask(page, "picker.outcome.distance_m") > 0.05
 
 
 def test_a_closed_loop_follows_a_goal_that_moves(page, table):
@@ -418,13 +376,6 @@ def test_it_fits_its_window(page, table, width):
         assert page.locator(f".affordlib-{widget} :not(svg *, option)").evaluate_all(cut) == []
     picture(page, f"8_width_{width}")
     page.set_viewport_size({"width": 1280, "height": 1000})
-
-
-def test_it_has_names_for_screen_readers(page, table):
-    x, y = goal_of(page)
-    at = f"The goal is at x = {100 * x:.1f}, y = {100 * y:.1f} cm, the object at x = "
-    assert page.get_by_role("application", name=at).count() == 1
-    assert page.get_by_role("progressbar", name="actions done").count() == 1
 
 
 def test_everything_can_be_pressed_without_a_mouse(page, table):

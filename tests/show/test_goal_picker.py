@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from affordlib.interactions import open_interactions
 from affordlib.planning import Skills, execute_plan, plan_astar, plan_continuous
 from affordlib.show import GoalPicker
 from affordlib.show.executors import open_loop
 from affordlib.show.table_data import TableView
-from affordlib.types import Goal, Obstacle
-from affordlib.world import BASE_X_M, REACH_M, Cuboid
+from affordlib.types import Obstacle
+from affordlib.world import Cuboid
 from tests.waiting import wait_until
 
 
@@ -103,15 +102,6 @@ def test_a_picked_goal_is_planned_for_drawn_and_reached(picker, world):
     assert outcome.end_pose == pytest.approx(plain.end_pose, abs=1e-12)
     for a, b in zip(outcome.object_paths_xy_m, plain.object_paths_xy_m, strict=True):
         np.testing.assert_array_equal(a, b)
-
-
-def test_the_first_time_that_is_shown_is_that_of_a_planner_at_work(make_picker, trained):
-    times = iter([7.0, 0.05])
-
-    def planner(problem):
-        return replace(plan_astar(problem), plan_s=next(times))
-
-    assert "Found in 50 ms" in make_picker(planners={"mine": planner}).controls.said
 
 
 def luminance(colour):
@@ -275,20 +265,6 @@ def test_a_disturbance_waits_for_the_end_of_the_action(make_picker, world):
     assert picker.outcome.distance_m == pytest.approx(goal.distance_m(world.object_pose()[:2]))
 
 
-def test_disturbances_are_seeded_and_planned_for(make_picker, world):
-    ends = []
-    for seed in (1, 1, 2):
-        picker = make_picker(seed=seed)
-        picker.controls.shove.click()
-        ends.append(in_time(picker).world.object_pose())
-        assert picker.plan.start_xy_m == ends[-1][:2]
-        picker.move_goal()
-        assert picker.plan.goal.xy_m != (0.12, 0.0)
-        picker.start_over()
-        assert picker.plan.start_xy_m == pytest.approx((0.0, 0.0), abs=1e-12)
-    assert ends[0] == ends[1] != ends[2]
-
-
 @pytest.mark.slow
 def test_a_closed_loop_replans_with_the_chosen_planner_for_a_goal_that_moves(make_picker):
     shown, picker = [], make_picker(seed=5)
@@ -321,17 +297,6 @@ def test_after_a_failed_run_the_next_plan_is_from_where_it_ended(make_picker):
     picker.controls.executor.value = "open loop"
     picker.run()
     assert picker.outcome.distance_m < 0.03, picker.controls.words.value
-
-
-def test_a_slider_moves_what_it_is_for_and_nothing_else(picker):
-    picker.pick(0.45, 0.1)
-    picker.controls.y.value = 12.0
-    assert in_time(picker).goal.xy_m == (0.45, 0.12)
-    picker.set_pose(turn_deg=120)
-    assert picker.controls.turn.value == 90  # the slider's maximum
-    picker.controls.height.value = 3.0
-    assert math.degrees(in_time(picker).goal.turn_rad) == pytest.approx(120)
-    assert picker.goal.height_m == pytest.approx(0.03)
 
 
 def test_a_saved_picker_leaves_its_picture(picker):
@@ -406,22 +371,3 @@ def test_the_robot_is_shown_in_3d_as_it_moved(make_picker, world):
     assert "<img alt=" in html
     picker.start_over()
     assert len(scene._frames) == 1
-
-
-def test_what_cannot_be_lifted_so_high_is_said_before_anything_moves(posed):
-    posed._follow(Goal((0.04, 0.03), height_m=0.45))
-    assert "but not its turn or height" in in_time(posed).controls.words.value
-
-
-def test_the_ring_is_where_the_arm_can_push_from(world):
-    data = open_interactions("reach")
-    pushes = data["primitive"].values == 0
-    xy = data["estimated_xy"].values[pushes]
-    theta = data["theta"].values[pushes]
-    along = np.linspace(0.2, -0.05, 6)[:, None, None]
-    places = xy + along * np.column_stack([np.cos(theta), np.sin(theta)])
-    far = np.hypot(places[..., 0] - BASE_X_M, places[..., 1])
-    inside = ((REACH_M[0] <= far) & (far <= REACH_M[1])).all(axis=0)
-    reached = data["reached"].values[pushes].astype(bool)
-    assert (inside == reached).mean() > 0.93
-    assert reached[inside].mean() > 0.97

@@ -133,12 +133,7 @@ def test_an_obstacle_is_added_moved_resized_and_removed_and_planned_around(opene
     one = page.locator(".obstacle").first
     plan = page.locator(".prediction").first
 
-    def middle():
-        points = one.evaluate("e => [...e.points].map(({x, y}) => [x, y])")
-        return np.mean(points, axis=0), np.ptp(points, axis=0).max()
-
-    box = one.bounding_box()
-    before = plan.get_attribute("points")
+    box, before = one.bounding_box(), plan.get_attribute("points")
     page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
     page.mouse.down()
     page.mouse.move(*at(page, 0.1, 0.03), steps=6)
@@ -146,18 +141,16 @@ def test_an_obstacle_is_added_moved_resized_and_removed_and_planned_around(opene
     settled(page)
     assert plan.get_attribute("points") != before
     assert "Predicted to end 0.0 mm" in words(page)
-    svg, (place, size) = page.locator(".affordlib-table svg"), middle()
+    svg = page.locator(".affordlib-table svg")
     svg.press("+")
     svg.press("ArrowRight")
     settled(page)
-    assert middle()[1] > 1.1 * size
+    assert one.bounding_box()["width"] > 1.1 * box["width"]
     svg.press("Delete")
     assert page.locator(".obstacle").count() == 1
     assert goal_of(page) == [13, 8.5]
     page.get_by_role("button", name="Undo").click()
     assert page.locator(".obstacle").count() == 2
-    assert svg.is_visible()
-    assert len(place) == 2
 
 
 def test_a_recorded_execution_is_played_and_named_so(opened):
