@@ -47,7 +47,6 @@ from affordlib.world import ROLLABLE, STANDING, Tabletop, UnreachableError
 from experiments import reported, runner
 from experiments.commands import command
 from experiments.field_baselines import plan_cem
-from experiments.oracle import oracle_effects
 from experiments.runner import FOLDER, Job, Rows, interval, plain
 from experiments.tasks import GOAL_SOURCES, PlanningTask, frozen_tasks, tasks_sha256
 
@@ -100,8 +99,8 @@ class PlannerConfig:
     """A planner, its model, and its goals.
 
     planner: a function of a `PlanningProblem`; arguments: its further arguments; execution: fields
-    of `Attempt`. model: a checkpoint or "simulator". world, sources, modes: of the frozen goals;
-    stride: use every stride-th goal; standing: exclude rollable objects.
+    of `Attempt`. model: a checkpoint. world, sources, modes: of the frozen goals;
+    standing: exclude rollable objects.
     """
 
     planner: Callable[..., Plan]
@@ -110,15 +109,12 @@ class PlannerConfig:
     execution: dict[str, Any] = field(default_factory=dict)
     world: str = "clean"
     sources: tuple[str, ...] = ("constructed",)
-    stride: int = 1
     standing: bool = False
     modes: tuple[str, ...] = tuple(MODES)
 
     @property
     def checkpoints(self) -> dict[str, str]:
         """Checkpoints by primitive: the model's, and one for drags if rollable objects occur."""
-        if self.model == "simulator":
-            return {}
         drags = self.model.startswith("film") and self.world not in ("perturbed", "outside")
         return {"push": self.model} | ({"drag": "drag_film_500"} if drags else {})
 
@@ -127,8 +123,7 @@ class PlannerConfig:
         """The object categories of its goals."""
         if self.world == "perturbed_rollable":
             return ROLLABLE
-        drags = "drag" in self.checkpoints or self.model == "simulator"
-        drags &= self.world == "clean" and not self.standing
+        drags = "drag" in self.checkpoints and self.world == "clean" and not self.standing
         return STANDING + ROLLABLE if drags else STANDING
 
     def chosen(self, tasks: Sequence[PlanningTask]) -> list[int]:
@@ -137,19 +132,16 @@ class PlannerConfig:
             (t.goals in self.sources and t.mode in self.modes and t.obj.category in self.classes)
             for t in tasks
         ]
-        return np.flatnonzero(asked)[:: self.stride].tolist()
+        return np.flatnonzero(asked).tolist()
 
-    def pose(self, world: Tabletop) -> Pose:
-        """Return what poses the problems; only the model "simulator" reads the world's state."""
+    def pose(self) -> Pose:
+        """Return what poses the problems."""
         models = {kind: load_checkpoint(name)[0] for kind, name in self.checkpoints.items()}
-        skills, imagined = Skills(models), None if models else Tabletop()
+        skills = Skills(models)
 
         def pose(image, start_xy_m, goal, mode) -> PlanningProblem:
-            if imagined:
-                effects = oracle_effects(imagined, world, image)
-            else:
-                kind = skills.kind_for(image) if "drag" in models else Push
-                effects = EffectMap(skills.model(kind), image, kind)
+            kind = skills.kind_for(image) if "drag" in models else Push
+            effects = EffectMap(skills.model(kind), image, kind)
             return PlanningProblem(start_xy_m, goal, effects, mode)
 
         return pose
@@ -161,7 +153,6 @@ RECEDING = {"execution": {"receding": True}}
 DISC = {"heuristic": "disc"}
 PERTURBED = {"model": "film_5000_perturbed", "world": "perturbed"}
 ROLLING, OUTSIDE = (PERTURBED | {"world": world} for world in ("perturbed_rollable", "outside"))
-ORACLE = {"model": "simulator"}
 RISK_WEIGHTS = (0.0, 1.0, 10.0, 30.0)
 """Risk weights of the continuous planner that are tried on the validation goals."""
 
@@ -206,8 +197,6 @@ CONFIGS: dict[str, PlannerConfig] = {
     "continuous_cnp_500": PlannerConfig(plan_continuous, "cnp_500", **ALL),
     "continuous_film_500": PlannerConfig(plan_continuous, "film_500", **ALL),
     "continuous_lstm_500": PlannerConfig(plan_continuous, "lstm_500"),
-    # The simulator in place of a model.
-    "oracle": PlannerConfig(plan_continuous, **ORACLE),
     # The perturbed world with a noisy camera.
     "perturbed": PlannerConfig(plan_continuous, **PERTURBED),
     "perturbed_corrected": PlannerConfig(plan_continuous, **PERTURBED, **CORRECTED),
@@ -219,7 +208,6 @@ CONFIGS: dict[str, PlannerConfig] = {
     "perturbed_rollable_corrected": PlannerConfig(plan_continuous, **ROLLING, **CORRECTED),
     "outside": PlannerConfig(plan_continuous, **OUTSIDE),
     "outside_corrected": PlannerConfig(plan_continuous, **OUTSIDE, **CORRECTED),
-    "perturbed_oracle": PlannerConfig(plan_continuous, **ORACLE, world="perturbed", stride=5),
     # Constants of the planners, on the validation goals.
     **{
         f"RISK_WEIGHT={weight:g}": PlannerConfig(
@@ -354,7 +342,7 @@ def run_config(config: str) -> list[dict[str, Any]]:
     about, records = CONFIGS[config], []
     planner, tasks = partial(about.planner, **about.arguments), frozen_tasks(about.world)
     with Tabletop() as world:
-        pose = about.pose(world)
+        pose = about.pose()
         for k in tqdm(about.chosen(tasks), config, unit=" goals", leave=False):
             outcome = attempt(world, tasks[k], pose, planner, **about.execution)
             records.append({"task": k} | outcome_record(tasks[k], outcome))

@@ -1,6 +1,6 @@
 """Studies in addition to the cross-validation: ablations, novelty, partial actions.
 
-    python -m experiments.studies --only study=ablation
+    python -m experiments.studies --only study=novelty_judged
 
 computes missing or stale results in `data/results/raw/studies.jsonl.gz`. The tables are written by
 `experiments.effect_prediction`.
@@ -64,11 +64,6 @@ def partial_execution() -> Rows:
 
 
 STUDIES: dict[Callable[[], Rows], dict[str, Any]] = {
-    ablation.ablation: {
-        "data": ("push", "push_test"),
-        "settings": (ablation.ABOUT, ablation.CHANGES),
-        "version": 2,
-    },
     ablation.incremental_ablation: {
         "data": ("push",),
         "settings": (ablation.ABOUT, [ablation.CHANGES[c] for c in ablation.LADDER.values()]),
