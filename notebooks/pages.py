@@ -30,6 +30,7 @@ PAGES = {path.stem: path for path in ROOT.glob("notebooks/nano.ipynb")}
 PAGES |= {path.stem: path for path in sorted(ROOT.glob("notebooks/[0-9][0-9]_*.ipynb"))}
 PAGES |= {path.stem: path for path in sorted(ROOT.glob("notebooks/appendix/A[0-9]_*.ipynb"))}
 WIDGET = "application/vnd.jupyter.widget-view+json"
+SHOWN = {"image/png", "image/svg+xml", "text/html"}
 ADDED = {"injected-parameters", "papermill-error-cell-tag"}
 """Tags of the cells that papermill adds."""
 
@@ -106,7 +107,7 @@ def cleaned(notebook: "nbformat.NotebookNode") -> str:
     """Return the text of an executed notebook to commit: outputs and tags, no other metadata.
 
     JupyterLab does not know the tag `hide-input`; it folds a cell whose source is hidden.
-    A widget is replaced by its picture, as JupyterLab shows an error for a widget without a kernel.
+    A widget is replaced by its picture or page: JupyterLab shows an error for it without a kernel.
     The caption in the cell below a picture becomes the picture's alternative text.
     """
     import nbformat  # here, because its import takes longer than all else
@@ -115,9 +116,9 @@ def cleaned(notebook: "nbformat.NotebookNode") -> str:
     for cell, below in zip(cells, cells[1:] + cells[-1:], strict=True):
         caption = re.match(r"\*\*Figure .*?\*\* (.*)", below.source)
         for output in cell.get("outputs", []):
-            for kind in {"image/png", "image/svg+xml"} & output.get("data", {}).keys():
+            for kind in SHOWN & output.get("data", {}).keys():
                 output.data.pop(WIDGET, None)
-                if caption:
+                if caption and kind != "text/html":
                     output.metadata.setdefault(kind, {})["alt"] = caption[1]
         tags = cell.metadata.get("tags")
         folded = {"jupyter": {"source_hidden": True}} if "hide-input" in (tags or []) else {}
