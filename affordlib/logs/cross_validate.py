@@ -81,7 +81,9 @@ def worst(
     names: of the pushes (`Log.names`), instead of their numbers.
     """
     check_choice("model", model, set(errors["model"]))
-    known = errors[errors["model"] == model].nlargest(n, "error_over_std")
+    if 0 < len(names) <= errors["push"].max():
+        raise ValueError(f"names must be one for each push (Log.names), got {len(names)}")
+    known = errors[errors["model"] == model].nlargest(check_count("n", n), "error_over_std")
     known = known.assign(push=[names[k] if len(names) else k for k in known["push"]])
     return known[["push", "group", "position_m", "yaw_rad", "error_over_std"]]
 

@@ -95,19 +95,19 @@ def planar(values: Any, order: str = "xyzw", up: str = "z") -> np.ndarray:
     """
     check_choice("order", order, ORDERS)
     shift = UPS[check_choice("up", up, UPS)]
-    rows = _rows("values", values, 3 if np.shape(values)[-1:] == (3,) else 7, least=1)
+    rows = _rows("values", values, (3, 7), least=1)
     xy = np.roll(rows[:, :3], shift, axis=1)[:, :2]
     if rows.shape[1] == 3:
         return xy
     quaternions = rows[:, 3:][:, ORDERS[order]]
     size = np.linalg.norm(quaternions, axis=1)
     if (row := int(np.abs(size - 1).argmax())) >= 0 and abs(size[row] - 1) > 0.05:
-        raise ValueError(f"quaternions must have length 1, but that of row {row} has {size[row]:g}")
+        raise ValueError(f"values: a quaternion has length 1, but in row {row} {size[row]:g}")
     i, j, k = np.roll(quaternions[:, :3], shift, axis=1).T
     w, tilt = quaternions[:, 3], np.arccos(np.clip(1 - 2 * (i * i + j * j), -1, 1))
     if (row := int(tilt.argmax())) >= 0 and tilt[row] > MOST_TILT_RAD:
         raise ValueError(
-            f"the object's {up} axis must point up, but in row {row} it is tilted by "
+            f"values: the object's {up} axis must point up, but in row {row} it is tilted by "
             f"{math.degrees(tilt[row]):.0f}°; choose another order ({order}) or up ({up}), or turn "
             "the frame fixed to the object"
         )
@@ -312,8 +312,8 @@ class Log:
         deep = self._radius_m - _nearest(self.outline_m, at_end)[0].item()
         if deep > DEEP_M:
             raise ValueError(
-                f"the tool is {1e3 * deep:.1f} mm inside the outline at the last of the poses, "
-                f"more than {1e3 * DEEP_M:g} mm; {CAUSES}"
+                f"tool_xy ends {1e3 * deep:.1f} mm inside the outline at the pose of then "
+                f"(poses, by tool_t and poses_t), more than {1e3 * DEEP_M:g} mm; {CAUSES}"
             )
 
     def _context(self, context: Mapping[str, Any]) -> dict[str, np.ndarray]:
@@ -338,16 +338,18 @@ def check_feet(feet: np.ndarray) -> None:
 
 
 def _rows(
-    name: str, values: Any, columns: int, most: float = MOST_ROWS, least: int = 2
+    name: str, values: Any, columns: int | tuple, most: float = MOST_ROWS, least: int = 2
 ) -> np.ndarray:
     """Finite numbers (m, columns), least ≤ m ≤ most; raises ValueError."""
+    widths = columns if isinstance(columns, tuple) else (columns,)
     try:
         array = np.ma.asarray(values, dtype=float).filled(np.nan)
     except (TypeError, ValueError, RuntimeError):
         array = check_array(name, values)
-    if array.ndim != 2 or array.shape[1] != columns or not least <= len(array) <= most:
+    if array.ndim != 2 or array.shape[1] not in widths or not least <= len(array) <= most:
         raise ValueError(
-            f"{name} must have {least} to {most} rows of {columns} numbers, got {array.shape}; "
+            f"{name} must have {least} to {most} rows of {' or '.join(map(str, widths))} "
+            f"numbers, got {array.shape}; "
             "split a session (Log.split), and read positions and quaternions in space by planar"
         )
     if (lost := np.flatnonzero(~np.isfinite(array).all(axis=1))).size:

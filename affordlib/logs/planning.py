@@ -147,6 +147,9 @@ class PushPlanner:
 
     def __post_init__(self) -> None:
         check_count("seed", self.seed, least=0)
+        check_within("price", self.price, 0.0, 1.0)
+        check_count("rounds", self.rounds, 0, 20)
+        check_array("room_m", self.room_m or np.zeros((2, 2)), 2, 2)
         radius_m = gyration_radius_m(self.obj.outline_m) if self.turn_m is None else self.turn_m
         self._turn_m = check_within("turn_m", radius_m, 0.0, LARGEST_M, "m")
         self._drawn = self.obj.drawn(N_CANDIDATES, self.seed)

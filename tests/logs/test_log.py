@@ -128,12 +128,12 @@ BAD = {
     "a held pose": (
         {"poses": (START, START)},
         {},
-        r"push 0 .*tool is 14.0 mm inside the outline at the last of the poses.* held, or seen",
+        r"push 0 .*tool_xy ends 14.0 mm inside the outline at the pose of then .* held, or seen",
     ),
     "the other sign of the yaw": (
         {"poses": (START, (598.555, -8.562, 0.22))},
         {},
-        r"push 0 .*tool is 5.\d mm inside the outline at the last of the poses.*sign, unit",
+        r"push 0 .*tool_xy ends 5.\d mm inside the outline at the pose of then .*sign, unit",
     ),
     "two clocks": (
         {"poses": [START, END], "poses_t": (1.7e9, 1.7e9 + 6.6)},
