@@ -5,6 +5,7 @@ many targets each, some 200 times as many targets per second; the paper's loop i
 for comparison. `train_model` goes from data set and split to a calibrated network.
 """
 
+import inspect
 import math
 import time
 from collections.abc import Callable
@@ -112,6 +113,11 @@ def train(
     the same call continues to bit-identical results.
     """
     config = config or TrainingConfig()
+    for name, function, n in (("sampler", sampler, 4), ("score", score, 2)):
+        try:
+            inspect.signature(function).bind(*range(n))
+        except (TypeError, ValueError) as error:
+            raise TypeError(f"{name} must take {n} arguments, got {function!r}: {error}") from None
     for name, tensors in (("training", training), ("validation", validation)):
         if len(tensors) == 0:
             raise ValueError(f"{name} holds no interactions")
