@@ -29,7 +29,7 @@ from affordlib.primitives import Drag
 from affordlib.types import Plan, Step, check_choice, check_count
 
 DESCENTS = {"gradient": (torch.optim.SGD, 0.3), "adam": (torch.optim.Adam, 0.005)}
-"""Optimiser and its usual rate; `experiments/planning.py` has others, on the validation goals."""
+"""Optimiser and its usual rate."""
 
 STILL = {"direction": 1e-3, "point": 1e-4}
 """Change per iteration, of the direction [rad] or the point [m], below which it is still."""
