@@ -251,8 +251,9 @@ def plan_continuous(
                 enough = 1 if candidates and candidates[0][0] < NEAR_M else math.inf
             if candidates and n_actions >= enough:
                 break
-    steps = ()
-    near = [one for one in candidates[:N_REFINED] if problem.obstacles and one[0] < NEAR_M]
+    # The plan remains empty if none ends nearer to the goal.
+    steps, least_m = (), goal.distance_m(start)
+    near = [one for one in candidates if problem.obstacles and one[0] < NEAR_M]
     for _, *best in near or candidates[:1]:
         best = tuple(best)
         chain, predicted = correct(effects, target, best, mode.partial)
@@ -260,16 +261,11 @@ def plan_continuous(
         if not (ok and (not problem.obstacles or free(problem, tuple(chain.T[:, None])).all())):
             chain, predicted = torch.cat(best).T, None
         found = make_steps(effects, start, chain, predicted)
-        if not steps or goal.distance_m(found[-1].predicted_end_xy_m) < goal.distance_m(
-            steps[-1].predicted_end_xy_m
-        ):
-            steps = found
-        if goal.distance_m(steps[-1].predicted_end_xy_m) < WELL_M:
+        if (away_m := goal.distance_m(found[-1].predicted_end_xy_m)) < least_m:
+            steps, least_m = found, away_m
+        if least_m < WELL_M:
             break
-    if steps and goal.distance_m(steps[-1].predicted_end_xy_m) >= goal.distance_m(start):
-        steps = ()  # the empty plan, if no plan ends nearer to the goal
-    end = steps[-1].predicted_end_xy_m if steps else start
-    reaches = goal.distance_m(end) <= goal.tolerance_m
+    reaches = least_m <= goal.tolerance_m
     return problem.plan_of(steps, "continuous", reaches, began)
 
 
@@ -319,5 +315,5 @@ def _best_chain(
         direction, phase = torch.cat([direction, after[0]]), torch.cat([phase, after[1]])
     if trace is not None:
         trace.append((direction, phase, cost))
-    order = cost.argsort(stable=True)[: int(cost.isfinite().sum())].tolist()
-    return [(float(cost[k]), direction[k : k + 1], phase[k : k + 1]) for k in order]
+    best = cost.argsort(stable=True)[: N_REFINED if problem.obstacles else 1].tolist()
+    return [(float(cost[k]), direction[k : k + 1], phase[k : k + 1]) for k in best]

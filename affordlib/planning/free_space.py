@@ -83,12 +83,10 @@ def gaps_m(obstacles: Sequence[np.ndarray], shapes: np.ndarray, far_m: float = F
     moves = long[..., None] > 1e-9
     across = np.where(moves, across / np.maximum(long[..., None], 1e-9), sides[:, :-1, :1])
     # The hulls are the last axis of all arrays: corners (2, 2k, h), axes (2, a, h), middles (2, h).
+    both = shapes[:, :-1], shapes[:, 1:]
+    every = sides[:, :-1], sides[:, 1:], across, -across
     corners, axes = (
-        np.concatenate(parts, axis=2).reshape(n * (s - 1), -1, 2).T
-        for parts in (
-            (shapes[:, :-1], shapes[:, 1:]),
-            (sides[:, :-1], sides[:, 1:], across, -across),
-        )
+        np.concatenate(parts, axis=2).reshape(n * (s - 1), -1, 2).T for parts in (both, every)
     )
     middles = corners.mean(axis=1)
     radius = np.hypot(*(corners - middles[:, None])).max(axis=0)
@@ -111,6 +109,11 @@ def _products(axes: np.ndarray, points: np.ndarray) -> np.ndarray:
     return axes[0][:, None] * points[0] + axes[1][:, None] * points[1]
 
 
+def _gap_at(xy_m: Sequence[float], outline: np.ndarray, polygons: Sequence[np.ndarray]) -> float:
+    """Gap [m] of an outline (k, 2) at (x, y) [m]."""
+    return float(gaps_m(polygons, placed(outline, np.array([[[*xy_m, 0.0]] * 2]))).min())
+
+
 class FreeSpace:
     """What is free of obstacles, for the object in an image (2, 48, 48) at a start (x, y) [m].
 
@@ -129,17 +132,7 @@ class FreeSpace:
         self.polygons = [corners_of(one) for one in obstacles]
         self.outline_m = outline_of(image) if outline_m is None else outline_m
         self.start_xy_m = np.array(start_xy_m)
-        self.least_m = min(START_M, *(self._gap_at(start_xy_m, [one]) for one in self.polygons))
-
-    def _gap_at(
-        self,
-        xy_m: Sequence[float],
-        polygons: Sequence[np.ndarray],
-        outline_m: np.ndarray | None = None,
-    ) -> float:
-        """Gap [m] of an outline, by default the object's as its image shows it, at (x, y) [m]."""
-        outline = self.outline_m if outline_m is None else outline_m
-        return float(gaps_m(polygons, placed(outline, np.array([[[*xy_m, 0.0]] * 2]))).min())
+        self.least_m = min(START_M, _gap_at(start_xy_m, self.outline_m, self.polygons))
 
     def check(
         self, goal_xy_m: Sequence[float], on_table: Callable[[np.ndarray], np.ndarray]
@@ -160,7 +153,7 @@ class FreeSpace:
                 )
             places = ("object", self.start_xy_m, self.outline_m), ("goal", goal_xy_m, inner)
             for what, (x, y), outline in places:
-                if self._gap_at((x, y), [polygon], outline) < -DEEPEST_M:
+                if _gap_at((x, y), outline, [polygon]) < -DEEPEST_M:
                     raise ValueError(f"{name} lies on the {what} at ({x:.3f}, {y:.3f}) m; move it")
 
     def margin_m(self, xy_m: np.ndarray) -> np.ndarray:
@@ -191,7 +184,7 @@ class FreeSpace:
             hand[..., :2] = poses[:, [0, -1], :2]
             hand[..., 2] = adapt_to_object(action, self.image).grip_yaw + poses[:, 0, 2, None]
         by_hand = gaps_m(self.polygons, placed(hand_m(action), hand))[:, 0]
-        return np.minimum(spare, by_hand - self.margin_m(poses[:, 0, :2]))
+        return np.minimum(spare, by_hand - self.margin_m(poses[:, 0, :2]).clip(0.0))
 
     def is_free(self, step: Step) -> bool:
         """Return whether the hand can close around the object, at the end of a step, and turn."""
@@ -201,7 +194,7 @@ class FreeSpace:
         hand = np.column_stack([np.broadcast_to(at, (N_POSES, 2)), yaws])[None]
         shapes = hand_m(step.primitive), ring(radius_m(self.image))
         gap_m = min(gaps_m(self.polygons, placed(shape, hand)).min() for shape in shapes)
-        return bool(gap_m >= self.margin_m(at))
+        return bool(gap_m >= max(self.margin_m(at), 0.0))
 
 
 def hand_m(action: Primitive) -> np.ndarray:
