@@ -7,7 +7,6 @@ import pytest
 import torch
 from matplotlib.path import Path
 
-from affordlib.perception import outline_image
 from affordlib.planning import (
     EffectMap,
     PlanMode,
@@ -38,6 +37,14 @@ from tests.problems import problem_of
 
 PLANNERS = (plan_astar, plan_continuous, plan_gradient, plan_cem)
 BOX = 0.5 * np.array([[0.06, 0.05], [-0.06, 0.05], [-0.06, -0.05], [0.06, -0.05]])
+
+
+def box_image():
+    """Camera image of the box."""
+    x = 0.16 * (np.arange(144) + 0.5) / 144 - 0.08
+    mask = (np.abs(x) < 0.03) & (np.abs(x[:, None]) < 0.025)
+    mask = mask.reshape(48, 3, 48, 3).mean(axis=(1, 3))
+    return np.stack([1 - 0.05 * mask, mask]).astype(np.float32)
 
 
 def drawn(rng, within_m=0.12):
@@ -267,13 +274,13 @@ def unit(angle):
 
 def test_an_object_beside_an_obstacle_may_leave_it():
     wall, goal = Obstacle.box((-0.0405, 0.02), (0.02, 0.02)), Goal((0.03, 0.12), 0.005)
-    effects = EffectMap(KnownDynamics(), outline_image(BOX))
+    effects = EffectMap(KnownDynamics(), box_image())
     posed = PlanningProblem((0.0, 0.0), goal, effects, obstacles=(wall,))
     assert posed.free_space.least_m < START_M
     assert plan_continuous(posed).reaches_goal
 
 
 def test_the_outline_of_an_image_is_the_objects():
-    image = outline_image(BOX)
+    image = box_image()
     space = FreeSpace([Obstacle.disc((0.2, 0.2), 0.02)], image, (0.0, 0.0))
     assert np.abs(np.sort(space.outline_m, axis=0) - np.sort(BOX, axis=0)).max() < 0.002
