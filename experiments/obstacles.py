@@ -1,9 +1,8 @@
 """A table with obstacles: what partial actions and each part of the free-space check are worth.
 
-Tasks are drawn with a seed, by an object's dimensions alone, before any planner runs. A task is
-*feasible* if a search finds a chain that has the simulator in place of the model, no margin, and
-four times as many chains as a planner. *Success*: at most 5 mm from the goal, and neither object
-nor arm has touched an obstacle, by the contact forces of every simulation step.
+Tasks are drawn with a seed, by an object's dimensions alone, before any planner runs; whether one
+can be solved is not known. *Success*: at most 5 mm from the goal, and neither object nor arm has
+touched an obstacle, by the contact forces of every simulation step.
 
     python -m experiments.obstacles --only row=continuous,continuous_full
 """
@@ -26,7 +25,6 @@ import torch
 from affordlib.interactions.recipes import Variation
 from affordlib.models import load_checkpoint
 from affordlib.planning import (
-    EffectMap,
     PlanMode,
     PlanningProblem,
     Skills,
@@ -35,7 +33,6 @@ from affordlib.planning import (
     plan_continuous,
     plan_gradient,
 )
-from affordlib.planning.continuous import free, starts
 from affordlib.planning.free_space import (
     FULL_AT_M,
     MARGIN_M,
@@ -47,7 +44,7 @@ from affordlib.planning.free_space import (
     placed,
     ring,
 )
-from affordlib.planning.rollout import poses_along, roll_out
+from affordlib.planning.rollout import poses_along
 from affordlib.planning.skills import CHECKPOINTS
 from affordlib.primitives import Drag, Push
 from affordlib.types import Goal, Obstacle, UnreachableError
@@ -55,7 +52,6 @@ from affordlib.world import Cuboid, Tabletop, TabletopObject, WorldConfig, categ
 from experiments import runner
 from experiments.commands import command
 from experiments.field_baselines import plan_cem
-from experiments.oracle import oracle_effects
 from experiments.runner import FOLDER, Job, Rows, interval, plain
 
 NAME, SEED, VALIDATION_SEED = "obstacles", 40_001, 40_002
@@ -68,9 +64,6 @@ N_OBJECTS = 12
 
 CATEGORIES = "cuboid", "upright_cylinder", "bar", "sphere", "cuboid", "lying_cylinder"
 """A bar is a cuboid of 8 × 4 cm, the longest within the sizes of the training objects."""
-
-N_SEARCHED = 4096
-"""Chains of each number of actions in the search with the simulator."""
 
 
 @dataclass(frozen=True)
@@ -201,24 +194,16 @@ LAYOUTS = {
 }
 
 
-class WithoutMargin(FreeSpace):
-    """A free-space check that allows what just does not touch."""
-
-    def margin_m(self, xy_m):
-        """Return zeros (...) for positions (..., 2)."""
-        return np.zeros(xy_m.shape[:-1])
-
-
 @dataclass(frozen=True)
 class PartlyChecked(PlanningProblem):
     """A problem of which only a part is checked.
 
     check: "goal", the object's pose near the goal; "ends", its pose after each action, and the
     hand; "line", the straight way between these poses, and the hand; "object", its whole way
-    without the hand; "exact", all without a margin.
+    without the hand.
     """
 
-    check: str = "exact"
+    check: str = "line"
 
     def spare_m(self, begins, direction_rad, phase):
         """Return the gap of what is checked, minus the margin [m] (n,)."""
@@ -227,9 +212,6 @@ class PartlyChecked(PlanningProblem):
         poses = poses_along(self.effects, begins, direction_rad, phase, N_POSES)
         space, ends = self.free_space, poses[:, [-1, -1]]
         action, angle = self.effects.kind.towards(0.0), direction_rad.numpy()
-        if self.check == "exact":
-            space = WithoutMargin(self.obstacles, space.image, self.start_xy_m, space.outline_m)
-            return space.spare_m(action, angle, phase.numpy(), poses)
         if self.check == "line":
             return space.spare_m(action, angle, phase.numpy(), poses[:, [0, -1]])
         shown = poses if self.check == "object" else ends
@@ -272,50 +254,14 @@ def _skills(world: str) -> Skills:
 
 
 @lru_cache(maxsize=1)
-def _tabletops() -> tuple[Tabletop, Tabletop]:
-    return Tabletop(), Tabletop()
-
-
-@lru_cache(maxsize=N_OBJECTS)
-def _oracle(number: int) -> EffectMap:
-    """The effect map by the simulator of an object."""
-    world, imagined = _tabletops()
-    obj, yaw = drawn_object(number)
-    world.place(obj, (0.0, 0.0), yaw)
-    return oracle_effects(imagined, world, world.depth_image())
-
-
-def find_feasible(family: str, index: int, seed: int) -> dict[str, Any]:
-    """Search for a chain with the simulator as the model; actions: the fewest that are enough."""
-    task = drawn_task(family, index, seed)
-    problem = PartlyChecked(
-        (0.0, 0.0), task.goal, _oracle(task.number), "multi_partial", obstacles=task.obstacles
-    )
-    found = {}
-    for partial in (True, False):
-        rng = np.random.default_rng(index)
-        posed = replace(problem, mode=PlanMode(MAX_STEPS, partial))
-        found["partial" if partial else "full"] = next(
-            (k for k in range(1, MAX_STEPS + 1) if _reaches(posed, k, rng)), None
-        )
-    return found
-
-
-def _reaches(problem: PlanningProblem, k: int, rng: np.random.Generator) -> bool:
-    """Whether any of `N_SEARCHED` chains of k actions is free and ends at the goal."""
-    target = torch.from_numpy(np.subtract(problem.goal.xy_m, problem.start_xy_m))
-    direction, phase = starts(problem, target, k, N_SEARCHED, rng)
-    if not len(direction):
-        return False
-    positions, _, _ = roll_out(problem.effects, direction, phase)
-    near = (positions[:, -1] - target).norm(dim=-1) <= WITHIN_M
-    return bool(near.any()) and bool(free(problem, (direction[near], phase[near])).any())
+def _tabletop() -> Tabletop:
+    return Tabletop()
 
 
 def run_task(row: str, family: str, index: int, seed: int) -> dict[str, Any]:
     """Plan and execute a task without observing; return what came of it."""
     planner, settings = ROWS[row]
-    task, world = drawn_task(family, index, seed), _tabletops()[0]
+    task, world = drawn_task(family, index, seed), _tabletop()
     where = settings.get("world", "clean")
     rng = np.random.default_rng([seed, index])
     config = Variation().sample(task.obj, rng) if where == "perturbed" else WorldConfig()
@@ -362,7 +308,7 @@ def calibrate(kind: str, index: int) -> list[dict[str, float]]:
     the gap to the recorded way, negative where it would touch, is the error. travel_m: predicted
     distance of the object from its start, where it comes nearest.
     """
-    world, found = _tabletops()[0], []
+    world, found = _tabletop(), []
     for k in range(N_PUSHES):
         rng = np.random.default_rng([VALIDATION_SEED, index, k])
         of_kind = (0, 1, 2) if kind == "push" else (3, 5)
@@ -398,7 +344,7 @@ def calibrate(kind: str, index: int) -> list[dict[str, float]]:
 
 
 def job(row: str, family: str = "", index: int = 0, seed: int = SEED) -> Job:
-    """Return the job of a row and a task; rows "feasible" and "margin" plan nothing."""
+    """Return the job of a row and a task; the row "margin" plans nothing."""
     arguments = {"row": row, "family": family, "index": index, "seed": seed}
     return Job(make, arguments, checkpoints=(*CHECKPOINTS.values(), "film_5000_perturbed"))
 
@@ -407,8 +353,6 @@ def make(row: str, family: str, index: int, seed: int) -> Any:
     """Make the result of a job."""
     if row == "margin":
         return calibrate(family, index)
-    if row == "feasible":
-        return find_feasible(family, index, seed)
     return run_task(row, family, index, seed)
 
 
@@ -420,7 +364,7 @@ TASKS = sorted(
     key=lambda task: (task[1] / FAMILIES[task[0]], task[0]),
 )
 GROUPS = (
-    ("continuous", "continuous_full", "feasible"),
+    ("continuous", "continuous_full"),
     ("astar", "astar_full"),
     ("check_ends", "check_line", "check_object", "check_goal"),
     ("perturbed", "perturbed_full"),
@@ -437,12 +381,10 @@ def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
     found = runner.read(NAME, job, folder)
     errors = pd.DataFrame([a | e for a, r in found if a["row"] == "margin" for e in r])
     records = judged(pd.DataFrame([a | r for a, r in found if a["row"] in ROWS]))
-    searched = pd.DataFrame([a | r for a, r in found if a["row"] == "feasible"])
     return {
         "margin": margin_rows(errors),
         "rows": rows_of(records),
         "partial_and_full": paired_rows(records),
-        "feasible": feasible_rows(searched),
     }
 
 
@@ -494,16 +436,6 @@ def rows_of(records: pd.DataFrame) -> Rows:
             made["actions_mean"] = some.actions.mean()
             rows.append(made)
     return plain(rows)
-
-
-def feasible_rows(searched: pd.DataFrame) -> Rows:
-    """Return how many of the tasks that were searched have a chain, and one of full actions."""
-    rows = []
-    for family, some in by_family(searched) if len(searched) else ():
-        row = {"family": family, "n": len(some)}
-        row["feasible"] = int(some[["partial", "full"]].notna().any(axis=1).sum())
-        rows.append(row | {"feasible_full": int(some.full.notna().sum())})
-    return rows
 
 
 PAIRS = [(row, f"{row}_full") for row in ("continuous", "astar", "perturbed")]
