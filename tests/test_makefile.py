@@ -119,15 +119,6 @@ def test_another_python_or_system_is_refused(project, system, options, why):
     assert (failed, ran) == (True, [])
 
 
-def test_an_environment_of_uv_stays_one(project):
-    project.make()
-    (project.here / ".venv" / ".installed").unlink()
-    (project.here / ".venv" / "pyvenv.cfg").write_text("home = /usr/bin\nuv = 0.9.1\n")
-    (project.commands / "uv").write_text('#!/bin/sh\necho "uv $*" >> log\n')
-    assert project.make()[::2] == (False, ["uv sync"])
-    assert project.make()[::2] == (False, [])
-
-
 def test_options_are_words_and_zero_means_no(project):
     project.make()
     for text in ('2"; touch here; "', "$$(touch here)", "x; touch here"):

@@ -54,27 +54,6 @@ def test_few_interactions_are_flagged_and_all_say_why(shipped):
     assert data["reached"].values.all() or name == "reach"
 
 
-def test_full_executions_train_and_partial_ones_are_a_set_of_their_own(shipped):
-    name, data = shipped
-    stop = data["stop_phase"].values
-    if name != "partial":
-        assert (stop == 1).all()
-        assert "full_effect" not in data
-        return
-    assert 0.05 < stop.min() < 0.1
-    assert 0.95 < stop.max() < 1
-    arrays = InteractionTensors.from_dataset(data, np.arange(20))
-    stop = torch.from_numpy(stop[:20]).float()
-    batch = sample_mixed(arrays, 8, 4, torch.Generator().manual_seed(0))
-    assert torch.equal(batch.t_target[:, 0], stop)
-    assert torch.equal(
-        condition_on_recorded_action(arrays.joined(arrays)).action_t[:, 1], stop.repeat(2)
-    )
-    gap_m = np.linalg.norm((data["rest_effect"] - data["full_effect"]).values[:, :3], axis=1)
-    assert np.median(gap_m) < 0.0005
-    assert np.quantile(gap_m, 0.95) < 0.002
-
-
 def test_the_tool_was_where_the_action_says(shipped):
     """Measured every 150 ms, as in the paper; a guarded hand may have stopped above its target."""
     name, data = shipped

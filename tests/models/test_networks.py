@@ -1,7 +1,6 @@
 """Properties of every network in both frames: equivariance, gradients, ranges, loss."""
 
 import dataclasses
-import itertools
 import math
 
 import numpy as np
@@ -120,26 +119,6 @@ def test_a_row_alone_is_predicted_as_in_a_batch(network, some):
         one = dataclasses.replace(batch, observations=row_of(batch.observations, row), **part)
         for a, b in zip(together, predictions(network, one), strict=True):
             torch.testing.assert_close(a[[row]], b, atol=4e-5, rtol=1e-4)  # 8e-6
-
-
-def test_the_literal_loop_and_the_batch_agree(network, some):
-    """On the same draw, the mean over single targets has the batch's loss and gradients."""
-    batch = batch_of(some.select(torch.arange(6)), n_targets=3)
-    network.loss(batch).backward()
-    together = [p.grad.clone() for p in network.parameters() if p.grad is not None]
-    network.zero_grad()
-    losses = []
-    for b, j in itertools.product(range(6), range(3)):
-        names = ("t_target", "action", "effect")
-        target = {name: getattr(batch, name)[[b], j : j + 1] for name in names}
-        seen = row_of(batch.observations, b)
-        one = dataclasses.replace(batch, image=batch.image[[b]], observations=seen, **target)
-        losses.append(network.loss(one) / 18)
-        losses[-1].backward()
-    apart = [p.grad for p in network.parameters() if p.grad is not None]
-    torch.testing.assert_close(sum(losses), network.loss(batch), rtol=1e-5, atol=0)
-    for a, b in zip(together, apart, strict=True):
-        assert (a - b).norm() <= 1e-4 * a.norm() + 1e-5
 
 
 @torch.no_grad()
