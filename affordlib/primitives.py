@@ -149,7 +149,6 @@ class Move(Primitive):
     length: float = metres(0.0, 0.15, 0.05)
 
     ahead_rad: ClassVar[float] = 0.0  # from theta to the direction in which the object moves
-    reach_m: ClassVar[float]  # by which one full action moves nearly any object
 
     @classmethod
     def sample(cls, outline_m: np.ndarray, rng: np.random.Generator) -> Self:
@@ -184,7 +183,6 @@ class Push(Move):
     rollable = False
     acts_from = 0.4
     ahead_rad = math.pi
-    reach_m = 0.075
 
     @cached_property
     def segments(self) -> tuple[Segment, ...]:
@@ -238,7 +236,6 @@ class Drag(Move):
     force_N = 10.0
     rollable = True
     acts_from = 0.25
-    reach_m = 0.045
 
     @cached_property
     def segments(self) -> tuple[Segment, ...]:

@@ -74,7 +74,7 @@ def test_a_new_moving_primitive_has_a_map(monkeypatch):
     class Nudge(Move):
         """A push of the known dynamics, which is no subclass of `Push`."""
 
-        name, acts_from, reach_m = "nudge", Push.acts_from, 0.05
+        name, acts_from = "nudge", Push.acts_from
 
         def __init__(self, theta):
             object.__setattr__(self, "push", Push(theta + math.pi))

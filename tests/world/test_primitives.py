@@ -207,7 +207,7 @@ def test_a_primitive_is_one_class(film, cuboid_image):
         grip: float = radians(0.0)
         seconds: float = 3.75
 
-        name, reach_m, segments = "tap", 0.02, Push(0.0).segments
+        name, segments = "tap", Push(0.0).segments
 
     tap = Tap(-1.0, grip=4.0, seconds=9.0)
     assert (tap.theta, tap.grip, tap.seconds) == (2 * math.pi - 1.0, 4.0 - 2 * math.pi, 9.0)
