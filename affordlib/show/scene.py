@@ -50,6 +50,7 @@ class Scene(widgets.VBox):
         self.plot = k3d.plot(
             height=height, grid_visible=False, camera_auto_fit=False, menu_visibility=False
         )
+        self.plot.layout.width = "100%"
         self.plot.background_color, self.plot.camera = 0xF4F6F8, list(CAMERA)
         self.plot.axes_helper, self.plot.lighting = 0.0, 1.8
         table = [(x, y) for x in TABLE_X_M for y in TABLE_Y_M]
@@ -62,7 +63,7 @@ class Scene(widgets.VBox):
         self._object: Any | None = None
         self._marks: list[Any] = []
         self.player = widgets.Play(interval=round(1000 * EVERY * STEP_S), max=0)
-        time = widgets.IntSlider(max=0, readout=False, layout={"flex": "1"})
+        time = widgets.IntSlider(max=0, readout=False, layout={"flex": "1", "min_width": "0"})
         speed = widgets.Dropdown(options={"1×": 1, "½×": 2, "¼×": 4}, layout={"width": "5em"})
         for name in ("value", "max"):
             widgets.jslink((self.player, name), (time, name))
@@ -71,7 +72,8 @@ class Scene(widgets.VBox):
         speed.observe(lambda c: setattr(self.player, "interval", interval * c["new"]), "value")
         self.place()
         below = widgets.HBox([self.player, time, speed])
-        super().__init__([self.plot, below], layout={"flex": "1 1 420px", "max_width": "700px"})
+        layout = {"flex": "1 1 420px", "max_width": "700px", "min_width": "0"}
+        super().__init__([self.plot, below], layout=layout)
 
     def place(self, goal: Goal | None = None, plan: Plan | None = None) -> None:
         """Show the world's present object and obstacles, and forget what was recorded."""
