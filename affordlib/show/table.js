@@ -280,7 +280,7 @@ export function handAt(hand, phase) {
 
 // problem: {object: {map, outline, hand, yaw (of the object in the map's image)}, pose [x, y, yaw],
 // goal [x, y], tolerance, most (actions), partial (may stop early), risk (weight of the variance),
-// obstacles, reachable, table [x0, x1, y0, y1], previous (a chain)}.
+// obstacles, reachable, table [x0, x1, y0, y1], previous (a chain), quick (a smaller search)}.
 export function plan(asked) {
   const problem = asked.obstacles?.length ? { ...asked, space: spaceOf(asked) } : asked;
   const { object, pose, goal, most = 3, tolerance = 0.02 } = problem;
@@ -319,11 +319,11 @@ function halton(i, base) {
   return value;
 }
 
-function startsOf({ object, pose, partial = true, obstacles = [] }, target, n) {
+function startsOf({ object, pose, partial = true, obstacles = [], quick }, target, n) {
   const yaw = pose[2] - (object.yaw ?? 0);
   const bearing = Math.atan2(target[1], target[0]);
   const starts = [];
-  for (let i = 1; i <= (obstacles.length ? 3 : 1) * STARTS; i++) {
+  for (let i = 1; i <= (obstacles.length && !quick ? 3 : 1) * STARTS; i++) {
     const spread = obstacles.length && i % 2 ? Math.PI : SPREAD; // half of them make a detour
     const chain = [];
     for (let k = 0; k < n - 1; k++) {
@@ -623,7 +623,8 @@ export class Table {
 
   // A moment of a motion as it was simulated: rows of [x, y, yaw, lift, hand's x, y, z, yaw, gap].
   replay(rows, place) {
-    const k = Math.min(Math.floor(place), rows.length - 1);
+    place = between(0, place, rows.length - 1); // a frame's time may lie before the start
+    const k = Math.floor(place);
     const next = rows[Math.min(k + 1, rows.length - 1)];
     const now = rows[k].map((value, axis) => share(value, next[axis], place - k));
     const [x, y, yaw, lift, ...tool] = now;
@@ -925,7 +926,7 @@ function render({ model, el }) {
     if (running || !thing?.map) return view.state.steps;
     const { table } = model.get("table");
     const asked = { object: thing, pose, goal: xy, tolerance: goal.tolerance, reachable, table, obstacles };
-    const planned = plan({ ...asked, previous: chain });
+    const planned = plan({ ...asked, previous: chain, quick: true });
     chain = planned.chain;
     return planned.steps;
   }

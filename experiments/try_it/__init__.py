@@ -89,7 +89,7 @@ def recorded(world: Tabletop, obj: TabletopObject, skills: Skills, goal: Goal) -
     world.on_step = None
     whole = np.round(10_000 * np.array(rows or [9 * [0.0]])).astype("<i2")
     return {
-        "goal": goal.xy_m,
+        "goal": list(goal.xy_m),
         "chain": [v for s in plan.steps for v in (s.primitive.direction_rad, s.stop_phase)],
         "motion": base64.b64encode(whole.tobytes()).decode(),
         "distance": round(outcome.distance_m, 5),

@@ -36,7 +36,7 @@ function problem() {
   return {
     object: mapOf(object), pose, goal, tolerance: 0.01, most: Number(most.value), partial: partial.checked,
     risk: Number(risk.value), obstacles,
-    reachable: object.reachable, table: data.table, previous: chain,
+    reachable: object.reachable, table: data.table, previous: chain, quick: Boolean(view.held),
   };
 }
 

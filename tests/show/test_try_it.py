@@ -19,7 +19,7 @@ def numbers(value):
     if isinstance(value, dict | list):
         inner = value.values() if isinstance(value, dict) else value
         return [number for one in inner for number in numbers(one)]
-    return [len(value) if isinstance(value, str) else float(value)]
+    return [len(value) if isinstance(value, str) else float(value or 0)]
 
 
 def test_the_page_is_what_its_command_makes_of_its_sources():
@@ -161,10 +161,10 @@ def test_a_recorded_execution_is_played_and_named_so(opened):
     assert re.search(r"nearest of \d+ goals, [\d.]+ cm from yours", said.inner_text())
     page.get_by_role("button", name="See the robot do it").click()
     page.locator(".truth").wait_for(state="attached")
-    assert "recorded in the simulation" in page.locator(".note").inner_text()
+    assert "recorded in the simulation" in page.locator(".note").text_content()
     assert re.search(r"ended [\d.]+ mm from this recorded goal", said.inner_text())
     page.get_by_role("button", name="Play the plan").click()
-    assert page.locator(".note").inner_text() == "prediction"
+    assert page.locator(".note").text_content() == "prediction"
 
 
 def test_by_touch_a_swipe_scrolls_and_a_tap_moves_the_goal(opened):
