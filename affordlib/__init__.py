@@ -23,7 +23,7 @@ interactions.collect interactions.recipes
 interactions.store logs.cross_validate logs.fit logs.log logs.planning models.evaluation
 models.checkpoint models.domain models.lever_up models.training
 show.executors show.explorers
-show.goal_picker show.plots
+show.goal_picker show.plots show.scene
 """
 _CONF = BeartypeConf(
     violation_type=TypeError,

@@ -27,7 +27,7 @@ from affordlib.results import (
     results_table,
     write_results,
 )
-from affordlib.types import Goal, Outcome, Plan, Step, UnreachableError, check_array
+from affordlib.types import Goal, Obstacle, Outcome, Plan, Step, UnreachableError, check_array
 from affordlib.world.camera import View
 from exercises import check
 from tests.problems import Still
@@ -104,8 +104,9 @@ EffectNetwork FittedModel LoggedPushes NetworkConfig Pushes TabletopObject open_
 """
 INSIDE = """
 Batch BranchTable CircularHarmonics FreeSpace Reading about_training condition_on_final_effect
-condition_on_poses condition_on_recorded_action dataset_sha256 descend final_error final_errors_m
-make_steps network_predictions plot_flow roll_out sample_mixed search stored_sha256
+condition_on_poses condition_on_recorded_action corners_of dataset_sha256 descend final_error
+final_errors_m gaps_m make_steps network_predictions placed plot_flow roll_out sample_mixed search
+stored_sha256
 """
 """Parts of driven ones, for pages that show what is inside."""
 NAMES = sorted(
@@ -247,9 +248,10 @@ def shop(one_world, skills, pushes, tmp_path_factory):
         "EffectMap": {"n_directions": 8, "n_phases": 5},
         "plan_astar": {"stop_phases": (0.5, 1.0)},
         "plan_gradient": {"samples": 10},
-        "plan_continuous": {"draft": True},
         "run_closed_loop": {"config": once, "goal": Goal(AT, 0.05)},
         "GoalPicker": {"view": False},
+        "Scene": {"height": 400},
+        "plot_obstacles": {"obstacles": (Obstacle.disc((0.2, 0.0), 0.03),)},
         "conditioning_explorer": {"seen": executed},
         "Grasp": {"seen_height": 0.05},
         "Push": {"radius": 0.2},

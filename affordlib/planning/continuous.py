@@ -237,7 +237,7 @@ def plan_continuous(
     rng = np.random.default_rng(check_count("seed", seed, least=0))
     target = torch.from_numpy(np.subtract(goal.xy_m, start))
     fewest = max(1, math.ceil(float(target.norm()) / max(effects.reach_m, 1e-4)))
-    check_within("risk_weight", risk_weight, 0.0, 1e6)
+    risk_weight = check_within("risk_weight", risk_weight, 0.0, 1e6)
     value = partial(objective, effects, target, risk_weight=risk_weight)
     candidates = []
     for n in N_FREE_STARTS if problem.obstacles else (N_STARTS,):

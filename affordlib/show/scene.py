@@ -63,7 +63,8 @@ class Scene(widgets.VBox):
         self._object: Any | None = None
         self._marks: list[Any] = []
         self.player = widgets.Play(interval=round(1000 * EVERY * STEP_S), max=0)
-        time = widgets.IntSlider(max=0, readout=False, layout={"flex": "1", "min_width": "0"})
+        looks = {"layout": {"flex": "1", "min_width": "0"}, "style": {"description_width": "auto"}}
+        time = widgets.IntSlider(max=0, readout=False, description="time", **looks)
         speed = widgets.Dropdown(options={"1×": 1, "½×": 2, "¼×": 4}, layout={"width": "5em"})
         for name in ("value", "max"):
             widgets.jslink((self.player, name), (time, name))

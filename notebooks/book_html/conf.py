@@ -17,7 +17,8 @@ from myst_parser.slugs import github_slugify
 project = html_title = "Planning with partial actions"
 root_doc = "README"
 extensions = ["myst_nb"]
-include_patterns = ["*.md", "data/*.md", "notebooks/*.ipynb", "notebooks/appendix/*.ipynb"]
+include_patterns = ["*.md", "data/*.md", "notebooks/*.md", "notebooks/*.ipynb"]
+include_patterns += ["notebooks/appendix/*.ipynb"]
 exclude_patterns = [".*", "runs", "build", "**/.*"]
 
 nb_execution_mode = "off"

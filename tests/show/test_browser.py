@@ -298,7 +298,7 @@ def test_sliders_by_keyboard(page, table):
     x, y = goal_of(page)
     handles = page.locator(".affordlib-picker .noUi-handle")
     named = handles.evaluate_all("all => all.map((e) => e.getAttribute('aria-label'))")
-    assert named == ["x [cm]", "y [cm]", "turn [°]", "lift [cm]"]
+    assert named == ["x [cm]", "y [cm]", "turn [°]", "lift [cm]", "time"]
 
     def press(slider, key, presses):
         for _ in range(presses):
@@ -431,7 +431,8 @@ def test_a_saved_notebook_keeps_a_picture(page, lab):
     outputs = saved_outputs(page, lab)
     widget = [o for o in outputs if WIDGET in o.get("data", ())]
     assert widget
-    assert all("image/png" in output["data"] for output in widget)
+    drawn = ["<img" in output["data"].get("text/html", "") for output in widget]  # a scene
+    assert all("image/png" in o["data"] or is_ for o, is_ in zip(widget, drawn, strict=True))
     assert [o for o in outputs if o.output_type == "error"] == []
     assert (lab.out / "00_start_here.json").is_file()
 
