@@ -95,5 +95,6 @@
     said.innerHTML = words[state];
   }
   show();
+  el.dataset.lmSuppressShortcuts = true; // of JupyterLab, which would take the arrow keys
   el.replaceChildren(style, ...controls.map(({ label }) => label), row, legend, said);
 })
