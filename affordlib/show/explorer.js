@@ -81,6 +81,7 @@
   const controls = sliders.map(({ name, values }, k) => {
     const [text, input] = [make("span", []), make("input", [])];
     Object.assign(input, { type: "range", min: 0, max: values.length - 1, step: 1, value: at[k] });
+    input.dataset.lmSuppressShortcuts = true; // of JupyterLab, which would take the arrow keys
     input.addEventListener("input", () => {
       at[k] = Number(input.value);
       show();
@@ -95,6 +96,5 @@
     said.innerHTML = words[state];
   }
   show();
-  el.dataset.lmSuppressShortcuts = true; // of JupyterLab, which would take the arrow keys
   el.replaceChildren(style, ...controls.map(({ label }) => label), row, legend, said);
 })

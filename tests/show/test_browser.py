@@ -421,7 +421,7 @@ def test_a_slider_of_an_explorer_changes_its_figure_without_the_kernel(page):
     wait_until(lambda: "At t = 0.80" in words.inner_text())
     assert explorer.locator("img").count() == 0  # that of pages without scripts
     before = explorer.locator("circle").get_attribute("cx")
-    slider.evaluate("e => { e.stepDown(); e.dispatchEvent(new Event('input')); }")
+    slider.press("ArrowLeft")
     wait_until(lambda: "At t = 0.75" in words.inner_text())
     assert float(explorer.locator("circle").get_attribute("cx")) < float(before)
     picture(page, "explorer")
