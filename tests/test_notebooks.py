@@ -162,7 +162,7 @@ def test_stored_results_are_shown_as_they_are_now(name):
 @each_notebook
 def test_small_and_clean(name):
     text = PATHS[name].read_text(encoding="utf-8")
-    assert len(text.encode()) < 1_700_000
+    assert len(text.encode()) < 1_500_000
     assert text == cleaned(read(name)), "metadata is not clean; run `make notebooks`"
 
 

@@ -21,7 +21,7 @@
     button.textContent = "▶";
   };
   const step = (now) => {
-    const next = Number(time.value) + ((now - last) / 1000) * 30 * Number(speed.value);
+    const next = Number(time.value) + ((now - last) / 1000) * 24 * Number(speed.value);
     last = now;
     show(Math.min(next, frames - 1));
     if (next < frames - 1) frame = requestAnimationFrame(step);

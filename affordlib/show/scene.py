@@ -24,7 +24,7 @@ from affordlib.world.camera import SCENERY
 from affordlib.world.objects import mesh
 from affordlib.world.trajectory import STEP_S
 
-EVERY = 8
+EVERY = 10
 """Simulation steps (1/240 s) between two recorded poses."""
 
 CAMERA = (0.84, -0.88, 0.62, -0.24, 0.02, 0.24, 0.0, 0.0, 1.0)
@@ -154,7 +154,7 @@ class Scene(widgets.VBox):
         asked = json.dumps({"frames": len(self._frames), "height": self.plot.height})
         script = f"{_SCRIPT.read_text()}(document.currentScript.parentElement, {asked}, '{data}')"
         picture = io.BytesIO()
-        Image.fromarray(self.world.picture(640, 400)).save(picture, "jpeg", quality=85)
+        Image.fromarray(self.world.picture(640, 400)).save(picture, "jpeg", quality=70)
         still = base64.b64encode(picture.getvalue()).decode()
         image = f'<img alt="The robot and its table" src="data:image/jpeg;base64,{still}">'
         html = f"<div>{image}<script>{script}</script></div>"
