@@ -154,7 +154,8 @@ DISC = {"heuristic": "disc"}
 PERTURBED = {"model": "film_5000_perturbed", "world": "perturbed"}
 ROLLING, OUTSIDE = (PERTURBED | {"world": world} for world in ("perturbed_rollable", "outside"))
 RISK_WEIGHTS = (0.0, 1.0, 10.0, 30.0)
-"""Risk weights of the continuous planner that are tried on the validation goals."""
+RATES = {"gradient": (0.03, 0.1, 0.3, 1.0, 3.0), "adam": (0.001, 0.005, 0.02)}
+"""Constants of our planner and of the paper's that are tried on the validation goals."""
 
 READINGS = {
     "gradient_100": {"samples": 100, "reading": Reading()},
@@ -214,6 +215,17 @@ CONFIGS: dict[str, PlannerConfig] = {
             plan_continuous, arguments={"risk_weight": weight}, world="validation"
         )
         for weight in RISK_WEIGHTS
+    },
+    **{
+        f"{descent}_rate={rate:g}": PlannerConfig(
+            plan_gradient,
+            "cnp_500",
+            {"samples": 100, "reading": replace(READINGS[name]["reading"], rate=rate)},
+            world="validation",
+            **BY_PLAN,
+        )
+        for descent, name in (("gradient", "gradient_100"), ("adam", "gradient_adam_100"))
+        for rate in RATES[descent]
     },
 }
 
