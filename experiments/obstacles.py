@@ -356,23 +356,10 @@ def make(row: str, family: str, index: int, seed: int) -> Any:
     return run_task(row, family, index, seed)
 
 
-SHARE = 0.25
-"""Share of each family's tasks that are run; all rows have the same tasks."""
-
-TASKS = sorted(
-    ((family, k) for family, n in FAMILIES.items() for k in range(round(SHARE * n))),
-    key=lambda task: (task[1] / FAMILIES[task[0]], task[0]),
-)
-GROUPS = (
-    ("continuous", "continuous_full"),
-    ("astar", "astar_full"),
-    ("check_ends", "check_line", "check_object", "check_goal"),
-    ("perturbed", "perturbed_full"),
-    ("cem", "gradient"),
-)
+TASKS = [(family, k) for family, n in FAMILIES.items() for k in range(n)]
 JOBS = [
     *(job("margin", kind, k) for kind, n in (("push", 3), ("drag", 1)) for k in range(n)),
-    *(job(row, *task) for rows in GROUPS for task in TASKS for row in rows),
+    *(job(row, *task) for row in ROWS for task in TASKS),
 ]
 
 
