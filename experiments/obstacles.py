@@ -25,6 +25,7 @@ import torch
 from affordlib.interactions.recipes import Variation
 from affordlib.models import load_checkpoint
 from affordlib.planning import (
+    ClosedLoopConfig,
     PlanMode,
     PlanningProblem,
     Skills,
@@ -32,6 +33,7 @@ from affordlib.planning import (
     plan_astar,
     plan_continuous,
     plan_gradient,
+    run_closed_loop,
 )
 from affordlib.planning.free_space import (
     FULL_AT_M,
@@ -240,8 +242,12 @@ ROWS = {
     "perturbed_full": (plan_continuous, {"world": "perturbed", "partial": False}),
     "cem": (plan_cem, {}),
     "gradient": (plan_gradient, {}),
+    "closed_loop": (plan_continuous, {"observes": True}),
+    "closed_loop_full": (plan_continuous, {"observes": True, "partial": False}),
+    "closed_loop_perturbed": (plan_continuous, {"observes": True, "world": "perturbed"}),
 }
-"""Planner of each row, and its settings: whether it may stop early, what is checked, the world."""
+"""Planner of each row, and its settings: whether it may stop early, what is checked, the world, and
+whether it observes after each action, with up to two actions more."""
 
 
 @lru_cache(maxsize=2)
@@ -259,7 +265,7 @@ def _tabletop() -> Tabletop:
 
 
 def run_task(row: str, family: str, index: int, seed: int) -> dict[str, Any]:
-    """Plan and execute a task without observing; return what came of it."""
+    """Plan and execute a task; return what came of it."""
     planner, settings = ROWS[row]
     task, world = drawn_task(family, index, seed), _tabletop()
     where = settings.get("world", "clean")
@@ -268,10 +274,15 @@ def run_task(row: str, family: str, index: int, seed: int) -> dict[str, Any]:
     world.place(task.obj, (0.0, 0.0), task.yaw_rad, config=config, obstacles=task.obstacles)
     if where == "perturbed":
         world.settle(2.0)
+    mode = PlanMode(MAX_STEPS, settings.get("partial", True))
+    if settings.get("observes"):
+        config = ClosedLoopConfig(mode, MAX_STEPS + 2, max_renewals=0)
+        result = run_closed_loop(world, task.goal, _skills(where), planner, config)
+        about = {"planned": bool(result.plans), "status": result.status}
+        return about | _outcome(task, world, len(result.steps))
     seen = world.observe()
     effects = _skills(where).effects(seen.image)
     effects.spline  # noqa: B018 - computed before the time is taken, as by a loop that planned
-    mode = PlanMode(MAX_STEPS, settings.get("partial", True))
     posed, more = PlanningProblem, {"obstacles": seen.obstacles}
     if "check" in settings:
         posed, more = PartlyChecked, more | {"check": settings["check"]}
@@ -285,16 +296,15 @@ def run_task(row: str, family: str, index: int, seed: int) -> dict[str, Any]:
         execute_plan(world, plan)
     except UnreachableError:
         fault = True
+    about = {"planned": plan.predicted_distance_m <= WITHIN_M, "unreachable": fault}
+    return about | _outcome(task, world, len(plan.steps)) | {"plan_s": seconds}
+
+
+def _outcome(task: ObstacleTask, world: Tabletop, actions: int) -> dict[str, Any]:
     x, y, _ = world.object_pose()
-    return {
-        "planned": plan.predicted_distance_m <= WITHIN_M,
-        "distance_m": task.goal.distance_m((x, y)),
-        "object_touched": any(what == "object" for _, what in world.obstacles.touched),
-        "arm_touched": any(what == "arm" for _, what in world.obstacles.touched),
-        "unreachable": fault,
-        "actions": len(plan.steps),
-        "plan_s": seconds,
-    }
+    touched = {f"{name}_touched": False for name in ("object", "arm")}
+    touched |= {f"{what}_touched": True for _, what in world.obstacles.touched}
+    return {"distance_m": task.goal.distance_m((x, y)), "actions": actions} | touched
 
 
 N_PUSHES, N_BESIDE, WITHIN_GAP_M = 20, 20, 0.02
@@ -426,7 +436,9 @@ def rows_of(records: pd.DataFrame) -> Rows:
 
 
 PAIRS = [(row, f"{row}_full") for row in ("continuous", "astar", "perturbed")]
-PAIRS += [("continuous", row) for row in ROWS if row.startswith("check")]
+PAIRS += [("continuous", row) for row in ROWS if row.startswith("check") or row == "cem"]
+PAIRS += [("closed_loop", "continuous"), ("closed_loop", "closed_loop_full")]
+PAIRS += [("closed_loop_perturbed", "perturbed")]
 
 
 def paired_rows(records: pd.DataFrame) -> Rows:
