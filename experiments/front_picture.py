@@ -1,7 +1,7 @@
-"""Make the README's pictures: `python -m experiments.front_picture`.
+"""Make the README's picture: `python -m experiments.front_picture`.
 
 An animation of one push, twice: the full push overshoots the goal; the partial push, stopped at the
-planned phase, ends there. And a drawing of the data flow.
+planned phase, ends there.
 """
 
 from __future__ import annotations
@@ -10,16 +10,12 @@ import itertools
 from dataclasses import replace
 from io import BytesIO
 
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib import font_manager
 from PIL import Image, ImageDraw, ImageFont
 
 from affordlib.planning import Skills, execute_plan, plan_continuous
 from affordlib.results import repo_root, write_atomically
-from affordlib.show.diagrams import plot_flow
-from affordlib.show.plots import GOAL as GOAL_COLOR
-from affordlib.show.plots import NEUTRAL, PREDICTION, TRUTH
 from affordlib.types import Goal
 from affordlib.world import Cuboid, Tabletop
 
@@ -87,41 +83,8 @@ def _titled(picture: np.ndarray, title: str) -> np.ndarray:
     return np.asarray(image)
 
 
-def data_flow() -> bytes:
-    """Return a drawing, as SVG, of what passes from the robot to the planner and back."""
-    robot, data = "robot in PyBullet,\nor a log of your own", "interactions:\nimage, action, effect"
-    network = "network: effect and\nits σ at every phase"
-    planner, goal = "planner: pushes, and the\nphase where each one stops", "goal"
-    boxes = {
-        robot: (0.0, 1.0, NEUTRAL),
-        data: (1.0, 1.0, TRUTH),
-        network: (2.0, 1.0, PREDICTION),
-        planner: (1.0, 0.0, NEUTRAL),
-        goal: (2.0, 0.0, GOAL_COLOR),
-    }
-    arrows = {
-        (robot, data): (0.49, 1.21, "collect:\n02, 09"),
-        (data, network): (1.51, 1.21, "train:\n03–05"),
-        (network, planner): (1.72, 0.5, "predict: 06"),
-        (planner, robot): (0.28, 0.5, "execute,\nreplan: 07"),
-        (goal, planner): (1.6, 0.1, ""),
-    }
-    style = {"svg.hashsalt": "data flow", "font.size": 9}
-    with plt.rc_context(style):
-        figure, ax = plt.subplots(figsize=(7, 2.2))
-        plot_flow(ax, boxes, list(arrows))
-        for x, y, text in arrows.values():
-            ax.text(x, y, text, ha="center", va="center", color=NEUTRAL)
-        ax.set(xlim=(-0.35, 2.35), ylim=(-0.25, 1.4))
-        drawn = BytesIO()
-        figure.savefig(drawn, format="svg", metadata={"Date": None})
-        plt.close(figure)
-    return drawn.getvalue()
-
-
 def main() -> None:
-    """Draw the data flow; record the full and the partial push, and write them side by side."""
-    write_atomically(FIGURES / "data_flow.svg", data_flow())
+    """Record the full and the partial push, and write them side by side."""
     both = recorded("The full push", stop=False), recorded("Stopped at {:.0%} of it", stop=True)
     longest = max(map(len, both))
     sides = [side + side[-1:] * (longest - len(side)) for side in both]

@@ -1,9 +1,8 @@
-"""The embedded log of page 09, and the execution of plans with off-centre pushes.
+"""The embedded log of page 09.
 
 `python -m experiments.own_log` collects `data/own_log/SURFACE_SUPPORT.txt.xz` in the simulated
 world, in the text format of Zhou et al.: 50 pushes of one triangle with a thin rod for each of five
-combinations of surface (friction) and support (centre of mass). Then it plans and executes 50
-goals with the fitted models. `--only log` or `--only goals` does one of the two.
+combinations of surface (friction) and support (centre of mass).
 """
 
 from __future__ import annotations
@@ -16,19 +15,18 @@ from pathlib import Path
 
 import numpy as np
 
-from affordlib.geometry import rotated, unit_vector
-from affordlib.logs import Log, LoggedPushes, PushedObject, fit
+from affordlib.geometry import rotated
+from affordlib.logs import Log, LoggedPushes
 from affordlib.primitives import PushAt
-from affordlib.results import repo_root, write_results
+from affordlib.results import repo_root
 from affordlib.types import UnreachableError
 from affordlib.world import Prism, Tabletop, WorldConfig
 from affordlib.world.robot import ROD_WIDTH_M
 from experiments.commands import command
-from experiments.pose_goals import Remembered, attempt, summary
 from experiments.real_pushes import pushes_of
 
 FOLDER = repo_root() / "data" / "own_log"
-N_PUSHES, N_GOALS = 50, 50
+N_PUSHES = 50
 TRIANGLE_M = ((0.0, 0.0), (0.13, 0.0), (0.03, 0.11))
 """Corners [m] of the triangle in the recorded frame; it is scalene, so it has no symmetry."""
 HEIGHT_M = 0.02
@@ -104,35 +102,14 @@ def collect(condition: str, seed: int) -> str:
     return "\n".join([str(n), *lines]) + "\n"
 
 
-def goals(n: int = N_GOALS) -> list[dict]:
-    """Return errors of executed plans, without and with corrections."""
-    log, found = read_log(), []
-    prism, rng = Prism(TRIANGLE_M, HEIGHT_M), np.random.default_rng(1)
-    for condition in CONDITIONS:
-        of_one = log.select(log.groups == condition)
-        model, triangle = Remembered(fit(of_one, "np")), PushedObject.of(of_one)
-        with Tabletop(world_config(condition)) as world:
-            for _ in range(n // len(CONDITIONS)):
-                xy = rng.uniform(0.008, 0.03) * unit_vector(rng.uniform(-math.pi, math.pi))
-                world.place(prism, (0.0, 0.0), 0.0, tool="rod")
-                found += attempt(world, model, (*xy, rng.uniform(-0.35, 0.35)), triangle)
-    return summary(found, ["corrected"])
-
-
 @command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
-    """Collect the log, execute the plans, or both."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", choices=("log", "goals"))
-    only = parser.parse_args(argv).only
-    if only != "goals":
-        FOLDER.mkdir(parents=True, exist_ok=True)
-        for seed, condition in enumerate(CONDITIONS):
-            text = collect(condition, seed)
-            (FOLDER / f"{condition}.txt.xz").write_bytes(lzma.compress(text.encode()))
-    if only != "log":
-        tables = {"goals": goals()}
-        write_results(repo_root() / "data" / "results", "own_log", {"n_goals": N_GOALS}, tables)
+    """Collect the log."""
+    argparse.ArgumentParser(description=__doc__).parse_args(argv)
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    for seed, condition in enumerate(CONDITIONS):
+        text = collect(condition, seed)
+        (FOLDER / f"{condition}.txt.xz").write_bytes(lzma.compress(text.encode()))
     return 0
 
 

@@ -217,15 +217,15 @@ CONFIGS: dict[str, PlannerConfig] = {
         for weight in RISK_WEIGHTS
     },
     **{
-        f"{descent}_rate={rate:g}": PlannerConfig(
+        f"{how.descent}_rate={rate:g}": PlannerConfig(
             plan_gradient,
             "cnp_500",
-            {"samples": 100, "reading": replace(READINGS[name]["reading"], rate=rate)},
+            {"samples": 100, "reading": replace(how, rate=rate)},
             world="validation",
             **BY_PLAN,
         )
-        for descent, name in (("gradient", "gradient_100"), ("adam", "gradient_adam_100"))
-        for rate in RATES[descent]
+        for how in (Reading(), Reading("adam", "circle", "point"))
+        for rate in RATES[how.descent]
     },
 }
 

@@ -8,6 +8,8 @@ from pages import PAGES as PATHS
 
 from affordlib.results import repo_root
 from exercises import EXERCISES, check
+from exercises.checking import WRONG
+from exercises.hints import HINTS, explanation
 
 NOTEBOOKS = repo_root() / "notebooks"
 SOLUTIONS = sorted((NOTEBOOKS / "solutions").glob("*.py"))
@@ -56,6 +58,11 @@ def trusting(plan, act):
     return len([act(step) for step in plan.steps])
 
 
+def idle(look, plan, act):
+    """Execute nothing of a plan's first step."""
+    return act(replace(plan(look()).steps[0], stop_phase=0.0))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "attempt", "says"),
@@ -63,33 +70,33 @@ def trusting(plan, act):
         ("01.1", lambda t: 0.0, "failed, 125 mm/s, largest error; expected 0 ± 0.1 mm/s"),
         ("01.1", lambda t: 1 / 0, "failed (ZeroDivisionError: division by zero); expected"),
         ("01.2", lambda image: 16**2 * image[1].mean() * 6, "failed, 20.7"),
-        ("02.1", 7.5, "failed, 7.5 mm; expected 0.076 ± 0.005 mm"),
+        ("02.1", 7.5, "failed, 7.5 mm. Hint: Rotate"),
         ("03.2", lambda mean, sigma, rng: mean, "failed (ValueError: the draws spread by 0.00 σ"),
-        (
-            "03.2",
-            lambda m, s, rng: rng.normal(m, s)[1:],
-            "failed (ValueError: a trajectory has",
-        ),
+        ("03.2", lambda m, s, rng: rng.normal(m, s)[1:], "failed (ValueError: a trajectory"),
         ("04.1", lambda model, arrays: 0.002, "failed (ValueError: ours rotates with"),
         ("05.1", 0.261, "failed, 0.261 cm"),
         ("06.1", straight, "failed, 16.8"),
         ("06.2", lambda effects, goal: (np.arctan2(goal[1], goal[0]), 1.0), "failed, 39"),
         ("07.1", lambda look, plan, act: trusting(plan(look()), act), "failed, 77"),
-        (
-            "07.1",
-            lambda look, plan, act: [
-                act(replace(plan(look()).steps[0], stop_phase=0.0)) for _ in range(99)
-            ],
-            "no end a",
-        ),
+        ("07.1", lambda look, plan, act: [idle(look, plan, act) for _ in range(99)], "no end a"),
         ("07.2", lambda height, phase, course: 1.0, "failed, 220"),
         ("08.1", lambda image: image[1].mean(), "failed, 31"),
-        ("A5.1", 0.6, "failed, 0.6 of the full action; expected 0.58"),
+        ("A5.1", 0.6, "failed, 0.6 of the full action. Hint: The"),
         ("A5.2", lambda a, b: a.read_bytes() == b.read_bytes(), "failed, 1 pairs"),
     ],
 )
 def test_a_wrong_answer_fails_and_says_by_how_much(name, attempt, says):
     assert says in str(check(name, attempt))
+
+
+def test_a_wrong_answer_gives_one_hint_then_another_and_an_explanation_but_not_the_answer():
+    assert set(HINTS) == set(EXERCISES)
+    WRONG.clear()
+    first, second = check("A5.1", 0.61), check("A5.1", 0.62)
+    assert [v.hint for v in (first, second)] == [*HINTS["A5.1"]]
+    assert "0.58" not in f"{first} {second} {second._repr_html_()}"
+    assert "<details>" in second._repr_html_()
+    assert all(explanation(name) for name in EXERCISES)
 
 
 def test_an_unknown_exercise_is_refused():

@@ -28,8 +28,8 @@ from affordlib.planning.problem import PlanningProblem
 from affordlib.primitives import Drag
 from affordlib.types import Plan, Step, check_choice, check_count
 
-DESCENTS = {"gradient": (torch.optim.SGD, 0.3), "adam": (torch.optim.Adam, 0.005)}
-"""Optimiser and its usual rate."""
+DESCENTS = {"gradient": (torch.optim.SGD, 0.3), "adam": (torch.optim.Adam, 0.001)}
+"""Optimiser and its rate, the best on the validation goals (`RATES` of `experiments.planning`)."""
 
 STILL = {"direction": 1e-3, "point": 1e-4}
 """Change per iteration, of the direction [rad] or the point [m], below which it is still."""

@@ -72,7 +72,8 @@ class MovePlanner:
         if plan:
             return plan
         best = f"the best ends {1000 * min(self._ends_m):.1f} mm from it"
-        if seen.obstacles or self.vetoes > vetoes or len(self._ends_m) == 1:
+        planned = len(self._ends_m) > 1 and self._can_arrive(whole)
+        if seen.obstacles or self.vetoes > vetoes or not planned:
             at = "({:.3f}, {:.3f}) m".format(*goal.xy_m)
             past = " past the obstacles" * bool(seen.obstacles)
             why = f"the arm cannot bring it there{past}; of all plans, {best}"
@@ -82,6 +83,13 @@ class MovePlanner:
             f"{1000 * distance_m:.1f} mm from the goal, the planner finds no plan that the arm can "
             f"follow; {best}, and planning again from the same place gives the same",
         )
+
+    def _can_arrive(self, whole: PlanningProblem) -> bool:
+        """Whether the arm can make any action whose straight way ends at the goal."""
+        angle = np.linspace(-np.pi, np.pi, 72, endpoint=False)
+        way_m = np.outer(np.linspace(0.0, whole.effects.reach_m, 8), np.exp(1j * angle)).ravel()
+        begins = np.subtract(whole.goal.xy_m, np.column_stack([way_m.real, way_m.imag]))
+        return bool(whole.reachable(begins, np.tile(angle, 8)).any())
 
     def _plan_towards(self, whole: PlanningProblem, seen: Observation) -> Plan | None:
         """Plan to a place as near to the goal as a plan can come, from where the arm can go on."""

@@ -1,6 +1,5 @@
 """Pictures for people: figures, animations, and interactive widgets."""
 
-from affordlib.show.diagrams import plot_flow
 from affordlib.show.executors import closed_loop, open_loop
 from affordlib.show.explorers import conditioning_explorer, phase_explorer
 from affordlib.show.goal_picker import GoalPicker
@@ -11,6 +10,7 @@ from affordlib.show.plots import (
     TRUTH,
     plot_closed_loop,
     plot_depth,
+    plot_flow,
     plot_footprint,
     plot_obstacles,
     plot_outcome,

@@ -7,7 +7,6 @@ It is a view on plain objects: everything it does can be done with a planner, `e
 import base64
 import io
 import itertools
-import math
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -133,12 +132,6 @@ class GoalPicker(widgets.HBox):
         """Set the goal [m], rounded to millimetres, and replan."""
         check_on_table("goal", (x_m, y_m))
         self._set_goal(replace(self.goal, xy_m=_whole_mm((x_m, y_m))))
-        self._update_plan()
-
-    def set_pose(self, turn_deg: float = 0.0, height_cm: float = 0.0) -> None:
-        """Set rotation and height of the goal (0: not part of the goal), and replan."""
-        turn, height = math.radians(turn_deg) or None, height_cm / 100 or None
-        self._set_goal(replace(self.goal, turn_rad=turn, height_m=height))
         self._update_plan()
 
     def run(self) -> None:

@@ -5,7 +5,7 @@ Plot functions draw into the `ax` that they get and return it. Positions are in 
 
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -244,4 +244,20 @@ def plot_depth(ax: Axes, image: np.ndarray, title: str = "") -> Axes:
     ax.imshow(height_m, extent=(-half, half, -half, half), cmap="cividis", vmin=0)
     ax.grid(False)
     ax.set(title=title, xlabel="x [cm]", ylabel="y [cm]", xticks=(-5, 0, 5), yticks=(-5, 0, 5))
+    return ax
+
+
+def plot_flow(
+    ax: Axes, boxes: Mapping[str, tuple[float, float, str]], arrows: Sequence[tuple[str, str]]
+) -> Axes:
+    """Draw texts in boxes at (x, y), coloured by their third entry, and arrows between them."""
+    drawn = {}
+    for text, (x, y, color) in boxes.items():
+        style = {"boxstyle": "round,pad=0.4", "fc": "white", "ec": color, "lw": 1.5}
+        drawn[text] = ax.text(x, y, text, ha="center", va="center", bbox=style)
+    for tail, tip in arrows:
+        arrow = {"arrowstyle": "-|>", "color": NEUTRAL, "lw": 1.5}
+        arrow |= {"patchA": drawn[tail].get_bbox_patch(), "patchB": drawn[tip].get_bbox_patch()}
+        ax.annotate("", boxes[tip][:2], boxes[tail][:2], arrowprops=arrow)
+    ax.axis("off")
     return ax

@@ -1,12 +1,23 @@
-"""How an attempt is judged: by a figure, beside the expected one; an error of it is shown."""
+"""How an attempt is judged: by a figure, beside the expected one; an error of it is shown.
+
+A wrong answer gives a hint, the next one another; then, or once solved, the explanation is folded
+below. Where the answer itself is the figure, the expected one is not shown.
+"""
 
 from __future__ import annotations
 
+import html
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+
+from exercises.hints import HINTS, explanation
+
+WRONG: Counter[str] = Counter()
+"""Wrong answers so far, by the exercise's name."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +43,8 @@ class Verdict:
     status: str
     figure: float | None = None
     why: str = ""
+    hint: str = ""
+    told: bool = False
 
     @property
     def passed(self) -> bool:
@@ -43,8 +56,17 @@ class Verdict:
         line = f"Exercise {self.name}: {self.status}"
         if self.status == "not attempted":
             return f"{line}. {exercise.asks}"
-        got = f" ({self.why})" if self.why else f", {self.figure:.4g} {exercise.unit}"
-        return f"{line}{got}; expected {exercise.expected:g} ± {exercise.within:g} {exercise.unit}"
+        line += f" ({self.why})" if self.why else f", {self.figure:.4g} {exercise.unit}"
+        if self.told or self.passed:
+            line += f"; expected {exercise.expected:g} ± {exercise.within:g} {exercise.unit}"
+        return f"{line}. Hint: {self.hint}" if self.hint else line
+
+    def _repr_html_(self) -> str | None:
+        """The line, with the explanation folded below, once it is solved or both hints are used."""
+        if not (self.passed or WRONG[self.name] >= len(HINTS[self.name])):
+            return None
+        line, more = html.escape(str(self)), html.escape(explanation(self.name))
+        return f"{line}<details><summary>Explanation</summary><p>{more}</p></details>"
 
     def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
         printer.text(str(self))
@@ -57,14 +79,20 @@ def judge(exercises: Mapping[str, Exercise], name: str, attempt: Any) -> Verdict
     exercise = exercises[name]
     if _is_empty(attempt):
         return Verdict(name, exercise, "not attempted")
+    why, figure = "", None
     try:
         figure = float(exercise.figure(attempt))
     except _NotAttempted:
         return Verdict(name, exercise, "not attempted")
     except Exception as error:
-        return Verdict(name, exercise, "failed", why=f"{type(error).__name__}: {error}")
-    passed = abs(figure - exercise.expected) <= exercise.within
-    return Verdict(name, exercise, "passed" if passed else "failed", figure)
+        why = f"{type(error).__name__}: {error}"
+    if figure is not None and abs(figure - exercise.expected) <= exercise.within:
+        return Verdict(name, exercise, "passed", figure)
+    WRONG[name] += 1
+    hints = HINTS[name]
+    hint = hints[min(WRONG[name], len(hints)) - 1]
+    told = callable(attempt) or figure != attempt
+    return Verdict(name, exercise, "failed", figure, why, hint, told)
 
 
 class _NotAttempted(Exception):

@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 import torch
 
+from affordlib.geometry import centroid, cross
 from affordlib.interactions import InteractionTensors
 from affordlib.interactions.dataset import sample_mixed
+from affordlib.logs import Log
 from affordlib.results import repo_root
-from experiments import ablation, studies
+from affordlib.world.robot import ROD_WIDTH_M
+from experiments import ablation, studies, t_on_arm
 from experiments.ablation import random_contexts
 from experiments.real_pushes import pushes_of
 
@@ -73,3 +76,13 @@ def test_a_damaged_log_of_pushes_is_named(tmp_path):
         path.write_bytes(content)
         with pytest.raises(ValueError, match=f"{name} is damaged, or is not a log of pushes"):
             list(pushes_of(path))
+
+
+def test_the_arms_t_is_its_outline_and_its_pushes_are_read_by_the_log():
+    block = t_on_arm.TBlock()
+    corners = block.footprint_m
+    area_m2 = cross(corners, np.roll(corners, -1, axis=0)).sum() / 2
+    assert block.volume_m3 == pytest.approx(area_m2 * block.height)
+    np.testing.assert_allclose(centroid(corners), 0.0, atol=1e-9)
+    log = Log("m", corners, tool_radius=ROD_WIDTH_M / 2)
+    assert (log.add_all(t_on_arm.collect(6, seed=3)), len(log.pushes())) == ({}, 6)

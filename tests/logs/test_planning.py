@@ -16,7 +16,7 @@ from affordlib.logs.planning import primitive_of
 from affordlib.types import Goal, UnreachableError
 from affordlib.world import Cuboid, UprightCylinder
 from affordlib.world.robot import ROD_WIDTH_M
-from experiments.pose_goals import pursue
+from experiments.t_on_arm import TURN_M, bring
 from tests.problems import Still
 
 OUTLINE_M = np.array([[0.03, -0.02], [0.03, 0.02], [-0.03, 0.02], [-0.03, -0.02]])
@@ -67,10 +67,9 @@ def test_pursuit_knows_only_what_it_observes(world, monkeypatch):
         return x, y, yaw + 1.0
 
     monkeypatch.setattr(world, "object_pose", lies)
-    n_pushes = list(pursue(world, Pretrained(), (0.04, -0.01, 0.2), outline))
+    planner = PushPlanner(Pretrained(), outline, turn_m=TURN_M)
+    assert bring(world, planner, (0.04, -0.01, 0.2)) <= 10
     x, y, yaw = truth()
-    assert n_pushes[0] <= 3
-    assert n_pushes[1] <= n_pushes[0] + 4
     assert math.dist((x, y), (0.04, -0.01)) < 0.003
     assert abs(yaw - 0.6) < math.radians(3)
 

@@ -583,8 +583,7 @@ def test_a_goal_across_the_table_is_reached_in_the_limit_or_refused(world, skill
     world.place(BOX, (0.5, 0.3), 0.0)
     pose = world.object_pose()
     went = run_closed_loop(world, Goal((0.65, 0.65), EXACT_M), skills)
-    assert not went.reached
-    assert went.steps == ()
+    assert (went.status, went.steps) == ("unreachable", ()), went.message
     assert world.object_pose() == pose
 
 

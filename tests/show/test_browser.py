@@ -316,7 +316,7 @@ def test_sliders_by_keyboard(page, table):
     table.wait_for_answer()
     np.testing.assert_allclose(table.points(".predicted"), table.points(".place"), atol=0.021)
     picture(page, "7_turn_and_lift")
-    ask(page, "picker.set_pose()")
+    ask(page, "[setattr(s, 'value', 0.0) for s in picker.controls.sliders[2:]]")
 
 
 def test_run(page, table):

@@ -328,9 +328,9 @@ def test_turn_and_lift_are_planned_and_done(posed, world, executor, within_deg):
     assert posed.outcome.lifted_m == pytest.approx(0.06, abs=0.005), said
     assert world.object_state()[2] == pytest.approx(0.025 + 0.06, abs=0.005), said
     assert math.degrees(world.object_pose()[2]) == pytest.approx(25.0, abs=within_deg), said
-    posed.set_pose()
-    assert (posed.plan.goal.turn_rad, posed.plan.goal.height_m) == (None, None)
-    assert (posed.controls.turn.value, posed.controls.height.value) == (0.0, 0.0)
+    posed.controls.turn.value = posed.controls.height.value = 0.0
+    goal = in_time(posed).plan.goal
+    assert (goal.turn_rad, goal.height_m) == (None, None)
     assert world.object_state()[2] < 0.05  # released, to be observed and planned for
 
 
