@@ -49,7 +49,7 @@ unexport MPLBACKEND MATPLOTLIBRC
 unexport PIP_USER PIP_TARGET PIP_PREFIX PIP_REQUIREMENT PIP_CONSTRAINT
 unexport PYTEST_ADDOPTS JUPYTER_PATH JUPYTER_TOKEN
 
-.PHONY: help setup workbook nano lab test test-fast test-plain test-slow size book-check lint format bench data checkpoints notebooks html tables \
+.PHONY: help setup workbook nano lab slides test test-fast test-plain test-slow size book-check lint format bench data checkpoints notebooks html tables \
         constraints clean
 
 help: ## List the targets
@@ -163,6 +163,9 @@ data: $(STAMP) ## Collect the shipped data sets again and compare them with the 
 checkpoints: $(STAMP) ## Train the shipped models again (ONLY="film_500")
 	@$(if $(ONLY),,$(PY) -m experiments.shipped reachability)
 	@set -f; $(PY) -m experiments.shipped checkpoints $(if $(ONLY),--only $$ONLY)
+
+slides: $(STAMP) ## Write ten figures of the book with their captions into figures/slides, for those who teach
+	@$(PY) notebooks/slides.py
 
 html: $(STAMP) ## Write the book as web pages into runs/html, readable offline: open index.html
 	@rm -rf runs/html.new runs/jupyter_execute

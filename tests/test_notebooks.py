@@ -14,6 +14,7 @@ import pytest
 from IPython.core.inputtransformer2 import TransformerManager
 from pages import PAGES as PATHS
 from pages import WIDGET, cleaned, parameters_of_pages
+from slides import FIGURES, figures
 
 from affordlib.results import read_results, repo_root, results_table
 from affordlib.show import GOAL, PREDICTION, TRUTH
@@ -205,6 +206,7 @@ def test_nothing_depends_on_the_machine(name):
 
 
 def test_the_book_keeps_to_its_style():
+    assert [picture[:4] for picture, _ in figures().values()] == [b"\x89PNG"] * len(FIGURES)
     assert book_check.check()[1] == []
 
 
