@@ -95,11 +95,11 @@ def gaps_m(obstacles: Sequence[np.ndarray], shapes: np.ndarray, far_m: float = F
         centre, outward = polygon.mean(axis=0), _normals(polygon)
         size = np.linalg.norm(polygon - centre, axis=-1).max()
         near = np.flatnonzero(np.hypot(*(middles.T - centre).T) < radius + size + far_m)
-        hull, along = corners[..., near], axes[..., near]
-        beyond = _products(along, polygon.T[..., None]).min(axis=1)
-        beyond = (beyond - _products(along, hull).max(axis=1)).max(axis=0)
-        before = _products(outward.T[..., None], hull).min(axis=1)
+        before = _products(outward.T[..., None], corners[..., near]).min(axis=1)
         before = (before - (polygon * outward).sum(axis=-1)[:, None]).max(axis=0)
+        near, before = near[before < gaps[near]], before[before < gaps[near]]
+        beyond = _products(axes[..., near], polygon.T[..., None]).min(axis=1)
+        beyond = (beyond - _products(axes[..., near], corners[..., near]).max(axis=1)).max(axis=0)
         gaps[near] = np.minimum(gaps[near], np.maximum(before, beyond))
     return gaps.reshape(n, s - 1)
 
