@@ -48,6 +48,7 @@ def execute(path: Path, copy: Path) -> None:
     """Execute a page, check its results, and write its copy. What failed has another name."""
     start, results = time.monotonic(), copy.with_suffix(".json")
     failed = copy.with_suffix(".failed.ipynb")
+    left = failed.absolute()  # papermill works in the page's folder
     folder = Path(tempfile.mkdtemp(prefix="page-"))
     os.environ["IPYTHONDIR"] = str(folder)
 
@@ -57,7 +58,7 @@ def execute(path: Path, copy: Path) -> None:
             os.killpg(int((folder / "group").read_text()), signal.SIGKILL)
         shutil.rmtree(folder, ignore_errors=True)
         if number:
-            failed.unlink(missing_ok=True)
+            left.unlink(missing_ok=True)
             print(f"{path.stem}: interrupted; the same command continues", flush=True)
             os._exit(128 + number)
 

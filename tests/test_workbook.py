@@ -7,7 +7,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 
 import nbformat
 import psutil
@@ -213,9 +212,9 @@ def test_whatever_stops_make_leaves_no_process_and_is_taken_up_again(book, how):
     child = "import subprocess, time\nsubprocess.Popen(['sleep', '600'])\ntime.sleep(1)"
     book.add("01_first")
     book.add("02_second", child)
-    for delay in (0.5, 3.5):
+    for started in (book.processes, lambda: [*book.runs.rglob("*failed*")]):
         process = book.start()
-        time.sleep(delay)
+        wait_until(started)
         if how == signal.SIGINT:  # Ctrl-C reaches all that the terminal has started
             os.killpg(process.pid, how)
         else:

@@ -291,8 +291,8 @@ READINGS = [
     Reading(),
     Reading(starts=4),
     Reading(finds="point"),
-    Reading("adam", "circle"),
-    Reading("adam", "circle", "point"),
+    Reading("adam", "circle", rate=0.005),
+    Reading("adam", "circle", "point", 0.005),
 ]
 
 
