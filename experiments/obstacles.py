@@ -278,8 +278,7 @@ def run_task(row: str, family: str, index: int, seed: int) -> dict[str, Any]:
     if settings.get("observes"):
         config = ClosedLoopConfig(mode, MAX_STEPS + 2, max_renewals=0)
         result = run_closed_loop(world, task.goal, _skills(where), planner, config)
-        about = {"planned": bool(result.plans), "status": result.status}
-        return about | _outcome(task, world, len(result.steps))
+        return {"status": result.status} | _outcome(task, world, len(result.steps))
     seen = world.observe()
     effects = _skills(where).effects(seen.image)
     effects.spline  # noqa: B018 - computed before the time is taken, as by a loop that planned
