@@ -27,6 +27,13 @@ def rotated(xy: np.ndarray, angle_rad: float) -> np.ndarray:
     return xy @ np.array([[c, s], [-s, c]])
 
 
+def rotated_each(xy: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
+    """Rotate points (..., 2) about the origin, each by its angle (...) [rad]."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    x, y = xy[..., 0], xy[..., 1]
+    return np.stack([c * x - s * y, s * x + c * y], axis=-1)
+
+
 def cross(a: Any, b: Any) -> Any:
     """Return the z component (...) of the cross product of vectors (..., 2), arrays or tensors."""
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]

@@ -12,11 +12,17 @@ from collections.abc import Callable, Sequence
 from functools import lru_cache
 
 import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import cKDTree
 
+from affordlib.planning.problem import OUR_TABLE
 from affordlib.primitives import HOVER_M, TIP_HEIGHT_M, Drag, Move, Push
 from affordlib.world import UnreachableError, robot
 from affordlib.world.trajectory import RETREAT_M
-from experiments.routes import RouteMap, find_route
+
+CELL_M, LONGEST_M = 0.02, 0.2
+"""Distance [m] between neighbouring places on the table, and that of the longest action or more."""
 
 BAND_M = 0.01
 """Distance [m] from the limit of the reach within which goals are reported separately."""
@@ -74,11 +80,30 @@ def possible(
     return judge
 
 
-@lru_cache(maxsize=64)
-def _routes(kind: type[Move], half_mm: int, slack_m: float) -> RouteMap:
-    half = half_mm / 1000
+def _actions(
+    kind: type[Move], half_mm: int, slack_m: float, origins: np.ndarray, ends: np.ndarray
+) -> np.ndarray:
+    """Return whether one action can move an object between points (n, 2)."""
+    origins, ends = np.broadcast_arrays(origins, ends)
+    half, way = half_mm / 1000, ends - origins
     reach = Drag(0.0).length if kind is Drag else Push(0.0).length + half
-    return RouteMap.of(reach, possible(kind, half, slack_m))
+    length_m = np.hypot(*way.T)
+    short = length_m <= reach
+    judge = possible(kind, half, slack_m)
+    short[short] = judge(origins[short], np.arctan2(*way[short].T[::-1]), length_m[short])
+    return short
+
+
+@lru_cache(maxsize=64)
+def _graph(kind: type[Move], half_mm: int, slack_m: float) -> tuple[np.ndarray, csr_array]:
+    """Return places (n, 2) on the table, and between which of them one action moves an object."""
+    table = OUR_TABLE
+    x, y = (np.arange(low + CELL_M / 2, high, CELL_M) for low, high in (table.x_m, table.y_m))
+    places = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+    pairs = cKDTree(places).query_pairs(LONGEST_M, output_type="ndarray")
+    origin, end = np.concatenate([pairs, pairs[:, ::-1]]).T
+    ok = _actions(kind, half_mm, slack_m, places[origin], places[end])
+    return places, csr_array((ok[ok], (origin[ok], end[ok])), shape=(len(places),) * 2)
 
 
 def is_feasible(
@@ -89,10 +114,16 @@ def is_feasible(
     slack_m: float = 0.0,
 ) -> bool:
     """Return whether a chain of pushes or drags within the arm's reach leads to the goal."""
-    half_mm = 5 * round(200 * half_m)
-    routes = _routes(kind, half_mm, slack_m)
-    judge = possible(kind, half_mm / 1000, slack_m)
-    return bool(find_route(routes, start_xy_m, goal_xy_m, judge))
+    how = kind, 5 * round(200 * half_m), slack_m
+    places, graph = _graph(*how)
+    start, goal = np.asarray(start_xy_m, dtype=float), np.asarray(goal_xy_m, dtype=float)
+    if _actions(*how, start, goal[None])[0]:
+        return True
+    first = np.flatnonzero(_actions(*how, start, places))
+    if not len(first):
+        return False
+    reached = np.isfinite(dijkstra(graph, indices=first, unweighted=True, min_only=True))
+    return bool(_actions(*how, places[reached], goal).any())
 
 
 def on_the_rim(

@@ -1,8 +1,9 @@
 """A table with obstacles: what partial actions and each part of the free-space check are worth.
 
-Tasks are drawn with a seed, by an object's dimensions alone, before any planner runs; whether one
-can be solved is not known. *Success*: at most 5 mm from the goal, and neither object nor arm has
-touched an obstacle, by the contact forces of every simulation step.
+Tasks are drawn with a seed, by an object's dimensions alone, before any planner runs. *Success*: at
+most 5 mm from the goal, and neither object nor arm has touched an obstacle, by the contact forces
+of every simulation step. *Feasible*: an execution in the clean world has solved it, of any row or
+of a search that knows the effects of the simulator.
 
     python -m experiments.obstacles --only row=continuous,continuous_full
 """
@@ -14,7 +15,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +49,7 @@ from affordlib.planning.free_space import (
 )
 from affordlib.planning.rollout import poses_along
 from affordlib.planning.skills import CHECKPOINTS
-from affordlib.primitives import Drag, Push
+from affordlib.primitives import Drag, Move, Push
 from affordlib.types import Goal, Obstacle, UnreachableError
 from affordlib.world import Cuboid, Tabletop, TabletopObject, WorldConfig, category_named
 from experiments import runner
@@ -143,18 +144,6 @@ def _corridor(rng: np.random.Generator, local: np.ndarray) -> tuple:
     return goal, walls
 
 
-def _pocket(rng: np.random.Generator, local: np.ndarray) -> tuple:
-    return _walled(rng, local, 0.0, rng.uniform(0.05, 0.08))
-
-
-def _bay(rng: np.random.Generator, local: np.ndarray) -> tuple:
-    return _walled(rng, local, rng.uniform(0.03, 0.08), rng.uniform(0.02, 0.04))
-
-
-def _deep_bay(rng: np.random.Generator, local: np.ndarray) -> tuple:
-    return _walled(rng, local, rng.uniform(0.10, 0.18), rng.uniform(0.05, 0.08))
-
-
 def _walled(rng: np.random.Generator, local: np.ndarray, before_m: float, deep_m: float) -> tuple:
     """Two walls with a third behind them, before_m from the object; the goal is deep_m inside."""
     half, radius = _half_m(rng, local), float(np.hypot(*local.T).max())
@@ -188,10 +177,12 @@ def _clutter(rng: np.random.Generator, local: np.ndarray) -> tuple:
 
 LAYOUTS = {
     "corridor": _corridor,
-    "pocket": _pocket,
+    "pocket": lambda rng, local: _walled(rng, local, 0.0, rng.uniform(0.05, 0.08)),
     "gate": _gate,
-    "bay": _bay,
-    "deep bay": _deep_bay,
+    "bay": lambda rng, local: _walled(rng, local, rng.uniform(0.03, 0.08), rng.uniform(0.02, 0.04)),
+    "deep bay": lambda rng, local: _walled(
+        rng, local, rng.uniform(0.10, 0.18), rng.uniform(0.05, 0.08)
+    ),
     "clutter": _clutter,
 }
 
@@ -242,21 +233,27 @@ ROWS = {
     "perturbed_full": (plan_continuous, {"world": "perturbed", "partial": False}),
     "cem": (plan_cem, {}),
     "gradient": (plan_gradient, {}),
+    "no_sigma": (partial(plan_continuous, risk_weight=0.0), {}),
+    "film_500": (plan_continuous, {"push": "film_500"}),
+    "cnp_500": (plan_continuous, {"push": "cnp_500"}),
     "closed_loop": (plan_continuous, {"observes": True}),
     "closed_loop_full": (plan_continuous, {"observes": True, "partial": False}),
     "closed_loop_perturbed": (plan_continuous, {"observes": True, "world": "perturbed"}),
 }
-"""Planner of each row, and its settings: whether it may stop early, what is checked, the world, and
-whether it observes after each action, with up to two actions more."""
+"""Planner of each row, and its settings: whether it may stop early, what is checked, the world, the
+network of pushes, and whether it observes after each action, with up to two actions more."""
 
 
 @lru_cache(maxsize=2)
-def _skills(world: str) -> Skills:
+def _skills(push: str = CHECKPOINTS["push"]) -> Skills:
     skills = Skills.load()
-    if world == "perturbed":
-        push = load_checkpoint("film_5000_perturbed")[0]
-        skills = replace(skills, models=skills.models | {"push": push})
-    return skills
+    return replace(skills, models=skills.models | {"push": load_checkpoint(push)[0]})
+
+
+def _network(row: str) -> str:
+    settings = ROWS[row][1] if row in ROWS else {}
+    usual = CHECKPOINTS["push"] + "_perturbed" * (settings.get("world") == "perturbed")
+    return settings.get("push", usual)
 
 
 @lru_cache(maxsize=1)
@@ -274,13 +271,13 @@ def run_task(row: str, family: str, index: int, seed: int) -> dict[str, Any]:
     world.place(task.obj, (0.0, 0.0), task.yaw_rad, config=config, obstacles=task.obstacles)
     if where == "perturbed":
         world.settle(2.0)
-    mode = PlanMode(MAX_STEPS, settings.get("partial", True))
+    mode, skills = PlanMode(MAX_STEPS, settings.get("partial", True)), _skills(_network(row))
     if settings.get("observes"):
         config = ClosedLoopConfig(mode, MAX_STEPS + 2, max_renewals=0)
-        result = run_closed_loop(world, task.goal, _skills(where), planner, config)
+        result = run_closed_loop(world, task.goal, skills, planner, config)
         return {"status": result.status} | _outcome(task, world, len(result.steps))
     seen = world.observe()
-    effects = _skills(where).effects(seen.image)
+    effects = skills.effects(seen.image)
     effects.spline  # noqa: B018 - computed before the time is taken, as by a loop that planned
     posed, more = PlanningProblem, {"obstacles": seen.obstacles}
     if "check" in settings:
@@ -325,7 +322,7 @@ def calibrate(kind: str, index: int) -> list[dict[str, float]]:
         obj, yaw = drawn_object(number)
         world.place(obj, (0.0, 0.0), yaw)
         seen, angle = world.observe(), rng.uniform(-math.pi, math.pi)
-        effects = _skills("clean").effects(seen.image)
+        effects = _skills().effects(seen.image)
         stop = rng.uniform(0.7, 1.0)
         done = world.execute_primitive(effects.kind.towards(angle), stop, approach=True)
         if done.fell or done.left_table or effects.kind is not (Push if kind == "push" else Drag):
@@ -352,16 +349,94 @@ def calibrate(kind: str, index: int) -> list[dict[str, float]]:
     return found
 
 
+N_DIRECTIONS, N_STOPS, BEAM, N_TRIES, CLEAR_M = 90, 16, 100, 24, 0.0005
+"""Of the search: directions and stops of an action, states that are kept of each length of plan,
+plans that are executed, and the gap [m] that they keep."""
+
+
+@lru_cache(maxsize=N_OBJECTS)
+def simulated(number: int) -> tuple[type[Move], np.ndarray, np.ndarray]:
+    """Execute full actions in all directions with an object, alone on the table.
+
+    Returns their primitive, directions [rad] (d,), and the object's poses (d, 301, 3) from its own.
+    """
+    world, (obj, yaw) = _tabletop(), drawn_object(number)
+    angles, ways = [], []
+    for angle in np.linspace(-math.pi, math.pi, N_DIRECTIONS, endpoint=False):
+        world.place(obj, (0.0, 0.0), yaw)
+        seen = world.observe()
+        kind = Skills.kind_for(seen.image)
+        done = world.execute_primitive(kind.towards(angle), approach=True, seen=seen)
+        if not (done.fell or done.left_table):
+            angles.append(angle)
+            ways.append(done.object_path[:, [0, 1, 3]] - [0.0, 0.0, yaw])
+    return kind, np.array(angles), np.array(ways)
+
+
+def search(family: str, index: int, seed: int) -> dict[str, Any]:
+    """Search plans with the simulator's effects, breadth first, and execute the best ones.
+
+    Returns what came of the first that succeeds, or of the one that ended nearest.
+    """
+    task, world = drawn_task(family, index, seed), _tabletop()
+    kind, angles, ways = simulated(task.number)
+    world.place(task.obj, (0.0, 0.0), task.yaw_rad, obstacles=task.obstacles)
+    outline = placed(task.obj.footprint_m, np.array([0.0, 0.0, task.yaw_rad]))
+    space = FreeSpace(task.obstacles, world.observe().image, (0.0, 0.0), outline)
+    space.margin_m = lambda xy_m: np.full(np.shape(xy_m)[:-1], CLEAR_M)
+    rng, first = np.random.default_rng([seed, index]), kind.acts_from
+    stops = np.repeat([np.linspace(first, 1, N_STOPS + 1)[1:]], len(angles), axis=0).ravel()
+    which = np.repeat(np.arange(len(angles)), N_STOPS)
+    share = (first + (stops[:, None] - first) * np.linspace(0, 1, N_POSES)) * 300
+    steps = ways[which[:, None], share.round().astype(int)]
+    ends, plans, found = [np.zeros(3)], [()], []
+    for _ in range(MAX_STEPS):
+        all_ends, all_plans = [], []
+        for end, plan in zip(ends, plans, strict=True):
+            poses = np.concatenate([placed(steps[..., :2], end)], axis=-1)
+            poses = np.concatenate([poses, end[2] + steps[..., 2:]], axis=-1)
+            turned = angles[which] + end[2]
+            free = space.spare_m(kind.towards(0.0), turned, stops, poses) >= 0
+            all_ends.extend(poses[free, -1])
+            all_plans += [(*plan, one) for one in zip(turned[free], stops[free], strict=True)]
+        if not all_ends:
+            break
+        away = np.linalg.norm(np.array(all_ends)[:, :2] - task.goal.xy_m, axis=1)
+        order = np.argsort(away)
+        found += [all_plans[k] for k in order[:200] if away[k] < WITHIN_M]
+        if len(found) > 2 * N_TRIES:
+            break
+        order = np.concatenate([order[: len(order) // 4], rng.permutation(order)])
+        cells = np.round(np.array(all_ends)[order] / [0.008, 0.008, 0.3])
+        kept = np.sort(np.unique(cells, axis=0, return_index=True)[1])[:BEAM]
+        ends, plans = ([many[k] for k in order[kept]] for many in (all_ends, all_plans))
+    best = {"distance_m": math.hypot(*task.goal.xy_m), "actions": 0}
+    for k in rng.permutation(len(found))[:N_TRIES]:
+        world.place(task.obj, (0.0, 0.0), task.yaw_rad, obstacles=task.obstacles)
+        for angle, stop in found[k]:
+            if not world.obstacles.touched:
+                world.execute_primitive(kind.towards(angle), stop, approach=True)
+        came = _outcome(task, world, len(found[k]))
+        if not world.obstacles.touched and came["distance_m"] <= best["distance_m"]:
+            best = came
+        if best["distance_m"] <= WITHIN_M:
+            break
+    return best | {"found": len(found)}
+
+
 def job(row: str, family: str = "", index: int = 0, seed: int = SEED) -> Job:
-    """Return the job of a row and a task; the row "margin" plans nothing."""
+    """Return the job of a row and a task; the rows "margin" and "search" plan nothing."""
     arguments = {"row": row, "family": family, "index": index, "seed": seed}
-    return Job(make, arguments, checkpoints=(*CHECKPOINTS.values(), "film_5000_perturbed"))
+    more = () if row not in ROWS or "push" not in ROWS[row][1] else (_network(row),)
+    return Job(make, arguments, checkpoints=(*CHECKPOINTS.values(), "film_5000_perturbed", *more))
 
 
 def make(row: str, family: str, index: int, seed: int) -> Any:
     """Make the result of a job."""
     if row == "margin":
         return calibrate(family, index)
+    if row == "search":
+        return search(family, index, seed)
     return run_task(row, family, index, seed)
 
 
@@ -372,11 +447,20 @@ JOBS = [
 ]
 
 
+def searches(folder: str | Path) -> list[Job]:
+    """Return the jobs of the search, for tasks that no row has solved in the clean world."""
+    found = runner.read(NAME, job, folder)
+    rows = judged([a | r for a, r in found if a["row"] in ROWS])
+    solved = {*rows[rows.feasible].groupby(["family", "index"]).groups}
+    return [job("search", *task) for task in TASKS if task not in solved]
+
+
 def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
     """Return the tables of all stored results."""
     found = runner.read(NAME, job, folder)
     errors = pd.DataFrame([a | e for a, r in found if a["row"] == "margin" for e in r])
-    records = judged(pd.DataFrame([a | r for a, r in found if a["row"] in ROWS]))
+    records = judged([a | r for a, r in found if a["row"] != "margin"])
+    records = records[records.row != "search"]
     return {
         "margin": margin_rows(errors),
         "rows": rows_of(records),
@@ -402,11 +486,14 @@ def margin_rows(errors: pd.DataFrame) -> Rows:
     return rows
 
 
-def judged(records: pd.DataFrame) -> pd.DataFrame:
-    """Add contact and success to the records of tasks."""
-    left = records.fillna({"object_touched": False, "arm_touched": False})
-    contact = left.object_touched.astype(bool) | left.arm_touched.astype(bool)
-    return left.assign(contact=contact, success=(left.distance_m <= WITHIN_M) & ~contact)
+def judged(records: Rows) -> pd.DataFrame:
+    """Return records of tasks with contact, success, and whether the task is feasible."""
+    table = pd.DataFrame(records).fillna({"object_touched": False, "arm_touched": False})
+    contact = table.object_touched.astype(bool) | table.arm_touched.astype(bool)
+    table = table.assign(contact=contact, success=(table.distance_m <= WITHIN_M) & ~contact)
+    solved = table.success & ~table.row.str.contains("perturbed")
+    task = [table.family, table["index"]]
+    return table.assign(feasible=solved.groupby(task).transform("any"))
 
 
 def by_family(table: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
@@ -418,16 +505,15 @@ def by_family(table: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
 
 
 def rows_of(records: pd.DataFrame) -> Rows:
-    """Return a row of results for each row of tasks and family; n counts all tasks that were run.
-
-    A task that no planner can solve counts as a failure of all.
-    """
+    """Return a row of results for each row of tasks and family."""
     rows = []
     for row, of_row in records.groupby("row", sort=False):
         for family, some in by_family(of_row):
             made = {"row": row, "family": family, "n": len(some)}
             for name in ("success", "contact", "planned"):
                 made[f"{name}_percent"] = 100 * some[name].astype(float).mean()
+            made["feasible"] = int(some.feasible.sum())
+            made["of_feasible_percent"] = 100 * float(some.success[some.feasible].mean())
             made |= {"distance_m_median": some.distance_m.median()}
             made["actions_mean"] = some.actions.mean()
             rows.append(made)
@@ -435,7 +521,10 @@ def rows_of(records: pd.DataFrame) -> Rows:
 
 
 PAIRS = [(row, f"{row}_full") for row in ("continuous", "astar", "perturbed")]
-PAIRS += [("continuous", row) for row in ROWS if row.startswith("check") or row == "cem"]
+PAIRS += [("continuous", row) for row in ROWS if row.startswith("check")]
+PAIRS += [("continuous", row) for row in ("cem", "no_sigma", "film_500")] + [
+    ("film_500", "cnp_500")
+]
 PAIRS += [("closed_loop", "continuous"), ("closed_loop", "closed_loop_full")]
 PAIRS += [("closed_loop_perturbed", "perturbed")]
 
@@ -445,12 +534,8 @@ def paired_rows(records: pd.DataFrame) -> Rows:
 
     low, high: None where all differences are equal, as resampling would tell nothing.
     """
-    rows, table = (
-        [],
-        records.pivot_table(
-            index=["family", "index"], columns="row", values="success", aggfunc="first"
-        ),
-    )
+    table = records.drop_duplicates(["family", "index", "row"])
+    table, rows = table.pivot(index=["family", "index"], columns="row", values="success"), []
     for one, other in PAIRS:
         if not {one, other} <= {*table.columns}:
             continue
@@ -467,7 +552,9 @@ def paired_rows(records: pd.DataFrame) -> Rows:
 @command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
     """Plan and execute missing tasks, and write the tables."""
-    return runner.make(JOBS, NAME, runner.parser(NAME, main.__doc__).parse_args(argv), tables)
+    options = runner.parser(NAME, main.__doc__).parse_args(argv)
+    runner.make(JOBS, NAME, options, tables)
+    return 0 if options.only else runner.make(searches(options.raw), NAME, options, tables)
 
 
 if __name__ == "__main__":

@@ -11,19 +11,15 @@ import argparse
 import lzma
 import math
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
 from affordlib.geometry import rotated
-from affordlib.logs import Log, LoggedPushes
 from affordlib.primitives import PushAt
 from affordlib.results import repo_root
 from affordlib.types import UnreachableError
 from affordlib.world import Prism, Tabletop, WorldConfig
-from affordlib.world.robot import ROD_WIDTH_M
 from experiments.commands import command
-from experiments.real_pushes import pushes_of
 
 FOLDER = repo_root() / "data" / "own_log"
 N_PUSHES = 50
@@ -45,18 +41,6 @@ def world_config(condition: str) -> WorldConfig:
     inside = {"com_offset_m": (x, y, -0.3 * HEIGHT_M)}
     friction = {"table_friction": SURFACES[surface], "finger_friction": SURFACES[surface]}
     return WorldConfig(**inside, **friction)
-
-
-def read_log(folder: Path = FOLDER) -> LoggedPushes:
-    """Read the embedded log."""
-    log = Log("mm", np.array(TRIANGLE_M) * 1e3, tool_radius=500 * ROD_WIDTH_M)
-    for path in sorted(folder.glob("*.txt.xz")):
-        name = path.name.removesuffix(".txt.xz")
-        told = dict(zip(("surface", "support"), name.split("_"), strict=True))
-        for poses, t, xy in pushes_of(path):
-            yaw = 2 * np.arctan2(poses[:, 6], poses[:, 3])
-            log.add(t, xy, np.column_stack([poses[:, :2], yaw]), context=told, group=name)
-    return log.pushes()
 
 
 def drawn_push(outline_m: np.ndarray, yaw: float, rng: np.random.Generator) -> PushAt:

@@ -16,7 +16,7 @@ from typing import Any, Self
 import numpy as np
 from scipy.optimize import brentq
 
-from affordlib.geometry import cross, rotated
+from affordlib.geometry import cross, rotated, rotated_each
 from affordlib.types import check_array, check_choice, check_within
 
 UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
@@ -215,9 +215,7 @@ class Log:
         at = _growing("poses_t", poses_t, len(known))
         known[:, 2] = np.unwrap(known[:, 2])
         seen = np.column_stack([np.interp(t, at, column) for column in known.T])
-        c, s = np.cos(seen[:, 2]), np.sin(seen[:, 2])
-        x, y = (tool - seen[:, :2]).T
-        inside = np.column_stack([c * x + s * y, c * y - s * x]) - self.origin_m
+        inside = rotated_each(tool - seen[:, :2], -seen[:, 2]) - self.origin_m
         gap, found, done = _nearest(self.outline_m, inside)[0] - self._radius_m, [], 0
         while (touch := np.flatnonzero(gap[done:] < TOUCH_M)).size:
             first = done + int(touch[0])

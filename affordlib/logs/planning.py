@@ -19,7 +19,7 @@ import numpy as np
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
-from affordlib.geometry import cross, rotated, unit_vector
+from affordlib.geometry import cross, rotated, rotated_each, unit_vector
 from affordlib.logs.fit import PushModel
 from affordlib.logs.log import FEET, LARGEST_M, Pushes, _nearest, centred, gyration_radius_m
 from affordlib.primitives import PushAt
@@ -117,7 +117,7 @@ class PushedObject:
         return Pushes(
             contact_m=self.outline_m[edge] + values[:, :1] * edges[edge],
             normal=normal,
-            direction=_turned(normal, values[:, 1]),
+            direction=rotated_each(normal, values[:, 1]),
             length_m=np.exp(values[:, 2]),
             groups=np.full(n, self.group),
             context={k: np.repeat(np.array(v)[None], n, 0) for k, v in self.context.items()},
@@ -196,7 +196,7 @@ class PushPlanner:
             found += best(self._pairs[near], self._ends[near])
         if n_pushes == 3:
             left = target - effect
-            left[:, :2] = _turned(left[:, :2], -effect[:, 2])
+            left[:, :2] = rotated_each(left[:, :2], -effect[:, 2])
             near = tree.query(weights * left, _NEIGHBOURS)[1].ravel()
             chains = np.column_stack([np.repeat(np.arange(n), _NEIGHBOURS), self._pairs[near]])
             found += best(chains, _after(effect[chains[:, 0]], self._ends[near]))
@@ -357,16 +357,10 @@ def primitive_of(pushes: Pushes, k: int, heading_rad: float) -> PushAt:
     return PushAt(tuple(rotated(middle, heading_rad)), direction, float(pushes.length_m[k]))
 
 
-def _turned(xy: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """Rotate points (n, 2), each by its angle (n,)."""
-    c, s = np.cos(angle), np.sin(angle)
-    return np.column_stack([c * xy[:, 0] - s * xy[:, 1], s * xy[:, 0] + c * xy[:, 1]])
-
-
 def _after(pose: np.ndarray, effect: np.ndarray) -> np.ndarray:
     """Poses (n, 3) after effects (n, 3), each in the frame of its pose."""
     return np.column_stack(
-        [pose[:, :2] + _turned(effect[:, :2], pose[:, 2]), pose[:, 2] + effect[:, 2]]
+        [pose[:, :2] + rotated_each(effect[:, :2], pose[:, 2]), pose[:, 2] + effect[:, 2]]
     )
 
 

@@ -195,8 +195,7 @@ class _ClosedLoop:
         config: ClosedLoopConfig,
     ) -> None:
         self.robot, self.goal_now, self.skills, self.config = robot, goal_now, skills, config
-        patience = config.mode, config.max_plans
-        self.moves = MovePlanner(robot, skills, planner, *patience)
+        self.moves = MovePlanner(robot, skills, planner, config.mode, config.max_plans)
         self.goal = self.acted_for = goal_now()  # updated before each action and after a lift
         self.steps: list[Step] = []
         self.executions: list[Execution] = []
@@ -340,7 +339,11 @@ class _ClosedLoop:
             return self._give_up(part)
         self.acted_for = self.goal
         if part != "position" or not self.queue:
-            plan = self._plan_move() if part == "position" else self._plan_pose(part)
+            if part == "position":
+                plan = self.moves.plan(self.seen, self.goal, self._grip_yaw())
+                self.plans += [plan] * isinstance(plan, Plan)
+            else:
+                plan = self._plan_pose(part)
             if isinstance(plan, Ending):
                 return plan
             self.plan, self.turned_by_plan_rad = plan, 0.0
@@ -366,12 +369,6 @@ class _ClosedLoop:
             phase, hand_rad = np.linspace(0, step.stop_phase, len(tool)), np.unwrap(tool[:, 3])
             closed_rad = np.interp(step.primitive.segment_phases[2], phase, hand_rad)
             self.reckoned_rad = self.seen.yaw_rad + float(hand_rad[-1] - closed_rad)
-
-    def _plan_move(self) -> Plan | Ending:
-        plan = self.moves.plan(self.seen, self.goal, self._grip_yaw())
-        if isinstance(plan, Plan):
-            self.plans.append(plan)
-        return plan
 
     def _plan_pose(self, part: str) -> Plan | Ending:
         """Plan the next rotation, or the lift, with a yaw of the hand that the arm can reach."""

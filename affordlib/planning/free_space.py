@@ -20,7 +20,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from affordlib.geometry import unit_vector
+from affordlib.geometry import rotated_each, unit_vector
 from affordlib.perception import adapt_to_object, outline_of, radius_m
 from affordlib.primitives import Primitive, Push, Rotate, min_jerk
 from affordlib.types import Obstacle, Step
@@ -57,10 +57,7 @@ def corners_of(obstacle: Obstacle) -> np.ndarray:
 
 def placed(corners: np.ndarray, poses: np.ndarray) -> np.ndarray:
     """Return the corners (..., k, 2) of a shape (k, 2) at poses (..., 3)."""
-    cos, sin = np.cos(poses[..., 2, None]), np.sin(poses[..., 2, None])
-    x, y = corners[..., 0], corners[..., 1]
-    turned = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
-    return turned + poses[..., None, :2]
+    return rotated_each(corners, poses[..., 2, None]) + poses[..., None, :2]
 
 
 def _normals(corners: np.ndarray) -> np.ndarray:

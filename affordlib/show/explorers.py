@@ -86,7 +86,8 @@ class Explorer:
                 if band is not None:
                     ax.fill_between(x, y - band, y + band, color=line.color, alpha=0.2, lw=0)
             ax.set(title=title, aspect="equal" if title == self.square else "auto")
-        handles = {name: line for ax in axes.flat for line, name in _legend(ax)}
+        legends = [zip(*ax.get_legend_handles_labels(), strict=True) for ax in axes.flat]
+        handles = {name: line for legend in legends for line, name in legend}
         figure.legend(handles.values(), handles, loc="outside lower center", ncols=5)
         return figure
 
@@ -114,10 +115,6 @@ class Explorer:
 
 def _of(values: np.ndarray | None, state: int) -> np.ndarray | None:
     return values if values is None or values.ndim == 1 else values[state]
-
-
-def _legend(ax: Any) -> zip:
-    return zip(*ax.get_legend_handles_labels(), strict=True)
 
 
 def _packed(line: Line) -> dict[str, Any]:

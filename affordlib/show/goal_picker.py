@@ -22,7 +22,6 @@ from matplotlib.figure import Figure
 from affordlib.geometry import unit_vector, wrap_angle
 from affordlib.models import load_checkpoint
 from affordlib.planning import Planner, Skills, plan_astar, plan_continuous, plan_gradient
-from affordlib.planning.effect_map import EffectMap
 from affordlib.planning.gradient import Reading
 from affordlib.show.executors import Executor, Stopped, closed_loop, measured, open_loop
 from affordlib.show.picker_controls import LIMIT_M, PickerControls, outcome_in_words, plan_in_words
@@ -170,7 +169,7 @@ class GoalPicker(widgets.HBox):
             [self.goal.xy_m, *(s.predicted_end_xy_m for s in plan.steps), self._pose[:2]]
         )
         low, high = points.min(axis=0), points.max(axis=0)
-        ax = plot_table(figure.subplots(), (low + high) / 2, 0.1 + float((high - low).max()) / 2)
+        ax = plot_table(figure.subplots(), (low + high) / 2, 0.12 + float((high - low).max()) / 2)
         plot_footprint(ax, self.world.obj, self._pose[:2], self._pose[2])
         return plot_plan(ax, plan, obj=self.world.obj, yaw_rad=self._plan_pose[2]).figure
 
@@ -271,18 +270,14 @@ class GoalPicker(widgets.HBox):
                 plan = self.planners[self.controls.planner.value](problem)
                 self.controls.say(f"{self._news} {plan_in_words(plan)}")
                 self._news = ""
-                self._show_object(problem.effects)
+                if problem.effects is not self._effects:  # with these the page plans
+                    effects = self._effects = problem.effects
+                    self._view.object = object_data(self.world.obj, effects, self._pose[2])
             finally:
                 self._begin(plan)
                 self._answered = number
                 self._stale = goal is not self.goal
                 self._show(planning=self._stale)
-
-    def _show_object(self, effects: EffectMap) -> None:
-        """Give the page the object's effect map, with which it plans."""
-        if effects is not self._effects:
-            self._view.object = object_data(self.world.obj, effects, self._pose[2])
-            self._effects = effects
 
     def _put_down(self) -> None:
         """Prepare the table for a new plan."""

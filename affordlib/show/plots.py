@@ -102,7 +102,8 @@ def plot_footprint(
     outline = _cm(outline + check_pair("xy_m", xy_m))
     filled = style == "filled"
     ax.fill(*outline, facecolor=color if filled else "none", alpha=0.25 if filled else 1, lw=0)
-    ax.plot(*_closed(outline), "-" if filled else style, color=color, lw=1.5, label=label)
+    closed = np.hstack([outline, outline[:, :1]])
+    ax.plot(*closed, "-" if filled else style, color=color, lw=1.5, label=label)
     return ax
 
 
@@ -116,10 +117,6 @@ def plot_obstacles(ax: Axes, obstacles: Sequence[Obstacle]) -> Axes:
 def _cm(xy_m: Any) -> np.ndarray:
     """Convert points (n, 2) or one (2,) from metres to x and y in centimetres."""
     return 100 * np.asarray(xy_m, dtype=float).T
-
-
-def _closed(xy: np.ndarray) -> np.ndarray:
-    return np.hstack([xy, xy[:, :1]])
 
 
 def _name(ax: Axes, text: str, at_cm: Sequence[float], offset: Sequence[float], **style) -> None:
@@ -150,9 +147,9 @@ def plot_plan(
     """Draw a plan as predicted: the object's path, final position and σ of each step, and the goal.
 
     sigma: draw a disc at each step's end, with a radius of twenty σ. obj: drawn dotted at its
-    predicted pose before each later push; yaw_rad: its current yaw.
+    predicted pose after each push; yaw_rad: its current yaw.
     """
-    goal, first, turn, row = plan.goal, np.array(plan.start_xy_m), 0.0, 0
+    goal, first, row = plan.goal, np.array(plan.start_xy_m), 0
     radius = 100 * goal.tolerance_m
     ax.add_patch(plt.Circle(_cm(goal.xy_m), radius, color=GOAL, fill=False, lw=1))
     ax.plot(*_cm(goal.xy_m), "*", color=GOAL, ms=13, label="goal", zorder=5)
@@ -164,8 +161,6 @@ def plot_plan(
             row += 1
             _name_in_place(ax, text, step, goal, row)
             continue
-        if obj is not None and k > 0:
-            plot_footprint(ax, obj, start, yaw_rad + turn, PREDICTION, style=":")
         theta = step.primitive.direction_rad
         direction = np.array([math.cos(theta), math.sin(theta)])
         tail, tip = _cm(start - 0.075 * direction), _cm(start - 0.035 * direction)
@@ -182,15 +177,22 @@ def plot_plan(
         if sigma and not math.isnan(step.std_m):
             disc = {"radius": 100 * ENLARGED * step.std_m, "color": PREDICTION, "alpha": 0.35}
             ax.add_patch(plt.Circle(_cm(end), **disc, lw=1, zorder=1.5))
-        start, turn = end, step.predicted_turn_rad
+        start = end
+        if obj is not None:
+            plot_footprint(ax, obj, end, yaw_rad + step.predicted_turn_rad, PREDICTION, style=":")
     return ax
 
 
-def plot_outcome(ax: Axes, outcome: Outcome) -> Axes:
-    """Draw the object's true path in an executed plan over the plan (see `plot_plan`)."""
-    plot_plan(ax, outcome.plan, sigma=False)
+def plot_outcome(
+    ax: Axes, outcome: Outcome, obj: TabletopObject | None = None, yaw_rad: float = 0.0
+) -> Axes:
+    """Draw the true path and final pose of an object over its executed plan (see `plot_plan`)."""
+    plot_plan(ax, outcome.plan, sigma=False, obj=obj, yaw_rad=yaw_rad)
+    if obj is not None:
+        *xy_m, yaw = outcome.end_pose
+        plot_footprint(ax, obj, xy_m, yaw, TRUTH)
     for line in ax.lines:
-        if line.get_color() == PREDICTION:
+        if (line.get_color(), line.get_linestyle()) == (PREDICTION, "-"):
             line.set(lw=5, alpha=0.4)  # wide, so that it is seen below the executed path
     for k, path in enumerate(outcome.object_paths_xy_m):
         ax.plot(*_cm(path), color=TRUTH, lw=2, ls="--", label="executed" if k == 0 else None)

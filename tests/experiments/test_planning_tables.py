@@ -9,7 +9,7 @@ import pytest
 from affordlib.planning import MODES
 from affordlib.results import repo_root
 from affordlib.world import ROLLABLE, STANDING
-from experiments import planning, shipped, tasks
+from experiments import obstacles, planning, shipped, tasks
 from experiments.planning import CONFIGS, attempt
 from experiments.tasks import FROZEN, PlanningTask, frozen_tasks, tasks_sha256
 
@@ -112,3 +112,23 @@ def test_a_row_has_the_statistics_of_its_goals():
     found = [standing[f"single_full_{name}_m"] for name in ("mean", "sem", "median")]
     assert found == pytest.approx([0.002, 0.001, 0.002])
     assert rollable["single_full_sem_m"] is None
+
+
+def test_a_task_is_feasible_if_something_has_solved_it_in_the_clean_world():
+    def came(index, row, distance_m, touched=False):
+        told = {"family": "gate", "index": index, "row": row, "distance_m": distance_m}
+        return told | {"object_touched": touched, "arm_touched": False}
+
+    rows = [came(0, "astar", 0.004), came(1, "astar", 0.001, True), came(1, "perturbed", 0.001)]
+    rows += [came(2, "search", 0.003), came(2, "astar", 0.02)]
+    table = obstacles.judged(rows)
+    assert "".join("ny"[yes] for yes in table.feasible) == "ynnyy"
+    assert "".join("ny"[yes] for yes in table.success) == "ynyyn"
+
+
+@pytest.mark.slow
+def test_a_search_with_the_simulators_own_effects_solves_a_pocket(monkeypatch):
+    monkeypatch.setattr(obstacles, "N_DIRECTIONS", 36)
+    found = obstacles.search("pocket", 0, obstacles.SEED)
+    assert found["distance_m"] <= obstacles.WITHIN_M
+    assert not any(found[f"{what}_touched"] for what in ("object", "arm"))

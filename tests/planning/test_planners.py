@@ -24,13 +24,11 @@ from affordlib.planning import (
 )
 from affordlib.planning.astar import HEURISTICS, Branches, BranchTable, search
 from affordlib.planning.gradient import Reading, descend
-from affordlib.planning.problem import Table
 from affordlib.planning.rollout import roll_out
 from affordlib.primitives import Drag, Move, Push
 from affordlib.types import Goal, Prediction
 from affordlib.world import ROLLABLE, STANDING, Cuboid, UprightCylinder
 from experiments.planning import attempt, phases_of_way
-from experiments.routes import RouteMap, find_route
 from experiments.shipped import uniform_tasks
 from experiments.tasks import (
     constructed_tasks,
@@ -426,26 +424,6 @@ def test_a_goal_without_room_for_the_object_is_refused(film, cuboid_image, xy):
 def test_a_model_of_other_actions_plans_no_pushes(cuboid_image, name, plan):
     with pytest.raises(ValueError, match=r"model must have x|train on such actions"):
         plan(problem_of(load_checkpoint(name)[0], cuboid_image, (0.0, 0.0), Goal((0.1, 0.05))))
-
-
-# Routes
-
-
-def test_a_route_is_the_shortest_and_keeps_the_whole_object_on_the_table():
-    def gap(xy_m, direction_rad, length_m):
-        return (np.abs(xy_m[:, 1]) > 0.1) | (xy_m[:, 0] < -0.2)
-
-    routes, start, goal = RouteMap.of(0.075, gap), (0.2, 0.3), (0.2, -0.3)
-    route = np.array([start, *find_route(routes, start, goal, gap)])
-    lengths = np.hypot(*np.diff(route, axis=0).T)
-    assert lengths.max() <= 0.075
-    round_it = np.hypot(0.4, 0.2) * 2 + 0.2  # via the gap's corners
-    assert 0.95 * round_it < lengths.sum() < 1.05 * round_it
-    assert gap(route[:-1], None, None).all()
-    wall = RouteMap.of(0.075, lambda xy_m, *_: np.abs(xy_m[:, 1]) > 0.1)
-    assert find_route(wall, start, goal, gap) == []
-    inside = np.array(find_route(routes, (0.2, 0.65), (0.62, 0.65), gap, radius_m=0.045))
-    assert Table().holds(inside, 0.045).all()
 
 
 # Goals, and plans that are executed
