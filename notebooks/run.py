@@ -26,6 +26,8 @@ from pages import cleaned, own_cells, parameters_of_pages
 
 from affordlib.results import read_results, write_atomically
 
+ENDED_BY = signal.SIGINT, signal.SIGTERM
+
 
 class OwnKernel(AsyncKernelManager):
     """Kernels of the running interpreter, reached through files that only this user can open."""
@@ -39,9 +41,17 @@ class OwnKernel(AsyncKernelManager):
         """Start a kernel in its own process group, and keep what it prints outside of cells."""
         folder = Path(os.environ["IPYTHONDIR"])
         self.transport, self.connection_file = "ipc", str(folder / "kernel.json")
-        with (folder / "printed").open("wb") as printed:
-            await super().start_kernel(stdout=printed, stderr=printed, **options)
-        (folder / "group").write_text(str(self.provisioner.pgid))
+        later: list[int] = []  # signals that arrive before the kernel's group is known
+        ends = {n: signal.signal(n, lambda n, _: later.append(n)) for n in ENDED_BY}
+        try:
+            with (folder / "printed").open("wb") as printed:
+                await super().start_kernel(stdout=printed, stderr=printed, **options)
+            (folder / "group").write_text(str(self.provisioner.pgid))
+        finally:
+            for number, end in ends.items():
+                signal.signal(number, end)
+            for number in later:
+                os.kill(os.getpid(), number)
 
 
 def execute(path: Path, copy: Path) -> None:
@@ -62,8 +72,8 @@ def execute(path: Path, copy: Path) -> None:
             print(f"{path.stem}: interrupted; the same command continues", flush=True)
             os._exit(128 + number)
 
-    signal.signal(signal.SIGINT, end)
-    signal.signal(signal.SIGTERM, end)
+    for number in ENDED_BY:
+        signal.signal(number, end)
     results.unlink(missing_ok=True)
     copy.unlink(missing_ok=True)
     print(f"{path.stem} …", flush=True)

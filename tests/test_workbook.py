@@ -229,6 +229,16 @@ def test_whatever_stops_make_leaves_no_process_and_is_taken_up_again(book, how):
 
 
 @pytest.mark.slow
+def test_a_signal_while_a_kernel_starts_leaves_no_process(book):
+    book.add("01_first")
+    run = book.root / "notebooks" / "run.py"
+    start = "await super().start_kernel(stdout=printed, stderr=printed, **options)"
+    run.write_text(run.read_text().replace(start, f"{start}; os.kill(os.getpid(), 2)"))
+    assert "01_first: interrupted" in book.make()[1]
+    wait_until(lambda: not book.processes(), seconds=0.5, otherwise="the kernel is left")
+
+
+@pytest.mark.slow
 def test_in_place_puts_clean_executed_pages_back(book):
     book.add("01_first")
     before = nbformat.read(book.path("01_first"), as_version=4)

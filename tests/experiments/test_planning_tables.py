@@ -115,20 +115,10 @@ def test_a_row_has_the_statistics_of_its_goals():
 
 
 def test_a_task_is_feasible_if_something_has_solved_it_in_the_clean_world():
-    def came(index, row, distance_m, touched=False):
-        told = {"family": "gate", "index": index, "row": row, "distance_m": distance_m}
-        return told | {"object_touched": touched, "arm_touched": False}
-
-    rows = [came(0, "astar", 0.004), came(1, "astar", 0.001, True), came(1, "perturbed", 0.001)]
-    rows += [came(2, "search", 0.003), came(2, "astar", 0.02)]
+    names, more = ("index", "row", "distance_m", "object_touched"), {"arm_touched": False}
+    rows = [(0, "astar", 0.004, False), (1, "astar", 0.001, True), (1, "perturbed", 0.001, False)]
+    rows += [(2, "search", 0.003, False), (2, "astar", 0.02, False)]
+    rows = [more | {"family": "gate"} | dict(zip(names, row, strict=True)) for row in rows]
     table = obstacles.judged(rows)
     assert "".join("ny"[yes] for yes in table.feasible) == "ynnyy"
     assert "".join("ny"[yes] for yes in table.success) == "ynyyn"
-
-
-@pytest.mark.slow
-def test_a_search_with_the_simulators_own_effects_solves_a_pocket(monkeypatch):
-    monkeypatch.setattr(obstacles, "N_DIRECTIONS", 36)
-    found = obstacles.search("pocket", 0, obstacles.SEED)
-    assert found["distance_m"] <= obstacles.WITHIN_M
-    assert not any(found[f"{what}_touched"] for what in ("object", "arm"))
