@@ -20,10 +20,9 @@ world.tabletop planning.astar planning.closed_loop planning.continuous
 planning.effect_map planning.gradient planning.grasp_rotate
 planning.problem planning.reachability planning.skills interactions.dataset
 interactions.collect interactions.recipes
-interactions.store logs.cross_validate logs.fit logs.log logs.planning models.evaluation
+interactions.store workers logs.cross_validate logs.fit logs.log logs.planning models.evaluation
 models.checkpoint models.domain models.lever_up models.training
-show.executors show.explorers
-show.goal_picker show.plots show.scene
+show.explorers show.goal_picker show.picker_controls show.plots show.scene
 """
 _CONF = BeartypeConf(
     violation_type=TypeError,

@@ -10,12 +10,7 @@ import numpy as np
 import torch
 import xarray as xr
 
-from affordlib.interactions import (
-    InteractionTensors,
-    Scaler,
-    open_interactions,
-    split_interactions,
-)
+from affordlib.interactions import InteractionTensors, Scaler, open_interactions, split_interactions
 from affordlib.interactions.dataset import Batch, sample_mixed, valid_interactions
 from affordlib.models import EffectNetwork
 from affordlib.models.checkpoint import build

@@ -69,11 +69,7 @@ def about_objects(data: xr.Dataset, kept: np.ndarray) -> dict[str, Any]:
 
 
 def prediction_record(
-    data: xr.Dataset,
-    kept: np.ndarray,
-    arrays: InteractionTensors,
-    mean: Tensor,
-    std: Tensor,
+    data: xr.Dataset, kept: np.ndarray, arrays: InteractionTensors, mean: Tensor, std: Tensor
 ) -> dict[str, Any]:
     """Ground truth, mean and σ at t = 1 by channel, and mean errors of the whole trajectory.
 
@@ -131,11 +127,7 @@ def features(data: xr.Dataset) -> Tensor:
     angle = torch.stack([(2 * yaw).cos(), (2 * yaw).sin()], dim=-1).float()
     one_hot = torch.nn.functional.one_hot(category, len(names)).float()
     return torch.cat(
-        [
-            (size - 0.06) / 0.012,
-            1.5 * angle * has_yaw[category, None],
-            _CATEGORY_GAP * one_hot,
-        ],
+        [(size - 0.06) / 0.012, 1.5 * angle * has_yaw[category, None], _CATEGORY_GAP * one_hot],
         dim=1,
     )
 
@@ -157,9 +149,8 @@ def nearest(
 ) -> Forecast:
     """Predict the training trajectory of the most similar object; σ is the leave-one-out error."""
     effect, neighbours = _in_action_frame(train, at), NearestNeighbors(n_neighbors=1).fit(known)
-    left_out, found = (
-        neighbours.kneighbors(x, return_distance=False)[:, 0] for x in (None, queried)
-    )
+    both = (neighbours.kneighbors(x, return_distance=False) for x in (None, queried))
+    left_out, found = (rows[:, 0] for rows in both)
     std = (effect[left_out] - effect).square().mean(dim=0).sqrt()
     return _in_table_frame(test, at, effect[found], _floor(std))
 

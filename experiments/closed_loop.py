@@ -40,21 +40,8 @@ from affordlib.planning import (
 from affordlib.planning.grasp_rotate import GRIPPER_YAWS_RAD
 from affordlib.planning.skills import CHECKPOINTS
 from affordlib.primitives import Grasp, Move, move_for
-from affordlib.types import (
-    TABLE_X_M,
-    TABLE_Y_M,
-    Goal,
-    UnreachableError,
-    check_choice,
-    check_count,
-)
-from affordlib.world import (
-    ROLLABLE,
-    Tabletop,
-    TabletopObject,
-    WorldConfig,
-    category_named,
-)
+from affordlib.types import TABLE_X_M, TABLE_Y_M, Goal, UnreachableError, check_choice, check_count
+from affordlib.world import ROLLABLE, Tabletop, TabletopObject, WorldConfig, category_named
 from experiments import runner
 from experiments.commands import command
 from experiments.disturbances import KINDS, Disturbance, DisturbanceSchedule

@@ -40,12 +40,7 @@ from affordlib.models.training import train_model
 from affordlib.primitives import Grasp, Push
 from affordlib.types import check_choice, check_count
 from affordlib.world import Tabletop
-from experiments.baselines import (
-    BASELINES,
-    about_objects,
-    baseline_predictions,
-    network_record,
-)
+from experiments.baselines import BASELINES, about_objects, baseline_predictions, network_record
 from experiments.lever_training import Symmetry, augment_by_symmetry
 from experiments.runner import Job, open_once
 from experiments.shipped import CHECKPOINT_SPECS, GRASP_SYMMETRIES, HALF_TURNS

@@ -21,15 +21,7 @@ import pandas as pd
 
 from experiments import reported, runner, studies
 from experiments.commands import command
-from experiments.cross_validation import (
-    LARGE,
-    MODELS,
-    PLANE,
-    TASKS,
-    add_errors,
-    by_model,
-    job,
-)
+from experiments.cross_validation import LARGE, MODELS, PLANE, TASKS, add_errors, by_model, job
 from experiments.grasps import grasp_rows
 from experiments.runner import FOLDER, Result, Rows, frame, read
 
@@ -103,27 +95,6 @@ def error_rows(table: pd.DataFrame, primitive: str) -> Rows:
     return rows
 
 
-FRAMES = {
-    "cnp": {"network": "cnp", "frame": "table"},
-    "film": {"network": "film", "frame": "push"},
-    "cnp_push_frame": {"network": "cnp", "frame": "push"},
-    "film_table_frame": {"network": "film", "frame": "table"},
-}
-
-
-def frame_rows(results: list[Result]) -> Rows:
-    """Return errors on the fixed test set of two networks in two frames, on the same folds."""
-    of = {
-        (about["model"], about["fold"], about["seed"]): (about, result)
-        for about, result in results
-        if about["model"] in FRAMES and (about["data"], about["n"]) == ("push", "all")
-    }
-    shared = set.intersection(*({key[1:] for key in of if key[0] == m} for m in FRAMES))
-    every = [of[model, *key] for model in FRAMES for key in sorted(shared)]
-    rows = error_rows(predictions_of(every, "push", "fixed_test"), "push")
-    return [FRAMES[row["model"]] | row for row in rows]
-
-
 def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
     """Return all tables from the results in a folder and the studies beside them."""
     results = sorted_results(folder)
@@ -142,7 +113,6 @@ def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
         "grasp": [*reported.grasp_rows(grasp[0]), *grasp] if grasp else [],
         "rotate": errors("rotate", "fold_test"),
         "inverse": errors("push", "inverse"),
-        "frames": frame_rows(results),
         **studies.tables(folder),
     }
 

@@ -127,10 +127,7 @@ def is_feasible(
 
 
 def on_the_rim(
-    kind: type[Move],
-    half_m: float,
-    start_xy_m: Sequence[float],
-    goal_xy_m: Sequence[float],
+    kind: type[Move], half_m: float, start_xy_m: Sequence[float], goal_xy_m: Sequence[float]
 ) -> bool:
     """Return whether feasibility changes if the reach is longer or shorter by `BAND_M`."""
     answers = [is_feasible(kind, half_m, start_xy_m, goal_xy_m, s) for s in (-BAND_M, BAND_M)]

@@ -1,4 +1,5 @@
-"""A network for lever-ups, in the frame of the last observed pose.
+"""Two networks for lever-ups: ours, in the frame of the last observed pose, and the paper's around
+the mean trajectory, as the recurrent network predicts too.
 
     d(t)  = e(t) - m(t)                              m: mean of the training trajectories
     r     = w₁ mean h_a(a_i, t_i) + w₂ mean h_e(d_i - d_l, t_i - t_l, t_i),  l the last observed
@@ -13,7 +14,7 @@ observation d_l is the one at t = 0, where a displacement is zero.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -23,6 +24,7 @@ from affordlib import checked
 from affordlib.geometry import rotate_channels
 from affordlib.interactions.dataset import InteractionTensors, condition_on_recorded_action
 from affordlib.models.base import inverse, network, push_direction, with_time
+from affordlib.models.cnp import AffordanceCNP, CNPConfig
 from affordlib.models.film import FiLMConfig, FiLMNetwork, dense, waves
 from affordlib.types import Observations
 
@@ -79,6 +81,33 @@ class AroundMean:
     def prepare(self, training: InteractionTensors) -> None:
         """Set the mean trajectory m."""
         self.mean_trajectory.fit(training, self.config.frame, self.effect_scale)
+
+
+@checked
+@dataclass(frozen=True)
+class CNPAroundMeanConfig(CNPConfig):
+    """Channels as in `CNPConfig`."""
+
+    steps: int = 25  # linear segments of m(t)
+
+
+@network("cnp_around_mean", CNPAroundMeanConfig)
+class CNPAroundMean(AroundMean, AffordanceCNP):
+    """The paper's network, whose effects are differences d(t) from the mean trajectory."""
+
+    def make_layers(self, config: CNPAroundMeanConfig) -> None:
+        """Create the paper's layers, and the mean trajectory."""
+        super().make_layers(config)
+        self.mean_trajectory = MeanTrajectory(config.steps, len(config.effect_channels))
+
+    def outputs(
+        self, features: Tensor, observations: Observations, t_target: Tensor
+    ) -> tuple[Tensor, ...]:
+        """(μ_a, σ_a, μ_e, σ_e), each (B, T, C) and standardised."""
+        o, mean = observations, self.mean_trajectory
+        d = o.effect - mean(o.effect_t) * self.effect_scale
+        mu_a, sigma_a, d, sigma_e = super().outputs(features, replace(o, effect=d), t_target)
+        return mu_a, sigma_a, mean(t_target) + d, sigma_e
 
 
 @network("cnp_last_pose", LastPoseConfig)

@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -23,7 +23,10 @@ import pandas as pd
 import torch
 from tqdm.auto import tqdm
 
+from affordlib.interactions import split_interactions
+from affordlib.models import CNPConfig, EffectNetwork
 from affordlib.models.checkpoint import load_checkpoint
+from affordlib.models.training import train_model
 from affordlib.perception import adapt_to_object
 from affordlib.planning import (
     EffectMap,
@@ -39,15 +42,16 @@ from affordlib.planning import (
     plan_gradient,
 )
 from affordlib.planning.astar import STOP_PHASES
-from affordlib.planning.gradient import Reading
+from affordlib.planning.gradient import CIRCLE_M, Reading, decoded
 from affordlib.planning.problem import MODES, OUR_TABLE
-from affordlib.primitives import Push
+from affordlib.primitives import Drag, Move, Push
 from affordlib.types import NothingSeenError, Observation, Outcome, Plan, Step
 from affordlib.world import ROLLABLE, STANDING, Tabletop, UnreachableError
 from experiments import reported, runner
 from experiments.commands import command
 from experiments.field_baselines import plan_cem
-from experiments.runner import FOLDER, Job, Rows, interval, plain
+from experiments.runner import FOLDER, Job, Rows, interval, open_once, plain
+from experiments.shipped import CHECKPOINT_SPECS
 from experiments.tasks import GOAL_SOURCES, PlanningTask, frozen_tasks, tasks_sha256
 
 ENOUGH_M = 0.0003
@@ -94,6 +98,41 @@ VERSIONS: dict[Planner, int] = {plan_astar: 2, plan_astar_fine: 2}
 """Versions of planners (default 1); raise one when a change of code changes its numbers."""
 
 
+PAPER = CHECKPOINT_SPECS["cnp_500"]
+SEEDS = (1, 2)
+TRAINED = {
+    **{
+        f"{name}_seed_{k}": replace(PAPER, data=data, training=replace(PAPER.training, seed=k))
+        for name, data in (("cnp_500", "push"), ("cnp_mixed", "mixed"))
+        for k in SEEDS
+    },
+    "cnp_mixed": replace(PAPER, data="mixed"),
+    "cnp_yaw": replace(PAPER, network=CNPConfig(effect_channels=("x", "y", "yaw"))),
+}
+"""Networks that are trained for their rows, as `cnp_500` is: with other seeds, on pushes and drags
+together as in the paper, with yaw."""
+
+
+@lru_cache
+def network(name: str) -> EffectNetwork:
+    """Load a checkpoint, or train a network of `TRAINED`."""
+    if name not in TRAINED:
+        return load_checkpoint(name)[0]
+    spec = TRAINED[name]
+    data = open_once(spec.data)
+    split = split_interactions(data.sizes["interaction"])
+    return train_model(data, split, spec.training, spec.network)[0]
+
+
+def decoded_kind(model: EffectNetwork, image: np.ndarray) -> type[Move]:
+    """Primitive that a network of both decodes: only a push begins beside the object."""
+    angle = torch.arange(36) * (math.pi / 18)
+    effects = CIRCLE_M / 3 * torch.stack([angle.cos(), angle.sin()], dim=-1)
+    with torch.no_grad():
+        *_, action = decoded(EffectMap(model, image), effects, torch.zeros(1))
+    return Push if action[:, 0].norm(dim=-1).median() > CIRCLE_M / 2 else Drag
+
+
 @dataclass(frozen=True)
 class PlannerConfig:
     """A planner, its model, and its goals.
@@ -123,7 +162,8 @@ class PlannerConfig:
         """The object categories of its goals."""
         if self.world == "perturbed_rollable":
             return ROLLABLE
-        drags = "drag" in self.checkpoints and self.world == "clean" and not self.standing
+        drags = "drag" in self.checkpoints or "mixed" in self.model
+        drags = drags and self.world == "clean" and not self.standing
         return STANDING + ROLLABLE if drags else STANDING
 
     def chosen(self, tasks: Sequence[PlanningTask]) -> list[int]:
@@ -136,12 +176,14 @@ class PlannerConfig:
 
     def pose(self) -> Pose:
         """Return what poses the problems."""
-        models = {kind: load_checkpoint(name)[0] for kind, name in self.checkpoints.items()}
-        skills = Skills(models)
+        models = {kind: network(name) for kind, name in self.checkpoints.items()}
+        skills, push = Skills(models), models["push"]
 
         def pose(image, start_xy_m, goal, mode) -> PlanningProblem:
             kind = skills.kind_for(image) if "drag" in models else Push
-            effects = EffectMap(skills.model(kind), image, kind)
+            if "mixed" in self.model:
+                kind = decoded_kind(push, image)
+            effects = EffectMap(models.get(kind.name, push), image, kind)
             return PlanningProblem(start_xy_m, goal, effects, mode)
 
         return pose
@@ -226,6 +268,21 @@ CONFIGS: dict[str, PlannerConfig] = {
         )
         for how in (Reading(), Reading("adam", "circle", "point"))
         for rate in RATES[how.descent]
+    },
+}
+CONFIGS |= {
+    # Other trainings of the paper's network; goals drawn when all planners were finished.
+    **{
+        f"{name}_{model}": replace(CONFIGS[f"{name}_pushes"], model=model, sources=("constructed",))
+        for model in TRAINED
+        for name in ("gradient_100", "gradient_300", "astar_paper")
+    },
+    **{
+        f"fresh_{name}": replace(CONFIGS[name], world="fresh", sources=("constructed",))
+        for name in (
+            *("gradient_100_pushes", "gradient_300_pushes", "astar_paper_pushes", "astar"),
+            *("continuous", "continuous_film_500", "continuous_cnp_500", "astar_disc"),
+        )
     },
 }
 
@@ -344,6 +401,7 @@ def outcome_record(task: PlanningTask, outcome: Outcome) -> dict[str, Any]:
         "predicted_m": plan.predicted_distance_m,
         "prediction_error_m": float(error),
         "actions": len(outcome.object_paths_xy_m),
+        "dragged": any(isinstance(step.primitive, Drag) for step in plan.steps),
         "plan_s": plan.plan_s,
     }
 
@@ -364,9 +422,12 @@ def run_config(config: str) -> list[dict[str, Any]]:
 def job(config: str) -> Job:
     """Return the job that evaluates one planner."""
     about = CONFIGS[config]
-    settings, files = [about, tasks_sha256(about.world)], tuple(about.checkpoints.values())
-    version = VERSIONS.get(about.planner, 1)
-    return Job(run_config, {"config": config}, settings, (), files, version)
+    settings, names = [about, tasks_sha256(about.world)], [*about.checkpoints.values()]
+    specs = [TRAINED[name] for name in names if name in TRAINED]
+    settings += [(spec.network, spec.training) for spec in specs]
+    files = tuple(name for name in names if name not in TRAINED)
+    data, version = tuple(spec.data for spec in specs), VERSIONS.get(about.planner, 1)
+    return Job(run_config, {"config": config}, settings, data, files, version)
 
 
 def distances(records: dict[str, Rows]) -> pd.DataFrame:

@@ -38,12 +38,7 @@ from affordlib.interactions.store import SUFFIX as DATA_SUFFIX
 from affordlib.interactions.store import dataset_sha256
 from affordlib.models import CNPConfig, FiLMConfig, NetworkConfig
 from affordlib.models.checkpoint import SUFFIX, save_checkpoint
-from affordlib.models.training import (
-    Sampler,
-    TrainingConfig,
-    about_training,
-    train_model,
-)
+from affordlib.models.training import Sampler, TrainingConfig, about_training, train_model
 from affordlib.planning import MODES
 from affordlib.planning.reachability import SHIPPED as REACHABILITY
 from affordlib.planning.reachability import Reachability, reach_features
@@ -299,7 +294,7 @@ def draw_goals(_: argparse.Namespace) -> bool:
     missing = [world for world, path in FROZEN.items() if not (repo_root() / path).exists()]
     for name in missing:
         tasks: list[PlanningTask] = []
-        seed = int(name == "validation")
+        seed = {"validation": 1, "fresh": 2}.get(name, 0)
         counts = VALIDATION_GOALS if name == "validation" else N_GOALS
         with Tabletop() as world:
             for mode, n in counts.items():

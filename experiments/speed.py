@@ -60,11 +60,8 @@ def planning(n_goals: int = 15) -> Rows:
                 effects.fine_grid  # noqa: B018, computed once per object
                 problem = PlanningProblem(world.object_pose()[:2], task.goal, effects, task.mode)
                 for name, planner in PLANNERS.items():
-                    each = (
-                        seconds(partial(planner, problem)),
-                        seconds(partial(whole, planner, problem)),
-                    )
-                    times[name].append(each)
+                    both = partial(planner, problem), partial(whole, planner, problem)
+                    times[name].append([seconds(each) for each in both])
             for name, values in times.items():
                 median, with_map = 1000 * np.median(values, axis=0)
                 row = {"planner": name, "goals": goals, "median_ms": median}

@@ -29,6 +29,7 @@ FROZEN = {
     "perturbed_rollable": "data/goals/planning_perturbed_rollable.json",
     "outside": "data/goals/planning_outside.json",
     "validation": "data/goals/planning_validation.json",
+    "fresh": "data/goals/planning_fresh.json",
 }
 GOAL_SOURCES = ("constructed", "uniform")
 

@@ -9,7 +9,7 @@ import re
 
 from pages import PAGES, ROOT
 
-FIGURES = ("0.4", "1.3", "3.1", "3.2", "4.5", "5.2", "6.1", "6.4", "6.6", "10.2")
+FIGURES = ("0.4", "1.3", "3.1", "3.2", "4.5", "5.2", "6.1", "6.4", "6.7", "10.2")
 FOLDER = ROOT / "figures" / "slides"
 
 

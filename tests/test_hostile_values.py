@@ -21,12 +21,7 @@ from affordlib.interactions.collect import collect
 from affordlib.interactions.recipes import Recipe, Variation
 from affordlib.logs.fit import EFFORT
 from affordlib.primitives import Drag, Grasp, LeverUp, Push, PushAt, Rotate, primitive_named
-from affordlib.results import (
-    read_results,
-    repo_root,
-    results_table,
-    write_results,
-)
+from affordlib.results import read_results, repo_root, results_table, write_results
 from affordlib.types import Goal, Obstacle, Outcome, Plan, Step, UnreachableError, check_array
 from affordlib.world.camera import View
 from exercises import check
@@ -261,9 +256,7 @@ def shop(one_world, skills, pushes, tmp_path_factory):
 
 
 WRITERS = ("write_results", "collect", "save_checkpoint", "save_model")
-NOT_DRIVEN = {
-    "collect": {"workers": 1},
-}
+NOT_DRIVEN = {"collect": {"workers": 1}}
 
 
 def driven(name, shop):

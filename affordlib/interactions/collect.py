@@ -12,20 +12,14 @@ number of workers and any size and order of chunks. On a cluster:
 
 import os
 import shutil
-import signal
-import threading
-import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing, nullcontext, suppress
+from contextlib import closing, suppress
 from dataclasses import fields
 from functools import partial
 from importlib import metadata
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import xarray as xr
-from joblib import Parallel, delayed, parallel_config
 from tqdm.auto import tqdm
 
 from affordlib.interactions.recipes import Recipe, interact
@@ -46,6 +40,7 @@ from affordlib.types import (
     Interaction,
     check_count,
 )
+from affordlib.workers import spread
 from affordlib.world import CATEGORIES, Tabletop, TabletopObject, WorldConfig
 from affordlib.world.execution import RECORDED_SAMPLES
 from affordlib.world.trajectory import N_SAMPLES
@@ -167,45 +162,6 @@ def _make(recipe: Recipe, attrs: dict[str, str], task: tuple[range, Path]) -> xr
     return collect_chunk(recipe, task[0])
 
 
-def spread(
-    function: Callable[[Any], Any], tasks: Mapping[str, Any], workers: int = 1
-) -> Iterator[tuple[str, Any]]:
-    """Yield the name of each task and function(task) as soon as it is computed.
-
-    In this process for one worker, unless joblib.parallel_config says otherwise; else in new
-    processes, which end with this one. Raises RuntimeError that names a task that fails.
-    """
-    end = partial(_end_with, os.getpid())
-    new = parallel_config("loky", inner_max_num_threads=1, initializer=end)
-    with new if workers > 1 else nullcontext():
-        n_jobs = max(1, min(workers, len(tasks))) if workers > 1 else None
-        parallel = Parallel(
-            n_jobs, return_as="generator_unordered", batch_size=1, pre_dispatch="n_jobs"
-        )
-    calls = (delayed(_named)(function, name, task) for name, task in tasks.items())
-    with closing(parallel(calls)) as results:
-        yield from results
-
-
-def _named(function: Callable[[Any], Any], name: str, task: Any) -> tuple[str, Any]:
-    try:
-        return name, function(task)
-    except Exception as error:
-        raise RuntimeError(f"{name} failed: {type(error).__name__}: {error}") from error
-
-
-def _end_with(parent: int) -> None:
-    """Leave Ctrl-C to the parent process, and end this one within a second of its end."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-    def watch():
-        while os.getppid() == parent:
-            time.sleep(0.5)
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
-
-
 def attributes_for(recipe: Recipe) -> dict[str, str]:
     """Return the attributes of a recipe's data set, which are known before it is collected."""
     if LeverUp.name in recipe.primitives and set(recipe.primitives) != {LeverUp.name}:
@@ -262,19 +218,16 @@ def _row(obj: TabletopObject, done: Interaction, config: WorldConfig) -> dict[st
     """Return an interaction's values by variable name, including some that are not stored."""
     of_interaction = {name.removesuffix("_m"): value for name, value in vars(done).items()}
     parameters = {f.name: getattr(done.primitive, f.name) for f in fields(done.primitive)}
-    return (
-        of_interaction
-        | parameters
-        | {
-            "primitive": list(PRIMITIVES).index(done.primitive.name),
-            "category": list(CATEGORIES).index(obj.category),
-            "size": [*np.ptp(obj.footprint_m, axis=0), obj.height_m],
-            "mass": config.density_kg_m3 * obj.volume_m3,
-            "com_offset": config.com_offset_m,
-            "friction": (config.table_friction, config.object_friction, config.finger_friction),
-            "tip_offset": config.tip_offset_m,
-            "rollable": obj.rollable,
-            "success": done.success,
-            "fault": bool(done.faults),
-        }
-    )
+    row = of_interaction | parameters
+    return row | {
+        "primitive": list(PRIMITIVES).index(done.primitive.name),
+        "category": list(CATEGORIES).index(obj.category),
+        "size": [*np.ptp(obj.footprint_m, axis=0), obj.height_m],
+        "mass": config.density_kg_m3 * obj.volume_m3,
+        "com_offset": config.com_offset_m,
+        "friction": (config.table_friction, config.object_friction, config.finger_friction),
+        "tip_offset": config.tip_offset_m,
+        "rollable": obj.rollable,
+        "success": done.success,
+        "fault": bool(done.faults),
+    }

@@ -10,22 +10,8 @@ import numpy as np
 
 from affordlib.geometry import rotated
 from affordlib.primitives import PRIMITIVES, primitive_named
-from affordlib.types import (
-    TABLE_X_M,
-    TABLE_Y_M,
-    Checked,
-    Interaction,
-    check_range,
-    count,
-    number,
-)
-from affordlib.world import (
-    CATEGORIES,
-    Tabletop,
-    TabletopObject,
-    WorldConfig,
-    category_named,
-)
+from affordlib.types import TABLE_X_M, TABLE_Y_M, Checked, Interaction, check_range, count, number
+from affordlib.world import CATEGORIES, Tabletop, TabletopObject, WorldConfig, category_named
 
 _TABLE_MARGIN_M = 0.08
 

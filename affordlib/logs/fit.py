@@ -263,10 +263,8 @@ def _physics(
                 found = AnalyticPusher.fitted(rows[:, :7], rows[:, 7:], told)
                 state[key] = np.array([found.friction, found.size])
             some = log.select(log.groups == group)
-            pusher, told = (
-                AnalyticPusher(*state[key].tolist()),
-                told_feet(some)[0] if feet else None,
-            )
+            pusher = AnalyticPusher(*state[key].tolist())
+            told = told_feet(some)[0] if feet else None
             means[-1][log.groups == group] = pusher.predict(push_rows(some)[:, :7], told).numpy()
     left = _outcome(data) - means[0]
     if not process:

@@ -217,10 +217,7 @@ class PushPlanner:
         return Plan(goal, (x, y), plan, "push_at", bool(reaches), took_s)
 
     def way(
-        self,
-        pose: tuple[float, float, float],
-        tool_xy_m: tuple[float, float],
-        primitive: PushAt,
+        self, pose: tuple[float, float, float], tool_xy_m: tuple[float, float], primitive: PushAt
     ) -> np.ndarray:
         """Points (n, 2) of the tool's way from where it is to the end of a push of `plan`.
 

@@ -350,10 +350,8 @@ def rotate_both(
 def rotate_prediction(p: Prediction, rotation: Tensor, *channels: Channels) -> Prediction:
     """Rotate a prediction by (B, 2); the correlation of x and y that this introduces is dropped."""
     action, effect = rotate_both(p.action_mean, p.effect_mean, rotation, *channels)
-    stds = p.action_std, p.effect_std
-    action_std, effect_std = (
-        _rotate_std(std, each, rotation[:, None]) for std, each in zip(stds, channels, strict=True)
-    )
+    pairs = zip((p.action_std, p.effect_std), channels, strict=True)
+    action_std, effect_std = (_rotate_std(std, each, rotation[:, None]) for std, each in pairs)
     return Prediction(action, action_std, effect, effect_std)
 
 

@@ -74,9 +74,7 @@ def coverage(
 
 
 def fit_sigma_scale(
-    model: EffectNetwork,
-    validation: InteractionTensors,
-    phases: Sequence[float] = AFTER_CONTACT,
+    model: EffectNetwork, validation: InteractionTensors, phases: Sequence[float] = AFTER_CONTACT
 ) -> tuple[float, ...]:
     """Set and return the maximum-likelihood sigma_scale (C_e,); x and y share one factor."""
     model.sigma_scale.fill_(1.0)

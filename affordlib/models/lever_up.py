@@ -53,9 +53,9 @@ def lever_up_tensors(
     """Return lever-ups as 26 steps of poses and commanded actions, in the lever's frame.
 
     view: "near", the 42 cm of the image that contain the object, 48×48 (means of four pixels);
-    "wide", all of its 56 cm, 48×48; "full", as recorded, 128×128. Faulty ones are excluded.
+    "wide", all of its 56 cm, 48×48. Faulty ones are excluded.
     """
-    check_choice("view", view, ("near", "wide", "full"))
+    check_choice("view", view, ("near", "wide"))
     xyz = ("x", "y", "z")
     on_table = InteractionTensors.from_dataset(data, interactions, xyz, POSE_CHANNELS)
     chosen = np.arange(data.sizes["interaction"]) if interactions is None else interactions
@@ -67,7 +67,7 @@ def lever_up_tensors(
     image, width_m = on_table.image, on_table.image_width_m
     if view == "near":
         image, width_m = F.avg_pool2d(image[..., 16:112, 32:], 2), 96 / 128 * width_m
-    elif view == "wide":
+    else:
         image = F.interpolate(image, (48, 48), mode="bilinear", antialias=True)
     return replace(
         on_table,

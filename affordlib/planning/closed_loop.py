@@ -129,11 +129,10 @@ class ClosedLoopResult:
 
     status: "reached"; "unconfirmed", where all is within its tolerance by what the robot knows, but
     was not observed so exactly; "unreachable", "gave_up" or "lost". goal: the final one; errors:
-    what is left of it. end_pose: (x, y, rotation since the start) of the object, and turn_std_rad;
-    reckoned: which of "position" and "orientation" were not observed at the end but computed from
-    the motion of the hand. steps: the executed actions, and executions, their recordings; plans:
-    all that were made to positions; seen_xy_m: before every decision; vetoes: planned actions that
-    the arm's kinematics refused.
+    what is left of it. end_pose: (x, y, rotation since the start) of the object; reckoned: which of
+    "position" and "orientation" were not observed at the end but computed from the motion of the
+    hand. steps: the executed actions, and executions, their recordings; plans: all that were made
+    to positions; seen_xy_m: before every decision; vetoes: what the arm's kinematics refused.
     """
 
     goal: Goal
@@ -145,7 +144,6 @@ class ClosedLoopResult:
     plans: tuple[Plan, ...]
     seen_xy_m: tuple[tuple[float, float], ...]
     end_pose: tuple[float, float, float]
-    turn_std_rad: float | None
     reckoned: tuple[str, ...]
     vetoes: int = 0
 
@@ -230,7 +228,6 @@ class _ClosedLoop:
             plans=tuple(self.plans),
             seen_xy_m=tuple(self.seen_xy_m),
             end_pose=(*self.seen.xy_m, self._turned_rad()),
-            turn_std_rad=self.seen.yaw_std_rad,
             reckoned=self._reckoned(),
             vetoes=self.moves.vetoes,
         )

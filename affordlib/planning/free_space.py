@@ -82,9 +82,8 @@ def gaps_m(obstacles: Sequence[np.ndarray], shapes: np.ndarray, far_m: float = F
     # The hulls are the last axis of all arrays: corners (2, 2k, h), axes (2, a, h), middles (2, h).
     both = shapes[:, :-1], shapes[:, 1:]
     every = sides[:, :-1], sides[:, 1:], across, -across
-    corners, axes = (
-        np.concatenate(parts, axis=2).reshape(n * (s - 1), -1, 2).T for parts in (both, every)
-    )
+    joined = (np.concatenate(parts, axis=2) for parts in (both, every))
+    corners, axes = (parts.reshape(n * (s - 1), -1, 2).T for parts in joined)
     middles = corners.mean(axis=1)
     radius = np.hypot(*(corners - middles[:, None])).max(axis=0)
     gaps = np.full(len(radius), far_m)

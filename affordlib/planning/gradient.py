@@ -82,7 +82,7 @@ def descend(
     frame = normalize if reading.finds == "direction" else torch.clone
     for _ in range(MAX_ITERATIONS):
         xy.requires_grad_()
-        losses = (_predict(effects, xy, torch.ones(1))[1][:, 0] - target).square().mean(dim=-1)
+        losses = (decoded(effects, xy, torch.ones(1))[1][:, 0] - target).square().mean(dim=-1)
         (xy.grad,) = torch.autograd.grad(losses.sum(), [xy])
         before, now = xy.detach().clone(), xy.detach()
         if trace is not None:
@@ -96,7 +96,7 @@ def descend(
     return found[losses.detach().argsort(stable=True)]
 
 
-def _predict(effects: EffectMap, xy: torch.Tensor, t: torch.Tensor) -> tuple[Any, ...]:
+def decoded(effects: EffectMap, xy: torch.Tensor, t: torch.Tensor) -> tuple[Any, ...]:
     """Prediction at phases (T,), with its x and y of effect and action, from effects (n, 2)."""
     model, columns = effects.model, xy_columns(effects.model.effect_channels)
     effect = torch.zeros(len(xy), len(model.effect_channels))
@@ -144,7 +144,7 @@ def _step(
     effects, channels = problem.effects, problem.effects.model.effect_channels
     t = torch.linspace(0, 1, samples)
     with torch.no_grad():
-        found, path, action = _predict(effects, xy[None], t)
+        found, path, action = decoded(effects, xy[None], t)
     path, action = here + path[0].numpy().astype(float), action[0].numpy().astype(float)
     angle = math.atan2(*(action[-1] - action[0])[::-1])
     away = np.hypot(*(path - problem.goal.xy_m).T)
@@ -163,7 +163,7 @@ def _step(
         kind, at = effects.kind.towards(angle), np.array([t[stop].item()])
         if problem.free_space.spare_m(kind, np.array([angle]), at, poses)[0] < 0:
             return None
-    decoded = None if effects.kind is Drag else action[: stop + 1]
+    path_of_hand = None if effects.kind is Drag else action[: stop + 1]
     std_m = float(found.effect_std[0, stop, xy_columns(channels)].norm())
     primitive, end = effects.kind.towards(angle), tuple(path[stop].tolist())
-    return Step(primitive, float(t[stop]), end, path[: stop + 1], decoded, std_m, turns[stop])
+    return Step(primitive, float(t[stop]), end, path[: stop + 1], path_of_hand, std_m, turns[stop])

@@ -80,9 +80,8 @@ def predict_trajectories(
     action = replace(adapt_to_object(primitive, image), grip_yaw=0.0)
     prediction = model.predict(features, condition_on_primitives(model, [action] * len(turn)), t)
     k = model.effect_channels.index(channel)
-    mean, std = (
-        v[:, :, k].double().numpy() for v in (prediction.effect_mean, prediction.effect_std)
-    )
+    both = prediction.effect_mean, prediction.effect_std
+    mean, std = (values[:, :, k].double().numpy() for values in both)
     return PredictedTrajectories(yaws, t[0].double().numpy(), mean - mean[:, :1], std)
 
 

@@ -37,12 +37,8 @@ def roll_out(
         slope = (effect[:, 1] - effect[:, 2]) / (nearby[2] - nearby[1])  # d effect / d turned
         effect, added = effect[:, 0], std[:, 0].square()
         swing = rotate(slope[:, :2], angle)
-        trace = (
-            trace
-            + (2 * covariance * swing).sum(dim=-1)
-            + turn_variance * swing.square().sum(dim=-1)
-            + added[:, :2].sum(dim=-1)
-        )
+        trace = trace + (2 * covariance * swing).sum(dim=-1)
+        trace = trace + turn_variance * swing.square().sum(dim=-1) + added[:, :2].sum(dim=-1)
         kept = 1 + slope[:, 2]
         covariance = kept[:, None] * (covariance + turn_variance[:, None] * swing)
         turn_variance = kept.square() * turn_variance + added[:, 2]

@@ -1,8 +1,8 @@
 """Pictures for people: figures, animations, and interactive widgets."""
 
-from affordlib.show.executors import closed_loop, open_loop
 from affordlib.show.explorers import conditioning_explorer, phase_explorer
 from affordlib.show.goal_picker import GoalPicker
+from affordlib.show.picker_controls import closed_loop, open_loop
 from affordlib.show.plots import (
     GOAL,
     NEUTRAL,

@@ -94,12 +94,8 @@ class Explorer:
     def _repr_mimebundle_(self, **kwargs: object) -> dict[str, str]:
         """What a notebook shows: numbers and script, and a picture until the script has run."""
         panels = [
-            {
-                "title": title,
-                "square": title == self.square,
-                "lines": [_packed(one) for one in all_],
-            }
-            for title, all_ in self.panels.items()
+            {"title": name, "square": name == self.square, "lines": list(map(_packed, lines))}
+            for name, lines in self.panels.items()
         ]
         sliders = [{"name": k, "values": list(v)} for k, v in self.sliders.items()]
         data = {"sliders": sliders, "at": self.at, "panels": panels, "words": self.words}
@@ -201,12 +197,9 @@ def phase_explorer(world: Tabletop, action: Primitive, phase: float = 0.8) -> Ex
     along = np.linspace(0, 1, 101)
     effect = np.array([np.interp(along, full.phase, full.effect[:, c]) for c in (0, 1, 3)]).T
     during = start + [effect[round(100 * stop)] for stop in stops]
-    hand = (
-        np.array([np.interp(along, full.phase, full.action[:, c]) for c in (0, 1)])
-        + start[:2, None]
-    )
     until = np.minimum(along, stops[:, None])
-    gripper = [100 * np.interp(until, along, column) for column in hand]
+    hand = [np.interp(until, full.phase, full.action[:, c]) for c in (0, 1)]
+    gripper = [100 * (at + way) for at, way in zip(start[:2], hand, strict=True)]
 
     def outline(poses):
         corners = np.array(

@@ -23,9 +23,18 @@ from affordlib.geometry import unit_vector, wrap_angle
 from affordlib.models import load_checkpoint
 from affordlib.planning import Planner, Skills, plan_astar, plan_continuous, plan_gradient
 from affordlib.planning.gradient import Reading
-from affordlib.show.executors import Executor, Stopped, closed_loop, measured, open_loop
-from affordlib.show.picker_controls import LIMIT_M, PickerControls, outcome_in_words, plan_in_words
-from affordlib.show.plots import plot_footprint, plot_plan, plot_table
+from affordlib.show.picker_controls import (
+    LIMIT_M,
+    Executor,
+    PickerControls,
+    Stopped,
+    closed_loop,
+    measured,
+    open_loop,
+    outcome_in_words,
+    plan_in_words,
+)
+from affordlib.show.plots import NEUTRAL, plot_footprint, plot_plan, plot_table
 from affordlib.show.scene import Scene
 from affordlib.show.table_data import (
     TableView,
@@ -50,9 +59,10 @@ class GoalPicker(widgets.HBox):
     skills: what the robot can do. planners: name → function of a `PlanningProblem` that returns a
     plan. While a hand drags the goal, the browser plans over the effect map; when it lets go, the
     chosen planner does. seed: of the disturbances. view: whether the robot is shown in 3-D, too.
+    searched: an empty list, in which a planner may leave lines (n, 2) [m] of its search.
 
     `executors`: name → function (world, plan, planner, report) → Outcome that executes a plan, or
-    replans with the planner that made it; see `executors.Report`. `goal`, `plan` and `outcome` are
+    replans with the planner that made it; see `Report`. `goal`, `plan` and `outcome` are
     those shown. Methods do what mouse and buttons do, and return when done; mouse and buttons queue
     it in the background, and *Run* then shows each pose for `pace_s`.
     """
@@ -67,8 +77,10 @@ class GoalPicker(widgets.HBox):
         goal_xy_m: tuple[float, float] = (0.12, 0.10),
         seed: int = 0,
         view: bool = True,
+        searched: list[np.ndarray] | None = None,
     ) -> None:
         self.world, self.skills, self.planners = world, skills, planners
+        self._searched = [] if searched is None else searched
         self.executors: dict[str, Executor] = {
             "open loop": open_loop,
             "closed loop": closed_loop(skills),
@@ -100,8 +112,7 @@ class GoalPicker(widgets.HBox):
         below = [self._view, self.controls.progress, self.controls.words]
         table = widgets.VBox(below, layout={"flex": "1 1 320px", "max_width": "640px"})
         layout = {"flex_flow": "row wrap", "grid_gap": "12px"}
-        beside = [self.scene] if view else []
-        super().__init__([table, self.controls, *beside], layout=layout)
+        super().__init__([table, self.controls, *[self.scene] * view], layout=layout)
         self.add_class("affordlib-picker")
         for _ in range(2):  # what is slow only once is then not part of the time shown
             self._attempt(self._make_plan)
@@ -170,6 +181,8 @@ class GoalPicker(widgets.HBox):
         )
         low, high = points.min(axis=0), points.max(axis=0)
         ax = plot_table(figure.subplots(), (low + high) / 2, 0.12 + float((high - low).max()) / 2)
+        for x, y in (100 * np.transpose(line) for line in self._searched):
+            ax.plot(x, y, color=NEUTRAL, lw=0.6, marker="." * (len(x) == 1), ms=2)
         plot_footprint(ax, self.world.obj, self._pose[:2], self._pose[2])
         return plot_plan(ax, plan, obj=self.world.obj, yaw_rad=self._plan_pose[2]).figure
 
@@ -263,6 +276,7 @@ class GoalPicker(widgets.HBox):
             self.controls.say(f"{self._news} Planning with {self.controls.planner.value} …")
             self._show(planning=True)
             goal, number, plan = self.goal, self._view.wanted[2], None
+            self._searched.clear()
             self._put_down()
             try:
                 seen = self.world.depth_image(), self._pose[:2]
@@ -444,9 +458,8 @@ class GoalPicker(widgets.HBox):
 
     def _move_goal(self) -> None:
         by = self._displacement(self.goal.xy_m, 0.04, 0.08)
-        before = self.goal.xy_m
-        self._set_goal(replace(self.goal, xy_m=_whole_mm(before + by)))
-        self._marks.append([before, self.goal.xy_m])
+        self._marks.append([self.goal.xy_m, _whole_mm(self.goal.xy_m + by)])
+        self._set_goal(replace(self.goal, xy_m=self._marks[-1][1]))
         self._news += f" The goal was moved by {1000 * np.hypot(*by):.0f} mm."
 
     def _set_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
@@ -466,6 +479,8 @@ class GoalPicker(widgets.HBox):
         goal = {"xy": self.goal.xy_m, "tolerance": self.goal.tolerance_m, "yaw": None}
         if self.goal.turn_rad is not None:
             goal["yaw"] = self._turn_from + self.goal.turn_rad
+        shown = () if planning else self._searched
+        self._view.searched = [np.round(line, 4).tolist() for line in shown]
         self._view.scene = {
             "pose": self._pose,
             "goal": goal,

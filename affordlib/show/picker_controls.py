@@ -1,4 +1,4 @@
-"""Controls of the goal picker: menus, sliders, buttons, and what it says."""
+"""What the goal picker offers: its menus, sliders, buttons, words, and executors of plans."""
 
 import html
 import math
@@ -8,8 +8,11 @@ from dataclasses import replace
 from typing import Any
 
 import ipywidgets as widgets
+import numpy as np
 
+from affordlib.planning import ClosedLoopConfig, Planner, Skills, execute_plan, run_closed_loop
 from affordlib.types import Goal, Outcome, Plan, Step
+from affordlib.world import Tabletop
 
 LIMIT_M = 0.35
 """Largest goal coordinate that can be picked [m]."""
@@ -144,3 +147,52 @@ def outcome_in_words(outcome: Outcome, goal: Goal, how: str, done: int) -> tuple
 def step_in_words(step: Step) -> str:
     """Name the primitive and its stop phase in percent."""
     return f"{step.primitive.name.replace('_', ' ')} to {100 * step.stop_phase:.0f} %"
+
+
+Report = Callable[..., Goal]
+"""`report()` after an action applies pending disturbances, and raises `Stopped` when execution must
+end; `report(plan)` when a new plan replaces the current one. Both return the current goal."""
+
+Executor = Callable[[Tabletop, Plan, Planner, Report], Outcome]
+"""Function that executes a plan; the caller measures the object's rotation and height."""
+
+
+class Stopped(Exception):
+    """The user has pressed Stop."""
+
+
+def open_loop(world: Tabletop, plan: Plan, planner: Planner, report: Report) -> Outcome:
+    """Execute a plan as it is, action by action, and measure where the object comes to rest."""
+    paths: tuple[np.ndarray, ...] = ()
+    for step in plan.steps:
+        paths += execute_plan(world, replace(plan, steps=(step,))).object_paths_xy_m
+        report()
+    return measured(world, plan, paths)
+
+
+def measured(
+    world: Tabletop, plan: Plan, paths_xy_m: tuple[np.ndarray, ...] = (), words: str = ""
+) -> Outcome:
+    """The outcome of a plan, measured from the object's true pose."""
+    pose = world.object_pose()
+    return Outcome(plan, plan.goal.distance_m(pose[:2]), pose, paths_xy_m, words=words)
+
+
+def closed_loop(skills: Skills, tolerance_m: float = 0.002) -> Executor:
+    """Make an executor that observes after every action and replans to this tolerance [m]."""
+
+    def execute(world, plan, planner, report):
+        goal = plan.goal
+
+        def on_action(*_):
+            nonlocal goal
+            goal = report()
+
+        config = ClosedLoopConfig(on_action=on_action, on_plan=report)
+        done = run_closed_loop(
+            world, lambda: replace(goal, tolerance_m=tolerance_m), skills, planner, config
+        )
+        words = "" if done.reached else f"The loop ended as {done.status}: {done.message}."
+        return measured(world, plan, done.object_paths_xy_m, words).with_goal(goal)
+
+    return execute

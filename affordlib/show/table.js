@@ -19,6 +19,7 @@ const FAR = 0.01; // gaps above this are not distinguished [m]
 const ENLARGED = 20; // radius of the drawn disc, in σ
 const EXTENT = 0.4; // half width of the largest view [m]
 const LIMIT = 0.35; // largest coordinate of a goal [m]
+const GROWS = 1500; // time in which a search is drawn [ms]
 
 const between = (low, value, high) => Math.max(low, Math.min(high, value));
 const share = (a, b, t) => a + (b - a) * t;
@@ -635,6 +636,25 @@ export class Table {
     this.draw();
   }
 
+  // Show a planner's search, lines and single points, in the order in which it went.
+  search(searched) {
+    const began = performance.now();
+    const step = (now) => {
+      this.grown = still() ? 1 : between(0, (now - began) / GROWS, 1);
+      this.set({ searched });
+      if (this.grown < 1) this.growing = requestAnimationFrame(step);
+    };
+    cancelAnimationFrame(this.growing);
+    step(began);
+  }
+
+  tried() {
+    let left = Math.ceil(this.grown * this.state.searched.flat().length);
+    const seen = this.state.searched.map((line) => line.slice(0, Math.max(0, (left -= line.length) + line.length)));
+    const d = seen.filter((line) => line.length).map((line) => `M${this.points(line).replaceAll(" ", "L")}${line[1] ? "" : "h0"}`);
+    return shape("path", "tried", { d: d.join("") });
+  }
+
   get seconds() {
     const { steps, object } = this.state;
     const each = steps.map(({ stop }) => Math.max(0, stop - Math.min(0.9 * object.map.from, stop)) * object.seconds);
@@ -677,6 +697,7 @@ export class Table {
       const all = steps.flatMap(({ path }) => path.map((at) => `M${this.points(placed(object.outline, at))}Z`));
       shapes.push(shape("path", "swept", { d: all.join("") }));
     }
+    if (state.searched?.length && !state.live) shapes.push(this.tried());
     for (const step of other ?? []) shapes.push(this.line(step.path, "other"), this.outline(step.end, "other"));
     for (const mark of marks) shapes.push(this.line(mark, "mark"));
     steps.forEach((step, k) => {
@@ -911,6 +932,7 @@ export class Table {
   destroy() {
     this.watch.disconnect();
     cancelAnimationFrame(this.gliding);
+    cancelAnimationFrame(this.growing);
   }
 }
 
@@ -936,7 +958,7 @@ function render({ model, el }) {
       number = Math.max(number, model.get("wanted")[2]) + 1;
       view.svg.dataset.asked = number;
       Object.assign(view.svg.dataset, { draft: true });
-      view.set({ goal: { ...view.state.goal, xy }, steps: draft(xy) });
+      view.set({ goal: { ...view.state.goal, xy }, steps: draft(xy), searched: [] });
       if (!final) return;
       model.set("wanted", [...xy, number]);
       model.save_changes(); // ipywidgets sends the next one when this one has been processed
@@ -1005,10 +1027,13 @@ function render({ model, el }) {
     });
   const naming = new ResizeObserver(() => setTimeout(nameSliders, 500)); // after the page is complete
   naming.observe(el);
-  const listeners = { "change:object": look, "change:scene": show, "change:obstacles": show, "msg:custom": heard };
+  const searched = () => view.search(model.get("searched"));
+  const listeners = { "change:object": look, "change:scene": show, "change:obstacles": show,
+    "change:searched": searched, "msg:custom": heard };
   for (const [name, act] of Object.entries(listeners)) model.on(name, act);
   look();
   show();
+  searched();
   return () => {
     cancelAnimationFrame(timer);
     naming.disconnect();

@@ -31,9 +31,9 @@ class TableView(anywidget.AnyWidget):
 
     table: what `table_data` returns; object: `object_data`'s; scene: pose, goal, steps, trail and
     marks, and "answered", the number of the last request that it includes. obstacles: those on the
-    table, as `obstacle_data` writes them. wanted: x, y [m] and the growing number of a request for
-    a goal. It sends {"press": "run"} and "stop", and plays {"motions": [x, y, yaw, lift, the hand's
-    x, y, z, yaw, gap]} as they come.
+    table, as `obstacle_data` writes them. searched: lines [[x, y], …] [m] of the planner's search.
+    wanted: x, y [m] and the growing number of a request for a goal. It sends {"press": "run"} and
+    "stop", and plays {"motions": [x, y, yaw, lift, the hand's x, y, z, yaw, gap]} as they come.
     """
 
     _esm = _HERE / "table.js"
@@ -42,6 +42,7 @@ class TableView(anywidget.AnyWidget):
     object = traitlets.Dict().tag(sync=True)
     scene = traitlets.Dict().tag(sync=True)
     obstacles = traitlets.List().tag(sync=True)
+    searched = traitlets.List().tag(sync=True)
     wanted = traitlets.List([0.0, 0.0, 0]).tag(sync=True)
 
 

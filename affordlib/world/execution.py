@@ -108,13 +108,12 @@ class JointController:
         velocities = (np.diff(targets, axis=0) / STEP_S).tolist()
         # Velocity is fed forward, so the target must be this step's; the next one's would lead.
         commands = targets[:-1].tolist()
-        n_steps = whole if segment is None or segment.n_steps is None else segment.n_steps
         guarded = segment is not None and segment.guarded
         drive = {"forces": self.forces, "positionGains": self.gains}
         # Looked up once, because a client looks up its functions at every access.
         set_motors, simulate = partial(self._motors(), **drive), client.stepSimulation
         now, frozen_at = (targets[0].tolist(), [0.0] * 8), None
-        for step in range(n_steps):
+        for step in range(whole):
             if recording is not None and step % RECORD_EVERY == 0:
                 at_waypoint = step % STEPS_PER_WAYPOINT == 0
                 wanted = None if frozen_at else poses_W[step // STEPS_PER_WAYPOINT]
@@ -128,8 +127,6 @@ class JointController:
             simulate()
             self.after_step()
         self.angles_rad, self.gap_m = np.array(now[0][:6]), 2 * now[0][6]
-        if n_steps < whole:  # hold the last commanded position
-            set_motors(targetPositions=[*self.angles_rad, self.gap_m / 2, self.gap_m / 2])
         return 1.0 if frozen_at is None else frozen_at / whole
 
     def _motors(self) -> Callable[..., None]:

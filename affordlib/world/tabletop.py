@@ -38,13 +38,7 @@ from affordlib.types import (
 from affordlib.world import robot
 from affordlib.world.camera import CAMERAS, HIDDEN_M, View, add_scenery, depth_crop
 from affordlib.world.execution import JointController, execute, put_down, unreached
-from affordlib.world.objects import (
-    PlacedObject,
-    TabletopObject,
-    WorldConfig,
-    mesh,
-    set_friction,
-)
+from affordlib.world.objects import PlacedObject, TabletopObject, WorldConfig, mesh, set_friction
 from affordlib.world.obstacles import PlacedObstacles
 from affordlib.world.trajectory import STEP_S, Command, plan_motion, segments_until
 
@@ -296,7 +290,6 @@ class Tabletop(AbstractContextManager):
         stop_phase: float = 1.0,
         *,
         approach: bool = False,
-        smooth: bool = True,
         record_unreachable: bool = False,
         seen: Observation | None = None,
     ) -> Interaction:
@@ -304,13 +297,13 @@ class Tabletop(AbstractContextManager):
 
         approach: the arm moves there and back home through the air, and rollable objects are braked
         before and after; otherwise it is placed at the start of the path, and finally at home.
-        smooth: a partial action, a prefix of the path, is re-timed to a smooth stop, or ends
-        abruptly. If the arm cannot reach, raises UnreachableError, or with record_unreachable
-        returns an interaction in which nothing moved. seen: as in `execute`.
+        A partial action, a prefix of the path, is re-timed to a smooth stop. If the arm cannot
+        reach, raises UnreachableError, or with record_unreachable returns an interaction in which
+        nothing moved. seen: as in `execute`.
         """
         stop_phase = check_within("stop_phase", stop_phase, 0.0, 1.0)
         seen = seen or self.observe(primitive if isinstance(primitive, LeverUp) else None)
-        command = Command.of(adapt_to_object(primitive, seen.image), stop_phase, smooth)
+        command = Command.of(adapt_to_object(primitive, seen.image), stop_phase)
         try:
             return execute(self.arm, self.placed, command, seen, self.config.tip_offset_m, approach)
         except UnreachableError:

@@ -10,15 +10,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from affordlib.primitives import (
-    DURATION_S,
-    HOVER_M,
-    TIP_HEIGHT_M,
-    YAW,
-    Primitive,
-    Z,
-    min_jerk,
-)
+from affordlib.primitives import DURATION_S, HOVER_M, TIP_HEIGHT_M, YAW, Primitive, Z, min_jerk
 from affordlib.world import robot
 
 STEP_S = 1 / 240
@@ -38,7 +30,6 @@ class TrajectorySegment:
     poses: np.ndarray  # (n, 6) as in `Segment`
     phase: np.ndarray  # (n,)
     guarded: bool = False
-    n_steps: int | None = None  # of the simulation before the arm is stopped abruptly; None: all
 
 
 @dataclass(frozen=True)
@@ -51,11 +42,10 @@ class Command:
     segments: list[TrajectorySegment]  # the trajectory
 
     @classmethod
-    def of(cls, primitive: Primitive, stop_phase: float, smooth: bool = True) -> Self:
+    def of(cls, primitive: Primitive, stop_phase: float) -> Self:
         """Return the command for a primitive up to a phase."""
         phase = np.linspace(0.0, 1.0, N_SAMPLES) * stop_phase
-        segments = segments_until(primitive, stop_phase, smooth)
-        return cls(primitive, phase, primitive.path(phase), segments)
+        return cls(primitive, phase, primitive.path(phase), segments_until(primitive, stop_phase))
 
     @classmethod
     def along(cls, path_xy_m: np.ndarray, primitive: Primitive, stop_phase: float) -> Self:
@@ -81,28 +71,23 @@ class Command:
         return cls(primitive, phase, action, [TrajectorySegment(poses, at_phase)])
 
 
-def segments_until(
-    primitive: Primitive, stop_phase: float, smooth: bool = True
-) -> list[TrajectorySegment]:
-    """Return a primitive's trajectory up to a phase, with a minimum-jerk or an abrupt stop."""
+def segments_until(primitive: Primitive, stop_phase: float) -> list[TrajectorySegment]:
+    """Return a primitive's trajectory up to a phase, re-timed to a minimum-jerk stop."""
     segments = []
     phases = primitive.segment_phases
     for segment, begin, end in zip(primitive.segments, phases[:-1], phases[1:], strict=True):
         if segments and begin >= stop_phase - 1e-9:
             break
         local = min(1.0, (stop_phase - begin) / (end - begin))
-        covered = float(min_jerk(local)) if smooth else 1.0
+        covered = float(min_jerk(local))
         n = max(2, math.ceil(segment.seconds * covered / _WAYPOINT_S - 1e-9))
         share = covered * min_jerk(np.linspace(0, 1, n + 1))
         at_phase = np.linspace(0, 1, n + 1)
         if covered < 1.0:
             fine = np.linspace(0, local, 301)
             at_phase = np.interp(share, min_jerk(fine), fine)
-        steps = None
-        if not smooth and local < 1.0:
-            steps = RECORD_EVERY * round(local * segment.seconds / STEP_S / RECORD_EVERY)
         phase = begin + at_phase * (end - begin)
-        segments.append(TrajectorySegment(segment.at(share), phase, segment.guarded, steps))
+        segments.append(TrajectorySegment(segment.at(share), phase, segment.guarded))
     return segments
 
 
@@ -111,9 +96,9 @@ def recorded_phases(segments: list[TrajectorySegment]) -> tuple[np.ndarray, np.n
     per = STEPS_PER_WAYPOINT // RECORD_EVERY
     at_sample, at_waypoint = [], []
     for segment in segments:
-        waypoints, steps = np.arange(len(segment.phase)), segment.n_steps
-        records = waypoints[-1] * per if steps is None else steps // RECORD_EVERY
-        *samples, end = np.interp(np.arange(records + 1) / per, waypoints, segment.phase)
+        waypoints = np.arange(len(segment.phase))
+        at = np.arange(waypoints[-1] * per + 1) / per
+        *samples, end = np.interp(at, waypoints, segment.phase)
         at_sample += samples
         at_waypoint += samples[::per]
     return np.array([*at_sample, end]), np.array([*at_waypoint, end])
@@ -162,10 +147,7 @@ def plan_motion(
         near = paths[-1][-1]
 
     # Retreat: back along the path, then up; only up if the fingers cage the object.
-    n_steps, at = segments[-1].n_steps, np.arange(len(paths[-1]))
-    stop = at[-1] if n_steps is None else n_steps / STEPS_PER_WAYPOINT
-    end = np.array([np.interp(stop, at, column) for column in poses_W[-1].T])
-    near = np.array([np.interp(stop, at, column) for column in paths[-1].T])
+    end = poses_W[-1][-1]
     caged = primitive.path(0.0)[0, Z] > TIP_HEIGHT_M
     retreat, back = near[None], np.zeros(6)
     if not (caged or primitive.holds):

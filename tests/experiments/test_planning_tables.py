@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from affordlib.planning import MODES
+from affordlib.primitives import Drag, Push
 from affordlib.results import repo_root
 from affordlib.world import ROLLABLE, STANDING
 from experiments import obstacles, planning, shipped, tasks
@@ -93,6 +94,13 @@ def test_the_cross_entropy_method_keeps_to_its_actions_and_reaches_goals(world):
         assert MODES[task.mode].partial or all(s.stop_phase == 1 for s in plan.steps)
         ends.append(plan.predicted_distance_m)
     assert np.median(ends) < 0.001
+
+
+@pytest.mark.parametrize(("name", "kind"), [("cnp_500", Push), ("drag_film_500", Drag)])
+def test_a_network_decodes_the_kind_of_action_that_it_was_trained_on(world, name, kind):
+    for task in frozen_tasks()[:4]:
+        world.place(task.obj, (0.0, 0.0), task.yaw_rad)
+        assert planning.decoded_kind(planning.network(name), world.depth_image()) is kind
 
 
 def test_another_version_of_a_planner_makes_its_results_stale(monkeypatch):

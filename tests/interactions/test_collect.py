@@ -253,3 +253,9 @@ def test_how_far_apart_two_sets_are_is_said(undisturbed):
     one = old.copy(deep=True)
     one["rest_effect"][0, 0] += 0.05  # one object that tipped over in the other direction
     assert shipped.compare(old, one)[0]
+
+
+def test_a_worker_watches_its_parent_before_it_imports_what_is_large():
+    code = "import sys, affordlib.workers; print({'torch', 'xarray', 'pybullet'} & {*sys.modules})"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "set()\n"

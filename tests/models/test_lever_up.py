@@ -8,12 +8,7 @@ import torch
 from affordlib.interactions import Scaler
 from affordlib.interactions.dataset import condition_on_poses
 from affordlib.models import build
-from affordlib.models.lever_up import (
-    N_OBSERVED,
-    PROTOCOLS,
-    from_start_errors_m,
-    predict_steps,
-)
+from affordlib.models.lever_up import N_OBSERVED, PROTOCOLS, from_start_errors_m, predict_steps
 from experiments.lever_training import LEVER_MODELS, fit_lever_model
 
 

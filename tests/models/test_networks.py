@@ -26,7 +26,7 @@ from affordlib.models.base import condition_on_final_effect, gaussian_nll, push_
 from affordlib.models.evaluation import AFTER_CONTACT, effects_at
 from affordlib.primitives import Drag, Push
 from affordlib.types import Observations
-from experiments.last_pose import LastPoseConfig
+from experiments.last_pose import CNPAroundMeanConfig, LastPoseConfig
 from experiments.lstm import LSTMConfig
 
 YAW = {"action_channels": ("x", "y", "yaw"), "effect_channels": ("x", "y", "yaw")}
@@ -37,6 +37,7 @@ CONFIGS = {
     "film, table": FiLMConfig(**YAW, **SMALL, frame="table"),
     "film, push": FiLMConfig(**YAW, **SMALL),
     "last pose, table": LastPoseConfig(**YAW, **SMALL),
+    "around mean, table": CNPAroundMeanConfig(**YAW),
     "lstm, push": LSTMConfig(**YAW, frame="push", width=16),
 }
 IN_PUSH_FRAME = [name for name in CONFIGS if name.endswith("push")]
@@ -142,10 +143,7 @@ def test_a_quarter_turn_of_the_table_turns_the_prediction(name, quarters, some):
     directed = o.action_mask.any(1) | (seen_e & (o.weight < 1)[:, None]).any(1)
     directed &= push_direction(o, *YAW.values())[:, 1] != 0
     assert directed.sum() > 20
-    for mine, theirs in (
-        (rotated_e, t_mean_e),
-        (rotated_a[..., :2], t_mean_a[..., :2]),
-    ):
+    for mine, theirs in ((rotated_e, t_mean_e), (rotated_a[..., :2], t_mean_a[..., :2])):
         torch.testing.assert_close(mine[directed], theirs[directed], rtol=0, atol=2e-5)
     by = (rotated_a[..., 2] - t_mean_a[..., 2])[directed]
     assert torch.remainder(by + math.pi, 2 * math.pi).sub(math.pi).abs().max() < 1e-4

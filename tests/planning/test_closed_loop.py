@@ -288,7 +288,6 @@ def test_a_turn_that_nobody_sees_is_reckoned_by_the_hand_and_said_to_be(sees_yaw
     assert robot.yaw_rad == pytest.approx(0.2 + 1.7, abs=math.radians(2))
     assert went.end_pose[2] == pytest.approx(robot.yaw_rad - 0.2, abs=math.radians(0.2))
     assert went.reckoned == (() if sees_yaw else ("orientation",))
-    assert went.turn_std_rad == (0.001 if sees_yaw else None)
     lifted = loop(robot, Goal(robot.xy_m, height_m=0.1))
     assert lifted.status == "unconfirmed"
     assert lifted.reckoned == ("position", "orientation")

@@ -30,11 +30,7 @@ from affordlib.types import Goal, Prediction
 from affordlib.world import ROLLABLE, STANDING, Cuboid, UprightCylinder
 from experiments.planning import attempt, phases_of_way
 from experiments.shipped import uniform_tasks
-from experiments.tasks import (
-    constructed_tasks,
-    drawn_object,
-    frozen_tasks,
-)
+from experiments.tasks import constructed_tasks, drawn_object, frozen_tasks
 from tests.planning.point_robot import REACH_M, STARTS, KnownDynamics, moved_m
 from tests.problems import problem_of
 

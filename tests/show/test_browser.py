@@ -415,6 +415,19 @@ def test_the_browser_plans_while_the_hand_drags(page, table):
     assert_same_goal(page, table, 0.07, 0.09)
 
 
+def test_what_a_planner_has_tried_is_drawn(page, table):
+    planner, tried = "picker.planners['continuous']", [[[0, 0], [0.1, 0.05]], [[0.05, -0.05]]]
+    seen = f"lambda problem, plan={planner}: picker._searched.extend({tried}) or plan(problem)"
+    ask(page, f"picker.planners.update(continuous={seen})")
+    page.mouse.click(*table.at(0.1, 0.1))
+    table.wait_for_answer()
+    wait_until(lambda: (page.locator(".tried").get_attribute("d") or "").endswith("h0"))
+    drawn = re.findall(r"[\d.-]+", page.locator(".tried").get_attribute("d").removesuffix("h0"))
+    corner = [table.svg.bounding_box()[name] for name in "xy"]
+    wanted = [np.subtract(table.at(*xy), corner) for line in tried for xy in line]
+    np.testing.assert_allclose(np.reshape([*map(float, drawn)], (-1, 2)), wanted, atol=2)
+
+
 def test_a_slider_of_an_explorer_changes_its_figure_without_the_kernel(page):
     explorer = page.locator(".affordlib-explorer")
     explorer.scroll_into_view_if_needed()

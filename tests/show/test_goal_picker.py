@@ -12,7 +12,7 @@ from PIL import Image
 
 from affordlib.planning import Skills, execute_plan, plan_astar, plan_continuous
 from affordlib.show import GoalPicker
-from affordlib.show.executors import open_loop
+from affordlib.show.picker_controls import open_loop
 from affordlib.show.table_data import TableView
 from affordlib.types import Obstacle
 from affordlib.world import Cuboid
