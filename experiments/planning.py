@@ -24,7 +24,7 @@ import torch
 from tqdm.auto import tqdm
 
 from affordlib.interactions import split_interactions
-from affordlib.models import CNPConfig, EffectNetwork
+from affordlib.models import EffectNetwork
 from affordlib.models.checkpoint import load_checkpoint
 from affordlib.models.training import train_model
 from affordlib.perception import adapt_to_object
@@ -98,19 +98,13 @@ VERSIONS: dict[Planner, int] = {plan_astar: 2, plan_astar_fine: 2}
 """Versions of planners (default 1); raise one when a change of code changes its numbers."""
 
 
-PAPER = CHECKPOINT_SPECS["cnp_500"]
-SEEDS = (1, 2)
+_PAPER = CHECKPOINT_SPECS["cnp_500"]
 TRAINED = {
-    **{
-        f"{name}_seed_{k}": replace(PAPER, data=data, training=replace(PAPER.training, seed=k))
-        for name, data in (("cnp_500", "push"), ("cnp_mixed", "mixed"))
-        for k in SEEDS
-    },
-    "cnp_mixed": replace(PAPER, data="mixed"),
-    "cnp_yaw": replace(PAPER, network=CNPConfig(effect_channels=("x", "y", "yaw"))),
+    "cnp_500_seed_1": replace(_PAPER, training=replace(_PAPER.training, seed=1)),
+    "cnp_mixed": replace(_PAPER, data="mixed"),
 }
-"""Networks that are trained for their rows, as `cnp_500` is: with other seeds, on pushes and drags
-together as in the paper, with yaw."""
+"""Networks that are trained for their rows, as `cnp_500` is: with another seed, and on pushes and
+drags together as in the paper."""
 
 
 @lru_cache
@@ -439,6 +433,7 @@ def distances(records: dict[str, Rows]) -> pd.DataFrame:
     table = pd.concat([pd.DataFrame(rows).assign(planner=name) for name, rows in records.items()])
     group = {category: name for name, classes in GROUPS.items() for category in classes}
     table["object_class"] = table["object_class"].map(group)
+    table["dragged"] = table.get("dragged", pd.Series(np.nan, table.index)).astype(float)
     keys = ["planner", "object_class", "goals", "mode"]
     return table.groupby(keys, sort=False).agg(
         n=("distance_m", "size"),
@@ -447,6 +442,7 @@ def distances(records: dict[str, Rows]) -> pd.DataFrame:
         median_m=("distance_m", "median"),
         search_mean_m=("predicted_m", "mean"),
         model_mean_m=("prediction_error_m", "mean"),
+        dragged=("dragged", "mean"),
     )
 
 
@@ -458,6 +454,7 @@ def summary_rows(table: pd.DataFrame, source: str = "constructed") -> Rows:
         about = CONFIGS[planner]
         row = {"planner": planner, "model": about.model, "world": about.world}
         row |= {"object_class": group, "n": ", ".join(map(str, some["n"]))}
+        row["dragged_percent"] = 100 * some["dragged"].mean()
         for (*_, mode), values in some.iterrows():
             row |= {f"{mode}_{name}": values[name] for name in ("mean_m", "sem_m", "median_m")}
         rows.append(row)
@@ -467,7 +464,7 @@ def summary_rows(table: pd.DataFrame, source: str = "constructed") -> Rows:
 def decomposition_rows(table: pd.DataFrame) -> Rows:
     """Return the parts of the open-loop error on constructed goals, by planner, mode and group."""
     table = table.xs("constructed", level="goals").rename(columns={"mean_m": "total_mean_m"})
-    rows = table.drop(columns=["sem_m", "median_m"]).reset_index()
+    rows = table.drop(columns=["sem_m", "median_m", "dragged"]).reset_index()
     rows["world"] = [CONFIGS[planner].world for planner in rows["planner"]]
     open_loop = [name for name, about in CONFIGS.items() if {*about.execution} <= {"by_plan"}]
     return plain(rows[rows["planner"].isin(open_loop)])

@@ -10,10 +10,10 @@ import tokenize
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-LINES = {"affordlib": 12_692, "experiments": 6865, "tests": 9080}
+LINES = {"affordlib": 12_670, "experiments": 6840, "tests": 9060}
 """Maximum number of lines: lower it with every cut. The aim is 9,650, 6,000 and 7,800."""
 
-FILES, CODE = 63, 8020
+FILES, CODE = 63, 7970
 """Maxima for affordlib: all files, and lines of Python without docstrings, comments and blanks.
 
 The aim is 60 files and 6,700 lines of code."""
