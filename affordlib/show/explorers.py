@@ -103,7 +103,8 @@ class Explorer:
         buffer = io.BytesIO()
         self.figure().savefig(buffer, dpi=90)
         picture = base64.b64encode(buffer.getvalue()).decode()
-        inside = f'<img alt="{self.words[self.state]}" src="data:image/png;base64,{picture}">'
+        said = self.words[self.state].replace("<b>", "").replace("</b>", "")
+        inside = f'<img alt="{said}" src="data:image/png;base64,{picture}">'
         script = f"<script>{_SCRIPT.read_text()}(document.currentScript.parentElement, {text})"
         html = f'<div class="affordlib-explorer">{inside}{script}</script></div>'
         return {"text/html": html, "text/plain": type(self).__name__}
