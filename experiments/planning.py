@@ -24,7 +24,7 @@ import torch
 from tqdm.auto import tqdm
 
 from affordlib.interactions import split_interactions
-from affordlib.models import EffectNetwork
+from affordlib.models import CNPConfig, EffectNetwork
 from affordlib.models.checkpoint import load_checkpoint
 from affordlib.models.training import train_model
 from affordlib.perception import adapt_to_object
@@ -100,22 +100,26 @@ VERSIONS: dict[Planner, int] = {plan_astar: 2, plan_astar_fine: 2}
 
 _PAPER = CHECKPOINT_SPECS["cnp_500"]
 TRAINED = {
-    "cnp_500_seed_1": replace(_PAPER, training=replace(_PAPER.training, seed=1)),
+    **{
+        f"cnp_500_seed_{seed}": replace(_PAPER, training=replace(_PAPER.training, seed=seed))
+        for seed in (1, 2)
+    },
     "cnp_mixed": replace(_PAPER, data="mixed"),
+    "cnp_yaw": replace(_PAPER, network=CNPConfig(effect_channels=("x", "y", "yaw"))),
 }
-"""Networks that are trained for their rows, as `cnp_500` is: with another seed, and on pushes and
-drags together as in the paper."""
+"""Networks that are trained for their rows, as `cnp_500` is: with other seeds; on pushes and drags
+together as in the paper; with yaw among the effects."""
 
 
 @lru_cache
 def network(name: str) -> EffectNetwork:
-    """Load a checkpoint, or train a network of `TRAINED`."""
+    """Load a checkpoint, or train a network of `TRAINED`, once for all its rows."""
     if name not in TRAINED:
         return load_checkpoint(name)[0]
     spec = TRAINED[name]
     data = open_once(spec.data)
-    split = split_interactions(data.sizes["interaction"])
-    return train_model(data, split, spec.training, spec.network)[0]
+    split, partly = split_interactions(data.sizes["interaction"]), f"{FOLDER}/.{name}.pt"
+    return train_model(data, split, spec.training, spec.network, resume_checkpoint=partly)[0]
 
 
 def decoded_kind(model: EffectNetwork, image: np.ndarray) -> type[Move]:

@@ -29,6 +29,9 @@ ABSOLUTE = re.compile(
     r"(?<![\w.~/:-])/(?:home|root|tmp|work|usr|var|opt|mnt|media|Users|private)/\w|\b[A-Z]:\\\w"
 )
 
+# A reader's own settings, with which no page may fail.
+READERS_DASK = {"REQUIRE_ENCRYPTION": "true", "DEFAULT_SCHEME": "tls"}
+
 each_notebook = pytest.mark.parametrize("name", list(PATHS))
 
 
@@ -239,6 +242,7 @@ def run_with_nbval(copy):
     command = [sys.executable, "-m", "pytest", "--nbval-lax", "--nbval-current-env"]
     command += ["--nbval-cell-timeout=600", "-p", "no:cacheprovider", "--rootdir", copy.parent]
     environment = {k: v for k, v in os.environ.items() if k not in ("PYTEST_ADDOPTS", "MPLBACKEND")}
+    environment |= {f"DASK_DISTRIBUTED__COMM__{k}": v for k, v in READERS_DASK.items()}
     return subprocess.run(
         [*map(str, command), str(copy)], env=environment, capture_output=True, text=True
     )

@@ -128,7 +128,8 @@ def train(
     optimiser = torch.optim.AdamW(
         model.parameters(), config.learning_rate, weight_decay=config.weight_decay, fused=True
     )
-    floor, average = float(model.sigma_floor), _copies(dict(model.named_parameters()))
+    floor = float(model.sigma_floor)
+    average = _copies(dict(model.named_parameters())) if config.ema else {}
     best, best_error, step, fruitless, seconds, history = {}, math.inf, 0, 0, 0.0, []
     about = asdict(replace(config, device="cpu")) | {  # all that decides the results
         "model": repr(model.config),
@@ -167,8 +168,8 @@ def train(
         loss.backward()
         torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
         optimiser.step()
-        decay = min(config.ema, step / (step + 10)) if config.ema else 0.0
-        for name, value in model.named_parameters():
+        decay = min(config.ema, step / (step + 10))
+        for name, value in model.named_parameters() if config.ema else ():
             average[name].lerp_(value.detach(), 1 - decay)
         bar.update()
         if step % config.validate_every and step != config.steps:
