@@ -112,6 +112,8 @@ $(RUN)/%.ipynb $(RUN)/%.json: $(1)/%.ipynb $(USED)
 	@$(if $(filter-out 1,$(WORKERS)),OMP_NUM_THREADS=1) exec $(PY) notebooks/run.py $$< $$(@D)/$$*.ipynb
 endef
 $(foreach folder,notebooks notebooks/appendix,$(eval $(call PAGES,$(folder))))
+# These two plan with the network that page 03 trains, if it is run as well.
+$(RUN)/06_planning.ipynb $(RUN)/07_closed_loop.ipynb: | $(filter %/03_affordance_cnp.ipynb,$(MAKECMDGOALS))
 endif
 
 nano: $(STAMP) ## Gather, learn, plan and push: the whole idea on one page, in a minute

@@ -47,7 +47,7 @@ def tables() -> dict[str, list[dict[str, Any]]]:
     errors = {"reported": 1000 * PUSH_M, "as_published": means["cnp"], "ours": means["film"]}
     found = [_row(question, pushes.n["film"], **errors)]
     lever = _table("lever_up", "summary").set_index("model")
-    means = 10 * lever.step_5_mean_cm[["reported", "cnp", "cnp_last_pose"]]
+    means = 10 * lever.step_5_mean_cm[["reported", "cnp_tuned", "cnp_last_pose"]]
     errors = dict(zip(("reported", "as_published", "ours"), means, strict=True))
     found.append(_row("predict a lever-up 0.75 s ahead", lever.n["cnp_last_pose"], **errors))
     summary = _table("planning", "summary").query("object_class in ('standing', 'reported')")

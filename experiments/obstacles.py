@@ -54,7 +54,7 @@ from affordlib.types import Goal, Obstacle, UnreachableError
 from affordlib.world import Cuboid, Tabletop, TabletopObject, WorldConfig, category_named
 from experiments import runner
 from experiments.commands import command
-from experiments.field_baselines import plan_cem
+from experiments.field_baselines import MechanicsMap, plan_cem
 from experiments.runner import FOLDER, Job, Rows, interval, plain
 
 NAME, SEED, VALIDATION_SEED = "obstacles", 40_001, 40_002
@@ -236,12 +236,14 @@ ROWS = {
     "no_sigma": (partial(plan_continuous, risk_weight=0.0), {}),
     "film_500": (plan_continuous, {"push": "film_500"}),
     "cnp_500": (plan_continuous, {"push": "cnp_500"}),
+    "mechanics": (plan_continuous, {"mechanics": True}),
     "closed_loop": (plan_continuous, {"observes": True}),
     "closed_loop_full": (plan_continuous, {"observes": True, "partial": False}),
     "closed_loop_perturbed": (plan_continuous, {"observes": True, "world": "perturbed"}),
 }
 """Planner of each row, and its settings: whether it may stop early, what is checked, the world, the
-network of pushes, and whether it observes after each action, with up to two actions more."""
+network of pushes or mechanics instead, and whether it observes after each action, with up to two
+actions more."""
 
 
 @lru_cache(maxsize=2)
@@ -278,6 +280,8 @@ def run_task(row: str, family: str, index: int, seed: int) -> dict[str, Any]:
         return {"status": result.status} | _outcome(task, world, len(result.steps))
     seen = world.observe()
     effects = skills.effects(seen.image)
+    if settings.get("mechanics") and effects.kind is Push:
+        effects = MechanicsMap(effects.model, seen.image)
     effects.spline  # noqa: B018 - computed before the time is taken, as by a loop that planned
     posed, more = PlanningProblem, {"obstacles": seen.obstacles}
     if "check" in settings:
@@ -522,9 +526,8 @@ def rows_of(records: pd.DataFrame) -> Rows:
 
 PAIRS = [(row, f"{row}_full") for row in ("continuous", "astar", "perturbed")]
 PAIRS += [("continuous", row) for row in ROWS if row.startswith("check")]
-PAIRS += [("continuous", row) for row in ("cem", "no_sigma", "film_500")] + [
-    ("film_500", "cnp_500")
-]
+PAIRS += [("continuous", row) for row in ("cem", "no_sigma", "film_500", "mechanics")]
+PAIRS += [("film_500", "cnp_500"), ("no_sigma", "mechanics")]
 PAIRS += [("closed_loop", "continuous"), ("closed_loop", "closed_loop_full")]
 PAIRS += [("closed_loop_perturbed", "perturbed")]
 
