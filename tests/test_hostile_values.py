@@ -90,6 +90,8 @@ CALLABLES |= {"Push.towards": Push.towards, "Push.path": Push(0.0).path}
 CALLABLES["from_dataset"] = interactions.InteractionTensors.from_dataset
 CALLABLES |= {f"Log.{n}": getattr(logs.Log("m", CORNERS), n) for n in ("add", "query")}
 CALLABLES["Log.centroid_pose"] = logs.Log("m", CORNERS).centroid_pose
+STILL_PLANNER = logs.PushPlanner(Still(), logs.PushedObject(np.array(CORNERS)))
+CALLABLES["PushPlanner.plan"] = STILL_PLANNER.plan
 OF_THE_WORLD = """
 place execute_primitive execute execute_path can_reach picture mark shove settle
 """
@@ -224,8 +226,7 @@ def shop(one_world, skills, pushes, tmp_path_factory):
         "Log.centroid_pose": {"pose": (0.0,) * 3},
         "fit": {"data": log, "model": "np"},
         "cross_validate": {"data": log, "models": (), "folds": 2},
-        "plan_push_at": {"model": Still(), "pose": (0.0,) * 3, "goal": Goal((0.01, 0.0))}
-        | {"obj": logs.PushedObject(np.array(CORNERS)), "n_pushes": 1},
+        "PushPlanner.plan": {"pose": (0.0,) * 3, "goal": Goal((0.01, 0.0)), "n_pushes": 1},
         "PushPlanner": {"model": Still(), "obj": logs.PushedObject(np.array(CORNERS))},
         "planar": {"values": ((0.0,) * 6 + (1.0,),)},
         "worst": {"errors": logs.cross_validate(log, (), 2), "model": "constant"},

@@ -6,4 +6,4 @@ It stands on the package's ground, beside all other parts.
 from affordlib.logs.cross_validate import cross_validate, summary, worst
 from affordlib.logs.fit import FittedModel, fit, load_model, save_model
 from affordlib.logs.log import Log, LoggedPushes, Pushes, planar
-from affordlib.logs.planning import PushedObject, PushPlanner, plan_push_at
+from affordlib.logs.planning import PushedObject, PushPlanner

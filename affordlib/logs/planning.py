@@ -30,6 +30,7 @@ from affordlib.types import (
     UnreachableError,
     check_array,
     check_count,
+    check_pair,
     check_range,
     check_within,
 )
@@ -167,15 +168,19 @@ class PushPlanner:
         n_pushes: int = 3,
         tool_xy_m: tuple[float, float] | None = None,
     ) -> Plan:
-        """Plan up to three pushes as `plan_push_at`; the tool must find a way to the first one.
+        """Plan up to three pushes from a pose (x, y, yaw) to a goal, with its turn if it has one.
 
-        tool_xy_m: where the tool's centre is; None does not look for a way. Raises UnreachableError
-        if there is none to any push.
+        pose: of the object's centroid (`Log.centroid_pose`); goal: a position of the centroid in
+        the same frame, and a turn relative to the present yaw; tool_xy_m: where the tool's centre
+        is; None does not look for a way. Raises UnreachableError if there is none to any push.
         """
         began = time.perf_counter()
         x, y, yaw = check_array("pose", pose, 3).tolist()
         check_within("yaw of pose", yaw, -2 * math.pi, 2 * math.pi, "rad")
         check_count("n_pushes", n_pushes, 1, 3)
+        if tool_xy_m is not None:
+            away_m = math.dist(check_pair("tool_xy_m", tool_xy_m), (x, y))
+            check_within("the distance of tool_xy_m from pose", away_m, 0.0, 100.0, "m")
         weights = np.array([1.0, 1.0, self._turn_m if goal.turn_rad is not None else 1e-6])
         target = np.array([*rotated(np.subtract(goal.xy_m, (x, y)), -yaw), goal.turn_rad or 0.0])
         shut = self.shut(pose, tool_xy_m)
@@ -327,24 +332,6 @@ class PushPlanner:
         total = from_start[:, None] + length[:, 9:]
         via = total.argmin(axis=0)
         return turns, before, via, total.min(axis=0)
-
-
-def plan_push_at(
-    model: PushModel,
-    obj: PushedObject,
-    pose: tuple[float, float, float],
-    goal: Goal,
-    n_pushes: int = 3,
-    seed: int = 0,
-    turn_m: float | None = None,
-) -> Plan:
-    """Plan off-centre pushes from a pose (x, y, yaw) to a goal, with its rotation if it has one.
-
-    pose: of the object's centroid, in metres and radians (`Log.centroid_pose`); goal: a position of
-    the centroid in the same frame, and a turn relative to the present yaw; turn_m: as in
-    `PushPlanner`, which plans often, and with the tool's way.
-    """
-    return PushPlanner(model, obj, seed, turn_m).plan(pose, goal, n_pushes)
 
 
 def primitive_of(pushes: Pushes, k: int, heading_rad: float) -> PushAt:

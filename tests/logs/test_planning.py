@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from affordlib.geometry import cross, rotated, wrap_angle
-from affordlib.logs import PushedObject, PushPlanner, plan_push_at
+from affordlib.logs import PushedObject, PushPlanner
 from affordlib.logs.fit import in_object_frame, push_rows, told_feet
 from affordlib.logs.log import _nearest
 from affordlib.logs.neural_process import load_neural_process
@@ -82,8 +82,9 @@ def test_round_objects_have_no_more_feet_than_a_model_takes():
 
 
 def test_a_plan_that_does_not_turn_misses_a_turn():
+    planner = PushPlanner(Still(), PushedObject(OUTLINE_M))
     reaches = [
-        plan_push_at(Still(), PushedObject(OUTLINE_M), (0.3, 0.3, 0.0), goal, 1).reaches_goal
+        planner.plan((0.3, 0.3, 0.0), goal, 1).reaches_goal
         for goal in (Goal((0.3, 0.3)), Goal((0.3, 0.3), turn_rad=1.5))
     ]
     assert reaches == [True, False]
