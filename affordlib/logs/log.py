@@ -16,7 +16,7 @@ from typing import Any, Self
 import numpy as np
 from scipy.optimize import brentq
 
-from affordlib.geometry import cross, rotated, rotated_each
+from affordlib.geometry import centroid, cross, rotated, rotated_each
 from affordlib.types import check_array, check_choice, check_within
 
 UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
@@ -383,31 +383,19 @@ def centred(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             f"outline must be three to {MOST_CORNERS} corners (k, 2), got {corners.shape}; of a "
             "contour in an image, take every tenth point"
         )
-    following = np.roll(corners, -1, axis=0)
-    if (meet := _crossings(corners, following - corners)).size:
+    following, each = np.roll(corners, -1, axis=0), np.arange(len(corners))
+    gaps = segment_gaps(corners, corners, following)
+    gaps[each, each] = gaps[each, (each + 1) % len(corners)] = np.inf  # an edge's own corners
+    if (meet := np.argwhere(gaps < 1e-9 * np.ptp(corners))).size:
         raise ValueError(
             f"outline crosses itself: its edges from corner {meet[0, 0]} and from corner "
             f"{meet[0, 1]} meet; give the corners in order around it, each once"
         )
-    doubled = cross(corners, following)
-    if abs(doubled.sum()) < 1e-9:
+    doubled_area = cross(corners, following).sum()
+    if abs(doubled_area) < 1e-9:
         raise ValueError("outline has no area; give its corners in order around it")
-    centroid = ((corners + following) * doubled[:, None]).sum(axis=0) / (3 * doubled.sum())
-    return centroid, (corners - centroid)[:: 1 if doubled.sum() > 0 else -1]
-
-
-def _crossings(corners: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Pairs (m, 2) of edges that meet though they are no neighbours."""
-    off, sizes = corners - corners[:, None], np.linalg.norm(edges, axis=1)[:, None]
-    side = cross(edges[:, None], off) / sizes  # distance of corner j from the line of edge i
-    side = np.where(np.abs(side) < 1e-9 * sizes.max(), 0.0, np.sign(side))
-    along = (edges[:, None] * off).sum(axis=-1) / sizes**2
-    ends = [np.stack([v, np.roll(v, -1, axis=1)]) for v in (side, along)]  # of edge j
-    apart = (ends[1].min(axis=0) > 1) | (ends[1].max(axis=0) < 0)
-    parts = (ends[0].prod(axis=0) <= 0) & ~(apart & (ends[0] == 0).all(axis=0))
-    meet = np.triu(parts & parts.T, 2)
-    meet[0, -1] = False  # these two are neighbours
-    return np.argwhere(meet)
+    centre = centroid(corners)
+    return centre, (corners - centre)[:: 1 if doubled_area > 0 else -1]
 
 
 def gyration_radius_m(outline_m: np.ndarray) -> float:
@@ -436,6 +424,21 @@ def _nearest(
         passed = (off[:, 1] >= 0) != (off[:, 1] >= edge[1])
         inside ^= passed & ((cross(edge, off) > 0) == (edge[1] > 0))
     return np.where(inside, -gap, gap), edges, on
+
+
+def segment_gaps(outline_m: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Distances (n, k) of an outline's corners from segments, from start to end (n, 2).
+
+    Where a segment crosses the edge from a corner to the next, the distance of this corner is 0.
+    """
+    edges, along = np.roll(outline_m, -1, axis=0) - outline_m, end - start
+    off = outline_m - start[:, None]
+    share = (off * along[:, None]).sum(axis=-1) / np.maximum((along**2).sum(axis=1), 1e-18)[:, None]
+    beside = off - np.clip(share, 0, 1)[..., None] * along[:, None]
+    side = cross(along[:, None], off)
+    crosses = side * np.roll(side, -1, axis=1) < 0
+    crosses &= cross(edges, -off) * cross(edges, end[:, None] - outline_m) < 0
+    return np.where(crosses, 0.0, np.linalg.norm(beside, axis=-1))
 
 
 def _contact(outline_m: np.ndarray, tool: np.ndarray, radius_m: float) -> dict[str, Any]:

@@ -19,9 +19,17 @@ import numpy as np
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
-from affordlib.geometry import cross, rotated, rotated_each, unit_vector
+from affordlib.geometry import rotated, rotated_each, unit_vector
 from affordlib.logs.fit import PushModel
-from affordlib.logs.log import FEET, LARGEST_M, Pushes, _nearest, centred, gyration_radius_m
+from affordlib.logs.log import (
+    FEET,
+    LARGEST_M,
+    Pushes,
+    _nearest,
+    centred,
+    gyration_radius_m,
+    segment_gaps,
+)
 from affordlib.primitives import PushAt
 from affordlib.types import (
     Goal,
@@ -325,7 +333,8 @@ class PushPlanner:
         off = ends - turns[:, None]
         length = np.linalg.norm(off, axis=-1) + TURN_PRICE_M
         pairs = np.broadcast_to(turns[:, None], off.shape).reshape(-1, 2), np.tile(ends, (9, 1))
-        gap, nearest = _gaps(outline_m, *pairs).reshape(length.shape), _nearest(outline_m, ends)[0]
+        gap = segment_gaps(outline_m, *pairs).min(axis=1).reshape(length.shape)
+        nearest = _nearest(outline_m, ends)[0]
         gap = np.minimum(gap, np.minimum(nearest, nearest[:9, None]))
         length[gap < radius_m + CLEAR_M / 2] = np.inf
         from_start, before = dijkstra(length[:, :9], indices=0, return_predecessors=True)
@@ -346,15 +355,3 @@ def _after(pose: np.ndarray, effect: np.ndarray) -> np.ndarray:
     return np.column_stack(
         [pose[:, :2] + rotated_each(effect[:, :2], pose[:, 2]), pose[:, 2] + effect[:, 2]]
     )
-
-
-def _gaps(outline_m: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Distances (n,) of an outline's corners from segments; 0 where a segment crosses an edge."""
-    edges, along = np.roll(outline_m, -1, axis=0) - outline_m, end - start
-    off = outline_m - start[:, None]
-    share = (off * along[:, None]).sum(axis=-1) / np.maximum((along**2).sum(axis=1), 1e-18)[:, None]
-    beside = off - np.clip(share, 0, 1)[..., None] * along[:, None]
-    side = cross(along[:, None], off)
-    parts = side * np.roll(side, -1, axis=1) < 0
-    parts &= cross(edges, -off) * cross(edges, end[:, None] - outline_m) < 0
-    return np.where(parts.any(axis=1), 0.0, np.linalg.norm(beside, axis=-1).min(axis=1))
