@@ -25,6 +25,13 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteKernel
+from sklearn.linear_model import RidgeCV
+from sklearn.neighbors import KNeighborsRegressor
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import PolynomialFeatures, StandardScaler
 from torch import Tensor
 
 from affordlib.geometry import quarter_turn
@@ -161,8 +168,6 @@ def _constant(data: LoggedPushes, pushes: Pushes, state: State) -> Forecast:
 
 
 def _nearest(data: LoggedPushes, pushes: Pushes, state: State) -> Forecast:
-    from sklearn.neighbors import KNeighborsRegressor
-
     known, outcome = _features(data, data), _outcome(data)
     nearest = KNeighborsRegressor(1).fit(known, outcome)
     std = (outcome[nearest.kneighbors(return_distance=False)[:, 0]] - outcome).std(axis=0)
@@ -170,10 +175,6 @@ def _nearest(data: LoggedPushes, pushes: Pushes, state: State) -> Forecast:
 
 
 def _ridge(data: LoggedPushes, pushes: Pushes, state: State) -> Forecast:
-    from sklearn.linear_model import RidgeCV
-    from sklearn.pipeline import make_pipeline
-    from sklearn.preprocessing import PolynomialFeatures, StandardScaler
-
     parts = PolynomialFeatures(2), StandardScaler(), RidgeCV(np.logspace(-3, 2, 11))
     known, outcome = _features(data, data), _outcome(data)
     ridge = make_pipeline(*parts).fit(known, outcome)
@@ -196,9 +197,6 @@ def mirrors(outline_m: np.ndarray) -> list[np.ndarray]:
 @lru_cache(maxsize=6)
 def _process(known: bytes, target: bytes, theta: tuple[float, ...] = (), rate: bool = False) -> Any:
     """A Gaussian process of a target (n,) on inputs (n, c); theta: its parameters, if known."""
-    from sklearn.gaussian_process import GaussianProcessRegressor
-    from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteKernel
-
     each = np.frombuffer(target)
     inputs = np.frombuffer(known).reshape(len(each), -1)
     widths = [1.0] * inputs.shape[1], (1e-2, 1e4)
@@ -217,8 +215,6 @@ def _processes(
 
     rate: of the target per length, with a rougher kernel, and of the normal too.
     """
-    from sklearn.exceptions import ConvergenceWarning
-
     columns = [0, 1, 2, 3, 4, 5] if rate else [0, 1, 4, 5]
     rows, known = push_rows(data), [_features(data, data, columns)]
     rows[:, 7:], targets = torch.from_numpy(target), [target]
@@ -252,9 +248,8 @@ def _physics(
     data: LoggedPushes, pushes: Pushes, state: State, feet: bool = False, process: bool = False
 ) -> Forecast:
     """A pusher fitted to each group, or to all pushes for a group that is not in the log."""
-    means = []
-    for log in (data, pushes):
-        means.append(np.zeros((len(log), 3)))
+    means = [np.zeros((len(log), 3)) for log in (data, pushes)]
+    for log, mean in zip((data, pushes), means, strict=True):
         for group in np.unique(log.groups):
             if (key := f"pusher {group}") not in state:
                 known = data.groups == group
@@ -265,7 +260,7 @@ def _physics(
             some = log.select(log.groups == group)
             pusher = AnalyticPusher(*state[key].tolist())
             told = told_feet(some)[0] if feet else None
-            means[-1][log.groups == group] = pusher.predict(push_rows(some)[:, :7], told).numpy()
+            mean[log.groups == group] = pusher.predict(push_rows(some)[:, :7], told).numpy()
     left = _outcome(data) - means[0]
     if not process:
         return _in_metres(pushes, means[1], np.sqrt((left**2).mean(axis=0)))
