@@ -95,17 +95,19 @@ def planar(values: Any, order: str = "xyzw", up: str = "z") -> np.ndarray:
     """
     check_choice("order", order, ORDERS)
     shift = UPS[check_choice("up", up, UPS)]
-    rows = _rows("values", values, (3, 7), least=1)
+    rows = _rows("values", values, 3, 7, least=1)
     xy = np.roll(rows[:, :3], shift, axis=1)[:, :2]
     if rows.shape[1] == 3:
         return xy
     quaternions = rows[:, 3:][:, ORDERS[order]]
     size = np.linalg.norm(quaternions, axis=1)
-    if (row := int(np.abs(size - 1).argmax())) >= 0 and abs(size[row] - 1) > 0.05:
+    row = int(np.abs(size - 1).argmax())
+    if abs(size[row] - 1) > 0.05:
         raise ValueError(f"values: a quaternion has length 1, but in row {row} {size[row]:g}")
     i, j, k = np.roll(quaternions[:, :3], shift, axis=1).T
     w, tilt = quaternions[:, 3], np.arccos(np.clip(1 - 2 * (i * i + j * j), -1, 1))
-    if (row := int(tilt.argmax())) >= 0 and tilt[row] > MOST_TILT_RAD:
+    row = int(tilt.argmax())
+    if tilt[row] > MOST_TILT_RAD:
         raise ValueError(
             f"values: the object's {up} axis must point up, but in row {row} it is tilted by "
             f"{math.degrees(tilt[row]):.0f}°; choose another order ({order}) or up ({up}), or turn "
@@ -169,7 +171,7 @@ class Log:
             centre, tool = (rotated(p - centre[0], -ends[0, 2]) for p in (centre, tool))
             push = _contact(self.outline_m, tool, self._radius_m)
             push |= {"displacement_m": centre[1], "turn_rad": ends[1, 2] - ends[0, 2]}
-            self._refuse_jumps(tool[-1:], **push)
+            self._refuse_jumps(push, tool[-1:])
             push |= {"groups": group, "context": self._context(context or {})}
         except ValueError as error:
             self.refused[name] = str(error)
@@ -209,7 +211,7 @@ class Log:
         The object must be seen throughout, as in `add`. A push begins outside the outline, or at
         the first row, and ends where the tool is farthest from where it touched.
         """
-        tool = _rows("tool_xy", tool_xy, 2, math.inf) * self._metres
+        tool = _rows("tool_xy", tool_xy, 2, most=math.inf) * self._metres
         t = _growing("tool_t", tool_t, len(tool))
         known = self._poses("poses", poses, math.inf)
         at = _growing("poses_t", poses_t, len(known))
@@ -262,7 +264,7 @@ class Log:
 
     def _poses(self, name: str, values: Any, most: float = MOST_ROWS) -> np.ndarray:
         """Convert poses (k, 3) to metres and radians; raises ValueError."""
-        poses = _rows(name, values, 3, most) * [self._metres, self._metres, self._radians]
+        poses = _rows(name, values, 3, most=most) * [self._metres, self._metres, self._radians]
         if np.abs(poses[:, 2]).max() > 2 * math.pi:
             raise ValueError(
                 f"yaws of {name}, in {self._angle_unit}, must lie within one turn, got "
@@ -287,26 +289,20 @@ class Log:
         known[:, 2] = np.unwrap(known[:, 2])
         return np.column_stack([np.interp(t[[0, -1]], at, column) for column in known.T])
 
-    def _refuse_jumps(
-        self,
-        tool: np.ndarray,
-        length_m: float,
-        displacement_m: np.ndarray,
-        turn_rad: float,
-        **_: Any,
-    ) -> None:
+    def _refuse_jumps(self, push: dict[str, Any], tool: np.ndarray) -> None:
         """Raise ValueError if the object's motion exceeds what the tool can cause, or falls short.
 
         The lever arm of the rotation is taken to be at least the distance to the nearest edge. At
         the final pose the tool (1, 2) touches the outline or has slipped off, but is not inside.
         """
-        of = f"poses after {length_m:.3g} m of contact (are they another push's?)"
-        most_m = length_m + SLACK_M
+        moved_m, turn_rad = push["displacement_m"], push["turn_rad"]
+        of = f"poses after {push['length_m']:.3g} m of contact (are they another push's?)"
+        most_m = push["length_m"] + SLACK_M
         lever_m = max(1e-3, abs(_nearest(self.outline_m, np.zeros((1, 2)))[0].item()))
         turn, most_rad = f"the turn, in {self._angle_unit}, of {of}", min(most_m / lever_m, math.pi)
         check_within(turn, abs(turn_rad), 0.0, most_rad, "rad")
-        check_within(f"the motion of {of}", math.hypot(*displacement_m), 0.0, most_m, "m")
-        at_end = rotated(tool - displacement_m, -turn_rad)
+        check_within(f"the motion of {of}", math.hypot(*moved_m), 0.0, most_m, "m")
+        at_end = rotated(tool - moved_m, -turn_rad)
         deep = self._radius_m - _nearest(self.outline_m, at_end)[0].item()
         if deep > DEEP_M:
             raise ValueError(
@@ -336,17 +332,16 @@ def check_feet(feet: np.ndarray) -> None:
 
 
 def _rows(
-    name: str, values: Any, columns: int | tuple, most: float = MOST_ROWS, least: int = 2
+    name: str, values: Any, *columns: int, most: float = MOST_ROWS, least: int = 2
 ) -> np.ndarray:
     """Finite numbers (m, columns), least ≤ m ≤ most; raises ValueError."""
-    widths = columns if isinstance(columns, tuple) else (columns,)
     try:
         array = np.ma.asarray(values, dtype=float).filled(np.nan)
     except (TypeError, ValueError, RuntimeError):
         array = check_array(name, values)
-    if array.ndim != 2 or array.shape[1] not in widths or not least <= len(array) <= most:
+    if array.ndim != 2 or array.shape[1] not in columns or not least <= len(array) <= most:
         raise ValueError(
-            f"{name} must have {least} to {most} rows of {' or '.join(map(str, widths))} "
+            f"{name} must have {least} to {most} rows of {' or '.join(map(str, columns))} "
             f"numbers, got {array.shape}; "
             "split a session (Log.split), and read positions and quaternions in space by planar"
         )
