@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Self
 
 import numpy as np
@@ -21,15 +21,7 @@ from scipy.spatial import cKDTree
 
 from affordlib.geometry import rotated, rotated_each, unit_vector
 from affordlib.logs.fit import PushModel
-from affordlib.logs.log import (
-    FEET,
-    LARGEST_M,
-    Pushes,
-    _nearest,
-    centred,
-    gyration_radius_m,
-    segment_gaps,
-)
+from affordlib.logs.log import LARGEST_M, Pushes, _nearest, centred, gyration_radius_m, segment_gaps
 from affordlib.primitives import PushAt
 from affordlib.types import (
     Goal,
@@ -67,25 +59,20 @@ class PushedObject:
     """An object to plan pushes for.
 
     outline_m: (k, 2) corners [m]; tool_radius_m: of a round tool; lengths_m: range of the lengths
-    of pushes; group, context: the condition, as in `Log.add`. By default, for an object that was
-    only seen, points on its outline are given as feet of equal weight.
+    of pushes; group, context: the condition, as in `Log.add`.
     """
 
     outline_m: np.ndarray
     tool_radius_m: float = 0.0
     lengths_m: tuple[float, float] = LENGTHS_M
     group: str = "seen"
-    context: dict[str, Any] | None = None
+    context: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         outline_m = centred(check_array("outline_m", self.outline_m, 2))[1]
         check_within("tool_radius_m", self.tool_radius_m, 0.0, LARGEST_M, "m")
         check_range("lengths_m", self.lengths_m, 1e-4, LARGEST_M)
         object.__setattr__(self, "outline_m", outline_m)
-        if self.context is None:
-            some = np.linspace(0, len(outline_m), min(len(outline_m), FEET), endpoint=False)
-            feet = np.insert(outline_m[some.astype(int)], 2, 1 / len(some), axis=1)
-            object.__setattr__(self, "context", {"feet": feet})
 
     @classmethod
     def of(cls, pushes: Pushes) -> Self:

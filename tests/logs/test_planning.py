@@ -14,7 +14,7 @@ from affordlib.logs.log import _nearest
 from affordlib.logs.neural_process import load_neural_process
 from affordlib.logs.planning import primitive_of
 from affordlib.types import Goal, UnreachableError
-from affordlib.world import Cuboid, UprightCylinder
+from affordlib.world import Cuboid
 from affordlib.world.robot import ROD_WIDTH_M
 from experiments.t_on_arm import TURN_M, bring
 from tests.problems import Still
@@ -72,13 +72,6 @@ def test_pursuit_knows_only_what_it_observes(world, monkeypatch):
     x, y, yaw = truth()
     assert math.dist((x, y), (0.04, -0.01)) < 0.003
     assert abs(yaw - 0.6) < math.radians(3)
-
-
-def test_round_objects_have_no_more_feet_than_a_model_takes():
-    feet = told_feet(PushedObject(UprightCylinder(0.06, 0.05).footprint_m).draw(3))
-    assert feet.shape == (3, 12, 3)
-    assert feet[0, :, 2].sum() == pytest.approx(1)
-    assert feet[0, :, :2].mean(dim=0).abs().max() < 1e-5
 
 
 def test_a_plan_that_does_not_turn_misses_a_turn():
