@@ -254,27 +254,25 @@ class PushPlanner:
     ) -> list[tuple]:
         """Gauss-Newton steps of least norm, of all chains (edges, values) side by side."""
         best: list[tuple] = [(math.inf, chain) for chain in chains]
+        shifts = np.vstack([np.zeros(3), _SHIFT * np.eye(3)])[:, None]
+        places = np.cumsum([4 * len(edge) for edge, _ in chains])[:-1]
         for _ in range(self.rounds):
-            shifted = [
-                v[None] + np.vstack([np.zeros(3), _SHIFT * np.eye(3)])[:, None] for _, v in chains
-            ]
             edges = np.concatenate([np.tile(edge, 4) for edge, _ in chains])
-            flat = np.concatenate([values.reshape(-1, 3) for values in shifted])
-            both, at = self.model.predict(self.obj.at(edges, flat)), 0
-            for number, (edge, values) in enumerate(chains):
-                k = len(edge)
-                effect, std = (each[at : at + 4 * k].reshape(4, k, 3) for each in both)
-                at += 4 * k
-                every = np.tile(effect[0], (1 + 3 * k, 1, 1))
+            shifted = np.concatenate([(values + shifts).reshape(-1, 3) for _, values in chains])
+            both = self.model.predict(self.obj.at(edges, shifted))
+            parts = zip(*(np.split(each, places) for each in both), strict=True)
+            for number, (effect, std) in enumerate(parts):
+                (edge, values), k = chains[number], len(chains[number][0])
+                effect, std = effect.reshape(4, k, 3), std[:k]
+                ends = np.zeros((1 + 3 * k, 3))  # without shifts, and for each shifted value
                 for push in range(k):
-                    every[1 + 3 * push : 4 + 3 * push, push] = effect[1:, push]
-                ends = np.zeros((1 + 3 * k, 3))
-                for push in range(k):
-                    ends = _after(ends, every[:, push])
+                    every = np.tile(effect[0, push], (1 + 3 * k, 1))
+                    every[1 + 3 * push : 4 + 3 * push] = effect[1:, push]
+                    ends = _after(ends, every)
                 off = weights * (ends[0] - target)
-                cost = math.sqrt((off**2).sum() + ((weights * std[0]) ** 2).sum())
+                cost = math.sqrt((off**2).sum() + ((weights * std) ** 2).sum())
                 if cost < best[number][0]:
-                    best[number] = cost, (edge, values), effect[0], std[0]
+                    best[number] = cost, (edge, values), effect[0], std
                 slope = weights * (ends[1:] - ends[0]) / _SHIFT
                 damped = slope.T @ slope + _DAMPING_M**2 * np.eye(3)
                 step = np.clip(-slope @ np.linalg.solve(damped, off), -_LARGEST_STEP, _LARGEST_STEP)
