@@ -30,7 +30,7 @@ ELLIPSOID = 100.0
 
 
 def quasi_static_push(
-    push: Tensor, feet: Tensor, friction: Tensor, smoothing: float = 0.05, steps: int = STEPS
+    push: Tensor, feet: Tensor, friction: Tensor, smoothing: float = 0.05
 ) -> Tensor:
     """Displacement of the centroid and rotation (B, 3), in the object's frame at the start.
 
@@ -40,9 +40,9 @@ def quasi_static_push(
     contact, normal, direction, travel = push.split([2, 2, 2, 1], dim=-1)
     turn, moved = torch.zeros_like(friction), torch.zeros_like(contact)
     tangent, state = quarter_turn(normal), torch.zeros(3, *friction.shape)
-    for _ in range(steps):
-        step = rotate(direction, -turn) * travel / steps
-        at_contact, spin, state = _motion(contact, normal, step, feet, (friction, smoothing), state)
+    for _ in range(STEPS):
+        step = rotate(direction, -turn) * travel / STEPS
+        at_contact, spin, state = _motion(contact, normal, step, feet, friction, smoothing, state)
         at_centroid = at_contact - spin[:, None] * quarter_turn(contact)
         moved = moved + rotate(at_centroid, turn + spin / 2)
         contact = contact + ((step - at_contact) * tangent).sum(-1, keepdim=True) * tangent
@@ -55,11 +55,11 @@ def _motion(
     normal: Tensor,
     step: Tensor,
     feet: Tensor,
-    friction_smoothing: tuple[Tensor, float],
+    friction: Tensor,
+    smoothing: float,
     state: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Motion of the object's point at the contact (B, 2), rotation (B,), and the solver's state."""
-    friction, smoothing = friction_smoothing
     size = step.norm(dim=-1, keepdim=True)
     u = step / size
     per_turn = quarter_turn(feet[..., :2] - contact[:, None])  # velocity of a foot
