@@ -35,7 +35,7 @@ from sklearn.preprocessing import PolynomialFeatures, StandardScaler
 from torch import Tensor
 
 from affordlib.geometry import quarter_turn
-from affordlib.logs.log import FEET, LoggedPushes, Pushes, check_feet, gyration_radius_m
+from affordlib.logs.log import LoggedPushes, Pushes, check_feet, gyration_radius_m
 from affordlib.logs.neural_process import (
     NeuralProcess,
     in_contact_frame,
@@ -44,6 +44,7 @@ from affordlib.logs.neural_process import (
     transformed,
 )
 from affordlib.logs.physics import AnalyticPusher
+from affordlib.results import from_root
 from affordlib.types import check_choice, check_count
 from affordlib.weights import read_weights, write_weights
 
@@ -82,13 +83,11 @@ def push_rows(pushes: Pushes) -> Tensor:
 
 
 def told_feet(pushes: Pushes) -> Tensor:
-    """Known feet (n, 12, 3) in units of the radius of gyration; (n, 0, 3) where none are known."""
-    feet = torch.zeros(len(pushes), FEET if "feet" in pushes.context else 0, 3)
-    if feet.shape[1]:
-        known = pushes.context["feet"]
-        check_feet(known)
-        feet[:, : known.shape[1]] = torch.from_numpy(known.astype(np.float32))
-        feet[..., :2] /= gyration_radius_m(pushes.outline_m)
+    """Known feet (n, k, 3) in units of the radius of gyration; (n, 0, 3) where none are known."""
+    known = pushes.context.get("feet", np.zeros((len(pushes), 0, 3)))
+    check_feet(known)
+    feet = torch.tensor(known, dtype=torch.float32)
+    feet[..., :2] /= gyration_radius_m(pushes.outline_m)
     return feet
 
 
@@ -382,7 +381,7 @@ def load_model(path: str | Path) -> FittedModel:
 
     Raises FileNotFoundError, or ValueError when the file is damaged or of another kind.
     """
-    if not Path(path).is_file():
+    if not from_root(path).is_file():
         raise FileNotFoundError(f"path: there is no model at {path}; fit one and save it there")
     tensors, about = read_weights(path, "fit the model to its log again")
     if about.get("format") != FORMAT:

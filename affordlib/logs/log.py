@@ -474,5 +474,5 @@ def _contact(outline_m: np.ndarray, tool: np.ndarray, radius_m: float) -> dict[s
     aside = float(np.abs(cross(travelled, path - contact)).max() / length)
     curved = "tool_xy's way aside (a push is straight: cut a curved one into pieces)"
     check_within(curved, aside, 0, most, "m")
-    known = {"contact_m": contact, "normal": normal}
-    return known | {"direction": travelled / length, "length_m": length}
+    direction = travelled / length
+    return {"contact_m": contact, "normal": normal, "direction": direction, "length_m": length}
