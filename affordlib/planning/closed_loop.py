@@ -11,7 +11,8 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -26,6 +27,7 @@ from affordlib.planning.robot import Execution, Robot
 from affordlib.planning.skills import Skills
 from affordlib.primitives import EMPTY_M, Drag, Grasp, Rotate
 from affordlib.types import (
+    Checked,
     Goal,
     GoalError,
     NothingSeenError,
@@ -35,9 +37,21 @@ from affordlib.types import (
     Step,
     UnreachableError,
     check_count,
-    check_field,
-    check_within,
+    count,
+    parameter,
 )
+
+SURPRISE_M = 0.002
+"""Distance [m] of the object from its predicted position above which the loop plans again."""
+
+DISPLACED_M = 0.03
+"""Distance [m] above which others have displaced it; the loop then waits until it is at rest."""
+
+AT_REST_M, OBSERVE_EVERY_S, MAX_OBSERVATIONS = 0.001, 0.25, 20
+"""It is at rest when it moves less than this between two observations."""
+
+MOVE_M, SPARE_ACTIONS, MAX_LIFTS = 0.05, 3, 2
+"""By default one action is allowed per distance [m], and some more; and so many grasps."""
 
 
 def execute_plan(robot: Robot, plan: Plan) -> Outcome:
@@ -74,53 +88,26 @@ def _outcome(robot: Robot, plan: Plan, done: Sequence[Execution]) -> Outcome:
 
 
 @dataclass(frozen=True)
-class ClosedLoopConfig:
-    """Patience, thresholds and callbacks of a closed loop.
+class ClosedLoopConfig(Checked):
+    """Patience and callbacks of a closed loop.
 
-    mode: of its plans. max_actions: default `action_limit` of the distance, renewed when the goal
-    moves or, up to max_renewals times, when somebody displaces the object; max_lifts: of grasps.
-    max_plans: see `MovePlanner`. n_images: number of images averaged per observation;
-    eight of the Kinect give the rotation to one degree.
-
-    surprise_m: distance of the object from its predicted position above which it plans again;
-    displaced_m: that above which others have displaced it. Then the loop waits until it moves less
-    than at_rest_m between two observations, at most max_observations, observe_every_s apart.
-
+    mode: of its plans. max_actions: by default a number that grows with the distance, renewed when
+    the goal moves or, up to max_renewals times, when somebody displaces the object. n_images:
+    number of images averaged per observation; eight of the Kinect give the rotation to one degree.
     on_action: called after each action with the plan and the number of actions so far; on_plan:
     called with a plan before its first action.
     """
 
     mode: str | PlanMode = "multi_partial"
-    max_actions: int | None = None
-    max_renewals: int = 3
-    max_lifts: int = 2
-    max_plans: int = 12
-    n_images: int = 1
-    surprise_m: float = 0.002
-    displaced_m: float = 0.03
-    at_rest_m: float = 0.001
-    observe_every_s: float = 0.25
-    max_observations: int = 20
-    move_m: float = 0.05
-    spare_actions: int = 3
+    max_actions: int | None = parameter(partial(check_count, least=0), None)
+    max_renewals: int = count(3, 0)
+    n_images: int = count(1, 1, 100)
     on_action: Callable[[Plan, int], None] = lambda *_: None
     on_plan: Callable[[Plan], None] = lambda *_: None
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         object.__setattr__(self, "mode", PlanMode.of(self.mode))
-        check_count("n_images", self.n_images, 1, 100)
-        for field in fields(self):
-            if isinstance(field.default, float):
-                check_field(self, field.name, 1e-6, 10.0)
-            elif getattr(self, field.name) is not None and str(field.type).startswith("int"):
-                check_count(field.name, getattr(self, field.name), least=0)
-
-    def action_limit(self, distance_m: float) -> int:
-        """Number of actions for a distance: by default one per `move_m`, and `spare_actions`."""
-        distance_m = check_within("distance_m", distance_m, 0.0, math.inf, "m")
-        if self.max_actions is not None:
-            return self.max_actions
-        return math.ceil(distance_m / self.move_m - 1e-9) + self.spare_actions
 
 
 @dataclass(frozen=True)
@@ -131,8 +118,8 @@ class ClosedLoopResult:
     was not observed so exactly; "unreachable", "gave_up" or "lost". goal: the final one; errors:
     what is left of it. end_pose: (x, y, rotation since the start) of the object; reckoned: which of
     "position" and "orientation" were not observed at the end but computed from the motion of the
-    hand. steps: the executed actions, and executions, their recordings; plans: all that were made
-    to positions; seen_xy_m: before every decision; vetoes: what the arm's kinematics refused.
+    hand. steps: the executed actions, and object_paths_xy_m, the path (n, 2) of the object in each,
+    as recorded; plans: all that were made to positions; seen_xy_m: before every decision.
     """
 
     goal: Goal
@@ -140,12 +127,11 @@ class ClosedLoopResult:
     message: str
     errors: dict[str, GoalError]
     steps: tuple[Step, ...]
-    executions: tuple[Execution, ...]
+    object_paths_xy_m: tuple[np.ndarray, ...]
     plans: tuple[Plan, ...]
     seen_xy_m: tuple[tuple[float, float], ...]
     end_pose: tuple[float, float, float]
     reckoned: tuple[str, ...]
-    vetoes: int = 0
 
     @property
     def reached(self) -> bool:
@@ -156,11 +142,6 @@ class ClosedLoopResult:
     def distance_m(self) -> float:
         """Distance [m] of the object from the goal."""
         return self.errors["position"].left
-
-    @property
-    def object_paths_xy_m(self) -> tuple[np.ndarray, ...]:
-        """Recorded path (n, 2) of the object in each action."""
-        return tuple(execution.object_path[:, :2] for execution in self.executions)
 
 
 def run_closed_loop(
@@ -193,7 +174,7 @@ class _ClosedLoop:
         config: ClosedLoopConfig,
     ) -> None:
         self.robot, self.goal_now, self.skills, self.config = robot, goal_now, skills, config
-        self.moves = MovePlanner(robot, skills, planner, config.mode, config.max_plans)
+        self.moves = MovePlanner(robot, skills, planner, config.mode)
         self.goal = self.acted_for = goal_now()  # updated before each action and after a lift
         self.steps: list[Step] = []
         self.executions: list[Execution] = []
@@ -224,22 +205,21 @@ class _ClosedLoop:
             message=ending.message,
             errors=self._errors(),
             steps=tuple(self.steps),
-            executions=tuple(self.executions),
+            object_paths_xy_m=tuple(done.object_path[:, :2] for done in self.executions),
             plans=tuple(self.plans),
             seen_xy_m=tuple(self.seen_xy_m),
             end_pose=(*self.seen.xy_m, self._turned_rad()),
             reckoned=self._reckoned(),
-            vetoes=self.moves.vetoes,
         )
 
     def _observe(self) -> Ending | None:
         """Observe, and check whether the plan is still valid."""
-        seen, displaced_m = self._mean_of_images(), self.config.displaced_m
+        seen = self._mean_of_images()
         off_m, fell = self._surprise(seen)
-        if off_m > displaced_m or fell:
+        if off_m > DISPLACED_M or fell:
             seen = self._wait(seen)
             off_m, fell = self._surprise(seen)
-        was_displaced = off_m > displaced_m
+        was_displaced = off_m > DISPLACED_M
         self.disturbed = was_displaced or fell
         obstacle_moved = seen.obstacles != self.seen.obstacles
         self.seen = self._with_yaw(seen, fell, was_displaced)
@@ -252,7 +232,7 @@ class _ClosedLoop:
             self.renewals -= not goal_moved
             self.turn_allowed &= not goal_moved  # a new goal may need a full rotation again
             self.limit = max(self.limit, len(self.steps) + self._limit_from(seen.xy_m))
-        if off_m > self.config.surprise_m or goal_moved or fell or obstacle_moved:
+        if off_m > SURPRISE_M or goal_moved or fell or obstacle_moved:
             self.queue = []
         return None
 
@@ -265,10 +245,10 @@ class _ClosedLoop:
 
     def _wait(self, seen: Observation) -> Observation:
         """Observe until an object that somebody has set in motion is at rest."""
-        for _ in range(self.config.max_observations):
-            self.robot.settle(self.config.observe_every_s)
+        for _ in range(MAX_OBSERVATIONS):
+            self.robot.settle(OBSERVE_EVERY_S)
             before, seen = seen, self._mean_of_images()
-            if math.dist(before.xy_m, seen.xy_m) < self.config.at_rest_m:
+            if math.dist(before.xy_m, seen.xy_m) < AT_REST_M:
                 break
         return seen
 
@@ -301,7 +281,7 @@ class _ClosedLoop:
         if turn and not turn.is_met() and not self.turn_allowed:
             # Up to a full rotation, in sweeps of 60°, each of which may move it from its position.
             sweeps = math.ceil((turn.left % (2 * math.pi)) / Rotate.sweep_rad)
-            self._allow(2 * sweeps + self.config.spare_actions)
+            self._allow(2 * sweeps + SPARE_ACTIONS)
             self.turn_allowed = True
         part = next((name for name, error in errors.items() if not error.is_met()), None)
         if part is None:
@@ -309,10 +289,10 @@ class _ClosedLoop:
         if part != "height":
             return self._act(part)
         lifts = sum(isinstance(step.primitive, Grasp) for step in self.steps)
-        if lifts >= self.config.max_lifts:
+        if lifts >= MAX_LIFTS:
             return self._give_up("height")
         self._allow(1)
-        return self._act("height") or self._judge_lift(last=lifts + 1 == self.config.max_lifts)
+        return self._act("height") or self._judge_lift(last=lifts + 1 == MAX_LIFTS)
 
     def _judge_lift(self, last: bool) -> Ending | None:
         """Check whether the held object is as the goal requires; otherwise put it down."""
@@ -378,7 +358,6 @@ class _ClosedLoop:
             can = self.robot.can_reach(primitive, step.stop_phase, self.seen.xy_m)
             can &= space is None or space.is_free(step)
             if not can:
-                self.moves.vetoes += 1
                 refused.add(primitive.name)
             return can
 
@@ -409,7 +388,9 @@ class _ClosedLoop:
         return released_yaw(last)
 
     def _limit_from(self, xy_m: Sequence[float]) -> int:
-        return self.config.action_limit(self.goal.distance_m(xy_m))
+        if self.config.max_actions is not None:
+            return self.config.max_actions
+        return math.ceil(self.goal.distance_m(xy_m) / MOVE_M - 1e-9) + SPARE_ACTIONS
 
     def _allow(self, further: int) -> None:
         """Raise the action limit, unless the configuration sets it."""

@@ -14,7 +14,8 @@ from affordlib.planning.skills import Skills
 from affordlib.primitives import Drag, Move, Primitive
 from affordlib.types import Goal, Observation, Plan
 
-Point = tuple[float, float]
+MAX_PLANS = 12
+"""Plans to one place that the kinematics may veto before another place is tried."""
 
 REFUSED_WITHIN_M, REFUSED_WITHIN_RAD = 0.01, math.radians(6)
 """Actions this near to a refused action, in position [m] and direction [rad], are excluded."""
@@ -32,16 +33,10 @@ class Ending(NamedTuple):
 
 
 class MovePlanner:
-    """Plans to a position; remembers which actions the kinematics has refused.
+    """Plans to a position; remembers which actions the kinematics has refused."""
 
-    max_plans: vetoed plans to one place before another is tried. vetoes: number of refused actions.
-    """
-
-    def __init__(
-        self, robot: Robot, skills: Skills, planner: Planner, mode: PlanMode, max_plans: int = 12
-    ) -> None:
+    def __init__(self, robot: Robot, skills: Skills, planner: Planner, mode: PlanMode) -> None:
         self.robot, self.skills, self.planner, self.mode = robot, skills, planner, mode
-        self.max_plans, self.vetoes = max_plans, 0
         self._ends_m: list[float] = []  # distances of the plans' ends from the current goal
         self._refused: list[tuple[str, np.ndarray, float]] = []
 
@@ -59,7 +54,7 @@ class MovePlanner:
         return self._plan(seen, goal)
 
     def _plan(self, seen: Observation, goal: Goal, kind: type[Move] | None = None) -> Plan | Ending:
-        effects, vetoes = self.skills.effects(seen.image, kind), self.vetoes
+        effects, refused = self.skills.effects(seen.image, kind), len(self._refused)
         try:
             whole = self._problem(effects, seen, goal)
         except ValueError as error:
@@ -73,7 +68,7 @@ class MovePlanner:
             return plan
         best = f"the best ends {1000 * min(self._ends_m):.1f} mm from it"
         planned = len(self._ends_m) > 1 and self._can_arrive(whole)
-        if seen.obstacles or self.vetoes > vetoes or not planned:
+        if seen.obstacles or len(self._refused) > refused or not planned:
             at = "({:.3f}, {:.3f}) m".format(*goal.xy_m)
             past = " past the obstacles" * bool(seen.obstacles)
             why = f"the arm cannot bring it there{past}; of all plans, {best}"
@@ -113,7 +108,7 @@ class MovePlanner:
 
     def _plan_to(self, problem: PlanningProblem, goal: Goal, within_m: float) -> Plan | None:
         """A plan that ends within a distance of the problem's goal and that the arm can follow."""
-        for _ in range(self.max_plans):
+        for _ in range(MAX_PLANS):
             plan = self.planner(problem)
             self._ends_m.append(goal.distance_m(plan.predicted_end_xy_m))
             if not plan.steps or plan.predicted_distance_m > within_m:
@@ -151,7 +146,6 @@ class MovePlanner:
         starts = [plan.start_xy_m, *(step.predicted_end_xy_m for step in plan.steps)]
         for step, at in zip(plan.steps, starts, strict=False):
             if not self.robot.can_reach(step.primitive, step.stop_phase, at):
-                self.vetoes += 1
                 action = step.primitive
                 self._refused.append((action.name, np.array(at), action.direction_rad))
                 return False

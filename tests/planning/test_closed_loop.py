@@ -21,6 +21,7 @@ from affordlib.planning import (
     plan_gradient,
     run_closed_loop,
 )
+from affordlib.planning.closed_loop import DISPLACED_M
 from affordlib.planning.grasp_rotate import GRIPPER_YAWS_RAD
 from affordlib.planning.reachability import Reachability
 from affordlib.primitives import Drag, Grasp, Push, Rotate
@@ -43,7 +44,6 @@ from tests.planning.point_robot import PointRobot, point_skills
 from tests.problems import problem_of
 
 EXACT_M = 0.002
-DISPLACED_M, action_limit = ClosedLoopConfig().displaced_m, ClosedLoopConfig().action_limit
 BOX, TUBE, BALL = Cuboid(0.06, 0.05, 0.05), UprightCylinder(0.05, 0.07), Sphere(0.06)
 
 
@@ -76,8 +76,7 @@ def test_every_planner_brings_a_pose_about(planner):
     assert abs(went.errors["orientation"].left) < math.radians(2)
     assert abs(went.errors["height"].left) < 0.003
     assert "from the goal after" in went.message
-    assert len(went.steps) == len(went.object_paths_xy_m) <= action_limit(0.22) + 6
-    assert [action_limit(d) for d in (0.0, 0.01, 0.05, 0.051, 0.25)] == [3, 4, 4, 5, 8]
+    assert len(went.steps) == len(went.object_paths_xy_m) <= 8 + 6
     # It goes as near as the goal asks; if the object is at the goal, nothing moves.
     for within_m, n_pushes in ((0.01, 1), (0.001, 2)):
         assert len(loop(PointRobot(), Goal((0.08, 0.0), within_m)).steps) == n_pushes
@@ -117,7 +116,7 @@ def test_an_object_that_always_escapes_ends_the_loop():
 
     went = loop(robot, Goal((0.06, 0.0), EXACT_M), on_action=take_away)
     assert went.status == "gave_up"
-    assert 5 < len(went.steps) <= 4 * action_limit(0.06)
+    assert 5 < len(went.steps) <= 4 * 5
 
 
 @pytest.mark.parametrize(("n_steps", "ends_mm"), [(0, "100.0"), (1, "99.9")])
@@ -213,7 +212,6 @@ def test_a_veto_is_remembered_and_another_plan_made():
 
     went = loop(PointRobot(refuses=refuses), Goal((0.1, 0.05), EXACT_M))
     assert went.reached, went.message
-    assert went.vetoes == len(refused) >= 1
     assert abs(went.steps[0].primitive.direction_rad - refused[0]) > 0.05
 
 
@@ -222,19 +220,18 @@ def test_what_the_arm_cannot_do_is_refused_before_any_motion():
     went = loop(robot, Goal((0.5, 0.62), EXACT_M))
     assert went.status == "unreachable"
     assert "the position (0.500, 0.620) m: the arm cannot bring it there" in went.message
-    assert went.vetoes > 0
     robot = PointRobot((0.5, 0.3))
     went = loop(robot, Goal((0.5, 0.69)))
     assert (went.status, robot.executed) == ("unreachable", [])
     assert "too near the rim" in went.message
     hands = PointRobot(refuses=lambda primitive, at: primitive.name != "push")
     went = loop(hands, Goal((0.0, 0.0), height_m=0.1))
-    assert (went.status, went.steps, went.vetoes) == ("unreachable", (), len(GRIPPER_YAWS_RAD))
+    assert (went.status, went.steps) == ("unreachable", ())
     assert went.message.endswith("left: the arm cannot grasp at (0.000, 0.000) m")
     asked = []
     hands.refuses = lambda primitive, at: asked.append(primitive.grip_yaw) or len(asked) < 3
     went = loop(hands, Goal((0.0, 0.0), turn_rad=0.5))
-    assert (went.status, went.vetoes) == ("reached", 2)
+    assert went.reached
     assert went.steps[0].primitive.grip_yaw == asked[-1]
     assert len(set(asked)) == 3
 
@@ -578,7 +575,7 @@ def test_a_goal_across_the_table_is_reached_in_the_limit_or_refused(world, skill
     world.place(BALL, (0.2, -0.4), 0.0)
     went = run_closed_loop(world, Goal((0.2, 0.25), EXACT_M), skills)
     assert went.reached, went.message
-    assert len(went.steps) <= action_limit(0.65)
+    assert len(went.steps) <= 16
     world.place(BOX, (0.5, 0.3), 0.0)
     pose = world.object_pose()
     went = run_closed_loop(world, Goal((0.65, 0.65), EXACT_M), skills)
