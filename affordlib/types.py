@@ -159,10 +159,16 @@ def check_range(name: str, pair: Any, low: float, high: float) -> tuple[float, f
     return first, last
 
 
+def on_table(xy_m: np.ndarray, radius_m: float = 0.0) -> np.ndarray | np.bool_:
+    """Return whether points (..., 2) lie on the table and farther than a radius from its rim."""
+    low, high = np.transpose([TABLE_X_M, TABLE_Y_M])
+    return ((xy_m >= low + radius_m) & (xy_m <= high - radius_m)).all(axis=-1)
+
+
 def check_on_table(name: str, xy_m: Any) -> tuple[float, float]:
     """Return (x, y) [m] in the table's frame; raises ValueError unless it is on the table."""
     x, y = check_pair(name, xy_m)
-    if not (TABLE_X_M[0] <= x <= TABLE_X_M[1] and TABLE_Y_M[0] <= y <= TABLE_Y_M[1]):
+    if not on_table(np.array([x, y])):
         raise ValueError(
             f"{name} = ({x:g}, {y:g}) m lies off the table; choose x in "
             f"[{TABLE_X_M[0]:g}, {TABLE_X_M[1]:g}] and y in [{TABLE_Y_M[0]:g}, {TABLE_Y_M[1]:g}]"

@@ -16,8 +16,8 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
-from affordlib.planning.problem import OUR_TABLE
 from affordlib.primitives import HOVER_M, TIP_HEIGHT_M, Drag, Move, Push
+from affordlib.types import TABLE_X_M, TABLE_Y_M
 from affordlib.world import UnreachableError, robot
 from affordlib.world.trajectory import RETREAT_M
 
@@ -97,8 +97,7 @@ def _actions(
 @lru_cache(maxsize=64)
 def _graph(kind: type[Move], half_mm: int, slack_m: float) -> tuple[np.ndarray, csr_array]:
     """Return places (n, 2) on the table, and between which of them one action moves an object."""
-    table = OUR_TABLE
-    x, y = (np.arange(low + CELL_M / 2, high, CELL_M) for low, high in (table.x_m, table.y_m))
+    x, y = (np.arange(low + CELL_M / 2, high, CELL_M) for low, high in (TABLE_X_M, TABLE_Y_M))
     places = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
     pairs = cKDTree(places).query_pairs(LONGEST_M, output_type="ndarray")
     origin, end = np.concatenate([pairs, pairs[:, ::-1]]).T

@@ -43,9 +43,9 @@ from affordlib.planning import (
 )
 from affordlib.planning.astar import STOP_PHASES
 from affordlib.planning.gradient import CIRCLE_M, Reading, decoded
-from affordlib.planning.problem import MODES, OUR_TABLE
+from affordlib.planning.problem import MODES
 from affordlib.primitives import Drag, Move, Push
-from affordlib.types import NothingSeenError, Observation, Outcome, Plan, Step
+from affordlib.types import NothingSeenError, Observation, Outcome, Plan, Step, on_table
 from affordlib.world import ROLLABLE, STANDING, Tabletop, UnreachableError
 from experiments import reported, runner
 from experiments.commands import command
@@ -316,7 +316,7 @@ def corrected(
         for _ in range(corrections):
             seen = robot.observe()
             distance_m = goal.distance_m(seen.xy_m)
-            if distance_m <= ENOUGH_M or not OUR_TABLE.holds(np.array([seen.xy_m]))[0]:
+            if distance_m <= ENOUGH_M or not on_table(np.array(seen.xy_m)):
                 break
             plan = replan(seen.image, seen.xy_m, exactly)
             first = replace(plan, goal=goal, steps=plan.steps[:1])

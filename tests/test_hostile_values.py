@@ -241,7 +241,6 @@ def shop(one_world, skills, pushes, tmp_path_factory):
         "condition_on_primitives": {"model": network},
         "save_checkpoint": {"model": network, "path": folder / "net.safetensors", "about": {}},
         "Skills": {"models": {"push": model}},
-        "EffectMap": {"n_directions": 8, "n_phases": 5},
         "plan_astar": {"stop_phases": (0.5, 1.0)},
         "plan_gradient": {"samples": 10},
         "run_closed_loop": {"config": once, "goal": Goal(AT, 0.05)},

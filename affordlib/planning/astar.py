@@ -18,7 +18,7 @@ import torch
 from affordlib.planning.effect_map import EffectMap
 from affordlib.planning.problem import PlanningProblem
 from affordlib.planning.rollout import make_steps
-from affordlib.types import Plan, check_choice, check_count, check_within
+from affordlib.types import Plan, check_choice, check_count, check_within, on_table
 
 N_DIRECTIONS = 36
 HEURISTICS = ("goal", "disc")
@@ -125,7 +125,7 @@ def search(
         else:
             within_m = tolerance + (max_steps - depth) * effects.reach_m + nearest_m
             rows = np.flatnonzero(away <= within_m)
-        rows = rows[problem.table.holds(places[rows], effects.radius_m)]
+        rows = rows[on_table(places[rows], effects.radius_m)]
         here = np.broadcast_to((x, y), (len(rows), 2))
         rows = rows[problem.reachable(here, direction[rows])]
         if problem.obstacles and len(rows):

@@ -38,6 +38,7 @@ from affordlib.types import (
     UnreachableError,
     check_count,
     count,
+    on_table,
     parameter,
 )
 
@@ -224,7 +225,7 @@ class _ClosedLoop:
         obstacle_moved = seen.obstacles != self.seen.obstacles
         self.seen = self._with_yaw(seen, fell, was_displaced)
         self.seen_xy_m.append(seen.xy_m)
-        if not (seen.image[1].any() and self.skills.table.holds(np.array([seen.xy_m]))[0]):
+        if not (seen.image[1].any() and on_table(np.array(seen.xy_m))):
             return Ending("lost", f"the object is no longer on the table, after {self._count()}")
         self.goal = self.goal_now()
         goal_moved = self.acted_for != self.goal

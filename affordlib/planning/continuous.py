@@ -24,7 +24,7 @@ from affordlib.geometry import rotate
 from affordlib.planning.effect_map import EffectMap
 from affordlib.planning.problem import PlanningProblem
 from affordlib.planning.rollout import make_steps, roll_out
-from affordlib.types import Plan, check_count, check_within
+from affordlib.types import Plan, check_count, check_within, on_table
 
 N_STARTS, N_REFINED = 192, 16
 """Number of initial chains, and of the best of them that are refined by gradient descent."""
@@ -167,12 +167,8 @@ def _descend(value: Objective, chains: Chains, stops_early: bool) -> Chains:
     return direction, phase
 
 
-def correct(
-    effects: EffectMap,
-    target: Tensor,
-    chain: Chains,
-    stops_early: bool,
-    corrections: int = CORRECTIONS,
+def _correct(
+    effects: EffectMap, target: Tensor, chain: Chains, stops_early: bool
 ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
     """Correct one chain (B = 1) by Newton's method until its end by the model is the target.
 
@@ -181,7 +177,7 @@ def correct(
     """
     (direction, phase), k = chain, chain[0].shape[1]
     ends, turns = _predicted(effects, direction, phase)
-    for _ in range(corrections):
+    for _ in range(CORRECTIONS):
         off = target - ends[-1]
         if float(off.norm()) < EXACT_M:
             break
@@ -256,7 +252,7 @@ def plan_continuous(
     near = [one for one in candidates if problem.obstacles and one[0] < NEAR_M]
     for _, *best in near or candidates[:1]:
         best = tuple(best)
-        chain, predicted = correct(effects, target, best, mode.partial)
+        chain, predicted = _correct(effects, target, best, mode.partial)
         ok = _allowed(problem, predicted[0][None], chain[None, :, 0]).all()
         if not (ok and (not problem.obstacles or free(problem, tuple(chain.T[:, None])).all())):
             chain, predicted = torch.cat(best).T, None
@@ -275,7 +271,7 @@ def _allowed(problem: PlanningProblem, positions: Tensor, direction: Tensor) -> 
     ends = xy + positions.numpy()
     begins = np.concatenate([np.broadcast_to(xy, ends[:, :1].shape), ends[:, :-1]], axis=1)
     within = problem.reachable(begins.reshape(-1, 2), direction.reshape(-1).numpy())
-    inside = problem.table.holds(ends, problem.effects.radius_m)
+    inside = on_table(ends, problem.effects.radius_m)
     return torch.from_numpy((inside & within.reshape(direction.shape)).all(axis=1))
 
 

@@ -30,14 +30,10 @@ from affordlib.models.base import (
 )
 from affordlib.perception import outline_of, radius_m
 from affordlib.primitives import Move, Push
-from affordlib.types import (
-    CROP_WIDTH_M,
-    IMAGE_CHANNELS,
-    IMAGE_PIXELS,
-    Prediction,
-    check_array,
-    check_count,
-)
+from affordlib.types import CROP_WIDTH_M, IMAGE_CHANNELS, IMAGE_PIXELS, Prediction, check_array
+
+N_DIRECTIONS, N_PHASES = 48, 17
+"""Size of the grid on which the model is queried."""
 
 FINE_DIRECTIONS, FINE_PHASES = 180, 31
 
@@ -57,19 +53,15 @@ def checked_image(image: np.ndarray) -> torch.Tensor:
 class EffectMap:
     """Effects and σ of `kind` on an image's object: ahead [m], to the left [m], rotation [rad].
 
-    image: (2, 48, 48). The model is queried on first use, once for all plans, on a grid of
-    n_directions × n_phases. If the model predicts no yaw, the rotation is 0 with σ = 0.
+    image: (2, 48, 48). The model is queried on first use, once for all plans. If it predicts no
+    yaw, the rotation is 0 with σ = 0.
     """
 
     model: EffectModel
     image: np.ndarray
     kind: type[Move] = Push
-    n_directions: int = 48
-    n_phases: int = 17
 
     def __post_init__(self) -> None:
-        check_count("n_directions", self.n_directions, 8, 720)
-        check_count("n_phases", self.n_phases, 5, 500)
         checked_image(self.image)
         if domain := getattr(self.model, "domain", None):
             domain.check_width("image", CROP_WIDTH_M)
@@ -100,8 +92,8 @@ class EffectMap:
     @cached_property
     def grid(self) -> tuple[Tensor, Tensor]:
         """Effects and σ (D, T, 3) at the grid's directions and phases."""
-        angles = np.arange(self.n_directions) * (2 * math.pi / self.n_directions)
-        t_target = phases_of(self.kind, self.n_phases).float().expand(self.n_directions, -1)
+        angles = np.arange(N_DIRECTIONS) * (2 * math.pi / N_DIRECTIONS)
+        t_target = phases_of(self.kind, N_PHASES).float().expand(N_DIRECTIONS, -1)
         effect, std = self.query(angles, t_target)
         # Before contact the true effect is zero: the model's prediction there is an offset.
         return effect - effect[:, :1], std
@@ -140,8 +132,8 @@ class EffectMap:
     def __call__(self, direction_rad: Tensor, phase: Tensor) -> tuple[Tensor, Tensor]:
         """Effects and σ (..., 3) in the action's frame, for directions relative to the object."""
         first = self.kind.acts_from
-        row = torch.remainder(direction_rad, 2 * math.pi) * (self.n_directions / (2 * math.pi))
-        column = (phase.clamp(first, 1) - first) * ((self.n_phases - 1) / (1 - first))
+        row = torch.remainder(direction_rad, 2 * math.pi) * (N_DIRECTIONS / (2 * math.pi))
+        column = (phase.clamp(first, 1) - first) * ((N_PHASES - 1) / (1 - first))
         values = torch.from_numpy(self.spline(torch.stack([row, column], dim=-1).numpy()))
         return values[..., :3], values[..., 3:].clamp_min(1e-6)
 

@@ -16,7 +16,7 @@
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -130,18 +130,14 @@ class FreeSpace:
         self.start_xy_m = np.array(start_xy_m)
         self.least_m = min(START_M, _gap_at(start_xy_m, self.outline_m, self.polygons))
 
-    def check(
-        self, goal_xy_m: Sequence[float], on_table: Callable[[np.ndarray], np.ndarray]
-    ) -> None:
-        """Raise ValueError for an obstacle off the table, too high, on the object or on the goal.
+    def check(self, goal_xy_m: Sequence[float]) -> None:
+        """Raise ValueError for an obstacle that is too high, on the object or on the goal.
 
         An object covers its goal at least with the circle in its outline, however it has turned.
         """
         inner = ring((_normals(self.outline_m) * self.outline_m).sum(axis=1).min())
         for k, (one, polygon) in enumerate(zip(self.obstacles, self.polygons, strict=True)):
             name = f"obstacles[{k}]"
-            if not on_table(np.array(one.corners_m)).all():
-                raise ValueError(f"{name} lies off the table; move it inwards")
             if one.height_m > HIGHEST_M:
                 raise ValueError(
                     f"{name} is {100 * one.height_m:.0f} cm high, and the palm would touch what is "

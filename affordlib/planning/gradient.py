@@ -13,6 +13,7 @@ import math
 import time
 import warnings
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,7 @@ from affordlib.planning.effect_map import EffectMap
 from affordlib.planning.free_space import N_POSES
 from affordlib.planning.problem import PlanningProblem
 from affordlib.primitives import Drag
-from affordlib.types import Plan, Step, check_choice, check_count
+from affordlib.types import Checked, Plan, Step, check_choice, check_count, count, parameter
 
 DESCENTS = {"gradient": (torch.optim.SGD, 0.3), "adam": (torch.optim.Adam, 0.001)}
 """Optimiser and its rate, the best on the validation goals (`RATES` of `experiments.planning`)."""
@@ -39,7 +40,7 @@ CIRCLE_M, SUCCESS_M, NEARER_M = 0.2, 0.002, 0.0005
 
 
 @dataclass(frozen=True)
-class Reading:
+class Reading(Checked):
     """A reading of Algorithm 1; the defaults are the paper's words.
 
     descent: by the "gradient" or by "adam"; rate: its rate. start: on the "ring" of effects that
@@ -48,17 +49,11 @@ class Reading:
     that is reachable and leads nearer to the goal is used.
     """
 
-    descent: str = "gradient"
-    start: str = "ring"
-    finds: str = "direction"
+    descent: str = parameter(partial(check_choice, known=DESCENTS), "gradient")
+    start: str = parameter(partial(check_choice, known=("ring", "circle")), "ring")
+    finds: str = parameter(partial(check_choice, known=STILL), "direction")
     rate: float | None = None
-    starts: int = 1
-
-    def __post_init__(self) -> None:
-        check_choice("descent", self.descent, DESCENTS)
-        check_choice("start", self.start, ("ring", "circle"))
-        check_choice("finds", self.finds, STILL)
-        check_count("starts", self.starts, 1, 100)
+    starts: int = count(1, 1, 100)
 
 
 def descend(

@@ -66,8 +66,6 @@ def predict_trajectories(
 
     Raises ValueError where the model has no such channel.
     """
-    if not len(gripper_yaws_rad):
-        raise ValueError("gripper_yaws_rad must hold at least one yaw of the gripper, got none")
     yaws = tuple(check_finite("gripper_yaws_rad", yaw) for yaw in gripper_yaws_rad)
     if channel not in model.effect_channels:
         raise ValueError(

@@ -120,8 +120,9 @@ class MovePlanner:
 
     def _problem(self, effects: EffectMap, seen: Observation, goal: Goal) -> PlanningProblem:
         allowed = self._allowed(effects.kind)
-        more = {"table": self.skills.table, "obstacles": seen.obstacles}
-        return PlanningProblem(seen.xy_m, goal, effects, self.mode, allowed, **more)
+        return PlanningProblem(
+            seen.xy_m, goal, effects, self.mode, allowed, obstacles=seen.obstacles
+        )
 
     def _allowed(self, kind: type[Primitive]) -> Reachable:
         """Where the arm can act: learned reachability, without the actions refused so far."""

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 import torch
@@ -12,16 +12,16 @@ from affordlib.planning.effect_map import EffectMap
 from affordlib.planning.free_space import N_POSES, FreeSpace
 from affordlib.planning.rollout import poses_along
 from affordlib.types import (
-    TABLE_X_M,
-    TABLE_Y_M,
+    Checked,
     Goal,
     Obstacle,
     Plan,
     Step,
     check_choice,
     check_count,
-    check_pair,
-    check_range,
+    check_on_table,
+    on_table,
+    parameter,
 )
 
 Reachable = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -34,14 +34,11 @@ def everywhere(xy_m: np.ndarray, *_: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class PlanMode:
+class PlanMode(Checked):
     """Maximum number of actions of a plan, and whether they may stop before phase 1."""
 
-    max_steps: int
+    max_steps: int = parameter(partial(check_count, least=1, most=10))
     partial: bool
-
-    def __post_init__(self) -> None:
-        check_count("max_steps", self.max_steps, 1, 10)
 
     @classmethod
     def of(cls, mode: "str | PlanMode") -> "PlanMode":
@@ -57,45 +54,14 @@ MODES: dict[str, PlanMode] = {
 
 
 @dataclass(frozen=True)
-class Table:
-    """A rectangle on which objects may lie: its ranges of x and y [m]; default: our table."""
-
-    x_m: tuple[float, float] = TABLE_X_M
-    y_m: tuple[float, float] = TABLE_Y_M
-
-    def __post_init__(self) -> None:
-        for name in ("x_m", "y_m"):
-            object.__setattr__(self, name, check_range(name, getattr(self, name), -100.0, 100.0))
-
-    def holds(self, xy_m: np.ndarray, radius_m: float = 0.0) -> np.ndarray:
-        """Whether points (n, 2) lie on it and farther than a radius [m] from its rim: (n,)."""
-        (x0, x1), (y0, y1) = self.x_m, self.y_m
-        inside = np.array(xy_m) - (x0 + radius_m, y0 + radius_m)
-        size = x1 - x0 - 2 * radius_m, y1 - y0 - 2 * radius_m
-        return ((inside >= 0) & (inside <= size)).all(-1)
-
-    def check(self, name: str, xy_m: tuple[float, float], radius_m: float = 0.0) -> None:
-        """Raise ValueError where an object of a radius [m] would extend beyond the rim."""
-        if not self.holds(np.array([xy_m]), radius_m)[0]:
-            x, y = xy_m
-            raise ValueError(
-                f"{name} = ({x:g}, {y:g}) m is off the table, or too near the rim of the table for "
-                f"an object with a radius of {100 * radius_m:.1f} cm; move it inwards"
-            )
-
-
-OUR_TABLE = Table()
-
-
-@dataclass(frozen=True)
 class PlanningProblem:
     """Bring an object from a start [m] to a goal, by actions with known effects.
 
     mode: a `PlanMode`, or its name in `MODES`. reachable: function of positions (n, 2) and
     directions (n,): whether the arm can act there (default: everywhere). pose_planner: plans the
-    final rotation and lift, without which a plan cannot reach a goal that requires them. table: on
-    which the object has to stay; obstacles: which neither object nor hand may touch. Raises
-    ValueError where the object would extend beyond the rim, or an obstacle lies on it or its goal.
+    final rotation and lift, without which a plan cannot reach a goal that requires them. obstacles:
+    which neither object nor hand may touch. Raises ValueError where the object would extend beyond
+    the rim of the table, or an obstacle lies on it or its goal.
     """
 
     start_xy_m: tuple[float, float]
@@ -104,17 +70,20 @@ class PlanningProblem:
     mode: str | PlanMode = "multi_partial"
     reachable: Reachable = everywhere
     pose_planner: Callable[..., tuple[Step, ...] | None] | None = None
-    table: Table = OUR_TABLE
     obstacles: tuple[Obstacle, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "obstacles", tuple(self.obstacles))
-        object.__setattr__(self, "start_xy_m", check_pair("start_xy_m", self.start_xy_m))
-        self.table.check("start_xy_m", self.start_xy_m)
+        object.__setattr__(self, "start_xy_m", check_on_table("start_xy_m", self.start_xy_m))
         object.__setattr__(self, "mode", PlanMode.of(self.mode))
-        self.table.check("goal xy_m", self.goal.xy_m, self.effects.radius_m)
+        (x, y), radius_m = self.goal.xy_m, self.effects.radius_m
+        if not on_table(np.array([x, y]), radius_m):
+            raise ValueError(
+                f"goal xy_m = ({x:g}, {y:g}) m is off the table, or too near the rim of the table "
+                f"for an object with a radius of {100 * radius_m:.1f} cm; move it inwards"
+            )
         if self.obstacles:
-            self.free_space.check(self.goal.xy_m, self.table.holds)
+            self.free_space.check(self.goal.xy_m)
 
     @cached_property
     def free_space(self) -> FreeSpace:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Self
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -12,17 +12,10 @@ from affordlib.perception import looks_rollable
 from affordlib.planning.effect_map import EffectMap, checked_image
 from affordlib.planning.free_space import FreeSpace
 from affordlib.planning.grasp_rotate import PosePlanner
-from affordlib.planning.problem import (
-    OUR_TABLE,
-    PlanMode,
-    PlanningProblem,
-    Reachable,
-    Table,
-    everywhere,
-)
+from affordlib.planning.problem import PlanMode, PlanningProblem, Reachable, everywhere
 from affordlib.planning.reachability import Reachability
 from affordlib.primitives import Grasp, Move, Primitive, Rotate, move_for, primitive_named
-from affordlib.types import Goal, Obstacle, Step, check_field
+from affordlib.types import Goal, Obstacle, Step
 
 CHECKPOINTS = {
     "push": "film_5000",
@@ -30,8 +23,6 @@ CHECKPOINTS = {
     "grasp": "grasp_film_1000_firm",
     "rotate": "rotate_film_1000",
 }
-
-
 _KEPT = {"default_factory": dict, "init": False, "repr": False, "compare": False}
 
 
@@ -40,20 +31,17 @@ class Skills:
     """Models by the name of their primitive, and the probability that the arm can act.
 
     reachability: None means that the arm can act everywhere. threshold: minimum probability of an
-    action to be planned; it is low, since the arm's kinematics is checked afterwards. table: where
-    objects may lie.
+    action to be planned; it is low, since the arm's kinematics is checked afterwards.
     """
 
     models: dict[str, EffectModel]
     reachability: Reachability | None = None
-    threshold: float = 0.2
-    table: Table = OUR_TABLE
+    threshold: ClassVar[float] = 0.2
     _last: dict[bytes, tuple[EffectMap, PosePlanner | None]] = field(**_KEPT)
 
     def __post_init__(self) -> None:
         for name in self.models:
             primitive_named(name)
-        check_field(self, "threshold", 0.0, 1.0)
 
     @classmethod
     def load(cls) -> Self:
@@ -90,7 +78,7 @@ class Skills:
         if obstacles and poses:
             space = FreeSpace(obstacles, image, start_xy_m, effects.outline_m)
             poses = self.pose_planner(image, lambda s: self._can_act(s) and space.is_free(s))
-        more = self.reachable(effects.kind), poses, self.table, tuple(obstacles)
+        more = self.reachable(effects.kind), poses, tuple(obstacles)
         return PlanningProblem(start_xy_m, goal, effects, mode, *more)
 
     def effects(self, image: np.ndarray, kind: type[Move] | None = None) -> EffectMap:

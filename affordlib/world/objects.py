@@ -20,13 +20,12 @@ from scipy.spatial.transform import Rotation
 
 from affordlib.geometry import centroid, is_convex
 from affordlib.types import (
-    TABLE_X_M,
-    TABLE_Y_M,
     Checked,
     check_array,
     check_choice,
     check_field,
     number,
+    on_table,
     parameter,
     point,
 )
@@ -354,8 +353,7 @@ class PlacedObject:
     def left_table(self) -> bool:
         """Return whether the object's centre is no longer above the table."""
         x, y, z = self.state()[:3]
-        inside = TABLE_X_M[0] <= x <= TABLE_X_M[1] and TABLE_Y_M[0] <= y <= TABLE_Y_M[1]
-        return not (z > 0 and inside)
+        return not (z > 0 and on_table(np.array([x, y])))
 
     def brake(self, brakes: bool) -> None:
         """Set high rolling friction if the object can roll (Bullet accelerates it), or reset it."""

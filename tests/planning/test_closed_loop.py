@@ -14,7 +14,6 @@ from affordlib.planning import (
     MODES,
     ClosedLoopConfig,
     Robot,
-    Table,
     execute_plan,
     plan_astar,
     plan_continuous,
@@ -140,14 +139,6 @@ def test_the_loop_plans_in_its_mode():
     goal = Goal((0.15, 0.0), EXACT_M)
     assert loop(PointRobot(), goal, planner=planner, mode="single_partial").reached
     assert modes == {MODES["single_partial"]}
-
-
-def test_goals_of_another_robot_lie_on_its_table():
-    skills = replace(point_skills(), table=Table((2.0, 3.0), (-1.0, 1.0)))
-    went = loop(PointRobot((2.5, 0.2)), Goal((2.6, 0.8), EXACT_M), skills)
-    assert went.reached, went.message
-    here = loop(PointRobot((2.5, 0.2)), Goal((0.1, 0.0)), skills)
-    assert (here.status, here.steps) == ("unreachable", ())
 
 
 def test_nothing_is_reached_that_the_camera_cannot_tell():
