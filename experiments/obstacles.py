@@ -200,8 +200,6 @@ class PartlyChecked(PlanningProblem):
 
     def spare_m(self, begins, direction_rad, phase):
         """Return the gap of what is checked, minus the margin [m] (n,)."""
-        if not self.obstacles:
-            return np.full(len(begins), np.inf)
         poses = poses_along(self.effects, begins, direction_rad, phase, N_POSES)
         space, ends = self.free_space, poses[:, [-1, -1]]
         action, angle = self.effects.kind.towards(0.0), direction_rad.numpy()

@@ -120,8 +120,11 @@ def collect(
         left = sum(len(rows) for rows, _ in missing.values())
         bar = tqdm(total=n, initial=n - left, unit=" interactions", disable=not progress)
         try:
-            with closing(spread(partial(_make, recipe, attrs), missing, workers)) as made, bar:
+            with closing(spread(partial(_make, recipe), missing, workers)) as made, bar:
                 for name, data in made:
+                    if data.attrs != attrs:
+                        there, here = data.attrs["versions"], attrs["versions"]
+                        raise RuntimeError(f"{name} were made with {there}, but need {here}")
                     write_interactions(data, missing[name][1], level=1)  # temporary, and fast
                     bar.update(len(missing[name][0]))
             chunks = [open_interactions(part) for part in files]
@@ -152,13 +155,8 @@ def _is_there(file: Path, attrs: dict[str, str], replace: bool) -> bool:
     return found == attrs
 
 
-def _make(recipe: Recipe, attrs: dict[str, str], task: tuple[range, Path]) -> xr.Dataset:
-    """Collect one chunk on a worker; raises RuntimeError if its set would have other attributes."""
-    if (here := attributes_for(recipe)) != attrs:
-        raise RuntimeError(
-            f"this worker would make another set than the collector expects: it has {here}, "
-            f"not {attrs}; install the same package versions on both"
-        )
+def _make(recipe: Recipe, task: tuple[range, Path]) -> xr.Dataset:
+    """Collect one chunk, on a worker."""
     return collect_chunk(recipe, task[0])
 
 

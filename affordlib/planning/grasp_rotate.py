@@ -23,7 +23,10 @@ from affordlib.models.base import EffectModel, condition_on_primitives, rotate_i
 from affordlib.perception import adapt_to_object
 from affordlib.planning.effect_map import checked_image
 from affordlib.primitives import Grasp, Primitive, Rotate
-from affordlib.types import Goal, Step, check_finite, check_pair, check_within
+from affordlib.types import Goal, Step
+
+MAX_TURNS = 7
+"""Maximum number of rotations: 360° in sweeps of 60°, and one more for the error of aligning."""
 
 N_PHASES = 301
 Z_90 = 1.28
@@ -34,11 +37,6 @@ FULL_ROTATION_SHARE = 0.9
 
 GRIPPER_YAWS_RAD = tuple(np.radians([0, 15, -15, 30, -30, 45, -45, 60, -60, 75, -75, 90]).tolist())
 """Candidate gripper yaws, by magnitude; they cover 180°, since the two fingers are identical."""
-
-
-def aligned_gripper_yaws(yaw_rad: float) -> tuple[float, ...]:
-    """Gripper yaws that grasp, without rotating it, an object released at another gripper yaw."""
-    return tuple(wrap_angle(yaw_rad + k * math.pi / 2) for k in (0, 1, -1))
 
 
 @dataclass(frozen=True)
@@ -66,7 +64,7 @@ def predict_trajectories(
 
     Raises ValueError where the model has no such channel.
     """
-    yaws = tuple(check_finite("gripper_yaws_rad", yaw) for yaw in gripper_yaws_rad)
+    yaws = tuple(float(yaw) for yaw in gripper_yaws_rad)
     if channel not in model.effect_channels:
         raise ValueError(
             f"channel {channel!r} is not among the effects {model.effect_channels} of the model; "
@@ -102,8 +100,7 @@ def candidate_turns(
     angle while the object is held. If there is none, it is the full rotation of lowest σ that turns
     the object by most of its sweep, and another step has to follow.
     """
-    wanted = wrap_angle(check_finite("turn_rad", turn_rad))
-    place, phase = check_pair("xy_m", xy_m), predicted.phase
+    wanted, phase = wrap_angle(turn_rad), predicted.phase
     closed, opening = Rotate().segment_phases[2], Rotate().segment_phases[-2]
     held = (phase >= closed) & (phase <= opening)
     stops = [
@@ -124,7 +121,7 @@ def candidate_turns(
             k, stop = left[np.where(enough, predicted.std[left, -1], np.inf).argmin()], 1.0
         turned = float(np.interp(stop, phase, predicted.mean[k]))
         primitive = Rotate(predicted.gripper_yaws_rad[k])
-        yield _step_at(place, primitive, stop, predicted_turn_rad=turned)
+        yield _step_at(xy_m, primitive, stop, predicted_turn_rad=turned)
         left.remove(k)
 
 
@@ -136,32 +133,28 @@ def candidate_lifts(
 
     The best has the highest mean - σ of the height; ties, to a centimetre, go to the first.
     """
-    height = check_within("height_m", height_m, 0.0, 0.5, "m")
-    place, phase = check_pair("xy_m", xy_m), predicted.phase
+    phase = predicted.phase
     surely = (predicted.mean - predicted.std)[:, -1].round(2)
     for k in np.argsort(-surely, kind="stable"):
         mean, std = predicted.mean[k], predicted.std[k]
         primitive = Grasp(grip_yaw=predicted.gripper_yaws_rad[k])
         closed = phase >= primitive.segment_phases[-2]
-        if mean.max() < height <= mean[-1] + Z_90 * std[-1]:
+        if mean.max() < height_m <= mean[-1] + Z_90 * std[-1]:
             # The object may slip; if it does not, it moves with the hand.
             hand = primitive.path(phase)[:, 2]
             mean = np.maximum(hand - hand[closed][0], 0.0)
-        stops = crossings(phase[closed], mean[closed], height)
+        stops = crossings(phase[closed], mean[closed], height_m)
         if not len(stops):
             return
-        yield _step_at(place, primitive, float(stops[0]), predicted_height_m=height)
+        yield _step_at(xy_m, primitive, float(stops[0]), predicted_height_m=height_m)
 
 
 def _step_at(
-    place: tuple[float, float], primitive: Grasp | Rotate, stop_phase: float, **predicted: float
+    xy_m: Sequence[float], primitive: Grasp | Rotate, stop_phase: float, **predicted: float
 ) -> Step:
     """A step that does not change the object's position."""
-    return Step(primitive, stop_phase, place, np.array([place, place]), std_m=0.0, **predicted)
-
-
-MAX_TURNS = 7
-"""Maximum number of rotations: 360° in sweeps of 60°, and one more for the error of aligning."""
+    path_xy_m = np.array([xy_m, xy_m])
+    return Step(primitive, stop_phase, tuple(xy_m), path_xy_m, std_m=0.0, **predicted)
 
 
 @dataclass(frozen=True)
@@ -218,14 +211,19 @@ class PosePlanner:
         grip_yaw: that of a hand that has just released it: the grasp has the same, since another
         would rotate the object.
         """
-        yaws = GRIPPER_YAWS_RAD if grip_yaw is None else aligned_gripper_yaws(grip_yaw - turned_rad)
+        yaws = GRIPPER_YAWS_RAD
+        if grip_yaw is not None:
+            quarters = (0.0, math.pi / 2, -math.pi / 2)
+            yaws = tuple(wrap_angle(grip_yaw - turned_rad + quarter) for quarter in quarters)
         predicted = self._predicted(Grasp, "z", yaws)
         return self._first(candidate_lifts(predicted, xy_m, height_m), turned_rad)
 
     def _first(self, candidates: Iterator[Step], turned_rad: float) -> Step | None:
         """The first candidate that the arm can execute, for an object that has rotated."""
         for step in candidates:
-            yaw = _smallest_yaw(step.primitive.grip_yaw + turned_rad)
+            yaw = step.primitive.grip_yaw + turned_rad
+            # The equivalent yaw of smallest magnitude, the two fingers being identical.
+            yaw = (yaw + math.pi / 2) % math.pi - math.pi / 2
             step = replace(
                 step,
                 primitive=replace(step.primitive, grip_yaw=yaw),
@@ -249,8 +247,3 @@ class PosePlanner:
 def released_yaw(step: Step) -> float:
     """Yaw [rad] of the hand at the end of a step."""
     return float(step.primitive.path(step.stop_phase)[0, 3])
-
-
-def _smallest_yaw(yaw_rad: float) -> float:
-    """The equivalent yaw of smallest magnitude, the two fingers being identical."""
-    return (yaw_rad + math.pi / 2) % math.pi - math.pi / 2

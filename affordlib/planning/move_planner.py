@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 
 from affordlib.geometry import unit_vector
-from affordlib.planning.effect_map import EffectMap
 from affordlib.planning.problem import PlanMode, Planner, PlanningProblem, Reachable
 from affordlib.planning.robot import Robot
 from affordlib.planning.skills import Skills
@@ -56,7 +55,10 @@ class MovePlanner:
     def _plan(self, seen: Observation, goal: Goal, kind: type[Move] | None = None) -> Plan | Ending:
         effects, refused = self.skills.effects(seen.image, kind), len(self._refused)
         try:
-            whole = self._problem(effects, seen, goal)
+            allowed, obstacles = self._allowed(effects.kind), seen.obstacles
+            whole = PlanningProblem(
+                seen.xy_m, goal, effects, self.mode, allowed, obstacles=obstacles
+            )
         except ValueError as error:
             return Ending("unreachable", f"the position: {error}")
         distance_m = goal.distance_m(seen.xy_m)
@@ -99,7 +101,8 @@ class MovePlanner:
             elif not whole.reachable(stop[None], np.array([math.atan2(left[1], left[0])]))[0]:
                 continue
             try:
-                problem = self._problem(effects, seen, Goal(tuple(stop.tolist()), goal.tolerance_m))
+                near = Goal(tuple(stop.tolist()), goal.tolerance_m)
+                problem = replace(whole, goal=near, reachable=self._allowed(effects.kind))
             except ValueError:  # off the table, or on an obstacle
                 continue
             if plan := self._plan_to(problem, goal, within_m):
@@ -117,12 +120,6 @@ class MovePlanner:
                 return plan
             problem = replace(problem, reachable=self._allowed(problem.effects.kind))
         return None
-
-    def _problem(self, effects: EffectMap, seen: Observation, goal: Goal) -> PlanningProblem:
-        allowed = self._allowed(effects.kind)
-        return PlanningProblem(
-            seen.xy_m, goal, effects, self.mode, allowed, obstacles=seen.obstacles
-        )
 
     def _allowed(self, kind: type[Primitive]) -> Reachable:
         """Where the arm can act: learned reachability, without the actions refused so far."""

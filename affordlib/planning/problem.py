@@ -98,8 +98,6 @@ class PlanningProblem:
 
         begins: (n, 3), x, y [m] and turn [rad] before them; direction_rad, phase: (n,).
         """
-        if not self.obstacles:
-            return np.full(len(begins), np.inf)
         poses = poses_along(self.effects, begins, direction_rad, phase, N_POSES)
         angle, stop = direction_rad.numpy(), phase.numpy()
         return self.free_space.spare_m(self.effects.kind.towards(0.0), angle, stop, poses)

@@ -324,8 +324,6 @@ class PlacedObject:
 
     def states_of_centre(self, states: np.ndarray) -> np.ndarray:
         """Convert states (n, 7) of the centre of mass to those of the object's centre."""
-        if not self._centre_of_mass_m.any():
-            return states
         shift = Rotation.from_quat(states[:, 3:]).apply(self._centre_of_mass_m)
         return np.column_stack([states[:, :3] - shift, states[:, 3:]])
 
