@@ -48,6 +48,13 @@ def is_convex(corners: np.ndarray) -> bool:
     return len(corners) > 2 and bool((turns > 0).all()) and rounds < 1.5
 
 
+def edge_normals(corners: np.ndarray) -> np.ndarray:
+    """Return the outward unit normals (..., k, 2) of the edges of polygons (..., k, 2)."""
+    edges = np.roll(corners, -1, axis=-2) - corners
+    outward = np.stack([edges[..., 1], -edges[..., 0]], axis=-1)
+    return outward / np.linalg.norm(outward, axis=-1, keepdims=True)
+
+
 def centroid(corners: np.ndarray) -> np.ndarray:
     """Return the centroid (2,) of a polygon with the given corners (k, 2)."""
     following = np.roll(corners, -1, axis=0)

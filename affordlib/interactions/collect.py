@@ -43,7 +43,7 @@ from affordlib.types import (
 from affordlib.workers import spread
 from affordlib.world import CATEGORIES, Tabletop, TabletopObject, WorldConfig
 from affordlib.world.execution import RECORDED_SAMPLES
-from affordlib.world.trajectory import N_SAMPLES
+from affordlib.world.trajectory import N_SAMPLES, interpolated
 
 MOST_WORKERS = 256
 CHUNK = 50
@@ -195,9 +195,7 @@ def collect_chunk(recipe: Recipe, numbers: range) -> xr.Dataset:
             row = dict.fromkeys(parameters, np.nan) | _row(obj, done, world.config)
             if recipe.partial:
                 _, full = interact(recipe, number, world, stop_phase=1.0)
-                row["full_effect"] = [
-                    np.interp(done.stop_phase, full.phase, effect) for effect in full.effect.T
-                ]
+                row["full_effect"] = interpolated(done.phase[-1:], full.phase, full.effect)[0]
             rows.append(row | {"interaction": number})
     data = {"phase": ("sample", np.linspace(0, 1, N_SAMPLES), _PHASE)}
     for name, (dtype, dims, *about) in variables.items():

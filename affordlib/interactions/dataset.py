@@ -82,8 +82,6 @@ class Scaler:
     """Scales that normalise channels to unit RMS without an offset; x and y share one scale.
 
     An action channel that is always zero keeps its unit: a query may have another value there.
-
-    image_mean, image_std: mean and standard deviation of depth and mask.
     """
 
     action_scale: tuple[float, ...]
@@ -116,11 +114,7 @@ _BY_INTERACTION = ("image", "action", "effect", "stop_phase")
 
 @dataclass(frozen=True)
 class InteractionTensors:
-    """Interactions as tensors.
-
-    Raises ValueError for numbers that are not in metres and radians, relative to the object's pose
-    at the start.
-    """
+    """Interactions as tensors in metres and radians, relative to the object's pose at the start."""
 
     image: torch.Tensor  # (N, 2, 48, 48), depth [m] and mask
     phase: torch.Tensor  # (S,)
@@ -273,10 +267,7 @@ def condition_on_recorded_action(tensors: InteractionTensors) -> Observations:
 def condition_on_poses(
     tensors: InteractionTensors, start: torch.Tensor, n_poses: int
 ) -> Observations:
-    """Return a context of the action at t = 0 and 1, and n_poses effects from sample `start` (N,).
-
-    With n_poses = 0 only the action is observed (w₁ = 1), otherwise both (w₁ = 1/2).
-    """
+    """Return a context of the action at t = 0 and 1, and n_poses effects from samples (N,) on."""
     at = start[:, None] + torch.arange(n_poses)
     effect = tensors.effect_at(at) if n_poses else None
     return Observations.of(tensors, tensors.action_at(torch.tensor([0, -1])), effect)

@@ -132,9 +132,9 @@ def sample_world(recipe: Recipe, index: int, obj: TabletopObject) -> WorldConfig
 def interact(
     recipe: Recipe, index: int, world: Tabletop, stop_phase: float | None = None
 ) -> tuple[TabletopObject, Interaction]:
-    """Execute interaction `index` of a recipe; bit-identical in every process and order.
+    """Execute interaction `index` of a recipe, up to a phase (default: the recipe's).
 
-    stop_phase: phase at which the action stops (default: the recipe's).
+    It is bit-identical in every process and order.
     """
     obj, yaw, rng = sample_scene(recipe, index)
     kinds = [primitive_named(name) for name in recipe.primitives]

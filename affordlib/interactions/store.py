@@ -53,10 +53,7 @@ def dataset_sha256(data: "xarray.Dataset") -> str:
 
 
 def write_interactions(data: "xarray.Dataset", path: Path, level: int = 9) -> None:
-    """Write a set as one file, atomically; equal sets give identical bytes.
-
-    level: compression level from 0 to 9.
-    """
+    """Write a set as one file, atomically; equal sets give identical bytes."""
     from zarr.codecs import BloscCodec
     from zarr.storage import MemoryStore
 

@@ -96,11 +96,9 @@ def _free_chains(
         parent = rng.integers(len(direction), size=n)
         spread = np.where(np.arange(n) % 2, DIRECTION_SPREAD_RAD, math.pi)
         stop = rng.uniform(MIN_STOP_PHASE, 1.0, n) if problem.mode.partial else np.ones(n)
-        new = torch.from_numpy(bearing + spread * rng.uniform(-1, 1, n)), torch.from_numpy(stop)
-        direction, phase = (
-            torch.cat([old[parent], more[:, None]], dim=1)
-            for old, more in zip((direction, phase), new, strict=True)
-        )
+        angle = bearing + spread * rng.uniform(-1, 1, n)
+        direction = torch.cat([direction[parent], torch.from_numpy(angle)[:, None]], dim=1)
+        phase = torch.cat([phase[parent], torch.from_numpy(stop)[:, None]], dim=1)
         kept = free(problem, (direction, phase), last=True)
         direction, phase = direction[kept], phase[kept]
         if not len(direction):

@@ -152,10 +152,7 @@ class EffectMap:
         )
 
     def nearest(self, wanted_xy_m: Tensor, n: int, partial: bool) -> tuple[Tensor, Tensor]:
-        """Directions and phases (B, n) of the n actions ending nearest to wanted_xy_m (B, 2).
-
-        partial: whether actions may stop before phase 1.
-        """
+        """Directions and phases (B, n) of the n (partial) actions ending nearest points (B, 2)."""
         direction, phase, trees = self.fine_grid
         rows = torch.from_numpy(trees[partial].query(wanted_xy_m.numpy(), n)[1]).reshape(-1, n)
         if not partial:
@@ -171,10 +168,7 @@ class EffectMap:
 
     @torch.no_grad()
     def query(self, direction_rad: np.ndarray, t_target: Tensor) -> tuple[Tensor, Tensor]:
-        """Effects and σ (n, T, 3) of actions in n directions, by the model: ahead, left, turn.
-
-        t_target: (n, T).
-        """
+        """Effects and σ (n, T, 3) of actions in n directions at phases (n, T), by the model."""
         pushes = [self.kind.towards(float(angle)) for angle in direction_rad]
         observed = condition_on_primitives(self.model, pushes)
         channels = self.model.action_channels, self.model.effect_channels

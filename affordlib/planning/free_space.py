@@ -20,7 +20,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from affordlib.geometry import rotated_each, unit_vector
+from affordlib.geometry import edge_normals, rotated_each, unit_vector
 from affordlib.perception import adapt_to_object, outline_of, radius_m
 from affordlib.primitives import Primitive, Push, Rotate, min_jerk
 from affordlib.types import Obstacle, Step
@@ -60,19 +60,9 @@ def placed(corners: np.ndarray, poses: np.ndarray) -> np.ndarray:
     return rotated_each(corners, poses[..., 2, None]) + poses[..., None, :2]
 
 
-def _normals(corners: np.ndarray) -> np.ndarray:
-    """Outward unit normals (..., k, 2) of the edges of polygons (..., k, 2)."""
-    edges = np.roll(corners, -1, axis=-2) - corners
-    outward = np.stack([edges[..., 1], -edges[..., 0]], axis=-1)
-    return outward / np.linalg.norm(outward, axis=-1, keepdims=True)
-
-
 def gaps_m(obstacles: Sequence[np.ndarray], shapes: np.ndarray, far_m: float = FAR_M) -> np.ndarray:
-    """Gaps [m] (n, s - 1), at most far_m, to what n shapes (n, s, k, 2) sweep between s poses.
-
-    obstacles: corners (m, 2) of each.
-    """
-    (n, s, _, _), sides = shapes.shape, _normals(shapes)
+    """Gaps [m] (n, s - 1), at most far_m, between polygons and what n shapes (n, s, k, 2) sweep."""
+    (n, s, _, _), sides = shapes.shape, edge_normals(shapes)
     if not n:
         return np.empty((0, s - 1))
     way = (shapes[:, 1:] - shapes[:, :-1]).mean(axis=2, keepdims=True)
@@ -88,7 +78,7 @@ def gaps_m(obstacles: Sequence[np.ndarray], shapes: np.ndarray, far_m: float = F
     radius = np.hypot(*(corners - middles[:, None])).max(axis=0)
     gaps = np.full(len(radius), far_m)
     for polygon in obstacles:
-        centre, outward = polygon.mean(axis=0), _normals(polygon)
+        centre, outward = polygon.mean(axis=0), edge_normals(polygon)
         size = np.linalg.norm(polygon - centre, axis=-1).max()
         near = np.flatnonzero(np.hypot(*(middles.T - centre).T) < radius + size + far_m)
         before = _products(outward.T[..., None], corners[..., near]).min(axis=1)
@@ -135,7 +125,7 @@ class FreeSpace:
 
         An object covers its goal at least with the circle in its outline, however it has turned.
         """
-        inner = ring((_normals(self.outline_m) * self.outline_m).sum(axis=1).min())
+        inner = ring((edge_normals(self.outline_m) * self.outline_m).sum(axis=1).min())
         for k, (one, polygon) in enumerate(zip(self.obstacles, self.polygons, strict=True)):
             name = f"obstacles[{k}]"
             if one.height_m > HIGHEST_M:

@@ -41,10 +41,7 @@ GRIPPER_YAWS_RAD = tuple(np.radians([0, 15, -15, 30, -30, 45, -45, 60, -60, 75, 
 
 @dataclass(frozen=True)
 class PredictedTrajectories:
-    """Trajectories of one effect channel over phase (n,): mean and std (m, n) for m gripper yaws.
-
-    The effect is zero at the first phase.
-    """
+    """Mean and std (m, n) of an effect, zero at first, for m gripper yaws over the phase (n,)."""
 
     gripper_yaws_rad: tuple[float, ...]
     phase: np.ndarray
@@ -60,10 +57,7 @@ def predict_trajectories(
     channel: str,
     gripper_yaws_rad: Sequence[float] = GRIPPER_YAWS_RAD,
 ) -> PredictedTrajectories:
-    """Predict the effect of a primitive for each gripper yaw [rad].
-
-    Raises ValueError where the model has no such channel.
-    """
+    """Predict a channel of the effect of a primitive for each gripper yaw [rad]."""
     yaws = tuple(float(yaw) for yaw in gripper_yaws_rad)
     if channel not in model.effect_channels:
         raise ValueError(
@@ -192,10 +186,7 @@ class PosePlanner:
         return None if None in steps else tuple(replace(step, std_m=std_m) for step in steps)
 
     def turn(self, turn_rad: float, xy_m: Sequence[float], turned_rad: float = 0.0) -> Step | None:
-        """The best step that the arm can execute to rotate the object by an angle, or towards it.
-
-        turned_rad: its rotation since the image was taken.
-        """
+        """The best step that the arm can execute to rotate the object by, or towards, an angle."""
         predicted = self._predicted(Rotate, "yaw", GRIPPER_YAWS_RAD)
         return self._first(candidate_turns(predicted, xy_m, turn_rad), turned_rad)
 

@@ -24,10 +24,7 @@ _REMEDY = "learn it again with python -m experiments.shipped reachability"
 
 
 class Reachability(nn.Module):
-    """Predicts the probability that the arm can execute a primitive at a position.
-
-    primitives: names of those that it is trained on.
-    """
+    """Predicts the probability that the arm can execute one of some primitives at a position."""
 
     def __init__(self, primitives: Sequence[str]) -> None:
         super().__init__()
@@ -42,10 +39,7 @@ class Reachability(nn.Module):
 
     @classmethod
     def load(cls, path: str | Path | None = None) -> Self:
-        """Load a saved network; default: the shipped one, trained on the set `reach`.
-
-        Raises FileNotFoundError, or ValueError when the file is damaged or of another network.
-        """
+        """Load a saved network; default: the shipped one, trained on the set `reach`."""
         path = Path(path or repo_root() / SHIPPED)
         return restored(path, _REMEDY, lambda described: cls(described["primitives"]))[0]
 

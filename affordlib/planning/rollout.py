@@ -52,10 +52,7 @@ def roll_out(
 def poses_along(
     effects: EffectMap, begins: np.ndarray, direction_rad: Tensor, phase: Tensor, n_poses: int
 ) -> np.ndarray:
-    """Poses (n, n_poses, 3) of the object during actions, from begins (n, 3): x, y [m], turn [rad].
-
-    direction_rad, phase: (n,).
-    """
+    """Poses (n, n_poses, 3) of the object in n actions, from poses (n, 3): x, y [m], turn [rad]."""
     first = effects.kind.acts_from
     phases = first + (phase - first).clamp_min(0)[:, None] * torch.linspace(0, 1, n_poses)
     begins = torch.tensor(begins)

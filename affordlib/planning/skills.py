@@ -82,10 +82,7 @@ class Skills:
         return PlanningProblem(start_xy_m, goal, effects, mode, *more)
 
     def effects(self, image: np.ndarray, kind: type[Move] | None = None) -> EffectMap:
-        """Effect map of the object in an image (2, 48, 48); cached for the last image.
-
-        kind: the primitive (default: `kind_for` the image).
-        """
+        """Effect map of a primitive, by default `kind_for` the image; cached for the last image."""
         if kind in (None, self.kind_for(image)):
             return self._predictions(image)[0]
         return EffectMap(self.model(kind), image, kind)
@@ -102,10 +99,7 @@ class Skills:
     def pose_planner(
         self, image: np.ndarray, can_act: Callable[[Step], bool] | None = None
     ) -> PosePlanner:
-        """Planner of rotations and lifts of the object in an image (2, 48, 48).
-
-        can_act: whether the arm can execute a step (default: by the learned reachability).
-        """
+        """Planner of rotations and lifts where the arm can act, by default as learned."""
         return PosePlanner(image, self.model, can_act or self._can_act)
 
     def _can_act(self, step: Step) -> bool:

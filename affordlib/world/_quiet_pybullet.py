@@ -2,14 +2,11 @@
 
 import os
 
-_saved = [(stream, os.dup(stream)) for stream in (1, 2)]
-_null = os.open(os.devnull, os.O_WRONLY)
+_saved, _null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
 try:
-    for _stream, _ in _saved:
-        os.dup2(_null, _stream)
+    os.dup2(_null, 2)
     import pybullet  # noqa: F401
 finally:
-    for _stream, _copy in _saved:
-        os.dup2(_copy, _stream)
-        os.close(_copy)
+    os.dup2(_saved, 2)
+    os.close(_saved)
     os.close(_null)

@@ -24,6 +24,7 @@ from affordlib.world.trajectory import (
     UP,
     Command,
     TrajectorySegment,
+    interpolated,
     joint_move,
     line,
     plan_motion,
@@ -291,19 +292,15 @@ def _interaction(
     return replace(
         unreached(command, placed, seen),
         reached=True,
-        effect=_interpolated(command.phase, at_sample, recorded - origin),
+        effect=interpolated(command.phase, at_sample, recorded - origin),
         rest_effect=rest - origin,
         start_pose=(float(start[0]), float(start[1]), float(recorded[0, YAW])),
         tracking_error_m=recording.off_path_m,
-        tool=_interpolated(seldom, at_waypoint, tool),
+        tool=interpolated(seldom, at_waypoint, tool),
         penetration_m=recording.penetration_m,
         left_table=placed.left_table(),
         fell=placed.fell(),
     )
-
-
-def _interpolated(phase: np.ndarray, at: np.ndarray, values: np.ndarray) -> np.ndarray:
-    return np.column_stack([np.interp(phase, at, column) for column in values.T])
 
 
 def unreached(command: Command, placed: PlacedObject, seen: Observation) -> Interaction:

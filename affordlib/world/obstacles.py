@@ -10,6 +10,7 @@ import numpy as np
 import pybullet
 from pybullet_utils.bullet_client import BulletClient
 
+from affordlib.geometry import edge_normals
 from affordlib.types import Obstacle
 from affordlib.world.camera import HIDDEN_M
 from affordlib.world.objects import HULL_MARGIN_M, mesh, set_friction
@@ -69,9 +70,7 @@ def _shapes(one: Obstacle) -> tuple[dict[str, Any], dict[str, Any], tuple[float,
         at = (*one.corners_m[0], one.height_m / 2)
         return disc | {"height": one.height_m}, disc | {"length": one.height_m}, at
     corners = np.array(one.corners_m)
-    edges = np.roll(corners, -1, axis=0) - corners
-    outward = np.column_stack([edges[:, 1], -edges[:, 0]])
-    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    outward = edge_normals(corners)
     before = np.roll(outward, 1, axis=0)
     inset = HULL_MARGIN_M / (1 + (outward * before).sum(axis=1, keepdims=True))
     inner = corners - inset * (outward + before)

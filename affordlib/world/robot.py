@@ -40,13 +40,6 @@ _ARM_RGBA = {"shoulder_link": "0.30 0.45 0.60 1", "wrist_1_link": "0.30 0.45 0.6
 _GREY, _DARK, _RED = "0.72 0.74 0.77 1", "0.25 0.27 0.30 1", "0.75 0.25 0.15 1"
 
 
-def _description_folder() -> Path:
-    for file in metadata.files("example-robot-data") or []:
-        if file.name == "ur10_robot.urdf":
-            return Path(file.locate()).resolve().parents[2]
-    raise FileNotFoundError("example-robot-data has no UR10 description; run `make setup` again")
-
-
 def _box(
     name: str, size: str, centre: str, mass_kg: float, rgba: str, *joint: str, axis: str = ""
 ) -> str:
@@ -92,7 +85,8 @@ def robot_description(tool: str = "gripper") -> str:
 
     Massless frames are removed, because PyBullet would give each of them a mass of 1 kg.
     """
-    folder = _description_folder()
+    package = metadata.distribution("example-robot-data")
+    folder = Path(package.locate_file("cmeel.prefix/share/example-robot-data/robots"))
     root = ET.parse(folder / "ur_description" / "urdf" / "ur10_robot.urdf").getroot()
     dropped = {"ee_link", "base", "tool0", "world"}
     for element in list(root):
@@ -173,10 +167,7 @@ def inverse_kinematics(
 
 
 def joint_path(poses_W: np.ndarray, near: np.ndarray, tool: str = "gripper") -> np.ndarray:
-    """Compute continuous joint angles (n, 6) along tool poses (n, 6), as those of `Segment`.
-
-    Raises UnreachableError if a pose is out of reach.
-    """
+    """Compute continuous joint angles (n, 6) along tool poses (n, 6), as those of `Segment`."""
     joints = np.empty((len(poses_W), 6))
     last = None
     for i, pose in enumerate(poses_W.tolist()):

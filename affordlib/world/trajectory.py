@@ -66,9 +66,13 @@ class Command:
         if length[-1] > 1e-9:
             wanted = min_jerk(np.linspace(0, 1, n + 1)) * length[-1]
             at_phase = np.interp(wanted, length, phase)
-            for c in range(5):
-                poses[:, c] = np.interp(wanted, length, action[:, c])
+            poses[:, :5] = interpolated(wanted, length, action)
         return cls(primitive, phase, action, [TrajectorySegment(poses, at_phase)])
+
+
+def interpolated(at: np.ndarray, known_at: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return columns (n, c) of values (m, c), interpolated linearly."""
+    return np.column_stack([np.interp(at, known_at, column) for column in values.T])
 
 
 def segments_until(primitive: Primitive, stop_phase: float) -> list[TrajectorySegment]:
