@@ -106,10 +106,6 @@ class ClosedLoopConfig(Checked):
     on_action: Callable[[Plan, int], None] = lambda *_: None
     on_plan: Callable[[Plan], None] = lambda *_: None
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        object.__setattr__(self, "mode", PlanMode.of(self.mode))
-
 
 @dataclass(frozen=True)
 class ClosedLoopResult:
@@ -175,7 +171,7 @@ class _ClosedLoop:
         config: ClosedLoopConfig,
     ) -> None:
         self.robot, self.goal_now, self.skills, self.config = robot, goal_now, skills, config
-        self.moves = MovePlanner(robot, skills, planner, config.mode)
+        self.moves = MovePlanner(robot, skills, planner, PlanMode.of(config.mode))
         self.goal = self.acted_for = goal_now()  # updated before each action and after a lift
         self.steps: list[Step] = []
         self.executions: list[Execution] = []

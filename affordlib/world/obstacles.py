@@ -21,8 +21,8 @@ _RGBA = (0.55, 0.45, 0.38, 1.0)
 class PlacedObstacles:
     """The obstacles in a client, with the lateral friction of the table.
 
-    shown: ids of the bodies in pictures; touched: largest force [N] so far between an obstacle and
-    the object or the arm, by the obstacle's number and "object" or "arm", where there was any.
+    shown: ids of the bodies in pictures; touched: numbers of the obstacles that were touched so
+    far, each with "object" or "arm".
     """
 
     def __init__(
@@ -30,7 +30,7 @@ class PlacedObstacles:
     ) -> None:
         self.client, self.all = client, tuple(obstacles)
         self.shown: list[int] = []
-        self.touched: dict[tuple[int, str], float] = {}
+        self.touched: set[tuple[int, str]] = set()
         self._felt: list[int] = []
         for one in self.all:
             felt, seen, at = _shapes(one)
@@ -58,9 +58,9 @@ class PlacedObstacles:
         """Note which obstacles the object's body and the arm touch at present."""
         for k, felt in enumerate(self._felt):
             for name, other in (("object", body), ("arm", arm)):
-                force = sum(contact[9] for contact in self.client.getContactPoints(other, felt))
-                if force > 0.0:
-                    self.touched[k, name] = max(force, self.touched.get((k, name), 0.0))
+                contacts = self.client.getContactPoints(other, felt)
+                if sum(contact[9] for contact in contacts) > 0.0:
+                    self.touched.add((k, name))
 
 
 def _shapes(one: Obstacle) -> tuple[dict[str, Any], dict[str, Any], tuple[float, ...]]:
