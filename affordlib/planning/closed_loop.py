@@ -20,7 +20,7 @@ from affordlib.geometry import wrap_angle
 from affordlib.perception import adapt_to_object, looks_fallen, turn_between
 from affordlib.planning.continuous import plan_continuous
 from affordlib.planning.free_space import FreeSpace
-from affordlib.planning.grasp_rotate import released_yaw
+from affordlib.planning.grasp_rotate import PosePlanner, released_yaw
 from affordlib.planning.move_planner import Ending, MovePlanner
 from affordlib.planning.problem import PlanMode, Planner
 from affordlib.planning.robot import Execution, Robot
@@ -358,7 +358,7 @@ class _ClosedLoop:
                 refused.add(primitive.name)
             return can
 
-        poses = self.skills.pose_planner(self.seen.image, can_act)
+        poses = PosePlanner(self.seen.image, self.skills.model, can_act)
         if part == "orientation":
             step = poses.turn(error.left, (x, y))
         else:

@@ -161,7 +161,7 @@ class PosePlanner:
 
     image: np.ndarray
     model: Callable[[type[Primitive]], EffectModel]
-    can_act: Callable[[Step], bool] = lambda _: True
+    can_act: Callable[[Step], bool]
     _kept: dict[tuple[type, tuple[float, ...]], PredictedTrajectories] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )

@@ -1,6 +1,6 @@
 """The skills of a robot: a model for each primitive, and where its arm can act."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar, Self
 
@@ -77,7 +77,7 @@ class Skills:
         effects, poses = self._predictions(image)
         if obstacles and poses:
             space = FreeSpace(obstacles, image, start_xy_m, effects.outline_m)
-            poses = self.pose_planner(image, lambda s: self._can_act(s) and space.is_free(s))
+            poses = PosePlanner(image, self.model, lambda s: self._can_act(s) and space.is_free(s))
         more = self.reachable(effects.kind), poses, tuple(obstacles)
         return PlanningProblem(start_xy_m, goal, effects, mode, *more)
 
@@ -91,16 +91,10 @@ class Skills:
         key = np.ascontiguousarray(image).tobytes()
         if key not in self._last:
             kind, both = self.kind_for(image), {Rotate.name, Grasp.name} <= set(self.models)
-            poses = self.pose_planner(image) if both else None
+            poses = PosePlanner(image, self.model, self._can_act) if both else None
             self._last.clear()
             self._last[key] = EffectMap(self.model(kind), image, kind), poses
         return self._last[key]
-
-    def pose_planner(
-        self, image: np.ndarray, can_act: Callable[[Step], bool] | None = None
-    ) -> PosePlanner:
-        """Planner of rotations and lifts where the arm can act, by default as learned."""
-        return PosePlanner(image, self.model, can_act or self._can_act)
 
     def _can_act(self, step: Step) -> bool:
         at = np.array([step.predicted_end_xy_m])
