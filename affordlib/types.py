@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Sequence
+from contextlib import suppress
 from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import partial
 from numbers import Integral, Real
@@ -53,9 +54,10 @@ class NothingSeenError(RuntimeError):
 def check_finite(name: str, value: Any) -> float:
     """Return `value` as a float; raises ValueError unless it is a finite number."""
     known = isinstance(value, Real) and not isinstance(value, bool)
-    if not known or not -LARGEST < value < LARGEST:
-        raise ValueError(f"{name} must be a finite number, got {value!r}")
-    return float(value)
+    with suppress(OverflowError):
+        if known and -LARGEST < float(value) < LARGEST:
+            return float(value)
+    raise ValueError(f"{name} must be a finite number, got {value!r:.200}")
 
 
 def check_within(name: str, value: Any, low: float, high: float, unit: str = "") -> float:
@@ -85,14 +87,14 @@ def check_count(name: str, value: Any, least: int = 1, most: float = math.inf) -
     """Return `value`; raises ValueError unless it is a whole number in [least, most]."""
     if isinstance(value, bool) or not isinstance(value, Integral) or not least <= value <= most:
         span = f"of at least {least}" if most == math.inf else f"in [{least}, {most:g}]"
-        raise ValueError(f"{name} must be a whole number {span}, got {value!r}")
+        raise ValueError(f"{name} must be a whole number {span}, got {value!r:.200}")
     return int(value)
 
 
 def check_choice(name: str, value: Any, known: Collection[Any]) -> Any:
     """Return `value`; raises ValueError unless it is one of `known`."""
     if value not in known:
-        raise ValueError(f"{name} must be one of {sorted(known)}, got {value!r}")
+        raise ValueError(f"{name} must be one of {sorted(known)}, got {value!r:.200}")
     return value
 
 
@@ -147,7 +149,7 @@ def check_pair(name: str, pair: Any, what: str = "(x, y) [m]") -> tuple[float, f
     try:
         one, other = (check_finite(name, value) for value in pair)
     except (TypeError, ValueError):
-        raise ValueError(f"{name} must be two finite numbers {what}, got {pair!r}") from None
+        raise ValueError(f"{name} must be two finite numbers {what}, got {pair!r:.200}") from None
     return one, other
 
 

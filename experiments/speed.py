@@ -28,11 +28,7 @@ from experiments.runner import Rows
 from experiments.tasks import frozen_tasks
 
 MODES = {"single_partial": "one action", "multi_partial": "up to three actions"}
-PLANNERS = {
-    "A*, to the disc": partial(plan_astar, heuristic="disc"),
-    "continuous": plan_continuous,
-    "first plan": partial(plan_continuous, draft=True),
-}
+PLANNERS = {"A*, to the disc": partial(plan_astar, heuristic="disc"), "continuous": plan_continuous}
 
 
 def seconds(work: Callable[[], object]) -> float:

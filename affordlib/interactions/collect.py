@@ -131,6 +131,8 @@ def collect(
             how = {"data_vars": "minimal", "combine_attrs": "override"}
             write_interactions(xr.concat(chunks, "interaction", **how), file)
         except (KeyboardInterrupt, OSError, RuntimeError) as error:
+            if isinstance(error, OSError) and _attributes(file) == attrs:
+                return file  # another process has just completed it
             error.add_note("finished chunks are kept; collect into the same path to continue")
             raise
     shutil.rmtree(parts, ignore_errors=True)  # also of a process that was killed at its very end

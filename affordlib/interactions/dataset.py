@@ -67,11 +67,10 @@ def split_interactions(n: int, seed: int = 0, fold: int = 0, n_folds: int = 10) 
 
     Each interaction has its own object, so the split is by object.
     """
-    check_count("n", n, 3, 10_000_000)
-    check_count("n_folds", n_folds, 3, n)
-    check_count("fold", fold, 0, n_folds - 1)
-    check_count("seed", seed, least=0)
-    blocks = np.array_split(np.random.default_rng(seed).permutation(n), n_folds)
+    n_folds = check_count("n_folds", n_folds, 3, check_count("n", n, 3, 10_000_000))
+    fold = check_count("fold", fold, 0, n_folds - 1)
+    rng = np.random.default_rng(check_count("seed", seed, least=0))
+    blocks = np.array_split(rng.permutation(n), n_folds)
     test, validation = fold, (fold + 1) % n_folds
     train = np.concatenate([b for k, b in enumerate(blocks) if k not in (test, validation)])
     return Split(np.sort(train), np.sort(blocks[validation]), np.sort(blocks[test]))

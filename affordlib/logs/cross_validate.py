@@ -34,7 +34,7 @@ def cross_validate(
     model, group, number of the push, n_train, position_m and yaw_rad, the errors, the shares of x,
     y and yaw inside the 50 and 90 % intervals, and the largest of their errors over σ.
     """
-    check_count("folds", folds, 2)
+    folds = check_count("folds", folds, 2)
     check_choice("within", within, ("group", "all"))
     for name in models:
         check_choice("models", name, MODELS)
@@ -111,5 +111,6 @@ def forecast_errors(model: PushModel, test: LoggedPushes) -> pd.DataFrame:
     off = np.abs(mean - np.column_stack([test.displacement_m, test.turn_rad]))
     inside = {f"inside_{p}": (off < norm.ppf(0.5 + p / 200) * std).mean(axis=1) for p in (50, 90)}
     errors = {"position_m": np.hypot(off[:, 0], off[:, 1]), "yaw_rad": off[:, 2]}
-    inside["error_over_std"] = (off / std).max(axis=1)
+    over = np.divide(off, std, out=np.where(off > 0, np.inf, 0.0), where=std > 0)
+    inside["error_over_std"] = over.max(axis=1)
     return pd.DataFrame({"group": test.groups} | errors | inside)

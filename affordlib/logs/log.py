@@ -164,6 +164,8 @@ class Log:
         """
         name = str(len(self.names) + len(self.refused)) if name is None else str(name)
         try:
+            if name in self.names:
+                raise ValueError("another push has this name; give each push its own")
             tool = _rows("tool_xy", tool_xy, 2) * self._metres
             t = _growing("tool_t", tool_t, len(tool))
             ends = self._ends(t, poses, poses_t)
@@ -181,11 +183,11 @@ class Log:
 
     def add_all(self, pushes: Iterable[Mapping[str, Any]]) -> dict[str, str]:
         """Add pushes, each the arguments of `add`; returns why some were refused, by name."""
-        before = {*self.refused}
+        before = dict(self.refused)
         for each in pushes:
             with suppress(ValueError):
                 self.add(**each)
-        return {name: why for name, why in self.refused.items() if name not in before}
+        return {name: why for name, why in self.refused.items() if before.get(name) is not why}
 
     def from_contact(self, contact: Any, direction: Any, length: float, pose: Any) -> dict:
         """Times and path of a tool that was not recorded, as arguments of `add`.
@@ -354,8 +356,12 @@ def _rows(
 
 
 def _growing(name: str, times: Any, n: int) -> np.ndarray:
-    if getattr(times, "dtype", np.dtype(float)).kind == "M":  # dates, as nanoseconds
-        times = np.asarray(times, "datetime64[ns]").astype(np.int64)
+    missing = np.ma.getmaskarray(np.ma.asarray(times))
+    if getattr(getattr(times, "dtype", None), "kind", "") == "M":  # dates, as nanoseconds
+        times = np.asarray(times, "datetime64[ns]")
+        missing, times = missing | np.isnat(times), times.astype(np.int64)
+    if missing.any():
+        raise ValueError(f"{name} has no time in row {missing.argmax()}; drop the row")
     t = check_array(name, times)
     if t.shape != (n,):
         raise ValueError(f"{name} must be {n} times, one for each row, got {t.shape}")

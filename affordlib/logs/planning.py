@@ -172,7 +172,8 @@ class PushPlanner:
         began = time.perf_counter()
         x, y, yaw = check_array("pose", pose, 3).tolist()
         check_within("yaw of pose", yaw, -2 * math.pi, 2 * math.pi, "rad")
-        check_count("n_pushes", n_pushes, 1, 3)
+        check_within("the distance of pose from the frame's origin", math.hypot(x, y), 0, 100, "m")
+        n_pushes = check_count("n_pushes", n_pushes, 1, 3)
         if tool_xy_m is not None:
             away_m = math.dist(check_pair("tool_xy_m", tool_xy_m), (x, y))
             check_within("the distance of tool_xy_m from pose", away_m, 0.0, 100.0, "m")

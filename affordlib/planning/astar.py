@@ -18,9 +18,9 @@ import torch
 from affordlib.planning.effect_map import EffectMap
 from affordlib.planning.problem import PlanningProblem
 from affordlib.planning.rollout import make_steps
-from affordlib.types import Plan, check_choice, check_count, check_within, on_table
+from affordlib.types import Plan, check_array, check_choice, check_count, check_within, on_table
 
-N_DIRECTIONS = 36
+N_DIRECTIONS, MOST_STOPS = 36, 100
 HEURISTICS = ("goal", "disc")
 STOP_PHASES = (0.2, 0.4, 0.6, 0.8, 1.0)
 PRUNE_BELOW_M = 0.001
@@ -46,10 +46,11 @@ class BranchTable:
         n_directions: int = N_DIRECTIONS,
         stop_phases: Sequence[float] = STOP_PHASES,
     ) -> None:
-        check_count("n_directions", n_directions, 1, 720)
+        n_directions = check_count("n_directions", n_directions, 1, 720)
+        stop_phases = check_array("stop_phases", stop_phases).ravel().tolist()
+        if len(stop_phases) > MOST_STOPS:
+            raise ValueError(f"stop_phases must be at most {MOST_STOPS}, got {len(stop_phases)}")
         stop_phases = [check_within("stop_phases", phase, 1e-3, 1.0) for phase in stop_phases]
-        if not stop_phases:
-            raise ValueError("stop_phases must hold at least one phase in (0, 1], got none")
         between = 2 * math.pi / n_directions
         finer = math.ceil(between / YAW_STEP_RAD)
         self._step_rad = between / finer

@@ -38,12 +38,10 @@ from affordlib.types import (
     UnreachableError,
     check_count,
     count,
+    number,
     on_table,
     parameter,
 )
-
-SURPRISE_M = 0.002
-"""Distance [m] of the object from its predicted position above which the loop plans again."""
 
 DISPLACED_M = 0.03
 """Distance [m] above which others have displaced it; the loop then waits until it is at rest."""
@@ -92,7 +90,8 @@ def _outcome(robot: Robot, plan: Plan, done: Sequence[Execution]) -> Outcome:
 class ClosedLoopConfig(Checked):
     """Patience and callbacks of a closed loop.
 
-    mode: of its plans. max_actions: by default a number that grows with the distance, renewed when
+    surprise_m: distance of the object from its predicted position above which it plans again. mode:
+    of its plans. max_actions: by default a number that grows with the distance, renewed when
     the goal moves or, up to max_renewals times, when somebody displaces the object. n_images:
     number of images averaged per observation; eight of the Kinect give the rotation to one degree.
     on_action: called after each action with the plan and the number of actions so far; on_plan:
@@ -103,6 +102,7 @@ class ClosedLoopConfig(Checked):
     max_actions: int | None = parameter(partial(check_count, least=0), None)
     max_renewals: int = count(3, 0)
     n_images: int = count(1, 1, 100)
+    surprise_m: float = number(1e-6, 10.0, "m", 0.002)
     on_action: Callable[[Plan, int], None] = lambda *_: None
     on_plan: Callable[[Plan], None] = lambda *_: None
 
@@ -229,7 +229,7 @@ class _ClosedLoop:
             self.renewals -= not goal_moved
             self.turn_allowed &= not goal_moved  # a new goal may need a full rotation again
             self.limit = max(self.limit, len(self.steps) + self._limit_from(seen.xy_m))
-        if off_m > SURPRISE_M or goal_moved or fell or obstacle_moved:
+        if off_m > self.config.surprise_m or goal_moved or fell or obstacle_moved:
             self.queue = []
         return None
 

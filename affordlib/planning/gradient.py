@@ -27,7 +27,7 @@ from affordlib.planning.effect_map import EffectMap
 from affordlib.planning.free_space import N_POSES
 from affordlib.planning.problem import PlanningProblem
 from affordlib.primitives import Drag
-from affordlib.types import Checked, Plan, Step, check_choice, check_count, count, parameter
+from affordlib.types import Checked, Plan, Step, check_choice, check_count, count, number, parameter
 
 DESCENTS = {"gradient": (torch.optim.SGD, 0.3), "adam": (torch.optim.Adam, 0.001)}
 """Optimiser and its rate, the best on the validation goals (`RATES` of `experiments.planning`)."""
@@ -52,7 +52,7 @@ class Reading(Checked):
     descent: str = parameter(partial(check_choice, known=DESCENTS), "gradient")
     start: str = parameter(partial(check_choice, known=("ring", "circle")), "ring")
     finds: str = parameter(partial(check_choice, known=STILL), "direction")
-    rate: float | None = None
+    rate: float | None = number(1e-9, 1e3, default=None)
     starts: int = count(1, 1, 100)
 
 
@@ -111,7 +111,7 @@ def plan_gradient(
     Where no start leads nearer to the goal, they are drawn again, `MAX_DRAWS` times in a plan.
     """
     began = time.perf_counter()
-    check_count("samples", samples, 2, 10_000)
+    samples = check_count("samples", samples, 2, 10_000)
     generator = np.random.default_rng(check_count("seed", seed, least=0))
     goal, steps = problem.goal, []
     here, draws = np.array(problem.start_xy_m), 0

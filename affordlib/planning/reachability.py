@@ -15,6 +15,7 @@ from torch import nn
 from affordlib.models.checkpoint import restored
 from affordlib.primitives import primitive_named
 from affordlib.results import repo_root
+from affordlib.types import check_array
 from affordlib.weights import write_weights
 
 _HIDDEN = 64
@@ -59,13 +60,15 @@ class Reachability(nn.Module):
         direction_rad: (n,) or one number, the direction of a push or drag; None for the others.
         """
         primitive_named(primitive)
-        xy_m = np.atleast_2d(np.asarray(xy_m, dtype=float))
+        if np.size(xy_m) == 0:
+            return np.ones(0)
+        xy_m = np.atleast_2d(check_array("xy_m", xy_m, 2))
         if primitive not in self.primitives:
             return np.ones(len(xy_m))
-        turn = np.asarray(np.nan if direction_rad is None else direction_rad, dtype=float)
-        if not (np.isfinite(xy_m).all() and (direction_rad is None or np.isfinite(turn).all())):
-            raise ValueError("xy_m and direction_rad must be finite numbers")
-        turn = np.broadcast_to(turn, len(xy_m))
+        turn = np.full(len(xy_m), np.nan)
+        if direction_rad is not None:
+            shape = (len(xy_m),) if np.ndim(direction_rad) else ()
+            turn[:] = check_array("direction_rad", direction_rad, *shape)
         number = np.full(len(xy_m), self.primitives.index(primitive))
         features = reach_features(np.eye(len(self.primitives))[number], xy_m, turn)
         return torch.sigmoid(self.layers(features)).squeeze(-1).numpy()

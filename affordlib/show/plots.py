@@ -79,7 +79,9 @@ def save_figure(figure: Figure, folder: Path, name: str) -> Path:
 
 def plot_table(ax: Axes, around_m: Sequence[float] = (0.0, 0.0), half_width_m: float = 0.3) -> Axes:
     """Draw an empty top-down view of the table around a point."""
-    x, y = (100 * check_within("around_m", v, -10, 10, "m") for v in check_pair("around", around_m))
+    x, y = (
+        100 * check_within("around_m", v, -10, 10, "m") for v in check_pair("around_m", around_m)
+    )
     half = 100 * check_within("half_width_m", half_width_m, 0.01, 10.0, "m")
     corners = np.array([(u, v) for u in TABLE_X_M for v in TABLE_Y_M])[[0, 1, 3, 2, 0]]
     ax.plot(*_cm(corners), color=NEUTRAL, lw=1)

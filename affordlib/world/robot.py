@@ -167,7 +167,10 @@ def inverse_kinematics(
 
 
 def joint_path(poses_W: np.ndarray, near: np.ndarray, tool: str = "gripper") -> np.ndarray:
-    """Compute continuous joint angles (n, 6) along tool poses (n, 6), as those of `Segment`."""
+    """Compute continuous joint angles (n, 6) along tool poses (n, 6), as those of `Segment`.
+
+    Raises UnreachableError if a pose is out of reach.
+    """
     joints = np.empty((len(poses_W), 6))
     last = None
     for i, pose in enumerate(poses_W.tolist()):

@@ -115,6 +115,16 @@ BAD = {
         {},
         r"push 0 .*tool_t must increase, but row 6 .*remove",
     ),
+    "a date that is missing": (
+        {"tool_t": np.array([*np.arange(11), "NaT"], "datetime64[s]")},
+        {},
+        r"push 0 .*tool_t has no time in row 11",
+    ),
+    "a time that is masked": (
+        {"tool_t": np.ma.masked_equal(np.arange(12.0), 4)},
+        {},
+        r"push 0 .*tool_t has no time in row 4",
+    ),
     "a gap": (
         {"tool_xy": np.vstack([tool()[:-1], [[np.nan, 0]]])},
         {},
@@ -339,6 +349,9 @@ def test_all_refusals_are_known_after_one_run_by_name():
     refused = log.add_all(p | {"name": f"take {k}"} for k, p in enumerate(pushes))
     assert [*refused] == ["take 5", "take 11", "take 44"]
     assert log.names[4:6] == ["take 4", "take 6"]
+    again = log.add_all([pushes[5] | {"name": "take 5"}, pushes[6] | {"name": "take 6"}])
+    assert [*again] == ["take 5", "take 6"]
+    assert "another push has this name" in again["take 6"]
 
 
 def test_a_session_is_split_into_its_pushes():

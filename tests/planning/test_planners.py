@@ -164,6 +164,17 @@ def test_branches_are_the_papers_180():
     np.testing.assert_allclose(effect_m[:, full], expected, atol=1e-4)
 
 
+def test_numbers_of_few_bits_plan_as_others_and_numbers_without_end_are_refused():
+    effects = EffectMap(MODEL, IMAGE)
+    for few in (np.uint8(200), np.int8(36)):
+        branches, others = (BranchTable(effects, n).at(0.3) for n in (few, int(few)))
+        np.testing.assert_array_equal(branches[0], others[0])
+    with pytest.raises(ValueError, match="stop_phases must be at most 100, got 101"):
+        BranchTable(effects, stop_phases=np.linspace(0.01, 1, 101))
+    with pytest.raises(ValueError, match=r"Reading\.rate must be a finite number"):
+        Reading(rate=math.nan)
+
+
 def test_segments_of_the_recorded_part_are_the_papers_180_branches():
     shares = np.array([0.2, 0.4, 0.6, 0.8, 1.0])
     effects = EffectMap(MODEL, IMAGE)

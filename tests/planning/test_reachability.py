@@ -65,3 +65,7 @@ def test_a_missing_file_and_an_unknown_primitive_are_told(learned, tmp_path):
         Reachability.load(tmp_path / "none.safetensors")
     with pytest.raises(ValueError, match=r"primitive must be one of .*, got 'kick'"):
         learned.probability("kick", np.zeros((1, 2)))
+    with pytest.raises(ValueError, match=r"xy_m must be finite numbers of shape"):
+        learned.probability("push", np.zeros((2, 3)), 0.0)
+    with pytest.raises(ValueError, match=r"direction_rad must be finite numbers of shape"):
+        learned.probability("push", np.zeros((2, 2)), np.zeros(3))
