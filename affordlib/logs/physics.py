@@ -30,7 +30,7 @@ ELLIPSOID = 100.0
 
 
 def quasi_static_push(
-    push: Tensor, feet: Tensor, friction: Tensor, smoothing: float = 0.05
+    push: Tensor, feet: Tensor, friction: Tensor, smoothing: float = 0.05, steps: int = STEPS
 ) -> Tensor:
     """Displacement of the centroid and rotation (B, 3), in the object's frame at the start.
 
@@ -40,8 +40,8 @@ def quasi_static_push(
     contact, normal, direction, travel = push.split([2, 2, 2, 1], dim=-1)
     turn, moved = torch.zeros_like(friction), torch.zeros_like(contact)
     tangent, state = quarter_turn(normal), torch.zeros(3, *friction.shape)
-    for _ in range(STEPS):
-        step = rotate(direction, -turn) * travel / STEPS
+    for _ in range(steps):
+        step = rotate(direction, -turn) * travel / steps
         at_contact, spin, state = _motion(contact, normal, step, feet, friction, smoothing, state)
         at_centroid = at_contact - spin[:, None] * quarter_turn(contact)
         moved = moved + rotate(at_centroid, turn + spin / 2)

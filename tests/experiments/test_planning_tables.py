@@ -1,18 +1,38 @@
 """Table 3: its rows, its planners, and agreement of the committed one with shipped files."""
 
 import json
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from affordlib.planning import MODES
 from affordlib.primitives import Drag, Push
 from affordlib.results import repo_root
-from affordlib.world import ROLLABLE, STANDING
-from experiments import obstacles, planning, shipped, tasks
+from affordlib.world import ROLLABLE, STANDING, Cuboid, UprightCylinder
+from experiments import obstacles, planning, shipped, speed, tasks
+from experiments.field_baselines import FRONT_M, MechanicsMap
 from experiments.planning import CONFIGS, attempt
 from experiments.tasks import FROZEN, PlanningTask, frozen_tasks, tasks_sha256
+
+
+def test_mechanics_push_a_disc_ahead_and_turn_a_box_until_both_fingers_lie_on_a_face(world, film):
+    for obj, turn_deg in ((UprightCylinder(0.06, 0.06), 0.0), (Cuboid(0.06, 0.06, 0.05), -20.0)):
+        world.place(obj, (0.0, 0.0), math.radians(-turn_deg))
+        effects = MechanicsMap(film, world.depth_image())
+        ahead, left, turn = effects.query(np.zeros(1), torch.ones(1, 1))[0][0, 0].tolist()
+        behind = math.sqrt(0.03**2 - 0.015**2) if turn_deg == 0 else 0.03
+        assert ahead == pytest.approx(0.05 + FRONT_M + behind, abs=0.0025)
+        assert math.degrees(turn) == pytest.approx(turn_deg, abs=1)
+        assert (abs(left) < 0.0003) == (turn_deg == 0)
+
+
+@pytest.mark.slow
+def test_the_benchmarks_run():
+    assert [row["median_ms"] > 0 for row in speed.planning(1)] == [True] * 5
+    assert min(row["per_second"] for row in speed.collection(1)) > 0
 
 
 def test_goals_survive_the_file_which_is_never_written_over(capsys):
