@@ -38,6 +38,7 @@ FAULT_LIMIT_M = 0.002
 
 TABLE_X_M = (-0.5, 0.7)
 TABLE_Y_M = (-0.7, 0.7)
+_CORNERS_M = np.transpose([TABLE_X_M, TABLE_Y_M])
 LARGEST = 1e300
 
 
@@ -163,7 +164,7 @@ def check_range(name: str, pair: Any, low: float, high: float) -> tuple[float, f
 
 def on_table(xy_m: np.ndarray, radius_m: float = 0.0) -> np.ndarray | np.bool_:
     """Return whether points (..., 2) lie on the table and farther than a radius from its rim."""
-    low, high = np.transpose([TABLE_X_M, TABLE_Y_M])
+    low, high = _CORNERS_M
     return ((xy_m >= low + radius_m) & (xy_m <= high - radius_m)).all(axis=-1)
 
 
