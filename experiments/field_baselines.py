@@ -65,8 +65,8 @@ FLUSH_M, N_STEPS = 0.0002, 120
 """Where the fingers are across a push, and how far their front is before the hand's centre.
 
 Friction with the object, and the ellipsoid's ratio of torque to force in radii of gyration; these
-and the front are the best of 13 settings on the first 40 training pushes. Points of the outline
-within FLUSH_M of the rearmost touch as well; steps of a push."""
+and the front were chosen by hand, from two dozen settings on 40 training pushes. Points of the
+outline within FLUSH_M of the rearmost touch as well; steps of a push."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -113,7 +113,7 @@ together as in the paper; with yaw among the effects."""
 
 @lru_cache
 def network(name: str) -> EffectNetwork:
-    """Load a checkpoint, or train a network of `TRAINED`, once for all its rows."""
+    """Load a checkpoint, or train a network of `TRAINED`, which is kept as .NAME.pt."""
     if name not in TRAINED:
         return load_checkpoint(name)[0]
     spec = TRAINED[name]

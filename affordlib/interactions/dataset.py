@@ -113,7 +113,7 @@ _BY_INTERACTION = ("image", "action", "effect", "stop_phase")
 
 @dataclass(frozen=True)
 class InteractionTensors:
-    """Interactions as tensors in metres and radians, relative to the object's pose at the start."""
+    """Interactions as tensors [m, rad], relative to the start; ValueError for other units."""
 
     image: torch.Tensor  # (N, 2, 48, 48), depth [m] and mask
     phase: torch.Tensor  # (S,)

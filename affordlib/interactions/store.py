@@ -53,7 +53,7 @@ def dataset_sha256(data: "xarray.Dataset") -> str:
 
 
 def write_interactions(data: "xarray.Dataset", path: Path, level: int = 9) -> None:
-    """Write a set as one file, atomically; equal sets give identical bytes."""
+    """Write a set as one file, compressed at a level of 0 to 9; equal sets give equal bytes."""
     from zarr.codecs import BloscCodec
     from zarr.storage import MemoryStore
 

@@ -44,13 +44,13 @@ from affordlib.types import (
 )
 
 DISPLACED_M = 0.03
-"""Distance [m] above which others have displaced it; the loop then waits until it is at rest."""
+"""Distance [m] of the object from its predicted position above which others have displaced it."""
 
 AT_REST_M, OBSERVE_EVERY_S, MAX_OBSERVATIONS = 0.001, 0.25, 20
-"""It is at rest when it moves less than this between two observations."""
+"""The loop then waits until it moves less [m] between two observations, so far apart [s]."""
 
 MOVE_M, SPARE_ACTIONS, MAX_LIFTS = 0.05, 3, 2
-"""By default one action is allowed per distance [m], and some more; and so many grasps."""
+"""Default limits: one action for each such distance [m] to the goal, spare ones, and grasps."""
 
 
 def execute_plan(robot: Robot, plan: Plan) -> Outcome:
@@ -90,10 +90,10 @@ def _outcome(robot: Robot, plan: Plan, done: Sequence[Execution]) -> Outcome:
 class ClosedLoopConfig(Checked):
     """Patience and callbacks of a closed loop.
 
-    surprise_m: distance of the object from its predicted position above which it plans again. mode:
-    of its plans. max_actions: by default a number that grows with the distance, renewed when
-    the goal moves or, up to max_renewals times, when somebody displaces the object. n_images:
-    number of images averaged per observation; eight of the Kinect give the rotation to one degree.
+    mode: of its plans. surprise_m: distance of the object from its predicted position above which
+    it plans again. max_actions: by default it grows with the distance, and is renewed when the goal
+    moves or, up to max_renewals times, when somebody displaces the object. n_images: number of
+    images averaged per observation; eight of the Kinect give the rotation to one degree.
     on_action: called after each action with the plan and the number of actions so far; on_plan:
     called with a plan before its first action.
     """

@@ -168,7 +168,7 @@ class EffectMap:
 
     @torch.no_grad()
     def query(self, direction_rad: np.ndarray, t_target: Tensor) -> tuple[Tensor, Tensor]:
-        """Effects and σ (n, T, 3) of actions in n directions at phases (n, T), by the model."""
+        """Effects and σ (n, T, 3): ahead, left, turn, for n directions at phases (n, T)."""
         pushes = [self.kind.towards(float(angle)) for angle in direction_rad]
         observed = condition_on_primitives(self.model, pushes)
         channels = self.model.action_channels, self.model.effect_channels

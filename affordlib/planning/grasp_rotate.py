@@ -57,7 +57,7 @@ def predict_trajectories(
     channel: str,
     gripper_yaws_rad: Sequence[float] = GRIPPER_YAWS_RAD,
 ) -> PredictedTrajectories:
-    """Predict a channel of the effect of a primitive for each gripper yaw [rad]."""
+    """Predict a channel of the effect for each gripper yaw [rad]; ValueError if it has none."""
     yaws = tuple(float(yaw) for yaw in gripper_yaws_rad)
     if channel not in model.effect_channels:
         raise ValueError(
@@ -186,7 +186,7 @@ class PosePlanner:
         return None if None in steps else tuple(replace(step, std_m=std_m) for step in steps)
 
     def turn(self, turn_rad: float, xy_m: Sequence[float], turned_rad: float = 0.0) -> Step | None:
-        """The best step that the arm can execute to rotate the object by, or towards, an angle."""
+        """The best step to rotate by, or towards, an angle; turned_rad: since the image."""
         predicted = self._predicted(Rotate, "yaw", GRIPPER_YAWS_RAD)
         return self._first(candidate_turns(predicted, xy_m, turn_rad), turned_rad)
 

@@ -40,7 +40,7 @@ class Reachability(nn.Module):
 
     @classmethod
     def load(cls, path: str | Path | None = None) -> Self:
-        """Load a saved network; default: the shipped one, trained on the set `reach`."""
+        """Load a network, trained on the set `reach`; ValueError where the file is damaged."""
         path = Path(path or repo_root() / SHIPPED)
         return restored(path, _REMEDY, lambda described: cls(described["primitives"]))[0]
 

@@ -187,7 +187,7 @@ class Tabletop(AbstractContextManager):
         return self.placed.pose()
 
     def shove(self, dx_m: float, dy_m: float, dyaw_rad: float = 0.0) -> None:
-        """Displace the object by (dx, dy) [m] on the table, rotate it, and let it settle."""
+        """Displace, rotate and settle the object; ValueError if it would leave the table."""
         (x, y, _), turn = self.object_pose(), check_finite("dyaw_rad", dyaw_rad)
         to = x + check_finite("dx_m", dx_m), y + check_finite("dy_m", dy_m)
         check_on_table("dx_m, dy_m: the shoved object's centre", to)
