@@ -29,8 +29,7 @@ ABSOLUTE = re.compile(
     r"(?<![\w.~/:-])/(?:home|root|tmp|work|usr|var|opt|mnt|media|Users|private)/\w|\b[A-Z]:\\\w"
 )
 
-# A reader's own settings, with which no page may fail.
-READERS_DASK = {"REQUIRE_ENCRYPTION": "true", "DEFAULT_SCHEME": "tls"}
+READERS_DASK = {"REQUIRE_ENCRYPTION": "true", "DEFAULT_SCHEME": "tls"}  # no page may fail with it
 
 each_notebook = pytest.mark.parametrize("name", list(PATHS))
 
