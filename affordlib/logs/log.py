@@ -284,7 +284,7 @@ class Log:
         most = min(2 * float(np.median(np.diff(at))), LATE_SHARE * float(t[-1] - t[0]))
         if max(at[0] - t[0], t[-1] - at[-1]) > most:
             raise ValueError(
-                f"poses_t are from {at[0]:g} to {at[-1]:g}, but the tool moves from {t[0]:g} to "
+                f"poses_t are from {at[0]:g} to {at[-1]:g}, but tool_t from {t[0]:g} to "
                 f"{t[-1]:g}: the object must be seen before it moves and when the tool has "
                 "stopped, by the same clock, in the same unit"
             )

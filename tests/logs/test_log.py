@@ -148,7 +148,7 @@ BAD = {
     "two clocks": (
         {"poses": [START, END], "poses_t": (1.7e9, 1.7e9 + 6.6)},
         {},
-        r"push 0 .*poses_t are from 1.7e\+09 to .*, but the tool moves from 0 to 6.6: .*same clock",
+        r"push 0 .*poses_t are from 1.7e\+09 to .*, but tool_t from 0 to 6.6: .*same clock",
     ),
     "times of 32 bits": (
         {"tool_t": (1.7e9 + np.linspace(0, 6.6, 12)).astype(np.float32)},
@@ -168,7 +168,7 @@ BAD = {
     "an object that is lost before the push ends": (
         {"poses_t": (0.0, 4.0)},
         {},
-        r"push 0 .*poses_t are from 0 to 4, but the tool moves from 0 to 6.6: .*same clock",
+        r"push 0 .*poses_t are from 0 to 4, but tool_t from 0 to 6.6: .*same clock",
     ),
     "poses without times": ({"poses": (START, START, END)}, {}, r"push 0 .*give their times"),
     "a tool inside": (
