@@ -128,7 +128,10 @@ class InteractionTensors:
         if self.stop_phase is None:
             object.__setattr__(self, "stop_phase", torch.ones(len(self)))
         check_field(self, "image_width_m", 0.01, 10.0, "m")
-        n, steps = len(self.image), len(self.phase)
+        t = self.phase
+        n, steps = len(self.image), len(t)
+        if t.ndim != 1 or steps < 2 or t[0] != 0 or t[-1] != 1 or (t.diff() <= 0).any():
+            raise ValueError(f"phase must increase from 0 to 1, got {t.tolist()!r:.80}")
         shapes = {"image": (2, *self.image.shape[-1:] * 2), "stop_phase": ()}
         for kind in ("action", "effect"):
             shapes[kind] = steps, len(getattr(self, f"{kind}_channels"))
@@ -137,8 +140,6 @@ class InteractionTensors:
         for name, shape in shapes.items():
             if (got := tuple(getattr(self, name).shape)) != (n, *shape):
                 raise ValueError(f"{name} must be {(n, *shape)}, got {got}")
-        if steps < 2 or self.phase[0] != 0 or self.phase[-1] != 1 or (self.phase.diff() <= 0).any():
-            raise ValueError(f"phase must increase from 0 to 1, got {self.phase.tolist()!r:.80}")
         if n:
             self._check_values()
 

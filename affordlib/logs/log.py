@@ -339,7 +339,7 @@ def _rows(
     """Finite numbers (m, columns), least ≤ m ≤ most; raises ValueError."""
     try:
         array = np.ma.asarray(values, dtype=float).filled(np.nan)
-    except (TypeError, ValueError, RuntimeError):
+    except (TypeError, ValueError, RuntimeError, OverflowError):
         array = check_array(name, values)
     if array.ndim != 2 or array.shape[1] not in columns or not least <= len(array) <= most:
         raise ValueError(

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from affordlib import checked
 from affordlib.models.base import EffectNetwork, NetworkConfig, he_initialise, network
-from affordlib.types import IMAGE_PIXELS, Observations
+from affordlib.types import IMAGE_PIXELS, Observations, check_count
 
 
 class CircularHarmonics(nn.Module):
@@ -36,6 +36,7 @@ class CircularHarmonics(nn.Module):
 
     def __init__(self, rings: int = 7, orders: int = 8, reach: float = 0.8) -> None:
         super().__init__()
+        check_count("rings", rings, 1, 100), check_count("orders", orders, 0, 100)
         u = (torch.arange(IMAGE_PIXELS) + 0.5) / (IMAGE_PIXELS / 2) - 1
         x, y = u[None].expand(len(u), -1), -u[:, None].expand(-1, len(u))
         r, phi = torch.hypot(x, y), torch.atan2(y, x)

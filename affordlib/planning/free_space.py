@@ -23,7 +23,7 @@ import numpy as np
 from affordlib.geometry import edge_normals, rotated_each, unit_vector
 from affordlib.perception import adapt_to_object, outline_of, radius_m
 from affordlib.primitives import Primitive, Push, Rotate, min_jerk
-from affordlib.types import Obstacle, Step
+from affordlib.types import Obstacle, Step, check_finite
 
 DISC_SIDES, N_POSES = 16, 7
 START_M, MARGIN_M, FULL_AT_M = 0.002, 0.004, 0.02
@@ -76,7 +76,7 @@ def gaps_m(obstacles: Sequence[np.ndarray], shapes: np.ndarray, far_m: float = F
     corners, axes = (parts.reshape(n * (s - 1), -1, 2).T for parts in joined)
     middles = corners.mean(axis=1)
     radius = np.hypot(*(corners - middles[:, None])).max(axis=0)
-    gaps = np.full(len(radius), far_m)
+    gaps = np.full(len(radius), check_finite("far_m", far_m))
     for polygon in obstacles:
         centre, outward = polygon.mean(axis=0), edge_normals(polygon)
         size = np.linalg.norm(polygon - centre, axis=-1).max()

@@ -105,7 +105,6 @@ class GoalPicker(widgets.HBox):
         self._news = ""  # of disturbances, until the next action or plan
         self._view = TableView(table=table_data(skills))
         self.scene = Scene(world) if view else None
-        self._played = 0  # frames of the scene
         goal = Goal(_whole_mm(check_on_table("goal_xy_m", goal_xy_m)))
         self.controls = PickerControls(goal, list(planners), list(self.executors), self._follow)
         self._listen()
@@ -382,6 +381,8 @@ class GoalPicker(widgets.HBox):
                 self.world.on_step = on_step
                 self._disturbances.clear()
                 self._wait_until_shown()
+                if self.scene is not None:
+                    self.scene.stop()
                 self._pose = self.world.object_pose()
                 self._set_running(False)
                 self._show()
@@ -405,7 +406,6 @@ class GoalPicker(widgets.HBox):
         steps, self._shown_until, self._pace_s = itertools.count(), time.monotonic(), pace_s
         if self.scene is not None:
             self.scene.place(self.goal, self.plan)
-            self._played = 0
 
         def log(world):
             for one in (also, self.scene):
@@ -414,7 +414,8 @@ class GoalPicker(widgets.HBox):
             number = next(steps)
             if number % POSE_EVERY == 0:
                 pose, lift = world.object_pose(), world.object_state()[2] - z_m
-                motion = [*pose, lift, *world.arm.tool_pose()]
+                bodies = () if self.scene is None else self.scene.poses().flat
+                motion = [*pose, lift, *world.arm.tool_pose(), *bodies]
                 self._motions.append(np.round(motion, 4).tolist())
                 self._trail.append(pose[:2])
             if number == 0 or len(self._motions) == SENT_TOGETHER:
@@ -425,15 +426,14 @@ class GoalPicker(widgets.HBox):
     def _send_motions(self, first: bool = False) -> None:
         """Send the motions logged since the last call, to be shown as they come."""
         if self._motions:
-            self._view.send({"motions": self._motions, "first": first})
+            bodies = self.scene.named_bodies() if self.scene else []
+            self._view.send({"motions": self._motions, "first": first, "bodies": bodies})
             self._shown_until = max(self._shown_until, time.monotonic())
             self._shown_until += self._pace_s * len(self._motions)
             self._motions = []
 
     def _wait_until_shown(self) -> None:
         self._send_motions()
-        if self.scene is not None:
-            self._played = self.scene.play(self._played)
         if not self._stop.wait(max(0.0, self._shown_until - time.monotonic())):
             self._pose = self.world.object_pose()
 

@@ -105,7 +105,7 @@ def plot_footprint(
     filled = style == "filled"
     ax.fill(*outline, facecolor=color if filled else "none", alpha=0.25 if filled else 1, lw=0)
     closed = np.hstack([outline, outline[:, :1]])
-    ax.plot(*closed, "-" if filled else style, color=color, lw=1.5, label=label)
+    ax.plot(*closed, ls="-" if filled else style, color=color, lw=1.5, label=label)
     return ax
 
 
@@ -152,7 +152,7 @@ def plot_plan(
     predicted pose after each push; yaw_rad: its current yaw.
     """
     goal, first, row = plan.goal, np.array(plan.start_xy_m), 0
-    radius = 100 * goal.tolerance_m
+    radius, yaw_rad = 100 * goal.tolerance_m, check_finite("yaw_rad", yaw_rad)
     ax.add_patch(plt.Circle(_cm(goal.xy_m), radius, color=GOAL, fill=False, lw=1))
     ax.plot(*_cm(goal.xy_m), "*", color=GOAL, ms=13, label="goal", zorder=5)
     start = first

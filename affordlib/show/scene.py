@@ -11,11 +11,12 @@ import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import ipywidgets as widgets
 import numpy as np
 from PIL import Image
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from affordlib.show.plots import GOAL, PREDICTION, TRUTH
 from affordlib.types import TABLE_X_M, TABLE_Y_M, Goal, Plan, check_count
@@ -24,8 +25,10 @@ from affordlib.world.camera import SCENERY
 from affordlib.world.objects import mesh
 from affordlib.world.trajectory import STEP_S
 
-EVERY = 10
-"""Simulation steps (1/240 s) between two recorded poses."""
+EVERY, TICKS = 16, 2
+"""Simulation steps (1/240 s) between two recorded poses, and times from one to the next.
+
+k3d moves and turns its bodies from pose to pose."""
 
 CAMERA = (0.84, -0.88, 0.62, -0.24, 0.02, 0.24, 0.0, 0.0, 1.0)
 """Where the camera stands, what it looks at [m], and what is upwards."""
@@ -47,22 +50,24 @@ class Scene(widgets.VBox):
 
         self.world, self._mesh = world, k3d.mesh
         check_count("height", height, 100, 2000)
-        self.plot = k3d.plot(
-            height=height, grid_visible=False, camera_auto_fit=False, menu_visibility=False
-        )
+        plain = {"grid_visible": False, "camera_auto_fit": False, "menu_visibility": False}
+        fast = {"antialias": 1, "logarithmic_depth_buffer": False}  # twice, without a GPU
+        self.plot = k3d.plot(height=height, **plain, **fast)
         self.plot.layout.width = "100%"
         self.plot.background_color, self.plot.camera = 0xF4F6F8, list(CAMERA)
         self.plot.axes_helper, self.plot.lighting = 0.0, 1.8
         table = [(x, y) for x in TABLE_X_M for y in TABLE_Y_M]
         self._add(_between(np.array(table), -0.1, 0.0), _WOOD)
         for half, at, rgb in SCENERY:
-            self._add(_box(2 * np.array(half)), _hex(rgb), _matrix(at, 0.0))
+            self._add(_box(2 * np.array(half)), _hex(rgb), _matrix(at))
         base, *links = _arm(world)
-        self._add(*base, _matrix((BASE_X_M, 0.0, 0.0), 0.0))
+        self._add(*base, _matrix((BASE_X_M, 0.0, 0.0)))
         self._links = [self._add(*link) for link in links]
-        self._object: Any | None = None
+        self.name = f"scene_{uuid4().hex}"
+        self.plot.additional_js_code = f"(globalThis.affordlib ??= {{}}).{self.name} = K3DInstance"
+        self._object, self._last = None, np.ones(7)
         self._marks: list[Any] = []
-        self.player = widgets.Play(interval=round(1000 * EVERY * STEP_S), max=0)
+        self.player = widgets.Play(interval=round(1000 * EVERY * STEP_S / TICKS), max=0)
         looks = {"layout": {"flex": "1", "min_width": "0"}, "style": {"description_width": "auto"}}
         time = widgets.IntSlider(max=0, readout=False, description="time", **looks)
         speed = widgets.Dropdown(options={"1×": 1, "½×": 2, "¼×": 4}, layout={"width": "5em"})
@@ -81,10 +86,11 @@ class Scene(widgets.VBox):
         if self._object is not None:
             self.plot -= self._object
         self._object = self._add(_solid(self.world.obj), TRUTH)
-        self._frames: list[np.ndarray] = [self._poses()]
+        self._frames: list[np.ndarray] = [self.poses()]
         self._steps = 0
         self.mark(goal, plan)
-        self.play(0, playing=False)
+        self.player.playing = False
+        self.stop()
 
     def mark(self, goal: Goal | None = None, plan: Plan | None = None) -> None:
         """Show obstacles, and goal and predicted final pose of a plan, in place of earlier ones."""
@@ -112,28 +118,43 @@ class Scene(widgets.VBox):
         """Record the world's present poses, every few steps."""
         self._steps += 1
         if self._steps % EVERY == 0:
-            self._frames.append(self._poses())
+            self._frames.append(self.poses())
 
-    def play(self, first: int = 0, playing: bool = True) -> int:
-        """Play what was recorded from a frame on, if there is any; return the number of frames."""
-        if first == len(self._frames):
-            return first
+    def play(self) -> None:
+        """Play what was recorded."""
+        self.stop()
+        self.player.value = 0
+        self.player.playing = len(self._frames) > 1
+
+    def stop(self) -> None:
+        """Put what was recorded on the time line, and show its end."""
+        frames = np.array(self._frames)
+        turns = Rotation.from_quat(frames[..., 3:])
+        shown = np.float32(RigidTransform.from_components(frames[..., :3], turns).as_matrix())
         # 11 bits of each mantissa are half a millimetre at 1 m, and pages of half the size.
-        shown = (np.array(self._frames).view(np.int32) & -8192).view(np.float32)
-        for k, part in enumerate([*self._links, self._object]):
-            part.model_matrix = {str(t): frame[k] for t, frame in enumerate(shown)}
-        self.player.max = len(self._frames) - 1
-        self.player.value = first
-        self.player.playing = playing
-        return len(self._frames)
+        shown = (shown.view(np.int32) & -8192).view(np.float32)
+        for k, part in enumerate(self.bodies):
+            part.model_matrix = {str(TICKS * t): frame[k] for t, frame in enumerate(shown)}
+        self.player.max = TICKS * (len(shown) - 1)
+        self.player.value = self.player.max
 
-    def _poses(self) -> np.ndarray:
-        """Where the arm's parts and the object are (n, 4, 4), as float32."""
+    @property
+    def bodies(self) -> list[Any]:
+        """What moves: the arm's parts and the object, in the order of `poses`."""
+        return [*self._links, self._object]
+
+    def named_bodies(self) -> list[Any]:
+        """The scene's name and the numbers of its bodies, by which a page's scripts find them."""
+        return [self.name, [body.id for body in self.bodies]]
+
+    def poses(self) -> np.ndarray:
+        """Where the bodies are: position [m] and quaternion, (n, 7)."""
         client, robot = self.world.client, self.world.arm.robot
         states = client.getLinkStates(robot, list(range(len(self._links))))
-        poses = [(state[4], state[5]) for state in states]
-        state = self.world.object_state()
-        return np.array([_matrix(*pose) for pose in [*poses, (state[:3], state[3:])]])
+        now = np.array([*((*s[4], *s[5]) for s in states), self.world.object_state()])
+        now[:, 3:] *= np.where((now * self._last)[:, 3:].sum(axis=1) < 0, -1, 1)[:, None]
+        self._last = now  # of the two quaternions of a turn, the one next to the last
+        return now
 
     def _add(self, points: Any, color: str, at: Any = None, opacity: float = 1.0) -> Any:
         """Add a body: the convex hull of points (n, 3), or triangles (n, 3, 3)."""
@@ -151,7 +172,7 @@ class Scene(widgets.VBox):
         """The view, and for a page without a kernel what was recorded, drawn by k3d's script."""
         bundle = super()._repr_mimebundle_(**kwargs)
         data = base64.b64encode(self.plot.get_binary_snapshot()).decode()
-        asked = json.dumps({"frames": len(self._frames), "height": self.plot.height})
+        asked = json.dumps({"last": self.player.max, "height": self.plot.height})
         script = f"{_SCRIPT.read_text()}(document.currentScript.parentElement, {asked}, '{data}')"
         picture = io.BytesIO()
         Image.fromarray(self.world.picture(640, 400)).save(picture, "jpeg", quality=70)
@@ -161,15 +182,10 @@ class Scene(widgets.VBox):
         return bundle | {"text/html": html, "text/plain": type(self).__name__}
 
 
-def _matrix(xyz: Any, turn: Any) -> np.ndarray:
-    """A pose (4, 4) from a position and a quaternion or a yaw."""
-    made = np.eye(4, dtype=np.float32)
-    still = np.ndim(turn) == 0
-    made[:3, :3] = (
-        Rotation.from_euler("z", turn) if still else Rotation.from_quat(turn)
-    ).as_matrix()
-    made[:3, 3] = xyz
-    return made
+def _matrix(xyz: Any, yaw_rad: float = 0.0) -> np.ndarray:
+    """A pose (4, 4) from a position and a yaw."""
+    turn = Rotation.from_euler("z", yaw_rad)
+    return np.float32(RigidTransform.from_components(xyz, turn).as_matrix())
 
 
 def _arm(world: Tabletop) -> Iterator[tuple[np.ndarray, str]]:

@@ -622,7 +622,8 @@ export class Table {
     return null;
   }
 
-  // A moment of a motion as it was simulated: rows of [x, y, yaw, lift, hand's x, y, z, yaw, gap].
+  // A moment of a motion as it was simulated: rows of [x, y, yaw, lift, hand's x, y, z, yaw, gap,
+  // bodies in 3-D]. Returns it.
   replay(rows, place) {
     place = between(0, place, rows.length - 1); // a frame's time may lie before the start
     const k = Math.floor(place);
@@ -634,6 +635,7 @@ export class Table {
     this.state.live = { pose: [x, y, yaw], lift, hand };
     this.state.trail = rows.slice(0, k + 1);
     this.draw();
+    return now;
   }
 
   // Show a planner's search, lines and single points, in the order in which it went.
@@ -937,8 +939,22 @@ export class Table {
 }
 
 // A view of Python's widget: while a hand drags, the browser plans; when it lets go, Python does.
+// Move the bodies of a scene in 3-D, if the page has it: [its name, their numbers].
+function move([name, numbers], row) { // [] where no view in 3-D is shown
+  const scene = globalThis.affordlib?.[name];
+  const shown = scene?.getWorld().K3DObjects.children ?? [];
+  for (const body of shown) {
+    const k = numbers.indexOf(body.K3DIdentifier);
+    if (k < 0) continue;
+    const [x, y, z, ...turn] = row.slice(9 + 7 * k, 16 + 7 * k);
+    body.position.set(x, y, z);
+    body.quaternion.fromArray(turn).normalize();
+  }
+  scene?.render();
+}
+
 function render({ model, el }) {
-  let [number, chain, thing, reachable, recorded, began, timer] = [0, [], null, null, [], 0, null];
+  let [number, chain, thing, reachable, recorded, bodies, began, timer] = [0, [], null, null, [], [], 0, null];
   const scrub = document.createElement("input");
   Object.assign(scrub, { type: "range", min: 0, max: 1, step: "any", hidden: true });
   scrub.setAttribute("aria-label", "Time of the last run");
@@ -998,11 +1014,11 @@ function render({ model, el }) {
 
   function at(place) {
     scrub.value = place / Math.max(recorded.length - 1, 1);
-    view.replay(recorded, place);
+    move(bodies, view.replay(recorded, place));
   }
 
-  function heard({ motions, first }) {
-    if (first) [recorded, began] = [[], performance.now()];
+  function heard({ motions, first, bodies: others }) {
+    if (first) [recorded, began, bodies] = [[], performance.now(), others];
     recorded.push(...motions);
     scrub.hidden = false;
     if (timer) return;

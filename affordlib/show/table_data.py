@@ -33,7 +33,8 @@ class TableView(anywidget.AnyWidget):
     marks, and "answered", the number of the last request that it includes. obstacles: those on the
     table, as `obstacle_data` writes them. searched: lines [[x, y], …] [m] of the planner's search.
     wanted: x, y [m] and the growing number of a request for a goal. It sends {"press": "run"} and
-    "stop", and plays {"motions": [x, y, yaw, lift, the hand's x, y, z, yaw, gap]} as they come.
+    "stop", and plays {"motions": [x, y, yaw, lift, the hand's x, y, z, yaw, gap, bodies]} as they
+    come, in 3-D too: of the bodies [a scene's name, their numbers], positions and quaternions.
     """
 
     _esm = _HERE / "table.js"

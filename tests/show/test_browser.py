@@ -334,6 +334,31 @@ def test_run(page, table):
     picture(page, "3_run")
 
 
+def test_the_robot_moves_in_3d_while_it_is_simulated(page, table):
+    button(page, "Start over").click()
+    wait_for_words(page, "Plan: ")
+    ask(page, "setattr(picker, 'pace_s', 0.05)")
+    page.evaluate(
+        """([name, ...arm]) => {
+            const all = () => globalThis.affordlib[name].getWorld().K3DObjects.children;
+            window.seen = [];
+            setInterval(() => {
+                const words = document.querySelector(".affordlib-picker [role=status]").innerText;
+                const parts = all().filter((body) => arm.includes(body.K3DIdentifier));
+                seen.push([words, ...parts.map((body) => body.position.toArray())]);
+            }, 20);
+        }""",
+        ask(page, "[picker.scene.name, *(one.id for one in picker.scene.bodies[:-1])]"),
+    )
+    button(page, "Run").click()
+    wait_for_words(page, "from the goal, ")
+    ask(page, "setattr(picker, 'pace_s', 0.01)")
+    seen = [row[1:] for row in page.evaluate("seen") if row[0].startswith("Push 1 of")]
+    assert (np.ptp(seen, axis=0).max(axis=1) > 0.02).sum() > 5  # parts of the arm
+    assert len(np.unique(seen, axis=0)) > 5
+    picture(page, "4_run_in_3d")
+
+
 def test_a_closed_loop_follows_a_goal_that_moves(page, table):
     button(page, "Start over").click()
     ask(page, "picker.pick(0.18, 0.0)")
