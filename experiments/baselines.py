@@ -36,7 +36,6 @@ from affordlib.world import category_named
 Forecast = tuple[Tensor, Tensor]
 """Mean and σ (N, T, C) of the effect at some samples."""
 
-CONTACT_M = 0.001  # displacement [m] (or rotation [rad]) from which on an object is touched
 _CATEGORY_GAP = 3.0
 """Feature distance between two categories; the other features have a spread of about 1."""
 
@@ -79,15 +78,10 @@ def prediction_record(
     truth, names = arrays.effect[:, steps_of(arrays)], arrays.effect_channels
     columns = xy_columns(names) or [0]
     error = (mean - truth)[..., columns].norm(dim=-1)
-    touched = truth[..., columns].norm(dim=-1) > CONTACT_M
-    after = (error * touched).sum(dim=1) / touched.sum(dim=1).clamp_min(1)
     record = about_objects(data, kept)
     for name, values in (("truth", truth), ("mean", mean), ("std", std)):
         record[name] = {c: values[:, -1, k].tolist() for k, c in enumerate(names)}
-    return record | {
-        "trajectory_error": error.mean(dim=1).tolist(),
-        "after_contact_error": after.tolist(),
-    }
+    return record | {"trajectory_error": error.mean(dim=1).tolist()}
 
 
 def baseline_predictions(

@@ -2,14 +2,12 @@
 
 A job is a model, a data set, its size, a fold and a seed. It trains on the training part, stops
 early on the validation part, and predicts the effects of the test part from the image and the
-commanded action at t = 0 and t = 1. Networks of pushes also solve the inverse problem: a push is
-decoded from the effect of each test interaction and executed on its object.
-`experiments.effect_prediction` runs the jobs and makes the tables.
+commanded action at t = 0 and t = 1. `experiments.effect_prediction` runs the jobs and makes the
+tables.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
@@ -18,28 +16,19 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import torch
 import xarray as xr
 from sklearn.linear_model import LogisticRegression
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
-from affordlib.geometry import wrap_angle
-from affordlib.interactions import InteractionTensors, Split, split_interactions
+from affordlib.interactions import Split, split_interactions
 from affordlib.interactions.dataset import valid_interactions
-from affordlib.interactions.recipes import Recipe, sample_scene, sample_world
-from affordlib.models.base import (
-    EffectModel,
-    EffectNetwork,
-    NetworkConfig,
-    condition_on_final_effect,
-)
+from affordlib.models.base import EffectNetwork, NetworkConfig
 from affordlib.models.cnp import CNPConfig
 from affordlib.models.film import FiLMConfig
 from affordlib.models.training import train_model
-from affordlib.primitives import Grasp, Push
+from affordlib.primitives import Grasp
 from affordlib.types import check_choice, check_count
-from affordlib.world import Tabletop
 from experiments.baselines import BASELINES, about_objects, baseline_predictions, network_record
 from experiments.lever_training import Symmetry, augment_by_symmetry
 from experiments.runner import Job, open_once
@@ -148,7 +137,7 @@ def job(model: str, data: str, n: int | str = "all", fold: int = 0, seed: int = 
 def cross_validate(
     model: str, data: str, n: int | str, fold: int, seed: int, resume_checkpoint: Path
 ) -> dict[str, Any]:
-    """Return columns of predictions on the test part, errors on test_set, inverse problems."""
+    """Return columns of predictions on the test part, errors on test_set."""
     interactions, task = open_once(data), task_of(data)
     available = interactions.sizes["interaction"]
     size = available if n == "all" else int(n)
@@ -170,11 +159,6 @@ def cross_validate(
 
     result["fold_test"] = prediction_columns(predicted(interactions, split.test))
     if task.test_set:
-        rows = valid_interactions(interactions, split.test)
-        if model in NETWORKS or model == "constant":
-            decode = decoded_theta_rad if model in NETWORKS else theta_along_effect
-            theta = decode(network if model in NETWORKS else None, interactions, rows)
-            result["inverse"] = executed_columns(interactions, rows, theta)
         other = open_once(task.test_set)
         found = prediction_columns(predicted(other, np.arange(other.sizes["interaction"])))
         add_errors(table := pd.DataFrame(found), data.removesuffix(LARGE))
@@ -243,46 +227,3 @@ def _train(
     best = min(record.validation_error for record in history)
     steps = {"steps": history[-1].step, "seconds": history[-1].seconds}
     return trained, steps | {"validation_error": best, "temperature": trained.sigma_scale.tolist()}
-
-
-@torch.no_grad()
-def decoded_theta_rad(model: EffectModel, data: xr.Dataset, rows: np.ndarray) -> np.ndarray:
-    """Solve the inverse problem: return angles θ (N,) of pushes decoded from given effects.
-
-    The model observes only the effect at t = 1 (w₁ = 0); θ is the direction of the first point of
-    the decoded action.
-    """
-    channels = model.action_channels, model.effect_channels
-    arrays = InteractionTensors.from_dataset(data, rows, *channels)
-    observed = condition_on_final_effect(model, arrays.effect[:, -1])
-    decoded = model.predict(model.encode(arrays.image), observed, torch.zeros(len(arrays), 1))
-    x, y = (decoded.action_mean[:, 0, channels[0].index(name)] for name in "xy")
-    return torch.atan2(y, x).numpy()
-
-
-def theta_along_effect(_: None, data: xr.Dataset, rows: np.ndarray) -> np.ndarray:
-    """Return θ (N,) of the baseline: push in the direction of the desired effect."""
-    x, y = data["effect"].values[rows, -1, :2].T
-    return np.arctan2(y, x) + math.pi
-
-
-def executed_columns(
-    data: xr.Dataset, rows: np.ndarray, theta_rad: np.ndarray
-) -> dict[str, list[Any]]:
-    """Execute pushes θ (N,) and return errors from the interactions' effects, by column."""
-    recipe, effects = Recipe.from_json(data.attrs["recipe"]), []
-    with Tabletop(recipe.world) as world:
-        for index, theta in zip(data["interaction"].values[rows].tolist(), theta_rad, strict=True):
-            obj, yaw, _ = sample_scene(recipe, index)
-            world.place(obj, (0.0, 0.0), yaw, config=sample_world(recipe, index, obj))
-            done = world.execute_primitive(Push(float(theta)), record_unreachable=True)
-            effects.append(done.effect[-1])
-    off = np.array(effects) - data["effect"].values[rows, -1]
-    theta_off = theta_rad - data["theta"].values[rows]
-    return {
-        "interaction": data["interaction"].values[rows].tolist(),
-        "category": about_objects(data, rows)["category"],
-        "final_error": np.hypot(*off[:, :2].T).tolist(),
-        "yaw_error": [abs(wrap_angle(d)) for d in off[:, 3].tolist()],
-        "theta_error": [abs(wrap_angle(d)) for d in theta_off.tolist()],
-    }

@@ -51,7 +51,7 @@ def sorted_results(folder: str | Path = FOLDER) -> list[Result]:
 
 
 def predictions_of(results: Iterable[Result], primitive: str, part: str) -> pd.DataFrame:
-    """Return a row per test interaction; part: `fold_test`, `fixed_test` or `inverse`."""
+    """Return a row per test interaction; part: `fold_test` or `fixed_test`."""
     results = [(about | {"n": result["n_interactions"]}, result) for about, result in results
                if about["data"].removesuffix(LARGE) == primitive]  # fmt: skip
     table = frame(results, part)
@@ -69,10 +69,7 @@ def mean_sem(group: pd.DataFrame, column: str) -> tuple[float, float]:
 
 
 def error_rows(table: pd.DataFrame, primitive: str) -> Rows:
-    """Return rows of errors by model and category; yaw only for cuboids, where it is defined.
-
-    table: predictions, or executed pushes that were decoded, which have an error in θ.
-    """
+    """Return rows of errors by model and category; yaw only for cuboids, where it is defined."""
     unit, name = ("m", "final_error") if primitive in PLANE else ("rad", "error")
     rows = []
     for about, group in by_model(table):
@@ -83,11 +80,7 @@ def error_rows(table: pd.DataFrame, primitive: str) -> Rows:
             median, p95 = some["final_error"].quantile([0.5, 0.95])
             for told, value in (("mean", mean), ("sem", sem), ("median", median), ("p95", p95)):
                 row[f"{name}_{told}_{unit}"] = float(value)
-            if "theta_error" in some:
-                row["theta_error_mean_rad"] = mean_sem(some, "theta_error")[0]
-            else:
-                for key in ("trajectory_error", "after_contact_error"):
-                    row[f"{key}_mean_{unit}"] = mean_sem(some, key)[0]
+            row[f"trajectory_error_mean_{unit}"] = mean_sem(some, "trajectory_error")[0]
             if primitive == "push":
                 turns = yaw_predicted and category == "cuboid"
                 row["yaw_error_mean_rad"] = mean_sem(some, "yaw_error")[0] if turns else None
@@ -112,7 +105,6 @@ def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
         "drag": errors("drag", "fold_test"),
         "grasp": [*reported.grasp_rows(grasp[0]), *grasp] if grasp else [],
         "rotate": errors("rotate", "fold_test"),
-        "inverse": errors("push", "inverse"),
         **studies.tables(folder),
     }
 

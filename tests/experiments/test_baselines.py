@@ -25,8 +25,7 @@ def test_answers_are_those_of_the_model_itself(trained, held_out_pushes):
     short = network_predictions(trained, held_out_pushes, some)
     np.testing.assert_allclose(final_error(short), final_error(told), atol=1e-7)
     assert told["interaction"] == some.tolist()
-    after, whole = (np.array(told[k]) for k in ("after_contact_error", "trajectory_error"))
-    assert (after > whole).all()  # before contact nothing moves, which lowers the mean
+    assert (np.array(told["trajectory_error"]) < final_error(told)).mean() > 0.5
 
 
 def test_a_turn_is_measured_the_short_way_round():

@@ -8,12 +8,7 @@ import torch
 
 from experiments import cross_validation
 from experiments import effect_prediction as tables
-from experiments.cross_validation import (
-    executed_columns,
-    job,
-    network_and_training,
-    theta_along_effect,
-)
+from experiments.cross_validation import job, network_and_training
 from experiments.grasps import auc, confusion_columns
 from experiments.lever_up import job as lever_job
 from experiments.runner import run
@@ -107,7 +102,7 @@ def test_shipped_networks_are_those_of_the_tables():
 def test_a_fold_may_lack_a_category():
     def result(fold, categories):
         errors = [0.001 * (k + 1) for k in range(len(categories))]
-        names = ("final_error", "trajectory_error", "after_contact_error")
+        names = ("final_error", "trajectory_error")
         columns = {"interaction": range(len(errors)), "category": list(categories)}
         about = {"model": "film", "data": "drag", "n": 100, "fold": fold, "seed": 0}
         return about, {"n_interactions": 100, "fixed_test": columns | dict.fromkeys(names, errors)}
@@ -116,17 +111,6 @@ def test_a_fold_may_lack_a_category():
     rows = tables.error_rows(tables.predictions_of(folds, "drag", "fixed_test"), "drag")
     means = [row["final_error_mean_m"] for row in rows]
     assert means == pytest.approx([0.00225, 0.0015, 0.003])
-
-
-# The inverse problem
-
-
-def test_the_same_push_has_the_same_effect(pushes):
-    some = np.flatnonzero(pushes["category"].values == 1)[:2]
-    right = executed_columns(pushes, some, pushes["theta"].values[some])
-    assert max(right["final_error"]) < 1e-5  # the same simulation again, stored to a micrometre
-    baseline = executed_columns(pushes, some, theta_along_effect(None, pushes, some))
-    assert max(baseline["theta_error"]) < 0.02  # cylinders go where they are pushed
 
 
 # Grasps
