@@ -86,31 +86,18 @@ def _raw(scaler: Scaler) -> Scaler:
     )
 
 
-CHANGES: dict[str, dict[str, Any]] = {
-    "metres, not standardised": {"scales": _raw},
-    "table frame": {"network": {"frame": "table"}},
-    "no rotation and reflection augmentation": {"training": {"augment": False}},
-    "no FiLM: image joined only": {"start": _no_modulation},
-    "no EMA of the weights": {"training": {"ema": 0.0}},
-    "plain likelihood (β = 0)": {"training": {"beta": 0.0}},
-    "PyTorch initialisation": {"start": _plain_start},
-    "one trajectory, one target a step": {"draw": one_at_a_time},
-    "random contexts only": {"draw": random_contexts},
+LADDER: dict[str, dict[str, Any]] = {
+    "channels of unit size": {"scales": _raw},
+    "He initialisation": {"start": _plain_start},
+    "batches": {"draw": one_at_a_time},
+    "contexts at the ends": {"draw": random_contexts},
+    "push frame": {"network": {"frame": "table"}},
+    "FiLM": {"start": _no_modulation},
+    "rotation and reflection augmentation": {"training": {"augment": False}},
+    "β": {"training": {"beta": 0.0}},
+    "EMA of the weights": {"training": {"ema": 0.0}},
 }
-"""Changes to network or training by name."""
-
-LADDER = {
-    "channels of unit size": "metres, not standardised",
-    "He initialisation": "PyTorch initialisation",
-    "batches": "one trajectory, one target a step",
-    "contexts at the ends": "random contexts only",
-    "push frame": "table frame",
-    "FiLM": "no FiLM: image joined only",
-    "rotation and reflection augmentation": "no rotation and reflection augmentation",
-    "β": "plain likelihood (β = 0)",
-    "EMA of the weights": "no EMA of the weights",
-}
-"""Parts that are added in turn to the published training, each with the change it reverts."""
+"""Parts that are added in turn to the published training, each with the change that reverts it."""
 
 STEPS, SEEDS = 500, 3
 SHIPPED = CHECKPOINT_SPECS["film_500"]
@@ -122,9 +109,9 @@ def incremental_ablation() -> Rows:
 
     They are on validation data: the mean, the least and the largest over seeds.
     """
-    names, changes, rows = ["nothing", *LADDER], list(LADDER.values()), []
-    for k, name in enumerate(names):
-        each = [error_m(tuple(changes[k:]), STEPS, seed) for seed in range(SEEDS)]
+    rows = []
+    for k, name in enumerate(["nothing", *LADDER]):
+        each = [error_m(tuple(LADDER)[k:], STEPS, seed) for seed in range(SEEDS)]
         row = {"added": name, "steps": STEPS, "seeds": SEEDS}
         for statistic in (np.mean, np.min, np.max):
             row[f"final_error_{statistic.__name__}_m"] = float(statistic(each))
@@ -132,7 +119,7 @@ def incremental_ablation() -> Rows:
     return rows
 
 
-def error_m(changes: tuple[str, ...], steps: int, seed: int) -> float:
+def error_m(without: tuple[str, ...], steps: int, seed: int) -> float:
     """Return the mean final error [m] of the network of `ablated` on its validation data.
 
     Both categories have the same weight.
@@ -140,7 +127,7 @@ def error_m(changes: tuple[str, ...], steps: int, seed: int) -> float:
     data = open_interactions(SHIPPED.data)
     rows = split_interactions(data.sizes["interaction"], fold=seed).validation
     rows = valid_interactions(data, rows)
-    errors = final_errors_m(ablated(changes, steps, seed), _tensors(data, rows))
+    errors = final_errors_m(ablated(without, steps, seed), _tensors(data, rows))
     box = torch.from_numpy(data["category"].values[rows] == 0)
     return float(errors[box].mean() + errors[~box].mean()) / 2
 
@@ -152,12 +139,12 @@ def _tensors(data: xr.Dataset, rows: np.ndarray) -> InteractionTensors:
 
 
 @cache
-def ablated(changes: tuple[str, ...], steps: int, seed: int = 0) -> EffectNetwork:
-    """Train our network on `push` with some of `CHANGES`; the seed is also the fold.
+def ablated(without: tuple[str, ...], steps: int, seed: int = 0) -> EffectNetwork:
+    """Train our network on `push` without some parts of `LADDER`; the seed is also the fold.
 
     If several of them change the sampler of contexts, the first one is used.
     """
-    each = [CHANGES[change] for change in changes]
+    each = [LADDER[part] for part in without]
     scales = next((how["scales"] for how in each if "scales" in how), lambda same: same)
     draw = next((how["draw"] for how in each if "draw" in how), sample_mixed)
     options: dict[str, dict[str, Any]] = {

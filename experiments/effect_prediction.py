@@ -98,7 +98,7 @@ def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
         return error_rows(predictions_of(results, primitive, part), primitive)
 
     grasps = predictions_of(results, "grasp", "fold_test")
-    grasp = grasp_rows(grasps)
+    grasp = grasp_rows(grasps) if len(grasps) else []
     return {
         "push": errors("push", "fold_test"),
         "push_test": errors("push", "fixed_test"),

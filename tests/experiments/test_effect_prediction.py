@@ -9,7 +9,7 @@ import torch
 from experiments import cross_validation
 from experiments import effect_prediction as tables
 from experiments.cross_validation import job, network_and_training
-from experiments.grasps import auc, confusion_columns
+from experiments.grasps import confusion_columns
 from experiments.lever_up import job as lever_job
 from experiments.runner import run
 
@@ -114,14 +114,6 @@ def test_a_fold_may_lack_a_category():
 
 
 # Grasps
-
-
-def test_auc_counts_pairs_in_order_within_folds():
-    truth, one = np.array([True, False, True, False]), np.zeros(4)
-    score = np.array([0.9, 0.1, 0.4, 0.4])
-    assert auc(score, truth, one) == (3 + 0.5) / 4
-    assert auc(score, truth, np.array([0, 0, 1, 1])) == (1 + 0.5) / 2
-    assert auc(score, truth, np.arange(4)) is None
 
 
 def test_shares_are_of_the_true_successes_and_failures():

@@ -35,8 +35,8 @@ def test_changes_of_an_ablation_add_up(monkeypatch):
         made.append((model, config, sampler))
 
     monkeypatch.setattr(ablation, "train", remember)
-    ablation.ablated(tuple(ablation.LADDER.values()), 10)
-    ablation.ablated(("random contexts only",), 10)
+    ablation.ablated(tuple(ablation.LADDER), 10)
+    ablation.ablated(("contexts at the ends",), 10)
     (bare, config, draw), (ours, usual, loose) = made
     assert draw is ablation.one_at_a_time  # which draws at random moments, too
     assert (config.augment, config.beta, config.ema) == (False, 0.0, 0.0)
