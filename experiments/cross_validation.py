@@ -174,16 +174,12 @@ def logistic_predictions(
     """Return a grasp's probability of success by object size, and the ground-truth heights."""
     known, kept = valid_interactions(data, train_on), valid_interactions(other, queried)
     lifted = data["effect"].values[known, -1, 2] > Grasp.success_m
-    probability = logistic(data["size"].values[known], lifted, other["size"].values[kept])
+    regression = make_pipeline(StandardScaler(), LogisticRegression())
+    regression.fit(data["size"].values[known], lifted)
+    probability = regression.predict_proba(other["size"].values[kept])[:, 1]
     height = other["effect"].values[kept, -1, 2].tolist()
     record = about_objects(other, kept) | {"truth": {"z": height}}
     return record | {"probability": probability.tolist()}
-
-
-def logistic(size: np.ndarray, success: np.ndarray, queried: np.ndarray) -> np.ndarray:
-    """Return P(success) (M,) of a logistic regression on sizes (N, 3) with L2 regularisation."""
-    regression = make_pipeline(StandardScaler(), LogisticRegression())
-    return regression.fit(size, success).predict_proba(queried)[:, 1]
 
 
 def prediction_columns(predictions: dict[str, Any]) -> dict[str, Any]:

@@ -1,7 +1,6 @@
 """Shared fixtures, and the order of the test files."""
 
 from collections import Counter
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ from affordlib.models import AffordanceCNP, CNPConfig, load_checkpoint
 from affordlib.models.lever_up import lever_up_tensors
 from affordlib.planning import Skills
 from affordlib.world import Cuboid, Tabletop, WorldConfig
-from experiments.lever_training import LEVER_MODELS
 
 
 def pytest_collection_modifyitems(items):
@@ -90,15 +88,3 @@ def levers():
 def levered(levers):
     """48 lever-ups in the frame of the lever."""
     return lever_up_tensors(levers)
-
-
-@pytest.fixture(scope="session")
-def short():
-    """A function that trains a lever-up model, given by name, for a few steps."""
-
-    def short(name, **change):
-        few = {"steps": 4, "batch_size": 8, "validate_every": 2} | change
-        lever = LEVER_MODELS[name]
-        return replace(lever, training=replace(lever.training, **few))
-
-    return short

@@ -10,7 +10,7 @@ import torch
 from affordlib.interactions import InteractionTensors
 from affordlib.models import final_error, final_errors_m, network_predictions
 from experiments.baselines import constant, gaussian_process, nearest, network_record
-from experiments.cross_validation import add_errors, logistic
+from experiments.cross_validation import add_errors
 
 # Answers
 
@@ -64,11 +64,3 @@ def test_baselines_know_the_direction_and_recover_a_law_of_size():
     assert off[constant] == pytest.approx(float(expected), rel=1e-4)
     assert off[nearest] < off[constant] / 5
     assert off[gaussian_process] < off[constant] / 20
-
-
-def test_logistic_regression_finds_the_boundary():
-    rng = np.random.default_rng(0)
-    size = rng.uniform(0.03, 0.12, (400, 3))
-    fits = size[:, 0] < 0.08
-    told = logistic(size[:200], fits[:200], size[200:])
-    assert ((told > 0.5) == fits[200:]).mean() > 0.95

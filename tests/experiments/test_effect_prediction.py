@@ -4,14 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from experiments import cross_validation
 from experiments import effect_prediction as tables
 from experiments.cross_validation import job, network_and_training
 from experiments.grasps import confusion_columns
 from experiments.lever_up import job as lever_job
-from experiments.runner import run
 
 FEW = [job("constant", "grasp", fold=fold) for fold in range(3)]
 
@@ -42,36 +40,6 @@ FEW = [job("constant", "grasp", fold=fold) for fold in range(3)]
 def test_jobs_that_cannot_be_are_refused(make, arguments, reason):
     with pytest.raises(ValueError, match=reason):
         make(**arguments)
-
-
-@pytest.fixture
-def short(monkeypatch):
-    """Training on 100 grasps for a few steps."""
-    monkeypatch.setattr(cross_validation, "STEPS_ON_100", 6)
-    specs = cross_validation.CHECKPOINT_SPECS
-    training = replace(specs["film_500"].training, validate_every=2, batch_size=8, ema=0.0)
-    few = specs | {"film_500": replace(specs["film_500"], training=training)}
-    monkeypatch.setattr(cross_validation, "CHECKPOINT_SPECS", few)
-
-
-def test_a_training_that_was_killed_resumes_to_the_same_result(tmp_path, short, monkeypatch):
-    one, real, seen = job("film", "grasp"), torch.nn.utils.clip_grad_norm_, []
-    (whole,) = run([one], "table", folder=tmp_path / "whole", progress=False)
-
-    def dies(*arguments):
-        seen.append(1)
-        if len(seen) == 4:  # after a validation
-            raise KeyboardInterrupt
-        return real(*arguments)
-
-    monkeypatch.setattr(torch.nn.utils, "clip_grad_norm_", dies)
-    with pytest.raises(KeyboardInterrupt):
-        run([one], "table", folder=tmp_path, progress=False)
-    assert len(list(tmp_path.glob(".table-*.pt"))) == 1
-    (again,) = run([one], "table", folder=tmp_path, progress=False)
-    assert again["fold_test"] == whole["fold_test"]
-    assert not list(tmp_path.glob(".table-*.pt"))
-    assert len(seen) < 12  # finished work is not repeated
 
 
 def test_what_decides_a_training_decides_whether_its_result_is_stale(monkeypatch):

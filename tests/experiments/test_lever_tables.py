@@ -1,6 +1,5 @@
 """Lever-ups: baselines, jobs, tables made from their results, and shipped files."""
 
-import numpy as np
 import pytest
 import torch
 
@@ -22,18 +21,6 @@ def test_baselines_are_right_about_what_they_assume():
     mean, truth = extrapolate("constant_velocity", steady, "first_step")
     assert mean.abs().max() == 0
     assert truth.shape[1] == 25
-
-
-@pytest.mark.slow
-def test_folds_test_every_object_at_most_once():
-    whole = open_interactions("lever_up")
-    splits = [lever_split(whole, fold) for fold in range(5)]
-    tests = np.concatenate([s.test for s in splits])
-    assert len(set(tests)) == len(tests) == 900
-    for split in splits:
-        parts = [set(p) for p in (split.train, split.validation, split.test)]
-        assert [len(p) for p in parts] == [1440, 180, 180]
-        assert len(set.union(*parts)) == 1800
 
 
 @pytest.mark.parametrize(

@@ -77,20 +77,6 @@ def test_other_conditions_are_read(cells, tmp_path):
         run(cells, needed, tmp_path, folder)
 
 
-def test_a_csv_may_hold_the_motion_and_other_clocks(cells, tmp_path):
-    """Rows of poses alone, between those of the tool, change nothing but the first and the last."""
-    names = run(cells, "c03 csv c05", tmp_path)
-    table = names["pd"].read_csv(names["csv"])
-    known = table.dropna()
-    between = known.groupby("push").mean().reset_index()[["push", "t", "x", "y", "yaw"]]
-    more = names["pd"].concat([table, between]).sort_values(["push", "t"])
-    more.to_csv(tmp_path / "more.csv", index=False)
-    other = run(cells, "c05", tmp_path, **names | {"csv": tmp_path / "more.csv"})
-    for name in ("contact_m", "direction", "displacement_m", "turn_rad"):
-        one, two = (getattr(each["pushes"], name) for each in (names, other))
-        np.testing.assert_array_equal(one, two)
-
-
 def test_plans_want_one_group(cells, tmp_path):
     data = run(cells, "c03 csv c05 conditions", tmp_path)["data"]
     assert len(data) == 250

@@ -61,8 +61,10 @@ def test_a_rollout_does_not_depend_on_how_far_it_is_asked(levered):
 
 
 @pytest.mark.parametrize(("name", "kind"), [("cnp_last_pose", "all"), ("lstm_tuned", "first_step")])
-def test_training_learns(levered, short, name, kind):
-    lever = short(name, steps=60, batch_size=16, validate_every=30, ema=0.0)
+def test_training_learns(levered, name, kind):
+    few = {"steps": 60, "batch_size": 16, "validate_every": 30, "ema": 0.0}
+    lever = LEVER_MODELS[name]
+    lever = replace(lever, training=replace(lever.training, **few))
     model, history = fit_lever_model(lever, levered, levered, kind)
     moves = levered.effect[:, 1:, :3].norm(dim=-1).mean()
     assert from_start_errors_m(model, levered).mean() < moves / 3

@@ -30,7 +30,7 @@ from affordlib.types import Goal, Prediction
 from affordlib.world import ROLLABLE, STANDING, Cuboid, UprightCylinder
 from experiments.planning import attempt, phases_of_way
 from experiments.shipped import uniform_tasks
-from experiments.tasks import constructed_tasks, drawn_object, frozen_tasks
+from experiments.tasks import constructed_tasks, frozen_tasks
 from tests.planning.point_robot import REACH_M, STARTS, KnownDynamics, moved_m
 from tests.problems import problem_of
 
@@ -369,16 +369,6 @@ def test_a_push_that_would_stop_before_it_begins_is_none():
         assert all(step.stop_phase > 0 for step in plan.steps)
 
 
-@pytest.mark.slow
-def test_finer_samples_stop_nearer():
-    errors = []
-    for samples in (25, 100, 300):
-        goals = [(r * math.cos(r * 99), r * math.sin(r * 99)) for r in np.linspace(0.03, 0.08, 8)]
-        plans = [plan_gradient(known(xy), samples=samples) for xy in goals]
-        errors.append(np.mean([plan.predicted_distance_m for plan in plans]))
-    assert errors[0] > 2 * errors[1] > 4 * errors[2]
-
-
 def test_modes_bind_the_gradient_planner():
     partial, again = (plan_gradient(known((0.04, 0.0), "single_partial")) for _ in range(2))
     expected = STARTS + (1 - STARTS) * math.sqrt(0.04 / REACH_M)
@@ -465,36 +455,3 @@ def test_the_frozen_goals_are_those_that_are_drawn(world):
         assert task.obj == again.obj
         assert task.goal.distance_m(again.goal.xy_m) < 0.002
     assert all(math.hypot(*task.goal.xy_m) > 0.02 for task in frozen)
-
-
-def test_an_object_that_never_stays_is_replaced_by_another_of_its_category(world, monkeypatch):
-    first, *_ = drawn_object("multi_partial", "constructed", 0, 0, ROLLABLE)
-    placed, executed = [], []
-
-    def execute_primitive(action, stop, approach):
-        executed.append(placed[-1])
-        return SimpleNamespace(faults=(), fell=False, left_table=placed[-1] == first)
-
-    monkeypatch.setattr(world, "place", lambda obj, *_, config: placed.append(obj))
-    monkeypatch.setattr(world, "execute_primitive", execute_primitive)
-    monkeypatch.setattr(world, "object_pose", lambda: (0.05, 0.0, 0.0))
-    tasks = constructed_tasks(world, "multi_partial", 2, 0, ROLLABLE)
-    assert [task.obj.category for task in tasks] == list(ROLLABLE)
-    assert [task.obj for task in tasks] == placed[-2:]
-    assert first not in placed[-2:]
-    assert placed.count(first) == executed.count(first)  # nothing after it left the table
-    assert 1 < placed.count(first) == len(placed) - 2
-
-
-def test_an_attempt_averages_as_many_images_as_it_is_told(world, film):
-    task = next(t for t in frozen_tasks("perturbed") if t.mode == "single_full")
-    seen = []
-
-    def planner(problem):
-        seen.append(problem.start_xy_m)
-        return plan_continuous(problem)
-
-    attempt(world, task, partial(problem_of, film), planner, n_averaged_images=3)
-    world.place(task.obj, (0.0, 0.0), task.yaw_rad, config=task.config)
-    views = [world.observe().xy_m for _ in range(3)]
-    assert seen == [tuple(np.mean(views, axis=0).tolist())]
