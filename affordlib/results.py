@@ -221,12 +221,6 @@ def heading(column: str) -> str:
     return name.replace("_", " ") + (f", {unit[0]}" if unit else "")
 
 
-def factor(column: str) -> float:
-    """Return the factor that converts a column's numbers to the unit of its heading."""
-    _, unit = _split_unit(column)
-    return unit[1] if unit else 1.0
-
-
 def cell(column: str, value: object) -> str:
     """Return a value as text in the unit, and with the decimals, of its column's heading."""
     value = value.item() if isinstance(value, np.generic) else value

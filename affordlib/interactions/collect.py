@@ -111,23 +111,24 @@ def collect(
     check_count("workers", workers, 1, MOST_WORKERS)
     size = check_count("chunk", CHUNK if chunk is None else chunk)
     attrs, file, n = attributes_for(recipe), from_root(path), recipe.n_interactions
-    parts, missing, files = file.with_name(f".{file.name}.parts"), {}, []
+    parts, missing, files = file.with_name(f".{file.name}.parts"), {}, {}
     if not _is_there(file, attrs, replace):
         for rows in (range(k, min(k + size, n)) for k in range(0, n, size)):
-            files.append(parts / f"{rows.start:08d}-{rows.stop:08d}{SUFFIX}")
-            if _attributes(files[-1]) != attrs:
-                missing[f"interactions {rows.start} to {rows[-1]}"] = rows, files[-1]
-        left = sum(len(rows) for rows, _ in missing.values())
+            name = f"interactions {rows.start} to {rows[-1]}"
+            files[name] = parts / f"{rows.start:08d}-{rows.stop:08d}{SUFFIX}"
+            if _attributes(files[name]) != attrs:
+                missing[name] = rows
+        left = sum(map(len, missing.values()))
         bar = tqdm(total=n, initial=n - left, unit=" interactions", disable=not progress)
         try:
-            with closing(spread(partial(_make, recipe), missing, workers)) as made, bar:
+            with closing(spread(partial(collect_chunk, recipe), missing, workers)) as made, bar:
                 for name, data in made:
                     if data.attrs != attrs:
                         there, here = data.attrs["versions"], attrs["versions"]
                         raise RuntimeError(f"{name} were made with {there}, but need {here}")
-                    write_interactions(data, missing[name][1], level=1)  # temporary, and fast
-                    bar.update(len(missing[name][0]))
-            chunks = [open_interactions(part) for part in files]
+                    write_interactions(data, files[name], level=1)  # temporary, and fast
+                    bar.update(len(missing[name]))
+            chunks = [open_interactions(part) for part in files.values()]
             how = {"data_vars": "minimal", "combine_attrs": "override"}
             write_interactions(xr.concat(chunks, "interaction", **how), file)
         except (KeyboardInterrupt, OSError, RuntimeError) as error:
@@ -155,11 +156,6 @@ def _is_there(file: Path, attrs: dict[str, str], replace: bool) -> bool:
             f"path {file} is {what}; choose another path, delete it, or pass replace=True"
         )
     return found == attrs
-
-
-def _make(recipe: Recipe, task: tuple[range, Path]) -> xr.Dataset:
-    """Collect one chunk, on a worker."""
-    return collect_chunk(recipe, task[0])
 
 
 def attributes_for(recipe: Recipe) -> dict[str, str]:

@@ -122,13 +122,6 @@ def sample_scene(recipe: Recipe, index: int) -> tuple[TabletopObject, float, np.
     return obj, float(rng.uniform(-math.pi, math.pi)), rng
 
 
-def sample_world(recipe: Recipe, index: int, obj: TabletopObject) -> WorldConfig:
-    """Return the world parameters of interaction `index`."""
-    if recipe.variation is None:
-        return recipe.world
-    return recipe.variation.sample(obj, _generator(recipe, index, 3))
-
-
 def interact(
     recipe: Recipe, index: int, world: Tabletop, stop_phase: float | None = None
 ) -> tuple[TabletopObject, Interaction]:
@@ -141,7 +134,9 @@ def interact(
     kinds = [kind for kind in kinds if kind.rollable in (None, obj.rollable)] or kinds
     kind = kinds[rng.integers(len(kinds)) if len(kinds) > 1 else 0]
     action = kind.sample(rotated(obj.footprint_m, yaw), rng)
-    config, xy_m, stop = sample_world(recipe, index, obj), (0.0, 0.0), 1.0
+    config, xy_m, stop = recipe.world, (0.0, 0.0), 1.0
+    if recipe.variation is not None:
+        config = recipe.variation.sample(obj, _generator(recipe, index, 3))
     if recipe.anywhere:
         low = np.array([TABLE_X_M[0], TABLE_Y_M[0]]) + _TABLE_MARGIN_M
         high = np.array([TABLE_X_M[1], TABLE_Y_M[1]]) - _TABLE_MARGIN_M

@@ -75,15 +75,11 @@ def load_checkpoint(name_or_path: str | Path) -> tuple[EffectNetwork, dict[str, 
             raise ValueError(f"its network is in {description['module']!r:.80}")
         importlib.import_module(description["module"])
         kind, config_class = NETWORKS[description["model"]]
-        parts = []
-        for name, part in (
-            ("config", config_class),
-            ("scaler", Scaler),
-            ("domain", TrainingDomain),
-        ):
+        parts = {"config": config_class, "scaler": Scaler, "domain": TrainingDomain}
+        for name, part in parts.items():
             items = description[name].items()
-            parts.append(part(**{k: tuple(v) if isinstance(v, list) else v for k, v in items}))
-        return kind(*parts)
+            parts[name] = part(**{k: tuple(v) if isinstance(v, list) else v for k, v in items})
+        return kind(**parts)
 
     model, description = restored(path, _REMEDY, make)
     return model, description["about"]

@@ -73,12 +73,10 @@ def coverage(
     return float(((truth - mean).abs() <= half * std).double().mean())
 
 
-def fit_sigma_scale(
-    model: EffectNetwork, validation: InteractionTensors, phases: Sequence[float] = AFTER_CONTACT
-) -> tuple[float, ...]:
+def fit_sigma_scale(model: EffectNetwork, validation: InteractionTensors) -> tuple[float, ...]:
     """Set and return the maximum-likelihood sigma_scale (C_e,); x and y share one factor."""
     model.sigma_scale.fill_(1.0)
-    truth, mean, std = effects_at(model, validation, phases)
+    truth, mean, std = effects_at(model, validation, AFTER_CONTACT)
     squared = ((truth - mean) / std).square().mean(dim=(0, 1))
     plane = xy_columns(model.effect_channels)
     squared[plane] = squared[plane].mean()

@@ -203,13 +203,11 @@ def plot_outcome(
     return ax
 
 
-def plot_closed_loop(
-    ax: Axes, result: ClosedLoopResult, obj: TabletopObject | None = None, yaw_rad: float = 0.0
-) -> Axes:
+def plot_closed_loop(ax: Axes, result: ClosedLoopResult) -> Axes:
     """Draw a closed loop from above: the object's path in each action, and disturbances.
 
     Dots are predicted positions after each action, numbers count the actions, and dotted lines are
-    motions between actions. obj: drawn at its final pose, if given; yaw_rad: its yaw at the start.
+    motions between actions.
     """
     goal = result.goal
     first = result.plans[0].goal if result.plans else goal
@@ -233,9 +231,6 @@ def plot_closed_loop(
         moved = np.hypot(*np.diff(path, axis=0, prepend=path[:1]).T).cumsum()
         middle = [np.interp(moved[-1] / 2, moved, path[:, c]) for c in (0, 1)]
         _name(ax, f"{k + 1}", _cm(middle), (0, 0))
-    if obj is not None:
-        x, y, turned_rad = result.end_pose
-        plot_footprint(ax, obj, (x, y), check_finite("yaw_rad", yaw_rad) + turned_rad, TRUTH)
     actions = len(result.steps)
     ax.set_title(f"{result.status}: {1000 * result.distance_m:.1f} mm, {actions} actions")
     return ax
