@@ -204,13 +204,13 @@ def logged(pushes: Sequence[dict[str, Any]]) -> LoggedPushes:
     return log.pushes()
 
 
-def attempt(table: Table, planner: PushPlanner, n_pushes: int, seed: int) -> dict[str, Any]:
-    """Solve one initial state: plan, push, observe, plan again; what it took."""
+def attempt(table: Table, planner: PushPlanner | None, n_pushes: int, seed: int) -> dict[str, Any]:
+    """Solve one initial state: plan, push, observe, plan again; what it took. None: do nothing."""
     log, took_s, pushes = log_of_t(), [], 0
     table.reset(seed)
     goal = log.centroid_pose(GOAL)
     rng = np.random.default_rng(seed)
-    while not table.done:
+    while planner and not table.done:
         if table.solved["a"]:
             table.act(table.agent)
             continue
@@ -324,17 +324,9 @@ def solve(row: str, block: int) -> dict[str, Any]:
     """Solve the initial states of a block."""
     about, first = ROWS[row], FIRST_START + block * OF_BLOCK
     table = Table(about.view, block_cog=about.block_cog)
-    if row == "nothing":
-        runs = []
-        for seed in range(first, first + OF_BLOCK):
-            table.reset(seed)
-            runs.append({"seed": seed, "pushes": 0, "plan_s": 0.0})
-            runs[-1] |= {f"steps_{rule}": steps for rule, steps in table.solved.items()}
-        return {"runs": runs}
-    planner = planner_of(about, block % DRAWS)
-    return {
-        "runs": [attempt(table, planner, about.chain, s) for s in range(first, first + OF_BLOCK)]
-    }
+    planner = planner_of(about, block % DRAWS) if about.n else None
+    seeds = range(first, first + OF_BLOCK)
+    return {"runs": [attempt(table, planner, about.chain, seed) for seed in seeds]}
 
 
 def errors(row: str, draw: int) -> dict[str, Any]:

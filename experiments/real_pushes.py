@@ -193,14 +193,10 @@ def differences(errors: pd.DataFrame) -> Rows:
             for column, unit in (("position", "m"), ("yaw", "rad")):
                 each = errors[f"{column}_{unit}"]
                 off = (each["np", told] - each[best, baseline_told]).dropna()
-                row |= {"n": len(off)} | dict(zip(named(column, unit), interval(off), strict=True))
+                names = [f"{column}_{what}_{unit}" for what in ("mean", "low", "high")]
+                row |= {"n": len(off)} | dict(zip(names, interval(off), strict=True))
             rows.append(row)
     return rows
-
-
-def named(name: str, unit: str) -> list[str]:
-    """Return the names of the columns of a mean difference and its interval."""
-    return [f"{name}_{what}_{unit}" for what in ("mean", "low", "high")]
 
 
 @command(OSError, ValueError)

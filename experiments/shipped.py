@@ -25,7 +25,6 @@ from torch import nn
 from affordlib.interactions import (
     Batch,
     InteractionTensors,
-    Split,
     condition_on_recorded_action,
     open_interactions,
     recipes,
@@ -184,13 +183,6 @@ def data_of(checkpoint: str) -> str:
     return CHECKPOINT_SPECS[checkpoint].data if checkpoint in CHECKPOINT_SPECS else "lever_up"
 
 
-def about_checkpoint(
-    data: xr.Dataset, split: Split, training: TrainingConfig, **more: str
-) -> dict[str, object]:
-    """Return the description of a shipped checkpoint's training, with further entries `more`."""
-    return about_training(data, np.concatenate([split.train, split.validation]), training) | more
-
-
 def train_checkpoint(name: str) -> None:
     """Train a shipped model on fold 0 of its data set and write it to data/checkpoints."""
     data = open_interactions(data_of(name))
@@ -206,7 +198,8 @@ def train_checkpoint(name: str) -> None:
         how = {"augment": augment, "sampler": spec.sampler}
         model, history = train_model(data, split, spec.training, spec.network, **how)
     path = repo_root() / "data" / "checkpoints" / f"{name}{SUFFIX}"
-    save_checkpoint(model, path, about_checkpoint(data, split, spec.training, **more))
+    seen = np.concatenate([split.train, split.validation])
+    save_checkpoint(model, path, about_training(data, seen, spec.training) | more)
     error = 1000 * min(record.validation_error for record in history)
     steps, seconds = history[-1].step, history[-1].seconds
     print(f"{path.name}: {steps} steps in {seconds:.0f} s, validation {error:.2f} mm or mrad")
