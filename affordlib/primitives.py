@@ -18,10 +18,10 @@ from affordlib.types import (
     check_array,
     check_choice,
     check_finite,
-    check_pair,
     check_within,
     number,
     parameter,
+    point,
 )
 
 DURATION_S = 3.75  # of every primitive: 25 samples, one every 3 steps of 50 ms (Section 4.2)
@@ -192,10 +192,6 @@ class Push(Move):
         return _segments((0.0, (*start, *facing)), (DURATION_S, (*end, *facing)))
 
 
-def _near_centre(name: str, xy_m: Any) -> tuple[float, ...]:
-    return tuple(check_within(name, value, -0.3, 0.3, "m") for value in check_pair(name, xy_m))
-
-
 @dataclass(frozen=True)
 class PushAt(Primitive):
     """A straight push with a thin rod at any contact point and in any direction.
@@ -204,7 +200,7 @@ class PushAt(Primitive):
     centre in the table's axes, and continues by `length` [m].
     """
 
-    contact: tuple[float, float] = parameter(_near_centre)
+    contact: tuple[float, float] = point(2, 0.3)
     direction: float = radians()
     length: float = metres(0.0, 0.15, 0.016)
 

@@ -135,7 +135,7 @@ def count(default: int, least: int = 1, most: float = math.inf) -> Any:
     return parameter(partial(check_count, least=least, most=most), default)
 
 
-def point(size: int, most_m: float, default: tuple[float, ...]) -> Any:
+def point(size: int, most_m: float, default: Any = MISSING) -> Any:
     """Declare a field that is a tuple of numbers in [-most_m, most_m] m."""
 
     def check(name, value):

@@ -302,14 +302,13 @@ def _tuned(model: NeuralProcess, data: LoggedPushes, kept: np.ndarray, seed: int
 
 def _predicted(model: NeuralProcess, data: LoggedPushes, pushes: Pushes) -> tuple[Tensor, Tensor]:
     """Mean and σ (n, 3) in the contact frames, given the pushes of the same group as context."""
-    rows, feet, logged = push_rows(pushes), told_feet(pushes), push_rows(data)
+    rows, feet, log = push_rows(pushes), told_feet(pushes), push_rows(data)
     mean, std = torch.zeros(len(rows), 3), torch.zeros(len(rows), 3)
     for group in np.unique(pushes.groups):
         known = np.flatnonzero(data.groups == group)
         few = np.linspace(0, len(known) - 1, min(len(known), MOST_CONTEXT)).round().astype(int)
         query = torch.from_numpy(pushes.groups == group)
-        of_group = model.predict(rows[query, :7], logged[known[few]], feet[query][0])
-        mean[query], std[query] = of_group
+        mean[query], std[query] = model.predict(rows[query, :7], log[known[few]], feet[query][0])
     return mean, std
 
 

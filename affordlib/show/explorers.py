@@ -9,6 +9,7 @@ import io
 import itertools
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -49,6 +50,7 @@ class Line(NamedTuple):
     band: np.ndarray | None = None
 
 
+@dataclass(frozen=True, eq=False, repr=False)
 class Explorer:
     """Panels of lines that depend on sliders.
 
@@ -57,18 +59,17 @@ class Explorer:
     whose axes have the same scale. words: a sentence for each state, in which <b> is bold.
     """
 
-    def __init__(
-        self,
-        sliders: dict[str, Sequence[float]],
-        start: Sequence[float],
-        panels: dict[str, list[Line]],
-        words: list[str],
-        square: str = "",
-    ) -> None:
-        self.sliders, self.panels, self.words = sliders, panels, words
-        self.square = square
-        pairs = zip(sliders.values(), start, strict=True)
-        self.at = [int(np.abs(np.subtract(values, wanted)).argmin()) for values, wanted in pairs]
+    sliders: dict[str, Sequence[float]]
+    start: Sequence[float]
+    panels: dict[str, list[Line]]
+    words: list[str]
+    square: str = ""
+
+    @property
+    def at(self) -> list[int]:
+        """Number of the value at which each slider starts."""
+        pairs = zip(self.sliders.values(), self.start, strict=True)
+        return [int(np.abs(np.subtract(values, wanted)).argmin()) for values, wanted in pairs]
 
     @property
     def state(self) -> int:
@@ -81,7 +82,8 @@ class Explorer:
         axes = figure.subplots((len(self.panels) + 1) // 2, 2, squeeze=False)
         for ax, (title, lines) in zip(axes.flat, self.panels.items(), strict=True):
             for line in lines:
-                x, y, band = (_of(value, self.state) for value in (line.x, line.y, line.band))
+                parts = (line.x, line.y, line.band)
+                x, y, band = (v if v is None or v.ndim == 1 else v[self.state] for v in parts)
                 ax.plot(x, y, line.style, color=line.color, label=line.name)
                 if band is not None:
                     ax.fill_between(x, y - band, y + band, color=line.color, alpha=0.2, lw=0)
@@ -108,10 +110,6 @@ class Explorer:
         script = f"<script>{_SCRIPT.read_text()}(document.currentScript.parentElement, {text})"
         html = f'<div class="affordlib-explorer">{inside}{script}</script></div>'
         return {"text/html": html, "text/plain": type(self).__name__}
-
-
-def _of(values: np.ndarray | None, state: int) -> np.ndarray | None:
-    return values if values is None or values.ndim == 1 else values[state]
 
 
 def _packed(line: Line) -> dict[str, Any]:
@@ -141,7 +139,8 @@ def conditioning_explorer(
     states = np.array(list(itertools.product(*sliders.values())))
     context = {"action": np.insert(states[:, :1], 0, 0.0, axis=1), "effect": states[:, 1:2]}
     channels = {of: getattr(model, f"{of}_channels") for of in CHANNELS}
-    truth = {of: _columns(seen, of, names) for of, names in channels.items()}
+    columns = {of: [CHANNELS[of].index(n) for n in names] for of, names in channels.items()}
+    truth = {of: getattr(seen, of)[:, each] for of, each in columns.items()}
 
     def values(of, t):
         return np.stack([np.interp(t, seen.phase, column) for column in truth[of].T], axis=-1)
@@ -176,10 +175,6 @@ def conditioning_explorer(
 
 def _tensor(values: Any) -> torch.Tensor:
     return torch.as_tensor(values, dtype=torch.float32)
-
-
-def _columns(seen: Interaction, of: str, names: Sequence[str]) -> np.ndarray:
-    return getattr(seen, of)[:, [CHANNELS[of].index(name) for name in names]]
 
 
 def phase_explorer(world: Tabletop, action: Primitive, phase: float = 0.8) -> Explorer:
