@@ -96,7 +96,7 @@ class GoalPicker(widgets.HBox):
         self._alone = threading.RLock()  # held while planning or moving something in the world
         self._queue = ThreadPoolExecutor(1)
         self._stop = threading.Event()
-        self._disturbances: list[Callable[[], None]] = []  # pending until the action ends
+        self._disturbances: list[Callable[[], None]] = []  # until the action ends
         self._motions: list[list[float]] = []  # of object and hand, not yet sent
         self._trail: list[tuple[float, float]] = []  # of the object since the plan was made
         self._marks: list[list[Any]] = []  # moves of object and goal that were not planned
@@ -175,9 +175,8 @@ class GoalPicker(widgets.HBox):
         """The table, object, goal and plan as a figure."""
         figure = Figure(figsize=(5.2, 5.2), layout="constrained")
         plan = self.plan or Plan(self.goal, self._pose[:2], (), "none", False, 0.0)
-        points = np.array(
-            [self.goal.xy_m, *(s.predicted_end_xy_m for s in plan.steps), self._pose[:2]]
-        )
+        ends = [step.predicted_end_xy_m for step in plan.steps]
+        points = np.array([self.goal.xy_m, *ends, self._pose[:2]])
         low, high = points.min(axis=0), points.max(axis=0)
         ax = plot_table(figure.subplots(), (low + high) / 2, 0.12 + float((high - low).max()) / 2)
         for x, y in (100 * np.transpose(line) for line in self._searched):
@@ -375,17 +374,19 @@ class GoalPicker(widgets.HBox):
                     self._stale = False  # the run has followed the goal
                 self.controls.say(*outcome_in_words(outcome, self.goal, how, done))
             except Exception:
-                self.plan = None  # the next run plans from the current pose
+                self.plan, self._disturbances = None, []  # the next run plans from the current pose
                 raise
             finally:
                 self.world.on_step = on_step
-                self._disturbances.clear()
                 self._wait_until_shown()
                 if self.scene is not None:
                     self.scene.stop()
                 self._pose = self.world.object_pose()
                 self._set_running(False)
                 self._show()
+            if self._disturbances:  # pressed after the last action
+                self._news = self.controls.said
+                self._disturb()
 
     def _replace_plan(self, plan: Plan, done: int) -> None:
         """Show a plan that was made during a run, after `done` actions."""
@@ -439,13 +440,13 @@ class GoalPicker(widgets.HBox):
 
     # Disturbances
 
-    def _disturb(self, disturbance: Callable[[], None]) -> None:
-        if self._running:
-            self._disturbances.append(disturbance)
-            return
-        with self._alone:
-            disturbance()
-            self._make_plan()
+    def _disturb(self, *disturbances: Callable[[], None]) -> None:
+        self._disturbances += disturbances
+        if not self._running:
+            with self._alone:
+                while self._disturbances:
+                    self._disturbances.pop(0)()
+                self._make_plan()
 
     def _shove(self) -> None:
         dx, dy = self._displacement(self.world.object_pose()[:2], 0.02, 0.04)
@@ -479,8 +480,7 @@ class GoalPicker(widgets.HBox):
         goal = {"xy": self.goal.xy_m, "tolerance": self.goal.tolerance_m, "yaw": None}
         if self.goal.turn_rad is not None:
             goal["yaw"] = self._turn_from + self.goal.turn_rad
-        shown = () if planning else self._searched
-        self._view.searched = [np.round(line, 4).tolist() for line in shown]
+        self._view.searched = [np.round(v, 4).tolist() for v in self._searched * (not planning)]
         self._view.scene = {
             "pose": self._pose,
             "goal": goal,

@@ -190,10 +190,10 @@ def test_stop_lets_an_action_end_and_begins_no_other(make_picker, world):
         picker.run()
     picker.shove_object()
     picker.controls.stop.click()
-    assert "Stopped after 1 action:" in in_time(picker).controls.words.value
-    assert math.dist(world.object_pose()[:2], first) < 0.03
+    said = in_time(picker).controls.said
+    assert re.search(r"Stopped after 1 action:.* The object was shoved by \d\d mm. Plan: ", said)
+    assert math.dist(world.object_pose()[:2], first) < 0.07
     assert not picker.controls.run.disabled
-    # Disturbances pending at a stop are not applied in the next run.
     picker.pick(*(0.05 + v for v in world.object_pose()[:2]))
     picker.run()
     assert picker.outcome.distance_m < 0.03, picker.controls.words.value
@@ -263,6 +263,22 @@ def test_a_disturbance_waits_for_the_end_of_the_action(make_picker, world):
     assert 0.039 < math.dist(first_goal.xy_m, goal.xy_m) < 0.081
     assert drawn_goal(picker) == goal.xy_m
     assert picker.outcome.distance_m == pytest.approx(goal.distance_m(world.object_pose()[:2]))
+
+
+def test_a_disturbance_after_the_last_action_is_one_of_what_rests(make_picker, world):
+    def executor(world, plan, planner, report):
+        done = open_loop(world, plan, planner, report)
+        picker.shove_object()
+        picker.move_goal()
+        return done
+
+    picker = make_picker(executor=executor)
+    first = picker.plan
+    picker.run()
+    assert math.dist(world.object_pose()[:2], first.predicted_end_xy_m) > 0.015
+    assert re.search("Done, .* was shoved by .* was moved by .* Plan: ", picker.controls.said)
+    assert picker.plan.start_xy_m == world.object_pose()[:2]
+    assert picker.plan.goal.xy_m == drawn_goal(picker) != first.goal.xy_m
 
 
 @pytest.mark.slow
