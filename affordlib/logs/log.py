@@ -39,7 +39,8 @@ BACK_M = 0.01
 """How far [m] the path of a tool that touches in the first row is extended backwards."""
 APART_M, TOUCH_M = 0.003, 0.001
 """In a session: gaps [m] at which a push may begin, and below which the tool touches."""
-MOST_TILT_RAD = math.radians(20)
+MOST_TILT_RAD, WOBBLE_RAD = math.radians(20), math.radians(2)
+"""How far an upright object may be tilted, and how much that may vary if its yaw varies less."""
 ORDERS = {"xyzw": [0, 1, 2, 3], "wxyz": [1, 2, 3, 0]}
 UPS = {"z": 0, "y": 1, "x": -1}
 """How far x, y, z must be shifted so that the axis that points up comes last."""
@@ -91,7 +92,9 @@ def planar(values: Any, order: str = "xyzw", up: str = "z") -> np.ndarray:
 
     order: of the quaternion, "xyzw" or "wxyz"; up: the axis of the world that points up, "z", "y"
     or "x"; the plane's x and y are the two that follow it, for "y" these are z and x. Raises
-    ValueError if the object's own axis of this name does not point up.
+    ValueError if the object's own axis of this name does not point up, or if its tilt varies where
+    its yaw does not, as in another order. Poses that hardly turn may be of any order: try one of
+    the object turned by 90°.
     """
     check_choice("order", order, ORDERS)
     shift = UPS[check_choice("up", up, UPS)]
@@ -106,14 +109,15 @@ def planar(values: Any, order: str = "xyzw", up: str = "z") -> np.ndarray:
         raise ValueError(f"values: a quaternion has length 1, but in row {row} {size[row]:g}")
     i, j, k = np.roll(quaternions[:, :3], shift, axis=1).T
     w, tilt = quaternions[:, 3], np.arccos(np.clip(1 - 2 * (i * i + j * j), -1, 1))
-    row = int(tilt.argmax())
-    if tilt[row] > MOST_TILT_RAD:
+    yaw, row = np.arctan2(2 * (w * k + i * j), 1 - 2 * (j * j + k * k)), int(tilt.argmax())
+    wobble = 2 * np.hypot(*np.std([i * k - w * j, j * k + w * i], axis=1))  # of up, as it sees it
+    if tilt[row] > MOST_TILT_RAD or wobble > max(WOBBLE_RAD, np.unwrap(yaw).std()):
         raise ValueError(
             f"values: the object's {up} axis must point up, but in row {row} it is tilted by "
-            f"{math.degrees(tilt[row]):.0f}°; choose another order ({order}) or up ({up}), or turn "
-            "the frame fixed to the object"
+            f"{math.degrees(tilt[row]):.0f}°, which varies by {math.degrees(wobble):.0f}°; choose "
+            f"another order ({order}) or up ({up}), or turn the frame fixed to the object"
         )
-    return np.column_stack([xy, np.arctan2(2 * (w * k + i * j), 1 - 2 * (j * j + k * k))])
+    return np.column_stack([xy, yaw])
 
 
 class Log:

@@ -357,6 +357,20 @@ def test_poses_in_space_become_poses_in_the_plane(up, order):
         planar(both, {"xyzw": "wxyz", "wxyz": "xyzw"}[order], up)
 
 
+@pytest.mark.parametrize("turn_deg", [0.0, 3.0, 5.0, 12.0])
+@pytest.mark.parametrize(("order", "about"), [("xyzw", 0.0), ("wxyz", math.pi)])
+def test_a_turn_is_not_read_as_a_tilt(order, about, turn_deg):
+    """About these yaws another order looks upright, but its tilt varies as the yaw should."""
+    yaw = about + np.radians([-1.0, turn_deg - 1.0])
+    q = np.column_stack([[0.004, -0.004], [0, 0.004], np.sin(yaw / 2), np.cos(yaw / 2)])
+    rows = np.hstack([np.zeros((2, 3)), q if order == "xyzw" else np.roll(q, 1, axis=1)])
+    turn = np.diff(np.unwrap(planar(rows, order)[:, 2]))
+    assert np.degrees(turn) == pytest.approx(turn_deg, abs=0.1)
+    if turn_deg > 4:
+        with pytest.raises(ValueError, match=r"varies by .* another order"):
+            planar(rows, {"xyzw": "wxyz", "wxyz": "xyzw"}[order])
+
+
 def test_a_push_without_a_path_is_known_by_contact_direction_and_length():
     log = Log("mm", TRIANGLE_MM, tool_radius=3)
     contact = rotated(np.array([30.6, 0.0]), 0.3) + START[:2]
