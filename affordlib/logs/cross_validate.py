@@ -60,8 +60,9 @@ def summary(errors: pd.DataFrame, by: Sequence[str] = ("model",)) -> list[dict[s
 
     The number of pushes, mean, standard error (sem) and median of the errors, and coverage.
     """
-    if not by or not set(by) <= set(errors.columns):
-        raise ValueError(f"by must be columns of errors ({', '.join(errors)}), got {by!r}")
+    if not by or not {"position_m", "yaw_rad", "inside_50", "inside_90", *by} <= {*errors}:
+        made = f"errors, a table of cross_validate ({', '.join(map(str, errors))})"
+        raise ValueError(f"by must be columns of {made}, got {by!r}")
     rows = []
     for key, part in errors.groupby([*by], sort=False):
         row = dict(zip(by, key, strict=True)) | {"n": len(part)}
@@ -80,12 +81,15 @@ def worst(
     Look at them before you trust a log: poses that jump, and rows of another push, come first.
     names: of the pushes (`Log.names`), instead of their numbers.
     """
+    shown = ["push", "group", "position_m", "yaw_rad", "error_over_std"]
+    if lost := {"model", *shown} - {*errors}:
+        raise ValueError(f"errors must be a table of cross_validate, but has no {sorted(lost)}")
     check_choice("model", model, set(errors["model"]))
     if 0 < len(names) <= errors["push"].max():
         raise ValueError(f"names must be one for each push (Log.names), got {len(names)}")
     known = errors[errors["model"] == model].nlargest(check_count("n", n), "error_over_std")
     known = known.assign(push=[names[k] if len(names) else k for k in known["push"]])
-    return known[["push", "group", "position_m", "yaw_rad", "error_over_std"]]
+    return known[shown]
 
 
 def errors_of(

@@ -412,3 +412,6 @@ def test_the_pushes_that_fit_worst_are_those_whose_pose_jumped():
     spoiled = {name for name in ("3", "21") if name in log.names}
     assert spoiled
     assert spoiled <= {*worst(errors, log.names, n=3)["push"]}
+    for ask in (worst, summary):
+        with pytest.raises(ValueError, match="table of cross_validate"):
+            ask(errors.drop(columns="yaw_rad"))
