@@ -33,48 +33,15 @@ from tests.problems import Still
 LIMIT_S, N_VALUES = 5.0, 60
 NUMBERS = (math.nan, math.inf, -math.inf, 10**400, -1, 0, 1, 2.5, 1e300, 1e-300, -0.0, 10**6, True)
 WORDS = ("", "0.05", "push", "../../x", "\x00", "ü" * 300, b"0.05", Path("/proc/x"))
-SHIPPED = (
-    "cnp_500",
-    "np_cnp",
-    "reachability",
-    "push_test",
-    "novelty_push",
-    "planning",
-    "README.md",
-)
-HEAPS = (
-    [],
-    {},
-    set(),
-    (),
-    [[]],
-    [[0.1], [0.1, 0.2]],
-    {"x": 1},
-    (0.1,),
-    (0.1, "0.2"),
-    (math.nan, 0),
-    (1e9, 1e9),
-    (1, 2, 3),
-)
-ARRAYS = (
-    np.zeros(0),
-    np.full((2, 48, 48), np.nan),
-    np.zeros((2, 48, 48)),
-    np.zeros((48, 48, 2), np.uint8),
-    np.full((3, 2), np.inf),
-    np.array(["a", "b"]),
-    torch.full((2,), math.nan),
-    torch.zeros(1, 2, 48, 48),
-)
-OBJECTS = (
-    None,
-    object(),
-    lambda: None,
-    1j,
-    decimal.Decimal("0.05"),
-    fractions.Fraction(1, 20),
-    int,
-)
+SHIPPED = ("cnp_500", "np_cnp", "reachability", "push_test", "novelty_push", "planning")
+SHIPPED += ("README.md",)
+HEAPS = ([], {}, set(), (), [[]], [[0.1], [0.1, 0.2]], {"x": 1}, (0.1,), (0.1, "0.2"))
+HEAPS += ((math.nan, 0), (1e9, 1e9), (1, 2, 3))
+ARRAYS = (np.zeros(0), np.full((2, 48, 48), np.nan), np.zeros((2, 48, 48)))
+ARRAYS += (np.zeros((48, 48, 2), np.uint8), np.full((3, 2), np.inf), np.array(["a", "b"]))
+ARRAYS += (torch.full((2,), math.nan), torch.zeros(1, 2, 48, 48))
+OBJECTS = (None, object(), lambda: None, 1j)
+OBJECTS += (decimal.Decimal("0.05"), fractions.Fraction(1, 20), int)
 OURS = (Goal((0.1, 0.0)), Push(0.0), world.Cuboid(0.06, 0.05, 0.05), planning.PlanMode(1, True))
 FIXED = (*NUMBERS, *WORDS, *SHIPPED, *ARRAYS, *OBJECTS, *OURS, *HEAPS)
 
