@@ -12,7 +12,7 @@ from contextlib import closing, nullcontext
 from functools import partial
 from typing import Any
 
-from joblib import Parallel, delayed, parallel_config
+from joblib.parallel import Parallel, delayed, mp, parallel_config
 
 
 def spread(
@@ -23,10 +23,10 @@ def spread(
     In this process for one worker, unless joblib.parallel_config says otherwise; else in new
     processes, which end with this one. Raises RuntimeError that names a task that fails.
     """
-    end = partial(_end_with, os.getpid())
-    new = parallel_config("loky", inner_max_num_threads=1, initializer=end)
-    with new if workers > 1 else nullcontext():
-        n_jobs = max(1, min(workers, len(tasks))) if workers > 1 else None
+    own = {"inner_max_num_threads": 1, "initializer": partial(_end_with, os.getpid())}
+    many = workers > 1 and mp is not None  # joblib warns where /dev/shm allows no processes
+    with parallel_config("loky", **own) if many else nullcontext():
+        n_jobs = max(1, min(workers, len(tasks))) if many else None
         parallel = Parallel(
             n_jobs, return_as="generator_unordered", batch_size=1, pre_dispatch="n_jobs"
         )
