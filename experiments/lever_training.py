@@ -10,6 +10,7 @@ from pathlib import Path
 
 import torch
 import xarray as xr
+from jaxtyping import Float
 from torch import Tensor
 
 from affordlib.interactions import InteractionTensors, Split
@@ -20,8 +21,9 @@ from affordlib.models.lever_up import (
     N_OBSERVED,
     N_PREDICTED,
     POSE_CHANNELS,
-    from_start_errors_m,
+    errors_m,
     lever_up_tensors,
+    predict_steps,
     window_errors_m,
 )
 from affordlib.models.training import TrainingConfig, TrainingRecord, train, untrained
@@ -31,6 +33,11 @@ from experiments.lstm import LSTMConfig
 
 Symmetry = tuple[int, bool]
 """The number of rotations by π/2, and whether y is mirrored first."""
+
+
+def from_start_errors_m(model: EffectNetwork, tensors: InteractionTensors) -> Float[Tensor, "n t"]:
+    """Errors [m] at all steps after the first, given only the image and the action."""
+    return errors_m(*predict_steps(model, tensors, "image_only"))
 
 
 def augment_by_symmetry(

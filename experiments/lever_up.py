@@ -35,7 +35,13 @@ from affordlib.models.lever_up import N_OBSERVED, N_PREDICTED, PROTOCOLS, lever_
 from affordlib.types import Prediction, check_choice, check_count
 from experiments import reported, runner
 from experiments.commands import command
-from experiments.lever_training import LEVER_MODELS, TRAINING, LeverModel, train_lever_model
+from experiments.lever_training import (
+    LEVER_MODELS,
+    TRAINING,
+    LeverModel,
+    from_start_errors_m,
+    train_lever_model,
+)
 from experiments.runner import FOLDER, Job, Result, Rows, interval, open_once, plain, read
 
 NAME, DATA, N_FOLDS = "lever_up", "lever_up", 5
@@ -120,7 +126,7 @@ def _tuned(network: EffectNetwork, validation: InteractionTensors, trained_for: 
     if trained_for != "first_step":
         row["window_mean_m"] = float(models.window_errors_m(network, validation).mean())
     if trained_for != "window":
-        row["beginning_mean_m"] = float(models.from_start_errors_m(network, validation).mean())
+        row["beginning_mean_m"] = float(from_start_errors_m(network, validation).mean())
     return row
 
 

@@ -39,7 +39,7 @@ BACK_M = 0.01
 """How far [m] the path of a tool that touches in the first row is extended backwards."""
 APART_M, TOUCH_M = 0.003, 0.001
 """In a session: gaps [m] at which a push may begin, and below which the tool touches."""
-MOST_TILT_RAD, WOBBLE_RAD = math.radians(20), math.radians(2)
+MOST_TILT_RAD, WOBBLE_RAD = math.radians(20), math.radians(3)
 """How far an upright object may be tilted, and how much that may vary if its yaw varies less."""
 ORDERS = {"xyzw": [0, 1, 2, 3], "wxyz": [1, 2, 3, 0]}
 UPS = {"z": 0, "y": 1, "x": -1}

@@ -112,12 +112,10 @@ def refuse_seen(about: dict[str, Any], data: "xarray.Dataset", interactions: np.
     about: the second value that `load_checkpoint` returns, from `about_training`.
     """
     check_numbers("interactions", interactions)
-    try:
-        used, recipe = about["seen_interactions"], json.loads(about["recipe"])
-    except KeyError as error:
-        raise ValueError(f"about does not tell {error}; see about_training") from None
-    seen = {*used} & {*data["interaction"].values[interactions].tolist()}
-    recipes = recipe, json.loads(data.attrs["recipe"])
+    if not {"seen_interactions", "recipe"} <= about.keys():
+        raise ValueError(f"about must be what about_training returns, got {about!r:.200}")
+    seen = {*about["seen_interactions"]} & {*data["interaction"].values[interactions].tolist()}
+    recipes = json.loads(about["recipe"]), json.loads(data.attrs["recipe"])
     decisive = ("seed", "families", "size_range_m", "height_range_m")  # for a recipe's objects
     if seen and all(recipes[0][name] == recipes[1][name] for name in decisive):
         raise ValueError(

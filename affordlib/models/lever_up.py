@@ -119,8 +119,3 @@ def window_errors_m(model: EffectNetwork, tensors: InteractionTensors) -> Float[
     starts = range(n_windows(tensors))
     found = [predict_steps(model, tensors, "window", start, features) for start in starts]
     return torch.stack([errors_m(*one) for one in found], dim=1)
-
-
-def from_start_errors_m(model: EffectNetwork, tensors: InteractionTensors) -> Float[Tensor, "n t"]:
-    """Errors [m] at all steps after the first, given only the image and the action."""
-    return errors_m(*predict_steps(model, tensors, "image_only"))

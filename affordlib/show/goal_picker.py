@@ -164,12 +164,9 @@ class GoalPicker(widgets.HBox):
     def start_over(self) -> None:
         """Put the object back where it was when the picker was created."""
         self._refuse_while_running()
-        with self._alone:
-            x, y, yaw = self._first_pose
-            self.world.place(self.world.obj, (x, y), yaw, obstacles=self.world.obstacles.all)
-            if self.scene is not None:
-                self.scene.place()
-            self._make_plan()
+        x, y, yaw = self._first_pose
+        place = partial(self.world.place, self.world.obj, (x, y), yaw)
+        self._disturb(lambda: place(obstacles=self.world.obstacles.all))
 
     def figure(self) -> Figure:
         """The table, object, goal and plan as a figure."""
@@ -427,7 +424,7 @@ class GoalPicker(widgets.HBox):
     def _send_motions(self, first: bool = False) -> None:
         """Send the motions logged since the last call, to be shown as they come."""
         if self._motions:
-            bodies = self.scene.named_bodies() if self.scene else []
+            bodies = [self.scene.name, [one.id for one in self.scene.bodies]] if self.scene else []
             self._view.send({"motions": self._motions, "first": first, "bodies": bodies})
             self._shown_until = max(self._shown_until, time.monotonic())
             self._shown_until += self._pace_s * len(self._motions)
@@ -446,6 +443,8 @@ class GoalPicker(widgets.HBox):
             with self._alone:
                 while self._disturbances:
                     self._disturbances.pop(0)()
+                if self.scene is not None:
+                    self.scene.place()
                 self._make_plan()
 
     def _shove(self) -> None:
@@ -480,7 +479,8 @@ class GoalPicker(widgets.HBox):
         goal = {"xy": self.goal.xy_m, "tolerance": self.goal.tolerance_m, "yaw": None}
         if self.goal.turn_rad is not None:
             goal["yaw"] = self._turn_from + self.goal.turn_rad
-        self._view.searched = [np.round(v, 4).tolist() for v in self._searched * (not planning)]
+        shown = () if planning else self._searched
+        self._view.searched = [np.round(line, 4).tolist() for line in shown]
         self._view.scene = {
             "pose": self._pose,
             "goal": goal,

@@ -26,9 +26,9 @@ from affordlib.world.objects import mesh
 from affordlib.world.trajectory import STEP_S
 
 EVERY, TICKS = 16, 2
-"""Simulation steps (1/240 s) between two recorded poses, and times from one to the next.
+"""Simulation steps between two recorded poses, and ticks of the time line: k3d moves in between."""
 
-k3d moves and turns its bodies from pose to pose."""
+TICK_MS = round(1000 * EVERY * STEP_S / TICKS)
 
 CAMERA = (0.84, -0.88, 0.62, -0.24, 0.02, 0.24, 0.0, 0.0, 1.0)
 """Where the camera stands, what it looks at [m], and what is upwards."""
@@ -67,15 +67,14 @@ class Scene(widgets.VBox):
         self.plot.additional_js_code = f"(globalThis.affordlib ??= {{}}).{self.name} = K3DInstance"
         self._object, self._last = None, np.ones(7)
         self._marks: list[Any] = []
-        self.player = widgets.Play(interval=round(1000 * EVERY * STEP_S / TICKS), max=0)
+        self.player = widgets.Play(interval=TICK_MS, max=0)
         looks = {"layout": {"flex": "1", "min_width": "0"}, "style": {"description_width": "auto"}}
         time = widgets.IntSlider(max=0, readout=False, description="time", **looks)
         speed = widgets.Dropdown(options={"1×": 1, "½×": 2, "¼×": 4}, layout={"width": "5em"})
         for name in ("value", "max"):
             widgets.jslink((self.player, name), (time, name))
         widgets.jslink((self.player, "value"), (self.plot, "time"))
-        interval = self.player.interval
-        speed.observe(lambda c: setattr(self.player, "interval", interval * c["new"]), "value")
+        speed.observe(lambda c: setattr(self.player, "interval", TICK_MS * c["new"]), "value")
         self.place()
         below = widgets.HBox([self.player, time, speed])
         layout = {"flex": "1 1 420px", "max_width": "700px", "min_width": "0"}
@@ -89,7 +88,6 @@ class Scene(widgets.VBox):
         self._frames: list[np.ndarray] = [self.poses()]
         self._steps = 0
         self.mark(goal, plan)
-        self.player.playing = False
         self.stop()
 
     def mark(self, goal: Goal | None = None, plan: Plan | None = None) -> None:
@@ -135,17 +133,13 @@ class Scene(widgets.VBox):
         shown = (shown.view(np.int32) & -8192).view(np.float32)
         for k, part in enumerate(self.bodies):
             part.model_matrix = {str(TICKS * t): frame[k] for t, frame in enumerate(shown)}
-        self.player.max = TICKS * (len(shown) - 1)
+        self.player.playing, self.player.max = False, TICKS * (len(shown) - 1)
         self.player.value = self.player.max
 
     @property
     def bodies(self) -> list[Any]:
         """What moves: the arm's parts and the object, in the order of `poses`."""
         return [*self._links, self._object]
-
-    def named_bodies(self) -> list[Any]:
-        """The scene's name and the numbers of its bodies, by which a page's scripts find them."""
-        return [self.name, [body.id for body in self.bodies]]
 
     def poses(self) -> np.ndarray:
         """Where the bodies are: position [m] and quaternion, (n, 7)."""

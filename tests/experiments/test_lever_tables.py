@@ -5,8 +5,9 @@ import torch
 
 from affordlib.interactions import open_interactions
 from affordlib.models import load_checkpoint
-from affordlib.models.lever_up import from_start_errors_m, lever_up_tensors, window_errors_m
+from affordlib.models.lever_up import lever_up_tensors, window_errors_m
 from affordlib.results import repo_root
+from experiments.lever_training import from_start_errors_m
 from experiments.lever_up import extrapolate, lever_split
 
 

@@ -8,8 +8,8 @@ import torch
 from affordlib.interactions import Scaler
 from affordlib.interactions.dataset import condition_on_poses
 from affordlib.models import build
-from affordlib.models.lever_up import N_OBSERVED, PROTOCOLS, from_start_errors_m, predict_steps
-from experiments.lever_training import LEVER_MODELS, fit_lever_model
+from affordlib.models.lever_up import N_OBSERVED, PROTOCOLS, predict_steps
+from experiments.lever_training import LEVER_MODELS, fit_lever_model, from_start_errors_m
 
 
 def made(name, levered):
