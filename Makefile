@@ -187,5 +187,5 @@ constraints: $(STAMP) ## Write constraints.txt, and its copy in pyproject.toml, 
 	@mv pyproject.toml.tmp pyproject.toml
 
 clean: ## Remove runs/, caches and build files, but not .venv
-	@rm -rf runs build dist *.egg-info .pytest_cache .ruff_cache .hypothesis notebooks/.ipynb_checkpoints
+	@rm -rf runs build dist *.egg-info .pytest_cache .ruff_cache notebooks/.ipynb_checkpoints
 	@find affordlib tests experiments -name __pycache__ -type d -prune -exec rm -rf {} +
