@@ -131,10 +131,10 @@ class Scene(widgets.VBox):
         shown = np.float32(RigidTransform.from_components(frames[..., :3], turns).as_matrix())
         # 11 bits of each mantissa are half a millimetre at 1 m, and pages of half the size.
         shown = (shown.view(np.int32) & -8192).view(np.float32)
+        self.player.playing, self.player.max = False, TICKS * (len(shown) - 1)
+        self.player.value = self.player.max  # before the bodies, which k3d makes anew at this time
         for k, part in enumerate(self.bodies):
             part.model_matrix = {str(TICKS * t): frame[k] for t, frame in enumerate(shown)}
-        self.player.playing, self.player.max = False, TICKS * (len(shown) - 1)
-        self.player.value = self.player.max
 
     @property
     def bodies(self) -> list[Any]:

@@ -340,7 +340,7 @@ def test_the_robot_moves_in_3d_while_it_is_simulated(page, table):
     ask(page, "setattr(picker, 'pace_s', 0.05)")
     page.evaluate(
         """([name, ...arm]) => {
-            const all = () => globalThis.affordlib[name].getWorld().K3DObjects.children;
+            window.all = () => globalThis.affordlib[name].getWorld().K3DObjects.children;
             window.seen = [];
             setInterval(() => {
                 const words = document.querySelector(".affordlib-picker [role=status]").innerText;
@@ -356,6 +356,9 @@ def test_the_robot_moves_in_3d_while_it_is_simulated(page, table):
     seen = [row[1:] for row in page.evaluate("seen") if row[0].startswith("Push 1 of")]
     assert (np.ptp(seen, axis=0).max(axis=1) > 0.02).sum() > 5  # parts of the arm
     assert len(np.unique(seen, axis=0)) > 5
+    number, *at = ask(page, "[picker.scene.bodies[-1].id, *picker.world.object_state()[:3]]")
+    shown = f"all().find((body) => body.K3DIdentifier === {number})?.position.toArray()"
+    wait_until(lambda: np.allclose(page.evaluate(shown) or 0, at, atol=1e-3), 20)
     picture(page, "4_run_in_3d")
 
 
