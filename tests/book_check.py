@@ -20,7 +20,7 @@ TEXTS |= {"notebooks/cheat_sheet.md": 500}
 """Pages of text, and their maximum number of words."""
 
 LIMITS = {"minutes": 60, "words": 2000, "cells": 40, "tables": 3, "rows": 8}
-LIMITS |= {"code": 30, "px": 900, "no alt": 0, "private": 0}
+LIMITS |= {"code": 30, "px": 900, "no alt": 0, "private": 0, "numbers": 2}
 NOT_YET: dict[str, dict[str, int]] = {}
 """A ratchet: higher limits for unfinished pages. Lower them with every page."""
 
@@ -35,6 +35,12 @@ PRIVATE = re.compile(
 
 ABBREVIATION = re.compile(r"\b(CNP|LSTM|CNN|NLL|CKA|CRPS|AUC|ROC|EMA|MLP|FiLM|sem|TP|TN|PCA|MSE)\b")
 
+NAME = r"^\*\*Figure.*|\[[^\]]*\]\([^)]*\)|\*\*\w\d\.\d|^\d\. |\(\d\)|\d-D|\d[σπ]|\d+ % interval"
+NAME += r"|\b(19|20)\d\d\b|(?<![\d.,])0\d\b|\b([Nn]otebook|page|Figure|Table|Section)s? \d+(\.\d+)*"
+NUMBER = r"(?<![\w./^–])\d+(?:[.,/]\d+)*(?: ?(?:%|°|[cm]?m\b|s\b))?"
+NUMBER += rf"(?: ?(?:to|or|and|×|±|of|of the) ?−?{NUMBER})*"
+"""What has digits but is no number, and a number: a range, a share or a pair counts as one."""
+
 
 def prose(text: str) -> str:
     """The text of a Markdown page without code, equations, tables and comments."""
@@ -45,6 +51,12 @@ def prose(text: str) -> str:
 
 def count_words(text: str) -> int:
     return len(re.findall(r"\w[\w'’-]*", prose(text)))
+
+
+def crowded(text: str) -> int:
+    """Count the sentences with more than one number."""
+    sentences = re.split(r"[.!?:;][*)]*\s|\n", prose(re.sub(NAME, "", text, flags=re.MULTILINE)))
+    return sum(len(re.findall(NUMBER, sentence)) > 1 for sentence in sentences)
 
 
 def markdown(notebook: nbformat.NotebookNode) -> str:
@@ -84,6 +96,7 @@ def measure(notebook: nbformat.NotebookNode) -> dict[str, int]:
         "px": max(widths, default=0),
         "no alt": no_alt,
         "private": sum(1 for _ in PRIVATE.finditer(prose(markdown(notebook)))),
+        "numbers": crowded(text),
     }
 
 
@@ -120,7 +133,7 @@ def check() -> tuple[dict[str, dict[str, int]], list[str]]:
         found = measures[name] = measure(notebook)
         most = LIMITS | NOT_YET.get(name, {})
         if name[0] == "A":  # an appendix may be long
-            most = {key: most[key] for key in ("code", "px", "no alt", "private")}
+            most = {key: most[key] for key in ("code", "px", "no alt", "private", "numbers")}
         wrong += [f"{name}: {found[k]} {k}, at most {n}" for k, n in most.items() if found[k] > n]
         wrong += [f"{name}: cell {c.id} is empty" for c in notebook.cells if not c.source.strip()]
         if found["private"] > most["private"] or name not in NOT_YET:
