@@ -403,7 +403,7 @@ class GoalPicker(widgets.HBox):
         """
         steps, self._shown_until, self._pace_s = itertools.count(), time.monotonic(), pace_s
         if self.scene is not None:
-            self.scene.place(self.goal, self.plan)
+            self.scene.begin(self.goal, self.plan)
 
         def log(world):
             for one in (also, self.scene):

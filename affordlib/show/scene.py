@@ -81,14 +81,20 @@ class Scene(widgets.VBox):
         super().__init__([self.plot, below], layout=layout)
 
     def place(self, goal: Goal | None = None, plan: Plan | None = None) -> None:
-        """Show the world's present object and obstacles, and forget what was recorded."""
+        """Show the world's present object and obstacles, and begin a recording."""
         if self._object is not None:
             self.plot -= self._object
-        self._object = self._add(_solid(self.world.obj), TRUTH)
-        self._frames: list[np.ndarray] = [self.poses()]
-        self._steps = 0
+        self._object, self._drawn = self._add(_solid(self.world.obj), TRUTH), self.world.obj
+        self.begin()
         self.mark(goal, plan)
         self.stop()
+
+    def begin(self, goal: Goal | None = None, plan: Plan | None = None) -> None:
+        """Forget what was recorded; bodies are drawn anew, which takes long, for another object."""
+        if self._drawn is not self.world.obj:
+            self.place(goal, plan)
+        self._frames: list[np.ndarray] = [self.poses()]
+        self._steps = 0
 
     def mark(self, goal: Goal | None = None, plan: Plan | None = None) -> None:
         """Show obstacles, and goal and predicted final pose of a plan, in place of earlier ones."""

@@ -374,8 +374,9 @@ def test_obstacles_of_the_page_are_planned_around_and_stand_on_the_table(posed, 
 def test_the_robot_is_shown_in_3d_as_it_moved(make_picker, world):
     picker = make_picker(view=True)
     picker.pick(0.1, 0.06)
+    scene, bodies = picker.scene, [*picker.scene.plot.objects]
     picker.run()
-    scene = picker.scene
+    assert scene.plot.objects == bodies, "drawn anew, bodies stop the page for a second"
     shown = [list(body.model_matrix.values()) for body in scene.bodies]
     frames = np.swapaxes(shown, 0, 1)
     assert scene.player.max == 2 * (len(frames) - 1) > 100
