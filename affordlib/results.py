@@ -159,7 +159,7 @@ def read_results(path: str | os.PathLike[str]) -> dict[str, Any]:
         return {key: document[key] for key in ("notebook", "parameters", "versions", "tables")}
     except (ValueError, TypeError, KeyError, RecursionError) as error:
         raise ValueError(
-            f"path: {path} holds no results ({error!r}); delete it and run its notebook again"
+            f"path: {path} holds no results ({error!r:.300}); delete it and run its notebook again"
         ) from None
 
 
@@ -218,7 +218,7 @@ def results_table(
 def heading(column: str) -> str:
     """Return the heading of a column: `plan_ms_median` becomes `plan median, ms`."""
     name, unit = _split_unit(column)
-    return name.replace("_", " ") + (f", {unit[0]}" if unit else "")
+    return plain(name.replace("_", " ")) + (f", {unit[0]}" if unit else "")
 
 
 def cell(column: str, value: object) -> str:
@@ -233,7 +233,12 @@ def cell(column: str, value: object) -> str:
         return f"{round(value * unit[1], unit[2]) + 0.0:.{unit[2]}f}"
     if isinstance(value, float):
         return f"{value:.3g}" if abs(value) < 999.5 else f"{value:.0f}"
-    return " ".join(str(value).splitlines())
+    return plain(value)
+
+
+def plain(text: object) -> str:
+    """Return a text as one line without control characters, cut where it is very long."""
+    return "".join(c if c.isprintable() else " " for c in str(text)[:2000])
 
 
 def _split_unit(column: str) -> tuple[str, tuple[str, float, int] | None]:
@@ -247,5 +252,6 @@ def columns_of(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None)
     there = list(dict.fromkeys(name for row in rows for name in row))
     for name in columns or ():
         if rows and name not in there:
-            raise ValueError(f"columns: {name!r} is not in the table; it has {', '.join(there)}")
+            known = plain(", ".join(there))
+            raise ValueError(f"columns: {name!r} is not in the table; it has {known:.999}")
     return there if columns is None else list(columns)

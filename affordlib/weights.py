@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 from safetensors.torch import save
+from torch import nn
 
 from affordlib.results import file_at, from_root, write_atomically
 
@@ -28,8 +30,8 @@ def resolve_checkpoint(name_or_path: str | Path) -> Path:
         return file_at(path)
     except FileNotFoundError as error:
         others = ("np_", "reachability")  # these have their own load functions
-        shipped = [p.stem for p in sorted(from_root("data/checkpoints").glob(f"*{SUFFIX}"))]
-        shipped = [name for name in shipped if not name.startswith(others)]
+        files = from_root("data/checkpoints").glob(f"*{SUFFIX}")
+        shipped = sorted(path.stem for path in files if not path.stem.startswith(others))
         raise FileNotFoundError(
             f"checkpoint {str(name_or_path)!r}: {error}; give one of the shipped names {shipped} "
             f"or the path of a {SUFFIX} file"
@@ -53,8 +55,10 @@ def write_weights(
     return path
 
 
-def read_weights(path: str | Path, remedy: str) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-    """Read what `write_weights` wrote; ValueError, which ends with the remedy, if it is damaged."""
+def read_weights(
+    path: str | Path, remedy: str, make: Callable[[dict, dict], Any] = lambda *both: both
+) -> Any:
+    """Return what `make` makes of a file's tensors and description; ValueError if it cannot."""
     path = file_at(path)
     try:
         with safe_open(path, "pt") as file:
@@ -66,8 +70,22 @@ def read_weights(path: str | Path, remedy: str) -> tuple[dict[str, torch.Tensor]
         for name, value in tensors.items():
             if value.is_floating_point() and not value.isfinite().all():
                 raise ValueError(f"{name} holds numbers that are not finite")
-        return tensors, json.loads(text)
-    except KeyError as error:
-        raise ValueError(f"{path} holds no weights with a description; {remedy}") from error
-    except (SafetensorError, ValueError, TypeError, RecursionError) as error:
-        raise ValueError(f"{path} is damaged, or holds no weights ({error}); {remedy}") from error
+        return make(tensors, json.loads(text))
+    except Exception as error:
+        raise ValueError(f"{path} is damaged or unfit ({error!r:.300}); {remedy}") from error
+
+
+def restored(
+    path: str | Path, remedy: str, make: Callable[[dict[str, Any]], nn.Module]
+) -> tuple[Any, dict[str, Any]]:
+    """Load a file, as `read_weights`, into the module that `make` creates of its description."""
+
+    def filled(tensors, description):
+        model = make(description)
+        own = model.state_dict()
+        if other := [k for k in own if k not in tensors or tensors[k].dtype != own[k].dtype]:
+            raise ValueError(f"{other[0]} is missing or has another type")
+        model.load_state_dict(tensors, assign=next(iter(own.values())).is_meta)
+        return model.eval(), description
+
+    return read_weights(path, remedy, filled)

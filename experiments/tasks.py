@@ -75,7 +75,9 @@ class PlanningTask:
         obj = category_named(plain["object_class"])(*plain["size_m"])
         goal = Goal(tuple(plain["goal_xy_m"]))
         config = WorldConfig(**plain.get("world", {}))
-        return cls(obj, plain["yaw_rad"], goal, plain["mode"], plain["goals"], config)
+        mode = check_choice("mode", plain["mode"], MODES)
+        goals = check_choice("goals", plain["goals"], GOAL_SOURCES)
+        return cls(obj, plain["yaw_rad"], goal, mode, goals, config)
 
 
 def drawn_object(mode: str, goals: str, seed: int, index: int, classes: Sequence[str]) -> tuple:
@@ -162,4 +164,8 @@ def tasks_sha256(world: str = "clean") -> str:
 
 def frozen_tasks(world: str = "clean") -> list[PlanningTask]:
     """Load the tasks of the tables in one of the worlds, or the validation tasks."""
-    return [PlanningTask.from_json(plain) for plain in json.loads(frozen_text(world))["tasks"]]
+    text = frozen_text(world)
+    try:
+        return [PlanningTask.from_json(plain) for plain in json.loads(text)["tasks"]]
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise ValueError(f"{FROZEN[world]} holds no goals ({error!r:.300})") from error

@@ -19,19 +19,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from affordlib import planning
 from affordlib.interactions import InteractionTensors, open_interactions
 from affordlib.interactions.recipes import RECIPES, interact
 from affordlib.models import load_checkpoint
 from affordlib.models.lever_up import lever_up_tensors
-from affordlib.planning import (
-    MODES,
-    EffectMap,
-    PlanningProblem,
-    Skills,
-    plan_astar,
-    plan_continuous,
-    plan_gradient,
-)
 from affordlib.planning.reachability import Reachability
 from affordlib.results import repo_root
 from affordlib.types import Observations
@@ -90,19 +82,19 @@ def predicted() -> dict[str, list[float]]:
 
 def planned() -> dict[str, list[float]]:
     """Plans of all planners for the first frozen goals of each mode."""
-    skills, found = Skills.load(), {}
+    skills, found = planning.Skills.load(), {}
     tasks = [t for t in frozen_tasks() if t.goals == "constructed"]
-    some = [[t for t in tasks if t.mode == mode][: N_GOALS // 2] for mode in MODES]
+    some = [[t for t in tasks if t.mode == mode][: N_GOALS // 2] for mode in planning.MODES]
     with Tabletop() as world:
         for k, task in enumerate((some[1] + some[2])[:N_GOALS]):
             world.place(task.obj, (0.0, 0.0), task.yaw_rad, config=task.config)
             seen = world.observe()
             kind = skills.kind_for(seen.image)
-            effects = EffectMap(skills.model(kind), seen.image, kind)
-            problem = PlanningProblem(seen.xy_m, task.goal, effects, task.mode)
-            plans = [plan_astar(problem), plan_continuous(problem)]
+            effects = planning.EffectMap(skills.model(kind), seen.image, kind)
+            problem = planning.PlanningProblem(seen.xy_m, task.goal, effects, task.mode)
+            plans = [planning.plan_astar(problem), planning.plan_continuous(problem)]
             if kind.name == "push":
-                plans.append(plan_gradient(problem, 100))
+                plans.append(planning.plan_gradient(problem, 100))
             for plan in plans:
                 steps = [(*s.predicted_end_xy_m, s.stop_phase, s.std_m) for s in plan.steps]
                 found[f"planned {k} {plan.planner}"] = np.ravel(steps).tolist()

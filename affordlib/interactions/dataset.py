@@ -181,7 +181,7 @@ class InteractionTensors:
         for kind, names in (("action", action_channels), ("effect", effect_channels)):
             known = data.attrs[f"{kind}_channels"].split()
             if unknown := [name for name in names if name not in known]:
-                raise ValueError(f"{kind}_channels {unknown} are not stored; choose from {known}")
+                raise ValueError(f"{kind}_channels {unknown} are not stored, only {known!r:.300}")
             columns = part[kind].values[..., [known.index(name) for name in names]]
             values.append(torch.from_numpy(np.ascontiguousarray(columns)))
         return cls(

@@ -82,8 +82,7 @@ def _url_of(name_or_path: str | Path) -> str:
     try:
         return url if "://" in url else str(file_at(url))
     except FileNotFoundError as error:
-        files = from_root("data").glob(f"*{SUFFIX}")
-        shipped = sorted(path.name.removesuffix(SUFFIX) for path in files)
+        shipped = sorted(p.name.removesuffix(SUFFIX) for p in from_root("data").glob(f"*{SUFFIX}"))
         raise FileNotFoundError(
             f"interactions {str(name_or_path)!r}: {error}; give one of the shipped names "
             f"{shipped} or the path of a {SUFFIX} file, or collect them with `make data`"
@@ -111,7 +110,7 @@ def _read(url: str, arrays: bool = True) -> tuple[dict[str, str], dict[str, byte
         return manifest["arrays"], found
     except Exception as error:
         raise CorruptedDataError(
-            f"{url} cannot be read: {name} is damaged or missing ({error!r}); {_REMEDY}"
+            f"{url} cannot be read: {name} is damaged or missing ({error!r:.300}); {_REMEDY}"
         ) from error
 
 
@@ -129,7 +128,7 @@ def open_interactions(name_or_path: str | Path) -> "xarray.Dataset":
     from zarr.buffer.cpu import Buffer
     from zarr.storage import MemoryStore
 
-    from affordlib.interactions.recipes import RECIPES
+    from affordlib.interactions.recipes import RECIPES, Recipe
 
     url = _url_of(name_or_path)
     store = MemoryStore({n: Buffer.from_bytes(c) for n, c in _read(url)[1].items()})
@@ -139,9 +138,12 @@ def open_interactions(name_or_path: str | Path) -> "xarray.Dataset":
                 raise ValueError(f"its arrays of {data.nbytes / 1e9:.0f} GB exceed the memory")
             data = data[sorted(data.data_vars)].load()
             data = data.rename({there: name for name, there in STORED_AS.items() if there in data})
+            (data.attrs["action_channels"] + data.attrs["effect_channels"]).split()
+            Recipe.from_json(data.attrs["recipe"])
+            data["category"].attrs["flag_meanings"].split()[data["category"].values.max()]
             recipe = RECIPES.get(str(name_or_path))
             if recipe is not None and data.attrs.get("recipe") != recipe.to_json():
                 raise ValueError(f"its recipe is not that of {name_or_path!r}")
             return data
     except Exception as error:
-        raise CorruptedDataError(f"{url} is not a data set ({error}); {_REMEDY}") from error
+        raise CorruptedDataError(f"{url} is not a data set ({error!r:.300}); {_REMEDY}") from error

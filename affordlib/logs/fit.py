@@ -44,7 +44,6 @@ from affordlib.logs.neural_process import (
     transformed,
 )
 from affordlib.logs.physics import AnalyticPusher
-from affordlib.results import from_root
 from affordlib.types import check_choice, check_count
 from affordlib.weights import read_weights, write_weights
 
@@ -376,21 +375,19 @@ def save_model(model: FittedModel, path: str | Path) -> Path:
 
 
 def load_model(path: str | Path) -> FittedModel:
-    """Load what `save_model` wrote; it predicts the same.
+    """Load what `save_model` wrote, which predicts the same; ValueError if it is damaged."""
 
-    Raises FileNotFoundError, or ValueError when the file is damaged or of another kind.
-    """
-    if not from_root(path).is_file():
-        raise FileNotFoundError(f"path: there is no model at {path}; fit one and save it there")
-    tensors, about = read_weights(path, "fit the model to its log again")
-    if about.get("format") != FORMAT:
-        raise ValueError(f"path: {path} holds no model of pushes; give one that save_model wrote")
-    arrays = {name: value.numpy() for name, value in tensors.items()}
-    arrays |= {name: np.array(values) for name, values in about["texts"].items()}
-    parts: dict[str, State] = {"data": {}, "context": {}, "state": {}}
-    for name, values in arrays.items():
-        part, _, name = name.partition(".")
-        parts[part][name] = values
-    radius_m = float(parts["data"].pop("tool_radius_m"))
-    data = LoggedPushes(**parts["data"], context=parts["context"], tool_radius_m=radius_m)
-    return FittedModel(about["model"], data, parts["state"])
+    def made(tensors, about):
+        if about.get("format") != FORMAT:
+            raise ValueError("it holds no model of pushes; give one that save_model wrote")
+        arrays = {name: value.numpy() for name, value in tensors.items()}
+        arrays |= {name: np.array(values) for name, values in about["texts"].items()}
+        parts: dict[str, State] = {"data": {}, "context": {}, "state": {}}
+        for name, values in arrays.items():
+            part, _, name = name.partition(".")
+            parts[part][name] = values
+        radius_m = float(parts["data"].pop("tool_radius_m"))
+        data = LoggedPushes(**parts["data"], context=parts["context"], tool_radius_m=radius_m)
+        return FittedModel(check_choice("model", about["model"], MODELS), data, parts["state"])
+
+    return read_weights(path, "fit the model to its log again", made)

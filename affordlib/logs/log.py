@@ -17,6 +17,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from affordlib.geometry import centroid, cross, rotated, rotated_each
+from affordlib.results import plain
 from affordlib.types import check_array, check_choice, check_within
 
 UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
@@ -181,7 +182,7 @@ class Log:
             push |= {"groups": group, "context": self._context(context or {})}
         except ValueError as error:
             self.refused[name] = str(error)
-            raise ValueError(f"push {name} (group {group!r}): {error}") from None
+            raise ValueError(f"push {plain(name):.80} (group {group!r:.80}): {error}") from None
         self._pushes.append(push)
         self.names.append(name)
 

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from torch.nn.functional import huber_loss, scaled_dot_product_attention, softplus
 
 from affordlib.geometry import cross, quarter_turn
-from affordlib.weights import read_weights, resolve_checkpoint
+from affordlib.weights import resolve_checkpoint, restored
 
 WIDTH, BLOCKS, HEADS = 64, 4, 4
 PRETRAINED = "np_simulated_pushes"
@@ -185,10 +185,11 @@ def _loss(mean: Tensor, std: Tensor, truth: Tensor) -> Tensor:
 def load_neural_process(name_or_path: str | Path = PRETRAINED) -> NeuralProcess:
     """Load a shipped or another checkpoint; ValueError if it is damaged or of another kind."""
     path, remedy = resolve_checkpoint(name_or_path), "train it: python -m experiments.pretrain_np"
-    tensors, description = read_weights(path, remedy)
-    if description.get("model") != "np":
-        raise ValueError(f"{path} holds no neural process of pushes; {remedy}")
-    with torch.device("meta"):  # draws no random weights
-        model = NeuralProcess()
-    model.load_state_dict(tensors, assign=True)
-    return model.eval()
+
+    def make(description):
+        if description["model"] != "np":
+            raise ValueError("it is no neural process of pushes")
+        with torch.device("meta"):  # draws no random weights
+            return NeuralProcess()
+
+    return restored(path, remedy, make)[0]

@@ -78,7 +78,7 @@ class PushedObject:
     def of(cls, pushes: Pushes) -> Self:
         """Return the object of a log with one group, for pushes as long as the log's or shorter."""
         if len(names := np.unique(pushes.groups)) > 1:
-            raise ValueError(f"pushes must be of one group, got {names.tolist()}; select one")
+            raise ValueError(f"pushes must be of one group, got {names.tolist()!r:.99}; select one")
         longest = pushes.length_m.max()
         lengths_m = min(pushes.length_m.min(), SHORTEST_SHARE * longest), longest
         context = {name: values[0] for name, values in pushes.context.items()}

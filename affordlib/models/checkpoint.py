@@ -6,22 +6,20 @@ code in it.
 
 import importlib
 import io
-import pickle
 import re
 import zipfile
-from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import nn
 
 from affordlib.interactions.dataset import Scaler
 from affordlib.models.base import NETWORKS, EffectNetwork, NetworkConfig
 from affordlib.models.domain import TrainingDomain
 from affordlib.results import file_at, from_root, write_atomically
-from affordlib.weights import SUFFIX, read_weights, resolve_checkpoint, write_weights
+from affordlib.weights import SUFFIX, resolve_checkpoint, restored, write_weights
 
 FORMAT = "affordlib checkpoint 4"
 _REMEDY = "give another checkpoint, or train it again with notebook 03"
@@ -61,8 +59,7 @@ def save_checkpoint(model: EffectNetwork, path: str | Path, about: dict[str, Any
 def load_checkpoint(name_or_path: str | Path) -> tuple[EffectNetwork, dict[str, Any]]:
     """Load a model, ready to predict, and the `about` of its checkpoint.
 
-    Raises FileNotFoundError, or ValueError when the file is damaged, holds another model, or is
-    another checkpoint than the shipped one of this name.
+    Raises ValueError when the file is damaged, or is not the shipped checkpoint of its name.
     """
     path = resolve_checkpoint(name_or_path)
 
@@ -71,6 +68,7 @@ def load_checkpoint(name_or_path: str | Path) -> tuple[EffectNetwork, dict[str, 
             raise ValueError(f"its format is {description['format']!r}, not {FORMAT!r}")
         if Path(name_or_path).suffix != SUFFIX and description["name"] != path.stem:
             raise ValueError(f"it is {description['name']!r}, renamed")
+        dict(description["about"])  # raises where it is none
         if not _MODULES.fullmatch(description["module"]):
             raise ValueError(f"its network is in {description['module']!r:.80}")
         importlib.import_module(description["module"])
@@ -85,27 +83,6 @@ def load_checkpoint(name_or_path: str | Path) -> tuple[EffectNetwork, dict[str, 
     return model, description["about"]
 
 
-def restored(
-    path: Path, remedy: str, make: Callable[[dict[str, Any]], nn.Module]
-) -> tuple[Any, dict[str, Any]]:
-    """Load a file into the module that `make` creates from its description; return both.
-
-    Raises FileNotFoundError, or ValueError when the file is damaged or of another kind.
-    """
-    tensors, description = read_weights(path, remedy)
-    try:
-        model = make(description)
-        own = model.state_dict()
-        if other := [k for k in own if k not in tensors or tensors[k].dtype != own[k].dtype]:
-            raise ValueError(f"{other[0]} is missing or has another type")
-        model.load_state_dict(tensors)
-    except (KeyError, TypeError, ValueError, AttributeError, RuntimeError, ImportError) as error:
-        raise ValueError(
-            f"{path} does not describe a model of this package ({error}); {remedy}"
-        ) from error
-    return model.eval(), description
-
-
 def save_state(path: str | Path, state: dict[str, Any]) -> None:
     """Write a training state, which `load_state` reads, to a file atomically."""
     buffer = io.BytesIO()
@@ -115,13 +92,9 @@ def save_state(path: str | Path, state: dict[str, Any]) -> None:
 
 def load_state(path: str | Path, device: torch.device | str = "cpu") -> dict[str, Any]:
     """Load what `save_state` wrote; ValueError when the file is damaged or of another kind."""
-    path = file_at(path)
-    try:
-        with zipfile.ZipFile(path) as archive:
-            damaged = archive.testzip()
-        state = None if damaged else torch.load(path, weights_only=True, map_location=device)
-    except (zipfile.BadZipFile, pickle.PickleError, RuntimeError, EOFError, OSError, ValueError):
-        state = None
+    path, state = file_at(path), None
+    with suppress(Exception), zipfile.ZipFile(path) as archive:
+        state = archive.testzip() or torch.load(path, weights_only=True, map_location=device)
     if not isinstance(state, dict) or "about" not in state:
         raise ValueError(
             f"resume_checkpoint {str(path)!r} is damaged or holds no training state; delete it "

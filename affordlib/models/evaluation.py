@@ -117,7 +117,7 @@ def refuse_seen(about: dict[str, Any], data: "xarray.Dataset", interactions: np.
     seen = {*about["seen_interactions"]} & {*data["interaction"].values[interactions].tolist()}
     recipes = json.loads(about["recipe"]), json.loads(data.attrs["recipe"])
     decisive = ("seed", "families", "size_range_m", "height_range_m")  # for a recipe's objects
-    if seen and all(recipes[0][name] == recipes[1][name] for name in decisive):
+    if seen and all(recipes[0].get(name) == recipes[1].get(name) for name in decisive):
         raise ValueError(
             f"interactions: the model was trained or tuned on {len(seen)} of them (such as "
             f"{sorted(seen)[:5]}); evaluate it on the test part of its split or on another data set"

@@ -12,11 +12,10 @@ import numpy as np
 import torch
 from torch import nn
 
-from affordlib.models.checkpoint import restored
 from affordlib.primitives import primitive_named
 from affordlib.results import repo_root
 from affordlib.types import check_array
-from affordlib.weights import write_weights
+from affordlib.weights import restored, write_weights
 
 _HIDDEN = 64
 SHIPPED = "data/checkpoints/reachability.safetensors"
@@ -29,7 +28,7 @@ class Reachability(nn.Module):
 
     def __init__(self, primitives: Sequence[str]) -> None:
         super().__init__()
-        self.primitives = tuple(primitives)
+        self.primitives = tuple(primitive_named(name).name for name in primitives)
         self.layers = nn.Sequential(
             nn.Linear(4 + len(self.primitives), _HIDDEN),
             nn.Tanh(),

@@ -11,6 +11,7 @@ import ipywidgets as widgets
 import numpy as np
 
 from affordlib.planning import ClosedLoopConfig, Planner, Skills, execute_plan, run_closed_loop
+from affordlib.results import plain
 from affordlib.types import Goal, Outcome, Plan, Step
 from affordlib.world import Tabletop
 
@@ -100,7 +101,7 @@ class PickerControls(widgets.VBox):
 
 def words_as_html(text: str, css: str = "") -> str:
     """A text that screen readers announce, as HTML; only what stands in **stars** is bold."""
-    text = re.sub(r"\*\*(.*?)\*\*", r"<b>\1</b>", html.escape(text))
+    text = re.sub(r"\*\*(.*?)\*\*", r"<b>\1</b>", html.escape(plain(text)))
     return f"<div role='status' aria-live='polite'><div class='{css}'>{text}</div></div>"
 
 

@@ -199,7 +199,8 @@ def plot_outcome(
     for k, path in enumerate(outcome.object_paths_xy_m):
         ax.plot(*_cm(path), color=TRUTH, lw=2, ls="--", label="executed" if k == 0 else None)
     ax.plot(*_cm(outcome.end_pose[:2]), "s", color=TRUTH, ms=6, zorder=6)
-    ax.set_title(f"{outcome.plan.planner}: {1000 * outcome.distance_m:.1f} mm from the goal")
+    title = f"{outcome.plan.planner}: {1000 * outcome.distance_m:.1f} mm from the goal"
+    ax.set_title(title, parse_math=False)
     return ax
 
 

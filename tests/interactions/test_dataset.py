@@ -8,13 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from affordlib import results
-from affordlib.interactions import (
-    CorruptedDataError,
-    InteractionTensors,
-    open_interactions,
-    split_interactions,
-)
+from affordlib import interactions, results
 from affordlib.interactions.dataset import condition_on_recorded_action, sample_mixed
 from affordlib.interactions.recipes import RECIPES, Recipe, interact
 from affordlib.interactions.store import dataset_sha256, stored_sha256, write_interactions
@@ -24,7 +18,7 @@ from affordlib.results import read_results, repo_root
 
 @pytest.fixture(scope="module", params=list(RECIPES))
 def shipped(request):
-    return request.param, open_interactions(request.param)
+    return request.param, interactions.open_interactions(request.param)
 
 
 def test_the_shipped_sets_are_what_their_recipes_say(shipped, world):
@@ -87,8 +81,8 @@ def test_shipped_files_are_small_and_complete(pushes):
 
 def test_whatever_is_damaged_or_missing_is_named(tmp_path):
     path, rng = tmp_path / "set.zarr.zip", np.random.default_rng(0)
-    write_interactions(open_interactions("rotate").isel(interaction=slice(2)), path)
-    whole, expected = path.read_bytes(), dataset_sha256(open_interactions(path))
+    write_interactions(interactions.open_interactions("rotate").isel(interaction=slice(2)), path)
+    whole, expected = path.read_bytes(), dataset_sha256(interactions.open_interactions(path))
     with zipfile.ZipFile(path) as archive:
         files = {name: archive.read(name) for name in archive.namelist()}
     for name, content in files.items():
@@ -99,34 +93,34 @@ def test_whatever_is_damaged_or_missing_is_named(tmp_path):
                 for other, stored in (files | {name: changed}).items():
                     if stored is not None:
                         archive.writestr(other, stored)
-            with pytest.raises(CorruptedDataError, match=f"{name}.*again"):
-                open_interactions(path)
+            with pytest.raises(interactions.CorruptedDataError, match=f"{name}.*again"):
+                interactions.open_interactions(path)
     caught = 0
     for position in rng.integers(0, len(whole), 40):
         damaged = bytearray(whole)
         damaged[position] ^= 1 << int(rng.integers(8))
         path.write_bytes(damaged)
         try:  # a flip in the zip's padding or times harms nothing
-            assert dataset_sha256(open_interactions(path)) == expected
-        except CorruptedDataError:
+            assert dataset_sha256(interactions.open_interactions(path)) == expected
+        except interactions.CorruptedDataError:
             caught += 1
     assert caught >= 30
 
 
 def test_splits_and_folds():
-    folds = [split_interactions(500, seed=3, fold=k) for k in range(10)]
+    folds = [interactions.split_interactions(500, seed=3, fold=k) for k in range(10)]
     assert sorted(np.concatenate([f.test for f in folds])) == list(range(500))
     for split in folds:
         parts = [split.train, split.validation, split.test]
         assert [len(p) for p in parts] == [400, 50, 50]
         assert len(np.unique(np.concatenate(parts))) == 500
-    assert not np.array_equal(folds[0].test, split_interactions(500, seed=4).test)
+    assert not np.array_equal(folds[0].test, interactions.split_interactions(500, seed=4).test)
 
 
 @pytest.mark.parametrize(("quarters", "mirror"), [(1, False), (2, False), (1, True), (3, True)])
 def test_image_action_and_effect_rotate_alike(pushes, quarters, mirror):
     """A mark drawn at the object's final position keeps its place in the rotated image."""
-    arrays = InteractionTensors.from_dataset(pushes, np.arange(4))
+    arrays = interactions.InteractionTensors.from_dataset(pushes, np.arange(4))
     arrays.image.zero_()
     arrays.effect[:, -1] = torch.tensor([0.05, 0.02])
     pixel_m = 0.16 / 48
@@ -144,7 +138,7 @@ def test_image_action_and_effect_rotate_alike(pushes, quarters, mirror):
 
 
 def test_batches_hold_what_the_trajectories_hold(pushes):
-    arrays = InteractionTensors.from_dataset(pushes, np.arange(8))
+    arrays = interactions.InteractionTensors.from_dataset(pushes, np.arange(8))
     batch = sample_mixed(arrays, 5, 10, torch.Generator().manual_seed(0))
     at = (batch.t_target * 300).round().long()
     assert torch.equal(batch.effect, arrays.effect[torch.arange(8)[:, None], at])
@@ -165,13 +159,15 @@ def test_a_file_that_would_fill_the_memory_or_never_end_is_refused(tmp_path):
         for name in whole.namelist():
             archive.writestr(name, whole.read(name))
         archive.writestr("extra", bytes(10**7), zipfile.ZIP_DEFLATED)  # in no manifest: not read
-    assert open_interactions(bomb).equals(open_interactions(undamaged))
+    assert interactions.open_interactions(bomb).equals(interactions.open_interactions(undamaged))
     with zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("manifest.json", bytes(10**7))
-    with pytest.raises(CorruptedDataError, match=r"manifest\.json .* larger than the file"):
-        open_interactions(bomb)
+    with pytest.raises(
+        interactions.CorruptedDataError, match=r"manifest\.json .* larger than the file"
+    ):
+        interactions.open_interactions(bomb)
     os.mkfifo(pipe)
-    for read in (open_interactions, stored_sha256, load_state, read_results):
+    for read in (interactions.open_interactions, stored_sha256, load_state, read_results):
         with pytest.raises(FileNotFoundError, match=r"no file .*pipe\.zarr\.zip"):
             read(pipe)
 
@@ -180,5 +176,5 @@ def test_a_set_under_the_name_of_another_is_refused(tmp_path, monkeypatch):
     (tmp_path / "data").mkdir()
     shutil.copy(repo_root() / "data" / "grasp.zarr.zip", tmp_path / "data" / "rotate.zarr.zip")
     monkeypatch.setattr(results, "repo_root", lambda: tmp_path)
-    with pytest.raises(CorruptedDataError, match="its recipe is not that of 'rotate'"):
-        open_interactions("rotate")
+    with pytest.raises(interactions.CorruptedDataError, match="its recipe is not that of 'rotate'"):
+        interactions.open_interactions("rotate")

@@ -9,19 +9,7 @@ import pytest
 from affordlib.geometry import cross, wrap_angle
 from affordlib.logs.cross_validate import errors_of
 from affordlib.results import repo_root
-from experiments.push_t import (
-    FIRST_CHOICE,
-    MOST_STEPS,
-    ROWS,
-    Table,
-    attempt,
-    collect,
-    logged,
-    motion,
-    planner_of,
-    read_picture,
-    targets_to,
-)
+from experiments import push_t
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +35,7 @@ def stored():
 
 
 def test_the_shipped_pushes_are_read_and_predicted():
-    data = logged(stored())
+    data = push_t.logged(stored())
     assert len(data) == 200
     trained = np.arange(200) < 150
     errors = errors_of(data, trained, ~trained, ("nearest", "rate_gp")).groupby("model")
@@ -56,11 +44,11 @@ def test_the_shipped_pushes_are_read_and_predicted():
 
 
 def test_the_agent_comes_to_rest_at_its_target_on_a_line():
-    a, b = motion()
+    a, b = push_t.motion()
     for point, at, within in (((300, 200), (250, 260), 1e-6), ((400, 420), (60, 55), 2.0)):
         point, at = np.array(point, dtype=float), np.array(at, dtype=float)
         state = np.stack([at, np.zeros(2)])
-        for target in targets_to(point, at):
+        for target in push_t.targets_to(point, at):
             assert (target >= 0).all()
             assert (target <= 512).all()
             state = a @ state + np.outer(b, target)
@@ -70,32 +58,35 @@ def test_the_agent_comes_to_rest_at_its_target_on_a_line():
 
 
 def test_the_model_of_the_agent_is_that_of_the_environment(environment):
-    table = Table()
-    table.reset(FIRST_CHOICE)
+    table = push_t.Table()
+    table.reset(push_t.FIRST_CHOICE)
     agent, _ = table.look()
     table.go(np.stack([agent + np.array([30, -20]), agent]))
     np.testing.assert_allclose(table.look()[0], agent, atol=0.05)
 
 
 def test_a_picture_gives_the_pose_of_the_t_and_the_agent(environment):
-    table = Table("picture")
-    for seed in range(FIRST_CHOICE, FIRST_CHOICE + 5):
+    table = push_t.Table("picture")
+    for seed in range(push_t.FIRST_CHOICE, push_t.FIRST_CHOICE + 5):
         table.reset(seed)
-        agent, (x, y, yaw) = read_picture(table.seen)
+        agent, (x, y, yaw) = push_t.read_picture(table.seen)
         assert np.hypot(*np.subtract((x, y), table.truth[:2])) < 2
         assert abs(wrap_angle(yaw - table.truth[2])) < np.radians(1.5)
         assert np.hypot(*np.subtract(agent, table.history[-1][0])) < 1.5
 
 
 def test_pushes_are_the_same_for_a_seed_and_move_the_t(environment):
-    one, again = (logged(collect(6, 1)) for _ in range(2))
+    one, again = (push_t.logged(push_t.collect(6, 1)) for _ in range(2))
     np.testing.assert_array_equal(one.displacement_m, again.displacement_m)
     assert np.linalg.norm(one.displacement_m, axis=1).max() > 0.002
 
 
 @pytest.mark.slow
 def test_forty_pushes_solve_the_t(environment):
-    row = replace(ROWS["gp_50"], n=40)
-    found = [attempt(Table(), planner_of(row, 0), 3, FIRST_CHOICE + k) for k in range(3)]
+    row = replace(push_t.ROWS["gp_50"], n=40)
+    found = [
+        push_t.attempt(push_t.Table(), push_t.planner_of(row, 0), 3, push_t.FIRST_CHOICE + k)
+        for k in range(3)
+    ]
     assert sum(run["steps_a"] is not None for run in found) >= 2
-    assert all(run["steps_a"] is None or run["steps_a"] <= MOST_STEPS for run in found)
+    assert all(run["steps_a"] is None or run["steps_a"] <= push_t.MOST_STEPS for run in found)

@@ -7,21 +7,9 @@ import numpy as np
 import pytest
 import torch
 
+from affordlib import models
 from affordlib.interactions import Scaler
 from affordlib.interactions.dataset import sample_mixed
-from affordlib.models import (
-    CNPConfig,
-    EffectModel,
-    FiLMConfig,
-    OutOfRangeWarning,
-    TrainingDomain,
-    build,
-    condition_on_primitives,
-    coverage,
-    fit_sigma_scale,
-    load_checkpoint,
-    save_checkpoint,
-)
 from affordlib.models.base import condition_on_final_effect, gaussian_nll, push_direction
 from affordlib.models.evaluation import AFTER_CONTACT, effects_at
 from affordlib.primitives import Drag, Push
@@ -32,10 +20,10 @@ from experiments.lstm import LSTMConfig
 YAW = {"action_channels": ("x", "y", "yaw"), "effect_channels": ("x", "y", "yaw")}
 SMALL = {"width": 32, "blocks": 2, "rings": 3, "orders": 4}
 CONFIGS = {
-    "cnp, table": CNPConfig(**YAW),
-    "cnp, push": CNPConfig(**YAW, frame="push"),
-    "film, table": FiLMConfig(**YAW, **SMALL, frame="table"),
-    "film, push": FiLMConfig(**YAW, **SMALL),
+    "cnp, table": models.CNPConfig(**YAW),
+    "cnp, push": models.CNPConfig(**YAW, frame="push"),
+    "film, table": models.FiLMConfig(**YAW, **SMALL, frame="table"),
+    "film, push": models.FiLMConfig(**YAW, **SMALL),
     "last pose, table": LastPoseConfig(**YAW, **SMALL),
     "around mean, table": CNPAroundMeanConfig(**YAW),
     "lstm, push": LSTMConfig(**YAW, frame="push", width=16),
@@ -50,7 +38,9 @@ def network(request, some):
 
 def made(name, arrays):
     torch.manual_seed(0)
-    network = build(CONFIGS[name], Scaler.fit(arrays), TrainingDomain.fit(arrays)).eval()
+    network = models.build(
+        CONFIGS[name], Scaler.fit(arrays), models.TrainingDomain.fit(arrays)
+    ).eval()
     with torch.no_grad():  # the last layers of blocks are initialised to zero
         for parameter in network.parameters():
             parameter.add_(0.02 * torch.randn_like(parameter))
@@ -74,12 +64,14 @@ def predictions(network, batch, observations=None):
 @torch.no_grad()
 def test_order_and_what_is_masked_have_no_effect(network, some, tmp_path):
     """Saving and loading have no effect either."""
-    assert isinstance(network, EffectModel)
+    assert isinstance(network, models.EffectModel)
     batch = batch_of(some)
     predicted = predictions(network, batch)
     assert [tuple(v.shape) for v in predicted] == [(40, 5, 3)] * 4
     assert all(bool((v > 0).all()) for v in (predicted[1], predicted[3]))
-    again, _ = load_checkpoint(save_checkpoint(network, tmp_path / "m.safetensors", {}))
+    again, _ = models.load_checkpoint(
+        models.save_checkpoint(network, tmp_path / "m.safetensors", {})
+    )
     assert type(again) is type(network)
     assert all(map(torch.equal, predicted, predictions(again, batch)))
     seen = batch.observations
@@ -154,11 +146,11 @@ def test_a_quarter_turn_of_the_table_turns_the_prediction(name, quarters, some):
 
 @pytest.mark.parametrize("name", ["film_500", "cnp_500"])
 def test_many_queries_at_once_equal_each_alone(name, some):
-    model = load_checkpoint(name)[0].double()
+    model = models.load_checkpoint(name)[0].double()
     pushes = [Push(float(theta)) for theta in np.linspace(-3, 3, 40)]
     features = model.encode(some.image[:1].double())
     t_target = torch.linspace(0, 1, 6, dtype=torch.float64).expand(40, -1)
-    observed = condition_on_primitives(model, pushes)
+    observed = models.condition_on_primitives(model, pushes)
     observed = dataclasses.replace(
         observed, action=observed.action.double(), action_t=observed.action_t.double(),
         effect=observed.effect.double(), effect_t=observed.effect_t.double(),
@@ -209,8 +201,8 @@ def test_what_is_out_of_range_is_refused(some):
         (Push(0, length=0.12), r"ends 0\.120 m"),
     ):
         with pytest.raises(ValueError, match=words):
-            network.predict(features, condition_on_primitives(network, [action]), one)
-    pushed = condition_on_primitives(network, [Push(0)])
+            network.predict(features, models.condition_on_primitives(network, [action]), one)
+    pushed = models.condition_on_primitives(network, [Push(0)])
     for t in (-0.2, 1.5, math.nan):
         with pytest.raises(ValueError, match=r"t_target must lie in \[0, 1\]"):
             network.predict(features, pushed, torch.full((1, 1), t))
@@ -218,7 +210,7 @@ def test_what_is_out_of_range_is_refused(some):
     with pytest.raises(ValueError, match="starts nan m"):
         network.predict(features, nowhere, one)
     far = condition_on_final_effect(network, torch.tensor([[0.2, 0.0, 0.0]]))
-    with pytest.warns(OutOfRangeWarning, match=r"ends 0\.200 m away, trained on 0\.0\d+ to"):
+    with pytest.warns(models.OutOfRangeWarning, match=r"ends 0\.200 m away, trained on 0\.0\d+ to"):
         network.predict(features, far, one)
     empty = some.image[:2].clone()
     empty[1, 1] = 0
@@ -233,14 +225,14 @@ def test_coverage_and_variance_scaling(some):
     z = torch.randn(100_000, generator=generator)
     zero, one = torch.zeros_like(z), torch.ones_like(z)
     for level in (0.5, 0.9):
-        assert coverage(z, zero, one, level) == pytest.approx(level, abs=0.005)
-        assert coverage(z, zero, one / 2, level) < level - 0.1
+        assert models.coverage(z, zero, one, level) == pytest.approx(level, abs=0.005)
+        assert models.coverage(z, zero, one / 2, level) < level - 0.1
     network = made("film, push", some)
 
     def nll():
         return float(gaussian_nll(*effects_at(network, some, AFTER_CONTACT)).mean())
 
-    before, scale = nll(), fit_sigma_scale(network, some)
+    before, scale = nll(), models.fit_sigma_scale(network, some)
     assert tuple(network.sigma_scale.tolist()) == scale
     best = nll()
     assert best < before
@@ -248,17 +240,17 @@ def test_coverage_and_variance_scaling(some):
         network.sigma_scale.copy_(factor * torch.tensor(scale))
         assert best < nll()
     with pytest.raises(ValueError, match=r"level .* 1\.5"):
-        coverage(z, zero, one, 1.5)
+        models.coverage(z, zero, one, 1.5)
 
 
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: FiLMConfig(effect_channels=("z",)), "effect_channels must name x and y"),
-        (lambda: FiLMConfig(rings=True), "rings=True"),
+        (lambda: models.FiLMConfig(effect_channels=("z",)), "effect_channels must name x and y"),
+        (lambda: models.FiLMConfig(rings=True), "rings=True"),
         (lambda: LSTMConfig(steps=2.5), r"steps=2\.5"),
-        (lambda: CNPConfig(sigma_floor=0.0), r"sigma_floor .* 0\.0"),
-        (lambda: FiLMConfig(blocks=10**7), r"blocks must be a whole number in \[1, 4096\]"),
+        (lambda: models.CNPConfig(sigma_floor=0.0), r"sigma_floor .* 0\.0"),
+        (lambda: models.FiLMConfig(blocks=10**7), r"blocks must be a whole number in \[1, 4096\]"),
     ],
 )
 def test_bad_settings_are_named(make, words):

@@ -7,19 +7,9 @@ import pickle
 import pytest
 import torch
 
+from affordlib import models
 from affordlib.interactions import InteractionTensors, Scaler, split_interactions
 from affordlib.interactions.dataset import condition_on_recorded_action
-from affordlib.models import (
-    FiLMConfig,
-    FiLMNetwork,
-    TrainingConfig,
-    TrainingDomain,
-    build,
-    fit_sigma_scale,
-    load_checkpoint,
-    save_checkpoint,
-    train,
-)
 from affordlib.models.evaluation import final_errors_m
 from affordlib.planning import EffectMap
 from experiments.ablation import sample_literal
@@ -29,10 +19,10 @@ from experiments.baselines import constant
 def fresh(arrays):
     """An untrained small network."""
     torch.manual_seed(0)
-    small = FiLMConfig(
+    small = models.FiLMConfig(
         arrays.action_channels, arrays.effect_channels, width=32, blocks=2, rings=3, orders=4
     )
-    return build(small, Scaler.fit(arrays)).eval()
+    return models.build(small, Scaler.fit(arrays)).eval()
 
 
 def mean_length_error_m(training, test):
@@ -48,20 +38,20 @@ def test_the_literal_loop_draws_up_to_all_observations(some):
 
 
 def test_a_training_that_never_validates_says_so(some):
-    config = TrainingConfig(steps=20, validate_every=10, learning_rate=0.5)
+    config = models.TrainingConfig(steps=20, validate_every=10, learning_rate=0.5)
 
     def never(model, tensors):
         return torch.full((len(tensors),), math.nan)
 
     with pytest.raises(ValueError, match=r"learning_rate 0\.5: no validation error was finite"):
-        train(fresh(some), some, some, config, score=never)
+        models.train(fresh(some), some, some, config, score=never)
 
 
 def test_channels_in_another_order_are_refused(some):
     other = dataclasses.replace(some, effect_channels=("yaw", "x", "y"))
     for act in (
         lambda: final_errors_m(fresh(some), other),
-        lambda: train(fresh(some), some, other),
+        lambda: models.train(fresh(some), some, other),
     ):
         with pytest.raises(ValueError, match=r"has the effect_channels .* the model needs"):
             act()
@@ -72,11 +62,11 @@ class Stopped(Exception):
 
 
 def test_training_resumes_to_the_same_bits(some, tmp_path, monkeypatch):
-    config = TrainingConfig(steps=9, batch_size=16, validate_every=2, ema=0.9)
+    config = models.TrainingConfig(steps=9, batch_size=16, validate_every=2, ema=0.9)
     whole = fresh(some)
-    history = train(whole, some, some, config)
+    history = models.train(whole, some, some, config)
 
-    broken, calls, loss_of = fresh(some), [], FiLMNetwork.loss
+    broken, calls, loss_of = fresh(some), [], models.FiLMNetwork.loss
 
     def stop(model, batch, beta):
         calls.append(0)
@@ -86,11 +76,11 @@ def test_training_resumes_to_the_same_bits(some, tmp_path, monkeypatch):
 
     file = tmp_path / "run" / "training.pt"
     with monkeypatch.context() as patch:
-        patch.setattr(FiLMNetwork, "loss", stop)
+        patch.setattr(models.FiLMNetwork, "loss", stop)
         with pytest.raises(Stopped):
-            train(broken, some, some, config, resume_checkpoint=file)
+            models.train(broken, some, some, config, resume_checkpoint=file)
     again = fresh(some)
-    resumed = train(again, some, some, config, resume_checkpoint=file)
+    resumed = models.train(again, some, some, config, resume_checkpoint=file)
     assert [(h.step, h.loss, h.validation_error) for h in resumed] == [
         (h.step, h.loss, h.validation_error) for h in history
     ]
@@ -99,13 +89,13 @@ def test_training_resumes_to_the_same_bits(some, tmp_path, monkeypatch):
     assert again.sigma_floor == whole.sigma_floor
     other = dataclasses.replace(config, steps=10)
     with pytest.raises(ValueError, match="resume_checkpoint is of a training with other steps"):
-        train(fresh(some), some, some, other, resume_checkpoint=file)
+        models.train(fresh(some), some, some, other, resume_checkpoint=file)
 
 
 def test_a_foreign_or_damaged_state_of_a_training_is_named(some, tmp_path):
-    config = TrainingConfig(steps=2, batch_size=4, validate_every=1)
+    config = models.TrainingConfig(steps=2, batch_size=4, validate_every=1)
     file = tmp_path / "training.pt"
-    train(fresh(some), some, some, config, resume_checkpoint=file)
+    models.train(fresh(some), some, some, config, resume_checkpoint=file)
     whole = bytearray(file.read_bytes())
     whole[len(whole) // 2] ^= 1
     for content in (bytes(whole), whole[:-9], b"", b"notes", pickle.dumps({"about": 1})):
@@ -113,7 +103,7 @@ def test_a_foreign_or_damaged_state_of_a_training_is_named(some, tmp_path):
         with pytest.raises(
             ValueError, match=r"training\.pt' is damaged or holds no training state"
         ) as caught:
-            train(fresh(some), some, some, config, resume_checkpoint=file)
+            models.train(fresh(some), some, some, config, resume_checkpoint=file)
         assert "weights_only" not in str(caught.value)
         assert caught.value.__suppress_context__
 
@@ -121,26 +111,28 @@ def test_a_foreign_or_damaged_state_of_a_training_is_named(some, tmp_path):
 def test_training_continues_from_a_loaded_model_as_from_the_one_in_memory(some, tmp_path):
     """The σ floor goes on from where it stopped, and never rises."""
     model = fresh(some)
-    train(model, some, some, TrainingConfig(steps=4, validate_every=2, final_sigma_floor=0.005))
-    fit_sigma_scale(model, some)
-    again, _ = load_checkpoint(save_checkpoint(model, tmp_path / "m.safetensors", {}))
+    models.train(
+        model, some, some, models.TrainingConfig(steps=4, validate_every=2, final_sigma_floor=0.005)
+    )
+    models.fit_sigma_scale(model, some)
+    again, _ = models.load_checkpoint(models.save_checkpoint(model, tmp_path / "m.safetensors", {}))
     for key, value in model.state_dict().items():
         assert torch.equal(again.state_dict()[key], value)
     assert again.config == model.config == fresh(some).config
     floor = float(model.sigma_floor)
     for one in (model, again):
-        train(one, some, some, TrainingConfig(steps=3, validate_every=1))
+        models.train(one, some, some, models.TrainingConfig(steps=3, validate_every=1))
         assert float(one.sigma_floor) == floor
     for a, b in zip(model.parameters(), again.parameters(), strict=True):
         assert torch.equal(a, b)
 
 
 def test_images_of_another_width_or_size_are_refused(some, cuboid_image):
-    config = FiLMConfig(some.action_channels, some.effect_channels)
-    model = build(config, Scaler.fit(some), TrainingDomain.fit(some))
+    config = models.FiLMConfig(some.action_channels, some.effect_channels)
+    model = models.build(config, Scaler.fit(some), models.TrainingDomain.fit(some))
     wider = dataclasses.replace(some, image_width_m=0.2)
     with pytest.raises(ValueError, match=r"validation has images 0\.2 m wide, .* 0\.16 m wide"):
-        train(model, some, wider)
+        models.train(model, some, wider)
     with pytest.raises(ValueError, match=r"image has 24×24 pixels, trained on 48×48"):
         model.encode(some.image[..., ::2, ::2])
     model.domain = dataclasses.replace(model.domain, image_width_m=0.2)
@@ -155,9 +147,9 @@ def test_a_short_training_beats_the_mean_length(pushes):
     training = InteractionTensors.from_dataset(pushes, split.train)
     validation = InteractionTensors.from_dataset(pushes, split.validation)
     torch.manual_seed(0)
-    model = build(FiLMConfig(), Scaler.fit(training))
-    config = TrainingConfig(steps=600, n_targets=8, batch_size=48, validate_every=200)
-    history = train(model, training, validation, config)
+    model = models.build(models.FiLMConfig(), Scaler.fit(training))
+    config = models.TrainingConfig(steps=600, n_targets=8, batch_size=48, validate_every=200)
+    history = models.train(model, training, validation, config)
     assert history[-1].loss < history[0].loss
     errors = final_errors_m(model, validation)
     # Early stopping keeps the best weights, not the last.
@@ -173,7 +165,7 @@ def test_a_short_training_beats_the_mean_length(pushes):
 def test_the_shipped_networks_reach_their_goals(
     name, n, all_mm, cuboid_mm, p95_mm, yaw_deg, held_out_pushes
 ):
-    model, about = load_checkpoint(name)
+    model, about = models.load_checkpoint(name)
     split = split_interactions(n)
     assert about["seen_interactions"] == sorted([*split.train, *split.validation])
     test = InteractionTensors.from_dataset(

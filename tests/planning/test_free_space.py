@@ -7,15 +7,7 @@ import pytest
 import torch
 from matplotlib.path import Path
 
-from affordlib.planning import (
-    EffectMap,
-    PlanMode,
-    PlanningProblem,
-    plan_astar,
-    plan_continuous,
-    plan_gradient,
-    run_closed_loop,
-)
+from affordlib import planning
 from affordlib.planning.free_space import (
     FAR_M,
     N_POSES,
@@ -34,7 +26,7 @@ from experiments.field_baselines import plan_cem
 from tests.planning.point_robot import KnownDynamics, PointRobot, disc_image, point_skills
 from tests.problems import problem_of
 
-PLANNERS = (plan_astar, plan_continuous, plan_gradient, plan_cem)
+PLANNERS = (planning.plan_astar, planning.plan_continuous, planning.plan_gradient, plan_cem)
 BOX = 0.5 * np.array([[0.06, 0.05], [-0.06, 0.05], [-0.06, -0.05], [0.06, -0.05]])
 
 
@@ -151,7 +143,7 @@ def test_an_obstacle_where_none_can_be_is_refused(obstacle, says):
 
 def problem(goal, obstacles, **more):
     """A problem of a disc with known dynamics."""
-    mode = more.pop("mode", PlanMode(3, partial=True))
+    mode = more.pop("mode", planning.PlanMode(3, partial=True))
     more |= {"obstacles": tuple(obstacles)}
     return problem_of(KnownDynamics(), disc_image(), (0.0, 0.0), goal, mode, **more)
 
@@ -192,11 +184,11 @@ def corridor(half_m=0.033, length_m=0.3):
     return [Obstacle.box((0.0, s * (half_m + 0.01)), (length_m, 0.02)) for s in (-1, 1)]
 
 
-@pytest.mark.parametrize("plan", [plan_astar, plan_continuous])
+@pytest.mark.parametrize("plan", [planning.plan_astar, planning.plan_continuous])
 def test_in_a_corridor_a_push_must_be_able_to_stop(plan):
     goal = Goal((0.05, 0.0), 0.005)
     ends = [
-        plan(problem(goal, corridor(), mode=PlanMode(4, partial))).predicted_distance_m
+        plan(problem(goal, corridor(), mode=planning.PlanMode(4, partial))).predicted_distance_m
         for partial in (True, False)
     ]
     assert ends[0] < 0.005 < 0.02 < ends[1]
@@ -206,11 +198,11 @@ def test_a_way_that_is_closed_is_unreachable_and_nothing_is_touched():
     bay = [*corridor(0.05, 0.12), Obstacle.box((0.07, 0.0), (0.02, 0.14))]
     bay.append(Obstacle.box((-0.07, 0.0), (0.02, 0.14)))
     robot = PointRobot(obstacles=tuple(bay))
-    found = run_closed_loop(robot, Goal((0.2, 0.0), 0.01), point_skills())
+    found = planning.run_closed_loop(robot, Goal((0.2, 0.0), 0.01), point_skills())
     assert (found.status, found.steps) == ("unreachable", ())
     assert "past the obstacles" in found.message
     robot.obstacles = (Obstacle.disc((0.2, 0.0), 0.03),)
-    found = run_closed_loop(robot, Goal((0.2, 0.0), 0.01), point_skills())
+    found = planning.run_closed_loop(robot, Goal((0.2, 0.0), 0.01), point_skills())
     assert "obstacles[0] lies on the goal" in found.message
 
 
@@ -223,7 +215,7 @@ def test_an_obstacle_that_moves_makes_the_loop_plan_again():
             robot.obstacles = wall
 
     def ends(robot):
-        found = run_closed_loop(robot, Goal((0.22, 0.0), 0.005), point_skills())
+        found = planning.run_closed_loop(robot, Goal((0.22, 0.0), 0.005), point_skills())
         assert found.reached, found.message
         return found
 
@@ -239,7 +231,7 @@ def test_of_what_is_predicted_to_pass_little_touches(world, skills):
     for _ in range(12):
         obj = Cuboid.sample(rng)
         world.place(obj, (0.0, 0.0), rng.uniform(-3, 3))
-        effects = EffectMap(skills.model(Push), world.depth_image())
+        effects = planning.EffectMap(skills.model(Push), world.depth_image())
         angle = rng.uniform(-3, 3)
         at = torch.tensor([angle]).double()
         poses = poses_along(effects, np.zeros((1, 3)), at, torch.ones(1).double(), N_POSES)
@@ -272,10 +264,10 @@ def unit(angle):
 
 def test_an_object_beside_an_obstacle_may_leave_it():
     wall, goal = Obstacle.box((-0.0405, 0.02), (0.02, 0.02)), Goal((0.03, 0.12), 0.005)
-    effects = EffectMap(KnownDynamics(), box_image())
-    posed = PlanningProblem((0.0, 0.0), goal, effects, obstacles=(wall,))
+    effects = planning.EffectMap(KnownDynamics(), box_image())
+    posed = planning.PlanningProblem((0.0, 0.0), goal, effects, obstacles=(wall,))
     assert posed.free_space.least_m < START_M
-    assert plan_continuous(posed).reaches_goal
+    assert planning.plan_continuous(posed).reaches_goal
 
 
 def test_the_outline_of_an_image_is_the_objects():

@@ -11,17 +11,9 @@ import numpy as np
 import pytest
 import torch
 
-from affordlib import primitives
+from affordlib import planning, primitives
 from affordlib.geometry import rotated
 from affordlib.models import load_checkpoint
-from affordlib.planning import (
-    EffectMap,
-    PlanMode,
-    Skills,
-    plan_astar,
-    plan_continuous,
-    plan_gradient,
-)
 from affordlib.planning.astar import HEURISTICS, Branches, BranchTable, search
 from affordlib.planning.gradient import Reading, descend
 from affordlib.planning.rollout import roll_out
@@ -36,7 +28,7 @@ from tests.problems import problem_of
 
 IMAGE = np.zeros((2, 48, 48), dtype=np.float32)
 MODEL = KnownDynamics()
-PLANNERS = (plan_astar, plan_continuous, plan_gradient)
+PLANNERS = (planning.plan_astar, planning.plan_continuous, planning.plan_gradient)
 
 
 def known(goal_xy, mode="multi_partial", tolerance_m=0.02, model=MODEL, **more):
@@ -50,7 +42,7 @@ def known(goal_xy, mode="multi_partial", tolerance_m=0.02, model=MODEL, **more):
 @pytest.mark.parametrize("kind", [Push, Drag])
 def test_an_effect_map_says_what_the_model_says(world, film, kind):
     world.place(Cuboid(0.07, 0.05, 0.05), (0.0, 0.0), 0.4)
-    effects = EffectMap(film if kind is Push else MODEL, world.depth_image(), kind)
+    effects = planning.EffectMap(film if kind is Push else MODEL, world.depth_image(), kind)
     assert effects.radius_m == pytest.approx(math.hypot(0.035, 0.025), abs=0.004)
     rng = np.random.default_rng(0)
     direction = torch.from_numpy(rng.uniform(-7, 7, 40))
@@ -77,14 +69,14 @@ def test_a_new_moving_primitive_has_a_map(monkeypatch):
             return self.push.ends()
 
     monkeypatch.setitem(primitives.PRIMITIVES, "nudge", Nudge)
-    skills = Skills({"nudge": MODEL})
+    skills = planning.Skills({"nudge": MODEL})
     assert skills.effects(IMAGE, Nudge).reach_m == pytest.approx(REACH_M, abs=1e-4)
 
 
 def test_sigma_is_that_of_the_push_frame(world, film):
     """A disc looks the same from all directions, so ahead and left have the same σ in all."""
     world.place(UprightCylinder(0.06, 0.06))
-    effects = EffectMap(film, world.depth_image())
+    effects = planning.EffectMap(film, world.depth_image())
     std = effects.grid[1][:, -1, :2]
     assert (std.std(dim=0) < 0.015 * std.mean(dim=0)).all()
     assert (std[:, 1] > 1.05 * std[:, 0]).all()  # also at 45°
@@ -93,7 +85,7 @@ def test_sigma_is_that_of_the_push_frame(world, film):
 def test_a_chain_turns_with_the_object(world, film):
     """Rolling out two pushes equals querying the second for the rotated object."""
     world.place(Cuboid(0.07, 0.05, 0.05), (0.0, 0.0), 0.4)
-    effects = EffectMap(film, world.depth_image())
+    effects = planning.EffectMap(film, world.depth_image())
     direction, phase = torch.tensor([[0.3, 1.2]]).double(), torch.tensor([[1.0, 0.9]]).double()
     positions, turns, variances = roll_out(effects, direction, phase)
     first, _ = effects(direction[:, 0], phase[:, 0])
@@ -154,7 +146,7 @@ def test_astar_finds_what_exhaustive_search_finds(seed, heuristic):
 
 
 def test_branches_are_the_papers_180():
-    direction, stop_phase, effect_m, _ = BranchTable(EffectMap(MODEL, IMAGE)).at(0.0)
+    direction, stop_phase, effect_m, _ = BranchTable(planning.EffectMap(MODEL, IMAGE)).at(0.0)
     # Actions that stop before contact are pruned: 36 x {80, 100 %} remain.
     assert len(direction) == 72
     assert set(np.round(stop_phase, 3)) == {0.8, 1.0}
@@ -165,7 +157,7 @@ def test_branches_are_the_papers_180():
 
 
 def test_numbers_of_few_bits_plan_as_others_and_numbers_without_end_are_refused():
-    effects = EffectMap(MODEL, IMAGE)
+    effects = planning.EffectMap(MODEL, IMAGE)
     for few in (np.uint8(200), np.int8(36)):
         branches, others = (BranchTable(effects, n).at(0.3) for n in (few, int(few)))
         np.testing.assert_array_equal(branches[0], others[0])
@@ -177,7 +169,7 @@ def test_numbers_of_few_bits_plan_as_others_and_numbers_without_end_are_refused(
 
 def test_segments_of_the_recorded_part_are_the_papers_180_branches():
     shares = np.array([0.2, 0.4, 0.6, 0.8, 1.0])
-    effects = EffectMap(MODEL, IMAGE)
+    effects = planning.EffectMap(MODEL, IMAGE)
     stops = phases_of_way(effects, shares)
     np.testing.assert_allclose(stops, STARTS + (1 - STARTS) * np.sqrt(shares), atol=0.005)
     _, _, effect_m, _ = BranchTable(effects, stop_phases=stops).at(0.0)
@@ -186,7 +178,7 @@ def test_segments_of_the_recorded_part_are_the_papers_180_branches():
 
 
 def test_astar_plans():
-    plan = plan_astar(known((0.18, 0.06)))
+    plan = planning.plan_astar(known((0.18, 0.06)))
     assert plan.reaches_goal
     assert 2 <= len(plan.steps) <= 3
     assert plan.predicted_distance_m <= 0.02
@@ -195,8 +187,8 @@ def test_astar_plans():
         np.testing.assert_allclose(step.predicted_path_xy_m[0], xy, atol=1e-4)
         xy = step.predicted_path_xy_m[-1]
         np.testing.assert_allclose(xy, step.predicted_end_xy_m, atol=1e-9)
-    assert plan_astar(known((0.01, 0.0))).steps == ()
-    far = plan_astar(known((0.45, 0.0)))
+    assert planning.plan_astar(known((0.01, 0.0))).steps == ()
+    far = planning.plan_astar(known((0.45, 0.0)))
     assert not far.reaches_goal
     assert far.predicted_distance_m == pytest.approx(0.45 - 3 * REACH_M, abs=1e-6)
 
@@ -209,7 +201,7 @@ def test_a_search_goes_on_where_the_end_cannot_be_had(film, cuboid_image):
         asked.append(xy_m)
         return () if xy_m[0] > 0.085 else None
 
-    two = PlanMode(2, partial=True)
+    two = planning.PlanMode(2, partial=True)
     problem = problem_of(film, cuboid_image, (0.0, 0.0), goal, two, pose_planner=only_beyond)
     table = BranchTable(problem.effects)
     chain, reached = search(problem, table)
@@ -217,7 +209,7 @@ def test_a_search_goes_on_where_the_end_cannot_be_had(film, cuboid_image):
     assert len(asked) > 1
     assert asked[-1][0] > 0.085
     assert all(goal.distance_m(xy) <= goal.tolerance_m for xy in asked)
-    one = PlanMode(1, partial=True)
+    one = planning.PlanMode(1, partial=True)
     assert not search(replace(problem, mode=one, pose_planner=lambda *_: None), table)[1]
     assert len(chain) >= 1
 
@@ -226,9 +218,9 @@ def test_a_plan_reaches_the_goal_only_where_it_says_that_it_ends_there(film, cub
     """The search, which rounds turns to a degree, has a small error."""
     for angle in range(8):
         xy = 0.15 * math.cos(angle), 0.15 * math.sin(angle)
-        ends = plan_astar(problem_of(film, cuboid_image, (0.0, 0.0), Goal(xy)))
+        ends = planning.plan_astar(problem_of(film, cuboid_image, (0.0, 0.0), Goal(xy)))
         near = Goal(xy, ends.predicted_distance_m - 1e-6)
-        plan = plan_astar(problem_of(film, cuboid_image, (0.0, 0.0), near))
+        plan = planning.plan_astar(problem_of(film, cuboid_image, (0.0, 0.0), near))
         assert plan.reaches_goal == (plan.predicted_distance_m <= near.tolerance_m)
 
 
@@ -237,7 +229,7 @@ def test_a_plan_reaches_the_goal_only_where_it_says_that_it_ends_there(film, cub
 
 @pytest.mark.parametrize("goal_xy", [(0.05, 0.02), (-0.03, 0.06), (0.13, -0.11), (0.2, 0.05)])
 def test_the_continuous_planner_ends_at_the_goal(goal_xy):
-    plan = plan_continuous(known(goal_xy))
+    plan = planning.plan_continuous(known(goal_xy))
     assert len(plan.steps) >= math.ceil(math.hypot(*goal_xy) / REACH_M)
     assert plan.predicted_distance_m < 5e-5
     xy = np.zeros(2)
@@ -248,14 +240,14 @@ def test_the_continuous_planner_ends_at_the_goal(goal_xy):
         np.testing.assert_allclose(step.predicted_end_xy_m, end, atol=1e-5)
         xy = np.array(step.predicted_end_xy_m)
     here = problem_of(MODEL, IMAGE, goal_xy, Goal(goal_xy))
-    assert plan_continuous(here).steps == ()
+    assert planning.plan_continuous(here).steps == ()
 
 
 def test_where_nothing_brings_it_nearer_it_stays(film, cuboid_image):
     near, far = (Goal((x, 0.0), tolerance_m=0.02) for x in (0.015, 0.08))
-    plan = plan_continuous(problem_of(film, cuboid_image, (0.0, 0.0), near, "single_full"))
+    plan = planning.plan_continuous(problem_of(film, cuboid_image, (0.0, 0.0), near, "single_full"))
     assert (plan.steps, plan.reaches_goal) == ((), True)
-    plan = plan_continuous(problem_of(film, cuboid_image, (0.0, 0.0), far, "single_full"))
+    plan = planning.plan_continuous(problem_of(film, cuboid_image, (0.0, 0.0), far, "single_full"))
     assert len(plan.steps) == 1
 
 
@@ -269,7 +261,7 @@ def test_of_two_plans_that_of_lower_variance_is_taken():
             std = 0.001 + 0.02 * along[..., :1].square().expand_as(known.effect_std)
             return Prediction(known.action_mean, std, known.effect_mean, std)
 
-    plan = plan_continuous(known((0.0, 0.12), model=SureUpwards()))
+    plan = planning.plan_continuous(known((0.0, 0.12), model=SureUpwards()))
     assert plan.predicted_distance_m < 1e-4
     assert all(abs(math.sin(s.primitive.direction_rad)) > 0.95 for s in plan.steps)
     assert plan.steps[-1].std_m < 0.004
@@ -322,7 +314,7 @@ def test_each_reading_finds_the_direction_whose_effect_points_at_the_goal(goal_x
 @pytest.mark.parametrize("reading", READINGS[::4], ids=str)
 @pytest.mark.parametrize("goal_xy", [(0.05, 0.02), (-0.03, 0.06), (0.13, -0.11)])
 def test_the_gradient_planner_finds_direction_and_phase(goal_xy, reading):
-    plan = plan_gradient(known(goal_xy), 300, reading=reading)
+    plan = planning.plan_gradient(known(goal_xy), 300, reading=reading)
     assert len(plan.steps) == math.ceil(math.hypot(*goal_xy) / REACH_M)
     # Between two of 300 samples the object moves 0.75 mm; the direction converges.
     assert plan.predicted_distance_m < 0.001
@@ -345,14 +337,14 @@ def test_a_start_that_leads_away_is_drawn_again_and_the_planner_says_if_all_do()
     ends_m = []
     for seed in range(12):
         with warnings.catch_warnings(record=True, action="always") as said:
-            plan = plan_gradient(known((0.05, 0.0), model=Deaf()), seed=seed)
+            plan = planning.plan_gradient(known((0.05, 0.0), model=Deaf()), seed=seed)
         assert bool(plan.steps) != any("none of 5 random starts" in str(w.message) for w in said)
         ends_m += [plan.predicted_distance_m] * bool(plan.steps)
     assert len(ends_m) >= 10
     assert max(ends_m) < 0.05
     nowhere = known((0.05, 0.0), reachable=lambda xy, *_: np.zeros(len(xy), bool))
     with pytest.warns(UserWarning, match="none of 10 random starts led nearer to the goal"):
-        plan_gradient(nowhere, reading=Reading(starts=2))
+        planning.plan_gradient(nowhere, reading=Reading(starts=2))
 
 
 def test_a_push_that_would_stop_before_it_begins_is_none():
@@ -365,16 +357,20 @@ def test_a_push_that_would_stop_before_it_begins_is_none():
 
     for seed in range(6):
         with warnings.catch_warnings(action="ignore", category=UserWarning):
-            plan = plan_gradient(known((0.03, 0.0), model=Offset()), seed=seed)
+            plan = planning.plan_gradient(known((0.03, 0.0), model=Offset()), seed=seed)
         assert all(step.stop_phase > 0 for step in plan.steps)
 
 
 def test_modes_bind_the_gradient_planner():
-    partial, again = (plan_gradient(known((0.04, 0.0), "single_partial")) for _ in range(2))
+    partial, again = (
+        planning.plan_gradient(known((0.04, 0.0), "single_partial")) for _ in range(2)
+    )
     expected = STARTS + (1 - STARTS) * math.sqrt(0.04 / REACH_M)
     assert partial.steps[0].stop_phase == pytest.approx(expected, abs=0.01)
     assert np.array_equal(again.steps[0].path_xy_m, partial.steps[0].path_xy_m)
-    drag = plan_gradient(replace(known((0.04, 0.0)), effects=EffectMap(MODEL, IMAGE, Drag)))
+    drag = planning.plan_gradient(
+        replace(known((0.04, 0.0)), effects=planning.EffectMap(MODEL, IMAGE, Drag))
+    )
     assert drag.steps[0].path_xy_m is None
     assert drag.steps[0].primitive.direction_rad == pytest.approx(0.0, abs=0.01)
 
@@ -385,7 +381,7 @@ def test_a_decoded_path_is_followed(world):
     world.place(obj, (0.0, 0.0), 0.3)
     own = world.execute_primitive(push, stop, approach=True)
     path = push.path(np.linspace(0, stop, 60))[:, :2]
-    step = plan_astar(known((0.08, 0.0))).steps[0]
+    step = planning.plan_astar(known((0.08, 0.0))).steps[0]
     world.place(obj, (0.0, 0.0), 0.3)
     done = world.execute(replace(step, primitive=push, stop_phase=stop, path_xy_m=path))
     np.testing.assert_allclose(done.rest_effect[:2], own.rest_effect[:2], atol=0.001)
@@ -438,11 +434,11 @@ def test_plans_come_within_what_their_planner_promises(world, trained, film):
         pose = partial(problem_of, model)
         return [attempt(world, task, pose, plan, **how).distance_m for task in tasks]
 
-    assert np.mean(distances(plan_astar, trained, tasks)) < 0.03
+    assert np.mean(distances(planning.plan_astar, trained, tasks)) < 0.03
     hard = [t for t in frozen_tasks() if (t.goals, t.mode) == ("constructed", "multi_partial")]
     hard = [t for t in hard if not t.obj.rollable][:5]
-    open_loop = distances(plan_continuous, film, hard)
-    corrected = distances(plan_continuous, film, hard, corrections=2)
+    open_loop = distances(planning.plan_continuous, film, hard)
+    corrected = distances(planning.plan_continuous, film, hard, corrections=2)
     assert np.mean(open_loop) < 0.003  # 1.1 mm
     assert np.mean(corrected) < min(0.002, np.mean(open_loop))
 

@@ -5,14 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from affordlib.perception import (
-    long_axis_rad,
-    looks_fallen,
-    looks_rollable,
-    object_height_m,
-    outline_of,
-    turn_between,
-)
+from affordlib import perception
 from affordlib.primitives import Push
 from affordlib.world import (
     CATEGORIES,
@@ -36,8 +29,8 @@ def test_round_tops_look_rollable(world, category):
     for _ in range(10):
         obj = category.sample(rng)
         image = _seen(world, obj, rng.uniform(-3, 3)).image
-        assert looks_rollable(image) == obj.rollable
-        assert object_height_m(image) == pytest.approx(obj.height_m, abs=0.003)
+        assert perception.looks_rollable(image) == obj.rollable
+        assert perception.object_height_m(image) == pytest.approx(obj.height_m, abs=0.003)
 
 
 def test_the_axis_of_a_lying_cylinder_is_seen(world):
@@ -45,7 +38,7 @@ def test_the_axis_of_a_lying_cylinder_is_seen(world):
     for _ in range(10):
         yaw = rng.uniform(-math.pi, math.pi)
         image = _seen(world, LyingCylinder.sample(rng), yaw).image
-        off = (long_axis_rad(image) - yaw + math.pi / 2) % math.pi - math.pi / 2
+        off = (perception.long_axis_rad(image) - yaw + math.pi / 2) % math.pi - math.pi / 2
         assert abs(math.degrees(off)) < 2
 
 
@@ -55,13 +48,13 @@ def test_a_fallen_cylinder_is_known_to_roll(world):
     world.place(UprightCylinder(0.034, 0.11), config=high)
     before = world.depth_image()
     assert not world.placed.rolls()
-    assert not looks_rollable(before)
+    assert not perception.looks_rollable(before)
     seen = world.execute_primitive(Push.towards(0.0))
     assert (seen.fell, seen.rolls, world.placed.fell(), world.placed.rolls()) == (True,) * 4
     after = world.depth_image()
-    assert looks_fallen(before, after)
-    assert looks_rollable(after)
-    assert not looks_fallen(before, before)
+    assert perception.looks_fallen(before, after)
+    assert perception.looks_rollable(after)
+    assert not perception.looks_fallen(before, before)
 
 
 @pytest.mark.parametrize("obj", [Cuboid(0.06, 0.05, 0.05), Sphere(0.06), LyingCylinder(0.07, 0.05)])
@@ -95,11 +88,11 @@ def test_turns_are_seen_between_two_images(world, category, camera, n_images, sp
             xy, seed = tuple(rng.uniform(-0.12, 0.12, 2)), int(rng.integers(2**31))
             _seen(world, obj, yaw, xy, camera=camera, noise_seed=seed)
             images.append(np.mean([world.observe().image for _ in range(n_images)], axis=0))
-        seen, std = turn_between(*images, turn + rng.uniform(-0.5, 0.5))
+        seen, std = perception.turn_between(*images, turn + rng.uniform(-0.5, 0.5))
         off = math.degrees(abs(math.remainder(seen - turn, 2 * math.pi)))
         assert off < max(5 * spread_deg, 3 * math.degrees(std))
         assert math.degrees(std) < 5
-    same, std = turn_between(images[0], images[0])
+    same, std = perception.turn_between(images[0], images[0])
     assert (same, std) == pytest.approx((0.0, 0.0), abs=1e-3)
 
 
@@ -112,12 +105,12 @@ def test_the_turn_of_what_is_round_is_not_seen(world, category, camera, n_images
         images = [
             np.mean([world.observe().image for _ in range(n_images)], axis=0) for _ in range(2)
         ]
-        assert turn_between(*images, 0.0) is None
+        assert perception.turn_between(*images, 0.0) is None
 
 
 def test_an_outline_is_found_to_a_fraction_of_a_pixel(world):
     prism = Prism(((0.0, 0.0), (0.07, 0.0), (0.0, 0.08)), 0.05)
-    corners = outline_of(_seen(world, prism, yaw=0.0).image)
+    corners = perception.outline_of(_seen(world, prism, yaw=0.0).image)
     assert len(corners) == 3
     off = np.linalg.norm(corners[:, None] - prism.footprint_m, axis=2)
     assert off.min(axis=1).max() < 0.001  # a third of a pixel
