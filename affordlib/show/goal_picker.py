@@ -164,9 +164,8 @@ class GoalPicker(widgets.HBox):
     def start_over(self) -> None:
         """Put the object back where it was when the picker was created."""
         self._refuse_while_running()
-        x, y, yaw = self._first_pose
-        place = partial(self.world.place, self.world.obj, (x, y), yaw)
-        self._disturb(lambda: place(obstacles=self.world.obstacles.all))
+        (x, y, yaw), obstacles = self._first_pose, self.world.obstacles.all
+        self._disturb(partial(self.world.place, self.world.obj, (x, y), yaw, obstacles=obstacles))
 
     def figure(self) -> Figure:
         """The table, object, goal and plan as a figure."""
@@ -245,13 +244,8 @@ class GoalPicker(widgets.HBox):
         """Set the goal, and soon show a plan for it, unless another one follows."""
         goal = replace(goal)  # a new object, which identifies this request
         self._set_goal(goal)
-
-        def plan():
-            if goal is self.goal:
-                self._update_plan()
-
         if not self._running:
-            self._soon(plan)
+            self._soon(lambda: goal is self.goal and self._update_plan())
 
     def _set_goal(self, goal: Goal) -> None:
         """Show a goal that has no plan yet."""

@@ -162,8 +162,8 @@ class Scene(widgets.VBox):
         if points.ndim == 2:
             points = np.array(mesh([points])["vertices"]).reshape(-1, 3, 3)
         corners, indices = np.unique(points.reshape(-1, 3), axis=0, return_inverse=True)
-        at = np.eye(4, dtype=np.float32) if at is None else at
-        options = {"color": int(color[1:], 16), "opacity": opacity, "model_matrix": at}
+        options = {"color": int(color[1:], 16), "opacity": opacity}
+        options["model_matrix"] = np.eye(4, dtype=np.float32) if at is None else at
         body = self._mesh(np.float32(corners), np.uint32(indices).reshape(-1, 3), **options)
         self.plot += body
         return body
