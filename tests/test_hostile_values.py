@@ -95,11 +95,11 @@ stored_sha256
 NAMES = sorted({*CALLABLES, *OF_THE_WORLD.split(), "kind_for"} - {*MADE_BY_DRIVEN_ONES.split()})
 
 
-def log_of_eight():
+def log_of_eight(**about):
     """The same push eight times."""
     log = logs.Log("m", CORNERS)
     for _ in range(8):
-        log.add((0, 1), ((-0.1, 0), (0, 0)), ((0, 0, 0), (0.0163, 0, 0)))
+        log.add((0, 1), ((-0.1, 0), (0, 0)), ((0, 0, 0), (0.0163, 0, 0)), **about)
     return log.pushes()
 
 
