@@ -46,8 +46,8 @@ def free_port():
 
 
 @contextmanager
-def serve(folder, name, more_cells=(), **parameters):
-    """Start a JupyterLab with separate settings, workspaces and run-time files, and one notebook.
+def serve(folder, name, more_cells=(), app="jupyterlab", **parameters):
+    """Start a Jupyter with separate settings, workspaces and run-time files, and one notebook.
 
     more_cells: code added after the goal picker; the page omits cells that are far out of view.
     """
@@ -67,6 +67,7 @@ def serve(folder, name, more_cells=(), **parameters):
     nbformat.write(notebook, file)
     port, token = free_port(), secrets.token_hex(16)
     own = {f"JUPYTER_{part}_DIR": str(folder / part) for part in ("CONFIG", "DATA", "RUNTIME")}
+    traits = {"jupyterlab": "LabApp", "notebook": "JupyterNotebookApp"}[app]
     options = [
         "--no-browser",
         "--allow-root",
@@ -75,13 +76,13 @@ def serve(folder, name, more_cells=(), **parameters):
         "--ServerApp.port_retries=0",
         f"--ServerApp.root_dir={book}",
         f"--IdentityProvider.token={token}",
-        "--LabApp.expose_app_in_browser=True",
-        f"--LabApp.user_settings_dir={folder / 'settings'}",
-        f"--LabApp.workspaces_dir={folder / 'workspaces'}",
+        f"--{traits}.expose_app_in_browser=True",
+        f"--{traits}.user_settings_dir={folder / 'settings'}",
+        f"--{traits}.workspaces_dir={folder / 'workspaces'}",
     ]
     with (folder / "lab.log").open("w") as log:
         server = subprocess.Popen(
-            [sys.executable, "-m", "jupyterlab", *options],
+            [sys.executable, "-m", app, *options],
             env=os.environ | own | {"JUPYTER_PREFER_ENV_PATH": "1"},
             stdout=log,
             stderr=subprocess.STDOUT,
@@ -89,7 +90,8 @@ def serve(folder, name, more_cells=(), **parameters):
         address = f"http://127.0.0.1:{port}"
         try:
             wait_until(lambda: answers(f"{address}/api"), 60, server, f"see {folder / 'lab.log'}")
-            url = f"{address}/doc/tree/{name}.ipynb?token={token}"
+            path = "doc/tree" if app == "jupyterlab" else "notebooks"
+            url = f"{address}/{path}/{name}.ipynb?token={token}"
             yield SimpleNamespace(address=address, url=url, notebook=file, out=out)
         finally:
             server.terminate()
@@ -249,8 +251,7 @@ def browser():
         yield playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
 
 
-@pytest.fixture(scope="module")
-def page(lab, browser):
+def opened(lab, browser):
     """The notebook with all cells run, and `requests`: every requested address."""
     page = browser.new_page(viewport={"width": 1280, "height": 1000})
     page.set_default_timeout(25_000)
@@ -268,6 +269,11 @@ def page(lab, browser):
     page.locator(".affordlib-table .prediction").first.wait_for(timeout=90_000)
     ask(page, "setattr(picker, 'pace_s', 0.01)")  # answered after all cells
     return page
+
+
+@pytest.fixture(scope="module")
+def page(lab, browser):
+    return opened(lab, browser)
 
 
 @pytest.fixture
@@ -494,6 +500,14 @@ def test_after_a_restart_of_the_kernel_one_sentence_says_what_to_do(page):
     wait_until(lambda: "run the cells above again" in picker.evaluate(said), 40)
     assert button(page, "Run").evaluate(said) == "none"
     picture(page, "9_restarted")
+
+
+def test_notebook_7_draws_the_picker_which_answers(tmp_path, browser):
+    pytest.importorskip("notebook", reason="Notebook 7 is not installed")
+    with serve(tmp_path, "00_start_here", app="notebook") as served:
+        page = opened(served, browser)
+        page.mouse.click(*Table(page).at(0.1, -0.1))
+        assert_same_goal(page, Table(page), 0.1, -0.1)
 
 
 @pytest.fixture(scope="module")
