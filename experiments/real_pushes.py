@@ -95,12 +95,16 @@ def read_logs(folder: str | Path, told: bool = True) -> LoggedPushes:
     return log.pushes()
 
 
-def from_40(data: LoggedPushes, names: tuple[str, ...], seed: int, fold: int) -> pd.DataFrame:
-    """Return errors on a fold of each condition, trained on the condition's other folds."""
+def from_some(
+    n: int, data: LoggedPushes, names: tuple[str, ...], seed: int, fold: int
+) -> pd.DataFrame:
+    """Return errors on a fold of each condition, trained on n of the condition's other pushes."""
     tested, parts = folds_of(data.groups, 5, seed) == fold, []
+    rng, every = np.random.default_rng([seed, fold]), np.arange(len(data))
     for name in CONDITIONS:
         of_group = data.groups == name
-        parts.append(errors_of(data, of_group & ~tested, of_group & tested, names, seed))
+        trained = np.isin(every, rng.permutation(np.flatnonzero(of_group & ~tested))[:n])
+        parts.append(errors_of(data, trained, of_group & tested, names, seed))
     return pd.concat(parts)
 
 
@@ -133,7 +137,8 @@ def unseen(data: LoggedPushes, names: tuple[str, ...], seed: int, fold: int) -> 
 
 
 NAMES = ("baselines", "np")
-PROTOCOLS = {"from_40": (from_40, 5), "pooled": (pooled, 5), "unseen": (unseen, len(CONDITIONS))}
+PROTOCOLS = {f"from_{n}": (partial(from_some, n), 5) for n in (10, 20, 40)}
+PROTOCOLS |= {"pooled": (pooled, 5), "unseen": (unseen, len(CONDITIONS))}
 COLUMNS = ["model", "shots", "push", "position_m", "yaw_rad", "inside_50", "inside_90"]
 
 
@@ -211,7 +216,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         for predictor, told in itertools.product(NAMES, (False, True))
         for seed, fold in itertools.product(range(3 if predictor == "np" else 1), range(folds))
         # Within one condition, the feet are the same for all pushes.
-        if predictor == "baselines" or not told or protocol != "from_40"
+        if predictor == "baselines" or not told or not protocol.startswith("from")
     ]
     return runner.make(jobs if options.logs else [], TABLE, options, tables)
 
