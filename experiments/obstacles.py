@@ -273,7 +273,8 @@ def run_task(row: str, family: str, index: int, seed: int) -> dict[str, Any]:
         world.settle(2.0)
     mode, skills = PlanMode(MAX_STEPS, settings.get("partial", True)), _skills(_network(row))
     if settings.get("observes"):
-        config = ClosedLoopConfig(mode, MAX_STEPS + 2, max_renewals=0)
+        n_images = 8 if where == "perturbed" else 1  # as in `experiments.closed_loop`
+        config = ClosedLoopConfig(mode, MAX_STEPS + 2, max_renewals=0, n_images=n_images)
         result = run_closed_loop(world, task.goal, skills, planner, config)
         return {"status": result.status} | _outcome(task, world, len(result.steps))
     seen = world.observe()
@@ -430,7 +431,9 @@ def job(row: str, family: str = "", index: int = 0, seed: int = SEED) -> Job:
     """Return the job of a row and a task; the rows "margin" and "search" plan nothing."""
     arguments = {"row": row, "family": family, "index": index, "seed": seed}
     more = () if row not in ROWS or "push" not in ROWS[row][1] else (_network(row),)
-    return Job(make, arguments, checkpoints=(*CHECKPOINTS.values(), "film_5000_perturbed", *more))
+    checkpoints = *CHECKPOINTS.values(), "film_5000_perturbed", *more
+    version = 2 if row == "closed_loop_perturbed" else 1
+    return Job(make, arguments, checkpoints=checkpoints, version=version)
 
 
 def make(row: str, family: str, index: int, seed: int) -> Any:
