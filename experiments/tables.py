@@ -8,23 +8,31 @@ A page contains
 and `python -m experiments.tables README.md` fills it; `--check` fails if that would change it.
 Options: `columns` (`a±b` shows two columns in one, `a(b..c)` a value and its interval, and
 `title:a` gives a column another title);
-`by=mode values=mean_m` gives each mode its own column of values; any other, such as
-`mode=multi_partial,single_full`, keeps the rows that have these values, in this order.
+`by=mode values=mean_m` gives each mode its own column of values; `picture=planning:error,median`
+adds `figures/results/planning.svg`, which shows the columns with these headings as dots; any other,
+such as `mode=multi_partial,single_full`, keeps the rows that have these values, in this order.
 """
 
 import argparse
+import hashlib
+import io
+import math
 import re
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import matplotlib.pyplot as plt
+import numpy as np
 import pandas as pd
 
 from affordlib.results import (
     cell,
     columns_of,
+    from_root,
     heading,
     read_results,
     results_table,
@@ -38,6 +46,12 @@ MARKUP = str.maketrans({"&": "&amp;", "<": "&lt;", ">": "&gt;", "[": "&#91;", "|
 COLUMN = re.compile(r"(?:(?P<title>\w+):)?(\w+)(?:±(\w+)|\((\w+)\.\.(\w+)\))?")
 SHOWN = {1: "{}", 2: "{} ± {}", 3: "{} ({} to {})"}
 """How the parts of a column are shown, by their number."""
+
+PICTURES = "figures/results"
+LOOKS = [
+    {"color": color, "fmt": marker, "ms": 5}
+    for color, marker in zip(("black", "#888888", "#CC79A7", "#8c6d46"), "osD^", strict=True)
+]
 
 BLOCK = re.compile(
     r"(?P<open>^<!-- table: (?P<what>.*?) -->\n)(?P<body>.*?)(?P<close>^<!-- /table -->$)",
@@ -82,6 +96,46 @@ def markdown_table(
     return "".join(f"| {line} |\n" for line in lines)
 
 
+def interval_of(text: str) -> tuple[float, ...]:
+    """Return the value of a cell, and the ends of its interval; not a number where it is empty."""
+    value, *more = (*map(float, re.findall(r"-?\d+(?:\.\d+)?", text)), *(math.nan,) * (text == "–"))
+    if "±" in text:
+        more = value - more[0], value + more[0]
+    return value, *(more or (value, value))
+
+
+def dots(table: str, columns: Sequence[str], about: str) -> bytes:
+    """Draw columns of a Markdown table as dots with intervals, as SVG.
+
+    columns: their headings without unit; about: the description in the file. A row is named by its
+    first columns, as many as tell all rows apart.
+    """
+    head, _, *rows = ([c.strip(" |") for c in line.split(" | ")] for line in table.splitlines())
+    shown = {name.rpartition(", ")[0]: k for k, name in enumerate(head)}
+    units = {head[shown[name]].rpartition(", ")[2] for name in columns if name in shown}
+    if len(units) != 1 or not shown.keys() >= {*columns}:
+        raise ValueError(f"picture: {columns} must be headings of one unit, from {head}")
+    names = [[" ".join(row[:k]) for row in rows] for k in range(1, len(head))]
+    names = next(some for some in names if len({*some}) == len(rows))
+    with plt.rc_context({"svg.hashsalt": "dots", "svg.fonttype": "none"}):
+        figure, ax = plt.subplots(figsize=(8, 1.2 + 0.28 * len(rows)), layout="constrained")
+        for n, name in enumerate(columns):
+            value, low, high = np.array([interval_of(row[shown[name]]) for row in rows]).T
+            y = np.arange(len(rows)) + 0.16 * (n - (len(columns) - 1) / 2)
+            ax.errorbar(value, y, xerr=(value - low, high - value), **LOOKS[n], label=name)
+        ax.set(yticks=range(len(rows)), yticklabels=names, xlabel=f"[{units.pop()}]")
+        if "%" not in ax.get_xlabel() and np.nanmax(value) > 20 * np.nanmin(value):
+            ax.set_xscale("log")
+            ax.xaxis.set_major_formatter("{x:g}")
+        ax.invert_yaxis()
+        ax.grid(axis="x", color="#dddddd")
+        figure.legend(loc="outside upper center", ncols=len(columns), frameon=False)
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format="svg", metadata={"Date": None, "Description": about})
+    plt.close(figure)
+    return buffer.getvalue()
+
+
 def fill_tables(text: str) -> str:
     """Return a Markdown page with each of its table blocks filled from its results file."""
 
@@ -91,24 +145,39 @@ def fill_tables(text: str) -> str:
         tables = read_results(path)["tables"]
         if name not in tables:
             raise ValueError(f"table: {path} has no table {name!r}, only {', '.join(tables)}")
-        rows, shape = tables[name], {}
+        rows, shape, link = tables[name], {}, ""
         for option in options:
             key, _, value = option.partition("=")
             if key in ("columns", "values"):
                 shape[key] = value.split(",")
             elif key == "by":
                 shape[key] = value
+            elif key == "picture":
+                link = f"\n![The table as dots]({PICTURES}/{value.partition(':')[0]}.svg)\n"
             else:
                 columns_of(rows, [key])
                 rows = [row for one in value.split(",") for row in rows if str(row.get(key)) == one]
                 if not rows:
                     raise ValueError(f"table: no row of {source} has {option}")
-        return f"{block['open']}{markdown_table(rows, **shape)}{block['close']}"
+        return f"{block['open']}{markdown_table(rows, **shape)}{link}{block['close']}"
 
     filled, count = BLOCK.subn(fill, text)
     if count != text.count("<!-- table:") or count != text.count("<!-- /table -->"):
         raise ValueError("table: a block is not closed; each ends with the line <!-- /table -->")
     return filled
+
+
+def pictures(text: str) -> Iterator[tuple[Path, str, Callable[[str], bytes]]]:
+    """Yield for each picture of a filled page its file, a hash of what it shows, how to draw it."""
+    for block in BLOCK.finditer(text):
+        for asked in re.findall(r" picture=(\S+)", block["what"]):
+            name, _, columns = asked.partition(":")
+            table, columns = (
+                block["body"].partition("\n\n")[0],
+                columns.replace("_", " ").split(","),
+            )
+            about = hashlib.sha256(f"{table}{columns}".encode()).hexdigest()
+            yield from_root(f"{PICTURES}/{name}.svg"), about, partial(dots, table, columns)
 
 
 @command(OSError, ValueError)
@@ -121,12 +190,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     stale = False
     for page in options.pages:
         text = page.read_text(encoding="utf-8")
-        if (filled := fill_tables(text)) == text:
+        filled = fill_tables(text)
+        drawn = {
+            p: draw(a)
+            for p, a, draw in pictures(filled)
+            if a not in (p.read_text() if p.exists() else "")
+        }
+        if filled == text and not drawn:
             continue
         if options.check:
             print(f"out of date; run: python -m experiments.tables {page}", file=sys.stderr)
             stale = True
         else:
+            for path, picture in drawn.items():
+                write_atomically(path, picture, b"</svg>\n")
             write_atomically(page, filled)
     return int(stale)
 

@@ -43,9 +43,9 @@ NUMBER += rf"(?: ?(?:to|or|and|×|±|of|of the) ?−?{NUMBER})*"
 
 
 def prose(text: str) -> str:
-    """The text of a Markdown page without code, equations, tables and comments."""
+    """The text of a Markdown page without code, equations, tables, pictures and comments."""
     text = re.sub(r"```.*?```|\$\$.*?\$\$|<!--.*?-->", " ", text, flags=re.DOTALL)
-    text = re.sub(r"^\|.*$", " ", text, flags=re.MULTILINE)
+    text = re.sub(r"^\|.*$|!\[[^]]*\]\([^)]*\)", " ", text, flags=re.MULTILINE)
     return re.sub(r"`[^`]*`|\$[^$]*\$|\]\([^)]*\)", " ", text)
 
 

@@ -4,6 +4,7 @@ import errno
 import json
 import math
 import os
+import re
 import subprocess
 import sys
 import time
@@ -204,6 +205,26 @@ def test_blocks_join_columns_and_turn_rows_into_columns(tmp_path):
         "| e | 3.00 ± 1.00 | – | 3.00 (1.00 to 1.00) | – |",
         "| a | – | 2.00 ± 1.00 | – | 2.00 (1.00 to 1.00) |",
     ]
+
+
+def test_columns_are_drawn_as_dots_once(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(tables, "PICTURES", str(tmp_path))
+    source, page = write_results(tmp_path, "a", {}, {"t": ROWS}), tmp_path / "page.md"
+    block = f"<!-- table: {source}#t picture=some:{{}} -->\n<!-- /table -->\n"
+    page.write_text(block.format("mean"))
+    assert [tables.main([*check, str(page)]) for check in (["--check"], [], ["--check"])] == [
+        1,
+        0,
+        0,
+    ]
+    assert {"astar", "gradient", "[mm]"} <= {
+        *re.findall(r">([^<]+)</text>", (tmp_path / "some.svg").read_text())
+    }
+    page.write_text(block.format("mean,tp"))
+    assert tables.main([str(page)]) == 1
+    assert "['mean', 'tp'] must be headings of one unit" in capsys.readouterr().err
+    assert [tables.interval_of(c) for c in ("–", "2.0 ± 0.5", "-1.0 (-2.5 to 1.0)")][1:] == [
+        (2.0, 1.5, 2.5), (-1.0, -2.5, 1.0)]  # fmt: skip
 
 
 def test_the_pages_and_the_shipped_results_agree_and_carry_no_path():
