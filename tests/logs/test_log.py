@@ -33,6 +33,17 @@ def one(**changed):
     return PUSH | {"tool_xy": tool()} | changed
 
 
+def shipped_log():
+    """An empty log of the shipped object."""
+    return Log("mm", ((0, 0), (130, 0), (30, 110)), tool_radius=1.5)
+
+
+def shipped():
+    """Arguments of `add` of its fifty pushes."""
+    pushes = pushes_of(repo_root() / "data" / "own_log" / "felt_left.txt.xz")
+    return [{"tool_t": t, "tool_xy": xy, "poses": planar(p, "wxyz")} for p, t, xy in pushes]
+
+
 def test_a_push_is_told_in_the_frame_of_the_object():
     log = Log("mm", TRIANGLE_MM)
     log.add(**one())
@@ -207,11 +218,8 @@ def test_what_is_wrong_is_said_in_a_sentence_and_not_added(name):
 
 def test_whatever_follows_a_recorded_push_is_noticed():
     """All shipped pushes are accepted, and none with a way back or aside; half of it suffices."""
-    condition = repo_root() / "data" / "own_log" / "felt_left.txt.xz"
-    outline = ((0, 0), (130, 0), (30, 110))
-    log = Log("mm", outline, tool_radius=1.5)
-    for poses, t, xy in pushes_of(condition):
-        poses = planar(poses, "wxyz")
+    log = shipped_log()
+    for t, xy, poses in map(dict.values, shipped()):
         across = np.array([xy[0, 1] - xy[-1, 1], xy[-1, 0] - xy[0, 0]])
         for then in (xy[0], (xy[0] + xy[-1]) / 2, 20 * xy[0] - 19 * xy[-1], xy[-1] + 2 * across):
             with pytest.raises(ValueError, match=r"way back|way aside"):
@@ -260,22 +268,10 @@ def test_a_log_has_pushes_enough_and_of_one_kind():
     assert {row["n"] for row in summary(errors)} == {8}
 
 
-SHIPPED = ((0, 0), (130, 0), (30, 110))
-
-
-def shipped(condition="felt_left"):
-    """Arguments of `add` of the pushes of a shipped log."""
-    path = repo_root() / "data" / "own_log" / f"{condition}.txt.xz"
-    return [
-        {"tool_t": t, "tool_xy": xy, "poses": planar(poses, "wxyz")}
-        for poses, t, xy in pushes_of(path)
-    ]
-
-
 @pytest.mark.parametrize("late_mm", [0.0, 0.5, 1.5])
 def test_a_recording_may_begin_at_the_contact(late_mm):
     """Contact, direction and length are nearly those of the whole recording."""
-    whole, late = (Log("mm", SHIPPED, tool_radius=1.5) for _ in range(2))
+    whole, late = shipped_log(), shipped_log()
     assert not whole.add_all(shipped())
     pushes = whole.pushes()
     for k, push in enumerate(shipped()):
@@ -297,7 +293,7 @@ DAMAGED = {
 
 @pytest.mark.parametrize("name", DAMAGED)
 def test_spoiled_poses_do_not_become_a_log(name):
-    log = Log("mm", SHIPPED, tool_radius=1.5)
+    log = shipped_log()
     refused = log.add_all(p | {"poses": DAMAGED[name](p["poses"])} for p in shipped())
     assert len(refused) >= 20
     assert len(log) == 50 - len(refused) == len(log.names)
@@ -310,7 +306,7 @@ def test_all_refusals_are_known_after_one_run_by_name():
     pushes = shipped()
     for k in (5, 11, 44):
         pushes[k]["poses"][1] = pushes[k]["poses"][1] + [300, 0, 0]
-    log = Log("mm", SHIPPED, tool_radius=1.5)
+    log = shipped_log()
     refused = log.add_all(p | {"name": f"take {k}"} for k, p in enumerate(pushes))
     assert [*refused] == ["take 5", "take 11", "take 44"]
     assert log.names[4:6] == ["take 4", "take 6"]
@@ -406,7 +402,7 @@ def test_the_pushes_that_fit_worst_are_those_whose_pose_jumped():
     pushes = shipped()
     for k in (3, 21):
         pushes[k]["poses"][1] = pushes[k]["poses"][1] + [0, 0, -0.35]
-    log = Log("mm", SHIPPED, tool_radius=1.5)
+    log = shipped_log()
     log.add_all(pushes)
     errors = cross_validate(log.pushes(), models=(), folds=3)
     spoiled = {name for name in ("3", "21") if name in log.names}

@@ -16,7 +16,6 @@ from affordlib.primitives import Drag, Grasp, LeverUp, Move, Push, Rotate, min_j
 from affordlib.world import CATEGORIES, Cuboid, LyingCylinder, Prism, Sphere, Tabletop, WorldConfig
 from affordlib.world.objects import CHAMFER_M
 
-LEVERING = RECIPES["lever_up"].world
 EXAMPLES = (Push(0.3), Drag(0.3), Grasp(0.05), Rotate(), LeverUp(-0.08, 0.0, 0.0, 0.16))
 
 
