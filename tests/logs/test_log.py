@@ -92,15 +92,12 @@ BAD = {
     ),
     "degrees as radians": (
         {"poses": ((600.0, -20.0, 17.2), END)},
-        r"push 0 .*yaws of poses, in rad, must lie within one turn, got 17.2; angle_unit is 'rad'",
+        r"push 0 .*yaws of poses, in rad, must lie within one turn, got 17.2; angle_unit is 'rad'"
+        ".* counted must be taken away",
     ),
     "degrees of the end alone": (
         {"poses": (START, (605.0, -14.0, 4.5))},
         r"push 0 .*the turn, in rad, of poses .* must lie in .* rad, got 2.08",
-    ),
-    "absolute tool, relative object": (
-        {"poses": ((0.0, 0.0, 0.0), END)},
-        r"push 0 .*tool_xy never touches the outline.*share a frame",
     ),
     "a pose of another push": (
         {"poses": (START, (700.0, -14.0, 0.38))},
@@ -132,11 +129,7 @@ BAD = {
     ),
     "a held pose": (
         {"poses": (START, START)},
-        r"push 0 .*tool_xy ends 14.0 mm inside the outline at the pose of then .* held, or seen",
-    ),
-    "the other sign of the yaw": (
-        {"poses": (START, (598.555, -8.562, 0.22))},
-        r"push 0 .*tool_xy ends 5.\d mm inside the outline at the pose of then .*sign, unit",
+        r"push 0 .*tool_xy ends 14.0 mm inside the outline at the pose of .*sign, unit.* held, or",
     ),
     "two clocks": (
         {"poses": [START, END], "poses_t": (1.7e9, 1.7e9 + 6.6)},
@@ -145,10 +138,6 @@ BAD = {
     "times of 32 bits": (
         {"tool_t": (1.7e9 + np.linspace(0, 6.6, 12)).astype(np.float32)},
         r"push 0 .*tool_t must increase, but row 1 .*64 bits",
-    ),
-    "turns that were counted": (
-        {"poses": (np.add(START, (0, 0, 8 * np.pi)), END)},
-        r"push 0 .*yaws of poses, in rad, must lie within one turn.* counted must be taken away",
     ),
     "positions in space": (
         {"tool_xy": np.insert(tool(), 2, 7.0, axis=1)},
@@ -178,14 +167,6 @@ BAD = {
     "a whole session": (
         {"tool_t": np.arange(1e5), "tool_xy": np.zeros((100_000, 2))},
         r"push 0 .*tool_xy must have 2 to 20000 rows .*split a session",
-    ),
-    "the way back": (
-        {"tool_t": np.arange(13.0), "tool_xy": np.vstack([tool(), tool()[:1]])},
-        r"push 0 .*way back \(cut it where the push ends\) must lie in .* got 0.016",
-    ),
-    "a way aside": (
-        {"tool_t": np.arange(13.0), "tool_xy": np.vstack([tool(), np.add(tool()[-1:], (30, 10))])},
-        r"push 0 .*way aside \(a push is straight: cut a curved one .* must lie in .* m, got 0.0",
     ),
     "a curved push": (
         {"tool_xy": tool() - np.outer(np.sin(np.linspace(0, np.pi, 12)), (9, 0))},
@@ -222,7 +203,7 @@ def test_whatever_follows_a_recorded_push_is_noticed():
     for t, xy, poses in map(dict.values, shipped()):
         across = np.array([xy[0, 1] - xy[-1, 1], xy[-1, 0] - xy[0, 0]])
         for then in (xy[0], (xy[0] + xy[-1]) / 2, 20 * xy[0] - 19 * xy[-1], xy[-1] + 2 * across):
-            with pytest.raises(ValueError, match=r"way back|way aside"):
+            with pytest.raises(ValueError, match=r"way back \(cut it|way aside"):
                 log.add(np.append(t, t[-1] + 1), np.vstack([xy, then]), poses)
         log.add(t, xy, poses)
     assert len(log) == 50
