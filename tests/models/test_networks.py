@@ -146,10 +146,8 @@ def test_many_queries_at_once_equal_each_alone(name, some):
     features = model.encode(some.image[:1].double())
     t_target = torch.linspace(0, 1, 6, dtype=torch.float64).expand(40, -1)
     observed = models.condition_on_primitives(model, pushes)
-    observed = dataclasses.replace(
-        observed, action=observed.action.double(), action_t=observed.action_t.double(),
-        effect=observed.effect.double(), effect_t=observed.effect_t.double(),
-    )  # fmt: skip
+    exact = {n: v.double() for n, v in vars(observed).items() if v.is_floating_point()}
+    observed = dataclasses.replace(observed, **exact)
     with torch.no_grad():
         together = model.predict(features, observed, t_target)
         each = [

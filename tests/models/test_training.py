@@ -89,9 +89,8 @@ def test_a_foreign_or_damaged_state_of_a_training_is_named(some, tmp_path):
     whole[len(whole) // 2] ^= 1
     for content in (bytes(whole), whole[:-9], b"", b"notes", pickle.dumps({"about": 1})):
         file.write_bytes(content)
-        with pytest.raises(
-            ValueError, match=r"training\.pt' is damaged or holds no training state"
-        ) as caught:
+        says = r"training\.pt' is damaged or holds no training state"
+        with pytest.raises(ValueError, match=says) as caught:
             models.train(fresh(some), some, some, config, resume_checkpoint=file)
         assert "weights_only" not in str(caught.value)
         assert caught.value.__suppress_context__
@@ -100,9 +99,8 @@ def test_a_foreign_or_damaged_state_of_a_training_is_named(some, tmp_path):
 def test_training_continues_from_a_loaded_model_as_from_the_one_in_memory(some, tmp_path):
     """The σ floor goes on from where it stopped, and never rises."""
     model = fresh(some)
-    models.train(
-        model, some, some, models.TrainingConfig(steps=4, validate_every=2, final_sigma_floor=0.005)
-    )
+    config = models.TrainingConfig(steps=4, validate_every=2, final_sigma_floor=0.005)
+    models.train(model, some, some, config)
     models.fit_sigma_scale(model, some)
     again, _ = models.load_checkpoint(models.save_checkpoint(model, tmp_path / "m.safetensors", {}))
     torch.testing.assert_close(again.state_dict(), model.state_dict(), rtol=0, atol=0)
