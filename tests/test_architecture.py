@@ -11,10 +11,8 @@ from pathlib import Path
 
 import pytest
 
-import affordlib
 from tests.size import ROOT, code_lines
 
-CHECKED = affordlib._CHECKED.split()
 MODULES = sorted(p.relative_to(ROOT) for p in (ROOT / "affordlib").rglob("*.py"))
 EXPERIMENTS = sorted(p.relative_to(ROOT) for p in (ROOT / "experiments").rglob("*.py"))
 TREES = {path: ast.parse((ROOT / path).read_text()) for path in [*MODULES, *EXPERIMENTS]}

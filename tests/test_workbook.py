@@ -257,6 +257,14 @@ def test_in_place_puts_clean_executed_pages_back(book):
     assert "run.py" in book.make("-n", target="notebooks")[1]
 
 
+def test_an_html_book_that_cannot_be_written_leaves_the_old_one(book):
+    old = book.runs / "html" / "index.html"
+    old.parent.mkdir(parents=True)
+    old.touch()
+    assert book.make("PY=false", target="html")[0]
+    assert old.exists()
+
+
 READER = {"PROFILE": "reader", "SEED": "0", "OUT": "", "ONLY": "", "ARGS": ""}
 
 

@@ -11,7 +11,7 @@ from experiments.cross_validation import job, network_and_training
 from experiments.grasps import confusion_columns
 from experiments.lever_up import job as lever_job
 
-FEW = [job("constant", "grasp", fold=fold) for fold in range(3)]
+WINDOW = {"model": "lstm_tuned", "trained_for": "window"}
 
 # Jobs
 
@@ -30,11 +30,7 @@ FEW = [job("constant", "grasp", fold=fold) for fold in range(3)]
         (lever_job, {"model": "lstm_tuned"}, "must be one of .*window.*, got 'all'"),
         (lever_job, {"model": "cnp_last_pose_single"}, "must be one of .*window.*, got 'all'"),
         (lever_job, {"model": "cnp", "trained_for": "window"}, "must be .*all.*, got 'window'"),
-        (
-            lever_job,
-            {"model": "lstm_tuned", "trained_for": "window", "setting": "x"},
-            "setting must",
-        ),
+        (lever_job, WINDOW | {"setting": "x"}, "setting must"),
     ],
 )
 def test_jobs_that_cannot_be_are_refused(make, arguments, reason):

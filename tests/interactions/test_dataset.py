@@ -162,9 +162,8 @@ def test_a_file_that_would_fill_the_memory_or_never_end_is_refused(tmp_path):
     assert interactions.open_interactions(bomb).equals(interactions.open_interactions(undamaged))
     with zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("manifest.json", bytes(10**7))
-    with pytest.raises(
-        interactions.CorruptedDataError, match=r"manifest\.json .* larger than the file"
-    ):
+    larger = r"manifest\.json .* larger than the file"
+    with pytest.raises(interactions.CorruptedDataError, match=larger):
         interactions.open_interactions(bomb)
     os.mkfifo(pipe)
     for read in (interactions.open_interactions, stored_sha256, load_state, read_results):

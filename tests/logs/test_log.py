@@ -33,6 +33,17 @@ def one(**changed):
     return PUSH | {"tool_xy": tool()} | changed
 
 
+def shipped_log():
+    """An empty log of the shipped object."""
+    return Log("mm", ((0, 0), (130, 0), (30, 110)), tool_radius=1.5)
+
+
+def shipped():
+    """Arguments of `add` of its fifty pushes."""
+    pushes = pushes_of(repo_root() / "data" / "own_log" / "felt_left.txt.xz")
+    return [{"tool_t": t, "tool_xy": xy, "poses": planar(p, "wxyz")} for p, t, xy in pushes]
+
+
 def test_a_push_is_told_in_the_frame_of_the_object():
     log = Log("mm", TRIANGLE_MM)
     log.add(**one())
@@ -81,15 +92,12 @@ BAD = {
     ),
     "degrees as radians": (
         {"poses": ((600.0, -20.0, 17.2), END)},
-        r"push 0 .*yaws of poses, in rad, must lie within one turn, got 17.2; angle_unit is 'rad'",
+        r"push 0 .*yaws of poses, in rad, must lie within one turn, got 17.2; angle_unit is 'rad'"
+        ".* counted must be taken away",
     ),
     "degrees of the end alone": (
         {"poses": (START, (605.0, -14.0, 4.5))},
         r"push 0 .*the turn, in rad, of poses .* must lie in .* rad, got 2.08",
-    ),
-    "absolute tool, relative object": (
-        {"poses": ((0.0, 0.0, 0.0), END)},
-        r"push 0 .*tool_xy never touches the outline.*share a frame",
     ),
     "a pose of another push": (
         {"poses": (START, (700.0, -14.0, 0.38))},
@@ -121,11 +129,7 @@ BAD = {
     ),
     "a held pose": (
         {"poses": (START, START)},
-        r"push 0 .*tool_xy ends 14.0 mm inside the outline at the pose of then .* held, or seen",
-    ),
-    "the other sign of the yaw": (
-        {"poses": (START, (598.555, -8.562, 0.22))},
-        r"push 0 .*tool_xy ends 5.\d mm inside the outline at the pose of then .*sign, unit",
+        r"push 0 .*tool_xy ends 14.0 mm inside the outline at the pose of .*sign, unit.* held, or",
     ),
     "two clocks": (
         {"poses": [START, END], "poses_t": (1.7e9, 1.7e9 + 6.6)},
@@ -134,10 +138,6 @@ BAD = {
     "times of 32 bits": (
         {"tool_t": (1.7e9 + np.linspace(0, 6.6, 12)).astype(np.float32)},
         r"push 0 .*tool_t must increase, but row 1 .*64 bits",
-    ),
-    "turns that were counted": (
-        {"poses": (np.add(START, (0, 0, 8 * np.pi)), END)},
-        r"push 0 .*yaws of poses, in rad, must lie within one turn.* counted must be taken away",
     ),
     "positions in space": (
         {"tool_xy": np.insert(tool(), 2, 7.0, axis=1)},
@@ -167,14 +167,6 @@ BAD = {
     "a whole session": (
         {"tool_t": np.arange(1e5), "tool_xy": np.zeros((100_000, 2))},
         r"push 0 .*tool_xy must have 2 to 20000 rows .*split a session",
-    ),
-    "the way back": (
-        {"tool_t": np.arange(13.0), "tool_xy": np.vstack([tool(), tool()[:1]])},
-        r"push 0 .*way back \(cut it where the push ends\) must lie in .* got 0.016",
-    ),
-    "a way aside": (
-        {"tool_t": np.arange(13.0), "tool_xy": np.vstack([tool(), np.add(tool()[-1:], (30, 10))])},
-        r"push 0 .*way aside \(a push is straight: cut a curved one .* must lie in .* m, got 0.0",
     ),
     "a curved push": (
         {"tool_xy": tool() - np.outer(np.sin(np.linspace(0, np.pi, 12)), (9, 0))},
@@ -207,14 +199,11 @@ def test_what_is_wrong_is_said_in_a_sentence_and_not_added(name):
 
 def test_whatever_follows_a_recorded_push_is_noticed():
     """All shipped pushes are accepted, and none with a way back or aside; half of it suffices."""
-    condition = repo_root() / "data" / "own_log" / "felt_left.txt.xz"
-    outline = ((0, 0), (130, 0), (30, 110))
-    log = Log("mm", outline, tool_radius=1.5)
-    for poses, t, xy in pushes_of(condition):
-        poses = planar(poses, "wxyz")
+    log = shipped_log()
+    for t, xy, poses in map(dict.values, shipped()):
         across = np.array([xy[0, 1] - xy[-1, 1], xy[-1, 0] - xy[0, 0]])
         for then in (xy[0], (xy[0] + xy[-1]) / 2, 20 * xy[0] - 19 * xy[-1], xy[-1] + 2 * across):
-            with pytest.raises(ValueError, match=r"way back|way aside"):
+            with pytest.raises(ValueError, match=r"way back \(cut it|way aside"):
                 log.add(np.append(t, t[-1] + 1), np.vstack([xy, then]), poses)
         log.add(t, xy, poses)
     assert len(log) == 50
@@ -260,22 +249,10 @@ def test_a_log_has_pushes_enough_and_of_one_kind():
     assert {row["n"] for row in summary(errors)} == {8}
 
 
-SHIPPED = ((0, 0), (130, 0), (30, 110))
-
-
-def shipped(condition="felt_left"):
-    """Arguments of `add` of the pushes of a shipped log."""
-    path = repo_root() / "data" / "own_log" / f"{condition}.txt.xz"
-    return [
-        {"tool_t": t, "tool_xy": xy, "poses": planar(poses, "wxyz")}
-        for poses, t, xy in pushes_of(path)
-    ]
-
-
 @pytest.mark.parametrize("late_mm", [0.0, 0.5, 1.5])
 def test_a_recording_may_begin_at_the_contact(late_mm):
     """Contact, direction and length are nearly those of the whole recording."""
-    whole, late = (Log("mm", SHIPPED, tool_radius=1.5) for _ in range(2))
+    whole, late = shipped_log(), shipped_log()
     assert not whole.add_all(shipped())
     pushes = whole.pushes()
     for k, push in enumerate(shipped()):
@@ -297,7 +274,7 @@ DAMAGED = {
 
 @pytest.mark.parametrize("name", DAMAGED)
 def test_spoiled_poses_do_not_become_a_log(name):
-    log = Log("mm", SHIPPED, tool_radius=1.5)
+    log = shipped_log()
     refused = log.add_all(p | {"poses": DAMAGED[name](p["poses"])} for p in shipped())
     assert len(refused) >= 20
     assert len(log) == 50 - len(refused) == len(log.names)
@@ -310,7 +287,7 @@ def test_all_refusals_are_known_after_one_run_by_name():
     pushes = shipped()
     for k in (5, 11, 44):
         pushes[k]["poses"][1] = pushes[k]["poses"][1] + [300, 0, 0]
-    log = Log("mm", SHIPPED, tool_radius=1.5)
+    log = shipped_log()
     refused = log.add_all(p | {"name": f"take {k}"} for k, p in enumerate(pushes))
     assert [*refused] == ["take 5", "take 11", "take 44"]
     assert log.names[4:6] == ["take 4", "take 6"]
@@ -406,7 +383,7 @@ def test_the_pushes_that_fit_worst_are_those_whose_pose_jumped():
     pushes = shipped()
     for k in (3, 21):
         pushes[k]["poses"][1] = pushes[k]["poses"][1] + [0, 0, -0.35]
-    log = Log("mm", SHIPPED, tool_radius=1.5)
+    log = shipped_log()
     log.add_all(pushes)
     errors = cross_validate(log.pushes(), models=(), folds=3)
     spoiled = {name for name in ("3", "21") if name in log.names}

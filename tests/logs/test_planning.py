@@ -35,15 +35,6 @@ def test_the_middle_of_the_tool_stays_its_radius_outside():
         assert math.acos(ahead @ pushes.normal[k]) <= math.radians(50) + 1e-9
 
 
-def test_a_turned_object_is_pushed_alike():
-    pushes, quarter = PushedObject(OUTLINE_M, TOOL_M).draw(5), math.pi / 2
-    for k in range(5):
-        as_is, turned = (primitive_of(pushes, k, heading) for heading in (0.0, quarter))
-        x, y = as_is.contact
-        np.testing.assert_allclose(turned.contact, (-y, x), atol=1e-12)
-        assert wrap_angle(turned.direction - as_is.direction - quarter) == pytest.approx(0)
-
-
 class Pretrained:
     """The neural process before it has seen any push of the object."""
 

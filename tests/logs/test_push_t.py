@@ -13,14 +13,10 @@ from experiments import push_t
 
 
 @pytest.fixture(scope="module")
-def environment(monkeypatch_module):
-    pytest.importorskip("gym_pusht", reason="make setup PUSHT=1 installs it")
-
-
-@pytest.fixture(scope="module")
-def monkeypatch_module():
+def environment():
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SDL_VIDEODRIVER", "dummy")
+        pytest.importorskip("gym_pusht", reason="make setup PUSHT=1 installs it")
         yield
 
 

@@ -69,10 +69,11 @@ def test_order_and_what_is_masked_have_no_effect(network, some, tmp_path):
     predicted = predictions(network, batch)
     assert [tuple(v.shape) for v in predicted] == [(40, 5, 3)] * 4
     assert all(bool((v > 0).all()) for v in (predicted[1], predicted[3]))
-    again, _ = models.load_checkpoint(
-        models.save_checkpoint(network, tmp_path / "m.safetensors", {})
-    )
-    assert type(again) is type(network)
+    path = models.save_checkpoint(network, tmp_path / "m.safetensors", {"note": "none"})
+    again, about = models.load_checkpoint(path)
+    assert (type(again), about) == (type(network), {"note": "none"})
+    for part in ("config", "scaler", "domain"):
+        assert getattr(again, part) == getattr(network, part)
     assert all(map(torch.equal, predicted, predictions(again, batch)))
     seen = batch.observations
     seen = dataclasses.replace(
@@ -81,14 +82,8 @@ def test_order_and_what_is_masked_have_no_effect(network, some, tmp_path):
         effect=torch.where(seen.effect_mask[..., None], seen.effect, -7.0),
     )
     order = torch.randperm(4, generator=torch.Generator().manual_seed(1))
-    shuffled = dataclasses.replace(
-        seen,
-        **{
-            f"{kind}{part}": getattr(seen, f"{kind}{part}")[:, order]
-            for kind in ("action", "effect")
-            for part in ("", "_t", "_mask")
-        },
-    )
+    parts = [kind + part for kind in ("action", "effect") for part in ("", "_t", "_mask")]
+    shuffled = dataclasses.replace(seen, **{n: getattr(seen, n)[:, order] for n in parts})
     for a, b in zip(predicted, predictions(network, batch, shuffled), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5)
 
@@ -151,10 +146,8 @@ def test_many_queries_at_once_equal_each_alone(name, some):
     features = model.encode(some.image[:1].double())
     t_target = torch.linspace(0, 1, 6, dtype=torch.float64).expand(40, -1)
     observed = models.condition_on_primitives(model, pushes)
-    observed = dataclasses.replace(
-        observed, action=observed.action.double(), action_t=observed.action_t.double(),
-        effect=observed.effect.double(), effect_t=observed.effect_t.double(),
-    )  # fmt: skip
+    exact = {n: v.double() for n, v in vars(observed).items() if v.is_floating_point()}
+    observed = dataclasses.replace(observed, **exact)
     with torch.no_grad():
         together = model.predict(features, observed, t_target)
         each = [

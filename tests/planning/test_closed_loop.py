@@ -351,20 +351,6 @@ def test_what_was_done_before_the_arm_refused_is_kept():
 # On the simulated table
 
 
-def test_a_plan_is_executed(world, trained):
-    world.place(BOX, (0.0, 0.0), 0.0)
-    goal = Goal((0.15, 0.0))
-    plan = plan_astar(problem_of(trained, world.depth_image(), world.object_pose()[:2], goal))
-    outcome = execute_plan(world, plan)
-    assert outcome.end_pose == pytest.approx(world.object_pose())
-    assert outcome.distance_m == pytest.approx(goal.distance_m(world.object_pose()[:2]))
-    assert outcome.distance_m < goal.tolerance_m + 0.005  # 15 mm: A* stops within 2 cm
-    assert len(outcome.object_paths_xy_m) == len(outcome.plan.steps) == 2
-    first, second = outcome.object_paths_xy_m
-    np.testing.assert_allclose(first[-1], second[0], atol=1e-9)
-    assert outcome.with_goal(Goal((0.0, 0.0))).distance_m > 0.1
-
-
 def test_the_kinematics_agrees_with_what_execution_refuses(world):
     rng = np.random.default_rng(4)
     refused, steps = 0, []

@@ -8,6 +8,7 @@ import torch
 from matplotlib.path import Path
 
 from affordlib import planning
+from affordlib.geometry import unit_vector
 from affordlib.planning.free_space import (
     FAR_M,
     N_POSES,
@@ -47,10 +48,7 @@ def drawn(rng, within_m=0.12):
     if kind == 1:
         return Obstacle.box(at, tuple(2 * size), rng.uniform(0, math.pi))
     turn = rng.uniform(0, 2 * math.pi)
-    corners = [
-        np.array(at) + size[0] * np.array([math.cos(turn + a), math.sin(turn + a)])
-        for a in (0.0, 1.8, 4.0)
-    ]
+    corners = [at + size[0] * unit_vector(turn + a) for a in (0.0, 1.8, 4.0)]
     return Obstacle(tuple(map(tuple, corners)))
 
 
@@ -153,7 +151,7 @@ def problem(goal, obstacles, **more):
 def test_no_plan_passes_a_wall(plan):
     """Random obstacles: neither disc nor hand touches them at any of many poses of any plan."""
     rng, n_steps, bent = np.random.default_rng(3), 0, 0
-    pushed = np.array([[math.cos(a), math.sin(a)] for a in np.linspace(0, 2 * math.pi, 40)]) * 0.02
+    pushed = 0.02 * np.array([*map(unit_vector, np.linspace(0, 2 * math.pi, 40))])
     for _ in range(12):
         goal = Goal(tuple(rng.uniform(-0.15, 0.15, 2)), 0.01)
         obstacles = [drawn(rng, 0.2) for _ in range(3)]
@@ -169,7 +167,7 @@ def test_no_plan_passes_a_wall(plan):
             assert not overlaps(pushed, between(path, 4), points)
             angle = step.primitive.direction_rad
             travel = 0.25 * min_jerk(np.linspace(0, step.stop_phase, 80)) - 0.2
-            hand = here + travel[:, None] * [math.cos(angle), math.sin(angle)]
+            hand = here + travel[:, None] * unit_vector(angle)
             poses = np.column_stack([hand, np.full(80, angle)])
             assert not overlaps(hand_m(step.primitive), poses, points)
             here = np.array(step.predicted_end_xy_m)
@@ -250,16 +248,12 @@ def test_of_what_is_predicted_to_pass_little_touches(world, skills):
 
 def beside(outline, poses, rng):
     """A disc at the margin from what the outline sweeps, in a random direction."""
-    away, middle = unit(rng.uniform(-3, 3)), poses[0, -1, :2] * rng.uniform(0.4, 1)
+    away, middle = unit_vector(rng.uniform(-3, 3)), poses[0, -1, :2] * rng.uniform(0.4, 1)
     for far in np.arange(0.0, 0.15, 0.0005):
         one = Obstacle.disc(tuple(middle + far * away), 0.015)
         if gaps_m([corners_of(one)], placed(outline, poses)).min() > 0.004:
             return one
     return None
-
-
-def unit(angle):
-    return np.array([math.cos(angle), math.sin(angle)])
 
 
 def test_an_object_beside_an_obstacle_may_leave_it():

@@ -1,7 +1,6 @@
 """Orientation and height: stop phase, gripper yaw, and their place at the end of plans."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -150,10 +149,8 @@ def test_a_plan_that_cannot_turn_or_lift_says_so(world, skills, plan):
     high = plan(skills.problem(image, AT, Goal((0.05, 0.0), height_m=0.45)))
     assert not high.reaches_goal
     assert high.steps  # as far as possible
-    poses, goal = (
-        skills.problem(image, AT, Goal(AT)).pose_planner,
-        Goal(AT, turn_rad=0.5, height_m=0.05),
-    )
+    poses = skills.problem(image, AT, Goal(AT)).pose_planner
+    goal = Goal(AT, turn_rad=0.5, height_m=0.05)
     assert poses(goal, AT) is not None
     assert poses(goal, (0.7, 0.7)) is None  # beyond the learned reach
     assert poses(Goal(AT), (0.7, 0.7)) == ()
@@ -162,12 +159,10 @@ def test_a_plan_that_cannot_turn_or_lift_says_so(world, skills, plan):
 def test_predictions_are_kept_while_only_the_goal_moves(skills, cuboid_image):
     first = skills.effects(cuboid_image)
     for x in (0.03, 0.06):
-        posed = skills.problem(cuboid_image, AT, Goal((x, 0.04)), "single_partial")
-        plan = plan_continuous(posed, seed=1)
-        problem = problem_of(
-            skills.model(Push), cuboid_image, AT, Goal((x, 0.04)), "single_partial"
-        )
-        again = plan_continuous(replace(problem, reachable=skills.reachable(Push)), seed=1)
+        task = cuboid_image, AT, Goal((x, 0.04)), "single_partial"
+        plan = plan_continuous(skills.problem(*task), seed=1)
+        problem = problem_of(skills.model(Push), *task, reachable=skills.reachable(Push))
+        again = plan_continuous(problem, seed=1)
         assert plan.predicted_end_xy_m == again.predicted_end_xy_m
     assert skills.effects(np.array(cuboid_image)) is first
     assert skills.effects(np.roll(cuboid_image, 1)) is not first

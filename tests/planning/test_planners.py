@@ -177,22 +177,6 @@ def test_segments_of_the_recorded_part_are_the_papers_180_branches():
     np.testing.assert_allclose(ends_m, np.tile(REACH_M * shares, (36, 1)), atol=1e-3)
 
 
-def test_astar_plans():
-    plan = planning.plan_astar(known((0.18, 0.06)))
-    assert plan.reaches_goal
-    assert 2 <= len(plan.steps) <= 3
-    assert plan.predicted_distance_m <= 0.02
-    xy = np.zeros(2)
-    for step in plan.steps:
-        np.testing.assert_allclose(step.predicted_path_xy_m[0], xy, atol=1e-4)
-        xy = step.predicted_path_xy_m[-1]
-        np.testing.assert_allclose(xy, step.predicted_end_xy_m, atol=1e-9)
-    assert planning.plan_astar(known((0.01, 0.0))).steps == ()
-    far = planning.plan_astar(known((0.45, 0.0)))
-    assert not far.reaches_goal
-    assert far.predicted_distance_m == pytest.approx(0.45 - 3 * REACH_M, abs=1e-6)
-
-
 def test_a_search_goes_on_where_the_end_cannot_be_had(film, cuboid_image):
     """A node within the tolerance does not count if the goal's turn is unreachable there."""
     goal, asked = Goal((0.08, 0.0), turn_rad=0.1), []
@@ -219,6 +203,8 @@ def test_a_plan_reaches_the_goal_only_where_it_says_that_it_ends_there(film, cub
     for angle in range(8):
         xy = 0.15 * math.cos(angle), 0.15 * math.sin(angle)
         ends = planning.plan_astar(problem_of(film, cuboid_image, (0.0, 0.0), Goal(xy)))
+        at = ends.steps[-1]
+        np.testing.assert_allclose(at.predicted_path_xy_m[-1], at.predicted_end_xy_m, atol=1e-9)
         near = Goal(xy, ends.predicted_distance_m - 1e-6)
         plan = planning.plan_astar(problem_of(film, cuboid_image, (0.0, 0.0), near))
         assert plan.reaches_goal == (plan.predicted_distance_m <= near.tolerance_m)
@@ -328,9 +314,8 @@ class Deaf(KnownDynamics):
 
     def predict(self, features, observations, t_target):
         found = super().predict(features, observations, t_target)
-        return replace(
-            found, effect_mean=found.effect_mean.detach() + 0 * observations.effect.sum()
-        )
+        deaf = found.effect_mean.detach() + 0 * observations.effect.sum()
+        return replace(found, effect_mean=deaf)
 
 
 def test_a_start_that_leads_away_is_drawn_again_and_the_planner_says_if_all_do():
@@ -362,15 +347,12 @@ def test_a_push_that_would_stop_before_it_begins_is_none():
 
 
 def test_modes_bind_the_gradient_planner():
-    partial, again = (
-        planning.plan_gradient(known((0.04, 0.0), "single_partial")) for _ in range(2)
-    )
+    problem = known((0.04, 0.0), "single_partial")
+    partial, again = planning.plan_gradient(problem), planning.plan_gradient(problem)
     expected = STARTS + (1 - STARTS) * math.sqrt(0.04 / REACH_M)
     assert partial.steps[0].stop_phase == pytest.approx(expected, abs=0.01)
     assert np.array_equal(again.steps[0].path_xy_m, partial.steps[0].path_xy_m)
-    drag = planning.plan_gradient(
-        replace(known((0.04, 0.0)), effects=planning.EffectMap(MODEL, IMAGE, Drag))
-    )
+    drag = planning.plan_gradient(known((0.04, 0.0), kind=Drag))
     assert drag.steps[0].path_xy_m is None
     assert drag.steps[0].primitive.direction_rad == pytest.approx(0.0, abs=0.01)
 

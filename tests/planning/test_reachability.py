@@ -11,12 +11,8 @@ from affordlib.planning.reachability import Reachability
 from affordlib.primitives import Drag, Grasp, Push, Rotate
 from experiments.shipped import learn_reachability
 
-KINDS = {
-    "push": lambda angle: Push.towards(angle),
-    "drag": lambda angle: Drag.towards(angle),
-    "grasp": lambda angle: Grasp(),
-    "rotate": lambda angle: Rotate(),
-}
+KINDS = {"push": Push.towards, "drag": Drag.towards}
+KINDS |= {"grasp": lambda _: Grasp(), "rotate": lambda _: Rotate()}
 
 
 @pytest.fixture(scope="module")

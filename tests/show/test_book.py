@@ -1,10 +1,8 @@
-"""How `make html` prepares the pages, and what it leaves of an older book where it fails."""
+"""How `make html` prepares the pages."""
 
 import itertools
 import json
 import runpy
-import shutil
-import subprocess
 
 import pytest
 
@@ -37,16 +35,3 @@ def test_no_alternative_text_of_the_book_has_marks(conf):
                 alt = cell["metadata"]["mystnb"].get("image", {}).get("alt", "")
                 assert not {"$", "\\", "`"} & set(alt), (path, alt)
                 assert "*" not in alt.replace("A*", ""), (path, alt)
-
-
-@pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
-def test_a_book_that_cannot_be_written_leaves_the_old_one(tmp_path):
-    shutil.copy(repo_root() / "Makefile", tmp_path)
-    for name in ("requirements.txt", "constraints.txt", "pyproject.toml"):
-        (tmp_path / name).touch()
-    for path in (tmp_path / ".venv" / ".installed", tmp_path / "runs" / "html" / "index.html"):
-        path.parent.mkdir(parents=True)
-        path.touch()
-    command = ["make", "html", "PY=false"]
-    assert subprocess.run(command, cwd=tmp_path, capture_output=True, timeout=60).returncode
-    assert (tmp_path / "runs" / "html" / "index.html").exists()

@@ -97,9 +97,8 @@ def test_the_browser_reaches_what_python_reaches(ask, seen, skills):
     for name in ("box", "roller"):
         image, _, data = seen[name]
         wanted = goals(25, 1)
-        found = ask(
-            data, [{"pose": [0, 0, 0], "goal": g} for g in wanted], table_data(skills)["reach"]
-        )
+        asked = [{"pose": [0, 0, 0], "goal": g} for g in wanted]
+        found = ask(data, asked, table_data(skills)["reach"])
         for goal, plan in zip(wanted, found, strict=True):
             best = plan_continuous(skills.problem(image, (0.0, 0.0), Goal(tuple(goal))))
             if best.predicted_distance_m < 5e-4:

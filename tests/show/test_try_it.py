@@ -89,12 +89,11 @@ def settled(page):
     page.wait_for_timeout(400)
 
 
-@pytest.fixture
-def words():
-    return lambda page: page.locator(".words").inner_text()
+def words(page):
+    return page.locator(".words").inner_text()
 
 
-def test_drag_play_keys_and_switches(opened, words):
+def test_drag_play_keys_and_switches(opened):
     page = opened()
     assert "Two pushes, stopped at" in words(page)
     page.mouse.move(*at(page, 0.13, 0.085))
@@ -128,7 +127,7 @@ def test_drag_play_keys_and_switches(opened, words):
     assert goal_of(page) == [13, 8.5]
 
 
-def test_an_obstacle_is_added_moved_resized_and_removed_and_planned_around(opened, words):
+def test_an_obstacle_is_added_moved_resized_and_removed_and_planned_around(opened):
     page = opened()
     page.get_by_role("button", name="obstacle: + box").click()
     page.get_by_role("button", name="obstacle: + disc").click()
