@@ -78,10 +78,10 @@ def prediction_record(
     truth, names = arrays.effect[:, steps_of(arrays)], arrays.effect_channels
     columns = xy_columns(names) or [0]
     error = (mean - truth)[..., columns].norm(dim=-1)
-    record = about_objects(data, kept)
+    record = about_objects(data, kept) | {"trajectory_error": error.mean(dim=1).tolist()}
     for name, values in (("truth", truth), ("mean", mean), ("std", std)):
         record[name] = {c: values[:, -1, k].tolist() for k, c in enumerate(names)}
-    return record | {"trajectory_error": error.mean(dim=1).tolist()}
+    return record
 
 
 def baseline_predictions(
@@ -204,8 +204,4 @@ def _floor(std: Tensor) -> Tensor:
     return std.clamp_min(1e-5)
 
 
-BASELINES: dict[str, Callable[..., Forecast]] = {
-    "constant": constant,
-    "nearest": nearest,
-    "gaussian_process": gaussian_process,
-}
+BASELINES = {each.__name__: each for each in (constant, nearest, gaussian_process)}
