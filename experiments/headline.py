@@ -25,14 +25,11 @@ def _table(file: str, name: str) -> pd.DataFrame:
     return pd.DataFrame(read_results(f"data/results/{file}.json")["tables"][name])
 
 
-def _row(question: str, n: int, **errors_mm: float | list[float]) -> dict[str, Any]:
-    shown = {
-        name.replace("_", " "): " / ".join(
-            f"{e:.2f}" for e in ([errors] if isinstance(errors, float) else errors)
-        )
-        for name, errors in errors_mm.items()
-    }
-    return {"mean error in mm": question, "n": int(n)} | shown
+def _row(question: str, n: int, *errors_mm: float, ours: float) -> dict[str, Any]:
+    """Return a row; errors_mm: one or two that the paper reports, and that of its network."""
+    *reported, published = (f"{error:.2f}" for error in errors_mm)
+    row = {"mean error in mm": question, "n": int(n), "reported": " / ".join(reported)}
+    return row | {"as published": published, "ours": f"{ours:.2f}"}
 
 
 def tables() -> dict[str, list[dict[str, Any]]]:
@@ -44,22 +41,18 @@ def tables() -> dict[str, list[dict[str, Any]]]:
     pushes = effects[effects.n_interactions == 500].set_index("model")
     means = 1000 * pushes.final_error_mean_m
     question = "predict where a push ends"
-    errors = {"reported": 1000 * PUSH_M, "as_published": means["cnp"], "ours": means["film"]}
-    found = [_row(question, pushes.n["film"], **errors)]
+    found = [_row(question, pushes.n["film"], 1000 * PUSH_M, means["cnp"], ours=means["film"])]
     lever = _table("lever_up", "summary").set_index("model")
-    means = 10 * lever.step_5_mean_cm[["reported", "cnp_tuned", "cnp_last_pose"]]
-    errors = dict(zip(("reported", "as_published", "ours"), means, strict=True))
-    found.append(_row("predict a lever-up 0.75 s ahead", lever.n["cnp_last_pose"], **errors))
+    *others, ours = 10 * lever.step_5_mean_cm[["reported", "cnp_tuned", "cnp_last_pose"]]
+    question = "predict a lever-up 0.75 s ahead"
+    found.append(_row(question, lever.n["cnp_last_pose"], *others, ours=ours))
     summary = _table("planning", "summary").query("object_class in ('standing', 'reported')")
     summary = summary.set_index("planner")
     for k, (mode, question) in enumerate(PLANS.items()):
         means = 1000 * summary[f"{mode}_mean_m"]
-        reported = means[["reported_gradient_100", "reported_gradient_300"]].tolist()
+        others = means[["reported_gradient_100", "reported_gradient_300", PAPERS]]
         n = summary.n["continuous_film_500"].split(", ")[k]
-        ours = float(means["continuous_film_500"])
-        found.append(
-            _row(question, n, reported=reported, as_published=float(means[PAPERS]), ours=ours)
-        )
+        found.append(_row(question, n, *others, ours=means["continuous_film_500"]))
     return {"main": found}
 
 
