@@ -148,9 +148,8 @@ def fit_lever_model(
     if hasattr(network, "steps"):
         network = replace(network, steps=len(training.phase) - 1)
     model = untrained(network, training, lever.training.seed)
-    return model, train(
-        model, training, validation, lever.training, resume_checkpoint, *trained_for
-    )
+    how = lever.training, resume_checkpoint, *trained_for
+    return model, train(model, training, validation, *how)
 
 
 LEVER_CHECKPOINTS: dict[str, tuple[str, str]] = {

@@ -5,11 +5,9 @@
 runs these jobs if they are missing, then makes the tables from all results. The split is by object
 into five folds, 80/10/10 (each interaction has its own object). A job is one training, or one
 baseline, tested in all protocols that it is trained for; errors are distances [cm] between
-predicted and true positions, after steps of 150 ms.
-A job with a `setting` is tuning: it is scored on the validation part of fold 0.
-
-An object's errors are averaged over its windows; means, standard errors and intervals are over
-objects.
+predicted and true positions, after steps of 150 ms. A job with a `setting` is tuning: it is scored
+on the validation part of fold 0. An object's errors are averaged over its windows; means, standard
+errors and intervals are over objects.
 """
 
 from __future__ import annotations
@@ -203,8 +201,7 @@ def paired_rows(results: list[Result]) -> Rows:
     """Return paired differences to the recurrent network, with bootstrap 95 % intervals.
 
     They are those of the paper's network, tuned, and of ours, trained for all protocols or for one
-    at a time. Pairs are test objects, with errors
-    averaged over windows.
+    at a time. Pairs are test objects, with errors averaged over windows.
     """
     rows: Rows = []
     errors = {

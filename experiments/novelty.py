@@ -3,9 +3,8 @@
 σ covers the noise in the training data, not the novelty of an object. `Novelty` is the distance of
 an image to its nearest training image (Sun et al., Out-of-distribution detection with deep nearest
 neighbors, ICML 2022) in circular harmonics, since learned features discard what training did not
-need.
-Object categories that no model has seen are used: some to choose the novelty score and the growth
-of σ, the others only to test them. Their pushes are collected into runs/strangers.
+need. Object categories that no model has seen are used: some to choose the novelty score and the
+growth of σ, the others only to test them. Their pushes are collected into runs/strangers.
 """
 
 from __future__ import annotations

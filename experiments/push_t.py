@@ -3,8 +3,8 @@
     python -m experiments.push_t [--only row=gp_200 block=0,1] [--stored]
 
 needs `requirements-pusht.txt`. `--stored` writes what page 10 shows: 200 pushes, one run, its film.
-The environment is used as published: targets of its agent, a disc,
-in [0, 512]², ten a second, 300 of them at most. One pixel counts as one millimetre.
+The environment is used as published: targets of its agent, a disc, in [0, 512]², ten a second, 300
+of them at most. One pixel counts as one millimetre.
 
 Protocol. 300 initial states: those of `reset(seed)` for 300 seeds from `FIRST_START`, of which none
 is solved. They are made in 15 blocks of 20; block b uses the training pushes of draw b mod 5. A
