@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -138,7 +137,6 @@ def _tensors(data: xr.Dataset, rows: np.ndarray) -> InteractionTensors:
     return InteractionTensors.from_dataset(data, rows, *channels)
 
 
-@cache
 def ablated(without: tuple[str, ...], steps: int, seed: int = 0) -> EffectNetwork:
     """Train our network on `push` without some parts of `LADDER`; the seed is also the fold.
 

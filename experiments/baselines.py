@@ -50,9 +50,8 @@ def network_record(
 ) -> dict[str, Any]:
     """Predictions of a network for interactions: see `prediction_record`."""
     kept = valid_interactions(data, interactions)
-    arrays = InteractionTensors.from_dataset(
-        data, kept, model.action_channels, model.effect_channels
-    )
+    channels = model.action_channels, model.effect_channels
+    arrays = InteractionTensors.from_dataset(data, kept, *channels)
     phases = (steps_of(arrays) / (len(arrays.phase) - 1)).tolist()
     return prediction_record(data, kept, arrays, *effects_at(model, arrays, phases)[1:])
 
@@ -78,10 +77,10 @@ def prediction_record(
     truth, names = arrays.effect[:, steps_of(arrays)], arrays.effect_channels
     columns = xy_columns(names) or [0]
     error = (mean - truth)[..., columns].norm(dim=-1)
-    record = about_objects(data, kept)
+    record = about_objects(data, kept) | {"trajectory_error": error.mean(dim=1).tolist()}
     for name, values in (("truth", truth), ("mean", mean), ("std", std)):
         record[name] = {c: values[:, -1, k].tolist() for k, c in enumerate(names)}
-    return record | {"trajectory_error": error.mean(dim=1).tolist()}
+    return record
 
 
 def baseline_predictions(
@@ -96,12 +95,9 @@ def baseline_predictions(
     known, kept = valid_interactions(data, train_on), valid_interactions(other, queried)
     training = InteractionTensors.from_dataset(data, known, *channels)
     arrays = InteractionTensors.from_dataset(other, kept, *channels)
-    train_features = features(data.isel(interaction=known))
-    at = steps_of(arrays)
-    mean, std = baseline(
-        training, arrays, at, train_features, features(other.isel(interaction=kept))
-    )
-    return prediction_record(other, kept, arrays, mean, std)
+    both = features(data.isel(interaction=known)), features(other.isel(interaction=kept))
+    forecast = baseline(training, arrays, steps_of(arrays), *both)
+    return prediction_record(other, kept, arrays, *forecast)
 
 
 def features(data: xr.Dataset) -> Tensor:
@@ -194,9 +190,8 @@ def _in_table_frame(arrays: InteractionTensors, at: Tensor, mean: Tensor, std: T
     channels = arrays.action_channels, arrays.effect_channels
     action = arrays.action[:, at]
     prediction = Prediction(action, torch.zeros_like(action), mean, std)
-    prediction = rotate_prediction(
-        prediction, push_direction(condition_on_recorded_action(arrays), *channels), *channels
-    )
+    direction = push_direction(condition_on_recorded_action(arrays), *channels)
+    prediction = rotate_prediction(prediction, direction, *channels)
     return prediction.effect_mean, prediction.effect_std
 
 
@@ -204,8 +199,4 @@ def _floor(std: Tensor) -> Tensor:
     return std.clamp_min(1e-5)
 
 
-BASELINES: dict[str, Callable[..., Forecast]] = {
-    "constant": constant,
-    "nearest": nearest,
-    "gaussian_process": gaussian_process,
-}
+BASELINES = {each.__name__: each for each in (constant, nearest, gaussian_process)}

@@ -5,9 +5,9 @@
 Trial i of a table is a function of the seed and i: object, start, goal and disturbances are sampled
 before planning, with objects that no model has seen. Each trial is run in the clean world with the
 ideal camera, and in a perturbed one (`Variation`) with the Kinect; `open_loop` trials execute a
-plan made from a single image in the clean world. Errors are ground truth of the
-simulator, which the robot does not know. Whether a goal is feasible is determined by the arm's
-kinematics (position) and by full grasps (height), never by the planner under test.
+plan made from a single image in the clean world. Errors are ground truth of the simulator, which
+the robot does not know. Whether a goal is feasible is determined by the arm's kinematics (position)
+and by full grasps (height), never by the planner under test.
 """
 
 from __future__ import annotations
@@ -145,16 +145,15 @@ def _clean_trial(table: str, index: int, seed: int) -> Trial:
     farthest = 0.25 if table == "disturbances" else 0.12
     r, angle = math.sqrt(rng.uniform(0.02**2, farthest**2)), rng.uniform(-math.pi, math.pi)
     xy = (r * math.cos(angle), r * math.sin(angle))
+    goal = Goal(xy, tolerance_m)
     if table == "height":
-        height_m = float(rng.uniform(0.02, 0.2))
-        return Trial(**about, goal=Goal(xy, tolerance_m, height_m=height_m))
+        return Trial(**about, goal=replace(goal, height_m=float(rng.uniform(0.02, 0.2))))
     if table.startswith("orientation"):
-        turn_rad = float(rng.uniform(-math.pi, math.pi))
-        return Trial(**about, goal=Goal(xy, tolerance_m, turn_rad=turn_rad))
+        return Trial(**about, goal=replace(goal, turn_rad=float(rng.uniform(-math.pi, math.pi))))
     n_actions = max(1, math.ceil(r / 0.09))
     kinds = [kind for kind in KINDS if kind != "topple" or not obj.rollable]
     disturbances = (sample_disturbance(int(rng.integers(2**32)), n_actions, kinds),)
-    return Trial(**about, goal=Goal(xy, tolerance_m), disturbances=disturbances)
+    return Trial(**about, goal=goal, disturbances=disturbances)
 
 
 def sample_disturbance(seed: int, n_actions: int = 2, kinds: Sequence[str] = KINDS) -> Disturbance:

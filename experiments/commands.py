@@ -12,21 +12,12 @@ from pathlib import Path
 from typing import Any
 
 
-def whole_type(least: int, most: int) -> Callable[[str], int]:
-    """Return an argparse `type` that accepts whole numbers in [least, most]."""
-
-    def parse(text: str) -> int:
-        with suppress(ValueError):
-            if least <= (number := int(text)) <= most:
-                return number
-        raise argparse.ArgumentTypeError(
-            f"must be a whole number from {least} to {most}, got {text!r:.40}"
-        )
-
-    return parse
-
-
-worker_type = whole_type(1, 256)
+def worker_type(text: str) -> int:
+    """Read a number of processes, as an argparse `type`."""
+    with suppress(ValueError):
+        if 1 <= (number := int(text)) <= 256:
+            return number
+    raise argparse.ArgumentTypeError(f"must be a whole number from 1 to 256, got {text!r:.40}")
 
 
 class _Terminated(KeyboardInterrupt):

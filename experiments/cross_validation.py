@@ -178,17 +178,13 @@ def logistic_predictions(
     regression.fit(data["size"].values[known], lifted)
     probability = regression.predict_proba(other["size"].values[kept])[:, 1]
     height = other["effect"].values[kept, -1, 2].tolist()
-    record = about_objects(other, kept) | {"truth": {"z": height}}
-    return record | {"probability": probability.tolist()}
+    record = about_objects(other, kept) | {"probability": probability.tolist()}
+    return record | {"truth": {"z": height}}
 
 
 def prediction_columns(predictions: dict[str, Any]) -> dict[str, Any]:
-    """Convert predictions to the columns of a table: `truth_x`, `mean_x`, `std_x`, … and errors."""
-    columns = dict(predictions)
-    for kind in ("truth", "mean", "std"):
-        by_channel = columns.pop(kind, {})
-        columns |= {f"{kind}_{channel}": values for channel, values in by_channel.items()}
-    return columns
+    """Flatten predictions to the columns of a table: `truth_x`, `mean_x`, `std_x` and others."""
+    return pd.json_normalize(predictions, sep="_").iloc[0].to_dict()
 
 
 def add_errors(table: pd.DataFrame, primitive: str) -> None:

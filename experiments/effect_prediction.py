@@ -91,8 +91,6 @@ def error_rows(table: pd.DataFrame, primitive: str) -> Rows:
 def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
     """Return all tables from the results in a folder and the studies beside them."""
     results = sorted_results(folder)
-    if not results:
-        raise FileNotFoundError(f"folder: there are no results in {folder}; run some jobs first")
 
     def errors(primitive: str, part: str) -> Rows:
         return error_rows(predictions_of(results, primitive, part), primitive)

@@ -11,11 +11,10 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy import stats
 
 from affordlib.primitives import Grasp
 from experiments.cross_validation import by_model
-from experiments.runner import Rows
+from experiments.runner import Rows, shares
 
 
 def grasp_rows(grasps: pd.DataFrame) -> Rows:
@@ -41,8 +40,6 @@ def confusion_columns(predicted: np.ndarray, lifted: np.ndarray) -> dict[str, An
     columns: dict[str, Any] = {}
     for rate, those in (("tp", lifted), ("tn", ~lifted)):
         n, k = int(those.sum()), int((predicted == lifted)[those].sum())
-        interval = stats.binomtest(k, n).proportion_ci(method="wilson") if n else (None, None)
-        shares = (k / n if n else None, *interval)
-        for end, share in zip(("", "_low", "_high"), shares, strict=True):
-            columns[f"{rate}{end}_percent"] = share and 100 * share
+        names = (f"{rate}{end}_percent" for end in ("", "_low", "_high"))
+        columns |= zip(names, shares(k, n), strict=True)
     return columns | {"n_success": int(lifted.sum()), "n_failure": int((~lifted).sum())}

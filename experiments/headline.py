@@ -16,7 +16,7 @@ PLANS = {
     "single_partial": "plan one partial push, execute it",
     "multi_partial": "plan up to three partial pushes, execute them",
 }
-PAPERS = "gradient_100_pushes"
+PAPERS, OURS = "gradient_100_pushes", "continuous_film_500"
 PUSH_M = 0.02
 """The paper's error of a push: "around 0.02 m" (Section 4.3)."""
 
@@ -25,14 +25,11 @@ def _table(file: str, name: str) -> pd.DataFrame:
     return pd.DataFrame(read_results(f"data/results/{file}.json")["tables"][name])
 
 
-def _row(question: str, n: int, **errors_mm: float | list[float]) -> dict[str, Any]:
-    shown = {
-        name.replace("_", " "): " / ".join(
-            f"{e:.2f}" for e in ([errors] if isinstance(errors, float) else errors)
-        )
-        for name, errors in errors_mm.items()
-    }
-    return {"mean error in mm": question, "n": int(n)} | shown
+def _row(question: str, n: int, *errors_mm: float) -> dict[str, Any]:
+    """Return a row; errors_mm: one or two that the paper reports, its network's here, and ours."""
+    *reported, published, ours = (f"{error:.2f}" for error in errors_mm)
+    row = {"mean error in mm": question, "n": int(n), "reported": " / ".join(reported)}
+    return row | {"as published": published, "ours": ours}
 
 
 def tables() -> dict[str, list[dict[str, Any]]]:
@@ -43,23 +40,17 @@ def tables() -> dict[str, list[dict[str, Any]]]:
     effects = _table("effect_prediction", "push_test").query("object_class == 'all'")
     pushes = effects[effects.n_interactions == 500].set_index("model")
     means = 1000 * pushes.final_error_mean_m
-    question = "predict where a push ends"
-    errors = {"reported": 1000 * PUSH_M, "as_published": means["cnp"], "ours": means["film"]}
-    found = [_row(question, pushes.n["film"], **errors)]
+    errors = 1000 * PUSH_M, means["cnp"], means["film"]
+    found = [_row("predict where a push ends", pushes.n["film"], *errors)]
     lever = _table("lever_up", "summary").set_index("model")
-    means = 10 * lever.step_5_mean_cm[["reported", "cnp_tuned", "cnp_last_pose"]]
-    errors = dict(zip(("reported", "as_published", "ours"), means, strict=True))
-    found.append(_row("predict a lever-up 0.75 s ahead", lever.n["cnp_last_pose"], **errors))
+    errors = 10 * lever.step_5_mean_cm[["reported", "cnp_tuned", "cnp_last_pose"]]
+    found.append(_row("predict a lever-up 0.75 s ahead", lever.n["cnp_last_pose"], *errors))
     summary = _table("planning", "summary").query("object_class in ('standing', 'reported')")
     summary = summary.set_index("planner")
+    planners = ["reported_gradient_100", "reported_gradient_300", PAPERS, OURS]
     for k, (mode, question) in enumerate(PLANS.items()):
-        means = 1000 * summary[f"{mode}_mean_m"]
-        reported = means[["reported_gradient_100", "reported_gradient_300"]].tolist()
-        n = summary.n["continuous_film_500"].split(", ")[k]
-        ours = float(means["continuous_film_500"])
-        found.append(
-            _row(question, n, reported=reported, as_published=float(means[PAPERS]), ours=ours)
-        )
+        errors = 1000 * summary[f"{mode}_mean_m"][planners]
+        found.append(_row(question, summary.n[OURS].split(", ")[k], *errors))
     return {"main": found}
 
 

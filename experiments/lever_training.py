@@ -148,9 +148,8 @@ def fit_lever_model(
     if hasattr(network, "steps"):
         network = replace(network, steps=len(training.phase) - 1)
     model = untrained(network, training, lever.training.seed)
-    return model, train(
-        model, training, validation, lever.training, resume_checkpoint, *trained_for
-    )
+    how = lever.training, resume_checkpoint, *trained_for
+    return model, train(model, training, validation, *how)
 
 
 LEVER_CHECKPOINTS: dict[str, tuple[str, str]] = {
@@ -161,11 +160,6 @@ LEVER_CHECKPOINTS: dict[str, tuple[str, str]] = {
 """Checkpoints of lever-ups: the name in `LEVER_MODELS`, and the protocol it is trained for."""
 
 
-def lever_training(lever: LeverModel, data: xr.Dataset, split: Split) -> InteractionTensors:
-    """Return the training data of a lever-up network: the training part and its mirror image."""
-    return augment_by_symmetry(lever_up_tensors(data, split.train, lever.view), MIRRORED)
-
-
 def train_lever_model(
     lever: LeverModel,
     data: xr.Dataset,
@@ -174,6 +168,6 @@ def train_lever_model(
     resume_checkpoint: Path | None = None,
 ) -> tuple[EffectNetwork, list[TrainingRecord]]:
     """Train a lever-up network on a split's training part and its mirror image."""
-    training = lever_training(lever, data, split)
+    training = augment_by_symmetry(lever_up_tensors(data, split.train, lever.view), MIRRORED)
     validation = lever_up_tensors(data, split.validation, lever.view)
     return fit_lever_model(lever, training, validation, trained_for, resume_checkpoint)

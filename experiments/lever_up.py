@@ -5,11 +5,9 @@
 runs these jobs if they are missing, then makes the tables from all results. The split is by object
 into five folds, 80/10/10 (each interaction has its own object). A job is one training, or one
 baseline, tested in all protocols that it is trained for; errors are distances [cm] between
-predicted and true positions, after steps of 150 ms.
-A job with a `setting` is tuning: it is scored on the validation part of fold 0.
-
-An object's errors are averaged over its windows; means, standard errors and intervals are over
-objects.
+predicted and true positions, after steps of 150 ms. A job with a `setting` is tuning: it is scored
+on the validation part of fold 0. An object's errors are averaged over its windows; means, standard
+errors and intervals are over objects.
 """
 
 from __future__ import annotations
@@ -165,11 +163,9 @@ def _errors(
 def sorted_results(folder: str | Path = FOLDER) -> list[Result]:
     """Return all results in the order of models and folds."""
 
-    def order(result: Result) -> list[Any]:
-        about = {name: value or 0 for name, value in result[0].items()}
-        tuned = [*SETTINGS].index(about["setting"]) if about["setting"] else -1
-        place = [about[name] for name in ("trained_for", "fold")]
-        return [MODELS.index(about["model"]), *place, tuned]
+    def order(result: Result) -> tuple[Any, ...]:
+        model, trained_for, fold, setting = result[0].values()
+        return MODELS.index(model), trained_for, fold, [None, *SETTINGS].index(setting)
 
     return sorted(read(NAME, job, folder), key=order)
 
@@ -205,8 +201,7 @@ def paired_rows(results: list[Result]) -> Rows:
     """Return paired differences to the recurrent network, with bootstrap 95 % intervals.
 
     They are those of the paper's network, tuned, and of ours, trained for all protocols or for one
-    at a time. Pairs are test objects, with errors
-    averaged over windows.
+    at a time. Pairs are test objects, with errors averaged over windows.
     """
     rows: Rows = []
     errors = {
@@ -226,13 +221,10 @@ def paired_rows(results: list[Result]) -> Rows:
 
 def summary_rows(rows: Rows) -> Rows:
     """Return one row per model for the window protocol, as in the paper's Table 1."""
-    summary: dict[str, dict[str, Any]] = {}
-    for row in rows:
-        if row["protocol"] == "window":
-            columns = {name: row[name] for name in ("model", "folds", "n")}
-            one = summary.setdefault(row["model"], columns)
-            one[f"step_{row['steps']}_mean_cm"] = row["mean_cm"]
-    return list(summary.values())
+    window = pd.DataFrame(rows).query("protocol == 'window'")
+    keys = ["model", "folds", "n"]
+    summary = window.set_index([*keys, "steps"])["mean_cm"].unstack(sort=False)
+    return plain(summary.rename(columns="step_{}_mean_cm".format).reset_index())
 
 
 def tuning_rows(results: list[Result]) -> Rows:

@@ -3,9 +3,8 @@
 σ covers the noise in the training data, not the novelty of an object. `Novelty` is the distance of
 an image to its nearest training image (Sun et al., Out-of-distribution detection with deep nearest
 neighbors, ICML 2022) in circular harmonics, since learned features discard what training did not
-need.
-Object categories that no model has seen are used: some to choose the novelty score and the growth
-of σ, the others only to test them. Their pushes are collected into runs/strangers.
+need. Object categories that no model has seen are used: some to choose the novelty score and the
+growth of σ, the others only to test them. Their pushes are collected into runs/strangers.
 """
 
 from __future__ import annotations
@@ -230,11 +229,6 @@ def final(model: Any, pushes: InteractionTensors) -> tuple[Tensor, Tensor, Tenso
     return tuple(value[:, 0, :2] for value in c.effects_at(model, pushes, (1.0,)))
 
 
-def beyond_percent(truth: Tensor, mean: Tensor, std: Tensor) -> float:
-    """Return the share of errors beyond 2σ, in per cent."""
-    return 100 * float(((mean - truth).norm(dim=1) > 2 * std.norm(dim=1)).double().mean())
-
-
 def novelty_gain() -> Rows:
     """Fit the gain of σ's growth so that at most 1 % of any category and model are beyond 2σ."""
     needed = []
@@ -267,11 +261,13 @@ def novelty_judged() -> Rows:
             row = {"model": name, "objects": objects, "n": len(novelty), "auc": None}
             if objects != "known":
                 row["auc"] = auc(found["known"][0], novelty)
-            row["error_mean_m"] = float((mean - truth).norm(dim=1).mean())
+            off = (mean - truth).norm(dim=1)
+            row["error_mean_m"] = float(off.mean())
             for kind, sigma in (("", std), ("aware_", aware)):
                 row[f"{kind}sigma_median_m"] = float(sigma.norm(dim=1).median())
                 for k in (50, 90):
                     row[f"{kind}coverage_{k}"] = c.coverage(truth, mean, sigma, k / 100)
-                row[f"{kind}beyond_2_sigma_percent"] = beyond_percent(truth, mean, sigma)
+                beyond = (off > 2 * sigma.norm(dim=1)).double()
+                row[f"{kind}beyond_2_sigma_percent"] = 100 * float(beyond.mean())
             rows.append(row)
     return rows

@@ -10,7 +10,10 @@ from __future__ import annotations
 import argparse
 import lzma
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from functools import partial
+from itertools import islice
 
 import numpy as np
 
@@ -18,7 +21,7 @@ from affordlib.geometry import rotated
 from affordlib.primitives import PushAt
 from affordlib.results import repo_root
 from affordlib.types import UnreachableError
-from affordlib.world import Prism, Tabletop, WorldConfig
+from affordlib.world import Prism, Tabletop, TabletopObject, WorldConfig
 from experiments.commands import command
 
 FOLDER = repo_root() / "data" / "own_log"
@@ -26,6 +29,7 @@ N_PUSHES = 50
 TRIANGLE_M = ((0.0, 0.0), (0.13, 0.0), (0.03, 0.11))
 """Corners [m] of the triangle in the recorded frame; it is scalene, so it has no symmetry."""
 HEIGHT_M = 0.02
+Pose = tuple[float, float, float]
 SUPPORTS = {"mid": (0.0, 0.0), "left": (-0.02, -0.005), "right": (0.022, -0.01)}
 SURFACES = {"felt": 0.9, "steel": 0.35}
 CONDITIONS = ("felt_mid", "felt_left", "steel_mid", "steel_right", "steel_left")
@@ -54,36 +58,41 @@ def drawn_push(outline_m: np.ndarray, yaw: float, rng: np.random.Generator) -> P
     return PushAt(rotated(contact, yaw), direction + yaw, float(rng.uniform(0.009, 0.017)))
 
 
+def executed(
+    obj: TabletopObject,
+    draw: Callable[[float], PushAt],
+    rng: np.random.Generator,
+    config: WorldConfig | None = None,
+) -> Iterator[tuple[np.ndarray, tuple[Pose, Pose]]]:
+    """Yield the rod's path (n, 2) of pushes, and the object's poses before and after it.
+
+    draw: samples a push for the object's yaw. Pushes that fail are left out.
+    """
+    with Tabletop(config) as world:
+        while True:
+            world.place(obj, (0.0, 0.0), rng.uniform(-math.pi, math.pi), tool="rod")
+            before = world.object_pose()
+            with suppress(UnreachableError):
+                done = world.execute_primitive(draw(before[2]))
+                if not (done.faults or done.fell):
+                    path = done.tool[:, :2] + done.estimated_xy_m
+                    yield path, (before, world.object_pose())
+
+
 def collect(condition: str, seed: int) -> str:
     """Collect the pushes of a condition and return the text of its log."""
-    rng = np.random.default_rng(seed)
+    rng, lines = np.random.default_rng(seed), [str(N_PUSHES)]
     prism = Prism(TRIANGLE_M, HEIGHT_M)
-    corner = np.array(prism.corners[0])
-    lines, n = [], 0
-    with Tabletop(world_config(condition)) as world:
-        while n < N_PUSHES:
-            world.place(prism, (0.0, 0.0), rng.uniform(-math.pi, math.pi), tool="rod")
-            x, y, yaw = world.object_pose()
-            try:
-                done = world.execute_primitive(drawn_push(prism.footprint_m, yaw, rng))
-            except UnreachableError:
-                continue
-            if done.faults or done.fell:
-                continue
-            tool = done.tool[:, :2] + done.estimated_xy_m
-            rows = [
-                "{:.2f} {:.3f} {:.3f} 0 1 0 0 0".format(t, *xy)
-                for t, xy in zip(np.linspace(0, 3.75, len(tool)), 1e3 * tool, strict=True)
-            ]
-            poses = []
-            for px, py, a in ((x, y, yaw), world.object_pose()):
-                at = np.add((px, py), rotated(corner, a)) + rng.normal(0, NOISE_M, 2)
-                a = (a + rng.normal(0, NOISE_RAD)) / 2
-                at = 1e3 * at
-                poses.append(f"{at[0]:.3f} {at[1]:.3f} 0 {math.cos(a):.6f} 0 0 {math.sin(a):.6f}")
-            lines += [*poses, "0", str(len(rows)), *rows]
-            n += 1
-    return "\n".join([str(n), *lines]) + "\n"
+    corner, draw = np.array(prism.corners[0]), partial(drawn_push, prism.footprint_m, rng=rng)
+    for tool, poses in islice(executed(prism, draw, rng, world_config(condition)), N_PUSHES):
+        for x, y, yaw in poses:
+            at = np.add((x, y), rotated(corner, yaw)) + rng.normal(0, NOISE_M, 2)
+            at, a = 1e3 * at, (yaw + rng.normal(0, NOISE_RAD)) / 2
+            lines.append(f"{at[0]:.3f} {at[1]:.3f} 0 {math.cos(a):.6f} 0 0 {math.sin(a):.6f}")
+        lines += ["0", str(len(tool))]
+        for t, xy in zip(np.linspace(0, 3.75, len(tool)), 1e3 * tool, strict=True):
+            lines.append("{:.2f} {:.3f} {:.3f} 0 1 0 0 0".format(t, *xy))
+    return "\n".join(lines) + "\n"
 
 
 @command(OSError, ValueError)

@@ -1,6 +1,6 @@
-"""Pretrain the neural process on simulated pushes of random objects (half an hour on one core).
+"""Pretrain the neural process on simulated pushes of random objects.
 
-    python -m experiments.pretrain_np [--objects 12288] [--steps 7000] [--to PATH]
+    python -m experiments.pretrain_np    (half an hour on one core)
 
 Objects are convex outlines with three or four corners and random feet and frictions; a push is
 `quasi_static_push` with measurement noise on the poses before and after. Errors on held-out objects
@@ -32,9 +32,11 @@ from affordlib.logs.neural_process import (
 from affordlib.logs.physics import quasi_static_push
 from affordlib.results import repo_root
 from affordlib.weights import write_weights
-from experiments.commands import command, whole_type
+from experiments.commands import command
 
 PUSHES, CHUNK = 48, 64
+OBJECTS, STEPS = 12_288, 7000
+CHECKPOINT = repo_root() / "data" / "checkpoints" / f"{PRETRAINED}.safetensors"
 _SHORT, _LONG = 0.12, 0.9
 
 
@@ -188,27 +190,23 @@ def held_out_errors(model: NeuralProcess, held_out: list[Tensor]) -> dict[str, l
 @command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
     """Simulate, train, and write the checkpoint with its errors on held-out objects."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--objects", type=whole_type(64, 10**6), default=12288)
-    parser.add_argument("--steps", type=whole_type(1, 10**7), default=7000)
-    parser.add_argument("--to", default=repo_root() / f"data/checkpoints/{PRETRAINED}.safetensors")
-    options = parser.parse_args(argv)
+    argparse.ArgumentParser(description=__doc__.splitlines()[0]).parse_args(argv)
     start = time.perf_counter()
-    rows, feet, _ = simulate_many(options.objects, seed=0)
+    rows, feet, _ = simulate_many(OBJECTS, seed=0)
     held_out = simulate_many(256, seed=99)
     print(f"simulated in {time.perf_counter() - start:.0f} s", flush=True)
     torch.manual_seed(0)
     model = NeuralProcess()
 
     def report(step: int, loss: float) -> None:
-        if step % 500 == 0 or step == options.steps:
+        if step % 500 == 0:
             seconds, errors = time.perf_counter() - start, held_out_errors(model, held_out)
             print(f"{step} {loss:.3f} {seconds:.0f} s {errors}", flush=True)
-            about = {"objects": options.objects, "steps": step, "held_out": errors}
-            save_neural_process(model, options.to, about)
+            about = {"objects": OBJECTS, "steps": step, "held_out": errors}
+            save_neural_process(model, CHECKPOINT, about)
 
     g = torch.Generator().manual_seed(0)
-    train_neural_process(model, rows, feet, (options.steps, 1.2e-3, 48), g, report)
+    train_neural_process(model, rows, feet, (STEPS, 1.2e-3, 48), g, report)
     return 0
 
 

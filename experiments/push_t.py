@@ -3,8 +3,8 @@
     python -m experiments.push_t [--only row=gp_200 block=0,1] [--stored]
 
 needs `requirements-pusht.txt`. `--stored` writes what page 10 shows: 200 pushes, one run, its film.
-The environment is used as published: targets of its agent, a disc,
-in [0, 512]², ten a second, 300 of them at most. One pixel counts as one millimetre.
+The environment is used as published: targets of its agent, a disc, in [0, 512]², ten a second, 300
+of them at most. One pixel counts as one millimetre.
 
 Protocol. 300 initial states: those of `reset(seed)` for 300 seeds from `FIRST_START`, of which none
 is solved. They are made in 15 blocks of 20; block b uses the training pushes of draw b mod 5. A
@@ -29,7 +29,6 @@ import pandas as pd
 from PIL import Image, ImageDraw
 from scipy.optimize import least_squares
 from scipy.special import expit
-from scipy.stats import binomtest
 
 from affordlib.geometry import rotated, unit_vector, wrap_angle
 from affordlib.logs import Log, LoggedPushes, PushedObject, Pushes, PushPlanner, fit
@@ -44,7 +43,7 @@ from affordlib.show import NEUTRAL
 from affordlib.types import Goal, UnreachableError
 from experiments import runner
 from experiments.commands import command
-from experiments.runner import FOLDER, Job, Rows, frame, read
+from experiments.runner import FOLDER, Job, Rows, frame, read, shares
 
 TABLE, STORED = "push_t", repo_root() / "data" / "push_t"
 T_PX = ((-60, 0), (60, 0), (60, 30), (15, 30), (15, 120), (-15, 120), (-15, 30), (-60, 30))
@@ -358,50 +357,32 @@ def job(row: str, block: int | None = None, draw: int | None = None) -> Job:
 
 def tables(folder: str = FOLDER) -> dict[str, Rows]:
     """Return the shares of solved states by row, rule and limit, and the models' errors."""
-    results = read(TABLE, job, folder)
+    results = sorted(read(TABLE, job, folder), key=lambda r: list(ROWS).index(r[0]["row"]))
     runs = frame([(about, r) for about, r in results if "runs" in r], "runs")
     solved, predicted = [], []
-    for row, part in runs.groupby("row"):
+    for row, part in runs.groupby("row", sort=False):
         for rule in "ab":
             steps = part[f"steps_{rule}"].astype(float).fillna(math.inf)
-            about = {
-                "row": row,
-                "rule": rule,
-                "n": len(part),
-                "draws": part["block"].mod(DRAWS).nunique(),
-            }
+            about = {"row": row, "rule": rule, "n": len(part)}
+            about["draws"] = part["block"].mod(DRAWS).nunique()
             for limit in LIMITS:
-                k = int((steps <= limit).sum())
-                ends = binomtest(k, len(part)).proportion_ci(method="wilson")
-                shares = zip(
-                    ("share", "low", "high"), (k / len(part), ends.low, ends.high), strict=True
-                )
-                about |= {f"{name}_{limit}_percent": 100 * value for name, value in shares}
-            median = float(steps.median())
-            about["steps_median"] = median if math.isfinite(median) else None
-            solved.append(
-                about | {"pushes_mean": part["pushes"].mean(), "plan_mean_s": part["plan_s"].mean()}
-            )
-    spent = [about | r["spent"] for about, r in results if "spent" in r]
-    every = frame([(about, r) for about, r in results if "errors" in r], "errors")
-    for row, part in every.groupby("row") if len(every) else ():
+                names = (f"{name}_{limit}_percent" for name in ("share", "low", "high"))
+                about |= zip(names, shares(int((steps <= limit).sum()), len(part)), strict=True)
+            about["steps_median"] = steps.median() if steps.median() < math.inf else None
+            about["pushes_mean"] = part["pushes"].mean()
+            solved.append(about | {"plan_mean_s": part["plan_s"].mean()})
+    told = [(about, r | {"spent": [r["spent"]]}) for about, r in results if "errors" in r]
+    every, spent = frame(told, "errors"), frame(told, "spent")
+    for row, part in every.groupby("row", sort=False) if told else ():
         about = {"row": row, "n": len(part), "draws": part["draw"].nunique()}
-        for name in ("position_m", "yaw_rad"):
-            what, unit = name.split("_")
-            about |= {
-                f"{what}_{q}_{unit}": part[name].quantile(at)
-                for q, at in (("median", 0.5), ("p95", 0.95))
-            }
+        for what, unit in (("position", "m"), ("yaw", "rad")):
+            for name, at in (("median", 0.5), ("p95", 0.95)):
+                about[f"{what}_{name}_{unit}"] = part[f"{what}_{unit}"].quantile(at)
         about |= {f"coverage_{p}": part[f"inside_{p}"].mean() for p in (50, 90)}
-        of_row = [one for one in spent if one["row"] == row]
-        about |= {
-            f"{n}_mean_s": float(np.mean([one[f"{n}_s"] for one in of_row]))
-            for n in ("collect", "fit", "first")
-        }
+        means = spent[spent["row"] == row].mean(numeric_only=True)
+        about |= {f"{name}_mean_s": means[f"{name}_s"] for name in ("collect", "fit", "first")}
         predicted.append(about)
-    order = list(ROWS)
-    key = lambda each: order.index(each["row"])  # noqa: E731
-    return {"solved": sorted(solved, key=key), "errors": sorted(predicted, key=key)}
+    return {"solved": solved, "errors": predicted}
 
 
 def film(history: Sequence[Any], path: Path, size: int = 320) -> None:

@@ -35,7 +35,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 from filelock import FileLock
-from scipy.stats import bootstrap
+from scipy.stats import binomtest, bootstrap
 from tqdm.auto import tqdm
 
 from affordlib.interactions import open_interactions
@@ -90,17 +90,6 @@ class Job:
             "checkpoints": [hash_of(name, "checkpoint") for name in self.checkpoints],
         }
 
-    def importable(self) -> Job:
-        """Return the job with the function of the imported module, for a worker's `__main__`."""
-        return replace(self, function=_importable(self.function))
-
-    def record(self, resume_checkpoint: Path) -> dict[str, Any]:
-        """Call the function and return a line of the table."""
-        takes = inspect.signature(self.function).parameters
-        more = {k: v for k, v in {"resume_checkpoint": resume_checkpoint}.items() if k in takes}
-        result = _rounded(self.function(**self.arguments, **more))
-        return {"arguments": self.arguments, "made_of": self.made_of(), "result": result}
-
 
 def _rounded(value: Any) -> Any:
     """Round all floats in nested values to six significant digits."""
@@ -111,24 +100,18 @@ def _rounded(value: Any) -> Any:
     return float(f"{value:.6g}") if isinstance(value, float) else value
 
 
-def run(
-    jobs: Sequence[Job],
-    table: str,
-    folder: str | Path = FOLDER,
-    workers: int = 1,
-    progress: bool = True,
-) -> list[Any]:
+def run(jobs: Sequence[Job], table: str, folder: str | Path = FOLDER, workers: int = 1) -> list:
     """Return the results of jobs, in order; compute missing or stale ones as `spread` does."""
     folder = resolve_out_dir(folder)
     records, keys = _records(table, folder), [_key(job.arguments) for job in jobs]
-    tasks = {
-        key: (job.importable(), folder / f".{table}-{_sha256([key, job.made_of()])}.pt")
-        for key, job in zip(keys, jobs, strict=True)
-        if key not in records or _stale(records[key], job)
-    }
+    tasks: dict[str, tuple[Job, Path]] = {}
+    for key, job in zip(keys, jobs, strict=True):
+        if key not in records or _stale(records[key], job):
+            path = folder / f".{table}-{_sha256([key, job.made_of()])}.pt"
+            tasks[key] = replace(job, function=_importable(job.function)), path
     new: dict[str, dict[str, Any]] = {}
     made, last = spread(_record, tasks, workers), 0.0
-    bar = tqdm(total=len(tasks), desc=table, disable=not (progress and tasks))
+    bar = tqdm(total=len(tasks), desc=table, disable=not tasks)
     try:
         with closing(made), bar:
             for key, record in made:
@@ -147,8 +130,12 @@ def run(
 
 
 def _record(task: tuple[Job, Path]) -> dict[str, Any]:
+    """Call a job's function and return a line of the table."""
     job, resume_checkpoint = task
-    return job.record(resume_checkpoint)
+    takes = "resume_checkpoint" in inspect.signature(job.function).parameters
+    more = {"resume_checkpoint": resume_checkpoint} if takes else {}
+    result = _rounded(job.function(**job.arguments, **more))
+    return {"arguments": job.arguments, "made_of": job.made_of(), "result": result}
 
 
 def read(
@@ -180,6 +167,12 @@ def frame(results: Iterable[Result], part: str) -> pd.DataFrame:
     """Concatenate a part of all results (columns or rows), with the arguments as columns."""
     tables = [pd.DataFrame(r[part]).assign(**about) for about, r in results if r.get(part)]
     return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
+
+
+def shares(k: int, n: int) -> tuple[float | None, ...]:
+    """Return k of n in per cent with the ends of its 95 % interval (Wilson); None where n is 0."""
+    ends = binomtest(k, n).proportion_ci(method="wilson") if n else (None, None)
+    return tuple(share and 100 * share for share in (k / n if n else None, *ends))
 
 
 def plain(table: pd.DataFrame | Rows) -> Rows:

@@ -12,6 +12,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from affordlib.world.objects import mesh
 from affordlib.world.robot import ROD_WIDTH_M
 from experiments import runner
 from experiments.commands import command
-from experiments.own_log import NOISE_M, NOISE_RAD
+from experiments.own_log import NOISE_M, NOISE_RAD, executed
 from experiments.runner import Job, Rows
 
 TABLE = "t_on_arm"
@@ -81,19 +82,10 @@ def collect(n: int, seed: int) -> list[dict[str, Any]]:
     """Return n random pushes as arguments of `Log.add`: the rod's path, and noisy poses."""
     rng, found = np.random.default_rng(seed), []
     the_t = PushedObject(np.array(T_M) / 100, ROD_WIDTH_M / 2, LENGTHS_M)
-    with Tabletop() as world:
-        while len(found) < n:
-            world.place(TBlock(), (0.0, 0.0), rng.uniform(-math.pi, math.pi), tool="rod")
-            before = world.object_pose()
-            try:
-                done = world.execute_primitive(primitive_of(the_t.draw(8, rng), 0, before[2]))
-            except UnreachableError:
-                continue
-            if done.faults or done.fell:
-                continue
-            tool = done.tool[:, :2] + done.estimated_xy_m
-            poses = rng.normal([before, world.object_pose()], (NOISE_M, NOISE_M, NOISE_RAD))
-            found.append({"tool_t": np.arange(len(tool)), "tool_xy": tool, "poses": poses})
+    pushes = executed(TBlock(), lambda yaw: primitive_of(the_t.draw(8, rng), 0, yaw), rng)
+    for tool, poses in islice(pushes, n):
+        poses = rng.normal(poses, (NOISE_M, NOISE_M, NOISE_RAD))
+        found.append({"tool_t": np.arange(len(tool)), "tool_xy": tool, "poses": poses})
     return found
 
 

@@ -147,11 +147,8 @@ def frozen_text(world: str = "clean") -> str:
         path = file_at(FROZEN[name])
     except FileNotFoundError as error:
         raise FileNotFoundError(f"{error}; {remedy}") from None
-    try:
-        content = path.read_text(encoding="utf-8")
-        text = "{" + content.partition(",\n")[2]
-    except UnicodeDecodeError:
-        content, text = "damaged", ""
+    content = path.read_text(encoding="utf-8", errors="replace")
+    text = "{" + content.partition(",\n")[2]
     if content != sealed(path.stem, text):
         raise ValueError(f"{path} is damaged, or is not the file of its name; {remedy}")
     return text

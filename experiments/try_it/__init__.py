@@ -112,7 +112,3 @@ def main() -> None:
     """Write the page."""
     write_atomically(PAGE, page(data()), b"<!doctype html>")
     print(f"{PAGE.relative_to(repo_root())}: {PAGE.stat().st_size / 1000:.0f} kB")
-
-
-if __name__ == "__main__":
-    main()

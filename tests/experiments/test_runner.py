@@ -43,13 +43,13 @@ def test_a_killed_run_goes_on_where_it_was(tmp_path):
     DEADLY.add(3)
     jobs = [job(n) for n in (1, 2, 3, 4)]
     with pytest.raises(KeyboardInterrupt):
-        run(jobs, "table", folder=tmp_path, progress=False)
+        run(jobs, "table", folder=tmp_path)
     assert [arguments["n"] for arguments, _ in read("table", job, tmp_path)] == [1, 2]
     assert len(list(tmp_path.glob("*.pt"))) == 1 == len(list(tmp_path.glob(".*.pt")))
-    results = run(jobs, "table", folder=tmp_path, progress=False)
+    results = run(jobs, "table", folder=tmp_path)
     assert CALLS == [1, 2, 3, 3, 4]
     assert not list(tmp_path.glob(".*.pt"))
-    assert run(jobs[::-1], "table", folder=tmp_path, progress=False) == results[::-1]
+    assert run(jobs[::-1], "table", folder=tmp_path) == results[::-1]
     assert len(CALLS) == 5
     assert results[1] == {"rows": [{"k": 0, "square": 0.0}, {"k": 1, "square": 0.333333}]}
     table = frame(read("table", job, tmp_path), "rows")
@@ -79,7 +79,7 @@ def test_what_was_made_of_something_else_is_refused_and_made_again(tmp_path, cha
     def now(n):
         return replace(before(n), **change)
 
-    first = run([before(2)], "table", folder=tmp_path, progress=False)
+    first = run([before(2)], "table", folder=tmp_path)
     with pytest.raises(ValueError, match=f"table: the result of {{'n': 2}} .* another {named}"):
         read("table", now, tmp_path)
     assert read("table", now, tmp_path, accept=True)[0][1] == first[0]
@@ -87,20 +87,20 @@ def test_what_was_made_of_something_else_is_refused_and_made_again(tmp_path, cha
     with pytest.raises(ValueError, match=f"another {named}"):
         read("table", before, tmp_path)
     assert CALLS == [2]
-    run([before(2)], "table", folder=tmp_path, progress=False)
+    run([before(2)], "table", folder=tmp_path)
     assert CALLS == [2, 2]
     assert read("table", lambda n: job(n, settings=Settings(device="cuda")), tmp_path)
 
 
 def test_damaged_results_are_named_and_none_are_no_results(tmp_path):
-    run([job(2)], "table", tmp_path, progress=False)
+    run([job(2)], "table", tmp_path)
     path = tmp_path / "table.jsonl.gz"
     whole = path.read_bytes()
     flipped = bytes([*whole[:-9], whole[-9] ^ 1, *whole[-8:]])
     for content in (b"", whole[:-4], flipped, b"x" + whole[1:], gzip.compress(b"[1]")):
         path.write_bytes(content)
         with pytest.raises(ValueError, match=r"table\.jsonl\.gz is damaged"):
-            run([job(2)], "table", tmp_path, progress=False)
+            run([job(2)], "table", tmp_path)
         assert path.read_bytes() == content
 
 
