@@ -203,7 +203,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             stale = True
         else:
             for path, picture in drawn.items():
-                write_atomically(path, picture, b"</svg>\n")
+                write_atomically(path, picture, b"<?xml")
             write_atomically(page, filled)
     return int(stale)
 

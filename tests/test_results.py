@@ -220,6 +220,8 @@ def test_columns_are_drawn_as_dots_once(tmp_path, monkeypatch, capsys):
     assert {"astar", "gradient", "[mm]"} <= {
         *re.findall(r">([^<]+)</text>", (tmp_path / "some.svg").read_text())
     }
+    page.write_text(block.format("plan_median"))  # drawn anew
+    assert tables.main([str(page)]) == 0
     page.write_text(block.format("mean,tp"))
     assert tables.main([str(page)]) == 1
     assert "['mean', 'tp'] must be headings of one unit" in capsys.readouterr().err
