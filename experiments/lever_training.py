@@ -54,7 +54,6 @@ def augment_by_symmetry(
 MIRRORED: tuple[Symmetry, ...] = ((0, False), (0, True))
 """Reflection augmentation: a lever-up and its mirror image in y (see `augment_by_symmetry`)."""
 
-
 _CHANNELS = {"action_channels": LEVER_ACTION_CHANNELS, "effect_channels": POSE_CHANNELS}
 TRAINING = TrainingConfig(
     steps=1000, n_targets=N_PREDICTED, obs_max=N_OBSERVED, patience=99, beta=0.5, weight_decay=0.1,

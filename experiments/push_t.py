@@ -393,9 +393,8 @@ def film(history: Sequence[Any], path: Path, size: int = 320) -> None:
         draw = ImageDraw.Draw(frame)
         for at, colour in ((GOAL, GOAL_COLOUR), (pose, NEUTRAL)):
             corners = scale * (rotated(np.array(T_PX, dtype=float), at[2]) + np.array(at[:2]))
-            draw.polygon(
-                [*map(tuple, corners)], fill=colour if at is pose else None, outline=colour, width=6
-            )
+            fill = colour if at is pose else None
+            draw.polygon([*map(tuple, corners)], fill=fill, outline=colour, width=6)
         (x, y), radius = scale * np.array(agent), scale * AGENT_PX
         draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill="black")
         frames.append(frame.resize((size, size)).quantize(16))

@@ -37,13 +37,11 @@ TABLE = "t_on_arm"
 BARS_M = ((-0.06, 0.02, 0.06, 0.05), (-0.015, -0.07, 0.015, 0.02))
 """The T's two bars: least x and y, largest x and y [m]."""
 T_M = ((-6, 2), (-1.5, 2), (-1.5, -7), (1.5, -7), (1.5, 2), (6, 2), (6, 5), (-6, 5))
+CENTROID_M = centroid(np.array(T_M) / 100)
 HEIGHT_M, LENGTHS_M = 0.03, (0.005, 0.05)
 N_PUSHES, N_GOALS, DRAWS, MOST_PUSHES, FAR_M = 200, 50, 5, 20, 0.15
 TURN_M, WITHIN_M, WITHIN_RAD = 0.04, 0.005, math.radians(5)
 """Weight of yaw errors [m/rad] relative to position errors; when a goal is reached."""
-
-
-CENTROID_M = centroid(np.array(T_M) / 100)
 
 
 def _corners(bar: Sequence[float]) -> np.ndarray:
