@@ -18,7 +18,7 @@ from affordlib.models.film import FiLMNetwork
 from affordlib.models.training import train
 from affordlib.types import Observations
 from experiments.runner import Rows
-from experiments.shipped import CHECKPOINT_SPECS
+from experiments.shipped import CHECKPOINT_SPECS, one_at_a_time
 
 
 def random_contexts(
@@ -32,31 +32,6 @@ def random_contexts(
     seen = Observations.of(arrays, action, effect, o.weight)
     masks = {"action_mask": o.action_mask, "effect_mask": o.effect_mask}
     return replace(batch, observations=replace(seen, **masks))
-
-
-def sample_literal(tensors: InteractionTensors, obs_max: int, generator: torch.Generator) -> Batch:
-    """Sample as in the paper: one trajectory, k observations, k uniform in 1 … obs_max, one target.
-
-    Action and effect are observed at the same phases; w₁ is 1, 0 or uniform in [0, 1] (1/3 each).
-    """
-
-    def draw(high, n=1):
-        return torch.randint(high, (n,), generator=generator)
-
-    part, last = tensors.select(draw(len(tensors))), len(tensors.phase)
-    at, target_at = draw(last, 1 + int(draw(obs_max))), draw(last)
-    kind, weight = int(draw(3)), torch.rand(1, generator=generator)
-    weight = weight if kind == 2 else torch.tensor([float(kind)])
-    observed = Observations.of(part, part.action_at(at), part.effect_at(at), weight)
-    return Batch.of(part, observed, target_at)
-
-
-def one_at_a_time(
-    arrays: InteractionTensors, n_targets: int, obs_max: int, g: torch.Generator
-) -> Batch:
-    """Sample one trajectory and one target per step, as in the paper."""
-    row = torch.randint(len(arrays), (1,), generator=g)  # any of the batch, augmented or not
-    return sample_literal(arrays.select(row), obs_max, g)
 
 
 def _plain_start(model: FiLMNetwork) -> None:

@@ -213,9 +213,12 @@ CONFIGS: dict[str, PlannerConfig] = {
         f"{name}_pushes": PlannerConfig(plan_gradient, "cnp_500", how, **BY_PLAN)
         for name, how in READINGS.items()
     },
-    "gradient_100_recentred_pushes": PlannerConfig(
-        plan_gradient, "cnp_500", READINGS["gradient_100"], modes=("multi_partial",)
-    ),
+    **{
+        f"gradient_100_recentred_{what}": PlannerConfig(
+            plan_gradient, model, READINGS["gradient_100"], modes=("multi_partial",)
+        )
+        for what, model in (("pushes", "cnp_500"), ("cnp_mixed", "cnp_mixed"))
+    },
     "astar_paper_pushes": PlannerConfig(plan_astar, "cnp_500", **ALL),
     "astar_paper_recorded_pushes": PlannerConfig(plan_astar_recorded, "cnp_500", **ALL),
     # Our planner and A* on our best model.
@@ -272,7 +275,7 @@ CONFIGS |= {
     # Other trainings of the paper's network; goals drawn when all planners were finished.
     **{
         f"{name}_{model}": replace(CONFIGS[f"{name}_pushes"], model=model, sources=("constructed",))
-        for model in TRAINED
+        for model in (*TRAINED, "cnp_published")
         for name in ("gradient_100", "gradient_300", "astar_paper")
     },
     **{

@@ -12,8 +12,8 @@ from affordlib.interactions import InteractionTensors, Scaler, split_interaction
 from affordlib.interactions.dataset import condition_on_recorded_action
 from affordlib.models.evaluation import final_errors_m
 from affordlib.planning import EffectMap
-from experiments.ablation import sample_literal
 from experiments.baselines import constant
+from experiments.shipped import one_at_a_time
 
 
 def fresh(arrays):
@@ -27,7 +27,7 @@ def fresh(arrays):
 
 def test_the_literal_loop_draws_up_to_all_observations(some):
     g = torch.Generator().manual_seed(0)
-    counts = [sample_literal(some, 10, g).observations.action_t.shape[1] for _ in range(200)]
+    counts = [one_at_a_time(some, 1, 10, g).observations.action_t.shape[1] for _ in range(200)]
     assert set(counts) == set(range(1, 11))
 
 
