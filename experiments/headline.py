@@ -27,9 +27,9 @@ def _table(file: str, name: str) -> pd.DataFrame:
 
 def _row(question: str, n: int, *errors_mm: float) -> dict[str, Any]:
     """Return a row; errors_mm: one or two that the paper reports, its network's here, and ours."""
-    *reported, published, ours = (f"{error:.2f}" for error in errors_mm)
+    *reported, method, ours = (f"{error:.2f}" for error in errors_mm)
     row = {"mean error in mm": question, "n": int(n), "reported": " / ".join(reported)}
-    return row | {"as published": published, "ours": ours}
+    return row | {"paper's method": method, "ours": ours}
 
 
 def tables() -> dict[str, list[dict[str, Any]]]:

@@ -16,7 +16,6 @@ such as `mode=multi_partial,single_full`, keeps the rows that have these values,
 import argparse
 import hashlib
 import io
-import math
 import re
 import shlex
 import sys
@@ -48,10 +47,8 @@ SHOWN = {1: "{}", 2: "{} ± {}", 3: "{} ({} to {})"}
 """How the parts of a column are shown, by their number."""
 
 PICTURES = "figures/results"
-LOOKS = [
-    {"color": color, "fmt": marker, "ms": 5}
-    for color, marker in zip(("black", "#888888", "#CC79A7", "#8c6d46"), "osD^", strict=True)
-]
+COLORS = ("black", "#888888", "#CC79A7", "#8c6d46")
+LOOKS = [{"color": c, "fmt": marker, "ms": 5} for c, marker in zip(COLORS, "osD^", strict=True)]
 
 BLOCK = re.compile(
     r"(?P<open>^<!-- table: (?P<what>.*?) -->\n)(?P<body>.*?)(?P<close>^<!-- /table -->$)",
@@ -98,7 +95,7 @@ def markdown_table(
 
 def interval_of(text: str) -> tuple[float, ...]:
     """Return the value of a cell, and the ends of its interval; not a number where it is empty."""
-    value, *more = (*map(float, re.findall(r"-?\d+(?:\.\d+)?", text)), *(math.nan,) * (text == "–"))
+    value, *more = map(float, re.findall(r"-?\d+(?:\.\d+)?", text) or ["nan"])
     if "±" in text:
         more = value - more[0], value + more[0]
     return value, *(more or (value, value))
@@ -124,7 +121,8 @@ def dots(table: str, columns: Sequence[str], about: str) -> bytes:
             y = np.arange(len(rows)) + 0.16 * (n - (len(columns) - 1) / 2)
             ax.errorbar(value, y, xerr=(value - low, high - value), **LOOKS[n], label=name)
         ax.set(yticks=range(len(rows)), yticklabels=names, xlabel=f"[{units.pop()}]")
-        if "%" not in ax.get_xlabel() and np.nanmax(value) > 20 * np.nanmin(value):
+        least, most = ax.dataLim.intervalx
+        if "%" not in ax.get_xlabel() and 0 < 20 * least < most:
             ax.set_xscale("log")
             ax.xaxis.set_major_formatter("{x:g}")
         ax.invert_yaxis()
@@ -153,7 +151,9 @@ def fill_tables(text: str) -> str:
             elif key == "by":
                 shape[key] = value
             elif key == "picture":
-                link = f"\n![The table as dots]({PICTURES}/{value.partition(':')[0]}.svg)\n"
+                file, _, drawn = value.partition(":")
+                alt = ", ".join(drawn.split(",")).replace("_", " ")
+                link = f"\n![For each row as a dot: {alt}.]({PICTURES}/{file}.svg)\n"
             else:
                 columns_of(rows, [key])
                 rows = [row for one in value.split(",") for row in rows if str(row.get(key)) == one]
@@ -167,17 +167,18 @@ def fill_tables(text: str) -> str:
     return filled
 
 
-def pictures(text: str) -> Iterator[tuple[Path, str, Callable[[str], bytes]]]:
-    """Yield for each picture of a filled page its file, a hash of what it shows, how to draw it."""
+def stale_pictures(text: str) -> Iterator[tuple[Path, Callable[[], bytes]]]:
+    """Yield for each picture that shows another table than a filled page its file and a drawing.
+
+    The file holds a hash of what it shows.
+    """
     for block in BLOCK.finditer(text):
-        for asked in re.findall(r" picture=(\S+)", block["what"]):
-            name, _, columns = asked.partition(":")
-            table, columns = (
-                block["body"].partition("\n\n")[0],
-                columns.replace("_", " ").split(","),
-            )
-            about = hashlib.sha256(f"{table}{columns}".encode()).hexdigest()
-            yield from_root(f"{PICTURES}/{name}.svg"), about, partial(dots, table, columns)
+        table = block["body"].partition("\n\n")[0]
+        for name, columns in re.findall(r" picture=([^:]+):(\S+)", block["what"]):
+            heads, path = columns.replace("_", " ").split(","), from_root(f"{PICTURES}/{name}.svg")
+            about = hashlib.sha256(f"{table}{heads}".encode()).hexdigest()
+            if not path.exists() or about not in path.read_text():
+                yield path, partial(dots, table, heads, about)
 
 
 @command(OSError, ValueError)
@@ -191,19 +192,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     for page in options.pages:
         text = page.read_text(encoding="utf-8")
         filled = fill_tables(text)
-        drawn = {
-            p: draw(a)
-            for p, a, draw in pictures(filled)
-            if a not in (p.read_text() if p.exists() else "")
-        }
-        if filled == text and not drawn:
+        pictures = dict(stale_pictures(filled))
+        if filled == text and not pictures:
             continue
         if options.check:
             print(f"out of date; run: python -m experiments.tables {page}", file=sys.stderr)
             stale = True
         else:
-            for path, picture in drawn.items():
-                write_atomically(path, picture, b"<?xml")
+            for path, draw in pictures.items():
+                write_atomically(path, draw(), b"<?xml")
             write_atomically(page, filled)
     return int(stale)
 

@@ -160,4 +160,6 @@ def test_a_hostile_text_in_a_file_is_refused_or_shown_as_text(kind, text, tmp_pa
 @pytest.mark.parametrize("text", TEXTS.values())
 def test_a_picture_takes_any_name(text):
     plan, ax = Plan(Goal((0.1, 0)), (0, 0), (), text[:999], True, 0.0), Figure().subplots()
-    show.plot_outcome(ax, Outcome(plan, 0.0, (0.1, 0.0, 0.0))).figure.savefig(io.BytesIO())
+    show.plot_outcome(ax, Outcome(plan, 0.0, (0.1, 0.0, 0.0)))
+    ax.figure.savefig(io.BytesIO())
+    assert ax.get_title(loc="left").startswith(text[:999])

@@ -90,7 +90,7 @@ class Scene(widgets.VBox):
         self.stop()
 
     def begin(self, goal: Goal | None = None, plan: Plan | None = None) -> None:
-        """Forget what was recorded; bodies are drawn anew, which takes long, for another object."""
+        """Start a recording; only another object is drawn, since that takes up to a second."""
         if self._drawn is not self.world.obj:
             self.place(goal, plan)
         self._frames: list[np.ndarray] = [self.poses()]
