@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
+from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -99,12 +100,14 @@ VERSIONS: dict[Planner, int] = {plan_astar: 2, plan_astar_fine: 2}
 
 
 _PAPER = CHECKPOINT_SPECS["cnp_500"]
+_MIXED = replace(_PAPER, data="mixed")
 TRAINED = {
     **{
-        f"cnp_500_seed_{seed}": replace(_PAPER, training=replace(_PAPER.training, seed=seed))
+        f"{name}_seed_{seed}": replace(spec, training=replace(spec.training, seed=seed))
+        for name, spec in (("cnp_500", _PAPER), ("cnp_mixed", _MIXED))
         for seed in (1, 2)
     },
-    "cnp_mixed": replace(_PAPER, data="mixed"),
+    "cnp_mixed": _MIXED,
     "cnp_yaw": replace(_PAPER, network=CNPConfig(effect_channels=("x", "y", "yaw"))),
 }
 """Networks that are trained for their rows, as `cnp_500` is: with other seeds; on pushes and drags
@@ -206,6 +209,7 @@ READINGS = {
 """Readings of the paper's planner: as printed with 100 and 300 phases, the best of four starts,
 Adam from 20 cm."""
 
+PAPERS = ("gradient_100", "gradient_300", "astar_paper")
 CONFIGS: dict[str, PlannerConfig] = {
     # The paper's planners on its own network. Each action is placed by the plan, as in the paper;
     # `_recentred`, at the object as it is then observed, which differs for several actions only.
@@ -276,7 +280,7 @@ CONFIGS |= {
     **{
         f"{name}_{model}": replace(CONFIGS[f"{name}_pushes"], model=model, sources=("constructed",))
         for model in (*TRAINED, "cnp_published")
-        for name in ("gradient_100", "gradient_300", "astar_paper")
+        for name in PAPERS
     },
     **{
         f"fresh_{name}": replace(CONFIGS[name], world="fresh", sources=("constructed",))
@@ -514,6 +518,25 @@ def variant_rows(records: dict[str, Rows]) -> Rows:
     return rows
 
 
+def training_rows(records: dict[str, Rows]) -> Rows:
+    """Return Table 3 of the paper's planners on all objects: the mean, least and largest of the
+    mean distances with three trainings of its network.
+    """
+    rows: Rows = []
+    for model, planner in product(("cnp_500", "cnp_mixed"), PAPERS):
+        first = f"{planner}_{model}".replace("_cnp_500", "_pushes")
+        names = [first, *(f"{planner}_{model}_seed_{k}" for k in (1, 2))]
+        some = pd.concat([pd.DataFrame(records[n]).assign(by=n) for n in names if n in records])
+        some = some[some["goals"] == "constructed"].groupby(["mode", "by"])["distance_m"]
+        n = some.size().unstack().min(axis=1)[[*MODES]]
+        row = {"planner": planner, "network": model, "n": ", ".join(map(str, n))}
+        for mode, each in some.mean().unstack().iterrows():
+            ends = zip(("mean", "low", "high"), each.agg(["mean", "min", "max"]), strict=True)
+            row |= {f"{mode}_{name}_m": value for name, value in ends}
+        rows.append(row)
+    return plain(rows)
+
+
 def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
     """Return all tables of the evaluated planners."""
     found = {about["config"]: result for about, result in runner.read("planning", job, folder)}
@@ -522,6 +545,7 @@ def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
     return {
         "summary": [*reported.PLANNING_ROWS, *summary_rows(table)],
         "summary_uniform": summary_rows(table, "uniform"),
+        "trainings": training_rows(records),
         "variants": variant_rows(records),
         "error_decomposition": decomposition_rows(table),
     }

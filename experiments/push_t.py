@@ -349,10 +349,10 @@ def errors(row: str, draw: int) -> dict[str, Any]:
 def job(row: str, block: int | None = None, draw: int | None = None) -> Job:
     """Return the job of a block of initial states, or of the errors for a draw of pushes."""
     settings = ROWS[row], PRICE, ROUNDS, LENGTHS_M, FIRST_START, OF_BLOCK
-    checkpoints = (PRETRAINED,) if ROWS[row].model == "np" else ()
+    made = {"checkpoints": (PRETRAINED,), "version": 2} if ROWS[row].model == "np" else {}
     part = {"block": block} if draw is None else {"draw": draw}
     function = solve if draw is None else errors
-    return Job(function, {"row": row} | part, settings, checkpoints=checkpoints)
+    return Job(function, {"row": row} | part, settings, **made)
 
 
 def tables(folder: str = FOLDER) -> dict[str, Rows]:

@@ -155,8 +155,9 @@ def job(protocol: str, predictor: str, told: bool, seed: int, fold: int, logs: s
     """Return the job of one fold of a protocol; the path of the logs is not part of its key."""
     arguments = {"protocol": protocol, "predictor": predictor, "told": told}
     arguments |= {"seed": seed, "fold": fold}
-    settings, checkpoints = (EFFORT, (PRETRAINED,)) if predictor == "np" else ((), ())
-    return Job(partial(measure, logs), arguments, settings, checkpoints=checkpoints, version=2)
+    if predictor == "np":
+        return Job(partial(measure, logs), arguments, EFFORT, checkpoints=(PRETRAINED,), version=3)
+    return Job(partial(measure, logs), arguments, version=2)
 
 
 def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:

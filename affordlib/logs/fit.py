@@ -314,12 +314,11 @@ def _predicted(model: NeuralProcess, data: LoggedPushes, pushes: Pushes) -> tupl
 def sigma_scale(off: Tensor) -> Tensor:
     """Factors (3,) on σ that match the 50 and 90 % intervals of residuals (n, 3), in units of σ.
 
-    x and y share one factor. Factors are shrunk towards 1 with the weight of 20 residuals.
+    x and y share one factor.
     """
     factors = []
     for z in (off[:, :2].abs().flatten(), off[:, 2].abs()):
-        found = (z.quantile(0.5) / 0.6745).log() + (z.quantile(0.9) / 1.6449).log()
-        factors.append((found / 2 * len(z) / (len(z) + 20.0)).exp())
+        factors.append((z.quantile(0.5) / 0.6745 * z.quantile(0.9) / 1.6449).sqrt())
     return torch.stack([factors[0], *factors])
 
 

@@ -151,10 +151,11 @@ def test_tuning_lowers_the_error_where_the_world_is_another():
     assert off[0] < off[1], off
 
 
-def test_sigma_scale_is_that_of_the_residuals_where_there_are_many():
+def test_sigma_scale_is_that_of_the_residuals_of_few_pushes_too():
     off = torch.randn(4000, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([2, 2, 3])
     torch.testing.assert_close(sigma_scale(off), torch.tensor([2.0, 2, 3]), atol=0.1, rtol=0)
-    assert (sigma_scale(off[:1]).log().abs() < 0.2).all()
+    of_ten = torch.stack([sigma_scale(some) for some in off.split(10)]).log().mean(dim=0).exp()
+    torch.testing.assert_close(of_ten, torch.tensor([2.0, 2, 3]), atol=0, rtol=0.12)
 
 
 def test_fit_refuses_what_it_does_not_know():
