@@ -26,9 +26,9 @@ def test_the_chapters_with_checks_have_two_exercises_and_solutions():
 def test_the_notebook_asks_each_exercise_and_leaves_it_open(name):
     cells = nbformat.read(PATHS[name], as_version=4).cells
     text = "\n".join(c.source for c in cells)
-    asked = re.findall(r'check\("(\w\d\.\d)"', text)
-    assert asked == [n for n in EXERCISES if n[:2] == name[:2]]
-    assert all(f"**{number}**" in text for number in asked)
+    numbers = re.findall(r'check\("(\w\d\.\d)"', text)
+    assert numbers == [n for n in EXERCISES if n[:2] == name[:2]]
+    assert all(f"**{number}**" in text for number in numbers)
     shown = [
         output["data"]["text/plain"]
         for cell in cells
@@ -36,7 +36,7 @@ def test_the_notebook_asks_each_exercise_and_leaves_it_open(name):
         for output in cell.get("outputs", [])
         if "data" in output
     ]
-    assert len(shown) == len(asked)
+    assert len(shown) == len(numbers)
     assert all("not attempted" in text for text in shown)
 
 

@@ -39,8 +39,8 @@ def read(name):
 
 
 def default_parameters(name):
-    told = papermill.inspect_notebook(str(PATHS[name])).items()
-    return {parameter: ast.literal_eval(one["default"]) for parameter, one in told}
+    found = papermill.inspect_notebook(str(PATHS[name])).items()
+    return {parameter: ast.literal_eval(one["default"]) for parameter, one in found}
 
 
 def parameters(profile, seed=0):
@@ -60,9 +60,9 @@ def test_parameters(name):
     defaults = default_parameters(name)
     assert defaults["seed"] == 0
     assert defaults["out_dir"] == "runs/lab"
-    told = papermill.inspect_notebook(str(PATHS[name])).values()
-    assert len(told) == len(defaults)
-    for parameter in told:
+    found = papermill.inspect_notebook(str(PATHS[name])).values()
+    assert len(found) == len(defaults)
+    for parameter in found:
         assert parameter["inferred_type_name"] != "None", f"{parameter['name']} has no type"
         assert parameter["help"].strip(), f"{parameter['name']} is not explained"
 

@@ -126,12 +126,12 @@ def test_a_run_leaves_copies_and_results_with_their_parameters(finished):
     copy = nbformat.read(run / "02_second.ipynb", as_version=4)
     assert "3.5\n" in [output.get("text") for output in copy.cells[-1].outputs]  # 7 / 2
     assert copy.metadata.papermill.output_path == f"runs/{RUN}/02_second.ipynb"
-    told = [read_results(run / f"{n}.json")["parameters"] for n in ("01_first", "02_second")]
-    assert [(t["n"], t["seed"]) for t in told] == [(2, 3), (7, 3)]
+    found = [read_results(run / f"{n}.json")["parameters"] for n in ("01_first", "02_second")]
+    assert [(t["n"], t["seed"]) for t in found] == [(2, 3), (7, 3)]
     # The kernel is this interpreter, in the notebooks' folder, whatever is registered.
-    assert told[0]["python"] == sys.executable
-    assert os.path.samefile(told[0]["cwd"], book.root / "notebooks")
-    assert told[0]["backend"].endswith("inline")
+    assert found[0]["python"] == sys.executable
+    assert os.path.samefile(found[0]["cwd"], book.root / "notebooks")
+    assert found[0]["backend"].endswith("inline")
 
 
 @pytest.mark.parametrize(

@@ -81,7 +81,7 @@ def push_rows(pushes: Pushes) -> Tensor:
     return torch.from_numpy(np.concatenate(parts, axis=1)).float()
 
 
-def told_feet(pushes: Pushes) -> Tensor:
+def known_feet(pushes: Pushes) -> Tensor:
     """Known feet (n, k, 3) in units of the radius of gyration; (n, 0, 3) where none are known."""
     known = pushes.context.get("feet", np.zeros((len(pushes), 0, 3)))
     check_feet(known)
@@ -139,8 +139,8 @@ def _features(pushes: Pushes, like: Pushes, of_rows: Sequence[int] = (0, 1, 4, 5
     if like.length_m.std() > 0.05 * like.length_m.mean():
         columns.append(pushes.length_m[:, None] / gyration_radius_m(pushes.outline_m))
     for name in sorted(like.context.keys() - {"feet"}):
-        told, seen = (p.context[name].reshape(len(p), -1).T for p in (pushes, like))
-        for values, known in zip(told, map(np.unique, seen), strict=True):
+        given, seen = (p.context[name].reshape(len(p), -1).T for p in (pushes, like))
+        for values, known in zip(given, map(np.unique, seen), strict=True):
             if len(known) > 1 and values.dtype.kind == "U":
                 columns.append((values[:, None] == known).astype(float))
             elif len(known) > 1:
@@ -252,13 +252,13 @@ def _physics(
             if (key := f"pusher {group}") not in state:
                 known = data.groups == group
                 fitted = data.select(known if known.any() else ~known)
-                rows, told = push_rows(fitted), told_feet(fitted)[0] if feet else None
-                found = AnalyticPusher.fitted(rows[:, :7], rows[:, 7:], told)
+                rows, support = push_rows(fitted), known_feet(fitted)[0] if feet else None
+                found = AnalyticPusher.fitted(rows[:, :7], rows[:, 7:], support)
                 state[key] = np.array([found.friction, found.size])
             some = log.select(log.groups == group)
             pusher = AnalyticPusher(*state[key].tolist())
-            told = told_feet(some)[0] if feet else None
-            mean[log.groups == group] = pusher.predict(push_rows(some)[:, :7], told).numpy()
+            support = known_feet(some)[0] if feet else None
+            mean[log.groups == group] = pusher.predict(push_rows(some)[:, :7], support).numpy()
     left = _outcome(data) - means[0]
     if not process:
         return _in_metres(pushes, means[1], np.sqrt((left**2).mean(axis=0)))
@@ -288,7 +288,7 @@ def _neural_process(data: LoggedPushes, pushes: Pushes, state: State) -> Forecas
 
 def _tuned(model: NeuralProcess, data: LoggedPushes, kept: np.ndarray, seed: int) -> Tensor:
     """Fine-tune on the kept part (n,) of a log; residuals of the rest, in units of σ."""
-    rows, feet = push_rows(data), told_feet(data)
+    rows, feet = push_rows(data), known_feet(data)
     some = [kept & (data.groups == group) for group in np.unique(data.groups)]
     if some := [of_group for of_group in some if of_group.sum() > 1]:
         of_tasks = torch.stack([feet[of_group][0] for of_group in some])
@@ -301,7 +301,7 @@ def _tuned(model: NeuralProcess, data: LoggedPushes, kept: np.ndarray, seed: int
 
 def _predicted(model: NeuralProcess, data: LoggedPushes, pushes: Pushes) -> tuple[Tensor, Tensor]:
     """Mean and σ (n, 3) in the contact frames, given the pushes of the same group as context."""
-    rows, feet, log = push_rows(pushes), told_feet(pushes), push_rows(data)
+    rows, feet, log = push_rows(pushes), known_feet(pushes), push_rows(data)
     mean, std = torch.zeros(len(rows), 3), torch.zeros(len(rows), 3)
     for group in np.unique(pushes.groups):
         known = np.flatnonzero(data.groups == group)

@@ -194,24 +194,6 @@ class Log:
                 self.add(**each)
         return {name: why for name, why in self.refused.items() if before.get(name) is not why}
 
-    def from_contact(self, contact: Any, direction: Any, length: float, pose: Any) -> dict:
-        """Times and path of a tool that was not recorded, as arguments of `add`.
-
-        contact: (2,), on the outline, direction: (2,), of the tool's motion, and length of the
-        motion after contact, all in the world frame; pose: (3,), x, y and yaw before the push.
-        """
-        x, y, yaw = self.centroid_pose(pose)
-        point, ahead = check_array("contact", contact, 2), check_array("direction", direction, 2)
-        point, ahead = point * self._metres, ahead / max(1e-12, np.linalg.norm(ahead))
-        off, edge, on = _nearest(self.outline_m, rotated(point - (x, y), -yaw)[None])
-        within = "the distance of contact from the outline at pose"
-        check_within(within, abs(off.item()), 0.0, DEEP_M, "m")
-        normal = np.array([-edge[0, 1], edge[0, 0]]) / np.linalg.norm(edge)
-        middle = rotated(on[0] - self._radius_m * normal, yaw) + np.array([x, y])
-        end = ahead * check_within("length", length, 0.0, 1e3) * self._metres
-        path = np.stack([middle - BACK_M * ahead, middle + end]) / self._metres
-        return {"tool_t": np.array([0.0, 1.0]), "tool_xy": path}
-
     def split(self, tool_t: Any, tool_xy: Any, poses: Any, poses_t: Any) -> list[dict[str, Any]]:
         """Find the pushes in the recording of a session; returns arguments of `add`, one each.
 

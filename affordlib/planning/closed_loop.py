@@ -262,8 +262,8 @@ class _ClosedLoop:
         """
         if seen.yaw_rad is None:
             expected = None if displaced else self.expected_rad - self.first.yaw_rad
-            told = None if fell else turn_between(self.first.image, seen.image, expected)
-            turn, std = told or (self.reckoned_rad - self.first.yaw_rad, None)
+            seen_turn = None if fell else turn_between(self.first.image, seen.image, expected)
+            turn, std = seen_turn or (self.reckoned_rad - self.first.yaw_rad, None)
             seen = replace(seen, yaw_rad=self.first.yaw_rad + turn, yaw_std_rad=std)
         self.expected_rad = self.reckoned_rad = seen.yaw_rad
         self.first = seen if fell else self.first
@@ -422,8 +422,8 @@ class _ClosedLoop:
             elif not error.is_met(std.get(name, 0.0)):
                 whys.setdefault("observed less exactly than required", []).append(name)
         if whys:
-            told = [f"the {' and '.join(names)} {why}" for why, names in whys.items()]
-            return Ending("unconfirmed", f"{self._where()}: {'; '.join(told)}")
+            parts = [f"the {' and '.join(names)} {why}" for why, names in whys.items()]
+            return Ending("unconfirmed", f"{self._where()}: {'; '.join(parts)}")
         return Ending("reached", self._where())
 
     def _give_up(self, part: str) -> Ending:

@@ -152,7 +152,7 @@ class FreeSpace:
         action: any of them; phase: (n,), where they stop; poses: (n, s, 3), the object's x, y and
         rotation since its image was taken.
         """
-        poses = np.concatenate([poses, poses[:, -1:]], axis=1)  # the last by itself
+        poses = np.concatenate([poses, poses[:, -1:]], axis=1)  # the last alone
         spare = gaps_m(self.polygons, placed(self.outline_m, poses))
         spare = (spare - self.margin_m(poses[:, :-1, :2])).min(axis=1)
         hand = np.empty((len(poses), 2, 3))

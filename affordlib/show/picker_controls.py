@@ -125,10 +125,10 @@ def plan_in_words(plan: Plan) -> str:
     if not plan.reaches_goal and plan.predicted_distance_m <= plan.goal.tolerance_m:
         arrives = " It reaches the goal's position, but not its turn or height."
     std_m = plan.steps[-1].std_m if plan.steps else math.nan
-    unsure = "" if math.isnan(std_m) else f" (σ of the last step {1000 * std_m:.1f} mm)"
+    spread = "" if math.isnan(std_m) else f" (σ of the last step {1000 * std_m:.1f} mm)"
     return (
         f"Plan: {steps}. Predicted to end {1000 * plan.predicted_distance_m:.1f} mm from the goal"
-        f"{unsure}.{arrives} Found in {1000 * plan.plan_s:.0f} ms."
+        f"{spread}.{arrives} Found in {1000 * plan.plan_s:.0f} ms."
     )
 
 

@@ -138,7 +138,7 @@ class Scene(widgets.VBox):
         # 11 bits of each mantissa are half a millimetre at 1 m, and pages of half the size.
         shown = (shown.view(np.int32) & -8192).view(np.float32)
         self.player.playing, self.player.max = False, TICKS * (len(shown) - 1)
-        self.player.value = self.player.max  # before the bodies, which k3d makes anew at this time
+        self.player.value = self.player.max  # before the bodies, which k3d makes again at this time
         for k, part in enumerate(self.bodies):
             part.model_matrix = {str(TICKS * t): frame[k] for t, frame in enumerate(shown)}
 
@@ -172,8 +172,8 @@ class Scene(widgets.VBox):
         """The view, and for a page without a kernel what was recorded, drawn by k3d's script."""
         bundle = super()._repr_mimebundle_(**kwargs)
         data = base64.b64encode(self.plot.get_binary_snapshot()).decode()
-        asked = json.dumps({"last": self.player.max, "height": self.plot.height})
-        script = f"{_SCRIPT.read_text()}(document.currentScript.parentElement, {asked}, '{data}')"
+        about = json.dumps({"last": self.player.max, "height": self.plot.height})
+        script = f"{_SCRIPT.read_text()}(document.currentScript.parentElement, {about}, '{data}')"
         picture = io.BytesIO()
         Image.fromarray(self.world.picture(640, 400)).save(picture, "jpeg", quality=70)
         still = base64.b64encode(picture.getvalue()).decode()

@@ -113,8 +113,8 @@ function weigh(u, out) {
   out[3] = u ** 3 / 6;
 }
 
-// Poses after each action of a chain [direction, phase, …] of an object at the origin, and, if asked
-// for, the variance of the position: that of each action, and that of turns on later actions.
+// Poses after each action of a chain [direction, phase, …] of an object at the origin, and, where
+// wanted, the variance of the position: that of each action, and that of turns on later actions.
 export function rollOut(map, chain, yaw = 0, uncertain = false) {
   let [x, y, turn, trace, turnVariance, cx, cy] = [0, 0, yaw, 0, 0, 0, 0];
   const poses = [];
@@ -282,8 +282,8 @@ export function handAt(hand, phase) {
 // problem: {object: {map, outline, hand, yaw (of the object in the map's image)}, pose [x, y, yaw],
 // goal [x, y], tolerance, most (actions), partial (may stop early), risk (weight of the variance),
 // obstacles, reachable, table [x0, x1, y0, y1], previous (a chain), quick (a smaller search)}.
-export function plan(asked) {
-  const problem = asked.obstacles?.length ? { ...asked, space: spaceOf(asked) } : asked;
+export function plan(query) {
+  const problem = query.obstacles?.length ? { ...query, space: spaceOf(query) } : query;
   const { object, pose, goal, most = 3, tolerance = 0.02 } = problem;
   const target = [goal[0] - pose[0], goal[1] - pose[1]];
   const far = Math.hypot(...target);
@@ -954,17 +954,17 @@ function move([name, numbers], row) { // [] where no view in 3-D is shown
 }
 
 function render({ model, el }) {
-  let [number, chain, thing, reachable, recorded, bodies, began, timer] = [0, [], null, null, [], [], 0, null];
+  let [number, chain, item, reachable, recorded, bodies, began, timer] = [0, [], null, null, [], [], 0, null];
   const scrub = document.createElement("input");
   Object.assign(scrub, { type: "range", min: 0, max: 1, step: "any", hidden: true });
   scrub.setAttribute("aria-label", "Time of the last run");
 
   function draft(xy, obstacles = view.state.obstacles) {
     const { pose, goal, running } = model.get("scene");
-    if (running || !thing?.map) return view.state.steps;
+    if (running || !item?.map) return view.state.steps;
     const { table } = model.get("table");
-    const asked = { object: thing, pose, goal: xy, tolerance: goal.tolerance, reachable, table, obstacles };
-    const planned = plan({ ...asked, previous: chain, quick: true });
+    const query = { object: item, pose, goal: xy, tolerance: goal.tolerance, reachable, table, obstacles };
+    const planned = plan({ ...query, previous: chain, quick: true });
     chain = planned.chain;
     return planned.steps;
   }
@@ -972,7 +972,7 @@ function render({ model, el }) {
   const view = new Table(el, {
     goal(xy, final) {
       number = Math.max(number, model.get("wanted")[2]) + 1;
-      view.svg.dataset.asked = number;
+      view.svg.dataset.query = number;
       Object.assign(view.svg.dataset, { draft: true });
       view.set({ goal: { ...view.state.goal, xy }, steps: draft(xy), searched: [] });
       if (!final) return;
@@ -992,11 +992,11 @@ function render({ model, el }) {
 
   function look() {
     const { map, ...about } = model.get("object");
-    thing = { ...about, map: map && new EffectMap(map) };
+    item = { ...about, map: map && new EffectMap(map) };
     const { reach, ring, seconds } = model.get("table");
     reachable = reach && map ? reachability(reach, map.primitive) : null;
     chain = [];
-    view.set({ object: { ...thing, seconds }, ring });
+    view.set({ object: { ...item, seconds }, ring });
   }
 
   function show() {

@@ -1,6 +1,6 @@
 """Obstacles: fixed bodies that object and arm can touch, and that are in pictures only.
 
-The robot is told where they are; its depth cameras do not see them.
+The robot knows where they are; its depth cameras do not see them.
 """
 
 from collections.abc import Sequence

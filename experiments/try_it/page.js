@@ -14,7 +14,7 @@ const view = new Table(one(".table"), {
   press: (key) => (key === "Enter" ? play() : end()),
 });
 
-// A change by hand: planned for at once, and remembered when the hand lets go.
+// A change by hand: planned for immediately, and remembered when the hand lets go.
 let dragging = false;
 function change(act, final) {
   if (!dragging) undone.push(structuredClone({ pose, goal, obstacles }));
@@ -23,12 +23,12 @@ function change(act, final) {
   replan();
 }
 
-function mapOf(thing) {
-  if (!(thing.map instanceof EffectMap)) {
-    thing.map = new EffectMap(thing.map);
-    thing.reachable = reachability(data.reach, thing.map.primitive);
+function mapOf(item) {
+  if (!(item.map instanceof EffectMap)) {
+    item.map = new EffectMap(item.map);
+    item.reachable = reachability(data.reach, item.map.primitive);
   }
-  return thing;
+  return item;
 }
 
 function problem() {
@@ -42,11 +42,11 @@ function problem() {
 
 function replan() {
   stop();
-  const asked = problem();
-  shown = plan(asked);
+  const query = problem();
+  shown = plan(query);
   chain = shown.chain;
   const { sigma, swept, compare } = form.elements;
-  const full = asked.partial && (compare.checked || !view.held) ? plan({ ...asked, partial: false, previous: null }) : null;
+  const full = query.partial && (compare.checked || !view.held) ? plan({ ...query, partial: false, previous: null }) : null;
   view.set({
     object, pose, goal: { xy: goal, tolerance: 0.01 }, steps: shown.steps, obstacles,
     other: compare.checked && full ? full.steps : null,
@@ -170,15 +170,15 @@ form.addEventListener("reset", () => setTimeout(() => {
   replan();
 }));
 
-objects.forEach((thing, k) => {
+objects.forEach((item, k) => {
   const choice = document.createElement("button");
-  const points = thing.outline.map(([x, y]) => [22 + 380 * x, 18 - 380 * y].join()).join(" ");
+  const points = item.outline.map(([x, y]) => [22 + 380 * x, 18 - 380 * y].join()).join(" ");
   choice.type = "button";
   choice.setAttribute("role", "radio");
-  choice.innerHTML = `<svg viewBox="0 0 44 36" aria-hidden="true"><polygon points="${points}"/></svg>${escaped(thing.name)}` +
-    `<small class="${thing.known ? "" : "new"}">${thing.known ? "known kind" : "never seen"}</small>`;
+  choice.innerHTML = `<svg viewBox="0 0 44 36" aria-hidden="true"><polygon points="${points}"/></svg>${escaped(item.name)}` +
+    `<small class="${item.known ? "" : "new"}">${item.known ? "known kind" : "never seen"}</small>`;
   choice.addEventListener("click", () => {
-    [object, chain] = [thing, []];
+    [object, chain] = [item, []];
     choose();
   });
   choice.addEventListener("keydown", (event) => {

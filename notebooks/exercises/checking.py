@@ -22,7 +22,7 @@ WRONG: Counter[str] = Counter()
 
 @dataclass(frozen=True)
 class Exercise:
-    """What is asked, and how an answer is measured.
+    """The question, and how an answer is measured.
 
     figure: the answer's figure, in `unit`; it passes if it lies within `within` of `expected`.
     """
@@ -44,7 +44,7 @@ class Verdict:
     figure: float | None = None
     why: str = ""
     hint: str = ""
-    told: bool = False
+    shown: bool = False
 
     @property
     def passed(self) -> bool:
@@ -57,7 +57,7 @@ class Verdict:
         if self.status == "not attempted":
             return f"{line}. {exercise.asks}"
         line += f" ({self.why})" if self.why else f", {self.figure:.4g} {exercise.unit}"
-        if self.told or self.passed:
+        if self.shown or self.passed:
             line += f"; expected {exercise.expected:g} ± {exercise.within:g} {exercise.unit}"
         return f"{line}. Hint: {self.hint}" if self.hint else line
 
@@ -91,8 +91,8 @@ def judge(exercises: Mapping[str, Exercise], name: str, attempt: Any) -> Verdict
     WRONG[name] += 1
     hints = HINTS[name]
     hint = hints[min(WRONG[name], len(hints)) - 1]
-    told = callable(attempt) or figure != attempt
-    return Verdict(name, exercise, "failed", figure, why, hint, told)
+    shown = callable(attempt) or figure != attempt
+    return Verdict(name, exercise, "failed", figure, why, hint, shown)
 
 
 class _NotAttempted(Exception):
@@ -103,7 +103,7 @@ def _is_empty(answer: Any) -> bool:
     return answer is None or answer is Ellipsis
 
 
-def asked(function: Callable[..., Any], *arguments: Any) -> np.ndarray:
+def answer_of(function: Callable[..., Any], *arguments: Any) -> np.ndarray:
     """What the reader's function gives, as numbers."""
     return np.asarray(answered(function, *arguments), dtype=float)
 

@@ -62,7 +62,7 @@ HINTS: dict[str, tuple[str, str]] = {
         "Ask for the direction minus the turn so far; rotate the answer by the direction.",
     ),
     "06.2": (
-        "Try many directions and phases at once: `effects` takes tensors.",
+        "Try many directions and phases together: `effects` takes tensors.",
         "`ahead` and `left` are in the push frame: rotate them before you compare with the goal.",
     ),
     "06.3": (

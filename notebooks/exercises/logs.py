@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from affordlib.geometry import rotated, unit_vector
-from exercises.checking import Exercise, asked
+from exercises.checking import Exercise, answer_of
 
 
 def _effect_error(effect: Callable[..., Any]) -> float:
@@ -20,7 +20,7 @@ def _effect_error(effect: Callable[..., Any]) -> float:
         middle = xy + rotated(centroid, yaw) + rotated(moved, heading)
         end_yaw = (yaw + turn + np.pi) % (2 * np.pi) - np.pi
         end = middle - rotated(centroid, end_yaw)
-        got = asked(effect, (*xy, yaw), (*end, end_yaw), centroid, heading)
+        got = answer_of(effect, (*xy, yaw), (*end, end_yaw), centroid, heading)
         worst = max(worst, float(np.abs(got - (*moved, turn)).max()))
     return 1000 * worst
 
@@ -32,7 +32,7 @@ def _mirror_error(mirrored: Callable[..., Any]) -> float:
         contact, moved, angle, turn = *rng.normal(size=(2, 2)), *rng.normal(size=2)
         flip = np.array([1, -1])
         truth = *(flip * contact), *(flip * unit_vector(angle)), *(flip * moved), -turn
-        got = asked(mirrored, contact, unit_vector(angle), moved, turn)
+        got = answer_of(mirrored, contact, unit_vector(angle), moved, turn)
         worst = max(worst, float(np.abs(got - truth).max()))
     return worst
 
@@ -45,7 +45,7 @@ def _standoff_error(standoff: Callable[..., Any]) -> float:
         radius, clear = rng.uniform(0.001, 0.02, 2)
         normal, direction = unit_vector(np.pi * facing), unit_vector(np.pi * facing + 0.8 * aside)
         truth = contact - radius * normal - clear / (normal @ direction) * direction
-        got = asked(standoff, contact, normal, direction, radius, clear)
+        got = answer_of(standoff, contact, normal, direction, radius, clear)
         worst = max(worst, float(np.abs(got - truth).max()))
     return 1000 * worst
 
@@ -61,7 +61,7 @@ def _choice_error(chosen: Callable[..., Any]) -> float:
         )
         price = rng.uniform(0, 0.5)
         best = int((off_m + price * now_m * pushes).argmin())
-        wrong += int(asked(chosen, off_m, pushes, price, now_m).item() != best)
+        wrong += int(answer_of(chosen, off_m, pushes, price, now_m).item() != best)
     return 2.0 * wrong
 
 

@@ -15,7 +15,7 @@ from affordlib.interactions import (
     split_interactions,
 )
 from affordlib.models import coverage, load_checkpoint, network_predictions
-from exercises.checking import Exercise, asked
+from exercises.checking import Exercise, answer_of
 
 # 03 The affordance network
 
@@ -48,7 +48,7 @@ def _drawn_length(
     """How many times as long as the real trajectories those are that the reader draws."""
     mean, sigma, truth = _marginals()
     rng = np.random.default_rng(0)
-    drawn = np.stack([asked(draw, m, s, rng) for m, s in zip(mean, sigma, strict=True)])
+    drawn = np.stack([answer_of(draw, m, s, rng) for m, s in zip(mean, sigma, strict=True)])
     if drawn.shape != mean.shape:
         raise ValueError(f"a trajectory has the shape {mean.shape[1:]}, got {drawn.shape[1:]}")
     spread = float(((drawn - mean) / sigma).std())
@@ -69,7 +69,7 @@ def _lopsided_mm(lopsided_m: Callable[..., float]) -> float:
         some = InteractionTensors.from_dataset(
             open_interactions("push_test"), np.arange(200), *channels
         )
-        return 1000 * float(asked(lopsided_m, model, some))
+        return 1000 * float(answer_of(lopsided_m, model, some))
 
     ours = by("film_500")
     if abs(ours) > 0.01:

@@ -26,7 +26,7 @@ from affordlib.planning.rollout import poses_along
 from affordlib.primitives import Grasp, Push
 from affordlib.types import Goal, Observation, Obstacle, Plan, Step
 from affordlib.world import Cuboid, Prism, Tabletop, UprightCylinder
-from exercises.checking import Exercise, answered, asked
+from exercises.checking import Exercise, answer_of, answered
 from exercises.world import rest_cm
 
 BOX = Cuboid(length=0.07, width=0.05, height=0.05)
@@ -52,7 +52,7 @@ def _right_percent(reaches: Callable[[np.ndarray], bool]) -> float:
     *_, ends = _box_effects().fine_grid
     true = ends[False].query(goals)[0] < Goal((0.0, 0.0)).tolerance_m
     return 100 * float(
-        np.mean([bool(asked(reaches, g)) == t for g, t in zip(goals, true, strict=True)])
+        np.mean([bool(answer_of(reaches, g)) == t for g, t in zip(goals, true, strict=True)])
     )
 
 
@@ -66,7 +66,7 @@ def _chain_error_mm(chain_end: Callable[..., Any]) -> float:
     phase = torch.from_numpy(rng.uniform(0.6, 1.0, (50, 3)))
     with torch.no_grad():
         ends = roll_out(effects, direction, phase)[0][:, -1].numpy()
-        given = [asked(chain_end, effects, d, p) for d, p in zip(direction, phase, strict=True)]
+        given = [answer_of(chain_end, effects, d, p) for d, p in zip(direction, phase, strict=True)]
     return 1000 * float(np.hypot(*(np.array(given) - ends).T).max())
 
 
@@ -76,7 +76,7 @@ def _push_error_mm(choose: Callable[..., Any]) -> float:
     with Tabletop() as world:
         for bearing, far_m in ((0.2, 0.03), (1.5, 0.04), (2.8, 0.05), (-1.9, 0.06), (-0.6, 0.07)):
             goal = far_m * np.array([math.cos(bearing), math.sin(bearing)])
-            direction, phase = asked(choose, _box_effects(), goal)
+            direction, phase = answer_of(choose, _box_effects(), goal)
             world.place(BOX, yaw_rad=YAW_RAD)
             went = world.execute_primitive(Push.towards(float(direction)), float(phase))
             off.append(math.dist(goal, went.rest_effect[:2]))
@@ -90,7 +90,7 @@ def _gap_error_mm(gap_m: Callable[..., Any]) -> float:
         triangle = ring(0.03)[np.sort(rng.choice(5, 3, replace=False)) * 3]
         other = placed(BOX.footprint_m, rng.uniform(-0.07, 0.07, 3) * (1, 1, 40))
         expected = gaps_m([other], triangle[None, None].repeat(2, axis=1), far_m=1.0)[0, 0]
-        off.append(abs(float(asked(gap_m, triangle, other)) - expected))
+        off.append(abs(float(answer_of(gap_m, triangle, other)) - expected))
     return 1000 * max(off)
 
 
@@ -108,7 +108,7 @@ def _stop_error_mm(last_phase: Callable[..., Any]) -> float:
                 shapes = placed(effects.outline_m, poses)
                 return float(gaps_m([corners_of(wall)], shapes, far_m=1.0)[0, 0])
 
-            stop = float(asked(last_phase, gap_at, margin_m))
+            stop = float(answer_of(last_phase, gap_at, margin_m))
             world.execute_primitive(Push.towards(0.0), stop, approach=True)
             end = np.array([[world.object_pose()] * 2])
             gap = gaps_m([corners_of(wall)], placed(BOX.footprint_m, end), far_m=1.0)[0, 0]
@@ -157,7 +157,7 @@ def _lift_error_mm(stop_at: Callable[..., Any]) -> float:
         for height_m in (0.03, 0.09, 0.18):
             world.place(UprightCylinder(0.045, 0.06))
             grasp = predict_trajectories(model, world.depth_image(), Grasp(), "z", [0.0])
-            stop = float(asked(stop_at, height_m, grasp.phase, grasp.mean[0]))
+            stop = float(answer_of(stop_at, height_m, grasp.phase, grasp.mean[0]))
             off.append(abs(world.execute_primitive(Grasp(), stop).effect[-1, 2] - height_m))
     return 1000 * max(off)
 
@@ -187,7 +187,7 @@ def _house(rng: np.random.Generator) -> Prism:
 
 def _told_apart_percent(strangeness: Callable[..., Any]) -> float:
     """Share [%] of pairs of a known object and a house of which the house is the stranger."""
-    known, houses = ([float(asked(strangeness, image)) for image in some] for some in _looks())
+    known, houses = ([float(answer_of(strangeness, image)) for image in some] for some in _looks())
     more = np.subtract.outer(houses, known)
     return 100 * float((more > 0).mean() + 0.5 * (more == 0).mean())
 

@@ -10,7 +10,7 @@ import numpy as np
 from affordlib.interactions import open_interactions
 from affordlib.primitives import DURATION_S, Push
 from affordlib.world import CATEGORIES, Cuboid, Prism, Tabletop, UprightCylinder
-from exercises.checking import Exercise, asked
+from exercises.checking import Exercise, answer_of
 
 # 01 The tabletop
 
@@ -20,7 +20,7 @@ def _worst_speed_error(speed_m_s: Callable[[float], float]) -> float:
     t, dt = np.linspace(0.05, 0.95, 19), 1e-4
     ahead, behind = (Push.towards(0.0).path(t + side * dt)[:, 0] for side in (1, -1))
     true = (ahead - behind) / (2 * dt * DURATION_S)
-    return 1000 * max(abs(asked(speed_m_s, float(k)) - v) for k, v in zip(t, true, strict=True))
+    return 1000 * max(abs(answer_of(speed_m_s, float(k)) - v) for k, v in zip(t, true, strict=True))
 
 
 def rest_cm(phase: float, yaw_rad: float) -> float:
@@ -49,7 +49,7 @@ def _standing() -> tuple[list[np.ndarray], list[float]]:
 def _volume_error_percent(volume_cm3: Callable[[np.ndarray], float]) -> float:
     images, true = _standing()
     return 100 * float(
-        np.mean([abs(asked(volume_cm3, i) / v - 1) for i, v in zip(images, true, strict=True)])
+        np.mean([abs(answer_of(volume_cm3, i) / v - 1) for i, v in zip(images, true, strict=True)])
     )
 
 
@@ -68,7 +68,7 @@ def _cylinders() -> tuple[np.ndarray, np.ndarray]:
 
 def _cylinder_error_mm(end_m: Callable[[float], float]) -> float:
     diameters, true = _cylinders()
-    given = np.array([asked(end_m, float(d)) for d in diameters])
+    given = np.array([answer_of(end_m, float(d)) for d in diameters])
     return 1000 * float(np.abs(given - true).mean())
 
 

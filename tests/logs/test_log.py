@@ -348,20 +348,6 @@ def test_a_turn_is_not_read_as_a_tilt(order, about, turn_deg):
             planar(rows, {"xyzw": "wxyz", "wxyz": "xyzw"}[order])
 
 
-def test_a_push_without_a_path_is_known_by_contact_direction_and_length():
-    log = Log("mm", TRIANGLE_MM, tool_radius=3)
-    contact = rotated(np.array([30.6, 0.0]), 0.3) + START[:2]
-    ahead = rotated(np.array([5.0, 16.0]), 0.3)
-    known = log.from_contact(contact, ahead, 14.0, START)
-    log.add(**known, poses=(START, END))
-    data = log.pushes()
-    np.testing.assert_allclose(data.contact_m[0], [-0.0194, -0.05], atol=1e-6)
-    np.testing.assert_allclose(data.direction[0], np.array([5, 16]) / np.hypot(5, 16), atol=1e-9)
-    assert data.length_m[0] == pytest.approx(0.014)
-    with pytest.raises(ValueError, match="distance of contact from the outline at pose"):
-        log.from_contact(np.add(contact, (0, -9)), ahead, 14.0, START)
-
-
 @pytest.mark.parametrize(
     ("unit", "size", "times"),
     [

@@ -100,14 +100,14 @@ def test_analytic_pusher_finds_the_numbers_that_made_the_pushes(simulated):
 
 def test_order_of_context_and_what_is_not_seen_do_not_matter(shipped, simulated):
     rows, feet, _ = simulated
-    query, context, told = rows[:4, 32:], rows[:4, :20], feet[:4]
+    query, context, given = rows[:4, 32:], rows[:4, :20], feet[:4]
     with torch.no_grad():
-        expected = shipped(query, context, told)
+        expected = shipped(query, context, given)
         order = torch.randperm(20, generator=torch.Generator().manual_seed(0))
-        got = shipped(query, context[:, order], told.flip(1))
+        got = shipped(query, context[:, order], given.flip(1))
         seen = torch.arange(32).expand(4, -1) < 20
-        hidden = shipped(query, rows[:4, :32], told, seen)
-        alone = shipped(query[:, 3:4], context, told)
+        hidden = shipped(query, rows[:4, :32], given, seen)
+        alone = shipped(query[:, 3:4], context, given)
     for mine, other, masked, one in zip(expected, got, hidden, alone, strict=True):
         torch.testing.assert_close(mine, other, atol=1e-5, rtol=0)
         torch.testing.assert_close(mine, masked, atol=1e-5, rtol=0)
@@ -127,9 +127,9 @@ def test_prediction_turns_and_mirrors_with_the_object(shipped, simulated):
 def test_context_and_feet_make_predictions_better(shipped, simulated):
     rows, feet, truth = simulated
     truth, off = in_contact_frame(rows, truth)[:, 32:], []
-    for n, told in ((0, 0), (5, 0), (20, 0), (0, 1)):
+    for n, given in ((0, 0), (5, 0), (20, 0), (0, 1)):
         with torch.no_grad():
-            mean, std = shipped(rows[:, 32:], rows[:, :n], feet * told)
+            mean, std = shipped(rows[:, 32:], rows[:, :n], feet * given)
         assert bool((std > 0).all())
         off.append(float((mean - truth).norm(dim=-1).mean()))
     assert off[0] > off[1] > off[2], off

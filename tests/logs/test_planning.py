@@ -9,7 +9,7 @@ import torch
 
 from affordlib.geometry import cross, rotated, wrap_angle
 from affordlib.logs import PushedObject, PushPlanner
-from affordlib.logs.fit import in_object_frame, push_rows, told_feet
+from affordlib.logs.fit import in_object_frame, known_feet, push_rows
 from affordlib.logs.log import _nearest
 from affordlib.logs.neural_process import load_neural_process
 from affordlib.logs.planning import primitive_of
@@ -41,7 +41,7 @@ class Pretrained:
     network = load_neural_process()
 
     def predict(self, pushes):
-        feet, none = told_feet(pushes)[0], torch.zeros(0, 10)
+        feet, none = known_feet(pushes)[0], torch.zeros(0, 10)
         predicted = self.network.predict(push_rows(pushes)[:, :7], none, feet)
         return in_object_frame(pushes, *predicted)
 

@@ -29,10 +29,10 @@ def test_no_model_sees_what_it_has_to_foresee(untrained, levered):
     for protocol, last in zip(PROTOCOLS, (N_OBSERVED - 1, 0, 0), strict=True):
         later = levered.effect.clone()
         later[:, last + 1 :] += 0.05
-        told, _ = predict_steps(untrained, levered, protocol)
+        found, _ = predict_steps(untrained, levered, protocol)
         again, truth = predict_steps(untrained, replace(levered, effect=later), protocol)
-        torch.testing.assert_close(told.effect_mean, again.effect_mean)
-        assert truth.shape == told.effect_mean.shape == told.effect_std.shape
+        torch.testing.assert_close(found.effect_mean, again.effect_mean)
+        assert truth.shape == found.effect_mean.shape == found.effect_std.shape
 
 
 def test_an_anchored_network_begins_where_the_object_is(levered):
@@ -40,8 +40,8 @@ def test_an_anchored_network_begins_where_the_object_is(levered):
     seen = condition_on_poses(levered, torch.zeros(len(levered), dtype=torch.long), 10)
     t = levered.phase[[9]].expand(len(levered), -1)
     with torch.no_grad():
-        told = model.predict(model.encode(levered.image), seen, t)
-    torch.testing.assert_close(told.effect_mean[:, 0], levered.effect[:, 9], atol=1e-5, rtol=0)
+        found = model.predict(model.encode(levered.image), seen, t)
+    torch.testing.assert_close(found.effect_mean[:, 0], levered.effect[:, 9], atol=1e-5, rtol=0)
 
 
 def test_a_rollout_does_not_depend_on_how_far_it_is_asked(levered):

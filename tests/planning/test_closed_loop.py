@@ -219,12 +219,12 @@ def test_what_the_arm_cannot_do_is_refused_before_any_motion():
     went = loop(hands, Goal((0.0, 0.0), height_m=0.1))
     assert (went.status, went.steps) == ("unreachable", ())
     assert went.message.endswith("left: the arm cannot grasp at (0.000, 0.000) m")
-    asked = []
-    hands.refuses = lambda primitive, at: asked.append(primitive.grip_yaw) or len(asked) < 3
+    tried = []
+    hands.refuses = lambda primitive, at: tried.append(primitive.grip_yaw) or len(tried) < 3
     went = loop(hands, Goal((0.0, 0.0), turn_rad=0.5))
     assert went.reached
-    assert went.steps[0].primitive.grip_yaw == asked[-1]
-    assert len(set(asked)) == 3
+    assert went.steps[0].primitive.grip_yaw == tried[-1]
+    assert len(set(tried)) == 3
 
 
 def test_a_far_goal_is_reached_round_what_the_arm_cannot_do():
@@ -307,10 +307,10 @@ def test_a_slip_is_noticed_by_the_fingers(slips, status):
 
 
 def test_corrections_bring_it_nearer_and_stop_where_enough():
-    goal, asked = Goal((0.1, 0.04)), []
+    goal, tried = Goal((0.1, 0.04)), []
 
     def replan(image, xy, goal):
-        asked.append(goal.tolerance_m)
+        tried.append(goal.tolerance_m)
         return plan_continuous(problem_of(point_skills().model(Push), image, xy, goal))
 
     robot = PointRobot()
@@ -319,7 +319,7 @@ def test_corrections_bring_it_nearer_and_stop_where_enough():
     closed = corrected(robot, execute_plan(robot, plan), replan, 2)
     assert closed.distance_m == goal.distance_m(robot.xy_m) < 0.5 * open_loop.distance_m
     assert len(plan.steps) < len(closed.object_paths_xy_m) <= len(plan.steps) + 2
-    assert set(asked) == {0.0003}
+    assert set(tried) == {0.0003}
     none = Plan(goal, goal.xy_m, (), "none", True, 0.0)
     there = PointRobot(plan.goal.xy_m)
     assert corrected(there, execute_plan(there, none), replan, 2).object_paths_xy_m == ()

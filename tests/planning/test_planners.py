@@ -179,10 +179,10 @@ def test_segments_of_the_recorded_part_are_the_papers_180_branches():
 
 def test_a_search_goes_on_where_the_end_cannot_be_had(film, cuboid_image):
     """A node within the tolerance does not count if the goal's turn is unreachable there."""
-    goal, asked = Goal((0.08, 0.0), turn_rad=0.1), []
+    goal, tried = Goal((0.08, 0.0), turn_rad=0.1), []
 
     def only_beyond(goal, xy_m, turned_rad):
-        asked.append(xy_m)
+        tried.append(xy_m)
         return () if xy_m[0] > 0.085 else None
 
     two = planning.PlanMode(2, partial=True)
@@ -190,9 +190,9 @@ def test_a_search_goes_on_where_the_end_cannot_be_had(film, cuboid_image):
     table = BranchTable(problem.effects)
     chain, reached = search(problem, table)
     assert reached
-    assert len(asked) > 1
-    assert asked[-1][0] > 0.085
-    assert all(goal.distance_m(xy) <= goal.tolerance_m for xy in asked)
+    assert len(tried) > 1
+    assert tried[-1][0] > 0.085
+    assert all(goal.distance_m(xy) <= goal.tolerance_m for xy in tried)
     one = planning.PlanMode(1, partial=True)
     assert not search(replace(problem, mode=one, pose_planner=lambda *_: None), table)[1]
     assert len(chain) >= 1

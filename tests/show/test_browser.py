@@ -166,7 +166,7 @@ class Table:
 
     def wait_for_answer(self):
         self.page.wait_for_function(
-            "svg => Number(svg.dataset.answered) >= Number(svg.dataset.asked ?? 0)"
+            "svg => Number(svg.dataset.answered) >= Number(svg.dataset.query ?? 0)"
             " && svg.dataset.draft === 'false' && svg.dataset.planning === 'false'",
             arg=self.svg.element_handle(),
         )
@@ -197,12 +197,12 @@ def wait_for_words(page, text, seconds=40):
 def assert_same_goal(page, table, x_m, y_m, within_m=0.0011):
     """Check that Python's goal, the sliders and the drawing agree."""
     table.wait_for_answer()
-    asked = goal_of(page)
-    assert asked == pytest.approx((x_m, y_m), abs=within_m)
-    np.testing.assert_allclose(table.goal(), asked, atol=3e-4)
+    wanted = goal_of(page)
+    assert wanted == pytest.approx((x_m, y_m), abs=within_m)
+    np.testing.assert_allclose(table.goal(), wanted, atol=3e-4)
     shown = page.locator(".affordlib-picker .widget-readout").all_inner_texts()[:2]
     assert [float(text.replace("−", "-")) for text in shown] == pytest.approx(
-        [100 * v for v in asked]
+        [100 * v for v in wanted]
     )
 
     def drawn_is_planned():  # a better plan may follow the first
@@ -445,7 +445,7 @@ def test_the_browser_plans_while_the_hand_drags(page, table):
         page.mouse.move(*table.at(0.05 + 0.02 * share, 0.09))
         drawn = table.points(".prediction")
         assert np.hypot(*(drawn[-1] - table.goal())) < 0.003
-        assert ask(page, "list(picker.plan.goal.xy_m)") == before  # not yet asked for
+        assert ask(page, "list(picker.plan.goal.xy_m)") == before  # not yet wanted for
     page.mouse.up()
     assert_same_goal(page, table, 0.07, 0.09)
 
@@ -487,8 +487,8 @@ def test_a_saved_notebook_keeps_a_picture(page, lab):
 
 
 def test_no_request_leaves_the_machine(page, lab):
-    asked = [url for url in page.requests if not url.startswith(("data:", "blob:"))]
-    assert {urlparse(url).netloc for url in asked} == {urlparse(lab.address).netloc}
+    wanted = [url for url in page.requests if not url.startswith(("data:", "blob:"))]
+    assert {urlparse(url).netloc for url in wanted} == {urlparse(lab.address).netloc}
     assert any("ws" in urlparse(url).scheme for url in page.requests)
     assert page.locator("text=Would you like to get notified").count() == 0
 

@@ -34,10 +34,10 @@ def state_of(explorer, *at):
 
 @pytest.mark.slow
 def test_what_is_observed_decides_what_is_predicted(explorer, trained, push):
-    told = condition_on_primitives(trained, [push.primitive])
+    context = condition_on_primitives(trained, [push.primitive])
     t = torch.linspace(0, 1, 31)[None]
     with torch.no_grad():
-        plain = trained.predict(trained.encode(torch.tensor(push.image)[None]), told, t)
+        plain = trained.predict(trained.encode(torch.tensor(push.image)[None]), context, t)
     _, line, dots = explorer.panels["effect, x [cm], over phase"]
     alone = line.y[state_of(explorer, 4, 7, 4)]
     np.testing.assert_allclose(alone, 100 * plain.effect_mean[0, :, 0], atol=2e-3)

@@ -113,7 +113,7 @@ def test_lines_and_words_stand_out_from_the_table():
     styles = str(TableView._css).split("@media")
     for style in map(str, styles):
         colour = dict(re.findall(r"--([\w-]+): (#\w{6})", style))
-        wanted = {"ink": 4.5, "goal": 3, "prediction": 3, "truth": 2.9, "thing-rim": 3, "rim": 3}
+        wanted = {"ink": 4.5, "goal": 3, "prediction": 3, "truth": 2.9, "object-rim": 3, "rim": 3}
         for name, least in wanted.items():
             for ground in ("ground", "reach"):
                 pair = sorted(luminance(colour[one]) + 0.05 for one in (name, ground))
@@ -368,7 +368,7 @@ def test_the_robot_is_shown_in_3d_as_it_moved(make_picker, world):
     picker.pick(0.1, 0.06)
     scene, bodies = picker.scene, [*picker.scene.plot.objects]
     picker.run()
-    assert scene.plot.objects == bodies, "drawn anew, bodies stop the page for a second"
+    assert scene.plot.objects == bodies, "drawn again, bodies stop the page for a second"
     shown = [list(body.model_matrix.values()) for body in scene.bodies]
     frames = np.swapaxes(shown, 0, 1)
     assert scene.player.max == 2 * (len(frames) - 1) > 100

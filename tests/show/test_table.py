@@ -26,12 +26,12 @@ OBJECTS = {
 ASK = """
 import fs from "node:fs";
 import { EffectMap, plan, reachability, spare } from "./table.mjs";
-const { reach, object, asked } = JSON.parse(fs.readFileSync("asked.json"));
+const { reach, object, queries } = JSON.parse(fs.readFileSync("queries.json"));
 object.map = new EffectMap(object.map);
 const reachable = reach && reachability(reach, object.map.primitive);
 const answer = ({ action, ...one }) =>
   action ? spare({ object, ...one }, ...action) : plan({ object, reachable, ...one });
-console.log(JSON.stringify(asked.map(answer)));
+console.log(JSON.stringify(queries.map(answer)));
 """
 
 
@@ -43,9 +43,9 @@ def ask(tmp_path_factory):
     shutil.copy(Path(show.__file__).with_name("table.js"), folder / "table.mjs")
     (folder / "ask.mjs").write_text(ASK)
 
-    def plans(data, asked, reach=None):
-        question = {"object": data, "asked": asked, "reach": reach}
-        (folder / "asked.json").write_text(json.dumps(question))
+    def plans(data, queries, reach=None):
+        question = {"object": data, "queries": queries, "reach": reach}
+        (folder / "queries.json").write_text(json.dumps(question))
         command = [node, "ask.mjs"]
         done = subprocess.run(command, cwd=folder, capture_output=True, timeout=120, check=False)
         assert not done.returncode, done.stderr.decode()
@@ -73,8 +73,8 @@ def goals(n, seed, far_m=0.24):
 @pytest.mark.parametrize("name", OBJECTS)
 def test_the_browser_predicts_what_the_effect_map_predicts(ask, seen, skills, name):
     _, effects, data = seen[name]
-    asked = [{"pose": [0.01, -0.02, 0.7], "goal": goal} for goal in goals(80, 0)]
-    found = ask(data, asked, table_data(skills)["reach"])
+    queries = [{"pose": [0.01, -0.02, 0.7], "goal": goal} for goal in goals(80, 0)]
+    found = ask(data, queries, table_data(skills)["reach"])
     assert sum(len(plan["steps"]) > 1 for plan in found) > 20
     assert len(json.dumps(data)) < 60_000
     for plan in found:
@@ -97,8 +97,8 @@ def test_the_browser_reaches_what_python_reaches(ask, seen, skills):
     for name in ("box", "roller"):
         image, _, data = seen[name]
         wanted = goals(25, 1)
-        asked = [{"pose": [0, 0, 0], "goal": g} for g in wanted]
-        found = ask(data, asked, table_data(skills)["reach"])
+        queries = [{"pose": [0, 0, 0], "goal": g} for g in wanted]
+        found = ask(data, queries, table_data(skills)["reach"])
         for goal, plan in zip(wanted, found, strict=True):
             best = plan_continuous(skills.problem(image, (0.0, 0.0), Goal(tuple(goal))))
             if best.predicted_distance_m < 5e-4:
@@ -108,10 +108,10 @@ def test_the_browser_reaches_what_python_reaches(ask, seen, skills):
 def test_fewer_and_full_pushes_are_fewer_and_full(ask, seen):
     _, _, data = seen["box"]
     for most in (1, 2):
-        asked = [{"pose": [0, 0, 0], "goal": g, "most": most} for g in goals(10, 2)]
-        assert all(len(plan["steps"]) <= most for plan in ask(data, asked))
-    asked = [{"pose": [0, 0, 0], "goal": g, "partial": False} for g in goals(10, 3)]
-    assert {step["stop"] for plan in ask(data, asked) for step in plan["steps"]} == {1}
+        queries = [{"pose": [0, 0, 0], "goal": g, "most": most} for g in goals(10, 2)]
+        assert all(len(plan["steps"]) <= most for plan in ask(data, queries))
+    queries = [{"pose": [0, 0, 0], "goal": g, "partial": False} for g in goals(10, 3)]
+    assert {step["stop"] for plan in ask(data, queries) for step in plan["steps"]} == {1}
 
 
 def obstacles_of(rng, n, near=0.07, far=0.2):
@@ -135,8 +135,8 @@ def test_the_free_space_check_is_that_of_python(ask, seen, skills, name):
     expected = problem.spare_m(begins, *map(torch.from_numpy, (direction, phase)))
     common = {"pose": [0, 0, 0], "obstacles": [obstacle_data(one) for one in obstacles]}
     actions = zip(begins.tolist(), direction.tolist(), phase.tolist(), strict=True)
-    asked = [common | {"action": [at, to, stop, at[2]]} for at, to, stop in actions]
-    found = np.array(ask(data, asked))
+    queries = [common | {"action": [at, to, stop, at[2]]} for at, to, stop in actions]
+    found = np.array(ask(data, queries))
     near = expected < 0.005  # Python does not distinguish larger gaps
     assert 30 < (expected < 0).sum() < 180
     np.testing.assert_allclose(found[near], expected[near], atol=1e-4)
@@ -145,8 +145,8 @@ def test_the_free_space_check_is_that_of_python(ask, seen, skills, name):
 
 def test_no_plan_meets_an_obstacle(ask, seen, skills):
     image, _, data = seen["box"]
-    rng, asked, problems = np.random.default_rng(4), [], []
-    while len(asked) < 30:
+    rng, queries, problems = np.random.default_rng(4), [], []
+    while len(queries) < 30:
         goal, obstacles = tuple(rng.uniform(-0.2, 0.2, 2).tolist()), obstacles_of(rng, 4)
         try:
             problem = skills.problem(image, (0.0, 0.0), Goal(goal), obstacles=obstacles)
@@ -154,8 +154,8 @@ def test_no_plan_meets_an_obstacle(ask, seen, skills):
             continue
         problems.append(problem)
         near = [obstacle_data(one) for one in obstacles]
-        asked.append({"pose": [0, 0, 0], "goal": goal, "obstacles": near})
-    found, reached = ask(data, asked), 0
+        queries.append({"pose": [0, 0, 0], "goal": goal, "obstacles": near})
+    found, reached = ask(data, queries), 0
     for problem, plan in zip(problems, found, strict=True):
         steps = plan["steps"]
         reached += bool(steps) and plan["distance"] < 0.01

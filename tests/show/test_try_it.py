@@ -26,7 +26,7 @@ def test_the_page_is_what_its_command_makes_of_its_sources():
     text = try_it.PAGE.read_text()
     known = json.loads(re.search(r'type="application/json">(.*?)</script>', text)[1])
     assert text == try_it.page(known), "run python -m experiments.try_it"
-    assert sum(len(thing["runs"]) for thing in known["objects"]) >= 200
+    assert sum(len(one["runs"]) for one in known["objects"]) >= 200
     assert np.median([run["distance"] for one in known["objects"] for run in one["runs"]]) < 0.005
     few = known | {"objects": [one | {"runs": one["runs"][:1]} for one in known["objects"]]}
     both = few, try_it.data(1)  # executions end up to 0.1 mm apart on different processors
@@ -50,14 +50,14 @@ def browser():
 @pytest.fixture
 def opened(browser):
     """Function that opens the page; it must neither ask for anything nor complain."""
-    pages, asked = [], []
+    pages, heard = [], []
 
     def page(width=1280, height=860, **options):
         made = browser.new_page(viewport={"width": width, "height": height}, **options)
         made.set_default_timeout(20_000)
-        made.on("request", lambda request: asked.append(request.url))
-        made.on("console", lambda message: asked.append(message.text))
-        made.on("pageerror", lambda error: asked.append(str(error)))
+        made.on("request", lambda request: heard.append(request.url))
+        made.on("console", lambda message: heard.append(message.text))
+        made.on("pageerror", lambda error: heard.append(str(error)))
         made.goto(try_it.PAGE.as_uri())
         made.locator(".prediction").first.wait_for(state="attached")
         made.wait_for_timeout(400)  # until the view stands
@@ -65,7 +65,7 @@ def opened(browser):
         return made
 
     yield page
-    assert set(asked) == {try_it.PAGE.as_uri()}
+    assert set(heard) == {try_it.PAGE.as_uri()}
     for made in pages:
         made.close()
 

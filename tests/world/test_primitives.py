@@ -152,8 +152,8 @@ def test_no_episode_knows_of_the_one_before(world):
         with Tabletop() as fresh:
             first[job] = bits(fresh, *job)
     code = f"{BITS}\nwith Tabletop() as world:\n    print(*(bits(world, *job) for job in {jobs}))"
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, text=True)
-    assert told.stdout.split() == list(first.values())
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, text=True)
+    assert done.stdout.split() == list(first.values())
     before = psutil.Process().memory_info().rss
     for job in [*reversed(jobs), *jobs, *reversed(jobs)]:
         assert bits(world, *job) == first[job]
