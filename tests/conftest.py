@@ -5,6 +5,7 @@ from collections import Counter
 import numpy as np
 import pytest
 import torch
+from xdist.scheduler import LoadScopeScheduling
 
 from affordlib.interactions import InteractionTensors, open_interactions
 from affordlib.interactions.dataset import Scaler
@@ -18,6 +19,17 @@ def pytest_collection_modifyitems(items):
     """Start with the files of many slow tests, so that none of them runs last on one core."""
     slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
     items.sort(key=lambda item: -slow[item.path])
+
+
+class _ByFile(LoadScopeScheduling):
+    """A file's tests run on one worker; only the pages of the book are shared by all."""
+
+    def _split_scope(self, nodeid):
+        return nodeid if "::test_run[" in nodeid else nodeid.split("::")[0]
+
+
+def pytest_xdist_make_scheduler(config, log):
+    return _ByFile(config, log) if config.getvalue("dist") == "loadfile" else None
 
 
 @pytest.fixture(scope="session")

@@ -249,7 +249,7 @@ def run_with_nbval(copy):
 
 @pytest.fixture(scope="module")
 def smoke(tmp_path_factory):
-    """The folder of one shared run: later notebooks may read files of earlier ones."""
+    """The folder of the runs of one worker: notebooks may read files of earlier ones."""
     folder = tmp_path_factory.mktemp("smoke")
     return folder, parameters("smoke", seed=1)
 
