@@ -13,7 +13,6 @@ and by full grasps (height), never by the planner under test.
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -43,7 +42,6 @@ from affordlib.primitives import Grasp, Move, move_for
 from affordlib.types import TABLE_X_M, TABLE_Y_M, Goal, UnreachableError, check_choice
 from affordlib.world import ROLLABLE, Tabletop, TabletopObject, WorldConfig, category_named
 from experiments import runner
-from experiments.commands import command
 from experiments.disturbances import KINDS, Disturbance, DisturbanceSchedule
 from experiments.feasibility import half_width_m, is_feasible, on_the_rim
 from experiments.runner import FOLDER, Job, Rows, plain
@@ -391,12 +389,7 @@ JOBS = [
 ]
 
 
-@command(OSError, ValueError)
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the missing trials and write the tables of all trials."""
-    options = runner.parser("closed_loop", main.__doc__).parse_args(argv)
-    return runner.make(JOBS, "closed_loop", options, tables)
-
+main = runner.command_of("closed_loop", __doc__, lambda: JOBS, tables)
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

@@ -11,8 +11,7 @@ over all predictions.
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from itertools import product
 from pathlib import Path
 
@@ -20,7 +19,6 @@ import numpy as np
 import pandas as pd
 
 from experiments import reported, runner, studies
-from experiments.commands import command
 from experiments.cross_validation import LARGE, MODELS, PLANE, TASKS, add_errors, by_model, job
 from experiments.grasps import grasp_rows
 from experiments.runner import FOLDER, Result, Rows, frame, read
@@ -128,11 +126,7 @@ JOBS += [
 JOBS += [job(model, "push_x10", 1500) for model in ("constant", "nearest")]
 
 
-@command(OSError, ValueError)
-def main(argv: Sequence[str] | None = None) -> int:
-    """Train and test models in folds and make the tables; only missing results are computed."""
-    return runner.make(JOBS, NAME, runner.parser(NAME, main.__doc__).parse_args(argv), tables)
-
+main = runner.command_of(NAME, __doc__, lambda: JOBS, tables)
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

@@ -12,8 +12,6 @@ errors and intervals are over objects.
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -32,7 +30,6 @@ from affordlib.models.base import EffectNetwork
 from affordlib.models.lever_up import N_OBSERVED, N_PREDICTED, PROTOCOLS, lever_up_tensors
 from affordlib.types import Prediction, check_choice, check_count
 from experiments import reported, runner
-from experiments.commands import command
 from experiments.lever_training import (
     LEVER_MODELS,
     TRAINING,
@@ -267,11 +264,7 @@ JOBS = [
 ]
 
 
-@command(OSError, ValueError)
-def main(argv: Sequence[str] | None = None) -> int:
-    """Train and test models in folds and make the tables; only missing results are computed."""
-    return runner.make(JOBS, NAME, runner.parser(NAME, main.__doc__).parse_args(argv), tables)
-
+main = runner.command_of(NAME, __doc__, lambda: JOBS, tables)
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

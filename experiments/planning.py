@@ -9,7 +9,6 @@ tables are made from all stored outcomes.
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -49,7 +48,6 @@ from affordlib.primitives import Drag, Move, Push
 from affordlib.types import NothingSeenError, Observation, Outcome, Plan, Step, on_table
 from affordlib.world import ROLLABLE, STANDING, Tabletop, UnreachableError
 from experiments import reported, runner
-from experiments.commands import command
 from experiments.field_baselines import plan_cem
 from experiments.runner import FOLDER, Job, Rows, interval, open_once, plain
 from experiments.shipped import CHECKPOINT_SPECS
@@ -551,12 +549,7 @@ def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
     }
 
 
-@command(OSError, ValueError)
-def main(argv: Sequence[str] | None = None) -> int:
-    """Evaluate planners on the frozen goals and make the tables of all evaluated planners."""
-    options = runner.parser("planning", main.__doc__).parse_args(argv)
-    return runner.make([job(name) for name in CONFIGS], "planning", options, tables)
-
+main = runner.command_of("planning", __doc__, lambda: [job(name) for name in CONFIGS], tables)
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())
