@@ -14,14 +14,15 @@ from __future__ import annotations
 from collections.abc import Iterable
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from affordlib.primitives import Grasp
 from experiments import reported, runner, studies
 from experiments.cross_validation import LARGE, MODELS, PLANE, TASKS, add_errors, by_model, job
-from experiments.grasps import grasp_rows
-from experiments.runner import FOLDER, Result, Rows, frame, read
+from experiments.runner import FOLDER, Result, Rows, frame, read, shares
 
 NAME = "effect_prediction"
 SAME_TRUTH = 1e-6
@@ -84,6 +85,38 @@ def error_rows(table: pd.DataFrame, primitive: str) -> Rows:
                 row["yaw_error_mean_rad"] = mean_sem(some, "yaw_error")[0] if turns else None
             rows.append(row)
     return rows
+
+
+def grasp_rows(grasps: pd.DataFrame) -> Rows:
+    """Return the paper's Table 2; grasps: predictions with the jobs' arguments as columns.
+
+    The paper predicts success if μ_z(1) is above 0.1 m, as for a true success. Only the first seed
+    is used, because cross-validations with other seeds test the same grasps.
+    """
+    rows = []
+    for about, group in by_model(grasps[grasps["seed"] == grasps["seed"].min()]):
+        known = about["model"] != "logistic"
+        lifts = group["mean_z"] > Grasp.success_m if known else group["probability"] > 0.5
+        group = group.assign(predicted=lifts, lifted=group["truth_z"] > Grasp.success_m)
+        for rollable, some in group.groupby("rollable"):
+            row = about | {"rollable": bool(rollable), "n": len(some)}
+            row["error_mean_m"] = float(some["final_error"].mean()) if known else None
+            predicted, lifted = some["predicted"].to_numpy(), some["lifted"].to_numpy()
+            rows.append(row | confusion_columns(predicted, lifted))
+    return rows
+
+
+def confusion_columns(predicted: np.ndarray, lifted: np.ndarray) -> dict[str, Any]:
+    """Return TP and TN [%] with Wilson's 95 % intervals; None without successes or failures.
+
+    TP is the share of successes that are predicted (sensitivity), TN that of failures.
+    """
+    columns: dict[str, Any] = {}
+    for rate, those in (("tp", lifted), ("tn", ~lifted)):
+        n, k = int(those.sum()), int((predicted == lifted)[those].sum())
+        names = (f"{rate}{end}_percent" for end in ("", "_low", "_high"))
+        columns |= zip(names, shares(k, n), strict=True)
+    return columns | {"n_success": int(lifted.sum()), "n_failure": int((~lifted).sum())}
 
 
 def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:

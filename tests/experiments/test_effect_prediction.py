@@ -8,7 +8,7 @@ import pytest
 from experiments import cross_validation
 from experiments import effect_prediction as tables
 from experiments.cross_validation import job, network_and_training
-from experiments.grasps import confusion_columns
+from experiments.effect_prediction import confusion_columns
 from experiments.lever_up import job as lever_job
 
 WINDOW = {"model": "lstm_tuned", "trained_for": "window"}
