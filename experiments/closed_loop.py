@@ -16,7 +16,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cache, partial
+from functools import cache, lru_cache, partial
 from itertools import islice, product
 from pathlib import Path
 from typing import Any
@@ -68,7 +68,10 @@ FOUR_CATEGORIES = ("cuboid", "upright_cylinder", "lying_cylinder", "sphere")
 WORLDS = {"clean": 1, "perturbed": 8}
 """Worlds, and the number of images over which an observation averages in each."""
 OPEN_LOOP = "open_loop"
-PERTURBED_PUSHES = "film_5000_perturbed"
+PUSHES = dict.fromkeys(("clean", OPEN_LOOP), CHECKPOINTS["push"])
+PUSHES["perturbed"] = "film_5000_perturbed"
+"""Checkpoint of pushes in each world."""
+
 AT_REST_S = 3.0
 """Time [s] in which an object of the perturbed world settles before a trial starts."""
 
@@ -174,18 +177,21 @@ def sample_disturbance(seed: int, n_actions: int = 2, kinds: Sequence[str] = KIN
 
 
 @cache
-def tabletop_and_skills(world: str = "clean") -> tuple[Tabletop, Skills]:
-    """Create the world and the skills once per process."""
+def one_tabletop() -> Tabletop:
+    """Create the world once per process."""
+    return Tabletop()
+
+
+@lru_cache(maxsize=2)
+def skills_with(push: str) -> Skills:
+    """Load the skills with a checkpoint of pushes; cached between jobs."""
     skills = Skills.load()
-    if world == "perturbed":
-        push = load_checkpoint(PERTURBED_PUSHES)[0]
-        skills = replace(skills, models=skills.models | {"push": push})
-    return Tabletop(), skills
+    return replace(skills, models=skills.models | {"push": load_checkpoint(push)[0]})
 
 
 def run_trial(table: str, index: int, seed: int = 0, world: str = "clean") -> dict[str, Any]:
     """Run a trial and return its record: result, errors and whether the goal was feasible."""
-    tabletop, skills = tabletop_and_skills(world)
+    tabletop, skills = one_tabletop(), skills_with(PUSHES[world])
     trial = sample_trial(table, index, seed, world)
     if world == OPEN_LOOP:
         return run_open_loop(tabletop, skills, trial)
@@ -359,7 +365,7 @@ def job(table: str, index: int, seed: int, world: str = "clean") -> Job:
     arguments: dict[str, Any] = {"table": table, "index": index, "seed": seed}
     arguments |= {"world": world} if world != "clean" else {}
     used = ("push", "drag", POSE_PRIMITIVES.get(table))
-    models = CHECKPOINTS | ({"push": PERTURBED_PUSHES} if world == "perturbed" else {})
+    models = CHECKPOINTS | {"push": PUSHES[world]}
     files = tuple(file for kind, file in models.items() if kind in used)
     reach = runner.hash_of("reachability", "checkpoint")
     version = VERSIONS[table]
