@@ -36,6 +36,7 @@ from affordlib.interactions.store import SUFFIX as DATA_SUFFIX
 from affordlib.interactions.store import dataset_sha256
 from affordlib.models import CNPConfig, FiLMConfig, NetworkConfig
 from affordlib.models.checkpoint import SUFFIX, save_checkpoint
+from affordlib.models.lever_up import lever_up_tensors
 from affordlib.models.training import Sampler, TrainingConfig, about_training, train_model
 from affordlib.planning import MODES
 from affordlib.planning.reachability import SHIPPED as REACHABILITY
@@ -50,7 +51,7 @@ from experiments.lever_training import (
     LEVER_MODELS,
     Symmetry,
     augment_by_symmetry,
-    train_lever_model,
+    fit_lever_model,
 )
 from experiments.lstm import LSTMConfig
 from experiments.tasks import (
@@ -223,7 +224,8 @@ def train_checkpoint(name: str) -> None:
     if name in LEVER_CHECKPOINTS:
         lever_name, trained_for = LEVER_CHECKPOINTS[name]
         spec = LEVER_MODELS[lever_name]
-        model, history = train_lever_model(spec, data, split, trained_for)
+        parts = [lever_up_tensors(data, p, spec.view) for p in (split.train, split.validation)]
+        model, history = fit_lever_model(spec, *parts, trained_for)
         more = {"trained_for": trained_for, "view": spec.view}
     else:
         spec, more = CHECKPOINT_SPECS[name], {}
