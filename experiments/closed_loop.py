@@ -113,48 +113,39 @@ class Trial:
             world.settle(AT_REST_S)
 
 
-def sample_trial(table: str, index: int, seed: int = 0, world: str = "clean") -> Trial:
-    """Sample trial `index` of a table, a pure function of its arguments, equal in each world."""
-    trial = _clean_trial(table, index, seed)
-    if world != "perturbed":
-        return trial
-    key = (200 + list(N_TRIALS).index(table), index)
-    rng = np.random.default_rng(np.random.SeedSequence(2_000_003 + seed, spawn_key=key))
-    return replace(trial, config=Variation().sample(trial.obj, rng))
-
-
 def category_of(table: str, index: int) -> str:
     """Category of the object of a trial."""
     categories = CATEGORIES.get(table, FOUR_CATEGORIES)
     return categories[index % len(categories)]
 
 
-def _clean_trial(table: str, index: int, seed: int) -> Trial:
-    check_choice("table", table, N_TRIALS)
-    key = (100 + list(N_TRIALS).index(table), index)
-    rng = np.random.default_rng(np.random.SeedSequence(2_000_003 + seed, spawn_key=key))
+def sample_trial(table: str, index: int, seed: int = 0, world: str = "clean") -> Trial:
+    """Sample trial `index` of a table, a pure function of its arguments, equal in each world."""
+    number = list(N_TRIALS).index(check_choice("table", table, N_TRIALS))
+    keys = ((first + number, index) for first in (100, 200))
+    seeds = (np.random.SeedSequence(2_000_003 + seed, spawn_key=key) for key in keys)
+    rng, of_world = map(np.random.default_rng, seeds)
     obj = category_named(category_of(table, index)).sample(rng)
     while ConvexHull(obj.footprint_m).volume < SMALLEST_M2:
         obj = type(obj).sample(rng)
-    about: dict[str, Any] = {"obj": obj, "start_xy_m": (0.0, 0.0)}
-    about["yaw_rad"] = float(rng.uniform(-math.pi, math.pi))
+    config = Variation().sample(obj, of_world) if world == "perturbed" else WorldConfig()
+    trial = partial(Trial, obj, (0.0, 0.0), float(rng.uniform(-math.pi, math.pi)), config=config)
     tolerance_m = TOLERANCE_M.get(table, 0.002)
     if table == "reachability":
         low, high = (np.array([TABLE_X_M[k], TABLE_Y_M[k]]) for k in (0, 1))
         end = rng.uniform(low + EDGE_M, high - EDGE_M).tolist()
-        return Trial(**about, goal=Goal(tuple(end), tolerance_m))
+        return trial(Goal(tuple(end), tolerance_m))
     farthest = 0.25 if table == "disturbances" else 0.12
     r, angle = math.sqrt(rng.uniform(0.02**2, farthest**2)), rng.uniform(-math.pi, math.pi)
-    xy = (r * math.cos(angle), r * math.sin(angle))
-    goal = Goal(xy, tolerance_m)
+    goal = Goal((r * math.cos(angle), r * math.sin(angle)), tolerance_m)
     if table == "height":
-        return Trial(**about, goal=replace(goal, height_m=float(rng.uniform(0.02, 0.2))))
+        return trial(replace(goal, height_m=float(rng.uniform(0.02, 0.2))))
     if table.startswith("orientation"):
-        return Trial(**about, goal=replace(goal, turn_rad=float(rng.uniform(-math.pi, math.pi))))
+        return trial(replace(goal, turn_rad=float(rng.uniform(-math.pi, math.pi))))
     n_actions = max(1, math.ceil(r / 0.09))
     kinds = [kind for kind in KINDS if kind != "topple" or not obj.rollable]
     disturbances = (sample_disturbance(int(rng.integers(2**32)), n_actions, kinds),)
-    return Trial(**about, goal=goal, disturbances=disturbances)
+    return trial(goal, disturbances)
 
 
 def sample_disturbance(seed: int, n_actions: int = 2, kinds: Sequence[str] = KINDS) -> Disturbance:

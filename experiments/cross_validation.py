@@ -130,16 +130,18 @@ def cross_validate(
 
     def predicted(test_set: xr.Dataset, rows: np.ndarray) -> dict[str, Any]:
         if model in NETWORKS:
-            return network_record(network, test_set, rows)
-        if model == "logistic":
-            return logistic_predictions(*known, test_set, rows)
-        channels = task.action_channels, task.all_effects
-        return baseline_predictions(BASELINES[model], channels, *known, test_set, rows)
+            found = network_record(network, test_set, rows)
+        elif model == "logistic":
+            found = logistic_predictions(*known, test_set, rows)
+        else:
+            channels = task.action_channels, task.all_effects
+            found = baseline_predictions(BASELINES[model], channels, *known, test_set, rows)
+        return pd.json_normalize(found, sep="_").iloc[0].to_dict()  # truth_x, mean_x, std_x, …
 
-    result["fold_test"] = prediction_columns(predicted(interactions, split.test))
+    result["fold_test"] = predicted(interactions, split.test)
     if task.test_set:
         other = open_once(task.test_set)
-        found = prediction_columns(predicted(other, np.arange(other.sizes["interaction"])))
+        found = predicted(other, np.arange(other.sizes["interaction"]))
         add_errors(table := pd.DataFrame(found), data.removesuffix(LARGE))
         errors = table.filter(like="_error").to_dict("list").items()
         errors = {name: [float(f"{e:.4g}") for e in each] for name, each in errors}
@@ -159,11 +161,6 @@ def logistic_predictions(
     height = other["effect"].values[kept, -1, 2].tolist()
     record = about_objects(other, kept) | {"probability": probability.tolist()}
     return record | {"truth": {"z": height}}
-
-
-def prediction_columns(predictions: dict[str, Any]) -> dict[str, Any]:
-    """Flatten predictions to the columns of a table: `truth_x`, `mean_x`, `std_x` and others."""
-    return pd.json_normalize(predictions, sep="_").iloc[0].to_dict()
 
 
 def add_errors(table: pd.DataFrame, primitive: str) -> None:

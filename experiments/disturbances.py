@@ -14,16 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from affordlib.planning.robot import Execution
-from affordlib.types import (
-    TABLE_X_M,
-    TABLE_Y_M,
-    Goal,
-    Observation,
-    Step,
-    check_choice,
-    check_count,
-    check_field,
-)
+from affordlib.types import TABLE_X_M, TABLE_Y_M, Goal, Observation, Step
 from affordlib.world import Tabletop
 from affordlib.world.trajectory import STEP_S
 
@@ -52,16 +43,6 @@ class Disturbance:
     y: float
     turn: float = 0.0
     at_s: float | None = None
-
-    def __post_init__(self) -> None:
-        check_choice("kind", self.kind, KINDS)
-        check_count("action", self.action, least=0)
-        for name in ("x", "y", "turn"):
-            check_field(self, name)
-        if self.at_s is not None:
-            check_field(self, "at_s", 0.0, 60.0, "s")
-            if self.kind == "shove":
-                raise ValueError("a shove happens between actions; omit at_s, or use a knock")
 
     def apply(self, world: Tabletop, goal: Goal) -> Goal:
         """Apply the disturbance to the world, and return the goal after it."""

@@ -283,9 +283,9 @@ def run_task(row: str, family: str, index: int, seed: int) -> dict[str, Any]:
 
 def _outcome(task: ObstacleTask, world: Tabletop, actions: int) -> dict[str, Any]:
     x, y, _ = world.object_pose()
-    touched = {f"{name}_touched": False for name in ("object", "arm")}
-    touched |= {f"{what}_touched": True for _, what in world.obstacles.touched}
-    return {"distance_m": task.goal.distance_m((x, y)), "actions": actions} | touched
+    touched = {what for _, what in world.obstacles.touched}
+    about = {f"{name}_touched": name in touched for name in ("object", "arm")}
+    return {"distance_m": task.goal.distance_m((x, y)), "actions": actions} | about
 
 
 N_PUSHES, N_BESIDE, WITHIN_GAP_M = 20, 20, 0.02
@@ -378,8 +378,7 @@ def search(family: str, index: int, seed: int) -> dict[str, Any]:
     for _ in range(MAX_STEPS):
         all_ends, all_plans = [], []
         for end, plan in zip(ends, plans, strict=True):
-            poses = np.concatenate([placed(steps[..., :2], end)], axis=-1)
-            poses = np.concatenate([poses, end[2] + steps[..., 2:]], axis=-1)
+            poses = np.concatenate([placed(steps[..., :2], end), end[2] + steps[..., 2:]], axis=-1)
             turned = angles[which] + end[2]
             free = space.spare_m(kind.towards(0.0), turned, stops, poses) >= 0
             all_ends.extend(poses[free, -1])

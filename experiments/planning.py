@@ -89,10 +89,6 @@ def plan_astar_fine(problem: PlanningProblem, heuristic: str = "goal") -> Plan:
     return plan_astar(problem, 72, FINE_PHASES, heuristic)
 
 
-Pose = Callable[..., PlanningProblem]
-"""Poses the problem of (image, start_xy_m, goal, mode), as `Skills.problem` does."""
-
-
 VERSIONS: dict[Planner, int] = {plan_astar: 2, plan_astar_fine: 2}
 """Versions of planners (default 1); raise one when a change of code changes its numbers."""
 
@@ -173,8 +169,8 @@ class PlannerConfig:
         ]
         return np.flatnonzero(asked).tolist()
 
-    def pose(self) -> Pose:
-        """Return what poses the problems."""
+    def pose(self) -> Callable[..., PlanningProblem]:
+        """Return what poses the problem of (image, start_xy_m, goal, mode), as `Skills` does."""
         models = {kind: network(name) for kind, name in self.checkpoints.items()}
         skills, push = Skills(models), models["push"]
 

@@ -286,11 +286,10 @@ def learn_reachability(data: xr.Dataset, seed: int = 0) -> Reachability:
     return model.eval()
 
 
-def train_reachability(_: argparse.Namespace) -> bool:
+def train_reachability(_: argparse.Namespace) -> None:
     """Train the shipped reachability on the shipped set `reach`."""
     learn_reachability(open_interactions("reach")).save(repo_root() / REACHABILITY)
     print(REACHABILITY)
-    return True
 
 
 def uniform_tasks(
@@ -319,7 +318,7 @@ VARIATIONS = {
 rougher tables, denser objects, and other errors and offsets up to twice as large as in training."""
 
 
-def draw_goals(_: argparse.Namespace) -> bool:
+def draw_goals(_: argparse.Namespace) -> None:
     """Sample the goals of Table 3 and 40 validation goals, and write files that stay frozen."""
     missing = [world for world, path in FROZEN.items() if not (repo_root() / path).exists()]
     for name in missing:
@@ -340,7 +339,6 @@ def draw_goals(_: argparse.Namespace) -> bool:
         path = repo_root() / FROZEN[name]
         write_atomically(path, sealed(path.stem, text))
     print(f"goals sampled for the worlds: {', '.join(missing) or 'none, all files exist'}")
-    return True
 
 
 COMMANDS = {
@@ -367,7 +365,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     names = sorted([*CHECKPOINT_SPECS, *LEVER_CHECKPOINTS])
     checkpoints.add_argument("--only", nargs="+", choices=names, help="default: all")
     options = parser.parse_args(argv)
-    return 0 if options.make(options) else 1
+    return int(options.make(options) is False)
 
 
 if __name__ == "__main__":
