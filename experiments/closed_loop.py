@@ -195,7 +195,6 @@ def run_trial(table: str, index: int, seed: int = 0, world: str = "clean") -> di
         result = run_closed_loop(robot, goal, skills, config=config)
         about = {"status": "reached" if result.status in ARRIVED else result.status}
         about |= {"message": result.message, "actions": len(result.steps)}
-        about |= {"orientation_reckoned": "orientation" in result.reckoned}
         return result, about | _errors(tabletop, result.goal, yaw, z)
 
     result, measured = pursue(robot.current_goal, robot)
@@ -223,8 +222,7 @@ def run_open_loop(world: Tabletop, skills: Skills, trial: Trial) -> dict[str, An
     with suppress(UnreachableError):
         execute_plan(world, plan)
     about = {"object_class": trial.obj.category, "status": "reached", "feasible": True}
-    about |= {"actions": len(plan.steps), "orientation_reckoned": False}
-    about |= _errors(world, trial.goal, yaw, z)
+    about |= {"actions": len(plan.steps)} | _errors(world, trial.goal, yaw, z)
     world.park()
     return about
 
@@ -298,9 +296,7 @@ def pose_rows(records: Rows, column: str, within: float, unit: str) -> Rows:
         row["within_percent"] = 100 * (hit & (feasible.distance_m <= WITHIN_M)).mean()
         row[f"pose_error_{unit}_mean"] = error.mean()
         row[f"pose_error_{unit}_p95"] = error.quantile(0.95)
-        row["distance_m_mean"] = reached.distance_m.mean()
-        row["reckoned"] = some.orientation_reckoned.sum()
-        rows.append(row | {"actions_mean": reached.actions.mean()})
+        rows.append(row)
     return plain(rows)
 
 

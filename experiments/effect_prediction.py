@@ -68,11 +68,10 @@ def mean_sem(group: pd.DataFrame, column: str) -> tuple[float, float]:
 
 
 def error_rows(table: pd.DataFrame, primitive: str) -> Rows:
-    """Return rows of errors by model and category; yaw only for cuboids, where it is defined."""
+    """Return rows of errors by model and category."""
     unit, name = ("m", "final_error") if primitive in PLANE else ("rad", "error")
     rows = []
     for about, group in by_model(table):
-        yaw_predicted = "yaw_error" in group and group["yaw_error"].notna().all()
         for category, some in [("all", group), *group.groupby("category")]:
             row = about | {"object_class": category, "n": some["interaction"].nunique()}
             mean, sem = mean_sem(some, "final_error")
@@ -80,9 +79,6 @@ def error_rows(table: pd.DataFrame, primitive: str) -> Rows:
             for told, value in (("mean", mean), ("sem", sem), ("median", median), ("p95", p95)):
                 row[f"{name}_{told}_{unit}"] = float(value)
             row[f"trajectory_error_mean_{unit}"] = mean_sem(some, "trajectory_error")[0]
-            if primitive == "push":
-                turns = yaw_predicted and category == "cuboid"
-                row["yaw_error_mean_rad"] = mean_sem(some, "yaw_error")[0] if turns else None
             rows.append(row)
     return rows
 
