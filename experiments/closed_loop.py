@@ -13,11 +13,10 @@ and by full grasps (height), never by the planner under test.
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cache, partial
+from functools import cache, lru_cache, partial
 from itertools import islice, product
 from pathlib import Path
 from typing import Any
@@ -43,7 +42,6 @@ from affordlib.primitives import Grasp, Move, move_for
 from affordlib.types import TABLE_X_M, TABLE_Y_M, Goal, UnreachableError, check_choice
 from affordlib.world import ROLLABLE, Tabletop, TabletopObject, WorldConfig, category_named
 from experiments import runner
-from experiments.commands import command
 from experiments.disturbances import KINDS, Disturbance, DisturbanceSchedule
 from experiments.feasibility import half_width_m, is_feasible, on_the_rim
 from experiments.runner import FOLDER, Job, Rows, plain
@@ -70,7 +68,10 @@ FOUR_CATEGORIES = ("cuboid", "upright_cylinder", "lying_cylinder", "sphere")
 WORLDS = {"clean": 1, "perturbed": 8}
 """Worlds, and the number of images over which an observation averages in each."""
 OPEN_LOOP = "open_loop"
-PERTURBED_PUSHES = "film_5000_perturbed"
+PUSHES = dict.fromkeys(("clean", OPEN_LOOP), CHECKPOINTS["push"])
+PUSHES["perturbed"] = "film_5000_perturbed"
+"""Checkpoint of pushes in each world."""
+
 AT_REST_S = 3.0
 """Time [s] in which an object of the perturbed world settles before a trial starts."""
 
@@ -112,48 +113,39 @@ class Trial:
             world.settle(AT_REST_S)
 
 
-def sample_trial(table: str, index: int, seed: int = 0, world: str = "clean") -> Trial:
-    """Sample trial `index` of a table, a pure function of its arguments, equal in each world."""
-    trial = _clean_trial(table, index, seed)
-    if world != "perturbed":
-        return trial
-    key = (200 + list(N_TRIALS).index(table), index)
-    rng = np.random.default_rng(np.random.SeedSequence(2_000_003 + seed, spawn_key=key))
-    return replace(trial, config=Variation().sample(trial.obj, rng))
-
-
 def category_of(table: str, index: int) -> str:
     """Category of the object of a trial."""
     categories = CATEGORIES.get(table, FOUR_CATEGORIES)
     return categories[index % len(categories)]
 
 
-def _clean_trial(table: str, index: int, seed: int) -> Trial:
-    check_choice("table", table, N_TRIALS)
-    key = (100 + list(N_TRIALS).index(table), index)
-    rng = np.random.default_rng(np.random.SeedSequence(2_000_003 + seed, spawn_key=key))
+def sample_trial(table: str, index: int, seed: int = 0, world: str = "clean") -> Trial:
+    """Sample trial `index` of a table, a pure function of its arguments, equal in each world."""
+    number = list(N_TRIALS).index(check_choice("table", table, N_TRIALS))
+    keys = ((first + number, index) for first in (100, 200))
+    seeds = (np.random.SeedSequence(2_000_003 + seed, spawn_key=key) for key in keys)
+    rng, of_world = map(np.random.default_rng, seeds)
     obj = category_named(category_of(table, index)).sample(rng)
     while ConvexHull(obj.footprint_m).volume < SMALLEST_M2:
         obj = type(obj).sample(rng)
-    about: dict[str, Any] = {"obj": obj, "start_xy_m": (0.0, 0.0)}
-    about["yaw_rad"] = float(rng.uniform(-math.pi, math.pi))
+    config = Variation().sample(obj, of_world) if world == "perturbed" else WorldConfig()
+    trial = partial(Trial, obj, (0.0, 0.0), float(rng.uniform(-math.pi, math.pi)), config=config)
     tolerance_m = TOLERANCE_M.get(table, 0.002)
     if table == "reachability":
         low, high = (np.array([TABLE_X_M[k], TABLE_Y_M[k]]) for k in (0, 1))
         end = rng.uniform(low + EDGE_M, high - EDGE_M).tolist()
-        return Trial(**about, goal=Goal(tuple(end), tolerance_m))
+        return trial(Goal(tuple(end), tolerance_m))
     farthest = 0.25 if table == "disturbances" else 0.12
     r, angle = math.sqrt(rng.uniform(0.02**2, farthest**2)), rng.uniform(-math.pi, math.pi)
-    xy = (r * math.cos(angle), r * math.sin(angle))
-    goal = Goal(xy, tolerance_m)
+    goal = Goal((r * math.cos(angle), r * math.sin(angle)), tolerance_m)
     if table == "height":
-        return Trial(**about, goal=replace(goal, height_m=float(rng.uniform(0.02, 0.2))))
+        return trial(replace(goal, height_m=float(rng.uniform(0.02, 0.2))))
     if table.startswith("orientation"):
-        return Trial(**about, goal=replace(goal, turn_rad=float(rng.uniform(-math.pi, math.pi))))
+        return trial(replace(goal, turn_rad=float(rng.uniform(-math.pi, math.pi))))
     n_actions = max(1, math.ceil(r / 0.09))
     kinds = [kind for kind in KINDS if kind != "topple" or not obj.rollable]
     disturbances = (sample_disturbance(int(rng.integers(2**32)), n_actions, kinds),)
-    return Trial(**about, goal=goal, disturbances=disturbances)
+    return trial(goal, disturbances)
 
 
 def sample_disturbance(seed: int, n_actions: int = 2, kinds: Sequence[str] = KINDS) -> Disturbance:
@@ -176,18 +168,21 @@ def sample_disturbance(seed: int, n_actions: int = 2, kinds: Sequence[str] = KIN
 
 
 @cache
-def tabletop_and_skills(world: str = "clean") -> tuple[Tabletop, Skills]:
-    """Create the world and the skills once per process."""
+def one_tabletop() -> Tabletop:
+    """Create the world once per process."""
+    return Tabletop()
+
+
+@lru_cache(maxsize=2)
+def skills_with(push: str) -> Skills:
+    """Load the skills with a checkpoint of pushes; cached between jobs."""
     skills = Skills.load()
-    if world == "perturbed":
-        push = load_checkpoint(PERTURBED_PUSHES)[0]
-        skills = replace(skills, models=skills.models | {"push": push})
-    return Tabletop(), skills
+    return replace(skills, models=skills.models | {"push": load_checkpoint(push)[0]})
 
 
 def run_trial(table: str, index: int, seed: int = 0, world: str = "clean") -> dict[str, Any]:
     """Run a trial and return its record: result, errors and whether the goal was feasible."""
-    tabletop, skills = tabletop_and_skills(world)
+    tabletop, skills = one_tabletop(), skills_with(PUSHES[world])
     trial = sample_trial(table, index, seed, world)
     if world == OPEN_LOOP:
         return run_open_loop(tabletop, skills, trial)
@@ -200,7 +195,6 @@ def run_trial(table: str, index: int, seed: int = 0, world: str = "clean") -> di
         result = run_closed_loop(robot, goal, skills, config=config)
         about = {"status": "reached" if result.status in ARRIVED else result.status}
         about |= {"message": result.message, "actions": len(result.steps)}
-        about |= {"orientation_reckoned": "orientation" in result.reckoned}
         return result, about | _errors(tabletop, result.goal, yaw, z)
 
     result, measured = pursue(robot.current_goal, robot)
@@ -228,8 +222,7 @@ def run_open_loop(world: Tabletop, skills: Skills, trial: Trial) -> dict[str, An
     with suppress(UnreachableError):
         execute_plan(world, plan)
     about = {"object_class": trial.obj.category, "status": "reached", "feasible": True}
-    about |= {"actions": len(plan.steps), "orientation_reckoned": False}
-    about |= _errors(world, trial.goal, yaw, z)
+    about |= {"actions": len(plan.steps)} | _errors(world, trial.goal, yaw, z)
     world.park()
     return about
 
@@ -303,9 +296,7 @@ def pose_rows(records: Rows, column: str, within: float, unit: str) -> Rows:
         row["within_percent"] = 100 * (hit & (feasible.distance_m <= WITHIN_M)).mean()
         row[f"pose_error_{unit}_mean"] = error.mean()
         row[f"pose_error_{unit}_p95"] = error.quantile(0.95)
-        row["distance_m_mean"] = reached.distance_m.mean()
-        row["reckoned"] = some.orientation_reckoned.sum()
-        rows.append(row | {"actions_mean": reached.actions.mean()})
+        rows.append(row)
     return plain(rows)
 
 
@@ -361,7 +352,7 @@ def job(table: str, index: int, seed: int, world: str = "clean") -> Job:
     arguments: dict[str, Any] = {"table": table, "index": index, "seed": seed}
     arguments |= {"world": world} if world != "clean" else {}
     used = ("push", "drag", POSE_PRIMITIVES.get(table))
-    models = CHECKPOINTS | ({"push": PERTURBED_PUSHES} if world == "perturbed" else {})
+    models = CHECKPOINTS | {"push": PUSHES[world]}
     files = tuple(file for kind, file in models.items() if kind in used)
     reach = runner.hash_of("reachability", "checkpoint")
     version = VERSIONS[table]
@@ -391,12 +382,7 @@ JOBS = [
 ]
 
 
-@command(OSError, ValueError)
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the missing trials and write the tables of all trials."""
-    options = runner.parser("closed_loop", main.__doc__).parse_args(argv)
-    return runner.make(JOBS, "closed_loop", options, tables)
-
+main = runner.command_of("closed_loop", __doc__, lambda: JOBS, tables)
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

@@ -28,15 +28,16 @@ def _terminate(*_: object) -> None:
     raise _Terminated
 
 
-def command(*errors: type[Exception]) -> Callable[[Callable[..., int]], Callable[..., int]]:
+def command(
+    *errors: type[Exception], name: str = ""
+) -> Callable[[Callable[..., int]], Callable[..., int]]:
     """Decorate a command's `main`, which returns its exit status.
 
     `errors`, Ctrl-C and SIGTERM end the command with a one-line message and status 1, 130 or 143.
+    name: begins the message; by default that of the module.
     """
 
     def decorate(main: Callable[..., int]) -> Callable[..., int]:
-        name = Path(inspect.getfile(main)).stem
-
         @functools.wraps(main)
         def run(*arguments: Any) -> int:
             for stream in (sys.stdout, sys.stderr):  # dots and dashes on a terminal without UTF-8
@@ -53,7 +54,7 @@ def command(*errors: type[Exception]) -> Callable[[Callable[..., int]], Callable
                 why, code = str(error), 1
             finally:
                 signal.signal(signal.SIGTERM, before)
-            print(f"{name}: {why}", file=sys.stderr)
+            print(f"{name or Path(inspect.getfile(main)).stem}: {why}", file=sys.stderr)
             return code
 
         return run

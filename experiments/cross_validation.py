@@ -21,14 +21,12 @@ from sklearn.linear_model import LogisticRegression
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
-from affordlib.interactions import Split, split_interactions
+from affordlib.interactions import split_interactions
 from affordlib.interactions.dataset import valid_interactions
-from affordlib.models.base import EffectNetwork, NetworkConfig
 from affordlib.models.cnp import CNPConfig
 from affordlib.models.film import FiLMConfig
 from affordlib.models.training import train_model
 from affordlib.primitives import Grasp
-from affordlib.types import check_choice, check_count
 from experiments.baselines import BASELINES, about_objects, baseline_predictions, network_record
 from experiments.lever_training import Symmetry, augment_by_symmetry
 from experiments.runner import Job, open_once
@@ -69,24 +67,16 @@ PLANE = ("push", "drag")
 """Primitives whose effect is a displacement in the table's plane."""
 
 CHANNELS = ("x", "y", "z", "yaw")
-SETS = (*TASKS, *(f"{name}{LARGE}" for name in TASKS))
-
-
-@dataclass(frozen=True)
-class Network:
-    """A network to compare: its type, the shipped checkpoint with its training, its frame."""
-
-    config: type[NetworkConfig]
-    checkpoint: str
-    push_frame: bool = True
 
 
 NETWORKS = {
-    "cnp": Network(CNPConfig, "cnp_500", push_frame=False),
-    "film": Network(FiLMConfig, "film_500"),
-    "cnp_push_frame": Network(CNPConfig, "cnp_500"),
-    "film_table_frame": Network(FiLMConfig, "film_500", push_frame=False),
+    "cnp": (CNPConfig, "cnp_500", "table"),
+    "film": (FiLMConfig, "film_500", "push"),
+    "cnp_push_frame": (CNPConfig, "cnp_500", "push"),
+    "film_table_frame": (FiLMConfig, "film_500", "table"),
 }
+"""Networks to compare: their type, the shipped checkpoint with their training, their frame."""
+
 MODELS = (*NETWORKS, *BASELINES, "logistic")
 
 
@@ -101,34 +91,23 @@ def network_and_training(model: str, data: str, n: int | str = "all") -> tuple[A
     FiLM uses the checkpoint trained on the same set, if there is one; the sets of 100 grasps and
     100 rotations use fewer steps.
     """
-    task, network = task_of(data), NETWORKS[model]
-    training = CHECKPOINT_SPECS[network.checkpoint].training
-    if network.config is FiLMConfig and n == "all":
+    task, (config, checkpoint, frame) = task_of(data), NETWORKS[model]
+    training = CHECKPOINT_SPECS[checkpoint].training
+    if config is FiLMConfig and n == "all":
         specs = [s for s in CHECKPOINT_SPECS.values() if isinstance(s.network, FiLMConfig)]
         training = next((s.training for s in specs if s.data == data), training)
     if task.symmetries is not None:
         steps = training.steps if data.endswith(LARGE) else STEPS_ON_100
-        training = replace(training, augment=False, steps=steps)
-    effects = task.effect_channels if network.config is CNPConfig else task.all_effects
-    frame = "push" if network.push_frame and task.symmetries is None else "table"
+        training, frame = replace(training, augment=False, steps=steps), "table"
+    effects = task.effect_channels if config is CNPConfig else task.all_effects
     channels = {"action_channels": task.action_channels, "effect_channels": effects}
-    return network.config(**channels, frame=frame), training
+    return config(**channels, frame=frame), training
 
 
 def job(model: str, data: str, n: int | str = "all", fold: int = 0, seed: int = 0) -> Job:
     """Return the job of one training and its tests; n interactions are split into ten folds."""
-    check_choice("model", model, MODELS)
-    check_choice("data", data, SETS)
-    check_count("fold", fold, 0, N_FOLDS - 1)
-    if n != "all" and (not isinstance(n, int) or n < N_FOLDS):
-        raise ValueError(f'n must be "all" or at least {N_FOLDS}, got {n!r}')
-    task, settings = task_of(data), ()
-    if model == "logistic" and not data.startswith("grasp"):
-        raise ValueError(f"model 'logistic' needs a data set of grasps, got {data!r}")
-    if task.symmetries is not None and model.endswith("_frame"):
-        raise ValueError(f"data {data!r} has no direction, which model {model!r} requires")
-    if model in NETWORKS:
-        settings = network_and_training(model, data, n)
+    task = task_of(data)
+    settings = network_and_training(model, data, n) if model in NETWORKS else ()
     arguments = {"model": model, "data": data, "n": n, "fold": fold, "seed": seed}
     sets = (data, task.test_set) if task.test_set else (data,)
     return Job(cross_validate, arguments, (task, settings), sets, version=VERSION)
@@ -139,28 +118,30 @@ def cross_validate(
 ) -> dict[str, Any]:
     """Return columns of predictions on the test part, errors on test_set."""
     interactions, task = open_once(data), task_of(data)
-    available = interactions.sizes["interaction"]
-    size = available if n == "all" else int(n)
-    if size > available:
-        raise ValueError(f"n must be at most {available}, the size of {data!r}, got {n}")
+    size = interactions.sizes["interaction"] if n == "all" else int(n)
     split = split_interactions(size, seed, fold, N_FOLDS)
     result: dict[str, Any] = {"n_interactions": size}
     known = interactions, split.train
     if model in NETWORKS:
-        network, result["training"] = _train(model, data, n, seed, split, resume_checkpoint)
+        config, training = network_and_training(model, data, n)
+        augment = partial(augment_by_symmetry, symmetries=task.symmetries or ())
+        how = replace(training, seed=seed), config, augment, resume_checkpoint
+        network, _ = train_model(interactions, split, *how)
 
     def predicted(test_set: xr.Dataset, rows: np.ndarray) -> dict[str, Any]:
         if model in NETWORKS:
-            return network_record(network, test_set, rows)
-        if model == "logistic":
-            return logistic_predictions(*known, test_set, rows)
-        channels = task.action_channels, task.all_effects
-        return baseline_predictions(BASELINES[model], channels, *known, test_set, rows)
+            found = network_record(network, test_set, rows)
+        elif model == "logistic":
+            found = logistic_predictions(*known, test_set, rows)
+        else:
+            channels = task.action_channels, task.all_effects
+            found = baseline_predictions(BASELINES[model], channels, *known, test_set, rows)
+        return pd.json_normalize(found, sep="_").iloc[0].to_dict()  # truth_x, mean_x, std_x, …
 
-    result["fold_test"] = prediction_columns(predicted(interactions, split.test))
+    result["fold_test"] = predicted(interactions, split.test)
     if task.test_set:
         other = open_once(task.test_set)
-        found = prediction_columns(predicted(other, np.arange(other.sizes["interaction"])))
+        found = predicted(other, np.arange(other.sizes["interaction"]))
         add_errors(table := pd.DataFrame(found), data.removesuffix(LARGE))
         errors = table.filter(like="_error").to_dict("list").items()
         errors = {name: [float(f"{e:.4g}") for e in each] for name, each in errors}
@@ -182,11 +163,6 @@ def logistic_predictions(
     return record | {"truth": {"z": height}}
 
 
-def prediction_columns(predictions: dict[str, Any]) -> dict[str, Any]:
-    """Flatten predictions to the columns of a table: `truth_x`, `mean_x`, `std_x` and others."""
-    return pd.json_normalize(predictions, sep="_").iloc[0].to_dict()
-
-
 def add_errors(table: pd.DataFrame, primitive: str) -> None:
     """Add columns of errors at t = 1 to a table: in (x, y) [m], or in z or yaw; and in yaw."""
     off = {c: table[f"mean_{c}"] - table[f"truth_{c}"] for c in CHANNELS if f"mean_{c}" in table}
@@ -206,16 +182,3 @@ def by_model(table: pd.DataFrame) -> Iterator[tuple[dict[str, Any], pd.DataFrame
         about = {"model": model, "n_interactions": int(n)}
         counts = {f"{key}s": group[key].nunique() for key in ("fold", "seed")}
         yield about | counts, group
-
-
-def _train(
-    model: str, data: str, n: int | str, seed: int, split: Split, resume_checkpoint: Path
-) -> tuple[EffectNetwork, dict[str, Any]]:
-    """Train a network; also return a record of the training."""
-    network, training = network_and_training(model, data, n)
-    augment = partial(augment_by_symmetry, symmetries=task_of(data).symmetries or ())
-    how = replace(training, seed=seed), network, augment, resume_checkpoint
-    trained, history = train_model(open_once(data), split, *how)
-    best = min(record.validation_error for record in history)
-    steps = {"steps": history[-1].step, "seconds": history[-1].seconds}
-    return trained, steps | {"validation_error": best, "temperature": trained.sigma_scale.tolist()}

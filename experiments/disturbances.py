@@ -8,26 +8,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from affordlib.planning.robot import Execution
-from affordlib.types import (
-    TABLE_X_M,
-    TABLE_Y_M,
-    Goal,
-    Observation,
-    Step,
-    check_choice,
-    check_count,
-    check_field,
-)
+from affordlib.types import TABLE_X_M, TABLE_Y_M, Goal, Observation, Step
+from affordlib.world import Tabletop
 from affordlib.world.trajectory import STEP_S
-
-if TYPE_CHECKING:
-    import affordlib.world
 
 KINDS = ("shove", "knock", "topple", "goal")
 STEPS_PER_S = round(1 / STEP_S)
@@ -55,17 +44,7 @@ class Disturbance:
     turn: float = 0.0
     at_s: float | None = None
 
-    def __post_init__(self) -> None:
-        check_choice("kind", self.kind, KINDS)
-        check_count("action", self.action, least=0)
-        for name in ("x", "y", "turn"):
-            check_field(self, name)
-        if self.at_s is not None:
-            check_field(self, "at_s", 0.0, 60.0, "s")
-            if self.kind == "shove":
-                raise ValueError("a shove happens between actions; omit at_s, or use a knock")
-
-    def apply(self, world: affordlib.world.Tabletop, goal: Goal) -> Goal:
+    def apply(self, world: Tabletop, goal: Goal) -> Goal:
         """Apply the disturbance to the world, and return the goal after it."""
         if self.kind == "goal":
             return replace(goal, xy_m=_inside(goal.xy_m[0] + self.x, goal.xy_m[1] + self.y))
@@ -80,7 +59,7 @@ class Disturbance:
         return goal
 
 
-def _topple(world: affordlib.world.Tabletop, direction_rad: float) -> None:
+def _topple(world: Tabletop, direction_rad: float) -> None:
     """Give the object the spin that tips it over the edge of its base in a direction [rad]."""
     c, s = math.cos(direction_rad), math.sin(direction_rad)
     low, high = world.client.getAABB(world.placed.body)
@@ -96,9 +75,7 @@ def _topple(world: affordlib.world.Tabletop, direction_rad: float) -> None:
     _set_in_motion(world, np.cross(spin, [-out * c, -out * s, up]), spin)
 
 
-def _set_in_motion(
-    world: affordlib.world.Tabletop, linear: Sequence[float], angular: Sequence[float]
-) -> None:
+def _set_in_motion(world: Tabletop, linear: Sequence[float], angular: Sequence[float]) -> None:
     """Add to the object's velocity [m/s] and to its spin [rad/s]."""
     body, moving = world.placed.body, world.client.getBaseVelocity(world.placed.body)
     world.client.resetBaseVelocity(body, *np.add(moving, (linear, angular)).tolist())
@@ -117,9 +94,7 @@ class DisturbanceSchedule:
     disturbances applied so far, in order.
     """
 
-    def __init__(
-        self, world: affordlib.world.Tabletop, goal: Goal, disturbances: Sequence[Disturbance] = ()
-    ) -> None:
+    def __init__(self, world: Tabletop, goal: Goal, disturbances: Sequence[Disturbance]) -> None:
         self.world, self.goal = world, goal
         self.happened: list[Disturbance] = []
         self._waiting = list(disturbances)

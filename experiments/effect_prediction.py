@@ -11,19 +11,18 @@ over all predictions.
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from affordlib.primitives import Grasp
 from experiments import reported, runner, studies
-from experiments.commands import command
 from experiments.cross_validation import LARGE, MODELS, PLANE, TASKS, add_errors, by_model, job
-from experiments.grasps import grasp_rows
-from experiments.runner import FOLDER, Result, Rows, frame, read
+from experiments.runner import FOLDER, Result, Rows, frame, read, shares
 
 NAME = "effect_prediction"
 SAME_TRUTH = 1e-6
@@ -69,11 +68,10 @@ def mean_sem(group: pd.DataFrame, column: str) -> tuple[float, float]:
 
 
 def error_rows(table: pd.DataFrame, primitive: str) -> Rows:
-    """Return rows of errors by model and category; yaw only for cuboids, where it is defined."""
+    """Return rows of errors by model and category."""
     unit, name = ("m", "final_error") if primitive in PLANE else ("rad", "error")
     rows = []
     for about, group in by_model(table):
-        yaw_predicted = "yaw_error" in group and group["yaw_error"].notna().all()
         for category, some in [("all", group), *group.groupby("category")]:
             row = about | {"object_class": category, "n": some["interaction"].nunique()}
             mean, sem = mean_sem(some, "final_error")
@@ -81,11 +79,40 @@ def error_rows(table: pd.DataFrame, primitive: str) -> Rows:
             for told, value in (("mean", mean), ("sem", sem), ("median", median), ("p95", p95)):
                 row[f"{name}_{told}_{unit}"] = float(value)
             row[f"trajectory_error_mean_{unit}"] = mean_sem(some, "trajectory_error")[0]
-            if primitive == "push":
-                turns = yaw_predicted and category == "cuboid"
-                row["yaw_error_mean_rad"] = mean_sem(some, "yaw_error")[0] if turns else None
             rows.append(row)
     return rows
+
+
+def grasp_rows(grasps: pd.DataFrame) -> Rows:
+    """Return the paper's Table 2; grasps: predictions with the jobs' arguments as columns.
+
+    The paper predicts success if μ_z(1) is above 0.1 m, as for a true success. Only the first seed
+    is used, because cross-validations with other seeds test the same grasps.
+    """
+    rows = []
+    for about, group in by_model(grasps[grasps["seed"] == grasps["seed"].min()]):
+        known = about["model"] != "logistic"
+        lifts = group["mean_z"] > Grasp.success_m if known else group["probability"] > 0.5
+        group = group.assign(predicted=lifts, lifted=group["truth_z"] > Grasp.success_m)
+        for rollable, some in group.groupby("rollable"):
+            row = about | {"rollable": bool(rollable), "n": len(some)}
+            row["error_mean_m"] = float(some["final_error"].mean()) if known else None
+            predicted, lifted = some["predicted"].to_numpy(), some["lifted"].to_numpy()
+            rows.append(row | confusion_columns(predicted, lifted))
+    return rows
+
+
+def confusion_columns(predicted: np.ndarray, lifted: np.ndarray) -> dict[str, Any]:
+    """Return TP and TN [%] with Wilson's 95 % intervals; None without successes or failures.
+
+    TP is the share of successes that are predicted (sensitivity), TN that of failures.
+    """
+    columns: dict[str, Any] = {}
+    for rate, those in (("tp", lifted), ("tn", ~lifted)):
+        n, k = int(those.sum()), int((predicted == lifted)[those].sum())
+        names = (f"{rate}{end}_percent" for end in ("", "_low", "_high"))
+        columns |= zip(names, shares(k, n), strict=True)
+    return columns | {"n_success": int(lifted.sum()), "n_failure": int((~lifted).sum())}
 
 
 def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
@@ -128,11 +155,7 @@ JOBS += [
 JOBS += [job(model, "push_x10", 1500) for model in ("constant", "nearest")]
 
 
-@command(OSError, ValueError)
-def main(argv: Sequence[str] | None = None) -> int:
-    """Train and test models in folds and make the tables; only missing results are computed."""
-    return runner.make(JOBS, NAME, runner.parser(NAME, main.__doc__).parse_args(argv), tables)
-
+main = runner.command_of(NAME, __doc__, lambda: JOBS, tables)
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

@@ -9,11 +9,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-import xarray as xr
 from jaxtyping import Float
 from torch import Tensor
 
-from affordlib.interactions import InteractionTensors, Split
+from affordlib.interactions import InteractionTensors
 from affordlib.interactions.dataset import Batch, condition_on_poses
 from affordlib.models import CNPConfig, EffectNetwork, NetworkConfig
 from affordlib.models.lever_up import (
@@ -22,12 +21,10 @@ from affordlib.models.lever_up import (
     N_PREDICTED,
     POSE_CHANNELS,
     errors_m,
-    lever_up_tensors,
     predict_steps,
     window_errors_m,
 )
 from affordlib.models.training import TrainingConfig, TrainingRecord, train, untrained
-from affordlib.types import check_choice
 from experiments.last_pose import CNPAroundMeanConfig, LastPoseConfig
 from experiments.lstm import LSTMConfig
 
@@ -140,14 +137,14 @@ def fit_lever_model(
 ) -> tuple[EffectNetwork, list[TrainingRecord]]:
     """Train a network, with as many steps as a trajectory has, for one protocol or all of them.
 
-    Early stopping uses the validation errors of the protocols that it is trained for.
+    The training part is joined by its mirror image. Early stopping uses the validation errors of
+    the protocols that it is trained for.
     """
-    trained_for = TRAINED_FOR[check_choice("trained_for", trained_for, TRAINED_FOR)]
-    network = lever.network
+    training, network = augment_by_symmetry(training, MIRRORED), lever.network
     if hasattr(network, "steps"):
         network = replace(network, steps=len(training.phase) - 1)
     model = untrained(network, training, lever.training.seed)
-    how = lever.training, resume_checkpoint, *trained_for
+    how = lever.training, resume_checkpoint, *TRAINED_FOR[trained_for]
     return model, train(model, training, validation, *how)
 
 
@@ -157,16 +154,3 @@ LEVER_CHECKPOINTS: dict[str, tuple[str, str]] = {
     "lever_up_lstm_1800_first_step": ("lstm_tuned", "first_step"),
 }
 """Checkpoints of lever-ups: the name in `LEVER_MODELS`, and the protocol it is trained for."""
-
-
-def train_lever_model(
-    lever: LeverModel,
-    data: xr.Dataset,
-    split: Split,
-    trained_for: str = "all",
-    resume_checkpoint: Path | None = None,
-) -> tuple[EffectNetwork, list[TrainingRecord]]:
-    """Train a lever-up network on a split's training part and its mirror image."""
-    training = augment_by_symmetry(lever_up_tensors(data, split.train, lever.view), MIRRORED)
-    validation = lever_up_tensors(data, split.validation, lever.view)
-    return fit_lever_model(lever, training, validation, trained_for, resume_checkpoint)

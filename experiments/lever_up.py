@@ -12,8 +12,6 @@ errors and intervals are over objects.
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -30,15 +28,14 @@ from affordlib.interactions.dataset import InteractionTensors, valid_interaction
 from affordlib.models import lever_up as models
 from affordlib.models.base import EffectNetwork
 from affordlib.models.lever_up import N_OBSERVED, N_PREDICTED, PROTOCOLS, lever_up_tensors
-from affordlib.types import Prediction, check_choice, check_count
+from affordlib.types import Prediction
 from experiments import reported, runner
-from experiments.commands import command
 from experiments.lever_training import (
     LEVER_MODELS,
     TRAINING,
     LeverModel,
+    fit_lever_model,
     from_start_errors_m,
-    train_lever_model,
 )
 from experiments.runner import FOLDER, Job, Result, Rows, interval, open_once, plain, read
 
@@ -82,11 +79,6 @@ def lever_model(model: str, setting: str | None = None) -> LeverModel | None:
 
 def job(model: str, trained_for: str = "all", fold: int = 0, setting: str | None = None) -> Job:
     """Return the job of one training and its tests."""
-    check_choice("model", model, MODELS)
-    check_choice(f"trained_for of {model!r}", trained_for, EACH.get(model, ("all",)))
-    check_count("fold", fold, 0, N_FOLDS - 1)
-    if setting is not None:
-        check_choice("setting", setting, SETTINGS)
     arguments = {"model": model, "trained_for": trained_for, "fold": fold, "setting": setting}
     return Job(cross_validate, arguments, lever_model(model, setting), (DATA,))
 
@@ -107,10 +99,8 @@ def cross_validate(
     split = lever_split(data, fold)
     network, result = model, {}
     if lever:
-        network, history = train_lever_model(lever, data, split, trained_for, resume_checkpoint)
-        best = min(record.validation_error for record in history)
-        told = {"steps": history[-1].step, "seconds": history[-1].seconds}
-        result["training"] = told | {"validation_error": best}
+        parts = [lever_up_tensors(data, p, lever.view) for p in (split.train, split.validation)]
+        network, _ = fit_lever_model(lever, *parts, trained_for, resume_checkpoint)
     view = lever.view if lever else "near"
     if setting is not None:
         return _tuned(network, lever_up_tensors(data, split.validation, view), trained_for)
@@ -158,16 +148,6 @@ def _errors(
         found = [models.predict_steps(network, arrays, protocol, start, seen) for start in starts]
     errors = torch.stack([100 * models.errors_m(told, truth) for told, truth in found], dim=1)
     return {"error_cm": errors.double().numpy().round(4).tolist()}
-
-
-def sorted_results(folder: str | Path = FOLDER) -> list[Result]:
-    """Return all results in the order of models and folds."""
-
-    def order(result: Result) -> tuple[Any, ...]:
-        model, trained_for, fold, setting = result[0].values()
-        return MODELS.index(model), trained_for, fold, [None, *SETTINGS].index(setting)
-
-    return sorted(read(NAME, job, folder), key=order)
 
 
 def _error_table(results: list[Result]) -> pd.DataFrame:
@@ -239,10 +219,13 @@ def tuning_rows(results: list[Result]) -> Rows:
 
 def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
     """Return all tables from the results in a folder."""
-    every = sorted_results(folder)
+
+    def order(result: Result) -> tuple[Any, ...]:
+        model, trained_for, fold, setting = result[0].values()
+        return MODELS.index(model), trained_for, fold, [None, *SETTINGS].index(setting)
+
+    every = sorted(read(NAME, job, folder), key=order)
     results = [result for result in every if result[0]["setting"] is None]
-    if not results:
-        raise FileNotFoundError(f"folder: there are no results in {folder}; run some jobs first")
     rows = error_rows(results)
     return {
         "lever_up": rows,
@@ -267,11 +250,7 @@ JOBS = [
 ]
 
 
-@command(OSError, ValueError)
-def main(argv: Sequence[str] | None = None) -> int:
-    """Train and test models in folds and make the tables; only missing results are computed."""
-    return runner.make(JOBS, NAME, runner.parser(NAME, main.__doc__).parse_args(argv), tables)
-
+main = runner.command_of(NAME, __doc__, lambda: JOBS, tables)
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

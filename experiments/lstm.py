@@ -36,13 +36,8 @@ class LSTMConfig(HarmonicsConfig):
     width: int = 192
 
 
-@dataclass(frozen=True)
-class Known:
-    """Observed effects on a grid of steps: d (B, K, C), their mask (B, K), first step (B,)."""
-
-    d: Tensor
-    where: Tensor
-    first: Tensor
+Known = tuple[Tensor, Tensor, Tensor]
+"""Observed effects on a grid of steps: d (B, K, C), their mask (B, K), first step (B,)."""
 
 
 def on_grid(effect: Tensor, t: Tensor, seen: Tensor, steps: int) -> Known:
@@ -55,7 +50,7 @@ def on_grid(effect: Tensor, t: Tensor, seen: Tensor, steps: int) -> Known:
     where = torch.zeros(b, n + 1, dtype=torch.bool, device=effect.device)
     where = where.scatter(1, at, torch.ones_like(seen))[:, :n]
     where[:, 0] |= ~where.any(dim=1)
-    return Known(d, where, where.to(torch.uint8).argmax(dim=1))
+    return d, where, where.to(torch.uint8).argmax(dim=1)
 
 
 @network("lstm", LSTMConfig)
@@ -91,8 +86,8 @@ class LSTMNetwork(AroundMean, HarmonicsNetwork):
         )
         static = torch.cat([features.expand(b, -1), code], dim=1)
         d = o.effect / self.effect_scale - self.mean_trajectory(o.effect_t)
-        known = on_grid(d, o.effect_t, o.effect_mask, self.config.steps)
-        at = (t_target * self.config.steps - known.first[:, None]).clamp_min(0)
+        *_, first = known = on_grid(d, o.effect_t, o.effect_mask, self.config.steps)
+        at = (t_target * self.config.steps - first[:, None]).clamp_min(0)
         path, raw = self.roll(known, static, max(1, int(at.detach().max().ceil())))
         mu_e = self.mean_trajectory(t_target) + between(path, at)
         sigma_e = self.sigma_floor + F.softplus(between(raw, at))
@@ -107,6 +102,7 @@ class LSTMNetwork(AroundMean, HarmonicsNetwork):
         The static inputs' contribution to the gates is computed once. Observed steps are not
         predicted, independent of the other rows of the batch.
         """
+        known_d, where, first = known
         rows, last = torch.arange(len(static), device=static.device), self.config.steps
         h, c = self.begin(static).tanh().chunk(2, dim=-1)
         moving = self.cell.input_size - static.shape[1]
@@ -115,20 +111,20 @@ class LSTMNetwork(AroundMean, HarmonicsNetwork):
         weight = torch.cat([w_in[:, :moving], w_h], dim=1).T
         phases = torch.linspace(0, 1, last + 1, device=static.device)[None]
         times = waves(phases, self.config.waves)[0]
-        predicted = previous = known.d[rows, known.first]
+        predicted = previous = known_d[rows, first]
         certain = torch.full_like(predicted, _CERTAIN)
         path, sigmas = [predicted], [certain]
         for j in range(n):
-            k = (known.first + j).clamp_max(last)
-            observed = known.where[rows, k][:, None]
-            d = torch.where(observed, known.d[rows, k], predicted)
+            k = (first + j).clamp_max(last)
+            observed = where[rows, k][:, None]
+            d = torch.where(observed, known_d[rows, k], predicted)
             change = d - previous
             x = torch.cat([d, change, times[k], observed.to(d.dtype), h], dim=1)
             i, f, g, o = torch.addmm(fixed, x, weight).chunk(4, dim=1)
             c = f.sigmoid() * c + i.sigmoid() * g.tanh()
             h = o.sigmoid() * c.tanh()
             after = (k + 1).clamp_max(last)
-            seen, to_come = known.where[rows, after][:, None], known.d[rows, after]
+            seen, to_come = where[rows, after][:, None], known_d[rows, after]
             if bool(seen.all()):
                 predicted, raw = to_come, certain
             else:

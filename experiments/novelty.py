@@ -203,9 +203,9 @@ MODELS = ("film_500", "film_5000", "cnp_500", "lstm_500")
 SETTINGS = (N_PUSHES, *CHOOSE, *ROLL, *FIRST, *SECOND)
 
 
-def tensors(data: Any, model: Any, rows: Any = None) -> InteractionTensors:
-    """Return tensors with a model's channels; rows: all by default."""
-    return InteractionTensors.from_dataset(data, rows, model.action_channels, model.effect_channels)
+def tensors(data: Any, model: Any) -> InteractionTensors:
+    """Return tensors of all interactions with a model's channels."""
+    return InteractionTensors.from_dataset(data, None, model.action_channels, model.effect_channels)
 
 
 def strangers(category: str, model: Any) -> InteractionTensors:
@@ -217,11 +217,6 @@ def strangers(category: str, model: Any) -> InteractionTensors:
     path = resolve_out_dir(FOLDER) / f"{category}.zarr.zip"
     every = tensors(open_interactions(collect(recipe, path, progress=False)), model)
     return every.select(every.image[:, 1].mean(dim=(1, 2)) > model.domain.mask_share[0] / 2)
-
-
-def auc(known: Any, unknown: Any) -> float:
-    """Return the probability that an unknown object's score exceeds a known one's, scores (N,)."""
-    return float((np.asarray(known)[:, None] < np.asarray(unknown)).mean())
 
 
 def final(model: Any, pushes: InteractionTensors) -> tuple[Tensor, Tensor, Tensor]:
@@ -260,7 +255,8 @@ def novelty_judged() -> Rows:
             novelty, truth, mean, std, aware = map(torch.cat, every)
             row = {"model": name, "objects": objects, "n": len(novelty), "auc": None}
             if objects != "known":
-                row["auc"] = auc(found["known"][0], novelty)
+                above = found["known"][0][:, None] < novelty
+                row["auc"] = float(above.double().mean())
             off = (mean - truth).norm(dim=1)
             row["error_mean_m"] = float(off.mean())
             for kind, sigma in (("", std), ("aware_", aware)):

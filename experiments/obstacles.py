@@ -11,10 +11,9 @@ of a search that knows the effects of the simulator.
 from __future__ import annotations
 
 import math
-import sys
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,6 @@ import pandas as pd
 import torch
 
 from affordlib.interactions.recipes import Variation
-from affordlib.models import load_checkpoint
 from affordlib.planning import (
     ClosedLoopConfig,
     PlanMode,
@@ -53,6 +51,7 @@ from affordlib.primitives import Drag, Move, Push
 from affordlib.types import Goal, Obstacle, UnreachableError
 from affordlib.world import Cuboid, Tabletop, TabletopObject, WorldConfig, category_named
 from experiments import runner
+from experiments.closed_loop import PUSHES, WORLDS, one_tabletop, skills_with
 from experiments.commands import command
 from experiments.field_baselines import MechanicsMap, plan_cem
 from experiments.runner import FOLDER, Job, Rows, interval, plain
@@ -244,37 +243,20 @@ network of pushes or mechanics instead, and whether it observes after each actio
 actions more."""
 
 
-@lru_cache(maxsize=2)
-def _skills(push: str = CHECKPOINTS["push"]) -> Skills:
-    skills = Skills.load()
-    return replace(skills, models=skills.models | {"push": load_checkpoint(push)[0]})
-
-
-def _network(row: str) -> str:
-    settings = ROWS[row][1] if row in ROWS else {}
-    usual = CHECKPOINTS["push"] + "_perturbed" * (settings.get("world") == "perturbed")
-    return settings.get("push", usual)
-
-
-@lru_cache(maxsize=1)
-def _tabletop() -> Tabletop:
-    return Tabletop()
-
-
 def run_task(row: str, family: str, index: int, seed: int) -> dict[str, Any]:
     """Plan and execute a task; return what came of it."""
     planner, settings = ROWS[row]
-    task, world = drawn_task(family, index, seed), _tabletop()
+    task, world = drawn_task(family, index, seed), one_tabletop()
     where = settings.get("world", "clean")
     rng = np.random.default_rng([seed, index])
     config = Variation().sample(task.obj, rng) if where == "perturbed" else WorldConfig()
     world.place(task.obj, (0.0, 0.0), task.yaw_rad, config=config, obstacles=task.obstacles)
     if where == "perturbed":
         world.settle(2.0)
-    mode, skills = PlanMode(MAX_STEPS, settings.get("partial", True)), _skills(_network(row))
+    skills = skills_with(settings.get("push", PUSHES[where]))
+    mode = PlanMode(MAX_STEPS, settings.get("partial", True))
     if settings.get("observes"):
-        n_images = 8 if where == "perturbed" else 1  # as in `experiments.closed_loop`
-        config = ClosedLoopConfig(mode, MAX_STEPS + 2, max_renewals=0, n_images=n_images)
+        config = ClosedLoopConfig(mode, MAX_STEPS + 2, max_renewals=0, n_images=WORLDS[where])
         result = run_closed_loop(world, task.goal, skills, planner, config)
         return {"status": result.status} | _outcome(task, world, len(result.steps))
     seen = world.observe()
@@ -301,9 +283,9 @@ def run_task(row: str, family: str, index: int, seed: int) -> dict[str, Any]:
 
 def _outcome(task: ObstacleTask, world: Tabletop, actions: int) -> dict[str, Any]:
     x, y, _ = world.object_pose()
-    touched = {f"{name}_touched": False for name in ("object", "arm")}
-    touched |= {f"{what}_touched": True for _, what in world.obstacles.touched}
-    return {"distance_m": task.goal.distance_m((x, y)), "actions": actions} | touched
+    touched = {what for _, what in world.obstacles.touched}
+    about = {f"{name}_touched": name in touched for name in ("object", "arm")}
+    return {"distance_m": task.goal.distance_m((x, y)), "actions": actions} | about
 
 
 N_PUSHES, N_BESIDE, WITHIN_GAP_M = 20, 20, 0.02
@@ -317,7 +299,7 @@ def calibrate(kind: str, index: int) -> list[dict[str, float]]:
     the gap to the recorded way, negative where it would touch, is the error. travel_m: predicted
     distance of the object from its start, where it comes nearest.
     """
-    world, found = _tabletop(), []
+    world, found = one_tabletop(), []
     for k in range(N_PUSHES):
         rng = np.random.default_rng([VALIDATION_SEED, index, k])
         of_kind = (0, 1, 2) if kind == "push" else (3, 5)
@@ -325,7 +307,7 @@ def calibrate(kind: str, index: int) -> list[dict[str, float]]:
         obj, yaw = drawn_object(number)
         world.place(obj, (0.0, 0.0), yaw)
         seen, angle = world.observe(), rng.uniform(-math.pi, math.pi)
-        effects = _skills().effects(seen.image)
+        effects = skills_with(CHECKPOINTS["push"]).effects(seen.image)
         stop = rng.uniform(0.7, 1.0)
         done = world.execute_primitive(effects.kind.towards(angle), stop, approach=True)
         if done.fell or done.left_table or effects.kind is not (Push if kind == "push" else Drag):
@@ -363,7 +345,7 @@ def simulated(number: int) -> tuple[type[Move], np.ndarray, np.ndarray]:
 
     Returns their primitive, directions [rad] (d,), and the object's poses (d, 301, 3) from its own.
     """
-    world, (obj, yaw) = _tabletop(), drawn_object(number)
+    world, (obj, yaw) = one_tabletop(), drawn_object(number)
     angles, ways = [], []
     for angle in np.linspace(-math.pi, math.pi, N_DIRECTIONS, endpoint=False):
         world.place(obj, (0.0, 0.0), yaw)
@@ -381,7 +363,7 @@ def search(family: str, index: int, seed: int) -> dict[str, Any]:
 
     Returns what came of the first that succeeds, or of the one that ended nearest.
     """
-    task, world = drawn_task(family, index, seed), _tabletop()
+    task, world = drawn_task(family, index, seed), one_tabletop()
     kind, angles, ways = simulated(task.number)
     world.place(task.obj, (0.0, 0.0), task.yaw_rad, obstacles=task.obstacles)
     outline = placed(task.obj.footprint_m, np.array([0.0, 0.0, task.yaw_rad]))
@@ -396,8 +378,7 @@ def search(family: str, index: int, seed: int) -> dict[str, Any]:
     for _ in range(MAX_STEPS):
         all_ends, all_plans = [], []
         for end, plan in zip(ends, plans, strict=True):
-            poses = np.concatenate([placed(steps[..., :2], end)], axis=-1)
-            poses = np.concatenate([poses, end[2] + steps[..., 2:]], axis=-1)
+            poses = np.concatenate([placed(steps[..., :2], end), end[2] + steps[..., 2:]], axis=-1)
             turned = angles[which] + end[2]
             free = space.spare_m(kind.towards(0.0), turned, stops, poses) >= 0
             all_ends.extend(poses[free, -1])
@@ -430,10 +411,11 @@ def search(family: str, index: int, seed: int) -> dict[str, Any]:
 def job(row: str, family: str = "", index: int = 0, seed: int = SEED) -> Job:
     """Return the job of a row and a task; the rows "margin" and "search" plan nothing."""
     arguments = {"row": row, "family": family, "index": index, "seed": seed}
-    more = () if row not in ROWS or "push" not in ROWS[row][1] else (_network(row),)
-    checkpoints = *CHECKPOINTS.values(), "film_5000_perturbed", *more
+    checkpoints = [*CHECKPOINTS.values(), PUSHES["perturbed"]]
+    if row in ROWS and "push" in ROWS[row][1]:
+        checkpoints.append(ROWS[row][1]["push"])
     version = 2 if row == "closed_loop_perturbed" else 1
-    return Job(make, arguments, checkpoints=checkpoints, version=version)
+    return Job(make, arguments, checkpoints=tuple(checkpoints), version=version)
 
 
 def make(row: str, family: str, index: int, seed: int) -> Any:
@@ -562,4 +544,4 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

@@ -37,16 +37,6 @@ NOISE_M, NOISE_RAD = 0.0003, 0.003
 """Standard deviation of the noise of the tracked poses [m] and [rad]."""
 
 
-def world_config(condition: str) -> WorldConfig:
-    """Return the world parameters of a condition."""
-    surface, support = condition.split("_")
-    x, y = SUPPORTS[support]
-    # The centre of mass is low, so that the triangle does not tip over.
-    inside = {"com_offset_m": (x, y, -0.3 * HEIGHT_M)}
-    friction = {"table_friction": SURFACES[surface], "finger_friction": SURFACES[surface]}
-    return WorldConfig(**inside, **friction)
-
-
 def drawn_push(outline_m: np.ndarray, yaw: float, rng: np.random.Generator) -> PushAt:
     """Sample a push anywhere on the outline, up to 50° from the normal."""
     edges = np.roll(outline_m, -1, axis=0) - outline_m
@@ -82,9 +72,13 @@ def executed(
 def collect(condition: str, seed: int) -> str:
     """Collect the pushes of a condition and return the text of its log."""
     rng, lines = np.random.default_rng(seed), [str(N_PUSHES)]
+    surface, support = condition.split("_")
+    friction = dict.fromkeys(("table_friction", "finger_friction"), SURFACES[surface])
+    # The centre of mass is low, so that the triangle does not tip over.
+    config = WorldConfig(com_offset_m=(*SUPPORTS[support], -0.3 * HEIGHT_M), **friction)
     prism = Prism(TRIANGLE_M, HEIGHT_M)
     corner, draw = np.array(prism.corners[0]), partial(drawn_push, prism.footprint_m, rng=rng)
-    for tool, poses in islice(executed(prism, draw, rng, world_config(condition)), N_PUSHES):
+    for tool, poses in islice(executed(prism, draw, rng, config), N_PUSHES):
         for x, y, yaw in poses:
             at = np.add((x, y), rotated(corner, yaw)) + rng.normal(0, NOISE_M, 2)
             at, a = 1e3 * at, (yaw + rng.normal(0, NOISE_RAD)) / 2

@@ -9,7 +9,6 @@ tables are made from all stored outcomes.
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -49,7 +48,6 @@ from affordlib.primitives import Drag, Move, Push
 from affordlib.types import NothingSeenError, Observation, Outcome, Plan, Step, on_table
 from affordlib.world import ROLLABLE, STANDING, Tabletop, UnreachableError
 from experiments import reported, runner
-from experiments.commands import command
 from experiments.field_baselines import plan_cem
 from experiments.runner import FOLDER, Job, Rows, interval, open_once, plain
 from experiments.shipped import CHECKPOINT_SPECS
@@ -89,10 +87,6 @@ def plan_astar_fine(problem: PlanningProblem, heuristic: str = "goal") -> Plan:
     """A* with twice as many directions and stop phases, and a tolerance of 5 mm instead of 20."""
     problem = replace(problem, goal=replace(problem.goal, tolerance_m=0.005))
     return plan_astar(problem, 72, FINE_PHASES, heuristic)
-
-
-Pose = Callable[..., PlanningProblem]
-"""Poses the problem of (image, start_xy_m, goal, mode), as `Skills.problem` does."""
 
 
 VERSIONS: dict[Planner, int] = {plan_astar: 2, plan_astar_fine: 2}
@@ -138,8 +132,8 @@ def decoded_kind(model: EffectNetwork, image: np.ndarray) -> type[Move]:
 class PlannerConfig:
     """A planner, its model, and its goals.
 
-    planner: a function of a `PlanningProblem`; arguments: its further arguments; execution: fields
-    of `Attempt`. model: a checkpoint. world, sources, modes: of the frozen goals;
+    planner: a function of a `PlanningProblem`; arguments: its further arguments; execution: options
+    of `attempt`. model: a checkpoint. world, sources, modes: of the frozen goals;
     standing: exclude rollable objects.
     """
 
@@ -175,8 +169,8 @@ class PlannerConfig:
         ]
         return np.flatnonzero(asked).tolist()
 
-    def pose(self) -> Pose:
-        """Return what poses the problems."""
+    def pose(self) -> Callable[..., PlanningProblem]:
+        """Return what poses the problem of (image, start_xy_m, goal, mode), as `Skills` does."""
         models = {kind: network(name) for kind, name in self.checkpoints.items()}
         skills, push = Skills(models), models["push"]
 
@@ -196,9 +190,8 @@ RECEDING = {"execution": {"receding": True}}
 DISC = {"heuristic": "disc"}
 PERTURBED = {"model": "film_5000_perturbed", "world": "perturbed"}
 ROLLING, OUTSIDE = (PERTURBED | {"world": world} for world in ("perturbed_rollable", "outside"))
-RISK_WEIGHTS = (0.0, 1.0, 10.0, 30.0)
 RATES = {"gradient": (0.03, 0.1, 0.3, 1.0, 3.0), "adam": (0.001, 0.005, 0.02)}
-"""Constants of our planner and of the paper's that are tried on the validation goals."""
+"""Rates of the paper's planner that are tried on the validation goals."""
 
 READINGS = {
     "gradient_100": {"samples": 100, "reading": Reading()},
@@ -261,7 +254,7 @@ CONFIGS: dict[str, PlannerConfig] = {
         f"RISK_WEIGHT={weight:g}": PlannerConfig(
             plan_continuous, arguments={"risk_weight": weight}, world="validation"
         )
-        for weight in RISK_WEIGHTS
+        for weight in (0.0, 1.0, 10.0, 30.0)
     },
     **{
         f"{how.descent}_rate={rate:g}": PlannerConfig(
@@ -290,22 +283,6 @@ CONFIGS |= {
         )
     },
 }
-
-
-@dataclass(frozen=True)
-class Attempt:
-    """How a plan is executed.
-
-    corrections: largest number of single actions that correct the final position.
-    n_averaged_images: number of images of which a position is the mean. by_plan: each action is
-    relative to the object's predicted position instead of the observed one. receding: after each
-    action, a new plan is made for the remaining number of actions (model-predictive control).
-    """
-
-    corrections: int = 0
-    n_averaged_images: int = 1
-    by_plan: bool = False
-    receding: bool = False
 
 
 def corrected(
@@ -344,44 +321,52 @@ def _joined(done: Outcome, more: Outcome) -> Outcome:
 
 
 def attempt(
-    world: Tabletop, task: PlanningTask, pose: Pose, planner: Planner, **options: Any
+    world: Tabletop,
+    task: PlanningTask,
+    plan_for: Callable[..., Plan],
+    corrections: int = 0,
+    n_averaged_images: int = 1,
+    by_plan: bool = False,
+    receding: bool = False,
 ) -> Outcome:
-    """Plan and execute one task; options: fields of `Attempt`.
+    """Plan and execute one task; plan_for: makes the plan of (image, start_xy_m, goal, mode).
+
+    corrections: largest number of single actions that correct the final position.
+    n_averaged_images: number of images of which a position is the mean. by_plan: each action is
+    relative to the object's predicted position instead of the observed one. receding: after each
+    action, a new plan is made for the remaining number of actions (model-predictive control).
 
     The distance is the world's ground truth. If the arm cannot follow a plan, the distance after
     its last executed action counts.
     """
-    how = Attempt(**options)
     world.place(task.obj, (0.0, 0.0), task.yaw_rad, config=task.config)
     once, at_xy_m = PlanMode(1, partial=True), None
 
     def observe() -> Observation:
-        views = [world.observe() for _ in range(how.n_averaged_images)]
+        views = [world.observe() for _ in range(n_averaged_images)]
         return replace(views[0], xy_m=tuple(np.mean([v.xy_m for v in views], axis=0).tolist()))
 
     def execute(step: Step) -> Execution:
         nonlocal at_xy_m
-        seen = replace(observe(), xy_m=at_xy_m) if how.by_plan else observe()
+        seen = replace(observe(), xy_m=at_xy_m) if by_plan else observe()
         at_xy_m = step.predicted_end_xy_m
         return world.execute(step, seen)
 
-    robot = SimpleNamespace(observe=observe, execute=execute)
-    for name in ("can_reach", "park", "settle"):
-        setattr(robot, name, getattr(world, name))
+    known = {name: getattr(world, name) for name in ("can_reach", "park", "settle")}
+    robot = SimpleNamespace(observe=observe, execute=execute, **known)
     seen = robot.observe()
-    plan = planner(pose(seen.image, seen.xy_m, task.goal, task.mode))
+    plan = plan_for(seen.image, seen.xy_m, task.goal, task.mode)
     at_xy_m = seen.xy_m
-    now = replace(plan, steps=plan.steps[:1]) if how.receding else plan
+    now = replace(plan, steps=plan.steps[:1]) if receding else plan
     try:
         outcome = execute_plan(robot, now)
-        outcome = corrected(robot, outcome, lambda *q: planner(pose(*q, once)), how.corrections)
+        outcome = corrected(robot, outcome, lambda *q: plan_for(*q, once), corrections)
         mode = MODES[task.mode]
-        for left in range(mode.max_steps - 1, 0, -1) if how.receding else ():
+        for left in range(mode.max_steps - 1, 0, -1) if receding else ():
             seen = robot.observe()
             if task.goal.distance_m(seen.xy_m) <= ENOUGH_M:
                 break
-            fewer = replace(mode, max_steps=left)
-            again = planner(pose(seen.image, seen.xy_m, task.goal, fewer))
+            again = plan_for(seen.image, seen.xy_m, task.goal, replace(mode, max_steps=left))
             more = execute_plan(robot, replace(again, steps=again.steps[:1]))
             outcome = replace(_joined(outcome, more), plan=plan)
     except UnreachableError as refused:
@@ -419,7 +404,7 @@ def run_config(config: str) -> list[dict[str, Any]]:
     with Tabletop() as world:
         pose = about.pose()
         for k in tqdm(about.chosen(tasks), config, unit=" goals", leave=False):
-            outcome = attempt(world, tasks[k], pose, planner, **about.execution)
+            outcome = attempt(world, tasks[k], lambda *q: planner(pose(*q)), **about.execution)
             records.append({"task": k} | outcome_record(tasks[k], outcome))
     return records
 
@@ -551,12 +536,7 @@ def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
     }
 
 
-@command(OSError, ValueError)
-def main(argv: Sequence[str] | None = None) -> int:
-    """Evaluate planners on the frozen goals and make the tables of all evaluated planners."""
-    options = runner.parser("planning", main.__doc__).parse_args(argv)
-    return runner.make([job(name) for name in CONFIGS], "planning", options, tables)
-
+main = runner.command_of("planning", __doc__, lambda: [job(name) for name in CONFIGS], tables)
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

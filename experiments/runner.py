@@ -44,7 +44,7 @@ from affordlib.planning.reachability import SHIPPED as REACHABILITY
 from affordlib.results import file_at, repo_root, resolve_out_dir, write_atomically, write_results
 from affordlib.weights import read_weights, resolve_checkpoint, weights_sha256
 from affordlib.workers import spread
-from experiments.commands import worker_type
+from experiments.commands import command, worker_type
 
 FOLDER = "data/results/raw"
 WRITE_EVERY_S = 30
@@ -229,6 +229,21 @@ def make(
         return 0
     print(write_results(options.out, table, {}, made))
     return 0
+
+
+def command_of(
+    table: str,
+    about: str,
+    jobs: Callable[[], Sequence[Job]],
+    tables: Callable[[str], dict[str, Rows]] | None = None,
+) -> Callable[..., int]:
+    """Return the `main` of a command that does as `make` does; about: the module's docstring."""
+
+    @command(OSError, ValueError, name=table)
+    def main(argv: Sequence[str] | None = None) -> int:
+        return make(jobs(), table, parser(table, about.splitlines()[0]).parse_args(argv), tables)
+
+    return main
 
 
 def _importable(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -12,7 +12,6 @@ import argparse
 import json
 import math
 import os
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -37,6 +36,7 @@ from affordlib.interactions.store import SUFFIX as DATA_SUFFIX
 from affordlib.interactions.store import dataset_sha256
 from affordlib.models import CNPConfig, FiLMConfig, NetworkConfig
 from affordlib.models.checkpoint import SUFFIX, save_checkpoint
+from affordlib.models.lever_up import lever_up_tensors
 from affordlib.models.training import Sampler, TrainingConfig, about_training, train_model
 from affordlib.planning import MODES
 from affordlib.planning.reachability import SHIPPED as REACHABILITY
@@ -51,7 +51,7 @@ from experiments.lever_training import (
     LEVER_MODELS,
     Symmetry,
     augment_by_symmetry,
-    train_lever_model,
+    fit_lever_model,
 )
 from experiments.lstm import LSTMConfig
 from experiments.tasks import (
@@ -224,7 +224,8 @@ def train_checkpoint(name: str) -> None:
     if name in LEVER_CHECKPOINTS:
         lever_name, trained_for = LEVER_CHECKPOINTS[name]
         spec = LEVER_MODELS[lever_name]
-        model, history = train_lever_model(spec, data, split, trained_for)
+        parts = [lever_up_tensors(data, p, spec.view) for p in (split.train, split.validation)]
+        model, history = fit_lever_model(spec, *parts, trained_for)
         more = {"trained_for": trained_for, "view": spec.view}
     else:
         spec, more = CHECKPOINT_SPECS[name], {}
@@ -285,11 +286,10 @@ def learn_reachability(data: xr.Dataset, seed: int = 0) -> Reachability:
     return model.eval()
 
 
-def train_reachability(_: argparse.Namespace) -> bool:
+def train_reachability(_: argparse.Namespace) -> None:
     """Train the shipped reachability on the shipped set `reach`."""
     learn_reachability(open_interactions("reach")).save(repo_root() / REACHABILITY)
     print(REACHABILITY)
-    return True
 
 
 def uniform_tasks(
@@ -318,7 +318,7 @@ VARIATIONS = {
 rougher tables, denser objects, and other errors and offsets up to twice as large as in training."""
 
 
-def draw_goals(_: argparse.Namespace) -> bool:
+def draw_goals(_: argparse.Namespace) -> None:
     """Sample the goals of Table 3 and 40 validation goals, and write files that stay frozen."""
     missing = [world for world, path in FROZEN.items() if not (repo_root() / path).exists()]
     for name in missing:
@@ -339,7 +339,6 @@ def draw_goals(_: argparse.Namespace) -> bool:
         path = repo_root() / FROZEN[name]
         write_atomically(path, sealed(path.stem, text))
     print(f"goals sampled for the worlds: {', '.join(missing) or 'none, all files exist'}")
-    return True
 
 
 COMMANDS = {
@@ -366,8 +365,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     names = sorted([*CHECKPOINT_SPECS, *LEVER_CHECKPOINTS])
     checkpoints.add_argument("--only", nargs="+", choices=names, help="default: all")
     options = parser.parse_args(argv)
-    return 0 if options.make(options) else 1
+    return int(options.make(options) is False)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

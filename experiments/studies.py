@@ -8,8 +8,7 @@ computes missing or stale results in `data/results/raw/studies.jsonl.gz`. The ta
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,6 @@ from affordlib.interactions import open_interactions
 from affordlib.models import condition_on_primitives, load_checkpoint
 from affordlib.primitives import Drag, Push
 from experiments import ablation, novelty, runner
-from experiments.commands import command
 from experiments.runner import FOLDER, Job, Rows, read
 
 NAME = "studies"
@@ -106,12 +104,7 @@ def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
     return {name: made[name] for name in BY_NAME if name in made}
 
 
-@command(OSError, ValueError)
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run missing or stale studies."""
-    options = runner.parser(NAME, main.__doc__).parse_args(argv)
-    return runner.make([job(name) for name in BY_NAME], NAME, options)
-
+main = runner.command_of(NAME, __doc__, lambda: [job(name) for name in BY_NAME])
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

@@ -29,7 +29,6 @@ from affordlib.world import Tabletop, TabletopObject
 from affordlib.world.objects import mesh
 from affordlib.world.robot import ROD_WIDTH_M
 from experiments import runner
-from experiments.commands import command
 from experiments.own_log import NOISE_M, NOISE_RAD, executed
 from experiments.runner import Job, Rows
 
@@ -143,12 +142,7 @@ def tables(folder: str | Path = runner.FOLDER) -> dict[str, Rows]:
     return {"goals": [row]}
 
 
-@command(OSError, ValueError)
-def main(argv: Sequence[str] | None = None) -> int:
-    """Collect, fit and bring the T to its goals, and make the table."""
-    options = runner.parser(TABLE, main.__doc__).parse_args(argv)
-    return runner.make([job(draw) for draw in range(DRAWS)], TABLE, options, tables)
-
+main = runner.command_of(TABLE, __doc__, lambda: [job(draw) for draw in range(DRAWS)], tables)
 
 if __name__ == "__main__":
     raise SystemExit(main())

@@ -23,13 +23,9 @@ from affordlib.results import file_at
 from affordlib.types import Goal, check_choice
 from affordlib.world import STANDING, Tabletop, TabletopObject, WorldConfig, category_named
 
-FROZEN = {
-    "clean": "data/goals/planning.json",
-    "perturbed": "data/goals/planning_perturbed.json",
-    "perturbed_rollable": "data/goals/planning_perturbed_rollable.json",
-    "outside": "data/goals/planning_outside.json",
-    "validation": "data/goals/planning_validation.json",
-    "fresh": "data/goals/planning_fresh.json",
+FROZEN = {"clean": "data/goals/planning.json"} | {
+    world: f"data/goals/planning_{world}.json"
+    for world in ("perturbed", "perturbed_rollable", "outside", "validation", "fresh")
 }
 GOAL_SOURCES = ("constructed", "uniform")
 

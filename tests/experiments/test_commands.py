@@ -13,7 +13,7 @@ from experiments.commands import command
 ALL = {
     path.relative_to(repo_root()).with_suffix("").as_posix().replace("/", ".")
     for path in (repo_root() / "experiments").rglob("*.py")
-    if "parse_args" in path.read_text() and "\nif __name__" in path.read_text()
+    if re.search(r"(parse_args|command_of).*\nif __name__", path.read_text(), re.DOTALL)
 }
 
 

@@ -8,34 +8,9 @@ import pytest
 from experiments import cross_validation
 from experiments import effect_prediction as tables
 from experiments.cross_validation import job, network_and_training
-from experiments.grasps import confusion_columns
-from experiments.lever_up import job as lever_job
-
-WINDOW = {"model": "lstm_tuned", "trained_for": "window"}
+from experiments.effect_prediction import confusion_columns
 
 # Jobs
-
-
-@pytest.mark.parametrize(
-    ("make", "arguments", "reason"),
-    [
-        (job, {"model": "lstm", "data": "push"}, "model must be one of.*'lstm'"),
-        (job, {"model": "film", "data": "lever_up"}, "data must be one of"),
-        (job, {"model": "film", "data": "push", "n": 5}, 'n must be "all" or at least 10, got 5'),
-        (job, {"model": "film", "data": "push", "fold": 10}, "fold must be .*9.*, got 10"),
-        (job, {"model": "logistic", "data": "push"}, "grasps, got 'push'"),
-        (job, {"model": "film_table_frame", "data": "grasp"}, "has no direction"),
-        (lever_job, {"model": "gru"}, "model must be one of"),
-        (lever_job, {"model": "cnp_last_pose", "fold": 5}, "fold must be .*4.*, got 5"),
-        (lever_job, {"model": "lstm_tuned"}, "must be one of .*window.*, got 'all'"),
-        (lever_job, {"model": "cnp_last_pose_single"}, "must be one of .*window.*, got 'all'"),
-        (lever_job, {"model": "cnp", "trained_for": "window"}, "must be .*all.*, got 'window'"),
-        (lever_job, WINDOW | {"setting": "x"}, "setting must"),
-    ],
-)
-def test_jobs_that_cannot_be_are_refused(make, arguments, reason):
-    with pytest.raises(ValueError, match=reason):
-        make(**arguments)
 
 
 def test_what_decides_a_training_decides_whether_its_result_is_stale(monkeypatch):

@@ -88,15 +88,13 @@ def test_planners_differ_and_are_asked_about_all_their_categories_alike():
 
 def test_actions_are_placed_by_the_plan(world):
     task = next(t for t in frozen_tasks() if t.mode == "multi_partial" and not t.obj.rollable)
-    config, seen = CONFIGS["continuous"], []
+    pose, seen = CONFIGS["continuous"].pose(), []
 
-    def watched(problem):
-        seen.append(problem.start_xy_m)
-        return config.planner(problem)
+    def watched(*query):
+        seen.append(query)
+        return CONFIGS["continuous"].planner(pose(*query))
 
-    again, once = (
-        attempt(world, task, config.pose(), watched, by_plan=by_plan) for by_plan in (False, True)
-    )
+    again, once = (attempt(world, task, watched, by_plan=by_plan) for by_plan in (False, True))
     assert len(seen) == 2
     assert again.distance_m != once.distance_m
     # Only the object's position in the plan matters, not that in the world.

@@ -440,8 +440,6 @@ def test_disturbances_are_a_function_of_the_seed():
     assert {d.kind for d in drawn} == {"shove", "knock", "topple", "goal"}
     assert all(d.at_s is None for d in drawn if d.kind == "shove")
     assert all(d.action >= 1 for d in drawn if d.at_s is None)
-    with pytest.raises(ValueError, match="a shove happens between actions"):
-        Disturbance("shove", 1, 0.1, 0.0, at_s=1.0)
 
 
 def test_the_disturbance_and_not_the_robot_makes_a_goal_infeasible(world):

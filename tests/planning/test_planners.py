@@ -4,7 +4,6 @@ import itertools
 import math
 import warnings
 from dataclasses import replace
-from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -413,8 +412,10 @@ def test_plans_come_within_what_their_planner_promises(world, trained, film):
     assert all(math.hypot(*task.goal.xy_m) > 0.02 for task in tasks)
 
     def distances(plan, model, tasks, **how):
-        pose = partial(problem_of, model)
-        return [attempt(world, task, pose, plan, **how).distance_m for task in tasks]
+        def plan_for(*query):
+            return plan(problem_of(model, *query))
+
+        return [attempt(world, task, plan_for, **how).distance_m for task in tasks]
 
     assert np.mean(distances(planning.plan_astar, trained, tasks)) < 0.03
     hard = [t for t in frozen_tasks() if (t.goals, t.mode) == ("constructed", "multi_partial")]
