@@ -76,8 +76,8 @@ def error_rows(table: pd.DataFrame, primitive: str) -> Rows:
             row = about | {"object_class": category, "n": some["interaction"].nunique()}
             mean, sem = mean_sem(some, "final_error")
             median, p95 = some["final_error"].quantile([0.5, 0.95])
-            for told, value in (("mean", mean), ("sem", sem), ("median", median), ("p95", p95)):
-                row[f"{name}_{told}_{unit}"] = float(value)
+            for what, value in (("mean", mean), ("sem", sem), ("median", median), ("p95", p95)):
+                row[f"{name}_{what}_{unit}"] = float(value)
             row[f"trajectory_error_mean_{unit}"] = mean_sem(some, "trajectory_error")[0]
             rows.append(row)
     return rows
@@ -135,7 +135,7 @@ def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
 
 
 NEED_NO_NETWORK = ("constant", "nearest", "gaussian_process")
-ASKED = (
+COMPARED = (
     (("film", "cnp", *NEED_NO_NETWORK), TASKS, range(10)),
     (("logistic",), ["grasp"], range(10)),
     (("film_table_frame",), ["push"], range(10)),
@@ -146,7 +146,7 @@ ASKED = (
 )
 """Models, data sets and folds of the tables."""
 
-JOBS = [job(model, data, fold=fold) for asked in ASKED for model, data, fold in product(*asked)]
+JOBS = [job(model, data, fold=fold) for those in COMPARED for model, data, fold in product(*those)]
 JOBS += [
     job(model, data, seed=seed)
     for model in ("film", "cnp", "constant", "nearest")

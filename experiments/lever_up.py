@@ -146,7 +146,7 @@ def _errors(
         with torch.no_grad():
             seen = network.encode(arrays.image)
         found = [models.predict_steps(network, arrays, protocol, start, seen) for start in starts]
-    errors = torch.stack([100 * models.errors_m(told, truth) for told, truth in found], dim=1)
+    errors = torch.stack([100 * models.errors_m(given, truth) for given, truth in found], dim=1)
     return {"error_cm": errors.double().numpy().round(4).tolist()}
 
 

@@ -163,11 +163,11 @@ class PlannerConfig:
 
     def chosen(self, tasks: Sequence[PlanningTask]) -> list[int]:
         """Return the numbers of the tasks that it is evaluated on."""
-        asked = [
+        fits = [
             (t.goals in self.sources and t.mode in self.modes and t.obj.category in self.classes)
             for t in tasks
         ]
-        return np.flatnonzero(asked).tolist()
+        return np.flatnonzero(fits).tolist()
 
     def pose(self) -> Callable[..., PlanningProblem]:
         """Return what poses the problem of (image, start_xy_m, goal, mode), as `Skills` does."""

@@ -179,10 +179,10 @@ def held_out_errors(model: NeuralProcess, held_out: list[Tensor]) -> dict[str, l
     rows, feet, truth = held_out
     truth = in_contact_frame(rows, truth)[:, 32:]
     errors = {}
-    for n, told in ((0, True), (0, False), (5, False), (32, False), (32, True)):
-        mean, _ = model(rows[:, 32:], rows[:, :n], feet * told)
+    for n, known in ((0, True), (0, False), (5, False), (32, False), (32, True)):
+        mean, _ = model(rows[:, 32:], rows[:, :n], feet * known)
         xy, turn = (mean - truth)[..., :2].norm(dim=-1).mean(), (mean - truth)[..., 2].abs().mean()
-        key = f"{n} pushes{', told the feet' if told else ''}"
+        key = f"{n} pushes{', feet known' if known else ''}"
         errors[key] = [round(float(xy) * 100, 3), round(math.degrees(turn), 3)]
     return errors
 

@@ -371,9 +371,9 @@ def tables(folder: str = FOLDER) -> dict[str, Rows]:
             about["steps_median"] = steps.median() if steps.median() < math.inf else None
             about["pushes_mean"] = part["pushes"].mean()
             solved.append(about | {"plan_mean_s": part["plan_s"].mean()})
-    told = [(about, r | {"spent": [r["spent"]]}) for about, r in results if "errors" in r]
-    every, spent = frame(told, "errors"), frame(told, "spent")
-    for row, part in every.groupby("row", sort=False) if told else ():
+    measured = [(about, r | {"spent": [r["spent"]]}) for about, r in results if "errors" in r]
+    every, spent = frame(measured, "errors"), frame(measured, "spent")
+    for row, part in every.groupby("row", sort=False) if measured else ():
         about = {"row": row, "n": len(part), "draws": part["draw"].nunique()}
         for what, unit in (("position", "m"), ("yaw", "rad")):
             for name, at in (("median", 0.5), ("p95", 0.95)):

@@ -17,21 +17,21 @@ from experiments.cross_validation import add_errors
 
 def test_answers_are_those_of_the_model_itself(trained, held_out_pushes):
     some = np.arange(5)
-    told = network_record(trained, held_out_pushes, some)
+    found = network_record(trained, held_out_pushes, some)
     arrays = InteractionTensors.from_dataset(held_out_pushes, some)
     torch.testing.assert_close(
-        torch.tensor(final_error(told)).float(), final_errors_m(trained, arrays)
+        torch.tensor(final_error(found)).float(), final_errors_m(trained, arrays)
     )
     short = network_predictions(trained, held_out_pushes, some)
-    np.testing.assert_allclose(final_error(short), final_error(told), atol=1e-7)
-    assert told["interaction"] == some.tolist()
-    assert (np.array(told["trajectory_error"]) < final_error(told)).mean() > 0.5
+    np.testing.assert_allclose(final_error(short), final_error(found), atol=1e-7)
+    assert found["interaction"] == some.tolist()
+    assert (np.array(found["trajectory_error"]) < final_error(found)).mean() > 0.5
 
 
 def test_a_turn_is_measured_the_short_way_round():
-    told = pd.DataFrame({"truth_yaw": [3.1, 0.2], "mean_yaw": [-3.1, 0.1]})
-    add_errors(told, "rotate")
-    np.testing.assert_allclose(told["yaw_error"], [2 * math.pi - 6.2, 0.1])
+    found = pd.DataFrame({"truth_yaw": [3.1, 0.2], "mean_yaw": [-3.1, 0.1]})
+    add_errors(found, "rotate")
+    np.testing.assert_allclose(found["yaw_error"], [2 * math.pi - 6.2, 0.1])
 
 
 # Baselines
@@ -53,10 +53,10 @@ def test_baselines_know_the_direction_and_recover_a_law_of_size():
     out = torch.stack([theta.cos(), theta.sin()], dim=-1)
     arrays = arrays_of((0.05 + 0.02 * size[:, None]) * out, theta)
     train, test, at = arrays.select(slice(0, 40)), arrays.select(slice(40, 60)), torch.tensor([1])
-    known, asked = 3 * size[:40, None], 3 * size[40:, None]
+    known, queried = 3 * size[:40, None], 3 * size[40:, None]
     off = {}
     for baseline in (constant, nearest, gaussian_process):
-        mean, std = baseline(train, test, at, known, asked)
+        mean, std = baseline(train, test, at, known, queried)
         off[baseline] = float((mean[:, 0] - test.effect[:, 1]).norm(dim=-1).mean())
         assert mean.shape == std.shape == (20, 1, 2)
     length = 0.05 + 0.02 * size
