@@ -82,14 +82,14 @@ def pushes_of(path: Path) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]
 
 
 @lru_cache
-def read_logs(folder: str | Path, told: bool = True) -> LoggedPushes:
-    """Read all pushes of the seven conditions; told: include the feet as context."""
+def read_logs(folder: str | Path, feet: bool = True) -> LoggedPushes:
+    """Read all pushes of the seven conditions; feet: include the feet as context."""
     log = Log(unit="mm", outline=CORNERS_MM)
     for name in CONDITIONS:
         found = sorted(Path(folder).glob(f"{name}.txt*"))
         if not found:
             raise FileNotFoundError(f"--logs: there is no {name}.txt or {name}.txt.xz in {folder}")
-        context = {"feet": feet_of(name.split("_")[1])} if told else {}
+        context = {"feet": feet_of(name.split("_")[1])} if feet else {}
         for poses, t, xy in pushes_of(found[0]):
             log.add(t, xy, planar(poses, "wxyz"), context=context, group=name)
     return log.pushes()
@@ -142,18 +142,18 @@ PROTOCOLS |= {"pooled": (pooled, 5), "unseen": (unseen, len(CONDITIONS))}
 COLUMNS = ["model", "shots", "push", "position_m", "yaw_rad", "inside_50", "inside_90"]
 
 
-def measure(logs: str, protocol: str, predictor: str, told: bool, seed: int, fold: int) -> dict:
+def measure(logs: str, protocol: str, predictor: str, feet: bool, seed: int, fold: int) -> dict:
     """Return the errors per push of one fold."""
     names = (predictor,)
     if predictor == "baselines":  # only physics_feet… use known feet
-        names = tuple(name for name in BASELINES if name.startswith("physics_feet") == told)
-    errors = PROTOCOLS[protocol][0](read_logs(logs, told), names, seed, fold)
+        names = tuple(name for name in BASELINES if name.startswith("physics_feet") == feet)
+    errors = PROTOCOLS[protocol][0](read_logs(logs, feet), names, seed, fold)
     return {"errors": errors.reindex(columns=COLUMNS).fillna({"shots": -1}).to_dict("list")}
 
 
-def job(protocol: str, predictor: str, told: bool, seed: int, fold: int, logs: str = "") -> Job:
+def job(protocol: str, predictor: str, feet: bool, seed: int, fold: int, logs: str = "") -> Job:
     """Return the job of one fold of a protocol; the path of the logs is not part of its key."""
-    arguments = {"protocol": protocol, "predictor": predictor, "told": told}
+    arguments = {"protocol": protocol, "predictor": predictor, "feet": feet}
     arguments |= {"seed": seed, "fold": fold}
     if predictor == "np":
         return Job(partial(measure, logs), arguments, EFFORT, checkpoints=(PRETRAINED,), version=3)
@@ -166,7 +166,7 @@ def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
     A push's error is its mean over seeds, so that each push counts once.
     """
     every = frame(read(TABLE, job, folder), "errors").drop(columns=["fold", "predictor"])
-    keys = ["protocol", "told", "shots", "model"]
+    keys = ["protocol", "feet", "shots", "model"]
     seeds = every.groupby(keys)["seed"].nunique()
     pushes = every.groupby([*keys, "push"]).mean(numeric_only=True).reset_index()
     pushes["condition"] = np.array(CONDITIONS)[pushes["push"] // 50]
@@ -177,7 +177,7 @@ def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
     found["differences"] = [
         {"protocol": protocol, "shots": shots} | row
         for (protocol, shots), part in pushes.groupby(["protocol", "shots"])
-        for row in differences(part.pivot(index="push", columns=["model", "told"]))
+        for row in differences(part.pivot(index="push", columns=["model", "feet"]))
     ]
     for row in (row for rows in found.values() for row in rows):
         row["shots"] = int(row["shots"]) if row["shots"] >= 0 else None
@@ -192,13 +192,13 @@ def differences(errors: pd.DataFrame) -> Rows:
     bootstrap over pushes, not over seeds.
     """
     mean, rows = errors["position_m"].mean(), []
-    for _, told in (key for key in mean.index if key[0] == "np"):
-        for baseline_told in sorted(set(mean[list(BASELINES)].index.get_level_values("told"))):
-            best = mean[list(BASELINES)].xs(baseline_told, level="told").idxmin()
-            row = {"told": told, "baseline": best, "baseline_told": baseline_told}
+    for _, feet in (key for key in mean.index if key[0] == "np"):
+        for baseline_feet in sorted(set(mean[list(BASELINES)].index.get_level_values("feet"))):
+            best = mean[list(BASELINES)].xs(baseline_feet, level="feet").idxmin()
+            row = {"feet": feet, "baseline": best, "baseline_feet": baseline_feet}
             for column, unit in (("position", "m"), ("yaw", "rad")):
                 each = errors[f"{column}_{unit}"]
-                off = (each["np", told] - each[best, baseline_told]).dropna()
+                off = (each["np", feet] - each[best, baseline_feet]).dropna()
                 names = [f"{column}_{what}_{unit}" for what in ("mean", "low", "high")]
                 row |= {"n": len(off)} | dict(zip(names, interval(off), strict=True))
             rows.append(row)
@@ -212,12 +212,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--logs", help="folder of the published logs; without it, only tables")
     options = parser.parse_args(argv)
     jobs = [
-        job(protocol, predictor, told, seed, fold, options.logs)
+        job(protocol, predictor, feet, seed, fold, options.logs)
         for protocol, (_, folds) in PROTOCOLS.items()
-        for predictor, told in itertools.product(NAMES, (False, True))
+        for predictor, feet in itertools.product(NAMES, (False, True))
         for seed, fold in itertools.product(range(3 if predictor == "np" else 1), range(folds))
         # Within one condition, the feet are the same for all pushes.
-        if predictor == "baselines" or not told or not protocol.startswith("from")
+        if predictor == "baselines" or not feet or not protocol.startswith("from")
     ]
     return runner.make(jobs if options.logs else [], TABLE, options, tables)
 
