@@ -22,12 +22,8 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from affordlib.geometry import rotate, xy_columns
-from affordlib.models.base import (
-    EffectModel,
-    EffectNetwork,
-    condition_on_primitives,
-    rotate_prediction,
-)
+from affordlib.models import EffectModel, EffectNetwork, condition_on_primitives
+from affordlib.models.base import rotate_prediction
 from affordlib.perception import outline_of, radius_m
 from affordlib.primitives import Move, Push
 from affordlib.types import CROP_WIDTH_M, IMAGE_CHANNELS, IMAGE_PIXELS, Prediction, check_array

@@ -25,7 +25,6 @@ from affordlib.planning import Planner, Skills, plan_astar, plan_continuous, pla
 from affordlib.planning.gradient import Reading
 from affordlib.show.picker_controls import (
     LIMIT_M,
-    Executor,
     PickerControls,
     Stopped,
     closed_loop,
@@ -81,10 +80,7 @@ class GoalPicker(widgets.HBox):
     ) -> None:
         self.world, self.skills, self.planners = world, skills, planners
         self._searched = [] if searched is None else searched
-        self.executors: dict[str, Executor] = {
-            "open loop": open_loop,
-            "closed loop": closed_loop(skills),
-        }
+        self.executors = {"open loop": open_loop, "closed loop": closed_loop(skills)}
         self.plan: Plan | None = None
         self.outcome: Outcome | None = None
         self._rng = np.random.default_rng(check_count("seed", seed, least=0))
@@ -266,7 +262,11 @@ class GoalPicker(widgets.HBox):
             self._show(planning=True)
             goal, number, plan = self.goal, self._view.wanted[2], None
             self._searched.clear()
-            self._put_down()
+            self.controls.show_progress(0)
+            if self._lifted:  # put it down
+                self.world.park()
+                self._lifted = False
+            self._pose = self.world.object_pose()
             try:
                 seen = self.world.depth_image(), self._pose[:2]
                 problem = self.skills.problem(*seen, goal, obstacles=self.world.obstacles.all)
@@ -277,27 +277,15 @@ class GoalPicker(widgets.HBox):
                     effects = self._effects = problem.effects
                     self._view.object = object_data(self.world.obj, effects, self._pose[2])
             finally:
-                self._begin(plan)
+                self.plan, self.outcome = plan, None
+                self._trail.clear()
+                self._marks.clear()
+                if self.scene is not None:
+                    self.scene.mark(self.goal, plan)
+                self._plan_pose, self._turn_from = self._pose, self._pose[2]
                 self._answered = number
                 self._stale = goal is not self.goal
                 self._show(planning=self._stale)
-
-    def _put_down(self) -> None:
-        """Prepare the table for a new plan."""
-        self.controls.show_progress(0)
-        if self._lifted:
-            self.world.park()
-            self._lifted = False
-        self._pose = self.world.object_pose()
-
-    def _begin(self, plan: Plan | None) -> None:
-        """Show a plan that starts at the object's current pose."""
-        self.plan, self.outcome = plan, None
-        self._trail.clear()
-        self._marks.clear()
-        if self.scene is not None:
-            self.scene.mark(self.goal, plan)
-        self._plan_pose, self._turn_from = self._pose, self._pose[2]
 
     # Execution
 

@@ -19,7 +19,7 @@ from PIL import Image
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from affordlib.show.plots import GOAL, PREDICTION, TRUTH
-from affordlib.types import TABLE_X_M, TABLE_Y_M, Goal, Plan, check_count
+from affordlib.types import TABLE_X_M, TABLE_Y_M, Goal, Plan
 from affordlib.world import BASE_X_M, LyingCylinder, Sphere, Tabletop, TabletopObject
 from affordlib.world.camera import SCENERY
 from affordlib.world.objects import mesh
@@ -39,20 +39,19 @@ _SCRIPT = Path(__file__).with_name("scene.js")
 
 
 class Scene(widgets.VBox):
-    """A view of a world and its object, drawn by k3d, `height` pixels high, with a time line.
+    """A view of a world and its object, drawn by k3d, 400 pixels high, with a time line.
 
     As the world's `on_step` it records the motion; `play` shows what was recorded since `place`, in
     real time. Call `place` when there is another object.
     """
 
-    def __init__(self, world: Tabletop, height: int = 400) -> None:
+    def __init__(self, world: Tabletop) -> None:
         import k3d  # a quarter of a second that only a scene needs
 
         self.world, self._mesh = world, k3d.mesh
-        check_count("height", height, 100, 2000)
         plain = {"grid_visible": False, "camera_auto_fit": False, "menu_visibility": False}
         fast = {"antialias": 1, "logarithmic_depth_buffer": False}  # twice, without a GPU
-        self.plot = k3d.plot(height=height, **plain, **fast)
+        self.plot = k3d.plot(height=400, **plain, **fast)
         self.plot.layout.width = "100%"
         self.plot.background_color, self.plot.camera = 0xF4F6F8, list(CAMERA)
         self.plot.axes_helper, self.plot.lighting = 0.0, 1.8

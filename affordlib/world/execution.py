@@ -64,7 +64,8 @@ class JointController:
     def __init__(self, client: BulletClient, tool: str, after_step: Callable[[], None]) -> None:
         self.client, self.tool, self.after_step = client, tool, after_step
         self.robot = robot.load_robot(client, tool)
-        self.links = robot.links(client, self.robot)
+        numbers = range(client.getNumJoints(self.robot))  # of the links, too
+        self.links = {client.getJointInfo(self.robot, k)[12].decode(): k for k in numbers}
         self.fingers = self.links["left_finger"], self.links["right_finger"]
         self.joints = (*robot.ARM_JOINTS, *self.fingers)
         self.palm = self.links["palm"]
