@@ -22,7 +22,6 @@ from affordlib.geometry import xy_columns
 from affordlib.interactions import InteractionTensors, condition_on_recorded_action
 from affordlib.interactions.dataset import check_fits, check_numbers, valid_interactions
 from affordlib.models.base import EffectModel, EffectNetwork
-from affordlib.types import check_within
 
 AFTER_CONTACT = (0.8, 0.9, 1.0)
 """Phases at which every push has moved its object; before contact the effect is always zero."""
@@ -35,9 +34,6 @@ def effects_at(
     model: EffectModel, tensors: InteractionTensors, phases: Sequence[float]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Ground truth, mean and σ of the effects, (N, T, C) each, given image and action."""
-    phases = [check_within("phases", phase, 0.0, 1.0) for phase in phases]
-    if not phases:
-        raise ValueError("phases must hold at least one phase in [0, 1], got none")
     check_fits("tensors", tensors, model)
     at = (torch.tensor(phases) * (len(tensors.phase) - 1)).round().long()
     predicted = model.predict(

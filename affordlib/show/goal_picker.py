@@ -344,10 +344,11 @@ class GoalPicker(widgets.HBox):
                     how = "Done,"
                     self.controls.show_progress(1)
                 except Stopped:
-                    outcome, how = measured(self.world, self.plan), "Stopped after"
+                    outcome, how = measured(self.world, self.plan, self.goal), "Stopped after"
                 turned = wrap_angle(self.world.object_pose()[2] - yaw)
                 lifted = self.world.object_state()[2] - z
-                outcome = replace(outcome.with_goal(self.goal), turned_rad=turned, lifted_m=lifted)
+                left_m = self.goal.distance_m(outcome.end_pose[:2])
+                outcome = replace(outcome, distance_m=left_m, turned_rad=turned, lifted_m=lifted)
                 self.outcome, self._lifted = outcome, bool(self.goal.height_m)
                 if self.plan.goal == self.goal or outcome.distance_m <= self.goal.tolerance_m:
                     self._stale = False  # the run has followed the goal

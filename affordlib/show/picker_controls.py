@@ -162,15 +162,15 @@ def open_loop(world: Tabletop, plan: Plan, planner: Planner, report: Report) -> 
     for step in plan.steps:
         paths += execute_plan(world, replace(plan, steps=(step,))).object_paths_xy_m
         report()
-    return measured(world, plan, paths)
+    return measured(world, plan, plan.goal, paths)
 
 
 def measured(
-    world: Tabletop, plan: Plan, paths_xy_m: tuple[np.ndarray, ...] = (), words: str = ""
+    world: Tabletop, plan: Plan, goal: Goal, paths: tuple[np.ndarray, ...] = (), words: str = ""
 ) -> Outcome:
-    """The outcome of a plan, measured from the object's true pose."""
+    """The outcome of a plan, measured from the object's true pose to a goal; paths: (n, 2) [m]."""
     pose = world.object_pose()
-    return Outcome(plan, plan.goal.distance_m(pose[:2]), pose, paths_xy_m, words=words)
+    return Outcome(plan, goal.distance_m(pose[:2]), pose, paths, words=words)
 
 
 def closed_loop(skills: Skills, tolerance_m: float = 0.002) -> Executor:
@@ -188,6 +188,6 @@ def closed_loop(skills: Skills, tolerance_m: float = 0.002) -> Executor:
             world, lambda: replace(goal, tolerance_m=tolerance_m), skills, planner, config
         )
         words = "" if done.reached else f"The loop ended as {done.status}: {done.message}."
-        return measured(world, plan, done.object_paths_xy_m, words).with_goal(goal)
+        return measured(world, plan, goal, done.object_paths_xy_m, words)
 
     return execute

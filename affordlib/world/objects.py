@@ -18,7 +18,7 @@ from pybullet_utils.bullet_client import BulletClient
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from affordlib.geometry import centroid, edge_normals, is_convex
+from affordlib.geometry import centroid, circle, edge_normals, extruded, is_convex, rectangle
 from affordlib.types import (
     Checked,
     Obstacle,
@@ -83,15 +83,6 @@ class TabletopObject(ABC):
         return self.rollable
 
 
-def _circle(diameter: float) -> np.ndarray:
-    angle = np.linspace(0, 2 * math.pi, 36, endpoint=False)
-    return diameter / 2 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-
-
-def _rectangle(length: float, width: float) -> np.ndarray:
-    return np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * np.array([length / 2, width / 2])
-
-
 @dataclass(frozen=True)
 class Cuboid(TabletopObject):
     """A box with edges `length`, `width` and `height` [m], standing on its base."""
@@ -103,7 +94,7 @@ class Cuboid(TabletopObject):
     category = "cuboid"
     stable = True
     volume_m3 = property(lambda self: self.length * self.width * self.height)
-    footprint_m = property(lambda self: _rectangle(self.length, self.width))
+    footprint_m = property(lambda self: rectangle((self.length, self.width)))
 
     def shape(self) -> dict[str, Any]:
         half = [self.length / 2, self.width / 2, self.height / 2]
@@ -125,7 +116,7 @@ class UprightCylinder(TabletopObject):
     stable = True
     has_yaw = False
     volume_m3 = property(lambda self: math.pi * self.diameter**2 / 4 * self.height)
-    footprint_m = property(lambda self: _circle(self.diameter))
+    footprint_m = property(lambda self: circle(self.diameter / 2, 36))
 
     def shape(self) -> dict[str, Any]:
         return _cylinder(self.diameter, self.height)
@@ -145,7 +136,7 @@ class LyingCylinder(TabletopObject):
     rollable = True
     height_m = property(lambda self: self.diameter)
     volume_m3 = property(lambda self: math.pi * self.diameter**2 / 4 * self.length)
-    footprint_m = property(lambda self: _rectangle(self.length, self.diameter))
+    footprint_m = property(lambda self: rectangle((self.length, self.diameter)))
 
     def shape(self) -> dict[str, Any]:
         frame = pybullet.getQuaternionFromEuler((0, math.pi / 2, 0))
@@ -169,7 +160,7 @@ class Sphere(TabletopObject):
     has_yaw = False
     height_m = property(lambda self: self.diameter)
     volume_m3 = property(lambda self: math.pi * self.diameter**3 / 6)
-    footprint_m = property(lambda self: _circle(self.diameter))
+    footprint_m = property(lambda self: circle(self.diameter / 2, 36))
 
     def shape(self) -> dict[str, Any]:
         return {"shapeType": pybullet.GEOM_SPHERE, "radius": self.diameter / 2}
@@ -441,7 +432,6 @@ def _shapes(one: Obstacle) -> tuple[dict[str, Any], dict[str, Any], tuple[float,
     before = np.roll(outward, 1, axis=0)
     inset = HULL_MARGIN_M / (1 + (outward * before).sum(axis=1, keepdims=True))
     inner = corners - inset * (outward + before)
-    levels = (inner, HULL_MARGIN_M), (inner, one.height_m - HULL_MARGIN_M)
-    felt = np.vstack([np.insert(outline, 2, z, axis=1) for outline, z in levels]).tolist()
-    seen = np.vstack([np.insert(corners, 2, z, axis=1) for z in (0.0, one.height_m)])
-    return {"shapeType": pybullet.GEOM_MESH, "vertices": felt}, mesh([seen]), (0.0, 0.0, 0.0)
+    felt = extruded(inner, HULL_MARGIN_M, one.height_m - HULL_MARGIN_M).tolist()
+    seen = mesh([extruded(corners, 0.0, one.height_m)])
+    return {"shapeType": pybullet.GEOM_MESH, "vertices": felt}, seen, (0.0, 0.0, 0.0)
