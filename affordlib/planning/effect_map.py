@@ -136,16 +136,12 @@ class EffectMap:
     @cached_property
     def fine_grid(self) -> tuple[Tensor, Tensor, dict[bool, cKDTree]]:
         """A fine grid's directions and phases, and k-d trees of the positions that result."""
-        angles = torch.arange(FINE_DIRECTIONS, dtype=torch.float64) * (
-            2 * math.pi / FINE_DIRECTIONS
-        )
+        step = 2 * math.pi / FINE_DIRECTIONS
+        angles = torch.arange(FINE_DIRECTIONS, dtype=torch.float64) * step
         direction, phase = torch.cartesian_prod(angles, phases_of(self.kind, FINE_PHASES)).T
         ends = rotate(self(direction, phase)[0][:, :2], direction)
-        return (
-            direction,
-            phase,
-            {True: cKDTree(ends), False: cKDTree(ends[FINE_PHASES - 1 :: FINE_PHASES])},
-        )
+        full = ends[FINE_PHASES - 1 :: FINE_PHASES]
+        return direction, phase, {True: cKDTree(ends), False: cKDTree(full)}
 
     def nearest(self, wanted_xy_m: Tensor, n: int, partial: bool) -> tuple[Tensor, Tensor]:
         """Directions and phases (B, n) of the n (partial) actions ending nearest points (B, 2)."""

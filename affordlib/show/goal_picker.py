@@ -35,14 +35,7 @@ from affordlib.show.picker_controls import (
 )
 from affordlib.show.plots import NEUTRAL, plot_footprint, plot_plan, plot_table
 from affordlib.show.scene import Scene
-from affordlib.show.table_data import (
-    TableView,
-    object_data,
-    obstacle_data,
-    obstacle_of,
-    plan_data,
-    table_data,
-)
+from affordlib.show.table_data import TableView, object_data, obstacle_data, plan_data, table_data
 from affordlib.types import Goal, Obstacle, Outcome, Plan, check_count, check_on_table
 from affordlib.world import Cuboid, Tabletop
 from affordlib.world.trajectory import STEP_S
@@ -194,7 +187,8 @@ class GoalPicker(widgets.HBox):
             self._follow(replace(self.goal, xy_m=_whole_mm(change["new"][:2])))
 
         def adopt():
-            wanted = tuple(map(obstacle_of, self._view.obstacles))
+            parts = ((tuple(o["corners"]), o["radius"], o["height"]) for o in self._view.obstacles)
+            wanted = tuple(Obstacle(*each) for each in parts)
             if wanted != self.world.obstacles.all:
                 self._disturb(partial(self._set_obstacles, wanted))
 

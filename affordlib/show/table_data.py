@@ -53,12 +53,6 @@ def obstacle_data(obstacle: Obstacle) -> dict[str, Any]:
     return {"corners": corners, "radius": obstacle.radius_m, "height": obstacle.height_m}
 
 
-def obstacle_of(data: dict[str, Any]) -> Obstacle:
-    """The obstacle that the page has described."""
-    corners = tuple((float(x), float(y)) for x, y in data["corners"])
-    return Obstacle(corners, float(data["radius"]), float(data["height"]))
-
-
 def plan_data(plan: Plan, yaw_rad: float) -> list[dict[str, Any]]:
     """A plan's steps; yaw_rad: the object's yaw at the start."""
     steps, at = [], [*plan.start_xy_m, yaw_rad]
