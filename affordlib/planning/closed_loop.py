@@ -6,8 +6,6 @@ obstacles moved? If so, it plans again from a new image. Rotation is estimated f
 height from the hand; what neither shows is computed from the executed actions (dead reckoning).
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Sequence

@@ -300,7 +300,12 @@ class GoalPicker(widgets.HBox):
             nonlocal done
             if plan is not None:
                 left[:] = plan.steps
-                self._replace_plan(plan, done)
+                arrives = self.goal.distance_m(plan.predicted_end_xy_m) <= self.goal.tolerance_m
+                self.plan = replace(plan, goal=self.goal, reaches_goal=arrives)
+                self._pose = self.world.object_pose()
+                self._plan_pose = (*plan.start_xy_m, self._pose[2])
+                self._news += " New plan." * (done > 0)
+                self._show()
                 return self.goal
             done += 1
             left[:] = left[1:]
@@ -361,15 +366,6 @@ class GoalPicker(widgets.HBox):
             if self._disturbances:  # pressed after the last action
                 self._news = self.controls.said
                 self._disturb()
-
-    def _replace_plan(self, plan: Plan, done: int) -> None:
-        """Show a plan that was made during a run, after `done` actions."""
-        arrives = self.goal.distance_m(plan.predicted_end_xy_m) <= self.goal.tolerance_m
-        self.plan = plan = replace(plan, goal=self.goal, reaches_goal=arrives)
-        self._pose = self.world.object_pose()
-        self._plan_pose = (*plan.start_xy_m, self._pose[2])
-        self._news += " New plan." * (done > 0)
-        self._show()
 
     def _motion_log(
         self, also: Callable[[Tabletop], None] | None, z_m: float, pace_s: float
