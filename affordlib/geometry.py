@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -37,6 +38,22 @@ def rotated_each(xy: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
 def cross(a: Any, b: Any) -> Any:
     """Return the z component (...) of the cross product of vectors (..., 2), arrays or tensors."""
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
+def rectangle(size: Sequence[float]) -> np.ndarray:
+    """Return the corners (4, 2) of a rectangle around the origin; size: along x and y."""
+    return np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * (np.array(size) / 2)
+
+
+def circle(radius: float, n: int) -> np.ndarray:
+    """Return n points (n, 2) on a circle around the origin."""
+    angle = np.linspace(0, 2 * math.pi, n, endpoint=False)
+    return radius * np.column_stack([np.cos(angle), np.sin(angle)])
+
+
+def extruded(outline: np.ndarray, low: float, high: float) -> np.ndarray:
+    """Return the corners (2n, 3) of what stands between two heights over an outline (n, 2)."""
+    return np.vstack([np.insert(outline, 2, z, axis=1) for z in (low, high)])
 
 
 def is_convex(corners: np.ndarray) -> bool:

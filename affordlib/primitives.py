@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from affordlib.geometry import unit_vector, wrap_angle
+from affordlib.geometry import edge_normals, unit_vector, wrap_angle
 from affordlib.types import (
     Checked,
     check_array,
@@ -361,10 +361,7 @@ class LeverUp(Primitive):
         least force (weight · distance to the centroid / distance to the contact). The blade's
         direction bisects the outward normal of that edge and the inward normal of its own edge.
         """
-        following = np.roll(outline_m, -1, axis=0)
-        along = following - outline_m
-        outward = np.column_stack([along[:, 1], -along[:, 0]])
-        outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+        along, outward = np.roll(outline_m, -1, axis=0) - outline_m, edge_normals(outline_m)
         contact = outline_m[edge] + check_within("share", share, 0.0, 1.0) * along[edge]
         to_centre = (outline_m * outward).sum(axis=1)
         to_contact = to_centre - outward @ contact

@@ -10,14 +10,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
-from dataclasses import MISSING, dataclass, field, fields, replace
+from dataclasses import MISSING, dataclass, field, fields
 from functools import partial
 from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
-from affordlib.geometry import is_convex, rotated, wrap_angle
+from affordlib.geometry import is_convex, rectangle, rotated, wrap_angle
 
 if TYPE_CHECKING:
     import torch
@@ -38,7 +38,6 @@ FAULT_LIMIT_M = 0.002
 
 TABLE_X_M = (-0.5, 0.7)
 TABLE_Y_M = (-0.7, 0.7)
-_CORNERS_M = np.transpose([TABLE_X_M, TABLE_Y_M])
 LARGEST = 1e300
 
 
@@ -164,7 +163,7 @@ def check_range(name: str, pair: Any, low: float, high: float) -> tuple[float, f
 
 def on_table(xy_m: np.ndarray, radius_m: float = 0.0) -> np.ndarray | np.bool_:
     """Return whether points (..., 2) lie on the table and farther than a radius from its rim."""
-    low, high = _CORNERS_M
+    low, high = np.transpose([TABLE_X_M, TABLE_Y_M])
     return ((xy_m >= low + radius_m) & (xy_m <= high - radius_m)).all(axis=-1)
 
 
@@ -217,8 +216,7 @@ class Obstacle:
         height_m: float = 0.06,
     ) -> Obstacle:
         """Return the rectangle of length and width [m] with its centre at (x, y) [m]."""
-        signs, half = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]), np.array(size_m) / 2
-        corners = rotated(signs * half, check_finite("yaw_rad", yaw_rad)) + np.array(xy_m)
+        corners = rotated(rectangle(size_m), check_finite("yaw_rad", yaw_rad)) + np.array(xy_m)
         return cls(tuple((float(x), float(y)) for x, y in corners), 0.0, height_m)
 
 
@@ -446,7 +444,3 @@ class Outcome(Checked):
     turned_rad: float = 0.0
     lifted_m: float = 0.0
     words: str = ""  # a text on the result
-
-    def with_goal(self, goal: Goal) -> Outcome:
-        """Return the outcome with its distance measured to another goal."""
-        return replace(self, distance_m=goal.distance_m(self.end_pose[:2]))

@@ -3,8 +3,6 @@
 Safetensors files, replaced atomically; reading one runs no code in it.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Callable

@@ -236,7 +236,6 @@ def shop(one_world, skills, pushes, tmp_path_factory):
         "plan_gradient": {"samples": 10},
         "run_closed_loop": {"config": once, "goal": Goal(AT, 0.05)},
         "GoalPicker": {"view": False},
-        "Scene": {"height": 400},
         "Batch": fields_of(batch)["Batch"],
         "about_training": {"seen": np.arange(2), "config": few},
         "condition_on_final_effect": {"model": network, "effect": arrays.effect[:, -1]},

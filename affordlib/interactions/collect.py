@@ -23,12 +23,7 @@ import xarray as xr
 from tqdm.auto import tqdm
 
 from affordlib.interactions.recipes import Recipe, interact
-from affordlib.interactions.store import (
-    SUFFIX,
-    CorruptedDataError,
-    open_interactions,
-    write_interactions,
-)
+from affordlib.interactions.store import SUFFIX, open_interactions, write_interactions
 from affordlib.primitives import PRIMITIVES, LeverUp, primitive_named
 from affordlib.results import from_root
 from affordlib.types import (
@@ -142,7 +137,7 @@ def collect(
 
 def _attributes(file: Path) -> dict[str, str] | None:
     """Return the attributes of a complete set, or None if there is none."""
-    with suppress(CorruptedDataError, OSError):
+    with suppress(ValueError, OSError):  # ValueError: it is damaged
         return open_interactions(file).attrs
     return None
 

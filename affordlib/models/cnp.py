@@ -19,14 +19,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from affordlib import checked
-from affordlib.models.base import (
-    EffectNetwork,
-    NetworkConfig,
-    he_initialise,
-    network,
-    rotate_image,
-    with_time,
-)
+from affordlib.models.base import EffectNetwork, NetworkConfig, he_initialise, network, rotate_image
 from affordlib.types import Observations
 
 ENCODER_WIDTHS = (32, 64, 64, 128, 128, 256, 128)
@@ -110,7 +103,7 @@ class AffordanceCNP(EffectNetwork):
                 hidden = base[:, None] + t_target[..., None] * weight[:, -1]
             else:
                 known_at_t = known[:, None].expand(-1, t_target.shape[1], -1)
-                hidden = first(self.merge(with_time(known_at_t, t_target)))
+                hidden = first(self.merge(torch.cat([known_at_t, t_target[..., None]], dim=-1)))
             mean, raw = decoder[1:](hidden).chunk(2, dim=-1)
             outputs += [mean, self.sigma_floor + F.softplus(raw)]
         return tuple(outputs)

@@ -2,6 +2,7 @@
 
 import warnings
 from dataclasses import dataclass
+from functools import partial
 from typing import Self
 
 import torch
@@ -10,9 +11,10 @@ from torch import Tensor
 
 from affordlib.geometry import xy_columns
 from affordlib.interactions.dataset import InteractionTensors
-from affordlib.types import Observations, check_field, check_pair
+from affordlib.types import Checked, Observations, check_pair, number, parameter
 
 Range = tuple[float, float]
+_check_range = partial(check_pair, what="(low, high)")
 PHASE_TOLERANCE, END_PHASE = 1e-5, 1e-3
 RADIUS_TOLERANCE_M = 0.02
 
@@ -22,23 +24,17 @@ class OutOfRangeWarning(UserWarning):
 
 
 @dataclass(frozen=True)
-class TrainingDomain:
+class TrainingDomain(Checked):
     """What a model was trained on, None where unknown."""
 
-    start_radius_m: Range | None = None  # distance of the action from the object's centre at t = 0
-    end_radius_m: Range | None = None  # the same at t = 1
-    mask_share: Range | None = None  # fraction of the image that the object covers
+    # Distance of the action from the object's centre at t = 0, and at t = 1
+    start_radius_m: tuple[float, float] | None = parameter(_check_range, None)
+    end_radius_m: tuple[float, float] | None = parameter(_check_range, None)
+    mask_share: tuple[float, float] | None = parameter(_check_range, None)  # that the object covers
     touches_border: bool = True  # whether objects reach the image's edge
-    effect_radius_m: Range | None = None  # distance that objects have moved at t = 1
+    effect_radius_m: tuple[float, float] | None = parameter(_check_range, None)  # moved at t = 1
     image_pixels: int | None = None  # along an edge of the square image
-    image_width_m: float | None = None
-
-    def __post_init__(self) -> None:
-        for name in ("start_radius_m", "end_radius_m", "mask_share", "effect_radius_m"):
-            if getattr(self, name) is not None:
-                check_pair(name, getattr(self, name), "(low, high)")
-        if self.image_width_m is not None:
-            check_field(self, "image_width_m", 0.01, 10.0, "m")
+    image_width_m: float | None = number(0.01, 10.0, "m", None)
 
     @classmethod
     def fit(cls, tensors: InteractionTensors) -> Self:

@@ -10,26 +10,18 @@ Variance scaling multiplies σ of an effect channel by s; the maximum-likelihood
 import json
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
+import xarray
 from jaxtyping import Float
 from torch import Tensor
 
 from affordlib.geometry import xy_columns
-from affordlib.interactions.dataset import (
-    InteractionTensors,
-    check_fits,
-    check_numbers,
-    condition_on_recorded_action,
-    valid_interactions,
-)
+from affordlib.interactions import InteractionTensors, condition_on_recorded_action
+from affordlib.interactions.dataset import check_fits, check_numbers, valid_interactions
 from affordlib.models.base import EffectModel, EffectNetwork
-from affordlib.types import check_within
-
-if TYPE_CHECKING:
-    import xarray
 
 AFTER_CONTACT = (0.8, 0.9, 1.0)
 """Phases at which every push has moved its object; before contact the effect is always zero."""
@@ -42,9 +34,6 @@ def effects_at(
     model: EffectModel, tensors: InteractionTensors, phases: Sequence[float]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Ground truth, mean and σ of the effects, (N, T, C) each, given image and action."""
-    phases = [check_within("phases", phase, 0.0, 1.0) for phase in phases]
-    if not phases:
-        raise ValueError("phases must hold at least one phase in [0, 1], got none")
     check_fits("tensors", tensors, model)
     at = (torch.tensor(phases) * (len(tensors.phase) - 1)).round().long()
     predicted = model.predict(
@@ -85,7 +74,7 @@ def fit_sigma_scale(model: EffectNetwork, validation: InteractionTensors) -> tup
 
 
 def network_predictions(
-    model: EffectModel, data: "xarray.Dataset", interactions: np.ndarray
+    model: EffectModel, data: xarray.Dataset, interactions: np.ndarray
 ) -> dict[str, Any]:
     """Ground truth, mean and σ at t = 1 by channel, and category, of the valid interactions."""
     kept = valid_interactions(data, interactions)
@@ -106,7 +95,7 @@ def final_error(record: dict[str, Any]) -> np.ndarray:
     return np.linalg.norm([np.subtract(mean[name], truth[name]) for name in names], axis=0)
 
 
-def refuse_seen(about: dict[str, Any], data: "xarray.Dataset", interactions: np.ndarray) -> None:
+def refuse_seen(about: dict[str, Any], data: xarray.Dataset, interactions: np.ndarray) -> None:
     """Raise ValueError if a checkpoint was trained on these interactions.
 
     about: the second value that `load_checkpoint` returns, from `about_training`.

@@ -18,26 +18,20 @@ protocols, a recurrent one separately for each (`experiments/lever_training.py`)
 """
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 import torch.nn.functional as F
+import xarray
 from jaxtyping import Float
 from torch import Tensor
 
 from affordlib.geometry import rotate_channels
-from affordlib.interactions.dataset import (
-    InteractionTensors,
-    condition_on_poses,
-    valid_interactions,
-)
+from affordlib.interactions import InteractionTensors, condition_on_poses
+from affordlib.interactions.dataset import valid_interactions
 from affordlib.models.base import EffectNetwork
 from affordlib.models.evaluation import EVERY
 from affordlib.types import Prediction, check_choice
-
-if TYPE_CHECKING:
-    import xarray
 
 LEVER_ACTION_CHANNELS = ("x", "z")
 POSE_CHANNELS = ("x", "y", "z", "tilt")
@@ -48,7 +42,7 @@ PROTOCOLS = ("window", "first_step", "image_only")
 
 
 def lever_up_tensors(
-    data: "xarray.Dataset", interactions: np.ndarray | None = None, view: str = "near"
+    data: xarray.Dataset, interactions: np.ndarray | None = None, view: str = "near"
 ) -> InteractionTensors:
     """Return lever-ups as 26 steps of poses and commanded actions, in the lever's frame.
 

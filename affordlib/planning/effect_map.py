@@ -22,12 +22,8 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from affordlib.geometry import rotate, xy_columns
-from affordlib.models.base import (
-    EffectModel,
-    EffectNetwork,
-    condition_on_primitives,
-    rotate_prediction,
-)
+from affordlib.models import EffectModel, EffectNetwork, condition_on_primitives
+from affordlib.models.base import rotate_prediction
 from affordlib.perception import outline_of, radius_m
 from affordlib.primitives import Move, Push
 from affordlib.types import CROP_WIDTH_M, IMAGE_CHANNELS, IMAGE_PIXELS, Prediction, check_array
@@ -140,16 +136,12 @@ class EffectMap:
     @cached_property
     def fine_grid(self) -> tuple[Tensor, Tensor, dict[bool, cKDTree]]:
         """A fine grid's directions and phases, and k-d trees of the positions that result."""
-        angles = torch.arange(FINE_DIRECTIONS, dtype=torch.float64) * (
-            2 * math.pi / FINE_DIRECTIONS
-        )
+        step = 2 * math.pi / FINE_DIRECTIONS
+        angles = torch.arange(FINE_DIRECTIONS, dtype=torch.float64) * step
         direction, phase = torch.cartesian_prod(angles, phases_of(self.kind, FINE_PHASES)).T
         ends = rotate(self(direction, phase)[0][:, :2], direction)
-        return (
-            direction,
-            phase,
-            {True: cKDTree(ends), False: cKDTree(ends[FINE_PHASES - 1 :: FINE_PHASES])},
-        )
+        full = ends[FINE_PHASES - 1 :: FINE_PHASES]
+        return direction, phase, {True: cKDTree(ends), False: cKDTree(full)}
 
     def nearest(self, wanted_xy_m: Tensor, n: int, partial: bool) -> tuple[Tensor, Tensor]:
         """Directions and phases (B, n) of the n (partial) actions ending nearest points (B, 2)."""

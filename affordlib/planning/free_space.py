@@ -20,7 +20,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from affordlib.geometry import edge_normals, rotated_each, unit_vector
+from affordlib.geometry import edge_normals, rectangle, rotated_each, unit_vector
 from affordlib.perception import adapt_to_object, outline_of, radius_m
 from affordlib.primitives import Primitive, Push, Rotate, min_jerk
 from affordlib.types import Obstacle, Step, check_finite
@@ -182,5 +182,4 @@ class FreeSpace:
 def hand_m(action: Primitive) -> np.ndarray:
     """Return the corners (4, 2) [m] of the rectangle of an action's open hand, at yaw 0."""
     length, width = FINGER_M
-    half = np.array([length / 2, action.opening_m / 2 + width])
-    return half * [[1, 1], [-1, 1], [-1, -1], [1, -1]]
+    return rectangle((length, action.opening_m + 2 * width))

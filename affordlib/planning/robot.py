@@ -3,8 +3,6 @@
 `affordlib.world.Tabletop` implements it; so can a real arm or another simulator.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Protocol, runtime_checkable
 

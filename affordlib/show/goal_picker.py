@@ -25,7 +25,6 @@ from affordlib.planning import Planner, Skills, plan_astar, plan_continuous, pla
 from affordlib.planning.gradient import Reading
 from affordlib.show.picker_controls import (
     LIMIT_M,
-    Executor,
     PickerControls,
     Stopped,
     closed_loop,
@@ -36,14 +35,7 @@ from affordlib.show.picker_controls import (
 )
 from affordlib.show.plots import NEUTRAL, plot_footprint, plot_plan, plot_table
 from affordlib.show.scene import Scene
-from affordlib.show.table_data import (
-    TableView,
-    object_data,
-    obstacle_data,
-    obstacle_of,
-    plan_data,
-    table_data,
-)
+from affordlib.show.table_data import TableView, object_data, obstacle_data, plan_data, table_data
 from affordlib.types import Goal, Obstacle, Outcome, Plan, check_count, check_on_table
 from affordlib.world import Cuboid, Tabletop
 from affordlib.world.trajectory import STEP_S
@@ -81,10 +73,7 @@ class GoalPicker(widgets.HBox):
     ) -> None:
         self.world, self.skills, self.planners = world, skills, planners
         self._searched = [] if searched is None else searched
-        self.executors: dict[str, Executor] = {
-            "open loop": open_loop,
-            "closed loop": closed_loop(skills),
-        }
+        self.executors = {"open loop": open_loop, "closed loop": closed_loop(skills)}
         self.plan: Plan | None = None
         self.outcome: Outcome | None = None
         self._rng = np.random.default_rng(check_count("seed", seed, least=0))
@@ -198,7 +187,8 @@ class GoalPicker(widgets.HBox):
             self._follow(replace(self.goal, xy_m=_whole_mm(change["new"][:2])))
 
         def adopt():
-            wanted = tuple(map(obstacle_of, self._view.obstacles))
+            parts = ((tuple(o["corners"]), o["radius"], o["height"]) for o in self._view.obstacles)
+            wanted = tuple(Obstacle(*each) for each in parts)
             if wanted != self.world.obstacles.all:
                 self._disturb(partial(self._set_obstacles, wanted))
 
@@ -266,7 +256,11 @@ class GoalPicker(widgets.HBox):
             self._show(planning=True)
             goal, number, plan = self.goal, self._view.wanted[2], None
             self._searched.clear()
-            self._put_down()
+            self.controls.show_progress(0)
+            if self._lifted:  # put it down
+                self.world.park()
+                self._lifted = False
+            self._pose = self.world.object_pose()
             try:
                 seen = self.world.depth_image(), self._pose[:2]
                 problem = self.skills.problem(*seen, goal, obstacles=self.world.obstacles.all)
@@ -277,27 +271,15 @@ class GoalPicker(widgets.HBox):
                     effects = self._effects = problem.effects
                     self._view.object = object_data(self.world.obj, effects, self._pose[2])
             finally:
-                self._begin(plan)
+                self.plan, self.outcome = plan, None
+                self._trail.clear()
+                self._marks.clear()
+                if self.scene is not None:
+                    self.scene.mark(self.goal, plan)
+                self._plan_pose, self._turn_from = self._pose, self._pose[2]
                 self._answered = number
                 self._stale = goal is not self.goal
                 self._show(planning=self._stale)
-
-    def _put_down(self) -> None:
-        """Prepare the table for a new plan."""
-        self.controls.show_progress(0)
-        if self._lifted:
-            self.world.park()
-            self._lifted = False
-        self._pose = self.world.object_pose()
-
-    def _begin(self, plan: Plan | None) -> None:
-        """Show a plan that starts at the object's current pose."""
-        self.plan, self.outcome = plan, None
-        self._trail.clear()
-        self._marks.clear()
-        if self.scene is not None:
-            self.scene.mark(self.goal, plan)
-        self._plan_pose, self._turn_from = self._pose, self._pose[2]
 
     # Execution
 
@@ -318,7 +300,12 @@ class GoalPicker(widgets.HBox):
             nonlocal done
             if plan is not None:
                 left[:] = plan.steps
-                self._replace_plan(plan, done)
+                arrives = self.goal.distance_m(plan.predicted_end_xy_m) <= self.goal.tolerance_m
+                self.plan = replace(plan, goal=self.goal, reaches_goal=arrives)
+                self._pose = self.world.object_pose()
+                self._plan_pose = (*plan.start_xy_m, self._pose[2])
+                self._news += " New plan." * (done > 0)
+                self._show()
                 return self.goal
             done += 1
             left[:] = left[1:]
@@ -356,10 +343,11 @@ class GoalPicker(widgets.HBox):
                     how = "Done,"
                     self.controls.show_progress(1)
                 except Stopped:
-                    outcome, how = measured(self.world, self.plan), "Stopped after"
+                    outcome, how = measured(self.world, self.plan, self.goal), "Stopped after"
                 turned = wrap_angle(self.world.object_pose()[2] - yaw)
                 lifted = self.world.object_state()[2] - z
-                outcome = replace(outcome.with_goal(self.goal), turned_rad=turned, lifted_m=lifted)
+                left_m = self.goal.distance_m(outcome.end_pose[:2])
+                outcome = replace(outcome, distance_m=left_m, turned_rad=turned, lifted_m=lifted)
                 self.outcome, self._lifted = outcome, bool(self.goal.height_m)
                 if self.plan.goal == self.goal or outcome.distance_m <= self.goal.tolerance_m:
                     self._stale = False  # the run has followed the goal
@@ -378,15 +366,6 @@ class GoalPicker(widgets.HBox):
             if self._disturbances:  # pressed after the last action
                 self._news = self.controls.said
                 self._disturb()
-
-    def _replace_plan(self, plan: Plan, done: int) -> None:
-        """Show a plan that was made during a run, after `done` actions."""
-        arrives = self.goal.distance_m(plan.predicted_end_xy_m) <= self.goal.tolerance_m
-        self.plan = plan = replace(plan, goal=self.goal, reaches_goal=arrives)
-        self._pose = self.world.object_pose()
-        self._plan_pose = (*plan.start_xy_m, self._pose[2])
-        self._news += " New plan." * (done > 0)
-        self._show()
 
     def _motion_log(
         self, also: Callable[[Tabletop], None] | None, z_m: float, pace_s: float

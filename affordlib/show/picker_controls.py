@@ -12,7 +12,7 @@ import numpy as np
 
 from affordlib.planning import ClosedLoopConfig, Planner, Skills, execute_plan, run_closed_loop
 from affordlib.results import plain
-from affordlib.types import Goal, Outcome, Plan, Step
+from affordlib.types import Goal, Outcome, Plan
 from affordlib.world import Tabletop
 
 LIMIT_M = 0.35
@@ -110,16 +110,15 @@ def _numbers(goal: Goal) -> list[float]:
     return [*goal.xy_m, goal.turn_rad or 0.0, goal.height_m or 0.0]
 
 
-def _button(name: str, icon: str, tooltip: str = "", **kwargs: Any) -> widgets.Button:
+def _button(name: str, icon: str, tooltip: str, **kwargs: Any) -> widgets.Button:
     layout = {"width": "auto", "flex": "none"}
-    return widgets.Button(
-        description=name, icon=icon, tooltip=tooltip or name, layout=layout, **kwargs
-    )
+    return widgets.Button(description=name, icon=icon, tooltip=tooltip, layout=layout, **kwargs)
 
 
 def plan_in_words(plan: Plan) -> str:
     """Describe a plan: its actions, predicted distance to the goal, and planning time."""
-    steps = ", then ".join(step_in_words(step) for step in plan.steps) or "no action"
+    words = ((step.primitive.name.replace("_", " "), 100 * step.stop_phase) for step in plan.steps)
+    steps = ", then ".join(f"{name} to {phase:.0f} %" for name, phase in words) or "no action"
     missed = " Up to three pushes or drags do not reach the goal; a closed loop then plans again."
     arrives = "" if plan.reaches_goal else missed
     if not plan.reaches_goal and plan.predicted_distance_m <= plan.goal.tolerance_m:
@@ -145,11 +144,6 @@ def outcome_in_words(outcome: Outcome, goal: Goal, how: str, done: int) -> tuple
     return words, f"outcome {within}"
 
 
-def step_in_words(step: Step) -> str:
-    """Name the primitive and its stop phase in percent."""
-    return f"{step.primitive.name.replace('_', ' ')} to {100 * step.stop_phase:.0f} %"
-
-
 Report = Callable[..., Goal]
 """`report()` after an action applies pending disturbances, and raises `Stopped` when execution must
 end; `report(plan)` when a new plan replaces the current one. Both return the current goal."""
@@ -168,15 +162,15 @@ def open_loop(world: Tabletop, plan: Plan, planner: Planner, report: Report) -> 
     for step in plan.steps:
         paths += execute_plan(world, replace(plan, steps=(step,))).object_paths_xy_m
         report()
-    return measured(world, plan, paths)
+    return measured(world, plan, plan.goal, paths)
 
 
 def measured(
-    world: Tabletop, plan: Plan, paths_xy_m: tuple[np.ndarray, ...] = (), words: str = ""
+    world: Tabletop, plan: Plan, goal: Goal, paths: tuple[np.ndarray, ...] = (), words: str = ""
 ) -> Outcome:
-    """The outcome of a plan, measured from the object's true pose."""
+    """The outcome of a plan, measured from the object's true pose to a goal; paths: (n, 2) [m]."""
     pose = world.object_pose()
-    return Outcome(plan, plan.goal.distance_m(pose[:2]), pose, paths_xy_m, words=words)
+    return Outcome(plan, goal.distance_m(pose[:2]), pose, paths, words=words)
 
 
 def closed_loop(skills: Skills, tolerance_m: float = 0.002) -> Executor:
@@ -194,6 +188,6 @@ def closed_loop(skills: Skills, tolerance_m: float = 0.002) -> Executor:
             world, lambda: replace(goal, tolerance_m=tolerance_m), skills, planner, config
         )
         words = "" if done.reached else f"The loop ended as {done.status}: {done.message}."
-        return measured(world, plan, done.object_paths_xy_m, words).with_goal(goal)
+        return measured(world, plan, goal, done.object_paths_xy_m, words)
 
     return execute

@@ -44,24 +44,20 @@ ENLARGED = 20
 """Radius, in σ, of the disc at the end of a predicted path: a disc of one σ is too small to see."""
 
 # From matplotlib's defaults, so that a reader's own configuration changes no figure of the book.
-_STYLE = [
-    "default",
-    {
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "axes.grid": True,
-        "axes.titlesize": 11,
-        "axes.titlelocation": "left",
-        "figure.constrained_layout.use": True,
-        "figure.dpi": 90,
-        "font.size": 10,
-        "grid.alpha": 0.3,
-        "legend.frameon": False,
-        "savefig.dpi": 120,
-    },
-]
-plt.style.use(_STYLE)
-
+_STYLE = {
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.titlesize": 11,
+    "axes.titlelocation": "left",
+    "figure.constrained_layout.use": True,
+    "figure.dpi": 90,
+    "font.size": 10,
+    "grid.alpha": 0.3,
+    "legend.frameon": False,
+    "savefig.dpi": 120,
+}
+plt.style.use(["default", _STYLE])
 
 if shell := get_ipython():  # in notebooks figures have their own size, and twice the resolution
     InlineBackend.instance(parent=shell).print_figure_kwargs = {"bbox_inches": None}

@@ -18,8 +18,9 @@ import numpy as np
 from PIL import Image
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from affordlib.geometry import circle, extruded
 from affordlib.show.plots import GOAL, PREDICTION, TRUTH
-from affordlib.types import TABLE_X_M, TABLE_Y_M, Goal, Plan, check_count
+from affordlib.types import TABLE_X_M, TABLE_Y_M, Goal, Plan
 from affordlib.world import BASE_X_M, LyingCylinder, Sphere, Tabletop, TabletopObject
 from affordlib.world.camera import SCENERY
 from affordlib.world.objects import mesh
@@ -39,25 +40,24 @@ _SCRIPT = Path(__file__).with_name("scene.js")
 
 
 class Scene(widgets.VBox):
-    """A view of a world and its object, drawn by k3d, `height` pixels high, with a time line.
+    """A view of a world and its object, drawn by k3d, 400 pixels high, with a time line.
 
     As the world's `on_step` it records the motion; `play` shows what was recorded since `place`, in
     real time. Call `place` when there is another object.
     """
 
-    def __init__(self, world: Tabletop, height: int = 400) -> None:
+    def __init__(self, world: Tabletop) -> None:
         import k3d  # a quarter of a second that only a scene needs
 
         self.world, self._mesh = world, k3d.mesh
-        check_count("height", height, 100, 2000)
         plain = {"grid_visible": False, "camera_auto_fit": False, "menu_visibility": False}
         fast = {"antialias": 1, "logarithmic_depth_buffer": False}  # twice, without a GPU
-        self.plot = k3d.plot(height=height, **plain, **fast)
+        self.plot = k3d.plot(height=400, **plain, **fast)
         self.plot.layout.width = "100%"
         self.plot.background_color, self.plot.camera = 0xF4F6F8, list(CAMERA)
         self.plot.axes_helper, self.plot.lighting = 0.0, 1.8
         table = [(x, y) for x in TABLE_X_M for y in TABLE_Y_M]
-        self._add(_between(np.array(table), -0.1, 0.0), _WOOD)
+        self._add(extruded(np.array(table), -0.1, 0.0), _WOOD)
         for half, at, rgb in SCENERY:
             self._add(_box(2 * np.array(half)), _hex(rgb), _matrix(at))
         base, *links = _arm(world)
@@ -104,8 +104,8 @@ class Scene(widgets.VBox):
         for one in self.world.obstacles.all:
             corners = np.array(one.corners_m)
             if one.radius_m:
-                corners = corners + _circle(one.radius_m)
-            self._marks.append(self._add(_between(corners, 0.0, one.height_m), _STONE))
+                corners = corners + circle(one.radius_m, 48)
+            self._marks.append(self._add(extruded(corners, 0.0, one.height_m), _STONE))
         start = yaw = self.world.object_pose()[2]
         if plan is not None and plan.steps:
             yaw += plan.steps[-1].predicted_turn_rad
@@ -114,7 +114,7 @@ class Scene(widgets.VBox):
             self._marks.append(ghost)
         if goal is not None:
             yaw = yaw if goal.turn_rad is None else start + goal.turn_rad
-            sheet = _between(1.3 * obj.footprint_m, 0.0, 0.003)
+            sheet = extruded(1.3 * obj.footprint_m, 0.0, 0.003)
             at = *goal.xy_m, goal.height_m or 0.0
             self._marks.append(self._add(sheet, GOAL, _matrix(at, yaw)))
 
@@ -205,22 +205,14 @@ def _box(size_m: Sequence[float]) -> np.ndarray:
     return np.array(list(itertools.product((-0.5, 0.5), repeat=3))) * size_m
 
 
-def _circle(radius_m: float, n: int = 48) -> np.ndarray:
-    angle = np.linspace(0, 2 * np.pi, n, endpoint=False)
-    return radius_m * np.column_stack([np.cos(angle), np.sin(angle)])
-
-
-def _between(outline: np.ndarray, low_m: float, high_m: float) -> np.ndarray:
-    """Corners (2n, 3) of what stands between two heights over an outline (n, 2)."""
-    return np.vstack([np.insert(outline, 2, z, axis=1) for z in (low_m, high_m)])
-
-
 def _solid(obj: TabletopObject) -> np.ndarray:
     """Points (n, 3) whose convex hull is the object, around its centre."""
     half = obj.height_m / 2
     if isinstance(obj, Sphere):
         levels = half * np.cos(np.linspace(0, np.pi, 17))
-        return np.vstack([_between(_circle(np.sqrt(half**2 - z**2)), z, z)[:48] for z in levels])
+        return np.vstack(
+            [np.insert(circle(np.sqrt(half**2 - z**2), 48), 2, z, axis=1) for z in levels]
+        )
     if isinstance(obj, LyingCylinder):
-        return _between(_circle(half), -obj.length / 2, obj.length / 2)[:, [2, 0, 1]]
-    return _between(obj.footprint_m, -half, half)
+        return extruded(circle(half, 48), -obj.length / 2, obj.length / 2)[:, [2, 0, 1]]
+    return extruded(obj.footprint_m, -half, half)

@@ -53,12 +53,6 @@ def obstacle_data(obstacle: Obstacle) -> dict[str, Any]:
     return {"corners": corners, "radius": obstacle.radius_m, "height": obstacle.height_m}
 
 
-def obstacle_of(data: dict[str, Any]) -> Obstacle:
-    """The obstacle that the page has described."""
-    corners = tuple((float(x), float(y)) for x, y in data["corners"])
-    return Obstacle(corners, float(data["radius"]), float(data["height"]))
-
-
 def plan_data(plan: Plan, yaw_rad: float) -> list[dict[str, Any]]:
     """A plan's steps; yaw_rad: the object's yaw at the start."""
     steps, at = [], [*plan.start_xy_m, yaw_rad]
@@ -103,15 +97,10 @@ def table_data(skills: Skills) -> dict[str, Any]:
     table = {"table": [*TABLE_X_M, *TABLE_Y_M], "ring": ring, "seconds": DURATION_S}
     if skills.reachability is None:
         return table
-    linear = [layer for layer in skills.reachability.layers if isinstance(layer, nn.Linear)]
-    layers = [
-        [layer.in_features, _packed(layer.weight.detach().numpy(), layer.bias.detach().numpy())]
-        for layer in linear
-    ]
+    layers = []
+    for linear in skills.reachability.layers[::2]:
+        numbers = nn.utils.parameters_to_vector(linear.parameters()).detach().numpy()
+        packed = base64.b64encode(numbers.astype("<f4").tobytes()).decode()
+        layers.append([linear.in_features, packed])
     reach = {"layers": layers, "primitives": list(skills.reachability.primitives)}
     return table | {"reach": reach | {"threshold": skills.threshold}}
-
-
-def _packed(*values: np.ndarray) -> str:
-    numbers = np.concatenate([value.ravel() for value in values]).astype("<f4")
-    return base64.b64encode(numbers.tobytes()).decode()

@@ -15,6 +15,8 @@ from affordlib.perception import CAMERA_HEIGHT_M, centre_m, height_map, largest_
 from affordlib.types import (
     CROP_WIDTH_M,
     IMAGE_PIXELS,
+    LEVER_CROP_WIDTH_M,
+    LEVER_IMAGE_PIXELS,
     TABLE_X_M,
     TABLE_Y_M,
     Checked,
@@ -57,20 +59,17 @@ def _distance_m(
     return far * near / (far - buffer * (far - near))
 
 
-def depth_crop(
-    client: BulletClient,
-    xy_m: tuple[float, float],
-    pixels: int = IMAGE_PIXELS,
-    width_m: float = CROP_WIDTH_M,
-    turn_rad: float = 0.0,
-    samples: int = RAYS_PER_SIDE,
-) -> np.ndarray:
-    """Render depth [m] and mask (2, n, n) of the square around (x, y), as float32.
+def depth_crop(client: BulletClient, x: float, y: float, lever_rad: float | None) -> np.ndarray:
+    """Render depth [m] and mask (2, n, n) of the square around (x, y) [m], as float32.
 
-    Columns run along the direction turn_rad of the table, rows at π/2 clockwise from it. A pixel is
-    the mean of samples x samples rays, so at the object's edge the mask is the covered share.
+    Columns run along the table's x axis, or in a lever-up's larger image along the lever, rows at
+    π/2 clockwise from it. A pixel is the mean of samples x samples rays (of a lever-up one ray), so
+    at the object's edge the mask is the covered share.
     """
-    x, y = xy_m
+    pixels, width_m, samples, turn_rad = IMAGE_PIXELS, CROP_WIDTH_M, RAYS_PER_SIDE, 0.0
+    if lever_rad is not None:
+        pixels, width_m, samples = LEVER_IMAGE_PIXELS, LEVER_CROP_WIDTH_M, 1
+        turn_rad = lever_rad
     up = (-math.sin(turn_rad), math.cos(turn_rad), 0)
     view = pybullet.computeViewMatrix((x, y, CAMERA_HEIGHT_M), (x, y, 0), up)
     fine, depth_range = pixels * samples, _FAR_M - _NEAR_M
@@ -89,7 +88,7 @@ def ideal(
 ) -> Observation:
     """Observe the object at (x, y) [m] from straight above, with parallel rays and no noise."""
     x, y = (xy_m + bias_m).tolist()
-    return Observation((x, y), depth_crop(client, (x, y)))
+    return Observation((x, y), depth_crop(client, x, y, None))
 
 
 def kinect(

@@ -64,7 +64,8 @@ class JointController:
     def __init__(self, client: BulletClient, tool: str, after_step: Callable[[], None]) -> None:
         self.client, self.tool, self.after_step = client, tool, after_step
         self.robot = robot.load_robot(client, tool)
-        self.links = robot.links(client, self.robot)
+        numbers = range(client.getNumJoints(self.robot))  # of the links, too
+        self.links = {client.getJointInfo(self.robot, k)[12].decode(): k for k in numbers}
         self.fingers = self.links["left_finger"], self.links["right_finger"]
         self.joints = (*robot.ARM_JOINTS, *self.fingers)
         self.palm = self.links["palm"]
@@ -220,7 +221,7 @@ def execute(
         )
     start = poses(np.array([placed.state()]))[0]
     origin_m = *seen.xy_m, tip_offset_m
-    motion = plan_motion(primitive, command.segments, origin_m, approach)
+    above, down, paths, back, poses_W = plan_motion(primitive, command.segments, origin_m, approach)
     gaps = [primitive.opening_m * segment.poses[:, GRIPPER] for segment in command.segments]
 
     closes = any(np.ptp(gap) > 0 for gap in gaps)
@@ -229,15 +230,15 @@ def execute(
         arm.tie_fingers()
     if approach:
         placed.brake(True)
-        over = joint_move(arm.angles_rad, motion.above, 1.0)
+        over = joint_move(arm.angles_rad, above, 1.0)
         arm.follow(over, np.linspace(arm.gap_m, gaps[0][0], 2))
-        arm.follow(motion.down, gaps[0][[0, 0]])
+        arm.follow(down, gaps[0][[0, 0]])
     else:
-        arm.put(motion.paths[0][0], gaps[0][0])
+        arm.put(paths[0][0], gaps[0][0])
     placed.brake(False)
 
     recording, floor = Recording(placed.body), -math.inf
-    parts = command.segments, motion.poses_W, motion.paths, gaps
+    parts = command.segments, poses_W, paths, gaps
     for segment, one, path, gap in zip(*parts, strict=True):
         if one[:, Z].min() < floor:
             one[:, Z] = np.maximum(one[:, Z], floor)
@@ -258,7 +259,7 @@ def execute(
         release = np.array([arm.gap_m, primitive.opening_m if closes else arm.gap_m])
         if release[1] > release[0]:
             arm.follow(np.repeat(arm.angles_rad[None], 13, axis=0), np.linspace(*release, 13))
-        arm.follow(motion.back, release[[1, 1]])
+        arm.follow(back, release[[1, 1]])
         if approach:
             arm.follow(joint_move(arm.angles_rad, _HOME, 1.0), release[[1, 1]])
     arm.wait(SETTLE_STEPS)

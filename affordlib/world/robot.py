@@ -112,12 +112,6 @@ def load_robot(client: BulletClient, tool: str = "gripper") -> int:
         return client.loadURDF(str(path), basePosition=(BASE_X_M, 0, 0), useFixedBase=True)
 
 
-def links(client: BulletClient, robot: int) -> dict[str, int]:
-    """Return the index of each link, which is also its joint's, by the link's name."""
-    count = range(client.getNumJoints(robot))
-    return {client.getJointInfo(robot, k)[12].decode(): k for k in count}
-
-
 def _flange_pose(
     xyz_W: np.ndarray, yaw_rad: float, pitch_rad: float, offsets_m: tuple[float, float]
 ) -> np.ndarray:

@@ -15,11 +15,10 @@ import numpy as np
 import pybullet
 from pybullet_utils.bullet_client import BulletClient
 
+from affordlib.geometry import extruded
 from affordlib.perception import adapt_to_object
 from affordlib.primitives import PUSH_GAP_M, LeverUp, Primitive, Push
 from affordlib.types import (
-    LEVER_CROP_WIDTH_M,
-    LEVER_IMAGE_PIXELS,
     TABLE_X_M,
     TABLE_Y_M,
     Interaction,
@@ -38,8 +37,14 @@ from affordlib.types import (
 from affordlib.world import robot
 from affordlib.world.camera import CAMERAS, HIDDEN_M, View, add_scenery, depth_crop
 from affordlib.world.execution import JointController, execute, put_down, unreached
-from affordlib.world.objects import PlacedObject, TabletopObject, WorldConfig, mesh, set_friction
-from affordlib.world.obstacles import PlacedObstacles
+from affordlib.world.objects import (
+    PlacedObject,
+    PlacedObstacles,
+    TabletopObject,
+    WorldConfig,
+    mesh,
+    set_friction,
+)
 from affordlib.world.trajectory import STEP_S, Command, plan_motion, segments_until
 
 OBJECTS_PER_BUILD = 256  # after which the client is rebuilt: Bullet leaks 5 kB per removed object
@@ -218,8 +223,8 @@ class Tabletop(AbstractContextManager):
             return replace(seen, obstacles=self.obstacles.all)
         check_choice("camera of a lever-up", self.config.camera, ("ideal",))
         x, y = (xy_m + bias_m).tolist()
-        window = (x + lever.contact_x, y + lever.contact_y), LEVER_IMAGE_PIXELS, LEVER_CROP_WIDTH_M
-        return Observation((x, y), depth_crop(self.client, *window, lever.theta, samples=1))
+        contact = x + lever.contact_x, y + lever.contact_y
+        return Observation((x, y), depth_crop(self.client, *contact, lever.theta))
 
     def depth_image(self) -> np.ndarray:
         """Return depth [m] and mask (2, 48, 48) around the object; the arm must be parked."""
@@ -251,8 +256,8 @@ class Tabletop(AbstractContextManager):
         rgb = [check_within("rgb", share, 0.0, 1.0) for share in check_array("rgb", rgb, 3)]
         # Larger sheets lie lower, so that a larger one appears as a frame around a smaller one.
         top = 0.001 / scale if height_m is None else check_within("height_m", height_m, 0.0, 1.0)
-        sheet = [np.vstack([np.insert(outline, 2, z, axis=1) for z in (-0.005, top)])]
-        shape = self.client.createVisualShape(**mesh(sheet), rgbaColor=(*rgb, 1))
+        sheet = mesh([extruded(outline, -0.005, top)])
+        shape = self.client.createVisualShape(**sheet, rgbaColor=(*rgb, 1))
         turn = pybullet.getQuaternionFromEuler((0, 0, yaw_rad))
         at = {"basePosition": (*xy_m, -HIDDEN_M), "baseOrientation": turn}
         self._marks.append(self.client.createMultiBody(baseVisualShapeIndex=shape, **at))

@@ -6,7 +6,7 @@ Inverse kinematics is solved at 20 Hz and interpolated with a spline (its error 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Self
+from typing import Self
 
 import numpy as np
 
@@ -119,23 +119,17 @@ def line(start_W: np.ndarray, end_W: np.ndarray, near: np.ndarray, seconds: floa
     return robot.joint_path(joint_move(start_W, end_W, seconds), near, tool)
 
 
-class Motion(NamedTuple):
-    """Planned joint waypoints (n, 6)."""
-
-    above: np.ndarray  # (6,), above the start
-    down: np.ndarray  # to the start
-    paths: list[np.ndarray]  # of each segment
-    back: np.ndarray  # and up again
-    poses_W: list[np.ndarray]  # the tool's poses (n, 6) of each segment
-
-
 def plan_motion(
     primitive: Primitive,
     segments: list[TrajectorySegment],
     origin_m: Sequence[float],
     approach: bool,
-) -> Motion:
-    """Plan the arm's motion along segments about an origin (x, y, z); raises UnreachableError."""
+) -> tuple[np.ndarray, np.ndarray, list[np.ndarray], np.ndarray, list[np.ndarray]]:
+    """Plan the arm's motion along segments about an origin (x, y, z); raises UnreachableError.
+
+    Returns joint angles (6,) above the start; joint waypoints (n, 6) from there to the start, of
+    each segment, and back and up again; and the tool's poses (n, 6) of each segment.
+    """
     home, tool = np.array(robot.HOME), primitive.tool
     rise = max(HOVER_M + TIP_HEIGHT_M - segments[0].poses[0, Z], 0.0) * UP
     options = []
@@ -166,4 +160,4 @@ def plan_motion(
     down = above[None]
     if approach:
         down = line(poses_W[0][0] + rise, poses_W[0][0], above, 1.0, tool)
-    return Motion(above, down, paths, np.concatenate([retreat, lift[1:]]), poses_W)
+    return above, down, paths, np.concatenate([retreat, lift[1:]]), poses_W

@@ -22,7 +22,7 @@ from affordlib.planning import (
 )
 from affordlib.planning.closed_loop import DISPLACED_M
 from affordlib.planning.grasp_rotate import GRIPPER_YAWS_RAD
-from affordlib.planning.reachability import Reachability
+from affordlib.planning.skills import Reachability
 from affordlib.primitives import Drag, Grasp, Push, Rotate
 from affordlib.results import repo_root
 from affordlib.types import Goal, Plan, Step
