@@ -11,7 +11,6 @@ import pytest
 
 from affordlib.perception import adapt_to_object
 from affordlib.planning import (
-    MODES,
     ClosedLoopConfig,
     Robot,
     execute_plan,
@@ -130,15 +129,9 @@ def test_a_planner_that_does_not_help_is_given_up_and_it_is_said_why(n_steps, en
 
 
 def test_the_loop_plans_in_its_mode():
-    modes = set()
-
-    def planner(problem):
-        modes.add(problem.mode)
-        return plan_continuous(problem)
-
-    goal = Goal((0.15, 0.0), EXACT_M)
-    assert loop(PointRobot(), goal, planner=planner, mode="single_partial").reached
-    assert modes == {MODES["single_partial"]}
+    went = loop(PointRobot(), Goal((0.15, 0.0), EXACT_M), mode="single_partial")
+    assert went.reached
+    assert {len(plan.steps) for plan in went.plans} == {1}
 
 
 def test_nothing_is_reached_that_the_camera_cannot_tell():

@@ -262,9 +262,3 @@ def test_an_object_beside_an_obstacle_may_leave_it():
     posed = planning.PlanningProblem((0.0, 0.0), goal, effects, obstacles=(wall,))
     assert posed.free_space.least_m < START_M
     assert planning.plan_continuous(posed).reaches_goal
-
-
-def test_the_outline_of_an_image_is_the_objects():
-    image = box_image()
-    space = FreeSpace([Obstacle.disc((0.2, 0.2), 0.02)], image, (0.0, 0.0))
-    assert np.abs(np.sort(space.outline_m, axis=0) - np.sort(BOX, axis=0)).max() < 0.002
