@@ -18,6 +18,8 @@ def test_harmonics_turn_as_their_image_does(some):
         turned = (
             torch.rot90(some.image, 1, (-2, -1)) if exact else rotate_image(some.image, towards)
         )
+        kept = (1 - turned[:, 0]).sum(dim=(1, 2)) / (1 - some.image[:, 0]).sum(dim=(1, 2))
+        assert (kept - 1).abs().max() < 0.01  # of the object's height, also in the corners
         off = harmonics.rotated(known, towards) - harmonics(turned)
         # An interpolated image differs slightly from a rotated one; rotated harmonics are exact.
         assert off.abs().max() < (1e-4 if exact else 0.03 * known.abs().max())

@@ -98,6 +98,15 @@ def test_one_image_is_enough_for_position_turn_and_height(world, skills, plan, o
     assert outcome.lifted_m == pytest.approx(world.object_state()[2] - z, abs=1e-6)
 
 
+def test_a_turn_backwards_goes_round_in_several_rotations(world, skills):
+    world.place(TUBE)
+    found = plan_astar(skills.problem(world.depth_image(), AT, Goal(AT, turn_rad=-2.5)))
+    assert found.reaches_goal
+    assert {type(step.primitive) for step in found.steps} == {Rotate}
+    off = wrap_angle(execute_plan(world, found).turned_rad + 2.5)
+    assert off == pytest.approx(0.0, abs=math.radians(5))
+
+
 def test_predictions_turn_with_the_object(world, skills):
     """A push that turns the box, and an image of the box turned, lead to the same final pose."""
     turned = 0.35
