@@ -10,7 +10,7 @@ import tokenize
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-LINES = {"affordlib": 12_473, "experiments": 6594, "tests": 8906}
+LINES = {"affordlib": 12_473, "experiments": 6594, "tests": 8582}
 """Maximum number of lines: lower it with every cut. The aim is 9,650, 6,000 and 7,800."""
 
 FILES, CODE = 63, 7848

@@ -69,3 +69,10 @@ def test_a_page_gets_the_numbers_the_script_and_a_picture(name, request):
         len(lines) for lines in explorer.panels.values()
     ]
     assert len(data["words"]) == np.prod([len(one["values"]) for one in data["sliders"]])
+
+
+def test_values_out_of_range_are_named(trained, push, world):
+    with pytest.raises(ValueError, match="effect_t must lie"):
+        conditioning_explorer(trained, push, 1.2)
+    with pytest.raises(ValueError, match="phase must lie"):
+        phase_explorer(world, Push.towards(0.6), -1)

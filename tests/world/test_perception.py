@@ -33,6 +33,15 @@ def test_round_tops_look_rollable(world, category):
         assert perception.object_height_m(image) == pytest.approx(obj.height_m, abs=0.003)
 
 
+def test_the_axis_of_a_lying_cylinder_is_seen(world):
+    rng = np.random.default_rng(8)
+    for _ in range(10):
+        yaw = rng.uniform(-math.pi, math.pi)
+        image = _seen(world, LyingCylinder.sample(rng), yaw).image
+        off = (perception.long_axis_rad(image) - yaw + math.pi / 2) % math.pi - math.pi / 2
+        assert abs(math.degrees(off)) < 2
+
+
 def test_a_fallen_cylinder_is_known_to_roll(world):
     """Pushed above its centre, a slender cylinder topples."""
     high = WorldConfig(tip_offset_m=0.06, table_friction=1.0)

@@ -13,7 +13,7 @@ from affordlib.geometry import unit_vector
 from affordlib.interactions.recipes import RECIPES, Variation, interact
 from affordlib.planning import EffectMap
 from affordlib.primitives import Drag, Grasp, LeverUp, Move, Push, Rotate, min_jerk, radians
-from affordlib.world import CATEGORIES, LyingCylinder, Prism, Sphere, Tabletop
+from affordlib.world import CATEGORIES, Cuboid, LyingCylinder, Prism, Sphere, Tabletop, WorldConfig
 from affordlib.world.objects import CHAMFER_M
 
 EXAMPLES = (Push(0.3), Drag(0.3), Grasp(0.05), Rotate(), LeverUp(-0.08, 0.0, 0.0, 0.16))
@@ -73,6 +73,19 @@ def test_a_prism_is_an_extruded_polygon_about_its_centroid():
     assert edges == {3, 4, 5, 6, 7, 8}
 
 
+def test_grasps_lift_what_fits_and_leave_what_does_not(world):
+    world.place(Cuboid(0.05, 0.05, 0.06))
+    small = world.execute_primitive(Grasp())
+    world.place(Cuboid(0.118, 0.118, 0.06))
+    large = world.execute_primitive(Grasp())
+    assert small.success
+    assert small.rest_effect[2] == pytest.approx(Grasp.lift_m, abs=0.01)
+    assert not large.success
+    assert not large.faults
+    # The fingers stopped when they felt the object's top.
+    assert large.tool[:14, 2].min() > 0.06 - 0.003
+
+
 @pytest.mark.parametrize("name", ["push", "drag", "rotate", "grasp"])
 def test_stopped_anywhere_it_rests_where_the_full_one_was(world, name):
     held, slipped = [], []
@@ -89,6 +102,18 @@ def test_stopped_anywhere_it_rests_where_the_full_one_was(world, name):
     assert max(held) < 0.003
     # An object that slipped from the fingers may still roll when the arm stops.
     assert max(slipped, default=0) < 0.015
+
+
+def test_mass_off_the_centre_turns_a_push_and_not_the_frame(world):
+    turned = []
+    for offset in (0.0, 0.036):
+        config = WorldConfig(com_offset_m=(0.0, offset, 0.0))
+        world.place(Cuboid(0.06, 0.08, 0.05), (0.05, 0.1), 0.0, config=config)
+        np.testing.assert_allclose(world.object_pose(), (0.05, 0.1, 0.0), atol=1e-9)
+        seen = world.execute_primitive(Push.towards(0.0))
+        np.testing.assert_allclose(seen.effect[0, :4], 0.0, atol=1e-6)
+        turned.append(seen.effect[-1, 3])
+    assert abs(turned[1]) > abs(turned[0]) + 0.01
 
 
 @pytest.mark.parametrize("category", ["lying_cylinder", "sphere"])
