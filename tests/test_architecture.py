@@ -70,7 +70,6 @@ def test_no_module_needs_itself():
 def test_modules_are_short_and_well_named(path):
     assert (ROOT / path).read_text().count("\n") <= 500
     assert path.stem not in {"utils", "helpers", "misc", "common"}
-    assert ast.get_docstring(TREES[path])
 
 
 def test_no_function_has_too_many_parameters():
@@ -105,7 +104,7 @@ def test_a_page_imports_from_few_modules(path):
 
 
 IMPORT = """
-import os, threading, time
+import os, sys, threading, time
 import numpy as np
 began = time.process_time()
 import torch
@@ -120,12 +119,12 @@ before, began = state(), time.process_time()
 import affordlib.{part}
 took_s = time.process_time() - began
 assert state() == before, [pair for pair in zip(state(), before) if pair[0] != pair[1]]
-print(torch_s, took_s)
+print(torch_s, took_s, "pybullet" in sys.modules)
 """
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("part", [UP[-1], BESIDE])
+@pytest.mark.parametrize("part", ["show", "planning", BESIDE])
 def test_importing_is_quick_and_changes_nothing(part, tmp_path):
     """Importing takes a second on an idle machine; the limit is three times the time of PyTorch."""
     code = IMPORT.format(part=part)
@@ -133,7 +132,8 @@ def test_importing_is_quick_and_changes_nothing(part, tmp_path):
         [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True
     )
     assert (done.returncode, done.stderr) == (0, "")
-    torch_s, took_s = done.stdout.split()
+    torch_s, took_s, simulator = done.stdout.split()
+    assert simulator == str(part == "show")
     assert float(took_s) < 3 * float(torch_s)
 
 

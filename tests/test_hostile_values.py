@@ -78,13 +78,9 @@ CALLABLES |= {f"Log.{n}": getattr(logs.Log("m", CORNERS), n) for n in ("add", "q
 CALLABLES["Log.centroid_pose"] = logs.Log("m", CORNERS).centroid_pose
 STILL_PLANNER = logs.PushPlanner(Still(), logs.PushedObject(np.array(CORNERS)))
 CALLABLES["PushPlanner.plan"] = STILL_PLANNER.plan
-OF_THE_WORLD = """
-place execute_primitive execute execute_path can_reach picture mark shove settle
-"""
-MADE_BY_DRIVEN_ONES = """
-ClosedLoopResult EffectModel Execution Planner Robot
-EffectNetwork FittedModel LoggedPushes NetworkConfig Pushes TabletopObject open_loop
-"""
+OF_THE_WORLD = "place execute_primitive execute execute_path can_reach picture mark shove settle"
+MADE_BY_DRIVEN_ONES = """ClosedLoopResult EffectModel Execution Planner Robot EffectNetwork
+FittedModel LoggedPushes NetworkConfig Pushes TabletopObject open_loop"""
 INSIDE = """
 Batch BranchTable CircularHarmonics FreeSpace Reading about_training condition_on_final_effect
 condition_on_poses condition_on_recorded_action corners_of dataset_sha256 descend final_error
@@ -137,19 +133,17 @@ def shop(one_world, skills, pushes, tmp_path_factory):
     rows = read_results("data/results/planning.json")["tables"]["summary"][:3]
     by_name = {
         "obj": BOX,
-        "xy_m at_xy_m start_xy_m centre": AT,
-        "contact_xy_m": np.array(AT),
+        "xy_m at_xy_m start_xy_m": AT,
         "contact": (0.0, -0.03),
         "path_xy_m": np.array([[-0.1, 0.0], [0.0, 0.0]]),
         "corners outline": CORNERS,
         "outline_m": np.array(CORNERS),
         "length width height diameter height_m": 0.05,
-        "theta contact_x contact_y dy_m dy_m_s y": 0.0,
-        "dx_m dx_m_s x reach distance_m turn_rad theta_rad direction_rad direction": 0.1,
+        "theta contact_x contact_y dy_m": 0.0,
+        "dx_m reach direction_rad direction": 0.1,
         "yaw_rad": 0.3,
         "stop_phase phase level": 0.5,
         "n": 20,
-        "seed": 0,
         "max_steps": 2,
         "partial": True,
         "rgb": (0.0, 0.5, 1.0),
@@ -167,7 +161,6 @@ def shop(one_world, skills, pushes, tmp_path_factory):
         "outcome": Outcome(plan, 0.01, (0.04, 0.02, 0.0), (path,)),
         "image": image,
         "data": pushes,
-        "log": log,
         "interactions": np.arange(2),
         "split": interactions.Split(*np.split(np.arange(30), (12, 24))),
         "training validation tensors": arrays,
@@ -184,19 +177,17 @@ def shop(one_world, skills, pushes, tmp_path_factory):
         "notebook": "x",
         "parameters tables": {},
         "rows": rows,
-        "errors_m": np.array([0.1, 0.2]),
         "attempt": None,
         "effects": effects,
         "generator": torch.Generator().manual_seed(0),
         "obstacles": (wall,),
         "obstacle": wall,
         "n_directions n_targets obs_max n_poses": 4,
-        "color": "black",
     }
     by_callable = {
         **fields_of(step, plan, problem, scaler, domain, arrays, Recipe(), Variation(), few),
         **fields_of(world.WorldConfig(), View(), config, models.FiLMConfig()),
-        **fields_of(interactions.split_interactions(20)),
+        **fields_of(interactions.split_interactions(20), batch),
         "place": {"config": None},
         "Tabletop": {"config": world.WorldConfig()},
         "picture": {"width": 32, "height": 32},
@@ -236,7 +227,6 @@ def shop(one_world, skills, pushes, tmp_path_factory):
         "plan_gradient": {"samples": 10},
         "run_closed_loop": {"config": once, "goal": Goal(AT, 0.05)},
         "GoalPicker": {"view": False},
-        "Batch": fields_of(batch)["Batch"],
         "about_training": {"seen": np.arange(2), "config": few},
         "condition_on_final_effect": {"model": network, "effect": arrays.effect[:, -1]},
         "condition_on_poses": {"start": torch.zeros(12, dtype=torch.int64)},
@@ -246,10 +236,7 @@ def shop(one_world, skills, pushes, tmp_path_factory):
         "gaps_m": {"obstacles": [corners_of(wall)], "shapes": np.array([[CORNERS, CORNERS]])},
         "make_steps": {"chain": torch.tensor([[0.3, 0.8]])},
         "placed": {"corners": np.array(CORNERS), "poses": np.zeros((2, 3))},
-        "plot_flow": {
-            "boxes": {"a": (0.0, 0.0, "k"), "b": (1.0, 1.0, "k")},
-            "arrows": [("a", "b")],
-        },
+        "plot_flow": {"boxes": {"a": (0, 0, "k"), "b": (1, 1, "k")}, "arrows": [("a", "b")]},
         "roll_out": {"direction_rad": torch.zeros(3, 1), "phase": torch.ones(3, 1)},
         "search": {"table": planning.BranchTable(effects, 4)},
         "stored_sha256": {"name_or_path": "push_test"},

@@ -107,7 +107,6 @@ def test_what_a_link_leads_to_is_not_emptied(project):
     [
         ("Linux x86_64", {"version": "3.9"}, "needs Python 3.11, as PyBullet has no wheel for a"),
         ("Linux aarch64", {}, "needs Linux on x86-64: PyBullet has no wheel for Linux aarch64"),
-        ("Darwin arm64", {}, "needs Linux on x86-64: PyBullet has no wheel for Darwin arm64"),
     ],
 )
 def test_another_python_or_system_is_refused(project, system, options, why):

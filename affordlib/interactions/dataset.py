@@ -8,11 +8,10 @@ takes the interactions of a batch, n_targets, obs_max and a generator, and retur
 import copy
 import math
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 import torch
-import xarray
 
 from affordlib.geometry import rotate_channels
 from affordlib.types import (
@@ -25,8 +24,11 @@ from affordlib.types import (
     check_finite,
 )
 
+if TYPE_CHECKING:
+    import xarray
 
-def valid_interactions(data: xarray.Dataset, interactions: np.ndarray) -> np.ndarray:
+
+def valid_interactions(data: "xarray.Dataset", interactions: np.ndarray) -> np.ndarray:
     """Select the interactions that the arm could reach and that have no simulator faults."""
     return interactions[(data["reached"].values & ~data["fault"].values)[interactions]]
 
@@ -164,7 +166,7 @@ class InteractionTensors:
     @classmethod
     def from_dataset(
         cls,
-        data: xarray.Dataset,
+        data: "xarray.Dataset",
         interactions: np.ndarray | None = None,
         action_channels: tuple[str, ...] = ("x", "y"),
         effect_channels: tuple[str, ...] = ("x", "y"),

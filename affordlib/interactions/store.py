@@ -10,13 +10,16 @@ import json
 import os
 import zipfile
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import fsspec
 import numpy as np
 import psutil
-import xarray
 
 from affordlib.results import file_at, from_root, write_atomically
+
+if TYPE_CHECKING:
+    import xarray
 
 SUFFIX = ".zarr.zip"
 MANIFEST = "manifest.json"
@@ -29,7 +32,7 @@ class CorruptedDataError(ValueError):
     """Raised when a stored data set is damaged."""
 
 
-def _hashes(data: xarray.Dataset) -> dict[str, str]:
+def _hashes(data: "xarray.Dataset") -> dict[str, str]:
     """Return a hash of the type, shape and bytes of each array."""
     found = {}
     for name in data.variables:
@@ -44,12 +47,12 @@ def _hash_of(hashes: dict[str, str]) -> str:
     return hashlib.sha256(json.dumps(hashes, sort_keys=True).encode()).hexdigest()
 
 
-def dataset_sha256(data: xarray.Dataset) -> str:
+def dataset_sha256(data: "xarray.Dataset") -> str:
     """Return one hash of all arrays of a data set, independent of workers and file."""
     return _hash_of(_hashes(data))
 
 
-def write_interactions(data: xarray.Dataset, path: Path, level: int = 9) -> None:
+def write_interactions(data: "xarray.Dataset", path: Path, level: int = 9) -> None:
     """Write a set as one file, compressed at a level of 0 to 9; equal sets give equal bytes."""
     from zarr.codecs import BloscCodec
     from zarr.storage import MemoryStore
@@ -116,11 +119,12 @@ def stored_sha256(name_or_path: str | Path) -> str:
     return _hash_of(_read(_url_of(name_or_path), arrays=False)[0])
 
 
-def open_interactions(name_or_path: str | Path) -> xarray.Dataset:
+def open_interactions(name_or_path: str | Path) -> "xarray.Dataset":
     """Read and verify a data set, given a shipped name (`"push"`), a path or an fsspec URL.
 
     Raises FileNotFoundError, or CorruptedDataError that names the damaged part.
     """
+    import xarray
     from zarr.buffer.cpu import Buffer
     from zarr.storage import MemoryStore
 

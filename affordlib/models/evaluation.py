@@ -10,11 +10,10 @@ Variance scaling multiplies σ of an effect channel by s; the maximum-likelihood
 import json
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-import xarray
 from jaxtyping import Float
 from torch import Tensor
 
@@ -22,6 +21,9 @@ from affordlib.geometry import xy_columns
 from affordlib.interactions import InteractionTensors, condition_on_recorded_action
 from affordlib.interactions.dataset import check_fits, check_numbers, valid_interactions
 from affordlib.models.base import EffectModel, EffectNetwork
+
+if TYPE_CHECKING:
+    import xarray
 
 AFTER_CONTACT = (0.8, 0.9, 1.0)
 """Phases at which every push has moved its object; before contact the effect is always zero."""
@@ -74,7 +76,7 @@ def fit_sigma_scale(model: EffectNetwork, validation: InteractionTensors) -> tup
 
 
 def network_predictions(
-    model: EffectModel, data: xarray.Dataset, interactions: np.ndarray
+    model: EffectModel, data: "xarray.Dataset", interactions: np.ndarray
 ) -> dict[str, Any]:
     """Ground truth, mean and σ at t = 1 by channel, and category, of the valid interactions."""
     kept = valid_interactions(data, interactions)
@@ -95,7 +97,7 @@ def final_error(record: dict[str, Any]) -> np.ndarray:
     return np.linalg.norm([np.subtract(mean[name], truth[name]) for name in names], axis=0)
 
 
-def refuse_seen(about: dict[str, Any], data: xarray.Dataset, interactions: np.ndarray) -> None:
+def refuse_seen(about: dict[str, Any], data: "xarray.Dataset", interactions: np.ndarray) -> None:
     """Raise ValueError if a checkpoint was trained on these interactions.
 
     about: the second value that `load_checkpoint` returns, from `about_training`.

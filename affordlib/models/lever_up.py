@@ -18,11 +18,11 @@ protocols, a recurrent one separately for each (`experiments/lever_training.py`)
 """
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 import torch.nn.functional as F
-import xarray
 from jaxtyping import Float
 from torch import Tensor
 
@@ -33,6 +33,9 @@ from affordlib.models.base import EffectNetwork
 from affordlib.models.evaluation import EVERY
 from affordlib.types import Prediction, check_choice
 
+if TYPE_CHECKING:
+    import xarray
+
 LEVER_ACTION_CHANNELS = ("x", "z")
 POSE_CHANNELS = ("x", "y", "z", "tilt")
 N_OBSERVED, N_PREDICTED = 15, 5
@@ -42,7 +45,7 @@ PROTOCOLS = ("window", "first_step", "image_only")
 
 
 def lever_up_tensors(
-    data: xarray.Dataset, interactions: np.ndarray | None = None, view: str = "near"
+    data: "xarray.Dataset", interactions: np.ndarray | None = None, view: str = "near"
 ) -> InteractionTensors:
     """Return lever-ups as 26 steps of poses and commanded actions, in the lever's frame.
 

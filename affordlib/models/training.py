@@ -11,11 +11,10 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-import xarray
 from torch import Tensor
 from tqdm import tqdm
 
@@ -28,6 +27,9 @@ from affordlib.models.domain import TrainingDomain
 from affordlib.models.evaluation import final_errors_m, fit_sigma_scale
 from affordlib.results import from_root
 from affordlib.types import Checked, count, number
+
+if TYPE_CHECKING:
+    import xarray
 
 Sampler = Callable[[InteractionTensors, int, int, torch.Generator], Batch]
 Score = Callable[[EffectNetwork, InteractionTensors], Tensor]
@@ -213,7 +215,7 @@ def untrained(config: NetworkConfig, training: InteractionTensors, seed: int) ->
 
 
 def train_model(
-    data: xarray.Dataset,
+    data: "xarray.Dataset",
     split: Split,
     config: TrainingConfig,
     model_config: NetworkConfig | None = None,
@@ -237,7 +239,7 @@ def train_model(
 
 
 def about_training(
-    data: xarray.Dataset, seen: np.ndarray, config: TrainingConfig
+    data: "xarray.Dataset", seen: np.ndarray, config: TrainingConfig
 ) -> dict[str, object]:
     """The record of a training for its checkpoint: data set, interactions seen, settings."""
     return {

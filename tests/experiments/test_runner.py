@@ -104,8 +104,7 @@ def test_damaged_results_are_named_and_none_are_no_results(tmp_path):
         assert path.read_bytes() == content
 
 
-TABLES = ("effect_prediction", "lever_up", "planning", "closed_loop")
-TABLES += ("real_pushes", "headline")
+TABLES = ("effect_prediction", "lever_up", "planning", "closed_loop", "real_pushes", "headline")
 
 
 @pytest.mark.slow

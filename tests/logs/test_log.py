@@ -78,103 +78,75 @@ def test_units_frames_tables_and_poses_in_between_change_nothing():
     table = {"poses": pd.DataFrame(poses), "poses_t": pd.Series(times)}
     between = Log("mm", TRIANGLE_MM)
     between.add(**one(**table, tool_xy=pd.DataFrame(tool())))
+    logs = [other, between]
+    for unit, size, t in (("cm", 0.1, 1.7e9 + PUSH["tool_t"]), ("m", 1e-3, PUSH["tool_t"])):
+        logs.append(Log(unit, np.multiply(TRIANGLE_MM, size)))  # with lists, and stamps as in ROS
+        t = (1e9 * t).astype(np.int64) if unit == "cm" else pd.to_datetime(t, unit="s")
+        poses = [np.multiply(pose, (size, size, 1)).tolist() for pose in (START, END)]
+        logs[-1].add(**one(tool_xy=(tool() * size).tolist(), poses=poses, tool_t=t))
     for name in ("contact_m", "normal", "direction", "length_m", "displacement_m", "turn_rad"):
-        for data in (other.pushes(), between.pushes()):
+        for same in logs:
             expected = getattr(log.pushes(), name)
-            np.testing.assert_allclose(getattr(data, name), expected, atol=1e-9)
+            np.testing.assert_allclose(getattr(same.pushes(), name), expected, atol=1e-9)
 
 
 BAD = {
-    "millimetres as metres": ({"unit": "m"}, r"the radius of outline, in m, must lie in .*"),
+    "millimetres as metres": ({"unit": "m"}, "the radius of outline, in m, must lie in"),
     "another outline's unit": (
         {"unit": "m", "outline": np.array(TRIANGLE_MM) / 1e3},
-        r"push 0 .*tool_xy never touches .*share a frame, unit and clock",
+        "tool_xy never touches .*share a frame, unit and clock",
     ),
     "degrees as radians": (
         {"poses": ((600.0, -20.0, 17.2), END)},
-        r"push 0 .*yaws of poses, in rad, must lie within one turn, got 17.2; angle_unit is 'rad'"
-        ".* counted must be taken away",
+        "yaws of poses, in rad, .* got 17.2; angle_unit is 'rad'.* counted must be taken away",
     ),
-    "degrees of the end alone": (
-        {"poses": (START, (605.0, -14.0, 4.5))},
-        r"push 0 .*the turn, in rad, of poses .* must lie in .* rad, got 2.08",
-    ),
-    "a pose of another push": (
-        {"poses": (START, (700.0, -14.0, 0.38))},
-        r"push 0 .*motion of poses after 0.0147 m .*another push's.* got 0.0",
-    ),
-    "a missing column of the pose": (
-        {"poses": (START[:2], END[:2])},
-        r"push 0 .*poses must have 2 to 20000 rows of 3 numbers",
-    ),
-    "repeated times": (
-        {"tool_t": np.array([0, 1, 2, 3, 4, 5, 5, 7, 8, 9, 10, 11.0])},
-        r"push 0 .*tool_t must increase, but row 6 .*remove",
-    ),
+    "degrees of the end alone": ({"poses": (START, (605.0, -14.0, 4.5))}, "turn, in rad.* 2.08"),
+    "a pose of another push": ({"poses": (START, (700.0, -14.0, 0.38))}, "of poses .*another push"),
+    "a missing column of the pose": ({"poses": (START[:2], END[:2])}, "poses must have .* 3 num"),
+    "repeated times": ({"tool_t": np.array([0, 1, 1, *range(3, 12)])}, "tool_t must incr.* row 2"),
     "a date that is missing": (
         {"tool_t": np.array([*np.arange(11), "NaT"], "datetime64[s]")},
-        r"push 0 .*tool_t has no time in row 11",
+        "tool_t has no time in row 11",
     ),
-    "a time that is masked": (
-        {"tool_t": np.ma.masked_equal(np.arange(12.0), 4)},
-        r"push 0 .*tool_t has no time in row 4",
-    ),
+    "a time that is masked": ({"tool_t": np.ma.masked_equal(range(12), 4)}, "tool_t .* in row 4"),
     "a gap": (
         {"tool_xy": np.vstack([tool()[:-1], [[np.nan, 0]]])},
-        r"push 0 .*tool_xy must be finite, but 1 of 12 rows are not, the first is row 11; drop",
+        "tool_xy must be finite, but 1 of 12 rows are not, the first is row 11; drop",
     ),
     "an object that was lost": (
         {"poses": [START, *[(np.nan,) * 3] * 4, END], "poses_t": np.linspace(0, 6.6, 6)},
-        r"push 0 .*poses must be finite, but 4 of 6 rows are not, the first is row 1; drop",
+        "poses must be finite, but 4 of 6 rows are not, the first is row 1; drop",
     ),
-    "a held pose": (
-        {"poses": (START, START)},
-        r"push 0 .*tool_xy ends 14.0 mm inside the outline at the pose of .*sign, unit.* held, or",
-    ),
-    "two clocks": (
-        {"poses": [START, END], "poses_t": (1.7e9, 1.7e9 + 6.6)},
-        r"push 0 .*poses_t are from 1.7e\+09 to .*, but tool_t from 0 to 6.6: .*same clock",
-    ),
+    "a held pose": ({"poses": (START, START)}, "tool_xy ends 14.0 mm inside .*sign, unit.* held"),
+    "two clocks": ({"poses_t": (1.7e9, 1.7e9 + 6.6)}, "poses_t are from 1.7.* tool_t .*same clock"),
     "times of 32 bits": (
         {"tool_t": (1.7e9 + np.linspace(0, 6.6, 12)).astype(np.float32)},
-        r"push 0 .*tool_t must increase, but row 1 .*64 bits",
+        "tool_t must increase, but row 1 .*64 bits",
     ),
-    "positions in space": (
-        {"tool_xy": np.insert(tool(), 2, 7.0, axis=1)},
-        r"push 0 .*tool_xy must have 2 to 20000 rows of 2 numbers, got \(12, 3\).*planar",
-    ),
-    "an object that is lost before the push ends": (
-        {"poses_t": (0.0, 4.0)},
-        r"push 0 .*poses_t are from 0 to 4, but tool_t from 0 to 6.6: .*same clock",
-    ),
-    "poses without times": ({"poses": (START, START, END)}, r"push 0 .*give their times"),
+    "positions in space": ({"tool_xy": np.insert(tool(), 2, 7.0, axis=1)}, "tool_xy .*planar"),
+    "an object that is lost before the push ends": ({"poses_t": (0.0, 4.0)}, "from 0 to 4, but"),
+    "poses without times": ({"poses": (START, START, END)}, "give their times"),
     "a tool inside": (
         {"tool_xy": tool()[8:], "tool_t": np.arange(4.0)},
-        r"push 0 .*tool_xy is already 9.6 mm inside the outline in its first row",
+        "tool_xy is already 9.6 mm inside the outline in its first row",
     ),
-    "a context that is no number": (
-        {"context": {"m": float("nan")}},
-        r"push 0 .*context 'm' must be finite numbers",
-    ),
-    "too many feet": (
-        {"context": {"feet": np.ones((36, 3))}},
-        r"context feet must be .*up to 12, 3\), got \(36, 3\)",
-    ),
+    "a context that is no number": ({"context": {"m": float("nan")}}, "context 'm' must be finite"),
+    "too many feet": ({"context": {"feet": np.ones((36, 3))}}, "feet must be .*up to 12, 3., got"),
     "a contour of an image": (
         {"outline": np.random.default_rng(0).random((30_000, 2))},
-        r"outline must be three to 1000 corners .*every tenth point",
+        "outline must be three to 1000 corners .*every tenth point",
     ),
     "a whole session": (
         {"tool_t": np.arange(1e5), "tool_xy": np.zeros((100_000, 2))},
-        r"push 0 .*tool_xy must have 2 to 20000 rows .*split a session",
+        "tool_xy must have 2 to 20000 rows .*split a session",
     ),
     "a curved push": (
         {"tool_xy": tool() - np.outer(np.sin(np.linspace(0, np.pi, 12)), (9, 0))},
-        r"push 0 .*way aside \(a push is straight: cut a curved one into pieces\)",
+        "way aside .a push is straight: cut a curved one into pieces",
     ),
     "an outline that crosses itself": (
         {"outline": ((0, 0), (150, 150), (150, 0), (0, 150))},
-        r"outline crosses itself: .*corner 0 and from corner 2",
+        "outline crosses itself: .*corner 0 and from corner 2",
     ),
 }
 """Arguments of `Log` or of a push that are wrong, and what is said."""
@@ -183,18 +155,19 @@ BAD = {
 @pytest.mark.parametrize("name", BAD)
 def test_what_is_wrong_is_said_in_a_sentence_and_not_added(name):
     changed, says = BAD[name]
-    usual, logs = {"unit": "mm", "outline": TRIANGLE_MM}, []
-    settings = {name: changed.get(name, value) for name, value in usual.items()}
-    push = one(**{name: value for name, value in changed.items() if name not in usual})
+    log = {"unit": "mm", "outline": TRIANGLE_MM}
+    log |= {name: changed[name] for name in changed.keys() & log.keys()}
+    push, logs = one(**{name: changed[name] for name in changed.keys() - log.keys()}), []
 
     def read():
-        logs.append(Log(**settings))
+        logs.append(Log(**log))
         logs[0].add(**push)
 
     with pytest.raises(ValueError, match=says) as raised:
         read()
-    assert "\n" not in str(raised.value)
-    assert not any(map(len, logs))
+    said = str(raised.value)
+    assert "\n" not in said
+    assert not logs or (len(logs[0]) == 0 and "push 0 " in said)
 
 
 def test_whatever_follows_a_recorded_push_is_noticed():
@@ -346,23 +319,6 @@ def test_a_turn_is_not_read_as_a_tilt(order, about, turn_deg):
     if turn_deg > 6:
         with pytest.raises(ValueError, match=r"varies by .* another order"):
             planar(rows, {"xyzw": "wxyz", "wxyz": "xyzw"}[order])
-
-
-@pytest.mark.parametrize(
-    ("unit", "size", "times"),
-    [
-        ("cm", 0.1, lambda t: t),
-        ("mm", 1, lambda t: (1.7e18 + 1e9 * t).astype(np.int64)),
-        ("m", 1e-3, lambda t: pd.to_datetime(t, unit="s")),
-    ],
-)
-def test_units_and_stamps_as_people_have_them(unit, size, times):
-    log, same = Log("mm", TRIANGLE_MM), Log(unit, np.multiply(TRIANGLE_MM, size))
-    log.add(**one())
-    poses = [np.multiply(pose, (size, size, 1)).tolist() for pose in (START, END)]
-    same.add(**one(tool_xy=(tool() * size).tolist(), poses=poses, tool_t=times(PUSH["tool_t"])))
-    np.testing.assert_allclose(same.pushes().contact_m, log.pushes().contact_m, atol=1e-9)
-    np.testing.assert_allclose(same.pushes().turn_rad, log.pushes().turn_rad)
 
 
 def test_the_pushes_that_fit_worst_are_those_whose_pose_jumped():

@@ -62,6 +62,11 @@ def test_from_a_csv_to_a_model_and_a_plan(cells, tmp_path):
 def test_other_conditions_are_read(cells, tmp_path):
     """Any name, compressed or not, any number of pushes; the error of a truncated one says so."""
     needed, folder = "c03 csv c05 conditions", tmp_path / "logs"
+    data = run(cells, needed, tmp_path)["data"]
+    assert len(data) == 250
+    assert np.degrees(np.arccos((data.normal * data.direction).sum(axis=1))).max() < 52
+    with pytest.raises(ValueError, match="pushes must be of one group"):
+        PushedObject.of(data)
     folder.mkdir()
     packed = (repo_root() / "data" / "own_log" / "felt_mid.txt.xz").read_bytes()
     (folder / "ice.txt.xz").write_bytes(packed)
@@ -75,11 +80,3 @@ def test_other_conditions_are_read(cells, tmp_path):
     (folder / "steel_patch_2.txt").write_bytes(text[:-4000])
     with pytest.raises(ValueError, match=r"steel_patch_2.txt is damaged"):
         run(cells, needed, tmp_path, folder)
-
-
-def test_plans_want_one_group(cells, tmp_path):
-    data = run(cells, "c03 csv c05 conditions", tmp_path)["data"]
-    assert len(data) == 250
-    assert np.degrees(np.arccos((data.normal * data.direction).sum(axis=1))).max() < 52
-    with pytest.raises(ValueError, match="pushes must be of one group"):
-        PushedObject.of(data)

@@ -3,7 +3,6 @@
 import dataclasses
 import math
 
-import numpy as np
 import pytest
 import torch
 
@@ -137,27 +136,6 @@ def test_a_quarter_turn_of_the_table_turns_the_prediction(name, quarters, some):
     for mine, theirs in ((std_a, t_std_a), (std_e, t_std_e)):
         swapped = mine[..., [1, 0, 2]] if quarters % 2 else mine
         torch.testing.assert_close(swapped[directed], theirs[directed], rtol=1e-3, atol=2e-5)
-
-
-@pytest.mark.parametrize("name", ["film_500", "cnp_500"])
-def test_many_queries_at_once_equal_each_alone(name, some):
-    model = models.load_checkpoint(name)[0].double()
-    pushes = [Push(float(theta)) for theta in np.linspace(-3, 3, 40)]
-    features = model.encode(some.image[:1].double())
-    t_target = torch.linspace(0, 1, 6, dtype=torch.float64).expand(40, -1)
-    observed = models.condition_on_primitives(model, pushes)
-    exact = {n: v.double() for n, v in vars(observed).items() if v.is_floating_point()}
-    observed = dataclasses.replace(observed, **exact)
-    with torch.no_grad():
-        together = model.predict(features, observed, t_target)
-        each = [
-            model.predict(features, row_of(observed, k), t_target[:1]) for k in range(len(pushes))
-        ]
-    apart = model.predict(features.expand(40, -1), observed, t_target)  # with gradients
-    for field in dataclasses.fields(together):
-        one_by_one = torch.cat([getattr(predicted, field.name) for predicted in each])
-        for other in (one_by_one, getattr(apart, field.name)):
-            torch.testing.assert_close(getattr(together, field.name), other, atol=1e-12, rtol=0)
 
 
 @pytest.mark.parametrize("name", IN_PUSH_FRAME)

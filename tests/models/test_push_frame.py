@@ -9,21 +9,6 @@ from affordlib.models.film import CircularHarmonics
 from affordlib.types import Observations
 
 
-def test_turning_an_image_keeps_the_object(some):
-    angle = 2 * math.pi * torch.rand(40, generator=torch.Generator().manual_seed(0))
-    towards = torch.stack([angle.cos(), angle.sin()], dim=1)
-    turned = rotate_image(some.image, towards)
-    for channel, full in ((1, some.image[:, 1]), (0, 1 - some.image[:, 0])):
-        now = turned[:, 1] if channel == 1 else 1 - turned[:, 0]
-        kept = now.sum(dim=(1, 2)) / full.sum(dim=(1, 2))
-        assert (kept - 1).abs().max() < 0.01
-    again = rotate_image(turned, inverse(towards))
-    assert (again - some.image)[:, 1].abs().mean() < 0.02
-    quarter = torch.tensor([[0.0, 1.0]]).expand(40, 2)
-    exact = torch.rot90(some.image, 1, (-2, -1))
-    torch.testing.assert_close(rotate_image(some.image, quarter), exact, atol=1e-5, rtol=0)
-
-
 def test_harmonics_turn_as_their_image_does(some):
     harmonics = CircularHarmonics(rings=3, orders=4)
     known = harmonics(some.image)
@@ -33,6 +18,8 @@ def test_harmonics_turn_as_their_image_does(some):
         turned = (
             torch.rot90(some.image, 1, (-2, -1)) if exact else rotate_image(some.image, towards)
         )
+        kept = (1 - turned[:, 0]).sum(dim=(1, 2)) / (1 - some.image[:, 0]).sum(dim=(1, 2))
+        assert (kept - 1).abs().max() < 0.01  # of the object's height, also in the corners
         off = harmonics.rotated(known, towards) - harmonics(turned)
         # An interpolated image differs slightly from a rotated one; rotated harmonics are exact.
         assert off.abs().max() < (1e-4 if exact else 0.03 * known.abs().max())

@@ -1,8 +1,6 @@
 """Closed loop and execution: all endings, termination, and vetoes before motion."""
 
 import math
-import subprocess
-import sys
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -11,7 +9,6 @@ import pytest
 
 from affordlib.perception import adapt_to_object
 from affordlib.planning import (
-    MODES,
     ClosedLoopConfig,
     Robot,
     execute_plan,
@@ -24,7 +21,6 @@ from affordlib.planning.closed_loop import DISPLACED_M
 from affordlib.planning.grasp_rotate import GRIPPER_YAWS_RAD
 from affordlib.planning.skills import Reachability
 from affordlib.primitives import Drag, Grasp, Push, Rotate
-from affordlib.results import repo_root
 from affordlib.types import Goal, Plan, Step
 from affordlib.world import (
     Cuboid,
@@ -63,6 +59,7 @@ def disturbed(world, goal, skills, *disturbances):
 @pytest.mark.parametrize("planner", [plan_astar, plan_continuous, plan_gradient])
 def test_every_planner_brings_a_pose_about(planner):
     robot, goal = PointRobot(), Goal((0.21, -0.06), 0.01, turn_rad=1.3, height_m=0.1)
+    assert isinstance(robot, Robot)
     went = loop(robot, goal, planner=planner)
     assert went.status == "unconfirmed", went.message  # what the hand holds is not seen
     assert went.message.endswith("the position and orientation computed, not observed")
@@ -80,22 +77,6 @@ def test_every_planner_brings_a_pose_about(planner):
     for within_m, n_pushes in ((0.01, 1), (0.001, 2)):
         assert len(loop(PointRobot(), Goal((0.08, 0.0), within_m)).steps) == n_pushes
     assert loop(robot, Goal(robot.xy_m, EXACT_M)).steps == ()
-
-
-def test_the_loop_needs_no_simulator():
-    code = """
-import sys
-sys.modules["pybullet"] = sys.modules["affordlib.world"] = None
-from affordlib.planning import run_closed_loop
-from affordlib.types import Goal
-from tests.planning.point_robot import PointRobot, point_skills
-went = run_closed_loop(PointRobot(), Goal((0.1, 0.05), 0.002, height_m=0.1), point_skills())
-print(went.status)
-"""
-    run = [sys.executable, "-c", code]
-    done = subprocess.run(run, capture_output=True, text=True, cwd=repo_root(), check=False)
-    assert done.stdout == "unconfirmed\n", done.stderr
-    assert isinstance(PointRobot(), Robot)
 
 
 @pytest.mark.parametrize("pose", [{}, {"turn_rad": -0.5}, {"height_m": 0.1}])
@@ -130,15 +111,9 @@ def test_a_planner_that_does_not_help_is_given_up_and_it_is_said_why(n_steps, en
 
 
 def test_the_loop_plans_in_its_mode():
-    modes = set()
-
-    def planner(problem):
-        modes.add(problem.mode)
-        return plan_continuous(problem)
-
-    goal = Goal((0.15, 0.0), EXACT_M)
-    assert loop(PointRobot(), goal, planner=planner, mode="single_partial").reached
-    assert modes == {MODES["single_partial"]}
+    went = loop(PointRobot(), Goal((0.15, 0.0), EXACT_M), mode="single_partial")
+    assert went.reached
+    assert {len(plan.steps) for plan in went.plans} == {1}
 
 
 def test_nothing_is_reached_that_the_camera_cannot_tell():
@@ -434,9 +409,8 @@ def test_a_knock_in_the_middle_of_an_action_follows_mechanics(world):
     assert world.on_step is None
 
 
-def test_disturbances_are_a_function_of_the_seed():
-    drawn, again = ([sample_disturbance(k, n_actions=3) for k in range(300)] for _ in range(2))
-    assert drawn == again
+def test_disturbances_of_all_kinds_are_drawn():
+    drawn = [sample_disturbance(k, n_actions=3) for k in range(300)]
     assert {d.kind for d in drawn} == {"shove", "knock", "topple", "goal"}
     assert all(d.at_s is None for d in drawn if d.kind == "shove")
     assert all(d.action >= 1 for d in drawn if d.at_s is None)
@@ -533,16 +507,3 @@ def test_no_task_needs_the_state_of_the_simulator(world, skills, monkeypatch, ca
     if goal.height_m is not None:
         assert world.object_state()[2] - obj.height_m / 2 == pytest.approx(0.1, abs=0.006)
     assert ("orientation" in went.reckoned) == (obj in (BALL, TUBE) or goal.height_m is not None)
-
-
-@pytest.mark.slow
-def test_a_goal_across_the_table_is_reached_in_the_limit_or_refused(world, skills):
-    world.place(BALL, (0.2, -0.4), 0.0)
-    went = run_closed_loop(world, Goal((0.2, 0.25), EXACT_M), skills)
-    assert went.reached, went.message
-    assert len(went.steps) <= 16
-    world.place(BOX, (0.5, 0.3), 0.0)
-    pose = world.object_pose()
-    went = run_closed_loop(world, Goal((0.65, 0.65), EXACT_M), skills)
-    assert (went.status, went.steps) == ("unreachable", ()), went.message
-    assert world.object_pose() == pose

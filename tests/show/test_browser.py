@@ -8,11 +8,9 @@ import json
 import os
 import re
 import secrets
-import shutil
 import socket
 import subprocess
 import sys
-import urllib.request
 from contextlib import contextmanager
 from types import SimpleNamespace
 from urllib.parse import unquote, urlparse
@@ -27,16 +25,9 @@ from pages import WIDGET
 from affordlib.results import repo_root
 from tests.waiting import wait_until
 
-CHROMIUM = shutil.which("chromium")
-FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"]
 PICTURES = repo_root() / "runs" / "browser"
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.browser,
-    pytest.mark.timeout(300),
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt-get install chromium"),
-]
+pytestmark = [pytest.mark.slow, pytest.mark.browser, pytest.mark.timeout(300)]
 
 
 def free_port():
@@ -80,31 +71,19 @@ def serve(folder, name, more_cells=(), app="jupyterlab", **parameters):
         f"--{traits}.user_settings_dir={folder / 'settings'}",
         f"--{traits}.workspaces_dir={folder / 'workspaces'}",
     ]
-    with (folder / "lab.log").open("w") as log:
-        server = subprocess.Popen(
-            [sys.executable, "-m", app, *options],
-            env=os.environ | own | {"JUPYTER_PREFER_ENV_PATH": "1"},
-            stdout=log,
-            stderr=subprocess.STDOUT,
-        )
+    log, environment = folder / "lab.log", os.environ | own | {"JUPYTER_PREFER_ENV_PATH": "1"}
+    with log.open("w") as said:
+        command = [sys.executable, "-m", app, *options]
+        server = subprocess.Popen(command, env=environment, stdout=said, stderr=said)
         address = f"http://127.0.0.1:{port}"
         try:
-            wait_until(lambda: answers(f"{address}/api"), 60, server, f"see {folder / 'lab.log'}")
+            wait_until(lambda: f":{port}/" in log.read_text(), 60, server, f"see {log}")
             path = "doc/tree" if app == "jupyterlab" else "notebooks"
             url = f"{address}/{path}/{name}.ipynb?token={token}"
             yield SimpleNamespace(address=address, url=url, notebook=file, out=out)
         finally:
             server.terminate()
             server.wait(timeout=30)
-
-
-def answers(url):
-    """Whether a server responds."""
-    try:
-        urllib.request.urlopen(url, timeout=5).close()
-    except OSError:
-        return False
-    return True
 
 
 def ask(page, expression):
@@ -128,6 +107,20 @@ def goal_of(page):
     return tuple(ask(page, "picker.plan.goal.xy_m"))
 
 
+def view_of(svg):
+    """Middle (2,) of the table [pixels], what is there (2,) [m], and pixels per metre."""
+    box = svg.bounding_box()
+    x, y, half = map(float, svg.get_attribute("data-view").split())
+    middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    return np.array(middle), np.array((x, y)), box["height"] / (2 * half)
+
+
+def screen_at(svg, x_m, y_m):
+    """Screen position of a place on the table."""
+    middle, there, scale = view_of(svg)
+    return tuple(middle + scale * ((x_m, y_m) - there) * (1, -1))
+
+
 class Table:
     """The table in the page: screen positions of its points, and what is drawn on it."""
 
@@ -139,16 +132,8 @@ class Table:
         assert box["width"] > 280
         assert box["height"] == pytest.approx(box["width"], rel=0.01)
 
-    def view(self):
-        """Middle (2,) [pixels], what is there (2,) [m], and pixels per metre."""
-        box = self.svg.bounding_box()
-        x, y, half = map(float, self.svg.get_attribute("data-view").split())
-        middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-        return np.array(middle), np.array((x, y)), box["height"] / (2 * half)
-
     def at(self, x_m, y_m):
-        middle, there, scale = self.view()
-        return tuple(middle + scale * ((x_m, y_m) - there) * (1, -1))
+        return screen_at(self.svg, x_m, y_m)
 
     def points(self, selector):
         """Corners (n, 2) [m] of everything drawn with a class."""
@@ -158,7 +143,7 @@ class Table:
                 return [x, y];
             }))"""
         )
-        middle, there, scale = self.view()
+        middle, there, scale = view_of(self.svg)
         return there + (np.array(corners, dtype=float).reshape(-1, 2) - middle) * (1, -1) / scale
 
     def goal(self):
@@ -213,20 +198,6 @@ def assert_same_goal(page, table, x_m, y_m, within_m=0.0011):
     wait_until(drawn_is_planned, otherwise="the drawn path is not that of the plan")
 
 
-def saved_outputs(page, lab):
-    """Save the notebook as a reader would, and return all outputs in its file."""
-    page.evaluate("window.jupyterapp.commands.execute('docmanager:save')")
-    outputs = []
-
-    def saved():
-        cells = nbformat.read(lab.notebook, as_version=4).cells
-        outputs[:] = [output for cell in cells for output in cell.get("outputs", [])]
-        return any(WIDGET in output.get("data", ()) for output in outputs)
-
-    wait_until(saved, otherwise="the notebook was not saved with its widget")
-    return outputs
-
-
 EXPLORER = """from affordlib.primitives import Push
 from affordlib.show import phase_explorer
 
@@ -237,18 +208,10 @@ explorer"""
 
 
 @pytest.fixture(scope="module")
-def lab(tmp_path_factory):
+def lab(tmp_path_factory, browser):  # which may be missing
     folder = tmp_path_factory.mktemp("lab")
     with serve(folder, "00_start_here", [EXPLORER]) as lab:
         yield lab
-
-
-@pytest.fixture(scope="module")
-def browser():
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        yield playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
 
 
 def opened(lab, browser):
@@ -477,9 +440,16 @@ def test_a_slider_of_an_explorer_changes_its_figure_without_the_kernel(page):
 
 
 def test_a_saved_notebook_keeps_a_picture(page, lab):
-    outputs = saved_outputs(page, lab)
+    page.evaluate("window.jupyterapp.commands.execute('docmanager:save')")
+    outputs = []
+
+    def saved():
+        cells = nbformat.read(lab.notebook, as_version=4).cells
+        outputs[:] = [output for cell in cells for output in cell.get("outputs", [])]
+        return any(WIDGET in output.get("data", ()) for output in outputs)
+
+    wait_until(saved, otherwise="the notebook was not saved with its widget")
     widget = [o for o in outputs if WIDGET in o.get("data", ())]
-    assert widget
     drawn = ["<img" in output["data"].get("text/html", "") for output in widget]  # a scene
     assert all("image/png" in o["data"] or is_ for o, is_ in zip(widget, drawn, strict=True))
     assert [o for o in outputs if o.output_type == "error"] == []
@@ -511,7 +481,7 @@ def test_notebook_7_draws_the_picker_which_answers(tmp_path, browser):
 
 
 @pytest.fixture(scope="module")
-def web(tmp_path_factory):
+def web(tmp_path_factory, browser):
     """The folder of the web pages and, of each page, its path and its parsed text."""
     made = tmp_path_factory.mktemp("web")
     options = ["-q", "-W", "--keep-going", "-c", "notebooks/book_html", "-d", made / "doctrees"]

@@ -235,42 +235,32 @@ def test_a_goal_picked_while_an_open_loop_runs_is_planned_for_when_it_ends(make_
 
 
 def test_a_disturbance_waits_for_the_end_of_the_action(make_picker, world):
+    """After the last action it is one of what rests."""
     seen = []
 
     def executor(world, plan, planner, report):
-        before = world.object_pose()
-        picker.shove_object()
-        picker.move_goal()
-        assert world.object_pose() == before
-        goal = report()
-        seen.append((before, world.object_pose(), goal))
-        plan = planner(picker.skills.problem(world.depth_image(), world.object_pose()[:2], goal))
-        return open_loop(world, plan, planner, report)
+        for when in ("before", "after"):
+            at = world.object_pose()
+            picker.shove_object()
+            picker.move_goal()
+            assert world.object_pose() == at
+            if when == "before":
+                seen.extend((at, goal := report(), world.object_pose()))
+                problem = picker.skills.problem(world.depth_image(), seen[2][:2], goal)
+                seen.append(open_loop(world, planner(problem), planner, report))
+        return seen[3]
 
     picker = make_picker(executor=executor, seed=3)
     first_goal = picker.plan.goal
     picker.run()
-    (before, after, goal) = seen[0]
+    before, goal, after, done = seen
     assert 0.019 < math.dist(before[:2], after[:2]) < 0.041
     assert 0.039 < math.dist(first_goal.xy_m, goal.xy_m) < 0.081
-    assert drawn_goal(picker) == goal.xy_m
-    assert picker.outcome.distance_m == pytest.approx(goal.distance_m(world.object_pose()[:2]))
-
-
-def test_a_disturbance_after_the_last_action_is_one_of_what_rests(make_picker, world):
-    def executor(world, plan, planner, report):
-        done = open_loop(world, plan, planner, report)
-        picker.shove_object()
-        picker.move_goal()
-        return done
-
-    picker = make_picker(executor=executor)
-    first = picker.plan
-    picker.run()
-    assert math.dist(world.object_pose()[:2], first.predicted_end_xy_m) > 0.015
+    assert done.distance_m == pytest.approx(goal.distance_m(done.end_pose[:2]))
+    assert math.dist(world.object_pose()[:2], done.end_pose[:2]) > 0.015
     assert re.search("Done, .* was shoved by .* was moved by .* Plan: ", picker.controls.said)
     assert picker.plan.start_xy_m == world.object_pose()[:2]
-    assert picker.plan.goal.xy_m == drawn_goal(picker) != first.goal.xy_m
+    assert picker.plan.goal.xy_m == drawn_goal(picker) != goal.xy_m
 
 
 @pytest.mark.slow

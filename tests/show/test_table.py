@@ -105,15 +105,6 @@ def test_the_browser_reaches_what_python_reaches(ask, seen, skills):
                 assert plan["distance"] < 1e-3, goal
 
 
-def test_fewer_and_full_pushes_are_fewer_and_full(ask, seen):
-    _, _, data = seen["box"]
-    for most in (1, 2):
-        queries = [{"pose": [0, 0, 0], "goal": g, "most": most} for g in goals(10, 2)]
-        assert all(len(plan["steps"]) <= most for plan in ask(data, queries))
-    queries = [{"pose": [0, 0, 0], "goal": g, "partial": False} for g in goals(10, 3)]
-    assert {step["stop"] for plan in ask(data, queries) for step in plan["steps"]} == {1}
-
-
 def obstacles_of(rng, n, near=0.07, far=0.2):
     """Discs and boxes around the origin."""
     made = []

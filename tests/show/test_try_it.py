@@ -2,15 +2,13 @@
 
 import json
 import re
-import shutil
 
 import numpy as np
 import pytest
 
 from experiments import try_it
+from tests.show.test_browser import screen_at
 
-CHROMIUM = shutil.which("chromium")
-FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"]
 pytestmark = [pytest.mark.slow, pytest.mark.browser, pytest.mark.timeout(120)]
 
 
@@ -37,16 +35,6 @@ def test_the_page_is_what_its_command_makes_of_its_sources():
     assert "http" not in text.replace("http://www.w3.org/2000/svg", "")
 
 
-@pytest.fixture(scope="module")
-def browser():
-    from playwright.sync_api import sync_playwright
-
-    if CHROMIUM is None:
-        pytest.skip("no Chromium: apt-get install chromium")
-    with sync_playwright() as playwright:
-        yield playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-
-
 @pytest.fixture
 def opened(browser):
     """Function that opens the page; it must neither ask for anything nor complain."""
@@ -71,22 +59,12 @@ def opened(browser):
 
 
 def at(page, x_m, y_m):
-    """Screen position of a place on the table."""
-    svg = page.locator(".affordlib-table svg")
-    box, view = svg.bounding_box(), svg.get_attribute("data-view")
-    x, y, half = map(float, view.split())
-    scale = box["height"] / (2 * half)
-    middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-    return middle[0] + scale * (x_m - x), middle[1] - scale * (y_m - y)
+    return screen_at(page.locator(".affordlib-table svg"), x_m, y_m)
 
 
 def goal_of(page):
     label = page.locator(".affordlib-table svg").get_attribute("aria-label")
     return [float(number) for number in re.findall(r"= (-?[\d.]+)", label)[:2]]
-
-
-def settled(page):
-    page.wait_for_timeout(400)
 
 
 def words(page):
@@ -100,7 +78,7 @@ def test_drag_play_keys_and_switches(opened):
     page.mouse.down()
     page.mouse.move(*at(page, -0.06, 0.05), steps=5)
     page.mouse.up()
-    settled(page)
+    page.wait_for_timeout(400)
     assert goal_of(page) == pytest.approx([-6, 5], abs=0.2)
     assert "Predicted to end 0.0 mm" in words(page)
     svg = page.locator(".affordlib-table svg")
@@ -120,7 +98,7 @@ def test_drag_play_keys_and_switches(opened):
     page.get_by_role("radio", name="slab").click()
     assert "trained on no such object" in words(page)
     page.get_by_role("button", name="Start over").click()
-    settled(page)
+    page.wait_for_timeout(400)
     assert goal_of(page) == [13, 8.5]
     page.mouse.click(*at(page, 0.0, 0.16))
     page.get_by_role("button", name="Undo").click()
@@ -131,7 +109,7 @@ def test_an_obstacle_is_added_moved_resized_and_removed_and_planned_around(opene
     page = opened()
     page.get_by_role("button", name="obstacle: + box").click()
     page.get_by_role("button", name="obstacle: + disc").click()
-    settled(page)
+    page.wait_for_timeout(400)
     one = page.locator(".obstacle").first
     plan = page.locator(".prediction").first
 
@@ -140,13 +118,13 @@ def test_an_obstacle_is_added_moved_resized_and_removed_and_planned_around(opene
     page.mouse.down()
     page.mouse.move(*at(page, 0.1, 0.03), steps=6)
     page.mouse.up()
-    settled(page)
+    page.wait_for_timeout(400)
     assert plan.get_attribute("points") != before
     assert "Predicted to end 0.0 mm" in words(page)
     svg = page.locator(".affordlib-table svg")
     svg.press("+")
     svg.press("ArrowRight")
-    settled(page)
+    page.wait_for_timeout(400)
     assert one.bounding_box()["width"] > 1.1 * box["width"]
     svg.press("Delete")
     assert page.locator(".obstacle").count() == 1
@@ -181,7 +159,7 @@ def test_by_touch_a_swipe_scrolls_and_a_tap_moves_the_goal(opened):
             kind = "touchStart" if k == 0 else "touchMove" if point else "touchEnd"
             place = [{"x": point[0], "y": point[1]}] if point else []
             touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": place})
-        settled(page)
+        page.wait_for_timeout(400)
 
     svg.scroll_into_view_if_needed()
     before, scrolled = goal_of(page), page.evaluate("scrollY")
@@ -189,9 +167,9 @@ def test_by_touch_a_swipe_scrolls_and_a_tap_moves_the_goal(opened):
     assert goal_of(page) == before
     assert page.evaluate("scrollY") > scrolled + 50
     page.evaluate("scrollTo(0, 300)")
-    settled(page)
+    page.wait_for_timeout(400)
     page.touchscreen.tap(*at(page, 0.05, 0.08))
-    settled(page)
+    page.wait_for_timeout(400)
     assert goal_of(page) == pytest.approx([5, 8], abs=0.3)
     x, y = at(page, *(value / 100 for value in goal_of(page)))
     scrolled = page.evaluate("scrollY")
