@@ -18,7 +18,7 @@ _CHECKED = """
 types geometry primitives perception results weights world.objects
 world.tabletop planning.astar planning.closed_loop planning.continuous
 planning.effect_map planning.gradient planning.grasp_rotate
-planning.problem planning.skills interactions.dataset
+planning.problem planning.reachability planning.skills interactions.dataset
 interactions.collect interactions.recipes
 interactions.store workers logs.cross_validate logs.fit logs.log logs.planning models.evaluation
 models.checkpoint models.domain models.lever_up models.training

@@ -39,7 +39,7 @@ from affordlib.models.checkpoint import SUFFIX, save_checkpoint
 from affordlib.models.lever_up import lever_up_tensors
 from affordlib.models.training import Sampler, TrainingConfig, about_training, train_model
 from affordlib.planning import MODES
-from affordlib.planning.skills import REACHABILITY, Reachability, reach_features
+from affordlib.planning.reachability import REACHABILITY, Reachability, reach_features
 from affordlib.primitives import move_for
 from affordlib.results import repo_root, write_atomically
 from affordlib.types import Goal, Observations

@@ -215,3 +215,19 @@ def test_the_pages_and_the_shipped_results_agree_and_carry_no_path():
         assert read_results(path)["notebook"] == path.stem
         given = json.loads(path.read_text())["parameters"].values()
         assert not [v for v in given if isinstance(v, str) and os.path.isabs(v)]
+
+
+def test_blocks_join_columns_and_turn_rows_into_columns(tmp_path):
+    rows = [{"planner": p, "mode": m, "mean_m": x, "sem_m": 1e-3} for p, m, x in
+            [("a", "b_c", 2e-3), ("a", "d", None), ("e", "d", 3e-3)]]  # fmt: skip
+    source = write_results(tmp_path, "06_planning", {}, {"planning": rows})
+    options = (
+        "planner=e,a columns=who:planner by=mode 'values=mean_m±sem_m,up_to:mean_m(sem_m..sem_m)'"
+    )
+    filled = fill_tables(f"<!-- table: {source}#planning {options} -->\n<!-- /table -->\n")
+    assert filled.splitlines()[1:-1] == [
+        "| who | d: mean, mm | b c: mean, mm | d: up to, mm | b c: up to, mm |",
+        "| --- | ---: | ---: | ---: | ---: |",
+        "| e | 3.00 ± 1.00 | – | 3.00 (1.00 to 1.00) | – |",
+        "| a | – | 2.00 ± 1.00 | – | 2.00 (1.00 to 1.00) |",
+    ]

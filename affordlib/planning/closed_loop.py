@@ -194,11 +194,17 @@ class _ClosedLoop:
                 ending = self._observe() or self._decide_and_act()
             except NothingSeenError:
                 ending = Ending("lost", f"no object is seen on the table, after {self._count()}")
-        paths = tuple(done.object_path[:, :2] for done in self.executions)
-        done = tuple(self.steps), paths, tuple(self.plans), tuple(self.seen_xy_m)
-        end_pose = *self.seen.xy_m, self._turned_rad()
         return ClosedLoopResult(
-            self.goal, *ending, self._errors(), *done, end_pose, self._reckoned()
+            goal=self.goal,
+            status=ending.status,
+            message=ending.message,
+            errors=self._errors(),
+            steps=tuple(self.steps),
+            object_paths_xy_m=tuple(done.object_path[:, :2] for done in self.executions),
+            plans=tuple(self.plans),
+            seen_xy_m=tuple(self.seen_xy_m),
+            end_pose=(*self.seen.xy_m, self._turned_rad()),
+            reckoned=self._reckoned(),
         )
 
     def _observe(self) -> Ending | None:

@@ -1,12 +1,31 @@
 """Cross-validation trains the models of its jobs, and tables agree with their results."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from experiments import cross_validation
 from experiments import effect_prediction as tables
-from experiments.cross_validation import network_and_training
+from experiments.cross_validation import job, network_and_training
 from experiments.effect_prediction import confusion_columns
+
+# Jobs
+
+
+def test_what_decides_a_training_decides_whether_its_result_is_stale(monkeypatch):
+    def made_of():
+        return job("film", "push").made_of()
+
+    before, (network, training) = made_of(), network_and_training("film", "push")
+    for change in ((replace(network, blocks=5), training), (network, replace(training, ema=0.5))):
+        monkeypatch.setattr(
+            cross_validation, "network_and_training", lambda *_, change=change: change
+        )
+        assert made_of() != before
+    same = network, replace(training, device="cpu")
+    monkeypatch.setattr(cross_validation, "network_and_training", lambda *_: same)
+    assert made_of() == before
 
 
 def test_shipped_networks_are_those_of_the_tables():

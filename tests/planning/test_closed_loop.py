@@ -19,7 +19,7 @@ from affordlib.planning import (
 )
 from affordlib.planning.closed_loop import DISPLACED_M
 from affordlib.planning.grasp_rotate import GRIPPER_YAWS_RAD
-from affordlib.planning.skills import Reachability
+from affordlib.planning.reachability import Reachability
 from affordlib.primitives import Drag, Grasp, Push, Rotate
 from affordlib.types import Goal, Plan, Step
 from affordlib.world import (
@@ -507,3 +507,16 @@ def test_no_task_needs_the_state_of_the_simulator(world, skills, monkeypatch, ca
     if goal.height_m is not None:
         assert world.object_state()[2] - obj.height_m / 2 == pytest.approx(0.1, abs=0.006)
     assert ("orientation" in went.reckoned) == (obj in (BALL, TUBE) or goal.height_m is not None)
+
+
+@pytest.mark.slow
+def test_a_goal_across_the_table_is_reached_in_the_limit_or_refused(world, skills):
+    world.place(BALL, (0.2, -0.4), 0.0)
+    went = run_closed_loop(world, Goal((0.2, 0.25), EXACT_M), skills)
+    assert went.reached, went.message
+    assert len(went.steps) <= 16
+    world.place(BOX, (0.5, 0.3), 0.0)
+    pose = world.object_pose()
+    went = run_closed_loop(world, Goal((0.65, 0.65), EXACT_M), skills)
+    assert (went.status, went.steps) == ("unreachable", ()), went.message
+    assert world.object_pose() == pose
