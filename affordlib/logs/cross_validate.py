@@ -16,8 +16,7 @@ from affordlib.logs.fit import BASELINES, MODELS, FittedModel, PushModel, folds_
 from affordlib.logs.log import LoggedPushes
 from affordlib.types import check_choice, check_count
 
-MOST_PUSHES = 3000
-"""Maximum number of pushes: the time of a Gaussian process grows with its cube."""
+MOST_PUSHES = 3000  # the time of a Gaussian process grows with its cube
 
 
 def cross_validate(

@@ -35,7 +35,7 @@ from sklearn.preprocessing import PolynomialFeatures, StandardScaler
 from torch import Tensor
 
 from affordlib.geometry import quarter_turn
-from affordlib.logs.log import LoggedPushes, Pushes, check_feet, gyration_radius_m
+from affordlib.logs.log import LoggedPushes, Pushes, gyration_radius_m
 from affordlib.logs.neural_process import (
     NeuralProcess,
     in_contact_frame,
@@ -48,10 +48,8 @@ from affordlib.types import check_choice, check_count
 from affordlib.weights import read_weights, write_weights
 
 INNER_FOLDS, FEW, MOST_CONTEXT = 3, 100, 64
-MOST_FITTED = 250
-"""Number of pushes, of those of `rate_gp`, from which its kernel is learned."""
-FAR = 1.2
-"""Length of a push, as a multiple of the log's longest, beyond which σ is widened."""
+MOST_FITTED = 250  # pushes from which the kernel of `rate_gp` is learned
+FAR = 1.2  # times the length of the log's longest push, beyond which σ is widened
 EFFORT = {"few": (100, 1e-4, 8), "many": (600, 3e-4, 8)}
 """Fine-tuning on fewer than `FEW` pushes or on more: steps, learning rate, tasks per step."""
 FORMAT = "affordlib model of pushes 1"
@@ -84,7 +82,6 @@ def push_rows(pushes: Pushes) -> Tensor:
 def known_feet(pushes: Pushes) -> Tensor:
     """Known feet (n, k, 3) in units of the radius of gyration; (n, 0, 3) where none are known."""
     known = pushes.context.get("feet", np.zeros((len(pushes), 0, 3)))
-    check_feet(known)
     feet = torch.tensor(known, dtype=torch.float32)
     feet[..., :2] /= gyration_radius_m(pushes.outline_m)
     return feet

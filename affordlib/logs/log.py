@@ -23,32 +23,18 @@ from affordlib.types import check_array, check_choice, check_within
 UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 UNITS_RAD = {"deg": math.pi / 180, "rad": 1.0}
 MOST_ROWS, MOST_CORNERS = 20_000, 1000
-FEET = 12
-"""Maximum number of feet in `context["feet"]`, (feet, 3): x, y [m] and share of the weight."""
+FEET = 12  # at most, in context["feet"], (feet, 3): x, y [m] and share of the weight
 LARGEST_M = 1.0
-SLACK_M = 0.03
-"""Distance [m] by which an object may move farther than the tool."""
-OFF_M, OFF_SHARE = 0.002, 0.2
-"""How far the tool may go back or aside: a length [m], and a share of its greatest depth."""
-LATE_SHARE = 0.05
-"""Share of a push's duration by which its poses may begin late or end early; two frames at most."""
-SAMPLES = 500
-"""Number of points of a path, at least, at which contact is looked for."""
-DEEP_M = 0.003
-"""How deep [m] the tool may be inside the outline in the first row and at the final pose."""
-BACK_M = 0.01
-"""How far [m] the path of a tool that touches in the first row is extended backwards."""
-APART_M, TOUCH_M = 0.003, 0.001
-"""In a session: gaps [m] at which a push may begin, and below which the tool touches."""
-MOST_TILT_RAD, WOBBLE_RAD = math.radians(20), math.radians(3)
-"""How far an upright object may be tilted, and how much that may vary if its yaw varies less."""
+SLACK_M = 0.03  # by which an object may move farther than the tool
+OFF_M, OFF_SHARE = 0.002, 0.2  # the tool's way back or aside, plus a share of its depth
+LATE_SHARE = 0.05  # of its duration, by which a push may be seen late; two frames at most
+SAMPLES = 500  # points of a path, at least, at which contact is looked for
+DEEP_M = 0.003  # of the tool in the outline, in the first row and at the final pose
+BACK_M = 0.01  # how far the path of a tool that touches in the first row is extended backwards
+APART_M, TOUCH_M = 0.003, 0.001  # in a session: gaps where a push may begin, where the tool touches
+MOST_TILT_RAD, WOBBLE_RAD = math.radians(20), math.radians(3)  # wobble: if the yaw varies less
 ORDERS = {"xyzw": [0, 1, 2, 3], "wxyz": [1, 2, 3, 0]}
-UPS = {"z": 0, "y": 1, "x": -1}
-"""How far x, y, z must be shifted so that the axis that points up comes last."""
-CAUSES = (
-    "likely causes: sign, unit or axis of the yaw, or order of the quaternion; a pose that was "
-    "held, or seen before the push ended; another push's pose; a marker off the outline's origin"
-)
+UPS = {"z": 0, "y": 1, "x": -1}  # shift of x, y, z that puts the axis that points up last
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -204,7 +190,6 @@ class Log:
         t = _growing("tool_t", tool_t, len(tool))
         known = self._poses("poses", poses, math.inf)
         at = _growing("poses_t", poses_t, len(known))
-        known[:, 2] = np.unwrap(known[:, 2])
         seen = np.column_stack([np.interp(t, at, column) for column in known.T])
         inside = rotated_each(tool - seen[:, :2], -seen[:, 2]) - self.origin_m
         gap, found, done = _nearest(self.outline_m, inside)[0] - self._radius_m, [], 0
@@ -230,8 +215,8 @@ class Log:
         """
         tool = _rows("tool_xy", tool_xy, 2) * self._metres - self.origin_m
         push = _contact(self.outline_m, tool, self._radius_m)
-        about = {"groups": group, "context": self._context(context or {})}
-        return self._stacked(Pushes, [{**push, **about}])
+        push |= {"groups": group, "context": self._context(context or {})}
+        return self._stacked(Pushes, [push])
 
     def pushes(self) -> LoggedPushes:
         """Return all added pushes; raises ValueError if there are none."""
@@ -246,13 +231,12 @@ class Log:
 
     def _stacked(self, kind: type, pushes: list[dict[str, Any]]) -> Any:
         arrays = {n: np.array([p[n] for p in pushes]) for n in pushes[0] if n != "context"}
-        names = pushes[0]["context"]
-        context = {n: np.array([p["context"][n] for p in pushes]) for n in names}
+        context = {n: np.array([p["context"][n] for p in pushes]) for n in pushes[0]["context"]}
         of_all = {"outline_m": self.outline_m, "tool_radius_m": self._radius_m}
         return kind(**arrays, context=context, **of_all)
 
     def _poses(self, name: str, values: Any, most: float = MOST_ROWS) -> np.ndarray:
-        """Convert poses (k, 3) to metres and radians; raises ValueError."""
+        """Poses (k, 3) in metres and radians, without jumps of the yaw by 2π; ValueError."""
         poses = _rows(name, values, 3, most=most) * [self._metres, self._metres, self._radians]
         if np.abs(poses[:, 2]).max() > 2 * math.pi:
             raise ValueError(
@@ -260,10 +244,11 @@ class Log:
                 f"{poses[np.abs(poses[:, 2]).argmax(), 2] / self._radians:g}; angle_unit is "
                 f"{self._angle_unit!r}, and whole turns that were counted must be taken away"
             )
+        poses[:, 2] = np.unwrap(poses[:, 2])
         return poses
 
     def _ends(self, t: np.ndarray, poses: Any, poses_t: Any) -> np.ndarray:
-        """Poses (2, 3) before the push and when the tool stops, without a jump of the yaw by 2π."""
+        """Poses (2, 3) before the push and when the tool stops."""
         known = self._poses("poses", poses)
         if poses_t is None and len(known) > 2:
             raise ValueError(f"poses are {len(known)}; give their times, poses_t, as well")
@@ -275,7 +260,6 @@ class Log:
                 f"{t[-1]:g}: the object must be seen before it moves and when the tool has "
                 "stopped, by the same clock, in the same unit"
             )
-        known[:, 2] = np.unwrap(known[:, 2])
         return np.column_stack([np.interp(t[[0, -1]], at, column) for column in known.T])
 
     def _refuse_jumps(self, push: dict[str, Any], tool: np.ndarray) -> None:
@@ -296,14 +280,19 @@ class Log:
         if deep > DEEP_M:
             raise ValueError(
                 f"tool_xy ends {1e3 * deep:.1f} mm inside the outline at the pose of then "
-                f"(poses, by tool_t and poses_t), more than {1e3 * DEEP_M:g} mm; {CAUSES}"
+                f"(poses, by tool_t and poses_t), more than {1e3 * DEEP_M:g} mm; likely causes: "
+                "sign, unit or axis of the yaw, or order of the quaternion; a pose that was held, "
+                "or seen before the push ended; another push's pose; a marker off the outline's "
+                "origin"
             )
 
     def _context(self, context: Mapping[str, Any]) -> dict[str, np.ndarray]:
         """Values as arrays of finite numbers or text, alike in all pushes; raises ValueError."""
         found = {n: np.array(v) for n, v in context.items() if isinstance(v, str)}
         found |= {n: check_array(f"context {n!r}", v) for n, v in context.items() if n not in found}
-        check_feet(found.get("feet", np.zeros((1, 3))))
+        feet = found.get("feet", np.zeros((1, 3)))
+        if feet.ndim < 2 or feet.shape[-1] != 3 or feet.shape[-2] > FEET:
+            raise ValueError(f"context feet must be (…, up to {FEET}, 3), got {feet.shape}")
         expected = self._pushes[0]["context"] if self._pushes else found
         shapes = [{n: (v.dtype.kind, v.shape) for n, v in c.items()} for c in (found, expected)]
         if shapes[0] != shapes[1]:
@@ -312,12 +301,6 @@ class Log:
                 "use the same names and kinds of values in all pushes"
             )
         return {name: found[name] for name in expected}
-
-
-def check_feet(feet: np.ndarray) -> None:
-    """Raise ValueError unless these are up to 12 feet (…, k, 3)."""
-    if feet.ndim < 2 or feet.shape[-1] != 3 or feet.shape[-2] > FEET:
-        raise ValueError(f"context feet must be (…, up to {FEET}, 3), got {feet.shape}")
 
 
 def _rows(

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
-from affordlib.geometry import rotated, rotated_each, unit_vector
+from affordlib.geometry import circle, edge_normals, rotated, rotated_each, unit_vector
 from affordlib.logs.fit import PushModel
 from affordlib.logs.log import LARGEST_M, Pushes, _nearest, centred, gyration_radius_m, segment_gaps
 from affordlib.primitives import PushAt
@@ -36,21 +36,15 @@ from affordlib.types import (
 )
 
 N_CANDIDATES = 600
-LENGTHS_M = 0.002, 0.045
-"""Range of push lengths for an object without a log of pushes."""
+LENGTHS_M = 0.002, 0.045  # of pushes of an object without a log
 MOST_INCIDENCE_RAD = math.radians(50)
-CORNER_SHARE = 0.08
-"""Fraction of an edge excluded from contacts at each end."""
+CORNER_SHARE = 0.08  # of an edge, without contacts at each end
 SHORTEST_SHARE = 0.3
-CLEAR_M = 0.004
-"""Distance [m] between tool and outline on the tool's way; half of it must remain."""
-TURN_PRICE_M = 0.03
-"""Length [m] that the tool rather goes than turn once more on its way."""
-KEPT = 3
-"""Number of chains of each length that are refined."""
+CLEAR_M = 0.004  # between tool and outline on the tool's way; half of it must remain
+TURN_PRICE_M = 0.03  # that the tool rather goes than turn once more on its way
+KEPT = 3  # chains of each length that are refined
 _NEIGHBOURS, _PAIRS = 30, 2000
-_BEFORE = 1 / math.cos(MOST_INCIDENCE_RAD)
-"""Distance before the contact at which the tool stops, in `CLEAR_M`, even for an oblique push."""
+_BEFORE = 1 / math.cos(MOST_INCIDENCE_RAD)  # where even an oblique push begins, in CLEAR_M
 _SHIFT, _LARGEST_STEP, _DAMPING_M = 0.01, 0.5, 0.0003
 
 
@@ -108,8 +102,7 @@ class PushedObject:
     def at(self, edge: np.ndarray, values: np.ndarray) -> Pushes:
         """Pushes on edges (n,) with values (n, 3) as in `drawn`."""
         edges, n = np.roll(self.outline_m, -1, axis=0) - self.outline_m, len(edge)
-        sizes = np.linalg.norm(edges, axis=1)
-        normal = np.stack([-edges[:, 1], edges[:, 0]], axis=1)[edge] / sizes[edge, None]
+        normal = -edge_normals(self.outline_m)[edge]
         return Pushes(
             contact_m=self.outline_m[edge] + values[:, :1] * edges[edge],
             normal=normal,
@@ -303,13 +296,12 @@ class PushPlanner:
         """
         outline_m, radius_m = self.obj.outline_m, self.obj.tool_radius_m
         start = rotated(np.subtract(tool_xy_m, pose[:2]), -pose[2])
-        angle = np.linspace(0, 2 * math.pi, 32, endpoint=False)
-        circle = np.column_stack([np.cos(angle), np.sin(angle)])
+        ring = circle(1.0, 32)
         if (lacks := radius_m + CLEAR_M - _nearest(outline_m, start[None])[0].item()) > 0:
-            back = start + (lacks + 1e-4) * circle  # one of these is nearly along the normal
+            back = start + (lacks + 1e-4) * ring  # one of these is nearly along the normal
             start = back[_nearest(outline_m, back)[0].argmax()]
         far_m = np.linalg.norm(outline_m, axis=1).max() + radius_m + CLEAR_M
-        around = circle[::4] * far_m / math.cos(math.pi / 8)
+        around = ring[::4] * far_m / math.cos(math.pi / 8)
         if self.room_m is not None:
             around = rotated(
                 np.clip(rotated(around, pose[2]) + pose[:2], *self.room_m) - pose[:2], -pose[2]
