@@ -313,10 +313,9 @@ def sigma_scale(off: Tensor) -> Tensor:
 
     x and y share one factor.
     """
-    factors = []
-    for z in (off[:, :2].abs().flatten(), off[:, 2].abs()):
-        factors.append((z.quantile(0.5) / 0.6745 * z.quantile(0.9) / 1.6449).sqrt())
-    return torch.stack([factors[0], *factors])
+    both = off[:, :2].abs().flatten(), off[:, 2].abs()
+    xy, turn = ((z.quantile(0.5) / 0.6745 * z.quantile(0.9) / 1.6449).sqrt() for z in both)
+    return torch.stack([xy, xy, turn])
 
 
 def folds_of(groups: np.ndarray, k: int, seed: int) -> np.ndarray:

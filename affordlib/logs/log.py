@@ -311,6 +311,7 @@ def _rows(
         array = np.ma.asarray(values, dtype=float).filled(np.nan)
     except (TypeError, ValueError, RuntimeError, OverflowError):
         array = check_array(name, values)
+    array = array[:, None] if array.ndim == 1 and columns == (1,) else array
     if array.ndim != 2 or array.shape[1] not in columns or not least <= len(array) <= most:
         raise ValueError(
             f"{name} must have {least} to {most} rows of {' or '.join(map(str, columns))} "
@@ -326,15 +327,13 @@ def _rows(
 
 
 def _growing(name: str, times: Any, n: int) -> np.ndarray:
-    missing = np.ma.getmaskarray(np.ma.asarray(times))
+    """Increasing times (n,); raises ValueError."""
     if getattr(getattr(times, "dtype", None), "kind", "") == "M":  # dates, as nanoseconds
-        times = np.asarray(times, "datetime64[ns]")
-        missing, times = missing | np.isnat(times), times.astype(np.int64)
-    if missing.any():
-        raise ValueError(f"{name} has no time in row {missing.argmax()}; drop the row")
-    t = check_array(name, times)
-    if t.shape != (n,):
-        raise ValueError(f"{name} must be {n} times, one for each row, got {t.shape}")
+        times = np.ma.asarray(times, "datetime64[ns]").filled(np.datetime64("NaT"))
+        times = np.where(np.isnat(times), np.nan, times.astype(np.int64))
+    t = _rows(name, times, 1, most=math.inf)[:, 0]
+    if len(t) != n:
+        raise ValueError(f"{name} must be {n} times, one for each row, got {len(t)}")
     if (stuck := np.flatnonzero(np.diff(t) <= 0)).size:
         row = int(stuck[0]) + 1
         raise ValueError(

@@ -148,16 +148,18 @@ def train_neural_process(
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, steps, pct_start=0.08)
     for step in range(steps):
         drawn = torch.randint(len(tasks), (batch,), generator=generator)
-        rows, seen = zip(
-            *(_split(tasks[i], queries, generator) for i in drawn.tolist()), strict=True
-        )
+        parts = [_split(tasks[i], queries, generator) for i in drawn.tolist()]
+        rows, seen = map(torch.stack, zip(*parts, strict=True))
         chance = torch.rand(3, batch, generator=generator)
         matrix = rotation(chance[0] * 2 * math.pi, chance[1] < 0.5)
-        rows = transformed(torch.stack(rows), matrix)
+        rows = transformed(rows, matrix)
         given = transformed(feet[drawn] * (chance[2] < 0.5)[:, None, None], matrix)
         context, query = rows.split([_CONTEXT, queries], 1)
-        mean, std = model(query, context, given, torch.stack(seen))
-        loss = _loss(mean, std, in_contact_frame(query, query[..., 7:]))
+        mean, std = model(query, context, given, seen)
+        truth = in_contact_frame(query, query[..., 7:])
+        off = (truth - mean.detach()) / std
+        loss = huber_loss(50 * mean, 50 * truth)  # linear beyond 2 % of the radius
+        loss = loss + 0.05 * (std.log() + off.clamp(-4, 4) ** 2 / 2).mean()
         optimiser.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(model.parameters(), 1.0)
@@ -176,19 +178,11 @@ def _split(task: Tensor, queries: int, generator: torch.Generator) -> tuple[Tens
     return task[order[torch.cat([places[0] % n, places[1]])]], seen
 
 
-def _loss(mean: Tensor, std: Tensor, truth: Tensor) -> Tensor:
-    """Huber loss, linear beyond 2 % of the radius, and likelihood of σ with a detached mean."""
-    off = (truth - mean.detach()) / std
-    return huber_loss(50 * mean, 50 * truth) + 0.05 * (std.log() + off.clamp(-4, 4) ** 2 / 2).mean()
-
-
 def load_neural_process(name_or_path: str | Path = PRETRAINED) -> NeuralProcess:
     """Load a shipped or another checkpoint; ValueError if it is damaged or of another kind."""
     path, remedy = resolve_checkpoint(name_or_path), "train it: python -m experiments.pretrain_np"
 
-    def make(description):
-        if description["model"] != "np":
-            raise ValueError("it is no neural process of pushes")
+    def make(_description):
         with torch.device("meta"):  # draws no random weights
             return NeuralProcess()
 

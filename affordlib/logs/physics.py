@@ -14,6 +14,7 @@ and the pusher's travel after contact. Feet are rows of 3: x, y and weight (sum 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Self
 
@@ -38,9 +39,14 @@ def quasi_static_push(
     contact, normal, direction, travel = push.split([2, 2, 2, 1], dim=-1)
     turn, moved = torch.zeros_like(friction), torch.zeros_like(contact)
     tangent, state = quarter_turn(normal), torch.zeros(3, *friction.shape)
+
+    def weights(v):
+        return feet[..., 2] / (v.square().sum(-1) + smoothing**2).sqrt()
+
     for _ in range(steps):
         step = rotate(direction, -turn) * travel / steps
-        at_contact, spin, state = _motion(contact, normal, step, feet, friction, smoothing, state)
+        arms = quarter_turn(feet[..., :2] - contact[:, None])  # velocities of the feet per turn
+        at_contact, spin, state = _motion(normal, step, arms, weights, friction, state)
         at_centroid = at_contact - spin[:, None] * quarter_turn(contact)
         moved = moved + rotate(at_centroid, turn + spin / 2)
         contact = contact + ((step - at_contact) * tangent).sum(-1, keepdim=True) * tangent
@@ -49,42 +55,31 @@ def quasi_static_push(
 
 
 def _motion(
-    contact: Tensor,
-    normal: Tensor,
-    step: Tensor,
-    feet: Tensor,
-    friction: Tensor,
-    smoothing: float,
-    state: Tensor,
+    normal: Tensor, step: Tensor, arms: Tensor, weights: Callable, friction: Tensor, state: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Motion of the object's point at the contact (B, 2), rotation (B,), and the solver's state."""
     size = step.norm(dim=-1, keepdim=True)
     u = step / size
-    per_turn = quarter_turn(feet[..., :2] - contact[:, None])  # velocity of a foot
-
-    def weights(v: Tensor) -> Tensor:
-        return feet[..., 2] / (v.square().sum(-1) + smoothing**2).sqrt()
-
     turn, along, turn_sliding = state
     for _ in range(3):
-        v = u[:, None] + turn[:, None, None] * per_turn
+        v = u[:, None] + turn[:, None, None] * arms
         k = weights(v)
-        turn = -(k * (u[:, None] * per_turn).sum(-1)).sum(1)
-        turn = turn / ((k * per_turn.square().sum(-1)).sum(1) + 1e-9)
-    v = u[:, None] + turn[:, None, None] * per_turn
+        turn = -(k * (u[:, None] * arms).sum(-1)).sum(1)
+        turn = turn / ((k * arms.square().sum(-1)).sum(1) + 1e-9)
+    v = u[:, None] + turn[:, None, None] * arms
     force, tangent = (weights(v)[..., None] * v).sum(1), quarter_turn(normal)
     sideways = (force * tangent).sum(-1)
     slides = sideways.abs() > friction * (force * normal).sum(-1)
     edge = normal + (friction * sideways.sign())[:, None] * tangent
     edge = edge / edge.norm(dim=-1, keepdim=True)
     across = quarter_turn(edge)
-    for _ in range(5):  # v_i = edge + along * across + turn * per_turn, up to a factor
-        v = (edge + along[:, None] * across)[:, None] + turn_sliding[:, None, None] * per_turn
+    for _ in range(5):  # v_i = edge + along * across + turn * arms, up to a factor
+        v = (edge + along[:, None] * across)[:, None] + turn_sliding[:, None, None] * arms
         k = weights(v)
-        a = (across[:, None] * per_turn).sum(-1)
+        a = (across[:, None] * arms).sum(-1)
         a11, a12 = k.sum(1), (k * a).sum(1)
-        a22 = (k * per_turn.square().sum(-1)).sum(1)
-        right = -(k * (edge[:, None] * per_turn).sum(-1)).sum(1)
+        a22 = (k * arms.square().sum(-1)).sum(1)
+        right = -(k * (edge[:, None] * arms).sum(-1)).sum(1)
         det = a11 * a22 - a12**2 + 1e-9
         along, turn_sliding = -a12 * right / det, a11 * right / det
     sliding = edge + along[:, None] * across

@@ -47,6 +47,8 @@ _NEIGHBOURS, _PAIRS = 30, 2000
 _BEFORE = 1 / math.cos(MOST_INCIDENCE_RAD)  # where even an oblique push begins, in CLEAR_M
 _SHIFT, _LARGEST_STEP, _DAMPING_M = 0.01, 0.5, 0.0003
 
+XY, Pose = tuple[float, float], tuple[float, float, float]
+
 
 @dataclass(frozen=True)
 class PushedObject:
@@ -58,7 +60,7 @@ class PushedObject:
 
     outline_m: np.ndarray
     tool_radius_m: float = 0.0
-    lengths_m: tuple[float, float] = LENGTHS_M
+    lengths_m: XY = LENGTHS_M
     group: str = "seen"
     context: dict[str, Any] = field(default_factory=dict)
 
@@ -80,34 +82,34 @@ class PushedObject:
 
     def draw(self, n: int = N_CANDIDATES, seed: int | np.random.Generator = 0) -> Pushes:
         """Draw n pushes all around the outline, less those whose tool would overlap the object."""
-        return self.at(*self.drawn(n, seed))
+        return self.at(self.drawn(n, seed))
 
-    def drawn(self, n: int, seed: int | np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """Edges (m,) and values (m, 3) of pushes: share of the edge, angle [rad], log of length."""
+    def drawn(self, n: int, seed: int | np.random.Generator) -> np.ndarray:
+        """Pushes (m, 4): number of the edge, share of it, angle to its normal, log of length."""
         rng, n = np.random.default_rng(seed), check_count("n", n, 1, 100_000)
         sizes = np.linalg.norm(np.roll(self.outline_m, -1, axis=0) - self.outline_m, axis=1)
-        edge, (low, high) = rng.choice(len(sizes), n, p=sizes / sizes.sum()), self.bounds.T
-        values = np.column_stack([rng.uniform(*ends, n) for ends in zip(low, high, strict=True)])
-        pushes = self.at(edge, values)
+        edge = rng.choice(len(sizes), n, p=sizes / sizes.sum())
+        rows = np.column_stack([edge, *(rng.uniform(*ends, n) for ends in self.bounds)])
+        pushes = self.at(rows)
         middle = pushes.contact_m - self.tool_radius_m * pushes.normal
-        fits = _nearest(self.outline_m, middle)[0] > self.tool_radius_m - 1e-6
-        return edge[fits], values[fits]
+        return rows[_nearest(self.outline_m, middle)[0] > self.tool_radius_m - 1e-6]
 
     @property
     def bounds(self) -> np.ndarray:
-        """Least and largest value of a push's share of the edge, angle and log of length (3, 2)."""
+        """Least and largest value (3, 2) of the last three numbers of `drawn`."""
         share, angle = (CORNER_SHARE, 1 - CORNER_SHARE), (-MOST_INCIDENCE_RAD, MOST_INCIDENCE_RAD)
         return np.array([share, angle, np.log(self.lengths_m)])
 
-    def at(self, edge: np.ndarray, values: np.ndarray) -> Pushes:
-        """Pushes on edges (n,) with values (n, 3) as in `drawn`."""
-        edges, n = np.roll(self.outline_m, -1, axis=0) - self.outline_m, len(edge)
+    def at(self, rows: np.ndarray) -> Pushes:
+        """Pushes as `drawn` describes them."""
+        edge, n = rows[:, 0].astype(int), len(rows)
+        edges = np.roll(self.outline_m, -1, axis=0) - self.outline_m
         normal = -edge_normals(self.outline_m)[edge]
         return Pushes(
-            contact_m=self.outline_m[edge] + values[:, :1] * edges[edge],
+            contact_m=self.outline_m[edge] + rows[:, 1:2] * edges[edge],
             normal=normal,
-            direction=rotated_each(normal, values[:, 1]),
-            length_m=np.exp(values[:, 2]),
+            direction=rotated_each(normal, rows[:, 2]),
+            length_m=np.exp(rows[:, 3]),
             groups=np.full(n, self.group),
             context={k: np.repeat(np.array(v)[None], n, 0) for k, v in self.context.items()},
             outline_m=self.outline_m,
@@ -132,7 +134,7 @@ class PushPlanner:
     turn_m: float | None = None
     price: float = 0.0
     rounds: int = 0
-    room_m: tuple[tuple[float, float], tuple[float, float]] | None = None
+    room_m: tuple[XY, XY] | None = None
 
     def __post_init__(self) -> None:
         check_count("seed", self.seed, least=0)
@@ -142,20 +144,14 @@ class PushPlanner:
         radius_m = gyration_radius_m(self.obj.outline_m) if self.turn_m is None else self.turn_m
         self._turn_m = check_within("turn_m", radius_m, 0.0, LARGEST_M, "m")
         self._drawn = self.obj.drawn(N_CANDIDATES, self.seed)
-        self.library = self.obj.at(*self._drawn)
+        self.library = self.obj.at(self._drawn)
         self._effect, self._std = self.model.predict(self.library)
         each = np.arange(len(self.library))
         self._pairs = np.stack(np.meshgrid(each, each), axis=-1).reshape(-1, 2)
         self._ends = _after(*(self._effect[rows] for rows in self._pairs.T))
         self._trees: dict[float, cKDTree] = {}
 
-    def plan(
-        self,
-        pose: tuple[float, float, float],
-        goal: Goal,
-        n_pushes: int = 3,
-        tool_xy_m: tuple[float, float] | None = None,
-    ) -> Plan:
+    def plan(self, pose: Pose, goal: Goal, n_pushes: int = 3, tool_xy_m: XY | None = None) -> Plan:
         """Plan up to three pushes from a pose (x, y, yaw) to a goal, with its turn if it has one.
 
         pose: of the object's centroid (`Log.centroid_pose`); goal: a position of the centroid in
@@ -173,19 +169,20 @@ class PushPlanner:
         weights = np.array([1.0, 1.0, self._turn_m if goal.turn_rad is not None else 1e-6])
         target = np.array([*rotated(np.subtract(goal.xy_m, (x, y)), -yaw), goal.turn_rad or 0.0])
         shut = self.shut(pose, tool_xy_m)
+        parts = self._drawn, self._effect, self._std
         risk, effect, n = (weights * self._std) ** 2, self._effect, len(self.library)
 
         def best(chains, ends):
             cost = ((weights * (ends - target)) ** 2).sum(axis=1) + risk[chains].sum(axis=(1, 2))
             cost[shut[chains[:, 0]]] = np.inf
             order = np.argpartition(cost, KEPT)[:KEPT] if self.rounds else [cost.argmin()]
-            return [(math.sqrt(cost[k]), *self._chain(chains[k])) for k in order]
+            return [(math.sqrt(cost[k]), *(part[chains[k]] for part in parts)) for k in order]
 
         found = best(np.arange(n)[:, None], effect)
-        if n_pushes > 1 and weights[2] not in self._trees:
-            self._trees[weights[2]] = cKDTree(weights * self._ends)
-        tree = self._trees.get(weights[2])
         if n_pushes > 1:  # a chain that is refined need not be the very best
+            if weights[2] not in self._trees:
+                self._trees[weights[2]] = cKDTree(weights * self._ends)
+            tree = self._trees[weights[2]]
             near = tree.query(weights * target, _PAIRS)[1] if self.rounds else slice(None)
             found += best(self._pairs[near], self._ends[near])
         if n_pushes == 3:
@@ -195,24 +192,22 @@ class PushPlanner:
             chains = np.column_stack([np.repeat(np.arange(n), _NEIGHBOURS), self._pairs[near]])
             found += best(chains, _after(effect[chains[:, 0]], self._ends[near]))
         if self.rounds:
-            found += self._refined([chain[1] for chain in found], weights, target)
-            firsts = self.obj.at(*(np.array([c[1][k][0] for c in found]) for k in (0, 1)))
+            found += self._refined([rows for _, rows, *_ in found], weights, target)
+            firsts = self.obj.at(np.array([rows[0] for _, rows, *_ in found]))
             shut = self.shut(pose, tool_xy_m, firsts)
             found = [chain for chain, is_shut in zip(found, shut, strict=True) if not is_shut]
-        price = self.price * np.linalg.norm(weights * target)
         found = [chain for chain in found if math.isfinite(chain[0])]
         if not found:
             raise UnreachableError("tool_xy_m: the tool finds no way around the object to a push")
-        _, chosen, *predicted = min(found, key=lambda each: each[0] + price * len(each[2]))
-        plan = self._steps(pose, goal, self.obj.at(*chosen), *predicted)
+        price = self.price * np.linalg.norm(weights * target)
+        _, rows, *predicted = min(found, key=lambda each: each[0] + price * len(each[1]))
+        plan = _steps(pose, self.obj.at(rows), *predicted)
         off_m = goal.distance_m(plan[-1].predicted_end_xy_m)
         turn_off = weights[2] * abs(plan[-1].predicted_turn_rad - target[2])
         reaches, took_s = max(off_m, turn_off) <= goal.tolerance_m, time.perf_counter() - began
         return Plan(goal, (x, y), plan, "push_at", bool(reaches), took_s)
 
-    def way(
-        self, pose: tuple[float, float, float], tool_xy_m: tuple[float, float], primitive: PushAt
-    ) -> np.ndarray:
+    def way(self, pose: Pose, tool_xy_m: XY, primitive: PushAt) -> np.ndarray:
         """Points (n, 2) of the tool's way from where it is to the end of a push of `plan`.
 
         It retreats from the outline, goes around the object, and comes to rest before the contact.
@@ -227,36 +222,19 @@ class PushPlanner:
             k = int(last[k])
         return np.array([*points[::-1], before, contact + primitive.length * ahead])
 
-    def _chain(self, rows: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray]:
-        return tuple(part[rows] for part in self._drawn), self._effect[rows], self._std[rows]
-
-    def _steps(
-        self, pose: Any, goal: Goal, pushes: Pushes, effect: np.ndarray, std: np.ndarray
-    ) -> tuple[Step, ...]:
-        x, y, yaw = pose
-        steps, ends = [], np.zeros((1, 3))
-        for k in range(len(pushes)):
-            ends = np.vstack([ends, _after(ends[-1:], effect[k : k + 1])])
-            path = np.add((x, y), rotated(ends[-2:, :2], yaw))
-            primitive = primitive_of(pushes, k, yaw + ends[-2, 2])
-            std_m, turn = float(np.hypot(*std[k, :2])), float(ends[-1, 2])
-            steps.append(Step(primitive, 1.0, tuple(path[1].tolist()), path, None, std_m, turn))
-        return tuple(steps)
-
     def _refined(
-        self, chains: list[tuple[np.ndarray, np.ndarray]], weights: np.ndarray, target: np.ndarray
+        self, chains: list[np.ndarray], weights: np.ndarray, target: np.ndarray
     ) -> list[tuple]:
-        """Gauss-Newton steps of least norm, of all chains (edges, values) side by side."""
-        best: list[tuple] = [(math.inf, chain) for chain in chains]
-        shifts = np.vstack([np.zeros(3), _SHIFT * np.eye(3)])[:, None]
-        places = np.cumsum([4 * len(edge) for edge, _ in chains])[:-1]
+        """Gauss-Newton steps of least norm, of all chains of drawn pushes (k, 4) side by side."""
+        best: list[tuple] = [(math.inf,)] * len(chains)
+        shifts, (low, high) = np.eye(4)[:, None] * [0, _SHIFT, _SHIFT, _SHIFT], self.obj.bounds.T
+        places = np.cumsum([4 * len(rows) for rows in chains])[:-1]
         for _ in range(self.rounds):
-            edges = np.concatenate([np.tile(edge, 4) for edge, _ in chains])
-            shifted = np.concatenate([(values + shifts).reshape(-1, 3) for _, values in chains])
-            both = self.model.predict(self.obj.at(edges, shifted))
+            shifted = np.concatenate([(rows + shifts).reshape(-1, 4) for rows in chains])
+            both = self.model.predict(self.obj.at(shifted))
             parts = zip(*(np.split(each, places) for each in both), strict=True)
             for number, (effect, std) in enumerate(parts):
-                (edge, values), k = chains[number], len(chains[number][0])
+                rows, k = chains[number], len(chains[number])
                 effect, std = effect.reshape(4, k, 3), std[:k]
                 ends = np.zeros((1 + 3 * k, 3))  # without shifts, and for each shifted value
                 for push in range(k):
@@ -266,12 +244,13 @@ class PushPlanner:
                 off = weights * (ends[0] - target)
                 cost = math.sqrt((off**2).sum() + ((weights * std) ** 2).sum())
                 if cost < best[number][0]:
-                    best[number] = cost, (edge, values), effect[0], std
+                    best[number] = cost, rows, effect[0], std
                 slope = weights * (ends[1:] - ends[0]) / _SHIFT
                 damped = slope.T @ slope + _DAMPING_M**2 * np.eye(3)
                 step = np.clip(-slope @ np.linalg.solve(damped, off), -_LARGEST_STEP, _LARGEST_STEP)
-                chains[number] = edge, np.clip(values + step.reshape(k, 3), *self.obj.bounds.T)
-        return [each for each in best if len(each) > 2]
+                values = np.clip(rows[:, 1:] + step.reshape(k, 3), low, high)
+                chains[number] = np.column_stack([rows[:, 0], values])
+        return [each for each in best if math.isfinite(each[0])]
 
     def shut(self, pose: Any, tool_xy_m: Any, pushes: Pushes | None = None) -> np.ndarray:
         """Which pushes (n,), by default of the library, the tool at tool_xy_m cannot make."""
@@ -303,9 +282,8 @@ class PushPlanner:
         far_m = np.linalg.norm(outline_m, axis=1).max() + radius_m + CLEAR_M
         around = ring[::4] * far_m / math.cos(math.pi / 8)
         if self.room_m is not None:
-            around = rotated(
-                np.clip(rotated(around, pose[2]) + pose[:2], *self.room_m) - pose[:2], -pose[2]
-            )
+            inside = np.clip(rotated(around, pose[2]) + pose[:2], *self.room_m)
+            around = rotated(inside - pose[:2], -pose[2])
         turns = np.vstack([start, around])
         ends = np.vstack([turns, goals_m])
         off = ends - turns[:, None]
@@ -326,6 +304,18 @@ def primitive_of(pushes: Pushes, k: int, heading_rad: float) -> PushAt:
     middle = pushes.contact_m[k] - pushes.tool_radius_m * pushes.normal[k]
     direction = math.atan2(pushes.direction[k, 1], pushes.direction[k, 0]) + heading_rad
     return PushAt(tuple(rotated(middle, heading_rad)), direction, float(pushes.length_m[k]))
+
+
+def _steps(pose: Pose, pushes: Pushes, effect: np.ndarray, std: np.ndarray) -> tuple[Step, ...]:
+    x, y, yaw = pose
+    steps, ends = [], np.zeros((1, 3))
+    for k in range(len(pushes)):
+        ends = np.vstack([ends, _after(ends[-1:], effect[k : k + 1])])
+        path = np.add((x, y), rotated(ends[-2:, :2], yaw))
+        primitive = primitive_of(pushes, k, yaw + ends[-2, 2])
+        std_m, turn = float(np.hypot(*std[k, :2])), float(ends[-1, 2])
+        steps.append(Step(primitive, 1.0, tuple(path[1].tolist()), path, None, std_m, turn))
+    return tuple(steps)
 
 
 def _after(pose: np.ndarray, effect: np.ndarray) -> np.ndarray:

@@ -106,9 +106,12 @@ BAD = {
     "repeated times": ({"tool_t": np.array([0, 1, 1, *range(3, 12)])}, "tool_t must incr.* row 2"),
     "a date that is missing": (
         {"tool_t": np.array([*np.arange(11), "NaT"], "datetime64[s]")},
-        "tool_t has no time in row 11",
+        "tool_t must be finite, but 1 of 12 rows are not, the first is row 11",
     ),
-    "a time that is masked": ({"tool_t": np.ma.masked_equal(range(12), 4)}, "tool_t .* in row 4"),
+    "a time that is masked": (
+        {"tool_t": np.ma.masked_equal(range(12), 4)},
+        "tool_t .* row 4; drop",
+    ),
     "a gap": (
         {"tool_xy": np.vstack([tool()[:-1], [[np.nan, 0]]])},
         "tool_xy must be finite, but 1 of 12 rows are not, the first is row 11; drop",
