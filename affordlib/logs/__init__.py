@@ -1,7 +1,4 @@
-"""A log of one's own: off-centre pushes of one object, models fitted to them, and plans.
-
-It stands on the package's ground, beside all other parts.
-"""
+"""A log of one's own: off-centre pushes of one object, models fitted to them, and plans."""
 
 from affordlib.logs.cross_validate import cross_validate, summary, worst
 from affordlib.logs.fit import FittedModel, fit, load_model, save_model

@@ -44,8 +44,7 @@ def cross_validate(
             f"at most {MOST_PUSHES}, got {dict(zip(names.tolist(), counts.tolist(), strict=True))}"
         )
     fold = folds_of(data.groups, folds, check_count("seed", seed, least=0))
-    pools = [data.groups == name for name in names]
-    pools = [np.ones(len(data), dtype=bool)] if within == "all" else pools
+    pools = [True] if within == "all" else [data.groups == name for name in names]
     jobs = [(pool & (fold != k), pool & (fold == k)) for pool in pools for k in range(folds)]
     known = [n for n in (*BASELINES, *models) if "feet" in data.context or "feet" not in n]
     parts = joblib.Parallel(n_jobs=min(len(jobs), joblib.cpu_count()))(

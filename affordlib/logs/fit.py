@@ -54,10 +54,8 @@ EFFORT = {"few": (100, 1e-4, 8), "many": (600, 3e-4, 8)}
 """Fine-tuning on fewer than `FEW` pushes or on more: steps, learning rate, tasks per step."""
 FORMAT = "affordlib model of pushes 1"
 
-Forecast = tuple[np.ndarray, np.ndarray]
-"""Mean and σ (n, 3) of displacement [m] and rotation [rad], in the object's frame."""
-State = dict[str, np.ndarray]
-"""What a model has learned from its log; it learns what is missing when it predicts."""
+Forecast = tuple[np.ndarray, np.ndarray]  # mean and σ (n, 3), as `PushModel.predict` returns them
+State = dict[str, np.ndarray]  # what a model learned; it learns what is missing when it predicts
 
 
 @runtime_checkable
@@ -66,7 +64,6 @@ class PushModel(Protocol):
 
     def predict(self, pushes: Pushes) -> Forecast:
         """Mean and σ (n, 3) of displacement [m] and rotation [rad], in the object's frame."""
-        ...
 
 
 def push_rows(pushes: Pushes) -> Tensor:
@@ -309,10 +306,7 @@ def _predicted(model: NeuralProcess, data: LoggedPushes, pushes: Pushes) -> tupl
 
 
 def sigma_scale(off: Tensor) -> Tensor:
-    """Factors (3,) on σ that match the 50 and 90 % intervals of residuals (n, 3), in units of σ.
-
-    x and y share one factor.
-    """
+    """Factors (3,) on σ that match the 50 and 90 % intervals of residuals (n, 3), in units of σ."""
     both = off[:, :2].abs().flatten(), off[:, 2].abs()
     xy, turn = ((z.quantile(0.5) / 0.6745 * z.quantile(0.9) / 1.6449).sqrt() for z in both)
     return torch.stack([xy, xy, turn])

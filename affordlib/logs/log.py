@@ -1,8 +1,7 @@
 """Logs of a robot's own pushes of one object: checks and conversion to a common frame.
 
-`Log` accepts raw numbers, in its own unit and in the world frame. `Log.pushes` returns them in
-metres and radians, in the object's frame before each push: the origin is the centroid of the
-outline, the axes are those of the recorded pose. `planar` reads positions and quaternions in space.
+`Log` accepts raw numbers, in its own unit and in the world frame. `Log.pushes` returns metres and
+radians in the object's frame before each push: from its centroid, with the recorded pose's axes.
 """
 
 from __future__ import annotations
@@ -263,14 +262,11 @@ class Log:
         return np.column_stack([np.interp(t[[0, -1]], at, column) for column in known.T])
 
     def _refuse_jumps(self, push: dict[str, Any], tool: np.ndarray) -> None:
-        """Raise ValueError if the object's motion exceeds what the tool can cause, or falls short.
-
-        The lever arm of the rotation is taken to be at least the distance to the nearest edge. At
-        the final pose the tool (1, 2) touches the outline or has slipped off, but is not inside.
-        """
+        """Raise ValueError if the object moved by more or less than the tool (1, 2) can cause."""
         moved_m, turn_rad = push["displacement_m"], push["turn_rad"]
         of = f"poses after {push['length_m']:.3g} m of contact (are they another push's?)"
         most_m = push["length_m"] + SLACK_M
+        # A rotation's lever arm is at least the distance to the nearest edge.
         lever_m = max(1e-3, abs(_nearest(self.outline_m, np.zeros((1, 2)))[0].item()))
         turn, most_rad = f"the turn, in {self._angle_unit}, of {of}", min(most_m / lever_m, math.pi)
         check_within(turn, abs(turn_rad), 0.0, most_rad, "rad")

@@ -117,8 +117,7 @@ class NeuralProcess(nn.Module):
     def predict(self, query: Tensor, context: Tensor, feet: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and σ (Q, 3) in the contact frames; query (Q, 7), context (C, 10).
 
-        Averages over quarter rotations and reflections (8 in all), which makes it invariant to
-        them.
+        Averages over the eight quarter rotations and reflections, to which it is invariant.
         """
         mirrored = torch.arange(8) % 2 == 1
         matrix = rotation(torch.arange(8) // 2 * (math.pi / 2), mirrored)
