@@ -13,6 +13,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, Self
 
 import numpy as np
+from scipy.ndimage import find_objects, label
 from scipy.optimize import brentq
 
 from affordlib.geometry import centroid, cross, rotated, rotated_each
@@ -191,15 +192,12 @@ class Log:
         at = _growing("poses_t", poses_t, len(known))
         seen = np.column_stack([np.interp(t, at, column) for column in known.T])
         inside = rotated_each(tool - seen[:, :2], -seen[:, 2]) - self.origin_m
-        gap, found, done = _nearest(self.outline_m, inside)[0] - self._radius_m, [], 0
-        while (touch := np.flatnonzero(gap[done:] < TOUCH_M)).size:
-            first = done + int(touch[0])
-            apart = np.flatnonzero(gap[first:] > APART_M)
-            last = first + int(apart[0]) if apart.size else len(t)
-            end = first + int(np.linalg.norm(tool[first:last] - tool[first], axis=1).argmax())
-            away = np.flatnonzero(gap[done:first] > APART_M)
-            rows, done = slice(done + int(away[-1]) if away.size else done, end + 1), last
-            if end > first:
+        gap, found = _nearest(self.outline_m, inside)[0] - self._radius_m, []
+        for (near,) in find_objects(label(gap <= APART_M)[0]):
+            first = near.start + int((gap[near] < TOUCH_M).argmax())
+            way = np.linalg.norm(tool[first : near.stop] - tool[first], axis=1)
+            rows = slice(max(near.start - 1, 0), first + int(way.argmax()) + 1)
+            if gap[first] < TOUCH_M and way.any():
                 push = {"tool_t": t[rows], "tool_xy": tool[rows] / self._metres}
                 push["poses"] = seen[rows] / [self._metres, self._metres, self._radians]
                 found.append(push | {"poses_t": t[rows]})
