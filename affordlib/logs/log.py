@@ -92,8 +92,7 @@ def planar(values: Any, order: str = "xyzw", up: str = "z") -> np.ndarray:
     quaternions = rows[:, 3:][:, ORDERS[order]]
     size = np.linalg.norm(quaternions, axis=1)
     row = int(np.abs(size - 1).argmax())
-    if abs(size[row] - 1) > 0.05:
-        raise ValueError(f"values: a quaternion has length 1, but in row {row} {size[row]:g}")
+    check_within(f"the length of the quaternion in row {row} of values", size[row], 0.95, 1.05)
     i, j, k = np.roll(quaternions[:, :3], shift, axis=1).T
     w, tilt = quaternions[:, 3], np.arccos(np.clip(1 - 2 * (i * i + j * j), -1, 1))
     yaw, row = np.arctan2(2 * (w * k + i * j), 1 - 2 * (j * j + k * k)), int(tilt.argmax())
