@@ -108,10 +108,7 @@ BAD = {
         {"tool_t": np.array([*np.arange(11), "NaT"], "datetime64[s]")},
         "tool_t must be finite, but 1 of 12 rows are not, the first is row 11",
     ),
-    "a time that is masked": (
-        {"tool_t": np.ma.masked_equal(range(12), 4)},
-        "tool_t .* row 4; drop",
-    ),
+    "a time that is masked": ({"tool_t": np.ma.masked_equal(range(12), 4)}, "tool_t .* is row 4;"),
     "a gap": (
         {"tool_xy": np.vstack([tool()[:-1], [[np.nan, 0]]])},
         "tool_xy must be finite, but 1 of 12 rows are not, the first is row 11; drop",
