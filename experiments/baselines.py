@@ -33,8 +33,7 @@ from affordlib.models.evaluation import EVERY, effects_at
 from affordlib.types import Prediction
 from affordlib.world import category_named
 
-Forecast = tuple[Tensor, Tensor]
-"""Mean and σ (N, T, C) of the effect at some samples."""
+Forecast = tuple[Tensor, Tensor]  # mean and σ (N, T, C) of the effect at some samples
 
 _CATEGORY_GAP = 3.0
 """Feature distance between two categories; the other features have a spread of about 1."""

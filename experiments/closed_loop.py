@@ -69,11 +69,9 @@ WORLDS = {"clean": 1, "perturbed": 8}
 """Worlds, and the number of images over which an observation averages in each."""
 OPEN_LOOP = "open_loop"
 PUSHES = dict.fromkeys(("clean", OPEN_LOOP), CHECKPOINTS["push"])
-PUSHES["perturbed"] = "film_5000_perturbed"
-"""Checkpoint of pushes in each world."""
+PUSHES["perturbed"] = "film_5000_perturbed"  # checkpoint of pushes in each world
 
-AT_REST_S = 3.0
-"""Time [s] in which an object of the perturbed world settles before a trial starts."""
+AT_REST_S = 3.0  # time [s] in which an object of the perturbed world settles before a trial starts
 
 SMALLEST_M2 = 0.001
 """Prisms with a smaller footprint [m²] are sampled again, because models reject objects that are
@@ -86,8 +84,7 @@ WITHIN_M, WITHIN_HEIGHT_M, WITHIN_TURN_RAD = 0.005, 0.005, math.radians(3)
 STATUSES = ("reached", "unreachable", "gave_up", "lost")
 ARRIVED = ("reached", "unconfirmed")
 """Statuses of a loop that count as reached here, where the simulator measures the errors."""
-EDGE_M = 0.05
-"""Smallest distance [m] of a goal of `reachability` from the table's edge."""
+EDGE_M = 0.05  # smallest distance [m] of a goal of `reachability` from the table's edge
 
 
 @dataclass(frozen=True)

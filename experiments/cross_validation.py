@@ -34,11 +34,9 @@ from experiments.shipped import CHECKPOINT_SPECS, GRASP_SYMMETRIES, HALF_TURNS
 
 VERSION = 2
 N_FOLDS = 10
-STEPS_ON_100 = 800
-"""Number of training steps on the sets of 100 interactions."""
+STEPS_ON_100 = 800  # number of training steps on the sets of 100 interactions
 
-LARGE = "_x10"
-"""Suffix of the names of sets of ten times the size, which are not shipped."""
+LARGE = "_x10"  # suffix of the names of sets of ten times the size, which are not shipped
 
 
 @dataclass(frozen=True)
@@ -63,8 +61,7 @@ TASKS: dict[str, Task] = {
     "grasp": Task(("z", "gripper"), ("z",), ("z",), GRASP_SYMMETRIES),
     "rotate": Task(("yaw", "gripper"), ("yaw",), ("yaw",), HALF_TURNS),
 }
-PLANE = ("push", "drag")
-"""Primitives whose effect is a displacement in the table's plane."""
+PLANE = ("push", "drag")  # primitives whose effect is a displacement in the table's plane
 
 CHANNELS = ("x", "y", "z", "yaw")
 

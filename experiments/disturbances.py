@@ -23,8 +23,7 @@ STEPS_PER_S = round(1 / STEP_S)
 TIPPING_S = 1.0
 TOPPLING = 1.5
 """Factor on the energy that tips an object onto its edge, since sliding dissipates some of it."""
-EDGE_M = 0.15
-"""Margin at the table's edge [m] into which disturbances move neither object nor goal."""
+EDGE_M = 0.15  # margin at the table's edge [m] into which disturbances move neither object nor goal
 
 
 @dataclass(frozen=True)

@@ -24,8 +24,7 @@ from affordlib.world.trajectory import RETREAT_M
 CELL_M, LONGEST_M = 0.02, 0.2
 """Distance [m] between neighbouring places on the table, and that of the longest action or more."""
 
-BAND_M = 0.01
-"""Distance [m] from the limit of the reach within which goals are reported separately."""
+BAND_M = 0.01  # distance [m] from the limit of the reach within which goals are reported separately
 
 
 @lru_cache

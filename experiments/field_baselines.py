@@ -21,8 +21,7 @@ N_CHAINS, ROUNDS, N_ELITE = 218, 16, 22
 
 In total 3,488 chains, about as many as our planner evaluates for a goal of three actions."""
 
-MOVES_M = 0.001
-"""Actions that move the object by less than this [m] are removed from a plan."""
+MOVES_M = 0.001  # actions that move the object by less than this [m] are removed from a plan
 
 
 def plan_cem(problem: PlanningProblem, seed: int = 0) -> Plan:

@@ -17,8 +17,7 @@ PLANS = {
     "multi_partial": "plan up to three partial pushes, execute them",
 }
 PAPERS, OURS = "gradient_100_pushes", "continuous_film_500"
-PUSH_M = 0.02
-"""The paper's error of a push: "around 0.02 m" (Section 4.3)."""
+PUSH_M = 0.02  # the paper's error of a push: "around 0.02 m" (Section 4.3)
 
 
 def _table(file: str, name: str) -> pd.DataFrame:

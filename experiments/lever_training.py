@@ -28,8 +28,7 @@ from affordlib.models.training import TrainingConfig, TrainingRecord, train, unt
 from experiments.last_pose import CNPAroundMeanConfig, LastPoseConfig
 from experiments.lstm import LSTMConfig
 
-Symmetry = tuple[int, bool]
-"""The number of rotations by π/2, and whether y is mirrored first."""
+Symmetry = tuple[int, bool]  # the number of rotations by π/2, and whether y is mirrored first
 
 
 def from_start_errors_m(model: EffectNetwork, tensors: InteractionTensors) -> Float[Tensor, "n t"]:

@@ -23,8 +23,7 @@ from affordlib.models.film import HarmonicsConfig, HarmonicsNetwork, dense, wave
 from affordlib.types import Observations
 from experiments.last_pose import AroundMean, MeanTrajectory, between
 
-_CERTAIN = -6.0
-"""Raw σ of observed values: its softplus is nearly zero."""
+_CERTAIN = -6.0  # raw σ of observed values: its softplus is nearly zero
 
 
 @checked

@@ -61,8 +61,7 @@ FAMILIES = {"corridor": 30, "pocket": 30, "gate": 40, "bay": 20, "deep bay": 20,
 """Tasks of each family; of the validation tasks there are a quarter."""
 
 MAX_STEPS, WITHIN_M, WALL_M = 4, 0.005, 0.02
-N_OBJECTS = 12
-"""Different objects, each with a yaw; tasks have them in turn."""
+N_OBJECTS = 12  # different objects, each with a yaw; tasks have them in turn
 
 CATEGORIES = "cuboid", "upright_cylinder", "bar", "sphere", "cuboid", "lying_cylinder"
 """A bar is a cuboid of 8 × 4 cm, the longest within the sizes of the training objects."""

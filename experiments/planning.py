@@ -194,26 +194,31 @@ RATES = {"gradient": (0.03, 0.1, 0.3, 1.0, 3.0), "adam": (0.001, 0.005, 0.02)}
 """Rates of the paper's planner that are tried on the validation goals."""
 
 READINGS = {
-    "gradient_100": {"samples": 100, "reading": Reading()},
-    "gradient_300": {"samples": 300, "reading": Reading()},
-    "gradient_starts_100": {"samples": 100, "reading": Reading(starts=4)},
-    "gradient_adam_100": {"samples": 100, "reading": Reading("adam", "circle", "point")},
+    "gradient_100": Reading(),
+    "gradient_300": Reading(),
+    "gradient_starts_100": Reading(starts=4),
+    "gradient_circle_100": Reading(start="circle", rate=1.0),
+    "gradient_point_100": Reading("gradient", "circle", "point", rate=1.0),
+    "gradient_adam_100": Reading("adam", "circle", "point"),
 }
 """Readings of the paper's planner: as printed with 100 and 300 phases, the best of four starts,
-Adam from 20 cm."""
+from the circle of 20 cm, from there until the point is still, the same with Adam."""
+
+
+def _descent(reading: Reading, model: str = "cnp_500", samples: int = 100, **how: Any):
+    arguments = {"samples": samples, "reading": reading}
+    return PlannerConfig(plan_gradient, model, arguments, **how)
+
 
 PAPERS = ("gradient_100", "gradient_300", "astar_paper")
 CONFIGS: dict[str, PlannerConfig] = {
     # The paper's planners on its own network. Each action is placed by the plan, as in the paper;
     # `_recentred`, at the object as it is then observed, which differs for several actions only.
+    **{f"{name}_pushes": _descent(how, **BY_PLAN) for name, how in READINGS.items()},
+    "gradient_100_uniform_pushes": _descent(Reading(), **BY_PLAN, sources=("uniform",)),
+    "gradient_300_pushes": _descent(Reading(), samples=300, **BY_PLAN),
     **{
-        f"{name}_pushes": PlannerConfig(plan_gradient, "cnp_500", how, **BY_PLAN)
-        for name, how in READINGS.items()
-    },
-    **{
-        f"gradient_100_recentred_{what}": PlannerConfig(
-            plan_gradient, model, READINGS["gradient_100"], modes=("multi_partial",)
-        )
+        f"gradient_100_recentred_{what}": _descent(Reading(), model, modes=("multi_partial",))
         for what, model in (("pushes", "cnp_500"), ("cnp_mixed", "cnp_mixed"))
     },
     "astar_paper_pushes": PlannerConfig(plan_astar, "cnp_500", **ALL),
@@ -257,14 +262,16 @@ CONFIGS: dict[str, PlannerConfig] = {
         for weight in (0.0, 1.0, 10.0, 30.0)
     },
     **{
-        f"{how.descent}_rate={rate:g}": PlannerConfig(
-            plan_gradient,
-            "cnp_500",
-            {"samples": 100, "reading": replace(how, rate=rate)},
-            world="validation",
-            **BY_PLAN,
+        f"{name}_rate={rate:g}": _descent(
+            replace(how, rate=rate), model, world="validation", **BY_PLAN
         )
-        for how in (Reading(), Reading("adam", "circle", "point"))
+        for name, model, how in (
+            ("gradient", "cnp_500", READINGS["gradient_100"]),
+            ("gradient_published", "cnp_published", READINGS["gradient_100"]),
+            ("circle", "cnp_500", READINGS["gradient_circle_100"]),
+            ("point", "cnp_500", READINGS["gradient_point_100"]),
+            ("adam", "cnp_500", READINGS["gradient_adam_100"]),
+        )
         for rate in RATES[how.descent]
     },
 }

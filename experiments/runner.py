@@ -48,8 +48,7 @@ from experiments.commands import command, worker_type
 
 FOLDER = "data/results/raw"
 WRITE_EVERY_S = 30
-NOT_DECISIVE = ("device",)
-"""Options without influence on results: those of the machine."""
+NOT_DECISIVE = ("device",)  # options without influence on results: those of the machine
 
 
 @lru_cache(maxsize=4)

@@ -32,8 +32,7 @@ GOAL_SOURCES = ("constructed", "uniform")
 MIN_DISTANCE_M = 0.02
 EARLIEST_STOP = 0.55
 """Earliest stop phase of constructed tasks; before it hardly any action has moved its object."""
-ATTEMPTS = 30
-"""Number of random episodes tried with an object before it is replaced."""
+ATTEMPTS = 30  # number of random episodes tried with an object before it is replaced
 
 REACH_M = {Push: 0.07, Drag: 0.05}
 """Distance [m] of one full action: the minimum (push) or the approximate one (drag)."""
