@@ -56,17 +56,13 @@ export class EffectMap {
     const whole = decoded(coefficients, Int16Array);
     const numbers = Float64Array.from(whole, (value, i) => value * scale[i % 6]);
     Object.assign(this, { primitive, rows, columns, from, numbers });
-    const ends = Array.from({ length: FINE_DIRECTIONS * FINE_PHASES }, (_, i) => {
-      const [direction, phase] = this.action(i);
-      return rotated(this.at(direction, phase), direction);
+    this.actions = Array.from({ length: FINE_DIRECTIONS * FINE_PHASES }, (_, i) => {
+      const phase = share(from, 1, (i % FINE_PHASES) / (FINE_PHASES - 1));
+      return [(Math.floor(i / FINE_PHASES) * TURN) / FINE_DIRECTIONS, phase];
     });
-    this.fine = Float64Array.from(ends.flat());
+    const ends = this.actions.map((action) => rotated(this.at(...action), action[0]));
+    this.ends = Float64Array.from(ends.flat());
     this.reach = farthest(ends);
-  }
-
-  action(i) {
-    const phase = share(this.from, 1, (i % FINE_PHASES) / (FINE_PHASES - 1));
-    return [(Math.floor(i / FINE_PHASES) * TURN) / FINE_DIRECTIONS, phase];
   }
 
   at(direction, phase) {
@@ -92,11 +88,11 @@ export class EffectMap {
   nearest(x, y, partial) {
     const [first, step] = partial ? [0, 1] : [FINE_PHASES - 1, FINE_PHASES];
     let [best, least] = [first, Infinity];
-    for (let i = first; i < FINE_DIRECTIONS * FINE_PHASES; i += step) {
-      const far = (this.fine[2 * i] - x) ** 2 + (this.fine[2 * i + 1] - y) ** 2;
+    for (let i = first; i < this.actions.length; i += step) {
+      const far = (this.ends[2 * i] - x) ** 2 + (this.ends[2 * i + 1] - y) ** 2;
       if (far < least) [best, least] = [i, far];
     }
-    return this.action(best);
+    return this.actions[best];
   }
 }
 
@@ -418,7 +414,7 @@ function shape(tag, css, attributes, inside = "") {
 export class Table {
   constructor(el, heard) {
     this.heard = heard;
-    this.state = { pose: [0, 0, 0], goal: { xy: [0, 0], tolerance: 0.02 }, steps: [], other: null,
+    this.state = { pose: [0, 0, 0], goal: { xy: [0, 0], tolerance: 0.02 }, steps: [], other: [],
       obstacles: [], trail: [], marks: [], searched: [] };
     this.camera = null; // [x, y, half of the shown height]
     this.held = this.tapped = this.chosen = null;
@@ -484,9 +480,10 @@ export class Table {
   frame() {
     const { pose, goal, steps, object, obstacles, trail } = this.state;
     if (!object) return;
-    const hands = steps.map(({ from, direction }) => beyond(from, direction ?? 0, -0.07));
-    const seen = [pose, goal.xy, ...trail, ...obstacles.flatMap(cornersOf), ...hands];
-    seen.push(...steps.map(({ end }) => end));
+    const seen = [pose, goal.xy, ...trail, ...obstacles.flatMap(cornersOf)];
+    for (const { from, end, direction } of steps) {
+      seen.push(end, beyond(from, direction ?? 0, -0.07));
+    }
     const [width, height] = this.size();
     const room = this.held ? 0.015 : farthest(object.outline) + 0.035;
     if (this.held) {
@@ -615,61 +612,60 @@ export class Table {
   draw() {
     const { state } = this;
     if (!state.object || !this.camera) return;
-    const { pose, goal, steps, other, obstacles, trail, object } = state;
-    const now = state.live;
+    const { pose, goal, steps, other, obstacles, trail, live } = state;
     const end = steps.at(-1)?.end ?? pose;
-    const shapes = [this.ground()];
-    obstacles.forEach((one, k) => {
-      const css = k === this.chosen ? "obstacle chosen" : "obstacle";
-      const points = this.points(cornersOf(one));
-      shapes.push(shape("polygon", css, { points, "data-handle": `obstacle ${k}` }));
-      if (k !== this.chosen) return;
-      for (const [part, radius] of [["grip", 0.012], ["turner", 0.004]]) {
-        shapes.push(this.disc(sizeKnob(one), part, radius, { "data-handle": `size ${k}` }));
-      }
-    });
-    if (state.swept && steps.length) {
-      const all = steps.flatMap(({ path }) => path.map((at) => placed(object.outline, at)));
-      shapes.push(shape("path", "swept", { d: all.map((o) => `M${this.points(o)}Z`).join("") }));
-    }
-    if (state.searched.length && !state.live) shapes.push(this.tried());
-    for (const step of other ?? []) {
-      shapes.push(this.line(step.path, "other"), this.outline(step.end, "other"));
-    }
-    for (const mark of state.marks) shapes.push(this.line(mark, "mark"));
-    steps.forEach((step, k) => {
-      if (state.sigma && step.std) shapes.push(this.disc(step.end, "sigma", ENLARGED * step.std));
-      shapes.push(this.line(step.path, "prediction"));
-      shapes.push(this.outline(step.end, k === steps.length - 1 ? "predicted" : "ghost"));
-    });
-    if (trail.length) shapes.push(this.line(trail, "truth"));
     const short = apart(end, goal.xy);
     const missed = short > goal.tolerance && !state.planning;
-    if (missed) shapes.push(this.line([end, goal.xy], "short"));
-    const standing = now?.pose ?? pose;
-    const lift = now?.lift > 0.003 ? now.lift : 0;
+    const standing = live?.pose ?? pose;
+    const lift = live?.lift > 0.003 ? live.lift : 0;
     const handle = { "data-handle": this.heard.pose ? "object" : "none" };
-    shapes.push(this.outline(standing, lift ? "object lifted" : "object", handle, 1 + 3 * lift));
-    shapes.push(this.line([standing, this.ahead(standing, 0.5)], "heading"));
-    shapes.push(this.goal(end, missed));
-    if (this.heard.pose && !now) shapes.push(this.knob(pose));
-    if (now) shapes.push(this.hand(now.hand));
-    else if (!this.held) {
-      const moving = steps.filter(({ direction }) => direction !== null);
-      shapes.push(...moving.map((step) => this.arrow(step)));
-    }
-    shapes.push(shape("g", "labels", {}, this.labels(missed ? short : 0)), this.ruler());
-    this.svg.innerHTML = shapes.join("");
+    const shapes = [
+      this.ground(),
+      ...obstacles.map((one, k) => this.obstacle(one, k)),
+      state.swept && steps.length && this.swept(),
+      state.searched.length && !live && this.tried(),
+      ...other.flatMap(({ path, end }) => [this.line(path, "other"), this.outline(end, "other")]),
+      ...state.marks.map((mark) => this.line(mark, "mark")),
+      ...steps.flatMap((step, k) => [
+        state.sigma && step.std && this.disc(step.end, "sigma", ENLARGED * step.std),
+        this.line(step.path, "prediction"),
+        this.outline(step.end, k === steps.length - 1 ? "predicted" : "ghost"),
+      ]),
+      trail.length && this.line(trail, "truth"),
+      missed && this.line([end, goal.xy], "short"),
+      this.outline(standing, lift ? "object lifted" : "object", handle, 1 + 3 * lift),
+      this.line([standing, this.ahead(standing, 0.5)], "heading"),
+      this.goal(end, missed),
+      this.heard.pose && !live && this.knob(pose),
+      live && this.hand(live.hand),
+      ...(live || this.held ? [] : steps.map((step) => this.arrow(step))),
+      shape("g", "labels", {}, this.labels(missed ? short : 0)),
+      this.ruler(),
+    ];
+    this.svg.innerHTML = shapes.filter(Boolean).join("");
     this.svg.setAttribute("viewBox", `0 0 ${this.size().join(" ")}`);
     const [gx, gy, x, y] = [...goal.xy, ...pose].map((value) => (100 * value).toFixed(1));
-    this.svg.setAttribute(
-      "aria-label",
+    this.svg.ariaLabel =
       `Table from above. The goal is at x = ${gx}, y = ${gy} cm, the object at x = ${x}, ` +
-        `y = ${y} cm. Arrow keys move the goal by 1 cm, with Shift by 1 mm; Enter runs the plan, ` +
-        "Escape stops it. An obstacle that is chosen is moved by the arrow keys, resized by + " +
-        "and -, removed by Delete.",
-    );
+      `y = ${y} cm. Arrow keys move the goal by 1 cm, with Shift by 1 mm; Enter runs the plan, ` +
+      "Escape stops it. An obstacle that is chosen is moved by the arrow keys, resized by + " +
+      "and -, removed by Delete.";
     this.svg.dataset.view = this.camera.map((v) => v.toFixed(5)).join(" ");
+  }
+
+  obstacle(one, k) {
+    const chosen = k === this.chosen;
+    const more = { points: this.points(cornersOf(one)), "data-handle": `obstacle ${k}` };
+    const body = shape("polygon", chosen ? "obstacle chosen" : "obstacle", more);
+    const knob = (css, radius) =>
+      this.disc(sizeKnob(one), css, radius, { "data-handle": `size ${k}` });
+    return chosen ? body + knob("grip", 0.012) + knob("turner", 0.004) : body;
+  }
+
+  swept() {
+    const { steps, object } = this.state;
+    const all = steps.flatMap(({ path }) => path.map((at) => placed(object.outline, at)));
+    return shape("path", "swept", { d: all.map((one) => `M${this.points(one)}Z`).join("") });
   }
 
   ground() {
@@ -737,6 +733,7 @@ export class Table {
 
   // Where an action begins to push, outside the object.
   arrow({ direction, from }) {
+    if (direction === null) return "";
     const turned = placed(this.state.object.outline, [0, 0, from[2] - direction]);
     const back = -Math.min(...turned.map(([x]) => x)) * this.scale + 4;
     const line = shape("path", "push", { d: `M${-back - 34} 0H${-back - 9}` });

@@ -81,7 +81,6 @@ def object_data(obj: TabletopObject, effects: EffectMap, yaw_rad: float = 0.0) -
     path = action.path(np.linspace(0, 1, HAND_SAMPLES))[:, [0, ACTION_CHANNELS.index("gripper")]]
     hand["path"] = (path * (1, action.opening_m)).round(5).tolist()
     return {
-        "category": obj.category,
         "outline": obj.footprint_m.round(6).tolist(),
         "yaw": yaw_rad,
         "seen": seen.round(6).tolist(),

@@ -50,7 +50,7 @@ function replan() {
   const full = query.partial && (compare.checked || !view.held) ? plan({ ...query, partial: false, previous: null }) : null;
   view.set({
     object, pose, goal: { xy: goal, tolerance: 0.01 }, steps: shown.steps, obstacles,
-    other: compare.checked && full ? full.steps : null,
+    other: compare.checked && full ? full.steps : [],
     ring: data.ring, sigma: sigma.checked, swept: swept.checked, note: "prediction",
   });
   film = { rows: view.predicted(0.02), every: 0.02, recorded: false };
@@ -101,7 +101,7 @@ function robot() {
   const from = pose;
   stop();
   const steps = stepsOf({ object: mapOf(object), pose: from }, run.chain.map((v, k) => (k % 2 ? v : v + from[2])));
-  view.set({ goal: { xy, tolerance: 0.01 }, steps, other: null, obstacles: [], note: "recorded in the simulation" });
+  view.set({ goal: { xy, tolerance: 0.01 }, steps, other: [], obstacles: [], note: "recorded in the simulation" });
   offer(`The robot ended ${(1000 * run.distance).toFixed(1)} mm from this recorded goal (predicted: ${
     (1000 * apart(steps.at(-1)?.end ?? from, xy)).toFixed(1)} mm).`);
   film = { rows: motionOf(run), every: data.every, recorded: true };
