@@ -5,7 +5,6 @@ web book. Where scripts do not run, a still picture stands in their place.
 """
 
 import base64
-import io
 import itertools
 import json
 from collections.abc import Sequence
@@ -15,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from IPython.core.pylabtools import print_figure
 from matplotlib.figure import Figure
 
 from affordlib.models.base import EffectModel
@@ -102,9 +102,7 @@ class Explorer:
         sliders = [{"name": k, "values": list(v)} for k, v in self.sliders.items()]
         data = {"sliders": sliders, "at": self.at, "panels": panels, "words": self.words}
         text = json.dumps(data).replace("<", "\\u003c")
-        buffer = io.BytesIO()
-        self.figure().savefig(buffer, dpi=90)
-        picture = base64.b64encode(buffer.getvalue()).decode()
+        picture = print_figure(self.figure(), base64=True, bbox_inches=None)
         said = self.words[self.state].replace("<b>", "").replace("</b>", "")
         inside = f'<img alt="{said}" src="data:image/png;base64,{picture}">'
         script = f"<script>{_SCRIPT.read_text()}(document.currentScript.parentElement, {text})"

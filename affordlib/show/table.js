@@ -174,6 +174,8 @@ const RING = Array.from({ length: SIDES }, (_, k) =>
 const cornersOf = ({ corners: [middle], corners, radius }) =>
   radius ? RING.map(([x, y]) => [middle[0] + radius * x, middle[1] + radius * y]) : corners;
 
+const box = (w, h) => [[-w, -h], [w, -h], [w, h], [-w, h]];
+
 const middleOf = (corners) =>
   [0, 1].map((axis) => corners.reduce((sum, at) => sum + at[axis], 0) / corners.length);
 
@@ -224,14 +226,13 @@ export function spare(problem, from, direction, stop) {
   const { known, margin, size: radius } = problem.space ?? spaceOf(problem);
   const path = pathOf(object, { from, direction, stop }, POSES);
   const { size, grip } = object.hand;
-  const box = [[1, 1], [-1, 1], [-1, -1], [1, -1]].map(([x, y]) => [x * size[0], y * size[1]]);
   const hands = grip === null
     ? [0, stop].map((phase) =>
         [...beyond(from, direction, handAt(object.hand, phase)[0]), direction])
     : [path[0], path[POSES - 1]].map(([x, y]) => [x, y, grip + from[2] - object.yaw]);
   const sweeps = path.map((at, k) =>
     [object.seen, radius, at, path[Math.min(k + 1, POSES - 1)], at]);
-  sweeps.unshift([box, Math.hypot(...size), ...hands, path[0]]);
+  sweeps.unshift([box(...size), Math.hypot(...size), ...hands, path[0]]);
   let worst = Infinity;
   for (const [shape, long, a, b, at] of sweeps) {
     const [reach, centre] = [long + apart(a, b) / 2, middleOf([a, b])];
@@ -382,8 +383,7 @@ const escaped = (text) =>
   String(text).replace(/[&<>"']/g, (letter) => `&#${letter.charCodeAt(0)};`);
 
 const DISC = { corners: [[0, 0]], radius: 0.02, height: 0.06 };
-const CORNERS = [[-0.025, -0.02], [0.025, -0.02], [0.025, 0.02], [-0.025, 0.02]];
-const BOX = { corners: CORNERS, radius: 0, height: 0.06 };
+const BOX = { corners: box(0.025, 0.02), radius: 0, height: 0.06 };
 const changed = (one, act) => ({ ...one, corners: one.corners.map((at) => at.map(act)) });
 const shifted = (one, by) => changed(one, (value, axis) => value + by[axis]);
 const sizeKnob = (one) =>
@@ -408,8 +408,8 @@ function shape(tag, css, attributes, inside = "") {
 }
 
 // state: {object, pose, goal {xy, yaw, tolerance}, steps, other (steps to compare with), obstacles,
-// ring, trail, marks (what moved by itself: [from, to]), searched, sigma, swept, note (text in a
-// corner), planning, live (pose, hand and lift that are shown instead)}.
+// ring, trail, marks (what moved by itself: [from, to]), searched, since (when), sigma, swept, note
+// (text in a corner), planning, live (pose, hand and lift that are shown instead)}.
 // heard: {goal(xy, final), obstacles(all, final), press(key), pose(pose, final), if it is movable}.
 export class Table {
   constructor(el, heard) {
@@ -568,21 +568,13 @@ export class Table {
     return now;
   }
 
-  // Show a planner's search, lines and single points, in the order in which it went.
-  search(searched) {
-    const began = performance.now();
-    const step = (now) => {
-      this.grown = still() ? 1 : between(0, (now - began) / GROWS, 1);
-      this.set({ searched });
-      if (this.grown < 1) this.growing = requestAnimationFrame(step);
-    };
-    cancelAnimationFrame(this.growing);
-    step(began);
-  }
-
+  // A planner's search, lines and single points, that grows in the order in which it went.
   tried() {
-    const { searched } = this.state;
-    let left = Math.ceil(this.grown * searched.flat().length);
+    const { searched, since } = this.state;
+    const grown = still() ? 1 : between(0, (performance.now() - since) / GROWS, 1);
+    cancelAnimationFrame(this.growing);
+    if (grown < 1) this.growing = requestAnimationFrame(() => this.draw());
+    let left = Math.ceil(grown * searched.flat().length);
     const d = searched.map((line) => {
       const seen = line.slice(0, Math.max(0, left));
       left -= line.length;
@@ -982,7 +974,7 @@ function render({ model, el }) {
     }
   };
   new ResizeObserver(() => setTimeout(nameSliders, 500)).observe(el); // when all is there
-  const searched = () => view.search(model.get("searched"));
+  const searched = () => view.set({ searched: model.get("searched"), since: performance.now() });
   model.on("change:object", look);
   model.on("change:scene", show);
   model.on("change:obstacles", show);
