@@ -374,9 +374,8 @@ class GoalPicker(widgets.HBox):
             self.scene.begin(self.goal, self.plan)
 
         def log(world):
-            for one in (also, self.scene):
-                if one is not None:
-                    one(world)
+            for one in filter(None, (also, self.scene)):
+                one(world)
             number = next(steps)
             if number % POSE_EVERY == 0:
                 pose, lift = world.object_pose(), world.object_state()[2] - z_m

@@ -94,8 +94,7 @@ class Scene(widgets.VBox):
         """Start a recording; only another object is drawn, since that takes up to a second."""
         if self._drawn is not self.world.obj:
             self.place(goal, plan)
-        self._frames: list[np.ndarray] = [self.poses()]
-        self._steps = 0
+        self._frames, self._steps = [self.poses()], 0
 
     def mark(self, goal: Goal | None = None, plan: Plan | None = None) -> None:
         """Show obstacles, and goal and predicted final pose of a plan, in place of earlier ones."""

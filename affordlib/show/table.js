@@ -885,7 +885,7 @@ function render({ model, el }) {
 
   function draft(xy, obstacles) {
     const { pose, goal: { tolerance }, running } = model.get("scene");
-    if (running) return view.state.steps;
+    if (running || !item) return view.state.steps;
     const { table } = model.get("table");
     const query = { object: item, pose, goal: xy, tolerance, obstacles, reachable, table };
     const planned = plan({ ...query, previous: chain, quick: true });
