@@ -5,7 +5,6 @@ web book. Where scripts do not run, a still picture stands in their place.
 """
 
 import base64
-import io
 import itertools
 import json
 from collections.abc import Sequence
@@ -15,10 +14,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from IPython.core.pylabtools import print_figure
 from matplotlib.figure import Figure
 
-from affordlib.geometry import rotated
 from affordlib.models.base import EffectModel
+from affordlib.planning.free_space import placed
 from affordlib.primitives import Primitive
 from affordlib.show.plots import NEUTRAL, PREDICTION, TRUTH
 from affordlib.types import (
@@ -102,9 +102,7 @@ class Explorer:
         sliders = [{"name": k, "values": list(v)} for k, v in self.sliders.items()]
         data = {"sliders": sliders, "at": self.at, "panels": panels, "words": self.words}
         text = json.dumps(data).replace("<", "\\u003c")
-        buffer = io.BytesIO()
-        self.figure().savefig(buffer, dpi=90)
-        picture = base64.b64encode(buffer.getvalue()).decode()
+        picture = print_figure(self.figure(), base64=True, bbox_inches=None)
         said = self.words[self.state].replace("<b>", "").replace("</b>", "")
         inside = f'<img alt="{said}" src="data:image/png;base64,{picture}">'
         script = f"<script>{_SCRIPT.read_text()}(document.currentScript.parentElement, {text})"
@@ -145,12 +143,12 @@ def conditioning_explorer(
     def values(of, t):
         return np.stack([np.interp(t, seen.phase, column) for column in truth[of].T], axis=-1)
 
-    given = [tuple(map(_tensor, (t, values(of, t)))) for of, t in context.items()]
-    observed = Observations.of(model, *given, _tensor(states[:, 2]))
+    given = [tuple(map(torch.Tensor, (t, values(of, t)))) for of, t in context.items()]
+    observed = Observations.of(model, *given, torch.Tensor(states[:, 2]))
     t = np.linspace(0, 1, N_TARGETS)
     with torch.no_grad():
-        features = model.encode(_tensor(seen.image)[None]).expand(len(states), -1)
-        found = model.predict(features, observed, _tensor(t).expand(len(states), -1))
+        features = model.encode(torch.Tensor(seen.image)[None]).expand(len(states), -1)
+        found = model.predict(features, observed, torch.Tensor(t).expand(len(states), -1))
     panels, shown = {}, {"action": states[:, 2] > 0, "effect": states[:, 2] < 1}
     for of, name in itertools.product(CHANNELS, ("x", "y")):
         c = channels[of].index(name)
@@ -171,10 +169,6 @@ def conditioning_explorer(
         for error, std in zip(error_mm, std_mm, strict=True)
     ]
     return Explorer(sliders, first, panels, words)
-
-
-def _tensor(values: Any) -> torch.Tensor:
-    return torch.as_tensor(values, dtype=torch.float32)
 
 
 def phase_explorer(world: Tabletop, action: Primitive, phase: float = 0.8) -> Explorer:
@@ -198,10 +192,8 @@ def phase_explorer(world: Tabletop, action: Primitive, phase: float = 0.8) -> Ex
     gripper = [100 * (at + way) for at, way in zip(start[:2], hand, strict=True)]
 
     def outline(poses):
-        corners = np.array(
-            [rotated(obj.footprint_m, pose[2]) + pose[:2] for pose in np.array(poses)]
-        )
-        return np.moveaxis(100 * np.concatenate([corners, corners[:, :1]], axis=1), -1, 0)
+        corners = placed(np.vstack([obj.footprint_m, obj.footprint_m[:1]]), np.array(poses))
+        return np.moveaxis(100 * corners, -1, 0)
 
     moved = 100 * np.hypot(*effect[:, :2].T)
     rest_cm = 100 * np.hypot(*(np.array(rest) - start).T[:2])[:, None]

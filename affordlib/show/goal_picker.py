@@ -4,8 +4,6 @@ It is a view on plain objects: everything it does can be done with a planner, `e
 `Tabletop.shove`.
 """
 
-import base64
-import io
 import itertools
 import threading
 import time
@@ -17,6 +15,7 @@ from typing import Any, Self
 
 import ipywidgets as widgets
 import numpy as np
+from IPython.core.pylabtools import retina_figure
 from matplotlib.figure import Figure
 
 from affordlib.geometry import unit_vector, wrap_angle
@@ -40,7 +39,6 @@ from affordlib.types import Goal, Obstacle, Outcome, Plan, check_count, check_on
 from affordlib.world import Cuboid, Tabletop
 from affordlib.world.trajectory import STEP_S
 
-DPI = 90
 POSE_EVERY, SENT_TOGETHER = 12, 5
 """Simulation steps (1/240 s) between two poses of the shown motion, and poses in a message."""
 
@@ -171,12 +169,9 @@ class GoalPicker(widgets.HBox):
 
     def _repr_mimebundle_(self, **kwargs: object) -> tuple[dict[str, object], dict[str, object]]:
         """The widget, and for a page without a kernel a picture at twice the resolution."""
-        buffer, figure = io.BytesIO(), self.figure()
-        figure.savefig(buffer, dpi=2 * DPI)
+        picture, size = retina_figure(self.figure(), base64=True, bbox_inches=None)
         bundle = super()._repr_mimebundle_(**kwargs) | {"text/plain": type(self).__name__}
-        picture = {"image/png": base64.b64encode(buffer.getvalue()).decode()}
-        width, height = (round(DPI * inches) for inches in figure.get_size_inches())
-        return bundle | picture, {"image/png": {"width": width, "height": height}}
+        return bundle | {"image/png": picture}, {"image/png": size}
 
     # Requests from the page
 
@@ -379,9 +374,8 @@ class GoalPicker(widgets.HBox):
             self.scene.begin(self.goal, self.plan)
 
         def log(world):
-            for one in (also, self.scene):
-                if one is not None:
-                    one(world)
+            for one in filter(None, (also, self.scene)):
+                one(world)
             number = next(steps)
             if number % POSE_EVERY == 0:
                 pose, lift = world.object_pose(), world.object_state()[2] - z_m

@@ -177,17 +177,14 @@ def closed_loop(skills: Skills, tolerance_m: float = 0.002) -> Executor:
     """Make an executor that observes after every action and replans to this tolerance [m]."""
 
     def execute(world, plan, planner, report):
-        goal = plan.goal
+        goals = [plan.goal]
 
-        def on_action(*_):
-            nonlocal goal
-            goal = report()
+        def exact():
+            return replace(goals[-1], tolerance_m=tolerance_m)
 
-        config = ClosedLoopConfig(on_action=on_action, on_plan=report)
-        done = run_closed_loop(
-            world, lambda: replace(goal, tolerance_m=tolerance_m), skills, planner, config
-        )
+        config = ClosedLoopConfig(on_action=lambda *_: goals.append(report()), on_plan=report)
+        done = run_closed_loop(world, exact, skills, planner, config)
         words = "" if done.reached else f"The loop ended as {done.status}: {done.message}."
-        return measured(world, plan, goal, done.object_paths_xy_m, words)
+        return measured(world, plan, goals[-1], done.object_paths_xy_m, words)
 
     return execute

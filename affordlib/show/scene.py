@@ -15,6 +15,7 @@ from uuid import uuid4
 
 import ipywidgets as widgets
 import numpy as np
+from matplotlib.colors import to_hex
 from PIL import Image
 from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -59,7 +60,7 @@ class Scene(widgets.VBox):
         table = [(x, y) for x in TABLE_X_M for y in TABLE_Y_M]
         self._add(extruded(np.array(table), -0.1, 0.0), _WOOD)
         for half, at, rgb in SCENERY:
-            self._add(_box(2 * np.array(half)), _hex(rgb), _matrix(at))
+            self._add(_box(2 * np.array(half)), to_hex(rgb), _matrix(at))
         base, *links = _arm(world)
         self._add(*base, _matrix((BASE_X_M, 0.0, 0.0)))
         self._links = [self._add(*link) for link in links]
@@ -93,8 +94,7 @@ class Scene(widgets.VBox):
         """Start a recording; only another object is drawn, since that takes up to a second."""
         if self._drawn is not self.world.obj:
             self.place(goal, plan)
-        self._frames: list[np.ndarray] = [self.poses()]
-        self._steps = 0
+        self._frames, self._steps = [self.poses()], 0
 
     def mark(self, goal: Goal | None = None, plan: Plan | None = None) -> None:
         """Show obstacles, and goal and predicted final pose of a plan, in place of earlier ones."""
@@ -191,14 +191,10 @@ def _matrix(xyz: Any, yaw_rad: float = 0.0) -> np.ndarray:
 def _arm(world: Tabletop) -> Iterator[tuple[np.ndarray, str]]:
     """Points or triangles of the arm's base and of each link, and their colours."""
     for _, _, _, size, file, at, _, rgba in world.client.getVisualShapeData(world.arm.robot):
+        points = _box(size) + at
         if file:
-            yield np.frombuffer(Path(file.decode()).read_bytes()[84:], _STL)["corners"], _hex(rgba)
-        else:
-            yield _box(size) + at, _hex(rgba)
-
-
-def _hex(rgb: Sequence[float]) -> str:
-    return "#" + "".join(f"{round(255 * share):02x}" for share in rgb[:3])
+            points = np.frombuffer(Path(file.decode()).read_bytes()[84:], _STL)["corners"]
+        yield points, to_hex(rgba)
 
 
 def _box(size_m: Sequence[float]) -> np.ndarray:

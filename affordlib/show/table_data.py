@@ -78,14 +78,13 @@ def object_data(obj: TabletopObject, effects: EffectMap, yaw_rad: float = 0.0) -
     hand = {"size": hand_m(action).max(axis=0).tolist(), "grip": None}
     if not isinstance(action, Push):
         hand["grip"] = adapt_to_object(action, effects.image).grip_yaw
-    path = action.path(np.linspace(0, 1, HAND_SAMPLES))
-    along, opening = path[:, 0], path[:, ACTION_CHANNELS.index("gripper")] * action.opening_m
+    path = action.path(np.linspace(0, 1, HAND_SAMPLES))[:, [0, ACTION_CHANNELS.index("gripper")]]
+    hand["path"] = (path * (1, action.opening_m)).round(5).tolist()
     return {
-        "category": obj.category,
         "outline": obj.footprint_m.round(6).tolist(),
         "yaw": yaw_rad,
         "seen": seen.round(6).tolist(),
-        "hand": hand | {"along": along.round(5).tolist(), "gap": opening.round(5).tolist()},
+        "hand": hand,
         "margins": [START_M, MARGIN_M, FULL_AT_M],
         "map": effects.numbers(),
     }

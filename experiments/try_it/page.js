@@ -5,7 +5,8 @@ const FIRST = { pose: [0, 0, 0.3], goal: [0.13, 0.085] };
 const objects = data.objects.map((object) => ({ ...object, seconds: data.seconds }));
 const undone = [];
 let [object, pose, goal, obstacles] = [objects[0], FIRST.pose, FIRST.goal, []];
-let [chain, shown, playing, motion] = [[], null, 0, null];
+let [chain, shown, playing] = [[], null, 0];
+let film = null; // {rows, every (seconds), recorded}: what is played
 
 const view = new Table(one(".table"), {
   goal: (xy, final) => change(() => (goal = xy), final),
@@ -49,9 +50,10 @@ function replan() {
   const full = query.partial && (compare.checked || !view.held) ? plan({ ...query, partial: false, previous: null }) : null;
   view.set({
     object, pose, goal: { xy: goal, tolerance: 0.01 }, steps: shown.steps, obstacles,
-    other: compare.checked && full ? full.steps : null,
-    ring: data.ring, sigma: sigma.checked, swept: swept.checked, movable: true, note: "prediction",
+    other: compare.checked && full ? full.steps : [],
+    ring: data.ring, sigma: sigma.checked, swept: swept.checked, note: "prediction",
   });
+  film = { rows: view.predicted(0.02), every: 0.02, recorded: false };
   tell(full);
   offer();
   one(".play").disabled = one(".scrub").disabled = !shown.steps.length;
@@ -75,15 +77,13 @@ function tell(full) {
 // The recorded goal that is nearest, of those whose way was recorded beside no obstacle.
 function nearestRun() {
   const there = object.runs.map((run) => ({ run, xy: placed([run.goal], pose)[0] }));
-  return there.reduce((best, one) => (apartOf(one.xy) < apartOf(best.xy) ? one : best));
+  return there.reduce((best, one) => (apart(one.xy, goal) < apart(best.xy, goal) ? one : best));
 }
-
-const apartOf = (xy) => Math.hypot(xy[0] - goal[0], xy[1] - goal[1]);
 
 function offer(text) {
   const { xy } = nearestRun();
   one(".recorded span").textContent = text ??
-    `Recorded for the nearest of ${object.runs.length} goals, ${(100 * apartOf(xy)).toFixed(1)} cm from yours.`;
+    `Recorded for the nearest of ${object.runs.length} goals, ${(100 * apart(xy, goal)).toFixed(1)} cm from yours.`;
 }
 
 // Rows of a recorded motion, moved to where the object stands.
@@ -101,41 +101,37 @@ function robot() {
   const from = pose;
   stop();
   const steps = stepsOf({ object: mapOf(object), pose: from }, run.chain.map((v, k) => (k % 2 ? v : v + from[2])));
-  view.set({ goal: { xy, tolerance: 0.01 }, steps, other: null, obstacles: [], note: "recorded in the simulation" });
+  view.set({ goal: { xy, tolerance: 0.01 }, steps, other: [], obstacles: [], note: "recorded in the simulation" });
   offer(`The robot ended ${(1000 * run.distance).toFixed(1)} mm from this recorded goal (predicted: ${
-    (1000 * Math.hypot(...[0, 1].map((axis) => (steps.at(-1)?.end ?? from)[axis] - xy[axis]))).toFixed(1)} mm).`);
-  motion = motionOf(run);
+    (1000 * apart(steps.at(-1)?.end ?? from, xy)).toFixed(1)} mm).`);
+  film = { rows: motionOf(run), every: data.every, recorded: true };
   play();
 }
 
 function stop() {
   cancelAnimationFrame(playing);
   playing = 0;
-  view.clock = view.state.live = motion = null;
+  view.state.live = null;
   view.state.trail = [];
   one(".play").textContent = "▶";
   one(".scrub").value = 0;
 }
 
 function end() {
-  const had = motion;
   stop();
-  if (had) replan();
+  if (film.recorded) replan();
   else view.draw();
 }
 
-const seconds = () => (motion ? (motion.length - 1) * data.every : view.seconds);
+const seconds = () => (film.rows.length - 1) * film.every;
 
 function at(time) {
   one(".scrub").value = time / seconds();
-  view.clock = motion ? null : time;
-  if (motion) view.replay(motion, Math.min(time / data.every, motion.length - 1));
-  else view.draw();
+  view.replay(film.rows, time / film.every, film.recorded);
 }
 
 function play() {
-  if (!motion && (playing || !shown.steps.length)) return end();
-  if (playing) return end();
+  if (playing || (!film.recorded && !shown.steps.length)) return end();
   one(".play").textContent = "■";
   let [last, time] = [performance.now(), 0];
   if (still()) return at(seconds());

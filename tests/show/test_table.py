@@ -126,7 +126,7 @@ def test_the_free_space_check_is_that_of_python(ask, seen, skills, name):
     expected = problem.spare_m(begins, *map(torch.from_numpy, (direction, phase)))
     common = {"pose": [0, 0, 0], "obstacles": [obstacle_data(one) for one in obstacles]}
     actions = zip(begins.tolist(), direction.tolist(), phase.tolist(), strict=True)
-    queries = [common | {"action": [at, to, stop, at[2]]} for at, to, stop in actions]
+    queries = [common | {"action": action} for action in actions]
     found = np.array(ask(data, queries))
     near = expected < 0.005  # Python does not distinguish larger gaps
     assert 30 < (expected < 0).sum() < 180
