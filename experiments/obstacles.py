@@ -517,10 +517,12 @@ PAIRS += [("closed_loop_perturbed", "perturbed")]
 def paired_rows(records: pd.DataFrame) -> Rows:
     """Return differences of success [%] on the same tasks, with their 95 % intervals.
 
-    low, high: None where all differences are equal, as resampling would tell nothing.
+    low, high: None where all differences are equal, as resampling would tell nothing. actions,
+    other_actions: mean numbers on the tasks that both solve.
     """
-    table = records.drop_duplicates(["family", "index", "row"])
-    table, rows = table.pivot(index=["family", "index"], columns="row", values="success"), []
+    table, rows = records.drop_duplicates(["family", "index", "row"]), []
+    actions = table[table.success].pivot(index=["family", "index"], columns="row", values="actions")
+    table = table.pivot(index=["family", "index"], columns="row", values="success")
     for one, other in PAIRS:
         if not {one, other} <= {*table.columns}:
             continue
@@ -530,6 +532,11 @@ def paired_rows(records: pd.DataFrame) -> Rows:
             mean, low, high = interval(off) if off.nunique() > 1 else (off.iloc[0], None, None)
             row = {"row": one, "other": other, "family": family, "n": len(some)}
             row |= {"successes": int(some[one].sum()), "other_successes": int(some[other].sum())}
+            solved = actions[
+                actions.index.isin(pd.MultiIndex.from_frame(some[["family", "index"]]))
+            ]
+            solved = solved[[one, other]].dropna().mean()
+            row |= {"actions": solved[one], "other_actions": solved[other]}
             rows.append(row | {"difference_percent": mean, "low": low, "high": high})
     return plain(rows)
 

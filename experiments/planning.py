@@ -397,6 +397,8 @@ def outcome_record(task: PlanningTask, outcome: Outcome) -> dict[str, Any]:
         "distance_m": outcome.distance_m,
         "predicted_m": plan.predicted_distance_m,
         "prediction_error_m": float(error),
+        "std_m": plan.steps[-1].std_m if plan.steps else None,
+        "steps": len(plan.steps),
         "actions": len(outcome.object_paths_xy_m),
         "dragged": any(isinstance(step.primitive, Drag) for step in plan.steps),
         "plan_s": plan.plan_s,
@@ -491,23 +493,44 @@ VARIANTS = {
 def variant_rows(records: dict[str, Rows]) -> Rows:
     """Return paired differences of final distance for `VARIANTS`: mean [m] and interval.
 
-    They are on constructed goals and stable objects.
+    They are on stable objects. difference_actions: that of the number of actions.
     """
     rows: Rows = []
     for name, than in VARIANTS.items():
         if not {name, than} <= set(records):
             continue
         both = pd.merge(*(pd.DataFrame(records[key]) for key in (name, than)), on="task")
-        both = both[both.object_class_x.isin(STANDING) & (both.goals_x == "constructed")]
-        rng = np.random.default_rng(0)
-        for mode, pairs in both.groupby("mode_x", sort=False):
+        both, rngs = both[both.object_class_x.isin(STANDING)], {}
+        for (goals, mode), pairs in both.groupby(["goals_x", "mode_x"], sort=False):
+            rng = rngs.setdefault(goals, np.random.default_rng(0))
             by_m = pairs.distance_m_x - pairs.distance_m_y
             mean, low, high = interval(by_m, 2000, rng)
-            about = {"planner": name, "than": than, "object_class": "standing", "mode": mode}
-            rows.append(
-                about | {"n": len(by_m), "difference_mean_m": mean, "low_m": low, "high_m": high}
-            )
+            about = {"planner": name, "than": than, "object_class": "standing", "goals": goals}
+            about |= {"mode": mode, "n": len(by_m), "difference_mean_m": mean}
+            about |= {"low_m": low, "high_m": high}
+            more = interval(pairs.actions_x - pairs.actions_y, 2000)
+            names = (f"difference_actions{end}" for end in ("", "_low", "_high"))
+            rows.append(about | dict(zip(names, more, strict=True)))
     return rows
+
+
+def sigma_rows(records: dict[str, Rows]) -> Rows:
+    """Return prediction error and σ of executed plans, by the number of their actions.
+
+    Both are root mean squares [m], on all goals and stable objects. beyond_2_sigma_percent: 2 for
+    a calibrated, round Gaussian.
+    """
+    rows: Rows = []
+    for name in [n for n in ("continuous", "continuous_film_500") if n in records]:
+        plans = pd.DataFrame(records[name]).query("object_class in @STANDING and steps == actions > 0")
+        for steps, some in plans.groupby("steps"):
+            error, sigma = some.prediction_error_m, some.std_m
+            row = {"planner": name, "model": CONFIGS[name].model, "actions": steps, "n": len(some)}
+            row |= {
+                f"{k}_m": math.sqrt((v**2).mean()) for k, v in (("error", error), ("sigma", sigma))
+            }
+            rows.append(row | {"beyond_2_sigma_percent": 100 * (error > 2 * sigma).mean()})
+    return plain(rows)
 
 
 def training_rows(records: dict[str, Rows]) -> Rows:
@@ -539,6 +562,7 @@ def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
         "summary_uniform": summary_rows(table, "uniform"),
         "trainings": training_rows(records),
         "variants": variant_rows(records),
+        "sigma": sigma_rows(records),
         "error_decomposition": decomposition_rows(table),
     }
 
