@@ -52,9 +52,6 @@ def code_of(notebook):
     return [cell for cell in notebook.cells if cell.cell_type == "code"]
 
 
-# As committed
-
-
 @each_notebook
 def test_parameters(name):
     defaults = default_parameters(name)
@@ -124,11 +121,8 @@ def test_executed_in_order_without_errors(name):
     assert [o for o in outputs if o.output_type == "error" or o.get("name") == "stderr"] == []
 
 
-STORED = [
-    name
-    for name in PATHS
-    if 'read_results("data/results/' in PATHS[name].read_text("utf-8").replace("\\", "")
-]
+READS_STORED = 'read_results(\\"data/results/'  # in JSON
+STORED = [name for name, path in PATHS.items() if READS_STORED in path.read_text("utf-8")]
 
 
 def last_value(source, space):
@@ -210,9 +204,6 @@ def test_nothing_depends_on_the_machine(name):
 def test_the_book_keeps_to_its_style():
     assert [picture[:4] for picture, _ in figures().values()] == [b"\x89PNG"] * len(FIGURES)
     assert book_check.check()[1] == []
-
-
-# As run
 
 
 def prepare(path, parameters, folder):

@@ -34,9 +34,6 @@ def test_a_turn_is_measured_the_short_way_round():
     np.testing.assert_allclose(found["yaw_error"], [2 * math.pi - 6.2, 0.1])
 
 
-# Baselines
-
-
 def arrays_of(effect, theta):
     n = len(theta)
     out = torch.stack([theta.cos(), theta.sin()], dim=-1)

@@ -35,9 +35,6 @@ def test_shipped_networks_are_those_of_the_tables():
         assert (cross_validation.task_of(spec.data).symmetries or ()) == spec.symmetries
 
 
-# Tables
-
-
 def test_a_fold_may_lack_a_category():
     def result(fold, categories):
         errors = [0.001 * (k + 1) for k in range(len(categories))]
@@ -50,9 +47,6 @@ def test_a_fold_may_lack_a_category():
     rows = tables.error_rows(tables.predictions_of(folds, "drag", "fixed_test"), "drag")
     means = [row["final_error_mean_m"] for row in rows]
     assert means == pytest.approx([0.00225, 0.0015, 0.003])
-
-
-# Grasps
 
 
 def test_shares_are_of_the_true_successes_and_failures():

@@ -7,29 +7,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from affordlib import planning
 from affordlib.perception import adapt_to_object
-from affordlib.planning import (
-    ClosedLoopConfig,
-    Robot,
-    execute_plan,
-    plan_astar,
-    plan_continuous,
-    plan_gradient,
-    run_closed_loop,
-)
+from affordlib.planning import execute_plan, plan_astar, plan_continuous, run_closed_loop
 from affordlib.planning.closed_loop import DISPLACED_M
 from affordlib.planning.grasp_rotate import GRIPPER_YAWS_RAD
 from affordlib.planning.reachability import Reachability
 from affordlib.primitives import Drag, Grasp, Push, Rotate
-from affordlib.types import Goal, Plan, Step
-from affordlib.world import (
-    Cuboid,
-    LyingCylinder,
-    Sphere,
-    UnreachableError,
-    UprightCylinder,
-    WorldConfig,
-)
+from affordlib.types import Goal, Plan, Step, UnreachableError
+from affordlib.world import Cuboid, LyingCylinder, Sphere, UprightCylinder, WorldConfig
 from affordlib.world.execution import put_down
 from affordlib.world.objects import PlacedObject
 from experiments.closed_loop import Trial, _stays_feasible, sample_disturbance
@@ -38,6 +24,7 @@ from experiments.planning import corrected
 from tests.planning.point_robot import PointRobot, point_skills
 from tests.problems import problem_of
 
+PLANNERS = pytest.mark.parametrize("planner", [plan_astar, plan_continuous, planning.plan_gradient])
 EXACT_M = 0.002
 BOX, TUBE, BALL = Cuboid(0.06, 0.05, 0.05), UprightCylinder(0.05, 0.07), Sphere(0.06)
 
@@ -45,7 +32,7 @@ BOX, TUBE, BALL = Cuboid(0.06, 0.05, 0.05), UprightCylinder(0.05, 0.07), Sphere(
 def loop(robot, goal, skills=None, planner=plan_continuous, **config):
     """Run a closed loop, by default with models of a `PointRobot` without its overshoot."""
     skills = skills or point_skills()
-    return run_closed_loop(robot, goal, skills, planner, config=ClosedLoopConfig(**config))
+    return run_closed_loop(robot, goal, skills, planner, config=planning.ClosedLoopConfig(**config))
 
 
 def disturbed(world, goal, skills, *disturbances):
@@ -53,13 +40,10 @@ def disturbed(world, goal, skills, *disturbances):
     return run_closed_loop(schedule, schedule.current_goal, skills), schedule
 
 
-# On a robot in pure Python
-
-
-@pytest.mark.parametrize("planner", [plan_astar, plan_continuous, plan_gradient])
+@PLANNERS
 def test_every_planner_brings_a_pose_about(planner):
     robot, goal = PointRobot(), Goal((0.21, -0.06), 0.01, turn_rad=1.3, height_m=0.1)
-    assert isinstance(robot, Robot)
+    assert isinstance(robot, planning.Robot)
     went = loop(robot, goal, planner=planner)
     assert went.status == "unconfirmed", went.message  # what the hand holds is not seen
     assert went.message.endswith("the position and orientation computed, not observed")
@@ -134,7 +118,7 @@ def test_an_object_that_is_gone_is_lost(change):
     assert (went.status, len(went.steps)) == ("lost", 1)
 
 
-@pytest.mark.parametrize("planner", [plan_astar, plan_continuous, plan_gradient])
+@PLANNERS
 def test_a_goal_that_moves_is_followed(planner):
     goal, robot = Goal((0.1, 0.0), EXACT_M, turn_rad=-0.4), PointRobot(yaw_rad=0.0)
     goals = [Goal((0.1, 0.08), EXACT_M, turn_rad=turn) for turn in (-0.4, -0.8, -1.2)]
@@ -323,9 +307,6 @@ def test_what_was_done_before_the_arm_refused_is_kept():
     assert (went.status, went.message) == ("unreachable", "the height: out of reach")
 
 
-# On the simulated table
-
-
 def test_the_kinematics_agrees_with_what_execution_refuses(world):
     rng = np.random.default_rng(4)
     refused, steps = 0, []
@@ -488,7 +469,7 @@ def test_no_task_needs_the_state_of_the_simulator(world, skills, monkeypatch, ca
     goal = Goal((0.06, -0.03), 0.004, **pose)
     with monkeypatch.context() as patched:
         robot = knowing_only_what_it_measures(world, patched)
-        config = ClosedLoopConfig(n_images=1 if camera == "ideal" else 8)
+        config = planning.ClosedLoopConfig(n_images=1 if camera == "ideal" else 8)
         went = run_closed_loop(robot, goal, skills, config=config)
     seen = goal.height_m is None and (goal.turn_rad is None or obj is not BALL)
     assert went.status in ("reached", "unconfirmed"), went.message

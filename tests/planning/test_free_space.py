@@ -10,16 +10,8 @@ from matplotlib.path import Path
 from affordlib import planning
 from affordlib.geometry import unit_vector
 from affordlib.perception import outline_of
-from affordlib.planning.free_space import (
-    FAR_M,
-    N_POSES,
-    START_M,
-    FreeSpace,
-    corners_of,
-    gaps_m,
-    hand_m,
-    placed,
-)
+from affordlib.planning import corners_of
+from affordlib.planning.free_space import FAR_M, N_POSES, START_M, FreeSpace, gaps_m, hand_m, placed
 from affordlib.planning.rollout import poses_along
 from affordlib.primitives import Drag, Grasp, Push, Rotate, min_jerk
 from affordlib.types import Goal, Obstacle, Step

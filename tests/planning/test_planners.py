@@ -35,9 +35,6 @@ def known(goal_xy, mode="multi_partial", tolerance_m=0.02, model=MODEL, **more):
     return problem_of(model, IMAGE, (0.0, 0.0), Goal(goal_xy, tolerance_m), mode, **more)
 
 
-# The map
-
-
 @pytest.mark.parametrize("kind", [Push, Drag])
 def test_an_effect_map_says_what_the_model_says(world, film, kind):
     world.place(Cuboid(0.07, 0.05, 0.05), (0.0, 0.0), 0.4)
@@ -76,9 +73,6 @@ def test_a_chain_turns_with_the_object(world, film):
     np.testing.assert_allclose(positions[0, 1] - positions[0, 0], moved, atol=1e-12)
     assert float(turns[0, 1]) == pytest.approx(float(first[0, 2] + second[0, 2]))
     assert float(variances[0, 1]) > float(variances[0, 0]) > 0
-
-
-# A*
 
 
 class RandomTable(BranchTable):
@@ -190,9 +184,6 @@ def test_a_plan_reaches_the_goal_only_where_it_says_that_it_ends_there(film, cub
         assert plan.reaches_goal == (plan.predicted_distance_m <= near.tolerance_m)
 
 
-# The continuous planner
-
-
 @pytest.mark.parametrize("goal_xy", [(0.05, 0.02), (-0.03, 0.06), (0.13, -0.11), (0.2, 0.05)])
 def test_the_continuous_planner_ends_at_the_goal(goal_xy):
     plan = planning.plan_continuous(known(goal_xy))
@@ -231,9 +222,6 @@ def test_of_two_plans_that_of_lower_variance_is_taken():
     assert plan.predicted_distance_m < 1e-4
     assert all(abs(math.sin(s.primitive.direction_rad)) > 0.95 for s in plan.steps)
     assert plan.steps[-1].std_m < 0.004
-
-
-# The paper's gradient planner
 
 
 class Turned(KnownDynamics):
@@ -342,9 +330,6 @@ def test_a_decoded_path_is_followed(world):
     np.testing.assert_allclose(done.rest_effect[:2], own.rest_effect[:2], atol=0.001)
 
 
-# All of them
-
-
 @pytest.mark.filterwarnings("ignore:none of 5 random starts")
 @pytest.mark.parametrize("plan", PLANNERS)
 def test_planners_keep_to_mode_reach_and_table(plan):
@@ -372,9 +357,6 @@ def test_a_goal_without_room_for_the_object_is_refused(film, cuboid_image, xy):
 def test_a_model_of_other_actions_plans_no_pushes(cuboid_image, name, plan):
     with pytest.raises(ValueError, match=r"model must have x|train on such actions"):
         plan(problem_of(load_checkpoint(name)[0], cuboid_image, (0.0, 0.0), Goal((0.1, 0.05))))
-
-
-# Goals, and plans that are executed
 
 
 @pytest.mark.slow

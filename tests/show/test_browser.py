@@ -37,7 +37,7 @@ def free_port():
 
 
 @contextmanager
-def serve(folder, name, more_cells=(), app="jupyterlab", **parameters):
+def serve(folder, name, more_cells=(), app="jupyterlab"):
     """Start a Jupyter with separate settings, workspaces and run-time files, and one notebook.
 
     more_cells: code added after the goal picker; the page omits cells that are far out of view.
@@ -45,32 +45,20 @@ def serve(folder, name, more_cells=(), app="jupyterlab", **parameters):
     book = folder / "book"
     book.mkdir()
     file, out = book / f"{name}.ipynb", folder / "out"
-    notebook = papermill.execute_notebook(
-        repo_root() / "notebooks" / f"{name}.ipynb",
-        None,
-        {"out_dir": str(out), **parameters},
-        prepare_only=True,
-        kernel_name="python3",
-        language="python",
-    )
+    source, given = repo_root() / "notebooks" / f"{name}.ipynb", {"out_dir": str(out)}
+    python = {"kernel_name": "python3", "language": "python"}
+    notebook = papermill.execute_notebook(source, None, given, prepare_only=True, **python)
     after = [k for k, cell in enumerate(notebook.cells) if "GoalPicker." in cell.source][-1] + 1
     notebook.cells[after:after] = [nbformat.v4.new_code_cell(cell) for cell in more_cells]
     nbformat.write(notebook, file)
     port, token = free_port(), secrets.token_hex(16)
     own = {f"JUPYTER_{part}_DIR": str(folder / part) for part in ("CONFIG", "DATA", "RUNTIME")}
     traits = {"jupyterlab": "LabApp", "notebook": "JupyterNotebookApp"}[app]
-    options = [
-        "--no-browser",
-        "--allow-root",
-        "--ip=127.0.0.1",
-        f"--port={port}",
-        "--ServerApp.port_retries=0",
-        f"--ServerApp.root_dir={book}",
-        f"--IdentityProvider.token={token}",
-        f"--{traits}.expose_app_in_browser=True",
-        f"--{traits}.user_settings_dir={folder / 'settings'}",
-        f"--{traits}.workspaces_dir={folder / 'workspaces'}",
-    ]
+    options = ["--no-browser", "--allow-root", "--ip=127.0.0.1", f"--port={port}"]
+    options += ["--ServerApp.port_retries=0", f"--ServerApp.root_dir={book}"]
+    options += [f"--IdentityProvider.token={token}", f"--{traits}.expose_app_in_browser=True"]
+    options += [f"--{traits}.user_settings_dir={folder / 'settings'}"]
+    options += [f"--{traits}.workspaces_dir={folder / 'workspaces'}"]
     log, environment = folder / "lab.log", os.environ | own | {"JUPYTER_PREFER_ENV_PATH": "1"}
     with log.open("w") as said:
         command = [sys.executable, "-m", app, *options]
