@@ -25,8 +25,6 @@ BESIDE = "logs"
 USE_WORLD = {"recipes", "collect"}
 """The modules of `interactions` that know the world."""
 
-MOST_PARAMETERS = 7
-
 
 def name_of(path):
     """Import name of a module."""
@@ -78,7 +76,7 @@ def test_no_function_has_too_many_parameters():
             if isinstance(node, ast.FunctionDef):
                 a = node.args
                 each = {x.arg for x in [*a.posonlyargs, *a.args, *a.kwonlyargs]} - {"self", "cls"}
-                assert len(each) <= MOST_PARAMETERS, f"{path}: {node.name}"
+                assert len(each) <= 7, f"{path}: {node.name}"
 
 
 def test_only_the_world_knows_pybullet():

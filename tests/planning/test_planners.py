@@ -238,13 +238,8 @@ class Turned(KnownDynamics):
         return replace(found, effect_mean=found.effect_mean @ turn)
 
 
-READINGS = [
-    Reading(),
-    Reading(starts=4),
-    Reading(finds="point"),
-    Reading("adam", "circle", rate=0.005),
-    Reading("adam", "circle", "point", 0.005),
-]
+READINGS = [Reading(), Reading(starts=4), Reading(finds="point")]
+READINGS += [Reading("adam", "circle", finds, rate=0.005) for finds in ("direction", "point")]
 
 
 @pytest.mark.parametrize("reading", READINGS, ids=str)

@@ -1,8 +1,4 @@
-"""Notebook 00, the two explorers and the web pages in a real browser.
-
-JupyterLab runs on this machine, in headless Chromium. Pictures and measured times are stored in
-`runs/browser/`.
-"""
+"""Notebook 00, an explorer and the web pages in headless Chromium; pictures: `runs/browser/`."""
 
 import json
 import os
