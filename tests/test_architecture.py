@@ -126,9 +126,8 @@ print(torch_s, took_s, "pybullet" in sys.modules)
 def test_importing_is_quick_and_changes_nothing(part, tmp_path):
     """Importing takes a second on an idle machine; the limit is three times the time of PyTorch."""
     code = IMPORT.format(part=part)
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True
-    )
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
     torch_s, took_s, simulator = done.stdout.split()
     assert simulator == str(part == "show")

@@ -148,10 +148,8 @@ def test_stored_results_are_shown_as_they_are_now(name):
         assert "import " not in cell.source, "with the imports, cells that train would run here too"
         value = last_value(cell.source, space)
         if value is not None:
-            (shown,) = [
-                o.data["text/html"] for o in cell.outputs if "text/html" in o.get("data", {})
-            ]
-            assert shown == value._repr_html_(), f"run `make notebooks`: stale\n{cell.source}"
+            shown = [o.data["text/html"] for o in cell.outputs if "text/html" in o.get("data", {})]
+            assert shown == [value._repr_html_()], f"run `make notebooks`: stale\n{cell.source}"
             compared += 1
     assert compared
 
@@ -208,10 +206,8 @@ def test_the_book_keeps_to_its_style():
 
 def prepare(path, parameters, folder):
     """Write a copy with these parameters into a folder, ready to run."""
-    copy = folder / path.name
-    papermill.execute_notebook(
-        path, copy, parameters, prepare_only=True, kernel_name="python3", language="python"
-    )
+    copy, python = folder / path.name, {"kernel_name": "python3", "language": "python"}
+    papermill.execute_notebook(path, copy, parameters, prepare_only=True, **python)
     return copy
 
 
@@ -229,13 +225,11 @@ def append_solutions(copy):
 
 def run_with_nbval(copy):
     """Run a prepared notebook in a separate pytest: asserts, and outputs marked for checking."""
-    command = [sys.executable, "-m", "pytest", "--nbval-lax", "--nbval-current-env"]
+    command = [sys.executable, "-m", "pytest", "--nbval-lax", "--nbval-current-env", copy]
     command += ["--nbval-cell-timeout=600", "-p", "no:cacheprovider", "--rootdir", copy.parent]
     environment = {k: v for k, v in os.environ.items() if k not in ("PYTEST_ADDOPTS", "MPLBACKEND")}
     environment |= {f"DASK_DISTRIBUTED__COMM__{k}": v for k, v in READERS_DASK.items()}
-    return subprocess.run(
-        [*map(str, command), str(copy)], env=environment, capture_output=True, text=True
-    )
+    return subprocess.run([*map(str, command)], env=environment, capture_output=True, text=True)
 
 
 @pytest.fixture(scope="module")

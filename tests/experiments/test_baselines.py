@@ -17,9 +17,8 @@ def test_answers_are_those_of_the_model_itself(trained, held_out_pushes):
     some = np.arange(5)
     found = network_record(trained, held_out_pushes, some)
     arrays = InteractionTensors.from_dataset(held_out_pushes, some)
-    torch.testing.assert_close(
-        torch.tensor(final_error(found)).float(), final_errors_m(trained, arrays)
-    )
+    expected = final_errors_m(trained, arrays)
+    torch.testing.assert_close(torch.tensor(final_error(found)).float(), expected)
     short = network_predictions(trained, held_out_pushes, some)
     np.testing.assert_allclose(final_error(short), final_error(found), atol=1e-7)
     assert found["interaction"] == some.tolist()

@@ -26,6 +26,7 @@ from experiments import shipped
 from tests.waiting import start, wait_until
 
 SMALL = Recipe(n_interactions=6, seed=11)
+CONTINUE = "finished chunks are kept; collect into the same path to continue"
 ROOT = Path(affordlib.__file__).parents[1]
 
 pytestmark = pytest.mark.usefixtures("small_chunks")
@@ -77,9 +78,7 @@ def test_what_a_full_disk_has_left_out_or_damaged_is_made_again(tmp_path, made, 
         full.setattr(os, "fsync", lambda handle: real(handle) if room and room.pop() else no_room())
         with pytest.raises(OSError, match="No space left") as failure:
             collect_set(SMALL, path, progress=False)
-    assert failure.value.__notes__ == [
-        "finished chunks are kept; collect into the same path to continue"
-    ]
+    assert failure.value.__notes__ == [CONTINUE]
     with pytest.raises(FileNotFoundError, match="no file"):
         open_interactions(path)
     assert not list(tmp_path.rglob("*.tmp"))
@@ -148,8 +147,7 @@ def test_ctrl_c_ends_collecting_with_one_error(tmp_path):
     said, _ = process.communicate(timeout=60)
     assert process.returncode == -signal.SIGINT
     assert said.count("Traceback") == 1
-    kept = "finished chunks are kept; collect into the same path to continue"
-    assert said.splitlines()[-2:] == ["KeyboardInterrupt", kept]
+    assert said.splitlines()[-2:] == ["KeyboardInterrupt", CONTINUE]
 
 
 def test_a_chunk_that_cannot_be_made_on_a_cluster_is_named(tmp_path, made, monkeypatch):

@@ -180,9 +180,8 @@ def corridor(half_m=0.033, length_m=0.3):
 @pytest.mark.parametrize("plan", [planning.plan_astar, planning.plan_continuous])
 def test_in_a_corridor_a_push_must_be_able_to_stop(plan):
     goal = Goal((0.05, 0.0), 0.005)
-    partial, full = (
-        plan(problem(goal, corridor(), mode=planning.PlanMode(4, one))) for one in (True, False)
-    )
+    modes = planning.PlanMode(4, partial=True), planning.PlanMode(4, partial=False)
+    partial, full = (plan(problem(goal, corridor(), mode=mode)) for mode in modes)
     assert partial.predicted_distance_m < 0.005 < 0.02 < full.predicted_distance_m
 
 

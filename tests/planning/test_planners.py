@@ -121,13 +121,18 @@ def test_astar_finds_what_exhaustive_search_finds(seed, heuristic):
         assert goal.distance_m(end) == pytest.approx(nearest, abs=1e-9)
 
 
-def test_branches_are_the_papers_180():
-    direction, stop_phase, effect_m, _ = BranchTable(planning.EffectMap(MODEL, IMAGE)).at(0.0)
+def test_branches_are_the_papers_180_of_the_action_or_of_its_recorded_part():
+    effects, shares = planning.EffectMap(MODEL, IMAGE), np.array([0.2, 0.4, 0.6, 0.8, 1.0])
+    stops = phases_of_way(effects, shares)
+    np.testing.assert_allclose(stops, STARTS + (1 - STARTS) * np.sqrt(shares), atol=0.005)
     # Actions that stop before contact are pruned: 36 x {80, 100 %} remain.
-    assert len(direction) == 72
-    assert set(np.round(stop_phase, 3)) == {0.8, 1.0}
-    expected = moved_m(stop_phase) * np.stack([np.cos(direction), np.sin(direction)])
-    np.testing.assert_allclose(effect_m, expected, atol=1e-4)
+    for given, kept, off_m in (({}, [0.8, 1.0], 1e-4), ({"stop_phases": stops}, stops, 1e-3)):
+        direction, stop_phase, effect_m, _ = BranchTable(effects, **given).at(0.0)
+        assert len(direction) == 36 * len(kept)
+        assert set(np.round(stop_phase, 3)) == set(np.round(kept, 3))
+        expected = moved_m(stop_phase) * np.stack([np.cos(direction), np.sin(direction)])
+        np.testing.assert_allclose(effect_m, expected, atol=off_m)
+    np.testing.assert_allclose(np.hypot(*effect_m), np.tile(REACH_M * shares, 36), atol=1e-3)
 
 
 def test_numbers_of_few_bits_plan_as_others_and_numbers_without_end_are_refused():
@@ -139,16 +144,6 @@ def test_numbers_of_few_bits_plan_as_others_and_numbers_without_end_are_refused(
         BranchTable(effects, stop_phases=np.linspace(0.01, 1, 101))
     with pytest.raises(ValueError, match=r"Reading\.rate must be a finite number"):
         Reading(rate=math.nan)
-
-
-def test_segments_of_the_recorded_part_are_the_papers_180_branches():
-    shares = np.array([0.2, 0.4, 0.6, 0.8, 1.0])
-    effects = planning.EffectMap(MODEL, IMAGE)
-    stops = phases_of_way(effects, shares)
-    np.testing.assert_allclose(stops, STARTS + (1 - STARTS) * np.sqrt(shares), atol=0.005)
-    _, _, effect_m, _ = BranchTable(effects, stop_phases=stops).at(0.0)
-    ends_m = np.hypot(*effect_m).reshape(36, 5)
-    np.testing.assert_allclose(ends_m, np.tile(REACH_M * shares, (36, 1)), atol=1e-3)
 
 
 def test_a_search_goes_on_where_the_end_cannot_be_had(film, cuboid_image):

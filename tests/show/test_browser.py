@@ -169,10 +169,9 @@ def assert_same_goal(page, table, x_m, y_m, within_m=0.0011):
     wanted = goal_of(page)
     assert wanted == pytest.approx((x_m, y_m), abs=within_m)
     np.testing.assert_allclose(table.goal(), wanted, atol=3e-4)
-    shown = page.locator(".affordlib-picker .widget-readout").all_inner_texts()[:2]
-    assert [float(text.replace("−", "-")) for text in shown] == pytest.approx(
-        [100 * v for v in wanted]
-    )
+    texts = page.locator(".affordlib-picker .widget-readout").all_inner_texts()[:2]
+    shown = [float(text.replace("−", "-")) for text in texts]
+    assert shown == pytest.approx([100 * v for v in wanted])
 
     def drawn_is_planned():  # a better plan may follow the first
         paths = ask(page, "[s.predicted_path_xy_m.tolist() for s in picker.plan.steps]")
