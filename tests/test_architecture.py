@@ -25,8 +25,6 @@ BESIDE = "logs"
 USE_WORLD = {"recipes", "collect"}
 """The modules of `interactions` that know the world."""
 
-MOST_PARAMETERS = 7
-
 
 def name_of(path):
     """Import name of a module."""
@@ -78,7 +76,7 @@ def test_no_function_has_too_many_parameters():
             if isinstance(node, ast.FunctionDef):
                 a = node.args
                 each = {x.arg for x in [*a.posonlyargs, *a.args, *a.kwonlyargs]} - {"self", "cls"}
-                assert len(each) <= MOST_PARAMETERS, f"{path}: {node.name}"
+                assert len(each) <= 7, f"{path}: {node.name}"
 
 
 def test_only_the_world_knows_pybullet():
@@ -128,9 +126,8 @@ print(torch_s, took_s, "pybullet" in sys.modules)
 def test_importing_is_quick_and_changes_nothing(part, tmp_path):
     """Importing takes a second on an idle machine; the limit is three times the time of PyTorch."""
     code = IMPORT.format(part=part)
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True
-    )
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
     torch_s, took_s, simulator = done.stdout.split()
     assert simulator == str(part == "show")

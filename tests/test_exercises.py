@@ -29,13 +29,8 @@ def test_the_notebook_asks_each_exercise_and_leaves_it_open(name):
     numbers = re.findall(r'check\("(\w\d\.\d)"', text)
     assert numbers == [n for n in EXERCISES if n[:2] == name[:2]]
     assert all(f"**{number}**" in text for number in numbers)
-    shown = [
-        output["data"]["text/plain"]
-        for cell in cells
-        if "check(" in cell.source
-        for output in cell.get("outputs", [])
-        if "data" in output
-    ]
+    outputs = [o for cell in cells if "check(" in cell.source for o in cell.get("outputs", [])]
+    shown = [output["data"]["text/plain"] for output in outputs if "data" in output]
     assert len(shown) == len(numbers)
     assert all("not attempted" in text for text in shown)
 

@@ -76,8 +76,7 @@ CALLABLES |= {"Push.towards": Push.towards, "Push.path": Push(0.0).path}
 CALLABLES["from_dataset"] = interactions.InteractionTensors.from_dataset
 CALLABLES |= {f"Log.{n}": getattr(logs.Log("m", CORNERS), n) for n in ("add", "query")}
 CALLABLES["Log.centroid_pose"] = logs.Log("m", CORNERS).centroid_pose
-STILL_PLANNER = logs.PushPlanner(Still(), logs.PushedObject(np.array(CORNERS)))
-CALLABLES["PushPlanner.plan"] = STILL_PLANNER.plan
+CALLABLES["PushPlanner.plan"] = logs.PushPlanner(Still(), logs.PushedObject(np.array(CORNERS))).plan
 OF_THE_WORLD = "place execute_primitive execute execute_path can_reach picture mark shove settle"
 MADE_BY_DRIVEN_ONES = """ClosedLoopResult EffectModel Execution Planner Robot EffectNetwork
 FittedModel LoggedPushes NetworkConfig Pushes TabletopObject open_loop"""

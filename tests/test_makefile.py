@@ -3,7 +3,6 @@
 import importlib.metadata
 import os
 import shutil
-import subprocess
 import sys
 import tomllib
 from types import SimpleNamespace
@@ -12,6 +11,7 @@ import pytest
 from packaging.specifiers import SpecifierSet
 
 from affordlib.results import repo_root
+from tests.waiting import start
 
 PRETENDED = """\
 #!{python}
@@ -53,17 +53,8 @@ def project(tmp_path):
             path.chmod(0o755)
         environment = {name: value for name, value in os.environ.items() if "MAKE" not in name}
         environment["PATH"] = f"{commands}:{environment['PATH']}"
-        started = [
-            subprocess.Popen(
-                ["make", f"PYTHON={own}", *(options or ["setup"])],
-                cwd=here,
-                env=environment,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.STDOUT,
-                text=True,
-            )
-            for _ in range(copies)
-        ]
+        command = ["make", f"PYTHON={own}", *(options or ["setup"])]
+        started = [start(command, cwd=here, env=environment) for _ in range(copies)]
         said = [process.communicate(timeout=60)[0] for process in started]
         log = here / "log"
         ran = log.read_text().splitlines() if log.exists() else []

@@ -52,9 +52,6 @@ def code_of(notebook):
     return [cell for cell in notebook.cells if cell.cell_type == "code"]
 
 
-# As committed
-
-
 @each_notebook
 def test_parameters(name):
     defaults = default_parameters(name)
@@ -124,11 +121,8 @@ def test_executed_in_order_without_errors(name):
     assert [o for o in outputs if o.output_type == "error" or o.get("name") == "stderr"] == []
 
 
-STORED = [
-    name
-    for name in PATHS
-    if 'read_results("data/results/' in PATHS[name].read_text("utf-8").replace("\\", "")
-]
+READS_STORED = 'read_results(\\"data/results/'  # in JSON
+STORED = [name for name, path in PATHS.items() if READS_STORED in path.read_text("utf-8")]
 
 
 def last_value(source, space):
@@ -154,10 +148,8 @@ def test_stored_results_are_shown_as_they_are_now(name):
         assert "import " not in cell.source, "with the imports, cells that train would run here too"
         value = last_value(cell.source, space)
         if value is not None:
-            (shown,) = [
-                o.data["text/html"] for o in cell.outputs if "text/html" in o.get("data", {})
-            ]
-            assert shown == value._repr_html_(), f"run `make notebooks`: stale\n{cell.source}"
+            shown = [o.data["text/html"] for o in cell.outputs if "text/html" in o.get("data", {})]
+            assert shown == [value._repr_html_()], f"run `make notebooks`: stale\n{cell.source}"
             compared += 1
     assert compared
 
@@ -212,15 +204,10 @@ def test_the_book_keeps_to_its_style():
     assert book_check.check()[1] == []
 
 
-# As run
-
-
 def prepare(path, parameters, folder):
     """Write a copy with these parameters into a folder, ready to run."""
-    copy = folder / path.name
-    papermill.execute_notebook(
-        path, copy, parameters, prepare_only=True, kernel_name="python3", language="python"
-    )
+    copy, python = folder / path.name, {"kernel_name": "python3", "language": "python"}
+    papermill.execute_notebook(path, copy, parameters, prepare_only=True, **python)
     return copy
 
 
@@ -238,13 +225,11 @@ def append_solutions(copy):
 
 def run_with_nbval(copy):
     """Run a prepared notebook in a separate pytest: asserts, and outputs marked for checking."""
-    command = [sys.executable, "-m", "pytest", "--nbval-lax", "--nbval-current-env"]
+    command = [sys.executable, "-m", "pytest", "--nbval-lax", "--nbval-current-env", copy]
     command += ["--nbval-cell-timeout=600", "-p", "no:cacheprovider", "--rootdir", copy.parent]
     environment = {k: v for k, v in os.environ.items() if k not in ("PYTEST_ADDOPTS", "MPLBACKEND")}
     environment |= {f"DASK_DISTRIBUTED__COMM__{k}": v for k, v in READERS_DASK.items()}
-    return subprocess.run(
-        [*map(str, command), str(copy)], env=environment, capture_output=True, text=True
-    )
+    return subprocess.run([*map(str, command)], env=environment, capture_output=True, text=True)
 
 
 @pytest.fixture(scope="module")

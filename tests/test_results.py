@@ -207,24 +207,21 @@ def test_columns_are_drawn_as_dots_once(tmp_path, monkeypatch, capsys):
 
 
 def test_the_pages_and_the_shipped_results_agree_and_carry_no_path():
-    pages = [
-        str(results.repo_root() / name) for name in ("README.md", "RESULTS.md", "data/README.md")
-    ]
-    assert tables.main(["--check", *pages]) == 0
-    for path in (results.repo_root() / "data" / "results").glob("*.json"):
+    root, pages = results.repo_root(), ("README.md", "RESULTS.md", "data/README.md")
+    assert tables.main(["--check", *(str(root / name) for name in pages)]) == 0
+    for path in (root / "data" / "results").glob("*.json"):
         assert read_results(path)["notebook"] == path.stem
         given = json.loads(path.read_text())["parameters"].values()
         assert not [v for v in given if isinstance(v, str) and os.path.isabs(v)]
 
 
 def test_blocks_join_columns_and_turn_rows_into_columns(tmp_path):
-    rows = [{"planner": p, "mode": m, "mean_m": x, "sem_m": 1e-3} for p, m, x in
-            [("a", "b_c", 2e-3), ("a", "d", None), ("e", "d", 3e-3)]]  # fmt: skip
+    three = ("a", "b_c", 2e-3), ("a", "d", None), ("e", "d", 3e-3)
+    rows = [{"planner": p, "mode": m, "mean_m": mean, "sem_m": 1e-3} for p, m, mean in three]
     source = write_results(tmp_path, "06_planning", {}, {"planning": rows})
-    options = (
-        "planner=e,a columns=who:planner by=mode 'values=mean_m±sem_m,up_to:mean_m(sem_m..sem_m)'"
-    )
-    filled = fill_tables(f"<!-- table: {source}#planning {options} -->\n<!-- /table -->\n")
+    options = "columns=who:planner by=mode 'values=mean_m±sem_m,up_to:mean_m(sem_m..sem_m)'"
+    block = f"<!-- table: {source}#planning planner=e,a {options} -->\n<!-- /table -->\n"
+    filled = fill_tables(block)
     assert filled.splitlines()[1:-1] == [
         "| who | d: mean, mm | b c: mean, mm | d: up to, mm | b c: up to, mm |",
         "| --- | ---: | ---: | ---: | ---: |",

@@ -5,7 +5,6 @@ import os
 import re
 import shutil
 import signal
-import subprocess
 import sys
 
 import nbformat
@@ -14,7 +13,7 @@ import pytest
 from pages import cleaned, parameters_of_pages
 
 from affordlib.results import read_results, repo_root
-from tests.waiting import wait_until
+from tests.waiting import start, wait_until
 
 ROOT = repo_root()
 PARAMETERS = "seed: int = 0  # of all\nout_dir: str = 'runs/lab'  # for results\nn: int = 2  # a\n"
@@ -67,16 +66,7 @@ class Book:
 
     def start(self, *options, target="workbook", **environment):
         inherited = {k: v for k, v in os.environ.items() if "MAKE" not in k}
-        return subprocess.Popen(
-            ["make", target, *options],
-            cwd=self.root,
-            env=inherited | environment,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            start_new_session=True,
-            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # as in a terminal
-        )
+        return start(["make", target, *options], cwd=self.root, env=inherited | environment)
 
     def make(self, *options, **more):
         process = self.start(*options, **more)
@@ -233,8 +223,8 @@ def test_whatever_stops_make_leaves_no_process_and_is_taken_up_again(book, how):
 def test_a_signal_while_a_kernel_starts_leaves_no_process(book):
     book.add("01_first")
     run = book.root / "notebooks" / "run.py"
-    start = "await super().start_kernel(stdout=printed, stderr=printed, **options)"
-    run.write_text(run.read_text().replace(start, f"{start}; os.kill(os.getpid(), 2)"))
+    begin = "await super().start_kernel(stdout=printed, stderr=printed, **options)"
+    run.write_text(run.read_text().replace(begin, f"{begin}; os.kill(os.getpid(), 2)"))
     assert "01_first: interrupted" in book.make()[1]
     wait_until(lambda: not book.processes(), seconds=0.5, otherwise="the kernel is left")
 

@@ -1,6 +1,15 @@
-"""Waiting for another thread or process."""
+"""Starting other processes, and waiting for them or for threads."""
 
+import signal
+import subprocess
 import time
+
+
+def start(command, **options):
+    """Start a process as in a terminal: Ctrl-C reaches it, which background jobs ignore."""
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "stdin": subprocess.DEVNULL}
+    options |= {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)}
+    return subprocess.Popen(command, start_new_session=True, text=True, **pipes, **options)
 
 
 def wait_until(condition, seconds=60.0, process=None, otherwise="waited in vain"):

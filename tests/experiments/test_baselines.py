@@ -12,16 +12,13 @@ from affordlib.models import final_error, final_errors_m, network_predictions
 from experiments.baselines import constant, gaussian_process, nearest, network_record
 from experiments.cross_validation import add_errors
 
-# Answers
-
 
 def test_answers_are_those_of_the_model_itself(trained, held_out_pushes):
     some = np.arange(5)
     found = network_record(trained, held_out_pushes, some)
     arrays = InteractionTensors.from_dataset(held_out_pushes, some)
-    torch.testing.assert_close(
-        torch.tensor(final_error(found)).float(), final_errors_m(trained, arrays)
-    )
+    expected = final_errors_m(trained, arrays)
+    torch.testing.assert_close(torch.tensor(final_error(found)).float(), expected)
     short = network_predictions(trained, held_out_pushes, some)
     np.testing.assert_allclose(final_error(short), final_error(found), atol=1e-7)
     assert found["interaction"] == some.tolist()
@@ -34,24 +31,15 @@ def test_a_turn_is_measured_the_short_way_round():
     np.testing.assert_allclose(found["yaw_error"], [2 * math.pi - 6.2, 0.1])
 
 
-# Baselines
-
-
-def arrays_of(effect, theta):
-    n = len(theta)
-    out = torch.stack([theta.cos(), theta.sin()], dim=-1)
-    action = torch.stack([-0.2 * out, 0.05 * out], dim=1)
-    effect = torch.stack([torch.zeros(n, 2), effect], dim=1)
-    phase, image = torch.tensor([0.0, 1.0]), torch.zeros(n, 2, 4, 4)
-    return InteractionTensors(image, phase, action, effect, ("x", "y"), ("x", "y"))
-
-
 def test_baselines_know_the_direction_and_recover_a_law_of_size():
     generator = torch.Generator().manual_seed(0)
     theta, size = (torch.rand(60, generator=generator) for _ in range(2))
     theta = 2 * math.pi * theta
     out = torch.stack([theta.cos(), theta.sin()], dim=-1)
-    arrays = arrays_of((0.05 + 0.02 * size[:, None]) * out, theta)
+    action = torch.stack([-0.2 * out, 0.05 * out], dim=1)
+    effect = torch.stack([0 * out, (0.05 + 0.02 * size[:, None]) * out], dim=1)
+    phase, image = torch.tensor([0.0, 1.0]), torch.zeros(60, 2, 4, 4)
+    arrays = InteractionTensors(image, phase, action, effect, ("x", "y"), ("x", "y"))
     train, test, at = arrays.select(slice(0, 40)), arrays.select(slice(40, 60)), torch.tensor([1])
     known, queried = 3 * size[:40, None], 3 * size[40:, None]
     off = {}

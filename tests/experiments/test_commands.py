@@ -21,34 +21,30 @@ def main_of(name):
     return importlib.import_module(name).main
 
 
+TABLE, SHIPPED = "experiments.effect_prediction", "experiments.shipped data"
+
+
 @pytest.mark.parametrize(
-    ("line", "named"),
+    ("line", "code", "named"),
     [
-        ("experiments.effect_prediction --workers -2", "--workers: must be .* from 1 to 256"),
-        ("experiments.shipped data --workers 257", "--workers: must be .* from 1 to 256"),
-        ("experiments.shipped data --only nope", "--only: invalid choice: 'nope'"),
-        (f"experiments.shipped data --workers {'1' * 5000}", "--workers: must be .*'1{5,40}$"),
+        (f"{TABLE} --workers -2", 2, "--workers: must be .* from 1 to 256"),
+        (f"{SHIPPED} --workers 257", 2, "--workers: must be .* from 1 to 256"),
+        (f"{SHIPPED} --only nope", 2, "--only: invalid choice: 'nope'"),
+        (f"{SHIPPED} --workers {'1' * 5000}", 2, "--workers: must be .*'1{5,40}$"),
+        (f"{TABLE} --only model=film,flim", 1, "no job has model = 'flim', but cnp, .*, nearest$"),
+        (f"{TABLE} --only fold=11", 1, "no job has fold = '11', but 0, 1,"),
+        (f"{TABLE} --only modle=film", 1, "no job has modle = 'film', but None$"),
     ],
 )
-def test_unknown_names_and_impossible_numbers_are_refused(capsys, line, named):
+def test_unknown_names_and_impossible_numbers_are_refused(capsys, line, code, named):
     name, *arguments = line.split()
-    with pytest.raises(SystemExit) as ended:
-        main_of(name)(arguments)
-    assert ended.value.code == 2
-    assert re.search(rf"error: (argument )?{named}", capsys.readouterr().err, re.MULTILINE)
-
-
-@pytest.mark.parametrize(
-    ("only", "named"),
-    [
-        ("model=film,flim", "no job has model = 'flim', but cnp, .*, nearest$"),
-        ("fold=11", "no job has fold = '11', but 0, 1,"),
-        ("modle=film", "no job has modle = 'film', but None$"),
-    ],
-)
-def test_jobs_that_are_not_of_a_table_are_refused(capsys, only, named):
-    assert main_of("experiments.effect_prediction")(["--only", only]) == 1
-    assert re.search(rf"^effect_prediction: --only: {named}", capsys.readouterr().err, re.MULTILINE)
+    try:
+        ended = main_of(name)(arguments)
+    except SystemExit as stopped:
+        ended = stopped.code
+    assert ended == code
+    begins = {1: "^effect_prediction: --only: ", 2: "error: (argument )?"}[code]
+    assert re.search(begins + named, capsys.readouterr().err, re.MULTILINE)
 
 
 def test_every_command_line_ends_in_this_way():

@@ -10,22 +10,15 @@ from experiments import effect_prediction as tables
 from experiments.cross_validation import job, network_and_training
 from experiments.effect_prediction import confusion_columns
 
-# Jobs
-
 
 def test_what_decides_a_training_decides_whether_its_result_is_stale(monkeypatch):
-    def made_of():
-        return job("film", "push").made_of()
-
-    before, (network, training) = made_of(), network_and_training("film", "push")
-    for change in ((replace(network, blocks=5), training), (network, replace(training, ema=0.5))):
-        monkeypatch.setattr(
-            cross_validation, "network_and_training", lambda *_, change=change: change
-        )
-        assert made_of() != before
-    same = network, replace(training, device="cpu")
-    monkeypatch.setattr(cross_validation, "network_and_training", lambda *_: same)
-    assert made_of() == before
+    network, training = network_and_training("film", "push")
+    others = (replace(network, blocks=5), training), (network, replace(training, ema=0.5))
+    made_of = [job("film", "push").made_of()]
+    for now in (*others, (network, replace(training, device="cpu"))):
+        monkeypatch.setattr(cross_validation, "network_and_training", lambda *_, now=now: now)
+        made_of.append(job("film", "push").made_of())
+    assert [one == made_of[0] for one in made_of] == [True, False, False, True]
 
 
 def test_shipped_networks_are_those_of_the_tables():
@@ -33,9 +26,6 @@ def test_shipped_networks_are_those_of_the_tables():
     for spec in map(cross_validation.CHECKPOINT_SPECS.get, names):
         assert network_and_training("film", spec.data) == (spec.network, spec.training)
         assert (cross_validation.task_of(spec.data).symmetries or ()) == spec.symmetries
-
-
-# Tables
 
 
 def test_a_fold_may_lack_a_category():
@@ -50,9 +40,6 @@ def test_a_fold_may_lack_a_category():
     rows = tables.error_rows(tables.predictions_of(folds, "drag", "fixed_test"), "drag")
     means = [row["final_error_mean_m"] for row in rows]
     assert means == pytest.approx([0.00225, 0.0015, 0.003])
-
-
-# Grasps
 
 
 def test_shares_are_of_the_true_successes_and_failures():

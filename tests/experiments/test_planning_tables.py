@@ -129,10 +129,9 @@ def test_another_version_of_a_planner_makes_its_results_stale(monkeypatch):
 
 def test_a_row_has_the_statistics_of_its_goals():
     about = {"goals": "constructed", "mode": "single_full", "predicted_m": 0.0}
-    records = [
-        {"object_class": name, "distance_m": distance_m, "prediction_error_m": 0.002} | about
-        for name, distance_m in (("cuboid", 0.001), ("upright_cylinder", 0.003), ("sphere", 1.0))
-    ]
+    about["prediction_error_m"] = 0.002
+    ends = ("cuboid", 0.001), ("upright_cylinder", 0.003), ("sphere", 1.0)
+    records = [about | {"object_class": name, "distance_m": end_m} for name, end_m in ends]
     standing, rollable = planning.summary_rows(planning.distances({"continuous": records}))
     assert (standing["n"], rollable["n"], standing["world"]) == ("2", "1", "clean")
     found = [standing[f"single_full_{name}_m"] for name in ("mean", "sem", "median")]

@@ -129,6 +129,5 @@ def test_the_committed_tables_are_drawn_from_the_committed_results(tmp_path, nam
     assert made.keys() == committed.keys()
     for table, rows in made.items():
         # The order of summation depends on the processor, so last digits differ from the table's.
-        assert_frame_equal(
-            pd.DataFrame(rows), pd.DataFrame(committed[table]), rtol=1e-9, atol=1e-15
-        )
+        both = pd.DataFrame(rows), pd.DataFrame(committed[table])
+        assert_frame_equal(*both, rtol=1e-9, atol=1e-15)

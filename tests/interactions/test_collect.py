@@ -23,9 +23,10 @@ from affordlib.interactions.collect import collect as collect_set
 from affordlib.interactions.recipes import Recipe
 from affordlib.interactions.store import dataset_sha256, open_interactions, stored_sha256
 from experiments import shipped
-from tests.waiting import wait_until
+from tests.waiting import start, wait_until
 
 SMALL = Recipe(n_interactions=6, seed=11)
+CONTINUE = "finished chunks are kept; collect into the same path to continue"
 ROOT = Path(affordlib.__file__).parents[1]
 
 pytestmark = pytest.mark.usefixtures("small_chunks")
@@ -77,9 +78,7 @@ def test_what_a_full_disk_has_left_out_or_damaged_is_made_again(tmp_path, made, 
         full.setattr(os, "fsync", lambda handle: real(handle) if room and room.pop() else no_room())
         with pytest.raises(OSError, match="No space left") as failure:
             collect_set(SMALL, path, progress=False)
-    assert failure.value.__notes__ == [
-        "finished chunks are kept; collect into the same path to continue"
-    ]
+    assert failure.value.__notes__ == [CONTINUE]
     with pytest.raises(FileNotFoundError, match="no file"):
         open_interactions(path)
     assert not list(tmp_path.rglob("*.tmp"))
@@ -104,8 +103,6 @@ def test_paths_and_workers_that_cannot_be_are_named(tmp_path):
             collect_set(SMALL, tmp_path / "x.zarr.zip", workers=workers)
 
 
-# Processes of this machine
-
 SCRIPT = """
 import sys
 import threading
@@ -119,22 +116,15 @@ collect.collect(recipe, sys.argv[1], workers=int(sys.argv[3]), progress=False)
 """
 
 
-def start(*arguments, **options):
-    """Start Python so that it receives Ctrl-C, which background jobs ignore."""
-
-    def heed():
-        os.setsid()
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "stdin": subprocess.DEVNULL}
-    command = [sys.executable, *map(str, arguments)]
-    return subprocess.Popen(command, preexec_fn=heed, cwd=ROOT, text=True, **pipes | options)
+def start_collector(path, n_interactions):
+    """Collect with two workers in another process."""
+    return start([sys.executable, "-c", SCRIPT, str(path), str(n_interactions), "2"], cwd=ROOT)
 
 
 @pytest.mark.slow
 def test_a_collector_killed_at_any_moment_is_no_loss(undisturbed, tmp_path):
     path = tmp_path / "set.zarr.zip"
-    process = start("-c", SCRIPT, path, 6, 2)
+    process = start_collector(path, 6)
     wait_until(lambda: list(tmp_path.glob(".set*.parts")) or process.poll() is not None, 120)
     time.sleep(random.uniform(0, 3))
     family = psutil.Process(process.pid).children(recursive=True)
@@ -149,21 +139,15 @@ def test_a_collector_killed_at_any_moment_is_no_loss(undisturbed, tmp_path):
 @pytest.mark.slow
 def test_ctrl_c_ends_collecting_with_one_error(tmp_path):
     """Until then its workers have no open port."""
-    process = start("-c", SCRIPT, tmp_path / "set.zarr.zip", 100, 2)
+    process = start_collector(tmp_path / "set.zarr.zip", 100)
     wait_until(lambda: list(tmp_path.glob(".set*.parts/*.zip")), 120, process)
     family = psutil.Process(process.pid).children(recursive=True)
     assert not [port for one in family for port in one.net_connections("inet")]
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does
-    _, err = process.communicate(timeout=60)
+    said, _ = process.communicate(timeout=60)
     assert process.returncode == -signal.SIGINT
-    assert err.count("Traceback") == 1
-    assert err.splitlines()[-2:] == [
-        "KeyboardInterrupt",
-        "finished chunks are kept; collect into the same path to continue",
-    ]
-
-
-# Workers that fail
+    assert said.count("Traceback") == 1
+    assert said.splitlines()[-2:] == ["KeyboardInterrupt", CONTINUE]
 
 
 def test_a_chunk_that_cannot_be_made_on_a_cluster_is_named(tmp_path, made, monkeypatch):
@@ -204,9 +188,6 @@ def test_a_worker_that_dies_says_so(undisturbed, tmp_path):
         collect_set(Deadly(**vars(SMALL)), path, 2, progress=False)
     collect_set(SMALL, path, 2, progress=False)
     assert path.read_bytes() == undisturbed(SMALL).read_bytes()
-
-
-# Making the shipped sets again
 
 
 @pytest.mark.slow

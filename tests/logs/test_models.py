@@ -8,15 +8,9 @@ import pytest
 import torch
 from scipy.optimize import minimize
 
-from affordlib.logs import LoggedPushes, cross_validate, fit, load_model, save_model
+from affordlib.logs import LoggedPushes, cross_validate, fit, load_model, neural_process, save_model
 from affordlib.logs.fit import MODELS, mirrors, sigma_scale
-from affordlib.logs.neural_process import (
-    NeuralProcess,
-    in_contact_frame,
-    load_neural_process,
-    rotation,
-    transformed,
-)
+from affordlib.logs.neural_process import load_neural_process, rotation, transformed
 from affordlib.logs.physics import ELLIPSOID, AnalyticPusher, quasi_static_push
 from experiments.pretrain_np import save_neural_process, simulate
 
@@ -126,7 +120,7 @@ def test_prediction_turns_and_mirrors_with_the_object(shipped, simulated):
 
 def test_context_and_feet_make_predictions_better(shipped, simulated):
     rows, feet, truth = simulated
-    truth, off = in_contact_frame(rows, truth)[:, 32:], []
+    truth, off = neural_process.in_contact_frame(rows, truth)[:, 32:], []
     for n, given in ((0, 0), (5, 0), (20, 0), (0, 1)):
         with torch.no_grad():
             mean, std = shipped(rows[:, 32:], rows[:, :n], feet * given)
@@ -186,8 +180,9 @@ def test_a_model_predicts_the_same_after_it_was_saved(name, tmp_path):
 
 
 def test_other_files_hold_no_model_of_pushes(tmp_path):
+    untrained = neural_process.NeuralProcess()
     with pytest.raises(ValueError, match="holds no model of pushes"):
-        load_model(save_neural_process(NeuralProcess(), tmp_path / "np.safetensors", {}))
+        load_model(save_neural_process(untrained, tmp_path / "np.safetensors", {}))
     with pytest.raises(FileNotFoundError, match=r"there is no file .*missing"):
         load_model(tmp_path / "missing.safetensors")
     with pytest.raises(ValueError, match=r"film_500.* train it: .*pretrain_np"):

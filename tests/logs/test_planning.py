@@ -68,11 +68,9 @@ def test_pursuit_knows_only_what_it_observes(world, monkeypatch):
 
 def test_a_plan_that_does_not_turn_misses_a_turn():
     planner = PushPlanner(Still(), PushedObject(OUTLINE_M))
-    reaches = [
-        planner.plan((0.3, 0.3, 0.0), goal, 1).reaches_goal
-        for goal in (Goal((0.3, 0.3)), Goal((0.3, 0.3), turn_rad=1.5))
-    ]
-    assert reaches == [True, False]
+    for turn_rad, reaches in ((None, True), (1.5, False)):
+        goal = Goal((0.3, 0.3), turn_rad=turn_rad)
+        assert planner.plan((0.3, 0.3, 0.0), goal, 1).reaches_goal == reaches
 
 
 def test_what_no_object_has_is_refused():

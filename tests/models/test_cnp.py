@@ -14,9 +14,8 @@ N = 7
 
 def some_observations() -> Observations:
     g = torch.Generator().manual_seed(0)
-    action, action_t, effect, effect_t = (
-        torch.rand(*shape, generator=g) for shape in ((2, N, 2), (2, N)) * 2
-    )
+    shapes = ((2, N, 2), (2, N)) * 2
+    action, action_t, effect, effect_t = (torch.rand(*shape, generator=g) for shape in shapes)
     both = (action_t, 0.2 * action), (effect_t, 0.1 * effect)
     return Observations.of(CNPConfig(), *both, torch.rand(2, generator=g))
 

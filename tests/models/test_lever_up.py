@@ -51,10 +51,8 @@ def test_a_rollout_does_not_depend_on_how_far_it_is_asked(levered):
     ask = levered.phase[[5, 12, 25]].expand(len(levered), -1)
     with torch.no_grad():
         features, step = model.encode(levered.image), levered.phase[5]
-        whole, near, between, next_one = (
-            model.predict(features, seen, t)
-            for t in (ask, ask[:, :1], 0 * ask[:, :1] + step + 0.02, 0 * ask[:, :1] + 6 / 25)
-        )
+        at = ask, ask[:, :1], 0 * ask[:, :1] + step + 0.02, 0 * ask[:, :1] + 6 / 25
+        whole, near, between, next_one = (model.predict(features, seen, t) for t in at)
     torch.testing.assert_close(whole.effect_mean[:, :1], near.effect_mean)
     middle = (near.effect_mean + next_one.effect_mean) / 2
     torch.testing.assert_close(between.effect_mean, middle, atol=1e-5, rtol=1e-4)

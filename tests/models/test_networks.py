@@ -37,9 +37,8 @@ def network(request, some):
 
 def made(name, arrays):
     torch.manual_seed(0)
-    network = models.build(
-        CONFIGS[name], Scaler.fit(arrays), models.TrainingDomain.fit(arrays)
-    ).eval()
+    scaler, domain = Scaler.fit(arrays), models.TrainingDomain.fit(arrays)
+    network = models.build(CONFIGS[name], scaler, domain).eval()
     with torch.no_grad():  # the last layers of blocks are initialised to zero
         for parameter in network.parameters():
             parameter.add_(0.02 * torch.randn_like(parameter))
@@ -75,11 +74,9 @@ def test_order_and_what_is_masked_have_no_effect(network, some, tmp_path):
         assert getattr(again, part) == getattr(network, part)
     assert all(map(torch.equal, predicted, predictions(again, batch)))
     seen = batch.observations
-    seen = dataclasses.replace(
-        seen,
-        action=torch.where(seen.action_mask[..., None], seen.action, 7.0),
-        effect=torch.where(seen.effect_mask[..., None], seen.effect, -7.0),
-    )
+    action = torch.where(seen.action_mask[..., None], seen.action, 7.0)
+    effect = torch.where(seen.effect_mask[..., None], seen.effect, -7.0)
+    seen = dataclasses.replace(seen, action=action, effect=effect)
     order = torch.randperm(4, generator=torch.Generator().manual_seed(1))
     parts = [kind + part for kind in ("action", "effect") for part in ("", "_t", "_mask")]
     shuffled = dataclasses.replace(seen, **{n: getattr(seen, n)[:, order] for n in parts})
@@ -150,9 +147,7 @@ def test_gradients_in_effect_and_action(name, some):
         return network.predict(features, seen, one).effect_mean
 
     def of_direction(angle):
-        start = torch.stack([angle.cos(), angle.sin(), angle + math.pi], dim=-1) * one.new_tensor(
-            [0.2, 0.2, 1.0]
-        )
+        start = torch.stack([0.2 * angle.cos(), 0.2 * angle.sin(), angle + math.pi], dim=-1)
         seen = Observations.of(network, action=(0 * one, start[:, None]))
         return network.predict(features, seen, one).effect_mean
 

@@ -15,9 +15,8 @@ def test_harmonics_turn_as_their_image_does(some):
     angle = math.tau * torch.rand(40, generator=torch.Generator().manual_seed(0))
     for turn, exact in ((torch.full((40,), math.pi / 2), True), (angle, False)):
         towards = torch.stack([turn.cos(), turn.sin()], dim=-1)
-        turned = (
-            torch.rot90(some.image, 1, (-2, -1)) if exact else rotate_image(some.image, towards)
-        )
+        quarter = torch.rot90(some.image, 1, (-2, -1))
+        turned = quarter if exact else rotate_image(some.image, towards)
         kept = (1 - turned[:, 0]).sum(dim=(1, 2)) / (1 - some.image[:, 0]).sum(dim=(1, 2))
         assert (kept - 1).abs().max() < 0.01  # of the object's height, also in the corners
         off = harmonics.rotated(known, towards) - harmonics(turned)

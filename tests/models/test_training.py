@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import operator
 import pickle
 
 import pytest
@@ -19,10 +20,9 @@ from experiments.shipped import one_at_a_time
 def fresh(arrays):
     """An untrained small network."""
     torch.manual_seed(0)
-    small = models.FiLMConfig(
-        arrays.action_channels, arrays.effect_channels, width=32, blocks=2, rings=3, orders=4
-    )
-    return models.build(small, Scaler.fit(arrays)).eval()
+    channels, small = (arrays.action_channels, arrays.effect_channels), {"width": 32, "blocks": 2}
+    config = models.FiLMConfig(*channels, **small, rings=3, orders=4)
+    return models.build(config, Scaler.fit(arrays)).eval()
 
 
 def test_the_literal_loop_draws_up_to_all_observations(some):
@@ -71,9 +71,8 @@ def test_training_resumes_to_the_same_bits(some, tmp_path, monkeypatch):
             models.train(broken, some, some, config, resume_checkpoint=file)
     again = fresh(some)
     resumed = models.train(again, some, some, config, resume_checkpoint=file)
-    assert [(h.step, h.loss, h.validation_error) for h in resumed] == [
-        (h.step, h.loss, h.validation_error) for h in history
-    ]
+    kept = operator.attrgetter("step", "loss", "validation_error")
+    assert [*map(kept, resumed)] == [*map(kept, history)]
     assert all(map(torch.equal, whole.parameters(), again.parameters()))
     assert again.sigma_floor == whole.sigma_floor
     other = dataclasses.replace(config, steps=10)
@@ -155,17 +154,15 @@ def test_the_shipped_networks_reach_their_goals(
     model, about = models.load_checkpoint(name)
     split = split_interactions(n)
     assert about["seen_interactions"] == sorted([*split.train, *split.validation])
-    test = InteractionTensors.from_dataset(
-        held_out_pushes, None, *(model.action_channels, model.effect_channels)
-    )
+    channels = model.action_channels, model.effect_channels
+    test = InteractionTensors.from_dataset(held_out_pushes, None, *channels)
     errors = 1000 * final_errors_m(model, test)
     box = torch.from_numpy(held_out_pushes["category"].values == 0)
     assert (errors[box].mean() + errors[~box].mean()) / 2 < all_mm
     assert errors[box].mean() < cuboid_mm
     assert errors.quantile(0.95) < p95_mm
     with torch.no_grad():
-        predicted = model.predict(
-            model.encode(test.image), condition_on_recorded_action(test), torch.ones(len(test), 1)
-        )
+        given = condition_on_recorded_action(test), torch.ones(len(test), 1)
+        predicted = model.predict(model.encode(test.image), *given)
     off = (predicted.effect_mean[:, 0, 2] - test.effect[:, -1, 2])[box].abs().mean()
     assert math.degrees(off) < yaw_deg

@@ -7,29 +7,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from affordlib import planning
 from affordlib.perception import adapt_to_object
-from affordlib.planning import (
-    ClosedLoopConfig,
-    Robot,
-    execute_plan,
-    plan_astar,
-    plan_continuous,
-    plan_gradient,
-    run_closed_loop,
-)
+from affordlib.planning import execute_plan, plan_astar, plan_continuous, run_closed_loop
 from affordlib.planning.closed_loop import DISPLACED_M
 from affordlib.planning.grasp_rotate import GRIPPER_YAWS_RAD
 from affordlib.planning.reachability import Reachability
 from affordlib.primitives import Drag, Grasp, Push, Rotate
-from affordlib.types import Goal, Plan, Step
-from affordlib.world import (
-    Cuboid,
-    LyingCylinder,
-    Sphere,
-    UnreachableError,
-    UprightCylinder,
-    WorldConfig,
-)
+from affordlib.types import Goal, Plan, Step, UnreachableError
+from affordlib.world import Cuboid, LyingCylinder, Sphere, UprightCylinder, WorldConfig
 from affordlib.world.execution import put_down
 from affordlib.world.objects import PlacedObject
 from experiments.closed_loop import Trial, _stays_feasible, sample_disturbance
@@ -38,30 +24,33 @@ from experiments.planning import corrected
 from tests.planning.point_robot import PointRobot, point_skills
 from tests.problems import problem_of
 
+PLANNERS = pytest.mark.parametrize("planner", [plan_astar, plan_continuous, planning.plan_gradient])
 EXACT_M = 0.002
 BOX, TUBE, BALL = Cuboid(0.06, 0.05, 0.05), UprightCylinder(0.05, 0.07), Sphere(0.06)
 
 
-def loop(robot, goal, skills=None, planner=plan_continuous, **config):
-    """Run a closed loop, by default with models of a `PointRobot` without its overshoot."""
-    skills = skills or point_skills()
-    return run_closed_loop(robot, goal, skills, planner, config=ClosedLoopConfig(**config))
+def loop(robot, goal, skills=None, planner=plan_continuous, ends=None, **config):
+    """Run a closed loop, by default with models of a `PointRobot` without its overshoot.
+
+    ends: the status that it must have at its end, if not any.
+    """
+    config = planning.ClosedLoopConfig(**config)
+    went = run_closed_loop(robot, goal, skills or point_skills(), planner, config=config)
+    assert ends in (None, went.status), went.message
+    assert went.reached == (went.status == "reached")
+    return went
 
 
-def disturbed(world, goal, skills, *disturbances):
+def disturbed(world, goal, skills, *disturbances, ends="reached"):
     schedule = DisturbanceSchedule(world, goal, disturbances)
-    return run_closed_loop(schedule, schedule.current_goal, skills), schedule
+    return loop(schedule, schedule.current_goal, skills, ends=ends), schedule
 
 
-# On a robot in pure Python
-
-
-@pytest.mark.parametrize("planner", [plan_astar, plan_continuous, plan_gradient])
+@PLANNERS
 def test_every_planner_brings_a_pose_about(planner):
     robot, goal = PointRobot(), Goal((0.21, -0.06), 0.01, turn_rad=1.3, height_m=0.1)
-    assert isinstance(robot, Robot)
-    went = loop(robot, goal, planner=planner)
-    assert went.status == "unconfirmed", went.message  # what the hand holds is not seen
+    assert isinstance(robot, planning.Robot)
+    went = loop(robot, goal, planner=planner, ends="unconfirmed")  # what the hand holds is not seen
     assert went.message.endswith("the position and orientation computed, not observed")
     kinds = [type(step.primitive) for step in went.steps]
     assert kinds == [Push] * (len(kinds) - 3) + [Rotate, Rotate, Grasp]  # in sweeps of 60°
@@ -94,8 +83,7 @@ def test_an_object_that_always_escapes_ends_the_loop():
     def take_away(plan, n):
         robot.xy_m = (0.0, 0.0)
 
-    went = loop(robot, Goal((0.06, 0.0), EXACT_M), on_action=take_away)
-    assert went.status == "gave_up"
+    went = loop(robot, Goal((0.06, 0.0), EXACT_M), on_action=take_away, ends="gave_up")
     assert 5 < len(went.steps) <= 4 * 5
 
 
@@ -111,8 +99,7 @@ def test_a_planner_that_does_not_help_is_given_up_and_it_is_said_why(n_steps, en
 
 
 def test_the_loop_plans_in_its_mode():
-    went = loop(PointRobot(), Goal((0.15, 0.0), EXACT_M), mode="single_partial")
-    assert went.reached
+    went = loop(PointRobot(), Goal((0.15, 0.0), EXACT_M), mode="single_partial", ends="reached")
     assert {len(plan.steps) for plan in went.plans} == {1}
 
 
@@ -121,10 +108,9 @@ def test_nothing_is_reached_that_the_camera_cannot_tell():
         def observe(self):
             return replace(super().observe(), std_m=0.0005)
 
-    went = loop(Blurred(), Goal((0.08, 0.0), 0.0005))
-    assert went.status == "unconfirmed", went.message
+    went = loop(Blurred(), Goal((0.08, 0.0), 0.0005), ends="unconfirmed")
     assert went.message.endswith("the position observed less exactly than required")
-    assert loop(Blurred(), Goal((0.08, 0.0), 0.02)).reached
+    loop(Blurred(), Goal((0.08, 0.0), 0.02), ends="reached")
 
 
 @pytest.mark.parametrize("change", [{"xy_m": (0.75, 0.0)}, {"visible": False}])
@@ -134,7 +120,7 @@ def test_an_object_that_is_gone_is_lost(change):
     assert (went.status, len(went.steps)) == ("lost", 1)
 
 
-@pytest.mark.parametrize("planner", [plan_astar, plan_continuous, plan_gradient])
+@PLANNERS
 def test_a_goal_that_moves_is_followed(planner):
     goal, robot = Goal((0.1, 0.0), EXACT_M, turn_rad=-0.4), PointRobot(yaw_rad=0.0)
     goals = [Goal((0.1, 0.08), EXACT_M, turn_rad=turn) for turn in (-0.4, -0.8, -1.2)]
@@ -145,8 +131,7 @@ def test_a_goal_that_moves_is_followed(planner):
         if goals and (off < 0.05 or goal.xy_m == (0.1, 0.0)):
             goal = goals.pop(0)
 
-    went = loop(robot, lambda: goal, on_action=move, planner=planner)
-    assert went.reached, went.message
+    went = loop(robot, lambda: goal, on_action=move, planner=planner, ends="reached")
     assert (goals, went.goal) == ([], goal)
     assert goal.distance_m(robot.xy_m) < EXACT_M
     with pytest.raises(TypeError, match="goal must be a Goal"):
@@ -161,8 +146,7 @@ def test_what_somebody_has_set_rolling_is_waited_for():
             x, y = robot.xy_m
             robot.xy_m, robot.velocity = (x, y + DISPLACED_M + 0.01), (0.0, 0.2)
 
-    went = loop(robot, Goal((0.16, 0.0), EXACT_M), on_action=knock)
-    assert went.reached
+    went = loop(robot, Goal((0.16, 0.0), EXACT_M), on_action=knock, ends="reached")
     assert robot.velocity[1] < 0.01
     assert went.seen_xy_m[1][1] > DISPLACED_M + 0.09
 
@@ -176,15 +160,13 @@ def test_a_veto_is_remembered_and_another_plan_made():
             return True
         return False
 
-    went = loop(PointRobot(refuses=refuses), Goal((0.1, 0.05), EXACT_M))
-    assert went.reached, went.message
+    went = loop(PointRobot(refuses=refuses), Goal((0.1, 0.05), EXACT_M), ends="reached")
     assert abs(went.steps[0].primitive.direction_rad - refused[0]) > 0.05
 
 
 def test_what_the_arm_cannot_do_is_refused_before_any_motion():
     robot = PointRobot((0.5, 0.3), refuses=lambda primitive, at: at[1] > 0.45)
-    went = loop(robot, Goal((0.5, 0.62), EXACT_M))
-    assert went.status == "unreachable"
+    went = loop(robot, Goal((0.5, 0.62), EXACT_M), ends="unreachable")
     assert "the position (0.500, 0.620) m: the arm cannot bring it there" in went.message
     robot = PointRobot((0.5, 0.3))
     went = loop(robot, Goal((0.5, 0.69)))
@@ -196,8 +178,7 @@ def test_what_the_arm_cannot_do_is_refused_before_any_motion():
     assert went.message.endswith("left: the arm cannot grasp at (0.000, 0.000) m")
     tried = []
     hands.refuses = lambda primitive, at: tried.append(primitive.grip_yaw) or len(tried) < 3
-    went = loop(hands, Goal((0.0, 0.0), turn_rad=0.5))
-    assert went.reached
+    went = loop(hands, Goal((0.0, 0.0), turn_rad=0.5), ends="reached")
     assert went.steps[0].primitive.grip_yaw == tried[-1]
     assert len(set(tried)) == 3
 
@@ -208,8 +189,7 @@ def test_a_far_goal_is_reached_round_what_the_arm_cannot_do():
             return 1.0 - ((xy_m[:, 0] > 0.1) & (np.abs(xy_m[:, 1]) < 0.06))
 
     robot, skills = PointRobot((0.2, -0.3)), replace(point_skills(), reachability=Learned(["push"]))
-    went = loop(robot, Goal((0.2, 0.25), EXACT_M), skills, max_actions=20)
-    assert went.reached, went.message
+    went = loop(robot, Goal((0.2, 0.25), EXACT_M), skills, max_actions=20, ends="reached")
     assert min(path[0, 0] for path in went.object_paths_xy_m) < 0.1
 
 
@@ -233,8 +213,7 @@ def test_what_is_held_aside_of_its_goal_is_put_down_and_lifted_there(shifts_m, l
             new = {"height_m": None} if by_m is None else {"xy_m": (goal.xy_m[0] + by_m, 0.0)}
             goal = replace(goal, **new)
 
-    went = loop(PointRobot(), lambda: goal, on_action=move_goal)
-    assert went.status == status, went.message
+    went = loop(PointRobot(), lambda: goal, on_action=move_goal, ends=status)
     assert sum(isinstance(step.primitive, Grasp) for step in went.steps) == lifts
     aside_m = shifts_m[-1] if status == "gave_up" else 0.0
     assert went.distance_m == pytest.approx(aside_m, abs=0.005)
@@ -246,13 +225,12 @@ def test_what_is_held_aside_of_its_goal_is_put_down_and_lifted_there(shifts_m, l
 def test_a_turn_that_nobody_sees_is_reckoned_by_the_hand_and_said_to_be(sees_yaw):
     """The image of a disc does not show its rotation."""
     robot = PointRobot(sees_yaw=sees_yaw)
-    went = loop(robot, Goal((0.1, 0.0), EXACT_M, turn_rad=1.7))
-    assert went.status == ("reached" if sees_yaw else "unconfirmed"), went.message
+    status = "reached" if sees_yaw else "unconfirmed"
+    went = loop(robot, Goal((0.1, 0.0), EXACT_M, turn_rad=1.7), ends=status)
     assert robot.yaw_rad == pytest.approx(0.2 + 1.7, abs=math.radians(2))
     assert went.end_pose[2] == pytest.approx(robot.yaw_rad - 0.2, abs=math.radians(0.2))
     assert went.reckoned == (() if sees_yaw else ("orientation",))
-    lifted = loop(robot, Goal(robot.xy_m, height_m=0.1))
-    assert lifted.status == "unconfirmed"
+    lifted = loop(robot, Goal(robot.xy_m, height_m=0.1), ends="unconfirmed")
     assert lifted.reckoned == ("position", "orientation")
 
 
@@ -273,12 +251,10 @@ def test_the_grip_is_kept_unless_somebody_displaces_the_object(shove_m, kept):
 
 @pytest.mark.parametrize(("slips", "status"), [(1, "unconfirmed"), (2, "gave_up")])
 def test_a_slip_is_noticed_by_the_fingers(slips, status):
-    went = loop(PointRobot(slips=slips), Goal((0.0, 0.0), height_m=0.1))
-    assert went.status == status, went.message
+    went = loop(PointRobot(slips=slips), Goal((0.0, 0.0), height_m=0.1), ends=status)
     assert [step.primitive.name for step in went.steps] == ["grasp"] * 2
-    assert went.errors["height"].left == pytest.approx(
-        0.0 if status == "unconfirmed" else 0.1, abs=0.003
-    )
+    left_m = 0.0 if status == "unconfirmed" else 0.1
+    assert went.errors["height"].left == pytest.approx(left_m, abs=0.003)
 
 
 def test_corrections_bring_it_nearer_and_stop_where_enough():
@@ -323,9 +299,6 @@ def test_what_was_done_before_the_arm_refused_is_kept():
     assert (went.status, went.message) == ("unreachable", "the height: out of reach")
 
 
-# On the simulated table
-
-
 def test_the_kinematics_agrees_with_what_execution_refuses(world):
     rng = np.random.default_rng(4)
     refused, steps = 0, []
@@ -350,8 +323,7 @@ def test_the_arm_is_asked_about_the_grasp_that_it_will_execute(world, skills):
     """At the limit of its reach the hand's height matters, which depends on the object's."""
     for x, status in ((0.52, "unconfirmed"), (0.526, "unreachable")):
         world.place(Cuboid(0.05, 0.05, 0.08), (x, 0.0))
-        went = run_closed_loop(world, Goal((x, 0.0), EXACT_M, height_m=0.24), skills)
-        assert went.status == status, went.message
+        went = loop(world, Goal((x, 0.0), EXACT_M, height_m=0.24), skills, ends=status)
         assert x == 0.52 or went.steps == ()
 
 
@@ -363,7 +335,6 @@ def test_a_toppled_cylinder_is_dragged(world, skills):
     assert schedule.happened == [falls]
     assert world.placed.fell()
     assert [type(s.primitive) for s in went.steps][:2] == [Push, Drag]
-    assert went.reached, went.message
 
 
 def test_a_goal_moves_and_an_object_is_shoved_as_scheduled(world, skills):
@@ -373,15 +344,13 @@ def test_a_goal_moves_and_an_object_is_shoved_as_scheduled(world, skills):
     went, schedule = disturbed(world, Goal((0.1, 0.0), EXACT_M), skills, moves, shove)
     assert schedule.happened == [moves, shove]
     assert went.goal.xy_m == pytest.approx((0.1, 0.08))
-    assert went.reached, went.message
     assert went.goal.distance_m(world.object_pose()[:2]) < 0.005
 
 
 def test_an_object_that_no_camera_sees_is_lost(world, skills):
     world.place(BALL, (0.5, 0.0), config=WorldConfig(camera="kinect"))
     off = Disturbance("knock", 1, 1.5, 0.0)
-    went, _ = disturbed(world, Goal((0.4, 0.1), EXACT_M), skills, off)
-    assert went.status == "lost", went.message
+    disturbed(world, Goal((0.4, 0.1), EXACT_M), skills, off, ends="lost")
 
 
 def test_what_lies_can_be_toppled_again(world):
@@ -488,8 +457,7 @@ def test_no_task_needs_the_state_of_the_simulator(world, skills, monkeypatch, ca
     goal = Goal((0.06, -0.03), 0.004, **pose)
     with monkeypatch.context() as patched:
         robot = knowing_only_what_it_measures(world, patched)
-        config = ClosedLoopConfig(n_images=1 if camera == "ideal" else 8)
-        went = run_closed_loop(robot, goal, skills, config=config)
+        went = loop(robot, goal, skills, n_images=1 if camera == "ideal" else 8)
     seen = goal.height_m is None and (goal.turn_rad is None or obj is not BALL)
     assert went.status in ("reached", "unconfirmed"), went.message
     assert went.reached or not (seen and camera == "ideal")
@@ -512,11 +480,8 @@ def test_no_task_needs_the_state_of_the_simulator(world, skills, monkeypatch, ca
 @pytest.mark.slow
 def test_a_goal_across_the_table_is_reached_in_the_limit_or_refused(world, skills):
     world.place(BALL, (0.2, -0.4), 0.0)
-    went = run_closed_loop(world, Goal((0.2, 0.25), EXACT_M), skills)
-    assert went.reached, went.message
-    assert len(went.steps) <= 16
+    assert len(loop(world, Goal((0.2, 0.25), EXACT_M), skills, ends="reached").steps) <= 16
     world.place(BOX, (0.5, 0.3), 0.0)
     pose = world.object_pose()
-    went = run_closed_loop(world, Goal((0.65, 0.65), EXACT_M), skills)
-    assert (went.status, went.steps) == ("unreachable", ()), went.message
+    assert loop(world, Goal((0.65, 0.65), EXACT_M), skills, ends="unreachable").steps == ()
     assert world.object_pose() == pose

@@ -5,14 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from affordlib.planning import execute_plan, plan_astar, plan_continuous
-from affordlib.planning.grasp_rotate import (
-    GRIPPER_YAWS_RAD,
-    candidate_lifts,
-    candidate_turns,
-    crossings,
-    predict_trajectories,
-)
+from affordlib.planning import execute_plan, grasp_rotate, plan_astar, plan_continuous
+from affordlib.planning.grasp_rotate import GRIPPER_YAWS_RAD, crossings, predict_trajectories
 from affordlib.primitives import Drag, Grasp, Push, Rotate, wrap_angle
 from affordlib.types import Goal
 from affordlib.world import Cuboid, LyingCylinder, UprightCylinder
@@ -26,17 +20,14 @@ PLANNERS = pytest.mark.parametrize("plan", [plan_astar, plan_continuous])
 AT = (0.0, 0.0)
 
 
-def plan_turn(model, image, xy_m, turn_rad):
-    return next(
-        candidate_turns(predict_trajectories(model, image, Rotate(), "yaw"), xy_m, turn_rad), None
-    )
+def plan_turn(model, image, turn_rad):
+    predicted = predict_trajectories(model, image, Rotate(), "yaw")
+    return next(grasp_rotate.candidate_turns(predicted, AT, turn_rad), None)
 
 
-def plan_lift(model, image, xy_m, height_m, yaws=GRIPPER_YAWS_RAD):
-    return next(
-        candidate_lifts(predict_trajectories(model, image, Grasp(), "z", yaws), xy_m, height_m),
-        None,
-    )
+def plan_lift(model, image, height_m, yaws=GRIPPER_YAWS_RAD):
+    predicted = predict_trajectories(model, image, Grasp(), "z", yaws)
+    return next(grasp_rotate.candidate_lifts(predicted, AT, height_m), None)
 
 
 def test_crossings_are_where_the_trajectory_has_the_value():
@@ -52,7 +43,7 @@ def test_crossings_are_where_the_trajectory_has_the_value():
 )
 def test_a_partial_rotation_turns_by_the_angle_either_way(world, skills, obj, degrees):
     world.place(obj, AT, 0.2)
-    step = plan_turn(skills.model(Rotate), world.depth_image(), AT, math.radians(degrees))
+    step = plan_turn(skills.model(Rotate), world.depth_image(), math.radians(degrees))
     turned = math.degrees(world.execute(step).rest_effect[3])
     assert turned == pytest.approx(degrees, abs=2)
     assert step.predicted_turn_rad == pytest.approx(math.radians(degrees))
@@ -61,20 +52,20 @@ def test_a_partial_rotation_turns_by_the_angle_either_way(world, skills, obj, de
 def test_what_cannot_be_had_is_not_planned(world, skills):
     world.place(BOX)
     image = world.depth_image()
-    assert plan_lift(skills.model(Grasp), image, AT, 0.4) is None
+    assert plan_lift(skills.model(Grasp), image, 0.4) is None
     with pytest.raises(ValueError, match="channel 'yaw' is not among the effects"):
-        plan_turn(skills.model(Grasp), image, AT, 0.5)
+        plan_turn(skills.model(Grasp), image, 0.5)
 
 
 def test_the_hand_takes_what_it_can_hold(world, skills):
     world.place(DISC, yaw_rad=0.6)
     image = world.depth_image()
-    step = plan_lift(skills.model(Grasp), image, AT, 0.15)
+    step = plan_lift(skills.model(Grasp), image, 0.15)
     assert step.primitive.grip_yaw != 0
     assert world.execute(step).rest_effect[2] == pytest.approx(0.15, abs=0.005)
     world.place(DISC, yaw_rad=0.6)
     assert world.execute_primitive(Grasp()).effect[-1, 2] < 0.01
-    assert plan_lift(skills.model(Grasp), image, AT, 0.15, [0.0]) is None
+    assert plan_lift(skills.model(Grasp), image, 0.15, [0.0]) is None
 
 
 @pytest.mark.parametrize(

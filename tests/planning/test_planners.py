@@ -35,9 +35,6 @@ def known(goal_xy, mode="multi_partial", tolerance_m=0.02, model=MODEL, **more):
     return problem_of(model, IMAGE, (0.0, 0.0), Goal(goal_xy, tolerance_m), mode, **more)
 
 
-# The map
-
-
 @pytest.mark.parametrize("kind", [Push, Drag])
 def test_an_effect_map_says_what_the_model_says(world, film, kind):
     world.place(Cuboid(0.07, 0.05, 0.05), (0.0, 0.0), 0.4)
@@ -76,9 +73,6 @@ def test_a_chain_turns_with_the_object(world, film):
     np.testing.assert_allclose(positions[0, 1] - positions[0, 0], moved, atol=1e-12)
     assert float(turns[0, 1]) == pytest.approx(float(first[0, 2] + second[0, 2]))
     assert float(variances[0, 1]) > float(variances[0, 0]) > 0
-
-
-# A*
 
 
 class RandomTable(BranchTable):
@@ -127,13 +121,18 @@ def test_astar_finds_what_exhaustive_search_finds(seed, heuristic):
         assert goal.distance_m(end) == pytest.approx(nearest, abs=1e-9)
 
 
-def test_branches_are_the_papers_180():
-    direction, stop_phase, effect_m, _ = BranchTable(planning.EffectMap(MODEL, IMAGE)).at(0.0)
+def test_branches_are_the_papers_180_of_the_action_or_of_its_recorded_part():
+    effects, shares = planning.EffectMap(MODEL, IMAGE), np.array([0.2, 0.4, 0.6, 0.8, 1.0])
+    stops = phases_of_way(effects, shares)
+    np.testing.assert_allclose(stops, STARTS + (1 - STARTS) * np.sqrt(shares), atol=0.005)
     # Actions that stop before contact are pruned: 36 x {80, 100 %} remain.
-    assert len(direction) == 72
-    assert set(np.round(stop_phase, 3)) == {0.8, 1.0}
-    expected = moved_m(stop_phase) * np.stack([np.cos(direction), np.sin(direction)])
-    np.testing.assert_allclose(effect_m, expected, atol=1e-4)
+    for given, kept, off_m in (({}, [0.8, 1.0], 1e-4), ({"stop_phases": stops}, stops, 1e-3)):
+        direction, stop_phase, effect_m, _ = BranchTable(effects, **given).at(0.0)
+        assert len(direction) == 36 * len(kept)
+        assert set(np.round(stop_phase, 3)) == set(np.round(kept, 3))
+        expected = moved_m(stop_phase) * np.stack([np.cos(direction), np.sin(direction)])
+        np.testing.assert_allclose(effect_m, expected, atol=off_m)
+    np.testing.assert_allclose(np.hypot(*effect_m), np.tile(REACH_M * shares, 36), atol=1e-3)
 
 
 def test_numbers_of_few_bits_plan_as_others_and_numbers_without_end_are_refused():
@@ -145,16 +144,6 @@ def test_numbers_of_few_bits_plan_as_others_and_numbers_without_end_are_refused(
         BranchTable(effects, stop_phases=np.linspace(0.01, 1, 101))
     with pytest.raises(ValueError, match=r"Reading\.rate must be a finite number"):
         Reading(rate=math.nan)
-
-
-def test_segments_of_the_recorded_part_are_the_papers_180_branches():
-    shares = np.array([0.2, 0.4, 0.6, 0.8, 1.0])
-    effects = planning.EffectMap(MODEL, IMAGE)
-    stops = phases_of_way(effects, shares)
-    np.testing.assert_allclose(stops, STARTS + (1 - STARTS) * np.sqrt(shares), atol=0.005)
-    _, _, effect_m, _ = BranchTable(effects, stop_phases=stops).at(0.0)
-    ends_m = np.hypot(*effect_m).reshape(36, 5)
-    np.testing.assert_allclose(ends_m, np.tile(REACH_M * shares, (36, 1)), atol=1e-3)
 
 
 def test_a_search_goes_on_where_the_end_cannot_be_had(film, cuboid_image):
@@ -188,9 +177,6 @@ def test_a_plan_reaches_the_goal_only_where_it_says_that_it_ends_there(film, cub
         near = Goal(xy, ends.predicted_distance_m - 1e-6)
         plan = planning.plan_astar(problem_of(film, cuboid_image, (0.0, 0.0), near))
         assert plan.reaches_goal == (plan.predicted_distance_m <= near.tolerance_m)
-
-
-# The continuous planner
 
 
 @pytest.mark.parametrize("goal_xy", [(0.05, 0.02), (-0.03, 0.06), (0.13, -0.11), (0.2, 0.05)])
@@ -233,9 +219,6 @@ def test_of_two_plans_that_of_lower_variance_is_taken():
     assert plan.steps[-1].std_m < 0.004
 
 
-# The paper's gradient planner
-
-
 class Turned(KnownDynamics):
     """Known dynamics whose predicted effect is turned by a constant angle from the observed one."""
 
@@ -250,13 +233,8 @@ class Turned(KnownDynamics):
         return replace(found, effect_mean=found.effect_mean @ turn)
 
 
-READINGS = [
-    Reading(),
-    Reading(starts=4),
-    Reading(finds="point"),
-    Reading("adam", "circle", rate=0.005),
-    Reading("adam", "circle", "point", 0.005),
-]
+READINGS = [Reading(), Reading(starts=4), Reading(finds="point")]
+READINGS += [Reading("adam", "circle", finds, rate=0.005) for finds in ("direction", "point")]
 
 
 @pytest.mark.parametrize("reading", READINGS, ids=str)
@@ -342,9 +320,6 @@ def test_a_decoded_path_is_followed(world):
     np.testing.assert_allclose(done.rest_effect[:2], own.rest_effect[:2], atol=0.001)
 
 
-# All of them
-
-
 @pytest.mark.filterwarnings("ignore:none of 5 random starts")
 @pytest.mark.parametrize("plan", PLANNERS)
 def test_planners_keep_to_mode_reach_and_table(plan):
@@ -372,9 +347,6 @@ def test_a_goal_without_room_for_the_object_is_refused(film, cuboid_image, xy):
 def test_a_model_of_other_actions_plans_no_pushes(cuboid_image, name, plan):
     with pytest.raises(ValueError, match=r"model must have x|train on such actions"):
         plan(problem_of(load_checkpoint(name)[0], cuboid_image, (0.0, 0.0), Goal((0.1, 0.05))))
-
-
-# Goals, and plans that are executed
 
 
 @pytest.mark.slow

@@ -1,8 +1,4 @@
-"""Notebook 00, the two explorers and the web pages in a real browser.
-
-JupyterLab runs on this machine, in headless Chromium. Pictures and measured times are stored in
-`runs/browser/`.
-"""
+"""Notebook 00, an explorer and the web pages in headless Chromium; pictures: `runs/browser/`."""
 
 import json
 import os
@@ -37,7 +33,7 @@ def free_port():
 
 
 @contextmanager
-def serve(folder, name, more_cells=(), app="jupyterlab", **parameters):
+def serve(folder, name, more_cells=(), app="jupyterlab"):
     """Start a Jupyter with separate settings, workspaces and run-time files, and one notebook.
 
     more_cells: code added after the goal picker; the page omits cells that are far out of view.
@@ -45,32 +41,20 @@ def serve(folder, name, more_cells=(), app="jupyterlab", **parameters):
     book = folder / "book"
     book.mkdir()
     file, out = book / f"{name}.ipynb", folder / "out"
-    notebook = papermill.execute_notebook(
-        repo_root() / "notebooks" / f"{name}.ipynb",
-        None,
-        {"out_dir": str(out), **parameters},
-        prepare_only=True,
-        kernel_name="python3",
-        language="python",
-    )
+    source, given = repo_root() / "notebooks" / f"{name}.ipynb", {"out_dir": str(out)}
+    python = {"kernel_name": "python3", "language": "python"}
+    notebook = papermill.execute_notebook(source, None, given, prepare_only=True, **python)
     after = [k for k, cell in enumerate(notebook.cells) if "GoalPicker." in cell.source][-1] + 1
     notebook.cells[after:after] = [nbformat.v4.new_code_cell(cell) for cell in more_cells]
     nbformat.write(notebook, file)
     port, token = free_port(), secrets.token_hex(16)
     own = {f"JUPYTER_{part}_DIR": str(folder / part) for part in ("CONFIG", "DATA", "RUNTIME")}
     traits = {"jupyterlab": "LabApp", "notebook": "JupyterNotebookApp"}[app]
-    options = [
-        "--no-browser",
-        "--allow-root",
-        "--ip=127.0.0.1",
-        f"--port={port}",
-        "--ServerApp.port_retries=0",
-        f"--ServerApp.root_dir={book}",
-        f"--IdentityProvider.token={token}",
-        f"--{traits}.expose_app_in_browser=True",
-        f"--{traits}.user_settings_dir={folder / 'settings'}",
-        f"--{traits}.workspaces_dir={folder / 'workspaces'}",
-    ]
+    options = ["--no-browser", "--allow-root", "--ip=127.0.0.1", f"--port={port}"]
+    options += ["--ServerApp.port_retries=0", f"--ServerApp.root_dir={book}"]
+    options += [f"--IdentityProvider.token={token}", f"--{traits}.expose_app_in_browser=True"]
+    options += [f"--{traits}.user_settings_dir={folder / 'settings'}"]
+    options += [f"--{traits}.workspaces_dir={folder / 'workspaces'}"]
     log, environment = folder / "lab.log", os.environ | own | {"JUPYTER_PREFER_ENV_PATH": "1"}
     with log.open("w") as said:
         command = [sys.executable, "-m", app, *options]
@@ -185,10 +169,9 @@ def assert_same_goal(page, table, x_m, y_m, within_m=0.0011):
     wanted = goal_of(page)
     assert wanted == pytest.approx((x_m, y_m), abs=within_m)
     np.testing.assert_allclose(table.goal(), wanted, atol=3e-4)
-    shown = page.locator(".affordlib-picker .widget-readout").all_inner_texts()[:2]
-    assert [float(text.replace("−", "-")) for text in shown] == pytest.approx(
-        [100 * v for v in wanted]
-    )
+    texts = page.locator(".affordlib-picker .widget-readout").all_inner_texts()[:2]
+    shown = [float(text.replace("−", "-")) for text in texts]
+    assert shown == pytest.approx([100 * v for v in wanted])
 
     def drawn_is_planned():  # a better plan may follow the first
         paths = ask(page, "[s.predicted_path_xy_m.tolist() for s in picker.plan.steps]")

@@ -20,9 +20,8 @@ def test_a_footprint_is_drawn_where_the_object_is(world, trained):
     np.testing.assert_allclose(np.ptp(outline, axis=0), [4.0, 6.0], atol=1e-9)
     np.testing.assert_allclose(outline[:-1].mean(axis=0), [10.0, -5.0], atol=1e-9)
     world.place(Cuboid(0.06, 0.05, 0.05))
-    outcome = execute_plan(
-        world, plan_astar(problem_of(trained, world.depth_image(), (0.0, 0.0), Goal((0.12, 0.0))))
-    )
+    problem = problem_of(trained, world.depth_image(), (0.0, 0.0), Goal((0.12, 0.0)))
+    outcome = execute_plan(world, plan_astar(problem))
     assert "mm from the goal" in plot_outcome(ax, outcome, world.obj).get_title(loc="left")
     last = [line.get_xydata()[:-1] for line in ax.lines if len(line.get_xydata()) == 5][-1]
     np.testing.assert_allclose(last.mean(axis=0), 100 * np.array(outcome.end_pose[:2]), atol=1e-9)

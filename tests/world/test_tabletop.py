@@ -7,18 +7,10 @@ import pytest
 from pybullet_utils.bullet_client import BulletClient
 
 from affordlib.primitives import Grasp, LeverUp, Push
-from affordlib.types import CROP_WIDTH_M, IMAGE_PIXELS, Obstacle
-from affordlib.world import (
-    Cuboid,
-    LyingCylinder,
-    Prism,
-    Sphere,
-    Tabletop,
-    UnreachableError,
-    UprightCylinder,
-    WorldConfig,
-    robot,
-)
+from affordlib.types import CROP_WIDTH_M, IMAGE_PIXELS, Obstacle, UnreachableError
+from affordlib.world import Cuboid, LyingCylinder, Prism, Sphere, Tabletop, UprightCylinder
+from affordlib.world.objects import WorldConfig
+from affordlib.world.robot import HOME, TOOL_LENGTH_M, inverse_kinematics, load_robot
 
 OBJECTS = (Cuboid(0.05, 0.07, 0.06), UprightCylinder(0.06, 0.05))
 LEVER = LeverUp(-0.03, 0.0, 0.0, 0.06)
@@ -27,17 +19,17 @@ STAR = tuple((0.05 * math.cos(a), 0.05 * math.sin(a)) for a in 0.8 * math.pi * n
 
 def test_inverse_kinematics_agrees_with_the_description():
     client = BulletClient(pybullet.DIRECT)
-    arm = robot.load_robot(client)
+    arm = load_robot(client)
     rng = np.random.default_rng(0)
     for _ in range(50):
         xyz = rng.uniform([-0.4, -0.5, 0.01], [0.4, 0.5, 0.2])
         yaw = rng.uniform(-math.pi, math.pi)
-        joints = robot.inverse_kinematics(xyz, yaw, np.array(robot.HOME))
+        joints = inverse_kinematics(xyz, yaw, np.array(HOME))
         for joint, angle in enumerate(joints):
             client.resetJointState(arm, joint, angle)
         state = client.getLinkState(arm, 6, computeForwardKinematics=True)
         axes = np.array(pybullet.getMatrixFromQuaternion(state[5])).reshape(3, 3)
-        tip = np.array(state[4]) + robot.TOOL_LENGTH_M * axes[:, 2]
+        tip = np.array(state[4]) + TOOL_LENGTH_M * axes[:, 2]
         np.testing.assert_allclose(tip, xyz, atol=1e-6)
         np.testing.assert_allclose(axes[:2, 0], [math.cos(yaw), math.sin(yaw)], atol=1e-6)
 
