@@ -7,8 +7,15 @@ import pytest
 
 from affordlib import perception
 from affordlib.primitives import Push
-from affordlib.world import CATEGORIES, Cuboid, LyingCylinder, Prism, Sphere, UprightCylinder
-from affordlib.world.objects import WorldConfig
+from affordlib.world import (
+    CATEGORIES,
+    Cuboid,
+    LyingCylinder,
+    Prism,
+    Sphere,
+    UprightCylinder,
+    WorldConfig,
+)
 
 
 def _seen(world, obj, yaw=0.3, xy=(0.0, 0.0), **config):

@@ -8,8 +8,15 @@ from pybullet_utils.bullet_client import BulletClient
 
 from affordlib.primitives import Grasp, LeverUp, Push
 from affordlib.types import CROP_WIDTH_M, IMAGE_PIXELS, Obstacle, UnreachableError
-from affordlib.world import Cuboid, LyingCylinder, Prism, Sphere, Tabletop, UprightCylinder
-from affordlib.world.objects import WorldConfig
+from affordlib.world import (
+    Cuboid,
+    LyingCylinder,
+    Prism,
+    Sphere,
+    Tabletop,
+    UprightCylinder,
+    WorldConfig,
+)
 from affordlib.world.robot import HOME, TOOL_LENGTH_M, inverse_kinematics, load_robot
 
 OBJECTS = (Cuboid(0.05, 0.07, 0.06), UprightCylinder(0.06, 0.05))
