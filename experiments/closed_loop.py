@@ -164,10 +164,7 @@ def sample_disturbance(seed: int, n_actions: int = 2, kinds: Sequence[str] = KIN
     return Disturbance(kind, action + (not middle), *xy, float(turn), at_s)
 
 
-@cache
-def one_tabletop() -> Tabletop:
-    """Create the world once per process."""
-    return Tabletop()
+one_tabletop = cache(Tabletop)  # one world per process
 
 
 @lru_cache(maxsize=2)

@@ -22,6 +22,7 @@ import numpy as np
 import pandas as pd
 import torch
 
+from affordlib.geometry import rotated_each
 from affordlib.interactions.recipes import Variation
 from affordlib.planning import (
     ClosedLoopConfig,
@@ -89,33 +90,28 @@ def drawn_object(number: int) -> tuple[TabletopObject, float]:
 
 def drawn_task(family: str, index: int, seed: int) -> ObstacleTask:
     """Draw a task; those in narrow places have no objects that roll, as the open hand is wider."""
-    key = [seed, list(FAMILIES).index(family), index]
-    rng = np.random.default_rng(key)
+    rng = np.random.default_rng([seed, list(FAMILIES).index(family), index])
+
+    def turned(xy: Any, angle_rad: float) -> np.ndarray:
+        return rotated_each(np.array(xy), np.array(angle_rad))
+
     while True:
         number = int(rng.integers(N_OBJECTS))
         obj, yaw = drawn_object(number)
         if obj.rollable and family != "clutter":
             continue
-        outline = placed(obj.footprint_m, np.array([0.0, 0.0, yaw]))
+        outline = turned(obj.footprint_m, yaw)
         angle = rng.uniform(-math.pi, math.pi)
-        local = placed(outline, np.array([0.0, 0.0, -angle]))
-        goal, shapes = LAYOUTS[family](rng, local)
-        obstacles = tuple(_turned(shape, angle) for shape in shapes)
-        turned = placed(np.array([goal]), np.array([0.0, 0.0, angle]))[0]
-        task = ObstacleTask(
-            family, number, obj, yaw, Goal(tuple(turned.tolist()), WITHIN_M), obstacles
+        goal, shapes = LAYOUTS[family](rng, turned(outline, -angle))
+        moved = turned([goal, *(one[:2] for one in shapes)], angle)
+        goal, *centres = map(tuple, moved.tolist())
+        obstacles = tuple(
+            Obstacle.box(at, one[2:4], one[4] + angle) if one[3:] else Obstacle.disc(at, one[2])
+            for at, one in zip(centres, shapes, strict=True)
         )
+        task = ObstacleTask(family, number, obj, yaw, Goal(goal, WITHIN_M), obstacles)
         if _is_fair(task, outline):
             return task
-
-
-def _turned(shape: tuple, angle_rad: float) -> Obstacle:
-    """An obstacle (x, y, length, width, yaw) or (x, y, radius) of a layout, turned with it."""
-    at = placed(np.array([shape[:2]]), np.array([0.0, 0.0, angle_rad]))[0]
-    at = tuple(at.tolist())
-    if len(shape) == 3:
-        return Obstacle.disc(at, shape[2])
-    return Obstacle.box(at, shape[2:4], shape[4] + angle_rad)
 
 
 def _is_fair(task: ObstacleTask, outline: np.ndarray) -> bool:
@@ -142,18 +138,22 @@ def _corridor(rng: np.random.Generator, local: np.ndarray) -> tuple:
     return goal, walls
 
 
-def _walled(rng: np.random.Generator, local: np.ndarray, before_m: float, deep_m: float) -> tuple:
+def _walled(
+    rng: np.random.Generator,
+    local: np.ndarray,
+    deep_m: tuple[float, float],
+    before_m: tuple[float, float] | None = None,
+) -> tuple:
     """Two walls with a third behind them, before_m from the object; the goal is deep_m inside."""
-    half, radius = _half_m(rng, local), float(np.hypot(*local.T).max())
-    mouth = before_m + (radius + 0.01 if before_m else 0.0)
-    end = mouth + deep_m + radius + rng.uniform(0.006, 0.014)
-    aside = rng.uniform(-0.03, 0.03) if before_m else 0.0
-    walls = [
-        (*((mouth + end) / 2, aside + s * (half + WALL_M / 2)), end - mouth, WALL_M, 0.0)
-        for s in (-1, 1)
-    ]
+    before = rng.uniform(*before_m) if before_m else None
+    deep, half, radius = rng.uniform(*deep_m), _half_m(rng, local), np.hypot(*local.T).max()
+    mouth = 0.0 if before is None else before + (radius + 0.01)
+    end = mouth + deep + radius + rng.uniform(0.006, 0.014)
+    aside = 0.0 if before is None else rng.uniform(-0.03, 0.03)
+    x, size = (mouth + end) / 2, (end - mouth, WALL_M, 0.0)
+    walls = [(x, aside + s * (half + WALL_M / 2), *size) for s in (-1, 1)]
     back = end + WALL_M / 2, aside, WALL_M, 2 * half + 2 * WALL_M, 0.0
-    return (mouth + deep_m, aside), [*walls, back]
+    return (mouth + deep, aside), [*walls, back]
 
 
 def _gate(rng: np.random.Generator, local: np.ndarray) -> tuple:
@@ -175,14 +175,14 @@ def _clutter(rng: np.random.Generator, local: np.ndarray) -> tuple:
 
 LAYOUTS = {
     "corridor": _corridor,
-    "pocket": lambda rng, local: _walled(rng, local, 0.0, rng.uniform(0.05, 0.08)),
+    "pocket": partial(_walled, deep_m=(0.05, 0.08)),
     "gate": _gate,
-    "bay": lambda rng, local: _walled(rng, local, rng.uniform(0.03, 0.08), rng.uniform(0.02, 0.04)),
-    "deep bay": lambda rng, local: _walled(
-        rng, local, rng.uniform(0.10, 0.18), rng.uniform(0.05, 0.08)
-    ),
+    "bay": partial(_walled, deep_m=(0.02, 0.04), before_m=(0.03, 0.08)),
+    "deep bay": partial(_walled, deep_m=(0.05, 0.08), before_m=(0.10, 0.18)),
     "clutter": _clutter,
 }
+"""Goal (x, y), and obstacles (x, y, length, width, yaw) or (x, y, radius), ahead of an object whose
+outline is given."""
 
 
 @dataclass(frozen=True)
@@ -242,8 +242,12 @@ network of pushes or mechanics instead, and whether it observes after each actio
 actions more."""
 
 
-def run_task(row: str, family: str, index: int, seed: int) -> dict[str, Any]:
-    """Plan and execute a task; return what came of it."""
+def run_task(row: str, family: str, index: int, seed: int) -> Any:
+    """Plan and execute a task; return what came of it. Rows "margin" and "search" plan nothing."""
+    if row == "margin":
+        return calibrate(family, index)
+    if row == "search":
+        return search(family, index, seed)
     planner, settings = ROWS[row]
     task, world = drawn_task(family, index, seed), one_tabletop()
     where = settings.get("world", "clean")
@@ -408,22 +412,13 @@ def search(family: str, index: int, seed: int) -> dict[str, Any]:
 
 
 def job(row: str, family: str = "", index: int = 0, seed: int = SEED) -> Job:
-    """Return the job of a row and a task; the rows "margin" and "search" plan nothing."""
+    """Return the job of a row and a task."""
     arguments = {"row": row, "family": family, "index": index, "seed": seed}
     checkpoints = [*CHECKPOINTS.values(), PUSHES["perturbed"]]
     if row in ROWS and "push" in ROWS[row][1]:
         checkpoints.append(ROWS[row][1]["push"])
     version = 2 if row == "closed_loop_perturbed" else 1
-    return Job(make, arguments, checkpoints=tuple(checkpoints), version=version)
-
-
-def make(row: str, family: str, index: int, seed: int) -> Any:
-    """Make the result of a job."""
-    if row == "margin":
-        return calibrate(family, index)
-    if row == "search":
-        return search(family, index, seed)
-    return run_task(row, family, index, seed)
+    return Job(run_task, arguments, checkpoints=tuple(checkpoints), version=version)
 
 
 TASKS = [(family, k) for family, n in FAMILIES.items() for k in range(n)]
@@ -433,25 +428,14 @@ JOBS = [
 ]
 
 
-def searches(folder: str | Path) -> list[Job]:
-    """Return the jobs of the search, for tasks that no row has solved in the clean world."""
-    found = runner.read(NAME, job, folder)
-    rows = judged([a | r for a, r in found if a["row"] in ROWS])
-    solved = {*rows[rows.feasible].groupby(["family", "index"]).groups}
-    return [job("search", *task) for task in TASKS if task not in solved]
-
-
 def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
     """Return the tables of all stored results."""
     found = runner.read(NAME, job, folder)
     errors = pd.DataFrame([a | e for a, r in found if a["row"] == "margin" for e in r])
     records = judged([a | r for a, r in found if a["row"] != "margin"])
     records = records[records.row != "search"]
-    return {
-        "margin": margin_rows(errors),
-        "rows": rows_of(records),
-        "partial_and_full": paired_rows(records),
-    }
+    both = {"rows": rows_of(records), "partial_and_full": paired_rows(records)}
+    return {"margin": margin_rows(errors)} | both
 
 
 def margin_rows(errors: pd.DataFrame) -> Rows:
@@ -498,11 +482,10 @@ def rows_of(records: pd.DataFrame) -> Rows:
             made = {"row": row, "family": family, "n": len(some)}
             for name in ("success", "contact", "planned"):
                 made[f"{name}_percent"] = 100 * some[name].astype(float).mean()
-            made["feasible"] = int(some.feasible.sum())
+            made |= {"feasible": int(some.feasible.sum())}
             made["of_feasible_percent"] = 100 * float(some.success[some.feasible].mean())
-            made |= {"distance_m_median": some.distance_m.median()}
-            made["actions_mean"] = some.actions.mean()
-            rows.append(made)
+            made["distance_m_median"] = some.distance_m.median()
+            rows.append(made | {"actions_mean": some.actions.mean()})
     return plain(rows)
 
 
@@ -536,10 +519,15 @@ def paired_rows(records: pd.DataFrame) -> Rows:
 
 @command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
-    """Plan and execute missing tasks, and write the tables."""
+    """Plan and execute missing tasks, search plans for those not solved, and write the tables."""
     options = runner.parser(NAME, main.__doc__).parse_args(argv)
     runner.make(JOBS, NAME, options, tables)
-    return 0 if options.only else runner.make(searches(options.raw), NAME, options, tables)
+    if options.only:
+        return 0
+    rows = judged([a | r for a, r in runner.read(NAME, job, options.raw) if a["row"] in ROWS])
+    solved = {*rows[rows.feasible].groupby(["family", "index"]).groups}
+    searches = [job("search", *task) for task in TASKS if task not in solved]
+    return runner.make(searches, NAME, options, tables)
 
 
 if __name__ == "__main__":

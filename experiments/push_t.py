@@ -20,8 +20,9 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -31,9 +32,8 @@ from scipy.optimize import least_squares
 from scipy.special import expit
 
 from affordlib.geometry import rotated, unit_vector, wrap_angle
-from affordlib.logs import Log, LoggedPushes, PushedObject, Pushes, PushPlanner, fit
+from affordlib.logs import Log, LoggedPushes, PushedObject, PushPlanner, fit
 from affordlib.logs.cross_validate import forecast_errors
-from affordlib.logs.fit import Forecast
 from affordlib.logs.log import _nearest, centred
 from affordlib.logs.neural_process import PRETRAINED
 from affordlib.logs.planning import primitive_of
@@ -59,9 +59,7 @@ PRICE, ROUNDS = 0.3, 2
 NEAR_PX, NEAR_RAD, REST_PX = 10.0, math.radians(10), 0.01
 
 
-def log_of_t() -> Log:
-    """Return an empty log of the T; a pixel counts as a millimetre."""
-    return Log("mm", T_PX, tool_radius=AGENT_PX)
+log_of_t = partial(Log, "mm", T_PX, tool_radius=AGENT_PX)  # a pixel counts as a millimetre
 
 
 @lru_cache
@@ -154,14 +152,6 @@ class Table:
         return np.array(path)
 
 
-class Nothing:
-    """A model for a robot that knows nothing yet."""
-
-    def predict(self, pushes: Pushes) -> Forecast:
-        """Predict that nothing moves."""
-        return np.zeros((len(pushes), 3)), np.ones((len(pushes), 3))
-
-
 def metres(log: Log, seen: tuple) -> tuple[tuple[float, float], tuple[float, float, float]]:
     """Convert what is seen to the tool's position [m] and the pose of the T's centroid."""
     return tuple((1e-3 * seen[0]).tolist()), log.centroid_pose(seen[1])
@@ -172,11 +162,11 @@ def collect(n: int, draw: int, view: str = "state", **of_block: Any) -> list[dic
     log, table, found = log_of_t(), Table(view, **of_block), []
     rng, seed = np.random.default_rng(FIRST_DRAW + draw), FIRST_DRAW + 1000 * draw
     of_t = PushedObject(1e-3 * np.array(T_PX), 1e-3 * AGENT_PX, LENGTHS_M)
-    planner = PushPlanner(Nothing(), of_t, room_m=ROOM_M)
+    unknown = SimpleNamespace(predict=lambda pushes: np.ones((2, len(pushes), 3)))
+    planner = PushPlanner(unknown, of_t, room_m=ROOM_M)  # which only looks for ways around the T
     table.reset(seed)
     while len(found) < n:
-        seen = table.look()
-        tool, pose = metres(log, seen)
+        tool, pose = metres(log, table.look())
         middle = 1e3 * np.array(pose[:2])
         planner.library = of_t.draw(64, rng)
         can = np.flatnonzero(~planner.shut(pose, tool))
