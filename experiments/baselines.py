@@ -35,8 +35,7 @@ from affordlib.world import category_named
 
 Forecast = tuple[Tensor, Tensor]  # mean and σ (N, T, C) of the effect at some samples
 
-_CATEGORY_GAP = 3.0
-"""Feature distance between two categories; the other features have a spread of about 1."""
+LEAST_STD = 1e-5
 
 
 def steps_of(arrays: InteractionTensors) -> Tensor:
@@ -115,10 +114,8 @@ def features(data: xr.Dataset) -> Tensor:
     has_yaw = torch.tensor([category_named(name).has_yaw for name in names])
     angle = torch.stack([(2 * yaw).cos(), (2 * yaw).sin()], dim=-1).float()
     one_hot = torch.nn.functional.one_hot(category, len(names)).float()
-    return torch.cat(
-        [(size - 0.06) / 0.012, 1.5 * angle * has_yaw[category, None], _CATEGORY_GAP * one_hot],
-        dim=1,
-    )
+    scaled = (size - 0.06) / 0.012, 1.5 * angle * has_yaw[category, None]
+    return torch.cat([*scaled, 3.0 * one_hot], dim=1)  # categories are farther apart than 1
 
 
 def constant(
@@ -130,7 +127,7 @@ def constant(
     if _has_direction(train):
         mean[:, xy_columns(train.effect_channels)[1]] = 0.0
     std = (effect - mean).square().mean(dim=0).sqrt()
-    return _in_table_frame(test, at, mean.expand(len(test), -1, -1), _floor(std))
+    return _in_table_frame(test, at, mean.expand(len(test), -1, -1), std.clamp_min(LEAST_STD))
 
 
 def nearest(
@@ -141,7 +138,7 @@ def nearest(
     both = (neighbours.kneighbors(x, return_distance=False) for x in (None, queried))
     left_out, found = (rows[:, 0] for rows in both)
     std = (effect[left_out] - effect).square().mean(dim=0).sqrt()
-    return _in_table_frame(test, at, effect[found], _floor(std))
+    return _in_table_frame(test, at, effect[found], std.clamp_min(LEAST_STD))
 
 
 def gaussian_process(
@@ -153,7 +150,7 @@ def gaussian_process(
     last sample, and are used for all samples.
     """
     effect = _in_action_frame(train, at).double()
-    centre, scale = effect.mean(dim=0), _floor(effect.std(dim=0))
+    centre, scale = effect.mean(dim=0), effect.std(dim=0).clamp_min(LEAST_STD)
     target = (effect - centre) / scale
     prior = ConstantKernel() * RBF([3.0] * known.shape[1], (1e-2, 1e9))
     prior += WhiteKernel(0.1, (1e-9, 1e3))
@@ -192,10 +189,6 @@ def _in_table_frame(arrays: InteractionTensors, at: Tensor, mean: Tensor, std: T
     direction = push_direction(condition_on_recorded_action(arrays), *channels)
     prediction = rotate_prediction(prediction, direction, *channels)
     return prediction.effect_mean, prediction.effect_std
-
-
-def _floor(std: Tensor) -> Tensor:
-    return std.clamp_min(1e-5)
 
 
 BASELINES = {each.__name__: each for each in (constant, nearest, gaussian_process)}

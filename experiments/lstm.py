@@ -54,10 +54,7 @@ def on_grid(effect: Tensor, t: Tensor, seen: Tensor, steps: int) -> Known:
 
 @network("lstm", LSTMConfig)
 class LSTMNetwork(AroundMean, HarmonicsNetwork):
-    """Predicts a trajectory step by step from the observed part of it; satisfies `EffectModel`.
-
-    It interpolates linearly between steps, so any phase can be queried, with gradients.
-    """
+    """Predicts a trajectory step by step, linear between steps; satisfies `EffectModel`."""
 
     def make_layers(self, config: LSTMConfig) -> None:
         """Create the encoders and decoders described above."""

@@ -344,9 +344,8 @@ plans that are executed, and the gap [m] that they keep."""
 
 @lru_cache(maxsize=N_OBJECTS)
 def simulated(number: int) -> tuple[type[Move], np.ndarray, np.ndarray]:
-    """Execute full actions in all directions with an object, alone on the table.
-
-    Returns their primitive, directions [rad] (d,), and the object's poses (d, 301, 3) from its own.
+    """Execute full actions with an object, alone on the table, and return their primitive,
+    directions [rad] (d,), and the object's poses (d, 301, 3) from its own.
     """
     world, (obj, yaw) = one_tabletop(), drawn_object(number)
     angles, ways = [], []
@@ -362,9 +361,8 @@ def simulated(number: int) -> tuple[type[Move], np.ndarray, np.ndarray]:
 
 
 def search(family: str, index: int, seed: int) -> dict[str, Any]:
-    """Search plans with the simulator's effects, breadth first, and execute the best ones.
-
-    Returns what came of the first that succeeds, or of the one that ended nearest.
+    """Search plans with the simulator's effects, breadth first, and execute the best ones until one
+    succeeds; return what came of it, or of the one that ended nearest.
     """
     task, world = drawn_task(family, index, seed), one_tabletop()
     kind, angles, ways = simulated(task.number)
@@ -498,10 +496,7 @@ PAIRS += [("closed_loop_perturbed", "perturbed")]
 
 
 def paired_rows(records: pd.DataFrame) -> Rows:
-    """Return differences of success [%] on the same tasks, with their 95 % intervals.
-
-    low, high: None where all differences are equal, as resampling would tell nothing.
-    """
+    """Return paired differences of success [%] and 95 % intervals, None where all are equal."""
     table = records.drop_duplicates(["family", "index", "row"])
     table, rows = table.pivot(index=["family", "index"], columns="row", values="success"), []
     for one, other in PAIRS:

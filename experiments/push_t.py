@@ -34,6 +34,7 @@ from scipy.special import expit
 from affordlib.geometry import rotated, unit_vector, wrap_angle
 from affordlib.logs import Log, LoggedPushes, PushedObject, PushPlanner, fit
 from affordlib.logs.cross_validate import forecast_errors
+from affordlib.logs.fit import PushModel
 from affordlib.logs.log import _nearest, centred
 from affordlib.logs.neural_process import PRETRAINED
 from affordlib.logs.planning import primitive_of
@@ -163,7 +164,7 @@ def collect(n: int, draw: int, view: str = "state", **of_block: Any) -> list[dic
     rng, seed = np.random.default_rng(FIRST_DRAW + draw), FIRST_DRAW + 1000 * draw
     of_t = PushedObject(1e-3 * np.array(T_PX), 1e-3 * AGENT_PX, LENGTHS_M)
     unknown = SimpleNamespace(predict=lambda pushes: np.ones((2, len(pushes), 3)))
-    planner = PushPlanner(unknown, of_t, room_m=ROOM_M)  # which only looks for ways around the T
+    planner = PushPlanner(unknown, of_t, room_m=ROOM_M)  # only looks for ways around the T
     table.reset(seed)
     while len(found) < n:
         tool, pose = metres(log, table.look())
@@ -182,7 +183,7 @@ def collect(n: int, draw: int, view: str = "state", **of_block: Any) -> list[dic
         path = table.go(way[-1:])
         after = table.look()
         push = {"tool_t": np.arange(len(path)), "tool_xy": path, "poses": (before[1], after[1])}
-        found += [push] if not log.add_all([push]) else []
+        found += [] if log.add_all([push]) else [push]
     return found
 
 
@@ -296,17 +297,22 @@ ROWS = {
 
 
 @lru_cache(maxsize=3 * DRAWS)
-def pushes_of_draw(n: int, draw: int, row: Row) -> LoggedPushes:
-    """Return the first n random pushes of a draw, as this row sees them."""
-    return logged(collect(n, draw, row.view, block_cog=row.block_cog))
+def pushes_of_draw(n: int, draw: int, view: str, block_cog: tuple | None) -> LoggedPushes:
+    """Return the first n random pushes of a draw."""
+    return logged(collect(n, draw, view, block_cog=block_cog))
 
 
 @lru_cache(maxsize=DRAWS)
 def planner_of(row: Row, draw: int) -> PushPlanner:
     """Fit a row's model to a draw of pushes, and return its planner."""
-    data = pushes_of_draw(row.n, draw, replace(row, model="", n=0, chain=0))
+    data = pushes_of_draw(row.n, draw, row.view, row.block_cog)
+    return planner_with(fit(data, row.model), data)
+
+
+def planner_with(model: PushModel, data: LoggedPushes) -> PushPlanner:
+    """Return the planner of a model for the T of a log."""
     obj = replace(PushedObject.of(data), lengths_m=LENGTHS_M)
-    return PushPlanner(fit(data, row.model), obj, price=PRICE, rounds=ROUNDS, room_m=ROOM_M)
+    return PushPlanner(model, obj, price=PRICE, rounds=ROUNDS, room_m=ROOM_M)
 
 
 def solve(row: str, block: int) -> dict[str, Any]:
@@ -314,8 +320,8 @@ def solve(row: str, block: int) -> dict[str, Any]:
     about, first = ROWS[row], FIRST_START + block * OF_BLOCK
     table = Table(about.view, block_cog=about.block_cog)
     planner = planner_of(about, block % DRAWS) if about.n else None
-    seeds = range(first, first + OF_BLOCK)
-    return {"runs": [attempt(table, planner, about.chain, seed) for seed in seeds]}
+    runs = [attempt(table, planner, about.chain, first + k) for k in range(OF_BLOCK)]
+    return {"runs": runs}
 
 
 def errors(row: str, draw: int) -> dict[str, Any]:
@@ -325,9 +331,7 @@ def errors(row: str, draw: int) -> dict[str, Any]:
     collected = time.process_time()
     model = fit(pushes, about.model)
     fitted, table = time.process_time(), Table(about.view, block_cog=about.block_cog)
-    obj = replace(PushedObject.of(pushes), lengths_m=LENGTHS_M)
-    planner = PushPlanner(model, obj, price=PRICE, rounds=ROUNDS, room_m=ROOM_M)
-    attempt(table, planner, about.chain, FIRST_CHOICE)
+    attempt(table, planner_with(model, pushes), about.chain, FIRST_CHOICE)
     solved = time.process_time()
     new = logged(collect(400, DRAWS + draw, about.view, block_cog=about.block_cog))
     found = forecast_errors(model, new)

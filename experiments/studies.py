@@ -30,10 +30,9 @@ PHASES = (0.0, 0.55, 0.65, 0.75, 1.0)
 
 @torch.no_grad()
 def partial_execution() -> Rows:
-    """Measure the errors on partial actions of networks trained only on full actions.
+    """Measure the errors on actions that stop at phase t of networks trained only on full actions.
 
-    Actions stop at phase t; the truth is the state of the full action at t, or the object's rest
-    position.
+    The truth is the state of the full action at t, or the object's rest position.
     """
     data, rows = open_interactions("partial"), []
     names = data["primitive"].attrs["flag_meanings"].split()

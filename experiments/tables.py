@@ -168,10 +168,7 @@ def fill_tables(text: str) -> str:
 
 
 def stale_pictures(text: str) -> Iterator[tuple[Path, Callable[[], bytes]]]:
-    """Yield for each picture that shows another table than a filled page its file and a drawing.
-
-    The file holds a hash of what it shows.
-    """
+    """Yield file and drawing of each picture whose hash is not that of its table on a page."""
     for block in BLOCK.finditer(text):
         table = block["body"].partition("\n\n")[0]
         for name, columns in re.findall(r" picture=([^:]+):(\S+)", block["what"]):
