@@ -23,11 +23,8 @@ from sklearn.neighbors import NearestNeighbors
 from torch import Tensor
 
 from affordlib.geometry import rotate_channels, xy_columns
-from affordlib.interactions.dataset import (
-    InteractionTensors,
-    condition_on_recorded_action,
-    valid_interactions,
-)
+from affordlib.interactions import InteractionTensors, condition_on_recorded_action
+from affordlib.interactions.dataset import valid_interactions
 from affordlib.models.base import EffectModel, inverse, push_direction, rotate_prediction
 from affordlib.models.evaluation import EVERY, effects_at
 from affordlib.types import Prediction

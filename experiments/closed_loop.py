@@ -27,15 +27,8 @@ from scipy.spatial import ConvexHull
 
 from affordlib.interactions.recipes import Variation
 from affordlib.models import load_checkpoint
-from affordlib.planning import (
-    ClosedLoopConfig,
-    ClosedLoopResult,
-    Robot,
-    Skills,
-    execute_plan,
-    plan_continuous,
-    run_closed_loop,
-)
+from affordlib.planning import Robot, Skills, execute_plan, plan_continuous
+from affordlib.planning.closed_loop import ClosedLoopConfig, ClosedLoopResult, run_closed_loop
 from affordlib.planning.grasp_rotate import GRIPPER_YAWS_RAD
 from affordlib.planning.skills import CHECKPOINTS
 from affordlib.primitives import Grasp, Move, move_for
@@ -358,7 +351,6 @@ JOBS = [
     for table, world in [*product(ROWS, WORLDS), ("height", OPEN_LOOP), ("orientation", OPEN_LOOP)]
     for index in range(N_TRIALS[table])
 ]
-
 
 main = runner.command_of("closed_loop", __doc__, lambda: JOBS, tables)
 

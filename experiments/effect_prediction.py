@@ -145,7 +145,6 @@ JOBS += [
 ]
 JOBS += [job(model, "push_x10", 1500) for model in ("constant", "nearest")]
 
-
 main = runner.command_of(NAME, __doc__, lambda: JOBS, tables)
 
 if __name__ == "__main__":

@@ -24,17 +24,10 @@ import torch
 
 from affordlib.geometry import rotated_each
 from affordlib.interactions.recipes import Variation
-from affordlib.planning import (
-    ClosedLoopConfig,
-    PlanMode,
-    PlanningProblem,
-    Skills,
-    execute_plan,
-    plan_astar,
-    plan_continuous,
-    plan_gradient,
-    run_closed_loop,
-)
+from affordlib.planning import PlanMode, PlanningProblem, Skills, execute_plan
+from affordlib.planning.astar import plan_astar
+from affordlib.planning.closed_loop import ClosedLoopConfig, run_closed_loop
+from affordlib.planning.continuous import plan_continuous
 from affordlib.planning.free_space import (
     FULL_AT_M,
     MARGIN_M,
@@ -46,6 +39,7 @@ from affordlib.planning.free_space import (
     placed,
     ring,
 )
+from affordlib.planning.gradient import plan_gradient
 from affordlib.planning.rollout import poses_along
 from affordlib.planning.skills import CHECKPOINTS
 from affordlib.primitives import Drag, Move, Push

@@ -37,7 +37,6 @@ from experiments.commands import command
 PUSHES, CHUNK = 48, 64
 OBJECTS, STEPS = 12_288, 7000
 CHECKPOINT = repo_root() / "data" / "checkpoints" / f"{PRETRAINED}.safetensors"
-_SHORT, _LONG = 0.12, 0.9
 
 
 def between(low: float, high: float, shape: tuple[int, ...], g: torch.Generator) -> Tensor:
@@ -128,7 +127,7 @@ def simulate(n: int, g: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
     normal = -quarter_turn(tangent)
     incidence = between(-62, 62, (*shape, 1), g).deg2rad()
     direction = incidence.cos() * normal + incidence.sin() * tangent
-    travel = log_between(_SHORT, _LONG, (n, 1), g) * between(0.9, 1.1, shape, g)
+    travel = log_between(0.12, 0.9, (n, 1), g) * between(0.9, 1.1, shape, g)
     same = torch.rand(n, 1, generator=g) < 0.5
     travel = torch.where(same, 0.276 * between(0.97, 1.03, shape, g), travel)[..., None]
     friction = 1 + 0.08 * torch.randn(shape, generator=g)

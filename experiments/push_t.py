@@ -59,7 +59,6 @@ BLOCKS, OF_BLOCK, DRAWS = 15, 20, 5
 PRICE, ROUNDS = 0.3, 2
 NEAR_PX, NEAR_RAD, REST_PX = 10.0, math.radians(10), 0.01
 
-
 log_of_t = partial(Log, "mm", T_PX, tool_radius=AGENT_PX)  # a pixel counts as a millimetre
 
 

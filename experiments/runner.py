@@ -49,7 +49,6 @@ FOLDER = "data/results/raw"
 WRITE_EVERY_S = 30
 NOT_DECISIVE = ("device",)  # options without influence on results: those of the machine
 
-
 open_once = lru_cache(maxsize=4)(open_interactions)  # data sets are kept between jobs
 Rows = list[dict[str, Any]]
 Result = tuple[dict[str, Any], Any]

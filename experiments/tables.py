@@ -146,10 +146,8 @@ def fill_tables(text: str) -> str:
         rows, shape, link = tables[name], {}, ""
         for option in options:
             key, _, value = option.partition("=")
-            if key in ("columns", "values"):
-                shape[key] = value.split(",")
-            elif key == "by":
-                shape[key] = value
+            if key in ("columns", "values", "by"):
+                shape[key] = value if key == "by" else value.split(",")
             elif key == "picture":
                 file, _, drawn = value.partition(":")
                 alt = ", ".join(drawn.split(",")).replace("_", " ")
