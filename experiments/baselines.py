@@ -53,12 +53,10 @@ def network_record(
 
 def about_objects(data: xr.Dataset, kept: np.ndarray) -> dict[str, Any]:
     """Number of each interaction, category of its object, and whether the object rolls."""
-    names = data["category"].attrs["flag_meanings"].split()
-    return {
-        "interaction": data["interaction"].values[kept].tolist(),
-        "category": [names[k] for k in data["category"].values[kept]],
-        "rollable": data["rollable"].values[kept].tolist(),
-    }
+    names = np.array(data["category"].attrs["flag_meanings"].split())
+    columns = {name: data[name].values[kept] for name in ("interaction", "category", "rollable")}
+    columns["category"] = names[columns["category"]]
+    return {name: column.tolist() for name, column in columns.items()}
 
 
 def prediction_record(

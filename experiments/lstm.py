@@ -77,9 +77,8 @@ class LSTMNetwork(AroundMean, HarmonicsNetwork):
     ) -> tuple[Tensor, ...]:
         """(μ_a, σ_a, μ_e, σ_e), each (B, T, C) and standardised."""
         o, b = observations, len(observations.weight)
-        code = masked_mean(
-            self.action_encoder(with_time(o.action / self.action_scale, o.action_t)), o.action_mask
-        )
+        actions = with_time(o.action / self.action_scale, o.action_t)
+        code = masked_mean(self.action_encoder(actions), o.action_mask)
         static = torch.cat([features.expand(b, -1), code], dim=1)
         d = o.effect / self.effect_scale - self.mean_trajectory(o.effect_t)
         *_, first = known = on_grid(d, o.effect_t, o.effect_mask, self.config.steps)

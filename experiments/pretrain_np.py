@@ -138,9 +138,8 @@ def simulate(n: int, g: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
     each[..., 2] = each[..., 2] * (0.15 * unsteady).exp()
     each[..., 2] = each[..., 2] / each[..., 2].sum(-1, keepdim=True)
     push = torch.cat([contact, normal, direction, travel], -1)
-    truth = quasi_static_push(
-        push.flatten(0, 1), each.flatten(0, 1), friction.flatten(), smoothing
-    ).unflatten(0, shape)
+    inputs = push.flatten(0, 1), each.flatten(0, 1), friction.flatten()
+    truth = quasi_static_push(*inputs, smoothing).unflatten(0, shape)
     # Poses before and after have measurement noise; the computed contact stays on the edge.
     scatter = log_between(0.002, 0.012, (n, 1, 1), g)
     before, after = (scatter * torch.randn(*shape, 3, generator=g) for _ in range(2))

@@ -99,15 +99,14 @@ class Table:
         import gymnasium
 
         self.view = view
-        self.env = gymnasium.make(
-            "gym_pusht/PushT-v0", obs_type="state" if view == "state" else "pixels", **of_block
-        )
+        seen = "state" if view == "state" else "pixels"
+        self.env = gymnasium.make("gym_pusht/PushT-v0", obs_type=seen, **of_block)
 
     def reset(self, seed: int) -> None:
         """Begin an episode, and wait until the T rests, should the agent begin inside it."""
         self.seen, info = self.env.reset(seed=seed)
-        self.steps, self.rests, self.solved = 0, 0, dict.fromkeys("ab")
-        self.truth, self.done = info["block_pose"], False
+        self.steps, self.rests, self.solved, self.done = 0, 0, dict.fromkeys("ab"), False
+        self.truth = info["block_pose"]
         self.history = [(info["pos_agent"].tolist(), self.truth.tolist())]
         self.look()
         while self.steps < MOST_STEPS:
@@ -356,8 +355,8 @@ def tables(folder: str = FOLDER) -> dict[str, Rows]:
     for row, part in runs.groupby("row", sort=False):
         for rule in "ab":
             steps = part[f"steps_{rule}"].astype(float).fillna(math.inf)
-            about = {"row": row, "rule": rule, "n": len(part)}
-            about["draws"] = part["block"].mod(DRAWS).nunique()
+            draws = part["block"].mod(DRAWS).nunique()
+            about = {"row": row, "rule": rule, "n": len(part), "draws": draws}
             for limit in LIMITS:
                 names = (f"{name}_{limit}_percent" for name in ("share", "low", "high"))
                 about |= zip(names, shares(int((steps <= limit).sum()), len(part)), strict=True)
@@ -407,9 +406,7 @@ def store(n: int = 200) -> None:
     pd.concat(rows).round(4).to_csv(STORED / "pushes.csv.xz", index=False)
     table = Table()
     attempt(table, planner_of(ROWS["gp_200"], 0), 3, FIRST_CHOICE + 7)
-    history = [
-        [[round(v, 2) for v in agent], [round(v, 4) for v in pose]] for agent, pose in table.history
-    ]
+    history = [[[round(v, 2) for v in a], [round(v, 4) for v in p]] for a, p in table.history]
     write_atomically(STORED / "run.json", json.dumps({"steps": history, "solved": table.solved}))
     film(history, repo_root() / "figures" / "push_t.gif")
 
