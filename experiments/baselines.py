@@ -119,7 +119,7 @@ def constant(
     """Predict the mean trajectory in the direction of the action; σ is the spread about it."""
     effect = _in_action_frame(train, at)
     mean = effect.mean(dim=0)
-    if _has_direction(train):
+    if _direction(train) is not None:
         mean[:, xy_columns(train.effect_channels)[1]] = 0.0
     std = (effect - mean).square().mean(dim=0).sqrt()
     return _in_table_frame(test, at, mean.expand(len(test), -1, -1), std.clamp_min(LEAST_STD))
@@ -160,30 +160,31 @@ def gaussian_process(
     return _in_table_frame(test, at, (centre + scale * mean).float(), (scale * std).float())
 
 
-def _has_direction(arrays: InteractionTensors) -> bool:
-    return bool(xy_columns(arrays.action_channels) and xy_columns(arrays.effect_channels))
+def _direction(arrays: InteractionTensors) -> Tensor | None:
+    """Directions of the recorded actions; None for primitives that have none."""
+    channels = arrays.action_channels, arrays.effect_channels
+    if not all(map(xy_columns, channels)):
+        return None
+    return push_direction(condition_on_recorded_action(arrays), *channels)
 
 
 def _in_action_frame(arrays: InteractionTensors, at: Tensor) -> Tensor:
     """True effects (N, T, C) in the frame of the action."""
-    effect, channels = arrays.effect[:, at], (arrays.action_channels, arrays.effect_channels)
-    if not _has_direction(arrays):
+    effect, direction = arrays.effect[:, at], _direction(arrays)
+    if direction is None:
         return effect
-    back = inverse(push_direction(condition_on_recorded_action(arrays), *channels))[:, None]
+    back = inverse(direction)[:, None]
     return rotate_channels(effect, arrays.effect_channels, back, absolute_yaw=False)
 
 
 def _in_table_frame(arrays: InteractionTensors, at: Tensor, mean: Tensor, std: Tensor) -> Forecast:
     """Rotate predictions from the frame of the action to the table's."""
-    std = std.expand_as(mean)
-    if not _has_direction(arrays):
+    std, action, direction = std.expand_as(mean), arrays.action[:, at], _direction(arrays)
+    if direction is None:
         return mean, std
-    channels = arrays.action_channels, arrays.effect_channels
-    action = arrays.action[:, at]
-    prediction = Prediction(action, torch.zeros_like(action), mean, std)
-    direction = push_direction(condition_on_recorded_action(arrays), *channels)
-    prediction = rotate_prediction(prediction, direction, *channels)
-    return prediction.effect_mean, prediction.effect_std
+    turned = Prediction(action, torch.zeros_like(action), mean, std)
+    turned = rotate_prediction(turned, direction, arrays.action_channels, arrays.effect_channels)
+    return turned.effect_mean, turned.effect_std
 
 
 BASELINES = {each.__name__: each for each in (constant, nearest, gaussian_process)}

@@ -133,17 +133,14 @@ def _corridor(rng: np.random.Generator, local: np.ndarray) -> tuple:
 
 
 def _walled(
-    rng: np.random.Generator,
-    local: np.ndarray,
-    deep_m: tuple[float, float],
-    before_m: tuple[float, float] | None = None,
+    rng: np.random.Generator, local: np.ndarray, deep_m: tuple, before_m: tuple = ()
 ) -> tuple:
     """Two walls with a third behind them, before_m from the object; the goal is deep_m inside."""
-    before = rng.uniform(*before_m) if before_m else None
-    deep, half, radius = rng.uniform(*deep_m), _half_m(rng, local), np.hypot(*local.T).max()
-    mouth = 0.0 if before is None else before + (radius + 0.01)
+    radius = float(np.hypot(*local.T).max())
+    mouth = rng.uniform(*before_m) + (radius + 0.01) if before_m else 0.0
+    deep, half = rng.uniform(*deep_m), _half_m(rng, local)
     end = mouth + deep + radius + rng.uniform(0.006, 0.014)
-    aside = 0.0 if before is None else rng.uniform(-0.03, 0.03)
+    aside = rng.uniform(-0.03, 0.03) if before_m else 0.0
     x, size = (mouth + end) / 2, (end - mouth, WALL_M, 0.0)
     walls = [(x, aside + s * (half + WALL_M / 2), *size) for s in (-1, 1)]
     back = end + WALL_M / 2, aside, WALL_M, 2 * half + 2 * WALL_M, 0.0
