@@ -88,7 +88,6 @@ class Trial:
 
     @property
     def kind(self) -> type[Move]:
-        """The primitive that moves the object."""
         return move_for(self.obj.rollable)
 
     def place(self, world: Tabletop) -> None:

@@ -50,9 +50,8 @@ def log_between(low: float, high: float, shape: tuple[int, ...], g: torch.Genera
 
 
 def outlines(n: int, g: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Sample outlines: corners (n, 4, 2), and shares (n, 4) of the area at each edge.
-
-    Corners are counter-clockwise (triangles repeat one); centroid 0, radius of gyration 1.
+    """Sample outlines of centroid 0 and radius of gyration 1: corners (n, 4, 2), counter-clockwise
+    (triangles repeat one), and shares (n, 4) of the area at each edge.
     """
     angle = (between(0.15, 0.85, (n, 4), g) + torch.arange(4)) * (math.pi / 2)
     of_three = (between(0.2, 0.8, (n, 3), g) + torch.arange(3)) * (2 * math.pi / 3)

@@ -87,8 +87,8 @@ def markdown_table(
         wide.columns = [f"{of[b]}: {head}" for head, b in wide.columns]
         numbers |= {*wide.columns}
         frame = wide.reset_index()
-    lines = ["---:" if name in numbers else "---" for name in frame.columns]
-    lines = [list(frame.columns), lines, *frame.to_numpy().tolist()]
+    rule = ["---:" if name in numbers else "---" for name in frame.columns]
+    lines = [list(frame.columns), rule, *frame.to_numpy().tolist()]
     lines = [" | ".join(text.translate(MARKUP) for text in line) for line in lines]
     return "".join(f"| {line} |\n" for line in lines)
 
