@@ -24,21 +24,11 @@ import torch
 
 from affordlib.geometry import rotated_each
 from affordlib.interactions.recipes import Variation
-from affordlib.planning import PlanMode, PlanningProblem, Skills, execute_plan
+from affordlib.planning import PlanMode, PlanningProblem, Skills, execute_plan, free_space
 from affordlib.planning.astar import plan_astar
 from affordlib.planning.closed_loop import ClosedLoopConfig, run_closed_loop
 from affordlib.planning.continuous import plan_continuous
-from affordlib.planning.free_space import (
-    FULL_AT_M,
-    MARGIN_M,
-    N_POSES,
-    START_M,
-    FreeSpace,
-    corners_of,
-    gaps_m,
-    placed,
-    ring,
-)
+from affordlib.planning.free_space import N_POSES, FreeSpace, corners_of, gaps_m, placed, ring
 from affordlib.planning.gradient import plan_gradient
 from affordlib.planning.rollout import poses_along
 from affordlib.planning.skills import CHECKPOINTS
@@ -433,10 +423,10 @@ def margin_rows(errors: pd.DataFrame) -> Rows:
     at_margin_percent: of those that pass at the margin; within_percent: of those that pass by up to
     `WITHIN_GAP_M` more, all gaps being equally frequent.
     """
-    rows = []
+    rows, start_m = [], free_space.START_M
     for kind, some in errors.groupby("family", sort=False):
-        grown = np.minimum(some.travel_m / FULL_AT_M, 1)
-        over = some.error_m - START_M - (MARGIN_M - START_M) * grown
+        grown = np.minimum(some.travel_m / free_space.FULL_AT_M, 1)
+        over = some.error_m - start_m - (free_space.MARGIN_M - start_m) * grown
         row = {"primitive": kind, "n": len(some)}
         row |= {f"q{q}_m": float(some.error_m.quantile(q / 100)) for q in (50, 95, 99)}
         row["at_margin_percent"] = 100 * float((over > 0).mean())
