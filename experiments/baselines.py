@@ -23,11 +23,8 @@ from sklearn.neighbors import NearestNeighbors
 from torch import Tensor
 
 from affordlib.geometry import rotate_channels, xy_columns
-from affordlib.interactions.dataset import (
-    InteractionTensors,
-    condition_on_recorded_action,
-    valid_interactions,
-)
+from affordlib.interactions import InteractionTensors, condition_on_recorded_action
+from affordlib.interactions.dataset import valid_interactions
 from affordlib.models.base import EffectModel, inverse, push_direction, rotate_prediction
 from affordlib.models.evaluation import EVERY, effects_at
 from affordlib.types import Prediction
@@ -35,8 +32,7 @@ from affordlib.world import category_named
 
 Forecast = tuple[Tensor, Tensor]  # mean and σ (N, T, C) of the effect at some samples
 
-_CATEGORY_GAP = 3.0
-"""Feature distance between two categories; the other features have a spread of about 1."""
+LEAST_STD = 1e-5
 
 
 def steps_of(arrays: InteractionTensors) -> Tensor:
@@ -57,12 +53,10 @@ def network_record(
 
 def about_objects(data: xr.Dataset, kept: np.ndarray) -> dict[str, Any]:
     """Number of each interaction, category of its object, and whether the object rolls."""
-    names = data["category"].attrs["flag_meanings"].split()
-    return {
-        "interaction": data["interaction"].values[kept].tolist(),
-        "category": [names[k] for k in data["category"].values[kept]],
-        "rollable": data["rollable"].values[kept].tolist(),
-    }
+    names = np.array(data["category"].attrs["flag_meanings"].split())
+    columns = {name: data[name].values[kept] for name in ("interaction", "category", "rollable")}
+    columns["category"] = names[columns["category"]]
+    return {name: column.tolist() for name, column in columns.items()}
 
 
 def prediction_record(
@@ -115,10 +109,8 @@ def features(data: xr.Dataset) -> Tensor:
     has_yaw = torch.tensor([category_named(name).has_yaw for name in names])
     angle = torch.stack([(2 * yaw).cos(), (2 * yaw).sin()], dim=-1).float()
     one_hot = torch.nn.functional.one_hot(category, len(names)).float()
-    return torch.cat(
-        [(size - 0.06) / 0.012, 1.5 * angle * has_yaw[category, None], _CATEGORY_GAP * one_hot],
-        dim=1,
-    )
+    scaled = (size - 0.06) / 0.012, 1.5 * angle * has_yaw[category, None]
+    return torch.cat([*scaled, 3.0 * one_hot], dim=1)  # categories are farther apart than 1
 
 
 def constant(
@@ -127,10 +119,10 @@ def constant(
     """Predict the mean trajectory in the direction of the action; σ is the spread about it."""
     effect = _in_action_frame(train, at)
     mean = effect.mean(dim=0)
-    if _has_direction(train):
+    if _direction(train) is not None:
         mean[:, xy_columns(train.effect_channels)[1]] = 0.0
     std = (effect - mean).square().mean(dim=0).sqrt()
-    return _in_table_frame(test, at, mean.expand(len(test), -1, -1), _floor(std))
+    return _in_table_frame(test, at, mean.expand(len(test), -1, -1), std.clamp_min(LEAST_STD))
 
 
 def nearest(
@@ -141,7 +133,7 @@ def nearest(
     both = (neighbours.kneighbors(x, return_distance=False) for x in (None, queried))
     left_out, found = (rows[:, 0] for rows in both)
     std = (effect[left_out] - effect).square().mean(dim=0).sqrt()
-    return _in_table_frame(test, at, effect[found], _floor(std))
+    return _in_table_frame(test, at, effect[found], std.clamp_min(LEAST_STD))
 
 
 def gaussian_process(
@@ -153,7 +145,7 @@ def gaussian_process(
     last sample, and are used for all samples.
     """
     effect = _in_action_frame(train, at).double()
-    centre, scale = effect.mean(dim=0), _floor(effect.std(dim=0))
+    centre, scale = effect.mean(dim=0), effect.std(dim=0).clamp_min(LEAST_STD)
     target = (effect - centre) / scale
     prior = ConstantKernel() * RBF([3.0] * known.shape[1], (1e-2, 1e9))
     prior += WhiteKernel(0.1, (1e-9, 1e3))
@@ -168,34 +160,31 @@ def gaussian_process(
     return _in_table_frame(test, at, (centre + scale * mean).float(), (scale * std).float())
 
 
-def _has_direction(arrays: InteractionTensors) -> bool:
-    return bool(xy_columns(arrays.action_channels) and xy_columns(arrays.effect_channels))
+def _direction(arrays: InteractionTensors) -> Tensor | None:
+    """Directions of the recorded actions; None for primitives that have none."""
+    channels = arrays.action_channels, arrays.effect_channels
+    if not all(map(xy_columns, channels)):
+        return None
+    return push_direction(condition_on_recorded_action(arrays), *channels)
 
 
 def _in_action_frame(arrays: InteractionTensors, at: Tensor) -> Tensor:
     """True effects (N, T, C) in the frame of the action."""
-    effect, channels = arrays.effect[:, at], (arrays.action_channels, arrays.effect_channels)
-    if not _has_direction(arrays):
+    effect, direction = arrays.effect[:, at], _direction(arrays)
+    if direction is None:
         return effect
-    back = inverse(push_direction(condition_on_recorded_action(arrays), *channels))[:, None]
+    back = inverse(direction)[:, None]
     return rotate_channels(effect, arrays.effect_channels, back, absolute_yaw=False)
 
 
 def _in_table_frame(arrays: InteractionTensors, at: Tensor, mean: Tensor, std: Tensor) -> Forecast:
     """Rotate predictions from the frame of the action to the table's."""
-    std = std.expand_as(mean)
-    if not _has_direction(arrays):
+    std, action, direction = std.expand_as(mean), arrays.action[:, at], _direction(arrays)
+    if direction is None:
         return mean, std
-    channels = arrays.action_channels, arrays.effect_channels
-    action = arrays.action[:, at]
-    prediction = Prediction(action, torch.zeros_like(action), mean, std)
-    direction = push_direction(condition_on_recorded_action(arrays), *channels)
-    prediction = rotate_prediction(prediction, direction, *channels)
-    return prediction.effect_mean, prediction.effect_std
-
-
-def _floor(std: Tensor) -> Tensor:
-    return std.clamp_min(1e-5)
+    turned = Prediction(action, torch.zeros_like(action), mean, std)
+    turned = rotate_prediction(turned, direction, arrays.action_channels, arrays.effect_channels)
+    return turned.effect_mean, turned.effect_std
 
 
 BASELINES = {each.__name__: each for each in (constant, nearest, gaussian_process)}

@@ -27,15 +27,8 @@ from scipy.spatial import ConvexHull
 
 from affordlib.interactions.recipes import Variation
 from affordlib.models import load_checkpoint
-from affordlib.planning import (
-    ClosedLoopConfig,
-    ClosedLoopResult,
-    Robot,
-    Skills,
-    execute_plan,
-    plan_continuous,
-    run_closed_loop,
-)
+from affordlib.planning import Robot, Skills, execute_plan, plan_continuous
+from affordlib.planning.closed_loop import ClosedLoopConfig, ClosedLoopResult, run_closed_loop
 from affordlib.planning.grasp_rotate import GRIPPER_YAWS_RAD
 from affordlib.planning.skills import CHECKPOINTS
 from affordlib.primitives import Grasp, Move, move_for
@@ -46,13 +39,8 @@ from experiments.disturbances import KINDS, Disturbance, DisturbanceSchedule
 from experiments.feasibility import half_width_m, is_feasible, on_the_rim
 from experiments.runner import FOLDER, Job, Rows, plain
 
-N_TRIALS = {
-    "height": 50,
-    "orientation": 50,
-    "disturbances": 200,
-    "reachability": 1000,
-    "orientation_unseen": 50,
-}
+N_TRIALS = {"height": 50, "orientation": 50, "disturbances": 200, "reachability": 1000}
+N_TRIALS |= {"orientation_unseen": 50}
 VERSIONS = dict.fromkeys(N_TRIALS, 1) | dict.fromkeys(("height", "orientation"), 2)
 """Version of each table's jobs; raise it when a change of code changes the table's numbers.
 
@@ -100,7 +88,6 @@ class Trial:
 
     @property
     def kind(self) -> type[Move]:
-        """The primitive that moves the object."""
         return move_for(self.obj.rollable)
 
     def place(self, world: Tabletop) -> None:
@@ -146,12 +133,7 @@ def sample_trial(table: str, index: int, seed: int = 0, world: str = "clean") ->
 
 
 def sample_disturbance(seed: int, n_actions: int = 2, kinds: Sequence[str] = KINDS) -> Disturbance:
-    """Sample a disturbance, a pure function of the seed.
-
-    It occurs during one of n_actions actions, or between two of them (never before the first): a
-    shove by 3 to 10 cm and up to half a turn, a knock of 0.2 to 0.5 m/s, a goal that moves by 3 to
-    10 cm.
-    """
+    """Sample a disturbance during one of n_actions actions or after it, by the seed alone."""
     rng = np.random.default_rng(seed)
     kind = str(rng.choice(list(kinds)))
     action, angle = int(rng.integers(n_actions)), rng.uniform(-math.pi, math.pi)
@@ -164,10 +146,7 @@ def sample_disturbance(seed: int, n_actions: int = 2, kinds: Sequence[str] = KIN
     return Disturbance(kind, action + (not middle), *xy, float(turn), at_s)
 
 
-@cache
-def one_tabletop() -> Tabletop:
-    """Create the world once per process."""
-    return Tabletop()
+one_tabletop = cache(Tabletop)  # one world per process
 
 
 @lru_cache(maxsize=2)
@@ -205,9 +184,9 @@ def run_trial(table: str, index: int, seed: int = 0, world: str = "clean") -> di
         record["kind"] = trial.disturbances[0].kind
         record["undisturbed"] = pursue(trial.goal, tabletop)[1]
     else:
-        query = trial.kind, half_width_m(trial.obj.footprint_m)
-        record["feasible"] = is_feasible(*query, trial.start_xy_m, trial.goal.xy_m)
-        record["on_the_rim"] = on_the_rim(*query, trial.start_xy_m, trial.goal.xy_m)
+        half = half_width_m(trial.obj.footprint_m)
+        query = trial.kind, half, trial.start_xy_m, trial.goal.xy_m
+        record |= {"feasible": is_feasible(*query), "on_the_rim": on_the_rim(*query)}
     return record
 
 
@@ -218,10 +197,10 @@ def run_open_loop(world: Tabletop, skills: Skills, trial: Trial) -> dict[str, An
     plan = plan_continuous(skills.problem(world.depth_image(), trial.start_xy_m, trial.goal))
     with suppress(UnreachableError):
         execute_plan(world, plan)
-    about = {"object_class": trial.obj.category, "status": "reached", "feasible": True}
-    about |= {"actions": len(plan.steps)} | _errors(world, trial.goal, yaw, z)
+    errors = _errors(world, trial.goal, yaw, z)
     world.park()
-    return about
+    about = {"object_class": trial.obj.category, "status": "reached", "feasible": True}
+    return about | {"actions": len(plan.steps)} | errors
 
 
 def _errors(world: Tabletop, goal: Goal, yaw: float, z: float) -> dict[str, float | None]:
@@ -251,10 +230,8 @@ def _can_be_lifted(world: Tabletop, trial: Trial, result: ClosedLoopResult) -> b
 def _stays_feasible(
     world: Tabletop, trial: Trial, result: ClosedLoopResult, happened: Sequence[Disturbance]
 ) -> bool:
-    """Return whether a feasible route exists from the start and from the disturbed position.
-
-    The disturbed position is the first one observed after the disturbance. Later failures are due
-    to the robot.
+    """Return whether a feasible route exists from the start and from the disturbed position, the
+    first one observed after the disturbance. Later failures are due to the robot.
     """
     half, start = half_width_m(trial.obj.footprint_m), trial.start_xy_m
     if not is_feasible(trial.kind, half, start, trial.goal.xy_m):
@@ -298,12 +275,8 @@ def pose_rows(records: Rows, column: str, within: float, unit: str) -> Rows:
 
 
 def disturbance_rows(records: Rows) -> Rows:
-    """Return the rows of `disturbances`: results and errors with and without disturbance.
-
-    Means are over all feasible trials, including those that did not reach the goal.
-    """
-    rows = []
-    table = pd.json_normalize(list(records), sep="_")
+    """Return the rows of `disturbances`, with means over all feasible trials, reached or not."""
+    rows, table = [], pd.json_normalize(list(records), sep="_")
     for row, some in _groups(table, "kind", "object_class"):
         feasible = some[some.feasible]
         row["within_percent"] = 100 * (feasible.distance_m <= WITHIN_M).mean()
@@ -377,7 +350,6 @@ JOBS = [
     for table, world in [*product(ROWS, WORLDS), ("height", OPEN_LOOP), ("orientation", OPEN_LOOP)]
     for index in range(N_TRIALS[table])
 ]
-
 
 main = runner.command_of("closed_loop", __doc__, lambda: JOBS, tables)
 

@@ -63,9 +63,6 @@ TASKS: dict[str, Task] = {
 }
 PLANE = ("push", "drag")  # primitives whose effect is a displacement in the table's plane
 
-CHANNELS = ("x", "y", "z", "yaw")
-
-
 NETWORKS = {
     "cnp": (CNPConfig, "cnp_500", "table"),
     "film": (FiLMConfig, "film_500", "push"),
@@ -162,7 +159,8 @@ def logistic_predictions(
 
 def add_errors(table: pd.DataFrame, primitive: str) -> None:
     """Add columns of errors at t = 1 to a table: in (x, y) [m], or in z or yaw; and in yaw."""
-    off = {c: table[f"mean_{c}"] - table[f"truth_{c}"] for c in CHANNELS if f"mean_{c}" in table}
+    names = [name.removeprefix("mean_") for name in table if name.startswith("mean_")]
+    off = {name: table[f"mean_{name}"] - table[f"truth_{name}"] for name in names}
     if primitive in PLANE:
         table["final_error"] = np.hypot(off["x"], off["y"])
     else:
@@ -173,8 +171,6 @@ def add_errors(table: pd.DataFrame, primitive: str) -> None:
 
 def by_model(table: pd.DataFrame) -> Iterator[tuple[dict[str, Any], pd.DataFrame]]:
     """Yield the rows of each model and set size, with the columns that identify them."""
-    if table.empty:
-        return
     for (_, model, n), group in table.groupby(["data", "model", "n"], sort=False):
         about = {"model": model, "n_interactions": int(n)}
         counts = {f"{key}s": group[key].nunique() for key in ("fold", "seed")}

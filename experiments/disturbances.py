@@ -100,7 +100,6 @@ class DisturbanceSchedule:
         self._n_actions = 0
 
     def current_goal(self) -> Goal:
-        """Return the current goal."""
         return self.goal
 
     def observe(self) -> Observation:
@@ -140,5 +139,4 @@ class DisturbanceSchedule:
                 self.world.settle(TIPPING_S)
 
     def __getattr__(self, name: str) -> Any:
-        """Forward everything else to the tabletop."""
         return getattr(self.world, name)

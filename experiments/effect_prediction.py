@@ -31,10 +31,7 @@ collected again on another processor has another hash, but nearly the same effec
 
 
 def sorted_results(folder: str | Path = FOLDER) -> list[Result]:
-    """Return all results in the order of sets, models, sizes, seeds and folds.
-
-    Raises ValueError if results are stale, or differ in the recorded effect of an interaction.
-    """
+    """Return all results in order; raises ValueError if effects of an interaction differ."""
     results = read(NAME, job, folder)
     results.sort(key=lambda r: (r[0]["data"], MODELS.index(r[0]["model"]),
                                 str(r[0]["n"]), r[0]["seed"], r[0]["fold"]))  # fmt: skip
@@ -43,9 +40,7 @@ def sorted_results(folder: str | Path = FOLDER) -> list[Result]:
     apart = (truth.max() - truth.min()).max(axis=1)
     if apart.max() > SAME_TRUTH:
         data, number = apart.idxmax()
-        raise ValueError(
-            f"{NAME}: results of {data!r} differ in the effect of interaction {number}"
-        )
+        raise ValueError(f"{NAME}: results of {data!r} differ in effects of interaction {number}")
     return results
 
 
@@ -54,7 +49,7 @@ def predictions_of(results: Iterable[Result], primitive: str, part: str) -> pd.D
     results = [(about | {"n": result["n_interactions"]}, result) for about, result in results
                if about["data"].removesuffix(LARGE) == primitive]  # fmt: skip
     table = frame(results, part)
-    if part == "fold_test" and len(table):
+    if part == "fold_test":
         add_errors(table, primitive)
     return table
 
@@ -103,10 +98,7 @@ def grasp_rows(grasps: pd.DataFrame) -> Rows:
 
 
 def confusion_columns(predicted: np.ndarray, lifted: np.ndarray) -> dict[str, Any]:
-    """Return TP and TN [%] with Wilson's 95 % intervals; None without successes or failures.
-
-    TP is the share of successes that are predicted (sensitivity), TN that of failures.
-    """
+    """Return TP and TN, shares [%] of successes and of failures that are predicted."""
     columns: dict[str, Any] = {}
     for rate, those in (("tp", lifted), ("tn", ~lifted)):
         n, k = int(those.sum()), int((predicted == lifted)[those].sum())
@@ -122,13 +114,12 @@ def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
     def errors(primitive: str, part: str) -> Rows:
         return error_rows(predictions_of(results, primitive, part), primitive)
 
-    grasps = predictions_of(results, "grasp", "fold_test")
-    grasp = grasp_rows(grasps) if len(grasps) else []
+    grasp = grasp_rows(predictions_of(results, "grasp", "fold_test"))
     return {
         "push": errors("push", "fold_test"),
         "push_test": errors("push", "fixed_test"),
         "drag": errors("drag", "fold_test"),
-        "grasp": [*reported.grasp_rows(grasp[0]), *grasp] if grasp else [],
+        "grasp": [*reported.grasp_rows(grasp[0]), *grasp],
         "rotate": errors("rotate", "fold_test"),
         **studies.tables(folder),
     }
@@ -153,7 +144,6 @@ JOBS += [
     for data, seed in product(("push_x10", "drag_x10"), range(3))
 ]
 JOBS += [job(model, "push_x10", 1500) for model in ("constant", "nearest")]
-
 
 main = runner.command_of(NAME, __doc__, lambda: JOBS, tables)
 

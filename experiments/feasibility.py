@@ -24,6 +24,7 @@ from affordlib.world.trajectory import RETREAT_M
 CELL_M, LONGEST_M = 0.02, 0.2
 """Distance [m] between neighbouring places on the table, and that of the longest action or more."""
 
+XY = Sequence[float]
 BAND_M = 0.01  # distance [m] from the limit of the reach within which goals are reported separately
 
 
@@ -105,11 +106,7 @@ def _graph(kind: type[Move], half_mm: int, slack_m: float) -> tuple[np.ndarray, 
 
 
 def is_feasible(
-    kind: type[Move],
-    half_m: float,
-    start_xy_m: Sequence[float],
-    goal_xy_m: Sequence[float],
-    slack_m: float = 0.0,
+    kind: type[Move], half_m: float, start_xy_m: XY, goal_xy_m: XY, slack_m: float = 0.0
 ) -> bool:
     """Return whether a chain of pushes or drags within the arm's reach leads to the goal."""
     how = kind, 5 * round(200 * half_m), slack_m
@@ -124,9 +121,7 @@ def is_feasible(
     return bool(_actions(*how, places[reached], goal).any())
 
 
-def on_the_rim(
-    kind: type[Move], half_m: float, start_xy_m: Sequence[float], goal_xy_m: Sequence[float]
-) -> bool:
+def on_the_rim(kind: type[Move], half_m: float, start_xy_m: XY, goal_xy_m: XY) -> bool:
     """Return whether feasibility changes if the reach is longer or shorter by `BAND_M`."""
     answers = [is_feasible(kind, half_m, start_xy_m, goal_xy_m, s) for s in (-BAND_M, BAND_M)]
     return answers[0] != answers[1]

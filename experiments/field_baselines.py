@@ -106,9 +106,8 @@ class MechanicsMap(EffectMap):
             at, turn = at + unit * moved[:, :2], turn + moved[:, 2]
             effects[:, k] = torch.cat([at - rotate(middle, turn), turn[:, None]], -1)
         hand = [self.kind.towards(0.0).path(t)[:, 0] + FRONT_M for t in t_target.numpy()]
-        found = [
-            [np.interp(h, front, e) for e in one.T] for h, one in zip(hand, effects, strict=True)
-        ]
+        pairs = zip(hand, effects, strict=True)
+        found = [[np.interp(ahead, front, e) for e in one.T] for ahead, one in pairs]
         mean = torch.from_numpy(np.array(found)).mT
         return mean, torch.zeros_like(mean)
 

@@ -60,13 +60,9 @@ def animated(frames: list[np.ndarray]) -> bytes:
     frames = [frames[-1], *frames[:-1]]
     # One palette for all frames, made from a few of them, prevents flickering colours.
     few = np.vstack(frames[:: len(frames) // 3])
-    palette = Image.fromarray(few).quantize(
-        255, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE
-    )
-    first, *others = [
-        Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE)
-        for frame in frames
-    ]
+    octree, flat = Image.Quantize.FASTOCTREE, Image.Dither.NONE
+    palette = Image.fromarray(few).quantize(255, method=octree, dither=flat)
+    first, *others = (Image.fromarray(f).quantize(palette=palette, dither=flat) for f in frames)
     buffer = BytesIO()
     durations = [2000] + [FRAME_MS] * len(others)
     options = {"save_all": True, "append_images": others, "duration": durations, "loop": 0}

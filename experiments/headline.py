@@ -32,10 +32,7 @@ def _row(question: str, n: int, *errors_mm: float) -> dict[str, Any]:
 
 
 def tables() -> dict[str, list[dict[str, Any]]]:
-    """Return a row per question: number of trials, and the errors reported, of the paper and ours.
-
-    The paper reports two errors of its plans: for 100 and for 300 phases of a trajectory.
-    """
+    """Return a row per question; of its plans, the paper reports errors for 100 and 300 phases."""
     effects = _table("effect_prediction", "push_test").query("object_class == 'all'")
     pushes = effects[effects.n_interactions == 500].set_index("model")
     means = 1000 * pushes.final_error_mean_m

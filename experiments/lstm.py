@@ -54,10 +54,7 @@ def on_grid(effect: Tensor, t: Tensor, seen: Tensor, steps: int) -> Known:
 
 @network("lstm", LSTMConfig)
 class LSTMNetwork(AroundMean, HarmonicsNetwork):
-    """Predicts a trajectory step by step from the observed part of it; satisfies `EffectModel`.
-
-    It interpolates linearly between steps, so any phase can be queried, with gradients.
-    """
+    """Predicts a trajectory step by step, linear between steps; satisfies `EffectModel`."""
 
     def make_layers(self, config: LSTMConfig) -> None:
         """Create the encoders and decoders described above."""
@@ -80,9 +77,8 @@ class LSTMNetwork(AroundMean, HarmonicsNetwork):
     ) -> tuple[Tensor, ...]:
         """(μ_a, σ_a, μ_e, σ_e), each (B, T, C) and standardised."""
         o, b = observations, len(observations.weight)
-        code = masked_mean(
-            self.action_encoder(with_time(o.action / self.action_scale, o.action_t)), o.action_mask
-        )
+        actions = with_time(o.action / self.action_scale, o.action_t)
+        code = masked_mean(self.action_encoder(actions), o.action_mask)
         static = torch.cat([features.expand(b, -1), code], dim=1)
         d = o.effect / self.effect_scale - self.mean_trajectory(o.effect_t)
         *_, first = known = on_grid(d, o.effect_t, o.effect_mask, self.config.steps)

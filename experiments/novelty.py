@@ -240,12 +240,12 @@ def novelty_gain() -> Rows:
 
 def novelty_judged() -> Rows:
     """Evaluate σ, unchanged and grown, on known objects and on unused categories."""
-    rows, parts = [], {"first_six": FIRST, "second_six": SECOND}
-    parts = {k: (k,) for k in ("known", *FIRST, *SECOND, *ROLL)} | parts
+    rows, categories = [], ("known", *FIRST, *SECOND, *ROLL)
+    parts = {k: (k,) for k in categories} | {"first_six": FIRST, "second_six": SECOND}
     for name in MODELS:
         model, novelty_by, found = load_checkpoint(name)[0], novelty_of(name), {}
         known = tensors(open_interactions("push_test"), model)
-        for category in ("known", *FIRST, *SECOND, *ROLL):
+        for category in categories:
             pushes = known if category == "known" else strangers(category, model)
             novelty, (truth, mean, std) = novelty_by(pushes.image), final(model, pushes)
             aware = final(NoveltyAware(model, novelty_by), pushes)[2]

@@ -22,29 +22,14 @@ import numpy as np
 import pandas as pd
 import torch
 
+from affordlib.geometry import rotated_each
 from affordlib.interactions.recipes import Variation
-from affordlib.planning import (
-    ClosedLoopConfig,
-    PlanMode,
-    PlanningProblem,
-    Skills,
-    execute_plan,
-    plan_astar,
-    plan_continuous,
-    plan_gradient,
-    run_closed_loop,
-)
-from affordlib.planning.free_space import (
-    FULL_AT_M,
-    MARGIN_M,
-    N_POSES,
-    START_M,
-    FreeSpace,
-    corners_of,
-    gaps_m,
-    placed,
-    ring,
-)
+from affordlib.planning import PlanMode, PlanningProblem, Skills, execute_plan, free_space
+from affordlib.planning.astar import plan_astar
+from affordlib.planning.closed_loop import ClosedLoopConfig, run_closed_loop
+from affordlib.planning.continuous import plan_continuous
+from affordlib.planning.free_space import N_POSES, FreeSpace, corners_of, gaps_m, placed, ring
+from affordlib.planning.gradient import plan_gradient
 from affordlib.planning.rollout import poses_along
 from affordlib.planning.skills import CHECKPOINTS
 from affordlib.primitives import Drag, Move, Push
@@ -89,33 +74,28 @@ def drawn_object(number: int) -> tuple[TabletopObject, float]:
 
 def drawn_task(family: str, index: int, seed: int) -> ObstacleTask:
     """Draw a task; those in narrow places have no objects that roll, as the open hand is wider."""
-    key = [seed, list(FAMILIES).index(family), index]
-    rng = np.random.default_rng(key)
+    rng = np.random.default_rng([seed, list(FAMILIES).index(family), index])
+
+    def turned(xy: Any, angle_rad: float) -> np.ndarray:
+        return rotated_each(np.array(xy), np.array(angle_rad))
+
     while True:
         number = int(rng.integers(N_OBJECTS))
         obj, yaw = drawn_object(number)
         if obj.rollable and family != "clutter":
             continue
-        outline = placed(obj.footprint_m, np.array([0.0, 0.0, yaw]))
+        outline = turned(obj.footprint_m, yaw)
         angle = rng.uniform(-math.pi, math.pi)
-        local = placed(outline, np.array([0.0, 0.0, -angle]))
-        goal, shapes = LAYOUTS[family](rng, local)
-        obstacles = tuple(_turned(shape, angle) for shape in shapes)
-        turned = placed(np.array([goal]), np.array([0.0, 0.0, angle]))[0]
-        task = ObstacleTask(
-            family, number, obj, yaw, Goal(tuple(turned.tolist()), WITHIN_M), obstacles
+        goal, shapes = LAYOUTS[family](rng, turned(outline, -angle))
+        moved = turned([goal, *(one[:2] for one in shapes)], angle)
+        goal, *centres = map(tuple, moved.tolist())
+        obstacles = tuple(
+            Obstacle.box(at, one[2:4], one[4] + angle) if one[3:] else Obstacle.disc(at, one[2])
+            for at, one in zip(centres, shapes, strict=True)
         )
+        task = ObstacleTask(family, number, obj, yaw, Goal(goal, WITHIN_M), obstacles)
         if _is_fair(task, outline):
             return task
-
-
-def _turned(shape: tuple, angle_rad: float) -> Obstacle:
-    """An obstacle (x, y, length, width, yaw) or (x, y, radius) of a layout, turned with it."""
-    at = placed(np.array([shape[:2]]), np.array([0.0, 0.0, angle_rad]))[0]
-    at = tuple(at.tolist())
-    if len(shape) == 3:
-        return Obstacle.disc(at, shape[2])
-    return Obstacle.box(at, shape[2:4], shape[4] + angle_rad)
 
 
 def _is_fair(task: ObstacleTask, outline: np.ndarray) -> bool:
@@ -142,18 +122,19 @@ def _corridor(rng: np.random.Generator, local: np.ndarray) -> tuple:
     return goal, walls
 
 
-def _walled(rng: np.random.Generator, local: np.ndarray, before_m: float, deep_m: float) -> tuple:
+def _walled(
+    rng: np.random.Generator, local: np.ndarray, deep_m: tuple, before_m: tuple = ()
+) -> tuple:
     """Two walls with a third behind them, before_m from the object; the goal is deep_m inside."""
-    half, radius = _half_m(rng, local), float(np.hypot(*local.T).max())
-    mouth = before_m + (radius + 0.01 if before_m else 0.0)
-    end = mouth + deep_m + radius + rng.uniform(0.006, 0.014)
+    radius = float(np.hypot(*local.T).max())
+    mouth = rng.uniform(*before_m) + (radius + 0.01) if before_m else 0.0
+    deep, half = rng.uniform(*deep_m), _half_m(rng, local)
+    end = mouth + deep + radius + rng.uniform(0.006, 0.014)
     aside = rng.uniform(-0.03, 0.03) if before_m else 0.0
-    walls = [
-        (*((mouth + end) / 2, aside + s * (half + WALL_M / 2)), end - mouth, WALL_M, 0.0)
-        for s in (-1, 1)
-    ]
+    x, size = (mouth + end) / 2, (end - mouth, WALL_M, 0.0)
+    walls = [(x, aside + s * (half + WALL_M / 2), *size) for s in (-1, 1)]
     back = end + WALL_M / 2, aside, WALL_M, 2 * half + 2 * WALL_M, 0.0
-    return (mouth + deep_m, aside), [*walls, back]
+    return (mouth + deep, aside), [*walls, back]
 
 
 def _gate(rng: np.random.Generator, local: np.ndarray) -> tuple:
@@ -175,14 +156,14 @@ def _clutter(rng: np.random.Generator, local: np.ndarray) -> tuple:
 
 LAYOUTS = {
     "corridor": _corridor,
-    "pocket": lambda rng, local: _walled(rng, local, 0.0, rng.uniform(0.05, 0.08)),
+    "pocket": partial(_walled, deep_m=(0.05, 0.08)),
     "gate": _gate,
-    "bay": lambda rng, local: _walled(rng, local, rng.uniform(0.03, 0.08), rng.uniform(0.02, 0.04)),
-    "deep bay": lambda rng, local: _walled(
-        rng, local, rng.uniform(0.10, 0.18), rng.uniform(0.05, 0.08)
-    ),
+    "bay": partial(_walled, deep_m=(0.02, 0.04), before_m=(0.03, 0.08)),
+    "deep bay": partial(_walled, deep_m=(0.05, 0.08), before_m=(0.10, 0.18)),
     "clutter": _clutter,
 }
+"""Goal (x, y), and obstacles (x, y, length, width, yaw) or (x, y, radius), ahead of an object whose
+outline is given."""
 
 
 @dataclass(frozen=True)
@@ -242,8 +223,12 @@ network of pushes or mechanics instead, and whether it observes after each actio
 actions more."""
 
 
-def run_task(row: str, family: str, index: int, seed: int) -> dict[str, Any]:
-    """Plan and execute a task; return what came of it."""
+def run_task(row: str, family: str, index: int, seed: int) -> Any:
+    """Plan and execute a task; return what came of it. Rows "margin" and "search" plan nothing."""
+    if row == "margin":
+        return calibrate(family, index)
+    if row == "search":
+        return search(family, index, seed)
     planner, settings = ROWS[row]
     task, world = drawn_task(family, index, seed), one_tabletop()
     where = settings.get("world", "clean")
@@ -340,9 +325,8 @@ plans that are executed, and the gap [m] that they keep."""
 
 @lru_cache(maxsize=N_OBJECTS)
 def simulated(number: int) -> tuple[type[Move], np.ndarray, np.ndarray]:
-    """Execute full actions in all directions with an object, alone on the table.
-
-    Returns their primitive, directions [rad] (d,), and the object's poses (d, 301, 3) from its own.
+    """Execute full actions with an object, alone on the table, and return their primitive,
+    directions [rad] (d,), and the object's poses (d, 301, 3) from its own.
     """
     world, (obj, yaw) = one_tabletop(), drawn_object(number)
     angles, ways = [], []
@@ -358,9 +342,8 @@ def simulated(number: int) -> tuple[type[Move], np.ndarray, np.ndarray]:
 
 
 def search(family: str, index: int, seed: int) -> dict[str, Any]:
-    """Search plans with the simulator's effects, breadth first, and execute the best ones.
-
-    Returns what came of the first that succeeds, or of the one that ended nearest.
+    """Search plans with the simulator's effects, breadth first, and execute the best ones until one
+    succeeds; return what came of it, or of the one that ended nearest.
     """
     task, world = drawn_task(family, index, seed), one_tabletop()
     kind, angles, ways = simulated(task.number)
@@ -408,22 +391,13 @@ def search(family: str, index: int, seed: int) -> dict[str, Any]:
 
 
 def job(row: str, family: str = "", index: int = 0, seed: int = SEED) -> Job:
-    """Return the job of a row and a task; the rows "margin" and "search" plan nothing."""
+    """Return the job of a row and a task."""
     arguments = {"row": row, "family": family, "index": index, "seed": seed}
     checkpoints = [*CHECKPOINTS.values(), PUSHES["perturbed"]]
     if row in ROWS and "push" in ROWS[row][1]:
         checkpoints.append(ROWS[row][1]["push"])
     version = 2 if row == "closed_loop_perturbed" else 1
-    return Job(make, arguments, checkpoints=tuple(checkpoints), version=version)
-
-
-def make(row: str, family: str, index: int, seed: int) -> Any:
-    """Make the result of a job."""
-    if row == "margin":
-        return calibrate(family, index)
-    if row == "search":
-        return search(family, index, seed)
-    return run_task(row, family, index, seed)
+    return Job(run_task, arguments, checkpoints=tuple(checkpoints), version=version)
 
 
 TASKS = [(family, k) for family, n in FAMILIES.items() for k in range(n)]
@@ -433,25 +407,14 @@ JOBS = [
 ]
 
 
-def searches(folder: str | Path) -> list[Job]:
-    """Return the jobs of the search, for tasks that no row has solved in the clean world."""
-    found = runner.read(NAME, job, folder)
-    rows = judged([a | r for a, r in found if a["row"] in ROWS])
-    solved = {*rows[rows.feasible].groupby(["family", "index"]).groups}
-    return [job("search", *task) for task in TASKS if task not in solved]
-
-
 def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
     """Return the tables of all stored results."""
     found = runner.read(NAME, job, folder)
     errors = pd.DataFrame([a | e for a, r in found if a["row"] == "margin" for e in r])
     records = judged([a | r for a, r in found if a["row"] != "margin"])
     records = records[records.row != "search"]
-    return {
-        "margin": margin_rows(errors),
-        "rows": rows_of(records),
-        "partial_and_full": paired_rows(records),
-    }
+    both = {"rows": rows_of(records), "partial_and_full": paired_rows(records)}
+    return {"margin": margin_rows(errors)} | both
 
 
 def margin_rows(errors: pd.DataFrame) -> Rows:
@@ -460,10 +423,10 @@ def margin_rows(errors: pd.DataFrame) -> Rows:
     at_margin_percent: of those that pass at the margin; within_percent: of those that pass by up to
     `WITHIN_GAP_M` more, all gaps being equally frequent.
     """
-    rows = []
+    rows, start_m = [], free_space.START_M
     for kind, some in errors.groupby("family", sort=False):
-        grown = np.minimum(some.travel_m / FULL_AT_M, 1)
-        over = some.error_m - START_M - (MARGIN_M - START_M) * grown
+        grown = np.minimum(some.travel_m / free_space.FULL_AT_M, 1)
+        over = some.error_m - start_m - (free_space.MARGIN_M - start_m) * grown
         row = {"primitive": kind, "n": len(some)}
         row |= {f"q{q}_m": float(some.error_m.quantile(q / 100)) for q in (50, 95, 99)}
         row["at_margin_percent"] = 100 * float((over > 0).mean())
@@ -498,11 +461,10 @@ def rows_of(records: pd.DataFrame) -> Rows:
             made = {"row": row, "family": family, "n": len(some)}
             for name in ("success", "contact", "planned"):
                 made[f"{name}_percent"] = 100 * some[name].astype(float).mean()
-            made["feasible"] = int(some.feasible.sum())
+            made |= {"feasible": int(some.feasible.sum())}
             made["of_feasible_percent"] = 100 * float(some.success[some.feasible].mean())
-            made |= {"distance_m_median": some.distance_m.median()}
-            made["actions_mean"] = some.actions.mean()
-            rows.append(made)
+            made["distance_m_median"] = some.distance_m.median()
+            rows.append(made | {"actions_mean": some.actions.mean()})
     return plain(rows)
 
 
@@ -515,10 +477,9 @@ PAIRS += [("closed_loop_perturbed", "perturbed")]
 
 
 def paired_rows(records: pd.DataFrame) -> Rows:
-    """Return differences of success [%] on the same tasks, with their 95 % intervals.
+    """Return paired differences of success [%] and 95 % intervals, None where all are equal.
 
-    low, high: None where all differences are equal, as resampling would tell nothing. actions,
-    other_actions: mean numbers on the tasks that both solve.
+    actions, other_actions: mean numbers on the tasks that both solve.
     """
     table, rows = records.drop_duplicates(["family", "index", "row"]), []
     actions = table[table.success].pivot(index=["family", "index"], columns="row", values="actions")
@@ -543,10 +504,15 @@ def paired_rows(records: pd.DataFrame) -> Rows:
 
 @command(OSError, ValueError)
 def main(argv: Sequence[str] | None = None) -> int:
-    """Plan and execute missing tasks, and write the tables."""
+    """Plan and execute missing tasks, search plans for those not solved, and write the tables."""
     options = runner.parser(NAME, main.__doc__).parse_args(argv)
     runner.make(JOBS, NAME, options, tables)
-    return 0 if options.only else runner.make(searches(options.raw), NAME, options, tables)
+    if options.only:
+        return 0
+    rows = judged([a | r for a, r in runner.read(NAME, job, options.raw) if a["row"] in ROWS])
+    solved = {*rows[rows.feasible].groupby(["family", "index"]).groups}
+    searches = [job("search", *task) for task in TASKS if task not in solved]
+    return runner.make(searches, NAME, options, tables)
 
 
 if __name__ == "__main__":

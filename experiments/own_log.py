@@ -50,14 +50,11 @@ def drawn_push(outline_m: np.ndarray, yaw: float, rng: np.random.Generator) -> P
 
 def executed(
     obj: TabletopObject,
-    draw: Callable[[float], PushAt],
+    draw: Callable[[float], PushAt],  # a push for the object's yaw
     rng: np.random.Generator,
     config: WorldConfig | None = None,
 ) -> Iterator[tuple[np.ndarray, tuple[Pose, Pose]]]:
-    """Yield the rod's path (n, 2) of pushes, and the object's poses before and after it.
-
-    draw: samples a push for the object's yaw. Pushes that fail are left out.
-    """
+    """Yield the rod's path (n, 2) of pushes that do not fail, and the poses before and after."""
     with Tabletop(config) as world:
         while True:
             world.place(obj, (0.0, 0.0), rng.uniform(-math.pi, math.pi), tool="rod")

@@ -522,7 +522,8 @@ def sigma_rows(records: dict[str, Rows]) -> Rows:
     """
     rows: Rows = []
     for name in [n for n in ("continuous", "continuous_film_500") if n in records]:
-        plans = pd.DataFrame(records[name]).query("object_class in @STANDING and steps == actions > 0")
+        plans = pd.DataFrame(records[name]).query("object_class in @STANDING")
+        plans = plans[(plans.steps == plans.actions) & (plans.steps > 0)]
         for steps, some in plans.groupby("steps"):
             error, sigma = some.prediction_error_m, some.std_m
             row = {"planner": name, "model": CONFIGS[name].model, "actions": steps, "n": len(some)}

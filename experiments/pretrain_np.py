@@ -37,7 +37,6 @@ from experiments.commands import command
 PUSHES, CHUNK = 48, 64
 OBJECTS, STEPS = 12_288, 7000
 CHECKPOINT = repo_root() / "data" / "checkpoints" / f"{PRETRAINED}.safetensors"
-_SHORT, _LONG = 0.12, 0.9
 
 
 def between(low: float, high: float, shape: tuple[int, ...], g: torch.Generator) -> Tensor:
@@ -51,9 +50,8 @@ def log_between(low: float, high: float, shape: tuple[int, ...], g: torch.Genera
 
 
 def outlines(n: int, g: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Sample outlines: corners (n, 4, 2), and shares (n, 4) of the area at each edge.
-
-    Corners are counter-clockwise (triangles repeat one); centroid 0, radius of gyration 1.
+    """Sample outlines of centroid 0 and radius of gyration 1: corners (n, 4, 2), counter-clockwise
+    (triangles repeat one), and shares (n, 4) of the area at each edge.
     """
     angle = (between(0.15, 0.85, (n, 4), g) + torch.arange(4)) * (math.pi / 2)
     of_three = (between(0.2, 0.8, (n, 3), g) + torch.arange(3)) * (2 * math.pi / 3)
@@ -128,7 +126,7 @@ def simulate(n: int, g: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
     normal = -quarter_turn(tangent)
     incidence = between(-62, 62, (*shape, 1), g).deg2rad()
     direction = incidence.cos() * normal + incidence.sin() * tangent
-    travel = log_between(_SHORT, _LONG, (n, 1), g) * between(0.9, 1.1, shape, g)
+    travel = log_between(0.12, 0.9, (n, 1), g) * between(0.9, 1.1, shape, g)
     same = torch.rand(n, 1, generator=g) < 0.5
     travel = torch.where(same, 0.276 * between(0.97, 1.03, shape, g), travel)[..., None]
     friction = 1 + 0.08 * torch.randn(shape, generator=g)
@@ -139,9 +137,8 @@ def simulate(n: int, g: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
     each[..., 2] = each[..., 2] * (0.15 * unsteady).exp()
     each[..., 2] = each[..., 2] / each[..., 2].sum(-1, keepdim=True)
     push = torch.cat([contact, normal, direction, travel], -1)
-    truth = quasi_static_push(
-        push.flatten(0, 1), each.flatten(0, 1), friction.flatten(), smoothing
-    ).unflatten(0, shape)
+    inputs = push.flatten(0, 1), each.flatten(0, 1), friction.flatten()
+    truth = quasi_static_push(*inputs, smoothing).unflatten(0, shape)
     # Poses before and after have measurement noise; the computed contact stays on the edge.
     scatter = log_between(0.002, 0.012, (n, 1, 1), g)
     before, after = (scatter * torch.randn(*shape, 3, generator=g) for _ in range(2))

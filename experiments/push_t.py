@@ -20,8 +20,9 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -31,9 +32,9 @@ from scipy.optimize import least_squares
 from scipy.special import expit
 
 from affordlib.geometry import rotated, unit_vector, wrap_angle
-from affordlib.logs import Log, LoggedPushes, PushedObject, Pushes, PushPlanner, fit
+from affordlib.logs import Log, LoggedPushes, PushedObject, PushPlanner, fit
 from affordlib.logs.cross_validate import forecast_errors
-from affordlib.logs.fit import Forecast
+from affordlib.logs.fit import PushModel
 from affordlib.logs.log import _nearest, centred
 from affordlib.logs.neural_process import PRETRAINED
 from affordlib.logs.planning import primitive_of
@@ -58,10 +59,7 @@ BLOCKS, OF_BLOCK, DRAWS = 15, 20, 5
 PRICE, ROUNDS = 0.3, 2
 NEAR_PX, NEAR_RAD, REST_PX = 10.0, math.radians(10), 0.01
 
-
-def log_of_t() -> Log:
-    """Return an empty log of the T; a pixel counts as a millimetre."""
-    return Log("mm", T_PX, tool_radius=AGENT_PX)
+log_of_t = partial(Log, "mm", T_PX, tool_radius=AGENT_PX)  # a pixel counts as a millimetre
 
 
 @lru_cache
@@ -101,15 +99,14 @@ class Table:
         import gymnasium
 
         self.view = view
-        self.env = gymnasium.make(
-            "gym_pusht/PushT-v0", obs_type="state" if view == "state" else "pixels", **of_block
-        )
+        seen = "state" if view == "state" else "pixels"
+        self.env = gymnasium.make("gym_pusht/PushT-v0", obs_type=seen, **of_block)
 
     def reset(self, seed: int) -> None:
         """Begin an episode, and wait until the T rests, should the agent begin inside it."""
         self.seen, info = self.env.reset(seed=seed)
-        self.steps, self.rests, self.solved = 0, 0, dict.fromkeys("ab")
-        self.truth, self.done = info["block_pose"], False
+        self.steps, self.rests, self.solved, self.done = 0, 0, dict.fromkeys("ab"), False
+        self.truth = info["block_pose"]
         self.history = [(info["pos_agent"].tolist(), self.truth.tolist())]
         self.look()
         while self.steps < MOST_STEPS:
@@ -154,14 +151,6 @@ class Table:
         return np.array(path)
 
 
-class Nothing:
-    """A model for a robot that knows nothing yet."""
-
-    def predict(self, pushes: Pushes) -> Forecast:
-        """Predict that nothing moves."""
-        return np.zeros((len(pushes), 3)), np.ones((len(pushes), 3))
-
-
 def metres(log: Log, seen: tuple) -> tuple[tuple[float, float], tuple[float, float, float]]:
     """Convert what is seen to the tool's position [m] and the pose of the T's centroid."""
     return tuple((1e-3 * seen[0]).tolist()), log.centroid_pose(seen[1])
@@ -172,11 +161,11 @@ def collect(n: int, draw: int, view: str = "state", **of_block: Any) -> list[dic
     log, table, found = log_of_t(), Table(view, **of_block), []
     rng, seed = np.random.default_rng(FIRST_DRAW + draw), FIRST_DRAW + 1000 * draw
     of_t = PushedObject(1e-3 * np.array(T_PX), 1e-3 * AGENT_PX, LENGTHS_M)
-    planner = PushPlanner(Nothing(), of_t, room_m=ROOM_M)
+    unknown = SimpleNamespace(predict=lambda pushes: np.ones((2, len(pushes), 3)))
+    planner = PushPlanner(unknown, of_t, room_m=ROOM_M)  # only looks for ways around the T
     table.reset(seed)
     while len(found) < n:
-        seen = table.look()
-        tool, pose = metres(log, seen)
+        tool, pose = metres(log, table.look())
         middle = 1e3 * np.array(pose[:2])
         planner.library = of_t.draw(64, rng)
         can = np.flatnonzero(~planner.shut(pose, tool))
@@ -192,7 +181,7 @@ def collect(n: int, draw: int, view: str = "state", **of_block: Any) -> list[dic
         path = table.go(way[-1:])
         after = table.look()
         push = {"tool_t": np.arange(len(path)), "tool_xy": path, "poses": (before[1], after[1])}
-        found += [push] if not log.add_all([push]) else []
+        found += [] if log.add_all([push]) else [push]
     return found
 
 
@@ -306,17 +295,22 @@ ROWS = {
 
 
 @lru_cache(maxsize=3 * DRAWS)
-def pushes_of_draw(n: int, draw: int, row: Row) -> LoggedPushes:
-    """Return the first n random pushes of a draw, as this row sees them."""
-    return logged(collect(n, draw, row.view, block_cog=row.block_cog))
+def pushes_of_draw(n: int, draw: int, view: str, block_cog: tuple | None) -> LoggedPushes:
+    """Return the first n random pushes of a draw."""
+    return logged(collect(n, draw, view, block_cog=block_cog))
 
 
 @lru_cache(maxsize=DRAWS)
 def planner_of(row: Row, draw: int) -> PushPlanner:
     """Fit a row's model to a draw of pushes, and return its planner."""
-    data = pushes_of_draw(row.n, draw, replace(row, model="", n=0, chain=0))
+    data = pushes_of_draw(row.n, draw, row.view, row.block_cog)
+    return planner_with(fit(data, row.model), data)
+
+
+def planner_with(model: PushModel, data: LoggedPushes) -> PushPlanner:
+    """Return the planner of a model for the T of a log."""
     obj = replace(PushedObject.of(data), lengths_m=LENGTHS_M)
-    return PushPlanner(fit(data, row.model), obj, price=PRICE, rounds=ROUNDS, room_m=ROOM_M)
+    return PushPlanner(model, obj, price=PRICE, rounds=ROUNDS, room_m=ROOM_M)
 
 
 def solve(row: str, block: int) -> dict[str, Any]:
@@ -324,8 +318,8 @@ def solve(row: str, block: int) -> dict[str, Any]:
     about, first = ROWS[row], FIRST_START + block * OF_BLOCK
     table = Table(about.view, block_cog=about.block_cog)
     planner = planner_of(about, block % DRAWS) if about.n else None
-    seeds = range(first, first + OF_BLOCK)
-    return {"runs": [attempt(table, planner, about.chain, seed) for seed in seeds]}
+    runs = [attempt(table, planner, about.chain, first + k) for k in range(OF_BLOCK)]
+    return {"runs": runs}
 
 
 def errors(row: str, draw: int) -> dict[str, Any]:
@@ -335,9 +329,7 @@ def errors(row: str, draw: int) -> dict[str, Any]:
     collected = time.process_time()
     model = fit(pushes, about.model)
     fitted, table = time.process_time(), Table(about.view, block_cog=about.block_cog)
-    obj = replace(PushedObject.of(pushes), lengths_m=LENGTHS_M)
-    planner = PushPlanner(model, obj, price=PRICE, rounds=ROUNDS, room_m=ROOM_M)
-    attempt(table, planner, about.chain, FIRST_CHOICE)
+    attempt(table, planner_with(model, pushes), about.chain, FIRST_CHOICE)
     solved = time.process_time()
     new = logged(collect(400, DRAWS + draw, about.view, block_cog=about.block_cog))
     found = forecast_errors(model, new)
@@ -363,8 +355,8 @@ def tables(folder: str = FOLDER) -> dict[str, Rows]:
     for row, part in runs.groupby("row", sort=False):
         for rule in "ab":
             steps = part[f"steps_{rule}"].astype(float).fillna(math.inf)
-            about = {"row": row, "rule": rule, "n": len(part)}
-            about["draws"] = part["block"].mod(DRAWS).nunique()
+            draws = part["block"].mod(DRAWS).nunique()
+            about = {"row": row, "rule": rule, "n": len(part), "draws": draws}
             for limit in LIMITS:
                 names = (f"{name}_{limit}_percent" for name in ("share", "low", "high"))
                 about |= zip(names, shares(int((steps <= limit).sum()), len(part)), strict=True)
@@ -414,9 +406,7 @@ def store(n: int = 200) -> None:
     pd.concat(rows).round(4).to_csv(STORED / "pushes.csv.xz", index=False)
     table = Table()
     attempt(table, planner_of(ROWS["gp_200"], 0), 3, FIRST_CHOICE + 7)
-    history = [
-        [[round(v, 2) for v in agent], [round(v, 4) for v in pose]] for agent, pose in table.history
-    ]
+    history = [[[round(v, 2) for v in a], [round(v, 4) for v in p]] for a, p in table.history]
     write_atomically(STORED / "run.json", json.dumps({"steps": history, "solved": table.solved}))
     film(history, repo_root() / "figures" / "push_t.gif")
 

@@ -115,9 +115,8 @@ def pooled(data: LoggedPushes, names: tuple[str, ...], seed: int, fold: int) -> 
 
 
 def unseen(data: LoggedPushes, names: tuple[str, ...], seed: int, fold: int) -> pd.DataFrame:
-    """Return errors on a condition, trained on the six others and its first 0, 5 and 10 pushes.
-
-    The neural process is trained on the others only and uses the first pushes as context.
+    """Return errors on a condition, trained on the six others and its first 0, 5 and 10 pushes, or,
+    with the first pushes as context of the neural process, on the others only.
     """
     of_group = data.groups == CONDITIONS[fold]
     order = np.random.default_rng(seed).permutation(np.flatnonzero(of_group))
@@ -129,14 +128,13 @@ def unseen(data: LoggedPushes, names: tuple[str, ...], seed: int, fold: int) -> 
             trained = np.isin(np.arange(len(data)), given)
             errors = errors_of(data, trained, tested, names, seed)
         else:
-            fitted.data, test = data.select(given), data.select(tested)
-            errors = forecast_errors(fitted, test)
+            fitted.data = data.select(given)
+            errors = forecast_errors(fitted, data.select(tested))
             errors = errors.assign(model="np", push=np.flatnonzero(tested))
         parts.append(errors.assign(shots=shots))
     return pd.concat(parts)
 
 
-NAMES = ("baselines", "np")
 PROTOCOLS = {f"from_{n}": (partial(from_some, n), 5) for n in (10, 20, 40)}
 PROTOCOLS |= {"pooled": (pooled, 5), "unseen": (unseen, len(CONDITIONS))}
 COLUMNS = ["model", "shots", "push", "position_m", "yaw_rad", "inside_50", "inside_90"]
@@ -161,10 +159,7 @@ def job(protocol: str, predictor: str, feet: bool, seed: int, fold: int, logs: s
 
 
 def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
-    """Return errors by protocol, model and context, and paired differences to the best baseline.
-
-    A push's error is its mean over seeds, so that each push counts once.
-    """
+    """Return errors, means of a push over seeds, and paired differences to the best baseline."""
     every = frame(read(TABLE, job, folder), "errors").drop(columns=["fold", "predictor"])
     keys = ["protocol", "feet", "shots", "model"]
     seeds = every.groupby(keys)["seed"].nunique()
@@ -214,7 +209,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     jobs = [
         job(protocol, predictor, feet, seed, fold, options.logs)
         for protocol, (_, folds) in PROTOCOLS.items()
-        for predictor, feet in itertools.product(NAMES, (False, True))
+        for predictor, feet in itertools.product(("baselines", "np"), (False, True))
         for seed, fold in itertools.product(range(3 if predictor == "np" else 1), range(folds))
         # Within one condition, the feet are the same for all pushes.
         if predictor == "baselines" or not feet or not protocol.startswith("from")

@@ -33,7 +33,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import xarray as xr
 from filelock import FileLock
 from scipy.stats import binomtest, bootstrap
 from tqdm.auto import tqdm
@@ -50,13 +49,7 @@ FOLDER = "data/results/raw"
 WRITE_EVERY_S = 30
 NOT_DECISIVE = ("device",)  # options without influence on results: those of the machine
 
-
-@lru_cache(maxsize=4)
-def open_once(name: str) -> xr.Dataset:
-    """Open a data set by name and cache it between jobs."""
-    return open_interactions(name)
-
-
+open_once = lru_cache(maxsize=4)(open_interactions)  # data sets are kept between jobs
 Rows = list[dict[str, Any]]
 Result = tuple[dict[str, Any], Any]
 """The arguments of a job and the value that its function returned."""

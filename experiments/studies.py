@@ -30,10 +30,9 @@ PHASES = (0.0, 0.55, 0.65, 0.75, 1.0)
 
 @torch.no_grad()
 def partial_execution() -> Rows:
-    """Measure the errors on partial actions of networks trained only on full actions.
+    """Measure the errors on actions that stop at phase t of networks trained only on full actions.
 
-    Actions stop at phase t; the truth is the state of the full action at t, or the object's rest
-    position.
+    The truth is the state of the full action at t, or the object's rest position.
     """
     data, rows = open_interactions("partial"), []
     names = data["primitive"].attrs["flag_meanings"].split()
@@ -61,36 +60,22 @@ def partial_execution() -> Rows:
     return rows
 
 
-STUDIES: dict[Callable[[], Rows], dict[str, Any]] = {
-    ablation.incremental_ablation: {
-        "data": ("push",),
-        "settings": (ablation.ABOUT, list(ablation.LADDER.values())),
-        "version": 2,
-    },
-    novelty.novelty_gain: {
-        "data": ("push",),
-        "settings": novelty.SETTINGS,
-        "checkpoints": novelty.MODELS[:3],
-    },
-    novelty.novelty_judged: {
-        "data": ("push_test",),
-        "settings": (*novelty.SETTINGS, novelty.NOVELTY_GAIN),
-        "checkpoints": novelty.MODELS,
-    },
-    partial_execution: {
-        "data": ("partial",),
-        "checkpoints": WHOLE_ACTION_MODELS,
-        "settings": PHASES,
-    },
+_LADDER = ablation.ABOUT, [*ablation.LADDER.values()]
+_GROWN = *novelty.SETTINGS, novelty.NOVELTY_GAIN
+STUDIES: dict[Callable[[], Rows], tuple[Any, ...]] = {
+    ablation.incremental_ablation: (_LADDER, ("push",), (), 2),
+    novelty.novelty_gain: (novelty.SETTINGS, ("push",), novelty.MODELS[:3]),
+    novelty.novelty_judged: (_GROWN, ("push_test",), novelty.MODELS),
+    partial_execution: (PHASES, ("partial",), WHOLE_ACTION_MODELS),
 }
-"""Functions that return the rows of a study, each with further fields of its `Job`."""
+"""Functions that return the rows of a study; settings, data, checkpoints and version of its job."""
 
 BY_NAME = {study.__name__: study for study in STUDIES}
 
 
 def job(study: str) -> Job:
     """Return the job that makes the rows of a study."""
-    return Job(make_rows, {"study": study}, **STUDIES[BY_NAME[study]])
+    return Job(make_rows, {"study": study}, *STUDIES[BY_NAME[study]])
 
 
 def make_rows(study: str) -> Rows:

@@ -87,8 +87,8 @@ def markdown_table(
         wide.columns = [f"{of[b]}: {head}" for head, b in wide.columns]
         numbers |= {*wide.columns}
         frame = wide.reset_index()
-    lines = ["---:" if name in numbers else "---" for name in frame.columns]
-    lines = [list(frame.columns), lines, *frame.to_numpy().tolist()]
+    rule = ["---:" if name in numbers else "---" for name in frame.columns]
+    lines = [list(frame.columns), rule, *frame.to_numpy().tolist()]
     lines = [" | ".join(text.translate(MARKUP) for text in line) for line in lines]
     return "".join(f"| {line} |\n" for line in lines)
 
@@ -146,10 +146,8 @@ def fill_tables(text: str) -> str:
         rows, shape, link = tables[name], {}, ""
         for option in options:
             key, _, value = option.partition("=")
-            if key in ("columns", "values"):
-                shape[key] = value.split(",")
-            elif key == "by":
-                shape[key] = value
+            if key in ("columns", "values", "by"):
+                shape[key] = value if key == "by" else value.split(",")
             elif key == "picture":
                 file, _, drawn = value.partition(":")
                 alt = ", ".join(drawn.split(",")).replace("_", " ")
@@ -168,10 +166,7 @@ def fill_tables(text: str) -> str:
 
 
 def stale_pictures(text: str) -> Iterator[tuple[Path, Callable[[], bytes]]]:
-    """Yield for each picture that shows another table than a filled page its file and a drawing.
-
-    The file holds a hash of what it shows.
-    """
+    """Yield file and drawing of each picture whose hash is not that of its table on a page."""
     for block in BLOCK.finditer(text):
         table = block["body"].partition("\n\n")[0]
         for name, columns in re.findall(r" picture=([^:]+):(\S+)", block["what"]):

@@ -40,10 +40,7 @@ REACH_M = {Push: 0.07, Drag: 0.05}
 
 @dataclass(frozen=True)
 class PlanningTask:
-    """An object at the table's centre, rotated by a yaw [rad], and its goal.
-
-    config: the world, which is unknown to the planners.
-    """
+    """An object at the table's centre with a yaw [rad], its goal, and a world that is not known."""
 
     obj: TabletopObject
     yaw_rad: float

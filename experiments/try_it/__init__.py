@@ -17,15 +17,8 @@ from affordlib.planning import Skills, execute_plan, plan_continuous
 from affordlib.results import repo_root, write_atomically
 from affordlib.show.table_data import object_data, table_data
 from affordlib.types import Goal
-from affordlib.world import (
-    Cuboid,
-    LyingCylinder,
-    Prism,
-    Sphere,
-    Tabletop,
-    TabletopObject,
-    UprightCylinder,
-)
+from affordlib.world import Tabletop, TabletopObject
+from affordlib.world.objects import Cuboid, LyingCylinder, Prism, Sphere, UprightCylinder
 from affordlib.world.trajectory import STEP_S
 
 PAGE = repo_root() / "figures" / "try_it.html"
