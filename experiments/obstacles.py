@@ -493,9 +493,7 @@ def paired_rows(records: pd.DataFrame) -> Rows:
             mean, low, high = interval(off) if off.nunique() > 1 else (off.iloc[0], None, None)
             row = {"row": one, "other": other, "family": family, "n": len(some)}
             row |= {"successes": int(some[one].sum()), "other_successes": int(some[other].sum())}
-            solved = actions[
-                actions.index.isin(pd.MultiIndex.from_frame(some[["family", "index"]]))
-            ]
+            solved = actions.reindex(pd.MultiIndex.from_frame(some[["family", "index"]]))
             solved = solved[[one, other]].dropna().mean()
             row |= {"actions": solved[one], "other_actions": solved[other]}
             rows.append(row | {"difference_percent": mean, "low": low, "high": high})

@@ -195,17 +195,16 @@ RATES = {"gradient": (0.03, 0.1, 0.3, 1.0, 3.0), "adam": (0.001, 0.005, 0.02)}
 
 READINGS = {
     "gradient_100": Reading(),
-    "gradient_300": Reading(),
     "gradient_starts_100": Reading(starts=4),
     "gradient_circle_100": Reading(start="circle", rate=1.0),
     "gradient_point_100": Reading("gradient", "circle", "point", rate=1.0),
     "gradient_adam_100": Reading("adam", "circle", "point"),
 }
-"""Readings of the paper's planner: as printed with 100 and 300 phases, the best of four starts,
-from the circle of 20 cm, from there until the point is still, the same with Adam."""
+"""Readings of the paper's planner: as printed, the best of four starts, from the circle of 20 cm,
+from there until the point is still, the same with Adam."""
 
 
-def _descent(reading: Reading, model: str = "cnp_500", samples: int = 100, **how: Any):
+def _descent(reading: Reading, model: str = "cnp_500", samples: int = 100, **how: Any) -> Any:
     arguments = {"samples": samples, "reading": reading}
     return PlannerConfig(plan_gradient, model, arguments, **how)
 
