@@ -350,8 +350,7 @@ def test_a_goal_moves_and_an_object_is_shoved_as_scheduled(world, skills):
 def test_an_object_that_no_camera_sees_is_lost(world, skills):
     world.place(BALL, (0.5, 0.0), config=WorldConfig(camera="kinect"))
     off = Disturbance("knock", 1, 1.5, 0.0)
-    went, _ = disturbed(world, Goal((0.4, 0.1), EXACT_M), skills, off, ends="lost")
-    assert len(went.steps) == 2  # the knock is during the second
+    assert disturbed(world, Goal((0.4, 0.1), EXACT_M), skills, off, ends=None)[0].status == "lost"
 
 
 def test_what_lies_can_be_toppled_again(world):
