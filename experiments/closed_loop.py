@@ -326,8 +326,8 @@ def job(table: str, index: int, seed: int, world: str = "clean") -> Job:
     files = tuple(file for kind, file in models.items() if kind in used)
     reach = runner.hash_of("reachability", "checkpoint")
     version = VERSIONS[table]
-    if world == "perturbed" and category_of(table, index) in ROLLABLE:
-        version += 1
+    if world == "perturbed":
+        version += 1 + (category_of(table, index) in ROLLABLE)
     return Job(run_trial, arguments, reach, (), files, version)
 
 

@@ -107,7 +107,7 @@ class DisturbanceSchedule:
         self._apply([d for d in self._waiting if d.action <= self._n_actions and d.at_s is None])
         return self.world.observe()
 
-    def execute(self, step: Step) -> Execution:
+    def execute(self, step: Step, seen: Observation | None = None) -> Execution:
         """Execute as the tabletop does, and apply the disturbances due during the action."""
         world, n_steps, on_step = self.world, 0, self.world.on_step
         due = [d for d in self._waiting if d.action <= self._n_actions and d.at_s is not None]
@@ -123,7 +123,7 @@ class DisturbanceSchedule:
 
         world.on_step = watch if due else on_step
         try:
-            done = world.execute(step)
+            done = world.execute(step, seen)
         finally:
             world.on_step = on_step
         self._apply(due)

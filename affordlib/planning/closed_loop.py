@@ -310,6 +310,12 @@ class _ClosedLoop:
         if len(self.steps) >= self.limit:
             return self._give_up(part)
         self.acted_for = self.goal
+        if self.queue and self.seen.obstacles:
+            step = self.queue[0]
+            if isinstance(step.primitive, Drag):  # the hand closes as it has opened, and as planned
+                yaw = float(self.executions[-1].tool[-1, 3])
+                step = replace(step, primitive=replace(step.primitive, grip_yaw=yaw))
+            self.queue = [step, *self.queue[1:]] if self.moves.is_free(step, self.seen) else []
         if part != "position" or not self.queue:
             if part == "position":
                 plan = self.moves.plan(self.seen, self.goal, self._grip_yaw())
@@ -323,7 +329,7 @@ class _ClosedLoop:
             self.config.on_plan(plan)
         step = self.queue.pop(0)
         try:
-            execution = self.robot.execute(step)
+            execution = self.robot.execute(step, self.seen)
         except UnreachableError as error:  # the object is now seen at a slightly other position
             return Ending("unreachable", f"the {part}: {error}")
         self.steps.append(step)

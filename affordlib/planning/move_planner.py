@@ -5,13 +5,16 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+import torch
 
 from affordlib.geometry import unit_vector
+from affordlib.planning.free_space import N_POSES, FreeSpace
 from affordlib.planning.problem import PlanMode, Planner, PlanningProblem, Reachable
 from affordlib.planning.robot import Robot
+from affordlib.planning.rollout import poses_along
 from affordlib.planning.skills import Skills
 from affordlib.primitives import Drag, Move, Primitive
-from affordlib.types import Goal, Observation, Plan
+from affordlib.types import Goal, Observation, Plan, Step
 
 MAX_PLANS = 12
 """Plans to one place that the kinematics may veto before another place is tried."""
@@ -49,8 +52,18 @@ class MovePlanner:
             if isinstance(plan, Plan):
                 grips = (replace(step.primitive, grip_yaw=grip_yaw) for step in plan.steps)
                 steps = zip(plan.steps, grips, strict=True)
-                return replace(plan, steps=tuple(replace(s, primitive=grip) for s, grip in steps))
+                plan = replace(plan, steps=tuple(replace(s, primitive=grip) for s, grip in steps))
+                if not seen.obstacles or self.is_free(plan.steps[0], seen):
+                    return plan
         return self._plan(seen, goal)
+
+    def is_free(self, step: Step, seen: Observation) -> bool:
+        """Whether a push or drag, planned before, passes the obstacles from where the object is."""
+        effects = self.skills.effects(seen.image, type(step.primitive))
+        space = FreeSpace(seen.obstacles, seen.image, seen.xy_m, effects.outline_m)
+        known, here = [[step.primitive.direction_rad], [step.stop_phase]], [[*seen.xy_m, 0.0]]
+        poses = poses_along(effects, np.array(here), *torch.tensor(known).double(), N_POSES)
+        return bool(space.spare_m(step.primitive, *np.array(known), poses)[0] >= 0)
 
     def _plan(self, seen: Observation, goal: Goal, kind: type[Move] | None = None) -> Plan | Ending:
         effects, refused = self.skills.effects(seen.image, kind), len(self._refused)

@@ -38,8 +38,11 @@ class Robot(Protocol):
     def observe(self) -> Observation:
         """Observe the object; raises NothingSeenError if no object is visible."""
 
-    def execute(self, step: Step) -> Execution:
-        """Execute an action of a plan; raises UnreachableError before any motion."""
+    def execute(self, step: Step, seen: Observation | None = None) -> Execution:
+        """Execute an action of a plan; raises UnreachableError before any motion.
+
+        seen: the observation that the action is relative to (default: a new one).
+        """
 
     def can_reach(self, primitive: Primitive, stop_phase: float, at_xy_m: Sequence[float]) -> bool:
         """Whether the arm's kinematics allows an action on an object at (x, y) [m]."""

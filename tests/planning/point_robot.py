@@ -113,7 +113,7 @@ class PointRobot:
         seen = Observation(self.xy_m, disc_image(self.height_m), obstacles=self.obstacles)
         return replace(seen, yaw_rad=self.yaw_rad, yaw_std_rad=0.001) if self.sees_yaw else seen
 
-    def execute(self, step):
+    def execute(self, step, seen=None):
         primitive, (x, y) = step.primitive, self.xy_m
         phase = np.linspace(0, step.stop_phase, 26)
         tool, holds = primitive.path(phase), primitive.holds and not self.slips

@@ -151,6 +151,22 @@ def test_what_somebody_has_set_rolling_is_waited_for():
     assert went.seen_xy_m[1][1] > DISPLACED_M + 0.09
 
 
+def test_it_acts_on_the_mean_of_the_images_that_it_planned_with():
+    rng, acted_on = np.random.default_rng(0), []
+
+    class Noisy(PointRobot):
+        def observe(self):
+            seen = super().observe()
+            return replace(seen, xy_m=(seen.xy_m[0] + rng.normal(0, 0.002), seen.xy_m[1]))
+
+        def execute(self, step, seen=None):
+            acted_on.append(seen.xy_m)
+            return super().execute(step, seen)
+
+    went = loop(Noisy(), Goal((0.1, 0.0), 0.01), n_images=4)
+    assert acted_on == list(went.seen_xy_m[: len(acted_on)])
+
+
 def test_a_veto_is_remembered_and_another_plan_made():
     refused = []
 
@@ -278,10 +294,10 @@ def test_corrections_bring_it_nearer_and_stop_where_enough():
 
 def test_what_was_done_before_the_arm_refused_is_kept():
     class Refuses(PointRobot):
-        def execute(self, step):
+        def execute(self, step, seen=None):
             if step.primitive.name == "grasp":
                 raise UnreachableError("out of reach")
-            return super().execute(step)
+            return super().execute(step, seen)
 
     robot, path = Refuses(), np.zeros((2, 2))
     can, cannot = Step(Push(math.pi), 1.0, (0.09, 0.0), path), Step(Grasp(), 1.0, (0.0, 0.0), path)

@@ -9,13 +9,14 @@ from matplotlib.path import Path
 
 from affordlib import planning
 from affordlib.geometry import unit_vector
-from affordlib.perception import outline_of
+from affordlib.perception import adapt_to_object, outline_of
 from affordlib.planning import corners_of
 from affordlib.planning.free_space import FAR_M, N_POSES, START_M, FreeSpace, gaps_m, hand_m, placed
+from affordlib.planning.move_planner import MovePlanner
 from affordlib.planning.rollout import poses_along
 from affordlib.primitives import Drag, Grasp, Push, Rotate, min_jerk
-from affordlib.types import Goal, Obstacle, Step
-from affordlib.world import Cuboid
+from affordlib.types import Goal, Observation, Obstacle, Step
+from affordlib.world import Cuboid, Sphere
 from experiments.field_baselines import plan_cem
 from tests.planning.point_robot import KnownDynamics, PointRobot, disc_image, point_skills
 from tests.problems import problem_of
@@ -255,3 +256,25 @@ def test_an_object_beside_an_obstacle_may_leave_it():
     posed = planning.PlanningProblem((0.0, 0.0), goal, effects, obstacles=(wall,))
     assert posed.free_space.least_m < START_M
     assert planning.plan_continuous(posed).reaches_goal
+
+
+@pytest.mark.parametrize(("grip_yaw", "free"), [(0.0, False), (math.pi / 2, True)])
+def test_a_planned_drag_is_checked_again_with_its_own_grip(grip_yaw, free):
+    """A post is in the way of the fingers, if they close along y."""
+    skills = planning.Skills({"drag": KnownDynamics()})
+    moves = MovePlanner(PointRobot(), skills, planning.plan_continuous, planning.PlanMode(1, True))
+    seen = Observation((0.0, 0.0), disc_image(), obstacles=(Obstacle.disc((0.0, 0.075), 0.008),))
+    step = Step(Drag(0.0, grip_yaw=grip_yaw), 0.9, (0.05, 0.0), np.zeros((2, 2)))
+    assert moves.is_free(step, seen) == free
+
+
+def test_beside_obstacles_a_ball_is_dragged_on_with_the_hand_as_planned(world, skills):
+    """A ball looks the same at every yaw, so images do not tell at which the plan was checked."""
+    world.place(Sphere(0.05), obstacles=[Obstacle.disc((0.2, 0.2), 0.02)])
+    planned = adapt_to_object(Drag.towards(0.0), world.depth_image()).grip_yaw
+    config = planning.ClosedLoopConfig(surprise_m=0.05)
+    first, second, *_ = planning.run_closed_loop(
+        world, Goal((0.15, 0.0)), skills, config=config
+    ).steps
+    assert first.primitive.grip_yaw is None
+    assert abs(math.sin(second.primitive.grip_yaw - planned)) < 0.02
