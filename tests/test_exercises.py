@@ -11,13 +11,12 @@ from exercises import EXERCISES, check
 from exercises.checking import WRONG
 from exercises.hints import HINTS, explanation
 
-NOTEBOOKS = repo_root() / "notebooks"
-SOLUTIONS = sorted((NOTEBOOKS / "solutions").glob("*.py"))
 ASKED = {name[:2] for name in EXERCISES}
 
 
 def test_the_chapters_with_checks_have_two_exercises_and_solutions():
-    assert {path.stem for path in SOLUTIONS} == {n for n in PATHS if n[:2] in ASKED}
+    solutions = (repo_root() / "notebooks" / "solutions").glob("*.py")
+    assert {path.stem for path in solutions} == {n for n in PATHS if n[:2] in ASKED}
     assert {name[:2] for name in PATHS if name[0].isdigit()} | {"A5"} == ASKED
     assert all(sum(e[:2] == number for e in EXERCISES) >= 2 for number in ASKED)
 
@@ -48,11 +47,6 @@ def straight(effects, direction, phase):
     return float((c * ahead - s * left).sum()), float((s * ahead + c * left).sum())
 
 
-def trusting(plan, act):
-    """Execute a plan without observing."""
-    return len([act(step) for step in plan.steps])
-
-
 def idle(look, plan, act):
     return act(replace(plan(look()).steps[0], stop_phase=0.0))
 
@@ -71,7 +65,7 @@ def idle(look, plan, act):
         ("05.1", 0.261, "failed, 0.261 cm"),
         ("06.1", straight, "failed, 16.8"),
         ("06.2", lambda effects, goal: (np.arctan2(goal[1], goal[0]), 1.0), "failed, 39"),
-        ("07.1", lambda look, plan, act: trusting(plan(look()), act), "failed, 77"),
+        ("07.1", lambda look, plan, act: [act(step) for step in plan(look()).steps], "failed, 77"),
         ("07.1", lambda look, plan, act: [idle(look, plan, act) for _ in range(99)], "no end a"),
         ("07.2", lambda height, phase, course: 1.0, "failed, 220"),
         ("08.1", lambda image: image[1].mean(), "failed, 31"),
@@ -90,8 +84,3 @@ def test_a_wrong_answer_gives_one_hint_then_another_and_an_explanation_but_not_t
     assert [v.hint for v in (first, second)] == [*HINTS["A5.1"]]
     assert "0.58" not in f"{first} {second} {second._repr_html_()}"
     assert "<details>" in second._repr_html_()
-
-
-def test_an_unknown_exercise_is_refused():
-    with pytest.raises(ValueError, match=r"exercise '09\.9' is unknown; there are 00\.1"):
-        check("09.9", 1)

@@ -41,12 +41,6 @@ def planted(value, text):
             yield from ([*value[:k], new, *value[k + 1 :]] for new in planted(old, text))
 
 
-def packed(values):
-    """The same, with a recipe as the text that files hold."""
-    recipes = {k: json.dumps(v) for k, v in values.items() if (k, type(v)) == ("recipe", dict)}
-    return values | recipes
-
-
 def of_results(path, _):
     def shown(new):
         path.write_text(json.dumps(new))
@@ -117,7 +111,9 @@ def of_a_data_set(path, fixture):
 
     def shown(new):
         data = known.copy(deep=True)
-        data.attrs, data["category"].attrs = packed(new), {k: new[k] for k in category if k in new}
+        data["category"].attrs = {k: new[k] for k in category if k in new}
+        text = {k: json.dumps(v) for k, v in new.items() if (k, type(v)) == ("recipe", dict)}
+        data.attrs = new | text  # a file holds a recipe as text
         write_interactions(data, path, 1)
         read = interactions.open_interactions(path)
         yield read._repr_html_()

@@ -151,7 +151,6 @@ def shop(one_world, skills, pushes, tmp_path_factory):
         "actions": [Push(0.0)],
         "step": step,
         "plan": plan,
-        "goal": goal,
         "problem": problem,
         "planners": {"A*": planning.plan_astar},
         "skills": skills,
@@ -185,8 +184,7 @@ def shop(one_world, skills, pushes, tmp_path_factory):
     }
     by_callable = {
         **fields_of(step, plan, problem, scaler, domain, arrays, Recipe(), Variation(), few),
-        **fields_of(world.WorldConfig(), View(), config, models.FiLMConfig()),
-        **fields_of(interactions.split_interactions(20), batch),
+        **fields_of(models.FiLMConfig(), interactions.split_interactions(20), batch),
         "place": {"config": None},
         "Tabletop": {"config": world.WorldConfig()},
         "picture": {"width": 32, "height": 32},
@@ -218,8 +216,9 @@ def shop(one_world, skills, pushes, tmp_path_factory):
         "FiLMNetwork": {"config": models.FiLMConfig()},
         "train": {"model": network, "config": few},
         "train_model": {"config": few, "model_config": config},
-        "fit_sigma_scale": {"model": network, "phases": (0.8, 1.0)},
         "condition_on_primitives": {"model": network},
+        "fit_sigma_scale": {"model": network},
+        "final_errors_m": {"model": network},
         "save_checkpoint": {"model": network, "path": folder / "net.safetensors", "about": {}},
         "Skills": {"models": {"push": model}},
         "plan_astar": {"stop_phases": (0.5, 1.0)},
@@ -230,7 +229,6 @@ def shop(one_world, skills, pushes, tmp_path_factory):
         "condition_on_final_effect": {"model": network, "effect": arrays.effect[:, -1]},
         "condition_on_poses": {"start": torch.zeros(12, dtype=torch.int64)},
         "descend": {"target_xy_m": np.array([0.05, 0.02]), "generator": np.random.default_rng(0)},
-        "final_errors_m": {"model": network},
         "final_error": {"record": models.network_predictions(model, pushes, np.arange(2))},
         "gaps_m": {"obstacles": [corners_of(wall)], "shapes": np.array([[CORNERS, CORNERS]])},
         "make_steps": {"chain": torch.tensor([[0.3, 0.8]])},
@@ -241,20 +239,15 @@ def shop(one_world, skills, pushes, tmp_path_factory):
         "stored_sha256": {"name_or_path": "push_test"},
         "conditioning_explorer": {"seen": executed},
         "Grasp": {"seen_height": 0.05},
-        "Push": {"radius": 0.2},
         "PushAt": {"length": 0.01},
     }
     return {k: v for names, v in by_name.items() for k in names.split()}, by_callable
 
 
-WRITERS = ("write_results", "collect", "save_checkpoint", "save_model")
-NOT_DRIVEN = {"collect": {"workers": 1}}
-
-
 def driven(name, shop):
     """A callable, with a valid value for each of its parameters."""
     by_name, by_callable = shop
-    w, fixed = by_name["world"], NOT_DRIVEN.get(name, {})
+    w, fixed = by_name["world"], {"workers": 1} if name == "collect" else {}
     act = by_name["skills"].kind_for if name == "kind_for" else CALLABLES.get(name)
     act = act or getattr(w, name, None) or getattr(w.placed, name)
     given = by_name | by_callable.get(name, {})
@@ -295,7 +288,8 @@ def test_a_hostile_value_is_refused_by_name_or_does_no_harm(shop, name, tmp_path
     monkeypatch.chdir(tmp_path)
     call, valid = driven(name, shop)
     call(**valid)
-    if name in WRITERS or name.startswith("train"):  # a relative path starts in the checkout
+    writers = ("write_results", "collect", "save_checkpoint", "save_model")
+    if name in writers or name.startswith("train"):  # a relative path starts in the checkout
         monkeypatch.setattr("affordlib.results.repo_root", lambda: tmp_path)
     found = []
 

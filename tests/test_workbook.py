@@ -255,9 +255,6 @@ def test_an_html_book_that_cannot_be_written_leaves_the_old_one(book):
     assert old.exists()
 
 
-READER = {"PROFILE": "reader", "SEED": "0", "OUT": "", "ONLY": "", "ARGS": ""}
-
-
 @pytest.mark.parametrize(
     ("wrong", "named"),
     [
@@ -274,8 +271,9 @@ READER = {"PROFILE": "reader", "SEED": "0", "OUT": "", "ONLY": "", "ARGS": ""}
     ],
 )
 def test_what_does_not_fit_is_refused(wrong, named):
+    reader = {"PROFILE": "reader", "SEED": "0", "OUT": "", "ONLY": "", "ARGS": ""}
     with pytest.raises(ValueError, match=named):
-        parameters_of_pages(READER | wrong)
+        parameters_of_pages(reader | wrong)
 
 
 def test_hostile_words_on_the_command_line_are_only_words(book):

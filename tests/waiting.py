@@ -2,6 +2,7 @@
 
 import signal
 import subprocess
+import sys
 import time
 
 
@@ -10,6 +11,14 @@ def start(command, **options):
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "stdin": subprocess.DEVNULL}
     options |= {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)}
     return subprocess.Popen(command, start_new_session=True, text=True, **pipes, **options)
+
+
+def printed(code, **options):
+    """What Python code prints in another process, in which nothing may fail or warn."""
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, **options)
+    assert (done.returncode, done.stderr) == (0, ""), done.stderr
+    return done.stdout
 
 
 def wait_until(condition, seconds=60.0, process=None, otherwise="waited in vain"):

@@ -4,15 +4,16 @@ import errno
 import os
 import random
 import signal
-import subprocess
 import sys
 import threading
 import time
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import psutil
 import pytest
+import xarray as xr
 from dask.distributed import Client
 from joblib import parallel_config
 
@@ -23,13 +24,39 @@ from affordlib.interactions.collect import collect as collect_set
 from affordlib.interactions.recipes import Recipe
 from affordlib.interactions.store import dataset_sha256, open_interactions, stored_sha256
 from experiments import shipped
-from tests.waiting import start, wait_until
+from tests.waiting import printed, start, wait_until
 
 SMALL = Recipe(n_interactions=6, seed=11)
 CONTINUE = "finished chunks are kept; collect into the same path to continue"
 ROOT = Path(affordlib.__file__).parents[1]
 
-pytestmark = pytest.mark.usefixtures("small_chunks")
+
+@pytest.fixture(autouse=True)
+def small_chunks(monkeypatch):
+    monkeypatch.setattr(collect, "CHUNK", 2)
+
+
+@pytest.fixture(scope="session")
+def undisturbed(tmp_path_factory):
+    """A file that is collected in this process, uninterrupted."""
+    path = tmp_path_factory.mktemp("undisturbed") / "set.zarr.zip"
+    return collect_set(SMALL, path, progress=False, chunk=2)
+
+
+@pytest.fixture
+def made(monkeypatch):
+    """Replace interactions by cheap ones; list the first numbers of the chunks that are made."""
+    made = []
+
+    def chunk(recipe, numbers):
+        made.append(numbers.start)
+        values = [np.random.default_rng(i).random(5000, dtype=np.float32) for i in numbers]
+        kinds = ("interaction", np.zeros(len(values), np.int8), {"flag_meanings": "cuboid"})
+        found = {"x": (("interaction", "value"), values), "category": kinds}
+        return xr.Dataset(found, attrs=attributes_for(recipe))
+
+    monkeypatch.setattr(collect, "collect_chunk", chunk)
+    return made
 
 
 def names_in(folder):
@@ -42,7 +69,7 @@ def no_room(*_):
 
 @pytest.mark.slow
 def test_a_file_holds_what_the_interactions_left(undisturbed):
-    expected, path = collect_chunk(SMALL, range(6)), undisturbed(SMALL)
+    expected, path = collect_chunk(SMALL, range(6)), undisturbed
     for read in (open_interactions(path), open_interactions(f"file://{path}")):
         assert read.identical(expected[list(read.data_vars)])
         assert all(read[name].dtype == expected[name].dtype for name in expected.variables)
@@ -105,20 +132,18 @@ def test_paths_and_workers_that_cannot_be_are_named(tmp_path):
 
 SCRIPT = """
 import sys
-import threading
 from affordlib.interactions import collect
 from affordlib.interactions.recipes import Recipe
 
-print("started", flush=True)
 collect.CHUNK = 2
 recipe = Recipe(n_interactions=int(sys.argv[2]), seed=11)
-collect.collect(recipe, sys.argv[1], workers=int(sys.argv[3]), progress=False)
+collect.collect(recipe, sys.argv[1], workers=2, progress=False)
 """
 
 
 def start_collector(path, n_interactions):
     """Collect with two workers in another process."""
-    return start([sys.executable, "-c", SCRIPT, str(path), str(n_interactions), "2"], cwd=ROOT)
+    return start([sys.executable, "-c", SCRIPT, str(path), str(n_interactions)], cwd=ROOT)
 
 
 @pytest.mark.slow
@@ -132,7 +157,7 @@ def test_a_collector_killed_at_any_moment_is_no_loss(undisturbed, tmp_path):
     process.communicate(timeout=180)  # its workers write to the same pipes
     assert not psutil.wait_procs(family, timeout=5)[1]  # it leaves no workers
     collect_set(SMALL, path, progress=False)
-    assert path.read_bytes() == undisturbed(SMALL).read_bytes()
+    assert path.read_bytes() == undisturbed.read_bytes()
     assert names_in(tmp_path) == [path.name]
 
 
@@ -187,7 +212,7 @@ def test_a_worker_that_dies_says_so(undisturbed, tmp_path):
     with pytest.raises(RuntimeError, match="unexpectedly terminated"):
         collect_set(Deadly(**vars(SMALL)), path, 2, progress=False)
     collect_set(SMALL, path, 2, progress=False)
-    assert path.read_bytes() == undisturbed(SMALL).read_bytes()
+    assert path.read_bytes() == undisturbed.read_bytes()
 
 
 @pytest.mark.slow
@@ -198,16 +223,16 @@ def test_make_data_compares_with_what_was_there(undisturbed, tmp_path, monkeypat
     arguments = ["data", "--only", "push", *where]
     assert shipped.main(arguments) == 1
     assert "not the same: 6 interactions, formerly 500" in capsys.readouterr().out
-    assert (tmp_path / "push.zarr.zip").read_bytes() == undisturbed(SMALL).read_bytes()
+    assert (tmp_path / "push.zarr.zip").read_bytes() == undisturbed.read_bytes()
     real = shipped.open_interactions
-    there = {"push": undisturbed(SMALL)}
+    there = {"push": undisturbed}
     monkeypatch.setattr(shipped, "open_interactions", lambda name: real(there.get(name, name)))
     assert shipped.main(arguments) == 0
     assert "push: the same, bit for bit" in capsys.readouterr().out
 
 
 def test_how_far_apart_two_sets_are_is_said(undisturbed):
-    old = open_interactions(undisturbed(SMALL))
+    old = open_interactions(undisturbed)
     for gap_m, agree in ((0.00004, True), (0.00006, False)):
         new = old.copy(deep=True)
         new["rest_effect"][:, 1] += gap_m
@@ -222,5 +247,4 @@ def test_how_far_apart_two_sets_are_is_said(undisturbed):
 
 def test_a_worker_watches_its_parent_before_it_imports_what_is_large():
     code = "import sys, affordlib.workers; print({'torch', 'xarray', 'pybullet'} & {*sys.modules})"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout == "set()\n"
+    assert printed(code) == "set()\n"

@@ -3,8 +3,6 @@
 import json
 import math
 import pickle
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -18,6 +16,7 @@ from affordlib.planning.reachability import Reachability
 from affordlib.results import repo_root
 from affordlib.weights import read_weights, write_weights
 from experiments.runner import checkpoint_sha256
+from tests.waiting import printed
 
 
 def test_the_hash_is_of_all_that_decides_the_predictions(untrained, tmp_path):
@@ -60,9 +59,7 @@ def test_a_bad_checkpoint_is_named(untrained, tmp_path):
 
 def test_a_shipped_network_from_elsewhere_loads_in_a_fresh_process():
     code = "from affordlib.models import load_checkpoint as load; print(*load('lstm_500')[1])"
-    command = [sys.executable, "-c", code]
-    done = subprocess.run(command, cwd=repo_root(), capture_output=True, text=True)
-    assert "seen_interactions" in done.stdout, done.stderr
+    assert "seen_interactions" in printed(code, cwd=repo_root())
 
 
 def test_a_renamed_checkpoint_is_refused(monkeypatch, tmp_path):

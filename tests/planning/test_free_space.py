@@ -25,14 +25,6 @@ PLANNERS = (planning.plan_astar, planning.plan_continuous, planning.plan_gradien
 BOX = 0.5 * np.array([[0.06, 0.05], [-0.06, 0.05], [-0.06, -0.05], [0.06, -0.05]])
 
 
-def box_image():
-    """Camera image of the box."""
-    x = 0.16 * (np.arange(144) + 0.5) / 144 - 0.08
-    mask = (np.abs(x) < 0.03) & (np.abs(x[:, None]) < 0.025)
-    mask = mask.reshape(48, 3, 48, 3).mean(axis=(1, 3))
-    return np.stack([1 - 0.05 * mask, mask]).astype(np.float32)
-
-
 def drawn(rng, within_m=0.12):
     """A random disc, box or triangle."""
     at = tuple(rng.uniform(-within_m, within_m, 2))
@@ -227,7 +219,11 @@ def test_of_what_is_predicted_to_pass_little_touches(world, skills):
         angle = rng.uniform(-3, 3)
         at = torch.tensor([angle]).double()
         poses = poses_along(effects, np.zeros((1, 3)), at, torch.ones(1).double(), N_POSES)
-        one = beside(effects.outline_m, poses, rng)
+        # A disc at the margin from what the outline sweeps, in a random direction.
+        away, middle = unit_vector(rng.uniform(-3, 3)), poses[0, -1, :2] * rng.uniform(0.4, 1)
+        swept, ways = placed(effects.outline_m, poses), np.arange(0.0, 0.15, 0.0005)
+        discs = (Obstacle.disc(tuple(middle + far * away), 0.015) for far in ways)
+        one = next((d for d in discs if gaps_m([corners_of(d)], swept).min() > 0.004), None)
         if one is None:
             continue
         space = FreeSpace([one], effects.image, (0.0, 0.0), effects.outline_m)
@@ -240,19 +236,9 @@ def test_of_what_is_predicted_to_pass_little_touches(world, skills):
     assert touched == 0
 
 
-def beside(outline, poses, rng):
-    """A disc at the margin from what the outline sweeps, in a random direction."""
-    away, middle = unit_vector(rng.uniform(-3, 3)), poses[0, -1, :2] * rng.uniform(0.4, 1)
-    for far in np.arange(0.0, 0.15, 0.0005):
-        one = Obstacle.disc(tuple(middle + far * away), 0.015)
-        if gaps_m([corners_of(one)], placed(outline, poses)).min() > 0.004:
-            return one
-    return None
-
-
 def test_an_object_beside_an_obstacle_may_leave_it():
-    wall, goal = Obstacle.box((-0.0405, 0.02), (0.02, 0.02)), Goal((0.03, 0.12), 0.005)
-    effects = planning.EffectMap(KnownDynamics(), box_image())
+    wall, goal = Obstacle.box((-0.0388, 0.02), (0.02, 0.02)), Goal((0.03, 0.12), 0.005)
+    effects = planning.EffectMap(KnownDynamics(), disc_image(radius_m=0.03))
     posed = planning.PlanningProblem((0.0, 0.0), goal, effects, obstacles=(wall,))
     assert posed.free_space.least_m < START_M
     assert planning.plan_continuous(posed).reaches_goal

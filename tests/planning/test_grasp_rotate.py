@@ -16,7 +16,6 @@ BOX, TUBE, LOG = Cuboid(0.06, 0.05, 0.05), UprightCylinder(0.05, 0.07), LyingCyl
 DISC = LyingCylinder(0.05, 0.10)
 """Lying on its rim, and as wide as the hand can open: only its faces can be grasped."""
 
-PLANNERS = pytest.mark.parametrize("plan", [plan_astar, plan_continuous])
 AT = (0.0, 0.0)
 
 
@@ -118,7 +117,7 @@ def test_predictions_turn_with_the_object(world, skills):
     assert off == pytest.approx(round(off), abs=1e-6)
 
 
-@PLANNERS
+@pytest.mark.parametrize("plan", [plan_astar, plan_continuous])
 def test_a_plan_that_cannot_turn_or_lift_says_so(world, skills, plan):
     world.place(BOX)
     image = world.depth_image()

@@ -8,12 +8,10 @@ import pytest
 
 from affordlib.results import repo_root
 
-CONF = repo_root() / "notebooks" / "book_html" / "conf.py"
-
 
 @pytest.fixture(scope="module")
 def conf():
-    return runpy.run_path(str(CONF))
+    return runpy.run_path(str(repo_root() / "notebooks" / "book_html" / "conf.py"))
 
 
 def test_a_picture_is_described_by_its_caption_also_after_jupyterlab_has_saved_the_page(conf):

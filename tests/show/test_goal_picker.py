@@ -19,29 +19,17 @@ from tests.waiting import wait_until
 
 
 @pytest.fixture
-def planned_for():
-    """Goal positions for which A* has planned."""
-    return []
-
-
-@pytest.fixture
-def make_picker(world, trained, planned_for):
+def make_picker(world, trained):
     world.place(Cuboid(0.06, 0.05, 0.05))
-
-    def astar(problem):
-        planned_for.append(problem.goal.xy_m)
-        return plan_astar(problem)
 
     def broken(*_):
         raise ValueError("no <plan> today")
 
-    def make(pace_s=0.0, skills=None, executor=None, **options):
-        planners = options.pop("planners", {"A*": astar, "broken": broken})
-        goal = options.pop("goal_xy_m", (0.12, 0.0))
+    def make(pace_s=0.0, skills=None, planners=None, executor=open_loop, **options):
+        planners = planners or {"A*": plan_astar, "broken": broken}
         skills = skills or Skills({"push": trained})
-        picker = GoalPicker(world, skills, planners, goal, **{"view": False, **options})
-        if executor is not None:
-            picker.executors["open loop"] = executor
+        picker = GoalPicker(world, skills, planners, (0.12, 0.0), **{"view": False, **options})
+        picker.executors["open loop"] = executor
         picker.pace_s = pace_s
         return picker
 
@@ -120,19 +108,25 @@ def test_lines_and_words_stand_out_from_the_table():
                 assert pair[1] / pair[0] > least, (name, ground)
 
 
-def test_what_the_hand_wants_is_planned_for_once(picker, planned_for):
-    before = len(planned_for)
+def test_what_the_hand_wants_is_planned_for_once(picker):
+    planned_for = []
+
+    def astar(problem):
+        planned_for.append(problem.goal.xy_m)
+        return plan_astar(problem)
+
+    picker.planners["A*"] = astar
     for number, xy in enumerate([(0.081, 0.033), (0.081, 0.033), (-0.05, 0.1234)], 1):
         want(picker, *xy, number)
         assert in_time(picker)._view.scene["answered"] == number
     wanted = [(0.081, 0.033), (0.081, 0.033), (-0.05, 0.123)]
-    assert planned_for[before:] == wanted  # once each: the sliders cause no second plan
+    assert planned_for == wanted  # once each: the sliders cause no second plan
     assert (picker.controls.x.value, picker.controls.y.value) == (-5.0, 12.3)
     picker.controls.x.value = 7.7
     assert in_time(picker).plan.goal.xy_m == drawn_goal(picker) == (0.077, 0.123)
 
 
-def test_run_waits_for_the_plan_of_the_goal_that_is_shown(make_picker, trained):
+def test_run_waits_for_the_plan_of_the_goal_that_is_shown(picker):
     """Two clicks and Run, faster than the planner: the plan of the second click is executed."""
     began = []
 
@@ -141,7 +135,6 @@ def test_run_waits_for_the_plan_of_the_goal_that_is_shown(make_picker, trained):
         time.sleep(0.3)
         return plan_astar(problem)
 
-    picker = make_picker()
     picker.planners["A*"] = slow
     want(picker, 0.08, 0.03, 1)
     wait_until(lambda: began)
@@ -285,14 +278,12 @@ def test_after_a_failed_run_the_next_plan_is_from_where_it_ended(make_picker):
         execute_plan(world, replace(plan, steps=plan.steps[:1]))
         raise ValueError("the arm is stuck")
 
-    picker = make_picker()
-    picker.executors["closed loop"] = fails
-    picker.controls.executor.value = "closed loop"
+    picker = make_picker(executor=fails)
     picker.pick(0.2, 0.0)
     with pytest.raises(ValueError, match="stuck"):
         picker.run()
     assert picker.plan is None
-    picker.controls.executor.value = "open loop"
+    picker.executors["open loop"] = open_loop
     picker.run()
     assert picker.outcome.distance_m < 0.03, picker.controls.words.value
 

@@ -1,6 +1,4 @@
 import os
-import subprocess
-import sys
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -11,6 +9,7 @@ from affordlib.show import plot_footprint, plot_outcome, plot_table
 from affordlib.types import Goal
 from affordlib.world import Cuboid
 from tests.problems import problem_of
+from tests.waiting import printed
 
 
 def test_a_footprint_is_drawn_where_the_object_is(world, trained):
@@ -41,8 +40,7 @@ def test_the_configuration_of_a_reader_changes_no_figure(tmp_path):
     )
     drawn = []
     for name, own in (("own", {"MATPLOTLIBRC": str(tmp_path)}), ("plain", {})):
-        command = [sys.executable, "-c", code.format(tmp_path / name)]
         environment = os.environ | {"MPLBACKEND": "agg"} | own
-        done = subprocess.run(command, env=environment, capture_output=True, check=True)
-        drawn.append(np.asarray(Image.open(done.stdout.decode().strip())))
+        path = printed(code.format(tmp_path / name), env=environment).strip()
+        drawn.append(np.asarray(Image.open(path)))
     np.testing.assert_array_equal(*drawn)

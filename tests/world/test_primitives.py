@@ -1,8 +1,6 @@
 """Drag, grasp, rotate and lever-up, the arm's reach, and worlds that vary."""
 
 import math
-import subprocess
-import sys
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +13,7 @@ from affordlib.planning import EffectMap
 from affordlib.primitives import Drag, Grasp, LeverUp, Move, Push, Rotate, min_jerk, radians
 from affordlib.world import CATEGORIES, Cuboid, LyingCylinder, Prism, Sphere, Tabletop, WorldConfig
 from affordlib.world.objects import CHAMFER_M
+from tests.waiting import printed
 
 EXAMPLES = (Push(0.3), Drag(0.3), Grasp(0.05), Rotate(), LeverUp(-0.08, 0.0, 0.0, 0.16))
 
@@ -152,8 +151,7 @@ def test_no_episode_knows_of_the_one_before(world):
         with Tabletop() as fresh:
             first[job] = bits(fresh, *job)
     code = f"{BITS}\nwith Tabletop() as world:\n    print(*(bits(world, *job) for job in {jobs}))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, text=True)
-    assert done.stdout.split() == list(first.values())
+    assert printed(code).split() == list(first.values())
     before = psutil.Process().memory_info().rss
     for job in [*reversed(jobs), *jobs, *reversed(jobs)]:
         assert bits(world, *job) == first[job]
