@@ -15,13 +15,12 @@ _NUMBER = Annotated[Real, _NO_BOOL]
 _NO_TEXT = Is[lambda value: not isinstance(value, str)]
 _NUMBERS = Annotated[Sequence[_NUMBER], _NO_TEXT] | np.ndarray
 _CHECKED = """
-types geometry primitives perception results weights world.objects
-world.tabletop planning.astar planning.closed_loop planning.continuous
-planning.effect_map planning.gradient planning.grasp_rotate
-planning.problem planning.reachability planning.skills interactions.dataset
-interactions.collect interactions.recipes
-interactions.store workers logs.cross_validate logs.fit logs.log logs.planning models.evaluation
-models.checkpoint models.domain models.lever_up models.training
+types geometry primitives perception results weights workers world.objects world.tabletop
+interactions.collect interactions.dataset interactions.recipes interactions.store
+models.checkpoint models.domain models.evaluation models.lever_up models.training
+planning.astar planning.closed_loop planning.continuous planning.effect_map planning.gradient
+planning.grasp_rotate planning.problem planning.reachability planning.skills
+logs.cross_validate logs.fit logs.log logs.planning
 show.explorers show.goal_picker show.picker_controls show.plots show.scene
 """
 _CONF = BeartypeConf(

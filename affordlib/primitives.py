@@ -171,8 +171,7 @@ class Push(Move):
     """A straight push through the object's centre (Section 3.3).
 
     The gripper starts on a circle of `radius` [m] around the object at the angle theta [rad],
-    moves through the centre and stops `length` [m] beyond it. The object therefore moves in the
-    direction theta + π.
+    moves through the centre and stops `length` [m] beyond it. The object moves towards theta + π.
     """
 
     radius: float = metres(0.1, 0.3, 0.2)

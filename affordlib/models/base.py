@@ -116,10 +116,9 @@ def network(name: str, config: type[NetworkConfig]) -> Callable[[type], type]:
 class EffectNetwork(nn.Module, ABC):
     """A network that satisfies `EffectModel`.
 
-    Inputs and outputs are in metres and radians, in the frame of the table; standardisation and
-    rotation into the network's frame happen inside. A subclass implements `features` and `outputs`,
-    which work in standardised units, creates its layers in `make_layers`, and is registered by the
-    decorator `network`. Buffers: sigma_floor, the lower bound of σ, which decreases in training;
+    A subclass implements `features` and `outputs`, which work in standardised units and in the
+    network's frame, creates its layers in `make_layers`, and is registered by the decorator
+    `network`. Buffers: sigma_floor, the lower bound of σ, which decreases in training;
     sigma_scale (C_e,), factors on σ of the effect channels, see `fit_sigma_scale`.
     """
 
@@ -131,6 +130,7 @@ class EffectNetwork(nn.Module, ABC):
         self.config, self.scaler, self.domain = config, scaler, domain or TrainingDomain()
         self.action_channels = config.action_channels
         self.effect_channels = config.effect_channels
+        self._channels = config.action_channels, config.effect_channels
         for kind in ("action", "effect"):
             width = len(getattr(config, f"{kind}_channels"))
             if len(getattr(scaler, f"{kind}_scale")) != width:
@@ -187,10 +187,6 @@ class EffectNetwork(nn.Module, ABC):
         w_1 = o.weight[:, None]
         return w_1 * r_a + (1 - w_1) * r_e
 
-    @property
-    def _channels(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        return self.action_channels, self.effect_channels
-
     def _scaled(self, image: Tensor) -> Tensor:
         mean, std = (v[:, None, None] for v in (self.image_mean, self.image_std))
         return (image - mean) / std
@@ -211,10 +207,8 @@ class EffectNetwork(nn.Module, ABC):
         """Mean and σ (B, T, C) at t_target (B, T); features (B, F), or (1, F) for all.
 
         frame: axes of the prediction, those of the "table" or of each "push". In the axes of
-        another frame than the network's, σ lacks the correlation of x and y.
-        Raises ValueError for phases outside [0, 1], and for actions whose start or end lies outside
-        the training domain. Only warns (`OutOfRangeWarning`) of such effects at t = 1, since a
-        planner may pass through them during its search.
+        another frame than the network's, σ lacks the correlation of x and y. Raises ValueError or
+        warns outside the training domain, as `TrainingDomain.check_query` does.
         """
         self.domain.check_query(observations, t_target, *self._channels)
         (mu_a, sigma_a, mu_e, sigma_e), direction = self._decode(features, observations, t_target)

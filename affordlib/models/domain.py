@@ -84,9 +84,9 @@ class TrainingDomain(Checked):
         action_channels: tuple[str, ...],
         effect_channels: tuple[str, ...],
     ) -> None:
-        """Raise ValueError where a phase or an observed action is out of range.
+        """Raise ValueError where a phase, or an observed action's start or end, is out of range.
 
-        Warn (`OutOfRangeWarning`) where an observed final effect is out of range.
+        Only warn (`OutOfRangeWarning`) of a final effect: a planner's search may pass through it.
         """
         low, high = t_target.detach().aminmax()
         if not (low > -PHASE_TOLERANCE and high < 1 + PHASE_TOLERANCE):

@@ -11,10 +11,9 @@ lifts along its arc); its other channels are constant.
     first_step  the first pose observed; all later steps predicted
     image_only  no pose observed
 
-All models observe the image and the commanded action at t = 0 and t = 1. A pose is the change since
-the start, so the first pose is always zero. Therefore first_step contains no more information than
-image_only, and one trained network serves both. A conditional network is trained once for all
-protocols, a recurrent one separately for each (`experiments/lever_training.py`).
+All models observe the image and the commanded action at t = 0 and t = 1. The first pose is always
+zero, so first_step contains no more information than image_only, and one trained network serves
+both; a recurrent one is trained for each protocol (`experiments/lever_training.py`).
 """
 
 from dataclasses import replace

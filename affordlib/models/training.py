@@ -1,8 +1,7 @@
 """Training: one plain loop over batches of trajectories, with early stopping (Section 3.2).
 
 The paper uses one trajectory and one target per iteration. Here a step uses many trajectories with
-many targets each, some 200 times as many targets per second; the paper's loop is in `experiments/`
-for comparison. `train_model` goes from data set and split to a calibrated network.
+many targets each, some 200 times as many targets per second; `experiments/` has the paper's loop.
 """
 
 import inspect

@@ -6,9 +6,8 @@
 e is the object's effect map, p and ψ are its position and rotation. λ = 1 gives the expected
 squared distance; a larger λ, the risk weight, weights the variance more. The covariance is
 propagated along the chain, so that of two plans ending at the goal the one of lower variance is
-chosen: the model's uncertainty differs between pushes. Many chains are started together, the last
-action of each looked up in the map. The best follow the gradient; the best of all is corrected by
-queries of the model itself until its predicted final position is the goal.
+chosen: the model's uncertainty differs between pushes. Many chains are started together; the best
+follow the gradient, and the best of all is corrected by queries of the model itself.
 """
 
 import math
@@ -170,8 +169,7 @@ def _correct(
 ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
     """Correct one chain (B = 1) by Newton's method until its end by the model is the target.
 
-    The derivatives are the map's. Returns the chain (K, 2), and the positions (K, 2) and rotations
-    (K,) that the model predicts.
+    The derivatives are the map's. Returns the chain (K, 2), and what `_predicted` says of it.
     """
     (direction, phase), k = chain, chain[0].shape[1]
     ends, turns = _predicted(effects, direction, phase)

@@ -20,7 +20,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from affordlib.geometry import edge_normals, rectangle, rotated_each, unit_vector
+from affordlib.geometry import circle, edge_normals, rectangle, rotated_each
 from affordlib.perception import adapt_to_object, outline_of, radius_m
 from affordlib.primitives import Primitive, Push, Rotate, min_jerk
 from affordlib.types import Obstacle, Step, check_finite
@@ -44,9 +44,7 @@ FAR_M = 0.01
 
 def ring(radius_m: float) -> np.ndarray:
     """Return the corners (16, 2) [m] of the regular polygon around a circle."""
-    turn = 2 * math.pi / DISC_SIDES
-    corners = [unit_vector(k * turn) for k in range(DISC_SIDES)]
-    return radius_m / math.cos(turn / 2) * np.stack(corners)
+    return circle(radius_m / math.cos(math.pi / DISC_SIDES), DISC_SIDES)
 
 
 def corners_of(obstacle: Obstacle) -> np.ndarray:

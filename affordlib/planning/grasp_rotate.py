@@ -7,8 +7,7 @@ yaw, and interpolates the stop phase on the predicted trajectory yaw(t) or z(t).
 
 The paper adds grasp and rotate to the branches of the search when the goal requires them (Section
 3.4). They do not change the position and nothing can follow a grasp, so `PosePlanner` puts them
-after the actions that bring the object to its position. One image is enough: acting on an object
-that a push has rotated is equivalent to rotating the hand back in the image taken before.
+after the actions that bring the object to its position, and needs no image taken after these.
 """
 
 import math
@@ -86,8 +85,7 @@ def crossings(phase: np.ndarray, values: np.ndarray, wanted: float) -> np.ndarra
 def candidate_turns(
     predicted: PredictedTrajectories, xy_m: Sequence[float], turn_rad: float
 ) -> Iterator[Step]:
-    """Candidate steps that rotate an object at (x, y) by an angle, best first; each has another
-    gripper yaw.
+    """Steps that rotate an object at (x, y) by an angle, one for each gripper yaw, best first.
 
     The closing fingers align a cuboid; then the hand rotates counter-clockwise, so negative angles
     take a rotation of up to 360°. The best step has the lowest σ of those predicted to reach the
@@ -122,8 +120,7 @@ def candidate_turns(
 def candidate_lifts(
     predicted: PredictedTrajectories, xy_m: Sequence[float], height_m: float
 ) -> Iterator[Step]:
-    """Candidate grasps that hold an object from (x, y) at a height [m], best first; each has
-    another gripper yaw.
+    """Grasps that hold an object from (x, y) at a height [m], one for each yaw, best first.
 
     The best has the highest mean - σ of the height; ties, to a centimetre, go to the first.
     """
@@ -199,8 +196,7 @@ class PosePlanner:
     ) -> Step | None:
         """The best step that the arm can execute to lift the object to a height.
 
-        grip_yaw: that of a hand that has just released it: the grasp has the same, since another
-        would rotate the object.
+        grip_yaw: of a hand that has just released it; a grasp at another would rotate the object.
         """
         yaws = GRIPPER_YAWS_RAD
         if grip_yaw is not None:

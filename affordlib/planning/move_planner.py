@@ -50,9 +50,9 @@ class MovePlanner:
         if grip_yaw is not None and Drag.name in self.skills.models:
             plan = self._plan(seen, goal, Drag)
             if isinstance(plan, Plan):
-                grips = (replace(step.primitive, grip_yaw=grip_yaw) for step in plan.steps)
-                steps = zip(plan.steps, grips, strict=True)
-                plan = replace(plan, steps=tuple(replace(s, primitive=grip) for s, grip in steps))
+                grip = {"grip_yaw": grip_yaw}
+                steps = (replace(s, primitive=replace(s.primitive, **grip)) for s in plan.steps)
+                plan = replace(plan, steps=tuple(steps))
                 if not seen.obstacles or self.is_free(plan.steps[0], seen):
                     return plan
         return self._plan(seen, goal)
@@ -68,10 +68,8 @@ class MovePlanner:
     def _plan(self, seen: Observation, goal: Goal, kind: type[Move] | None = None) -> Plan | Ending:
         effects, refused = self.skills.effects(seen.image, kind), len(self._refused)
         try:
-            allowed, obstacles = self._allowed(effects.kind), seen.obstacles
-            whole = PlanningProblem(
-                seen.xy_m, goal, effects, self.mode, allowed, obstacles=obstacles
-            )
+            known = seen.xy_m, goal, effects, self.mode, self._allowed(effects.kind)
+            whole = PlanningProblem(*known, obstacles=seen.obstacles)
         except ValueError as error:
             return Ending("unreachable", f"the position: {error}")
         distance_m = goal.distance_m(seen.xy_m)

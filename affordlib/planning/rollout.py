@@ -21,8 +21,7 @@ def roll_out(
     """Positions (B, K, 2) [m], turns (B, K) [rad] and variances (B, K) [m²] after each action.
 
     direction_rad, phase: (B, K), of chains that start at the origin. The variance is the trace of
-    the position's covariance: the variance of each action, and the effect of the rotation's
-    variance on later actions.
+    the position's covariance, to which the rotation's variance adds in later actions.
     """
     n, k_max = direction_rad.shape
     position, turned = direction_rad.new_zeros(n, 2), direction_rad.new_zeros(n)

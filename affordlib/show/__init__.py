@@ -2,7 +2,6 @@
 
 from affordlib.show.explorers import conditioning_explorer, phase_explorer
 from affordlib.show.goal_picker import GoalPicker
-from affordlib.show.picker_controls import closed_loop, open_loop
 from affordlib.show.plots import (
     GOAL,
     NEUTRAL,

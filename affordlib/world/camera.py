@@ -130,8 +130,7 @@ def _kinect_points(
 ) -> np.ndarray:
     """Simulate the points (n, 3) [m] that a Kinect measures in a window, every `step`-th pixel.
 
-    Depth has noise that grows with distance and is quantised in disparity; pixels are displaced at
-    random by about one pixel.
+    Depth is noisy and quantised in disparity; pixels are displaced by about one pixel at random.
     """
     pitch = step / KINECT_FOCAL_PX
     columns, rows = (math.ceil(w / KINECT_HEIGHT_M / pitch) for w in width_m)
@@ -162,8 +161,7 @@ def _kinect_points(
 
 _FLOOR_M = -0.74
 HIDDEN_M = 1.0
-"""Depth [m] under their place at which bodies wait that are in pictures only, out of the range of
-the robot's cameras."""
+"""Depth [m] under their place where bodies of pictures wait, unseen by the robot's cameras."""
 
 SCENERY = (
     ((1.7, 1.7, 0.05), (0.0, 0.0, _FLOOR_M - 0.05), (0.86, 0.87, 0.88)),
