@@ -444,8 +444,8 @@ def knowing_only_what_it_measures(world, monkeypatch):
 
         return act
 
-    def execute(step):
-        done = acting(world.execute)(step)
+    def execute(step, seen):
+        done = acting(world.execute)(step, seen)
         return SimpleNamespace(tool=done.tool, object_path=np.full((2, 4), np.nan))
 
     for name in ("state", "pose", "fell", "rolls", "left_table"):
