@@ -116,10 +116,10 @@ def network(name: str, config: type[NetworkConfig]) -> Callable[[type], type]:
 class EffectNetwork(nn.Module, ABC):
     """A network that satisfies `EffectModel`.
 
-    A subclass implements `features` and `outputs`, which work in standardised units and in the
-    network's frame, creates its layers in `make_layers`, and is registered by the decorator
-    `network`. Buffers: sigma_floor, the lower bound of σ, which decreases in training;
-    sigma_scale (C_e,), factors on σ of the effect channels, see `fit_sigma_scale`.
+    Inputs and outputs are in metres and radians, in the table's frame. A subclass implements
+    `features` and `outputs` in standardised units and its own frame, creates its layers in
+    `make_layers`, and is registered by `network`. Buffers: sigma_floor, which decreases in
+    training; sigma_scale (C_e,), factors on σ of the effect channels, see `fit_sigma_scale`.
     """
 
     @checked

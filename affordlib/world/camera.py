@@ -161,7 +161,7 @@ def _kinect_points(
 
 _FLOOR_M = -0.74
 HIDDEN_M = 1.0
-"""Depth [m] under their place where bodies of pictures wait, unseen by the robot's cameras."""
+"""Depth [m] below their place at which bodies wait that pictures show, but no robot's camera."""
 
 SCENERY = (
     ((1.7, 1.7, 0.05), (0.0, 0.0, _FLOOR_M - 0.05), (0.86, 0.87, 0.88)),
