@@ -6,15 +6,17 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import cKDTree
 
-from affordlib.geometry import unit_vector
 from affordlib.planning.free_space import N_POSES, FreeSpace
 from affordlib.planning.problem import PlanMode, Planner, PlanningProblem, Reachable
 from affordlib.planning.robot import Robot
 from affordlib.planning.rollout import poses_along
 from affordlib.planning.skills import Skills
 from affordlib.primitives import Drag, Move, Primitive
-from affordlib.types import Goal, Observation, Plan, Step
+from affordlib.types import TABLE_X_M, TABLE_Y_M, Goal, Observation, Plan, Step, on_table
 
 MAX_PLANS = 12
 """Plans to one place that the kinematics may veto before another place is tried."""
@@ -23,8 +25,45 @@ REFUSED_WITHIN_M, REFUSED_WITHIN_RAD = 0.01, math.radians(6)
 """Actions this near to a refused action, in position [m] and direction [rad], are excluded."""
 
 WAYPOINT_TOLERANCE_M = 0.01
-ASIDE_RAD = (0.0, 0.6, -0.6, 1.2, -1.2)
-"""Directions of waypoints relative to the goal's, in the order in which they are tried."""
+CELL_M, LONGEST_M = 0.04, 0.092
+"""Distance [m] of neighbours in the grid of a way, and that of the farthest that are joined."""
+
+BESIDE_M = 0.02 * np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
+"""Where the arm should act, too, relative to a place on a way [m]."""
+
+
+def find_way(problem: PlanningProblem) -> np.ndarray:
+    """Places (n, 2) [m] from start to goal on the shortest way that the arm allows; none: (0, 2).
+
+    A way leads over a grid. Near to where the arm cannot act, it counts as three times as long.
+    """
+    effects, axes = problem.effects, (np.arange(*ends, CELL_M) for ends in (TABLE_X_M, TABLE_Y_M))
+    grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+    grid = grid[on_table(grid, effects.radius_m)]
+    places = np.vstack([problem.start_xy_m, problem.goal.xy_m, grid])
+    pairs = cKDTree(places).query_pairs(LONGEST_M, output_type="ndarray")
+    begin, end = np.vstack([pairs, pairs[:, ::-1]]).T
+    n_actions = math.ceil(LONGEST_M / max(effects.reach_m, 0.01))
+    ahead = (places[end] - places[begin]) / n_actions
+    angle, long_m = np.arctan2(*ahead.T[::-1]), np.hypot(*ahead.T)
+    phases = torch.linspace(0, 1, 26).double()
+    moved_m = effects(torch.zeros_like(phases), phases)[0][:, 0]
+    stops = torch.tensor(np.interp(long_m, moved_m, phases))
+    allowed = np.ones(len(angle), bool)
+    for k in range(n_actions):
+        at = places[begin] + k * ahead
+        allowed &= problem.reachable(at, angle)
+        if problem.obstacles:
+            poses = np.column_stack([at, np.zeros_like(angle)])
+            allowed &= problem.spare_m(poses, torch.tensor(angle), stops) >= 0
+    beside = [problem.reachable(places[begin] + by_m, angle) for by_m in BESIDE_M]
+    cost = (n_actions * long_m + 0.1 * CELL_M) * np.where(np.all(beside, axis=0), 1.0, 3.0)
+    graph = csr_array((cost[allowed], (begin[allowed], end[allowed])), (len(places),) * 2)
+    _, before = dijkstra(graph, indices=0, return_predecessors=True)
+    way = [1]
+    while before[way[-1]] >= 0:
+        way.append(before[way[-1]])
+    return places[way[::-1]] if way[-1] == 0 else places[:0]
 
 
 class Ending(NamedTuple):
@@ -53,11 +92,11 @@ class MovePlanner:
                 grip = {"grip_yaw": grip_yaw}
                 steps = (replace(s, primitive=replace(s.primitive, **grip)) for s in plan.steps)
                 plan = replace(plan, steps=tuple(steps))
-                if not seen.obstacles or self.is_free(plan.steps[0], seen):
+                if not seen.obstacles or self.passes_obstacles(plan.steps[0], seen):
                     return plan
         return self._plan(seen, goal)
 
-    def is_free(self, step: Step, seen: Observation) -> bool:
+    def passes_obstacles(self, step: Step, seen: Observation) -> bool:
         """Whether a push or drag, planned before, passes the obstacles from where the object is."""
         effects = self.skills.effects(seen.image, type(step.primitive))
         space = FreeSpace(seen.obstacles, seen.image, seen.xy_m, effects.outline_m)
@@ -76,12 +115,11 @@ class MovePlanner:
         plan, self._ends_m = None, [distance_m]
         if distance_m <= self.mode.max_steps * effects.reach_m:
             plan = self._plan_to(whole, goal, goal.tolerance_m)
-        plan = plan or self._plan_towards(whole, seen)
-        if plan:
+        way = () if plan else find_way(whole)
+        if plan := plan or (self._plan_along(way, whole) if len(way) else None):
             return plan
         best = f"the best ends {1000 * min(self._ends_m):.1f} mm from it"
-        planned = len(self._ends_m) > 1 and self._can_arrive(whole)
-        if seen.obstacles or len(self._refused) > refused or not planned:
+        if seen.obstacles or len(self._refused) > refused or not len(way):
             at = "({:.3f}, {:.3f}) m".format(*goal.xy_m)
             past = " past the obstacles" * bool(seen.obstacles)
             why = f"the arm cannot bring it there{past}; of all plans, {best}"
@@ -92,31 +130,18 @@ class MovePlanner:
             f"follow; {best}, and planning again from the same place gives the same",
         )
 
-    def _can_arrive(self, whole: PlanningProblem) -> bool:
-        """Whether the arm can make any action whose straight way ends at the goal."""
-        angle = np.linspace(-np.pi, np.pi, 72, endpoint=False)
-        way_m = np.outer(np.linspace(0.0, whole.effects.reach_m, 8), np.exp(1j * angle)).ravel()
-        begins = np.subtract(whole.goal.xy_m, np.column_stack([way_m.real, way_m.imag]))
-        return bool(whole.reachable(begins, np.tile(angle, 8)).any())
-
-    def _plan_towards(self, whole: PlanningProblem, seen: Observation) -> Plan | None:
-        """Plan to a place as near to the goal as a plan can come, from where the arm can go on."""
-        goal, effects, here = whole.goal, whole.effects, np.array(seen.xy_m)
-        far_m = min(0.98 * self.mode.max_steps * effects.reach_m, goal.distance_m(here))
-        ahead = np.subtract(goal.xy_m, here)
-        for aside_rad in ASIDE_RAD:
-            stop = here + far_m * unit_vector(math.atan2(ahead[1], ahead[0]) + aside_rad)
-            left, within_m = np.subtract(goal.xy_m, stop), WAYPOINT_TOLERANCE_M
-            if np.hypot(*left) < 1e-6:  # the goal itself: half of the way is worth going
-                within_m = 0.0 if seen.obstacles else max(goal.tolerance_m, far_m / 2)
-            elif not whole.reachable(stop[None], np.array([math.atan2(left[1], left[0])]))[0]:
-                continue
+    def _plan_along(self, way: np.ndarray, whole: PlanningProblem) -> Plan | None:
+        """Plan to a place on a way (n, 2), as far along it as one plan comes."""
+        gone_m = np.append(0.0, np.hypot(*np.diff(way, axis=0).T).cumsum())
+        far_m = min(0.98 * self.mode.max_steps * whole.effects.reach_m, gone_m[-1])
+        for along_m in (far_m, 0.7 * far_m, 0.4 * far_m):
+            place = [float(np.interp(along_m, gone_m, axis)) for axis in way.T]
             try:
-                near = Goal(tuple(stop.tolist()), goal.tolerance_m)
-                problem = replace(whole, goal=near, reachable=self._allowed(effects.kind))
-            except ValueError:  # off the table, or on an obstacle
+                near = Goal((place[0], place[1]), whole.goal.tolerance_m)
+                problem = replace(whole, goal=near, reachable=self._allowed(whole.effects.kind))
+            except ValueError:  # on an obstacle
                 continue
-            if plan := self._plan_to(problem, goal, within_m):
+            if plan := self._plan_to(problem, whole.goal, WAYPOINT_TOLERANCE_M):
                 return plan
         return None
 

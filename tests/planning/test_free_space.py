@@ -251,7 +251,7 @@ def test_a_planned_drag_is_checked_again_with_its_own_grip(grip_yaw, free):
     moves = MovePlanner(PointRobot(), skills, planning.plan_continuous, planning.PlanMode(1, True))
     seen = Observation((0.0, 0.0), disc_image(), obstacles=(Obstacle.disc((0.0, 0.075), 0.008),))
     step = Step(Drag(0.0, grip_yaw=grip_yaw), 0.9, (0.05, 0.0), np.zeros((2, 2)))
-    assert moves.is_free(step, seen) == free
+    assert moves.passes_obstacles(step, seen) == free
 
 
 def test_beside_obstacles_a_ball_is_dragged_on_with_the_hand_as_planned(world, skills):
