@@ -208,7 +208,6 @@ def shop(one_world, skills, pushes, tmp_path_factory):
         "PushPlanner.plan": {"pose": (0.0,) * 3, "goal": Goal((0.01, 0.0)), "n_pushes": 1},
         "PushPlanner": {"model": Still(), "obj": logs.PushedObject(np.array(CORNERS))},
         "planar": {"values": ((0.0,) * 6 + (1.0,),)},
-        "worst": {"errors": logs.cross_validate(log, (), 2), "model": "constant"},
         "PushedObject": {"lengths_m": (0.01, 0.02), "context": {}},
         "save_model": {"model": still, "path": folder / "still.safetensors"},
         "load_model": {"path": logs.save_model(still, folder / "constant.safetensors")},

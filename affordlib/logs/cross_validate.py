@@ -71,25 +71,6 @@ def summary(errors: pd.DataFrame, by: Sequence[str] = ("model",)) -> list[dict[s
     return rows
 
 
-def worst(
-    errors: pd.DataFrame, names: Sequence[str] = (), model: str = "physics_gp", n: int = 5
-) -> pd.DataFrame:
-    """The n pushes of `cross_validate` that fit a model worst, by their errors over σ.
-
-    Look at them before you trust a log: poses that jump, and rows of another push, come first.
-    names: of the pushes (`Log.names`), instead of their numbers.
-    """
-    shown = ["push", "group", "position_m", "yaw_rad", "error_over_std"]
-    if lost := {"model", *shown} - {*errors}:
-        raise ValueError(f"errors must be a table of cross_validate, but has no {sorted(lost)}")
-    check_choice("model", model, set(errors["model"]))
-    if 0 < len(names) <= errors["push"].max():
-        raise ValueError(f"names must be one for each push (Log.names), got {len(names)}")
-    known = errors[errors["model"] == model].nlargest(check_count("n", n), "error_over_std")
-    known = known.assign(push=[names[k] if len(names) else k for k in known["push"]])
-    return known[shown]
-
-
 def errors_of(
     data: LoggedPushes, trained: np.ndarray, tested: np.ndarray, names: Sequence[str], seed: int = 0
 ) -> pd.DataFrame:
