@@ -9,7 +9,6 @@ OUT     =
 ONLY    =
 ARGS    =
 FORCE   =
-KEEP    =
 DRY_RUN =
 WORKERS = 2
 JOBS    = 2
@@ -37,7 +36,6 @@ yes = $(filter-out 0 no false,$(1))
 
 export PROFILE SEED WORKERS OUT ONLY ARGS FORCE JOBS INDEX
 override FORCE   := $(call yes,$(FORCE))
-override KEEP    := $(call yes,$(KEEP))
 override DRY_RUN := $(call yes,$(DRY_RUN))
 override PUSHT   := $(call yes,$(PUSHT))
 export PYTHONUTF8 := 1
@@ -156,8 +154,8 @@ format: $(STAMP) ## Format the code, notebooks included
 	@$(PY) -m ruff check --fix
 	@$(PY) -m ruff format
 
-bench: $(STAMP) ## Run the benchmarks (KEEP=1 writes the times to data/results/speed.json)
-	@$(PY) -m experiments.speed $(if $(KEEP),--keep)
+bench: $(STAMP) ## Run the benchmarks, and write the times to runs/speed.json
+	@$(PY) -m experiments.speed
 
 data: $(STAMP) ## Collect the shipped data sets again and compare them with the existing ones
 	@$(PY) -m experiments.shipped data

@@ -20,7 +20,9 @@ import hashlib
 import importlib
 import inspect
 import json
+import math
 import os
+import random
 import sys
 import time
 import zlib
@@ -29,6 +31,7 @@ from contextlib import closing
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -130,28 +133,15 @@ def _record(task: tuple[Job, Path]) -> dict[str, Any]:
     return {"arguments": job.arguments, "made_of": job.made_of(), "result": result}
 
 
-def read(
-    table: str, job: Callable[..., Job], folder: str | Path = FOLDER, accept: bool = False
-) -> list[Result]:
-    """Return all results of a table; raises ValueError for one whose `job` has other inputs now.
-
-    accept: store the results as those of the current jobs, after a change that changed no number,
-    such as another name in a checkpoint.
-    """
-    folder = resolve_out_dir(folder)
-    records = _records(table, folder)
+def read(table: str, job: Callable[..., Job], folder: str | Path = FOLDER) -> list[Result]:
+    """Return all results of a table; raises ValueError for one whose `job` has other inputs now."""
+    records = _records(table, resolve_out_dir(folder))
     for record in records.values():
-        now = job(**record["arguments"])
-        if (what := _stale(record, now)) and not accept:
+        if what := _stale(record, job(**record["arguments"])):
             raise ValueError(
                 f"{table}: the result of {record['arguments']} was made of another {what}; run the "
-                "job again, or, if no number changed, `experiments.runner.read(..., accept=True)`"
+                "job again"
             )
-        then, record["made_of"] = record["made_of"], now.made_of()
-        known = zip(record["made_of"]["data"], then["data"], strict=True)
-        record["made_of"]["data"] = [new or old for new, old in known]
-    if accept:
-        _add(records, table, folder)
     return [(record["arguments"], record["result"]) for record in records.values()]
 
 
@@ -189,8 +179,37 @@ def parser(table: str, description: str | None) -> argparse.ArgumentParser:
     shared.add_argument("--out", default="data/results")
     only = "run only jobs with these arguments, such as fold=0,1"
     shared.add_argument("--only", nargs="+", default=[], metavar="NAME=VALUE,…", help=only)
+    again = "run this many of the stored jobs again, and name those that differ"
+    shared.add_argument("--again", type=int, default=0, metavar="N", help=again)
     shared.add_argument("--workers", type=worker_type, default=1, help="processes on this machine")
     return shared
+
+
+def run_again(jobs: Sequence[Job], table: str, options: argparse.Namespace) -> int:
+    """Run some jobs again, and name those whose result differs: their version was forgotten."""
+    stored = _records(table, resolve_out_dir(options.raw))
+    known = [job for job in jobs if _key(job.arguments) in stored]
+    known = random.Random(0).sample(known, min(options.again, len(known)))
+    with TemporaryDirectory() as folder:
+        tasks = {}
+        for k, job in enumerate(known):
+            same = replace(job, function=_importable(job.function))
+            tasks[_key(job.arguments)] = same, Path(folder) / f"{k}.pt"
+        made = spread(_record, tasks, options.workers)
+        off = [key for key, new in made if not _alike(stored[key]["result"], new["result"])]
+    print("\n".join([*off, f"{table}: {len(off)} of {len(known)} differ"]))
+    return bool(off)
+
+
+def _alike(one: Any, other: Any) -> bool:
+    """Whether two results agree to 2 %, but for times."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        return all(_alike(one[k], other.get(k)) for k in one if not k.endswith("_s"))
+    if isinstance(one, list) and isinstance(other, list):
+        return len(one) == len(other) and all(map(_alike, one, other))
+    if isinstance(one, float) and isinstance(other, int | float):
+        return math.isclose(one, other, rel_tol=0.02, abs_tol=2e-4)
+    return one == other
 
 
 def make(
@@ -208,6 +227,8 @@ def make(
             there = ", ".join(sorted(known))
             raise ValueError(f"--only: no job has {name} = {unknown[0]!r:.40}, but {there}")
         jobs = [job for job in jobs if str(job.arguments.get(name)) in values]
+    if options.again:
+        return run_again(jobs, table, options)
     run(jobs, table, options.raw, options.workers)
     if tables is None:
         return 0

@@ -10,7 +10,7 @@ import tokenize
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-LINES = {"affordlib": 12_161, "experiments": 6438, "tests": 8355}
+LINES = {"affordlib": 12_152, "experiments": 6436, "tests": 8352}
 """Maximum number of lines: lower it with every cut. The aim is 9,650, 6,000 and 7,800."""
 
 FILES, CODE = 63, 7692

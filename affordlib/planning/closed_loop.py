@@ -315,9 +315,7 @@ class _ClosedLoop:
             if isinstance(step.primitive, Drag):  # the hand closes as it has opened, and as planned
                 yaw = float(self.executions[-1].tool[-1, 3])
                 step = replace(step, primitive=replace(step.primitive, grip_yaw=yaw))
-            self.queue = (
-                [step, *self.queue[1:]] if self.moves.passes_obstacles(step, self.seen) else []
-            )
+            self.queue = [step, *self.queue[1:]] if self.moves.passes(step, self.seen) else []
         if part != "position" or not self.queue:
             if part == "position":
                 plan = self.moves.plan(self.seen, self.goal, self._grip_yaw())

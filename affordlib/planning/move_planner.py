@@ -91,11 +91,11 @@ class MovePlanner:
                 grip = {"grip_yaw": grip_yaw}
                 steps = (replace(s, primitive=replace(s.primitive, **grip)) for s in plan.steps)
                 plan = replace(plan, steps=tuple(steps))
-                if not seen.obstacles or self.passes_obstacles(plan.steps[0], seen):
+                if not seen.obstacles or self.passes(plan.steps[0], seen):
                     return plan
         return self._plan(seen, goal)
 
-    def passes_obstacles(self, step: Step, seen: Observation) -> bool:
+    def passes(self, step: Step, seen: Observation) -> bool:
         """Whether a push or drag, planned before, passes the obstacles from where the object is."""
         effects = self.skills.effects(seen.image, type(step.primitive))
         space = FreeSpace(seen.obstacles, seen.image, seen.xy_m, effects.outline_m)

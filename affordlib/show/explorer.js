@@ -3,12 +3,6 @@
   const [WIDTH, HEIGHT, LEFT, BELOW, ABOVE] = [440, 240, 40, 24, 26];
   const nearly = (value) => Number(value.toPrecision(3));
 
-  function decoded({ n, scale, numbers }) {
-    const bytes = Uint8Array.from(atob(numbers), (letter) => letter.charCodeAt(0));
-    const all = Array.from(new Int16Array(bytes.buffer), (value) => value * scale);
-    return Array.from({ length: all.length / n }, (_, k) => all.slice(k * n, (k + 1) * n));
-  }
-
   function make(tag, inside, more = {}) {
     const made = Object.assign(document.createElement(tag), more);
     made.append(...inside);
@@ -54,9 +48,6 @@
   }
 
   for (const panel of panels) {
-    for (const line of panel.lines) {
-      for (const name of ["x", "y", "band"]) if (line[name]) line[name] = decoded(line[name]);
-    }
     panel.xs = limits(panel.lines, "x");
     panel.ys = limits(panel.lines, "y");
   }

@@ -4,7 +4,6 @@ Everything is computed beforehand, so they work without a kernel, too: in a save
 web book. Where scripts do not run, a still picture stands in their place.
 """
 
-import base64
 import itertools
 import json
 from collections.abc import Sequence
@@ -31,7 +30,7 @@ from affordlib.types import (
 from affordlib.world import Tabletop
 
 CHANNELS = {"action": ACTION_CHANNELS, "effect": EFFECT_CHANNELS}
-N_TARGETS = 31
+N_TARGETS = 25
 BLACK = "#222222"
 _SCRIPT = Path(__file__).with_name("explorer.js")
 
@@ -96,12 +95,12 @@ class Explorer:
     def _repr_mimebundle_(self, **kwargs: object) -> dict[str, str]:
         """What a notebook shows: numbers and script, and a picture until the script has run."""
         panels = [
-            {"title": name, "square": name == self.square, "lines": list(map(_packed, lines))}
+            {"title": name, "square": name == self.square, "lines": list(map(_plain, lines))}
             for name, lines in self.panels.items()
         ]
         sliders = [{"name": k, "values": list(v)} for k, v in self.sliders.items()]
         data = {"sliders": sliders, "at": self.at, "panels": panels, "words": self.words}
-        text = json.dumps(data).replace("<", "\\u003c")
+        text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
         picture = print_figure(self.figure(), base64=True, bbox_inches=None)
         said = self.words[self.state].replace("<b>", "").replace("</b>", "")
         inside = f'<img alt="{said}" src="data:image/png;base64,{picture}">'
@@ -110,15 +109,11 @@ class Explorer:
         return {"text/html": html, "text/plain": type(self).__name__}
 
 
-def _packed(line: Line) -> dict[str, Any]:
-    """A line in JSON's types: its numbers in 16 bits."""
-    packed = {"name": line.name, "color": line.color, "style": line.style}
-    for name in ("x", "y", "band"):
-        if (values := getattr(line, name)) is not None:
-            scale = float(np.abs(values).max() or 1.0) / 32767
-            numbers = base64.b64encode(np.round(values / scale).astype("<i2").tobytes()).decode()
-            packed[name] = {"n": values.shape[-1], "scale": scale, "numbers": numbers}
-    return packed
+def _plain(line: Line) -> dict[str, Any]:
+    """A line in JSON's types: its numbers as (S, n) or (1, n), to two decimals."""
+    numbers = {k: v for k, v in line._asdict().items() if isinstance(v, np.ndarray)}
+    lists = {k: np.atleast_2d(v).astype(float).round(2).tolist() for k, v in numbers.items()}
+    return line._asdict() | lists
 
 
 def conditioning_explorer(

@@ -7,19 +7,7 @@ import signal
 
 import pytest
 
-from affordlib.results import repo_root
 from experiments.commands import command
-
-ALL = {
-    path.relative_to(repo_root()).with_suffix("").as_posix().replace("/", ".")
-    for path in (repo_root() / "experiments").rglob("*.py")
-    if re.search(r"(parse_args|command_of).*\nif __name__", path.read_text(), re.DOTALL)
-}
-
-
-def main_of(name):
-    return importlib.import_module(name).main
-
 
 TABLE, SHIPPED = "experiments.effect_prediction", "experiments.shipped data"
 
@@ -39,16 +27,12 @@ TABLE, SHIPPED = "experiments.effect_prediction", "experiments.shipped data"
 def test_unknown_names_and_impossible_numbers_are_refused(capsys, line, code, named):
     name, *arguments = line.split()
     try:
-        ended = main_of(name)(arguments)
+        ended = importlib.import_module(name).main(arguments)
     except SystemExit as stopped:
         ended = stopped.code
     assert ended == code
     begins = {1: "^effect_prediction: --only: ", 2: "error: (argument )?"}[code]
     assert re.search(begins + named, capsys.readouterr().err, re.MULTILINE)
-
-
-def test_every_command_line_ends_in_this_way():
-    assert all(hasattr(main_of(module), "__wrapped__") for module in ALL)  # is a `command`
 
 
 @pytest.mark.parametrize(

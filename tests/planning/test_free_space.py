@@ -190,6 +190,12 @@ def test_a_way_that_is_closed_is_unreachable_and_nothing_is_touched():
     assert "obstacles[0] lies on the goal" in found.message
 
 
+def test_a_far_goal_behind_a_long_wall_is_reached():
+    robot = PointRobot(obstacles=(Obstacle.box((0.15, 0.05), (0.03, 0.4)),))
+    found = planning.run_closed_loop(robot, Goal((0.25, 0.05), 0.005), point_skills())
+    assert found.reached, found.message
+
+
 def test_an_obstacle_that_moves_makes_the_loop_plan_again():
     """A wall is put across the way after the first action, which it then goes round."""
     wall = (Obstacle.box((0.13, 0.0), (0.02, 0.1)),)
@@ -251,7 +257,7 @@ def test_a_planned_drag_is_checked_again_with_its_own_grip(grip_yaw, free):
     moves = MovePlanner(PointRobot(), skills, planning.plan_continuous, planning.PlanMode(1, True))
     seen = Observation((0.0, 0.0), disc_image(), obstacles=(Obstacle.disc((0.0, 0.075), 0.008),))
     step = Step(Drag(0.0, grip_yaw=grip_yaw), 0.9, (0.05, 0.0), np.zeros((2, 2)))
-    assert moves.passes_obstacles(step, seen) == free
+    assert moves.passes(step, seen) == free
 
 
 def test_beside_obstacles_a_ball_is_dragged_on_with_the_hand_as_planned(world, skills):

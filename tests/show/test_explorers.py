@@ -35,7 +35,7 @@ def state_of(explorer, *at):
 @pytest.mark.slow
 def test_what_is_observed_decides_what_is_predicted(explorer, trained, push):
     context = condition_on_primitives(trained, [push.primitive])
-    t = torch.linspace(0, 1, 31)[None]
+    t = torch.linspace(0, 1, 25)[None]
     with torch.no_grad():
         plain = trained.predict(trained.encode(torch.tensor(push.image)[None]), context, t)
     _, line, dots = explorer.panels["effect, x [cm], over phase"]
