@@ -396,7 +396,7 @@ def job(row: str, family: str = "", index: int = 0, seed: int = SEED) -> Job:
     checkpoints = [*CHECKPOINTS.values(), PUSHES["perturbed"]]
     if row in ROWS and "push" in ROWS[row][1]:
         checkpoints.append(ROWS[row][1]["push"])
-    version = {"closed_loop_perturbed": 4, "closed_loop": 3}.get(row, 1)
+    version = {"closed_loop_perturbed": 5, "closed_loop": 4, "closed_loop_full": 2}.get(row, 1)
     return Job(run_task, arguments, checkpoints=tuple(checkpoints), version=version)
 
 

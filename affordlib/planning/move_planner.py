@@ -117,12 +117,12 @@ class MovePlanner:
         way = () if plan else find_way(whole)
         if plan := plan or (self._plan_along(way, whole) if len(way) else None):
             return plan
-        best = f"the best ends {1000 * min(self._ends_m):.1f} mm from it"
+        best = f"of all plans, the best ends {1000 * min(self._ends_m):.1f} mm from it"
+        best = best if len(self._ends_m) > 1 else "no way leads there"
         if seen.obstacles or len(self._refused) > refused or not len(way):
-            at = "({:.3f}, {:.3f}) m".format(*goal.xy_m)
-            past = " past the obstacles" * bool(seen.obstacles)
-            why = f"the arm cannot bring it there{past}; of all plans, {best}"
-            return Ending("unreachable", f"the position {at}: {why}")
+            (x, y), past = goal.xy_m, " past the obstacles" * bool(seen.obstacles)
+            why = f"the arm cannot bring it there{past}; {best}"
+            return Ending("unreachable", f"the position ({x:.3f}, {y:.3f}) m: {why}")
         return Ending(
             "gave_up",
             f"{1000 * distance_m:.1f} mm from the goal, the planner finds no plan that the arm can "
