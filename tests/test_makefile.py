@@ -117,9 +117,7 @@ def test_options_are_words_and_zero_means_no(project):
             assert len(ran) == 1, said
     assert not (project.here / "here").exists()
     shutil.rmtree(project.here / ".venv")
-    ran = " ".join(project.make("PUSHT=0", "setup", words=9)[2])
-    assert "--extra-index-url here" not in ran
-    assert "pusht" not in ran
+    assert "pusht" not in " ".join(project.make("PUSHT=0", "setup", words=9)[2])
     shutil.rmtree(project.here / ".venv")
     assert "--extra-index-url here" in " ".join(project.make("INDEX=here", "setup", words=9)[2])
 

@@ -38,10 +38,10 @@ def find_way(problem: PlanningProblem) -> np.ndarray:
     A way leads over a grid. Near to where the arm cannot act, it counts as three times as long, and
     where an obstacle is, as ten times: there, plans may find what the grid does not.
     """
-    effects, axes = problem.effects, (np.arange(*ends, CELL_M) for ends in (TABLE_X_M, TABLE_Y_M))
+    effects, axes = problem.effects, (np.arange(*rim, CELL_M) for rim in (TABLE_X_M, TABLE_Y_M))
     grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
-    grid = grid[on_table(grid, effects.radius_m)]
-    places = np.vstack([problem.start_xy_m, problem.goal.xy_m, grid])
+    ends = problem.start_xy_m, problem.goal.xy_m
+    places = np.vstack([*ends, grid[on_table(grid, effects.radius_m)]])
     pairs = cKDTree(places).query_pairs(LONGEST_M, output_type="ndarray")
     begin, end = np.vstack([pairs, pairs[:, ::-1]]).T
     n_actions = math.ceil(LONGEST_M / max(effects.reach_m, 0.01))
@@ -134,9 +134,9 @@ class MovePlanner:
         gone_m = np.append(0.0, np.hypot(*np.diff(way, axis=0).T).cumsum())
         far_m = min(0.98 * self.mode.max_steps * whole.effects.reach_m, gone_m[-1])
         for along_m in (far_m, 0.7 * far_m, 0.4 * far_m):
-            place = [float(np.interp(along_m, gone_m, axis)) for axis in way.T]
+            x, y = (float(np.interp(along_m, gone_m, axis)) for axis in way.T)
             try:
-                near = Goal((place[0], place[1]), whole.goal.tolerance_m)
+                near = Goal((x, y), whole.goal.tolerance_m)
                 problem = replace(whole, goal=near, reachable=self._allowed(whole.effects.kind))
             except ValueError:  # on an obstacle
                 continue

@@ -9,7 +9,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -95,12 +95,12 @@ class Explorer:
     def _repr_mimebundle_(self, **kwargs: object) -> dict[str, str]:
         """What a notebook shows: numbers and script, and a picture until the script has run."""
         panels = [
-            {"title": name, "square": name == self.square, "lines": list(map(_plain, lines))}
+            {"title": name, "square": name == self.square, "lines": [x._asdict() for x in lines]}
             for name, lines in self.panels.items()
         ]
         sliders = [{"name": k, "values": list(v)} for k, v in self.sliders.items()]
         data = {"sliders": sliders, "at": self.at, "panels": panels, "words": self.words}
-        text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
+        text = json.dumps(data, separators=(",", ":"), default=_rows).replace("<", "\\u003c")
         picture = print_figure(self.figure(), base64=True, bbox_inches=None)
         said = self.words[self.state].replace("<b>", "").replace("</b>", "")
         inside = f'<img alt="{said}" src="data:image/png;base64,{picture}">'
@@ -109,11 +109,9 @@ class Explorer:
         return {"text/html": html, "text/plain": type(self).__name__}
 
 
-def _plain(line: Line) -> dict[str, Any]:
-    """A line in JSON's types: its numbers as (S, n) or (1, n), to two decimals."""
-    numbers = {k: v for k, v in line._asdict().items() if isinstance(v, np.ndarray)}
-    lists = {k: np.atleast_2d(v).astype(float).round(2).tolist() for k, v in numbers.items()}
-    return line._asdict() | lists
+def _rows(values: np.ndarray) -> list[list[float]]:
+    """Numbers (n,) or (S, n) in JSON's types, as rows with two decimals."""
+    return np.atleast_2d(values).astype(float).round(2).tolist()
 
 
 def conditioning_explorer(

@@ -7,6 +7,7 @@ import signal
 
 import pytest
 
+from affordlib.results import repo_root
 from experiments.commands import command
 
 TABLE, SHIPPED = "experiments.effect_prediction", "experiments.shipped data"
@@ -33,6 +34,11 @@ def test_unknown_names_and_impossible_numbers_are_refused(capsys, line, code, na
     assert ended == code
     begins = {1: "^effect_prediction: --only: ", 2: "error: (argument )?"}[code]
     assert re.search(begins + named, capsys.readouterr().err, re.MULTILINE)
+
+
+def test_every_command_line_ends_in_this_way():
+    for path in (repo_root() / "experiments").glob("*.py"):
+        assert not re.search(r"(?m)^(?!@command\().*\ndef main\(argv", path.read_text()), path
 
 
 @pytest.mark.parametrize(
