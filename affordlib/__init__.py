@@ -19,7 +19,7 @@ types geometry primitives perception results weights workers world.objects world
 interactions.collect interactions.dataset interactions.recipes interactions.store
 models.checkpoint models.domain models.evaluation models.lever_up models.training
 planning.astar planning.closed_loop planning.continuous planning.effect_map planning.gradient
-planning.grasp_rotate planning.problem planning.reachability planning.skills
+planning.grasp_rotate planning.problem planning.skills
 logs.cross_validate logs.fit logs.log logs.planning
 show.explorers show.goal_picker show.picker_controls show.plots show.scene
 """

@@ -16,7 +16,7 @@ from scipy.spatial import ConvexHull
 
 from affordlib.geometry import cross, wrap_angle
 from affordlib.primitives import Drag, Grasp, Primitive
-from affordlib.types import CROP_WIDTH_M, IMAGE_PIXELS
+from affordlib.types import CROP_WIDTH_M, IMAGE_PIXELS, NothingSeenError
 
 CAMERA_HEIGHT_M = 1.0
 _ROUND = 0.8  # curvature times radius of a round top, at least: 1 for a sphere, 0 for a box
@@ -185,6 +185,8 @@ def outline_of(image: np.ndarray, width_m: float = CROP_WIDTH_M) -> np.ndarray:
     or hardly change the shape are removed, and a line is fitted to the rim along each other edge.
     """
     near, n = ndimage.binary_dilation(image[1] > 0.5), len(image[1])
+    if not near.any():
+        raise NothingSeenError("image shows no object; take it of one on the table")
     cover = np.where(near, CAMERA_HEIGHT_M - image[0], 0.0) / object_height_m(image)
     rims = contour_generator(z=np.pad(np.clip(cover, 0, 1), 1)).lines(0.5)
     rim = (max(rims, key=len)[:-1] - (n + 1) / 2) * [1, -1]  # in pixels

@@ -58,11 +58,6 @@ class Segment:
         return self.start + np.asarray(share)[:, None] * (self.end - self.start)
 
 
-def metres(low: float, high: float, default: Any = MISSING) -> Any:
-    """Declare a parameter that is a length in [low, high] m."""
-    return number(low, high, "m", default)
-
-
 def radians(default: Any = MISSING, first: float = -math.pi) -> Any:
     """Declare a parameter that is an angle [rad], kept in the turn that begins with `first`."""
     turn = 2 * math.pi
@@ -110,11 +105,6 @@ class Primitive(Checked):
             action[inside] = segment.at(share)[:, :PITCH]
         return action
 
-    def ends(self) -> np.ndarray:
-        """Return the commanded action (2, 5) at t = 0 and t = 1, faster than with `path`."""
-        first, last = self.segments[0].at(np.zeros(1)), self.segments[-1].at(np.ones(1))
-        return np.concatenate([first, last])[:, :PITCH]
-
     def succeeded(self, effect: np.ndarray) -> bool:
         """Return whether a final effect (5,) is a success: here, a displacement above 1 cm."""
         return bool(np.hypot(effect[0], effect[1]) > 0.01)
@@ -146,7 +136,7 @@ class Move(Primitive):
     """A primitive that moves an object in a straight line, in a direction given by theta [rad]."""
 
     theta: float = radians(first=0.0)
-    length: float = metres(0.0, 0.15, 0.05)
+    length: float = number(0.0, 0.15, "m", 0.05)
 
     ahead_rad: ClassVar[float] = 0.0  # from theta to the direction in which the object moves
 
@@ -174,7 +164,7 @@ class Push(Move):
     moves through the centre and stops `length` [m] beyond it. The object moves towards theta + π.
     """
 
-    radius: float = metres(0.1, 0.3, 0.2)
+    radius: float = number(0.1, 0.3, "m", 0.2)
 
     name = "push"
     opening_m = PUSH_GAP_M
@@ -201,7 +191,7 @@ class PushAt(Primitive):
 
     contact: tuple[float, float] = point(2, 0.3)
     direction: float = radians()
-    length: float = metres(0.0, 0.15, 0.016)
+    length: float = number(0.0, 0.15, "m", 0.016)
 
     name = "push_at"
     opening_m = 0.0
@@ -246,7 +236,7 @@ class Grasp(Primitive):
     the height in the image. grip_yaw [rad] is the gripper's yaw; closing aligns the object with it.
     """
 
-    seen_height: float | None = metres(0.0, 0.3, None)
+    seen_height: float | None = number(0.0, 0.3, "m", None)
     grip_yaw: float = radians(0.0)
 
     name = "grasp"
@@ -324,10 +314,10 @@ class LeverUp(Primitive):
     far edge about which the object turns. The tip follows r(1 - cos φ), r sin φ up to φ = 65°.
     """
 
-    contact_x: float = metres(-0.2, 0.2)
-    contact_y: float = metres(-0.2, 0.2)
+    contact_x: float = number(-0.2, 0.2, "m")
+    contact_y: float = number(-0.2, 0.2, "m")
     theta: float = radians(first=0.0)
-    reach: float = metres(0.05, 0.4)
+    reach: float = number(0.05, 0.4, "m")
 
     name = "lever_up"
     opening_m = 0.012

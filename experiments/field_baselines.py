@@ -13,7 +13,7 @@ from affordlib.geometry import rotate
 from affordlib.logs.log import centred, gyration_radius_m
 from affordlib.logs.physics import ELLIPSOID, quasi_static_push
 from affordlib.planning import EffectMap, PlanningProblem, continuous
-from affordlib.planning.rollout import make_steps, roll_out
+from affordlib.planning.effect_map import make_steps, roll_out
 from affordlib.types import Plan
 
 N_CHAINS, ROUNDS, N_ELITE = 218, 16, 22

@@ -28,9 +28,9 @@ from affordlib.planning import PlanMode, PlanningProblem, Skills, execute_plan, 
 from affordlib.planning.astar import plan_astar
 from affordlib.planning.closed_loop import ClosedLoopConfig, run_closed_loop
 from affordlib.planning.continuous import plan_continuous
+from affordlib.planning.effect_map import poses_along
 from affordlib.planning.free_space import N_POSES, FreeSpace, corners_of, gaps_m, placed, ring
 from affordlib.planning.gradient import plan_gradient
-from affordlib.planning.rollout import poses_along
 from affordlib.planning.skills import CHECKPOINTS
 from affordlib.primitives import Drag, Move, Push
 from affordlib.types import Goal, Obstacle, UnreachableError

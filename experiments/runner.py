@@ -42,7 +42,7 @@ from tqdm.auto import tqdm
 
 from affordlib.interactions import open_interactions
 from affordlib.interactions.store import stored_sha256
-from affordlib.planning.reachability import REACHABILITY
+from affordlib.planning.skills import REACHABILITY
 from affordlib.results import file_at, repo_root, resolve_out_dir, write_atomically, write_results
 from affordlib.weights import read_weights, resolve_checkpoint, weights_sha256
 from affordlib.workers import spread

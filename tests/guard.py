@@ -24,7 +24,7 @@ from affordlib.interactions import InteractionTensors, open_interactions
 from affordlib.interactions.recipes import RECIPES, interact
 from affordlib.models import load_checkpoint
 from affordlib.models.lever_up import lever_up_tensors
-from affordlib.planning.reachability import Reachability
+from affordlib.planning.skills import Reachability
 from affordlib.results import repo_root
 from affordlib.types import Observations
 from affordlib.world import Tabletop

@@ -10,13 +10,13 @@ import tokenize
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-LINES = {"affordlib": 12_150, "experiments": 6436, "tests": 8355}
+LINES = {"affordlib": 12_086, "experiments": 6436, "tests": 8347}
 """Maximum number of lines: lower it with every cut. The aim is 9,650, 6,000 and 7,800."""
 
-FILES, CODE = 63, 7690
+FILES, CODE = 60, 7652
 """Maxima for affordlib: all files, and lines of Python without docstrings, comments and blanks.
 
-The aim is 60 files and 6,700 lines of code."""
+The aim is 6,700 lines of code."""
 
 NO_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT}
 NO_CODE |= {tokenize.ENDMARKER}

@@ -15,7 +15,7 @@ from affordlib.interactions.store import write_interactions
 from affordlib.logs.cross_validate import forecast_errors
 from affordlib.logs.neural_process import load_neural_process
 from affordlib.models.evaluation import network_predictions, refuse_seen
-from affordlib.planning.reachability import Reachability
+from affordlib.planning.skills import Reachability
 from affordlib.show.picker_controls import words_as_html
 from affordlib.types import Goal, Outcome, Plan
 from affordlib.weights import read_weights, resolve_checkpoint, write_weights

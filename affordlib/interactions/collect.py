@@ -12,6 +12,7 @@ number of workers and any size and order of chunks. On a cluster:
 
 import os
 import shutil
+from collections.abc import Callable
 from contextlib import closing, suppress
 from dataclasses import fields
 from functools import partial
@@ -116,7 +117,9 @@ def collect(
         left = sum(map(len, missing.values()))
         bar = tqdm(total=n, initial=n - left, unit=" interactions", disable=not progress)
         try:
-            with closing(spread(partial(collect_chunk, recipe), missing, workers)) as made, bar:
+            known = dict(PRIMITIVES), dict(CATEGORIES)
+            make = partial(_with_classes, known, collect_chunk, recipe)
+            with closing(spread(make, missing, workers)) as made, bar:
                 for name, data in made:
                     if data.attrs != attrs:
                         there, here = data.attrs["versions"], attrs["versions"]
@@ -169,6 +172,13 @@ def attributes_for(recipe: Recipe) -> dict[str, str]:
         "frame": "origin where the object stood at the start, axes of the table",
         "versions": " ".join(f"{name}={metadata.version(name)}" for name in packages),
     }
+
+
+def _with_classes(known: tuple[dict, dict], make: Callable, *arguments: object) -> object:
+    """Call a function in a process that may not know the classes that a user has added."""
+    for classes, here in zip(known, (PRIMITIVES, CATEGORIES), strict=True):
+        here.update(classes)
+    return make(*arguments)
 
 
 def collect_chunk(recipe: Recipe, numbers: range) -> xr.Dataset:

@@ -6,6 +6,7 @@ radians in the object's frame before each push: from its centroid, with the reco
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
@@ -13,10 +14,9 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, Self
 
 import numpy as np
-from scipy.ndimage import find_objects, label
 from scipy.optimize import brentq
 
-from affordlib.geometry import centroid, cross, rotated, rotated_each
+from affordlib.geometry import centroid, cross, rotated
 from affordlib.results import plain
 from affordlib.types import check_array, check_choice, check_within
 
@@ -31,7 +31,6 @@ LATE_SHARE = 0.05  # of its duration, by which a push may be seen late; two fram
 SAMPLES = 500  # points of a path, at least, at which contact is looked for
 DEEP_M = 0.003  # of the tool in the outline, in the first row and at the final pose
 BACK_M = 0.01  # how far the path of a tool that touches in the first row is extended backwards
-APART_M, TOUCH_M = 0.003, 0.001  # in a session: gaps where a push may begin, where the tool touches
 MOST_TILT_RAD, WOBBLE_RAD = math.radians(20), math.radians(3)  # wobble: if the yaw varies less
 ORDERS = {"xyzw": [0, 1, 2, 3], "wxyz": [1, 2, 3, 0]}
 UPS = {"z": 0, "y": 1, "x": -1}  # shift of x, y, z that puts the axis that points up last
@@ -127,6 +126,7 @@ class Log:
         check_within(f"the radius of outline, in {unit},", radius_m, 0.0, LARGEST_M, "m")
         self._radius_m = check_within("tool_radius", tool_radius, 0.0, 1e3) * self._metres
         self._pushes: list[dict[str, Any]] = []
+        self._numbers = itertools.count()
         self.names: list[str] = []
         self.refused: dict[str, str] = {}
 
@@ -150,9 +150,11 @@ class Log:
         and yaw of the object, at the times poses_t (k,) of the tool's clock, or without times two
         poses, before and after the push; context: further known values, numbers or text; group:
         name of the pushes that belong together; name: of this push (default: the number of the
-        call, from 0). Raises ValueError, and adds nothing, with name, value and what is expected.
+        call, from 0, or the next free one). Raises ValueError, and adds nothing, with name, value
+        and what is expected.
         """
-        name = str(len(self.names) + len(self.refused)) if name is None else str(name)
+        number = next(n for n in map(str, self._numbers) if n not in self.names)
+        name = number if name is None else str(name)
         try:
             if name in self.names:
                 raise ValueError("another push has this name; give each push its own")
@@ -178,29 +180,6 @@ class Log:
             with suppress(ValueError):
                 self.add(**each)
         return {name: why for name, why in self.refused.items() if before.get(name) is not why}
-
-    def split(self, tool_t: Any, tool_xy: Any, poses: Any, poses_t: Any) -> list[dict[str, Any]]:
-        """Find the pushes in the recording of a session; returns arguments of `add`, one each.
-
-        The object must be seen throughout, as in `add`. A push begins outside the outline, or at
-        the first row, and ends where the tool is farthest from where it touched.
-        """
-        tool = _rows("tool_xy", tool_xy, 2, most=math.inf) * self._metres
-        t = _growing("tool_t", tool_t, len(tool))
-        known = self._poses("poses", poses, math.inf)
-        at = _growing("poses_t", poses_t, len(known))
-        seen = np.column_stack([np.interp(t, at, column) for column in known.T])
-        inside = rotated_each(tool - seen[:, :2], -seen[:, 2]) - self.origin_m
-        gap, found = _nearest(self.outline_m, inside)[0] - self._radius_m, []
-        for (near,) in find_objects(label(gap <= APART_M)[0]):
-            first = near.start + int((gap[near] < TOUCH_M).argmax())
-            way = np.linalg.norm(tool[first : near.stop] - tool[first], axis=1)
-            rows = slice(max(near.start - 1, 0), first + int(way.argmax()) + 1)
-            if gap[first] < TOUCH_M and way.any():
-                push = {"tool_t": t[rows], "tool_xy": tool[rows] / self._metres}
-                push["poses"] = seen[rows] / [self._metres, self._metres, self._radians]
-                found.append(push | {"poses_t": t[rows]})
-        return found
 
     def query(
         self, tool_xy: Any, context: Mapping[str, Any] | None = None, group: str = "all"
@@ -231,9 +210,9 @@ class Log:
         of_all = {"outline_m": self.outline_m, "tool_radius_m": self._radius_m}
         return kind(**arrays, context=context, **of_all)
 
-    def _poses(self, name: str, values: Any, most: float = MOST_ROWS) -> np.ndarray:
+    def _poses(self, name: str, values: Any) -> np.ndarray:
         """Poses (k, 3) in metres and radians, without jumps of the yaw by 2π; ValueError."""
-        poses = _rows(name, values, 3, most=most) * [self._metres, self._metres, self._radians]
+        poses = _rows(name, values, 3) * [self._metres, self._metres, self._radians]
         if np.abs(poses[:, 2]).max() > 2 * math.pi:
             raise ValueError(
                 f"yaws of {name}, in {self._angle_unit}, must lie within one turn, got "
@@ -296,20 +275,18 @@ class Log:
         return {name: found[name] for name in expected}
 
 
-def _rows(
-    name: str, values: Any, *columns: int, most: float = MOST_ROWS, least: int = 2
-) -> np.ndarray:
-    """Finite numbers (m, columns), least ≤ m ≤ most; raises ValueError."""
+def _rows(name: str, values: Any, *columns: int, least: int = 2) -> np.ndarray:
+    """Finite numbers (m, columns), least ≤ m ≤ `MOST_ROWS`; raises ValueError."""
     try:
         array = np.ma.asarray(values, dtype=float).filled(np.nan)
     except (TypeError, ValueError, RuntimeError, OverflowError):
         array = check_array(name, values)
     array = array[:, None] if array.ndim == 1 and columns == (1,) else array
-    if array.ndim != 2 or array.shape[1] not in columns or not least <= len(array) <= most:
+    if array.ndim != 2 or array.shape[1] not in columns or not least <= len(array) <= MOST_ROWS:
         raise ValueError(
-            f"{name} must have {least} to {most} rows of {' or '.join(map(str, columns))} "
+            f"{name} must have {least} to {MOST_ROWS} rows of {' or '.join(map(str, columns))} "
             f"numbers, got {array.shape}; "
-            "split a session (Log.split), and read positions and quaternions in space by planar"
+            "split a session into its pushes, and read positions and quaternions in space by planar"
         )
     if (lost := np.flatnonzero(~np.isfinite(array).all(axis=1))).size:
         raise ValueError(
@@ -324,7 +301,7 @@ def _growing(name: str, times: Any, n: int) -> np.ndarray:
     if getattr(getattr(times, "dtype", None), "kind", "") == "M":  # dates, as nanoseconds
         times = np.ma.asarray(times, "datetime64[ns]").filled(np.datetime64("NaT"))
         times = np.where(np.isnat(times), np.nan, times.astype(np.int64))
-    t = _rows(name, times, 1, most=math.inf)[:, 0]
+    t = _rows(name, times, 1)[:, 0]
     if len(t) != n:
         raise ValueError(f"{name} must be {n} times, one for each row, got {len(t)}")
     if (stuck := np.flatnonzero(np.diff(t) <= 0)).size:

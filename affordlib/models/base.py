@@ -12,6 +12,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import pairwise
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -62,7 +63,7 @@ def condition_on_primitives(model: EffectModel, actions: Sequence[Primitive]) ->
     if not actions:
         raise ValueError("actions must hold at least one action, got none")
     columns = [ACTION_CHANNELS.index(name) for name in model.action_channels]
-    action = np.stack([one.ends() for one in actions])[..., columns]
+    action = np.stack([one.path((0.0, 1.0)) for one in actions])[..., columns]
     t = torch.tensor([0.0, 1.0]).expand(len(actions), 2)
     return Observations.of(model, action=(t, torch.as_tensor(action, dtype=torch.float32)))
 
@@ -274,6 +275,14 @@ def masked_mean(h: Float[Tensor, "b n c"], mask: Bool[Tensor, "b n"]) -> Float[T
 def gaussian_nll(y: Tensor, mean: Tensor, std: Tensor) -> Tensor:
     """-log N(y; mean, std²), elementwise."""
     return 0.5 * ((y - mean) / std) ** 2 + std.log() + 0.5 * math.log(2 * math.pi)
+
+
+def dense(*widths: int, activation: type[nn.Module] = nn.SiLU) -> list[nn.Module]:
+    """Linear layers of the given widths, with activations between them."""
+    layers: list[nn.Module] = []
+    for n_in, n_out in pairwise(widths):
+        layers += [nn.Linear(n_in, n_out), activation()]
+    return layers[:-1]
 
 
 def he_initialise(module: nn.Module) -> None:

@@ -11,7 +11,7 @@ different times and in different numbers.
 """
 
 from dataclasses import dataclass
-from itertools import pairwise
+from functools import partial
 
 import torch
 import torch.nn.functional as F
@@ -19,7 +19,14 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from affordlib import checked
-from affordlib.models.base import EffectNetwork, NetworkConfig, he_initialise, network, rotate_image
+from affordlib.models.base import (
+    EffectNetwork,
+    NetworkConfig,
+    dense,
+    he_initialise,
+    network,
+    rotate_image,
+)
 from affordlib.types import Observations
 
 ENCODER_WIDTHS = (32, 64, 64, 128, 128, 256, 128)
@@ -40,15 +47,6 @@ class CNPConfig(NetworkConfig):
     leaky_output: bool = False
 
 
-def _dense(widths: tuple[int, ...], activate_last: bool) -> nn.Sequential:
-    layers: list[nn.Module] = []
-    for k, (n_in, n_out) in enumerate(pairwise(widths)):
-        layers.append(nn.Linear(n_in, n_out))
-        if activate_last or k < len(widths) - 2:
-            layers.append(nn.LeakyReLU())
-    return nn.Sequential(*layers)
-
-
 def image_encoder() -> nn.Sequential:
     """Image encoder f: (B, 2, 48, 48) → (B, 16); five convolutions, each halving the image."""
     layers: list[nn.Module] = []
@@ -66,12 +64,13 @@ class AffordanceCNP(EffectNetwork):
         """Create the encoders and decoders described above."""
         n_a, n_e = len(config.action_channels), len(config.effect_channels)
         self.image_encoder = image_encoder()
-        self.action_encoder = _dense((n_a + 1, *ENCODER_WIDTHS), activate_last=True)
-        self.effect_encoder = _dense((n_e + 1, *ENCODER_WIDTHS), activate_last=False)
+        layers = partial(dense, activation=nn.LeakyReLU)
+        self.action_encoder = nn.Sequential(*layers(n_a + 1, *ENCODER_WIDTHS), nn.LeakyReLU())
+        self.effect_encoder = nn.Sequential(*layers(n_e + 1, *ENCODER_WIDTHS))
         self.merge = nn.Linear(ENCODER_WIDTHS[-1] + IMAGE_FEATURES + 1, MERGE_WIDTH)
-        last = config.leaky_output
-        self.action_decoder = _dense((MERGE_WIDTH, *DECODER_WIDTHS, 2 * n_a), last)
-        self.effect_decoder = _dense((MERGE_WIDTH, *DECODER_WIDTHS, 2 * n_e), last)
+        last = [nn.LeakyReLU()] * config.leaky_output
+        self.action_decoder = nn.Sequential(*layers(MERGE_WIDTH, *DECODER_WIDTHS, 2 * n_a), *last)
+        self.effect_decoder = nn.Sequential(*layers(MERGE_WIDTH, *DECODER_WIDTHS, 2 * n_e), *last)
         self.apply(he_initialise)
 
     def features(

@@ -93,7 +93,7 @@ def network_predictions(
 def final_error(record: dict[str, Any]) -> np.ndarray:
     """Error (N,) of the predicted effect at t = 1: of (x, y) [m], or else of z or yaw alone."""
     mean, truth = record["mean"], record["truth"]
-    names = "xy" if "x" in mean else list(mean)[:1]
+    names = "xy" if {"x", "y"} <= {*mean} else list(mean)[:1]
     return np.linalg.norm([np.subtract(mean[name], truth[name]) for name in names], axis=0)
 
 

@@ -12,7 +12,6 @@ visual reasoning with a general conditioning layer, AAAI 2018.
 
 import math
 from dataclasses import dataclass
-from itertools import pairwise
 
 import torch
 import torch.nn.functional as F
@@ -20,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from affordlib import checked
-from affordlib.models.base import EffectNetwork, NetworkConfig, he_initialise, network
+from affordlib.models.base import EffectNetwork, NetworkConfig, dense, he_initialise, network
 from affordlib.types import IMAGE_PIXELS, Observations, check_count
 
 
@@ -107,14 +106,6 @@ def waves(t: Float[Tensor, "b t"], n: int) -> Float[Tensor, "b t w"]:
     """Append sines and cosines of π k t, k = 1 … n, to t: (B, T, 2n + 1)."""
     angle = t[..., None] * (math.pi * torch.arange(1, n + 1, device=t.device))
     return torch.cat([t[..., None], angle.sin(), angle.cos()], dim=-1)
-
-
-def dense(*widths: int) -> list[nn.Module]:
-    """Linear layers of the given widths, with SiLU between them."""
-    layers: list[nn.Module] = []
-    for n_in, n_out in pairwise(widths):
-        layers += [nn.Linear(n_in, n_out), nn.SiLU()]
-    return layers[:-1]
 
 
 @checked

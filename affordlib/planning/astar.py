@@ -15,9 +15,8 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from affordlib.planning.effect_map import EffectMap
+from affordlib.planning.effect_map import EffectMap, make_steps
 from affordlib.planning.problem import PlanningProblem
-from affordlib.planning.rollout import make_steps
 from affordlib.types import Plan, check_array, check_choice, check_count, check_within, on_table
 
 N_DIRECTIONS, MOST_STOPS = 36, 100

@@ -4,11 +4,12 @@ Effects are relative to the object, so they are a surface over two variables: th
 action relative to the object, and the phase at which it stops. The model is queried once, on a
 grid, and cubic B-splines interpolate. Phases before the action can touch an object are not queried,
 as their effect is zero. When the object rotates, the surface rotates with it, so one map serves
-every step of a plan and every node of a search.
+every step of a plan and every node of a search. Chains of actions are rolled out on it.
 """
 
 import base64
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -21,12 +22,12 @@ from scipy.interpolate import NdBSpline
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from affordlib.geometry import rotate, xy_columns
+from affordlib.geometry import rotate, rotated, xy_columns
 from affordlib.models import EffectModel, EffectNetwork, condition_on_primitives
 from affordlib.models.base import rotate_prediction
 from affordlib.perception import outline_of, radius_m
 from affordlib.primitives import Move, Push
-from affordlib.types import CROP_WIDTH_M, IMAGE_CHANNELS, IMAGE_PIXELS, Prediction, check_array
+from affordlib.types import CROP_WIDTH_M, IMAGE_PIXELS, Prediction, Step, check_array
 
 N_DIRECTIONS, N_PHASES = 48, 17
 """Size of the grid on which the model is queried."""
@@ -37,7 +38,7 @@ FINE_DIRECTIONS, FINE_PHASES = 180, 31
 def checked_image(image: np.ndarray) -> torch.Tensor:
     """Convert one depth image (2, 48, 48) to (1, 2, 48, 48); ValueError for any other shape."""
     image = check_array("image", image).astype(np.float32)
-    if image.shape != (len(IMAGE_CHANNELS), IMAGE_PIXELS, IMAGE_PIXELS):
+    if image.shape != (2, IMAGE_PIXELS, IMAGE_PIXELS):
         raise ValueError(
             f"image must have the shape (2, {IMAGE_PIXELS}, {IMAGE_PIXELS}) that "
             f"Tabletop.depth_image() gives, got {image.shape}"
@@ -89,7 +90,8 @@ class EffectMap:
     def grid(self) -> tuple[Tensor, Tensor]:
         """Effects and σ (D, T, 3) at the grid's directions and phases."""
         angles = np.arange(N_DIRECTIONS) * (2 * math.pi / N_DIRECTIONS)
-        t_target = phases_of(self.kind, N_PHASES).float().expand(N_DIRECTIONS, -1)
+        phases = torch.linspace(self.kind.acts_from, 1, N_PHASES, dtype=torch.float64)
+        t_target = phases.float().expand(N_DIRECTIONS, -1)
         effect, std = self.query(angles, t_target)
         # Before contact the true effect is zero: the model's prediction there is an offset.
         return effect - effect[:, :1], std
@@ -138,7 +140,8 @@ class EffectMap:
         """A fine grid's directions and phases, and k-d trees of the positions that result."""
         step = 2 * math.pi / FINE_DIRECTIONS
         angles = torch.arange(FINE_DIRECTIONS, dtype=torch.float64) * step
-        direction, phase = torch.cartesian_prod(angles, phases_of(self.kind, FINE_PHASES)).T
+        phases = torch.linspace(self.kind.acts_from, 1, FINE_PHASES, dtype=torch.float64)
+        direction, phase = torch.cartesian_prod(angles, phases).T
         ends = rotate(self(direction, phase)[0][:, :2], direction)
         full = ends[FINE_PHASES - 1 :: FINE_PHASES]
         return direction, phase, {True: cKDTree(ends), False: cKDTree(full)}
@@ -177,6 +180,87 @@ class EffectMap:
         return tuple(F.pad(value.double(), (0, 3 - len(columns))) for value in both)
 
 
-def phases_of(kind: type[Move], n_phases: int) -> Tensor:
-    """Phases (T,) of a map's grid."""
-    return torch.linspace(kind.acts_from, 1, n_phases, dtype=torch.float64)
+PATH_SAMPLES = 25
+"""Number of points of a step's predicted path, as in Section 4.3."""
+
+
+def roll_out(
+    effects: EffectMap, direction_rad: Tensor, phase: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Positions (B, K, 2) [m], turns (B, K) [rad] and variances (B, K) [m²] after each action.
+
+    direction_rad, phase: (B, K), of chains that start at the origin. The variance is the trace of
+    the position's covariance, to which the rotation's variance adds in later actions.
+    """
+    n, k_max = direction_rad.shape
+    position, turned = direction_rad.new_zeros(n, 2), direction_rad.new_zeros(n)
+    # The trace of the position's covariance, the turn's variance, and the covariance of the two.
+    trace, turn_variance = torch.zeros_like(turned), torch.zeros_like(turned)
+    covariance = torch.zeros_like(position)
+    after = []
+    nearby = torch.tensor([0.0, -0.02, 0.02], dtype=direction_rad.dtype)
+    for k in range(k_max):
+        angle = direction_rad[:, k]
+        effect, std = effects((angle - turned)[:, None] + nearby, phase[:, k, None].expand(n, 3))
+        slope = (effect[:, 1] - effect[:, 2]) / (nearby[2] - nearby[1])  # d effect / d turned
+        effect, added = effect[:, 0], std[:, 0].square()
+        swing = rotate(slope[:, :2], angle)
+        trace = trace + (2 * covariance * swing).sum(dim=-1)
+        trace = trace + turn_variance * swing.square().sum(dim=-1) + added[:, :2].sum(dim=-1)
+        kept = 1 + slope[:, 2]
+        covariance = kept[:, None] * (covariance + turn_variance[:, None] * swing)
+        turn_variance = kept.square() * turn_variance + added[:, 2]
+        position = position + rotate(effect[:, :2], angle)
+        turned = turned + effect[:, 2]
+        after.append((position, turned, trace))
+    positions, turns, variances = (torch.stack(each, dim=1) for each in zip(*after, strict=True))
+    return positions, turns, variances
+
+
+def poses_along(
+    effects: EffectMap, begins: np.ndarray, direction_rad: Tensor, phase: Tensor, n_poses: int
+) -> np.ndarray:
+    """Poses (n, n_poses, 3) of the object in n actions, from poses (n, 3): x, y [m], turn [rad]."""
+    first = effects.kind.acts_from
+    phases = first + (phase - first).clamp_min(0)[:, None] * torch.linspace(0, 1, n_poses)
+    begins = torch.tensor(begins)
+    effect = effects((direction_rad - begins[:, 2])[:, None].expand(phases.shape), phases)[0]
+    moved = rotate(effect[..., :2], direction_rad[:, None])
+    return (begins[:, None] + torch.cat([moved, effect[..., 2:]], dim=-1)).numpy()
+
+
+def make_steps(
+    effects: EffectMap,
+    start_xy_m: Sequence[float],
+    chain: Tensor,
+    predicted: tuple[Tensor, Tensor] | None = None,
+) -> tuple[Step, ...]:
+    """Make steps of a chain (K, 2) of directions [rad] and phases, from a start (x, y) [m].
+
+    predicted: positions (K, 2) and rotations (K,) after each action, relative to the start, if more
+    accurate ones than the map's are known.
+    """
+    if not len(chain):
+        return ()
+    direction, phase = chain.T[:, None]
+    positions, turns, variances = roll_out(effects, direction, phase)
+    ends, turned = predicted or (positions[0], turns[0])
+    ends, turned = np.asarray(start_xy_m) + ends.numpy(), turned.tolist()
+    shares = torch.linspace(0, 1, PATH_SAMPLES, dtype=phase.dtype)
+    relative = direction[0] - torch.tensor([0.0, *turned[:-1]], dtype=phase.dtype)
+    relative, stops = torch.broadcast_tensors(relative[:, None], phase[0, :, None] * shares)
+    paths = effects(relative, stops)[0][..., :2].numpy()
+    steps, position = [], np.asarray(start_xy_m, dtype=float)
+    for k, (angle, stop) in enumerate(chain.tolist()):
+        path, position = position + rotated(paths[k], angle), ends[k]
+        steps.append(
+            Step(
+                effects.kind.towards(angle),
+                stop,
+                tuple(position.tolist()),
+                path,
+                std_m=math.sqrt(variances[0, k]),
+                predicted_turn_rad=turned[k],
+            )
+        )
+    return tuple(steps)

@@ -113,7 +113,8 @@ def candidate_turns(
             k, stop = left[np.where(enough, predicted.std[left, -1], np.inf).argmin()], 1.0
         turned = float(np.interp(stop, phase, predicted.mean[k]))
         primitive = Rotate(predicted.gripper_yaws_rad[k])
-        yield _step_at(xy_m, primitive, stop, predicted_turn_rad=turned)
+        at = tuple(xy_m), np.array([xy_m, xy_m])
+        yield Step(primitive, stop, *at, std_m=0.0, predicted_turn_rad=turned)
         left.remove(k)
 
 
@@ -137,15 +138,8 @@ def candidate_lifts(
         stops = crossings(phase[closed], mean[closed], height_m)
         if not len(stops):
             return
-        yield _step_at(xy_m, primitive, float(stops[0]), predicted_height_m=height_m)
-
-
-def _step_at(
-    xy_m: Sequence[float], primitive: Grasp | Rotate, stop_phase: float, **predicted: float
-) -> Step:
-    """A step that does not change the object's position."""
-    path_xy_m = np.array([xy_m, xy_m])
-    return Step(primitive, stop_phase, tuple(xy_m), path_xy_m, std_m=0.0, **predicted)
+        at = tuple(xy_m), np.array([xy_m, xy_m])
+        yield Step(primitive, float(stops[0]), *at, std_m=0.0, predicted_height_m=height_m)
 
 
 @dataclass(frozen=True)

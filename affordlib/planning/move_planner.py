@@ -10,10 +10,10 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
+from affordlib.planning.effect_map import poses_along
 from affordlib.planning.free_space import N_POSES, FreeSpace
 from affordlib.planning.problem import PlanMode, Planner, PlanningProblem, Reachable
 from affordlib.planning.robot import Robot
-from affordlib.planning.rollout import poses_along
 from affordlib.planning.skills import Skills
 from affordlib.primitives import Drag, Move, Primitive
 from affordlib.types import TABLE_X_M, TABLE_Y_M, Goal, Observation, Plan, Step, on_table

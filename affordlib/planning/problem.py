@@ -8,9 +8,8 @@ from functools import cached_property, partial
 import numpy as np
 import torch
 
-from affordlib.planning.effect_map import EffectMap
+from affordlib.planning.effect_map import EffectMap, poses_along
 from affordlib.planning.free_space import N_POSES, FreeSpace
-from affordlib.planning.rollout import poses_along
 from affordlib.types import (
     Checked,
     Goal,

@@ -301,6 +301,8 @@ class GoalPicker(widgets.HBox):
                 self._plan_pose = (*plan.start_xy_m, self._pose[2])
                 self._news += " New plan." * (done > 0)
                 self._show()
+                if self.scene is not None:
+                    self.scene.mark(self.goal, plan)
                 return self.goal
             done += 1
             left[:] = left[1:]

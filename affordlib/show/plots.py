@@ -211,7 +211,8 @@ def plot_closed_loop(ax: Axes, result: ClosedLoopResult) -> Axes:
     if first.xy_m != goal.xy_m:
         ax.plot(*_cm(first.xy_m), "*", color=GOAL, ms=11, mfc="none", label="first goal", zorder=5)
     ax.plot(*_cm(goal.xy_m), "*", color=GOAL, ms=13, label="goal", zorder=5)
-    at, row, others = np.array(result.seen_xy_m[0]), 0, "moved by others"
+    start = next(iter(result.seen_xy_m), (math.nan, math.nan))  # lost before it was seen
+    at, row, others = np.array(start), 0, "moved by others"
     ax.plot(*_cm(at), "o", color=NEUTRAL, ms=5, label="start")
     for k, (step, path) in enumerate(zip(result.steps, result.object_paths_xy_m, strict=True)):
         if math.dist(path[0], at) > 0.003:

@@ -20,6 +20,7 @@ from PIL import Image
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from affordlib.geometry import circle, extruded
+from affordlib.planning.free_space import corners_of
 from affordlib.show.plots import GOAL, PREDICTION, TRUTH
 from affordlib.types import TABLE_X_M, TABLE_Y_M, Goal, Plan
 from affordlib.world import BASE_X_M, LyingCylinder, Sphere, Tabletop, TabletopObject
@@ -102,10 +103,7 @@ class Scene(widgets.VBox):
             self.plot -= old
         obj, self._marks = self.world.obj, []
         for one in self.world.obstacles.all:
-            corners = np.array(one.corners_m)
-            if one.radius_m:
-                corners = corners + circle(one.radius_m, 48)
-            self._marks.append(self._add(extruded(corners, 0.0, one.height_m), _STONE))
+            self._marks.append(self._add(extruded(corners_of(one), 0.0, one.height_m), _STONE))
         start = yaw = self.world.object_pose()[2]
         if plan is not None and plan.steps:
             yaw += plan.steps[-1].predicted_turn_rad

@@ -37,8 +37,14 @@ from affordlib.types import (
 from affordlib.world import robot
 from affordlib.world.camera import CAMERAS, HIDDEN_M, View, add_scenery, depth_crop
 from affordlib.world.execution import JointController, execute, put_down, unreached
-from affordlib.world.objects import PlacedObject, TabletopObject, WorldConfig, mesh, set_friction
-from affordlib.world.obstacles import PlacedObstacles
+from affordlib.world.objects import (
+    PlacedObject,
+    PlacedObstacles,
+    TabletopObject,
+    WorldConfig,
+    mesh,
+    set_friction,
+)
 from affordlib.world.trajectory import STEP_S, Command, plan_motion, segments_until
 
 OBJECTS_PER_BUILD = 256  # after which the client is rebuilt: Bullet leaks 5 kB per removed object

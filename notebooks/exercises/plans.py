@@ -20,9 +20,9 @@ from affordlib.planning import (
     plan_continuous,
     roll_out,
 )
+from affordlib.planning.effect_map import poses_along
 from affordlib.planning.free_space import ring
 from affordlib.planning.grasp_rotate import predict_trajectories
-from affordlib.planning.rollout import poses_along
 from affordlib.primitives import Grasp, Push
 from affordlib.types import Goal, Observation, Obstacle, Plan, Step
 from affordlib.world import Cuboid, Prism, Tabletop, UprightCylinder

@@ -23,6 +23,7 @@ from affordlib.interactions.collect import attributes_for, collect_chunk
 from affordlib.interactions.collect import collect as collect_set
 from affordlib.interactions.recipes import Recipe
 from affordlib.interactions.store import dataset_sha256, open_interactions, stored_sha256
+from affordlib.world import Cuboid
 from experiments import shipped
 from tests.waiting import printed, start, wait_until
 
@@ -213,6 +214,16 @@ def test_a_worker_that_dies_says_so(undisturbed, tmp_path):
         collect_set(Deadly(**vars(SMALL)), path, 2, progress=False)
     collect_set(SMALL, path, 2, progress=False)
     assert path.read_bytes() == undisturbed.read_bytes()
+
+
+@pytest.mark.slow
+def test_workers_get_the_classes_of_a_user(tmp_path, monkeypatch):
+    monkeypatch.setitem(
+        collect.CATEGORIES, "brick", type("Brick", (Cuboid,), {"category": "brick"})
+    )
+    own = replace(SMALL, categories=("brick",))
+    one, two = (collect_set(own, tmp_path / f"{n}.zarr.zip", n, False) for n in (1, 2))
+    assert one.read_bytes() == two.read_bytes()
 
 
 @pytest.mark.slow

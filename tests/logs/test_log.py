@@ -265,28 +265,9 @@ def test_all_refusals_are_known_after_one_run_by_name():
     again = log.add_all([pushes[5] | {"name": "take 5"}, pushes[6] | {"name": "take 6"}])
     assert [*again] == ["take 5", "take 6"]
     assert "another push has this name" in again["take 6"]
-
-
-def test_a_session_is_split_into_its_pushes():
-    """The tool goes back and around between the pushes, and is at rest at the end of each."""
-    rows, end = [], np.array(START)
-    for _ in range(3):
-        path = rotated(np.stack([np.full(40, 32.0), np.linspace(-9, 14, 40)], axis=1), end[2])
-        path, moved = path + end[:2], rotated(np.array([2.0, 14.0]), end[2])
-        after = end + np.array([*moved, 0.08])
-        share = np.clip((np.arange(40) - 15.65) / 23.35, 0, 1)[:, None]
-        rows += [np.hstack([path, end + share * (after - end)])]
-        rows += [np.hstack([path[-1:].repeat(9, 0), after[None].repeat(9, 0)])]
-        back = np.linspace(path[-1], path[0], 20)
-        rows += [np.hstack([back, after[None].repeat(20, 0)])]
-        end = after
-    session, t = np.vstack(rows), 0.05 * np.arange(3 * 69)
-    log = Log("mm", TRIANGLE_MM)
-    assert not log.add_all(log.split(t, session[:, :2], session[:, 2:], t))
-    data = log.pushes()
-    np.testing.assert_allclose(data.turn_rad, 0.08, atol=1e-9)
-    np.testing.assert_allclose(data.contact_m, [[-0.018, -0.05]] * 3, atol=2e-4)
-    np.testing.assert_allclose(data.length_m, 0.014, atol=2e-4)
+    mixed = shipped_log()
+    assert not mixed.add_all([pushes[0] | {"name": "1"}, *pushes[1:4]])
+    assert mixed.names == ["1", "2", "3", "4"]
 
 
 @pytest.mark.parametrize("up", ["z", "y", "x"])

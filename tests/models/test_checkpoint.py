@@ -12,7 +12,7 @@ from safetensors.torch import save
 from affordlib.interactions import split_interactions
 from affordlib.models import load_checkpoint, save_checkpoint
 from affordlib.models.evaluation import refuse_seen
-from affordlib.planning.reachability import Reachability
+from affordlib.planning.skills import Reachability
 from affordlib.results import repo_root
 from affordlib.weights import read_weights, write_weights
 from experiments.runner import checkpoint_sha256

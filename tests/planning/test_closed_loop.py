@@ -12,7 +12,7 @@ from affordlib.perception import adapt_to_object
 from affordlib.planning import execute_plan, plan_astar, plan_continuous, run_closed_loop
 from affordlib.planning.closed_loop import DISPLACED_M
 from affordlib.planning.grasp_rotate import GRIPPER_YAWS_RAD
-from affordlib.planning.reachability import Reachability
+from affordlib.planning.skills import Reachability
 from affordlib.primitives import Drag, Grasp, Push, Rotate
 from affordlib.types import Goal, Plan, Step, UnreachableError
 from affordlib.world import Cuboid, LyingCylinder, Sphere, UprightCylinder, WorldConfig

@@ -11,9 +11,9 @@ from affordlib import planning
 from affordlib.geometry import unit_vector
 from affordlib.perception import adapt_to_object, outline_of
 from affordlib.planning import corners_of
+from affordlib.planning.effect_map import poses_along
 from affordlib.planning.free_space import FAR_M, N_POSES, START_M, FreeSpace, gaps_m, hand_m, placed
 from affordlib.planning.move_planner import MovePlanner
-from affordlib.planning.rollout import poses_along
 from affordlib.primitives import Drag, Grasp, Push, Rotate, min_jerk
 from affordlib.types import Goal, Observation, Obstacle, Step
 from affordlib.world import Cuboid, Sphere

@@ -14,8 +14,8 @@ from affordlib import planning
 from affordlib.geometry import rotated
 from affordlib.models import load_checkpoint
 from affordlib.planning.astar import HEURISTICS, Branches, BranchTable, search
+from affordlib.planning.effect_map import roll_out
 from affordlib.planning.gradient import Reading, descend
-from affordlib.planning.rollout import roll_out
 from affordlib.primitives import Drag, Push
 from affordlib.types import Goal, Prediction
 from affordlib.world import ROLLABLE, STANDING, Cuboid, UprightCylinder

@@ -7,7 +7,7 @@ import pytest
 
 from affordlib import primitives
 from affordlib.interactions import open_interactions
-from affordlib.planning.reachability import Reachability
+from affordlib.planning.skills import Reachability
 from affordlib.primitives import Drag, Grasp, Push, Rotate
 from experiments.shipped import learn_reachability
 

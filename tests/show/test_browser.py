@@ -327,6 +327,7 @@ def test_a_closed_loop_follows_a_goal_that_moves(page, table):
     assert ask(page, "picker.outcome.distance_m") < 0.01
     goal = ask(page, "picker.goal.xy_m")
     assert goal == pytest.approx((0.1, 0.16), abs=0.0011)
+    assert ask(page, "picker.scene._marks[-1].model_matrix[:2, 3].tolist()") == pytest.approx(goal)
     at = ask(page, "picker.world.object_pose()[:2]")  # also if the shove came after the last action
     wait_until(lambda: np.allclose(table.points(".object").mean(axis=0), at, atol=0.001), 20)
     picture(page, "6_closed_loop")

@@ -13,7 +13,7 @@ import torch
 from affordlib import show
 from affordlib.geometry import rotated, unit_vector
 from affordlib.planning import plan_continuous
-from affordlib.planning.rollout import roll_out
+from affordlib.planning.effect_map import roll_out
 from affordlib.show.table_data import object_data, obstacle_data, table_data
 from affordlib.types import Goal, Obstacle
 from affordlib.world import Cuboid, LyingCylinder, Prism

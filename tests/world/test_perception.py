@@ -7,6 +7,7 @@ import pytest
 
 from affordlib import perception
 from affordlib.primitives import Push
+from affordlib.types import NothingSeenError
 from affordlib.world import (
     CATEGORIES,
     Cuboid,
@@ -104,6 +105,8 @@ def test_turns_are_seen_between_two_images(world, category, camera, n_images, sp
 def test_an_outline_is_found_to_a_fraction_of_a_pixel(world):
     prism = Prism(((0.0, 0.0), (0.07, 0.0), (0.0, 0.08)), 0.05)
     corners = perception.outline_of(_seen(world, prism, yaw=0.0).image)
+    with pytest.raises(NothingSeenError, match="image shows no object"):
+        perception.outline_of(np.zeros((2, 48, 48)))
     assert len(corners) == 3
     off = np.linalg.norm(corners[:, None] - prism.footprint_m, axis=2)
     assert off.min(axis=1).max() < 0.001  # a third of a pixel

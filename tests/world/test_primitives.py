@@ -25,7 +25,6 @@ def test_a_path_is_smooth_and_passes_its_keyframes(primitive):
     assert np.abs(np.diff(path[:, :3], axis=0)).max() * 1000 < 0.75  # m/s
     for segment, begin in zip(primitive.segments, primitive.segment_phases, strict=False):
         np.testing.assert_allclose(primitive.path(begin)[0], segment.start[:5], atol=1e-9)
-    np.testing.assert_allclose(primitive.ends(), path[[0, -1]], atol=1e-12)
     assert sum(segment.seconds for segment in primitive.segments) == pytest.approx(3.75)
 
 
