@@ -17,8 +17,9 @@ from affordlib.models.evaluation import final_errors_m
 from affordlib.models.film import FiLMNetwork
 from affordlib.models.training import train
 from affordlib.types import Observations
+from experiments.published import one_at_a_time
 from experiments.runner import Rows
-from experiments.shipped import CHECKPOINT_SPECS, one_at_a_time
+from experiments.shipped import CHECKPOINT_SPECS
 
 
 def random_contexts(

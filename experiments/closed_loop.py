@@ -94,19 +94,14 @@ class Trial:
             world.settle(AT_REST_S)
 
 
-def category_of(table: str, index: int) -> str:
-    """Category of the object of a trial."""
-    categories = CATEGORIES.get(table, FOUR_CATEGORIES)
-    return categories[index % len(categories)]
-
-
 def sample_trial(table: str, index: int, seed: int = 0, world: str = "clean") -> Trial:
     """Sample trial `index` of a table, a pure function of its arguments, equal in each world."""
     number = list(N_TRIALS).index(check_choice("table", table, N_TRIALS))
     keys = ((first + number, index) for first in (100, 200))
     seeds = (np.random.SeedSequence(2_000_003 + seed, spawn_key=key) for key in keys)
     rng, of_world = map(np.random.default_rng, seeds)
-    obj = category_named(category_of(table, index)).sample(rng)
+    categories = CATEGORIES.get(table, FOUR_CATEGORIES)
+    obj = category_named(categories[index % len(categories)]).sample(rng)
     while ConvexHull(obj.footprint_m).volume < SMALLEST_M2:
         obj = type(obj).sample(rng)
     config = Variation().sample(obj, of_world) if world == "perturbed" else WorldConfig()

@@ -21,7 +21,7 @@ from sklearn.linear_model import LogisticRegression
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
-from affordlib.interactions import split_interactions
+from affordlib.interactions import sample_mixed, split_interactions
 from affordlib.interactions.dataset import valid_interactions
 from affordlib.models.cnp import CNPConfig
 from affordlib.models.film import FiLMConfig
@@ -29,6 +29,7 @@ from affordlib.models.training import train_model
 from affordlib.primitives import Grasp
 from experiments.baselines import BASELINES, about_objects, baseline_predictions, network_record
 from experiments.lever_training import Symmetry, augment_by_symmetry
+from experiments.published import PUBLISHED
 from experiments.runner import Job, open_once
 from experiments.shipped import CHECKPOINT_SPECS, GRASP_SYMMETRIES, HALF_TURNS
 
@@ -68,6 +69,7 @@ NETWORKS = {
     "film": (FiLMConfig, "film_500", "push"),
     "cnp_push_frame": (CNPConfig, "cnp_500", "push"),
     "film_table_frame": (FiLMConfig, "film_500", "table"),
+    "cnp_published": (CNPConfig, "cnp_published", "table"),
 }
 """Networks to compare: their type, the shipped checkpoint with their training, their frame."""
 
@@ -90,7 +92,9 @@ def network_and_training(model: str, data: str, n: int | str = "all") -> tuple[A
     if config is FiLMConfig and n == "all":
         specs = [s for s in CHECKPOINT_SPECS.values() if isinstance(s.network, FiLMConfig)]
         training = next((s.training for s in specs if s.data == data), training)
-    if task.symmetries is not None:
+    if model == "cnp_published":
+        training = replace(PUBLISHED, patience=20)
+    elif task.symmetries is not None:
         steps = training.steps if data.endswith(LARGE) else STEPS_ON_100
         training, frame = replace(training, augment=False, steps=steps), "table"
     effects = task.effect_channels if config is CNPConfig else task.all_effects
@@ -118,8 +122,10 @@ def cross_validate(
     known = interactions, split.train
     if model in NETWORKS:
         config, training = network_and_training(model, data, n)
-        augment = partial(augment_by_symmetry, symmetries=task.symmetries or ())
-        how = replace(training, seed=seed), config, augment, resume_checkpoint
+        sampler = CHECKPOINT_SPECS[NETWORKS[model][1]].sampler
+        symmetries = task.symmetries if sampler is sample_mixed else None
+        augment = partial(augment_by_symmetry, symmetries=symmetries or ())
+        how = replace(training, seed=seed), config, augment, resume_checkpoint, sampler
         network, _ = train_model(interactions, split, *how)
 
     def predicted(test_set: xr.Dataset, rows: np.ndarray) -> dict[str, Any]:

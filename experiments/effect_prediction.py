@@ -134,6 +134,7 @@ COMPARED = (
     (("film", "cnp", "logistic", *NEED_NO_NETWORK), ["grasp_x10"], range(10)),
     (NEED_NO_NETWORK, ["rotate_x10"], range(10)),
     (("film",), ["rotate_x10"], range(3)),
+    (("cnp_published",), ["grasp"], [0]),
 )
 """Models, data sets and folds of the tables."""
 

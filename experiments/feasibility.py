@@ -14,7 +14,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
-from scipy.spatial import cKDTree
+from scipy.spatial import ConvexHull, cKDTree
 
 from affordlib.primitives import HOVER_M, TIP_HEIGHT_M, Drag, Move, Push
 from affordlib.types import TABLE_X_M, TABLE_Y_M
@@ -129,6 +129,4 @@ def on_the_rim(kind: type[Move], half_m: float, start_xy_m: XY, goal_xy_m: XY) -
 
 def half_width_m(footprint_m: np.ndarray) -> float:
     """Return the radius [m] of the circle that has the area of an outline (n, 2)."""
-    x, y = footprint_m.T
-    area = 0.5 * abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1)))
-    return math.sqrt(area / math.pi)
+    return math.sqrt(ConvexHull(footprint_m).volume / math.pi)

@@ -27,6 +27,7 @@ from affordlib.models.lever_up import (
 from affordlib.models.training import TrainingConfig, TrainingRecord, train, untrained
 from experiments.last_pose import CNPAroundMeanConfig, LastPoseConfig
 from experiments.lstm import LSTMConfig
+from experiments.published import PUBLISHED, ConstantRate, one_at_a_time
 
 Symmetry = tuple[int, bool]  # the number of rotations by π/2, and whether y is mirrored first
 
@@ -75,15 +76,18 @@ LEVER_MODELS: dict[str, LeverModel] = {
     "cnp_tuned": LeverModel(
         CNPAroundMeanConfig(**_CHANNELS), replace(TRAINING, learning_rate=2e-3)
     ),
+    "cnp_published": LeverModel(
+        CNPConfig(**_CHANNELS), replace(PUBLISHED, steps=350_000, obs_max=N_OBSERVED), "wide"
+    ),
     "lstm_tuned": LeverModel(
         LSTMConfig(**_CHANNELS, **_IMAGE), replace(TRAINING, learning_rate=2e-3)
     ),
 }
-"""Our network, the paper's (on 48×48 images as in its appendix), the paper's tuned, and the tuned
-recurrent network.
+"""Our network, the paper's (on 48×48 images as in its appendix), the paper's tuned, by its own
+recipe, and the tuned recurrent network.
 
-All train for the same number of steps; those of the paper's network cost three times as much. The
-other learning rates minimise validation error (`SETTINGS` of `experiments/lever_up.py`)."""
+Without the recipe, all train for the same number of steps; those of the paper's network cost three
+times as much. Rates: see `SETTINGS` of `experiments/lever_up.py`."""
 
 
 def sample_windows(
@@ -136,14 +140,18 @@ def fit_lever_model(
 ) -> tuple[EffectNetwork, list[TrainingRecord]]:
     """Train a network, with as many steps as a trajectory has, for one protocol or all of them.
 
-    The training part is joined by its mirror image. Early stopping uses the validation errors of
-    the protocols that it is trained for.
+    The training part is joined by its mirror image, except by the paper's own recipe. Early
+    stopping uses the validation errors of the protocols that it is trained for.
     """
-    training, network = augment_by_symmetry(training, MIRRORED), lever.network
+    network, (sampler, score) = lever.network, TRAINED_FOR[trained_for]
+    if isinstance(lever.training, ConstantRate):
+        sampler = one_at_a_time
+    else:
+        training = augment_by_symmetry(training, MIRRORED)
     if hasattr(network, "steps"):
         network = replace(network, steps=len(training.phase) - 1)
     model = untrained(network, training, lever.training.seed)
-    how = lever.training, resume_checkpoint, *TRAINED_FOR[trained_for]
+    how = lever.training, resume_checkpoint, sampler, score
     return model, train(model, training, validation, *how)
 
 

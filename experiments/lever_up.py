@@ -3,11 +3,10 @@
     python -m experiments.lever_up --only model=lstm_tuned
 
 runs these jobs if they are missing, then makes the tables from all results. The split is by object
-into five folds, 80/10/10 (each interaction has its own object). A job is one training, or one
-baseline, tested in all protocols that it is trained for; errors are distances [cm] between
-predicted and true positions, after steps of 150 ms. A job with a `setting` is tuning: it is scored
-on the validation part of fold 0. An object's errors are averaged over its windows; means, standard
-errors and intervals are over objects.
+into five folds, 80/10/10 (each interaction has its own object). A job is one training,
+tested in all protocols that it is trained for; errors are distances [cm] between predicted and true
+positions, after steps of 150 ms. A job with a `setting` is tuning: it is scored on the validation
+part of fold 0. Means, standard errors and intervals are over objects.
 """
 
 from __future__ import annotations
@@ -21,14 +20,12 @@ import numpy as np
 import pandas as pd
 import torch
 import xarray as xr
-from torch import Tensor
 
 from affordlib.interactions import Split, split_interactions
 from affordlib.interactions.dataset import InteractionTensors, valid_interactions
 from affordlib.models import lever_up as models
 from affordlib.models.base import EffectNetwork
-from affordlib.models.lever_up import N_OBSERVED, N_PREDICTED, PROTOCOLS, lever_up_tensors
-from affordlib.types import Prediction
+from affordlib.models.lever_up import PROTOCOLS, lever_up_tensors
 from experiments import reported, runner
 from experiments.lever_training import (
     LEVER_MODELS,
@@ -43,9 +40,11 @@ NAME, DATA, N_FOLDS = "lever_up", "lever_up", 5
 OURS, SINGLE, RECURRENT = "cnp_last_pose", "cnp_last_pose_single", "lstm_tuned"
 """Our network, the same trained for one protocol at a time, and the recurrent one."""
 
-BASELINES = ("persistence", "constant_velocity")
-MODELS = ("cnp", "cnp_tuned", OURS, SINGLE, RECURRENT, *BASELINES)
-EACH = {"cnp_tuned": ("window",), **dict.fromkeys((SINGLE, RECURRENT), ("window", "first_step"))}
+MODELS = ("cnp", "cnp_published", "cnp_tuned", OURS, SINGLE, RECURRENT)
+EACH = {
+    **dict.fromkeys(("cnp_published", "cnp_tuned"), ("window",)),
+    **dict.fromkeys((SINGLE, RECURRENT), ("window", "first_step")),
+}
 """Networks that are trained for one protocol at a time, and these protocols."""
 
 TESTED = {"all": PROTOCOLS, "window": PROTOCOLS[:1], "first_step": PROTOCOLS[1:]}
@@ -66,10 +65,10 @@ recurrent one, the rate whose two errors, each relative to the best of its proto
 sum."""
 
 
-def lever_model(model: str, setting: str | None = None) -> LeverModel | None:
-    """Return a network of `LEVER_MODELS`, or with a setting; None for baselines."""
-    lever = LEVER_MODELS.get(OURS if model == SINGLE else model)
-    if lever is None or setting is None:
+def lever_model(model: str, setting: str | None = None) -> LeverModel:
+    """Return a network of `LEVER_MODELS`, or with a setting."""
+    lever = LEVER_MODELS[OURS if model == SINGLE else model]
+    if setting is None:
         return lever
     network = lever.network
     if setting.endswith("half the width"):
@@ -97,16 +96,16 @@ def cross_validate(
     """
     data, lever = open_once(DATA), lever_model(model, setting)
     split = lever_split(data, fold)
-    network, result = model, {}
-    if lever:
-        parts = [lever_up_tensors(data, p, lever.view) for p in (split.train, split.validation)]
-        network, _ = fit_lever_model(lever, *parts, trained_for, resume_checkpoint)
-    view = lever.view if lever else "near"
+    training, validation, test = (
+        lever_up_tensors(data, part, lever.view)
+        for part in (split.train, split.validation, split.test)
+    )
+    network, _ = fit_lever_model(lever, training, validation, trained_for, resume_checkpoint)
     if setting is not None:
-        return _tuned(network, lever_up_tensors(data, split.validation, view), trained_for)
-    kept, test = valid_interactions(data, split.test), lever_up_tensors(data, split.test, view)
-    result["interaction"] = data["interaction"].values[kept].tolist()
-    return result | {protocol: _errors(network, test, protocol) for protocol in TESTED[trained_for]}
+        return _tuned(network, validation, trained_for)
+    kept = data["interaction"].values[valid_interactions(data, split.test)]
+    errors = {protocol: _errors(network, test, protocol) for protocol in TESTED[trained_for]}
+    return {"interaction": kept.tolist()} | errors
 
 
 def _tuned(network: EffectNetwork, validation: InteractionTensors, trained_for: str) -> dict:
@@ -118,34 +117,12 @@ def _tuned(network: EffectNetwork, validation: InteractionTensors, trained_for: 
     return row
 
 
-def extrapolate(
-    baseline: str, effect: Tensor, protocol: str, start: int = 0
-) -> tuple[Tensor, Tensor]:
-    """Return a baseline's prediction of poses from effects (N, S, C), and ground truth (N, T, C).
-
-    With only the first step the velocity is unknown, and both baselines predict no motion.
-    """
-    window = protocol == "window"
-    last = start + N_OBSERVED - 1 if window else 0
-    ahead = torch.arange(1, (N_PREDICTED if window else effect.shape[1] - 1) + 1)
-    velocity = torch.zeros_like(effect[:, last])
-    if window and baseline == "constant_velocity":
-        velocity = effect[:, last] - effect[:, last - 1]
-    return effect[:, last, None] + ahead[:, None] * velocity[:, None], effect[:, last + ahead]
-
-
-def _errors(
-    network: EffectNetwork | str, arrays: InteractionTensors, protocol: str
-) -> dict[str, Any]:
-    """Return the errors (N, W, T) [cm] of a network or baseline, rounded to 1 µm, as lists."""
+@torch.no_grad()
+def _errors(network: EffectNetwork, arrays: InteractionTensors, protocol: str) -> dict[str, Any]:
+    """Return the errors (N, W, T) [cm] of a network, rounded to 1 µm, as lists."""
     starts = range(models.n_windows(arrays) if protocol == "window" else 1)
-    if isinstance(network, str):
-        found = [extrapolate(network, arrays.effect, protocol, start) for start in starts]
-        found = [(Prediction(mean, mean, mean, 0 * mean), truth) for mean, truth in found]
-    else:
-        with torch.no_grad():
-            seen = network.encode(arrays.image)
-        found = [models.predict_steps(network, arrays, protocol, start, seen) for start in starts]
+    seen = network.encode(arrays.image)
+    found = [models.predict_steps(network, arrays, protocol, start, seen) for start in starts]
     errors = torch.stack([100 * models.errors_m(given, truth) for given, truth in found], dim=1)
     return {"error_cm": errors.double().numpy().round(4).tolist()}
 
@@ -240,7 +217,8 @@ def _jobs(model: str, *how: Any) -> list[Job]:
 
 
 JOBS = [
-    *(each for model, fold in product(MODELS, range(N_FOLDS)) for each in _jobs(model, fold)),
+    *_jobs("cnp_published"),
+    *(e for m in MODELS if m != "cnp_published" for k in range(N_FOLDS) for e in _jobs(m, k)),
     *(
         each
         for m, s in product(("cnp_tuned", OURS, RECURRENT), SETTINGS)
@@ -248,7 +226,6 @@ JOBS = [
         for each in _jobs(m, 0, s)
     ),
 ]
-
 
 main = runner.command_of(NAME, __doc__, lambda: JOBS, tables)
 

@@ -520,7 +520,8 @@ def sigma_rows(records: dict[str, Rows]) -> Rows:
     a calibrated, round Gaussian.
     """
     rows: Rows = []
-    for name in [n for n in ("continuous", "continuous_film_500") if n in records]:
+    weights = (name for name in records if name.startswith("RISK_WEIGHT"))
+    for name in [n for n in ("continuous", "continuous_film_500", *weights) if n in records]:
         plans = pd.DataFrame(records[name]).query("object_class in @STANDING")
         plans = plans[(plans.steps == plans.actions) & (plans.steps > 0)]
         for steps, some in plans.groupby("steps"):

@@ -39,10 +39,10 @@ from affordlib.models.checkpoint import SUFFIX, save_checkpoint
 from affordlib.models.lever_up import lever_up_tensors
 from affordlib.models.training import Sampler, TrainingConfig, about_training, train_model
 from affordlib.planning import MODES
-from affordlib.planning.reachability import REACHABILITY, Reachability, reach_features
+from affordlib.planning.skills import REACHABILITY, Reachability, reach_features
 from affordlib.primitives import move_for
 from affordlib.results import repo_root, write_atomically
-from affordlib.types import Goal, Observations
+from affordlib.types import Goal
 from affordlib.world import ROLLABLE, STANDING, Tabletop, WorldConfig
 from experiments.commands import command, worker_type
 from experiments.lever_training import (
@@ -53,6 +53,7 @@ from experiments.lever_training import (
     fit_lever_model,
 )
 from experiments.lstm import LSTMConfig
+from experiments.published import PUBLISHED, ConstantRate, one_at_a_time
 from experiments.tasks import (
     FROZEN,
     MIN_DISTANCE_M,
@@ -85,35 +86,6 @@ def sample_forward(
     return Batch.of(tensors, condition_on_recorded_action(tensors), target_at)
 
 
-def one_at_a_time(
-    arrays: InteractionTensors, n_targets: int, obs_max: int, generator: torch.Generator
-) -> Batch:
-    """Sample as in the paper: one trajectory and one target; n_targets is not used.
-
-    Action and effect are observed at the same k phases, k uniform in 1 … obs_max; w₁ is 1, 0 or
-    uniform in [0, 1] (1/3 each).
-    """
-
-    def draw(high, n=1):
-        return torch.randint(high, (n,), generator=generator)
-
-    part, last = arrays.select(draw(len(arrays))), len(arrays.phase)
-    draw(1)  # keeps the random numbers of the trainings that were made
-    at, target_at = draw(last, 1 + int(draw(obs_max))), draw(last)
-    kind, weight = int(draw(3)), torch.rand(1, generator=generator)
-    weight = weight if kind == 2 else torch.tensor([float(kind)])
-    observed = Observations.of(part, part.action_at(at), part.effect_at(at), weight)
-    return Batch.of(part, observed, target_at)
-
-
-@dataclass(frozen=True)
-class ConstantRate(TrainingConfig):
-    """Training whose learning rate does not change."""
-
-    def rate(self, step: int) -> float:
-        return self.learning_rate
-
-
 @dataclass(frozen=True)
 class CheckpointSpec:
     """The definition of a shipped checkpoint: its data set, network and training.
@@ -132,9 +104,6 @@ _PUSH_FRAME = TrainingConfig(
     steps=4000, n_targets=8, patience=99, beta=0.5, weight_decay=0.1, final_sigma_floor=0.005,
     ema=0.99,
 )  # fmt: skip
-_PUBLISHED = ConstantRate(
-    10**6, 1, 1, learning_rate=1e-4, augment=False, validate_every=5000, patience=40
-)
 _TABLE_FRAME = replace(_PUSH_FRAME, augment=False)
 _LONG = replace(_PUSH_FRAME, steps=16000)
 _YAW = FiLMConfig(effect_channels=("x", "y", "yaw"))
@@ -147,7 +116,7 @@ GRASP_SYMMETRIES: tuple[Symmetry, ...] = (*HALF_TURNS, (0, True), (2, True))
 
 CHECKPOINT_SPECS: dict[str, CheckpointSpec] = {
     "cnp_500": CheckpointSpec("push", CNPConfig(), TrainingConfig(steps=5000, patience=20)),
-    "cnp_published": CheckpointSpec("push", CNPConfig(), _PUBLISHED, sampler=one_at_a_time),
+    "cnp_published": CheckpointSpec("push", CNPConfig(), PUBLISHED, sampler=one_at_a_time),
     "film_500": CheckpointSpec("push", _YAW, _PUSH_FRAME),
     "film_5000": CheckpointSpec("push_x10", _YAW, _LONG),
     "film_5000_perturbed": CheckpointSpec("push_varied_x10", _YAW, _LONG),
@@ -168,11 +137,8 @@ VALIDATION_GOALS = {"multi_partial": 40}
 REACH_STEPS, REACH_RATE = 1500, 1e-2
 
 TOLERANCE_M = 0.00005
-"""Largest median distance [m] between the final positions of two collections of the same set.
-
-On the machine that made the sets, collections agree bit for bit. Without NumPy's vector
-instructions, as on another processor, the final positions of 150 pushes differed by 0.0005 mm
-(median), and a few objects tipped over in another direction."""
+"""Largest median distance [m] between the final positions of two collections of the same set, on
+other processors, too (see *Known limits* in data/README.md)."""
 
 
 def compare(old: xr.Dataset, new: xr.Dataset) -> tuple[bool, str]:

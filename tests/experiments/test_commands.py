@@ -41,6 +41,19 @@ def test_every_command_line_ends_in_this_way():
         assert not re.search(r"(?m)^(?!@command\().*\ndef main\(argv", path.read_text()), path
 
 
+def test_the_texts_name_commands_and_options_that_exist():
+    root, makefile = repo_root(), (repo_root() / "Makefile").read_text()
+    modules = {p.stem: p.read_text() for p in root.glob("experiments/**/*.py")} | {"try_it": ""}
+    for path in [*root.glob("*.md"), *root.glob("data/*.md"), *root.glob("notebooks/**/*.ipynb")]:
+        text = path.read_text()
+        for name in re.findall(r"[A-Z]+(?==)", " ".join(re.findall(r"make [a-z-]+ [^`\n]*", text))):
+            assert re.search(rf"^{name} +=", makefile, re.MULTILINE), (path, name)
+        for module, rest in re.findall(r"(?:experiments\.|#[-\w]+\) \| `)(\w+)([^`\n]*)", text):
+            assert module in modules, (path, module)
+            for option in re.findall(r"--\w+", rest):
+                assert f'"{option}"' in "".join(modules.values()), (path, option)
+
+
 @pytest.mark.parametrize(
     ("how", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (None, 1), (0, 7)]
 )

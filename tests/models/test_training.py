@@ -14,7 +14,7 @@ from affordlib.interactions.dataset import condition_on_recorded_action
 from affordlib.models.evaluation import final_errors_m
 from affordlib.planning import EffectMap
 from experiments.baselines import constant
-from experiments.shipped import one_at_a_time
+from experiments.published import one_at_a_time
 
 
 def fresh(arrays):
