@@ -520,8 +520,8 @@ def sigma_rows(records: dict[str, Rows]) -> Rows:
     a calibrated, round Gaussian.
     """
     rows: Rows = []
-    weights = (name for name in records if name.startswith("RISK_WEIGHT"))
-    for name in [n for n in ("continuous", "continuous_film_500", *weights) if n in records]:
+    ours = "continuous", "continuous_film_500"
+    for name in [n for n in records if n in ours or n.startswith("RISK_WEIGHT")]:
         plans = pd.DataFrame(records[name]).query("object_class in @STANDING")
         plans = plans[(plans.steps == plans.actions) & (plans.steps > 0)]
         for steps, some in plans.groupby("steps"):
