@@ -21,9 +21,8 @@ def test_answers_are_those_of_the_model_itself(trained, held_out_pushes):
     torch.testing.assert_close(torch.tensor(final_error(found)).float(), expected)
     short = network_predictions(trained, held_out_pushes, some)
     np.testing.assert_allclose(final_error(short), final_error(found), atol=1e-7)
-    along = {part: {"x": short[part]["x"]} for part in ("mean", "truth")}
-    off = np.subtract(along["mean"]["x"], along["truth"]["x"])
-    assert final_error(along) == pytest.approx(np.abs(off))
+    one = {part: {"x": short[part]["x"]} for part in ("mean", "truth")}
+    assert final_error(one) == pytest.approx(np.abs(np.subtract(*[v["x"] for v in one.values()])))
     assert found["interaction"] == some.tolist()
     assert (np.array(found["trajectory_error"]) < final_error(found)).mean() > 0.5
 

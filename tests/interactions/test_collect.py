@@ -218,9 +218,8 @@ def test_a_worker_that_dies_says_so(undisturbed, tmp_path):
 
 @pytest.mark.slow
 def test_workers_get_the_classes_of_a_user(tmp_path, monkeypatch):
-    monkeypatch.setitem(
-        collect.CATEGORIES, "brick", type("Brick", (Cuboid,), {"category": "brick"})
-    )
+    brick = type("Brick", (Cuboid,), {"category": "brick"})
+    monkeypatch.setitem(collect.CATEGORIES, "brick", brick)
     own = replace(SMALL, categories=("brick",))
     one, two = (collect_set(own, tmp_path / f"{n}.zarr.zip", n, False) for n in (1, 2))
     assert one.read_bytes() == two.read_bytes()

@@ -384,6 +384,8 @@ def test_everything_can_be_pressed_without_a_mouse(page, table):
 
 def test_the_browser_plans_while_the_hand_drags(page, table):
     button(page, "Start over").click()
+    back = "max(map(abs, map(float.__sub__, picker._plan_pose, picker._first_pose))) < 1e-6"
+    wait_until(lambda: ask(page, f"{back} and not (picker._stale or picker._running)"))
     table.wait_for_answer()
     before = ask(page, "list(picker.plan.goal.xy_m)")
     page.mouse.move(*table.at(*table.goal()))
