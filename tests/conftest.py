@@ -1,5 +1,6 @@
 """Shared fixtures, and the order of the test files."""
 
+import shutil
 from collections import Counter
 
 import numpy as np
@@ -44,6 +45,18 @@ def world(one_world):
     one_world.config, one_world.on_step = WorldConfig(), None
     one_world.reset()
     return one_world
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """Headless Chromium."""
+    from playwright.sync_api import sync_playwright
+
+    flags = ["--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"]
+    if (path := shutil.which("chromium")) is None:
+        pytest.skip("no Chromium: apt-get install chromium")
+    with sync_playwright() as playwright:
+        yield playwright.chromium.launch(executable_path=path, args=flags)
 
 
 @pytest.fixture(scope="session")

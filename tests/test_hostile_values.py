@@ -130,115 +130,77 @@ def shop(one_world, skills, pushes, tmp_path_factory):
     pursuit = planning.run_closed_loop(one_world, goal, skills, config=once)
     figure, (_, ax) = plt.figure(), plt.subplots()
     rows = read_results("data/results/planning.json")["tables"]["summary"][:3]
-    by_name = {
-        "obj": BOX,
-        "xy_m at_xy_m start_xy_m": AT,
-        "contact": (0.0, -0.03),
-        "path_xy_m": np.array([[-0.1, 0.0], [0.0, 0.0]]),
-        "corners outline": CORNERS,
-        "outline_m": np.array(CORNERS),
-        "length width height diameter height_m": 0.05,
+    numbers = {
         "theta contact_x contact_y dy_m": 0.0,
+        "length width height diameter height_m": 0.05,
         "dx_m reach direction_rad direction": 0.1,
-        "yaw_rad": 0.3,
         "stop_phase phase level": 0.5,
-        "n": 20,
-        "max_steps": 2,
-        "partial": True,
-        "rgb": (0.0, 0.5, 1.0),
-        "unit": "m",
-        "action primitive": Push(0.0),
-        "actions": [Push(0.0)],
-        "step": step,
-        "plan": plan,
-        "problem": problem,
-        "planners": {"A*": planning.plan_astar},
-        "skills": skills,
-        "robot world": one_world,
-        "result": pursuit,
-        "outcome": Outcome(plan, 0.01, (0.04, 0.02, 0.0), (path,)),
-        "image": image,
-        "data": pushes,
-        "interactions": np.arange(2),
-        "split": interactions.Split(*np.split(np.arange(30), (12, 24))),
-        "training validation tensors": arrays,
-        "action_channels effect_channels": ("x", "y"),
-        "scaler": scaler,
-        "config": config,
-        "model": model,
-        "truth mean std": torch.ones(4),
-        "about": models.load_checkpoint("cnp_500")[1],
-        "seen": seen,
-        "ax": ax,
-        "figure": figure,
-        "folder out_dir": folder,
-        "notebook": "x",
-        "parameters tables": {},
-        "rows": rows,
-        "attempt": None,
-        "effects": effects,
-        "generator": torch.Generator().manual_seed(0),
-        "obstacles": (wall,),
-        "obstacle": wall,
         "n_directions n_targets obs_max n_poses": 4,
     }
-    by_callable = {
-        **fields_of(step, plan, problem, scaler, domain, arrays, Recipe(), Variation(), few),
-        **fields_of(models.FiLMConfig(), interactions.split_interactions(20), batch),
-        "place": {"config": None},
-        "Tabletop": {"config": world.WorldConfig()},
-        "picture": {"width": 32, "height": 32},
-        "settle": {"seconds": 0.1},
-        "primitive_named": {"name": "push"},
-        "category_named": {"name": "cuboid"},
-        "save_figure": {"name": "x"},
-        "check": {"name": "01.1"},
-        "load_checkpoint": {"name_or_path": "cnp_500"},
-        "open_interactions": {"name_or_path": "push_test"},
+    numbers |= {"yaw_rad": 0.3, "n": 20, "max_steps": 2, "partial": True}
+    places = {"xy_m at_xy_m start_xy_m": AT, "contact": (0.0, -0.03), "corners outline": CORNERS}
+    places |= {"outline_m": np.array(CORNERS), "path_xy_m": np.array([[-0.1, 0.0], [0.0, 0.0]])}
+    planned = {"action primitive": Push(0.0), "actions": [Push(0.0)], "step": step, "plan": plan}
+    planned |= {"problem": problem, "planners": {"A*": planning.plan_astar}, "effects": effects}
+    planned |= {"result": pursuit, "outcome": Outcome(plan, 0.01, (0.04, 0.02, 0.0), (path,))}
+    real = {"obj": BOX, "robot world": one_world, "image": image, "seen": seen, "attempt": None}
+    real |= {"obstacles": (wall,), "obstacle": wall}
+    learned = {"data": pushes, "interactions": np.arange(2), "training validation tensors": arrays}
+    learned |= {"split": interactions.Split(*np.split(np.arange(30), (12, 24))), "scaler": scaler}
+    learned |= {"action_channels effect_channels": ("x", "y"), "truth mean std": torch.ones(4)}
+    learned |= {"skills": skills, "model": model, "about": models.load_checkpoint("cnp_500")[1]}
+    learned |= {"config": config, "generator": torch.Generator().manual_seed(0)}
+    shown = {"ax": ax, "figure": figure, "rgb": (0.0, 0.5, 1.0), "unit": "m", "notebook": "x"}
+    shown |= {"folder out_dir": folder, "parameters tables": {}, "rows": rows}
+    by_name = numbers | places | planned | real | learned | shown
+    by_callable = fields_of(step, plan, problem, scaler, domain, arrays, Recipe(), Variation(), few)
+    by_callable |= fields_of(models.FiLMConfig(), interactions.split_interactions(20), batch)
+    names = {"primitive_named": "push", "category_named": "cuboid", "save_figure": "x"}
+    names |= {"check": "01.1"}
+    by_callable |= {each: {"name": name} for each, name in names.items()}
+    by_callable["load_checkpoint"] = {"name_or_path": "cnp_500"}
+    for each in ("open_interactions", "stored_sha256"):
+        by_callable[each] = {"name_or_path": "push_test"}
+    for each in ("condition_on_primitives", "fit_sigma_scale", "final_errors_m"):
+        by_callable[each] = {"model": network}
+    by_callable |= {"plan_gradient": {"samples": 10}, "plan_astar": {"stop_phases": (0.5, 1.0)}}
+    by_callable |= {"Grasp": {"seen_height": 0.05}, "PushAt": {"length": 0.01}}
+    by_callable |= {"GoalPicker": {"view": False}, "settle": {"seconds": 0.1}}
+    by_callable |= {"place": {"config": None}, "Tabletop": {"config": world.WorldConfig()}}
+    by_callable |= {"picture": {"width": 32, "height": 32}, "Skills": {"models": {"push": model}}}
+    by_callable |= {"FiLMNetwork": {"config": models.FiLMConfig()}, "refuse_seen": {"data": test}}
+    by_callable |= {"search": {"table": planning.BranchTable(effects, 4)}}
+    by_callable |= {"train": {"model": network, "config": few}, "fit": {"data": log, "model": "np"}}
+    by_callable |= {
+        "planar": {"values": ((0.0,) * 6 + (1.0,),)},
+        "Log.centroid_pose": {"pose": (0.0,) * 3},
+        "make_steps": {"chain": torch.tensor([[0.3, 0.8]])},
+        "conditioning_explorer": {"seen": executed},
         "read_results": {"path": "data/results/planning.json"},
-        "refuse_seen": {"data": test},
         "collect": {"recipe": Recipe(n_interactions=1), "path": folder / "one.zarr.zip"}
         | {"progress": False},
         "Log.add": {"poses": ((0.0,) * 3, (0.02, 0.0, 0.0)), "poses_t": (0.0, 1.0)}
         | {"tool_t": (0.0, 1.0), "tool_xy": ((-0.1, 0.0), AT), "context": {"support": "felt"}},
         "Log.query": {"tool_xy": ((-0.1, 0.0), AT), "context": {}},
-        "Log.centroid_pose": {"pose": (0.0,) * 3},
-        "fit": {"data": log, "model": "np"},
         "cross_validate": {"data": log, "models": (), "folds": 2},
         "PushPlanner.plan": {"pose": (0.0,) * 3, "goal": Goal((0.01, 0.0)), "n_pushes": 1},
         "PushPlanner": {"model": Still(), "obj": logs.PushedObject(np.array(CORNERS))},
-        "planar": {"values": ((0.0,) * 6 + (1.0,),)},
         "PushedObject": {"lengths_m": (0.01, 0.02), "context": {}},
         "save_model": {"model": still, "path": folder / "still.safetensors"},
         "load_model": {"path": logs.save_model(still, folder / "constant.safetensors")},
         "summary": {"errors": logs.cross_validate(log, (), 2), "by": ("model",)},
-        "FiLMNetwork": {"config": models.FiLMConfig()},
-        "train": {"model": network, "config": few},
         "train_model": {"config": few, "model_config": config},
-        "condition_on_primitives": {"model": network},
-        "fit_sigma_scale": {"model": network},
-        "final_errors_m": {"model": network},
         "save_checkpoint": {"model": network, "path": folder / "net.safetensors", "about": {}},
-        "Skills": {"models": {"push": model}},
-        "plan_astar": {"stop_phases": (0.5, 1.0)},
-        "plan_gradient": {"samples": 10},
         "run_closed_loop": {"config": once, "goal": Goal(AT, 0.05)},
-        "GoalPicker": {"view": False},
         "about_training": {"seen": np.arange(2), "config": few},
         "condition_on_final_effect": {"model": network, "effect": arrays.effect[:, -1]},
         "condition_on_poses": {"start": torch.zeros(12, dtype=torch.int64)},
         "descend": {"target_xy_m": np.array([0.05, 0.02]), "generator": np.random.default_rng(0)},
         "final_error": {"record": models.network_predictions(model, pushes, np.arange(2))},
         "gaps_m": {"obstacles": [corners_of(wall)], "shapes": np.array([[CORNERS, CORNERS]])},
-        "make_steps": {"chain": torch.tensor([[0.3, 0.8]])},
         "placed": {"corners": np.array(CORNERS), "poses": np.zeros((2, 3))},
         "plot_flow": {"boxes": {"a": (0, 0, "k"), "b": (1, 1, "k")}, "arrows": [("a", "b")]},
         "roll_out": {"direction_rad": torch.zeros(3, 1), "phase": torch.ones(3, 1)},
-        "search": {"table": planning.BranchTable(effects, 4)},
-        "stored_sha256": {"name_or_path": "push_test"},
-        "conditioning_explorer": {"seen": executed},
-        "Grasp": {"seen_height": 0.05},
-        "PushAt": {"length": 0.01},
     }
     return {k: v for names, v in by_name.items() for k in names.split()}, by_callable
 

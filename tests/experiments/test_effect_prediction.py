@@ -1,14 +1,29 @@
-"""Cross-validation trains the models of its jobs, and tables agree with their results."""
+"""Effect prediction: errors, baselines, novelty, cross-validation and its tables."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
+import torch
 
+from affordlib.interactions import InteractionTensors
+from affordlib.models import (
+    EffectModel,
+    condition_on_primitives,
+    final_error,
+    final_errors_m,
+    network_predictions,
+)
+from affordlib.primitives import Push
+from affordlib.world import Prism
 from experiments import cross_validation
 from experiments import effect_prediction as tables
-from experiments.cross_validation import job, network_and_training
+from experiments.baselines import constant, gaussian_process, nearest, network_record
+from experiments.cross_validation import add_errors, job, network_and_training
 from experiments.effect_prediction import confusion_columns
+from experiments.novelty import NOVELTY_GAIN, NoveltyAware, novelty_of
 
 
 def test_what_decides_a_training_decides_whether_its_result_is_stale(monkeypatch):
@@ -51,3 +66,72 @@ def test_shares_are_of_the_true_successes_and_failures():
     assert ends == pytest.approx([49.02, 94.33], abs=0.01)  # Wilson's, of eight of ten
     none = confusion_columns(np.array([True]), np.array([True]))
     assert none["tn_percent"] is none["tn_low_percent"] is None
+
+
+def test_answers_are_those_of_the_model_itself(trained, held_out_pushes):
+    some = np.arange(5)
+    found = network_record(trained, held_out_pushes, some)
+    arrays = InteractionTensors.from_dataset(held_out_pushes, some)
+    expected = final_errors_m(trained, arrays)
+    torch.testing.assert_close(torch.tensor(final_error(found)).float(), expected)
+    short = network_predictions(trained, held_out_pushes, some)
+    np.testing.assert_allclose(final_error(short), final_error(found), atol=1e-7)
+    one = {part: {"x": short[part]["x"]} for part in ("mean", "truth")}
+    assert final_error(one) == pytest.approx(np.abs(np.subtract(*[v["x"] for v in one.values()])))
+    assert found["interaction"] == some.tolist()
+    assert (np.array(found["trajectory_error"]) < final_error(found)).mean() > 0.5
+
+
+def test_a_turn_is_measured_the_short_way_round():
+    found = pd.DataFrame({"truth_yaw": [3.1, 0.2], "mean_yaw": [-3.1, 0.1]})
+    add_errors(found, "rotate")
+    np.testing.assert_allclose(found["yaw_error"], [2 * math.pi - 6.2, 0.1])
+
+
+def test_baselines_know_the_direction_and_recover_a_law_of_size():
+    generator = torch.Generator().manual_seed(0)
+    theta, size = (torch.rand(60, generator=generator) for _ in range(2))
+    theta = 2 * math.pi * theta
+    out = torch.stack([theta.cos(), theta.sin()], dim=-1)
+    action = torch.stack([-0.2 * out, 0.05 * out], dim=1)
+    effect = torch.stack([0 * out, (0.05 + 0.02 * size[:, None]) * out], dim=1)
+    phase, image = torch.tensor([0.0, 1.0]), torch.zeros(60, 2, 4, 4)
+    arrays = InteractionTensors(image, phase, action, effect, ("x", "y"), ("x", "y"))
+    train, test, at = arrays.select(slice(0, 40)), arrays.select(slice(40, 60)), torch.tensor([1])
+    known, queried = 3 * size[:40, None], 3 * size[40:, None]
+    off = {}
+    for baseline in (constant, nearest, gaussian_process):
+        mean, std = baseline(train, test, at, known, queried)
+        off[baseline] = float((mean[:, 0] - test.effect[:, 1]).norm(dim=-1).mean())
+        assert mean.shape == std.shape == (20, 1, 2)
+    length = 0.05 + 0.02 * size
+    expected = (length[40:] - length[:40].mean()).abs().mean()
+    assert off[constant] == pytest.approx(float(expected), rel=1e-4)
+    assert off[nearest] < off[constant] / 5
+    assert off[gaussian_process] < off[constant] / 20
+
+
+HOUSE = Prism(((-0.03, -0.03), (0.03, -0.03), (0.03, 0.01), (0.0, 0.04), (-0.03, 0.01)), 0.05)
+
+
+def test_a_house_is_new_and_its_sigma_grows(film, held_out_pushes, pushes, world):
+    novelty = novelty_of("film_500")
+    tests = novelty(InteractionTensors.from_dataset(held_out_pushes).image)
+    assert 0.96 < (tests < 1).double().mean() < 0.999
+    world.place(HOUSE, (0.0, 0.0), 0.3)
+    house = torch.from_numpy(np.array(world.depth_image()))[None]
+    rotated = torch.cat([torch.rot90(house, k, (-2, -1)) for k in range(4)])
+    both = novelty(torch.cat([rotated, rotated.flip(-1)]))
+    assert both[0] > 10
+    assert torch.allclose(both, both[:1].expand(8), rtol=1e-2)
+    aware, t = NoveltyAware(film, novelty), torch.tensor([[0.3, 1.0]])
+    assert isinstance(aware, EffectModel)
+    seen = torch.from_numpy(pushes["image"].values[:500])
+    seen = seen[novelty(seen) < 0.9][:1]
+    given = condition_on_primitives(film, [Push.towards(0.0)])
+    for image, root in ((seen, 0.0), (house, (both[0] - 1).sqrt())):
+        plain, wider = (m.predict(m.encode(image), given, t) for m in (film, aware))
+        moved = plain.effect_mean[..., :2].norm(dim=-1, keepdim=True)
+        grown = torch.hypot(plain.effect_std[..., :2], NOVELTY_GAIN * root * moved)
+        assert torch.equal(plain.effect_mean, wider.effect_mean)
+        assert torch.allclose(wider.effect_std[..., :2], grown, rtol=1e-4)

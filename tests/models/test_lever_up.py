@@ -1,15 +1,33 @@
-"""Lever-ups: tensors in the frame of the lever, information available to models."""
+"""Lever-ups: tensors in the frame of the lever, sampling, what models see, shipped checkpoints."""
 
+import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
-from affordlib.interactions import Scaler
+from affordlib.interactions import Scaler, open_interactions
 from affordlib.interactions.dataset import condition_on_poses
-from affordlib.models import build
-from affordlib.models.lever_up import N_OBSERVED, PROTOCOLS, predict_steps
-from experiments.lever_training import LEVER_MODELS, fit_lever_model, from_start_errors_m
+from affordlib.models import build, load_checkpoint
+from affordlib.models.lever_up import (
+    N_OBSERVED,
+    N_PREDICTED,
+    PROTOCOLS,
+    lever_up_tensors,
+    n_windows,
+    predict_steps,
+    window_errors_m,
+)
+from experiments.lever_training import (
+    LEVER_CHECKPOINTS,
+    LEVER_MODELS,
+    fit_lever_model,
+    from_start_errors_m,
+    sample_from_start,
+    sample_windows,
+)
+from experiments.lever_up import lever_split
 
 
 def made(name, levered):
@@ -64,3 +82,55 @@ def test_training_learns(levered, name, kind):
     moves = levered.effect[:, 1:, :3].norm(dim=-1).mean()
     assert from_start_errors_m(model, levered).mean() < moves / 3
     assert len(history) == 2
+
+
+def test_arrays_are_in_the_frame_of_the_lever(levers, levered):
+    assert levered.effect.shape == (len(levered), 26, 4)
+    assert levered.effect[:, 0].abs().max() == 0
+    # Rotation preserves lengths, and objects move in the direction of the lever.
+    kept = ~levers["fault"].values
+    raw = levers["effect"].values[kept][:, ::12]
+    moved_m = np.hypot(raw[..., 0], raw[..., 1])
+    np.testing.assert_allclose(levered.effect[..., :2].norm(dim=-1), moved_m, atol=1e-6)
+    assert levered.effect[:, -1, 0].min() > 0.02
+    # The blade comes from behind the contact, slides 12 mm under, and never leaves its plane.
+    assert levered.action[:, 0, 0].numpy() == pytest.approx(-0.03, abs=1e-5)
+    assert levered.action[:, 7, 0].numpy() == pytest.approx(0.012, abs=1e-4)
+    assert (levered.action[:, -1, 1] > 0.1 * math.sin(math.radians(65))).any()
+
+
+def test_no_view_cuts_an_object_off(levers, levered):
+    wide, full = lever_up_tensors(levers, view="wide").image, torch.from_numpy(levers.image.values)
+    assert full.shape[-1] == 128
+    assert levered.image.shape[-1] == wide.shape[-1] == 48
+    area = full[:, 1].sum(dim=(1, 2)) / 128**2
+    torch.testing.assert_close(4 * levered.image[:, 1].sum(dim=(1, 2)), full[:, 1].sum(dim=(1, 2)))
+    torch.testing.assert_close(wide[:, 1].mean(dim=(1, 2)), area, rtol=0.02, atol=0)
+    with pytest.raises(ValueError, match="view must be one of"):
+        lever_up_tensors(levers, view="far")
+
+
+def test_windows_are_fifteen_steps_and_the_next_five(levered):
+    generator = torch.Generator().manual_seed(0)
+    assert n_windows(levered) == 7
+    batch = sample_windows(levered, N_PREDICTED, N_OBSERVED, generator)
+    seen = (batch.observations.effect_t * 25).round()
+    assert (seen.diff(dim=1) == 1).all()
+    assert {int(s) for s in seen[:, 0]} == set(range(7))
+    torch.testing.assert_close((batch.t_target[:, 0] * 25).round(), seen[:, -1] + 1)
+    assert batch.observations.effect_mask.all()
+    batches = [sample_from_start(levered, 0, 0, generator) for _ in range(20)]
+    assert {bool(b.observations.effect_mask.any()) for b in batches} == {True, False}
+
+
+@pytest.mark.parametrize("name", LEVER_CHECKPOINTS)
+def test_shipped_checkpoints_predict_what_they_have_not_seen(name):
+    whole = open_interactions("lever_up")
+    model, about = load_checkpoint(name)
+    split = lever_split(whole)
+    assert not set(about["seen_interactions"]) & set(split.test)
+    few = lever_up_tensors(whole, split.test[:60], about["view"])
+    if about["trained_for"] != "first_step":
+        assert 100 * window_errors_m(model, few).mean() < 0.3
+    if about["trained_for"] != "window":
+        assert 100 * from_start_errors_m(model, few).mean() < 0.4
