@@ -33,7 +33,10 @@ def pytest_xdist_make_scheduler(config, log):
     return _ByFile(config, log) if config.getvalue("dist") == "loadfile" else None
 
 
-@pytest.fixture(scope="session")
+once = pytest.fixture(scope="session")
+
+
+@once
 def one_world():
     with Tabletop() as tabletop:
         yield tabletop
@@ -45,6 +48,15 @@ def world(one_world):
     one_world.config, one_world.on_step = WorldConfig(), None
     one_world.reset()
     return one_world
+
+
+pushes = once(lambda: open_interactions("push"))
+held_out_pushes = once(lambda: open_interactions("push_test"))
+levers = once(lambda: open_interactions("lever_up").isel(interaction=slice(0, 48)).load())
+levered = once(lambda levers: lever_up_tensors(levers))
+trained = once(lambda: load_checkpoint("cnp_500")[0])
+film = once(lambda: load_checkpoint("film_500")[0])
+skills = once(lambda: Skills.load())
 
 
 @pytest.fixture(scope="module")
@@ -59,11 +71,6 @@ def browser():
         yield playwright.chromium.launch(executable_path=path, args=flags)
 
 
-@pytest.fixture(scope="session")
-def pushes():
-    return open_interactions("push")
-
-
 @pytest.fixture
 def untrained():
     torch.manual_seed(0)
@@ -71,45 +78,14 @@ def untrained():
     return AffordanceCNP(CNPConfig(), scaler).eval()
 
 
-@pytest.fixture(scope="session")
-def trained():
-    return load_checkpoint("cnp_500")[0]
-
-
-@pytest.fixture(scope="session")
-def film():
-    return load_checkpoint("film_500")[0]
-
-
-@pytest.fixture(scope="session")
-def skills():
-    return Skills.load()
-
-
-@pytest.fixture(scope="session")
+@once
 def cuboid_image(one_world):
     one_world.place(Cuboid(0.06, 0.05, 0.05), (0.0, 0.0), 0.3, config=WorldConfig())
     return np.array(one_world.depth_image())
 
 
-@pytest.fixture(scope="session")
-def held_out_pushes():
-    return open_interactions("push_test")
-
-
-@pytest.fixture(scope="session")
+@once
 def some(pushes):
     """Forty pushes with the yaw of action and effect."""
     channels = ("x", "y", "yaw")
     return InteractionTensors.from_dataset(pushes, np.arange(40), channels, channels)
-
-
-@pytest.fixture(scope="session")
-def levers():
-    return open_interactions("lever_up").isel(interaction=slice(0, 48)).load()
-
-
-@pytest.fixture(scope="session")
-def levered(levers):
-    """48 lever-ups in the frame of the lever."""
-    return lever_up_tensors(levers)

@@ -22,15 +22,14 @@ BESIDE = "logs"
 """A part that knows none of the others, and that none of them knows."""
 USE_WORLD = {"recipes", "collect"}
 """The modules of `interactions` that know the world."""
+PAGES = sorted((ROOT / "notebooks").rglob("*.ipynb"))
 
 
 def name_of(path):
-    """Import name of a module."""
     return ".".join(path.with_suffix("").parts).removesuffix(".__init__")
 
 
 def imported(path):
-    """Modules and names that a module imports."""
     names = set()
     tree = ast.Module([n for n in TREES[path].body if not isinstance(n, ast.If)], [])  # not types
     for node in ast.walk(tree):
@@ -79,9 +78,6 @@ def test_no_function_has_too_many_parameters():
 
 def test_only_the_world_knows_pybullet():
     assert {p.parts[1] for p in MODULES if "pybullet" in imported(p)} == {"world"}
-
-
-PAGES = sorted((ROOT / "notebooks").rglob("*.ipynb"))
 
 
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)

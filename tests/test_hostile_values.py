@@ -1,9 +1,11 @@
-"""Public callables with any input: an error that names the argument, or a sane result."""
+"""Any input to public callables, any text in a file: an error that names it, or a sane result."""
 
 import dataclasses
 import decimal
 import fractions
 import inspect
+import io
+import json
 import math
 import os
 import random
@@ -11,24 +13,36 @@ import re
 import struct
 import time
 from pathlib import Path
+from xml.etree import ElementTree
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import torch
+from matplotlib.figure import Figure
+from nbconvert.filters.markdown_mistune import markdown2html_mistune
 
-from affordlib import interactions, logs, models, planning, show, world
+from affordlib import interactions, logs, models, planning, results, show, world
 from affordlib.interactions.collect import collect
 from affordlib.interactions.dataset import sample_mixed
 from affordlib.interactions.recipes import Recipe, Variation
+from affordlib.interactions.store import write_interactions
+from affordlib.logs.cross_validate import forecast_errors
 from affordlib.logs.fit import EFFORT
+from affordlib.logs.neural_process import load_neural_process
+from affordlib.models.evaluation import network_predictions, refuse_seen
 from affordlib.planning import corners_of
+from affordlib.planning.skills import Reachability
 from affordlib.primitives import Drag, Grasp, LeverUp, Push, PushAt, Rotate, primitive_named
 from affordlib.results import read_results, repo_root, results_table, write_results
+from affordlib.show.picker_controls import words_as_html
 from affordlib.types import Goal, Obstacle, Outcome, Plan, Step, UnreachableError, check_array
+from affordlib.weights import read_weights, resolve_checkpoint, write_weights
 from affordlib.world.camera import View
 from exercises import check
-from tests.problems import Still
+from experiments import tasks
+from experiments.tables import markdown_table
+from tests.planning.point_robot import Still
 
 LIMIT_S, N_VALUES = 5.0, 60
 NUMBERS = (math.nan, math.inf, -math.inf, 10**400, -1, 0, 1, 2.5, 1e300, 1e-300, -0.0, 10**6, True)
@@ -44,6 +58,8 @@ OBJECTS = (None, object(), lambda: None, 1j)
 OBJECTS += (decimal.Decimal("0.05"), fractions.Fraction(1, 20), int)
 OURS = (Goal((0.1, 0.0)), Push(0.0), world.Cuboid(0.06, 0.05, 0.05), planning.PlanMode(1, True))
 FIXED = (*NUMBERS, *WORDS, *SHIPPED, *ARRAYS, *OBJECTS, *OURS, *HEAPS)
+MARKUP = "<img src=x onerror=alert(1)>'\"</div><script>[a](javascript:alert(1))![a](//x/y)a|b&lt;"
+TEXTS = {"short": f"{MARKUP}$\\frac$\x1b]0;mine\x07\u202egpj.exe\x00\n", "long": "x" * 100_000}
 
 
 def hostile(rng):
@@ -91,7 +107,6 @@ NAMES = sorted({*CALLABLES, *OF_THE_WORLD.split(), "kind_for"} - {*MADE_BY_DRIVE
 
 
 def log_of_eight(**about):
-    """The same push eight times."""
     log = logs.Log("m", CORNERS)
     for _ in range(8):
         log.add((0, 1), ((-0.1, 0), (0, 0)), ((0, 0, 0), (0.0163, 0, 0)), **about)
@@ -290,3 +305,136 @@ def test_what_holds_no_numbers_is_named():
     for wrong in ([[1.0], [1.0, 2.0]], [1j, 2.0], ["a", "b"], [None, 1.0], learned):
         with pytest.raises(ValueError, match="outline must be finite numbers of shape"):
             check_array("outline", wrong, 2)
+
+
+def planted(value, text):
+    """Copies of JSON values, in each of which another text, or name, is replaced by `text`."""
+    if isinstance(value, str):
+        yield text
+    elif isinstance(value, dict):
+        for name in value:
+            yield {text if n == name else n: v for n, v in value.items()}
+            yield from (value | {name: new} for new in planted(value[name], text))
+    elif isinstance(value, list | tuple):
+        for k, old in enumerate(value[:2]):
+            yield from ([*value[:k], new, *value[k + 1 :]] for new in planted(old, text))
+
+
+def of_results(path, _):
+    def shown(new):
+        path.write_text(json.dumps(new))
+        for rows in results.read_results(path)["tables"].values():
+            table, page = results.results_table(rows), markdown2html_mistune(markdown_table(rows))
+            assert "".join([*table.columns, *table.to_numpy().flat]).isprintable()
+            assert {*re.findall(r"<(\w+)", page)} == {"table", "thead", "tbody", "tr", "th", "td"}
+            yield table.to_html()
+            results.results_table(rows, ["speed"])
+
+    tables = {"t": [{"planner": "a", "mean_m": 0.1}]}
+    return {"notebook": "a", "parameters": {"x": "y"}, "versions": {}, "tables": tables}, shown
+
+
+def of_weights(path, source, shown):
+    tensors, about = read_weights(source, "")
+    return about, lambda new: shown(write_weights(path, tensors, new))
+
+
+def picked(fixture, *skills):
+    """What the goal picker says and sends to the page."""
+    fixture("world").place(BOX)
+    planners, skills = {"A*": planning.plan_astar}, planning.Skills(*skills)
+    picker = show.GoalPicker(fixture("world"), skills, planners, view=False)
+    yield picker.controls.words.value
+    yield str([getattr(picker._view, name) for name in ("object", "scene", "table")])
+
+
+def of_a_network(path, fixture):
+    about, known = models.load_checkpoint("cnp_500")[1], fixture("pushes")
+
+    def shown(file):
+        model, read = models.load_checkpoint(file)
+        yield from picked(fixture, {"push": model}) if read == about else ()
+        refuse_seen(read, known, np.arange(5))
+
+    return of_weights(path, models.save_checkpoint(fixture("untrained"), path, about), shown)
+
+
+def of_reachability(path, fixture):
+    known, source = {"push": fixture("trained")}, Reachability(("push", "drag")).save(path)
+    return of_weights(path, source, lambda file: picked(fixture, known, Reachability.load(file)))
+
+
+def of_a_neural_process(path, _):
+    source = resolve_checkpoint("np_simulated_pushes")
+    return of_weights(path, source, lambda file: [str(load_neural_process(file))])
+
+
+def of_a_model_of_pushes(path, _):
+    def shown(file):
+        model = logs.load_model(file)
+        yield forecast_errors(model, model.data).to_html()
+        logs.PushedObject.of(model.data)
+
+    source = logs.save_model(logs.fit(log_of_eight(), "constant"), path)
+    return of_weights(path, source, shown)
+
+
+def of_a_log(*_):
+    about = {"group": "a", "context": {"support": "felt"}, "name": "1"}
+    return about, lambda new: [str(log_of_eight(**{k: v for k, v in new.items() if k in about}))]
+
+
+def of_a_data_set(path, fixture):
+    path, known = path.with_suffix(".zarr.zip"), fixture("pushes").isel(interaction=slice(6)).load()
+    (model, about), category = models.load_checkpoint("cnp_500"), known["category"].attrs
+
+    def shown(new):
+        data = known.copy(deep=True)
+        data["category"].attrs = {k: new[k] for k in category if k in new}
+        text = {k: json.dumps(v) for k, v in new.items() if (k, type(v)) == ("recipe", dict)}
+        data.attrs = new | text  # a file holds a recipe as text
+        write_interactions(data, path, 1)
+        read = interactions.open_interactions(path)
+        yield read._repr_html_()
+        yield words_as_html(str(network_predictions(model, read, np.arange(4))["category"]))
+        refuse_seen(about, read, np.arange(2))
+
+    return known.attrs | category | {"recipe": json.loads(known.attrs["recipe"])}, shown
+
+
+def of_goals(path, fixture):
+    def shown(new):
+        path.write_text(tasks.sealed(path.stem, json.dumps(new)))
+        fixture("monkeypatch").setitem(tasks.FROZEN, "clean", path)
+        yield str(tasks.frozen_tasks())
+
+    return {"tasks": [tasks.frozen_tasks("perturbed")[0].to_json()]}, shown
+
+
+KINDS = (of_results, of_a_network, of_reachability, of_a_neural_process, of_a_model_of_pushes)
+
+
+@pytest.mark.parametrize("text", TEXTS)
+@pytest.mark.parametrize("kind", [*KINDS, of_a_log, of_a_data_set, of_goals])
+def test_a_hostile_text_in_a_file_is_refused_or_shown_as_text(kind, text, tmp_path, request):
+    content, shown = kind(tmp_path / "file.safetensors", request.getfixturevalue)
+    for new in planted(content, TEXTS[text]):
+        said = ""
+        try:
+            for words in shown(new):
+                assert "<img src" not in words
+        except ValueError as error:
+            said = str(error)
+        assert said.isprintable()
+        assert len(said) < 1500
+        words = words_as_html(f"**{said or TEXTS[text][:999]}**")
+        assert set(re.findall(r"<\w+", words)) == {"<div", "<b"}
+        ElementTree.fromstring(words)  # one element, well formed
+
+
+@pytest.mark.parametrize("text", TEXTS.values())
+def test_a_picture_takes_any_name(text):
+    plan, ax = Plan(Goal((0.1, 0)), (0, 0), (), text[:999], True, 0.0), Figure().subplots()
+    show.plot_outcome(ax, Outcome(plan, 0.0, (0.1, 0.0, 0.0)))
+    ax.figure.savefig(io.BytesIO())
+    assert ax.get_title(loc="left").startswith(text[:999])

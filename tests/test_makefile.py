@@ -33,12 +33,12 @@ elif sys.argv[1:3] == ["-m", "venv"]:
     time.sleep(0.3)
     python.write_text(pathlib.Path(__file__).read_text())
     python.chmod(0o755)
-elif (here / "no_network").exists():
-    print("The conflict is caused by: no network")
-    sys.exit("no")
 """
-INSTALLED = ["-m pip", "-m pip"]
+ROOT, INSTALLED = repo_root(), ["-m pip", "-m pip"]
+book = pytest.fixture(lambda tmp_path: Book(tmp_path))
 pytestmark = pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
+OPTIONS = "SEED=3", "ARGS=02_second.n=7"
+RUN = "reader-seed3"
 
 
 @pytest.fixture
@@ -47,7 +47,7 @@ def project(tmp_path):
     here, commands = tmp_path / "a project", tmp_path / "bin"  # with a blank in its name
     here.mkdir()
     commands.mkdir()
-    shutil.copy(repo_root() / "Makefile", here)
+    shutil.copy(ROOT / "Makefile", here)
     for name in ("requirements.txt", "constraints.txt", "pyproject.toml"):
         (here / name).touch()
 
@@ -130,20 +130,19 @@ def test_options_are_words_and_zero_means_no(project):
 
 def test_all_packages_install_on_the_oldest_python_that_is_promised():
     oldest = "3.11.2"  # of Debian 12, as README says
-    assert oldest in (repo_root() / "README.md").read_text("utf-8")
+    assert oldest in (ROOT / "README.md").read_text("utf-8")
     for package in importlib.metadata.distributions():
         wanted = package.metadata.get("Requires-Python") or ""
         assert SpecifierSet(wanted).contains(oldest), f"{package.name} needs Python {wanted}"
 
 
 def test_uv_reads_the_same_constraints():
-    lines = (repo_root() / "constraints.txt").read_text("utf-8").splitlines()
+    lines = (ROOT / "constraints.txt").read_text("utf-8").splitlines()
     held = [line for line in lines if line and not line.startswith("#")]
-    uv = tomllib.loads((repo_root() / "pyproject.toml").read_text("utf-8"))["tool"]["uv"]
+    uv = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["uv"]
     assert uv["constraint-dependencies"] == held, "run `make constraints`"
 
 
-ROOT = repo_root()
 PARAMETERS = "seed: int = 0  # of all\nout_dir: str = 'runs/lab'  # for results\nn: int = 2  # a\n"
 # A page of these books writes its results by hand, to spare the import of pandas.
 WRITE = """\
@@ -209,11 +208,6 @@ class Book:
         return [p for p in psutil.process_iter(["cwd"]) if (p.info["cwd"] or "").startswith(here)]
 
 
-@pytest.fixture
-def book(tmp_path):
-    return Book(tmp_path)
-
-
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     """A book of two pages, run once, on a machine where another kernel has our name."""
@@ -226,10 +220,6 @@ def finished(tmp_path_factory):
     (kernel / "kernel.json").write_text(json.dumps(wrong))
     more = {"JUPYTER_PATH": str(book.root / "jupyter"), "PYTHONIOENCODING": "ascii", "LC_ALL": "C"}
     return book, book.make(*OPTIONS, HOME="/nowhere", **more)
-
-
-OPTIONS = "SEED=3", "ARGS=02_second.n=7"
-RUN = "reader-seed3"
 
 
 def test_a_run_leaves_copies_and_results_with_their_parameters(finished):

@@ -30,6 +30,7 @@ ABSOLUTE = re.compile(
 )
 
 READERS_DASK = {"REQUIRE_ENCRYPTION": "true", "DEFAULT_SCHEME": "tls"}  # no page may fail with it
+conf = pytest.fixture(lambda: runpy.run_path(f"{ROOT}/notebooks/book_html/conf.py"), scope="module")
 
 each_notebook = pytest.mark.parametrize("name", list(PATHS))
 
@@ -277,11 +278,6 @@ def test_the_same_route_fails_on_a_broken_notebook(tmp_path):
     assert "2 failed, 2 passed" in done.stdout
     assert "assert total == 3" in done.stdout
     assert "mismatch 'stdout'" in done.stdout
-
-
-@pytest.fixture(scope="module")
-def conf():
-    return runpy.run_path(str(repo_root() / "notebooks" / "book_html" / "conf.py"))
 
 
 def test_a_picture_is_described_by_its_caption_also_after_jupyterlab_has_saved_the_page(conf):

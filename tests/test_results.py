@@ -22,6 +22,10 @@ ROWS = [
     {"planner": "astar", "n": 30, "mean_m": 0.00441, "plan_ms_median": 12.345, "tp_percent": 80.0},
     {"planner": "gradient", "n": 30, "mean_m": None, "plan_ms_median": 1.0, "tp_percent": 99.96},
 ]
+SHOWN = [("p95_m", 0.0123456, "p95, mm", "12.35"), ("theta_rad", math.pi / 2, "theta, °", "90.0")]
+SHOWN += [("error_mm", -0.001, "error, mm", "0.00"), ("closed_loop", False, "closed loop", "no")]
+SHOWN += [("loss", 0.123456, "loss", "0.123"), ("loss", -999.7, "loss", "-1000")]
+SHOWN += [("note", "two\nlines", "note", "two lines"), ("m", 3, "m", "3")]
 
 
 def test_round_trip_converts_numpy_scalars(tmp_path):
@@ -147,19 +151,7 @@ def test_tables_show_units_and_few_digits():
     assert table.to_numpy().tolist() == [["astar", "4.41"], ["gradient", "–"]]
 
 
-@pytest.mark.parametrize(
-    ("column", "value", "head", "shown"),
-    [
-        ("p95_m", 0.0123456, "p95, mm", "12.35"),
-        ("theta_rad", math.pi / 2, "theta, °", "90.0"),
-        ("error_mm", -0.001, "error, mm", "0.00"),
-        ("loss", 0.123456, "loss", "0.123"),
-        ("loss", -999.7, "loss", "-1000"),
-        ("note", "two\nlines", "note", "two lines"),
-        ("closed_loop", False, "closed loop", "no"),
-        ("m", 3, "m", "3"),
-    ],
-)
+@pytest.mark.parametrize(("column", "value", "head", "shown"), SHOWN)
 def test_units_come_from_the_name(column, value, head, shown):
     assert (results.heading(column), results.cell(column, value)) == (head, shown)
 

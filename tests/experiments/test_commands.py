@@ -20,6 +20,8 @@ from experiments.commands import command
 from experiments.runner import Job, frame, read, run
 
 TABLE, SHIPPED = "experiments.effect_prediction", "experiments.shipped data"
+CALLS, DEADLY = [], set()
+TABLES = ("effect_prediction", "lever_up", "planning", "closed_loop", "real_pushes", "headline")
 
 
 @pytest.mark.parametrize(
@@ -87,9 +89,6 @@ def test_a_command_ends_with_a_status_and_one_line(capsys, how, code):
     assert capsys.readouterr().err == expected.get(code, f"\ntest_commands: {line}\n")
 
 
-CALLS = []
-
-
 def squares(n, resume_checkpoint=None):
     """Rows of squares; killed once between its two halves if `n` is among the deadly."""
     CALLS.append(n)
@@ -97,9 +96,6 @@ def squares(n, resume_checkpoint=None):
         resume_checkpoint.write_text("half")
         raise KeyboardInterrupt
     return {"rows": [{"k": k, "square": k * k / 3} for k in range(n)]}
-
-
-DEADLY = set()
 
 
 def job(n, **change):
@@ -135,22 +131,17 @@ class Settings:
     device: str = "cpu"
 
 
-@pytest.mark.parametrize(
-    ("change", "named"),
-    [
-        ({"version": 2}, "version"),
-        ({"settings": Settings(rate=0.2)}, "settings"),
-        ({"settings": (Settings(), "more")}, "settings"),
-        ({"data": ("drag",)}, "data"),
-        ({"checkpoints": ("cnp_500",)}, "checkpoints"),
-    ],
-)
-def test_what_was_made_of_something_else_is_refused_and_made_again(tmp_path, change, named):
+CHANGES = [("version", 2), ("settings", Settings(rate=0.2)), ("settings", (Settings(), "more"))]
+CHANGES += [("data", ("drag",)), ("checkpoints", ("cnp_500",))]
+
+
+@pytest.mark.parametrize(("named", "value"), CHANGES)
+def test_what_was_made_of_something_else_is_refused_and_made_again(tmp_path, named, value):
     def before(n):
         return job(n, settings=Settings())
 
     def now(n):
-        return replace(before(n), **change)
+        return replace(before(n), **{named: value})
 
     first = run([before(2)], "table", folder=tmp_path)
     with pytest.raises(ValueError, match=f"table: the result of {{'n': 2}} .* another {named}"):
@@ -184,9 +175,6 @@ def test_damaged_results_are_named_and_none_are_no_results(tmp_path):
         with pytest.raises(ValueError, match=r"table\.jsonl\.gz is damaged"):
             run([job(2)], "table", tmp_path)
         assert path.read_bytes() == content
-
-
-TABLES = ("effect_prediction", "lever_up", "planning", "closed_loop", "real_pushes", "headline")
 
 
 @pytest.mark.slow

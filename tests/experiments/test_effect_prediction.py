@@ -1,4 +1,4 @@
-"""Effect prediction: errors, baselines, novelty, cross-validation and its tables."""
+"""Effect prediction: errors, baselines, novelty, cross-validation and its tables, ablations."""
 
 import math
 from dataclasses import replace
@@ -8,22 +8,18 @@ import pandas as pd
 import pytest
 import torch
 
+from affordlib import models
 from affordlib.interactions import InteractionTensors
-from affordlib.models import (
-    EffectModel,
-    condition_on_primitives,
-    final_error,
-    final_errors_m,
-    network_predictions,
-)
+from affordlib.interactions.dataset import sample_mixed
 from affordlib.primitives import Push
 from affordlib.world import Prism
-from experiments import cross_validation
+from experiments import ablation, cross_validation, studies
 from experiments import effect_prediction as tables
 from experiments.baselines import constant, gaussian_process, nearest, network_record
 from experiments.cross_validation import add_errors, job, network_and_training
-from experiments.effect_prediction import confusion_columns
 from experiments.novelty import NOVELTY_GAIN, NoveltyAware, novelty_of
+
+HOUSE = Prism(((-0.03, -0.03), (0.03, -0.03), (0.03, 0.01), (0.0, 0.04), (-0.03, 0.01)), 0.05)
 
 
 def test_what_decides_a_training_decides_whether_its_result_is_stale(monkeypatch):
@@ -59,12 +55,12 @@ def test_a_fold_may_lack_a_category():
 
 def test_shares_are_of_the_true_successes_and_failures():
     lifted = np.array([True] * 4 + [False] * 2)
-    row = confusion_columns(np.array([True, True, True, False, False, True]), lifted)
+    row = tables.confusion_columns(np.array([True, True, True, False, False, True]), lifted)
     assert [row[f"{k}_percent"] for k in ("tp", "tn")] == [75, 50]
-    eight = confusion_columns(np.arange(10) < 8, np.ones(10, bool))
+    eight = tables.confusion_columns(np.arange(10) < 8, np.ones(10, bool))
     ends = [eight[f"tp_{end}_percent"] for end in ("low", "high")]
     assert ends == pytest.approx([49.02, 94.33], abs=0.01)  # Wilson's, of eight of ten
-    none = confusion_columns(np.array([True]), np.array([True]))
+    none = tables.confusion_columns(np.array([True]), np.array([True]))
     assert none["tn_percent"] is none["tn_low_percent"] is None
 
 
@@ -72,14 +68,15 @@ def test_answers_are_those_of_the_model_itself(trained, held_out_pushes):
     some = np.arange(5)
     found = network_record(trained, held_out_pushes, some)
     arrays = InteractionTensors.from_dataset(held_out_pushes, some)
-    expected = final_errors_m(trained, arrays)
-    torch.testing.assert_close(torch.tensor(final_error(found)).float(), expected)
-    short = network_predictions(trained, held_out_pushes, some)
-    np.testing.assert_allclose(final_error(short), final_error(found), atol=1e-7)
+    expected = models.final_errors_m(trained, arrays)
+    torch.testing.assert_close(torch.tensor(models.final_error(found)).float(), expected)
+    short = models.network_predictions(trained, held_out_pushes, some)
+    np.testing.assert_allclose(models.final_error(short), models.final_error(found), atol=1e-7)
     one = {part: {"x": short[part]["x"]} for part in ("mean", "truth")}
-    assert final_error(one) == pytest.approx(np.abs(np.subtract(*[v["x"] for v in one.values()])))
+    off = np.subtract(*[v["x"] for v in one.values()])
+    assert models.final_error(one) == pytest.approx(np.abs(off))
     assert found["interaction"] == some.tolist()
-    assert (np.array(found["trajectory_error"]) < final_error(found)).mean() > 0.5
+    assert (np.array(found["trajectory_error"]) < models.final_error(found)).mean() > 0.5
 
 
 def test_a_turn_is_measured_the_short_way_round():
@@ -111,9 +108,6 @@ def test_baselines_know_the_direction_and_recover_a_law_of_size():
     assert off[gaussian_process] < off[constant] / 20
 
 
-HOUSE = Prism(((-0.03, -0.03), (0.03, -0.03), (0.03, 0.01), (0.0, 0.04), (-0.03, 0.01)), 0.05)
-
-
 def test_a_house_is_new_and_its_sigma_grows(film, held_out_pushes, pushes, world):
     novelty = novelty_of("film_500")
     tests = novelty(InteractionTensors.from_dataset(held_out_pushes).image)
@@ -125,13 +119,57 @@ def test_a_house_is_new_and_its_sigma_grows(film, held_out_pushes, pushes, world
     assert both[0] > 10
     assert torch.allclose(both, both[:1].expand(8), rtol=1e-2)
     aware, t = NoveltyAware(film, novelty), torch.tensor([[0.3, 1.0]])
-    assert isinstance(aware, EffectModel)
+    assert isinstance(aware, models.EffectModel)
     seen = torch.from_numpy(pushes["image"].values[:500])
     seen = seen[novelty(seen) < 0.9][:1]
-    given = condition_on_primitives(film, [Push.towards(0.0)])
+    given = models.condition_on_primitives(film, [Push.towards(0.0)])
     for image, root in ((seen, 0.0), (house, (both[0] - 1).sqrt())):
         plain, wider = (m.predict(m.encode(image), given, t) for m in (film, aware))
         moved = plain.effect_mean[..., :2].norm(dim=-1, keepdim=True)
         grown = torch.hypot(plain.effect_std[..., :2], NOVELTY_GAIN * root * moved)
         assert torch.equal(plain.effect_mean, wider.effect_mean)
         assert torch.allclose(wider.effect_std[..., :2], grown, rtol=1e-4)
+
+
+def test_random_contexts_are_of_any_phase(pushes):
+    arrays, firsts = InteractionTensors.from_dataset(pushes, np.arange(80)), []
+    for draw in (sample_mixed, ablation.random_contexts):
+        seen = draw(arrays, 4, 6, torch.Generator().manual_seed(0)).observations
+        firsts.append((seen.action_t[:, 0] == 0).float().mean())
+    assert firsts[0] > 0.3
+    assert firsts[1] < 0.1
+    at = (seen.action_t * (len(arrays.phase) - 1)).round().long()
+    assert torch.equal(seen.action, arrays.action[torch.arange(80)[:, None], at])
+
+
+def test_changes_of_an_ablation_add_up(monkeypatch):
+    made = []
+
+    def remember(model, training, validation, config, sampler):
+        made.append((model, config, sampler))
+
+    monkeypatch.setattr(ablation, "train", remember)
+    ablation.ablated(tuple(ablation.LADDER), 10)
+    ablation.ablated(("contexts at the ends",), 10)
+    (bare, config, draw), (ours, usual, loose) = made
+    assert draw is ablation.one_at_a_time  # which draws at random moments, too
+    assert (config.augment, config.beta, config.ema) == (False, 0.0, 0.0)
+    assert (bare.config.frame, bare.scaler.action_scale) == ("table", (1.0, 1.0))
+    assert not any(p.requires_grad for b in bare.blocks for p in b.modulation.parameters())
+    assert loose is ablation.random_contexts
+    assert usual.augment
+    assert (usual.beta, ours.config.frame) == (0.5, "push")
+    assert ours.scaler.action_scale < (0.5, 0.5)
+    first = [next(m for m in net.image_encoder if hasattr(m, "weight")) for net in (bare, ours)]
+    assert not torch.equal(first[0].weight, first[1].weight)
+
+
+def test_networks_of_whole_actions_foresee_what_broken_off_ones_do():
+    rows = studies.partial_execution()
+    assert {row["model"] for row in rows} == set(studies.WHOLE_ACTION_MODELS)
+    late = [row for row in rows if row["from_phase"] >= 0.55]
+    assert min(row["n"] for row in late) > 10
+    assert max(row["whole_median_m"] for row in late) < 0.001
+    assert all(row["slid_mean_m"] > 0 for row in late)
+    before = [row["whole_mean_m"] for row in rows if row["from_phase"] == 0.0]
+    assert max(before) < 1e-4  # before contact

@@ -1,4 +1,4 @@
-"""Tables of planning and of the closed loop: rows, planners, trials, the kinematic oracle."""
+"""Tables of planning and of the closed loop: rows, planners, trials, and models of the reach."""
 
 import json
 import math
@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 import torch
 
+from affordlib import primitives
+from affordlib.interactions import open_interactions
 from affordlib.planning import MODES
-from affordlib.primitives import Drag, Push
+from affordlib.planning.skills import Reachability
+from affordlib.primitives import Drag, Grasp, Push, Rotate
 from affordlib.results import repo_root
 from affordlib.world import ROLLABLE, STANDING, Cuboid, UprightCylinder, WorldConfig
 from experiments import closed_loop, obstacles, planning, shipped, speed, tasks
@@ -17,7 +20,12 @@ from experiments.closed_loop import N_TRIALS, run_trial, sample_trial
 from experiments.feasibility import is_feasible, on_the_rim, possible
 from experiments.field_baselines import FRONT_M, MechanicsMap
 from experiments.planning import CONFIGS, attempt
+from experiments.shipped import learn_reachability
 from experiments.tasks import FROZEN, PlanningTask, frozen_tasks, tasks_sha256
+
+KINDS = {"push": Push.towards, "drag": Drag.towards}
+KINDS |= {"grasp": lambda _: Grasp(), "rotate": lambda _: Rotate()}
+learned = pytest.fixture(lambda: learn_reachability(open_interactions("reach")), scope="module")
 
 
 def test_mechanics_push_a_disc_ahead_and_turn_a_box_until_both_fingers_lie_on_a_face(world, film):
@@ -195,3 +203,48 @@ def test_an_open_loop_trial_measures_what_is_missing(monkeypatch):
     idle = run_trial("height", 0, world="open_loop")
     assert abs(idle["height_error_m"]) == pytest.approx(trial.goal.height_m, abs=1e-4)
     assert idle["distance_m"] == pytest.approx(np.hypot(*trial.goal.xy_m), abs=1e-4)
+
+
+def test_it_agrees_with_kinematics_on_places_it_has_not_seen(learned, world):
+    rng = np.random.default_rng(5)
+    right = {True: [], False: []}
+    for name, make in KINDS.items():
+        for _ in range(250):
+            xy, angle = rng.uniform([-0.42, -0.62], [0.62, 0.62]), rng.uniform(-math.pi, math.pi)
+            truth = world.can_reach(make(angle), 1.0, xy)
+            direction = angle if name in ("push", "drag") else None
+            said = learned.probability(name, xy, direction)[0] > 0.5
+            right[truth].append(said == truth)
+    assert np.mean(right[True] + right[False]) >= 0.97
+    assert 1 - np.mean(right[False]) < 0.15  # false 'reachable'
+    assert len(right[False]) > 60
+
+
+def test_the_shipped_one_was_learned_so(learned, tmp_path):
+    """Rounding differs between processors, without consequences."""
+    shipped = Reachability.load()
+    rng = np.random.default_rng(6)
+    places = rng.uniform([-0.42, -0.62], [0.62, 0.62], (4000, 2))
+    angles = rng.uniform(-math.pi, math.pi, 4000)
+    for name in KINDS:
+        turn = angles if name in ("push", "drag") else None
+        old, new = (m.probability(name, places, turn) for m in (shipped, learned))
+        assert np.mean((old > 0.2) == (new > 0.2)) > 0.99
+    learned.save(tmp_path / "mine.safetensors")
+    mine = Reachability.load(tmp_path / "mine.safetensors").probability("push", places, angles)
+    np.testing.assert_array_equal(mine, learned.probability("push", places, angles))
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.safetensors"]
+
+
+def test_a_primitive_that_was_not_learned_is_left_to_the_kinematics(monkeypatch):
+    monkeypatch.setitem(primitives.PRIMITIVES, "tap", type("Tap", (Push,), {"name": "tap"}))
+    assert (Reachability.load().probability("tap", np.zeros((2, 2))) == 1.0).all()
+
+
+def test_an_unknown_primitive_and_other_shapes_are_told(learned):
+    with pytest.raises(ValueError, match=r"primitive must be one of .*, got 'kick'"):
+        learned.probability("kick", np.zeros((1, 2)))
+    with pytest.raises(ValueError, match=r"xy_m must be finite numbers of shape"):
+        learned.probability("push", np.zeros((2, 3)), 0.0)
+    with pytest.raises(ValueError, match=r"direction_rad must be finite numbers of shape"):
+        learned.probability("push", np.zeros((2, 2)), np.zeros(3))

@@ -36,7 +36,6 @@ def one(**changed):
 
 
 def shipped_log():
-    """An empty log of the shipped object."""
     return Log("mm", SHIPPED_MM, tool_radius=1.5)
 
 
@@ -319,13 +318,11 @@ def test_the_pushes_that_fit_worst_are_those_whose_pose_jumped():
 
 @pytest.fixture(scope="module")
 def cells():
-    """The source of the page's cells by id."""
     path = repo_root() / "notebooks" / "09_a_log_of_your_own.ipynb"
     return {c["id"]: "".join(c["source"]) for c in json.loads(path.read_text())["cells"]}
 
 
 def run(cells, ids, folder, logs="data/own_log", **known):
-    """Execute some cells; returns their names."""
     names = {"seed": 0, "folds": 2, "out_dir": str(folder), "logs": str(logs)}
     names |= {"outline": SHIPPED_MM, "tool_radius": 1.5} | known
     for each in ids.split():
@@ -382,3 +379,20 @@ def test_other_conditions_are_read(cells, tmp_path):
     (folder / "steel_patch_2.txt").write_bytes(b"12" + text[2:])
     data = run(cells, needed, tmp_path, folder)["data"]
     assert data.context["support"].tolist() == ["patch_2"] * 12
+
+
+def test_a_damaged_log_of_pushes_is_named(tmp_path):
+    packed = (repo_root() / "data" / "own_log" / "felt_mid.txt.xz").read_bytes()
+    text = lzma.decompress(packed)
+    for name, content in (
+        ("a.txt.xz", packed[:-100]),
+        ("b.txt.xz", text),
+        ("c.txt", text[:-4000]),
+        ("d.txt", text.replace(b".", b",", 1)),
+        ("e.txt", packed),
+        ("f.txt", b""),
+    ):
+        path = tmp_path / name
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=f"{name} is damaged, or is not a log of pushes"):
+            list(pushes_of(path))

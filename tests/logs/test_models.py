@@ -15,16 +15,8 @@ from affordlib.logs.physics import ELLIPSOID, AnalyticPusher, quasi_static_push
 from experiments.pretrain_np import save_neural_process, simulate
 
 TRIANGLE_M = np.array([(-0.05, -0.05), (0.1, -0.05), (-0.05, 0.1)])
-
-
-@pytest.fixture(scope="module")
-def simulated():
-    return simulate(24, torch.Generator().manual_seed(5))
-
-
-@pytest.fixture(scope="module")
-def shipped():
-    return load_neural_process()
+simulated = pytest.fixture(lambda: simulate(24, torch.Generator().manual_seed(5)), scope="module")
+shipped = pytest.fixture(lambda: load_neural_process(), scope="module")
 
 
 def log_of(rows, context=None, outline_m=TRIANGLE_M):

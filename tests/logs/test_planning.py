@@ -1,27 +1,31 @@
-"""Off-centre pushes of an object that is only seen."""
+"""Off-centre pushes of an object that is only seen, and the T of the field."""
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 
-from affordlib.geometry import cross, rotated, wrap_angle
-from affordlib.logs import PushedObject, PushPlanner
+from affordlib.geometry import centroid, cross, rotated, wrap_angle
+from affordlib.logs import Log, PushedObject, PushPlanner
+from affordlib.logs.cross_validate import errors_of
 from affordlib.logs.fit import in_object_frame, known_feet, push_rows
 from affordlib.logs.log import _nearest
 from affordlib.logs.neural_process import load_neural_process
 from affordlib.logs.planning import primitive_of
+from affordlib.results import repo_root
 from affordlib.types import Goal, UnreachableError
 from affordlib.world import Cuboid
 from affordlib.world.robot import ROD_WIDTH_M
-from experiments.push_t import T_PX
-from experiments.t_on_arm import TURN_M, bring
-from tests.problems import Still
+from experiments import push_t, t_on_arm
+from tests.planning.point_robot import Still
 
 OUTLINE_M = np.array([[0.03, -0.02], [0.03, 0.02], [-0.03, 0.02], [-0.03, -0.02]])
 TOOL_M = 0.0015
+T_M = 1e-3 * np.array(push_t.T_PX)
 
 
 def test_the_middle_of_the_tool_stays_its_radius_outside():
@@ -59,8 +63,8 @@ def test_pursuit_knows_only_what_it_observes(world, monkeypatch):
         return x, y, yaw + 1.0
 
     monkeypatch.setattr(world, "object_pose", lies)
-    planner = PushPlanner(Pretrained(), outline, turn_m=TURN_M)
-    assert bring(world, planner, (0.04, -0.01, 0.2)) <= 10
+    planner = PushPlanner(Pretrained(), outline, turn_m=t_on_arm.TURN_M)
+    assert t_on_arm.bring(world, planner, (0.04, -0.01, 0.2)) <= 10
     x, y, yaw = truth()
     assert math.dist((x, y), (0.04, -0.01)) < 0.003
     assert abs(yaw - 0.6) < math.radians(3)
@@ -80,9 +84,6 @@ def test_what_no_object_has_is_refused():
         PushedObject(OUTLINE_M, lengths_m=(0.02, 0.01))
     with pytest.raises(ValueError, match="n must be a whole number in"):
         PushedObject(OUTLINE_M).draw(10**9)
-
-
-T_M = 1e-3 * np.array(T_PX)
 
 
 class Carried:
@@ -156,3 +157,85 @@ def test_refinement_reaches_the_goal_and_a_price_saves_pushes():
     assert off[1] < 2e-4
     assert off[1] <= off[0] + 1e-6
     assert steps[2] < steps[1]
+
+
+def test_the_arms_t_is_its_outline_and_its_pushes_are_read_by_the_log():
+    block = t_on_arm.TBlock()
+    corners = block.footprint_m
+    area_m2 = cross(corners, np.roll(corners, -1, axis=0)).sum() / 2
+    assert block.volume_m3 == pytest.approx(area_m2 * block.height)
+    np.testing.assert_allclose(centroid(corners), 0.0, atol=1e-9)
+    log = Log("m", corners, tool_radius=ROD_WIDTH_M / 2)
+    assert (log.add_all(t_on_arm.collect(6, seed=3)), len(log.pushes())) == ({}, 6)
+
+
+@pytest.fixture(scope="module")
+def environment():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SDL_VIDEODRIVER", "dummy")
+        pytest.importorskip("gym_pusht", reason="make setup PUSHT=1 installs it")
+        yield
+
+
+def stored():
+    """The shipped pushes, as arguments of `Log.add`."""
+    for _, rows in pd.read_csv(repo_root() / "data" / "push_t" / "pushes.csv.xz").groupby("push"):
+        poses, path = rows[["x", "y", "yaw"]].dropna(), rows[["tool_x", "tool_y"]]
+        yield {"tool_t": rows["t"], "tool_xy": path, "poses": poses}
+
+
+def test_the_shipped_pushes_are_read_and_predicted():
+    data = push_t.logged(stored())
+    assert len(data) == 200
+    trained = np.arange(200) < 150
+    errors = errors_of(data, trained, ~trained, ("nearest", "rate_gp")).groupby("model")
+    median = 1e3 * errors["position_m"].median()
+    assert median["rate_gp"] < 0.3 < 1 < median["nearest"]
+
+
+def test_the_agent_comes_to_rest_at_its_target_on_a_line():
+    a, b = push_t.motion()
+    for point, at, within in (((300, 200), (250, 260), 1e-6), ((400, 420), (60, 55), 2.0)):
+        point, at = np.array(point, dtype=float), np.array(at, dtype=float)
+        state = np.stack([at, np.zeros(2)])
+        for target in push_t.targets_to(point, at):
+            assert (target >= 0).all()
+            assert (target <= 512).all()
+            state = a @ state + np.outer(b, target)
+        np.testing.assert_allclose(state[0], point, atol=within)
+        np.testing.assert_allclose(state[1], 0, atol=10 * within)
+        assert abs(cross(state[0] - at, point - at)) < 1e-6
+
+
+def test_the_model_of_the_agent_is_that_of_the_environment(environment):
+    table = push_t.Table()
+    table.reset(push_t.FIRST_CHOICE)
+    agent, _ = table.look()
+    table.go(np.stack([agent + np.array([30, -20]), agent]))
+    np.testing.assert_allclose(table.look()[0], agent, atol=0.05)
+
+
+def test_a_picture_gives_the_pose_of_the_t_and_the_agent(environment):
+    table = push_t.Table("picture")
+    for seed in range(push_t.FIRST_CHOICE, push_t.FIRST_CHOICE + 5):
+        table.reset(seed)
+        agent, (x, y, yaw) = push_t.read_picture(table.seen)
+        assert np.hypot(*np.subtract((x, y), table.truth[:2])) < 2
+        assert abs(wrap_angle(yaw - table.truth[2])) < np.radians(1.5)
+        assert np.hypot(*np.subtract(agent, table.history[-1][0])) < 1.5
+
+
+def test_pushes_are_the_same_for_a_seed_and_move_the_t(environment):
+    one, again = (push_t.logged(push_t.collect(6, 1)) for _ in range(2))
+    np.testing.assert_array_equal(one.displacement_m, again.displacement_m)
+    assert np.linalg.norm(one.displacement_m, axis=1).max() > 0.002
+
+
+@pytest.mark.slow
+def test_forty_pushes_solve_the_t(environment):
+    row, took = replace(push_t.ROWS["gp_50"], n=40), []
+    for seed in range(push_t.FIRST_CHOICE, push_t.FIRST_CHOICE + 3):
+        run = push_t.attempt(push_t.Table(), push_t.planner_of(row, 0), 3, seed)
+        took += [] if run["steps_a"] is None else [run["steps_a"]]
+    assert len(took) >= 2
+    assert max(took) <= push_t.MOST_STEPS

@@ -9,43 +9,26 @@ import torch
 
 from affordlib.interactions import Scaler, open_interactions
 from affordlib.interactions.dataset import condition_on_poses
-from affordlib.models import build, load_checkpoint
-from affordlib.models.lever_up import (
-    N_OBSERVED,
-    N_PREDICTED,
-    PROTOCOLS,
-    lever_up_tensors,
-    n_windows,
-    predict_steps,
-    window_errors_m,
-)
-from experiments.lever_training import (
-    LEVER_CHECKPOINTS,
-    LEVER_MODELS,
-    fit_lever_model,
-    from_start_errors_m,
-    sample_from_start,
-    sample_windows,
-)
+from affordlib.models import build, lever_up, load_checkpoint
+from experiments import lever_training
 from experiments.lever_up import lever_split
 
 
 def made(name, levered):
     torch.manual_seed(0)
-    model = build(LEVER_MODELS[name].network, Scaler.fit(levered)).eval()
+    model = build(lever_training.LEVER_MODELS[name].network, Scaler.fit(levered)).eval()
     model.prepare(levered)
     return model
 
 
 @pytest.mark.parametrize("name", ["cnp_last_pose", "lstm_tuned", "cnp"])
 def test_no_model_sees_what_it_has_to_foresee(name, levered):
-    """Changes after the observed steps do not affect predictions."""
     untrained = made(name, levered)
-    for protocol, last in zip(PROTOCOLS, (N_OBSERVED - 1, 0, 0), strict=True):
+    for protocol, last in zip(lever_up.PROTOCOLS, (lever_up.N_OBSERVED - 1, 0, 0), strict=True):
         later = levered.effect.clone()
         later[:, last + 1 :] += 0.05
-        found, _ = predict_steps(untrained, levered, protocol)
-        again, truth = predict_steps(untrained, replace(levered, effect=later), protocol)
+        found, _ = lever_up.predict_steps(untrained, levered, protocol)
+        again, truth = lever_up.predict_steps(untrained, replace(levered, effect=later), protocol)
         torch.testing.assert_close(found.effect_mean, again.effect_mean)
         assert truth.shape == found.effect_mean.shape == found.effect_std.shape
 
@@ -76,11 +59,11 @@ def test_a_rollout_does_not_depend_on_how_far_it_is_asked(levered):
 @pytest.mark.parametrize(("name", "kind"), [("cnp_last_pose", "all"), ("lstm_tuned", "first_step")])
 def test_training_learns(levered, name, kind):
     few = {"steps": 60, "batch_size": 16, "validate_every": 30, "ema": 0.0}
-    lever = LEVER_MODELS[name]
+    lever = lever_training.LEVER_MODELS[name]
     lever = replace(lever, training=replace(lever.training, **few))
-    model, history = fit_lever_model(lever, levered, levered, kind)
+    model, history = lever_training.fit_lever_model(lever, levered, levered, kind)
     moves = levered.effect[:, 1:, :3].norm(dim=-1).mean()
-    assert from_start_errors_m(model, levered).mean() < moves / 3
+    assert lever_training.from_start_errors_m(model, levered).mean() < moves / 3
     assert len(history) == 2
 
 
@@ -100,37 +83,39 @@ def test_arrays_are_in_the_frame_of_the_lever(levers, levered):
 
 
 def test_no_view_cuts_an_object_off(levers, levered):
-    wide, full = lever_up_tensors(levers, view="wide").image, torch.from_numpy(levers.image.values)
+    wide = lever_up.lever_up_tensors(levers, view="wide").image
+    full = torch.from_numpy(levers.image.values)
     assert full.shape[-1] == 128
     assert levered.image.shape[-1] == wide.shape[-1] == 48
     area = full[:, 1].sum(dim=(1, 2)) / 128**2
     torch.testing.assert_close(4 * levered.image[:, 1].sum(dim=(1, 2)), full[:, 1].sum(dim=(1, 2)))
     torch.testing.assert_close(wide[:, 1].mean(dim=(1, 2)), area, rtol=0.02, atol=0)
     with pytest.raises(ValueError, match="view must be one of"):
-        lever_up_tensors(levers, view="far")
+        lever_up.lever_up_tensors(levers, view="far")
 
 
 def test_windows_are_fifteen_steps_and_the_next_five(levered):
     generator = torch.Generator().manual_seed(0)
-    assert n_windows(levered) == 7
-    batch = sample_windows(levered, N_PREDICTED, N_OBSERVED, generator)
+    assert lever_up.n_windows(levered) == 7
+    lengths = lever_up.N_PREDICTED, lever_up.N_OBSERVED
+    batch = lever_training.sample_windows(levered, *lengths, generator)
     seen = (batch.observations.effect_t * 25).round()
     assert (seen.diff(dim=1) == 1).all()
     assert {int(s) for s in seen[:, 0]} == set(range(7))
     torch.testing.assert_close((batch.t_target[:, 0] * 25).round(), seen[:, -1] + 1)
     assert batch.observations.effect_mask.all()
-    batches = [sample_from_start(levered, 0, 0, generator) for _ in range(20)]
+    batches = [lever_training.sample_from_start(levered, 0, 0, generator) for _ in range(20)]
     assert {bool(b.observations.effect_mask.any()) for b in batches} == {True, False}
 
 
-@pytest.mark.parametrize("name", LEVER_CHECKPOINTS)
+@pytest.mark.parametrize("name", lever_training.LEVER_CHECKPOINTS)
 def test_shipped_checkpoints_predict_what_they_have_not_seen(name):
     whole = open_interactions("lever_up")
     model, about = load_checkpoint(name)
     split = lever_split(whole)
     assert not set(about["seen_interactions"]) & set(split.test)
-    few = lever_up_tensors(whole, split.test[:60], about["view"])
+    few = lever_up.lever_up_tensors(whole, split.test[:60], about["view"])
     if about["trained_for"] != "first_step":
-        assert 100 * window_errors_m(model, few).mean() < 0.3
+        assert 100 * lever_up.window_errors_m(model, few).mean() < 0.3
     if about["trained_for"] != "window":
-        assert 100 * from_start_errors_m(model, few).mean() < 0.4
+        assert 100 * lever_training.from_start_errors_m(model, few).mean() < 0.4

@@ -1,4 +1,4 @@
-"""Properties of every network in both frames: equivariance, gradients, ranges, loss."""
+"""Networks in both frames: equivariance, gradients, ranges, loss; the layers of the paper's."""
 
 import dataclasses
 import math
@@ -8,14 +8,8 @@ import torch
 
 from affordlib import models
 from affordlib.interactions import Scaler
-from affordlib.interactions.dataset import sample_mixed
-from affordlib.models.base import (
-    condition_on_final_effect,
-    gaussian_nll,
-    inverse,
-    push_direction,
-    rotate_image,
-)
+from affordlib.interactions.dataset import Batch, sample_mixed
+from affordlib.models import CNPConfig, base
 from affordlib.models.evaluation import AFTER_CONTACT, effects_at
 from affordlib.models.film import CircularHarmonics
 from affordlib.primitives import Drag, Push
@@ -35,11 +29,8 @@ CONFIGS = {
     "lstm, push": LSTMConfig(**YAW, frame="push", width=16),
 }
 IN_PUSH_FRAME = [name for name in CONFIGS if name.endswith("push")]
-
-
-@pytest.fixture(params=CONFIGS)
-def network(request, some):
-    return made(request.param, some)
+network = pytest.fixture(lambda request, some: made(request.param, some), params=CONFIGS)
+N = 7
 
 
 def made(name, arrays):
@@ -67,8 +58,7 @@ def predictions(network, batch, observations=None):
 
 
 @torch.no_grad()
-def test_order_and_what_is_masked_have_no_effect(network, some, tmp_path):
-    """Saving and loading have no effect either."""
+def test_order_what_is_masked_and_saving_have_no_effect(network, some, tmp_path):
     assert isinstance(network, models.EffectModel)
     batch = batch_of(some)
     predicted = predictions(network, batch)
@@ -131,7 +121,7 @@ def test_a_quarter_turn_of_the_table_turns_the_prediction(name, quarters, some):
     o = a.observations
     seen_e = o.effect_mask & (o.effect[..., :2].norm(dim=-1) > 1e-3)
     directed = o.action_mask.any(1) | (seen_e & (o.weight < 1)[:, None]).any(1)
-    directed &= push_direction(o, *YAW.values())[:, 1] != 0
+    directed &= base.push_direction(o, *YAW.values())[:, 1] != 0
     assert directed.sum() > 20
     for mine, theirs in ((rotated_e, t_mean_e), (rotated_a[..., :2], t_mean_a[..., :2])):
         torch.testing.assert_close(mine[directed], theirs[directed], rtol=0, atol=2e-5)
@@ -182,7 +172,7 @@ def test_what_is_out_of_range_is_refused(some):
     nowhere = dataclasses.replace(pushed, action=torch.full_like(pushed.action, math.nan))
     with pytest.raises(ValueError, match="starts nan m"):
         network.predict(features, nowhere, one)
-    far = condition_on_final_effect(network, torch.tensor([[0.2, 0.0, 0.0]]))
+    far = base.condition_on_final_effect(network, torch.tensor([[0.2, 0.0, 0.0]]))
     with pytest.warns(models.OutOfRangeWarning, match=r"ends 0\.200 m away, trained on 0\.0\d+ to"):
         network.predict(features, far, one)
     empty = some.image[:2].clone()
@@ -203,7 +193,7 @@ def test_coverage_and_variance_scaling(some):
     network = made("film, push", some)
 
     def nll():
-        return float(gaussian_nll(*effects_at(network, some, AFTER_CONTACT)).mean())
+        return float(base.gaussian_nll(*effects_at(network, some, AFTER_CONTACT)).mean())
 
     before, scale = nll(), models.fit_sigma_scale(network, some)
     assert tuple(network.sigma_scale.tolist()) == scale
@@ -238,14 +228,14 @@ def test_harmonics_turn_as_their_image_does(some):
     for turn, exact in ((torch.full((40,), math.pi / 2), True), (angle, False)):
         towards = torch.stack([turn.cos(), turn.sin()], dim=-1)
         quarter = torch.rot90(some.image, 1, (-2, -1))
-        turned = quarter if exact else rotate_image(some.image, towards)
+        turned = quarter if exact else base.rotate_image(some.image, towards)
         kept = (1 - turned[:, 0]).sum(dim=(1, 2)) / (1 - some.image[:, 0]).sum(dim=(1, 2))
         assert (kept - 1).abs().max() < 0.01  # of the object's height, also in the corners
         off = harmonics.rotated(known, towards) - harmonics(turned)
         # An interpolated image differs slightly from a rotated one; rotated harmonics are exact.
         assert off.abs().max() < (1e-4 if exact else 0.03 * known.abs().max())
         assert (harmonics(turned) - known).abs().max() > 0.2 * known.abs().max()
-    back = harmonics.rotated(harmonics.rotated(known, towards), inverse(towards))
+    back = harmonics.rotated(harmonics.rotated(known, towards), base.inverse(towards))
     torch.testing.assert_close(back, known, atol=1e-5, rtol=1e-4)
 
 
@@ -255,10 +245,93 @@ def test_the_direction_is_that_of_the_push(some):
     expected = travel / travel.norm(dim=-1, keepdim=True)
     for samples in ((0, -1), (0,), (-1, 0), (10, 20)):
         observed = Observations.of(some, some.action_at(torch.tensor(samples)))
-        direction = push_direction(observed, *channels)
+        direction = base.push_direction(observed, *channels)
         torch.testing.assert_close(direction, expected, atol=1e-4, rtol=0)
     # For the inverse query it is the effect's direction; for a zero effect, the table's x axis.
     end = torch.tensor([[0.03, -0.04, 0.1], [0.0, 0.0, 0.0]])
     observed = Observations.of(some, effect=(torch.ones(2, 1), end[:, None]))
-    direction = push_direction(observed, *channels)
+    direction = base.push_direction(observed, *channels)
     torch.testing.assert_close(direction, torch.tensor([[0.6, -0.8], [1.0, 0.0]]))
+
+
+def some_observations() -> Observations:
+    g = torch.Generator().manual_seed(0)
+    shapes = ((2, N, 2), (2, N)) * 2
+    action, action_t, effect, effect_t = (torch.rand(*shape, generator=g) for shape in shapes)
+    both = (action_t, 0.2 * action), (effect_t, 0.1 * effect)
+    return Observations.of(CNPConfig(), *both, torch.rand(2, generator=g))
+
+
+def linear_sizes(module: torch.nn.Module) -> list[tuple[int, int]]:
+    layers = [layer for layer in module.modules() if isinstance(layer, torch.nn.Linear)]
+    return [(layer.in_features, layer.out_features) for layer in layers]
+
+
+def test_layer_table_of_the_appendix(untrained):
+    encoder = [(3, 32), (32, 64), (64, 64), (64, 128), (128, 128), (128, 256), (256, 128)]
+    decoder = [(1024, 512), (512, 256), (256, 128), (128, 32), (32, 4)]
+    assert linear_sizes(untrained.action_encoder) == encoder
+    assert linear_sizes(untrained.effect_encoder) == encoder
+    assert isinstance(untrained.action_encoder[-1], torch.nn.LeakyReLU)
+    assert isinstance(untrained.effect_encoder[-1], torch.nn.Linear)
+    assert linear_sizes(untrained.merge) == [(128 + 16 + 1, 1024)]
+    assert linear_sizes(untrained.action_decoder) == decoder
+    assert linear_sizes(untrained.effect_decoder) == decoder
+    assert sum(p.numel() for p in untrained.parameters()) == 2_009_912
+
+    shapes, x = [], torch.zeros(1, 2, 48, 48)
+    for layer in untrained.image_encoder:
+        x = layer(x)
+        if isinstance(layer, torch.nn.MaxPool2d):
+            shapes.append(tuple(x.shape[1:]))
+    assert shapes == [(32, 24, 24), (64, 12, 12), (64, 6, 6), (128, 3, 3), (128, 1, 1)]
+    assert x.shape == (1, 16)
+
+
+def test_representation_is_equations_2_and_3(untrained):
+    """Observed at the same times, r is the mean of r_i = w₁ h_a(a_i) + w₂ h_e(e_i)."""
+    seen = some_observations()
+    expected = []
+    for b in range(2):
+        r_i = []
+        for i in range(N):
+            a = torch.cat([seen.action[b, i] / 0.1, seen.action_t[b, i : i + 1]])
+            e = torch.cat([seen.effect[b, i] / 0.03, seen.effect_t[b, i : i + 1]])
+            w_1 = seen.weight[b]
+            h_a, h_e = untrained.action_encoder(a), untrained.effect_encoder(e)
+            r_i.append(w_1 * h_a + (1 - w_1) * h_e)
+        expected.append(torch.stack(r_i).mean(dim=0))
+    torch.testing.assert_close(untrained.represent(seen), torch.stack(expected))
+
+
+def test_folded_decoding_equals_the_layers_one_by_one(untrained):
+    """Also after a fused optimiser, which changes weights without incrementing their version."""
+    r, features = torch.randn(2, 128), torch.randn(2, 16)
+    t = torch.rand(2, 60)
+    known = torch.cat([r, features], dim=1)[:, None].expand(-1, 60, -1)
+    optimiser = torch.optim.Adam(untrained.parameters(), 1e-3, fused=True)
+    for _ in range(2):
+        with torch.no_grad():
+            merged = untrained.merge(torch.cat([known, t[..., None]], dim=-1))
+            mu_a, sigma_a, mu_e, sigma_e = untrained.eval().decode(r, features, t)
+        for decoder, mean, std in (
+            (untrained.action_decoder, mu_a, sigma_a),
+            (untrained.effect_decoder, mu_e, sigma_e),
+        ):
+            literal_mean, raw = decoder(merged).chunk(2, dim=-1)
+            torch.testing.assert_close(mean, literal_mean, rtol=1e-4, atol=1e-4)
+            expected = untrained.sigma_floor + torch.nn.functional.softplus(raw)
+            torch.testing.assert_close(std, expected, rtol=1e-4, atol=1e-4)
+        sum(v.sum() for v in untrained.train().decode(r, features, t)).backward()
+        optimiser.step()
+
+
+@pytest.mark.parametrize("beta", [0.0, 0.5])
+def test_loss_is_the_gaussian_log_likelihood(untrained, beta):
+    seen, t = some_observations(), torch.rand(2, 5)
+    image, action, effect = torch.rand(2, 2, 48, 48), torch.rand(2, 5, 2), torch.rand(2, 5, 2)
+    mu_a, sigma_a, mu_e, sigma_e = untrained(image, seen, t)
+    a = torch.distributions.Normal(mu_a, sigma_a).log_prob(action / 0.1) * sigma_a ** (2 * beta)
+    e = torch.distributions.Normal(mu_e, sigma_e).log_prob(effect / 0.03) * sigma_e ** (2 * beta)
+    loss = untrained.loss(Batch(image, seen, t, action, effect), beta)
+    torch.testing.assert_close(loss, -(a.mean() + e.mean()) / 2)

@@ -1,4 +1,4 @@
-"""A robot in pure Python, and models with known dynamics: no simulator, no network."""
+"""A robot in pure Python, models with known dynamics, and problems: no simulator, no network."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import torch
 
-from affordlib.planning import Skills
-from affordlib.primitives import Grasp, Rotate
+from affordlib.planning import EffectMap, PlanningProblem, Skills
+from affordlib.primitives import Grasp, Push, Rotate
 from affordlib.types import NothingSeenError, Observation, Observations, Prediction
 
 REACH_M = 0.09
@@ -18,6 +18,18 @@ STARTS = 0.6
 def moved_m(phase):
     """Distance [m] by which a push that stops at a phase moves the object."""
     return REACH_M * (np.clip(phase - STARTS, 0, 1 - STARTS) / (1 - STARTS)) ** 2
+
+
+def problem_of(model, image, start_xy_m, goal, mode="multi_partial", kind=Push, **more):
+    """A problem, given the model and the image of its effects."""
+    return PlanningProblem(start_xy_m, goal, EffectMap(model, image, kind), mode, **more)
+
+
+class Still:
+    """A model of pushes that do not move the object."""
+
+    def predict(self, pushes):
+        return np.zeros((len(pushes), 3)), np.ones((len(pushes), 3))
 
 
 class KnownDynamics:

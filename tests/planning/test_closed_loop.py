@@ -1,6 +1,7 @@
 """Closed loop and execution: all endings, termination, and vetoes before motion."""
 
 import math
+from contextlib import contextmanager
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -21,12 +22,16 @@ from affordlib.world.objects import PlacedObject
 from experiments.closed_loop import Trial, _stays_feasible, sample_disturbance
 from experiments.disturbances import Disturbance, DisturbanceSchedule
 from experiments.planning import corrected
-from tests.planning.point_robot import PointRobot, point_skills
-from tests.problems import problem_of
+from tests.planning.point_robot import PointRobot, point_skills, problem_of
 
 PLANNERS = pytest.mark.parametrize("planner", [plan_astar, plan_continuous, planning.plan_gradient])
 EXACT_M = 0.002
 BOX, TUBE, BALL = Cuboid(0.06, 0.05, 0.05), UprightCylinder(0.05, 0.07), Sphere(0.06)
+TURN, LIFT = {"turn_rad": 0.6}, {"height_m": 0.1}
+TASKS = [(BOX, {}), (BALL, {}), (BOX, TURN), (BALL, TURN), (LyingCylinder(0.07, 0.05), TURN)]
+TASKS += [(TUBE, LIFT), (BOX, TURN | LIFT)]
+SHIFTS = [((0.0,), 1, "unconfirmed"), ((0.02,), 2, "unconfirmed")]
+SHIFTS += [((0.02, 0.02), 2, "gave_up"), ((None,), 1, "reached")]
 
 
 def loop(robot, goal, skills=None, planner=plan_continuous, ends=None, **config):
@@ -209,15 +214,7 @@ def test_a_far_goal_is_reached_round_what_the_arm_cannot_do():
     assert min(path[0, 0] for path in went.object_paths_xy_m) < 0.1
 
 
-@pytest.mark.parametrize(
-    ("shifts_m", "lifts", "status"),
-    [
-        ((0.0,), 1, "unconfirmed"),
-        ((0.02,), 2, "unconfirmed"),
-        ((0.02, 0.02), 2, "gave_up"),
-        ((None,), 1, "reached"),
-    ],
-)
+@pytest.mark.parametrize(("shifts_m", "lifts", "status"), SHIFTS)
 def test_what_is_held_aside_of_its_goal_is_put_down_and_lifted_there(shifts_m, lifts, status):
     """The goal moves by this much after each lift, or requires no height any longer (None)."""
     goal, left = Goal((0.06, 0.0), EXACT_M, height_m=0.1), list(shifts_m)
@@ -252,7 +249,6 @@ def test_a_turn_that_nobody_sees_is_reckoned_by_the_hand_and_said_to_be(sees_yaw
 
 @pytest.mark.parametrize(("shove_m", "kept"), [(0.0, True), (0.05, False)])
 def test_the_grip_is_kept_unless_somebody_displaces_the_object(shove_m, kept):
-    """Here the goal moves as well."""
     robot, goal = PointRobot(), Goal((0.0, 0.0), EXACT_M, turn_rad=0.5, height_m=0.1)
 
     def displace(plan, n):
@@ -344,7 +340,6 @@ def test_the_arm_is_asked_about_the_grasp_that_it_will_execute(world, skills):
 
 
 def test_a_toppled_cylinder_is_dragged(world, skills):
-    """It is pushed while standing, and dragged when its image shows that it would roll."""
     world.place(TUBE, (0.0, 0.0), 0.0)
     falls = Disturbance("topple", 1, 0.0, 1.0)
     went, schedule = disturbed(world, Goal((0.2, 0.0), EXACT_M), skills, falls)
@@ -434,39 +429,26 @@ def knowing_only_what_it_measures(world, monkeypatch):
 
         return state
 
-    def acting(method):
-        def act(*args):
-            acts.append(method)
-            try:
-                return method(*args)
-            finally:
-                acts.pop()
-
-        return act
+    @contextmanager
+    def acting():
+        acts.append(None)
+        try:
+            yield
+        finally:
+            acts.pop()
 
     def execute(step, seen):
-        done = acting(world.execute)(step, seen)
+        done = acting()(world.execute)(step, seen)
         return SimpleNamespace(tool=done.tool, object_path=np.full((2, 4), np.nan))
 
     for name in ("state", "pose", "fell", "rolls", "left_table"):
         monkeypatch.setattr(PlacedObject, name, guarded(getattr(PlacedObject, name)))
     free = {"park": lambda: put_down(world.arm), "can_reach": world.can_reach, "execute": execute}
-    return SimpleNamespace(observe=acting(world.observe), settle=acting(world.settle), **free)
+    return SimpleNamespace(observe=acting()(world.observe), settle=acting()(world.settle), **free)
 
 
 @pytest.mark.parametrize("camera", ["ideal", "kinect"])
-@pytest.mark.parametrize(
-    ("obj", "pose"),
-    [
-        (BOX, {}),
-        (BALL, {}),
-        (BOX, {"turn_rad": 0.6}),
-        (BALL, {"turn_rad": 0.6}),
-        (LyingCylinder(0.07, 0.05), {"turn_rad": 0.6}),
-        (TUBE, {"height_m": 0.1}),
-        (BOX, {"turn_rad": 0.6, "height_m": 0.1}),
-    ],
-)
+@pytest.mark.parametrize(("obj", "pose"), TASKS)
 def test_no_task_needs_the_state_of_the_simulator(world, skills, monkeypatch, camera, obj, pose):
     """Observation errors are at most 0.5° and 1 mm (ideal), 1.8° and 2.3 mm (Kinect, mean of 8)."""
     world.place(obj, (0.0, 0.0), 0.3, config=WorldConfig(camera=camera))

@@ -19,9 +19,9 @@ from affordlib.types import Goal, Observation, Obstacle, Step
 from affordlib.world import Cuboid, Sphere
 from experiments.field_baselines import plan_cem
 from tests.planning.point_robot import KnownDynamics, PointRobot, disc_image, point_skills
-from tests.problems import problem_of
 
 PLANNERS = (planning.plan_astar, planning.plan_continuous, planning.plan_gradient, plan_cem)
+AT, THREE = (0.0, 0.0), planning.PlanMode(3, partial=True)
 BOX = 0.5 * np.array([[0.06, 0.05], [-0.06, 0.05], [-0.06, -0.05], [0.06, -0.05]])
 
 
@@ -83,7 +83,7 @@ def test_gaps_are_distances_along_the_normals_of_edges():
     thin = corners_of(Obstacle.box((0.1, 0.0), (0.005, 0.3)))
     jump = placed(BOX, np.array([[[0.0, 0.0, 0.0], [0.2, 0.0, 0.0]]]))
     assert gaps_m([thin], jump)[0, 0] < 0  # no pose touches it, the way does
-    disc = corners_of(Obstacle.disc((0.0, 0.0), 0.04))
+    disc = corners_of(Obstacle.disc(AT, 0.04))
     assert (np.hypot(*disc.T) >= 0.04).all()
 
 
@@ -96,7 +96,7 @@ def test_the_hand_is_checked_too(kind):
     poses[0, :, 0] = np.linspace(0, 0.04, N_POSES)
     at = {Push: (-0.15, 0.03), Drag: (0.0, 0.075)}[kind]
     for xy, free in ((at, False), ((at[0], at[1] + 0.03), True)):
-        space = FreeSpace([Obstacle.disc(xy, 0.008)], image, (0.0, 0.0))
+        space = FreeSpace([Obstacle.disc(xy, 0.008)], image, AT)
         spare = space.spare_m(action, np.zeros(1), np.ones(1), poses)
         assert (spare[0] > 0) == free
     assert hand_m(Push.towards(0.0))[:, 1].max() == pytest.approx(0.027)
@@ -107,10 +107,10 @@ def test_the_open_hand_needs_room(action):
     step = Step(action, 1.0, (0.1, 0.0), np.zeros((2, 2)))
     post = Obstacle.disc((0.1, action.opening_m / 2 + 0.01), 0.01)
     image = disc_image()
-    near = FreeSpace([post], image, (0.0, 0.0))
+    near = FreeSpace([post], image, AT)
     assert not near.is_free(step)
     np.testing.assert_array_equal(near.outline_m, outline_of(image))
-    assert FreeSpace([Obstacle.disc((0.1, 0.15), 0.01)], image, (0.0, 0.0)).is_free(step)
+    assert FreeSpace([Obstacle.disc((0.1, 0.15), 0.01)], image, AT).is_free(step)
 
 
 @pytest.mark.parametrize(
@@ -127,11 +127,9 @@ def test_an_obstacle_where_none_can_be_is_refused(obstacle, says):
         problem(Goal((0.12, 0.0)), [fine, obstacle])
 
 
-def problem(goal, obstacles, **more):
-    """A problem of a disc with known dynamics."""
-    mode = more.pop("mode", planning.PlanMode(3, partial=True))
-    more |= {"obstacles": tuple(obstacles)}
-    return problem_of(KnownDynamics(), disc_image(), (0.0, 0.0), goal, mode, **more)
+def problem(goal, obstacles, mode=THREE):
+    effects = planning.EffectMap(KnownDynamics(), disc_image())
+    return planning.PlanningProblem(AT, goal, effects, mode, obstacles=tuple(obstacles))
 
 
 @pytest.mark.filterwarnings("ignore:none of 5 random starts")
@@ -166,7 +164,6 @@ def test_no_plan_passes_a_wall(plan):
 
 
 def corridor(half_m=0.033, length_m=0.3):
-    """Two walls along x."""
     return [Obstacle.box((0.0, s * (half_m + 0.01)), (length_m, 0.02)) for s in (-1, 1)]
 
 
@@ -196,7 +193,6 @@ def test_a_far_goal_behind_a_long_wall_is_reached():
 
 
 def test_an_obstacle_that_moves_makes_the_loop_plan_again():
-    """A wall is put across the way after the first action, which it then goes round."""
     wall = (Obstacle.box((0.13, 0.0), (0.02, 0.1)),)
 
     def before(robot):
@@ -219,7 +215,7 @@ def test_of_what_is_predicted_to_pass_little_touches(world, skills):
     rng, touched, n = np.random.default_rng(8), 0, 0
     for _ in range(12):
         obj = Cuboid.sample(rng)
-        world.place(obj, (0.0, 0.0), rng.uniform(-3, 3))
+        world.place(obj, AT, rng.uniform(-3, 3))
         effects = planning.EffectMap(skills.model(Push), world.depth_image())
         angle = rng.uniform(-3, 3)
         at = torch.tensor([angle]).double()
@@ -231,7 +227,7 @@ def test_of_what_is_predicted_to_pass_little_touches(world, skills):
         one = next((d for d in discs if gaps_m([corners_of(d)], swept).min() > 0.004), None)
         if one is None:
             continue
-        space = FreeSpace([one], effects.image, (0.0, 0.0), effects.outline_m)
+        space = FreeSpace([one], effects.image, AT, effects.outline_m)
         if space.spare_m(Push.towards(angle), np.array([angle]), np.ones(1), poses)[0] < 0:
             continue
         world.set_obstacles([one])
@@ -244,7 +240,7 @@ def test_of_what_is_predicted_to_pass_little_touches(world, skills):
 def test_an_object_beside_an_obstacle_may_leave_it():
     wall, goal = Obstacle.box((-0.0388, 0.02), (0.02, 0.02)), Goal((0.03, 0.12), 0.005)
     effects = planning.EffectMap(KnownDynamics(), disc_image(radius_m=0.03))
-    posed = planning.PlanningProblem((0.0, 0.0), goal, effects, obstacles=(wall,))
+    posed = planning.PlanningProblem(AT, goal, effects, obstacles=(wall,))
     assert posed.free_space.least_m < START_M
     assert planning.plan_continuous(posed).reaches_goal
 
@@ -254,7 +250,7 @@ def test_a_planned_drag_is_checked_again_with_its_own_grip(grip_yaw, free):
     """A post is in the way of the fingers, if they close along y."""
     skills = planning.Skills({"drag": KnownDynamics()})
     moves = MovePlanner(PointRobot(), skills, planning.plan_continuous, planning.PlanMode(1, True))
-    seen = Observation((0.0, 0.0), disc_image(), obstacles=(Obstacle.disc((0.0, 0.075), 0.008),))
+    seen = Observation(AT, disc_image(), obstacles=(Obstacle.disc((0.0, 0.075), 0.008),))
     step = Step(Drag(0.0, grip_yaw=grip_yaw), 0.9, (0.05, 0.0), np.zeros((2, 2)))
     assert moves.passes(step, seen) == free
 

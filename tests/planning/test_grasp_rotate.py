@@ -10,7 +10,7 @@ from affordlib.planning.grasp_rotate import GRIPPER_YAWS_RAD, crossings, predict
 from affordlib.primitives import Drag, Grasp, Push, Rotate, wrap_angle
 from affordlib.types import Goal
 from affordlib.world import Cuboid, LyingCylinder, UprightCylinder
-from tests.problems import problem_of
+from tests.planning.point_robot import problem_of
 
 BOX, TUBE, LOG = Cuboid(0.06, 0.05, 0.05), UprightCylinder(0.05, 0.07), LyingCylinder(0.08, 0.05)
 DISC = LyingCylinder(0.05, 0.10)

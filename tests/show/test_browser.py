@@ -24,6 +24,8 @@ from tests.waiting import wait_until
 PICTURES = repo_root() / "runs" / "browser"
 
 pytestmark = [pytest.mark.slow, pytest.mark.browser, pytest.mark.timeout(300)]
+page = pytest.fixture(lambda lab, browser: opened(lab, browser), scope="module")
+table = pytest.fixture(lambda page: Table(page))
 
 
 def free_port():
@@ -100,7 +102,6 @@ def view_of(svg):
 
 
 def screen_at(svg, x_m, y_m):
-    """Screen position of a place on the table."""
     middle, there, scale = view_of(svg)
     return tuple(middle + scale * ((x_m, y_m) - there) * (1, -1))
 
@@ -217,16 +218,6 @@ def opened(lab, browser):
     return page
 
 
-@pytest.fixture(scope="module")
-def page(lab, browser):
-    return opened(lab, browser)
-
-
-@pytest.fixture
-def table(page):
-    return Table(page)
-
-
 def test_the_first_click_after_scrolling_lands_where_the_mouse_is(page, table):
     table.svg.evaluate(
         """svg => {
@@ -272,23 +263,12 @@ def test_sliders_by_keyboard(page, table):
     ask(page, f"[*(setattr(s, 'value', 0) for s in {posed}), picker.pick(0.1, 0)]")
 
 
-def test_run(page, table):
+def test_a_run_is_drawn_from_above_and_in_3d_while_it_is_simulated(page, table):
+    button(page, "Start over").click()
+    wait_for_words(page, "Plan: ")
     page.mouse.click(*table.at(0.12, 0.12))
     assert_same_goal(page, table, 0.12, 0.12)
     before = table.points(".object").mean(axis=0)
-    button(page, "Run").click()
-    wait_for_words(page, "from the goal, ")
-    outcome = ask(page, "[*picker.outcome.end_pose, picker.outcome.distance_m]")
-    assert f"{1000 * outcome[3]:.1f} mm" in words(page)
-    wait_until(lambda: abs(table.points(".object").mean(axis=0) - outcome[:2]).max() < 1e-3)
-    assert np.hypot(*(table.points(".object").mean(axis=0) - before)) > 0.05
-    np.testing.assert_allclose(table.points(".truth")[-1], outcome[:2], atol=1e-3)
-    picture(page, "3_run")
-
-
-def test_the_robot_moves_in_3d_while_it_is_simulated(page, table):
-    button(page, "Start over").click()
-    wait_for_words(page, "Plan: ")
     ask(page, "setattr(picker, 'pace_s', 0.05)")
     page.evaluate(
         """([name, ...arm]) => {
@@ -305,6 +285,11 @@ def test_the_robot_moves_in_3d_while_it_is_simulated(page, table):
     button(page, "Run").click()
     wait_for_words(page, "from the goal, ")
     ask(page, "setattr(picker, 'pace_s', 0.01)")
+    outcome = ask(page, "[*picker.outcome.end_pose, picker.outcome.distance_m]")
+    assert f"{1000 * outcome[3]:.1f} mm" in words(page)
+    wait_until(lambda: abs(table.points(".object").mean(axis=0) - outcome[:2]).max() < 1e-3)
+    assert np.hypot(*(table.points(".object").mean(axis=0) - before)) > 0.05
+    np.testing.assert_allclose(table.points(".truth")[-1], outcome[:2], atol=1e-3)
     seen = [row[1:] for row in page.evaluate("seen") if row[0].startswith("Push 1 of")]
     assert (np.ptp(seen, axis=0).max(axis=1) > 0.02).sum() > 5  # parts of the arm
     assert len(np.unique(seen, axis=0)) > 5

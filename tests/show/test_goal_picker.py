@@ -17,6 +17,8 @@ from affordlib.types import Obstacle
 from affordlib.world import Cuboid
 from tests.waiting import wait_until
 
+picker = pytest.fixture(lambda make_picker: make_picker())
+
 
 @pytest.fixture
 def make_picker(world, trained):
@@ -34,11 +36,6 @@ def make_picker(world, trained):
         return picker
 
     return make
-
-
-@pytest.fixture
-def picker(make_picker):
-    return make_picker()
 
 
 @pytest.fixture
