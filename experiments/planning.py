@@ -32,7 +32,6 @@ from affordlib.planning import (
     EffectMap,
     Execution,
     PlanMode,
-    Planner,
     PlanningProblem,
     Robot,
     Skills,
@@ -47,6 +46,7 @@ from affordlib.planning.problem import MODES
 from affordlib.primitives import Drag, Move, Push
 from affordlib.types import NothingSeenError, Observation, Outcome, Plan, Step, on_table
 from affordlib.world import ROLLABLE, STANDING, Tabletop, UnreachableError
+from affordlib.world.trajectory import STEP_S
 from experiments import reported, runner
 from experiments.field_baselines import plan_cem
 from experiments.runner import FOLDER, Job, Rows, interval, open_once, plain
@@ -89,8 +89,9 @@ def plan_astar_fine(problem: PlanningProblem, heuristic: str = "goal") -> Plan:
     return plan_astar(problem, 72, FINE_PHASES, heuristic)
 
 
-VERSIONS: dict[Planner, int] = {plan_astar: 2, plan_astar_fine: 2}
-"""Versions of planners (default 1); raise one when a change of code changes its numbers."""
+VERSIONS = {plan_astar: 2, plan_astar_fine: 2, "astar": 3, "astar_full": 3}
+VERSIONS |= {"continuous": 2, "continuous_full": 2}
+"""Versions of planners or configs (default 1); raise one if a change of code changes its rows."""
 
 
 _PAPER = CHECKPOINT_SPECS["cnp_500"]
@@ -186,7 +187,7 @@ class PlannerConfig:
 
 ALL = {"sources": GOAL_SOURCES}
 CORRECTED, BY_PLAN = {"execution": {"corrections": 2}}, {"execution": {"by_plan": True}}
-RECEDING = {"execution": {"receding": True}}
+RECENTRED = {"modes": ("multi_partial",)}
 DISC = {"heuristic": "disc"}
 PERTURBED = {"model": "film_5000_perturbed", "world": "perturbed"}
 ROLLING, OUTSIDE = (PERTURBED | {"world": world} for world in ("perturbed_rollable", "outside"))
@@ -194,11 +195,11 @@ RATES = {"gradient": (0.03, 0.1, 0.3, 1.0, 3.0), "adam": (0.001, 0.005, 0.02)}
 """Rates of the paper's planner that are tried on the validation goals."""
 
 READINGS = {
-    "gradient_100": Reading(),
-    "gradient_starts_100": Reading(starts=4),
-    "gradient_circle_100": Reading(start="circle", rate=1.0),
-    "gradient_point_100": Reading("gradient", "circle", "point", rate=1.0),
-    "gradient_adam_100": Reading("adam", "circle", "point"),
+    "gradient": Reading(),
+    "gradient_starts": Reading(starts=4),
+    "gradient_circle": Reading(start="circle", rate=1.0),
+    "gradient_point": Reading("gradient", "circle", "point", rate=1.0),
+    "gradient_adam": Reading("adam", "circle", "point"),
 }
 """Readings of the paper's planner: as printed, the best of four starts, from the circle of 20 cm,
 from there until the point is still, the same with Adam."""
@@ -210,16 +211,20 @@ def _descent(reading: Reading, model: str = "cnp_500", samples: int = 100, **how
 
 
 PAPERS = ("gradient_100", "gradient_300", "astar_paper")
+NAMED, SAMPLES = ("gradient", "gradient_starts", "gradient_adam"), (100, 300)
 CONFIGS: dict[str, PlannerConfig] = {
     # The paper's planners on its own network. Each action is placed by the plan, as in the paper;
     # `_recentred`, at the object as it is then observed, which differs for several actions only.
-    **{f"{name}_pushes": _descent(how, **BY_PLAN) for name, how in READINGS.items()},
-    "gradient_100_uniform_pushes": _descent(Reading(), **BY_PLAN, sources=("uniform",)),
-    "gradient_300_pushes": _descent(Reading(), samples=300, **BY_PLAN),
     **{
-        f"gradient_100_recentred_{what}": _descent(Reading(), model, modes=("multi_partial",))
-        for what, model in (("pushes", "cnp_500"), ("cnp_mixed", "cnp_mixed"))
+        f"{name}_{samples}_pushes": _descent(how, samples=samples, **BY_PLAN)
+        for (name, how), samples in product(READINGS.items(), SAMPLES)
     },
+    "gradient_100_uniform_pushes": _descent(Reading(), **BY_PLAN, sources=("uniform",)),
+    **{
+        f"{name}_{samples}_recentred_pushes": _descent(READINGS[name], samples=samples, **RECENTRED)
+        for name, samples in product(NAMED, SAMPLES)
+    },
+    "gradient_100_recentred_cnp_mixed": _descent(Reading(), "cnp_mixed", **RECENTRED),
     "astar_paper_pushes": PlannerConfig(plan_astar, "cnp_500", **ALL),
     "astar_paper_recorded_pushes": PlannerConfig(plan_astar_recorded, "cnp_500", **ALL),
     # Our planner and A* on our best model.
@@ -234,10 +239,7 @@ CONFIGS: dict[str, PlannerConfig] = {
     "astar_disc": PlannerConfig(plan_astar, arguments=DISC, **ALL),
     "astar_disc_corrected": PlannerConfig(plan_astar, arguments=DISC, **CORRECTED, **ALL),
     "astar_disc_fine": PlannerConfig(plan_astar_fine, arguments=DISC, **ALL),
-    # A standard planner.
-    "cem": PlannerConfig(plan_cem, standing=True),
-    "mpc_cem": PlannerConfig(plan_cem, **RECEDING, standing=True),
-    "mpc_continuous": PlannerConfig(plan_continuous, **RECEDING, standing=True),
+    "cem": PlannerConfig(plan_cem, standing=True),  # a standard planner
     # Other networks, one of them recurrent.
     "continuous_cnp_500": PlannerConfig(plan_continuous, "cnp_500", **ALL),
     "continuous_film_500": PlannerConfig(plan_continuous, "film_500", **ALL),
@@ -265,13 +267,11 @@ CONFIGS: dict[str, PlannerConfig] = {
             replace(how, rate=rate), model, world="validation", **BY_PLAN
         )
         for name, model, how in (
-            ("gradient", "cnp_500", READINGS["gradient_100"]),
-            ("gradient_published", "cnp_published", READINGS["gradient_100"]),
-            ("circle", "cnp_500", READINGS["gradient_circle_100"]),
-            ("point", "cnp_500", READINGS["gradient_point_100"]),
-            ("adam", "cnp_500", READINGS["gradient_adam_100"]),
+            *((key.removeprefix("gradient_"), "cnp_500", how) for key, how in READINGS.items()),
+            ("gradient_published", "cnp_published", Reading()),
         )
         for rate in RATES[how.descent]
+        if how.starts == 1
     },
 }
 CONFIGS |= {
@@ -280,6 +280,11 @@ CONFIGS |= {
         f"{name}_{model}": replace(CONFIGS[f"{name}_pushes"], model=model, sources=("constructed",))
         for model in (*TRAINED, "cnp_published")
         for name in PAPERS
+    },
+    **{
+        f"{name}_{samples}{placed}_{model}": _descent(READINGS[name], model, samples, **how)
+        for name, samples, model in product(NAMED, SAMPLES, ("cnp_500_seed_1", "cnp_500_seed_2"))
+        for placed, how in (("", BY_PLAN), ("_recentred", RECENTRED))
     },
     **{
         f"fresh_{name}": replace(CONFIGS[name], world="fresh", sources=("constructed",))
@@ -316,14 +321,10 @@ def corrected(
             action = adapt_to_object(step.primitive, again.image)
             if not robot.can_reach(action, step.stop_phase, again.xy_m):
                 break
-            done = _joined(done, execute_plan(robot, first))
+            more = execute_plan(robot, first)
+            paths = done.object_paths_xy_m + more.object_paths_xy_m
+            done = replace(more, plan=done.plan, object_paths_xy_m=paths)
     return done
-
-
-def _joined(done: Outcome, more: Outcome) -> Outcome:
-    """Return the outcome of a plan and of further actions executed after it."""
-    paths = done.object_paths_xy_m + more.object_paths_xy_m
-    return replace(more, plan=done.plan, object_paths_xy_m=paths)
 
 
 def attempt(
@@ -333,19 +334,20 @@ def attempt(
     corrections: int = 0,
     n_averaged_images: int = 1,
     by_plan: bool = False,
-    receding: bool = False,
+    ticks: list[Tabletop] | None = None,
 ) -> Outcome:
     """Plan and execute one task; plan_for: makes the plan of (image, start_xy_m, goal, mode).
 
     corrections: largest number of single actions that correct the final position.
     n_averaged_images: number of images of which a position is the mean. by_plan: each action is
-    relative to the object's predicted position instead of the observed one. receding: after each
-    action, a new plan is made for the remaining number of actions (model-predictive control).
+    relative to the object's predicted position instead of the observed one. ticks, if given, gets
+    an element for each step of the simulation.
 
     The distance is the world's ground truth. If the arm cannot follow a plan, the distance after
     its last executed action counts.
     """
     world.place(task.obj, (0.0, 0.0), task.yaw_rad, config=task.config)
+    world.on_step = ticks.append if ticks is not None else None
     once, at_xy_m = PlanMode(1, partial=True), None
 
     def observe() -> Observation:
@@ -363,18 +365,9 @@ def attempt(
     seen = robot.observe()
     plan = plan_for(seen.image, seen.xy_m, task.goal, task.mode)
     at_xy_m = seen.xy_m
-    now = replace(plan, steps=plan.steps[:1]) if receding else plan
     try:
-        outcome = execute_plan(robot, now)
+        outcome = execute_plan(robot, plan)
         outcome = corrected(robot, outcome, lambda *q: plan_for(*q, once), corrections)
-        mode = MODES[task.mode]
-        for left in range(mode.max_steps - 1, 0, -1) if receding else ():
-            seen = robot.observe()
-            if task.goal.distance_m(seen.xy_m) <= ENOUGH_M:
-                break
-            again = plan_for(seen.image, seen.xy_m, task.goal, replace(mode, max_steps=left))
-            more = execute_plan(robot, replace(again, steps=again.steps[:1]))
-            outcome = replace(_joined(outcome, more), plan=plan)
     except UnreachableError as refused:
         outcome = refused.outcome
     end = world.object_pose()
@@ -412,8 +405,10 @@ def run_config(config: str) -> list[dict[str, Any]]:
     with Tabletop() as world:
         pose = about.pose()
         for k in tqdm(about.chosen(tasks), config, unit=" goals", leave=False):
-            outcome = attempt(world, tasks[k], lambda *q: planner(pose(*q)), **about.execution)
-            records.append({"task": k} | outcome_record(tasks[k], outcome))
+            how = about.execution | {"ticks": (ticks := [])}
+            outcome = attempt(world, tasks[k], lambda *q: planner(pose(*q)), **how)
+            record = outcome_record(tasks[k], outcome) | {"motion_s": STEP_S * len(ticks)}
+            records.append({"task": k} | record)
     return records
 
 
@@ -424,7 +419,8 @@ def job(config: str) -> Job:
     specs = [TRAINED[name] for name in names if name in TRAINED]
     settings += [(spec.network, spec.training) for spec in specs]
     files = tuple(name for name in names if name not in TRAINED)
-    data, version = tuple(spec.data for spec in specs), VERSIONS.get(about.planner, 1)
+    data = tuple(spec.data for spec in specs)
+    version = VERSIONS.get(config, VERSIONS.get(about.planner, 1))
     return Job(run_config, {"config": config}, settings, data, files, version)
 
 
@@ -481,8 +477,6 @@ VARIANTS = {
     if name.removesuffix(change) in {*CONFIGS} - {name}
 } | {
     "cem": "continuous",
-    "mpc_continuous": "continuous",
-    "mpc_cem": "mpc_continuous",
     "continuous_cnp_500": "continuous_film_500",
     "continuous_film_500": "continuous",
 }
@@ -492,7 +486,8 @@ VARIANTS = {
 def variant_rows(records: dict[str, Rows]) -> Rows:
     """Return paired differences of final distance for `VARIANTS`: mean [m] and interval.
 
-    They are on stable objects. difference_actions: that of the number of actions.
+    They are on stable objects. difference_actions: that of the number of actions;
+    difference_motion_s: that of the time that the robot moves, where it was measured.
     """
     rows: Rows = []
     for name, than in VARIANTS.items():
@@ -507,9 +502,12 @@ def variant_rows(records: dict[str, Rows]) -> Rows:
             about = {"planner": name, "than": than, "object_class": "standing", "goals": goals}
             about |= {"mode": mode, "n": len(by_m), "difference_mean_m": mean}
             about |= {"low_m": low, "high_m": high}
-            more = interval(pairs.actions_x - pairs.actions_y, 2000)
-            names = (f"difference_actions{end}" for end in ("", "_low", "_high"))
-            rows.append(about | dict(zip(names, more, strict=True)))
+            for what in ("actions", "motion_s"):
+                if not pairs.get(f"{what}_y", pd.Series([np.nan])).isna().any():
+                    more = interval(pairs[f"{what}_x"] - pairs[f"{what}_y"], 2000)
+                    names = (f"difference_{end}{what}" for end in ("", "low_", "high_"))
+                    about |= dict(zip(names, more, strict=True))
+            rows.append(about)
     return rows
 
 
@@ -535,20 +533,25 @@ def sigma_rows(records: dict[str, Rows]) -> Rows:
 
 
 def training_rows(records: dict[str, Rows]) -> Rows:
-    """Return Table 3 of the paper's planners on all objects: the mean, least and largest of the
-    mean distances with three trainings of its network.
+    """Return Table 3 of the paper's planners on all objects, by reading: the mean, least and
+    largest of the mean distances with three trainings of its network, and the mean of the medians.
     """
     rows: Rows = []
-    for model, planner in product(("cnp_500", "cnp_mixed"), PAPERS):
+    placed = product(NAMED, ("", "_recentred"), SAMPLES)
+    planners = [f"{name}_{samples}{where}" for name, where, samples in placed] + ["astar_paper"]
+    for model, planner in product(("cnp_500", "cnp_mixed"), planners):
         first = f"{planner}_{model}".replace("_cnp_500", "_pushes")
         names = [first, *(f"{planner}_{model}_seed_{k}" for k in (1, 2))]
-        some = pd.concat([pd.DataFrame(records[n]).assign(by=n) for n in names if n in records])
+        if not set(names) <= set(records):
+            continue
+        some = pd.concat([pd.DataFrame(records[n]).assign(by=n) for n in names])
         some = some[some["goals"] == "constructed"].groupby(["mode", "by"])["distance_m"]
-        n = some.size().unstack().min(axis=1)[[*MODES]]
+        n = some.size().unstack().min(axis=1).reindex(MODES).dropna().astype(int)
         row = {"planner": planner, "network": model, "n": ", ".join(map(str, n))}
         for mode, each in some.mean().unstack().iterrows():
             ends = zip(("mean", "low", "high"), each.agg(["mean", "min", "max"]), strict=True)
             row |= {f"{mode}_{name}_m": value for name, value in ends}
+            row[f"{mode}_median_m"] = some.median().unstack().loc[mode].mean()
         rows.append(row)
     return plain(rows)
 

@@ -11,6 +11,7 @@ from affordlib.planning.continuous import plan_continuous
 from affordlib.planning.effect_map import EffectMap, make_steps, roll_out
 from affordlib.planning.free_space import FreeSpace, corners_of, gaps_m, placed
 from affordlib.planning.gradient import Reading, descend, plan_gradient
+from affordlib.planning.grasp_rotate import predict_trajectories
 from affordlib.planning.problem import MODES, PlanMode, Planner, PlanningProblem
 from affordlib.planning.robot import Execution, Robot
 from affordlib.planning.skills import Skills

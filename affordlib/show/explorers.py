@@ -30,7 +30,6 @@ from affordlib.types import (
 from affordlib.world import Tabletop
 
 CHANNELS = {"action": ACTION_CHANNELS, "effect": EFFECT_CHANNELS}
-N_TARGETS = 25
 BLACK = "#222222"
 _SCRIPT = Path(__file__).with_name("explorer.js")
 
@@ -138,7 +137,7 @@ def conditioning_explorer(
 
     given = [tuple(map(torch.Tensor, (t, values(of, t)))) for of, t in context.items()]
     observed = Observations.of(model, *given, torch.Tensor(states[:, 2]))
-    t = np.linspace(0, 1, N_TARGETS)
+    t = np.linspace(0, 1, 25)
     with torch.no_grad():
         features = model.encode(torch.Tensor(seen.image)[None]).expand(len(states), -1)
         found = model.predict(features, observed, torch.Tensor(t).expand(len(states), -1))
