@@ -23,19 +23,16 @@ const GROWS = 1500; // time in which a search is drawn [ms]
 
 const between = (low, value, high) => Math.max(low, Math.min(high, value));
 const share = (a, b, t) => a + (b - a) * t;
+const plus = ([x, y], [u, v]) => [x + u, y + v];
+const minus = ([x, y], [u, v]) => [x - u, y - v];
 const apart = ([x, y], [u, v]) => Math.hypot(x - u, y - v);
 const farthest = (corners, from = [0, 0]) => Math.max(...corners.map((at) => apart(at, from)));
-const beyond = ([x, y], direction, far) =>
-  [x + far * Math.cos(direction), y + far * Math.sin(direction)];
 const rotated = ([x, y], angle) => {
   const [c, s] = [Math.cos(angle), Math.sin(angle)];
   return [c * x - s * y, s * x + c * y];
 };
-const placed = (outline, [x, y, yaw]) =>
-  outline.map((corner) => {
-    const [u, v] = rotated(corner, yaw);
-    return [x + u, y + v];
-  });
+const beyond = (at, direction, far) => plus(at, rotated([far, 0], direction));
+const placed = (outline, pose) => outline.map((corner) => plus(pose, rotated(corner, pose[2])));
 
 // The row at a place between two rows.
 function blend(rows, place) {
@@ -44,10 +41,8 @@ function blend(rows, place) {
   return rows[k].map((value, axis) => share(value, next[axis], place - k));
 }
 
-function decoded(text, Type) {
-  const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
-  return new Type(bytes.buffer);
-}
+const decoded = (text, Type) =>
+  new Type(Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0)).buffer);
 
 // Effects of an action, ahead, to the left, turn, and their σ, over direction and phase: the cubic
 // B-spline of Python's EffectMap, from its numbers.
@@ -121,8 +116,7 @@ export function rollOut({ map, yaw }, pose, chain, uncertain = false) {
       [cx, cy] = [kept * (cx + turnVariance * sx), kept * (cy + turnVariance * sy)];
       turnVariance = kept ** 2 * turnVariance + effect[5] ** 2;
     }
-    const [dx, dy] = rotated(effect, direction);
-    const end = [from[0] + dx, from[1] + dy, from[2] + effect[2]];
+    const end = [...plus(from, rotated(effect, direction)), from[2] + effect[2]];
     steps.push({ direction, stop, from, end, std: Math.sqrt(variance) });
     from = end;
   }
@@ -134,14 +128,10 @@ export const stepsOf = ({ object, pose }, chain) =>
   rollOut(object, pose, chain, true).map((step) => ({ ...step, path: pathOf(object, step) }));
 
 // Poses of the object along an action, from its pose before it.
-export function pathOf({ map, yaw }, { from, direction, stop }, samples = PATH_SAMPLES) {
-  const first = Math.min(map.from, stop);
-  return Array.from({ length: samples }, (_, k) => {
-    const phase = share(first, stop, k / (samples - 1));
-    const effect = map.at(direction - from[2] + yaw, phase);
-    const [dx, dy] = rotated(effect, direction);
-    return [from[0] + dx, from[1] + dy, from[2] + effect[2]];
-  });
+export function pathOf(object, { from, direction, stop }, samples = PATH_SAMPLES) {
+  const first = Math.min(object.map.from, stop);
+  return Array.from({ length: samples }, (_, k) =>
+    rollOut(object, from, [direction, share(first, stop, k / (samples - 1))])[0].end);
 }
 
 // Where the hand is at a phase, ahead of the object's place before the action, and its opening.
@@ -156,10 +146,8 @@ export function reachability({ layers, primitives, threshold }, primitive) {
     let values = [2 * x, 2 * y, Math.cos(direction), Math.sin(direction), ...hot];
     for (const [inputs, weights] of read) {
       const outputs = weights.length / (inputs + 1);
-      const next = Array.from(weights.subarray(inputs * outputs)); // the biases
-      for (let o = 0; o < outputs; o++) {
-        for (let i = 0; i < inputs; i++) next[o] += weights[o * inputs + i] * values[i];
-      }
+      const next = Array.from(weights.subarray(inputs * outputs), (bias, o) =>
+        values.reduce((sum, value, i) => sum + weights[o * inputs + i] * value, bias));
       values = outputs > 1 ? next.map(Math.tanh) : next;
     }
     return 1 / (1 + Math.exp(-values[0])) >= threshold;
@@ -179,13 +167,11 @@ const box = (w, h) => [[-w, -h], [w, -h], [w, h], [-w, h]];
 const middleOf = (corners) =>
   [0, 1].map((axis) => corners.reduce((sum, at) => sum + at[axis], 0) / corners.length);
 
-function normals(corners) {
-  return corners.map(([ax, ay], k) => {
-    const [bx, by] = corners[(k + 1) % corners.length];
-    const long = Math.hypot(bx - ax, by - ay) || 1;
-    return [(by - ay) / long, (ax - bx) / long];
-  });
-}
+const normals = (corners) => corners.map((corner, k) => {
+  const [x, y] = minus(corners[(k + 1) % corners.length], corner);
+  const long = Math.hypot(x, y) || 1;
+  return [y / long, -x / long];
+});
 
 // Gap between an obstacle and what a shape sweeps between two poses, as in Python's FreeSpace: the
 // largest separation along the normals of all; negative where they overlap, at most about FAR.
@@ -230,8 +216,7 @@ export function spare(problem, from, direction, stop) {
     ? [0, stop].map((phase) =>
         [...beyond(from, direction, handAt(object.hand, phase)[0]), direction])
     : [path[0], path[POSES - 1]].map(([x, y]) => [x, y, grip + from[2] - object.yaw]);
-  const sweeps = path.map((at, k) =>
-    [object.seen, radius, at, path[Math.min(k + 1, POSES - 1)], at]);
+  const sweeps = path.map((at, k) => [object.seen, radius, at, path[k + 1] ?? at, at]);
   sweeps.unshift([box(...size), Math.hypot(...size), ...hands, path[0]]);
   let worst = Infinity;
   for (const [shape, long, a, b, at] of sweeps) {
@@ -281,11 +266,11 @@ function startsOf({ object, pose, goal, partial = true, obstacles = [], quick },
       const phase = partial ? 0.5 + 0.5 * halton(i, [3, 7][k % 2]) : 1;
       chain.push(bearing + spread * (2 * halton(i, [2, 5][k % 2]) - 1), phase);
     }
-    const [x, y, yaw] = rollOut(object, pose, chain).at(-1)?.end ?? pose;
+    const end = rollOut(object, pose, chain).at(-1)?.end ?? pose;
     // A single action begins around the one that ends nearest.
     const off = n > 1 ? [0, 0] : [0.02 * (halton(i, 2) - 0.5), 0.02 * (halton(i, 3) - 0.5)];
-    const turn = yaw - object.yaw;
-    const left = rotated([goal[0] - x + off[0], goal[1] - y + off[1]], -turn);
+    const turn = end[2] - object.yaw;
+    const left = rotated(plus(minus(goal, end), off), -turn);
     const [direction, phase] = object.map.nearest(...left, partial);
     starts.push([...chain, direction + turn, phase]);
   }
@@ -300,31 +285,28 @@ function bestChain(problem, n) {
     const cost = distance + Math.sqrt(distance ** 2 + risk * std ** 2) + ACTION_COST * n;
     return { chain, distance, cost };
   };
-  const byCost = (a, b) => a.cost - b.cost;
-  const sorted = (chains) => chains.map(weighed).sort(byCost);
+  const sorted = (all) => all.sort((a, b) => a.cost - b.cost);
   const allowed = ({ chain }) => isAllowed(problem, chain);
-  const corrected = (all, rounds) => all.map(({ chain }) => correct(problem, chain, rounds));
+  const corrected = (all, rounds) =>
+    all.map(({ chain }) => weighed(correct(problem, chain, rounds)));
   const few = [];
-  for (const start of sorted(startsOf(problem, n))) {
+  for (const start of sorted(startsOf(problem, n).map(weighed))) {
     if (few.length < REFINED && allowed(start)) few.push(start);
   }
-  const options = sorted([...few.map(({ chain }) => chain), ...corrected(few)]);
+  const options = [...few, ...corrected(few)];
   if (previous?.length === 2 * n && (partial || previous.every((v, k) => k % 2 === 0 || v === 1))) {
     const kept = weighed(correct(problem, previous));
     options.push({ ...kept, cost: kept.cost - LOYALTY });
-    options.sort(byCost);
   }
-  const best = options.find(allowed);
+  const best = sorted(options).find(allowed);
   if (!best || best.distance < NEAR_ENOUGH) return best;
-  return sorted([best.chain, ...corrected(options.slice(0, REFINED), 40)]).find(allowed);
+  const others = corrected(options.slice(0, REFINED), 40);
+  return sorted([weighed(best.chain), ...others]).find(allowed);
 }
 
 // Newton's method on the end of a chain; of all solutions the smallest change.
 export function correct({ object, pose, goal, partial = true }, start, rounds = CORRECTIONS) {
-  const off = (chain) => {
-    const { end } = rollOut(object, pose, chain).at(-1);
-    return [goal[0] - end[0], goal[1] - end[1]];
-  };
+  const off = (chain) => minus(goal, rollOut(object, pose, chain).at(-1).end);
   const scale = (k) => (k % 2 ? 0.5 : 1); // half the phase moves the end about as far as a radian
   let [chain, left] = [start, off(start)];
   for (let round = 0; round < rounds && Math.hypot(...left) > 1e-5; round++) {
