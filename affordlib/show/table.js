@@ -23,6 +23,7 @@ const GROWS = 1500; // time in which a search is drawn [ms]
 
 const between = (low, value, high) => Math.max(low, Math.min(high, value));
 const share = (a, b, t) => a + (b - a) * t;
+const bearing = ([x, y], [u, v]) => Math.atan2(v - y, u - x);
 const plus = ([x, y], [u, v]) => [x + u, y + v];
 const minus = ([x, y], [u, v]) => [x - u, y - v];
 const apart = ([x, y], [u, v]) => Math.hypot(x - u, y - v);
@@ -257,14 +258,14 @@ function halton(i, base) {
 }
 
 function startsOf({ object, pose, goal, partial = true, obstacles = [], quick }, n) {
-  const bearing = Math.atan2(goal[1] - pose[1], goal[0] - pose[0]);
+  const ahead = bearing(pose, goal);
   const starts = [];
   for (let i = 1; i <= (obstacles.length && !quick ? 3 : 1) * STARTS; i++) {
     const spread = obstacles.length && i % 2 ? Math.PI : SPREAD; // half of them make a detour
     const chain = [];
     for (let k = 0; k < n - 1; k++) {
       const phase = partial ? 0.5 + 0.5 * halton(i, [3, 7][k % 2]) : 1;
-      chain.push(bearing + spread * (2 * halton(i, [2, 5][k % 2]) - 1), phase);
+      chain.push(ahead + spread * (2 * halton(i, [2, 5][k % 2]) - 1), phase);
     }
     const end = rollOut(object, pose, chain).at(-1)?.end ?? pose;
     // A single action begins around the one that ends nearest.
@@ -300,8 +301,7 @@ function bestChain(problem, n) {
   }
   const best = sorted(options).find(allowed);
   if (!best || best.distance < NEAR_ENOUGH) return best;
-  const others = corrected(options.slice(0, REFINED), 40);
-  return sorted([weighed(best.chain), ...others]).find(allowed);
+  return sorted([weighed(best.chain), ...corrected(options.slice(0, REFINED), 40)]).find(allowed);
 }
 
 // Newton's method on the end of a chain; of all solutions the smallest change.
@@ -350,11 +350,10 @@ function isAllowed({ object, pose, reachable, table, space }, chain) {
 
 // From here on: the drawing.
 
-const STAR = Array.from({ length: 10 }, (_, k) => {
-  const radius = k % 2 ? 0.4 : 1;
-  return [radius * Math.sin((k * Math.PI) / 5), radius * Math.cos((k * Math.PI) / 5)];
-});
+const STAR = Array.from({ length: 10 }, (_, k) =>
+  beyond([0, 0], (k / 10 + 1 / 4) * TURN, k % 2 ? 0.4 : 1));
 const KEYS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
+const CHANGES = { "+": "larger", "-": "smaller", Delete: "remove" }; // buttons, by key
 const AROUND = [[1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, 1], [1, -1], [-1, -1]];
 const APPROACH = 0.45; // seconds that the hand takes to come down, and to leave
 const [HIGH, LOW] = [0.1375, 0.0125]; // heights of a hand that is not seen, and fully [m]
@@ -366,28 +365,23 @@ const escaped = (text) =>
 
 const DISC = { corners: [[0, 0]], radius: 0.02, height: 0.06 };
 const BOX = { corners: box(0.025, 0.02), radius: 0, height: 0.06 };
-const changed = (one, act) => ({ ...one, corners: one.corners.map((at) => at.map(act)) });
-const shifted = (one, by) => changed(one, (value, axis) => value + by[axis]);
-const sizeKnob = (one) =>
-  cornersOf(one).reduce((best, at) => (at[0] + at[1] > best[0] + best[1] ? at : best));
+const shifted = (one, by) => ({ ...one, corners: one.corners.map((at) => plus(at, by)) });
+const sizeKnob = (one) => cornersOf(one).toSorted((a, b) => b[0] + b[1] - (a[0] + a[1]))[0];
 
 function resized(one, by) {
   if (one.radius) return { ...one, radius: between(0.006, one.radius * by, 0.12) };
   const middle = middleOf(one.corners);
-  return changed(one, (value, axis) => middle[axis] + (value - middle[axis]) * by);
+  const resize = (at) => at.map((value, axis) => share(middle[axis], value, by));
+  return { ...one, corners: one.corners.map(resize) };
 }
-
-// What takes the place of an obstacle, by the key that is pressed.
-const CHANGES = {
-  "+": (one) => [resized(one, 1.2)],
-  "-": (one) => [resized(one, 1 / 1.2)],
-  Delete: () => [],
-};
 
 function shape(tag, css, attributes, inside = "") {
   const said = Object.entries(attributes).map(([name, value]) => ` ${name}="${escaped(value)}"`);
   return `<${tag} class="${css}"${said.join("")}>${inside}</${tag}>`;
 }
+
+const rectangle = (css, x, y, width, height, rx) =>
+  shape("rect", css, { x, y, width, height, rx });
 
 // state: {object, pose, goal {xy, yaw, tolerance}, steps, other (steps to compare with), obstacles,
 // ring, trail, marks (what moved by itself: [from, to]), searched, since (when), sigma, swept, note
@@ -402,9 +396,9 @@ export class Table {
     this.held = this.tapped = this.chosen = null;
     el.classList.add("affordlib-table");
     el.dataset.lmSuppressShortcuts = "true"; // JupyterLab's own, while this has the focus
-    el.innerHTML = '<svg role="application" tabindex="0"></svg>';
+    el.innerHTML = '<svg role="application" tabindex="0"></svg><div class="tools"></div>';
     this.svg = el.firstChild;
-    el.append(this.tools());
+    this.tools(el.lastChild);
     const acts = {
       pointerdown: (event) => this.pressed(event),
       pointermove: (event) => this.held && this.move(this.place(event), false),
@@ -417,39 +411,35 @@ export class Table {
   }
 
   // Buttons that add, change and remove obstacles, for mouse, touch and keyboard.
-  tools() {
-    const acts = {
+  tools(row) {
+    this.acts = {
       "+ disc": () => this.add(DISC),
       "+ box": () => this.add(BOX),
-      larger: () => this.change(CHANGES["+"]),
-      smaller: () => this.change(CHANGES["-"]),
-      remove: () => this.change(CHANGES.Delete),
+      larger: () => this.change((one) => resized(one, 1.2)),
+      smaller: () => this.change((one) => resized(one, 1 / 1.2)),
+      remove: () => this.change(() => []),
     };
-    const row = document.createElement("div");
-    row.className = "tools";
-    row.innerHTML = Object.keys(acts).map((name) =>
+    row.innerHTML = Object.keys(this.acts).map((name) =>
       `<button type="button" aria-label="obstacle: ${name}">${name}</button>`).join("");
-    row.addEventListener("click", ({ target }) => acts[target.textContent]?.());
-    return row;
+    row.addEventListener("click", ({ target }) => this.acts[target.textContent]?.());
   }
 
   // Add an obstacle between object and goal, beside those that are there.
   add(one) {
     const { obstacles, pose, goal: { xy } } = this.state;
     const [row, side] = [Math.floor(obstacles.length / 2), obstacles.length % 2 ? -1 : 1];
-    const ahead = Math.atan2(xy[1] - pose[1], xy[0] - pose[0]);
-    const at = placed([[0.06 * row, 0.09 * side]], [...middleOf([pose, xy]), ahead])[0];
+    const middle = [...middleOf([pose, xy]), bearing(pose, xy)];
+    const [at] = placed([[0.06 * row, 0.09 * side]], middle);
     this.chosen = obstacles.length;
     this.heard.obstacles([...obstacles, shifted(one, at)], true);
   }
 
-  // Replace the chosen obstacle by others.
+  // Replace the chosen obstacle by another, or by [].
   change(act, final = true) {
-    const all = [...this.state.obstacles];
-    if (!all[this.chosen]) return;
-    const others = act(all[this.chosen]);
-    all.splice(this.chosen, 1, ...others);
-    if (!others.length) this.chosen = null;
+    const { obstacles } = this.state;
+    if (!obstacles[this.chosen]) return;
+    const all = obstacles.flatMap((one, k) => (k === this.chosen ? act(one) : one));
+    if (all.length < obstacles.length) this.chosen = null;
     this.heard.obstacles(all, final);
   }
 
@@ -462,10 +452,9 @@ export class Table {
   frame() {
     const { pose, goal, steps, object, obstacles, trail } = this.state;
     if (!object) return;
-    const seen = [pose, goal.xy, ...trail, ...obstacles.flatMap(cornersOf)];
-    for (const { from, end, direction } of steps) {
-      seen.push(end, beyond(from, direction ?? 0, -0.07));
-    }
+    const ends = steps.flatMap(({ from, end, direction }) =>
+      [end, beyond(from, direction ?? 0, -0.07)]);
+    const seen = [pose, goal.xy, ...ends, ...trail, ...obstacles.flatMap(cornersOf)];
     const [width, height] = this.size();
     const room = this.held ? 0.015 : farthest(object.outline) + 0.035;
     if (this.held) {
@@ -587,6 +576,7 @@ export class Table {
     const { state } = this;
     if (!state.object || !this.camera) return;
     const { pose, goal, steps, other, obstacles, trail, live } = state;
+    const knob = beyond(this.ahead(pose, 1.25), pose[2], 10 / this.scale);
     const end = steps.at(-1)?.end ?? pose;
     const short = apart(end, goal.xy);
     const missed = short > goal.tolerance && !state.planning;
@@ -596,7 +586,7 @@ export class Table {
     const shapes = [
       this.ground(),
       ...obstacles.map((one, k) => this.obstacle(one, k)),
-      state.swept && steps.length && this.swept(),
+      ...steps.flatMap(({ path }) => path.map((at) => state.swept && this.outline(at, "swept"))),
       state.searched.length && !live && this.tried(),
       ...other.flatMap(({ path, end }) => [this.line(path, "other"), this.outline(end, "other")]),
       ...state.marks.map((mark) => this.line(mark, "mark")),
@@ -610,7 +600,7 @@ export class Table {
       this.outline(standing, lift ? "object lifted" : "object", handle, 1 + 3 * lift),
       this.line([standing, this.ahead(standing, 0.5)], "heading"),
       this.goal(end, missed),
-      this.heard.pose && !live && this.knob(pose),
+      this.heard.pose && !live && this.knob("yaw", knob, 22 / this.scale, 6 / this.scale),
       live && this.hand(live.hand),
       ...(live || this.held ? [] : steps.map((step) => this.arrow(step))),
       shape("g", "labels", {}, this.labels(missed ? short : 0)),
@@ -631,15 +621,7 @@ export class Table {
     const chosen = k === this.chosen;
     const more = { points: this.points(cornersOf(one)), "data-handle": `obstacle ${k}` };
     const body = shape("polygon", chosen ? "obstacle chosen" : "obstacle", more);
-    const knob = (css, radius) =>
-      this.disc(sizeKnob(one), css, radius, { "data-handle": `size ${k}` });
-    return chosen ? body + knob("grip", 0.012) + knob("turner", 0.004) : body;
-  }
-
-  swept() {
-    const { steps, object } = this.state;
-    const all = steps.flatMap(({ path }) => path.map((at) => placed(object.outline, at)));
-    return shape("path", "swept", { d: all.map((one) => `M${this.points(one)}Z`).join("") });
+    return chosen ? body + this.knob(`size ${k}`, sizeKnob(one), 0.012, 0.004) : body;
   }
 
   ground() {
@@ -651,24 +633,21 @@ export class Table {
     const [w, step] = [(half * width) / height, 0.05];
     for (let x = Math.ceil((cx - w) / step) * step; x < cx + w; x += step) {
       for (let y = Math.ceil((cy - half) / step) * step; y < cy + half; y += step) {
-        const [u, v] = this.at([x, y]).map((value) => value.toFixed(1));
-        shapes.push(shape("circle", "dot", { cx: u, cy: v, r: 1 }));
+        shapes.push(this.disc([x, y], "dot", 1 / this.scale));
       }
     }
     return shapes.join("");
   }
 
   goal(end, missed) {
-    const { goal } = this.state;
-    const [u, v] = this.at(goal.xy);
-    const size = between(9, 0.012 * this.scale, 15);
-    const star = STAR.map(([x, y]) => `${(u + size * x).toFixed(1)},${(v - size * y).toFixed(1)}`);
-    const css = goal.yaw == null ? "place" : "place turned";
+    const { xy, yaw, tolerance } = this.state.goal;
+    const size = between(9 / this.scale, 0.012, 15 / this.scale);
+    const points = this.points(STAR.map((corner) => plus(xy, corner.map((v) => size * v))));
     return shape("g", "wanted", { "data-handle": "goal" }, [
-      shape("circle", "grip", { cx: u, cy: v, r: 28 }),
-      this.outline([...goal.xy, goal.yaw ?? end[2]], css),
-      this.disc(goal.xy, "tolerance", goal.tolerance),
-      shape("polygon", missed ? "goal missed" : "goal", { points: star.join(" ") }),
+      this.disc(xy, "grip", 28 / this.scale),
+      this.outline([...xy, yaw ?? end[2]], yaw == null ? "place" : "place turned"),
+      this.disc(xy, "tolerance", tolerance),
+      shape("polygon", missed ? "goal missed" : "goal", { points }),
     ].join(""));
   }
 
@@ -676,13 +655,10 @@ export class Table {
     return beyond(pose, pose[2], part * farthest(this.state.object.outline));
   }
 
-  knob(pose) {
-    const [a, b] = [this.at(pose), this.at(this.ahead(pose, 1.25))];
-    const more = 10 / apart(a, b);
-    const [cx, cy] = b.map((value, k) => (value + (value - a[k]) * more).toFixed(1));
-    const grip = shape("circle", "grip", { cx, cy, r: 22 });
-    const turner = shape("circle", "turner", { cx, cy, r: 6 });
-    return shape("g", "knob", { "data-handle": "yaw" }, grip + turner);
+  // What turns or resizes, with the radii of what is grabbed and seen.
+  knob(handle, at, grip, seen) {
+    const discs = this.disc(at, "grip", grip) + this.disc(at, "turner", seen);
+    return shape("g", "knob", { "data-handle": handle }, discs);
   }
 
   // How what is drawn around (0, 0), to the right, gets to a place and a direction.
@@ -693,16 +669,11 @@ export class Table {
   hand({ gap, direction, from, near }) {
     const wide = Math.max(gap / 2, 0.006);
     const s = this.scale * share(1.25, 1, near);
-    const part = (css, ...numbers) => {
-      const [x, y, width, height, rx] = numbers.map((value) => value * s);
-      return shape("rect", css, { x, y, width, height, rx });
-    };
-    const parts = [part("palm", -0.05, -(wide + 0.02), 0.032, 2 * (wide + 0.02), 0.008)];
-    for (const side of [-wide, wide]) {
-      parts.push(part("finger", -0.022, side - 0.009, 0.022, 0.018, 0.004));
-    }
-    const transform = this.towards(from, direction);
-    return shape("g", "hand", { transform, opacity: near.toFixed(2) }, parts.join(""));
+    const part = (css, ...numbers) => rectangle(css, ...numbers.map((value) => value * s));
+    const palm = part("palm", -0.05, -(wide + 0.02), 0.032, 2 * (wide + 0.02), 0.008);
+    const finger = (side) => part("finger", -0.022, side - 0.009, 0.022, 0.018, 0.004);
+    const about = { transform: this.towards(from, direction), opacity: near.toFixed(2) };
+    return shape("g", "hand", about, palm + finger(-wide) + finger(wide));
   }
 
   // Where an action begins to push, outside the object.
@@ -757,8 +728,7 @@ export class Table {
     const rim = [between(x - w, u, x + w), between(y - h, v, y + h)];
     const leader = apart(rim, [u, v]) > 45
       ? shape("path", "leader", { d: `M${rim.join(" ")}L${u} ${v}` }) : "";
-    const size = { width: 2 * w, height: 2 * h, rx: h };
-    const plate = shape("rect", "plate", { x: x - w, y: y - h, ...size });
+    const plate = rectangle("plate", x - w, y - h, 2 * w, 2 * h, h);
     const words = shape("text", "", { x, y: y + 4.5 }, escaped(text));
     return leader + shape("g", css, {}, plate + words);
   }
@@ -785,8 +755,7 @@ export class Table {
     const [kind, number] = this.held.split(" ");
     this.chosen = number ? Number(number) : null;
     const middle = { object: pose, obstacle: number && middleOf(obstacles[number].corners) }[kind];
-    // From the pointer to the middle of what it holds.
-    this.grip = middle ? [middle[0] - at[0], middle[1] - at[1]] : [0, 0];
+    this.grip = middle ? minus(middle, at) : [0, 0]; // from the pointer to what it holds
     this.svg.setPointerCapture(event.pointerId);
     this.svg.classList.add("by-pointer"); // focused so, it needs no frame
     this.svg.focus({ preventScroll: true });
@@ -803,20 +772,16 @@ export class Table {
 
   move(at, final) {
     this.last = at;
-    const { pose, obstacles } = this.state;
-    const [x, y] = at.map((value, k) => between(-LIMIT, value + this.grip[k], LIMIT));
-    const [name, k] = this.held.split(" ");
-    if (name === "goal") this.aim([x, y], final);
-    else if (name === "object") this.heard.pose([x, y, pose[2]], final);
-    else if (name === "yaw") {
-      const yaw = Math.atan2(at[1] - pose[1], at[0] - pose[0]);
-      this.heard.pose([pose[0], pose[1], yaw], final);
-    } else {
-      const [one, [u, v]] = [obstacles[k], middleOf(obstacles[k].corners)];
-      const by = apart([x, y], [u, v]) / apart(sizeKnob(one), [u, v]);
-      const other = name === "size" ? resized(one, by) : shifted(one, [x - u, y - v]);
-      this.change(() => [other], final);
-    }
+    const [x, y, yaw] = this.state.pose;
+    const to = plus(at, this.grip).map((value) => between(-LIMIT, value, LIMIT));
+    if (this.held === "goal") this.aim(to, final);
+    else if (this.held === "object") this.heard.pose([...to, yaw], final);
+    else if (this.held === "yaw") this.heard.pose([x, y, bearing([x, y], at)], final);
+    else this.change((one) => {
+      const middle = middleOf(one.corners);
+      if (this.held.startsWith("obstacle")) return shifted(one, minus(to, middle));
+      return resized(one, apart(to, middle) / apart(sizeKnob(one), middle));
+    }, final);
   }
 
   // Ask for a goal, in whole millimetres on the table.
@@ -832,12 +797,12 @@ export class Table {
     const { goal, pose, obstacles } = this.state;
     const one = obstacles[this.chosen];
     const by = KEYS[key]?.map((way) => way * (shiftKey ? 0.001 : 0.01));
-    if (one && by) this.change(() => [shifted(one, by)]);
-    else if (one && key in CHANGES) this.change(CHANGES[key]);
+    if (one && by) this.change(() => shifted(one, by));
+    else if (one && key in CHANGES) this.acts[CHANGES[key]]();
     else if (one && key === "Escape") {
       this.chosen = null;
       this.draw();
-    } else if (by) this.aim([goal.xy[0] + by[0], goal.xy[1] + by[1]], true);
+    } else if (by) this.aim(plus(goal.xy, by), true);
     else if (this.heard.pose && "qe".includes(key)) {
       this.heard.pose([pose[0], pose[1], pose[2] + (key === "q" ? 0.0873 : -0.0873)], true);
     } else if (key === "Enter" || key === "Escape") this.heard.press(key);
@@ -862,35 +827,29 @@ function moveBodies([name, numbers], row) {
 
 // A view of Python's widget: while a hand drags, the browser plans; when it lets go, Python does.
 function render({ model, el }) {
-  let [number, chain, item, reachable] = [0, [], null, null];
-  let [recorded, bodies, began, timer] = [[], [], 0, null];
+  let [number, chain, recorded, bodies, began, timer] = [0, [], [], [], 0, null];
 
-  function draft(xy, obstacles) {
-    const { pose, goal: { tolerance }, running } = model.get("scene");
-    if (running || !item) return view.state.steps;
-    const { table } = model.get("table");
-    const query = { object: item, pose, goal: xy, tolerance, obstacles, reachable, table };
-    const planned = plan({ ...query, previous: chain, quick: true });
-    chain = planned.chain;
-    return planned.steps;
+  function draft(changes, final, ...wanted) {
+    const { object, pose, goal: { xy, tolerance }, obstacles } = { ...view.state, ...changes };
+    if (object && !model.get("scene").running) {
+      const query = { object, pose, goal: xy, tolerance, obstacles, reachable: object.reachable };
+      const { table } = model.get("table");
+      ({ chain, steps: changes.steps } = plan({ ...query, table, previous: chain, quick: true }));
+    }
+    view.set(changes);
+    if (!final) return;
+    model.set(...wanted);
+    model.save_changes(); // ipywidgets sends the next one when this one has been processed
   }
 
   const view = new Table(el, {
     goal(xy, final) {
       number = Math.max(number, model.get("wanted")[2]) + 1;
       Object.assign(view.svg.dataset, { query: number, draft: true });
-      const { goal, obstacles } = view.state;
-      view.set({ goal: { ...goal, xy }, steps: draft(xy, obstacles), searched: [] });
-      if (!final) return;
-      model.set("wanted", [...xy, number]);
-      model.save_changes(); // ipywidgets sends the next one when this one has been processed
+      const changes = { goal: { ...view.state.goal, xy }, searched: [] };
+      draft(changes, final, "wanted", [...xy, number]);
     },
-    obstacles(all, final) {
-      view.set({ obstacles: all, steps: draft(view.state.goal.xy, all) });
-      if (!final) return;
-      model.set("obstacles", all);
-      model.save_changes();
-    },
+    obstacles: (all, final) => draft({ obstacles: all }, final, "obstacles", all),
     press: (key) => model.send({ press: key === "Enter" ? "run" : "stop" }),
   });
   const scrub = document.createElement("input");
@@ -903,10 +862,9 @@ function render({ model, el }) {
     const { map, ...about } = model.get("object");
     if (!map) return; // nothing has been planned yet
     const { reach, ring, seconds } = model.get("table");
-    item = { ...about, seconds, map: new EffectMap(map) };
-    reachable = reach && reachability(reach, map.primitive);
+    const reachable = reach && reachability(reach, map.primitive);
     chain = [];
-    view.set({ object: item, ring });
+    view.set({ object: { ...about, seconds, reachable, map: new EffectMap(map) }, ring });
   }
 
   function show() {
@@ -936,8 +894,7 @@ function render({ model, el }) {
     const frame = (now) => {
       const { pace, running } = model.get("scene");
       const last = recorded.length - 1;
-      // A frame's time may lie a little before the message's.
-      const place = still() ? last : between(0, (now - began) / (1000 * pace), last);
+      const place = still() ? last : Math.min((now - began) / (1000 * pace), last);
       at(place);
       const waits = place >= last;
       if (waits) began = now - 1000 * pace * last; // for what is simulated next
