@@ -355,7 +355,6 @@ const STAR = Array.from({ length: 10 }, (_, k) =>
 const KEYS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
 const CHANGES = { "+": "larger", "-": "smaller", Delete: "remove" }; // buttons, by key
 const AROUND = [[1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, 1], [1, -1], [-1, -1]];
-const APPROACH = 0.45; // seconds that the hand takes to come down, and to leave
 const [HIGH, LOW] = [0.1375, 0.0125]; // heights of a hand that is not seen, and fully [m]
 const LETTER = 7.5; // width of a letter of a label [px]
 
@@ -434,7 +433,7 @@ export class Table {
     this.heard.obstacles([...obstacles, shifted(one, at)], true);
   }
 
-  // Replace the chosen obstacle by another, or by [].
+  // Replace the chosen obstacle by another, or by none: [].
   change(act, final = true) {
     const { obstacles } = this.state;
     if (!obstacles[this.chosen]) return;
@@ -506,26 +505,6 @@ export class Table {
     return [x + right / this.scale, y - down / this.scale];
   }
 
-  // The execution as it is predicted: a motion for `replay`, with a row every so many seconds.
-  predicted(every) {
-    const { steps, object: { map, hand, seconds } } = this.state;
-    return steps.flatMap(({ direction, stop, from, path }) => {
-      const [begins, first] = [Math.min(0.9 * map.from, stop), Math.min(map.from, stop)];
-      const acts = (stop - begins) * seconds;
-      const lasts = acts + 2 * APPROACH;
-      const rows = Math.ceil(lasts / every);
-      return Array.from({ length: rows + 1 }, (_, k) => {
-        const time = (k / rows) * lasts;
-        const phase = share(begins, stop, between(0, (time - APPROACH) / acts, 1));
-        const moved = between(0, (phase - first) / (stop - first || 1), 1);
-        const near = between(0, Math.min(time, lasts - time) / APPROACH, 1);
-        const [along, gap] = handAt(hand, phase);
-        const tool = [...beyond(from, direction, along), share(HIGH, LOW, near), direction, gap];
-        return [...blend(path, moved * (path.length - 1)), 0, ...tool];
-      });
-    });
-  }
-
   // Show a place in a motion: rows of [x, y, yaw, lift, hand's x, y, z, yaw, gap, bodies in 3-D].
   replay(rows, place, trail = true) {
     place = between(0, place, rows.length - 1); // a frame's time may lie before the start
@@ -545,13 +524,9 @@ export class Table {
     const grown = still() ? 1 : between(0, (performance.now() - since) / GROWS, 1);
     cancelAnimationFrame(this.growing);
     if (grown < 1) this.growing = requestAnimationFrame(() => this.draw());
-    let left = Math.ceil(grown * searched.flat().length);
-    const d = searched.map((line) => {
-      const seen = line.slice(0, Math.max(0, left));
-      left -= line.length;
-      return seen.length && `M${this.points(seen).replaceAll(" ", "L")}${seen[1] ? "" : "h0"}`;
-    });
-    return shape("path", "tried", { d: d.filter(Boolean).join("") });
+    const all = searched.flatMap((line) =>
+      line.map((at, k) => (k ? `L${this.points([at])}` : `M${this.points([at])}z`))); // z: a dot
+    return shape("path", "tried", { d: all.slice(0, Math.ceil(grown * all.length)).join("") });
   }
 
   points(corners) {
@@ -582,7 +557,7 @@ export class Table {
     const missed = short > goal.tolerance && !state.planning;
     const standing = live?.pose ?? pose;
     const lift = live?.lift > 0.003 ? live.lift : 0;
-    const handle = { "data-handle": this.heard.pose ? "object" : "none" };
+    const handle = this.heard.pose ? { "data-handle": "object" } : {};
     const shapes = [
       this.ground(),
       ...obstacles.map((one, k) => this.obstacle(one, k)),
@@ -703,10 +678,8 @@ export class Table {
     const last = steps.at(-1);
     const cm = (100 * short).toFixed(short < 0.01 ? 1 : 0);
     if (short) texts.push([`${cm} cm short`, goal.xy, "step short-by"]);
-    if (sigma && last?.std) {
-      const mm = (1000 * last.std).toFixed(1);
-      texts.push([`σ ${mm} mm (× ${ENLARGED})`, last.end, "step small"]);
-    }
+    const mm = (1000 * last?.std).toFixed(1);
+    if (sigma && last?.std) texts.push([`σ ${mm} mm (× ${ENLARGED})`, last.end, "step small"]);
     return texts.map(([text, at, css]) => this.label(text, this.at(at), css, taken)).join("");
   }
 
@@ -747,10 +720,10 @@ export class Table {
   pressed(event) {
     if (event.button || !this.camera) return;
     const at = this.place(event); // before focusing, which may scroll the drawing into view
-    const name = event.target.closest("[data-handle]")?.dataset.handle ?? "none";
-    this.tapped = event.pointerType === "touch" && name === "none";
+    const handle = event.target.closest("[data-handle]")?.dataset.handle;
+    this.tapped = event.pointerType === "touch" && !handle;
     if (this.tapped) return;
-    this.held = name === "none" ? "goal" : name;
+    this.held = handle ?? "goal";
     const { pose, obstacles } = this.state;
     const [kind, number] = this.held.split(" ");
     this.chosen = number ? Number(number) : null;
@@ -829,6 +802,7 @@ function moveBodies([name, numbers], row) {
 function render({ model, el }) {
   let [number, chain, recorded, bodies, began, timer] = [0, [], [], [], 0, null];
 
+  // Show what a hand changes and, unless the robot moves, a plan for it; Python hears the last.
   function draft(changes, final, ...wanted) {
     const { object, pose, goal: { xy, tolerance }, obstacles } = { ...view.state, ...changes };
     if (object && !model.get("scene").running) {
@@ -846,8 +820,7 @@ function render({ model, el }) {
     goal(xy, final) {
       number = Math.max(number, model.get("wanted")[2]) + 1;
       Object.assign(view.svg.dataset, { query: number, draft: true });
-      const changes = { goal: { ...view.state.goal, xy }, searched: [] };
-      draft(changes, final, "wanted", [...xy, number]);
+      draft({ goal: { ...view.state.goal, xy }, searched: [] }, final, "wanted", [...xy, number]);
     },
     obstacles: (all, final) => draft({ obstacles: all }, final, "obstacles", all),
     press: (key) => model.send({ press: key === "Enter" ? "run" : "stop" }),
@@ -914,10 +887,8 @@ function render({ model, el }) {
   };
   new ResizeObserver(() => setTimeout(nameSliders, 500)).observe(el); // when all is there
   const searched = () => view.set({ searched: model.get("searched"), since: performance.now() });
-  model.on("change:object", look);
-  model.on("change:scene", show);
-  model.on("change:obstacles", show);
-  model.on("change:searched", searched);
+  const acts = { object: look, scene: show, obstacles: show, searched };
+  for (const [name, act] of Object.entries(acts)) model.on(`change:${name}`, act);
   model.on("msg:custom", heard); // anywidget ends all when the view ends
   look();
   show();

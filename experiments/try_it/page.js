@@ -53,10 +53,32 @@ function replan() {
     other: compare.checked && full ? full.steps : [],
     ring: data.ring, sigma: sigma.checked, swept: swept.checked, note: "prediction",
   });
-  film = { rows: view.predicted(0.02), every: 0.02, recorded: false };
+  film = { rows: predicted(0.02), every: 0.02, recorded: false };
   tell(full);
   offer();
   one(".play").disabled = one(".scrub").disabled = !shown.steps.length;
+}
+
+const APPROACH = 0.45; // seconds that the hand takes to come down, and to leave
+
+// The execution as it is predicted: a motion for `replay`, with a row every so many seconds.
+function predicted(every) {
+  const { map, hand, seconds } = object;
+  return shown.steps.flatMap(({ direction, stop, from, path }) => {
+    const [begins, first] = [Math.min(0.9 * map.from, stop), Math.min(map.from, stop)];
+    const acts = (stop - begins) * seconds;
+    const lasts = acts + 2 * APPROACH;
+    const rows = Math.ceil(lasts / every);
+    return Array.from({ length: rows + 1 }, (_, k) => {
+      const time = (k / rows) * lasts;
+      const phase = share(begins, stop, between(0, (time - APPROACH) / acts, 1));
+      const moved = between(0, (phase - first) / (stop - first || 1), 1);
+      const near = between(0, Math.min(time, lasts - time) / APPROACH, 1);
+      const [along, gap] = handAt(hand, phase);
+      const tool = [...beyond(from, direction, along), share(HIGH, LOW, near), direction, gap];
+      return [...blend(path, moved * (path.length - 1)), 0, ...tool];
+    });
+  });
 }
 
 function tell(full) {
