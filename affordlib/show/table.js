@@ -147,8 +147,10 @@ export function reachability({ layers, primitives, threshold }, primitive) {
     let values = [2 * x, 2 * y, Math.cos(direction), Math.sin(direction), ...hot];
     for (const [inputs, weights] of read) {
       const outputs = weights.length / (inputs + 1);
-      const next = Array.from(weights.subarray(inputs * outputs), (bias, o) =>
-        values.reduce((sum, value, i) => sum + weights[o * inputs + i] * value, bias));
+      const next = Array.from(weights.subarray(inputs * outputs)); // the biases
+      for (let o = 0; o < outputs; o++) {
+        for (let i = 0; i < inputs; i++) next[o] += weights[o * inputs + i] * values[i];
+      }
       values = outputs > 1 ? next.map(Math.tanh) : next;
     }
     return 1 / (1 + Math.exp(-values[0])) >= threshold;
@@ -379,8 +381,7 @@ function shape(tag, css, attributes, inside = "") {
   return `<${tag} class="${css}"${said.join("")}>${inside}</${tag}>`;
 }
 
-const rectangle = (css, x, y, width, height, rx) =>
-  shape("rect", css, { x, y, width, height, rx });
+const rectangle = (css, x, y, width, height, rx) => shape("rect", css, { x, y, width, height, rx });
 
 // state: {object, pose, goal {xy, yaw, tolerance}, steps, other (steps to compare with), obstacles,
 // ring, trail, marks (what moved by itself: [from, to]), searched, since (when), sigma, swept, note
@@ -427,8 +428,7 @@ export class Table {
   add(one) {
     const { obstacles, pose, goal: { xy } } = this.state;
     const [row, side] = [Math.floor(obstacles.length / 2), obstacles.length % 2 ? -1 : 1];
-    const middle = [...middleOf([pose, xy]), bearing(pose, xy)];
-    const [at] = placed([[0.06 * row, 0.09 * side]], middle);
+    const [at] = placed([[0.06 * row, 0.09 * side]], [...middleOf([pose, xy]), bearing(pose, xy)]);
     this.chosen = obstacles.length;
     this.heard.obstacles([...obstacles, shifted(one, at)], true);
   }
@@ -557,11 +557,13 @@ export class Table {
     const missed = short > goal.tolerance && !state.planning;
     const standing = live?.pose ?? pose;
     const lift = live?.lift > 0.003 ? live.lift : 0;
+    const swept = (state.swept ? steps : []).flatMap(({ path }) =>
+      path.map((at) => `M${this.points(placed(state.object.outline, at))}Z`));
     const handle = this.heard.pose ? { "data-handle": "object" } : {};
     const shapes = [
       this.ground(),
       ...obstacles.map((one, k) => this.obstacle(one, k)),
-      ...steps.flatMap(({ path }) => path.map((at) => state.swept && this.outline(at, "swept"))),
+      swept.length && shape("path", "swept", { d: swept.join("") }),
       state.searched.length && !live && this.tried(),
       ...other.flatMap(({ path, end }) => [this.line(path, "other"), this.outline(end, "other")]),
       ...state.marks.map((mark) => this.line(mark, "mark")),
@@ -851,8 +853,7 @@ function render({ model, el }) {
     view.svg.setAttribute("aria-busy", planning);
     if (!running && !timer) scene.live = null;
     if (!view.held) scene.obstacles = model.get("obstacles");
-    const note = planning ? "planning …" : "";
-    view.set({ ...scene, planning, sigma: true, swept: true, note });
+    view.set({ ...scene, planning, sigma: true, swept: true, note: planning ? "planning …" : "" });
   }
 
   function at(place) {
