@@ -19,4 +19,5 @@ from affordlib.models.evaluation import (
     refuse_seen,
 )
 from affordlib.models.film import CircularHarmonics, FiLMConfig, FiLMNetwork
+from affordlib.models.lever_up import lever_up_tensors, predict_steps
 from affordlib.models.training import TrainingConfig, about_training, train, train_model

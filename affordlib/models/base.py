@@ -35,7 +35,6 @@ from affordlib.types import (
     check_count,
 )
 
-FRAMES = ("table", "push")
 _SHORTEST_M = 1e-3
 
 Channels = tuple[str, ...]
@@ -85,7 +84,7 @@ class NetworkConfig:
     frame: str = "table"  # or "push", the push-aligned frame
 
     def __post_init__(self) -> None:
-        check_choice("frame", self.frame, FRAMES)
+        check_choice("frame", self.frame, ("table", "push"))
         for name in ("action_channels", "effect_channels"):
             channels = tuple(getattr(self, name))
             if not channels:
