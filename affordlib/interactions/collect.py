@@ -41,7 +41,6 @@ from affordlib.world import CATEGORIES, Tabletop, TabletopObject, WorldConfig
 from affordlib.world.execution import RECORDED_SAMPLES
 from affordlib.world.trajectory import N_SAMPLES, interpolated
 
-MOST_WORKERS = 256
 CHUNK = 50
 """Usual number of interactions per chunk, the unit that a worker collects, returns and stores."""
 
@@ -104,7 +103,7 @@ def collect(
     """
     if not str(path).endswith(SUFFIX):
         raise ValueError(f"path must end in {SUFFIX!r}, got {str(path)!r}")
-    check_count("workers", workers, 1, MOST_WORKERS)
+    check_count("workers", workers, 1, 256)
     size = check_count("chunk", CHUNK if chunk is None else chunk)
     attrs, file, n = attributes_for(recipe), from_root(path), recipe.n_interactions
     parts, missing, files = file.with_name(f".{file.name}.parts"), {}, {}

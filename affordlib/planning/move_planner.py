@@ -24,7 +24,6 @@ MAX_PLANS = 12
 REFUSED_WITHIN_M, REFUSED_WITHIN_RAD = 0.01, math.radians(6)
 """Actions this near to a refused action, in position [m] and direction [rad], are excluded."""
 
-WAYPOINT_TOLERANCE_M = 0.01
 CELL_M, LONGEST_M = 0.04, 0.092
 """Distance [m] of neighbours in the grid of a way, and that of the farthest that are joined."""
 
@@ -140,7 +139,7 @@ class MovePlanner:
                 problem = replace(whole, goal=near, reachable=self._allowed(whole.effects.kind))
             except ValueError:  # on an obstacle
                 continue
-            if plan := self._plan_to(problem, whole.goal, WAYPOINT_TOLERANCE_M):
+            if plan := self._plan_to(problem, whole.goal, 0.01):
                 return plan
         return None
 

@@ -36,6 +36,12 @@ TICK_MS = round(1000 * EVERY * STEP_S / TICKS)
 CAMERA = (0.84, -0.88, 0.62, -0.24, 0.02, 0.24, 0.0, 0.0, 1.0)
 """Where the camera stands, what it looks at [m], and what is upwards."""
 
+_COARSER = """const { renderer } = K3DInstance.getWorld(), gl = renderer.getContext();
+const about = gl.getExtension("WEBGL_debug_renderer_info");
+const name = about ? gl.getParameter(about.UNMASKED_RENDERER_WEBGL) : "";
+if (/SwiftShader|llvmpipe|Basic Render/.test(name)) renderer.setPixelRatio(0.6);"""
+"""Without a GPU, fewer pixels, so that the robot moves more smoothly."""
+
 _WOOD, _STONE = "#ede6d9", "#8c735f"
 _STL = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _SCRIPT = Path(__file__).with_name("scene.js")
@@ -66,7 +72,8 @@ class Scene(widgets.VBox):
         self._add(*base, _matrix((BASE_X_M, 0.0, 0.0)))
         self._links = [self._add(*link) for link in links]
         self.name = f"scene_{uuid4().hex}"
-        self.plot.additional_js_code = f"(globalThis.affordlib ??= {{}}).{self.name} = K3DInstance"
+        self.plot.additional_js_code = f"(globalThis.affordlib ??= {{}}).{self.name} = K3DInstance;"
+        self.plot.additional_js_code += _COARSER
         self._object, self._last = None, np.ones(7)
         self._marks: list[Any] = []
         self.player = widgets.Play(interval=TICK_MS, max=0)

@@ -22,7 +22,6 @@ from affordlib.world import BASE_X_M, REACH_M, TabletopObject
 PUSH_RUN_UP_M = 0.2
 """Largest distance [m] of a push's start from the object; it bounds the shaded reachable ring."""
 
-HAND_SAMPLES = 26
 _HERE = Path(__file__).parent
 
 
@@ -78,7 +77,7 @@ def object_data(obj: TabletopObject, effects: EffectMap, yaw_rad: float = 0.0) -
     hand = {"size": hand_m(action).max(axis=0).tolist(), "grip": None}
     if not isinstance(action, Push):
         hand["grip"] = adapt_to_object(action, effects.image).grip_yaw
-    path = action.path(np.linspace(0, 1, HAND_SAMPLES))[:, [0, ACTION_CHANNELS.index("gripper")]]
+    path = action.path(np.linspace(0, 1, 26))[:, [0, ACTION_CHANNELS.index("gripper")]]
     hand["path"] = (path * (1, action.opening_m)).round(5).tolist()
     return {
         "outline": obj.footprint_m.round(6).tolist(),

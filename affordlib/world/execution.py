@@ -37,7 +37,6 @@ RECORDED_SAMPLES = 26  # of the tool: at t = 0 and every 3 steps of 50 ms (as in
 GUARD_FORCE_N = 30.0  # between object and robot, above which a guarded segment stops
 _HOME = np.array(robot.HOME)
 ARM_FORCES_N_M = (330.0, 330.0, 150.0, 54.0, 54.0, 54.0)
-_ARM_GAINS = [0.3] * 6
 _STILL_FINGERS, _MOVING_FINGERS = [0.3] * 2, [0.02] * 2
 """Position gains of the fingers: with high ones, closing fingers jump when contact is lost."""
 
@@ -67,7 +66,7 @@ class JointController:
         numbers = range(client.getNumJoints(self.robot))  # of the links, too
         self.links = {client.getJointInfo(self.robot, k)[12].decode(): k for k in numbers}
         self.fingers = self.links["left_finger"], self.links["right_finger"]
-        self.joints = (*robot.ARM_JOINTS, *self.fingers)
+        self.joints = (*range(6), *self.fingers)
         self.palm = self.links["palm"]
         self._gear: int | None = None
         self._grip: int | None = None
@@ -83,7 +82,7 @@ class JointController:
 
     def set_fingers(self, force_N: float, closing: bool) -> None:
         """Set the maximum force [N] of each finger, and low position gains if they will close."""
-        self.gains = _ARM_GAINS + (_MOVING_FINGERS if closing else _STILL_FINGERS)
+        self.gains = [0.3] * 6 + (_MOVING_FINGERS if closing else _STILL_FINGERS)
         self.forces = [*ARM_FORCES_N_M, force_N, force_N]
 
     def follow(

@@ -296,6 +296,8 @@ def test_a_run_is_drawn_from_above_and_in_3d_while_it_is_simulated(page, table):
     number, *at = ask(page, "[picker.scene.bodies[-1].id, *picker.world.object_state()[:3]]")
     shown = f"all().find((body) => body.K3DIdentifier === {number})?.position.toArray()"
     wait_until(lambda: np.allclose(page.evaluate(shown) or 0, at, atol=1e-3), 20)
+    ratio = "Object.values(affordlib)[0].getWorld().renderer.getPixelRatio()"
+    assert page.evaluate(ratio) < 1  # without a GPU
     picture(page, "4_run_in_3d")
 
 
