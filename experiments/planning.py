@@ -65,6 +65,11 @@ def plan_continuous_full(problem: PlanningProblem) -> Plan:
     return plan_continuous(replace(problem, mode=replace(problem.mode, partial=False)))
 
 
+def plan_gradient_full(problem: PlanningProblem, **arguments: Any) -> Plan:
+    """Plan with the paper's planner, without partial actions."""
+    return plan_gradient(replace(problem, mode=replace(problem.mode, partial=False)), **arguments)
+
+
 def plan_astar_recorded(problem: PlanningProblem) -> Plan:
     """A* with the segments 20, 40, … 100 % of what the paper records.
 
@@ -251,6 +256,8 @@ CONFIGS: dict[str, PlannerConfig] = {
         plan_continuous, **PERTURBED, execution={"corrections": 2, "n_averaged_images": 8}
     ),
     "perturbed_film_5000": PlannerConfig(plan_continuous, world="perturbed"),
+    "perturbed_film_500": PlannerConfig(plan_continuous, "film_500", world="perturbed"),
+    "perturbed_gradient_100": _descent(Reading(), world="perturbed", **BY_PLAN),
     "perturbed_rollable": PlannerConfig(plan_continuous, **ROLLING),
     "perturbed_rollable_corrected": PlannerConfig(plan_continuous, **ROLLING, **CORRECTED),
     "outside": PlannerConfig(plan_continuous, **OUTSIDE),
@@ -275,6 +282,7 @@ CONFIGS: dict[str, PlannerConfig] = {
     },
 }
 CONFIGS |= {
+    "gradient_100_pushes_full": replace(CONFIGS["gradient_100_pushes"], planner=plan_gradient_full),
     # Other trainings of the paper's network; goals drawn when all planners were finished.
     **{
         f"{name}_{model}": replace(CONFIGS[f"{name}_pushes"], model=model, sources=("constructed",))

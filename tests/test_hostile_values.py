@@ -99,8 +99,8 @@ FittedModel LoggedPushes NetworkConfig Pushes TabletopObject open_loop"""
 INSIDE = """
 Batch BranchTable CircularHarmonics FreeSpace Reading about_training condition_on_final_effect
 condition_on_poses condition_on_recorded_action corners_of dataset_sha256 descend final_error
-final_errors_m gaps_m make_steps network_predictions placed plot_flow roll_out sample_mixed search
-stored_sha256
+final_errors_m gaps_m lever_up_tensors make_steps network_predictions placed plot_flow predict_steps
+predict_trajectories roll_out sample_mixed search stored_sha256
 """
 """Parts of driven ones, for pages that show what is inside: they may refuse in any words."""
 NAMES = sorted({*CALLABLES, *OF_THE_WORLD.split(), "kind_for"} - {*MADE_BY_DRIVEN_ONES.split()})
@@ -122,7 +122,7 @@ def fields_of(*made):
 
 
 @pytest.fixture(scope="module")
-def shop(one_world, skills, pushes, tmp_path_factory):
+def shop(one_world, skills, pushes, levers, levered, tmp_path_factory):
     """A valid value for each parameter by name, or by callable where that needs another."""
     folder, path, log = tmp_path_factory.mktemp("hostile"), np.zeros((3, 2)), log_of_eight()
     one_world.config = world.WorldConfig()
@@ -216,6 +216,14 @@ def shop(one_world, skills, pushes, tmp_path_factory):
         "placed": {"corners": np.array(CORNERS), "poses": np.zeros((2, 3))},
         "plot_flow": {"boxes": {"a": (0, 0, "k"), "b": (1, 1, "k")}, "arrows": [("a", "b")]},
         "roll_out": {"direction_rad": torch.zeros(3, 1), "phase": torch.ones(3, 1)},
+        "lever_up_tensors": {"data": levers},
+        "predict_steps": {"tensors": levered, "protocol": "image_only"}
+        | {"model": models.load_checkpoint("lever_up_last_pose_1800")[0]},
+        "predict_trajectories": {
+            "model": skills.model(Grasp),
+            "primitive": Grasp(),
+            "channel": "z",
+        },
     }
     return {k: v for names, v in by_name.items() for k in names.split()}, by_callable
 

@@ -41,7 +41,7 @@ CIRCLE_M, SUCCESS_M, NEARER_M = 0.2, 0.002, 0.0005
 
 @dataclass(frozen=True)
 class Reading(Checked):
-    """A reading of Algorithm 1; the defaults are the paper's words.
+    """A reading of Algorithm 1; the defaults are *as printed* in our tables.
 
     descent: by the "gradient" or by "adam"; rate: its rate. start: on the "ring" of effects that
     full actions have, or on the "circle" of 0.2 m where pushes start. finds: the "direction" in
