@@ -139,7 +139,7 @@ class MovePlanner:
                 problem = replace(whole, goal=near, reachable=self._allowed(whole.effects.kind))
             except ValueError:  # on an obstacle
                 continue
-            if plan := self._plan_to(problem, whole.goal, 0.01):
+            if plan := self._plan_to(problem, whole.goal, within_m=0.01):
                 return plan
         return None
 

@@ -66,7 +66,7 @@ class JointController:
         numbers = range(client.getNumJoints(self.robot))  # of the links, too
         self.links = {client.getJointInfo(self.robot, k)[12].decode(): k for k in numbers}
         self.fingers = self.links["left_finger"], self.links["right_finger"]
-        self.joints = (*range(6), *self.fingers)
+        self.joints = (*range(len(robot.HOME)), *self.fingers)
         self.palm = self.links["palm"]
         self._gear: int | None = None
         self._grip: int | None = None
