@@ -79,15 +79,15 @@ def centroid(corners: np.ndarray) -> np.ndarray:
     return ((corners + following) * doubled[:, None]).sum(axis=0) / (3 * doubled.sum())
 
 
-def quarter_turn(a: torch.Tensor) -> torch.Tensor:
-    """Rotate vectors (..., 2) by +90°."""
+def quarter_turn(a: Any) -> Any:
+    """Rotate vectors (..., 2), a tensor, by +90°."""
     import torch  # imported here because code that only simulates does not need it
 
     return torch.stack([-a[..., 1], a[..., 0]], -1)
 
 
-def rotate(a: torch.Tensor, angle_rad: torch.Tensor) -> torch.Tensor:
-    """Rotate vectors (..., 2) by angles (...), counter-clockwise."""
+def rotate(a: Any, angle_rad: Any) -> Any:
+    """Rotate vectors (..., 2) by angles (...), both tensors, counter-clockwise."""
     return angle_rad.cos()[..., None] * a + angle_rad.sin()[..., None] * quarter_turn(a)
 
 

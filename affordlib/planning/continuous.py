@@ -17,6 +17,7 @@ from functools import partial
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from affordlib.geometry import rotate
@@ -74,7 +75,7 @@ def starts(
         )
     left, turned = target.expand(n, 2), target.new_zeros(n)
     if n_actions > 1:
-        positions, turns, _ = roll_out(effects, direction, phase)
+        positions, turns, _ = roll_out(effects, direction, phase, False)
         left, turned = target - positions[:, -1], turns[:, -1]
     many = 2 if n_actions > 1 else (2 + 4 * bool(problem.obstacles)) * N_REFINED
     last_direction, last_phase = effects.nearest(rotate(left, -turned), many, stops_early)
@@ -107,7 +108,7 @@ def _free_chains(
 def free(problem: PlanningProblem, chains: Chains, last: bool = False) -> Tensor:
     """Return whether chains (B,), or the last action of each, are allowed and meet no obstacle."""
     direction, phase = chains
-    positions, turns, _ = roll_out(problem.effects, direction, phase)
+    positions, turns, _ = roll_out(problem.effects, direction, phase, False)
     poses = torch.cat([positions, turns[..., None]], dim=-1)
     begins = torch.cat([torch.zeros_like(poses[:, :1]), poses[:, :-1]], dim=1)
     begins[..., :2] += torch.tensor(problem.start_xy_m)
@@ -164,51 +165,56 @@ def _descend(value: Objective, chains: Chains, stops_early: bool) -> Chains:
 
 
 def _correct(
-    effects: EffectMap, target: Tensor, chain: Chains, stops_early: bool
-) -> tuple[Tensor, tuple[Tensor, Tensor]]:
-    """Correct one chain (B = 1) by Newton's method until its end by the model is the target.
+    effects: EffectMap, target: Tensor, chains: Chains, stops_early: bool
+) -> tuple[Chains, Tensor, Tensor]:
+    """Correct chains (B, K) by Newton's method until their ends by the model are the target.
 
-    The derivatives are the map's. Returns the chain (K, 2), and what `_predicted` says of it.
+    The derivatives are the map's. Returns the chains, and what `_predicted` says of them.
     """
-    (direction, phase), k = chain, chain[0].shape[1]
+    direction, phase = (v.clone() for v in chains)
     ends, turns = _predicted(effects, direction, phase)
+    k, nearer = direction.shape[1], torch.ones(len(direction), dtype=torch.bool)
+    # One radian moves the end about as far as half the phase does; this scales the two alike.
+    scale = torch.tensor([1.0, 0.5], dtype=phase.dtype).repeat_interleave(k)
     for _ in range(CORRECTIONS):
-        off = target - ends[-1]
-        if float(off.norm()) < EXACT_M:
+        away = (target - ends[:, -1]).norm(dim=1)
+        rows = (nearer & (away >= EXACT_M)).nonzero()[:, 0]
+        if not len(rows):
             break
-        slopes = _slopes(lambda *near: roll_out(effects, *near)[0][:, -1], direction, phase)
-        by_direction, by_phase = (one[0].T for one in slopes)
-        free = (phase[0] < 1) | (off @ by_phase < 0)
-        by_phase = by_phase * (free & stops_early)
-        # One radian moves the end about as far as half the phase does; this scales the two alike.
-        scale = torch.cat([torch.ones_like(direction[0]), 0.5 * torch.ones_like(phase[0])])
-        slopes = torch.cat([by_direction, by_phase], dim=1) * scale
+        near, off = (direction[rows], phase[rows]), target - ends[rows, -1]
+        slopes = _slopes(lambda *near: roll_out(effects, *near, False)[0][:, -1], *near)
+        by_direction, by_phase = (one.mT for one in slopes)
+        free = (near[1] < 1) | ((off[:, None] @ by_phase)[:, 0] < 0)
+        slopes = torch.cat([by_direction, by_phase * (free & stops_early)[:, None]], dim=2) * scale
         # Singular values below 5 % of the largest are dropped, as their steps would be long; beyond
         # 0.3 rad, or 0.3 of the phase, the linearisation is invalid.
-        step = scale * (torch.linalg.pinv(slopes, rtol=0.05) @ off)
-        step = step * min(1.0, 0.3 / max(float(step.abs().max()), 1e-9))
+        step = scale * (torch.linalg.pinv(slopes, rtol=0.05) @ off[..., None])[..., 0]
+        step = step * (0.3 / step.abs().amax(dim=1, keepdim=True).clamp_min(1e-9)).clamp_max(1)
+        nearer[rows] = False
         for _ in range(HALVINGS):
-            better = direction + step[:k], (phase + step[k:]).clamp(0, 1)
+            better = direction[rows] + step[:, :k], (phase[rows] + step[:, k:]).clamp(0, 1)
             moved, turned = _predicted(effects, *better)
-            if (moved[-1] - target).norm() < off.norm():
+            good = (moved[:, -1] - target).norm(dim=1) < away[rows]
+            found = *better, moved, turned
+            for old, new in zip((direction, phase, ends, turns), found, strict=True):
+                old[rows[good]] = new[good]
+            nearer[rows[good]] = True
+            rows, step = rows[~good], step[~good] / 2
+            if not len(rows):
                 break
-            step = step / 2
-        else:
-            break
-        (direction, phase), ends, turns = better, moved, turned
-    return torch.stack([direction[0], phase[0]], dim=1), (ends, turns)
+    return (direction, phase), ends, turns
 
 
 def _predicted(effects: EffectMap, direction: Tensor, phase: Tensor) -> tuple[Tensor, Tensor]:
-    """Positions (K, 2) and rotations (K,) after each action of a chain (1, K), by the model.
+    """Positions (B, K, 2) and rotations (B, K) after each action of chains (B, K), by the model.
 
     An action's effect depends on the rotations before it. The map's rotations are accurate enough
     to query all actions together; the model's are returned.
     """
-    _, turns, _ = roll_out(effects, direction, phase)
-    before = torch.cat([turns.new_zeros(1), turns[0, :-1]])
-    effect = effects.query_model(direction[0] - before, phase[0])
-    return rotate(effect[:, :2], direction[0]).cumsum(dim=0), effect[:, 2].cumsum(dim=0)
+    _, turns, _ = roll_out(effects, direction, phase, False)
+    relative = direction - F.pad(turns[:, :-1], (1, 0))
+    effect = effects.query_model(relative.flatten(), phase.flatten()).view(*phase.shape, 3)
+    return rotate(effect[..., :2], direction).cumsum(dim=1), effect[..., 2].cumsum(dim=1)
 
 
 def plan_continuous(
@@ -245,17 +251,22 @@ def plan_continuous(
     # The plan remains empty if none ends nearer to the goal.
     steps, least_m = (), goal.distance_m(start)
     near = [one for one in candidates if problem.obstacles and one[0] < NEAR_M]
-    for _, *best in near or candidates[:1]:
-        best = tuple(best)
-        chain, predicted = _correct(effects, target, best, mode.partial)
-        ok = _allowed(problem, predicted[0][None], chain[None, :, 0]).all()
-        if not (ok and (not problem.obstacles or free(problem, tuple(chain.T[:, None])).all())):
-            chain, predicted = torch.cat(best).T, None
-        found = make_steps(effects, start, chain, predicted)
-        if (away_m := goal.distance_m(found[-1].predicted_end_xy_m)) < least_m:
-            steps, least_m = found, away_m
+    near = near or candidates[:1]
+    for some in filter(None, (near[:1], near[1:])):
         if least_m < WELL_M:
             break
+        chains = tuple(map(torch.cat, list(zip(*some, strict=True))[1:]))
+        corrected, ends, turns = _correct(effects, target, chains, mode.partial)
+        ok = _allowed(problem, ends, corrected[0])
+        if problem.obstacles:
+            ok &= free(problem, corrected)
+        for k in range(len(some)):
+            chain = torch.stack([one[k] for one in (corrected if ok[k] else chains)], dim=1)
+            found = make_steps(effects, start, chain, (ends[k], turns[k]) if ok[k] else None)
+            if (away_m := goal.distance_m(found[-1].predicted_end_xy_m)) < least_m:
+                steps, least_m = found, away_m
+            if least_m < WELL_M:
+                break
     reaches = least_m <= goal.tolerance_m
     return problem.plan_of(steps, "continuous", reaches, began)
 

@@ -38,8 +38,8 @@ HIGHEST_M = 0.13
 DEEPEST_M = 0.003
 """Overlap [m] of object and obstacle that may be an error of the image."""
 
-FAR_M = 0.01
-"""Gaps [m] above this are not distinguished by planners."""
+FAR_M = 0.005
+"""Gaps [m] above this, and so above every margin, are not distinguished by the check."""
 
 
 def ring(radius_m: float) -> np.ndarray:
@@ -58,7 +58,7 @@ def placed(corners: np.ndarray, poses: np.ndarray) -> np.ndarray:
     return rotated_each(corners, poses[..., 2, None]) + poses[..., None, :2]
 
 
-def gaps_m(obstacles: Sequence[np.ndarray], shapes: np.ndarray, far_m: float = FAR_M) -> np.ndarray:
+def gaps_m(obstacles: Sequence[np.ndarray], shapes: np.ndarray, far_m: float = 0.01) -> np.ndarray:
     """Gaps [m] (n, s - 1), at most far_m, between polygons and what n shapes (n, s, k, 2) sweep."""
     (n, s, _, _), sides = shapes.shape, edge_normals(shapes)
     if not n:
@@ -147,12 +147,10 @@ class FreeSpace:
     ) -> np.ndarray:
         """Return gap minus margin [m] (n,) of pushes or drags; negative where they are not free.
 
-        action: any of them; phase: (n,), where they stop; poses: (n, s, 3), the object's x, y and
-        rotation since its image was taken.
+        Where the hand is not free, the object's gap is not computed. action: any of them; phase:
+        (n,), where they stop; poses: (n, s, 3), the object's x, y and rotation since its image was
+        taken.
         """
-        poses = np.concatenate([poses, poses[:, -1:]], axis=1)  # the last alone
-        spare = gaps_m(self.polygons, placed(self.outline_m, poses))
-        spare = (spare - self.margin_m(poses[:, :-1, :2])).min(axis=1)
         hand = np.empty((len(poses), 2, 3))
         if isinstance(action, Push):
             travel = min_jerk(phase)[:, None] * [action.radius + action.length]
@@ -163,8 +161,13 @@ class FreeSpace:
         else:
             hand[..., :2] = poses[:, [0, -1], :2]
             hand[..., 2] = adapt_to_object(action, self.image).grip_yaw + poses[:, 0, 2, None]
-        by_hand = gaps_m(self.polygons, placed(hand_m(action), hand))[:, 0]
-        return np.minimum(spare, by_hand - self.margin_m(poses[:, 0, :2]).clip(0.0))
+        spare = gaps_m(self.polygons, placed(hand_m(action), hand), FAR_M)[:, 0]
+        spare = spare - self.margin_m(poses[:, 0, :2]).clip(0.0)
+        poses = np.concatenate([poses, poses[:, -1:]], axis=1)[spare >= 0]  # the last alone
+        gaps = gaps_m(self.polygons, placed(self.outline_m, poses), FAR_M)
+        gaps = (gaps - self.margin_m(poses[:, :-1, :2])).min(axis=1)
+        spare[spare >= 0] = np.minimum(spare[spare >= 0], gaps)
+        return spare
 
     def is_free(self, step: Step) -> bool:
         """Return whether the hand can close around the object, at the end of a step, and turn."""

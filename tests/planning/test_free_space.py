@@ -79,7 +79,7 @@ def test_gaps_are_distances_along_the_normals_of_edges():
     here = placed(BOX, np.zeros((1, 2, 3)))
     for gap in (-0.01, 0.004, 2 * FAR_M):
         wall = corners_of(Obstacle.box((0.03 + gap + 0.01, 0.0), (0.02, 0.3)))
-        assert gaps_m([wall], here)[0, 0] == pytest.approx(min(gap, FAR_M), abs=1e-12)
+        assert gaps_m([wall], here, FAR_M)[0, 0] == pytest.approx(min(gap, FAR_M), abs=1e-12)
     thin = corners_of(Obstacle.box((0.1, 0.0), (0.005, 0.3)))
     jump = placed(BOX, np.array([[[0.0, 0.0, 0.0], [0.2, 0.0, 0.0]]]))
     assert gaps_m([thin], jump)[0, 0] < 0  # no pose touches it, the way does

