@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from typing import Any, Self
@@ -27,7 +28,6 @@ from affordlib.show.picker_controls import (
     PickerControls,
     Stopped,
     closed_loop,
-    measured,
     open_loop,
     outcome_in_words,
     plan_in_words,
@@ -51,9 +51,9 @@ class GoalPicker(widgets.HBox):
     chosen planner does. seed: of the disturbances. view: whether the robot is shown in 3-D, too.
     searched: an empty list, in which a planner may leave lines (n, 2) [m] of its search.
 
-    `executors`: name → function (world, plan, planner, report) → Outcome that executes a plan, or
-    replans with the planner that made it; see `Report`. `goal`, `plan` and `outcome` are
-    those shown. Methods do what mouse and buttons do, and return when done; mouse and buttons queue
+    `executors`: name → function (world, plan, planner, report) → Done that executes a plan, or
+    replans with the planner that made it; see `Report`. `goal`, `plan` and `outcome` are those
+    shown. Methods do what mouse and buttons do, and return when done; mouse and buttons queue
     it in the background, and *Run* then shows each pose for `pace_s`.
     """
 
@@ -71,7 +71,7 @@ class GoalPicker(widgets.HBox):
     ) -> None:
         self.world, self.skills, self.planners = world, skills, planners
         self._searched = [] if searched is None else searched
-        self.executors = {"open loop": open_loop, "closed loop": closed_loop(skills)}
+        self.executors = {"open loop": open_loop, "closed loop": partial(closed_loop, skills)}
         self.plan: Plan | None = None
         self.outcome: Outcome | None = None
         self._rng = np.random.default_rng(check_count("seed", seed, least=0))
@@ -310,12 +310,12 @@ class GoalPicker(widgets.HBox):
             self._wait_until_shown()
             while self._disturbances and not self._stop.is_set():
                 self._disturbances.pop(0)()
-            if self._stop.is_set():
-                raise Stopped
             begin()
             return self.goal
 
         def begin():
+            if self._stop.is_set():
+                raise Stopped
             if left:
                 name, of = left[0].primitive.name.replace("_", " "), done + len(left)
                 self.controls.say(f"{name.capitalize()} {done + 1} of {of} …{self._news}")
@@ -326,25 +326,23 @@ class GoalPicker(widgets.HBox):
             try:
                 if self._stale or self.plan is None or self.outcome is not None:
                     self._make_plan()
-                left[:], self._news = self.plan.steps, ""
-                begin()
+                plan, self._news = self.plan, ""
+                left[:] = plan.steps
                 self._show()
                 yaw, z = self.world.object_pose()[2], self.world.object_state()[2]
                 self.world.on_step = self._motion_log(on_step, z, pace_s)
-                try:
-                    if self._stop.is_set():
-                        raise Stopped
+                paths, words, how = (), "", "Stopped after"
+                with suppress(Stopped):
+                    begin()
                     execute = self.executors[self.controls.executor.value]
                     planner = self.planners[self.controls.planner.value]
-                    outcome = execute(self.world, self.plan, planner, report)
+                    paths, words = execute(self.world, plan, planner, report)
                     how = "Done,"
                     self.controls.show_progress(1)
-                except Stopped:
-                    outcome, how = measured(self.world, self.plan, self.goal), "Stopped after"
-                turned = wrap_angle(self.world.object_pose()[2] - yaw)
-                lifted = self.world.object_state()[2] - z
-                left_m = self.goal.distance_m(outcome.end_pose[:2])
-                outcome = replace(outcome, distance_m=left_m, turned_rad=turned, lifted_m=lifted)
+                pose = self.world.object_pose()
+                left_m = self.goal.distance_m(pose[:2])
+                moved = wrap_angle(pose[2] - yaw), self.world.object_state()[2] - z
+                outcome = Outcome(plan, left_m, pose, paths, *moved, words)
                 self.outcome, self._lifted = outcome, bool(self.goal.height_m)
                 if self.plan.goal == self.goal or outcome.distance_m <= self.goal.tolerance_m:
                     self._stale = False  # the run has followed the goal

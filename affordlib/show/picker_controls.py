@@ -148,43 +148,33 @@ Report = Callable[..., Goal]
 """`report()` after an action applies pending disturbances, and raises `Stopped` when execution must
 end; `report(plan)` when a new plan replaces the current one. Both return the current goal."""
 
-Executor = Callable[[Tabletop, Plan, Planner, Report], Outcome]
-"""Function that executes a plan; the caller measures the object's rotation and height."""
+Done = tuple[tuple[np.ndarray, ...], str]
+"""What an executor returns: the object's path (n, 2) [m] in each action, and a text on it."""
 
 
 class Stopped(Exception):
     """The user has pressed Stop."""
 
 
-def open_loop(world: Tabletop, plan: Plan, planner: Planner, report: Report) -> Outcome:
-    """Execute a plan as it is, action by action, and measure where the object comes to rest."""
+def open_loop(world: Tabletop, plan: Plan, planner: Planner, report: Report) -> Done:
+    """Execute a plan as it is, action by action."""
     paths: tuple[np.ndarray, ...] = ()
     for step in plan.steps:
         paths += execute_plan(world, replace(plan, steps=(step,))).object_paths_xy_m
         report()
-    return measured(world, plan, plan.goal, paths)
+    return paths, ""
 
 
-def measured(
-    world: Tabletop, plan: Plan, goal: Goal, paths: tuple[np.ndarray, ...] = (), words: str = ""
-) -> Outcome:
-    """The outcome of a plan, measured from the object's true pose to a goal; paths: (n, 2) [m]."""
-    pose = world.object_pose()
-    return Outcome(plan, goal.distance_m(pose[:2]), pose, paths, words=words)
+def closed_loop(
+    skills: Skills, world: Tabletop, plan: Plan, planner: Planner, report: Report
+) -> Done:
+    """Observe after every action, and plan again until the object is within 2 mm of the goal."""
+    goals = [plan.goal]
 
+    def exact():
+        return replace(goals[-1], tolerance_m=0.002)
 
-def closed_loop(skills: Skills, tolerance_m: float = 0.002) -> Executor:
-    """Make an executor that observes after every action and replans to this tolerance [m]."""
-
-    def execute(world, plan, planner, report):
-        goals = [plan.goal]
-
-        def exact():
-            return replace(goals[-1], tolerance_m=tolerance_m)
-
-        config = ClosedLoopConfig(on_action=lambda *_: goals.append(report()), on_plan=report)
-        done = run_closed_loop(world, exact, skills, planner, config)
-        words = "" if done.reached else f"The loop ended as {done.status}: {done.message}."
-        return measured(world, plan, goals[-1], done.object_paths_xy_m, words)
-
-    return execute
+    config = ClosedLoopConfig(on_action=lambda *_: goals.append(report()), on_plan=report)
+    done = run_closed_loop(world, exact, skills, planner, config)
+    words = "" if done.reached else f"The loop ended as {done.status}: {done.message}."
+    return done.object_paths_xy_m, words
