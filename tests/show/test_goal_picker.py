@@ -177,6 +177,7 @@ def test_stop_lets_an_action_end_and_begins_no_other(make_picker, world):
     assert math.dist(world.object_pose()[:2], first) < 0.07
     assert not picker.controls.run.disabled
     picker.pick(*(0.05 + v for v in world.object_pose()[:2]))
+    picker.pace_s = 0.0
     picker.run()
     assert picker.outcome.distance_m < 0.03, picker.controls.words.value
 
