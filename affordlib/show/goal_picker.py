@@ -320,7 +320,7 @@ class GoalPicker(widgets.HBox):
                 self._show()
                 yaw, z = self.world.object_pose()[2], self.world.object_state()[2]
                 if self.scene is not None:
-                    self.scene.begin(self.goal, self.plan)
+                    self.scene.begin()
                 self.world.on_step = partial(self._log, itertools.count(), z)
                 paths, words, how = (), "", "Stopped after"
                 with suppress(Stopped):
