@@ -145,8 +145,8 @@ def conditioning_explorer(
     for of, name in itertools.product(CHANNELS, ("x", "y")):
         c = channels[of].index(name)
         mean, std = (100 * getattr(found, f"{of}_{m}")[..., c].numpy() for m in ("mean", "std"))
-        dots = 100 * np.where(shown[of][:, None], values(of, context[of])[..., c], np.inf)
-        dots = np.where(np.isinf(dots), mean.min() - 99, dots)  # out of sight
+        dots = 100 * values(of, context[of])[..., c]
+        dots[~shown[of]] = mean.min() - 99  # out of sight
         panels[f"{of}, {name} [cm], over phase"] = [
             Line("ground truth", TRUTH, seen.phase[::10], 100 * truth[of][::10, c], "--"),
             Line("prediction ± 2 σ", PREDICTION, t, mean, "-", 2 * std),

@@ -229,8 +229,6 @@ def plot_closed_loop(ax: Axes, result: ClosedLoopResult) -> Axes:
         moved = np.hypot(*np.diff(path, axis=0, prepend=path[:1]).T).cumsum()
         middle = [np.interp(moved[-1] / 2, moved, path[:, c]) for c in (0, 1)]
         _name(ax, f"{k + 1}", _cm(middle), (0, 0))
-    actions = len(result.steps)
-    ax.set_title(f"{result.status}: {1000 * result.distance_m:.1f} mm, {actions} actions")
     return ax
 
 
