@@ -331,9 +331,8 @@ class GoalPicker(widgets.HBox):
                     how = "Done,"
                     self.controls.show_progress(1)
                 pose = self.world.object_pose()
-                left_m = self.goal.distance_m(pose[:2])
                 moved = wrap_angle(pose[2] - yaw), self.world.object_state()[2] - z
-                outcome = Outcome(plan, left_m, pose, paths, *moved, words)
+                outcome = Outcome(plan, self.goal.distance_m(pose[:2]), pose, paths, *moved, words)
                 self.outcome, self._lifted = outcome, bool(self.goal.height_m)
                 if self.plan.goal == self.goal or outcome.distance_m <= self.goal.tolerance_m:
                     self._stale = False  # the run has followed the goal
@@ -421,14 +420,12 @@ class GoalPicker(widgets.HBox):
         return np.where(np.abs(np.add(xy_m, by)) < LIMIT_M, by, -np.copysign(by, xy_m))
 
     def _show(self, planning: bool = False) -> None:
-        goal = {"xy": self.goal.xy_m, "tolerance": self.goal.tolerance_m, "yaw": None}
-        if self.goal.turn_rad is not None:
-            goal["yaw"] = self._turn_from + self.goal.turn_rad
+        yaw = None if self.goal.turn_rad is None else self._turn_from + self.goal.turn_rad
         shown = () if planning else self._searched
         self._view.searched = [np.round(line, 4).tolist() for line in shown]
         self._view.scene = {
             "pose": self._pose,
-            "goal": goal,
+            "goal": {"xy": self.goal.xy_m, "tolerance": self.goal.tolerance_m, "yaw": yaw},
             "steps": plan_data(self.plan, self._plan_pose[2]) if self.plan else [],
             "trail": list(self._trail),
             "marks": list(self._marks),

@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib_inline.config import InlineBackend
 
-from affordlib.geometry import rotated
+from affordlib.geometry import rotated, unit_vector
 from affordlib.perception import CAMERA_HEIGHT_M
 from affordlib.planning import ClosedLoopResult
 from affordlib.planning.effect_map import checked_image
@@ -96,12 +96,12 @@ def plot_footprint(
     style: str = "filled",
 ) -> Axes:
     """Draw the outline of an object's base at a pose, filled or with a line style such as "--"."""
-    outline = rotated(obj.footprint_m, check_finite("yaw_rad", yaw_rad))
-    outline = _cm(outline + check_pair("xy_m", xy_m))
-    filled = style == "filled"
-    ax.fill(*outline, facecolor=color if filled else "none", alpha=0.25 if filled else 1, lw=0)
-    closed = np.hstack([outline, outline[:, :1]])
-    ax.plot(*closed, ls="-" if filled else style, color=color, lw=1.5, label=label)
+    closed = np.vstack([obj.footprint_m, obj.footprint_m[:1]])
+    closed = _cm(rotated(closed, check_finite("yaw_rad", yaw_rad)) + check_pair("xy_m", xy_m))
+    if style == "filled":
+        ax.fill(*closed, facecolor=color, alpha=0.25, lw=0)
+        style = "-"
+    ax.plot(*closed, ls=style, color=color, lw=1.5, label=label)
     return ax
 
 
@@ -159,8 +159,7 @@ def plot_plan(
             row += 1
             _name_in_place(ax, text, step, goal, row)
             continue
-        theta = step.primitive.direction_rad
-        direction = np.array([math.cos(theta), math.sin(theta)])
+        direction = unit_vector(step.primitive.direction_rad)
         tail, tip = _cm(start - 0.075 * direction), _cm(start - 0.035 * direction)
         arrow = {"arrowstyle": "-|>", "color": NEUTRAL, "lw": 1.5}
         ax.annotate("", tip, tail, arrowprops=arrow, zorder=4)
