@@ -41,7 +41,6 @@ class PickerControls(widgets.VBox):
         executors: Sequence[str],
         on_goal: Callable[[Goal], None],
     ) -> None:
-        self.goal = goal
         self.sliders = [widgets.FloatSlider(description=n, **s) for n, s in _SLIDERS.items()]
         self.x, self.y, self.turn, self.height = self.sliders
         self.planner = widgets.Dropdown(options=list(planners), description="planner")
@@ -55,30 +54,26 @@ class PickerControls(widgets.VBox):
         self.show(goal)
         for slider in self.sliders:
             slider.observe(lambda change: self._slid(change["owner"], on_goal), names="value")
-        rows = [
-            [self.planner],
-            [self.executor],
-            *([slider] for slider in self.sliders),
-            [self.run, self.stop, self.start_over],
-            [widgets.Label("disturb"), self.shove, self.move_goal],
-        ]
+        rows = [[one] for one in (self.planner, self.executor, *self.sliders)]
+        rows.append([self.run, self.stop, self.start_over])
+        rows.append([widgets.Label("disturb"), self.shove, self.move_goal])
         layout = {"flex": "1 1 250px", "max_width": "300px"}
         super().__init__([widgets.HBox(row) for row in rows], layout=layout)
 
     def show(self, goal: Goal) -> None:
         """Set the sliders to a goal, as accurately as they can show it."""
-        self.goal = goal
-        for slider, value in zip(self.sliders, self._shown(goal), strict=True):
+        self.goal, self._numbers = goal, [*goal.xy_m, goal.turn_rad or 0.0, goal.height_m or 0.0]
+        for slider, value in zip(self.sliders, self._shown(), strict=True):
             slider.value = value
 
-    def _shown(self, goal: Goal) -> list[float]:
-        each = zip(self.sliders, _SCALES, _numbers(goal), strict=True)
+    def _shown(self) -> list[float]:
+        each = zip(self.sliders, _SCALES, self._numbers, strict=True)
         return [round(min(max(scale * v, s.min), s.max), 1) for s, scale, v in each]
 
     def _slid(self, slider: widgets.FloatSlider, on_goal: Callable[[Goal], None]) -> None:
         """Change the goal's value that belongs to a slider, unless the slider follows the goal."""
-        k, numbers = self.sliders.index(slider), _numbers(self.goal)
-        if slider.value != self._shown(self.goal)[k]:
+        k, numbers = self.sliders.index(slider), [*self._numbers]
+        if slider.value != self._shown()[k]:
             numbers[k] = round(slider.value / _SCALES[k], 12)
             x, y, turn, height = numbers
             wanted = {"turn_rad": turn or None, "height_m": height or None}
@@ -103,11 +98,6 @@ def words_as_html(text: str, css: str = "") -> str:
     """A text that screen readers announce, as HTML; only what stands in **stars** is bold."""
     text = re.sub(r"\*\*(.*?)\*\*", r"<b>\1</b>", html.escape(plain(text)))
     return f"<div role='status' aria-live='polite'><div class='{css}'>{text}</div></div>"
-
-
-def _numbers(goal: Goal) -> list[float]:
-    """The values of a goal that the sliders show, in m and rad."""
-    return [*goal.xy_m, goal.turn_rad or 0.0, goal.height_m or 0.0]
 
 
 def _button(name: str, icon: str, tooltip: str, **kwargs: Any) -> widgets.Button:

@@ -32,9 +32,6 @@ EVERY, TICKS = 16, 2
 
 TICK_MS = round(1000 * EVERY * STEP_S / TICKS)
 
-CAMERA = (0.84, -0.88, 0.62, -0.24, 0.02, 0.24, 0.0, 0.0, 1.0)
-"""Where the camera stands, what it looks at [m], and what is upwards."""
-
 _COARSER = """const { renderer } = K3DInstance.getWorld(), gl = renderer.getContext();
 const about = gl.getExtension("WEBGL_debug_renderer_info");
 const name = about ? gl.getParameter(about.UNMASKED_RENDERER_WEBGL) : "";
@@ -61,8 +58,8 @@ class Scene(widgets.VBox):
         fast = {"antialias": 1, "logarithmic_depth_buffer": False}  # twice, without a GPU
         self.plot = k3d.plot(height=400, **plain, **fast)
         self.plot.layout.width = "100%"
-        self.plot.background_color, self.plot.camera = 0xF4F6F8, list(CAMERA)
-        self.plot.axes_helper, self.plot.lighting = 0.0, 1.8
+        self.plot.background_color, self.plot.axes_helper, self.plot.lighting = 0xF4F6F8, 0.0, 1.8
+        self.plot.camera = [0.84, -0.88, 0.62, -0.24, 0.02, 0.24, 0.0, 0.0, 1.0]  # at, to, upwards
         table = [(x, y) for x in TABLE_X_M for y in TABLE_Y_M]
         self._add(extruded(np.array(table), -0.1, 0.0), _WOOD)
         for half, at, rgb in SCENERY:
