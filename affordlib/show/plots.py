@@ -21,7 +21,6 @@ from affordlib.perception import CAMERA_HEIGHT_M
 from affordlib.planning import ClosedLoopResult
 from affordlib.planning.effect_map import checked_image
 from affordlib.planning.free_space import corners_of
-from affordlib.primitives import Grasp, Rotate
 from affordlib.results import write_atomically
 from affordlib.types import (
     CROP_WIDTH_M,
@@ -131,10 +130,6 @@ def _name_in_place(ax: Axes, text: str, step: Step, goal: Goal, row: int) -> Non
     _name(ax, f"{text} {step.primitive.name}", at, (8, -11 * row), ha="left", va="baseline")
 
 
-def _moves(step: Step) -> bool:
-    return not isinstance(step.primitive, Grasp | Rotate)
-
-
 def plot_plan(
     ax: Axes,
     plan: Plan,
@@ -155,7 +150,7 @@ def plot_plan(
     for k, step in enumerate(plan.steps):
         end = np.array(step.predicted_end_xy_m)
         text = f"{k + 1}: {100 * step.stop_phase:.0f} %"
-        if not _moves(step):
+        if not hasattr(step.primitive, "direction_rad"):
             row += 1
             _name_in_place(ax, text, step, goal, row)
             continue
@@ -221,7 +216,7 @@ def plot_closed_loop(ax: Axes, result: ClosedLoopResult) -> Axes:
         ax.plot(*_cm(path), color=TRUTH, lw=2, label=truth)
         ax.plot(*_cm(step.predicted_end_xy_m), "o", color=PREDICTION, ms=5, label=prediction)
         at = path[-1]
-        if not _moves(step):
+        if not hasattr(step.primitive, "direction_rad"):
             row += 1
             _name_in_place(ax, f"{k + 1}", step, goal, row)
             continue
