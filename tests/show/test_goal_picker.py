@@ -116,8 +116,7 @@ def test_what_the_hand_wants_is_planned_for_once(picker):
     for number, xy in enumerate([(0.081, 0.033), (0.081, 0.033), (-0.05, 0.1234)], 1):
         want(picker, *xy, number)
         assert in_time(picker)._view.scene["answered"] == number
-    wanted = [(0.081, 0.033), (0.081, 0.033), (-0.05, 0.123)]
-    assert planned_for == wanted  # once each: the sliders cause no second plan
+    assert planned_for == [(0.081, 0.033), (0.081, 0.033), (-0.05, 0.123)]  # sliders cause none
     assert (picker.controls.x.value, picker.controls.y.value) == (-5.0, 12.3)
     picker.controls.x.value = 7.7
     assert in_time(picker).plan.goal.xy_m == drawn_goal(picker) == (0.077, 0.123)
@@ -238,18 +237,17 @@ def test_a_disturbance_waits_for_the_end_of_the_action(make_picker, world):
             if when == "before":
                 seen.extend((at, goal := report(), world.object_pose()))
                 problem = picker.skills.problem(world.depth_image(), seen[2][:2], goal)
-                done = open_loop(world, planner(problem), planner, report)
-                seen.append(world.object_pose())
-        return done
+                seen.append(open_loop(world, planner(problem), planner, report))
+        return seen[3]
 
     picker = make_picker(executor=executor, seed=3)
     first_goal = picker.plan.goal
     picker.run()
-    before, goal, after, end = seen
+    before, goal, after, (paths, _) = seen
     assert 0.019 < math.dist(before[:2], after[:2]) < 0.041
     assert 0.039 < math.dist(first_goal.xy_m, goal.xy_m) < 0.081
-    assert f"rests **{1000 * goal.distance_m(end[:2]):.1f} mm** from" in picker.controls.said
-    assert math.dist(world.object_pose()[:2], end[:2]) > 0.015
+    assert f"**{1000 * goal.distance_m(paths[-1][-1]):.1f} mm** from" in picker.controls.said
+    assert math.dist(world.object_pose()[:2], paths[-1][-1]) > 0.015
     assert re.search("Done, .* was shoved by .* was moved by .* Plan: ", picker.controls.said)
     assert picker.plan.start_xy_m == world.object_pose()[:2]
     assert picker.plan.goal.xy_m == drawn_goal(picker) != goal.xy_m
