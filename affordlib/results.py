@@ -83,16 +83,6 @@ def resolve_out_dir(out_dir: str | os.PathLike[str]) -> Path:
     return path
 
 
-def versions() -> dict[str, str]:
-    """Return the versions that affect numbers: Python, the package, the libraries, the platform."""
-    packages = ("affordlib", "torch", "pybullet", "numpy")
-    return {
-        "python": platform.python_version(),
-        **{name: importlib.metadata.version(name) for name in packages},
-        "platform": f"{platform.system()} {platform.machine()}",
-    }
-
-
 def write_results(
     out_dir: str | os.PathLike[str],
     notebook: str,
@@ -110,6 +100,10 @@ def write_results(
             f"notebook must be a plain name such as '06_planning', got {notebook!r}; "
             "leave out the folder and the file extension"
         )
+    packages = ("affordlib", "torch", "pybullet", "numpy")  # whose versions affect numbers
+    versions = {"python": platform.python_version()}
+    versions |= {name: importlib.metadata.version(name) for name in packages}
+    versions |= {"platform": f"{platform.system()} {platform.machine()}"}
     about = {"notebook": notebook, "parameters": _plain(parameters, "parameters")}
     blocks, dump = [], partial(json.dumps, ensure_ascii=False)
     for name, rows in _plain(tables, "tables").items():
@@ -119,7 +113,7 @@ def write_results(
         # One line per row, so that a changed number changes one line of the file.
         body = ",\n".join(f"   {dump(row)}" for row in rows)
         blocks.append(f"  {dump(name)}: [\n{body}\n  ]")
-    lines = [f" {dump(k)}: {dump(v)},\n" for k, v in (about | {"versions": versions()}).items()]
+    lines = [f" {dump(k)}: {dump(v)},\n" for k, v in (about | {"versions": versions}).items()]
     text = "".join(["{\n", *lines, ' "tables": {\n', ",\n".join(blocks), "\n }\n}\n"])
     path = resolve_out_dir(out_dir) / f"{notebook}.json"
     write_atomically(path, text, _MARK)

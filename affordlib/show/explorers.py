@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from IPython.core.pylabtools import print_figure
 from matplotlib.figure import Figure
+from scipy.interpolate import make_interp_spline
 
 from affordlib.models.base import EffectModel
 from affordlib.planning.free_space import placed
@@ -131,11 +132,8 @@ def conditioning_explorer(
     channels = {of: getattr(model, f"{of}_channels") for of in CHANNELS}
     columns = {of: [CHANNELS[of].index(n) for n in names] for of, names in channels.items()}
     truth = {of: getattr(seen, of)[:, each] for of, each in columns.items()}
-
-    def values(of, t):
-        return np.stack([np.interp(t, seen.phase, column) for column in truth[of].T], axis=-1)
-
-    given = [tuple(map(torch.Tensor, (t, values(of, t)))) for of, t in context.items()]
+    values = {of: make_interp_spline(seen.phase, rows, k=1) for of, rows in truth.items()}
+    given = [tuple(map(torch.Tensor, (t, values[of](t)))) for of, t in context.items()]
     observed = Observations.of(model, *given, torch.Tensor(states[:, 2]))
     t = np.linspace(0, 1, 25)
     with torch.no_grad():
@@ -145,8 +143,8 @@ def conditioning_explorer(
     for of, name in itertools.product(CHANNELS, ("x", "y")):
         c = channels[of].index(name)
         mean, std = (100 * getattr(found, f"{of}_{m}")[..., c].numpy() for m in ("mean", "std"))
-        dots = 100 * np.where(shown[of][:, None], values(of, context[of])[..., c], np.inf)
-        dots = np.where(np.isinf(dots), mean.min() - 99, dots)  # out of sight
+        dots = 100 * values[of](context[of])[..., c]
+        dots[~shown[of]] = mean.min() - 99  # out of sight
         panels[f"{of}, {name} [cm], over phase"] = [
             Line("ground truth", TRUTH, seen.phase[::10], 100 * truth[of][::10, c], "--"),
             Line("prediction ± 2 σ", PREDICTION, t, mean, "-", 2 * std),

@@ -7,8 +7,9 @@ It is a view on plain objects: everything it does can be done with a planner, `e
 import itertools
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from typing import Any, Self
@@ -27,7 +28,6 @@ from affordlib.show.picker_controls import (
     PickerControls,
     Stopped,
     closed_loop,
-    measured,
     open_loop,
     outcome_in_words,
     plan_in_words,
@@ -51,10 +51,10 @@ class GoalPicker(widgets.HBox):
     chosen planner does. seed: of the disturbances. view: whether the robot is shown in 3-D, too.
     searched: an empty list, in which a planner may leave lines (n, 2) [m] of its search.
 
-    `executors`: name → function (world, plan, planner, report) → Outcome that executes a plan, or
-    replans with the planner that made it; see `Report`. `goal`, `plan` and `outcome` are
-    those shown. Methods do what mouse and buttons do, and return when done; mouse and buttons queue
-    it in the background, and *Run* then shows each pose for `pace_s`.
+    `executors`: name → function (world, plan, planner, report) → Done that executes a plan, or
+    replans with the planner that made it; see `Report`. `goal`, `plan` and `outcome` are those
+    shown. Methods do what mouse and buttons do, and return when done; mouse and buttons queue
+    it in the background. A run shows each pose for `pace_s`.
     """
 
     pace_s = POSE_EVERY * STEP_S
@@ -71,7 +71,7 @@ class GoalPicker(widgets.HBox):
     ) -> None:
         self.world, self.skills, self.planners = world, skills, planners
         self._searched = [] if searched is None else searched
-        self.executors = {"open loop": open_loop, "closed loop": closed_loop(skills)}
+        self.executors = {"open loop": open_loop, "closed loop": partial(closed_loop, skills)}
         self.plan: Plan | None = None
         self.outcome: Outcome | None = None
         self._rng = np.random.default_rng(check_count("seed", seed, least=0))
@@ -87,12 +87,11 @@ class GoalPicker(widgets.HBox):
         self._motions: list[list[float]] = []  # of object and hand, not yet sent
         self._trail: list[tuple[float, float]] = []  # of the object since the plan was made
         self._marks: list[list[Any]] = []  # moves of object and goal that were not planned
-        self._effects: object = None  # those that the page has
         self._shown_until = 0.0
         self._news = ""  # of disturbances, until the next action or plan
         self._view = TableView(table=table_data(skills))
         self.scene = Scene(world) if view else None
-        goal = Goal(_whole_mm(check_on_table("goal_xy_m", goal_xy_m)))
+        goal = Goal(check_on_table("goal_xy_m", goal_xy_m))
         self.controls = PickerControls(goal, list(planners), list(self.executors), self._follow)
         self._listen()
         below = [self._view, self.controls.progress, self.controls.words]
@@ -127,14 +126,14 @@ class GoalPicker(widgets.HBox):
     def pick(self, x_m: float, y_m: float) -> None:
         """Set the goal [m], rounded to millimetres, and replan."""
         check_on_table("goal", (x_m, y_m))
-        self._set_goal(replace(self.goal, xy_m=_whole_mm((x_m, y_m))))
+        self._set_goal(self._goal_at((x_m, y_m)))
         self._update_plan()
 
     def run(self) -> None:
         """Execute the plan and show the outcome; the next plan starts from there."""
         self._refuse_while_running()
         self._set_running(True)
-        self._run(pace_s=0.0)
+        self._run()
 
     def stop(self) -> None:
         """Stop after the current action."""
@@ -173,13 +172,14 @@ class GoalPicker(widgets.HBox):
         bundle = super()._repr_mimebundle_(**kwargs) | {"text/plain": type(self).__name__}
         return bundle | {"image/png": picture}, {"image/png": size}
 
+    def _goal_at(self, xy_m: Any) -> Goal:
+        """The shown goal, moved to a position [m] in whole millimetres."""
+        return replace(self.goal, xy_m=np.round(xy_m, 3))
+
     # Requests from the page
 
     def _listen(self) -> None:
         controls = self.controls
-
-        def place(change):
-            self._follow(replace(self.goal, xy_m=_whole_mm(change["new"][:2])))
 
         def adopt():
             parts = ((tuple(o["corners"]), o["radius"], o["height"]) for o in self._view.obstacles)
@@ -187,10 +187,9 @@ class GoalPicker(widgets.HBox):
             if wanted != self.world.obstacles.all:
                 self._disturb(partial(self._set_obstacles, wanted))
 
-        self._view.observe(place, names="wanted")
-        self._view.observe(lambda _: self._soon(adopt), names="obstacles")
-        presses = {"run": self._run_in_background, "stop": self.stop}
-        self._view.on_msg(lambda _, message, __: presses[message["press"]]())
+        self._view.observe(lambda _: self._follow(self._goal_at(self._view.wanted[:2])), "wanted")
+        self._view.observe(lambda _: self._soon(adopt), "obstacles")
+        self._view.on_msg(lambda _, message, __: getattr(controls, message["press"]).click())
         controls.planner.observe(lambda _: self._follow(self.goal), names="value")
         controls.run.on_click(lambda _: self._run_in_background())
         controls.stop.on_click(lambda _: self.stop())
@@ -216,14 +215,7 @@ class GoalPicker(widgets.HBox):
         """Execute the plan of the shown goal when it is ready; a second press is ignored."""
         if not self._running:
             self._set_running(True)
-            self._queue.submit(self._attempt, partial(self._run, self.pace_s))
-            self._queue.submit(self._attempt, self._plan_after_run)
-
-    def _plan_after_run(self) -> None:
-        """Show a plan from here if the goal was moved and the run did not follow it."""
-        if self._stale and self.outcome is not None:
-            self._news = self.controls.said
-            self._update_plan()
+            self._queue.submit(self._attempt, self._run)
 
     def _follow(self, goal: Goal) -> None:
         """Set the goal, and soon show a plan for it, unless another one follows."""
@@ -262,9 +254,7 @@ class GoalPicker(widgets.HBox):
                 plan = self.planners[self.controls.planner.value](problem)
                 self.controls.say(f"{self._news} {plan_in_words(plan)}")
                 self._news = ""
-                if problem.effects is not self._effects:  # with these the page plans
-                    effects = self._effects = problem.effects
-                    self._view.object = object_data(self.world.obj, effects, self._pose[2])
+                self._view.object = object_data(self.world.obj, problem.effects, self._pose[2])
             finally:
                 self.plan, self.outcome = plan, None
                 self._trail.clear()
@@ -287,7 +277,7 @@ class GoalPicker(widgets.HBox):
         self._stop.clear()
         self.controls.set_running(running)
 
-    def _run(self, pace_s: float) -> None:
+    def _run(self) -> None:
         """Execute the plan, after making a new one if the shown one is outdated."""
         done, left = 0, []
 
@@ -310,41 +300,39 @@ class GoalPicker(widgets.HBox):
             self._wait_until_shown()
             while self._disturbances and not self._stop.is_set():
                 self._disturbances.pop(0)()
-            if self._stop.is_set():
-                raise Stopped
             begin()
             return self.goal
 
         def begin():
+            if self._stop.is_set():
+                raise Stopped
             if left:
                 name, of = left[0].primitive.name.replace("_", " "), done + len(left)
                 self.controls.say(f"{name.capitalize()} {done + 1} of {of} …{self._news}")
                 self._news = ""
 
         with self._alone:
-            on_step = self.world.on_step
             try:
                 if self._stale or self.plan is None or self.outcome is not None:
                     self._make_plan()
-                left[:], self._news = self.plan.steps, ""
-                begin()
+                plan, self._news = self.plan, ""
+                left[:] = plan.steps
                 self._show()
                 yaw, z = self.world.object_pose()[2], self.world.object_state()[2]
-                self.world.on_step = self._motion_log(on_step, z, pace_s)
-                try:
-                    if self._stop.is_set():
-                        raise Stopped
+                if self.scene is not None:
+                    self.scene.begin()
+                self.world.on_step = partial(self._log, itertools.count(), z)
+                paths, words, how = (), "", "Stopped after"
+                with suppress(Stopped):
+                    begin()
                     execute = self.executors[self.controls.executor.value]
                     planner = self.planners[self.controls.planner.value]
-                    outcome = execute(self.world, self.plan, planner, report)
+                    paths, words = execute(self.world, plan, planner, report)
                     how = "Done,"
                     self.controls.show_progress(1)
-                except Stopped:
-                    outcome, how = measured(self.world, self.plan, self.goal), "Stopped after"
-                turned = wrap_angle(self.world.object_pose()[2] - yaw)
-                lifted = self.world.object_state()[2] - z
-                left_m = self.goal.distance_m(outcome.end_pose[:2])
-                outcome = replace(outcome, distance_m=left_m, turned_rad=turned, lifted_m=lifted)
+                pose = self.world.object_pose()
+                moved = wrap_angle(pose[2] - yaw), self.world.object_state()[2] - z
+                outcome = Outcome(plan, self.goal.distance_m(pose[:2]), pose, paths, *moved, words)
                 self.outcome, self._lifted = outcome, bool(self.goal.height_m)
                 if self.plan.goal == self.goal or outcome.distance_m <= self.goal.tolerance_m:
                     self._stale = False  # the run has followed the goal
@@ -353,42 +341,29 @@ class GoalPicker(widgets.HBox):
                 self.plan, self._disturbances = None, []  # the next run plans from the current pose
                 raise
             finally:
-                self.world.on_step = on_step
+                self.world.on_step = None
                 self._wait_until_shown()
                 if self.scene is not None:
                     self.scene.stop()
-                self._pose = self.world.object_pose()
                 self._set_running(False)
                 self._show()
-            if self._disturbances:  # pressed after the last action
+            if self._stale or self._disturbances:  # by a hand that the run did not follow
                 self._news = self.controls.said
                 self._disturb()
 
-    def _motion_log(
-        self, also: Callable[[Tabletop], None] | None, z_m: float, pace_s: float
-    ) -> Callable[[Tabletop], None]:
-        """Make a callback for the world's steps that sends motions, and calls another.
-
-        z_m: the object's height on the table; pace_s: time for which each pose is shown.
-        """
-        steps, self._shown_until, self._pace_s = itertools.count(), time.monotonic(), pace_s
+    def _log(self, steps: Iterator[int], z_m: float, world: Tabletop) -> None:
+        """Log a step of the simulation, and send what is logged; z_m: the object's first height."""
+        number = next(steps)
         if self.scene is not None:
-            self.scene.begin(self.goal, self.plan)
-
-        def log(world):
-            for one in filter(None, (also, self.scene)):
-                one(world)
-            number = next(steps)
-            if number % POSE_EVERY == 0:
-                pose, lift = world.object_pose(), world.object_state()[2] - z_m
-                bodies = () if self.scene is None else self.scene.poses().flat
-                motion = [*pose, lift, *world.arm.tool_pose(), *bodies]
-                self._motions.append(np.round(motion, 4).tolist())
-                self._trail.append(pose[:2])
-            if number == 0 or len(self._motions) == SENT_TOGETHER:
-                self._send_motions(first=number == 0)
-
-        return log
+            self.scene(world)
+        if number % POSE_EVERY == 0:
+            pose, lift = world.object_pose(), world.object_state()[2] - z_m
+            bodies = () if self.scene is None else self.scene.poses().flat
+            motion = [*pose, lift, *world.arm.tool_pose(), *bodies]
+            self._motions.append(np.round(motion, 4).tolist())
+            self._trail.append(pose[:2])
+        if number == 0 or len(self._motions) == SENT_TOGETHER:
+            self._send_motions(first=number == 0)
 
     def _send_motions(self, first: bool = False) -> None:
         """Send the motions logged since the last call, to be shown as they come."""
@@ -396,13 +371,13 @@ class GoalPicker(widgets.HBox):
             bodies = [self.scene.name, [one.id for one in self.scene.bodies]] if self.scene else []
             self._view.send({"motions": self._motions, "first": first, "bodies": bodies})
             self._shown_until = max(self._shown_until, time.monotonic())
-            self._shown_until += self._pace_s * len(self._motions)
+            self._shown_until += self.pace_s * len(self._motions)
             self._motions = []
 
     def _wait_until_shown(self) -> None:
         self._send_motions()
-        if not self._stop.wait(max(0.0, self._shown_until - time.monotonic())):
-            self._pose = self.world.object_pose()
+        self._stop.wait(max(0.0, self._shown_until - time.monotonic()))
+        self._pose, self._shown_until = self.world.object_pose(), 0.0
 
     # Disturbances
 
@@ -412,8 +387,8 @@ class GoalPicker(widgets.HBox):
             with self._alone:
                 while self._disturbances:
                     self._disturbances.pop(0)()
-                if self.scene is not None:
-                    self.scene.place()
+                    if self.scene is not None:
+                        self.scene.place()
                 self._make_plan()
 
     def _shove(self) -> None:
@@ -427,8 +402,9 @@ class GoalPicker(widgets.HBox):
 
     def _move_goal(self) -> None:
         by = self._displacement(self.goal.xy_m, 0.04, 0.08)
-        self._marks.append([self.goal.xy_m, _whole_mm(self.goal.xy_m + by)])
-        self._set_goal(replace(self.goal, xy_m=self._marks[-1][1]))
+        goal = self._goal_at(self.goal.xy_m + by)
+        self._marks.append([self.goal.xy_m, goal.xy_m])
+        self._set_goal(goal)
         self._news += f" The goal was moved by {1000 * np.hypot(*by):.0f} mm."
 
     def _set_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
@@ -441,18 +417,15 @@ class GoalPicker(widgets.HBox):
     def _displacement(self, xy_m: tuple[float, float], least_m: float, most_m: float) -> np.ndarray:
         """A random displacement (2,) [m], reversed where it would leave the shown area."""
         by = self._rng.uniform(least_m, most_m) * unit_vector(self._rng.uniform(0, 2 * np.pi))
-        inside = np.abs(np.add(xy_m, by)) < LIMIT_M
-        return np.where(inside, by, -np.copysign(by, xy_m))
+        return np.where(np.abs(np.add(xy_m, by)) < LIMIT_M, by, -np.copysign(by, xy_m))
 
     def _show(self, planning: bool = False) -> None:
-        goal = {"xy": self.goal.xy_m, "tolerance": self.goal.tolerance_m, "yaw": None}
-        if self.goal.turn_rad is not None:
-            goal["yaw"] = self._turn_from + self.goal.turn_rad
+        yaw = None if self.goal.turn_rad is None else self._turn_from + self.goal.turn_rad
         shown = () if planning else self._searched
         self._view.searched = [np.round(line, 4).tolist() for line in shown]
         self._view.scene = {
             "pose": self._pose,
-            "goal": goal,
+            "goal": {"xy": self.goal.xy_m, "tolerance": self.goal.tolerance_m, "yaw": yaw},
             "steps": plan_data(self.plan, self._plan_pose[2]) if self.plan else [],
             "trail": list(self._trail),
             "marks": list(self._marks),
@@ -461,9 +434,3 @@ class GoalPicker(widgets.HBox):
             "planning": planning,
             "pace": self.pace_s,
         }
-
-
-def _whole_mm(xy_m: Any) -> tuple[float, float]:
-    """Round a position [m] to whole millimetres."""
-    x, y = np.round(xy_m, 3).tolist()
-    return x, y

@@ -41,7 +41,6 @@ class PickerControls(widgets.VBox):
         executors: Sequence[str],
         on_goal: Callable[[Goal], None],
     ) -> None:
-        self.goal = goal
         self.sliders = [widgets.FloatSlider(description=n, **s) for n, s in _SLIDERS.items()]
         self.x, self.y, self.turn, self.height = self.sliders
         self.planner = widgets.Dropdown(options=list(planners), description="planner")
@@ -55,30 +54,26 @@ class PickerControls(widgets.VBox):
         self.show(goal)
         for slider in self.sliders:
             slider.observe(lambda change: self._slid(change["owner"], on_goal), names="value")
-        rows = [
-            [self.planner],
-            [self.executor],
-            *([slider] for slider in self.sliders),
-            [self.run, self.stop, self.start_over],
-            [widgets.Label("disturb"), self.shove, self.move_goal],
-        ]
+        rows = [[one] for one in (self.planner, self.executor, *self.sliders)]
+        rows.append([self.run, self.stop, self.start_over])
+        rows.append([widgets.Label("disturb"), self.shove, self.move_goal])
         layout = {"flex": "1 1 250px", "max_width": "300px"}
         super().__init__([widgets.HBox(row) for row in rows], layout=layout)
 
     def show(self, goal: Goal) -> None:
         """Set the sliders to a goal, as accurately as they can show it."""
-        self.goal = goal
-        for slider, value in zip(self.sliders, self._shown(goal), strict=True):
+        self.goal, self._numbers = goal, [*goal.xy_m, goal.turn_rad or 0.0, goal.height_m or 0.0]
+        for slider, value in zip(self.sliders, self._shown(), strict=True):
             slider.value = value
 
-    def _shown(self, goal: Goal) -> list[float]:
-        each = zip(self.sliders, _SCALES, _numbers(goal), strict=True)
+    def _shown(self) -> list[float]:
+        each = zip(self.sliders, _SCALES, self._numbers, strict=True)
         return [round(min(max(scale * v, s.min), s.max), 1) for s, scale, v in each]
 
     def _slid(self, slider: widgets.FloatSlider, on_goal: Callable[[Goal], None]) -> None:
         """Change the goal's value that belongs to a slider, unless the slider follows the goal."""
-        k, numbers = self.sliders.index(slider), _numbers(self.goal)
-        if slider.value != self._shown(self.goal)[k]:
+        k, numbers = self.sliders.index(slider), [*self._numbers]
+        if slider.value != self._shown()[k]:
             numbers[k] = round(slider.value / _SCALES[k], 12)
             x, y, turn, height = numbers
             wanted = {"turn_rad": turn or None, "height_m": height or None}
@@ -103,11 +98,6 @@ def words_as_html(text: str, css: str = "") -> str:
     """A text that screen readers announce, as HTML; only what stands in **stars** is bold."""
     text = re.sub(r"\*\*(.*?)\*\*", r"<b>\1</b>", html.escape(plain(text)))
     return f"<div role='status' aria-live='polite'><div class='{css}'>{text}</div></div>"
-
-
-def _numbers(goal: Goal) -> list[float]:
-    """The values of a goal that the sliders show, in m and rad."""
-    return [*goal.xy_m, goal.turn_rad or 0.0, goal.height_m or 0.0]
 
 
 def _button(name: str, icon: str, tooltip: str, **kwargs: Any) -> widgets.Button:
@@ -148,43 +138,33 @@ Report = Callable[..., Goal]
 """`report()` after an action applies pending disturbances, and raises `Stopped` when execution must
 end; `report(plan)` when a new plan replaces the current one. Both return the current goal."""
 
-Executor = Callable[[Tabletop, Plan, Planner, Report], Outcome]
-"""Function that executes a plan; the caller measures the object's rotation and height."""
+Done = tuple[tuple[np.ndarray, ...], str]
+"""What an executor returns: the object's path (n, 2) [m] in each action, and a text on it."""
 
 
 class Stopped(Exception):
     """The user has pressed Stop."""
 
 
-def open_loop(world: Tabletop, plan: Plan, planner: Planner, report: Report) -> Outcome:
-    """Execute a plan as it is, action by action, and measure where the object comes to rest."""
+def open_loop(world: Tabletop, plan: Plan, planner: Planner, report: Report) -> Done:
+    """Execute a plan as it is, action by action."""
     paths: tuple[np.ndarray, ...] = ()
     for step in plan.steps:
         paths += execute_plan(world, replace(plan, steps=(step,))).object_paths_xy_m
         report()
-    return measured(world, plan, plan.goal, paths)
+    return paths, ""
 
 
-def measured(
-    world: Tabletop, plan: Plan, goal: Goal, paths: tuple[np.ndarray, ...] = (), words: str = ""
-) -> Outcome:
-    """The outcome of a plan, measured from the object's true pose to a goal; paths: (n, 2) [m]."""
-    pose = world.object_pose()
-    return Outcome(plan, goal.distance_m(pose[:2]), pose, paths, words=words)
+def closed_loop(
+    skills: Skills, world: Tabletop, plan: Plan, planner: Planner, report: Report
+) -> Done:
+    """Observe after every action, and plan again until the object is within 2 mm of the goal."""
+    goals = [plan.goal]
 
+    def exact():
+        return replace(goals[-1], tolerance_m=0.002)
 
-def closed_loop(skills: Skills, tolerance_m: float = 0.002) -> Executor:
-    """Make an executor that observes after every action and replans to this tolerance [m]."""
-
-    def execute(world, plan, planner, report):
-        goals = [plan.goal]
-
-        def exact():
-            return replace(goals[-1], tolerance_m=tolerance_m)
-
-        config = ClosedLoopConfig(on_action=lambda *_: goals.append(report()), on_plan=report)
-        done = run_closed_loop(world, exact, skills, planner, config)
-        words = "" if done.reached else f"The loop ended as {done.status}: {done.message}."
-        return measured(world, plan, goals[-1], done.object_paths_xy_m, words)
-
-    return execute
+    config = ClosedLoopConfig(on_action=lambda *_: goals.append(report()), on_plan=report)
+    done = run_closed_loop(world, exact, skills, planner, config)
+    words = "" if done.reached else f"The loop ended as {done.status}: {done.message}."
+    return done.object_paths_xy_m, words

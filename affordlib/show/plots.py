@@ -16,12 +16,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib_inline.config import InlineBackend
 
-from affordlib.geometry import rotated
+from affordlib.geometry import rotated, unit_vector
 from affordlib.perception import CAMERA_HEIGHT_M
 from affordlib.planning import ClosedLoopResult
 from affordlib.planning.effect_map import checked_image
 from affordlib.planning.free_space import corners_of
-from affordlib.primitives import Grasp, Rotate
 from affordlib.results import write_atomically
 from affordlib.types import (
     CROP_WIDTH_M,
@@ -96,12 +95,12 @@ def plot_footprint(
     style: str = "filled",
 ) -> Axes:
     """Draw the outline of an object's base at a pose, filled or with a line style such as "--"."""
-    outline = rotated(obj.footprint_m, check_finite("yaw_rad", yaw_rad))
-    outline = _cm(outline + check_pair("xy_m", xy_m))
-    filled = style == "filled"
-    ax.fill(*outline, facecolor=color if filled else "none", alpha=0.25 if filled else 1, lw=0)
-    closed = np.hstack([outline, outline[:, :1]])
-    ax.plot(*closed, ls="-" if filled else style, color=color, lw=1.5, label=label)
+    closed = np.vstack([obj.footprint_m, obj.footprint_m[:1]])
+    closed = _cm(rotated(closed, check_finite("yaw_rad", yaw_rad)) + check_pair("xy_m", xy_m))
+    if style == "filled":
+        ax.fill(*closed, facecolor=color, alpha=0.25, lw=0)
+        style = "-"
+    ax.plot(*closed, ls=style, color=color, lw=1.5, label=label)
     return ax
 
 
@@ -131,10 +130,6 @@ def _name_in_place(ax: Axes, text: str, step: Step, goal: Goal, row: int) -> Non
     _name(ax, f"{text} {step.primitive.name}", at, (8, -11 * row), ha="left", va="baseline")
 
 
-def _moves(step: Step) -> bool:
-    return not isinstance(step.primitive, Grasp | Rotate)
-
-
 def plot_plan(
     ax: Axes,
     plan: Plan,
@@ -155,12 +150,11 @@ def plot_plan(
     for k, step in enumerate(plan.steps):
         end = np.array(step.predicted_end_xy_m)
         text = f"{k + 1}: {100 * step.stop_phase:.0f} %"
-        if not _moves(step):
+        if not hasattr(step.primitive, "direction_rad"):
             row += 1
             _name_in_place(ax, text, step, goal, row)
             continue
-        theta = step.primitive.direction_rad
-        direction = np.array([math.cos(theta), math.sin(theta)])
+        direction = unit_vector(step.primitive.direction_rad)
         tail, tip = _cm(start - 0.075 * direction), _cm(start - 0.035 * direction)
         arrow = {"arrowstyle": "-|>", "color": NEUTRAL, "lw": 1.5}
         ax.annotate("", tip, tail, arrowprops=arrow, zorder=4)
@@ -222,15 +216,13 @@ def plot_closed_loop(ax: Axes, result: ClosedLoopResult) -> Axes:
         ax.plot(*_cm(path), color=TRUTH, lw=2, label=truth)
         ax.plot(*_cm(step.predicted_end_xy_m), "o", color=PREDICTION, ms=5, label=prediction)
         at = path[-1]
-        if not _moves(step):
+        if not hasattr(step.primitive, "direction_rad"):
             row += 1
             _name_in_place(ax, f"{k + 1}", step, goal, row)
             continue
         moved = np.hypot(*np.diff(path, axis=0, prepend=path[:1]).T).cumsum()
         middle = [np.interp(moved[-1] / 2, moved, path[:, c]) for c in (0, 1)]
         _name(ax, f"{k + 1}", _cm(middle), (0, 0))
-    actions = len(result.steps)
-    ax.set_title(f"{result.status}: {1000 * result.distance_m:.1f} mm, {actions} actions")
     return ax
 
 

@@ -6,7 +6,6 @@ a page does so by k3d's script, which `make html` takes from the environment.
 
 import base64
 import io
-import itertools
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -32,9 +31,6 @@ EVERY, TICKS = 16, 2
 """Simulation steps between two recorded poses, and ticks of the time line: k3d moves in between."""
 
 TICK_MS = round(1000 * EVERY * STEP_S / TICKS)
-
-CAMERA = (0.84, -0.88, 0.62, -0.24, 0.02, 0.24, 0.0, 0.0, 1.0)
-"""Where the camera stands, what it looks at [m], and what is upwards."""
 
 _COARSER = """const { renderer } = K3DInstance.getWorld(), gl = renderer.getContext();
 const about = gl.getExtension("WEBGL_debug_renderer_info");
@@ -62,14 +58,14 @@ class Scene(widgets.VBox):
         fast = {"antialias": 1, "logarithmic_depth_buffer": False}  # twice, without a GPU
         self.plot = k3d.plot(height=400, **plain, **fast)
         self.plot.layout.width = "100%"
-        self.plot.background_color, self.plot.camera = 0xF4F6F8, list(CAMERA)
-        self.plot.axes_helper, self.plot.lighting = 0.0, 1.8
+        self.plot.background_color, self.plot.axes_helper, self.plot.lighting = 0xF4F6F8, 0.0, 1.8
+        self.plot.camera = [0.84, -0.88, 0.62, -0.24, 0.02, 0.24, 0.0, 0.0, 1.0]  # at, to, upwards
         table = [(x, y) for x in TABLE_X_M for y in TABLE_Y_M]
         self._add(extruded(np.array(table), -0.1, 0.0), _WOOD)
         for half, at, rgb in SCENERY:
-            self._add(_box(2 * np.array(half)), to_hex(rgb), _matrix(at))
+            self._add(_box(2 * np.array(half)), to_hex(rgb), at)
         base, *links = _arm(world)
-        self._add(*base, _matrix((BASE_X_M, 0.0, 0.0)))
+        self._add(*base, (BASE_X_M, 0.0, 0.0))
         self._links = [self._add(*link) for link in links]
         self.name = f"scene_{uuid4().hex}"
         self.plot.additional_js_code = f"(globalThis.affordlib ??= {{}}).{self.name} = K3DInstance;"
@@ -89,19 +85,17 @@ class Scene(widgets.VBox):
         layout = {"flex": "1 1 420px", "max_width": "700px", "min_width": "0"}
         super().__init__([self.plot, below], layout=layout)
 
-    def place(self, goal: Goal | None = None, plan: Plan | None = None) -> None:
+    def place(self) -> None:
         """Show the world's present object and obstacles, and begin a recording."""
         if self._object is not None:
             self.plot -= self._object
-        self._object, self._drawn = self._add(_solid(self.world.obj), TRUTH), self.world.obj
+        self._object = self._add(_solid(self.world.obj), TRUTH)
         self.begin()
-        self.mark(goal, plan)
+        self.mark()
         self.stop()
 
-    def begin(self, goal: Goal | None = None, plan: Plan | None = None) -> None:
-        """Start a recording; only another object is drawn, since that takes up to a second."""
-        if self._drawn is not self.world.obj:
-            self.place(goal, plan)
+    def begin(self) -> None:
+        """Begin a recording."""
         self._frames, self._steps = [self.poses()], 0
 
     def mark(self, goal: Goal | None = None, plan: Plan | None = None) -> None:
@@ -115,13 +109,12 @@ class Scene(widgets.VBox):
         if plan is not None and plan.steps:
             yaw += plan.steps[-1].predicted_turn_rad
             at = (*plan.predicted_end_xy_m, obj.height_m / 2)
-            ghost = self._add(_solid(obj), PREDICTION, _matrix(at, yaw), opacity=0.4)
-            self._marks.append(ghost)
+            self._marks.append(self._add(_solid(obj), PREDICTION, at, yaw, opacity=0.4))
         if goal is not None:
             yaw = yaw if goal.turn_rad is None else start + goal.turn_rad
             sheet = extruded(1.3 * obj.footprint_m, 0.0, 0.003)
             at = *goal.xy_m, goal.height_m or 0.0
-            self._marks.append(self._add(sheet, GOAL, _matrix(at, yaw)))
+            self._marks.append(self._add(sheet, GOAL, at, yaw))
 
     def __call__(self, world: Tabletop) -> None:
         """Record the world's present poses, every few steps."""
@@ -161,14 +154,16 @@ class Scene(widgets.VBox):
         self._last = now  # of the two quaternions of a turn, the one next to the last
         return now
 
-    def _add(self, points: Any, color: str, at: Any = None, opacity: float = 1.0) -> Any:
-        """Add a body: the convex hull of points (n, 3), or triangles (n, 3, 3)."""
+    def _add(
+        self, points: Any, color: str, xyz: Any = (0, 0, 0), yaw_rad: float = 0, opacity: float = 1
+    ) -> Any:
+        """Add a body at a pose: the convex hull of points (n, 3), or triangles (n, 3, 3)."""
         points = np.asarray(points, dtype=float)
         if points.ndim == 2:
             points = np.array(mesh([points])["vertices"]).reshape(-1, 3, 3)
         corners, indices = np.unique(points.reshape(-1, 3), axis=0, return_inverse=True)
-        options = {"color": int(color[1:], 16), "opacity": opacity}
-        options["model_matrix"] = np.eye(4, dtype=np.float32) if at is None else at
+        at = RigidTransform.from_components(xyz, Rotation.from_euler("z", yaw_rad)).as_matrix()
+        options = {"color": int(color[1:], 16), "opacity": opacity, "model_matrix": np.float32(at)}
         body = self._mesh(np.float32(corners), np.uint32(indices).reshape(-1, 3), **options)
         self.plot += body
         return body
@@ -187,12 +182,6 @@ class Scene(widgets.VBox):
         return bundle | {"text/html": html, "text/plain": type(self).__name__}
 
 
-def _matrix(xyz: Any, yaw_rad: float = 0.0) -> np.ndarray:
-    """A pose (4, 4) from a position and a yaw."""
-    turn = Rotation.from_euler("z", yaw_rad)
-    return np.float32(RigidTransform.from_components(xyz, turn).as_matrix())
-
-
 def _arm(world: Tabletop) -> Iterator[tuple[np.ndarray, str]]:
     """Points or triangles of the arm's base and of each link, and their colours."""
     for _, _, _, size, file, at, _, rgba in world.client.getVisualShapeData(world.arm.robot):
@@ -203,17 +192,15 @@ def _arm(world: Tabletop) -> Iterator[tuple[np.ndarray, str]]:
 
 
 def _box(size_m: Sequence[float]) -> np.ndarray:
-    return np.array(list(itertools.product((-0.5, 0.5), repeat=3))) * size_m
+    return (np.array(list(np.ndindex(2, 2, 2))) - 0.5) * size_m
 
 
 def _solid(obj: TabletopObject) -> np.ndarray:
     """Points (n, 3) whose convex hull is the object, around its centre."""
     half = obj.height_m / 2
     if isinstance(obj, Sphere):
-        levels = half * np.cos(np.linspace(0, np.pi, 17))
-        return np.vstack(
-            [np.insert(circle(np.sqrt(half**2 - z**2), 48), 2, z, axis=1) for z in levels]
-        )
+        levels = half * np.cos(np.linspace(0, np.pi / 2, 9))
+        return np.vstack([extruded(circle(np.sqrt(half**2 - z**2), 48), -z, z) for z in levels])
     if isinstance(obj, LyingCylinder):
         return extruded(circle(half, 48), -obj.length / 2, obj.length / 2)[:, [2, 0, 1]]
     return extruded(obj.footprint_m, -half, half)

@@ -74,16 +74,14 @@ def object_data(obj: TabletopObject, effects: EffectMap, yaw_rad: float = 0.0) -
     yaw_rad: the object's yaw in the map's image.
     """
     action, seen = effects.kind.towards(0.0), rotated(effects.outline_m, -yaw_rad)
-    hand = {"size": hand_m(action).max(axis=0).tolist(), "grip": None}
-    if not isinstance(action, Push):
-        hand["grip"] = adapt_to_object(action, effects.image).grip_yaw
-    path = action.path(np.linspace(0, 1, 26))[:, [0, ACTION_CHANNELS.index("gripper")]]
-    hand["path"] = (path * (1, action.opening_m)).round(5).tolist()
+    size, path = hand_m(action).max(axis=0).tolist(), action.path(np.linspace(0, 1, 26))
+    path = path[:, [0, ACTION_CHANNELS.index("gripper")]] * (1, action.opening_m)
+    grip = None if isinstance(action, Push) else adapt_to_object(action, effects.image).grip_yaw
     return {
         "outline": obj.footprint_m.round(6).tolist(),
         "yaw": yaw_rad,
         "seen": seen.round(6).tolist(),
-        "hand": hand,
+        "hand": {"size": size, "grip": grip, "path": path.round(5).tolist()},
         "margins": [START_M, MARGIN_M, FULL_AT_M],
         "map": effects.numbers(),
     }
