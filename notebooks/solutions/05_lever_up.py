@@ -55,6 +55,4 @@ def recurrent_over_conditional(noise_m=0.001):
 
 
 VERDICTS = [check("05.1", two_poses_cm()), check("05.2", recurrent_over_conditional())]
-
-if __name__ == "__main__":
-    print(*VERDICTS, sep="\n")
+print(*VERDICTS, sep="\n")
