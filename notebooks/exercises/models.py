@@ -5,12 +5,8 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from affordlib.interactions import (
-    InteractionTensors,
-    condition_on_recorded_action,
-    open_interactions,
-    split_interactions,
-)
+from affordlib import interactions
+from affordlib.interactions import InteractionTensors, open_interactions
 from affordlib.models import coverage, load_checkpoint, network_predictions
 from exercises.checking import answer_of, exercise
 
@@ -39,11 +35,11 @@ def drawn_length(draw: Callable) -> float:
     rng.normal takes arrays of means and of standard deviations.
     """
     pushes = open_interactions("push")
-    held_out = split_interactions(pushes.sizes["interaction"]).test
+    held_out = interactions.split_interactions(pushes.sizes["interaction"]).test
     arrays = InteractionTensors.from_dataset(pushes, held_out)
     at = torch.linspace(0, len(arrays.phase) - 1, 61).round().long()
     model, _ = load_checkpoint("cnp_500")
-    query = condition_on_recorded_action(arrays)
+    query = interactions.condition_on_recorded_action(arrays)
     answer = model.predict(model.encode(arrays.image), query, arrays.phases(at))
     mean, sigma = answer.effect_mean.numpy(), answer.effect_std.numpy()
     rng = np.random.default_rng(0)

@@ -7,16 +7,9 @@ from functools import cache
 import numpy as np
 import torch
 
+from affordlib import planning
 from affordlib.models import load_checkpoint
-from affordlib.planning import (
-    EffectMap,
-    PlanningProblem,
-    corners_of,
-    gaps_m,
-    placed,
-    plan_continuous,
-    roll_out,
-)
+from affordlib.planning import EffectMap, corners_of, gaps_m, placed
 from affordlib.planning.effect_map import poses_along
 from affordlib.planning.free_space import ring
 from affordlib.planning.grasp_rotate import predict_trajectories
@@ -75,7 +68,7 @@ def chain_error(chain_end: Callable) -> float:
     direction = torch.from_numpy(rng.uniform(-math.pi, math.pi, (50, 3)))
     phase = torch.from_numpy(rng.uniform(0.6, 1.0, (50, 3)))
     with torch.no_grad():
-        ends = roll_out(effects, direction, phase)[0][:, -1].numpy()
+        ends = planning.roll_out(effects, direction, phase)[0][:, -1].numpy()
         answers = [answer_of(chain_end, effects, *d) for d in zip(direction, phase, strict=True)]
     return 1000 * np.linalg.norm(answers - ends, axis=1).max()
 
@@ -158,7 +151,8 @@ def _shoved_mm(bring: Callable, shove: tuple[float, float, float]) -> float:
     goal, taken = Goal((0.16, 0.09)), []
 
     def plan(seen: Observation) -> Plan:
-        return plan_continuous(PlanningProblem(seen.xy_m, goal, EffectMap(model, seen.image)))
+        problem = planning.PlanningProblem(seen.xy_m, goal, EffectMap(model, seen.image))
+        return planning.plan_continuous(problem)
 
     def act(step: Step) -> None:
         if len(taken) == MOST_ACTIONS:
