@@ -82,6 +82,9 @@ def test_a_wrong_answer_gives_one_hint_then_another_and_an_explanation_but_not_t
     assert all(len(exercise.hints) == 2 for exercise in EXERCISES.values())
     WRONG.clear()
     first, second = check("A5.1", 0.61), check("A5.1", 0.62)
-    assert [v.hint for v in (first, second)] == EXERCISES["A5.1"].hints
+    hints = [str(verdict).partition(". Hint: ")[2] for verdict in (first, second)]
+    assert hints == EXERCISES["A5.1"].hints
     assert "0.58" not in f"{first} {second} {second._repr_html_()}"
     assert "<details>" in second._repr_html_()
+    for no_number in ("0.61", "x", np.nan, [0.61]):
+        assert "0.58" not in str(check("A5.1", no_number))

@@ -7,6 +7,7 @@ below. Where the answer itself is the figure, the expected one is not shown.
 import ast
 import html
 import inspect
+import math
 import re
 from collections import Counter
 from collections.abc import Callable
@@ -61,12 +62,8 @@ class Verdict:
     """What became of an attempt at an exercise; printed as one line."""
 
     name: str
-    exercise: Exercise
     status: str
-    figure: float | None = None
-    why: str = ""
-    hint: str = ""
-    shown: bool = False
+    says: str
 
     @property
     def passed(self) -> bool:
@@ -74,18 +71,11 @@ class Verdict:
         return self.status == "passed"
 
     def __str__(self) -> str:
-        exercise = self.exercise
-        line = f"Exercise {self.name}: {self.status}"
-        if self.status == "not attempted":
-            return f"{line}. {exercise.asks}"
-        line += f" ({self.why})" if self.why else f", {self.figure:.4g} {exercise.unit}"
-        if self.shown or self.passed:
-            line += f"; expected {exercise.expected:g} ± {exercise.within:g} {exercise.unit}"
-        return f"{line}. Hint: {self.hint}" if self.hint else line
+        return f"Exercise {self.name}: {self.status}{self.says}"
 
     def _repr_html_(self) -> str | None:
         """The line, with the explanation folded below, once it is solved or both hints are used."""
-        if not (self.passed or WRONG[self.name] >= len(self.exercise.hints)):
+        if not (self.passed or WRONG[self.name] >= len(EXERCISES[self.name].hints)):
             return None
         line, more = html.escape(str(self)), html.escape(explanation(self.name))
         return f"{line}<details><summary>Explanation</summary><p>{more}</p></details>"
@@ -102,19 +92,22 @@ def check(name: str, attempt: Any) -> Verdict:
     """
     if name not in EXERCISES:
         raise ValueError(f"exercise {name!r} is unknown; there are {', '.join(EXERCISES)}")
-    exercise, why, figure = EXERCISES[name], "", None
+    exercise, value = EXERCISES[name], attempt
     try:
-        figure = float(exercise.figure(given(attempt)))
+        value = exercise.figure(given(attempt))
+        figure, says = float(value), f", {float(value):.4g} {exercise.unit}"
     except _NotAttempted:
-        return Verdict(name, exercise, "not attempted")
+        return Verdict(name, "not attempted", f". {exercise.asks}")
     except Exception as error:
-        why = f"{type(error).__name__}: {error}"
-    if figure is not None and abs(figure - exercise.expected) <= exercise.within:
-        return Verdict(name, exercise, "passed", figure)
+        figure, says = math.nan, f" ({type(error).__name__}: {error})"
+    expected = f"; expected {exercise.expected:g} ± {exercise.within:g} {exercise.unit}"
+    if abs(figure - exercise.expected) <= exercise.within:
+        return Verdict(name, "passed", says + expected)
+    if value is attempt and not callable(attempt):  # the answer itself is expected
+        expected = ""
     WRONG[name] += 1
     hint = exercise.hints[min(WRONG[name], len(exercise.hints)) - 1]
-    shown = callable(attempt) or figure != attempt
-    return Verdict(name, exercise, "failed", figure, why, hint, shown)
+    return Verdict(name, "failed", f"{says}{expected}. Hint: {hint}")
 
 
 class _NotAttempted(Exception):
