@@ -70,7 +70,7 @@ class Verdict:
         """Whether the exercise is solved."""
         return self.status == "passed"
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         return f"Exercise {self.name}: {self.status}{self.says}"
 
     def _repr_html_(self) -> str | None:
@@ -79,9 +79,6 @@ class Verdict:
             return None
         line, more = html.escape(str(self)), html.escape(explanation(self.name))
         return f"{line}<details><summary>Explanation</summary><p>{more}</p></details>"
-
-    def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
-        printer.text(str(self))
 
 
 @checked
