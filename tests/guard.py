@@ -1,4 +1,4 @@
-"""Check that refactoring changes no data, predictions, plans or tables.
+"""Check that refactoring changes no data, predictions or plans.
 
 Write a file at one commit and compare it with another, on the same machine (results are not
 bit-identical across processors):
@@ -101,26 +101,6 @@ def planned() -> dict[str, list[float]]:
     return found
 
 
-def tabled() -> dict[str, list[float]]:
-    """Every number of the committed results, under any key."""
-    found = {}
-    for path in sorted((repo_root() / "data" / "results").glob("*.json")):
-        numbers = []
-
-        def gather(value, numbers=numbers):
-            if isinstance(value, dict):
-                value = list(value.values())
-            if isinstance(value, list):
-                for item in value:
-                    gather(item)
-            elif isinstance(value, int | float) and not isinstance(value, bool):
-                numbers.append(float(value))
-
-        gather(json.loads(path.read_text()))
-        found[f"tabled {path.stem}"] = sorted(numbers)
-    return found
-
-
 def compare(before: dict[str, list[float]], now: dict[str, list[float]]) -> list[str]:
     """One sentence for each entry that is missing, new, or not bit-identical."""
     moved = [f"{name}: gone" for name in before if name not in now]
@@ -141,7 +121,7 @@ def main() -> int:
     parser.add_argument("file", type=Path)
     options = parser.parse_args()
     torch.set_num_threads(1)
-    now = collected() | predicted() | planned() | tabled()
+    now = collected() | predicted() | planned()
     if options.action == "write":
         options.file.write_text(json.dumps(now))
         print(f"{len(now)} entries written to {options.file}")

@@ -4,34 +4,57 @@ A wrong answer gives a hint, the next one another; then, or once solved, the exp
 below. Where the answer itself is the figure, the expected one is not shown.
 """
 
-from __future__ import annotations
-
+import ast
 import html
+import inspect
+import math
+import re
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from exercises.hints import HINTS, explanation
+from affordlib import checked
 
+SOLUTIONS = Path(__file__).parents[1] / "solutions"
 WRONG: Counter[str] = Counter()
 """Wrong answers so far, by the exercise's name."""
 
 
 @dataclass(frozen=True)
 class Exercise:
-    """The question, and how an answer is measured.
+    """The question, two hints without the answer, and how an answer is measured.
 
     figure: the answer's figure, in `unit`; it passes if it lies within `within` of `expected`.
     """
 
     asks: str
+    hints: list[str]
     figure: Callable[[Any], float]
     expected: float
     within: float
     unit: str
+
+
+EXERCISES: dict[str, Exercise] = {}
+
+
+def exercise(name: str, expected: float, within: float, unit: str) -> Callable:
+    """Make an exercise of a function that measures answers.
+
+    Its docstring is the question, a blank line, and the hints, each on one line.
+    """
+
+    def add(figure: Callable[[Any], float]) -> Callable[[Any], float]:
+        asks, hints = inspect.getdoc(figure).split("\n\n")
+        asks = asks.replace("\n", " ")
+        EXERCISES[name] = Exercise(asks, hints.splitlines(), figure, expected, within, unit)
+        return figure
+
+    return add
 
 
 @dataclass(frozen=True)
@@ -39,78 +62,71 @@ class Verdict:
     """What became of an attempt at an exercise; printed as one line."""
 
     name: str
-    exercise: Exercise
     status: str
-    figure: float | None = None
-    why: str = ""
-    hint: str = ""
-    shown: bool = False
+    says: str
 
     @property
     def passed(self) -> bool:
         """Whether the exercise is solved."""
         return self.status == "passed"
 
-    def __str__(self) -> str:
-        exercise = self.exercise
-        line = f"Exercise {self.name}: {self.status}"
-        if self.status == "not attempted":
-            return f"{line}. {exercise.asks}"
-        line += f" ({self.why})" if self.why else f", {self.figure:.4g} {exercise.unit}"
-        if self.shown or self.passed:
-            line += f"; expected {exercise.expected:g} ± {exercise.within:g} {exercise.unit}"
-        return f"{line}. Hint: {self.hint}" if self.hint else line
+    def __repr__(self) -> str:
+        return f"Exercise {self.name}: {self.status}{self.says}"
 
     def _repr_html_(self) -> str | None:
         """The line, with the explanation folded below, once it is solved or both hints are used."""
-        if not (self.passed or WRONG[self.name] >= len(HINTS[self.name])):
+        if not (self.passed or WRONG[self.name] >= len(EXERCISES[self.name].hints)):
             return None
         line, more = html.escape(str(self)), html.escape(explanation(self.name))
         return f"{line}<details><summary>Explanation</summary><p>{more}</p></details>"
 
-    def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
-        printer.text(str(self))
 
+@checked
+def check(name: str, attempt: Any) -> Verdict:
+    """Judge an attempt at an exercise; whatever it does, the notebook goes on.
 
-def judge(exercises: Mapping[str, Exercise], name: str, attempt: Any) -> Verdict:
-    """Judge an attempt at one of some exercises."""
-    if name not in exercises:
-        raise ValueError(f"exercise {name!r} is unknown; there are {', '.join(exercises)}")
-    exercise = exercises[name]
-    if _is_empty(attempt):
-        return Verdict(name, exercise, "not attempted")
-    why, figure = "", None
+    None, `...` or a function that gives one of them counts as not attempted.
+    """
+    if name not in EXERCISES:
+        raise ValueError(f"exercise {name!r} is unknown; there are {', '.join(EXERCISES)}")
+    exercise, value = EXERCISES[name], attempt
     try:
-        figure = float(exercise.figure(attempt))
+        value = exercise.figure(given(attempt))
+        figure, says = float(value), f", {float(value):.4g} {exercise.unit}"
     except _NotAttempted:
-        return Verdict(name, exercise, "not attempted")
+        return Verdict(name, "not attempted", f". {exercise.asks}")
     except Exception as error:
-        why = f"{type(error).__name__}: {error}"
-    if figure is not None and abs(figure - exercise.expected) <= exercise.within:
-        return Verdict(name, exercise, "passed", figure)
+        figure, says = math.nan, f" ({type(error).__name__}: {error})"
+    expected = f"; expected {exercise.expected:g} ± {exercise.within:g} {exercise.unit}"
+    if abs(figure - exercise.expected) <= exercise.within:
+        return Verdict(name, "passed", says + expected)
+    if value is attempt and not callable(attempt):  # the answer itself is expected
+        expected = ""
     WRONG[name] += 1
-    hints = HINTS[name]
-    hint = hints[min(WRONG[name], len(hints)) - 1]
-    shown = callable(attempt) or figure != attempt
-    return Verdict(name, exercise, "failed", figure, why, hint, shown)
+    hint = exercise.hints[min(WRONG[name], len(exercise.hints)) - 1]
+    return Verdict(name, "failed", f"{says}{expected}. Hint: {hint}")
 
 
 class _NotAttempted(Exception):
     """A function that is still to be written."""
 
 
-def _is_empty(answer: Any) -> bool:
-    return answer is None or answer is Ellipsis
-
-
-def answer_of(function: Callable[..., Any], *arguments: Any) -> np.ndarray:
-    """What the reader's function gives, as numbers."""
-    return np.asarray(answered(function, *arguments), dtype=float)
-
-
-def answered(function: Callable[..., Any], *arguments: Any) -> Any:
-    """What the reader's function gives, whatever it is."""
-    answer = function(*arguments)
-    if _is_empty(answer):
+def given(answer: Any) -> Any:
+    """An answer, whatever it is, if there is one."""
+    if answer is None or answer is Ellipsis:
         raise _NotAttempted
     return answer
+
+
+def answer_of(function: Callable, *arguments: Any) -> np.ndarray:
+    """What the reader's function gives, as numbers."""
+    return np.asarray(given(function(*arguments)), dtype=float)
+
+
+def explanation(name: str) -> str:
+    """What the solution of an exercise says about itself."""
+    (path,) = SOLUTIONS.glob(f"{name.partition('.')[0]}*.py")
+    text = path.read_text("utf-8")
+    solution = re.search(rf'check\("{name}", (\w+)', text)[1]
+    (function,) = (node for node in ast.parse(text).body if getattr(node, "name", "") == solution)
+    return ast.get_docstring(function)

@@ -1,19 +1,21 @@
 """Exercises of notebooks 09 and 10: the effect of a push, mirrored pushes, and where to begin."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
 from affordlib.geometry import rotated, unit_vector
-from exercises.checking import Exercise, answer_of
+from exercises.checking import answer_of, exercise
 
 
-def _effect_error(effect: Callable[..., Any]) -> float:
-    """How far [mm or mrad] effects are from those that were moved into the world, at worst."""
-    rng, worst = np.random.default_rng(0), 0.0
+@exercise("09.1", 0.0, 0.1, "mm or mrad, largest error")
+def effect_error(effect: Callable) -> float:
+    """Write effect(before, after, centroid, heading): ahead, left and turn of a push.
+
+    The corner moves differently from the centroid when the object turns.
+    Rotate the given centroid by each pose's yaw and add its position; then subtract.
+    """
+    rng, off = np.random.default_rng(0), []
     for _ in range(20):
         heading, yaw, turn = rng.uniform(-np.pi, np.pi, 3)
         xy, centroid, moved = rng.normal(scale=0.1, size=(3, 2))
@@ -21,77 +23,53 @@ def _effect_error(effect: Callable[..., Any]) -> float:
         end_yaw = (yaw + turn + np.pi) % (2 * np.pi) - np.pi
         end = middle - rotated(centroid, end_yaw)
         got = answer_of(effect, (*xy, yaw), (*end, end_yaw), centroid, heading)
-        worst = max(worst, float(np.abs(got - (*moved, turn)).max()))
-    return 1000 * worst
+        off.append(got - (*moved, turn))
+    return 1000 * np.abs(off).max()
 
 
-def _mirror_error(mirrored: Callable[..., Any]) -> float:
-    """How far pushes and effects are from their mirror image at the x axis, at worst."""
-    rng, worst = np.random.default_rng(0), 0.0
+@exercise("09.2", 0.0, 1e-6, "largest error")
+def mirror_error(mirrored: Callable) -> float:
+    """Write mirrored(contact, direction, displacement, turn): seven numbers, mirrored at x.
+
+    Mirrored at the x axis, x stays.
+    All components along y change their signs; think also of the sense of rotation.
+    """
+    rng, off, flip = np.random.default_rng(0), [], np.array([1, -1])
     for _ in range(20):
         contact, moved, angle, turn = *rng.normal(size=(2, 2)), *rng.normal(size=2)
-        flip = np.array([1, -1])
         truth = *(flip * contact), *(flip * unit_vector(angle)), *(flip * moved), -turn
-        got = answer_of(mirrored, contact, unit_vector(angle), moved, turn)
-        worst = max(worst, float(np.abs(got - truth).max()))
-    return worst
+        off.append(answer_of(mirrored, contact, unit_vector(angle), moved, turn) - truth)
+    return np.abs(off).max()
 
 
-def _standoff_error(standoff: Callable[..., Any]) -> float:
-    """How far [mm] from the right point, at worst: at the distance, and on the line of the push."""
-    rng, worst = np.random.default_rng(0), 0.0
+@exercise("10.1", 0.0, 0.001, "mm, largest error")
+def standoff_error(standoff: Callable) -> float:
+    """Write standoff(contact, normal, direction, radius, clear): the tool's centre, (x, y).
+
+    At the contact the tool's centre is one radius outside, along the normal.
+    Going back along the push by a length gains only its share along the normal.
+    """
+    rng, off = np.random.default_rng(0), []
     for _ in range(20):
         contact, facing, aside = rng.normal(scale=0.1, size=2), *rng.uniform(-1, 1, 2)
         radius, clear = rng.uniform(0.001, 0.02, 2)
         normal, direction = unit_vector(np.pi * facing), unit_vector(np.pi * facing + 0.8 * aside)
         truth = contact - radius * normal - clear / (normal @ direction) * direction
-        got = answer_of(standoff, contact, normal, direction, radius, clear)
-        worst = max(worst, float(np.abs(got - truth).max()))
-    return 1000 * worst
+        off.append(answer_of(standoff, contact, normal, direction, radius, clear) - truth)
+    return 1000 * np.abs(off).max()
 
 
-def _choice_error(chosen: Callable[..., Any]) -> float:
-    """How often [%] another chain is chosen than the one of least cost and price."""
-    rng, wrong = np.random.default_rng(0), 0
+@exercise("10.2", 0.0, 0.1, "% wrong choices")
+def wrong_choices(chosen: Callable) -> float:
+    """Write chosen(off_m, pushes, price, now_m): the number of the chain, from 0.
+
+    Add the price of its pushes to each chain's distance.
+    One push costs the same in every chain: a share of the present distance.
+    """
+    rng, wrong = np.random.default_rng(0), []
     for _ in range(50):
-        off_m, pushes, now_m = (
-            rng.exponential(0.02, 12),
-            rng.integers(1, 4, 12),
-            rng.uniform(0, 0.2),
-        )
-        price = rng.uniform(0, 0.5)
-        best = int((off_m + price * now_m * pushes).argmin())
-        wrong += int(answer_of(chosen, off_m, pushes, price, now_m).item() != best)
-    return 2.0 * wrong
-
-
-LOGS: dict[str, Exercise] = {
-    "09.1": Exercise(
-        "Write effect(before, after, centroid, heading): ahead, left and turn of a push.",
-        _effect_error,
-        expected=0.0,
-        within=0.1,
-        unit="mm or mrad, largest error",
-    ),
-    "09.2": Exercise(
-        "Write mirrored(contact, direction, displacement, turn): seven numbers, mirrored at x.",
-        _mirror_error,
-        expected=0.0,
-        within=1e-6,
-        unit="largest error",
-    ),
-    "10.1": Exercise(
-        "Write standoff(contact, normal, direction, radius, clear): the tool's centre, (x, y).",
-        _standoff_error,
-        expected=0.0,
-        within=0.001,
-        unit="mm, largest error",
-    ),
-    "10.2": Exercise(
-        "Write chosen(off_m, pushes, price, now_m): the number of the chain, from 0.",
-        _choice_error,
-        expected=0.0,
-        within=0.1,
-        unit="% wrong choices",
-    ),
-}
+        off_m, pushes = rng.exponential(0.02, 12), rng.integers(1, 4, 12)
+        now_m, price = rng.uniform(0, 0.2), rng.uniform(0, 0.5)
+        best = (off_m + price * now_m * pushes).argmin()
+        wrong.append(answer_of(chosen, off_m, pushes, price, now_m).item() != best)
+    return 100 * np.mean(wrong)

@@ -1,142 +1,109 @@
 """Exercises of notebooks 03 to 05: predictions, their σ, and queries."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
-from functools import cache
 
 import numpy as np
 import torch
 
-from affordlib.interactions import (
-    InteractionTensors,
-    condition_on_recorded_action,
-    open_interactions,
-    split_interactions,
-)
+from affordlib import interactions
+from affordlib.interactions import InteractionTensors, open_interactions
 from affordlib.models import coverage, load_checkpoint, network_predictions
-from exercises.checking import Exercise, answer_of
-
-# 03 The affordance network
-
-N_PHASES = 61
+from exercises.checking import answer_of, exercise
 
 
-@cache
+@exercise("03.1", 1.38, 0.04, "mm")
+def from_observed(mm: float) -> float:
+    """Measure how far [mm] the predicted mean is from an effect observed at t = 0.8.
+
+    Give `Observations.of` the pair of phases and effects as `effect`, and no action.
+    Compare the predicted x and y at the same phase; average the distances, in mm.
+    """
+    return mm
+
+
+def _length_m(paths: np.ndarray) -> float:
+    """The mean length of trajectories (N, n, 2)."""
+    return np.linalg.norm(np.diff(paths, axis=1), axis=-1).sum(axis=1).mean()
+
+
+@exercise("03.2", 3.6, 0.3, "times the real length")
 @torch.no_grad()
-def _marginals() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean, σ and ground truth (50, 61, 2) [m] of the held-out pushes, given image and action."""
+def drawn_length(draw: Callable) -> float:
+    """Write draw(mean, sigma, rng): one trajectory, every phase drawn from its own Gaussian.
+
+    The draw has the shape of `mean`.
+    rng.normal takes arrays of means and of standard deviations.
+    """
     pushes = open_interactions("push")
-    held_out = split_interactions(pushes.sizes["interaction"]).test
+    held_out = interactions.split_interactions(pushes.sizes["interaction"]).test
     arrays = InteractionTensors.from_dataset(pushes, held_out)
-    at = torch.linspace(0, len(arrays.phase) - 1, N_PHASES).round().long()
+    at = torch.linspace(0, len(arrays.phase) - 1, 61).round().long()
     model, _ = load_checkpoint("cnp_500")
-    t_target = arrays.phases(at)
-    query = condition_on_recorded_action(arrays)
-    answer = model.predict(model.encode(arrays.image), query, t_target)
-    return answer.effect_mean.numpy(), answer.effect_std.numpy(), arrays.effect[:, at].numpy()
-
-
-def _length_m(paths: np.ndarray) -> np.ndarray:
-    """Lengths (N,) of trajectories (N, n, 2)."""
-    return np.hypot(*np.moveaxis(np.diff(paths, axis=1), -1, 0)).sum(axis=1)
-
-
-def _drawn_length(
-    draw: Callable[[np.ndarray, np.ndarray, np.random.Generator], np.ndarray],
-) -> float:
-    """How many times as long as the real trajectories those are that the reader draws."""
-    mean, sigma, truth = _marginals()
+    query = interactions.condition_on_recorded_action(arrays)
+    answer = model.predict(model.encode(arrays.image), query, arrays.phases(at))
+    mean, sigma = answer.effect_mean.numpy(), answer.effect_std.numpy()
     rng = np.random.default_rng(0)
     drawn = np.stack([answer_of(draw, m, s, rng) for m, s in zip(mean, sigma, strict=True)])
     if drawn.shape != mean.shape:
         raise ValueError(f"a trajectory has the shape {mean.shape[1:]}, got {drawn.shape[1:]}")
-    spread = float(((drawn - mean) / sigma).std())
+    spread = ((drawn - mean) / sigma).std()
     if not 0.8 < spread < 1.2:
         raise ValueError(f"the draws spread by {spread:.2f} σ about the mean, not by 1 σ")
-    return float(_length_m(drawn).mean() / _length_m(truth).mean())
+    return _length_m(drawn) / _length_m(arrays.effect[:, at].numpy())
 
 
-# 04 Effect prediction
+@exercise("04.1", 1.86, 0.05, "mm for the paper's network")
+def lopsided_mm(lopsided_m: Callable) -> float:
+    """Write lopsided_m(model, arrays): the mean distance between final positions predicted on
+    the rotated table, and final positions predicted first and rotated then.
 
-
-def _lopsided_mm(lopsided_m: Callable[..., float]) -> float:
-    """By how much [mm] the paper's network fails to rotate with the table."""
-
-    def by(name: str) -> float:
+    Both predictions need their own observations: those of the rotated arrays, and the first.
+    A quarter turn counter-clockwise takes (x, y) to (-y, x).
+    """
+    data = open_interactions("push_test")
+    for name in ("film_500", "cnp_500"):
         model, _ = load_checkpoint(name)
         channels = model.action_channels, model.effect_channels
-        some = InteractionTensors.from_dataset(
-            open_interactions("push_test"), np.arange(200), *channels
-        )
-        return 1000 * float(answer_of(lopsided_m, model, some))
-
-    ours = by("film_500")
-    if abs(ours) > 0.01:
-        raise ValueError(f"ours rotates with the table, so it should give 0 mm, got {ours:.3g} mm")
-    return by("cnp_500")
+        some = InteractionTensors.from_dataset(data, np.arange(200), *channels)
+        mm = 1000 * float(answer_of(lopsided_m, model, some))
+        if name == "film_500" and abs(mm) > 0.01:
+            raise ValueError(
+                f"ours rotates with the table, so it should give 0 mm, got {mm:.3g} mm"
+            )
+    return mm
 
 
-@cache
-def _predicted_ends() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Ground truth, mean and σ (2, 1000) [m] of the final positions of `push_test`."""
+@exercise("04.2", 50.0, 1.5, "% inside")
+def half_inside(factor: float) -> float:
+    """Find the factor on σ that puts half of the true ends into the central 50 % interval.
+
+    The 50 % interval reaches to 0.674 of σ on each side.
+    Which value of error over σ do half of the errors not exceed?
+    """
     data = open_interactions("push_test")
     model, _ = load_checkpoint("film_500")
     answers = network_predictions(model, data, np.arange(data.sizes["interaction"]))
-    truth, mean, std = (
-        torch.tensor([answers[k][c] for c in "xy"]) for k in ("truth", "mean", "std")
-    )
-    return truth, mean, std
-
-
-def _half_inside_percent(factor: float) -> float:
-    truth, mean, std = _predicted_ends()
+    keys = "truth", "mean", "std"
+    truth, mean, std = (torch.tensor([answers[key][c] for c in "xy"]) for key in keys)
     return 100 * coverage(truth, mean, float(factor) * std, 0.5)
 
 
-MODELS: dict[str, Exercise] = {
-    "03.1": Exercise(
-        "Measure how far [mm] the predicted mean is from an effect observed at t = 0.8.",
-        lambda mine: mine,
-        expected=1.38,
-        within=0.04,
-        unit="mm",
-    ),
-    "03.2": Exercise(
-        "Write draw(mean, sigma, rng): one trajectory, every phase drawn from its own Gaussian.",
-        _drawn_length,
-        expected=3.6,
-        within=0.3,
-        unit="times the real length",
-    ),
-    "04.1": Exercise(
-        "Write lopsided_m(model, arrays): the mean distance between final positions predicted on "
-        "the rotated table, and final positions predicted first and rotated then.",
-        _lopsided_mm,
-        expected=1.86,
-        within=0.05,
-        unit="mm for the paper's network",
-    ),
-    "04.2": Exercise(
-        "Find the factor on σ that puts half of the true ends into the central 50 % interval.",
-        _half_inside_percent,
-        expected=50.0,
-        within=1.5,
-        unit="% inside",
-    ),
-    "05.1": Exercise(
-        "Measure the conditional network's error [cm] at the fifth step if it sees two poses only.",
-        lambda mine: mine,
-        expected=0.277,
-        within=0.002,
-        unit="cm",
-    ),
-    "05.2": Exercise(
-        "Measure the recurrent network's error as a multiple of the conditional one's at the fifth "
-        "step, if the observed poses have errors of 1 mm.",
-        lambda mine: mine,
-        expected=2.03,
-        within=0.1,
-        unit="times",
-    ),
-}
+@exercise("05.1", 0.277, 0.002, "cm")
+def from_two_poses(cm: float) -> float:
+    """Measure the conditional network's error [cm] at the fifth step if it sees two poses only.
+
+    The fifth step is the fifth pose after the last one that is shown.
+    The last two of fifteen poses begin at `start + 13`.
+    """
+    return cm
+
+
+@exercise("05.2", 2.03, 0.1, "times")
+def recurrent_over_conditional(times: float) -> float:
+    """Measure the recurrent network's error as a multiple of the conditional one's at the fifth
+    step, if the observed poses have errors of 1 mm.
+
+    Add the noise to what the networks see, before increments are computed.
+    Divide the mean errors at the fifth step; the ground truth stays as it is.
+    """
+    return times

@@ -31,6 +31,4 @@ def reaches(goal_xy_m):
 
 
 VERDICTS = [check("00.1", phase_for_5_cm()), check("00.2", reaches)]
-
-if __name__ == "__main__":
-    print(*VERDICTS, sep="\n")
+print(*VERDICTS, sep="\n")

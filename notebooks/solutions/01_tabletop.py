@@ -20,6 +20,4 @@ def volume_cm3(image):
 
 
 VERDICTS = [check("01.1", speed_m_s), check("01.2", volume_cm3)]
-
-if __name__ == "__main__":
-    print(*VERDICTS, sep="\n")
+print(*VERDICTS, sep="\n")

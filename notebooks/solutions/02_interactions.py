@@ -27,6 +27,4 @@ def end_m(diameter_m):
 
 
 VERDICTS = [check("02.1", spread_of_drags_mm()), check("02.2", end_m)]
-
-if __name__ == "__main__":
-    print(*VERDICTS, sep="\n")
+print(*VERDICTS, sep="\n")

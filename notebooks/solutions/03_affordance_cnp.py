@@ -38,6 +38,4 @@ def draw(mean, sigma, rng):
 
 
 VERDICTS = [check("03.1", passes_by_mm()), check("03.2", draw)]
-
-if __name__ == "__main__":
-    print(*VERDICTS, sep="\n")
+print(*VERDICTS, sep="\n")

@@ -36,6 +36,4 @@ def factor_for_half():
 
 
 VERDICTS = [check("04.1", lopsided_m), check("04.2", factor_for_half())]
-
-if __name__ == "__main__":
-    print(*VERDICTS, sep="\n")
+print(*VERDICTS, sep="\n")

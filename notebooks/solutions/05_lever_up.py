@@ -5,32 +5,24 @@ from dataclasses import replace
 import torch
 
 from affordlib.interactions import condition_on_poses, open_interactions, split_interactions
-from affordlib.models import load_checkpoint
-from affordlib.models.lever_up import (
-    N_OBSERVED,
-    N_PREDICTED,
-    errors_m,
-    lever_up_tensors,
-    n_windows,
-    window_errors_m,
-)
+from affordlib.models import lever_up, load_checkpoint
 from exercises import check
 
 levers = open_interactions("lever_up")
-test = lever_up_tensors(levers, split_interactions(levers.sizes["interaction"]).test)
+test = lever_up.lever_up_tensors(levers, split_interactions(levers.sizes["interaction"]).test)
 conditional, _ = load_checkpoint("lever_up_last_pose_1800")
 recurrent, _ = load_checkpoint("lever_up_lstm_1800_window")
 
 
 @torch.no_grad()
-def fifth_step_cm(model, arrays, last=N_OBSERVED):
+def fifth_step_cm(model, arrays, last=lever_up.N_OBSERVED):
     """The mean error five steps ahead, from the last so many poses of what `arrays` shows."""
     features, errors = model.encode(test.image), []
-    for start in range(n_windows(test)):
-        first = torch.full((len(test),), start + N_OBSERVED - last)
-        at = start + N_OBSERVED + N_PREDICTED - 1
+    for start in range(lever_up.n_windows(test)):
+        now = start + lever_up.N_OBSERVED
+        first, at = torch.full((len(test),), now - last), now + lever_up.N_PREDICTED - 1
         seen, t = condition_on_poses(arrays, first, last), test.phase[[at]].expand(len(test), -1)
-        errors.append(errors_m(model.predict(features, seen, t), test.effect[:, [at]]))
+        errors.append(lever_up.errors_m(model.predict(features, seen, t), test.effect[:, [at]]))
     return 100 * float(torch.cat(errors).mean())
 
 
@@ -45,7 +37,7 @@ def recurrent_over_conditional(noise_m=0.001):
     Without noise they err by 0.26 and 0.28 cm (the ratio is 1.09), with it by 0.6 and 1.2 cm.
     Neither has seen noise in training, which would teach both.
     """
-    clean = window_errors_m(conditional, test)[..., -1].mean()
+    clean = lever_up.window_errors_m(conditional, test)[..., -1].mean()
     assert abs(100 * float(clean) - fifth_step_cm(conditional, test)) < 1e-3
     effect = test.effect.clone()
     noise = torch.randn(effect[..., :3].shape, generator=torch.Generator().manual_seed(0))
@@ -55,6 +47,4 @@ def recurrent_over_conditional(noise_m=0.001):
 
 
 VERDICTS = [check("05.1", two_poses_cm()), check("05.2", recurrent_over_conditional())]
-
-if __name__ == "__main__":
-    print(*VERDICTS, sep="\n")
+print(*VERDICTS, sep="\n")

@@ -56,6 +56,4 @@ VERDICTS = [
     check("06.3", gap_m),
     check("06.4", last_phase),
 ]
-
-if __name__ == "__main__":
-    print(*VERDICTS, sep="\n")
+print(*VERDICTS, sep="\n")

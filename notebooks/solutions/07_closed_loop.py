@@ -35,6 +35,4 @@ def stop_at(height_m, phase, height_curve_m):
 
 
 VERDICTS = [check("07.1", bring), check("07.2", stop_at)]
-
-if __name__ == "__main__":
-    print(*VERDICTS, sep="\n")
+print(*VERDICTS, sep="\n")

@@ -27,6 +27,4 @@ def lower_half_mm():
 
 
 VERDICTS = [check("08.1", strangeness), check("08.2", lower_half_mm())]
-
-if __name__ == "__main__":
-    print(*VERDICTS, sep="\n")
+print(*VERDICTS, sep="\n")

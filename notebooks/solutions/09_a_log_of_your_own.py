@@ -26,6 +26,4 @@ def mirrored(contact, direction, displacement, turn):
 
 
 VERDICTS = [check("09.1", effect), check("09.2", mirrored)]
-
-if __name__ == "__main__":
-    print(*VERDICTS, sep="\n")
+print(*VERDICTS, sep="\n")

@@ -17,6 +17,4 @@ def chosen(off_m, pushes, price, now_m):
 
 
 VERDICTS = [check("10.1", standoff), check("10.2", chosen)]
-
-if __name__ == "__main__":
-    print(*VERDICTS, sep="\n")
+print(*VERDICTS, sep="\n")

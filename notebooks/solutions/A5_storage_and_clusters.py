@@ -19,6 +19,4 @@ def same(path, other):
 
 
 VERDICTS = [check("A5.1", phase_at_1_mm()), check("A5.2", same)]
-
-if __name__ == "__main__":
-    print(*VERDICTS, sep="\n")
+print(*VERDICTS, sep="\n")
