@@ -312,6 +312,7 @@ class GoalPicker(widgets.HBox):
                 self._news = ""
 
         with self._alone:
+            on_step = self.world.on_step
             try:
                 if self._stale or self.plan is None or self.outcome is not None:
                     self._make_plan()
@@ -341,7 +342,7 @@ class GoalPicker(widgets.HBox):
                 self.plan, self._disturbances = None, []  # the next run plans from the current pose
                 raise
             finally:
-                self.world.on_step = None
+                self.world.on_step = on_step
                 self._wait_until_shown()
                 if self.scene is not None:
                     self.scene.stop()
