@@ -161,6 +161,11 @@ def check_range(name: str, pair: Any, low: float, high: float) -> tuple[float, f
     return first, last
 
 
+def span(low: float = -math.inf, high: float = math.inf, default: Any = MISSING) -> Any:
+    """Declare a field that is a range inside [low, high]."""
+    return parameter(partial(check_range, low=low, high=high), default)
+
+
 def on_table(xy_m: np.ndarray, radius_m: float = 0.0) -> np.ndarray | np.bool_:
     """Return whether points (..., 2) lie on the table and farther than a radius from its rim."""
     low, high = np.transpose([TABLE_X_M, TABLE_Y_M])
