@@ -213,9 +213,8 @@ class View(Checked):
             *(2 * width, 2 * height, view, projection), **light, **_RENDERER
         )
         _raise(client, hidden, -HIDDEN_M)
-        rgb = np.asarray(rgba, dtype=np.uint16).reshape(2 * height, 2 * width, 4)[..., :3]
-        rows = rgb[::2] + rgb[1::2]
-        return ((rows[:, ::2] + rows[:, 1::2]) // 4).astype(np.uint8)
+        rgb = np.asarray(rgba, dtype=np.uint16).reshape(height, 2, width, 2, 4)[..., :3]
+        return (rgb.sum(axis=(1, 3)) // 4).astype(np.uint8)
 
 
 def _raise(client: BulletClient, bodies: list[int], up_m: float) -> None:
