@@ -140,18 +140,9 @@ def radius_m(image: np.ndarray) -> float:
 
 def largest_blob(mask: np.ndarray) -> np.ndarray:
     """Return the largest connected component of a mask, with its holes filled."""
-    labels, n = ndimage.label(mask)
-    if n == 0:
-        return np.zeros_like(mask, dtype=bool)
-    sizes = ndimage.sum_labels(mask, labels, np.arange(1, n + 1))
-    return ndimage.binary_fill_holes(labels == 1 + int(np.argmax(sizes)))
-
-
-def centre_m(mask: np.ndarray) -> tuple[float, float]:
-    """Return the centroid (x, y) [m] of a mask (n, n), `CROP_WIDTH_M` wide, from its middle."""
-    rows, columns = np.nonzero(mask)
-    middle, pixel = (len(mask) - 1) / 2, CROP_WIDTH_M / len(mask)
-    return float((columns.mean() - middle) * pixel), float((middle - rows.mean()) * pixel)
+    labels, _ = ndimage.label(mask)
+    sizes = np.bincount(labels[mask], minlength=1)
+    return ndimage.binary_fill_holes(mask & (labels == sizes.argmax()))
 
 
 def adapt_to_object(primitive: Primitive, image: np.ndarray) -> Primitive:

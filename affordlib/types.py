@@ -98,14 +98,6 @@ def check_choice(name: str, value: Any, known: Collection[Any]) -> Any:
     return value
 
 
-def check_field(
-    owner: Any, name: str, low: float = -math.inf, high: float = math.inf, unit: str = ""
-) -> None:
-    """Check a number of a frozen dataclass and store it as a float; raises ValueError."""
-    checked = check_within(f"{type(owner).__name__}.{name}", getattr(owner, name), low, high, unit)
-    object.__setattr__(owner, name, checked)
-
-
 class Checked:
     """A frozen dataclass that checks its fields; None is valid where it is the default."""
 
@@ -161,6 +153,11 @@ def check_range(name: str, pair: Any, low: float, high: float) -> tuple[float, f
     return first, last
 
 
+def span(low: float = -math.inf, high: float = math.inf, default: Any = MISSING) -> Any:
+    """Declare a field that is a range inside [low, high]."""
+    return parameter(partial(check_range, low=low, high=high), default)
+
+
 def on_table(xy_m: np.ndarray, radius_m: float = 0.0) -> np.ndarray | np.bool_:
     """Return whether points (..., 2) lie on the table and farther than a radius from its rim."""
     low, high = np.transpose([TABLE_X_M, TABLE_Y_M])
@@ -179,7 +176,7 @@ def check_on_table(name: str, xy_m: Any) -> tuple[float, float]:
 
 
 @dataclass(frozen=True)
-class Obstacle:
+class Obstacle(Checked):
     """A fixed body on the table: a convex polygon or a disc, with a height [m].
 
     corners_m: corners (x, y) [m] in the table's frame, counter-clockwise, at least three; for a
@@ -187,15 +184,15 @@ class Obstacle:
     """
 
     corners_m: tuple[tuple[float, float], ...]
-    radius_m: float = 0.0
-    height_m: float = 0.06
+    radius_m: float = number(default=0.0)
+    height_m: float = number(0.005, 0.3, "m", 0.06)
 
     def __post_init__(self) -> None:
-        check_field(self, "height_m", 0.005, 0.3, "m")
+        super().__post_init__()
         corners = tuple(check_on_table("corners_m", corner) for corner in self.corners_m)
         object.__setattr__(self, "corners_m", corners)
         is_disc = len(corners) == 1
-        check_field(self, "radius_m", 0.005 * is_disc, 0.3 * is_disc, "m")
+        check_within("Obstacle.radius_m", self.radius_m, 0.005 * is_disc, 0.3 * is_disc, "m")
         if not (is_disc or is_convex(np.array(corners))):
             raise ValueError(
                 "corners_m must be one point (a disc) or go counter-clockwise around a convex "

@@ -20,8 +20,8 @@ from affordlib.types import (
     Observations,
     check_array,
     check_count,
-    check_field,
     check_finite,
+    check_within,
 )
 
 if TYPE_CHECKING:
@@ -127,7 +127,7 @@ class InteractionTensors:
     def __post_init__(self) -> None:
         if self.stop_phase is None:
             object.__setattr__(self, "stop_phase", torch.ones(len(self)))
-        check_field(self, "image_width_m", 0.01, 10.0, "m")
+        check_within("image_width_m", self.image_width_m, 0.01, 10.0, "m")
         t = self.phase
         n, steps = len(self.image), len(t)
         if t.ndim != 1 or steps < 2 or t[0] != 0 or t[-1] != 1 or (t.diff() <= 0).any():

@@ -10,7 +10,7 @@ import numpy as np
 
 from affordlib.geometry import rotated
 from affordlib.primitives import PRIMITIVES, primitive_named
-from affordlib.types import TABLE_X_M, TABLE_Y_M, Checked, Interaction, check_range, count, number
+from affordlib.types import TABLE_X_M, TABLE_Y_M, Checked, Interaction, count, number, span
 from affordlib.world import CATEGORIES, Tabletop, TabletopObject, WorldConfig, category_named
 
 _TABLE_MARGIN_M = 0.08
@@ -20,23 +20,16 @@ _TABLE_MARGIN_M = 0.08
 class Variation(Checked):
     """A perturbed world: ranges of its parameters, sampled separately for every interaction."""
 
-    table_friction: tuple[float, float] = (0.35, 0.65)
-    object_friction: tuple[float, float] = (0.35, 0.65)
-    finger_friction: tuple[float, float] = (0.6, 1.2)
-    density_kg_m3: tuple[float, float] = (300.0, 1200.0)
-    tip_offset_m: tuple[float, float] = (-0.003, 0.01)
+    table_friction: tuple[float, float] = span(0.01, 2.0, (0.35, 0.65))
+    object_friction: tuple[float, float] = span(0.01, 2.0, (0.35, 0.65))
+    finger_friction: tuple[float, float] = span(0.01, 2.0, (0.6, 1.2))
+    density_kg_m3: tuple[float, float] = span(50.0, 10_000.0, (300.0, 1200.0))
+    tip_offset_m: tuple[float, float] = span(-0.008, 0.1, (-0.003, 0.01))
     # Largest offset of the centre of mass, as a share of the half extents
     com_offset: float = number(0.0, 0.5, default=0.15)
     # Standard deviation of the estimated position, in addition to the camera's
     bias_sd_m: float = number(0.0, 0.02, "m", 0.001)
     camera: str = "kinect"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in _VARIED:
-            limits = WorldConfig.__dataclass_fields__[name].metadata["check"].keywords
-            checked = check_range(name, getattr(self, name), limits["low"], limits["high"])
-            object.__setattr__(self, name, checked)
 
     def sample(self, obj: TabletopObject, rng: np.random.Generator) -> WorldConfig:
         """Sample the world parameters for one interaction with this object."""
@@ -67,8 +60,8 @@ class Recipe(Checked):
     n_interactions: int = count(500)
     seed: int = count(0, 0)
     categories: tuple[str, ...] = ("cuboid", "upright_cylinder")
-    size_range_m: tuple[float, float] = (0.04, 0.08)
-    height_range_m: tuple[float, float] | None = None  # None: size_range_m
+    size_range_m: tuple[float, float] = span(0.005, 0.3, (0.04, 0.08))
+    height_range_m: tuple[float, float] | None = span(0.005, 0.3, None)  # None: size_range_m
     anywhere: bool = False  # objects lie all over the table, within reach or not
     partial: bool = False  # actions stop at a random phase
     world: WorldConfig = field(default_factory=WorldConfig)
@@ -81,10 +74,6 @@ class Recipe(Checked):
             if not values or not set(values) <= set(known):
                 raise ValueError(f"{name} must be some of {sorted(known)}, got {values!r}")
             object.__setattr__(self, name, values)
-        for name in ("size_range_m", "height_range_m"):
-            if getattr(self, name) is not None:
-                sizes = check_range(name, getattr(self, name), 0.005, 0.3)
-                object.__setattr__(self, name, sizes)
 
     def to_json(self) -> str:
         """Return the recipe as JSON with sorted keys; categories are called families there."""
@@ -138,9 +127,9 @@ def interact(
     if recipe.variation is not None:
         config = recipe.variation.sample(obj, _generator(recipe, index, 3))
     if recipe.anywhere:
-        low = np.array([TABLE_X_M[0], TABLE_Y_M[0]]) + _TABLE_MARGIN_M
-        high = np.array([TABLE_X_M[1], TABLE_Y_M[1]]) - _TABLE_MARGIN_M
-        xy_m = tuple(_generator(recipe, index, 1).uniform(low, high).tolist())
+        low, high = np.transpose([TABLE_X_M, TABLE_Y_M])
+        inside = low + _TABLE_MARGIN_M, high - _TABLE_MARGIN_M
+        xy_m = tuple(_generator(recipe, index, 1).uniform(*inside).tolist())
     if recipe.partial:
         stop = float(_generator(recipe, index, 2).uniform(0.05, 1.0))
     world.place(obj, xy_m, yaw, tool=action.tool, config=config)

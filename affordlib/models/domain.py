@@ -2,7 +2,6 @@
 
 import warnings
 from dataclasses import dataclass
-from functools import partial
 from typing import Self
 
 import torch
@@ -11,10 +10,9 @@ from torch import Tensor
 
 from affordlib.geometry import xy_columns
 from affordlib.interactions.dataset import InteractionTensors
-from affordlib.types import Checked, Observations, check_pair, number, parameter
+from affordlib.types import Checked, Observations, number, span
 
 Range = tuple[float, float]
-_check_range = partial(check_pair, what="(low, high)")
 PHASE_TOLERANCE, END_PHASE = 1e-5, 1e-3
 RADIUS_TOLERANCE_M = 0.02
 
@@ -28,11 +26,11 @@ class TrainingDomain(Checked):
     """What a model was trained on, None where unknown."""
 
     # Distance of the action from the object's centre at t = 0, and at t = 1
-    start_radius_m: tuple[float, float] | None = parameter(_check_range, None)
-    end_radius_m: tuple[float, float] | None = parameter(_check_range, None)
-    mask_share: tuple[float, float] | None = parameter(_check_range, None)  # that the object covers
+    start_radius_m: tuple[float, float] | None = span(default=None)
+    end_radius_m: tuple[float, float] | None = span(default=None)
+    mask_share: tuple[float, float] | None = span(default=None)  # that the object covers
     touches_border: bool = True  # whether objects reach the image's edge
-    effect_radius_m: tuple[float, float] | None = parameter(_check_range, None)  # moved at t = 1
+    effect_radius_m: tuple[float, float] | None = span(default=None)  # moved at t = 1
     image_pixels: int | None = None  # along an edge of the square image
     image_width_m: float | None = number(0.01, 10.0, "m", None)
 

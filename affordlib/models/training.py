@@ -4,6 +4,7 @@ The paper uses one trajectory and one target per iteration. Here a step uses man
 many targets each, some 200 times as many targets per second; `experiments/` has the paper's loop.
 """
 
+import copy
 import inspect
 import math
 import time
@@ -122,7 +123,7 @@ def train(
         model.parameters(), config.learning_rate, weight_decay=config.weight_decay, fused=True
     )
     floor = float(model.sigma_floor)
-    average = _copies(dict(model.named_parameters())) if config.ema else {}
+    average = {name: v.detach().clone() for name, v in model.named_parameters() if config.ema}
     best, best_error, step, fruitless, seconds, history = {}, math.inf, 0, 0, 0.0, []
     about = asdict(replace(config, device="cpu")) | {  # all that decides the results
         "model": repr(model.config),
@@ -167,13 +168,13 @@ def train(
         bar.update()
         if step % config.validate_every and step != config.steps:
             continue
-        own = _copies(model.state_dict())
+        own = copy.deepcopy(model.state_dict())
         model.load_state_dict(own | average)
         # The model is scored on the CPU, where the data are, so scores can ignore devices.
         error = float(score(model.cpu().eval(), validation).mean())
         fruitless += 1
         if error < best_error:
-            best, best_error, fruitless = _copies(model.state_dict()), error, 0
+            best, best_error, fruitless = copy.deepcopy(model.state_dict()), error, 0
         model.to(device).train().load_state_dict(own)
         seconds = time.perf_counter() - start
         history.append((step, seconds, loss.item(), error))
@@ -191,10 +192,6 @@ def train(
     model.load_state_dict(best)
     model.cpu().eval()
     return [TrainingRecord(*record) for record in history]
-
-
-def _copies(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    return {name: value.detach().clone() for name, value in tensors.items()}
 
 
 def _to(batch: Any, device: torch.device) -> Any:

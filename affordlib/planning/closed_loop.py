@@ -36,13 +36,13 @@ from affordlib.types import (
     UnreachableError,
     check_count,
     count,
-    number,
     on_table,
     parameter,
 )
 
-DISPLACED_M = 0.03
-"""Distance [m] of the object from its predicted position above which others have displaced it."""
+SURPRISE_M, DISPLACED_M = 0.002, 0.03
+"""Distances [m] of the object from its predicted position above which it is planned for again, and
+above which others have displaced it."""
 
 AT_REST_M, OBSERVE_EVERY_S, MAX_OBSERVATIONS = 0.001, 0.25, 20
 """The loop then waits until it moves less [m] between two observations, so far apart [s]."""
@@ -88,19 +88,17 @@ def _outcome(robot: Robot, plan: Plan, done: Sequence[Execution]) -> Outcome:
 class ClosedLoopConfig(Checked):
     """Patience and callbacks of a closed loop.
 
-    mode: of its plans. surprise_m: distance of the object from its predicted position above which
-    it plans again. max_actions: by default it grows with the distance, and is renewed when the goal
-    moves or, up to max_renewals times, when somebody displaces the object. n_images: number of
-    images averaged per observation; eight of the Kinect give the rotation to one degree.
-    on_action: called after each action with the plan and the number of actions so far; on_plan:
-    called with a plan before its first action.
+    mode: of its plans. max_actions: by default it grows with the distance, and is renewed when the
+    goal moves or, up to max_renewals times, when somebody displaces the object. n_images: number of
+    images averaged per observation; eight of the Kinect give the rotation to one degree. on_action:
+    called after each action with the plan and the number of actions so far; on_plan: called with a
+    plan before its first action.
     """
 
     mode: str | PlanMode = "multi_partial"
     max_actions: int | None = parameter(partial(check_count, least=0), None)
     max_renewals: int = count(3, 0)
     n_images: int = count(1, 1, 100)
-    surprise_m: float = number(1e-6, 10.0, "m", 0.002)
     on_action: Callable[[Plan, int], None] = lambda *_: None
     on_plan: Callable[[Plan], None] = lambda *_: None
 
@@ -227,7 +225,7 @@ class _ClosedLoop:
             self.renewals -= not goal_moved
             self.turn_allowed &= not goal_moved  # a new goal may need a full rotation again
             self.limit = max(self.limit, len(self.steps) + self._limit_from(seen.xy_m))
-        if off_m > self.config.surprise_m or goal_moved or fell or obstacle_moved:
+        if off_m > SURPRISE_M or goal_moved or fell or obstacle_moved:
             self.queue = []
         return None
 

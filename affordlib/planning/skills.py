@@ -21,7 +21,7 @@ from affordlib.planning.grasp_rotate import PosePlanner
 from affordlib.planning.problem import PlanMode, PlanningProblem, Reachable, everywhere
 from affordlib.primitives import Grasp, Move, Primitive, Rotate, move_for, primitive_named
 from affordlib.results import repo_root
-from affordlib.types import Goal, Obstacle, Step, check_array, check_choice
+from affordlib.types import Goal, Obstacle, check_array, check_choice
 from affordlib.weights import restored, write_weights
 
 CHECKPOINTS = {
@@ -100,11 +100,7 @@ class Skills:
     models: dict[str, EffectModel]
     reachability: Reachability | None = None
     threshold: ClassVar[float] = 0.2
-    _last: dict[bytes, tuple[EffectMap, PosePlanner | None]] = field(**_KEPT)
-
-    def __post_init__(self) -> None:
-        for name in self.models:
-            primitive_named(name)
+    _last: dict[tuple[type[Move], bytes], EffectMap] = field(**_KEPT)
 
     @classmethod
     def load(cls) -> Self:
@@ -131,33 +127,29 @@ class Skills:
     ) -> PlanningProblem:
         """Pose the problem of moving the object in an image (2, 48, 48) from (x, y) [m] to a goal.
 
-        obstacles: not to be touched. The models' predictions are cached for the last image.
+        obstacles: not to be touched.
         """
-        effects, poses = self._predictions(image)
-        if obstacles and poses:
-            space = FreeSpace(obstacles, image, start_xy_m, effects.outline_m)
-            poses = PosePlanner(image, self.model, lambda s: self._can_act(s) and space.is_free(s))
+        effects, poses = self.effects(image), None
+        if {Rotate.name, Grasp.name} <= set(self.models):
+            space = obstacles and FreeSpace(obstacles, image, start_xy_m, effects.outline_m)
+
+            def can_act(step):
+                at = np.array([step.predicted_end_xy_m])
+                can = bool(self.reachable(type(step.primitive))(at, None)[0])
+                return can and (not space or space.is_free(step))
+
+            poses = PosePlanner(image, self.model, can_act)
         more = self.reachable(effects.kind), poses, tuple(obstacles)
         return PlanningProblem(start_xy_m, goal, effects, mode, *more)
 
     def effects(self, image: np.ndarray, kind: type[Move] | None = None) -> EffectMap:
-        """Effect map of a primitive, by default `kind_for` the image; cached for the last image."""
-        if kind in (None, self.kind_for(image)):
-            return self._predictions(image)[0]
-        return EffectMap(self.model(kind), image, kind)
-
-    def _predictions(self, image: np.ndarray) -> tuple[EffectMap, PosePlanner | None]:
-        key = np.ascontiguousarray(image).tobytes()
+        """Effect map of a primitive, by default `kind_for` the image; the last one is cached."""
+        kind = kind or self.kind_for(image)
+        key = kind, np.ascontiguousarray(image).tobytes()
         if key not in self._last:
-            kind, both = self.kind_for(image), {Rotate.name, Grasp.name} <= set(self.models)
-            poses = PosePlanner(image, self.model, self._can_act) if both else None
             self._last.clear()
-            self._last[key] = EffectMap(self.model(kind), image, kind), poses
+            self._last[key] = EffectMap(self.model(kind), image, kind)
         return self._last[key]
-
-    def _can_act(self, step: Step) -> bool:
-        at = np.array([step.predicted_end_xy_m])
-        return bool(self.reachable(type(step.primitive))(at, None)[0])
 
     def reachable(self, kind: type[Primitive]) -> Reachable:
         """Function that says where the arm can act with a primitive."""

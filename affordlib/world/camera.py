@@ -10,8 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 import pybullet
 from pybullet_utils.bullet_client import BulletClient
+from scipy import ndimage
 
-from affordlib.perception import CAMERA_HEIGHT_M, centre_m, height_map, largest_blob
+from affordlib.perception import CAMERA_HEIGHT_M, height_map, largest_blob
 from affordlib.types import (
     CROP_WIDTH_M,
     IMAGE_PIXELS,
@@ -112,7 +113,9 @@ def kinect(
         if mask.any():
             # Only walls that face the camera are visible, which biases the centroid towards it;
             # for points above 45 % of the height (measured) the bias is negligible.
-            xy = xy + centre_m(mask & (height > 0.45 * np.quantile(height[mask], 0.9)))
+            top = mask & (height > 0.45 * np.quantile(height[mask], 0.9))
+            row, column = np.subtract(ndimage.center_of_mass(top), (IMAGE_PIXELS - 1) / 2)
+            xy = xy + np.array([column, -row]) * (CROP_WIDTH_M / IMAGE_PIXELS)
     height = height_map(points, xy)
     mask = largest_blob(height > _KINECT_MASK_HEIGHT_M)
     image = np.stack([CAMERA_HEIGHT_M - height, mask]).astype(np.float32)
@@ -210,9 +213,8 @@ class View(Checked):
             *(2 * width, 2 * height, view, projection), **light, **_RENDERER
         )
         _raise(client, hidden, -HIDDEN_M)
-        rgb = np.asarray(rgba, dtype=np.uint16).reshape(2 * height, 2 * width, 4)[..., :3]
-        rows = rgb[::2] + rgb[1::2]
-        return ((rows[:, ::2] + rows[:, 1::2]) // 4).astype(np.uint8)
+        rgb = np.asarray(rgba, dtype=np.uint16).reshape(height, 2, width, 2, 4)[..., :3]
+        return (rgb.sum(axis=(1, 3)) // 4).astype(np.uint8)
 
 
 def _raise(client: BulletClient, bodies: list[int], up_m: float) -> None:

@@ -26,7 +26,6 @@ from affordlib.types import (
     Obstacle,
     check_array,
     check_choice,
-    check_field,
     number,
     on_table,
     parameter,
@@ -42,9 +41,12 @@ CHAMFER_M = (0.006, 0.004)  # width and height around a prism's base: a blade ca
 HULL_MARGIN_M = 0.001  # by which PyBullet's collision shape of a convex hull exceeds its corners
 _UPRIGHT = math.cos(math.radians(45))
 
+length_m = partial(number, 0.005, LARGEST_M, "m")
+"""Declare a dimension of a category."""
+
 
 @dataclass(frozen=True)
-class TabletopObject(ABC):
+class TabletopObject(Checked, ABC):
     """An object on the table; all its fields are lengths [m]."""
 
     category: ClassVar[str]
@@ -53,10 +55,6 @@ class TabletopObject(ABC):
     has_yaw: ClassVar[bool] = True  # whether its yaw can be seen
     volume_m3: ClassVar[property]
     footprint_m: ClassVar[property]  # corners (n, 2) of its outline from above, at yaw 0
-
-    def __post_init__(self) -> None:
-        for field in fields(self):
-            check_field(self, field.name, 0.005, LARGEST_M, "m")
 
     @classmethod
     def sample(
@@ -89,9 +87,9 @@ class TabletopObject(ABC):
 class Cuboid(TabletopObject):
     """A box with edges `length`, `width` and `height` [m], standing on its base."""
 
-    length: float
-    width: float
-    height: float
+    length: float = length_m()
+    width: float = length_m()
+    height: float = length_m()
 
     category = "cuboid"
     stable = True
@@ -111,8 +109,8 @@ def _cylinder(diameter: float, length: float) -> dict[str, Any]:
 class UprightCylinder(TabletopObject):
     """A cylinder of the given `diameter` and `height` [m], standing on its round base."""
 
-    diameter: float
-    height: float
+    diameter: float = length_m()
+    height: float = length_m()
 
     category = "upright_cylinder"
     stable = True
@@ -131,8 +129,8 @@ class UprightCylinder(TabletopObject):
 class LyingCylinder(TabletopObject):
     """A cylinder of the given `length` and `diameter` [m], lying on its side."""
 
-    length: float
-    diameter: float
+    length: float = length_m()
+    diameter: float = length_m()
 
     category = "lying_cylinder"
     rollable = True
@@ -155,7 +153,7 @@ class LyingCylinder(TabletopObject):
 class Sphere(TabletopObject):
     """A ball of the given `diameter` [m]."""
 
-    diameter: float
+    diameter: float = length_m()
 
     category = "sphere"
     rollable = True
@@ -179,12 +177,12 @@ class Prism(TabletopObject):
     """
 
     corners: tuple[tuple[float, float], ...]
-    height: float
+    height: float = length_m()
 
     category = "prism"
 
     def __post_init__(self) -> None:
-        check_field(self, "height", 0.005, LARGEST_M, "m")
+        super().__post_init__()
         corners = check_array("prism corners", self.corners, 2)
         if corners.ndim != 2 or not N_EDGES[0] <= len(corners) <= N_EDGES[1]:
             raise ValueError(f"prism corners must be 3 to 8 points (x, y), got {corners.shape}")
