@@ -46,7 +46,6 @@ from affordlib.planning.problem import MODES
 from affordlib.primitives import Drag, Move, Push
 from affordlib.types import NothingSeenError, Observation, Outcome, Plan, Step, on_table
 from affordlib.world import ROLLABLE, STANDING, Tabletop, UnreachableError
-from affordlib.world.trajectory import STEP_S
 from experiments import reported, runner
 from experiments.field_baselines import plan_cem
 from experiments.runner import FOLDER, Job, Rows, interval, open_once, plain
@@ -215,8 +214,14 @@ def _descent(reading: Reading, model: str = "cnp_500", samples: int = 100, **how
     return PlannerConfig(plan_gradient, model, arguments, **how)
 
 
-PAPERS = ("gradient_100", "gradient_300", "astar_paper")
-NAMED, SAMPLES = ("gradient", "gradient_starts", "gradient_adam"), (100, 300)
+PAPERS, SAMPLES = ("gradient_100", "gradient_300", "astar_paper"), (100, 300)
+RETRAINED = {
+    f"{name}_{samples}{placed}": _descent(READINGS[name], samples=samples, **how)
+    for name in ("gradient", "gradient_starts", "gradient_adam")
+    for placed, how in (("", BY_PLAN), ("_recentred", RECENTRED))
+    for samples in SAMPLES
+}
+"""Planners that are tried with three trainings of the paper's network."""
 CONFIGS: dict[str, PlannerConfig] = {
     # The paper's planners on its own network. Each action is placed by the plan, as in the paper;
     # `_recentred`, at the object as it is then observed, which differs for several actions only.
@@ -225,10 +230,7 @@ CONFIGS: dict[str, PlannerConfig] = {
         for (name, how), samples in product(READINGS.items(), SAMPLES)
     },
     "gradient_100_uniform_pushes": _descent(Reading(), **BY_PLAN, sources=("uniform",)),
-    **{
-        f"{name}_{samples}_recentred_pushes": _descent(READINGS[name], samples=samples, **RECENTRED)
-        for name, samples in product(NAMED, SAMPLES)
-    },
+    **{f"{name}_pushes": config for name, config in RETRAINED.items() if "recentred" in name},
     "gradient_100_recentred_cnp_mixed": _descent(Reading(), "cnp_mixed", **RECENTRED),
     "astar_paper_pushes": PlannerConfig(plan_astar, "cnp_500", **ALL),
     "astar_paper_recorded_pushes": PlannerConfig(plan_astar_recorded, "cnp_500", **ALL),
@@ -287,12 +289,7 @@ CONFIGS |= {
     **{
         f"{name}_{model}": replace(CONFIGS[f"{name}_pushes"], model=model, sources=("constructed",))
         for model in (*TRAINED, "cnp_published")
-        for name in PAPERS
-    },
-    **{
-        f"{name}_{samples}{placed}_{model}": _descent(READINGS[name], model, samples, **how)
-        for name, samples, model in product(NAMED, SAMPLES, ("cnp_500_seed_1", "cnp_500_seed_2"))
-        for placed, how in (("", BY_PLAN), ("_recentred", RECENTRED))
+        for name in (*PAPERS, *(RETRAINED if model.startswith("cnp_500") else ()))
     },
     **{
         f"fresh_{name}": replace(CONFIGS[name], world="fresh", sources=("constructed",))
@@ -342,20 +339,17 @@ def attempt(
     corrections: int = 0,
     n_averaged_images: int = 1,
     by_plan: bool = False,
-    ticks: list[Tabletop] | None = None,
 ) -> Outcome:
     """Plan and execute one task; plan_for: makes the plan of (image, start_xy_m, goal, mode).
 
     corrections: largest number of single actions that correct the final position.
     n_averaged_images: number of images of which a position is the mean. by_plan: each action is
-    relative to the object's predicted position instead of the observed one. ticks, if given, gets
-    an element for each step of the simulation.
+    relative to the object's predicted position instead of the observed one.
 
     The distance is the world's ground truth. If the arm cannot follow a plan, the distance after
     its last executed action counts.
     """
     world.place(task.obj, (0.0, 0.0), task.yaw_rad, config=task.config)
-    world.on_step = ticks.append if ticks is not None else None
     once, at_xy_m = PlanMode(1, partial=True), None
 
     def observe() -> Observation:
@@ -413,10 +407,8 @@ def run_config(config: str) -> list[dict[str, Any]]:
     with Tabletop() as world:
         pose = about.pose()
         for k in tqdm(about.chosen(tasks), config, unit=" goals", leave=False):
-            how = about.execution | {"ticks": (ticks := [])}
-            outcome = attempt(world, tasks[k], lambda *q: planner(pose(*q)), **how)
-            record = outcome_record(tasks[k], outcome) | {"motion_s": STEP_S * len(ticks)}
-            records.append({"task": k} | record)
+            outcome = attempt(world, tasks[k], lambda *q: planner(pose(*q)), **about.execution)
+            records.append({"task": k} | outcome_record(tasks[k], outcome))
     return records
 
 
@@ -483,10 +475,6 @@ VARIANTS = {
     for change in ("_full", "_by_plan", "_corrected")
     for name in CONFIGS
     if name.removesuffix(change) in {*CONFIGS} - {name}
-} | {
-    "cem": "continuous",
-    "continuous_cnp_500": "continuous_film_500",
-    "continuous_film_500": "continuous",
 }
 """Planners with one change, each with the planner without it, for paired comparisons."""
 
@@ -494,8 +482,7 @@ VARIANTS = {
 def variant_rows(records: dict[str, Rows]) -> Rows:
     """Return paired differences of final distance for `VARIANTS`: mean [m] and interval.
 
-    They are on stable objects. difference_actions: that of the number of actions;
-    difference_motion_s: that of the time that the robot moves, where it was measured.
+    They are on stable objects.
     """
     rows: Rows = []
     for name, than in VARIANTS.items():
@@ -509,13 +496,7 @@ def variant_rows(records: dict[str, Rows]) -> Rows:
             mean, low, high = interval(by_m, 2000, rng)
             about = {"planner": name, "than": than, "object_class": "standing", "goals": goals}
             about |= {"mode": mode, "n": len(by_m), "difference_mean_m": mean}
-            about |= {"low_m": low, "high_m": high}
-            for what in ("actions", "motion_s"):
-                if not pairs.get(f"{what}_y", pd.Series([np.nan])).isna().any():
-                    more = interval(pairs[f"{what}_x"] - pairs[f"{what}_y"], 2000)
-                    names = (f"difference_{end}{what}" for end in ("", "low_", "high_"))
-                    about |= dict(zip(names, more, strict=True))
-            rows.append(about)
+            rows.append(about | {"low_m": low, "high_m": high})
     return rows
 
 
@@ -545,9 +526,7 @@ def training_rows(records: dict[str, Rows]) -> Rows:
     largest of the mean distances with three trainings of its network, and the mean of the medians.
     """
     rows: Rows = []
-    placed = product(NAMED, ("", "_recentred"), SAMPLES)
-    planners = [f"{name}_{samples}{where}" for name, where, samples in placed] + ["astar_paper"]
-    for model, planner in product(("cnp_500", "cnp_mixed"), planners):
+    for model, planner in product(("cnp_500", "cnp_mixed"), (*RETRAINED, "astar_paper")):
         first = f"{planner}_{model}".replace("_cnp_500", "_pushes")
         names = [first, *(f"{planner}_{model}_seed_{k}" for k in (1, 2))]
         if not set(names) <= set(records):
