@@ -114,7 +114,7 @@ class AnalyticPusher:
         return cls(*map(math.exp, best.x))
 
     @torch.no_grad()
-    def predict(self, push: Tensor, feet: Tensor | None = None) -> Tensor:
+    def predict(self, push: Tensor, feet: Tensor | None = None, steps: int = STEPS) -> Tensor:
         """Displacement and rotation (N, 3) of pushes (N, 7)."""
         smoothing = self.size
         if feet is None:
@@ -122,4 +122,4 @@ class AnalyticPusher:
             ring = [self.size * angle.cos(), self.size * angle.sin(), torch.full((3,), 1 / 3)]
             feet, smoothing = torch.stack(ring, -1), ELLIPSOID
         friction = torch.full((len(push),), self.friction)
-        return quasi_static_push(push, feet.expand(len(push), -1, -1), friction, smoothing)
+        return quasi_static_push(push, feet.expand(len(push), -1, -1), friction, smoothing, steps)
