@@ -3,8 +3,6 @@
 They happen between actions, or during one through the world's callback per simulation step.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -5,8 +5,6 @@ possible if the tool reaches all its poses; a position is reachable if a chain o
 leads to it. The wrist turns freely, so only the tool's distance from the base matters.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from functools import lru_cache

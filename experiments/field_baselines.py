@@ -1,7 +1,5 @@
 """Baselines that learn nothing: a standard planner, and mechanics in place of a network."""
 
-from __future__ import annotations
-
 import math
 import time
 from dataclasses import dataclass

@@ -12,8 +12,6 @@ change; n rises from 0 at t_l towards 1. Any t is predicted directly, without a 
 observation d_l is the one at t = 0, where a displacement is zero.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import torch

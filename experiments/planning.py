@@ -6,8 +6,6 @@ tables are made from all stored outcomes.
     python -m experiments.planning --only config=continuous,astar
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress

@@ -6,8 +6,6 @@ Objects are convex outlines with three or four corners and random feet and frict
 `quasi_static_push` with measurement noise on the poses before and after.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 from collections.abc import Sequence

@@ -13,8 +13,6 @@ state is solved (a) when the environment says so (coverage above 95 %), (b) when
 rounds, lengths, features of the Gaussian process) was chosen on the seeds from `FIRST_CHOICE`.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import time

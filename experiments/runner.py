@@ -12,8 +12,6 @@ running jobs and at most half a minute. Equal results give identical bytes.
     results = read("effect_prediction", job)
 """
 
-from __future__ import annotations
-
 import argparse
 import gzip
 import hashlib

@@ -6,8 +6,6 @@ python -m experiments.shipped reachability
 python -m experiments.shipped goals
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

@@ -4,8 +4,6 @@
 radians in the object's frame before each push: from its centroid, with the recorded pose's axes.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Iterable, Mapping

@@ -11,8 +11,6 @@ centroid. A push is a row of 7: contact point, inward normal and direction of th
 and the pusher's travel after contact. Feet are rows of 3: x, y and weight (sum 1).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -8,8 +8,6 @@ to the goal is chosen; ρ, the object's radius of gyration, converts rotations t
 known where the tool is, the first push must be one to which the tool finds a way around the object.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from dataclasses import dataclass, field
