@@ -20,7 +20,7 @@ import pandas as pd
 from affordlib.primitives import Grasp
 from experiments import reported, runner, studies
 from experiments.cross_validation import LARGE, MODELS, PLANE, TASKS, add_errors, by_model, job
-from experiments.runner import FOLDER, Result, Rows, frame, read
+from experiments.runner import FOLDER, Result, Rows, frame, read, shares
 
 NAME = "effect_prediction"
 SAME_TRUTH = 1e-6
@@ -97,11 +97,12 @@ def grasp_rows(grasps: pd.DataFrame) -> Rows:
 
 def confusion_columns(predicted: np.ndarray, lifted: np.ndarray) -> dict[str, Any]:
     """Return TP and TN, shares [%] of successes and of failures that are predicted."""
-    columns = {}
+    columns: dict[str, Any] = {}
     for rate, those in (("tp", lifted), ("tn", ~lifted)):
-        right = (predicted == lifted)[those]
-        columns[f"{rate}_percent"] = 100 * right.mean() if len(right) else None
-    return columns
+        n, k = int(those.sum()), int((predicted == lifted)[those].sum())
+        names = (f"{rate}{end}_percent" for end in ("", "_low", "_high"))
+        columns |= zip(names, shares(k, n), strict=True)
+    return columns | {"n_success": int(lifted.sum()), "n_failure": int((~lifted).sum())}
 
 
 def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:

@@ -44,6 +44,7 @@ from affordlib.planning.problem import MODES
 from affordlib.primitives import Drag, Move, Push
 from affordlib.types import NothingSeenError, Observation, Outcome, Plan, Step, on_table
 from affordlib.world import ROLLABLE, STANDING, Tabletop, UnreachableError
+from affordlib.world.trajectory import STEP_S
 from experiments import reported, runner
 from experiments.field_baselines import plan_cem
 from experiments.runner import FOLDER, Job, Rows, interval, open_once, plain
@@ -337,17 +338,20 @@ def attempt(
     corrections: int = 0,
     n_averaged_images: int = 1,
     by_plan: bool = False,
+    ticks: list[Tabletop] | None = None,
 ) -> Outcome:
     """Plan and execute one task; plan_for: makes the plan of (image, start_xy_m, goal, mode).
 
     corrections: largest number of single actions that correct the final position.
     n_averaged_images: number of images of which a position is the mean. by_plan: each action is
-    relative to the object's predicted position instead of the observed one.
+    relative to the object's predicted position instead of the observed one. ticks, if given, gets
+    an element for each step of the simulation.
 
     The distance is the world's ground truth. If the arm cannot follow a plan, the distance after
     its last executed action counts.
     """
     world.place(task.obj, (0.0, 0.0), task.yaw_rad, config=task.config)
+    world.on_step = ticks.append if ticks is not None else None
     once, at_xy_m = PlanMode(1, partial=True), None
 
     def observe() -> Observation:
@@ -405,8 +409,10 @@ def run_config(config: str) -> list[dict[str, Any]]:
     with Tabletop() as world:
         pose = about.pose()
         for k in tqdm(about.chosen(tasks), config, unit=" goals", leave=False):
-            outcome = attempt(world, tasks[k], lambda *q: planner(pose(*q)), **about.execution)
-            records.append({"task": k} | outcome_record(tasks[k], outcome))
+            how = about.execution | {"ticks": (ticks := [])}
+            outcome = attempt(world, tasks[k], lambda *q: planner(pose(*q)), **how)
+            record = outcome_record(tasks[k], outcome) | {"motion_s": STEP_S * len(ticks)}
+            records.append({"task": k} | record)
     return records
 
 
@@ -473,6 +479,10 @@ VARIANTS = {
     for change in ("_full", "_by_plan", "_corrected")
     for name in CONFIGS
     if name.removesuffix(change) in {*CONFIGS} - {name}
+} | {
+    "cem": "continuous",
+    "continuous_cnp_500": "continuous_film_500",
+    "continuous_film_500": "continuous",
 }
 """Planners with one change, each with the planner without it, for paired comparisons."""
 
@@ -480,7 +490,8 @@ VARIANTS = {
 def variant_rows(records: dict[str, Rows]) -> Rows:
     """Return paired differences of final distance for `VARIANTS`: mean [m] and interval.
 
-    They are on stable objects.
+    They are on stable objects. difference_actions: that of the number of actions;
+    difference_motion_s: that of the time that the robot moves, where it was measured.
     """
     rows: Rows = []
     for name, than in VARIANTS.items():
@@ -494,7 +505,13 @@ def variant_rows(records: dict[str, Rows]) -> Rows:
             mean, low, high = interval(by_m, 2000, rng)
             about = {"planner": name, "than": than, "object_class": "standing", "goals": goals}
             about |= {"mode": mode, "n": len(by_m), "difference_mean_m": mean}
-            rows.append(about | {"low_m": low, "high_m": high})
+            about |= {"low_m": low, "high_m": high}
+            for what in ("actions", "motion_s"):
+                if not pairs.get(f"{what}_y", pd.Series([np.nan])).isna().any():
+                    more = interval(pairs[f"{what}_x"] - pairs[f"{what}_y"], 2000)
+                    names = (f"difference_{end}{what}" for end in ("", "low_", "high_"))
+                    about |= dict(zip(names, more, strict=True))
+            rows.append(about)
     return rows
 
 

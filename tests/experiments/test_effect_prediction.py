@@ -18,7 +18,6 @@ from experiments import effect_prediction as tables
 from experiments.baselines import constant, gaussian_process, nearest, network_record
 from experiments.cross_validation import add_errors, job, network_and_training
 from experiments.novelty import NOVELTY_GAIN, NoveltyAware, novelty_of
-from experiments.runner import shares
 
 HOUSE = Prism(((-0.03, -0.03), (0.03, -0.03), (0.03, 0.01), (0.0, 0.04), (-0.03, 0.01)), 0.05)
 
@@ -58,9 +57,11 @@ def test_shares_are_of_the_true_successes_and_failures():
     lifted = np.array([True] * 4 + [False] * 2)
     row = tables.confusion_columns(np.array([True, True, True, False, False, True]), lifted)
     assert [row[f"{k}_percent"] for k in ("tp", "tn")] == [75, 50]
-    assert tables.confusion_columns(np.array([True]), np.array([True]))["tn_percent"] is None
-    assert shares(8, 10) == pytest.approx((80, 49.02, 94.33), abs=0.01)  # Wilson's
-    assert shares(0, 0) == (None, None, None)
+    eight = tables.confusion_columns(np.arange(10) < 8, np.ones(10, bool))
+    ends = [eight[f"tp_{end}_percent"] for end in ("low", "high")]
+    assert ends == pytest.approx([49.02, 94.33], abs=0.01)  # Wilson's, of eight of ten
+    none = tables.confusion_columns(np.array([True]), np.array([True]))
+    assert none["tn_percent"] is none["tn_low_percent"] is None
 
 
 def test_answers_are_those_of_the_model_itself(trained, held_out_pushes):
