@@ -1,7 +1,5 @@
 """An ablation study of our network: its parts are added one after another."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -22,13 +22,14 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 from sklearn.neighbors import NearestNeighbors
 from torch import Tensor
 
-from affordlib.geometry import rotate_channels, xy_columns
-from affordlib.interactions import InteractionTensors, condition_on_recorded_action
+from affordlib.geometry import xy_columns
+from affordlib.interactions import InteractionTensors
 from affordlib.interactions.dataset import valid_interactions
-from affordlib.models.base import EffectModel, inverse, push_direction, rotate_prediction
+from affordlib.models.base import EffectModel, rotate_prediction
 from affordlib.models.evaluation import EVERY, effects_at
 from affordlib.types import Prediction
 from affordlib.world import category_named
+from experiments.last_pose import action_direction, in_action_frame
 
 Forecast = tuple[Tensor, Tensor]  # mean and σ (N, T, C) of the effect at some samples
 
@@ -117,9 +118,9 @@ def constant(
     train: InteractionTensors, test: InteractionTensors, at: Tensor, *_: Tensor
 ) -> Forecast:
     """Predict the mean trajectory in the direction of the action; σ is the spread about it."""
-    effect = _in_action_frame(train, at)
+    effect = in_action_frame(train, at)
     mean = effect.mean(dim=0)
-    if _direction(train) is not None:
+    if action_direction(train) is not None:
         mean[:, xy_columns(train.effect_channels)[1]] = 0.0
     std = (effect - mean).square().mean(dim=0).sqrt()
     return _in_table_frame(test, at, mean.expand(len(test), -1, -1), std.clamp_min(LEAST_STD))
@@ -129,7 +130,7 @@ def nearest(
     train: InteractionTensors, test: InteractionTensors, at: Tensor, known: Tensor, queried: Tensor
 ) -> Forecast:
     """Predict the training trajectory of the most similar object; σ is the leave-one-out error."""
-    effect, neighbours = _in_action_frame(train, at), NearestNeighbors(n_neighbors=1).fit(known)
+    effect, neighbours = in_action_frame(train, at), NearestNeighbors(n_neighbors=1).fit(known)
     both = (neighbours.kneighbors(x, return_distance=False) for x in (None, queried))
     left_out, found = (rows[:, 0] for rows in both)
     std = (effect[left_out] - effect).square().mean(dim=0).sqrt()
@@ -144,7 +145,7 @@ def gaussian_process(
     k(x, x') = s² exp(-½ Σ (x - x')² / l²) + noise; s, l and noise maximise the likelihood of the
     last sample, and are used for all samples.
     """
-    effect = _in_action_frame(train, at).double()
+    effect = in_action_frame(train, at).double()
     centre, scale = effect.mean(dim=0), effect.std(dim=0).clamp_min(LEAST_STD)
     target = (effect - centre) / scale
     prior = ConstantKernel() * RBF([3.0] * known.shape[1], (1e-2, 1e9))
@@ -160,26 +161,9 @@ def gaussian_process(
     return _in_table_frame(test, at, (centre + scale * mean).float(), (scale * std).float())
 
 
-def _direction(arrays: InteractionTensors) -> Tensor | None:
-    """Directions of the recorded actions; None for primitives that have none."""
-    channels = arrays.action_channels, arrays.effect_channels
-    if not all(map(xy_columns, channels)):
-        return None
-    return push_direction(condition_on_recorded_action(arrays), *channels)
-
-
-def _in_action_frame(arrays: InteractionTensors, at: Tensor) -> Tensor:
-    """True effects (N, T, C) in the frame of the action."""
-    effect, direction = arrays.effect[:, at], _direction(arrays)
-    if direction is None:
-        return effect
-    back = inverse(direction)[:, None]
-    return rotate_channels(effect, arrays.effect_channels, back, absolute_yaw=False)
-
-
 def _in_table_frame(arrays: InteractionTensors, at: Tensor, mean: Tensor, std: Tensor) -> Forecast:
     """Rotate predictions from the frame of the action to the table's."""
-    std, action, direction = std.expand_as(mean), arrays.action[:, at], _direction(arrays)
+    std, action, direction = std.expand_as(mean), arrays.action[:, at], action_direction(arrays)
     if direction is None:
         return mean, std
     turned = Prediction(action, torch.zeros_like(action), mean, std)

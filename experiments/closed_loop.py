@@ -10,8 +10,6 @@ the robot does not know. Whether a goal is feasible is determined by the arm's k
 and by full grasps (height), never by the planner under test.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress

@@ -6,8 +6,6 @@ commanded action at t = 0 and t = 1. `experiments.effect_prediction` runs the jo
 tables.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial

@@ -3,8 +3,6 @@
 They happen between actions, or during one through the world's callback per simulation step.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,6 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from affordlib.geometry import extruded
 from affordlib.planning.robot import Execution
 from affordlib.types import TABLE_X_M, TABLE_Y_M, Goal, Observation, Step
 from affordlib.world import Tabletop
@@ -63,8 +62,8 @@ def _topple(world: Tabletop, direction_rad: float) -> None:
     c, s = math.cos(direction_rad), math.sin(direction_rad)
     low, high = world.client.getAABB(world.placed.body)
     *centre, i, j, k, w = world.placed.state()
-    outline, half = world.obj.footprint_m, world.obj.height_m / 2
-    ends = np.concatenate([np.insert(outline, 2, z, axis=1) for z in (-half, half)])
+    half = world.obj.height_m / 2
+    ends = extruded(world.obj.footprint_m, -half, half)
     corners = Rotation.from_quat([i, j, k, w]).apply(ends)[:, :2]
     out, up = float((corners @ (c, s)).max()), centre[2] - low[2]
     # For a box about its lower edge: inertia per mass, and the rise of its centre.

@@ -9,8 +9,6 @@ trainings; `all` is the mean over categories with equal weights. Medians and 95t
 over all predictions.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from itertools import product
 from pathlib import Path

@@ -5,13 +5,12 @@ possible if the tool reaches all its poses; a position is reachable if a chain o
 leads to it. The wrist turns freely, so only the tool's distance from the base matters.
 """
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
+from scipy.optimize import bisect
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import ConvexHull, cKDTree
@@ -32,52 +31,46 @@ BAND_M = 0.01  # distance [m] from the limit of the reach within which goals are
 def tool_reach_m(height_m: float) -> tuple[float, float]:
     """Return the smallest and largest distance [m] from the base of a vertical tool at a height."""
 
-    def there(radius: float) -> bool:
+    def there(radius: float) -> float:
         at = np.array([robot.BASE_X_M + radius, 0.0, height_m])
         try:
             robot.inverse_kinematics(at, 0.0, np.array(robot.HOME))
         except UnreachableError:
-            return False
-        return True
+            return -1.0
+        return 1.0
 
-    def rim(inside: float, outside: float) -> float:
-        while abs(outside - inside) > 1e-6:
-            middle = (inside + outside) / 2
-            inside, outside = (middle, outside) if there(middle) else (inside, middle)
-        return inside
-
-    return rim(0.6, 0.0), rim(0.6, 2.0)
+    return bisect(there, 0.6, 0.0, xtol=1e-6), bisect(there, 0.6, 2.0, xtol=1e-6)
 
 
 def possible(
-    kind: type[Move], half_m: float, slack_m: float = 0.0
-) -> Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
-    """Return a test of which actions are possible: positions (n, 2), directions and lengths (n,).
+    kind: type[Move],
+    half_m: float,
+    slack_m: float,
+    xy_m: np.ndarray,
+    direction_rad: np.ndarray,
+    length_m: np.ndarray,
+) -> np.ndarray:
+    """Return which actions are possible, at positions (n, 2), with directions and lengths (n,).
 
     half_m: half the object's width, by which the fingers of a push stop behind its centre [m];
     slack_m: distance [m] added to the arm's reach.
     """
-    low, up = tool_reach_m(TIP_HEIGHT_M), tool_reach_m(HOVER_M + TIP_HEIGHT_M)
-    caging = tool_reach_m(HOVER_M)
+    ahead = np.column_stack([np.cos(direction_rad), np.sin(direction_rad)])
 
-    def judge(xy_m: np.ndarray, direction_rad: np.ndarray, length_m: np.ndarray) -> np.ndarray:
-        ahead = np.column_stack([np.cos(direction_rad), np.sin(direction_rad)])
+    def within(along_m: np.ndarray | float, height_m: float) -> np.ndarray:
+        at = xy_m + np.broadcast_to(along_m, len(xy_m))[:, None] * ahead
+        least, most = tool_reach_m(height_m)
+        radius = np.hypot(at[:, 0] - robot.BASE_X_M, at[:, 1])
+        return (least - slack_m <= radius) & (radius <= most + slack_m)
 
-        def within(along_m: np.ndarray | float, reach: tuple[float, float]) -> np.ndarray:
-            at = xy_m + np.broadcast_to(along_m, len(xy_m))[:, None] * ahead
-            radius = np.hypot(at[:, 0] - robot.BASE_X_M, at[:, 1])
-            return (reach[0] - slack_m <= radius) & (radius <= reach[1] + slack_m)
-
-        if kind is Drag:
-            return within(0.0, caging) & within(length_m, caging)
-        end = length_m - half_m
-        ok = within(-Push(0.0).radius, up) & within(end, low) & within(end - RETREAT_M, up)
-        # The path between start and end may pass too near to the base.
-        for share in (0.25, 0.5, 0.75):
-            ok &= within(-Push(0.0).radius * (1 - share) + share * end, low)
-        return ok
-
-    return judge
+    if kind is Drag:
+        return within(0.0, HOVER_M) & within(length_m, HOVER_M)
+    begin, end, up = -Push(0.0).radius, length_m - half_m, HOVER_M + TIP_HEIGHT_M
+    ok = within(begin, up) & within(end, TIP_HEIGHT_M) & within(end - RETREAT_M, up)
+    # The path between start and end may pass too near to the base.
+    for share in (0.25, 0.5, 0.75):
+        ok &= within(begin * (1 - share) + share * end, TIP_HEIGHT_M)
+    return ok
 
 
 def _actions(
@@ -89,8 +82,8 @@ def _actions(
     reach = Drag(0.0).length if kind is Drag else Push(0.0).length + half
     length_m = np.hypot(*way.T)
     short = length_m <= reach
-    judge = possible(kind, half, slack_m)
-    short[short] = judge(origins[short], np.arctan2(*way[short].T[::-1]), length_m[short])
+    actions = origins[short], np.arctan2(*way[short].T[::-1]), length_m[short]
+    short[short] = possible(kind, half, slack_m, *actions)
     return short
 
 

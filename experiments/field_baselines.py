@@ -1,7 +1,5 @@
 """Baselines that learn nothing: a standard planner, and mechanics in place of a network."""
 
-from __future__ import annotations
-
 import math
 import time
 from dataclasses import dataclass
@@ -11,7 +9,7 @@ import torch
 
 from affordlib.geometry import rotate
 from affordlib.logs.log import centred, gyration_radius_m
-from affordlib.logs.physics import ELLIPSOID, quasi_static_push
+from affordlib.logs.physics import AnalyticPusher
 from affordlib.planning import EffectMap, PlanningProblem, continuous
 from affordlib.planning.effect_map import make_steps, roll_out
 from affordlib.types import Plan
@@ -59,7 +57,7 @@ def plan_cem(problem: PlanningProblem, seed: int = 0) -> Plan:
 
 
 FINGERS_M, FRONT_M = np.linspace((-0.027, 0.015), (-0.015, 0.027), 7).T.ravel(), 0.009
-FRICTION, SUPPORT = 1.0, 2.0
+MECHANICS = AnalyticPusher(friction=1.0, size=2.0)
 FLUSH_M, N_STEPS = 0.0002, 120
 """Where the fingers are across a push, and how far their front is before the hand's centre.
 
@@ -83,11 +81,8 @@ class MechanicsMap(EffectMap):
         unit, n = gyration_radius_m(corners.numpy()), len(angle)
         middle, corners = rotate(middle.expand(n, 2), -angle), corners.expand(n, -1, 2)
         corners = rotate(corners, -angle[:, None])
-        third = torch.arange(3) * (2 * math.pi / 3)
-        feet = [SUPPORT * third.cos(), SUPPORT * third.sin(), torch.full((3,), 1 / 3)]
-        feet, friction = torch.stack(feet, -1).double().expand(n, 3, 3), torch.full((n,), FRICTION)
-        at, turn, ahead = middle.clone(), torch.zeros(n).double(), torch.tensor([[1.0, 0.0]])
-        ahead = ahead.double().expand(n, 2)
+        at, turn = middle.clone(), torch.zeros(n).double()
+        ahead = torch.tensor([[1.0, 0.0]]).double().expand(n, 2)
         front = np.linspace(-0.1, self.kind.towards(0.0).length + FRONT_M, N_STEPS)
         effects = np.zeros((n, N_STEPS, 3))
         for k, x in enumerate(front):
@@ -101,8 +96,7 @@ class MechanicsMap(EffectMap):
             contact = (torch.stack([first, y], -1) - at) / unit
             travel = (x - first).clamp_min(0).where(first.isfinite(), 0.0) / unit
             rows = torch.nan_to_num(torch.cat([contact, ahead, ahead, travel[:, None]], -1))
-            moved = quasi_static_push(rows, feet, friction, ELLIPSOID, 1)
-            moved = moved.where(travel[:, None] > 0, 0.0)
+            moved = MECHANICS.predict(rows, steps=1).where(travel[:, None] > 0, 0.0)
             at, turn = at + unit * moved[:, :2], turn + moved[:, 2]
             effects[:, k] = torch.cat([at - rotate(middle, turn), turn[:, None]], -1)
         hand = [self.kind.towards(0.0).path(t)[:, 0] + FRONT_M for t in t_target.numpy()]

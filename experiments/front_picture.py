@@ -4,8 +4,6 @@ An animation of one push, twice: the full push overshoots the goal; the partial 
 planned phase, ends there.
 """
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 from io import BytesIO

@@ -3,8 +3,6 @@
 Each number is taken from a larger table in `data/results`, which has its own command.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import pandas as pd

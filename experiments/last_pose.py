@@ -12,8 +12,6 @@ change; n rises from 0 at t_l towards 1. Any t is predicted directly, without a 
 observation d_l is the one at t = 0, where a displacement is zero.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import torch
@@ -21,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from affordlib import checked
-from affordlib.geometry import rotate_channels
+from affordlib.geometry import rotate_channels, xy_columns
 from affordlib.interactions.dataset import InteractionTensors, condition_on_recorded_action
 from affordlib.models.base import inverse, network, push_direction, with_time
 from affordlib.models.cnp import AffordanceCNP, CNPConfig
@@ -52,6 +50,23 @@ def between(values: Float[Tensor, "b n c"], at: Float[Tensor, "b t"]) -> Float[T
     return (1 - share) * pick(below) + share * pick(below + 1)
 
 
+def action_direction(arrays: InteractionTensors) -> Tensor | None:
+    """Directions of the recorded actions; None for primitives that have none."""
+    channels = arrays.action_channels, arrays.effect_channels
+    if not all(map(xy_columns, channels)):
+        return None
+    return push_direction(condition_on_recorded_action(arrays), *channels)
+
+
+def in_action_frame(arrays: InteractionTensors, at: Tensor) -> Tensor:
+    """True effects (N, T, C) at sample numbers (T,) in the frame of the action, if it has one."""
+    effect, direction = arrays.effect[:, at], action_direction(arrays)
+    if direction is None:
+        return effect
+    back = inverse(direction)[:, None]
+    return rotate_channels(effect, arrays.effect_channels, back, absolute_yaw=False)
+
+
 class MeanTrajectory(nn.Module):
     """Mean effect m(t) over the phase, linear between steps, in standardised units."""
 
@@ -63,11 +78,7 @@ class MeanTrajectory(nn.Module):
         """Set m to the mean effect of training trajectories and their mirror images, in a frame."""
         both = training.joined(training.rotated_and_mirrored(0, mirror=True))
         at = torch.linspace(0, len(both.phase) - 1, len(self.values)).round().long()
-        effect = both.effect[:, at]
-        if frame == "push":
-            channels = both.action_channels, both.effect_channels
-            back = inverse(push_direction(condition_on_recorded_action(both), *channels))[:, None]
-            effect = rotate_channels(effect, both.effect_channels, back, absolute_yaw=False)
+        effect = in_action_frame(both, at) if frame == "push" else both.effect[:, at]
         self.values = effect.mean(dim=0) / scale
 
     def forward(self, t: Float[Tensor, "b t"]) -> Float[Tensor, "b t c"]:

@@ -3,8 +3,6 @@
 A conditional network is trained once for all protocols, a recurrent one separately for each.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 

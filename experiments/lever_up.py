@@ -9,8 +9,6 @@ positions, after steps of 150 ms. A job with a `setting` is tuning: it is scored
 part of fold 0. Means, standard errors and intervals are over objects.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import product
 from pathlib import Path

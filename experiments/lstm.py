@@ -9,8 +9,6 @@ rollouts. Source: Seker, Tekden and Ugur, Deep effect trajectory prediction in r
 Robotics and Autonomous Systems, 2019, with fewer parameters, which were tuned.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -7,13 +7,11 @@ need. Object categories that no model has seen are used: some to choose the nove
 growth of σ, the others only to test them. Their pushes are collected into runs/strangers.
 """
 
-from __future__ import annotations
-
 import hashlib
 import math
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import pybullet
@@ -152,7 +150,7 @@ class Novelty:
         self.limit = self.distances(references, 2)[:, 1].quantile(0.99)
 
     @classmethod
-    def fit(cls, image: Tensor) -> Novelty:
+    def fit(cls, image: Tensor) -> Self:
         """Create it from at most the first 500 training images."""
         return cls(spectrum(CircularHarmonics(), image[:500]))
 

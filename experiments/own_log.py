@@ -5,8 +5,6 @@ world, in the text format of Zhou et al.: 50 pushes of one triangle with a thin 
 combinations of surface (friction) and support (centre of mass).
 """
 
-from __future__ import annotations
-
 import argparse
 import lzma
 import math

@@ -6,8 +6,6 @@ tables are made from all stored outcomes.
     python -m experiments.planning --only config=continuous,astar
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -215,8 +213,14 @@ def _descent(reading: Reading, model: str = "cnp_500", samples: int = 100, **how
     return PlannerConfig(plan_gradient, model, arguments, **how)
 
 
-PAPERS = ("gradient_100", "gradient_300", "astar_paper")
-NAMED, SAMPLES = ("gradient", "gradient_starts", "gradient_adam"), (100, 300)
+PAPERS, SAMPLES = ("gradient_100", "gradient_300", "astar_paper"), (100, 300)
+RETRAINED = {
+    f"{name}_{samples}{placed}": _descent(READINGS[name], samples=samples, **how)
+    for name in ("gradient", "gradient_starts", "gradient_adam")
+    for placed, how in (("", BY_PLAN), ("_recentred", RECENTRED))
+    for samples in SAMPLES
+}
+"""Planners that are tried with three trainings of the paper's network."""
 CONFIGS: dict[str, PlannerConfig] = {
     # The paper's planners on its own network. Each action is placed by the plan, as in the paper;
     # `_recentred`, at the object as it is then observed, which differs for several actions only.
@@ -225,10 +229,7 @@ CONFIGS: dict[str, PlannerConfig] = {
         for (name, how), samples in product(READINGS.items(), SAMPLES)
     },
     "gradient_100_uniform_pushes": _descent(Reading(), **BY_PLAN, sources=("uniform",)),
-    **{
-        f"{name}_{samples}_recentred_pushes": _descent(READINGS[name], samples=samples, **RECENTRED)
-        for name, samples in product(NAMED, SAMPLES)
-    },
+    **{f"{name}_pushes": config for name, config in RETRAINED.items() if "recentred" in name},
     "gradient_100_recentred_cnp_mixed": _descent(Reading(), "cnp_mixed", **RECENTRED),
     "astar_paper_pushes": PlannerConfig(plan_astar, "cnp_500", **ALL),
     "astar_paper_recorded_pushes": PlannerConfig(plan_astar_recorded, "cnp_500", **ALL),
@@ -287,12 +288,7 @@ CONFIGS |= {
     **{
         f"{name}_{model}": replace(CONFIGS[f"{name}_pushes"], model=model, sources=("constructed",))
         for model in (*TRAINED, "cnp_published")
-        for name in PAPERS
-    },
-    **{
-        f"{name}_{samples}{placed}_{model}": _descent(READINGS[name], model, samples, **how)
-        for name, samples, model in product(NAMED, SAMPLES, ("cnp_500_seed_1", "cnp_500_seed_2"))
-        for placed, how in (("", BY_PLAN), ("_recentred", RECENTRED))
+        for name in (*PAPERS, *(RETRAINED if model.startswith("cnp_500") else ()))
     },
     **{
         f"fresh_{name}": replace(CONFIGS[name], world="fresh", sources=("constructed",))
@@ -545,9 +541,7 @@ def training_rows(records: dict[str, Rows]) -> Rows:
     largest of the mean distances with three trainings of its network, and the mean of the medians.
     """
     rows: Rows = []
-    placed = product(NAMED, ("", "_recentred"), SAMPLES)
-    planners = [f"{name}_{samples}{where}" for name, where, samples in placed] + ["astar_paper"]
-    for model, planner in product(("cnp_500", "cnp_mixed"), planners):
+    for model, planner in product(("cnp_500", "cnp_mixed"), (*RETRAINED, "astar_paper")):
         first = f"{planner}_{model}".replace("_cnp_500", "_pushes")
         names = [first, *(f"{planner}_{model}_seed_{k}" for k in (1, 2))]
         if not set(names) <= set(records):

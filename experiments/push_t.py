@@ -13,8 +13,6 @@ state is solved (a) when the environment says so (coverage above 95 %), (b) when
 rounds, lengths, features of the Gaussian process) was chosen on the seeds from `FIRST_CHOICE`.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import time
@@ -34,7 +32,6 @@ from scipy.special import expit
 from affordlib.geometry import rotated, unit_vector, wrap_angle
 from affordlib.logs import Log, LoggedPushes, PushedObject, PushPlanner, fit
 from affordlib.logs.cross_validate import forecast_errors
-from affordlib.logs.fit import PushModel
 from affordlib.logs.log import _nearest, centred
 from affordlib.logs.neural_process import PRETRAINED
 from affordlib.logs.planning import primitive_of
@@ -304,13 +301,8 @@ def pushes_of_draw(n: int, draw: int, view: str, block_cog: tuple | None) -> Log
 def planner_of(row: Row, draw: int) -> PushPlanner:
     """Fit a row's model to a draw of pushes, and return its planner."""
     data = pushes_of_draw(row.n, draw, row.view, row.block_cog)
-    return planner_with(fit(data, row.model), data)
-
-
-def planner_with(model: PushModel, data: LoggedPushes) -> PushPlanner:
-    """Return the planner of a model for the T of a log."""
     obj = replace(PushedObject.of(data), lengths_m=LENGTHS_M)
-    return PushPlanner(model, obj, price=PRICE, rounds=ROUNDS, room_m=ROOM_M)
+    return PushPlanner(fit(data, row.model), obj, price=PRICE, rounds=ROUNDS, room_m=ROOM_M)
 
 
 def solve(row: str, block: int) -> dict[str, Any]:
@@ -323,17 +315,14 @@ def solve(row: str, block: int) -> dict[str, Any]:
 
 
 def errors(row: str, draw: int) -> dict[str, Any]:
-    """Return the errors of a row's model at 400 new pushes of the next draw, and its times."""
-    about, began = ROWS[row], time.process_time()
-    pushes = logged(collect(about.n, draw, about.view, block_cog=about.block_cog))
-    collected = time.process_time()
+    """Return the errors of a row's model at 400 new pushes of the next draw, and its time."""
+    about = ROWS[row]
+    pushes = pushes_of_draw(about.n, draw, about.view, about.block_cog)
+    began = time.process_time()
     model = fit(pushes, about.model)
-    fitted, table = time.process_time(), Table(about.view, block_cog=about.block_cog)
-    attempt(table, planner_with(model, pushes), about.chain, FIRST_CHOICE)
-    solved = time.process_time()
-    new = logged(collect(400, DRAWS + draw, about.view, block_cog=about.block_cog))
+    spent = {"fit_s": time.process_time() - began}
+    new = pushes_of_draw(400, DRAWS + draw, about.view, about.block_cog)
     found = forecast_errors(model, new)
-    spent = {"collect_s": collected - began, "fit_s": fitted - collected, "first_s": solved - began}
     columns = ("position_m", "yaw_rad", "inside_50", "inside_90")
     return {"errors": {name: found[name].tolist() for name in columns}, "spent": spent}
 
@@ -350,9 +339,8 @@ def job(row: str, block: int | None = None, draw: int | None = None) -> Job:
 def tables(folder: str = FOLDER) -> dict[str, Rows]:
     """Return the shares of solved states by row, rule and limit, and the models' errors."""
     results = sorted(read(TABLE, job, folder), key=lambda r: list(ROWS).index(r[0]["row"]))
-    runs = frame([(about, r) for about, r in results if "runs" in r], "runs")
     solved, predicted = [], []
-    for row, part in runs.groupby("row", sort=False):
+    for row, part in frame(results, "runs").groupby("row", sort=False):
         for rule in "ab":
             steps = part[f"steps_{rule}"].astype(float).fillna(math.inf)
             draws = part["block"].mod(DRAWS).nunique()
@@ -363,17 +351,14 @@ def tables(folder: str = FOLDER) -> dict[str, Rows]:
             about["steps_median"] = steps.median() if steps.median() < math.inf else None
             about["pushes_mean"] = part["pushes"].mean()
             solved.append(about | {"plan_mean_s": part["plan_s"].mean()})
-    measured = [(about, r | {"spent": [r["spent"]]}) for about, r in results if "errors" in r]
-    every, spent = frame(measured, "errors"), frame(measured, "spent")
-    for row, part in every.groupby("row", sort=False) if measured else ():
+    for row, part in frame(results, "errors").groupby("row", sort=False):
         about = {"row": row, "n": len(part), "draws": part["draw"].nunique()}
-        for what, unit in (("position", "m"), ("yaw", "rad")):
-            for name, at in (("median", 0.5), ("p95", 0.95)):
-                about[f"{what}_{name}_{unit}"] = part[f"{what}_{unit}"].quantile(at)
+        for name, at in (("median", 0.5), ("p95", 0.95)):
+            about[f"position_{name}_m"] = part["position_m"].quantile(at)
+        about["yaw_median_rad"] = part["yaw_rad"].median()
         about |= {f"coverage_{p}": part[f"inside_{p}"].mean() for p in (50, 90)}
-        means = spent[spent["row"] == row].mean(numeric_only=True)
-        about |= {f"{name}_mean_s": means[f"{name}_s"] for name in ("collect", "fit", "first")}
-        predicted.append(about)
+        spent = [r["spent"]["fit_s"] for of, r in results if of["row"] == row and "spent" in r]
+        predicted.append(about | {"fit_mean_s": np.mean(spent)})
     return {"solved": solved, "errors": predicted}
 
 

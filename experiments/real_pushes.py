@@ -8,8 +8,6 @@ makes `data/results/real_pushes.json`. FOLDER contains the logs of seven conditi
 ICRA 2016).
 """
 
-from __future__ import annotations
-
 import itertools
 import lzma
 from collections.abc import Iterator, Sequence

@@ -3,8 +3,6 @@
 The paper uses its own simulator, objects, gripper and data, so they are context, not a comparison.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any
 

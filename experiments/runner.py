@@ -12,8 +12,6 @@ running jobs and at most half a minute. Equal results give identical bytes.
     results = read("effect_prediction", job)
 """
 
-from __future__ import annotations
-
 import argparse
 import gzip
 import hashlib
@@ -50,7 +48,6 @@ from experiments.commands import command, worker_type
 
 FOLDER = "data/results/raw"
 WRITE_EVERY_S = 30
-NOT_DECISIVE = ("device",)  # options without influence on results: those of the machine
 
 open_once = lru_cache(maxsize=4)(open_interactions)  # data sets are kept between jobs
 Rows = list[dict[str, Any]]
@@ -328,7 +325,7 @@ def checkpoint_sha256(name_or_path: str | Path) -> str:
 
 def _values(settings: Any) -> Any:
     if is_dataclass(settings):
-        names = [f.name for f in fields(settings) if f.name not in NOT_DECISIVE]
+        names = [f.name for f in fields(settings) if f.name != "device"]  # has no influence
         return [_values(getattr(settings, name)) for name in names]
     if isinstance(settings, dict):
         return [[_values(k), _values(v)] for k, v in settings.items()]

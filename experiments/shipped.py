@@ -6,8 +6,6 @@ python -m experiments.shipped reachability
 python -m experiments.shipped goals
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import math
@@ -290,15 +288,12 @@ def draw_goals(_: argparse.Namespace) -> None:
         tasks: list[PlanningTask] = []
         seed = {"validation": 1, "fresh": 2}.get(name, 0)
         counts = VALIDATION_GOALS if name == "validation" else N_GOALS
+        classes = {"clean": STANDING + ROLLABLE, "perturbed_rollable": ROLLABLE}.get(name, STANDING)
         with Tabletop() as world:
             for mode, n in counts.items():
-                if name != "clean":
-                    classes = ROLLABLE if name == "perturbed_rollable" else STANDING
-                    variation = VARIATIONS.get(name)
-                    tasks += constructed_tasks(world, mode, n, seed, classes, variation)
-                    continue
-                tasks += constructed_tasks(world, mode, n, 0, STANDING + ROLLABLE)
-                tasks += uniform_tasks(mode, n, 0, STANDING + ROLLABLE)
+                tasks += constructed_tasks(world, mode, n, seed, classes, VARIATIONS.get(name))
+                if name == "clean":
+                    tasks += uniform_tasks(mode, n, seed, classes)
         rows = ",\n".join(json.dumps(task.to_json()) for task in tasks)
         text = f'{{"seed": {seed}, "tasks": [\n{rows}\n]}}\n'
         path = repo_root() / FROZEN[name]

@@ -3,8 +3,6 @@
 Plans and the map of effects that they need, measured in one run on one core.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from functools import partial

@@ -6,8 +6,6 @@ computes missing or stale results in `data/results/raw/studies.jsonl.gz`. The ta
 `experiments.effect_prediction`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path

@@ -5,8 +5,6 @@ fits a Gaussian process, and brings the T to 50 goals: plan, push, observe, and 
 what the camera shows. *Within*: 5 mm and 5°, by the true pose, at most 20 pushes.
 """
 
-from __future__ import annotations
-
 import math
 import tempfile
 from collections.abc import Sequence

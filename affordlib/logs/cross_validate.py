@@ -1,7 +1,5 @@
 """Cross-validation of models on a user's own log, always with all baselines for comparison."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Sequence
 from typing import Any

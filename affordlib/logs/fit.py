@@ -14,8 +14,6 @@
 The baselines that can use `context` get it, if it differs among the logged pushes.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields

@@ -4,8 +4,6 @@
 radians in the object's frame before each push: from its centroid, with the recorded pose's axes.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Iterable, Mapping
@@ -213,12 +211,9 @@ class Log:
     def _poses(self, name: str, values: Any) -> np.ndarray:
         """Poses (k, 3) in metres and radians, without jumps of the yaw by 2π; ValueError."""
         poses = _rows(name, values, 3) * [self._metres, self._metres, self._radians]
-        if np.abs(poses[:, 2]).max() > 2 * math.pi:
-            raise ValueError(
-                f"yaws of {name}, in {self._angle_unit}, must lie within one turn, got "
-                f"{poses[np.abs(poses[:, 2]).argmax(), 2] / self._radians:g}; angle_unit is "
-                f"{self._angle_unit!r}, and whole turns that were counted must be taken away"
-            )
+        worst, turn = np.abs(poses[:, 2]).max() / self._radians, 2 * math.pi / self._radians
+        how = f"angle_unit is {self._angle_unit!r}; take away whole turns that were counted"
+        check_within(f"yaws of {name} ({how})", float(worst), -turn, turn, self._angle_unit)
         poses[:, 2] = np.unwrap(poses[:, 2])
         return poses
 
@@ -346,9 +341,7 @@ def gyration_radius_m(outline_m: np.ndarray) -> float:
     return math.sqrt((area * squares).sum() / (6 * area.sum()))
 
 
-def _nearest(
-    outline_m: np.ndarray, points: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _nearest(outline_m: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, ...]:
     """Distances (n,) of points (n, 2) from an outline, negative inside; edges and points (n, 2) on
     them that are nearest. A loop over the edges needs little memory.
     """

@@ -9,8 +9,6 @@ Pushes and feet are rows as in `physics.py`, in units of the object's radius of 
 its frame; pushes with known outcome have three more values: displacement and rotation.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path

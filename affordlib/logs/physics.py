@@ -11,8 +11,6 @@ centroid. A push is a row of 7: contact point, inward normal and direction of th
 and the pusher's travel after contact. Feet are rows of 3: x, y and weight (sum 1).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -114,7 +112,7 @@ class AnalyticPusher:
         return cls(*map(math.exp, best.x))
 
     @torch.no_grad()
-    def predict(self, push: Tensor, feet: Tensor | None = None) -> Tensor:
+    def predict(self, push: Tensor, feet: Tensor | None = None, steps: int = STEPS) -> Tensor:
         """Displacement and rotation (N, 3) of pushes (N, 7)."""
         smoothing = self.size
         if feet is None:
@@ -122,4 +120,4 @@ class AnalyticPusher:
             ring = [self.size * angle.cos(), self.size * angle.sin(), torch.full((3,), 1 / 3)]
             feet, smoothing = torch.stack(ring, -1), ELLIPSOID
         friction = torch.full((len(push),), self.friction)
-        return quasi_static_push(push, feet.expand(len(push), -1, -1), friction, smoothing)
+        return quasi_static_push(push, feet.expand(len(push), -1, -1), friction, smoothing, steps)

@@ -8,11 +8,10 @@ to the goal is chosen; ρ, the object's radius of gyration, converts rotations t
 known where the tool is, the first push must be one to which the tool finds a way around the object.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any, Self
 
 import numpy as np
@@ -149,7 +148,7 @@ class PushPlanner:
         each = np.arange(len(self.library))
         self._pairs = np.stack(np.meshgrid(each, each), axis=-1).reshape(-1, 2)
         self._ends = _after(*(self._effect[rows] for rows in self._pairs.T))
-        self._trees: dict[float, cKDTree] = {}
+        self._tree = lru_cache(lambda turn_m: cKDTree(self._ends * (1.0, 1.0, turn_m)))
 
     def plan(self, pose: Pose, goal: Goal, n_pushes: int = 3, tool_xy_m: XY | None = None) -> Plan:
         """Plan up to three pushes from a pose (x, y, yaw) to a goal, with its turn if it has one.
@@ -180,9 +179,7 @@ class PushPlanner:
 
         found = best(np.arange(n)[:, None], effect)
         if n_pushes > 1:  # a chain that is refined need not be the very best
-            if weights[2] not in self._trees:
-                self._trees[weights[2]] = cKDTree(weights * self._ends)
-            tree = self._trees[weights[2]]
+            tree = self._tree(weights[2])
             near = tree.query(weights * target, _PAIRS)[1] if self.rounds else slice(None)
             found += best(self._pairs[near], self._ends[near])
         if n_pushes == 3:
@@ -320,6 +317,5 @@ def _steps(pose: Pose, pushes: Pushes, effect: np.ndarray, std: np.ndarray) -> t
 
 def _after(pose: np.ndarray, effect: np.ndarray) -> np.ndarray:
     """Poses (n, 3) after effects (n, 3), each in the frame of its pose."""
-    return np.column_stack(
-        [pose[:, :2] + rotated_each(effect[:, :2], pose[:, 2]), pose[:, 2] + effect[:, 2]]
-    )
+    xy = pose[:, :2] + rotated_each(effect[:, :2], pose[:, 2])
+    return np.column_stack([xy, pose[:, 2] + effect[:, 2]])

@@ -168,7 +168,7 @@ def test_the_kinematic_oracle_is_the_kinematics(world):
         for kind, half in ((Push, 0.02), (Drag, 0.0)):
             action = kind.towards(angle)
             query = xy[None], np.array([angle]), np.array([action.length + half])
-            said, near, far = (possible(kind, half, s)(*query)[0] for s in (0.0, 0.004, -0.004))
+            said, near, far = (possible(kind, half, s, *query)[0] for s in (0.0, 0.004, -0.004))
             truth = world.can_reach(action, 1.0, tuple(xy))
             assert truth == said or near != far
             no += not truth

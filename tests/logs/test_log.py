@@ -99,7 +99,7 @@ BAD = {
     ),
     "degrees as radians": (
         {"poses": ((600.0, -20.0, 17.2), END)},
-        "yaws of poses, in rad, .* got 17.2; angle_unit is 'rad'.* counted must be taken away",
+        "yaws of poses .angle_unit is 'rad'; take away .* must lie in .* rad, got 17.2",
     ),
     "degrees of the end alone": ({"poses": (START, (605.0, -14.0, 4.5))}, "turn, in rad.* 2.08"),
     "a pose of another push": ({"poses": (START, (700.0, -14.0, 0.38))}, "of poses .*another push"),
@@ -107,7 +107,7 @@ BAD = {
     "repeated times": ({"tool_t": np.array([0, 1, 1, *range(3, 12)])}, "tool_t must incr.* row 2"),
     "a date that is missing": (
         {"tool_t": np.array([*np.arange(11), "NaT"], "datetime64[s]")},
-        "tool_t must be finite, but 1 of 12 rows are not, the first is row 11",
+        "tool_t must increase, but row 11 is -9.2",
     ),
     "a time that is masked": ({"tool_t": np.ma.masked_equal(range(12), 4)}, "tool_t .* is row 4;"),
     "a gap": (
