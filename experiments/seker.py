@@ -10,8 +10,6 @@ about z. The action is not recorded; its two channels are the share of the steps
 objects are seen as 5 cm high. We have tried this on files made in this format, not on theirs.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,7 +22,7 @@ from PIL import Image
 from affordlib.interactions import InteractionTensors, split_interactions
 from affordlib.models.lever_up import LEVER_ACTION_CHANNELS, POSE_CHANNELS, window_errors_m
 from affordlib.results import write_results
-from affordlib.types import IMAGE_PIXELS, check_count
+from affordlib.types import IMAGE_PIXELS, check_array, check_count
 from experiments.commands import command
 from experiments.lever_training import LEVER_MODELS, fit_lever_model
 from experiments.lever_up import N_FOLDS
@@ -33,53 +31,43 @@ MODELS = ("cnp_tuned", "cnp_last_pose", "lstm_tuned")
 N_STEPS = 26
 MOVED_M, SLIPPED_M, SLIPPED_RAD = 1e-7**0.5, 0.03, 0.4
 HEIGHT_M = 0.05
-CORNERS = (0, 0, -1, -1), (0, -1, 0, -1)
-"""Rows and columns of an image's corners, which show the table."""
 
 
 def poses_of(path: Path) -> np.ndarray:
     """Return the steps (n, 6) of a trajectory in which the object moves, until it slips."""
-    try:
-        steps = np.loadtxt(path, ndmin=2)
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{path} must hold six numbers a line: {error}") from None
-    if steps.shape[1] != 6 or not np.isfinite(steps).all():
-        raise ValueError(f"{path} must hold six finite numbers a line, got {steps.shape[1]}")
+    steps = check_array(f"lines of {path}", np.genfromtxt(path, ndmin=2), 6)
     moves = np.diff(steps[:, :3], axis=0)
     slips = (moves[:, 2] < 0) | (moves[:, 2] > SLIPPED_M) | (abs(steps[1:, 5]) > SLIPPED_RAD)
     moved = np.linalg.norm(moves, axis=1) >= MOVED_M
-    slips &= moved
-    end = int(slips.argmax()) if slips.any() else len(moves)
-    return np.vstack([steps[:1], steps[1 : end + 1][moved[:end]]])
+    kept = moved & ~np.logical_or.accumulate(slips & moved)
+    return np.vstack([steps[:1], steps[1:][kept]])
 
 
 def seen_at(path: Path) -> np.ndarray:
-    """Return depth [m] and mask (2, 48, 48) of a grey image: what is unlike its corners."""
+    """Return depth [m] and mask (2, 48, 48) of a grey image: what is unlike its four corners."""
     grey = np.asarray(Image.open(path).convert("L").resize((128, 128))) > 127
-    mask = (grey != (grey[CORNERS].mean() > 0.5)).astype(np.uint8)
+    mask = (grey != (grey[::127, ::127].mean() > 0.5)).astype(np.uint8)
     small = Image.fromarray(255 * mask).resize((IMAGE_PIXELS, IMAGE_PIXELS), Image.Resampling.BOX)
     mask = np.asarray(small, dtype=np.float32) / 255
     return np.stack([1 - HEIGHT_M * mask, mask])
 
 
-def lever_ups_in(folder: Path, n_steps: int = N_STEPS) -> InteractionTensors:
-    """Read the lever-ups of at least n_steps steps, cut to as many."""
+def lever_ups_in(folder: Path) -> InteractionTensors:
+    """Read the lever-ups of at least `N_STEPS` steps, cut to as many."""
     paths = sorted((folder / "trajectories").glob("*.txt"), key=lambda path: int(path.stem))
-    long = [(path.stem, poses) for path in paths if len(poses := poses_of(path)) >= n_steps]
+    long = [(path.stem, poses) for path in paths if len(poses := poses_of(path)) >= N_STEPS]
     if len(long) < N_FOLDS * 2:
         raise ValueError(
-            f"{folder} must hold images/1.jpg, trajectories/1.txt and so on, with {2 * N_FOLDS} or "
-            f"more of at least {n_steps} steps; found {len(paths)} trajectories, {len(long)} of "
-            "them long enough"
+            f"{folder} must hold images/1.jpg, trajectories/1.txt and so on, at least "
+            f"{2 * N_FOLDS} of them of {N_STEPS} steps, got {len(long)}, and {len(paths)} in all"
         )
-    steps = np.stack([poses[:n_steps] for _, poses in long])
+    images = np.stack([seen_at(folder / "images" / f"{name}.jpg") for name, _ in long])
+    steps = np.stack([poses[:N_STEPS] for _, poses in long])
     tilt = np.arccos(np.clip(np.cos(steps[..., 3]) * np.cos(steps[..., 4]), -1, 1))
     effect = np.concatenate([steps[..., :3], tilt[..., None]], axis=-1)
-    phase = torch.linspace(0, 1, n_steps)
+    phase = torch.linspace(0, 1, N_STEPS)
     return InteractionTensors(
-        image=torch.from_numpy(
-            np.stack([seen_at(folder / "images" / f"{k}.jpg") for k, _ in long])
-        ),
+        image=torch.from_numpy(images),
         phase=phase,
         action=phase[None, :, None].repeat(len(long), 1, 2),
         effect=torch.from_numpy(effect - effect[:, :1]).float(),
@@ -94,10 +82,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m experiments.seker", description=main.__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--folds", type=int, default=N_FOLDS)
-    parser.add_argument("--steps", type=int, default=N_STEPS, help="of each lever-up")
     parser.add_argument("--out-dir", default="runs")
     options = parser.parse_args(argv)
-    lever_ups, rows = lever_ups_in(options.folder, check_count("--steps", options.steps, 21)), []
+    lever_ups, rows = lever_ups_in(options.folder), []
     for fold in range(check_count("--folds", options.folds, 1, N_FOLDS)):
         split = split_interactions(len(lever_ups), 0, 2 * fold, 2 * N_FOLDS)
         rows_of = (split.train, split.validation, split.test)

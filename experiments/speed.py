@@ -18,60 +18,59 @@ from affordlib.results import write_results
 from affordlib.world import Tabletop
 from experiments.commands import command
 from experiments.obstacles import MAX_STEPS, VALIDATION_SEED, drawn_task
-from experiments.runner import Rows
+from experiments.runner import Rows, plain
 from experiments.tasks import frozen_tasks
 
 MODES = {"single_partial": "one action", "multi_partial": "up to three actions"}
 AMONG = "up to four actions, four obstacles"
-PLANNERS = {"A*, to the disc": partial(plan_astar, heuristic="disc"), "continuous": plan_continuous}
-
-Task = tuple[Any, ...]
 
 
-def seconds(work: Callable[[], object]) -> float:
-    """Return the CPU time of a call [s], which excludes other programs."""
+def timed(work: Callable[[], Any]) -> tuple[Any, float]:
+    """Return the result of a call and its CPU time [ms], which excludes other programs."""
     began = time.process_time()
-    work()
-    return time.process_time() - began
+    return work(), 1000 * (time.process_time() - began)
 
 
-def tasks_by_goals(n: int) -> dict[str, list[Task]]:
+def tasks_by_goals(n: int) -> dict[str, list[tuple]]:
     """Return n tasks of each kind: object, yaw [rad], goal, mode and obstacles."""
-    uniform = [t for t in frozen_tasks() if t.goals == "uniform" and not t.obj.rollable]
-    tasks = {
-        goals: [(t.obj, t.yaw_rad, t.goal, mode, ()) for t in uniform if t.mode == mode][:n]
-        for mode, goals in MODES.items()
-    }
+    of_modes = (t for t in frozen_tasks() if t.mode in MODES and t.goals == "uniform")
+    uniform, tasks = [t for t in of_modes if not t.obj.rollable], {k: [] for k in MODES.values()}
+    for t in uniform:
+        tasks[MODES[t.mode]].append((t.obj, t.yaw_rad, t.goal, t.mode, ()))
     drawn = (drawn_task("clutter", k, VALIDATION_SEED) for k in count())
     some = islice((t for t in drawn if len(t.obstacles) == 4 and not t.obj.rollable), n)
     mode = PlanMode(MAX_STEPS, partial=True)
     tasks[AMONG] = [(t.obj, t.yaw_rad, t.goal, mode, t.obstacles) for t in some]
-    return tasks
+    return {goals: some[:n] for goals, some in tasks.items()}
 
 
 def planning(n: int = 40) -> Rows:
-    """Measure milliseconds per plan, and per map of the effects of a new object."""
+    """Measure the time per plan, and per map of the effects of a new object."""
     film, rows = load_checkpoint("film_5000")[0], []
     with Tabletop() as world:
         for goals, tasks in tasks_by_goals(n).items():
-            times: list[dict[str, float]] = []
-            among = goals == AMONG  # where A* takes seconds
-            planners = {k: p for k, p in PLANNERS.items() if p is plan_continuous or not among}
             for obj, yaw_rad, goal, mode, obstacles in tasks:
                 world.place(obj, (0.0, 0.0), yaw_rad, obstacles=obstacles)
                 seen = world.observe()
                 effects = EffectMap(film, seen.image)
-                took = {"map": seconds(lambda: effects.fine_grid)}  # noqa: B023
+                _, map_ms = timed(partial(getattr, effects, "fine_grid"))
                 more = {"obstacles": seen.obstacles}
                 problem = PlanningProblem(seen.xy_m, goal, effects, mode, **more)
-                times.append(took | {k: seconds(partial(p, problem)) for k, p in planners.items()})
-            milliseconds = 1000 * pd.DataFrame(times)
-            for name in planners:
-                row = {"planner": name, "goals": goals, "n": len(times)}
-                row |= {"median_ms": milliseconds[name].median()}
-                row |= {"p95_ms": milliseconds[name].quantile(0.95)}
-                rows.append(row | {"map_median_ms": milliseconds["map"].median()})
-    return rows
+                plan, plan_ms = timed(partial(plan_continuous, problem))
+                about = {"goals": goals + ", no way found" * (not plan.reaches_goal)}
+                about |= {"map_ms": map_ms}
+                rows.append(about | {"planner": "continuous", "ms": plan_ms})
+                if not obstacles:  # beside which A* takes seconds
+                    astar_ms = timed(partial(plan_astar, problem, heuristic="disc"))[1]
+                    rows.append(about | {"planner": "A*, to the disc", "ms": astar_ms})
+    groups = pd.DataFrame(rows).groupby(["planner", "goals"], sort=False)
+    table = groups.agg(
+        n=("ms", "size"),
+        median_ms=("ms", "median"),
+        p95_ms=("ms", lambda each: each.quantile(0.95)),
+        map_median_ms=("map_ms", "median"),
+    )
+    return plain(table.reset_index())
 
 
 @command(OSError, ValueError)

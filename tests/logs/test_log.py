@@ -107,7 +107,7 @@ BAD = {
     "repeated times": ({"tool_t": np.array([0, 1, 1, *range(3, 12)])}, "tool_t must incr.* row 2"),
     "a date that is missing": (
         {"tool_t": np.array([*np.arange(11), "NaT"], "datetime64[s]")},
-        "tool_t must increase, but row 11 is -9.2",
+        "tool_t must be finite, but 1 of 12 rows are not, the first is row 11",
     ),
     "a time that is masked": ({"tool_t": np.ma.masked_equal(range(12), 4)}, "tool_t .* is row 4;"),
     "a gap": (
