@@ -79,7 +79,7 @@ def _titled(picture: np.ndarray, title: str) -> np.ndarray:
 
 def main() -> None:
     """Record the full and the partial push, and write them side by side."""
-    both = recorded("The full push", stop=False), recorded("Stopped at {:.0%} of it", stop=True)
+    both = recorded("The full push", stop=False), recorded("Stopped at {:.0f} % of it", stop=True)
     longest = max(map(len, both))
     sides = [side + side[-1:] * (longest - len(side)) for side in both]
     frames = [np.hstack(pair) for pair in zip(*sides, strict=True)]

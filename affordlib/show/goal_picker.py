@@ -21,7 +21,15 @@ from matplotlib.figure import Figure
 
 from affordlib.geometry import unit_vector, wrap_angle
 from affordlib.models import load_checkpoint
-from affordlib.planning import Planner, Skills, plan_astar, plan_continuous, plan_gradient
+from affordlib.planning import (
+    PlanMode,
+    Planner,
+    PlanningProblem,
+    Skills,
+    plan_astar,
+    plan_continuous,
+    plan_gradient,
+)
 from affordlib.planning.gradient import Reading
 from affordlib.show.picker_controls import (
     LIMIT_M,
@@ -92,6 +100,7 @@ class GoalPicker(widgets.HBox):
         self._view = TableView(table=table_data(skills))
         self.scene = Scene(world) if view else None
         goal = Goal(check_on_table("goal_xy_m", goal_xy_m))
+        self._first_goal, self._other = goal, None
         self.controls = PickerControls(goal, list(planners), list(self.executors), self._follow)
         self._listen()
         below = [self._view, self.controls.progress, self.controls.words]
@@ -148,9 +157,11 @@ class GoalPicker(widgets.HBox):
         self._disturb(self._move_goal)
 
     def start_over(self) -> None:
-        """Put the object back where it was when the picker was created."""
+        """Put object and goal back where they were when the picker was created."""
         self._refuse_while_running()
         (x, y, yaw), obstacles = self._first_pose, self.world.obstacles.all
+        self._marks.clear()
+        self._set_goal(replace(self._first_goal))
         self._disturb(partial(self.world.place, self.world.obj, (x, y), yaw, obstacles=obstacles))
 
     def figure(self) -> Figure:
@@ -190,7 +201,8 @@ class GoalPicker(widgets.HBox):
         self._view.observe(lambda _: self._follow(self._goal_at(self._view.wanted[:2])), "wanted")
         self._view.observe(lambda _: self._soon(adopt), "obstacles")
         self._view.on_msg(lambda _, message, __: getattr(controls, message["press"]).click())
-        controls.planner.observe(lambda _: self._follow(self.goal), names="value")
+        for choice in (controls.planner, controls.other, controls.early):
+            choice.observe(lambda _: self._follow(self.goal), names="value")
         controls.run.on_click(lambda _: self._run_in_background())
         controls.stop.on_click(lambda _: self.stop())
         controls.shove.on_click(lambda _: self._soon(self.shove_object))
@@ -237,11 +249,17 @@ class GoalPicker(widgets.HBox):
         if self._stale and not self._running:
             self._make_plan()
 
+    def _planned(self, problem: PlanningProblem, planner: str = "") -> Plan:
+        """A plan by the chosen planner, or another one, whose actions may stop early or not."""
+        mode = PlanMode(problem.mode.max_steps, self.controls.early.value)
+        return self.planners[planner or self.controls.planner.value](replace(problem, mode=mode))
+
     def _make_plan(self) -> None:
         with self._alone:
             self.controls.say(f"{self._news} Planning with {self.controls.planner.value} …")
             self._show(planning=True)
             goal, number, plan = self.goal, self._view.wanted[2], None
+            self._other = None
             self._searched.clear()
             self.controls.show_progress(0)
             if self._lifted:  # put it down
@@ -251,14 +269,20 @@ class GoalPicker(widgets.HBox):
             try:
                 seen = self.world.depth_image(), self._pose[:2]
                 problem = self.skills.problem(*seen, goal, obstacles=self.world.obstacles.all)
-                plan = self.planners[self.controls.planner.value](problem)
-                self.controls.say(f"{self._news} {plan_in_words(plan)}")
+                plan, other = self._planned(problem), self.controls.other.value
+                words = plan_in_words(plan)
+                if other != "nothing":
+                    self._other = self._planned(problem, other)
+                    off_mm = 1000 * self._other.predicted_distance_m
+                    words += (
+                        f" By {other}, dashed: {len(self._other.steps)} actions, {off_mm:.1f} mm."
+                    )
+                self.controls.say(f"{self._news} {words}")
                 self._news = ""
                 self._view.object = object_data(self.world.obj, problem.effects, self._pose[2])
             finally:
                 self.plan, self.outcome = plan, None
                 self._trail.clear()
-                self._marks.clear()
                 if self.scene is not None:
                     self.scene.mark(self.goal, plan)
                 self._plan_pose, self._turn_from = self._pose, self._pose[2]
@@ -317,6 +341,7 @@ class GoalPicker(widgets.HBox):
                 if self._stale or self.plan is None or self.outcome is not None:
                     self._make_plan()
                 plan, self._news = self.plan, ""
+                self._marks.clear()
                 left[:] = plan.steps
                 self._show()
                 yaw, z = self.world.object_pose()[2], self.world.object_state()[2]
@@ -327,8 +352,7 @@ class GoalPicker(widgets.HBox):
                 with suppress(Stopped):
                     begin()
                     execute = self.executors[self.controls.executor.value]
-                    planner = self.planners[self.controls.planner.value]
-                    paths, words = execute(self.world, plan, planner, report)
+                    paths, words = execute(self.world, plan, self._planned, report)
                     how = "Done,"
                     self.controls.show_progress(1)
                 pose = self.world.object_pose()
@@ -428,6 +452,8 @@ class GoalPicker(widgets.HBox):
             "pose": self._pose,
             "goal": {"xy": self.goal.xy_m, "tolerance": self.goal.tolerance_m, "yaw": yaw},
             "steps": plan_data(self.plan, self._plan_pose[2]) if self.plan else [],
+            "other": plan_data(self._other, self._plan_pose[2]) if self._other else [],
+            "partial": self.controls.early.value,
             "trail": list(self._trail),
             "marks": list(self._marks),
             "answered": self._answered,

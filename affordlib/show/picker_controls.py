@@ -44,17 +44,20 @@ class PickerControls(widgets.VBox):
         self.sliders = [widgets.FloatSlider(description=n, **s) for n, s in _SLIDERS.items()]
         self.x, self.y, self.turn, self.height = self.sliders
         self.planner = widgets.Dropdown(options=list(planners), description="planner")
+        self.other = widgets.Dropdown(options=["nothing", *planners], description="compare")
+        self.early = widgets.Checkbox(value=True, description="may stop early", indent=False)
         self.executor = widgets.Dropdown(options=list(executors), description="carry out")
         self.run = _button("Run", "play", "Execute the plan", button_style="primary")
         self.stop = _button("Stop", "stop", "Stop after this action", disabled=True)
         self.shove = _button("Shove it", "hand-o-right", "Disturb: shove the object")
         self.move_goal = _button("Move goal", "random", "Disturb: move the goal")
-        self.start_over = _button("Start over", "undo", "Put the object back")
+        self.start_over = _button("Start over", "undo", "Put object and goal back")
         self.words, self.said, self.progress = widgets.HTML(), "", widgets.HTML()
         self.show(goal)
         for slider in self.sliders:
             slider.observe(lambda change: self._slid(change["owner"], on_goal), names="value")
-        rows = [[one] for one in (self.planner, self.executor, *self.sliders)]
+        rows = [[one] for one in (self.planner, self.other, self.early, self.executor)]
+        rows += [[slider] for slider in self.sliders]
         rows.append([self.run, self.stop, self.start_over])
         rows.append([widgets.Label("disturb"), self.shove, self.move_goal])
         layout = {"flex": "1 1 250px", "max_width": "300px"}
@@ -81,7 +84,8 @@ class PickerControls(widgets.VBox):
 
     def set_running(self, running: bool) -> None:
         """Disable the controls that have no effect during a run."""
-        for control in (self.run, self.start_over, self.planner, self.executor):
+        idle = self.planner, self.other, self.early, self.executor, self.run, self.start_over
+        for control in idle:
             control.disabled = running
         self.stop.disabled = not running
 
@@ -106,7 +110,7 @@ def _button(name: str, icon: str, tooltip: str, **kwargs: Any) -> widgets.Button
 
 
 def plan_in_words(plan: Plan) -> str:
-    """Describe a plan: its actions, predicted distance to the goal, and planning time."""
+    """Describe a plan: its actions, and their predicted distance to the goal."""
     words = ((step.primitive.name.replace("_", " "), 100 * step.stop_phase) for step in plan.steps)
     steps = ", then ".join(f"{name} to {phase:.0f} %" for name, phase in words) or "no action"
     missed = " Up to three pushes or drags do not reach the goal; a closed loop then plans again."
@@ -117,7 +121,7 @@ def plan_in_words(plan: Plan) -> str:
     spread = "" if math.isnan(std_m) else f" (σ of the last step {1000 * std_m:.1f} mm)"
     return (
         f"Plan: {steps}. Predicted to end {1000 * plan.predicted_distance_m:.1f} mm from the goal"
-        f"{spread}.{arrives} Found in {1000 * plan.plan_s:.0f} ms."
+        f"{spread}.{arrives}"
     )
 
 

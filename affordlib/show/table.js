@@ -809,10 +809,10 @@ function render({ model, el }) {
     const { object, pose, goal: { xy, tolerance }, obstacles } = { ...view.state, ...changes };
     if (object && !model.get("scene").running) {
       const query = { object, pose, goal: xy, tolerance, obstacles, reachable: object.reachable };
-      const { table } = model.get("table");
-      ({ chain, steps: changes.steps } = plan({ ...query, table, previous: chain, quick: true }));
+      const [{ table }, { partial }] = [model.get("table"), model.get("scene")];
+      ({ chain, steps: changes.steps } = plan({ ...query, table, partial, previous: chain, quick: true }));
     }
-    view.set(changes);
+    view.set({ ...changes, other: [] });
     if (!final) return;
     model.set(...wanted);
     model.save_changes(); // ipywidgets sends the next one when this one has been processed

@@ -231,6 +231,7 @@ class Turned(KnownDynamics):
 
 
 READINGS = [Reading(), Reading(starts=4), Reading(finds="point")]
+READINGS += [Reading("gradient", "circle", finds, rate=1.0) for finds in ("direction", "point")]
 READINGS += [Reading("adam", "circle", finds, rate=0.005) for finds in ("direction", "point")]
 
 
@@ -252,7 +253,7 @@ def test_each_reading_finds_the_direction_whose_effect_points_at_the_goal(goal_x
             assert float(found.norm()) == pytest.approx(REACH_M, abs=1e-3)
 
 
-@pytest.mark.parametrize("reading", READINGS[::4], ids=str)
+@pytest.mark.parametrize("reading", [READINGS[0], READINGS[-1]], ids=str)
 @pytest.mark.parametrize("goal_xy", [(0.05, 0.02), (-0.03, 0.06), (0.13, -0.11)])
 def test_the_gradient_planner_finds_direction_and_phase(goal_xy, reading):
     plan, again = (planning.plan_gradient(known(goal_xy), 300, reading=reading) for _ in range(2))

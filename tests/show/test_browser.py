@@ -153,7 +153,7 @@ def button(page, name):
 
 
 def choose(page, option):
-    page.locator(".affordlib-picker select", has_text=option).select_option(option)
+    page.locator(".affordlib-picker select", has_text=option).first.select_option(option)
 
 
 def words(page):
@@ -321,9 +321,9 @@ def test_a_closed_loop_follows_a_goal_that_moves(page, table):
     choose(page, "open loop")
 
 
-@pytest.mark.parametrize("width", [1280, 600, 400])
+@pytest.mark.parametrize("width", [1280, 853, 600, 400])  # 853: 1280 at a zoom of 150 %
 def test_it_fits_its_window(page, table, width):
-    """Table and controls are side by side from 1,000 px on, the words are below the table."""
+    """Table and controls are side by side from 800 px on, the words are below the table."""
     page.set_viewport_size({"width": width, "height": 1000})
     parts = (table.svg, page.locator(".affordlib-picker [role=status]"), button(page, "Run"))
 
@@ -332,7 +332,7 @@ def test_it_fits_its_window(page, table, width):
         beside = run["x"] > top["x"] + top["width"] and run["y"] < top["y"] + top["height"]
         below = 0 < said["y"] - top["y"] - top["height"] < 220  # behind the obstacles' buttons
         within = top["x"] - 1 < said["x"] < said["x"] + said["width"] < top["x"] + top["width"] + 1
-        return below and within and beside == (width >= 1000)
+        return below and within and beside == (width >= 800)
 
     wait_until(arranged)
     cut = """all => all.filter((part) => part.getClientRects().length).filter((part) => {

@@ -88,6 +88,21 @@ def test_a_picked_goal_is_planned_for_drawn_and_reached(picker, world):
         np.testing.assert_array_equal(a, b)
 
 
+def test_another_plan_and_full_actions_are_shown(make_picker):
+    picker = make_picker(planners={"continuous": plan_continuous, "A*": plan_astar})
+    picker.pick(0.08, 0.03)
+    assert not picker._view.scene["other"]
+    picker.controls.other.value = "A*"
+    other = in_time(picker)._view.scene["other"]
+    assert math.dist(other[-1]["end"][:2], (0.08, 0.03)) < 0.02
+    assert f" By A*, dashed: {len(other)} actions" in picker.controls.said
+    picker.controls.early.value = False
+    scene = in_time(picker)._view.scene
+    assert {step["stop"] for step in scene["steps"] + scene["other"]} == {1.0}
+    picker.start_over()
+    assert picker.plan.goal.xy_m == drawn_goal(picker) == (0.12, 0.0)
+
+
 def luminance(colour):
     values = np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)]) / 255
     values = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
@@ -95,8 +110,9 @@ def luminance(colour):
 
 
 def test_lines_and_words_stand_out_from_the_table():
-    styles = str(TableView._css).split("@media")
-    for style in map(str, styles):
+    styles = str(TableView._css).split("@media (prefers-color-scheme: dark)")
+    assert len(styles) == 2
+    for style in styles:
         colour = dict(re.findall(r"--([\w-]+): (#\w{6})", style))
         wanted = {"ink": 4.5, "goal": 3, "prediction": 3, "truth": 2.9, "object-rim": 3, "rim": 3}
         for name, least in wanted.items():
