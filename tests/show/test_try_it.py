@@ -203,13 +203,13 @@ def test_a_plan_follows_the_pointer(opened):
             svg.setPointerCapture = () => {};
             event("pointerdown", 0);
             const times = [];
-            for (let k = 1; k <= 200; k++) {
+            for (let k = 1; k <= 300; k++) {
                 const began = performance.now();
                 event("pointermove", k);
                 times.push(performance.now() - began);
             }
-            event("pointerup", 200);
+            event("pointerup", 300);
             return times;
         }"""
     )
-    assert np.median(times) < 160, np.quantile(times, [0.5, 0.95])  # 16 on an idle machine
+    assert (np.quantile(times, [0.5, 0.95]) < (160, 500)).all()  # 16 and 50 on an idle machine
