@@ -20,7 +20,7 @@ TEXTS |= {"notebooks/cheat_sheet.md": 500}
 """Pages of text, and their maximum number of words."""
 
 LIMITS = {"minutes": 60, "words": 2000, "cells": 40, "tables": 3, "rows": 8}
-LIMITS |= {"code": 30, "px": 900, "no alt": 0, "numbers": 2}
+LIMITS |= {"code": 30, "px": 900, "no alt": 0, "numbers": 2, "paragraph": 3}
 
 PRIVATE = re.compile(
     r"\b(fores(ee\w*|aw)|promised|courses?|told|err(s|ed)|guess(es)?|yardsticks?|off by|wary|eyes?"
@@ -51,10 +51,10 @@ def count_words(text: str) -> int:
     return len(re.findall(r"\w[\w'’-]*", prose(text)))
 
 
-def crowded(text: str) -> int:
-    """Count the sentences with more than one number."""
-    sentences = re.split(r"[.!?:;][*)]*\s|\n", prose(re.sub(NAME, "", text, flags=re.MULTILINE)))
-    return sum(len(re.findall(NUMBER, sentence)) > 1 for sentence in sentences)
+def numbers_in(between: str, text: str) -> list[int]:
+    """Count the numbers in each part of a text; between: what separates the parts."""
+    parts = re.split(between, prose(re.sub(NAME, "", text, flags=re.MULTILINE)))
+    return [len(re.findall(NUMBER, part)) for part in parts]
 
 
 def markdown(notebook: nbformat.NotebookNode) -> str:
@@ -93,7 +93,8 @@ def measure(notebook: nbformat.NotebookNode) -> dict[str, int]:
         "figures": len(widths),
         "px": max(widths, default=0),
         "no alt": no_alt,
-        "numbers": crowded(text),
+        "numbers": sum(n > 1 for n in numbers_in(r"[.!?:;][*)]*\s|\n", text)),
+        "paragraph": max(numbers_in(r"\n\s*\n|\n- ", text)),
     }
 
 
@@ -130,7 +131,7 @@ def check() -> tuple[dict[str, dict[str, int]], list[str]]:
         found = measures[name] = measure(notebook)
         most = LIMITS
         if name[0] == "A":  # an appendix may be long
-            most = {key: most[key] for key in ("code", "px", "no alt", "numbers")}
+            most = {k: most[k] for k in ("code", "px", "no alt", "numbers", "paragraph")}
         wrong += [f"{name}: {found[k]} {k}, at most {n}" for k, n in most.items() if found[k] > n]
         wrong += [f"{name}: cell {c.id} is empty" for c in notebook.cells if not c.source.strip()]
         wrong += [f"{name}: {fault}" for fault in faults(path, markdown(notebook))]
