@@ -1,4 +1,4 @@
-"""Table 1 on the paper's own lever-ups, by Seker, Tekden and Ugur (2019), if somebody has them.
+"""Table 1 on the paper's own lever-ups, by Seker, Tekden and Ugur (2019).
 
     python -m experiments.seker FOLDER
 

@@ -57,7 +57,7 @@ def planning(n: int = 40) -> Rows:
                 more = {"obstacles": seen.obstacles}
                 problem = PlanningProblem(seen.xy_m, goal, effects, mode, **more)
                 plan, plan_ms = timed(partial(plan_continuous, problem))
-                about = {"goals": goals + ", no way found" * (not plan.reaches_goal)}
+                about = {"goals": goals + ", no plan found" * (not plan.reaches_goal)}
                 about |= {"map_ms": map_ms}
                 rows.append(about | {"planner": "continuous", "ms": plan_ms})
                 if not obstacles:  # beside which A* takes seconds

@@ -102,6 +102,10 @@ class Skills:
     threshold: ClassVar[float] = 0.2
     _last: dict[tuple[type[Move], bytes], EffectMap] = field(**_KEPT)
 
+    def __post_init__(self) -> None:
+        for name in self.models:
+            primitive_named(name)
+
     @classmethod
     def load(cls) -> Self:
         """Load the shipped models, and the reachability learned from the shipped interactions."""

@@ -26,6 +26,7 @@ from affordlib.types import (
     Obstacle,
     check_array,
     check_choice,
+    check_within,
     number,
     on_table,
     parameter,
@@ -41,12 +42,9 @@ CHAMFER_M = (0.006, 0.004)  # width and height around a prism's base: a blade ca
 HULL_MARGIN_M = 0.001  # by which PyBullet's collision shape of a convex hull exceeds its corners
 _UPRIGHT = math.cos(math.radians(45))
 
-length_m = partial(number, 0.005, LARGEST_M, "m")
-"""Declare a dimension of a category."""
-
 
 @dataclass(frozen=True)
-class TabletopObject(Checked, ABC):
+class TabletopObject(ABC):
     """An object on the table; all its fields are lengths [m]."""
 
     category: ClassVar[str]
@@ -55,6 +53,14 @@ class TabletopObject(Checked, ABC):
     has_yaw: ClassVar[bool] = True  # whether its yaw can be seen
     volume_m3: ClassVar[property]
     footprint_m: ClassVar[property]  # corners (n, 2) of its outline from above, at yaw 0
+
+    def __post_init__(self) -> None:
+        self._check_lengths(*(field.name for field in fields(self)))
+
+    def _check_lengths(self, *names: str) -> None:
+        for name in names:
+            about = f"{type(self).__name__}.{name}", getattr(self, name)
+            object.__setattr__(self, name, check_within(*about, 0.005, LARGEST_M, "m"))
 
     @classmethod
     def sample(
@@ -87,9 +93,9 @@ class TabletopObject(Checked, ABC):
 class Cuboid(TabletopObject):
     """A box with edges `length`, `width` and `height` [m], standing on its base."""
 
-    length: float = length_m()
-    width: float = length_m()
-    height: float = length_m()
+    length: float
+    width: float
+    height: float
 
     category = "cuboid"
     stable = True
@@ -109,8 +115,8 @@ def _cylinder(diameter: float, length: float) -> dict[str, Any]:
 class UprightCylinder(TabletopObject):
     """A cylinder of the given `diameter` and `height` [m], standing on its round base."""
 
-    diameter: float = length_m()
-    height: float = length_m()
+    diameter: float
+    height: float
 
     category = "upright_cylinder"
     stable = True
@@ -129,8 +135,8 @@ class UprightCylinder(TabletopObject):
 class LyingCylinder(TabletopObject):
     """A cylinder of the given `length` and `diameter` [m], lying on its side."""
 
-    length: float = length_m()
-    diameter: float = length_m()
+    length: float
+    diameter: float
 
     category = "lying_cylinder"
     rollable = True
@@ -153,7 +159,7 @@ class LyingCylinder(TabletopObject):
 class Sphere(TabletopObject):
     """A ball of the given `diameter` [m]."""
 
-    diameter: float = length_m()
+    diameter: float
 
     category = "sphere"
     rollable = True
@@ -177,12 +183,12 @@ class Prism(TabletopObject):
     """
 
     corners: tuple[tuple[float, float], ...]
-    height: float = length_m()
+    height: float
 
     category = "prism"
 
     def __post_init__(self) -> None:
-        super().__post_init__()
+        self._check_lengths("height")
         corners = check_array("prism corners", self.corners, 2)
         if corners.ndim != 2 or not N_EDGES[0] <= len(corners) <= N_EDGES[1]:
             raise ValueError(f"prism corners must be 3 to 8 points (x, y), got {corners.shape}")

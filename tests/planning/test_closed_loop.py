@@ -185,6 +185,11 @@ def test_a_veto_is_remembered_and_another_plan_made():
     assert abs(went.steps[0].primitive.direction_rad - refused[0]) > 0.05
 
 
+def test_a_skill_that_is_no_primitive_is_refused():
+    with pytest.raises(ValueError, match=r"one of .*'push'.* got 'pusch'"):
+        planning.Skills({"pusch": point_skills().model(Push)})
+
+
 def test_what_the_arm_cannot_do_is_refused_before_any_motion():
     robot = PointRobot((0.5, 0.3), refuses=lambda primitive, at: at[1] > 0.45)
     went = loop(robot, Goal((0.5, 0.62), EXACT_M), ends="unreachable")

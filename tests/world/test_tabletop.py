@@ -19,6 +19,7 @@ from affordlib.types import CROP_WIDTH_M, IMAGE_PIXELS, NothingSeenError, Obstac
 from affordlib.world import CATEGORIES, Tabletop, WorldConfig
 from affordlib.world.objects import CHAMFER_M, Cuboid, LyingCylinder, Prism, Sphere, UprightCylinder
 from affordlib.world.robot import HOME, TOOL_LENGTH_M, inverse_kinematics, load_robot
+from experiments.t_on_arm import TBlock
 from tests.waiting import printed
 
 OBJECTS = (Cuboid(0.05, 0.07, 0.06), UprightCylinder(0.06, 0.05))
@@ -118,6 +119,7 @@ def test_unreachable_raises_or_is_recorded_and_moves_nothing(world):
         (lambda w: Obstacle(tuple(STAR)), "one point .a disc. or go counter-clockwise"),
         (lambda w: Obstacle.disc((0.0, 0.0), 0.0), "Obstacle.radius_m must lie in"),
         (lambda w: Obstacle.box((0.7, 0.0), (0.1, 0.1)), "lies off the table"),
+        (lambda w: TBlock(height=math.nan), "TBlock.height must be"),
     ],
 )
 def test_bad_input_is_named(world, act, words):
