@@ -200,16 +200,18 @@ class PartlyChecked(PlanningProblem):
 ROWS = {
     "continuous": (plan_continuous, {}),
     "continuous_full": (plan_continuous, {"partial": False}),
-    "astar": (plan_astar, {}),
-    "astar_full": (plan_astar, {"partial": False}),
     "check_goal": (plan_continuous, {"check": "goal"}),
     "check_ends": (plan_continuous, {"check": "ends"}),
     "check_line": (plan_continuous, {"check": "line"}),
     "check_object": (plan_continuous, {"check": "object"}),
     "perturbed": (plan_continuous, {"world": "perturbed"}),
     "perturbed_full": (plan_continuous, {"world": "perturbed", "partial": False}),
-    "cem": (plan_cem, {}),
-    "gradient": (plan_gradient, {}),
+    **{
+        f"{loop}{name}{change}": (planner, how | more)
+        for loop, how in (("", {}), ("closed_loop_", {"observes": True}))
+        for name, planner in (("gradient", plan_gradient), ("cem", plan_cem), ("astar", plan_astar))
+        for change, more in (("", {}), ("_full", {"partial": False}))
+    },
     "no_sigma": (partial(plan_continuous, risk_weight=0.0), {}),
     "film_500": (plan_continuous, {"push": "film_500"}),
     "cnp_500": (plan_continuous, {"push": "cnp_500"}),
@@ -217,6 +219,10 @@ ROWS = {
     "closed_loop": (plan_continuous, {"observes": True}),
     "closed_loop_full": (plan_continuous, {"observes": True, "partial": False}),
     "closed_loop_perturbed": (plan_continuous, {"observes": True, "world": "perturbed"}),
+    "closed_loop_perturbed_full": (
+        plan_continuous,
+        {"observes": True, "world": "perturbed", "partial": False},
+    ),
 }
 """Planner of each row, and its settings: whether it may stop early, what is checked, the world, the
 network of pushes or mechanics instead, and whether it observes after each action, with up to two

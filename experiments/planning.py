@@ -194,7 +194,7 @@ RECENTRED = {"modes": ("multi_partial",)}
 DISC = {"heuristic": "disc"}
 PERTURBED = {"model": "film_5000_perturbed", "world": "perturbed"}
 ROLLING, OUTSIDE = (PERTURBED | {"world": world} for world in ("perturbed_rollable", "outside"))
-RATES = {"gradient": (0.03, 0.1, 0.3, 1.0, 3.0), "adam": (0.001, 0.005, 0.02)}
+RATES = {"gradient": (0.03, 0.1, 0.3, 1.0, 3.0), "adam": (0.0003, 0.001, 0.003, 0.005, 0.02)}
 """Rates of the paper's planner that are tried on the validation goals."""
 
 READINGS = {
@@ -202,7 +202,7 @@ READINGS = {
     "gradient_starts": Reading(starts=4),
     "gradient_circle": Reading(start="circle", rate=1.0),
     "gradient_point": Reading("gradient", "circle", "point", rate=1.0),
-    "gradient_adam": Reading("adam", "circle", "point"),
+    "gradient_adam": Reading("adam", "circle", "point", rate=0.003),
 }
 """Readings of the paper's planner: as printed, the best of four starts, from the circle of 20 cm,
 from there until the point is still, the same with Adam."""

@@ -29,7 +29,7 @@ from affordlib.planning.problem import PlanningProblem
 from affordlib.primitives import Drag
 from affordlib.types import Checked, Plan, Step, check_choice, check_count, count, number, parameter
 
-DESCENTS = {"gradient": (torch.optim.SGD, 0.3), "adam": (torch.optim.Adam, 0.001)}
+DESCENTS = {"gradient": (torch.optim.SGD, 0.3), "adam": (torch.optim.Adam, 0.003)}
 """Optimiser and its rate, the best on the validation goals (`RATES` of `experiments.planning`)."""
 
 STILL = {"direction": 1e-3, "point": 1e-4}

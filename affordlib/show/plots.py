@@ -162,7 +162,8 @@ def plot_plan(
         if aside @ (start - first) < 0:
             aside = -aside  # away from the object's start
         clear = 6 + np.min((20, 6) / np.maximum(np.abs(aside), 1e-6))  # half a label, and a gap
-        _name(ax, text, tail, clear * aside)
+        beside = 0.0 if obj is None or k == 0 else 0.7 * np.hypot(*obj.footprint_m.T).max()
+        _name(ax, text, tail + _cm(beside * aside), clear * aside)
         label = "prediction" if k == 0 else None
         ax.plot(*_cm(step.predicted_path_xy_m), color=PREDICTION, lw=2, label=label)
         ax.plot(*_cm(end), "o", color=PREDICTION, ms=3)

@@ -190,7 +190,7 @@ form.addEventListener("reset", () => setTimeout(() => {
 
 objects.forEach((item, k) => {
   const choice = document.createElement("button");
-  const points = item.outline.map(([x, y]) => [22 + 380 * x, 18 - 380 * y].join()).join(" ");
+  const points = item.outline.map(([x, y]) => [22 + 300 * x, 18 - 300 * y].join()).join(" ");
   choice.type = "button";
   choice.setAttribute("role", "radio");
   choice.innerHTML = `<svg viewBox="0 0 44 36" aria-hidden="true"><polygon points="${points}"/></svg>${escaped(item.name)}` +
@@ -218,3 +218,8 @@ function choose() {
   replan();
 }
 choose();
+if (window !== parent) {
+  // In a page of the book, which makes room for all of it.
+  document.documentElement.classList.add("framed");
+  new ResizeObserver(() => parent.postMessage(one("main").offsetHeight, "*")).observe(one("main"));
+}

@@ -21,6 +21,15 @@ include_patterns = ["*.md", "data/*.md", "notebooks/*.md", "notebooks/*.ipynb"]
 include_patterns += ["notebooks/appendix/*.ipynb"]
 exclude_patterns = [".*", "runs", "build", "**/.*"]
 
+PICKER = """<iframe class="picker" src="../_static/try_it.html" title="Pick a goal"></iframe>
+<script>
+addEventListener("message", ({data, source}) => {
+  const frame = document.querySelector("iframe.picker");
+  if (source === frame.contentWindow) frame.style.height = `${Number(data)}px`;
+});
+</script>"""
+"""What stands for the goal picker of the first page: one that plans without a kernel."""
+
 nb_execution_mode = "off"
 nb_ipywidgets_js = {}
 myst_enable_extensions = ["dollarmath"]
@@ -48,6 +57,9 @@ def plain(text: str) -> str:
 def describe(cell: dict, below: str) -> None:
     """Give a picture its alternative text, the caption in the cell below; name a folded cell."""
     about = cell["metadata"]["mystnb"] = {}
+    if "GoalPicker.demo(" in "".join(cell["source"]):
+        live = {"output_type": "display_data", "data": {"text/html": PICKER}, "metadata": {}}
+        cell["outputs"] = [live]
     caption = re.match(r"\*\*Figure .*?\*\* (.*)", below)
     kinds = {"write_results(": "results", "import": "imports"}
     named = [name for word, name in kinds.items() if word in "".join(cell["source"])]
@@ -91,17 +103,18 @@ def add_robot(app, page: str, template: str, context: dict, doctree) -> None:
         app.add_js_file("robot.js", priority=600)
 
 
-def copy_robot(app) -> None:
-    """Copy the script from the installed package, by a name that k3d does not look for."""
+def copy_scripts(app) -> None:
+    """Copy the picker, and the robot's script from k3d by a name that it does not look for."""
     script = Path(k3d.__file__).parent / "static" / "standalone.js"
     folder = Path(app.outdir, "_static")
     folder.mkdir(parents=True, exist_ok=True)
     shutil.copy(script, folder / "robot.js")
+    shutil.copy(Path(app.srcdir, "figures", "try_it.html"), folder)
 
 
 def setup(app) -> None:
     """Register the above; when all is written, the first page is copied to index.html."""
-    app.connect("builder-inited", copy_robot)
+    app.connect("builder-inited", copy_scripts)
     app.connect("html-page-context", add_robot)
     app.connect("source-read", prepare)
     app.add_html_math_renderer("mathml", (write_math, None), (write_math, None))

@@ -216,24 +216,33 @@ def lab(tmp_path_factory, browser):  # which may be missing
         yield lab
 
 
-def opened(lab, browser):
-    """The notebook with all cells run, and `requests`: every requested address."""
+def opened(lab, browser, click_m=None):
+    """The notebook with all cells run, and `requests`: every requested address.
+
+    click_m: a place on the table that is clicked while the later cells still run.
+    """
     page = browser.new_page(viewport={"width": 1280, "height": 1000})
     page.set_default_timeout(25_000)
     page.requests = []
     page.context.on("request", lambda request: page.requests.append(request.url))
     page.on("websocket", lambda socket: page.requests.append(socket.url))
-    page.goto(lab.url)
-    page.wait_for_function("() => window.jupyterapp")  # a little after the page has loaded
-    page.evaluate("async () => { await window.jupyterapp.restored; }")
+    load(page, lab.url)
     page.wait_for_function(
         "() => window.jupyterapp.shell.currentWidget?.sessionContext?.session?.kernel"
         "?.status === 'idle'"
     )
     page.evaluate("window.jupyterapp.commands.execute('notebook:run-all-cells')")
     page.locator(".affordlib-table .prediction").first.wait_for(timeout=90_000)
+    if click_m:
+        page.mouse.click(*Table(page).at(*click_m))
     ask(page, "setattr(picker, 'pace_s', 0.01)")  # answered after all cells
     return page
+
+
+def load(page, url):
+    page.goto(url)
+    page.wait_for_function("() => window.jupyterapp")  # a little after the page has loaded
+    page.evaluate("async () => { await window.jupyterapp.restored; }")
 
 
 def test_the_first_click_after_scrolling_lands_where_the_mouse_is(page, table):
@@ -454,6 +463,45 @@ def test_no_request_leaves_the_machine(page, lab):
     assert page.locator("text=Would you like to get notified").count() == 0
 
 
+def test_a_second_window_without_webgl_shows_the_same_and_plays_from_above(page, table, lab):
+    """It is loaded while the kernel runs, so this is a reload, too."""
+    page.evaluate("window.jupyterapp.commands.execute('docmanager:save')")
+    other = page.context.browser.new_page(viewport={"width": 1280, "height": 1000})
+    none = "HTMLCanvasElement.prototype.getContext = new Proxy(HTMLCanvasElement.prototype."
+    none += "getContext, {apply: (f, el, [kind, ...more]) =>"
+    other.add_init_script(none + " /webgl/.test(kind) ? null : f.call(el, kind, ...more)});")
+    load(other, lab.url)
+    other.locator(".affordlib-table .prediction").first.wait_for(timeout=40_000)
+    second = Table(other)
+    other.mouse.click(*second.at(0.06, 0.11))
+    assert_same_goal(other, second, 0.06, 0.11)
+    wait_until(lambda: np.abs(table.goal() - second.goal()).max() < 1e-3)
+    button(other, "Run").click()
+    wait_for_words(other, "from the goal, ")
+    end = ask(page, "picker.outcome.end_pose[:2]")
+    for one in (table, second):
+        wait_until(lambda one=one: np.allclose(one.points(".object").mean(axis=0), end, atol=1e-3))
+    picture(other, "without_webgl")
+    other.close()
+
+
+def test_a_goal_out_of_reach_is_hollow_and_says_how_far(page, table):
+    table.start_over()
+    ask(page, "picker.pick(0.3, 0.25)")
+    wait_until(lambda: table.svg.locator(".short-by").count() == 1)
+    short_cm = ask(page, "100 * picker.plan.predicted_distance_m")
+    assert f"{short_cm:.0f} cm short" in table.svg.locator(".short-by").text_content()
+    inner, line = table.svg.evaluate(
+        """svg => {
+            const {fill, stroke} = getComputedStyle(svg.querySelector(".goal.missed"));
+            return [fill, stroke];
+        }"""
+    )
+    assert inner != line
+    picture(page, "out_of_reach")
+    table.start_over()
+
+
 def test_after_a_restart_of_the_kernel_one_sentence_says_what_to_do(page):
     page.evaluate("window.jupyterapp.shell.currentWidget.sessionContext.session.kernel.restart()")
     said = "e => getComputedStyle(e, '::before').content"
@@ -466,8 +514,7 @@ def test_after_a_restart_of_the_kernel_one_sentence_says_what_to_do(page):
 def test_notebook_7_draws_the_picker_which_answers(tmp_path, browser):
     pytest.importorskip("notebook", reason="Notebook 7 is not installed")
     with serve(tmp_path, "00_start_here", app="notebook") as served:
-        page = opened(served, browser)
-        page.mouse.click(*Table(page).at(0.1, -0.1))
+        page = opened(served, browser, click_m=(0.1, -0.1))
         assert_same_goal(page, Table(page), 0.1, -0.1)
 
 
@@ -544,6 +591,18 @@ def test_the_web_pages_are_read_on_a_phone_without_a_network(web, browser):
     assert scrolled > 50
     assert all(url.startswith(("file:", "data:", "blob:")) for url in requests)
     assert not [text for text in complaints if "K3D" not in text and "GL Driver" not in text]
+
+
+def test_the_first_web_page_plans_without_a_kernel(web, browser):
+    page = browser.new_page(viewport={"width": 1280, "height": 900})
+    page.goto((web[0] / "notebooks" / "00_start_here.html").as_uri())
+    inside, table = page.frames[1], page.frame_locator("iframe.picker").locator("svg[data-view]")
+    page.mouse.click(*screen_at(table, 0.0, 0.08))
+    wait_until(lambda: "The goal is at x = 0.0, y = 8.0 cm" in table.get_attribute("aria-label"))
+    assert "Predicted to end 0.0 mm" in inside.locator(".words").inner_text()
+    fits = "() => document.documentElement.scrollHeight <= innerHeight"
+    wait_until(lambda: inside.evaluate(fits), 20)
+    picture(page, "web_picker")
 
 
 def test_the_web_pages_are_found_by_a_word_and_darken(web, browser):
