@@ -47,7 +47,7 @@ SHOWN = {1: "{}", 2: "{} ± {}", 3: "{} ({} to {})"}
 """How the parts of a column are shown, by their number."""
 
 PICTURES = "figures/results"
-COLORS = ("black", "#888888", "#CC79A7", "#8c6d46")
+COLORS = ("black", "#888888", "#999933", "#8c6d46")
 LOOKS = [{"color": c, "fmt": marker, "ms": 5} for c, marker in zip(COLORS, "osD^", strict=True)]
 
 BLOCK = re.compile(

@@ -22,15 +22,11 @@ from affordlib.planning.effect_map import roll_out
 from affordlib.primitives import Push
 from affordlib.show.table_data import object_data, obstacle_data, table_data
 from affordlib.types import Goal, Obstacle
-from affordlib.world import Cuboid, LyingCylinder, Prism
+from affordlib.world import Cuboid
+from experiments.try_it import OBJECTS
 from tests.planning.point_robot import problem_of
 from tests.waiting import printed
 
-OBJECTS = {
-    "box": Cuboid(0.07, 0.05, 0.05),
-    "roller": LyingCylinder(0.07, 0.05),
-    "wedge": Prism(((-0.05, -0.02), (0.05, -0.02), (0.05, 0.0), (-0.05, 0.03)), 0.04),
-}
 ASK = """
 import fs from "node:fs";
 import { EffectMap, plan, reachability, spare } from "./table.mjs";
@@ -176,9 +172,9 @@ def goals(n, seed, far_m=0.24):
 @pytest.mark.parametrize("name", OBJECTS)
 def test_the_browser_predicts_what_the_effect_map_predicts(ask, seen, skills, name):
     _, effects, data = seen[name]
-    queries = [{"pose": [0.01, -0.02, 0.7], "goal": goal} for goal in goals(80, 0)]
+    queries = [{"pose": [0.01, -0.02, 0.7], "goal": goal} for goal in goals(40, 0)]
     found = ask(data, queries, table_data(skills)["reach"])
-    assert sum(len(plan["steps"]) > 1 for plan in found) > 20
+    assert sum(len(plan["steps"]) > 1 for plan in found) > 10
     assert len(json.dumps(data)) < 60_000
     for plan in found:
         chain = torch.tensor(plan["chain"], dtype=torch.float64).reshape(-1, 2)
@@ -205,7 +201,7 @@ def test_the_browser_reaches_what_python_reaches(ask, seen, skills):
         for goal, plan in zip(wanted, found, strict=True):
             best = plan_continuous(skills.problem(image, (0.0, 0.0), Goal(tuple(goal))))
             if best.predicted_distance_m < 5e-4:
-                assert plan["distance"] < 1e-3, goal
+                assert plan["distance"] < 5e-4, goal
 
 
 def obstacles_of(rng, n, near=0.07, far=0.2):
