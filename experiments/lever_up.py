@@ -88,9 +88,8 @@ def lever_split(data: xr.Dataset, fold: int = 0) -> Split:
 def cross_validate(
     model: str, trained_for: str, fold: int, setting: str | None, resume_checkpoint: Path
 ) -> dict[str, Any]:
-    """Train and return the errors in all windows of all test trajectories, by protocol.
-
-    With a setting, return the mean errors on the validation part instead.
+    """Return the errors in all windows of all test trajectories, by protocol; with a setting, the
+    mean errors on the validation part.
     """
     data, lever = open_once(DATA), lever_model(model, setting)
     split = lever_split(data, fold)
@@ -99,14 +98,10 @@ def cross_validate(
         for part in (split.train, split.validation, split.test)
     )
     network, _ = fit_lever_model(lever, training, validation, trained_for, resume_checkpoint)
-    if setting is not None:
-        return _tuned(network, validation, trained_for)
-    kept = data["interaction"].values[valid_interactions(data, split.test)]
-    errors = {protocol: _errors(network, test, protocol) for protocol in TESTED[trained_for]}
-    return {"interaction": kept.tolist()} | errors
-
-
-def _tuned(network: EffectNetwork, validation: InteractionTensors, trained_for: str) -> dict:
+    if setting is None:
+        kept = data["interaction"].values[valid_interactions(data, split.test)]
+        errors = {protocol: _errors(network, test, protocol) for protocol in TESTED[trained_for]}
+        return {"interaction": kept.tolist()} | errors
     row: dict[str, Any] = {"n": len(validation)}
     if trained_for != "first_step":
         row["window_mean_m"] = float(models.window_errors_m(network, validation).mean())
@@ -118,11 +113,11 @@ def _tuned(network: EffectNetwork, validation: InteractionTensors, trained_for: 
 @torch.no_grad()
 def _errors(network: EffectNetwork, arrays: InteractionTensors, protocol: str) -> dict[str, Any]:
     """Return the errors (N, W, T) [cm] of a network, rounded to 1 µm, as lists."""
-    starts = range(models.n_windows(arrays) if protocol == "window" else 1)
-    seen = network.encode(arrays.image)
-    found = [models.predict_steps(network, arrays, protocol, start, seen) for start in starts]
-    errors = torch.stack([100 * models.errors_m(given, truth) for given, truth in found], dim=1)
-    return {"error_cm": errors.double().numpy().round(4).tolist()}
+    if protocol == "window":
+        errors = models.window_errors_m(network, arrays)
+    else:
+        errors = models.errors_m(*models.predict_steps(network, arrays, protocol))[:, None]
+    return {"error_cm": (100 * errors).double().numpy().round(4).tolist()}
 
 
 def _error_table(results: list[Result]) -> pd.DataFrame:
@@ -155,8 +150,7 @@ def error_rows(results: list[Result]) -> Rows:
 def paired_rows(results: list[Result]) -> Rows:
     """Return paired differences to the recurrent network, with bootstrap 95 % intervals.
 
-    They are those of the paper's network, tuned, and of ours, trained for all protocols or for one
-    at a time. Pairs are test objects, with errors averaged over windows.
+    Pairs are test objects, with errors averaged over windows.
     """
     rows: Rows = []
     errors = {
