@@ -33,7 +33,7 @@ from affordlib.models.training import train_model
 from affordlib.primitives import Grasp
 from experiments import reported, runner, studies
 from experiments.baselines import BASELINES, about_objects, baseline_predictions, network_record
-from experiments.lever_training import Symmetry, augment_by_symmetry
+from experiments.lever_up import Symmetry, augment_by_symmetry
 from experiments.published import PUBLISHED
 from experiments.runner import FOLDER, Job, Result, Rows, frame, open_once, read, shares
 from experiments.shipped import CHECKPOINT_SPECS, GRASP_SYMMETRIES, HALF_TURNS

@@ -8,7 +8,6 @@ python -m experiments.shipped goals
 
 import argparse
 import json
-import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -36,14 +35,11 @@ from affordlib.models import CNPConfig, FiLMConfig, NetworkConfig
 from affordlib.models.checkpoint import SUFFIX, save_checkpoint
 from affordlib.models.lever_up import lever_up_tensors
 from affordlib.models.training import Sampler, TrainingConfig, about_training, train_model
-from affordlib.planning import MODES
 from affordlib.planning.skills import REACHABILITY, Reachability, reach_features
-from affordlib.primitives import move_for
 from affordlib.results import repo_root, write_atomically
-from affordlib.types import Goal
 from affordlib.world import ROLLABLE, STANDING, Tabletop, WorldConfig
 from experiments.commands import command, worker_type
-from experiments.lever_training import (
+from experiments.lever_up import (
     LEVER_CHECKPOINTS,
     LEVER_MODELS,
     Symmetry,
@@ -52,16 +48,7 @@ from experiments.lever_training import (
 )
 from experiments.lstm import LSTMConfig
 from experiments.published import PUBLISHED, ConstantRate, one_at_a_time
-from experiments.tasks import (
-    FROZEN,
-    MIN_DISTANCE_M,
-    REACH_M,
-    PlanningTask,
-    constructed_tasks,
-    drawn_object,
-    off_grid,
-    sealed,
-)
+from experiments.tasks import FROZEN, PlanningTask, constructed_tasks, sealed, uniform_tasks
 
 _TEN_TIMES = {
     f"{name}_x10": replace(recipe, n_interactions=10 * recipe.n_interactions, seed=recipe.seed + 10)
@@ -86,10 +73,7 @@ def sample_forward(
 
 @dataclass(frozen=True)
 class CheckpointSpec:
-    """The definition of a shipped checkpoint: its data set, network and training.
-
-    symmetries: see `augment_by_symmetry`; sampler: see `train`.
-    """
+    """The data set, network and training of a checkpoint; symmetries: of `augment_by_symmetry`."""
 
     data: str
     network: NetworkConfig
@@ -199,9 +183,10 @@ def train_checkpoint(name: str) -> None:
     path = repo_root() / "data" / "checkpoints" / f"{name}{SUFFIX}"
     seen = np.concatenate([split.train, split.validation])
     save_checkpoint(model, path, about_training(data, seen, spec.training) | more)
-    error = 1000 * min(record.validation_error for record in history)
-    steps, seconds = history[-1].step, history[-1].seconds
-    print(f"{path.name}: {steps} steps in {seconds:.0f} s, validation {error:.2f} mm or mrad")
+    error, last = 1000 * min(record.validation_error for record in history), history[-1]
+    print(
+        f"{path.name}: {last.step} steps in {last.seconds:.0f} s, validation {error:.2f} mm or mrad"
+    )
 
 
 def train_checkpoints(options: argparse.Namespace) -> bool:
@@ -212,19 +197,18 @@ def train_checkpoints(options: argparse.Namespace) -> bool:
         data = data_of(name)
         if (repo_root() / "data" / f"{data}{DATA_SUFFIX}").is_file():
             train_checkpoint(name)
-            continue
-        complete = False
-        print(
-            f"{name}: unchanged, because its data set {data} is neither shipped nor here. "
-            f"Collect it: .venv/bin/python -m experiments.shipped data --only {data} --to data"
-        )
+        else:
+            complete = False
+            print(
+                f"{name}: unchanged, because its data set {data} is neither shipped nor here. "
+                f"Collect it: .venv/bin/python -m experiments.shipped data --only {data} --to data"
+            )
     return complete
 
 
 def learn_reachability(data: xr.Dataset, seed: int = 0) -> Reachability:
-    """Train reachability on interactions with objects all over the table (seconds on one core).
-
-    The arm's base is on the table's x axis, so mirror images of all interactions are added.
+    """Train reachability on interactions with objects all over the table, and their mirror images,
+    as the arm's base is on the table's x axis (seconds on one core).
     """
     number = data["primitive"].values
     xy_m = data["estimated_xy"].values
@@ -253,21 +237,6 @@ def train_reachability(_: argparse.Namespace) -> None:
     """Train the shipped reachability on the shipped set `reach`."""
     learn_reachability(open_interactions("reach")).save(repo_root() / REACHABILITY)
     print(REACHABILITY)
-
-
-def uniform_tasks(
-    mode: str, n: int, seed: int = 0, classes: Sequence[str] = STANDING
-) -> list[PlanningTask]:
-    """Sample tasks with goals uniform on the ring between 2 cm and the mode's reach."""
-    tasks = []
-    for index in range(n):
-        obj, yaw, rng = drawn_object(mode, "uniform", seed, index, classes)
-        reach = MODES[mode].max_steps * REACH_M[move_for(obj.rollable)]
-        r = math.sqrt(rng.uniform(MIN_DISTANCE_M**2, reach**2))
-        angle = off_grid(rng, 0.0, math.pi)
-        goal = Goal((r * math.cos(angle), r * math.sin(angle)))
-        tasks.append(PlanningTask(obj, yaw, goal, mode, "uniform"))
-    return tasks
 
 
 VARIATIONS = {
