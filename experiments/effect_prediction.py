@@ -52,9 +52,8 @@ LARGE = "_x10"  # suffix of the names of sets of ten times the size, which are n
 class Task:
     """Channels of action and effect with which models of a primitive are compared.
 
-    all_effects: effect channels of all models except the paper's network.
-    symmetries: (quarter turns, mirrored) under which the primitive is invariant; None for those
-    with a direction, whose training augments the data itself. test_set: a second test set.
+    all_effects: of all models except the paper's network. symmetries: of the primitive; None with a
+    direction, whose training augments the data itself. test_set: a second test set.
     """
 
     action_channels: tuple[str, ...]
@@ -92,8 +91,7 @@ def task_of(data: str) -> Task:
 def network_and_training(model: str, data: str, n: int | str = "all") -> tuple[Any, ...]:
     """Return the configurations of a network and its training, those of a shipped checkpoint.
 
-    FiLM uses the checkpoint trained on the same set, if there is one; the sets of 100 grasps and
-    100 rotations use fewer steps.
+    That of FiLM is trained on the same set, if there is one; sets of 100 use fewer steps.
     """
     task, (config, checkpoint, frame) = task_of(data), NETWORKS[model]
     training = CHECKPOINT_SPECS[checkpoint].training
@@ -230,9 +228,8 @@ def error_rows(table: pd.DataFrame, primitive: str) -> Rows:
     for about, group in by_model(table):
         for category, some in [("all", group), *group.groupby("category")]:
             row = about | {"object_class": category, "n": some["interaction"].nunique()}
-            mean, sem = mean_sem(some, "final_error")
-            median, p95 = some["final_error"].quantile([0.5, 0.95])
-            for what, value in (("mean", mean), ("sem", sem), ("median", median), ("p95", p95)):
+            found = *mean_sem(some, "final_error"), *some["final_error"].quantile([0.5, 0.95])
+            for what, value in zip(("mean", "sem", "median", "p95"), found, strict=True):
                 row[f"{name}_{what}_{unit}"] = float(value)
             row[f"trajectory_error_mean_{unit}"] = mean_sem(some, "trajectory_error")[0]
             rows.append(row)

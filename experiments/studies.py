@@ -48,7 +48,8 @@ def random_contexts(
     return replace(batch, observations=replace(seen, **masks))
 
 
-def _plain_start(model: FiLMNetwork) -> None:  # PyTorch's initialisation of the image encoder
+def _plain_start(model: FiLMNetwork) -> None:
+    """Initialise the image encoder with PyTorch's default instead of He initialisation."""
     for module in model.image_encoder:
         if isinstance(module, torch.nn.Linear):
             module.reset_parameters()
@@ -150,13 +151,13 @@ def partial_execution() -> Rows:
         predicted = model.predict(features, condition_on_primitives(model, actions), at)
         columns = [model.effect_channels.index(c) for c in "xy"]
         mean = predicted.effect_mean[:, 0, columns].numpy()
-        errors = [np.hypot(*(mean - truth[mine, :2]).T) for truth in (whole, rest)]
         for low, high in pairwise(PHASES):
             of = (phase[mine] > low) & (phase[mine] <= high)
             row = {"model": name, "from_phase": low, "to_phase": high, "n": int(of.sum())}
-            for what, error in zip(("whole", "rest"), errors, strict=True):
-                row[f"{what}_mean_m"] = float(error[of].mean())
-                row[f"{what}_median_m"] = float(np.median(error[of]))
+            for what, truth in (("whole", whole), ("rest", rest)):
+                error = np.hypot(*(mean - truth[mine, :2])[of].T)
+                row[f"{what}_mean_m"] = float(error.mean())
+                row[f"{what}_median_m"] = float(np.median(error))
             rows.append(row | {"slid_mean_m": float(slid[mine][of].mean())})
     return rows
 
