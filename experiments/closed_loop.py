@@ -16,7 +16,6 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache, partial
 from itertools import islice, product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -311,7 +310,7 @@ def job(table: str, index: int, seed: int, world: str = "clean") -> Job:
     return Job(run_trial, arguments, reach, (), files, VERSION)
 
 
-def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
+def tables(folder: str = FOLDER) -> dict[str, Rows]:
     """Return the tables of the trials in a folder; trials with seeds other than 0 are ignored."""
     read = runner.read("closed_loop", job, folder)
     found = [{"world": "clean"} | about | record for about, record in read]

@@ -15,7 +15,6 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -361,7 +360,7 @@ TASKS = [(family, k) for family, n in FAMILIES.items() for k in range(n)]
 JOBS = [job(row, *task) for row in ROWS for task in TASKS]
 
 
-def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
+def tables(folder: str = FOLDER) -> dict[str, Rows]:
     """Return the tables of all stored results."""
     known = (*ROWS, "search")
     records = judged([a | r for a, r in runner.read(NAME, job, folder) if a["row"] in known])

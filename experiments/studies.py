@@ -9,7 +9,6 @@ computes missing or stale results in `data/results/raw/studies.jsonl.gz`. The ta
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -185,7 +184,7 @@ def make_rows(study: str) -> Rows:
     return BY_NAME[study]()
 
 
-def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
+def tables(folder: str = FOLDER) -> dict[str, Rows]:
     """Return the rows of all finished studies; raises ValueError for stale ones."""
     made = {arguments["study"]: rows for arguments, rows in read(NAME, job, folder)}
     return {name: made[name] for name in BY_NAME if name in made}
