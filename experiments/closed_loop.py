@@ -16,7 +16,6 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache, partial
 from itertools import islice, product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -43,23 +42,17 @@ VERSION = 5
 """Version of the jobs; raise it when a change of code changes the tables' numbers."""
 
 POSE_PRIMITIVES = {"height": "grasp", "orientation": "rotate", "orientation_unseen": "rotate"}
-TURN_SHOWS, TURN_IS_HIDDEN = ("cuboid", "lying_cylinder", "prism"), ("upright_cylinder", "sphere")
-CATEGORIES = {"orientation": TURN_SHOWS, "orientation_unseen": TURN_IS_HIDDEN}
-"""Object categories of a table; the other tables use the four below."""
-FOUR_CATEGORIES = ("cuboid", "upright_cylinder", "lying_cylinder", "sphere")
+CATEGORIES = {"orientation": ("cuboid", "lying_cylinder", "prism")}
+CATEGORIES["orientation_unseen"] = ("upright_cylinder", "sphere")
+FOUR_CATEGORIES = ("cuboid", "upright_cylinder", "lying_cylinder", "sphere")  # of other tables
 
-WORLDS = {"clean": 1, "perturbed": 8}
+OPEN_LOOP, WORLDS = "open_loop", {"clean": 1, "perturbed": 8}
 """Worlds, and the number of images over which an observation averages in each."""
-OPEN_LOOP = "open_loop"
 PUSHES = dict.fromkeys(("clean", OPEN_LOOP), CHECKPOINTS["push"])
 PUSHES["perturbed"] = "film_5000_perturbed"  # checkpoint of pushes in each world
 
 AT_REST_S = 3.0  # time [s] in which an object of the perturbed world settles before a trial starts
-
-SMALLEST_M2 = 0.001
-"""Prisms with a smaller footprint [m²] are sampled again, because models reject objects that are
-much smaller than those they were trained on."""
-
+SMALLEST_M2 = 0.001  # models reject objects much smaller than those they were trained on
 TOLERANCE_M = dict.fromkeys(POSE_PRIMITIVES, 0.004)
 """Position tolerance [m] if not 2 mm; it is larger here because gripping shifts objects."""
 
@@ -249,8 +242,7 @@ def _groups(table: pd.DataFrame, *by: str) -> Iterator[tuple[dict[str, Any], pd.
 def pose_rows(records: Rows, column: str, within: float, unit: str) -> Rows:
     """Return the rows of `height` or `orientation`: success rates and errors at feasible goals.
 
-    A success is within 5 mm of the position and within `within` of the height [m] or rotation
-    [rad]; errors are over trials with the status "reached".
+    within: of the height [m] or rotation [rad] in a success. Errors are of "reached" trials.
     """
     rows = []
     for row, some in _groups(pd.DataFrame(records), "object_class"):
@@ -318,7 +310,7 @@ def job(table: str, index: int, seed: int, world: str = "clean") -> Job:
     return Job(run_trial, arguments, reach, (), files, VERSION)
 
 
-def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
+def tables(folder: str = FOLDER) -> dict[str, Rows]:
     """Return the tables of the trials in a folder; trials with seeds other than 0 are ignored."""
     read = runner.read("closed_loop", job, folder)
     found = [{"world": "clean"} | about | record for about, record in read]

@@ -16,6 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from affordlib import checked
+from affordlib.interactions import Batch, InteractionTensors, condition_on_recorded_action
 from affordlib.models.base import masked_mean, network, with_time
 from affordlib.models.film import HarmonicsConfig, HarmonicsNetwork, dense, waves
 from affordlib.types import Observations
@@ -31,6 +32,16 @@ class LSTMConfig(HarmonicsConfig):
 
     steps: int = 25  # into which it divides the phase
     width: int = 192
+
+
+def sample_forward(
+    tensors: InteractionTensors, n_targets: int, obs_max: int, generator: torch.Generator
+) -> Batch:
+    """Sample targets for a context of only the action at t = 0 and 1; obs_max is not used."""
+    last = len(tensors.phase) - 1
+    target_at = torch.randint(0, last + 1, (len(tensors), n_targets), generator=generator)
+    target_at[:, 0] = last
+    return Batch.of(tensors, condition_on_recorded_action(tensors), target_at)
 
 
 Known = tuple[Tensor, Tensor, Tensor]

@@ -11,7 +11,7 @@ import hashlib
 import math
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numpy as np
 import pybullet
@@ -130,29 +130,25 @@ class Stranger(TabletopObject):
 NOVELTY_GAIN = 0.0167  # c of `NoveltyAware`, chosen by `novelty_gain`
 
 
-def spectrum(harmonics: CircularHarmonics, image: Tensor) -> Tensor:
-    """Return norms (n, f) of the harmonics' pairs of cosine and sine, invariant to rotation."""
-    return harmonics(image).reshape(-1, *harmonics.layout).norm(dim=2).flatten(1)
-
-
 class Novelty:
     """Distance (N,) of images to their nearest training image, in units of `limit`.
 
-    references: (n, f) spectra of the circular harmonics of training images, which are invariant to
-    rotation. limit: 99 % of the references are closer than this to their nearest other reference.
+    references: spectra (n, f) of the first 500 training images. limit: 99 % of them are closer than
+    this to their nearest other reference.
     """
 
-    def __init__(self, references: Tensor) -> None:
-        self.references, self.harmonics = references, CircularHarmonics()
+    def __init__(self, images: Tensor) -> None:
+        self.harmonics = CircularHarmonics()
+        self.references = references = self.spectra(images[:500])
         spread = references.std(dim=0).reshape(2, -1)
         # A spread below 1 % of the largest spread of its image channel is pixel noise.
         self.spread = spread.maximum(0.01 * spread.amax(dim=1, keepdim=True)).flatten()
         self.limit = self.distances(references, 2)[:, 1].quantile(0.99)
 
-    @classmethod
-    def fit(cls, image: Tensor) -> Self:
-        """Create it from at most the first 500 training images."""
-        return cls(spectrum(CircularHarmonics(), image[:500]))
+    def spectra(self, images: Tensor) -> Tensor:
+        """Norms (n, f) of the harmonics' pairs of cosine and sine, invariant to rotation."""
+        pairs = self.harmonics(images).reshape(-1, *self.harmonics.layout)
+        return pairs.norm(dim=2).flatten(1)
 
     def distances(self, spectra: Tensor, n: int = 1) -> Tensor:
         """Distances (N, n) to the nearest n references."""
@@ -162,7 +158,7 @@ class Novelty:
 
     @torch.no_grad()
     def __call__(self, image: Tensor) -> Tensor:
-        return self.distances(spectrum(self.harmonics, image))[:, 0] / self.limit
+        return self.distances(self.spectra(image))[:, 0] / self.limit
 
 
 class NoveltyAware:
@@ -194,7 +190,7 @@ def novelty_of(name: str) -> Novelty:
     """Return the novelty for a shipped checkpoint, from the images that it was trained on."""
     data = open_interactions(data_of(name))
     split = split_interactions(data.sizes["interaction"])
-    return Novelty.fit(InteractionTensors.from_dataset(data, split.train).image)
+    return Novelty(InteractionTensors.from_dataset(data, split.train).image)
 
 
 MODELS = ("film_500", "film_5000", "cnp_500", "lstm_500")

@@ -12,7 +12,6 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from itertools import product
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -69,10 +68,8 @@ def plan_gradient_full(problem: PlanningProblem, **arguments: Any) -> Plan:
 
 
 def plan_astar_recorded(problem: PlanningProblem) -> Plan:
-    """A* with the segments 20, 40, … 100 % of what the paper records.
-
-    It records "the parts of the interaction where the object is potentially going to be displaced".
-    Our phase begins with the approach, in which the first segments would end.
+    """A* with segments of the object's way, which the paper records, instead of the phase, which
+    begins with the approach here.
     """
     return plan_astar(problem, stop_phases=phases_of_way(problem.effects, STOP_PHASES))
 
@@ -342,13 +339,9 @@ def attempt(
 ) -> Outcome:
     """Plan and execute one task; plan_for: makes the plan of (image, start_xy_m, goal, mode).
 
-    corrections: largest number of single actions that correct the final position.
-    n_averaged_images: number of images of which a position is the mean. by_plan: each action is
-    relative to the object's predicted position instead of the observed one. ticks, if given, gets
-    an element for each step of the simulation.
-
-    The distance is the world's ground truth. If the arm cannot follow a plan, the distance after
-    its last executed action counts.
+    corrections: see `corrected`; n_averaged_images: of which a position is the mean; by_plan: place
+    each action at the predicted position instead of the observed one; ticks: gets an element for
+    each step of the simulation. The distance is the ground truth, after the last executed action.
     """
     world.place(task.obj, (0.0, 0.0), task.yaw_rad, config=task.config)
     world.on_step = ticks.append if ticks is not None else None
@@ -379,10 +372,8 @@ def attempt(
 
 
 def outcome_record(task: PlanningTask, outcome: Outcome) -> dict[str, Any]:
-    """Return the columns of the tables for one outcome.
-
-    predicted_m: the predicted final distance from the goal; prediction_error_m: the distance
-    between the object's predicted and actual final positions.
+    """Return the columns of the tables for one outcome; prediction_error_m: the distance between
+    the predicted and the actual final position.
     """
     plan = outcome.plan
     error = np.hypot(*np.subtract(plan.predicted_end_xy_m, outcome.end_pose[:2]))
@@ -429,10 +420,9 @@ def job(config: str) -> Job:
 
 
 def distances(records: dict[str, Rows]) -> pd.DataFrame:
-    """Return statistics of the final distance and its parts.
+    """Return statistics of the final distance and its parts by planner, objects, goals and mode.
 
-    They are by planner, group of objects, source of goals and mode. search: predicted distance from
-    the goal; model: distance between predicted and actual positions.
+    search: predicted distance from the goal; model: between predicted and actual positions.
     """
     table = pd.concat([pd.DataFrame(rows).assign(planner=name) for name, rows in records.items()])
     group = {category: name for name, classes in GROUPS.items() for category in classes}
@@ -479,19 +469,13 @@ VARIANTS = {
     for change in ("_full", "_by_plan", "_corrected")
     for name in CONFIGS
     if name.removesuffix(change) in {*CONFIGS} - {name}
-} | {
-    "cem": "continuous",
-    "continuous_cnp_500": "continuous_film_500",
-    "continuous_film_500": "continuous",
-}
+} | {"cem": "continuous"}
 """Planners with one change, each with the planner without it, for paired comparisons."""
 
 
 def variant_rows(records: dict[str, Rows]) -> Rows:
-    """Return paired differences of final distance for `VARIANTS`: mean [m] and interval.
-
-    They are on stable objects. difference_actions: that of the number of actions;
-    difference_motion_s: that of the time that the robot moves, where it was measured.
+    """Return paired differences for `VARIANTS` on stable objects, with intervals: of the distance
+    [m], the number of actions, and the time that the robot moves, where it was measured.
     """
     rows: Rows = []
     for name, than in VARIANTS.items():
@@ -516,10 +500,9 @@ def variant_rows(records: dict[str, Rows]) -> Rows:
 
 
 def sigma_rows(records: dict[str, Rows]) -> Rows:
-    """Return prediction error and σ of executed plans, by the number of their actions.
+    """Return root mean squares [m] of error and σ of plans of stable objects, by number of actions.
 
-    Both are root mean squares [m], on all goals and stable objects. beyond_2_sigma_percent: 2 for
-    a calibrated, round Gaussian.
+    beyond_2_sigma_percent: 2 for a calibrated, round Gaussian.
     """
     rows: Rows = []
     ours = "continuous", "continuous_film_500"
@@ -529,16 +512,14 @@ def sigma_rows(records: dict[str, Rows]) -> Rows:
         for steps, some in plans.groupby("steps"):
             error, sigma = some.prediction_error_m, some.std_m
             row = {"planner": name, "model": CONFIGS[name].model, "actions": steps, "n": len(some)}
-            row |= {
-                f"{k}_m": math.sqrt((v**2).mean()) for k, v in (("error", error), ("sigma", sigma))
-            }
+            row["error_m"], row["sigma_m"] = (math.sqrt((v**2).mean()) for v in (error, sigma))
             rows.append(row | {"beyond_2_sigma_percent": 100 * (error > 2 * sigma).mean()})
     return plain(rows)
 
 
 def training_rows(records: dict[str, Rows]) -> Rows:
-    """Return Table 3 of the paper's planners on all objects, by reading: the mean, least and
-    largest of the mean distances with three trainings of its network, and the mean of the medians.
+    """Return Table 3 of the paper's planners on all objects: mean, least and largest of the mean
+    distances with three trainings of its network, and the mean of the medians.
     """
     rows: Rows = []
     for model, planner in product(("cnp_500", "cnp_mixed"), (*RETRAINED, "astar_paper")):
@@ -558,7 +539,7 @@ def training_rows(records: dict[str, Rows]) -> Rows:
     return plain(rows)
 
 
-def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
+def tables(folder: str = FOLDER) -> dict[str, Rows]:
     """Return all tables of the evaluated planners."""
     found = {about["config"]: result for about, result in runner.read("planning", job, folder)}
     records = {name: found[name] for name in CONFIGS if name in found}

@@ -25,7 +25,7 @@ import sys
 import time
 import zlib
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -188,12 +188,9 @@ def run_again(jobs: Sequence[Job], table: str, options: argparse.Namespace) -> i
     known = [job for job in jobs if _key(job.arguments) in stored]
     known = random.Random(0).sample(known, min(options.again, len(known)))
     with TemporaryDirectory() as folder:
-        tasks = {}
-        for k, job in enumerate(known):
-            same = replace(job, function=_importable(job.function))
-            tasks[_key(job.arguments)] = same, Path(folder) / f"{k}.pt"
-        made = spread(_record, tasks, options.workers)
-        off = [key for key, new in made if not _alike(stored[key]["result"], new["result"])]
+        new = run(known, table, folder, options.workers)
+    both = zip([_key(job.arguments) for job in known], new, strict=True)
+    off = [key for key, result in both if not _alike(stored[key]["result"], result)]
     print("\n".join([*off, f"{table}: {len(off)} of {len(known)} differ"]))
     return bool(off)
 
@@ -310,10 +307,9 @@ def hash_of(name: str, kind: str) -> str | None:
         return weights_sha256(read_weights(repo_root() / REACHABILITY, "learn it again")[0], "")
     if kind == "checkpoint":
         return checkpoint_sha256(name)
-    try:
+    with suppress(FileNotFoundError):
         return stored_sha256(name)
-    except FileNotFoundError:
-        return None
+    return None
 
 
 def checkpoint_sha256(name_or_path: str | Path) -> str:

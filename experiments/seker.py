@@ -24,8 +24,7 @@ from affordlib.models.lever_up import LEVER_ACTION_CHANNELS, POSE_CHANNELS, wind
 from affordlib.results import write_results
 from affordlib.types import IMAGE_PIXELS, check_array, check_count
 from experiments.commands import command
-from experiments.lever_training import LEVER_MODELS, fit_lever_model
-from experiments.lever_up import N_FOLDS
+from experiments.lever_up import LEVER_MODELS, N_FOLDS, fit_lever_model
 
 MODELS = ("cnp_tuned", "cnp_last_pose", "lstm_tuned")
 N_STEPS = 26

@@ -8,7 +8,6 @@ python -m experiments.shipped goals
 
 import argparse
 import json
-import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,15 +18,7 @@ import torch
 import xarray as xr
 from torch import nn
 
-from affordlib.interactions import (
-    Batch,
-    InteractionTensors,
-    condition_on_recorded_action,
-    open_interactions,
-    recipes,
-    sample_mixed,
-    split_interactions,
-)
+from affordlib.interactions import open_interactions, recipes, sample_mixed, split_interactions
 from affordlib.interactions.collect import collect
 from affordlib.interactions.recipes import Variation
 from affordlib.interactions.store import SUFFIX as DATA_SUFFIX
@@ -36,60 +27,30 @@ from affordlib.models import CNPConfig, FiLMConfig, NetworkConfig
 from affordlib.models.checkpoint import SUFFIX, save_checkpoint
 from affordlib.models.lever_up import lever_up_tensors
 from affordlib.models.training import Sampler, TrainingConfig, about_training, train_model
-from affordlib.planning import MODES
 from affordlib.planning.skills import REACHABILITY, Reachability, reach_features
-from affordlib.primitives import move_for
 from affordlib.results import repo_root, write_atomically
-from affordlib.types import Goal
 from affordlib.world import ROLLABLE, STANDING, Tabletop, WorldConfig
+from experiments import lever_up
 from experiments.commands import command, worker_type
-from experiments.lever_training import (
-    LEVER_CHECKPOINTS,
-    LEVER_MODELS,
-    Symmetry,
-    augment_by_symmetry,
-    fit_lever_model,
-)
-from experiments.lstm import LSTMConfig
+from experiments.lever_up import Symmetry, augment_by_symmetry
+from experiments.lstm import LSTMConfig, sample_forward
 from experiments.published import PUBLISHED, ConstantRate, one_at_a_time
-from experiments.tasks import (
-    FROZEN,
-    MIN_DISTANCE_M,
-    REACH_M,
-    PlanningTask,
-    constructed_tasks,
-    drawn_object,
-    off_grid,
-    sealed,
-)
+from experiments.tasks import FROZEN, PlanningTask, constructed_tasks, sealed, uniform_tasks
 
 _TEN_TIMES = {
     f"{name}_x10": replace(recipe, n_interactions=10 * recipe.n_interactions, seed=recipe.seed + 10)
     for name, recipe in recipes.RECIPES.items()
     if name not in ("push_test", "partial", "reach")
 }
-_FIRM = replace(_TEN_TIMES["grasp_x10"], seed=18, world=WorldConfig())
-RECIPES = recipes.RECIPES | _TEN_TIMES | {"grasp_firm_x10": _FIRM}
+RECIPES = recipes.RECIPES | _TEN_TIMES
+RECIPES["grasp_firm_x10"] = replace(RECIPES["grasp_x10"], seed=18, world=WorldConfig())
 """The shipped sets, sets of ten times the size, and grasps with the friction of the pushes, with
 which objects slip less."""
 
 
-def sample_forward(
-    tensors: InteractionTensors, n_targets: int, obs_max: int, generator: torch.Generator
-) -> Batch:
-    """Sample targets for a context of only the action at t = 0 and 1; obs_max is not used."""
-    last = len(tensors.phase) - 1
-    target_at = torch.randint(0, last + 1, (len(tensors), n_targets), generator=generator)
-    target_at[:, 0] = last
-    return Batch.of(tensors, condition_on_recorded_action(tensors), target_at)
-
-
 @dataclass(frozen=True)
 class CheckpointSpec:
-    """The definition of a shipped checkpoint: its data set, network and training.
-
-    symmetries: see `augment_by_symmetry`; sampler: see `train`.
-    """
+    """The data set, network and training of a checkpoint; symmetries: of `augment_by_symmetry`."""
 
     data: str
     network: NetworkConfig
@@ -128,10 +89,7 @@ CHECKPOINT_SPECS: dict[str, CheckpointSpec] = {
 and for 5,000 pushes, one or two for others. Five use `_x10` sets, which are not shipped.
 `cnp_published`, by the paper's own recipe, takes hours: it is resumed, and made only if named."""
 
-N_GOALS = {"single_full": 50, "single_partial": 100, "multi_partial": 80}
-VALIDATION_GOALS = {"multi_partial": 40}
-"""Number of goals of each mode (N_GOALS: as in Table 3 of the paper)."""
-
+N_GOALS = {"single_full": 50, "single_partial": 100, "multi_partial": 80}  # as in Table 3
 REACH_STEPS, REACH_RATE = 1500, 1e-2
 
 TOLERANCE_M = 0.00005
@@ -184,11 +142,11 @@ def train_checkpoint(name: str) -> None:
     """Train a shipped model on fold 0 of its data set and write it to data/checkpoints."""
     data = open_interactions(data_of(name))
     split = split_interactions(data.sizes["interaction"])
-    if name in LEVER_CHECKPOINTS:
-        lever_name, trained_for = LEVER_CHECKPOINTS[name]
-        spec = LEVER_MODELS[lever_name]
+    if name in lever_up.LEVER_CHECKPOINTS:
+        lever_name, trained_for = lever_up.LEVER_CHECKPOINTS[name]
+        spec = lever_up.LEVER_MODELS[lever_name]
         parts = [lever_up_tensors(data, p, spec.view) for p in (split.train, split.validation)]
-        model, history = fit_lever_model(spec, *parts, trained_for)
+        model, history = lever_up.fit_lever_model(spec, *parts, trained_for)
         more = {"trained_for": trained_for, "view": spec.view}
     else:
         spec, more = CHECKPOINT_SPECS[name], {}
@@ -199,32 +157,31 @@ def train_checkpoint(name: str) -> None:
     path = repo_root() / "data" / "checkpoints" / f"{name}{SUFFIX}"
     seen = np.concatenate([split.train, split.validation])
     save_checkpoint(model, path, about_training(data, seen, spec.training) | more)
-    error = 1000 * min(record.validation_error for record in history)
-    steps, seconds = history[-1].step, history[-1].seconds
-    print(f"{path.name}: {steps} steps in {seconds:.0f} s, validation {error:.2f} mm or mrad")
+    error, last = 1000 * min(record.validation_error for record in history), history[-1]
+    took = f"{last.step} steps in {last.seconds:.0f} s"
+    print(f"{path.name}: {took}, validation {error:.2f} mm or mrad")
 
 
 def train_checkpoints(options: argparse.Namespace) -> bool:
     """Train the checkpoints whose data exist; return whether these are all."""
     complete = True
     usual = [name for name in CHECKPOINT_SPECS if name != "cnp_published"]
-    for name in options.only or [*usual, *LEVER_CHECKPOINTS]:
+    for name in options.only or [*usual, *lever_up.LEVER_CHECKPOINTS]:
         data = data_of(name)
         if (repo_root() / "data" / f"{data}{DATA_SUFFIX}").is_file():
             train_checkpoint(name)
-            continue
-        complete = False
-        print(
-            f"{name}: unchanged, because its data set {data} is neither shipped nor here. "
-            f"Collect it: .venv/bin/python -m experiments.shipped data --only {data} --to data"
-        )
+        else:
+            complete = False
+            print(
+                f"{name}: unchanged, because its data set {data} is neither shipped nor here. "
+                f"Collect it: .venv/bin/python -m experiments.shipped data --only {data} --to data"
+            )
     return complete
 
 
 def learn_reachability(data: xr.Dataset, seed: int = 0) -> Reachability:
-    """Train reachability on interactions with objects all over the table (seconds on one core).
-
-    The arm's base is on the table's x axis, so mirror images of all interactions are added.
+    """Train reachability on interactions with objects all over the table, and their mirror images,
+    as the arm's base is on the table's x axis (seconds on one core).
     """
     number = data["primitive"].values
     xy_m = data["estimated_xy"].values
@@ -255,21 +212,6 @@ def train_reachability(_: argparse.Namespace) -> None:
     print(REACHABILITY)
 
 
-def uniform_tasks(
-    mode: str, n: int, seed: int = 0, classes: Sequence[str] = STANDING
-) -> list[PlanningTask]:
-    """Sample tasks with goals uniform on the ring between 2 cm and the mode's reach."""
-    tasks = []
-    for index in range(n):
-        obj, yaw, rng = drawn_object(mode, "uniform", seed, index, classes)
-        reach = MODES[mode].max_steps * REACH_M[move_for(obj.rollable)]
-        r = math.sqrt(rng.uniform(MIN_DISTANCE_M**2, reach**2))
-        angle = off_grid(rng, 0.0, math.pi)
-        goal = Goal((r * math.cos(angle), r * math.sin(angle)))
-        tasks.append(PlanningTask(obj, yaw, goal, mode, "uniform"))
-    return tasks
-
-
 VARIATIONS = {
     "perturbed": Variation(),
     "perturbed_rollable": Variation(),
@@ -287,7 +229,7 @@ def draw_goals(_: argparse.Namespace) -> None:
     for name in missing:
         tasks: list[PlanningTask] = []
         seed = {"validation": 1, "fresh": 2}.get(name, 0)
-        counts = VALIDATION_GOALS if name == "validation" else N_GOALS
+        counts = {"multi_partial": 40} if name == "validation" else N_GOALS
         classes = {"clean": STANDING + ROLLABLE, "perturbed_rollable": ROLLABLE}.get(name, STANDING)
         with Tabletop() as world:
             for mode, n in counts.items():
@@ -322,7 +264,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     data.add_argument("--to", default=str(repo_root() / "data"), help="output folder")
     cores = min(os.cpu_count() or 1, 256)
     data.add_argument("--workers", type=worker_type, default=cores, help="local processes")
-    names = sorted([*CHECKPOINT_SPECS, *LEVER_CHECKPOINTS])
+    names = sorted([*CHECKPOINT_SPECS, *lever_up.LEVER_CHECKPOINTS])
     checkpoints.add_argument("--only", nargs="+", choices=names, help="default: all")
     options = parser.parse_args(argv)
     return int(options.make(options) is False)

@@ -16,6 +16,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from affordlib.geometry import unit_vector
 from affordlib.interactions.recipes import Variation
 from affordlib.planning import MODES
 from affordlib.primitives import Drag, Push, move_for
@@ -123,6 +124,20 @@ def constructed_tasks(
 
     of_place = [map(drawn, count(index, 1000 * len(classes))) for index in range(n)]
     return [next(filter(None, candidates)) for candidates in of_place]
+
+
+def uniform_tasks(
+    mode: str, n: int, seed: int = 0, classes: Sequence[str] = STANDING
+) -> list[PlanningTask]:
+    """Draw tasks with goals uniform on the ring between 2 cm and the mode's reach."""
+    tasks = []
+    for index in range(n):
+        obj, yaw, rng = drawn_object(mode, "uniform", seed, index, classes)
+        reach = MODES[mode].max_steps * REACH_M[move_for(obj.rollable)]
+        r = math.sqrt(rng.uniform(MIN_DISTANCE_M**2, reach**2))
+        goal = Goal(tuple((r * unit_vector(off_grid(rng, 0.0, math.pi))).tolist()))
+        tasks.append(PlanningTask(obj, yaw, goal, mode, "uniform"))
+    return tasks
 
 
 def sealed(name: str, text: str) -> str:

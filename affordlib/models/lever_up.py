@@ -13,7 +13,7 @@ lifts along its arc); its other channels are constant.
 
 All models observe the image and the commanded action at t = 0 and t = 1. The first pose is always
 zero, so first_step contains no more information than image_only, and one trained network serves
-both; a recurrent one is trained for each protocol (`experiments/lever_training.py`).
+both; a recurrent one is trained for each protocol (`experiments/lever_up.py`).
 """
 
 from dataclasses import replace

@@ -13,10 +13,10 @@ from affordlib.interactions import InteractionTensors
 from affordlib.interactions.dataset import sample_mixed
 from affordlib.primitives import Push
 from affordlib.world import Prism
-from experiments import ablation, cross_validation, studies
 from experiments import effect_prediction as tables
+from experiments import studies
 from experiments.baselines import constant, gaussian_process, nearest, network_record
-from experiments.cross_validation import add_errors, job, network_and_training
+from experiments.effect_prediction import add_errors, job, network_and_training
 from experiments.novelty import NOVELTY_GAIN, NoveltyAware, novelty_of
 
 HOUSE = Prism(((-0.03, -0.03), (0.03, -0.03), (0.03, 0.01), (0.0, 0.04), (-0.03, 0.01)), 0.05)
@@ -27,16 +27,16 @@ def test_what_decides_a_training_decides_whether_its_result_is_stale(monkeypatch
     others = (replace(network, blocks=5), training), (network, replace(training, ema=0.5))
     made_of = [job("film", "push").made_of()]
     for now in (*others, (network, replace(training, device="cpu"))):
-        monkeypatch.setattr(cross_validation, "network_and_training", lambda *_, now=now: now)
+        monkeypatch.setattr(tables, "network_and_training", lambda *_, now=now: now)
         made_of.append(job("film", "push").made_of())
     assert [one == made_of[0] for one in made_of] == [True, False, False, True]
 
 
 def test_shipped_networks_are_those_of_the_tables():
     names = ("film_500", "film_5000", "drag_film_500", "grasp_film_1000", "rotate_film_1000")
-    for spec in map(cross_validation.CHECKPOINT_SPECS.get, names):
+    for spec in map(tables.CHECKPOINT_SPECS.get, names):
         assert network_and_training("film", spec.data) == (spec.network, spec.training)
-        assert (cross_validation.task_of(spec.data).symmetries or ()) == spec.symmetries
+        assert (tables.task_of(spec.data).symmetries or ()) == spec.symmetries
 
 
 def test_a_fold_may_lack_a_category():
@@ -133,7 +133,7 @@ def test_a_house_is_new_and_its_sigma_grows(film, held_out_pushes, pushes, world
 
 def test_random_contexts_are_of_any_phase(pushes):
     arrays, firsts = InteractionTensors.from_dataset(pushes, np.arange(80)), []
-    for draw in (sample_mixed, ablation.random_contexts):
+    for draw in (sample_mixed, studies.random_contexts):
         seen = draw(arrays, 4, 6, torch.Generator().manual_seed(0)).observations
         firsts.append((seen.action_t[:, 0] == 0).float().mean())
     assert firsts[0] > 0.3
@@ -148,15 +148,15 @@ def test_changes_of_an_ablation_add_up(monkeypatch):
     def remember(model, training, validation, config, sampler):
         made.append((model, config, sampler))
 
-    monkeypatch.setattr(ablation, "train", remember)
-    ablation.ablated(tuple(ablation.LADDER), 10)
-    ablation.ablated(("contexts at the ends",), 10)
+    monkeypatch.setattr(studies, "train", remember)
+    studies.error_m(tuple(studies.LADDER), 10)
+    studies.error_m(("contexts at the ends",), 10)
     (bare, config, draw), (ours, usual, loose) = made
-    assert draw is ablation.one_at_a_time  # which draws at random moments, too
+    assert draw is studies.one_at_a_time  # which draws at random moments, too
     assert (config.augment, config.beta, config.ema) == (False, 0.0, 0.0)
     assert (bare.config.frame, bare.scaler.action_scale) == ("table", (1.0, 1.0))
     assert not any(p.requires_grad for b in bare.blocks for p in b.modulation.parameters())
-    assert loose is ablation.random_contexts
+    assert loose is studies.random_contexts
     assert usual.augment
     assert (usual.beta, ours.config.frame) == (0.5, "push")
     assert ours.scaler.action_scale < (0.5, 0.5)

@@ -10,13 +10,12 @@ import torch
 from affordlib.interactions import Scaler, open_interactions
 from affordlib.interactions.dataset import condition_on_poses
 from affordlib.models import build, lever_up, load_checkpoint
-from experiments import lever_training
-from experiments.lever_up import lever_split
+from experiments import lever_up as experiment
 
 
 def made(name, levered):
     torch.manual_seed(0)
-    model = build(lever_training.LEVER_MODELS[name].network, Scaler.fit(levered)).eval()
+    model = build(experiment.LEVER_MODELS[name].network, Scaler.fit(levered)).eval()
     model.prepare(levered)
     return model
 
@@ -59,11 +58,11 @@ def test_a_rollout_does_not_depend_on_how_far_it_is_asked(levered):
 @pytest.mark.parametrize(("name", "kind"), [("cnp_last_pose", "all"), ("lstm_tuned", "first_step")])
 def test_training_learns(levered, name, kind):
     few = {"steps": 60, "batch_size": 16, "validate_every": 30, "ema": 0.0}
-    lever = lever_training.LEVER_MODELS[name]
+    lever = experiment.LEVER_MODELS[name]
     lever = replace(lever, training=replace(lever.training, **few))
-    model, history = lever_training.fit_lever_model(lever, levered, levered, kind)
+    model, history = experiment.fit_lever_model(lever, levered, levered, kind)
     moves = levered.effect[:, 1:, :3].norm(dim=-1).mean()
-    assert lever_training.from_start_errors_m(model, levered).mean() < moves / 3
+    assert experiment.from_start_errors_m(model, levered).mean() < moves / 3
     assert len(history) == 2
 
 
@@ -98,24 +97,24 @@ def test_windows_are_fifteen_steps_and_the_next_five(levered):
     generator = torch.Generator().manual_seed(0)
     assert lever_up.n_windows(levered) == 7
     lengths = lever_up.N_PREDICTED, lever_up.N_OBSERVED
-    batch = lever_training.sample_windows(levered, *lengths, generator)
+    batch = experiment.sample_windows(levered, *lengths, generator)
     seen = (batch.observations.effect_t * 25).round()
     assert (seen.diff(dim=1) == 1).all()
     assert {int(s) for s in seen[:, 0]} == set(range(7))
     torch.testing.assert_close((batch.t_target[:, 0] * 25).round(), seen[:, -1] + 1)
     assert batch.observations.effect_mask.all()
-    batches = [lever_training.sample_from_start(levered, 0, 0, generator) for _ in range(20)]
+    batches = [experiment.sample_from_start(levered, 0, 0, generator) for _ in range(20)]
     assert {bool(b.observations.effect_mask.any()) for b in batches} == {True, False}
 
 
-@pytest.mark.parametrize("name", lever_training.LEVER_CHECKPOINTS)
+@pytest.mark.parametrize("name", experiment.LEVER_CHECKPOINTS)
 def test_shipped_checkpoints_predict_what_they_have_not_seen(name):
     whole = open_interactions("lever_up")
     model, about = load_checkpoint(name)
-    split = lever_split(whole)
+    split = experiment.lever_split(whole)
     assert not set(about["seen_interactions"]) & set(split.test)
     few = lever_up.lever_up_tensors(whole, split.test[:60], about["view"])
     if about["trained_for"] != "first_step":
         assert 100 * lever_up.window_errors_m(model, few).mean() < 0.3
     if about["trained_for"] != "window":
-        assert 100 * lever_training.from_start_errors_m(model, few).mean() < 0.4
+        assert 100 * experiment.from_start_errors_m(model, few).mean() < 0.4

@@ -20,8 +20,7 @@ from affordlib.primitives import Drag, Push
 from affordlib.types import Goal, Prediction
 from affordlib.world import ROLLABLE, STANDING, Cuboid, UprightCylinder
 from experiments.planning import attempt, phases_of_way
-from experiments.shipped import uniform_tasks
-from experiments.tasks import constructed_tasks, frozen_tasks
+from experiments.tasks import constructed_tasks, frozen_tasks, uniform_tasks
 from tests.planning.point_robot import REACH_M, STARTS, KnownDynamics, moved_m, problem_of
 
 IMAGE = np.zeros((2, 48, 48), dtype=np.float32)
