@@ -19,10 +19,11 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import torch
 
 from affordlib.geometry import rotated_each
 from affordlib.interactions.recipes import Variation
-from affordlib.planning import PlanMode, PlanningProblem, Skills, execute_plan
+from affordlib.planning import PlanMode, PlanningProblem, Skills, execute_plan, free_space
 from affordlib.planning.astar import plan_astar
 from affordlib.planning.closed_loop import ClosedLoopConfig, run_closed_loop
 from affordlib.planning.continuous import plan_continuous
@@ -30,7 +31,7 @@ from affordlib.planning.effect_map import poses_along
 from affordlib.planning.free_space import N_POSES, FreeSpace, corners_of, gaps_m, placed, ring
 from affordlib.planning.gradient import plan_gradient
 from affordlib.planning.skills import CHECKPOINTS
-from affordlib.primitives import Move, Push
+from affordlib.primitives import Drag, Move, Push
 from affordlib.types import Goal, Obstacle, UnreachableError
 from affordlib.world import Cuboid, Tabletop, TabletopObject, WorldConfig, category_named
 from experiments import runner
@@ -228,7 +229,9 @@ actions more."""
 
 
 def run_task(row: str, family: str, index: int, seed: int) -> Any:
-    """Plan and execute a task; return what came of it. The row "search" plans nothing."""
+    """Plan and execute a task; return what came of it. Rows "margin" and "search" plan nothing."""
+    if row == "margin":
+        return calibrate(family, index)
     if row == "search":
         return search(family, index, seed)
     planner, settings = ROWS[row]
@@ -272,6 +275,52 @@ def _outcome(task: ObstacleTask, world: Tabletop, actions: int) -> dict[str, Any
     touched = {what for _, what in world.obstacles.touched}
     about = {f"{name}_touched": name in touched for name in ("object", "arm")}
     return {"distance_m": task.goal.distance_m((x, y)), "actions": actions} | about
+
+
+N_PUSHES, N_BESIDE, WITHIN_GAP_M = 20, 20, 0.02
+"""Actions of a calibration job, obstacles beside each, and the gaps [m] that are counted."""
+
+
+def calibrate(kind: str, index: int) -> list[dict[str, float]]:
+    """Execute actions, and return by how much each comes nearer to obstacles than predicted.
+
+    The obstacles lie beside the object's predicted way, just without contact, and are not felt:
+    the gap to the recorded way, negative where it would touch, is the error. travel_m: predicted
+    distance of the object from its start, where it comes nearest.
+    """
+    world, found = one_tabletop(), []
+    for k in range(N_PUSHES):
+        rng = np.random.default_rng([VALIDATION_SEED, index, k])
+        of_kind = (0, 1, 2) if kind == "push" else (3, 5)
+        number = int(rng.integers(1000)) * 6 + of_kind[k % len(of_kind)]
+        obj, yaw = drawn_object(number)
+        world.place(obj, (0.0, 0.0), yaw)
+        seen, angle = world.observe(), rng.uniform(-math.pi, math.pi)
+        effects = skills_with(CHECKPOINTS["push"]).effects(seen.image)
+        stop = rng.uniform(0.7, 1.0)
+        done = world.execute_primitive(effects.kind.towards(angle), stop, approach=True)
+        if done.fell or done.left_table or effects.kind is not (Push if kind == "push" else Drag):
+            continue
+        action = (torch.tensor([v], dtype=torch.float64) for v in (angle, stop))
+        poses = poses_along(effects, np.zeros((1, 3)), *action, N_POSES)
+        path = done.object_path[:, [0, 1, 3]][None]
+        for _ in range(N_BESIDE):
+            aim, away = poses[0, rng.integers(N_POSES), :2], rng.uniform(-math.pi, math.pi)
+            size = rng.uniform(0.02, 0.08, 2)
+            one = Obstacle.disc((0.0, 0.0), size[0] / 2)
+            if rng.random() < 0.5:
+                one = Obstacle.box((0.0, 0.0), tuple(size), rng.uniform(0, math.pi))
+            ahead = np.array([math.cos(away), math.sin(away)])
+            low, high = 0.0, 0.3
+            for _ in range(14):
+                middle = (low + high) / 2
+                polygon = corners_of(one) + aim + middle * ahead
+                gaps = gaps_m([polygon], placed(effects.outline_m, poses))[0]
+                low, high = (low, middle) if gaps.min() > 0 else (middle, high)
+            really = gaps_m([polygon], placed(obj.footprint_m, path)).min()
+            travel = float(np.hypot(*poses[0, gaps.argmin(), :2]))
+            found.append({"error_m": float(gaps.min() - really), "travel_m": travel})
+    return found
 
 
 N_DIRECTIONS, N_STOPS, BEAM, N_TRIES, CLEAR_M = 90, 16, 100, 24, 0.0005
@@ -357,15 +406,38 @@ def job(row: str, family: str = "", index: int = 0, seed: int = SEED) -> Job:
 
 
 TASKS = [(family, k) for family, n in FAMILIES.items() for k in range(n)]
-JOBS = [job(row, *task) for row in ROWS for task in TASKS]
+JOBS = [
+    *(job("margin", kind, k) for kind, n in (("push", 3), ("drag", 1)) for k in range(n)),
+    *(job(row, *task) for row in ROWS for task in TASKS),
+]
 
 
 def tables(folder: str = FOLDER) -> dict[str, Rows]:
     """Return the tables of all stored results."""
-    known = (*ROWS, "search")
-    records = judged([a | r for a, r in runner.read(NAME, job, folder) if a["row"] in known])
+    found = runner.read(NAME, job, folder)
+    errors = pd.DataFrame([a | e for a, r in found if a["row"] == "margin" for e in r])
+    records = judged([a | r for a, r in found if a["row"] != "margin"])
     records = records[records.row != "search"]
-    return {"rows": rows_of(records), "partial_and_full": paired_rows(records)}
+    both = {"rows": rows_of(records), "partial_and_full": paired_rows(records)}
+    return {"margin": margin_rows(errors)} | both
+
+
+def margin_rows(errors: pd.DataFrame) -> Rows:
+    """Return quantiles of the gap's error [m], and how many touch of what is predicted to pass.
+
+    at_margin_percent: of those that pass at the margin; within_percent: of those that pass by up to
+    `WITHIN_GAP_M` more, all gaps being equally frequent.
+    """
+    rows, start_m = [], free_space.START_M
+    for kind, some in errors.groupby("family", sort=False):
+        grown = np.minimum(some.travel_m / free_space.FULL_AT_M, 1)
+        over = some.error_m - start_m - (free_space.MARGIN_M - start_m) * grown
+        row = {"primitive": kind, "n": len(some)}
+        row |= {f"q{q}_m": float(some.error_m.quantile(q / 100)) for q in (50, 95, 99)}
+        row["at_margin_percent"] = 100 * float((over > 0).mean())
+        row["within_percent"] = 100 * float((over / WITHIN_GAP_M).clip(0, 1).mean())
+        rows.append(row)
+    return rows
 
 
 def judged(records: Rows) -> pd.DataFrame:

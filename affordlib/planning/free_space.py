@@ -27,7 +27,7 @@ from affordlib.types import Obstacle, Step, check_finite
 
 DISC_SIDES, N_POSES = 16, 7
 START_M, MARGIN_M, FULL_AT_M = 0.002, 0.004, 0.02
-"""Of what is predicted to pass by up to 2 cm more, 1 % may touch: 0.6 % of 1,200 gaps of pushes."""
+"""By `experiments.obstacles`: of what is predicted to pass by up to 2 cm more, 1 % may touch."""
 
 FINGER_M = (0.02, 0.012)
 """Length and width [m] of a finger, along the hand's yaw and across it."""

@@ -211,7 +211,7 @@ def test_an_obstacle_that_moves_makes_the_loop_plan_again():
 
 
 def test_of_what_is_predicted_to_pass_little_touches(world, skills):
-    """Executed pushes beside an obstacle at the margin."""
+    """Executed pushes beside an obstacle at the margin: a sample of `experiments.obstacles`."""
     rng, touched, n = np.random.default_rng(8), 0, 0
     for _ in range(12):
         obj = Cuboid.sample(rng)
