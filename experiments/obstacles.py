@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any
@@ -229,9 +229,12 @@ actions more."""
 
 
 def run_task(row: str, family: str, index: int, seed: int) -> Any:
-    """Plan and execute a task; return what came of it. Rows "margin" and "search" plan nothing."""
-    if row == "margin":
-        return calibrate(family, index)
+    """Plan and execute a task; return what came of it.
+
+    Rows "margin", "felt" and "search" plan nothing.
+    """
+    if row in ("margin", "felt"):
+        return (calibrate if row == "margin" else felt)(family, index)
     if row == "search":
         return search(family, index, seed)
     planner, settings = ROWS[row]
@@ -281,6 +284,54 @@ N_PUSHES, N_BESIDE, WITHIN_GAP_M = 20, 20, 0.02
 """Actions of a calibration job, obstacles beside each, and the gaps [m] that are counted."""
 
 
+def beside(rng: np.random.Generator, poses: np.ndarray) -> Callable[[float], Obstacle]:
+    """Draw an obstacle; return it as a function of its distance [m] from one of poses (n, 3)."""
+    aim, away = poses[rng.integers(N_POSES), :2], rng.uniform(-math.pi, math.pi)
+    size, ahead = rng.uniform(0.02, 0.08, 2), np.array([math.cos(away), math.sin(away)])
+    yaw = rng.uniform(0, math.pi) if rng.random() < 0.5 else None
+
+    def at(far_m: float) -> Obstacle:
+        x, y = (aim + far_m * ahead).tolist()
+        return (
+            Obstacle.disc((x, y), size[0] / 2) if yaw is None else Obstacle.box((x, y), size, yaw)
+        )
+
+    return at
+
+
+def nearest(at: Callable[[float], Obstacle], is_free: Callable[[Obstacle], bool]) -> Obstacle:
+    """Return the obstacle just so far away that it is free."""
+    low, high = 0.0, 0.3
+    for _ in range(14):
+        middle = (low + high) / 2
+        low, high = (low, middle) if is_free(at(middle)) else (middle, high)
+    return at(high)
+
+
+def felt(kind: str, index: int) -> list[dict[str, float]]:
+    """Execute pushes beside an obstacle at the margin, and return whether anything touched it."""
+    world, found = one_tabletop(), []
+    for k in range(N_PUSHES):
+        rng = np.random.default_rng([VALIDATION_SEED, 1000 + index, k])
+        obj, yaw = drawn_object(6 * int(rng.integers(1000)) + k % 3)
+        world.place(obj, (0.0, 0.0), yaw)
+        seen, angle, stop = world.observe(), rng.uniform(-math.pi, math.pi), rng.uniform(0.7, 1.0)
+        effects, action = skills_with(CHECKPOINTS["push"]).effects(seen.image), Push.towards(angle)
+        chain = torch.tensor([[angle], [stop]], dtype=torch.float64)
+        poses = poses_along(effects, np.zeros((1, 3)), *chain, N_POSES)
+
+        def is_free(one: Obstacle, seen=seen, action=action, chain=chain, poses=poses) -> bool:
+            space = FreeSpace([one], seen.image, (0.0, 0.0))
+            return space.spare_m(action, *chain.numpy(), poses)[0] >= 0
+
+        one = nearest(beside(rng, poses[0]), is_free)
+        world.place(obj, (0.0, 0.0), yaw, obstacles=[one])
+        world.execute_primitive(action, stop, approach=True)
+        touched = {what for _, what in world.obstacles.touched}
+        found.append({f"{what}_percent": 100.0 * (what in touched) for what in ("object", "arm")})
+    return found
+
+
 def calibrate(kind: str, index: int) -> list[dict[str, float]]:
     """Execute actions, and return by how much each comes nearer to obstacles than predicted.
 
@@ -305,21 +356,14 @@ def calibrate(kind: str, index: int) -> list[dict[str, float]]:
         poses = poses_along(effects, np.zeros((1, 3)), *action, N_POSES)
         path = done.object_path[:, [0, 1, 3]][None]
         for _ in range(N_BESIDE):
-            aim, away = poses[0, rng.integers(N_POSES), :2], rng.uniform(-math.pi, math.pi)
-            size = rng.uniform(0.02, 0.08, 2)
-            one = Obstacle.disc((0.0, 0.0), size[0] / 2)
-            if rng.random() < 0.5:
-                one = Obstacle.box((0.0, 0.0), tuple(size), rng.uniform(0, math.pi))
-            ahead = np.array([math.cos(away), math.sin(away)])
-            low, high = 0.0, 0.3
-            for _ in range(14):
-                middle = (low + high) / 2
-                polygon = corners_of(one) + aim + middle * ahead
-                gaps = gaps_m([polygon], placed(effects.outline_m, poses))[0]
-                low, high = (low, middle) if gaps.min() > 0 else (middle, high)
-            really = gaps_m([polygon], placed(obj.footprint_m, path)).min()
-            travel = float(np.hypot(*poses[0, gaps.argmin(), :2]))
-            found.append({"error_m": float(gaps.min() - really), "travel_m": travel})
+
+            def gaps(one: Obstacle, effects=effects, poses=poses) -> np.ndarray:
+                return gaps_m([corners_of(one)], placed(effects.outline_m, poses))[0]
+
+            one = nearest(beside(rng, poses[0]), lambda one, gaps=gaps: gaps(one).min() > 0)
+            really = gaps_m([corners_of(one)], placed(obj.footprint_m, path)).min()
+            travel = float(np.hypot(*poses[0, gaps(one).argmin(), :2]))
+            found.append({"error_m": float(gaps(one).min() - really), "travel_m": travel})
     return found
 
 
@@ -401,13 +445,19 @@ def job(row: str, family: str = "", index: int = 0, seed: int = SEED) -> Job:
     checkpoints = [*CHECKPOINTS.values(), PUSHES["perturbed"]]
     if row in ROWS and "push" in ROWS[row][1]:
         checkpoints.append(ROWS[row][1]["push"])
-    version = {"closed_loop_perturbed": 5, "closed_loop": 4, "closed_loop_full": 2}.get(row, 1)
+    version = {
+        "margin": 2,
+        "closed_loop_perturbed": 5,
+        "closed_loop": 4,
+        "closed_loop_full": 2,
+    }.get(row, 1)
     return Job(run_task, arguments, checkpoints=tuple(checkpoints), version=version)
 
 
 TASKS = [(family, k) for family, n in FAMILIES.items() for k in range(n)]
 JOBS = [
     *(job("margin", kind, k) for kind, n in (("push", 3), ("drag", 1)) for k in range(n)),
+    *(job("felt", "push", k) for k in range(25)),
     *(job(row, *task) for row in ROWS for task in TASKS),
 ]
 
@@ -416,10 +466,12 @@ def tables(folder: str = FOLDER) -> dict[str, Rows]:
     """Return the tables of all stored results."""
     found = runner.read(NAME, job, folder)
     errors = pd.DataFrame([a | e for a, r in found if a["row"] == "margin" for e in r])
-    records = judged([a | r for a, r in found if a["row"] != "margin"])
+    pushes = pd.DataFrame([e for a, r in found if a["row"] == "felt" for e in r])
+    records = judged([a | r for a, r in found if isinstance(r, dict)])
     records = records[records.row != "search"]
     both = {"rows": rows_of(records), "partial_and_full": paired_rows(records)}
-    return {"margin": margin_rows(errors)} | both
+    beside_them = [{"primitive": "push", "n": len(pushes)} | pushes.mean().to_dict()]
+    return {"margin": margin_rows(errors), "felt": beside_them} | both
 
 
 def margin_rows(errors: pd.DataFrame) -> Rows:
