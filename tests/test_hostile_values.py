@@ -65,15 +65,10 @@ TEXTS = {"short": f"{MARKUP}$\\frac$\x1b]0;mine\x07\u202egpj.exe\x00\n", "long":
 def hostile(rng):
     """Any value: one of those above, or random numbers or words."""
     real = lambda: struct.unpack("d", rng.randbytes(8))[0]  # noqa: E731
-    return rng.choice(
-        (
-            *(lambda: rng.choice(FIXED),) * 5,
-            real,
-            lambda: rng.choice((-1, 1)) * rng.getrandbits(rng.choice((2, 8, 80))),
-            lambda: "".join(chr(rng.randrange(0xD000)) for _ in range(rng.randrange(20))),
-            lambda: [real() for _ in range(rng.randrange(5))],
-        )
-    )()
+    whole = lambda: rng.choice((-1, 1)) * rng.getrandbits(rng.choice((2, 8, 80)))  # noqa: E731
+    text = lambda: "".join(chr(rng.randrange(0xD000)) for _ in range(rng.randrange(20)))  # noqa: E731
+    reals = lambda: [real() for _ in range(rng.randrange(5))]  # noqa: E731
+    return rng.choice((*(lambda: rng.choice(FIXED),) * 5, real, whole, text, reals))()
 
 
 AT, BOX = (0.0, 0.0), world.Cuboid(0.06, 0.05, 0.05)
@@ -115,10 +110,7 @@ def log_of_eight(**about):
 
 def fields_of(*made):
     """Arguments that give instances of dataclasses, by class."""
-    return {
-        type(one).__name__: {f.name: getattr(one, f.name) for f in dataclasses.fields(one)}
-        for one in made
-    }
+    return {type(one).__name__: dict(vars(one)) for one in made}
 
 
 @pytest.fixture(scope="module")
@@ -219,11 +211,8 @@ def shop(one_world, skills, pushes, levers, levered, tmp_path_factory):
         "lever_up_tensors": {"data": levers},
         "predict_steps": {"tensors": levered, "protocol": "image_only"}
         | {"model": models.load_checkpoint("lever_up_last_pose_1800")[0]},
-        "predict_trajectories": {
-            "model": skills.model(Grasp),
-            "primitive": Grasp(),
-            "channel": "z",
-        },
+        "predict_trajectories": {"model": skills.model(Grasp), "channel": "z"}
+        | {"primitive": Grasp()},
     }
     return {k: v for names, v in by_name.items() for k in names.split()}, by_callable
 
@@ -275,9 +264,7 @@ def test_a_hostile_value_is_refused_by_name_or_does_no_harm(shop, name, tmp_path
     writers = ("write_results", "collect", "save_checkpoint", "save_model")
     if name in writers or name.startswith("train"):  # a relative path starts in the checkout
         monkeypatch.setattr("affordlib.results.repo_root", lambda: tmp_path)
-    found = []
-
-    rng = random.Random(os.environ.get("HOSTILE_SEED", "0") + name)
+    found, rng = [], random.Random(os.environ.get("HOSTILE_SEED", "0") + name)
     for _ in range(N_VALUES):
         argument, value = rng.choice(sorted(valid)), hostile(rng)
         began, wrong = time.process_time(), ""

@@ -1,6 +1,5 @@
 """Results are read back unchanged, written completely or not at all; tables are made from them."""
 
-import errno
 import json
 import math
 import os
@@ -16,7 +15,7 @@ from affordlib import results
 from affordlib.results import read_results, write_results
 from experiments import tables
 from experiments.tables import fill_tables, markdown_table
-from tests.waiting import wait_until
+from tests.waiting import no_room, wait_until
 
 ROWS = [
     {"planner": "astar", "n": 30, "mean_m": 0.00441, "plan_ms_median": 12.345, "tp_percent": 80.0},
@@ -62,11 +61,7 @@ def test_bad_tables_are_refused_before_anything_is_written(tmp_path, table, name
 def test_a_full_disk_leaves_the_old_file(tmp_path, monkeypatch, step):
     path = write_results(tmp_path, "a", {}, {"t": [{"n": 1}]})
     before = path.read_bytes()
-
-    def fail(*_):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(os, step, fail)
+    monkeypatch.setattr(os, step, no_room)
     with pytest.raises(OSError, match=r"No space left.*a\.json") as failure:
         write_results(tmp_path, "a", {}, {"t": [{"n": 2}]})
     assert failure.value.filename == str(path)

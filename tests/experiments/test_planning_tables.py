@@ -10,7 +10,7 @@ import torch
 
 from affordlib import primitives
 from affordlib.interactions import open_interactions
-from affordlib.planning import MODES
+from affordlib.planning import MODES, Skills
 from affordlib.planning.skills import Reachability
 from affordlib.primitives import Drag, Grasp, Push, Rotate
 from affordlib.results import repo_root
@@ -241,7 +241,9 @@ def test_a_primitive_that_was_not_learned_is_left_to_the_kinematics(monkeypatch)
     assert (Reachability.load().probability("tap", np.zeros((2, 2))) == 1.0).all()
 
 
-def test_an_unknown_primitive_and_other_shapes_are_told(learned):
+def test_an_unknown_primitive_and_other_shapes_are_told(learned, film):
+    with pytest.raises(ValueError, match=r"one of .*'push'.* got 'pusch'"):
+        Skills({"pusch": film})
     with pytest.raises(ValueError, match=r"primitive must be one of .*, got 'kick'"):
         learned.probability("kick", np.zeros((1, 2)))
     with pytest.raises(ValueError, match=r"xy_m must be finite numbers of shape"):

@@ -22,7 +22,7 @@ from affordlib.weights import read_weights, write_weights
 from experiments.baselines import constant
 from experiments.published import one_at_a_time
 from experiments.runner import checkpoint_sha256
-from tests.waiting import printed
+from tests.waiting import flipped, printed
 
 
 def fresh(arrays):
@@ -92,9 +92,8 @@ def test_a_foreign_or_damaged_state_of_a_training_is_named(some, tmp_path):
     config = models.TrainingConfig(steps=2, batch_size=4, validate_every=1)
     file = tmp_path / "training.pt"
     models.train(fresh(some), some, some, config, resume_checkpoint=file)
-    whole = bytearray(file.read_bytes())
-    whole[len(whole) // 2] ^= 1
-    for content in (bytes(whole), whole[:-9], b"", b"notes", pickle.dumps({"about": 1})):
+    damaged = flipped(file.read_bytes(), file.stat().st_size // 2)
+    for content in (damaged, damaged[:-9], b"", b"notes", pickle.dumps({"about": 1})):
         file.write_bytes(content)
         says = r"training\.pt' is damaged or holds no training state"
         with pytest.raises(ValueError, match=says) as caught:
@@ -234,10 +233,8 @@ def test_no_flipped_bit_loads_as_another_model(untrained, tmp_path):
         whole = path.read_bytes()
         header = 8 + int.from_bytes(whole[:8], "little")
         for number in range(50):
-            spoiled = bytearray(whole)
             at = rng.integers(header if number % 2 else len(whole))
-            spoiled[at] ^= 1 << int(rng.integers(8))
-            path.write_bytes(spoiled)
+            path.write_bytes(flipped(whole, at, rng.integers(8)))
             with pytest.raises(ValueError, match=path.name):
                 load(path)
 
