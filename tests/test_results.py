@@ -40,21 +40,18 @@ def test_round_trip_converts_numpy_scalars(tmp_path):
     assert read_results(write_results(tmp_path, "a", {}, {"t": []}))["tables"] == {"t": []}
 
 
-@pytest.mark.parametrize(
-    ("table", "named"),
-    [
+def test_bad_tables_are_refused_before_anything_is_written(tmp_path):
+    for table, named in (
         ([{"mean_m": math.nan}], r"tables\['t'\]\[0\]\['mean_m'\] is nan"),
         ([{"a": 1.0}, {"a": np.float64("-inf")}], r"\[1\]\['a'\] is -inf"),
         ([{"a": np.zeros(2)}], r"\['a'\] .*ndarray"),
         ([{3: 1}], r"tables\['t'\]\[0\] has the key 3"),
         ({"a": 1}, r"tables\['t'\] .*dict"),
         ([[1]], r"tables\['t'\] .*each a dict"),
-    ],
-)
-def test_bad_tables_are_refused_before_anything_is_written(tmp_path, table, named):
-    with pytest.raises((TypeError, ValueError), match=named):
-        write_results(tmp_path, "06_planning", {}, {"t": table})
-    assert list(tmp_path.iterdir()) == []
+    ):
+        with pytest.raises((TypeError, ValueError), match=named):
+            write_results(tmp_path, "06_planning", {}, {"t": table})
+        assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("step", ["fsync", "replace"])
@@ -96,20 +93,17 @@ def test_a_kill_leaves_no_half_file_and_the_next_writer_no_leftovers(tmp_path):
     assert sorted(tmp_path.iterdir()) == [living, path]
 
 
-@pytest.mark.parametrize(
-    ("text", "reason"),
-    [
+def test_damaged_or_missing_results_are_named(tmp_path):
+    for text, reason in (
         ('{"notebook": "a", "parameters": {}, "vers', "JSONDecodeError"),
         ('{"notebook": 1, "parameters": 1, "versions": 1, "tables": {"t": [{"a": NaN}]}}', "nan"),
         ('{"notebook": "a", "parameters": {}, "versions": {}}', "KeyError.'tables'"),
         ("[]", "TypeError"),
         ("[" * 100_000, "RecursionError"),
-    ],
-)
-def test_damaged_or_missing_results_are_named(tmp_path, text, reason):
-    (tmp_path / "a.json").write_text(text)
-    with pytest.raises(ValueError, match=rf"a\.json .*{reason}.*delete it and run"):
-        read_results(tmp_path / "a.json")
+    ):
+        (tmp_path / "a.json").write_text(text)
+        with pytest.raises(ValueError, match=rf"a\.json .*{reason}.*delete it and run"):
+            read_results(tmp_path / "a.json")
     with pytest.raises(FileNotFoundError, match=r"b\.json; run the notebook"):
         read_results(tmp_path / "b.json")
 
@@ -144,11 +138,8 @@ def test_tables_show_units_and_few_digits():
     table = results.results_table(ROWS, ["planner", "mean_m"])
     assert list(table.columns) == ["planner", "mean, mm"]
     assert table.to_numpy().tolist() == [["astar", "4.41"], ["gradient", "–"]]
-
-
-@pytest.mark.parametrize(("column", "value", "head", "shown"), SHOWN)
-def test_units_come_from_the_name(column, value, head, shown):
-    assert (results.heading(column), results.cell(column, value)) == (head, shown)
+    for column, value, head, shown in SHOWN:  # units come from the name
+        assert (results.heading(column), results.cell(column, value)) == (head, shown)
 
 
 def test_pages_are_filled_and_checked(tmp_path, capsys):

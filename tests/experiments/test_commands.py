@@ -24,9 +24,8 @@ CALLS, DEADLY = [], set()
 TABLES = ("effect_prediction", "lever_up", "planning", "closed_loop", "real_pushes", "headline")
 
 
-@pytest.mark.parametrize(
-    ("line", "code", "named"),
-    [
+def test_unknown_names_and_impossible_numbers_are_refused(capsys):
+    for line, code, named in (
         (f"{TABLE} --workers -2", 2, "--workers: must be .* from 1 to 256"),
         (f"{SHIPPED} --workers 257", 2, "--workers: must be .* from 1 to 256"),
         (f"{SHIPPED} --only nope", 2, "--only: invalid choice: 'nope'"),
@@ -34,17 +33,15 @@ TABLES = ("effect_prediction", "lever_up", "planning", "closed_loop", "real_push
         (f"{TABLE} --only model=film,flim", 1, "no job has model = 'flim', but cnp, .*, nearest$"),
         (f"{TABLE} --only fold=11", 1, "no job has fold = '11', but 0, 1,"),
         (f"{TABLE} --only modle=film", 1, "no job has modle = 'film', but None$"),
-    ],
-)
-def test_unknown_names_and_impossible_numbers_are_refused(capsys, line, code, named):
-    name, *arguments = line.split()
-    try:
-        ended = importlib.import_module(name).main(arguments)
-    except SystemExit as stopped:
-        ended = stopped.code
-    assert ended == code
-    begins = {1: "^effect_prediction: --only: ", 2: "error: (argument )?"}[code]
-    assert re.search(begins + named, capsys.readouterr().err, re.MULTILINE)
+    ):
+        name, *arguments = line.split()
+        try:
+            ended = importlib.import_module(name).main(arguments)
+        except SystemExit as stopped:
+            ended = stopped.code
+        assert ended == code, line
+        begins = {1: "^effect_prediction: --only: ", 2: "error: (argument )?"}[code]
+        assert re.search(begins + named, capsys.readouterr().err, re.MULTILINE)
 
 
 def test_every_command_line_ends_in_this_way():

@@ -57,12 +57,7 @@ def test_pursuit_knows_only_what_it_observes(world, monkeypatch):
     world.place(box, (0.02, 0.0), 0.4, tool="rod")
     outline = PushedObject(rotated(box.footprint_m, 0.4), ROD_WIDTH_M / 2)
     truth = world.object_pose
-
-    def lies():
-        x, y, yaw = truth()
-        return x, y, yaw + 1.0
-
-    monkeypatch.setattr(world, "object_pose", lies)
+    monkeypatch.setattr(world, "object_pose", lambda: tuple(np.add(truth(), (0.0, 0.0, 1.0))))
     planner = PushPlanner(Pretrained(), outline, turn_m=t_on_arm.TURN_M)
     assert t_on_arm.bring(world, planner, (0.04, -0.01, 0.2)) <= 10
     x, y, yaw = truth()
@@ -95,12 +90,6 @@ class Carried:
         return np.column_stack([moved, turn]), np.full((len(pushes), 3), 1e-4)
 
 
-def gap_m(points, pose, outline_m):
-    """The least distance of the tool's centre from an outline on a way (n, 2), finely sampled."""
-    fine = np.vstack([np.linspace(a, b, 60) for a, b in itertools.pairwise(points)])
-    return _nearest(outline_m, rotated(fine - pose[:2], -pose[2]))[0].min()
-
-
 def test_the_tool_goes_around_a_concave_object_without_contact():
     obj, rng = PushedObject(T_M, 0.015), np.random.default_rng(0)
     planner = PushPlanner(Carried(), obj, price=0.3, rounds=2)
@@ -111,7 +100,9 @@ def test_the_tool_goes_around_a_concave_object_without_contact():
         goal = Goal((0.0, 0.0), turn_rad=wrap_angle(-pose[2]))
         push = planner.plan(pose, goal, 3, tool).steps[0].primitive
         way = planner.way(pose, tool, push)
-        assert gap_m([tool, *way[:-1]], pose, obj.outline_m) > 0.015
+        lines = itertools.pairwise([tool, *way[:-1]])
+        fine = np.vstack([np.linspace(a, b, 60) for a, b in lines])
+        assert _nearest(obj.outline_m, rotated(fine - pose[:2], -pose[2]))[0].min() > 0.015
         at_contact = rotated(np.array([push.contact]), -pose[2])
         assert _nearest(obj.outline_m, at_contact)[0] == pytest.approx(0.015, abs=1e-5)
 
@@ -177,15 +168,12 @@ def environment():
         yield
 
 
-def stored():
-    """The shipped pushes, as arguments of `Log.add`."""
+def test_the_shipped_pushes_are_read_and_predicted():
+    stored = []
     for _, rows in pd.read_csv(repo_root() / "data" / "push_t" / "pushes.csv.xz").groupby("push"):
         poses, path = rows[["x", "y", "yaw"]].dropna(), rows[["tool_x", "tool_y"]]
-        yield {"tool_t": rows["t"], "tool_xy": path, "poses": poses}
-
-
-def test_the_shipped_pushes_are_read_and_predicted():
-    data = push_t.logged(stored())
+        stored.append({"tool_t": rows["t"], "tool_xy": path, "poses": poses})
+    data = push_t.logged(stored)
     assert len(data) == 200
     trained = np.arange(200) < 150
     errors = errors_of(data, trained, ~trained, ("nearest", "rate_gp")).groupby("model")

@@ -206,19 +206,16 @@ def test_coverage_and_variance_scaling(some):
         models.coverage(z, zero, one, 1.5)
 
 
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda: models.FiLMConfig(effect_channels=("z",)), "effect_channels must name x and y"),
-        (lambda: models.FiLMConfig(rings=True), "rings=True"),
-        (lambda: LSTMConfig(steps=2.5), r"steps=2\.5"),
-        (lambda: models.CNPConfig(sigma_floor=0.0), r"sigma_floor .* 0\.0"),
-        (lambda: models.FiLMConfig(blocks=10**7), r"blocks must be a whole number in \[1, 4096\]"),
-    ],
-)
-def test_bad_settings_are_named(make, words):
-    with pytest.raises((TypeError, ValueError), match=words):
-        make()
+def test_bad_settings_are_named():
+    for make, given, words in (
+        (models.FiLMConfig, {"effect_channels": ("z",)}, "effect_channels must name x and y"),
+        (models.FiLMConfig, {"rings": True}, "rings=True"),
+        (LSTMConfig, {"steps": 2.5}, r"steps=2\.5"),
+        (models.CNPConfig, {"sigma_floor": 0.0}, r"sigma_floor .* 0\.0"),
+        (models.FiLMConfig, {"blocks": 10**7}, r"blocks must be a whole number in \[1, 4096\]"),
+    ):
+        with pytest.raises((TypeError, ValueError), match=words):
+            make(**given)
 
 
 def test_harmonics_turn_as_their_image_does(some):
@@ -270,13 +267,12 @@ def linear_sizes(module: torch.nn.Module) -> list[tuple[int, int]]:
 def test_layer_table_of_the_appendix(untrained):
     encoder = [(3, 32), (32, 64), (64, 64), (64, 128), (128, 128), (128, 256), (256, 128)]
     decoder = [(1024, 512), (512, 256), (256, 128), (128, 32), (32, 4)]
-    assert linear_sizes(untrained.action_encoder) == encoder
-    assert linear_sizes(untrained.effect_encoder) == encoder
-    assert isinstance(untrained.action_encoder[-1], torch.nn.LeakyReLU)
-    assert isinstance(untrained.effect_encoder[-1], torch.nn.Linear)
+    encoders = untrained.action_encoder, untrained.effect_encoder
+    assert [*map(linear_sizes, encoders)] == [encoder] * 2
+    assert [type(one[-1]) for one in encoders] == [torch.nn.LeakyReLU, torch.nn.Linear]
     assert linear_sizes(untrained.merge) == [(128 + 16 + 1, 1024)]
-    assert linear_sizes(untrained.action_decoder) == decoder
-    assert linear_sizes(untrained.effect_decoder) == decoder
+    for one in (untrained.action_decoder, untrained.effect_decoder):
+        assert linear_sizes(one) == decoder
     assert sum(p.numel() for p in untrained.parameters()) == 2_009_912
 
     shapes, x = [], torch.zeros(1, 2, 48, 48)

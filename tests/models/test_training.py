@@ -41,12 +41,9 @@ def test_the_literal_loop_draws_up_to_all_observations(some):
 
 def test_a_training_that_never_validates_says_so(some):
     config = models.TrainingConfig(steps=20, validate_every=10, learning_rate=0.5)
-
-    def never(model, tensors):
-        return torch.full((len(tensors),), math.nan)
-
+    never = {"score": lambda model, tensors: torch.full((len(tensors),), math.nan)}
     with pytest.raises(ValueError, match=r"learning_rate 0\.5: no validation error was finite"):
-        models.train(fresh(some), some, some, config, score=never)
+        models.train(fresh(some), some, some, config, **never)
 
 
 def test_channels_in_another_order_are_refused(some):
@@ -188,12 +185,9 @@ def test_a_bad_checkpoint_is_named(untrained, tmp_path):
     path = models.save_checkpoint(untrained, tmp_path / "m.safetensors", {})
     whole = path.read_bytes()
     tensors, description = read_weights(path, "")
-
-    def described(**changes):
-        return write_weights(path, tensors, description | changes)
-
     half = {name: value.half() for name, value in tensors.items()}
-    scaler = description["scaler"] | {"action_scale": [0.0, 1.0]}
+    scaler = {"scaler": description["scaler"] | {"action_scale": [0.0, 1.0]}}
+    config = {"config": description["config"] | {"sigma_floor": 0}}
     for spoil in (
         lambda: path.write_bytes(whole[: len(whole) // 2]),
         lambda: path.write_bytes(pickle.dumps({"weights": [1.0]})),
@@ -201,8 +195,8 @@ def test_a_bad_checkpoint_is_named(untrained, tmp_path):
         lambda: write_weights(path, {"a": torch.tensor([math.nan])}, description),
         lambda: write_weights(path, tensors, {"format": "something else"}),
         lambda: write_weights(path, half, description),
-        lambda: described(scaler=scaler),
-        lambda: described(config=description["config"] | {"sigma_floor": 0}),
+        lambda: write_weights(path, tensors, description | scaler),
+        lambda: write_weights(path, tensors, description | config),
     ):
         path.unlink()
         spoil()

@@ -76,9 +76,8 @@ class FollowsTheHand:
 
 def hand_moves(primitive, phase):
     """Motion (n, 5) of the hand while it is closed."""
-    closed, opens = primitive.segment_phases[2], primitive.segment_phases[-2]
-    if primitive.holds:
-        opens = 1.0
+    closed = primitive.segment_phases[2]
+    opens = 1.0 if primitive.holds else primitive.segment_phases[-2]
     return primitive.path(np.clip(phase, closed, opens)) - primitive.path(closed)
 
 

@@ -85,11 +85,8 @@ def test_no_more_actions_than_were_allowed(pose):
 
 def test_an_object_that_always_escapes_ends_the_loop():
     robot = PointRobot()
-
-    def take_away(plan, n):
-        robot.xy_m = (0.0, 0.0)
-
-    went = loop(robot, Goal((0.06, 0.0), EXACT_M), on_action=take_away, ends="gave_up")
+    away = {"on_action": lambda *_: setattr(robot, "xy_m", (0.0, 0.0))}
+    went = loop(robot, Goal((0.06, 0.0), EXACT_M), **away, ends="gave_up")
     assert 5 < len(went.steps) <= 4 * 5
 
 

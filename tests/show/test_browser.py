@@ -28,12 +28,6 @@ page = pytest.fixture(lambda lab, browser: opened(lab, browser), scope="module")
 table = pytest.fixture(lambda page: Table(page))
 
 
-def free_port():
-    with socket.socket() as sock:
-        sock.bind(("127.0.0.1", 0))
-        return sock.getsockname()[1]
-
-
 @contextmanager
 def serve(folder, name, more_cells=(), app="jupyterlab"):
     """Start a Jupyter with separate settings, workspaces and run-time files, and one notebook.
@@ -49,7 +43,9 @@ def serve(folder, name, more_cells=(), app="jupyterlab"):
     after = [k for k, cell in enumerate(notebook.cells) if "GoalPicker." in cell.source][-1] + 1
     notebook.cells[after:after] = [nbformat.v4.new_code_cell(cell) for cell in more_cells]
     nbformat.write(notebook, file)
-    port, token = free_port(), secrets.token_hex(16)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port, token = free.getsockname()[1], secrets.token_hex(16)
     own = {f"JUPYTER_{part}_DIR": str(folder / part) for part in ("CONFIG", "DATA", "RUNTIME")}
     traits = {"jupyterlab": "LabApp", "notebook": "JupyterNotebookApp"}[app]
     options = ["--no-browser", "--allow-root", "--ip=127.0.0.1", f"--port={port}"]

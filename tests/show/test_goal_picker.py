@@ -123,12 +123,7 @@ def test_lines_and_words_stand_out_from_the_table():
 
 def test_what_the_hand_wants_is_planned_for_once(picker):
     planned_for = []
-
-    def astar(problem):
-        planned_for.append(problem.goal.xy_m)
-        return plan_astar(problem)
-
-    picker.planners["A*"] = astar
+    picker.planners["A*"] = lambda p: planned_for.append(p.goal.xy_m) or plan_astar(p)
     for number, xy in enumerate([(0.081, 0.033), (0.081, 0.033), (-0.05, 0.1234)], 1):
         want(picker, *xy, number)
         assert in_time(picker)._view.scene["answered"] == number
@@ -226,11 +221,7 @@ def test_a_run_can_be_watched_while_it_is_simulated(make_picker, monkeypatch):
 
 
 def test_a_goal_picked_while_an_open_loop_runs_is_planned_for_when_it_ends(make_picker, world):
-    def executor(world, plan, planner, report):
-        want(picker, -0.05, 0.1, 1)
-        return open_loop(world, plan, planner, report)
-
-    picker = make_picker(executor=executor)
+    picker = make_picker(executor=lambda *given: want(picker, -0.05, 0.1, 1) or open_loop(*given))
     picker._view._handle_custom_msg({"press": "run"}, [])
     in_time(in_time(picker))
     assert picker.plan.goal.xy_m == drawn_goal(picker) == (-0.05, 0.1)

@@ -26,11 +26,8 @@ from affordlib.world import Cuboid, LyingCylinder, Prism
 from tests.planning.point_robot import problem_of
 from tests.waiting import printed
 
-OBJECTS = {
-    "box": Cuboid(0.07, 0.05, 0.05),
-    "roller": LyingCylinder(0.07, 0.05),
-    "wedge": Prism(((-0.05, -0.02), (0.05, -0.02), (0.05, 0.0), (-0.05, 0.03)), 0.04),
-}
+WEDGE = Prism(((-0.05, -0.02), (0.05, -0.02), (0.05, 0.0), (-0.05, 0.03)), 0.04)
+OBJECTS = {"box": Cuboid(0.07, 0.05, 0.05), "roller": LyingCylinder(0.07, 0.05), "wedge": WEDGE}
 ASK = """
 import fs from "node:fs";
 import { EffectMap, plan, reachability, spare } from "./table.mjs";
