@@ -137,14 +137,10 @@ def shop(one_world, skills, pushes, levers, levered, tmp_path_factory):
     pursuit = planning.run_closed_loop(one_world, goal, skills, config=once)
     figure, (_, ax) = plt.figure(), plt.subplots()
     rows = read_results("data/results/planning.json")["tables"]["summary"][:3]
-    numbers = {
-        "theta contact_x contact_y dy_m": 0.0,
-        "length width height diameter height_m": 0.05,
-        "dx_m reach direction_rad direction": 0.1,
-        "stop_phase phase level": 0.5,
-        "n_directions n_targets obs_max n_poses": 4,
-    }
-    numbers |= {"yaw_rad": 0.3, "n": 20, "max_steps": 2, "partial": True}
+    numbers = {"theta contact_x contact_y dy_m": 0.0, "dx_m reach direction_rad direction": 0.1}
+    numbers |= {"length width height diameter height_m": 0.05, "stop_phase phase level": 0.5}
+    numbers |= {"n_directions n_targets obs_max n_poses": 4, "yaw_rad": 0.3, "n": 20}
+    numbers |= {"max_steps": 2, "partial": True}
     places = {"xy_m at_xy_m start_xy_m": AT, "contact": (0.0, -0.03), "corners outline": CORNERS}
     places |= {"outline_m": np.array(CORNERS), "path_xy_m": np.array([[-0.1, 0.0], [0.0, 0.0]])}
     planned = {"action primitive": Push(0.0), "actions": [Push(0.0)], "step": step, "plan": plan}
@@ -165,11 +161,9 @@ def shop(one_world, skills, pushes, levers, levered, tmp_path_factory):
     names = {"primitive_named": "push", "category_named": "cuboid", "save_figure": "x"}
     names |= {"check": "01.1"}
     by_callable |= {each: {"name": name} for each, name in names.items()}
-    by_callable["load_checkpoint"] = {"name_or_path": "cnp_500"}
-    for each in ("open_interactions", "stored_sha256"):
-        by_callable[each] = {"name_or_path": "push_test"}
-    for each in ("condition_on_primitives", "fit_sigma_scale", "final_errors_m"):
-        by_callable[each] = {"model": network}
+    by_callable |= {"open_interactions stored_sha256": {"name_or_path": "push_test"}}
+    by_callable |= {"condition_on_primitives fit_sigma_scale final_errors_m": {"model": network}}
+    by_callable |= {"load_checkpoint": {"name_or_path": "cnp_500"}}
     by_callable |= {"plan_gradient": {"samples": 10}, "plan_astar": {"stop_phases": (0.5, 1.0)}}
     by_callable |= {"Grasp": {"seen_height": 0.05}, "PushAt": {"length": 0.01}}
     by_callable |= {"GoalPicker": {"view": False}, "settle": {"seconds": 0.1}}
@@ -214,7 +208,8 @@ def shop(one_world, skills, pushes, levers, levered, tmp_path_factory):
         "predict_trajectories": {"model": skills.model(Grasp), "channel": "z"}
         | {"primitive": Grasp()},
     }
-    return {k: v for names, v in by_name.items() for k in names.split()}, by_callable
+    both = by_name, by_callable
+    return [{k: v for names, v in given.items() for k in names.split()} for given in both]
 
 
 def driven(name, shop):

@@ -92,11 +92,6 @@ def test_every_parameter_is_explained_and_used(name):
     assert not defaults.keys() - names
 
 
-@pytest.mark.parametrize("profile", ["smoke", "reader", "full"])
-def test_every_value_of_a_profile_is_a_parameter_of_its_type(profile):
-    assert parameters(profile).keys() == PATHS.keys()
-
-
 @each_notebook
 def test_executed_in_order_without_errors_and_colours_have_one_meaning(name):
     cells = code_of(read(name))
@@ -178,7 +173,9 @@ def test_everything_shown_shows_on_the_web_and_nothing_depends_on_the_machine(na
             assert "filterwarnings" not in cell.source
 
 
-def test_the_book_keeps_to_its_style():
+def test_the_book_keeps_to_its_style_and_values_of_profiles_to_their_types():
+    for profile in ("smoke", "reader", "full"):
+        assert parameters(profile).keys() == PATHS.keys()
     assert [picture[:4] for picture, _ in figures().values()] == [b"\x89PNG"] * len(FIGURES)
     assert book_check.check()[1] == []
 

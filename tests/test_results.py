@@ -142,7 +142,7 @@ def test_tables_show_units_and_few_digits():
         assert (results.heading(column), results.cell(column, value)) == (head, shown)
 
 
-def test_pages_are_filled_and_checked(tmp_path, capsys):
+def test_pages_are_filled_and_checked_and_blocks_must_choose_what_is_there(tmp_path, capsys):
     source = write_results(tmp_path, "06_planning", {}, {"planning": ROWS})
     page = tmp_path / "page.md"
     opened = f"<!-- table: {source}#planning -->\n"
@@ -153,16 +153,12 @@ def test_pages_are_filled_and_checked(tmp_path, capsys):
     assert tables.main([str(page)]) == 0
     assert page.read_text() == f"# Title\n\n{opened}{MARKDOWN}<!-- /table -->\n\nend\n"
     assert tables.main(["--check", str(page)]) == 0
-
-
-def test_blocks_that_choose_what_is_not_there_are_refused(tmp_path):
-    source = write_results(tmp_path, "06_planning", {}, {"planning": ROWS})
     block = "<!-- table: {}#planning {} -->\n<!-- /table -->\n"
     for option, reason in [("planner=rrt", "no row"), ("columns=x", "'x'"), ("mode=a", "'mode'")]:
         with pytest.raises(ValueError, match=reason):
             fill_tables(block.format(source, option))
     with pytest.raises(ValueError, match="not closed"):
-        fill_tables(f"<!-- table: {source}#planning -->\n")
+        fill_tables(opened)
 
 
 def test_columns_are_drawn_as_dots_once(tmp_path, monkeypatch, capsys):

@@ -9,7 +9,6 @@ import threading
 import time
 import zipfile
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import psutil
@@ -19,7 +18,6 @@ import xarray as xr
 from dask.distributed import Client
 from joblib import parallel_config
 
-import affordlib
 from affordlib import interactions, results
 from affordlib.interactions import collect, open_interactions
 from affordlib.interactions.dataset import condition_on_recorded_action, sample_mixed
@@ -32,7 +30,6 @@ from tests.waiting import flipped, no_room, printed, start, wait_until
 
 SMALL = Recipe(n_interactions=6, seed=11)
 CONTINUE = "finished chunks are kept; collect into the same path to continue"
-ROOT = Path(affordlib.__file__).parents[1]
 
 
 @pytest.fixture(autouse=True)
@@ -140,7 +137,9 @@ collect.collect(recipe, sys.argv[1], workers=2, progress=False)
 
 
 def start_collector(path, n_interactions):
-    return start([sys.executable, "-c", SCRIPT, str(path), str(n_interactions)], cwd=ROOT)
+    return start(
+        [sys.executable, "-c", SCRIPT, str(path), str(n_interactions)], cwd=results.repo_root()
+    )
 
 
 @pytest.mark.slow

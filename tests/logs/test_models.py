@@ -23,17 +23,11 @@ shipped = pytest.fixture(lambda: load_neural_process(), scope="module")
 def log_of(rows, context=None, outline_m=TRIANGLE_M):
     """Simulated pushes (n, 10) of a triangle as a log."""
     rows = rows.double().numpy() * [0.05, 0.05, 1, 1, 1, 1, 0.05, 0.05, 0.05, 1]
-    return LoggedPushes(
-        contact_m=rows[:, :2],
-        normal=rows[:, 2:4],
-        direction=rows[:, 4:6],
-        length_m=rows[:, 6],
-        displacement_m=rows[:, 7:9],
-        turn_rad=rows[:, 9],
-        groups=np.array(["a", "b"] * len(rows))[: len(rows)],
-        context=context or {},
-        outline_m=outline_m,
-    )
+    way = {"contact_m": rows[:, :2], "normal": rows[:, 2:4], "direction": rows[:, 4:6]}
+    moved = {"length_m": rows[:, 6], "displacement_m": rows[:, 7:9], "turn_rad": rows[:, 9]}
+    groups = np.array(["a", "b"] * len(rows))[: len(rows)]
+    about = {"groups": groups, "context": context or {}, "outline_m": outline_m}
+    return LoggedPushes(**way, **moved, **about)
 
 
 def test_push_through_the_centre_of_friction_goes_straight():

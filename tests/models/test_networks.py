@@ -57,8 +57,18 @@ def predictions(network, batch, observations=None):
     return [getattr(made, f.name) for f in dataclasses.fields(made)]
 
 
+def row_of(observations, row):
+    """The observations of one row; unobserved ones become a single masked value."""
+    one = {f.name: getattr(observations, f.name)[[row]] for f in dataclasses.fields(observations)}
+    for kind in ("action", "effect"):
+        seen = one[f"{kind}_mask"][0]
+        seen = seen | ~seen.any() & (torch.arange(len(seen)) == 0)
+        one |= {f"{kind}{part}": one[f"{kind}{part}"][:, seen] for part in ("", "_t", "_mask")}
+    return Observations(**one)
+
+
 @torch.no_grad()
-def test_order_what_is_masked_and_saving_have_no_effect(network, some, tmp_path):
+def test_order_batch_what_is_masked_and_saving_have_no_effect(network, some, tmp_path):
     assert isinstance(network, models.EffectModel)
     batch = batch_of(some)
     predicted = predictions(network, batch)
@@ -79,26 +89,10 @@ def test_order_what_is_masked_and_saving_have_no_effect(network, some, tmp_path)
     shuffled = dataclasses.replace(seen, **{n: getattr(seen, n)[:, order] for n in parts})
     for a, b in zip(predicted, predictions(network, batch, shuffled), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5)
-
-
-def row_of(observations, row):
-    """The observations of one row; unobserved ones become a single masked value."""
-    one = {f.name: getattr(observations, f.name)[[row]] for f in dataclasses.fields(observations)}
-    for kind in ("action", "effect"):
-        seen = one[f"{kind}_mask"][0]
-        seen = seen | ~seen.any() & (torch.arange(len(seen)) == 0)
-        one |= {f"{kind}{part}": one[f"{kind}{part}"][:, seen] for part in ("", "_t", "_mask")}
-    return Observations(**one)
-
-
-@torch.no_grad()
-def test_a_row_alone_is_predicted_as_in_a_batch(network, some):
-    batch = batch_of(some)
-    together = predictions(network, batch)
     for row in range(len(some)):
         part = {"image": batch.image[[row]], "t_target": batch.t_target[[row]]}
         one = dataclasses.replace(batch, observations=row_of(batch.observations, row), **part)
-        for a, b in zip(together, predictions(network, one), strict=True):
+        for a, b in zip(predicted, predictions(network, one), strict=True):
             torch.testing.assert_close(a[[row]], b, atol=4e-5, rtol=1e-4)  # 8e-6
 
 

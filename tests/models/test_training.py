@@ -48,12 +48,9 @@ def test_a_training_that_never_validates_says_so(some):
 
 def test_channels_in_another_order_are_refused(some):
     other = dataclasses.replace(some, effect_channels=("yaw", "x", "y"))
-    for act in (
-        lambda: final_errors_m(fresh(some), other),
-        lambda: models.train(fresh(some), some, other),
-    ):
+    for act in (final_errors_m, lambda model, data: models.train(model, some, data)):
         with pytest.raises(ValueError, match=r"has the effect_channels .* the model needs"):
-            act()
+            act(fresh(some), other)
 
 
 def test_training_resumes_to_the_same_bits(some, tmp_path, monkeypatch):

@@ -17,7 +17,10 @@ from affordlib.types import Obstacle
 from affordlib.world import Cuboid
 from tests.waiting import wait_until
 
+CONTINUOUS = {"continuous": plan_continuous}
 picker = pytest.fixture(lambda make_picker: make_picker())
+posed = pytest.fixture(lambda make_picker, skills: make_picker(skills=skills, planners=CONTINUOUS))
+"""A picker whose plans turn and lift."""
 
 
 @pytest.fixture
@@ -36,12 +39,6 @@ def make_picker(world, trained):
         return picker
 
     return make
-
-
-@pytest.fixture
-def posed(make_picker, skills):
-    """A picker whose plans turn and lift."""
-    return make_picker(skills=skills, planners={"continuous": plan_continuous})
 
 
 def want(picker, x_m, y_m, number):
@@ -89,7 +86,7 @@ def test_a_picked_goal_is_planned_for_drawn_and_reached(picker, world):
 
 
 def test_another_plan_and_full_actions_are_shown(make_picker):
-    picker = make_picker(planners={"continuous": plan_continuous, "A*": plan_astar})
+    picker = make_picker(planners=CONTINUOUS | {"A*": plan_astar})
     picker.pick(0.08, 0.03)
     assert not picker._view.scene["other"]
     picker.controls.other.value = "A*"

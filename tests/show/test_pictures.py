@@ -38,6 +38,8 @@ const answer = ({ action, ...one }) =>
   action ? spare({ object, ...one }, ...action) : plan({ object, reachable, ...one });
 console.log(JSON.stringify(queries.map(answer)));
 """
+push = pytest.fixture(lambda placed: placed.execute_primitive(Push.towards(0.6)))
+slider = pytest.fixture(lambda placed: show.phase_explorer(placed, Push.towards(0.6), 0.8))
 explorer = pytest.fixture(lambda trained, push: show.conditioning_explorer(trained, push))
 
 
@@ -76,15 +78,9 @@ def test_the_configuration_of_a_reader_changes_no_figure(tmp_path):
 
 
 @pytest.fixture
-def push(world):
-    world.place(Cuboid(0.07, 0.05, 0.05), (0.02, -0.01), 0.4)
-    return world.execute_primitive(Push.towards(0.6))
-
-
-@pytest.fixture
-def slider(world):
-    world.place(Cuboid(0.07, 0.05, 0.05), (0.02, -0.01), 0.4)
-    return show.phase_explorer(world, Push.towards(0.6), 0.8)
+def placed(world):
+    world.place(OBJECTS["box"], (0.02, -0.01), 0.4)
+    return world
 
 
 def state_of(explorer, *at):
