@@ -18,10 +18,8 @@ TREES = {path: ast.parse((ROOT / path).read_text()) for path in [*MODULES, *EXPE
 UP = ("world", "interactions", "models", "planning", "show")
 """The parts in order: each may know those before it, but for `EXCEPT`."""
 EXCEPT = {"models": {"world"}, "planning": {"world"}}
-BESIDE = "logs"
-"""A part that knows none of the others, and that none of them knows."""
-USE_WORLD = {"recipes", "collect"}
-"""The modules of `interactions` that know the world."""
+BESIDE = "logs"  # a part that knows none of the others, and that none of them knows
+USE_WORLD = {"recipes", "collect"}  # the modules of `interactions` that know the world
 PAGES = sorted((ROOT / "notebooks").rglob("*.ipynb"))
 
 

@@ -24,14 +24,11 @@ from nbconvert.filters.markdown_mistune import markdown2html_mistune
 
 from affordlib import interactions, logs, models, planning, results, show, world
 from affordlib.interactions.collect import collect
-from affordlib.interactions.dataset import sample_mixed
 from affordlib.interactions.recipes import Recipe, Variation
-from affordlib.interactions.store import write_interactions
 from affordlib.logs.cross_validate import forecast_errors
 from affordlib.logs.fit import EFFORT
 from affordlib.logs.neural_process import load_neural_process
 from affordlib.models.evaluation import network_predictions, refuse_seen
-from affordlib.planning import corners_of
 from affordlib.planning.skills import Reachability
 from affordlib.primitives import Drag, Grasp, LeverUp, Push, PushAt, Rotate, primitive_named
 from affordlib.results import read_results, repo_root, results_table, write_results
@@ -80,8 +77,7 @@ CALLABLES = {
     if callable(value) and not name.endswith(("Error", "Warning"))
 }
 of_modules = (Goal, Step, Plan, Push, PushAt, Drag, Grasp, Rotate, LeverUp, primitive_named)
-of_modules += (Recipe, Variation, collect, check)
-of_modules += (View, read_results, results_table, write_results)
+of_modules += (Recipe, Variation, collect, check, View, read_results, results_table, write_results)
 CALLABLES |= {each.__name__: each for each in of_modules}
 CALLABLES |= {"Push.towards": Push.towards, "Push.path": Push(0.0).path}
 CALLABLES["from_dataset"] = interactions.InteractionTensors.from_dataset
@@ -131,7 +127,7 @@ def shop(one_world, skills, pushes, levers, levered, tmp_path_factory):
     plan = Plan(goal, AT, (step,), "by hand", True, 0.0)
     effects = planning.EffectMap(model, image)
     problem = planning.PlanningProblem(AT, goal, effects, "single_partial")
-    batch = sample_mixed(arrays, 2, 2, torch.Generator().manual_seed(0))
+    batch = interactions.dataset.sample_mixed(arrays, 2, 2, torch.Generator().manual_seed(0))
     wall = Obstacle.disc((0.2, 0.0), 0.03)
     once = planning.ClosedLoopConfig(max_actions=1)
     pursuit = planning.run_closed_loop(one_world, goal, skills, config=once)
@@ -198,7 +194,10 @@ def shop(one_world, skills, pushes, levers, levered, tmp_path_factory):
         "condition_on_poses": {"start": torch.zeros(12, dtype=torch.int64)},
         "descend": {"target_xy_m": np.array([0.05, 0.02]), "generator": np.random.default_rng(0)},
         "final_error": {"record": models.network_predictions(model, pushes, np.arange(2))},
-        "gaps_m": {"obstacles": [corners_of(wall)], "shapes": np.array([[CORNERS, CORNERS]])},
+        "gaps_m": {
+            "obstacles": [planning.corners_of(wall)],
+            "shapes": np.array([[CORNERS, CORNERS]]),
+        },
         "placed": {"corners": np.array(CORNERS), "poses": np.zeros((2, 3))},
         "plot_flow": {"boxes": {"a": (0, 0, "k"), "b": (1, 1, "k")}, "arrows": [("a", "b")]},
         "roll_out": {"direction_rad": torch.zeros(3, 1), "phase": torch.ones(3, 1)},
@@ -284,7 +283,6 @@ def test_a_hostile_value_is_refused_by_name_or_does_no_harm(shop, name, tmp_path
             wrong = f"takes {took_s:.0f} s"
         if wrong:
             found.append(f"{argument}={value!r:.60} {wrong:.200}")
-
     plt.close("all")
     assert not found, "\n".join(found)
     assert not list(repo_root().glob("*/x.json"))
@@ -383,7 +381,7 @@ def of_a_data_set(path, fixture):
         data["category"].attrs = {k: new[k] for k in category if k in new}
         text = {k: json.dumps(v) for k, v in new.items() if (k, type(v)) == ("recipe", dict)}
         data.attrs = new | text  # a file holds a recipe as text
-        write_interactions(data, path, 1)
+        interactions.store.write_interactions(data, path, 1)
         read = interactions.open_interactions(path)
         yield read._repr_html_()
         yield words_as_html(str(network_predictions(model, read, np.arange(4))["category"]))

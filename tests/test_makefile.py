@@ -34,6 +34,7 @@ elif sys.argv[1:3] == ["-m", "venv"]:
     python.write_text(pathlib.Path(__file__).read_text())
     python.chmod(0o755)
 """
+ENVIRONMENT = {name: value for name, value in os.environ.items() if "MAKE" not in name}
 ROOT, INSTALLED = repo_root(), ["-m pip", "-m pip"]
 book = pytest.fixture(lambda tmp_path: Book(tmp_path))
 pytestmark = pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
@@ -52,20 +53,17 @@ def project(tmp_path):
         (here / name).touch()
 
     def make(*options, version="3.11", copies=1, words=3):
-        own = tmp_path / "python"
+        own, log = tmp_path / "python", here / "log"
+        log.write_text("")
         text = PRETENDED.format(python=sys.executable, here=str(here), version=version, words=words)
         own.write_text(text)
         for path in (own, *commands.iterdir()):
             path.chmod(0o755)
-        environment = {name: value for name, value in os.environ.items() if "MAKE" not in name}
-        environment["PATH"] = f"{commands}:{environment['PATH']}"
+        environment = ENVIRONMENT | {"PATH": f"{commands}:{os.environ['PATH']}"}
         command = ["make", f"PYTHON={own}", *(options or ["setup"])]
         started = [start(command, cwd=here, env=environment) for _ in range(copies)]
         said = [process.communicate(timeout=60)[0] for process in started]
-        log = here / "log"
-        ran = log.read_text().splitlines() if log.exists() else []
-        log.unlink(missing_ok=True)
-        ran = [line for line in ran if not line.startswith("-c")]
+        ran = [line for line in log.read_text().splitlines() if not line.startswith("-c")]
         return any(process.returncode for process in started), "".join(said), ran
 
     return SimpleNamespace(here=here, make=make, commands=commands)
@@ -186,8 +184,7 @@ class Book:
         return self.root / "notebooks" / f"{name}.ipynb"
 
     def start(self, *options, target="workbook", **environment):
-        inherited = {k: v for k, v in os.environ.items() if "MAKE" not in k}
-        return start(["make", target, *options], cwd=self.root, env=inherited | environment)
+        return start(["make", target, *options], cwd=self.root, env=ENVIRONMENT | environment)
 
     def make(self, *options, **more):
         process = self.start(*options, **more)

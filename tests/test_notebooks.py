@@ -30,7 +30,6 @@ ABSOLUTE = re.compile(
 )
 
 READERS_DASK = {"REQUIRE_ENCRYPTION": "true", "DEFAULT_SCHEME": "tls"}  # no page may fail with it
-
 each_notebook = pytest.mark.parametrize("name", list(PATHS))
 
 
@@ -93,7 +92,10 @@ def test_every_parameter_is_explained_and_used(name):
 
 
 @each_notebook
-def test_executed_in_order_without_errors_and_colours_have_one_meaning(name):
+def test_executed_in_order_without_errors_small_clean_and_colours_have_one_meaning(name):
+    text = PATHS[name].read_text(encoding="utf-8")
+    assert len(text.encode()) < 1_500_000
+    assert text == cleaned(read(name)), "metadata is not clean; run `make notebooks`"
     cells = code_of(read(name))
     for colour in (GOAL, PREDICTION, TRUTH):
         assert not [c for c in cells if colour.lower() in c.source.lower()], "use its name"
@@ -133,13 +135,6 @@ def test_stored_results_are_shown_as_they_are_now(name):
             assert shown == [value._repr_html_()], f"run `make notebooks`: stale\n{cell.source}"
             compared += 1
     assert compared
-
-
-@each_notebook
-def test_small_and_clean(name):
-    text = PATHS[name].read_text(encoding="utf-8")
-    assert len(text.encode()) < 1_500_000
-    assert text == cleaned(read(name)), "metadata is not clean; run `make notebooks`"
 
 
 def test_of_a_widget_its_picture_is_kept():
@@ -211,8 +206,7 @@ def run_with_nbval(copy):
 @pytest.fixture(scope="module")
 def smoke(tmp_path_factory):
     """The folder of the runs of one worker: notebooks may read files of earlier ones."""
-    folder = tmp_path_factory.mktemp("smoke")
-    return folder, parameters("smoke", seed=1)
+    return tmp_path_factory.mktemp("smoke"), parameters("smoke", seed=1)
 
 
 @pytest.mark.slow

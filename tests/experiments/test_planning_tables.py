@@ -81,8 +81,7 @@ def test_a_shipped_checkpoint_can_be_trained_again(monkeypatch, capsys):
 
 def test_planners_differ_and_are_asked_about_all_their_categories_alike():
     assert CONFIGS["continuous"].classes == STANDING + ROLLABLE
-    assert CONFIGS["gradient_100_pushes"].classes == STANDING
-    assert CONFIGS["outside"].classes == STANDING
+    assert CONFIGS["gradient_100_pushes"].classes == CONFIGS["outside"].classes == STANDING
     assert len({repr(config) for config in CONFIGS.values()}) == len(CONFIGS)
     for name, config in CONFIGS.items():
         tasks = frozen_tasks(config.world)

@@ -223,8 +223,7 @@ def test_workers_get_the_classes_of_a_user(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_make_data_compares_with_what_was_there(undisturbed, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(shipped, "RECIPES", {"push": SMALL})
-    where = ["--to", str(tmp_path), "--workers", "2"]
-    arguments = ["data", "--only", "push", *where]
+    arguments = ["data", "--only", "push", "--to", str(tmp_path), "--workers", "2"]
     assert shipped.main(arguments) == 1
     assert "not the same: 6 interactions, formerly 500" in capsys.readouterr().out
     assert (tmp_path / "push.zarr.zip").read_bytes() == undisturbed.read_bytes()
@@ -256,9 +255,6 @@ def test_a_worker_watches_its_parent_before_it_imports_what_is_large():
 
 @pytest.mark.parametrize(("name", "recipe"), RECIPES.items())
 def test_the_shipped_sets_are_what_their_recipes_say(name, recipe, world):
-    """The tool, measured every 150 ms as in the paper, was where the action says; a guarded hand
-    may have stopped above its target. Few interactions are flagged, and all say why.
-    """
     data = open_interactions(name)
     assert Recipe.from_json(data.attrs["recipe"]) == recipe
     assert data.attrs["recipe"] == recipe.to_json()
@@ -273,20 +269,20 @@ def test_the_shipped_sets_are_what_their_recipes_say(name, recipe, world):
         assert gap < 0.001
         assert stored["size"].values[2] == pytest.approx(obj.height_m, abs=2e-6)
         assert bool(stored["success"]) == seen.success
-
+    # Few interactions are flagged, and all say why.
     reasons = (data["tracking_error"] > 0.002) | (data["penetration"] > 0.002)
     np.testing.assert_array_equal(data["fault"].values, reasons.values)
     assert data["fault"].values.mean() < 0.05
     assert not data["effect"].values[~data["reached"].values].any()
     assert data["reached"].values.all() or name == "reach"
-
+    # The tool was where the action says, measured every 150 ms, as in the paper.
     ok = data["reached"].values & ~data["fault"].values
     commanded = data["action"].values[ok][:, ::12, :3]
     measured = data["tool"].values[ok][:, :, :3]
     if name == "push_varied":  # its gripper moves higher than commanded, by an amount it measures
         commanded, measured = commanded[..., :2], measured[..., :2]
     off = measured - commanded
-    if name == "grasp":
+    if name == "grasp":  # a guarded hand may have stopped above its target
         assert off[..., 2].max() > 0.01
         off[..., 2] = np.minimum(off[..., 2], 0)
     # The waypoints of a very short action are further apart than its samples.

@@ -136,7 +136,7 @@ def test_sigma_scale_is_that_of_the_residuals_of_few_pushes_too():
     torch.testing.assert_close(of_ten, torch.tensor([2.0, 2, 3]), atol=0, rtol=0.12)
 
 
-def test_fit_refuses_what_it_does_not_know(rows):
+def test_fit_refuses_what_it_does_not_know_and_other_files_hold_no_model(rows, tmp_path):
     with pytest.raises(ValueError, match="model must be one of"):
         fit(log_of(rows), "x")
     for few, model in ((rows[:7], "np"), (rows, "physics_feet")):
@@ -145,6 +145,13 @@ def test_fit_refuses_what_it_does_not_know(rows):
     narrow = log_of(rows, outline_m=0.9 * TRIANGLE_M)
     with pytest.raises(ValueError, match="pushes: their outline_m or tool_radius_m"):
         fit(log_of(rows), "constant").predict(narrow)
+    untrained = neural_process.NeuralProcess()
+    with pytest.raises(ValueError, match="holds no model of pushes"):
+        load_model(save_neural_process(untrained, tmp_path / "np.safetensors", {}))
+    with pytest.raises(FileNotFoundError, match=r"there is no file .*missing"):
+        load_model(tmp_path / "missing.safetensors")
+    with pytest.raises(ValueError, match=r"film_500.* train it: .*pretrain_np"):
+        load_neural_process("film_500")
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -159,16 +166,6 @@ def test_a_model_predicts_the_same_after_it_was_saved(name, tmp_path):
     path.write_bytes(path.read_bytes()[:-9])
     with pytest.raises(ValueError, match=r"damaged.*fit the model to its log again"):
         load_model(path)
-
-
-def test_other_files_hold_no_model_of_pushes(tmp_path):
-    untrained = neural_process.NeuralProcess()
-    with pytest.raises(ValueError, match="holds no model of pushes"):
-        load_model(save_neural_process(untrained, tmp_path / "np.safetensors", {}))
-    with pytest.raises(FileNotFoundError, match=r"there is no file .*missing"):
-        load_model(tmp_path / "missing.safetensors")
-    with pytest.raises(ValueError, match=r"film_500.* train it: .*pretrain_np"):
-        load_neural_process("film_500")
 
 
 def test_cross_validation_leaves_the_number_of_threads_alone(monkeypatch, rows):

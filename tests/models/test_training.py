@@ -39,14 +39,11 @@ def test_the_literal_loop_draws_up_to_all_observations(some):
     assert set(counts) == set(range(1, 11))
 
 
-def test_a_training_that_never_validates_says_so(some):
+def test_a_training_that_never_validates_or_has_channels_in_another_order_says_so(some):
     config = models.TrainingConfig(steps=20, validate_every=10, learning_rate=0.5)
     never = {"score": lambda model, tensors: torch.full((len(tensors),), math.nan)}
     with pytest.raises(ValueError, match=r"learning_rate 0\.5: no validation error was finite"):
         models.train(fresh(some), some, some, config, **never)
-
-
-def test_channels_in_another_order_are_refused(some):
     other = dataclasses.replace(some, effect_channels=("yaw", "x", "y"))
     for act in (final_errors_m, lambda model, data: models.train(model, some, data)):
         with pytest.raises(ValueError, match=r"has the effect_channels .* the model needs"):
@@ -57,7 +54,6 @@ def test_training_resumes_to_the_same_bits(some, tmp_path, monkeypatch):
     config = models.TrainingConfig(steps=9, batch_size=16, validate_every=2, ema=0.9)
     whole = fresh(some)
     history = models.train(whole, some, some, config)
-
     broken, calls, loss_of = fresh(some), [], models.FiLMNetwork.loss
 
     def stop(model, batch, beta):

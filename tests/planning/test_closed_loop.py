@@ -330,16 +330,14 @@ def test_the_arm_is_asked_about_the_grasp_that_it_will_execute(world, skills):
         assert x == 0.52 or went.steps == ()
 
 
-def test_a_toppled_cylinder_is_dragged(world, skills):
+def test_disturbances_happen_as_scheduled_and_are_answered(world, skills):
+    """What has toppled is dragged; what no camera sees is lost."""
     world.place(TUBE, (0.0, 0.0), 0.0)
     falls = Disturbance("topple", 1, 0.0, 1.0)
     went, schedule = disturbed(world, Goal((0.2, 0.0), EXACT_M), skills, falls)
     assert schedule.happened == [falls]
     assert world.placed.fell()
     assert [type(s.primitive) for s in went.steps][:2] == [Push, Drag]
-
-
-def test_a_goal_moves_and_an_object_is_shoved_as_scheduled(world, skills):
     world.place(BOX, (0.0, 0.0), 0.3)
     moves = Disturbance("goal", 0, 0.0, 0.08, at_s=3.0)
     shove = Disturbance("shove", 1, -0.02, 0.07, turn=1.0)
@@ -347,9 +345,6 @@ def test_a_goal_moves_and_an_object_is_shoved_as_scheduled(world, skills):
     assert schedule.happened == [moves, shove]
     assert went.goal.xy_m == pytest.approx((0.1, 0.08))
     assert went.goal.distance_m(world.object_pose()[:2]) < 0.005
-
-
-def test_an_object_that_no_camera_sees_is_lost(world, skills):
     world.place(BALL, (0.5, 0.0), config=WorldConfig(camera="kinect"))
     off = Disturbance("knock", 1, 1.5, 0.0)
     assert disturbed(world, Goal((0.4, 0.1), EXACT_M), skills, off, ends=None)[0].status == "lost"
@@ -407,10 +402,7 @@ def test_the_disturbance_and_not_the_robot_makes_a_goal_infeasible(world):
 
 
 def knowing_only_what_it_measures(world, monkeypatch):
-    """A tabletop as a `Robot` that reads the simulator's state only while it acts.
-
-    Parking does not read the state, and the recorded object path is NaN.
-    """
+    """A tabletop as a `Robot` that reads the state only while it acts, not as it parks."""
     names = ("state", "pose", "fell", "rolls", "left_table")
     known = {name: getattr(PlacedObject, name) for name in names}
 

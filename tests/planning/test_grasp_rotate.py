@@ -13,9 +13,7 @@ from affordlib.world import Cuboid, LyingCylinder, UprightCylinder
 from tests.planning.point_robot import problem_of
 
 BOX, TUBE, LOG = Cuboid(0.06, 0.05, 0.05), UprightCylinder(0.05, 0.07), LyingCylinder(0.08, 0.05)
-DISC = LyingCylinder(0.05, 0.10)
-"""Lying on its rim, and as wide as the hand can open: only its faces can be grasped."""
-
+DISC = LyingCylinder(0.05, 0.10)  # as wide as the hand can open: only its faces can be grasped
 AT = (0.0, 0.0)
 
 

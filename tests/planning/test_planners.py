@@ -349,10 +349,8 @@ def test_plans_come_within_what_their_planner_promises(world, trained, film):
     tasks += uniform_tasks("multi_partial", 4, seed=7)
 
     def distances(plan, model, tasks, **how):
-        def plan_for(*query):
-            return plan(problem_of(model, *query))
-
-        return [attempt(world, task, plan_for, **how).distance_m for task in tasks]
+        runs = (attempt(world, t, lambda *q: plan(problem_of(model, *q)), **how) for t in tasks)
+        return [run.distance_m for run in runs]
 
     assert np.mean(distances(planning.plan_astar, trained, tasks)) < 0.03
     hard = [t for t in frozen_tasks() if (t.goals, t.mode) == ("constructed", "multi_partial")]

@@ -305,16 +305,14 @@ def test_turn_and_lift_are_planned_and_done(posed, world, executor, within_deg):
     goal = in_time(posed).plan.goal
     assert (math.degrees(goal.turn_rad), goal.height_m) == pytest.approx((25.0, 0.06))
     assert goal.xy_m == (0.04, 0.03)
-    assert "then rotate to" in posed.controls.words.value
-    assert "then grasp to" in posed.controls.words.value
+    assert re.search("(?s)then rotate to .*then grasp to ", posed.controls.words.value)
     scene = posed._view.scene
     assert math.degrees(scene["goal"]["yaw"]) == pytest.approx(25.0)
     assert math.degrees(scene["steps"][-1]["end"][2]) == pytest.approx(25.0, abs=2.3)
     assert [step["name"] for step in scene["steps"]][-2:] == ["rotate", "grasp"]
     posed.run()
     said = posed.controls.words.value
-    assert "The orientation has an error of" in said
-    assert "The height has an error of" in said
+    assert re.search("The orientation has an error of .* The height has an error of ", said)
     assert posed.outcome.lifted_m == pytest.approx(0.06, abs=0.005), said
     assert world.object_state()[2] == pytest.approx(0.025 + 0.06, abs=0.005), said
     assert math.degrees(world.object_pose()[2]) == pytest.approx(25.0, abs=within_deg), said

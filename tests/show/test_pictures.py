@@ -7,11 +7,11 @@ import shutil
 import subprocess
 from pathlib import Path
 
-import matplotlib.pyplot as plt
 import numpy as np
 import playwright
 import pytest
 import torch
+from matplotlib.figure import Figure
 from PIL import Image
 
 from affordlib import show
@@ -44,7 +44,7 @@ explorer = pytest.fixture(lambda trained, push: show.conditioning_explorer(train
 
 
 def test_a_footprint_is_drawn_where_the_object_is(world, trained):
-    figure, ax = plt.subplots()
+    ax = Figure().subplots()
     show.plot_footprint(show.plot_table(ax), Cuboid(0.06, 0.04, 0.05), (0.1, -0.05), np.pi / 2)
     outline = ax.lines[-1].get_xydata()
     np.testing.assert_allclose(np.ptp(outline, axis=0), [4.0, 6.0], atol=1e-9)
@@ -55,7 +55,6 @@ def test_a_footprint_is_drawn_where_the_object_is(world, trained):
     assert "mm from the goal" in show.plot_outcome(ax, outcome, world.obj).get_title(loc="left")
     last = [line.get_xydata()[:-1] for line in ax.lines if len(line.get_xydata()) == 5][-1]
     np.testing.assert_allclose(last.mean(axis=0), 100 * np.array(outcome.end_pose[:2]), atol=1e-9)
-    plt.close(figure)
 
 
 def test_the_configuration_of_a_reader_changes_no_figure(tmp_path):
