@@ -93,9 +93,6 @@ def test_every_parameter_is_explained_and_used(name):
 
 @each_notebook
 def test_executed_in_order_without_errors_small_clean_and_colours_have_one_meaning(name):
-    text = PATHS[name].read_text(encoding="utf-8")
-    assert len(text.encode()) < 1_500_000
-    assert text == cleaned(read(name)), "metadata is not clean; run `make notebooks`"
     cells = code_of(read(name))
     for colour in (GOAL, PREDICTION, TRUTH):
         assert not [c for c in cells if colour.lower() in c.source.lower()], "use its name"
@@ -103,6 +100,9 @@ def test_executed_in_order_without_errors_small_clean_and_colours_have_one_meani
     outputs = [output for cell in cells for output in cell.outputs]
     assert outputs, "run `make notebooks`"
     assert [o for o in outputs if o.output_type == "error" or o.get("name") == "stderr"] == []
+    text = PATHS[name].read_text(encoding="utf-8")
+    assert len(text.encode()) < 1_500_000
+    assert text == cleaned(read(name)), "metadata is not clean; run `make notebooks`"
 
 
 READS_STORED = 'read_results(\\"data/results/'  # in JSON
