@@ -18,10 +18,8 @@ TREES = {path: ast.parse((ROOT / path).read_text()) for path in [*MODULES, *EXPE
 UP = ("world", "interactions", "models", "planning", "show")
 """The parts in order: each may know those before it, but for `EXCEPT`."""
 EXCEPT = {"models": {"world"}, "planning": {"world"}}
-BESIDE = "logs"
-"""A part that knows none of the others, and that none of them knows."""
-USE_WORLD = {"recipes", "collect"}
-"""The modules of `interactions` that know the world."""
+BESIDE = "logs"  # a part that knows none of the others, and that none of them knows
+USE_WORLD = {"recipes", "collect"}  # the modules of `interactions` that know the world
 PAGES = sorted((ROOT / "notebooks").rglob("*.ipynb"))
 
 
@@ -42,7 +40,9 @@ def imported(path):
 
 
 @pytest.mark.parametrize("path", MODULES, ids=str)
-def test_imports_point_one_way(path):
+def test_a_module_is_short_well_named_and_imports_one_way(path):
+    assert (ROOT / path).read_text().count("\n") <= 500
+    assert path.stem not in {"utils", "helpers", "misc", "common"}
     names = imported(path)
     assert not any(name.split(".")[0] in ("experiments", "exercises", "tests") for name in names)
     parts = {name.split(".")[1] for name in names if name.startswith("affordlib.")}
@@ -55,16 +55,11 @@ def test_imports_point_one_way(path):
     assert not parts & {*UP, BESIDE} - allowed
 
 
-def test_no_module_needs_itself():
+def test_no_module_needs_itself_and_only_the_world_knows_pybullet():
     modules = {name_of(path): path for path in TREES}
     needs = {name: imported(path) & modules.keys() - {name} for name, path in modules.items()}
     assert len(list(graphlib.TopologicalSorter(needs).static_order())) == len(modules)
-
-
-@pytest.mark.parametrize("path", MODULES, ids=str)
-def test_modules_are_short_and_well_named(path):
-    assert (ROOT / path).read_text().count("\n") <= 500
-    assert path.stem not in {"utils", "helpers", "misc", "common"}
+    assert {p.parts[1] for p in MODULES if "pybullet" in imported(p)} == {"world"}
 
 
 def test_no_function_has_too_many_parameters():
@@ -74,10 +69,6 @@ def test_no_function_has_too_many_parameters():
                 a = node.args
                 each = {x.arg for x in [*a.posonlyargs, *a.args, *a.kwonlyargs]} - {"self", "cls"}
                 assert len(each) <= 7, f"{path}: {node.name}"
-
-
-def test_only_the_world_knows_pybullet():
-    assert {p.parts[1] for p in MODULES if "pybullet" in imported(p)} == {"world"}
 
 
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)

@@ -24,14 +24,11 @@ from nbconvert.filters.markdown_mistune import markdown2html_mistune
 
 from affordlib import interactions, logs, models, planning, results, show, world
 from affordlib.interactions.collect import collect
-from affordlib.interactions.dataset import sample_mixed
 from affordlib.interactions.recipes import Recipe, Variation
-from affordlib.interactions.store import write_interactions
 from affordlib.logs.cross_validate import forecast_errors
 from affordlib.logs.fit import EFFORT
 from affordlib.logs.neural_process import load_neural_process
 from affordlib.models.evaluation import network_predictions, refuse_seen
-from affordlib.planning import corners_of
 from affordlib.planning.skills import Reachability
 from affordlib.primitives import Drag, Grasp, LeverUp, Push, PushAt, Rotate, primitive_named
 from affordlib.results import read_results, repo_root, results_table, write_results
@@ -65,15 +62,10 @@ TEXTS = {"short": f"{MARKUP}$\\frac$\x1b]0;mine\x07\u202egpj.exe\x00\n", "long":
 def hostile(rng):
     """Any value: one of those above, or random numbers or words."""
     real = lambda: struct.unpack("d", rng.randbytes(8))[0]  # noqa: E731
-    return rng.choice(
-        (
-            *(lambda: rng.choice(FIXED),) * 5,
-            real,
-            lambda: rng.choice((-1, 1)) * rng.getrandbits(rng.choice((2, 8, 80))),
-            lambda: "".join(chr(rng.randrange(0xD000)) for _ in range(rng.randrange(20))),
-            lambda: [real() for _ in range(rng.randrange(5))],
-        )
-    )()
+    whole = lambda: rng.choice((-1, 1)) * rng.getrandbits(rng.choice((2, 8, 80)))  # noqa: E731
+    text = lambda: "".join(chr(rng.randrange(0xD000)) for _ in range(rng.randrange(20)))  # noqa: E731
+    reals = lambda: [real() for _ in range(rng.randrange(5))]  # noqa: E731
+    return rng.choice((*(lambda: rng.choice(FIXED),) * 5, real, whole, text, reals))()
 
 
 AT, BOX = (0.0, 0.0), world.Cuboid(0.06, 0.05, 0.05)
@@ -85,8 +77,7 @@ CALLABLES = {
     if callable(value) and not name.endswith(("Error", "Warning"))
 }
 of_modules = (Goal, Step, Plan, Push, PushAt, Drag, Grasp, Rotate, LeverUp, primitive_named)
-of_modules += (Recipe, Variation, collect, check)
-of_modules += (View, read_results, results_table, write_results)
+of_modules += (Recipe, Variation, collect, check, View, read_results, results_table, write_results)
 CALLABLES |= {each.__name__: each for each in of_modules}
 CALLABLES |= {"Push.towards": Push.towards, "Push.path": Push(0.0).path}
 CALLABLES["from_dataset"] = interactions.InteractionTensors.from_dataset
@@ -115,10 +106,7 @@ def log_of_eight(**about):
 
 def fields_of(*made):
     """Arguments that give instances of dataclasses, by class."""
-    return {
-        type(one).__name__: {f.name: getattr(one, f.name) for f in dataclasses.fields(one)}
-        for one in made
-    }
+    return {type(one).__name__: dict(vars(one)) for one in made}
 
 
 @pytest.fixture(scope="module")
@@ -139,20 +127,16 @@ def shop(one_world, skills, pushes, levers, levered, tmp_path_factory):
     plan = Plan(goal, AT, (step,), "by hand", True, 0.0)
     effects = planning.EffectMap(model, image)
     problem = planning.PlanningProblem(AT, goal, effects, "single_partial")
-    batch = sample_mixed(arrays, 2, 2, torch.Generator().manual_seed(0))
+    batch = interactions.dataset.sample_mixed(arrays, 2, 2, torch.Generator().manual_seed(0))
     wall = Obstacle.disc((0.2, 0.0), 0.03)
     once = planning.ClosedLoopConfig(max_actions=1)
     pursuit = planning.run_closed_loop(one_world, goal, skills, config=once)
     figure, (_, ax) = plt.figure(), plt.subplots()
     rows = read_results("data/results/planning.json")["tables"]["summary"][:3]
-    numbers = {
-        "theta contact_x contact_y dy_m": 0.0,
-        "length width height diameter height_m": 0.05,
-        "dx_m reach direction_rad direction": 0.1,
-        "stop_phase phase level": 0.5,
-        "n_directions n_targets obs_max n_poses": 4,
-    }
-    numbers |= {"yaw_rad": 0.3, "n": 20, "max_steps": 2, "partial": True}
+    numbers = {"theta contact_x contact_y dy_m": 0.0, "dx_m reach direction_rad direction": 0.1}
+    numbers |= {"length width height diameter height_m": 0.05, "stop_phase phase level": 0.5}
+    numbers |= {"n_directions n_targets obs_max n_poses": 4, "yaw_rad": 0.3, "n": 20}
+    numbers |= {"max_steps": 2, "partial": True}
     places = {"xy_m at_xy_m start_xy_m": AT, "contact": (0.0, -0.03), "corners outline": CORNERS}
     places |= {"outline_m": np.array(CORNERS), "path_xy_m": np.array([[-0.1, 0.0], [0.0, 0.0]])}
     planned = {"action primitive": Push(0.0), "actions": [Push(0.0)], "step": step, "plan": plan}
@@ -173,11 +157,9 @@ def shop(one_world, skills, pushes, levers, levered, tmp_path_factory):
     names = {"primitive_named": "push", "category_named": "cuboid", "save_figure": "x"}
     names |= {"check": "01.1"}
     by_callable |= {each: {"name": name} for each, name in names.items()}
-    by_callable["load_checkpoint"] = {"name_or_path": "cnp_500"}
-    for each in ("open_interactions", "stored_sha256"):
-        by_callable[each] = {"name_or_path": "push_test"}
-    for each in ("condition_on_primitives", "fit_sigma_scale", "final_errors_m"):
-        by_callable[each] = {"model": network}
+    by_callable |= {"open_interactions stored_sha256": {"name_or_path": "push_test"}}
+    by_callable |= {"condition_on_primitives fit_sigma_scale final_errors_m": {"model": network}}
+    by_callable |= {"load_checkpoint": {"name_or_path": "cnp_500"}}
     by_callable |= {"plan_gradient": {"samples": 10}, "plan_astar": {"stop_phases": (0.5, 1.0)}}
     by_callable |= {"Grasp": {"seen_height": 0.05}, "PushAt": {"length": 0.01}}
     by_callable |= {"GoalPicker": {"view": False}, "settle": {"seconds": 0.1}}
@@ -212,20 +194,21 @@ def shop(one_world, skills, pushes, levers, levered, tmp_path_factory):
         "condition_on_poses": {"start": torch.zeros(12, dtype=torch.int64)},
         "descend": {"target_xy_m": np.array([0.05, 0.02]), "generator": np.random.default_rng(0)},
         "final_error": {"record": models.network_predictions(model, pushes, np.arange(2))},
-        "gaps_m": {"obstacles": [corners_of(wall)], "shapes": np.array([[CORNERS, CORNERS]])},
+        "gaps_m": {
+            "obstacles": [planning.corners_of(wall)],
+            "shapes": np.array([[CORNERS, CORNERS]]),
+        },
         "placed": {"corners": np.array(CORNERS), "poses": np.zeros((2, 3))},
         "plot_flow": {"boxes": {"a": (0, 0, "k"), "b": (1, 1, "k")}, "arrows": [("a", "b")]},
         "roll_out": {"direction_rad": torch.zeros(3, 1), "phase": torch.ones(3, 1)},
         "lever_up_tensors": {"data": levers},
         "predict_steps": {"tensors": levered, "protocol": "image_only"}
         | {"model": models.load_checkpoint("lever_up_last_pose_1800")[0]},
-        "predict_trajectories": {
-            "model": skills.model(Grasp),
-            "primitive": Grasp(),
-            "channel": "z",
-        },
+        "predict_trajectories": {"model": skills.model(Grasp), "channel": "z"}
+        | {"primitive": Grasp()},
     }
-    return {k: v for names, v in by_name.items() for k in names.split()}, by_callable
+    both = by_name, by_callable
+    return [{k: v for names, v in given.items() for k in names.split()} for given in both]
 
 
 def driven(name, shop):
@@ -275,9 +258,7 @@ def test_a_hostile_value_is_refused_by_name_or_does_no_harm(shop, name, tmp_path
     writers = ("write_results", "collect", "save_checkpoint", "save_model")
     if name in writers or name.startswith("train"):  # a relative path starts in the checkout
         monkeypatch.setattr("affordlib.results.repo_root", lambda: tmp_path)
-    found = []
-
-    rng = random.Random(os.environ.get("HOSTILE_SEED", "0") + name)
+    found, rng = [], random.Random(os.environ.get("HOSTILE_SEED", "0") + name)
     for _ in range(N_VALUES):
         argument, value = rng.choice(sorted(valid)), hostile(rng)
         began, wrong = time.process_time(), ""
@@ -302,7 +283,6 @@ def test_a_hostile_value_is_refused_by_name_or_does_no_harm(shop, name, tmp_path
             wrong = f"takes {took_s:.0f} s"
         if wrong:
             found.append(f"{argument}={value!r:.60} {wrong:.200}")
-
     plt.close("all")
     assert not found, "\n".join(found)
     assert not list(repo_root().glob("*/x.json"))
@@ -401,7 +381,7 @@ def of_a_data_set(path, fixture):
         data["category"].attrs = {k: new[k] for k in category if k in new}
         text = {k: json.dumps(v) for k, v in new.items() if (k, type(v)) == ("recipe", dict)}
         data.attrs = new | text  # a file holds a recipe as text
-        write_interactions(data, path, 1)
+        interactions.store.write_interactions(data, path, 1)
         read = interactions.open_interactions(path)
         yield read._repr_html_()
         yield words_as_html(str(network_predictions(model, read, np.arange(4))["category"]))

@@ -30,8 +30,6 @@ ABSOLUTE = re.compile(
 )
 
 READERS_DASK = {"REQUIRE_ENCRYPTION": "true", "DEFAULT_SCHEME": "tls"}  # no page may fail with it
-conf = pytest.fixture(lambda: runpy.run_path(f"{ROOT}/notebooks/book_html/conf.py"), scope="module")
-
 each_notebook = pytest.mark.parametrize("name", list(PATHS))
 
 
@@ -45,23 +43,11 @@ def default_parameters(name):
 
 
 def parameters(profile, seed=0):
-    options = {"PROFILE": profile, "SEED": str(seed), "OUT": "", "ARGS": ""}
-    return parameters_of_pages(options)
+    return parameters_of_pages({"PROFILE": profile, "SEED": str(seed), "OUT": "", "ARGS": ""})
 
 
 def code_of(notebook):
     return [cell for cell in notebook.cells if cell.cell_type == "code"]
-
-
-@each_notebook
-def test_parameters(name):
-    defaults = default_parameters(name)
-    assert defaults["seed"] == 0
-    assert defaults["out_dir"] == "runs/lab"
-    found = papermill.inspect_notebook(str(PATHS[name])).values()
-    for parameter in found:
-        assert parameter["inferred_type_name"] != "None", f"{parameter['name']} has no type"
-        assert parameter["help"].strip(), f"{parameter['name']} is not explained"
 
 
 @each_notebook
@@ -90,35 +76,33 @@ class WithoutNotes(ast.NodeTransformer):
 
 
 @each_notebook
-def test_every_parameter_is_used(name):
+def test_every_parameter_is_explained_and_used(name):
     """At least one cell does more than record it."""
+    defaults = default_parameters(name)
+    assert (defaults["seed"], defaults["out_dir"]) == (0, "runs/lab")
+    for parameter in papermill.inspect_notebook(str(PATHS[name])).values():
+        assert parameter["inferred_type_name"] != "None", f"{parameter['name']} has no type"
+        assert parameter["help"].strip(), f"{parameter['name']} is not explained"
     cells = code_of(read(name))
     at = next(i for i, c in enumerate(cells) if "parameters" in c.metadata.get("tags", []))
     code = [TransformerManager().transform_cell(cell.source) for cell in cells[at + 1 :]]
     nodes = [node for c in code for node in ast.walk(WithoutNotes().visit(ast.parse(c)))]
     names = {n.id for n in nodes if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Load)}
-    assert not default_parameters(name).keys() - names
-
-
-@pytest.mark.parametrize("profile", ["smoke", "reader", "full"])
-def test_every_value_of_a_profile_is_a_parameter_of_its_type(profile):
-    assert parameters(profile).keys() == PATHS.keys()
+    assert not defaults.keys() - names
 
 
 @each_notebook
-def test_colours_of_goal_prediction_and_truth_have_no_other_meaning(name):
-    for cell in code_of(read(name)):
-        for colour in (GOAL, PREDICTION, TRUTH):
-            assert colour.lower() not in cell.source.lower(), "use its name, where it is meant"
-
-
-@each_notebook
-def test_executed_in_order_without_errors(name):
+def test_executed_in_order_without_errors_small_clean_and_colours_have_one_meaning(name):
     cells = code_of(read(name))
+    for colour in (GOAL, PREDICTION, TRUTH):
+        assert not [c for c in cells if colour.lower() in c.source.lower()], "use its name"
     assert [cell.execution_count for cell in cells] == list(range(1, len(cells) + 1))
     outputs = [output for cell in cells for output in cell.outputs]
     assert outputs, "run `make notebooks`"
     assert [o for o in outputs if o.output_type == "error" or o.get("name") == "stderr"] == []
+    text = PATHS[name].read_text(encoding="utf-8")
+    assert len(text.encode()) < 1_500_000
+    assert text == cleaned(read(name)), "metadata is not clean; run `make notebooks`"
 
 
 READS_STORED = 'read_results(\\"data/results/'  # in JSON
@@ -138,11 +122,10 @@ def last_value(source, space):
 
 @pytest.mark.parametrize("name", STORED)
 def test_stored_results_are_shown_as_they_are_now(name):
-    notebook = read(name)
     space = {"np": np, "read_results": read_results, "results_table": results_table}
     space |= default_parameters(name)
     compared = 0
-    for cell in code_of(notebook):
+    for cell in code_of(read(name)):
         if not ("results_table(" in cell.source or "read_results(" in cell.source):
             continue
         assert "import " not in cell.source, "with the imports, cells that train would run here too"
@@ -152,13 +135,6 @@ def test_stored_results_are_shown_as_they_are_now(name):
             assert shown == [value._repr_html_()], f"run `make notebooks`: stale\n{cell.source}"
             compared += 1
     assert compared
-
-
-@each_notebook
-def test_small_and_clean(name):
-    text = PATHS[name].read_text(encoding="utf-8")
-    assert len(text.encode()) < 1_500_000
-    assert text == cleaned(read(name)), "metadata is not clean; run `make notebooks`"
 
 
 def test_of_a_widget_its_picture_is_kept():
@@ -173,25 +149,18 @@ def test_of_a_widget_its_picture_is_kept():
 
 
 @each_notebook
-def test_everything_shown_shows_on_the_web(name):
+def test_everything_shown_shows_on_the_web_and_nothing_depends_on_the_machine(name):
     """Web pages made from a notebook drop GIFs, and print the object's name instead."""
     known = {"image/png", "image/svg+xml", "image/jpeg", "text/html", "text/markdown"}
     for number, cell in enumerate(read(name).cells, 1):
+        words = [cell.source]
         for output in cell.get("outputs", []):
             data = output.get("data", {})
             alone = data.get("text/plain", "")
             assert data.keys() & known or "<" not in alone, f"cell {number} of {name}: {alone}"
-
-
-@each_notebook
-def test_nothing_depends_on_the_machine(name):
-    for number, cell in enumerate(read(name).cells, 1):
-        outputs = [
-            output.get("text", "")
-            + "".join(str(v) for k, v in output.get("data", {}).items() if k.startswith("text/"))
-            for output in cell.get("outputs", [])
-        ]
-        found = ABSOLUTE.search("\n".join([cell.source, *outputs]))
+            words += [output.get("text", "")]
+            words += [str(value) for kind, value in data.items() if kind.startswith("text/")]
+        found = ABSOLUTE.search("\n".join(words))
         assert not found, f"cell {number} of {name} holds the absolute path {found.group()!r}"
         if cell.cell_type == "code":
             bad = re.search(r"\bsys\.path\b|\bos\.chdir\b|^\s*[!%]\s*(pip|cd)\b", cell.source, re.M)
@@ -199,7 +168,9 @@ def test_nothing_depends_on_the_machine(name):
             assert "filterwarnings" not in cell.source
 
 
-def test_the_book_keeps_to_its_style():
+def test_the_book_keeps_to_its_style_and_values_of_profiles_to_their_types():
+    for profile in ("smoke", "reader", "full"):
+        assert parameters(profile).keys() == PATHS.keys()
     assert [picture[:4] for picture, _ in figures().values()] == [b"\x89PNG"] * len(FIGURES)
     assert book_check.check()[1] == []
 
@@ -235,8 +206,7 @@ def run_with_nbval(copy):
 @pytest.fixture(scope="module")
 def smoke(tmp_path_factory):
     """The folder of the runs of one worker: notebooks may read files of earlier ones."""
-    folder = tmp_path_factory.mktemp("smoke")
-    return folder, parameters("smoke", seed=1)
+    return tmp_path_factory.mktemp("smoke"), parameters("smoke", seed=1)
 
 
 @pytest.mark.slow
@@ -280,22 +250,20 @@ def test_the_same_route_fails_on_a_broken_notebook(tmp_path):
     assert "mismatch 'stdout'" in done.stdout
 
 
-def test_a_picture_is_described_by_its_caption_also_after_jupyterlab_has_saved_the_page(conf):
+def test_a_picture_is_described_by_its_caption_without_its_marks():
+    """Also after JupyterLab has saved the page."""
+    describe = runpy.run_path(f"{ROOT}/notebooks/book_html/conf.py")["describe"]
     picture = {"data": {"image/png": "…"}, "metadata": {"image/png": {"width": 900}}}
     cell = {"cell_type": "code", "source": ["plot()"], "metadata": {}, "outputs": [picture]}
     caption = "**Figure 1.2.** Turn $\\varphi_1$ of *aligned* pushes by `A*` ([why](06.ipynb))."
-    conf["describe"](cell, caption)
+    describe(cell, caption)
     assert cell["metadata"]["mystnb"]["image"]["alt"] == "Turn φ1 of aligned pushes by A* (why)."
-    conf["describe"](cell, "Text.")
+    describe(cell, "Text.")
     assert cell["metadata"]["mystnb"]["image"]["alt"]
-
-
-def test_no_alternative_text_of_the_book_has_marks(conf):
-    for path in (repo_root() / "notebooks").rglob("[0-9A]*.ipynb"):
-        cells = json.loads(path.read_text())["cells"]
-        for cell, below in itertools.pairwise(cells):
+    for path in (ROOT / "notebooks").rglob("[0-9A]*.ipynb"):
+        for cell, below in itertools.pairwise(json.loads(path.read_text())["cells"]):
             if cell["cell_type"] == "code":
-                conf["describe"](cell, "".join(below["source"]))
+                describe(cell, "".join(below["source"]))
                 alt = cell["metadata"]["mystnb"].get("image", {}).get("alt", "")
                 assert not {"$", "\\", "`"} & set(alt), (path, alt)
                 assert "*" not in alt.replace("A*", ""), (path, alt)

@@ -1,6 +1,5 @@
 """Results are read back unchanged, written completely or not at all; tables are made from them."""
 
-import errno
 import json
 import math
 import os
@@ -16,7 +15,7 @@ from affordlib import results
 from affordlib.results import read_results, write_results
 from experiments import tables
 from experiments.tables import fill_tables, markdown_table
-from tests.waiting import wait_until
+from tests.waiting import no_room, wait_until
 
 ROWS = [
     {"planner": "astar", "n": 30, "mean_m": 0.00441, "plan_ms_median": 12.345, "tp_percent": 80.0},
@@ -41,32 +40,25 @@ def test_round_trip_converts_numpy_scalars(tmp_path):
     assert read_results(write_results(tmp_path, "a", {}, {"t": []}))["tables"] == {"t": []}
 
 
-@pytest.mark.parametrize(
-    ("table", "named"),
-    [
+def test_bad_tables_are_refused_before_anything_is_written(tmp_path):
+    for table, named in (
         ([{"mean_m": math.nan}], r"tables\['t'\]\[0\]\['mean_m'\] is nan"),
         ([{"a": 1.0}, {"a": np.float64("-inf")}], r"\[1\]\['a'\] is -inf"),
         ([{"a": np.zeros(2)}], r"\['a'\] .*ndarray"),
         ([{3: 1}], r"tables\['t'\]\[0\] has the key 3"),
         ({"a": 1}, r"tables\['t'\] .*dict"),
         ([[1]], r"tables\['t'\] .*each a dict"),
-    ],
-)
-def test_bad_tables_are_refused_before_anything_is_written(tmp_path, table, named):
-    with pytest.raises((TypeError, ValueError), match=named):
-        write_results(tmp_path, "06_planning", {}, {"t": table})
-    assert list(tmp_path.iterdir()) == []
+    ):
+        with pytest.raises((TypeError, ValueError), match=named):
+            write_results(tmp_path, "06_planning", {}, {"t": table})
+        assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("step", ["fsync", "replace"])
 def test_a_full_disk_leaves_the_old_file(tmp_path, monkeypatch, step):
     path = write_results(tmp_path, "a", {}, {"t": [{"n": 1}]})
     before = path.read_bytes()
-
-    def fail(*_):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(os, step, fail)
+    monkeypatch.setattr(os, step, no_room)
     with pytest.raises(OSError, match=r"No space left.*a\.json") as failure:
         write_results(tmp_path, "a", {}, {"t": [{"n": 2}]})
     assert failure.value.filename == str(path)
@@ -101,20 +93,17 @@ def test_a_kill_leaves_no_half_file_and_the_next_writer_no_leftovers(tmp_path):
     assert sorted(tmp_path.iterdir()) == [living, path]
 
 
-@pytest.mark.parametrize(
-    ("text", "reason"),
-    [
+def test_damaged_or_missing_results_are_named(tmp_path):
+    for text, reason in (
         ('{"notebook": "a", "parameters": {}, "vers', "JSONDecodeError"),
         ('{"notebook": 1, "parameters": 1, "versions": 1, "tables": {"t": [{"a": NaN}]}}', "nan"),
         ('{"notebook": "a", "parameters": {}, "versions": {}}', "KeyError.'tables'"),
         ("[]", "TypeError"),
         ("[" * 100_000, "RecursionError"),
-    ],
-)
-def test_damaged_or_missing_results_are_named(tmp_path, text, reason):
-    (tmp_path / "a.json").write_text(text)
-    with pytest.raises(ValueError, match=rf"a\.json .*{reason}.*delete it and run"):
-        read_results(tmp_path / "a.json")
+    ):
+        (tmp_path / "a.json").write_text(text)
+        with pytest.raises(ValueError, match=rf"a\.json .*{reason}.*delete it and run"):
+            read_results(tmp_path / "a.json")
     with pytest.raises(FileNotFoundError, match=r"b\.json; run the notebook"):
         read_results(tmp_path / "b.json")
 
@@ -149,14 +138,11 @@ def test_tables_show_units_and_few_digits():
     table = results.results_table(ROWS, ["planner", "mean_m"])
     assert list(table.columns) == ["planner", "mean, mm"]
     assert table.to_numpy().tolist() == [["astar", "4.41"], ["gradient", "–"]]
+    for column, value, head, shown in SHOWN:  # units come from the name
+        assert (results.heading(column), results.cell(column, value)) == (head, shown)
 
 
-@pytest.mark.parametrize(("column", "value", "head", "shown"), SHOWN)
-def test_units_come_from_the_name(column, value, head, shown):
-    assert (results.heading(column), results.cell(column, value)) == (head, shown)
-
-
-def test_pages_are_filled_and_checked(tmp_path, capsys):
+def test_pages_are_filled_and_checked_and_blocks_must_choose_what_is_there(tmp_path, capsys):
     source = write_results(tmp_path, "06_planning", {}, {"planning": ROWS})
     page = tmp_path / "page.md"
     opened = f"<!-- table: {source}#planning -->\n"
@@ -167,16 +153,12 @@ def test_pages_are_filled_and_checked(tmp_path, capsys):
     assert tables.main([str(page)]) == 0
     assert page.read_text() == f"# Title\n\n{opened}{MARKDOWN}<!-- /table -->\n\nend\n"
     assert tables.main(["--check", str(page)]) == 0
-
-
-def test_blocks_that_choose_what_is_not_there_are_refused(tmp_path):
-    source = write_results(tmp_path, "06_planning", {}, {"planning": ROWS})
     block = "<!-- table: {}#planning {} -->\n<!-- /table -->\n"
     for option, reason in [("planner=rrt", "no row"), ("columns=x", "'x'"), ("mode=a", "'mode'")]:
         with pytest.raises(ValueError, match=reason):
             fill_tables(block.format(source, option))
     with pytest.raises(ValueError, match="not closed"):
-        fill_tables(f"<!-- table: {source}#planning -->\n")
+        fill_tables(opened)
 
 
 def test_columns_are_drawn_as_dots_once(tmp_path, monkeypatch, capsys):

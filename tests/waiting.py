@@ -1,5 +1,6 @@
-"""Starting other processes, and waiting for them or for threads."""
+"""What several tests need: other processes, waiting for them or for threads, damage, full disks."""
 
+import errno
 import signal
 import subprocess
 import sys
@@ -19,6 +20,17 @@ def printed(code, **options):
     done = subprocess.run(command, capture_output=True, text=True, **options)
     assert (done.returncode, done.stderr) == (0, ""), done.stderr
     return done.stdout
+
+
+def flipped(content, at, bit=0):
+    """Bytes of which one bit is changed."""
+    changed = bytearray(content)
+    changed[at] ^= 1 << int(bit)
+    return bytes(changed)
+
+
+def no_room(*_):
+    raise OSError(errno.ENOSPC, "No space left on device")
 
 
 def wait_until(condition, seconds=60.0, process=None, otherwise="waited in vain"):

@@ -21,12 +21,12 @@ from experiments.runner import Job, frame, read, run
 
 TABLE, SHIPPED = "experiments.effect_prediction", "experiments.shipped data"
 CALLS, DEADLY = [], set()
+ENDS = {signal.SIGINT: 130, signal.SIGTERM: 143, None: 1, 0: 7}
 TABLES = ("effect_prediction", "lever_up", "planning", "closed_loop", "real_pushes", "headline")
 
 
-@pytest.mark.parametrize(
-    ("line", "code", "named"),
-    [
+def test_unknown_names_and_impossible_numbers_are_refused(capsys):
+    for line, code, named in (
         (f"{TABLE} --workers -2", 2, "--workers: must be .* from 1 to 256"),
         (f"{SHIPPED} --workers 257", 2, "--workers: must be .* from 1 to 256"),
         (f"{SHIPPED} --only nope", 2, "--only: invalid choice: 'nope'"),
@@ -34,27 +34,22 @@ TABLES = ("effect_prediction", "lever_up", "planning", "closed_loop", "real_push
         (f"{TABLE} --only model=film,flim", 1, "no job has model = 'flim', but cnp, .*, nearest$"),
         (f"{TABLE} --only fold=11", 1, "no job has fold = '11', but 0, 1,"),
         (f"{TABLE} --only modle=film", 1, "no job has modle = 'film', but None$"),
-    ],
-)
-def test_unknown_names_and_impossible_numbers_are_refused(capsys, line, code, named):
-    name, *arguments = line.split()
-    try:
-        ended = importlib.import_module(name).main(arguments)
-    except SystemExit as stopped:
-        ended = stopped.code
-    assert ended == code
-    begins = {1: "^effect_prediction: --only: ", 2: "error: (argument )?"}[code]
-    assert re.search(begins + named, capsys.readouterr().err, re.MULTILINE)
+    ):
+        name, *arguments = line.split()
+        try:
+            ended = importlib.import_module(name).main(arguments)
+        except SystemExit as stopped:
+            ended = stopped.code
+        assert ended == code, line
+        begins = {1: "^effect_prediction: --only: ", 2: "error: (argument )?"}[code]
+        assert re.search(begins + named, capsys.readouterr().err, re.MULTILINE)
 
 
-def test_every_command_line_ends_in_this_way():
-    for path in (repo_root() / "experiments").glob("*.py"):
-        assert not re.search(r"(?m)^(?!@command\().*\ndef main\(argv", path.read_text()), path
-
-
-def test_the_texts_name_commands_and_options_that_exist():
+def test_command_lines_end_in_this_way_and_the_texts_name_commands_and_options_that_exist():
     root, makefile = repo_root(), (repo_root() / "Makefile").read_text()
     modules = {p.stem: p.read_text() for p in root.glob("experiments/**/*.py")} | {"try_it": ""}
+    for path in (root / "experiments").rglob("*.py"):
+        assert not re.search(r"(?m)^(?!@command\().*\ndef main\(argv", path.read_text()), path
     for path in [*root.glob("*.md"), *root.glob("data/*.md"), *root.glob("notebooks/**/*.ipynb")]:
         text = path.read_text()
         for name in re.findall(r"[A-Z]+(?==)", " ".join(re.findall(r"make [a-z-]+ [^`\n]*", text))):
@@ -65,9 +60,7 @@ def test_the_texts_name_commands_and_options_that_exist():
                 assert f'"{option}"' in "".join(modules.values()), (path, option)
 
 
-@pytest.mark.parametrize(
-    ("how", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (None, 1), (0, 7)]
-)
+@pytest.mark.parametrize(("how", "code"), ENDS.items())
 def test_a_command_ends_with_a_status_and_one_line(capsys, how, code):
     @command(OSError)
     def main():

@@ -10,7 +10,7 @@ import torch
 
 from affordlib import primitives
 from affordlib.interactions import open_interactions
-from affordlib.planning import MODES
+from affordlib.planning import MODES, Skills
 from affordlib.planning.skills import Reachability
 from affordlib.primitives import Drag, Grasp, Push, Rotate
 from affordlib.results import repo_root
@@ -81,8 +81,7 @@ def test_a_shipped_checkpoint_can_be_trained_again(monkeypatch, capsys):
 
 def test_planners_differ_and_are_asked_about_all_their_categories_alike():
     assert CONFIGS["continuous"].classes == STANDING + ROLLABLE
-    assert CONFIGS["gradient_100_pushes"].classes == STANDING
-    assert CONFIGS["outside"].classes == STANDING
+    assert CONFIGS["gradient_100_pushes"].classes == CONFIGS["outside"].classes == STANDING
     assert len({repr(config) for config in CONFIGS.values()}) == len(CONFIGS)
     for name, config in CONFIGS.items():
         tasks = frozen_tasks(config.world)
@@ -236,12 +235,12 @@ def test_the_shipped_one_was_learned_so(learned, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["mine.safetensors"]
 
 
-def test_a_primitive_that_was_not_learned_is_left_to_the_kinematics(monkeypatch):
+def test_a_primitive_that_was_not_learned_is_left_to_the_kinematics(learned, film, monkeypatch):
     monkeypatch.setitem(primitives.PRIMITIVES, "tap", type("Tap", (Push,), {"name": "tap"}))
     assert (Reachability.load().probability("tap", np.zeros((2, 2))) == 1.0).all()
-
-
-def test_an_unknown_primitive_and_other_shapes_are_told(learned):
+    # An unknown one, and other shapes, are told.
+    with pytest.raises(ValueError, match=r"one of .*'push'.* got 'pusch'"):
+        Skills({"pusch": film})
     with pytest.raises(ValueError, match=r"primitive must be one of .*, got 'kick'"):
         learned.probability("kick", np.zeros((1, 2)))
     with pytest.raises(ValueError, match=r"xy_m must be finite numbers of shape"):

@@ -1,6 +1,5 @@
 """Data sets: collecting them, with kills and workers; shipped files, damage, splits, sampling."""
 
-import errno
 import os
 import random
 import shutil
@@ -10,7 +9,6 @@ import threading
 import time
 import zipfile
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import psutil
@@ -20,22 +18,18 @@ import xarray as xr
 from dask.distributed import Client
 from joblib import parallel_config
 
-import affordlib
 from affordlib import interactions, results
 from affordlib.interactions import collect, open_interactions
-from affordlib.interactions.collect import attributes_for, collect_chunk
-from affordlib.interactions.collect import collect as collect_set
 from affordlib.interactions.dataset import condition_on_recorded_action, sample_mixed
 from affordlib.interactions.recipes import RECIPES, Recipe, interact
 from affordlib.interactions.store import dataset_sha256, stored_sha256, write_interactions
 from affordlib.models.checkpoint import load_state
 from affordlib.world import Cuboid
 from experiments import shipped
-from tests.waiting import printed, start, wait_until
+from tests.waiting import flipped, no_room, printed, start, wait_until
 
 SMALL = Recipe(n_interactions=6, seed=11)
 CONTINUE = "finished chunks are kept; collect into the same path to continue"
-ROOT = Path(affordlib.__file__).parents[1]
 
 
 @pytest.fixture(autouse=True)
@@ -47,7 +41,7 @@ def small_chunks(monkeypatch):
 def undisturbed(tmp_path_factory):
     """A file that is collected in this process, uninterrupted."""
     path = tmp_path_factory.mktemp("undisturbed") / "set.zarr.zip"
-    return collect_set(SMALL, path, progress=False, chunk=2)
+    return collect.collect(SMALL, path, progress=False, chunk=2)
 
 
 @pytest.fixture
@@ -60,7 +54,7 @@ def made(monkeypatch):
         values = [np.random.default_rng(i).random(5000, dtype=np.float32) for i in numbers]
         kinds = ("interaction", np.zeros(len(values), np.int8), {"flag_meanings": "cuboid"})
         found = {"x": (("interaction", "value"), values), "category": kinds}
-        return xr.Dataset(found, attrs=attributes_for(recipe))
+        return xr.Dataset(found, attrs=collect.attributes_for(recipe))
 
     monkeypatch.setattr(collect, "collect_chunk", chunk)
     return made
@@ -70,39 +64,35 @@ def names_in(folder):
     return [path.name for path in folder.iterdir()]
 
 
-def no_room(*_):
-    raise OSError(errno.ENOSPC, "No space left on device")
-
-
 @pytest.mark.slow
 def test_a_file_holds_what_the_interactions_left(undisturbed):
-    expected, path = collect_chunk(SMALL, range(6)), undisturbed
+    expected, path = collect.collect_chunk(SMALL, range(6)), undisturbed
     for read in (open_interactions(path), open_interactions(f"file://{path}")):
         assert read.identical(expected[list(read.data_vars)])
         assert all(read[name].dtype == expected[name].dtype for name in expected.variables)
         assert dataset_sha256(read) == dataset_sha256(expected) == stored_sha256(path)
-        assert read.attrs == attributes_for(SMALL)
+        assert read.attrs == collect.attributes_for(SMALL)
     assert names_in(path.parent) == [path.name]
 
 
 def test_a_set_is_made_once_and_nothing_else_is_replaced(tmp_path, made):
     path = tmp_path / "x.zarr.zip"
     for _ in range(2):
-        assert collect_set(SMALL, path, progress=False) == path
+        assert collect.collect(SMALL, path, progress=False) == path
         assert made == [0, 2, 4]
     before = path.read_bytes()
     with pytest.raises(ValueError, match=r"x\.zarr\.zip is a set of another recipe"):
-        collect_set(replace(SMALL, seed=12), path, progress=False)
+        collect.collect(replace(SMALL, seed=12), path, progress=False)
     (tmp_path / "folder.zarr.zip").mkdir()
     (tmp_path / "link.zarr.zip").symlink_to(tmp_path / "nowhere")
     (tmp_path / "half.zarr.zip").write_bytes(before[: len(before) // 2])
     there = sorted(tmp_path.rglob("*"))
     for name in ("folder", "link", "half"):
         with pytest.raises(ValueError, match=rf"path .*{name}.* (choose|delete)"):
-            collect_set(SMALL, tmp_path / f"{name}.zarr.zip", progress=False)
+            collect.collect(SMALL, tmp_path / f"{name}.zarr.zip", progress=False)
     assert sorted(tmp_path.rglob("*")) == there
     assert (path.read_bytes(), made) == (before, [0, 2, 4])
-    collect_set(SMALL, tmp_path / "half.zarr.zip", progress=False, replace=True)
+    collect.collect(SMALL, tmp_path / "half.zarr.zip", progress=False, replace=True)
     assert (tmp_path / "half.zarr.zip").read_bytes() == before
 
 
@@ -111,19 +101,17 @@ def test_what_a_full_disk_has_left_out_or_damaged_is_made_again(tmp_path, made, 
     with monkeypatch.context() as full:
         full.setattr(os, "fsync", lambda handle: real(handle) if room and room.pop() else no_room())
         with pytest.raises(OSError, match="No space left") as failure:
-            collect_set(SMALL, path, progress=False)
+            collect.collect(SMALL, path, progress=False)
     assert failure.value.__notes__ == [CONTINUE]
     with pytest.raises(FileNotFoundError, match="no file"):
         open_interactions(path)
     assert not list(tmp_path.rglob("*.tmp"))
     first, second, _ = sorted(tmp_path.glob(".x*.parts/*.zip"))
     first.unlink()
-    damaged = bytearray(second.read_bytes())
-    damaged[len(damaged) // 2] ^= 1
-    second.write_bytes(damaged)
-    collect_set(SMALL, path, progress=False)
+    second.write_bytes(flipped(second.read_bytes(), second.stat().st_size // 2))
+    collect.collect(SMALL, path, progress=False)
     assert made == [0, 2, 4, 0, 2]
-    whole = collect_set(SMALL, tmp_path / "y.zarr.zip", progress=False, chunk=4)
+    whole = collect.collect(SMALL, tmp_path / "y.zarr.zip", progress=False, chunk=4)
     assert path.read_bytes() == whole.read_bytes()
     assert sorted(names_in(tmp_path)) == ["x.zarr.zip", "y.zarr.zip"]
 
@@ -131,10 +119,10 @@ def test_what_a_full_disk_has_left_out_or_damaged_is_made_again(tmp_path, made, 
 def test_paths_and_workers_that_cannot_be_are_named(tmp_path):
     for path in (tmp_path / "x.zip", tmp_path / "x.zarr"):
         with pytest.raises(ValueError, match=r"path must end in .*got .*x\."):
-            collect_set(SMALL, path)
+            collect.collect(SMALL, path)
     for workers in (0, 10**6):
         with pytest.raises(ValueError, match=rf"workers must be a whole number .* {workers}$"):
-            collect_set(SMALL, tmp_path / "x.zarr.zip", workers=workers)
+            collect.collect(SMALL, tmp_path / "x.zarr.zip", workers=workers)
 
 
 SCRIPT = """
@@ -149,7 +137,9 @@ collect.collect(recipe, sys.argv[1], workers=2, progress=False)
 
 
 def start_collector(path, n_interactions):
-    return start([sys.executable, "-c", SCRIPT, str(path), str(n_interactions)], cwd=ROOT)
+    return start(
+        [sys.executable, "-c", SCRIPT, str(path), str(n_interactions)], cwd=results.repo_root()
+    )
 
 
 @pytest.mark.slow
@@ -162,7 +152,7 @@ def test_a_collector_killed_at_any_moment_is_no_loss(undisturbed, tmp_path):
     process.kill()
     process.communicate(timeout=180)  # its workers write to the same pipes
     assert not psutil.wait_procs(family, timeout=5)[1]  # it leaves no workers
-    collect_set(SMALL, path, progress=False)
+    collect.collect(SMALL, path, progress=False)
     assert path.read_bytes() == undisturbed.read_bytes()
     assert names_in(tmp_path) == [path.name]
 
@@ -193,17 +183,17 @@ def test_a_chunk_that_cannot_be_made_on_a_cluster_is_named(tmp_path, made, monke
     wrong = pytest.raises(RuntimeError, match="interactions 4 to 5 failed: IndexError: pop")
     with Client(processes=False, n_workers=2, threads_per_worker=1, dashboard_address=None):
         with parallel_config("dask"), wrong:
-            collect_set(SMALL, path, progress=False)
+            collect.collect(SMALL, path, progress=False)
         assert not path.exists()
         monkeypatch.setattr(collect, "collect_chunk", make)
         with parallel_config("dask"):
-            collect_set(SMALL, path, progress=False)
+            collect.collect(SMALL, path, progress=False)
     assert names_in(tmp_path) == [path.name]
 
 
 def test_where_no_processes_can_be_had_there_is_one(tmp_path, made, monkeypatch):
     monkeypatch.setattr("affordlib.workers.mp", None)  # joblib's, where /dev/shm is read-only
-    collect_set(SMALL, tmp_path / "set.zarr.zip", workers=2, progress=False)
+    collect.collect(SMALL, tmp_path / "set.zarr.zip", workers=2, progress=False)
     assert made == [0, 2, 4]
 
 
@@ -216,8 +206,8 @@ def test_a_worker_that_dies_says_so(undisturbed, tmp_path):
             return super().to_json() if os.getpid() == here else os._exit(9)
 
     with pytest.raises(RuntimeError, match="unexpectedly terminated"):
-        collect_set(Deadly(**vars(SMALL)), path, 2, progress=False)
-    collect_set(SMALL, path, 2, progress=False)
+        collect.collect(Deadly(**vars(SMALL)), path, 2, progress=False)
+    collect.collect(SMALL, path, 2, progress=False)
     assert path.read_bytes() == undisturbed.read_bytes()
 
 
@@ -226,15 +216,14 @@ def test_workers_get_the_classes_of_a_user(tmp_path, monkeypatch):
     brick = type("Brick", (Cuboid,), {"category": "brick"})
     monkeypatch.setitem(collect.CATEGORIES, "brick", brick)
     own = replace(SMALL, categories=("brick",))
-    one, two = (collect_set(own, tmp_path / f"{n}.zarr.zip", n, False) for n in (1, 2))
+    one, two = (collect.collect(own, tmp_path / f"{n}.zarr.zip", n, False) for n in (1, 2))
     assert one.read_bytes() == two.read_bytes()
 
 
 @pytest.mark.slow
 def test_make_data_compares_with_what_was_there(undisturbed, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(shipped, "RECIPES", {"push": SMALL})
-    where = ["--to", str(tmp_path), "--workers", "2"]
-    arguments = ["data", "--only", "push", *where]
+    arguments = ["data", "--only", "push", "--to", str(tmp_path), "--workers", "2"]
     assert shipped.main(arguments) == 1
     assert "not the same: 6 interactions, formerly 500" in capsys.readouterr().out
     assert (tmp_path / "push.zarr.zip").read_bytes() == undisturbed.read_bytes()
@@ -264,14 +253,9 @@ def test_a_worker_watches_its_parent_before_it_imports_what_is_large():
     assert printed(code) == "set()\n"
 
 
-@pytest.fixture(scope="module", params=list(RECIPES))
-def shipped_set(request):
-    return request.param, open_interactions(request.param)
-
-
-def test_the_shipped_sets_are_what_their_recipes_say(shipped_set, world):
-    name, data = shipped_set
-    recipe = RECIPES[name]
+@pytest.mark.parametrize(("name", "recipe"), RECIPES.items())
+def test_the_shipped_sets_are_what_their_recipes_say(name, recipe, world):
+    data = open_interactions(name)
     assert Recipe.from_json(data.attrs["recipe"]) == recipe
     assert data.attrs["recipe"] == recipe.to_json()
     assert data.sizes["interaction"] == recipe.n_interactions
@@ -285,27 +269,20 @@ def test_the_shipped_sets_are_what_their_recipes_say(shipped_set, world):
         assert gap < 0.001
         assert stored["size"].values[2] == pytest.approx(obj.height_m, abs=2e-6)
         assert bool(stored["success"]) == seen.success
-
-
-def test_few_interactions_are_flagged_and_all_say_why(shipped_set):
-    name, data = shipped_set
+    # Few interactions are flagged, and all say why.
     reasons = (data["tracking_error"] > 0.002) | (data["penetration"] > 0.002)
     np.testing.assert_array_equal(data["fault"].values, reasons.values)
     assert data["fault"].values.mean() < 0.05
     assert not data["effect"].values[~data["reached"].values].any()
     assert data["reached"].values.all() or name == "reach"
-
-
-def test_the_tool_was_where_the_action_says(shipped_set):
-    """Measured every 150 ms, as in the paper; a guarded hand may have stopped above its target."""
-    name, data = shipped_set
+    # The tool was where the action says, measured every 150 ms, as in the paper.
     ok = data["reached"].values & ~data["fault"].values
     commanded = data["action"].values[ok][:, ::12, :3]
     measured = data["tool"].values[ok][:, :, :3]
     if name == "push_varied":  # its gripper moves higher than commanded, by an amount it measures
         commanded, measured = commanded[..., :2], measured[..., :2]
     off = measured - commanded
-    if name == "grasp":
+    if name == "grasp":  # a guarded hand may have stopped above its target
         assert off[..., 2].max() > 0.01
         off[..., 2] = np.minimum(off[..., 2], 0)
     # The waypoints of a very short action are further apart than its samples.
@@ -334,9 +311,8 @@ def test_whatever_is_damaged_or_missing_is_named(tmp_path):
     with zipfile.ZipFile(path) as archive:
         files = {name: archive.read(name) for name in archive.namelist()}
     for name, content in files.items():
-        damaged = bytearray(content)
-        damaged[rng.integers(len(content))] ^= 1 << int(rng.integers(8))
-        for changed in (None, b"{}" if name == "manifest.json" else bytes(damaged)):
+        damaged = flipped(content, rng.integers(len(content)), rng.integers(8))
+        for changed in (None, b"{}" if name == "manifest.json" else damaged):
             with zipfile.ZipFile(path, "w") as archive:
                 for other, stored in (files | {name: changed}).items():
                     if stored is not None:
@@ -345,9 +321,7 @@ def test_whatever_is_damaged_or_missing_is_named(tmp_path):
                 open_interactions(path)
     caught = 0
     for position in rng.integers(0, len(whole), 40):
-        damaged = bytearray(whole)
-        damaged[position] ^= 1 << int(rng.integers(8))
-        path.write_bytes(damaged)
+        path.write_bytes(flipped(whole, position, rng.integers(8)))
         try:  # a flip in the zip's padding or times harms nothing
             assert dataset_sha256(open_interactions(path)) == expected
         except interactions.CorruptedDataError:

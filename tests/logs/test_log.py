@@ -16,12 +16,8 @@ from experiments.real_pushes import pushes_of
 TRIANGLE_MM, SHIPPED_MM = ((0, 0), (150, 0), (0, 150)), ((0, 0), (130, 0), (30, 110))
 CENTRE_MM = np.array([50.0, 50.0])
 START, END = (600.0, -20.0, 0.3), (598.555, -8.562, 0.38)  # the tool touches in both
-PUSH = {
-    "tool_t": np.linspace(0, 6.6, 12),
-    "poses": (START, END),
-    "context": {"surface": "felt"},
-    "group": "felt_mid",
-}
+PUSH = {"tool_t": np.linspace(0, 6.6, 12), "poses": (START, END)}
+PUSH |= {"context": {"surface": "felt"}, "group": "felt_mid"}
 
 
 def tool(angle=0.3, at=(600.0, -20.0)):
@@ -67,13 +63,10 @@ def test_units_frames_tables_and_poses_in_between_change_nothing():
     log.add(**one())
     x, y, yaw = END
     away = rotated(np.array([x, y]) - (600, -20), np.radians(-40) - 0.3) / 1e3
-    elsewhere = {
-        "poses": ((0.0, 0.0, -40.0), (*away, -40 + np.degrees(yaw - 0.3))),
-        "tool_xy": rotated(tool(0.0, (0, 0)), np.radians(-40)) / 1e3,
-    }
+    poses = (0.0, 0.0, -40.0), (*away, -40 + np.degrees(yaw - 0.3))
     closed = [*TRIANGLE_MM, TRIANGLE_MM[0]]  # as other programs store outlines
     other = Log("m", np.array(closed) / 1e3, angle_unit="deg")
-    other.add(**one(**elsewhere))
+    other.add(**one(poses=poses, tool_xy=rotated(tool(0.0, (0, 0)), np.radians(-40)) / 1e3))
     # The object is seen until after the tool has stopped, when someone takes it away.
     times, poses = [0.0, 3.3, 6.6, 9.0], [START, START, END, (0.0, 0.0, 0.0)]
     table = {"poses": pd.DataFrame(poses), "poses_t": pd.Series(times)}
@@ -347,8 +340,7 @@ def test_from_a_csv_to_a_model_and_a_plan(cells, tmp_path):
 
     # The page goes on with a model read from a file: it predicts as the fitted one does.
     fitted = fit(pushes, "np", seed=0)
-    for one, other in zip(fitted.predict(pushes), names["model"].predict(pushes), strict=True):
-        np.testing.assert_allclose(one, other, atol=1e-6)
+    np.testing.assert_allclose(fitted.predict(pushes), names["model"].predict(pushes), atol=1e-6)
 
     # The first push, in the robot's frame and unit, is a push of the log: recorded, it reads alike.
     contact, end = names["contact_mm"], names["end_mm"]

@@ -15,6 +15,7 @@ from affordlib.logs.physics import ELLIPSOID, AnalyticPusher, quasi_static_push
 from experiments.pretrain_np import save_neural_process, simulate
 
 TRIANGLE_M = np.array([(-0.05, -0.05), (0.1, -0.05), (-0.05, 0.1)])
+rows = pytest.fixture(lambda: simulate(1, torch.Generator().manual_seed(8))[0][0])
 simulated = pytest.fixture(lambda: simulate(24, torch.Generator().manual_seed(5)), scope="module")
 shipped = pytest.fixture(lambda: load_neural_process(), scope="module")
 
@@ -22,17 +23,11 @@ shipped = pytest.fixture(lambda: load_neural_process(), scope="module")
 def log_of(rows, context=None, outline_m=TRIANGLE_M):
     """Simulated pushes (n, 10) of a triangle as a log."""
     rows = rows.double().numpy() * [0.05, 0.05, 1, 1, 1, 1, 0.05, 0.05, 0.05, 1]
-    return LoggedPushes(
-        contact_m=rows[:, :2],
-        normal=rows[:, 2:4],
-        direction=rows[:, 4:6],
-        length_m=rows[:, 6],
-        displacement_m=rows[:, 7:9],
-        turn_rad=rows[:, 9],
-        groups=np.array(["a", "b"] * len(rows))[: len(rows)],
-        context=context or {},
-        outline_m=outline_m,
-    )
+    way = {"contact_m": rows[:, :2], "normal": rows[:, 2:4], "direction": rows[:, 4:6]}
+    moved = {"length_m": rows[:, 6], "displacement_m": rows[:, 7:9], "turn_rad": rows[:, 9]}
+    groups = np.array(["a", "b"] * len(rows))[: len(rows)]
+    about = {"groups": groups, "context": context or {}, "outline_m": outline_m}
+    return LoggedPushes(**way, **moved, **about)
 
 
 def test_push_through_the_centre_of_friction_goes_straight():
@@ -94,10 +89,9 @@ def test_order_of_context_and_what_is_not_seen_do_not_matter(shipped, simulated)
         seen = torch.arange(32).expand(4, -1) < 20
         hidden = shipped(query, rows[:4, :32], given, seen)
         alone = shipped(query[:, 3:4], context, given)
-    for mine, other, masked, one in zip(expected, got, hidden, alone, strict=True):
-        torch.testing.assert_close(mine, other, atol=1e-5, rtol=0)
-        torch.testing.assert_close(mine, masked, atol=1e-5, rtol=0)
-        torch.testing.assert_close(mine[:, 3:4], one, atol=1e-5, rtol=0)
+    last = [value[:, 3:4] for value in expected]
+    for a, b in ((expected, got), (expected, hidden), (last, alone)):
+        torch.testing.assert_close(a, b, atol=1e-5, rtol=0)
 
 
 def test_prediction_turns_and_mirrors_with_the_object(shipped, simulated):
@@ -122,10 +116,8 @@ def test_context_and_feet_make_predictions_better(shipped, simulated):
     assert off[3] < off[0], off
 
 
-def test_tuning_lowers_the_error_where_the_world_is_another():
-    # A world in which pushes move objects 15 % less than in pretraining.
-    rows = simulate(1, torch.Generator().manual_seed(8))[0][0]
-    rows[:, 7:] *= 0.85
+def test_tuning_lowers_the_error_where_the_world_is_another(rows):
+    rows[:, 7:] *= 0.85  # pushes move objects 15 % less than in pretraining
     train, test = log_of(rows[:40]), log_of(rows[40:])
     model = fit(train, "np")
     truth = np.column_stack([test.displacement_m, test.turn_rad]) / [0.05, 0.05, 1]
@@ -144,8 +136,7 @@ def test_sigma_scale_is_that_of_the_residuals_of_few_pushes_too():
     torch.testing.assert_close(of_ten, torch.tensor([2.0, 2, 3]), atol=0, rtol=0.12)
 
 
-def test_fit_refuses_what_it_does_not_know():
-    rows = simulate(1, torch.Generator().manual_seed(8))[0][0]
+def test_fit_refuses_what_it_does_not_know_and_other_files_hold_no_model(rows, tmp_path):
     with pytest.raises(ValueError, match="model must be one of"):
         fit(log_of(rows), "x")
     for few, model in ((rows[:7], "np"), (rows, "physics_feet")):
@@ -154,6 +145,13 @@ def test_fit_refuses_what_it_does_not_know():
     narrow = log_of(rows, outline_m=0.9 * TRIANGLE_M)
     with pytest.raises(ValueError, match="pushes: their outline_m or tool_radius_m"):
         fit(log_of(rows), "constant").predict(narrow)
+    untrained = neural_process.NeuralProcess()
+    with pytest.raises(ValueError, match="holds no model of pushes"):
+        load_model(save_neural_process(untrained, tmp_path / "np.safetensors", {}))
+    with pytest.raises(FileNotFoundError, match=r"there is no file .*missing"):
+        load_model(tmp_path / "missing.safetensors")
+    with pytest.raises(ValueError, match=r"film_500.* train it: .*pretrain_np"):
+        load_neural_process("film_500")
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -164,25 +162,13 @@ def test_a_model_predicts_the_same_after_it_was_saved(name, tmp_path):
     data = log_of(rows[0, :20], {"feet": known, "surface": words, "place": places})
     model = fit(data, name, seed=3)
     path = save_model(model, tmp_path / "model.safetensors")
-    for one, again in zip(model.predict(data), load_model(path).predict(data), strict=True):
-        np.testing.assert_array_equal(one, again)
+    np.testing.assert_array_equal(model.predict(data), load_model(path).predict(data))
     path.write_bytes(path.read_bytes()[:-9])
     with pytest.raises(ValueError, match=r"damaged.*fit the model to its log again"):
         load_model(path)
 
 
-def test_other_files_hold_no_model_of_pushes(tmp_path):
-    untrained = neural_process.NeuralProcess()
-    with pytest.raises(ValueError, match="holds no model of pushes"):
-        load_model(save_neural_process(untrained, tmp_path / "np.safetensors", {}))
-    with pytest.raises(FileNotFoundError, match=r"there is no file .*missing"):
-        load_model(tmp_path / "missing.safetensors")
-    with pytest.raises(ValueError, match=r"film_500.* train it: .*pretrain_np"):
-        load_neural_process("film_500")
-
-
-def test_cross_validation_leaves_the_number_of_threads_alone(monkeypatch):
-    rows = simulate(1, torch.Generator().manual_seed(8))[0][0]
+def test_cross_validation_leaves_the_number_of_threads_alone(monkeypatch, rows):
     monkeypatch.setattr("joblib.cpu_count", lambda: 1)  # runs in this process
     torch.set_num_threads(2)
     cross_validate(log_of(rows[:16]), models=(), folds=2)
@@ -190,9 +176,8 @@ def test_cross_validation_leaves_the_number_of_threads_alone(monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["gaussian_process", "rate_gp"])
-def test_sigma_grows_outside_the_log(name):
+def test_sigma_grows_outside_the_log(name, rows):
     """Far contacts are unlike the log's; a push much longer than the log's is warned of."""
-    rows = simulate(1, torch.Generator().manual_seed(8))[0][0]
     some = rows[rows[:, 0] > rows[:, 0].median()]
     model = fit(log_of(some), name)
     near, far = log_of(some), log_of(rows[rows[:, 0] < rows[:, 0].quantile(0.2)])

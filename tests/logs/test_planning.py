@@ -28,7 +28,7 @@ TOOL_M = 0.0015
 T_M = 1e-3 * np.array(push_t.T_PX)
 
 
-def test_the_middle_of_the_tool_stays_its_radius_outside():
+def test_the_middle_of_the_tool_stays_its_radius_outside_and_what_no_object_has_is_refused():
     pushes = PushedObject(OUTLINE_M + 0.01, TOOL_M).draw(50)
     np.testing.assert_allclose(pushes.outline_m, OUTLINE_M, atol=1e-12)
     for k in range(50):
@@ -38,6 +38,12 @@ def test_the_middle_of_the_tool_stays_its_radius_outside():
         ahead = np.array([math.cos(primitive.direction), math.sin(primitive.direction)])
         assert abs(cross(ahead, pushes.direction[k])) < 1e-9
         assert math.acos(ahead @ pushes.normal[k]) <= math.radians(50) + 1e-9
+    with pytest.raises(ValueError, match="tool_radius_m must be a finite"):
+        PushedObject(OUTLINE_M, tool_radius_m=math.nan)
+    with pytest.raises(ValueError, match="lengths_m must be a range"):
+        PushedObject(OUTLINE_M, lengths_m=(0.02, 0.01))
+    with pytest.raises(ValueError, match="n must be a whole number in"):
+        PushedObject(OUTLINE_M).draw(10**9)
 
 
 class Pretrained:
@@ -57,12 +63,7 @@ def test_pursuit_knows_only_what_it_observes(world, monkeypatch):
     world.place(box, (0.02, 0.0), 0.4, tool="rod")
     outline = PushedObject(rotated(box.footprint_m, 0.4), ROD_WIDTH_M / 2)
     truth = world.object_pose
-
-    def lies():
-        x, y, yaw = truth()
-        return x, y, yaw + 1.0
-
-    monkeypatch.setattr(world, "object_pose", lies)
+    monkeypatch.setattr(world, "object_pose", lambda: tuple(np.add(truth(), (0.0, 0.0, 1.0))))
     planner = PushPlanner(Pretrained(), outline, turn_m=t_on_arm.TURN_M)
     assert t_on_arm.bring(world, planner, (0.04, -0.01, 0.2)) <= 10
     x, y, yaw = truth()
@@ -77,15 +78,6 @@ def test_a_plan_that_does_not_turn_misses_a_turn():
         assert planner.plan((0.3, 0.3, 0.0), goal, 1).reaches_goal == reaches
 
 
-def test_what_no_object_has_is_refused():
-    with pytest.raises(ValueError, match="tool_radius_m must be a finite"):
-        PushedObject(OUTLINE_M, tool_radius_m=math.nan)
-    with pytest.raises(ValueError, match="lengths_m must be a range"):
-        PushedObject(OUTLINE_M, lengths_m=(0.02, 0.01))
-    with pytest.raises(ValueError, match="n must be a whole number in"):
-        PushedObject(OUTLINE_M).draw(10**9)
-
-
 class Carried:
     """The object moves as the tool does after contact, and turns a little."""
 
@@ -95,13 +87,7 @@ class Carried:
         return np.column_stack([moved, turn]), np.full((len(pushes), 3), 1e-4)
 
 
-def gap_m(points, pose, outline_m):
-    """The least distance of the tool's centre from an outline on a way (n, 2), finely sampled."""
-    fine = np.vstack([np.linspace(a, b, 60) for a, b in itertools.pairwise(points)])
-    return _nearest(outline_m, rotated(fine - pose[:2], -pose[2]))[0].min()
-
-
-def test_the_tool_goes_around_a_concave_object_without_contact():
+def test_the_tool_retreats_and_goes_around_a_concave_object_without_contact():
     obj, rng = PushedObject(T_M, 0.015), np.random.default_rng(0)
     planner = PushPlanner(Carried(), obj, price=0.3, rounds=2)
     for _ in range(20):
@@ -111,16 +97,13 @@ def test_the_tool_goes_around_a_concave_object_without_contact():
         goal = Goal((0.0, 0.0), turn_rad=wrap_angle(-pose[2]))
         push = planner.plan(pose, goal, 3, tool).steps[0].primitive
         way = planner.way(pose, tool, push)
-        assert gap_m([tool, *way[:-1]], pose, obj.outline_m) > 0.015
+        lines = itertools.pairwise([tool, *way[:-1]])
+        fine = np.vstack([np.linspace(a, b, 60) for a, b in lines])
+        assert _nearest(obj.outline_m, rotated(fine - pose[:2], -pose[2]))[0].min() > 0.015
         at_contact = rotated(np.array([push.contact]), -pose[2])
         assert _nearest(obj.outline_m, at_contact)[0] == pytest.approx(0.015, abs=1e-5)
-
-
-def test_the_tool_retreats_from_the_outline_first():
-    obj, pose = PushedObject(T_M, 0.015), (0.0, 0.0, 0.0)
     planner = PushPlanner(Carried(), obj)
-    bar = obj.outline_m[:, 1].min()
-    touching = (0.02, bar - 0.015)
+    pose, touching = (0.0, 0.0, 0.0), (0.02, obj.outline_m[:, 1].min() - 0.015)
     push = planner.plan(pose, Goal((0.0, 0.1)), 1, touching).steps[0].primitive
     first = planner.way(pose, touching, push)[0]
     assert first[1] < touching[1] - 0.0039
@@ -177,15 +160,12 @@ def environment():
         yield
 
 
-def stored():
-    """The shipped pushes, as arguments of `Log.add`."""
+def test_the_shipped_pushes_are_read_and_predicted():
+    stored = []
     for _, rows in pd.read_csv(repo_root() / "data" / "push_t" / "pushes.csv.xz").groupby("push"):
         poses, path = rows[["x", "y", "yaw"]].dropna(), rows[["tool_x", "tool_y"]]
-        yield {"tool_t": rows["t"], "tool_xy": path, "poses": poses}
-
-
-def test_the_shipped_pushes_are_read_and_predicted():
-    data = push_t.logged(stored())
+        stored.append({"tool_t": rows["t"], "tool_xy": path, "poses": poses})
+    data = push_t.logged(stored)
     assert len(data) == 200
     trained = np.arange(200) < 150
     errors = errors_of(data, trained, ~trained, ("nearest", "rate_gp")).groupby("model")
@@ -207,15 +187,12 @@ def test_the_agent_comes_to_rest_at_its_target_on_a_line():
         assert abs(cross(state[0] - at, point - at)) < 1e-6
 
 
-def test_the_model_of_the_agent_is_that_of_the_environment(environment):
+def test_the_model_of_the_agent_and_what_a_picture_gives_are_those_of_the_environment(environment):
     table = push_t.Table()
     table.reset(push_t.FIRST_CHOICE)
     agent, _ = table.look()
     table.go(np.stack([agent + np.array([30, -20]), agent]))
     np.testing.assert_allclose(table.look()[0], agent, atol=0.05)
-
-
-def test_a_picture_gives_the_pose_of_the_t_and_the_agent(environment):
     table = push_t.Table("picture")
     for seed in range(push_t.FIRST_CHOICE, push_t.FIRST_CHOICE + 5):
         table.reset(seed)

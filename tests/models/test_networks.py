@@ -57,8 +57,18 @@ def predictions(network, batch, observations=None):
     return [getattr(made, f.name) for f in dataclasses.fields(made)]
 
 
+def row_of(observations, row):
+    """The observations of one row; unobserved ones become a single masked value."""
+    one = {f.name: getattr(observations, f.name)[[row]] for f in dataclasses.fields(observations)}
+    for kind in ("action", "effect"):
+        seen = one[f"{kind}_mask"][0]
+        seen = seen | ~seen.any() & (torch.arange(len(seen)) == 0)
+        one |= {f"{kind}{part}": one[f"{kind}{part}"][:, seen] for part in ("", "_t", "_mask")}
+    return Observations(**one)
+
+
 @torch.no_grad()
-def test_order_what_is_masked_and_saving_have_no_effect(network, some, tmp_path):
+def test_order_batch_what_is_masked_and_saving_have_no_effect(network, some, tmp_path):
     assert isinstance(network, models.EffectModel)
     batch = batch_of(some)
     predicted = predictions(network, batch)
@@ -79,26 +89,10 @@ def test_order_what_is_masked_and_saving_have_no_effect(network, some, tmp_path)
     shuffled = dataclasses.replace(seen, **{n: getattr(seen, n)[:, order] for n in parts})
     for a, b in zip(predicted, predictions(network, batch, shuffled), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5)
-
-
-def row_of(observations, row):
-    """The observations of one row; unobserved ones become a single masked value."""
-    one = {f.name: getattr(observations, f.name)[[row]] for f in dataclasses.fields(observations)}
-    for kind in ("action", "effect"):
-        seen = one[f"{kind}_mask"][0]
-        seen = seen | ~seen.any() & (torch.arange(len(seen)) == 0)
-        one |= {f"{kind}{part}": one[f"{kind}{part}"][:, seen] for part in ("", "_t", "_mask")}
-    return Observations(**one)
-
-
-@torch.no_grad()
-def test_a_row_alone_is_predicted_as_in_a_batch(network, some):
-    batch = batch_of(some)
-    together = predictions(network, batch)
     for row in range(len(some)):
         part = {"image": batch.image[[row]], "t_target": batch.t_target[[row]]}
         one = dataclasses.replace(batch, observations=row_of(batch.observations, row), **part)
-        for a, b in zip(together, predictions(network, one), strict=True):
+        for a, b in zip(predicted, predictions(network, one), strict=True):
             torch.testing.assert_close(a[[row]], b, atol=4e-5, rtol=1e-4)  # 8e-6
 
 
@@ -206,19 +200,16 @@ def test_coverage_and_variance_scaling(some):
         models.coverage(z, zero, one, 1.5)
 
 
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda: models.FiLMConfig(effect_channels=("z",)), "effect_channels must name x and y"),
-        (lambda: models.FiLMConfig(rings=True), "rings=True"),
-        (lambda: LSTMConfig(steps=2.5), r"steps=2\.5"),
-        (lambda: models.CNPConfig(sigma_floor=0.0), r"sigma_floor .* 0\.0"),
-        (lambda: models.FiLMConfig(blocks=10**7), r"blocks must be a whole number in \[1, 4096\]"),
-    ],
-)
-def test_bad_settings_are_named(make, words):
-    with pytest.raises((TypeError, ValueError), match=words):
-        make()
+def test_bad_settings_are_named():
+    for make, given, words in (
+        (models.FiLMConfig, {"effect_channels": ("z",)}, "effect_channels must name x and y"),
+        (models.FiLMConfig, {"rings": True}, "rings=True"),
+        (LSTMConfig, {"steps": 2.5}, r"steps=2\.5"),
+        (models.CNPConfig, {"sigma_floor": 0.0}, r"sigma_floor .* 0\.0"),
+        (models.FiLMConfig, {"blocks": 10**7}, r"blocks must be a whole number in \[1, 4096\]"),
+    ):
+        with pytest.raises((TypeError, ValueError), match=words):
+            make(**given)
 
 
 def test_harmonics_turn_as_their_image_does(some):
@@ -270,13 +261,12 @@ def linear_sizes(module: torch.nn.Module) -> list[tuple[int, int]]:
 def test_layer_table_of_the_appendix(untrained):
     encoder = [(3, 32), (32, 64), (64, 64), (64, 128), (128, 128), (128, 256), (256, 128)]
     decoder = [(1024, 512), (512, 256), (256, 128), (128, 32), (32, 4)]
-    assert linear_sizes(untrained.action_encoder) == encoder
-    assert linear_sizes(untrained.effect_encoder) == encoder
-    assert isinstance(untrained.action_encoder[-1], torch.nn.LeakyReLU)
-    assert isinstance(untrained.effect_encoder[-1], torch.nn.Linear)
+    encoders = untrained.action_encoder, untrained.effect_encoder
+    assert [*map(linear_sizes, encoders)] == [encoder] * 2
+    assert [type(one[-1]) for one in encoders] == [torch.nn.LeakyReLU, torch.nn.Linear]
     assert linear_sizes(untrained.merge) == [(128 + 16 + 1, 1024)]
-    assert linear_sizes(untrained.action_decoder) == decoder
-    assert linear_sizes(untrained.effect_decoder) == decoder
+    for one in (untrained.action_decoder, untrained.effect_decoder):
+        assert linear_sizes(one) == decoder
     assert sum(p.numel() for p in untrained.parameters()) == 2_009_912
 
     shapes, x = [], torch.zeros(1, 2, 48, 48)

@@ -22,7 +22,7 @@ from affordlib.weights import read_weights, write_weights
 from experiments.baselines import constant
 from experiments.published import one_at_a_time
 from experiments.runner import checkpoint_sha256
-from tests.waiting import printed
+from tests.waiting import flipped, printed
 
 
 def fresh(arrays):
@@ -39,31 +39,21 @@ def test_the_literal_loop_draws_up_to_all_observations(some):
     assert set(counts) == set(range(1, 11))
 
 
-def test_a_training_that_never_validates_says_so(some):
+def test_a_training_that_never_validates_or_has_channels_in_another_order_says_so(some):
     config = models.TrainingConfig(steps=20, validate_every=10, learning_rate=0.5)
-
-    def never(model, tensors):
-        return torch.full((len(tensors),), math.nan)
-
+    never = {"score": lambda model, tensors: torch.full((len(tensors),), math.nan)}
     with pytest.raises(ValueError, match=r"learning_rate 0\.5: no validation error was finite"):
-        models.train(fresh(some), some, some, config, score=never)
-
-
-def test_channels_in_another_order_are_refused(some):
+        models.train(fresh(some), some, some, config, **never)
     other = dataclasses.replace(some, effect_channels=("yaw", "x", "y"))
-    for act in (
-        lambda: final_errors_m(fresh(some), other),
-        lambda: models.train(fresh(some), some, other),
-    ):
+    for act in (final_errors_m, lambda model, data: models.train(model, some, data)):
         with pytest.raises(ValueError, match=r"has the effect_channels .* the model needs"):
-            act()
+            act(fresh(some), other)
 
 
 def test_training_resumes_to_the_same_bits(some, tmp_path, monkeypatch):
     config = models.TrainingConfig(steps=9, batch_size=16, validate_every=2, ema=0.9)
     whole = fresh(some)
     history = models.train(whole, some, some, config)
-
     broken, calls, loss_of = fresh(some), [], models.FiLMNetwork.loss
 
     def stop(model, batch, beta):
@@ -92,9 +82,8 @@ def test_a_foreign_or_damaged_state_of_a_training_is_named(some, tmp_path):
     config = models.TrainingConfig(steps=2, batch_size=4, validate_every=1)
     file = tmp_path / "training.pt"
     models.train(fresh(some), some, some, config, resume_checkpoint=file)
-    whole = bytearray(file.read_bytes())
-    whole[len(whole) // 2] ^= 1
-    for content in (bytes(whole), whole[:-9], b"", b"notes", pickle.dumps({"about": 1})):
+    damaged = flipped(file.read_bytes(), file.stat().st_size // 2)
+    for content in (damaged, damaged[:-9], b"", b"notes", pickle.dumps({"about": 1})):
         file.write_bytes(content)
         says = r"training\.pt' is damaged or holds no training state"
         with pytest.raises(ValueError, match=says) as caught:
@@ -189,12 +178,9 @@ def test_a_bad_checkpoint_is_named(untrained, tmp_path):
     path = models.save_checkpoint(untrained, tmp_path / "m.safetensors", {})
     whole = path.read_bytes()
     tensors, description = read_weights(path, "")
-
-    def described(**changes):
-        return write_weights(path, tensors, description | changes)
-
     half = {name: value.half() for name, value in tensors.items()}
-    scaler = description["scaler"] | {"action_scale": [0.0, 1.0]}
+    scaler = {"scaler": description["scaler"] | {"action_scale": [0.0, 1.0]}}
+    config = {"config": description["config"] | {"sigma_floor": 0}}
     for spoil in (
         lambda: path.write_bytes(whole[: len(whole) // 2]),
         lambda: path.write_bytes(pickle.dumps({"weights": [1.0]})),
@@ -202,8 +188,8 @@ def test_a_bad_checkpoint_is_named(untrained, tmp_path):
         lambda: write_weights(path, {"a": torch.tensor([math.nan])}, description),
         lambda: write_weights(path, tensors, {"format": "something else"}),
         lambda: write_weights(path, half, description),
-        lambda: described(scaler=scaler),
-        lambda: described(config=description["config"] | {"sigma_floor": 0}),
+        lambda: write_weights(path, tensors, description | scaler),
+        lambda: write_weights(path, tensors, description | config),
     ):
         path.unlink()
         spoil()
@@ -234,10 +220,8 @@ def test_no_flipped_bit_loads_as_another_model(untrained, tmp_path):
         whole = path.read_bytes()
         header = 8 + int.from_bytes(whole[:8], "little")
         for number in range(50):
-            spoiled = bytearray(whole)
             at = rng.integers(header if number % 2 else len(whole))
-            spoiled[at] ^= 1 << int(rng.integers(8))
-            path.write_bytes(spoiled)
+            path.write_bytes(flipped(whole, at, rng.integers(8)))
             with pytest.raises(ValueError, match=path.name):
                 load(path)
 

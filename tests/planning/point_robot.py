@@ -63,8 +63,7 @@ class FollowsTheHand:
     def __init__(self, kind, channel):
         self.kind, self.action_channels, self.effect_channels = kind, (channel,), (channel,)
 
-    def encode(self, image):
-        return torch.zeros(len(image), 1)
+    encode = KnownDynamics.encode
 
     def predict(self, features, observations, t_target):
         column = {"z": 2, "yaw": 3}[self.effect_channels[0]]
@@ -76,9 +75,8 @@ class FollowsTheHand:
 
 def hand_moves(primitive, phase):
     """Motion (n, 5) of the hand while it is closed."""
-    closed, opens = primitive.segment_phases[2], primitive.segment_phases[-2]
-    if primitive.holds:
-        opens = 1.0
+    closed = primitive.segment_phases[2]
+    opens = 1.0 if primitive.holds else primitive.segment_phases[-2]
     return primitive.path(np.clip(phase, closed, opens)) - primitive.path(closed)
 
 

@@ -13,9 +13,7 @@ from affordlib.world import Cuboid, LyingCylinder, UprightCylinder
 from tests.planning.point_robot import problem_of
 
 BOX, TUBE, LOG = Cuboid(0.06, 0.05, 0.05), UprightCylinder(0.05, 0.07), LyingCylinder(0.08, 0.05)
-DISC = LyingCylinder(0.05, 0.10)
-"""Lying on its rim, and as wide as the hand can open: only its faces can be grasped."""
-
+DISC = LyingCylinder(0.05, 0.10)  # as wide as the hand can open: only its faces can be grasped
 AT = (0.0, 0.0)
 
 
@@ -46,14 +44,6 @@ def test_a_partial_rotation_turns_by_the_angle_either_way(world, skills, obj, de
     turned = math.degrees(world.execute(step).rest_effect[3])
     assert turned == pytest.approx(degrees, abs=2)
     assert step.predicted_turn_rad == pytest.approx(math.radians(degrees))
-
-
-def test_what_cannot_be_had_is_not_planned(world, skills):
-    world.place(BOX)
-    image = world.depth_image()
-    assert plan_lift(skills.model(Grasp), image, 0.4) is None
-    with pytest.raises(ValueError, match="channel 'yaw' is not among the effects"):
-        plan_turn(skills.model(Grasp), image, 0.5)
 
 
 def test_the_hand_takes_what_it_can_hold(world, skills):
@@ -130,6 +120,9 @@ def test_a_plan_that_cannot_turn_or_lift_says_so(world, skills, plan):
     assert poses(goal, AT) is not None
     assert poses(goal, (0.7, 0.7)) is None  # beyond the learned reach
     assert poses(Goal(AT), (0.7, 0.7)) == ()
+    assert plan_lift(skills.model(Grasp), image, 0.4) is None
+    with pytest.raises(ValueError, match="channel 'yaw' is not among the effects"):
+        plan_turn(skills.model(Grasp), image, 0.5)
 
 
 def test_predictions_are_kept_while_only_the_goal_moves(skills, cuboid_image):

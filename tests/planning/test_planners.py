@@ -28,6 +28,17 @@ MODEL = KnownDynamics()
 PLANNERS = (planning.plan_astar, planning.plan_continuous, planning.plan_gradient)
 
 
+class Changed(KnownDynamics):
+    """Known dynamics, but for the mean effect: a function of it and of the observations."""
+
+    def __init__(self, change):
+        self.change = change
+
+    def predict(self, features, observations, t_target):
+        found = super().predict(features, observations, t_target)
+        return replace(found, effect_mean=self.change(found.effect_mean, observations))
+
+
 def known(goal_xy, mode="multi_partial", tolerance_m=0.02, model=MODEL, **more):
     """A problem with known dynamics, from the middle of the table."""
     return problem_of(model, IMAGE, (0.0, 0.0), Goal(goal_xy, tolerance_m), mode, **more)
@@ -215,18 +226,12 @@ def test_of_two_plans_that_of_lower_variance_is_taken():
     assert plan.steps[-1].std_m < 0.004
 
 
-class Turned(KnownDynamics):
-    """Known dynamics whose predicted effect is turned by a constant angle from the observed one."""
+TURN = torch.tensor([[math.cos(0.4), math.sin(0.4)], [-math.sin(0.4), math.cos(0.4)]])
 
-    by_rad = 0.4
 
-    def predict(self, features, observations, t_target):
-        found = super().predict(features, observations, t_target)
-        if not observations.effect_mask.any():
-            return found
-        c, s = math.cos(self.by_rad), math.sin(self.by_rad)
-        turn = torch.tensor([[c, s], [-s, c]])
-        return replace(found, effect_mean=found.effect_mean @ turn)
+def turned(mean, observations):
+    """An effect that is turned by 0.4 rad from the observed one."""
+    return mean @ TURN if observations.effect_mask.any() else mean
 
 
 READINGS = [Reading(), Reading(starts=4), Reading(finds="point")]
@@ -241,8 +246,8 @@ def test_each_reading_finds_the_direction_whose_effect_points_at_the_goal(goal_x
 
     For a goal g and an input of angle a, the loss is (r² + |g|² - 2 r |g| cos(a + 0.4 - φ)) / 2.
     """
-    problem = known(goal_xy, model=Turned())
-    expected = math.atan2(goal_xy[1], goal_xy[0]) - Turned.by_rad
+    problem = known(goal_xy, model=Changed(turned))
+    expected = math.atan2(goal_xy[1], goal_xy[0]) - 0.4
     for seed in range(3):
         rng = np.random.default_rng(seed)
         found = descend(problem.effects, np.array(goal_xy), rng, reading)[0]
@@ -268,20 +273,16 @@ def test_the_gradient_planner_finds_direction_and_phase(goal_xy, reading):
     assert drag.primitive.direction_rad == pytest.approx(0.0, abs=0.02)
 
 
-class Deaf(KnownDynamics):
-    """Known dynamics through which no gradient flows, so that a descent stays at its start."""
-
-    def predict(self, features, observations, t_target):
-        found = super().predict(features, observations, t_target)
-        deaf = found.effect_mean.detach() + 0 * observations.effect.sum()
-        return replace(found, effect_mean=deaf)
+def deaf(mean, observations):
+    """An effect through which no gradient flows, so that a descent stays at its start."""
+    return mean.detach() + 0 * observations.effect.sum()
 
 
 def test_a_start_that_leads_away_is_drawn_again_and_the_planner_says_if_all_do():
     ends_m = []
     for seed in range(12):
         with warnings.catch_warnings(record=True, action="always") as said:
-            plan = planning.plan_gradient(known((0.05, 0.0), model=Deaf()), seed=seed)
+            plan = planning.plan_gradient(known((0.05, 0.0), model=Changed(deaf)), seed=seed)
         assert bool(plan.steps) != any("none of 5 random starts" in str(w.message) for w in said)
         ends_m += [plan.predicted_distance_m] * bool(plan.steps)
     assert len(ends_m) >= 10
@@ -293,16 +294,12 @@ def test_a_start_that_leads_away_is_drawn_again_and_the_planner_says_if_all_do()
 
 def test_a_push_that_would_stop_before_it_begins_is_none():
     """A network predicts a few millimetres of effect at t = 0, where nothing has happened."""
-
-    class Offset(Deaf):
-        def predict(self, features, observations, t_target):
-            found = super().predict(features, observations, t_target)
-            return replace(found, effect_mean=found.effect_mean + torch.tensor([0.01, 0.0]))
-
-    for seed in range(6):
-        with warnings.catch_warnings(action="ignore", category=UserWarning):
-            plan = planning.plan_gradient(known((0.03, 0.0), model=Offset()), seed=seed)
-        assert all(step.stop_phase > 0 for step in plan.steps)
+    model = Changed(lambda *given: deaf(*given) + torch.tensor([0.01, 0.0]))
+    with warnings.catch_warnings(action="ignore", category=UserWarning):
+        plans = [planning.plan_gradient(known((0.03, 0.0), model=model), seed=k) for k in range(6)]
+    steps = [step for plan in plans for step in plan.steps]
+    assert steps
+    assert all(step.stop_phase > 0 for step in steps)
 
 
 def test_a_decoded_path_is_followed(world):
@@ -352,10 +349,8 @@ def test_plans_come_within_what_their_planner_promises(world, trained, film):
     tasks += uniform_tasks("multi_partial", 4, seed=7)
 
     def distances(plan, model, tasks, **how):
-        def plan_for(*query):
-            return plan(problem_of(model, *query))
-
-        return [attempt(world, task, plan_for, **how).distance_m for task in tasks]
+        runs = (attempt(world, t, lambda *q: plan(problem_of(model, *q)), **how) for t in tasks)
+        return [run.distance_m for run in runs]
 
     assert np.mean(distances(planning.plan_astar, trained, tasks)) < 0.03
     hard = [t for t in frozen_tasks() if (t.goals, t.mode) == ("constructed", "multi_partial")]

@@ -28,12 +28,6 @@ page = pytest.fixture(lambda lab, browser: opened(lab, browser), scope="module")
 table = pytest.fixture(lambda page: Table(page))
 
 
-def free_port():
-    with socket.socket() as sock:
-        sock.bind(("127.0.0.1", 0))
-        return sock.getsockname()[1]
-
-
 @contextmanager
 def serve(folder, name, more_cells=(), app="jupyterlab"):
     """Start a Jupyter with separate settings, workspaces and run-time files, and one notebook.
@@ -49,7 +43,9 @@ def serve(folder, name, more_cells=(), app="jupyterlab"):
     after = [k for k, cell in enumerate(notebook.cells) if "GoalPicker." in cell.source][-1] + 1
     notebook.cells[after:after] = [nbformat.v4.new_code_cell(cell) for cell in more_cells]
     nbformat.write(notebook, file)
-    port, token = free_port(), secrets.token_hex(16)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port, token = free.getsockname()[1], secrets.token_hex(16)
     own = {f"JUPYTER_{part}_DIR": str(folder / part) for part in ("CONFIG", "DATA", "RUNTIME")}
     traits = {"jupyterlab": "LabApp", "notebook": "JupyterNotebookApp"}[app]
     options = ["--no-browser", "--allow-root", "--ip=127.0.0.1", f"--port={port}"]
@@ -166,10 +162,6 @@ def picture(page, name):
 
 def button(page, name):
     return page.locator(".affordlib-picker button", has_text=name)
-
-
-def choose(page, option):
-    page.locator(".affordlib-picker select", has_text=option).first.select_option(option)
 
 
 def words(page):
@@ -336,7 +328,8 @@ def test_a_closed_loop_follows_a_goal_that_moves(page, table):
     table.start_over()
     ask(page, "picker.pick(0.18, 0.0)")
     assert_same_goal(page, table, 0.18, 0.0)
-    choose(page, "closed loop")
+    modes = page.locator(".affordlib-picker select", has_text="closed loop").first
+    modes.select_option("closed loop")
     button(page, "Run").click()
     page.locator(".affordlib-table .hand").wait_for(state="attached")
     page.mouse.click(*table.at(0.1, 0.16))
@@ -349,7 +342,7 @@ def test_a_closed_loop_follows_a_goal_that_moves(page, table):
     at = ask(page, "picker.world.object_pose()[:2]")  # also if the shove came after the last action
     wait_until(lambda: np.allclose(table.points(".object").mean(axis=0), at, atol=0.001), 20)
     picture(page, "6_closed_loop")
-    choose(page, "open loop")
+    modes.select_option("open loop")
 
 
 @pytest.mark.parametrize("width", [1280, 853, 600, 400])  # 853: 1280 at a zoom of 150 %
@@ -520,27 +513,22 @@ def test_notebook_7_draws_the_picker_which_answers(tmp_path, browser):
 
 @pytest.fixture(scope="module")
 def web(tmp_path_factory, browser):
-    """The folder of the web pages and, of each page, its path and its parsed text."""
+    """The folder of the web pages, the text of each by path, and the paths in reading order."""
     made = tmp_path_factory.mktemp("web")
     options = ["-q", "-W", "--keep-going", "-c", "notebooks/book_html", "-d", made / "doctrees"]
     command = [sys.executable, "-m", "sphinx", *options, ".", made / "html"]
     subprocess.run(command, cwd=repo_root(), check=True)
-    files = sorted((made / "html").rglob("*.html"))
-    return made / "html", {p: BeautifulSoup(p.read_text(), "html.parser") for p in files}
-
-
-def chapters(web):
-    """The pages in reading order, without index (a copy of the first) and search."""
-    folder, pages = web
-    first = folder / "README.html"
+    folder, first = made / "html", made / "html" / "README.html"
+    files = sorted(folder.rglob("*.html"))
+    pages = {path: BeautifulSoup(path.read_text(), "html.parser") for path in files}
     names = [link["href"] for link in pages[first].select(".sidebar-tree a.internal")]
-    return [first, *(folder / name for name in names)]
+    return folder, pages, [first, *(folder / name for name in names)]
 
 
 def test_every_link_of_the_web_pages_leads_somewhere(web):
-    folder, pages = web
+    folder, pages, order = web
     written = {f"{path.stem}.html" for path in (repo_root() / "notebooks").rglob("[0-9A]*.ipynb")}
-    assert written <= {path.name for path in chapters(web)} <= {path.name for path in pages}
+    assert written <= {path.name for path in order} <= {path.name for path in pages}
     named = {path: {tag["id"] for tag in page.select("[id]")} for path, page in pages.items()}
     for path, page in pages.items():
         for tag in page.select("[href], [src]"):
@@ -560,8 +548,7 @@ def test_every_link_of_the_web_pages_leads_somewhere(web):
 
 def test_the_web_pages_are_read_on_a_phone_without_a_network(web, browser):
     """Equations are drawn, nothing is wider than the window, and nothing is requested outside."""
-    order = chapters(web)
-    page = browser.new_page(viewport={"width": 400, "height": 800})
+    order, page = web[2], browser.new_page(viewport={"width": 400, "height": 800})
     requests, complaints, scrolled = [], [], 0
     page.on("request", lambda request: requests.append(request.url))
     page.on("console", lambda message: complaints.append(message.text))
@@ -606,7 +593,7 @@ def test_the_first_web_page_plans_without_a_kernel(web, browser):
 
 
 def test_the_web_pages_are_found_by_a_word_and_darken(web, browser):
-    folder, _ = web
+    folder = web[0]
     page = browser.new_page(viewport={"width": 1280, "height": 900})
     page.goto((folder / "index.html").as_uri())
     page.locator("input.sidebar-search").fill("Garnelo")

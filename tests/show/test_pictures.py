@@ -7,11 +7,11 @@ import shutil
 import subprocess
 from pathlib import Path
 
-import matplotlib.pyplot as plt
 import numpy as np
 import playwright
 import pytest
 import torch
+from matplotlib.figure import Figure
 from PIL import Image
 
 from affordlib import show
@@ -37,11 +37,13 @@ const answer = ({ action, ...one }) =>
   action ? spare({ object, ...one }, ...action) : plan({ object, reachable, ...one });
 console.log(JSON.stringify(queries.map(answer)));
 """
+push = pytest.fixture(lambda placed: placed.execute_primitive(Push.towards(0.6)))
+slider = pytest.fixture(lambda placed: show.phase_explorer(placed, Push.towards(0.6), 0.8))
 explorer = pytest.fixture(lambda trained, push: show.conditioning_explorer(trained, push))
 
 
 def test_a_footprint_is_drawn_where_the_object_is(world, trained):
-    figure, ax = plt.subplots()
+    ax = Figure().subplots()
     show.plot_footprint(show.plot_table(ax), Cuboid(0.06, 0.04, 0.05), (0.1, -0.05), np.pi / 2)
     outline = ax.lines[-1].get_xydata()
     np.testing.assert_allclose(np.ptp(outline, axis=0), [4.0, 6.0], atol=1e-9)
@@ -52,7 +54,6 @@ def test_a_footprint_is_drawn_where_the_object_is(world, trained):
     assert "mm from the goal" in show.plot_outcome(ax, outcome, world.obj).get_title(loc="left")
     last = [line.get_xydata()[:-1] for line in ax.lines if len(line.get_xydata()) == 5][-1]
     np.testing.assert_allclose(last.mean(axis=0), 100 * np.array(outcome.end_pose[:2]), atol=1e-9)
-    plt.close(figure)
 
 
 def test_the_configuration_of_a_reader_changes_no_figure(tmp_path):
@@ -75,15 +76,9 @@ def test_the_configuration_of_a_reader_changes_no_figure(tmp_path):
 
 
 @pytest.fixture
-def push(world):
-    world.place(Cuboid(0.07, 0.05, 0.05), (0.02, -0.01), 0.4)
-    return world.execute_primitive(Push.towards(0.6))
-
-
-@pytest.fixture
-def slider(world):
-    world.place(Cuboid(0.07, 0.05, 0.05), (0.02, -0.01), 0.4)
-    return show.phase_explorer(world, Push.towards(0.6), 0.8)
+def placed(world):
+    world.place(OBJECTS["box"], (0.02, -0.01), 0.4)
+    return world
 
 
 def state_of(explorer, *at):
