@@ -85,8 +85,8 @@ class GoalPicker(widgets.HBox):
         self._rng = np.random.default_rng(check_count("seed", seed, least=0))
         self._first_pose = self._pose = self._plan_pose = world.object_pose()
         self._turn_from = self._pose[2]  # the yaw to which the goal's rotation is relative
-        self._running = self._lifted = False
-        self._stale = True  # the shown plan is not the chosen planner's for the shown goal
+        self._running = False
+        self._planned_for: Goal | None = None  # the goal when the chosen planner was last asked
         self._answered = 0  # the number of the last goal from the page with a plan
         self._alone = threading.RLock()  # held while planning or moving something in the world
         self._queue = ThreadPoolExecutor(1)
@@ -108,8 +108,7 @@ class GoalPicker(widgets.HBox):
         layout = {"flex_flow": "row wrap", "grid_gap": "12px"}
         super().__init__([table, self.controls, *[self.scene] * view], layout=layout)
         self.add_class("affordlib-picker")
-        for _ in range(2):  # what is slow only once is then not part of the time shown
-            self._attempt(self._make_plan)
+        self._attempt(self._make_plan)
 
     @classmethod
     def demo(cls, goal_xy_m: tuple[float, float] = (0.12, 0.08), seed: int = 0) -> Self:
@@ -161,7 +160,7 @@ class GoalPicker(widgets.HBox):
         self._refuse_while_running()
         (x, y, yaw), obstacles = self._first_pose, self.world.obstacles.all
         self._marks.clear()
-        self._set_goal(replace(self._first_goal))
+        self._set_goal(self._first_goal)
         self._disturb(partial(self.world.place, self.world.obj, (x, y), yaw, obstacles=obstacles))
 
     def figure(self) -> Figure:
@@ -231,23 +230,23 @@ class GoalPicker(widgets.HBox):
 
     def _follow(self, goal: Goal) -> None:
         """Set the goal, and soon show a plan for it, unless another one follows."""
-        goal = replace(goal)  # a new object, which identifies this request
         self._set_goal(goal)
-        if not self._running:
-            self._soon(lambda: goal is self.goal and self._update_plan())
+        self._soon(self._update_plan)
 
     def _set_goal(self, goal: Goal) -> None:
-        """Show a goal that has no plan yet."""
-        self.controls.show(goal)
-        self._stale = True
+        """Show a goal that has no plan yet, even if it equals the last one."""
+        self.controls.show(replace(goal))
         if self._running:  # the executor gets it after this action
             self._answered = self._view.wanted[2]
         self._show(planning=not self._running)
 
     def _update_plan(self) -> None:
         """Plan for the shown goal, if it has no plan yet and the robot is idle."""
-        if self._stale and not self._running:
+        if self._is_outdated() and not self._running:
             self._make_plan()
+
+    def _is_outdated(self) -> bool:
+        return self._planned_for is not self.goal
 
     def _planned(self, problem: PlanningProblem, planner: str = "") -> Plan:
         """A plan by the chosen planner, or another one, whose actions may stop early or not."""
@@ -262,9 +261,8 @@ class GoalPicker(widgets.HBox):
             self._other = None
             self._searched.clear()
             self.controls.show_progress(0)
-            if self._lifted:  # put it down
+            if self.world.arm.raised_m:  # put it down
                 self.world.park()
-                self._lifted = False
             self._pose = self.world.object_pose()
             try:
                 seen = self.world.depth_image(), self._pose[:2]
@@ -286,9 +284,8 @@ class GoalPicker(widgets.HBox):
                 if self.scene is not None:
                     self.scene.mark(self.goal, plan)
                 self._plan_pose, self._turn_from = self._pose, self._pose[2]
-                self._answered = number
-                self._stale = goal is not self.goal
-                self._show(planning=self._stale)
+                self._answered, self._planned_for = number, goal
+                self._show(planning=self._is_outdated())
 
     # Execution
 
@@ -338,7 +335,7 @@ class GoalPicker(widgets.HBox):
         with self._alone:
             on_step = self.world.on_step
             try:
-                if self._stale or self.plan is None or self.outcome is not None:
+                if self._is_outdated() or self.plan is None or self.outcome is not None:
                     self._make_plan()
                 plan, self._news = self.plan, ""
                 self._marks.clear()
@@ -358,9 +355,9 @@ class GoalPicker(widgets.HBox):
                 pose = self.world.object_pose()
                 moved = wrap_angle(pose[2] - yaw), self.world.object_state()[2] - z
                 outcome = Outcome(plan, self.goal.distance_m(pose[:2]), pose, paths, *moved, words)
-                self.outcome, self._lifted = outcome, bool(self.goal.height_m)
+                self.outcome = outcome
                 if self.plan.goal == self.goal or outcome.distance_m <= self.goal.tolerance_m:
-                    self._stale = False  # the run has followed the goal
+                    self._planned_for = self.goal  # the run has followed it
                 self.controls.say(*outcome_in_words(outcome, self.goal, how, done))
             except Exception:
                 self.plan, self._disturbances = None, []  # the next run plans from the current pose
@@ -372,7 +369,7 @@ class GoalPicker(widgets.HBox):
                     self.scene.stop()
                 self._set_running(False)
                 self._show()
-            if self._stale or self._disturbances:  # by a hand that the run did not follow
+            if self._is_outdated() or self._disturbances:  # by a hand that the run did not follow
                 self._news = self.controls.said
                 self._disturb()
 
@@ -435,7 +432,7 @@ class GoalPicker(widgets.HBox):
     def _set_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
         try:
             self.world.set_obstacles(obstacles)
-            self._stale = True
+            self._planned_for = None
         finally:
             self._view.obstacles = [obstacle_data(one) for one in self.world.obstacles.all]
 
