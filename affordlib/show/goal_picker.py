@@ -19,17 +19,10 @@ import numpy as np
 from IPython.core.pylabtools import retina_figure
 from matplotlib.figure import Figure
 
+from affordlib import planning
 from affordlib.geometry import unit_vector, wrap_angle
 from affordlib.models import load_checkpoint
-from affordlib.planning import (
-    PlanMode,
-    Planner,
-    PlanningProblem,
-    Skills,
-    plan_astar,
-    plan_continuous,
-    plan_gradient,
-)
+from affordlib.planning import PlanMode, Planner, PlanningProblem, Skills
 from affordlib.planning.gradient import Reading
 from affordlib.show.picker_controls import (
     LIMIT_M,
@@ -120,10 +113,10 @@ class GoalPicker(widgets.HBox):
 
         def gradient(problem):  # the paper's planner, with the paper's network
             known = replace(problem, effects=published.effects(problem.effects.image))
-            return plan_gradient(known, seed=seed, reading=reading)
+            return planning.plan_gradient(known, seed=seed, reading=reading)
 
-        continuous = partial(plan_continuous, seed=seed)
-        planners = {"continuous": continuous, "A*": plan_astar, "gradient": gradient}
+        continuous = partial(planning.plan_continuous, seed=seed)
+        planners = {"continuous": continuous, "A*": planning.plan_astar, "gradient": gradient}
         return cls(world, skills, planners, goal_xy_m, seed)
 
     @property
@@ -271,10 +264,8 @@ class GoalPicker(widgets.HBox):
                 words = plan_in_words(plan)
                 if other != "nothing":
                     self._other = self._planned(problem, other)
-                    off_mm = 1000 * self._other.predicted_distance_m
-                    words += (
-                        f" By {other}, dashed: {len(self._other.steps)} actions, {off_mm:.1f} mm."
-                    )
+                    n, off_mm = len(self._other.steps), 1000 * self._other.predicted_distance_m
+                    words += f" By {other}, dashed: {n} actions, {off_mm:.1f} mm."
                 self.controls.say(f"{self._news} {words}")
                 self._news = ""
                 self._view.object = object_data(self.world.obj, problem.effects, self._pose[2])
@@ -359,7 +350,7 @@ class GoalPicker(widgets.HBox):
                 if self.plan.goal == self.goal or outcome.distance_m <= self.goal.tolerance_m:
                     self._planned_for = self.goal  # the run has followed it
                 self.controls.say(*outcome_in_words(outcome, self.goal, how, done))
-            except Exception:
+            except BaseException:  # an interruption, too
                 self.plan, self._disturbances = None, []  # the next run plans from the current pose
                 raise
             finally:
@@ -375,31 +366,31 @@ class GoalPicker(widgets.HBox):
 
     def _log(self, steps: Iterator[int], z_m: float, world: Tabletop) -> None:
         """Log a step of the simulation, and send what is logged; z_m: the object's first height."""
-        number = next(steps)
         if self.scene is not None:
             self.scene(world)
-        if number % POSE_EVERY == 0:
+        if next(steps) % POSE_EVERY == 0:
             pose, lift = world.object_pose(), world.object_state()[2] - z_m
             bodies = () if self.scene is None else self.scene.poses().flat
             motion = [*pose, lift, *world.arm.tool_pose(), *bodies]
             self._motions.append(np.round(motion, 4).tolist())
             self._trail.append(pose[:2])
-        if number == 0 or len(self._motions) == SENT_TOGETHER:
-            self._send_motions(first=number == 0)
+            if len(self._trail) == 1 or len(self._motions) == SENT_TOGETHER:
+                self._send_motions()
 
-    def _send_motions(self, first: bool = False) -> None:
+    def _send_motions(self) -> None:
         """Send the motions logged since the last call, to be shown as they come."""
         if self._motions:
+            first = len(self._motions) == len(self._trail)
             bodies = [self.scene.name, [one.id for one in self.scene.bodies]] if self.scene else []
             self._view.send({"motions": self._motions, "first": first, "bodies": bodies})
-            self._shown_until = max(self._shown_until, time.monotonic())
-            self._shown_until += self.pace_s * len(self._motions)
+            from_s = max(self._shown_until, time.monotonic())
+            self._shown_until = from_s + self.pace_s * len(self._motions)
             self._motions = []
 
     def _wait_until_shown(self) -> None:
         self._send_motions()
-        self._stop.wait(max(0.0, self._shown_until - time.monotonic()))
-        self._pose, self._shown_until = self.world.object_pose(), 0.0
+        self._stop.wait(self._shown_until - time.monotonic())
+        self._pose = self.world.object_pose()
 
     # Disturbances
 
