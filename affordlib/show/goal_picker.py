@@ -296,11 +296,8 @@ class GoalPicker(widgets.HBox):
         def report(plan=None):
             nonlocal done
             if plan is not None:
-                left[:] = plan.steps
-                arrives = self.goal.distance_m(plan.predicted_end_xy_m) <= self.goal.tolerance_m
-                self.plan = replace(plan, goal=self.goal, reaches_goal=arrives)
-                self._pose = self.world.object_pose()
-                self._plan_pose = (*plan.start_xy_m, self._pose[2])
+                left[:], self.plan = plan.steps, replace(plan, goal=self.goal)
+                self._pose = self._plan_pose = self.world.object_pose()
                 self._news += " New plan." * (done > 0)
                 self._show()
                 if self.scene is not None:
@@ -319,8 +316,8 @@ class GoalPicker(widgets.HBox):
             if self._stop.is_set():
                 raise Stopped
             if left:
-                name, of = left[0].primitive.name.replace("_", " "), done + len(left)
-                self.controls.say(f"{name.capitalize()} {done + 1} of {of} …{self._news}")
+                name, of = left[0].primitive.name.capitalize(), done + len(left)
+                self.controls.say(f"{name} {done + 1} of {of} …{self._news}")
                 self._news = ""
 
         with self._alone:
