@@ -47,15 +47,13 @@ POSE_EVERY, SENT_TOGETHER = 12, 5
 class GoalPicker(widgets.HBox):
     """The table from above, where a goal is picked by mouse, keyboard or sliders.
 
-    skills: what the robot can do. planners: name → function of a `PlanningProblem` that returns a
-    plan. While a hand drags the goal, the browser plans over the effect map; when it lets go, the
-    chosen planner does. seed: of the disturbances. view: whether the robot is shown in 3-D, too.
-    searched: an empty list, in which a planner may leave lines (n, 2) [m] of its search.
+    planners: name → planner; while a hand drags the goal, the browser plans over the effect map,
+    and when it lets go, the chosen planner does. seed: of the disturbances. view: whether the robot
+    is shown in 3-D, too. searched: an empty list, in which a planner may leave lines (n, 2) [m] of
+    its search.
 
-    `executors`: name → function (world, plan, planner, report) → Done that executes a plan, or
-    replans with the planner that made it; see `Report`. `goal`, `plan` and `outcome` are those
-    shown. Methods do what mouse and buttons do, and return when done; mouse and buttons queue
-    it in the background. A run shows each pose for `pace_s`.
+    `executors`: name → function (world, plan, planner, report) → Done, see `Report`. Methods do
+    what mouse and buttons do, and return when done. A run shows each pose for `pace_s` seconds.
     """
 
     pace_s = POSE_EVERY * STEP_S
@@ -136,10 +134,6 @@ class GoalPicker(widgets.HBox):
         self._set_running(True)
         self._run()
 
-    def stop(self) -> None:
-        """Stop after the current action."""
-        self._stop.set()
-
     def shove_object(self) -> None:
         """Shove the object 2 to 4 cm in a random direction; during a run, after this action."""
         self._disturb(self._shove)
@@ -196,7 +190,7 @@ class GoalPicker(widgets.HBox):
         for choice in (controls.planner, controls.other, controls.early):
             choice.observe(lambda _: self._follow(self.goal), names="value")
         controls.run.on_click(lambda _: self._run_in_background())
-        controls.stop.on_click(lambda _: self.stop())
+        controls.stop.on_click(lambda _: self._stop.set())
         controls.shove.on_click(lambda _: self._soon(self.shove_object))
         controls.move_goal.on_click(lambda _: self._soon(self.move_goal))
         controls.start_over.on_click(lambda _: self._soon(self.start_over))
