@@ -53,21 +53,15 @@ class Explorer:
     """Panels of lines that depend on sliders.
 
     sliders: name → values; the states are all their combinations, the last slider changing fastest.
-    start: the first value of each slider. panels: title → lines; square: the panel
-    whose axes have the same scale. words: a sentence for each state, in which <b> is bold.
+    at: the number of the value at which each slider starts. panels: title → lines; square: the
+    panel whose axes have the same scale. words: a sentence for each state, in which <b> is bold.
     """
 
     sliders: dict[str, Sequence[float]]
-    start: Sequence[float]
+    at: list[int]
     panels: dict[str, list[Line]]
     words: list[str]
     square: str = ""
-
-    @property
-    def at(self) -> list[int]:
-        """Number of the value at which each slider starts."""
-        pairs = zip(self.sliders.values(), self.start, strict=True)
-        return [int(np.abs(np.subtract(values, wanted)).argmin()) for values, wanted in pairs]
 
     @property
     def state(self) -> int:
@@ -121,7 +115,8 @@ def conditioning_explorer(
     paper; the effect at one phase, with 1 - w₁. The band is mean ± 2 σ. seen: a full interaction,
     the ground truth; effect_t, weight: the first phase of the effect, and w₁.
     """
-    first = 1.0, check_within("effect_t", effect_t, 0, 1), check_within("weight", weight, 0, 1)
+    effect_t = check_within("effect_t", effect_t, 0, 1)
+    weight = check_within("weight", weight, 0, 1)
     phases, quarters = np.linspace(0, 1, 11).round(2), np.linspace(0, 1, 5)
     sliders = {"action also seen at t": quarters, "effect seen at t": phases, "w₁": quarters}
     states = np.array(list(itertools.product(*sliders.values())))
@@ -155,7 +150,7 @@ def conditioning_explorer(
         f"with σ = {std:.1f} mm."
         for error, std in zip(error_mm, std_mm, strict=True)
     ]
-    return Explorer(sliders, first, panels, words)
+    return Explorer(sliders, [4, round(10 * effect_t), round(4 * weight)], panels, words)
 
 
 def phase_explorer(world: Tabletop, action: Primitive, phase: float = 0.8) -> Explorer:
@@ -202,4 +197,5 @@ def phase_explorer(world: Tabletop, action: Primitive, phase: float = 0.8) -> Ex
         f"<b>{mm:.2f} mm</b> from that position."
         for t, cm, mm in zip(stops, moved[(100 * stops).round().astype(int)], off_mm, strict=True)
     ]
-    return Explorer({"phase t": stops}, (phase,), panels, words, "from above [cm]")
+    at = int(np.abs(stops - phase).argmin())
+    return Explorer({"phase t": stops}, [at], panels, words, "from above [cm]")
