@@ -1,7 +1,6 @@
 """Two explorers: figures that sliders change, drawn by the browser from a table of numbers.
 
-Everything is computed beforehand, so they work without a kernel, too: in a saved page and in the
-web book. Where scripts do not run, a still picture stands in their place.
+All is computed beforehand, so they need no kernel. Without scripts, a still picture is shown.
 """
 
 import itertools
@@ -54,21 +53,15 @@ class Explorer:
     """Panels of lines that depend on sliders.
 
     sliders: name → values; the states are all their combinations, the last slider changing fastest.
-    start: the first value of each slider. panels: title → lines; square: the panel
-    whose axes have the same scale. words: a sentence for each state, in which <b> is bold.
+    at: the number of the value at which each slider starts. panels: title → lines; square: the
+    panel whose axes have the same scale. words: a sentence for each state, in which <b> is bold.
     """
 
     sliders: dict[str, Sequence[float]]
-    start: Sequence[float]
+    at: list[int]
     panels: dict[str, list[Line]]
     words: list[str]
     square: str = ""
-
-    @property
-    def at(self) -> list[int]:
-        """Number of the value at which each slider starts."""
-        pairs = zip(self.sliders.values(), self.start, strict=True)
-        return [int(np.abs(np.subtract(values, wanted)).argmin()) for values, wanted in pairs]
 
     @property
     def state(self) -> int:
@@ -77,18 +70,17 @@ class Explorer:
 
     def figure(self) -> Figure:
         """The first state as a figure."""
-        figure = Figure(figsize=(10, 2.6 * ((len(self.panels) + 1) // 2)), layout="constrained")
-        axes = figure.subplots((len(self.panels) + 1) // 2, 2, squeeze=False)
+        rows, handles = (len(self.panels) + 1) // 2, {}
+        figure = Figure(figsize=(10, 2.6 * rows), layout="constrained")
+        axes = figure.subplots(rows, 2, squeeze=False)
         for ax, (title, lines) in zip(axes.flat, self.panels.items(), strict=True):
             for line in lines:
                 parts = (line.x, line.y, line.band)
                 x, y, band = (v if v is None or v.ndim == 1 else v[self.state] for v in parts)
-                ax.plot(x, y, line.style, color=line.color, label=line.name)
+                [handles[line.name]] = ax.plot(x, y, line.style, color=line.color)
                 if band is not None:
                     ax.fill_between(x, y - band, y + band, color=line.color, alpha=0.2, lw=0)
             ax.set(title=title, aspect="equal" if title == self.square else "auto")
-        legends = [zip(*ax.get_legend_handles_labels(), strict=True) for ax in axes.flat]
-        handles = {name: line for legend in legends for line, name in legend}
         figure.legend(handles.values(), handles, loc="outside lower center", ncols=5)
         return figure
 
@@ -119,12 +111,12 @@ def conditioning_explorer(
 ) -> Explorer:
     """Make an explorer of predictions from chosen observations of an interaction.
 
-    Equation (2) of the paper: the representation is w₁ r_action + w₂ r_effect, w₂ = 1 - w₁. The
-    action is observed at 0 and at a second phase, the effect at one; with w₁ = 1 the effect is not
-    observed, with w₁ = 0 the action is not. The band is mean ± 2 σ. seen: a full interaction, the
-    ground truth; effect_t, weight: the first phase of the effect, and w₁.
+    The action is observed at 0 and at a second phase, with a weight w₁ as in equation (2) of the
+    paper; the effect at one phase, with 1 - w₁. The band is mean ± 2 σ. seen: a full interaction,
+    the ground truth; effect_t, weight: the first phase of the effect, and w₁.
     """
-    first = 1.0, check_within("effect_t", effect_t, 0, 1), check_within("weight", weight, 0, 1)
+    effect_t = check_within("effect_t", effect_t, 0, 1)
+    weight = check_within("weight", weight, 0, 1)
     phases, quarters = np.linspace(0, 1, 11).round(2), np.linspace(0, 1, 5)
     sliders = {"action also seen at t": quarters, "effect seen at t": phases, "w₁": quarters}
     states = np.array(list(itertools.product(*sliders.values())))
@@ -158,7 +150,7 @@ def conditioning_explorer(
         f"with σ = {std:.1f} mm."
         for error, std in zip(error_mm, std_mm, strict=True)
     ]
-    return Explorer(sliders, first, panels, words)
+    return Explorer(sliders, [4, round(10 * effect_t), round(4 * weight)], panels, words)
 
 
 def phase_explorer(world: Tabletop, action: Primitive, phase: float = 0.8) -> Explorer:
@@ -205,4 +197,5 @@ def phase_explorer(world: Tabletop, action: Primitive, phase: float = 0.8) -> Ex
         f"<b>{mm:.2f} mm</b> from that position."
         for t, cm, mm in zip(stops, moved[(100 * stops).round().astype(int)], off_mm, strict=True)
     ]
-    return Explorer({"phase t": stops}, (phase,), panels, words, "from above [cm]")
+    at = int(np.abs(stops - phase).argmin())
+    return Explorer({"phase t": stops}, [at], panels, words, "from above [cm]")

@@ -19,17 +19,10 @@ import numpy as np
 from IPython.core.pylabtools import retina_figure
 from matplotlib.figure import Figure
 
+from affordlib import planning
 from affordlib.geometry import unit_vector, wrap_angle
 from affordlib.models import load_checkpoint
-from affordlib.planning import (
-    PlanMode,
-    Planner,
-    PlanningProblem,
-    Skills,
-    plan_astar,
-    plan_continuous,
-    plan_gradient,
-)
+from affordlib.planning import PlanMode, Planner, PlanningProblem, Skills
 from affordlib.planning.gradient import Reading
 from affordlib.show.picker_controls import (
     LIMIT_M,
@@ -54,15 +47,13 @@ POSE_EVERY, SENT_TOGETHER = 12, 5
 class GoalPicker(widgets.HBox):
     """The table from above, where a goal is picked by mouse, keyboard or sliders.
 
-    skills: what the robot can do. planners: name → function of a `PlanningProblem` that returns a
-    plan. While a hand drags the goal, the browser plans over the effect map; when it lets go, the
-    chosen planner does. seed: of the disturbances. view: whether the robot is shown in 3-D, too.
-    searched: an empty list, in which a planner may leave lines (n, 2) [m] of its search.
+    planners: name → planner; while a hand drags the goal, the browser plans over the effect map,
+    and when it lets go, the chosen planner does. seed: of the disturbances. view: whether the robot
+    is shown in 3-D, too. searched: an empty list, in which a planner may leave lines (n, 2) [m] of
+    its search.
 
-    `executors`: name → function (world, plan, planner, report) → Done that executes a plan, or
-    replans with the planner that made it; see `Report`. `goal`, `plan` and `outcome` are those
-    shown. Methods do what mouse and buttons do, and return when done; mouse and buttons queue
-    it in the background. A run shows each pose for `pace_s`.
+    `executors`: name → function (world, plan, planner, report) → Done, see `Report`. Methods do
+    what mouse and buttons do, and return when done. A run shows each pose for `pace_s` seconds.
     """
 
     pace_s = POSE_EVERY * STEP_S
@@ -85,8 +76,8 @@ class GoalPicker(widgets.HBox):
         self._rng = np.random.default_rng(check_count("seed", seed, least=0))
         self._first_pose = self._pose = self._plan_pose = world.object_pose()
         self._turn_from = self._pose[2]  # the yaw to which the goal's rotation is relative
-        self._running = self._lifted = False
-        self._stale = True  # the shown plan is not the chosen planner's for the shown goal
+        self._running = False
+        self._planned_for: Goal | None = None  # the goal when the chosen planner was last asked
         self._answered = 0  # the number of the last goal from the page with a plan
         self._alone = threading.RLock()  # held while planning or moving something in the world
         self._queue = ThreadPoolExecutor(1)
@@ -108,8 +99,7 @@ class GoalPicker(widgets.HBox):
         layout = {"flex_flow": "row wrap", "grid_gap": "12px"}
         super().__init__([table, self.controls, *[self.scene] * view], layout=layout)
         self.add_class("affordlib-picker")
-        for _ in range(2):  # what is slow only once is then not part of the time shown
-            self._attempt(self._make_plan)
+        self._attempt(self._make_plan)
 
     @classmethod
     def demo(cls, goal_xy_m: tuple[float, float] = (0.12, 0.08), seed: int = 0) -> Self:
@@ -121,10 +111,10 @@ class GoalPicker(widgets.HBox):
 
         def gradient(problem):  # the paper's planner, with the paper's network
             known = replace(problem, effects=published.effects(problem.effects.image))
-            return plan_gradient(known, seed=seed, reading=reading)
+            return planning.plan_gradient(known, seed=seed, reading=reading)
 
-        continuous = partial(plan_continuous, seed=seed)
-        planners = {"continuous": continuous, "A*": plan_astar, "gradient": gradient}
+        continuous = partial(planning.plan_continuous, seed=seed)
+        planners = {"continuous": continuous, "A*": planning.plan_astar, "gradient": gradient}
         return cls(world, skills, planners, goal_xy_m, seed)
 
     @property
@@ -144,10 +134,6 @@ class GoalPicker(widgets.HBox):
         self._set_running(True)
         self._run()
 
-    def stop(self) -> None:
-        """Stop after the current action."""
-        self._stop.set()
-
     def shove_object(self) -> None:
         """Shove the object 2 to 4 cm in a random direction; during a run, after this action."""
         self._disturb(self._shove)
@@ -161,7 +147,7 @@ class GoalPicker(widgets.HBox):
         self._refuse_while_running()
         (x, y, yaw), obstacles = self._first_pose, self.world.obstacles.all
         self._marks.clear()
-        self._set_goal(replace(self._first_goal))
+        self._set_goal(self._first_goal)
         self._disturb(partial(self.world.place, self.world.obj, (x, y), yaw, obstacles=obstacles))
 
     def figure(self) -> Figure:
@@ -204,7 +190,7 @@ class GoalPicker(widgets.HBox):
         for choice in (controls.planner, controls.other, controls.early):
             choice.observe(lambda _: self._follow(self.goal), names="value")
         controls.run.on_click(lambda _: self._run_in_background())
-        controls.stop.on_click(lambda _: self.stop())
+        controls.stop.on_click(lambda _: self._stop.set())
         controls.shove.on_click(lambda _: self._soon(self.shove_object))
         controls.move_goal.on_click(lambda _: self._soon(self.move_goal))
         controls.start_over.on_click(lambda _: self._soon(self.start_over))
@@ -231,23 +217,23 @@ class GoalPicker(widgets.HBox):
 
     def _follow(self, goal: Goal) -> None:
         """Set the goal, and soon show a plan for it, unless another one follows."""
-        goal = replace(goal)  # a new object, which identifies this request
         self._set_goal(goal)
-        if not self._running:
-            self._soon(lambda: goal is self.goal and self._update_plan())
+        self._soon(self._update_plan)
 
     def _set_goal(self, goal: Goal) -> None:
-        """Show a goal that has no plan yet."""
-        self.controls.show(goal)
-        self._stale = True
+        """Show a goal that has no plan yet, even if it equals the last one."""
+        self.controls.show(replace(goal))
         if self._running:  # the executor gets it after this action
             self._answered = self._view.wanted[2]
         self._show(planning=not self._running)
 
     def _update_plan(self) -> None:
         """Plan for the shown goal, if it has no plan yet and the robot is idle."""
-        if self._stale and not self._running:
+        if self._is_outdated() and not self._running:
             self._make_plan()
+
+    def _is_outdated(self) -> bool:
+        return self._planned_for is not self.goal
 
     def _planned(self, problem: PlanningProblem, planner: str = "") -> Plan:
         """A plan by the chosen planner, or another one, whose actions may stop early or not."""
@@ -262,9 +248,8 @@ class GoalPicker(widgets.HBox):
             self._other = None
             self._searched.clear()
             self.controls.show_progress(0)
-            if self._lifted:  # put it down
+            if self.world.arm.raised_m:  # put it down
                 self.world.park()
-                self._lifted = False
             self._pose = self.world.object_pose()
             try:
                 seen = self.world.depth_image(), self._pose[:2]
@@ -273,10 +258,8 @@ class GoalPicker(widgets.HBox):
                 words = plan_in_words(plan)
                 if other != "nothing":
                     self._other = self._planned(problem, other)
-                    off_mm = 1000 * self._other.predicted_distance_m
-                    words += (
-                        f" By {other}, dashed: {len(self._other.steps)} actions, {off_mm:.1f} mm."
-                    )
+                    n, off_mm = len(self._other.steps), 1000 * self._other.predicted_distance_m
+                    words += f" By {other}, dashed: {n} actions, {off_mm:.1f} mm."
                 self.controls.say(f"{self._news} {words}")
                 self._news = ""
                 self._view.object = object_data(self.world.obj, problem.effects, self._pose[2])
@@ -286,9 +269,8 @@ class GoalPicker(widgets.HBox):
                 if self.scene is not None:
                     self.scene.mark(self.goal, plan)
                 self._plan_pose, self._turn_from = self._pose, self._pose[2]
-                self._answered = number
-                self._stale = goal is not self.goal
-                self._show(planning=self._stale)
+                self._answered, self._planned_for = number, goal
+                self._show(planning=self._is_outdated())
 
     # Execution
 
@@ -308,11 +290,8 @@ class GoalPicker(widgets.HBox):
         def report(plan=None):
             nonlocal done
             if plan is not None:
-                left[:] = plan.steps
-                arrives = self.goal.distance_m(plan.predicted_end_xy_m) <= self.goal.tolerance_m
-                self.plan = replace(plan, goal=self.goal, reaches_goal=arrives)
-                self._pose = self.world.object_pose()
-                self._plan_pose = (*plan.start_xy_m, self._pose[2])
+                left[:], self.plan = plan.steps, replace(plan, goal=self.goal)
+                self._pose = self._plan_pose = self.world.object_pose()
                 self._news += " New plan." * (done > 0)
                 self._show()
                 if self.scene is not None:
@@ -331,14 +310,14 @@ class GoalPicker(widgets.HBox):
             if self._stop.is_set():
                 raise Stopped
             if left:
-                name, of = left[0].primitive.name.replace("_", " "), done + len(left)
-                self.controls.say(f"{name.capitalize()} {done + 1} of {of} …{self._news}")
+                name, of = left[0].primitive.name.capitalize(), done + len(left)
+                self.controls.say(f"{name} {done + 1} of {of} …{self._news}")
                 self._news = ""
 
         with self._alone:
             on_step = self.world.on_step
             try:
-                if self._stale or self.plan is None or self.outcome is not None:
+                if self._is_outdated() or self.plan is None or self.outcome is not None:
                     self._make_plan()
                 plan, self._news = self.plan, ""
                 self._marks.clear()
@@ -358,11 +337,11 @@ class GoalPicker(widgets.HBox):
                 pose = self.world.object_pose()
                 moved = wrap_angle(pose[2] - yaw), self.world.object_state()[2] - z
                 outcome = Outcome(plan, self.goal.distance_m(pose[:2]), pose, paths, *moved, words)
-                self.outcome, self._lifted = outcome, bool(self.goal.height_m)
+                self.outcome = outcome
                 if self.plan.goal == self.goal or outcome.distance_m <= self.goal.tolerance_m:
-                    self._stale = False  # the run has followed the goal
+                    self._planned_for = self.goal  # the run has followed it
                 self.controls.say(*outcome_in_words(outcome, self.goal, how, done))
-            except Exception:
+            except BaseException:  # an interruption, too
                 self.plan, self._disturbances = None, []  # the next run plans from the current pose
                 raise
             finally:
@@ -372,37 +351,37 @@ class GoalPicker(widgets.HBox):
                     self.scene.stop()
                 self._set_running(False)
                 self._show()
-            if self._stale or self._disturbances:  # by a hand that the run did not follow
+            if self._is_outdated() or self._disturbances:  # by a hand that the run did not follow
                 self._news = self.controls.said
                 self._disturb()
 
     def _log(self, steps: Iterator[int], z_m: float, world: Tabletop) -> None:
         """Log a step of the simulation, and send what is logged; z_m: the object's first height."""
-        number = next(steps)
         if self.scene is not None:
             self.scene(world)
-        if number % POSE_EVERY == 0:
+        if next(steps) % POSE_EVERY == 0:
             pose, lift = world.object_pose(), world.object_state()[2] - z_m
             bodies = () if self.scene is None else self.scene.poses().flat
             motion = [*pose, lift, *world.arm.tool_pose(), *bodies]
             self._motions.append(np.round(motion, 4).tolist())
             self._trail.append(pose[:2])
-        if number == 0 or len(self._motions) == SENT_TOGETHER:
-            self._send_motions(first=number == 0)
+            if len(self._trail) == 1 or len(self._motions) == SENT_TOGETHER:
+                self._send_motions()
 
-    def _send_motions(self, first: bool = False) -> None:
+    def _send_motions(self) -> None:
         """Send the motions logged since the last call, to be shown as they come."""
         if self._motions:
+            first = len(self._motions) == len(self._trail)
             bodies = [self.scene.name, [one.id for one in self.scene.bodies]] if self.scene else []
             self._view.send({"motions": self._motions, "first": first, "bodies": bodies})
-            self._shown_until = max(self._shown_until, time.monotonic())
-            self._shown_until += self.pace_s * len(self._motions)
+            from_s = max(self._shown_until, time.monotonic())
+            self._shown_until = from_s + self.pace_s * len(self._motions)
             self._motions = []
 
     def _wait_until_shown(self) -> None:
         self._send_motions()
-        self._stop.wait(max(0.0, self._shown_until - time.monotonic()))
-        self._pose, self._shown_until = self.world.object_pose(), 0.0
+        self._stop.wait(self._shown_until - time.monotonic())
+        self._pose = self.world.object_pose()
 
     # Disturbances
 
@@ -435,7 +414,7 @@ class GoalPicker(widgets.HBox):
     def _set_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
         try:
             self.world.set_obstacles(obstacles)
-            self._stale = True
+            self._planned_for = None
         finally:
             self._view.obstacles = [obstacle_data(one) for one in self.world.obstacles.all]
 

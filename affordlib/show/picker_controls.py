@@ -79,14 +79,12 @@ class PickerControls(widgets.VBox):
         if slider.value != self._shown()[k]:
             numbers[k] = round(slider.value / _SCALES[k], 12)
             x, y, turn, height = numbers
-            wanted = {"turn_rad": turn or None, "height_m": height or None}
-            on_goal(replace(self.goal, xy_m=(x, y), **wanted))
+            on_goal(replace(self.goal, xy_m=(x, y), turn_rad=turn or None, height_m=height or None))
 
     def set_running(self, running: bool) -> None:
         """Disable the controls that have no effect during a run."""
-        idle = self.planner, self.other, self.early, self.executor, self.run, self.start_over
-        for control in idle:
-            control.disabled = running
+        for one in (self.planner, self.other, self.early, self.executor, self.run, self.start_over):
+            one.disabled = running
         self.stop.disabled = not running
 
     def show_progress(self, done: int, of: int = 1) -> None:
@@ -111,18 +109,17 @@ def _button(name: str, icon: str, tooltip: str, **kwargs: Any) -> widgets.Button
 
 def plan_in_words(plan: Plan) -> str:
     """Describe a plan: its actions, and their predicted distance to the goal."""
-    words = ((step.primitive.name.replace("_", " "), 100 * step.stop_phase) for step in plan.steps)
-    steps = ", then ".join(f"{name} to {phase:.0f} %" for name, phase in words) or "no action"
-    missed = " Up to three pushes or drags do not reach the goal; a closed loop then plans again."
-    arrives = "" if plan.reaches_goal else missed
-    if not plan.reaches_goal and plan.predicted_distance_m <= plan.goal.tolerance_m:
-        arrives = " It reaches the goal's position, but not its turn or height."
+    steps = [f"{step.primitive.name} to {100 * step.stop_phase:.0f} %" for step in plan.steps]
     std_m = plan.steps[-1].std_m if plan.steps else math.nan
     spread = "" if math.isnan(std_m) else f" (σ of the last step {1000 * std_m:.1f} mm)"
-    return (
-        f"Plan: {steps}. Predicted to end {1000 * plan.predicted_distance_m:.1f} mm from the goal"
-        f"{spread}.{arrives}"
+    words = (
+        f"Plan: {', then '.join(steps) or 'no action'}. Predicted to end "
+        f"{1000 * plan.predicted_distance_m:.1f} mm from the goal{spread}."
     )
+    missed = " Up to three pushes or drags do not reach the goal; a closed loop then plans again."
+    if plan.predicted_distance_m <= plan.goal.tolerance_m:
+        missed = " It reaches the goal's position, but not its turn or height."
+    return words if plan.reaches_goal else words + missed
 
 
 def outcome_in_words(outcome: Outcome, goal: Goal, how: str, done: int) -> tuple[str, str]:

@@ -38,6 +38,7 @@ from affordlib.types import (
 from affordlib.world import TabletopObject
 
 GOAL, PREDICTION, TRUTH, NEUTRAL = "#0072B2", "#D55E00", "#009E73", "#777777"
+_ARROW = {"arrowstyle": "-|>", "color": NEUTRAL, "lw": 1.5}
 
 ENLARGED = 20
 """Radius, in σ, of the disc at the end of a predicted path: a disc of one σ is too small to see."""
@@ -156,8 +157,7 @@ def plot_plan(
             continue
         direction = unit_vector(step.primitive.direction_rad)
         tail, tip = _cm(start - 0.075 * direction), _cm(start - 0.035 * direction)
-        arrow = {"arrowstyle": "-|>", "color": NEUTRAL, "lw": 1.5}
-        ax.annotate("", tip, tail, arrowprops=arrow, zorder=4)
+        ax.annotate("", tip, tail, arrowprops=_ARROW, zorder=4)
         aside = -direction if k == 0 else direction[::-1] * (1, -1)
         if aside @ (start - first) < 0:
             aside = -aside  # away from the object's start
@@ -250,8 +250,7 @@ def plot_flow(
         style = {"boxstyle": "round,pad=0.4", "fc": "white", "ec": color, "lw": 1.5}
         drawn[text] = ax.text(x, y, text, ha="center", va="center", bbox=style)
     for tail, tip in arrows:
-        arrow = {"arrowstyle": "-|>", "color": NEUTRAL, "lw": 1.5}
-        arrow |= {"patchA": drawn[tail].get_bbox_patch(), "patchB": drawn[tip].get_bbox_patch()}
-        ax.annotate("", boxes[tip][:2], boxes[tail][:2], arrowprops=arrow)
+        ends = {"patchA": drawn[tail].get_bbox_patch(), "patchB": drawn[tip].get_bbox_patch()}
+        ax.annotate("", boxes[tip][:2], boxes[tail][:2], arrowprops=_ARROW | ends)
     ax.axis("off")
     return ax

@@ -1,7 +1,6 @@
 """The robot in 3-D, to turn and zoom: arm, hand, object, goal, prediction and obstacles, by k3d.
 
-A scene records its world's motion, and plays it: play, pause, scrub, slow motion. Without a kernel,
-a page does so by k3d's script, which `make html` takes from the environment.
+Without a kernel, a page plays what was recorded by k3d's script, which `make html` adds.
 """
 
 import base64
@@ -54,11 +53,13 @@ class Scene(widgets.VBox):
         import k3d  # a quarter of a second that only a scene needs
 
         self.world, self._mesh = world, k3d.mesh
+        self.name = f"scene_{uuid4().hex}"
+        code = f"(globalThis.affordlib ??= {{}}).{self.name} = K3DInstance;{_COARSER}"
         plain = {"grid_visible": False, "camera_auto_fit": False, "menu_visibility": False}
+        plain |= {"background_color": 0xF4F6F8, "axes_helper": 0.0, "lighting": 1.8}
         fast = {"antialias": 1, "logarithmic_depth_buffer": False}  # twice, without a GPU
-        self.plot = k3d.plot(height=400, **plain, **fast)
+        self.plot = k3d.plot(height=400, additional_js_code=code, **plain, **fast)
         self.plot.layout.width = "100%"
-        self.plot.background_color, self.plot.axes_helper, self.plot.lighting = 0xF4F6F8, 0.0, 1.8
         self.plot.camera = [0.84, -0.88, 0.62, -0.24, 0.02, 0.24, 0.0, 0.0, 1.0]  # at, to, upwards
         table = [(x, y) for x in TABLE_X_M for y in TABLE_Y_M]
         self._add(extruded(np.array(table), -0.1, 0.0), _WOOD)
@@ -67,9 +68,6 @@ class Scene(widgets.VBox):
         base, *links = _arm(world)
         self._add(*base, (BASE_X_M, 0.0, 0.0))
         self._links = [self._add(*link) for link in links]
-        self.name = f"scene_{uuid4().hex}"
-        self.plot.additional_js_code = f"(globalThis.affordlib ??= {{}}).{self.name} = K3DInstance;"
-        self.plot.additional_js_code += _COARSER
         self._object, self._last = None, np.ones(7)
         self._marks: list[Any] = []
         self.player = widgets.Play(interval=TICK_MS, max=0)

@@ -22,8 +22,6 @@ from affordlib.world import BASE_X_M, REACH_M, TabletopObject
 PUSH_RUN_UP_M = 0.2
 """Largest distance [m] of a push's start from the object; it bounds the shaded reachable ring."""
 
-_HERE = Path(__file__).parent
-
 
 class TableView(anywidget.AnyWidget):
     """The table from above, whose goal is dragged; see `table.js`.
@@ -36,8 +34,8 @@ class TableView(anywidget.AnyWidget):
     come, in 3-D too: of the bodies [a scene's name, their numbers], positions and quaternions.
     """
 
-    _esm = _HERE / "table.js"
-    _css = _HERE / "table.css"
+    _esm = Path(__file__).with_name("table.js")
+    _css = Path(__file__).with_name("table.css")
     table = traitlets.Dict().tag(sync=True)
     object = traitlets.Dict().tag(sync=True)
     scene = traitlets.Dict().tag(sync=True)
@@ -62,7 +60,7 @@ def plan_data(plan: Plan, yaw_rad: float) -> list[dict[str, Any]]:
         moves = hasattr(step.primitive, "direction_rad")
         about = {"from": at, "end": end, "path": path.tolist(), "stop": step.stop_phase}
         about["direction"] = step.primitive.direction_rad if moves else None
-        about["name"] = step.primitive.name.replace("_", " ").removeprefix("push")
+        about["name"] = step.primitive.name.removeprefix("push")
         steps.append(about | {"std": None if math.isnan(step.std_m) or not moves else step.std_m})
         at = end
     return steps

@@ -151,7 +151,8 @@ class Table:
     def start_over(self):
         button(self.page, "Start over").click()
         back = "max(map(abs, map(float.__sub__, picker._plan_pose, picker._first_pose))) < 1e-6"
-        wait_until(lambda: ask(self.page, f"{back} and not (picker._stale or picker._running)"))
+        idle = "not (picker._is_outdated() or picker._running)"
+        wait_until(lambda: ask(self.page, f"{back} and {idle}"))
         self.wait_for_answer()
 
 
