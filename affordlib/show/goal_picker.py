@@ -266,9 +266,9 @@ class GoalPicker(widgets.HBox):
             finally:
                 self.plan, self.outcome = plan, None
                 self._trail.clear()
-                if self.scene is not None:
-                    self.scene.mark(self.goal, plan)
                 self._plan_pose, self._turn_from = self._pose, self._pose[2]
+                if self.scene is not None:
+                    self.scene.mark(self.goal, plan, self._turn_from)
                 self._answered, self._planned_for = number, goal
                 self._show(planning=self._is_outdated())
 
@@ -295,7 +295,7 @@ class GoalPicker(widgets.HBox):
                 self._news += " New plan." * (done > 0)
                 self._show()
                 if self.scene is not None:
-                    self.scene.mark(self.goal, plan)
+                    self.scene.mark(self.goal, plan, self._turn_from)
                 return self.goal
             done += 1
             left[:] = left[1:]

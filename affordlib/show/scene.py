@@ -96,14 +96,20 @@ class Scene(widgets.VBox):
         """Begin a recording."""
         self._frames, self._steps = [self.poses()], 0
 
-    def mark(self, goal: Goal | None = None, plan: Plan | None = None) -> None:
-        """Show obstacles, and goal and predicted final pose of a plan, in place of earlier ones."""
+    def mark(
+        self, goal: Goal | None = None, plan: Plan | None = None, from_rad: float | None = None
+    ) -> None:
+        """Show obstacles, and goal and predicted final pose of a plan, in place of earlier ones.
+
+        from_rad: yaw to which the goal's turn is relative, by default the present one.
+        """
         for old in self._marks:
             self.plot -= old
         obj, self._marks = self.world.obj, []
         for one in self.world.obstacles.all:
             self._marks.append(self._add(extruded(corners_of(one), 0.0, one.height_m), _STONE))
-        start = yaw = self.world.object_pose()[2]
+        yaw = self.world.object_pose()[2]
+        start = yaw if from_rad is None else from_rad
         if plan is not None and plan.steps:
             yaw += plan.steps[-1].predicted_turn_rad
             at = (*plan.predicted_end_xy_m, obj.height_m / 2)

@@ -56,6 +56,12 @@ def test_a_footprint_is_drawn_where_the_object_is(world, trained):
     np.testing.assert_allclose(last.mean(axis=0), 100 * np.array(outcome.end_pose[:2]), atol=1e-9)
 
 
+def test_the_turn_of_a_goal_is_that_from_where_the_object_was(world):
+    world.place(Cuboid(0.06, 0.04, 0.05), yaw_rad=0.8)
+    (scene := show.Scene(world)).mark(Goal((0.1, 0.0), turn_rad=0.5), from_rad=0.3)
+    assert np.arctan2(*scene._marks[-1].model_matrix[1::-1, 0]) == pytest.approx(0.8)
+
+
 def test_the_configuration_of_a_reader_changes_no_figure(tmp_path):
     (tmp_path / "matplotlibrc").write_text(
         "text.usetex: True\nfont.family: fantasy\naxes.grid: False\nfigure.figsize: 2, 2\n"
