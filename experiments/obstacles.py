@@ -322,7 +322,8 @@ def felt(kind: str, index: int) -> list[dict[str, float]]:
 
         def is_free(one: Obstacle, seen=seen, action=action, chain=chain, poses=poses) -> bool:
             space = FreeSpace([one], seen.image, (0.0, 0.0))
-            return space.spare_m(action, *chain.numpy(), poses)[0] >= 0
+            spare_m = space.spare_m(action, *chain.numpy(), poses)[0]
+            return space.least_m == free_space.START_M and spare_m >= 0
 
         one = nearest(beside(rng, poses[0]), is_free)
         world.place(obj, (0.0, 0.0), yaw, obstacles=[one])
