@@ -526,11 +526,11 @@ def rows_of(records: pd.DataFrame) -> Rows:
     return plain(rows)
 
 
-PAIRS = [(row, f"{row}_full") for row in ("continuous", "astar", "perturbed")]
+PAIRS = [(row, f"{row}_full") for row in ROWS if f"{row}_full" in ROWS]
 PAIRS += [("continuous", row) for row in ROWS if row.startswith("check")]
 PAIRS += [("continuous", row) for row in ("cem", "no_sigma", "film_500", "mechanics")]
 PAIRS += [("film_500", "cnp_500"), ("no_sigma", "mechanics")]
-PAIRS += [("closed_loop", "continuous"), ("closed_loop", "closed_loop_full")]
+PAIRS += [("closed_loop", "continuous")]
 PAIRS += [("closed_loop_perturbed", "perturbed")]
 
 
