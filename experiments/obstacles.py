@@ -206,9 +206,8 @@ ROWS = {
     "perturbed": (plan_continuous, {"world": "perturbed"}),
     "perturbed_full": (plan_continuous, {"world": "perturbed", "partial": False}),
     **{
-        f"{loop}{name}{change}": (planner, how | more)
-        for loop, how in (("", {}), ("closed_loop_", {"observes": True}))
-        for name, planner in (("gradient", plan_gradient), ("cem", plan_cem), ("astar", plan_astar))
+        f"{name}{change}": (planner, more)
+        for name, planner in (("astar", plan_astar), ("gradient", plan_gradient), ("cem", plan_cem))
         for change, more in (("", {}), ("_full", {"partial": False}))
     },
     "no_sigma": (partial(plan_continuous, risk_weight=0.0), {}),
@@ -217,6 +216,9 @@ ROWS = {
     "mechanics": (plan_continuous, {"mechanics": True}),
     "closed_loop": (plan_continuous, {"observes": True}),
     "closed_loop_full": (plan_continuous, {"observes": True, "partial": False}),
+    "closed_loop_gradient": (plan_gradient, {"observes": True}),
+    "closed_loop_cem": (plan_cem, {"observes": True}),
+    "closed_loop_cem_full": (plan_cem, {"observes": True, "partial": False}),
     "closed_loop_perturbed": (plan_continuous, {"observes": True, "world": "perturbed"}),
     "closed_loop_perturbed_full": (
         plan_continuous,

@@ -310,7 +310,7 @@ class GoalPicker(widgets.HBox):
             if self._stop.is_set():
                 raise Stopped
             if left:
-                name, of = left[0].primitive.name.capitalize(), done + len(left)
+                name, of = left[0].primitive.name.capitalize().replace("_", " "), done + len(left)
                 self.controls.say(f"{name} {done + 1} of {of} …{self._news}")
                 self._news = ""
 
@@ -381,7 +381,7 @@ class GoalPicker(widgets.HBox):
     def _wait_until_shown(self) -> None:
         self._send_motions()
         self._stop.wait(self._shown_until - time.monotonic())
-        self._pose = self.world.object_pose()
+        self._pose, self._shown_until = self.world.object_pose(), 0.0
 
     # Disturbances
 

@@ -110,6 +110,7 @@ def _button(name: str, icon: str, tooltip: str, **kwargs: Any) -> widgets.Button
 def plan_in_words(plan: Plan) -> str:
     """Describe a plan: its actions, and their predicted distance to the goal."""
     steps = [f"{step.primitive.name} to {100 * step.stop_phase:.0f} %" for step in plan.steps]
+    steps = [words.replace("_", " ") for words in steps]
     std_m = plan.steps[-1].std_m if plan.steps else math.nan
     spread = "" if math.isnan(std_m) else f" (σ of the last step {1000 * std_m:.1f} mm)"
     words = (

@@ -60,7 +60,7 @@ def plan_data(plan: Plan, yaw_rad: float) -> list[dict[str, Any]]:
         moves = hasattr(step.primitive, "direction_rad")
         about = {"from": at, "end": end, "path": path.tolist(), "stop": step.stop_phase}
         about["direction"] = step.primitive.direction_rad if moves else None
-        about["name"] = step.primitive.name.removeprefix("push")
+        about["name"] = step.primitive.name.removeprefix("push").replace("_", " ")
         steps.append(about | {"std": None if math.isnan(step.std_m) or not moves else step.std_m})
         at = end
     return steps

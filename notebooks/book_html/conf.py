@@ -58,8 +58,10 @@ def describe(cell: dict, below: str) -> None:
     """Give a picture its alternative text, the caption in the cell below; name a folded cell."""
     about = cell["metadata"]["mystnb"] = {}
     if "GoalPicker.demo(" in "".join(cell["source"]):
-        live = {"output_type": "display_data", "data": {"text/html": PICKER}, "metadata": {}}
-        cell["outputs"] = [live]
+        png = next((o["data"]["image/png"] for o in cell["outputs"] if "data" in o), "")
+        still = f'<noscript><img alt="Its picture" src="data:image/png;base64,{png}"></noscript>'
+        live = {"output_type": "display_data", "data": {"text/html": still + PICKER}}
+        cell["outputs"] = [live | {"metadata": {}}]
     caption = re.match(r"\*\*Figure .*?\*\* (.*)", below)
     kinds = {"write_results(": "results", "import": "imports"}
     named = [name for word, name in kinds.items() if word in "".join(cell["source"])]

@@ -151,6 +151,7 @@ class Table:
     def start_over(self):
         button(self.page, "Start over").click()
         back = "max(map(abs, map(float.__sub__, picker._plan_pose, picker._first_pose))) < 1e-6"
+        back += " and picker.goal.xy_m == picker._first_goal.xy_m"
         idle = "not (picker._is_outdated() or picker._running)"
         wait_until(lambda: ask(self.page, f"{back} and {idle}"))
         self.wait_for_answer()
@@ -180,10 +181,9 @@ def assert_same_goal(page, table, x_m, y_m, within_m=0.0011):
     assert wanted == pytest.approx((x_m, y_m), abs=within_m)
     wait_until(lambda: np.abs(table.goal() - wanted).max() < 3e-4)
     readouts = page.locator(".affordlib-picker .widget-readout")
+    read = "all => all.slice(0, 2).map((e) => Number(e.innerText.replace('−', '-')))"
     shown = [pytest.approx(100 * v) for v in wanted]
-    wait_until(
-        lambda: [float(s.replace("−", "-")) for s in readouts.all_inner_texts()[:2]] == shown
-    )
+    wait_until(lambda: readouts.evaluate_all(read) == shown)
 
     def drawn_is_planned():  # a better plan may follow the first
         paths = ask(page, "[s.predicted_path_xy_m.tolist() for s in picker.plan.steps]")
@@ -461,9 +461,9 @@ def test_a_second_window_without_webgl_shows_the_same_and_plays_from_above(page,
     """It is loaded while the kernel runs, so this is a reload, too."""
     page.evaluate("window.jupyterapp.commands.execute('docmanager:save')")
     other = page.context.browser.new_page(viewport={"width": 1280, "height": 1000})
-    none = "HTMLCanvasElement.prototype.getContext = new Proxy(HTMLCanvasElement.prototype."
-    none += "getContext, {apply: (f, el, [kind, ...more]) =>"
-    other.add_init_script(none + " /webgl/.test(kind) ? null : f.call(el, kind, ...more)});")
+    none = "{apply: (get, el, kind) => /webgl/.test(kind[0]) ? null : get.apply(el, kind)}"
+    context = "HTMLCanvasElement.prototype.getContext"
+    other.add_init_script(f"{context} = new Proxy({context}, {none})")
     load(other, lab.url)
     other.locator(".affordlib-table .prediction").first.wait_for(timeout=40_000)
     second = Table(other)
@@ -482,9 +482,10 @@ def test_a_second_window_without_webgl_shows_the_same_and_plays_from_above(page,
 def test_a_goal_out_of_reach_is_hollow_and_says_how_far(page, table):
     table.start_over()
     ask(page, "picker.pick(0.3, 0.25)")
-    wait_until(lambda: table.svg.locator(".short-by").count() == 1)
+    hollow = table.svg.locator(".short-by")
+    wait_until(lambda: goal_of(page) == (0.3, 0.25) and hollow.count() == 1)
     short_cm = ask(page, "100 * picker.plan.predicted_distance_m")
-    assert f"{short_cm:.0f} cm short" in table.svg.locator(".short-by").text_content()
+    assert f"{short_cm:.0f} cm short" in hollow.text_content()
     style = "svg => getComputedStyle(svg.querySelector('.goal.missed'))"
     assert table.svg.evaluate(f"{style}.fill") != table.svg.evaluate(f"{style}.stroke")
     picture(page, "out_of_reach")
@@ -583,8 +584,7 @@ def test_the_first_web_page_plans_without_a_kernel(web, browser):
     page.mouse.click(*screen_at(table, 0.0, 0.08))
     wait_until(lambda: "The goal is at x = 0.0, y = 8.0 cm" in table.get_attribute("aria-label"))
     assert "Predicted to end 0.0 mm" in inside.locator(".words").inner_text()
-    fits = "() => document.documentElement.scrollHeight <= innerHeight"
-    wait_until(lambda: inside.evaluate(fits), 20)
+    wait_until(lambda: inside.evaluate("document.documentElement.scrollHeight <= innerHeight"))
     picture(page, "web_picker")
 
 

@@ -57,7 +57,7 @@ def test_a_footprint_is_drawn_where_the_object_is(world, trained):
 
 
 def test_the_turn_of_a_goal_is_that_from_where_the_object_was(world):
-    world.place(Cuboid(0.06, 0.04, 0.05), yaw_rad=0.8)
+    world.place(Cuboid(0.06, 0.04, 0.05), yaw_rad=0.6)
     (scene := show.Scene(world)).mark(Goal((0.1, 0.0), turn_rad=0.5), from_rad=0.3)
     assert np.arctan2(*scene._marks[-1].model_matrix[1::-1, 0]) == pytest.approx(0.8)
 
