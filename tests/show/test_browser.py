@@ -65,7 +65,7 @@ def serve(folder, name, more_cells=(), app="jupyterlab"):
             yield SimpleNamespace(address=address, url=url, notebook=file, out=out)
         finally:
             server.terminate()
-            server.wait(timeout=30)
+            server.wait(timeout=60)
 
 
 def ask(page, expression):
@@ -457,8 +457,9 @@ def test_no_request_leaves_the_machine(page, lab):
     assert page.locator("text=Would you like to get notified").count() == 0
 
 
-def test_a_second_window_without_webgl_shows_the_same_and_plays_from_above(page, table, lab):
+def test_a_second_window_without_webgl_plans_and_shows_the_same(page, table, lab):
     """It is loaded while the kernel runs, so this is a reload, too."""
+    table.start_over()
     page.evaluate("window.jupyterapp.commands.execute('docmanager:save')")
     other = page.context.browser.new_page(viewport={"width": 1280, "height": 1000})
     none = "{apply: (get, el, kind) => /webgl/.test(kind[0]) ? null : get.apply(el, kind)}"
@@ -467,14 +468,9 @@ def test_a_second_window_without_webgl_shows_the_same_and_plays_from_above(page,
     load(other, lab.url)
     other.locator(".affordlib-table .prediction").first.wait_for(timeout=40_000)
     second = Table(other)
-    other.mouse.click(*second.at(0.06, 0.11))
-    assert_same_goal(other, second, 0.06, 0.11)
+    other.mouse.click(*second.at(0.07, 0.03))
+    assert_same_goal(other, second, 0.07, 0.03)
     wait_until(lambda: np.abs(table.goal() - second.goal()).max() < 1e-3)
-    button(other, "Run").click()
-    wait_for_words(other, "from the goal, ")
-    end = ask(page, "picker.outcome.end_pose[:2]")
-    for one in (table, second):
-        wait_until(lambda one=one: np.allclose(one.points(".object").mean(axis=0), end, atol=1e-3))
     picture(other, "without_webgl")
     other.close()
 
