@@ -77,7 +77,7 @@ class GoalPicker(widgets.HBox):
         self._first_pose = self._pose = self._plan_pose = world.object_pose()
         self._turn_from = self._pose[2]  # the yaw to which the goal's rotation is relative
         self._running = False
-        self._planned_for: Goal | None = None  # the goal when the chosen planner was last asked
+        self._planned_for: Goal | None = None  # what the chosen planner has last planned for
         self._answered = 0  # the number of the last goal from the page with a plan
         self._alone = threading.RLock()  # held while planning or moving something in the world
         self._queue = ThreadPoolExecutor(1)

@@ -238,7 +238,7 @@ def test_the_shipped_one_was_learned_so(learned, tmp_path):
 def test_a_primitive_that_was_not_learned_is_left_to_the_kinematics(learned, film, monkeypatch):
     monkeypatch.setitem(primitives.PRIMITIVES, "tap", type("Tap", (Push,), {"name": "tap"}))
     assert (Reachability.load().probability("tap", np.zeros((2, 2))) == 1.0).all()
-    # An unknown one, and other shapes, are told.
+    # An unknown one, and other shapes, are named.
     with pytest.raises(ValueError, match=r"one of .*'push'.* got 'pusch'"):
         Skills({"pusch": film})
     with pytest.raises(ValueError, match=r"primitive must be one of .*, got 'kick'"):
